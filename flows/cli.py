@@ -1,0 +1,341 @@
+"""The ``velfield`` command. Imports nothing heavy until a command runs."""
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import App, Parameter
+
+from flows.launch import limit_threads
+from velfield.errors import InputError
+
+if TYPE_CHECKING:
+    from flows.console import Console, Verbosity
+    from schemas.job import Job
+    from schemas.summary import RunSummary
+
+DONE, BAD_INPUT, USAGE, INCOMPLETE = 0, 1, 2, 3
+"""Exit statuses. 3: done, but frames were lost."""
+
+app = App(
+    name="velfield",
+    help="Aerial video of a city in, a probability distribution over vehicle velocity at every pixel of the map out.",
+    version_flags=["--version"],
+)
+
+Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative=())]
+Verbose = Annotated[bool, Parameter(name=["--verbose", "-v"], negative=())]
+LogJson = Annotated[bool, Parameter(name="--log-json", negative=())]
+Preset = Literal["best", "fast", "paper"]
+
+
+@app.command
+def run(
+    source: Path,
+    /,
+    *,
+    out: Path,
+    base: Path | None = None,
+    gsd_m: float | None = None,
+    labels: Path | None = None,
+    detector: Path | None = None,
+    detections: Path | None = None,
+    timestamps: Path | None = None,
+    fps: float | None = None,
+    config: Path | None = None,
+    preset: Preset | None = None,
+    settings: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False)] = (),
+    every: str | None = None,
+    start_s: float | None = None,
+    stop_s: float | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    plan: Annotated[bool, Parameter(negative=())] = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    log_json: LogJson = False,
+) -> int:
+    """Aerial video in, velocity field out. The same command again resumes.
+
+    Parameters
+    ----------
+    source
+        Video file, or folder of pictures.
+    out
+        Run folder: everything is written there.
+    base
+        Picture whose pixels become the base pixels: GeoTIFF, PNG with world file, or plain.
+        Default: built from the flight.
+    gsd_m
+        Ground sample distance, metres a base pixel. Default: from the base picture's CRS, else all stays in px/s.
+    labels
+        Marked cars to learn from: CSV, or a YOLO folder. Default: learnt from motion.
+    detector
+        A detector file in place of training.
+    detections
+        Another detector's boxes in place of ours.
+    timestamps
+        CSV `frame,time_s` for a folder of pictures.
+    fps
+        Frame rate of a folder of pictures that has no times.
+    config
+        flight.yaml with the flight's configuration.
+    preset
+        Set of defaults to start from.
+    settings
+        `section.key=value`, any number of times.
+    every
+        Take every n-th frame; `auto`: the frames nearest to 0.2 s apart.
+    start_s
+        Leave out what comes before, seconds from the first frame.
+    stop_s
+        Leave out what comes at or after, seconds from the first frame.
+    workers
+        Processes of a local cluster. Default: threads of this process.
+    scheduler
+        Address of a Dask scheduler.
+    plan
+        Say what would be done, and stop.
+    quiet
+        Warnings only.
+    verbose
+        More detail.
+    log_json
+        Lines of JSON in place of text.
+    """
+    from schemas.job import Inputs, Job
+    from velfield.configuration import resolve_config
+
+    overrides = {
+        "gsd_m": gsd_m,
+        "frames.every": _every(every),
+        "frames.fps": fps,
+        "frames.start_s": start_s,
+        "frames.stop_s": stop_s,
+    }
+    resolved = resolve_config(preset=preset, file=config, settings=settings, overrides=overrides)
+    inputs = Inputs(
+        source=str(source),
+        base=_text(base),
+        labels=_text(labels),
+        detector=_text(detector),
+        detections=_text(detections),
+        timestamps=_text(timestamps),
+    )
+    job = Job(root=str(out), inputs=inputs, config=resolved)
+    if plan:
+        return _show_plan(job)
+    return _process(job, workers=workers, scheduler=scheduler, verbosity=_verbosity(quiet, verbose, log_json))
+
+
+@app.command
+def simulate(
+    out: Path,
+    /,
+    *,
+    frames: int = 300,
+    size: str = "1280x960",
+    seed: int = 0,
+    quiet: Quiet = False,
+) -> int:
+    """Simulate a flight over a city, with the truth: writes frames/, timestamps.csv, base.png, labels.csv, truth/.
+
+    Parameters
+    ----------
+    out
+        Folder to write to.
+    frames
+        How many frames.
+    size
+        Frame size, WxH in pixels.
+    seed
+        Another seed, another city and another flight.
+    quiet
+        Warnings only.
+    """
+    _simulate(out, frames=frames, size=size, seed=seed, quiet=quiet)
+    print(f"{out}: try  velfield run {out}/frames --timestamps {out}/timestamps.csv --gsd-m 0.23 --out RUN")
+    return DONE
+
+
+@app.command
+def demo(
+    *,
+    out: Path = Path("velfield-demo"),
+    frames: int = 120,
+    size: str = "960x720",
+    seed: int = 1,
+    quiet: Quiet = False,
+) -> int:
+    """A simulated flight, the whole job, the report.
+
+    Parameters
+    ----------
+    out
+        Folder to write to.
+    frames
+        How many frames.
+    size
+        Frame size, WxH in pixels.
+    seed
+        Another seed, another city.
+    quiet
+        Warnings only.
+    """
+    from schemas.job import Inputs, Job
+    from velfield.configuration import resolve_config
+
+    flight = out / "flight"
+    _simulate(flight, frames=frames, size=size, seed=seed, quiet=quiet)
+    inputs = Inputs(
+        source=str(flight / "frames"),
+        base=str(flight / "base.png"),
+        labels=str(flight / "labels.csv"),
+        timestamps=str(flight / "timestamps.csv"),
+    )
+    job = Job(root=str(out / "run"), inputs=inputs, config=resolve_config(overrides={"gsd_m": 0.23}))
+    status = _process(job, verbosity="quiet" if quiet else "normal")
+    if status in (DONE, INCOMPLETE):
+        _score(out / "run", flight)
+    return status
+
+
+@app.command
+def export(
+    run_folder: Path,
+    /,
+    *,
+    format_name: Annotated[Literal["cog", "geoparquet", "geotrax", "sumo", "arrows"], Parameter(name="--format")],
+    out: Path | None = None,
+) -> int:
+    """Write a finished run in a format that others read.
+
+    Parameters
+    ----------
+    run_folder
+        The run folder.
+    format_name
+        `cog`: the field's layers as GeoTIFF; `geoparquet`: tracklets as lines; `geotrax`: tracks as CSV; `sumo`: tracks
+        as FCD XML; `arrows`: modal velocities as GeoJSON.
+    out
+        File to write. Default: in the run folder's `exports/`.
+    """
+    from velfield.exporting import export_run
+    from velfield.run import open_run
+
+    print(export_run(open_run(run_folder), format_name, out))
+    return DONE
+
+
+@app.command
+def schema() -> int:
+    """Print the JSON Schema of flight.yaml, for editors."""
+    import json
+
+    from schemas.flight import FlightConfig
+
+    print(json.dumps(FlightConfig.model_json_schema(), indent=1))
+    return DONE
+
+
+def _simulate(out: Path, *, frames: int, size: str, seed: int, quiet: bool) -> None:
+    from flows.console import Console
+    from schemas.simulation import SimulationConfig
+    from velfield.synthetic import write_flight
+
+    width, times, height = size.lower().partition("x")
+    if not (times and width.isdigit() and height.isdigit()):
+        raise InputError(f"--size {size}: expected WIDTHxHEIGHT in pixels, as 1280x960")
+    console = Console("quiet" if quiet else "normal")
+    config = SimulationConfig(frames=frames, width=int(width), height=int(height), seed=seed)
+    with console.stage("simulate", "simulate", frames) as progress:
+        write_flight(out, config, lambda done, _total: progress.at_least(done))
+    console.event("stage", f"simulated     {frames} frames of {width} x {height} px in {out}")
+
+
+def _score(run_folder: Path, flight: Path) -> None:
+    from velfield.scoring import score_run
+
+    print(score_run(run_folder, flight).text())
+
+
+def _process(
+    job: "Job",
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    verbosity: "Verbosity" = "normal",
+) -> int:
+    from flows.launch import prepare_process
+
+    prepare_process(verbose=verbosity == "verbose")
+    from flows.console import Console
+    from flows.process_flight import run_flight
+    from flows.runners import RunnerConfig
+
+    console = Console(verbosity)
+    summary = run_flight(job, RunnerConfig(workers=workers, scheduler=scheduler), console)
+    return _conclude(summary, console)
+
+
+def _conclude(summary: "RunSummary", console: "Console") -> int:
+    root = Path(summary.root)
+    console.result(f"maps    {root / 'maps'}")
+    console.result(f"report  {root / 'index.html'}")
+    if summary.complete:
+        return DONE
+    for line in summary.frames_lost[:10]:
+        console.warn(line)
+    lost_units = sum(len(stage.lost) for stage in summary.stages)
+    console.warn(
+        f"done, but not complete: {len(summary.frames_lost)} frames and {lost_units} units lost; the report lists them"
+    )
+    return INCOMPLETE
+
+
+def _show_plan(job: "Job") -> int:
+    from velfield.plan import make_plan
+    from velfield.steps.planning import describe_plan
+
+    print(describe_plan(make_plan(job)))
+    return DONE
+
+
+def _every(text: str | None) -> int | str | None:
+    if text is None or text == "auto":
+        return text
+    if not text.isdigit() or int(text) < 1:
+        raise InputError(f"--every {text}: expected a whole number from 1 on, or auto")
+    return int(text)
+
+
+def _text(path: Path | None) -> str | None:
+    return None if path is None else str(path)
+
+
+def _verbosity(quiet: bool, verbose: bool, log_json: bool) -> "Verbosity":
+    if log_json:
+        return "json"
+    return "quiet" if quiet else "verbose" if verbose else "normal"
+
+
+def main() -> None:
+    """Run the command; bad input is one clear line, never a traceback."""
+    limit_threads()
+    try:
+        status = app(result_action="return_value")
+    except InputError as error:
+        print(f"velfield: {error}", file=sys.stderr)
+        status = BAD_INPUT
+    except BrokenPipeError:  # whoever read our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        status = DONE
+    except KeyboardInterrupt:
+        print("velfield: stopped; the same command resumes", file=sys.stderr)
+        status = 130
+    sys.exit(status)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,40 @@
+"""How a process of ours that uses Prefect or Dask is set up: before either is imported.
+
+A person's own settings win: every variable is a default.
+"""
+
+import os
+
+_SETTINGS: dict[str, str] = {
+    # The temporary server imports from the working folder: a module there with a common name would break it.
+    "PYTHONSAFEPATH": "1",
+    # The first flow on a cold machine took 8-20 s to get its server, whose time-out is 20 s.
+    "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "180",
+    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+    "DO_NOT_TRACK": "1",
+    # Pickle is Prefect's default; what is kept of us there is plain.
+    "PREFECT_RESULTS_DEFAULT_SERIALIZER": "json",
+    "DASK_DISTRIBUTED__LOGGING__DISTRIBUTED": "error",
+}
+_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+"""The work is parallel by frames. Small solves on BLAS threads of their own cost a frame 8 s in place of 0.4."""
+_QUIET: dict[str, str] = {
+    # Only the terminal is quiet: PREFECT_LOGGING_LEVEL would hide retries in the UI too.
+    "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "CRITICAL",
+}
+
+
+def limit_threads() -> None:
+    """Keep libraries from starting threads of their own. Call before anything imports numpy."""
+    for name in _ONE_THREAD:
+        os.environ.setdefault(name, "1")
+
+
+def prepare_process(*, verbose: bool) -> None:
+    """Set this process up to run flows. Call before anything imports prefect."""
+    for name, value in (_SETTINGS if verbose else _SETTINGS | _QUIET).items():
+        os.environ.setdefault(name, value)
+    import cv2
+
+    # The work is parallel by frames: OpenCV's own threads would only compete with it.
+    cv2.setNumThreads(1)

@@ -1,0 +1,27 @@
+"""Flow runs that were killed stay "Running" in Prefect for ever, unless somebody says otherwise."""
+
+from prefect.client.orchestration import get_client
+from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterName, FlowRunFilterState, FlowRunFilterStateType
+from prefect.client.schemas.objects import StateType
+from prefect.runtime import flow_run
+from prefect.states import Crashed
+
+
+def mark_crashed(name: str) -> int:
+    """Say of earlier runs of this name that still seem to run that they crashed; returns how many.
+
+    Call while holding the run folder's lock: then no other run on it can be alive.
+    """
+    wanted = FlowRunFilter(
+        name=FlowRunFilterName(any_=[name]),
+        state=FlowRunFilterState(type=FlowRunFilterStateType(any_=[StateType.RUNNING])),
+    )
+    own = str(flow_run.id)
+    found = 0
+    with get_client(sync_client=True) as client:
+        for run in client.read_flow_runs(flow_run_filter=wanted):
+            if str(run.id) != own:
+                state = Crashed(message="the process was killed; the next run of this folder went on from its commits")
+                client.set_flow_run_state(run.id, state, force=True)
+                found += 1
+    return found

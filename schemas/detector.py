@@ -1,0 +1,85 @@
+"""The detector file: JSON with a schema, never pickle. Numbers only: no picture that it was learnt from."""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, NonNegativeInt, PositiveFloat, model_validator
+
+from schemas.model import Model
+
+DETECTOR_VERSION = 1
+
+Coordinate = Annotated[int, Field(ge=-64, le=64)]
+
+
+class Rectangle(Model):
+    """A signed rectangle of a feature: whole working px from the centre, half-open."""
+
+    sign: Literal[-1, 1]
+    x0: Coordinate
+    y0: Coordinate
+    x1: Coordinate
+    y1: Coordinate
+
+    @model_validator(mode="after")
+    def _has_an_area(self) -> Self:
+        if self.x1 <= self.x0 or self.y1 <= self.y0:
+            raise ValueError(f"rectangle from ({self.x0}, {self.y0}) to ({self.x1}, {self.y1}) has no area")
+        return self
+
+
+class Round(Model):
+    """One round of boosting: a sum of rectangles, a threshold, and what is said below and above it."""
+
+    channel: Literal[0, 1, 2, 3]
+    """0 grey, 1 gradient along, 2 gradient across, 3 difference to the background."""
+    rectangles: tuple[Rectangle, ...] = Field(min_length=1, max_length=16)
+    threshold: float
+    below: float
+    above: float
+
+
+class PrecisionRecallCurve(Model):
+    """How precision falls as recall rises, on cars that were left out of training."""
+
+    recall: tuple[float, ...] = Field(max_length=1000)
+    precision: tuple[float, ...] = Field(max_length=1000)
+    threshold: tuple[float, ...] = Field(max_length=1000)
+    chosen: NonNegativeInt | None = None
+    evidence: str
+
+
+class Proposer(Model):
+    """Step one of the aligned method: a coarse classifier at half the resolution, dense over place and turn."""
+
+    rounds: tuple[Round, ...] = Field(min_length=1, max_length=500)
+    least_score: float
+    """Places that it likes less are not looked at again."""
+    least_first_score: float
+    """Places that the first rounds of step two like less are let go."""
+
+
+class DetectorRecord(Model):
+    """A trained detector."""
+
+    kind: Literal["velfield-detector"] = "velfield-detector"
+    version: Literal[1] = 1
+    method: Literal["aligned", "dense"]
+    working_car_length_px: PositiveFloat = Field(le=200)
+    """A car's length on the grid that it was learnt on."""
+    rounds: tuple[Round, ...] = Field(min_length=1, max_length=5000)
+    threshold: float
+    contrast_floor: PositiveFloat | None = None
+    """Aligned: sums are divided by the mean gradient about the place plus this; none: they are taken as they are."""
+    proposer: Proposer | None = None
+    """Aligned: what finds the places to look at."""
+    curve: PrecisionRecallCurve | None = None
+    cars: NonNegativeInt = 0
+    """How many marked cars it was learnt from."""
+    attribution: tuple[str, ...] = Field(default=(), max_length=50)
+    """Whose pictures it was learnt from, and under what licence."""
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Self:
+        if self.method == "aligned" and (self.contrast_floor is None or self.proposer is None):
+            raise ValueError("a detector of the aligned method needs contrast_floor and proposer")
+        return self

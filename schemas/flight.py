@@ -1,0 +1,241 @@
+"""The flight's configuration: one frozen model a stage, the paper's number beside each default.
+
+"Paper" is Rosten, Loveland, Hickman, "Automatic creation of urban velocity fields from aerial video". A stage function
+takes its own section and nothing else, so that a changed number redoes only the stages that read it.
+"""
+
+from typing import Literal
+
+from pydantic import Field, PositiveFloat, PositiveInt
+
+from schemas.model import Model
+
+Every = PositiveInt | Literal["auto"]
+Preset = Literal["best", "fast", "paper"]
+
+
+class FramesConfig(Model):
+    """Which frames of the source are worked on."""
+
+    every: Every = "auto"
+    """Take every n-th source frame; ``auto``: the frames nearest to ``target_interval_s`` apart."""
+    target_interval_s: PositiveFloat = 0.2
+    """Working interval that ``every = auto`` aims at, s. Paper: about 5 frames a second."""
+    start_s: float | None = None
+    """Leave out what comes before this time, s from the first frame."""
+    stop_s: float | None = None
+    """Leave out what comes at or after this time, s from the first frame."""
+    fps: PositiveFloat | None = None
+    """Frame rate of a picture folder that has no times of its own; never used where the source has times."""
+    max_pixels: PositiveInt = 400_000_000
+    """A picture larger than this is refused before memory is taken."""
+
+
+class LensConfig(Model):
+    """Radial distortion from the plumb-line constraint (paper: camera calibration)."""
+
+    calibrate: Literal["auto", "always", "never"] = "auto"
+    """``auto``: calibrate, and keep the pin-hole where the evidence for a distortion is too small."""
+    frames: PositiveInt = 12
+    """How many frames, spread over the flight, give edge points."""
+    max_edge_points: PositiveInt = 40_000
+    """Edge points used, all frames together."""
+    angle_bins: PositiveInt = 720
+    """Bins of the one-dimensional histogram of line angle whose entropy is least for straight lines."""
+    max_distortion: PositiveFloat = 0.6
+    """Largest |a| of Harris' model r_d = r / sqrt(1 + a r^2) that the grid of starts covers; r in half-diagonals."""
+
+
+class BaseConfig(Model):
+    """Base image: inter-sensor registration to a given picture, or built from the flight itself."""
+
+    coarse_scale: PositiveFloat = Field(0.25, le=1)
+    """SIFT for the coarse homography runs on pictures reduced to this scale. Paper: quarter size."""
+    grid_spacing_px: PositiveInt = 50
+    """Spacing of the points matched by normalised cross-correlation. Paper: 50."""
+    patch_size_px: PositiveInt = 75
+    """Side of the correlated patches. Paper: 75 x 75."""
+    search_radius_px: PositiveInt = 40
+    """How far from the coarse prediction a patch is searched."""
+    drop_fraction: PositiveFloat = Field(0.05, lt=1)
+    """Share of worst points dropped a round of case deletion. Paper: 5 %."""
+    max_mean_error_px: PositiveFloat = 2.0
+    """Case deletion ends when the mean error is below this. Paper: 2 px; outliers are not gone by then, see
+    findings."""
+    min_control_points: PositiveInt = 40
+    """Fewer surviving control points than this: the picture is not of this place."""
+    median_frames: PositiveInt = 64
+    """Frames, spread over the flight, whose median is the base image where none is given, and the background."""
+
+
+class RegistrationConfig(Model):
+    """Every frame to the base image and to the previous registered frame together (paper: intra-sensor
+    registration)."""
+
+    model: Literal["row_spline", "polyprojective", "homography"] = "row_spline"
+    """``row_spline``: second-order polyprojective plus a spline in the row, fitted jointly and robustly (rolling
+    shutter);
+    ``polyprojective``: the paper's, by case deletion; ``homography``: eight parameters."""
+    row_spline_knots: PositiveInt = Field(48, ge=4)
+    """Knots of the row spline; it follows motion of up to about a third as many cycles a frame. How stiff it is, each
+    frame's held-out control points decide, so that more knots than needed do no harm."""
+    key_points: PositiveInt = 4000
+    """Key points kept a frame, spread by cells."""
+    key_point_scale: PositiveFloat = Field(0.5, le=1)
+    """Key points are found on frames reduced to this scale, then refined below the pixel at full size."""
+    window_px: PositiveInt = 50
+    """A match is searched within a square of this side around the prediction. Paper: 50 x 50."""
+    drop_fraction: PositiveFloat = Field(0.05, lt=1)
+    """Share of worst control points dropped a round of case deletion. Paper: 5 %."""
+    max_mean_error_px: PositiveFloat = 0.8
+    """Case deletion ends when the mean error is below this. Paper: 2 px, at which 10 % wrong matches survive."""
+    cell_size_px: PositiveInt = 200
+    """Cell of the displacement mesh. Paper: 200 x 200."""
+    mesh: bool = True
+    """Whether the residual displacement of each cell is measured and interpolated."""
+    min_control_points: PositiveInt = 40
+    """Fewer surviving control points than this: the frame is not registered."""
+    max_residual_px: PositiveFloat = 3.0
+    """A held-out RMS above this: the frame is not registered."""
+    segment_frames: PositiveInt = 64
+    """Frames chained to their predecessors before the chain is seeded anew from the base image."""
+
+
+class DetectionConfig(Model):
+    """Cars by boosted sums of random rectangles (paper: car detection)."""
+
+    method: Literal["aligned", "dense"] = "aligned"
+    """``aligned``: candidates, then a boosted classifier on cars turned to the horizontal; ``dense``: the paper's
+    response."""
+    rounds: PositiveInt = 800
+    """Rounds of AdaBoost. Paper: 200."""
+    feature_pool: PositiveInt = 3000
+    """Random features a round chooses from."""
+    max_rectangles: PositiveInt = 5
+    """1 to this many positive, and as many negative, rectangles a feature. Paper: 5."""
+    corner_sigma_px: PositiveFloat = 10.0
+    """Standard deviation of the rectangles' corners, working px. Paper: 10."""
+    car_radius_px: PositiveFloat = 6.0
+    """Pixels nearer than this to a car's centre are car (dense). Paper: 6."""
+    background_radius_px: PositiveFloat = 20.0
+    """Pixels farther than this from every car are not (dense). Paper: 20."""
+    car_fraction: PositiveFloat = Field(0.15, lt=1)
+    """Share of cars among the training samples. Paper: 15 %."""
+    response_sigma_px: PositiveFloat = 3.0
+    """Blur of the response before maxima are taken. Paper: 3."""
+    min_region_px: PositiveInt = 10
+    """Regions smaller than this are dropped. Paper: 10."""
+    threshold: float | None = None
+    """Threshold T on the response; none: chosen from the training evidence and stored with the detector."""
+    working_car_length_px: PositiveFloat = 16.0
+    """Frames are scaled so that a car is about this long: 8 x 16 px at the paper's 0.23 m a pixel."""
+    car_length_m: PositiveFloat = 4.0
+    """A usual car's length, which with the ground sample distance sets the working scale."""
+    motion_channel: Literal["auto", "always", "never"] = "auto"
+    """Whether |frame - background| is a channel of the classifier; ``auto``: where the evidence is that roofs stand
+    still."""
+    seed: int = Field(0, ge=0)
+    """Seed of everything random in training."""
+
+
+class TrackingConfig(Model):
+    """Tracklets over three frames (paper: tracking). Limits are physical; jitter widens them by ``jitter_sigmas``."""
+
+    max_speed_m_per_s: PositiveFloat = 34.5
+    """Paper: 30 px a frame, that is 78 mph."""
+    max_turn_rad: PositiveFloat = 0.5235987755982988
+    """Paper: 30 degrees between the two segments."""
+    max_axis_offset_rad: PositiveFloat = 0.5235987755982988
+    """Paper: motion within 30 degrees of the car's axis."""
+    slow_m_per_s: PositiveFloat = 1.15
+    """Below this speed direction means nothing and is not tested. Paper: 5 px/s."""
+    max_acceleration_m_per_s2: PositiveFloat = 23.0
+    """Paper: 4 px/frame^2, that is 100 px/s^2 at 5 Hz."""
+    jitter_sigmas: PositiveFloat = 3.0
+    """Gates are widened by this many standard deviations of a detection's place."""
+    jitter_px: PositiveFloat = 1.0
+    """Standard deviation of a detection's place apart from the registration's residual, base px."""
+    max_interval_s: PositiveFloat = 0.45
+    """Consecutive frames of a window are no farther apart than this."""
+    patch_width_px: PositiveInt = 8
+    """Oriented patch across the car, working px. Paper: 8 x 16."""
+    patch_length_px: PositiveInt = 16
+    """Oriented patch along the car, working px. Paper: 8 x 16."""
+    linking: Literal["joint", "links"] = "joint"
+    """``joint``: the two links of a window are chosen together, by looks and motion; ``links``: the paper's, each link
+    the mutual best by SAD, then the gates."""
+    min_confidence: float = Field(0.8, ge=0, lt=1)
+    """A tracklet less sure than this, against its rivals and chance, is dropped (``joint``)."""
+    refine: bool = True
+    """Align the patches of a link below the pixel, and let the tracklet carry that displacement."""
+
+
+class FieldConfig(Model):
+    """The velocity histogram at every pixel (paper: velocity model)."""
+
+    bin_width_m_per_s: PositiveFloat = 2.0
+    """Width of a velocity bin; the peak is refined below it."""
+    kernel_sigma_m_per_s: PositiveFloat = 0.7
+    """Gaussian blob that a segment adds (the paper gives no width); best by held-out likelihood on real tracks."""
+    velocity_span_s: float = Field(0.6, ge=0)
+    """A segment's velocity is averaged along its passage over this time; 0, preset ``paper``: each by itself."""
+    max_speed_m_per_s: PositiveFloat = 36.0
+    """The histogram covers velocity components of up to this, either way."""
+    lane_width_m: PositiveFloat = 3.5
+    """A segment counts half of this wide across its path; preset ``paper``: one pixel."""
+    one_pixel_wide: bool = False
+    """The paper's one-pixel lines in place of half a lane."""
+    weigh_shared_segments: Literal["once", "twice"] = "once"
+    """A segment that two tracklets share. Paper: twice."""
+    tile_size_px: PositiveInt = 64
+    """Side of a stored tile, base px."""
+    standing_m_per_s: PositiveFloat = 1.15
+    """No direction is drawn where the modal speed is below this."""
+
+
+class WorkConfig(Model):
+    """How the work is cut. Never depends on the number of workers."""
+
+    block_frames: PositiveInt = 8
+    """Frames a Dask block; one-frame blocks cost 10 ms each."""
+    unit_frames: PositiveInt | Literal["auto"] = "auto"
+    """Frames a unit, that is a Prefect task run and a commit record; ``auto``: 16 up to 256 frames, 64 up to
+    4096, then 256."""
+    retries: int = Field(2, ge=0)
+    """How often a unit that failed is tried again."""
+
+
+class FlightConfig(Model):
+    """All that a run can be told, apart from its inputs. ``gsd_m`` and ``preset`` concern several stages."""
+
+    preset: Preset = "best"
+    """Which set of defaults this configuration started from."""
+    gsd_m: PositiveFloat | None = None
+    """Ground sample distance of the base image, m a pixel; none: from the base image's CRS, or all stays in px/s."""
+    frames: FramesConfig = FramesConfig()
+    lens: LensConfig = LensConfig()
+    base: BaseConfig = BaseConfig()
+    registration: RegistrationConfig = RegistrationConfig()
+    detection: DetectionConfig = DetectionConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    field: FieldConfig = FieldConfig()
+    work: WorkConfig = WorkConfig()
+
+
+PAPER_GSD_M = 0.23
+"""The paper's ground sample distance. Where none is known, limits in metres become the paper's in pixels by it."""
+
+PRESETS: dict[Preset, dict[str, dict[str, object]]] = {
+    "best": {},
+    "fast": {
+        "registration": {"key_points": 1500, "key_point_scale": 0.25},
+        "detection": {"rounds": 300, "feature_pool": 1500},
+    },
+    "paper": {
+        "registration": {"model": "polyprojective", "max_mean_error_px": 2.0, "key_point_scale": 1.0},
+        "detection": {"method": "dense", "rounds": 200, "feature_pool": 1000, "motion_channel": "never"},
+        "tracking": {"refine": False, "linking": "links", "min_confidence": 0.0},
+        "field": {"one_pixel_wide": True, "weigh_shared_segments": "twice", "velocity_span_s": 0.0},
+    },
+}
+"""What each preset changes of the defaults."""

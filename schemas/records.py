@@ -1,0 +1,109 @@
+"""Records that a run leaves: a commit a finished unit, the resolved flight, the grid of the base image."""
+
+from typing import Literal
+
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
+
+from schemas.flight import FlightConfig
+from schemas.model import Model
+
+FORMAT_VERSION = 1
+"""Version of the run folder's layout; a folder of another version is refused."""
+
+
+class CommitRecord(Model):
+    """A finished unit of work: written last of all, so that what it names is whole."""
+
+    stage: str
+    unit: str
+    key: str
+    """Content key: digests of the inputs, the parameters that the stage reads, the version of the stage's code."""
+    outputs: dict[str, str] = Field(default_factory=dict)
+    """Path in the run folder -> BLAKE2b digest of the file, or of the store's chunks that the unit wrote."""
+    counts: dict[str, float] = Field(default_factory=dict)
+    """What people ask of the unit: frames, cars, tracklets, pixels."""
+    notes: tuple[str, ...] = ()
+    """Warnings of the unit, one line each."""
+    seconds: float = Field(0.0, ge=0)
+    code_version: str
+
+
+class SourceRecord(Model):
+    """Where the frames came from."""
+
+    path: str
+    kind: str
+    digest: str
+    width: PositiveInt
+    height: PositiveInt
+    frame_count: NonNegativeInt
+
+
+class InputsRecord(Model):
+    """Digests of what the user gave; ``None`` where nothing was given."""
+
+    source: SourceRecord
+    base: str | None = None
+    labels: str | None = None
+    detector: str | None = None
+    detections: str | None = None
+    timestamps: str | None = None
+
+
+class FlightRecord(Model):
+    """``flight.json``: the resolved configuration, the inputs' digests, the version of the code."""
+
+    format_version: PositiveInt = FORMAT_VERSION
+    code_version: str
+    config: FlightConfig
+    inputs: InputsRecord
+
+
+class GridRecord(Model):
+    """``base/grid.json``: the grid of base pixels and how it came about."""
+
+    width_px: PositiveInt
+    height_px: PositiveInt
+    origin_x_px: float = 0.0
+    """Column of the reference frame's undistorted grid that base pixel (0, 0) has; 0 where a base image was given."""
+    origin_y_px: float = 0.0
+    gsd_m: PositiveFloat | None = None
+    """Metres a base pixel; none: not known, all stays in px/s."""
+    crs_wkt: str | None = None
+    affine: tuple[float, float, float, float, float, float] | None = None
+    """Base pixel (column, row) -> CRS coordinates, GDAL's corner convention, as rasterio's ``Affine``."""
+    how: str
+    """``own``: built from the flight; ``given``: the picture given as ``--base``."""
+    frames_to: Literal["own", "given"] = "own"
+    """What frames are registered to: the flight's own base image, or straight to the given picture where it serves."""
+    reference_frame: NonNegativeInt
+    intersensor_error_px: float | None = None
+    """Mean error at left-out points of the registration to the given picture."""
+    intersensor_points: NonNegativeInt | None = None
+
+
+class PolyprojectiveRecord(Model):
+    """A second-order polyprojective transform: three rows of six coefficients on normalised coordinates."""
+
+    coefficients: tuple[tuple[float, float, float, float, float, float], ...] = Field(min_length=3, max_length=3)
+    source: tuple[float, float, float]
+    """Normalisation of what goes in: centre x, y, and scale."""
+    target: tuple[float, float, float]
+    """Normalisation of what comes out."""
+
+
+class WorkingRecord(Model):
+    """``base/working.json``: the grid that cars are looked for on, and what the detector was learnt from."""
+
+    scale: PositiveFloat
+    """Working pixels a base pixel: a car is about ``working_car_length_px`` long on that grid."""
+    learnt_from: str
+    """``labels``, ``motion``, ``file`` (a detector file), ``shipped`` or ``detections`` (another detector's boxes)."""
+    has_background: bool = False
+    """Whether ``base/background.npz`` holds the flight's background on the working grid."""
+    labels: NonNegativeInt = 0
+    """Cars the detector was learnt from."""
+    purity: float | None = None
+    """Estimated share of labels from motion that are cars."""
+    coherence: float | None = None
+    """Share of what moves that goes along its length: about 1 for cars, less where roofs shift (parallax)."""

@@ -1,0 +1,35 @@
+"""What a run says of itself at the end: a line a stage, warnings, what was lost."""
+
+from pydantic import Field
+
+from schemas.model import Model
+
+
+class StageSummary(Model):
+    """One stage, all its units together."""
+
+    name: str
+    units: int
+    done_before: int
+    """Units that an earlier run had finished."""
+    lost: tuple[str, ...] = ()
+    """Units that failed in every try: done again by the next run."""
+    counts: dict[str, float] = Field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    seconds: float
+    text: str
+    """The stage in one line, for people."""
+
+
+class RunSummary(Model):
+    """One run."""
+
+    root: str
+    stages: tuple[StageSummary, ...]
+    frames_lost: tuple[str, ...] = ()
+    """Frames that are in no tracklet though the source has them, and why: ``frame 12 (2.412 s): failed:...``."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing was lost."""
+        return not self.frames_lost and not any(stage.lost for stage in self.stages)

@@ -1,0 +1,51 @@
+"""Columns of the tables in a run folder: names end in their unit, pixels are base pixels unless the name says raw."""
+
+DETECTION_COLUMNS: dict[str, str] = {
+    "detection_id": "int64",  # frame * 2**20 + index in the frame: unique, and the same however the flight is cut
+    "frame": "int32",  # index in frames.zarr
+    "time_s": "float64",
+    "x_px": "float64",
+    "y_px": "float64",
+    "orientation_rad": "float32",  # axial, [0, pi), from +x towards +y (down)
+    "orientation_sd_rad": "float32",
+    "area_px": "float32",
+    "score": "float32",
+}
+
+TRACKLET_COLUMNS: dict[str, str] = {
+    "tracklet_id": "int64",  # the detection_id of its middle detection: a detection is in the middle of at most one
+    "passage_id": "int64",  # the smallest detection_id of the chain: one vehicle going by
+    "frame_0": "int32",
+    "frame_1": "int32",
+    "frame_2": "int32",
+    "detection_id_0": "int64",
+    "detection_id_1": "int64",
+    "detection_id_2": "int64",
+    "time_0_s": "float64",
+    "time_1_s": "float64",
+    "time_2_s": "float64",
+    "x_0_px": "float64",
+    "y_0_px": "float64",
+    "x_1_px": "float64",
+    "y_1_px": "float64",
+    "x_2_px": "float64",
+    "y_2_px": "float64",
+    "vx_01_px_per_s": "float64",  # from the refined displacement where there is one
+    "vy_01_px_per_s": "float64",
+    "vx_12_px_per_s": "float64",
+    "vy_12_px_per_s": "float64",
+    "displacement_sd_01_px": "float32",
+    "displacement_sd_12_px": "float32",
+    "sad_01": "float32",  # mean absolute difference of the two oriented patches, grey levels
+    "sad_12": "float32",
+    "confidence": "float32",  # [0, 1]
+}
+
+LABEL_COLUMNS: dict[str, str] = {
+    "frame": "str",  # a picture's file name, or a video's 0-based frame index, as text
+    "x_px": "float64",  # raw pixels
+    "y_px": "float64",
+    "orientation_rad": "float64",  # NaN where the label does not tell
+    "length_px": "float64",  # NaN where the label does not tell
+    "width_px": "float64",
+}

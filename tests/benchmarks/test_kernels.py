@@ -1,0 +1,70 @@
+"""Speed of the kernels beside a plain peer in the same run: read the ratio, not the time. `make bench` runs them."""
+
+import numpy as np
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+from schemas.flight import FieldConfig
+from velfield.detection.boosting import random_pool
+from velfield.detection.detector import BoostedSums
+from velfield.detection.response import MARGIN_PX, dense_response
+from velfield.field.accumulate import accumulate_tile
+from velfield.field.bins import VelocityBins
+from velfield.field.segments import SEGMENT_DTYPE
+
+
+@pytest.fixture
+def picture() -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (240, 320), dtype=np.uint8)
+
+
+@pytest.fixture
+def sums() -> BoostedSums:
+    rng = np.random.default_rng(1)
+    pool = random_pool(20, channels=1, sigma_xy_px=(10.0, 10.0), reach_xy_px=(40, 40), max_rectangles=5, rng=rng)
+    leaves = rng.normal(0, 1, (20, 2)).astype(np.float32)
+    return BoostedSums(pool.table, pool.starts, pool.channels, np.zeros(20, np.float32), leaves)
+
+
+def plain_response(image: np.ndarray, sums: BoostedSums) -> np.ndarray:
+    """The dense response by numpy slices, a rectangle at a time."""
+    padded = np.pad(image, MARGIN_PX, mode="reflect").astype(np.int32)
+    integral = np.pad(padded, ((1, 0), (1, 0))).cumsum(0).cumsum(1)
+    height, width = image.shape
+    out = np.zeros(image.shape, np.float32)
+
+    def corner(y: int, x: int) -> np.ndarray:
+        return integral[MARGIN_PX + y : MARGIN_PX + y + height, MARGIN_PX + x : MARGIN_PX + x + width]
+
+    for f in range(len(sums)):
+        total = np.zeros(image.shape, np.int64)
+        for sign, x0, y0, x1, y1 in sums.rectangles[sums.starts[f] : sums.starts[f + 1]]:
+            total += sign * (corner(y1, x1) - corner(y0, x1) - corner(y1, x0) + corner(y0, x0))
+        out += np.where(total > sums.thresholds[f], sums.leaves[f, 1], sums.leaves[f, 0])
+    return out
+
+
+def test_the_fast_response_is_the_plain_one(picture: np.ndarray, sums: BoostedSums) -> None:
+    np.testing.assert_allclose(dense_response(picture, sums), plain_response(picture, sums), atol=1e-4)
+
+
+@pytest.mark.parametrize("how", ["numba", "numpy"])
+def test_dense_response(benchmark: BenchmarkFixture, picture: np.ndarray, sums: BoostedSums, how: str) -> None:
+    benchmark.group = "dense response, 20 rounds, 320 x 240"
+    out = benchmark(dense_response if how == "numba" else plain_response, picture, sums)
+    assert out.shape == picture.shape
+
+
+def test_tile_of_the_field(benchmark: BenchmarkFixture) -> None:
+    benchmark.group = "tile of 64 x 64 from 2,000 segments"
+    rng = np.random.default_rng(2)
+    segments = np.zeros(2000, SEGMENT_DTYPE)
+    segments["passage"] = np.arange(2000)
+    segments["duration_s"] = 0.2
+    for name in ("x0_px", "y0_px", "x1_px", "y1_px"):
+        segments[name] = rng.uniform(0, 64, 2000)
+    segments["vx_px_per_s"] = (segments["x1_px"] - segments["x0_px"]) / 0.2
+    segments["vy_px_per_s"] = (segments["y1_px"] - segments["y0_px"]) / 0.2
+    bins = VelocityBins.from_config(FieldConfig(), 0.23)
+    tile = benchmark(lambda: accumulate_tile(segments, origin_xy=(0, 0), shape=(64, 64), bins=bins, radius_px=3.8))
+    assert tile.count.sum() > 0

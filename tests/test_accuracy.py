@@ -1,0 +1,42 @@
+"""A flight long enough for five vehicles a pixel, held to the figures that the long one reached."""
+
+from pathlib import Path
+
+import pytest
+
+from flows.console import Console
+from flows.launch import prepare_process
+from flows.runners import RunnerConfig
+from schemas.job import Inputs, Job
+from schemas.simulation import SimulationConfig
+from velfield.configuration import resolve_config
+from velfield.synthetic import write_flight
+
+FRAMES = 80
+
+
+@pytest.mark.slow
+def test_a_flight_with_base_image_and_labels_is_near_the_truth(tmp_path: Path) -> None:
+    prepare_process(verbose=False)
+    from prefect.testing.utilities import prefect_test_harness
+
+    from flows.process_flight import run_flight
+    from velfield.scoring import score_run
+
+    flight = tmp_path / "flight"
+    write_flight(flight, SimulationConfig(frames=FRAMES, width=640, height=480, seed=31))
+    inputs = Inputs(
+        source=str(flight / "frames"),
+        timestamps=str(flight / "timestamps.csv"),
+        base=str(flight / "base.png"),
+        labels=str(flight / "labels.csv"),
+    )
+    settings = ["detection.rounds=120", "detection.feature_pool=800", "registration.key_points=1500"]
+    config = resolve_config(settings=settings, overrides={"gsd_m": 0.23})
+    with prefect_test_harness(server_startup_timeout=180):
+        run_flight(Job(root=str(tmp_path / "run"), inputs=inputs, config=config), RunnerConfig(), Console("quiet"))
+    score = score_run(tmp_path / "run", flight)
+    assert score.registration.mean_px <= 1
+    assert score.tracking.precision >= 0.95
+    assert score.field.pixels >= 1000
+    assert score.field.share_within >= 0.95

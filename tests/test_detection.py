@@ -1,0 +1,173 @@
+"""Cars found: on a simulated city that was not trained on, and the rules of the detector file."""
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from schemas.flight import DetectionConfig
+from velfield.detection.axis import axial_difference, structure_axis
+from velfield.detection.detect import FrameDetections, detect_frame
+from velfield.detection.detector import Detector, load_detector, save_detector
+from velfield.detection.patches import oriented_patches, upright_chips
+from velfield.detection.segmentation import moments, segment_response
+from velfield.detection.train import LabelledImage, train_detector
+from velfield.errors import InputError
+from velfield.steps.labelled import scaled
+from velfield.synthetic import Flight, small_flight
+
+SCALE = 0.92  # 16 px a car at 0.23 m a pixel
+SMALL = DetectionConfig(rounds=120, feature_pool=800)
+MATCH_PX = 8.0
+
+
+@cache
+def flight(seed: int) -> Flight:
+    return small_flight(frames=3, width=640, height=480, seed=seed)
+
+
+def sample(of: Flight, frame: int) -> LabelledImage:
+    labels = of.labels(frame)[["x_px", "y_px", "orientation_rad", "length_px", "width_px"]].to_numpy(copy=True)
+    labels[:, :2] = (labels[:, :2] + 0.5) * SCALE - 0.5
+    labels[:, 3:] *= SCALE
+    return LabelledImage(image=scaled(of.frame(frame), SCALE), cars=labels)
+
+
+@cache
+def detector(method: str) -> Detector:
+    return train_detector([sample(flight(5), 0)], SMALL.model_copy(update={"method": method}))
+
+
+def found_in(of: Flight, frame: int, method: str) -> tuple[FrameDetections, LabelledImage]:
+    truth = sample(of, frame)
+    return detect_frame(truth.image, None, detector(method), SMALL), truth
+
+
+def matches(found: FrameDetections, truth: LabelledImage) -> list[tuple[int, int]]:
+    """Pairs (find, car), the best finds first, each car once."""
+    pairs, taken = [], set()
+    for k in np.argsort(-found.score):
+        gap = np.hypot(*(truth.cars[:, :2] - found.xy[k]).T)
+        gap[list(taken)] = np.inf
+        if gap.min(initial=np.inf) < MATCH_PX:
+            taken.add(int(gap.argmin()))
+            pairs.append((int(k), int(gap.argmin())))
+    return pairs
+
+
+def test_cars_of_a_city_that_was_not_trained_on() -> None:
+    found, truth = found_in(flight(6), 1, "aligned")
+    pairs = matches(found, truth)
+    assert len(pairs) / len(found.xy) > 0.85
+    assert len(pairs) / len(truth.cars) > 0.7
+
+
+def test_the_axis_of_what_is_found() -> None:
+    found, truth = found_in(flight(6), 1, "aligned")
+    k, car = np.array(matches(found, truth)).T
+    off = np.degrees(axial_difference(np.asarray(found.orientation_rad[k], np.float64), truth.cars[car, 2]))
+    assert np.median(off) < 5
+    assert np.mean(off < 30) > 0.93
+    assert np.all((found.orientation_rad >= 0) & (found.orientation_rad < np.pi))
+
+
+def test_pictures_go_with_each_find() -> None:
+    found, _ = found_in(flight(6), 1, "aligned")
+    n = len(found.xy)
+    assert found.patches.shape == (n, 16, 8)
+    assert found.chips.shape == (n, 32, 32)
+    assert found.patches.dtype == found.chips.dtype == np.uint8
+
+
+def test_training_twice_is_one_detector() -> None:
+    again = train_detector([sample(flight(5), 0)], SMALL)
+    assert again.record == detector("aligned").record
+
+
+def test_the_papers_recipe_finds_cars_where_it_was_trained() -> None:
+    found, truth = found_in(flight(5), 0, "dense")
+    assert len(matches(found, truth)) / len(truth.cars) > 0.4
+
+
+def test_a_higher_threshold_finds_fewer() -> None:
+    truth = sample(flight(6), 1)
+    strict = SMALL.model_copy(update={"threshold": detector("aligned").threshold + 0.3})
+    fewer = detect_frame(truth.image, None, detector("aligned"), strict)
+    assert len(fewer.xy) < len(found_in(flight(6), 1, "aligned")[0].xy)
+
+
+def test_nothing_is_found_where_the_frame_does_not_reach() -> None:
+    truth = sample(flight(6), 1)
+    valid = np.zeros(truth.image.shape, bool)
+    valid[:, : truth.image.shape[1] // 2] = True
+    found = detect_frame(truth.image, valid, detector("aligned"), SMALL)
+    assert len(found.xy) > 0
+    assert found.xy[:, 0].max() < truth.image.shape[1] // 2 + 4
+
+
+def test_too_few_cars_to_learn_from() -> None:
+    truth = sample(flight(5), 0)
+    with pytest.raises(InputError, match="cars to learn from"):
+        train_detector([LabelledImage(image=truth.image, cars=truth.cars[:3])], SMALL)
+
+
+def test_a_detector_comes_back_from_its_file(tmp_path: Path) -> None:
+    save_detector(detector("aligned"), tmp_path / "d.json")
+    assert load_detector(tmp_path / "d.json").record == detector("aligned").record
+
+
+@pytest.mark.parametrize("damage", ["not json", "another file", "no rounds", "a rectangle without area"])
+def test_a_detector_file_that_is_not_ours_is_one_clear_line(tmp_path: Path, damage: str) -> None:
+    record = json.loads(detector("aligned").record.model_dump_json())
+    if damage == "no rounds":
+        record["rounds"] = []
+    if damage == "a rectangle without area":
+        rectangle = record["rounds"][0]["rectangles"][0]
+        rectangle["x1"] = rectangle["x0"]
+    text = {"not json": "{", "another file": '{"kind": "other"}'}.get(damage, json.dumps(record))
+    (tmp_path / "d.json").write_text(text)
+    with pytest.raises(InputError) as caught:
+        load_detector(tmp_path / "d.json")
+    assert "expected a detector file" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def bar(angle: float, side: int = 64) -> np.ndarray:
+    """A bright bar through the middle, blurred at its edges."""
+    y, x = np.mgrid[:side, :side] - (side - 1) / 2
+    u, v = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+    inside = 1 / (1 + np.exp(2 * (np.abs(u) - 8))) / (1 + np.exp(2 * (np.abs(v) - 4)))
+    return (60 + 150 * inside).astype(np.uint8)
+
+
+@pytest.mark.parametrize("angle", np.linspace(0, np.pi, 7, endpoint=False))
+def test_the_structure_tensor_gives_the_axis_of_a_bar(angle: float) -> None:
+    axis, _ = structure_axis(bar(angle))
+    assert axial_difference(np.array([float(axis[32, 32])]), np.array([angle]))[0] < np.radians(6)
+
+
+@pytest.mark.parametrize("angle", [0.3, 1.2, 2.5])
+def test_oriented_patches_turn_every_bar_alike(angle: float) -> None:
+    upright = oriented_patches(bar(0.0), np.array([[31.5, 31.5]]), np.array([0.0]))[0].astype(int)
+    turned = oriented_patches(bar(angle), np.array([[31.5, 31.5]]), np.array([angle]))[0].astype(int)
+    assert np.abs(upright - turned).mean() < 4
+
+
+def test_chips_are_cut_about_the_rounded_place() -> None:
+    image = np.arange(64 * 64, dtype=np.uint32).reshape(64, 64).astype(np.uint8)
+    chip = upright_chips(image, np.array([[30.4, 20.6]]))[0]
+    assert chip[16, 16] == image[21, 30]
+
+
+def test_regions_grow_from_maxima_and_have_the_axis_of_their_covariance() -> None:
+    response = np.full((80, 120), -1.0, np.float32)
+    response[20:28, 10:40] = 2.0
+    response[50:74, 80:88] = 2.0
+    response[5:7, 100:102] = 2.0
+    smooth, labels = segment_response(response, sigma_px=1.0, threshold=0.0, min_region_px=10)
+    found = moments(labels, smooth)
+    assert len(found) == 2
+    np.testing.assert_allclose(found[:, :2], [[24.5, 23.5], [83.5, 61.5]], atol=0.5)
+    assert axial_difference(found[:, 2], np.array([0.0, np.pi / 2])).max() < 0.05

@@ -1,0 +1,273 @@
+"""The field: what a pixel weighs, that cutting changes nothing, and that the plain version agrees."""
+
+from math import erf, hypot, sqrt
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from schemas.flight import FieldConfig
+from schemas.tables import TRACKLET_COLUMNS
+from velfield.errors import InputError
+from velfield.field.accumulate import REACH_SIGMAS, UNIT, FieldTile, accumulate_tile
+from velfield.field.algebra import merge_tiles, subtract_tile
+from velfield.field.bins import VelocityBins, band_radius_px, standing_px_per_s
+from velfield.field.segments import SEGMENT_DTYPE, Segments, segment_table, segments_by_tile, touched_tiles
+
+BINS = VelocityBins(width_px_per_s=10.0, reach=6, kernel_sigma_px_per_s=3.5)
+
+
+def passages(seed: int, n: int = 6, size: float = 40.0) -> Segments:
+    """Vehicles that turn, slow down and stand, of a few segments each."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for passage in range(n):
+        place, heading = rng.uniform(0, size, 2), rng.uniform(-np.pi, np.pi)
+        for k in range(int(rng.integers(1, 6))):
+            speed = rng.choice([0.0, 3.0, 30.0, 55.0])
+            heading += rng.normal(0, 0.2)
+            velocity = speed * np.array([np.cos(heading), np.sin(heading)])
+            duration = rng.uniform(0.1, 0.4)
+            there = place + velocity * duration
+            rows.append(
+                (passage, k * 1.0, duration, *place, *there, *velocity, passage * 100 + k, passage * 100 + k + 1)
+            )
+            place = there
+    return np.array(rows, SEGMENT_DTYPE)
+
+
+def tile_of(segments: Segments, radius_px: float | None = 2.0, weight: str = "passage", size: int = 40) -> FieldTile:
+    return accumulate_tile(
+        segments, origin_xy=(0, 0), shape=(size, size), bins=BINS, radius_px=radius_px, weight=weight
+    )
+
+
+def plain_tile(segments: Segments, radius: float, weight: str, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """The same, read from the definition: float64, every pixel against every segment."""
+    histogram, count = np.zeros((size, size, BINS.n, BINS.n)), np.zeros((size, size), int)
+    for passage in np.unique(segments["passage"]):
+        mine = segments[segments["passage"] == passage]
+        for y in range(size):
+            for x in range(size):
+                dwell = np.array([_dwell(s, x, y, radius) for s in mine])
+                if not dwell.any():
+                    continue
+                count[y, x] += 1
+                share = {"passage": dwell / dwell.sum(), "segment": 1.0 * (dwell > 0), "time": dwell}[weight]
+                for segment, part in zip(mine, share, strict=True):
+                    histogram[y, x] += part * _blob(segment["vx_px_per_s"], segment["vy_px_per_s"])
+    return histogram, count
+
+
+def _dwell(segment: np.void, x: int, y: int, radius: float) -> float:
+    """Seconds within the radius of a pixel."""
+    a = np.array([segment["x0_px"] - x, segment["y0_px"] - y])
+    d = np.array([segment["x1_px"] - segment["x0_px"], segment["y1_px"] - segment["y0_px"]])
+    if hypot(*a) > hypot(*d) + radius:
+        return 0.0
+    if hypot(*d) < 1e-9:
+        return float(segment["duration_s"]) if a @ a < radius**2 else 0.0
+    roots = np.roots([d @ d, 2 * a @ d, a @ a - radius**2])
+    if abs(roots.imag).max() > 0:
+        return 0.0
+    low, high = np.clip(np.sort(roots.real), 0, 1)
+    return float((high - low) * segment["duration_s"])
+
+
+def _blob(vx: float, vy: float) -> np.ndarray:
+    def shares(v: float) -> np.ndarray:
+        sigma, position = BINS.kernel_sigma_px_per_s / BINS.width_px_per_s, v / BINS.width_px_per_s + BINS.reach
+        position = min(max(position, 0), BINS.n - 1)
+        edges = np.arange(BINS.n + 1) - 0.5
+        below = np.array([0.5 * (1 + erf((e - position) / sigma / sqrt(2))) for e in edges])
+        reach = REACH_SIGMAS * sigma
+        first = max(int(np.floor(position - reach + 0.5)), 0)
+        last = min(int(np.floor(position + reach + 0.5)), BINS.n - 1)
+        below[: first + 1], below[last + 1 :] = 0, 1
+        return np.diff(below)
+
+    return np.outer(shares(vy), shares(vx))
+
+
+@pytest.mark.parametrize("weight", ["passage", "segment", "time"])
+def test_kernel_agrees_with_the_definition(weight: str) -> None:
+    segments = passages(seed=3, n=9, size=20.0)
+    fast = tile_of(segments, weight=weight, size=20)
+    plain, count = plain_tile(segments, radius=2.0, weight=weight, size=20)
+    assert (count > 1).any()
+    np.testing.assert_array_equal(fast.count, count)
+    np.testing.assert_allclose(fast.histogram / UNIT, plain, atol=2e-3)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_a_passage_weighs_one_at_each_pixel(seed: int) -> None:
+    """Slow or fast, of one segment or of many, at a joint or between: ``histogram.sum((2, 3)) == count * UNIT``."""
+    tile = tile_of(passages(seed))
+    assert (tile.histogram >= 0).all()
+    np.testing.assert_array_equal(tile.histogram.sum(axis=(2, 3)), tile.count * UNIT)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000), radius=st.sampled_from([None, 0.75, 2.0]))
+def test_order_of_passages_and_cutting_into_tiles_change_no_bit(seed: int, radius: float | None) -> None:
+    segments = passages(seed)
+    whole = tile_of(segments, radius)
+    shuffled = np.concatenate([segments[segments["passage"] == p] for p in np.random.default_rng(seed).permutation(6)])
+    np.testing.assert_array_equal(tile_of(shuffled, radius).histogram, whole.histogram)
+    rows = segments_by_tile(segments, shape=(40, 40), tile_size=16, radius_px=radius)
+    joined = np.zeros_like(whole.histogram)
+    for (ty, tx), part in rows.items():
+        height, width = min(16, 40 - 16 * ty), min(16, 40 - 16 * tx)
+        tile = accumulate_tile(
+            segments[part], origin_xy=(16 * tx, 16 * ty), shape=(height, width), bins=BINS, radius_px=radius
+        )
+        joined[16 * ty : 16 * ty + height, 16 * tx : 16 * tx + width] = tile.histogram
+    np.testing.assert_array_equal(joined, whole.histogram)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_disjoint_sets_of_passages_add_to_the_whole_and_subtract_again(seed: int) -> None:
+    segments = passages(seed, n=10)
+    whole = tile_of(segments)
+    parts = [tile_of(segments[segments["passage"] % 5 == k]) for k in range(5)]
+    for merged, expected in zip(merge_tiles(parts), whole, strict=True):
+        np.testing.assert_array_equal(merged, expected)
+    for left, expected in zip(subtract_tile(whole, parts[0]), merge_tiles(parts[1:]), strict=True):
+        np.testing.assert_array_equal(left, expected)
+
+
+def test_subtracting_what_is_no_part_is_refused() -> None:
+    small, large = tile_of(passages(1, n=2)), tile_of(passages(2, n=8))
+    with pytest.raises(InputError, match="no part of it"):
+        subtract_tile(small, large)
+
+
+def test_standing_weighs_by_its_time_when_asked() -> None:
+    """One car stands for 20 s, one goes by: by passage they weigh alike, by time the standing one outweighs."""
+    stands = [(0, t, 1.0, 20.0, 20.0, 20.0, 20.0, 0.0, 0.0, t, t + 1) for t in range(20)]
+    moves = [(1, t, 1.0, 40 * t - 20.0, 20.0, 40 * t + 20.0, 20.0, 40.0, 0.0, 100 + t, 101 + t) for t in range(2)]
+    segments = np.array(stands + moves, SEGMENT_DTYPE)
+    by_passage, by_time = tile_of(segments), tile_of(segments, weight="time")
+    at_rest = np.s_[20, 20, :, BINS.reach - 1 : BINS.reach + 2]
+    assert by_passage.count[20, 20] == 2
+    assert by_passage.histogram[at_rest].sum() == pytest.approx(UNIT, rel=1e-3)
+    assert by_time.histogram[at_rest].sum() == pytest.approx(20 * UNIT, rel=1e-3)
+    assert by_passage.dwell_ms[20, 20] == pytest.approx(20_000 + 2 * 2 / 40 * 1000, abs=2)
+
+
+def test_band_is_half_a_lane_wide_and_the_papers_line_one_pixel() -> None:
+    segment = np.array([(0, 0, 0.5, 5.0, 20.0, 35.0, 20.0, 60.0, 0.0, 0, 1)], SEGMENT_DTYPE)
+    config = FieldConfig(lane_width_m=3.6)
+    radius = band_radius_px(config, gsd_m=0.2)
+    assert radius == pytest.approx(4.5)
+    assert (tile_of(segment, radius).count[:, 20] > 0).sum() == 9
+    line = tile_of(segment, band_radius_px(config.model_copy(update={"one_pixel_wide": True}), 0.2))
+    assert (line.count[:, 20] > 0).sum() == 1
+    assert (line.count > 0).sum() == 31
+
+
+def test_beyond_the_last_bin_goes_to_the_last_bin() -> None:
+    segment = np.array([(0, 0, 0.1, 5.0, 20.0, 35.0, 20.0, 300.0, 0.0, 0, 1)], SEGMENT_DTYPE)
+    assert tile_of(segment).histogram[20, 20, :, -2:].sum() == UNIT
+
+
+def tracklets(n: int) -> pd.DataFrame:
+    """A chain of tracklets of one vehicle at 50 px/s along x, five frames a second."""
+    k = np.arange(n)
+    table: dict[str, object] = {name: np.zeros(n) for name in TRACKLET_COLUMNS}
+    table |= {"tracklet_id": k + 1, "passage_id": np.zeros(n, int)}
+    for i in range(3):
+        table |= {f"frame_{i}": k + i, f"detection_id_{i}": k + i, f"time_{i}_s": (k + i) / 5}
+        table |= {f"x_{i}_px": 10.0 * (k + i), f"y_{i}_px": np.full(n, 20.0)}
+    table |= {"vx_01_px_per_s": np.full(n, 50.0), "vx_12_px_per_s": np.full(n, 50.0)}
+    return pd.DataFrame(table).astype(TRACKLET_COLUMNS)
+
+
+def test_shared_segments_count_once_or_as_the_paper_has_it_twice() -> None:
+    once = segment_table(tracklets(4), FieldConfig())
+    twice = segment_table(tracklets(4), FieldConfig(weigh_shared_segments="twice"))
+    assert len(once) == 5
+    assert len(twice) == 8
+    np.testing.assert_array_equal(np.diff(once["x0_px"]), 10.0)
+    np.testing.assert_array_equal(tile_of(twice).count, tile_of(once).count)
+
+
+def test_segment_table_does_not_depend_on_the_order_of_tracklets() -> None:
+    table = tracklets(6)
+    shuffled = table.sample(frac=1, random_state=3)
+    np.testing.assert_array_equal(segment_table(table, FieldConfig()), segment_table(shuffled, FieldConfig()))
+
+
+def test_averaging_halves_the_error_of_places_and_keeps_steady_acceleration() -> None:
+    """Places good to 1 px: their error enters neighbouring segments with opposite signs."""
+    table = tracklets(60)
+    t = np.arange(62) / 5
+    true_x = 20 * t + 0.5 * 9 * t**2
+    seen_x = true_x + np.random.default_rng(0).normal(0, 1, 62)
+    for k, pair in enumerate(("01", "12")):
+        table[f"vx_{pair}_px_per_s"] = np.diff(seen_x)[k : k + 60] * 5
+    truth = np.diff(true_x) * 5
+    error = {
+        span: segment_table(table, FieldConfig(velocity_span_s=span))["vx_px_per_s"] - truth for span in (0.0, 0.6)
+    }
+    assert error[0.6].std() < 0.45 * error[0.0].std()
+    assert abs(error[0.6][1:-1].mean()) < 0.5
+
+
+def test_averaging_stops_where_a_passage_is_broken() -> None:
+    table = tracklets(6)
+    table["passage_id"] = [0, 0, 0, 1, 1, 1]
+    table.loc[3:, ["vx_01_px_per_s", "vx_12_px_per_s"]] = -50.0
+    velocity = segment_table(table, FieldConfig(velocity_span_s=2.0))["vx_px_per_s"]
+    assert np.abs(velocity).tolist() == pytest.approx([50.0] * 8)
+
+
+def test_velocities_do_not_depend_on_which_other_passages_are_given() -> None:
+    rng = np.random.default_rng(4)
+    parts = []
+    for passage in range(5):
+        part = tracklets(9)
+        part["passage_id"] = passage
+        part[[c for c in part if c.startswith("detection_id")]] += 100 * passage
+        part[[c for c in part if c.startswith("v")]] += rng.normal(0, 5, (9, 4))
+        parts.append(part)
+    whole = segment_table(pd.concat(parts), FieldConfig())
+    alone = segment_table(parts[3], FieldConfig())
+    np.testing.assert_array_equal(whole[whole["passage"] == 3], alone)
+
+
+def test_an_interval_of_zero_is_refused() -> None:
+    table = tracklets(3)
+    table["time_1_s"] = table["time_0_s"]
+    with pytest.raises(InputError, match="intervals positive"):
+        segment_table(table, FieldConfig())
+
+
+def test_only_touched_tiles_are_listed() -> None:
+    segments = segment_table(tracklets(4), FieldConfig())
+    assert touched_tiles(segments, shape=(200, 200), tile_size=64, radius_px=2.0) == [(0, 0)]
+    assert touched_tiles(segments[:0], shape=(200, 200), tile_size=64, radius_px=2.0) == []
+    outside = segments.copy()
+    outside["x0_px"] -= 500
+    outside["x1_px"] -= 500
+    assert touched_tiles(outside, shape=(200, 200), tile_size=64, radius_px=2.0) == []
+
+
+def test_without_a_ground_distance_the_papers_gives_pixels() -> None:
+    bins = VelocityBins.from_config(FieldConfig(), None)
+    assert bins.centres_m_per_s is None
+    assert bins.width_px_per_s == pytest.approx(2 / 0.23)
+    assert standing_px_per_s(FieldConfig(), None) == pytest.approx(5.0)
+    metric = VelocityBins.from_config(FieldConfig(), 0.5).centres_m_per_s
+    assert metric is not None
+    assert metric[[0, 18, -1]] == pytest.approx([-36, 0, 36])
+
+
+def test_a_full_pixel_is_refused_not_wrapped() -> None:
+    long = np.array([(0, 0, 140_000.0, 20.0, 20.0, 20.0, 20.0, 0.0, 0.0, 0, 1)], SEGMENT_DTYPE)
+    with pytest.raises(InputError, match="into slices"):
+        tile_of(long, weight="time")

@@ -1,0 +1,156 @@
+"""Statistics of a pixel, the whole map, and the prior."""
+
+import numpy as np
+import pytest
+
+from velfield.errors import InputError
+from velfield.field.bins import VelocityBins
+from velfield.field.segments import SEGMENT_DTYPE, Segments
+from velfield.field.view import VelocityField
+
+GSD_M = 0.25
+BINS = VelocityBins(width_px_per_s=2 / GSD_M, reach=18, kernel_sigma_px_per_s=0.7 / GSD_M, gsd_m=GSD_M)
+
+
+def drive(velocities: np.ndarray, y0: float = 50.0) -> Segments:
+    """One passage a velocity (px/s) through (80, y0), half a second long, of one segment."""
+    out = np.zeros(len(velocities), SEGMENT_DTYPE)
+    out["passage"], out["duration_s"] = np.arange(len(velocities)), 0.5
+    out["vx_px_per_s"], out["vy_px_per_s"] = velocities[:, 0], velocities[:, 1]
+    for axis, centre in (("x", 80.0), ("y", y0)):
+        out[f"{axis}0_px"] = centre - out[f"v{axis}_px_per_s"] * 0.25
+        out[f"{axis}1_px"] = centre + out[f"v{axis}_px_per_s"] * 0.25
+    return out
+
+
+def field(segments: Segments, shape: tuple[int, int] = (100, 160)) -> VelocityField:
+    return VelocityField.from_segments(
+        segments, shape=shape, tile_size=64, bins=BINS, radius_px=3.5, standing_px_per_s=1.15 / GSD_M
+    )
+
+
+def polar(speed_m_per_s: np.ndarray, direction_deg: np.ndarray) -> np.ndarray:
+    angle = np.radians(direction_deg)
+    return np.column_stack([np.cos(angle), np.sin(angle)]) * np.asarray(speed_m_per_s)[..., None] / GSD_M
+
+
+def test_peak_is_refined_below_the_bin() -> None:
+    """At any speed and direction: bins of 2 m/s alone would be 1 m/s and 5 degrees off."""
+    rng = np.random.default_rng(0)
+    for speed, direction in zip(rng.uniform(3, 30, 40), rng.uniform(-180, 180, 40), strict=True):
+        velocity = polar(np.array([speed]), np.array([direction]))
+        mode = field(drive(velocity)).at(80, 50).modal_velocity_px_per_s
+        assert np.hypot(*(mode - velocity[0])) * GSD_M < 0.12
+
+
+def test_mode_of_many_is_their_most_frequent_velocity() -> None:
+    rng = np.random.default_rng(1)
+    velocities = polar(rng.normal(13, 1.5, 60), rng.normal(-30, 4, 60))
+    found = field(drive(velocities)).at(80, 50)
+    assert found.n == 60
+    assert np.degrees(np.arctan2(*found.modal_velocity_px_per_s[::-1])) == pytest.approx(-30, abs=3)
+    assert np.hypot(*found.modal_velocity_px_per_s) * GSD_M == pytest.approx(13, abs=1)
+    assert found.direction_se_rad == pytest.approx(np.radians(4) / np.sqrt(60), rel=0.5)
+
+
+def test_percentiles_are_those_of_the_speeds() -> None:
+    speeds = np.random.default_rng(2).normal(12, 2.5, 400)
+    found = field(drive(polar(speeds, np.full(400, 75.0)))).at(80, 50)
+    for share, value in found.percentiles_px_per_s.items():
+        assert value * GSD_M == pytest.approx(np.percentile(speeds, share), abs=0.35)
+    median_se = 1.2533 * 2.5 / np.sqrt(400)
+    assert found.speed_se_px_per_s * GSD_M == pytest.approx(median_se, rel=0.35)
+
+
+def test_two_directions_are_two_modes_with_their_shares() -> None:
+    velocities = np.vstack([polar(np.full(30, 12.0), np.full(30, 0.0)), polar(np.full(10, 9.0), np.full(10, 90.0))])
+    modes = field(drive(velocities)).at(80, 50).modes
+    assert len(modes) == 2
+    np.testing.assert_allclose(modes[:, 2], [0.75, 0.25], atol=0.01)
+    np.testing.assert_allclose(modes[:, :2] * GSD_M, [[12, 0], [0, 9]], atol=0.15)
+
+
+def test_spread_of_direction_and_entropy() -> None:
+    same = field(drive(polar(np.full(8, 12.0), np.zeros(8)))).at(80, 50)
+    every = field(drive(polar(np.full(8, 12.0), np.arange(8) * 45.0))).at(80, 50)
+    assert same.circular_variance < 0.01
+    assert every.circular_variance > 0.99
+    assert every.entropy_nats > same.entropy_nats + 1.5
+    assert np.isnan(field(drive(np.zeros((3, 2)))).at(80, 50).circular_variance)
+
+
+def test_maps_are_empty_where_nothing_passed_and_standing_has_no_direction() -> None:
+    segments = drive(np.array([[48.0, 0.0], [0.0, 0.0]]))
+    segments["x0_px"][1] = segments["x1_px"][1] = 20.0
+    map_ = field(segments)
+    direction, speed, count = map_.modal_direction_rad(), map_.modal_speed_px_per_s(), map_.count()
+    assert count.sum() > 100
+    assert np.isnan(speed[count == 0]).all()
+    assert np.isfinite(speed[count > 0]).all()
+    assert np.isnan(direction[50, 20])
+    assert speed[50, 20] < 1
+    assert direction[50, 80] == pytest.approx(0, abs=0.01)
+    np.testing.assert_array_equal(
+        map_.at(80, 50).modal_velocity_px_per_s.astype(np.float32), map_.modal_velocity()[50, 80]
+    )
+
+
+def test_whole_map_statistics_are_those_of_its_pixels() -> None:
+    map_ = field(drive(polar(np.array([8.0, 9.0, 12.0]), np.array([10.0, 20.0, 15.0]))))
+    whole, one = map_.statistics(), map_.at(85, 52)
+    np.testing.assert_array_equal(whole.n, map_.count())
+    np.testing.assert_allclose(
+        whole.speed_percentiles_px_per_s[52, 85], list(one.percentiles_px_per_s.values()), rtol=1e-6
+    )
+    assert whole.entropy_nats[52, 85] == pytest.approx(one.entropy_nats)
+
+
+def test_a_pixel_that_is_not_on_the_map_is_refused() -> None:
+    with pytest.raises(InputError, match="not on the map"):
+        field(drive(np.array([[48.0, 0.0]]))).at(160, 0)
+
+
+def test_an_empty_map_answers() -> None:
+    empty = field(drive(np.array([[48.0, 0.0]]))[:0])
+    assert np.isnan(empty.modal_velocity()).all()
+    assert empty.at(3, 3).n == 0
+    assert np.isfinite(empty.log_density(np.array([[5.0, 5.0]]), np.array([[1.0, 1.0]]))).all()
+
+
+@pytest.mark.parametrize(
+    "place", [(80.0, 50.0), (80.0, 20.0), (-900.0, 0.0)], ids=["known", "near none", "off the map"]
+)
+def test_density_integrates_to_one(place: tuple[float, float]) -> None:
+    map_ = field(drive(polar(np.array([8.0, 12.0]), np.array([10.0, 15.0]))))
+    axis = np.arange(-109.5, 110, 1.5) / GSD_M
+    v = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    density = np.exp(map_.log_density(np.tile(place, (len(v), 1)), v))
+    assert density.sum() * 2.25 / GSD_M**2 == pytest.approx(1, abs=0.01)
+
+
+def test_density_prefers_what_was_seen_here_and_never_says_impossible() -> None:
+    north = drive(polar(np.full(20, 12.0), np.full(20, -90.0)), y0=30.0)
+    map_ = field(np.concatenate([drive(polar(np.full(20, 12.0), np.zeros(20)), y0=70.0), north]))
+    xy = np.array([[80.0, 70.0]] * 4)
+    v = np.array([[48.0, 0.0], [0.0, -48.0], [-48.0, 0.0], [900.0, 0.0]])
+    usual, seen_elsewhere, never, absurd = map_.log_density(xy, v)
+    assert usual > seen_elsewhere > never > absurd
+    assert np.isfinite(absurd)
+    assert np.isnan(map_.log_density(xy[:1], np.array([[np.nan, 0.0]]))).all()
+
+
+def test_held_out_passages_are_likelier_than_under_one_density_for_the_map() -> None:
+    """Two opposed lanes, learnt from 12 passages each: at least 0.7 nats a passage better."""
+    rng = np.random.default_rng(5)
+
+    def lanes(n: int) -> Segments:
+        there = drive(polar(rng.normal(13, 2, n), rng.normal(0, 2, n)), y0=40.0)
+        back = drive(polar(rng.normal(11, 2, n), rng.normal(180, 2, n)), y0=60.0)
+        back["passage"] += n
+        return np.concatenate([there, back])
+
+    map_, test = field(lanes(12)), lanes(100)
+    places = np.column_stack([np.full(200, 80.0), np.repeat([40.0, 60.0], 100)])
+    v = np.column_stack([test["vx_px_per_s"], test["vy_px_per_s"]])
+    here, anywhere = map_.log_density(places, v), map_.log_density(np.full((200, 2), -1000.0), v)
+    assert (here - anywhere).mean() > 0.6  # two lanes: log 2 is all that can be gained, less what 12 passages cost

@@ -1,0 +1,152 @@
+"""Fits of registration: the paper's case deletion, its simplex as the reference, and the joint robust fit."""
+
+import numpy as np
+import pytest
+
+from velfield.camera.lens import HarrisLens
+from velfield.errors import Failure
+from velfield.registration.fitting import case_deletion, fit_by_simplex, fit_polyprojective
+from velfield.registration.joint import ControlPoints, joint_fit
+from velfield.registration.kernels import solve_positive
+from velfield.registration.mesh import fit_mesh
+from velfield.registration.transforms import HomographyTransform, PolyprojectiveTransform, normalisation_of
+
+WIDTH, HEIGHT = 1280, 960
+LENS = HarrisLens(0.2, 645.0, 474.0, 800.0)
+MATRIX = np.array([[1.02, 0.12, 30.0], [-0.11, 0.99, 50.0], [1e-5, -8e-6, 1.0]])
+
+
+def places(rng: np.random.Generator, count: int) -> np.ndarray:
+    return rng.uniform(0, 1, (count, 2)) * [WIDTH - 1, HEIGHT - 1]
+
+
+def shaken(raw: np.ndarray, *, amplitude_px: float, cycles: float) -> np.ndarray:
+    """Lens, rows that move by ``amplitude_px`` in both coordinates, then the homography."""
+    angle = 2 * np.pi * cycles * raw[:, 1] / HEIGHT
+    motion = amplitude_px * np.stack([np.sin(angle + 0.3), np.sin(angle + 1.3)], axis=1)
+    return HomographyTransform(MATRIX)(LENS.undistort_points(raw) - motion)
+
+
+def control_points(
+    rng: np.random.Generator, *, count: int, noise_px: float, wrong: float, **motion: float
+) -> ControlPoints:
+    raw = places(rng, count)
+    base = shaken(raw, **motion) + rng.normal(0, noise_px, (count, 2))
+    bad = rng.random(count) < wrong
+    base[bad] += rng.uniform(-25, 25, (int(bad.sum()), 2))
+    return ControlPoints(raw, base, np.full(count, 0.5))
+
+
+def fit(points: ControlPoints, *, knots: int = 48, **options: bool):
+    corners = np.array([[0.0, 0.0], [WIDTH - 1, HEIGHT - 1]])
+    start = PolyprojectiveTransform.from_homography(MATRIX, normalisation_of(corners), normalisation_of(points.xy_base))
+    return joint_fit(points, start=start, lens=LENS, width=WIDTH, height=HEIGHT, knots=knots, **options)
+
+
+def mean_error(transform, **motion: float) -> float:
+    raw = places(np.random.default_rng(99), 4000)
+    return float(np.linalg.norm(transform.to_base(raw) - shaken(raw, **motion), axis=1).mean())
+
+
+@pytest.mark.parametrize("model", ["homography", "polyprojective"])
+def test_exact_points_are_fitted_exactly(model: str) -> None:
+    source = places(np.random.default_rng(0), 60)
+    target = HomographyTransform(MATRIX)(source)
+    found = fit_polyprojective(source, target, model=model)
+    np.testing.assert_allclose(found(source), target, atol=1e-6)
+
+
+def test_gauss_newton_reaches_what_the_paper_reaches_by_downhill_simplex() -> None:
+    rng = np.random.default_rng(1)
+    source = places(rng, 80)
+    target = HomographyTransform(MATRIX)(source) + rng.normal(0, 0.5, (80, 2))
+    fast = fit_polyprojective(source, target, model="homography")
+    nudged = PolyprojectiveTransform(fast.coefficients * (1 + 1e-3), fast.source, fast.target)
+    slow = fit_by_simplex(source, target, start=nudged, model="homography")
+    squares = [float(((t(source) - target) ** 2).sum()) for t in (fast, slow)]
+    assert squares[0] <= squares[1] * (1 + 1e-6)
+    assert squares[1] == pytest.approx(squares[0], rel=0.02)
+
+
+def test_case_deletion_drops_the_wrong_matches() -> None:
+    rng = np.random.default_rng(2)
+    source = places(rng, 800)
+    target = HomographyTransform(MATRIX)(source) + rng.normal(0, 0.3, (800, 2))
+    wrong = rng.random(800) < 0.1
+    target[wrong] += rng.uniform(-25, 25, (int(wrong.sum()), 2))
+    found = case_deletion(source, target, max_mean_error_px=0.5)
+    assert found
+    assert found.kept[~wrong].mean() > 0.9
+    assert found.kept[wrong].mean() < 0.05
+    assert found.mean_error_px <= 0.5
+
+
+def test_case_deletion_says_how_many_points_were_left() -> None:
+    rng = np.random.default_rng(3)
+    found = case_deletion(places(rng, 100), places(rng, 100), min_control_points=40)
+    assert isinstance(found, Failure)
+    assert "of 100, 40 needed" in found.reason
+
+
+def test_too_few_points_are_a_failure_with_counts() -> None:
+    assert fit_polyprojective(np.zeros((3, 2)), np.zeros((3, 2))).reason == "3 control points, a polyprojective needs 9"
+
+
+@pytest.mark.parametrize(("cycles", "limit_px"), [(6.0, 0.13), (12.0, 0.25)])
+def test_wobbling_rows_are_followed_among_a_third_of_wrong_matches(cycles: float, limit_px: float) -> None:
+    points = control_points(
+        np.random.default_rng(4), count=3000, noise_px=0.5, wrong=0.3, amplitude_px=4.0, cycles=cycles
+    )
+    found = fit(points)
+    assert mean_error(found.transform, amplitude_px=4.0, cycles=cycles) < limit_px
+
+
+def test_case_deletion_cannot_follow_wobbling_rows() -> None:
+    points = control_points(np.random.default_rng(5), count=3000, noise_px=0.5, wrong=0.1, amplitude_px=4.0, cycles=6.0)
+    found = fit(points, knots=0)
+    assert mean_error(found.transform, amplitude_px=4.0, cycles=6.0) > 3.0
+
+
+def test_a_still_camera_pays_nothing_for_the_spline() -> None:
+    points = control_points(np.random.default_rng(6), count=3000, noise_px=0.5, wrong=0.1, amplitude_px=0.0, cycles=0.0)
+    with_spline, without = fit(points), fit(points, knots=0)
+    still = {"amplitude_px": 0.0, "cycles": 0.0}
+    assert mean_error(with_spline.transform, **still) < mean_error(without.transform, **still) + 0.01
+
+
+def test_held_out_residual_is_that_of_a_fit_without_the_fold() -> None:
+    points = control_points(np.random.default_rng(7), count=600, noise_px=0.5, wrong=0.0, amplitude_px=0.0, cycles=0.0)
+    found = fit(points, knots=0)
+    assert found.residual_px < found.heldout_px < 1.1 * found.residual_px
+    # noise of 0.5 px a coordinate; weights fall with the residual, so that the kept ones lie a little nearer
+    assert 0.55 < found.heldout_px < 0.75
+
+
+def test_moving_things_do_not_pull_the_fit() -> None:
+    rng = np.random.default_rng(8)
+    points = control_points(rng, count=2000, noise_px=0.2, wrong=0.0, amplitude_px=0.0, cycles=0.0)
+    moving = (points.xy_raw[:, 0] > 400) & (points.xy_raw[:, 0] < 700)
+    moved = ControlPoints(points.xy_raw, points.xy_base + np.where(moving[:, None], [6.0, 0.0], 0.0), points.sigma_px)
+    found = fit(moved)
+    assert mean_error(found.transform, amplitude_px=0.0, cycles=0.0) < 0.1
+    assert not found.kept[moving].any()
+
+
+def test_mesh_takes_up_slow_relief_and_nothing_else() -> None:
+    rng = np.random.default_rng(9)
+    raw = places(rng, 2000)
+    noise = rng.normal(0, 0.3, raw.shape)
+    relief = 1.5 * np.stack([np.sin(raw[:, 0] / 250), np.cos(raw[:, 1] / 250)], axis=1)
+    size = {"width": WIDTH, "height": HEIGHT, "cell_size_px": 200}
+    found = fit_mesh(raw, noise + relief, noise + relief, np.ones(len(raw)), **size)
+    assert found.mesh is not None
+    assert (found.heldout**2).mean() < 0.15 * ((noise + relief) ** 2).mean()
+    assert fit_mesh(raw, noise, noise, np.ones(len(raw)), **size).mesh is None
+
+
+def test_small_systems_are_solved_as_lapack_does() -> None:
+    rng = np.random.default_rng(10)
+    half = rng.normal(size=(40, 40))
+    matrix, right = half @ half.T + np.eye(40), rng.normal(size=(40, 2))
+    np.testing.assert_allclose(solve_positive(matrix, right), np.linalg.solve(matrix, right), atol=1e-9)
+    assert np.isnan(solve_positive(-matrix, right)).all()

@@ -1,0 +1,239 @@
+"""The whole job as a flow: what it leaves, what a second run does again, what a failing unit costs."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from flows.console import Console
+from flows.launch import prepare_process
+from flows.runners import RunnerConfig
+from schemas.job import Inputs, Job
+from schemas.simulation import SimulationConfig
+from schemas.summary import RunSummary
+from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
+from velfield import open_run
+from velfield.configuration import resolve_config
+from velfield.errors import InputError
+from velfield.layout import STAGES, RunLayout
+from velfield.provenance import digest_bytes
+from velfield.synthetic import write_flight
+
+SMALL = (
+    "detection.rounds=60",
+    "detection.feature_pool=400",
+    "registration.key_points=1200",
+    "work.unit_frames=8",
+    "work.retries=1",
+)
+FRAMES = 18
+
+
+@pytest.fixture(scope="session")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated flight of a few seconds."""
+    folder = tmp_path_factory.mktemp("flight")
+    write_flight(folder, SimulationConfig(frames=FRAMES, width=640, height=480, seed=11))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A Prefect server of our own, once a session: its start takes longer than a small flight."""
+    prepare_process(verbose=False)
+    from prefect.testing.utilities import prefect_test_harness
+
+    with prefect_test_harness(server_startup_timeout=180):
+        yield
+
+
+def job(flight: Path, root: Path, *settings: str, **inputs: str) -> Job:
+    given = {
+        "source": str(flight / "frames"),
+        "timestamps": str(flight / "timestamps.csv"),
+        "base": str(flight / "base.png"),
+        "labels": str(flight / "labels.csv"),
+    }
+    config = resolve_config(settings=[*SMALL, *settings], overrides={"gsd_m": 0.23})
+    return Job(root=str(root), inputs=Inputs.model_validate(given | inputs), config=config)
+
+
+def process(work: Job, runner: RunnerConfig | None = None) -> RunSummary:
+    from flows.process_flight import run_flight
+
+    return run_flight(work, runner or RunnerConfig(), Console("quiet"))
+
+
+def digests(root: Path) -> dict[str, str]:
+    """Of all that a run leaves, apart from what tells when it was made."""
+    layout = RunLayout(root)
+    when = {layout.flight, layout.report, layout.lock}
+    files = [path for path in sorted(root.rglob("*")) if path.is_file() and path not in when]
+    return {
+        path.relative_to(root).as_posix(): digest_bytes(path.read_bytes())
+        for path in files
+        if not path.is_relative_to(layout.commits)
+    }
+
+
+def redone(summary: RunSummary) -> list[str]:
+    return [stage.name for stage in summary.stages if stage.done_before < stage.units]
+
+
+@pytest.fixture(scope="session")
+def whole(flight: Path, server: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunSummary]:
+    """The flight's run, done once."""
+    root = tmp_path_factory.mktemp("run") / "whole"
+    return root, process(job(flight, root))
+
+
+def test_it_leaves_what_the_contract_says(whole: tuple[Path, RunSummary]) -> None:
+    root, summary = whole
+    assert [stage.name for stage in summary.stages] == list(STAGES)
+    assert summary.complete
+    names = ("flight.json", "frames.zarr", "camera.json", "base/grid.json", "base/base_image.png", "registration.zarr")
+    names += ("detector.json", "detections", "tracklets", "field.zarr", "maps/direction.png", "maps/speed.png")
+    names += ("maps/direction.tif", "maps/speed.tif", "index.html", "commits")
+    assert [name for name in names if not (root / name).exists()] == []
+
+
+def test_the_python_side_of_the_contract(whole: tuple[Path, RunSummary]) -> None:
+    run = open_run(whole[0])
+    assert run.times_s.shape == (FRAMES,)
+    assert list(run.registration_status) == ["ok"] * FRAMES
+    assert list(run.detections().columns) == list(DETECTION_COLUMNS)
+    tracklets = run.tracklets()
+    assert list(tracklets.columns) == list(TRACKLET_COLUMNS)
+    assert len(tracklets) > 50
+    raw = np.array([[100.0, 90.0], [500.0, 400.0]])
+    np.testing.assert_allclose(run.to_raw(4, run.to_base(4, raw)), raw, atol=1e-2)
+    count, velocity = run.field.count(), run.field.modal_velocity()
+    assert count.shape == velocity.shape[:2] == run.base_image.shape
+    assert np.isfinite(velocity[count > 0]).all()
+    assert np.isnan(velocity[count == 0]).all()
+    y, x = np.unravel_index(count.argmax(), count.shape)
+    here = run.field.at(int(x), int(y))
+    assert here.n == count[y, x]
+    assert here.weights.sum() == pytest.approx(1)
+    np.testing.assert_allclose(run.field.modal_velocity()[y, x], here.modal_velocity_px_per_s, rtol=1e-5)
+    fast, slow = run.field.log_density(np.array([[x, y], [x, y]]), np.array([velocity[y, x], velocity[y, x] + 90]))
+    assert fast > slow
+
+
+def test_it_is_as_good_as_a_small_flight_lets_it_be(whole: tuple[Path, RunSummary], flight: Path) -> None:
+    from velfield.scoring import score_run
+
+    score = score_run(whole[0], flight, min_count=1)
+    assert score.registration.mean_px < 1.0
+    assert score.registration.jitter_px < 0.25
+    assert score.tracking.precision_moving > 0.95
+    assert score.field.pixels > 1000
+
+
+def test_a_second_run_does_nothing_again(whole: tuple[Path, RunSummary], flight: Path) -> None:
+    root, _ = whole
+    before = digests(root)
+    again = process(job(flight, root))
+    assert redone(again) == []
+    assert digests(root) == before
+
+
+def test_a_changed_gate_redoes_tracking_onward(whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path) -> None:
+    import shutil
+
+    root = tmp_path / "copy"
+    shutil.copytree(whole[0], root)
+    changed = process(job(flight, root, "tracking.max_speed_m_per_s=5"))
+    assert redone(changed) == ["links", "tracklets", "field", "maps"]
+    speeds = open_run(root).tracklets()[["vx_01_px_per_s", "vy_01_px_per_s"]]
+    assert np.hypot(*speeds.to_numpy().T).max() * 0.23 < 12  # 5 m/s and what jitter adds
+
+
+def test_workers_give_the_same_bits(whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path) -> None:
+    process(job(flight, tmp_path / "workers"), RunnerConfig(workers=2))
+    assert digests(tmp_path / "workers") == digests(whole[0])
+
+
+def test_a_unit_that_fails_once_is_tried_again(
+    flight: Path, server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from velfield.steps import frames as step
+
+    calls: list[range] = []
+    true = step.read_unit
+
+    def failing(plan: object, frames: range) -> object:
+        calls.append(frames)
+        if len(calls) == 1:
+            raise OSError("the disk blinked")
+        return true(plan, frames)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(step, "read_unit", failing)
+    summary = process(job(flight, tmp_path / "run", "frames.stop_s=2"))
+    assert not summary.stages[0].lost
+    assert len(calls) == summary.stages[0].units + 1
+
+
+def test_a_unit_that_always_fails_is_lost_and_done_by_the_next_run(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from velfield.steps import detections as step
+
+    true = step.detect_block
+
+    def failing(plan: object, frames: range) -> object:
+        if 8 in frames:
+            raise RuntimeError("this chunk kills its worker")
+        return true(plan, frames)  # type: ignore[arg-type]
+
+    root = tmp_path / "run"
+    monkeypatch.setattr(step, "detect_block", failing)
+    summary = process(job(flight, root))
+    lost = {stage.name: stage.lost for stage in summary.stages if stage.lost}
+    assert lost["detections"] == ("000008-000015",)
+    assert not summary.complete
+    monkeypatch.setattr(step, "detect_block", true)
+    again = process(job(flight, root))
+    assert again.complete
+    assert digests(root) == digests(whole[0])
+
+
+def test_a_base_image_of_another_place_is_refused(flight: Path, server: None, tmp_path: Path) -> None:
+    import cv2
+
+    picture = cv2.imread(str(flight / "base.png"), cv2.IMREAD_GRAYSCALE)
+    wrong = tmp_path / "mirrored.png"
+    cv2.imwrite(str(wrong), picture[:, ::-1])
+    with pytest.raises(InputError, match="not a picture of this flight's place"):
+        process(job(flight, tmp_path / "run", base=str(wrong)))
+    assert not (tmp_path / "run" / "commits" / "registration").exists()
+
+
+def test_commit_records_say_what_was_done(whole: tuple[Path, RunSummary]) -> None:
+    root, _ = whole
+    record = json.loads((root / "commits" / "detections" / "000008-000015.json").read_text())
+    assert record["counts"]["frames"] == 8
+    assert record["counts"]["cars"] == int((open_run(root).detections()["frame"].between(8, 15)).sum())
+    assert all(digest for name, digest in record["outputs"].items() if name.endswith(".parquet"))
+
+
+def test_detections_of_another_detector_take_the_place_of_ours(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
+) -> None:
+    from velfield.synthetic import load_truth
+
+    cars = load_truth(flight).cars
+    cars = cars[cars["visible"]]
+    names = sorted(path.name for path in (flight / "frames").iterdir())
+    table = pd.DataFrame(
+        {"frame": [names[k] for k in cars["frame"]], "x_px": cars["x_raw_px"], "y_px": cars["y_raw_px"]}
+    )
+    inside = table["x_px"].between(0, 639) & table["y_px"].between(0, 479)
+    table[inside].to_csv(tmp_path / "boxes.csv", index=False)
+    summary = process(job(flight, tmp_path / "run", detections=str(tmp_path / "boxes.csv")))
+    counts = {stage.name: stage.counts for stage in summary.stages}
+    assert counts["detections"]["cars"] == pytest.approx(inside.sum(), rel=0.02)
+    assert counts["tracklets"]["passages"] > 20

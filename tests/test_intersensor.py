@@ -1,0 +1,149 @@
+"""Inter-sensor registration: found through tones, turns and scales; another place is refused with its scores."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from schemas.flight import BaseConfig
+from tests.scenes import by_homography, city, frame_grid, photograph, similarity
+from velfield.camera.lens import HarrisLens, pinhole
+from velfield.errors import Failure
+from velfield.registration.correlation import match_grid
+from velfield.registration.intersensor import IntersensorResult, register_intersensor
+
+SHAPE = (480, 640)
+MIDDLE = np.array([319.5, 239.5])
+LENS = HarrisLens(0.15, 324.0, 236.0, 400.0)
+CONFIG = BaseConfig()
+
+
+def other_sensor(ground: np.ndarray, seed: int = 9) -> np.ndarray:
+    """The ground in other tones, less sharp, with noise of its own."""
+    rng = np.random.default_rng(seed)
+    tones = 255.0 * (cv2.GaussianBlur(ground, (0, 0), 1.0) / 255.0) ** 0.6
+    return np.clip(tones + rng.normal(0, 3.0, ground.shape), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def ground() -> np.ndarray:
+    return city(4, 900, blocks=220)
+
+
+@pytest.fixture(scope="module")
+def base(ground: np.ndarray) -> np.ndarray:
+    return other_sensor(ground)
+
+
+def view(scale: float, rotation_deg: float) -> np.ndarray:
+    return similarity(scale, rotation_deg, MIDDLE, np.array([450.0, 440.0]))
+
+
+def found(image: np.ndarray, base: np.ndarray, **arguments: object) -> IntersensorResult:
+    result = register_intersensor(image, base, CONFIG, lens=LENS, **arguments)  # type: ignore[arg-type]
+    assert isinstance(result, IntersensorResult), result.reason
+    return result
+
+
+def mean_error_px(result: IntersensorResult, to_base: np.ndarray) -> float:
+    raw = frame_grid(SHAPE)
+    true = by_homography(to_base, LENS.undistort_points(raw))
+    inside = ((true > 0) & (true < 900)).all(axis=1)
+    return float(np.linalg.norm(result.transform.to_base(raw[inside]) - true[inside], axis=1).mean())
+
+
+@pytest.mark.parametrize(("scale", "rotation_deg"), [(1.0, 0.0), (0.6, 137.0), (1.15, -80.0)])
+def test_any_turn_and_scale_is_found_to_a_fraction_of_a_pixel(
+    ground: np.ndarray, base: np.ndarray, scale: float, rotation_deg: float
+) -> None:
+    to_base = view(scale, rotation_deg)
+    result = found(photograph(ground, to_base, LENS, SHAPE, 1), base)
+    assert mean_error_px(result, to_base) < 0.5
+    assert result.left_out_error_px < 1.0
+    assert result.scale == pytest.approx(scale, rel=0.02)
+    assert np.degrees(result.rotation_rad) == pytest.approx(rotation_deg, abs=1.0)
+
+
+def test_scales_of_two_and_a_half(ground: np.ndarray, base: np.ndarray) -> None:
+    image = photograph(ground, view(1.0, 20.0), LENS, SHAPE, 1)
+    for factor in (0.5, 2.0):
+        size = round(900 * factor)
+        scaled = cv2.resize(base, (size, size), interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC)
+        assert found(image, scaled).scale == pytest.approx(factor, rel=0.02)
+
+
+@pytest.mark.parametrize(("scale", "turn_deg"), [(1.2, 10.0), (0.8, -10.0), (0.8, 10.0)])
+def test_a_given_coarse_map_may_be_off_by_a_fifth_and_ten_degrees(
+    ground: np.ndarray, base: np.ndarray, scale: float, turn_deg: float
+) -> None:
+    to_base = view(1.0, 15.0)
+    off = to_base @ similarity(scale, turn_deg, MIDDLE, MIDDLE + np.array([15.0, -12.0]))
+    result = found(photograph(ground, to_base, LENS, SHAPE, 1), base, initial=off)
+    assert result.how.startswith("given")
+    assert mean_error_px(result, to_base) < 0.5
+
+
+def test_a_negative_is_found(ground: np.ndarray, base: np.ndarray) -> None:
+    to_base = view(1.0, 15.0)
+    result = found(photograph(ground, to_base, LENS, SHAPE, 1), np.bitwise_not(base))
+    assert mean_error_px(result, to_base) < 0.5
+
+
+def test_the_error_map_covers_the_ground_seen_and_nothing_else(ground: np.ndarray, base: np.ndarray) -> None:
+    result = found(photograph(ground, view(0.6, 0.0), LENS, SHAPE, 1), base)
+    spacing = result.error_map_spacing_px
+    assert result.error_map.shape == (900 // spacing, 900 // spacing)
+    assert np.isfinite(result.error_map[440 // spacing, 450 // spacing])
+    assert np.isnan(result.error_map[0, 0])
+    assert result.source_raw.shape == result.target.shape == (len(result.error_left_out_px), 2)
+
+
+def test_another_place_is_refused_with_the_scores(base: np.ndarray) -> None:
+    image = photograph(city(77, 900, blocks=220), view(1.0, 5.0), LENS, SHAPE, 1)
+    result = register_intersensor(image, base, CONFIG, lens=LENS)
+    assert isinstance(result, Failure)
+    assert "does not show this place" in result.reason
+    assert "SIFT: " in result.reason
+    assert "matches agree" in result.reason
+    assert "\n" not in result.reason
+
+
+def test_a_mirrored_base_image_is_refused_and_called_so(ground: np.ndarray, base: np.ndarray) -> None:
+    image = photograph(ground, view(1.0, 5.0), LENS, SHAPE, 1)
+    result = register_intersensor(image, np.ascontiguousarray(base[:, ::-1]), CONFIG, lens=LENS)
+    assert isinstance(result, Failure)
+    assert "so it is flipped" in result.reason
+
+
+def test_a_black_frame_is_refused(base: np.ndarray) -> None:
+    result = register_intersensor(np.zeros(SHAPE, dtype=np.uint8), base, CONFIG, lens=LENS)
+    assert isinstance(result, Failure)
+
+
+def test_the_grid_stage_measures_a_known_shift_below_the_pixel(ground: np.ndarray) -> None:
+    moved = cv2.warpAffine(ground, np.array([[1.0, 0, 3.3], [0, 1.0, -2.6]]), (900, 900), flags=cv2.INTER_CUBIC)
+    mask = np.ones(ground.shape, dtype=bool)
+    matches = match_grid(ground, mask, moved, spacing_px=100, patch_px=75, radius_px=8)
+    inner = (np.abs(matches.points - 450) < 350).all(axis=1)
+    assert np.abs(np.median(matches.displacement[inner], axis=0) - (3.3, -2.6)).max() < 0.1
+    assert np.median(matches.score[inner]) > 0.95
+
+
+@pytest.mark.footage
+@pytest.mark.parametrize("negative", [False, True])
+def test_west_concord(footage: Callable[[str], Path], negative: bool) -> None:
+    folder = footage("westconcord")
+    image = cv2.imread(str(folder / "westconcordaerial.png"), cv2.IMREAD_GRAYSCALE)
+    base = cv2.imread(str(folder / "westconcordorthophoto.png"), cv2.IMREAD_GRAYSCALE)
+    shown = np.bitwise_not(image) if negative else image
+    result = register_intersensor(shown, base, CONFIG, lens=pinhole((image.shape[0], image.shape[1])))
+    assert isinstance(result, IntersensorResult), result.reason
+    assert result.scale == pytest.approx(0.915, abs=0.012)
+    assert np.degrees(result.rotation_rad) == pytest.approx(10.3, abs=0.5)
+    assert result.left_out_error_px < 1.0
+    flipped = register_intersensor(
+        np.ascontiguousarray(shown[:, ::-1]), base, CONFIG, lens=pinhole((image.shape[0], image.shape[1]))
+    )
+    assert isinstance(flipped, Failure)

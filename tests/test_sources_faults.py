@@ -1,0 +1,310 @@
+"""Faults of sources: each goes on and is flagged, or stops with one line that says what was found and what to do."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from schemas.flight import FramesConfig
+from tests.media import drifting, flip_bytes, ground, write_pictures, write_times, write_video
+from velfield.errors import InputError
+from velfield.sources.flags import UNUSABLE, FrameFlag, describe_flags
+from velfield.sources.quality import flag_blurred, flag_foreign, frame_quality
+from velfield.sources.source import iter_frames, probe
+
+ALL = FramesConfig()
+FPS = FramesConfig(fps=5)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return list(drifting(60, 320, 240))
+
+
+def assert_stops(path, match, frames=FPS, timestamps=None):
+    """Assert that probing or reading stops with one line holding `match`, "found" or a reason, and a remedy."""
+    with pytest.raises(InputError, match=match) as caught:
+        probe_and_read(path, frames, timestamps)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert ";" in message, message
+
+
+def probe_and_read(path, frames, timestamps):
+    info = probe(path, frames=frames, timestamps=timestamps)
+    return list(iter_frames(path, info, range(info.frame_count)))
+
+
+def read_all(path, frames=ALL):
+    info = probe(path, frames=frames)
+    return info, list(iter_frames(path, info, range(info.frame_count)))
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".ts", ".avi", ".mkv"])
+def test_a_video_cut_in_half_gives_the_frames_there_are_and_says_so(tmp_path, frames, suffix):
+    faststart = {"movflags": "faststart"} if suffix == ".mp4" else None
+    whole = write_video(tmp_path / f"whole{suffix}", frames, container_options=faststart)
+    clean = {round(frame.time_s, 3): frame for frame in read_all(whole)[1]}
+    cut = tmp_path / f"cut{suffix}"
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    info, read = read_all(cut)
+    assert 10 < info.frame_count < 50
+    if suffix != ".ts":  # a transport stream declares neither frames nor seconds
+        assert any("cut short" in warning for warning in info.warnings), info.warnings
+    for frame in read:
+        same = np.array_equal(frame.grey, clean[round(frame.time_s, 3)].grey)
+        assert same or frame.flags & (FrameFlag.SUSPECT | FrameFlag.UNREADABLE)
+    assert sum(not frame.flags for frame in read) > 10
+
+
+def test_an_mp4_that_lost_its_index_stops(tmp_path, frames):
+    whole = write_video(tmp_path / "whole.mp4", frames)
+    cut = tmp_path / "cut.mp4"
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    assert_stops(cut, "could not be opened as video")
+
+
+def test_a_video_cut_within_the_run_yields_its_lost_frames_as_unreadable(tmp_path, frames):
+    path = write_video(tmp_path / "a.ts", frames)
+    info = probe(path, frames=ALL)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    read = list(iter_frames(path, info, range(0, 60, 5)))
+    assert [frame.source_index for frame in read] == list(range(0, 60, 5))
+    assert read[-1].flags & FrameFlag.UNREADABLE
+    assert "frame 55 at" in read[-1].reason
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("suffix", "codec"), [(".mp4", "libx264"), (".ts", "libx264"), (".avi", "mpeg4")])
+def test_no_wrong_frame_of_a_damaged_stretch_goes_unflagged(tmp_path, frames, suffix, codec, seed):
+    clean = {
+        round(frame.time_s, 3): frame.grey
+        for frame in read_all(write_video(tmp_path / f"a{suffix}", frames, codec=codec))[1]
+    }
+    damaged = flip_bytes(tmp_path / f"a{suffix}", tmp_path / f"d{suffix}", start=0.3, stop=0.45, count=30, seed=seed)
+    _, read = read_all(damaged)
+    wrong = [frame for frame in read if not np.array_equal(frame.grey, clean[round(frame.time_s, 3)])]
+    assert wrong
+    visible = [f for f in wrong if np.count_nonzero(np.abs(f.grey.astype(int) - clean[round(f.time_s, 3)]) > 16) > 20]
+    assert not [frame.source_index for frame in visible if not frame.flags & UNUSABLE]
+    assert all(frame.reason for frame in read if frame.flags)
+
+
+def test_frames_are_good_again_from_the_next_key_frame_on(tmp_path, frames):
+    write_video(tmp_path / "a.mp4", frames, options={"preset": "veryfast", "x264-params": "scenecut=0"})
+    damaged = flip_bytes(tmp_path / "a.mp4", tmp_path / "d.mp4", start=0.42, stop=0.44, count=30, seed=1)
+    info, read = read_all(damaged)
+    suspect = [frame.source_index for frame in read if frame.flags]
+    keys = np.flatnonzero(info.key_frames)
+    assert suspect
+    assert suspect == list(range(suspect[0], suspect[-1] + 1))
+    assert suspect[-1] + 1 in keys
+    assert suspect[-1] < 40
+
+
+def test_damage_is_flagged_alike_when_a_flight_is_read_in_pieces(tmp_path, frames):
+    write_video(tmp_path / "a.mp4", frames)
+    damaged = flip_bytes(tmp_path / "a.mp4", tmp_path / "d.mp4", start=0.3, stop=0.5, count=30, seed=3)
+    info, whole = read_all(damaged)
+    pieces = [frame for first in range(0, 60, 10) for frame in iter_frames(damaged, info, range(first, first + 10))]
+    assert [bool(f.flags & UNUSABLE) for f in pieces] == [bool(f.flags & UNUSABLE) for f in whole]
+
+
+def test_a_truncated_or_unreadable_picture_is_flagged_and_the_rest_read(tmp_path, frames):
+    names = write_pictures(tmp_path / "f", frames[:5], name="{}.jpg")
+    for name, share in ((names[1], 0.5), (names[2], 0.01), (names[3], 0.0)):
+        content = (tmp_path / "f" / name).read_bytes()
+        (tmp_path / "f" / name).write_bytes(content[: int(share * len(content))])
+    info, read = read_all(tmp_path / "f", FPS)
+    unreadable = [bool(frame.flags & FrameFlag.UNREADABLE) for frame in read]
+    assert unreadable == [False, True, True, True, False]
+    assert not read[1].grey.any()
+    assert "truncated" in read[1].reason
+    assert any("2 of 5 pictures cannot be read" in warning for warning in info.warnings)
+
+
+def test_a_png_with_flipped_bytes_is_flagged(tmp_path, frames):
+    (name,) = write_pictures(tmp_path / "f", frames[:1])
+    write_pictures(tmp_path / "f", frames[:2], name="g{}.png")
+    flip_bytes(tmp_path / "f" / name, tmp_path / "f" / name, start=0.3, stop=0.8, count=5, seed=0)
+    _, read = read_all(tmp_path / "f", FPS)
+    assert [bool(frame.flags & FrameFlag.UNREADABLE) for frame in read] == [True, False, False]
+
+
+def test_missing_duplicate_black_blurred_and_foreign_frames_are_flagged(tmp_path, frames):
+    import cv2
+
+    sequence = [frame.copy() for frame in frames[:9]]
+    sequence[2] = sequence[1].copy()
+    sequence[3] = np.zeros_like(sequence[3])
+    sequence[5] = cv2.GaussianBlur(sequence[5], (0, 0), 6)
+    sequence[7] = ground(320, 240, seed=99)
+    write_pictures(tmp_path / "f", sequence)
+    (tmp_path / "f" / "f9.png").unlink()
+    side = write_times(tmp_path / "t.csv", [(f"f{i + 1}.png", 0.2 * i) for i in range(9)])
+    info = probe(tmp_path / "f", frames=ALL, timestamps=side)
+    assert any("1 frames of t.csv are not in f (f9.png)" in warning for warning in info.warnings)
+    read = list(iter_frames(tmp_path / "f", info, range(8)))
+    assert [describe_flags(frame.flags) for frame in read[:5]] == ["", "", "duplicate", "black", ""]
+    quality = [frame_quality(frame.grey) for frame in [*read, *read[4:5]]]
+    assert np.flatnonzero(flag_blurred(np.array([q.sharpness for q in quality]))).tolist() == [3, 5]
+    assert np.flatnonzero(flag_foreign(np.array([q.thumbnail for q in quality]))).tolist() == [3, 7]
+
+
+def test_a_flight_cut_into_units_finds_the_same_duplicates(tmp_path, frames):
+    write_pictures(tmp_path / "f", [frames[0], frames[1], frames[1], frames[2]])
+    info, whole = read_all(tmp_path / "f", FPS)
+    second = list(iter_frames(tmp_path / "f", info, [2, 3], after=1))
+    assert [frame.flags for frame in second] == [frame.flags for frame in whole[2:]] == [int(FrameFlag.DUPLICATE), 0]
+
+
+def test_permuted_times_are_sorted_and_said(tmp_path, frames):
+    names = write_pictures(tmp_path / "f", frames[:4])
+    side = write_times(tmp_path / "t.csv", list(zip(names, [0.6, 0.0, 0.4, 0.2], strict=True)))
+    info = probe(tmp_path / "f", frames=ALL, timestamps=side)
+    assert info.names == ("f2.png", "f4.png", "f3.png", "f1.png")
+    assert any("order of time" in warning for warning in info.warnings)
+
+
+def test_equal_times_are_said_and_flagged(tmp_path, frames):
+    names = write_pictures(tmp_path / "f", frames[:3])
+    side = write_times(tmp_path / "t.csv", list(zip(names, [0.0, 0.2, 0.2], strict=True)))
+    info = probe(tmp_path / "f", frames=ALL, timestamps=side)
+    assert any("1 frames have the time of the frame before" in warning for warning in info.warnings)
+    assert [frame.flags for frame in iter_frames(tmp_path / "f", info, range(3))] == [0, 0, int(FrameFlag.DUPLICATE)]
+
+
+def test_a_folder_without_times_says_what_to_give(tmp_path, frames):
+    write_pictures(tmp_path / "f", frames[:2])
+    assert_stops(tmp_path / "f", "give --timestamps CSV .* or --fps", ALL)
+
+
+def test_time_stamps_that_contradict_the_container_stop(tmp_path, frames):
+    path = write_video(tmp_path / "a.mp4", frames[:20])
+    assert_stops(
+        path, "as the video's own times say", ALL, write_times(tmp_path / "t.csv", [(i, i * 0.05) for i in range(20)])
+    )
+    assert_stops(
+        path, "found no time for 1 of 20", ALL, write_times(tmp_path / "u.csv", [(i, i * 0.04) for i in range(19)])
+    )
+
+
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [
+        ("frame,time_s\nf1.png,nan\n", "finite"),
+        ("frame,time_s\nf1.png,soon\n", "finite"),
+        ("frame,time_s\nf1.png,1\nf1.png,2\n", "a second time"),
+        ("name,t\nf1.png,1\n", "expected time stamps as CSV"),
+        ("frame,time_s\nf1.png\n", "cells"),
+        ("frame,time_s\n", "no rows"),
+        ("", "columns"),
+        ("frame,time_s\nelsewhere.png,1\n", "none a picture"),
+        (b"\xff\xfe\0\0", "not UTF-8"),
+    ],
+)
+def test_a_bad_time_stamps_file_stops(tmp_path, frames, content, match):
+    write_pictures(tmp_path / "f", frames[:2])
+    side = tmp_path / "t.csv"
+    side.write_bytes(content if isinstance(content, bytes) else content.encode())
+    assert_stops(tmp_path / "f", match, ALL, side)
+
+
+def test_rate_and_side_file_together_stop(tmp_path, frames):
+    names = write_pictures(tmp_path / "f", frames[:2])
+    assert_stops(
+        tmp_path / "f",
+        "expected one of them",
+        FPS,
+        write_times(tmp_path / "t.csv", [(n, i) for i, n in enumerate(names)]),
+    )
+
+
+def test_frames_that_change_size_stop_with_both_sizes(tmp_path, frames):
+    write_pictures(tmp_path / "f", [*frames[:3], frames[3][:200, :300]])
+    assert_stops(tmp_path / "f", "found f4.png of 300x200, expected 320x240")
+
+
+def test_a_video_that_changes_size_stops_with_both_sizes(tmp_path, frames):
+    first = write_video(tmp_path / "a.ts", frames[:20])
+    second = write_video(tmp_path / "b.ts", [f[:128, :160] for f in frames[:20]], times=list(range(20, 40)))
+    (tmp_path / "c.ts").write_bytes(first.read_bytes() + second.read_bytes())
+    assert_stops(tmp_path / "c.ts", "of 160x128, expected 320x240")
+
+
+def png_bomb(path: Path, width: int, height: int) -> Path:
+    """A PNG of a gigapixel in a few kB: rows of zeros."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    packed = zlib.compressobj(9)
+    body = b"".join(packed.compress(bytes(1 << 20)) for _ in range(4)) + packed.flush()
+    head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", body) + chunk(b"IEND", b""))
+    return path
+
+
+def test_a_gigapixel_in_a_few_kilobytes_is_refused(tmp_path):
+    (tmp_path / "f").mkdir()
+    png_bomb(tmp_path / "f" / "bomb.png", 40_000, 40_000)
+    assert_stops(tmp_path / "f", "40000x40000 = 1600000000 px, expected at most 400000000")
+
+
+def test_a_video_larger_than_the_limit_is_refused(tmp_path, frames):
+    path = write_video(tmp_path / "a.mp4", frames[:2])
+    assert_stops(path, "320x240 = 76800 px, expected at most 1000", FramesConfig(max_pixels=1000))
+
+
+@pytest.mark.parametrize(
+    "address", ["http://example.org/a.mp4", "https://example.org/a", "concat:a.ts|b.ts", "s3://b/a", "file:///a"]
+)
+def test_addresses_and_protocols_are_refused(address):
+    assert_stops(address, "is refused")
+    assert_stops(Path(address), "is refused")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"#EXTM3U\n#EXT-X-TARGETDURATION:5\n#EXTINF:5,\nsecret.ts\n#EXT-X-ENDLIST\n",
+        b"ffconcat version 1.0\nfile secret.ts\n",
+        b"v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nm=video 5004 RTP/AVP 96\n",
+        b"",
+        b"hello",
+    ],
+)
+def test_playlists_and_other_files_are_no_videos(tmp_path, frames, content):
+    write_video(tmp_path / "secret.ts", frames[:5])
+    for name in ("a.mp4", "a.m3u8", "a.ts"):
+        (tmp_path / name).write_bytes(content)
+        assert_stops(tmp_path / name, "could not be opened as video|no video stream|no frames|no frame size")
+
+
+def test_a_vrt_named_tif_is_refused(tmp_path, frames):
+    write_pictures(tmp_path / "other", frames[:1])
+    (tmp_path / "f").mkdir()
+    (tmp_path / "f" / "a.tif").write_text(
+        '<VRTDataset rasterXSize="320" rasterYSize="240"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>'
+        f"<SourceFilename>{tmp_path / 'other' / 'f1.png'}</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"
+    )
+    assert_stops(tmp_path / "f", "found a VRT")
+
+
+def test_nothing_there_an_empty_folder_and_a_folder_of_videos_stop(tmp_path, frames):
+    assert_stops(tmp_path / "none", "found no video or picture folder")
+    (tmp_path / "empty").mkdir()
+    assert_stops(tmp_path / "empty", "found no pictures in the folder")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    assert_stops(tmp_path / "loop", "found no video or picture folder")
+
+
+def test_float_pictures_are_no_frames(tmp_path):
+    Image.fromarray(np.ones((8, 8), np.float32)).save(tmp_path / "a.tif")
+    info = probe(tmp_path, frames=FPS)
+    (read,) = iter_frames(tmp_path, info, [0])
+    assert read.flags == FrameFlag.UNREADABLE
+    assert "expected grey or colour levels" in read.reason

@@ -1,0 +1,232 @@
+"""Rendered frames, the base image, what is written, what is read back, and the scores."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+
+from schemas.simulation import CameraSimulation, SceneSimulation, SimulationConfig, TrafficSimulation
+from velfield.errors import InputError
+from velfield.synthetic import (
+    fit_homography,
+    load_truth,
+    score_detections,
+    score_field,
+    score_registration,
+    score_tracklets,
+    small_flight,
+    truth_of,
+    write_flight,
+)
+from velfield.synthetic.cases import FLAT
+from velfield.synthetic.truth import CAR_COLUMNS, Truth
+
+STEADY = CameraSimulation(noise_grey=0, motion_blur_px=0, exposure_share=0)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Truth:
+    return truth_of(small_flight(frames=12))
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("flight") / "sim"
+    calls: list[tuple[int, int]] = []
+    config = SimulationConfig(frames=6, width=320, height=240, labelled_frames=2)
+    write_flight(out, config, lambda done, total: calls.append((done, total)))
+    assert calls == [(k, 6) for k in range(1, 7)]
+    return out
+
+
+def test_same_seed_same_picture_another_seed_another() -> None:
+    first, again, other = (small_flight(frames=2, width=320, height=240, seed=s) for s in (5, 5, 6))
+    assert np.array_equal(first.frame(1), again.frame(1))
+    assert np.array_equal(first.base_image, again.base_image)
+    assert not np.array_equal(first.frame(1), other.frame(1))
+
+
+def test_frames_do_not_depend_on_the_order_they_are_asked_for() -> None:
+    forward, backward = small_flight(frames=3, width=320, height=240), small_flight(frames=3, width=320, height=240)
+    wanted = [forward.frame(k) for k in range(3)]
+    got = [backward.frame(k) for k in (2, 1, 0)][::-1]
+    assert all(np.array_equal(a, b) for a, b in zip(wanted, got, strict=True))
+
+
+def test_cars_are_drawn_where_the_labels_say() -> None:
+    scene = FLAT.model_copy(update={"sun_length": 0.0})
+    flight = small_flight(frames=3, camera=STEADY, scene=scene)
+    empty = small_flight(
+        frames=3,
+        camera=STEADY,
+        scene=scene.model_copy(update={"parked_share": 0.0}),
+        traffic=TrafficSimulation(flow_veh_per_h=0, warm_up_s=0),
+    )
+    painted = np.abs(flight.frame(2).astype(int) - empty.frame(2).astype(int)) > 1
+    labels = flight.labels(2)
+    inside = labels["x_px"].between(25, 614) & labels["y_px"].between(25, 454)
+    alone = labels[inside & (labels["length_px"] < 30)]
+    assert len(alone) > 15
+    offsets = []
+    for car in alone.itertuples():
+        box = cv2.boxPoints(
+            ((car.x_px, car.y_px), (car.length_px + 3, car.width_px + 3), np.degrees(car.orientation_rad))
+        )
+        mask = np.zeros(painted.shape, np.uint8)
+        cv2.fillPoly(mask, [np.rint(box).astype(np.int32)], 1)
+        y, x = np.nonzero(painted & (mask > 0))
+        assert len(x) > 0.6 * car.length_px * car.width_px
+        offsets.append((x.mean() - car.x_px, y.mean() - car.y_px))
+    assert np.abs(np.median(offsets, axis=0)).max() < 0.3
+    assert np.median(np.hypot(*np.array(offsets).T)) < 0.8
+
+
+def test_the_base_image_is_of_another_sensor_and_has_no_traffic() -> None:
+    flight = small_flight(frames=2)
+    frame, base = flight.frame(0), flight.base_image
+    y, x = np.mgrid[0:480:4, 0:640:4]
+    at = flight.camera.to_base(0, np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)).astype(np.float32)
+    seen = cv2.remap(base, at[:, 0].reshape(y.shape), at[:, 1].reshape(y.shape), cv2.INTER_LINEAR)
+    likeness = np.corrcoef(frame[::4, ::4].ravel(), seen.ravel())[0, 1]
+    assert 0.4 < likeness < 0.97
+    inside = (at > 0).all() and (at < base.shape[::-1]).all()
+    assert inside
+
+
+def test_buildings_hide_cars_and_trees_cast_shadows() -> None:
+    bare = small_flight(frames=1, camera=STEADY, scene=FLAT)
+    built = small_flight(frames=1, camera=STEADY, scene=SceneSimulation(relief_m=0))
+    assert np.abs(bare.frame(0).astype(int) - built.frame(0)).mean() > 3
+
+
+def test_what_is_written_is_what_the_command_promises(written: Path) -> None:
+    frames = sorted((written / "frames").glob("*.png"))
+    times = pd.read_csv(written / "timestamps.csv")
+    assert [f.name for f in frames] == times["frame"].tolist()
+    assert (np.diff(times["time_s"]) > 0).all()
+    assert cv2.imread(str(frames[0]), cv2.IMREAD_UNCHANGED).shape == (240, 320)
+    labels = pd.read_csv(written / "labels.csv")
+    assert list(labels.columns) == ["frame", "x_px", "y_px", "orientation_rad", "length_px", "width_px"]
+    assert set(labels["frame"]) == {"00000.png", "00003.png"}
+    assert labels["orientation_rad"].between(0, np.pi).all()
+    base = cv2.imread(str(written / "base.png"), cv2.IMREAD_UNCHANGED)
+    assert base.shape == load_truth(written).base_shape
+
+
+def test_truth_read_back_is_the_truth(written: Path) -> None:
+    read = load_truth(written)
+    flight = small_flight(frames=6, width=320, height=240, labelled_frames=2)
+    memory = truth_of(flight)
+    xy = np.random.default_rng(0).uniform([0, 0], [319, 239], (100, 2))
+    assert np.array_equal(read.to_base(4, xy), memory.to_base(4, xy))
+    pd.testing.assert_frame_equal(read.cars, memory.cars)
+    assert {name: str(kind) for name, kind in read.cars.dtypes.items()} == CAR_COLUMNS
+    assert len(read.lanes) == len(memory.lanes)
+
+
+def test_another_flight_is_not_written_over(written: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="another configuration"):
+        write_flight(written, SimulationConfig(frames=6, width=320, height=240, seed=9))
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="other files"):
+        write_flight(tmp_path, SimulationConfig(frames=1, width=64, height=64))
+    with pytest.raises(InputError, match="no truth"):
+        load_truth(tmp_path)
+    assert json.loads((written / "simulation.json").read_text())["seed"] == 0
+
+
+def test_cars_of_the_truth_agree_with_its_map(truth: Truth) -> None:
+    cars = truth.cars[(truth.cars["frame"] == 7) & truth.cars["visible"]]
+    raw, base = cars[["x_raw_px", "y_raw_px"]].to_numpy(), cars[["x_base_px", "y_base_px"]].to_numpy()
+    assert np.abs(truth.to_base(7, raw) - base).max() < 0.02
+
+
+def test_velocity_of_the_truth_is_what_its_places_say(truth: Truth) -> None:
+    steps = truth.segments()
+    cars = truth.cars.set_index(["frame", "vehicle_id"])
+    before = cars.loc[pd.MultiIndex.from_frame(steps[["frame", "vehicle_id"]])]
+    error = np.hypot(
+        steps["vx_px_per_s"].to_numpy() - before["vx_px_per_s"].to_numpy(),
+        steps["vy_px_per_s"].to_numpy() - before["vy_px_per_s"].to_numpy(),
+    )
+    assert len(steps) > 50
+    assert np.median(error) < 2.0
+
+
+def test_a_perfect_run_scores_perfectly(truth: Truth) -> None:
+    score = score_registration(truth, truth.to_base, range(12))
+    assert score.mean_px == 0
+    assert score.jitter_px == 0
+    visible = truth.cars[truth.cars["visible"]]
+    found = visible.rename(columns={"x_base_px": "x_px", "y_base_px": "y_px"})
+    detections = score_detections(truth, found)
+    assert (detections.precision, detections.recall) == (1.0, 1.0)
+    assert detections.axis_median_rad == 0
+
+
+def test_a_run_on_another_grid_scores_after_the_best_homography(truth: Truth) -> None:
+    turn = np.array([[0.9, -0.2, 40.0], [0.2, 0.9, -15.0], [1e-5, 0, 1.0]])
+
+    def run(frame: int, xy: np.ndarray) -> np.ndarray:
+        return cv2.perspectiveTransform(truth.to_base(frame, xy)[None], turn)[0]
+
+    matrix = fit_homography(truth, run, range(12))
+    assert score_registration(truth, run, range(12)).mean_px > 10
+    assert score_registration(truth, run, range(12), to_truth=matrix).mean_px < 1e-3
+
+
+def test_shifts_and_jitter_are_told_apart(truth: Truth) -> None:
+    shifted = score_registration(truth, lambda f, xy: truth.to_base(f, xy) + np.array([0.6, 0.8]), range(12))
+    assert shifted.mean_px == pytest.approx(1.0)
+    assert shifted.jitter_px < 1e-9
+    shaken = score_registration(truth, lambda f, xy: truth.to_base(f, xy) + np.array([(-1) ** f, 0]), range(12))
+    assert shaken.jitter_px == pytest.approx(1.0, abs=0.05)
+
+
+def tracklets_of(truth: Truth) -> pd.DataFrame:
+    """Tracklets as a perfect tracker would give them."""
+    cars = truth.cars[truth.cars["visible"]].set_index(["vehicle_id", "frame"])
+    rows = []
+    for vehicle, frame in cars.index:
+        window = [(vehicle, frame + k) for k in range(3)]
+        if all(key in cars.index for key in window):
+            a, b, c = (cars.loc[key] for key in window)
+            row = {f"frame_{k}": frame + k for k in range(3)}
+            for k, car in enumerate((a, b, c)):
+                row |= {f"x_{k}_px": car["x_base_px"], f"y_{k}_px": car["y_base_px"]}
+            for name, p, q in (("01", a, b), ("12", b, c)):
+                dt = q["time_s"] - p["time_s"]
+                row[f"vx_{name}_px_per_s"] = (q["x_base_px"] - p["x_base_px"]) / dt
+                row[f"vy_{name}_px_per_s"] = (q["y_base_px"] - p["y_base_px"]) / dt
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def test_tracklets_are_right_when_they_follow_one_vehicle(truth: Truth) -> None:
+    tracklets = tracklets_of(truth)
+    score = score_tracklets(truth, tracklets)
+    assert score.precision == 1.0
+    assert score.recall_moving > 0.97
+    assert score.speed_error_mean_km_per_h < 0.7
+    swapped = tracklets.copy()
+    swapped[["x_2_px", "y_2_px"]] = swapped[["x_2_px", "y_2_px"]].to_numpy()[::-1]
+    assert score_tracklets(truth, swapped).precision < 0.1
+
+
+def test_a_field_along_the_lanes_scores_perfectly_and_one_across_does_not(truth: Truth) -> None:
+    h, w = truth.base_shape
+    velocity, count = np.full((h, w, 2), np.nan), np.zeros((h, w), int)
+    steps = truth.segments()
+    at = np.rint(steps[["x_0_px", "y_0_px"]].to_numpy()).astype(int)
+    inside = (at >= 0).all(axis=1) & (at < [w, h]).all(axis=1)
+    velocity[at[inside, 1], at[inside, 0]] = steps.loc[inside, ["vx_px_per_s", "vy_px_per_s"]].to_numpy()
+    count[at[inside, 1], at[inside, 0]] = 5
+    assert score_field(truth, velocity, count).share_within > 0.97
+    across = np.stack([-velocity[..., 1], velocity[..., 0]], axis=-1)
+    assert score_field(truth, across, count).share_within < 0.2
+    half = np.diag([0.5, 0.5, 1.0])
+    shrunk, few = velocity[::2, ::2], count[::2, ::2]
+    assert score_field(truth, shrunk, few, to_truth=np.linalg.inv(half)).share_within > 0.97

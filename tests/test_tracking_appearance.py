@@ -1,0 +1,86 @@
+"""Looks: kernels equal their plain definitions; an axis has no front."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from velfield.tracking.appearance import (
+    CAR_LENGTH_PX,
+    CAR_WIDTH_PX,
+    FACE_SHIFT_PX,
+    Looks,
+    face_differences,
+    faces,
+    look_differences,
+    patch_differences,
+)
+
+RNG = np.random.default_rng(5)
+PATCHES = RNG.integers(0, 256, (6, 16, 8), np.uint8)
+CROPS = RNG.integers(0, 256, (5, 32, 32), np.uint8)
+AXES = np.array([0.0, 0.4, 1.6, 2.9, np.nan])
+FIRST, SECOND = (g.ravel() for g in np.meshgrid(np.arange(5), np.arange(5), indexing="ij"))
+
+
+def plain_patch_difference(p: NDArray[np.uint8], q: NDArray[np.uint8], shift: int) -> float:
+    inner = p[shift : 16 - shift, shift : 8 - shift].astype(float)
+    return min(
+        float(np.abs(inner - r[shift + dy : 16 - shift + dy, shift + dx : 8 - shift + dx]).mean())
+        for r in (q.astype(float), q[::-1, ::-1].astype(float))
+        for dy in range(-shift, shift + 1)
+        for dx in range(-shift, shift + 1)
+    )
+
+
+def plain_face_difference(i: int, j: int) -> float:
+    """Birchfield and Tomasi's difference over every second pixel of the car, least over the shifts."""
+
+    def ranges(crop: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        near = [0.5 * (crop + np.roll(crop, s, axis)) for axis in (0, 1) for s in (1, -1)]
+        return np.floor(np.min([crop, *near], axis=0)), np.ceil(np.max([crop, *near], axis=0))
+
+    def car(axis: float) -> NDArray[np.bool_]:
+        y, x = np.mgrid[-16:16, -16:16]
+        if np.isnan(axis):
+            return np.asarray(np.hypot(x, y) <= CAR_WIDTH_PX)
+        along, across = x * np.cos(axis) + y * np.sin(axis), y * np.cos(axis) - x * np.sin(axis)
+        return np.asarray((abs(along) <= CAR_LENGTH_PX / 2) & (abs(across) <= CAR_WIDTH_PX / 2))
+
+    p, q = CROPS[i].astype(float), CROPS[j].astype(float)
+    (p_low, p_high), (q_low, q_high) = ranges(p), ranges(q)
+    every_second = np.zeros((32, 32), bool)
+    every_second[FACE_SHIFT_PX : 32 - FACE_SHIFT_PX : 2, FACE_SHIFT_PX : 32 - FACE_SHIFT_PX : 2] = True
+    mine = car(AXES[i]) & every_second
+    best = 255.0
+    steps = range(-FACE_SHIFT_PX, FACE_SHIFT_PX + 1)
+    for dy, dx in ((dy, dx) for dy in steps for dx in steps):
+        moved, low, high, on = (np.roll(a, (-dy, -dx), (0, 1)) for a in (q, q_low, q_high, car(AXES[j])))
+        both = mine & on
+        if both.sum() and 2 * both.sum() >= mine.sum():
+            outside = np.maximum.reduce([p - high, low - p, moved - p_high, p_low - moved, np.zeros_like(p)])
+            best = min(best, float(outside[both].mean()))
+    return best
+
+
+def test_patch_differences_equal_the_plain_ones() -> None:
+    for shift in (0, 1, 2):
+        got = patch_differences(PATCHES, PATCHES, FIRST, SECOND, max_shift_px=shift)
+        plain = [plain_patch_difference(PATCHES[i], PATCHES[j], shift) for i, j in zip(FIRST, SECOND, strict=True)]
+        assert np.allclose(got, plain)
+
+
+def test_a_patch_turned_about_is_the_same_car() -> None:
+    turned = np.ascontiguousarray(PATCHES[:, ::-1, ::-1])
+    assert np.all(patch_differences(PATCHES, turned, np.arange(6), np.arange(6)) == 0)
+
+
+def test_face_differences_equal_the_plain_ones() -> None:
+    prepared = faces(CROPS, AXES)
+    got = face_differences(prepared, prepared, FIRST, SECOND)
+    assert np.allclose(got, [plain_face_difference(i, j) for i, j in zip(FIRST, SECOND, strict=True)])
+
+
+def test_unknown_looks_differ_by_nothing_known() -> None:
+    nothing = Looks(None, None)
+    one = np.zeros(1, np.int64)
+    assert np.isnan(look_differences(nothing, Looks(PATCHES, None), one, one)).all()
+    assert look_differences(Looks(PATCHES, None), Looks(PATCHES, faces(CROPS, AXES)), one, one) == 0

@@ -1,0 +1,90 @@
+"""Displacement below the pixel: the car's, not the ground's, with an honest standard deviation."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.tracking_scenes import CHIP, Car, Detector, car, chips_of, draw, looks, road, watch
+from velfield.tracking.refine import align_crops
+
+
+def moved_cars(n: int, *, noise: float = 3.0, jitter: float = 0.8):  # type: ignore[no-untyped-def]
+    """Crops of cars before and after they moved over a standing ground; axes; the true shift between the crops."""
+    rng = np.random.default_rng(11)
+    ground = road(rng, (96, 96))
+    before, after, axes, shifts = [], [], [], []
+    for _ in range(n):
+        heading, style = rng.uniform(0, np.pi), looks(rng)
+        at = rng.uniform(38, 42, 2)
+        step = rng.uniform(8, 20) * np.array([np.cos(heading), np.sin(heading)])
+        seen = []
+        for k in (0, 1):
+            x, y = at + k * step
+            it = Car(lambda t, x=x, y=y: (x, y), lambda t, h=heading: h, *style)  # type: ignore[misc]
+            picture = draw(ground, [it], 0.0) + rng.normal(0, noise, (96, 96))
+            found = np.array([[x, y]]) + rng.normal(0, jitter, (1, 2))
+            (before, after)[k].append(chips_of(picture, found)[0])
+            seen.append((x, y) - np.rint(found[0]))
+        axes.append(heading + rng.normal(0, 0.05))
+        shifts.append(seen[1] - seen[0])
+    return np.array(before), np.array(after), np.array(axes) % np.pi, np.array(shifts)
+
+
+def test_alignment_is_ten_times_better_than_the_detections() -> None:
+    before, after, axes, shifts = moved_cars(60)
+    index = np.arange(60)
+    found = align_crops(before, after, axes, axes, index, index)
+    aligned = np.isfinite(found[:, 2])
+    errors = found[aligned, :2] - shifts[aligned]
+    assert aligned.mean() >= 0.95
+    assert np.sqrt(np.mean(errors**2)) < 0.12  # the detections' own: 1.1
+    assert np.mean(np.abs(errors) <= 1.645 * found[aligned, 2:]) >= 0.87
+
+
+def test_the_way_back_is_the_way_forth() -> None:
+    before, after, axes, _ = moved_cars(10)
+    index = np.arange(10)
+    forth = align_crops(before, after, axes, axes, index, index)
+    back = align_crops(after, before, axes, axes, index, index)
+    assert np.allclose(forth[:, :2], -back[:, :2], atol=0.1, equal_nan=True)
+
+
+def test_crops_without_a_picture_do_not_align() -> None:
+    flat = np.full((1, CHIP, CHIP), 100, np.uint8)
+    zero = np.zeros(1, np.int64)
+    assert np.isnan(align_crops(flat, flat, np.zeros(1), np.zeros(1), zero, zero)).all()
+
+
+def test_a_link_is_aligned_the_same_alone_and_among_others() -> None:
+    before, after, axes, _ = moved_cars(8)
+    together = align_crops(before, after, axes, axes, np.arange(8), np.arange(8))
+    for k in range(8):
+        alone = align_crops(before, after, axes, axes, np.array([k]), np.array([k]))
+        assert np.array_equal(alone[0], together[k], equal_nan=True)
+
+
+@pytest.mark.parametrize("scale", [0.8, 1.7])
+def test_working_scale_is_undone(scale: float) -> None:
+    from dataclasses import replace
+
+    from schemas.flight import TrackingConfig
+    from velfield.tracking.tracklets import link_windows
+
+    rng = np.random.default_rng(2)
+    perfect = Detector(recall=1.0, false_alarms=0.0, jitter_px=0.5)
+    seen = watch([car(rng, (60.0, 60.0), (50.0, 0.0))], [0.0, 0.2, 0.4], rng=rng, detector=perfect)
+    scaled = [replace(t, x_px=t.x_px / scale + 7, y_px=t.y_px / scale - 3, working_scale=scale) for t in seen.tables]
+    found, log = link_windows(scaled, TrackingConfig(), gsd_m=None, starts=range(1))
+    assert log["links_refined"] == 2
+    expected = np.full(1, 50.0 / scale)
+    assert np.allclose(found["vx_01_px_per_s"], expected, atol=1.0)
+    assert np.allclose(found["vx_12_px_per_s"], expected, atol=1.0)
+
+
+def test_crops_of_unlike_cars_keep_the_detections_places() -> None:
+    rng = np.random.default_rng(4)
+    one: NDArray[np.uint8] = rng.integers(0, 255, (1, CHIP, CHIP), np.uint8)
+    other: NDArray[np.uint8] = rng.integers(0, 255, (1, CHIP, CHIP), np.uint8)
+    zero = np.zeros(1, np.int64)
+    found = align_crops(one, other, np.zeros(1), np.zeros(1), zero, zero)
+    assert np.isnan(found).all() or found[0, 2] > 0.1

@@ -1,0 +1,195 @@
+"""Tracklets of named scenes: very likely right, few missed, and the same however the flight is cut."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from schemas.flight import TrackingConfig
+from schemas.tables import TRACKLET_COLUMNS
+from tests.tracking_scenes import SCENES, Detector, Watched, car, crossing, platoon, score, two_lanes_opposed, watch
+from velfield.errors import InputError
+from velfield.tracking.limits import GateLog
+from velfield.tracking.tracklets import link_windows, window_frames
+
+PAPERS_WAY = TrackingConfig(linking="links", min_confidence=0.0, refine=False)
+ALL = range(10**6)
+
+
+def uneven_times(rng: np.random.Generator, n: int, interval_s: float = 0.2) -> list[float]:
+    return (np.arange(n) * interval_s + rng.uniform(-0.1, 0.1, n) * interval_s).tolist()
+
+
+def scene(name: str, seed: int = 0, frames: int = 16, **how: object) -> Watched:
+    rng = np.random.default_rng(seed)
+    cars = SCENES[name](rng)
+    return watch(cars, uneven_times(rng, frames), rng=rng, **how)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", list(SCENES))
+def test_tracklets_follow_one_car(name: str) -> None:
+    seen = scene(name)
+    found, _ = link_windows(seen.tables, TrackingConfig(), gsd_m=None, starts=ALL)
+    result = score(seen, found)
+    assert result.moving_precision >= 0.99, result
+    assert result.precision >= 0.99, result
+    assert result.recall >= 0.9, result
+    assert result.moving_recall >= 0.85, result
+    assert result.speed_rms_px_per_s <= 1.5, result  # 1.2 km/h at 0.23 m; the detections alone: 2.5 px/s
+
+
+def test_at_25_frames_a_second_too() -> None:
+    rng = np.random.default_rng(4)
+    seen = watch(two_lanes_opposed(rng), uneven_times(rng, 16, 0.04), rng=rng)
+    result = score(seen, link_windows(seen.tables, TrackingConfig(), gsd_m=None, starts=ALL)[0])
+    assert result.precision >= 0.99
+    assert result.recall >= 0.9
+
+
+@pytest.mark.parametrize("speed", [25.0, 62.5, 125.0])
+def test_a_platoon_is_not_linked_each_to_the_one_behind(speed: float) -> None:
+    """At 125 px/s a car moves just its spacing in a frame: standing still is as smooth a motion as the true one."""
+    rng = np.random.default_rng(7)
+    seen = watch(platoon(rng, speed_px_per_s=speed), uneven_times(rng, 12), rng=rng)
+    found, _ = link_windows(seen.tables, TrackingConfig(), gsd_m=None, starts=ALL)
+    result = score(seen, found)
+    assert result.precision >= 0.99, result
+    assert result.recall >= 0.9, result
+    assert np.median(found["vx_01_px_per_s"]) == pytest.approx(speed, abs=1)
+
+
+def test_near_look_alikes_are_told_apart_where_the_papers_way_loses_half() -> None:
+    rng = np.random.default_rng(8)
+    seen = watch(platoon(rng, alike=0.8), uneven_times(rng, 16), rng=rng)
+    joint = score(seen, link_windows(seen.tables, TrackingConfig(), gsd_m=None, starts=ALL)[0])
+    papers = score(seen, link_windows(seen.tables, PAPERS_WAY, gsd_m=None, starts=ALL)[0])
+    assert joint.precision >= 0.98
+    assert joint.recall >= 0.85
+    assert papers.recall < 0.7
+
+
+def test_perfect_look_alikes_are_mostly_left_alone() -> None:
+    rng = np.random.default_rng(9)
+    seen = watch(platoon(rng, alike=1.0), uneven_times(rng, 16), rng=rng)
+    assert score(seen, link_windows(seen.tables, TrackingConfig(), gsd_m=None, starts=ALL)[0]).recall < 0.4
+
+
+def test_the_papers_way_is_there_too() -> None:
+    seen = scene("queue at red")
+    found, log = link_windows(seen.tables, PAPERS_WAY, gsd_m=None, starts=ALL)
+    assert score(seen, found).precision >= 0.95
+    assert log["appearance"] > 0
+
+
+def test_confidence_says_how_often_a_tracklet_is_right() -> None:
+    """Of tracklets that are half believed, more are wrong than of those that are believed."""
+    rng = np.random.default_rng(10)
+    poor = Detector(jitter_px=1.2, axis_sd_rad=0.12, recall=0.8, false_alarms=12.0, noise_grey=5.0)
+    seen = watch(crossing(rng), uneven_times(rng, 24), rng=rng, detector=poor)
+    found, _ = link_windows(seen.tables, TrackingConfig(min_confidence=0.0), gsd_m=None, starts=ALL)
+    sure = found["confidence"] >= 0.9
+    assert score(seen, found[sure]).precision >= 0.97
+    assert score(seen, found[~sure]).precision < 0.9
+    assert found["confidence"].between(0, 1).all()
+
+
+def test_columns_and_keys() -> None:
+    found, _ = link_windows(scene("crossing").tables, TrackingConfig(), gsd_m=None, starts=ALL)
+    assert {name: str(kind) for name, kind in found.dtypes.items()} == TRACKLET_COLUMNS
+    assert found["tracklet_id"].is_unique
+    assert (found["tracklet_id"] == found["detection_id_1"]).all()
+    assert (found["passage_id"] == -1).all()
+    for k in range(3):  # a detection stands at one place of one tracklet only
+        assert found[f"detection_id_{k}"].is_unique
+
+
+def test_a_shared_link_has_one_displacement() -> None:
+    found, _ = link_windows(scene("two lanes opposed").tables, TrackingConfig(), gsd_m=None, starts=ALL)
+    both = found.merge(
+        found, left_on=["detection_id_1", "detection_id_2"], right_on=["detection_id_0", "detection_id_1"]
+    )
+    assert len(both) > 20
+    assert (both["vx_12_px_per_s_x"] == both["vx_01_px_per_s_y"]).all()
+    assert (both["sad_12_x"] == both["sad_01_y"]).all()
+
+
+SHORT = scene("two lanes opposed", seed=3, frames=12, dropped=(4, 8, 9))
+FLAGS = [t.registered for t in SHORT.tables]
+TIMES = [t.time_s for t in SHORT.tables]
+WHOLE = link_windows(SHORT.tables, TrackingConfig(), gsd_m=None, starts=ALL)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.sets(st.integers(1, 11), max_size=8))
+def test_any_chunking_gives_the_same_tracklets(cuts: set[int]) -> None:
+    """link(parts, each with the frames of `window_frames`) == link(whole), to the bit, and their logs add up."""
+    bounds = [0, *sorted(cuts), len(TIMES)]
+    tables, log = [], GateLog()
+    for start, stop in pairwise(bounds):
+        starts = range(start, stop)
+        reads = window_frames(FLAGS, TIMES, starts, TrackingConfig().max_interval_s)
+        part = [SHORT.tables[i] for i in reads]
+        rows, counts = link_windows(part, TrackingConfig(), gsd_m=None, starts=starts)
+        tables.append(rows)
+        log = log + counts
+    pd.testing.assert_frame_equal(pd.concat(tables, ignore_index=True), WHOLE[0], check_exact=True)
+    assert {k: v for k, v in log.items() if v} == {k: v for k, v in WHOLE[1].items() if v}
+
+
+def test_a_dropped_frame_breaks_by_time_not_by_index() -> None:
+    rng = np.random.default_rng(1)
+    perfect = Detector(recall=1.0, false_alarms=0.0)
+    cars = [car(rng, (60.0, 60.0), (50.0, 0.0))]
+    at_5_fps = watch(cars, [0.0, 0.2, 0.4, 0.6], rng=rng, detector=perfect, dropped=(1,))
+    found, log = link_windows(at_5_fps.tables, TrackingConfig(), gsd_m=None, starts=ALL)
+    assert found[["frame_0", "frame_1", "frame_2"]].to_numpy().tolist() == [[0, 2, 3]]
+    assert found["vx_01_px_per_s"].item() == pytest.approx(50, abs=1.5)
+    assert log["frames_not_registered"] == 1
+    at_3_fps = watch(cars, [0.0, 0.3, 0.6, 0.9], rng=rng, detector=perfect, dropped=(1,))
+    found, log = link_windows(at_3_fps.tables, TrackingConfig(), gsd_m=None, starts=ALL)
+    assert found.empty
+    assert log["gaps_too_long"] == 1
+
+
+def test_an_interval_of_zero_never_divides() -> None:
+    rng = np.random.default_rng(1)
+    seen = watch([car(rng, (60.0, 60.0), (50.0, 0.0))], [0.0, 0.2, 0.2, 0.4], rng=rng)
+    found, log = link_windows(seen.tables, TrackingConfig(), gsd_m=None, starts=ALL)
+    assert found.empty
+    assert log["gaps_too_long"] == 1
+
+
+def test_frames_out_of_time_order_are_refused() -> None:
+    seen = scene("platoon", frames=3)
+    with pytest.raises(InputError, match="time order"):
+        link_windows(seen.tables[::-1], TrackingConfig(), gsd_m=None, starts=ALL)
+
+
+@pytest.mark.parametrize("frames", [0, 1, 2, 5])
+def test_frames_without_detections_have_no_tracklets(frames: int) -> None:
+    rng = np.random.default_rng(0)
+    seen = watch([], np.arange(frames) * 0.2, rng=rng, detector=Detector(false_alarms=0.0))
+    found, _ = link_windows(seen.tables, TrackingConfig(), gsd_m=None, starts=ALL)
+    assert found.empty
+    assert list(found.columns) == list(TRACKLET_COLUMNS)
+
+
+def test_places_alone_make_tracklets_too() -> None:
+    """Detections from elsewhere may come without axes and without pictures."""
+    rng = np.random.default_rng(6)
+    cars = [car(rng, (x, y), (50.0, 0.0)) for x, y in [(20.0, 30.0), (80.0, 60.0), (140.0, 90.0), (60.0, 120.0)]]
+    seen = watch(cars, uneven_times(rng, 8), rng=rng, detector=Detector(recall=1.0, false_alarms=0.0))
+    unknown = {"patches": None, "chips": None, "x_work": None, "y_work": None}
+    bare = [
+        replace(t, orientation_rad=t.x_px * np.nan, orientation_sd_rad=t.x_px * np.nan, **unknown) for t in seen.tables
+    ]
+    found, log = link_windows(bare, TrackingConfig(), gsd_m=None, starts=ALL)
+    result = score(seen, found)
+    assert result.precision == 1.0
+    assert result.recall >= 0.9
+    assert found["sad_01"].isna().all()
+    assert log["links_refined"] == 0

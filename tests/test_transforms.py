@@ -1,0 +1,163 @@
+"""Maps of registration: each against plain numpy, its inverse, and its place in a vector."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from schemas.flight import RegistrationConfig
+from velfield.camera.lens import HarrisLens
+from velfield.registration import kernels
+from velfield.registration.transforms import (
+    FrameTransform,
+    HomographyTransform,
+    PolyprojectiveTransform,
+    mesh_shape,
+    normalisation_of,
+    vector_length,
+)
+
+WIDTH, HEIGHT = 640, 480
+CONFIG = RegistrationConfig(row_spline_knots=20)
+
+
+def grid(columns: int = 17, rows: int = 13, *, inset: float = 0.0) -> np.ndarray:
+    x, y = np.linspace(inset, WIDTH - 1 - inset, columns), np.linspace(inset, HEIGHT - 1 - inset, rows)
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def homography(rng: np.random.Generator) -> np.ndarray:
+    angle, scale = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 2.0)
+    c, s = scale * np.cos(angle), scale * np.sin(angle)
+    tilt = rng.uniform(-1e-4, 1e-4, 2)
+    return np.array([[c, -s, rng.uniform(-500, 500)], [s, c, rng.uniform(-500, 500)], [tilt[0], tilt[1], 1.0]])
+
+
+def bent(rng: np.random.Generator) -> PolyprojectiveTransform:
+    """A polyprojective that is a homography and some bending of a few pixels."""
+    matrix = homography(rng)
+    source = normalisation_of(grid())
+    target = normalisation_of(HomographyTransform(matrix)(grid()))
+    plain = PolyprojectiveTransform.from_homography(matrix, source, target)
+    bend = np.zeros((3, 6))
+    bend[:, 3:] = rng.uniform(-0.01, 0.01, (3, 3))
+    return PolyprojectiveTransform(plain.coefficients + bend, source, target)
+
+
+def frame_transform(rng: np.random.Generator, *, mesh: bool = True) -> FrameTransform:
+    """Everything at once: lens, bending, rows that move by some pixels and roll, a mesh."""
+    rows = rng.normal(0, 1.0, (3, CONFIG.row_spline_knots)) * np.array([[2.0], [2.0], [2e-3]])
+    shape = mesh_shape(WIDTH, HEIGHT, CONFIG.cell_size_px)
+    return FrameTransform(
+        width=WIDTH,
+        height=HEIGHT,
+        lens=HarrisLens(0.2, 323.0, 236.0, 400.0),
+        polyprojective=bent(rng),
+        row_coefficients=rows,
+        mesh=rng.normal(0, 1.0, (*shape, 2)) if mesh else None,
+        cell_size_px=CONFIG.cell_size_px,
+    )
+
+
+def test_rational_is_the_plain_formula() -> None:
+    p = bent(np.random.default_rng(0))
+    xy = grid()
+    x, y = ((xy - p.source[:2]) * p.source[2]).T
+    m = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    a, b, c = (m @ row for row in p.coefficients)
+    plain = np.stack([a / c, b / c], axis=1) / p.target[2] + p.target[:2]
+    np.testing.assert_allclose(p(xy), plain, atol=1e-9)
+
+
+def test_jacobian_is_the_difference_quotient() -> None:
+    p = bent(np.random.default_rng(1))
+    step = 1e-4
+    for axis in range(2):
+        d = np.eye(2)[axis] * step
+        np.testing.assert_allclose(
+            p.jacobian(grid())[:, :, axis], (p(grid() + d) - p(grid() - d)) / (2 * step), atol=1e-6
+        )
+
+
+def test_polyprojective_without_bending_is_the_homography() -> None:
+    matrix = homography(np.random.default_rng(2))
+    p = PolyprojectiveTransform.from_homography(matrix, normalisation_of(grid()), np.array([3.0, 4.0, 0.01]))
+    assert p.is_homography
+    np.testing.assert_allclose(p(grid()), HomographyTransform(matrix)(grid()), atol=1e-8)
+    np.testing.assert_allclose(p.homography(), matrix, atol=1e-10)
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(0, 10_000))
+def test_polyprojective_inverse_undoes_it(seed: int) -> None:
+    p = bent(np.random.default_rng(seed))
+    np.testing.assert_allclose(p.inverse(p(grid())), grid(), atol=1e-3)
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(0, 10_000))
+def test_to_raw_undoes_to_base_below_a_thousandth_of_a_pixel(seed: int) -> None:
+    t = frame_transform(np.random.default_rng(seed))
+    raw = grid(31, 23)
+    back = t.to_raw(t.to_base(raw))
+    assert np.isfinite(back).all()
+    assert np.abs(t.to_base(back) - t.to_base(raw)).max() < 1e-3
+
+
+def test_to_raw_is_nan_far_outside_the_frame() -> None:
+    t = frame_transform(np.random.default_rng(3))
+    far = t.to_base(np.array([[320.0, 240.0]])) + np.array([1e5, 1e5])
+    assert np.isnan(t.to_raw(far)).all()
+    assert np.isnan(t.to_base(np.array([[np.nan, 1.0]]))).all()
+
+
+def test_row_motion_is_a_shift_and_a_roll_by_the_raw_row() -> None:
+    t = frame_transform(np.random.default_rng(4), mesh=False)
+    raw = grid()
+    motion = t.row_motion(raw[:, 1])
+    undistorted = t.lens.undistort_points(raw)
+    offset = undistorted - t.centre
+    turned = np.stack([-offset[:, 1], offset[:, 0]], axis=1) * motion[:, 2:]
+    np.testing.assert_allclose(t.row_moved(raw), undistorted + motion[:, :2] + turned, atol=1e-9)
+
+
+def test_spline_of_equal_coefficients_is_constant() -> None:
+    first, weights = kernels.spline_basis(np.linspace(-50, HEIGHT + 50, 301), HEIGHT, 12)
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
+    assert first.min() == 0
+    assert first.max() == 12 - 4
+
+
+def test_mesh_is_bilinear_between_the_centres_of_its_cells() -> None:
+    mesh = np.arange(3 * 4 * 2, dtype=float).reshape(3, 4, 2)
+    centres = np.stack(np.meshgrid(np.arange(4) * 200 + 99.5, np.arange(3) * 200 + 99.5), axis=-1).reshape(-1, 2)
+    np.testing.assert_allclose(kernels.mesh_displacement(centres, mesh, 200), mesh.reshape(-1, 2))
+    between = np.array([[199.5, 99.5]])
+    np.testing.assert_allclose(kernels.mesh_displacement(between, mesh, 200), [(mesh[0, 0] + mesh[0, 1]) / 2])
+
+
+@pytest.mark.parametrize("model", ["row_spline", "polyprojective", "homography"])
+def test_vector_brings_the_transform_back(model: str) -> None:
+    config = RegistrationConfig.model_validate({"model": model, "row_spline_knots": 20})
+    t = frame_transform(np.random.default_rng(5))
+    if model != "row_spline":
+        t = FrameTransform(
+            width=WIDTH, height=HEIGHT, lens=t.lens, polyprojective=t.polyprojective, mesh=t.mesh, cell_size_px=200
+        )
+    vector = t.to_vector(config)
+    assert vector.shape == (vector_length(WIDTH, HEIGHT, config),)
+    back = FrameTransform.from_vector(vector, width=WIDTH, height=HEIGHT, lens=t.lens, config=config)
+    np.testing.assert_array_equal(back.to_base(grid()), t.to_base(grid()))
+
+
+def test_composition_is_one_map_after_the_other() -> None:
+    rng = np.random.default_rng(6)
+    t, p = frame_transform(rng), bent(rng)
+    both = t.followed_by(p)
+    raw = grid(inset=20)
+    there = both.to_base(raw)
+    np.testing.assert_allclose(there, p(t.to_base(raw)))
+    good = np.isfinite(there).all(axis=1)
+    back = both.to_raw(there[good])
+    found = np.isfinite(back).all(axis=1)
+    assert np.abs(both.to_base(back[found]) - there[good][found]).max() < 1e-2

@@ -1,0 +1,102 @@
+"""Warps, told from pictures whose value is their own coordinate."""
+
+import cv2
+import numpy as np
+import pytest
+
+from velfield.camera.lens import HarrisLens, pinhole
+from velfield.registration.background import median_background
+from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, normalisation_of
+from velfield.registration.warp import footprint, warp_to_base
+
+WIDTH, HEIGHT = 240, 180
+
+
+def moved(matrix: np.ndarray, *, a: float = 0.0) -> FrameTransform:
+    corners = np.array([[0.0, 0.0], [WIDTH - 1, HEIGHT - 1]])
+    lens = HarrisLens(a, 119.5, 89.5, 150.0) if a else pinhole((HEIGHT, WIDTH))
+    p = PolyprojectiveTransform.from_homography(matrix, normalisation_of(corners), normalisation_of(corners))
+    return FrameTransform(width=WIDTH, height=HEIGHT, lens=lens, polyprojective=p)
+
+
+def coordinate_picture(axis: int) -> np.ndarray:
+    line = np.arange(WIDTH if axis == 0 else HEIGHT, dtype=np.uint8)
+    return np.tile(line, (HEIGHT, 1)) if axis == 0 else np.tile(line[:, None], (1, WIDTH))
+
+
+def test_identity_leaves_the_frame_as_it_is() -> None:
+    frame = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
+    image, mask = warp_to_base(frame, moved(np.eye(3)), window=(0, 0, WIDTH, HEIGHT))
+    assert mask.all()
+    np.testing.assert_array_equal(image, frame)
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("window", [(0, 0, WIDTH, HEIGHT), (31, 17, 101, 77), (-40, -30, 90, 80)])
+def test_every_working_pixel_holds_its_own_raw_coordinate(scale: float, window: tuple[int, int, int, int]) -> None:
+    angle = 0.1
+    matrix = np.array([[np.cos(angle), -np.sin(angle), 12.0], [np.sin(angle), np.cos(angle), -5.0], [1e-5, 0, 1.0]])
+    transform = moved(matrix, a=0.15)
+    for axis in range(2):
+        image, mask = warp_to_base(coordinate_picture(axis), transform, window=window, scale=scale)
+        assert image.shape == (round(window[3] * scale), round(window[2] * scale))
+        i, j = np.mgrid[: image.shape[0], : image.shape[1]]
+        base = np.stack([window[0] + (j + 0.5) / scale - 0.5, window[1] + (i + 0.5) / scale - 0.5], axis=-1)
+        raw = transform.to_raw(base.reshape(-1, 2)).reshape(*image.shape, 2)[..., axis]
+        # a reduced picture is averaged over areas: its border is half a large pixel inside
+        inner = cv2.erode(mask.astype(np.uint8), np.ones((7, 7)), borderValue=0) > 0
+        assert inner.any()
+        error = image[inner] - raw[inner]
+        # grey levels are whole numbers: rounded once, and once more where areas are averaged first
+        assert np.abs(error).max() < (0.6 if scale >= 1 else 1.1)
+        assert abs(float(error.mean())) < 0.3
+        assert not image[~mask].any()
+
+
+def test_shrinking_averages_in_place_of_skipping() -> None:
+    frame = np.zeros((HEIGHT, WIDTH), np.uint8)
+    frame[::2] = 200
+    image, mask = warp_to_base(frame, moved(np.eye(3)), window=(0, 0, WIDTH, HEIGHT), scale=0.25)
+    assert mask.all()
+    assert np.abs(image.astype(int) - 100).max() <= 2
+
+
+def test_footprint_holds_the_frame() -> None:
+    shift = np.array([[1.0, 0.0, 7.0], [0.0, 1.0, -3.0], [0.0, 0.0, 1.0]])
+    assert footprint(moved(shift), (HEIGHT, WIDTH)) == pytest.approx((7, -3, WIDTH + 6, HEIGHT - 4))
+
+
+def test_background_has_no_traffic_on_it() -> None:
+    rng = np.random.default_rng(1)
+    ground = rng.integers(60, 120, (50, 80), dtype=np.uint8)
+    frames, masks = [], []
+    for k in range(11):
+        frame = ground.copy()
+        frame[20:28, 7 * k : 7 * k + 12] = 250
+        frames.append(frame)
+        masks.append(np.ones(frame.shape, bool))
+    found = median_background(frames, masks, trim=0.2)
+    np.testing.assert_array_equal(found.median, ground)
+    np.testing.assert_array_equal(found.high, ground)
+    assert found.valid.all()
+
+
+def test_background_is_the_median_of_those_that_see() -> None:
+    rng = np.random.default_rng(2)
+    frames = [rng.integers(0, 256, (9, 7), dtype=np.uint8) for _ in range(6)]
+    masks = [rng.random((9, 7)) < 0.6 for _ in range(6)]
+    masks[0][0, 0] = False
+    for mask in masks:
+        mask[0, 0] = False
+    found = median_background(frames, masks, trim=0.0)
+    stack = np.ma.array(frames, mask=~np.array(masks))
+    seen = found.valid
+    plain = np.floor(np.ma.median(stack, axis=0).filled(0)[seen] + 0.5)
+    np.testing.assert_array_equal(found.median[seen], plain)
+    np.testing.assert_array_equal(found.low[seen], stack.min(axis=0).filled(0)[seen])
+    assert not seen[0, 0]
+
+
+def test_background_of_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match="0 images"):
+        median_background([], [])

@@ -1,0 +1,1 @@
+"""Lens models, and their calibration from the straight lines of the scene."""

@@ -1,0 +1,322 @@
+"""Radial lens models: raw pixels to the pixels a pin-hole would have given, and back.
+
+Paper: camera calibration. Undistorted pixels have the unit of raw pixels at the centre of distortion, where the scale
+is one, and extend beyond the frame where the lens is a barrel. A model is a frozen value with a closed undistortion;
+its inverse is closed (Harris, division) or found by Newton's method to 1e-9 px (polynomial), NaN where there is none.
+
+Whatever offers ``undistort_points``, ``distort_points`` and ``undistort_tangents`` is a lens (`Lens`), so that the
+rooms after this one need not know which.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.camera import DivisionLensRecord, HarrisLensRecord, LensRecord, PolynomialLensRecord
+
+Points = NDArray[np.float64]
+
+_NEWTON_STEPS = 60
+_NEWTON_TOLERANCE = 1e-13
+
+
+class Lens(Protocol):
+    """A map between raw and undistorted pixels; points are (n, 2) float64 as (x, y)."""
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether raw and undistorted pixels are the same."""
+        ...
+
+    def undistort_points(self, xy_raw: Points) -> Points:
+        """Raw pixels (n, 2) to undistorted pixels (n, 2); NaN rows outside the model's domain."""
+        ...
+
+    def distort_points(self, xy: Points) -> Points:
+        """Undistorted pixels (n, 2) to raw pixels (n, 2); NaN rows where there is no inverse."""
+        ...
+
+    def undistort_tangents(self, xy_raw: Points, tangents: Points) -> Points:
+        """Directions (n, 2) at raw pixels (n, 2) as the undistortion turns and stretches them (its derivative)."""
+        ...
+
+    def to_record(self) -> LensRecord:
+        """The record that ``camera.json`` holds."""
+        ...
+
+
+@dataclass(frozen=True)
+class HarrisLens:
+    """Harris' model, r_d = r / sqrt(1 + a r^2), with its closed inverse r = r_d / sqrt(1 - a r_d^2).
+
+    Parameters
+    ----------
+    a
+        Distortion, in 1 / half-diagonal^2: positive is barrel, zero the pin-hole.
+    centre_x_px, centre_y_px
+        Centre of distortion, raw px; it stays where it is.
+    half_diagonal_px
+        Unit of the radius, px.
+
+    Examples
+    --------
+    >>> lens = HarrisLens(a=0.19, centre_x_px=0.0, centre_y_px=0.0, half_diagonal_px=100.0)
+    >>> lens.undistort_points(np.array([[100.0, 0.0]])).round(3)
+    array([[111.111,   0.   ]])
+    """
+
+    a: float
+    centre_x_px: float
+    centre_y_px: float
+    half_diagonal_px: float
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether this is the pin-hole."""
+        return self.a == 0.0
+
+    def _offsets(self, xy: Points) -> tuple[Points, Points]:
+        offsets = np.asarray(xy, dtype=np.float64) - (self.centre_x_px, self.centre_y_px)
+        return offsets, np.sum(offsets * offsets, axis=-1, keepdims=True) / self.half_diagonal_px**2
+
+    def undistort_points(self, xy_raw: Points) -> Points:
+        """Raw pixels (n, 2) to undistorted pixels (n, 2); NaN rows at and beyond r_d = 1 / sqrt(a)."""
+        return self._stretched(xy_raw, -self.a)
+
+    def distort_points(self, xy: Points) -> Points:
+        """Undistorted pixels (n, 2) to raw pixels (n, 2); NaN rows where a pincushion has no inverse."""
+        return self._stretched(xy, self.a)
+
+    def _stretched(self, xy: Points, a: float) -> Points:
+        offsets, radius2 = self._offsets(xy)
+        square = 1.0 + a * radius2
+        stretched = offsets / np.sqrt(np.where(square > 0, square, np.nan))
+        return np.asarray(stretched + np.array([self.centre_x_px, self.centre_y_px]))
+
+    def undistort_tangents(self, xy_raw: Points, tangents: Points) -> Points:
+        """Directions (n, 2) at raw pixels (n, 2), times the derivative of the undistortion."""
+        offsets, radius2 = self._offsets(xy_raw)
+        square = 1.0 - self.a * radius2
+        scale = 1.0 / np.sqrt(np.where(square > 0, square, np.nan))
+        slope = 0.5 * self.a * scale**3  # of the scale with the squared radius
+        return _turned(offsets / self.half_diagonal_px, tangents, scale, slope)
+
+    def to_record(self) -> HarrisLensRecord:
+        """The record that ``camera.json`` holds."""
+        return HarrisLensRecord(
+            a=self.a,
+            centre_x_px=self.centre_x_px,
+            centre_y_px=self.centre_y_px,
+            half_diagonal_px=self.half_diagonal_px,
+        )
+
+
+@dataclass(frozen=True)
+class DivisionLens:
+    """Division model, r = r_d / (1 - k r_d^2), with its closed inverse: one parameter, for lenses wider than Harris'.
+
+    Parameters
+    ----------
+    k
+        Distortion, in 1 / half-diagonal^2: positive is barrel.
+    centre_x_px, centre_y_px
+        Centre of distortion, raw px.
+    half_diagonal_px
+        Unit of the radius, px.
+
+    Examples
+    --------
+    >>> lens = DivisionLens(k=0.2, centre_x_px=0.0, centre_y_px=0.0, half_diagonal_px=100.0)
+    >>> lens.distort_points(lens.undistort_points(np.array([[100.0, 0.0]])))
+    array([[100.,   0.]])
+    """
+
+    k: float
+    centre_x_px: float
+    centre_y_px: float
+    half_diagonal_px: float
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether this is the pin-hole."""
+        return self.k == 0.0
+
+    def _offsets(self, xy: Points) -> tuple[Points, Points]:
+        offsets = (np.asarray(xy, dtype=np.float64) - (self.centre_x_px, self.centre_y_px)) / self.half_diagonal_px
+        return offsets, np.sum(offsets * offsets, axis=-1, keepdims=True)
+
+    def _placed(self, offsets: Points) -> Points:
+        return np.asarray(offsets * self.half_diagonal_px + (self.centre_x_px, self.centre_y_px))
+
+    def _scale(self, radius2: Points) -> Points:
+        divisor = 1.0 - self.k * radius2
+        # A pincushion folds where k r_d^2 = -1; a barrel ends where the divisor is zero.
+        inside = (divisor > 0) & (self.k * radius2 > -1.0)
+        return 1.0 / np.where(inside, divisor, np.nan)
+
+    def undistort_points(self, xy_raw: Points) -> Points:
+        """Raw pixels (n, 2) to undistorted pixels (n, 2); NaN rows outside the model's domain."""
+        offsets, radius2 = self._offsets(xy_raw)
+        return self._placed(offsets * self._scale(radius2))
+
+    def distort_points(self, xy: Points) -> Points:
+        """Undistorted pixels (n, 2) to raw pixels (n, 2); NaN rows where a pincushion has no inverse."""
+        offsets, radius2 = self._offsets(xy)
+        square = 1.0 + 4.0 * self.k * radius2
+        return self._placed(offsets * 2.0 / (1.0 + np.sqrt(np.where(square > 0, square, np.nan))))
+
+    def undistort_tangents(self, xy_raw: Points, tangents: Points) -> Points:
+        """Directions (n, 2) at raw pixels (n, 2), times the derivative of the undistortion."""
+        offsets, radius2 = self._offsets(xy_raw)
+        scale = self._scale(radius2)
+        return _turned(offsets, tangents, scale, self.k * scale**2)
+
+    def to_record(self) -> DivisionLensRecord:
+        """The record that ``camera.json`` holds."""
+        return DivisionLensRecord(
+            k=self.k,
+            centre_x_px=self.centre_x_px,
+            centre_y_px=self.centre_y_px,
+            half_diagonal_px=self.half_diagonal_px,
+        )
+
+
+@dataclass(frozen=True)
+class PolynomialLens:
+    """Polynomial model, r = r_d (1 + k_1 r_d^2 + k_2 r_d^4 + ...), for lenses that one parameter cannot follow.
+
+    Parameters
+    ----------
+    coefficients
+        k_1, k_2, ..., with the radius in half-diagonals.
+    centre_x_px, centre_y_px
+        Centre of distortion, raw px.
+    half_diagonal_px
+        Unit of the radius, px.
+
+    Notes
+    -----
+    Its inverse is taken on the branch that holds the centre, up to the radius where the model would fold.
+    """
+
+    coefficients: tuple[float, ...]
+    centre_x_px: float
+    centre_y_px: float
+    half_diagonal_px: float
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether this is the pin-hole."""
+        return not any(self.coefficients)
+
+    def _polynomial(self) -> NDArray[np.float64]:
+        """The scale as a polynomial in the squared radius, lowest power first."""
+        return np.array((1.0, *self.coefficients))
+
+    def fold_radius(self) -> float:
+        """Raw radius, in half-diagonals, at which the undistorted radius stops growing; infinity if never."""
+        scale = self._polynomial()
+        growth = scale * (1.0 + 2.0 * np.arange(len(scale)))
+        # A vanishing last term has its root at infinity, and the other roots lose their digits to it.
+        roots = np.polynomial.polynomial.polyroots(np.polynomial.polynomial.polytrim(growth, tol=1e-9))
+        real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+        return float(np.sqrt(real.min())) if real.size else float("inf")
+
+    def _offsets(self, xy: Points) -> tuple[Points, Points]:
+        offsets = (np.asarray(xy, dtype=np.float64) - (self.centre_x_px, self.centre_y_px)) / self.half_diagonal_px
+        return offsets, np.sum(offsets * offsets, axis=-1, keepdims=True)
+
+    def _placed(self, offsets: Points) -> Points:
+        return np.asarray(offsets * self.half_diagonal_px + (self.centre_x_px, self.centre_y_px))
+
+    def undistort_points(self, xy_raw: Points) -> Points:
+        """Raw pixels (n, 2) to undistorted pixels (n, 2); NaN rows beyond the radius where the model folds."""
+        offsets, radius2 = self._offsets(xy_raw)
+        scale = np.polynomial.polynomial.polyval(radius2, self._polynomial())
+        return self._placed(offsets * np.where(radius2 < self.fold_radius() ** 2, scale, np.nan))
+
+    def distort_points(self, xy: Points) -> Points:
+        """Undistorted pixels (n, 2) to raw pixels (n, 2); NaN rows beyond what the model reaches before it folds."""
+        offsets, radius2 = self._offsets(xy)
+        radius = np.sqrt(radius2)
+        raw_radius = self._raw_radius(radius)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            scale = np.where(radius > 0, raw_radius / radius, 1.0)
+        return self._placed(offsets * scale)
+
+    def _raw_radius(self, radius: Points) -> Points:
+        """Solve r_d * scale(r_d^2) = r by Newton's method kept inside a shrinking bracket."""
+        scale = self._polynomial()
+        growth = scale * (1.0 + 2.0 * np.arange(len(scale)))
+        polyval = np.polynomial.polynomial.polyval
+        low = np.zeros_like(radius)
+        # Without a fold the scale is positive and grows in the end: some doubling of the radius reaches past the root.
+        high = np.full_like(radius, min(self.fold_radius(), 1e3))
+        raw = np.minimum(radius, high)
+        for _ in range(_NEWTON_STEPS):
+            excess = raw * polyval(raw * raw, scale) - radius
+            low, high = np.where(excess < 0, raw, low), np.where(excess >= 0, raw, high)
+            slope = polyval(raw * raw, growth)
+            step = np.where(slope > 0, excess / np.where(slope > 0, slope, 1.0), np.inf)
+            stepped = raw - step
+            inside = (stepped >= low) & (stepped <= high)
+            following = np.where(inside, stepped, 0.5 * (low + high))
+            if np.all(np.abs(following - raw) <= _NEWTON_TOLERANCE * np.maximum(raw, 1.0)):
+                raw = following
+                break
+            raw = following
+        missed = np.abs(raw * polyval(raw * raw, scale) - radius) > 1e-9 * np.maximum(radius, 1.0)
+        return np.where(missed, np.nan, raw)
+
+    def undistort_tangents(self, xy_raw: Points, tangents: Points) -> Points:
+        """Directions (n, 2) at raw pixels (n, 2), times the derivative of the undistortion."""
+        offsets, radius2 = self._offsets(xy_raw)
+        polynomial = self._polynomial()
+        scale = np.asarray(np.polynomial.polynomial.polyval(radius2, polynomial), dtype=np.float64)
+        derivative = np.polynomial.polynomial.polyder(polynomial)
+        slope = np.asarray(np.polynomial.polynomial.polyval(radius2, derivative), dtype=np.float64)
+        return _turned(offsets, tangents, scale, slope)
+
+    def to_record(self) -> PolynomialLensRecord:
+        """The record that ``camera.json`` holds."""
+        return PolynomialLensRecord(
+            coefficients=self.coefficients,
+            centre_x_px=self.centre_x_px,
+            centre_y_px=self.centre_y_px,
+            half_diagonal_px=self.half_diagonal_px,
+        )
+
+
+def _turned(offsets: Points, tangents: Points, scale: Points, slope: Points) -> Points:
+    """Derivative of ``offsets * scale(|offsets|^2)`` along the tangents; offsets in half-diagonals."""
+    along = np.sum(offsets * tangents, axis=-1, keepdims=True)
+    return np.asarray(scale * tangents + 2.0 * slope * along * offsets)
+
+
+def pinhole(frame_shape: tuple[int, int]) -> HarrisLens:
+    """The lens without distortion of a frame of that (height, width): the identity, centred.
+
+    Examples
+    --------
+    >>> pinhole((3, 5)).centre_x_px
+    2.0
+    """
+    height, width = frame_shape
+    return HarrisLens(
+        a=0.0,
+        centre_x_px=(width - 1) / 2,
+        centre_y_px=(height - 1) / 2,
+        half_diagonal_px=0.5 * float(np.hypot(width, height)),
+    )
+
+
+def lens_from_record(record: LensRecord) -> HarrisLens | DivisionLens | PolynomialLens:
+    """The lens that a record of ``camera.json`` describes."""
+    centre_and_unit = (record.centre_x_px, record.centre_y_px, record.half_diagonal_px)
+    if isinstance(record, HarrisLensRecord):
+        return HarrisLens(record.a, *centre_and_unit)
+    if isinstance(record, DivisionLensRecord):
+        return DivisionLens(record.k, *centre_and_unit)
+    return PolynomialLens(record.coefficients, *centre_and_unit)

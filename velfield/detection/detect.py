@@ -1,0 +1,109 @@
+"""Cars of one frame on the working grid, with what tracking wants to know of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.flight import DetectionConfig
+from velfield.detection.aligned import Look, distinct, find_cars
+from velfield.detection.dense import find_cars_densely
+from velfield.detection.detector import Detector
+from velfield.detection.patches import oriented_patches, upright_chips
+from velfield.detection.scan import propose
+from velfield.detection.turned import COARSE, picture_of
+
+Floats = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+
+CAR_ASPECT = 0.45
+"""A usual car's width over its length."""
+
+
+@dataclass(frozen=True)
+class FrameDetections:
+    """Cars of a frame.
+
+    Attributes
+    ----------
+    xy : (n, 2) float64, working px.
+    orientation_rad : (n,) axial, [0, pi), from +x towards +y (down).
+    orientation_sd_rad : (n,) its standard deviation.
+    area_px : (n,) working px^2.
+    score : (n,) response; the threshold is the detector's.
+    patches : (n, 16, 8) uint8, turned along the axis.
+    chips : (n, 32, 32) uint8, upright about the rounded place.
+    """
+
+    xy: Floats
+    orientation_rad: Floats
+    orientation_sd_rad: Floats
+    area_px: Floats
+    score: Floats
+    patches: Grey
+    chips: Grey
+
+
+def detect_frame(
+    image: Grey,
+    valid: NDArray[np.bool_] | None,
+    detector: Detector,
+    config: DetectionConfig,
+    background: Grey | None = None,
+) -> FrameDetections:
+    """Find cars.
+
+    Parameters
+    ----------
+    image
+        (h, w) uint8 on the working grid.
+    valid
+        (h, w) bool: where the frame covers it; none: everywhere.
+    detector
+        Its method decides; ``config.threshold`` overrides its threshold.
+    background
+        (h, w) uint8, for a detector that looks at |frame - background|.
+    """
+    threshold = detector.threshold if config.threshold is None else config.threshold
+    length = detector.record.working_car_length_px
+    if detector.record.method == "dense":
+        cars, area = find_cars_densely(image, valid, detector.sums, config, threshold)
+    else:
+        cars = _aligned(image, valid, detector, threshold, background if detector.uses_background else None)
+        area = np.full(len(cars), length * length * CAR_ASPECT)
+    order = np.lexsort((cars[:, 0], cars[:, 1]))
+    return pictured(image, cars[order], area[order])
+
+
+def _aligned(
+    image: Grey, valid: NDArray[np.bool_] | None, detector: Detector, threshold: float, background: Grey | None
+) -> Floats:
+    """Cars (n, 5) as x, y, axis, score, axis' standard deviation."""
+    proposer, floor = detector.record.proposer, detector.record.contrast_floor
+    assert proposer is not None  # the schema says so of the aligned method
+    assert floor is not None
+    places = propose(
+        picture_of(image, background, COARSE),
+        image.shape,
+        valid,
+        detector.proposer_sums,
+        contrast_floor=floor,
+        least_score=proposer.least_score,
+    )
+    look = Look(picture_of(image, background), detector.sums, floor)
+    found = find_cars(look, places, least_score=threshold, least_first_score=proposer.least_first_score)
+    return distinct(found, detector.record.working_car_length_px)
+
+
+def pictured(image: Grey, cars: Floats, area_px: Floats) -> FrameDetections:
+    """Cars (n, 5) as x, y, axis, score, axis' standard deviation, with their pictures."""
+    xy, axis = np.ascontiguousarray(cars[:, :2]), np.ascontiguousarray(cars[:, 2])
+    return FrameDetections(
+        xy=xy,
+        orientation_rad=axis,
+        orientation_sd_rad=cars[:, 4],
+        area_px=area_px,
+        score=cars[:, 3],
+        patches=oriented_patches(image, xy, axis),
+        chips=upright_chips(image, xy),
+    )

@@ -1,0 +1,53 @@
+"""Cars from the dense response: blur, maxima, region growing above T, mean and covariance (paper: segmentation)."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from skimage.segmentation import watershed
+
+Floats = NDArray[np.float64]
+
+
+def segment_response(
+    response: NDArray[np.float32], *, sigma_px: float, threshold: float, min_region_px: int
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """The blurred response, and the regions that grow above the threshold from its maxima with four neighbours.
+
+    Returns
+    -------
+    (h, w) float32, and (h, w) int32 labels, 0 where there is no region; regions under ``min_region_px`` are dropped.
+    """
+    smooth = cv2.GaussianBlur(response, (0, 0), sigma_px)
+    above = smooth > threshold
+    peak = above & (smooth >= cv2.dilate(smooth, np.ones((3, 3), np.uint8)))
+    _, markers = cv2.connectedComponents(peak.astype(np.uint8), connectivity=8)
+    # On a flat relief watershed floods each pixel from the seed that is fewest steps away: the paper's growing.
+    labels = watershed(np.zeros(smooth.shape, np.uint8), markers, connectivity=1, mask=above).astype(np.int32)
+    size = np.bincount(labels.ravel())
+    labels[size[labels] < min_region_px] = 0
+    return smooth, labels
+
+
+def moments(labels: NDArray[np.int32], smooth: NDArray[np.float32]) -> Floats:
+    """Place, axis and peak of each region.
+
+    Returns
+    -------
+    (n, 6): x, y, axis in [0, pi), peak response, axis' standard deviation, area.
+    """
+    y, x = np.nonzero(labels)
+    _, region = np.unique(labels[y, x], return_inverse=True)
+    n = int(region.max(initial=-1)) + 1
+    if not n:
+        return np.empty((0, 6))
+    area = np.bincount(region, minlength=n).astype(np.float64)
+    cx, cy = (np.bincount(region, c, n) / area for c in (x, y))
+    dx, dy = x - cx[region], y - cy[region]
+    xx, yy, xy = (np.bincount(region, v, n) / area for v in (dx * dx, dy * dy, dx * dy))
+    axis = np.mod(0.5 * np.arctan2(2 * xy, xx - yy), np.pi)
+    elongation = np.sqrt((xx - yy) ** 2 + 4 * xy**2) / np.maximum(xx + yy, 1e-9)
+    # A round region has no axis; a car's, twice as long as wide, has it to a few degrees.
+    sd = np.clip(1.0 / (np.sqrt(area) * np.maximum(elongation, 1e-3)), 0.05, np.pi / 4)
+    peak = np.full(n, -np.inf)
+    np.maximum.at(peak, region, smooth[y, x])
+    return np.column_stack([cx, cy, axis, peak, sd, area])

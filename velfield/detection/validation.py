@@ -1,0 +1,141 @@
+"""How good a detector will be, from cars left out of its training; T and the cascade's cuts follow from it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.detector import PrecisionRecallCurve
+from velfield.detection.aligned import FIRST_ROUNDS, Look, distinct, find_cars
+from velfield.detection.detector import BoostedSums
+from velfield.detection.learning import CONTRAST_FLOOR
+from velfield.detection.samples import Scene, distance, is_far, lies_in
+from velfield.detection.scan import propose
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+STRIPES = 4
+_MATCH_PX = 8.0
+_NEAR_PX = 6.0
+_CURVE_FROM = -0.25
+"""Scores below this are no cars at any precision that is of use."""
+_CURVE_POINTS = 400
+_LOST, _MARGIN = 0.02, 0.1
+"""The cascade's cuts: the share of held-out cars that they would lose, and a margin for sites that look otherwise."""
+_KEPT_RECALL = 0.95
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a detector said where it was not trained.
+
+    Attributes
+    ----------
+    score, right : (n,) of each find, and whether it is a marked car.
+    proposed, first : (n,) how much the proposer, and the first rounds, liked each find.
+    cars : how many cars there were to be found.
+    complete : whether what is not marked is no car.
+    """
+
+    score: Floats
+    right: Bools
+    proposed: Floats
+    first: Floats
+    cars: int
+    complete: bool
+
+
+def stripes(scene: Scene, fold: int) -> Bools:
+    """(h, w) stripes across the longer side, alternately in and out, as many cars in each."""
+    height, width = scene.sample.image.shape
+    axis = 0 if width >= height else 1
+    borders = np.quantile(scene.cars[:, axis], np.arange(1, STRIPES) / STRIPES) if len(scene.cars) else np.empty(0)
+    stripe = np.searchsorted(borders, np.arange(max(width, height)))
+    inside = stripe % 2 == fold
+    return np.broadcast_to(inside if axis == 0 else inside[:, None], (height, width))
+
+
+def evidence_of_part(scene: Scene, region: Bools, proposer: BoostedSums, sums: BoostedSums) -> Evidence:
+    """Try a detector on a part (h, w) of a scene that it was not trained on."""
+    places = propose(
+        scene.coarse, scene.sample.image.shape, scene.sample.valid, proposer, contrast_floor=CONTRAST_FLOOR
+    )
+    places = places[lies_in(region, places)]
+    look = Look(scene.fine, sums, CONTRAST_FLOOR)
+    found = distinct(find_cars(look, places, least_score=_CURVE_FROM), 16.0)
+    cars = scene.cars[lies_in(region, scene.cars)]
+    counted = is_far(found, scene) | (distance(found, cars) < _MATCH_PX)
+    found = found[counted]
+    right, first = _matched(found, cars), _first_scores(look, found)
+    return Evidence(found[:, 3], right, _best_near(places, found), first, len(cars), scene.sample.complete)
+
+
+def _matched(found: Floats, cars: Floats) -> Bools:
+    """Whether each find, the best first, is the first on a car."""
+    taken = np.zeros(len(cars), bool)
+    right = np.zeros(len(found), bool)
+    for k in range(len(found)):
+        gap = np.hypot(cars[:, 0] - found[k, 0], cars[:, 1] - found[k, 1])
+        gap[taken] = np.inf
+        if len(cars) and gap.min() < _MATCH_PX:
+            taken[gap.argmin()] = right[k] = True
+    return right
+
+
+def _best_near(places: Floats, found: Floats) -> Floats:
+    if not len(found):
+        return np.empty(0)
+    near = np.hypot(found[:, None, 0] - places[:, 0], found[:, None, 1] - places[:, 1]) < _NEAR_PX
+    return np.asarray(np.where(near, places[:, 3], -np.inf).max(axis=1), np.float64)
+
+
+def _first_scores(look: Look, found: Floats) -> Floats:
+    if not len(found):
+        return np.empty(0)
+    first = look.scores(found[:, :2], found[:, 2], np.zeros(1), np.zeros((1, 2), np.int64), FIRST_ROUNDS)
+    return np.asarray(first[:, 0, 0], np.float64)
+
+
+def joined(parts: Sequence[Evidence]) -> Evidence:
+    """Evidence of several parts together."""
+    return Evidence(
+        score=np.concatenate([part.score for part in parts]),
+        right=np.concatenate([part.right for part in parts]),
+        proposed=np.concatenate([part.proposed for part in parts]),
+        first=np.concatenate([part.first for part in parts]),
+        cars=sum(part.cars for part in parts),
+        complete=all(part.complete for part in parts),
+    )
+
+
+def cut_of(scores: Floats) -> float:
+    """A score that nearly all of these exceed."""
+    known = scores[np.isfinite(scores)]
+    return float(np.quantile(known, _LOST) - _MARGIN) if len(known) else -1.0
+
+
+def curve_of(evidence: Evidence) -> PrecisionRecallCurve | None:
+    """Precision and recall against the threshold; ``chosen`` is where they are best together."""
+    if not evidence.right.any():
+        return None
+    order = np.argsort(-evidence.score, kind="stable")
+    score, right = evidence.score[order], evidence.right[order]
+    found = np.cumsum(right)
+    precision, recall = found / np.arange(1, len(found) + 1), found / evidence.cars
+    best = int(_merit(precision, recall).argmax())
+    if not evidence.complete:
+        best = int(np.searchsorted(recall, _KEPT_RECALL * recall[-1]))
+    kept = np.unique(np.r_[np.linspace(0, len(score) - 1, min(_CURVE_POINTS, len(score))).astype(int), best])
+    return PrecisionRecallCurve(
+        recall=tuple(np.round(recall[kept], 4).tolist()),
+        precision=tuple(np.round(precision[kept], 4).tolist()),
+        threshold=tuple(np.round(score[kept], 4).tolist()),
+        chosen=int(np.searchsorted(kept, best)),
+        evidence=f"{evidence.cars} cars in alternate stripes, found by a detector trained on the stripes between",
+    )
+
+
+def _merit(precision: Floats, recall: Floats) -> Floats:
+    return np.asarray(2 * precision * recall / np.maximum(precision + recall, 1e-9))

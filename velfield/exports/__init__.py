@@ -1,0 +1,1 @@
+"""What goes out: formats that others read."""

@@ -1,0 +1,94 @@
+"""From base pixels to the ground: the base image's reference system, longitude and latitude, metres, headings."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from rasterio.crs import CRS
+from rasterio.warp import transform
+
+from velfield.errors import InputError
+
+Points = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the base image lies.
+
+    Attributes
+    ----------
+    shape
+        (h, w) of the base image.
+    crs_wkt, affine
+        Reference system, and (column, row) of pixel corners to its coordinates; None where there is none.
+    gsd_m
+        Metres a base pixel; None where it is not known.
+    """
+
+    shape: tuple[int, int]
+    crs_wkt: str | None = None
+    affine: tuple[float, float, float, float, float, float] | None = None
+    gsd_m: float | None = None
+
+    @property
+    def has_crs(self) -> bool:
+        """Whether base pixels have a place on earth."""
+        return self.crs_wkt is not None and self.affine is not None
+
+    def to_crs(self, xy_px: Points) -> Points:
+        """(n, 2) base pixels to (n, 2) coordinates of the reference system.
+
+        Raises
+        ------
+        InputError
+            There is none.
+        """
+        if self.crs_wkt is None or self.affine is None:
+            raise InputError(
+                "found a run whose base image has no reference system, expected one for this format; "
+                "run with --base GEOTIFF, or export a format in pixels"
+            )
+        a, b, c, d, e, f = self.affine
+        column, row = xy_px[:, 0] + 0.5, xy_px[:, 1] + 0.5  # our 0 is a pixel's centre, theirs its corner
+        return np.column_stack([a * column + b * row + c, d * column + e * row + f])
+
+    def to_lonlat(self, xy_px: Points) -> Points:
+        """(n, 2) base pixels to (n, 2) longitude and latitude on WGS 84, degrees."""
+        xy = self.to_crs(xy_px)
+        longitude, latitude = transform(CRS.from_wkt(self.crs_wkt), CRS.from_epsg(4326), xy[:, 0], xy[:, 1])
+        return np.column_stack([longitude, latitude]).astype(np.float64)
+
+    def to_metres(self, xy_px: Points) -> Points:
+        """(n, 2) base pixels to (n, 2) metres east and north of the base image's lower left corner.
+
+        Without a reference system "north" is the picture's up.
+
+        Raises
+        ------
+        InputError
+            The ground sample distance is not known.
+        """
+        if self.gsd_m is None:
+            raise InputError(
+                "found a run without a ground sample distance, expected one for this format; run with --gsd-m"
+            )
+        rows = self.shape[0]
+        return np.column_stack([xy_px[:, 0] + 0.5, rows - 0.5 - xy_px[:, 1]]) * self.gsd_m
+
+    def heading_deg(self, xy_px: Points, velocity_px_per_s: Points) -> NDArray[np.float64]:
+        """Where a vehicle goes, degrees clockwise from north (from the picture's up where there is no reference
+        system).
+
+        Examples
+        --------
+        >>> Place((10, 10)).heading_deg(np.zeros((3, 2)), np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0]])).tolist()
+        [0.0, 90.0, 180.0]
+        """
+        if not self.has_crs:
+            return np.degrees(np.arctan2(velocity_px_per_s[:, 0], -velocity_px_per_s[:, 1])) % 360
+        speed = np.linalg.norm(velocity_px_per_s, axis=1, keepdims=True)
+        step = np.divide(velocity_px_per_s, speed, out=np.zeros_like(velocity_px_per_s), where=speed > 0)
+        here, there = self.to_lonlat(xy_px), self.to_lonlat(xy_px + step)
+        east = (there[:, 0] - here[:, 0]) * np.cos(np.radians(here[:, 1]))
+        return np.degrees(np.arctan2(east, there[:, 1] - here[:, 1])) % 360

@@ -1,0 +1,74 @@
+"""Fields on one grid add and subtract, exactly: ``merge(a, subtract(b, a)) == b`` to the bit.
+
+The field of a whole is the sum of the fields of its parts as long as no passage is split between parts.
+"""
+
+from collections.abc import Sequence
+from functools import reduce
+
+import numpy as np
+from numpy.typing import NDArray
+
+from velfield.errors import InputError
+from velfield.field.accumulate import FieldTile
+
+_LARGEST = np.iinfo(np.int32).max
+
+
+def merge_tiles(tiles: Sequence[FieldTile]) -> FieldTile:
+    """The sum of tiles of one place.
+
+    Raises
+    ------
+    InputError
+        Where the tiles differ in shape, or a sum does not fit 32 bits.
+
+    Examples
+    --------
+    >>> one = FieldTile(np.ones((1, 1, 3, 3), np.int32), np.ones((1, 1), np.int32), np.ones((1, 1), np.int32))
+    >>> merge_tiles([one, one]).count
+    array([[2]], dtype=int32)
+    """
+    if not tiles:
+        raise ValueError("merge_tiles needs at least one tile")
+    return reduce(_add, tiles)
+
+
+def subtract_tile(whole: FieldTile, part: FieldTile) -> FieldTile:
+    """What is left of ``whole`` without ``part``.
+
+    Raises
+    ------
+    InputError
+        Where the tiles differ in shape, or ``part`` holds more than ``whole``, so is no part of it.
+    """
+    left = [_difference(a, b, name) for a, b, name in zip(whole, part, FieldTile._fields, strict=True)]
+    return FieldTile(*left)
+
+
+def _add(a: FieldTile, b: FieldTile) -> FieldTile:
+    return FieldTile(*(_sum(x, y, name) for x, y, name in zip(a, b, FieldTile._fields, strict=True)))
+
+
+def _sum(a: NDArray[np.int32], b: NDArray[np.int32], name: str) -> NDArray[np.int32]:
+    _same_shape(a, b, name)
+    # Neither is negative, so a sum too large is one that comes out below a summand.
+    total = a + b
+    if (total < a).any():
+        raise InputError(f"the sum of two fields' {name} passes {_LARGEST}, the most that int32 holds: merge fewer")
+    return total
+
+
+def _difference(a: NDArray[np.int32], b: NDArray[np.int32], name: str) -> NDArray[np.int32]:
+    _same_shape(a, b, name)
+    if (b > a).any():
+        raise InputError(
+            f"the field to subtract holds more {name} than the whole at {int((b > a).sum())} places: "
+            "it is no part of it; subtract a field that was merged into this one"
+        )
+    return a - b
+
+
+def _same_shape(a: NDArray[np.int32], b: NDArray[np.int32], name: str) -> None:
+    if a.shape != b.shape:
+        raise InputError(f"the fields' {name} differ in shape, {a.shape} and {b.shape}: they must share grid and bins")

@@ -1,0 +1,256 @@
+"""What a pixel's histogram says: mean, speed percentiles, spread of direction, entropy, and how sure that is.
+
+The histogram weighs each passage once, so these are statistics over passages (in traffic terms: time-mean speeds, as a
+detector loop would give them). A histogram accumulated with ``weight="time"`` gives the space-mean in the same way.
+"""
+
+from dataclasses import dataclass
+from math import atan2, cos, erf, floor, hypot, log, pi, sqrt
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from velfield.field.bins import VelocityBins
+from velfield.field.modes import modal_velocity
+
+PERCENTILES = (15.0, 50.0, 85.0)
+"""The speed percentiles kept, %; p85 is what speed limits are set by."""
+_CELLS_PER_BIN = 8
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TileStatistics:
+    """Statistics of a tile, each (ty, tx) float64 unless it says otherwise, NaN where no vehicle passed.
+
+    Attributes
+    ----------
+    n : int32
+        Distinct passages.
+    modal_velocity_px_per_s : (ty, tx, 2)
+        Velocity of the largest mode, px/s.
+    mode_share
+        Share of the weight within two bins of that mode.
+    mean_velocity_px_per_s : (ty, tx, 2)
+        Mean velocity, px/s.
+    speed_percentiles_px_per_s : (ty, tx, 3)
+        15, 50 and 85 % of the speeds, px/s, with the broadening by kernel and bins taken out.
+    standing_share
+        Share of passages that stand: the central bin's weight against that of a blob at rest. A vehicle of half a bin's
+        speed counts for a half.
+    circular_variance
+        1 - length of the mean direction, over what moves: 0 all one way, 1 no direction; NaN where nothing moves.
+    entropy_nats
+        Of the normalised histogram, nats; log(number of bins) where all are alike.
+    direction_se_rad
+        Standard error of the mean direction of what moves, rad; NaN with fewer than two passages.
+    speed_se_px_per_s
+        Standard error of the median speed, px/s: by its binomial rank's interval, and the kernel as the noise of one
+        passage; NaN with fewer than two passages.
+    """
+
+    n: NDArray[np.int32]
+    modal_velocity_px_per_s: Float
+    mode_share: Float
+    mean_velocity_px_per_s: Float
+    speed_percentiles_px_per_s: Float
+    standing_share: Float
+    circular_variance: Float
+    entropy_nats: Float
+    direction_se_rad: Float
+    speed_se_px_per_s: Float
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _speed_cells(h: NDArray[np.int32], reach: int, cells: Float) -> float:
+    """Weight by speed in cells of 1/8 bin: each bin spreads evenly over one bin's width of speed. Returns the sum."""
+    cells[:] = 0.0
+    total = 0.0
+    half = _CELLS_PER_BIN // 2
+    for y in range(h.shape[0]):
+        for x in range(h.shape[1]):
+            if h[y, x] <= 0:
+                continue
+            weight = float(h[y, x])
+            total += weight
+            low = hypot(float(y - reach), float(x - reach)) * _CELLS_PER_BIN - half
+            if low < 0.0:  # the bin of standing still: its speeds fold at zero
+                for c in range(half):
+                    cells[c] += weight / half
+                continue
+            first = floor(low)
+            part = low - first
+            for c in range(_CELLS_PER_BIN):
+                cells[first + c] += weight * (1.0 - part) / _CELLS_PER_BIN
+                cells[first + c + 1] += weight * part / _CELLS_PER_BIN
+    return total
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _quantile(cells: Float, total: float, share: float) -> float:
+    """Speed, in bins, below which ``share`` of the weight lies; linear within a cell."""
+    target = min(max(share, 0.0), 1.0) * total
+    below = 0.0
+    for c in range(cells.size):
+        if below + cells[c] >= target and cells[c] > 0.0:
+            return float((c + max(target - below, 0.0) / cells[c]) / _CELLS_PER_BIN)
+        below += cells[c]
+    return cells.size / _CELLS_PER_BIN
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _narrowing(cells: Float, total: float, blur: float) -> float:
+    """By how much quantiles are pulled towards the median: what is left of the spread without the variance ``blur``."""
+    mean, square = 0.0, 0.0
+    for c in range(cells.size):
+        speed = (c + 0.5) / _CELLS_PER_BIN
+        mean += cells[c] * speed
+        square += cells[c] * speed * speed
+    variance = square / total - (mean / total) ** 2
+    return sqrt(max(variance - blur, 0.0) / variance)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _moments(h: NDArray[np.int32], reach: int, standing: float, mode_y: float, mode_x: float, out: Float) -> None:
+    """Of one pixel, in bins: 0 mode share, 1-2 mean (x, y), 3 resting, 4 circular variance, 5 entropy, 6 dispersion."""
+    total, near, sum_x, sum_y = 0.0, 0.0, 0.0, 0.0
+    moving, cosine, sine, plogp = 0.0, 0.0, 0.0, 0.0
+    for y in range(h.shape[0]):
+        for x in range(h.shape[1]):
+            if h[y, x] <= 0:
+                continue
+            weight = float(h[y, x])
+            vx, vy = float(x - reach), float(y - reach)
+            speed = hypot(vx, vy)
+            total += weight
+            sum_x += weight * vx
+            sum_y += weight * vy
+            plogp += weight * log(weight)
+            if (x - mode_x) ** 2 + (y - mode_y) ** 2 <= 4.0:
+                near += weight
+            if speed > standing:
+                moving += weight
+                cosine += weight * vx / speed
+                sine += weight * vy / speed
+    out[0] = near / total
+    out[1], out[2] = sum_x / total, sum_y / total
+    out[3] = h[reach, reach] / total
+    out[5] = max(log(total) - plogp / total, 0.0)
+    out[4], out[6] = np.nan, np.nan
+    if moving > 0.0:
+        length = hypot(cosine, sine) / moving
+        out[4] = max(1.0 - length, 0.0)
+        out[6] = _circular_dispersion(h, reach, standing, atan2(sine, cosine), moving, length)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _circular_dispersion(
+    h: NDArray[np.int32], reach: int, standing: float, direction: float, moving: float, length: float
+) -> float:
+    """(1 - mean cos 2(theta - direction)) / (2 length^2): n times the variance of the mean direction, rad^2."""
+    double = 0.0
+    for y in range(h.shape[0]):
+        for x in range(h.shape[1]):
+            if h[y, x] > 0:
+                vx, vy = float(x - reach), float(y - reach)
+                if hypot(vx, vy) > standing:
+                    double += h[y, x] * cos(2.0 * (atan2(vy, vx) - direction))
+    if length <= 1e-9:
+        return np.inf
+    return max(1.0 - double / moving, 0.0) / (2.0 * length * length)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _tile(
+    histogram: NDArray[np.int32],
+    count: NDArray[np.int32],
+    mode: Float,
+    standing: float,
+    sigma: float,
+    percentiles: Float,
+    moments: Float,
+    speeds: Float,
+    errors: Float,
+) -> None:
+    reach = (histogram.shape[2] - 1) // 2
+    cells = np.zeros((floor(1.5 * reach) + 3) * _CELLS_PER_BIN)
+    blur = sigma * sigma + 2.0 / 12.0  # the kernel; the bins' width when filled, and again when spread over cells
+    at_rest = erf(0.5 / (sigma * sqrt(2.0))) ** 2
+    for y in range(count.shape[0]):
+        for x in range(count.shape[1]):
+            n = count[y, x]
+            if n == 0:
+                continue
+            h = histogram[y, x]
+            _moments(h, reach, standing, mode[y, x, 1], mode[y, x, 0], moments[y, x])
+            moments[y, x, 3] = min(moments[y, x, 3] / at_rest, 1.0)
+            total = _speed_cells(h, reach, cells)
+            narrowing = _narrowing(cells, total, blur)
+            median = _quantile(cells, total, 0.5)
+            for k in range(percentiles.size):
+                speeds[y, x, k] = median + narrowing * (_quantile(cells, total, percentiles[k] / 100.0) - median)
+            if n >= 2:
+                errors[y, x, 0] = sqrt(moments[y, x, 6] / n)
+                half = 0.5 / sqrt(float(n))
+                rank = (_quantile(cells, total, 0.5 + half) - _quantile(cells, total, 0.5 - half)) / 2.0
+                errors[y, x, 1] = sqrt((narrowing * rank) ** 2 + sigma * sigma / n)
+
+
+def tile_statistics(
+    histogram: NDArray[np.int32],
+    count: NDArray[np.int32],
+    *,
+    bins: VelocityBins,
+    standing_px_per_s: float,
+    percentiles: tuple[float, ...] = PERCENTILES,
+) -> TileStatistics:
+    """All statistics of a tile.
+
+    Parameters
+    ----------
+    histogram
+        (ty, tx, nvy, nvx) int32 weights; their unit does not matter.
+    count
+        (ty, tx) int32 passages.
+    standing_px_per_s
+        What is slower has no direction; where a bin and a half is faster, that is the limit.
+    percentiles
+        Of speed, %.
+    """
+    mode_px_per_s = modal_velocity(histogram, count, bins=bins)
+    shape = count.shape
+    moments, errors = np.full((*shape, 7), np.nan), np.full((*shape, 2), np.nan)
+    speeds = np.full((*shape, len(percentiles)), np.nan)
+    # A blob at rest spills into the bins next to the central one: direction is taken from beyond them.
+    moving_bins = max(standing_px_per_s / bins.width_px_per_s, 1.5)
+    sigma = bins.kernel_sigma_px_per_s / bins.width_px_per_s
+    limits = np.asarray(percentiles, np.float64)
+    _tile(histogram, count, bins.to_bins(mode_px_per_s), moving_bins, sigma, limits, moments, speeds, errors)
+    return TileStatistics(
+        n=count,
+        modal_velocity_px_per_s=mode_px_per_s,
+        mode_share=moments[..., 0],
+        mean_velocity_px_per_s=moments[..., 1:3] * bins.width_px_per_s,
+        speed_percentiles_px_per_s=speeds * bins.width_px_per_s,
+        standing_share=moments[..., 3],
+        circular_variance=moments[..., 4],
+        entropy_nats=moments[..., 5],
+        direction_se_rad=errors[..., 0],
+        speed_se_px_per_s=errors[..., 1] * bins.width_px_per_s,
+    )
+
+
+def direction_rad(velocity_px_per_s: Float, *, standing_px_per_s: float = 0.0) -> Float:
+    """Direction of motion in (-pi, pi] from +x towards +y (down); NaN where slower than standing, or empty."""
+    vx, vy = velocity_px_per_s[..., 0], velocity_px_per_s[..., 1]
+    direction = np.arctan2(vy, vx)
+    direction = np.where(direction == -pi, pi, direction)
+    slow = ~(np.hypot(vx, vy) > standing_px_per_s)
+    return np.where(slow, np.nan, direction)
+
+
+def speed_px_per_s(velocity_px_per_s: Float) -> Float:
+    """Length of the velocity, px/s; NaN where empty."""
+    return np.hypot(velocity_px_per_s[..., 0], velocity_px_per_s[..., 1])

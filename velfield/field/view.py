@@ -1,0 +1,355 @@
+"""The velocity field to be asked: one object over tiles, wherever they come from, never more than a few in memory."""
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from threading import Lock
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from velfield.errors import InputError
+from velfield.field.accumulate import accumulate_tile
+from velfield.field.bins import VelocityBins
+from velfield.field.modes import modal_velocity, velocity_modes
+from velfield.field.prior import log_density_in_window
+from velfield.field.segments import Segments, segments_by_tile
+from velfield.field.statistics import TileStatistics, direction_rad, speed_px_per_s, tile_statistics
+
+Tile = tuple[NDArray[np.int32], NDArray[np.int32]]
+"""(ty, tx, nvy, nvx) histogram and (ty, tx) count of passages; tiles at the map's edge may be cut or padded."""
+TileSource = Callable[[int, int], Tile | None]
+"""Gives tile (ty, tx); None where nothing was seen."""
+LayerSource = Callable[[str], NDArray[Any]]
+"""Gives a whole (y, x) layer by its name."""
+
+T = TypeVar("T")
+_Place = tuple[slice, slice]
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+_TILES_KEPT = 6
+_TILES_OF_THE_MAP = 64
+_NEIGHBOURHOOD_M = 1.5
+_NEIGHBOURHOOD_PX = 6
+
+
+@dataclass(frozen=True)
+class PixelDistribution:
+    """The distribution over velocity at a pixel.
+
+    Attributes
+    ----------
+    x, y
+        The pixel.
+    n
+        Passages that it rests on.
+    bins
+        Its velocity bins.
+    weights
+        (nvy, nvx) shares of the bins, summing to one; all zero where nothing passed.
+    modes
+        (k, 3) as (vx, vy) px/s and share, the largest share first.
+    modal_velocity_px_per_s, mean_velocity_px_per_s
+        (2,) as (vx, vy) px/s, NaN where nothing passed.
+    percentiles_px_per_s
+        Speed by percentage: 15, 50, 85; px/s.
+    standing_share, circular_variance, entropy_nats, direction_se_rad, speed_se_px_per_s
+        As in `TileStatistics`.
+    """
+
+    x: int
+    y: int
+    n: int
+    bins: VelocityBins
+    weights: Float
+    modes: Float
+    modal_velocity_px_per_s: Float
+    mean_velocity_px_per_s: Float
+    percentiles_px_per_s: dict[int, float]
+    standing_share: float
+    circular_variance: float
+    entropy_nats: float
+    direction_se_rad: float
+    speed_se_px_per_s: float
+
+
+class VelocityField:
+    """A velocity field over a source of tiles.
+
+    Parameters
+    ----------
+    source
+        Gives the tile (ty, tx), or None; called from several threads where ``threads`` is more than one.
+    tiles
+        The tiles that hold anything: no other is asked for.
+    shape
+        (height, width) of the map, base px.
+    tile_size
+        Side of a tile, px.
+    bins
+        Velocity axes.
+    standing_px_per_s
+        A modal speed below this has no direction.
+    threads
+        Tiles worked on at once by the methods that go over the whole map.
+    layers
+        Gives a (y, x) layer that was made with the tiles (``modal_vx``, ``modal_vy``, ``count``), so that whole maps
+        need no tile; None: they are made from the tiles.
+    """
+
+    def __init__(
+        self,
+        source: TileSource,
+        *,
+        tiles: Sequence[tuple[int, int]],
+        shape: tuple[int, int],
+        tile_size: int,
+        bins: VelocityBins,
+        standing_px_per_s: float,
+        threads: int = 1,
+        layers: LayerSource | None = None,
+    ) -> None:
+        self.shape, self.tile_size, self.bins = shape, tile_size, bins
+        self.standing_px_per_s = standing_px_per_s
+        self.tiles = sorted(tiles)
+        self._known = frozenset(self.tiles)
+        self._source, self._threads, self._layers = source, threads, layers
+        self._kept: OrderedDict[tuple[int, int], Tile | None] = OrderedDict()
+        self._lock = Lock()
+        self._modal: Float32 | None = None
+        self._everywhere: Float | None = None
+
+    @classmethod
+    def from_segments(
+        cls,
+        segments: Segments,
+        *,
+        shape: tuple[int, int],
+        tile_size: int,
+        bins: VelocityBins,
+        radius_px: float | None,
+        standing_px_per_s: float,
+    ) -> "VelocityField":
+        """The field of a segment table, its tiles made as they are asked for."""
+        rows = segments_by_tile(segments, shape=shape, tile_size=tile_size, radius_px=radius_px)
+
+        def make(ty: int, tx: int) -> Tile:
+            origin = (tx * tile_size, ty * tile_size)
+            part = segments[rows[ty, tx]]
+            size = (tile_size, tile_size)
+            tile = accumulate_tile(part, origin_xy=origin, shape=size, bins=bins, radius_px=radius_px)
+            return tile.histogram, tile.count
+
+        return cls(
+            make, tiles=list(rows), shape=shape, tile_size=tile_size, bins=bins, standing_px_per_s=standing_px_per_s
+        )
+
+    # -- the map ------------------------------------------------------------------------------------------------------
+
+    def modal_velocity(self) -> Float32:
+        """(y, x, 2) float32 velocity of the largest mode as (vx, vy) px/s; NaN where no vehicle passed."""
+        if self._modal is None:
+            out = np.full((*self.shape, 2), np.nan, np.float32)
+            if self._layers is not None:
+                out[..., 0], out[..., 1] = self._layers("modal_vx"), self._layers("modal_vy")
+                self._modal = out
+                return out.copy()
+            for where, velocity in self._over_tiles(lambda h, c: modal_velocity(h, c, bins=self.bins)):
+                out[where] = velocity[: out[where].shape[0], : out[where].shape[1]]
+            self._modal = out
+        return self._modal.copy()
+
+    def modal_direction_rad(self, *, standing_px_per_s: float | None = None) -> Float:
+        """(y, x) direction of the largest mode in (-pi, pi], from +x towards +y (down); NaN where empty or standing."""
+        limit = self.standing_px_per_s if standing_px_per_s is None else standing_px_per_s
+        return direction_rad(self.modal_velocity().astype(np.float64), standing_px_per_s=limit)
+
+    def modal_speed_px_per_s(self) -> Float:
+        """(y, x) speed of the largest mode, px/s; NaN where no vehicle passed."""
+        return speed_px_per_s(self.modal_velocity().astype(np.float64))
+
+    def count(self) -> NDArray[np.int32]:
+        """(y, x) distinct passages; 0 where no vehicle passed."""
+        if self._layers is not None:
+            return np.array(self._layers("count"), np.int32)
+        out = np.zeros(self.shape, np.int32)
+        for where, count in self._over_tiles(lambda _h, c: c):
+            out[where] = count[: out[where].shape[0], : out[where].shape[1]]
+        return out
+
+    def statistics(self) -> TileStatistics:
+        """All statistics of every pixel, as whole maps in float32."""
+        names = [field.name for field in fields(TileStatistics)]
+        maps: dict[str, NDArray[np.generic]] = {}
+        empty = np.zeros((1, 1, self.bins.n, self.bins.n), np.int32), np.zeros((1, 1), np.int32)
+        for name in names:
+            sample = getattr(self._tile_statistics(*empty), name)
+            full = (*self.shape, *sample.shape[2:])
+            maps[name] = np.zeros(full, np.int32) if name == "n" else np.full(full, np.nan, np.float32)
+        for where, part in self._over_tiles(self._tile_statistics):
+            for name in names:
+                target = maps[name][where]
+                target[...] = getattr(part, name)[: target.shape[0], : target.shape[1]]
+        return TileStatistics(**maps)  # type: ignore[arg-type]  # float32 in place of float64: half the memory
+
+    # -- a pixel ------------------------------------------------------------------------------------------------------
+
+    def at(self, x: float, y: float) -> PixelDistribution:
+        """The distribution at base pixel (x, y).
+
+        Raises
+        ------
+        InputError
+            Where the pixel is not on the map.
+        """
+        column, row = round(x), round(y)
+        if not (0 <= column < self.shape[1] and 0 <= row < self.shape[0]):
+            raise InputError(
+                f"pixel ({column}, {row}) is not on the map: x goes from 0 to {self.shape[1] - 1}, "
+                f"y from 0 to {self.shape[0] - 1}"
+            )
+        tile = self._tile(row // self.tile_size, column // self.tile_size)
+        histogram, count = np.zeros((1, 1, self.bins.n, self.bins.n), np.int32), np.zeros((1, 1), np.int32)
+        if tile is not None:
+            y0, x0 = row % self.tile_size, column % self.tile_size
+            histogram, count = tile[0][y0 : y0 + 1, x0 : x0 + 1], tile[1][y0 : y0 + 1, x0 : x0 + 1]
+        return self._distribution(column, row, histogram, count)
+
+    def _distribution(
+        self, x: int, y: int, histogram: NDArray[np.int32], count: NDArray[np.int32]
+    ) -> PixelDistribution:
+        statistics = self._tile_statistics(histogram, count)
+        modes = velocity_modes(histogram, count, bins=self.bins)[0, 0]
+        total = int(histogram.sum(dtype=np.int64))
+        return PixelDistribution(
+            x=x,
+            y=y,
+            n=int(count[0, 0]),
+            bins=self.bins,
+            weights=histogram[0, 0] / max(total, 1),
+            modes=modes[np.isfinite(modes[:, 2])],
+            modal_velocity_px_per_s=statistics.modal_velocity_px_per_s[0, 0],
+            mean_velocity_px_per_s=statistics.mean_velocity_px_per_s[0, 0],
+            percentiles_px_per_s=dict(
+                zip((15, 50, 85), map(float, statistics.speed_percentiles_px_per_s[0, 0]), strict=True)
+            ),
+            standing_share=float(statistics.standing_share[0, 0]),
+            circular_variance=float(statistics.circular_variance[0, 0]),
+            entropy_nats=float(statistics.entropy_nats[0, 0]),
+            direction_se_rad=float(statistics.direction_se_rad[0, 0]),
+            speed_se_px_per_s=float(statistics.speed_se_px_per_s[0, 0]),
+        )
+
+    # -- a prior for another tracker ----------------------------------------------------------------------------------
+
+    def log_density(self, xy: Float, v: Float) -> Float:
+        """Log of p(v | x), density per (px/s)^2: see `velfield.field.prior`.
+
+        Parameters
+        ----------
+        xy
+            (n, 2) base pixels; outside of the map the density is the whole map's.
+        v
+            (n, 2) velocities, px/s.
+
+        Returns
+        -------
+        ndarray
+            (n,) float64, finite; NaN where ``xy`` or ``v`` is not finite.
+        """
+        xy, v = np.atleast_2d(np.asarray(xy, np.float64)), np.atleast_2d(np.asarray(v, np.float64))
+        if xy.shape != v.shape or xy.shape[1] != 2:
+            raise InputError(
+                f"log_density needs places and velocities of one shape (n, 2), found {xy.shape} and {v.shape}"
+            )
+        out = np.full(len(xy), np.nan)
+        good = np.flatnonzero(np.isfinite(xy).all(axis=1) & np.isfinite(v).all(axis=1))
+        limit = float(max(self.shape)) * 2
+        pixels = np.floor(xy[good].clip(-limit, limit) + 0.5).astype(np.int64)
+        tiles = pixels[:, ::-1] // self.tile_size
+        radius = _NEIGHBOURHOOD_PX
+        if self.bins.gsd_m is not None:
+            radius = max(1, round(_NEIGHBOURHOOD_M / self.bins.gsd_m))
+        for ty, tx in np.unique(tiles, axis=0):
+            here = np.flatnonzero((tiles == (ty, tx)).all(axis=1))
+            histogram, count, origin = self._window(int(ty), int(tx), radius)
+            out[good[here]] = log_density_in_window(
+                histogram,
+                count,
+                self._map_distribution(),
+                pixels[here] - origin,
+                self.bins.to_bins(v[good[here]]),
+                radius,
+            )
+        out -= 2 * np.log(self.bins.width_px_per_s)
+        return out
+
+    def _map_distribution(self) -> Float:
+        """(nvy, nvx) the whole map's distribution, from tiles spread over it; zero where it is empty."""
+        if self._everywhere is None:
+            total = np.zeros((self.bins.n, self.bins.n))
+            step = max(1, len(self.tiles) // _TILES_OF_THE_MAP)
+            for ty, tx in self.tiles[::step]:
+                tile = self._tile(ty, tx)
+                if tile is not None:
+                    total += tile[0].sum(axis=(0, 1), dtype=np.int64)
+            self._everywhere = total / max(total.sum(), 1)
+        return self._everywhere
+
+    def _window(self, ty: int, tx: int, margin: int) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
+        """A tile with a margin from its neighbours: histogram, count, and the pixel (x, y) of its first corner."""
+        size = self.tile_size
+        y0, x0 = ty * size - margin, tx * size - margin
+        extent = size + 2 * margin
+        histogram = np.zeros((extent, extent, self.bins.n, self.bins.n), np.int32)
+        count = np.zeros((extent, extent), np.int32)
+        for row in range(y0 // size, (y0 + extent - 1) // size + 1):
+            for column in range(x0 // size, (x0 + extent - 1) // size + 1):
+                tile = self._tile(row, column)
+                if tile is None:
+                    continue
+                height, width = tile[1].shape
+                top, left = max(row * size, y0), max(column * size, x0)
+                bottom = min(row * size + height, y0 + extent)
+                right = min(column * size + width, x0 + extent)
+                target = np.s_[top - y0 : bottom - y0, left - x0 : right - x0]
+                origin = np.s_[top - row * size : bottom - row * size, left - column * size : right - column * size]
+                histogram[target], count[target] = tile[0][origin], tile[1][origin]
+        return histogram, count, np.array([x0, y0], np.int64)
+
+    # -- tiles --------------------------------------------------------------------------------------------------------
+
+    def _tile_statistics(self, histogram: NDArray[np.int32], count: NDArray[np.int32]) -> TileStatistics:
+        return tile_statistics(histogram, count, bins=self.bins, standing_px_per_s=self.standing_px_per_s)
+
+    def _tile(self, ty: int, tx: int) -> Tile | None:
+        """A tile, from the few kept in memory where it is one of them."""
+        key = (ty, tx)
+        if key not in self._known:
+            return None
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                return self._kept[key]
+        found = self._source(ty, tx)
+        tile = None if found is None else (found[0], found[1])
+        with self._lock:
+            self._kept[key] = tile
+            while len(self._kept) > _TILES_KEPT:
+                self._kept.popitem(last=False)
+        return tile
+
+    def _over_tiles(self, work: Callable[[NDArray[np.int32], NDArray[np.int32]], T]) -> Iterator[tuple[_Place, T]]:
+        """Work on every tile, in raster order: where it stands in the map, and the result. Tiles are not kept."""
+
+        def one(key: tuple[int, int]) -> T | None:
+            tile = self._source(*key)
+            return None if tile is None else work(tile[0], tile[1])
+
+        size = self.tile_size
+        with ThreadPoolExecutor(self._threads) as pool:
+            for (ty, tx), result in zip(self.tiles, pool.map(one, self.tiles), strict=True):
+                if result is not None:
+                    yield np.s_[ty * size : (ty + 1) * size, tx * size : (tx + 1) * size], result

@@ -1,0 +1,84 @@
+"""Connected regions of a map, and a table of them."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+from numba import njit
+from numpy.typing import NDArray
+from scipy import ndimage
+
+_EIGHT = np.ones((3, 3), np.int8)
+
+
+def label_mask(mask: NDArray[np.bool_], *, min_area_px: int) -> NDArray[np.int32]:
+    """Regions of a mask, corners joined, numbered from 1; smaller ones are dropped (0)."""
+    labels, _ = ndimage.label(mask, structure=_EIGHT)
+    return keep_large(np.asarray(labels, np.int32), min_area_px=min_area_px)
+
+
+def keep_large(labels: NDArray[np.int32], *, min_area_px: int) -> NDArray[np.int32]:
+    """Regions of at least ``min_area_px``, numbered from 1 in the order of their old numbers."""
+    area = np.bincount(labels.ravel())
+    large = area >= min_area_px
+    large[0] = False
+    number = np.zeros(len(area), np.int32)
+    number[large] = np.arange(1, large.sum() + 1)
+    return np.asarray(number[labels])
+
+
+def region_table(labels: NDArray[np.int32], medians: Mapping[str, NDArray[np.floating]]) -> pd.DataFrame:
+    """A row a region: ``region``, ``x_px``, ``y_px`` (of its pixel nearest to its centre), ``area_px``, medians."""
+    rows = []
+    for k, box in enumerate(ndimage.find_objects(labels), start=1):
+        mine = labels[box] == k
+        y, x = np.nonzero(mine)
+        nearest = np.argmin((y - y.mean()) ** 2 + (x - x.mean()) ** 2)
+        row: dict[str, float] = {
+            "region": k,
+            "x_px": int(x[nearest] + box[1].start),
+            "y_px": int(y[nearest] + box[0].start),
+            "area_px": len(x),
+        }
+        for name, values in medians.items():
+            known = values[box][mine]
+            known = known[np.isfinite(known)]
+            row[name] = float(np.median(known)) if len(known) else np.nan
+        rows.append(row)
+    return pd.DataFrame(rows, columns=["region", "x_px", "y_px", "area_px", *medians])
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _root(parent: NDArray[np.int32], i: int) -> int:
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = int(parent[i])
+    return i
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def label_smooth(angle_rad: NDArray[np.float64], max_step_rad: float) -> NDArray[np.int32]:
+    """Regions within which the angle changes by no more than ``max_step_rad`` from pixel to pixel; 0 where NaN."""
+    height, width = angle_rad.shape
+    parent = np.arange(height * width).astype(np.int32)
+    for y in range(height):
+        for x in range(width):
+            for dy, dx in ((0, 1), (1, 0)):
+                j, i = y + dy, x + dx
+                if j < height and i < width:
+                    step = abs((angle_rad[y, x] - angle_rad[j, i] + np.pi) % (2 * np.pi) - np.pi)
+                    if step <= max_step_rad:  # NaN is never
+                        a, b = _root(parent, y * width + x), _root(parent, j * width + i)
+                        parent[max(a, b)] = min(a, b)
+    labels = np.zeros((height, width), np.int32)
+    number = np.zeros(height * width, np.int32)
+    found = 0
+    for y in range(height):
+        for x in range(width):
+            if not np.isnan(angle_rad[y, x]):
+                root = _root(parent, y * width + x)
+                if number[root] == 0:
+                    found += 1
+                    number[root] = found
+                labels[y, x] = number[root]
+    return labels

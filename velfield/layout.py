@@ -1,0 +1,129 @@
+"""Where everything stands in a run folder (the contract of outputs)."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+STAGES = ("frames", "lens", "base", "registration", "detector", "detections", "links", "tracklets", "field", "maps")
+"""The stages in the order of the work."""
+
+
+@dataclass(frozen=True)
+class RunLayout:
+    """Paths inside one run folder.
+
+    Examples
+    --------
+    >>> RunLayout(Path("RUN")).camera.as_posix()
+    'RUN/camera.json'
+    """
+
+    root: Path
+
+    @property
+    def flight(self) -> Path:
+        return self.root / "flight.json"
+
+    @property
+    def frames(self) -> Path:
+        return self.root / "frames.zarr"
+
+    @property
+    def camera(self) -> Path:
+        return self.root / "camera.json"
+
+    @property
+    def base(self) -> Path:
+        return self.root / "base"
+
+    @property
+    def base_image(self) -> Path:
+        return self.base / "base_image.png"
+
+    @property
+    def base_image_tif(self) -> Path:
+        return self.base / "base_image.tif"
+
+    @property
+    def own_base_image(self) -> Path:
+        """Median of the flight's own frames in the reference frame's grid; every frame is registered to it."""
+        return self.base / "own_base_image.png"
+
+    @property
+    def own_base_mask(self) -> Path:
+        """Where the own base image is known."""
+        return self.base / "own_base_mask.png"
+
+    @property
+    def base_error_map(self) -> Path:
+        """Left-out error of the registration to a given base image."""
+        return self.base / "error_map.png"
+
+    @property
+    def own_to_base(self) -> Path:
+        """Own base pixels -> base pixels, where a base image was given."""
+        return self.base / "own_to_base.json"
+
+    @property
+    def grid(self) -> Path:
+        return self.base / "grid.json"
+
+    @property
+    def background(self) -> Path:
+        return self.base / "background.npz"
+
+    @property
+    def working(self) -> Path:
+        """The grid that cars are looked for on."""
+        return self.base / "working.json"
+
+    @property
+    def registration(self) -> Path:
+        return self.root / "registration.zarr"
+
+    @property
+    def detector(self) -> Path:
+        return self.root / "detector.json"
+
+    @property
+    def detections(self) -> Path:
+        return self.root / "detections"
+
+    @property
+    def links(self) -> Path:
+        """Tracklets by unit, before tracklets that share detections are chained into passages."""
+        return self.root / "links"
+
+    @property
+    def tracklets(self) -> Path:
+        return self.root / "tracklets"
+
+    @property
+    def field(self) -> Path:
+        return self.root / "field.zarr"
+
+    @property
+    def maps(self) -> Path:
+        return self.root / "maps"
+
+    @property
+    def report(self) -> Path:
+        return self.root / "index.html"
+
+    @property
+    def commits(self) -> Path:
+        return self.root / "commits"
+
+    @property
+    def lock(self) -> Path:
+        return self.root / ".lock"
+
+    def unit_file(self, folder: Path, unit: int, suffix: str) -> Path:
+        """File of one unit of frames in ``folder``.
+
+        Examples
+        --------
+        >>> layout = RunLayout(Path("RUN"))
+        >>> layout.unit_file(layout.detections, 3, ".parquet").as_posix()
+        'RUN/detections/unit-00003.parquet'
+        """
+        return folder / f"unit-{unit:05d}{suffix}"

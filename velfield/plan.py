@@ -1,0 +1,148 @@
+"""What a run will do: its frames, its units, and the content key of every stage, known before any work is done."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.flight import FlightConfig
+from schemas.job import Job
+from schemas.records import FlightRecord, InputsRecord, SourceRecord
+from velfield.errors import InputError
+from velfield.layout import STAGES, RunLayout
+from velfield.provenance import content_key, digest_path, write_atomically
+from velfield.sources.source import SourceInfo, probe, select_frames
+from velfield.version import STAGE_VERSIONS, code_version
+
+_UNITS = ((256, 16), (4096, 64))
+"""Up to so many frames, so many a unit: a short flight is cut finely enough for several workers ..."""
+_LARGEST_UNIT = 256
+"""... and a flight of hours stays below 3,000 task runs."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A run, resolved: picklable, small, and all that a worker is told besides a unit's number."""
+
+    job: Job
+    info: SourceInfo = field(repr=False)
+    indices: NDArray[np.int64] = field(repr=False)
+    """Source indices of the frames worked on, (frames,)."""
+    inputs: InputsRecord
+    keys: dict[str, str]
+    """Content key of each stage."""
+
+    @property
+    def layout(self) -> RunLayout:
+        return RunLayout(Path(self.job.root))
+
+    @property
+    def config(self) -> FlightConfig:
+        return self.job.config
+
+    @property
+    def frame_count(self) -> int:
+        return len(self.indices)
+
+    @property
+    def unit_frames(self) -> int:
+        """Frames a unit: depends on the flight alone, never on the number of workers."""
+        asked = self.config.work.unit_frames
+        if asked != "auto":
+            return asked
+        return next((unit for frames, unit in _UNITS if self.frame_count <= frames), _LARGEST_UNIT)
+
+    @property
+    def units(self) -> list[range]:
+        """Frames of each unit."""
+        n, step = self.frame_count, self.unit_frames
+        return [range(start, min(start + step, n)) for start in range(0, n, step)]
+
+    def despite(self, lost: Sequence[str]) -> "Plan":
+        """The plan for what comes after units were lost: under keys of its own.
+
+        The next run does the lost units, and by its other keys does again what was made without them.
+        """
+        if not lost:
+            return self
+        keys = {stage: content_key(stage, 0, inputs=[key, *sorted(lost)]) for stage, key in self.keys.items()}
+        return replace(self, keys=keys)
+
+    def blocks(self, frames: range) -> list[range]:
+        """A unit's frames cut into Dask blocks."""
+        step = self.config.work.block_frames
+        return [range(start, min(start + step, frames.stop)) for start in range(frames.start, frames.stop, step)]
+
+
+def make_plan(job: Job) -> Plan:
+    """Look at the inputs and resolve the run.
+
+    Raises
+    ------
+    InputError
+        The source cannot be read, has no times, or fewer than three frames are left to work on.
+    """
+    timestamps = Path(job.inputs.timestamps) if job.inputs.timestamps else None
+    info = probe(Path(job.inputs.source), frames=job.config.frames, timestamps=timestamps)
+    indices = select_frames(info.times_s, job.config.frames)
+    if len(indices) < 3:
+        raise InputError(
+            f"{job.inputs.source}: {len(indices)} frames to work on, 3 or more needed for a tracklet; "
+            "widen --start-s/--stop-s or lower --every"
+        )
+    inputs = _digest_inputs(job, info)
+    return Plan(job=job, info=info, indices=indices, inputs=inputs, keys=stage_keys(job.config, inputs))
+
+
+def _digest_inputs(job: Job, info: SourceInfo) -> InputsRecord:
+    digests: dict[str, str | None] = {}
+    for name in ("base", "labels", "detector", "detections", "timestamps"):
+        path = getattr(job.inputs, name)
+        if path is not None and not Path(path).exists():
+            raise InputError(f"--{name}: {path} is not there; give a path that exists")
+        digests[name] = digest_path(Path(path)) if path else None
+    source = SourceRecord(
+        path=job.inputs.source,
+        kind=info.kind,
+        digest=digest_path(Path(job.inputs.source)),
+        width=info.width,
+        height=info.height,
+        frame_count=info.frame_count,
+    )
+    return InputsRecord(source=source, **digests)
+
+
+def stage_keys(config: FlightConfig, inputs: InputsRecord) -> dict[str, str]:
+    """Each stage's key holds the keys of the stages that it reads, and the parameters that it reads, no others."""
+    keys: dict[str, str] = {}
+
+    def key(stage: str, parameters: list[object], upstream: list[str], given: list[str | None] | None = None) -> None:
+        keys[stage] = content_key(
+            stage,
+            STAGE_VERSIONS[stage],
+            parameters=parameters,
+            inputs=[*(keys[name] for name in upstream), *(given or [])],
+        )
+
+    # The unit's size decides where chains are seeded anew, so per-frame results belong to it.
+    units = [config.work.unit_frames, config.work.block_frames]
+    key("frames", [config.frames], [], [inputs.source.digest, inputs.timestamps])
+    key("lens", [config.lens], ["frames"])
+    key("base", [config.base, config.registration, config.gsd_m], ["lens"], [inputs.base])
+    key("registration", [config.registration, units], ["base"])
+    key("detector", [config.detection], ["registration"], [inputs.labels, inputs.detector, inputs.detections])
+    key("detections", [config.detection], ["detector"])
+    key("links", [config.tracking], ["detections"])
+    key("tracklets", [], ["links"])
+    key("field", [config.field], ["tracklets"])
+    key("maps", [], ["field"])
+    assert tuple(keys) == STAGES
+    return keys
+
+
+def write_flight_record(plan: Plan) -> None:
+    """Write ``flight.json``."""
+    record = FlightRecord(code_version=code_version(), config=plan.config, inputs=plan.inputs)
+    write_atomically(plan.layout.flight, record.model_dump_json(indent=1).encode())

@@ -1,0 +1,323 @@
+"""Numba kernels of the raw-to-base map: second-order rational function, row spline, displacement mesh.
+
+Everything here takes plain arrays. The map of one point, in order, is
+
+    undistorted u, raw row y  ->  v = u + shift(y) + roll(y) x (u - c)  ->  P(v)  ->  + mesh(raw x, raw y)
+
+with P the rational function in normalised coordinates. The plain numpy form stands in ``tests/test_transforms.py``.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+@njit(cache=True, nogil=True)
+def rational(points, coefficients, source, target):  # type: ignore[no-untyped-def]
+    """Second-order rational function of points (n, 2); NaN where the denominator is not positive.
+
+    ``coefficients`` (3, 6) over the monomials 1, x, y, x^2, xy, y^2 of normalised coordinates (x - cx) * s, with
+    ``source`` and ``target`` each (cx, cy, s).
+    """
+    out = np.empty((points.shape[0], 2))
+    for i in range(points.shape[0]):
+        x = (points[i, 0] - source[0]) * source[2]
+        y = (points[i, 1] - source[1]) * source[2]
+        xx, xy, yy = x * x, x * y, y * y
+        w = 0.0
+        p = 0.0
+        q = 0.0
+        for row in range(3):
+            c = coefficients[row]
+            value = c[0] + c[1] * x + c[2] * y + c[3] * xx + c[4] * xy + c[5] * yy
+            if row == 0:
+                p = value
+            elif row == 1:
+                q = value
+            else:
+                w = value
+        if w > 1e-9:
+            out[i, 0] = p / w / target[2] + target[0]
+            out[i, 1] = q / w / target[2] + target[1]
+        else:
+            out[i, 0] = np.nan
+            out[i, 1] = np.nan
+    return out
+
+
+@njit(cache=True, nogil=True)
+def rational_jacobian(points, coefficients, source, target):  # type: ignore[no-untyped-def]
+    """Derivative (n, 2, 2) of `rational`: [i, a, b] is d out_a / d in_b."""
+    out = np.empty((points.shape[0], 2, 2))
+    scale = source[2] / target[2]
+    for i in range(points.shape[0]):
+        x = (points[i, 0] - source[0]) * source[2]
+        y = (points[i, 1] - source[1]) * source[2]
+        value = np.empty(3)
+        dx = np.empty(3)
+        dy = np.empty(3)
+        for row in range(3):
+            c = coefficients[row]
+            value[row] = c[0] + c[1] * x + c[2] * y + c[3] * x * x + c[4] * x * y + c[5] * y * y
+            dx[row] = c[1] + 2 * c[3] * x + c[4] * y
+            dy[row] = c[2] + c[4] * x + 2 * c[5] * y
+        w = value[2] if value[2] > 1e-9 else np.nan
+        for row in range(2):
+            out[i, row, 0] = (dx[row] - value[row] / w * dx[2]) / w * scale
+            out[i, row, 1] = (dy[row] - value[row] / w * dy[2]) / w * scale
+    return out
+
+
+@njit(cache=True, nogil=True)
+def spline_basis(rows, height, knots):  # type: ignore[no-untyped-def]
+    """Uniform cubic B-spline at rows (n,): first of its four coefficients (n,) and their weights (n, 4).
+
+    Rows beyond the frame take the border's value, so that the map does not run away there.
+    """
+    first = np.empty(rows.shape[0], np.int64)
+    weights = np.empty((rows.shape[0], 4))
+    spans = knots - 3
+    for i in range(rows.shape[0]):
+        t = (rows[i] + 0.5) / height * spans
+        t = min(max(t, 0.0), float(spans)) if t == t else 0.0
+        k = min(int(t), spans - 1)
+        f = t - k
+        g = 1.0 - f
+        first[i] = k
+        weights[i, 0] = g * g * g / 6.0
+        weights[i, 1] = (3.0 * f * f * f - 6.0 * f * f + 4.0) / 6.0
+        weights[i, 2] = (3.0 * g * g * g - 6.0 * g * g + 4.0) / 6.0
+        weights[i, 3] = f * f * f / 6.0
+    return first, weights
+
+
+@njit(cache=True, nogil=True)
+def row_moved(undistorted, rows, coefficients, height, centre):  # type: ignore[no-untyped-def]
+    """Undistorted points (n, 2) with the row's motion taken out; ``coefficients`` (3, knots): x, y px, roll rad."""
+    out = undistorted.copy()
+    if coefficients.shape[1] < 4:
+        return out
+    first, weights = spline_basis(rows, height, coefficients.shape[1])
+    for i in range(undistorted.shape[0]):
+        motion = np.zeros(3)
+        for k in range(4):
+            for c in range(3):
+                motion[c] += weights[i, k] * coefficients[c, first[i] + k]
+        out[i, 0] += motion[0] - motion[2] * (undistorted[i, 1] - centre[1])
+        out[i, 1] += motion[1] + motion[2] * (undistorted[i, 0] - centre[0])
+    return out
+
+
+@njit(cache=True, nogil=True)
+def mesh_displacement(points, mesh, cell):  # type: ignore[no-untyped-def]
+    """Displacement (n, 2) at raw points from a mesh (my, mx, 2) of nodes at the cells' centres, bilinear."""
+    out = np.zeros((points.shape[0], 2))
+    my, mx = mesh.shape[0], mesh.shape[1]
+    for i in range(points.shape[0]):
+        if not (math.isfinite(points[i, 0]) and math.isfinite(points[i, 1])):
+            continue
+        gx = min(max((points[i, 0] + 0.5) / cell - 0.5, 0.0), mx - 1.0)
+        gy = min(max((points[i, 1] + 0.5) / cell - 0.5, 0.0), my - 1.0)
+        j = min(int(gx), max(mx - 2, 0))
+        k = min(int(gy), max(my - 2, 0))
+        fx, fy = gx - j, gy - k
+        j1, k1 = min(j + 1, mx - 1), min(k + 1, my - 1)
+        for c in range(2):
+            top = mesh[k, j, c] + fx * (mesh[k, j1, c] - mesh[k, j, c])
+            bottom = mesh[k1, j, c] + fx * (mesh[k1, j1, c] - mesh[k1, j, c])
+            out[i, c] = top + fy * (bottom - top)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def normal_equations(undistorted, moved, first, basis, wanted, weight, fold, folds, knots, coefficients, norms, centre):  # type: ignore[no-untyped-def]
+    """Normal equations of the joint fit, one set a fold: matrices (folds, p, p), right sides (folds, p), squares.
+
+    Parameters are the seventeen of the rational function (a, b: 6 each, c without its leading 1), then ``knots`` each
+    of the row's shift in x, in y, and its roll (px at a distance ``norms[3]`` from the centre). Each point touches
+    17 + 12 of them, which is why this is a loop and no matrix product. ``norms`` = source cx, cy, s, roll unit, target
+    cx, cy, s. Residuals are in output px, weighted by ``weight`` (n,).
+    """
+    p = 17 + 3 * knots
+    normal = np.zeros((folds, p, p))
+    right = np.zeros((folds, p))
+    squares = np.zeros(folds)
+    index = np.empty(29, np.int64)
+    gx = np.empty(29)
+    gy = np.empty(29)
+    m = np.empty(6)
+    count = 29 if knots > 0 else 17
+    ts = norms[6]
+    for i in range(undistorted.shape[0]):
+        if weight[i] <= 0.0:
+            continue
+        x = (moved[i, 0] - norms[0]) * norms[2]
+        y = (moved[i, 1] - norms[1]) * norms[2]
+        m[0], m[1], m[2], m[3], m[4], m[5] = 1.0, x, y, x * x, x * y, y * y
+        px, py, w = 0.0, 0.0, 0.0
+        for k in range(6):
+            px += coefficients[0, k] * m[k]
+            py += coefficients[1, k] * m[k]
+            w += coefficients[2, k] * m[k]
+        if w <= 1e-9:
+            continue
+        px, py = px / w, py / w
+        for k in range(6):
+            index[k] = k
+            gx[k] = m[k] / w / ts
+            gy[k] = 0.0
+            index[6 + k] = 6 + k
+            gx[6 + k] = 0.0
+            gy[6 + k] = m[k] / w / ts
+        for k in range(5):
+            index[12 + k] = 12 + k
+            gx[12 + k] = -px * m[k + 1] / w / ts
+            gy[12 + k] = -py * m[k + 1] / w / ts
+        if knots > 0:
+            c = coefficients
+            s = norms[2] / ts / w
+            wx = c[2, 1] + 2 * c[2, 3] * x + c[2, 4] * y
+            wy = c[2, 2] + c[2, 4] * x + 2 * c[2, 5] * y
+            jxx = (c[0, 1] + 2 * c[0, 3] * x + c[0, 4] * y - px * wx) * s
+            jxy = (c[0, 2] + c[0, 4] * x + 2 * c[0, 5] * y - px * wy) * s
+            jyx = (c[1, 1] + 2 * c[1, 3] * x + c[1, 4] * y - py * wx) * s
+            jyy = (c[1, 2] + c[1, 4] * x + 2 * c[1, 5] * y - py * wy) * s
+            rx = -(undistorted[i, 1] - centre[1]) / norms[3]
+            ry = (undistorted[i, 0] - centre[0]) / norms[3]
+            for k in range(4):
+                b = basis[i, k]
+                q = first[i] + k
+                index[17 + k] = 17 + q
+                gx[17 + k] = jxx * b
+                gy[17 + k] = jyx * b
+                index[21 + k] = 17 + knots + q
+                gx[21 + k] = jxy * b
+                gy[21 + k] = jyy * b
+                index[25 + k] = 17 + 2 * knots + q
+                gx[25 + k] = (jxx * rx + jxy * ry) * b
+                gy[25 + k] = (jyx * rx + jyy * ry) * b
+        ex = wanted[i, 0] - (px / ts + norms[4])
+        ey = wanted[i, 1] - (py / ts + norms[5])
+        f = fold[i]
+        squares[f] += weight[i] * (ex * ex + ey * ey)
+        for k in range(count):
+            vx, vy = gx[k] * weight[i], gy[k] * weight[i]
+            right[f, index[k]] += vx * ex + vy * ey
+            row = normal[f, index[k]]
+            for j in range(k + 1):
+                row[index[j]] += vx * gx[j] + vy * gy[j]
+    for f in range(folds):
+        for k in range(p):
+            for j in range(k):
+                normal[f, j, k] = normal[f, k, j]
+    return normal, right, squares
+
+
+@njit(cache=True, nogil=True)
+def predicted_change(undistorted, moved, first, basis, step, fold, knots, coefficients, norms, centre):  # type: ignore[no-untyped-def]
+    """First-order change (n, 2) of the mapped points under ``step`` (folds, p), each point by its own fold's."""
+    out = np.zeros((undistorted.shape[0], 2))
+    ts = norms[6]
+    m = np.empty(6)
+    for i in range(undistorted.shape[0]):
+        d = step[fold[i]]
+        x = (moved[i, 0] - norms[0]) * norms[2]
+        y = (moved[i, 1] - norms[1]) * norms[2]
+        m[0], m[1], m[2], m[3], m[4], m[5] = 1.0, x, y, x * x, x * y, y * y
+        c = coefficients
+        px, py, w, dp, dq, dw = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(6):
+            px += c[0, k] * m[k]
+            py += c[1, k] * m[k]
+            w += c[2, k] * m[k]
+            dp += d[k] * m[k]
+            dq += d[6 + k] * m[k]
+            if k > 0:
+                dw += d[11 + k] * m[k]
+        px, py = px / w, py / w
+        out[i, 0] = (dp - px * dw) / w / ts
+        out[i, 1] = (dq - py * dw) / w / ts
+        if knots > 0:
+            s = norms[2] / ts / w
+            wx = c[2, 1] + 2 * c[2, 3] * x + c[2, 4] * y
+            wy = c[2, 2] + c[2, 4] * x + 2 * c[2, 5] * y
+            sx, sy, roll = 0.0, 0.0, 0.0
+            for k in range(4):
+                q = 17 + first[i] + k
+                sx += basis[i, k] * d[q]
+                sy += basis[i, k] * d[q + knots]
+                roll += basis[i, k] * d[q + 2 * knots]
+            sx -= roll * (undistorted[i, 1] - centre[1]) / norms[3]
+            sy += roll * (undistorted[i, 0] - centre[0]) / norms[3]
+            out[i, 0] += (c[0, 1] + 2 * c[0, 3] * x + c[0, 4] * y - px * wx) * s * sx
+            out[i, 0] += (c[0, 2] + c[0, 4] * x + 2 * c[0, 5] * y - px * wy) * s * sy
+            out[i, 1] += (c[1, 1] + 2 * c[1, 3] * x + c[1, 4] * y - py * wx) * s * sx
+            out[i, 1] += (c[1, 2] + c[1, 4] * x + 2 * c[1, 5] * y - py * wy) * s * sy
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _dot(a, b, count):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for k in range(count):
+        total += a[k] * b[k]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def solve_positive(matrix, right):  # type: ignore[no-untyped-def]
+    """Solution (p, m) of a positive definite system, by Cholesky; NaN where it is not.
+
+    In place of LAPACK, whose threads, several to each of ours, spin on systems as small as these.
+    """
+    p, m = right.shape
+    low = np.zeros((p, p))
+    for i in range(p):
+        for j in range(i):
+            low[i, j] = (matrix[i, j] - _dot(low[i], low[j], j)) / low[j, j]
+        rest = matrix[i, i] - _dot(low[i], low[i], i)
+        if not rest > 0.0:
+            return np.full((p, m), np.nan)
+        low[i, i] = np.sqrt(rest)
+    out = right.copy()
+    for c in range(m):
+        for i in range(p):
+            total = out[i, c]
+            for k in range(i):
+                total -= low[i, k] * out[k, c]
+            out[i, c] = total / low[i, i]
+        for i in range(p - 1, -1, -1):
+            out[i, c] /= low[i, i]
+            for k in range(i):
+                out[k, c] -= low[i, k] * out[i, c]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def left_out(normal, right, squares, penalty, theta):  # type: ignore[no-untyped-def]
+    """Held-out squares over all folds, and each fold's step (folds, p) when the fit is made without it."""
+    folds, p = right.shape
+    steps = np.zeros((folds, p))
+    all_normal = penalty.copy()
+    all_right = np.zeros((p, 1))
+    rest = np.zeros((p, 1))
+    for i in range(p):
+        all_right[i, 0] = -_dot(penalty[i], theta, p)
+        for f in range(folds):
+            all_right[i, 0] += right[f, i]
+            for j in range(p):
+                all_normal[i, j] += normal[f, i, j]
+    total = 0.0
+    for f in range(folds):
+        for i in range(p):
+            rest[i, 0] = all_right[i, 0] - right[f, i]
+        step = solve_positive(all_normal - normal[f], rest)[:, 0].copy()
+        steps[f] = step
+        total += squares[f]
+        for i in range(p):
+            total += step[i] * (_dot(normal[f, i], step, p) - 2.0 * right[f, i])
+    return total, steps

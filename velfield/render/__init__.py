@@ -1,0 +1,1 @@
+"""Pictures and the report: what people look at."""

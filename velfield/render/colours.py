@@ -1,0 +1,93 @@
+"""Two colour scales, made in OKLab, where equal steps look equal: a wheel for direction, a ramp for speed.
+
+The ramp rises in lightness from violet to yellow, so it reads in grey and to the colour-blind, and it starts light
+enough to stand out from a dimmed aerial picture. The wheel takes of each hue the most chroma that a screen can show,
+and swings in lightness a little with it: a wheel of one lightness would be pale all round.
+"""
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+RGB = NDArray[np.uint8]
+
+_STEPS = 1024
+_WHEEL_TURN_DEG = 29.0  # red points along +x, as on the usual hue wheel
+_RAMP = np.array(  # lightness, chroma, hue (degrees)
+    [[0.49, 0.21, 285.0], [0.57, 0.23, 315.0], [0.65, 0.22, 365.0], [0.76, 0.16, 415.0], [0.95, 0.17, 466.0]]
+)
+
+
+def direction_colours(direction_rad: NDArray[np.floating]) -> RGB:
+    """(..., 3) colours of directions; opposite directions get opposite hues. NaN is black.
+
+    Examples
+    --------
+    >>> red, cyan = direction_colours(np.array([0.0, np.pi])).astype(int)
+    >>> bool(red[0] > 200 > red[2]), bool(cyan[0] < 120 < cyan[2])
+    (True, True)
+    """
+    turn = np.nan_to_num(direction_rad) / (2 * np.pi)
+    index = np.floor(turn * _STEPS + 0.5).astype(np.int64) % _STEPS
+    return np.where(np.isnan(direction_rad)[..., None], np.uint8(0), _wheel()[index])
+
+
+def ramp_colours(share: NDArray[np.floating]) -> RGB:
+    """(..., 3) colours of numbers in [0, 1], clipped to it. NaN is black."""
+    index = np.floor(np.nan_to_num(share).clip(0, 1) * (_STEPS - 1) + 0.5).astype(np.int64)
+    return np.where(np.isnan(share)[..., None], np.uint8(0), _ramp()[index])
+
+
+@cache
+def _wheel() -> RGB:
+    hue = np.radians(np.arange(_STEPS) * 360 / _STEPS + _WHEEL_TURN_DEG)
+    lightness = 0.72 + 0.06 * np.cos(hue - np.radians(120))
+    chroma = np.full(_STEPS, 0.30)
+    for _ in range(60):  # draw in, hue by hue, until the screen can show it
+        out_of_gamut = (np.abs(_linear_rgb(lightness, chroma, hue) - 0.5) > 0.5).any(axis=-1)
+        chroma = np.where(out_of_gamut, chroma * 0.97, chroma)
+    return _srgb(_linear_rgb(lightness, _smooth_round(chroma), hue))
+
+
+@cache
+def _ramp() -> RGB:
+    at = np.linspace(0, 1, _STEPS)
+    knots = np.linspace(0, 1, len(_RAMP))
+    lightness, chroma, hue = (np.interp(at, knots, column) for column in _RAMP.T)
+    return _srgb(_linear_rgb(lightness, chroma, np.radians(hue)))
+
+
+def _smooth_round(values: Float) -> Float:
+    """A moving mean around the circle, so that the gamut's corners do not show as seams."""
+    width = _STEPS // 16
+    around = np.concatenate([values[-width:], values, values[:width]])
+    return np.convolve(around, np.ones(2 * width + 1) / (2 * width + 1), mode="valid")
+
+
+def _linear_rgb(lightness: Float, chroma: Float, hue_rad: Float) -> Float:
+    """OKLCH to linear sRGB (Ottosson's matrices), not clipped."""
+    a, b = chroma * np.cos(hue_rad), chroma * np.sin(hue_rad)
+    lms = np.stack(
+        [
+            lightness + 0.3963377774 * a + 0.2158037573 * b,
+            lightness - 0.1055613458 * a - 0.0638541728 * b,
+            lightness - 0.0894841775 * a - 1.2914855480 * b,
+        ],
+        axis=-1,
+    )
+    to_rgb = np.array(
+        [
+            [4.0767416621, -3.3077115913, 0.2309699292],
+            [-1.2684380046, 2.6097574011, -0.3413193965],
+            [-0.0041960863, -0.7034186147, 1.7076147010],
+        ]
+    )
+    return np.asarray(lms**3 @ to_rgb.T)
+
+
+def _srgb(linear: Float) -> RGB:
+    linear = linear.clip(0, 1)
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.floor(encoded * 255 + 0.5).astype(np.uint8)

@@ -1,0 +1,140 @@
+"""Small plots as inline SVG: no script, no library, sharp at any size, coloured by the page's style."""
+
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+
+from schemas.report import PrecisionRecall, ResidualSeries
+from velfield.render.figures import round_up
+from velfield.render.panel import bar_ticks
+
+_WIDTH, _HEIGHT = 720, 260
+_LEFT, _RIGHT, _TOP, _BOTTOM = 56, 16, 14, 44
+_COLUMNS = 600
+
+
+def residual_plot(series: ResidualSeries) -> str:
+    """Registration residual against time: a line, gaps and red ticks where a frame is not registered."""
+    times = np.array(series.times_s, np.float64)
+    residual = np.array([np.nan if r is None else r for r in series.residual_px], np.float64)
+    lost = times[np.isnan(residual)]
+    times, residual = _thinned(times, residual)
+    highest = float(np.nanmax(residual)) if np.isfinite(residual).any() else 1.0
+    plot = _Plot(
+        x_range=(float(times.min(initial=0.0)), float(times.max(initial=1.0))),
+        y_top=round_up(highest * 1.1),
+        x_label="time, s",
+        y_label="residual, px",
+        description=f"Registration residual against time; {len(lost)} frames are not registered.",
+    )
+    if series.limit_px is not None and series.limit_px <= plot.y_top:
+        plot.rule(series.limit_px, f"limit {series.limit_px:g} px")
+    plot.line(times, residual)
+    for time in lost[:: max(1, len(lost) // _COLUMNS)]:
+        plot.tick(float(time))
+    return plot.svg()
+
+
+def precision_recall_plot(curve: PrecisionRecall) -> str:
+    """Precision against recall, the chosen threshold marked."""
+    plot = _Plot(
+        x_range=(0.0, 1.0),
+        y_top=1.0,
+        x_label="recall",
+        y_label="precision",
+        description="Precision of the car detector against its recall.",
+    )
+    plot.line(np.array(curve.recall, np.float64), np.array(curve.precision, np.float64))
+    if curve.chosen is not None:
+        x, y = curve.recall[curve.chosen], curve.precision[curve.chosen]
+        plot.mark(x, y, f"chosen: precision {y:.2f}, recall {x:.2f}")
+    return plot.svg()
+
+
+def _thinned(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """At most `_COLUMNS` points: the highest of each run of frames, so that no peak is lost."""
+    if len(times) <= _COLUMNS:
+        return times, values
+    step = -(-len(times) // _COLUMNS)
+    starts = np.arange(0, len(times), step)
+    highest = np.maximum.reduceat(np.where(np.isnan(values), -np.inf, values), starts)
+    return times[starts], np.where(np.isneginf(highest), np.nan, highest)
+
+
+class _Plot:
+    """Axes from 0 upwards, and what is drawn in them."""
+
+    def __init__(
+        self, *, x_range: tuple[float, float], y_top: float, x_label: str, y_label: str, description: str
+    ) -> None:
+        self.x_low, self.x_high = x_range[0], max(x_range[1], x_range[0] + 1e-6)
+        self.y_top = y_top
+        self.description = description
+        self.parts: list[str] = []
+        for value in bar_ticks(y_top):
+            self.parts.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" {self._at_y(value)}/>')
+            self._text(_LEFT - 8, self._y(value) + 4, f"{value:g}", "end")
+        for value in self._x_ticks():
+            self._text(self._x(value), _HEIGHT - _BOTTOM + 18, f"{value:g}", "middle")
+        self._text((_LEFT + _WIDTH - _RIGHT) / 2, _HEIGHT - 6, x_label, "middle")
+        self.parts.append(
+            f'<text class="label" text-anchor="middle" transform="translate(14 {(_HEIGHT - _BOTTOM) / 2:.0f}) '
+            f'rotate(-90)">{escape(y_label)}</text>'
+        )
+
+    def line(self, x: np.ndarray, y: np.ndarray) -> None:
+        """A line, broken where y is not finite; a lone point is a dot."""
+        good = np.isfinite(y)
+        for run in np.split(np.arange(len(x)), np.flatnonzero(np.diff(good.astype(np.int8))) + 1):
+            if not len(run) or not good[run[0]]:
+                continue
+            points = " ".join(f"{self._x(x[i]):.1f},{self._y(y[i]):.1f}" for i in run)
+            if len(run) == 1:
+                self.parts.append(
+                    f'<circle class="dot" cx="{self._x(x[run[0]]):.1f}" cy="{self._y(y[run[0]]):.1f}" r="2"/>'
+                )
+            else:
+                self.parts.append(f'<polyline class="line" points="{points}"/>')
+
+    def rule(self, y: float, label: str) -> None:
+        """A level across the plot."""
+        self.parts.append(f'<line class="rule" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" {self._at_y(y)}/>')
+        self._text(_WIDTH - _RIGHT - 4, self._y(y) - 5, label, "end")
+
+    def tick(self, x: float) -> None:
+        """A mark on the x axis."""
+        at = f"{self._x(x):.1f}"
+        foot = _HEIGHT - _BOTTOM
+        self.parts.append(f'<line class="lost" x1="{at}" x2="{at}" y1="{foot - 8}" y2="{foot}"/>')
+
+    def mark(self, x: float, y: float, label: str) -> None:
+        """A point with words beside it, on the side where there is room."""
+        self.parts.append(f'<circle class="dot" cx="{self._x(x):.1f}" cy="{self._y(y):.1f}" r="5"/>')
+        left = x > (self.x_low + self.x_high) / 2
+        self._text(self._x(x) + (-10 if left else 10), self._y(y) + 18, label, "end" if left else "start")
+
+    def svg(self) -> str:
+        body = "".join(self.parts)
+        return (
+            f'<svg class="plot" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" '
+            f'aria-label="{escape(self.description)}">{body}</svg>'
+        )
+
+    def _x_ticks(self) -> Sequence[float]:
+        span = self.x_high - self.x_low
+        step = bar_ticks(span)[1]
+        first = np.ceil(self.x_low / step - 1e-9) * step
+        return [float(v) + 0.0 for v in np.arange(first, self.x_high + 1e-9, step).round(9)]  # + 0.0: no minus zero
+
+    def _x(self, value: float) -> float:
+        return float(_LEFT + (value - self.x_low) / (self.x_high - self.x_low) * (_WIDTH - _LEFT - _RIGHT))
+
+    def _y(self, value: float) -> float:
+        return float(_HEIGHT - _BOTTOM - value / self.y_top * (_HEIGHT - _TOP - _BOTTOM))
+
+    def _at_y(self, value: float) -> str:
+        return f'y1="{self._y(value):.1f}" y2="{self._y(value):.1f}"'
+
+    def _text(self, x: float, y: float, text: str, anchor: str) -> None:
+        self.parts.append(f'<text class="label" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>')

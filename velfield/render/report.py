@@ -1,0 +1,165 @@
+"""The report: one HTML file that holds all it shows, opens offline, and runs no script.
+
+A content security policy in the page lets nothing in from elsewhere: pictures are ``data:``, the one style sheet is
+admitted by its hash, everything that came from outside (names, messages) is escaped.
+"""
+
+from base64 import b64encode
+from collections.abc import Iterable, Sequence
+from hashlib import sha256
+from html import escape
+from importlib.resources import files
+from urllib.parse import quote
+
+from schemas.report import Report, ReportFigure, ReportStage
+from velfield.render.plots import precision_recall_plot, residual_plot
+
+
+def render_report(report: Report, figures: Sequence[ReportFigure]) -> str:
+    """The report as one HTML document.
+
+    Parameters
+    ----------
+    report
+        What is told.
+    figures
+        What is shown: the maps first.
+    """
+    style = files("velfield.render").joinpath("report.css").read_text(encoding="utf-8")
+    digest = b64encode(sha256(style.encode()).digest()).decode()
+    policy = (
+        f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'; "
+        "base-uri 'none'; form-action 'none'"
+    )  # fmt: skip
+    sections = [
+        _warnings(report),
+        _facts(report.facts),
+        *map(_figure, figures),
+        _stages(report.stages),
+        _registration(report),
+        _detection(report),
+        _gates(report.gates),
+        _frames_lost(report.frames_lost),
+        _pairs("What went in", report.inputs),
+        _files(report.files),
+    ]
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<meta name="referrer" content="no-referrer">\n<link rel="icon" href="data:,">\n'
+        f"<title>{escape(report.title)}</title>\n<style>{style}</style>\n</head>\n<body>\n"
+        f"<header><h1>{escape(report.title)}</h1><p>{escape(report.source)}</p></header>\n<main>\n"
+        + "\n".join(section for section in sections if section)
+        + f"\n</main>\n<footer>velfield {escape(report.version)}, {escape(report.created)}</footer>\n</body>\n</html>\n"
+    )
+
+
+def _section(title: str, body: str, kind: str = "") -> str:
+    attribute = f' class="{kind}"' if kind else ""
+    return f"<section{attribute}><h2>{escape(title)}</h2>{body}</section>"
+
+
+def _items(texts: Iterable[str]) -> str:
+    return "<ul>" + "".join(f"<li>{escape(text)}</li>" for text in texts) + "</ul>"
+
+
+def _warnings(report: Report) -> str:
+    lost = sum(stage.lost for stage in report.stages)
+    said = list(report.warnings)
+    if report.frames_lost or lost:
+        said.insert(0, f"Not complete: {len(report.frames_lost)} frames and {lost} units lost. They are listed below.")
+    return _section("Warnings", _items(said), "warnings") if said else ""
+
+
+def _facts(facts: Sequence[tuple[str, str]]) -> str:
+    if not facts:
+        return ""
+    cells = "".join(f"<div><dt>{escape(label)}</dt><dd>{escape(value)}</dd></div>" for label, value in facts)
+    return f'<section class="facts" aria-label="In short"><dl>{cells}</dl></section>'
+
+
+def _figure(figure: ReportFigure) -> str:
+    data = b64encode(figure.data).decode()
+    image = f'<img alt="{escape(figure.alternative)}" src="data:{figure.mime};base64,{data}">'
+    link = ""
+    if figure.full_size:
+        link = f' <a href="{_path(figure.full_size)}">Full size</a>'
+    body = f"<figure>{image}<figcaption>{escape(figure.caption)}{link}</figcaption></figure>"
+    return _section(figure.title, body)
+
+
+def _stages(stages: Sequence[ReportStage]) -> str:
+    if not stages:
+        return ""
+    rows = "".join(
+        f'<tr><th scope="row">{escape(stage.name)}</th><td>{escape(stage.text)}</td>'
+        f'<td class="number">{stage.seconds:.1f}</td></tr>'
+        for stage in stages
+    )
+    total = sum(stage.seconds for stage in stages)
+    head = _head("Stage", "Result", number="Seconds")
+    foot = f'<tfoot><tr><th scope="row">all</th><td></td><td class="number">{total:.1f}</td></tr></tfoot>'
+    return _section("Stages", f'<div class="scroll"><table>{head}<tbody>{rows}</tbody>{foot}</table></div>')
+
+
+def _head(*names: str, number: str) -> str:
+    cells = "".join(f'<th scope="col">{name}</th>' for name in names)
+    return f'<thead><tr>{cells}<th scope="col" class="number">{number}</th></tr></thead>'
+
+
+def _registration(report: Report) -> str:
+    series = report.residual
+    if series is None or not series.times_s:
+        return ""
+    good = sorted(r for r in series.residual_px if r is not None)
+    text = f"{len(good)} of {len(series.times_s)} frames registered."
+    if good:
+        middle, late = good[len(good) // 2], good[min(int(len(good) * 0.95), len(good) - 1)]
+        text += f" Residual on control points left out of the fit: median {middle:.2f} px, 95 % below {late:.2f} px."
+    return _section("Registration", f"<p>{escape(text)}</p>{residual_plot(series)}")
+
+
+def _detection(report: Report) -> str:
+    curve = report.detection
+    if curve is None or not curve.recall:
+        return ""
+    evidence = f"<p>Measured on {escape(curve.evidence)}.</p>" if curve.evidence else ""
+    return _section("Detection", evidence + precision_recall_plot(curve))
+
+
+def _gates(gates: dict[str, int]) -> str:
+    if not gates:
+        return ""
+    rows = "".join(
+        f'<tr><th scope="row">{escape(name)}</th><td class="number">{count:,}</td></tr>'
+        for name, count in gates.items()
+    )
+    head = _head("Gate", number="Links")
+    return _section("Tracking gates", f'<div class="scroll narrow"><table>{head}<tbody>{rows}</tbody></table></div>')
+
+
+def _frames_lost(frames: Sequence[str]) -> str:
+    if not frames:
+        return ""
+    body = f"<details><summary>{len(frames)} frames are in no tracklet</summary>{_items(frames)}</details>"
+    return _section("Frames lost", body)
+
+
+def _pairs(title: str, pairs: Sequence[tuple[str, str]]) -> str:
+    if not pairs:
+        return ""
+    rows = "".join(f'<tr><th scope="row">{escape(a)}</th><td>{escape(b)}</td></tr>' for a, b in pairs)
+    return _section(title, f'<div class="scroll narrow"><table><tbody>{rows}</tbody></table></div>')
+
+
+def _files(listed: Sequence[tuple[str, str]]) -> str:
+    if not listed:
+        return ""
+    items = "".join(f'<li><a href="{_path(path)}">{escape(path)}</a> {escape(what)}</li>' for path, what in listed)
+    return _section("Files", f"<ul>{items}</ul>")
+
+
+def _path(relative: str) -> str:
+    """A path inside the run folder as a link; quoting the colon keeps it from being read as a scheme."""
+    return "./" + quote(relative)

@@ -1,0 +1,124 @@
+"""`open_run`: one object over a run folder, the Python side of the contract of outputs."""
+
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from schemas.records import FORMAT_VERSION, FlightRecord, GridRecord
+from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
+from velfield.errors import InputError
+from velfield.field.view import VelocityField
+from velfield.layout import RunLayout
+from velfield.steps.field_reading import open_velocity_field
+from velfield.steps.frame_maps import FrameMaps
+from velfield.steps.grid import read_grid_of
+from velfield.stores import FrameStore, RegistrationStore, open_frames, open_registration
+from velfield.tables import read_tables
+
+Points = NDArray[np.float64]
+
+
+def open_run(root: str | Path) -> "Run":
+    """Open a run folder for reading.
+
+    Raises
+    ------
+    InputError
+        The folder is not a run folder, or one of another format.
+    """
+    layout = RunLayout(Path(root))
+    if not layout.flight.exists():
+        raise InputError(
+            f"{root} is not a run folder: it has no flight.json; make one with `velfield run ... --out {root}`"
+        )
+    record = FlightRecord.model_validate_json(layout.flight.read_bytes())
+    if record.format_version != FORMAT_VERSION:
+        raise InputError(
+            f"{root} is a run folder of format {record.format_version}, this velfield reads {FORMAT_VERSION}; "
+            "run the flight again into a new folder"
+        )
+    return Run(layout, record)
+
+
+class Run:
+    """A run folder, read lazily: opening one reads no picture and no table.
+
+    Frames are numbered as in ``frames.zarr``; points are (x, y), pixel (0, 0) being the centre of the top-left pixel.
+    """
+
+    def __init__(self, layout: RunLayout, record: FlightRecord) -> None:
+        self.layout = layout
+        self.record = record
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.layout.root)!r}, {self.frames.count} frames)"
+
+    @cached_property
+    def frames(self) -> FrameStore:
+        """The frames: ``run.frames.read(frame)`` is (h, w) uint8."""
+        return open_frames(self.layout.frames)
+
+    @cached_property
+    def registration(self) -> RegistrationStore:
+        """Per-frame results of registration."""
+        return open_registration(self.layout.registration)
+
+    @cached_property
+    def grid(self) -> GridRecord:
+        """The grid of base pixels."""
+        return read_grid_of(self.layout)
+
+    @cached_property
+    def maps(self) -> FrameMaps:
+        """Raw pixels <-> base pixels of each frame."""
+        return FrameMaps.open(self.layout, self.record.config)
+
+    @property
+    def times_s(self) -> NDArray[np.float64]:
+        """(frames,) true times, s."""
+        return self.frames.column("time_s")
+
+    @property
+    def registration_status(self) -> list[str]:
+        """(frames,) ``ok``, ``failed:<reason>`` or ``skipped:<reason>``."""
+        return self.registration.statuses()
+
+    def to_base(self, frame: int, xy_raw: Points) -> Points:
+        """Raw pixels of a frame -> base pixels, (n, 2) -> (n, 2); NaN rows where the frame is not registered."""
+        return self._mapped("to_base", frame, xy_raw)
+
+    def to_raw(self, frame: int, xy_base: Points) -> Points:
+        """Base pixels -> raw pixels of a frame, (n, 2) -> (n, 2); NaN rows where there is no such pixel."""
+        return self._mapped("to_raw", frame, xy_base)
+
+    def _mapped(self, direction: str, frame: int, xy: Points) -> Points:
+        points = np.asarray(xy, np.float64).reshape(-1, 2)
+        transform = self.maps.transform(frame)
+        if transform is None:
+            return np.full_like(points, np.nan)
+        mapped: Points = getattr(transform, direction)(points)
+        return mapped
+
+    def detections(self) -> pd.DataFrame:
+        """All cars found, in base pixels: the columns of ``schemas.tables.DETECTION_COLUMNS``."""
+        return read_tables(sorted(self.layout.detections.glob("unit-*.parquet")), DETECTION_COLUMNS)
+
+    def tracklets(self) -> pd.DataFrame:
+        """All tracklets, in base pixels: the columns of ``schemas.tables.TRACKLET_COLUMNS``."""
+        return read_tables(sorted(self.layout.tracklets.glob("unit-*.parquet")), TRACKLET_COLUMNS)
+
+    @cached_property
+    def field(self) -> VelocityField:
+        """The velocity field."""
+        return open_velocity_field(self.layout)
+
+    @cached_property
+    def base_image(self) -> NDArray[np.uint8]:
+        """The base image, (y, x) grey uint8."""
+        from velfield.sources.pictures import read_picture_grey
+
+        path = self.layout.base_image_tif if self.layout.base_image_tif.exists() else self.layout.base_image
+        return read_picture_grey(path, self.record.config.frames.max_pixels)

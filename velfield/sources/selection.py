@@ -1,0 +1,76 @@
+"""Which of the source's frames are worked on: every n-th or the nearest to an interval, from a start to a stop."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.flight import FramesConfig
+from velfield.errors import InputError
+
+
+def select_frames(times_s: NDArray[np.float64], frames: FramesConfig) -> NDArray[np.int64]:
+    """Choose the frames to work on.
+
+    Parameters
+    ----------
+    times_s
+        (n,) ascending, s. Of frames with equal times only the first can be chosen, so that no interval is zero.
+    frames
+        ``every``, ``target_interval_s``, ``start_s``, ``stop_s``; start and stop count from the first frame.
+
+    Returns
+    -------
+    (m,) int64 indices into `times_s`, ascending, their times strictly ascending.
+
+    Raises
+    ------
+    InputError
+        No frame lies between start and stop, or stop is not after start.
+
+    Examples
+    --------
+    >>> select_frames(np.arange(10) / 25, FramesConfig(every="auto"))
+    array([0, 5])
+    >>> select_frames(np.arange(10) / 25, FramesConfig(every=3, start_s=0.04))
+    array([1, 4, 7])
+    """
+    times_s = np.asarray(times_s, np.float64)
+    if times_s.size == 0:
+        raise InputError("found a source without frames, expected at least one; nothing to do")
+    start_s = 0.0 if frames.start_s is None else frames.start_s
+    stop_s = np.inf if frames.stop_s is None else frames.stop_s
+    if stop_s <= start_s:
+        raise InputError(
+            f"found stop_s = {stop_s:g}, expected it after start_s = {start_s:g}; give --stop-s as s from the first "
+            "frame"
+        )
+    later = np.r_[True, np.diff(times_s) > 0]
+    since_first = times_s - times_s[0]
+    tolerance = 1e-9  # a start given as a frame's own time must not lose that frame to rounding
+    inside = np.flatnonzero(later & (since_first >= start_s - tolerance) & (since_first < stop_s - tolerance))
+    if inside.size == 0:
+        raise InputError(
+            f"found no frame from {start_s:g} s to {stop_s:g} s, the source lasts {since_first[-1]:.3f} s; "
+            "give --start-s and --stop-s as s from the first frame"
+        )
+    if frames.every == "auto":
+        return inside[_nearest_to_interval(times_s[inside], frames.target_interval_s)]
+    return inside[:: frames.every]
+
+
+def _nearest_to_interval(times_s: NDArray[np.float64], interval_s: float) -> NDArray[np.int64]:
+    """Walk from frame to frame, each the nearest to one interval after the last.
+
+    Measured from the frame last taken, not from a fixed comb: at 24 frames a second a comb of 0.2 s gives steps of 5,
+    5, 4 frames, and uneven intervals are what the acceleration gate likes least.
+    """
+    taken = [0]
+    while taken[-1] + 1 < times_s.size:
+        target = times_s[taken[-1]] + interval_s
+        after = int(np.searchsorted(times_s, target))
+        if after >= times_s.size and target - times_s[-1] > (times_s[-1] - times_s[-2]) / 2:
+            break  # the frame that would be nearest was not filmed: the last one would make an odd interval
+        candidates = [i for i in (after - 1, after) if taken[-1] < i < times_s.size]
+        if not candidates:
+            break
+        taken.append(min(candidates, key=lambda i: (abs(times_s[i] - target), i)))
+    return np.array(taken, np.int64)

@@ -1,0 +1,94 @@
+"""Small CSV tables that people write by hand: read row by row, so that a message can name the line."""
+
+import csv
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from velfield.errors import InputError
+
+MAX_TABLE_BYTES = 512 * 1024 * 1024
+"""A table larger than this is not one of labels or times."""
+
+
+def read_text(path: Path, what: str) -> str:
+    """Read a text file, UTF-8 with or without its mark.
+
+    Raises
+    ------
+    InputError
+        Too large, unreadable, or not text.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MAX_TABLE_BYTES:
+            raise InputError(f"{path.name}: found {size} bytes, expected {what} of at most {MAX_TABLE_BYTES}; cut it")
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(f"{path.name}: found a file that is not UTF-8 text, expected {what}; save it as CSV") from None
+    except OSError as error:
+        raise InputError(
+            f"{path.name}: could not be read ({error.strerror}), expected {what}; check the path"
+        ) from None
+
+
+def read_csv_rows(
+    path: Path, *, required: Sequence[str], optional: Sequence[str] | None = None, what: str
+) -> Iterator[tuple[int, dict[str, str]]]:
+    """Yield (line number, row) of a CSV with a header.
+
+    Parameters
+    ----------
+    path
+        The file.
+    required, optional
+        Columns it must and may have; ``optional = None``: any others are let pass.
+    what
+        What the table holds, for messages.
+
+    Raises
+    ------
+    InputError
+        No such columns, columns that are not known, a row of another length.
+    """
+    text = read_text(path, f"{what} as CSV")
+    reader = csv.reader(text.splitlines(), skipinitialspace=True)
+    header = [name.strip() for name in next(reader, [])]
+    expected = ",".join(required) + (f"[,{','.join(optional)}]" if optional else "")
+    missing = [name for name in required if name not in header]
+    unknown = [] if optional is None else [name for name in header if name not in (*required, *optional)]
+    if missing or unknown or len(set(header)) != len(header):
+        raise InputError(
+            f"{path.name}: found the columns {','.join(header)[:120]!r}, expected {what} as CSV `{expected}`; mend "
+            "its first line"
+        )
+    for row in reader:
+        if not row or not any(cell.strip() for cell in row):
+            continue
+        if len(row) != len(header):
+            raise InputError(
+                f"{path.name}: line {reader.line_num}: found {len(row)} cells, expected {len(header)} "
+                f"({','.join(header)}); "
+                "mend that line"
+            )
+        yield reader.line_num, {name: cell.strip() for name, cell in zip(header, row, strict=True)}
+
+
+def finite_cell(path: Path, line: int, row: dict[str, str], name: str) -> float:
+    """Number of a cell; NaN where the column is absent or the cell is empty.
+
+    Raises
+    ------
+    InputError
+        Something stands there that is no finite number.
+    """
+    text = row.get(name, "")
+    if text == "":
+        return math.nan
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(f"{path.name}: line {line}: found {name} {text!r}, expected a finite number; mend that line")
+    return value

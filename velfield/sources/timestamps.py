@@ -1,0 +1,86 @@
+"""The side file of times: CSV ``frame,time_s``."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from velfield.errors import InputError
+from velfield.sources.table import read_csv_rows
+
+Times = dict[str, float]
+
+
+def read_timestamps(path: Path) -> Times:
+    """Read the time of each frame, s.
+
+    Parameters
+    ----------
+    path
+        CSV with the columns ``frame`` (a picture's file name, or a video's 0-based frame index) and ``time_s``.
+
+    Raises
+    ------
+    InputError
+        Other columns, a time that is no finite number, a frame named twice, an empty file.
+    """
+    times: Times = {}
+    for line, row in read_csv_rows(path, required=("frame", "time_s"), what="time stamps"):
+        name = row["frame"]
+        time_s = _number(row["time_s"])
+        if time_s is None:
+            raise InputError(
+                f"{path.name}: line {line}: found time_s {row['time_s']!r}, expected a finite number of seconds; mend "
+                "that line"
+            )
+        if name in times:
+            raise InputError(
+                f"{path.name}: line {line}: found frame {name!r} a second time, expected each once; drop one"
+            )
+        times[name] = time_s
+    if not times:
+        raise InputError(f"{path.name}: found no rows, expected one `frame,time_s` a frame; fill it, or give --fps")
+    return times
+
+
+def check_against_container(
+    side_s: NDArray[np.float64], container_s: NDArray[np.float64], path: Path, *, share: float = 0.5
+) -> None:
+    """Stop where the side file and the container tell different stories.
+
+    An offset is no disagreement (a side file often counts from take-off); intervals are.
+
+    Parameters
+    ----------
+    side_s, container_s
+        (n,) times of the same frames, s, in the container's order.
+    path
+        The side file, for the message.
+    share
+        Disagreement, in median frame intervals, that stops.
+
+    Raises
+    ------
+    InputError
+        Some frame's time since the first differs by more than `share` of the median interval.
+    """
+    if side_s.size < 2:
+        return
+    difference = (side_s - side_s[0]) - (container_s - container_s[0])
+    limit = share * float(np.median(np.abs(np.diff(container_s))))
+    worst = int(np.argmax(np.abs(difference)))
+    if limit > 0 and abs(difference[worst]) > limit:
+        raise InputError(
+            f"{path.name}: found frame {worst} {side_s[worst] - side_s[0]:.3f} s after the first, expected "
+            f"{container_s[worst] - container_s[0]:.3f} s as the video's own times say; leave --timestamps out or "
+            "mend it"
+        )
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None

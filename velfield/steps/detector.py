@@ -1,0 +1,195 @@
+"""The detector of a flight: given, learnt from marked cars, or learnt from what moves; and the grid cars are looked
+for on."""
+
+from pathlib import Path
+
+import numpy as np
+
+from schemas.detector import PrecisionRecallCurve
+from schemas.flight import DetectionConfig
+from schemas.records import WorkingRecord
+from velfield.detection.detector import Detector, load_detector, save_detector, shipped_detector
+from velfield.detection.motion_difference import MotionBackground, MotionFrame, motion_background
+from velfield.detection.motion_evidence import evidence_of
+from velfield.detection.motion_labels import FrameLabels, MotionLabels, choose_frames, labels_from_motion, working_scale
+from velfield.detection.train import LabelledImage, train_detector
+from velfield.errors import InputError
+from velfield.plan import Plan
+from velfield.progress import advance
+from velfield.provenance import write_atomically
+from velfield.steps.grid import read_grid
+from velfield.steps.labelled import base_px_per_raw_px, car_length_raw_px, marked_cars, marked_frames
+from velfield.steps.outcome import Outcome
+from velfield.steps.registration import usable_frames
+from velfield.steps.working import WorkingGrid, write_background
+from velfield.stores import open_frames
+
+_TRAINING_FRAMES = 6
+_EVIDENCE_BURSTS = 3
+
+
+def make_detector(plan: Plan) -> Outcome:
+    """Choose the working grid, make the background, and train or load the detector."""
+    if plan.job.inputs.detections:
+        return _finish(plan, None, _scale_of_gsd(plan) or 1.0, "detections")
+    if plan.job.inputs.detector:
+        detector = load_detector(Path(plan.job.inputs.detector))
+        return _finish(plan, detector, _known_scale(plan), "file")
+    if plan.job.inputs.labels:
+        return _from_labels(plan)
+    return _from_motion(plan)
+
+
+def _scale_of_gsd(plan: Plan) -> float | None:
+    gsd_m = read_grid(plan).gsd_m
+    return None if gsd_m is None else working_scale(plan.config.detection, gsd_m)
+
+
+def _known_scale(plan: Plan) -> float:
+    scale = _scale_of_gsd(plan)
+    if scale is None:
+        raise InputError("the size of a car is not known: a detector file needs --gsd-m (metres a base pixel)")
+    return scale
+
+
+def _from_labels(plan: Plan) -> Outcome:
+    labels = marked_cars(plan)
+    base_per_raw = base_px_per_raw_px(plan)
+    scale, length = _scale_of_gsd(plan), car_length_raw_px(labels.cars)
+    if scale is None:
+        if not np.isfinite(length):
+            raise InputError(
+                "the size of a car is not known: the labels have no length_px and --gsd-m is not given; give either"
+            )
+        scale = plan.config.detection.working_car_length_px / (length * base_per_raw)
+    samples = [
+        LabelledImage(image=frame.image, cars=frame.cars, ignore=frame.ignore, complete=True)
+        for frame in marked_frames(plan, labels, work_per_raw=scale * base_per_raw)
+    ]
+    detector = train_detector(samples, plan.config.detection)
+    return _finish(plan, detector, scale, "labels", count=len(labels.cars))
+
+
+def _from_motion(plan: Plan) -> Outcome:
+    known = _scale_of_gsd(plan)
+    scale = known or 1.0
+    frames = _motion_frames(plan, scale)
+    background = motion_background(frames)
+    wanted = plan.config.detection.working_car_length_px
+    labels = labels_from_motion(frames, background, car_length_px=wanted if known else None)
+    if known is None and labels.usable:
+        scale = working_scale(plan.config.detection, None, labels, labels_scale=scale)
+        frames = _motion_frames(plan, scale)
+        background = motion_background(frames)
+        labels = labels_from_motion(frames, background, car_length_px=wanted)
+    if not labels.usable:
+        return _without_labels(plan, known, labels)
+    samples = [
+        LabelledImage(
+            image=frame.image,
+            valid=frame.valid & background.valid,
+            background=background.median,
+            cars=found.cars,
+            ignore=found.ignore,
+            complete=False,
+        )
+        for frame, found in _training_frames(frames, labels)
+    ]
+    detector = train_detector(samples, plan.config.detection)
+    if plan.config.detection.threshold is None:
+        detector = _threshold_by_motion(detector, frames, background, plan.config.detection)
+    return _finish(plan, detector, scale, "motion", count=labels.count, motion=labels, background=background)
+
+
+def _threshold_by_motion(
+    detector: Detector, frames: list[MotionFrame], background: MotionBackground, config: DetectionConfig
+) -> Detector:
+    """The detector with the threshold at which what it finds moves as cars do; as it is where too few move to tell."""
+    starts = np.unique(np.linspace(0, len(frames) - 3, min(_EVIDENCE_BURSTS, len(frames) - 2)).round().astype(int))
+    chosen = np.unique((starts[:, None] + np.arange(3)).ravel())
+    median = background.median if detector.uses_background else None
+    evidence = evidence_of(detector, [frames[k] for k in chosen], median, config)
+    if not np.isfinite(evidence.chosen):
+        return detector
+    at = int(np.argmin(np.abs(evidence.threshold - evidence.chosen)))
+    keep = np.unique(np.r_[np.linspace(0, len(evidence.threshold) - 1, 300).astype(int), at])
+    curve = PrecisionRecallCurve(
+        recall=tuple(np.round(evidence.recall[keep], 4).tolist()),
+        precision=tuple(np.round(evidence.precision[keep], 4).tolist()),
+        threshold=tuple(np.round(evidence.threshold[keep], 4).tolist()),
+        chosen=int(np.searchsorted(keep, at)),
+        evidence=f"how the detections of {len(chosen)} frames move: along their axis, at one velocity, or not",
+    )
+    return Detector(detector.record.model_copy(update={"threshold": evidence.chosen, "curve": curve}))
+
+
+def _training_frames(frames: list[MotionFrame], labels: MotionLabels) -> list[tuple[MotionFrame, FrameLabels]]:
+    """Labelled frames spread over the flight: more of them show the same cars on the same ground."""
+    labelled = [pair for pair in zip(frames, labels.frames, strict=True) if pair[1].labelled and len(pair[1].cars)]
+    chosen = np.unique(np.linspace(0, len(labelled) - 1, min(_TRAINING_FRAMES, len(labelled))).round().astype(int))
+    return [labelled[k] for k in chosen]
+
+
+def _without_labels(plan: Plan, scale: float | None, labels: MotionLabels) -> Outcome:
+    """Neither marked cars nor enough that move: the shipped detector, said aloud, where a car's size is known."""
+    told = "; ".join(labels.warnings)
+    if scale is None:
+        raise InputError(f"{told}; or give --gsd-m, so that the shipped detector can be used")
+    outcome = _finish(plan, shipped_detector(), scale, "shipped", motion=labels)
+    return Outcome(outcome.outputs, outcome.counts, [f"{told}. The shipped detector is used", *outcome.notes])
+
+
+def _motion_frames(plan: Plan, scale: float) -> list[MotionFrame]:
+    """Frames to take labels from, whole, on the working grid."""
+    times_s = open_frames(plan.layout.frames).column("time_s")
+    usable = np.flatnonzero(usable_frames(plan))
+    if len(usable) < 3:
+        raise InputError(f"{len(usable)} frames are registered, 3 or more needed; see the reasons above")
+    chosen = [int(frame) for frame in usable[choose_frames(times_s[usable])]]
+    working = WorkingGrid.open(plan, scale)
+    frames = []
+    for frame in chosen:
+        seen = working.frame(frame, working.whole)
+        if seen is not None:
+            frames.append(MotionFrame(seen.image, seen.valid, float(times_s[frame])))
+        advance("detector", 0)
+    return frames
+
+
+def _finish(
+    plan: Plan,
+    detector: Detector | None,
+    scale: float,
+    learnt_from: str,
+    *,
+    count: int = 0,
+    motion: MotionLabels | None = None,
+    background: MotionBackground | None = None,
+) -> Outcome:
+    """Write what detection needs: the detector, the working grid, the background where the detector looks at it."""
+    layout, outputs, notes = plan.layout, [plan.layout.working], []
+    if detector is not None:
+        save_detector(detector, layout.detector)
+        outputs.append(layout.detector)
+    if background is not None and detector is not None and detector.uses_background:
+        write_background(layout, background)
+        outputs.append(layout.background)
+    if motion is not None and learnt_from == "motion":
+        notes.append(
+            f"{motion.count} labels of {motion.vehicles} vehicles from motion, purity {motion.purity:.0%}, "
+            f"coherence {motion.coherence:.0%}"
+        )
+    record = WorkingRecord(
+        scale=scale,
+        learnt_from=learnt_from,
+        has_background=layout.background in outputs,
+        labels=count,
+        purity=None if motion is None else motion.purity,
+        coherence=None if motion is None else motion.coherence,
+    )
+    write_atomically(layout.working, record.model_dump_json(indent=1).encode())
+    advance("detector")
+    counts = {"labels": float(count), "working_scale": scale}
+    if detector is not None:
+        counts["threshold"] = detector.threshold
+    return Outcome(outputs, counts, notes)

@@ -1,0 +1,56 @@
+"""The (y, x) layers beside the histogram in ``field.zarr``: made with the tiles, so that maps and viewers read no
+histogram."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.flight import FieldConfig
+from velfield.field.accumulate import FieldTile
+from velfield.field.bins import VelocityBins, standing_px_per_s
+from velfield.field.statistics import tile_statistics
+
+_SPEED = {"units": "px s-1"}
+
+LAYERS: dict[str, dict[str, Any]] = {
+    "count": {"dtype": "int32", "units": "1", "long_name": "distinct passages"},
+    "dwell_ms": {"dtype": "int32", "units": "ms", "long_name": "time vehicles spent there, all together"},
+    "modal_vx": {**_SPEED, "long_name": "x component of the modal velocity"},
+    "modal_vy": {**_SPEED, "long_name": "y component of the modal velocity, down"},
+    "mode_share": {"units": "1", "long_name": "share of passages at the mode"},
+    "mean_vx": {**_SPEED, "long_name": "x component of the mean velocity"},
+    "mean_vy": {**_SPEED, "long_name": "y component of the mean velocity, down"},
+    "speed_p15": {**_SPEED, "long_name": "15th percentile of speed"},
+    "speed_p50": {**_SPEED, "long_name": "median speed"},
+    "speed_p85": {**_SPEED, "long_name": "85th percentile of speed"},
+    "standing_share": {"units": "1", "long_name": "share of passages that stand"},
+    "circular_variance": {"units": "1", "long_name": "circular variance of the direction of what moves"},
+    "entropy": {"units": "1", "long_name": "entropy of the velocity distribution, nats"},
+    "direction_se": {"units": "rad", "long_name": "standard error of the mean direction of what moves"},
+    "speed_se": {**_SPEED, "long_name": "standard error of the median speed"},
+}
+"""Layer -> attributes in the store; ``dtype`` where it is not float32."""
+
+
+def tile_layers(tile: FieldTile, bins: VelocityBins, config: FieldConfig) -> dict[str, NDArray[Any]]:
+    """All layers of one tile, each (ty, tx)."""
+    s = tile_statistics(tile.histogram, tile.count, bins=bins, standing_px_per_s=standing_px_per_s(config, bins.gsd_m))
+    values: dict[str, NDArray[Any]] = {
+        "count": tile.count,
+        "dwell_ms": tile.dwell_ms,
+        "modal_vx": s.modal_velocity_px_per_s[..., 0],
+        "modal_vy": s.modal_velocity_px_per_s[..., 1],
+        "mode_share": s.mode_share,
+        "mean_vx": s.mean_velocity_px_per_s[..., 0],
+        "mean_vy": s.mean_velocity_px_per_s[..., 1],
+        "speed_p15": s.speed_percentiles_px_per_s[..., 0],
+        "speed_p50": s.speed_percentiles_px_per_s[..., 1],
+        "speed_p85": s.speed_percentiles_px_per_s[..., 2],
+        "standing_share": s.standing_share,
+        "circular_variance": s.circular_variance,
+        "entropy": s.entropy_nats,
+        "direction_se": s.direction_se_rad,
+        "speed_se": s.speed_se_px_per_s,
+    }
+    return {name: np.asarray(value, LAYERS[name].get("dtype", "float32")) for name, value in values.items()}

@@ -1,0 +1,115 @@
+"""Marked cars, from raw pixels of their frame onto a picture that a detector can learn from.
+
+A labelled frame need not be among the frames worked on, nor be registered: a car looks the same in its raw frame,
+scaled.
+So labels are learnt from raw frames, brought to the working scale by the local scale of the map raw -> base.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from velfield.errors import InputError
+from velfield.plan import Plan
+from velfield.sources.flags import UNUSABLE
+from velfield.sources.labels import Labels, load_labels
+from velfield.sources.source import iter_frames
+from velfield.steps.frame_maps import FrameMaps
+from velfield.stores import open_registration
+
+
+@dataclass(frozen=True)
+class MarkedFrame:
+    """One labelled frame at the working scale.
+
+    Attributes
+    ----------
+    image
+        (h, w) uint8, the raw frame scaled.
+    cars
+        (n, 5): x, y, orientation, length, width in pixels of ``image``; NaN where the label does not tell.
+    ignore
+        (k, 3): x, y, radius of what is neither car nor background.
+    """
+
+    image: NDArray[np.uint8]
+    cars: NDArray[np.float64]
+    ignore: NDArray[np.float64]
+
+
+def marked_cars(plan: Plan) -> Labels:
+    """The labels of ``--labels``.
+
+    Raises
+    ------
+    InputError
+        The labels cannot be read, or hold no car.
+    """
+    labels = load_labels(Path(str(plan.job.inputs.labels)), plan.info)
+    if labels.cars.empty:
+        raise InputError(f"--labels {plan.job.inputs.labels}: no car in it; mark the cars of one frame")
+    return labels
+
+
+def base_px_per_raw_px(plan: Plan) -> float:
+    """Local scale of the map raw -> base at the frames' centre: the median over registered frames."""
+    maps = FrameMaps.open(plan.layout, plan.config)
+    statuses = open_registration(plan.layout.registration).statuses()
+    registered = [k for k, status in enumerate(statuses) if status == "ok"]
+    if not registered:
+        raise InputError("no frame could be registered: is the video of one place, seen from above?")
+    cross = np.array([[-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]]) * 64 + np.array([[maps.width, maps.height]]) / 2
+    scales = []
+    for k in registered[:: max(1, len(registered) // 15)]:
+        transform = maps.transform(k)
+        if transform is not None:
+            base = transform.to_base(cross) / 64
+            a, b = base[1] - base[0], base[3] - base[2]
+            scales.append(np.sqrt(abs(a[0] * b[1] - a[1] * b[0])))
+    return float(np.median(scales))
+
+
+def car_length_raw_px(labels: pd.DataFrame) -> float:
+    """Usual length of the marked cars, raw px; NaN where no label tells."""
+    longest = labels[["length_px", "width_px"]].max(axis=1).dropna()
+    return float(longest.median()) if len(longest) else float("nan")
+
+
+def marked_frames(plan: Plan, labels: Labels, *, work_per_raw: float) -> Iterator[MarkedFrame]:
+    """Every labelled frame of the source at the working scale.
+
+    Raises
+    ------
+    InputError
+        A labelled frame cannot be read.
+    """
+    place = {name: index for index, name in enumerate(plan.info.names)}
+    indices = np.array(sorted(place[name] for name in labels.frames), np.int64)
+    for found in iter_frames(Path(plan.job.inputs.source), plan.info, indices):
+        if found.flags & UNUSABLE:
+            raise InputError(f"--labels: the labelled frame {found.name} cannot be used: {found.reason}; mark another")
+        cars = _boxes(labels.cars, found.name, work_per_raw)
+        left_out = _boxes(labels.ignored, found.name, work_per_raw)
+        radius = np.nanmax(np.column_stack([left_out[:, 3:] / 2, np.full(len(left_out), 8.0)]), axis=1)
+        yield MarkedFrame(scaled(found.grey, work_per_raw), cars, np.column_stack([left_out[:, :2], radius]))
+
+
+def _boxes(table: pd.DataFrame, frame: str, work_per_raw: float) -> NDArray[np.float64]:
+    columns = ["x_px", "y_px", "orientation_rad", "length_px", "width_px"]
+    boxes = table.loc[table["frame"] == frame, columns].to_numpy(np.float64, copy=True)
+    boxes[:, :2] = (boxes[:, :2] + 0.5) * work_per_raw - 0.5
+    boxes[:, 3:] *= work_per_raw
+    return boxes
+
+
+def scaled(grey: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
+    """A grey picture scaled about its outer corner, area-averaged where it shrinks."""
+    height, width = grey.shape
+    size = max(1, round(width * factor)), max(1, round(height * factor))
+    how = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(grey, size, interpolation=how), np.uint8)

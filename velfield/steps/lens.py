@@ -1,0 +1,57 @@
+"""The lens of a flight: frames spread over it, the plumb-line constraint, ``camera.json``."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.camera import CameraRecord
+from velfield.camera.lens import lens_from_record, pinhole
+from velfield.camera.plumbline import calibrate
+from velfield.plan import Plan
+from velfield.progress import advance
+from velfield.provenance import write_atomically
+from velfield.sources.flags import UNUSABLE
+from velfield.steps.outcome import Outcome
+from velfield.stores import open_frames
+
+
+def spread_usable(plan: Plan, count: int) -> list[int]:
+    """At most ``count`` frames spread evenly over those that nothing is wrong with."""
+    flags = open_frames(plan.layout.frames).column("flags")
+    usable = np.flatnonzero((flags & int(UNUSABLE)) == 0)
+    chosen: NDArray[np.int64] = np.unique(
+        np.linspace(0, max(len(usable) - 1, 0), min(count, len(usable))).round()
+    ).astype(int)
+    return [int(frame) for frame in usable[chosen]]
+
+
+def calibrate_flight(plan: Plan) -> Outcome:
+    """Calibrate, or keep the pin-hole where that is asked for."""
+    store = open_frames(plan.layout.frames)
+    height, width = store.shape
+    config = plan.config.lens
+    if config.calibrate == "never":
+        record = CameraRecord(
+            lens=pinhole((height, width)).to_record(),
+            frame_width_px=width,
+            frame_height_px=height,
+            accepted=False,
+            reason="lens.calibrate is never: taken for a pin-hole",
+        )
+    else:
+        frames = spread_usable(plan, config.frames)
+        record = calibrate([store.read(frame) for frame in frames], config).to_record()
+    write_atomically(plan.layout.camera, record.model_dump_json(indent=1).encode())
+    advance("lens")
+    counts = {"corner_px": _corner_shift(record, width, height)}
+    if record.residual_px is not None:
+        counts["residual_px"] = record.residual_px
+    return Outcome(
+        [plan.layout.camera], counts, [] if record.accepted else [f"lens taken for a pin-hole: {record.reason}"]
+    )
+
+
+def _corner_shift(record: CameraRecord, width: int, height: int) -> float:
+    """How far the lens moves a corner of the frame, px: what a person can picture of a distortion."""
+    corners = np.array([[0.0, 0.0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]])
+    moved = lens_from_record(record.lens).undistort_points(corners) - corners
+    return float(np.hypot(*moved.T).max())

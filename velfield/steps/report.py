@@ -1,0 +1,137 @@
+"""The report of a run, ``index.html``: what was done, how well, and the maps; one page that needs nothing else."""
+
+import datetime
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from schemas.report import PrecisionRecall, Report, ReportFigure, ReportStage, ResidualSeries
+from schemas.summary import RunSummary, StageSummary
+from velfield.detection.detector import load_detector
+from velfield.plan import Plan
+from velfield.provenance import write_atomically
+from velfield.render.figures import jpeg_bytes
+from velfield.render.report import render_report
+from velfield.steps.grid import read_grid
+from velfield.steps.working import read_working
+from velfield.stores import open_frames, open_registration
+from velfield.version import code_version
+
+_PICTURE_SIDE_PX = 1600
+_CAPTIONS = {
+    "direction": (
+        "Which way traffic goes",
+        "The modal direction of travel at every pixel that vehicles passed, as hue; none where they stand.",
+    ),
+    "speed": ("How fast it goes", "The modal speed at every pixel that vehicles passed."),
+}
+_LEARNT_FROM = {
+    "labels": "marked cars",
+    "motion": "what moves in the flight",
+    "file": "a detector file",
+    "shipped": "the shipped detector",
+    "detections": "another detector's boxes",
+}
+
+
+def write_report(plan: Plan, summary: RunSummary) -> None:
+    """Write ``index.html``."""
+    counts = {stage.name: stage.counts for stage in summary.stages}
+    report = Report(
+        title=f"Velocity field of {plan.job.inputs.source.rstrip('/').rsplit('/', 1)[-1]}",
+        source=plan.job.inputs.source,
+        created=datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
+        version=code_version(),
+        facts=tuple(_facts(plan, counts)),
+        inputs=tuple(_inputs(plan)),
+        stages=tuple(
+            ReportStage(name=s.name, text=s.text, seconds=s.seconds, lost=len(s.lost)) for s in summary.stages
+        ),
+        residual=_residual(plan),
+        detection=_curve(plan),
+        gates=_gates(summary.stages),
+        warnings=(*plan.info.warnings, *(note for stage in summary.stages for note in stage.notes)),
+        frames_lost=summary.frames_lost,
+        files=tuple(_files(plan)),
+    )
+    write_atomically(plan.layout.report, render_report(report, _figures(plan)).encode())
+
+
+def _facts(plan: Plan, counts: dict[str, dict[str, float]]) -> list[tuple[str, str]]:
+    times_s = plan.info.times_s[plan.indices]
+    frames, registered = counts["registration"].get("frames", 0), counts["registration"].get("registered", 0)
+    return [
+        ("flight", f"{times_s[-1] - times_s[0]:.1f} s, {plan.frame_count} frames"),
+        ("registered", f"{registered:.0f} of {frames:.0f} frames"),
+        ("residual", f"{counts['registration'].get('heldout_px', float('nan')):.2f} px held out"),
+        ("cars found", f"{counts['detections'].get('cars', 0):.0f}"),
+        ("vehicles going by", f"{counts['tracklets'].get('passages', 0):.0f}"),
+        ("pixels known", f"{counts['field'].get('pixels', 0):.0f}"),
+    ]
+
+
+def _inputs(plan: Plan) -> list[tuple[str, str]]:
+    grid, working = read_grid(plan), read_working(plan.layout)
+    gsd = f"{grid.gsd_m:.4g} m a pixel" if grid.gsd_m else "not known: speeds in px/s"
+    return [
+        ("base image", plan.job.inputs.base or "built from the flight"),
+        ("ground sample distance", gsd),
+        ("cars learnt from", _LEARNT_FROM[working.learnt_from]),
+        ("preset", plan.config.preset),
+        ("frame size", f"{plan.info.width} x {plan.info.height} px"),
+    ]
+
+
+def _residual(plan: Plan) -> ResidualSeries:
+    times_s = open_frames(plan.layout.frames).column("time_s")
+    heldout = open_registration(plan.layout.registration).column("heldout_px")
+    return ResidualSeries(
+        times_s=tuple(float(time) for time in times_s),
+        residual_px=tuple(float(value) if np.isfinite(value) else None for value in heldout),
+        limit_px=plan.config.registration.max_residual_px,
+    )
+
+
+def _curve(plan: Plan) -> PrecisionRecall | None:
+    if not plan.layout.detector.exists():
+        return None
+    curve = load_detector(plan.layout.detector).curve
+    if curve is None:
+        return None
+    return PrecisionRecall(recall=curve.recall, precision=curve.precision, chosen=curve.chosen, evidence=curve.evidence)
+
+
+def _gates(stages: Sequence[StageSummary]) -> dict[str, int]:
+    links = next(stage for stage in stages if stage.name == "links")
+    return {name.removeprefix("gate_"): int(count) for name, count in links.counts.items() if name.startswith("gate_")}
+
+
+def _files(plan: Plan) -> list[tuple[str, str]]:
+    layout, told = plan.layout, []
+    for path, what in (
+        (layout.maps / "direction.png", "modal direction"),
+        (layout.maps / "speed.png", "modal speed"),
+        (layout.maps / "direction.tif", "modal direction, heading in degrees, for GIS"),
+        (layout.maps / "speed.tif", "modal speed for GIS"),
+    ):
+        if path.exists():
+            told.append((path.relative_to(layout.root).as_posix(), what))
+    return told
+
+
+def _figures(plan: Plan) -> list[ReportFigure]:
+    figures = []
+    for name, (title, caption) in _CAPTIONS.items():
+        picture = cv2.imread(str(plan.layout.maps / f"{name}.png"))
+        figures.append(
+            ReportFigure(
+                title=title,
+                caption=caption,
+                alternative=f"map of the modal {name} over the base image",
+                mime="image/jpeg",
+                data=jpeg_bytes(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), max_side=_PICTURE_SIDE_PX),
+                full_size=f"maps/{name}.png",
+            )
+        )
+    return figures

@@ -1,0 +1,337 @@
+"""The Zarr stores of a run folder: create, open, check. The only module that imports zarr.
+
+Three rules that were paid for (each is a fault seen in zarr or in its use):
+
+- ``ZstdCodec(checksum=True)`` everywhere: the default codec returns wrong pixels for one bit in seven, silently;
+- a chunk has one writer: two writers on parts of one chunk lose each other's work, so the chunks of per-frame columns
+  are exactly the units of work;
+- a missing chunk reads as the fill value: whoever reads asks the commit records which chunks must exist.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from zarr.codecs import ZstdCodec
+
+from velfield.errors import InputError
+
+_STATUS_BYTES = 160
+HISTOGRAM = "velocity_histogram"
+
+
+class StoreError(RuntimeError):
+    """A store is damaged or is not what was expected: names the store and the chunk."""
+
+
+def _create(
+    group: zarr.Group, name: str, shape: Sequence[int], chunks: Sequence[int], dtype: str, **kw: Any
+) -> zarr.Array[Any]:
+    level = kw.pop("level", 1)
+    return group.create_array(
+        name,
+        shape=tuple(shape),
+        chunks=tuple(chunks),
+        dtype=dtype,
+        compressors=ZstdCodec(level=level, checksum=True),
+        **kw,
+    )
+
+
+def _open(path: Path, mode: str) -> zarr.Group:
+    try:
+        return zarr.open_group(path, mode=cast(Any, mode), use_consolidated=False)
+    except FileNotFoundError:
+        raise InputError(f"{path} is not there: run `velfield run` on this folder first") from None
+
+
+def _array(group: zarr.Group, name: str) -> zarr.Array[Any]:
+    return cast("zarr.Array[Any]", group[name])
+
+
+# ------------------------------------------------------------------------------------------------------------- frames
+
+
+def store_key(path: Path) -> str | None:
+    """Content key that a store was laid out under; none where it is not there or not whole."""
+    try:
+        return str(zarr.open_group(path, mode="r", use_consolidated=False).attrs["key"])
+    except (FileNotFoundError, KeyError, ValueError):
+        return None
+
+
+def create_frames(
+    path: Path, *, key: str, count: int, height: int, width: int, unit_frames: int, source: Mapping[str, Any]
+) -> None:
+    """Lay out ``frames.zarr``: one frame a chunk; a unit of a column a chunk. Frames are unreadable until written."""
+    group = zarr.create_group(path, overwrite=True, attributes={"source": dict(source)})
+    chunk = min(unit_frames, max(count, 1))
+    _create(group, "raw", (count, height, width), (1, height, width), "uint8", dimension_names=("frame", "y", "x"))
+    for name, dtype, fill in (("time_s", "float64", np.nan), ("source_index", "int64", -1), ("flags", "uint16", 2)):
+        _create(group, name, (count,), (chunk,), dtype, fill_value=fill, dimension_names=("frame",))
+    for name in ("sharpness", "brightness"):
+        _create(group, name, (count,), (chunk,), "float32", fill_value=np.nan, dimension_names=("frame",))
+    group.attrs["key"] = key  # last: a store without it was not laid out whole
+
+
+@dataclass(frozen=True)
+class FrameStore:
+    """``frames.zarr``, opened."""
+
+    path: Path
+    group: zarr.Group
+
+    @property
+    def count(self) -> int:
+        return int(_array(self.group, "raw").shape[0])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width) of a frame, px."""
+        _, height, width = _array(self.group, "raw").shape
+        return int(height), int(width)
+
+    def read(self, frame: int) -> NDArray[np.uint8]:
+        """One grey frame, (h, w) uint8.
+
+        Raises
+        ------
+        StoreError
+            The chunk is damaged or gone.
+        """
+        if not (self.path / "raw" / "c" / str(frame) / "0" / "0").exists():
+            raise StoreError(f"{self.path}: the chunk of frame {frame} is gone; `velfield run` writes it again")
+        try:
+            return np.asarray(_array(self.group, "raw")[frame], dtype=np.uint8)
+        except Exception as error:
+            raise StoreError(f"{self.path}: the chunk of frame {frame} is damaged ({error})") from error
+
+    def write(self, frame: int, grey: NDArray[np.uint8]) -> None:
+        """Write one frame: one chunk."""
+        _array(self.group, "raw")[frame] = grey
+
+    def column(self, name: str) -> NDArray[Any]:
+        """One column: ``time_s``, ``source_index``, ``flags``, ``sharpness`` or ``brightness``, (frames,)."""
+        return np.asarray(_array(self.group, name)[:])
+
+    def write_columns(self, start: int, columns: Mapping[str, NDArray[Any]]) -> None:
+        """Write a whole unit of columns, from frame ``start`` on."""
+        for name, values in columns.items():
+            _array(self.group, name)[start : start + len(values)] = values
+
+
+def open_frames(path: Path, mode: str = "r") -> FrameStore:
+    """Open ``frames.zarr``."""
+    return FrameStore(path, _open(path, mode))
+
+
+# ------------------------------------------------------------------------------------------------------- registration
+
+REGISTRATION_COLUMNS: dict[str, str] = {
+    "count_base": "int32",  # matches with the base image
+    "count_previous": "int32",  # matches with the previous registered frame
+    "count_kept": "int32",  # control points that the robust fit kept
+    "residual_px": "float32",  # RMS of what was fitted
+    "heldout_px": "float32",  # RMS of what was held out of the fit
+    "spread": "float32",  # share of the picture's cells that hold control points
+}
+
+
+def create_registration(path: Path, *, key: str, count: int, vector_length: int, unit_frames: int) -> None:
+    """Lay out ``registration.zarr``: chunks are units, so that a unit has one writer."""
+    group = zarr.create_group(path, overwrite=True)
+    chunk = min(unit_frames, max(count, 1))
+    _create(group, "vector", (count, vector_length), (chunk, vector_length), "float64", fill_value=np.nan)
+    _create(group, "status", (count, _STATUS_BYTES), (chunk, _STATUS_BYTES), "uint8", fill_value=0)
+    for name, dtype in REGISTRATION_COLUMNS.items():
+        fill = np.nan if dtype.startswith("float") else 0
+        _create(group, name, (count,), (chunk,), dtype, fill_value=fill, dimension_names=("frame",))
+    group.attrs["key"] = key
+
+
+@dataclass(frozen=True)
+class RegistrationStore:
+    """``registration.zarr``, opened."""
+
+    path: Path
+    group: zarr.Group
+
+    def write(
+        self, start: int, vectors: NDArray[np.float64], statuses: Sequence[str], columns: Mapping[str, NDArray[Any]]
+    ) -> None:
+        """Write a whole unit from frame ``start`` on."""
+        stop = start + len(statuses)
+        text = np.zeros((len(statuses), _STATUS_BYTES), np.uint8)
+        for row, status in zip(text, statuses, strict=True):
+            data = np.frombuffer(status.encode()[:_STATUS_BYTES], np.uint8)
+            row[: len(data)] = data
+        _array(self.group, "vector")[start:stop] = vectors
+        _array(self.group, "status")[start:stop] = text
+        for name, values in columns.items():
+            _array(self.group, name)[start:stop] = values
+
+    def vector(self, frame: int) -> NDArray[np.float64]:
+        """Flat parameters of one frame's transform; NaN where it is not registered."""
+        return np.asarray(_array(self.group, "vector")[frame])
+
+    def vectors(self, start: int, stop: int) -> NDArray[np.float64]:
+        """Flat parameters of the frames ``[start, stop)``."""
+        return np.asarray(_array(self.group, "vector")[start:stop])
+
+    def statuses(self, start: int = 0, stop: int | None = None) -> list[str]:
+        """``ok``, ``failed:<reason>`` or ``skipped:<reason>`` of each frame; empty where nothing was done yet."""
+        rows = np.asarray(_array(self.group, "status")[start:stop])
+        return [bytes(row).rstrip(b"\0").decode(errors="replace") for row in rows]
+
+    def column(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
+        """One of ``REGISTRATION_COLUMNS``."""
+        return np.asarray(_array(self.group, name)[start:stop])
+
+
+def open_registration(path: Path, mode: str = "r") -> RegistrationStore:
+    """Open ``registration.zarr``."""
+    return RegistrationStore(path, _open(path, mode))
+
+
+# -------------------------------------------------------------------------------------------------------------- field
+
+
+def create_field(
+    path: Path,
+    *,
+    key: str,
+    height: int,
+    width: int,
+    tile: int,
+    group_tiles: int,
+    velocities_px_per_s: NDArray[np.float64],
+    attributes: Mapping[str, Any],
+    layers: Mapping[str, Mapping[str, Any]],
+) -> None:
+    """Lay out ``field.zarr``: the histogram in sparse tiles, whole layers in chunks of one tile group, labelled axes.
+
+    Parameters
+    ----------
+    velocities_px_per_s : (n,) float64
+        Bin centres of both velocity axes.
+    layers : name -> attributes
+        (y, x) layers beside the histogram; ``dtype`` among the attributes says their type, float32 where absent.
+    """
+    group = zarr.create_group(path, overwrite=True, attributes=dict(attributes))
+    n = len(velocities_px_per_s)
+    histogram = _create(
+        group,
+        HISTOGRAM,
+        (height, width, n, n),
+        (tile, tile, n, n),
+        "int32",
+        fill_value=0,
+        dimension_names=("y", "x", "vy", "vx"),
+    )
+    grid_mapping = {"grid_mapping": "crs"} if attributes.get("crs_wkt") else {}
+    histogram.attrs.update({"long_name": "velocity histogram", "units": "1", **grid_mapping})
+    side = tile * group_tiles
+    for name, attrs in layers.items():
+        attrs = dict(attrs)
+        dtype = attrs.pop("dtype", "float32")
+        fill: float = np.nan if dtype.startswith("float") else 0
+        layer = _create(group, name, (height, width), (side, side), dtype, fill_value=fill, dimension_names=("y", "x"))
+        layer.attrs.update({**attrs, **grid_mapping})
+    _write_axes(group, height, width, velocities_px_per_s, attributes)
+    group.attrs["key"] = key
+
+
+def _write_axes(
+    group: zarr.Group, height: int, width: int, velocities: NDArray[np.float64], attributes: Mapping[str, Any]
+) -> None:
+    axes: dict[str, tuple[NDArray[np.float64], str]] = {
+        "y": (np.arange(height, dtype=np.float64), "px"),
+        "x": (np.arange(width, dtype=np.float64), "px"),
+        "vy": (velocities, "px s-1"),
+        "vx": (velocities, "px s-1"),
+    }
+    for name, (values, units) in axes.items():
+        axis = _create(group, name, values.shape, values.shape, "float64", dimension_names=(name,))
+        axis[:] = values
+        axis.attrs["units"] = units
+    gsd_m = attributes.get("gsd_m")
+    if gsd_m:
+        for name in ("vy", "vx"):
+            metric = _create(
+                group, f"{name}_m_per_s", velocities.shape, velocities.shape, "float64", dimension_names=(name,)
+            )
+            metric[:] = velocities * float(gsd_m)
+            metric.attrs["units"] = "m s-1"
+    if attributes.get("crs_wkt"):
+        crs = _create(group, "crs", (), (), "int32", fill_value=0)
+        crs.attrs.update({"crs_wkt": attributes["crs_wkt"], "GeoTransform": attributes.get("geotransform", "")})
+
+
+@dataclass(frozen=True)
+class FieldStore:
+    """``field.zarr``, opened."""
+
+    path: Path
+    group: zarr.Group
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        return dict(self.group.attrs)
+
+    @property
+    def tile(self) -> int:
+        return int(_array(self.group, HISTOGRAM).chunks[0])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width) of the base image, px."""
+        height, width = _array(self.group, HISTOGRAM).shape[:2]
+        return int(height), int(width)
+
+    def velocities(self) -> NDArray[np.float64]:
+        """Bin centres, px/s."""
+        return np.asarray(_array(self.group, "vx")[:])
+
+    def write_tile(self, row: int, column: int, histogram: NDArray[np.int32]) -> None:
+        """Write one tile of the histogram, (ty, tx, nvy, nvx): one chunk."""
+        y, x, side = row * self.tile, column * self.tile, self.tile
+        _array(self.group, HISTOGRAM)[y : y + side, x : x + side] = histogram
+
+    def has_tile(self, row: int, column: int) -> bool:
+        """Whether the tile's chunk exists."""
+        return (self.path / HISTOGRAM / "c" / str(row) / str(column) / "0" / "0").exists()
+
+    def read_tile(self, row: int, column: int) -> NDArray[np.int32]:
+        """One tile of the histogram, (ty, tx, nvy, nvx) int32; clipped at the border.
+
+        Raises
+        ------
+        StoreError
+            The chunk is damaged.
+        """
+        y, x, side = row * self.tile, column * self.tile, self.tile
+        try:
+            return np.asarray(_array(self.group, HISTOGRAM)[y : y + side, x : x + side], dtype=np.int32)
+        except Exception as error:
+            raise StoreError(f"{self.path}: the chunk of tile ({row}, {column}) is damaged ({error})") from error
+
+    def write_layer(self, name: str, y: int, x: int, values: NDArray[Any]) -> None:
+        """Write a window of a layer: whole chunks."""
+        _array(self.group, name)[y : y + values.shape[0], x : x + values.shape[1]] = values
+
+    def layer(self, name: str) -> NDArray[Any]:
+        """A whole layer, (y, x)."""
+        return np.asarray(_array(self.group, name)[:])
+
+    def layer_names(self) -> list[str]:
+        """Names of the (y, x) layers."""
+        return [name for name, array in self.group.arrays() if array.ndim == 2]
+
+
+def open_field(path: Path, mode: str = "r") -> FieldStore:
+    """Open ``field.zarr``."""
+    return FieldStore(path, _open(path, mode))

@@ -1,0 +1,247 @@
+"""The simulated camera, exact both ways: raw pixel -> ground through lens, rolling shutter, pose and relief, and back.
+
+Axes: x right, y down (as the base image), z into the ground, all in base pixels; height above the ground is -z. A raw
+pixel's row tells when it was exposed, and with that the pose and the shake that hold for it:
+
+    raw -> undistort (Harris, closed) -> minus shake(t) -> ray of the pose(t) -> where the ray meets the ground
+
+No step is approximated, so the maps here are the truth that registration is scored against.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from schemas.simulation import CameraSimulation, SimulationConfig
+from velfield.synthetic.relief import Relief, ground_height, ground_height_at
+
+FloatArray = NDArray[np.float64]
+
+ROW_FIELDS = 14
+"""Columns of a row table: rotation camera -> base (9, row-major), camera place (3), shake (2)."""
+
+MAX_FIXED_POINT_ROUNDS = 60
+"""Rounds of the search for the row that saw a point; each shrinks the error by at least half, see ``to_raw``."""
+
+
+@dataclass(frozen=True)
+class Waves:
+    """A smooth function of time: a sum of sines, one row a channel.
+
+    ``amplitude``, ``omega_rad_per_s``, ``phase_rad``: (channels, waves).
+    """
+
+    amplitude: FloatArray
+    omega_rad_per_s: FloatArray
+    phase_rad: FloatArray
+
+    def __call__(self, time_s: FloatArray) -> FloatArray:
+        """Values (channels, n) at times (n,)."""
+        angle = self.omega_rad_per_s[:, :, None] * time_s[None, None, :] + self.phase_rad[:, :, None]
+        value: FloatArray = (self.amplitude[:, :, None] * np.sin(angle)).sum(axis=1)
+        return value
+
+
+def motion_waves(amplitudes: FloatArray, *, period_s: float, rng: np.random.Generator) -> Waves:
+    """Slow waves, three a channel, periods spread about ``period_s``, that never exceed ``amplitudes``."""
+    channels = len(amplitudes)
+    share = rng.dirichlet(np.full(3, 2.0), size=channels)
+    omega = 2 * np.pi / (period_s * rng.uniform(0.6, 2.0, size=(channels, 3)))
+    return Waves(amplitudes[:, None] * share, omega, rng.uniform(0, 2 * np.pi, size=(channels, 3)))
+
+
+def shake_waves(camera: CameraSimulation, rng: np.random.Generator) -> Waves:
+    """The shake in x and y: one pure tone where ``vibration_cycles`` is given, else three tones within the band."""
+    phase = rng.uniform(0, 2 * np.pi, size=(2, 3))
+    if camera.vibration_cycles is not None:
+        omega = np.full((2, 1), 2 * np.pi * camera.vibration_cycles / max(camera.readout_s, 1e-9))
+        return Waves(np.full((2, 1), camera.vibration_px), omega, phase[:, :1])
+    share = rng.dirichlet(np.full(3, 2.0), size=2)
+    omega = 2 * np.pi * rng.uniform(camera.vibration_low_hz, camera.vibration_high_hz, size=(2, 3))
+    return Waves(camera.vibration_px * share, omega, phase)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """The camera of one flight.
+
+    Attributes
+    ----------
+    width, height : frame size, px.
+    focal_px : focal length, px.
+    lens_a, lens_x_px, lens_y_px : Harris' distortion and its centre; radius in half-diagonals.
+    place_px : (3,) mean place of the camera, base px; z negative (above the ground).
+    heading_rad : mean turn, from +x towards +y.
+    motion : waves of x, y, z (base px), turn, tilt about x, tilt about y (rad).
+    shake : waves of the picture's shake in x and y, undistorted px.
+    readout_s : time from the first row to the last.
+    times_s : (frames,) exposure of each frame's first row.
+    relief : height of the ground.
+    """
+
+    width: int
+    height: int
+    focal_px: float
+    lens_a: float
+    lens_x_px: float
+    lens_y_px: float
+    place_px: FloatArray
+    heading_rad: float
+    motion: Waves
+    shake: Waves
+    readout_s: float
+    times_s: FloatArray
+    relief: Relief
+
+    @property
+    def half_diagonal_px(self) -> float:
+        """Unit of the lens's radius, px."""
+        return float(np.hypot(self.width, self.height) / 2)
+
+    def row_time_s(self, frame: int, rows: FloatArray) -> FloatArray:
+        """When rows (n,), also between rows or beyond the frame, were exposed, s."""
+        return np.asarray(self.times_s[frame] + self.readout_s * rows / max(self.height - 1, 1))
+
+    def row_table(self, frame: int, rows: FloatArray) -> FloatArray:
+        """Pose and shake at rows (n,): (n, ROW_FIELDS)."""
+        time_s = self.row_time_s(frame, rows)
+        dx, dy, dz, turn, tilt_x, tilt_y = self.motion(time_s)
+        table = np.empty((len(rows), ROW_FIELDS))
+        table[:, :9] = _rotation(self.heading_rad + turn, tilt_x, tilt_y).reshape(-1, 9)
+        table[:, 9:12] = self.place_px + np.stack([dx, dy, dz], axis=1)
+        table[:, 12:14] = self.shake(time_s).T
+        return table
+
+    def undistort(self, xy: FloatArray) -> FloatArray:
+        """Raw pixels (n, 2) -> undistorted pixels (n, 2); NaN beyond the lens's reach."""
+        return _radial(xy, (self.lens_x_px, self.lens_y_px), -self.lens_a, self.half_diagonal_px)
+
+    def distort(self, xy: FloatArray) -> FloatArray:
+        """Undistorted pixels (n, 2) -> raw pixels (n, 2); NaN beyond the lens's reach."""
+        return _radial(xy, (self.lens_x_px, self.lens_y_px), self.lens_a, self.half_diagonal_px)
+
+    def to_base(self, frame: int, xy_raw: FloatArray) -> FloatArray:
+        """Raw pixels (n, 2) of a frame -> the ground they show, base pixels (n, 2)."""
+        xy_raw = np.asarray(xy_raw, dtype=np.float64).reshape(-1, 2)
+        table = self.row_table(frame, xy_raw[:, 1])
+        rays = self.undistort(xy_raw)
+        return np.asarray(_rays_to_ground(rays, table, self.pinhole, self.relief.grid, self.relief.frame))
+
+    def to_raw(self, frame: int, xy_base: FloatArray, *, above_px: float | FloatArray = 0.0) -> FloatArray:
+        """Base pixels (n, 2) -> where the frame shows them (n, 2), also beyond its border; NaN where nowhere.
+
+        ``above_px`` lifts the points above the ground. The row that saw a point depends on where the point lands:
+        found by fixed-point iteration, which converges since the shake moves less than a row a row.
+        """
+        xy_base = np.asarray(xy_base, dtype=np.float64).reshape(-1, 2)
+        height = self.relief_at(xy_base) + above_px
+        place = np.column_stack([xy_base, -height])
+        rows = np.full(len(place), self.height / 2)
+        xy = np.full((len(place), 2), np.nan)
+        for _ in range(MAX_FIXED_POINT_ROUNDS):
+            xy = self.distort(_project(place, self.row_table(frame, rows), self.pinhole))
+            step = np.nan_to_num(xy[:, 1] - rows)
+            rows = rows + step
+            if len(step) == 0 or np.abs(step).max() < 1e-9:
+                break
+        return xy
+
+    def relief_at(self, xy_base: FloatArray) -> FloatArray:
+        """Height of the ground at base pixels (n, 2), base px."""
+        height: FloatArray = ground_height(
+            np.ascontiguousarray(xy_base[:, 0]),
+            np.ascontiguousarray(xy_base[:, 1]),
+            self.relief.grid,
+            self.relief.frame,
+        )
+        return height
+
+    @property
+    def pinhole(self) -> FloatArray:
+        return np.array([self.focal_px, (self.width - 1) / 2, (self.height - 1) / 2])
+
+
+def make_camera(config: SimulationConfig, times_s: FloatArray, relief: Relief, rng: np.random.Generator) -> Camera:
+    """The camera of a configuration, its mean place above base pixel (0, 0)."""
+    c = config.camera
+    focal = c.focal_widths * config.width
+    height_px = focal / c.scale
+    drift = c.drift_m / config.gsd_m
+    amplitudes = np.array(
+        [
+            drift,
+            drift,
+            c.climb_share * height_px,
+            np.radians(c.turn_deg),
+            np.radians(c.tilt_deg),
+            np.radians(c.tilt_deg),
+        ]
+    )
+    return Camera(
+        width=config.width,
+        height=config.height,
+        focal_px=focal,
+        lens_a=c.lens_a,
+        lens_x_px=(config.width - 1) / 2 + c.lens_offset_x_px,
+        lens_y_px=(config.height - 1) / 2 + c.lens_offset_y_px,
+        place_px=np.array([0.0, 0.0, -height_px]),
+        heading_rad=float(np.radians(c.heading_deg)),
+        motion=motion_waves(amplitudes, period_s=c.motion_period_s, rng=rng),
+        shake=shake_waves(c, rng),
+        readout_s=c.readout_s,
+        times_s=times_s,
+        relief=relief,
+    )
+
+
+def _rotation(turn: FloatArray, tilt_x: FloatArray, tilt_y: FloatArray) -> FloatArray:
+    """Rotations (n, 3, 3) camera -> base: tilt about x, then about y, then turn about z."""
+    zero, one = np.zeros_like(turn), np.ones_like(turn)
+    c, s = np.cos(turn), np.sin(turn)
+    about_z = np.array([[c, -s, zero], [s, c, zero], [zero, zero, one]])
+    c, s = np.cos(tilt_y), np.sin(tilt_y)
+    about_y = np.array([[c, zero, s], [zero, one, zero], [-s, zero, c]])
+    c, s = np.cos(tilt_x), np.sin(tilt_x)
+    about_x = np.array([[one, zero, zero], [zero, c, -s], [zero, s, c]])
+    product: FloatArray = np.einsum("abn,bcn,cdn->nad", about_z, about_y, about_x)
+    return product
+
+
+def _radial(xy: FloatArray, centre: tuple[float, float], a: float, unit: float) -> FloatArray:
+    """Harris' map: r -> r / sqrt(1 + a r^2); its inverse is itself with -a."""
+    offset = np.asarray(xy, dtype=np.float64) - centre
+    under_root = 1 + a * (offset**2).sum(axis=1) / unit**2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        scale = np.where(under_root > 0, 1 / np.sqrt(under_root), np.nan)
+    return np.asarray(offset * scale[:, None] + centre)
+
+
+@njit(cache=True, nogil=True)
+def _rays_to_ground(undistorted, table, pinhole, relief, relief_frame):  # type: ignore[no-untyped-def]
+    out = np.empty((len(undistorted), 2))
+    for i in range(len(undistorted)):
+        r = table[i]
+        u = undistorted[i, 0] - r[12] - pinhole[1]
+        v = undistorted[i, 1] - r[13] - pinhole[2]
+        dx = r[0] * u + r[1] * v + r[2] * pinhole[0]
+        dy = r[3] * u + r[4] * v + r[5] * pinhole[0]
+        dz = r[6] * u + r[7] * v + r[8] * pinhole[0]
+        slope_x, slope_y = dx / dz, dy / dz
+        x0, y0 = r[9] - r[11] * slope_x, r[10] - r[11] * slope_y
+        x, y = x0, y0
+        # the relief is slow, each round gains three digits
+        for _ in range(8):
+            z = -ground_height_at(x, y, relief, relief_frame)
+            x, y = x0 + z * slope_x, y0 + z * slope_y
+        out[i, 0], out[i, 1] = x, y
+    return out
+
+
+def _project(place: FloatArray, table: FloatArray, pinhole: FloatArray) -> FloatArray:
+    """Points (n, 3), each by its own pose -> undistorted pixels (n, 2), shake included; NaN behind the camera."""
+    ray = np.einsum("nij,ni->nj", table[:, :9].reshape(-1, 3, 3), place - table[:, 9:12])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        scale = np.where(ray[:, 2] > 0, pinhole[0] / ray[:, 2], np.nan)
+    return np.asarray(ray[:, :2] * scale[:, None] + pinhole[1:] + table[:, 12:14])

@@ -1,0 +1,77 @@
+"""The base image: the same ground from straight above, by another sensor, on another day, without the traffic."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.simulation import OtherSensorSimulation
+from velfield.synthetic.ground import light_map, shade
+from velfield.synthetic.render import MOSAIC_SCALE, Grey, Sprites, draw_sprites
+from velfield.synthetic.traffic import draw_kinds
+from velfield.synthetic.vehicles import draw_tones
+
+FloatArray = NDArray[np.float64]
+
+FAR_PX = 1e8
+"""Height of a camera whose rays are as good as upright."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What stands still: ``tone`` mosaic, ``height`` and ``reach`` maps, base px a count, and the mosaic's border."""
+
+    tone: Grey
+    height: Grey
+    reach: Grey
+    height_step_px: float
+    pad_px: int
+
+
+def other_sensor_image(
+    standing: Standing,
+    config: OtherSensorSimulation,
+    *,
+    shape: tuple[int, int],
+    sun: FloatArray,
+    parked: FloatArray,
+    gsd_m: float,
+    rng: np.random.Generator,
+) -> Grey:
+    """Picture (shape) with its own light, blur, tone curve and noise, and cars at ``parked`` (n, 3) x, y, direction."""
+    light = light_map(standing.height, standing.reach, step_px=standing.height_step_px, direction=sun)
+    lit = shade(standing.tone, light)
+    blurred = cv2.GaussianBlur(lit, (0, 0), MOSAIC_SCALE * float(np.hypot(config.blur_px, 0.29)))
+    first = standing.pad_px * MOSAIC_SCALE
+    last_y, last_x = (first + n * MOSAIC_SCALE for n in shape)
+    tones = np.ascontiguousarray(blurred[first:last_y:MOSAIC_SCALE, first:last_x:MOSAIC_SCALE], dtype=np.float32)
+    _draw_parked(tones, parked, sun=sun, gsd_m=gsd_m, rng=rng)
+    curved = 255 * (tones / 255) ** np.float32(1.0 if config.same_sensor else config.gamma)
+    curved += np.float32(config.noise_grey) * rng.standard_normal(tones.shape, dtype=np.float32)
+    return np.clip(np.rint(curved), 0, 255).astype(np.uint8)
+
+
+def _draw_parked(
+    out: NDArray[np.float32], parked: FloatArray, *, sun: FloatArray, gsd_m: float, rng: np.random.Generator
+) -> None:
+    """Draw cars seen from straight above, by a camera so high that all rays are upright."""
+    h, w = out.shape
+    n = len(parked)
+    kinds = draw_kinds(np.zeros(n, bool), rng)
+    sizes = np.column_stack([kinds.length_m, kinds.width_m, kinds.height_m]) / gsd_m
+    zero = np.zeros(n)
+    pose = np.column_stack([parked, zero, zero, zero, sizes, zero])
+    reach = sizes[:, :1] * (0.6 + float(np.hypot(*sun))) + 3
+    limit = [w - 1, h - 1]
+    box = np.column_stack([np.clip(parked[:, :2] - reach, 0, limit), np.clip(parked[:, :2] + reach, -1, limit)])
+    upright = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, -FAR_PX, 0, 0])
+    draw_sprites(
+        out,
+        np.zeros(out.shape, np.uint8),
+        Sprites(pose, kinds.shape, draw_tones(n, rng), box.astype(np.int64)),
+        table=np.tile(upright, (h, 1)),
+        pinhole=np.array([FAR_PX, 0.0, 0.0]),
+        lens=np.array([0.0, 0.0, 0.0, 1.0]),
+        sun=sun,
+    )

@@ -1,0 +1,237 @@
+"""From the city to a raw frame: every pixel by its own row's pose, nothing resampled twice.
+
+The ground is one orthographic mosaic at twice the base image's resolution, already blurred as the optics blur. A raw
+pixel's ray goes down through what stands there (a height map: roofs, walls, crowns) to the ground, and takes the
+mosaic's grey. Vehicles are splatted over it with their own supersampling, each where it was when its row was exposed.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from velfield.synthetic.relief import ground_height_at
+from velfield.synthetic.vehicles import LAYERS
+
+FloatArray = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+
+MOSAIC_SCALE = 2
+"""Mosaic pixels a base pixel."""
+REACH_CELL = 16
+"""Cell of the coarse map of what may stand in a ray's way, base px."""
+SAMPLES = 4
+"""Samples a pixel and axis where a vehicle is."""
+SPREAD_PX = 1.6
+"""Side of the square those samples cover: a box this wide blurs about as the optics do."""
+TALL_PX = 6.0
+"""What stands higher than this, base px, hides a vehicle."""
+SHADE = 0.52
+"""Light left in a shadow."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What stands still, as the renderer wants it.
+
+    ``mosaic`` uint8 at MOSAIC_SCALE, ``height`` uint8 (base resolution, ``height_step_px`` base px a count), ``reach``
+    uint8 (cells of REACH_CELL: greatest height within a ray's reach); all start at base pixel ``origin``.
+    """
+
+    mosaic: Grey
+    height: Grey
+    reach: Grey
+    origin: FloatArray
+    height_step_px: float
+
+
+@dataclass(frozen=True)
+class Sprites:
+    """Vehicles in one frame. ``pose`` (n, 10): x, y base px at its own row, direction rad, velocity x, y in base px a
+    row, that row, length, width, height base px, ground height; ``shape`` (n,); ``tones`` (n, 5); ``box`` (n, 4) raw
+    pixels x0, y0, x1, y1 (inclusive) it may touch."""
+
+    pose: FloatArray
+    shape: NDArray[np.int64]
+    tones: FloatArray
+    box: NDArray[np.int64]
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def render_ground(und_x, und_y, table, pinhole, relief, relief_frame, mosaic, height, reach, origin, step, out, tall):  # type: ignore[no-untyped-def]
+    """Grey of every pixel without vehicles into ``out`` (h, w) float32; ``tall`` 1 where something hides the road."""
+    f, cx, cy = pinhole[0], pinhole[1], pinhole[2]
+    mh, mw = mosaic.shape
+    for i in range(out.shape[0]):
+        r0, r1, r2, r3, r4, r5, r6, r7, r8 = (
+            table[i, 0],
+            table[i, 1],
+            table[i, 2],
+            table[i, 3],
+            table[i, 4],
+            table[i, 5],
+            table[i, 6],
+            table[i, 7],
+            table[i, 8],
+        )
+        px, py, pz = table[i, 9], table[i, 10], table[i, 11]
+        z = 0.0
+        for j in range(out.shape[1]):
+            u = und_x[i, j] - table[i, 12] - cx
+            v = und_y[i, j] - table[i, 13] - cy
+            inv = 1.0 / (r6 * u + r7 * v + r8 * f)
+            sx, sy = (r0 * u + r1 * v + r2 * f) * inv, (r3 * u + r4 * v + r5 * f) * inv
+            x0, y0 = px - pz * sx, py - pz * sy
+            # the neighbour's height is a good start: the relief is slow
+            for _ in range(2):
+                z = -ground_height_at(x0 + z * sx, y0 + z * sy, relief, relief_frame)
+            x, y = x0 + z * sx, y0 + z * sy
+            ci, cj = int((y - origin[1]) / 16.0), int((x - origin[0]) / 16.0)
+            tall[i, j] = 0
+            shade = 1.0
+            if 0 <= ci < reach.shape[0] and 0 <= cj < reach.shape[1] and reach[ci, cj] > 0:
+                x, y, above, wall = _first_hit(x, y, sx, sy, reach[ci, cj] * step, height, origin, step)
+                tall[i, j] = 1 if above > TALL_PX else 0
+                if wall:
+                    shade = 0.62 + 0.12 * (int(above / 7.0) & 1)
+            gx, gy = (x - origin[0]) * 2.0, (y - origin[1]) * 2.0
+            gx, gy = min(max(gx, 0.0), mw - 1.001), min(max(gy, 0.0), mh - 1.001)
+            a, b = int(gy), int(gx)
+            fy, fx = gy - a, gx - b
+            top = mosaic[a, b] * (1 - fx) + mosaic[a, b + 1] * fx
+            low = mosaic[a + 1, b] * (1 - fx) + mosaic[a + 1, b + 1] * fx
+            out[i, j] = shade * (top * (1 - fy) + low * fy)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _first_hit(x, y, sx, sy, highest, height, origin, step):  # type: ignore[no-untyped-def]
+    """Where a ray that would meet the ground at (x, y) first meets what stands: place, height, whether on a wall.
+
+    It comes down from the height ``highest`` in steps of about half a pixel sideways.
+    """
+    lean = np.sqrt(sx * sx + sy * sy)
+    n = int(highest * lean * 1.5) + 1
+    drop = highest / n
+    before = 1e9
+    for k in range(n + 1):
+        level = highest - k * drop
+        qx, qy = x - level * sx, y - level * sy
+        i, j = int(qy - origin[1] + 0.5), int(qx - origin[0] + 0.5)
+        if not (0 <= i < height.shape[0] and 0 <= j < height.shape[1]):
+            continue
+        here = height[i, j] * step
+        if here >= level and here > 0.0:
+            # stepping in from the side below the top: a wall
+            return qx, qy, level, here - level > 2.5 * drop + 3.0 and before < here - 3.0
+        before = here
+    return x, y, 0.0, False
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def splat(out, tall, pose, shape, tones, box, table, pinhole, lens, sun, layers):  # type: ignore[no-untyped-def]
+    """Draw vehicles and their shadows over ``out`` (h, w) float32; ``lens`` = a, centre x, centre y, half-diagonal.
+
+    The way from the picture to the vehicle is as good as linear within a pixel: three rays a pixel, and from them all
+    of its samples.
+    """
+    step = SPREAD_PX / SAMPLES
+    for n in range(len(pose)):
+        far = 0.5 * np.hypot(pose[n, 6], pose[n, 7]) + 1.5
+        lean = pose[n, 8] * np.hypot(sun[0], sun[1])
+        for i in range(box[n, 1], box[n, 3] + 1):
+            for j in range(box[n, 0], box[n, 2] + 1):
+                if tall[i, j] == 1:
+                    continue
+                a, b, sa, sb = _ray(j, i, pose[n], table, pinhole, lens)
+                if np.hypot(a, b) > far + max(lean, pose[n, 8] * np.hypot(sa, sb)):
+                    continue
+                ra, rb, _, _ = _ray(j + step, i, pose[n], table, pinhole, lens)
+                da, db, _, _ = _ray(j, i + step, pose[n], table, pinhole, lens)
+                c, s = np.cos(pose[n, 2]), np.sin(pose[n, 2])
+                seen, light, grey = 0, 0.0, 0.0
+                for p in range(SAMPLES):
+                    for q in range(SAMPLES):
+                        u, v = q - 0.5 * (SAMPLES - 1), p - 0.5 * (SAMPLES - 1)
+                        x, y = a + u * (ra - a) + v * (da - a), b + u * (rb - b) + v * (db - b)
+                        m = _layer(x, y, sa, sb, pose[n], layers[shape[n]])
+                        if m >= 0:
+                            seen += 1
+                            grey += tones[n, int(layers[shape[n], m, 5])]
+                            continue
+                        m = _layer(x, y, c * sun[0] + s * sun[1], c * sun[1] - s * sun[0], pose[n], layers[shape[n]])
+                        light += SHADE if m >= 0 else 1.0
+                if seen > 0 or light < SAMPLES * SAMPLES:
+                    out[i, j] = (grey + light * out[i, j]) / (SAMPLES * SAMPLES)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _ray(u, v, pose, table, pinhole, lens):  # type: ignore[no-untyped-def]
+    """A raw place's ray in a vehicle's own axes: where it meets the ground along and across, and its two slopes."""
+    ox, oy = u - lens[1], v - lens[2]
+    scale = 1.0 / np.sqrt(1.0 - lens[0] * (ox * ox + oy * oy) / (lens[3] * lens[3]))
+    row = min(max(v, 0.0), table.shape[0] - 1.001)
+    k = int(row)
+    t = row - k
+    d0 = lens[1] + ox * scale - (table[k, 12] * (1 - t) + table[k + 1, 12] * t + pinhole[1])
+    d1 = lens[2] + oy * scale - (table[k, 13] * (1 - t) + table[k + 1, 13] * t + pinhole[2])
+    # pose changes so little from row to row that this row's will do; the shake does not
+    r = table[k]
+    inv = 1.0 / (r[6] * d0 + r[7] * d1 + r[8] * pinhole[0])
+    sx = (r[0] * d0 + r[1] * d1 + r[2] * pinhole[0]) * inv
+    sy = (r[3] * d0 + r[4] * d1 + r[5] * pinhole[0]) * inv
+    depth = -pose[9]
+    x = r[9] + (depth - r[11]) * sx - (pose[0] + (v - pose[5]) * pose[3])
+    y = r[10] + (depth - r[11]) * sy - (pose[1] + (v - pose[5]) * pose[4])
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return c * x + s * y, c * y - s * x, c * sx + s * sy, c * sy - s * sx
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _layer(a, b, slope_a, slope_b, pose, layers):  # type: ignore[no-untyped-def]
+    """The highest layer that a ray down to the ground at (a, b) meets, -1: none."""
+    for m in range(layers.shape[0]):
+        z = layers[m, 0] * pose[8]
+        if _inside(a - z * slope_a, b - z * slope_b, layers[m], pose[6], pose[7]):
+            return m
+    return -1
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _inside(a, b, layer, length, width):  # type: ignore[no-untyped-def]
+    """Whether (a along, b across) lies in a layer's rectangle with rounded corners."""
+    middle, half = 0.5 * (layer[1] + layer[2]) * length, 0.5 * (layer[2] - layer[1]) * length
+    radius = layer[4] * width
+    da, db = abs(a - middle) - (half - radius), abs(b) - (layer[3] * width - radius)
+    if da > radius or db > radius:
+        return False
+    return da <= 0 or db <= 0 or da * da + db * db <= radius * radius
+
+
+@njit(cache=True, nogil=True)
+def hidden(place, slope, height, origin, step):  # type: ignore[no-untyped-def]
+    """Whether the rays of ``slope`` (n, 2) down to the ground at ``place`` (n, 2) meet something tall before."""
+    out = np.zeros(len(place), dtype=np.bool_)
+    highest = height.max() * step
+    for i in range(len(place)):
+        if highest > 0:
+            _, _, level, _ = _first_hit(
+                place[i, 0], place[i, 1], slope[i, 0], slope[i, 1], highest, height, origin, step
+            )
+            out[i] = level > TALL_PX
+    return out
+
+
+def draw_sprites(
+    out: NDArray[np.float32],
+    tall: Grey,
+    sprites: Sprites,
+    *,
+    table: FloatArray,
+    pinhole: FloatArray,
+    lens: FloatArray,
+    sun: FloatArray,
+) -> None:
+    """Draw vehicles over ``out`` in place; see ``splat``."""
+    if len(sprites.pose):
+        splat(out, tall, sprites.pose, sprites.shape, sprites.tones, sprites.box, table, pinhole, lens, sun, LAYERS)

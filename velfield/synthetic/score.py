@@ -1,0 +1,336 @@
+"""How near a run comes to a simulated flight's truth, in words of the domain.
+
+Where no base image was given, a run's base pixels are another picture's: ``fit_homography`` finds the best homography
+to the truth's, and each score takes it as ``to_truth``.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
+
+from velfield.synthetic.truth import Truth
+
+FloatArray = NDArray[np.float64]
+ToBase = Callable[[int, FloatArray], FloatArray]
+
+MATCH_PX = 8.0
+"""A detection within this of a car's middle is that car, base px. Paper: half a car's length."""
+BORDER_PX = 14.0
+"""Cars whose middle is nearer than this to the frame's border need not be found, raw px."""
+CELL_PX = 64.0
+"""Cells in which the error that stays is told from jitter, base px."""
+
+
+@dataclass(frozen=True)
+class RegistrationScore:
+    """Errors of the raw-to-base map, base px, over a grid of points in all registered frames.
+
+    ``jitter_px``: root mean square of what changes from frame to frame at one place, the mean of the place taken off.
+    """
+
+    mean_px: float
+    median_px: float
+    p95_px: float
+    jitter_px: float
+    worst_frame_px: float
+    frame_mean_px: FloatArray
+    frames: int
+
+
+@dataclass(frozen=True)
+class DetectionScore:
+    """Cars found. Cars cut by the frame's border are neither wanted nor wrong."""
+
+    precision: float
+    recall: float
+    f1: float
+    recall_moving: float
+    place_px: float
+    axis_median_rad: float
+    detections: int
+    cars: int
+
+
+@dataclass(frozen=True)
+class TrackletScore:
+    """Tracklets whose three detections are one vehicle; speeds of those, against the truth between the same frames."""
+
+    precision: float
+    precision_moving: float
+    recall_moving: float
+    speed_error_mean_km_per_h: float
+    speed_bias_km_per_h: float
+    direction_error_mean_rad: float
+    tracklets: int
+
+
+@dataclass(frozen=True)
+class FieldScore:
+    """Pixels with enough passages: how many, and the share whose modal direction is within 10 degrees of a lane's."""
+
+    share_within: float
+    pixels: int
+    median_error_rad: float
+
+
+def sample_grid(truth: Truth, *, columns: int = 24, rows: int = 18) -> FloatArray:
+    """Raw pixels (columns * rows, 2) spread over the frame."""
+    x = (np.arange(columns) + 0.5) / columns * truth.camera.width - 0.5
+    y = (np.arange(rows) + 0.5) / rows * truth.camera.height - 0.5
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def fit_homography(truth: Truth, to_base: ToBase, frames: list[int] | range) -> FloatArray:
+    """The homography (3, 3) from a run's base pixels to the truth's that fits best over a grid in ``frames``."""
+    grid = sample_grid(truth, columns=12, rows=9)
+    found = np.concatenate([to_base(frame, grid) for frame in frames])
+    true = np.concatenate([truth.to_base(frame, grid) for frame in frames])
+    good = np.isfinite(found).all(axis=1)
+    matrix, _ = cv2.findHomography(found[good], true[good], 0)
+    return np.asarray(matrix, dtype=np.float64)
+
+
+def apply_homography(matrix: FloatArray | None, xy: FloatArray) -> FloatArray:
+    """Points (n, 2) under a homography; unchanged where there is none."""
+    if matrix is None:
+        return xy
+    h = np.column_stack([xy, np.ones(len(xy))]) @ matrix.T
+    return np.asarray(h[:, :2] / h[:, 2:])
+
+
+def score_registration(
+    truth: Truth, to_base: ToBase, frames: list[int] | range, *, to_truth: FloatArray | None = None
+) -> RegistrationScore:
+    """Score a run's raw-to-base map over its registered ``frames``.
+
+    Points that the truth sees outside of the base image are left out, as are those where the run gives NaN.
+    """
+    grid = sample_grid(truth)
+    places, errors, numbers = [], [], []
+    for frame in frames:
+        true = truth.to_base(frame, grid)
+        error = apply_homography(to_truth, to_base(frame, grid)) - true
+        inside = (true >= 0).all(axis=1) & (true < truth.base_shape[::-1]).all(axis=1) & np.isfinite(error).all(axis=1)
+        places.append(true[inside])
+        errors.append(error[inside])
+        numbers.append(np.full(int(inside.sum()), frame))
+    place, error, number = np.concatenate(places), np.concatenate(errors), np.concatenate(numbers)
+    size = np.hypot(error[:, 0], error[:, 1])
+    by_frame = pd.Series(size).groupby(number).mean().to_numpy()
+    return RegistrationScore(
+        mean_px=float(size.mean()),
+        median_px=float(np.median(size)),
+        p95_px=float(np.percentile(size, 95)),
+        jitter_px=_jitter(place, error, number),
+        worst_frame_px=float(by_frame.max()),
+        frame_mean_px=np.asarray(by_frame, dtype=np.float64),
+        frames=len(by_frame),
+    )
+
+
+def _jitter(place: FloatArray, error: FloatArray, frame: NDArray[np.int64]) -> float:
+    cell = np.floor(place / CELL_PX).astype(np.int64)
+    table = pd.DataFrame({"i": cell[:, 1], "j": cell[:, 0], "frame": frame, "ex": error[:, 0], "ey": error[:, 1]})
+    each = table.groupby(["i", "j", "frame"])[["ex", "ey"]].mean()
+    rest = each - each.groupby(["i", "j"]).transform("mean")
+    return float(np.sqrt((rest**2).sum(axis=1).mean()))
+
+
+def score_detections(
+    truth: Truth,
+    detections: pd.DataFrame,
+    *,
+    frame_of: Mapping[int, int] | None = None,
+    to_truth: FloatArray | None = None,
+    match_px: float = MATCH_PX,
+) -> DetectionScore:
+    """Score detections (columns frame, x_px, y_px, orientation_rad; base px). ``frame_of``: run's frame -> flight's."""
+    matches, n_detections, n_cars, n_moving = [], 0, 0, 0
+    for frame, found in detections.groupby("frame"):
+        cars = _cars(truth, _flight_frame(frame, frame_of))
+        xy = apply_homography(to_truth, found[["x_px", "y_px"]].to_numpy(dtype=np.float64))
+        pairs = _match(xy, cars[["x_base_px", "y_base_px"]].to_numpy(), match_px)
+        wanted = cars["wanted"].to_numpy()
+        ignored = ~wanted[pairs[:, 1]]
+        n_detections += len(xy) - int(ignored.sum())
+        n_cars += int(wanted.sum())
+        n_moving += int((wanted & cars["moving"]).sum())
+        pairs = pairs[~ignored]
+        here = cars.iloc[pairs[:, 1]]
+        turn = 0.0 if to_truth is None else float(np.arctan2(to_truth[1, 0], to_truth[0, 0]))
+        axis = (
+            found["orientation_rad"].to_numpy(dtype=np.float64)[pairs[:, 0]] + turn - here["orientation_rad"].to_numpy()
+        )
+        place = xy[pairs[:, 0]] - here[["x_base_px", "y_base_px"]].to_numpy()
+        matches.append(
+            pd.DataFrame({"moving": here["moving"].to_numpy(), "axis": _axial(axis), "place": np.hypot(*place.T)})
+        )
+    table = pd.concat(matches, ignore_index=True) if matches else pd.DataFrame({"moving": [], "axis": [], "place": []})
+    precision, recall = len(table) / max(n_detections, 1), len(table) / max(n_cars, 1)
+    return DetectionScore(
+        precision=precision,
+        recall=recall,
+        f1=2 * precision * recall / max(precision + recall, 1e-9),
+        recall_moving=float(table["moving"].sum()) / max(n_moving, 1),
+        place_px=float(table["place"].median()),
+        axis_median_rad=float(table["axis"].median()),
+        detections=n_detections,
+        cars=n_cars,
+    )
+
+
+def score_tracklets(
+    truth: Truth,
+    tracklets: pd.DataFrame,
+    *,
+    frame_of: Mapping[int, int] | None = None,
+    to_truth: FloatArray | None = None,
+    match_px: float = MATCH_PX,
+) -> TrackletScore:
+    """Score tracklets: right where all three detections are nearest to one vehicle, within ``match_px`` of it."""
+    frames = [np.array([_flight_frame(f, frame_of) for f in tracklets[f"frame_{k}"]], dtype=np.int64) for k in range(3)]
+    places = [apply_homography(to_truth, tracklets[[f"x_{k}_px", f"y_{k}_px"]].to_numpy(np.float64)) for k in range(3)]
+    vehicles = np.stack([_nearest_vehicle(truth, f, xy, match_px) for f, xy in zip(frames, places, strict=True)])
+    right = (vehicles[0] >= 0) & (vehicles[0] == vehicles[1]) & (vehicles[0] == vehicles[2])
+    cars = truth.cars.set_index(["frame", "vehicle_id"])
+    table = pd.DataFrame({"frame": frames[1], "vehicle_id": vehicles[1]})[right]
+    here = cars.loc[pd.MultiIndex.from_frame(table)] if len(table) else cars.iloc[:0]
+    moving = here["moving"].to_numpy(dtype=bool)
+    v = 0.5 * sum(_velocity(tracklets, name, places[k], to_truth)[right] for k, name in ((0, "01"), (1, "12")))
+    v = np.asarray(v).reshape(-1, 2)
+    true = here[["vx_px_per_s", "vy_px_per_s"]].to_numpy()
+    to_km_h = truth.gsd_m * 3.6
+    fast = moving & (np.hypot(*true.T) * to_km_h > 20)
+    speed = (np.hypot(*v.T) - np.hypot(*true.T)) * to_km_h
+    turn = np.abs(np.angle(np.exp(1j * (np.arctan2(v[:, 1], v[:, 0]) - np.arctan2(true[:, 1], true[:, 0])))))
+    claimed = np.hypot(*_velocity(tracklets, "01", places[0], to_truth).T) * to_km_h > 5
+    triples = _true_triples(truth, list(zip(*frames, strict=True)))
+    hit = set(zip(frames[1][right].tolist(), vehicles[1][right].tolist(), strict=True))
+    return TrackletScore(
+        precision=float(right.mean()) if len(right) else 0.0,
+        precision_moving=float(right[claimed].mean()) if claimed.any() else 0.0,
+        recall_moving=len(hit & triples) / max(len(triples), 1),
+        speed_error_mean_km_per_h=float(np.abs(speed[moving]).mean()) if moving.any() else 0.0,
+        speed_bias_km_per_h=float(speed[moving].mean()) if moving.any() else 0.0,
+        direction_error_mean_rad=float(turn[fast].mean()) if fast.any() else 0.0,
+        tracklets=len(right),
+    )
+
+
+def score_field(
+    truth: Truth,
+    modal_velocity: FloatArray,
+    count: NDArray[np.integer],
+    *,
+    to_truth: FloatArray | None = None,
+    min_count: int = 5,
+    within_rad: float = float(np.radians(10)),
+) -> FieldScore:
+    """Score a field's modal velocity (h, w, 2), px/s, where ``count`` (h, w) is at least ``min_count``.
+
+    With ``to_truth``, pixels and velocities are carried over to the truth's base image first.
+    """
+    direction = np.arctan2(modal_velocity[..., 1], modal_velocity[..., 0])
+    known = (np.asarray(count) >= min_count) & np.isfinite(direction)
+    rows, columns = np.nonzero(known)
+    place = np.column_stack([columns, rows]).astype(np.float64)
+    v = modal_velocity[rows, columns]
+    v = v / np.maximum(np.hypot(v[:, 0], v[:, 1])[:, None], 1e-9)
+    ahead = apply_homography(to_truth, place + v)
+    place = apply_homography(to_truth, place)
+    angle = np.arctan2(*(ahead - place).T[::-1])
+    errors = _direction_errors(truth, place, angle)
+    within = float((errors <= within_rad).mean()) if len(errors) else 0.0
+    return FieldScore(within, len(errors), float(np.median(errors)) if len(errors) else float("nan"))
+
+
+def _direction_errors(truth: Truth, place: FloatArray, angle: FloatArray) -> FloatArray:
+    """Errors at places (n, 2): each place's angle against the lanes at its nearest pixel."""
+    h, w = truth.base_shape
+    at = np.rint(place).astype(np.int64)
+    inside = (at >= 0).all(axis=1) & (at < [w, h]).all(axis=1)
+    errors = np.full(len(place), np.pi)
+    left = np.flatnonzero(inside)
+    while len(left):
+        # several places may fall on one pixel: one of them a round
+        _, first = np.unique(at[left] @ [1, w], return_index=True)
+        some = left[first]
+        direction = np.full((h, w), np.nan)
+        direction[at[some, 1], at[some, 0]] = angle[some]
+        errors[some] = truth.direction_error_rad(direction)[at[some, 1], at[some, 0]]
+        left = np.setdiff1d(left, some)
+    return errors
+
+
+def _flight_frame(frame: object, frame_of: Mapping[int, int] | None) -> int:
+    number = int(frame)  # type: ignore[call-overload]
+    return number if frame_of is None else frame_of[number]
+
+
+def _cars(truth: Truth, frame: int) -> pd.DataFrame:
+    """Cars of a frame that may be met, and whether they are ``wanted``: well within the frame."""
+    cars = truth.cars[truth.cars["frame"] == frame]
+    size = [truth.camera.width - 1, truth.camera.height - 1]
+    raw = cars[["x_raw_px", "y_raw_px"]].to_numpy()
+    deep = (raw > BORDER_PX).all(axis=1) & (raw < np.array(size) - BORDER_PX).all(axis=1)
+    near = (raw > -BORDER_PX).all(axis=1) & (raw < np.array(size) + BORDER_PX).all(axis=1)
+    wanted = cars.assign(wanted=deep & cars["visible"].to_numpy())
+    return wanted.iloc[np.flatnonzero(near)].reset_index(drop=True)
+
+
+def _match(found: FloatArray, true: FloatArray, match_px: float) -> NDArray[np.int64]:
+    """Pairs (n, 2) of numbers, one to one, each within ``match_px``, of least total distance."""
+    if not len(found) or not len(true):
+        return np.empty((0, 2), dtype=np.int64)
+    distance = np.hypot(found[:, None, 0] - true[None, :, 0], found[:, None, 1] - true[None, :, 1])
+    a, b = linear_sum_assignment(np.where(distance <= match_px, distance, 1e6))
+    good = distance[a, b] <= match_px
+    return np.column_stack([a[good], b[good]]).astype(np.int64)
+
+
+def _nearest_vehicle(truth: Truth, frame: NDArray[np.int64], xy: FloatArray, match_px: float) -> NDArray[np.int64]:
+    out = np.full(len(xy), -1, dtype=np.int64)
+    for f in np.unique(frame):
+        cars = truth.cars[truth.cars["frame"] == f]
+        here = np.flatnonzero(frame == f)
+        if len(cars):
+            distance, k = cKDTree(cars[["x_base_px", "y_base_px"]].to_numpy()).query(xy[here])
+            out[here] = np.where(distance <= match_px, cars["vehicle_id"].to_numpy()[np.minimum(k, len(cars) - 1)], -1)
+    return out
+
+
+def _velocity(tracklets: pd.DataFrame, part: str, place: FloatArray, to_truth: FloatArray | None) -> FloatArray:
+    """Velocities (n, 2) of one segment, px/s, carried over to the truth's base image."""
+    v: FloatArray = tracklets[[f"vx_{part}_px_per_s", f"vy_{part}_px_per_s"]].to_numpy(np.float64)
+    if to_truth is None:
+        return v
+    back = apply_homography(np.asarray(np.linalg.inv(to_truth), dtype=np.float64), place)
+    ahead = apply_homography(to_truth, back + 0.01 * v)
+    return np.asarray((ahead - place) / 0.01)
+
+
+def _true_triples(truth: Truth, windows: list[tuple[int, int, int]]) -> set[tuple[int, int]]:
+    """(middle frame, vehicle) of all moving cars that are wanted in all three frames of some window."""
+    wanted: dict[int, set[int]] = {}
+    moving: dict[int, set[int]] = {}
+    out: set[tuple[int, int]] = set()
+    for window in set(windows):
+        for frame in window:
+            if frame not in wanted:
+                cars = _cars(truth, frame)
+                wanted[frame] = set(cars.loc[cars["wanted"], "vehicle_id"].tolist())
+                moving[frame] = set(cars.loc[cars["wanted"] & cars["moving"], "vehicle_id"].tolist())
+        both = wanted[window[0]] & wanted[window[2]] & moving[window[1]]
+        out |= {(window[1], vehicle) for vehicle in both}
+    return out
+
+
+def _axial(angle: FloatArray) -> FloatArray:
+    """Size of the difference of two axes, [0, pi/2]."""
+    return np.asarray(np.abs(np.mod(angle + np.pi / 2, np.pi) - np.pi / 2))

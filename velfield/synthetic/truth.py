@@ -1,0 +1,186 @@
+"""What is true of a simulated flight, in memory or as ``truth/`` keeps it: maps, cars, lanes."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from velfield.errors import InputError
+from velfield.synthetic.camera import Camera, Waves
+from velfield.synthetic.flight import Flight
+from velfield.synthetic.relief import Relief
+
+FloatArray = NDArray[np.float64]
+
+CAR_COLUMNS: dict[str, str] = {
+    "frame": "int32",
+    "vehicle_id": "int64",
+    "time_s": "float64",  # when the row that shows the car was exposed; x, y and the velocity hold for this time
+    "x_raw_px": "float64",  # where its middle meets the ground
+    "y_raw_px": "float64",
+    "x_base_px": "float64",
+    "y_base_px": "float64",
+    "orientation_rad": "float64",  # axial, in [0, pi), in the base image
+    "direction_rad": "float64",
+    "vx_px_per_s": "float64",  # base pixels
+    "vy_px_per_s": "float64",
+    "length_px": "float64",  # base pixels
+    "width_px": "float64",
+    "moving": "bool",  # faster than 0.5 m/s
+    "visible": "bool",  # its middle is within the frame, and no building hides it
+}
+"""Columns of ``truth/cars.parquet``: every vehicle of every frame, also beyond the frame's border."""
+
+LANE_WIDTH_M = 3.5
+
+
+@dataclass(frozen=True)
+class LanePath:
+    """The middle of a lane: ``path_px`` (n, 2) base px in the direction of travel; its limit in base px/s."""
+
+    kind: str
+    path_px: FloatArray
+    limit_px_per_s: float
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The truth of one flight."""
+
+    camera: Camera
+    times_s: FloatArray
+    gsd_m: float
+    base_shape: tuple[int, int]
+    cars: pd.DataFrame
+    lanes: list[LanePath]
+
+    def to_base(self, frame: int, xy_raw: FloatArray) -> FloatArray:
+        """Raw pixels (n, 2) of a frame -> base pixels (n, 2), exact."""
+        return self.camera.to_base(frame, xy_raw)
+
+    def to_raw(self, frame: int, xy_base: FloatArray) -> FloatArray:
+        """Base pixels (n, 2) -> raw pixels (n, 2) of a frame, also beyond its border, exact."""
+        return self.camera.to_raw(frame, xy_base)
+
+    def direction_error_rad(self, direction_rad: FloatArray) -> FloatArray:
+        """How far a direction at each base pixel (h, w) is from the nearest direction of a lane there.
+
+        NaN where ``direction_rad`` is; pi where no lane is within half a lane's width and half a metre.
+        """
+        error = np.where(np.isnan(direction_rad), np.nan, np.pi)
+        width = max(round((LANE_WIDTH_M + 1.0) / self.gsd_m), 1)
+        for lane in self.lanes:
+            _least_error(lane.path_px, width, direction_rad, error)
+        return error
+
+    def segments(self, *, max_interval_s: float = 0.45) -> pd.DataFrame:
+        """True moves from frame to frame: vehicle_id, frame, x_0, y_0, x_1, y_1 (base px), vx, vy px/s.
+
+        Of vehicles that are visible and moving in both frames; what a perfect tracker would give to the field.
+        """
+        cars = self.cars[self.cars["visible"] & self.cars["moving"]].sort_values(["vehicle_id", "frame"])
+        later = cars.shift(-1)
+        dt = later["time_s"] - cars["time_s"]
+        keep = (
+            (later["vehicle_id"] == cars["vehicle_id"]) & (later["frame"] == cars["frame"] + 1) & (dt < max_interval_s)
+        )
+        a, b, dt = cars[keep], later[keep], dt[keep]
+        return pd.DataFrame(
+            {
+                "vehicle_id": a["vehicle_id"],
+                "frame": a["frame"],
+                "x_0_px": a["x_base_px"],
+                "y_0_px": a["y_base_px"],
+                "x_1_px": b["x_base_px"],
+                "y_1_px": b["y_base_px"],
+                "vx_px_per_s": (b["x_base_px"] - a["x_base_px"]) / dt,
+                "vy_px_per_s": (b["y_base_px"] - a["y_base_px"]) / dt,
+            }
+        ).reset_index(drop=True)
+
+
+def truth_of(flight: Flight) -> Truth:
+    """The truth of a flight in memory."""
+    cars = pd.concat([flight.cars(frame) for frame in range(flight.config.frames)], ignore_index=True)
+    lanes = [
+        LanePath(edge.kind, flight.city.to_px(edge.path), edge.speed_m_per_s / flight.config.gsd_m)
+        for edge in flight.city.plan.network.edges
+    ]
+    cars = cars.astype(CAR_COLUMNS)
+    return Truth(flight.camera, flight.times_s, flight.config.gsd_m, flight.base_shape, cars, lanes)
+
+
+def save_truth(truth: Truth, folder: Path) -> None:
+    """Write ``cars.parquet``, ``camera.json``, ``lanes.json`` into ``folder``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    truth.cars.to_parquet(folder / "cars.parquet", index=False)
+    record = {"gsd_m": truth.gsd_m, "base_shape": list(truth.base_shape), "camera": _camera_record(truth.camera)}
+    (folder / "camera.json").write_text(json.dumps(record))
+    lanes = [
+        {"kind": lane.kind, "limit_px_per_s": lane.limit_px_per_s, "path_px": np.round(lane.path_px, 3).tolist()}
+        for lane in truth.lanes
+    ]
+    (folder / "lanes.json").write_text(json.dumps(lanes))
+
+
+def load_truth(folder: Path) -> Truth:
+    """Read a simulated flight's truth: ``folder`` is the flight's folder or its ``truth/``.
+
+    Raises
+    ------
+    InputError
+        Where there is none.
+    """
+    inner = folder / "truth" if (folder / "truth").is_dir() else folder
+    if not (inner / "camera.json").is_file():
+        raise InputError(f"{folder} holds no truth/camera.json; make a flight with `velfield simulate {folder}`")
+    record = json.loads((inner / "camera.json").read_text())
+    lanes = [
+        LanePath(lane["kind"], np.array(lane["path_px"]), lane["limit_px_per_s"])
+        for lane in json.loads((inner / "lanes.json").read_text())
+    ]
+    camera = _camera_from(record["camera"])
+    height, width = record["base_shape"]
+    cars = pd.read_parquet(inner / "cars.parquet")
+    return Truth(camera, camera.times_s, record["gsd_m"], (height, width), cars, lanes)
+
+
+def _camera_record(camera: Camera) -> dict[str, Any]:
+    record: dict[str, Any] = {}
+    for name, value in vars(camera).items():
+        if isinstance(value, Waves | Relief):
+            record[name] = {key: array.tolist() for key, array in vars(value).items()}
+        else:
+            record[name] = value.tolist() if isinstance(value, np.ndarray) else value
+    return record
+
+
+def _camera_from(record: dict[str, Any]) -> Camera:
+    values = dict(record)
+    for name, kind in (("motion", Waves), ("shake", Waves), ("relief", Relief)):
+        values[name] = kind(**{key: np.array(array) for key, array in record[name].items()})
+    for name in ("place_px", "times_s"):
+        values[name] = np.array(record[name])
+    return Camera(**values)
+
+
+def _least_error(path: FloatArray, width: int, direction_rad: FloatArray, error: FloatArray) -> None:
+    """Lower ``error`` where a lane's direction is nearer, in place, within the lane's own bounding box."""
+    h, w = direction_rad.shape
+    x0, y0 = np.maximum(np.floor(path.min(axis=0)).astype(int) - width, 0)
+    x1, y1 = np.minimum(np.ceil(path.max(axis=0)).astype(int) + width + 1, [w, h])
+    if x1 <= x0 or y1 <= y0:
+        return
+    lane = np.full((y1 - y0, x1 - x0), np.nan, np.float32)
+    points = np.rint((path - [x0, y0]) * 16).astype(np.int32)
+    step = np.diff(path, axis=0)
+    for a, b, heading in zip(points, points[1:], np.arctan2(step[:, 1], step[:, 0]), strict=False):
+        cv2.line(lane, a.tolist(), b.tolist(), float(heading), width, cv2.LINE_8, 4)
+    window = np.s_[y0:y1, x0:x1]
+    here = np.abs(np.angle(np.exp(1j * (direction_rad[window] - lane))))
+    error[window] = np.where(np.isnan(here), error[window], np.minimum(error[window], here))

@@ -1,0 +1,92 @@
+"""Writes a simulated flight as a user would have it (frames, times, base image, labels), and the truth beside it."""
+
+import json
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from schemas.simulation import SimulationConfig
+from velfield.errors import InputError
+from velfield.synthetic.flight import Flight, simulate
+from velfield.synthetic.truth import save_truth, truth_of
+
+WRITERS = 2
+"""Threads that render and write; numba, OpenCV and NumPy let go of the interpreter while they work."""
+
+
+def write_flight(
+    out: Path, config: SimulationConfig, progress: Callable[[int, int], None] | None = None, *, threads: int = WRITERS
+) -> Flight:
+    """Write ``frames/``, ``timestamps.csv``, ``base.png``, ``labels.csv`` and ``truth/`` into ``out``.
+
+    Parameters
+    ----------
+    out : folder, made where it is not there; one that holds other things is refused.
+    config : SimulationConfig
+    progress : called with (frames done, frames in all).
+
+    Raises
+    ------
+    InputError
+        Where ``out`` holds a flight of another configuration, or other files.
+    """
+    _claim(out, config)
+    flight = simulate(config)
+    flight.prepare()
+    _write_picture(out / "base.png", flight.base_image, [])
+    names = [frame_name(k, config) for k in range(config.frames)]
+    pd.DataFrame({"frame": names, "time_s": np.round(flight.times_s, 6)}).to_csv(out / "timestamps.csv", index=False)
+    labels = [flight.labels(k).assign(frame=names[k]) for k in labelled_frames(config)]
+    columns = ["frame", "x_px", "y_px", "orientation_rad", "length_px", "width_px"]
+    if labels:
+        pd.concat(labels)[columns].round(3).to_csv(out / "labels.csv", index=False)
+    save_truth(truth_of(flight), out / "truth")
+    options = (
+        [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality]
+        if config.picture_format == "jpg"
+        else [cv2.IMWRITE_PNG_COMPRESSION, 1]
+    )
+
+    def one(k: int) -> None:
+        _write_picture(out / "frames" / names[k], flight.frame(k), options)
+
+    with ThreadPoolExecutor(threads) as pool:
+        for done, _ in enumerate(pool.map(one, range(config.frames)), start=1):
+            if progress is not None:
+                progress(done, config.frames)
+    return flight
+
+
+def frame_name(index: int, config: SimulationConfig) -> str:
+    """File name of a frame; sorts naturally and alphabetically."""
+    return f"{index:05d}.{config.picture_format}"
+
+
+def labelled_frames(config: SimulationConfig) -> list[int]:
+    """The frames that labels.csv labels: the first, then evenly spread."""
+    n = min(config.labelled_frames, config.frames)
+    return sorted({k * config.frames // n for k in range(n)}) if n else []
+
+
+def _claim(out: Path, config: SimulationConfig) -> None:
+    record = out / "simulation.json"
+    if out.exists() and any(out.iterdir()):
+        if not record.is_file():
+            raise InputError(f"{out} holds other files; name an empty or new folder for the simulated flight")
+        if json.loads(record.read_text()) != config.model_dump(mode="json"):
+            raise InputError(f"{out} holds a flight of another configuration (simulation.json); name a new folder")
+    (out / "frames").mkdir(parents=True, exist_ok=True)
+    record.write_text(config.model_dump_json(indent=1))
+
+
+def _write_picture(path: Path, picture: NDArray[np.uint8], options: list[int]) -> None:
+    done, data = cv2.imencode(path.suffix, picture, options)
+    if not done:
+        raise InputError(f"{path.suffix} cannot be encoded here; choose png or jpg")
+    # not cv2.imwrite: on a full disk it returns False and raises nothing
+    path.write_bytes(data.tobytes())

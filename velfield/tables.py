@@ -1,0 +1,66 @@
+"""Tables of a run folder: Parquet parts of one unit each, and the patches beside them."""
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from velfield.provenance import write_atomically
+
+Patches = dict[str, NDArray[Any]]
+
+
+def conform(table: pd.DataFrame, columns: Mapping[str, str]) -> pd.DataFrame:
+    """The table with exactly these columns, in this order and of these types.
+
+    Raises
+    ------
+    KeyError
+        A column is missing.
+    """
+    return table[list(columns)].astype(dict(columns))
+
+
+def empty(columns: Mapping[str, str]) -> pd.DataFrame:
+    """A table of no rows.
+
+    Examples
+    --------
+    >>> len(empty({"frame": "int32"}))
+    0
+    """
+    return pd.DataFrame({name: np.empty(0, dtype) for name, dtype in columns.items()})
+
+
+def write_table(path: Path, table: pd.DataFrame, columns: Mapping[str, str]) -> None:
+    """Write one part, whole or not at all."""
+    buffer = io.BytesIO()
+    conform(table, columns).to_parquet(buffer, index=False, compression="zstd")
+    write_atomically(path, buffer.getvalue())
+
+
+def read_tables(
+    paths: Sequence[Path], columns: Mapping[str, str], *, only: Sequence[str] | None = None
+) -> pd.DataFrame:
+    """Parts put together in order; ``only`` names the columns that are wanted."""
+    wanted = {name: columns[name] for name in (only or columns)}
+    parts = [pd.read_parquet(path, columns=list(wanted)) for path in paths]
+    parts = [part for part in parts if len(part)]
+    return conform(pd.concat(parts, ignore_index=True), wanted) if parts else empty(wanted)
+
+
+def write_patches(path: Path, patches: Mapping[str, NDArray[Any]]) -> None:
+    """Write pictures of the detections, each (n, h, w) uint8, in the table's order."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **patches)
+    write_atomically(path, buffer.getvalue())
+
+
+def read_patches(path: Path) -> Patches:
+    """Pictures of the detections by name."""
+    with np.load(path, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}

@@ -1,0 +1,337 @@
+"""Displacement of a link below the pixel: the two upright crops of a car aligned to each other (Lucas-Kanade).
+
+A detection's place is good to about a pixel, which is 4.7 km/h of a segment's speed at 0.23 m and 5 Hz; the same
+car's two pictures say by themselves how far it went, and far better. What makes it work, by measurement on real cars
+moved over their ground:
+
+- only pixels count that lie on the car in both crops, and no rim about it: the ground stands still, and drags;
+- what of the ground is let in, or glints, is an outlier, and is weighed down by Tukey's biweight about the median
+  difference;
+- a blur of half a pixel, no more: without it cubic interpolation of noise pulls towards whole pixels, with more of it
+  the ground is smeared into the car;
+- the start is the whole-pixel shift of least absolute difference, which a glint does not move;
+- both ways round (one crop sought in the other, and the reverse) must agree; their mean is free of the bias that
+  either has.
+
+Root mean square error an axis, 660 links of 110 cars 14-16 px long, noise of 3-5 grey levels: 0.04-0.07 px; the
+minimum of the sum of absolute differences gave 0.21, normalised correlation 0.29-0.34, plain Lucas-Kanade with a rim
+0.17-0.19. A link that does not align keeps the detections' places and the standard deviation that goes with them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+CAR_LENGTH_PX = 14.0
+CAR_WIDTH_PX = 6.0
+"""What surely lies on a car, working px, of the paper's 16 x 8."""
+RIM_PX = 2.0
+"""Over which the weights fall to zero beyond it."""
+BLUR_SIGMA_PX = 0.5
+"""Blur of both crops before they are aligned."""
+MAX_SHIFT_PX = 6
+"""Largest shift searched, working px: some three standard deviations of two places' jitter."""
+MAX_DISAGREEMENT_PX = 0.75
+"""Largest difference of the shifts found both ways round, working px."""
+MIN_SD_PX = 0.03
+"""No alignment is believed better than this, working px: what is left on crops without noise."""
+MIN_PIXELS = 20
+"""Fewer pixels than this on the car in both crops: they do not align."""
+BIWEIGHT = 4.685
+"""Tukey's constant: differences beyond this many standard deviations have no weight."""
+ROUNDS = 15
+"""Gauss-Newton rounds; four to six are usual."""
+FREE_ROUNDS = 4
+"""Rounds in which the weights follow the shift; later they stay, or two sets of weights could take turns for ever."""
+SETTLED_PX = 0.01
+"""A step shorter than this ends them."""
+
+
+@dataclass(frozen=True)
+class Chips:
+    """Upright crops of one frame's detections.
+
+    Attributes
+    ----------
+    pixels
+        (n, side, side) uint8, working px.
+    centre_x_px, centre_y_px
+        (n,) places of the crops' centre pixel (side // 2), base px.
+    axis_rad
+        (n,) axis of each car.
+    scale
+        Working px a base px.
+    """
+
+    pixels: NDArray[np.uint8]
+    centre_x_px: Floats
+    centre_y_px: Floats
+    axis_rad: Floats
+    scale: float
+
+
+@dataclass(frozen=True)
+class Displacements:
+    """Displacements of links, base px; ``sd_px`` is NaN where the crops did not align."""
+
+    x_px: Floats
+    y_px: Floats
+    sd_px: Floats
+
+
+def refine_links(before: Chips, after: Chips, first: Ints, second: Ints) -> Displacements:
+    """Displacement of each link from its two crops.
+
+    Parameters
+    ----------
+    before, after
+        Crops of the earlier and the later frame.
+    first, second
+        (k,) which detection of each frame a link is made of.
+
+    Returns
+    -------
+    Displacements
+        (k,) each; NaN where the crops do not align.
+    """
+    if before.scale != after.scale:
+        # One detector, one working scale: another would change a car's size between the crops.
+        raise ValueError(f"working scales {before.scale} and {after.scale} differ between linked frames")
+    shift = align_crops(before.pixels, after.pixels, before.axis_rad, after.axis_rad, first, second)
+    return Displacements(
+        after.centre_x_px[second] - before.centre_x_px[first] + shift[:, 0] / before.scale,
+        after.centre_y_px[second] - before.centre_y_px[first] + shift[:, 1] / before.scale,
+        shift[:, 2] / before.scale,
+    )
+
+
+def align_crops(
+    before: NDArray[np.uint8],
+    after: NDArray[np.uint8],
+    axis_before: Floats,
+    axis_after: Floats,
+    first: Ints,
+    second: Ints,
+) -> Floats:
+    """Shift of the car between pairs of crops, and its standard deviation.
+
+    Parameters
+    ----------
+    before, after
+        (n, side, side) and (m, side, side) uint8, upright crops centred on a car.
+    axis_before, axis_after
+        (n,) and (m,) axes, radians; NaN: a disc is weighed in place of a car.
+    first, second
+        (k,) which crops a pair is made of.
+
+    Returns
+    -------
+    (k, 3) float64
+        x and y of the car in the later crop less those in the earlier one, and the standard deviation of either,
+        working px; NaN where the crops do not align.
+    """
+    radius = int(np.ceil(3 * BLUR_SIGMA_PX))
+    taps = np.exp(-0.5 * (np.arange(-radius, radius + 1) / BLUR_SIGMA_PX) ** 2)
+    return np.asarray(
+        _align_all(before, after, axis_before, axis_after, first, second, taps / taps.sum()), dtype=np.float64
+    )
+
+
+@njit(cache=True, nogil=True)
+def _blur(crop, taps):  # type: ignore[no-untyped-def]
+    """Separable blur, edge values repeated."""
+    side = crop.shape[0]
+    radius = taps.size // 2
+    rows = np.zeros((side, side))
+    out = np.zeros((side, side))
+    for y in range(side):
+        for x in range(side):
+            for k in range(taps.size):
+                rows[y, x] += taps[k] * crop[y, min(max(x + k - radius, 0), side - 1)]
+    for y in range(side):
+        for k in range(taps.size):
+            row = min(max(y + k - radius, 0), side - 1)
+            for x in range(side):
+                out[y, x] += taps[k] * rows[row, x]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _weights(side, axis):  # type: ignore[no-untyped-def]
+    """One on the car, falling to zero over the rim; a disc where the axis is not known."""
+    out = np.zeros((side, side))
+    cos, sin = np.cos(axis), np.sin(axis)
+    centre = side // 2
+    for y in range(side):
+        for x in range(side):
+            dx, dy = x - centre, y - centre
+            if np.isnan(axis):
+                beyond = np.hypot(dx, dy) - CAR_WIDTH_PX
+            else:
+                beyond = max(
+                    abs(dx * cos + dy * sin) - 0.5 * CAR_LENGTH_PX, abs(dy * cos - dx * sin) - 0.5 * CAR_WIDTH_PX
+                )
+            out[y, x] = min(max(1.0 - beyond / RIM_PX, 0.0), 1.0)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _car_pixels(weight):  # type: ignore[no-untyped-def]
+    """Rows and columns of the pixels that have weight and neighbours all round."""
+    side = weight.shape[0]
+    rows = np.empty(side * side, np.int64)
+    columns = np.empty(side * side, np.int64)
+    n = 0
+    for y in range(1, side - 1):
+        for x in range(1, side - 1):
+            if weight[y, x] > 0:
+                rows[n], columns[n] = y, x
+                n += 1
+    return rows[:n], columns[:n]
+
+
+@njit(cache=True, nogil=True)
+def _whole_shift(template, image, weight, image_weight, rows, columns):  # type: ignore[no-untyped-def]
+    """Whole-pixel shift of least mean absolute difference over what is car in both."""
+    side = template.shape[0]
+    best, best_x, best_y = np.inf, 0, 0
+    least = 0.125 * np.sum(weight)
+    for dy in range(-MAX_SHIFT_PX, MAX_SHIFT_PX + 1):
+        for dx in range(-MAX_SHIFT_PX, MAX_SHIFT_PX + 1):
+            total, weights = 0.0, 0.0
+            for i in range(0, rows.size, 2):  # half of them finds the whole pixel; what follows takes all
+                y, x = rows[i] + dy, columns[i] + dx
+                if 0 <= y < side and 0 <= x < side:
+                    w = min(weight[rows[i], columns[i]], image_weight[y, x])
+                    total += w * abs(image[y, x] - template[rows[i], columns[i]])
+                    weights += w
+            if weights > least and total < best * weights:
+                best, best_x, best_y = total / weights, dx, dy
+    return best_x, best_y
+
+
+@njit(cache=True, nogil=True)
+def _cubic(t):  # type: ignore[no-untyped-def]
+    """Weights of Catmull-Rom interpolation at t in [0, 1) between the second and the third of four samples."""
+    return (
+        ((-0.5 * t + 1.0) * t - 0.5) * t,
+        (1.5 * t - 2.5) * t * t + 1.0,
+        ((-1.5 * t + 2.0) * t + 0.5) * t,
+        (0.5 * t - 0.5) * t * t,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _differences(template, image, weight, image_weight, rows, columns, u, v, near, out):  # type: ignore[no-untyped-def]
+    """Rows of (difference, gradient x, gradient y, weight) of what is car in both at this shift; how many."""
+    side = template.shape[0]
+    ix, iy = int(np.floor(u)), int(np.floor(v))
+    cx, cy = _cubic(u - ix), _cubic(v - iy)
+    n = 0
+    for i in range(rows.size):
+        y, x = rows[i], columns[i]
+        row, column = y + iy - 1, x + ix - 1
+        if row < 0 or column < 0 or row + 3 >= side or column + 3 >= side:
+            continue
+        near_y, near_x = min(max(y + near[1], 0), side - 1), min(max(x + near[0], 0), side - 1)
+        w = min(weight[y, x], image_weight[near_y, near_x])
+        if w <= 0:
+            continue
+        value = 0.0
+        for k in range(4):
+            value += cy[k] * (
+                cx[0] * image[row + k, column]
+                + cx[1] * image[row + k, column + 1]
+                + cx[2] * image[row + k, column + 2]
+                + cx[3] * image[row + k, column + 3]
+            )
+        out[n, 0] = value - template[y, x]
+        out[n, 1] = 0.5 * (template[y, x + 1] - template[y, x - 1])
+        out[n, 2] = 0.5 * (template[y + 1, x] - template[y - 1, x])
+        out[n, 3] = w
+        n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _step(samples):  # type: ignore[no-untyped-def]
+    """One robust Gauss-Newton step, brightness difference eliminated: (step x, step y, variance), NaN where it is not
+    determined."""
+    middle = np.median(samples[:, 0])
+    spread = 1.4826 * np.median(np.abs(samples[:, 0] - middle)) + 1.0
+    s = sx = sy = sd = xx = xy = yy = xd = yd = dd = 0.0
+    for i in range(samples.shape[0]):
+        d, gx, gy = samples[i, 0] - middle, samples[i, 1], samples[i, 2]
+        e = d / (BIWEIGHT * spread)
+        if abs(e) >= 1:
+            continue
+        w = samples[i, 3] * (1 - e * e) ** 2
+        s += w
+        sx += w * gx
+        sy += w * gy
+        sd += w * d
+        xx += w * gx * gx
+        xy += w * gx * gy
+        yy += w * gy * gy
+        xd += w * gx * d
+        yd += w * gy * d
+        dd += w * d * d
+    xx, xy, yy = xx - sx * sx / s, xy - sx * sy / s, yy - sy * sy / s
+    xd, yd = xd - sx * sd / s, yd - sy * sd / s
+    determinant = xx * yy - xy * xy
+    if determinant <= 1e-6 * (xx + yy) ** 2:
+        return np.nan, np.nan, np.nan
+    variance = (dd - sd * sd / s) / s * 0.5 * (xx + yy) / determinant
+    return -(yy * xd - xy * yd) / determinant, -(xx * yd - xy * xd) / determinant, variance
+
+
+@njit(cache=True, nogil=True)
+def _lucas_kanade(template, image, weight, image_weight, rows, columns, u, v):  # type: ignore[no-untyped-def]
+    """Shift of the template in the image, and its variance; NaN where it leaves the search or does not settle."""
+    samples = np.empty((rows.size, 4))
+    near = (0, 0)
+    for count in range(ROUNDS):
+        if count < FREE_ROUNDS:
+            near = (int(np.rint(u)), int(np.rint(v)))
+        n = _differences(template, image, weight, image_weight, rows, columns, u, v, near, samples)
+        if n < MIN_PIXELS:
+            break
+        du, dv, variance = _step(samples[:n])
+        if np.isnan(du):
+            break
+        length = np.hypot(du, dv)
+        u += du / max(length, 1.0)
+        v += dv / max(length, 1.0)
+        if max(abs(u), abs(v)) > MAX_SHIFT_PX + 0.5:
+            break
+        if length < SETTLED_PX:
+            return u, v, variance
+    return np.nan, np.nan, np.nan
+
+
+@njit(cache=True, nogil=True)
+def _align_all(before, after, axis_before, axis_after, first, second, taps):  # type: ignore[no-untyped-def]
+    out = np.full((first.size, 3), np.nan)
+    side = before.shape[1]
+    # Neighbouring residuals of a blurred picture are alike: the variance grows by the blur's footprint.
+    alike = 4 * np.pi * BLUR_SIGMA_PX**2
+    for k in range(first.size):
+        a, b = _blur(before[first[k]], taps), _blur(after[second[k]], taps)
+        weight_a, weight_b = _weights(side, axis_before[first[k]]), _weights(side, axis_after[second[k]])
+        rows_a, columns_a = _car_pixels(weight_a)
+        rows_b, columns_b = _car_pixels(weight_b)
+        x, y = _whole_shift(a, b, weight_a, weight_b, rows_a, columns_a)
+        fx, fy, forth = _lucas_kanade(a, b, weight_a, weight_b, rows_a, columns_a, float(x), float(y))
+        bx, by, back = _lucas_kanade(b, a, weight_b, weight_a, rows_b, columns_b, float(-x), float(-y))
+        disagreement = np.hypot(fx + bx, fy + by)
+        if not disagreement <= MAX_DISAGREEMENT_PX:  # NaN too
+            continue
+        out[k, 0] = 0.5 * (fx - bx)
+        out[k, 1] = 0.5 * (fy - by)
+        out[k, 2] = np.sqrt(alike * 0.5 * (forth + back) + (0.5 * disagreement) ** 2 + MIN_SD_PX**2)
+    return out

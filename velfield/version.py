@@ -1,0 +1,21 @@
+"""The version of the code, and of each stage: raise a stage's number when its results change."""
+
+from importlib.metadata import version
+
+STAGE_VERSIONS: dict[str, int] = {
+    "frames": 1,
+    "lens": 1,
+    "base": 1,
+    "registration": 1,
+    "detector": 2,
+    "detections": 2,
+    "links": 1,
+    "tracklets": 1,
+    "field": 1,
+    "maps": 1,
+}
+
+
+def code_version() -> str:
+    """The installed version of velfield."""
+    return version("velfield")
