@@ -24,6 +24,9 @@ app = App(
     version_flags=["--version"],
 )
 
+# Each in a file of its own, imported when it runs.
+app.command("flows.commands.export:export", name="export")
+
 Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative=())]
 Verbose = Annotated[bool, Parameter(name=["--verbose", "-v"], negative=())]
 LogJson = Annotated[bool, Parameter(name="--log-json", negative=())]
@@ -199,33 +202,6 @@ def demo(
     if status in (DONE, INCOMPLETE):
         _score(out / "run", flight)
     return status
-
-
-@app.command
-def export(
-    run_folder: Path,
-    /,
-    *,
-    format_name: Annotated[Literal["cog", "geoparquet", "geotrax", "sumo", "arrows"], Parameter(name="--format")],
-    out: Path | None = None,
-) -> int:
-    """Write a finished run in a format that others read.
-
-    Parameters
-    ----------
-    run_folder
-        The run folder.
-    format_name
-        `cog`: the field's layers as GeoTIFF; `geoparquet`: tracklets as lines; `geotrax`: tracks as CSV; `sumo`: tracks
-        as FCD XML; `arrows`: modal velocities as GeoJSON.
-    out
-        File to write. Default: in the run folder's `exports/`.
-    """
-    from velfield.exporting import export_run
-    from velfield.run import open_run
-
-    print(export_run(open_run(run_folder), format_name, out))
-    return DONE
 
 
 @app.command

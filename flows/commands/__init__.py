@@ -1,0 +1,1 @@
+"""The commands of `velfield`, one file each, imported when they run."""
