@@ -25,7 +25,7 @@ app = App(
 )
 
 # Each in a file of its own, imported when it runs.
-app.command("flows.commands.export:export", name="export")
+app.command("flows.commands.export:export", name="export", help="Write a finished run in a format that others read.")
 
 Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative=())]
 Verbose = Annotated[bool, Parameter(name=["--verbose", "-v"], negative=())]
