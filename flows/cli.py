@@ -26,6 +26,7 @@ app = App(
 
 # Each in a file of its own, imported when it runs.
 app.command("flows.commands.export:export", name="export", help="Write a finished run in a format that others read.")
+app.command("flows.commands.bench:bench", name="bench", help="Speed and accuracy, against a peer in the same run.")
 
 Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative=())]
 Verbose = Annotated[bool, Parameter(name=["--verbose", "-v"], negative=())]

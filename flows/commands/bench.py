@@ -1,0 +1,5 @@
+"""``velfield bench``: speed and accuracy, as ratios against a peer in the same run; a file each in `velfield.bench`."""
+
+from cyclopts import App
+
+bench = App(name="bench", help="Speed and accuracy, against a peer in the same run.")
