@@ -3,3 +3,8 @@
 from cyclopts import App
 
 bench = App(name="bench", help="Speed and accuracy, against a peer in the same run.")
+bench.command(
+    "flows.commands.bench_registration:registration",
+    name="registration",
+    help="Register simulated flights of unseen seeds: errors against the truth, beside stabilo.",
+)

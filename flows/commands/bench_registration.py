@@ -1,0 +1,44 @@
+"""``velfield bench registration``: errors and time on simulated flights that nothing was tuned to, beside stabilo."""
+
+from pathlib import Path
+
+from velfield.errors import InputError
+
+
+def registration(
+    *,
+    out: Path = Path("velfield-bench"),
+    cases: tuple[str, ...] = ("homography", "wobble", "vibration"),
+    seeds: tuple[int, ...] = (101, 102, 103, 104, 105),
+    frames: int | None = None,
+) -> int:
+    """Register simulated flights of unseen seeds, and tell the error against their truth, median and worst.
+
+    Parameters
+    ----------
+    out
+        Folder for the flights and their runs; delete it afterwards.
+    cases
+        `homography`: plane, pin-hole, 2560x1440; `wobble`: lens and rows that move by 4 px, 6 cycles a frame;
+        `vibration`: lens, shake at 14-29 Hz, drift, turn, tilt, relief, base image of another sensor.
+    seeds
+        One flight each.
+    frames
+        Frames a flight. Default: 8, 12 and 60.
+    """
+    import cv2
+
+    from velfield.bench.registration import CASES, bench_registration, medians
+
+    cv2.setNumThreads(1)  # as the runs themselves: one core each
+    unknown = sorted(set(cases) - set(CASES))
+    if unknown:
+        raise InputError(f"--cases {' '.join(unknown)}: expected some of {', '.join(CASES)}")
+    measured = []
+    for case in cases:
+        for seed in seeds:
+            rows = bench_registration(out, CASES[case], seed, frames=frames)
+            measured += rows
+            print("\n".join(row.text() for row in rows), flush=True)
+    print("\n".join(medians(measured)))
+    return 0
