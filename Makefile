@@ -40,7 +40,7 @@ format: $(STAMP)
 # stabilo, the peer of registration, declares torch and kornia for detectors that are not used here (gigabytes), and
 # OpenCV below 5; with --no-deps it runs on what is there. So it stands here and not in the lock.
 bench: $(STAMP)  ## speed, as ratios against a peer in the same run
-	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps stabilo==1.4.7 tqdm==4.67.1
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps stabilo==1.4.7
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only
 
 # Universal, with hashes, and without a registry's address in it.

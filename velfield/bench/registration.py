@@ -220,7 +220,7 @@ def _stabilizer() -> Any:
     except ImportError:
         raise InputError(
             "stabilo is not installed, and the comparison needs it; `make bench` installs it, or: "
-            "pip install --no-deps stabilo tqdm"
+            "pip install --no-deps stabilo"
         ) from None
     return Stabilizer(
         detector_name="sift",
