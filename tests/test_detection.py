@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from schemas.flight import DetectionConfig
+from velfield.detection.aligned import distinct
 from velfield.detection.axis import axial_difference, structure_axis
 from velfield.detection.detect import FrameDetections, detect_frame
 from velfield.detection.detector import Detector, load_detector, save_detector
@@ -171,3 +172,16 @@ def test_regions_grow_from_maxima_and_have_the_axis_of_their_covariance() -> Non
     assert len(found) == 2
     np.testing.assert_allclose(found[:, :2], [[24.5, 23.5], [83.5, 61.5]], atol=0.5)
     assert axial_difference(found[:, 2], np.array([0.0, np.pi / 2])).max() < 0.05
+
+
+def test_the_gap_between_two_cars_of_a_queue_is_no_third_one() -> None:
+    queue = np.array([[20.0, 40.0, 0.0, 0.9, 0.1], [38.0, 40.0, 0.0, 0.8, 0.1], [29.0, 40.5, 0.0, 0.7, 0.1]])
+    beside = np.array([[20.0, 49.0, 0.0, 0.5, 0.1], [56.0, 40.0, 0.1, 0.4, 0.1]])
+    kept = distinct(np.concatenate([queue, beside]), 16.0)
+    assert kept[:, 3].tolist() == [0.9, 0.8, 0.5, 0.4]
+
+
+def test_of_two_finds_on_one_car_the_better_stays() -> None:
+    cars = np.array([[20.0, 40.0, 0.0, 0.3, 0.1], [23.0, 41.0, 0.2, 0.8, 0.1]])
+    assert distinct(cars, 16.0)[:, 3].tolist() == [0.8]
+    assert distinct(np.empty((0, 5)), 16.0).shape == (0, 5)

@@ -7,12 +7,12 @@ STAGE_VERSIONS: dict[str, int] = {
     "lens": 1,
     "base": 1,
     "registration": 1,
-    "detector": 2,
-    "detections": 2,
+    "detector": 3,
+    "detections": 3,
     "links": 1,
     "tracklets": 1,
     "field": 1,
-    "maps": 1,
+    "maps": 2,
 }
 
 

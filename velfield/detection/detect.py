@@ -9,15 +9,13 @@ from schemas.flight import DetectionConfig
 from velfield.detection.aligned import Look, distinct, find_cars
 from velfield.detection.dense import find_cars_densely
 from velfield.detection.detector import Detector
+from velfield.detection.label_axis import CAR_ASPECT
 from velfield.detection.patches import oriented_patches, upright_chips
 from velfield.detection.scan import propose
 from velfield.detection.turned import COARSE, picture_of
 
 Floats = NDArray[np.float64]
 Grey = NDArray[np.uint8]
-
-CAR_ASPECT = 0.45
-"""A usual car's width over its length."""
 
 
 @dataclass(frozen=True)

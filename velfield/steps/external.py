@@ -7,7 +7,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from velfield.detection.axis import at_places, structure_axis
-from velfield.detection.detect import CAR_ASPECT, FrameDetections, pictured
+from velfield.detection.detect import FrameDetections, pictured
+from velfield.detection.label_axis import CAR_ASPECT
 from velfield.plan import Plan
 from velfield.sources.detections import read_detections
 from velfield.steps.frame_maps import FrameMap
