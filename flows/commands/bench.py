@@ -8,3 +8,8 @@ bench.command(
     name="registration",
     help="Register simulated flights of unseen seeds: errors against the truth, beside stabilo.",
 )
+bench.command(
+    "flows.commands.bench_still:still",
+    name="still",
+    help="How still the things that stand lie on a run's map: registration's jitter, on your own footage.",
+)

@@ -56,8 +56,13 @@ class Templates:
         return len(self.xy)
 
 
-def make_templates(base: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> Templates:
-    """The best corner of each cell of a base image (h, w), with its patches; ``mask`` is where the image is known."""
+def make_templates(
+    base: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None, *, apart_from: FloatArray | None = None
+) -> Templates:
+    """The best corner of each cell of a base image (h, w), with its patches.
+
+    ``mask`` (h, w) is where the image is known; no corner lies within half a patch of ``apart_from`` (n, 2).
+    """
     height, width = base.shape
     fine, coarse = blurred(base)
     side = 2 * _HALF_PATCH + 1
@@ -70,6 +75,8 @@ def make_templates(base: NDArray[np.uint8], mask: NDArray[np.bool_] | None = Non
     if mask is not None:
         usable &= cv2.erode(mask.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8), borderValue=0)
     least *= usable
+    if apart_from is not None:
+        least *= _far_from(apart_from, base.shape)
     cell = float(np.clip(np.sqrt(base.size / _POINTS_A_PICTURE), *_CELL_PX))
     xy, strength = _best_of_cells(least, max(1, round(cell)), (_NOISE_GREY / _MAX_SIGMA_PX) ** 2)
     sigma = np.sqrt(_FLOOR_PX**2 + _NOISE_GREY**2 / np.maximum(strength, 1e-9))
@@ -82,6 +89,13 @@ def make_templates(base: NDArray[np.uint8], mask: NDArray[np.bool_] | None = Non
         fine=fine[at[:, 1:] + dy, at[:, :1] + dx],
         coarse=coarse[at[:, 1:] + _COARSE_SPACING_PX * dy, at[:, :1] + _COARSE_SPACING_PX * dx],
     )
+
+
+def _far_from(xy: FloatArray, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    free = np.ones(shape, np.uint8)
+    at = np.rint(xy).astype(np.int64)
+    free[at[:, 1], at[:, 0]] = 0
+    return np.asarray(cv2.distanceTransform(free, cv2.DIST_C, 3) > _HALF_PATCH)
 
 
 def _best_of_cells(strength: FloatArray, cell: int, least: float) -> tuple[FloatArray, FloatArray]:
