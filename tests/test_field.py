@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from schemas.flight import FieldConfig
 from schemas.tables import TRACKLET_COLUMNS
 from velfield.errors import InputError
-from velfield.field.accumulate import REACH_SIGMAS, UNIT, FieldTile, accumulate_tile
+from velfield.field.accumulate import NOISE_UNIT, REACH_SIGMAS, UNIT, FieldTile, accumulate_tile
 from velfield.field.algebra import merge_tiles, subtract_tile
 from velfield.field.bins import VelocityBins, band_radius_px, standing_px_per_s
 from velfield.field.segments import SEGMENT_DTYPE, Segments, segment_table, segments_by_tile, touched_tiles
@@ -32,7 +32,17 @@ def passages(seed: int, n: int = 6, size: float = 40.0) -> Segments:
             duration = rng.uniform(0.1, 0.4)
             there = place + velocity * duration
             rows.append(
-                (passage, k * 1.0, duration, *place, *there, *velocity, passage * 100 + k, passage * 100 + k + 1)
+                (
+                    passage,
+                    k * 1.0,
+                    duration,
+                    *place,
+                    *there,
+                    *velocity,
+                    passage * 100 + k,
+                    passage * 100 + k + 1,
+                    k + 1.0,
+                )
             )
             place = there
     return np.array(rows, SEGMENT_DTYPE)
@@ -44,9 +54,10 @@ def tile_of(segments: Segments, radius_px: float | None = 2.0, weight: str = "pa
     )
 
 
-def plain_tile(segments: Segments, radius: float, weight: str, size: int) -> tuple[np.ndarray, np.ndarray]:
+def plain_tile(segments: Segments, radius: float, weight: str, size: int) -> tuple[np.ndarray, ...]:
     """The same, read from the definition: float64, every pixel against every segment."""
     histogram, count = np.zeros((size, size, BINS.n, BINS.n)), np.zeros((size, size), int)
+    noise = np.zeros((size, size))
     for passage in np.unique(segments["passage"]):
         mine = segments[segments["passage"] == passage]
         for y in range(size):
@@ -55,10 +66,11 @@ def plain_tile(segments: Segments, radius: float, weight: str, size: int) -> tup
                 if not dwell.any():
                     continue
                 count[y, x] += 1
+                noise[y, x] += dwell @ (mine["sd_px_per_s"] / BINS.width_px_per_s) ** 2 / dwell.sum()
                 share = {"passage": dwell / dwell.sum(), "segment": 1.0 * (dwell > 0), "time": dwell}[weight]
                 for segment, part in zip(mine, share, strict=True):
                     histogram[y, x] += part * _blob(segment["vx_px_per_s"], segment["vy_px_per_s"])
-    return histogram, count
+    return histogram, count, noise
 
 
 def _dwell(segment: np.void, x: int, y: int, radius: float) -> float:
@@ -95,10 +107,11 @@ def _blob(vx: float, vy: float) -> np.ndarray:
 def test_kernel_agrees_with_the_definition(weight: str) -> None:
     segments = passages(seed=3, n=9, size=20.0)
     fast = tile_of(segments, weight=weight, size=20)
-    plain, count = plain_tile(segments, radius=2.0, weight=weight, size=20)
+    plain, count, noise = plain_tile(segments, radius=2.0, weight=weight, size=20)
     assert (count > 1).any()
     np.testing.assert_array_equal(fast.count, count)
     np.testing.assert_allclose(fast.histogram / UNIT, plain, atol=2e-3)
+    np.testing.assert_allclose(fast.noise / NOISE_UNIT, noise, atol=1e-3 * count.max())
 
 
 @settings(max_examples=25, deadline=None)
@@ -148,8 +161,8 @@ def test_subtracting_what_is_no_part_is_refused() -> None:
 
 def test_standing_weighs_by_its_time_when_asked() -> None:
     """One car stands for 20 s, one goes by: by passage they weigh alike, by time the standing one outweighs."""
-    stands = [(0, t, 1.0, 20.0, 20.0, 20.0, 20.0, 0.0, 0.0, t, t + 1) for t in range(20)]
-    moves = [(1, t, 1.0, 40 * t - 20.0, 20.0, 40 * t + 20.0, 20.0, 40.0, 0.0, 100 + t, 101 + t) for t in range(2)]
+    stands = [(0, t, 1.0, 20.0, 20.0, 20.0, 20.0, 0.0, 0.0, t, t + 1, 0.0) for t in range(20)]
+    moves = [(1, t, 1.0, 40 * t - 20.0, 20.0, 40 * t + 20.0, 20.0, 40.0, 0.0, 100 + t, 101 + t, 0.0) for t in range(2)]
     segments = np.array(stands + moves, SEGMENT_DTYPE)
     by_passage, by_time = tile_of(segments), tile_of(segments, weight="time")
     at_rest = np.s_[20, 20, :, BINS.reach - 1 : BINS.reach + 2]
@@ -160,7 +173,7 @@ def test_standing_weighs_by_its_time_when_asked() -> None:
 
 
 def test_band_is_half_a_lane_wide_and_the_papers_line_one_pixel() -> None:
-    segment = np.array([(0, 0, 0.5, 5.0, 20.0, 35.0, 20.0, 60.0, 0.0, 0, 1)], SEGMENT_DTYPE)
+    segment = np.array([(0, 0, 0.5, 5.0, 20.0, 35.0, 20.0, 60.0, 0.0, 0, 1, 0.0)], SEGMENT_DTYPE)
     config = FieldConfig(lane_width_m=3.6)
     radius = band_radius_px(config, gsd_m=0.2)
     assert radius == pytest.approx(4.5)
@@ -171,7 +184,7 @@ def test_band_is_half_a_lane_wide_and_the_papers_line_one_pixel() -> None:
 
 
 def test_beyond_the_last_bin_goes_to_the_last_bin() -> None:
-    segment = np.array([(0, 0, 0.1, 5.0, 20.0, 35.0, 20.0, 300.0, 0.0, 0, 1)], SEGMENT_DTYPE)
+    segment = np.array([(0, 0, 0.1, 5.0, 20.0, 35.0, 20.0, 300.0, 0.0, 0, 1, 0.0)], SEGMENT_DTYPE)
     assert tile_of(segment).histogram[20, 20, :, -2:].sum() == UNIT
 
 
@@ -268,6 +281,6 @@ def test_without_a_ground_distance_the_papers_gives_pixels() -> None:
 
 
 def test_a_full_pixel_is_refused_not_wrapped() -> None:
-    long = np.array([(0, 0, 140_000.0, 20.0, 20.0, 20.0, 20.0, 0.0, 0.0, 0, 1)], SEGMENT_DTYPE)
+    long = np.array([(0, 0, 140_000.0, 20.0, 20.0, 20.0, 20.0, 0.0, 0.0, 0, 1, 0.0)], SEGMENT_DTYPE)
     with pytest.raises(InputError, match="into slices"):
         tile_of(long, weight="time")

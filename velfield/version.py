@@ -11,7 +11,7 @@ STAGE_VERSIONS: dict[str, int] = {
     "detections": 3,
     "links": 1,
     "tracklets": 1,
-    "field": 1,
+    "field": 2,
     "maps": 2,
 }
 

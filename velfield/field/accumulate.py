@@ -29,6 +29,11 @@ UNIT_BITS = 14
 UNIT = 1 << UNIT_BITS
 """Fixed-point one. int32 then holds 131,071 passages (or 36 hours of standing) at a pixel."""
 
+NOISE_UNIT = 1 << 12
+"""Fixed-point one of a velocity's variance, bins^2 ..."""
+MOST_NOISE_BINS2 = 4.0
+"""... and the most that one passage counts for: int32 then holds as many passages as the histogram does."""
+
 MICROSECONDS = 1_000_000
 
 REACH_SIGMAS = 3.0
@@ -47,6 +52,9 @@ class FieldTile(NamedTuple):
     """(ty, tx) distinct passages."""
     dwell_ms: NDArray[np.int32]
     """(ty, tx) time that vehicles spent within the band's radius of the pixel, all together, ms."""
+    noise: NDArray[np.int32]
+    """(ty, tx) sum over passages of the variance of a velocity component by measurement, bins^2, `NOISE_UNIT` being
+    one."""
 
 
 def accumulate_tile(
@@ -79,7 +87,7 @@ def accumulate_tile(
         Where a pixel's weight does not fit 32 bits.
     """
     histogram = np.zeros((*shape, bins.n, bins.n), np.int32)
-    count, dwell_ms = np.zeros(shape, np.int32), np.zeros(shape, np.int32)
+    count, dwell_ms, noise = np.zeros((3, *shape), np.int32)
     weight_sum = np.zeros(shape, np.int64)
     path = np.column_stack([segments[name] for name in ("x0_px", "y0_px", "x1_px", "y1_px")]).astype(np.float64)
     path -= np.array([*origin_xy, *origin_xy], np.float64)
@@ -87,6 +95,7 @@ def accumulate_tile(
     _accumulate(
         path,
         bins.to_bins(velocity),
+        (segments["sd_px_per_s"] / bins.width_px_per_s) ** 2,
         np.ascontiguousarray(segments["duration_s"]),
         np.ascontiguousarray(segments["passage"]),
         -1.0 if radius_px is None else float(radius_px),
@@ -95,6 +104,7 @@ def accumulate_tile(
         histogram,
         count,
         dwell_ms,
+        noise,
         weight_sum,
     )
     if weight_sum.max(initial=0) > np.iinfo(np.int32).max:
@@ -103,7 +113,7 @@ def accumulate_tile(
             f"the histogram at pixel ({origin_xy[0] + int(x)}, {origin_xy[1] + int(y)}) sums to "
             f"{weight_sum.max() / UNIT:.0f}, and 32 bits hold {(1 << 31) / UNIT:.0f}: cut the flight into slices"
         )
-    return FieldTile(histogram, count, dwell_ms)
+    return FieldTile(histogram, count, dwell_ms, noise)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -229,6 +239,7 @@ def _unit_blob(shares_x: NDArray[np.float64], shares_y: NDArray[np.float64], blo
 def _accumulate(
     path: NDArray[np.float64],
     velocity: NDArray[np.float64],
+    variance: NDArray[np.float64],
     duration_s: NDArray[np.float64],
     passage: NDArray[np.int64],
     radius: float,
@@ -237,13 +248,15 @@ def _accumulate(
     histogram: NDArray[np.int32],
     count: NDArray[np.int32],
     dwell_ms: NDArray[np.int32],
+    noise: NDArray[np.int32],
     weight_sum: NDArray[np.int64],
 ) -> None:
     """Passage by passage: first the dwell of the whole passage at each pixel, then each segment's share of it."""
     height, width, n = histogram.shape[0], histogram.shape[1], histogram.shape[2]
     flat = histogram.reshape(-1)
     flat_count, flat_dwell, flat_sum = count.reshape(-1), dwell_ms.reshape(-1), weight_sum.reshape(-1)
-    total = np.zeros(height * width, np.int64)
+    flat_noise = noise.reshape(-1)
+    total, uncertain = np.zeros(height * width, np.int64), np.zeros(height * width)
     spent, given = np.zeros(height * width, np.int64), np.zeros(height * width, np.int64)
     pixels, dwell = np.empty(height * width, np.int64), np.empty(height * width, np.int64)
     touched = np.empty(height * width, np.int64)
@@ -264,6 +277,7 @@ def _accumulate(
                     touched[n_touched] = pixels[k]
                     n_touched += 1
                 total[pixels[k]] += dwell[k]
+                uncertain[pixels[k]] += variance[stop] * dwell[k]
             stop += 1
         for s in range(start, stop):
             x0, y0, x1, y1 = path[s]
@@ -292,7 +306,8 @@ def _accumulate(
             p = touched[k]
             flat_count[p] += 1
             flat_dwell[p] += (total[p] + 500) // 1000
-            total[p] = 0
+            flat_noise[p] += floor(min(uncertain[p] / total[p], MOST_NOISE_BINS2) * NOISE_UNIT + 0.5)
+            total[p], uncertain[p] = 0, 0.0
             spent[p] = 0
             given[p] = 0
         start = stop

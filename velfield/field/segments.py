@@ -20,9 +20,13 @@ SEGMENT_DTYPE = np.dtype(
         ("vy_px_per_s", "f8"),
         ("detection_0", "i8"),
         ("detection_1", "i8"),
+        ("sd_px_per_s", "f8"),
     ]
 )
-"""One vehicle from one frame to the next. Sorted by passage, then time: the order that `accumulate_tile` needs."""
+"""One vehicle from one frame to the next. Sorted by passage, then time: the order that `accumulate_tile` needs.
+
+``sd_px_per_s``: standard deviation of either component of its velocity, by registration and displacement.
+"""
 
 Segments = NDArray[np.void]
 """(n,) structured array of `SEGMENT_DTYPE`."""
@@ -65,17 +69,27 @@ def _averaged(segments: Segments, span_s: float) -> Segments:
     reach = np.maximum(np.minimum(before, after), 1)
     before, after = np.minimum(before, reach), np.minimum(after, reach)
     out = segments.copy()
-    rows = np.arange(len(segments))
     duration = segments["duration_s"]
+    time = _windowed(duration, before, after)
     for name in ("vx_px_per_s", "vy_px_per_s"):
-        way, time = np.zeros(len(segments)), np.zeros(len(segments))
-        # Summed window by window, not by running sums: these would depend, in the last bit, on which rows are given.
-        for step in range(-int(before.max(initial=0)), int(after.max(initial=0)) + 1):
-            mine = rows[(step >= -before) & (step <= after)]
-            way[mine] += segments[name][mine + step] * duration[mine + step]
-            time[mine] += duration[mine + step]
-        out[name] = way / time
+        out[name] = _windowed(segments[name] * duration, before, after) / time
+    # Errors of two displacements are taken as independent. Those of places cancel in part, so that where the crops did
+    # not align this is a little too large.
+    out["sd_px_per_s"] = np.sqrt(_windowed((segments["sd_px_per_s"] * duration) ** 2, before, after)) / time
     return out
+
+
+def _windowed(values: NDArray[np.float64], before: NDArray[np.int64], after: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Sum over the rows from ``before`` rows above to ``after`` rows below each.
+
+    Window by window, not by running sums: these would depend, in the last bit, on which rows are given.
+    """
+    rows = np.arange(len(values))
+    total = np.zeros(len(values))
+    for step in range(-int(before.max(initial=0)), int(after.max(initial=0)) + 1):
+        mine = rows[(step >= -before) & (step <= after)]
+        total[mine] += values[mine + step]
+    return total
 
 
 def _neighbours(run: NDArray[np.int64], middle: NDArray[np.float64], reach_s: float) -> NDArray[np.int64]:
@@ -102,6 +116,7 @@ def _half(tracklets: pd.DataFrame, first: int) -> Segments:
     half["x1_px"], half["y1_px"] = tracklets[f"x_{b}_px"], tracklets[f"y_{b}_px"]
     half["vx_px_per_s"] = tracklets[f"vx_{a}{b}_px_per_s"]
     half["vy_px_per_s"] = tracklets[f"vy_{a}{b}_px_per_s"]
+    half["sd_px_per_s"] = tracklets[f"displacement_sd_{a}{b}_px"] / half["duration_s"]
     half["detection_0"], half["detection_1"] = tracklets[f"detection_id_{a}"], tracklets[f"detection_id_{b}"]
     return half
 

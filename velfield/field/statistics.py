@@ -5,18 +5,20 @@ detector loop would give them). A histogram accumulated with ``weight="time"`` g
 """
 
 from dataclasses import dataclass
-from math import atan2, cos, erf, floor, hypot, log, pi, sqrt
+from math import atan2, cos, erf, hypot, log, pi, sqrt
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from velfield.field.accumulate import NOISE_UNIT
 from velfield.field.bins import VelocityBins
+from velfield.field.intervals import tile_intervals
 from velfield.field.modes import modal_velocity
+from velfield.field.speeds import blur_variance, most_cells, narrowing_by, quantile, speed_cells
 
 PERCENTILES = (15.0, 50.0, 85.0)
 """The speed percentiles kept, %; p85 is what speed limits are set by."""
-_CELLS_PER_BIN = 8
 
 Float = NDArray[np.float64]
 
@@ -46,6 +48,10 @@ class TileStatistics:
         Of the normalised histogram, nats; log(number of bins) where all are alike.
     direction_se_rad
         Standard error of the mean direction of what moves, rad; NaN with fewer than two passages.
+    direction_half_width_rad
+        Half the 90 % interval of the modal direction, rad; NaN where the mode stands.
+    median_speed_low_px_per_s, median_speed_high_px_per_s
+        90 % interval of the median speed, px/s.
     speed_se_px_per_s
         Standard error of the median speed, px/s: by its binomial rank's interval, and the kernel as the noise of one
         passage; NaN with fewer than two passages.
@@ -61,55 +67,9 @@ class TileStatistics:
     entropy_nats: Float
     direction_se_rad: Float
     speed_se_px_per_s: Float
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _speed_cells(h: NDArray[np.int32], reach: int, cells: Float) -> float:
-    """Weight by speed in cells of 1/8 bin: each bin spreads evenly over one bin's width of speed. Returns the sum."""
-    cells[:] = 0.0
-    total = 0.0
-    half = _CELLS_PER_BIN // 2
-    for y in range(h.shape[0]):
-        for x in range(h.shape[1]):
-            if h[y, x] <= 0:
-                continue
-            weight = float(h[y, x])
-            total += weight
-            low = hypot(float(y - reach), float(x - reach)) * _CELLS_PER_BIN - half
-            if low < 0.0:  # the bin of standing still: its speeds fold at zero
-                for c in range(half):
-                    cells[c] += weight / half
-                continue
-            first = floor(low)
-            part = low - first
-            for c in range(_CELLS_PER_BIN):
-                cells[first + c] += weight * (1.0 - part) / _CELLS_PER_BIN
-                cells[first + c + 1] += weight * part / _CELLS_PER_BIN
-    return total
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _quantile(cells: Float, total: float, share: float) -> float:
-    """Speed, in bins, below which ``share`` of the weight lies; linear within a cell."""
-    target = min(max(share, 0.0), 1.0) * total
-    below = 0.0
-    for c in range(cells.size):
-        if below + cells[c] >= target and cells[c] > 0.0:
-            return float((c + max(target - below, 0.0) / cells[c]) / _CELLS_PER_BIN)
-        below += cells[c]
-    return cells.size / _CELLS_PER_BIN
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _narrowing(cells: Float, total: float, blur: float) -> float:
-    """By how much quantiles are pulled towards the median: what is left of the spread without the variance ``blur``."""
-    mean, square = 0.0, 0.0
-    for c in range(cells.size):
-        speed = (c + 0.5) / _CELLS_PER_BIN
-        mean += cells[c] * speed
-        square += cells[c] * speed * speed
-    variance = square / total - (mean / total) ** 2
-    return sqrt(max(variance - blur, 0.0) / variance)
+    direction_half_width_rad: Float
+    median_speed_low_px_per_s: Float
+    median_speed_high_px_per_s: Float
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -175,8 +135,8 @@ def _tile(
     errors: Float,
 ) -> None:
     reach = (histogram.shape[2] - 1) // 2
-    cells = np.zeros((floor(1.5 * reach) + 3) * _CELLS_PER_BIN)
-    blur = sigma * sigma + 2.0 / 12.0  # the kernel; the bins' width when filled, and again when spread over cells
+    cells = np.zeros(most_cells(reach))
+    blur = blur_variance(sigma)
     at_rest = erf(0.5 / (sigma * sqrt(2.0))) ** 2
     for y in range(count.shape[0]):
         for x in range(count.shape[1]):
@@ -186,21 +146,22 @@ def _tile(
             h = histogram[y, x]
             _moments(h, reach, standing, mode[y, x, 1], mode[y, x, 0], moments[y, x])
             moments[y, x, 3] = min(moments[y, x, 3] / at_rest, 1.0)
-            total = _speed_cells(h, reach, cells)
-            narrowing = _narrowing(cells, total, blur)
-            median = _quantile(cells, total, 0.5)
+            total = speed_cells(h, reach, cells)
+            narrowing = narrowing_by(cells, total, blur)
+            median = quantile(cells, total, 0.5)
             for k in range(percentiles.size):
-                speeds[y, x, k] = median + narrowing * (_quantile(cells, total, percentiles[k] / 100.0) - median)
+                speeds[y, x, k] = median + narrowing * (quantile(cells, total, percentiles[k] / 100.0) - median)
             if n >= 2:
                 errors[y, x, 0] = sqrt(moments[y, x, 6] / n)
                 half = 0.5 / sqrt(float(n))
-                rank = (_quantile(cells, total, 0.5 + half) - _quantile(cells, total, 0.5 - half)) / 2.0
+                rank = (quantile(cells, total, 0.5 + half) - quantile(cells, total, 0.5 - half)) / 2.0
                 errors[y, x, 1] = sqrt((narrowing * rank) ** 2 + sigma * sigma / n)
 
 
 def tile_statistics(
     histogram: NDArray[np.int32],
     count: NDArray[np.int32],
+    noise: NDArray[np.int32],
     *,
     bins: VelocityBins,
     standing_px_per_s: float,
@@ -214,6 +175,8 @@ def tile_statistics(
         (ty, tx, nvy, nvx) int32 weights; their unit does not matter.
     count
         (ty, tx) int32 passages.
+    noise
+        (ty, tx) int32, their velocities' variance by measurement, summed: as in `FieldTile`.
     standing_px_per_s
         What is slower has no direction; where a bin and a half is faster, that is the limit.
     percentiles
@@ -228,6 +191,10 @@ def tile_statistics(
     sigma = bins.kernel_sigma_px_per_s / bins.width_px_per_s
     limits = np.asarray(percentiles, np.float64)
     _tile(histogram, count, bins.to_bins(mode_px_per_s), moving_bins, sigma, limits, moments, speeds, errors)
+    intervals = np.full((*shape, 3), np.nan)
+    each = noise / (np.maximum(count, 1) * float(NOISE_UNIT))
+    standing_bins = standing_px_per_s / bins.width_px_per_s
+    tile_intervals(histogram, count, each, mode_px_per_s / bins.width_px_per_s, sigma, standing_bins, intervals)
     return TileStatistics(
         n=count,
         modal_velocity_px_per_s=mode_px_per_s,
@@ -239,6 +206,9 @@ def tile_statistics(
         entropy_nats=moments[..., 5],
         direction_se_rad=errors[..., 0],
         speed_se_px_per_s=errors[..., 1] * bins.width_px_per_s,
+        direction_half_width_rad=intervals[..., 0],
+        median_speed_low_px_per_s=intervals[..., 1] * bins.width_px_per_s,
+        median_speed_high_px_per_s=intervals[..., 2] * bins.width_px_per_s,
     )
 
 

@@ -18,8 +18,9 @@ from velfield.field.prior import log_density_in_window
 from velfield.field.segments import Segments, segments_by_tile
 from velfield.field.statistics import TileStatistics, direction_rad, speed_px_per_s, tile_statistics
 
-Tile = tuple[NDArray[np.int32], NDArray[np.int32]]
-"""(ty, tx, nvy, nvx) histogram and (ty, tx) count of passages; tiles at the map's edge may be cut or padded."""
+Tile = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]
+"""(ty, tx, nvy, nvx) histogram, (ty, tx) count of passages and their noise, as in `FieldTile`; tiles at the map's edge
+may be cut or padded."""
 TileSource = Callable[[int, int], Tile | None]
 """Gives tile (ty, tx); None where nothing was seen."""
 LayerSource = Callable[[str], NDArray[Any]]
@@ -57,6 +58,10 @@ class PixelDistribution:
         Speed by percentage: 15, 50, 85; px/s.
     standing_share, circular_variance, entropy_nats, direction_se_rad, speed_se_px_per_s
         As in `TileStatistics`.
+    direction_interval_rad
+        90 % interval of the modal direction: from, to; rising, so that one end may lie beyond (-pi, pi].
+    median_speed_interval_px_per_s
+        90 % interval of the median speed: from, to.
     """
 
     x: int
@@ -73,6 +78,8 @@ class PixelDistribution:
     entropy_nats: float
     direction_se_rad: float
     speed_se_px_per_s: float
+    direction_interval_rad: tuple[float, float]
+    median_speed_interval_px_per_s: tuple[float, float]
 
 
 class VelocityField:
@@ -140,7 +147,7 @@ class VelocityField:
             part = segments[rows[ty, tx]]
             size = (tile_size, tile_size)
             tile = accumulate_tile(part, origin_xy=origin, shape=size, bins=bins, radius_px=radius_px)
-            return tile.histogram, tile.count
+            return tile.histogram, tile.count, tile.noise
 
         return cls(
             make, tiles=list(rows), shape=shape, tile_size=tile_size, bins=bins, standing_px_per_s=standing_px_per_s
@@ -156,7 +163,7 @@ class VelocityField:
                 out[..., 0], out[..., 1] = self._layers("modal_vx"), self._layers("modal_vy")
                 self._modal = out
                 return out.copy()
-            for where, velocity in self._over_tiles(lambda h, c: modal_velocity(h, c, bins=self.bins)):
+            for where, velocity in self._over_tiles(lambda t: modal_velocity(t[0], t[1], bins=self.bins)):
                 out[where] = velocity[: out[where].shape[0], : out[where].shape[1]]
             self._modal = out
         return self._modal.copy()
@@ -175,7 +182,7 @@ class VelocityField:
         if self._layers is not None:
             return np.array(self._layers("count"), np.int32)
         out = np.zeros(self.shape, np.int32)
-        for where, count in self._over_tiles(lambda _h, c: c):
+        for where, count in self._over_tiles(lambda t: t[1]):
             out[where] = count[: out[where].shape[0], : out[where].shape[1]]
         return out
 
@@ -183,9 +190,9 @@ class VelocityField:
         """All statistics of every pixel, as whole maps in float32."""
         names = [field.name for field in fields(TileStatistics)]
         maps: dict[str, NDArray[np.generic]] = {}
-        empty = np.zeros((1, 1, self.bins.n, self.bins.n), np.int32), np.zeros((1, 1), np.int32)
+        empty = self._tile_statistics(self._nothing())
         for name in names:
-            sample = getattr(self._tile_statistics(*empty), name)
+            sample = getattr(empty, name)
             full = (*self.shape, *sample.shape[2:])
             maps[name] = np.zeros(full, np.int32) if name == "n" else np.full(full, np.nan, np.float32)
         for where, part in self._over_tiles(self._tile_statistics):
@@ -211,16 +218,19 @@ class VelocityField:
                 f"y from 0 to {self.shape[0] - 1}"
             )
         tile = self._tile(row // self.tile_size, column // self.tile_size)
-        histogram, count = np.zeros((1, 1, self.bins.n, self.bins.n), np.int32), np.zeros((1, 1), np.int32)
-        if tile is not None:
-            y0, x0 = row % self.tile_size, column % self.tile_size
-            histogram, count = tile[0][y0 : y0 + 1, x0 : x0 + 1], tile[1][y0 : y0 + 1, x0 : x0 + 1]
-        return self._distribution(column, row, histogram, count)
+        if tile is None:
+            return self._distribution(column, row, self._nothing())
+        y0, x0 = row % self.tile_size, column % self.tile_size
+        pixel = np.s_[y0 : y0 + 1, x0 : x0 + 1]
+        return self._distribution(column, row, (tile[0][pixel], tile[1][pixel], tile[2][pixel]))
 
-    def _distribution(
-        self, x: int, y: int, histogram: NDArray[np.int32], count: NDArray[np.int32]
-    ) -> PixelDistribution:
-        statistics = self._tile_statistics(histogram, count)
+    def _nothing(self) -> Tile:
+        """A tile of one pixel that nobody passed."""
+        return (np.zeros((1, 1, self.bins.n, self.bins.n), np.int32), *np.zeros((2, 1, 1), np.int32))
+
+    def _distribution(self, x: int, y: int, pixel: Tile) -> PixelDistribution:
+        histogram, count, _ = pixel
+        statistics = self._tile_statistics(pixel)
         modes = velocity_modes(histogram, count, bins=self.bins)[0, 0]
         total = int(histogram.sum(dtype=np.int64))
         return PixelDistribution(
@@ -240,6 +250,11 @@ class VelocityField:
             entropy_nats=float(statistics.entropy_nats[0, 0]),
             direction_se_rad=float(statistics.direction_se_rad[0, 0]),
             speed_se_px_per_s=float(statistics.speed_se_px_per_s[0, 0]),
+            direction_interval_rad=_about(statistics),
+            median_speed_interval_px_per_s=(
+                float(statistics.median_speed_low_px_per_s[0, 0]),
+                float(statistics.median_speed_high_px_per_s[0, 0]),
+            ),
         )
 
     # -- a prior for another tracker ----------------------------------------------------------------------------------
@@ -321,8 +336,9 @@ class VelocityField:
 
     # -- tiles --------------------------------------------------------------------------------------------------------
 
-    def _tile_statistics(self, histogram: NDArray[np.int32], count: NDArray[np.int32]) -> TileStatistics:
-        return tile_statistics(histogram, count, bins=self.bins, standing_px_per_s=self.standing_px_per_s)
+    def _tile_statistics(self, tile: Tile) -> TileStatistics:
+        histogram, count, noise = tile
+        return tile_statistics(histogram, count, noise, bins=self.bins, standing_px_per_s=self.standing_px_per_s)
 
     def _tile(self, ty: int, tx: int) -> Tile | None:
         """A tile, from the few kept in memory where it is one of them."""
@@ -334,22 +350,28 @@ class VelocityField:
                 self._kept.move_to_end(key)
                 return self._kept[key]
         found = self._source(ty, tx)
-        tile = None if found is None else (found[0], found[1])
         with self._lock:
-            self._kept[key] = tile
+            self._kept[key] = found
             while len(self._kept) > _TILES_KEPT:
                 self._kept.popitem(last=False)
-        return tile
+        return found
 
-    def _over_tiles(self, work: Callable[[NDArray[np.int32], NDArray[np.int32]], T]) -> Iterator[tuple[_Place, T]]:
+    def _over_tiles(self, work: Callable[[Tile], T]) -> Iterator[tuple[_Place, T]]:
         """Work on every tile, in raster order: where it stands in the map, and the result. Tiles are not kept."""
 
         def one(key: tuple[int, int]) -> T | None:
             tile = self._source(*key)
-            return None if tile is None else work(tile[0], tile[1])
+            return None if tile is None else work(tile)
 
         size = self.tile_size
         with ThreadPoolExecutor(self._threads) as pool:
             for (ty, tx), result in zip(self.tiles, pool.map(one, self.tiles), strict=True):
                 if result is not None:
                     yield np.s_[ty * size : (ty + 1) * size, tx * size : (tx + 1) * size], result
+
+
+def _about(statistics: TileStatistics) -> tuple[float, float]:
+    """The interval of the modal direction of a tile of one pixel."""
+    vx, vy = statistics.modal_velocity_px_per_s[0, 0]
+    direction, half = float(np.arctan2(vy, vx)), float(statistics.direction_half_width_rad[0, 0])
+    return direction - half, direction + half

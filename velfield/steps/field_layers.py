@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.flight import FieldConfig
-from velfield.field.accumulate import FieldTile
+from velfield.field.accumulate import NOISE_UNIT, FieldTile
 from velfield.field.bins import VelocityBins, standing_px_per_s
 from velfield.field.statistics import tile_statistics
 
@@ -16,6 +16,11 @@ _SPEED = {"units": "px s-1"}
 LAYERS: dict[str, dict[str, Any]] = {
     "count": {"dtype": "int32", "units": "1", "long_name": "distinct passages"},
     "dwell_ms": {"dtype": "int32", "units": "ms", "long_name": "time vehicles spent there, all together"},
+    "velocity_noise": {
+        "dtype": "int32",
+        "units": "1",
+        "long_name": f"sum over passages of the variance of a velocity component, in bins squared times {NOISE_UNIT}",
+    },
     "modal_vx": {**_SPEED, "long_name": "x component of the modal velocity"},
     "modal_vy": {**_SPEED, "long_name": "y component of the modal velocity, down"},
     "mode_share": {"units": "1", "long_name": "share of passages at the mode"},
@@ -29,16 +34,21 @@ LAYERS: dict[str, dict[str, Any]] = {
     "entropy": {"units": "1", "long_name": "entropy of the velocity distribution, nats"},
     "direction_se": {"units": "rad", "long_name": "standard error of the mean direction of what moves"},
     "speed_se": {**_SPEED, "long_name": "standard error of the median speed"},
+    "direction_half90": {"units": "rad", "long_name": "half the width of the 90 % interval of the modal direction"},
+    "speed_p50_low90": {**_SPEED, "long_name": "lower end of the 90 % interval of the median speed"},
+    "speed_p50_high90": {**_SPEED, "long_name": "upper end of the 90 % interval of the median speed"},
 }
 """Layer -> attributes in the store; ``dtype`` where it is not float32."""
 
 
 def tile_layers(tile: FieldTile, bins: VelocityBins, config: FieldConfig) -> dict[str, NDArray[Any]]:
     """All layers of one tile, each (ty, tx)."""
-    s = tile_statistics(tile.histogram, tile.count, bins=bins, standing_px_per_s=standing_px_per_s(config, bins.gsd_m))
+    standing = standing_px_per_s(config, bins.gsd_m)
+    s = tile_statistics(tile.histogram, tile.count, tile.noise, bins=bins, standing_px_per_s=standing)
     values: dict[str, NDArray[Any]] = {
         "count": tile.count,
         "dwell_ms": tile.dwell_ms,
+        "velocity_noise": tile.noise,
         "modal_vx": s.modal_velocity_px_per_s[..., 0],
         "modal_vy": s.modal_velocity_px_per_s[..., 1],
         "mode_share": s.mode_share,
@@ -52,5 +62,8 @@ def tile_layers(tile: FieldTile, bins: VelocityBins, config: FieldConfig) -> dic
         "entropy": s.entropy_nats,
         "direction_se": s.direction_se_rad,
         "speed_se": s.speed_se_px_per_s,
+        "direction_half90": s.direction_half_width_rad,
+        "speed_p50_low90": s.median_speed_low_px_per_s,
+        "speed_p50_high90": s.median_speed_high_px_per_s,
     }
     return {name: np.asarray(value, LAYERS[name].get("dtype", "float32")) for name, value in values.items()}

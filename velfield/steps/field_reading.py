@@ -21,9 +21,9 @@ def open_velocity_field(layout: RunLayout) -> VelocityField:
     config = FlightRecord.model_validate_json(layout.flight.read_bytes()).config.field
     gsd_m = read_grid_of(layout).gsd_m
     store = open_field(layout.field)
-    count = store.layer("count")
+    count, noise = store.layer("count"), store.layer("velocity_noise")
     return VelocityField(
-        lambda row, column: _tile(store, count, row, column),
+        lambda row, column: _tile(store, count, noise, row, column),
         tiles=_known_tiles(count, store.tile),
         shape=store.shape,
         tile_size=store.tile,
@@ -40,8 +40,9 @@ def _known_tiles(count: np.ndarray, side: int) -> list[tuple[int, int]]:
     return [(int(row), int(column)) for row, column in tiles]
 
 
-def _tile(store: FieldStore, count: np.ndarray, row: int, column: int) -> Tile:
+def _tile(store: FieldStore, count: np.ndarray, noise: np.ndarray, row: int, column: int) -> Tile:
     if not store.has_tile(row, column):
         raise StoreError(f"{store.path / HISTOGRAM}: the chunk of tile ({row}, {column}) is gone; run the flight again")
     y, x, side = row * store.tile, column * store.tile, store.tile
-    return store.read_tile(row, column), count[y : y + side, x : x + side]
+    place = np.s_[y : y + side, x : x + side]
+    return store.read_tile(row, column), count[place], noise[place]

@@ -1,0 +1,74 @@
+"""The distribution of speed at a pixel, out of its histogram over velocity."""
+
+from math import floor, hypot, sqrt
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+CELLS_PER_BIN = 8
+"""Speed is counted in cells of this part of a bin."""
+
+Float = NDArray[np.float64]
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def most_cells(reach: int) -> int:
+    """Cells that the speeds of a histogram with ``reach`` bins on either side need."""
+    return int((floor(1.5 * reach) + 3) * CELLS_PER_BIN)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def blur_variance(sigma: float) -> float:
+    """Variance that the histogram adds to a speed, bins^2: the kernel; the bins' width when filled, and again when
+    spread over cells."""
+    return sigma * sigma + 2.0 / 12.0
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def speed_cells(h: NDArray[np.int32], reach: int, cells: Float) -> float:
+    """Weight by speed in cells of 1/8 bin: each bin spreads evenly over one bin's width of speed. Returns the sum."""
+    cells[:] = 0.0
+    total = 0.0
+    half = CELLS_PER_BIN // 2
+    for y in range(h.shape[0]):
+        for x in range(h.shape[1]):
+            if h[y, x] <= 0:
+                continue
+            weight = float(h[y, x])
+            total += weight
+            low = hypot(float(y - reach), float(x - reach)) * CELLS_PER_BIN - half
+            if low < 0.0:  # the bin of standing still: its speeds fold at zero
+                for c in range(half):
+                    cells[c] += weight / half
+                continue
+            first = floor(low)
+            part = low - first
+            for c in range(CELLS_PER_BIN):
+                cells[first + c] += weight * (1.0 - part) / CELLS_PER_BIN
+                cells[first + c + 1] += weight * part / CELLS_PER_BIN
+    return total
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def quantile(cells: Float, total: float, share: float) -> float:
+    """Speed, in bins, below which ``share`` of the weight lies; linear within a cell."""
+    target = min(max(share, 0.0), 1.0) * total
+    below = 0.0
+    for c in range(cells.size):
+        if below + cells[c] >= target and cells[c] > 0.0:
+            return float((c + max(target - below, 0.0) / cells[c]) / CELLS_PER_BIN)
+        below += cells[c]
+    return cells.size / CELLS_PER_BIN
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def narrowing_by(cells: Float, total: float, blur: float) -> float:
+    """By how much quantiles are pulled towards the median: what is left of the spread without the variance ``blur``."""
+    mean, square = 0.0, 0.0
+    for c in range(cells.size):
+        speed = (c + 0.5) / CELLS_PER_BIN
+        mean += cells[c] * speed
+        square += cells[c] * speed * speed
+    variance = square / total - (mean / total) ** 2
+    return sqrt(max(variance - blur, 0.0) / variance)

@@ -1,0 +1,127 @@
+"""Tracklets of a simulated city's traffic without its pictures: true drives with the errors that the pipeline makes.
+
+A picture costs a second, a drive nothing, so an hour of traffic can be had for what ten frames cost: for the long run
+that intervals are held to, and for fields of the size of a long flight.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from schemas.tables import TRACKLET_COLUMNS
+from velfield.synthetic.traffic import STEP_S, Traffic
+from velfield.tracking.passages import assign_passages
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_MAX_INTERVAL_S = 0.45
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What the pipeline does to a true drive; the defaults were measured on simulated flights with pictures.
+
+    Attributes
+    ----------
+    recall
+        Share of the vehicles in a frame that are detected, each frame for itself.
+    place_sd_px
+        Standard deviation of a detection's place along one axis, base px.
+    displacement_sd_px, claimed_sd_px
+        Standard deviation of an aligned link's displacement along one axis, and what the aligner says it is.
+    unaligned_share
+        Share of links whose crops do not align, so that the places alone say how far it went.
+    """
+
+    recall: float = 0.97
+    place_sd_px: float = 0.8
+    displacement_sd_px: float = 0.09
+    claimed_sd_px: float = 0.13
+    unaligned_share: float = 0.05
+
+
+NO_ERRORS = Errors(recall=1.0, place_sd_px=0.0, displacement_sd_px=0.0, claimed_sd_px=0.0, unaligned_share=0.0)
+
+
+def observed_tracklets(
+    traffic: Traffic,
+    times_s: FloatArray,
+    to_px: Callable[[FloatArray], FloatArray],
+    *,
+    shape: tuple[int, int],
+    rng: np.random.Generator,
+    errors: Errors = Errors(),
+) -> pd.DataFrame:
+    """Tracklets of all vehicles within a (height, width) base image; every window of three frames can have one.
+
+    Parameters
+    ----------
+    traffic
+        Who drives where.
+    times_s
+        (frames,) times of the frames.
+    to_px
+        Plan metres (n, 2) -> base pixels.
+    rng
+        For the errors.
+
+    Returns
+    -------
+    DataFrame
+        `schemas.tables.TRACKLET_COLUMNS`; the low 20 bits of a detection's id are the vehicle's number.
+    """
+    vehicle, frame = _appearances(traffic, times_s)
+    true = to_px(traffic.at(vehicle, times_s[frame])[0])
+    inside = (true >= 0).all(axis=1) & (true <= np.array(shape[::-1]) - 1).all(axis=1)
+    seen = inside & (rng.uniform(size=len(frame)) < errors.recall)
+    vehicle, frame, true = vehicle[seen], frame[seen], true[seen]
+    place = true + rng.normal(0, 1, true.shape) * errors.place_sd_px
+    moved, sd = _displacements(true, place, errors, rng)
+    # rows are sorted by vehicle, then frame: a window is three rows of one vehicle in consecutive frames
+    step = (np.diff(vehicle) == 0) & (np.diff(frame) == 1) & (np.diff(times_s[frame]) <= _MAX_INTERVAL_S)
+    start = np.flatnonzero(step[:-1] & step[1:])
+    columns: dict[str, NDArray[np.generic]] = {}
+    for k in range(3):
+        rows = start + k
+        columns[f"frame_{k}"], columns[f"time_{k}_s"] = frame[rows], times_s[frame[rows]]
+        columns[f"detection_id_{k}"] = (frame[rows] << 20) + vehicle[rows]
+        columns[f"x_{k}_px"], columns[f"y_{k}_px"] = place[rows].T
+    for k, link in ((0, "01"), (1, "12")):
+        rows = start + k
+        interval = times_s[frame[rows + 1]] - times_s[frame[rows]]
+        columns[f"vx_{link}_px_per_s"], columns[f"vy_{link}_px_per_s"] = (moved[rows] / interval[:, None]).T
+        columns[f"displacement_sd_{link}_px"] = sd[rows]
+        columns[f"sad_{link}"] = np.full(len(rows), np.nan)
+    columns["confidence"] = np.ones(len(start))
+    columns["tracklet_id"] = columns["detection_id_1"]
+    ids = np.stack([columns[f"detection_id_{k}"] for k in range(3)], axis=1).astype(np.int64)
+    columns["passage_id"] = assign_passages(ids)
+    return pd.DataFrame({name: columns[name].astype(kind) for name, kind in TRACKLET_COLUMNS.items()})
+
+
+def _appearances(traffic: Traffic, times_s: FloatArray) -> tuple[IntArray, IntArray]:
+    """(vehicle, frame) of every vehicle on the road in every frame, sorted."""
+    begin = traffic.start_step * STEP_S
+    end = begin + (np.diff(traffic.first) - 1) * STEP_S
+    low, high = np.searchsorted(times_s, begin), np.searchsorted(times_s, end)
+    count = np.maximum(high - low, 0)
+    vehicle = np.repeat(np.arange(len(traffic)), count)
+    frame = np.arange(len(vehicle)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(low, count)
+    return vehicle, frame
+
+
+def _displacements(
+    true: FloatArray, place: FloatArray, errors: Errors, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Displacement (n, 2) from each row to the next and its claimed standard deviation (n,); the last row's is zero."""
+    aligned = np.zeros_like(true)
+    aligned[:-1] = np.diff(true, axis=0) + rng.normal(0, 1, (len(true) - 1, 2)) * errors.displacement_sd_px
+    plain = np.zeros_like(true)
+    plain[:-1] = np.diff(place, axis=0)
+    unaligned = rng.uniform(size=len(true)) < errors.unaligned_share
+    sd = np.where(unaligned, np.sqrt(2) * errors.place_sd_px, errors.claimed_sd_px)
+    return np.where(unaligned[:, None], plain, aligned), sd
