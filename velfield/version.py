@@ -4,7 +4,7 @@ from importlib.metadata import version
 
 STAGE_VERSIONS: dict[str, int] = {
     "frames": 1,
-    "lens": 1,
+    "lens": 2,
     "base": 1,
     "registration": 1,
     "detector": 3,
