@@ -26,6 +26,7 @@ _SEGMENT_COLUMNS = [
     *(f"time_{k}_s" for k in range(3)),
     *(f"{axis}_{k}_px" for k in range(3) for axis in "xy"),
     *(f"v{axis}_{k}_px_per_s" for k in ("01", "12") for axis in "xy"),
+    *(f"displacement_sd_{k}_px" for k in ("01", "12")),
 ]
 
 
