@@ -91,6 +91,17 @@ def test_a_negative_is_found(ground: np.ndarray, base: np.ndarray) -> None:
     assert mean_error_px(result, to_base) < 0.5
 
 
+def test_rows_that_wobble_do_not_make_another_place_of_it(ground: np.ndarray, base: np.ndarray) -> None:
+    image = photograph(ground, view(1.0, 5.0), LENS, SHAPE, 1)
+    y, x = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]].astype(np.float32)
+    wave = (4.0 * np.sin(2 * np.pi * 4.0 * y / SHAPE[0])).astype(np.float32)
+    shaken = cv2.remap(image, x + wave, y + 0.7 * np.roll(wave, 30, axis=0), cv2.INTER_LINEAR)
+    result = found(shaken, base)
+    assert mean_error_px(result, view(1.0, 5.0)) < 2.5
+    turned = cv2.rotate(shaken, cv2.ROTATE_180)[:, ::-1].copy()
+    assert isinstance(register_intersensor(turned, base, CONFIG, lens=LENS), Failure)
+
+
 def test_the_error_map_covers_the_ground_seen_and_nothing_else(ground: np.ndarray, base: np.ndarray) -> None:
     result = found(photograph(ground, view(0.6, 0.0), LENS, SHAPE, 1), base)
     spacing = result.error_map_spacing_px

@@ -5,7 +5,7 @@ from importlib.metadata import version
 STAGE_VERSIONS: dict[str, int] = {
     "frames": 1,
     "lens": 2,
-    "base": 1,
+    "base": 2,
     "registration": 1,
     "detector": 3,
     "detections": 3,

@@ -42,6 +42,10 @@ MIN_AGREEING_PATCHES = 12
 
 _WITNESS_COUNT, _WITNESS_SIDES_PX = 200, (21, 75)
 _WITNESS_TOLERANCE_PX = 2.0
+_BY_ROWS_SHARE = 0.45
+"""Share of them that must agree by their rows where fewer do straight; of frames whose rows wobble by 4 px, .6 do."""
+_ROW_BANDS, _ROW_POINTS = 64, 8
+"""Rows within a 64th of the frame were taken at about one time; so many points tell how they moved."""
 _NEAR_SCALES = (0.8, 0.89, 1.0, 1.12, 1.25)
 _NEAR_TURNS = tuple(np.radians([-10.0, -5.0, 0.0, 5.0, 10.0]))
 _ALL_SCALES = (0.5, 0.63, 0.79, 1.0, 1.26, 1.59, 2.0)
@@ -127,11 +131,10 @@ def register_intersensor(
         if isinstance(fitted, Failure):
             scores.append(f"{candidate.how}: {fitted.reason}")
             continue
-        count, (agreeing, witnesses) = int(fitted.kept.sum()), _witnesses(pair, fitted.transform, candidate.look)
-        scores.append(f"{candidate.how}: {count} control points, {agreeing} of {witnesses} separate patches agree")
-        borne_out = agreeing >= max(MIN_AGREEING_PATCHES, MIN_AGREEING_SHARE * witnesses)
-        if count >= config.min_control_points and borne_out:
-            if agreeing < _SURE_SHARE * witnesses and _is_mirrored(pair):
+        count, heard = int(fitted.kept.sum()), _witnesses(pair, fitted, candidate.look)
+        scores.append(f"{candidate.how}: {count} control points, {heard.text}")
+        if count >= config.min_control_points and heard.borne_out:
+            if not heard.sure and _is_mirrored(pair):
                 break  # straight roads agree with their own mirror picture well enough to be taken for the place
             return _result(pair, fitted, candidate, tuple(scores))
     return Failure(_why_not(pair, scores))
@@ -188,16 +191,59 @@ def _searched(
                 yield Coarse(fine.matrix, f"{how} by {fine.look}, correlation {fine.score:.2f}", fine.look, fine.score)
 
 
-def _witnesses(pair: Pair, transform: FrameTransform, look: Look) -> tuple[int, int]:
-    """Of patches that do not overlap: how many lie where the map says, and how many lie anywhere clearly."""
-    pictures = on_base_grid(pair, transform, 1.0)
+@dataclass(frozen=True)
+class _Witnesses:
+    """Patches that do not overlap: how many lie anywhere clearly, where the map says, and where it says by their rows.
+
+    The rows of a rolling shutter may have moved by more than the tolerance: a patch agrees by its rows where control
+    points of the same rows, elsewhere in the picture, moved alike. By edges of a wrong place up to a quarter do.
+    """
+
+    count: int = 0
+    agreeing: int = 0
+    by_rows: int = 0
+
+    @property
+    def borne_out(self) -> bool:
+        straight = self.agreeing >= max(MIN_AGREEING_PATCHES, MIN_AGREEING_SHARE * self.count)
+        return straight or self.by_rows >= max(2 * MIN_AGREEING_PATCHES, _BY_ROWS_SHARE * self.count)
+
+    @property
+    def sure(self) -> bool:
+        return max(self.agreeing, self.by_rows) >= _SURE_SHARE * self.count
+
+    @property
+    def text(self) -> str:
+        return f"{self.agreeing} of {self.count} separate patches agree, {self.by_rows} by rows"
+
+
+def _witnesses(pair: Pair, fitted: Fitted, look: Look) -> _Witnesses:
+    pictures = on_base_grid(pair, fitted.transform, 1.0)
     if pictures is None:
-        return 0, 0
-    moving, mask, reference, _ = pictures
+        return _Witnesses()
+    moving, mask, reference, origin = pictures
     side = int(np.clip(np.sqrt(mask.sum() / _WITNESS_COUNT), *_WITNESS_SIDES_PX)) | 1
     matches = match_grid(moving, mask, reference, spacing_px=side, patch_px=side, radius_px=FINE_RADIUS_PX, look=look)
-    agree = np.linalg.norm(matches.displacement, axis=1) < _WITNESS_TOLERANCE_PX
-    return int(agree.sum()), int(agree.size)
+    raw = fitted.transform.to_raw(matches.points + origin)
+    rest = matches.displacement - _motion_of_rows(fitted, raw, apart_px=1.5 * pair.config.patch_size_px)
+    straight, by_rows = (
+        int((np.linalg.norm(miss, axis=1) < _WITNESS_TOLERANCE_PX).sum()) for miss in (matches.displacement, rest)
+    )
+    return _Witnesses(len(matches.points), straight, by_rows)
+
+
+def _motion_of_rows(fitted: Fitted, raw: Floats, *, apart_px: float) -> Floats:
+    """Median displacement (n, 2), base px, of the control points in the rows of raw places (n, 2), none too near."""
+    rest = fitted.target - fitted.transform.to_base(fitted.source_raw)
+    usable = np.linalg.norm(rest, axis=1) < 2.0 * FINE_RADIUS_PX
+    at, rest = fitted.source_raw[usable], rest[usable]
+    reach = fitted.transform.height / _ROW_BANDS
+    motion = np.zeros_like(raw)
+    for k, (x, y) in enumerate(raw):
+        same = (np.abs(at[:, 1] - y) < reach) & (np.abs(at[:, 0] - x) > apart_px)
+        if same.sum() >= _ROW_POINTS:
+            motion[k] = np.median(rest[same], axis=0)
+    return motion
 
 
 def _result(pair: Pair, fitted: Fitted, candidate: Coarse, scores: tuple[str, ...]) -> IntersensorResult:

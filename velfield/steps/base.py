@@ -28,6 +28,7 @@ from velfield.registration.own_base import OwnBase, build_own_base
 from velfield.render.figures import png_bytes
 from velfield.sources.geo import BasePicture, agreed_gsd, read_base_picture
 from velfield.sources.pictures import read_picture_grey
+from velfield.steps.external import free_of_vehicles
 from velfield.steps.frame_maps import polyprojective_record, read_lens
 from velfield.steps.grid import read_grid
 from velfield.steps.lens import spread_usable
@@ -58,7 +59,10 @@ def spread_frames(plan: Plan) -> list[int]:
 def key_points_of(plan: Plan, frames: Sequence[int]) -> list[FrameKeyPoints]:
     """Key points of a block of frames: the costly part of registration, and the parallel one."""
     store, config = open_frames(plan.layout.frames), plan.config.registration
-    return [FrameKeyPoints(frame, detect_key_points(store.read(frame), config)) for frame in frames]
+    return [
+        FrameKeyPoints(frame, detect_key_points(store.read(frame), config, free_of_vehicles(plan, frame, store.shape)))
+        for frame in frames
+    ]
 
 
 def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeyPoints]]) -> Outcome:

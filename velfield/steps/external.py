@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ _BOXES: dict[str, pd.DataFrame] = {}
 
 def _boxes(plan: Plan) -> pd.DataFrame:
     """The boxes of the whole flight, read once a process."""
-    key = plan.keys["detector"]
+    key = f"{plan.job.inputs.source} {plan.inputs.detections}"
     if key not in _BOXES:
         _BOXES.clear()
         _BOXES[key] = read_detections(Path(str(plan.job.inputs.detections)), plan.info)
@@ -43,6 +44,25 @@ def external_detections(plan: Plan, seen: WorkingFrame, transform: FrameMap, fra
     )
     good = np.isfinite(xy).all(axis=1)
     return pictured(seen.image, cars[good], area[good])
+
+
+def free_of_vehicles(plan: Plan, frame: int, shape: tuple[int, int]) -> NDArray[np.bool_] | None:
+    """Where a raw frame (h, w) shows no vehicle, as far as given detections tell: key points are looked for there.
+
+    None where no detections are given. Boxes without a size mask nothing; the robust fit keeps those out.
+    """
+    if plan.job.inputs.detections is None:
+        return None
+    table = _boxes(plan)
+    mine = table[table["source_index"] == plan.indices[frame]]
+    length, width = mine["length_px"].to_numpy(np.float64), mine["width_px"].to_numpy(np.float64)
+    axis = np.nan_to_num(mine["orientation_rad"].to_numpy(np.float64))
+    free = np.ones(shape, np.uint8)
+    for x, y, a, b, turn in zip(mine["x_px"], mine["y_px"], length, width, axis, strict=True):
+        if np.isfinite(a) and np.isfinite(b):
+            rectangle = ((float(x), float(y)), (float(a), float(b)), float(np.degrees(turn)))
+            cv2.fillPoly(free, [np.rint(cv2.boxPoints(rectangle)).astype(np.int32)], (0,))
+    return free.astype(np.bool_)
 
 
 def _turned(transform: FrameMap, raw: NDArray[np.float64], axis_raw: NDArray[np.float64]) -> NDArray[np.float64]:

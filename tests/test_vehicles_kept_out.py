@@ -1,0 +1,40 @@
+"""Key points stay off vehicles where another detector's boxes are given."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from schemas.job import Inputs, Job
+from velfield.configuration import resolve_config
+from velfield.plan import make_plan
+from velfield.steps.base import key_points_of
+from velfield.steps.external import free_of_vehicles
+from velfield.steps.frames import lay_out_frames, read_unit
+
+
+def test_no_key_point_lies_on_a_given_vehicle(tmp_path: Path) -> None:
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    blocks = np.random.default_rng(0).integers(0, 255, (15, 20), dtype=np.uint8).repeat(8, 0).repeat(8, 1)
+    for name in ("a.png", "b.png", "c.png"):
+        cv2.imwrite(str(folder / name), blocks)
+    boxes = tmp_path / "boxes.csv"
+    boxes.write_text("frame,x_px,y_px,orientation_rad,length_px,width_px\nb.png,80,60,0.0,60,30\nc.png,80,60,,,\n")
+    inputs = Inputs(source=str(folder), detections=str(boxes))
+    plan = make_plan(Job(root=str(tmp_path / "run"), inputs=inputs, config=resolve_config(overrides={"frames.fps": 5})))
+    lay_out_frames(plan)
+    read_unit(plan, range(3))
+    free = free_of_vehicles(plan, 1, (120, 160))
+    assert free is not None
+    assert not free[46:74, 52:108].any()
+    assert free[:43].all()
+    assert free[:, 114:].all()
+    everywhere, masked, unsized = (found.key_points.xy for found in key_points_of(plan, [0, 1, 2]))
+
+    def on_the_vehicle(xy: np.ndarray) -> int:
+        return int(((np.abs(xy - [80, 60])) < [28, 13]).all(axis=1).sum())
+
+    assert on_the_vehicle(everywhere) > 0
+    assert on_the_vehicle(masked) == 0
+    assert on_the_vehicle(unsized) == on_the_vehicle(everywhere)
