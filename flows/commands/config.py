@@ -1,0 +1,26 @@
+"""``velfield config``: the configuration that a run was made with."""
+
+from pathlib import Path
+
+from cyclopts import App
+
+config = App(name="config", help="The configuration of a run.")
+
+
+@config.command
+def show(run_folder: Path, /) -> int:
+    """Print the resolved configuration of a run as YAML; `velfield run ... --config FILE` reads it back.
+
+    Parameters
+    ----------
+    run_folder
+        The run folder.
+    """
+    import yaml
+
+    from velfield.run import open_run
+
+    record = open_run(run_folder).record
+    print(f"# made by velfield {record.code_version} from {record.inputs.source.path}")
+    print(yaml.safe_dump(record.config.model_dump(mode="json"), sort_keys=False), end="")
+    return 0

@@ -1,0 +1,40 @@
+"""``velfield init``: a commented flight.yaml to begin with."""
+
+from pathlib import Path
+
+
+def init(
+    source: Path,
+    /,
+    *,
+    out: Path = Path("flight.yaml"),
+    timestamps: Path | None = None,
+    fps: float | None = None,
+) -> int:
+    """Look at a video and write a commented flight.yaml: what was found, and every parameter with its default.
+
+    Parameters
+    ----------
+    source
+        Video file, or folder of pictures.
+    out
+        The file to write; one that is there is left alone.
+    timestamps
+        CSV `frame,time_s` for a folder of pictures.
+    fps
+        Frame rate of a folder of pictures that has no times.
+    """
+    from schemas.flight import FramesConfig
+    from velfield.configuration import resolve_config
+    from velfield.errors import InputError
+    from velfield.provenance import write_atomically
+    from velfield.sources.source import probe
+    from velfield.starting import found_lines, starting_config
+
+    if out.exists():
+        raise InputError(f"{out} is there already; name another file with --out, or move it away")
+    info = probe(source, frames=FramesConfig(fps=fps), timestamps=timestamps)
+    write_atomically(out, starting_config(str(source), info).encode())
+    print("\n".join(found_lines(info, resolve_config())))
+    print(f"{out}: try  velfield run {source} --config {out} --out RUN")
+    return 0
