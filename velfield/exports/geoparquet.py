@@ -32,20 +32,26 @@ def tracklets_geoparquet(tracklets: pd.DataFrame, place: Place) -> bytes:
     -------
     The file's bytes: ``geometry`` WKB, ``bbox`` struct, the tracklets' columns, and ``heading_deg``.
     """
-    xy = np.stack([tracklets[[f"x_{k}_px", f"y_{k}_px"]].to_numpy(np.float64) for k in range(3)], axis=1)
-    flat = xy.reshape(-1, 2)
-    lines = (place.to_crs(flat) if place.has_crs else flat * (1.0, -1.0)).reshape(-1, 3, 2)
+    table, lines = tracklet_lines(tracklets, place)
     low, high = lines.min(axis=1), lines.max(axis=1)
-    columns: dict[str, pa.Array] = {
-        "geometry": pa.array([_wkb(line) for line in lines], pa.binary()),
-        "bbox": _boxes(low, high),
-        "heading_deg": pa.array(_headings(tracklets, xy, place), pa.float32()),
-    }
-    columns |= {str(name): pa.array(tracklets[name].to_numpy()) for name in tracklets.columns}
-    table = pa.table(columns).replace_schema_metadata({"geo": json.dumps(_metadata(place, low, high))})
+    table = table.add_column(1, "bbox", _boxes(low, high))
+    table = table.replace_schema_metadata({"geo": json.dumps(_metadata(place, low, high))})
     sink = io.BytesIO()
     pq.write_table(table, sink, compression="zstd")
     return sink.getvalue()
+
+
+def tracklet_lines(tracklets: pd.DataFrame, place: Place) -> tuple[pa.Table, NDArray[np.float64]]:
+    """Tracklets as a table (``geometry`` WKB, ``heading_deg``, their own columns), and their lines (n, 3, 2)."""
+    xy = np.stack([tracklets[[f"x_{k}_px", f"y_{k}_px"]].to_numpy(np.float64) for k in range(3)], axis=1)
+    flat = xy.reshape(-1, 2)
+    lines = (place.to_crs(flat) if place.has_crs else flat * (1.0, -1.0)).reshape(-1, 3, 2)
+    columns: dict[str, pa.Array] = {
+        "geometry": pa.array([_wkb(line) for line in lines], pa.binary()),
+        "heading_deg": pa.array(_headings(tracklets, xy, place), pa.float32()),
+    }
+    columns |= {str(name): pa.array(tracklets[name].to_numpy()) for name in tracklets.columns}
+    return pa.table(columns), lines
 
 
 def _wkb(line: NDArray[np.float64]) -> bytes:
