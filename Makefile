@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export UV_LINK_MODE := copy
 
-.PHONY: demo test lint types check format env lock bench clean
+.PHONY: demo test lint types check format env lock bench soak clean
 
 demo: $(STAMP)  ## simulate a flight, run the whole job, say where the report is
 	$(BIN)/velfield demo --out demo
@@ -43,9 +43,12 @@ bench: $(STAMP)  ## speed, as ratios against a peer in the same run
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps stabilo==1.4.7
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only
 
+soak: $(STAMP)  ## fifty kills at random moments: every result equal to the bit
+	$(BIN)/python -m tests.kills --kills 50
+
 # Universal, with hashes, and without a registry's address in it.
 lock: $(STAMP)
-	$(BIN)/uv pip compile pyproject.toml --extra dev --universal --no-emit-index-url --no-emit-find-links \
+	$(BIN)/uv pip compile pyproject.toml --extra dev --extra s3 --universal --no-emit-index-url --no-emit-find-links \
 	  --generate-hashes --no-annotate --no-header --python-version 3.11 -o requirements.lock
 
 clean:

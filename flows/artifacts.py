@@ -1,7 +1,6 @@
 """What the Prefect UI shows of a run besides its graph: a summary, a table of stages, the two maps as pictures."""
 
 import base64
-from pathlib import Path
 
 from prefect.artifacts import create_markdown_artifact, create_table_artifact
 
@@ -14,7 +13,7 @@ _PICTURE_BYTES = 600_000
 
 def publish_summary(plan: Plan, summary: RunSummary) -> None:
     """Create the artifacts of a finished run."""
-    lines = [f"# {plan.job.inputs.source}", "", f"Report: `{Path(summary.root).resolve() / 'index.html'}`", ""]
+    lines = [f"# {plan.job.inputs.source}", "", f"Report: `{plan.layout.report}`", ""]
     lines += [f"- **{stage.name}**: {stage.text} ({stage.seconds:.1f} s)" for stage in summary.stages]
     lines += ["", f"{len(summary.frames_lost)} frames lost.", ""]
     for name in ("direction", "speed"):

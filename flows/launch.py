@@ -12,6 +12,8 @@ _SETTINGS: dict[str, str] = {
     "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "180",
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
     "DO_NOT_TRACK": "1",
+    # Prefect's default lets any page that a browser shows talk to the server.
+    "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": "http://127.0.0.1",
     # Pickle is Prefect's default; what is kept of us there is plain.
     "PREFECT_RESULTS_DEFAULT_SERIALIZER": "json",
     "DASK_DISTRIBUTED__LOGGING__DISTRIBUTED": "error",

@@ -5,13 +5,18 @@ a laptop; the same tasks submitting their graphs to a cluster survive a killed w
 either.
 """
 
+import importlib
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
+from pydantic import Field, PositiveInt, ValidationError
+
 from schemas.model import Model
+from velfield.errors import InputError
 
 
 class RunnerConfig(Model):
@@ -21,6 +26,39 @@ class RunnerConfig(Model):
     """Processes of a local cluster; none: the threads of this process."""
     scheduler: str | None = None
     """Address of a Dask scheduler, ``tcp://host:port``."""
+    cluster_class: str | None = None
+    """Where a class of Dask clusters stands, ``module.Class``: ``dask_kubernetes.operator.KubeCluster``, ..."""
+    cluster_kwargs: dict[str, Any] = Field(default_factory=dict)
+    """What it is called with."""
+
+
+class ClusterFile(Model):
+    """``--cluster FILE``: where to compute, by configuration alone."""
+
+    cluster_class: str
+    cluster_kwargs: dict[str, Any] = Field(default_factory=dict)
+    workers: PositiveInt = 2
+    """Workers to ask for."""
+
+
+def read_runner(path: Path) -> RunnerConfig:
+    """The runner that a ``--cluster`` file asks for.
+
+    Raises
+    ------
+    InputError
+        It is not there, or not such a file.
+    """
+    import yaml
+
+    try:
+        asked = ClusterFile.model_validate(yaml.safe_load(path.read_text()))
+    except FileNotFoundError:
+        raise InputError(f"--cluster: {path} is not there; see examples/ for some") from None
+    except (yaml.YAMLError, ValidationError) as error:
+        told = " ".join(str(error).split())
+        raise InputError(f"--cluster {path}: expected cluster_class, cluster_kwargs, workers; {told}") from None
+    return RunnerConfig(**asked.model_dump())
 
 
 class Runner(ABC):
@@ -60,25 +98,45 @@ class ClientRunner(Runner):
 @contextmanager
 def open_runner(config: RunnerConfig) -> Iterator[Runner]:
     """A runner for the time of a flow; what it started is gone afterwards."""
-    if config.scheduler is None and config.workers is None:
+    if config == RunnerConfig():
         yield ThreadsRunner(_usable_cores())
         return
-    from dask.distributed import Client, LocalCluster
+    from dask.distributed import Client
 
-    if config.scheduler is not None:
-        with Client(config.scheduler, timeout="30s", set_as_default=False) as client:
-            yield ClientRunner(client)
-        return
-    with (
-        LocalCluster(
-            n_workers=config.workers,
-            threads_per_worker=1,
-            dashboard_address="127.0.0.1:0",
-            host="127.0.0.1",
-        ) as cluster,
-        Client(cluster, set_as_default=False) as client,
-    ):
+    with _cluster(config) as cluster, Client(cluster, timeout="60s", set_as_default=False) as client:
+        if config.cluster_class is not None:
+            client.wait_for_workers(1)
         yield ClientRunner(client)
+
+
+@contextmanager
+def _cluster(config: RunnerConfig) -> Iterator[Any]:
+    """What a client connects to: an address, or a cluster that lives as long as the context."""
+    if config.scheduler is not None:
+        yield config.scheduler
+        return
+    cluster_class, given = _local_cluster(config) if config.cluster_class is None else _class_of(config)
+    with cluster_class(**given) as cluster:
+        if config.cluster_class is not None:
+            cluster.scale(config.workers)
+        yield cluster
+
+
+def _local_cluster(config: RunnerConfig) -> tuple[Any, dict[str, Any]]:
+    from dask.distributed import LocalCluster
+
+    here = {"dashboard_address": "127.0.0.1:0", "host": "127.0.0.1"}
+    return LocalCluster, {"n_workers": config.workers, "threads_per_worker": 1, **here}
+
+
+def _class_of(config: RunnerConfig) -> tuple[Any, dict[str, Any]]:
+    module, _, name = str(config.cluster_class).rpartition(".")
+    try:
+        return getattr(importlib.import_module(module), name), config.cluster_kwargs
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InputError(
+            f"cluster_class {config.cluster_class!r}: {error}; install its package, or correct the name"
+        ) from None
 
 
 def parallel_units(config: RunnerConfig) -> int:
@@ -89,5 +147,4 @@ def parallel_units(config: RunnerConfig) -> int:
 
 
 def _usable_cores() -> int:
-
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

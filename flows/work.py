@@ -15,6 +15,7 @@ from schemas.records import CommitRecord
 from schemas.summary import StageSummary
 from velfield.errors import InputError
 from velfield.plan import Plan
+from velfield.provenance import read_commits
 from velfield.steps.outcome import committed
 from velfield.steps.summary import summarise_stage
 
@@ -110,6 +111,13 @@ class Work:
         if len(summary.notes) > 5:
             self.console.warn(f"... and {len(summary.notes) - 5} more of {_LABELS[name]}; all are in the report")
         return stage
+
+    def carry_over(self, name: str) -> None:
+        """Tell of a stage whose units an earlier result had finished, and that this one takes as they are."""
+        records = read_commits(self.plan.layout, name)
+        count = len(records)
+        summary = summarise_stage(name, records, units=count, done_before=count, lost=(), seconds=0.0)
+        self.summaries.append(summary)
 
     def _submit(self, name: str, unit: Unit, wait_for: list[Future]) -> Future:
         plan = self.plan

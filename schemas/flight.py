@@ -191,6 +191,11 @@ class FieldConfig(Model):
     """Side of a stored tile, base px."""
     standing_m_per_s: PositiveFloat = 1.15
     """No direction is drawn where the modal speed is below this."""
+    by_time: bool = True
+    """Keep the histogram weighed by time too (``velocity_histogram_by_time``): what a camera sees at a random moment,
+    where the other is what a detector in the road counts."""
+    slice: str | None = None
+    """Fields of slices of time besides: a length (``15min``), or intervals (``0-300,300-900`` or ``07:00-09:00``)."""
 
 
 class WorkConfig(Model):

@@ -1,7 +1,20 @@
 """What a run is asked to do: its inputs, its configuration, its folder."""
 
+import os
+
 from schemas.flight import FlightConfig
 from schemas.model import Model
+
+
+def absolute(path: str) -> str:
+    """The path from the root on, so that it means the same in a process that works elsewhere; an address as it is.
+
+    Examples
+    --------
+    >>> absolute("s3://bucket/run")
+    's3://bucket/run'
+    """
+    return path if ":/" in path else os.path.abspath(path)
 
 
 class Inputs(Model):
@@ -28,3 +41,8 @@ class Job(Model):
     """The run folder."""
     inputs: Inputs
     config: FlightConfig = FlightConfig()
+
+    def anywhere(self) -> "Job":
+        """The same job with absolute paths: workers have working folders of their own."""
+        given = {name: path and absolute(path) for name, path in self.inputs.model_dump().items()}
+        return self.model_copy(update={"root": absolute(self.root), "inputs": Inputs(**given)})

@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 
 from schemas.flight import FlightConfig
+from schemas.job import Inputs
 from schemas.model import Model
 
 FORMAT_VERSION = 1
@@ -19,7 +20,7 @@ class CommitRecord(Model):
     key: str
     """Content key: digests of the inputs, the parameters that the stage reads, the version of the stage's code."""
     outputs: dict[str, str] = Field(default_factory=dict)
-    """Path in the run folder -> BLAKE2b digest of the file, or of the store's chunks that the unit wrote."""
+    """Path in the run folder -> BLAKE2b digest, of every file and every chunk of a store that the unit wrote."""
     counts: dict[str, float] = Field(default_factory=dict)
     """What people ask of the unit: frames, cars, tracklets, pixels."""
     notes: tuple[str, ...] = ()
@@ -57,6 +58,10 @@ class FlightRecord(Model):
     code_version: str
     config: FlightConfig
     inputs: InputsRecord
+    given: Inputs | None = None
+    """Where the inputs were, absolute: what ``verify --repair`` and ``reprocess`` work on again."""
+    keys: dict[str, str] = Field(default_factory=dict)
+    """Content key of each stage, in the order of the work."""
 
 
 class GridRecord(Model):
@@ -90,6 +95,52 @@ class PolyprojectiveRecord(Model):
     """Normalisation of what goes in: centre x, y, and scale."""
     target: tuple[float, float, float]
     """Normalisation of what comes out."""
+
+
+class RebaseRecord(Model):
+    """``base/rebased.json``: how a run's result was mapped onto a new base image."""
+
+    transform: PolyprojectiveRecord
+    """Old base pixels -> new base pixels."""
+    added_error_px: float
+    """Mean error of that map at control points left out of its fit, px of the new base image."""
+    added_error_95_px: float
+    """95 of 100 left-out points are nearer than this."""
+    points: NonNegativeInt
+    scale: PositiveFloat
+    """New base pixels an old one, at the middle."""
+    rotation_rad: float
+    old_base: str
+    """Content key of the base image that it was mapped from."""
+    gsd_m: PositiveFloat | None = None
+    """Metres a pixel of the new base image."""
+
+    def text(self) -> str:
+        """How it was done, and what error that adds, in one line."""
+        return (
+            f"mapped from the base image before, no frame looked at again; adds {self.added_error_px:.2f} px of error "
+            f"(95 % below {self.added_error_95_px:.2f} px, {self.points} left-out points)"
+        )
+
+
+class ResultRecord(Model):
+    """One result of a run folder."""
+
+    name: str
+    path: str
+    """Its run folder, from the first one's."""
+    base: str | None
+    """The base image's path as given; none: built from the flight."""
+    base_digest: str | None
+    how: Literal["run", "mapped", "registered again"]
+    added_error_px: float | None = None
+    created: str
+
+
+class ResultsRecord(Model):
+    """``results.json``: the results of one flight on several base images, the first one first."""
+
+    results: tuple[ResultRecord, ...]
 
 
 class WorkingRecord(Model):

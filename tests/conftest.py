@@ -1,9 +1,14 @@
 """Fixtures that every test may use."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+
+from flows.launch import prepare_process
+from schemas.simulation import SimulationConfig
+from schemas.summary import RunSummary
+from tests.small_flight import FRAMES, job, process
 
 FOOTAGE = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -19,3 +24,30 @@ def footage() -> Callable[[str], Path]:
         return path
 
     return find
+
+
+@pytest.fixture(scope="session")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated flight of a few seconds."""
+    from velfield.synthetic import write_flight
+
+    folder = tmp_path_factory.mktemp("flight")
+    write_flight(folder, SimulationConfig(frames=FRAMES, width=640, height=480, seed=11))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A Prefect server of our own, once a session: its start takes longer than a small flight."""
+    prepare_process(verbose=False)
+    from prefect.testing.utilities import prefect_test_harness
+
+    with prefect_test_harness(server_startup_timeout=180):
+        yield
+
+
+@pytest.fixture(scope="session")
+def whole(flight: Path, server: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunSummary]:
+    """The flight's run, done once."""
+    root = tmp_path_factory.mktemp("run") / "whole"
+    return root, process(job(flight, root))

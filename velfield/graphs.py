@@ -19,12 +19,15 @@ frames from the store, and only key points, tables and patches go from node to n
 """
 
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dask import delayed
 
 from velfield.plan import Plan
 from velfield.steps.outcome import commit, unit_name
+
+if TYPE_CHECKING:
+    from velfield.steps.rebase import Rebase
 
 Graph = Any
 """A ``dask.delayed.Delayed`` whose value is a ``CommitRecord``."""
@@ -38,8 +41,12 @@ def _node(function: Any, *arguments: Any) -> Any:
     return delayed(function, pure=False)(*arguments)
 
 
+def _constant(value: Any) -> Any:
+    return delayed(value, pure=False, traverse=False)
+
+
 def _plan_node(plan: Plan) -> Any:
-    return delayed(plan, pure=False, traverse=False)
+    return _constant(plan)
 
 
 def _committed(plan: Any, stage: str, unit: str, outcome: Any) -> Graph:
@@ -130,3 +137,27 @@ def maps_graph(plan: Plan) -> Graph:
 
     node = _plan_node(plan)
     return _committed(node, "maps", WHOLE, _node(make_maps, node))
+
+
+def rebase_graph(plan: Plan, rebase: "Rebase") -> Graph:
+    """A new base image under a finished run: its grid, and the map onto it."""
+    from velfield.steps.rebase import rebase_image
+
+    node = _plan_node(plan)
+    return _committed(node, "base", WHOLE, _node(rebase_image, node, _constant(rebase)))
+
+
+def rebase_detections_graph(plan: Plan, frames: range, rebase: "Rebase") -> Graph:
+    """The cars of a unit, mapped onto the new base image."""
+    from velfield.steps.rebase import rebase_detections
+
+    node = _plan_node(plan)
+    return _committed(node, "detections", unit_name(frames), _node(rebase_detections, node, frames, _constant(rebase)))
+
+
+def rebase_tracklets_graph(plan: Plan, rebase: "Rebase") -> Graph:
+    """All tracklets, mapped onto the new base image."""
+    from velfield.steps.rebase import rebase_tracklets
+
+    node = _plan_node(plan)
+    return _committed(node, "tracklets", WHOLE, _node(rebase_tracklets, node, _constant(rebase)))

@@ -22,6 +22,9 @@ from velfield.errors import InputError
 
 _STATUS_BYTES = 160
 HISTOGRAM = "velocity_histogram"
+HISTOGRAM_BY_TIME = "velocity_histogram_by_time"
+HISTOGRAMS: dict[str, dict[str, str]] = {HISTOGRAM: {"long_name": "velocity histogram", "units": "1"}}
+"""What a field holds at least, with its attributes."""
 
 
 class StoreError(RuntimeError):
@@ -210,6 +213,7 @@ def create_field(
     group_tiles: int,
     velocities_px_per_s: NDArray[np.float64],
     attributes: Mapping[str, Any],
+    histograms: Mapping[str, Mapping[str, Any]] = HISTOGRAMS,
     layers: Mapping[str, Mapping[str, Any]],
 ) -> None:
     """Lay out ``field.zarr``: the histogram in sparse tiles, whole layers in chunks of one tile group, labelled axes.
@@ -218,22 +222,25 @@ def create_field(
     ----------
     velocities_px_per_s : (n,) float64
         Bin centres of both velocity axes.
+    histograms : name -> attributes
+        (y, x, vy, vx) histograms; `HISTOGRAM` is one of them.
     layers : name -> attributes
         (y, x) layers beside the histogram; ``dtype`` among the attributes says their type, float32 where absent.
     """
     group = zarr.create_group(path, overwrite=True, attributes=dict(attributes))
     n = len(velocities_px_per_s)
-    histogram = _create(
-        group,
-        HISTOGRAM,
-        (height, width, n, n),
-        (tile, tile, n, n),
-        "int32",
-        fill_value=0,
-        dimension_names=("y", "x", "vy", "vx"),
-    )
     grid_mapping = {"grid_mapping": "crs"} if attributes.get("crs_wkt") else {}
-    histogram.attrs.update({"long_name": "velocity histogram", "units": "1", **grid_mapping})
+    for name, what in histograms.items():
+        histogram = _create(
+            group,
+            name,
+            (height, width, n, n),
+            (tile, tile, n, n),
+            "int32",
+            fill_value=0,
+            dimension_names=("y", "x", "vy", "vx"),
+        )
+        histogram.attrs.update({**what, **grid_mapping})
     side = tile * group_tiles
     for name, attrs in layers.items():
         attrs = dict(attrs)
@@ -296,17 +303,21 @@ class FieldStore:
         """Bin centres, px/s."""
         return np.asarray(_array(self.group, "vx")[:])
 
-    def write_tile(self, row: int, column: int, histogram: NDArray[np.int32]) -> None:
-        """Write one tile of the histogram, (ty, tx, nvy, nvx): one chunk."""
+    def histogram_names(self) -> list[str]:
+        """Names of the (y, x, vy, vx) histograms."""
+        return [name for name in (HISTOGRAM, HISTOGRAM_BY_TIME) if name in self.group]
+
+    def write_tile(self, row: int, column: int, histogram: NDArray[np.int32], name: str = HISTOGRAM) -> None:
+        """Write one tile of a histogram, (ty, tx, nvy, nvx): one chunk."""
         y, x, side = row * self.tile, column * self.tile, self.tile
-        _array(self.group, HISTOGRAM)[y : y + side, x : x + side] = histogram
+        _array(self.group, name)[y : y + side, x : x + side] = histogram
 
-    def has_tile(self, row: int, column: int) -> bool:
+    def has_tile(self, row: int, column: int, name: str = HISTOGRAM) -> bool:
         """Whether the tile's chunk exists."""
-        return (self.path / HISTOGRAM / "c" / str(row) / str(column) / "0" / "0").exists()
+        return (self.path / name / "c" / str(row) / str(column) / "0" / "0").exists()
 
-    def read_tile(self, row: int, column: int) -> NDArray[np.int32]:
-        """One tile of the histogram, (ty, tx, nvy, nvx) int32; clipped at the border.
+    def read_tile(self, row: int, column: int, name: str = HISTOGRAM) -> NDArray[np.int32]:
+        """One tile of a histogram, (ty, tx, nvy, nvx) int32; clipped at the border.
 
         Raises
         ------
@@ -315,7 +326,7 @@ class FieldStore:
         """
         y, x, side = row * self.tile, column * self.tile, self.tile
         try:
-            return np.asarray(_array(self.group, HISTOGRAM)[y : y + side, x : x + side], dtype=np.int32)
+            return np.asarray(_array(self.group, name)[y : y + side, x : x + side], dtype=np.int32)
         except Exception as error:
             raise StoreError(f"{self.path}: the chunk of tile ({row}, {column}) is damaged ({error})") from error
 

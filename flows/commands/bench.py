@@ -13,3 +13,8 @@ bench.command(
     name="still",
     help="How still the things that stand lie on a run's map: registration's jitter, on your own footage.",
 )
+bench.command(
+    "flows.commands.bench_overhead:overhead",
+    name="overhead",
+    help="What Prefect and Dask add to the bare functions, start-up left out.",
+)

@@ -57,7 +57,7 @@ def still_things(run: Run, *, max_frames: int = 200) -> StillScore:
     InputError
         Fewer than three registered frames, or nothing to follow in them.
     """
-    maps = replace(run.maps, own_to_base=None)
+    maps = replace(run.maps, onward=())
     registered = [frame for frame, status in enumerate(run.registration_status) if status == "ok"]
     chosen = np.unique(np.linspace(0, len(registered) - 1, min(max_frames, len(registered))).astype(int))
     if len(chosen) < 3:

@@ -40,6 +40,19 @@ def ramp_colours(share: NDArray[np.floating]) -> RGB:
     return np.where(np.isnan(share)[..., None], np.uint8(0), _ramp()[index])
 
 
+def change_colours(share: NDArray[np.floating]) -> RGB:
+    """(..., 3) colours of changes from -1 (blue) by 0 (white) to 1 (orange). NaN is black.
+
+    Examples
+    --------
+    >>> change_colours(np.array([-1.0, 0.0, 1.0])).tolist()
+    [[58, 124, 255], [240, 240, 240], [255, 122, 26]]
+    """
+    at = np.nan_to_num(share).clip(-1, 1)
+    out = np.stack([np.interp(at, (-1, 0, 1), ends) for ends in ((58, 240, 255), (124, 240, 122), (255, 240, 26))], -1)
+    return np.asarray(np.where(np.isnan(share)[..., None], 0, np.floor(out + 0.5)), np.uint8)
+
+
 @cache
 def _wheel() -> RGB:
     hue = np.radians(np.arange(_STEPS) * 360 / _STEPS + _WHEEL_TURN_DEG)

@@ -139,6 +139,18 @@ def jpeg_bytes(rgb: RGB, *, quality: int = 88, max_side: int | None = None) -> b
     return bytes(data)
 
 
+def over_picture(grey: NDArray[np.uint8], values: NDArray[np.floating], colours: RGB) -> RGB:
+    """(h, w, 3) colours over the dimmed picture where the values are known.
+
+    Raises
+    ------
+    InputError
+        Where the shapes differ.
+    """
+    _same_shape(grey, values)
+    return _over(grey, colours, np.isfinite(values))
+
+
 def _over(grey: NDArray[np.uint8], colours: RGB, known: NDArray[np.bool_]) -> RGB:
     """Colours over the dimmed picture where known, modulated a little by it so that kerbs and lanes stay visible."""
     base = np.repeat((grey.astype(np.float32) * _DIMMED)[..., None], 3, axis=2)

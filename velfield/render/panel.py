@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from velfield.render.colours import RGB, direction_colours, ramp_colours
+from velfield.render.colours import RGB, change_colours, direction_colours, ramp_colours
 
 _BACKGROUND = (18, 21, 26)
 _TEXT, _FAINT = (240, 242, 245), (168, 175, 184)
@@ -127,20 +127,29 @@ def _arrow(panel: _Panel, centre: tuple[float, float], angle: float, start: floa
 
 
 def draw_bar_panel(
-    map_shape: tuple[int, ...], legend: Legend, *, top: float, gsd_m: float | None, north_rad: float | None
+    map_shape: tuple[int, ...],
+    legend: Legend,
+    *,
+    top: float,
+    gsd_m: float | None,
+    north_rad: float | None,
+    changes: bool = False,
 ) -> RGB:
-    """(h, legend, 3) legend of a quantity from 0 to ``top``; an arrow to north where it is known."""
+    """(h, legend, 3) legend of a quantity from 0 to ``top``, of changes from ``-top``; an arrow to north where it is
+    known."""
     panel = _Panel(map_shape, legend)
     height = int(max(panel.height * 0.36, 3 * panel.text_px))
     width = round(1.6 * panel.text_px)
     x, y = panel.margin, round(panel.y + 0.5 * panel.text_px)
-    shares = np.repeat(np.linspace(1, 0, height)[:, None], width, axis=1)
-    panel.image.paste(Image.fromarray(ramp_colours(shares)), (x, y))
-    for tick in bar_ticks(top):
-        level = y + (height - 1) * (1 - tick / top)
+    bottom = -top if changes else 0.0
+    values = np.repeat(np.linspace(top, bottom, height)[:, None], width, axis=1) / top
+    panel.image.paste(Image.fromarray(change_colours(values) if changes else ramp_colours(values)), (x, y))
+    ticks = bar_ticks(top)
+    for tick in [*-ticks[:0:-1], *ticks] if changes else ticks:
+        level = y + (height - 1) * (top - tick) / (top - bottom)
         panel.draw.line((x + width, level, x + width + 0.35 * panel.text_px, level), fill=_TEXT)
         place = (x + width + 0.6 * panel.text_px, level)
-        panel.draw.text(place, f"{tick:g}", font=panel.font(), fill=_TEXT, anchor="lm")
+        panel.draw.text(place, f"{tick:+g}" if changes else f"{tick:g}", font=panel.font(), fill=_TEXT, anchor="lm")
     if north_rad is not None:
         _north(panel, north_rad, (panel.width - panel.margin - 1.2 * panel.text_px, y + 1.6 * panel.text_px))
     panel.y = y + height + panel.text_px

@@ -1,23 +1,26 @@
 """The velocity histogram, a group of tiles at a time: each tile from the segments that reach it, written once."""
 
+import shutil
+from functools import partial
+from math import isfinite
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 
 from schemas.flight import FieldConfig
 from schemas.tables import TRACKLET_COLUMNS
-from velfield.field.accumulate import UNIT, Weight, accumulate_tile
+from velfield.field.accumulate import Weight, accumulate_tile
 from velfield.field.bins import VelocityBins, band_radius_px
-from velfield.field.segments import SEGMENT_DTYPE, segment_table, segments_by_tile
+from velfield.field.segments import SEGMENT_DTYPE, Segments, segment_table, segments_by_tile
+from velfield.field.slices import TimeSlice, parse_slices, slice_of_passages
 from velfield.plan import Plan
 from velfield.progress import advance
-from velfield.steps.field_layers import LAYERS, tile_layers
+from velfield.steps.field_writing import Group, GroupWriter, create_field_store, groups_of
 from velfield.steps.grid import read_grid
 from velfield.steps.outcome import Outcome
-from velfield.stores import create_field, open_field, store_key
+from velfield.stores import open_field, store_key
 from velfield.tables import read_tables
-
-GROUP_TILES = 8
-"""A group is so many tiles high and wide: 512 x 512 px, a unit of work and a chunk of the layers."""
 
 _SEGMENT_COLUMNS = [
     "tracklet_id",
@@ -41,12 +44,9 @@ def group_name(group: tuple[int, int]) -> str:
     return f"group-{group[0]:03d}-{group[1]:03d}"
 
 
-def field_groups(plan: Plan) -> list[tuple[int, int]]:
+def field_groups(plan: Plan) -> list[Group]:
     """All groups of tiles of the base image, (row, column)."""
-    grid = read_grid(plan)
-    side = plan.config.field.tile_size_px * GROUP_TILES
-    rows, columns = -(-grid.height_px // side), -(-grid.width_px // side)
-    return [(row, column) for row in range(rows) for column in range(columns)]
+    return groups_of(read_grid(plan), plan.config.field)
 
 
 def field_weight(config: FieldConfig) -> Weight:
@@ -55,78 +55,84 @@ def field_weight(config: FieldConfig) -> Weight:
 
 
 def lay_out_field(plan: Plan) -> None:
-    """Create ``field.zarr`` unless it stands as this plan wants it."""
+    """Create ``field.zarr``, and the slices' stores, unless they stand as this plan wants them."""
     if store_key(plan.layout.field) == plan.keys["field"]:
         return
-    grid = read_grid(plan)
-    bins = VelocityBins.from_config(plan.config.field, grid.gsd_m)
-    attributes = {
-        "title": "velocity field",
-        "weight_unit": UNIT,
-        "weighted_by": field_weight(plan.config.field),
-        "bin_width_px_per_s": bins.width_px_per_s,
-        "kernel_sigma_px_per_s": bins.kernel_sigma_px_per_s,
-        "gsd_m": grid.gsd_m,
-        "crs_wkt": grid.crs_wkt,
-        "geotransform": " ".join(repr(v) for v in grid.affine) if grid.affine else None,
-    }
-    create_field(
-        plan.layout.field,
+    times_s = plan.info.times_s[plan.indices]
+    first_s, last_s = float(times_s[0]), float(times_s[-1])
+    shutil.rmtree(plan.layout.slices, ignore_errors=True)
+    config = plan.config.field
+    create = partial(
+        create_field_store,
         key=plan.keys["field"],
-        height=grid.height_px,
-        width=grid.width_px,
-        tile=plan.config.field.tile_size_px,
-        group_tiles=GROUP_TILES,
-        velocities_px_per_s=bins.centres_px_per_s,
-        attributes={name: value for name, value in attributes.items() if value is not None},
-        layers=LAYERS,
+        grid=read_grid(plan),
+        config=config,
+        weighted_by=field_weight(config),
     )
+    for path, part in slice_stores(plan):
+        watched_s = max(min(part.stop_s, last_s) - max(part.start_s, first_s), 0.0)
+        ends = {name: value for name, value in (("start_s", part.start_s), ("stop_s", part.stop_s)) if isfinite(value)}
+        create(path, observed_s=watched_s, by_time=False, more={"slice": part.name, **ends})
+    create(plan.layout.field, observed_s=last_s - first_s, by_time=config.by_time)  # last: its key says that all stand
 
 
-def accumulate_group(plan: Plan, group: tuple[int, int]) -> Outcome:
-    """Fill one group of tiles."""
+def slice_stores(plan: Plan) -> list[tuple[Path, TimeSlice]]:
+    """Stores of the slices of time, in their order; none where none were asked for."""
+    if plan.config.field.slice is None:
+        return []
+    times_s = plan.info.times_s[plan.indices]
+    slices = parse_slices(plan.config.field.slice, float(times_s[0]), float(times_s[-1]))
+    return [(plan.layout.slices / f"{k:03d}.zarr", part) for k, part in enumerate(slices)]
+
+
+def accumulate_group(plan: Plan, group: Group) -> Outcome:
+    """Fill one group of tiles, of the field and of its slices."""
     grid, config = read_grid(plan), plan.config.field
     bins = VelocityBins.from_config(config, grid.gsd_m)
-    radius = band_radius_px(config, grid.gsd_m)
-    side = config.tile_size_px * GROUP_TILES
-    y0, x0 = group[0] * side, group[1] * side
-    height, width = min(side, grid.height_px - y0), min(side, grid.width_px - x0)
-    tracklets = _tracklets_near(plan, x0, y0, width, height, (radius or 0.0) + 1)
-    segments = segment_table(tracklets, config) if len(tracklets) else np.empty(0, SEGMENT_DTYPE)
-    layers = {
-        name: np.full((height, width), _fill(attrs), attrs.get("dtype", "float32")) for name, attrs in LAYERS.items()
-    }
-    store = open_field(plan.layout.field, "r+")
-    shape = (grid.height_px, grid.width_px)
-    touched = 0
-    for (row, column), rows in segments_by_tile(
-        segments, shape=shape, tile_size=config.tile_size_px, radius_px=radius
-    ).items():
-        y, x = row * config.tile_size_px, column * config.tile_size_px
-        if not (y0 <= y < y0 + height and x0 <= x < x0 + width):
-            continue
-        tile_shape = min(config.tile_size_px, grid.height_px - y), min(config.tile_size_px, grid.width_px - x)
-        tile = accumulate_tile(
-            segments[rows], origin_xy=(x, y), shape=tile_shape, bins=bins, radius_px=radius, weight=field_weight(config)
-        )
-        if not tile.count.any():
-            continue
-        store.write_tile(row, column, tile.histogram)
-        touched += 1
-        for name, values in tile_layers(tile, bins, config).items():
-            layers[name][y - y0 : y - y0 + tile_shape[0], x - x0 : x - x0 + tile_shape[1]] = values
-    for name, values in layers.items():
-        store.write_layer(name, y0, x0, values)
+    writer = GroupWriter(open_field(plan.layout.field, "r+"), group, grid=grid, config=config, bins=bins)
+    segments = _segments_near(plan, writer)
+    weight = field_weight(config)
+    accumulate_into(writer, segments, weight=weight, by_time=config.by_time)
+    files = [plan.layout.field, *(path for path, _ in slice_stores(plan))]
+    slices = slice_stores(plan)
+    number = slice_of_passages(segments, [part for _, part in slices]) if slices else None
+    for k, (path, _) in enumerate(slices):
+        part = GroupWriter(open_field(path, "r+"), group, grid=grid, config=config, bins=bins)
+        accumulate_into(part, segments[number == k], weight=weight, by_time=False)
     advance("field")
-    count = layers["count"]
+    count = writer.layers["count"]
     return Outcome(
-        [plan.layout.field],
-        {"pixels": float((count > 0).sum()), "pixels_5": float((count >= 5).sum()), "tiles": touched},
+        files,
+        {"pixels": float((count > 0).sum()), "pixels_5": float((count >= 5).sum()), "tiles": len(writer.touched)},
     )
 
 
-def _fill(attributes: dict[str, object]) -> float:
-    return np.nan if str(attributes.get("dtype", "float32")).startswith("float") else 0
+def accumulate_into(writer: GroupWriter, segments: Segments, *, weight: Weight, by_time: bool) -> None:
+    """Fill a group from the segments that come near it."""
+    config, radius = writer.config, band_radius_px(writer.config, writer.bins.gsd_m)
+    mine = set(writer.tiles())
+    by_tile = segments_by_tile(segments, shape=writer.store.shape, tile_size=config.tile_size_px, radius_px=radius)
+    for (row, column), rows in by_tile.items():
+        if (row, column) not in mine:
+            continue
+        accumulate = partial(
+            accumulate_tile,
+            segments[rows],
+            origin_xy=writer.origin_xy(row, column),
+            shape=writer.tile_shape(row, column),
+            bins=writer.bins,
+            radius_px=radius,
+        )
+        timed = accumulate(weight="time").histogram if by_time else None
+        writer.put(row, column, accumulate(weight=weight), timed)
+    writer.close()
+
+
+def _segments_near(plan: Plan, writer: GroupWriter) -> Segments:
+    """All segments of the passages that come near the group: whole ones, for a passage shares one unit at a pixel."""
+    margin = (band_radius_px(writer.config, writer.bins.gsd_m) or 0.0) + 1
+    tracklets = _tracklets_near(plan, writer.x0, writer.y0, writer.width, writer.height, margin)
+    return segment_table(tracklets, writer.config) if len(tracklets) else np.empty(0, SEGMENT_DTYPE)
 
 
 def _tracklets_near(plan: Plan, x0: int, y0: int, width: int, height: int, margin: float) -> pd.DataFrame:

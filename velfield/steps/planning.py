@@ -4,7 +4,7 @@ import shutil
 
 from velfield.layout import STAGES
 from velfield.plan import Plan
-from velfield.steps.field import GROUP_TILES
+from velfield.steps.field_writing import GROUP_TILES
 from velfield.steps.outcome import committed, unit_name
 
 _PER_FRAME = ("frames", "registration", "detections", "links")

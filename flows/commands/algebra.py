@@ -1,0 +1,60 @@
+"""``velfield merge``, ``velfield subtract``, ``velfield compare``: fields of one grid put together."""
+
+from pathlib import Path
+
+
+def merge(*run_folders: Path, out: Path) -> int:
+    """Add the fields of two or more run folders on one grid, exactly.
+
+    Parameters
+    ----------
+    run_folders
+        The run folders.
+    out
+        New folder for the sum.
+    """
+    from velfield.steps.field_algebra import merge_fields
+
+    merge_fields(run_folders, out)
+    print(out / "field.zarr")
+    return 0
+
+
+def subtract(whole: Path, part: Path, /, *, out: Path) -> int:
+    """Take a field that was merged into another out of it again, exactly.
+
+    Parameters
+    ----------
+    whole
+        Run folder or merged folder.
+    part
+        What is taken away.
+    out
+        New folder for what is left.
+    """
+    from velfield.steps.field_algebra import subtract_fields
+
+    subtract_fields(whole, part, out)
+    print(out / "field.zarr")
+    return 0
+
+
+def compare(before: Path, after: Path, /, *, out: Path | None = None, min_count: int = 5) -> int:
+    """Map what changed between two fields of one grid: direction, speed, volume, and whether it is chance.
+
+    Parameters
+    ----------
+    before
+        Run folder of the earlier field.
+    after
+        Run folder of the later field.
+    out
+        Folder for the figures and layers. Default: `comparison/` in the later run's folder.
+    min_count
+        Passages that both fields must have at a pixel for direction and speed to be compared.
+    """
+    from velfield.comparing import compare_runs
+
+    for line in compare_runs(before, after, out or after / "comparison", min_count=min_count):
+        print(line)
+    return 0

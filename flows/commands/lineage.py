@@ -1,0 +1,63 @@
+"""``velfield lineage``: what stands behind a run, or behind one pixel of its field."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from velfield.errors import InputError
+
+
+def lineage(
+    run_folder: Path,
+    x: int | None = None,
+    y: int | None = None,
+    /,
+    *,
+    pixel: str | None = None,
+    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+) -> int:
+    """Which tracklets, frames, detector and base image stand behind a pixel; of the whole run, its stages and keys.
+
+    Parameters
+    ----------
+    run_folder
+        The run folder.
+    x
+        Column of the pixel, base pixels.
+    y
+        Row of the pixel, base pixels.
+    pixel
+        The pixel as X,Y, in place of the two.
+    as_json
+        JSON in place of text.
+    """
+    from velfield import lineage as told
+    from velfield.run import open_run
+
+    where = _pixel(x, y, pixel)
+    run = open_run(run_folder)
+    if where is None:
+        print(_json(told.stage_lineage(run)) if as_json else told.describe_lineage(run))
+    else:
+        found = told.pixel_lineage(run, *where)
+        print(_json(found) if as_json else told.describe_pixel(run, found))
+    return 0
+
+
+def _pixel(x: int | None, y: int | None, text: str | None) -> tuple[int, int] | None:
+    if text is None and y is None and x is None:
+        return None
+    if text is None and x is not None and y is not None:
+        return x, y
+    parts = (text or "").split(",")
+    if x is not None or len(parts) != 2 or not all(part.strip().lstrip("-").isdigit() for part in parts):
+        raise InputError(f"found {text or f'{x} alone'}; expected a pixel as two whole numbers, X Y or --pixel X,Y")
+    return int(parts[0]), int(parts[1])
+
+
+def _json(found: object) -> str:
+    import dataclasses
+    import json
+
+    return json.dumps(found, default=lambda value: dataclasses.asdict(value), indent=1)

@@ -1,0 +1,61 @@
+"""``velfield reprocess``: a new base image under a finished run."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+DONE, INCOMPLETE = 0, 3
+
+
+def reprocess(
+    run_folder: Path,
+    /,
+    *,
+    base: Path,
+    out: str | None = None,
+    full: Annotated[bool, Parameter(negative=())] = False,
+    max_error_px: float = 1.0,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], negative=())] = False,
+) -> int:
+    """A new base image: redo what depends on it, and only that. The result before stays, and both are named.
+
+    Where the new picture registers well to the old base image, all is mapped onto it in seconds, and the error that
+    this adds is stated; else the frames are registered again.
+
+    Parameters
+    ----------
+    run_folder
+        The run folder.
+    base
+        The new picture, as for `velfield run`.
+    out
+        Name of the new result, a folder under RUN/results. Default: the picture's name.
+    full
+        Register the frames again in any case.
+    max_error_px
+        Map only where the new picture lies on the old one better than this, new base pixels.
+    workers
+        Processes of a local cluster. Default: threads of this process.
+    scheduler
+        Address of a Dask scheduler.
+    quiet
+        Warnings only.
+    """
+    from flows.launch import prepare_process
+
+    prepare_process(verbose=False)
+    from flows.console import Console
+    from flows.reprocess import run_reprocess
+    from flows.runners import RunnerConfig
+
+    console = Console("quiet" if quiet else "normal")
+    where = RunnerConfig(workers=workers, scheduler=scheduler)
+    root, summary = run_reprocess(
+        run_folder, base, name=out, full=full, max_added_error_px=max_error_px, runner=where, console=console
+    )
+    console.result(f"result  {root}")
+    console.result(f"names   {run_folder / 'results.json'}")
+    return DONE if summary is None or summary.complete else INCOMPLETE

@@ -1,0 +1,79 @@
+"""``velfield verify``: is a run folder whole, and if not, make it so."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from velfield.errors import InputError
+
+if TYPE_CHECKING:
+    from schemas.job import Inputs, Job
+    from schemas.records import FlightRecord
+    from velfield.run import Run
+
+WHOLE, DAMAGED = 0, 3
+
+
+def verify(run_folder: Path, /, *, repair: Annotated[bool, Parameter(negative=())] = False) -> int:
+    """Compare every file and chunk of a run with its commit record; list what is damaged or gone.
+
+    Exit status 0: whole; 3: something is damaged, or was never finished.
+
+    Parameters
+    ----------
+    run_folder
+        The run folder.
+    repair
+        Do the damaged units again, from the same inputs.
+    """
+    from velfield.run import open_run
+    from velfield.verifying import describe_damage, verify_run
+
+    run = open_run(run_folder)
+    damages = verify_run(run.layout, run.record)
+    print(describe_damage(run_folder, damages))
+    if not damages:
+        return WHOLE
+    if not repair:
+        print(f"velfield verify {run_folder} --repair  does these units again")
+        return DAMAGED
+    _repair(run)
+    damages = verify_run(run.layout, open_run(run_folder).record)
+    print(describe_damage(run_folder, damages))
+    return DAMAGED if damages else WHOLE
+
+
+def _repair(run: "Run") -> None:
+    from flows.launch import prepare_process
+
+    prepare_process(verbose=False)
+    from flows.console import Console
+    from flows.process_flight import run_flight
+    from flows.runners import RunnerConfig
+    from schemas.job import Job
+    from velfield.locking import locked
+    from velfield.verifying import forget, verify_run
+
+    given = _inputs(run.record, run.layout.root)
+    job = Job(root=str(run.layout.root), inputs=given, config=run.record.config)
+    _same_inputs(job, run.record)
+    with locked(run.layout):
+        forget(run.layout, verify_run(run.layout, run.record))
+    run_flight(job, RunnerConfig(), Console("normal"))
+
+
+def _inputs(record: "FlightRecord", root: Path) -> "Inputs":
+    if record.given is None:
+        raise InputError(f"{root} does not say where its inputs are; run `velfield run ... --out {root}` again")
+    return record.given
+
+
+def _same_inputs(job: "Job", record: "FlightRecord") -> None:
+    """Nothing is taken back where the inputs changed since: then it is another run, not this one repaired."""
+    from velfield.plan import make_plan
+
+    if make_plan(job).keys != record.keys:
+        raise InputError(
+            f"{job.root}: its inputs or the code changed since it was made; run `velfield run` on it again"
+        )

@@ -1,0 +1,90 @@
+"""Flows as a server runs them: parameters that fit into JSON, each a few lines round the flows of the command."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from prefect import flow, get_run_logger
+
+from flows.console import Console
+from flows.launch import prepare_process
+from flows.process_flight import run_flight
+from flows.reprocess import run_reprocess
+from flows.runners import RunnerConfig, read_runner
+from velfield.configuration import resolve_config
+from velfield.errors import InputError
+from velfield.incoming import inputs_of, newest_picture, picture_named, run_folders, run_name
+from velfield.layout import RunLayout
+
+if TYPE_CHECKING:
+    from schemas.job import Job
+
+
+@flow(name="process-dropped-flight", flow_run_name="{source}", persist_result=False)
+def process_dropped(source: str, runs: str, cluster: str = "") -> str:
+    """Process a flight that was dropped into the watched folder.
+
+    Parameters
+    ----------
+    source
+        A video, a folder of pictures, or a folder with `frames/` or a video, and beside it what `velfield run` can be
+        given: `base.*`, `labels.csv`, `timestamps.csv`, `detector.json`, `flight.yaml`.
+    runs
+        Folder of run folders.
+    cluster
+        File that says where to compute, as `velfield run --cluster`. Default: the threads of this process.
+    """
+    prepare_process(verbose=False)
+    job = _dropped_job(Path(source), Path(runs))
+    summary = run_flight(job, _runner(cluster), Console("quiet"))
+    for line in summary.frames_lost:
+        get_run_logger().warning(line)
+    return summary.root
+
+
+@flow(name="reprocess-runs", flow_run_name="{base}", persist_result=False)
+def reprocess_runs(runs: str, base_images: str, base: str = "", run: str = "", cluster: str = "") -> list[str]:
+    """Put a new base image under one run, or under all; runs of another place stay as they are.
+
+    Parameters
+    ----------
+    runs
+        Folder of run folders.
+    base_images
+        Folder that base images arrive in; no other is read.
+    base
+        Name of the picture. Default: the newest.
+    run
+        Name of the run. Default: all.
+    cluster
+        File that says where to compute. Default: the threads of this process.
+    """
+    prepare_process(verbose=False)
+    logger = get_run_logger()
+    picture = picture_named(Path(base_images), base) if base else newest_picture(Path(base_images))
+    if picture is None:
+        logger.info("no base image has arrived in %s", base_images)
+        return []
+    made, refused = [], []
+    for root in run_folders(Path(runs), run):
+        try:
+            folder, _ = run_reprocess(root, picture, runner=_runner(cluster), console=Console("quiet"))
+            made.append(str(folder))
+        except InputError as error:
+            if run:
+                raise
+            refused.append(root.name)
+            logger.warning("%s stays as it is: %s", root.name, error)
+    logger.info("%s: %d results made, %d runs stay as they are", picture.name, len(made), len(refused))
+    return made
+
+
+def _runner(cluster: str) -> RunnerConfig:
+    return read_runner(Path(cluster)) if cluster else RunnerConfig()
+
+
+def _dropped_job(drop: Path, runs: Path) -> "Job":
+    from schemas.job import Job
+
+    inputs, config = inputs_of(drop)
+    root = RunLayout(runs / run_name(drop)).root
+    return Job(root=str(root), inputs=inputs, config=resolve_config(file=config))

@@ -1,0 +1,275 @@
+"""A Prefect server with its UI, and its deployments: flights that arrive, base images that arrive, nights.
+
+One folder, three parts: ``incoming/`` (flights), ``base-images/`` and ``runs/``. The server is a child of this process,
+and so is every flow run: whatever ends this process in order ends them.
+"""
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+from base64 import b64encode
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from velfield.errors import InputError
+from velfield.incoming import Watch
+
+if TYPE_CHECKING:
+    from prefect.deployments.runner import RunnerDeployment
+
+FLIGHT_ARRIVED = "velfield.flight.arrived"
+BASE_IMAGE_ARRIVED = "velfield.base-image.arrived"
+NIGHTLY = "0 3 * * *"
+_LOOK_EVERY_S = 1.0
+_START_S = 180.0
+_STOP_S = 10.0
+
+
+@dataclass(frozen=True)
+class ServeConfig:
+    """What is served, and where."""
+
+    folder: Path
+    host: str = "127.0.0.1"
+    port: int = 4200
+    database: str | None = None
+    """SQLAlchemy address of a Postgres database, ``postgresql+asyncpg://...``; none: SQLite in Prefect's home."""
+    auth: str | None = None
+    """``user:password`` that the API and the UI ask for."""
+    nightly: str = NIGHTLY
+    """Cron expression."""
+    settle_s: float = 10.0
+    """What has not changed for so long has arrived whole."""
+    limit: int = 1
+    """Flow runs at a time."""
+    cluster: str = ""
+    """File that says where to compute, as `velfield run --cluster`."""
+
+    @property
+    def url(self) -> str:
+        """The UI's address."""
+        return f"http://{self.host}:{self.port}"
+
+    @property
+    def incoming(self) -> Path:
+        return self.folder / "incoming"
+
+    @property
+    def base_images(self) -> Path:
+        return self.folder / "base-images"
+
+    @property
+    def runs(self) -> Path:
+        return self.folder / "runs"
+
+
+def check(config: ServeConfig) -> None:
+    """Refuse what is not safe or cannot work.
+
+    Raises
+    ------
+    InputError
+        Another address than this machine's own without ``--auth``, or a port that is taken.
+    """
+    if config.host not in ("127.0.0.1", "localhost", "::1") and not config.auth:
+        raise InputError(
+            f"--host {config.host}: other machines could run flows here; give --auth USER:PASSWORD with it, "
+            "or leave it at 127.0.0.1"
+        )
+    if config.auth is not None and not all(config.auth.partition(":")):
+        raise InputError("--auth: expected USER:PASSWORD")
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((config.host, config.port))
+        except OSError as error:
+            raise InputError(f"--port {config.port} of {config.host} cannot be had ({error}); give another") from None
+
+
+def settings(config: ServeConfig) -> dict[str, str]:
+    """Prefect's settings for the server, the deployments and their flow runs."""
+    given = {
+        "PREFECT_API_URL": f"{config.url}/api",
+        "PREFECT_UI_API_URL": f"{config.url}/api",
+        "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+        "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": config.url,
+        "PREFECT_RUNNER_POLL_FREQUENCY": "2",
+        "PREFECT_CLIENT_CSRF_SUPPORT_ENABLED": "true",
+    }
+    if config.database:
+        given["PREFECT_API_DATABASE_CONNECTION_URL"] = config.database
+    if config.auth:
+        given |= {"PREFECT_SERVER_API_AUTH_STRING": config.auth, "PREFECT_API_AUTH_STRING": config.auth}
+    return given
+
+
+def deployments(config: ServeConfig) -> list["RunnerDeployment"]:
+    """The three deployments; ``prefect.yaml`` has the same."""
+    from prefect.events import DeploymentEventTrigger
+    from prefect.flows import EntrypointType
+
+    from flows.deployed import process_dropped, reprocess_runs
+
+    where = {"runs": str(config.runs), "cluster": config.cluster}
+    images = {"base_images": str(config.base_images), "base": "", "run": ""}
+    dropped = process_dropped.to_deployment(
+        name="watched-folder",
+        description="A flight was dropped into the watched folder.",
+        parameters={"source": "", **where},
+        triggers=[
+            DeploymentEventTrigger(
+                name="flight arrived",
+                expect={FLIGHT_ARRIVED},
+                parameters={"source": "{{ event.payload.source }}", **where},
+            )
+        ],
+        entrypoint_type=EntrypointType.MODULE_PATH,
+    )
+    arrived = reprocess_runs.to_deployment(
+        name="base-image-arrived",
+        description="A new base image: every run, or the one that the event names, gets a result on it.",
+        parameters={**images, **where},
+        triggers=[
+            DeploymentEventTrigger(
+                name="base image arrived",
+                expect={BASE_IMAGE_ARRIVED},
+                parameters={
+                    **images,
+                    **where,
+                    "base": "{{ event.payload.base }}",
+                    "run": "{{ event.payload.run }}",
+                },
+            )
+        ],
+        entrypoint_type=EntrypointType.MODULE_PATH,
+    )
+    nightly = reprocess_runs.to_deployment(
+        name="nightly",
+        description="The newest base image under every run that has no result on it yet.",
+        cron=config.nightly,
+        parameters={**images, **where},
+        entrypoint_type=EntrypointType.MODULE_PATH,
+    )
+    return [dropped, arrived, nightly]
+
+
+@contextlib.contextmanager
+def server(config: ServeConfig) -> Iterator[None]:
+    """The Prefect server, up, for the time of the context."""
+    command = [sys.executable, "-m", "uvicorn", "--factory", "prefect.server.api.server:create_app"]
+    command += ["--host", config.host, "--port", str(config.port), "--log-level", "warning"]
+    # A session of its own: Ctrl-C reaches this process alone, which then ends the others in order.
+    process = subprocess.Popen(command, env=dict(os.environ), start_new_session=True)
+    try:
+        _wait_until_up(config, process)
+        yield
+    finally:
+        _end(process)
+
+
+def _wait_until_up(config: ServeConfig, process: subprocess.Popen[bytes]) -> None:
+    request = urllib.request.Request(f"{config.url}/api/health")
+    if config.auth:
+        request.add_header("Authorization", f"Basic {b64encode(config.auth.encode()).decode()}")
+    deadline = time.monotonic() + _START_S
+    while time.monotonic() < deadline:
+        if process.poll() is not None:
+            raise InputError(f"the Prefect server ended at once (status {process.returncode}); see what it said above")
+        with contextlib.suppress(urllib.error.URLError, OSError), urllib.request.urlopen(request, timeout=5):
+            return
+        time.sleep(0.2)
+    raise InputError(f"the Prefect server at {config.url} did not come up in {_START_S:.0f} s")
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(_STOP_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+@contextlib.contextmanager
+def watching(config: ServeConfig) -> Iterator[None]:
+    """Look at the folders for the time of the context, and say as events what arrives."""
+    from prefect.events import emit_event
+
+    def flight(path: Path) -> None:
+        _resource = {"prefect.resource.id": f"velfield.flight.{path.name}"}
+        emit_event(FLIGHT_ARRIVED, resource=_resource, payload={"source": str(path.resolve())})
+
+    def base_image(path: Path) -> None:
+        _resource = {"prefect.resource.id": f"velfield.base-image.{path.name}"}
+        emit_event(BASE_IMAGE_ARRIVED, resource=_resource, payload={"base": path.name, "run": ""})
+
+    flights = Watch(config.incoming, config.settle_s, flight, old_too=False)
+    images = Watch(config.base_images, config.settle_s, base_image, old_too=False)
+    ended = threading.Event()
+
+    def look() -> None:
+        while not ended.wait(_LOOK_EVERY_S):
+            for watch in (flights, images):
+                watch.look(time.monotonic())
+
+    thread = threading.Thread(target=look, name="watched folders", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join(_STOP_S)
+
+
+def serve_folder(config: ServeConfig) -> None:
+    """Serve until interrupted; leaves nothing running."""
+    check(config)
+    for folder in (config.incoming, config.base_images, config.runs):
+        folder.mkdir(parents=True, exist_ok=True)
+    # Server and flow runs import from their working folder, whatever PYTHONSAFEPATH says: let it be one of ours.
+    os.chdir(config.folder)
+    os.environ.update(settings(config))
+    signal.signal(signal.SIGTERM, _interrupt)
+    signal.signal(signal.SIGINT, _interrupt)  # a shell's background job is started with Ctrl-C ignored
+    try:
+        with server(config):
+            from prefect import serve
+
+            print(f"Prefect UI  {config.url}", flush=True)
+            for name, path in (
+                ("flights", config.incoming),
+                ("base images", config.base_images),
+                ("runs", config.runs),
+            ):
+                print(f"{name:<12}{path}", flush=True)
+            with watching(config):
+                serve(*deployments(config), pause_on_shutdown=False, print_starting_message=False, limit=config.limit)
+    finally:
+        _end_children()
+
+
+def _interrupt(_signal: int, _frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _end_children() -> None:
+    """What this process started and is still there: flow runs that were under way."""
+    import psutil
+
+    children = psutil.Process().children(recursive=True)
+    for child in children:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            child.terminate()
+    _, alive = psutil.wait_procs(children, timeout=_STOP_S)
+    for child in alive:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            child.kill()

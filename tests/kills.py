@@ -1,0 +1,80 @@
+"""SIGKILL at random moments: `make soak` runs this fifty times, the tests three.
+
+python -m tests.kills [--kills 50]
+"""
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from tests.small_flight import digests, job, process
+
+_RUN = """if True:
+    import sys
+    from flows.launch import limit_threads, prepare_process
+    limit_threads()
+    prepare_process(verbose=False)
+    from pathlib import Path
+    from tests.small_flight import job, process
+    process(job(Path(sys.argv[1]), Path(sys.argv[2])))
+"""
+
+
+def run_with_kills(flight: Path, root: Path, kills: int, seed: int) -> int:
+    """A run of the small flight, killed so many times, each time a little after a random number of commits, then left.
+
+    Returns how many kills met a run that was under way.
+    """
+    rng = np.random.default_rng(seed)
+    met = 0
+    for commits in np.sort(rng.integers(0, 26, kills)):
+        with _started(flight, root) as child:
+            while child.poll() is None and len(list(root.glob("commits/*/*.json"))) < commits:
+                time.sleep(0.02)
+            time.sleep(float(rng.uniform(0, 1.5)))
+            met += child.poll() is None
+            if child.poll() is None:
+                os.killpg(child.pid, signal.SIGKILL)
+    with _started(flight, root) as child:
+        assert child.wait(600) == 0
+    return met
+
+
+def _started(flight: Path, root: Path) -> "subprocess.Popen[bytes]":
+    command = [sys.executable, "-c", _RUN, str(flight), str(root)]
+    return subprocess.Popen(command, cwd=Path(__file__).parents[1], start_new_session=True)
+
+
+def main() -> None:
+    """Kill until so many kills have met a run, five a run; say whether all results are equal."""
+    from flows.launch import prepare_process
+    from schemas.simulation import SimulationConfig
+    from tests.small_flight import FRAMES
+    from velfield.synthetic import write_flight
+
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--kills", type=int, default=50)
+    wanted, met, rounds = parser.parse_args().kills, 0, 0
+    prepare_process(verbose=False)
+    with tempfile.TemporaryDirectory() as folder:
+        flight = Path(folder) / "flight"
+        write_flight(flight, SimulationConfig(frames=FRAMES, width=640, height=480, seed=11))
+        process(job(flight, Path(folder) / "whole"))
+        whole = digests(Path(folder) / "whole")
+        while met < wanted:
+            root = Path(folder) / f"round-{rounds}"
+            met += run_with_kills(flight, root, 5, rounds)
+            rounds += 1
+            assert digests(root) == whole, f"round {rounds} ended with other bits"
+            print(f"{met} kills in {rounds} runs: all results equal", flush=True)
+
+
+if __name__ == "__main__":
+    main()

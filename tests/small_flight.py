@@ -1,0 +1,53 @@
+"""A small simulated flight and its run: what the tests of flows share, made once a session (see conftest)."""
+
+from pathlib import Path
+
+from flows.console import Console
+from flows.runners import RunnerConfig
+from schemas.job import Inputs, Job
+from schemas.summary import RunSummary
+from velfield.configuration import resolve_config
+from velfield.layout import RunLayout
+from velfield.provenance import digest_bytes
+
+SMALL = (
+    "detection.rounds=60",
+    "detection.feature_pool=400",
+    "registration.key_points=1200",
+    "work.unit_frames=8",
+    "work.retries=1",
+)
+FRAMES = 18
+
+
+def job(flight: Path, root: Path, *settings: str, **inputs: str) -> Job:
+    given = {
+        "source": str(flight / "frames"),
+        "timestamps": str(flight / "timestamps.csv"),
+        "base": str(flight / "base.png"),
+        "labels": str(flight / "labels.csv"),
+    }
+    config = resolve_config(settings=[*SMALL, *settings], overrides={"gsd_m": 0.23})
+    return Job(root=str(root), inputs=Inputs.model_validate(given | inputs), config=config)
+
+
+def process(work: Job, runner: RunnerConfig | None = None) -> RunSummary:
+    from flows.process_flight import run_flight
+
+    return run_flight(work, runner or RunnerConfig(), Console("quiet"))
+
+
+def digests(root: Path) -> dict[str, str]:
+    """Of all that a run leaves, apart from what tells when it was made."""
+    layout = RunLayout(root)
+    when = {layout.flight, layout.report, layout.lock}
+    files = [path for path in sorted(root.rglob("*")) if path.is_file() and path not in when]
+    return {
+        path.relative_to(root).as_posix(): digest_bytes(path.read_bytes())
+        for path in files
+        if not path.is_relative_to(layout.commits)
+    }
+
+
+def redone(summary: RunSummary) -> list[str]:
+    return [stage.name for stage in summary.stages if stage.done_before < stage.units]

@@ -1,0 +1,84 @@
+"""Scale: what is planned for four hours, and that a driver's memory does not grow with the flight."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from schemas.job import Inputs, Job
+from schemas.records import InputsRecord, SourceRecord
+from velfield.configuration import resolve_config
+from velfield.plan import Plan, stage_keys
+from velfield.sources.frames import SourceInfo
+from velfield.steps.planning import describe_plan, planned_units
+
+FOUR_HOURS = 72_000
+
+
+def planned(frames: int, root: Path, width: int = 2560, height: int = 1920) -> Plan:
+    """The plan of a flight at 5 frames a second that need not exist."""
+    source = SourceRecord(path="flight.mp4", kind="video", digest="d", width=width, height=height, frame_count=frames)
+    inputs, config = InputsRecord(source=source), resolve_config()
+    info = SourceInfo("video", width, height, frames, np.arange(frames) / 5, ())
+    job = Job(root=str(root), inputs=Inputs(source="flight.mp4"), config=config)
+    return Plan(job, info, np.arange(frames), inputs, stage_keys(config, inputs))
+
+
+def test_four_hours_are_fewer_than_3000_task_runs(tmp_path: Path) -> None:
+    plan = planned(FOUR_HOURS, tmp_path)
+    total = sum(len(units) for units in planned_units(plan).values())
+    assert total < 3000
+    told = describe_plan(plan)
+    assert f"{total} task runs" in told
+    assert "memory" in told
+    assert "GB needed" in told
+
+
+def test_task_runs_grow_with_chunks_not_with_frames(tmp_path: Path) -> None:
+    runs = {frames: len(planned(frames, tmp_path).units) for frames in (18, 300, 3000, 30_000, FOUR_HOURS)}
+    assert max(runs.values()) < 300
+    assert runs[300] >= 4  # and yet several workers have something to do
+
+
+def test_a_plan_is_small(tmp_path: Path) -> None:
+    """It goes with every node of every graph."""
+    import pickle
+
+    assert len(pickle.dumps(planned(FOUR_HOURS, tmp_path))) < 3_000_000
+    small = len(pickle.dumps(planned(300, tmp_path)))
+    assert small < 20_000
+
+
+@pytest.mark.parametrize("frames", [300, FOUR_HOURS])
+def test_the_estimate_of_bytes_is_of_the_order_of_what_was_measured(tmp_path: Path, frames: int) -> None:
+    """354 GB are four hours of raw frames of that size; Zstandard leaves 0.6 to 0.8 of them."""
+    from velfield.steps.planning import estimated_bytes
+
+    raw = frames * 2560 * 1920
+    assert 0.6 * raw < estimated_bytes(planned(frames, tmp_path)) < 1.1 * raw
+
+
+def test_a_disk_that_is_too_small_is_told_before_anything_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from velfield.errors import InputError
+    from velfield.steps import planning
+
+    monkeypatch.setattr(planning, "_free_bytes", lambda root: 300_000_000_000)
+    planning.check_space(planned(FOUR_HOURS, tmp_path))
+    monkeypatch.setattr(planning, "_free_bytes", lambda root: 100_000_000_000)
+    with pytest.raises(InputError, match=r"about 29\d.\d\d GB needed, 100.00 GB free"):
+        planning.check_space(planned(FOUR_HOURS, tmp_path))
+
+
+def test_memory_does_not_grow_with_the_flight(tmp_path: Path) -> None:
+    from velfield.steps.planning import estimated_memory
+
+    assert estimated_memory(planned(300, tmp_path), 4) == estimated_memory(planned(FOUR_HOURS, tmp_path), 4)
+
+
+def test_no_stage_function_is_imported_by_planning() -> None:
+    code = "import sys, velfield.plan; sys.exit(any(name in sys.modules for name in ('prefect', 'dask', 'zarr')))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,145 @@
+"""What arrives in watched folders: flights and base images, told to be whole when they no longer grow.
+
+A flight is a video, a folder of pictures, or a folder that holds ``frames/`` or one video and, beside it, whatever else
+`velfield run` can be given, by name: ``base.*``, ``labels.csv`` or ``labels/``, ``timestamps.csv``, ``detector.json``,
+``flight.yaml``. That is also what `velfield simulate` writes.
+"""
+
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from schemas.job import Inputs
+from velfield.errors import InputError
+
+VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".ts", ".m4v", ".mpg", ".webm"})
+PICTURES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"})
+
+
+def run_name(drop: Path) -> str:
+    """Name of the run folder of a flight.
+
+    Examples
+    --------
+    >>> run_name(Path("incoming/Main St. 4.mp4"))
+    'Main-St-4'
+    """
+    stem = drop.stem if drop.suffix.lower() in VIDEOS else drop.name
+    name = re.sub(r"[^A-Za-z0-9_-]+", "-", stem).strip("-")
+    if not name:
+        raise InputError(f"{drop}: found no letter or digit in its name; rename it, the run is named after it")
+    return name
+
+
+def inputs_of(drop: Path) -> tuple[Inputs, Path | None]:
+    """What `velfield run` would be given for a flight, and its configuration file.
+
+    Raises
+    ------
+    InputError
+        It is neither a video nor a folder of pictures.
+    """
+    if drop.is_file():
+        return Inputs(source=str(drop)), None
+    if not drop.is_dir():
+        raise InputError(f"{drop} is not there; drop a video or a folder")
+    source = _source_in(drop)
+    if source == drop:
+        return Inputs(source=str(drop)), None
+    beside = {
+        "base": _first(path for path in sorted(drop.glob("base.*")) if path.suffix.lower() in PICTURES),
+        "labels": _first(path for path in (drop / "labels.csv", drop / "labels") if path.exists()),
+        "timestamps": _first(path for path in (drop / "timestamps.csv",) if path.exists()),
+        "detector": _first(path for path in (drop / "detector.json",) if path.exists()),
+    }
+    config = drop / "flight.yaml"
+    given = {name: str(path) for name, path in beside.items() if path is not None}
+    return Inputs.model_validate({"source": str(source), **given}), config if config.exists() else None
+
+
+def _source_in(drop: Path) -> Path:
+    if (drop / "frames").is_dir():
+        return drop / "frames"
+    videos = [path for path in sorted(drop.iterdir()) if path.suffix.lower() in VIDEOS]
+    if len(videos) > 1:
+        raise InputError(f"{drop}: found {len(videos)} videos; drop one flight at a time")
+    return videos[0] if videos else drop
+
+
+def _first(paths: Iterable[Path]) -> Path | None:
+    return next(iter(paths), None)
+
+
+def run_folders(runs: Path, name: str = "") -> list[Path]:
+    """Finished runs in a folder of run folders; only that of a name where one is given.
+
+    Raises
+    ------
+    InputError
+        The name is no plain name, or no run of that name is there.
+    """
+    if name:
+        root = _inside(runs, name)
+        if not (root / "flight.json").exists():
+            raise InputError(f"{root} is not a run folder; the runs are {', '.join(p.name for p in run_folders(runs))}")
+        return [root]
+    return sorted(path.parent for path in runs.glob("*/flight.json") if (path.parent / "index.html").exists())
+
+
+def picture_named(folder: Path, name: str) -> Path:
+    """A picture that arrived in a folder, by its name.
+
+    Raises
+    ------
+    InputError
+        It is not in that folder.
+    """
+    path = _inside(folder, name)
+    if not path.is_file():
+        raise InputError(f"{path} is not there; base images are taken from {folder} alone")
+    return path
+
+
+def newest_picture(folder: Path) -> Path | None:
+    """The picture that arrived last; none where there is none."""
+    found = [path for path in folder.glob("*") if path.is_file() and path.suffix.lower() in PICTURES]
+    return max(found, key=lambda path: (path.stat().st_mtime, path.name), default=None)
+
+
+def _inside(folder: Path, name: str) -> Path:
+    """A path in a folder by its name; also given in full, but never out of it, by ``..`` or by a link."""
+    path = (folder / name).resolve()
+    if path.parent != folder.resolve():
+        raise InputError(f"{name!r} is not in {folder}; give the name of what is there")
+    return path
+
+
+class Watch:
+    """Tells of each entry of a folder once, when it has not changed for a while."""
+
+    def __init__(self, folder: Path, settle_s: float, tell: Callable[[Path], None], *, old_too: bool) -> None:
+        self._folder, self._settle_s, self._tell = folder, settle_s, tell
+        self._told = set() if old_too else set(self._entries())
+        self._seen: dict[Path, tuple[tuple[int, int, int], float]] = {}
+
+    def look(self, now_s: float) -> None:
+        """Look once; ``now_s`` is any clock that goes on."""
+        for path in self._entries():
+            if path in self._told:
+                continue
+            state = _state(path)
+            before, since_s = self._seen.get(path, (None, now_s))
+            if state != before:
+                self._seen[path] = (state, now_s)
+            elif now_s - since_s >= self._settle_s:
+                self._told.add(path)
+                self._tell(path)
+
+    def _entries(self) -> list[Path]:
+        return sorted(path for path in self._folder.iterdir() if not path.name.startswith("."))
+
+
+def _state(path: Path) -> tuple[int, int, int]:
+    """Number, bytes and last change of the files of an entry: what grows while it is being copied."""
+    files = [found.stat() for found in (path.rglob("*") if path.is_dir() else (path,)) if found.is_file()]
+    return len(files), sum(stat.st_size for stat in files), max((stat.st_mtime_ns for stat in files), default=0)
