@@ -7,14 +7,20 @@ export UV_LINK_MODE := copy
 
 .PHONY: demo test lint types check format env lock bench soak clean
 
-demo: $(STAMP)  ## simulate a flight, run the whole job, say where the report is
+demo: page  ## simulate a flight, run the whole job, say where the report is
 	$(BIN)/velfield demo --out demo
 
-test: $(STAMP)  ## every check: lint, types, tests
+test: page  ## every check: lint, types, tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest
+
+# The viewer's page from page/: built where its sources changed. Node is the machine's, else PyPI's into the environment.
+page: $(STAMP)
+	@$(BIN)/python page/build.py --has-node || $(BIN)/uv pip install --quiet --python $(BIN)/python \
+	  "$$($(BIN)/python page/build.py --node-wheel)"
+	@$(BIN)/python page/build.py
 
 env: $(STAMP)
 
@@ -52,4 +58,4 @@ lock: $(STAMP)
 	  --generate-hashes --no-annotate --no-header --python-version 3.11 -o requirements.lock
 
 clean:
-	rm -rf $(VENV) demo dist build
+	rm -rf $(VENV) demo dist build velfield/render/page page/node_modules

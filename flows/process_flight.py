@@ -60,7 +60,8 @@ def process_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSumma
         work = Work(plan, where, console)
         _run_stages(work)
         summary = RunSummary(root=job.root, stages=tuple(work.summaries), frames_lost=lost_frames(work.plan))
-        write_report(work.plan, summary)
+        for note in write_report(work.plan, summary):
+            console.warn(note)
         publish_summary(work.plan, summary)
         return summary
 

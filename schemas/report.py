@@ -64,13 +64,15 @@ class Report(Model):
 
 
 class ReportFigure(Model):
-    """A picture of the report; its bytes go into the page."""
+    """A picture of the report: its bytes go into the page, or the page names its file."""
 
     title: str
     caption: str
     alternative: str
     """What the picture shows, for those who do not see it."""
     mime: Literal["image/png", "image/jpeg"]
-    data: bytes = Field(repr=False)
+    data: bytes = Field(b"", repr=False)
+    file: str | None = None
+    """Path of the picture, relative to the report, in place of its bytes."""
     full_size: str | None = None
     """Path of the full picture, relative to the report."""

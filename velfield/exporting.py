@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+from schemas.report import Report
 from velfield.errors import InputError
 from velfield.exports.arrows import arrows_geojson
 from velfield.exports.cog import write_cog
@@ -12,7 +13,9 @@ from velfield.exports.passages import geotrax_csv
 from velfield.exports.place import Place
 from velfield.exports.sumo import sumo_fcd
 from velfield.provenance import write_atomically
+from velfield.render.report import render_report
 from velfield.run import Run
+from velfield.steps.report import report_figures
 from velfield.stores import open_field
 
 Writer = Callable[[Run, Path], None]
@@ -56,12 +59,24 @@ def _cog(run: Run, path: Path) -> None:
     )
 
 
+def _report(run: Run, path: Path) -> None:
+    """The page's summary as one file that holds all it shows."""
+    record = run.layout.report_record
+    if not record.exists():
+        raise InputError(f"{record} is not there: the run was not finished, or an older velfield made it; run it again")
+    report = Report.model_validate_json(record.read_bytes())
+    alone = report.model_copy(update={"files": ()})  # they do not travel with the mail
+    figures = [figure.model_copy(update={"full_size": None}) for figure in report_figures(run.layout).values()]
+    write_atomically(path, render_report(alone, figures).encode())
+
+
 FORMATS: dict[str, tuple[str, Writer]] = {
     "cog": ("field.tif", _cog),
     "geoparquet": ("tracklets.parquet", _geoparquet),
     "geotrax": ("tracks.csv", _geotrax),
     "sumo": ("tracks.fcd.xml", _sumo),
     "arrows": ("arrows.geojson", _arrows),
+    "report": ("report.html", _report),
 }
 """Format -> usual file name and writer."""
 

@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from velfield.places import place
-
 STAGES = ("frames", "lens", "base", "registration", "detector", "detections", "links", "tracklets", "field", "maps")
 """The stages in the order of the work."""
 
@@ -20,9 +18,6 @@ class RunLayout:
     """
 
     root: Path
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "root", place(self.root))
 
     @property
     def flight(self) -> Path:
@@ -67,11 +62,6 @@ class RunLayout:
     def own_to_base(self) -> Path:
         """Own base pixels -> base pixels, where a base image was given."""
         return self.base / "own_to_base.json"
-
-    @property
-    def rebased(self) -> Path:
-        """Pixels of the base image before -> base pixels, where a result was mapped onto a new base image."""
-        return self.base / "rebased.json"
 
     @property
     def grid(self) -> Path:
@@ -120,14 +110,23 @@ class RunLayout:
         return self.root / "index.html"
 
     @property
-    def results(self) -> Path:
-        """Results on other base images, a run folder each, by name."""
-        return self.root / "results"
+    def view(self) -> Path:
+        """What the viewer page reads beside the field's tiles."""
+        return self.root / "view"
 
     @property
-    def results_index(self) -> Path:
-        """Names of all results, this folder's own first."""
-        return self.root / "results.json"
+    def view_record(self) -> Path:
+        return self.view / "run.json"
+
+    @property
+    def view_segments(self) -> Path:
+        """Vehicles from one frame to the next."""
+        return self.view / "segments.zarr"
+
+    @property
+    def report_record(self) -> Path:
+        """What the report tells, from which it can be written again."""
+        return self.view / "report.json"
 
     @property
     def commits(self) -> Path:

@@ -10,15 +10,19 @@ from numpy.typing import NDArray
 from schemas.records import FORMAT_VERSION, FlightRecord, GridRecord
 from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
 from velfield.errors import InputError
+from velfield.field.segments import Segments, segment_table
 from velfield.field.view import VelocityField
+from velfield.insight.crossings import line_crossings, settle_px
 from velfield.layout import RunLayout
-from velfield.steps.field_reading import FieldSlice, open_field_slices, open_velocity_field
+from velfield.steps.field_reading import open_velocity_field
 from velfield.steps.frame_maps import FrameMaps
 from velfield.steps.grid import read_grid_of
 from velfield.stores import FrameStore, RegistrationStore, open_frames, open_registration
 from velfield.tables import read_tables
 
 Points = NDArray[np.float64]
+_EACH_ONCE = {"weigh_shared_segments": "once"}
+"""The preset `paper` weighs segments that two tracklets share twice; who counts vehicles does not."""
 
 
 def open_run(root: str | Path) -> "Run":
@@ -110,20 +114,18 @@ class Run:
         """All tracklets, in base pixels: the columns of ``schemas.tables.TRACKLET_COLUMNS``."""
         return read_tables(sorted(self.layout.tracklets.glob("unit-*.parquet")), TRACKLET_COLUMNS)
 
+    def segments(self) -> Segments:
+        """Vehicles from one frame to the next, each once: by passage and time (`velfield.field.segments`)."""
+        return segment_table(self.tracklets(), self.record.config.field.model_copy(update=_EACH_ONCE))
+
+    def crossings(self, start_xy: tuple[float, float], end_xy: tuple[float, float]) -> pd.DataFrame:
+        """Who crosses the line between two base pixels, which way and how fast: `line_crossings`."""
+        return line_crossings(self.segments(), start_xy, end_xy, settle_px=settle_px(self.grid.gsd_m))
+
     @cached_property
     def field(self) -> VelocityField:
         """The velocity field."""
         return open_velocity_field(self.layout)
-
-    @cached_property
-    def field_by_time(self) -> VelocityField:
-        """The velocity field weighed by time: a vehicle that stays counts for as long as it does."""
-        return open_velocity_field(self.layout, by_time=True)
-
-    @cached_property
-    def field_slices(self) -> dict[str, FieldSlice]:
-        """Fields of slices of time by name, in their order; empty where none were asked for (``--slice``)."""
-        return {found.name: found for found in open_field_slices(self.layout)}
 
     @cached_property
     def base_image(self) -> NDArray[np.uint8]:

@@ -342,7 +342,34 @@ class FieldStore:
         """Names of the (y, x) layers."""
         return [name for name, array in self.group.arrays() if array.ndim == 2]
 
+    def layer_attributes(self, name: str) -> dict[str, Any]:
+        """Units and long name of a layer."""
+        return dict(_array(self.group, name).attrs)
+
+    def chunk_shape(self, name: str) -> tuple[int, int]:
+        """(height, width) of a chunk of an array, px."""
+        height, width = _array(self.group, name).chunks[:2]
+        return int(height), int(width)
+
+    def stored_chunks(self, name: str) -> list[tuple[int, int]]:
+        """(row, column) of the chunks of an array that are stored: one that is all fill value is not."""
+        return sorted((int(path.parent.name), int(path.name)) for path in (self.path / name / "c").glob("*/*"))
+
 
 def open_field(path: Path, mode: str = "r") -> FieldStore:
     """Open ``field.zarr``."""
     return FieldStore(path, _open(path, mode))
+
+
+# ------------------------------------------------------------------------------------------------------------- viewer
+
+_SEGMENTS_A_CHUNK = 65536
+
+
+def write_segments(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Write ``view/segments.zarr`` anew: columns of one length, (segments,) each; every chunk is there to be read."""
+    group = zarr.create_group(path, overwrite=True)
+    for name, values in columns.items():
+        chunk = (min(_SEGMENTS_A_CHUNK, max(len(values), 1)),)
+        column = _create(group, name, values.shape, chunk, values.dtype.name, dimension_names=("segment",))
+        column.with_config({"write_empty_chunks": True})[:] = values

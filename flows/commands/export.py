@@ -5,12 +5,14 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+Format = Literal["cog", "geoparquet", "geotrax", "sumo", "arrows", "report"]
+
 
 def export(
     run_folder: Path,
     /,
     *,
-    format_name: Annotated[Literal["cog", "geoparquet", "geotrax", "sumo", "arrows"], Parameter(name="--format")],
+    format_name: Annotated[Format, Parameter(name="--format")],
     out: Path | None = None,
 ) -> int:
     """Write a finished run in a format that others read.
@@ -21,7 +23,7 @@ def export(
         The run folder.
     format_name
         `cog`: the field's layers as GeoTIFF; `geoparquet`: tracklets as lines; `geotrax`: tracks as CSV; `sumo`: tracks
-        as FCD XML; `arrows`: modal velocities as GeoJSON.
+        as FCD XML; `arrows`: modal velocities as GeoJSON; `report`: the summary as one HTML file, to send by mail.
     out
         File to write. Default: in the run folder's `exports/`.
     """

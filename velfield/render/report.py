@@ -25,12 +25,30 @@ def render_report(report: Report, figures: Sequence[ReportFigure]) -> str:
     figures
         What is shown: the maps first.
     """
-    style = files("velfield.render").joinpath("report.css").read_text(encoding="utf-8")
+    style = report_style()
     digest = b64encode(sha256(style.encode()).digest()).decode()
     policy = (
         f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'; "
         "base-uri 'none'; form-action 'none'"
     )  # fmt: skip
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<meta name="referrer" content="no-referrer">\n<link rel="icon" href="data:,">\n'
+        f"<title>{escape(report.title)}</title>\n<style>{style}</style>\n</head>\n<body>\n"
+        f"<header><h1>{escape(report.title)}</h1><p>{escape(report.source)}</p></header>\n"
+        f"{render_sections(report, figures)}\n</body>\n</html>\n"
+    )
+
+
+def report_style() -> str:
+    """The style sheet of what `render_sections` gives."""
+    return files("velfield.render").joinpath("report.css").read_text(encoding="utf-8")
+
+
+def render_sections(report: Report, figures: Sequence[ReportFigure]) -> str:
+    """The report's sections and footer: what stands in a page's body below its title."""
     sections = [
         _warnings(report),
         _facts(report.facts),
@@ -44,14 +62,9 @@ def render_report(report: Report, figures: Sequence[ReportFigure]) -> str:
         _files(report.files),
     ]
     return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<meta name="referrer" content="no-referrer">\n<link rel="icon" href="data:,">\n'
-        f"<title>{escape(report.title)}</title>\n<style>{style}</style>\n</head>\n<body>\n"
-        f"<header><h1>{escape(report.title)}</h1><p>{escape(report.source)}</p></header>\n<main>\n"
+        "<main>\n"
         + "\n".join(section for section in sections if section)
-        + f"\n</main>\n<footer>velfield {escape(report.version)}, {escape(report.created)}</footer>\n</body>\n</html>\n"
+        + f"\n</main>\n<footer>velfield {escape(report.version)}, {escape(report.created)}</footer>"
     )
 
 
@@ -80,8 +93,11 @@ def _facts(facts: Sequence[tuple[str, str]]) -> str:
 
 
 def _figure(figure: ReportFigure) -> str:
-    data = b64encode(figure.data).decode()
-    image = f'<img alt="{escape(figure.alternative)}" src="data:{figure.mime};base64,{data}">'
+    if figure.file is None:
+        source = f'src="data:{figure.mime};base64,{b64encode(figure.data).decode()}"'
+    else:
+        source = f'loading="lazy" src="{_path(figure.file)}"'
+    image = f'<img alt="{escape(figure.alternative)}" {source}>'
     link = ""
     if figure.full_size:
         link = f' <a href="{_path(figure.full_size)}">Full size</a>'

@@ -2,6 +2,8 @@
 
 from functools import lru_cache
 
+import numpy as np
+
 from schemas.records import GridRecord
 from velfield.errors import InputError
 from velfield.layout import RunLayout
@@ -24,6 +26,16 @@ def read_grid_of(layout: RunLayout) -> GridRecord:
     if not layout.grid.exists():
         raise InputError(f"{layout.grid} is not there: run `velfield run` on this folder first")
     return _parse(layout.grid.read_bytes())
+
+
+def north_of(grid: GridRecord) -> float | None:
+    """Where north is in the picture, from +x towards +y (down); none where the base image has no place on earth."""
+    if grid.affine is None:
+        return None
+    a, b, _, d, e, _ = grid.affine
+    # One step north in the CRS, as a step of pixels: the inverse of [[a, b], [d, e]] times (0, 1).
+    determinant = a * e - b * d
+    return float(np.arctan2(a / determinant, -b / determinant))
 
 
 @lru_cache(maxsize=8)

@@ -1,4 +1,4 @@
-"""The maps people look at: modal direction and speed, as figures and as layers for GIS."""
+"""The maps people look at: modal direction and speed, as figures and as layers for GIS; and what the viewer reads."""
 
 from pathlib import Path
 
@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.records import GridRecord
 from velfield.exports.cog import write_cog
 from velfield.field.bins import standing_px_per_s
 from velfield.field.statistics import direction_rad, speed_px_per_s
@@ -15,16 +14,18 @@ from velfield.progress import advance
 from velfield.provenance import write_atomically
 from velfield.render.figures import MapScale, direction_figure, png_bytes, speed_figure
 from velfield.sources.pictures import read_picture_grey
-from velfield.steps.grid import read_grid
+from velfield.steps.grid import north_of, read_grid
 from velfield.steps.outcome import Outcome
 from velfield.stores import open_field
+from velfield.viewer.record import write_view_data
 
 Layer = NDArray[np.float64]
 PREVIEW_SIDE_PX = 900
 
 
 def make_maps(plan: Plan) -> Outcome:
-    """Write ``maps/``: direction and speed as PNG and as GeoTIFF, small pictures of both for the Prefect UI."""
+    """Write ``maps/``, direction and speed as PNG and as GeoTIFF, small pictures of both for the Prefect UI; and
+    what the viewer reads of the run beside the field's tiles."""
     grid, config, layout = read_grid(plan), plan.config.field, plan.layout
     store = open_field(layout.field)
     velocity = np.stack([store.layer("modal_vx"), store.layer("modal_vy")], axis=-1).astype(np.float64)
@@ -43,6 +44,7 @@ def make_maps(plan: Plan) -> Outcome:
             write_atomically(path, png_bytes(picture))
             written.append(path)
     written += _layers(plan, direction, speed)
+    written += write_view_data(layout)
     advance("maps")
     return Outcome(written, {"maps": float(len(figures))})
 
@@ -74,16 +76,6 @@ def _layers(plan: Plan, direction: Layer, speed: Layer) -> list[Path]:
             affine=grid.affine,
         )
     return [maps / "direction.tif", maps / "speed.tif"]
-
-
-def north_of(grid: GridRecord) -> float | None:
-    """Where north is in the picture, from +x towards +y (down); none where the base image has no place on earth."""
-    if grid.affine is None:
-        return None
-    a, b, _, d, e, _ = grid.affine
-    # One step north in the CRS, as a step of pixels: the inverse of [[a, b], [d, e]] times (0, 1).
-    determinant = a * e - b * d
-    return float(np.arctan2(a / determinant, -b / determinant))
 
 
 def small_picture(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -1,4 +1,4 @@
-"""The report of a run, ``index.html``: what was done, how well, and the maps; one page that needs nothing else."""
+"""The page of a run, ``index.html``: the viewer, and as its summary the report: what was done, how well, the maps."""
 
 import datetime
 from collections.abc import Sequence
@@ -9,14 +9,17 @@ import numpy as np
 from schemas.report import PrecisionRecall, Report, ReportFigure, ReportStage, ResidualSeries
 from schemas.summary import RunSummary, StageSummary
 from velfield.detection.detector import load_detector
+from velfield.layout import RunLayout
 from velfield.plan import Plan
 from velfield.provenance import write_atomically
 from velfield.render.figures import jpeg_bytes
 from velfield.render.report import render_report
+from velfield.render.viewer_page import NOT_BUILT, licences, page_is_built, render_viewer
 from velfield.steps.grid import read_grid
 from velfield.steps.working import read_working
 from velfield.stores import open_frames, open_registration
 from velfield.version import code_version
+from velfield.viewer.record import write_view_record
 
 _PICTURE_SIDE_PX = 1600
 _CAPTIONS = {
@@ -35,10 +38,32 @@ _LEARNT_FROM = {
 }
 
 
-def write_report(plan: Plan, summary: RunSummary) -> None:
-    """Write ``index.html``."""
+def write_report(plan: Plan, summary: RunSummary) -> list[str]:
+    """Write ``index.html``, the viewer with the report as its summary, and what both are made from.
+
+    Returns
+    -------
+    Warnings, one line each: the viewer is not built, and the report stands alone.
+    """
+    layout, report = plan.layout, make_report(plan, summary)
+    write_atomically(layout.report_record, report.model_dump_json().encode())
+    write_view_record(layout)
+    figures = report_figures(layout)
+    if not page_is_built():
+        write_atomically(layout.report, render_report(report, list(figures.values())).encode())
+        return [NOT_BUILT]
+    named = [figure.model_copy(update={"data": b"", "file": f"view/{name}.jpg"}) for name, figure in figures.items()]
+    for name, figure in figures.items():
+        write_atomically(layout.view / f"{name}.jpg", figure.data)
+    write_atomically(layout.view / "LICENSES.txt", licences().encode())
+    write_atomically(layout.report, render_viewer(report, named).encode())
+    return []
+
+
+def make_report(plan: Plan, summary: RunSummary) -> Report:
+    """What the report tells."""
     counts = {stage.name: stage.counts for stage in summary.stages}
-    report = Report(
+    return Report(
         title=f"Velocity field of {plan.job.inputs.source.rstrip('/').rsplit('/', 1)[-1]}",
         source=plan.job.inputs.source,
         created=datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
@@ -55,7 +80,6 @@ def write_report(plan: Plan, summary: RunSummary) -> None:
         frames_lost=summary.frames_lost,
         files=tuple(_files(plan)),
     )
-    write_atomically(plan.layout.report, render_report(report, _figures(plan)).encode())
 
 
 def _facts(plan: Plan, counts: dict[str, dict[str, float]]) -> list[tuple[str, str]]:
@@ -120,18 +144,17 @@ def _files(plan: Plan) -> list[tuple[str, str]]:
     return told
 
 
-def _figures(plan: Plan) -> list[ReportFigure]:
-    figures = []
+def report_figures(layout: RunLayout) -> dict[str, ReportFigure]:
+    """The pictures of the report, their bytes in them, by name."""
+    figures = {}
     for name, (title, caption) in _CAPTIONS.items():
-        picture = cv2.imread(str(plan.layout.maps / f"{name}.png"))
-        figures.append(
-            ReportFigure(
-                title=title,
-                caption=caption,
-                alternative=f"map of the modal {name} over the base image",
-                mime="image/jpeg",
-                data=jpeg_bytes(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), max_side=_PICTURE_SIDE_PX),
-                full_size=f"maps/{name}.png",
-            )
+        picture = cv2.imread(str(layout.maps / f"{name}.png"))
+        figures[name] = ReportFigure(
+            title=title,
+            caption=caption,
+            alternative=f"map of the modal {name} over the base image",
+            mime="image/jpeg",
+            data=jpeg_bytes(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), max_side=_PICTURE_SIDE_PX),
+            full_size=f"maps/{name}.png",
         )
     return figures

@@ -1,0 +1,47 @@
+"""``velfield annotate``: mark cars by click and drag, to learn from."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+
+def annotate(
+    place: Path,
+    /,
+    *,
+    labels: Path | None = None,
+    frames: int = 12,
+    port: int | None = None,
+    open_browser: Annotated[bool, Parameter(name="--open")] = True,
+) -> int:
+    """Mark cars in the browser, by a drag along each; saved as labels for `velfield run --labels`.
+
+    Parameters
+    ----------
+    place
+        A frame's picture, or a run folder: frames spread over its flight.
+    labels
+        CSV file to write; what it says of other frames stays. Default: `labels.csv` in the run folder, or beside the
+        picture.
+    frames
+        How many frames of a run to show.
+    port
+        Port to listen on. Default: any that is free.
+    open_browser
+        Open the browser, where there is a screen.
+    """
+    from velfield.viewer.annotation import frames_of
+    from velfield.viewer.annotator import annotate_app
+    from velfield.viewer.server import serve
+
+    file = labels or (place if place.is_dir() else place.parent) / "labels.csv"
+
+    def say(address: str) -> None:
+        print(f"{place}: {address}  writes {file}  (Ctrl-C ends)", flush=True)
+
+    try:
+        serve(annotate_app(frames_of(place, most=frames), file), port=port, open_browser=open_browser, say=say)
+    except KeyboardInterrupt:
+        print()
+    return 0

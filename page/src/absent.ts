@@ -1,0 +1,2 @@
+// In place of codecs that no store of a run folder has.
+export default undefined;

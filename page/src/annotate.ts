@@ -1,0 +1,246 @@
+// Marking cars: a drag along a car makes one, a click chooses one. Every change is saved at once.
+
+import "leaflet/dist/leaflet.css";
+import "./viewer.css";
+import L from "leaflet";
+import { corners, drawnCar, holds, USUAL_RATIO, type Car } from "./cars";
+import { find } from "./dom";
+import { toLatLng, toPoint, type Point } from "./place";
+
+interface Told {
+  token: string;
+  labels: string;
+  names: string[];
+  width: number;
+  height: number;
+  marks: { frames: string[]; cars: Car[] };
+}
+
+const LEAST_DRAG = 4; // screen px: less is a click
+
+class Annotator {
+  private readonly map: L.Map;
+  private readonly drawn = L.layerGroup();
+  private picture: L.ImageOverlay | undefined;
+  private frame = 0;
+  private cars: Car[];
+  private readonly empty: Set<string>; // frames that were said to hold no car
+  private readonly touched: Set<string>; // frames that are or were labelled
+  private chosen: Car | null = null;
+  private from: L.LatLng | null = null;
+  private ratio = USUAL_RATIO;
+  private saving: Promise<void> = Promise.resolve();
+
+  constructor(private readonly told: Told) {
+    this.cars = told.marks.cars;
+    this.empty = new Set(told.marks.frames.filter((name) => !this.cars.some((car) => car.frame === name)));
+    this.touched = new Set(told.marks.frames);
+    const whole = L.latLngBounds([0, 0], [-told.height, told.width]);
+    this.map = L.map(find("map"), {
+      crs: L.CRS.Simple,
+      attributionControl: false,
+      boxZoom: false,
+      doubleClickZoom: false,
+      dragging: false,
+      keyboard: false,
+      maxBounds: whole.pad(0.5),
+      maxZoom: 6,
+      minZoom: -6,
+      zoomSnap: 0.25,
+    });
+    this.map.fitBounds(whole);
+    this.drawn.addTo(this.map);
+    for (const id of ["previous", "next"]) find(id).hidden = told.names.length === 1;
+    this.listen();
+    this.show(0);
+  }
+
+  private get name(): string {
+    return this.told.names[this.frame]!;
+  }
+
+  // -- what is shown ---------------------------------------------------------------------------------------------------
+
+  private show(frame: number): void {
+    this.frame = Math.min(Math.max(frame, 0), this.told.names.length - 1);
+    this.chosen = null;
+    this.picture?.remove();
+    const whole = L.latLngBounds([0, 0], [-this.told.height, this.told.width]);
+    this.picture = L.imageOverlay(`frame/${this.frame}.png`, whole, { className: "frame" }).addTo(this.map);
+    find("frame").textContent = `Frame ${this.frame + 1} of ${this.told.names.length}: ${this.name}`;
+    find<HTMLButtonElement>("previous").disabled = this.frame === 0;
+    find<HTMLButtonElement>("next").disabled = this.frame === this.told.names.length - 1;
+    this.draw();
+  }
+
+  private draw(): void {
+    this.drawn.clearLayers();
+    const here = this.cars.filter((car) => car.frame === this.name);
+    for (const car of here) {
+      const colour = car === this.chosen ? "#ffd400" : "#00e5ff";
+      const shape = corners(car).map(({ x, y }) => toLatLng(x, y));
+      this.drawn.addLayer(L.polygon(shape, { color: "#000", weight: 4, fill: false, interactive: false }));
+      this.drawn.addLayer(L.polygon(shape, { color: colour, weight: 2, fillOpacity: 0.12, interactive: false }));
+    }
+    const none = find<HTMLButtonElement>("none");
+    none.setAttribute("aria-pressed", String(this.empty.has(this.name)));
+    none.disabled = here.length > 0;
+    find<HTMLButtonElement>("remove").disabled = this.chosen === null;
+    const width = find<HTMLInputElement>("width");
+    width.disabled = this.chosen === null;
+    width.value = this.chosen?.width_px?.toFixed(1) ?? "";
+    this.tell(`${here.length} ${here.length === 1 ? "car" : "cars"} in this frame`);
+  }
+
+  private tell(text: string): void {
+    find("saved").textContent = text;
+  }
+
+  // -- marks -----------------------------------------------------------------------------------------------------------
+
+  private pressed(event: PointerEvent): void {
+    const control = event.target instanceof Element && event.target.closest(".leaflet-control");
+    const draws = event.isPrimary && event.button === 0 && !control && !this.map.dragging.enabled();
+    this.from = draws ? this.map.mouseEventToLatLng(event) : null; // a second finger zooms
+  }
+
+  private released(event: PointerEvent): void {
+    const { from } = this;
+    this.from = null;
+    if (!from) return;
+    const to = this.map.mouseEventToLatLng(event);
+    const apart = this.map.latLngToContainerPoint(from).distanceTo(this.map.latLngToContainerPoint(to));
+    if (apart < LEAST_DRAG) this.choose(toPoint(to));
+    else this.add(toPoint(from), toPoint(to));
+  }
+
+  private choose(place: Point): void {
+    this.chosen = this.cars.find((car) => car.frame === this.name && holds(car, place)) ?? null;
+    this.draw();
+  }
+
+  private add(from: Point, to: Point): void {
+    const car = drawnCar(this.name, from, to, this.ratio);
+    if (!this.inside(car)) return;
+    this.cars.push(car);
+    this.chosen = car;
+    this.changed();
+  }
+
+  private inside({ x_px: x, y_px: y }: Car): boolean {
+    return x >= -0.5 && y >= -0.5 && x <= this.told.width - 0.5 && y <= this.told.height - 0.5;
+  }
+
+  private remove(): void {
+    this.cars = this.cars.filter((car) => car !== this.chosen);
+    this.chosen = null;
+    this.changed();
+  }
+
+  private widen(width: number): void {
+    const car = this.chosen;
+    if (!car || !(width >= 1)) return;
+    car.width_px = width;
+    if (car.length_px) this.ratio = width / car.length_px; // the next car is as wide for its length
+    this.changed();
+  }
+
+  private shift(dx: number, dy: number): void {
+    const car = this.chosen;
+    if (!car || !this.inside({ ...car, x_px: car.x_px + dx, y_px: car.y_px + dy })) return;
+    car.x_px += dx;
+    car.y_px += dy;
+    this.changed();
+  }
+
+  // -- saving ----------------------------------------------------------------------------------------------------------
+
+  private changed(): void {
+    if (this.cars.some((car) => car.frame === this.name)) this.empty.delete(this.name);
+    this.draw();
+    this.saving = this.saving.then(() => this.save()).catch((error) => this.tell(`NOT saved: ${error.message}`));
+  }
+
+  private async save(): Promise<void> {
+    const labelled = new Set([...this.empty, ...this.cars.map((car) => car.frame)]);
+    labelled.forEach((name) => this.touched.add(name));
+    const frames = this.told.names.filter((name) => labelled.has(name));
+    // A frame that lost its last car, and was not said to hold none, is no longer labelled.
+    const cleared = [...this.touched].filter((name) => !labelled.has(name));
+    const body = JSON.stringify({ frames, cleared, cars: this.cars });
+    const headers = { "content-type": "application/json", "x-token": this.told.token };
+    const answer = await fetch("labels", { method: "POST", headers, body });
+    if (!answer.ok) throw new Error(await answer.text());
+    const { cars } = (await answer.json()) as { cars: number };
+    this.tell(`saved: ${cars} ${cars === 1 ? "car" : "cars"} in ${this.told.labels}`);
+  }
+
+  // -- controls --------------------------------------------------------------------------------------------------------
+
+  private listen(): void {
+    const container = this.map.getContainer();
+    container.addEventListener("pointerdown", (event) => this.pressed(event));
+    container.addEventListener("pointermove", (event) => this.hover(event));
+    window.addEventListener("pointerup", (event) => this.released(event));
+    window.addEventListener("pointercancel", () => (this.from = null));
+    find("previous").addEventListener("click", () => this.show(this.frame - 1));
+    find("next").addEventListener("click", () => this.show(this.frame + 1));
+    find("remove").addEventListener("click", () => this.remove());
+    find("none").addEventListener("click", () => this.toggleEmpty());
+    const move = find<HTMLInputElement>("move");
+    move.addEventListener("change", () => this.letMove(move.checked));
+    const width = find<HTMLInputElement>("width");
+    width.addEventListener("change", () => this.widen(Number(width.value)));
+    document.addEventListener("keydown", (event) => this.key(event));
+    document.addEventListener("keyup", (event) => {
+      if (event.key === " ") this.letMove(move.checked);
+    });
+  }
+
+  private letMove(on: boolean): void {
+    if (on) this.map.dragging.enable();
+    else this.map.dragging.disable();
+  }
+
+  private toggleEmpty(): void {
+    if (!this.empty.delete(this.name)) this.empty.add(this.name);
+    this.changed();
+  }
+
+  private hover(event: PointerEvent): void {
+    const { x, y } = toPoint(this.map.mouseEventToLatLng(event));
+    find("readout").textContent = `(${x.toFixed(0)}, ${y.toFixed(0)})`;
+    if (!this.from) return;
+    this.draw();
+    const car = drawnCar(this.name, toPoint(this.from), { x, y }, this.ratio);
+    const shape = corners(car).map((corner) => toLatLng(corner.x, corner.y));
+    this.drawn.addLayer(L.polygon(shape, { color: "#ffd400", weight: 2, dashArray: "4 4", interactive: false }));
+  }
+
+  private key(event: KeyboardEvent): void {
+    if (event.target instanceof HTMLInputElement || event.ctrlKey || event.metaKey || event.altKey) return;
+    const act = this.actions(event.shiftKey ? 5 : 0.5)[event.key];
+    if (!act || (event.key === " " && event.target instanceof HTMLButtonElement)) return;
+    act();
+    event.preventDefault();
+  }
+
+  private actions(step: number): Record<string, () => void> {
+    const width = this.chosen?.width_px ?? 0;
+    return {
+      Delete: () => this.remove(),
+      Backspace: () => this.remove(),
+      "[": () => this.widen(width - 0.5),
+      "]": () => this.widen(width + 0.5),
+      ArrowLeft: () => this.shift(-step, 0),
+      ArrowRight: () => this.shift(step, 0),
+      ArrowUp: () => this.shift(0, -step),
+      ArrowDown: () => this.shift(0, step),
+      "+": () => this.map.zoomIn(0.5),
+      "-": () => this.map.zoomOut(0.5),
+      " ": () => this.letMove(true),
+    };
+  }
+}
+
+new Annotator(JSON.parse(find("told").textContent!) as Told);

@@ -1,0 +1,115 @@
+// Chunks of the run folder's Zarr arrays. A chunk that is not stored is known from run.json and not asked for.
+
+import * as zarr from "zarrita";
+import { ZSTDDecoder } from "zstddec";
+import { fetchFile, Unreadable, type StoredArray } from "./run";
+
+export type Numbers = Float32Array | Float64Array | Int32Array;
+
+/** zarrita's own zstd wants `unsafe-eval`; this one does not. It checks the checksum that every chunk carries. */
+class Zstd {
+  readonly kind = "bytes_to_bytes";
+  static readonly decoder = new ZSTDDecoder();
+
+  static async load(): Promise<typeof Zstd> {
+    await Zstd.decoder.init();
+    return Zstd;
+  }
+
+  static fromConfig(): Zstd {
+    return new Zstd();
+  }
+
+  encode(): never {
+    throw new Error("the page only reads");
+  }
+
+  decode(bytes: Uint8Array): Uint8Array {
+    const decoded = Zstd.decoder.decode(bytes);
+    if (decoded.length === 0) throw new Unreadable("a chunk is damaged: its checksum is wrong");
+    return decoded;
+  }
+}
+
+zarr.registry.set("zstd", () => Zstd.load() as never);
+
+/** An array; `metadata` where it is known already spares asking for it. */
+async function openArray(path: string, metadata?: object) {
+  const store = {
+    async get(key: string): Promise<Uint8Array> {
+      if (metadata && key === "/zarr.json") return new TextEncoder().encode(JSON.stringify(metadata));
+      return new Uint8Array(await (await fetchFile(path + key)).arrayBuffer());
+    },
+  };
+  return zarr.open.v3(store, { kind: "array" });
+}
+
+type OpenArray = Awaited<ReturnType<typeof openArray>>;
+
+/** (y, x, ...) array of field.zarr; keeps the chunks read last. */
+export class ChunkedArray {
+  readonly chunk: [number, number];
+  private readonly stored: Set<string>;
+  private readonly kept = new Map<string, Promise<Numbers>>();
+  private readonly ready = new Map<string, Numbers>();
+  private open: Promise<OpenArray> | undefined;
+
+  constructor(
+    readonly name: string,
+    private readonly told: StoredArray,
+    private readonly most: number,
+  ) {
+    this.chunk = told.chunk;
+    this.stored = new Set();
+    for (let k = 0; k < told.stored.length; k += 2) this.stored.add(`${told.stored[k]},${told.stored[k + 1]}`);
+  }
+
+  /** The numbers of a chunk, C order; null where nothing is stored: nothing was seen there. */
+  read(row: number, column: number): Promise<Numbers | null> {
+    const key = `${row},${column}`;
+    if (!this.stored.has(key)) return Promise.resolve(null);
+    const known = this.kept.get(key);
+    if (known) {
+      this.kept.delete(key); // to the end: read last
+      this.kept.set(key, known);
+      return known;
+    }
+    const promise = this.load(row, column, key);
+    this.kept.set(key, promise);
+    promise.catch(() => this.kept.delete(key)); // asked for again the next time
+    for (const oldest of this.kept.keys()) {
+      if (this.kept.size <= this.most) break;
+      this.kept.delete(oldest);
+      this.ready.delete(oldest);
+    }
+    return promise;
+  }
+
+  /** A chunk that is in memory already; undefined where it is not. */
+  peek(row: number, column: number): Numbers | null | undefined {
+    const key = `${row},${column}`;
+    return this.stored.has(key) ? this.ready.get(key) : null;
+  }
+
+  private async load(row: number, column: number, key: string): Promise<Numbers> {
+    this.open ??= openArray(`field.zarr/${this.name}`, this.told.metadata);
+    const array = await this.open;
+    const rest = array.shape.slice(2).map(() => 0);
+    const data = (await array.getChunk([row, column, ...rest])).data as Numbers;
+    if (this.kept.has(key)) this.ready.set(key, data);
+    return data;
+  }
+}
+
+/** A whole column of view/segments.zarr. */
+export async function readColumn<T extends Numbers>(name: string): Promise<T> {
+  const array = await openArray(`view/segments.zarr/${name}`);
+  const length = array.shape[0]!;
+  const chunks = length === 0 ? 0 : Math.ceil(length / array.chunks[0]!);
+  const parts = await Promise.all(Array.from({ length: chunks }, (_, k) => array.getChunk([k])));
+  if (parts.length === 1) return (parts[0]!.data as T).subarray(0, length) as T;
+  const Type = name === "passage" ? Int32Array : name === "start_s" ? Float64Array : Float32Array;
+  const whole = new Type(length);
+  parts.forEach((part, k) => whole.set((part.data as T).subarray(0, length - k * array.chunks[0]!), k * array.chunks[0]!));
+  return whole as unknown as T;
+}

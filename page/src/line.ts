@@ -1,0 +1,95 @@
+// What a line across a road says: how many crossed it, which way, how fast.
+
+import type { Crossing } from "./crossings";
+import { arrow, make, pairs } from "./dom";
+import type { Point } from "./place";
+import type { Run } from "./run";
+import { percentile, roundUp, ticks, type Units } from "./units";
+
+const PLOT = { width: 280, height: 96, left: 4, bottom: 20, top: 6 };
+
+export function showLine(crossings: Crossing[], [start, end]: [Point, Point], run: Run, units: Units): HTMLElement {
+  const metres = run.gsd_m === null ? 1 : run.gsd_m;
+  const length = Math.hypot(end.x - start.x, end.y - start.y) * metres;
+  const card = make("section", { class: "answer", "aria-label": "Line" }, make("h2", {}, "Across the line"));
+  const seconds = run.last_time_s - run.first_time_s;
+  card.append(
+    make(
+      "p",
+      { class: "note" },
+      `${length.toFixed(1)} ${run.gsd_m === null ? "px" : "m"} long; ${crossings.length} crossings in ${seconds.toFixed(0)} s.`,
+    ),
+  );
+  const top = roundUp(Math.max(...crossings.map((c) => c.speed * units.perPxPerS), 1));
+  for (const direction of [1, -1] as const) {
+    const part = crossings.filter((crossing) => crossing.direction === direction);
+    card.append(...oneWay(part, direction, across([start, end], direction), seconds, top, units));
+  }
+  return card;
+}
+
+/** The way across the line. */
+function across([start, end]: [Point, Point], direction: 1 | -1): number {
+  return Math.atan2(direction * (end.x - start.x), -direction * (end.y - start.y));
+}
+
+function oneWay(
+  part: Crossing[],
+  direction: 1 | -1,
+  across: number,
+  seconds: number,
+  top: number,
+  units: Units,
+): HTMLElement[] {
+  const speeds = part.map((crossing) => crossing.speed).sort((a, b) => a - b);
+  const name = direction === 1 ? "forward" : "back";
+  const title = make("h3", {}, arrow(across), ` towards ${units.headingText(across)}`);
+  const count = make("span", { "data-name": `${name}_count`, "data-value": String(part.length) }, `${part.length}`);
+  if (!part.length) return [title, make("p", {}, count, " vehicles")];
+  const speed = (percent: number): HTMLElement => {
+    const value = percentile(speeds, percent);
+    const attributes = { "data-name": `${name}_p${percent}`, "data-value": String(value) };
+    return make("span", attributes, units.speedText(value));
+  };
+  const rows: [string, Node | string][] = [
+    ["Vehicles", count],
+    ["Flow", `${Math.round((360 * part.length) / seconds) * 10} an hour${seconds < 300 ? " (short flight: a hint)" : ""}`],
+    ["15th percentile", speed(15)],
+    ["Median speed", speed(50)],
+    ["85th percentile", speed(85)],
+  ];
+  return [title, pairs(rows), bars(speeds.map((value) => value * units.perPxPerS), top, units.speed)];
+}
+
+/** A histogram of speeds, as SVG. */
+function bars(speeds: number[], top: number, unit: string): HTMLElement {
+  const { width, height, left, bottom } = PLOT;
+  const bins = 20;
+  const counts = new Array<number>(bins).fill(0);
+  for (const speed of speeds) counts[Math.min(Math.floor((speed / top) * bins), bins - 1)]! += 1;
+  const most = Math.max(...counts, 1);
+  const step = (width - 2 * left) / bins;
+  const svg = element("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", class: "bars" });
+  svg.setAttribute("aria-label", `Histogram of ${speeds.length} speeds from 0 to ${top} ${unit}`);
+  counts.forEach((count, k) => {
+    const tall = ((height - bottom - PLOT.top) * count) / most;
+    const at = { x: left + k * step + 0.5, y: height - bottom - tall, width: step - 1, height: tall };
+    svg.append(element("rect", at));
+  });
+  svg.append(element("line", { x1: left, x2: width - left, y1: height - bottom, y2: height - bottom }));
+  const values = ticks(top);
+  values.forEach((value, k) => {
+    const anchor = k === 0 ? "start" : value > 0.95 * top ? "end" : "middle";
+    const x = left + ((width - 2 * left) * value) / top;
+    const text = element("text", { x, y: height - 5, "text-anchor": anchor });
+    text.textContent = k === values.length - 1 ? `${value} ${unit}` : `${value}`;
+    svg.append(text);
+  });
+  return make("div", {}, svg);
+}
+
+function element(name: string, attributes: Record<string, string | number>): SVGElement {
+  const made = document.createElementNS("http://www.w3.org/2000/svg", name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, String(value));
+  return made;
+}

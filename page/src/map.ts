@@ -1,0 +1,167 @@
+// The map: base image and a layer of the field, in base pixels.
+
+import L from "leaflet";
+import { painter } from "./colours";
+import type { Numbers } from "./chunks";
+import type { Field } from "./field";
+import type { Layer, Run } from "./run";
+import { roundDown } from "./units";
+
+export function makeMap(element: HTMLElement, run: Run): L.Map {
+  const whole = L.latLngBounds([0, 0], [-run.height_px, run.width_px]);
+  const map = L.map(element, {
+    crs: L.CRS.Simple,
+    attributionControl: false,
+    zoomSnap: 0.25,
+    minZoom: -run.base.levels - 1,
+    maxZoom: 5,
+    maxBounds: whole.pad(0.5),
+    maxBoundsViscosity: 0.8,
+    zoomAnimation: !window.matchMedia("(prefers-reduced-motion: reduce)").matches,
+  });
+  map.fitBounds(whole);
+  new BaseTiles(run).addTo(map);
+  new ScaleBar(run).addTo(map);
+  map.getContainer().setAttribute("role", "application"); // arrow keys move the map, they do not read the page
+  return map;
+}
+
+/** A round length at the map's scale, in metres where they are known. */
+class ScaleBar extends L.Control {
+  private readonly bar = L.DomUtil.create("div", "scale");
+
+  constructor(private readonly run: Run) {
+    super({ position: "bottomright" });
+  }
+
+  onAdd(map: L.Map): HTMLElement {
+    const draw = (): void => {
+      const perScreenPx = (this.run.gsd_m ?? 1) / map.getZoomScale(map.getZoom(), 0);
+      const length = roundDown(120 * perScreenPx);
+      this.bar.style.width = `${length / perScreenPx}px`;
+      this.bar.textContent = `${length} ${this.run.gsd_m === null ? "px" : "m"}`;
+    };
+    map.on("zoomend", draw);
+    map.whenReady(draw);
+    return this.bar;
+  }
+}
+
+/** What all layers of tiles share: tiles of level k are reduced 2^k times, zoom 0 is the map's own pixels. */
+function tiling(run: Run, tile: number): L.GridLayerOptions {
+  const halvings = Math.log2(tile & -tile);
+  return {
+    tileSize: tile,
+    minNativeZoom: -Math.min(run.base.levels - 1, halvings),
+    maxNativeZoom: 0,
+    minZoom: -run.base.levels - 1,
+    maxZoom: 5,
+    bounds: L.latLngBounds([0, 0], [-run.height_px, run.width_px]),
+    noWrap: true,
+  };
+}
+
+class BaseTiles extends L.GridLayer {
+  constructor(private readonly run: Run) {
+    super({ ...tiling(run, run.base.tile), className: "base" });
+  }
+
+  protected createTile(coords: L.Coords, done: L.DoneCallback): HTMLElement {
+    const { width_px, height_px, base } = this.run;
+    const level = -coords.z;
+    const image = document.createElement("img");
+    image.alt = "";
+    // Those at the edge are smaller than a tile.
+    const width = Math.min(Math.ceil(width_px / 2 ** level) - coords.x * base.tile, base.tile);
+    const height = Math.min(Math.ceil(height_px / 2 ** level) - coords.y * base.tile, base.tile);
+    image.style.width = `${(100 * width) / base.tile}%`;
+    image.style.height = `${(100 * height) / base.tile}%`;
+    const tile = document.createElement("div");
+    tile.append(image);
+    image.onload = () => done(undefined, tile);
+    image.onerror = () => done(new Error(`${image.src} cannot be read`), tile);
+    image.src = `view/base/${level}/${coords.y}-${coords.x}.jpg`;
+    return tile;
+  }
+}
+
+/** A layer of the field, painted from its chunks. */
+export class Overlay extends L.GridLayer {
+  constructor(
+    private readonly field: Field,
+    private readonly shown: Layer,
+    private readonly top: number,
+    private readonly least: number,
+    opacity: number,
+    private readonly failed: (error: unknown) => void,
+  ) {
+    super({ ...tiling(field.run, field.array(shown.arrays[0]!).chunk[0]), opacity, className: "overlay" });
+  }
+
+  protected createTile(coords: L.Coords, done: L.DoneCallback): HTMLElement {
+    const side = this.field.array(this.shown.arrays[0]!).chunk[0];
+    const canvas = document.createElement("canvas");
+    canvas.width = canvas.height = side;
+    this.paint(canvas, coords.x, coords.y, -coords.z).then(
+      () => done(undefined, canvas),
+      (error) => {
+        this.failed(error);
+        done(error, canvas);
+      },
+    );
+    return canvas;
+  }
+
+  /** A tile of level k covers 2^k x 2^k chunks. */
+  private async paint(canvas: HTMLCanvasElement, x: number, y: number, level: number): Promise<void> {
+    const context = canvas.getContext("2d")!;
+    const side = canvas.width >> level;
+    const across = 2 ** level;
+    const work: Promise<void>[] = [];
+    for (let j = 0; j < across; j++) {
+      for (let i = 0; i < across; i++) {
+        const [row, column] = [y * across + j, x * across + i];
+        work.push(
+          this.chunks(row, column).then((data) => {
+            if (data) context.putImageData(this.picture(data, canvas.width, level), i * side, j * side);
+          }),
+        );
+      }
+    }
+    await Promise.all(work);
+  }
+
+  private async chunks(row: number, column: number): Promise<(Numbers | null)[] | null> {
+    const names = [...this.shown.arrays, "count"];
+    const data = await Promise.all(names.map((name) => this.field.array(name).read(row, column)));
+    return data.slice(0, -1).some((chunk) => chunk !== null) ? data : null;
+  }
+
+  private picture(data: (Numbers | null)[], side: number, level: number): ImageData {
+    const step = 2 ** level;
+    const picture = new ImageData(side / step, side / step);
+    const paint = painter(this.shown, this.top, this.field.run.standing_px_per_s);
+    const [a, b] = [data[0]!, data.length === 3 ? data[1]! : data[0]!];
+    const count = data[data.length - 1];
+    for (let j = 0, at = 0; j < side; j += step) {
+      for (let i = 0; i < side; i += step, at += 4) {
+        const index = this.known(a, count ?? null, j, i, step, side);
+        if (index >= 0) paint(picture.data, at, a[index]!, b[index]!);
+      }
+    }
+    return picture;
+  }
+
+  /** The first pixel of a block that is known and that vehicles enough passed: nothing is made up between two. */
+  private known(values: Numbers, count: Numbers | null, y: number, x: number, step: number, side: number): number {
+    for (let j = y; j < y + step; j++) {
+      for (let i = x; i < x + step; i++) {
+        const index = j * side + i;
+        if (Number.isFinite(values[index]!) && (this.least <= 1 || (count && count[index]! >= this.least))) {
+          if (values[index] !== 0 || step === 1) return index;
+        }
+      }
+    }
+    return -1;
+  }
+}

@@ -1,0 +1,52 @@
+// What view/run.json holds (schemas/view.py) and where the page's files stand.
+
+export type LayerKind = "direction" | "speed" | "count" | "angle" | "share" | "time" | "plain" | "change";
+
+export interface Layer {
+  name: string;
+  title: string;
+  about: string;
+  kind: LayerKind;
+  arrays: string[];
+  units: string;
+  top: number;
+  main: boolean;
+}
+
+export interface StoredArray {
+  chunk: [number, number];
+  stored: number[];
+  units: string;
+  /** zarr.json of the array. */
+  metadata: object;
+}
+
+export interface Run {
+  width_px: number;
+  height_px: number;
+  gsd_m: number | null;
+  north_rad: number | null;
+  standing_px_per_s: number;
+  first_time_s: number;
+  last_time_s: number;
+  bin_width_px_per_s: number;
+  bins: number;
+  base: { levels: number; tile: number };
+  layers: Layer[];
+  arrays: Record<string, StoredArray>;
+  segments: { count: number; passages: number; settle_px: number };
+}
+
+/** What people are told when something cannot be read. */
+export class Unreadable extends Error {}
+
+/** A file of the run folder, as it is now: a browser that kept an older one asks whether it changed. */
+export async function fetchFile(path: string): Promise<Response> {
+  const response = await fetch(path, { cache: "no-cache" });
+  if (!response.ok) throw new Unreadable(`${path} cannot be read (${response.status} ${response.statusText})`);
+  return response;
+}
+
+export async function loadRun(): Promise<Run> {
+  return (await fetchFile("view/run.json")).json();
+}

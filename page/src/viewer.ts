@@ -1,0 +1,326 @@
+// The page of a run: the map with what can be asked of it, and the summary.
+
+import "leaflet/dist/leaflet.css";
+import "./viewer.css";
+import type L from "leaflet";
+import { lineCrossings } from "./crossings";
+import { find, make } from "./dom";
+import { Drawings } from "./drawings";
+import { Field } from "./field";
+import { makeLegend } from "./legend";
+import { showLine } from "./line";
+import { makeMap, Overlay } from "./map";
+import { askPixel, showPassages, showPixel } from "./pixel";
+import { toLatLng, toPoint, type Point } from "./place";
+import { loadRun, type Layer, type Run } from "./run";
+import { readState, writeState, type State } from "./state";
+import { listenToTabs, showTab } from "./tabs";
+import { loadSegments, TrackIndex } from "./tracks";
+import { Units } from "./units";
+
+const TRACK_REACH_PX = 6; // screen pixels around the cursor
+const REST_MS = 60; // who rests on a road is about to click it: its tile is fetched already
+const PASSAGE_REACH_PX = 1.5; // base pixels around the pixel asked
+
+class Viewer {
+  private state: State = readState(location.hash);
+  private readonly field: Field;
+  private readonly units: Units;
+  private readonly map: L.Map;
+  private readonly drawings: Drawings;
+  private overlay: Overlay | undefined;
+  private index: Promise<TrackIndex> | undefined;
+  private drawing: Point[] | null = null; // ends of a line that is being drawn
+  private asked = 0;
+  private resting = 0;
+
+  constructor(private readonly run: Run) {
+    this.field = new Field(run);
+    this.units = new Units(run, this.state.unit);
+    this.map = makeMap(find("map"), run);
+    this.drawings = new Drawings(this.map);
+    this.fillControls();
+    this.applyView();
+    this.listen();
+    this.showLayer();
+    this.restore();
+  }
+
+  // -- what is shown ---------------------------------------------------------------------------------------------------
+
+  private get layer(): Layer {
+    return this.run.layers.find((layer) => layer.name === this.state.layer) ?? this.run.layers[0]!;
+  }
+
+  private set(change: Partial<State>): void {
+    this.state = { ...this.state, ...change };
+    history.replaceState(null, "", `#${writeState(this.state)}`);
+  }
+
+  private showLayer(): void {
+    const { layer } = this;
+    const legend = makeLegend(layer, this.run, this.units);
+    find("legend").replaceChildren(legend.element);
+    this.overlay?.remove();
+    const { least, opacity } = this.state;
+    this.overlay = new Overlay(this.field, layer, legend.top, least, opacity / 100, (error) => this.fail(error));
+    this.overlay.addTo(this.map);
+  }
+
+  /** The pixel and the line that the address names. */
+  private restore(): void {
+    this.drawings.showPixel(this.state.pixel);
+    this.drawings.showLine(this.state.line, (ends) => this.measure(ends));
+    if (this.state.line) this.measure(this.state.line);
+    else if (this.state.pixel) this.ask(this.state.pixel);
+  }
+
+  private applyView(): void {
+    const { view } = this.state;
+    if (view) this.map.setView(toLatLng(view.x, view.y), view.zoom, { animate: false });
+  }
+
+  private answer(...elements: HTMLElement[]): void {
+    const place = find("answer");
+    place.replaceChildren(...elements);
+    // On a small screen the answer stands below the controls: bring it into sight.
+    const side = find("side");
+    if (place.offsetTop + 120 > side.scrollTop + side.clientHeight) side.scrollTop = place.offsetTop - side.offsetTop;
+  }
+
+  private fail(error: unknown): void {
+    console.error(error);
+    this.answer(make("p", { class: "alarm" }, error instanceof Error ? error.message : String(error)));
+  }
+
+  // -- what is asked ---------------------------------------------------------------------------------------------------
+
+  private ask(place: Point): void {
+    if (!this.field.inside(place.x, place.y)) return;
+    this.set({ pixel: place, line: null });
+    this.drawings.showPixel(place);
+    this.drawings.showLine(null, () => undefined);
+    const asked = ++this.asked;
+    const started = performance.now();
+    askPixel(this.field, place)
+      .then((answer) => {
+        if (asked !== this.asked) return; // another pixel was asked since
+        this.answer(showPixel(answer, this.field, this.units));
+        find("answer").dataset.milliseconds = (performance.now() - started).toFixed(1);
+        if (answer.n) this.addPassages(place, asked);
+      })
+      .catch((error) => this.fail(error));
+  }
+
+  private addPassages(place: Point, asked: number): void {
+    this.tracks()
+      .then((index) => {
+        if (asked !== this.asked) return;
+        const near = index.near(place.x, place.y, PASSAGE_REACH_PX);
+        find("answer").firstElementChild?.append(showPassages(near, index, this.units));
+        if (this.state.tracks) this.drawings.showTracks(near, index);
+      })
+      .catch((error) => this.fail(error));
+  }
+
+  private measure(ends: [Point, Point]): void {
+    this.set({ line: ends, pixel: null });
+    this.drawings.showPixel(null);
+    this.drawings.showLine(ends, (moved) => this.measure(moved));
+    const asked = ++this.asked;
+    this.tracks()
+      .then(({ segments }) => {
+        if (asked !== this.asked) return;
+        const crossings = lineCrossings(segments, ends[0], ends[1], this.run.segments.settle_px);
+        this.answer(showLine(crossings, ends, this.run, this.units));
+      })
+      .catch((error) => this.fail(error));
+  }
+
+  private tracks(): Promise<TrackIndex> {
+    this.index ??= loadSegments(this.run).then((segments) => new TrackIndex(segments, this.run));
+    return this.index;
+  }
+
+  /** A click, a tap, or Enter at the map's centre: an end of the line being drawn, else a question. */
+  private point(place: Point): void {
+    if (this.drawing === null) {
+      this.ask({ x: Math.round(place.x), y: Math.round(place.y) });
+      return;
+    }
+    this.drawing.push(place);
+    this.drawings.showLine(this.drawing, () => undefined);
+    if (this.drawing.length === 2) {
+      const ends = this.drawing as [Point, Point];
+      this.draw(false);
+      this.measure(ends);
+    } else this.tell("Now the other side of the road.");
+  }
+
+  private draw(on: boolean): void {
+    this.drawing = on ? [] : null;
+    find("draw-line").setAttribute("aria-pressed", String(on));
+    this.map.getContainer().classList.toggle("drawing", on);
+    this.tell(on ? "Click on one side of the road, then on the other. Keyboard: Enter marks the map's centre." : "");
+  }
+
+  private tell(text: string): void {
+    find("hint").textContent = text;
+  }
+
+  // -- the mouse over the map ------------------------------------------------------------------------------------------
+
+  private hover(place: Point): void {
+    const [x, y] = [Math.round(place.x), Math.round(place.y)];
+    const readout = find("readout");
+    if (!this.field.inside(x, y)) {
+      readout.textContent = "";
+      return;
+    }
+    const value = (name: string): number | undefined => this.field.peek(name, x, y);
+    const [vx, vy, n] = [value("modal_vx"), value("modal_vy"), value("count")];
+    const where = `(${x}, ${y})`;
+    if (vx === undefined || vy === undefined || n === undefined) {
+      readout.textContent = where;
+      for (const name of ["modal_vx", "modal_vy", "count"]) void this.field.at(name, x, y).catch((error) => this.fail(error));
+    } else if (!n) readout.textContent = `${where} no vehicle`;
+    else {
+      const speed = Math.hypot(vx, vy);
+      const way = speed > this.run.standing_px_per_s ? this.units.headingText(Math.atan2(vy, vx)) : "stands";
+      readout.textContent = `${where} ${way} · ${this.units.speedText(speed)} · ${n} ${n === 1 ? "vehicle" : "vehicles"}`;
+    }
+    clearTimeout(this.resting);
+    if (n) this.resting = window.setTimeout(() => void askPixel(this.field, { x, y }).catch(() => undefined), REST_MS);
+    if (this.state.tracks) void this.hoverTracks(place);
+  }
+
+  private async hoverTracks({ x, y }: Point): Promise<void> {
+    const index = await this.tracks();
+    const reach = TRACK_REACH_PX / this.map.getZoomScale(this.map.getZoom(), 0);
+    this.drawings.showTracks(index.near(x, y, reach), index);
+  }
+
+  // -- controls --------------------------------------------------------------------------------------------------------
+
+  private fillControls(): void {
+    const layers = find<HTMLSelectElement>("layer");
+    const [main, more] = [make("optgroup", { label: "Main" }), make("optgroup", { label: "More" })];
+    for (const layer of this.run.layers) (layer.main ? main : more).append(make("option", { value: layer.name }, layer.title));
+    layers.append(main, ...(more.childElementCount ? [more] : []));
+    layers.value = this.layer.name;
+    const unit = find<HTMLSelectElement>("unit");
+    unit.value = this.state.unit;
+    if (this.run.gsd_m === null) {
+      unit.replaceChildren(make("option", {}, "px/s"));
+      unit.disabled = true;
+      unit.title = "metres a pixel are not known: give --gsd-m";
+    }
+    find<HTMLInputElement>("opacity").value = String(this.state.opacity);
+    find<HTMLInputElement>("least").value = String(this.state.least);
+    find<HTMLInputElement>("tracks").checked = this.state.tracks;
+  }
+
+  private listen(): void {
+    const on = (id: string, event: string, act: (element: HTMLInputElement) => void): void => {
+      const element = find<HTMLInputElement>(id);
+      element.addEventListener(event, () => act(element));
+    };
+    on("layer", "change", ({ value }) => {
+      this.set({ layer: value });
+      this.showLayer();
+    });
+    on("unit", "change", ({ value }) => this.changeUnit(value as State["unit"]));
+    on("opacity", "input", ({ value }) => {
+      this.set({ opacity: Number(value) });
+      this.overlay?.setOpacity(Number(value) / 100);
+    });
+    on("least", "change", (element) => {
+      const least = Math.max(1, Math.round(Number(element.value)) || 1);
+      element.value = String(least);
+      this.set({ least });
+      this.showLayer();
+    });
+    on("tracks", "change", ({ checked }) => {
+      this.set({ tracks: checked });
+      if (!checked) this.drawings.showTracks([], null);
+    });
+    on("draw-line", "click", () => this.draw(this.drawing === null));
+    on("whole", "click", () => this.map.fitBounds([[0, 0], [-this.run.height_px, this.run.width_px]]));
+    on("copy-link", "click", () => void this.copyLink());
+    this.listenToMap();
+    window.addEventListener("hashchange", () => location.reload());
+  }
+
+  private listenToMap(): void {
+    this.map.on("click", (event) => this.point(toPoint(event.latlng)));
+    this.map.on("mousemove", (event) => this.hover(toPoint(event.latlng)));
+    this.map.on("mouseout", () => this.hover({ x: -1, y: -1 }));
+    this.map.on("moveend", () => {
+      const { x, y } = toPoint(this.map.getCenter());
+      this.set({ view: { x, y, zoom: this.map.getZoom() } });
+    });
+    const container = this.map.getContainer();
+    container.addEventListener("pointerdown", () => container.classList.remove("by-keyboard"));
+    container.addEventListener("keydown", (event) => {
+      if (event.target !== container) return;
+      container.classList.add("by-keyboard"); // shows the centre, where Enter asks
+      if (event.key === "Enter" || event.key === " ") this.point(toPoint(this.map.getCenter()));
+      else if (event.key === "l") this.draw(this.drawing === null);
+      else if (event.key === "Escape") this.draw(false);
+      else return;
+      event.preventDefault();
+    });
+  }
+
+  private changeUnit(unit: State["unit"]): void {
+    this.set({ unit });
+    this.units.chosen = unit;
+    this.showLayer();
+    this.restore();
+  }
+
+  private async copyLink(): Promise<void> {
+    try {
+      await navigator.clipboard.writeText(location.href);
+      this.tell("The link is in the clipboard.");
+    } catch {
+      this.tell("This browser keeps the clipboard closed here: copy the page's address, it holds the view.");
+    }
+  }
+
+  resize(): void {
+    this.map.invalidateSize();
+  }
+}
+
+/** Why the map cannot be shown, in its place; the summary needs no server. */
+function explain(text: string): void {
+  find("map").replaceChildren(make("p", { class: "alarm", role: "alert" }, text));
+  find("side").hidden = true;
+}
+
+async function start(): Promise<void> {
+  const { tab } = readState(location.hash);
+  let viewer: Viewer | undefined;
+  listenToTabs((chosen) => {
+    showTab(chosen);
+    const state = { ...readState(location.hash), tab: chosen };
+    history.replaceState(null, "", `#${writeState(state)}`);
+    if (chosen === "map") viewer?.resize();
+  });
+  if (location.protocol === "file:") {
+    showTab("summary");
+    explain("A browser reads no data from a file opened from the disk. Show this run with: velfield view RUN");
+    return;
+  }
+  showTab("map");
+  try {
+    viewer = new Viewer(await loadRun());
+  } catch (error) {
+    console.error(error);
+    explain(`The map cannot be shown: ${error instanceof Error ? error.message : String(error)}`);
+  }
+  showTab(tab);
+}
+
+void start();

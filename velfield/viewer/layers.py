@@ -1,0 +1,139 @@
+"""Which layers of a field the page shows, what they are called, and where their colours end.
+
+The list follows the store: a layer that is not there is not shown, one that is not known here is shown under the
+``long_name`` that the store gives it.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.view import LayerKind, ViewLayer
+
+_REACH_PERCENT = 98.0
+"""Colours end where so many per cent of the known pixels are reached: a few outliers would flatten all else."""
+
+
+@dataclass(frozen=True)
+class _Known:
+    name: str
+    title: str
+    about: str
+    kind: LayerKind
+    arrays: tuple[str, ...]
+    main: bool = False
+
+
+_KNOWN = (
+    _Known(
+        "direction",
+        "Direction",
+        "Which way most vehicles go: the direction of the largest mode. No colour where they stand.",
+        "direction",
+        ("modal_vx", "modal_vy"),
+        True,
+    ),
+    _Known("speed", "Speed", "Speed of the largest mode.", "speed", ("modal_vx", "modal_vy"), True),
+    _Known("speed_p85", "85th percentile speed", "85 % of vehicles go slower.", "speed", ("speed_p85",), True),
+    _Known("count", "Vehicles", "How many vehicles passed.", "count", ("count",), True),
+    _Known(
+        "direction_half90",
+        "Uncertainty of direction",
+        "Half the 90 % interval of the direction.",
+        "angle",
+        ("direction_half90",),
+        True,
+    ),
+    _Known(
+        "speed_se",
+        "Uncertainty of speed",
+        "Standard error of the median speed; needs two vehicles.",
+        "speed",
+        ("speed_se",),
+        True,
+    ),
+    _Known("speed_p50", "Median speed", "Half of the vehicles go slower.", "speed", ("speed_p50",)),
+    _Known("speed_p15", "15th percentile speed", "15 % of vehicles go slower.", "speed", ("speed_p15",)),
+    _Known(
+        "direction_se",
+        "Standard error of direction",
+        "Of the mean direction of what moves; needs two vehicles.",
+        "angle",
+        ("direction_se",),
+    ),
+    _Known("mean_direction", "Mean direction", "Direction of the mean velocity.", "direction", ("mean_vx", "mean_vy")),
+    _Known(
+        "standing_share",
+        "Share that stand",
+        "Share of vehicles that stand here: stop lines, queues, parking.",
+        "share",
+        ("standing_share",),
+    ),
+    _Known("dwell", "Time spent", "Time that vehicles spent here, all together.", "time", ("dwell_ms",)),
+    _Known("mode_share", "Share of the mode", "Share of vehicles near the largest mode.", "share", ("mode_share",)),
+    _Known(
+        "circular_variance",
+        "Spread of direction",
+        "0: all go one way; 1: no direction.",
+        "plain",
+        ("circular_variance",),
+    ),
+)
+_COMMON_TOP = ("speed", "speed_p85", "speed_p50", "speed_p15", "speed_p50_low90", "speed_p50_high90")
+"""Shown on one scale, so that they compare."""
+
+_INNER = ("velocity_noise",)
+"""For the sums of fields, not for people."""
+
+Reader = Callable[[str], NDArray[Any]]
+
+
+def view_layers(attributes: Mapping[str, Mapping[str, Any]], read: Reader) -> list[ViewLayer]:
+    """The layers to show.
+
+    Parameters
+    ----------
+    attributes
+        Attributes of every (y, x) array of the store, by its name.
+    read
+        Gives an array by its name, (y, x).
+    """
+    known = [layer for layer in _KNOWN if all(name in attributes for name in layer.arrays)]
+    taken = {*_INNER, *(name for layer in _KNOWN for name in layer.arrays)}
+    known += [_unknown(name, attrs) for name, attrs in attributes.items() if name not in taken]
+    layers = [
+        ViewLayer(
+            name=layer.name,
+            title=layer.title,
+            about=layer.about,
+            kind=layer.kind,
+            arrays=layer.arrays,
+            units=str(attributes[layer.arrays[0]].get("units", "1")),
+            top=_top([np.asarray(read(name)) for name in layer.arrays]),
+            main=layer.main,
+        )
+        for layer in known
+    ]
+    common = max((layer.top for layer in layers if layer.name in _COMMON_TOP), default=1.0)
+    return [layer.model_copy(update={"top": common}) if layer.name in _COMMON_TOP else layer for layer in layers]
+
+
+_KINDS: dict[str, LayerKind] = {"px s-1": "speed", "rad": "angle", "ms": "time"}
+
+
+def _unknown(name: str, attributes: Mapping[str, Any]) -> _Known:
+    """A layer that this file does not know. One that can be below zero tells a change."""
+    title = str(attributes.get("long_name", name.replace("_", " ")))
+    kind = _KINDS.get(str(attributes.get("units", "1")), "plain")
+    change = "change" in name or "difference" in name
+    return _Known(name, title[:1].upper() + title[1:], title, "change" if change else kind, (name,), change)
+
+
+def _top(arrays: Sequence[NDArray[Any]]) -> float:
+    """Where the colours end: the 98th percentile of the sizes of what is known and not zero."""
+    size = np.abs(arrays[0].astype(np.float64)) if len(arrays) == 1 else np.hypot(*arrays)
+    size = size[np.isfinite(size) & (size > 0)]
+    return float(np.percentile(size, _REACH_PERCENT)) if size.size else 1.0

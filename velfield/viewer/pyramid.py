@@ -1,0 +1,46 @@
+"""The base image as JPEG tiles in several sizes: a page shows a map of any size without loading it whole."""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from velfield.errors import InputError
+
+TILE_PX = 512
+_QUALITY = 88
+
+
+def pyramid_levels(height: int, width: int) -> int:
+    """Levels until the whole picture fits a tile.
+
+    Examples
+    --------
+    >>> pyramid_levels(1920, 2560), pyramid_levels(100, 512)
+    (4, 1)
+    """
+    levels = 1
+    while max(height, width) > TILE_PX << (levels - 1):
+        levels += 1
+    return levels
+
+
+def pyramid_tiles(grey: NDArray[np.uint8]) -> Iterator[tuple[str, bytes]]:
+    """Name ``<level>/<row>-<column>.jpg`` and bytes of every tile; those at the right and lower edge are smaller."""
+    picture = grey
+    for level in range(pyramid_levels(*grey.shape)):
+        if level:
+            size = (-(-picture.shape[1] // 2), -(-picture.shape[0] // 2))
+            picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+        for row in range(-(-picture.shape[0] // TILE_PX)):
+            for column in range(-(-picture.shape[1] // TILE_PX)):
+                y, x = row * TILE_PX, column * TILE_PX
+                yield f"{level}/{row}-{column}.jpg", _jpeg(picture[y : y + TILE_PX, x : x + TILE_PX])
+
+
+def _jpeg(grey: NDArray[np.uint8]) -> bytes:
+    good, data = cv2.imencode(".jpg", np.ascontiguousarray(grey), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    if not good:
+        raise InputError(f"a tile of {grey.shape} px cannot be written as JPEG")
+    return data.tobytes()

@@ -1,0 +1,110 @@
+"""What the viewer page reads of a run folder beside the field's own tiles: ``view/``.
+
+    run.json         sizes, units, the list of layers, which chunks are stored
+    base/            the base image as JPEG tiles
+    segments.zarr    vehicles from one frame to the next, for the line tool and the tracks under the cursor
+
+Everything in it can be made again from the run folder: `write_view` does.
+"""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from schemas.records import FlightRecord, GridRecord
+from schemas.view import ViewArray, ViewBase, ViewLayer, ViewRecord, ViewSegments
+from velfield.field.bins import standing_px_per_s
+from velfield.field.segments import Segments
+from velfield.insight.crossings import settle_px
+from velfield.layout import RunLayout
+from velfield.provenance import write_atomically
+from velfield.run import open_run
+from velfield.steps.grid import north_of
+from velfield.stores import HISTOGRAM, FieldStore, open_field, write_segments
+from velfield.viewer.layers import view_layers
+from velfield.viewer.pyramid import TILE_PX, pyramid_levels, pyramid_tiles
+
+
+def write_view(layout: RunLayout) -> None:
+    """Write ``view/`` anew.
+
+    Raises
+    ------
+    InputError
+        The run has no field yet.
+    """
+    write_view_data(layout)
+    write_view_record(layout)
+
+
+def write_view_data(layout: RunLayout) -> list[Path]:
+    """Write the tiles of the base image and the segments; returns the files."""
+    run = open_run(layout.root)
+    shutil.rmtree(layout.view / "base", ignore_errors=True)  # tiles of an earlier, larger base image
+    written = []
+    for name, data in pyramid_tiles(run.base_image):
+        path = layout.view / "base" / name
+        write_atomically(path, data)
+        written.append(path)
+    write_segments(layout.view_segments, _columns(run.segments()))
+    return written + sorted(path for path in layout.view_segments.rglob("*") if path.is_file())
+
+
+def write_view_record(layout: RunLayout) -> None:
+    """Write ``view/run.json``: whenever layers were added to the field, or the run was made again."""
+    run = open_run(layout.root)
+    record = view_record(run.record, run.grid, open_field(layout.field), run.segments(), run.times_s)
+    write_atomically(layout.view_record, record.model_dump_json().encode())
+
+
+def view_record(
+    flight: FlightRecord, grid: GridRecord, store: FieldStore, segments: Segments, times_s: np.ndarray
+) -> ViewRecord:
+    """``view/run.json`` of a run with this field."""
+    known_s = times_s[np.isfinite(times_s)]
+    return ViewRecord(
+        width_px=grid.width_px,
+        height_px=grid.height_px,
+        gsd_m=grid.gsd_m,
+        north_rad=north_of(grid),
+        standing_px_per_s=standing_px_per_s(flight.config.field, grid.gsd_m),
+        first_time_s=float(known_s[0]) if len(known_s) else 0.0,
+        last_time_s=float(known_s[-1]) if len(known_s) else 0.0,
+        bin_width_px_per_s=float(store.attributes["bin_width_px_per_s"]),
+        bins=len(store.velocities()),
+        base=ViewBase(levels=pyramid_levels(grid.height_px, grid.width_px), tile=TILE_PX),
+        layers=tuple(_layers(store)),
+        arrays=_arrays(store),
+        segments=ViewSegments(
+            count=len(segments), passages=len(np.unique(segments["passage"])), settle_px=settle_px(grid.gsd_m)
+        ),
+    )
+
+
+def _layers(store: FieldStore) -> list[ViewLayer]:
+    return view_layers({name: store.layer_attributes(name) for name in store.layer_names()}, store.layer)
+
+
+def _arrays(store: FieldStore) -> dict[str, ViewArray]:
+    return {
+        name: ViewArray(
+            chunk=store.chunk_shape(name),
+            stored=tuple(index for place in store.stored_chunks(name) for index in place),
+            units=str(store.layer_attributes(name).get("units", "1")),
+            metadata=json.loads((store.path / name / "zarr.json").read_bytes()),
+        )
+        for name in [*store.layer_names(), HISTOGRAM]
+    }
+
+
+def _columns(segments: Segments) -> dict[str, np.ndarray]:
+    """Columns for the page: passages numbered from 0, places and velocities in float32 (a thousandth of a pixel)."""
+    numbers = np.unique(segments["passage"], return_inverse=True)[1]
+    names = ("duration_s", "x0_px", "y0_px", "x1_px", "y1_px", "vx_px_per_s", "vy_px_per_s")
+    return {
+        "passage": numbers.astype(np.int32),
+        "start_s": segments["start_s"].astype(np.float64),
+        **{name: segments[name].astype(np.float32) for name in names},
+    }

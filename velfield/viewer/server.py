@@ -1,0 +1,136 @@
+"""A run folder over HTTP, for its page: read-only, to this machine alone.
+
+Files of the folder and no others: no listing, no link that leads out of it, nothing whose name starts with a dot, no
+method but GET and HEAD. Who asks under another name than this machine's own is turned away, so that no page elsewhere
+can have the folder read through a name of its own (DNS rebinding).
+"""
+
+import re
+import socket
+import threading
+import webbrowser
+from base64 import b64encode
+from collections.abc import Callable
+from hashlib import sha256
+from os import environ
+from pathlib import Path
+from sys import platform
+from typing import TYPE_CHECKING, Any
+
+from velfield.errors import InputError
+
+if TYPE_CHECKING:
+    from starlette.applications import Starlette
+
+HOST = "127.0.0.1"
+_NAMES = [HOST, "localhost"]
+_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-cache",
+}
+_NOTHING = "default-src 'none'; frame-ancestors 'none'"
+
+
+def page_policy(html: str) -> str:
+    """Content security policy of a page whose scripts and styles stand in it: these, by their hashes, and no others.
+
+    Nothing comes from another host and nothing goes to one, whatever the page itself would allow.
+    """
+    scripts = " ".join(_hashes("script", html)) or "'none'"
+    styles = " ".join(_hashes("style", html)) or "'none'"
+    return (
+        f"default-src 'none'; script-src {scripts} 'wasm-unsafe-eval'; style-src {styles}; "
+        "img-src 'self' data: blob:; connect-src 'self' data:; base-uri 'none'; form-action 'none'; "
+        "frame-ancestors 'none'"
+    ).replace("'none' 'wasm-unsafe-eval'", "'none'")
+
+
+def _hashes(tag: str, html: str) -> list[str]:
+    texts = re.findall(rf"<{tag}>(.*?)</{tag}>", html, re.DOTALL)
+    return [f"'sha256-{b64encode(sha256(text.encode()).digest()).decode()}'" for text in texts]
+
+
+def headers_for(html: str | None) -> dict[str, str]:
+    """Headers of an answer: of a page, or of anything else (None)."""
+    return {**_HEADERS, "Content-Security-Policy": _NOTHING if html is None else page_policy(html)}
+
+
+def view_app(root: Path) -> "Starlette":
+    """The server of a run folder.
+
+    Raises
+    ------
+    InputError
+        There is no page in the folder.
+    """
+    from starlette.applications import Starlette
+    from starlette.exceptions import HTTPException
+    from starlette.routing import Mount
+    from starlette.staticfiles import StaticFiles
+
+    if not (root / "index.html").is_file():
+        raise InputError(f"{root} holds no index.html: make it with `velfield run ... --out {root}`")
+
+    class RunFiles(StaticFiles):
+        async def get_response(self, path: str, scope: Any) -> Any:
+            if any(part.startswith(".") and part != "." for part in Path(path).parts):
+                raise HTTPException(404)
+            return await super().get_response(path, scope)
+
+        def file_response(self, full_path: Any, *arguments: Any, **named: Any) -> Any:
+            response = super().file_response(full_path, *arguments, **named)
+            place = Path(full_path)
+            response.headers.update(headers_for(place.read_text("utf-8") if place.suffix == ".html" else None))
+            return response
+
+    return Starlette(routes=[Mount("/", RunFiles(directory=root, html=True))], middleware=[own_names()])
+
+
+def own_names() -> Any:
+    """Middleware that answers to this machine's own names alone."""
+    from starlette.middleware import Middleware
+    from starlette.middleware.trustedhost import TrustedHostMiddleware
+
+    return Middleware(TrustedHostMiddleware, allowed_hosts=_NAMES, www_redirect=False)
+
+
+def serve(app: "Starlette", *, port: int | None, open_browser: bool, say: Callable[[str], None]) -> None:
+    """Serve until interrupted.
+
+    Parameters
+    ----------
+    port
+        None: any that is free.
+    open_browser
+        Open the page in the person's browser, where there is a screen.
+    say
+        Is told the address once the server listens.
+
+    Raises
+    ------
+    InputError
+        The port is taken.
+    """
+    import uvicorn
+
+    with _listening(port) as listener:
+        address = f"http://{HOST}:{listener.getsockname()[1]}/"
+        say(address)
+        if open_browser and _has_screen():
+            # The socket listens already: the browser waits until it is answered.
+            threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+        config = uvicorn.Config(app, log_level="warning", lifespan="off", server_header=False)
+        uvicorn.Server(config).run(sockets=[listener])
+
+
+def _listening(port: int | None) -> socket.socket:
+    try:
+        return socket.create_server((HOST, port or 0))
+    except (OSError, OverflowError) as error:
+        raise InputError(f"--port {port}: {error}; leave it out for one that is free") from error
+
+
+def _has_screen() -> bool:
+    return platform in ("darwin", "win32") or "DISPLAY" in environ or "WAYLAND_DISPLAY" in environ
