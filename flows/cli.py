@@ -12,6 +12,7 @@ from velfield.errors import InputError
 
 if TYPE_CHECKING:
     from flows.console import Console, Verbosity
+    from flows.runners import RunnerConfig
     from schemas.job import Job
     from schemas.summary import RunSummary
 
@@ -28,6 +29,12 @@ app = App(
 app.command("flows.commands.view:view", name="view", help="Show a run's page in the browser.")
 app.command("flows.commands.annotate:annotate", name="annotate", help="Mark cars in the browser, to learn from.")
 app.command("flows.commands.export:export", name="export", help="Write a finished run in a format that others read.")
+app.command(
+    "flows.commands.lineage:lineage", name="lineage", help="What stands behind a run, or behind a pixel of its field."
+)
+app.command("flows.commands.reprocess:reprocess", name="reprocess", help="A new base image under a finished run.")
+app.command("flows.commands.serve:serve", name="serve", help="Process what arrives in a folder, with a UI.")
+app.command("flows.commands.verify:verify", name="verify", help="Is a run folder whole; and make it so.")
 app.command("flows.commands.bench:bench", name="bench", help="Speed and accuracy, against a peer in the same run.")
 
 Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative=())]
@@ -57,6 +64,7 @@ def run(
     stop_s: float | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
+    cluster: Path | None = None,
     plan: Annotated[bool, Parameter(negative=())] = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -101,6 +109,8 @@ def run(
         Processes of a local cluster. Default: threads of this process.
     scheduler
         Address of a Dask scheduler.
+    cluster
+        File with the class of Dask clusters to use and what it is called with; see `examples/cluster-*.yaml`.
     plan
         Say what would be done, and stop.
     quiet
@@ -131,8 +141,9 @@ def run(
     )
     job = Job(root=str(out), inputs=inputs, config=resolved)
     if plan:
-        return _show_plan(job)
-    return _process(job, workers=workers, scheduler=scheduler, verbosity=_verbosity(quiet, verbose, log_json))
+        return _show_plan(job, _runner(workers, scheduler, cluster))
+    where = _runner(workers, scheduler, cluster)
+    return _process(job, runner=where, verbosity=_verbosity(quiet, verbose, log_json))
 
 
 @app.command
@@ -239,11 +250,18 @@ def _score(run_folder: Path, flight: Path) -> None:
     print(score_run(run_folder, flight).text())
 
 
+def _runner(workers: int | None, scheduler: str | None, cluster: Path | None) -> "RunnerConfig":
+    from flows.runners import RunnerConfig, read_runner
+
+    if sum(given is not None for given in (workers, scheduler, cluster)) > 1:
+        raise InputError("found more than one of --workers, --scheduler and --cluster; give one")
+    return read_runner(cluster) if cluster else RunnerConfig(workers=workers, scheduler=scheduler)
+
+
 def _process(
     job: "Job",
     *,
-    workers: int | None = None,
-    scheduler: str | None = None,
+    runner: "RunnerConfig | None" = None,
     verbosity: "Verbosity" = "normal",
 ) -> int:
     from flows.launch import prepare_process
@@ -254,7 +272,7 @@ def _process(
     from flows.runners import RunnerConfig
 
     console = Console(verbosity)
-    summary = run_flight(job, RunnerConfig(workers=workers, scheduler=scheduler), console)
+    summary = run_flight(job, runner or RunnerConfig(), console)
     return _conclude(summary, console)
 
 
@@ -273,11 +291,12 @@ def _conclude(summary: "RunSummary", console: "Console") -> int:
     return INCOMPLETE
 
 
-def _show_plan(job: "Job") -> int:
+def _show_plan(job: "Job", runner: "RunnerConfig") -> int:
+    from flows.runners import parallel_units
     from velfield.plan import make_plan
     from velfield.steps.planning import describe_plan
 
-    print(describe_plan(make_plan(job)))
+    print(describe_plan(make_plan(job), parallel_units(runner)))
     return DONE
 
 

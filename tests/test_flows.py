@@ -1,93 +1,19 @@
 """The whole job as a flow: what it leaves, what a second run does again, what a failing unit costs."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from flows.console import Console
-from flows.launch import prepare_process
 from flows.runners import RunnerConfig
-from schemas.job import Inputs, Job
-from schemas.simulation import SimulationConfig
 from schemas.summary import RunSummary
 from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
+from tests.small_flight import FRAMES, digests, job, process, redone
 from velfield import open_run
-from velfield.configuration import resolve_config
 from velfield.errors import InputError
-from velfield.layout import STAGES, RunLayout
-from velfield.provenance import digest_bytes
-from velfield.synthetic import write_flight
-
-SMALL = (
-    "detection.rounds=60",
-    "detection.feature_pool=400",
-    "registration.key_points=1200",
-    "work.unit_frames=8",
-    "work.retries=1",
-)
-FRAMES = 18
-
-
-@pytest.fixture(scope="session")
-def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A simulated flight of a few seconds."""
-    folder = tmp_path_factory.mktemp("flight")
-    write_flight(folder, SimulationConfig(frames=FRAMES, width=640, height=480, seed=11))
-    return folder
-
-
-@pytest.fixture(scope="session")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A Prefect server of our own, once a session: its start takes longer than a small flight."""
-    prepare_process(verbose=False)
-    from prefect.testing.utilities import prefect_test_harness
-
-    with prefect_test_harness(server_startup_timeout=180):
-        yield
-
-
-def job(flight: Path, root: Path, *settings: str, **inputs: str) -> Job:
-    given = {
-        "source": str(flight / "frames"),
-        "timestamps": str(flight / "timestamps.csv"),
-        "base": str(flight / "base.png"),
-        "labels": str(flight / "labels.csv"),
-    }
-    config = resolve_config(settings=[*SMALL, *settings], overrides={"gsd_m": 0.23})
-    return Job(root=str(root), inputs=Inputs.model_validate(given | inputs), config=config)
-
-
-def process(work: Job, runner: RunnerConfig | None = None) -> RunSummary:
-    from flows.process_flight import run_flight
-
-    return run_flight(work, runner or RunnerConfig(), Console("quiet"))
-
-
-def digests(root: Path) -> dict[str, str]:
-    """Of all that a run leaves, apart from what tells when it was made."""
-    layout = RunLayout(root)
-    when = {layout.flight, layout.report, layout.report_record, layout.lock}
-    files = [path for path in sorted(root.rglob("*")) if path.is_file() and path not in when]
-    return {
-        path.relative_to(root).as_posix(): digest_bytes(path.read_bytes())
-        for path in files
-        if not path.is_relative_to(layout.commits)
-    }
-
-
-def redone(summary: RunSummary) -> list[str]:
-    return [stage.name for stage in summary.stages if stage.done_before < stage.units]
-
-
-@pytest.fixture(scope="session")
-def whole(flight: Path, server: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunSummary]:
-    """The flight's run, done once."""
-    root = tmp_path_factory.mktemp("run") / "whole"
-    return root, process(job(flight, root))
+from velfield.layout import STAGES
 
 
 def test_it_leaves_what_the_contract_says(whole: tuple[Path, RunSummary]) -> None:

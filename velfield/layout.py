@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from velfield.places import place
+
 STAGES = ("frames", "lens", "base", "registration", "detector", "detections", "links", "tracklets", "field", "maps")
 """The stages in the order of the work."""
 
@@ -18,6 +20,9 @@ class RunLayout:
     """
 
     root: Path
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "root", place(self.root))
 
     @property
     def flight(self) -> Path:
@@ -64,6 +69,11 @@ class RunLayout:
         return self.base / "own_to_base.json"
 
     @property
+    def rebased(self) -> Path:
+        """Pixels of the base image before -> base pixels, where a result was mapped onto a new base image."""
+        return self.base / "rebased.json"
+
+    @property
     def grid(self) -> Path:
         return self.base / "grid.json"
 
@@ -108,6 +118,16 @@ class RunLayout:
     @property
     def report(self) -> Path:
         return self.root / "index.html"
+
+    @property
+    def results(self) -> Path:
+        """Results on other base images, a run folder each, by name."""
+        return self.root / "results"
+
+    @property
+    def results_index(self) -> Path:
+        """Names of all results, this folder's own first."""
+        return self.root / "results.json"
 
     @property
     def view(self) -> Path:

@@ -14,7 +14,7 @@ from velfield.field.segments import Segments, segment_table
 from velfield.field.view import VelocityField
 from velfield.insight.crossings import line_crossings, settle_px
 from velfield.layout import RunLayout
-from velfield.steps.field_reading import open_velocity_field
+from velfield.steps.field_reading import FieldSlice, open_field_slices, open_velocity_field
 from velfield.steps.frame_maps import FrameMaps
 from velfield.steps.grid import read_grid_of
 from velfield.stores import FrameStore, RegistrationStore, open_frames, open_registration
@@ -126,6 +126,16 @@ class Run:
     def field(self) -> VelocityField:
         """The velocity field."""
         return open_velocity_field(self.layout)
+
+    @cached_property
+    def field_by_time(self) -> VelocityField:
+        """The velocity field weighed by time: a vehicle that stays counts for as long as it does."""
+        return open_velocity_field(self.layout, by_time=True)
+
+    @cached_property
+    def field_slices(self) -> dict[str, FieldSlice]:
+        """Fields of slices of time by name, in their order; empty where none were asked for (``--slice``)."""
+        return {found.name: found for found in open_field_slices(self.layout)}
 
     @cached_property
     def base_image(self) -> NDArray[np.uint8]:
