@@ -52,6 +52,9 @@ bench: $(STAMP)  ## speed, as ratios against a peer in the same run
 soak: $(STAMP)  ## fifty kills at random moments: every result equal to the bit
 	$(BIN)/python -m tests.kills --kills 50
 
+docs: $(STAMP)  ## the documentation as pages, in build/docs
+	$(BIN)/mkdocs build --quiet
+
 # Universal, with hashes, and without a registry's address in it.
 lock: $(STAMP)
 	$(BIN)/uv pip compile pyproject.toml --extra dev --extra s3 --universal --no-emit-index-url --no-emit-find-links \
