@@ -40,7 +40,7 @@ def process(work: Job, runner: RunnerConfig | None = None) -> RunSummary:
 def digests(root: Path) -> dict[str, str]:
     """Of all that a run leaves, apart from what tells when it was made."""
     layout = RunLayout(root)
-    when = {layout.flight, layout.report, layout.lock}
+    when = {layout.flight, layout.report, layout.report_record, layout.lock}
     files = [path for path in sorted(root.rglob("*")) if path.is_file() and path not in when]
     return {
         path.relative_to(root).as_posix(): digest_bytes(path.read_bytes())

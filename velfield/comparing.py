@@ -13,7 +13,7 @@ from velfield.render.change import change_figure
 from velfield.render.figures import MapScale, png_bytes
 from velfield.run import Run, open_run
 from velfield.steps.field_algebra import check_same_grid
-from velfield.steps.maps import north_of
+from velfield.steps.grid import north_of
 from velfield.stores import open_field
 
 

@@ -79,7 +79,7 @@ def _names(run: Run) -> Callable[[int], str]:
     told = run.record.inputs.source
     if told.kind == "video":
         return str
-    given = getattr(run.record, "given", None)
+    given = run.record.given
     timestamps = Path(given.timestamps) if given and given.timestamps else None
     if not Path(told.path).is_dir():
         raise InputError(
