@@ -1,0 +1,239 @@
+"""The page of a run in a real browser, from a plain static server: what it shows is what Python says."""
+
+import functools
+import json
+import threading
+from collections.abc import Callable, Iterator
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import pytest
+
+from schemas.summary import RunSummary
+from tests.browser import Browser, Page, browser
+from velfield import open_run
+from velfield.render.viewer_page import page_is_built
+from velfield.run import Run
+
+pytestmark = pytest.mark.skipif(not page_is_built(), reason="the page is not built: `make page`")
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with browser(tmp_path_factory.mktemp("chromium")) as running:
+        yield running
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *arguments: object) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def address(whole: tuple[Path, RunSummary]) -> Iterator[str]:
+    """The run folder behind Python's plain static server."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(whole[0]))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/"
+        server.shutdown()
+
+
+@pytest.fixture
+def page(chromium: Browser, address: str) -> Iterator[Page]:
+    """A page that complains of nothing and asks no other host for anything."""
+    with chromium.page() as opened:
+        yield opened
+        assert opened.complaints == []
+        assert [r for r in opened.requests if not r.startswith((address, "data:", "blob:"))] == []
+
+
+@pytest.fixture(scope="module")
+def run(whole: tuple[Path, RunSummary]) -> Run:
+    return open_run(whole[0])
+
+
+def told(page: Page, name: str) -> Any:
+    """The number behind a cell of the answer."""
+    return json.loads(page.value(f"document.querySelector('#answer [data-name={name}]').dataset.value"))
+
+
+def busiest(run: Run) -> tuple[int, int]:
+    count = run.field.count()
+    y, x = np.unravel_index(int(count.argmax()), count.shape)
+    return int(x), int(y)
+
+
+def click_pixel(page: Page, x: float, y: float) -> None:
+    """Click a base pixel, the map standing at zoom 3 around it."""
+    box = page.value(
+        "(({left, top, width, height}) => [left + width / 2, top + height / 2])(map.getBoundingClientRect())"
+    )
+    page.click(*box)
+    page.wait(f"document.querySelector('#answer h2')?.textContent === 'Pixel ({x}, {y})'")
+
+
+ANSWERED = "document.querySelector('#answer [data-name=n]') !== null"
+
+
+def test_a_click_shows_what_python_says(page: Page, address: str, run: Run) -> None:
+    x, y = busiest(run)
+    page.open(f"{address}#view={x},{y},3")
+    page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
+    click_pixel(page, x, y)
+    here = run.field.at(x, y)
+    assert told(page, "n") == here.n
+    vx, vy = here.modal_velocity_px_per_s
+    assert told(page, "direction") == pytest.approx(np.arctan2(vy, vx), abs=1e-5)
+    assert told(page, "modal_speed") == pytest.approx(np.hypot(vx, vy), rel=1e-5)
+    assert told(page, "standing_share") == pytest.approx(here.standing_share, abs=1e-6)
+    for percent, speed in here.percentiles_px_per_s.items():
+        assert told(page, f"speed_p{percent}") == pytest.approx(speed, rel=1e-5)
+        shown = page.value(f"document.querySelector('#answer [data-name=speed_p{percent}]').textContent")
+        assert shown == f"{speed * 0.23 * 3.6:.1f} km/h"
+    assert page.value("document.querySelector('#answer canvas').getContext('2d') !== null")
+    assert page.value("document.querySelectorAll('#answer [data-name^=mode_]').length") == len(here.modes)
+    for k, mode in enumerate(here.modes):
+        np.testing.assert_allclose(told(page, f"mode_{k}"), mode, rtol=1e-4, atol=0.02)
+
+
+def test_clicks_all_over_the_map_agree_and_are_quick(
+    page: Page, address: str, run: Run, record_property: Callable[[str, object], None]
+) -> None:
+    count = run.field.count()
+    places = np.argwhere(count > 0)[:: max(1, int((count > 0).sum()) // 8)]
+    taken = []
+    for y, x in places.tolist():
+        page.open("about:blank")
+        page.open(f"{address}#view={x},{y},2")
+        page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
+        click_pixel(page, x, y)
+        here = run.field.at(x, y)
+        assert told(page, "n") == here.n
+        assert told(page, "speed_p85") == pytest.approx(here.percentiles_px_per_s[85], rel=1e-5)
+        assert page.value("document.querySelectorAll('#answer [data-name^=mode_]').length") == len(here.modes)
+        taken.append(float(page.value("document.getElementById('answer').dataset.milliseconds")))
+    record_property("median_click_ms", median(taken))
+
+
+def test_the_line_counts_as_python_does(page: Page, address: str, run: Run) -> None:
+    crossed = 0
+    height, width = run.field.shape
+    for ends in (
+        (10, height / 2, width - 10, height / 2),
+        (width / 2, 10, width / 2, height - 10),
+        (0, 0, width, height),
+    ):
+        page.open("about:blank")
+        page.open(f"{address}#line={','.join(map(str, ends))}")
+        page.wait("document.querySelector('#answer [data-name=forward_count]') !== null")
+        crossings = run.crossings(ends[:2], ends[2:])
+        crossed += len(crossings)
+        for name, direction in (("forward", 1), ("back", -1)):
+            part = crossings[crossings["direction"] == direction]
+            assert told(page, f"{name}_count") == len(part)
+            if len(part):
+                speeds = np.percentile(part["speed_px_per_s"], (15, 50, 85))
+                found = [told(page, f"{name}_p{percent}") for percent in (15, 50, 85)]
+                np.testing.assert_allclose(found, speeds, rtol=1e-4)
+    assert crossed > 3
+
+
+def test_a_line_is_drawn_by_two_clicks_and_by_the_keyboard(page: Page, address: str) -> None:
+    page.open(address)
+    page.wait("document.getElementById('draw-line') !== null && document.querySelector('#layer option') !== null")
+    page.value("document.getElementById('draw-line').click()")
+    left, top = page.value("(({left, top}) => [left, top])(map.getBoundingClientRect())")
+    page.click(left + 200, top + 300)
+    page.click(left + 600, top + 300)
+    page.wait("document.querySelector('#answer [data-name=forward_count]') !== null")
+    assert "line=" in page.value("location.hash")
+    page.value("document.getElementById('map').focus()")
+    page.key("Enter", 13)
+    page.wait("document.querySelector('#answer h2').textContent.startsWith('Pixel')")
+    assert "line=" not in page.value("location.hash")
+
+
+def test_a_link_holds_the_view(page: Page, address: str, run: Run) -> None:
+    x, y = busiest(run)
+    page.open(f"{address}#layer=speed_p85&unit=mph&opacity=40&least=2&view={x},{y},1&pixel={x},{y}")
+    page.wait(ANSWERED)
+    shown = {
+        name: page.value(f"document.getElementById('{name}').value") for name in ("layer", "unit", "opacity", "least")
+    }
+    assert shown == {"layer": "speed_p85", "unit": "mph", "opacity": "40", "least": "2"}
+    speed = run.field.at(x, y).percentiles_px_per_s[85] * 0.23 * 2.2369362920544
+    assert page.value("document.querySelector('#answer [data-name=speed_p85]').textContent") == f"{speed:.1f} mph"
+    page.value("document.getElementById('layer').value = 'count'; layer.dispatchEvent(new Event('change'))")
+    assert "layer=count" in page.value("location.hash")
+    assert f"pixel={x},{y}" in page.value("location.hash")
+
+
+def test_every_layer_is_painted(page: Page, address: str) -> None:
+    page.open(address)
+    page.wait("document.querySelector('#layer option') !== null")
+    names = page.value("[...document.querySelectorAll('#layer option')].map((option) => option.value)")
+    assert {"direction", "speed", "speed_p85", "count", "direction_half90"} <= set(names)
+    painted = """(() => [...document.querySelectorAll('canvas.leaflet-tile-loaded')].some((canvas) => {
+      const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext('2d', {willReadFrequently: true});
+      copy.drawImage(canvas, 0, 0);
+      return copy.getImageData(0, 0, canvas.width, canvas.height).data.some((value) => value > 0);
+    }))()"""
+    for name in names:
+        page.value(f"layer.value = '{name}'; layer.dispatchEvent(new Event('change'))")
+        page.wait(painted)
+
+
+def test_tracks_under_the_cursor(page: Page, address: str, run: Run) -> None:
+    x, y = busiest(run)
+    page.open(f"{address}#view={x},{y},3&tracks=1&pixel={x},{y}")
+    page.wait("document.querySelector('#answer details.passages') !== null")
+    near = int(page.value("document.querySelector('#answer details.passages').dataset.count"))
+    assert 0 < near <= run.field.at(x, y).n + 2  # passages within a pixel and a half; the field's band is wider or not
+
+
+def test_hover_reads_direction_and_speed(page: Page, address: str, run: Run) -> None:
+    x, y = busiest(run)
+    page.open(f"{address}#view={x},{y},3")
+    page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
+    box = page.value(
+        "(({left, top, width, height}) => [left + width / 2, top + height / 2])(map.getBoundingClientRect())"
+    )
+    page.mouse("mouseMoved", *box)
+    page.wait("document.getElementById('readout').textContent.includes('vehicle')")
+    text = page.value("document.getElementById('readout').textContent")
+    vx, vy = run.field.at(x, y).modal_velocity_px_per_s
+    assert text.startswith(f"({x}, {y})")
+    assert f"{np.hypot(vx, vy) * 0.23 * 3.6:.1f} km/h" in text
+
+
+def test_the_summary_is_the_report(page: Page, address: str) -> None:
+    page.open(f"{address}#tab=summary")
+    page.wait("document.querySelector('#summary-panel').hidden === false")
+    text = page.value("document.getElementById('summary-panel').innerText")
+    for words in ("Which way traffic goes", "Registration", "Tracking gates", "What went in"):
+        assert words in text
+    page.wait("[...document.querySelectorAll('figure img')][0].naturalWidth > 300")
+
+
+@pytest.mark.parametrize("tab", ["map", "summary"])
+def test_a_small_screen_shows_it_without_scrolling_sideways(
+    chromium: Browser, address: str, run: Run, tab: str
+) -> None:
+    x, y = busiest(run)
+    with chromium.page(width=390, height=844) as small:
+        small.open(f"{address}#tab={tab}&pixel={x},{y}")
+        small.wait(ANSWERED)
+        assert small.value("document.documentElement.scrollWidth") <= 390
+        if tab == "map":
+            assert small.value("map.getBoundingClientRect().height") > 300
+
+
+def test_opened_from_the_disk_it_says_what_to_do(chromium: Browser, whole: tuple[Path, RunSummary]) -> None:
+    with chromium.page() as opened:
+        opened.open((whole[0] / "index.html").as_uri())
+        opened.wait("document.querySelector('#map .alarm') !== null")
+        assert "velfield view RUN" in opened.value("document.querySelector('#map .alarm').textContent")
+        assert opened.value("document.getElementById('summary-panel').hidden") is False

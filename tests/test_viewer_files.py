@@ -1,0 +1,115 @@
+"""What a run folder holds for its page: tiles of the base image, the list of layers, the report as a file."""
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from schemas.summary import RunSummary
+from schemas.view import ViewRecord
+from tests.small_flight import job, process
+from velfield import open_run
+from velfield.exporting import export_run
+from velfield.layout import RunLayout
+from velfield.steps import report as report_step
+from velfield.stores import open_field
+from velfield.viewer.layers import view_layers
+from velfield.viewer.pyramid import TILE_PX, pyramid_levels, pyramid_tiles
+from velfield.viewer.record import write_view_record
+
+
+def test_tiles_make_up_the_picture_at_every_level() -> None:
+    y, x = np.mgrid[:900, :1300]
+    grey = (127 + 60 * np.sin(x / 40) + 50 * np.cos(y / 55)).astype(np.uint8)
+    tiles = {
+        name: cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) for name, data in pyramid_tiles(grey)
+    }
+    assert pyramid_levels(*grey.shape) == 3
+    whole = np.vstack([np.hstack([tiles[f"0/{row}-{column}.jpg"] for column in range(3)]) for row in range(2)])
+    assert np.abs(whole.astype(int) - grey).max() < 12
+    assert tiles["2/0-0.jpg"].shape == (225, 325)
+    assert max(max(tile.shape) for tile in tiles.values()) <= TILE_PX
+
+
+def test_layers_follow_the_store() -> None:
+    values = np.array([[np.nan, 1.0, 2.0, 3.0]])
+    attributes = {
+        "modal_vx": {"units": "px s-1"},
+        "modal_vy": {"units": "px s-1"},
+        "velocity_noise": {},
+        "speed_change": {"units": "px s-1", "long_name": "change of the median speed"},
+        "headway": {"units": "s", "long_name": "time between vehicles"},
+    }
+    layers = {layer.name: layer for layer in view_layers(attributes, lambda _: values)}
+    assert list(layers) == ["direction", "speed", "speed_change", "headway"]
+    assert layers["speed_change"].kind == "change"
+    assert layers["headway"].title == "Time between vehicles"
+    assert layers["headway"].top == pytest.approx(2.96)
+
+
+def test_the_record_lists_what_is_stored(whole: tuple[Path, RunSummary]) -> None:
+    layout = RunLayout(whole[0])
+    record = ViewRecord.model_validate_json(layout.view_record.read_bytes())
+    run = open_run(whole[0])
+    assert (record.height_px, record.width_px) == run.field.shape
+    assert record.gsd_m == 0.23
+    assert record.segments.passages == len(np.unique(run.segments()["passage"]))
+    for name, array in record.arrays.items():
+        listed = set(zip(array.stored[::2], array.stored[1::2], strict=True))
+        tail = ("0", "0") if name == "velocity_histogram" else ()
+        for row, column in listed:
+            assert (layout.field / name / "c" / str(row) / str(column)).joinpath(*tail).is_file()
+        assert len(listed) == len([path for path in (layout.field / name / "c").glob("*/*") if path.exists()])
+
+
+def test_a_layer_added_later_is_shown(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
+    import shutil
+
+    root = tmp_path / "run"
+    shutil.copytree(whole[0], root, ignore=shutil.ignore_patterns("raw"))
+    layout = RunLayout(root)
+    store = open_field(layout.field, "r+")
+    shutil.copytree(layout.field / "speed_p50", layout.field / "speed_change")
+    assert "speed_change" in store.layer_names()
+    write_view_record(layout)
+    record = ViewRecord.model_validate_json(layout.view_record.read_bytes())
+    assert "change" in {layer.kind for layer in record.layers}
+
+
+def test_the_report_goes_by_mail(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
+    page = export_run(open_run(whole[0]), "report", tmp_path / "report.html").read_text()
+    assert page.count("data:image/jpeg;base64,") == 2
+    assert not re.findall(r'(?:src|href)="(?!data:)', page)
+    assert "<script" not in page
+    assert "Which way traffic goes" in page
+
+
+def test_without_a_built_page_the_report_stands_alone_and_it_is_said(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import shutil
+
+    from flows.console import Console
+
+    said: list[str] = []
+    monkeypatch.setattr(Console, "warn", lambda self, text: said.append(text))
+    monkeypatch.setattr(report_step, "page_is_built", lambda: False)
+    root = tmp_path / "run"
+    shutil.copytree(whole[0], root)
+    process(job(flight, root))
+    assert any("make page" in line for line in said)
+    page = (root / "index.html").read_text()
+    assert "<script" not in page
+    assert "Which way traffic goes" in page
+
+
+@pytest.mark.skipif(not report_step.page_is_built(), reason="the page is not built: `make page`")
+def test_the_page_holds_its_licences_and_no_address_elsewhere(whole: tuple[Path, RunSummary]) -> None:
+    licences = (whole[0] / "view" / "LICENSES.txt").read_text()
+    for package in ("leaflet", "zarrita", "zstddec"):
+        assert f"{package} " in licences
+    assert "Redistribution" in licences
+    page = re.sub(r"<script>.*?</script>", "", (whole[0] / "index.html").read_text(), flags=re.DOTALL)
+    assert not re.findall(r'(?:src|href)="(?:https?:)?//', page)
