@@ -26,6 +26,8 @@ app = App(
 )
 
 # Each in a file of its own, imported when it runs.
+app.command("flows.commands.init:init", name="init", help="Look at a video and write a commented flight.yaml.")
+app.command("flows.commands.config:config", name="config", help="The configuration that a run was made with.")
 app.command("flows.commands.view:view", name="view", help="Show a run's page in the browser.")
 app.command("flows.commands.annotate:annotate", name="annotate", help="Mark cars in the browser, to learn from.")
 app.command("flows.commands.export:export", name="export", help="Write a finished run in a format that others read.")
@@ -35,6 +37,9 @@ app.command(
 app.command("flows.commands.reprocess:reprocess", name="reprocess", help="A new base image under a finished run.")
 app.command("flows.commands.serve:serve", name="serve", help="Process what arrives in a folder, with a UI.")
 app.command("flows.commands.verify:verify", name="verify", help="Is a run folder whole; and make it so.")
+app.command("flows.commands.algebra:merge", name="merge", help="Add the fields of runs on one grid, exactly.")
+app.command("flows.commands.algebra:subtract", name="subtract", help="Take a field out of another again, exactly.")
+app.command("flows.commands.algebra:compare", name="compare", help="Map what changed between two fields.")
 app.command("flows.commands.bench:bench", name="bench", help="Speed and accuracy, against a peer in the same run.")
 
 Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative=())]
@@ -62,6 +67,7 @@ def run(
     every: str | None = None,
     start_s: float | None = None,
     stop_s: float | None = None,
+    time_slice: Annotated[str | None, Parameter(name="--slice")] = None,
     workers: int | None = None,
     scheduler: str | None = None,
     cluster: Path | None = None,
@@ -105,6 +111,8 @@ def run(
         Leave out what comes before, seconds from the first frame.
     stop_s
         Leave out what comes at or after, seconds from the first frame.
+    time_slice
+        Fields of slices of time besides: `15min`, or `07:00-09:00,15:00-18:00`, or seconds `0-300,300-600`.
     workers
         Processes of a local cluster. Default: threads of this process.
     scheduler
@@ -129,6 +137,7 @@ def run(
         "frames.fps": fps,
         "frames.start_s": start_s,
         "frames.stop_s": stop_s,
+        "field.slice": time_slice,
     }
     resolved = resolve_config(preset=preset, file=config, settings=settings, overrides=overrides)
     inputs = Inputs(

@@ -112,22 +112,17 @@ class RunLayout:
         return self.root / "field.zarr"
 
     @property
+    def slices(self) -> Path:
+        """Fields of slices of time, a store each."""
+        return self.root / "slices"
+
+    @property
     def maps(self) -> Path:
         return self.root / "maps"
 
     @property
     def report(self) -> Path:
         return self.root / "index.html"
-
-    @property
-    def results(self) -> Path:
-        """Results on other base images, a run folder each, by name."""
-        return self.root / "results"
-
-    @property
-    def results_index(self) -> Path:
-        """Names of all results, this folder's own first."""
-        return self.root / "results.json"
 
     @property
     def view(self) -> Path:
@@ -147,6 +142,16 @@ class RunLayout:
     def report_record(self) -> Path:
         """What the report tells, from which it can be written again."""
         return self.view / "report.json"
+
+    @property
+    def results(self) -> Path:
+        """Results on other base images, a run folder each, by name."""
+        return self.root / "results"
+
+    @property
+    def results_index(self) -> Path:
+        """Names of all results, this folder's own first."""
+        return self.root / "results.json"
 
     @property
     def commits(self) -> Path:

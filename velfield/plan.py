@@ -93,7 +93,7 @@ def make_plan(job: Job) -> Plan:
             "widen --start-s/--stop-s or lower --every"
         )
     inputs = _digest_inputs(job, info)
-    return Plan(job=job, info=info, indices=indices, inputs=inputs, keys=stage_keys(job.config, inputs))
+    return Plan(job=job.anywhere(), info=info, indices=indices, inputs=inputs, keys=stage_keys(job.config, inputs))
 
 
 def _digest_inputs(job: Job, info: SourceInfo) -> InputsRecord:
@@ -130,8 +130,8 @@ def stage_keys(config: FlightConfig, inputs: InputsRecord) -> dict[str, str]:
     units = [config.work.unit_frames, config.work.block_frames]
     key("frames", [config.frames], [], [inputs.source.digest, inputs.timestamps])
     key("lens", [config.lens], ["frames"])
-    key("base", [config.base, config.registration, config.gsd_m], ["lens"], [inputs.base])
-    key("registration", [config.registration, units], ["base"])
+    key("base", [config.base, config.registration, config.gsd_m], ["lens"], [inputs.base, inputs.detections])
+    key("registration", [config.registration, units], ["base"], [inputs.detections])
     key("detector", [config.detection], ["registration"], [inputs.labels, inputs.detector, inputs.detections])
     key("detections", [config.detection], ["detector"])
     key("links", [config.tracking], ["detections"])
@@ -144,5 +144,7 @@ def stage_keys(config: FlightConfig, inputs: InputsRecord) -> dict[str, str]:
 
 def write_flight_record(plan: Plan) -> None:
     """Write ``flight.json``."""
-    record = FlightRecord(code_version=code_version(), config=plan.config, inputs=plan.inputs)
+    record = FlightRecord(
+        code_version=code_version(), config=plan.config, inputs=plan.inputs, given=plan.job.inputs, keys=plan.keys
+    )
     write_atomically(plan.layout.flight, record.model_dump_json(indent=1).encode())

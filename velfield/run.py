@@ -14,6 +14,7 @@ from velfield.field.segments import Segments, segment_table
 from velfield.field.view import VelocityField
 from velfield.insight.crossings import line_crossings, settle_px
 from velfield.layout import RunLayout
+from velfield.places import local_copy
 from velfield.steps.field_reading import FieldSlice, open_field_slices, open_velocity_field
 from velfield.steps.frame_maps import FrameMaps
 from velfield.steps.grid import read_grid_of
@@ -143,4 +144,5 @@ class Run:
         from velfield.sources.pictures import read_picture_grey
 
         path = self.layout.base_image_tif if self.layout.base_image_tif.exists() else self.layout.base_image
-        return read_picture_grey(path, self.record.config.frames.max_pixels)
+        with local_copy(path) as here:
+            return read_picture_grey(here, self.record.config.frames.max_pixels)

@@ -8,7 +8,7 @@ Three rules that were paid for (each is a fault seen in zarr or in its use):
 - a missing chunk reads as the fill value: whoever reads asks the commit records which chunks must exist.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from zarr.codecs import ZstdCodec
 
 from velfield.errors import InputError
+from velfield.places import RemotePath
 
 _STATUS_BYTES = 160
 HISTOGRAM = "velocity_histogram"
@@ -45,9 +46,13 @@ def _create(
     )
 
 
+def _store(path: Path) -> Any:
+    return path.url if isinstance(path, RemotePath) else path
+
+
 def _open(path: Path, mode: str) -> zarr.Group:
     try:
-        return zarr.open_group(path, mode=cast(Any, mode), use_consolidated=False)
+        return zarr.open_group(_store(path), mode=cast(Any, mode), use_consolidated=False)
     except FileNotFoundError:
         raise InputError(f"{path} is not there: run `velfield run` on this folder first") from None
 
@@ -56,28 +61,55 @@ def _array(group: zarr.Group, name: str) -> zarr.Array[Any]:
     return cast("zarr.Array[Any]", group[name])
 
 
+def _read(path: Path, group: zarr.Group, name: str, selection: Any) -> NDArray[Any]:
+    try:
+        return np.asarray(_array(group, name)[selection])
+    except Exception as error:
+        raise StoreError(
+            f"{path / name}: a chunk is damaged ({error}); `velfield verify {path.parent}` says which"
+        ) from error
+
+
+def _metadata(path: Path) -> list[Path]:
+    """What describes a store and its arrays: as much part of it as its chunks."""
+    return [path / "zarr.json", *sorted(path.glob("*/zarr.json"))]
+
+
+def _existing(paths: Iterable[Path]) -> list[Path]:
+    """Chunks that were written: zarr leaves out those that hold nothing but the fill value."""
+    return [path for path in paths if path.exists()]
+
+
 # ------------------------------------------------------------------------------------------------------------- frames
 
 
 def store_key(path: Path) -> str | None:
     """Content key that a store was laid out under; none where it is not there or not whole."""
     try:
-        return str(zarr.open_group(path, mode="r", use_consolidated=False).attrs["key"])
+        return str(zarr.open_group(_store(path), mode="r", use_consolidated=False).attrs["key"])
     except (FileNotFoundError, KeyError, ValueError):
         return None
+
+
+FRAME_COLUMNS: dict[str, tuple[str, float]] = {
+    "time_s": ("float64", np.nan),
+    "source_index": ("int64", -1),
+    "flags": ("uint16", 2),
+    "sharpness": ("float32", np.nan),
+    "brightness": ("float32", np.nan),
+}
+"""Column -> type, and what stands there until it is written."""
 
 
 def create_frames(
     path: Path, *, key: str, count: int, height: int, width: int, unit_frames: int, source: Mapping[str, Any]
 ) -> None:
     """Lay out ``frames.zarr``: one frame a chunk; a unit of a column a chunk. Frames are unreadable until written."""
-    group = zarr.create_group(path, overwrite=True, attributes={"source": dict(source)})
+    group = zarr.create_group(_store(path), overwrite=True, attributes={"source": dict(source)})
     chunk = min(unit_frames, max(count, 1))
     _create(group, "raw", (count, height, width), (1, height, width), "uint8", dimension_names=("frame", "y", "x"))
-    for name, dtype, fill in (("time_s", "float64", np.nan), ("source_index", "int64", -1), ("flags", "uint16", 2)):
+    for name, (dtype, fill) in FRAME_COLUMNS.items():
         _create(group, name, (count,), (chunk,), dtype, fill_value=fill, dimension_names=("frame",))
-    for name in ("sharpness", "brightness"):
-        _create(group, name, (count,), (chunk,), "float32", fill_value=np.nan, dimension_names=("frame",))
     group.attrs["key"] = key  # last: a store without it was not laid out whole
 
 
@@ -114,17 +146,24 @@ class FrameStore:
             raise StoreError(f"{self.path}: the chunk of frame {frame} is damaged ({error})") from error
 
     def write(self, frame: int, grey: NDArray[np.uint8]) -> None:
-        """Write one frame: one chunk."""
-        _array(self.group, "raw")[frame] = grey
+        """Write one frame: one chunk, a black frame's too, or it could not be told from one that is gone."""
+        _array(self.group, "raw").with_config({"write_empty_chunks": True})[frame] = grey
 
     def column(self, name: str) -> NDArray[Any]:
         """One column: ``time_s``, ``source_index``, ``flags``, ``sharpness`` or ``brightness``, (frames,)."""
-        return np.asarray(_array(self.group, name)[:])
+        return _read(self.path, self.group, name, slice(None))
 
     def write_columns(self, start: int, columns: Mapping[str, NDArray[Any]]) -> None:
         """Write a whole unit of columns, from frame ``start`` on."""
         for name, values in columns.items():
             _array(self.group, name)[start : start + len(values)] = values
+
+    def files(self, start: int, stop: int) -> list[Path]:
+        """Files that hold the frames ``[start, stop)``, a unit, and their columns; and the store's metadata."""
+        raw = [self.path / "raw" / "c" / str(frame) / "0" / "0" for frame in range(start, stop)]
+        unit = start // int(_array(self.group, "time_s").chunks[0])
+        columns = [self.path / name / "c" / str(unit) for name in FRAME_COLUMNS]
+        return [*_metadata(self.path), *_existing([*raw, *columns])]
 
 
 def open_frames(path: Path, mode: str = "r") -> FrameStore:
@@ -146,7 +185,7 @@ REGISTRATION_COLUMNS: dict[str, str] = {
 
 def create_registration(path: Path, *, key: str, count: int, vector_length: int, unit_frames: int) -> None:
     """Lay out ``registration.zarr``: chunks are units, so that a unit has one writer."""
-    group = zarr.create_group(path, overwrite=True)
+    group = zarr.create_group(_store(path), overwrite=True)
     chunk = min(unit_frames, max(count, 1))
     _create(group, "vector", (count, vector_length), (chunk, vector_length), "float64", fill_value=np.nan)
     _create(group, "status", (count, _STATUS_BYTES), (chunk, _STATUS_BYTES), "uint8", fill_value=0)
@@ -179,20 +218,27 @@ class RegistrationStore:
 
     def vector(self, frame: int) -> NDArray[np.float64]:
         """Flat parameters of one frame's transform; NaN where it is not registered."""
-        return np.asarray(_array(self.group, "vector")[frame])
+        return _read(self.path, self.group, "vector", frame)
 
     def vectors(self, start: int, stop: int) -> NDArray[np.float64]:
         """Flat parameters of the frames ``[start, stop)``."""
-        return np.asarray(_array(self.group, "vector")[start:stop])
+        return _read(self.path, self.group, "vector", slice(start, stop))
 
     def statuses(self, start: int = 0, stop: int | None = None) -> list[str]:
         """``ok``, ``failed:<reason>`` or ``skipped:<reason>`` of each frame; empty where nothing was done yet."""
-        rows = np.asarray(_array(self.group, "status")[start:stop])
+        rows = _read(self.path, self.group, "status", slice(start, stop))
         return [bytes(row).rstrip(b"\0").decode(errors="replace") for row in rows]
 
     def column(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
         """One of ``REGISTRATION_COLUMNS``."""
-        return np.asarray(_array(self.group, name)[start:stop])
+        return _read(self.path, self.group, name, slice(start, stop))
+
+    def files(self, start: int) -> list[Path]:
+        """Files that hold the unit from frame ``start`` on, and the store's metadata."""
+        unit = start // int(_array(self.group, "vector").chunks[0])
+        tables = [self.path / name / "c" / str(unit) / "0" for name in ("vector", "status")]
+        columns = [self.path / name / "c" / str(unit) for name in REGISTRATION_COLUMNS]
+        return [*_metadata(self.path), *_existing([*tables, *columns])]
 
 
 def open_registration(path: Path, mode: str = "r") -> RegistrationStore:
@@ -227,7 +273,7 @@ def create_field(
     layers : name -> attributes
         (y, x) layers beside the histogram; ``dtype`` among the attributes says their type, float32 where absent.
     """
-    group = zarr.create_group(path, overwrite=True, attributes=dict(attributes))
+    group = zarr.create_group(_store(path), overwrite=True, attributes=dict(attributes))
     n = len(velocities_px_per_s)
     grid_mapping = {"grid_mapping": "crs"} if attributes.get("crs_wkt") else {}
     for name, what in histograms.items():
@@ -336,7 +382,15 @@ class FieldStore:
 
     def layer(self, name: str) -> NDArray[Any]:
         """A whole layer, (y, x)."""
-        return np.asarray(_array(self.group, name)[:])
+        return _read(self.path, self.group, name, slice(None))
+
+    def files(self, tiles: Iterable[tuple[int, int]], group: tuple[int, int]) -> list[Path]:
+        """Files that hold the tiles (row, column) and the layers of one group; and the store's metadata."""
+        places = [Path("c", str(row), str(column), "0", "0") for row, column in tiles]
+        histogram = [self.path / name / place for name in self.histogram_names() for place in places]
+        layers = [self.path / name / "c" / str(group[0]) / str(group[1]) for name in self.layer_names()]
+        axes = [self.path / name / "c" / "0" for name, array in self.group.arrays() if array.ndim == 1]
+        return [*_metadata(self.path), *_existing([*histogram, *layers, *axes])]
 
     def layer_names(self) -> list[str]:
         """Names of the (y, x) layers."""

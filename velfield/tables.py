@@ -1,6 +1,7 @@
 """Tables of a run folder: Parquet parts of one unit each, and the patches beside them."""
 
 import io
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -43,12 +44,26 @@ def write_table(path: Path, table: pd.DataFrame, columns: Mapping[str, str]) -> 
     write_atomically(path, buffer.getvalue())
 
 
+def link_file(source: Path, target: Path) -> Path:
+    """A file under a second name, whole or not at all; no bytes are copied where the disk can do without.
+
+    Files of a run folder are replaced, never changed in place, so what is done to one name is not seen under the other.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.unlink(missing_ok=True)
+    try:
+        os.link(source, target)
+    except (OSError, TypeError):  # another disk, or no disk at all
+        write_atomically(target, source.read_bytes())
+    return target
+
+
 def read_tables(
     paths: Sequence[Path], columns: Mapping[str, str], *, only: Sequence[str] | None = None
 ) -> pd.DataFrame:
     """Parts put together in order; ``only`` names the columns that are wanted."""
     wanted = {name: columns[name] for name in (only or columns)}
-    parts = [pd.read_parquet(path, columns=list(wanted)) for path in paths]
+    parts = [pd.read_parquet(io.BytesIO(path.read_bytes()), columns=list(wanted)) for path in paths]
     parts = [part for part in parts if len(part)]
     return conform(pd.concat(parts, ignore_index=True), wanted) if parts else empty(wanted)
 
@@ -62,5 +77,5 @@ def write_patches(path: Path, patches: Mapping[str, NDArray[Any]]) -> None:
 
 def read_patches(path: Path) -> Patches:
     """Pictures of the detections by name."""
-    with np.load(path, allow_pickle=False) as file:
+    with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
         return {name: file[name] for name in file.files}

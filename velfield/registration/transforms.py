@@ -317,7 +317,7 @@ class FrameTransform:
 class ComposedTransform:
     """A frame's map followed by another map of the plane."""
 
-    first: FrameTransform
+    first: "FrameTransform | ComposedTransform"
     second: PolyprojectiveTransform
 
     @property
@@ -337,6 +337,10 @@ class ComposedTransform:
     def to_raw(self, xy_base: FloatArray) -> FloatArray:
         """Base pixels (n, 2) to raw pixels (n, 2); NaN rows where there is no inverse."""
         return self.first.to_raw(self.second.inverse(xy_base))
+
+    def followed_by(self, transform: PolyprojectiveTransform) -> "ComposedTransform":
+        """This map, then another: from one base image on to the next."""
+        return ComposedTransform(self, transform)
 
 
 FrameMap = FrameTransform | ComposedTransform

@@ -18,6 +18,8 @@ from schemas.records import GridRecord
 from velfield.camera.lens import Lens, pinhole
 from velfield.errors import Failure, InputError
 from velfield.exports.cog import write_cog
+from velfield.layout import RunLayout
+from velfield.places import local_copy, written_locally
 from velfield.plan import Plan
 from velfield.progress import advance
 from velfield.provenance import write_atomically
@@ -84,7 +86,7 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeyPoints]]) -> Outcom
         if direct is not None:
             grid, outputs, used = (
                 _given_grid(plan, given, reference, direct),
-                _write_given(plan, given),
+                write_given_picture(plan.layout, given),
                 len(key_points),
             )
             layout.own_to_base.unlink(missing_ok=True)
@@ -105,6 +107,7 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeyPoints]]) -> Outcom
     if given is None:
         grid = _own_grid(plan, own, reference)
         write_atomically(layout.base_image, png_bytes(own.image))
+        layout.base_image_tif.unlink(missing_ok=True)
         layout.own_to_base.unlink(missing_ok=True)
         outputs.append(layout.base_image)
     else:
@@ -115,6 +118,7 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeyPoints]]) -> Outcom
 
 def _finish(plan: Plan, grid: GridRecord, outputs: list[Path], frames: int, given: BasePicture | None) -> Outcome:
     layout = plan.layout
+    layout.rebased.unlink(missing_ok=True)
     write_atomically(layout.grid, grid.model_dump_json(indent=1).encode())
     outputs.append(layout.grid)
     advance("base")
@@ -161,7 +165,7 @@ def _onto_given(plan: Plan, own: OwnBase, given: BasePicture, reference: int) ->
     record = polyprojective_record(found.transform.polyprojective)
     write_atomically(layout.own_to_base, record.model_dump_json(indent=1).encode())
     write_atomically(layout.base_error_map, png_bytes(_error_picture(found)))
-    written = [layout.own_to_base, layout.base_error_map, *_write_given(plan, given)]
+    written = [layout.own_to_base, layout.base_error_map, *write_given_picture(plan.layout, given)]
     grid = _given_grid(plan, given, reference, None)
     found_so = {"intersensor_error_px": found.left_out_error_px, "intersensor_points": len(found.error_left_out_px)}
     return grid.model_copy(update=found_so), written
@@ -198,13 +202,13 @@ def _straight_to(plan: Plan, given: BasePicture, key_points: dict[int, KeyPoints
     return _Direct(float(np.mean(heldout)), int(np.mean(points)))
 
 
-def _write_given(plan: Plan, given: BasePicture) -> list[Path]:
+def write_given_picture(layout: RunLayout, given: BasePicture) -> list[Path]:
     """The given picture as the run's base image: GeoTIFF where it has coordinates."""
-    layout = plan.layout
+    for before in (layout.base_image, layout.base_image_tif):
+        before.unlink(missing_ok=True)
     if given.crs_wkt is not None and given.affine is not None:
-        write_cog(
-            layout.base_image_tif, [given.grey], names=["grey"], units=["1"], crs_wkt=given.crs_wkt, affine=given.affine
-        )
+        with written_locally(layout.base_image_tif) as here:
+            write_cog(here, [given.grey], names=["grey"], units=["1"], crs_wkt=given.crs_wkt, affine=given.affine)
         return [layout.base_image_tif]
     write_atomically(layout.base_image, png_bytes(given.grey))
     return [layout.base_image]
@@ -250,6 +254,6 @@ def _make_reference(plan: Plan) -> BaseReference:
         given = _given_picture(plan)
         assert given is not None, "the grid says that a base image was given"
         return prepare_base(given.grey, plan.config.registration, mask=given.valid, frame_shape=shape)
-    grey = read_picture_grey(plan.layout.own_base_image, limit)
-    mask = read_picture_grey(plan.layout.own_base_mask, limit) > 0
+    with local_copy(plan.layout.own_base_image) as picture, local_copy(plan.layout.own_base_mask) as known:
+        grey, mask = read_picture_grey(picture, limit), read_picture_grey(known, limit) > 0
     return prepare_base(grey, plan.config.registration, mask=mask, frame_shape=shape)

@@ -8,7 +8,7 @@ import numpy as np
 from schemas.detector import PrecisionRecallCurve
 from schemas.flight import DetectionConfig
 from schemas.records import WorkingRecord
-from velfield.detection.detector import Detector, load_detector, save_detector, shipped_detector
+from velfield.detection.detector import Detector, load_detector, shipped_detector
 from velfield.detection.motion_difference import MotionBackground, MotionFrame, motion_background
 from velfield.detection.motion_evidence import evidence_of
 from velfield.detection.motion_labels import FrameLabels, MotionLabels, choose_frames, labels_from_motion, working_scale
@@ -169,7 +169,7 @@ def _finish(
     """Write what detection needs: the detector, the working grid, the background where the detector looks at it."""
     layout, outputs, notes = plan.layout, [plan.layout.working], []
     if detector is not None:
-        save_detector(detector, layout.detector)
+        write_atomically(layout.detector, detector.record.model_dump_json().encode())
         outputs.append(layout.detector)
     if background is not None and detector is not None and detector.uses_background:
         write_background(layout, background)

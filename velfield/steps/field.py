@@ -1,6 +1,5 @@
 """The velocity histogram, a group of tiles at a time: each tile from the segments that reach it, written once."""
 
-import shutil
 from functools import partial
 from math import isfinite
 from pathlib import Path
@@ -14,6 +13,7 @@ from velfield.field.accumulate import Weight, accumulate_tile
 from velfield.field.bins import VelocityBins, band_radius_px
 from velfield.field.segments import SEGMENT_DTYPE, Segments, segment_table, segments_by_tile
 from velfield.field.slices import TimeSlice, parse_slices, slice_of_passages
+from velfield.places import remove_tree
 from velfield.plan import Plan
 from velfield.progress import advance
 from velfield.steps.field_writing import Group, GroupWriter, create_field_store, groups_of
@@ -60,7 +60,7 @@ def lay_out_field(plan: Plan) -> None:
         return
     times_s = plan.info.times_s[plan.indices]
     first_s, last_s = float(times_s[0]), float(times_s[-1])
-    shutil.rmtree(plan.layout.slices, ignore_errors=True)
+    remove_tree(plan.layout.slices)
     config = plan.config.field
     create = partial(
         create_field_store,
@@ -93,12 +93,13 @@ def accumulate_group(plan: Plan, group: Group) -> Outcome:
     segments = _segments_near(plan, writer)
     weight = field_weight(config)
     accumulate_into(writer, segments, weight=weight, by_time=config.by_time)
-    files = [plan.layout.field, *(path for path, _ in slice_stores(plan))]
+    files = writer.files()
     slices = slice_stores(plan)
     number = slice_of_passages(segments, [part for _, part in slices]) if slices else None
     for k, (path, _) in enumerate(slices):
         part = GroupWriter(open_field(path, "r+"), group, grid=grid, config=config, bins=bins)
         accumulate_into(part, segments[number == k], weight=weight, by_time=False)
+        files += part.files()
     advance("field")
     count = writer.layers["count"]
     return Outcome(

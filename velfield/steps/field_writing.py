@@ -80,6 +80,10 @@ class GroupWriter:
         for name, values in self.layers.items():
             self.store.write_layer(name, self.y0, self.x0, values)
 
+    def files(self) -> list[Path]:
+        """What was written, once closed; and what describes it."""
+        return self.store.files(self.touched, self.group)
+
 
 def _fill(attributes: dict[str, object]) -> float:
     return np.nan if str(attributes.get("dtype", "float32")).startswith("float") else 0

@@ -6,13 +6,12 @@ given, the own one is registered to it once, and every frame's map is the compos
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from schemas.camera import CameraRecord
 from schemas.flight import FlightConfig, RegistrationConfig
-from schemas.records import PolyprojectiveRecord
+from schemas.records import PolyprojectiveRecord, RebaseRecord
 from velfield.camera.lens import Lens, lens_from_record
 from velfield.errors import InputError
 from velfield.layout import RunLayout
@@ -49,9 +48,14 @@ def polyprojective_of(record: PolyprojectiveRecord) -> PolyprojectiveTransform:
     return PolyprojectiveTransform(np.array(record.coefficients), np.array(record.source), np.array(record.target))
 
 
-def read_own_to_base(path: Path) -> PolyprojectiveTransform | None:
-    """Own base pixels -> base pixels; none where no base image was given, and they are the same."""
-    return polyprojective_of(PolyprojectiveRecord.model_validate_json(path.read_bytes())) if path.exists() else None
+def _onward(layout: RunLayout) -> tuple[PolyprojectiveTransform, ...]:
+    """What stands between the picture that frames are registered to and base pixels, in order; mostly nothing."""
+    records = []
+    if layout.own_to_base.exists():
+        records.append(PolyprojectiveRecord.model_validate_json(layout.own_to_base.read_bytes()))
+    if layout.rebased.exists():
+        records.append(RebaseRecord.model_validate_json(layout.rebased.read_bytes()).transform)
+    return tuple(polyprojective_of(record) for record in records)
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,8 @@ class FrameMaps:
     width: int
     height: int
     lens: Lens
-    own_to_base: PolyprojectiveTransform | None
+    onward: tuple[PolyprojectiveTransform, ...]
+    """Maps that follow a frame's own: to a given base image, and from that to a newer one."""
     store: RegistrationStore
     config: RegistrationConfig
 
@@ -73,7 +78,7 @@ class FrameMaps:
             width=width,
             height=height,
             lens=read_lens(layout),
-            own_to_base=read_own_to_base(layout.own_to_base),
+            onward=_onward(layout),
             store=open_registration(layout.registration),
             config=config.registration,
         )
@@ -83,7 +88,9 @@ class FrameMaps:
         vector = self.store.vector(frame)
         if not np.isfinite(vector).all():
             return None
-        own = FrameTransform.from_vector(
+        found: FrameMap = FrameTransform.from_vector(
             vector, width=self.width, height=self.height, lens=self.lens, config=self.config
         )
-        return own if self.own_to_base is None else own.followed_by(self.own_to_base)
+        for transform in self.onward:
+            found = found.followed_by(transform)
+        return found

@@ -70,4 +70,4 @@ def read_unit(plan: Plan, frames: range) -> Outcome:
     }
     store.write_columns(frames.start, columns)
     usable = int(np.sum((flags & int(UNUSABLE)) == 0))
-    return Outcome([store.path], {"frames": len(frames), "usable": usable}, notes)
+    return Outcome(store.files(frames.start, frames.stop), {"frames": len(frames), "usable": usable}, notes)

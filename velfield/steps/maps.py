@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from velfield.exports.cog import write_cog
 from velfield.field.bins import standing_px_per_s
 from velfield.field.statistics import direction_rad, speed_px_per_s
+from velfield.places import local_copy, written_locally
 from velfield.plan import Plan
 from velfield.progress import advance
 from velfield.provenance import write_atomically
@@ -53,7 +54,8 @@ def read_base_image(plan: Plan) -> NDArray[np.uint8]:
     """The base image, (y, x) uint8."""
     layout = plan.layout
     path = layout.base_image_tif if layout.base_image_tif.exists() else layout.base_image
-    return read_picture_grey(path, plan.config.frames.max_pixels)
+    with local_copy(path) as here:
+        return read_picture_grey(here, plan.config.frames.max_pixels)
 
 
 def _layers(plan: Plan, direction: Layer, speed: Layer) -> list[Path]:
@@ -67,14 +69,15 @@ def _layers(plan: Plan, direction: Layer, speed: Layer) -> list[Path]:
         ("direction", heading, about, "degree"),
         ("speed", speed * factor, "modal speed", unit),
     ):
-        write_cog(
-            maps / f"{name}.tif",
-            [values.astype(np.float32)],
-            names=[label],
-            units=[units],
-            crs_wkt=grid.crs_wkt,
-            affine=grid.affine,
-        )
+        with written_locally(maps / f"{name}.tif") as here:
+            write_cog(
+                here,
+                [values.astype(np.float32)],
+                names=[label],
+                units=[units],
+                crs_wkt=grid.crs_wkt,
+                affine=grid.affine,
+            )
     return [maps / "direction.tif", maps / "speed.tif"]
 
 

@@ -15,7 +15,7 @@ class Outcome:
     """What a unit of work did."""
 
     outputs: list[Path] = field(default_factory=list)
-    """Files and stores written, inside the run folder."""
+    """Files written, inside the run folder; of a store, its chunks."""
     counts: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     """Warnings, one line each."""
@@ -34,15 +34,11 @@ def unit_name(frames: range) -> str:
 
 def commit(plan: Plan, stage: str, unit: str, outcome: Outcome, *, started: float) -> CommitRecord:
     """Write the record of a finished unit: from now on it is not done again."""
-    files = [path for path in outcome.outputs if path.is_file()]
-    stores = [path for path in outcome.outputs if not path.is_file()]
-    outputs = digest_outputs(plan.layout, files)
-    outputs |= {path.relative_to(plan.layout.root).as_posix(): "" for path in stores}
     record = CommitRecord(
         stage=stage,
         unit=unit,
         key=plan.keys[stage],
-        outputs=outputs,
+        outputs=digest_outputs(plan.layout, outcome.outputs),
         counts=outcome.counts,
         notes=tuple(outcome.notes),
         seconds=max(0.0, time.time() - started),

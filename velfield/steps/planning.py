@@ -1,8 +1,11 @@
 """What a run would do, said before it is done: units, task runs, bytes, what is finished already."""
 
 import shutil
+from pathlib import Path
 
+from velfield.errors import InputError
 from velfield.layout import STAGES
+from velfield.places import is_remote
 from velfield.plan import Plan
 from velfield.steps.field_writing import GROUP_TILES
 from velfield.steps.outcome import committed, unit_name
@@ -14,6 +17,11 @@ _BYTES_A_DETECTION_FRAME = 150_000
 _BYTES_A_TILE = 200_000
 _TOUCHED = 0.1
 """Share of the map that traffic touches: a few per cent, with a margin."""
+
+
+_PROCESS_BYTES = 500_000_000
+_BYTES_A_PIXEL_IN_HAND = 350
+"""What a process takes by itself, and for each unit at a time: peaks of runs of 1280 x 960 and 1920 x 1080 px."""
 
 
 def planned_units(plan: Plan) -> dict[str, list[str]]:
@@ -35,8 +43,33 @@ def estimated_bytes(plan: Plan) -> int:
     return int(frames + tiles + 8 * pixels)
 
 
-def describe_plan(plan: Plan) -> str:
-    """The plan as text: a line a stage, then bytes needed and free."""
+def estimated_memory(plan: Plan, at_a_time: int) -> int:
+    """Bytes of memory that ``at_a_time`` units take together, whatever the flight's length."""
+    return _PROCESS_BYTES + at_a_time * plan.info.width * plan.info.height * _BYTES_A_PIXEL_IN_HAND
+
+
+def check_space(plan: Plan) -> None:
+    """Refuse a run that cannot end well, before it starts.
+
+    Raises
+    ------
+    InputError
+        The disk has less free than what is still to be written.
+    """
+    if is_remote(plan.layout.root):
+        return
+    names = [unit_name(frames) for frames in plan.units]
+    undone = sum(committed(plan, "frames", name) is None for name in names)
+    needed, free = int(estimated_bytes(plan) * undone / len(names)), _free_bytes(plan.layout.root)
+    if needed > free:
+        raise InputError(
+            f"{plan.layout.root}: about {needed / 1e9:.2f} GB needed, {free / 1e9:.2f} GB free; "
+            "make room, give --out on another disk, or fewer frames with --every or --stop-s"
+        )
+
+
+def describe_plan(plan: Plan, at_a_time: int = 2) -> str:
+    """The plan as text: a line a stage, then bytes needed and free, and memory for so many units at a time."""
     lines = [f"{plan.job.inputs.source}: {plan.info.frame_count} frames of {plan.info.width} x {plan.info.height} px, "]
     lines[0] += f"{plan.frame_count} of them to work on, {plan.unit_frames} a unit"
     total = 0
@@ -45,9 +78,16 @@ def describe_plan(plan: Plan) -> str:
         total += len(units)
         lines.append(f"  {stage:<13} {len(units):>5} units, {done:>5} done")
     root = plan.layout.root
-    existing = next(path for path in (root, *root.resolve().parents) if path.exists())
-    free = shutil.disk_usage(existing).free
-    lines.append(
-        f"{total} task runs; about {estimated_bytes(plan) / 1e9:.2f} GB needed in {root}, {free / 1e9:.1f} GB free"
-    )
+    lines.append(f"{total} task runs; about {estimated_bytes(plan) / 1e9:.2f} GB needed in {root}{_free(root)}")
+    memory = estimated_memory(plan, at_a_time) / 1e9
+    lines.append(f"about {memory:.1f} GB of memory with {at_a_time} units at a time")
     return "\n".join(lines)
+
+
+def _free(root: Path) -> str:
+    return "" if is_remote(root) else f", {_free_bytes(root) / 1e9:.1f} GB free"
+
+
+def _free_bytes(root: Path) -> int:
+    existing = next(path for path in (root, *root.resolve().parents) if path.exists())
+    return shutil.disk_usage(existing).free

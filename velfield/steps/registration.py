@@ -84,12 +84,13 @@ def _write(plan: Plan, frames: range, flags: NDArray[np.uint16], results: dict[i
             vectors[k] = result.transform.to_vector(config)
         for name in columns:
             columns[name][k] = getattr(result, name)
-    open_registration(plan.layout.registration, "r+").write(frames.start, vectors, statuses, columns)
+    store = open_registration(plan.layout.registration, "r+")
+    store.write(frames.start, vectors, statuses, columns)
     registered = statuses.count("ok")
     counts = {"frames": float(len(frames)), "registered": float(registered)}
     if registered:
         counts["heldout_px"] = float(np.nanmean(columns["heldout_px"]))
-    return Outcome([plan.layout.registration], counts)
+    return Outcome(store.files(frames.start), counts)
 
 
 def usable_frames(plan: Plan) -> NDArray[np.bool_]:

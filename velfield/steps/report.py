@@ -148,7 +148,8 @@ def report_figures(layout: RunLayout) -> dict[str, ReportFigure]:
     """The pictures of the report, their bytes in them, by name."""
     figures = {}
     for name, (title, caption) in _CAPTIONS.items():
-        picture = cv2.imread(str(layout.maps / f"{name}.png"))
+        encoded = np.frombuffer((layout.maps / f"{name}.png").read_bytes(), np.uint8)
+        picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
         figures[name] = ReportFigure(
             title=title,
             caption=caption,

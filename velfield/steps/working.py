@@ -1,5 +1,6 @@
 """Frames on the working grid: the base image's, scaled so that a car is about 8 x 16 px whatever the footage."""
 
+import io
 from dataclasses import dataclass
 
 import numpy as np
@@ -104,8 +105,6 @@ def read_working(layout: RunLayout) -> WorkingRecord:
 
 def write_background(layout: RunLayout, background: MotionBackground) -> None:
     """Write ``base/background.npz``."""
-    import io
-
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer,
@@ -120,5 +119,5 @@ def write_background(layout: RunLayout, background: MotionBackground) -> None:
 
 def read_background(layout: RunLayout) -> MotionBackground:
     """Read ``base/background.npz``."""
-    with np.load(layout.background, allow_pickle=False) as file:
+    with np.load(io.BytesIO(layout.background.read_bytes()), allow_pickle=False) as file:
         return MotionBackground(file["median"], file["low"], file["high"], file["valid"])

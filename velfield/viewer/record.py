@@ -8,7 +8,6 @@ Everything in it can be made again from the run folder: `write_view` does.
 """
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from velfield.field.bins import standing_px_per_s
 from velfield.field.segments import Segments
 from velfield.insight.crossings import settle_px
 from velfield.layout import RunLayout
+from velfield.places import remove_tree
 from velfield.provenance import write_atomically
 from velfield.run import open_run
 from velfield.steps.grid import north_of
@@ -42,7 +42,7 @@ def write_view(layout: RunLayout) -> None:
 def write_view_data(layout: RunLayout) -> list[Path]:
     """Write the tiles of the base image and the segments; returns the files."""
     run = open_run(layout.root)
-    shutil.rmtree(layout.view / "base", ignore_errors=True)  # tiles of an earlier, larger base image
+    remove_tree(layout.view / "base")  # tiles of an earlier, larger base image
     written = []
     for name, data in pyramid_tiles(run.base_image):
         path = layout.view / "base" / name
