@@ -110,7 +110,7 @@ def test_length_of_a_usual_car_comes_out_of_its_upright_box_at_any_turn(angle, l
         ("l.csv", "frame,x_px,y_px,length_px\na.png,5,5,-2\n", "both > 0"),
         ("l.csv", "filename,xmin,ymin,xmax,ymax,label\na.png,1,2,3,4,car\n", "expected labels as CSV `frame,x_px,y_px"),
         ("l.csv", "frame,x_px,y_px,angle\na.png,5,5,3\n", "expected labels as CSV"),
-        ("l.json", '{"shapes": []}', "found JSON, expected a CSV .* or a YOLO folder"),
+        ("l.json", '{"shapes": []}', "found JSON of another kind, expected COCO, LabelMe, VIA or GeoJSON"),
         ("l.xml", "<annotation/>", "found XML"),
         ("l.txt", "1,2,3,4\n", "a .txt that is not YOLO"),
         ("a.txt", "0 0.5 0.5 0.1 0.1\n0 12 34 10 10\n", "shares of the picture"),

@@ -9,16 +9,18 @@ import pandas as pd
 
 from schemas.tables import LABEL_COLUMNS
 from velfield.errors import InputError
+from velfield.sources.annotations import is_annotation_file, read_annotations
 from velfield.sources.frames import SourceInfo
 from velfield.sources.paths import local_path
 from velfield.sources.table import finite_cell, read_csv_rows
 from velfield.sources.yolo import Box, looks_like_yolo, read_yolo
 
 FORMATS = (
-    "a CSV `frame,x_px,y_px[,orientation_rad,length_px,width_px]` in raw pixels, or a YOLO folder, a .txt a picture"
+    "a CSV `frame,x_px,y_px[,orientation_rad,length_px,width_px]` or GeoJSON with `frame`, in raw pixels; a YOLO "
+    "folder, a .txt a picture; COCO; LabelMe; VIA"
 )
 _OPTIONAL = ("orientation_rad", "length_px", "width_px")
-_FOREIGN = {".json": "JSON", ".geojson": "GeoJSON", ".xml": "XML", ".jpg": "a picture", ".png": "a picture"}
+_FOREIGN = {".xml": "XML", ".jpg": "a picture", ".png": "a picture", ".zip": "an archive", ".shp": "a shapefile"}
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,8 @@ def load_labels(path: Path | str, info: SourceInfo) -> Labels:
     path
         CSV with the columns ``frame,x_px,y_px[,orientation_rad,length_px,width_px]`` in raw pixels, ``frame`` a
         picture's file name or a video's 0-based index in the file; a row with ``x_px`` and ``y_px`` empty names a frame
-        without cars. Or a YOLO folder or file, by file stem.
+        without cars. Or a YOLO folder or file, by file stem. Or a file of COCO, LabelMe (or a folder of these), VIA, or
+        GeoJSON whose features have the property ``frame`` and raw pixels as coordinates.
     info
         The source.
 
@@ -66,8 +69,9 @@ def load_labels(path: Path | str, info: SourceInfo) -> Labels:
         Another format, a frame that is not there, a label outside the picture, no labels at all.
     """
     place = local_path(path, "labels")
-    if looks_like_yolo(place):
-        boxes, frames, notes = read_yolo(place, info)
+    others = is_annotation_file(place)
+    if others or looks_like_yolo(place):
+        boxes, frames, notes = read_annotations(place, info) if others else read_yolo(place, info)
         _check_inside(place, ((box.frame, box.x_px, box.y_px) for box in boxes), info)
         cars = label_table([box for box in boxes if box.is_car])
         ignored = label_table([box for box in boxes if not box.is_car])

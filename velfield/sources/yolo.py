@@ -167,13 +167,18 @@ def _upright(values: Sequence[float], info: SourceInfo) -> tuple[float, float, f
     """
     x, y = values[0] * info.width - 0.5, values[1] * info.height - 0.5
     w, h = values[2] * info.width, values[3] * info.height
+    return x, y, *shape_of_upright_box(w, h)
+
+
+def shape_of_upright_box(w: float, h: float) -> tuple[float, float, float]:
+    """Orientation, length and width of the car in an upright box; NaN where it does not tell."""
     if min(w, h) <= 0:
-        return x, y, math.nan, math.nan, math.nan
+        return math.nan, math.nan, math.nan
     orientation = math.nan
     if max(w, h) >= _UPRIGHT_ASPECT * min(w, h):
         orientation = 0.0 if w > h else math.pi / 2
     length = length_from_upright_box(w, h)
-    return x, y, orientation, length, CAR_ASPECT * length
+    return orientation, length, CAR_ASPECT * length
 
 
 def length_from_upright_box(w: float, h: float, *, aspect: float = CAR_ASPECT) -> float:
@@ -222,10 +227,10 @@ def _car_classes(path: Path) -> set[int]:
     for place in (folder, folder.parent):
         for name in ("classes.txt", "obj.names"):
             if (place / name).is_file():
-                return _cars_among(enumerate(read_text(place / name, "class names").split("\n")), place / name)
+                return cars_among(enumerate(read_text(place / name, "class names").split("\n")), place / name)
         for name in ("data.yaml", "dataset.yaml"):
             if (place / name).is_file():
-                return _cars_among(_yaml_names(place / name), place / name)
+                return cars_among(_yaml_names(place / name), place / name)
     return {0}
 
 
@@ -241,7 +246,14 @@ def _yaml_names(path: Path) -> list[tuple[int, str]]:
         ) from None
 
 
-def _cars_among(names: Iterable[tuple[int, str]], path: Path) -> set[int]:
+def cars_among(names: Iterable[tuple[int, str]], path: Path) -> set[int]:
+    """Numbers of the names that are of cars.
+
+    Raises
+    ------
+    InputError
+        None is.
+    """
     known = [(number, name.strip().lower()) for number, name in names if name.strip()]
     cars = {
         number
