@@ -90,7 +90,7 @@ def run(
     gsd_m
         Ground sample distance, metres a base pixel. Default: from the base picture's CRS, else all stays in px/s.
     labels
-        Marked cars to learn from: CSV, or a YOLO folder. Default: learnt from motion.
+        Marked cars to learn from: CSV, GeoJSON, YOLO, COCO, LabelMe, VIA. Default: learnt from motion.
     detector
         A detector file in place of training.
     detections
