@@ -51,23 +51,11 @@ def _sigma(n: float) -> float:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _density(
-    histogram: NDArray[np.int32],
-    count: NDArray[np.int32],
-    everywhere: Float,
-    x: int,
-    y: int,
-    v_x: float,
-    v_y: float,
-    radius: int,
+def _around(
+    histogram: NDArray[np.int32], count: NDArray[np.int32], x: int, y: int, radius: int, around: Float
 ) -> float:
-    """Density per square bin at one pixel of a window of the field."""
-    reach = (everywhere.shape[0] - 1) / 2
-    broad = reach / 2
-    of_broad = exp(-0.5 * ((v_x - reach) ** 2 + (v_y - reach) ** 2) / (broad * broad)) / (2.0 * pi * broad * broad)
-    share = BROAD_SHARE if everywhere.sum() > 0 else 1.0
-    density = (1.0 - share) * _spread(everywhere, v_y, v_x, LEAST_SIGMA_BINS) + share * of_broad
-    around: Float = np.zeros(everywhere.shape)
+    """Fill ``around`` with the weights of the pixels near (x, y), summing to one; returns their mean passages, 0 where
+    there are none."""
     window, passages, unit = 0.0, 0.0, 0.0
     for j in range(max(0, y - radius), min(count.shape[0], y + radius + 1)):
         for i in range(max(0, x - radius), min(count.shape[1], x + radius + 1)):
@@ -81,15 +69,55 @@ def _density(
                         if histogram[j, i][b, a] > 0:
                             around[b, a] += near * histogram[j, i][b, a]
                             unit += near * histogram[j, i][b, a]
-    if window > 0.0:
-        # Neighbouring pixels see the same passages: their mean number is what is known, not their sum.
-        n = passages / window
-        density = (n * _spread(around, v_y, v_x, _sigma(n)) / unit + STRENGTH * density) / (n + STRENGTH)
-    if 0 <= y < count.shape[0] and 0 <= x < count.shape[1] and count[y, x] > 0:
-        own = histogram[y, x].astype(np.float64)
-        n = float(count[y, x])
-        density = (n * _spread(own, v_y, v_x, _sigma(n)) / own.sum() + STRENGTH * density) / (n + STRENGTH)
-    return float(density)
+    if window == 0.0:
+        return 0.0
+    around /= unit
+    # Neighbouring pixels see the same passages: their mean number is what is known, not their sum.
+    return float(passages / window)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _of_the_map(everywhere: Float, v_y: float, v_x: float) -> float:
+    """Density per square bin where nothing is known of the place."""
+    reach = (everywhere.shape[0] - 1) / 2
+    broad = reach / 2
+    of_broad = exp(-0.5 * ((v_x - reach) ** 2 + (v_y - reach) ** 2) / (broad * broad)) / (2.0 * pi * broad * broad)
+    share = BROAD_SHARE if everywhere.sum() > 0 else 1.0
+    return float((1.0 - share) * _spread(everywhere, v_y, v_x, LEAST_SIGMA_BINS) + share * of_broad)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def densities_at_pixel(
+    histogram: NDArray[np.int32],
+    count: NDArray[np.int32],
+    everywhere: Float,
+    x: int,
+    y: int,
+    velocity_bins: Float,
+    radius: int,
+) -> Float:
+    """Density per square bin of velocities (n, 2) as (vx, vy) at one pixel of a window of the field, (n,).
+
+    Parameters are those of `log_density_in_window`.
+    """
+    around: Float = np.zeros(everywhere.shape)
+    near = _around(histogram, count, x, y, radius, around)
+    inside = 0 <= y < count.shape[0] and 0 <= x < count.shape[1]
+    here = float(count[y, x]) if inside else 0.0
+    own: Float = np.zeros(everywhere.shape)
+    if here > 0.0:
+        own += histogram[y, x]
+        own /= own.sum()
+    out = np.empty(velocity_bins.shape[0])
+    for k in range(velocity_bins.shape[0]):
+        v_x, v_y = velocity_bins[k, 0], velocity_bins[k, 1]
+        density = _of_the_map(everywhere, v_y, v_x)
+        if near > 0.0:
+            density = (near * _spread(around, v_y, v_x, _sigma(near)) + STRENGTH * density) / (near + STRENGTH)
+        if here > 0.0:
+            density = (here * _spread(own, v_y, v_x, _sigma(here)) + STRENGTH * density) / (here + STRENGTH)
+        out[k] = density
+    return out
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -123,5 +151,6 @@ def log_density_in_window(
             out[k] = nan
             continue
         x, y = pixels[k, 0], pixels[k, 1]
-        out[k] = log(max(_density(histogram, count, everywhere, x, y, v_x, v_y, radius), 1e-300))
+        density = densities_at_pixel(histogram, count, everywhere, x, y, velocity_bins[k : k + 1], radius)[0]
+        out[k] = log(max(density, 1e-300))
     return out

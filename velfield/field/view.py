@@ -3,7 +3,7 @@
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from threading import Lock
 from typing import Any, TypeVar
 
@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from velfield.errors import InputError
 from velfield.field.accumulate import accumulate_tile
 from velfield.field.bins import VelocityBins
-from velfield.field.modes import modal_velocity, velocity_modes
-from velfield.field.prior import log_density_in_window
+from velfield.field.gate import SHARE, VelocityGate, make_gate
+from velfield.field.modes import modal_velocity
+from velfield.field.pixel import PixelDistribution, describe_pixel
+from velfield.field.prior import densities_at_pixel, log_density_in_window
 from velfield.field.segments import Segments, segments_by_tile
 from velfield.field.statistics import TileStatistics, direction_rad, speed_px_per_s, tile_statistics
 
@@ -34,52 +36,6 @@ _TILES_KEPT = 6
 _TILES_OF_THE_MAP = 64
 _NEIGHBOURHOOD_M = 1.5
 _NEIGHBOURHOOD_PX = 6
-
-
-@dataclass(frozen=True)
-class PixelDistribution:
-    """The distribution over velocity at a pixel.
-
-    Attributes
-    ----------
-    x, y
-        The pixel.
-    n
-        Passages that it rests on.
-    bins
-        Its velocity bins.
-    weights
-        (nvy, nvx) shares of the bins, summing to one; all zero where nothing passed.
-    modes
-        (k, 3) as (vx, vy) px/s and share, the largest share first.
-    modal_velocity_px_per_s, mean_velocity_px_per_s
-        (2,) as (vx, vy) px/s, NaN where nothing passed.
-    percentiles_px_per_s
-        Speed by percentage: 15, 50, 85; px/s.
-    standing_share, circular_variance, entropy_nats, direction_se_rad, speed_se_px_per_s
-        As in `TileStatistics`.
-    direction_interval_rad
-        90 % interval of the modal direction: from, to; rising, so that one end may lie beyond (-pi, pi].
-    median_speed_interval_px_per_s
-        90 % interval of the median speed: from, to.
-    """
-
-    x: int
-    y: int
-    n: int
-    bins: VelocityBins
-    weights: Float
-    modes: Float
-    modal_velocity_px_per_s: Float
-    mean_velocity_px_per_s: Float
-    percentiles_px_per_s: dict[int, float]
-    standing_share: float
-    circular_variance: float
-    entropy_nats: float
-    direction_se_rad: float
-    speed_se_px_per_s: float
-    direction_interval_rad: tuple[float, float]
-    median_speed_interval_px_per_s: tuple[float, float]
 
 
 class VelocityField:
@@ -229,33 +185,7 @@ class VelocityField:
         return (np.zeros((1, 1, self.bins.n, self.bins.n), np.int32), *np.zeros((2, 1, 1), np.int32))
 
     def _distribution(self, x: int, y: int, pixel: Tile) -> PixelDistribution:
-        histogram, count, _ = pixel
-        statistics = self._tile_statistics(pixel)
-        modes = velocity_modes(histogram, count, bins=self.bins)[0, 0]
-        total = int(histogram.sum(dtype=np.int64))
-        return PixelDistribution(
-            x=x,
-            y=y,
-            n=int(count[0, 0]),
-            bins=self.bins,
-            weights=histogram[0, 0] / max(total, 1),
-            modes=modes[np.isfinite(modes[:, 2])],
-            modal_velocity_px_per_s=statistics.modal_velocity_px_per_s[0, 0],
-            mean_velocity_px_per_s=statistics.mean_velocity_px_per_s[0, 0],
-            percentiles_px_per_s=dict(
-                zip((15, 50, 85), map(float, statistics.speed_percentiles_px_per_s[0, 0]), strict=True)
-            ),
-            standing_share=float(statistics.standing_share[0, 0]),
-            circular_variance=float(statistics.circular_variance[0, 0]),
-            entropy_nats=float(statistics.entropy_nats[0, 0]),
-            direction_se_rad=float(statistics.direction_se_rad[0, 0]),
-            speed_se_px_per_s=float(statistics.speed_se_px_per_s[0, 0]),
-            direction_interval_rad=_about(statistics),
-            median_speed_interval_px_per_s=(
-                float(statistics.median_speed_low_px_per_s[0, 0]),
-                float(statistics.median_speed_high_px_per_s[0, 0]),
-            ),
-        )
+        return describe_pixel(x, y, pixel[0], pixel[1], self.bins, self._tile_statistics(pixel))
 
     # -- a prior for another tracker ----------------------------------------------------------------------------------
 
@@ -284,9 +214,7 @@ class VelocityField:
         limit = float(max(self.shape)) * 2
         pixels = np.floor(xy[good].clip(-limit, limit) + 0.5).astype(np.int64)
         tiles = pixels[:, ::-1] // self.tile_size
-        radius = _NEIGHBOURHOOD_PX
-        if self.bins.gsd_m is not None:
-            radius = max(1, round(_NEIGHBOURHOOD_M / self.bins.gsd_m))
+        radius = self._neighbourhood_px()
         for ty, tx in np.unique(tiles, axis=0):
             here = np.flatnonzero((tiles == (ty, tx)).all(axis=1))
             histogram, count, origin = self._window(int(ty), int(tx), radius)
@@ -300,6 +228,63 @@ class VelocityField:
             )
         out -= 2 * np.log(self.bins.width_px_per_s)
         return out
+
+    def gate(self, xy: Float, covariance: Float | None = None, *, share: float = SHARE) -> VelocityGate:
+        """What velocities to expect at a place: a gate for another tracker (`velfield.field.gate`).
+
+        Parameters
+        ----------
+        xy
+            (2,) base pixel.
+        covariance
+            (2, 2) px^2, how well the place is known; None: to the pixel.
+        share
+            Share of vehicles that the gate lets pass.
+        """
+        place = np.asarray(xy, np.float64)
+        if place.shape != (2,) or not np.isfinite(place).all() or not 0 < share < 1:
+            raise InputError(f"gate needs one finite place (2,) and a share between 0 and 1, found {xy} and {share}")
+        return make_gate(
+            self._densities, place, np.zeros((2, 2)) if covariance is None else covariance, self.bins, share
+        )
+
+    def anomaly(self, times_s: Float, xy: Float) -> float:
+        """How unusual a track is: by how many nats a step its velocities are less likely than what is usual there.
+
+        About 0 for a track like those that the field was made of; 3 and more for a wrong-way driver, or for one who
+        stands where nobody does. Where nothing is known, hardly anything is unusual.
+
+        Parameters
+        ----------
+        times_s, xy
+            (n,) rising times and (n, 2) base pixels, n of 2 or more.
+        """
+        time, place = np.asarray(times_s, np.float64), np.asarray(xy, np.float64)
+        if time.ndim != 1 or len(time) < 2 or place.shape != (len(time), 2) or not (np.diff(time) > 0).all():
+            raise InputError(f"anomaly needs rising times (n,) and places (n, 2), found {time.shape} and {place.shape}")
+        velocity = np.diff(place, axis=0) / np.diff(time)[:, None]
+        middle = 0.5 * (place[1:] + place[:-1])
+        surprise = [
+            gate.expected_log_density - gate.log_density(v)[0]
+            for gate, v in ((self.gate(where), v) for where, v in zip(middle, velocity, strict=True))
+        ]
+        return float(np.mean(surprise))
+
+    def _densities(self, xy: Float, v: Float) -> Float:
+        """Density per (px/s)^2 at one place (2,) of velocities (n, 2)."""
+        radius = self._neighbourhood_px()
+        limit = float(max(self.shape)) * 2
+        x, y = np.floor(np.clip(xy, -limit, limit) + 0.5).astype(np.int64)
+        histogram, count = self._cut(int(x) - radius, int(y) - radius, 2 * radius + 1, 2 * radius + 1)
+        everywhere = self._map_distribution()
+        density = densities_at_pixel(histogram, count, everywhere, radius, radius, self.bins.to_bins(v), radius)
+        return np.asarray(density / self.bins.width_px_per_s**2, np.float64)
+
+    def _neighbourhood_px(self) -> int:
+        """How far the pixels around reach."""
+        if self.bins.gsd_m is None:
+            return _NEIGHBOURHOOD_PX
+        return max(1, round(_NEIGHBOURHOOD_M / self.bins.gsd_m))
 
     def _map_distribution(self) -> Float:
         """(nvy, nvx) the whole map's distribution, from tiles spread over it; zero where it is empty."""
@@ -315,24 +300,28 @@ class VelocityField:
 
     def _window(self, ty: int, tx: int, margin: int) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
         """A tile with a margin from its neighbours: histogram, count, and the pixel (x, y) of its first corner."""
+        x0, y0 = tx * self.tile_size - margin, ty * self.tile_size - margin
+        extent = self.tile_size + 2 * margin
+        return *self._cut(x0, y0, extent, extent), np.array([x0, y0], np.int64)
+
+    def _cut(self, x0: int, y0: int, width: int, height: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Histogram and count of a window of the map that may reach beyond it."""
         size = self.tile_size
-        y0, x0 = ty * size - margin, tx * size - margin
-        extent = size + 2 * margin
-        histogram = np.zeros((extent, extent, self.bins.n, self.bins.n), np.int32)
-        count = np.zeros((extent, extent), np.int32)
-        for row in range(y0 // size, (y0 + extent - 1) // size + 1):
-            for column in range(x0 // size, (x0 + extent - 1) // size + 1):
+        histogram = np.zeros((height, width, self.bins.n, self.bins.n), np.int32)
+        count = np.zeros((height, width), np.int32)
+        for row in range(y0 // size, (y0 + height - 1) // size + 1):
+            for column in range(x0 // size, (x0 + width - 1) // size + 1):
                 tile = self._tile(row, column)
                 if tile is None:
                     continue
-                height, width = tile[1].shape
+                tile_height, tile_width = tile[1].shape
                 top, left = max(row * size, y0), max(column * size, x0)
-                bottom = min(row * size + height, y0 + extent)
-                right = min(column * size + width, x0 + extent)
+                bottom = min(row * size + tile_height, y0 + height)
+                right = min(column * size + tile_width, x0 + width)
                 target = np.s_[top - y0 : bottom - y0, left - x0 : right - x0]
                 origin = np.s_[top - row * size : bottom - row * size, left - column * size : right - column * size]
                 histogram[target], count[target] = tile[0][origin], tile[1][origin]
-        return histogram, count, np.array([x0, y0], np.int64)
+        return histogram, count
 
     # -- tiles --------------------------------------------------------------------------------------------------------
 
@@ -368,10 +357,3 @@ class VelocityField:
             for (ty, tx), result in zip(self.tiles, pool.map(one, self.tiles), strict=True):
                 if result is not None:
                     yield np.s_[ty * size : (ty + 1) * size, tx * size : (tx + 1) * size], result
-
-
-def _about(statistics: TileStatistics) -> tuple[float, float]:
-    """The interval of the modal direction of a tile of one pixel."""
-    vx, vy = statistics.modal_velocity_px_per_s[0, 0]
-    direction, half = float(np.arctan2(vy, vx)), float(statistics.direction_half_width_rad[0, 0])
-    return direction - half, direction + half

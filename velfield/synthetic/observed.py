@@ -74,12 +74,7 @@ def observed_tracklets(
     DataFrame
         `schemas.tables.TRACKLET_COLUMNS`; the low 20 bits of a detection's id are the vehicle's number.
     """
-    vehicle, frame = _appearances(traffic, times_s)
-    true = to_px(traffic.at(vehicle, times_s[frame])[0])
-    inside = (true >= 0).all(axis=1) & (true <= np.array(shape[::-1]) - 1).all(axis=1)
-    seen = inside & (rng.uniform(size=len(frame)) < errors.recall)
-    vehicle, frame, true = vehicle[seen], frame[seen], true[seen]
-    place = true + rng.normal(0, 1, true.shape) * errors.place_sd_px
+    vehicle, frame, true, place = _detected(traffic, times_s, to_px, shape, rng, errors)
     moved, sd = _displacements(true, place, errors, rng)
     # rows are sorted by vehicle, then frame: a window is three rows of one vehicle in consecutive frames
     step = (np.diff(vehicle) == 0) & (np.diff(frame) == 1) & (np.diff(times_s[frame]) <= _MAX_INTERVAL_S)
@@ -101,6 +96,38 @@ def observed_tracklets(
     ids = np.stack([columns[f"detection_id_{k}"] for k in range(3)], axis=1).astype(np.int64)
     columns["passage_id"] = assign_passages(ids)
     return pd.DataFrame({name: columns[name].astype(kind) for name, kind in TRACKLET_COLUMNS.items()})
+
+
+def observed_detections(
+    traffic: Traffic,
+    times_s: FloatArray,
+    to_px: Callable[[FloatArray], FloatArray],
+    *,
+    shape: tuple[int, int],
+    rng: np.random.Generator,
+    errors: Errors = Errors(),
+) -> pd.DataFrame:
+    """Detections by frame: ``frame, time_s, x_px, y_px, vehicle_id``; parameters as in `observed_tracklets`."""
+    vehicle, frame, _, place = _detected(traffic, times_s, to_px, shape, rng, errors)
+    columns = {"frame": frame, "time_s": times_s[frame], "x_px": place[:, 0], "y_px": place[:, 1]}
+    return pd.DataFrame({**columns, "vehicle_id": vehicle}).sort_values("frame", kind="stable", ignore_index=True)
+
+
+def _detected(
+    traffic: Traffic,
+    times_s: FloatArray,
+    to_px: Callable[[FloatArray], FloatArray],
+    shape: tuple[int, int],
+    rng: np.random.Generator,
+    errors: Errors,
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """Vehicle, frame, true place and seen place (n, 2) of every detection, by vehicle, then frame."""
+    vehicle, frame = _appearances(traffic, times_s)
+    true = to_px(traffic.at(vehicle, times_s[frame])[0])
+    inside = (true >= 0).all(axis=1) & (true <= np.array(shape[::-1]) - 1).all(axis=1)
+    seen = inside & (rng.uniform(size=len(frame)) < errors.recall)
+    vehicle, frame, true = vehicle[seen], frame[seen], true[seen]
+    return vehicle, frame, true, true + rng.normal(0, 1, true.shape) * errors.place_sd_px
 
 
 def _appearances(traffic: Traffic, times_s: FloatArray) -> tuple[IntArray, IntArray]:

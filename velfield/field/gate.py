@@ -1,0 +1,88 @@
+"""The prior as a gate for another tracker, and as a judge of tracks: where its velocities are, how usual one is."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from velfield.field.bins import VelocityBins
+
+Float = NDArray[np.float64]
+Densities = Callable[[Float, Float], Float]
+"""Density per (px/s)^2 at a place (2,) of velocities (n, 2)."""
+
+SHARE = 0.99
+"""Share of the vehicles that a gate lets pass, if they drive as those before them did."""
+
+
+@dataclass(frozen=True)
+class VelocityGate:
+    """What velocities are to be expected at a place that is known to within a covariance.
+
+    Attributes
+    ----------
+    mean_px_per_s, covariance
+        (2,) and (2, 2) of the expected velocity: where a filter may start.
+    expected_log_density
+        Mean log density of a vehicle there: minus the entropy.
+    least_density
+        Density per (px/s)^2 that the gate asks for: the region of higher density holds ``share`` of the vehicles.
+    share
+        That share.
+    """
+
+    mean_px_per_s: Float
+    covariance: Float
+    expected_log_density: float
+    least_density: float
+    share: float
+    _densities: Callable[[Float], Float]
+
+    def log_density(self, v: Float) -> Float:
+        """(n,) log density per (px/s)^2 of velocities (n, 2), px/s."""
+        return np.log(np.maximum(self._densities(np.atleast_2d(np.asarray(v, np.float64))), 1e-300))
+
+    def accepts(self, v: Float) -> NDArray[np.bool_]:
+        """(n,) whether velocities (n, 2), px/s, lie in the region."""
+        return np.asarray(self.log_density(v) >= np.log(self.least_density))
+
+
+def make_gate(densities: Densities, xy: Float, covariance: Float, bins: VelocityBins, share: float) -> VelocityGate:
+    """The gate at a place, its uncertainty taken in by five points of the ellipse (unscented transform).
+
+    Parameters
+    ----------
+    densities
+        The field's prior.
+    xy, covariance
+        (2,) base pixel and (2, 2) px^2.
+    share
+        In (0, 1).
+    """
+    values, axes = np.linalg.eigh(np.asarray(covariance, np.float64))
+    steps = (np.sqrt(3.0 * np.maximum(values, 0.0)) * axes).T
+    offsets = np.concatenate([np.zeros((1, 2)), steps, -steps])
+    # A place known to within half a pixel is one pixel.
+    points = (
+        [(1.0, np.zeros(2))] if np.abs(offsets).max() < 0.5 else list(zip([1 / 3] + 4 * [1 / 6], offsets, strict=True))
+    )
+
+    def mixed(v: Float) -> Float:
+        return np.asarray(sum(weight * densities(np.asarray(xy) + offset, v) for weight, offset in points), np.float64)
+
+    grid = np.stack(np.meshgrid(bins.centres_px_per_s, bins.centres_px_per_s), axis=-1).reshape(-1, 2)
+    density = mixed(grid)
+    mass = density / density.sum()
+    order = np.argsort(-density, kind="stable")
+    last = min(int(np.searchsorted(np.cumsum(mass[order]), share)), len(order) - 1)
+    mean = mass @ grid
+    around = grid - mean
+    return VelocityGate(
+        mean_px_per_s=mean,
+        covariance=(mass[:, None] * around).T @ around,
+        expected_log_density=float(mass @ np.log(np.maximum(density, 1e-300))),
+        least_density=float(density[order[last]]),
+        share=share,
+        _densities=mixed,
+    )

@@ -1,0 +1,101 @@
+"""The distribution over velocity at one pixel, with all that is said of it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from velfield.field.bins import VelocityBins
+from velfield.field.modes import velocity_modes
+from velfield.field.statistics import TileStatistics
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PixelDistribution:
+    """The distribution over velocity at a pixel.
+
+    Attributes
+    ----------
+    x, y
+        The pixel.
+    n
+        Passages that it rests on.
+    bins
+        Its velocity bins.
+    weights
+        (nvy, nvx) shares of the bins, summing to one; all zero where nothing passed.
+    modes
+        (k, 3) as (vx, vy) px/s and share, the largest share first.
+    modal_velocity_px_per_s, mean_velocity_px_per_s
+        (2,) as (vx, vy) px/s, NaN where nothing passed.
+    percentiles_px_per_s
+        Speed by percentage: 15, 50, 85; px/s.
+    standing_share, circular_variance, entropy_nats, direction_se_rad, speed_se_px_per_s
+        As in `TileStatistics`.
+    direction_interval_rad
+        90 % interval of the modal direction: from, to; rising, so that one end may lie beyond (-pi, pi].
+    median_speed_interval_px_per_s
+        90 % interval of the median speed: from, to.
+    """
+
+    x: int
+    y: int
+    n: int
+    bins: VelocityBins
+    weights: Float
+    modes: Float
+    modal_velocity_px_per_s: Float
+    mean_velocity_px_per_s: Float
+    percentiles_px_per_s: dict[int, float]
+    standing_share: float
+    circular_variance: float
+    entropy_nats: float
+    direction_se_rad: float
+    speed_se_px_per_s: float
+    direction_interval_rad: tuple[float, float]
+    median_speed_interval_px_per_s: tuple[float, float]
+
+
+def describe_pixel(
+    x: int,
+    y: int,
+    histogram: NDArray[np.int32],
+    count: NDArray[np.int32],
+    bins: VelocityBins,
+    statistics: TileStatistics,
+) -> PixelDistribution:
+    """The distribution of a tile of one pixel, (1, 1, nvy, nvx) and (1, 1), with its statistics."""
+    modes = velocity_modes(histogram, count, bins=bins)[0, 0]
+    total = int(histogram.sum(dtype=np.int64))
+    return PixelDistribution(
+        x=x,
+        y=y,
+        n=int(count[0, 0]),
+        bins=bins,
+        weights=histogram[0, 0] / max(total, 1),
+        modes=modes[np.isfinite(modes[:, 2])],
+        modal_velocity_px_per_s=statistics.modal_velocity_px_per_s[0, 0],
+        mean_velocity_px_per_s=statistics.mean_velocity_px_per_s[0, 0],
+        percentiles_px_per_s=dict(
+            zip((15, 50, 85), map(float, statistics.speed_percentiles_px_per_s[0, 0]), strict=True)
+        ),
+        standing_share=float(statistics.standing_share[0, 0]),
+        circular_variance=float(statistics.circular_variance[0, 0]),
+        entropy_nats=float(statistics.entropy_nats[0, 0]),
+        direction_se_rad=float(statistics.direction_se_rad[0, 0]),
+        speed_se_px_per_s=float(statistics.speed_se_px_per_s[0, 0]),
+        direction_interval_rad=_about(statistics),
+        median_speed_interval_px_per_s=(
+            float(statistics.median_speed_low_px_per_s[0, 0]),
+            float(statistics.median_speed_high_px_per_s[0, 0]),
+        ),
+    )
+
+
+def _about(statistics: TileStatistics) -> tuple[float, float]:
+    """The interval of the modal direction of a tile of one pixel."""
+    vx, vy = statistics.modal_velocity_px_per_s[0, 0]
+    direction, half = float(np.arctan2(vy, vx)), float(statistics.direction_half_width_rad[0, 0])
+    return direction - half, direction + half
