@@ -29,7 +29,10 @@ class ViewLayer(Model):
 
 
 class ViewArray(Model):
-    """An array of the field store: where its chunks are, so that none is asked for that is not there."""
+    """An array of a store: where its chunks are, so that none is asked for that is not there."""
+
+    store: str
+    """Path of the store in the run folder."""
 
     chunk: tuple[PositiveInt, PositiveInt]
     """(height, width) of a chunk, px."""

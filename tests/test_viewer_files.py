@@ -1,6 +1,7 @@
 """What a run folder holds for its page: tiles of the base image, the list of layers, the report as a file."""
 
 import re
+import shutil
 from pathlib import Path
 
 import cv2
@@ -11,13 +12,12 @@ from schemas.summary import RunSummary
 from schemas.view import ViewRecord
 from tests.small_flight import job, process
 from velfield import open_run
+from velfield.comparing import compare_runs
 from velfield.exporting import export_run
 from velfield.layout import RunLayout
 from velfield.steps import report as report_step
-from velfield.stores import open_field
 from velfield.viewer.layers import view_layers
 from velfield.viewer.pyramid import TILE_PX, pyramid_levels, pyramid_tiles
-from velfield.viewer.record import write_view_record
 
 
 def test_tiles_make_up_the_picture_at_every_level() -> None:
@@ -57,25 +57,24 @@ def test_the_record_lists_what_is_stored(whole: tuple[Path, RunSummary]) -> None
     assert record.gsd_m == 0.23
     assert record.segments.passages == len(np.unique(run.segments()["passage"]))
     for name, array in record.arrays.items():
+        chunks = layout.root / array.store / name / "c"
         listed = set(zip(array.stored[::2], array.stored[1::2], strict=True))
         tail = ("0", "0") if name == "velocity_histogram" else ()
-        for row, column in listed:
-            assert (layout.field / name / "c" / str(row) / str(column)).joinpath(*tail).is_file()
-        assert len(listed) == len([path for path in (layout.field / name / "c").glob("*/*") if path.exists()])
+        assert all((chunks / str(row) / str(column)).joinpath(*tail).is_file() for row, column in listed)
+        assert len(listed) == len(list(chunks.glob("*/*")))
 
 
-def test_a_layer_added_later_is_shown(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
-    import shutil
-
+def test_what_compare_left_is_shown(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
     root = tmp_path / "run"
     shutil.copytree(whole[0], root, ignore=shutil.ignore_patterns("raw"))
-    layout = RunLayout(root)
-    store = open_field(layout.field, "r+")
-    shutil.copytree(layout.field / "speed_p50", layout.field / "speed_change")
-    assert "speed_change" in store.layer_names()
-    write_view_record(layout)
-    record = ViewRecord.model_validate_json(layout.view_record.read_bytes())
-    assert "change" in {layer.kind for layer in record.layers}
+    compare_runs(whole[0], root, tmp_path / "comparison")
+    record = ViewRecord.model_validate_json(RunLayout(root).view_record.read_bytes())
+    changes = [layer for layer in record.layers if layer.kind == "change"]
+    assert [layer.name for layer in changes] == ["direction_change", "speed_change", "volume_change"]
+    assert changes[1].title == "Change of speed since whole"
+    assert changes[1].units == "px s-1"
+    assert record.arrays["speed_change"].store == "view/change.zarr"
+    assert (root / record.arrays["speed_change"].store / "speed_change" / "zarr.json").is_file()
 
 
 def test_the_report_goes_by_mail(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
@@ -89,8 +88,6 @@ def test_the_report_goes_by_mail(whole: tuple[Path, RunSummary], tmp_path: Path)
 def test_without_a_built_page_the_report_stands_alone_and_it_is_said(
     whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import shutil
-
     from flows.console import Console
 
     said: list[str] = []

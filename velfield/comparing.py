@@ -15,10 +15,13 @@ from velfield.run import Run, open_run
 from velfield.steps.field_algebra import check_same_grid
 from velfield.steps.grid import north_of
 from velfield.stores import open_field
+from velfield.viewer.record import write_change_layers
 
 
 def compare_runs(before: Path, after: Path, out: Path, *, min_count: int = MIN_COUNT) -> list[str]:
     """Write ``direction_change.png``, ``speed_change.png``, ``volume_change.png`` and ``change.tif`` into ``out``.
+
+    The later run's page shows the changes too.
 
     Returns
     -------
@@ -48,10 +51,26 @@ def compare_runs(before: Path, after: Path, out: Path, *, min_count: int = MIN_C
         figure = change_figure(runs[1].base_image, real, scale, title=f"Change of {name}, {unit}")
         write_atomically(out / f"{name}_change.png", png_bytes(figure))
     _write_layers(out / "change.tif", changes, shown, runs[1])
+    _show_in_the_viewer(changes, before, runs[1])
     return [
         *(_line(name, changes[name], *shown[name]) for name in changes),
         f"significant: at most {FALSE_SHARE:.0%} of what is shown is chance; figures and change.tif in {out}",
     ]
+
+
+def _show_in_the_viewer(changes: dict[str, Change], before: Path, run: Run) -> None:
+    """Leave what changed for real as layers of the later run's page, where it has one, in the units of its field."""
+    if not run.layout.view_record.exists():
+        return
+    units = {"direction": "rad", "speed": "px s-1", "volume": "vehicles h-1"}
+    layers = {
+        f"{name}_change": (
+            np.where(change.significant, change.change, np.nan),
+            {"long_name": f"change of {name} since {before.name}", "units": units[name]},
+        )
+        for name, change in changes.items()
+    }
+    write_change_layers(run.layout, layers)
 
 
 def _shown(name: str, change: Change, run: Run) -> tuple[NDArray[np.float64], str]:

@@ -139,6 +139,11 @@ class RunLayout:
         return self.view / "segments.zarr"
 
     @property
+    def view_changes(self) -> Path:
+        """Layers of the change since another run, where `velfield compare` left them."""
+        return self.view / "change.zarr"
+
+    @property
     def report_record(self) -> Path:
         """What the report tells, from which it can be written again."""
         return self.view / "report.json"

@@ -418,12 +418,23 @@ def open_field(path: Path, mode: str = "r") -> FieldStore:
 # ------------------------------------------------------------------------------------------------------------- viewer
 
 _SEGMENTS_A_CHUNK = 65536
+_LAYER_CHUNK_PX = 512
 
 
 def write_segments(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write ``view/segments.zarr`` anew: columns of one length, (segments,) each; every chunk is there to be read."""
-    group = zarr.create_group(path, overwrite=True)
+    group = zarr.create_group(_store(path), overwrite=True)
     for name, values in columns.items():
         chunk = (min(_SEGMENTS_A_CHUNK, max(len(values), 1)),)
         column = _create(group, name, values.shape, chunk, values.dtype.name, dimension_names=("segment",))
         column.with_config({"write_empty_chunks": True})[:] = values
+
+
+def write_extra_layers(path: Path, layers: Mapping[str, tuple[NDArray[np.floating], Mapping[str, Any]]]) -> None:
+    """Write float32 (y, x) layers with their attributes, to be shown beside a field's own: `open_field` reads them."""
+    group = zarr.create_group(_store(path), overwrite=True)
+    for name, (values, attributes) in layers.items():
+        chunk = (_LAYER_CHUNK_PX, _LAYER_CHUNK_PX)
+        layer = _create(group, name, values.shape, chunk, "float32", fill_value=np.nan, dimension_names=("y", "x"))
+        layer[:] = values
+        layer.attrs.update(dict(attributes))

@@ -46,7 +46,7 @@ async function openArray(path: string, metadata?: object) {
 
 type OpenArray = Awaited<ReturnType<typeof openArray>>;
 
-/** (y, x, ...) array of field.zarr; keeps the chunks read last. */
+/** A (y, x, ...) array; keeps the chunks read last. */
 export class ChunkedArray {
   readonly chunk: [number, number];
   private readonly stored: Set<string>;
@@ -92,7 +92,7 @@ export class ChunkedArray {
   }
 
   private async load(row: number, column: number, key: string): Promise<Numbers> {
-    this.open ??= openArray(`field.zarr/${this.name}`, this.told.metadata);
+    this.open ??= openArray(`${this.told.store}/${this.name}`, this.told.metadata);
     const array = await this.open;
     const rest = array.shape.slice(2).map(() => 0);
     const data = (await array.getChunk([row, column, ...rest])).data as Numbers;

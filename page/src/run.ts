@@ -14,6 +14,8 @@ export interface Layer {
 }
 
 export interface StoredArray {
+  /** Path of its store in the run folder. */
+  store: string;
   chunk: [number, number];
   stored: number[];
   units: string;

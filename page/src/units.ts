@@ -55,6 +55,7 @@ export class Units {
     if (layer.units === "rad") return { factor: 180 / Math.PI, unit: "degrees" };
     if (layer.units === "ms") return { factor: 1e-3, unit: "s" };
     if (layer.kind === "share") return { factor: 100, unit: "%" };
+    if (layer.units === "vehicles h-1") return { factor: 1, unit: "vehicles an hour" };
     return { factor: 1, unit: layer.kind === "count" ? "vehicles" : "" };
   }
 }

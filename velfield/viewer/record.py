@@ -3,14 +3,17 @@
     run.json         sizes, units, the list of layers, which chunks are stored
     base/            the base image as JPEG tiles
     segments.zarr    vehicles from one frame to the next, for the line tool and the tracks under the cursor
+    change.zarr      what changed since another run, where `velfield compare` left it
 
 Everything in it can be made again from the run folder: `write_view` does.
 """
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.records import FlightRecord, GridRecord
 from schemas.view import ViewArray, ViewBase, ViewLayer, ViewRecord, ViewSegments
@@ -22,9 +25,11 @@ from velfield.places import remove_tree
 from velfield.provenance import write_atomically
 from velfield.run import open_run
 from velfield.steps.grid import north_of
-from velfield.stores import HISTOGRAM, FieldStore, open_field, write_segments
+from velfield.stores import HISTOGRAM, FieldStore, open_field, write_extra_layers, write_segments
 from velfield.viewer.layers import view_layers
 from velfield.viewer.pyramid import TILE_PX, pyramid_levels, pyramid_tiles
+
+Layer = NDArray[np.float64]
 
 
 def write_view(layout: RunLayout) -> None:
@@ -55,14 +60,28 @@ def write_view_data(layout: RunLayout) -> list[Path]:
 def write_view_record(layout: RunLayout) -> None:
     """Write ``view/run.json``: whenever layers were added to the field, or the run was made again."""
     run = open_run(layout.root)
-    record = view_record(run.record, run.grid, open_field(layout.field), run.segments(), run.times_s)
+    stores = {"field.zarr": open_field(layout.field)}
+    if layout.view_changes.exists():
+        stores["view/change.zarr"] = open_field(layout.view_changes)
+    record = view_record(run.record, run.grid, stores, run.segments(), run.times_s)
     write_atomically(layout.view_record, record.model_dump_json().encode())
 
 
+def write_change_layers(layout: RunLayout, layers: Mapping[str, tuple[Layer, Mapping[str, str]]]) -> None:
+    """Leave layers of change in a run's view: name -> (y, x) values, NaN where nothing changed, and attributes."""
+    write_extra_layers(layout.view_changes, layers)
+    write_view_record(layout)
+
+
 def view_record(
-    flight: FlightRecord, grid: GridRecord, store: FieldStore, segments: Segments, times_s: np.ndarray
+    flight: FlightRecord,
+    grid: GridRecord,
+    stores: Mapping[str, FieldStore],
+    segments: Segments,
+    times_s: np.ndarray,
 ) -> ViewRecord:
-    """``view/run.json`` of a run with this field."""
+    """``view/run.json`` of a run with these stores of layers, by their paths; the field is the first."""
+    store = next(iter(stores.values()))
     known_s = times_s[np.isfinite(times_s)]
     return ViewRecord(
         width_px=grid.width_px,
@@ -75,8 +94,8 @@ def view_record(
         bin_width_px_per_s=float(store.attributes["bin_width_px_per_s"]),
         bins=len(store.velocities()),
         base=ViewBase(levels=pyramid_levels(grid.height_px, grid.width_px), tile=TILE_PX),
-        layers=tuple(_layers(store)),
-        arrays=_arrays(store),
+        layers=tuple(layer for each in stores.values() for layer in _layers(each)),
+        arrays={name: array for path, each in stores.items() for name, array in _arrays(path, each).items()},
         segments=ViewSegments(
             count=len(segments), passages=len(np.unique(segments["passage"])), settle_px=settle_px(grid.gsd_m)
         ),
@@ -84,18 +103,20 @@ def view_record(
 
 
 def _layers(store: FieldStore) -> list[ViewLayer]:
-    return view_layers({name: store.layer_attributes(name) for name in store.layer_names()}, store.layer)
+    return view_layers({name: store.layer_attributes(name) for name in sorted(store.layer_names())}, store.layer)
 
 
-def _arrays(store: FieldStore) -> dict[str, ViewArray]:
+def _arrays(path: str, store: FieldStore) -> dict[str, ViewArray]:
+    histogram = [HISTOGRAM] if (store.path / HISTOGRAM).exists() else []
     return {
         name: ViewArray(
+            store=path,
             chunk=store.chunk_shape(name),
             stored=tuple(index for place in store.stored_chunks(name) for index in place),
             units=str(store.layer_attributes(name).get("units", "1")),
             metadata=json.loads((store.path / name / "zarr.json").read_bytes()),
         )
-        for name in [*store.layer_names(), HISTOGRAM]
+        for name in [*sorted(store.layer_names()), *histogram]
     }
 
 
