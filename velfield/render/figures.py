@@ -81,7 +81,12 @@ def direction_figure(grey: NDArray[np.uint8], direction_rad: NDArray[np.floating
 
 
 def speed_figure(
-    grey: NDArray[np.uint8], speed_px_per_s: NDArray[np.floating], scale: MapScale, *, top: float | None = None
+    grey: NDArray[np.uint8],
+    speed_px_per_s: NDArray[np.floating],
+    scale: MapScale,
+    *,
+    top: float | None = None,
+    bar_gsd_m: float | None = None,
 ) -> RGB:
     """The modal speed as colour, with a bar beside it; parameters as in `direction_figure`.
 
@@ -91,6 +96,8 @@ def speed_figure(
         (h, w) speed, px/s. Nothing is drawn where it is NaN.
     top
         Speed at the bar's end, in the shown unit; None: a round number that 99 % of the pixels stay below.
+    bar_gsd_m
+        Metres a pixel of the figure, for the scale bar, where it is not drawn at base resolution.
     """
     _same_shape(grey, speed_px_per_s)
     shown = scale.shown_speed(speed_px_per_s)
@@ -98,7 +105,8 @@ def speed_figure(
         top = round_up(float(np.nanpercentile(shown, 99))) if np.isfinite(shown).any() else 10.0
     picture = _over(grey, ramp_colours(shown / top), np.isfinite(shown))
     legend = Legend(f"Speed, {scale.shown_unit}", "Colour: the speed that most vehicles have. Bare grey: none seen.")
-    panel = draw_bar_panel(grey.shape, legend, top=top, gsd_m=scale.gsd_m, north_rad=scale.north_rad)
+    gsd_m = scale.gsd_m if bar_gsd_m is None else bar_gsd_m
+    panel = draw_bar_panel(grey.shape, legend, top=top, gsd_m=gsd_m, north_rad=scale.north_rad)
     return np.hstack([picture, panel])
 
 

@@ -1,0 +1,88 @@
+"""Every command and snippet of the documentation, run on a small flight or, where that would take long, understood.
+
+The words VIDEO, RUN, ... of the pages are replaced by what the test has.
+"""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from flows.cli import app
+from schemas.summary import RunSummary
+from tests.media import drifting, write_video
+from velfield.configuration import resolve_config
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+QUICK = {"schema", "config", "export", "init", "lineage", "verify"}
+"""Commands that are run; the others take minutes, or wait for a person: of those the line must be understood."""
+
+
+def blocks(language: str) -> list[tuple[str, str]]:
+    """(page, text) of all blocks of a language."""
+    return [
+        (page.relative_to(ROOT).as_posix(), text)
+        for page in PAGES
+        for kind, text in BLOCK.findall(page.read_text())
+        if kind == language
+    ]
+
+
+def commands() -> list[tuple[str, str]]:
+    lines = [
+        (page, line.split("  #")[0].split("   ")[0].strip())
+        for page, text in blocks("sh")
+        for line in text.splitlines()
+    ]
+    return sorted({(page, line) for page, line in lines if line.startswith("velfield ")})
+
+
+@pytest.fixture
+def place(whole: tuple[Path, RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder with what the pages speak of."""
+    (tmp_path / "RUN").symlink_to(whole[0], target_is_directory=True)
+    write_video(tmp_path / "VIDEO.mp4", list(drifting(30)))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def words(line: str) -> list[str]:
+    return [{"VIDEO": "VIDEO.mp4"}.get(word, word) for word in shlex.split(line)[1:]]
+
+
+def test_the_pages_have_commands_and_snippets() -> None:
+    assert len(commands()) > 10
+    assert len(blocks("python")) >= 2
+
+
+@pytest.mark.parametrize(("page", "line"), commands())
+def test_a_command_of_the_pages(page: str, line: str, place: Path) -> None:
+    asked = words(line)
+    app.parse_args(asked, exit_on_error=False, print_error=False)
+    if asked[0] in QUICK or "--plan" in asked:
+        assert app(asked, result_action="return_value", exit_on_error=False) == 0
+
+
+@pytest.mark.parametrize(("page", "text"), blocks("python"))
+def test_a_snippet_of_the_pages(page: str, text: str, place: Path) -> None:
+    exec(compile(text, page, "exec"), {"xy": [[100.0, 100.0]], "v": [[10.0, 0.0]]})
+
+
+@pytest.mark.parametrize(("page", "text"), blocks("yaml"))
+def test_a_configuration_of_the_pages(page: str, text: str, tmp_path: Path) -> None:
+    file = tmp_path / "flight.yaml"
+    file.write_text(text)
+    resolve_config(file=file)
+
+
+def test_links_between_the_pages_lead_somewhere() -> None:
+    missing = [
+        f"{page.name}: {target}"
+        for page in PAGES
+        for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text())
+        if not (page.parent / target).exists()
+    ]
+    assert missing == []
