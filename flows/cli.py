@@ -1,6 +1,7 @@
 """The ``velfield`` command. Imports nothing heavy until a command runs."""
 
 import os
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -289,6 +290,7 @@ def _conclude(summary: "RunSummary", console: "Console") -> int:
     root = Path(summary.root)
     console.result(f"maps    {root / 'maps'}")
     console.result(f"report  {root / 'index.html'}")
+    console.result(f"page    velfield view {shlex.quote(str(root))}")
     if summary.complete:
         return DONE
     for line in summary.frames_lost[:10]:

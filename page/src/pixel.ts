@@ -37,9 +37,11 @@ const WANTED = [
   "speed_p85_high90",
   "standing_share",
 ];
+/** What makes another value needless. */
+const BETTER: Record<string, string> = { direction_se: "direction_half90", speed_se: "speed_p50_low90" };
 
 export async function askPixel(field: Field, { x, y }: Point): Promise<PixelAnswer> {
-  const names = WANTED.filter((name) => field.has(name));
+  const names = WANTED.filter((name) => field.has(name) && !field.has(BETTER[name] ?? ""));
   const [histogram, ...found] = await Promise.all([field.histogram(x, y), ...names.map((name) => field.at(name, x, y))]);
   const values = Object.fromEntries(names.map((name, k) => [name, found[k]!]));
   const n = values.count || 0; // NaN where no chunk is stored

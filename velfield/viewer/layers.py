@@ -128,8 +128,9 @@ def _unknown(name: str, attributes: Mapping[str, Any]) -> _Known:
     """A layer that this file does not know. One that can be below zero tells a change."""
     title = str(attributes.get("long_name", name.replace("_", " ")))
     kind = _KINDS.get(str(attributes.get("units", "1")), "plain")
-    change = "change" in name or "difference" in name
-    return _Known(name, title[:1].upper() + title[1:], title, "change" if change else kind, (name,), change)
+    change = "change" in name
+    about = "The later less the earlier, shown where it is hardly chance." if change else ""
+    return _Known(name, title[:1].upper() + title[1:], about, "change" if change else kind, (name,), change)
 
 
 def _top(arrays: Sequence[NDArray[Any]]) -> float:
