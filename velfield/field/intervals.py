@@ -23,12 +23,12 @@ from velfield.field.speeds import CELLS_PER_BIN, blur_variance, most_cells, narr
 
 PLATOON = 20.0
 """Passages beyond this many are of another platoon."""
-SPEED_CORRELATION = 0.15
+SPEED_CORRELATION = 0.13
 DIRECTION_CORRELATION = 0.02
 """Correlation of two passages of a platoon."""
 USUAL_COUNTS_FOR = 3.0
 """Passages that the usual spread counts for."""
-USUAL_SPEED_SPREAD = 0.05
+USUAL_SPEED_SPREAD = 0.07
 """Standard deviation of speed at a place, as a share of it."""
 USUAL_SWAY = 0.01
 """Standard deviation of the sideways velocity at a place, as a share of the speed."""

@@ -77,12 +77,12 @@ def _around(
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _of_the_map(everywhere: Float, v_y: float, v_x: float) -> float:
-    """Density per square bin where nothing is known of the place."""
+def _of_the_map(everywhere: Float, known: bool, v_y: float, v_x: float) -> float:
+    """Density per square bin where nothing is known of the place; ``known``: whether anything is of the map."""
     reach = (everywhere.shape[0] - 1) / 2
     broad = reach / 2
     of_broad = exp(-0.5 * ((v_x - reach) ** 2 + (v_y - reach) ** 2) / (broad * broad)) / (2.0 * pi * broad * broad)
-    share = BROAD_SHARE if everywhere.sum() > 0 else 1.0
+    share = BROAD_SHARE if known else 1.0
     return float((1.0 - share) * _spread(everywhere, v_y, v_x, LEAST_SIGMA_BINS) + share * of_broad)
 
 
@@ -104,6 +104,7 @@ def densities_at_pixel(
     near = _around(histogram, count, x, y, radius, around)
     inside = 0 <= y < count.shape[0] and 0 <= x < count.shape[1]
     here = float(count[y, x]) if inside else 0.0
+    known = everywhere.sum() > 0.0
     own: Float = np.zeros(everywhere.shape)
     if here > 0.0:
         own += histogram[y, x]
@@ -111,7 +112,7 @@ def densities_at_pixel(
     out = np.empty(velocity_bins.shape[0])
     for k in range(velocity_bins.shape[0]):
         v_x, v_y = velocity_bins[k, 0], velocity_bins[k, 1]
-        density = _of_the_map(everywhere, v_y, v_x)
+        density = _of_the_map(everywhere, known, v_y, v_x)
         if near > 0.0:
             density = (near * _spread(around, v_y, v_x, _sigma(near)) + STRENGTH * density) / (near + STRENGTH)
         if here > 0.0:
