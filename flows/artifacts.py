@@ -1,19 +1,36 @@
-"""What the Prefect UI shows of a run besides its graph: a summary, a table of stages, the two maps as pictures."""
+"""What the Prefect UI shows of a run besides its graph: a summary with the two maps, a table of stages, the report's
+address, and how far a long stage is."""
 
 import base64
+import time
+from uuid import UUID
 
-from prefect.artifacts import create_markdown_artifact, create_table_artifact
+from prefect.artifacts import (
+    create_link_artifact,
+    create_markdown_artifact,
+    create_progress_artifact,
+    create_table_artifact,
+    update_progress_artifact,
+)
 
 from schemas.summary import RunSummary
+from velfield.layout import RunLayout
+from velfield.places import is_remote
 from velfield.plan import Plan
+from velfield.results import named
 
 _PICTURE_BYTES = 600_000
 """A markdown artifact of about this size was seen to show; a larger picture is left to the report."""
 
 
+_LONG_S, _EVERY_S = 20.0, 5.0
+"""A stage that takes longer than the one has its progress shown, as often as the other."""
+
+
 def publish_summary(plan: Plan, summary: RunSummary) -> None:
     """Create the artifacts of a finished run."""
-    lines = [f"# {plan.job.inputs.source}", "", f"Report: `{plan.layout.report}`", ""]
+    report = RunLayout(named(plan.layout.root)).report
+    lines = [f"# {plan.job.inputs.source}", "", f"Report: `{report}`", ""]
     lines += [f"- **{stage.name}**: {stage.text} ({stage.seconds:.1f} s)" for stage in summary.stages]
     lines += ["", f"{len(summary.frames_lost)} frames lost.", ""]
     for name in ("direction", "speed"):
@@ -22,6 +39,8 @@ def publish_summary(plan: Plan, summary: RunSummary) -> None:
             data = base64.b64encode(picture.read_bytes()).decode()
             lines += [f"## {name.capitalize()}", f"![modal {name}](data:image/png;base64,{data})", ""]
     create_markdown_artifact(key="summary", markdown="\n".join(lines), description="What was done, and the maps")
+    if not is_remote(plan.layout.root):
+        create_link_artifact(key="report", link=report.as_uri(), link_text="report", description="The run's own page")
     create_table_artifact(
         key="stages",
         table=[
@@ -36,3 +55,25 @@ def publish_summary(plan: Plan, summary: RunSummary) -> None:
         ],
         description="The stages of the run",
     )
+
+
+class LongStage:
+    """How far a stage is, told in the UI once it takes long; short ones would only fill the page."""
+
+    def __init__(self, stage: str, steps: int) -> None:
+        self._stage, self._steps = stage, max(steps, 1)
+        self._told_s = time.monotonic() + _LONG_S - _EVERY_S
+        self._artifact: UUID | None = None
+
+    def tell(self, done: int) -> None:
+        """So many steps are done."""
+        now_s = time.monotonic()
+        if now_s - self._told_s < _EVERY_S and (self._artifact is None or done < self._steps):
+            return
+        self._told_s = now_s
+        percent = 100.0 * min(done / self._steps, 1.0)
+        if self._artifact is None:
+            key, about = f"progress-{self._stage}", f"{self._stage}, per cent"
+            self._artifact = UUID(str(create_progress_artifact(percent, key=key, description=about)))
+        else:
+            update_progress_artifact(self._artifact, percent)

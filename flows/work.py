@@ -9,6 +9,7 @@ from prefect import task
 from prefect.cache_policies import NO_CACHE
 from prefect.futures import PrefectFuture, as_completed
 
+from flows.artifacts import LongStage
 from flows.console import Console, StageProgress
 from flows.runners import Runner
 from schemas.records import CommitRecord
@@ -90,7 +91,7 @@ class Work:
                 local = beside.futures[k : k + 1 + halo] if beside else []
                 done_before += committed(self.plan, name, unit.name) is not None
                 stage.futures.append(self._submit(name, unit, [*whole, *local]))
-            records = self._collect(stage, units, progress, essential=essential)
+            records = self._collect(name, stage, units, progress, essential=essential)
         self.plan = self.plan.despite([f"{name} {unit}" for unit in stage.lost])
         summary = summarise_stage(
             name,
@@ -123,7 +124,9 @@ class Work:
         plan = self.plan
 
         def do() -> CommitRecord:
-            return committed(plan, name, unit.name) or self.runner.compute(unit.graph())
+            record = committed(plan, name, unit.name) or self.runner.compute(unit.graph())
+            # Prefect keeps what a task returns: hundreds of digests a unit would make the driver grow with the flight.
+            return record.model_copy(update={"outputs": {}})
 
         label = _LABELS[name] if unit.name == "all" else f"{_LABELS[name]} {unit.name}"
         return task(
@@ -138,13 +141,15 @@ class Work:
         ).submit(wait_for=wait_for)
 
     def _collect(
-        self, stage: Stage, units: Sequence[Unit], progress: StageProgress, *, essential: bool
+        self, name: str, stage: Stage, units: Sequence[Unit], progress: StageProgress, *, essential: bool
     ) -> list[CommitRecord]:
         done = 0
+        shown = LongStage(name, sum(unit.steps for unit in units))
         steps = {future: unit.steps for future, unit in zip(stage.futures, units, strict=True)}
         for future in as_completed(stage.futures):
             done += steps[future]
             progress.at_least(done)
+            shown.tell(done)
         records = []
         for future, unit in zip(stage.futures, units, strict=True):
             if not _is_lost(future):

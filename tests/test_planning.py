@@ -17,10 +17,10 @@ from velfield.steps.planning import describe_plan, planned_units
 FOUR_HOURS = 72_000
 
 
-def planned(frames: int, root: Path, width: int = 2560, height: int = 1920) -> Plan:
+def planned(frames: int, root: Path, width: int = 2560, height: int = 1920, unit_frames: int | str = "auto") -> Plan:
     """The plan of a flight at 5 frames a second that need not exist."""
     source = SourceRecord(path="flight.mp4", kind="video", digest="d", width=width, height=height, frame_count=frames)
-    inputs, config = InputsRecord(source=source), resolve_config()
+    inputs, config = InputsRecord(source=source), resolve_config(overrides={"work.unit_frames": unit_frames})
     info = SourceInfo("video", width, height, frames, np.arange(frames) / 5, ())
     job = Job(root=str(root), inputs=Inputs(source="flight.mp4"), config=config)
     return Plan(job, info, np.arange(frames), inputs, stage_keys(config, inputs))

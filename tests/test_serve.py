@@ -23,6 +23,7 @@ import yaml
 
 from flows.serve import ServeConfig, check, deployments, settings
 from schemas.summary import RunSummary
+from tests.browser import browser
 from velfield.errors import InputError
 from velfield.incoming import Watch, inputs_of, newest_picture, picture_named, run_folders, run_name
 
@@ -164,9 +165,10 @@ class Served:
         return {run["name"]: run["state"]["type"] for run in begun}
 
 
-@pytest.fixture
-def served(whole: tuple[Path, RunSummary], tmp_path: Path) -> Iterator[Served]:
+@pytest.fixture(scope="module")
+def served(whole: tuple[Path, RunSummary], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """A served folder with one run in it, from a working folder with a decoy."""
+    tmp_path = tmp_path_factory.mktemp("serve")
     folder, port = tmp_path / "served", free_port()
     shutil.copytree(whole[0], folder / "runs" / "main-street")
     (tmp_path / "elsewhere").mkdir()
@@ -219,6 +221,63 @@ def test_from_the_event_to_the_finished_reprocess(served: Served, flight: Path) 
     results = json.loads((served.folder / "runs/main-street/results.json").read_text())["results"]
     assert [(result["name"], result["how"]) for result in results] == [("first", "run"), ("spring", "mapped")]
 
+
+_BLINKS = """if True:
+    import sys
+    from flows.launch import limit_threads, prepare_process
+    limit_threads()
+    prepare_process(verbose=False)
+    from pathlib import Path
+    from tests.small_flight import job, process
+    from velfield.steps import tracking
+    true, calls = tracking.link_unit, []
+
+    def blinks(plan, frames):
+        calls.append(frames)
+        if len(calls) == 1:
+            raise OSError("the disk blinked")
+        return true(plan, frames)
+
+    tracking.link_unit = blinks
+    process(job(Path(sys.argv[1]), Path(sys.argv[2])))
+"""
+
+
+def test_the_ui_shows_graph_retry_and_artifacts(
+    served: Served, whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
+) -> None:
+    """In a real browser: the graph drawn, a task that was tried twice shown so, the summary with its maps."""
+    root = tmp_path / "blinks"
+    shutil.copytree(whole[0], root)
+    (root / "commits/links/000008-000015.json").unlink()
+    environment = {**os.environ, "PREFECT_API_URL": f"{served.url}/api", "PYTHONPATH": str(ROOT)}
+    subprocess.run([sys.executable, "-c", _BLINKS, str(flight), str(root)], env=environment, check=True)
+    (run,) = served.ask("/flow_runs/filter", {"flow_runs": {"name": {"any_": [str(root)]}}})
+    tasks = served.ask("/task_runs/filter", {"flow_runs": {"id": {"any_": [run["id"]]}}})
+    (twice,) = [task for task in tasks if task["run_count"] > 1]
+    assert twice["name"] == "links 000008-000015"
+    with browser(tmp_path / "profile") as found, found.page() as page:
+        page.open(f"{served.url}/runs/flow-run/{run['id']}")
+        page.wait("document.body.innerText.includes('Completed')")
+        page.wait("document.querySelector('canvas')?.clientHeight > 100")
+        assert f"{len(tasks)} Task runs" in page.value("document.body.innerText")
+        page.open(f"{served.url}/runs/task-run/{twice['id']}")
+        page.wait("document.body.innerText.includes('the disk blinked')")
+        page.wait("/Run Count\\s+2/.test(document.body.innerText)")
+        assert "Retry 1/1 will start" in page.value("document.body.innerText")
+        (summary,) = served.ask(
+            "/artifacts/filter",
+            {"flow_runs": {"id": {"any_": [run["id"]]}}, "artifacts": {"key": {"any_": ["summary"]}}},
+        )
+        page.open(f"{served.url}/artifacts/artifact/{summary['id']}")
+        page.wait("document.querySelectorAll('img[src^=data]').length == 2")
+        page.wait("[...document.querySelectorAll('img')].every(img => img.naturalWidth > 100)")
+        asked = {request for request in page.requests if request.startswith("http")}
+        assert [request for request in asked if not request.startswith(served.url)] == []
+
+
+def test_sockets_and_origins_and_that_ctrl_c_leaves_nothing(served: Served) -> None:
+    """Last of all."""
     serving = psutil.Process(served.process.pid)
     family = [serving, *serving.children(recursive=True)]
     assert set().union(*(sockets_of(process) for process in family)) <= {"127.0.0.1"}

@@ -45,6 +45,18 @@ def unfinished(layout: RunLayout, name: str) -> RunLayout:
     return RunLayout(layout.results / f".{name}.unfinished")
 
 
+def named(root: Path) -> Path:
+    """Where a run folder stands once it is whole: elsewhere only while it is a result in the making.
+
+    Examples
+    --------
+    >>> named(Path("RUN/results/.spring.unfinished")).as_posix()
+    'RUN/results/spring'
+    """
+    name = root.name
+    return root.with_name(name[1:-11]) if name.startswith(".") and name.endswith(".unfinished") else root
+
+
 def read_results(layout: RunLayout) -> tuple[ResultRecord, ...]:
     """All results, the first one first; none where there is but the one."""
     path = layout.results_index

@@ -393,8 +393,8 @@ class FieldStore:
         return [*_metadata(self.path), *_existing([*histogram, *layers, *axes])]
 
     def layer_names(self) -> list[str]:
-        """Names of the (y, x) layers."""
-        return [name for name, array in self.group.arrays() if array.ndim == 2]
+        """Names of the (y, x) layers, in one order whatever the disk lists first."""
+        return sorted(name for name, array in self.group.arrays() if array.ndim == 2)
 
     def layer_attributes(self, name: str) -> dict[str, Any]:
         """Units and long name of a layer."""

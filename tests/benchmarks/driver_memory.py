@@ -1,0 +1,73 @@
+"""The driver's memory over a flight: all units of 5,000 and of 72,000 frames as tasks, their work left out.
+
+python -m tests.benchmarks.driver_memory
+"""
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from flows.launch import prepare_process
+
+
+def main() -> None:
+    """Print the resident memory of this process before and after each flight."""
+    prepare_process(verbose=False)
+    from prefect import flow
+    from prefect.task_runners import ThreadPoolTaskRunner
+
+    with tempfile.TemporaryDirectory() as folder:
+        print(f"{'frames':>8} {'unit':>5} {'tasks':>6} {'MB before':>10} {'MB after':>9}")
+        for frames, unit in ((256, 8), (5000, 8), (5000, "auto"), (72_000, "auto")):
+            flown = flow(name="driver-memory", validate_parameters=False, persist_result=False)(_stages)
+            root = Path(folder) / f"{frames}-{unit}"
+            before = _resident_mb()
+            tasks = flown.with_options(task_runner=ThreadPoolTaskRunner(max_workers=4))(root, frames, unit)
+            print(f"{frames:>8} {unit:>5} {tasks:>6} {before:>10.0f} {_resident_mb():>9.0f}", flush=True)
+
+
+def _stages(root: Path, frames: int, unit: Any) -> int:
+    from dask import delayed
+
+    from flows.console import Console
+    from flows.runners import ThreadsRunner
+    from flows.work import Stage, Unit, Work
+    from tests.test_planning import planned
+    from velfield.steps.outcome import unit_name
+
+    plan = planned(frames, root, unit_frames=unit)
+    work = Work(plan, ThreadsRunner(2), Console("quiet"))
+    before: Stage | None = None
+    count = 0
+    for stage in ("frames", "registration", "detections", "links"):
+        units = [
+            Unit(unit_name(part), lambda part=part, stage=stage: delayed(_commit, pure=False)(plan, stage, part))
+            for part in plan.units
+        ]
+        count += len(units)
+        before = work.run(stage, units, beside=before)
+    return count
+
+
+def _commit(plan: Any, stage: str, part: range) -> Any:
+    """A record as large as a true one's, written as a true one is."""
+    from schemas.records import CommitRecord
+    from velfield.provenance import write_commit
+    from velfield.steps.outcome import unit_name
+
+    counts = dict.fromkeys(("frames", "usable", "registered", "heldout_px", "cars", "tracklets"), 1.0)
+    outputs = {f"frames.zarr/raw/c/{frame}/0/0": "0" * 32 for frame in part}
+    key = plan.keys[stage]
+    record = CommitRecord(stage=stage, unit=unit_name(part), key=key, outputs=outputs, counts=counts, code_version="0")
+    write_commit(plan.layout, record)
+    return record
+
+
+def _resident_mb() -> float:
+    import psutil
+
+    return psutil.Process().memory_info().rss / 1e6
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,139 @@
+"""Clusters: by configuration alone, with a worker killed in mid-chunk, and with workers that have no `flows`."""
+
+import contextlib
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+from flows.runners import ClusterFile, RunnerConfig, open_runner, read_runner
+from schemas.summary import RunSummary
+from tests.small_flight import digests, job, process
+from velfield.errors import InputError
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = sorted((ROOT / "examples").glob("cluster-*.yaml"))
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_the_examples_are_read_and_say_what_stands_where(path: Path) -> None:
+    runner = read_runner(path)
+    assert runner.cluster_class is not None
+    assert runner.cluster_class.split(".")[0] in path.read_text().split("pip install ")[1].replace("-", "_")
+    assert runner.workers is not None
+    assert runner.workers > 1
+    assert "What stands where" in path.read_text()
+
+
+def test_there_is_an_example_for_each_kind() -> None:
+    assert [path.stem for path in EXAMPLES] == ["cluster-cloudprovider", "cluster-kubernetes", "cluster-slurm"]
+
+
+def test_an_example_whose_package_is_not_there_says_so() -> None:
+    with (
+        pytest.raises(InputError, match=r"cluster_class 'dask_jobqueue.SLURMCluster': .*install its package"),
+        open_runner(read_runner(ROOT / "examples/cluster-slurm.yaml")),
+    ):
+        pass
+
+
+@pytest.mark.parametrize(
+    "text", ["workers: 2", "cluster_class: a.B\nworker: 3", "- 1", "cluster_class: [", "cluster_class: a.B\nworkers: 0"]
+)
+def test_a_cluster_file_that_is_none_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "cluster.yaml").write_text(text)
+    with pytest.raises(InputError, match="expected cluster_class"):
+        read_runner(tmp_path / "cluster.yaml")
+
+
+def one_that_kills_its_worker(plan: object, frames: range) -> object:
+    """In place of the step: the first worker that gets frame 8 dies of it."""
+    from velfield.steps.detections import detect_block
+
+    mark = Path(plan.job.root) / "killed"  # type: ignore[attr-defined]
+    if 8 in frames and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), 9)
+    return detect_block(plan, frames)  # type: ignore[arg-type]
+
+
+def test_a_worker_killed_in_mid_chunk_on_a_cluster_by_class(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only detection onward is done: all before it is taken from the whole run."""
+    from velfield import graphs
+
+    root = tmp_path / "run"
+    shutil.copytree(whole[0], root)
+    for stage in ("detections", "links", "tracklets", "field", "maps"):
+        shutil.rmtree(root / "commits" / stage)
+    asked = {"cluster_class": "distributed.LocalCluster", "workers": 2}
+    asked["cluster_kwargs"] = {"n_workers": 0, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0"}
+    (tmp_path / "cluster.yaml").write_text(yaml.safe_dump(ClusterFile.model_validate(asked).model_dump()))
+    true = graphs.detections_graph
+
+    def deadly(plan: object, frames: range) -> object:
+        with monkeypatch.context() as patch:
+            patch.setattr("velfield.steps.detections.detect_block", one_that_kills_its_worker)
+            return true(plan, frames)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(graphs, "detections_graph", deadly)
+    summary = process(job(flight, root), read_runner(tmp_path / "cluster.yaml"))
+    assert (root / "killed").exists()
+    (root / "killed").unlink()
+    assert summary.complete
+    assert digests(root) == digests(whole[0])
+
+
+@pytest.fixture
+def foreign_cluster(tmp_path: Path) -> Iterator[str]:
+    """Scheduler and worker as processes of their own, in other working folders, `flows` hidden from them."""
+    site = tmp_path / "site"
+    for name in ("velfield", "schemas"):
+        shutil.copytree(ROOT / name, site / name)
+    (site / "flows.py").write_text("raise ImportError('there is no flows here')")
+    ours = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT")}
+    environment = {**ours, "PYTHONPATH": str(site), "PYTHONSAFEPATH": "1", "HOME": str(tmp_path)}
+    address_file = tmp_path / "scheduler.json"
+    told = ["--scheduler-file", str(address_file)]
+    scheduler = ["distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", *told]
+    worker = ["distributed.cli.dask_worker", "--host", "127.0.0.1", "--nthreads", "1", "--no-dashboard", *told]
+    processes = []
+    try:
+        for number, command in enumerate((scheduler, worker)):
+            folder = tmp_path / f"elsewhere-{number}"
+            folder.mkdir()
+            processes.append(
+                subprocess.Popen(
+                    [sys.executable, "-m", *command], cwd=folder, env=environment, stderr=subprocess.DEVNULL
+                )
+            )
+            while not address_file.exists():
+                assert processes[0].poll() is None
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    processes[0].wait(0.1)
+        yield str(yaml.safe_load(address_file.read_text())["address"])
+    finally:
+        for started in processes:
+            started.terminate()
+            started.wait(30)
+
+
+def test_workers_elsewhere_without_flows_give_the_same(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, foreign_cluster: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every stage runs there; the run folder is given by a relative path, which means nothing to the worker."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run").mkdir()
+    for stage in ("frames", "lens", "base"):
+        shutil.copytree(whole[0] / "commits" / stage, tmp_path / "run/commits" / stage)
+    for name in ("frames.zarr", "base"):
+        shutil.copytree(whole[0] / name, tmp_path / "run" / name)
+    shutil.copy(whole[0] / "camera.json", tmp_path / "run")
+    process(job(flight, Path("run")), RunnerConfig(scheduler=foreign_cluster))
+    assert digests(tmp_path / "run") == digests(whole[0])
