@@ -5,6 +5,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
 from schemas.summary import RunSummary
@@ -56,3 +57,12 @@ def test_the_command_knows_the_formats_that_there_are() -> None:
     from flows.commands.export import Format
 
     assert set(get_args(Format)) == set(FORMATS)
+
+
+def test_the_certificates_are_kept_and_shown(run: Run) -> None:
+    errors = run.registration.column("error_px")
+    assert errors.shape == (run.frames.count, 6, 8)
+    assert 0 < float(np.nanmedian(errors)) < 1
+    assert (run.layout.maps / "registration.png").exists()
+    assert (run.layout.maps / "lens.png").exists() == (not run.maps.lens.is_identity)
+    assert "How well frames lie on the map" in run.layout.report.read_text()

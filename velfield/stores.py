@@ -183,6 +183,10 @@ REGISTRATION_COLUMNS: dict[str, str] = {
 }
 
 
+ERROR_CELLS = (6, 8)
+"""Rows and columns of the cells of a frame that held-out errors are told by."""
+
+
 def create_registration(path: Path, *, key: str, count: int, vector_length: int, unit_frames: int) -> None:
     """Lay out ``registration.zarr``: chunks are units, so that a unit has one writer."""
     group = zarr.create_group(_store(path), overwrite=True)
@@ -192,6 +196,9 @@ def create_registration(path: Path, *, key: str, count: int, vector_length: int,
     for name, dtype in REGISTRATION_COLUMNS.items():
         fill = np.nan if dtype.startswith("float") else 0
         _create(group, name, (count,), (chunk,), dtype, fill_value=fill, dimension_names=("frame",))
+    axes = ("frame", "row", "column")
+    shape, chunks = (count, *ERROR_CELLS), (chunk, *ERROR_CELLS)
+    _create(group, "error_px", shape, chunks, "float32", fill_value=np.nan, dimension_names=axes)
     group.attrs["key"] = key
 
 
@@ -205,7 +212,7 @@ class RegistrationStore:
     def write(
         self, start: int, vectors: NDArray[np.float64], statuses: Sequence[str], columns: Mapping[str, NDArray[Any]]
     ) -> None:
-        """Write a whole unit from frame ``start`` on."""
+        """Write a whole unit from frame ``start`` on; ``columns`` are ``REGISTRATION_COLUMNS`` and ``error_px``."""
         stop = start + len(statuses)
         text = np.zeros((len(statuses), _STATUS_BYTES), np.uint8)
         for row, status in zip(text, statuses, strict=True):
@@ -230,7 +237,7 @@ class RegistrationStore:
         return [bytes(row).rstrip(b"\0").decode(errors="replace") for row in rows]
 
     def column(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
-        """One of ``REGISTRATION_COLUMNS``."""
+        """One of ``REGISTRATION_COLUMNS``, (frames,); or ``error_px``, (frames, 6, 8): held-out error by cell."""
         return _read(self.path, self.group, name, slice(start, stop))
 
     def files(self, start: int) -> list[Path]:
@@ -238,7 +245,8 @@ class RegistrationStore:
         unit = start // int(_array(self.group, "vector").chunks[0])
         tables = [self.path / name / "c" / str(unit) / "0" for name in ("vector", "status")]
         columns = [self.path / name / "c" / str(unit) for name in REGISTRATION_COLUMNS]
-        return [*_metadata(self.path), *_existing([*tables, *columns])]
+        errors = self.path / "error_px" / "c" / str(unit) / "0" / "0"
+        return [*_metadata(self.path), *_existing([*tables, *columns, errors])]
 
 
 def open_registration(path: Path, mode: str = "r") -> RegistrationStore:

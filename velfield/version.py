@@ -6,13 +6,13 @@ STAGE_VERSIONS: dict[str, int] = {
     "frames": 1,
     "lens": 2,
     "base": 2,
-    "registration": 1,
-    "detector": 3,
+    "registration": 2,
+    "detector": 4,
     "detections": 3,
     "links": 1,
     "tracklets": 1,
     "field": 2,
-    "maps": 2,
+    "maps": 3,
 }
 
 

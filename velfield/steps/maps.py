@@ -15,6 +15,7 @@ from velfield.progress import advance
 from velfield.provenance import write_atomically
 from velfield.render.figures import MapScale, direction_figure, png_bytes, speed_figure
 from velfield.sources.pictures import read_picture_grey
+from velfield.steps.certificates import write_certificates
 from velfield.steps.grid import north_of, read_grid
 from velfield.steps.outcome import Outcome
 from velfield.stores import open_field
@@ -45,6 +46,7 @@ def make_maps(plan: Plan) -> Outcome:
             write_atomically(path, png_bytes(picture))
             written.append(path)
     written += _layers(plan, direction, speed)
+    written += write_certificates(plan)
     written += write_view_data(layout)
     advance("maps")
     return Outcome(written, {"maps": float(len(figures))})

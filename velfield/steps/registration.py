@@ -15,6 +15,7 @@ from velfield.steps.base import FrameKeyPoints, base_reference
 from velfield.steps.frame_maps import read_lens
 from velfield.steps.outcome import Outcome
 from velfield.stores import (
+    ERROR_CELLS,
     REGISTRATION_COLUMNS,
     FrameStore,
     create_registration,
@@ -73,6 +74,7 @@ def _write(plan: Plan, frames: range, flags: NDArray[np.uint16], results: dict[i
         name: np.full(len(frames), np.nan if dtype.startswith("float") else 0, dtype)
         for name, dtype in REGISTRATION_COLUMNS.items()
     }
+    errors = np.full((len(frames), *ERROR_CELLS), np.nan, np.float32)
     statuses = []
     for k, frame in enumerate(frames):
         result = results.get(frame)
@@ -84,8 +86,10 @@ def _write(plan: Plan, frames: range, flags: NDArray[np.uint16], results: dict[i
             vectors[k] = result.transform.to_vector(config)
         for name in columns:
             columns[name][k] = getattr(result, name)
+        if result.error_map is not None:
+            errors[k] = result.error_map
     store = open_registration(plan.layout.registration, "r+")
-    store.write(frames.start, vectors, statuses, columns)
+    store.write(frames.start, vectors, statuses, {**columns, "error_px": errors})
     registered = statuses.count("ok")
     counts = {"frames": float(len(frames)), "registered": float(registered)}
     if registered:

@@ -26,9 +26,25 @@ _CAPTIONS = {
     "direction": (
         "Which way traffic goes",
         "The modal direction of travel at every pixel that vehicles passed, as hue; none where they stand.",
+        "map of the modal direction over the base image",
     ),
-    "speed": ("How fast it goes", "The modal speed at every pixel that vehicles passed."),
+    "speed": (
+        "How fast it goes",
+        "The modal speed at every pixel that vehicles passed.",
+        "map of the modal speed over the base image",
+    ),
+    "lens": (
+        "The lens",
+        "A frame as it was taken, and as a pin-hole would have taken it: the lines are straight in the second.",
+        "a frame before and after the lens's distortion is taken out",
+    ),
+    "registration": (
+        "How well frames lie on the map",
+        "Error of control points held out of the fit, px, by cell of the frame, all frames together.",
+        "registration error by cell over a frame",
+    ),
 }
+"""Picture of ``maps/`` -> title, caption, and what it shows for those who do not see it."""
 _LEARNT_FROM = {
     "labels": "marked cars",
     "motion": "what moves in the flight",
@@ -147,13 +163,15 @@ def _files(plan: Plan) -> list[tuple[str, str]]:
 def report_figures(layout: RunLayout) -> dict[str, ReportFigure]:
     """The pictures of the report, their bytes in them, by name."""
     figures = {}
-    for name, (title, caption) in _CAPTIONS.items():
+    for name, (title, caption, alternative) in _CAPTIONS.items():
+        if not (layout.maps / f"{name}.png").exists():
+            continue  # a pin-hole has no before and after
         encoded = np.frombuffer((layout.maps / f"{name}.png").read_bytes(), np.uint8)
         picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
         figures[name] = ReportFigure(
             title=title,
             caption=caption,
-            alternative=f"map of the modal {name} over the base image",
+            alternative=alternative,
             mime="image/jpeg",
             data=jpeg_bytes(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), max_side=_PICTURE_SIDE_PX),
             full_size=f"maps/{name}.png",
