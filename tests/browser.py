@@ -27,7 +27,7 @@ _FLAGS = (
     "--remote-debugging-port=0",
     "--window-size=1280,860",
 )
-_PATIENCE_S = 30.0
+_PATIENCE_S = 60.0
 
 
 def chromium() -> str:

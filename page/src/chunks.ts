@@ -1,37 +1,12 @@
 // Chunks of the run folder's Zarr arrays. A chunk that is not stored is known from run.json and not asked for.
 
 import * as zarr from "zarrita";
-import { ZSTDDecoder } from "zstddec";
-import { fetchFile, Unreadable, type StoredArray } from "./run";
-
-export type Numbers = Float32Array | Float64Array | Int32Array;
-
-/** zarrita's own zstd wants `unsafe-eval`; this one does not. It checks the checksum that every chunk carries. */
-class Zstd {
-  readonly kind = "bytes_to_bytes";
-  static readonly decoder = new ZSTDDecoder();
-
-  static async load(): Promise<typeof Zstd> {
-    await Zstd.decoder.init();
-    return Zstd;
-  }
-
-  static fromConfig(): Zstd {
-    return new Zstd();
-  }
-
-  encode(): never {
-    throw new Error("the page only reads");
-  }
-
-  decode(bytes: Uint8Array): Uint8Array {
-    const decoded = Zstd.decoder.decode(bytes);
-    if (decoded.length === 0) throw new Unreadable("a chunk is damaged: its checksum is wrong");
-    return decoded;
-  }
-}
+import { fetchFile, type StoredArray } from "./run";
+import { Zstd } from "./zstd";
 
 zarr.registry.set("zstd", () => Zstd.load() as never);
+
+export type Numbers = Float32Array | Float64Array | Int32Array;
 
 /** An array; `metadata` where it is known already spares asking for it. */
 async function openArray(path: string, metadata?: object) {

@@ -1,20 +1,22 @@
 // The field's arrays by name, read pixel by pixel.
 
 import { ChunkedArray, type Numbers } from "./chunks";
+import { Histogram } from "./histogram";
 import type { Run } from "./run";
 
-export const HISTOGRAM = "velocity_histogram";
-const LAYER_CHUNKS_KEPT = 24;
-const HISTOGRAM_CHUNKS_KEPT = 4; // tens of megabytes each once decoded
+const HISTOGRAM = "velocity_histogram";
+const CHUNKS_KEPT = 24; // of each array
 
 export class Field {
   private readonly arrays = new Map<string, ChunkedArray>();
+  private readonly histograms: Histogram;
 
   constructor(readonly run: Run) {
     for (const [name, told] of Object.entries(run.arrays)) {
-      const most = name === HISTOGRAM ? HISTOGRAM_CHUNKS_KEPT : LAYER_CHUNKS_KEPT;
-      this.arrays.set(name, new ChunkedArray(name, told, most));
+      if (name !== HISTOGRAM) this.arrays.set(name, new ChunkedArray(name, told, CHUNKS_KEPT));
     }
+    const told = run.arrays[HISTOGRAM]!;
+    this.histograms = new Histogram(`${told.store}/${HISTOGRAM}`, told, run.bins);
   }
 
   has(name: string): boolean {
@@ -47,12 +49,8 @@ export class Field {
   }
 
   /** The histogram at a pixel, (vy, vx) flat; null where nothing passed. */
-  async histogram(x: number, y: number): Promise<Int32Array | null> {
-    const array = this.array(HISTOGRAM);
-    const { row, column, index } = place(array, x, y);
-    const chunk = (await array.read(row, column)) as Int32Array | null;
-    const size = this.run.bins ** 2;
-    return chunk && chunk.subarray(index * size, (index + 1) * size);
+  histogram(x: number, y: number): Promise<Int32Array | null> {
+    return this.histograms.at(x, y);
   }
 }
 

@@ -132,9 +132,10 @@ export class Overlay extends L.GridLayer {
   }
 
   private async chunks(row: number, column: number): Promise<(Numbers | null)[] | null> {
-    const names = [...this.shown.arrays, "count"];
-    const data = await Promise.all(names.map((name) => this.field.array(name).read(row, column)));
-    return data.slice(0, -1).some((chunk) => chunk !== null) ? data : null;
+    const values = this.shown.arrays.map((name) => this.field.array(name).read(row, column));
+    const count = this.least > 1 ? this.field.array("count").read(row, column) : Promise.resolve(null);
+    const data = await Promise.all([...values, count]);
+    return data.slice(0, -1).every((chunk) => chunk !== null) ? data : null;
   }
 
   private picture(data: (Numbers | null)[], side: number, level: number): ImageData {

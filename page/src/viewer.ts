@@ -33,6 +33,7 @@ class Viewer {
   private drawing: Point[] | null = null; // ends of a line that is being drawn
   private asked = 0;
   private resting = 0;
+  private hovered: Point | null = null;
 
   constructor(private readonly run: Run) {
     this.field = new Field(run);
@@ -171,6 +172,7 @@ class Viewer {
   // -- the mouse over the map ------------------------------------------------------------------------------------------
 
   private hover(place: Point): void {
+    this.hovered = place;
     const [x, y] = [Math.round(place.x), Math.round(place.y)];
     const readout = find("readout");
     if (!this.field.inside(x, y)) {
@@ -182,7 +184,9 @@ class Viewer {
     const where = `(${x}, ${y})`;
     if (vx === undefined || vy === undefined || n === undefined) {
       readout.textContent = where;
-      for (const name of ["modal_vx", "modal_vy", "count"]) void this.field.at(name, x, y).catch((error) => this.fail(error));
+      const values = ["modal_vx", "modal_vy", "count"].map((name) => this.field.at(name, x, y));
+      const again = (): void => (this.hovered === place ? this.hover(place) : undefined);
+      Promise.all(values).then(again, (error) => this.fail(error));
     } else if (!n) readout.textContent = `${where} no vehicle`;
     else {
       const speed = Math.hypot(vx, vy);

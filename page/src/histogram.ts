@@ -1,0 +1,46 @@
+// The velocity histogram, (y, x, vy, vx), pixel by pixel. A tile holds tens of megabytes once decoded, most of them zeros:
+// it is kept as it is packed, and the pixel asked is cut from it as it is decoded.
+
+import { fetchFile, Unreadable, type StoredArray } from "./run";
+import { decodePart } from "./zstd";
+
+const MOST_TILES = 64;
+
+export class Histogram {
+  private readonly stored = new Set<string>();
+  private readonly packed = new Map<string, Promise<Uint8Array>>();
+
+  constructor(
+    private readonly path: string,
+    private readonly told: StoredArray,
+    private readonly bins: number,
+  ) {
+    for (let k = 0; k < told.stored.length; k += 2) this.stored.add(`${told.stored[k]}/${told.stored[k + 1]}`);
+    const { codecs } = told.metadata as { codecs: { name: string; configuration?: { endian?: string } }[] };
+    const names = codecs.map(({ name }) => name).join();
+    if (names !== "bytes,zstd" || codecs[0]!.configuration?.endian !== "little") {
+      throw new Unreadable(`${path} is packed as ${names}, this page reads little-endian bytes packed by zstd`);
+    }
+  }
+
+  /** The histogram at a pixel, (vy, vx) flat; null where nothing passed. */
+  async at(x: number, y: number): Promise<Int32Array | null> {
+    const [height, width] = this.told.chunk;
+    const key = `${Math.floor(y / height)}/${Math.floor(x / width)}`;
+    if (!this.stored.has(key)) return null;
+    const size = 4 * this.bins ** 2;
+    const index = (y % height) * width + (x % width);
+    const part = await decodePart(await this.tile(key), index * size, (index + 1) * size);
+    return new Int32Array(part.buffer);
+  }
+
+  private tile(key: string): Promise<Uint8Array> {
+    const known = this.packed.get(key);
+    if (known) return known;
+    const asked = fetchFile(`${this.path}/c/${key}/0/0`).then(async (file) => new Uint8Array(await file.arrayBuffer()));
+    this.packed.set(key, asked);
+    asked.catch(() => this.packed.delete(key)); // asked for again the next time
+    if (this.packed.size > MOST_TILES) this.packed.delete(this.packed.keys().next().value!);
+    return asked;
+  }
+}
