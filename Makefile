@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export UV_LINK_MODE := copy
 
-.PHONY: demo test lint types check format env lock bench soak clean
+.PHONY: demo test lint types check format env lock bench detector soak clean
 
 demo: page  ## simulate a flight, run the whole job, say where the report is
 	$(BIN)/velfield demo --out demo
@@ -54,6 +54,9 @@ soak: $(STAMP)  ## fifty kills at random moments: every result equal to the bit
 
 docs: $(STAMP)  ## the documentation as pages, in build/docs
 	$(BIN)/mkdocs build --quiet
+
+detector: $(STAMP)  ## make the detector that ships anew: make detector DATA=folder with songdo/ and kit_ais/
+	$(BIN)/python -m tests.benchmarks.ship_detector $(DATA)
 
 # Universal, with hashes, and without a registry's address in it.
 lock: $(STAMP)

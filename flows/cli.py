@@ -31,6 +31,7 @@ app.command("flows.commands.init:init", name="init", help="Look at a video and w
 app.command("flows.commands.config:config", name="config", help="The configuration that a run was made with.")
 app.command("flows.commands.view:view", name="view", help="Show a run's page in the browser.")
 app.command("flows.commands.annotate:annotate", name="annotate", help="Mark cars in the browser, to learn from.")
+app.command("flows.commands.train:train", name="train", help="Marked cars in, a detector file out.")
 app.command("flows.commands.export:export", name="export", help="Write a finished run in a format that others read.")
 app.command(
     "flows.commands.lineage:lineage", name="lineage", help="What stands behind a run, or behind a pixel of its field."

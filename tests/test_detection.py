@@ -11,7 +11,7 @@ from schemas.flight import DetectionConfig
 from velfield.detection.aligned import distinct
 from velfield.detection.axis import axial_difference, structure_axis
 from velfield.detection.detect import FrameDetections, detect_frame
-from velfield.detection.detector import Detector, load_detector, save_detector
+from velfield.detection.detector import Detector, load_detector, save_detector, shipped_detector
 from velfield.detection.patches import oriented_patches, upright_chips
 from velfield.detection.segmentation import moments, segment_response
 from velfield.detection.train import LabelledImage, train_detector
@@ -185,3 +185,35 @@ def test_of_two_finds_on_one_car_the_better_stays() -> None:
     cars = np.array([[20.0, 40.0, 0.0, 0.3, 0.1], [23.0, 41.0, 0.2, 0.8, 0.1]])
     assert distinct(cars, 16.0)[:, 3].tolist() == [0.8]
     assert distinct(np.empty((0, 5)), 16.0).shape == (0, 5)
+
+
+def test_few_cars_continue_the_shipped_detector() -> None:
+    truth = sample(flight(5), 0)
+    few = LabelledImage(image=truth.image, cars=truth.cars[:12], complete=False)
+    shipped = shipped_detector()
+    continued = train_detector([few], SMALL, continued=shipped)
+    assert len(continued.record.rounds) == len(shipped.record.rounds) + SMALL.rounds
+    assert continued.record.attribution == shipped.record.attribution
+    assert continued.threshold == shipped.threshold
+    assert f_measure(continued, sample(flight(6), 1)) > 0.7
+
+
+def f_measure(of: Detector, truth: LabelledImage) -> float:
+    found = detect_frame(truth.image, None, of, SMALL)
+    return 2 * len(matches(found, truth)) / max(len(found.xy) + len(truth.cars), 1)
+
+
+def test_a_detector_of_another_kind_is_not_continued() -> None:
+    with pytest.raises(InputError, match="of the aligned method"):
+        train_detector([sample(flight(5), 0)], SMALL, continued=detector("dense"))
+    other = SMALL.model_copy(update={"working_car_length_px": 20.0})
+    with pytest.raises(InputError, match="cars of 16 px to continue, expected 20 px"):
+        train_detector([sample(flight(5), 0)], other, continued=detector("aligned"))
+
+
+def test_the_shipped_detector_names_whose_pictures_it_learnt_from_and_finds_cars_of_unseen_cities() -> None:
+    shipped = shipped_detector()
+    assert any("CC-BY 4.0" in line for line in shipped.record.attribution)
+    assert any("CC-BY 3.0" in line for line in shipped.record.attribution)
+    assert f_measure(shipped, sample(flight(6), 1)) > 0.75
+    assert f_measure(shipped, sample(flight(5), 0)) > 0.75

@@ -85,6 +85,7 @@ def boost(
     car_fraction: float,
     rng: np.random.Generator,
     shrinkage: float = 1.0,
+    margins: Floats | None = None,
 ) -> Stumps:
     """Train.
 
@@ -102,8 +103,13 @@ def boost(
         Chooses each round's features: the same seed, the same detector.
     shrinkage
         Share of what AdaBoost would say that a round does say. Paper: 1.
+    margins
+        (samples,) what rounds learnt before say of each: the new ones mend what these get wrong.
     """
-    weights = np.where(is_car, car_fraction / is_car.sum(), (1 - car_fraction) / (~is_car).sum())
+    weights = start_weights(is_car, car_fraction)
+    if margins is not None:
+        weights *= np.exp(np.where(is_car, -margins, margins))
+        weights /= weights.sum()
     smallest = 0.5 / len(is_car)
     cars, others = np.flatnonzero(is_car), np.flatnonzero(~is_car)
     features, thresholds, leaves = [], [], []
@@ -126,6 +132,11 @@ def boost(
         thresholds.append(edges[feature, edge])
         leaves.append(said)
     return Stumps(np.array(features, np.int64), np.array(thresholds, np.float32), np.array(leaves, np.float32))
+
+
+def start_weights(is_car: NDArray[np.bool_], car_fraction: float) -> Floats:
+    """Weights of the samples before the first round: all cars together weigh ``car_fraction``."""
+    return np.asarray(np.where(is_car, car_fraction / is_car.sum(), (1 - car_fraction) / (~is_car).sum()))
 
 
 def _that_matter(weights: Floats, rows: Ints) -> Ints:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from schemas.detector import Round
 from schemas.flight import DetectionConfig
 from velfield.detection.aligned import Look, find_cars, moved, offset_grid
-from velfield.detection.bank import Bank, bank_of
-from velfield.detection.boosting import Bytes, Stumps, boost, random_pool, rounds_of
+from velfield.detection.bank import Bank, Samples, bank_of
+from velfield.detection.boosting import boost, random_pool, rounds_of, start_weights
 from velfield.detection.detector import BoostedSums, sums_of
 from velfield.detection.samples import Poses, Scene, is_far, is_wrong, other_poses, varied
 from velfield.detection.scan import propose
@@ -52,36 +52,41 @@ def learn_proposer(
         poses = other_poses(scene, _OTHERS // len(scenes), rng)
         others.append(poses.where(is_far(poses.rows, scene)))
     bank = _bank(scenes, COARSE, cars, others, min(config.feature_pool, _COARSE_POOL), _COARSE_SIGMA_PX, channels, rng)
-    car_bins = bank.all_bins(zip((scene.coarse for scene in scenes), cars, strict=True))
-    other_bins = bank.all_bins(zip((scene.coarse for scene in scenes), others, strict=True))
+    known_cars = bank.samples(zip((scene.coarse for scene in scenes), cars, strict=True))
+    known_others = bank.samples(zip((scene.coarse for scene in scenes), others, strict=True))
     for _ in range(2):
-        sums = sums_of(_as_rounds(bank, _boost(bank, car_bins, other_bins, COARSE_ROUNDS, rng)))
+        sums = sums_of(_boosted(bank, known_cars, known_others, COARSE_ROUNDS, rng))
         mined = [varied(_wrongly_proposed(scene, sums, _MINED // len(scenes)), rng) for scene in scenes]
-        more = bank.all_bins(zip((scene.coarse for scene in scenes), mined, strict=True))
-        other_bins = np.concatenate([other_bins, more], axis=1)
-    return _as_rounds(bank, _boost(bank, car_bins, other_bins, COARSE_ROUNDS, rng))
+        known_others += bank.samples(zip((scene.coarse for scene in scenes), mined, strict=True))
+    return _boosted(bank, known_cars, known_others, COARSE_ROUNDS, rng)
 
 
 def learn_classifier(
-    scenes: Sequence[Scene], config: DetectionConfig, channels: int, rng: np.random.Generator
+    scenes: Sequence[Scene],
+    config: DetectionConfig,
+    channels: int,
+    rng: np.random.Generator,
+    prior: Sequence[Round] = (),
 ) -> tuple[tuple[Round, ...], tuple[Scene, ...]]:
-    """The classifier of step two, and the scenes with the cars' axes as it sees them."""
+    """The classifier of step two, and the scenes with the cars' axes as it sees them.
+
+    ``prior``: rounds of an earlier classifier, which the new ones continue.
+    """
     scenes = tuple(scenes)
     cars = [_fine_cars(scene, _copies(scenes), rng) for scene in scenes]
     others = [other_poses(scene, _OTHERS // len(scenes), rng) for scene in scenes]
     sigma = config.corner_sigma_px * _SIGMA_SHARE_XY[0], config.corner_sigma_px * _SIGMA_SHARE_XY[1]
-    bank = _bank(scenes, FINE, cars, others, config.feature_pool, sigma, channels, rng)
-    other_bins = bank.all_bins(zip((scene.fine for scene in scenes), others, strict=True))
+    bank = _bank(scenes, FINE, cars, others, config.feature_pool, sigma, channels, rng, prior)
+    known_others = bank.samples(zip((scene.fine for scene in scenes), others, strict=True))
     for rounds in _FINE_STAGES:
-        car_bins = bank.all_bins(zip((scene.fine for scene in scenes), cars, strict=True))
-        sums = sums_of(_as_rounds(bank, _boost(bank, car_bins, other_bins, rounds, rng)))
+        known_cars = bank.samples(zip((scene.fine for scene in scenes), cars, strict=True))
+        sums = sums_of(_boosted(bank, known_cars, known_others, rounds, rng, prior))
         scenes = tuple(_realigned(scene, sums) for scene in scenes)
         mined = [varied(_wrongly_found(scene, sums, _MINED // len(scenes)), rng) for scene in scenes]
-        more = bank.all_bins(zip((scene.fine for scene in scenes), mined, strict=True))
-        other_bins = np.concatenate([other_bins, more], axis=1)
+        known_others += bank.samples(zip((scene.fine for scene in scenes), mined, strict=True))
         cars = [_fine_cars(scene, _copies(scenes), rng) for scene in scenes]
-    car_bins = bank.all_bins(zip((scene.fine for scene in scenes), cars, strict=True))
-    return _as_rounds(bank, _boost(bank, car_bins, other_bins, config.rounds, rng)), scenes
+    known_cars = bank.samples(zip((scene.fine for scene in scenes), cars, strict=True))
+    return _boosted(bank, known_cars, known_others, config.rounds, rng, prior), scenes
 
 
 def _copies(scenes: Sequence[Scene]) -> int:
@@ -97,6 +102,7 @@ def _bank(
     sigma_xy_px: tuple[float, float],
     channels: int,
     rng: np.random.Generator,
+    prior: Sequence[Round] = (),
 ) -> Bank:
     pool = random_pool(
         features,
@@ -108,24 +114,39 @@ def _bank(
     )
     pictures = [scene.fine if grain is FINE else scene.coarse for scene in scenes]
     parts = [*zip(pictures, cars, strict=True), *zip(pictures, others, strict=True)]
-    return bank_of(pool, CONTRAST_FLOOR, parts, rng)
+    return bank_of(pool, CONTRAST_FLOOR, parts, rng, sums_of(prior) if prior else None)
 
 
-def _boost(bank: Bank, cars: Bytes, others: Bytes, rounds: int, rng: np.random.Generator) -> Stumps:
-    is_car = np.arange(cars.shape[1] + others.shape[1]) < cars.shape[1]
-    return boost(
-        np.concatenate([cars, others], axis=1),
+def _boosted(
+    bank: Bank, cars: Samples, others: Samples, rounds: int, rng: np.random.Generator, prior: Sequence[Round] = ()
+) -> tuple[Round, ...]:
+    """New rounds; woven among an earlier classifier's, so that a cascade's first rounds hear both."""
+    known = cars + others
+    is_car = np.arange(len(known.margins)) < len(cars.margins)
+    trust = _trust(known.margins, is_car) if prior else 0.0
+    stumps = boost(
+        known.bins,
         bank.edges,
         is_car,
         rounds=rounds,
         car_fraction=_CAR_FRACTION,
         shrinkage=_SHRINKAGE,
         rng=rng,
+        margins=trust * known.margins,
     )
+    new = [Round.model_validate(one) for one in rounds_of(bank.pool, stumps)]
+    if not trust:
+        return tuple(new)
+    old = [r.model_copy(update={"below": trust * r.below, "above": trust * r.above}) for r in prior]
+    at = np.concatenate([(np.arange(len(part)) + 0.5) / len(part) for part in (new, old)])
+    return tuple((new + old)[k] for k in np.argsort(at, kind="stable"))
 
 
-def _as_rounds(bank: Bank, stumps: Stumps) -> tuple[Round, ...]:
-    return tuple(Round.model_validate(one) for one in rounds_of(bank.pool, stumps))
+def _trust(margins: Floats, is_car: NDArray[np.bool_]) -> float:
+    """How far an earlier classifier's word holds here: the factor on it at which the exponential loss is least."""
+    weights, sign = start_weights(is_car, _CAR_FRACTION), np.where(is_car, -1.0, 1.0)
+    tried = np.linspace(0, 1, 41)
+    return float(tried[np.argmin([weights @ np.exp(trust * sign * margins) for trust in tried])])
 
 
 def _fine_cars(scene: Scene, copies: int, rng: np.random.Generator) -> Poses:

@@ -15,7 +15,7 @@ from velfield.detection.scan import propose
 from velfield.detection.validation import Evidence, curve_of, cut_of, evidence_of_part, joined, stripes
 from velfield.errors import InputError
 
-__all__ = ["LabelledImage", "train_detector"]
+__all__ = ["LabelledImage", "record_of", "train_detector", "trained"]
 
 MIN_CARS = 8
 """Fewer marked cars than this do not train a detector."""
@@ -25,10 +25,11 @@ _FOLD_SCENES = 3
 _UNTRIED_THRESHOLD = 0.15
 """T where too few cars are marked to leave some out: what it came to on most sites."""
 _UNTRIED_CUT = -0.4
+_STRIPES_TOLD = "cars in alternate stripes, found by a detector trained on the stripes between"
 
 
 @dataclass(frozen=True)
-class _Steps:
+class Steps:
     """Both steps, trained."""
 
     proposer: tuple[Round, ...]
@@ -36,7 +37,9 @@ class _Steps:
     scenes: tuple[Scene, ...]
 
 
-def train_detector(samples: Sequence[LabelledImage], config: DetectionConfig) -> Detector:
+def train_detector(
+    samples: Sequence[LabelledImage], config: DetectionConfig, *, continued: Detector | None = None
+) -> Detector:
     """Train a detector (paper: car detection).
 
     Parameters
@@ -46,11 +49,13 @@ def train_detector(samples: Sequence[LabelledImage], config: DetectionConfig) ->
         lets it.
     config
         ``method`` chooses the paper's dense response or the aligned classifier.
+    continued
+        An earlier detector, whose rounds the new ones mend: where few cars are marked, it knows more of them.
 
     Raises
     ------
     InputError
-        Too few cars.
+        Too few cars; an earlier detector that cannot be continued.
     """
     count = sum(len(sample.cars) for sample in samples)
     if count < MIN_CARS:
@@ -59,12 +64,46 @@ def train_detector(samples: Sequence[LabelledImage], config: DetectionConfig) ->
         return train_densely(samples, config)
     has_background = config.motion_channel != "never" and all(sample.background is not None for sample in samples)
     channels = 4 if has_background else 3
-    steps = _trained([scene_of(sample, has_background) for sample in samples], config, channels, config.seed)
-    evidence = _held_out(steps.scenes, config, channels) if count >= _FOLD_MIN_CARS else None
-    return Detector(_record(steps, evidence, config, count))
+    prior = _rounds_to_continue(continued, config, channels)
+    steps = trained([scene_of(sample, has_background) for sample in samples], config, channels, config.seed, prior)
+    evidence = _held_out(steps.scenes, config, channels, prior) if count >= _FOLD_MIN_CARS else None
+    record = record_of(steps, evidence, config, count)
+    return Detector(record if continued is None else _continuing(record, continued, config, tried=evidence is not None))
 
 
-def _trained(scenes: Sequence[Scene], config: DetectionConfig, channels: int, seed: int) -> _Steps:
+def _continuing(record: DetectorRecord, earlier: Detector, config: DetectionConfig, *, tried: bool) -> DetectorRecord:
+    """The record with whose pictures the earlier detector had learnt from; and its T, where there is no evidence."""
+    update: dict[str, object] = {"attribution": earlier.record.attribution}
+    if not tried and config.threshold is None:
+        update["threshold"] = earlier.threshold
+    return record.model_copy(update=update)
+
+
+def _rounds_to_continue(earlier: Detector | None, config: DetectionConfig, channels: int) -> tuple[Round, ...]:
+    if earlier is None:
+        return ()
+    record = earlier.record
+    if (
+        record.method != "aligned"
+        or record.contrast_floor != CONTRAST_FLOOR
+        or (earlier.uses_background and channels < 4)
+    ):
+        raise InputError(
+            f"found a detector of the {record.method} method{' with' if earlier.uses_background else ' without'} a "
+            "background to continue, expected one of the aligned method that looks at what is there; train anew"
+        )
+    if record.working_car_length_px != config.working_car_length_px:
+        raise InputError(
+            f"found a detector of cars of {record.working_car_length_px:g} px to continue, expected "
+            f"{config.working_car_length_px:g} px; set detection.working_car_length_px"
+        )
+    return record.rounds
+
+
+def trained(
+    scenes: Sequence[Scene], config: DetectionConfig, channels: int, seed: int, prior: tuple[Round, ...] = ()
+) -> Steps:
+    """Both steps of the aligned method, learnt from scenes."""
     rng = np.random.default_rng(seed)
     proposer = learn_proposer(scenes, config, channels, rng)
     sums = sums_of(proposer)
@@ -73,27 +112,30 @@ def _trained(scenes: Sequence[Scene], config: DetectionConfig, channels: int, se
         shape, valid = scene.sample.image.shape, scene.sample.valid
         places = propose(scene.coarse, shape, valid, sums, contrast_floor=CONTRAST_FLOOR)
         looked_at.append(replace(scene, places=places[:, :3]))
-    classifier, aligned = learn_classifier(looked_at, config, channels, rng)
-    return _Steps(proposer, classifier, aligned)
+    classifier, aligned = learn_classifier(looked_at, config, channels, rng, prior)
+    return Steps(proposer, classifier, aligned)
 
 
-def _held_out(scenes: Sequence[Scene], config: DetectionConfig, channels: int) -> Evidence:
+def _held_out(scenes: Sequence[Scene], config: DetectionConfig, channels: int, prior: tuple[Round, ...]) -> Evidence:
     """Train on every other stripe of the pictures, try on the stripes between; then the other way round."""
     tried = np.unique(np.linspace(0, len(scenes) - 1, min(_FOLD_SCENES, len(scenes))).round().astype(int))
     parts = []
     for fold in (0, 1):
         seen = [part_of(scene, stripes(scene, fold)) for scene in scenes]
-        steps = _trained(seen, config, channels, config.seed + 1 + fold)
+        steps = trained(seen, config, channels, config.seed + 1 + fold, prior)
         proposer, sums = sums_of(steps.proposer), sums_of(steps.classifier)
         parts += [evidence_of_part(scenes[k], stripes(scenes[k], 1 - fold), proposer, sums) for k in tried]
     return joined(parts)
 
 
-def _record(steps: _Steps, evidence: Evidence | None, config: DetectionConfig, count: int) -> DetectorRecord:
+def record_of(
+    steps: Steps, evidence: Evidence | None, config: DetectionConfig, count: int, told: str = _STRIPES_TOLD
+) -> DetectorRecord:
+    """The detector's file; T and the cascade's cuts follow from evidence on cars that were left out."""
     curve: PrecisionRecallCurve | None = None
     threshold, cuts = _UNTRIED_THRESHOLD, (_UNTRIED_CUT, _UNTRIED_CUT)
     if evidence is not None:
-        curve = curve_of(evidence)
+        curve = curve_of(evidence, told)
         if curve is not None and curve.chosen is not None:
             threshold = curve.threshold[curve.chosen]
         surely = evidence.right & (evidence.score >= threshold)

@@ -17,7 +17,8 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 STRIPES = 4
-_MATCH_PX = 8.0
+MATCH_PX = 8.0
+"""A find this near to a car's middle is that car, working px: half its length."""
 _NEAR_PX = 6.0
 _CURVE_FROM = -0.25
 """Scores below this are no cars at any precision that is of use."""
@@ -68,20 +69,20 @@ def evidence_of_part(scene: Scene, region: Bools, proposer: BoostedSums, sums: B
     look = Look(scene.fine, sums, CONTRAST_FLOOR)
     found = distinct(find_cars(look, places, least_score=_CURVE_FROM), 16.0)
     cars = scene.cars[lies_in(region, scene.cars)]
-    counted = is_far(found, scene) | (distance(found, cars) < _MATCH_PX)
+    counted = is_far(found, scene) | (distance(found, cars) < MATCH_PX)
     found = found[counted]
-    right, first = _matched(found, cars), _first_scores(look, found)
+    right, first = matched(found, cars), _first_scores(look, found)
     return Evidence(found[:, 3], right, _best_near(places, found), first, len(cars), scene.sample.complete)
 
 
-def _matched(found: Floats, cars: Floats) -> Bools:
+def matched(found: Floats, cars: Floats) -> Bools:
     """Whether each find, the best first, is the first on a car."""
     taken = np.zeros(len(cars), bool)
     right = np.zeros(len(found), bool)
     for k in range(len(found)):
         gap = np.hypot(cars[:, 0] - found[k, 0], cars[:, 1] - found[k, 1])
         gap[taken] = np.inf
-        if len(cars) and gap.min() < _MATCH_PX:
+        if len(cars) and gap.min() < MATCH_PX:
             taken[gap.argmin()] = right[k] = True
     return right
 
@@ -118,8 +119,11 @@ def cut_of(scores: Floats) -> float:
     return float(np.quantile(known, _LOST) - _MARGIN) if len(known) else -1.0
 
 
-def curve_of(evidence: Evidence) -> PrecisionRecallCurve | None:
-    """Precision and recall against the threshold; ``chosen`` is the middle of where they are best together."""
+def curve_of(evidence: Evidence, told: str) -> PrecisionRecallCurve | None:
+    """Precision and recall against the threshold; ``chosen`` is the middle of where they are best together.
+
+    ``told``: which cars these are, for people.
+    """
     if not evidence.right.any():
         return None
     order = np.argsort(-evidence.score, kind="stable")
@@ -137,7 +141,7 @@ def curve_of(evidence: Evidence) -> PrecisionRecallCurve | None:
         precision=tuple(np.round(precision[kept], 4).tolist()),
         threshold=tuple(np.round(score[kept], 4).tolist()),
         chosen=int(np.searchsorted(kept, best)),
-        evidence=f"{evidence.cars} cars in alternate stripes, found by a detector trained on the stripes between",
+        evidence=f"{evidence.cars} {told}",
     )
 
 

@@ -26,6 +26,8 @@ from velfield.stores import open_frames
 
 _TRAINING_FRAMES = 6
 _EVIDENCE_BURSTS = 3
+_FEW_CARS = 40
+"""Fewer marked cars than this continue the shipped detector."""
 
 
 def make_detector(plan: Plan) -> Outcome:
@@ -66,8 +68,16 @@ def _from_labels(plan: Plan) -> Outcome:
         LabelledImage(image=frame.image, cars=frame.cars, ignore=frame.ignore, complete=True)
         for frame in marked_frames(plan, labels, work_per_raw=scale * base_per_raw)
     ]
-    detector = train_detector(samples, plan.config.detection)
+    continued = _to_continue(plan.config.detection, len(labels.cars))
+    detector = train_detector(samples, plan.config.detection, continued=continued)
     return _finish(plan, detector, scale, "labels", count=len(labels.cars))
+
+
+def _to_continue(config: DetectionConfig, cars: int) -> Detector | None:
+    """Few marked cars mend the shipped detector, many are better off without it; none where it does not fit."""
+    shipped = shipped_detector()
+    fits = config.method == "aligned" and config.working_car_length_px == shipped.record.working_car_length_px
+    return shipped if fits and cars < _FEW_CARS else None
 
 
 def _from_motion(plan: Plan) -> Outcome:

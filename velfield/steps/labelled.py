@@ -93,18 +93,25 @@ def marked_frames(plan: Plan, labels: Labels, *, work_per_raw: float) -> Iterato
     for found in iter_frames(Path(plan.job.inputs.source), plan.info, indices):
         if found.flags & UNUSABLE:
             raise InputError(f"--labels: the labelled frame {found.name} cannot be used: {found.reason}; mark another")
-        cars = _boxes(labels.cars, found.name, work_per_raw)
-        left_out = _boxes(labels.ignored, found.name, work_per_raw)
-        radius = np.nanmax(np.column_stack([left_out[:, 3:] / 2, np.full(len(left_out), 8.0)]), axis=1)
-        yield MarkedFrame(scaled(found.grey, work_per_raw), cars, np.column_stack([left_out[:, :2], radius]))
+        cars = boxes(labels.cars, found.name, work_per_raw)
+        circles = left_out(labels.ignored, found.name, work_per_raw)
+        yield MarkedFrame(scaled(found.grey, work_per_raw), cars, circles)
 
 
-def _boxes(table: pd.DataFrame, frame: str, work_per_raw: float) -> NDArray[np.float64]:
+def left_out(table: pd.DataFrame, frame: str, work_per_raw: float) -> NDArray[np.float64]:
+    """Circles (k, 3) as x, y, radius, working px, about a frame's objects that are neither car nor background."""
+    around = boxes(table, frame, work_per_raw)
+    radius = np.nanmax(np.column_stack([around[:, 3:] / 2, np.full(len(around), 8.0)]), axis=1)
+    return np.column_stack([around[:, :2], radius])
+
+
+def boxes(table: pd.DataFrame, frame: str, work_per_raw: float) -> NDArray[np.float64]:
+    """A frame's boxes (n, 5) as x, y, orientation, length, width, working px."""
     columns = ["x_px", "y_px", "orientation_rad", "length_px", "width_px"]
-    boxes = table.loc[table["frame"] == frame, columns].to_numpy(np.float64, copy=True)
-    boxes[:, :2] = (boxes[:, :2] + 0.5) * work_per_raw - 0.5
-    boxes[:, 3:] *= work_per_raw
-    return boxes
+    found = table.loc[table["frame"] == frame, columns].to_numpy(np.float64, copy=True)
+    found[:, :2] = (found[:, :2] + 0.5) * work_per_raw - 0.5
+    found[:, 3:] *= work_per_raw
+    return found
 
 
 def scaled(grey: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:

@@ -1,0 +1,51 @@
+"""``velfield train``: marked cars in, a detector file out."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+
+def train(
+    source: Path,
+    /,
+    *,
+    labels: Path,
+    out: Path = Path("detector.json"),
+    gsd_m: float | None = None,
+    continued: Annotated[str | None, Parameter(name="--continue")] = None,
+    review: Path | None = None,
+    config: Path | None = None,
+    preset: Literal["best", "fast", "paper"] | None = None,
+    settings: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False)] = (),
+) -> int:
+    """Train a detector from marked cars; `velfield run --detector` takes the file.
+
+    Parameters
+    ----------
+    source
+        Video file, or folder of pictures, that the labels are of.
+    labels
+        Marked cars: CSV, GeoJSON, YOLO, COCO, LabelMe, VIA. All cars of every frame that is named must be marked.
+    out
+        The detector file, with its precision-recall curve on cars left out of training.
+    gsd_m
+        Ground sample distance of the frames, metres a pixel. Default: from the length of the marked cars.
+    continued
+        A detector file to continue, or `shipped`: what few marked cars do not tell, it knows.
+    review
+        PNG to write: what was taken for cars and what was not.
+    config
+        flight.yaml with the flight's configuration.
+    preset
+        Set of defaults to start from.
+    settings
+        `section.key=value`, any number of times.
+    """
+    from velfield.configuration import resolve_config
+    from velfield.training import train_from_labels, write_training
+
+    resolved = resolve_config(preset=preset, file=config, settings=settings, overrides={"gsd_m": gsd_m})
+    training = train_from_labels(source, labels, resolved, continued=continued)
+    print("\n".join(write_training(training, out, review)))
+    return 0

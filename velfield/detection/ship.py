@@ -1,0 +1,135 @@
+"""Makes the detector that ships: ``make detector DATA=FOLDER``, where the folder holds ``songdo`` and ``kit_ais``.
+
+Learnt on pictures of two licensed sets and on simulated cities; numbers alone go into the file, no picture does.
+Deterministic by its seeds. What it says of each real place by a detector that never saw it is told, and T follows.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.flight import DetectionConfig
+from velfield.detection.detector import Detector, save_detector
+from velfield.detection.places import Place, left_out, train_on_places
+from velfield.detection.samples import LabelledImage
+from velfield.detection.validation import Evidence, joined
+from velfield.errors import InputError
+from velfield.sources.yolo import length_from_upright_box
+
+ATTRIBUTION = (
+    "Songdo Vision (R. Fonod and others), CC-BY 4.0: three frames, scaled to cars of 16 px",
+    "KIT AIS Vehicle Data Set (DLR, KIT; 3K camera, Munich), CC-BY 3.0: frames of two sequences, scaled likewise",
+    "cities simulated by velfield",
+)
+CONFIG = DetectionConfig(rounds=1200, feature_pool=4000, seed=7)
+SIMULATED_SEEDS = range(9001, 9007)
+_KIT_FRAMES = 4
+_TONES = ((1.7, 0.7, 0.0), (0.6, 0.0, 4.0))
+"""Other sensors: exponent of grey, blur in px, noise in grey levels."""
+
+
+def read_pictures(files: Sequence[Path], *, car_length_px: float = 16.0) -> list[LabelledImage]:
+    """Pictures with a YOLO file each beside them, all scaled by one factor that makes the usual car so long.
+
+    Raises
+    ------
+    InputError
+        No such pictures, or one that cannot be read.
+    """
+    if not files:
+        raise InputError(
+            "found no labelled pictures, expected the folders songdo and kit_ais; give their parent folder"
+        )
+    parts = [_boxes_of(file) for file in files]
+    usual = np.median(np.concatenate([boxes[boxes[:, 0] == 0, 5] for _, boxes in parts]))
+    return [_scaled(grey, boxes, car_length_px / float(usual)) for grey, boxes in parts]
+
+
+def _boxes_of(file: Path) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """A grey picture, and (n, 6): class, x, y, width, height of the upright box, length of the car in it, px."""
+    grey = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    if grey is None:
+        raise InputError(f"{file}: cannot be read as a picture; fetch it again")
+    size = [grey.shape[1], grey.shape[0]] * 2
+    boxes = np.loadtxt(file.with_suffix(".txt"), ndmin=2)[:, :5] * [1, *size] - [0, 0.5, 0.5, 0, 0]
+    lengths = [length_from_upright_box(w, h) for w, h in boxes[:, 3:]]
+    return np.asarray(grey, np.uint8), np.column_stack([boxes, lengths])
+
+
+def _scaled(grey: NDArray[np.uint8], boxes: NDArray[np.float64], factor: float) -> LabelledImage:
+    size = round(grey.shape[1] * factor), round(grey.shape[0] * factor)
+    image = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
+    xy, sides = (boxes[:, 1:3] + 0.5) * factor - 0.5, boxes[:, 3:5] * factor
+    axis = np.where(sides[:, 0] > sides[:, 1], 0.0, np.pi / 2)
+    axis[sides.max(axis=1) < 2 * sides.min(axis=1)] = np.nan
+    car = boxes[:, 0] == 0
+    left_alone = np.column_stack([xy, np.maximum(sides.max(axis=1) / 2, 8.0)])[~car]
+    return LabelledImage(image=image, cars=np.column_stack([xy, axis, sides])[car], ignore=left_alone)
+
+
+def simulated(seed: int) -> LabelledImage:
+    """A frame of a simulated city, its sun and its buildings drawn from the seed."""
+    from velfield.synthetic import small_flight
+
+    rng = np.random.default_rng(seed)
+    scene = {
+        "sun_azimuth_deg": float(rng.uniform(0, 360)),
+        "sun_length": float(rng.uniform(0.2, 1.6)),
+        "texture": float(rng.uniform(0.7, 1.6)),
+    }
+    flight = small_flight(frames=1, seed=seed, scene=scene)
+    factor = 16.0 * flight.config.gsd_m / DetectionConfig().car_length_m
+    cars = flight.labels(0)[["x_px", "y_px", "orientation_rad", "length_px", "width_px"]].to_numpy(copy=True)
+    cars[:, :2] = (cars[:, :2] + 0.5) * factor - 0.5
+    cars[:, 3:] *= factor
+    image = cv2.resize(flight.frame(0), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    return LabelledImage(image=np.asarray(image, np.uint8), cars=cars)
+
+
+def places_of(data: Path) -> list[Place]:
+    """The sites of songdo and the sequences of kit_ais."""
+    songdo = sorted((data / "songdo").glob("*.jpg"))
+    places = [
+        _place(f"songdo {file.stem}", [sample]) for file, sample in zip(songdo, read_pictures(songdo), strict=True)
+    ]
+    for folder in sorted((data / "kit_ais").glob("MOS*")):
+        files = sorted(
+            (f for f in folder.glob("*.png") if f.with_suffix(".txt").exists()), key=lambda f: int(f.stem[3:])
+        )
+        chosen = np.unique(np.linspace(0, len(files) - 1, _KIT_FRAMES).round().astype(int))
+        places.append(_place(f"kit_ais {folder.name}", read_pictures([files[k] for k in chosen])))
+    return places
+
+
+def _place(name: str, samples: Sequence[LabelledImage]) -> Place:
+    learnt = [*samples, *(_toned(sample, *tone) for sample in samples for tone in _TONES)]
+    return Place(name, learnt, samples)
+
+
+def _toned(sample: LabelledImage, exponent: float, blur_px: float, noise_grey: float) -> LabelledImage:
+    """The picture as another sensor would have taken it."""
+    tone = 255 * (sample.image / 255) ** exponent
+    if blur_px:
+        tone = cv2.GaussianBlur(tone, (0, 0), blur_px)
+    noise = np.random.default_rng(0).normal(0, 1, tone.shape) * noise_grey
+    return replace(sample, image=np.clip(tone + noise, 0, 255).astype(np.uint8))
+
+
+def ship(data: Path, out: Path) -> list[str]:
+    """Train and write the detector that ships; lines that tell what is measured on places left out."""
+    places, always = places_of(data), [simulated(seed) for seed in SIMULATED_SEEDS]
+    found = dict(left_out(places, always, CONFIG))
+    detector = train_on_places(places, always, CONFIG, list(found.values()))
+    save_detector(Detector(detector.record.model_copy(update={"attribution": ATTRIBUTION})), out)
+    return [_told(*one, detector.threshold) for one in (*found.items(), ("all", joined(list(found.values()))))]
+
+
+def _told(name: str, evidence: Evidence, threshold: float) -> str:
+    above = evidence.score > threshold
+    right = int(evidence.right[above].sum())
+    precision, recall = right / max(int(above.sum()), 1), right / evidence.cars
+    return f"{name:28} {evidence.cars:4} cars  precision {precision:.3f}  recall {recall:.3f}"
