@@ -18,3 +18,13 @@ bench.command(
     name="overhead",
     help="What Prefect and Dask add to the bare functions, start-up left out.",
 )
+bench.command(
+    "flows.commands.bench_field:field",
+    name="field",
+    help="Which kernel and bins of the field foretell held-out passages best.",
+)
+bench.command(
+    "flows.commands.bench_detection:detection",
+    name="detection",
+    help="How fast cars are found, beside plain peers in the same run.",
+)

@@ -71,7 +71,9 @@ def make_gate(densities: Densities, xy: Float, covariance: Float, bins: Velocity
     def mixed(v: Float) -> Float:
         return np.asarray(sum(weight * densities(np.asarray(xy) + offset, v) for weight, offset in points), np.float64)
 
-    grid = np.stack(np.meshgrid(bins.centres_px_per_s, bins.centres_px_per_s), axis=-1).reshape(-1, 2)
+    # Modes may be half a bin wide: at steps of a whole one their mass would be found wrong.
+    steps_px_per_s = bins.from_bins(np.arange(2 * bins.n - 1) / 2)
+    grid = np.stack(np.meshgrid(steps_px_per_s, steps_px_per_s), axis=-1).reshape(-1, 2)
     density = mixed(grid)
     mass = density / density.sum()
     order = np.argsort(-density, kind="stable")

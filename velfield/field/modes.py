@@ -36,7 +36,7 @@ def _smoothed(h: NDArray[np.int32], y: int, x: int) -> np.int64:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _window(passages: int) -> float:
+def window_bins(passages: int) -> float:
     return max(float(WINDOW_BINS * max(passages, 1) ** (-1.0 / 6.0)), LEAST_WINDOW_BINS)
 
 
@@ -101,7 +101,7 @@ def _is_peak(h: NDArray[np.int32], y: int, x: int) -> bool:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _pixel_modes(h: NDArray[np.int32], window: float, modes: NDArray[np.float64]) -> int:
+def pixel_modes(h: NDArray[np.int32], window: float, modes: NDArray[np.float64]) -> int:
     """Fill ``modes`` (k, 3) with (y, x, share) in bins, the largest share first; returns how many there are.
 
     Each bin's weight goes to the nearest mode, so that the shares sum to one.
@@ -144,7 +144,7 @@ def _modal_tile(histogram: NDArray[np.int32], count: NDArray[np.int32], out: NDA
     for y in range(count.shape[0]):
         for x in range(count.shape[1]):
             if count[y, x] > 0:
-                mode_y, mode_x = _main_mode(histogram[y, x], _window(count[y, x]))
+                mode_y, mode_x = _main_mode(histogram[y, x], window_bins(count[y, x]))
                 out[y, x, 0], out[y, x, 1] = mode_x, mode_y
 
 
@@ -154,7 +154,7 @@ def _modes_tile(histogram: NDArray[np.int32], count: NDArray[np.int32], out: NDA
     for y in range(count.shape[0]):
         for x in range(count.shape[1]):
             if count[y, x] > 0:
-                kept = _pixel_modes(histogram[y, x], _window(count[y, x]), modes)
+                kept = pixel_modes(histogram[y, x], window_bins(count[y, x]), modes)
                 for k in range(kept):
                     out[y, x, k] = (modes[k, 1], modes[k, 0], modes[k, 2])
 

@@ -2,23 +2,34 @@
 
 Three levels, each speaking as loud as its data: the pixel's own passages; those of the pixels around; all of the map.
 A level with n passages stands against the next with weight n : `STRENGTH`, so that where nothing is known the density
-is the map's, and where the map is empty a broad Gaussian. Within a level each bin is spread by a Gaussian along its
-velocity, narrower across: vehicles at one place differ in speed more than in direction. It narrows with the number of
-passages (n to the power -1/6, as Scott's rule has it in two dimensions).
+is the map's, and where the map is empty a broad Gaussian.
+
+Of a pixel, and of those around, each mode is a Gaussian: its weights' mean, and their covariance with the kernel and
+the bins taken out, which are wider than traffic that keeps its lane. The covariance of few passages is taken together
+with a usual one, longer along the velocity than across it: vehicles at one place differ in speed more than in
+direction. A share stays with the bins as they are, each spread a little, for what is no Gaussian.
 """
 
-from math import exp, floor, hypot, log, nan, pi
+from math import exp, floor, hypot, log, nan, pi, sqrt
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from velfield.field.modes import MAX_MODES, pixel_modes, window_bins
+
 STRENGTH = 1.0
 """Passages that a level counts for against the one before it."""
-ALONG_SIGMA_BINS = 1.2
-"""Standard deviation of a bin's spread along its velocity where one passage is known, bins."""
-LEAST_SIGMA_BINS = 0.5
-"""The spread across, and the least along: below half a bin the density would ripple."""
+SPREAD_SIGMA_BINS = 0.5
+"""Standard deviation of a bin's spread: below half a bin the density would ripple."""
+LEAST_SIGMA_BINS = 0.25
+"""No mode is narrower than this, nor a passage's velocity better known: a grid of half bins can hold it."""
+USUAL_ALONG, USUAL_ACROSS = 0.12, 0.03
+"""Usual standard deviations of a mode along its velocity and across it, as shares of the speed."""
+USUAL_COUNTS_FOR = 3.0
+"""Passages that the usual covariance counts for."""
+BINS_SHARE = 0.1
+"""Share that stays with the bins as they are."""
 BROAD_SHARE = 0.02
 """Share of the map's level that is a broad Gaussian, so that no velocity is impossible."""
 
@@ -26,28 +37,80 @@ Float = NDArray[np.float64]
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _spread(h: Float, v_y: float, v_x: float, along: float) -> float:
+def _spread(h: Float, v_y: float, v_x: float) -> float:
     """Density per square bin at (v_y, v_x) of weights ``h``, each spread by a Gaussian; they need not sum to one."""
-    reach = 3.5 * max(along, LEAST_SIGMA_BINS)
-    centre = (h.shape[0] - 1) / 2
+    reach = 3.5 * SPREAD_SIGMA_BINS
     total = 0.0
     for j in range(max(0, floor(v_y - reach + 0.5)), min(h.shape[0] - 1, floor(v_y + reach + 0.5)) + 1):
         for i in range(max(0, floor(v_x - reach + 0.5)), min(h.shape[1] - 1, floor(v_x + reach + 0.5)) + 1):
             if h[j, i] > 0:
-                speed = hypot(j - centre, i - centre)
-                # At rest there is no along: the spread is round.
-                ux, uy, s = 1.0, 0.0, LEAST_SIGMA_BINS
-                if speed > 0.5:
-                    ux, uy, s = (i - centre) / speed, (j - centre) / speed, along
-                forth = ((v_x - i) * ux + (v_y - j) * uy) / s
-                aside = ((v_y - j) * ux - (v_x - i) * uy) / LEAST_SIGMA_BINS
-                total += h[j, i] * exp(-0.5 * (forth * forth + aside * aside)) / s
-    return float(total / (2.0 * pi * LEAST_SIGMA_BINS))
+                square = (v_x - i) ** 2 + (v_y - j) ** 2
+                total += h[j, i] * exp(-0.5 * square / SPREAD_SIGMA_BINS**2)
+    return float(total / (2.0 * pi * SPREAD_SIGMA_BINS**2))
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _sigma(n: float) -> float:
-    return max(float(ALONG_SIGMA_BINS * max(n, 1.0) ** (-1.0 / 6.0)), LEAST_SIGMA_BINS)
+def _mode_gaussians(h: Float, n: float, blur: float, out: Float) -> int:
+    """Fill ``out`` (k, 6) with a Gaussian a mode: share, mean x and y, covariance xx, xy, yy, in bins; returns k.
+
+    ``n``: passages that the weights (summing to one) stand for; ``blur``: what kernel and bins add to a variance.
+    """
+    modes = np.empty((out.shape[0], 3))
+    found = pixel_modes((h * (1 << 20)).astype(np.int32), window_bins(max(int(n), 1)), modes)
+    sums = np.zeros((found, 6))
+    for y in range(h.shape[0]):
+        for x in range(h.shape[1]):
+            if h[y, x] > 0:
+                nearest, least = 0, np.inf
+                for k in range(found):
+                    distance = (modes[k, 0] - y) ** 2 + (modes[k, 1] - x) ** 2
+                    if distance < least:
+                        least, nearest = distance, k
+                w = h[y, x]
+                dx, dy = x - modes[nearest, 1], y - modes[nearest, 0]
+                sums[nearest, 0] += w
+                sums[nearest, 1] += w * dx
+                sums[nearest, 2] += w * dy
+                sums[nearest, 3] += w * dx * dx
+                sums[nearest, 4] += w * dx * dy
+                sums[nearest, 5] += w * dy * dy
+    centre = (h.shape[0] - 1) / 2
+    total = sums[:, 0].sum()
+    for k in range(found):
+        s = sums[k]
+        dx, dy = s[1] / s[0], s[2] / s[0]
+        x, y = modes[k, 1] + dx, modes[k, 0] + dy
+        vx, vy = x - centre, y - centre
+        speed = max(hypot(vx, vy), 1e-9)
+        along = (USUAL_ALONG * speed) ** 2 + LEAST_SIGMA_BINS**2
+        across = (USUAL_ACROSS * speed) ** 2 + LEAST_SIGMA_BINS**2
+        ux, uy = vx / speed, vy / speed
+        mine = max(n * s[0] / total, 1e-9)
+        known = mine / (mine + USUAL_COUNTS_FOR)
+        # A passage to come strays from the mean of few by what that mean strays, too.
+        more = 1.0 + 1.0 / max(mine, 1.0)
+        # Along and across the velocity, so that taking the blur out cannot leave a negative variance.
+        xx, xy, yy = s[3] / s[0] - dx * dx, s[4] / s[0] - dx * dy, s[5] / s[0] - dy * dy
+        own_along = max(ux * ux * xx + 2 * ux * uy * xy + uy * uy * yy - blur, LEAST_SIGMA_BINS**2)
+        own_across = max(uy * uy * xx - 2 * ux * uy * xy + ux * ux * yy - blur, LEAST_SIGMA_BINS**2)
+        a = more * (known * own_along + (1 - known) * along)
+        b = more * (known * own_across + (1 - known) * across)
+        out[k, 0], out[k, 1], out[k, 2] = s[0] / total, x, y
+        out[k, 3], out[k, 4], out[k, 5] = ux * ux * a + uy * uy * b, ux * uy * (a - b), uy * uy * a + ux * ux * b
+    return int(found)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _level(h: Float, gaussians: Float, v_y: float, v_x: float) -> float:
+    """Density per square bin of a level: its modes, and a share of its bins."""
+    density = 0.0
+    for k in range(gaussians.shape[0]):
+        dx, dy = v_x - gaussians[k, 1], v_y - gaussians[k, 2]
+        xx, xy, yy = gaussians[k, 3], gaussians[k, 4], gaussians[k, 5]
+        determinant = xx * yy - xy * xy
+        square = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinant
+        density += gaussians[k, 0] * exp(-0.5 * square) / (2.0 * pi * sqrt(determinant))
+    return float((1.0 - BINS_SHARE) * density + BINS_SHARE * _spread(h, v_y, v_x))
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -83,7 +146,7 @@ def _of_the_map(everywhere: Float, known: bool, v_y: float, v_x: float) -> float
     broad = reach / 2
     of_broad = exp(-0.5 * ((v_x - reach) ** 2 + (v_y - reach) ** 2) / (broad * broad)) / (2.0 * pi * broad * broad)
     share = BROAD_SHARE if known else 1.0
-    return float((1.0 - share) * _spread(everywhere, v_y, v_x, LEAST_SIGMA_BINS) + share * of_broad)
+    return float((1.0 - share) * _spread(everywhere, v_y, v_x) + share * of_broad)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -95,6 +158,7 @@ def densities_at_pixel(
     y: int,
     velocity_bins: Float,
     radius: int,
+    blur: float,
 ) -> Float:
     """Density per square bin of velocities (n, 2) as (vx, vy) at one pixel of a window of the field, (n,).
 
@@ -109,14 +173,17 @@ def densities_at_pixel(
     if here > 0.0:
         own += histogram[y, x]
         own /= own.sum()
+    of_near, of_here = np.empty((MAX_MODES, 6)), np.empty((MAX_MODES, 6))
+    of_near = of_near[: _mode_gaussians(around, near, blur, of_near) if near > 0.0 else 0]
+    of_here = of_here[: _mode_gaussians(own, here, blur, of_here) if here > 0.0 else 0]
     out = np.empty(velocity_bins.shape[0])
     for k in range(velocity_bins.shape[0]):
         v_x, v_y = velocity_bins[k, 0], velocity_bins[k, 1]
         density = _of_the_map(everywhere, known, v_y, v_x)
         if near > 0.0:
-            density = (near * _spread(around, v_y, v_x, _sigma(near)) + STRENGTH * density) / (near + STRENGTH)
+            density = (near * _level(around, of_near, v_y, v_x) + STRENGTH * density) / (near + STRENGTH)
         if here > 0.0:
-            density = (here * _spread(own, v_y, v_x, _sigma(here)) + STRENGTH * density) / (here + STRENGTH)
+            density = (here * _level(own, of_here, v_y, v_x) + STRENGTH * density) / (here + STRENGTH)
         out[k] = density
     return out
 
@@ -129,6 +196,7 @@ def log_density_in_window(
     pixels: NDArray[np.int64],
     velocity_bins: Float,
     radius: int,
+    blur: float,
 ) -> Float:
     """Log density per square bin of velocities at pixels of a window of the field.
 
@@ -144,6 +212,8 @@ def log_density_in_window(
         (n, 2) as (vx, vy) in bins, 0 being the first bin's centre; NaN in, NaN out.
     radius
         How far the pixels around reach, px.
+    blur
+        What the kernel and the bins add to a variance, bins^2.
     """
     out = np.empty(pixels.shape[0])
     for k in range(pixels.shape[0]):
@@ -152,6 +222,6 @@ def log_density_in_window(
             out[k] = nan
             continue
         x, y = pixels[k, 0], pixels[k, 1]
-        density = densities_at_pixel(histogram, count, everywhere, x, y, velocity_bins[k : k + 1], radius)[0]
+        density = densities_at_pixel(histogram, count, everywhere, x, y, velocity_bins[k : k + 1], radius, blur)[0]
         out[k] = log(max(density, 1e-300))
     return out

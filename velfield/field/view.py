@@ -225,6 +225,7 @@ class VelocityField:
                 pixels[here] - origin,
                 self.bins.to_bins(v[good[here]]),
                 radius,
+                self._blur(),
             )
         out -= 2 * np.log(self.bins.width_px_per_s)
         return out
@@ -277,8 +278,14 @@ class VelocityField:
         x, y = np.floor(np.clip(xy, -limit, limit) + 0.5).astype(np.int64)
         histogram, count = self._cut(int(x) - radius, int(y) - radius, 2 * radius + 1, 2 * radius + 1)
         everywhere = self._map_distribution()
-        density = densities_at_pixel(histogram, count, everywhere, radius, radius, self.bins.to_bins(v), radius)
+        density = densities_at_pixel(
+            histogram, count, everywhere, radius, radius, self.bins.to_bins(v), radius, self._blur()
+        )
         return np.asarray(density / self.bins.width_px_per_s**2, np.float64)
+
+    def _blur(self) -> float:
+        """What the kernel and the bins add to the variance of a velocity component, bins^2."""
+        return (self.bins.kernel_sigma_px_per_s / self.bins.width_px_per_s) ** 2 + 1.0 / 12.0
 
     def _neighbourhood_px(self) -> int:
         """How far the pixels around reach."""
