@@ -53,6 +53,15 @@ def test_a_share_of_the_vehicles_passes_as_asked(one_way: VelocityField) -> None
     assert passed[0] < 0.95 < passed[1]
 
 
+def test_where_all_stand_the_density_is_finite_and_standing_the_likeliest() -> None:
+    still = field(drive(np.zeros((5, 2))))
+    where = np.full((2, 2), [80.0, 50.0])
+    stands, drives = still.log_density(where, np.array([[0.0, 0.0], [40.0, 0.0]]))
+    assert np.isfinite([stands, drives]).all()
+    assert stands > drives + 3
+    assert still.gate(where[0]).accepts(np.zeros((1, 2)))[0]
+
+
 def test_a_gate_of_no_place_is_refused(one_way: VelocityField) -> None:
     with pytest.raises(InputError, match="finite place"):
         one_way.gate(np.array([np.nan, 3.0]))

@@ -76,15 +76,18 @@ def _mode_gaussians(h: Float, n: float, blur: float, out: Float) -> int:
                 sums[nearest, 5] += w * dy * dy
     centre = (h.shape[0] - 1) / 2
     total = sums[:, 0].sum()
-    for k in range(found):
-        s = sums[k]
+    kept = 0
+    for m in range(found):
+        s = sums[m]
+        if s[0] <= 0.0:  # a peak whose bins are all nearer to others
+            continue
         dx, dy = s[1] / s[0], s[2] / s[0]
-        x, y = modes[k, 1] + dx, modes[k, 0] + dy
+        x, y = modes[m, 1] + dx, modes[m, 0] + dy
         vx, vy = x - centre, y - centre
-        speed = max(hypot(vx, vy), 1e-9)
+        speed = hypot(vx, vy)
         along = (USUAL_ALONG * speed) ** 2 + LEAST_SIGMA_BINS**2
         across = (USUAL_ACROSS * speed) ** 2 + LEAST_SIGMA_BINS**2
-        ux, uy = vx / speed, vy / speed
+        ux, uy = (vx / speed, vy / speed) if speed > 1e-6 else (1.0, 0.0)  # at rest there is no along
         mine = max(n * s[0] / total, 1e-9)
         known = mine / (mine + USUAL_COUNTS_FOR)
         # A passage to come strays from the mean of few by what that mean strays, too.
@@ -95,9 +98,14 @@ def _mode_gaussians(h: Float, n: float, blur: float, out: Float) -> int:
         own_across = max(uy * uy * xx - 2 * ux * uy * xy + ux * ux * yy - blur, LEAST_SIGMA_BINS**2)
         a = more * (known * own_along + (1 - known) * along)
         b = more * (known * own_across + (1 - known) * across)
-        out[k, 0], out[k, 1], out[k, 2] = s[0] / total, x, y
-        out[k, 3], out[k, 4], out[k, 5] = ux * ux * a + uy * uy * b, ux * uy * (a - b), uy * uy * a + ux * ux * b
-    return int(found)
+        out[kept, 0], out[kept, 1], out[kept, 2] = s[0] / total, x, y
+        out[kept, 3], out[kept, 4], out[kept, 5] = (
+            ux * ux * a + uy * uy * b,
+            ux * uy * (a - b),
+            uy * uy * a + ux * ux * b,
+        )
+        kept += 1
+    return kept
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
