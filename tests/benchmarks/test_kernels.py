@@ -5,9 +5,10 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from schemas.flight import FieldConfig
+from velfield.bench.detection import plain_response
 from velfield.detection.boosting import random_pool
 from velfield.detection.detector import BoostedSums
-from velfield.detection.response import MARGIN_PX, dense_response
+from velfield.detection.response import dense_response
 from velfield.field.accumulate import accumulate_tile
 from velfield.field.bins import VelocityBins
 from velfield.field.segments import SEGMENT_DTYPE
@@ -24,24 +25,6 @@ def sums() -> BoostedSums:
     pool = random_pool(20, channels=1, sigma_xy_px=(10.0, 10.0), reach_xy_px=(40, 40), max_rectangles=5, rng=rng)
     leaves = rng.normal(0, 1, (20, 2)).astype(np.float32)
     return BoostedSums(pool.table, pool.starts, pool.channels, np.zeros(20, np.float32), leaves)
-
-
-def plain_response(image: np.ndarray, sums: BoostedSums) -> np.ndarray:
-    """The dense response by numpy slices, a rectangle at a time."""
-    padded = np.pad(image, MARGIN_PX, mode="reflect").astype(np.int32)
-    integral = np.pad(padded, ((1, 0), (1, 0))).cumsum(0).cumsum(1)
-    height, width = image.shape
-    out = np.zeros(image.shape, np.float32)
-
-    def corner(y: int, x: int) -> np.ndarray:
-        return integral[MARGIN_PX + y : MARGIN_PX + y + height, MARGIN_PX + x : MARGIN_PX + x + width]
-
-    for f in range(len(sums)):
-        total = np.zeros(image.shape, np.int64)
-        for sign, x0, y0, x1, y1 in sums.rectangles[sums.starts[f] : sums.starts[f + 1]]:
-            total += sign * (corner(y1, x1) - corner(y0, x1) - corner(y1, x0) + corner(y0, x0))
-        out += np.where(total > sums.thresholds[f], sums.leaves[f, 1], sums.leaves[f, 0])
-    return out
 
 
 def test_the_fast_response_is_the_plain_one(picture: np.ndarray, sums: BoostedSums) -> None:

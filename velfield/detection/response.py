@@ -36,12 +36,15 @@ def _response(integral, rectangles, starts, thresholds, leaves, margin, out):  #
                 top = integral[y + margin + rectangles[r, 2]]
                 bottom = integral[y + margin + rectangles[r, 4]]
                 left, right = margin + rectangles[r, 1], margin + rectangles[r, 3]
+                # Slices, whose index numba knows to be no negative one: only so is the loop a vector one.
+                a, b = bottom[right : right + width], bottom[left : left + width]
+                c, d = top[right : right + width], top[left : left + width]
                 if rectangles[r, 0] > 0:
                     for x in range(width):
-                        row[x] += bottom[x + right] - bottom[x + left] - top[x + right] + top[x + left]
+                        row[x] += a[x] - b[x] - c[x] + d[x]
                 else:
                     for x in range(width):
-                        row[x] -= bottom[x + right] - bottom[x + left] - top[x + right] + top[x + left]
+                        row[x] -= a[x] - b[x] - c[x] + d[x]
             threshold, below, above = thresholds[f], leaves[f, 0], leaves[f, 1]
             for x in range(width):
                 said[x] += above if row[x] > threshold else below

@@ -1,0 +1,105 @@
+"""How fast cars are found: each fast way beside a plain one in the same run. Ratios are to be read, not times."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.flight import DetectionConfig
+from velfield.detection.aligned import Look, offset_grid
+from velfield.detection.boosting import random_pool
+from velfield.detection.detect import detect_frame
+from velfield.detection.detector import BoostedSums, shipped_detector
+from velfield.detection.response import MARGIN_PX, dense_response
+from velfield.detection.turned import picture_of
+from velfield.synthetic import small_flight
+
+_TURNS = np.radians(np.arange(0.0, 180.0, 15.0))
+_DENSE_ROUNDS = 200
+_NUMPY_ROUNDS = 10
+_TILE_PX = 8
+
+
+@dataclass(frozen=True)
+class Speed:
+    """One comparison: the fast way and its peer, s for the same work."""
+
+    what: str
+    peer: str
+    seconds: float
+    peer_seconds: float
+
+    def text(self) -> str:
+        """For people, a line."""
+        ours, theirs = 1e3 * self.seconds, 1e3 * self.peer_seconds
+        return f"{self.what}: {ours:.0f} ms; {self.peer}: {theirs:.0f} ms; {theirs / ours:.0f} times"
+
+
+def plain_response(image: NDArray[np.uint8], sums: BoostedSums) -> NDArray[np.float32]:
+    """The dense response by numpy slices, a rectangle at a time: the reference of `dense_response`."""
+    padded = np.pad(image, MARGIN_PX, mode="reflect").astype(np.int32)
+    integral = np.pad(padded, ((1, 0), (1, 0))).cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32)
+    height, width = image.shape
+    out = np.zeros(image.shape, np.float32)
+
+    def corner(y: int, x: int) -> NDArray[np.int32]:
+        return integral[MARGIN_PX + y : MARGIN_PX + y + height, MARGIN_PX + x : MARGIN_PX + x + width]
+
+    for f in range(len(sums)):
+        total = np.zeros(image.shape, np.int32)
+        for sign, x0, y0, x1, y1 in sums.rectangles[sums.starts[f] : sums.starts[f + 1]]:
+            total += sign * (corner(y1, x1) - corner(y0, x1) - corner(y1, x0) + corner(y0, x0))
+        out += np.where(total > sums.thresholds[f], sums.leaves[f, 1], sums.leaves[f, 0])
+    return out
+
+
+def random_sums(rounds: int) -> BoostedSums:
+    """Rounds of the paper's shape, not learnt: only their cost counts."""
+    rng = np.random.default_rng(1)
+    pool = random_pool(rounds, channels=1, sigma_xy_px=(10.0, 10.0), reach_xy_px=(40, 40), max_rectangles=5, rng=rng)
+    leaves = rng.normal(0, 1, (rounds, 2)).astype(np.float32)
+    return BoostedSums(pool.table, pool.starts, pool.channels, np.zeros(rounds, np.float32), leaves)
+
+
+def city(width: int, height: int) -> NDArray[np.uint8]:
+    """A frame of a simulated city, repeated to the size."""
+    frame = small_flight(frames=1, seed=77).frame(0)
+    times = -(-height // frame.shape[0]), -(-width // frame.shape[1])
+    return np.ascontiguousarray(np.tile(frame, times)[:height, :width])
+
+
+def response_speed(image: NDArray[np.uint8]) -> Speed:
+    """The paper's dense response, whole rows at a time, against numpy, whose rounds are fewer and scaled up."""
+    sums, few = random_sums(_DENSE_ROUNDS), random_sums(_NUMPY_ROUNDS)
+    fast = _fastest(lambda: dense_response(image, sums), 2)
+    share = len(sums.rectangles) / len(few.rectangles)
+    slow = _fastest(lambda: plain_response(image, few), 1) * share
+    return Speed(f"dense response, {_DENSE_ROUNDS} rounds", "numpy", fast, slow)
+
+
+def cascade_speed(image: NDArray[np.uint8], *, crop_px: int = 96) -> Speed:
+    """Both steps against the second step's classifier at every pixel and turn, of a crop, scaled up."""
+    detector = shipped_detector()
+    fast = _fastest(lambda: detect_frame(image, None, detector, DetectionConfig()), 2)
+    look = Look(picture_of(image), detector.sums, float(detector.record.contrast_floor or 0.0))
+    spots = np.arange(0, crop_px, _TILE_PX) + _TILE_PX / 2
+    tiles = np.stack(np.meshgrid(spots, spots), axis=-1).reshape(-1, 2).astype(np.float64)
+    half = offset_grid(_TILE_PX // 2, _TILE_PX // 2)
+    offsets = half[(half > -_TILE_PX // 2).all(axis=1)]
+    slow = _fastest(lambda: look.scores(tiles, np.zeros(len(tiles)), np.asarray(_TURNS, np.float64), offsets), 1)
+    slow *= image.size / crop_px**2
+    rounds = len(detector.record.rounds)
+    return Speed(f"both steps, {rounds} rounds", f"dense over pixels and {len(_TURNS)} turns", fast, slow)
+
+
+def _fastest(work: Callable[[], object], repeats: int) -> float:
+    """The least of some runs, s of processor time; one before them compiles."""
+    work()
+    times = []
+    for _ in range(repeats):
+        start = time.process_time()
+        work()
+        times.append(time.process_time() - start)
+    return min(times)
