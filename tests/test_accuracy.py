@@ -12,7 +12,7 @@ from schemas.simulation import SimulationConfig
 from velfield.configuration import resolve_config
 from velfield.synthetic import write_flight
 
-FRAMES = 80
+FRAMES = 64
 
 
 @pytest.mark.slow
@@ -24,7 +24,7 @@ def test_a_flight_with_base_image_and_labels_is_near_the_truth(tmp_path: Path) -
     from velfield.scoring import score_run
 
     flight = tmp_path / "flight"
-    write_flight(flight, SimulationConfig(frames=FRAMES, width=640, height=480, seed=31))
+    write_flight(flight, SimulationConfig(frames=FRAMES, width=960, height=720, seed=33))
     inputs = Inputs(
         source=str(flight / "frames"),
         timestamps=str(flight / "timestamps.csv"),
