@@ -8,7 +8,7 @@ import pytest
 from flows.launch import prepare_process
 from schemas.simulation import SimulationConfig
 from schemas.summary import RunSummary
-from tests.small_flight import FRAMES, job, process
+from tests.small_flight import FRAMES, digests, job, process
 
 FOOTAGE = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -47,7 +47,10 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def whole(flight: Path, server: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunSummary]:
-    """The flight's run, done once."""
+def whole(flight: Path, server: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, RunSummary]]:
+    """The flight's run, done once; a test that writes into it works on a copy."""
     root = tmp_path_factory.mktemp("run") / "whole"
-    return root, process(job(flight, root))
+    summary = process(job(flight, root))
+    left = digests(root)
+    yield root, summary
+    assert digests(root) == left, "a test wrote into the run that all share"

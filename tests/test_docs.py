@@ -5,6 +5,7 @@ The words VIDEO, RUN, ... of the pages are replaced by what the test has.
 
 import re
 import shlex
+import shutil
 from pathlib import Path
 
 import pytest
@@ -43,7 +44,7 @@ def commands() -> list[tuple[str, str]]:
 @pytest.fixture
 def place(whole: tuple[Path, RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A working folder with what the pages speak of."""
-    (tmp_path / "RUN").symlink_to(whole[0], target_is_directory=True)
+    shutil.copytree(whole[0], tmp_path / "RUN")  # the commands write into it
     write_video(tmp_path / "VIDEO.mp4", list(drifting(30)))
     monkeypatch.chdir(tmp_path)
     return tmp_path

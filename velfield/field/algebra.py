@@ -25,7 +25,8 @@ def merge_tiles(tiles: Sequence[FieldTile]) -> FieldTile:
 
     Examples
     --------
-    >>> one = FieldTile(np.ones((1, 1, 3, 3), np.int32), np.ones((1, 1), np.int32), np.ones((1, 1), np.int32))
+    >>> pixel = np.ones((1, 1), np.int32)
+    >>> one = FieldTile(np.ones((1, 1, 3, 3), np.int32), pixel, pixel, pixel)
     >>> merge_tiles([one, one]).count
     array([[2]], dtype=int32)
     """
