@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export UV_LINK_MODE := copy
+# Where this is set, every process of ours compiles all that it imports anew: 12 s each for Prefect.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo test lint types check format env lock bench detector soak clean
 

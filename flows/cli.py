@@ -276,7 +276,9 @@ def _process(
     verbosity: "Verbosity" = "normal",
 ) -> int:
     from flows.launch import prepare_process
+    from velfield.plan import check_inputs
 
+    check_inputs(job)  # before Prefect: its start takes seconds
     prepare_process(verbose=verbosity == "verbose")
     from flows.console import Console
     from flows.process_flight import run_flight

@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 from flows.console import Console
-from flows.launch import prepare_process
 from flows.runners import RunnerConfig
 from schemas.job import Inputs, Job
 from schemas.simulation import SimulationConfig
@@ -16,10 +15,7 @@ FRAMES = 64
 
 
 @pytest.mark.slow
-def test_a_flight_with_base_image_and_labels_is_near_the_truth(tmp_path: Path) -> None:
-    prepare_process(verbose=False)
-    from prefect.testing.utilities import prefect_test_harness
-
+def test_a_flight_with_base_image_and_labels_is_near_the_truth(server: None, tmp_path: Path) -> None:
     from flows.process_flight import run_flight
     from velfield.scoring import score_run
 
@@ -33,8 +29,7 @@ def test_a_flight_with_base_image_and_labels_is_near_the_truth(tmp_path: Path) -
     )
     settings = ["detection.rounds=120", "detection.feature_pool=800", "registration.key_points=1500"]
     config = resolve_config(settings=settings, overrides={"gsd_m": 0.23})
-    with prefect_test_harness(server_startup_timeout=180):
-        run_flight(Job(root=str(tmp_path / "run"), inputs=inputs, config=config), RunnerConfig(), Console("quiet"))
+    run_flight(Job(root=str(tmp_path / "run"), inputs=inputs, config=config), RunnerConfig(), Console("quiet"))
     score = score_run(tmp_path / "run", flight)
     assert score.registration.mean_px <= 1
     assert score.tracking.precision >= 0.95

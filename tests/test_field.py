@@ -253,6 +253,10 @@ def test_velocities_do_not_depend_on_which_other_passages_are_given() -> None:
     np.testing.assert_array_equal(whole[whole["passage"] == 3], alone)
 
 
+def test_no_tracklets_are_no_segments() -> None:
+    assert len(segment_table(tracklets(3).iloc[:0], FieldConfig())) == 0
+
+
 def test_an_interval_of_zero_is_refused() -> None:
     table = tracklets(3)
     table["time_1_s"] = table["time_0_s"]

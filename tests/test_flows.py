@@ -1,6 +1,7 @@
 """The whole job as a flow: what it leaves, what a second run does again, what a failing unit costs."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,8 @@ from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
 from tests.small_flight import FRAMES, digests, job, process, redone
 from velfield import open_run
 from velfield.errors import InputError
-from velfield.layout import STAGES
+from velfield.layout import STAGES, RunLayout
+from velfield.results import share
 
 
 def test_it_leaves_what_the_contract_says(whole: tuple[Path, RunSummary]) -> None:
@@ -68,8 +70,6 @@ def test_a_second_run_does_nothing_again(whole: tuple[Path, RunSummary], flight:
 
 
 def test_a_changed_gate_redoes_tracking_onward(whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path) -> None:
-    import shutil
-
     root = tmp_path / "copy"
     shutil.copytree(whole[0], root)
     changed = process(job(flight, root, "tracking.max_speed_m_per_s=5"))
@@ -84,7 +84,7 @@ def test_workers_give_the_same_bits(whole: tuple[Path, RunSummary], flight: Path
 
 
 def test_a_unit_that_fails_once_is_tried_again(
-    flight: Path, server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from velfield.steps import frames as step
 
@@ -98,7 +98,11 @@ def test_a_unit_that_fails_once_is_tried_again(
         return true(plan, frames)  # type: ignore[arg-type]
 
     monkeypatch.setattr(step, "read_unit", failing)
-    summary = process(job(flight, tmp_path / "run", "frames.stop_s=2"))
+    root = tmp_path / "run"
+    shutil.copytree(whole[0], root)
+    shutil.rmtree(root / "commits/frames")
+    summary = process(job(flight, root))
+    assert redone(summary) == ["frames"]
     assert not summary.stages[0].lost
     assert len(calls) == summary.stages[0].units + 1
 
@@ -116,6 +120,7 @@ def test_a_unit_that_always_fails_is_lost_and_done_by_the_next_run(
         return true(plan, frames)  # type: ignore[arg-type]
 
     root = tmp_path / "run"
+    share(RunLayout(whole[0]), RunLayout(root), ("lens", "base", "detector"))
     monkeypatch.setattr(step, "detect_block", failing)
     summary = process(job(flight, root))
     lost = {stage.name: stage.lost for stage in summary.stages if stage.lost}

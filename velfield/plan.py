@@ -13,9 +13,11 @@ from schemas.records import FlightRecord, InputsRecord, SourceRecord
 from velfield.errors import InputError
 from velfield.layout import STAGES, RunLayout
 from velfield.provenance import content_key, digest_path, write_atomically
-from velfield.sources.source import SourceInfo, probe, select_frames
+from velfield.sources.source import SourceInfo, check_source, probe, select_frames
 from velfield.version import STAGE_VERSIONS, code_version
 
+_BESIDES = ("base", "labels", "detector", "detections", "timestamps")
+"""What may be given besides the source."""
 _UNITS = ((256, 16), (4096, 64))
 """Up to so many frames, so many a unit: a short flight is cut finely enough for several workers ..."""
 _LARGEST_UNIT = 256
@@ -76,6 +78,21 @@ class Plan:
         return [range(start, min(start + step, frames.stop)) for start in range(frames.start, frames.stop, step)]
 
 
+def check_inputs(job: Job) -> None:
+    """See at a glance that all that was given is there, before anything that takes long is started.
+
+    Raises
+    ------
+    InputError
+        The source cannot be opened, or another file that was given is not there.
+    """
+    check_source(job.inputs.source)
+    for name in _BESIDES:
+        path = getattr(job.inputs, name)
+        if path is not None and not Path(path).exists():
+            raise InputError(f"--{name}: {path} is not there; give a path that exists")
+
+
 def make_plan(job: Job) -> Plan:
     """Look at the inputs and resolve the run.
 
@@ -84,6 +101,7 @@ def make_plan(job: Job) -> Plan:
     InputError
         The source cannot be read, has no times, or fewer than three frames are left to work on.
     """
+    check_inputs(job)
     timestamps = Path(job.inputs.timestamps) if job.inputs.timestamps else None
     info = probe(Path(job.inputs.source), frames=job.config.frames, timestamps=timestamps)
     indices = select_frames(info.times_s, job.config.frames)
@@ -98,10 +116,8 @@ def make_plan(job: Job) -> Plan:
 
 def _digest_inputs(job: Job, info: SourceInfo) -> InputsRecord:
     digests: dict[str, str | None] = {}
-    for name in ("base", "labels", "detector", "detections", "timestamps"):
+    for name in _BESIDES:
         path = getattr(job.inputs, name)
-        if path is not None and not Path(path).exists():
-            raise InputError(f"--{name}: {path} is not there; give a path that exists")
         digests[name] = digest_path(Path(path)) if path else None
     source = SourceRecord(
         path=job.inputs.source,

@@ -60,6 +60,8 @@ def _averaged(segments: Segments, span_s: float) -> Segments:
     The error of a detection's place enters two neighbouring segments with opposite signs, so their mean loses most of
     it; within half a second or so a vehicle's acceleration is constant, and the mean is that of the middle.
     """
+    if not len(segments):
+        return segments
     broken = segments["passage"][1:] != segments["passage"][:-1]
     broken |= segments["detection_0"][1:] != segments["detection_1"][:-1]
     run = np.concatenate([[0], np.cumsum(broken)])

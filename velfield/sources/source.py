@@ -9,16 +9,18 @@ from numpy.typing import NDArray
 
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
+from velfield.sources.bitstream import libav_log
+from velfield.sources.container import open_video, video_stream
 from velfield.sources.decoding import iter_video
 from velfield.sources.flags import FrameFlag
-from velfield.sources.folder import iter_folder, probe_folder
+from velfield.sources.folder import iter_folder, list_pictures, probe_folder
 from velfield.sources.frames import SourceFrame, SourceInfo
 from velfield.sources.paths import local_path
 from velfield.sources.quality import is_black, is_duplicate
 from velfield.sources.selection import select_frames
 from velfield.sources.video import probe_video
 
-__all__ = ["SourceFrame", "SourceInfo", "iter_frames", "probe", "select_frames"]
+__all__ = ["SourceFrame", "SourceInfo", "check_source", "iter_frames", "probe", "select_frames"]
 
 
 def probe(path: Path | str, *, frames: FramesConfig, timestamps: Path | None = None) -> SourceInfo:
@@ -46,6 +48,22 @@ def probe(path: Path | str, *, frames: FramesConfig, timestamps: Path | None = N
     if place.is_dir():
         return probe_folder(place, frames=frames, timestamps=timestamps)
     return probe_video(place, frames=frames, timestamps=timestamps)
+
+
+def check_source(path: Path | str) -> None:
+    """A glance at the source: there, of a kind that we read, not empty. What `probe` finds beyond that takes longer.
+
+    Raises
+    ------
+    InputError
+        Nothing that can be read.
+    """
+    place = local_path(path, "video or picture folder")
+    if place.is_dir():
+        list_pictures(place)
+        return
+    with libav_log(), open_video(place) as container:
+        video_stream(container, place)
 
 
 def iter_frames(
