@@ -17,6 +17,10 @@ from velfield.errors import InputError
 
 SCHEME = "s3:/"
 """How such a path begins once it is a path: two slashes in a row mean the same as one."""
+S3_OPTIONS: dict[str, Any] = {
+    "use_listings_cache": False,  # other processes write what this one looks for
+    "max_concurrency": 1,  # more would ask for an object's size before each reading; ours are small
+}
 
 
 class Stat(NamedTuple):
@@ -118,8 +122,7 @@ def _files() -> Any:
         import s3fs
     except ImportError:
         raise InputError("a run folder on s3:// needs the extra: pip install 'velfield[s3]'") from None
-    # No cache of listings: other processes write what this one looks for.
-    return s3fs.S3FileSystem(use_listings_cache=False)
+    return s3fs.S3FileSystem(**S3_OPTIONS)
 
 
 def place(path: str | Path) -> Path:

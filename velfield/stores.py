@@ -10,6 +10,7 @@ Three rules that were paid for (each is a fault seen in zarr or in its use):
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from zarr.codecs import ZstdCodec
 
 from velfield.errors import InputError
-from velfield.places import RemotePath
+from velfield.places import S3_OPTIONS, RemotePath
 
 _STATUS_BYTES = 160
 HISTOGRAM = "velocity_histogram"
@@ -46,24 +47,49 @@ def _create(
     )
 
 
-def _store(path: Path) -> Any:
-    return path.url if isinstance(path, RemotePath) else path
+def _place(path: Path) -> dict[str, Any]:
+    """What zarr asks for to find a store."""
+    if isinstance(path, RemotePath):
+        return {"store": path.url, "storage_options": S3_OPTIONS}
+    return {"store": path}
 
 
-def _open(path: Path, mode: str) -> zarr.Group:
+class _Group:
+    """A group, opened, whose arrays are looked up once: on S3 each look is a request or two."""
+
+    def __init__(self, group: zarr.Group) -> None:
+        self._group = group
+        self._arrays: dict[str, zarr.Array[Any]] = {}
+
+    @property
+    def attrs(self) -> Mapping[str, Any]:
+        return self._group.attrs
+
+    def __getitem__(self, name: str) -> zarr.Array[Any]:
+        if name not in self._arrays:
+            self._arrays[name] = cast("zarr.Array[Any]", self._group[name])
+        return self._arrays[name]
+
+    @cached_property
+    def by_axes(self) -> dict[int, list[str]]:
+        """Names of the arrays of so many axes, in one order whatever the disk lists first."""
+        self._arrays |= dict(self._group.arrays())
+        names: dict[int, list[str]] = {}
+        for name in sorted(self._arrays):
+            names.setdefault(self._arrays[name].ndim, []).append(name)
+        return names
+
+
+def _open(path: Path, mode: str) -> _Group:
     try:
-        return zarr.open_group(_store(path), mode=cast(Any, mode), use_consolidated=False)
+        return _Group(zarr.open_group(**_place(path), mode=cast(Any, mode), zarr_format=3, use_consolidated=False))
     except FileNotFoundError:
         raise InputError(f"{path} is not there: run `velfield run` on this folder first") from None
 
 
-def _array(group: zarr.Group, name: str) -> zarr.Array[Any]:
-    return cast("zarr.Array[Any]", group[name])
-
-
-def _read(path: Path, group: zarr.Group, name: str, selection: Any) -> NDArray[Any]:
+def _read(path: Path, group: _Group, name: str, selection: Any) -> NDArray[Any]:
     try:
-        return np.asarray(_array(group, name)[selection])
+        return np.asarray(group[name][selection])
     except Exception as error:
         raise StoreError(
             f"{path / name}: a chunk is damaged ({error}); `velfield verify {path.parent}` says which"
@@ -86,7 +112,7 @@ def _existing(paths: Iterable[Path]) -> list[Path]:
 def store_key(path: Path) -> str | None:
     """Content key that a store was laid out under; none where it is not there or not whole."""
     try:
-        return str(zarr.open_group(_store(path), mode="r", use_consolidated=False).attrs["key"])
+        return str(zarr.open_group(**_place(path), mode="r", zarr_format=3, use_consolidated=False).attrs["key"])
     except (FileNotFoundError, KeyError, ValueError):
         return None
 
@@ -105,7 +131,7 @@ def create_frames(
     path: Path, *, key: str, count: int, height: int, width: int, unit_frames: int, source: Mapping[str, Any]
 ) -> None:
     """Lay out ``frames.zarr``: one frame a chunk; a unit of a column a chunk. Frames are unreadable until written."""
-    group = zarr.create_group(_store(path), overwrite=True, attributes={"source": dict(source)})
+    group = zarr.create_group(**_place(path), overwrite=True, attributes={"source": dict(source)})
     chunk = min(unit_frames, max(count, 1))
     _create(group, "raw", (count, height, width), (1, height, width), "uint8", dimension_names=("frame", "y", "x"))
     for name, (dtype, fill) in FRAME_COLUMNS.items():
@@ -118,16 +144,16 @@ class FrameStore:
     """``frames.zarr``, opened."""
 
     path: Path
-    group: zarr.Group
+    group: _Group
 
     @property
     def count(self) -> int:
-        return int(_array(self.group, "raw").shape[0])
+        return int(self.group["raw"].shape[0])
 
     @property
     def shape(self) -> tuple[int, int]:
         """(height, width) of a frame, px."""
-        _, height, width = _array(self.group, "raw").shape
+        _, height, width = self.group["raw"].shape
         return int(height), int(width)
 
     def read(self, frame: int) -> NDArray[np.uint8]:
@@ -141,13 +167,13 @@ class FrameStore:
         if not (self.path / "raw" / "c" / str(frame) / "0" / "0").exists():
             raise StoreError(f"{self.path}: the chunk of frame {frame} is gone; `velfield run` writes it again")
         try:
-            return np.asarray(_array(self.group, "raw")[frame], dtype=np.uint8)
+            return np.asarray(self.group["raw"][frame], dtype=np.uint8)
         except Exception as error:
             raise StoreError(f"{self.path}: the chunk of frame {frame} is damaged ({error})") from error
 
     def write(self, frame: int, grey: NDArray[np.uint8]) -> None:
         """Write one frame: one chunk, a black frame's too, or it could not be told from one that is gone."""
-        _array(self.group, "raw").with_config({"write_empty_chunks": True})[frame] = grey
+        self.group["raw"].with_config({"write_empty_chunks": True})[frame] = grey
 
     def column(self, name: str) -> NDArray[Any]:
         """One column: ``time_s``, ``source_index``, ``flags``, ``sharpness`` or ``brightness``, (frames,)."""
@@ -156,12 +182,12 @@ class FrameStore:
     def write_columns(self, start: int, columns: Mapping[str, NDArray[Any]]) -> None:
         """Write a whole unit of columns, from frame ``start`` on."""
         for name, values in columns.items():
-            _array(self.group, name)[start : start + len(values)] = values
+            self.group[name][start : start + len(values)] = values
 
     def files(self, start: int, stop: int) -> list[Path]:
         """Files that hold the frames ``[start, stop)``, a unit, and their columns; and the store's metadata."""
         raw = [self.path / "raw" / "c" / str(frame) / "0" / "0" for frame in range(start, stop)]
-        unit = start // int(_array(self.group, "time_s").chunks[0])
+        unit = start // int(self.group["time_s"].chunks[0])
         columns = [self.path / name / "c" / str(unit) for name in FRAME_COLUMNS]
         return [*_metadata(self.path), *_existing([*raw, *columns])]
 
@@ -189,7 +215,7 @@ ERROR_CELLS = (6, 8)
 
 def create_registration(path: Path, *, key: str, count: int, vector_length: int, unit_frames: int) -> None:
     """Lay out ``registration.zarr``: chunks are units, so that a unit has one writer."""
-    group = zarr.create_group(_store(path), overwrite=True)
+    group = zarr.create_group(**_place(path), overwrite=True)
     chunk = min(unit_frames, max(count, 1))
     _create(group, "vector", (count, vector_length), (chunk, vector_length), "float64", fill_value=np.nan)
     _create(group, "status", (count, _STATUS_BYTES), (chunk, _STATUS_BYTES), "uint8", fill_value=0)
@@ -207,7 +233,7 @@ class RegistrationStore:
     """``registration.zarr``, opened."""
 
     path: Path
-    group: zarr.Group
+    group: _Group
 
     def write(
         self, start: int, vectors: NDArray[np.float64], statuses: Sequence[str], columns: Mapping[str, NDArray[Any]]
@@ -218,10 +244,10 @@ class RegistrationStore:
         for row, status in zip(text, statuses, strict=True):
             data = np.frombuffer(status.encode()[:_STATUS_BYTES], np.uint8)
             row[: len(data)] = data
-        _array(self.group, "vector")[start:stop] = vectors
-        _array(self.group, "status")[start:stop] = text
+        self.group["vector"][start:stop] = vectors
+        self.group["status"][start:stop] = text
         for name, values in columns.items():
-            _array(self.group, name)[start:stop] = values
+            self.group[name][start:stop] = values
 
     def vector(self, frame: int) -> NDArray[np.float64]:
         """Flat parameters of one frame's transform; NaN where it is not registered."""
@@ -242,7 +268,7 @@ class RegistrationStore:
 
     def files(self, start: int) -> list[Path]:
         """Files that hold the unit from frame ``start`` on, and the store's metadata."""
-        unit = start // int(_array(self.group, "vector").chunks[0])
+        unit = start // int(self.group["vector"].chunks[0])
         tables = [self.path / name / "c" / str(unit) / "0" for name in ("vector", "status")]
         columns = [self.path / name / "c" / str(unit) for name in REGISTRATION_COLUMNS]
         errors = self.path / "error_px" / "c" / str(unit) / "0" / "0"
@@ -281,7 +307,7 @@ def create_field(
     layers : name -> attributes
         (y, x) layers beside the histogram; ``dtype`` among the attributes says their type, float32 where absent.
     """
-    group = zarr.create_group(_store(path), overwrite=True, attributes=dict(attributes))
+    group = zarr.create_group(**_place(path), overwrite=True, attributes=dict(attributes))
     n = len(velocities_px_per_s)
     grid_mapping = {"grid_mapping": "crs"} if attributes.get("crs_wkt") else {}
     for name, what in histograms.items():
@@ -337,7 +363,7 @@ class FieldStore:
     """``field.zarr``, opened."""
 
     path: Path
-    group: zarr.Group
+    group: _Group
 
     @property
     def attributes(self) -> dict[str, Any]:
@@ -345,26 +371,26 @@ class FieldStore:
 
     @property
     def tile(self) -> int:
-        return int(_array(self.group, HISTOGRAM).chunks[0])
+        return int(self.group[HISTOGRAM].chunks[0])
 
     @property
     def shape(self) -> tuple[int, int]:
         """(height, width) of the base image, px."""
-        height, width = _array(self.group, HISTOGRAM).shape[:2]
+        height, width = self.group[HISTOGRAM].shape[:2]
         return int(height), int(width)
 
     def velocities(self) -> NDArray[np.float64]:
         """Bin centres, px/s."""
-        return np.asarray(_array(self.group, "vx")[:])
+        return np.asarray(self.group["vx"][:])
 
     def histogram_names(self) -> list[str]:
         """Names of the (y, x, vy, vx) histograms."""
-        return [name for name in (HISTOGRAM, HISTOGRAM_BY_TIME) if name in self.group]
+        return [name for name in (HISTOGRAM, HISTOGRAM_BY_TIME) if name in self.group.by_axes.get(4, ())]
 
     def write_tile(self, row: int, column: int, histogram: NDArray[np.int32], name: str = HISTOGRAM) -> None:
         """Write one tile of a histogram, (ty, tx, nvy, nvx): one chunk."""
         y, x, side = row * self.tile, column * self.tile, self.tile
-        _array(self.group, name)[y : y + side, x : x + side] = histogram
+        self.group[name][y : y + side, x : x + side] = histogram
 
     def has_tile(self, row: int, column: int, name: str = HISTOGRAM) -> bool:
         """Whether the tile's chunk exists."""
@@ -380,13 +406,13 @@ class FieldStore:
         """
         y, x, side = row * self.tile, column * self.tile, self.tile
         try:
-            return np.asarray(_array(self.group, name)[y : y + side, x : x + side], dtype=np.int32)
+            return np.asarray(self.group[name][y : y + side, x : x + side], dtype=np.int32)
         except Exception as error:
             raise StoreError(f"{self.path}: the chunk of tile ({row}, {column}) is damaged ({error})") from error
 
     def write_layer(self, name: str, y: int, x: int, values: NDArray[Any]) -> None:
         """Write a window of a layer: whole chunks."""
-        _array(self.group, name)[y : y + values.shape[0], x : x + values.shape[1]] = values
+        self.group[name][y : y + values.shape[0], x : x + values.shape[1]] = values
 
     def layer(self, name: str) -> NDArray[Any]:
         """A whole layer, (y, x)."""
@@ -397,20 +423,20 @@ class FieldStore:
         places = [Path("c", str(row), str(column), "0", "0") for row, column in tiles]
         histogram = [self.path / name / place for name in self.histogram_names() for place in places]
         layers = [self.path / name / "c" / str(group[0]) / str(group[1]) for name in self.layer_names()]
-        axes = [self.path / name / "c" / "0" for name, array in self.group.arrays() if array.ndim == 1]
+        axes = [self.path / name / "c" / "0" for name in self.group.by_axes.get(1, ())]
         return [*_metadata(self.path), *_existing([*histogram, *layers, *axes])]
 
     def layer_names(self) -> list[str]:
         """Names of the (y, x) layers, in one order whatever the disk lists first."""
-        return sorted(name for name, array in self.group.arrays() if array.ndim == 2)
+        return self.group.by_axes.get(2, [])
 
     def layer_attributes(self, name: str) -> dict[str, Any]:
         """Units and long name of a layer."""
-        return dict(_array(self.group, name).attrs)
+        return dict(self.group[name].attrs)
 
     def chunk_shape(self, name: str) -> tuple[int, int]:
         """(height, width) of a chunk of an array, px."""
-        height, width = _array(self.group, name).chunks[:2]
+        height, width = self.group[name].chunks[:2]
         return int(height), int(width)
 
     def stored_chunks(self, name: str) -> list[tuple[int, int]]:
@@ -431,7 +457,7 @@ _LAYER_CHUNK_PX = 512
 
 def write_segments(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write ``view/segments.zarr`` anew: columns of one length, (segments,) each; every chunk is there to be read."""
-    group = zarr.create_group(_store(path), overwrite=True)
+    group = zarr.create_group(**_place(path), overwrite=True)
     for name, values in columns.items():
         chunk = (min(_SEGMENTS_A_CHUNK, max(len(values), 1)),)
         column = _create(group, name, values.shape, chunk, values.dtype.name, dimension_names=("segment",))
@@ -440,7 +466,7 @@ def write_segments(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
 
 def write_extra_layers(path: Path, layers: Mapping[str, tuple[NDArray[np.floating], Mapping[str, Any]]]) -> None:
     """Write float32 (y, x) layers with their attributes, to be shown beside a field's own: `open_field` reads them."""
-    group = zarr.create_group(_store(path), overwrite=True)
+    group = zarr.create_group(**_place(path), overwrite=True)
     for name, (values, attributes) in layers.items():
         chunk = (_LAYER_CHUNK_PX, _LAYER_CHUNK_PX)
         layer = _create(group, name, values.shape, chunk, "float32", fill_value=np.nan, dimension_names=("y", "x"))
