@@ -1,6 +1,9 @@
 """Fixtures that every test may use."""
 
+import fcntl
+import os
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -26,14 +29,27 @@ def footage() -> Callable[[str], Path]:
     return find
 
 
+@contextmanager
+def made_once(factory: pytest.TempPathFactory, name: str) -> Iterator[tuple[Path, bool]]:
+    """A folder that the session's processes share, and whether it is there already; the others wait meanwhile."""
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    folder.mkdir(exist_ok=True)
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield folder, (folder / "made").exists()
+        (folder / "made").touch()
+
+
 @pytest.fixture(scope="session")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated flight of a few seconds."""
     from velfield.synthetic import write_flight
 
-    folder = tmp_path_factory.mktemp("flight")
-    write_flight(folder, SimulationConfig(frames=FRAMES, width=640, height=480, seed=11))
-    return folder
+    with made_once(tmp_path_factory, "flight") as (folder, there):
+        if not there:
+            write_flight(folder / "flight", SimulationConfig(frames=FRAMES, width=640, height=480, seed=11))
+    return folder / "flight"
 
 
 @pytest.fixture(scope="session")
@@ -49,8 +65,10 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 @pytest.fixture(scope="session")
 def whole(flight: Path, server: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, RunSummary]]:
     """The flight's run, done once; a test that writes into it works on a copy."""
-    root = tmp_path_factory.mktemp("run") / "whole"
-    summary = process(job(flight, root))
-    left = digests(root)
+    with made_once(tmp_path_factory, "run") as (folder, there):
+        root, told = folder / "whole", folder / "summary.json"
+        if not there:
+            told.write_text(process(job(flight, root)).model_dump_json())
+        summary, left = RunSummary.model_validate_json(told.read_text()), digests(root)
     yield root, summary
     assert digests(root) == left, "a test wrote into the run that all share"

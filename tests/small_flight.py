@@ -11,8 +11,8 @@ from velfield.layout import RunLayout
 from velfield.provenance import digest_bytes
 
 SMALL = (
-    "detection.rounds=60",
-    "detection.feature_pool=400",
+    "detection.rounds=40",
+    "detection.feature_pool=250",
     "registration.key_points=1200",
     "work.unit_frames=8",
     "work.retries=1",

@@ -3,6 +3,7 @@
 import io
 import json
 from datetime import UTC, datetime
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ LENGTHS_M = [40.0 * 0.4 * GSD_M] * 3 + [30.0 * 0.4 * GSD_M]
 
 
 def test_geopandas_reads_geoparquet_with_its_place() -> None:
-    geopandas = pytest.importorskip("geopandas")
+    geopandas = import_module("geopandas")
     frame = geopandas.read_parquet(io.BytesIO(tracklets_geoparquet(tracklets_of(PATHS), PLACED)))
     assert frame.crs.to_epsg() == 32636
     np.testing.assert_allclose(frame.length, LENGTHS_M, rtol=1e-6)
@@ -36,7 +37,7 @@ def test_geopandas_reads_geoparquet_with_its_place() -> None:
 
 @pytest.mark.parametrize("place", [PLACED, PIXELS])
 def test_geopandas_reads_geopackage(tmp_path: Path, place: object) -> None:
-    geopandas = pytest.importorskip("geopandas")
+    geopandas = import_module("geopandas")
     path = tmp_path / "tracklets.gpkg"
     for _ in range(2):  # a second export takes the place of the first
         write_geopackage(path, tracklets_of(PATHS), place)  # type: ignore[arg-type]
@@ -51,7 +52,7 @@ def test_geopandas_reads_geopackage(tmp_path: Path, place: object) -> None:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
 def test_movingpandas_makes_trajectories_of_the_tracks() -> None:
-    movingpandas = pytest.importorskip("movingpandas")
+    movingpandas = import_module("movingpandas")
     table = pd.read_csv(io.StringIO(geotrax_csv(tracklets_of(PATHS), PLACED)))
     table["t"] = pd.Timestamp("2024-05-01") + pd.to_timedelta(table["Timestamp"], unit="s")
     tracks = movingpandas.TrajectoryCollection(table, "Vehicle_ID", t="t", x="Local_X", y="Local_Y", crs=PLACED.crs_wkt)
@@ -62,7 +63,7 @@ def test_movingpandas_makes_trajectories_of_the_tracks() -> None:
 
 
 def test_pystac_takes_the_item(tmp_path: Path) -> None:
-    pystac = pytest.importorskip("pystac")
+    pystac = import_module("pystac")
     item = stac_item(
         "flight", PLACED, {"field": "field.zarr"}, start=datetime(2024, 5, 1, 12, tzinfo=UTC), duration_s=60
     )
@@ -75,7 +76,7 @@ def test_pystac_takes_the_item(tmp_path: Path) -> None:
 
 
 def test_rio_cogeo_finds_the_geotiff_cloud_optimised(tmp_path: Path) -> None:
-    cogeo = pytest.importorskip("rio_cogeo.cogeo")
+    cogeo = import_module("rio_cogeo.cogeo")
     path = tmp_path / "speed.tif"
     speed = np.full((1200, 1400), np.nan, np.float32)
     speed[100:200, 50:80] = 12.5
@@ -85,7 +86,7 @@ def test_rio_cogeo_finds_the_geotiff_cloud_optimised(tmp_path: Path) -> None:
 
 
 def test_sumos_own_reader_gives_the_vehicles(tmp_path: Path) -> None:
-    sumolib = pytest.importorskip("sumolib")
+    sumolib = import_module("sumolib")
     path = tmp_path / "tracks.fcd.xml"
     path.write_text(sumo_fcd(tracklets_of(PATHS), PLACED))
     steps = list(sumolib.xml.parse(str(path), "timestep"))
