@@ -16,6 +16,8 @@ from typing import Any
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
+from velfield.render.viewer_page import page_is_built
+
 _FLAGS = (
     "--headless=new",
     "--no-sandbox",  # CI runs as root in a container
@@ -28,6 +30,10 @@ _FLAGS = (
     "--window-size=1280,860",
 )
 _PATIENCE_S = 60.0
+NEEDS_PAGE = pytest.mark.skipif(
+    not page_is_built() and not os.environ.get("VELFIELD_CI"),  # in CI they fail
+    reason="the page is not built: `make page`",
+)
 
 
 def chromium() -> str:

@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 
 from schemas.summary import RunSummary
-from tests.browser import Browser, Page, browser
+from tests.browser import NEEDS_PAGE, Browser, Page, browser
 from velfield import open_run
-from velfield.render.viewer_page import page_is_built
 from velfield.run import Run
 
-pytestmark = pytest.mark.skipif(not page_is_built(), reason="the page is not built: `make page`")
+pytestmark = NEEDS_PAGE
 
 
 @pytest.fixture(scope="module")

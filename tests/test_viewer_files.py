@@ -10,6 +10,7 @@ import pytest
 
 from schemas.summary import RunSummary
 from schemas.view import ViewRecord
+from tests.browser import NEEDS_PAGE
 from tests.small_flight import job, process
 from velfield import open_run
 from velfield.comparing import compare_runs
@@ -102,7 +103,7 @@ def test_without_a_built_page_the_report_stands_alone_and_it_is_said(
     assert "Which way traffic goes" in page
 
 
-@pytest.mark.skipif(not report_step.page_is_built(), reason="the page is not built: `make page`")
+@NEEDS_PAGE
 def test_the_page_holds_its_licences_and_no_address_elsewhere(whole: tuple[Path, RunSummary]) -> None:
     licences = (whole[0] / "view" / "LICENSES.txt").read_text()
     for package in ("leaflet", "zarrita", "zstddec"):

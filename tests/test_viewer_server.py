@@ -21,10 +21,9 @@ import uvicorn
 from schemas.annotation import MarkedCar, Marks
 from schemas.flight import FramesConfig
 from schemas.summary import RunSummary
-from tests.browser import browser
+from tests.browser import NEEDS_PAGE, browser
 from velfield.errors import InputError
 from velfield.render.figures import png_bytes
-from velfield.render.viewer_page import page_is_built
 from velfield.sources.labels import load_labels
 from velfield.sources.source import probe
 from velfield.viewer.annotation import Frames, frames_of, read_marks, write_marks
@@ -32,7 +31,6 @@ from velfield.viewer.annotator import annotate_app
 from velfield.viewer.server import page_policy, view_app
 
 ROOT = Path(__file__).resolve().parents[1]
-built = pytest.mark.skipif(not page_is_built(), reason="the page is not built: `make page`")
 
 
 class Client:
@@ -130,7 +128,7 @@ def command(*arguments: str) -> Iterator[str]:
             assert process.wait(30) == 0
 
 
-@built
+@NEEDS_PAGE
 def test_view_serves_the_page(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
     with command("view", str(whole[0])) as address, browser(tmp_path / "profile") as chromium, chromium.page() as page:
         page.open(address)
@@ -158,7 +156,7 @@ def drag(page: Any, start: tuple[float, float], end: tuple[float, float]) -> Non
     page.mouse("mouseReleased", *end, 0)
 
 
-@built
+@NEEDS_PAGE
 def test_a_drag_along_a_car_is_a_label(picture: Path, tmp_path: Path) -> None:
     labels = tmp_path / "labels.csv"
     arguments = ("annotate", str(picture), "--labels", str(labels))
@@ -217,7 +215,7 @@ def test_marks_that_cannot_be_are_refused(tmp_path: Path, wrong: MarkedCar) -> N
     assert not (tmp_path / "labels.csv").exists()
 
 
-@built
+@NEEDS_PAGE
 def test_only_the_page_it_served_may_write(tmp_path: Path) -> None:
     path = tmp_path / "labels.csv"
     body = Marks(frames=("a.png",), cars=(car("a.png"),)).model_dump_json()
