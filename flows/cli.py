@@ -275,16 +275,19 @@ def _process(
     runner: "RunnerConfig | None" = None,
     verbosity: "Verbosity" = "normal",
 ) -> int:
-    from flows.launch import prepare_process
+    from flows.launch import first_start, prepare_process
     from velfield.plan import check_inputs
 
     check_inputs(job)  # before Prefect: its start takes seconds
     prepare_process(verbose=verbosity == "verbose")
     from flows.console import Console
+
+    console = Console(verbosity)
+    if first_start():
+        console.event("start", "Prefect lays out its data base, this once: half a minute")
     from flows.process_flight import run_flight
     from flows.runners import RunnerConfig
 
-    console = Console(verbosity)
     summary = run_flight(job, runner or RunnerConfig(), console)
     return _conclude(summary, console)
 

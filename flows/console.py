@@ -75,7 +75,8 @@ class Console:
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
-        with Progress(*columns, console=self._rich, transient=True, refresh_per_second=5) as bar:
+        hidden = not self._rich.is_terminal  # in a log a bar would leave empty lines
+        with Progress(*columns, console=self._rich, transient=True, refresh_per_second=5, disable=hidden) as bar:
             progress = StageProgress(total, bar, bar.add_task(label, total=total), name)
             with listening(progress.hear):
                 yield progress

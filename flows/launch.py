@@ -4,6 +4,7 @@ A person's own settings win: every variable is a default.
 """
 
 import os
+from pathlib import Path
 
 _SETTINGS: dict[str, str] = {
     # The temporary server imports from the working folder: a module there with a common name would break it.
@@ -40,3 +41,13 @@ def prepare_process(*, verbose: bool) -> None:
 
     # The work is parallel by frames: OpenCV's own threads would only compete with it.
     cv2.setNumThreads(1)
+
+
+def first_start() -> bool:
+    """Whether Prefect has yet to lay out its temporary server's data base: half a minute that a person wonders at."""
+    from prefect.settings import get_current_settings
+
+    settings = get_current_settings()
+    url = settings.server.database.connection_url
+    kind, _, file = url.get_secret_value().partition(":///") if url else ("", "", "")
+    return settings.api.url is None and kind.startswith("sqlite") and not Path(file).exists()
