@@ -178,12 +178,16 @@ def test_a_run_on_another_grid_scores_after_the_best_homography(truth: Truth) ->
     assert score_registration(truth, run, range(12), to_truth=matrix).mean_px < 1e-3
 
 
-def test_shifts_and_jitter_are_told_apart(truth: Truth) -> None:
+def test_shifts_jitter_and_drift_are_told_apart(truth: Truth) -> None:
     shifted = score_registration(truth, lambda f, xy: truth.to_base(f, xy) + np.array([0.6, 0.8]), range(12))
     assert shifted.mean_px == pytest.approx(1.0)
     assert shifted.jitter_px < 1e-9
     shaken = score_registration(truth, lambda f, xy: truth.to_base(f, xy) + np.array([(-1) ** f, 0]), range(12))
     assert shaken.jitter_px == pytest.approx(1.0, abs=0.05)
+    assert shaken.drift_px == pytest.approx(2.0, abs=0.05)  # of 12 frames a tenth is one: the last against the first
+    drifting = score_registration(truth, lambda f, xy: truth.to_base(f, xy) + np.array([0, 0.1 * f]), range(12))
+    assert drifting.drift_px == pytest.approx(1.1, abs=0.05)
+    assert shifted.drift_px < 1e-9
 
 
 def tracklets_of(truth: Truth) -> pd.DataFrame:

@@ -11,6 +11,7 @@ def registration(
     cases: tuple[str, ...] = ("homography", "wobble", "vibration"),
     seeds: tuple[int, ...] = (101, 102, 103, 104, 105),
     frames: int | None = None,
+    stabilo: bool = True,
 ) -> int:
     """Register simulated flights of unseen seeds, and tell the error against their truth, median and worst.
 
@@ -20,11 +21,14 @@ def registration(
         Folder for the flights and their runs; delete it afterwards.
     cases
         `homography`: plane, pin-hole, 2560x1440; `wobble`: lens and rows that move by 4 px, 6 cycles a frame;
-        `vibration`: lens, shake at 14-29 Hz, drift, turn, tilt, relief, base image of another sensor.
+        `vibration`: lens, shake at 14-29 Hz, drift, turn, tilt, relief, base image of another sensor;
+        `long`: the same, 640x480, for the drift over 1000 frames.
     seeds
         One flight each.
     frames
-        Frames a flight. Default: 8, 12 and 60.
+        Frames a flight. Default: 8, 12, 60 and 1000.
+    stabilo
+        Register by stabilo too; without, velfield alone is measured, and stabilo need not be installed.
     """
     import cv2
 
@@ -37,7 +41,7 @@ def registration(
     measured = []
     for case in cases:
         for seed in seeds:
-            rows = bench_registration(out, CASES[case], seed, frames=frames)
+            rows = bench_registration(out, CASES[case], seed, frames=frames, stabilo=stabilo)
             measured += rows
             print("\n".join(row.text() for row in rows), flush=True)
     print("\n".join(medians(measured)))

@@ -32,12 +32,14 @@ class RegistrationScore:
     """Errors of the raw-to-base map, base px, over a grid of points in all registered frames.
 
     ``jitter_px``: root mean square of what changes from frame to frame at one place, the mean of the place taken off.
+    ``drift_px``: how far the places' mean error moved from the first tenth of the frames to the last.
     """
 
     mean_px: float
     median_px: float
     p95_px: float
     jitter_px: float
+    drift_px: float
     worst_frame_px: float
     frame_mean_px: FloatArray
     frames: int
@@ -123,23 +125,31 @@ def score_registration(
     place, error, number = np.concatenate(places), np.concatenate(errors), np.concatenate(numbers)
     size = np.hypot(error[:, 0], error[:, 1])
     by_frame = pd.Series(size).groupby(number).mean().to_numpy()
+    rest = _changing(place, error, number)
     return RegistrationScore(
         mean_px=float(size.mean()),
         median_px=float(np.median(size)),
         p95_px=float(np.percentile(size, 95)),
-        jitter_px=_jitter(place, error, number),
+        jitter_px=float(np.sqrt((rest**2).sum(axis=1).mean())),
+        drift_px=_drift(rest),
         worst_frame_px=float(by_frame.max()),
         frame_mean_px=np.asarray(by_frame, dtype=np.float64),
         frames=len(by_frame),
     )
 
 
-def _jitter(place: FloatArray, error: FloatArray, frame: NDArray[np.int64]) -> float:
+def _changing(place: FloatArray, error: FloatArray, frame: NDArray[np.int64]) -> pd.DataFrame:
+    """Errors ex, ey by cell (i, j) and frame, the cell's mean over the frames taken off."""
     cell = np.floor(place / CELL_PX).astype(np.int64)
     table = pd.DataFrame({"i": cell[:, 1], "j": cell[:, 0], "frame": frame, "ex": error[:, 0], "ey": error[:, 1]})
     each = table.groupby(["i", "j", "frame"])[["ex", "ey"]].mean()
-    rest = each - each.groupby(["i", "j"]).transform("mean")
-    return float(np.sqrt((rest**2).sum(axis=1).mean()))
+    return each - each.groupby(["i", "j"]).transform("mean")
+
+
+def _drift(rest: pd.DataFrame) -> float:
+    by_frame = rest.groupby("frame").mean().to_numpy()
+    tenth = max(1, len(by_frame) // 10)
+    return float(np.hypot(*(by_frame[-tenth:].mean(axis=0) - by_frame[:tenth].mean(axis=0))))
 
 
 def score_detections(
