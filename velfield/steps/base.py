@@ -1,7 +1,8 @@
 """The base image of a flight: its own, a median without traffic; and where one was given, how the own one lies on it.
 
-Frames are always registered to the flight's own base image, for the same camera in the same light gives a tenth of a
-pixel. A given base image is checked against one frame before any other work, and registered once to the own one.
+Frames are registered to the flight's own base image, for the same camera in the same light gives a tenth of a pixel;
+unless they lie straight on the given one. Where they do not, that is checked against one frame before the own one is
+built, and registered once to the own one.
 """
 
 import os
@@ -81,9 +82,8 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeyPoints]]) -> Outcom
     sharpness = store.column("sharpness")
     reference = max(key_points, key=lambda frame: float(np.nan_to_num(sharpness[frame])))
     if given is not None:
-        _check_place(plan, store.read(reference), given, lens)
         direct = _straight_to(plan, given, key_points, lens)
-        if direct is not None:
+        if direct is not None:  # to half a pixel all over the frame: no other place does that
             grid, outputs, used = (
                 _given_grid(plan, given, reference, direct),
                 write_given_picture(plan.layout, given),
@@ -91,6 +91,7 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeyPoints]]) -> Outcom
             )
             layout.own_to_base.unlink(missing_ok=True)
             return _finish(plan, grid, outputs, used, given)
+        _check_place(plan, store.read(reference), given, lens)
     own = build_own_base(
         store.read,
         key_points,

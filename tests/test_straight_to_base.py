@@ -1,0 +1,58 @@
+"""A given base image that frames lie straight on is taken, whatever the check of a single frame's patches says."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from schemas.job import Inputs, Job
+from tests.scenes import city, photograph, similarity
+from velfield.camera.lens import pinhole
+from velfield.configuration import resolve_config
+from velfield.errors import Failure
+from velfield.plan import Plan, make_plan
+from velfield.registration.intersensor import register_intersensor
+from velfield.steps.base import build_base, key_points_of
+from velfield.steps.frames import lay_out_frames, read_unit
+from velfield.steps.grid import read_grid
+from velfield.steps.lens import calibrate_flight
+
+SHAPE = (360, 480)
+MIDDLE = np.array([239.5, 179.5])
+
+
+def shaken(grey: np.ndarray) -> np.ndarray:
+    """Rows moved by 4 px, 6 cycles a frame: half a cycle is the height of the patches of the check."""
+    y, x = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]].astype(np.float32)
+    wave = (4.0 * np.sin(2 * np.pi * 6.0 * y / SHAPE[0])).astype(np.float32)
+    return cv2.remap(grey, x + wave, y + 0.7 * np.roll(wave, 30, axis=0), cv2.INTER_CUBIC)
+
+
+@pytest.fixture(scope="module")
+def base() -> np.ndarray:
+    return city(3, 640)
+
+
+def plan_on(base: np.ndarray, frames: list[np.ndarray], folder: Path) -> Plan:
+    """The plan of a flight of these frames, lens and frames done."""
+    (folder / "frames").mkdir()
+    for number, frame in enumerate(frames):
+        cv2.imwrite(str(folder / "frames" / f"{number}.png"), frame)
+    cv2.imwrite(str(folder / "base.png"), base)
+    inputs = Inputs(source=str(folder / "frames"), base=str(folder / "base.png"))
+    config = resolve_config(overrides={"frames.fps": 5, "lens.calibrate": "never"})
+    plan = make_plan(Job(root=str(folder / "run"), inputs=inputs, config=config))
+    lay_out_frames(plan)
+    read_unit(plan, range(len(frames)))
+    calibrate_flight(plan)
+    return plan
+
+
+def test_frames_whose_rows_wobble_lie_straight_on_their_base_image(base: np.ndarray, tmp_path: Path) -> None:
+    views = [similarity(1.0, 4.0 + k, MIDDLE, np.array([310.0 + 5 * k, 320.0])) for k in range(3)]
+    frames = [shaken(photograph(base, view, pinhole(SHAPE), SHAPE, k)) for k, view in enumerate(views)]
+    plan = plan_on(base, frames, tmp_path)
+    build_base(plan, [key_points_of(plan, range(3))])
+    assert read_grid(plan).frames_to == "given"
+    assert isinstance(register_intersensor(frames[1], base, plan.config.base, lens=pinhole(SHAPE)), Failure)
