@@ -7,7 +7,7 @@ STAGE_VERSIONS: dict[str, int] = {
     "lens": 2,
     "base": 2,
     "registration": 2,
-    "detector": 4,
+    "detector": 5,
     "detections": 3,
     "links": 1,
     "tracklets": 1,

@@ -14,6 +14,7 @@ from velfield.detection.samples import LabelledImage, Scene, part_of, scene_of
 from velfield.detection.scan import propose
 from velfield.detection.validation import Evidence, curve_of, cut_of, evidence_of_part, joined, stripes
 from velfield.errors import InputError
+from velfield.threads import each
 
 __all__ = ["LabelledImage", "record_of", "train_detector", "trained"]
 
@@ -107,25 +108,27 @@ def trained(
     rng = np.random.default_rng(seed)
     proposer = learn_proposer(scenes, config, channels, rng)
     sums = sums_of(proposer)
-    looked_at = []
-    for scene in scenes:
+
+    def looked_at(scene: Scene) -> Scene:
         shape, valid = scene.sample.image.shape, scene.sample.valid
         places = propose(scene.coarse, shape, valid, sums, contrast_floor=CONTRAST_FLOOR)
-        looked_at.append(replace(scene, places=places[:, :3]))
-    classifier, aligned = learn_classifier(looked_at, config, channels, rng, prior)
+        return replace(scene, places=places[:, :3])
+
+    classifier, aligned = learn_classifier(each(looked_at, scenes), config, channels, rng, prior)
     return Steps(proposer, classifier, aligned)
 
 
 def _held_out(scenes: Sequence[Scene], config: DetectionConfig, channels: int, prior: tuple[Round, ...]) -> Evidence:
     """Train on every other stripe of the pictures, try on the stripes between; then the other way round."""
     tried = np.unique(np.linspace(0, len(scenes) - 1, min(_FOLD_SCENES, len(scenes))).round().astype(int))
-    parts = []
-    for fold in (0, 1):
+
+    def of_fold(fold: int) -> list[Evidence]:
         seen = [part_of(scene, stripes(scene, fold)) for scene in scenes]
         steps = trained(seen, config, channels, config.seed + 1 + fold, prior)
         proposer, sums = sums_of(steps.proposer), sums_of(steps.classifier)
-        parts += [evidence_of_part(scenes[k], stripes(scenes[k], 1 - fold), proposer, sums) for k in tried]
-    return joined(parts)
+        return [evidence_of_part(scenes[k], stripes(scenes[k], 1 - fold), proposer, sums) for k in tried]
+
+    return joined([part for parts in each(of_fold, (0, 1)) for part in parts])
 
 
 def record_of(
