@@ -191,8 +191,8 @@ def simulate(
 def demo(
     *,
     out: Path = Path("velfield-demo"),
-    frames: int = 120,
-    size: str = "960x720",
+    frames: int = 64,
+    size: str = "800x600",
     seed: int = 1,
     quiet: Quiet = False,
 ) -> int:
