@@ -1,9 +1,11 @@
 """``velfield train``: marked cars in, a detector file out."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
+
+from flows.options import Preset, Settings
 
 
 def train(
@@ -16,8 +18,8 @@ def train(
     continued: Annotated[str | None, Parameter(name="--continue")] = None,
     review: Path | None = None,
     config: Path | None = None,
-    preset: Literal["best", "fast", "paper"] | None = None,
-    settings: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False)] = (),
+    preset: Preset | None = None,
+    settings: Settings = (),
 ) -> int:
     """Train a detector from marked cars; `velfield run --detector` takes the file.
 
