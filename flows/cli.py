@@ -212,11 +212,14 @@ def demo(
     quiet
         Warnings only.
     """
+    from flows.launch import first_start_beside, prepare_process
     from schemas.job import Inputs, Job
     from velfield.configuration import resolve_config
 
+    prepare_process(verbose=False)
     flight = out / "flight"
-    _simulate(flight, frames=frames, size=size, seed=seed, quiet=quiet)
+    with first_start_beside():
+        _simulate(flight, frames=frames, size=size, seed=seed, quiet=quiet)
     inputs = Inputs(
         source=str(flight / "frames"),
         base=str(flight / "base.png"),

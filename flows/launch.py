@@ -4,6 +4,10 @@ A person's own settings win: every variable is a default.
 """
 
 import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 _SETTINGS: dict[str, str] = {
@@ -51,3 +55,21 @@ def first_start() -> bool:
     url = settings.server.database.connection_url
     kind, _, file = url.get_secret_value().partition(":///") if url else ("", "", "")
     return settings.api.url is None and kind.startswith("sqlite") and not Path(file).exists()
+
+
+@contextmanager
+def first_start_beside() -> Iterator[None]:
+    """Prefect's first start, where it is to come, in a process of its own while this one does something else.
+
+    Should it fail, nothing is lost: the start itself does what is left, and says what is wrong.
+    """
+    if not first_start():
+        yield
+        return
+    command = [sys.executable, "-m", "prefect", "server", "database", "upgrade", "-y"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as beside:
+        try:
+            yield
+        except BaseException:
+            beside.terminate()
+            raise
