@@ -192,12 +192,12 @@ def simulate(
 def demo(
     *,
     out: Path = Path("velfield-demo"),
-    frames: int = 64,
+    frames: int = 48,
     size: str = "800x600",
     seed: int = 1,
     quiet: Quiet = False,
 ) -> int:
-    """A simulated flight, the whole job, the report.
+    """A simulated flight, the whole job by the preset `fast`, the report.
 
     Parameters
     ----------
@@ -226,7 +226,10 @@ def demo(
         labels=str(flight / "labels.csv"),
         timestamps=str(flight / "timestamps.csv"),
     )
-    job = Job(root=str(out / "run"), inputs=inputs, config=resolve_config(overrides={"gsd_m": 0.23}))
+    config = resolve_config(
+        preset="fast", overrides={"gsd_m": 0.23}
+    )  # four minutes, kernels' first compilation and all
+    job = Job(root=str(out / "run"), inputs=inputs, config=config)
     status = _process(job, verbosity="quiet" if quiet else "normal")
     if status in (DONE, INCOMPLETE):
         _score(out / "run", flight)
