@@ -192,7 +192,7 @@ def simulate(
 def demo(
     *,
     out: Path = Path("velfield-demo"),
-    frames: int = 48,
+    frames: int = 56,
     size: str = "800x600",
     seed: int = 1,
     quiet: Quiet = False,
@@ -226,9 +226,8 @@ def demo(
         labels=str(flight / "labels.csv"),
         timestamps=str(flight / "timestamps.csv"),
     )
-    config = resolve_config(
-        preset="fast", overrides={"gsd_m": 0.23}
-    )  # four minutes, kernels' first compilation and all
+    # Four minutes from an empty clone, the kernels' first compilation and all.
+    config = resolve_config(preset="fast", overrides={"gsd_m": 0.23})
     job = Job(root=str(out / "run"), inputs=inputs, config=config)
     status = _process(job, verbosity="quiet" if quiet else "normal")
     if status in (DONE, INCOMPLETE):
