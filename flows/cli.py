@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 
 from flows.launch import limit_threads
-from flows.options import Preset, Settings
+from flows.options import Preset, Settings, frame_size
 from velfield.errors import InputError
 
 if TYPE_CHECKING:
@@ -251,11 +251,9 @@ def _simulate(out: Path, *, frames: int, size: str, seed: int, quiet: bool) -> N
     from schemas.simulation import SimulationConfig
     from velfield.synthetic import write_flight
 
-    width, times, height = size.lower().partition("x")
-    if not (times and width.isdigit() and height.isdigit()):
-        raise InputError(f"--size {size}: expected WIDTHxHEIGHT in pixels, as 1280x960")
+    width, height = frame_size(size, "as 1280x960")
     console = Console("quiet" if quiet else "normal")
-    config = SimulationConfig(frames=frames, width=int(width), height=int(height), seed=seed)
+    config = SimulationConfig(frames=frames, width=width, height=height, seed=seed)
     with console.stage("simulate", "simulate", frames) as progress:
         write_flight(out, config, lambda done, _total: progress.at_least(done))
     console.event("stage", f"simulated     {frames} frames of {width} x {height} px in {out}")

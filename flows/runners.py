@@ -6,7 +6,6 @@ either.
 """
 
 import importlib
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ from pydantic import Field, PositiveInt, ValidationError
 
 from schemas.model import Model
 from velfield.errors import InputError
+from velfield.threads import usable_processors
 
 
 class RunnerConfig(Model):
@@ -99,7 +99,7 @@ class ClientRunner(Runner):
 def open_runner(config: RunnerConfig) -> Iterator[Runner]:
     """A runner for the time of a flow; what it started is gone afterwards."""
     if config == RunnerConfig():
-        yield ThreadsRunner(_usable_cores())
+        yield ThreadsRunner(usable_processors())
         return
     from dask.distributed import Client
 
@@ -143,8 +143,4 @@ def parallel_units(config: RunnerConfig) -> int:
     """How many units are worth having under way at once, as told before the runner is opened."""
     if config.scheduler is not None:
         return 32
-    return 2 * config.workers if config.workers is not None else _usable_cores()
-
-
-def _usable_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return 2 * config.workers if config.workers is not None else usable_processors()

@@ -1,15 +1,18 @@
 """Headless Chromium over its debugging protocol, as far as the tests of the pages need it: no driver, no framework."""
 
 import base64
+import functools
 import itertools
 import json
 import os
 import shutil
 import subprocess
+import threading
 import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +37,25 @@ NEEDS_PAGE = pytest.mark.skipif(
     not page_is_built() and not os.environ.get("VELFIELD_CI"),  # in CI they fail
     reason="the page is not built: `make page`",
 )
+
+
+MIDDLE_OF_MAP = "(({left, top, width, height}) => [left + width / 2, top + height / 2])(map.getBoundingClientRect())"
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    """Says nothing in the terminal."""
+
+    def log_message(self, format: str, *arguments: object) -> None:
+        pass
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """A folder behind Python's plain static server: its address."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/"
+        server.shutdown()
 
 
 def chromium() -> str:

@@ -1,5 +1,6 @@
 """A small simulated flight and its run: what the tests of flows share, made once a session (see conftest)."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from flows.console import Console
@@ -39,13 +40,17 @@ def process(work: Job, runner: RunnerConfig | None = None) -> RunSummary:
 
 def digests(root: Path) -> dict[str, str]:
     """Of all that a run leaves, apart from what tells when it was made."""
+    return digests_of(root, {path: path.read_bytes() for path in root.rglob("*") if path.is_file()})
+
+
+def digests_of(root: Path, files: Mapping[Path, bytes]) -> dict[str, str]:
+    """Of a run's files, wherever they were read from, apart from what tells when it was made."""
     layout = RunLayout(root)
     when = {layout.flight, layout.report, layout.report_record, layout.lock}
-    files = [path for path in sorted(root.rglob("*")) if path.is_file() and path not in when]
     return {
-        path.relative_to(root).as_posix(): digest_bytes(path.read_bytes())
-        for path in files
-        if not path.is_relative_to(layout.commits)
+        path.relative_to(root).as_posix(): digest_bytes(data)
+        for path, data in sorted(files.items())
+        if path not in when and not path.is_relative_to(layout.commits)
     }
 
 

@@ -11,13 +11,12 @@ import pytest
 import s3fs
 
 from schemas.summary import RunSummary
-from tests.small_flight import digests, job, process, redone
+from tests.small_flight import digests, digests_of, job, process, redone
 from velfield import open_run
 from velfield.errors import InputError
 from velfield.layout import RunLayout
 from velfield.locking import locked
 from velfield.places import S3_OPTIONS, RemotePath, place
-from velfield.provenance import digest_bytes
 from velfield.results import share
 from velfield.verifying import verify_run
 
@@ -51,17 +50,10 @@ def remote(s3: None, whole: tuple[Path, RunSummary], flight: Path) -> tuple[Remo
 
 
 def remote_digests(root: RemotePath) -> dict[str, str]:
-    layout = RunLayout(root)  # type: ignore[arg-type]
-    when = {layout.flight, layout.report, layout.report_record, layout.lock}
     # All at once: one by one takes half a minute.
     files_there = s3fs.S3FileSystem(**S3_OPTIONS)
     objects = files_there.cat(files_there.find(root.url))
-    files = {RemotePath("s3:/", key): data for key, data in objects.items()}
-    return {
-        path.relative_to(root).as_posix(): digest_bytes(data)
-        for path, data in sorted(files.items())
-        if path not in when and not path.is_relative_to(layout.commits)
-    }
+    return digests_of(root, {RemotePath("s3:/", key): data for key, data in objects.items()})  # type: ignore[arg-type,misc]
 
 
 def test_the_same_bits_as_on_a_disk(remote: tuple[RemotePath, RunSummary], whole: tuple[Path, RunSummary]) -> None:

@@ -1,10 +1,7 @@
 """The page of a run in a real browser, from a plain static server: what it shows is what Python says."""
 
-import functools
 import json
-import threading
 from collections.abc import Callable, Iterator
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -13,7 +10,7 @@ import numpy as np
 import pytest
 
 from schemas.summary import RunSummary
-from tests.browser import NEEDS_PAGE, Browser, Page, browser
+from tests.browser import MIDDLE_OF_MAP, NEEDS_PAGE, Browser, Page, browser, served
 from velfield import open_run
 from velfield.run import Run
 
@@ -26,18 +23,11 @@ def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
         yield running
 
 
-class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *arguments: object) -> None:
-        pass
-
-
 @pytest.fixture(scope="module")
 def address(whole: tuple[Path, RunSummary]) -> Iterator[str]:
     """The run folder behind Python's plain static server."""
-    with ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(whole[0]))) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}/"
-        server.shutdown()
+    with served(whole[0]) as there:
+        yield there
 
 
 @pytest.fixture
@@ -67,10 +57,7 @@ def busiest(run: Run) -> tuple[int, int]:
 
 def click_pixel(page: Page, x: float, y: float) -> None:
     """Click a base pixel, the map standing at zoom 3 around it."""
-    box = page.value(
-        "(({left, top, width, height}) => [left + width / 2, top + height / 2])(map.getBoundingClientRect())"
-    )
-    page.click(*box)
+    page.click(*page.value(MIDDLE_OF_MAP))
     page.wait(f"document.querySelector('#answer h2')?.textContent === 'Pixel ({x}, {y})'")
 
 

@@ -87,6 +87,10 @@ def check_inputs(job: Job) -> None:
         The source cannot be opened, or another file that was given is not there.
     """
     check_source(job.inputs.source)
+    _check_besides(job)
+
+
+def _check_besides(job: Job) -> None:
     for name in _BESIDES:
         path = getattr(job.inputs, name)
         if path is not None and not Path(path).exists():
@@ -101,7 +105,7 @@ def make_plan(job: Job) -> Plan:
     InputError
         The source cannot be read, has no times, or fewer than three frames are left to work on.
     """
-    check_inputs(job)
+    _check_besides(job)  # `probe` sees whether the source is there
     timestamps = Path(job.inputs.timestamps) if job.inputs.timestamps else None
     info = probe(Path(job.inputs.source), frames=job.config.frames, timestamps=timestamps)
     indices = select_frames(info.times_s, job.config.frames)

@@ -14,5 +14,10 @@ def each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
 
     Worth it where ``function`` spends its time in kernels that let go of Python's lock.
     """
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None) as pool:
+    with ThreadPoolExecutor(usable_processors()) as pool:
         return list(pool.map(function, items))
+
+
+def usable_processors() -> int:
+    """How many processors this process may use: fewer than there are, in a container or under a batch system."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

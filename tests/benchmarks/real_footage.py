@@ -10,11 +10,11 @@ import sys
 import tempfile
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from velfield import open_run
+from velfield.detection.ship import boxes_of
 from velfield.run import Run
 
 FPS = "2"  # the interval is not stated; the cars' speeds make sense with this one
@@ -50,7 +50,7 @@ def main() -> None:
 
 def _judge(run: Run, frame: int, picture: Path) -> tuple[int, int, int]:
     """How many of a picture's finds are on a car of their own (within half its length), finds, and marked cars."""
-    boxes = _boxes(picture)
+    _, boxes = boxes_of(picture)
     cars = boxes[boxes[:, 0] == 0]
     table = run.detections()
     table = table[table["frame"] == frame].sort_values("score", ascending=False)
@@ -65,13 +65,6 @@ def _judge(run: Run, frame: int, picture: Path) -> tuple[int, int, int]:
         elif _inside(place, boxes[boxes[:, 0] != 0]):  # a lorry, a bus: neither right nor wrong
             left_alone += 1
     return right, len(found) - left_alone, len(cars)
-
-
-def _boxes(picture: Path) -> NDArray[np.float64]:
-    """(n, 5): class, centre x and y, width, height, px."""
-    height, width = cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE).shape
-    table = np.loadtxt(picture.with_suffix(".txt"), ndmin=2)[:, :5]
-    return np.asarray(table * [1, width, height, width, height] - [0, 0.5, 0.5, 0, 0], np.float64)
 
 
 def _inside(place: NDArray[np.float64], boxes: NDArray[np.float64]) -> bool:

@@ -3,22 +3,17 @@
 python -m tests.benchmarks.viewer RUN
 """
 
-import functools
 import sys
 import tempfile
-import threading
 import time
-from http.server import ThreadingHTTPServer
 from pathlib import Path
 from statistics import median
 
 import numpy as np
 
-from tests.browser import Browser, browser
-from tests.test_viewer import Quiet
+from tests.browser import MIDDLE_OF_MAP, Browser, browser, served
 from velfield import open_run
 
-_MIDDLE = "(({left, top, width, height}) => [left + width / 2, top + height / 2])(map.getBoundingClientRect())"
 _VISITS, _CLICKS = 5, 12
 _REACH_X, _REACH_Y = 300, 250
 _STANDS = (
@@ -29,19 +24,16 @@ _STANDS = (
 def main(root: Path) -> None:
     """Serve the run folder from Python's plain static server, look, print."""
     with (
-        ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(root))) as server,
+        served(root) as address,
         tempfile.TemporaryDirectory() as profile,
         browser(Path(profile)) as running,
     ):
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        address = f"http://127.0.0.1:{server.server_port}/"
         views = [_first_view(running, address) for _ in range(_VISITS)]
         print(f"first view: {', '.join(f'{view:.2f}' for view in views)} s; median {median(views):.2f} s")
         first, later = _clicks(running, address, root)
         print(f"click: median {median([*first, *later]):.0f} ms of {len(first) + len(later)}")
         late = np.quantile(later, 0.9)
         print(f"  first of a visit {median(first):.0f} ms; later ones {median(later):.0f} ms, their p90 {late:.0f} ms")
-        server.shutdown()
 
 
 def _first_view(running: Browser, address: str) -> float:
@@ -64,7 +56,7 @@ def _clicks(running: Browser, address: str, root: Path) -> tuple[list[float], li
             page.open(f"{address}#view={x},{y},0")  # a screen pixel is a base pixel
             page.wait(_STANDS)
             near = known[(np.abs(known - [y, x]) <= [_REACH_Y, _REACH_X]).all(axis=1)]
-            left, top = page.value(_MIDDLE)
+            left, top = page.value(MIDDLE_OF_MAP)
             taken = []
             for there_y, there_x in rng.choice(near, _CLICKS).tolist():
                 page.value("delete document.getElementById('answer').dataset.milliseconds")

@@ -44,12 +44,12 @@ def read_pictures(files: Sequence[Path], *, car_length_px: float = 16.0) -> list
         raise InputError(
             "found no labelled pictures, expected the folders songdo and kit_ais; give their parent folder"
         )
-    parts = [_boxes_of(file) for file in files]
+    parts = [boxes_of(file) for file in files]
     usual = np.median(np.concatenate([boxes[boxes[:, 0] == 0, 5] for _, boxes in parts]))
     return [_scaled(grey, boxes, car_length_px / float(usual)) for grey, boxes in parts]
 
 
-def _boxes_of(file: Path) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+def boxes_of(file: Path) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """A grey picture, and (n, 6): class, x, y, width, height of the upright box, length of the car in it, px."""
     grey = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
     if grey is None:
