@@ -168,6 +168,8 @@ class TrackingConfig(Model):
     """A tracklet less sure than this, against its rivals and chance, is dropped (``joint``)."""
     refine: bool = True
     """Align the patches of a link below the pixel, and let the tracklet carry that displacement."""
+    join_gap_s: float = Field(2.0, ge=0)
+    """A vehicle that is lost from sight for no longer than this goes on as the same passage; 0: as another one."""
 
 
 class FieldConfig(Model):

@@ -198,7 +198,7 @@ def tracklets_of(truth: Truth) -> pd.DataFrame:
         window = [(vehicle, frame + k) for k in range(3)]
         if all(key in cars.index for key in window):
             a, b, c = (cars.loc[key] for key in window)
-            row = {f"frame_{k}": frame + k for k in range(3)}
+            row = {f"frame_{k}": frame + k for k in range(3)} | {"passage_id": vehicle}
             for k, car in enumerate((a, b, c)):
                 row |= {f"x_{k}_px": car["x_base_px"], f"y_{k}_px": car["y_base_px"]}
             for name, p, q in (("01", a, b), ("12", b, c)):
@@ -215,6 +215,9 @@ def test_tracklets_are_right_when_they_follow_one_vehicle(truth: Truth) -> None:
     assert score.precision == 1.0
     assert score.recall_moving > 0.97
     assert score.speed_error_mean_km_per_h < 0.7
+    assert score.passages_per_vehicle == 1.0
+    twice = tracklets.assign(passage_id=2 * tracklets["passage_id"] + tracklets["frame_1"] % 2)
+    assert score_tracklets(truth, twice).passages_per_vehicle > 1.9
     swapped = tracklets.copy()
     swapped[["x_2_px", "y_2_px"]] = swapped[["x_2_px", "y_2_px"]].to_numpy()[::-1]
     assert score_tracklets(truth, swapped).precision < 0.1

@@ -42,9 +42,10 @@ class RunScore:
                 f"of the moving {d.recall_moving:.3f}, "
                 f"axis off by {np.degrees(d.axis_median_rad):.1f} degrees (median)",
                 f"  tracklets     precision {t.precision:.3f}, recall of the moving {t.recall_moving:.3f}, "
-                f"speed off by {t.speed_error_mean_km_per_h:.2f} km/h (mean)",
+                f"speed off by {t.speed_error_mean_km_per_h:.2f} km/h (mean), "
+                f"each vehicle counted {t.passages_per_vehicle:.2f} times",
                 f"  field         modal direction within 10 degrees at {f.share_within:.1%} of "
-                f"{f.pixels} pixels with 5 or more vehicles",
+                f"{f.pixels} pixels with 5 or more vehicles; {f.undirected} where most stand have none",
             )
         )
 
@@ -69,6 +70,8 @@ def score_run(root: str | Path, flight: Path, *, min_count: int = 5) -> RunScore
         return run.to_base(flight_frames[flight_frame], xy_raw)
 
     frames = sorted(flight_frames)
+    velocity = run.field.modal_velocity().astype(np.float64)
+    velocity[np.isnan(run.field.modal_direction_rad())] = np.nan  # who stands has no direction
     to_truth = None if run.grid.how == "given" else fit_homography(truth, to_base, frames[:: max(1, len(frames) // 20)])
     return RunScore(
         registration=score_registration(truth, to_base, frames, to_truth=to_truth),
@@ -76,7 +79,7 @@ def score_run(root: str | Path, flight: Path, *, min_count: int = 5) -> RunScore
         tracking=score_tracklets(truth, run.tracklets(), frame_of=frame_of, to_truth=to_truth),
         field=score_field(
             truth,
-            run.field.modal_velocity().astype(np.float64),
+            velocity,
             run.field.count(),
             to_truth=to_truth,
             min_count=min_count,

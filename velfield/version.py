@@ -10,7 +10,7 @@ STAGE_VERSIONS: dict[str, int] = {
     "detector": 5,
     "detections": 3,
     "links": 1,
-    "tracklets": 1,
+    "tracklets": 2,
     "field": 2,
     "maps": 3,
 }

@@ -13,6 +13,7 @@ from velfield.steps.outcome import Outcome
 from velfield.steps.registration import MAP_PARAMETERS, usable_frames
 from velfield.stores import open_frames, open_registration
 from velfield.tables import Patches, read_patches, read_tables, write_table
+from velfield.tracking.joining import END_COLUMNS, join_chains
 from velfield.tracking.passages import assign_passages
 from velfield.tracking.tracklets import FrameTable, link_windows, window_frames
 
@@ -97,18 +98,17 @@ def link_files(plan: Plan, units: list[range]) -> list[Path]:
 
 
 def chain_passages(plan: Plan, units: list[range]) -> Outcome:
-    """Give every tracklet the passage that it belongs to: reads identifiers of all units, writes unit by unit."""
+    """Give every tracklet the passage that it belongs to: reads a few columns of all units, writes unit by unit."""
     ids = [f"detection_id_{k}" for k in range(3)]
     sources = link_files(plan, units)
-    parts = [read_tables([path], TRACKLET_COLUMNS, only=ids) for path in sources]
-    chains = assign_passages(
-        np.concatenate([part[ids].to_numpy(np.int64) for part in parts] or [np.empty((0, 3), np.int64)])
-    )
+    tracklets = read_tables(sources, TRACKLET_COLUMNS, only=[*ids, *END_COLUMNS])
+    chains = assign_passages(tracklets[ids].to_numpy(np.int64))
+    chains = join_chains(tracklets, chains, plan.config.tracking.join_gap_s, gsd_m=read_grid(plan).gsd_m)
     written, start = [], 0
-    for path, part in zip(sources, parts, strict=True):
+    for path in sources:
         table = read_tables([path], TRACKLET_COLUMNS)
-        table["passage_id"] = chains[start : start + len(part)]
-        start += len(part)
+        table["passage_id"] = chains[start : start + len(table)]
+        start += len(table)
         target = plan.layout.tracklets / path.name
         write_table(target, table, TRACKLET_COLUMNS)
         written.append(target)

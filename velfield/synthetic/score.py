@@ -61,7 +61,10 @@ class DetectionScore:
 
 @dataclass(frozen=True)
 class TrackletScore:
-    """Tracklets whose three detections are one vehicle; speeds of those, against the truth between the same frames."""
+    """Tracklets whose three detections are one vehicle; speeds of those, against the truth between the same frames.
+
+    ``passages_per_vehicle``: how often a vehicle is counted in all; one would be right.
+    """
 
     precision: float
     precision_moving: float
@@ -70,15 +73,20 @@ class TrackletScore:
     speed_bias_km_per_h: float
     direction_error_mean_rad: float
     tracklets: int
+    passages_per_vehicle: float
 
 
 @dataclass(frozen=True)
 class FieldScore:
-    """Pixels with enough passages: how many, and the share whose modal direction is within 10 degrees of a lane's."""
+    """Pixels with enough passages: how many, and the share whose modal direction is within 10 degrees of a lane's.
+
+    ``undirected``: pixels with enough passages besides, without a direction (most vehicles stand there).
+    """
 
     share_within: float
     pixels: int
     median_error_rad: float
+    undirected: int
 
 
 def sample_grid(truth: Truth, *, columns: int = 24, rows: int = 18) -> FloatArray:
@@ -230,7 +238,13 @@ def score_tracklets(
         speed_bias_km_per_h=float(speed[moving].mean()) if moving.any() else 0.0,
         direction_error_mean_rad=float(turn[fast].mean()) if fast.any() else 0.0,
         tracklets=len(right),
+        passages_per_vehicle=_passages_per_vehicle(tracklets["passage_id"].to_numpy()[right], vehicles[1][right]),
     )
+
+
+def _passages_per_vehicle(passage: NDArray[np.int64], vehicle: NDArray[np.int64]) -> float:
+    pairs = np.unique(np.stack([passage, vehicle], axis=1), axis=0)
+    return len(pairs) / max(len(np.unique(vehicle)), 1)
 
 
 def score_field(
@@ -242,13 +256,14 @@ def score_field(
     min_count: int = 5,
     within_rad: float = float(np.radians(10)),
 ) -> FieldScore:
-    """Score a field's modal velocity (h, w, 2), px/s, where ``count`` (h, w) is at least ``min_count``.
+    """Score a field's modal velocity (h, w, 2), px/s, where ``count`` (h, w) is at least ``min_count``; NaN where it
+    has no direction.
 
     With ``to_truth``, pixels and velocities are carried over to the truth's base image first.
     """
     direction = np.arctan2(modal_velocity[..., 1], modal_velocity[..., 0])
-    known = (np.asarray(count) >= min_count) & np.isfinite(direction)
-    rows, columns = np.nonzero(known)
+    enough = np.asarray(count) >= min_count
+    rows, columns = np.nonzero(enough & np.isfinite(direction))
     place = np.column_stack([columns, rows]).astype(np.float64)
     v = modal_velocity[rows, columns]
     v = v / np.maximum(np.hypot(v[:, 0], v[:, 1])[:, None], 1e-9)
@@ -257,7 +272,12 @@ def score_field(
     angle = np.arctan2(*(ahead - place).T[::-1])
     errors = _direction_errors(truth, place, angle)
     within = float((errors <= within_rad).mean()) if len(errors) else 0.0
-    return FieldScore(within, len(errors), float(np.median(errors)) if len(errors) else float("nan"))
+    return FieldScore(
+        share_within=within,
+        pixels=len(errors),
+        median_error_rad=float(np.median(errors)) if len(errors) else float("nan"),
+        undirected=int((enough & ~np.isfinite(direction)).sum()),
+    )
 
 
 def _direction_errors(truth: Truth, place: FloatArray, angle: FloatArray) -> FloatArray:

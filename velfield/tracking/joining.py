@@ -1,0 +1,113 @@
+"""Passages over gaps: a vehicle that was lost from sight for a moment goes on as the one it was.
+
+A detector misses a car now and then, and a chain of tracklets ends there; without this, a flight counted four passages
+of each vehicle, and a queue many more. Both ends of a gap say where and how fast: at a constant acceleration between
+them the way is the mean of both velocities times the gap, whatever the acceleration, so the place where the later chain
+starts is foretold below a metre for gaps of a second or two.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from schemas.flight import PAPER_GSD_M
+
+_SLACK_M = 1.5
+"""How far a vehicle may be from where it is foretold, besides: places of detections wander along a car."""
+_CHANGE_M_PER_S2 = 4.0
+"""How far an acceleration changes within a gap: from hard braking to none. Over dt that moves a vehicle by dt^2 / 8."""
+_WITHIN_M = 2.2
+"""Never farther than this: half a car, so that the neighbour in a queue is not meant."""
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class _Ends:
+    """One end of each chain: time (n,) s, place (n, 2) m, velocity (n, 2) m/s."""
+
+    time_s: Floats
+    place_m: Floats
+    velocity_m_per_s: Floats
+
+
+END_COLUMNS = [
+    *("time_0_s", "x_0_px", "y_0_px", "vx_01_px_per_s", "vy_01_px_per_s"),
+    *("time_2_s", "x_2_px", "y_2_px", "vx_12_px_per_s", "vy_12_px_per_s"),
+]
+"""Columns of tracklets that `join_chains` reads."""
+
+
+def join_chains(tracklets: pd.DataFrame, chains: Ints, max_gap_s: float, *, gsd_m: float | None) -> Ints:
+    """The passage of each tracklet: chains of one vehicle, with gaps of up to ``max_gap_s`` between them, are one.
+
+    Every end goes on in one start at most, the likeliest pairs first.
+
+    Parameters
+    ----------
+    tracklets
+        `END_COLUMNS`.
+    chains
+        (n,) chain of each tracklet, by `velfield.tracking.passages.assign_passages`.
+    max_gap_s
+        Longest gap; 0 leaves the chains as they are.
+    gsd_m
+        Metres a base pixel; None: the paper's.
+
+    Returns
+    -------
+    (n,) int64: the smallest chain of each passage.
+    """
+    names, chain = np.unique(chains, return_inverse=True)
+    metres = PAPER_GSD_M if gsd_m is None else gsd_m
+    order = np.lexsort((tracklets["time_0_s"].to_numpy(), chain))
+    first = order[np.searchsorted(chain[order], np.arange(len(names)))]
+    order = np.lexsort((tracklets["time_2_s"].to_numpy(), chain))
+    last = order[np.searchsorted(chain[order], np.arange(len(names)), side="right") - 1]
+    starts = _ends(tracklets.iloc[first], "0", "01", metres)
+    ends = _ends(tracklets.iloc[last], "2", "12", metres)
+    before = np.full(len(names), -1)  # the chain that each goes on from
+    taken = np.zeros(len(names), bool)
+    for end, start in _pairs(ends, starts, max_gap_s):
+        if not taken[end] and before[start] < 0:
+            taken[end], before[start] = True, end
+    passage = names.copy()
+    for k in np.argsort(starts.time_s, kind="stable"):  # a chain's forerunner starts before it
+        if before[k] >= 0:
+            passage[k] = passage[before[k]]
+    smallest: dict[int, int] = {}
+    for name, whole in zip(names.tolist(), passage.tolist(), strict=True):
+        smallest[whole] = min(name, smallest.get(whole, name))
+    return np.array([smallest[whole] for whole in passage.tolist()], np.int64)[chain]
+
+
+def _ends(rows: pd.DataFrame, place: str, link: str, metres: float) -> _Ends:
+    return _Ends(
+        rows[f"time_{place}_s"].to_numpy(np.float64),
+        rows[[f"x_{place}_px", f"y_{place}_px"]].to_numpy(np.float64) * metres,
+        rows[[f"vx_{link}_px_per_s", f"vy_{link}_px_per_s"]].to_numpy(np.float64) * metres,
+    )
+
+
+def _pairs(ends: _Ends, starts: _Ends, max_gap_s: float) -> Ints:
+    """(m, 2) ends and starts that may be one vehicle, the likeliest first."""
+    order = np.argsort(starts.time_s, kind="stable")
+    times = starts.time_s[order]
+    low = np.searchsorted(times, ends.time_s, side="right")
+    high = np.searchsorted(times, ends.time_s + max_gap_s, side="right")
+    found = []
+    for end in np.flatnonzero(high > low):
+        start = order[low[end] : high[end]]
+        gap = starts.time_s[start] - ends.time_s[end]
+        mean = (ends.velocity_m_per_s[end] + starts.velocity_m_per_s[start]) / 2
+        off = np.hypot(*(starts.place_m[start] - ends.place_m[end] - mean * gap[:, None]).T)
+        share = off / np.minimum(_SLACK_M + _CHANGE_M_PER_S2 * gap**2 / 8, _WITHIN_M)
+        may = share <= 1
+        # Of two that fit alike, the one that comes sooner.
+        found.append(np.stack([share[may] + gap[may] / max_gap_s, np.full(may.sum(), end), start[may]], axis=1))
+    table = np.concatenate(found) if found else np.empty((0, 3))
+    pairs = table[:, 1:].astype(np.int64)
+    return np.asarray(pairs[np.lexsort((pairs[:, 1], pairs[:, 0], table[:, 0]))], np.int64)
