@@ -24,7 +24,8 @@ def sumo_fcd(tracklets: pd.DataFrame, place: Place, *, vehicle_type: str = "car"
 
     Returns
     -------
-    XML text. ``time`` in s from the first tracked frame, ``speed`` m/s, ``angle`` degrees clockwise from north.
+    XML text. ``time`` in s from the first tracked frame, ``speed`` m/s, ``angle`` degrees clockwise from north;
+    from the picture's up, as ``y`` is, where the base image has no reference system and north is not known.
 
     Raises
     ------
