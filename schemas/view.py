@@ -24,6 +24,8 @@ class ViewLayer(Model):
     """Of what is stored."""
     top: float
     """Where the colours end, in stored units; of a change, on either side of zero."""
+    highest: float
+    """The greatest size of a value: what is above the top gets the last colour, and the legend says so."""
     main: bool = False
     """Whether it stands among the first in the list."""
 
@@ -57,6 +59,8 @@ class ViewSegments(Model):
     passages: NonNegativeInt
     settle_px: PositiveFloat
     """Who crosses a line and comes back without going farther than this, has not crossed it."""
+    reach_px: PositiveFloat
+    """Who comes within this of a pixel has passed it: the half width of the band that the field counts."""
 
 
 class ViewRecord(Model):

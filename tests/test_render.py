@@ -79,6 +79,15 @@ def test_speeds_are_shown_in_the_unit_that_can_be_known() -> None:
     assert MapScale(None, "mph").shown_speed(speed) == pytest.approx(40.0)
 
 
+def test_one_false_fast_track_does_not_set_the_colours() -> None:
+    _, speed = lanes()
+    false_track = speed.copy()
+    false_track[400, :5] = 400.0
+    plain, cut_off = speed_figure(GREY, speed, MapScale(0.25)), speed_figure(GREY, false_track, MapScale(0.25))
+    np.testing.assert_array_equal(plain[:390, :640], cut_off[:390, :640])
+    assert (plain[:, 640:] != cut_off[:, 640:]).any(), "the legend says that colours are cut off"
+
+
 def test_a_field_of_another_size_is_refused() -> None:
     with pytest.raises(InputError, match="must agree"):
         direction_figure(GREY, np.zeros((10, 10)), MapScale())
@@ -92,9 +101,10 @@ def test_pictures_come_back_from_their_bytes() -> None:
     assert max(small.shape) == 320
 
 
-@pytest.mark.parametrize("top", [0.7, 1.0, 10.0, 60.0, 150.0, 800.0])
-def test_bars_have_a_few_round_ticks(top: float) -> None:
+@pytest.mark.parametrize("top", [0.7, 1.0, 10.0, 60.0, 120.0, 150.0, 800.0])
+def test_bars_have_a_few_round_ticks_and_one_at_the_end(top: float) -> None:
     assert 4 <= len(bar_ticks(top)) <= 11
+    assert bar_ticks(top)[-1] == pytest.approx(top)
 
 
 class Reader(HTMLParser):

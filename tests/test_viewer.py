@@ -1,6 +1,7 @@
 """The page of a run in a real browser, from a plain static server: what it shows is what Python says."""
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import median
@@ -12,7 +13,10 @@ import pytest
 from schemas.summary import RunSummary
 from tests.browser import MIDDLE_OF_MAP, NEEDS_PAGE, Browser, Page, browser, served
 from velfield import open_run
+from velfield.layout import RunLayout
+from velfield.render.figures import round_up, speed_reach
 from velfield.run import Run
+from velfield.stores import open_field
 
 pytestmark = NEEDS_PAGE
 
@@ -83,6 +87,117 @@ def test_a_click_shows_what_python_says(page: Page, address: str, run: Run) -> N
     assert page.value("document.querySelectorAll('#answer [data-name^=mode_]').length") == len(here.modes)
     for k, mode in enumerate(here.modes):
         np.testing.assert_allclose(told(page, f"mode_{k}"), mode, rtol=1e-4, atol=0.02)
+
+
+@pytest.fixture
+def north_up(whole: tuple[Path, RunSummary], tmp_path: Path) -> Iterator[str]:
+    """The same run, had its base image north at its upper edge."""
+    for path in whole[0].iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    (tmp_path / "view").unlink()
+    (tmp_path / "view").mkdir()
+    for path in (whole[0] / "view").iterdir():
+        (tmp_path / "view" / path.name).symlink_to(path)
+    record = json.loads((tmp_path / "view" / "run.json").read_bytes())
+    (tmp_path / "view" / "run.json").unlink()
+    (tmp_path / "view" / "run.json").write_text(json.dumps({**record, "north_rad": -np.pi / 2}))
+    with served(tmp_path) as there:
+        yield there
+
+
+def beside(run: Run, away: int) -> tuple[int, int]:
+    """A pixel that no vehicle passed, so far above one that was passed, none nearer."""
+    count = run.field.count()
+    height, width = count.shape
+    for y, x in np.argwhere(count > 0).tolist():
+        if away <= y < height - away and away <= x < width - away:
+            around = count[y - 2 * away : y, x - away : x + away + 1]
+            if around.size and not around.any():
+                return x, y - away
+    raise AssertionError("no such place")
+
+
+def test_a_tap_beside_a_lane_means_the_lane_where_a_screen_pixel_is_many(page: Page, address: str, run: Run) -> None:
+    x, y = beside(run, 3)
+    page.open(f"{address}#view={x},{y},1")
+    page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
+    page.click(*page.value(MIDDLE_OF_MAP))
+    page.wait(ANSWERED)
+    away = told(page, "away")
+    pixel = [int(part) for part in page.value("new URLSearchParams(location.hash.slice(1)).get('pixel')").split(",")]
+    assert page.value("document.querySelector('#answer h2').textContent") == f"Pixel ({pixel[0]}, {pixel[1]})"
+    assert away == pytest.approx(np.hypot(pixel[0] - x, pixel[1] - y), abs=1.0)
+    assert 2 < away <= 4
+    assert told(page, "n") == run.field.at(*pixel).n > 0
+    assert "m away" in page.value("document.querySelector('#answer').textContent")
+
+
+def test_where_a_map_pixel_is_wider_than_a_finger_the_click_means_itself(page: Page, address: str, run: Run) -> None:
+    x, y = beside(run, 1)
+    page.open(f"{address}#view={x},{y},3")
+    page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
+    click_pixel(page, x, y)
+    assert told(page, "n") == 0
+
+
+def test_degrees_say_what_they_are_counted_from(chromium: Browser, address: str, north_up: str, run: Run) -> None:
+    x, y = busiest(run)
+    vx, vy = run.field.at(x, y).modal_velocity_px_per_s
+    degrees = f"{round(np.degrees(np.arctan2(vx, -vy))) % 360}°"
+    with chromium.page() as page:
+        for there, counted_from in ((address, " from up"), (north_up, " [NESW]{1,2}")):
+            page.open(f"{there}#line=10,200,600,200")
+            page.wait("document.querySelector('#answer h3') !== null")
+            assert re.search(
+                rf"towards 180°{counted_from}$", page.value("document.querySelector('#answer h3').textContent")
+            )
+            page.open("about:blank")
+            page.open(f"{there}#pixel={x},{y}&view={x},{y},3")
+            page.wait(ANSWERED)
+            direction = page.value("document.querySelector('#answer [data-name=direction]').closest('td').textContent")
+            assert re.search(rf"{degrees} .*{counted_from.strip()}$", direction)
+            page.mouse("mouseMoved", *page.value(MIDDLE_OF_MAP))
+            page.wait("document.getElementById('readout').textContent.includes('vehicle')")
+            assert re.search(rf"{degrees}{counted_from} ", page.value("document.getElementById('readout').textContent"))
+            titles = page.value("[...document.querySelectorAll('#answer thead th')].map((cell) => cell.textContent)")
+            assert ("From up" in titles) == (there == address)
+            page.open("about:blank")
+
+
+def test_the_labels_of_a_histogram_do_not_touch(page: Page, address: str, run: Run) -> None:
+    height, width = run.field.shape
+    page.open(f"{address}#line=0,0,{width},{height}")
+    page.wait("document.querySelector('#answer svg text') !== null")
+    boxes = page.value(
+        "[...document.querySelector('#answer svg').querySelectorAll('text')].map((text) => "
+        "(({left, right, top, bottom}) => [left, right, top, bottom])(text.getBoundingClientRect()))"
+    )
+    texts = page.value("[...document.querySelector('#answer svg').querySelectorAll('text')].map((t) => t.textContent)")
+    assert len(texts) >= 4
+    assert [text for text in texts if not text.isdecimal()] == ["km/h"]
+    for k, (left, right, top, bottom) in enumerate(boxes):
+        for other in boxes[k + 1 :]:
+            assert right < other[0] or other[1] < left or bottom < other[2] + 2 or other[3] < top + 2
+
+
+def test_the_page_colours_speeds_as_the_figure_does_and_says_what_is_cut_off(
+    page: Page, address: str, whole: tuple[Path, RunSummary]
+) -> None:
+    store = open_field(RunLayout(whole[0]).field)
+    modal = np.hypot(store.layer("modal_vx"), store.layer("modal_vy")).astype(np.float64) * 0.23 * 3.6
+    reach = speed_reach(modal)
+    assert reach is not None
+    page.open(address)
+    page.wait("document.querySelector('#layer option') !== null")
+    cut_off = []
+    for layer, values in (("speed", modal), ("speed_p50_high90", store.layer("speed_p50_high90") * 0.23 * 3.6)):
+        page.value(f"layer.value = '{layer}'; layer.dispatchEvent(new Event('change'))")
+        top = float(page.value("[...document.querySelectorAll('#legend .ticks span')].at(-1).textContent"))
+        assert top == round_up(reach)
+        said = page.value("document.getElementById('legend').textContent")
+        cut_off.append(f"Above {top:g} all has the last colour; the highest is {np.nanmax(values):.3g} km/h" in said)
+        assert cut_off[-1] == bool(np.nanmax(values) > top)
+    assert cut_off[-1], "the test needs a layer that is cut off"
 
 
 def test_clicks_all_over_the_map_agree_and_are_quick(

@@ -50,6 +50,17 @@ def test_layers_follow_the_store() -> None:
     assert layers["headway"].top == pytest.approx(2.96)
 
 
+def test_an_interval_and_one_false_track_do_not_set_the_scale_of_speeds() -> None:
+    speeds = np.linspace(5.0, 20.0, 400)[None]
+    false_track = np.where(np.arange(400) == 7, 300.0, speeds)
+    stored = {"modal_vx": false_track, "modal_vy": 0 * speeds, "speed_p50_high90": 3 * speeds}
+    attributes = {name: {"units": "px s-1"} for name in stored}
+    layers = {layer.name: layer for layer in view_layers(attributes, stored.__getitem__)}
+    assert layers["speed"].top == pytest.approx(20, rel=0.01)
+    assert layers["speed_p50_high90"].top == layers["speed"].top
+    assert (layers["speed"].highest, layers["speed_p50_high90"].highest) == (300, 60)
+
+
 def test_the_record_lists_what_is_stored(whole: tuple[Path, RunSummary]) -> None:
     layout = RunLayout(whole[0])
     record = ViewRecord.model_validate_json(layout.view_record.read_bytes())

@@ -12,7 +12,7 @@ STAGE_VERSIONS: dict[str, int] = {
     "links": 1,
     "tracklets": 2,
     "field": 2,
-    "maps": 3,
+    "maps": 4,
 }
 
 

@@ -2,6 +2,7 @@
 
 import { ChunkedArray, type Numbers } from "./chunks";
 import { Histogram } from "./histogram";
+import type { Point } from "./place";
 import type { Run } from "./run";
 
 const HISTOGRAM = "velocity_histogram";
@@ -48,10 +49,42 @@ export class Field {
     return chunk === undefined ? undefined : value(chunk, index);
   }
 
+  /**
+   * The pixel that a place of the map means: the place's own where vehicles passed it, else the nearest within `reach` px
+   * that `least` passed; its own again where there is none.
+   */
+  async nearest(at: Point, reach: number, least: number): Promise<Point> {
+    const own = { x: Math.round(at.x), y: Math.round(at.y) };
+    if (reach <= 1 || (await this.at("count", own.x, own.y)) > 0) return own;
+    const count = this.array("count");
+    const [height, width] = count.chunk;
+    const { width_px, height_px } = this.run;
+    const around = [...covered(at.y, reach, height_px, height)].flatMap((row) =>
+      [...covered(at.x, reach, width_px, width)].map((column) => ({ row, column, counts: count.read(row, column) })),
+    );
+    let [found, best] = [own, reach];
+    for (const { row, column, counts } of around) {
+      const read = await counts;
+      for (let k = 0; read && k < read.length; k++) {
+        if (read[k]! < least) continue;
+        const [x, y] = [column * width + (k % width), row * height + Math.floor(k / width)];
+        const distance = Math.hypot(x - at.x, y - at.y);
+        if (distance <= best && this.inside(x, y)) [found, best] = [{ x, y }, distance];
+      }
+    }
+    return found;
+  }
+
   /** The histogram at a pixel, (vy, vx) flat; null where nothing passed. */
   histogram(x: number, y: number): Promise<Int32Array | null> {
     return this.histograms.at(x, y);
   }
+}
+
+/** The chunks of so many pixels that come within `reach` of a place, along one axis of `size` pixels. */
+function* covered(at: number, reach: number, size: number, chunk: number): Generator<number> {
+  const first = Math.floor(Math.max(at - reach, 0) / chunk);
+  for (let k = first; k * chunk <= Math.min(at + reach, size - 1); k++) yield k;
 }
 
 function place(array: ChunkedArray, x: number, y: number): { row: number; column: number; index: number } {

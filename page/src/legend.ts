@@ -17,8 +17,16 @@ export function makeLegend(layer: Layer, run: Run, units: Units): Legend {
   if (layer.kind === "direction") return { element: wheel(layer, run), top: layer.top };
   const { factor, unit } = units.shown(layer);
   const end = layer.kind === "share" ? 100 : roundUp(layer.top * factor);
-  const about = make("p", { class: "note" }, layer.about);
+  const about = make("p", { class: "note" }, layer.about, clipped(layer, end, factor, unit));
   return { element: make("div", {}, bar(layer, end, unit), about), top: end / factor };
+}
+
+/** A few values that are far above all others would flatten the colours: what is said of those that are cut off. */
+function clipped(layer: Layer, end: number, factor: number, unit: string): string {
+  const highest = layer.highest * factor;
+  if (!(highest > end * (1 + 1e-6))) return "";
+  const most = `${+highest.toPrecision(3)}${unit && ` ${unit}`}`;
+  return ` Above ${+end.toPrecision(4)} all has the last colour; the highest is ${most}.`;
 }
 
 function bar(layer: Layer, end: number, unit: string): HTMLElement {

@@ -6,18 +6,17 @@ import type { Point } from "./place";
 import type { Run } from "./run";
 import { percentile, roundUp, ticks, type Units } from "./units";
 
-const PLOT = { width: 280, height: 96, left: 4, bottom: 20, top: 6 };
+const PLOT = { width: 280, height: 112, left: 10, bottom: 34, top: 6 };
 
 export function showLine(crossings: Crossing[], [start, end]: [Point, Point], run: Run, units: Units): HTMLElement {
-  const metres = run.gsd_m === null ? 1 : run.gsd_m;
-  const length = Math.hypot(end.x - start.x, end.y - start.y) * metres;
+  const length = units.length(Math.hypot(end.x - start.x, end.y - start.y));
   const card = make("section", { class: "answer", "aria-label": "Line" }, make("h2", {}, "Across the line"));
   const seconds = run.last_time_s - run.first_time_s;
   card.append(
     make(
       "p",
       { class: "note" },
-      `${length.toFixed(1)} ${run.gsd_m === null ? "px" : "m"} long; ${crossings.length} crossings in ${seconds.toFixed(0)} s.`,
+      `${length} long; ${crossings.length} crossings in ${seconds.toFixed(0)} s.`,
     ),
   );
   const top = roundUp(Math.max(...crossings.map((c) => c.speed * units.perPxPerS), 1));
@@ -77,14 +76,13 @@ function bars(speeds: number[], top: number, unit: string): HTMLElement {
     svg.append(element("rect", at));
   });
   svg.append(element("line", { x1: left, x2: width - left, y1: height - bottom, y2: height - bottom }));
-  const values = ticks(top);
-  values.forEach((value, k) => {
-    const anchor = k === 0 ? "start" : value > 0.95 * top ? "end" : "middle";
-    const x = left + ((width - 2 * left) * value) / top;
-    const text = element("text", { x, y: height - 5, "text-anchor": anchor });
-    text.textContent = k === values.length - 1 ? `${value} ${unit}` : `${value}`;
+  const write = (x: number, y: number, words: string): void => {
+    const text = element("text", { x, y, "text-anchor": "middle" });
+    text.textContent = words;
     svg.append(text);
-  });
+  };
+  for (const value of ticks(top)) write(left + ((width - 2 * left) * value) / top, height - bottom + 14, `${value}`);
+  write(width / 2, height - 4, unit);
   return make("div", {}, svg);
 }
 

@@ -54,9 +54,14 @@ function told(name: string, value: number, text: string): HTMLElement {
   return make("span", { "data-name": name, "data-value": String(value) }, text);
 }
 
-export function showPixel(answer: PixelAnswer, field: Field, units: Units): HTMLElement {
+/** The answer of a pixel, `away` px from the place that was pointed at. */
+export function showPixel(answer: PixelAnswer, field: Field, units: Units, away: number): HTMLElement {
   const { x, y, n, values, histogram } = answer;
   const card = make("section", { class: "answer", "aria-label": "Pixel" }, make("h2", {}, `Pixel (${x}, ${y})`));
+  if (away) {
+    const words = `The pixel nearest to the place you pointed at that vehicles passed, ${units.length(away)} away.`;
+    card.append(make("p", { class: "note", "data-name": "away", "data-value": String(away) }, words));
+  }
   if (!n || !histogram) {
     card.append(make("p", { "data-name": "n", "data-value": "0" }, "No vehicle passed here."));
     return card;
@@ -68,7 +73,7 @@ export function showPixel(answer: PixelAnswer, field: Field, units: Units): HTML
     make("p", { class: "note" }, "The way is the way on the map, farther out is faster; the circles are the modes."),
     make("h3", {}, answer.modes.length > 1 ? "Modes" : "Mode"),
     grid(
-      ["", "Heading", "Speed", "Share"],
+      ["", units.headingColumn.title, "Speed", "Share"],
       answer.modes.map((mode, k) => modeRow(mode, k, field, units)),
     ),
   );
@@ -88,8 +93,9 @@ function rows({ n, values }: PixelAnswer, field: Field, units: Units): [string, 
   const moving = speed > field.run.standing_px_per_s;
   const heading = make("span", {}, ...(moving ? [arrow(direction), " "] : []));
   heading.append(
-    told("direction", direction, moving ? units.headingText(direction) : "stands"),
+    told("direction", direction, moving ? units.headingDegrees(direction) : "stands"),
     plusMinus(values.direction_half90 ?? values.direction_se, (half) => `${((half * 180) / Math.PI).toFixed(1)}°`),
+    moving ? units.headingPoint(direction) : "",
   );
   const listed: [string, Node | string][] = [
     ["Vehicles", told("n", n, String(n))],
@@ -128,7 +134,7 @@ function modeRow(mode: Mode, k: number, field: Field, units: Units): (Node | str
   const { bins, bin_width_px_per_s: width, standing_px_per_s: standing } = field.run;
   const [vx, vy] = [(mode.x - (bins - 1) / 2) * width, (mode.y - (bins - 1) / 2) * width];
   const [direction, speed] = [Math.atan2(vy, vx), Math.hypot(vx, vy)];
-  const way = speed > standing ? make("span", {}, arrow(direction), ` ${units.headingText(direction)}`) : "stands";
+  const way = speed > standing ? make("span", {}, arrow(direction), ` ${units.headingColumn.text(direction)}`) : "stands";
   const whole = make("span", { "data-name": `mode_${k}`, "data-value": JSON.stringify([vx, vy, mode.share]) }, `${k + 1}`);
   return [whole, way, units.speedText(speed), `${Math.round(100 * mode.share)} %`];
 }
@@ -138,10 +144,10 @@ export function showPassages(near: Near[], index: TrackIndex, units: Units): HTM
   const most = 50;
   const s = index.segments;
   const table = grid(
-    ["Time", "Heading", "Speed"],
+    ["Time", units.headingColumn.title, "Speed"],
     near.slice(0, most).map(({ nearest: row }) => {
       const [vx, vy] = [s.vx_px_per_s[row]!, s.vy_px_per_s[row]!];
-      return [units.time(s.start_s[row]!), units.headingText(Math.atan2(vy, vx)), units.speedText(Math.hypot(vx, vy))];
+      return [units.time(s.start_s[row]!), units.headingColumn.text(Math.atan2(vy, vx)), units.speedText(Math.hypot(vx, vy))];
     }),
   );
   const more = near.length > most ? [make("p", { class: "note" }, `and ${near.length - most} more`)] : [];

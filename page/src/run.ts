@@ -10,6 +10,7 @@ export interface Layer {
   arrays: string[];
   units: string;
   top: number;
+  highest: number;
   main: boolean;
 }
 
@@ -36,7 +37,7 @@ export interface Run {
   base: { levels: number; tile: number };
   layers: Layer[];
   arrays: Record<string, StoredArray>;
-  segments: { count: number; passages: number; settle_px: number };
+  segments: { count: number; passages: number; settle_px: number; reach_px: number };
 }
 
 /** What people are told when something cannot be read. */

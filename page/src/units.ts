@@ -32,15 +32,31 @@ export class Units {
     return ((degrees % 360) + 360) % 360;
   }
 
-  /** "92° E"; without a known north the compass point would be a guess. */
+  /** "92° E", or "92° from up": without a known north the compass point would be a guess. */
   headingText(directionRad: number): string {
     if (!Number.isFinite(directionRad)) return "–";
-    const heading = Math.round(this.heading(directionRad)) % 360;
-    return this.run.north_rad === null ? `${heading}°` : `${heading}° ${POINTS[Math.round(heading / 45) % 8]}`;
+    return this.headingDegrees(directionRad) + this.headingPoint(directionRad);
   }
 
-  get headingNote(): string {
-    return this.run.north_rad === null ? "clockwise from the picture's up" : "clockwise from north";
+  /** "92°", where what it is counted from stands beside it. */
+  headingDegrees(directionRad: number): string {
+    return `${Math.round(this.heading(directionRad)) % 360}°`;
+  }
+
+  /** " E", or " from up": what stands after the degrees. */
+  headingPoint(directionRad: number): string {
+    return this.run.north_rad === null ? " from up" : ` ${POINTS[Math.round(this.heading(directionRad) / 45) % 8]}`;
+  }
+
+  /** A column of headings: its title, and what is in it. */
+  get headingColumn(): { title: string; text: (directionRad: number) => string } {
+    return this.run.north_rad === null
+      ? { title: "From up", text: (direction) => this.headingDegrees(direction) }
+      : { title: "Heading", text: (direction) => this.headingText(direction) };
+  }
+
+  length(px: number): string {
+    return this.run.gsd_m === null ? `${px.toFixed(1)} px` : `${(px * this.run.gsd_m).toFixed(1)} m`;
   }
 
   time(seconds: number): string {
@@ -60,10 +76,10 @@ export class Units {
   }
 }
 
-/** The least of 1, 2, 3, 4, 5, 6, 8 times a power of ten that is not below. */
+/** The least of 1, 1.2, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten that is not below: as `round_up` of the figures. */
 export function roundUp(value: number): number {
   const power = 10 ** Math.floor(Math.log10(value));
-  return [1, 2, 3, 4, 5, 6, 8, 10].map((step) => step * power).find((step) => step >= value * (1 - 1e-9))!;
+  return [1, 1.2, 1.5, 2, 3, 4, 5, 6, 8, 10].map((step) => step * power).find((step) => step >= value * (1 - 1e-9))!;
 }
 
 /** The largest of 1, 2 and 5 times a power of ten that is not above. */
@@ -72,9 +88,11 @@ export function roundDown(value: number): number {
   return [5, 2, 1].map((step) => step * power).find((step) => step <= value * (1 + 1e-9))!;
 }
 
-/** Round numbers from 0 to a round top, four to six of them. */
+/** Round numbers from 0 to a top, four to six of them; the last is the top itself where that is round. */
 export function ticks(top: number): number[] {
-  const step = [1, 2, 5, 10, 20, 50].map((s) => s * 10 ** (Math.floor(Math.log10(top)) - 1)).find((s) => top / s <= 5.01)!;
+  const power = 10 ** (Math.floor(Math.log10(top)) - 1);
+  const steps = [1, 2, 5, 10, 20, 50, 4, 40].map((s) => s * power).filter((s) => top / s <= 5.01);
+  const step = steps.find((s) => Math.abs(top / s - Math.round(top / s)) < 1e-6) ?? steps[0]!;
   return Array.from({ length: Math.floor(top / step + 1e-9) + 1 }, (_, k) => +(k * step).toPrecision(6));
 }
 

@@ -19,8 +19,8 @@ import { loadSegments, TrackIndex } from "./tracks";
 import { Units } from "./units";
 
 const TRACK_REACH_PX = 6; // screen pixels around the cursor
+const POINT_REACH_PX = 8; // screen pixels: a finger or a mouse that is so near a lane means the lane
 const REST_MS = 60; // who rests on a road is about to click it: its tile is fetched already
-const PASSAGE_REACH_PX = 1.5; // base pixels around the pixel asked
 
 class Viewer {
   private state: State = readState(location.hash);
@@ -96,17 +96,17 @@ class Viewer {
 
   // -- what is asked ---------------------------------------------------------------------------------------------------
 
-  private ask(place: Point): void {
+  /** `away`: how far from the place that was pointed at, base pixels. */
+  private ask(place: Point, away = 0, started = performance.now()): void {
     if (!this.field.inside(place.x, place.y)) return;
     this.set({ pixel: place, line: null });
     this.drawings.showPixel(place);
     this.drawings.showLine(null, () => undefined);
     const asked = ++this.asked;
-    const started = performance.now();
     askPixel(this.field, place)
       .then((answer) => {
         if (asked !== this.asked) return; // another pixel was asked since
-        this.answer(showPixel(answer, this.field, this.units));
+        this.answer(showPixel(answer, this.field, this.units, away));
         find("answer").dataset.milliseconds = (performance.now() - started).toFixed(1);
         if (answer.n) this.addPassages(place, asked);
       })
@@ -117,7 +117,7 @@ class Viewer {
     this.tracks()
       .then((index) => {
         if (asked !== this.asked) return;
-        const near = index.near(place.x, place.y, PASSAGE_REACH_PX);
+        const near = index.near(place.x, place.y, this.run.segments.reach_px);
         find("answer").firstElementChild?.append(showPassages(near, index, this.units));
         if (this.state.tracks) this.drawings.showTracks(near, index);
       })
@@ -146,7 +146,7 @@ class Viewer {
   /** A click, a tap, or Enter at the map's centre: an end of the line being drawn, else a question. */
   private point(place: Point): void {
     if (this.drawing === null) {
-      this.ask({ x: Math.round(place.x), y: Math.round(place.y) });
+      this.askNear(place);
       return;
     }
     this.drawing.push(place);
@@ -156,6 +156,27 @@ class Viewer {
       this.draw(false);
       this.measure(ends);
     } else this.tell("Now the other side of the road.");
+  }
+
+  private askNear(place: Point): void {
+    const [asked, started] = [++this.asked, performance.now()];
+    this.meant(place)
+      .then((meant) => {
+        if (asked !== this.asked) return; // another place was pointed at since
+        const own = meant.x === Math.round(place.x) && meant.y === Math.round(place.y);
+        this.ask(meant, own ? 0 : Math.hypot(meant.x - place.x, meant.y - place.y), started);
+      })
+      .catch((error) => this.fail(error));
+  }
+
+  /** The pixel that a place means: the whole map on a small screen has six pixels under each of the screen's. */
+  private meant(place: Point): Promise<Point> {
+    return this.field.nearest(place, this.reach(POINT_REACH_PX), this.state.least);
+  }
+
+  /** Screen pixels as base pixels. */
+  private reach(screenPx: number): number {
+    return screenPx / this.map.getZoomScale(this.map.getZoom(), 0);
   }
 
   private draw(on: boolean): void {
@@ -173,19 +194,25 @@ class Viewer {
 
   private hover(place: Point): void {
     this.hovered = place;
-    const [x, y] = [Math.round(place.x), Math.round(place.y)];
-    const readout = find("readout");
-    if (!this.field.inside(x, y)) {
-      readout.textContent = "";
+    if (!this.field.inside(Math.round(place.x), Math.round(place.y))) {
+      find("readout").textContent = "";
       return;
     }
+    const read = (meant: Point): void => (this.hovered === place ? this.read(meant, place) : undefined);
+    this.meant(place).then(read, (error) => this.fail(error));
+    if (this.state.tracks) void this.hoverTracks(place);
+  }
+
+  /** What a click would show, in a line. */
+  private read({ x, y }: Point, hovered: Point): void {
+    const readout = find("readout");
     const value = (name: string): number | undefined => this.field.peek(name, x, y);
     const [vx, vy, n] = [value("modal_vx"), value("modal_vy"), value("count")];
     const where = `(${x}, ${y})`;
     if (vx === undefined || vy === undefined || n === undefined) {
       readout.textContent = where;
       const values = ["modal_vx", "modal_vy", "count"].map((name) => this.field.at(name, x, y));
-      const again = (): void => (this.hovered === place ? this.hover(place) : undefined);
+      const again = (): void => (this.hovered === hovered ? this.read({ x, y }, hovered) : undefined);
       Promise.all(values).then(again, (error) => this.fail(error));
     } else if (!n) readout.textContent = `${where} no vehicle`;
     else {
@@ -195,13 +222,11 @@ class Viewer {
     }
     clearTimeout(this.resting);
     if (n) this.resting = window.setTimeout(() => void askPixel(this.field, { x, y }).catch(() => undefined), REST_MS);
-    if (this.state.tracks) void this.hoverTracks(place);
   }
 
   private async hoverTracks({ x, y }: Point): Promise<void> {
     const index = await this.tracks();
-    const reach = TRACK_REACH_PX / this.map.getZoomScale(this.map.getZoom(), 0);
-    this.drawings.showTracks(index.near(x, y, reach), index);
+    this.drawings.showTracks(index.near(x, y, this.reach(TRACK_REACH_PX)), index);
   }
 
   // -- controls --------------------------------------------------------------------------------------------------------

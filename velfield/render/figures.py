@@ -95,33 +95,45 @@ def speed_figure(
     speed_px_per_s
         (h, w) speed, px/s. Nothing is drawn where it is NaN.
     top
-        Speed at the bar's end, in the shown unit; None: a round number that 99 % of the pixels stay below.
+        Speed at the bar's end, in the shown unit; None: the round number above `speed_reach`, as on the page.
     bar_gsd_m
         Metres a pixel of the figure, for the scale bar, where it is not drawn at base resolution.
     """
     _same_shape(grey, speed_px_per_s)
     shown = scale.shown_speed(speed_px_per_s)
     if top is None:
-        top = round_up(float(np.nanpercentile(shown, 99))) if np.isfinite(shown).any() else 10.0
+        reach = speed_reach(shown)
+        top = 10.0 if reach is None else round_up(reach)
     picture = _over(grey, ramp_colours(shown / top), np.isfinite(shown))
-    legend = Legend(f"Speed, {scale.shown_unit}", "Colour: the speed that most vehicles have. Bare grey: none seen.")
+    note = "Colour: the speed that most vehicles have. Bare grey: none seen."
+    highest = float(np.nanmax(shown, initial=0.0))
+    if highest > top:
+        note += f" Above {top:g} all has the last colour; the highest is {highest:.3g}."
+    legend = Legend(f"Speed, {scale.shown_unit}", note)
     gsd_m = scale.gsd_m if bar_gsd_m is None else bar_gsd_m
     panel = draw_bar_panel(grey.shape, legend, top=top, gsd_m=gsd_m, north_rad=scale.north_rad)
     return np.hstack([picture, panel])
 
 
+def speed_reach(speed: NDArray[np.floating]) -> float | None:
+    """What 99 % of the known speeds stay below: where the colours end, then rounded up. One false fast track does not
+    flatten all others. None where none is known."""
+    known = speed[np.isfinite(speed)]
+    return float(np.percentile(known, 99)) if known.size else None
+
+
 def round_up(value: float) -> float:
-    """The next number of 1, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten.
+    """The next number of 1, 1.2, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten.
 
     Examples
     --------
-    >>> round_up(53.0), round_up(0.0), round_up(140.0)
-    (60.0, 1.0, 150.0)
+    >>> round_up(53.0), round_up(0.0), round_up(106.0), round_up(140.0)
+    (60.0, 1.0, 120.0, 150.0)
     """
     if not value > 0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(value))
-    for step in (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0):
+    for step in (1.0, 1.2, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0):
         if value <= step * power * (1 + 1e-9):
             return float(step * power)
     return float(10 * power)

@@ -164,14 +164,15 @@ def _north(panel: _Panel, north_rad: float, centre: tuple[float, float]) -> None
 
 
 def bar_ticks(top: float) -> NDArray[np.float64]:
-    """Round numbers from 0 to ``top``, four to eight of them.
+    """Round numbers from 0 to ``top``, four to eleven of them; the last is ``top`` itself where that is round.
 
     Examples
     --------
-    >>> bar_ticks(60.0)
-    array([ 0., 10., 20., 30., 40., 50., 60.])
+    >>> bar_ticks(60.0), bar_ticks(150.0)
+    (array([ 0., 10., 20., 30., 40., 50., 60.]), array([  0.,  50., 100., 150.]))
     """
-    step = round_down(top / 4)
+    steps = [round_down(top / parts) for parts in (4, 3)]
+    step = next((step for step in steps if abs(top / step - round(top / step)) < 1e-6), steps[0])
     return np.arange(0, top * (1 + 1e-9), step)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.view import LayerKind, ViewLayer
+from velfield.render.figures import speed_reach
 
 _REACH_PERCENT = 98.0
 """Colours end where so many per cent of the known pixels are reached: a few outliers would flatten all else."""
@@ -82,8 +83,8 @@ _KNOWN = (
         ("circular_variance",),
     ),
 )
-_COMMON_TOP = ("speed", "speed_p85", "speed_p50", "speed_p15", "speed_p50_low90", "speed_p50_high90")
-"""Shown on one scale, so that they compare."""
+_LIKE_SPEED = frozenset({"speed", "speed_p85", "speed_p50", "speed_p15", "speed_p50_low90", "speed_p50_high90"})
+"""Shown on the scale of the modal speed, so that they compare, and not on that of an interval's upper end."""
 
 _INNER = ("velocity_noise",)
 """For the sums of fields, not for people."""
@@ -104,7 +105,9 @@ def view_layers(attributes: Mapping[str, Mapping[str, Any]], read: Reader) -> li
     known = [layer for layer in _KNOWN if all(name in attributes for name in layer.arrays)]
     taken = {*_INNER, *(name for layer in _KNOWN for name in layer.arrays)}
     known += [_unknown(name, attrs) for name, attrs in attributes.items() if name not in taken]
-    layers = [
+    sizes = {layer.name: _sizes([np.asarray(read(name)) for name in layer.arrays]) for layer in known}
+    speed_top = speed_reach(sizes["speed"]) if "speed" in sizes else None
+    return [
         ViewLayer(
             name=layer.name,
             title=layer.title,
@@ -112,13 +115,12 @@ def view_layers(attributes: Mapping[str, Mapping[str, Any]], read: Reader) -> li
             kind=layer.kind,
             arrays=layer.arrays,
             units=str(attributes[layer.arrays[0]].get("units", "1")),
-            top=_top([np.asarray(read(name)) for name in layer.arrays]),
+            top=speed_top if speed_top and layer.name in _LIKE_SPEED else _top(sizes[layer.name]),
+            highest=float(sizes[layer.name].max(initial=0.0)),
             main=layer.main,
         )
         for layer in known
     ]
-    common = max((layer.top for layer in layers if layer.name in _COMMON_TOP), default=1.0)
-    return [layer.model_copy(update={"top": common}) if layer.name in _COMMON_TOP else layer for layer in layers]
 
 
 _KINDS: dict[str, LayerKind] = {"px s-1": "speed", "rad": "angle", "ms": "time"}
@@ -133,8 +135,13 @@ def _unknown(name: str, attributes: Mapping[str, Any]) -> _Known:
     return _Known(name, title[:1].upper() + title[1:], about, "change" if change else kind, (name,), change)
 
 
-def _top(arrays: Sequence[NDArray[Any]]) -> float:
-    """Where the colours end: the 98th percentile of the sizes of what is known and not zero."""
-    size = np.abs(arrays[0].astype(np.float64)) if len(arrays) == 1 else np.hypot(*arrays)
-    size = size[np.isfinite(size) & (size > 0)]
-    return float(np.percentile(size, _REACH_PERCENT)) if size.size else 1.0
+def _sizes(arrays: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
+    """Of the values that are known, without their sign; of velocities their speeds."""
+    size = np.hypot(*(np.asarray(array, np.float64) for array in [*arrays, 0.0][:2]))
+    return np.asarray(size[np.isfinite(size)], np.float64)
+
+
+def _top(sizes: NDArray[np.float64]) -> float:
+    """Where the colours end: the 98th percentile of the sizes of what is not zero."""
+    sizes = sizes[sizes > 0]
+    return float(np.percentile(sizes, _REACH_PERCENT)) if sizes.size else 1.0

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from schemas.records import FlightRecord, GridRecord
 from schemas.view import ViewArray, ViewBase, ViewLayer, ViewRecord, ViewSegments
-from velfield.field.bins import standing_px_per_s
+from velfield.field.bins import band_radius_px, standing_px_per_s
 from velfield.field.segments import Segments
 from velfield.insight.crossings import settle_px
 from velfield.layout import RunLayout
@@ -30,6 +30,8 @@ from velfield.viewer.layers import view_layers
 from velfield.viewer.pyramid import TILE_PX, pyramid_levels, pyramid_tiles
 
 Layer = NDArray[np.float64]
+_LINE_REACH_PX = 1.5
+"""Around a path that is a pixel wide."""
 
 
 def write_view(layout: RunLayout) -> None:
@@ -97,7 +99,10 @@ def view_record(
         layers=tuple(layer for each in stores.values() for layer in _layers(each)),
         arrays={name: array for path, each in stores.items() for name, array in _arrays(path, each).items()},
         segments=ViewSegments(
-            count=len(segments), passages=len(np.unique(segments["passage"])), settle_px=settle_px(grid.gsd_m)
+            count=len(segments),
+            passages=len(np.unique(segments["passage"])),
+            settle_px=settle_px(grid.gsd_m),
+            reach_px=band_radius_px(flight.config.field, grid.gsd_m) or _LINE_REACH_PX,
         ),
     )
 
