@@ -24,7 +24,7 @@ page: $(STAMP)
 	  "$$($(BIN)/python page/build.py --node-wheel)"
 	@$(BIN)/python page/build.py
 
-env: $(STAMP)
+env: page  ## the environment, with the viewer's page
 
 # uv installs the locked environment in seconds where pip takes a minute and a half; pip brings uv.
 $(STAMP): requirements.lock pyproject.toml

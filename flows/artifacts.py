@@ -2,7 +2,10 @@
 address, and how far a long stage is."""
 
 import base64
+import os
+import shlex
 import time
+from pathlib import Path
 from uuid import UUID
 
 from prefect.artifacts import (
@@ -13,6 +16,7 @@ from prefect.artifacts import (
     update_progress_artifact,
 )
 
+from flows.launch import PAGES, PAGES_OF
 from schemas.summary import RunSummary
 from velfield.layout import RunLayout
 from velfield.places import is_remote
@@ -30,7 +34,8 @@ _LONG_S, _EVERY_S = 20.0, 5.0
 def publish_summary(plan: Plan, summary: RunSummary) -> None:
     """Create the artifacts of a finished run."""
     report = RunLayout(named(plan.layout.root)).report
-    lines = [f"# {plan.job.inputs.source}", "", f"Report: `{report}`", ""]
+    shown = f"velfield view {shlex.quote(str(report.parent))}"
+    lines = [f"# {plan.job.inputs.source}", "", f"The map and the report, in a browser: `{shown}`", ""]
     lines += [f"- **{stage.name}**: {stage.text} ({stage.seconds:.1f} s)" for stage in summary.stages]
     lines += ["", f"{len(summary.frames_lost)} frames lost.", ""]
     for name in ("direction", "speed"):
@@ -40,7 +45,9 @@ def publish_summary(plan: Plan, summary: RunSummary) -> None:
             lines += [f"## {name.capitalize()}", f"![modal {name}](data:image/png;base64,{data})", ""]
     create_markdown_artifact(key="summary", markdown="\n".join(lines), description="What was done, and the maps")
     if not is_remote(plan.layout.root):
-        create_link_artifact(key="report", link=report.as_uri(), link_text="report", description="The run's own page")
+        create_link_artifact(
+            key="report", link=_address(report), link_text="report", description="The run's own page: map and report"
+        )
     create_table_artifact(
         key="stages",
         table=[
@@ -55,6 +62,14 @@ def publish_summary(plan: Plan, summary: RunSummary) -> None:
         ],
         description="The stages of the run",
     )
+
+
+def _address(report: Path) -> str:
+    """The page as `velfield serve` shows it; else the file, which browsers open only when asked by hand."""
+    served = os.environ.get(PAGES_OF)
+    if served is not None and report.resolve().is_relative_to(Path(served).resolve()):
+        return f"{os.environ[PAGES]}/{report.resolve().relative_to(Path(served).resolve()).as_posix()}"
+    return report.as_uri()
 
 
 class LongStage:

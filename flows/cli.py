@@ -10,6 +10,7 @@ from cyclopts import App, Parameter
 
 from flows.launch import limit_threads
 from flows.options import Preset, Settings, frame_size
+from flows.stopping import STOPPED, leave
 from velfield.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,9 +22,17 @@ if TYPE_CHECKING:
 DONE, BAD_INPUT, USAGE, INCOMPLETE = 0, 1, 2, 3
 """Exit statuses. 3: done, but frames were lost."""
 
+
+def _version() -> str:
+    from velfield.version import code_version
+
+    return code_version()
+
+
 app = App(
     name="velfield",
     help="Aerial video of a city in, a probability distribution over vehicle velocity at every pixel of the map out.",
+    version=_version,
     version_flags=["--version"],
     help_format="plaintext",  # Markdown takes a third of the time of --help
 )
@@ -280,8 +289,10 @@ def _process(
     verbosity: "Verbosity" = "normal",
 ) -> int:
     from flows.launch import first_start, prepare_process
+    from flows.stopping import stop_when_told
     from velfield.plan import check_inputs
 
+    stop_when_told()
     check_inputs(job)  # before Prefect: its start takes seconds
     prepare_process(verbose=verbosity == "verbose")
     from flows.console import Console
@@ -351,8 +362,7 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = DONE
     except KeyboardInterrupt:
-        print("velfield: stopped; the same command resumes", file=sys.stderr)
-        status = 130
+        leave(STOPPED)
     sys.exit(status)
 
 

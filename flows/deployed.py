@@ -1,5 +1,6 @@
 """Flows as a server runs them: parameters that fit into JSON, each a few lines round the flows of the command."""
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,6 +39,8 @@ def process_dropped(source: str, runs: str, cluster: str = "") -> str:
     summary = run_flight(job, _runner(cluster), Console("quiet"))
     for line in summary.frames_lost:
         get_run_logger().warning(line)
+    lost = f", {len(summary.frames_lost)} frames lost" if summary.frames_lost else ""
+    _say(f"{Path(source).name} is done{lost}: {summary.root}")
     return summary.root
 
 
@@ -74,8 +77,14 @@ def reprocess_runs(runs: str, base_images: str, base: str = "", run: str = "", c
                 raise
             refused.append(root.name)
             logger.warning("%s stays as it is: %s", root.name, error)
+    _say(f"{picture.name}: {len(made)} results made, {len(refused)} runs stay as they are")
     logger.info("%s: %d results made, %d runs stay as they are", picture.name, len(made), len(refused))
     return made
+
+
+def _say(text: str) -> None:
+    """To the terminal that serves."""
+    print(f"{time.strftime('%H:%M:%S')}    {text}", flush=True)
 
 
 def _runner(cluster: str) -> RunnerConfig:

@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+PAGES, PAGES_OF = "VELFIELD_PAGES", "VELFIELD_PAGES_OF"
+"""Environment: where `velfield serve` shows the pages of runs, and of which folder."""
 _SETTINGS: dict[str, str] = {
     # The temporary server imports from the working folder: a module there with a common name would break it.
     "PYTHONSAFEPATH": "1",

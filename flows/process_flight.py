@@ -26,6 +26,7 @@ from velfield.plan import Plan, make_plan, write_flight_record
 from velfield.provenance import sweep_partial
 from velfield.steps.field import field_groups, group_name, lay_out_field
 from velfield.steps.frames import lay_out_frames
+from velfield.steps.given import check_given
 from velfield.steps.outcome import unit_name
 from velfield.steps.planning import check_space
 from velfield.steps.registration import lay_out_registration, lost_frames
@@ -52,6 +53,7 @@ def process_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSumma
         mark_crashed(job.root)
         sweep_partial(layout.root)
         plan = make_plan(job)
+        check_given(plan)
         check_space(plan)
         write_flight_record(plan)
         console.event("start", f"{job.inputs.source}: {plan.frame_count} frames to work on, {where.description}")

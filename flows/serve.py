@@ -20,6 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flows.launch import PAGES, PAGES_OF
+from flows.stopping import end_children
 from velfield.errors import InputError
 from velfield.incoming import Watch
 
@@ -200,15 +202,28 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 @contextlib.contextmanager
+def pages(config: ServeConfig) -> Iterator[None]:
+    """The runs' own pages, at the port after the UI's, for this machine alone; the runs' artifacts link to them."""
+    from velfield.viewer.server import files_app, served_beside
+
+    with served_beside(files_app(config.runs), config.port + 1) as address:
+        os.environ.update({PAGES: address, PAGES_OF: str(config.runs)})
+        print(f"pages       {address}/RUN/", flush=True)
+        yield
+
+
+@contextlib.contextmanager
 def watching(config: ServeConfig) -> Iterator[None]:
     """Look at the folders for the time of the context, and say as events what arrives."""
     from prefect.events import emit_event
 
     def flight(path: Path) -> None:
+        _say(f"{path.name} has arrived: it is processed")
         _resource = {"prefect.resource.id": f"velfield.flight.{path.name}"}
         emit_event(FLIGHT_ARRIVED, resource=_resource, payload={"source": str(path.resolve())})
 
     def base_image(path: Path) -> None:
+        _say(f"base image {path.name} has arrived: all runs are reprocessed")
         _resource = {"prefect.resource.id": f"velfield.base-image.{path.name}"}
         emit_event(BASE_IMAGE_ARRIVED, resource=_resource, payload={"base": path.name, "run": ""})
 
@@ -251,25 +266,15 @@ def serve_folder(config: ServeConfig) -> None:
                 ("runs", config.runs),
             ):
                 print(f"{name:<12}{path}", flush=True)
-            with watching(config):
+            with watching(config), pages(config):
                 serve(*deployments(config), pause_on_shutdown=False, print_starting_message=False, limit=config.limit)
     finally:
-        _end_children()
+        end_children(_STOP_S)
+
+
+def _say(text: str) -> None:
+    print(f"{time.strftime('%H:%M:%S')}    {text}", flush=True)
 
 
 def _interrupt(_signal: int, _frame: object) -> None:
     raise KeyboardInterrupt
-
-
-def _end_children() -> None:
-    """What this process started and is still there: flow runs that were under way."""
-    import psutil
-
-    children = psutil.Process().children(recursive=True)
-    for child in children:
-        with contextlib.suppress(psutil.NoSuchProcess):
-            child.terminate()
-    _, alive = psutil.wait_procs(children, timeout=_STOP_S)
-    for child in alive:
-        with contextlib.suppress(psutil.NoSuchProcess):
-            child.kill()

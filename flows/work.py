@@ -85,11 +85,12 @@ class Work:
         started = time.monotonic()
         whole = [future for stage in after for future in stage.futures if not _is_lost(future)]
         stage = Stage()
-        done_before = 0
+        before: list[CommitRecord] = []
         with self.console.stage(name, _LABELS[name], sum(unit.steps for unit in units)) as progress:
             for k, unit in enumerate(units):
                 local = beside.futures[k : k + 1 + halo] if beside else []
-                done_before += committed(self.plan, name, unit.name) is not None
+                record = committed(self.plan, name, unit.name)
+                before += [] if record is None else [record]
                 stage.futures.append(self._submit(name, unit, [*whole, *local]))
             records = self._collect(name, stage, units, progress, essential=essential)
         self.plan = self.plan.despite([f"{name} {unit}" for unit in stage.lost])
@@ -97,7 +98,7 @@ class Work:
             name,
             records,
             units=len(units),
-            done_before=done_before,
+            before=before,
             lost=stage.lost,
             seconds=time.monotonic() - started,
         )
@@ -107,17 +108,18 @@ class Work:
             f"{_LABELS[name]:<13} {summary.text}   {summary.seconds:.1f} s",
             stage=summary.model_dump(mode="json"),
         )
-        for note in summary.notes[:5]:
-            self.console.warn(note)
-        if len(summary.notes) > 5:
-            self.console.warn(f"... and {len(summary.notes) - 5} more of {_LABELS[name]}; all are in the report")
+        for note in summary.notes:
+            self.console.event("note", f"  {note}")
+        for warning in summary.warnings[:5]:
+            self.console.warn(warning)
+        if len(summary.warnings) > 5:
+            self.console.warn(f"... and {len(summary.warnings) - 5} more of {_LABELS[name]}; all are in the report")
         return stage
 
     def carry_over(self, name: str) -> None:
         """Tell of a stage whose units an earlier result had finished, and that this one takes as they are."""
         records = read_commits(self.plan.layout, name)
-        count = len(records)
-        summary = summarise_stage(name, records, units=count, done_before=count, lost=(), seconds=0.0)
+        summary = summarise_stage(name, records, units=len(records), before=records, lost=(), seconds=0.0)
         self.summaries.append(summary)
 
     def _submit(self, name: str, unit: Unit, wait_for: list[Future]) -> Future:

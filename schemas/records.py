@@ -24,7 +24,9 @@ class CommitRecord(Model):
     counts: dict[str, float] = Field(default_factory=dict)
     """What people ask of the unit: frames, cars, tracklets, pixels."""
     notes: tuple[str, ...] = ()
-    """Warnings of the unit, one line each."""
+    """What is worth telling of the unit, one line each."""
+    warnings: tuple[str, ...] = ()
+    """What is to be minded, one line each."""
     seconds: float = Field(0.0, ge=0)
     code_version: str
 

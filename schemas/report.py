@@ -50,14 +50,19 @@ class Report(Model):
     version: str
     facts: tuple[tuple[str, str], ...] = ()
     """Headline numbers: label and value."""
+    few: str = ""
+    """What is to be said where hardly any pixel was passed by several vehicles."""
     inputs: tuple[tuple[str, str], ...] = ()
     """What went in: base image, ground distance, labels, preset; label and value."""
     stages: tuple[ReportStage, ...] = ()
     residual: ResidualSeries | None = None
     detection: PrecisionRecall | None = None
     gates: dict[str, int] = Field(default_factory=dict)
-    """Links that each gate of the tracking turned down, and those kept."""
+    """What tracking tried, turned down and kept, by the names of `velfield.tracking.limits.GateLog`."""
+    notes: tuple[str, ...] = ()
+    """What is worth telling of the stages."""
     warnings: tuple[str, ...] = ()
+    """What is to be minded."""
     frames_lost: tuple[str, ...] = ()
     files: tuple[tuple[str, str], ...] = ()
     """Files of the run folder worth opening: path relative to the report, and what it is."""

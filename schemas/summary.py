@@ -16,7 +16,13 @@ class StageSummary(Model):
     """Units that failed in every try: done again by the next run."""
     counts: dict[str, float] = Field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    """What is worth telling."""
+    warnings: tuple[str, ...] = ()
+    """What is to be minded."""
     seconds: float
+    """What this run spent on it."""
+    seconds_before: float = 0.0
+    """What earlier runs spent on the units that they had finished, added up."""
     text: str
     """The stage in one line, for people."""
 

@@ -15,34 +15,47 @@ from pathlib import Path
 
 import numpy as np
 
+from flows.stopping import STOPPED
 from tests.small_flight import digests, job, process
 
 _RUN = """if True:
     import sys
     from flows.launch import limit_threads, prepare_process
+    from flows.stopping import STOPPED, leave, stop_when_told
     limit_threads()
     prepare_process(verbose=False)
+    stop_when_told()
     from pathlib import Path
     from tests.small_flight import job, process
-    process(job(Path(sys.argv[1]), Path(sys.argv[2])))
+    try:
+        process(job(Path(sys.argv[1]), Path(sys.argv[2])))
+    except KeyboardInterrupt:
+        leave(STOPPED)
 """
 
 
 def run_with_kills(flight: Path, root: Path, kills: int, seed: int) -> int:
     """A run of the small flight, killed so many times, each time a little after a random number of commits, then left.
 
+    The last is told to end (SIGTERM) and must within seconds, the others are killed.
+
     Returns how many kills met a run that was under way.
     """
     rng = np.random.default_rng(seed)
     met = 0
     before = len(list(root.glob("commits/*/*.json")))
-    for commits in np.sort(rng.integers(before, 20, kills)):
+    for kill, commits in enumerate(np.sort(rng.integers(before, 20, kills))):
         with _started(flight, root) as child:
             while child.poll() is None and len(list(root.glob("commits/*/*.json"))) < commits:
                 time.sleep(0.02)
             time.sleep(float(rng.uniform(0, 1.5)))
             met += child.poll() is None
-            if child.poll() is None:
+            if child.poll() is None and kill == kills - 1:
+                child.terminate()
+                status = child.wait(30)
+                # With 0 where it was done that moment, by the signal where it had not got so far as to mind it.
+                assert status in (STOPPED, 0, -signal.SIGTERM), status
+            elif child.poll() is None:
                 os.killpg(child.pid, signal.SIGKILL)
     with _started(flight, root) as child:
         assert child.wait(600) == 0
@@ -51,7 +64,9 @@ def run_with_kills(flight: Path, root: Path, kills: int, seed: int) -> int:
 
 def _started(flight: Path, root: Path) -> "subprocess.Popen[bytes]":
     command = [sys.executable, "-c", _RUN, str(flight), str(root)]
-    return subprocess.Popen(command, cwd=Path(__file__).parents[1], start_new_session=True)
+    checkout = str(Path(__file__).parents[1])  # named: a process that has set up Prefect leaves PYTHONSAFEPATH behind
+    environment = {**os.environ, "PYTHONPATH": checkout}
+    return subprocess.Popen(command, cwd=checkout, env=environment, start_new_session=True)
 
 
 def main() -> None:

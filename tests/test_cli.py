@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,10 @@ def test_help_lists_the_commands() -> None:
     told = velfield("--help")
     assert told.returncode == 0
     assert [name for name in ("demo", "run", "schema", "simulate") if name not in told.stdout] == []
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    assert velfield("--version").stdout.strip() == version("velfield")
 
 
 def test_usage_is_status_2() -> None:

@@ -55,6 +55,16 @@ def test_a_file_that_is_no_yaml(tmp_path: Path) -> None:
     file.write_text("frames: [1, 2")
     with pytest.raises(InputError, match="this is not YAML"):
         resolve_config(file=file)
+    file.write_text("preset: best\n\n# tracking:\n   max_speed_m_per_s: 20\n")
+    with pytest.raises(InputError, match=r"line 4: this is not YAML.*`section:` on a line of its own") as caught:
+        resolve_config(file=file)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_section_without_keys_says_nothing(tmp_path: Path) -> None:
+    file = tmp_path / "flight.yaml"
+    file.write_text("tracking:\n# max_speed_m_per_s: 20\n")
+    assert resolve_config(file=file) == resolve_config()
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:

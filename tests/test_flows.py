@@ -67,6 +67,7 @@ def test_a_second_run_does_nothing_again(whole: tuple[Path, RunSummary], flight:
     again = process(job(flight, root))
     assert redone(again) == []
     assert digests(root) == before
+    assert all(stage.seconds_before > 0 for stage in again.stages)  # the report tells what the work took, once done
 
 
 def test_a_changed_gate_redoes_tracking_onward(whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path) -> None:

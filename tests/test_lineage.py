@@ -61,7 +61,7 @@ def test_the_command_tells_it_offline(
     whole: tuple[Path, RunSummary], pixel: tuple[int, int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     root, (x, y) = whole[0], pixel
-    assert lineage(root) == lineage(root, x, y) == 0
+    assert lineage(root) == lineage(root, str(x), y) == lineage(root, f"{x},{y}") == 0
     told = capsys.readouterr().out
     assert digest_file(root / "detector.json") in told
     assert digest_file(root / "base/base_image.png") in told

@@ -9,9 +9,12 @@ import pytest
 
 from schemas.job import Inputs, Job
 from schemas.records import InputsRecord, SourceRecord
+from tests.small_flight import job
 from velfield.configuration import resolve_config
-from velfield.plan import Plan, stage_keys
+from velfield.errors import InputError
+from velfield.plan import Plan, make_plan, stage_keys
 from velfield.sources.frames import SourceInfo
+from velfield.steps.given import check_given
 from velfield.steps.planning import describe_plan, planned_units
 
 FOUR_HOURS = 72_000
@@ -40,6 +43,16 @@ def test_task_runs_grow_with_chunks_not_with_frames(tmp_path: Path) -> None:
     runs = {frames: len(planned(frames, tmp_path).units) for frames in (18, 300, 3000, 30_000, FOUR_HOURS)}
     assert max(runs.values()) < 300
     assert runs[300] >= 4  # and yet several workers have something to do
+
+
+@pytest.mark.parametrize("option", ["base", "labels", "detector", "detections"])
+def test_what_is_not_what_it_was_given_as_is_told_before_any_work(flight: Path, tmp_path: Path, option: str) -> None:
+    (tmp_path / "hello.txt").write_text("hello\n")
+    given = job(flight, tmp_path / "run")
+    given = given.model_copy(update={"inputs": given.inputs.model_copy(update={option: str(tmp_path / "hello.txt")})})
+    with pytest.raises(InputError, match=f"^--{option}: .*hello.txt") as caught:
+        check_given(make_plan(given))
+    assert "b'" not in str(caught.value)
 
 
 def test_a_plan_is_small(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -220,6 +221,11 @@ def test_from_the_event_to_the_finished_reprocess(served: Served, flight: Path) 
     assert served.states() == {".spring.png": "COMPLETED"}
     results = json.loads((served.folder / "runs/main-street/results.json").read_text())["results"]
     assert [(result["name"], result["how"]) for result in results] == [("first", "run"), ("spring", "mapped")]
+    (link,) = served.ask("/artifacts/filter", {"artifacts": {"key": {"any_": ["report"]}}})
+    address = re.fullmatch(r"\[report\]\((http://127\.0\.0\.1:\d+/main-street/\S+)\)", link["data"])
+    assert address is not None, link["data"]
+    with urllib.request.urlopen(address[1], timeout=30) as answer:
+        assert b"<title>" in answer.read()
 
 
 _BLINKS = """if True:

@@ -52,6 +52,13 @@ def test_every_key_stands_in_it_and_may_be_uncommented(pictures: Path, tmp_path:
     }
 
 
+def test_one_key_is_set_by_taking_its_mark_away(pictures: Path, tmp_path: Path) -> None:
+    out = tmp_path / "flight.yaml"
+    init(str(pictures), "--fps", "10", "--out", str(out))
+    out.write_text(out.read_text().replace("#   max_speed_m_per_s: 34.5", "   max_speed_m_per_s: 20", 1))
+    assert resolve_config(file=out).tracking.max_speed_m_per_s == 20
+
+
 def test_a_file_that_is_there_is_left_alone(pictures: Path, tmp_path: Path) -> None:
     out = tmp_path / "flight.yaml"
     out.write_text("preset: fast\n")

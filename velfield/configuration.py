@@ -70,15 +70,26 @@ def _read(file: Path) -> Tree:
         raise InputError(
             f"{file}: found a {type(tree).__name__}; expected sections with keys, see examples/flight.yaml"
         )
-    return tree
+    # A section all of whose keys are commented out, as `velfield init` writes it, says nothing.
+    return {key: value for key, value in tree.items() if value is not None or not _is_section(key)}
+
+
+def _is_section(key: str) -> bool:
+    info = FlightConfig.model_fields.get(key)
+    return info is not None and isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel)
 
 
 def _yaml(text: str, what: str) -> Any:
     try:
         return yaml.safe_load(text)
     except yaml.YAMLError as error:
-        problem = " ".join(str(error).split())
-        raise InputError(f"{what}: this is not YAML ({problem})") from None
+        mark = getattr(error, "problem_mark", None)
+        where = "" if mark is None or "\n" not in text.strip() else f"line {mark.line + 1}: "
+        problem = getattr(error, "problem", None) or "it cannot be read"
+        raise InputError(
+            f"{what}: {where}this is not YAML ({problem}); expected `section:` on a line of its own and its keys, "
+            "indented alike, below it"
+        ) from None
 
 
 def _put(tree: Tree, dotted: str, value: object) -> None:

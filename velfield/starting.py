@@ -32,6 +32,7 @@ def starting_config(source: str, info: SourceInfo) -> str:
     config = resolve_config()
     lines = [
         "# The configuration of a flight. Every key is optional; those below are commented out at their defaults.",
+        "# To set one, take its `#` away: its section stands above it.",
         f"# Use it:  velfield run {source} --out RUN --config flight.yaml",
         "#",
         *(f"# {line}" for line in found_lines(info, config)),
@@ -42,7 +43,7 @@ def starting_config(source: str, info: SourceInfo) -> str:
         "# gsd_m: 0.23",
     ]
     for name, section in _sections(config):
-        lines += ["", *_comment(type(section).__doc__ or "", ""), f"# {name}:", *_keys(section)]
+        lines += ["", *_comment(type(section).__doc__ or "", ""), f"{name}:", *_keys(section)]
     return "\n".join(lines) + "\n"
 
 

@@ -36,5 +36,5 @@ def init(
     info = probe(source, frames=FramesConfig(fps=fps), timestamps=timestamps)
     write_atomically(out, starting_config(str(source), info).encode())
     print("\n".join(found_lines(info, resolve_config())))
-    print(f"{out}: try  velfield run {source} --config {out} --out RUN")
+    print(f"{out}: try  velfield run {source} --config {out} --gsd-m METRES_A_PIXEL --out RUN")
     return 0

@@ -10,7 +10,7 @@ from velfield.errors import InputError
 
 def lineage(
     run_folder: Path,
-    x: int | None = None,
+    x: str | None = None,
     y: int | None = None,
     /,
     *,
@@ -24,7 +24,7 @@ def lineage(
     run_folder
         The run folder.
     x
-        Column of the pixel, base pixels.
+        Column of the pixel, base pixels; or X,Y.
     y
         Row of the pixel, base pixels.
     pixel
@@ -45,14 +45,13 @@ def lineage(
     return 0
 
 
-def _pixel(x: int | None, y: int | None, text: str | None) -> tuple[int, int] | None:
-    if text is None and y is None and x is None:
+def _pixel(x: str | None, y: int | None, text: str | None) -> tuple[int, int] | None:
+    given = [str(part) for part in (x, y, text) if part is not None]
+    if not given:
         return None
-    if text is None and x is not None and y is not None:
-        return x, y
-    parts = (text or "").split(",")
-    if x is not None or len(parts) != 2 or not all(part.strip().lstrip("-").isdigit() for part in parts):
-        raise InputError(f"found {text or f'{x} alone'}; expected a pixel as two whole numbers, X Y or --pixel X,Y")
+    parts = ",".join(given).split(",")
+    if len(parts) != 2 or not all(part.strip().removeprefix("-").isdigit() for part in parts):
+        raise InputError(f"found {' '.join(given)}; expected a pixel as two whole numbers, X Y or X,Y")
     return int(parts[0]), int(parts[1])
 
 

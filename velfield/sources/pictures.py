@@ -125,7 +125,7 @@ def _plugin(path: Path) -> type:
         raise InputError(
             f"{path.name}: found a VRT, which names other files, expected {_READ}; write it out with gdal_translate"
         )
-    raise InputError(f"{path.name}: found {head[:4]!r} at its start, expected {_READ}; convert it")
+    raise InputError(f"{path.name}: found the bytes {head[:4].hex(' ')} at its start, expected {_READ}; convert it")
 
 
 def _grey(path: Path, picture: Image.Image) -> NDArray[np.uint8]:

@@ -146,7 +146,7 @@ def _without_labels(plan: Plan, scale: float | None, labels: MotionLabels) -> Ou
     if scale is None:
         raise InputError(f"{told}; or give --gsd-m, so that the shipped detector can be used")
     outcome = _finish(plan, shipped_detector(), scale, "shipped", motion=labels)
-    return Outcome(outcome.outputs, outcome.counts, [f"{told}. The shipped detector is used", *outcome.notes])
+    return Outcome(outcome.outputs, outcome.counts, outcome.notes, [f"{told}. The shipped detector is used"])
 
 
 def _motion_frames(plan: Plan, scale: float) -> list[MotionFrame]:

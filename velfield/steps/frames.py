@@ -45,13 +45,13 @@ def read_unit(plan: Plan, frames: range) -> Outcome:
     before = int(plan.indices[frames.start - 1]) if frames.start else None
     flags = np.zeros(len(frames), np.uint16)
     sharpness, brightness = np.full(len(frames), np.nan, np.float32), np.full(len(frames), np.nan, np.float32)
-    notes = []
+    warnings = []
     source = Path(plan.job.inputs.source)
     for k, found in enumerate(iter_frames(source, plan.info, indices, after=before)):
         store.write(frames[k], found.grey)
         flags[k] = found.flags
         if found.reason:
-            notes.append(f"frame {frames[k]}: {found.reason}")
+            warnings.append(f"frame {frames[k]}: {found.reason}")
         if not found.flags & FrameFlag.UNREADABLE:
             quality = frame_quality(found.grey)
             sharpness[k], brightness[k] = quality.sharpness, quality.brightness
@@ -70,4 +70,4 @@ def read_unit(plan: Plan, frames: range) -> Outcome:
     }
     store.write_columns(frames.start, columns)
     usable = int(np.sum((flags & int(UNUSABLE)) == 0))
-    return Outcome(store.files(frames.start, frames.stop), {"frames": len(frames), "usable": usable}, notes)
+    return Outcome(store.files(frames.start, frames.stop), {"frames": len(frames), "usable": usable}, warnings=warnings)

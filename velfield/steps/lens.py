@@ -45,9 +45,8 @@ def calibrate_flight(plan: Plan) -> Outcome:
     counts = {"corner_px": _corner_shift(record, width, height)}
     if record.residual_px is not None:
         counts["residual_px"] = record.residual_px
-    return Outcome(
-        [plan.layout.camera], counts, [] if record.accepted else [f"lens taken for a pin-hole: {record.reason}"]
-    )
+    notes = [] if record.accepted else ["why the lens is taken for a pin-hole, and how near it was: camera.json"]
+    return Outcome([plan.layout.camera], counts, notes)
 
 
 def _corner_shift(record: CameraRecord, width: int, height: int) -> float:

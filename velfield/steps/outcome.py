@@ -18,7 +18,9 @@ class Outcome:
     """Files written, inside the run folder; of a store, its chunks."""
     counts: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    """Warnings, one line each."""
+    """What is worth telling, one line each."""
+    warnings: list[str] = field(default_factory=list)
+    """What is to be minded, one line each."""
 
 
 def unit_name(frames: range) -> str:
@@ -41,6 +43,7 @@ def commit(plan: Plan, stage: str, unit: str, outcome: Outcome, *, started: floa
         outputs=digest_outputs(plan.layout, outcome.outputs),
         counts=outcome.counts,
         notes=tuple(outcome.notes),
+        warnings=tuple(outcome.warnings),
         seconds=max(0.0, time.time() - started),
         code_version=code_version(),
     )

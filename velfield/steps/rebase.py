@@ -155,7 +155,8 @@ def rebase_detections(plan: Plan, frames: range, rebase: Rebase) -> Outcome:
     unit = frames.start // plan.unit_frames
     source = plan.layout.unit_file(rebase.old.detections, unit, ".parquet")
     if not source.exists():
-        return Outcome([], {"frames": 0.0, "cars": 0.0}, [f"frames {frames.start} to {frames.stop - 1} have no cars"])
+        told = f"frames {frames.start} to {frames.stop - 1} have no cars"
+        return Outcome([], {"frames": 0.0, "cars": 0.0}, warnings=[told])
     table = mapped_detections(read_tables([source], DETECTION_COLUMNS), polyprojective_of(rebase.record.transform))
     path = plan.layout.unit_file(plan.layout.detections, unit, ".parquet")
     write_table(path, table, DETECTION_COLUMNS)

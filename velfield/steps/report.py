@@ -9,13 +9,14 @@ import numpy as np
 from schemas.report import PrecisionRecall, Report, ReportFigure, ReportStage, ResidualSeries
 from schemas.summary import RunSummary, StageSummary
 from velfield.detection.detector import load_detector
+from velfield.insight.coverage import few_vehicles, percent
 from velfield.layout import RunLayout
 from velfield.plan import Plan
 from velfield.provenance import write_atomically
 from velfield.render.figures import jpeg_bytes
 from velfield.render.report import render_report
 from velfield.render.viewer_page import NOT_BUILT, licences, page_is_built, render_viewer
-from velfield.steps.grid import read_grid
+from velfield.steps.grid import north_of, read_grid
 from velfield.steps.working import read_working
 from velfield.stores import open_frames, open_registration
 from velfield.version import code_version
@@ -85,14 +86,17 @@ def make_report(plan: Plan, summary: RunSummary) -> Report:
         created=datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
         version=code_version(),
         facts=tuple(_facts(plan, counts)),
+        few=few_vehicles(int(counts["field"].get("pixels", 0)), int(counts["field"].get("pixels_5", 0))),
         inputs=tuple(_inputs(plan)),
         stages=tuple(
-            ReportStage(name=s.name, text=s.text, seconds=s.seconds, lost=len(s.lost)) for s in summary.stages
+            ReportStage(name=s.name, text=s.text, seconds=s.seconds + s.seconds_before, lost=len(s.lost))
+            for s in summary.stages
         ),
         residual=_residual(plan),
         detection=_curve(plan),
         gates=_gates(summary.stages),
-        warnings=(*plan.info.warnings, *(note for stage in summary.stages for note in stage.notes)),
+        notes=tuple(note for stage in summary.stages for note in stage.notes),
+        warnings=(*plan.info.warnings, *(warning for stage in summary.stages for warning in stage.warnings)),
         frames_lost=summary.frames_lost,
         files=tuple(_files(plan)),
     )
@@ -100,6 +104,8 @@ def make_report(plan: Plan, summary: RunSummary) -> Report:
 
 def _facts(plan: Plan, counts: dict[str, dict[str, float]]) -> list[tuple[str, str]]:
     times_s = plan.info.times_s[plan.indices]
+    grid, field = read_grid(plan), counts["field"]
+    pixels = field.get("pixels", 0)
     frames, registered = counts["registration"].get("frames", 0), counts["registration"].get("registered", 0)
     return [
         ("flight", f"{times_s[-1] - times_s[0]:.1f} s, {plan.frame_count} frames"),
@@ -107,7 +113,8 @@ def _facts(plan: Plan, counts: dict[str, dict[str, float]]) -> list[tuple[str, s
         ("residual", f"{counts['registration'].get('heldout_px', float('nan')):.2f} px held out"),
         ("cars found", f"{counts['detections'].get('cars', 0):.0f}"),
         ("vehicles going by", f"{counts['tracklets'].get('passages', 0):.0f}"),
-        ("pixels known", f"{counts['field'].get('pixels', 0):.0f}"),
+        ("of the map, passed by vehicles", percent(pixels, grid.width_px * grid.height_px)),
+        ("of that, by 5 or more", percent(field.get("pixels_5", 0), pixels)),
     ]
 
 
@@ -149,10 +156,11 @@ def _gates(stages: Sequence[StageSummary]) -> dict[str, int]:
 
 def _files(plan: Plan) -> list[tuple[str, str]]:
     layout, told = plan.layout, []
+    north = "the picture's up: north is not known" if north_of(read_grid(plan)) is None else "north"
     for path, what in (
         (layout.maps / "direction.png", "modal direction"),
         (layout.maps / "speed.png", "modal speed"),
-        (layout.maps / "direction.tif", "modal direction, heading in degrees, for GIS"),
+        (layout.maps / "direction.tif", f"modal direction for GIS, degrees clockwise from {north}"),
         (layout.maps / "speed.tif", "modal speed for GIS"),
     ):
         if path.exists():

@@ -14,31 +14,41 @@ _LINES: dict[str, str] = {
     "detections": "{cars:.0f} cars in {frames:.0f} frames",
     "links": "{tracklets:.0f} tracklets over three frames",
     "tracklets": "{passages:.0f} vehicles going by in {tracklets:.0f} tracklets",
-    "field": "{pixels:.0f} pixels known, {pixels_5:.0f} of them by 5 or more vehicles",
+    "field": "vehicles passed {pixels:.0f} pixels, 5 or more vehicles {pixels_5:.0f} of them",
     "maps": "{maps:.0f} maps",
 }
+_PIN_HOLE = "no distortion to be told from none: taken for a pin-hole"
 _MEANS = frozenset({"heldout_px", "residual_px"})
 """Counts that are averaged over units, weighted by frames; all others are summed."""
 
 
 def summarise_stage(
-    name: str, records: Sequence[CommitRecord], *, units: int, done_before: int, lost: Sequence[str], seconds: float
+    name: str,
+    records: Sequence[CommitRecord],
+    *,
+    units: int,
+    before: Sequence[CommitRecord],
+    lost: Sequence[str],
+    seconds: float,
 ) -> StageSummary:
-    """Add up a stage's units."""
+    """Add up a stage's units; ``before``: those that an earlier run had finished."""
     counts = _total([record.counts for record in records])
-    text = _LINES[name].format_map({key: counts.get(key, float("nan")) for key in _keys(_LINES[name])})
-    if done_before:
-        text += f" ({done_before} of {units} units were done before)" if done_before < units else " (done before)"
+    line = _PIN_HOLE if name == "lens" and not counts.get("corner_px") else _LINES[name]
+    text = line.format_map({key: counts.get(key, float("nan")) for key in _keys(line)})
+    if before:
+        text += f" ({len(before)} of {units} units were done before)" if len(before) < units else " (done before)"
     if lost:
         text += f"; {len(lost)} of {units} units lost"
     return StageSummary(
         name=name,
         units=units,
-        done_before=done_before,
+        done_before=len(before),
         lost=tuple(lost),
         counts=counts,
         notes=tuple(note for record in records for note in record.notes),
+        warnings=tuple(warning for record in records for warning in record.warnings),
         seconds=seconds,
+        seconds_before=sum(record.seconds for record in before),
         text=text,
     )
 
