@@ -10,7 +10,8 @@ import socket
 import threading
 import webbrowser
 from base64 import b64encode
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from hashlib import sha256
 from os import environ
 from pathlib import Path
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from starlette.applications import Starlette
 
 HOST = "127.0.0.1"
+_STOP_S = 5.0
 _NAMES = [HOST, "localhost"]
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -65,13 +67,17 @@ def view_app(root: Path) -> "Starlette":
     InputError
         There is no page in the folder.
     """
+    if not (root / "index.html").is_file():
+        raise InputError(f"{root} holds no index.html: make it with `velfield run ... --out {root}`")
+    return files_app(root)
+
+
+def files_app(root: Path) -> "Starlette":
+    """The server of a folder: a run's, or one of runs."""
     from starlette.applications import Starlette
     from starlette.exceptions import HTTPException
     from starlette.routing import Mount
     from starlette.staticfiles import StaticFiles
-
-    if not (root / "index.html").is_file():
-        raise InputError(f"{root} holds no index.html: make it with `velfield run ... --out {root}`")
 
     class RunFiles(StaticFiles):
         async def get_response(self, path: str, scope: Any) -> Any:
@@ -94,6 +100,26 @@ def own_names() -> Any:
     from starlette.middleware.trustedhost import TrustedHostMiddleware
 
     return Middleware(TrustedHostMiddleware, allowed_hosts=_NAMES, www_redirect=False)
+
+
+@contextmanager
+def served_beside(app: "Starlette", port: int) -> Iterator[str]:
+    """Serve in a thread for the time of the context, at this port, or any where it is taken: the address."""
+    import uvicorn
+
+    try:
+        listener = _listening(port)
+    except InputError:
+        listener = _listening(None)
+    with listener:
+        server = uvicorn.Server(uvicorn.Config(app, log_level="warning", lifespan="off", server_header=False))
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, name="pages", daemon=True)
+        thread.start()
+        try:
+            yield f"http://{HOST}:{listener.getsockname()[1]}"
+        finally:
+            server.should_exit = True
+            thread.join(_STOP_S)
 
 
 def serve(app: "Starlette", *, port: int | None, open_browser: bool, say: Callable[[str], None]) -> None:
