@@ -81,3 +81,5 @@ class ViewRecord(Model):
     layers: tuple[ViewLayer, ...]
     arrays: dict[str, ViewArray]
     segments: ViewSegments
+    few: str = ""
+    """What is to be said where hardly any pixel was passed by several vehicles."""

@@ -14,8 +14,10 @@ from schemas.report import PrecisionRecall, Report, ReportFigure, ReportStage, R
 from velfield.errors import InputError
 from velfield.render.colours import direction_colours, ramp_colours
 from velfield.render.figures import MapScale, direction_figure, jpeg_bytes, png_bytes, speed_figure
+from velfield.render.gates import left_out, totals
 from velfield.render.panel import bar_ticks
 from velfield.render.report import render_report
+from velfield.tracking.limits import GateLog
 
 GREY = np.full((480, 640), 100, np.uint8)
 
@@ -140,7 +142,9 @@ def made_report() -> tuple[Report, list[ReportFigure]]:
         stages=(ReportStage(name="registration", text="8 of 9 frames", seconds=1.5, lost=1),),
         residual=ResidualSeries(times_s=(0.0, 0.2, 0.4, 0.6), residual_px=(0.3, None, 0.4, 0.5), limit_px=0.45),
         detection=PrecisionRecall(recall=(0.2, 0.9), precision=(1.0, 0.8), chosen=1, evidence="12 cars"),
-        gates={"kept": 1200, "too fast": 30},
+        gates={"links_tried": 1200, "speed": 30, "of_another_time": 7},
+        few="Directions hold; speeds are of single vehicles.",
+        notes=("lens taken for a pin-hole",),
         warnings=("few <b>labels</b>",),
         frames_lost=("frame 1 (0.200 s): failed:12 control points, 40 needed",),
         files=(("maps/direction.tif", "GeoTIFF"), ("javascript:alert(1)", "not a link")),
@@ -181,8 +185,48 @@ def test_policy_admits_the_style_and_nothing_else() -> None:
 
 def test_page_tells_what_the_run_was() -> None:
     page = render_report(*made_report())
-    for text in ("1,240", "8 of 9 frames", "too fast", "1,200", "12 control points", "Not complete", "precision 0.80"):
+    for text in (
+        "1,240",
+        "8 of 9 frames",
+        "faster than a vehicle",
+        "1,200",
+        "12 control points",
+        "Not complete",
+        "precision 0.80",
+    ):
         assert text in page
+
+
+def section(page: str, kind: str) -> str:
+    found = re.search(rf'<section class="{kind}">(.*?)</section>', page)
+    assert found is not None
+    return found.group(1)
+
+
+def test_only_what_is_to_be_minded_is_red() -> None:
+    page = render_report(*made_report())
+    assert "pin-hole" in section(page, "notes")
+    assert "Directions hold" in section(page, "few")
+    assert "labels" in section(page, "warnings")
+    assert not re.search("pin-hole|Directions hold", section(page, "warnings"))
+    assert page.index("Directions hold") < page.index("pin-hole") < page.index("<figure>")
+    report, figures = made_report()
+    calm = report.model_copy(update={"warnings": (), "frames_lost": (), "stages": ()})
+    assert 'class="warnings"' not in render_report(calm, figures)
+
+
+def test_what_tracking_left_out_stands_apart_from_what_it_tried() -> None:
+    gates = made_report()[0].gates
+    assert totals(gates) == [("Links tried, from a car to one in the next frame", "1,200"), ("of another time", "7")]
+    assert left_out(gates) == [("links", "faster than a vehicle", "30", "2 %")]
+
+
+def test_every_gate_that_tracking_counts_has_words() -> None:
+    told = set(re.findall(r"``(\w+)``", GateLog.__doc__ or ""))
+    assert {"links_tried", "not_best", "windows"} <= told
+    counts = dict.fromkeys(sorted(told), 3)
+    assert len(totals(counts)) + len(left_out(counts)) == len(told)
+    assert not {name.replace("_", " ") for name in told} & {words for words, _ in totals(counts)}
 
 
 def test_an_empty_report_is_a_page_too() -> None:

@@ -13,6 +13,7 @@ import pytest
 from schemas.summary import RunSummary
 from tests.browser import MIDDLE_OF_MAP, NEEDS_PAGE, Browser, Page, browser, served
 from velfield import open_run
+from velfield.insight import coverage
 from velfield.layout import RunLayout
 from velfield.render.figures import round_up, speed_reach
 from velfield.run import Run
@@ -146,12 +147,6 @@ def test_degrees_say_what_they_are_counted_from(chromium: Browser, address: str,
     degrees = f"{round(np.degrees(np.arctan2(vx, -vy))) % 360}°"
     with chromium.page() as page:
         for there, counted_from in ((address, " from up"), (north_up, " [NESW]{1,2}")):
-            page.open(f"{there}#line=10,200,600,200")
-            page.wait("document.querySelector('#answer h3') !== null")
-            assert re.search(
-                rf"towards 180°{counted_from}$", page.value("document.querySelector('#answer h3').textContent")
-            )
-            page.open("about:blank")
             page.open(f"{there}#pixel={x},{y}&view={x},{y},3")
             page.wait(ANSWERED)
             direction = page.value("document.querySelector('#answer [data-name=direction]').closest('td').textContent")
@@ -162,6 +157,9 @@ def test_degrees_say_what_they_are_counted_from(chromium: Browser, address: str,
             titles = page.value("[...document.querySelectorAll('#answer thead th')].map((cell) => cell.textContent)")
             assert ("From up" in titles) == (there == address)
             page.open("about:blank")
+        page.open(f"{address}#line=10,200,600,200")
+        page.wait("document.querySelector('#answer h3') !== null")
+        assert page.value("document.querySelector('#answer h3').textContent").endswith("towards 180° from up")
 
 
 def test_the_labels_of_a_histogram_do_not_touch(page: Page, address: str, run: Run) -> None:
@@ -314,9 +312,46 @@ def test_the_summary_is_the_report(page: Page, address: str) -> None:
     page.open(f"{address}#tab=summary")
     page.wait("document.querySelector('#summary-panel').hidden === false")
     text = page.value("document.getElementById('summary-panel').innerText")
-    for words in ("Which way traffic goes", "Registration", "Tracking gates", "What went in"):
+    for words in ("Which way traffic goes", "Registration", "What was tried and kept", "What went in"):
         assert words in text
     page.wait("[...document.querySelectorAll('figure img')][0].naturalWidth > 300")
+
+
+def test_a_short_clip_says_that_few_vehicles_passed_a_pixel(page: Page, address: str, run: Run) -> None:
+    count = run.field.count()
+    known, well = int((count > 0).sum()), int((count >= 5).sum())
+    assert well < known / 20, "the test needs a short clip"
+    page.open(f"{address}#tab=summary")
+    page.wait("document.querySelector('#summary-panel').hidden === false && document.getElementById('few').textContent")
+    for place in ("#few", "#summary-panel .few"):
+        text = page.value(f"document.querySelector('{place}').textContent")
+        assert "Directions hold; speeds and percentiles are those of single vehicles" in text
+    facts = dict(
+        page.value(
+            "[...document.querySelectorAll('.facts dl div')].map((d) => [...d.children].map((c) => c.textContent))"
+        )
+    )
+    assert facts["of the map, passed by vehicles"] == coverage.percent(known, count.size)
+    assert facts["of that, by 5 or more"] == coverage.percent(well, known)
+
+
+LABELS = """[...document.querySelectorAll('svg.plot')].filter((plot) => plot.checkVisibility()).map((plot) =>
+  [...plot.querySelectorAll('text')].map((text) => (({left, right, top, bottom}) => [left, right, top, bottom])(
+    text.getBoundingClientRect())))"""
+
+
+@pytest.mark.parametrize("width", [390, 1400])
+def test_the_labels_of_the_plots_can_be_read_on_any_screen(chromium: Browser, address: str, width: int) -> None:
+    with chromium.page(width=width, height=844) as opened:
+        opened.open(f"{address}#tab=summary")
+        opened.wait("document.querySelector('#summary-panel').hidden === false")
+        plots = opened.value(LABELS)
+    assert plots
+    for boxes in plots:
+        assert min(bottom - top for _, _, top, bottom in boxes) >= 13  # a letter of 11 px or more
+        for k, (left, right, top, bottom) in enumerate(boxes):
+            for a, b, c, d in boxes[k + 1 :]:
+                assert right < a or b < left or bottom < c + 3 or d < top + 3
 
 
 @pytest.mark.parametrize("tab", ["map", "summary"])

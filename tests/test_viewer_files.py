@@ -67,6 +67,7 @@ def test_the_record_lists_what_is_stored(whole: tuple[Path, RunSummary]) -> None
     run = open_run(whole[0])
     assert (record.height_px, record.width_px) == run.field.shape
     assert record.gsd_m == 0.23
+    assert run.record.config.field.lane_width_m / 4 / 0.23 == pytest.approx(record.segments.reach_px)
     assert record.segments.passages == len(np.unique(run.segments()["passage"]))
     for name, array in record.arrays.items():
         chunks = layout.root / array.store / name / "c"
@@ -92,6 +93,7 @@ def test_what_compare_left_is_shown(whole: tuple[Path, RunSummary], tmp_path: Pa
 def test_the_report_goes_by_mail(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
     page = export_run(open_run(whole[0]), "report", tmp_path / "report.html").read_text()
     assert page.count("data:image/jpeg;base64,") >= 2
+    assert "clockwise from the picture" in (whole[0] / "index.html").read_text()
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     assert "<script" not in page
     assert "Which way traffic goes" in page

@@ -38,6 +38,8 @@ export interface Run {
   layers: Layer[];
   arrays: Record<string, StoredArray>;
   segments: { count: number; passages: number; settle_px: number; reach_px: number };
+  /** Said where hardly any pixel was passed by several vehicles. */
+  few: string;
 }
 
 /** What people are told when something cannot be read. */

@@ -244,6 +244,7 @@ class Viewer {
       unit.disabled = true;
       unit.title = "metres a pixel are not known: give --gsd-m";
     }
+    find("few").textContent = this.run.few;
     find<HTMLInputElement>("opacity").value = String(this.state.opacity);
     find<HTMLInputElement>("least").value = String(this.state.least);
     find<HTMLInputElement>("tracks").checked = this.state.tracks;

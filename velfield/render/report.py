@@ -12,6 +12,7 @@ from importlib.resources import files
 from urllib.parse import quote
 
 from schemas.report import Report, ReportFigure, ReportStage
+from velfield.render.gates import left_out, totals
 from velfield.render.plots import precision_recall_plot, residual_plot
 
 
@@ -51,7 +52,9 @@ def render_sections(report: Report, figures: Sequence[ReportFigure]) -> str:
     """The report's sections and footer: what stands in a page's body below its title."""
     sections = [
         _warnings(report),
+        _section("Few vehicles at each pixel", f"<p>{escape(report.few)}</p>", "few") if report.few else "",
         _facts(report.facts),
+        _section("Notes", _items(report.notes), "notes") if report.notes else "",
         *map(_figure, figures),
         _stages(report.stages),
         _registration(report),
@@ -147,12 +150,22 @@ def _detection(report: Report) -> str:
 def _gates(gates: dict[str, int]) -> str:
     if not gates:
         return ""
-    rows = "".join(
-        f'<tr><th scope="row">{escape(name)}</th><td class="number">{count:,}</td></tr>'
-        for name, count in gates.items()
+    kept = _table(["What was tried and kept", "Number"], totals(gates), numbers=1)
+    lost = _table(["Left out", "Why", "Number", "Share"], left_out(gates), numbers=2)
+    return _section("Tracking", f'<div class="scroll narrow">{kept}</div><div class="scroll narrow">{lost}</div>')
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: int) -> str:
+    """A table whose last columns are numbers; nothing where it has no rows."""
+    if not rows:
+        return ""
+    kinds = [""] * (len(head) - numbers) + [' class="number"'] * numbers
+    titles = "".join(f'<th scope="col"{kind}>{title}</th>' for title, kind in zip(head, kinds, strict=True))
+    body = "".join(
+        "<tr>" + "".join(f"<td{kind}>{escape(cell)}</td>" for cell, kind in zip(row, kinds, strict=True)) + "</tr>"
+        for row in rows
     )
-    head = _head("Gate", number="Links")
-    return _section("Tracking gates", f'<div class="scroll narrow"><table>{head}<tbody>{rows}</tbody></table></div>')
+    return f"<table><thead><tr>{titles}</tr></thead><tbody>{body}</tbody></table>"
 
 
 def _frames_lost(frames: Sequence[str]) -> str:

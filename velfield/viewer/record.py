@@ -19,6 +19,7 @@ from schemas.records import FlightRecord, GridRecord
 from schemas.view import ViewArray, ViewBase, ViewLayer, ViewRecord, ViewSegments
 from velfield.field.bins import band_radius_px, standing_px_per_s
 from velfield.field.segments import Segments
+from velfield.insight.coverage import few_vehicles
 from velfield.insight.crossings import settle_px
 from velfield.layout import RunLayout
 from velfield.places import remove_tree
@@ -84,6 +85,7 @@ def view_record(
 ) -> ViewRecord:
     """``view/run.json`` of a run with these stores of layers, by their paths; the field is the first."""
     store = next(iter(stores.values()))
+    count = store.layer("count")
     known_s = times_s[np.isfinite(times_s)]
     return ViewRecord(
         width_px=grid.width_px,
@@ -104,6 +106,7 @@ def view_record(
             settle_px=settle_px(grid.gsd_m),
             reach_px=band_radius_px(flight.config.field, grid.gsd_m) or _LINE_REACH_PX,
         ),
+        few=few_vehicles(int((count > 0).sum()), int((count >= 5).sum())),
     )
 
 

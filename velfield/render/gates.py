@@ -1,0 +1,46 @@
+"""The counts of tracking's gates in people's words: what was tried and kept, and apart from it what was left out."""
+
+from collections.abc import Mapping
+
+_TOTALS = {
+    "windows": "Windows of three frames",
+    "links_tried": "Links tried, from a car to one in the next frame",
+    "pairs_tried": "Pairs of links tried, over three frames",
+    "tracklets": "Pairs kept: tracklets",
+    "links_refined": "Links of tracklets measured again in the pictures",
+    "links_not_refined": "Links of tracklets left as the cars were found",
+}
+_LEFT_OUT = {
+    "frames_not_registered": ("frames", "not registered to the map", None),
+    "gaps_too_long": ("frames", "the next one comes too late", None),
+    "speed": ("links", "faster than a vehicle", "links_tried"),
+    "axis": ("links", "not along the car's axis", "links_tried"),
+    "appearance": ("links", "another car looks more alike", "links_tried"),
+    "turn": ("pairs", "turn too sharply", "pairs_tried"),
+    "acceleration": ("pairs", "change speed too fast", "pairs_tried"),
+    "not_best": ("pairs", "another with the same car is likelier", "pairs_tried"),
+    "confidence": ("pairs", "likeliest, but not clearly", "pairs_tried"),
+}
+"""Gate -> what it left out, why, and of which total."""
+
+Rows = list[tuple[str, ...]]
+
+
+def totals(gates: Mapping[str, int]) -> Rows:
+    """What was tried and what was kept: words and count. A count that has no words here stands under its own name."""
+    known = [(words, f"{gates[name]:,}") for name, words in _TOTALS.items() if name in gates]
+    others = [name for name in gates if name not in _TOTALS and name not in _LEFT_OUT]
+    return [*known, *((name.replace("_", " "), f"{gates[name]:,}") for name in others)]
+
+
+def left_out(gates: Mapping[str, int]) -> Rows:
+    """What was left out: of what, why, count, and share of those tried."""
+    return [
+        (kind, why, f"{gates[name]:,}", _share(gates[name], gates.get(total or "", 0)))
+        for name, (kind, why, total) in _LEFT_OUT.items()
+        if name in gates
+    ]
+
+
+def _share(count: int, tried: int) -> str:
+    return f"{100 * count / tried:.0f} %" if tried else ""
