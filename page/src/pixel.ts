@@ -59,7 +59,7 @@ export function showPixel(answer: PixelAnswer, field: Field, units: Units, away:
   const { x, y, n, values, histogram } = answer;
   const card = make("section", { class: "answer", "aria-label": "Pixel" }, make("h2", {}, `Pixel (${x}, ${y})`));
   if (away) {
-    const words = `The pixel nearest to the place you pointed at that vehicles passed, ${units.length(away)} away.`;
+    const words = `No vehicle passed where you pointed: this is the nearest pixel that some did, ${units.length(away)} away.`;
     card.append(make("p", { class: "note", "data-name": "away", "data-value": String(away) }, words));
   }
   if (!n || !histogram) {

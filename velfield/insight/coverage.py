@@ -15,15 +15,16 @@ def few_vehicles(pixels: int, pixels_5: int) -> str:
     Examples
     --------
     >>> few_vehicles(55251, 1105).partition(".")[0]
-    '5 or more vehicles passed 2 % of the known pixels'
+    '2 % of the known pixels were passed by 5 or more vehicles'
     >>> few_vehicles(55251, 20000), few_vehicles(0, 0)
     ('', '')
     """
     if pixels_5 >= _SEEN_WELL * pixels:
         return ""
+    share = f"{percent(pixels_5, pixels)} of the known pixels were" if pixels_5 else "No pixel was"
     return (
-        f"5 or more vehicles passed {percent(pixels_5, pixels) if pixels_5 else 'none'} of the known pixels. "
-        "Directions hold; speeds and percentiles are those of single vehicles. Fly longer, or add flights up."
+        f"{share} passed by 5 or more vehicles. Directions hold; speeds and percentiles are those of single vehicles. "
+        "Fly longer, or add flights up."
     )
 
 
