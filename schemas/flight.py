@@ -125,6 +125,8 @@ class DetectionConfig(Model):
     """Blur of the response before maxima are taken. Paper: 3."""
     min_region_px: PositiveInt = 10
     """Regions smaller than this are dropped. Paper: 10."""
+    folds: int = Field(4, ge=2)
+    """T is chosen on cars left out of training: a so-manieth part of the marked ones at a time."""
     threshold: float | None = None
     """Threshold T on the response; none: chosen from the training evidence and stored with the detector."""
     working_car_length_px: PositiveFloat = 16.0
@@ -236,7 +238,7 @@ PRESETS: dict[Preset, dict[str, dict[str, object]]] = {
     "best": {},
     "fast": {
         "registration": {"key_points": 1500, "key_point_scale": 0.25},
-        "detection": {"rounds": 300, "feature_pool": 1500},
+        "detection": {"rounds": 300, "feature_pool": 1500, "folds": 2},
     },
     "paper": {
         "registration": {"model": "polyprojective", "max_mean_error_px": 2.0, "key_point_scale": 1.0},

@@ -14,6 +14,7 @@ from velfield.provenance import digest_bytes
 SMALL = (
     "detection.rounds=40",
     "detection.feature_pool=250",
+    "detection.folds=2",
     "registration.key_points=1200",
     "work.unit_frames=8",
     "work.retries=1",

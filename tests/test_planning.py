@@ -55,6 +55,12 @@ def test_what_is_not_what_it_was_given_as_is_told_before_any_work(flight: Path, 
     assert "b'" not in str(caught.value)
 
 
+def test_frames_too_far_apart_to_follow_a_car_are_told(flight: Path, tmp_path: Path) -> None:
+    assert make_plan(job(flight, tmp_path)).info.warnings == ()
+    (warning,) = make_plan(job(flight, tmp_path, "frames.every=4")).info.warnings
+    assert "set tracking.max_interval_s" in warning
+
+
 def test_a_plan_is_small(tmp_path: Path) -> None:
     """It goes with every node of every graph."""
     import pickle

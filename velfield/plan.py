@@ -16,6 +16,8 @@ from velfield.provenance import content_key, digest_path, write_atomically
 from velfield.sources.source import SourceInfo, check_source, probe, select_frames
 from velfield.version import STAGE_VERSIONS, code_version
 
+_MANY_GAPS = 0.3
+"""Share of frames without a near one before them from which it is said."""
 _BESIDES = ("base", "labels", "detector", "detections", "timestamps")
 """What may be given besides the source."""
 _UNITS = ((256, 16), (4096, 64))
@@ -114,8 +116,20 @@ def make_plan(job: Job) -> Plan:
             f"{job.inputs.source}: {len(indices)} frames to work on, 3 or more needed for a tracklet; "
             "widen --start-s/--stop-s or lower --every"
         )
+    info = replace(info, warnings=(*info.warnings, *_gaps(info.times_s[indices], job.config.tracking.max_interval_s)))
     inputs = _digest_inputs(job, info)
     return Plan(job=job.anywhere(), info=info, indices=indices, inputs=inputs, keys=stage_keys(job.config, inputs))
+
+
+def _gaps(times_s: NDArray[np.float64], max_interval_s: float) -> list[str]:
+    wide = np.diff(times_s) > max_interval_s
+    if wide.mean() < _MANY_GAPS:
+        return []
+    return [
+        f"{wide.mean():.0%} of the frames come more than {max_interval_s:g} s after the one before (median "
+        f"{np.median(np.diff(times_s)):.2f} s), over which no car is followed: few tracklets or none; take frames "
+        "closer together, or set tracking.max_interval_s"
+    ]
 
 
 def _digest_inputs(job: Job, info: SourceInfo) -> InputsRecord:

@@ -7,7 +7,7 @@ STAGE_VERSIONS: dict[str, int] = {
     "lens": 2,
     "base": 2,
     "registration": 2,
-    "detector": 5,
+    "detector": 6,
     "detections": 3,
     "links": 1,
     "tracklets": 2,

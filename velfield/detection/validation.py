@@ -16,7 +16,6 @@ from velfield.detection.scan import propose
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-STRIPES = 4
 MATCH_PX = 8.0
 """A find this near to a car's middle is that car, working px: half its length."""
 _NEAR_PX = 6.0
@@ -50,13 +49,13 @@ class Evidence:
     complete: bool
 
 
-def stripes(scene: Scene, fold: int) -> Bools:
-    """(h, w) stripes across the longer side, alternately in and out, as many cars in each."""
+def stripes(scene: Scene, fold: int, folds: int) -> Bools:
+    """(h, w) the two stripes across the longer side that a fold leaves out: with as many cars in each."""
     height, width = scene.sample.image.shape
-    axis = 0 if width >= height else 1
-    borders = np.quantile(scene.cars[:, axis], np.arange(1, STRIPES) / STRIPES) if len(scene.cars) else np.empty(0)
+    axis, count = 0 if width >= height else 1, 2 * folds
+    borders = np.quantile(scene.cars[:, axis], np.arange(1, count) / count) if len(scene.cars) else np.empty(0)
     stripe = np.searchsorted(borders, np.arange(max(width, height)))
-    inside = stripe % 2 == fold
+    inside = stripe % folds == fold
     return np.broadcast_to(inside if axis == 0 else inside[:, None], (height, width))
 
 
