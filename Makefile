@@ -16,7 +16,7 @@ test: page  ## every check: lint, types, tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 # The viewer's page from page/: built where its sources changed. Node is the machine's, else PyPI's into the environment.
 page: $(STAMP)

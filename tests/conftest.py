@@ -16,6 +16,19 @@ from tests.small_flight import FRAMES, digests, job, process
 FOOTAGE = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
+_LONGEST = (
+    *("kills", "accuracy", "serve", "reprocess", "s3", "cluster", "viewer", "flows", "cli", "docs", "training"),
+    *("detection", "intersensor", "straight_to_base", "intrasensor", "motion_labels", "synthetic_flight"),
+)
+"""Files that take a minute or so: begun first, or one process would sit over the last of them while the other waits."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first; order within a file stays (with `--no-loadscope-reorder` xdist keeps to it)."""
+    place = {f"test_{name}.py": k for k, name in enumerate(_LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.name, len(place)))
+
+
 @pytest.fixture
 def footage() -> Callable[[str], Path]:
     """Path of one folder of the real footage; skips the test, saying so, where it is absent."""
