@@ -1,11 +1,7 @@
 """Clusters: by configuration alone, with a worker killed in mid-chunk, and with workers that have no `flows`."""
 
-import contextlib
 import os
 import shutil
-import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,6 +9,7 @@ import yaml
 
 from flows.runners import ClusterFile, RunnerConfig, open_runner, read_runner
 from schemas.summary import RunSummary
+from tests.foreign_cluster import foreign_cluster
 from tests.small_flight import digests, job, process
 from velfield.errors import InputError
 from velfield.layout import RunLayout
@@ -53,6 +50,18 @@ def test_a_cluster_file_that_is_none_is_refused(tmp_path: Path, text: str) -> No
         read_runner(tmp_path / "cluster.yaml")
 
 
+def test_workers_of_our_own_keep_memory_for_pictures() -> None:
+    """What Dask sets costs half as much time again."""
+    from dask import delayed
+
+    from flows.launch import prepare_process
+
+    prepare_process(verbose=False)
+    with open_runner(RunnerConfig(workers=1)) as runner:
+        told = runner.compute(delayed(os.environ.get)("MALLOC_TRIM_THRESHOLD_"))
+    assert int(told) == 256 << 20
+
+
 def one_that_kills_its_worker(plan: object, frames: range) -> object:
     """In place of the step: the first worker that gets frame 8 dies of it."""
     from velfield.steps.detections import detect_block
@@ -84,46 +93,12 @@ def test_a_worker_killed_in_mid_chunk_on_a_cluster_by_class(
     assert digests(root) == digests(whole[0])
 
 
-@pytest.fixture
-def foreign_cluster(tmp_path: Path) -> Iterator[str]:
-    """Scheduler and worker as processes of their own, in other working folders, `flows` hidden from them."""
-    site = tmp_path / "site"
-    site.mkdir()
-    for name in ("velfield", "schemas"):
-        (site / name).symlink_to(ROOT / name, target_is_directory=True)  # not copied: numba's cache goes with it
-    (site / "flows.py").write_text("raise ImportError('there is no flows here')")
-    ours = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT")}
-    environment = {**ours, "PYTHONPATH": str(site), "PYTHONSAFEPATH": "1", "HOME": str(tmp_path)}
-    address_file = tmp_path / "scheduler.json"
-    told = ["--scheduler-file", str(address_file)]
-    scheduler = ["distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", *told]
-    worker = ["distributed.cli.dask_worker", "--host", "127.0.0.1", "--nthreads", "1", "--no-dashboard", *told]
-    processes = []
-    try:
-        for number, command in enumerate((scheduler, worker)):
-            folder = tmp_path / f"elsewhere-{number}"
-            folder.mkdir()
-            processes.append(
-                subprocess.Popen(
-                    [sys.executable, "-m", *command], cwd=folder, env=environment, stderr=subprocess.DEVNULL
-                )
-            )
-            while not address_file.exists():
-                assert processes[0].poll() is None
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    processes[0].wait(0.1)
-        yield str(yaml.safe_load(address_file.read_text())["address"])
-    finally:
-        for started in processes:
-            started.terminate()
-            started.wait(30)
-
-
 def test_workers_elsewhere_without_flows_give_the_same(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, foreign_cluster: str, monkeypatch: pytest.MonkeyPatch
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All but lens, base image and detector is done there; the run folder is given by a path from where we stand."""
     monkeypatch.chdir(tmp_path)
     share(RunLayout(whole[0]), RunLayout(tmp_path / "run"), ("lens", "base", "detector"))
-    process(job(flight, Path("run")), RunnerConfig(scheduler=foreign_cluster))
+    with foreign_cluster(tmp_path) as address:
+        process(job(flight, Path("run")), RunnerConfig(scheduler=address))
     assert digests(tmp_path / "run") == digests(whole[0])

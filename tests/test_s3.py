@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 import s3fs
 
+from flows.runners import RunnerConfig
 from schemas.summary import RunSummary
+from tests.foreign_cluster import foreign_cluster
 from tests.small_flight import digests, digests_of, job, process, redone
 from velfield import open_run
 from velfield.errors import InputError
@@ -42,11 +44,17 @@ def s3() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def remote(s3: None, whole: tuple[Path, RunSummary], flight: Path) -> tuple[RemotePath, RunSummary]:
-    """The flight's run on S3: all stores written there; only lens, base image and detector are taken from the disk."""
+def remote(
+    s3: None, whole: tuple[Path, RunSummary], flight: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[RemotePath, RunSummary]:
+    """The flight's run on S3, worked on by processes in folders of their own that have nothing but that in common.
+
+    All stores are written there; only lens, base image and detector are taken from the disk.
+    """
     root = RemotePath("s3://flights/runs/whole")
     share(RunLayout(whole[0]), RunLayout(place("s3://flights/runs/whole")), ("lens", "base", "detector"))
-    return root, process(job(flight, root))  # type: ignore[arg-type]
+    with foreign_cluster(tmp_path_factory.mktemp("cluster")) as address:
+        return root, process(job(flight, root), RunnerConfig(scheduler=address))  # type: ignore[arg-type]
 
 
 def remote_digests(root: RemotePath) -> dict[str, str]:
