@@ -40,6 +40,11 @@ class StageProgress:
             self.bar.update(self.task, completed=self.done)  # type: ignore[arg-type]
 
 
+def say(text: str) -> None:
+    """A line with the time of day, from a process that serves."""
+    print(f"{time.strftime('%H:%M:%S')}    {text}", flush=True)
+
+
 class Console:
     """Writes to the terminal; as lines of JSON where asked to."""
 

@@ -1,12 +1,11 @@
 """Flows as a server runs them: parameters that fit into JSON, each a few lines round the flows of the command."""
 
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from prefect import flow, get_run_logger
 
-from flows.console import Console
+from flows.console import Console, say
 from flows.launch import prepare_process
 from flows.process_flight import run_flight
 from flows.reprocess import run_reprocess
@@ -40,7 +39,7 @@ def process_dropped(source: str, runs: str, cluster: str = "") -> str:
     for line in summary.frames_lost:
         get_run_logger().warning(line)
     lost = f", {len(summary.frames_lost)} frames lost" if summary.frames_lost else ""
-    _say(f"{Path(source).name} is done{lost}: {summary.root}")
+    say(f"{Path(source).name} is done{lost}: {summary.root}")
     return summary.root
 
 
@@ -77,14 +76,9 @@ def reprocess_runs(runs: str, base_images: str, base: str = "", run: str = "", c
                 raise
             refused.append(root.name)
             logger.warning("%s stays as it is: %s", root.name, error)
-    _say(f"{picture.name}: {len(made)} results made, {len(refused)} runs stay as they are")
+    say(f"{picture.name}: {len(made)} results made, {len(refused)} runs stay as they are")
     logger.info("%s: %d results made, %d runs stay as they are", picture.name, len(made), len(refused))
     return made
-
-
-def _say(text: str) -> None:
-    """To the terminal that serves."""
-    print(f"{time.strftime('%H:%M:%S')}    {text}", flush=True)
 
 
 def _runner(cluster: str) -> RunnerConfig:

@@ -6,7 +6,6 @@ and so is every flow run: whatever ends this process in order ends them.
 
 import contextlib
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -20,8 +19,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flows.console import say
 from flows.launch import PAGES, PAGES_OF
-from flows.stopping import end_children
+from flows.stopping import as_ctrl_c, end_children
 from velfield.errors import InputError
 from velfield.incoming import Watch
 
@@ -218,12 +218,12 @@ def watching(config: ServeConfig) -> Iterator[None]:
     from prefect.events import emit_event
 
     def flight(path: Path) -> None:
-        _say(f"{path.name} has arrived: it is processed")
+        say(f"{path.name} has arrived: it is processed")
         _resource = {"prefect.resource.id": f"velfield.flight.{path.name}"}
         emit_event(FLIGHT_ARRIVED, resource=_resource, payload={"source": str(path.resolve())})
 
     def base_image(path: Path) -> None:
-        _say(f"base image {path.name} has arrived: all runs are reprocessed")
+        say(f"base image {path.name} has arrived: all runs are reprocessed")
         _resource = {"prefect.resource.id": f"velfield.base-image.{path.name}"}
         emit_event(BASE_IMAGE_ARRIVED, resource=_resource, payload={"base": path.name, "run": ""})
 
@@ -253,8 +253,7 @@ def serve_folder(config: ServeConfig) -> None:
     # Server and flow runs import from their working folder, whatever PYTHONSAFEPATH says: let it be one of ours.
     os.chdir(config.folder)
     os.environ.update(settings(config))
-    signal.signal(signal.SIGTERM, _interrupt)
-    signal.signal(signal.SIGINT, _interrupt)  # a shell's background job is started with Ctrl-C ignored
+    as_ctrl_c()
     try:
         with server(config):
             from prefect import serve
@@ -270,11 +269,3 @@ def serve_folder(config: ServeConfig) -> None:
                 serve(*deployments(config), pause_on_shutdown=False, print_starting_message=False, limit=config.limit)
     finally:
         end_children(_STOP_S)
-
-
-def _say(text: str) -> None:
-    print(f"{time.strftime('%H:%M:%S')}    {text}", flush=True)
-
-
-def _interrupt(_signal: int, _frame: object) -> None:
-    raise KeyboardInterrupt

@@ -18,13 +18,18 @@ _END_S = 3.0
 
 def stop_when_told() -> None:
     """From now on SIGTERM is as Ctrl-C, and neither waits for the work under way. Call in the main thread."""
-    for number in _ENDING:
-        signal.signal(number, _stop)
+    as_ctrl_c()
     # Prefect puts a handler of its own in the place of ours, then waits for the threads: this hears of it all the same.
     told, tell = socket.socketpair()
     tell.setblocking(False)
     signal.set_wakeup_fd(tell.fileno(), warn_on_full_buffer=False)
     threading.Thread(target=_end_late, args=(told, tell), name="end", daemon=True).start()
+
+
+def as_ctrl_c() -> None:
+    """SIGTERM is as Ctrl-C, and Ctrl-C is heard even where a shell started us in the background, with it ignored."""
+    for number in _ENDING:
+        signal.signal(number, _stop)
 
 
 def _stop(_number: int, _frame: FrameType | None) -> None:
