@@ -54,6 +54,34 @@ class ModelEvidence(Model):
     """The same on lines left out of the fit."""
 
 
+class OverlapEvidence(Model):
+    """What control points say of the lens: pairs of frames that see the same ground at different places."""
+
+    pairs: NonNegativeInt = 0
+    frames: NonNegativeInt = 0
+    """Frames among these pairs."""
+    points: NonNegativeInt = 0
+    """Matches among them."""
+    lines_a: float | None = None
+    """Distortion by the straight lines, as Harris' a ..."""
+    lines_a_sd: float | None = None
+    """... and its standard deviation, kerbs that bend alike allowed for."""
+    a: float | None = None
+    """Distortion by the control points, as Harris' a ..."""
+    a_sd: float | None = None
+    """... and its standard deviation; large where the camera hangs over one place."""
+    fit_px: float | None = None
+    """Usual miss of the matches with all fitted, raw px: large where the ground is not flat."""
+    before_px: float | None = None
+    """Usual miss of a frame's matches after a homography with the lens of the lines, raw px ..."""
+    after_px: float | None = None
+    """... and with the control points' lens, found without that frame."""
+    used: bool = False
+    """Whether the lens was changed by it."""
+    reason: str
+    """Why it was changed or not, in one line with the numbers."""
+
+
 class CameraRecord(Model):
     """The lens of a flight and the evidence for it."""
 
@@ -65,7 +93,7 @@ class CameraRecord(Model):
     reason: str
     """Why it was accepted or not, in one line with the numbers."""
     residual_px: float | None = None
-    """RMS distance of the edge points from their straight lines with this lens, raw px."""
+    """RMS distance of the edge points from their straight lines with the lens that the lines gave, raw px."""
     residual_without_px: float | None = None
     """The same with no lens."""
     a_sd: float | None = None
@@ -79,3 +107,5 @@ class CameraRecord(Model):
     entropy_nats: tuple[float, ...] = ()
     """... and the entropy of the lines' angles and distances there; least where lines are straight."""
     candidates: tuple[ModelEvidence, ...] = ()
+    overlap: OverlapEvidence | None = None
+    """What the control points say of the lens, and whether it was refined by them; none: they were not asked."""

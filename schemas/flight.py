@@ -36,8 +36,11 @@ class LensConfig(Model):
 
     calibrate: Literal["auto", "always", "never"] = "auto"
     """``auto``: calibrate, and keep the pin-hole where the evidence for a distortion is too small."""
+    refine: Literal["auto", "never"] = "auto"
+    """``auto``: the lens is refined by control points of frames that see the same ground at different places of the
+    picture, as far as their evidence bears it. Paper: by straight lines alone."""
     frames: PositiveInt = 12
-    """How many frames, spread over the flight, give edge points."""
+    """How many frames, spread over the flight, give edge points and control points."""
     max_edge_points: PositiveInt = 40_000
     """Edge points used, all frames together."""
     angle_bins: PositiveInt = 720
@@ -241,6 +244,7 @@ PRESETS: dict[Preset, dict[str, dict[str, object]]] = {
         "detection": {"rounds": 300, "feature_pool": 1500, "folds": 2},
     },
     "paper": {
+        "lens": {"refine": "never"},
         "registration": {"model": "polyprojective", "max_mean_error_px": 2.0, "key_point_scale": 1.0},
         "detection": {"method": "dense", "rounds": 200, "feature_pool": 1000, "motion_channel": "never"},
         "tracking": {"refine": False, "linking": "links", "min_confidence": 0.0},

@@ -4,7 +4,7 @@ from importlib.metadata import version
 
 STAGE_VERSIONS: dict[str, int] = {
     "frames": 1,
-    "lens": 2,
+    "lens": 3,
     "base": 2,
     "registration": 2,
     "detector": 6,

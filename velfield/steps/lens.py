@@ -1,4 +1,4 @@
-"""The lens of a flight: frames spread over it, the plumb-line constraint, ``camera.json``."""
+"""The lens of a flight: frames spread over it, the plumb line, what control points add, ``camera.json``."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,9 +6,11 @@ from numpy.typing import NDArray
 from schemas.camera import CameraRecord
 from velfield.camera.lens import lens_from_record, pinhole
 from velfield.camera.plumbline import calibrate
+from velfield.camera.refine import refine
 from velfield.plan import Plan
 from velfield.progress import advance
 from velfield.provenance import write_atomically
+from velfield.registration.pairing import matched_pairs
 from velfield.sources.flags import UNUSABLE
 from velfield.steps.outcome import Outcome
 from velfield.stores import open_frames
@@ -39,14 +41,24 @@ def calibrate_flight(plan: Plan) -> Outcome:
         )
     else:
         frames = spread_usable(plan, config.frames)
-        record = calibrate([store.read(frame) for frame in frames], config).to_record()
+        pictures = [store.read(frame) for frame in frames]
+        record = calibrate(pictures, config).to_record()
+        if config.refine == "auto":
+            record = refine(record, matched_pairs(pictures, lens_from_record(record.lens)))
     write_atomically(plan.layout.camera, record.model_dump_json(indent=1).encode())
     advance("lens")
     counts = {"corner_px": _corner_shift(record, width, height)}
     if record.residual_px is not None:
         counts["residual_px"] = record.residual_px
-    notes = [] if record.accepted else ["why the lens is taken for a pin-hole, and how near it was: camera.json"]
-    return Outcome([plan.layout.camera], counts, notes)
+    return Outcome([plan.layout.camera], counts, _notes(record))
+
+
+def _notes(record: CameraRecord) -> list[str]:
+    if not record.accepted:
+        return ["why the lens is taken for a pin-hole, and how near it was: camera.json"]
+    if record.overlap is not None and record.overlap.used:
+        return [f"the lens was refined by control points: {record.overlap.reason}"]
+    return []
 
 
 def _corner_shift(record: CameraRecord, width: int, height: int) -> float:
