@@ -23,7 +23,6 @@ from velfield import graphs
 from velfield.errors import Failure, InputError
 from velfield.layout import RunLayout
 from velfield.locking import locked
-from velfield.places import is_remote, place
 from velfield.plan import write_flight_record
 from velfield.provenance import sweep_partial
 from velfield.results import discard, made_before, publish, result_name, share, unfinished
@@ -59,8 +58,6 @@ def run_reprocess(
         The picture is not of this place, or the run folder is not one. Nothing was changed.
     """
     where = runner or RunnerConfig()
-    if is_remote(place(root)):
-        raise InputError(f"{root}: results on a new base image are made on a disk; copy the run folder to one")
     if not base.exists():
         raise InputError(f"--base: {base} is not there; give a path that exists")
     chosen = result_name(name, base)

@@ -13,6 +13,7 @@ from flows.console import Console
 from flows.reprocess import run_reprocess
 from schemas.records import RebaseRecord
 from schemas.summary import RunSummary
+from tests.new_base import NEW_FROM_OLD, SCALE, TURN_RAD, write_new_base
 from tests.small_flight import digests
 from velfield import open_run
 from velfield.errors import InputError
@@ -21,25 +22,10 @@ from velfield.results import result_name
 from velfield.run import Run
 from velfield.verifying import verify_run
 
-SCALE, TURN_RAD, SHIFT_PX = 0.9, 0.05, (14.0, 9.0)
-NEW_FROM_OLD = np.array(
-    [
-        [SCALE * np.cos(TURN_RAD), -SCALE * np.sin(TURN_RAD), SHIFT_PX[0]],
-        [SCALE * np.sin(TURN_RAD), SCALE * np.cos(TURN_RAD), SHIFT_PX[1]],
-    ]
-)
-"""Where the base image's pixels lie on the new picture: exactly known."""
-
 
 @pytest.fixture(scope="module")
 def new_base(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same place from another sensor: smaller, turned, of other tones, noisy."""
-    old = cv2.imread(str(flight / "base.png"), cv2.IMREAD_GRAYSCALE)
-    moved = cv2.warpAffine(old, NEW_FROM_OLD, (old.shape[1], old.shape[0]), flags=cv2.INTER_AREA, borderValue=90)
-    toned = 255 * (moved / 255.0) ** 0.8 * 0.8 + 20 + np.random.default_rng(0).normal(0, 3, moved.shape)
-    path = tmp_path_factory.mktemp("maps") / "spring 2026.png"
-    cv2.imwrite(str(path), np.clip(toned, 0, 255).astype(np.uint8))
-    return path
+    return write_new_base(flight, tmp_path_factory.mktemp("maps") / "spring 2026.png")
 
 
 @pytest.fixture(scope="module")

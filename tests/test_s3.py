@@ -1,38 +1,50 @@
 """A run folder on S3, a local server's: the same bits as on a disk."""
 
 import os
+import re
+import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 import s3fs
 
+from flows.console import Console
+from flows.reprocess import run_reprocess
 from flows.runners import RunnerConfig
+from schemas.records import ResultsRecord
 from schemas.summary import RunSummary
 from tests.foreign_cluster import foreign_cluster
+from tests.new_base import write_new_base
 from tests.small_flight import digests, digests_of, job, process, redone
-from velfield import open_run
+from velfield import open_run, places
 from velfield.errors import InputError
 from velfield.layout import RunLayout
 from velfield.locking import locked
-from velfield.places import S3_OPTIONS, RemotePath, place
+from velfield.places import S3_OPTIONS, RemotePath, copy_objects, place, rename_tree
 from velfield.results import share
 from velfield.verifying import verify_run
 
 
 @pytest.fixture(scope="module")
 def s3() -> Iterator[None]:
-    """An S3 of our own with a bucket, on this machine alone, told by the environment as any other would be."""
-    from moto.server import ThreadedMotoServer
+    """An S3 of our own with a bucket, on this machine alone, told by the environment as any other would be.
 
-    with pytest.MonkeyPatch.context() as patch:
-        started = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-        started.start()
-        host, port = started.get_host_and_port()
-        patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+    In a process of its own: in one with its clients, all wait for the interpreter most of the time.
+    """
+    command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", "0"]
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as started,
+    ):
+        assert started.stderr is not None
+        address = next(found[0] for line in started.stderr if (found := re.findall(r"http://127\.0\.0\.1:\d+", line)))
+        threading.Thread(target=started.stderr.read, daemon=True).start()  # or its log would fill the pipe
+        patch.setenv("AWS_ENDPOINT_URL", address)
         patch.setenv("AWS_ACCESS_KEY_ID", "testing")
         patch.setenv("AWS_SECRET_ACCESS_KEY", "testing")
         patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
@@ -40,7 +52,7 @@ def s3() -> Iterator[None]:
 
         boto3.client("s3").create_bucket(Bucket="flights")
         yield
-        started.stop()
+        started.terminate()
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +98,48 @@ def test_it_is_read_and_verified_from_there(
     chunk.write_bytes(data[:50] + bytes([data[50] ^ 1]) + data[51:])
     assert [damage.path for damage in verify_run(run.layout, run.record)] == ["frames.zarr/raw/c/5/0/0"]
     chunk.write_bytes(data)
+
+
+def test_a_new_base_image_under_a_run_that_is_there(
+    remote: tuple[RemotePath, RunSummary], whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
+) -> None:
+    base = write_new_base(flight, tmp_path / "spring.png")
+    shutil.copytree(whole[0], tmp_path / "run")
+    here, _ = run_reprocess(tmp_path / "run", base, console=Console("quiet"))
+    there, summary = run_reprocess(Path("s3://flights/runs/whole"), base, console=Console("quiet"))
+    assert summary is not None
+    assert summary.complete
+    assert there == remote[0] / "results/spring"
+    result = open_run("s3://flights/runs/whole/results/spring")
+    assert verify_run(result.layout, result.record) == []
+    assert remote_digests(there) == digests(here)  # type: ignore[arg-type]
+    index = ResultsRecord.model_validate_json((remote[0] / "results.json").read_bytes())
+    assert [found.name for found in index.results] == ["first", "spring"]
+    assert not list(remote[0].glob("results/.spring*/**"))
+    assert run_reprocess(Path("s3://flights/runs/whole"), base, console=Console("quiet")) == (there, None)
+
+
+def test_a_folder_whose_naming_was_cut_short_has_no_last_file_and_is_named_again(
+    s3: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, target = (place(f"s3://flights/naming/{name}") for name in ("source", "target"))
+    written = {"a/1": b"one", "a/2": b"two", "last": b"three"}
+    for name, data in written.items():
+        (source / name).write_bytes(data)
+
+    def cut_short(pairs: Sequence[tuple[Path, Path]]) -> None:
+        copy_objects(pairs)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(places, "copy_objects", cut_short)
+        with pytest.raises(KeyboardInterrupt):
+            rename_tree(source, target, last="last")
+    assert (target / "a/1").exists()
+    assert not (target / "last").exists()
+    rename_tree(source, target, last="last")
+    assert {name: (target / name).read_bytes() for name in written} == written
+    assert not source.exists()
 
 
 def test_two_runs_on_one_folder(s3: None) -> None:

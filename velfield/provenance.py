@@ -5,10 +5,12 @@ and what it names is there. The record is written last, atomically; a run killed
 """
 
 import hashlib
+import io
 import json
 import os
 from collections.abc import Iterable
 from pathlib import Path
+from typing import IO
 
 from pydantic import BaseModel, ValidationError
 
@@ -31,16 +33,23 @@ def digest_file(path: Path) -> str:
 
     Hashing a flight of hours whole would cost more than decoding its first minutes.
     """
+    if is_remote(path):
+        data = path.read_bytes()  # one request; its size and its blocks would be more
+        return _digest_stream(io.BytesIO(data), len(data))
     size = path.stat().st_size
-    digest = hashlib.blake2b(str(size).encode(), digest_size=16)
     with path.open("rb") as file:
-        if size <= _WHOLE_FILE_BYTES:
-            while block := file.read(_SAMPLE_BYTES):
-                digest.update(block)
-        else:
-            for k in range(_SAMPLES):
-                file.seek((size - _SAMPLE_BYTES) * k // (_SAMPLES - 1))
-                digest.update(file.read(_SAMPLE_BYTES))
+        return _digest_stream(file, size)
+
+
+def _digest_stream(file: IO[bytes], size: int) -> str:
+    digest = hashlib.blake2b(str(size).encode(), digest_size=16)
+    if size <= _WHOLE_FILE_BYTES:
+        while block := file.read(_SAMPLE_BYTES):
+            digest.update(block)
+    else:
+        for k in range(_SAMPLES):
+            file.seek((size - _SAMPLE_BYTES) * k // (_SAMPLES - 1))
+            digest.update(file.read(_SAMPLE_BYTES))
     return digest.hexdigest()
 
 

@@ -6,18 +6,20 @@ has a name that begins with a full stop, and gets its own in one step when it is
 
 import datetime
 import re
-import shutil
 from collections.abc import Iterable
 from pathlib import Path
 
 from schemas.records import FlightRecord, RebaseRecord, ResultRecord, ResultsRecord
 from velfield.errors import InputError
 from velfield.layout import RunLayout
-from velfield.provenance import commit_path, digest_path, read_commits, write_atomically
+from velfield.places import remove_tree, rename_tree
+from velfield.provenance import commit_path, digest_path, finished, read_commits, write_atomically
 from velfield.run import Run
-from velfield.tables import link_file
+from velfield.tables import link_files
 
 FIRST = "first"
+_LAST = "flight.json"
+"""What stands in a result that has its name: where names are given file by file, it is the last of them."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
@@ -71,9 +73,9 @@ def made_before(layout: RunLayout, name: str, base: Path) -> bool:
     InputError
         A result of that name stands there, of another base image.
     """
-    if not (layout.results / name).exists():
+    if not (layout.results / name / _LAST).exists():
         return False
-    record = FlightRecord.model_validate_json((layout.results / name / "flight.json").read_bytes())
+    record = FlightRecord.model_validate_json((layout.results / name / _LAST).read_bytes())
     if record.inputs.base != digest_path(base):
         raise InputError(f"{layout.results / name} is another base image's result; name this one with --out")
     return True
@@ -86,17 +88,17 @@ def share(old: RunLayout, new: RunLayout, stages: Iterable[str], *, without: tup
     """
     for stage in stages:
         for record in read_commits(old, stage):
+            if finished(new, stage, record.unit, record.key):
+                continue
             outputs = {name: digest for name, digest in record.outputs.items() if not name.startswith(without)}
-            for name in outputs:
-                if not (new.root / name).exists():
-                    link_file(old.root / name, new.root / name)
+            link_files([(old.root / name, new.root / name) for name in outputs])
             kept = record.model_copy(update={"outputs": outputs})
             write_atomically(commit_path(new, stage, record.unit), kept.model_dump_json(indent=1).encode())
 
 
 def discard(layout: RunLayout) -> None:
     """Remove a result that came to nothing."""
-    shutil.rmtree(layout.root, ignore_errors=True)
+    remove_tree(layout.root)
 
 
 def publish(run: Run, name: str, base: Path) -> Path:
@@ -104,8 +106,10 @@ def publish(run: Run, name: str, base: Path) -> Path:
     layout = run.layout
     target = layout.results / name
     waiting = unfinished(layout, name).root
-    if waiting.exists():
-        waiting.rename(target)
+    if (target / _LAST).exists():
+        remove_tree(waiting)  # what a process that was killed while it gave the name left
+    else:
+        rename_tree(waiting, target, last=_LAST)
     others = [result for result in read_results(layout) if result.name != name] or [_first(run)]
     records = ResultsRecord(results=(*others, _result(name, target, base)))
     write_atomically(layout.results_index, records.model_dump_json(indent=1).encode())

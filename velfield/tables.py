@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from velfield.places import copy_objects, is_remote
 from velfield.provenance import write_atomically
 
 Patches = dict[str, NDArray[Any]]
@@ -49,6 +50,9 @@ def link_file(source: Path, target: Path) -> Path:
 
     Files of a run folder are replaced, never changed in place, so what is done to one name is not seen under the other.
     """
+    if is_remote(source) and is_remote(target):
+        copy_objects([(source, target)])
+        return target
     target.parent.mkdir(parents=True, exist_ok=True)
     target.unlink(missing_ok=True)
     try:
@@ -56,6 +60,15 @@ def link_file(source: Path, target: Path) -> Path:
     except (OSError, TypeError):  # another disk, or no disk at all
         write_atomically(target, source.read_bytes())
     return target
+
+
+def link_files(pairs: Sequence[tuple[Path, Path]]) -> None:
+    """Many files at once, as by `link_file`: pairs of a file and its further name."""
+    if all(is_remote(source) and is_remote(target) for source, target in pairs):
+        copy_objects(pairs)
+        return
+    for source, target in pairs:
+        link_file(source, target)
 
 
 def read_tables(

@@ -47,11 +47,12 @@ def verify_run(layout: RunLayout, record: FlightRecord) -> list[Damage]:
 def _check(layout: RunLayout, record: CommitRecord) -> list[Damage]:
     found = []
     for name, digest in record.outputs.items():
-        path = layout.root / name
-        if not path.is_file():
+        try:
+            whole = digest_file(layout.root / name) == digest
+        except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
             found.append(Damage(record.stage, record.unit, name, "gone"))
-        elif digest_file(path) != digest:
-            found.append(Damage(record.stage, record.unit, name, "damaged"))
+        else:
+            found += [] if whole else [Damage(record.stage, record.unit, name, "damaged")]
     return found
 
 

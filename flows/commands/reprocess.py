@@ -59,5 +59,5 @@ def reprocess(
         run_folder, base, name=out, full=full, max_added_error_px=max_error_px, runner=where, console=console
     )
     console.result(f"result  {root}")
-    console.result(f"names   {run_folder / 'results.json'}")
+    console.result(f"names   {root.parents[1] / 'results.json'}")
     return DONE if summary is None or summary.complete else INCOMPLETE
