@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 from flows.console import say
 from flows.launch import PAGES, PAGES_OF
-from flows.stopping import as_ctrl_c, end_children
+from flows.stopping import as_ctrl_c, end_children, end_children_when_killed
 from velfield.errors import InputError
 from velfield.incoming import Watch
 
@@ -254,6 +254,7 @@ def serve_folder(config: ServeConfig) -> None:
     os.chdir(config.folder)
     os.environ.update(settings(config))
     as_ctrl_c()
+    end_children_when_killed()
     try:
         with server(config):
             from prefect import serve

@@ -1,12 +1,15 @@
 """SIGTERM and Ctrl-C: either ends a run within seconds, whatever is under way. What was committed stays."""
 
+import atexit
 import contextlib
 import logging
 import os
 import signal
 import socket
+import subprocess
 import sys
 import threading
+import time
 from types import FrameType
 
 STOPPED = 130
@@ -14,6 +17,20 @@ _ENDING = (signal.SIGTERM, signal.SIGINT)
 _GRACE_S = 5.0
 """For Prefect to be told that the run ended; the frames under way, half a minute of work perhaps, are given up."""
 _END_S = 3.0
+_MARK = "VELFIELD_STARTED_BY"
+"""Environment: by which process, of which moment, all of its children were started."""
+_WATCH = """if True:
+    import sys
+    mark = sys.argv[1]
+    sys.stdin.read()  # until the process that watches over its children is gone
+    import psutil
+    for process in psutil.process_iter():
+        try:
+            if process.environ().get("VELFIELD_STARTED_BY") == mark and process.pid != psutil.Process().pid:
+                process.terminate()
+        except psutil.Error:
+            pass
+"""
 
 
 def stop_when_told() -> None:
@@ -24,6 +41,30 @@ def stop_when_told() -> None:
     tell.setblocking(False)
     signal.set_wakeup_fd(tell.fileno(), warn_on_full_buffer=False)
     threading.Thread(target=_end_late, args=(told, tell), name="end", daemon=True).start()
+    end_children_when_killed()
+
+
+def end_children_when_killed() -> None:
+    """From now on what this process starts ends with it even where it is killed: Prefect's server would stay for ever.
+
+    Nobody can mind SIGKILL, so another process waits for the end of this one, and finds those it left by a mark in
+    their environment.
+    """
+    os.environ[_MARK] = mark = f"{os.getpid()}-{time.time_ns()}"
+    watcher = subprocess.Popen(
+        [sys.executable, "-c", _WATCH, mark],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,  # a terminal's Ctrl-C is for us, and not its end
+    )
+    atexit.register(_release, watcher)
+
+
+def _release(watcher: "subprocess.Popen[bytes]") -> None:
+    assert watcher.stdin is not None
+    watcher.stdin.close()
+    watcher.wait()
 
 
 def as_ctrl_c() -> None:
