@@ -160,7 +160,7 @@ def _joined(case: _Case, lines_a: float, lines_sd: float) -> CameraRecord:
 
 def _brought_in(case: _Case) -> CameraRecord:
     """A distortion that lines did not bear out, on strong evidence only; else the pin-hole."""
-    fit, value = case.fit, case.fit.amount
+    fit, value, said = case.fit, case.fit.amount, ""
     needed = BRING_IN_SIGMAS if case.lines is None else CONFIRMED_SIGMAS
     if case.relief:
         return case.kept(f": {fit.fit_px:.1f} px off any plane, pin-hole kept")
@@ -171,8 +171,9 @@ def _brought_in(case: _Case) -> CameraRecord:
         if abs(fit.amount - lines_a) > _MAX_DISAGREEMENT * abs(fit.amount):
             return case.kept(f", {lines_a:.3f} by lines: they disagree, pin-hole kept")
         value = float(np.average([fit.amount, lines_a], weights=[fit.amount_sd**-2, lines_sd**-2]))
+        said = f", {lines_a:.3f} +- {lines_sd:.3f} by lines"
     if fit.after_px > (1.0 - LEAST_GAIN) * fit.before_px:
         return case.kept(": frames left out do not show it, pin-hole kept")
     if case.corner_px(value) < LEAST_CORNER_PX:
         return case.kept(f": less than {LEAST_CORNER_PX:g} px at a corner, pin-hole kept")
-    return case.changed(value, f": a distortion of {value:.3f} accepted")
+    return case.changed(value, f"{said}: a distortion of {value:.3f} accepted")
