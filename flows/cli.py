@@ -221,14 +221,12 @@ def demo(
     quiet
         Warnings only.
     """
-    from flows.launch import first_start_beside, prepare_process
+    from flows.launch import first_start_beside, kernels_beside, prepare_process
     from schemas.job import Inputs, Job
     from velfield.configuration import resolve_config
 
     prepare_process(verbose=False)
     flight = out / "flight"
-    with first_start_beside():
-        _simulate(flight, frames=frames, size=size, seed=seed, quiet=quiet)
     inputs = Inputs(
         source=str(flight / "frames"),
         base=str(flight / "base.png"),
@@ -238,8 +236,11 @@ def demo(
     # Four minutes from an empty clone, the kernels' first compilation and all: a hundred marked cars are soon learnt.
     quick = {"detection.rounds": 120, "detection.feature_pool": 800}
     config = resolve_config(preset="fast", overrides={"gsd_m": 0.23, **quick})
-    job = Job(root=str(out / "run"), inputs=inputs, config=config)
-    status = _process(job, verbosity="quiet" if quiet else "normal")
+    with kernels_beside():
+        with first_start_beside():
+            _simulate(flight, frames=frames, size=size, seed=seed, quiet=quiet)
+        job = Job(root=str(out / "run"), inputs=inputs, config=config)
+        status = _process(job, verbosity="quiet" if quiet else "normal")
     if status in (DONE, INCOMPLETE):
         _score(out / "run", flight)
     return status

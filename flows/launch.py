@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
 PAGES, PAGES_OF = "VELFIELD_PAGES", "VELFIELD_PAGES_OF"
@@ -100,3 +101,26 @@ def first_start_beside() -> Iterator[None]:
         except BaseException:
             beside.terminate()
             raise
+
+
+@contextmanager
+def kernels_beside() -> Iterator[None]:
+    """Where numba has yet to compile the kernels: a process that does it, on a tiny job, while this one works.
+
+    A minute of a first run is waiting for the compiler on one processor, kernel after kernel; so the later ones are
+    there when they are wanted. Should it fail, nothing is lost.
+    """
+    spec = find_spec("velfield")
+    folders = spec.submodule_search_locations if spec else None
+    if (
+        any(found for folder in folders or () for found in Path(folder).rglob("*.nbi"))
+        or "NUMBA_CACHE_DIR" in os.environ
+    ):
+        yield
+        return
+    command = [sys.executable, "-m", "velfield.plain_run"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as beside:
+        try:
+            yield
+        finally:
+            beside.terminate()

@@ -221,6 +221,30 @@ def test_tracklets_are_right_when_they_follow_one_vehicle(truth: Truth) -> None:
     swapped = tracklets.copy()
     swapped[["x_2_px", "y_2_px"]] = swapped[["x_2_px", "y_2_px"]].to_numpy()[::-1]
     assert score_tracklets(truth, swapped).precision < 0.1
+    assert score_tracklets(truth, swapped).precision_on_vehicle < 0.1
+
+
+def test_a_tracklet_of_a_lorrys_load_is_on_the_vehicle_but_off_its_middle(truth: Truth) -> None:
+    tracklets = tracklets_of(truth)
+    cars = truth.cars.set_index(["vehicle_id", "frame"])
+    long = cars["length_px"].groupby("vehicle_id").max().loc[lambda length: length > 30].index
+    lorries = tracklets[tracklets["passage_id"].isin(long)]
+    assert len(lorries) > 5
+
+    def shifted(ahead: float, aside: float) -> pd.DataFrame:
+        moved = lorries.copy()
+        for k in range(3):
+            car = cars.loc[pd.MultiIndex.from_frame(moved[["passage_id", f"frame_{k}"]])]
+            along = ahead * car["length_px"].to_numpy()
+            axis = car["orientation_rad"].to_numpy()
+            moved[f"x_{k}_px"] += along * np.cos(axis) - aside * np.sin(axis)
+            moved[f"y_{k}_px"] += along * np.sin(axis) + aside * np.cos(axis)
+        return moved
+
+    load = score_tracklets(truth, shifted(0.3, 0.0))
+    assert load.precision < 0.1
+    assert load.precision_on_vehicle == 1.0
+    assert score_tracklets(truth, shifted(0.0, 12.0)).precision_on_vehicle < 0.6
 
 
 def test_a_field_along_the_lanes_scores_perfectly_and_one_across_does_not(truth: Truth) -> None:

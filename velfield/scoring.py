@@ -41,7 +41,8 @@ class RunScore:
                 f"  cars          precision {d.precision:.3f}, recall {d.recall:.3f}, "
                 f"of the moving {d.recall_moving:.3f}, "
                 f"axis off by {np.degrees(d.axis_median_rad):.1f} degrees (median)",
-                f"  tracklets     precision {t.precision:.3f}, recall of the moving {t.recall_moving:.3f}, "
+                f"  tracklets     precision {t.precision:.3f} ({t.precision_on_vehicle:.3f} where any place on a "
+                f"vehicle counts), recall of the moving {t.recall_moving:.3f}, "
                 f"speed off by {t.speed_error_mean_km_per_h:.2f} km/h (mean), "
                 f"each vehicle counted {t.passages_per_vehicle:.2f} times",
                 f"  field         modal direction within 10 degrees at {f.share_within:.1%} of "

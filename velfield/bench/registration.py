@@ -16,15 +16,13 @@ from numpy.typing import NDArray
 
 from schemas.job import Inputs, Job
 from schemas.simulation import OtherSensorSimulation, SimulationConfig
-from velfield import graphs
 from velfield.configuration import resolve_config
 from velfield.errors import InputError
+from velfield.plain_run import compute_stages
 from velfield.plan import Plan, make_plan, write_flight_record
 from velfield.registration.transforms import as_points
 from velfield.sources.pictures import read_picture_grey
 from velfield.steps.frame_maps import FrameMaps
-from velfield.steps.frames import lay_out_frames
-from velfield.steps.registration import lay_out_registration
 from velfield.synthetic import cases, write_flight
 from velfield.synthetic.score import RegistrationScore, score_registration
 from velfield.synthetic.truth import Truth, load_truth
@@ -172,19 +170,10 @@ def register_flight(flight: Path, out: Path) -> tuple[Plan, float]:
     )
     plan = make_plan(job)
     write_flight_record(plan)
-    lay_out_frames(plan)
-    _compute([graphs.frames_graph(plan, unit) for unit in plan.units])
-    _compute([graphs.lens_graph(plan)])
-    _compute([graphs.base_graph(plan)])
-    lay_out_registration(plan)
+    compute_stages(plan, ("frames", "lens", "base"))
     started = time.perf_counter()
-    _compute([graphs.registration_graph(plan, unit) for unit in plan.units])
+    compute_stages(plan, ("registration",))
     return plan, time.perf_counter() - started
-
-
-def _compute(units: Sequence[graphs.Graph]) -> None:
-    for unit in units:
-        unit.compute(scheduler="synchronous")
 
 
 def _by_velfield(flight: Path, config: SimulationConfig, truth: Truth) -> tuple[Mapped, list[int], float]:

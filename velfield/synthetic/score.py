@@ -63,11 +63,14 @@ class DetectionScore:
 class TrackletScore:
     """Tracklets whose three detections are one vehicle; speeds of those, against the truth between the same frames.
 
+    ``precision_on_vehicle``: where a place counts that is anywhere along a vehicle, not only near its middle: of a
+    lorry the load may be what is followed.
     ``passages_per_vehicle``: how often a vehicle is counted in all; one would be right.
     """
 
     precision: float
     precision_moving: float
+    precision_on_vehicle: float
     recall_moving: float
     speed_error_mean_km_per_h: float
     speed_bias_km_per_h: float
@@ -215,7 +218,8 @@ def score_tracklets(
     frames = [np.array([_flight_frame(f, frame_of) for f in tracklets[f"frame_{k}"]], dtype=np.int64) for k in range(3)]
     places = [apply_homography(to_truth, tracklets[[f"x_{k}_px", f"y_{k}_px"]].to_numpy(np.float64)) for k in range(3)]
     vehicles = np.stack([_nearest_vehicle(truth, f, xy, match_px) for f, xy in zip(frames, places, strict=True)])
-    right = (vehicles[0] >= 0) & (vehicles[0] == vehicles[1]) & (vehicles[0] == vehicles[2])
+    right = _same(vehicles)
+    touched = [_nearest_vehicle(truth, f, xy, match_px, along=True) for f, xy in zip(frames, places, strict=True)]
     cars = truth.cars.set_index(["frame", "vehicle_id"])
     table = pd.DataFrame({"frame": frames[1], "vehicle_id": vehicles[1]})[right]
     here = cars.loc[pd.MultiIndex.from_frame(table)] if len(table) else cars.iloc[:0]
@@ -233,6 +237,7 @@ def score_tracklets(
     return TrackletScore(
         precision=float(right.mean()) if len(right) else 0.0,
         precision_moving=float(right[claimed].mean()) if claimed.any() else 0.0,
+        precision_on_vehicle=float(_same(np.stack(touched)).mean()) if len(right) else 0.0,
         recall_moving=len(hit & triples) / max(len(triples), 1),
         speed_error_mean_km_per_h=float(np.abs(speed[moving]).mean()) if moving.any() else 0.0,
         speed_bias_km_per_h=float(speed[moving].mean()) if moving.any() else 0.0,
@@ -324,15 +329,38 @@ def _match(found: FloatArray, true: FloatArray, match_px: float) -> NDArray[np.i
     return np.column_stack([a[good], b[good]]).astype(np.int64)
 
 
-def _nearest_vehicle(truth: Truth, frame: NDArray[np.int64], xy: FloatArray, match_px: float) -> NDArray[np.int64]:
+def _same(vehicles: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(n,) whether three places, (3, n) vehicles or -1, are one vehicle's."""
+    return np.asarray((vehicles[0] >= 0) & (vehicles[0] == vehicles[1]) & (vehicles[0] == vehicles[2]))
+
+
+def _nearest_vehicle(
+    truth: Truth, frame: NDArray[np.int64], xy: FloatArray, match_px: float, *, along: bool = False
+) -> NDArray[np.int64]:
+    """(n,) the vehicle whose middle, or any place along it, is nearest and within ``match_px``; -1 where none is."""
     out = np.full(len(xy), -1, dtype=np.int64)
     for f in np.unique(frame):
         cars = truth.cars[truth.cars["frame"] == f]
         here = np.flatnonzero(frame == f)
         if len(cars):
-            distance, k = cKDTree(cars[["x_base_px", "y_base_px"]].to_numpy()).query(xy[here])
-            out[here] = np.where(distance <= match_px, cars["vehicle_id"].to_numpy()[np.minimum(k, len(cars) - 1)], -1)
+            places, vehicle = _along(cars, match_px) if along else (_middles(cars), cars["vehicle_id"].to_numpy())
+            distance, k = cKDTree(places).query(xy[here])
+            out[here] = np.where(distance <= match_px, vehicle[np.minimum(k, len(vehicle) - 1)], -1)
     return out
+
+
+def _middles(cars: pd.DataFrame) -> FloatArray:
+    return cars[["x_base_px", "y_base_px"]].to_numpy(np.float64)
+
+
+def _along(cars: pd.DataFrame, match_px: float) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Places (m, 2) along the vehicles, none nearer to an end than ``match_px`` but the middle, and whose they are."""
+    half = np.maximum(cars["length_px"].to_numpy(np.float64) / 2 - match_px, 0.0)
+    steps = np.linspace(-1.0, 1.0, 13)  # 2 px apart on the longest bus
+    axis = cars["orientation_rad"].to_numpy(np.float64)
+    ahead = np.column_stack([np.cos(axis), np.sin(axis)]) * half[:, None]
+    places = _middles(cars)[:, None] + steps[:, None] * ahead[:, None]
+    return places.reshape(-1, 2), np.repeat(cars["vehicle_id"].to_numpy(), len(steps))
 
 
 def _velocity(tracklets: pd.DataFrame, part: str, place: FloatArray, to_truth: FloatArray | None) -> FloatArray:
