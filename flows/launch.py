@@ -5,12 +5,12 @@ A person's own settings win: every variable is a default.
 
 import ctypes
 import os
-import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from subprocess import DEVNULL, Popen
 
 PAGES, PAGES_OF = "VELFIELD_PAGES", "VELFIELD_PAGES_OF"
 """Environment: where `velfield serve` shows the pages of runs, and of which folder."""
@@ -95,7 +95,7 @@ def first_start_beside() -> Iterator[None]:
         yield
         return
     command = [sys.executable, "-m", "prefect", "server", "database", "upgrade", "-y"]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as beside:
+    with Popen(command, stdout=DEVNULL, stderr=DEVNULL) as beside:
         try:
             yield
         except BaseException:
@@ -119,7 +119,7 @@ def kernels_beside() -> Iterator[None]:
         yield
         return
     command = [sys.executable, "-m", "velfield.plain_run"]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as beside:
+    with Popen(command, stdout=DEVNULL, stderr=DEVNULL) as beside:
         try:
             yield
         finally:
