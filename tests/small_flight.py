@@ -15,6 +15,7 @@ SMALL = (
     "detection.rounds=40",
     "detection.feature_pool=250",
     "detection.folds=2",
+    "lens.refine=never",
     "registration.key_points=1200",
     "work.unit_frames=8",
     "work.retries=1",

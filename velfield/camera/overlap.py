@@ -407,13 +407,13 @@ def fit_overlap(overlap: Overlap, line: LensLine, *, start: float | None, before
     fit_px = float(_medians(misses, overlap.there).mean())
     weight = float(_weights(misses, overlap.there).sum())
     before_px, after_px = _left_out(problem, state, left_out[:, :3], without, before)
-    return OverlapFit(
-        amount=float(state.shared[0]),
-        amount_sd=float(np.sqrt(disagreement + _hidden(problem, normal, weight, fit_px))),
-        fit_px=fit_px,
-        before_px=before_px,
-        after_px=after_px,
-    )
+    deviation = float(np.sqrt(disagreement + _hidden(problem, normal, weight, fit_px)))
+    return OverlapFit(*(_told(value) for value in (float(state.shared[0]), deviation, fit_px, before_px, after_px)))
+
+
+def _told(value: float) -> float:
+    """To six digits: the last ones hang on how many threads linear algebra has, and a run's bits must not."""
+    return float(f"{value:.6g}")
 
 
 def _hidden(problem: _Problem, normal: _Normal, weight: float, fit_px: float) -> float:
