@@ -117,13 +117,16 @@ def off_the_truth_px(record: CameraRecord, a: float) -> float:
     return rms_after_homography(found, lens_of(a).undistort_points(points))
 
 
-@pytest.mark.parametrize(("how", "a"), [("along", 0.05), ("along", 0.3), ("turns", 0.2), ("turns", -0.1)])
-def test_a_camera_that_flies_along_or_turns_tells_its_distortion_within_its_uncertainty(how: str, a: float) -> None:
-    for seed in (1, 2):
-        fit = fitted(flown(how, a, seed))
-        assert abs(fit.amount - a) < 0.012
-        assert abs(fit.amount - a) < 3 * fit.amount_sd
-        assert fit.amount_sd < 0.02
+@pytest.mark.parametrize(
+    ("how", "a", "seed"), [("along", 0.05, 1), ("along", 0.3, 2), ("turns", 0.2, 3), ("turns", -0.1, 4)]
+)
+def test_a_camera_that_flies_along_or_turns_tells_its_distortion_within_its_uncertainty(
+    how: str, a: float, seed: int
+) -> None:
+    fit = fitted(flown(how, a, seed))
+    assert abs(fit.amount - a) < 0.012
+    assert abs(fit.amount - a) < 3 * fit.amount_sd
+    assert fit.amount_sd < 0.02
 
 
 def test_the_ground_may_bulge_and_the_uncertainty_knows_it() -> None:
@@ -181,16 +184,15 @@ def test_a_distortion_that_lines_are_silent_of_is_brought_in_by_strong_evidence_
     assert "below 10 standard deviations" in weak.overlap.reason
 
 
-@pytest.mark.parametrize("how", ["along", "turns", "hangs"])
-def test_without_distortion_none_is_brought_in(how: str) -> None:
-    for seed in (11, 12):
-        refined = refine(nothing_by_lines(), flown(how, 0.0, seed))
-        assert not refined.accepted
-        assert lens_from_record(refined.lens) == pinhole(SHAPE)
-        assert refined.overlap is not None
-        assert refined.overlap.a is not None
-        assert refined.overlap.a_sd is not None
-        assert abs(refined.overlap.a) < CONFIRMED_SIGMAS * refined.overlap.a_sd
+@pytest.mark.parametrize(("how", "seed"), [("along", 11), ("turns", 12), ("hangs", 13)])
+def test_without_distortion_none_is_brought_in(how: str, seed: int) -> None:
+    refined = refine(nothing_by_lines(), flown(how, 0.0, seed))
+    assert not refined.accepted
+    assert lens_from_record(refined.lens) == pinhole(SHAPE)
+    assert refined.overlap is not None
+    assert refined.overlap.a is not None
+    assert refined.overlap.a_sd is not None
+    assert abs(refined.overlap.a) < CONFIRMED_SIGMAS * refined.overlap.a_sd
 
 
 def test_a_hollow_under_a_camera_that_hardly_moves_is_no_lens() -> None:

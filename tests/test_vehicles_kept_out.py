@@ -22,7 +22,13 @@ def test_no_key_point_lies_on_a_given_vehicle(tmp_path: Path) -> None:
     boxes = tmp_path / "boxes.csv"
     boxes.write_text("frame,x_px,y_px,orientation_rad,length_px,width_px\nb.png,80,60,0.0,60,30\nc.png,80,60,,,\n")
     inputs = Inputs(source=str(folder), detections=str(boxes))
-    plan = make_plan(Job(root=str(tmp_path / "run"), inputs=inputs, config=resolve_config(overrides={"frames.fps": 5})))
+    plan = make_plan(
+        Job(
+            root=str(tmp_path / "run"),
+            inputs=inputs,
+            config=resolve_config(overrides={"frames.fps": 5, "lens.refine": "never"}),
+        )
+    )
     lay_out_frames(plan)
     read_unit(plan, range(3))
     free = free_of_vehicles(plan, 1, (120, 160))
