@@ -5,9 +5,9 @@ from importlib.metadata import version
 STAGE_VERSIONS: dict[str, int] = {
     "frames": 1,
     "lens": 3,
-    "base": 2,
-    "registration": 2,
-    "detector": 6,
+    "base": 3,
+    "registration": 3,
+    "detector": 7,
     "detections": 3,
     "links": 1,
     "tracklets": 2,

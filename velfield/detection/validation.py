@@ -26,6 +26,7 @@ _LOST, _MARGIN = 0.02, 0.1
 """The cascade's cuts: the share of held-out cars that they would lose, and a margin for sites that look otherwise."""
 _KEPT_RECALL = 0.95
 _BETA = 0.7
+"""Precision counts twice as much: the field wants few wrong tracks rather than all cars."""
 _AS_GOOD = 0.985
 
 
@@ -129,9 +130,8 @@ def curve_of(evidence: Evidence, told: str) -> PrecisionRecallCurve | None:
     score, right = evidence.score[order], evidence.right[order]
     found = np.cumsum(right)
     precision, recall = found / np.arange(1, len(found) + 1), found / evidence.cars
-    merit = _merit(precision, recall)
     # Of a few dozen cars one more or less moves the peak far; the middle of all that is nearly as good stays.
-    best = int(np.median(np.flatnonzero(merit > _AS_GOOD * merit.max())))
+    best = int(np.median(nearly_best(precision, recall, beta=_BETA)))
     if not evidence.complete:
         best = int(np.searchsorted(recall, _KEPT_RECALL * recall[-1]))
     kept = np.unique(np.r_[np.linspace(0, len(score) - 1, min(_CURVE_POINTS, len(score))).astype(int), best])
@@ -144,6 +144,7 @@ def curve_of(evidence: Evidence, told: str) -> PrecisionRecallCurve | None:
     )
 
 
-def _merit(precision: Floats, recall: Floats) -> Floats:
-    """F measure; precision counts twice as much: the field wants few wrong tracks rather than all cars."""
-    return np.asarray((1 + _BETA**2) * precision * recall / np.maximum(_BETA**2 * precision + recall, 1e-9))
+def nearly_best(precision: Floats, recall: Floats, *, beta: float) -> NDArray[np.int64]:
+    """Where on a curve, by falling threshold, the F measure, recall weighed ``beta`` times, is all but greatest."""
+    merit = (1 + beta**2) * precision * recall / np.maximum(beta**2 * precision + recall, 1e-9)
+    return np.flatnonzero(merit > _AS_GOOD * merit.max())

@@ -10,7 +10,7 @@ from schemas.flight import DetectionConfig
 from schemas.records import WorkingRecord
 from velfield.detection.detector import Detector, load_detector, shipped_detector
 from velfield.detection.motion_difference import MotionBackground, MotionFrame, motion_background
-from velfield.detection.motion_evidence import evidence_of
+from velfield.detection.motion_evidence import evidence_of, neighbours
 from velfield.detection.motion_labels import FrameLabels, MotionLabels, choose_frames, labels_from_motion, working_scale
 from velfield.detection.train import LabelledImage, train_detector
 from velfield.errors import InputError
@@ -25,7 +25,7 @@ from velfield.steps.working import WorkingGrid, write_background
 from velfield.stores import open_frames
 
 _TRAINING_FRAMES = 6
-_EVIDENCE_BURSTS = 3
+_EVIDENCE_BURSTS = 6
 _FEW_CARS = 40
 """Fewer marked cars than this continue the shipped detector."""
 
@@ -115,8 +115,7 @@ def _threshold_by_motion(
     detector: Detector, frames: list[MotionFrame], background: MotionBackground, config: DetectionConfig
 ) -> Detector:
     """The detector with the threshold at which what it finds moves as cars do; as it is where too few move to tell."""
-    starts = np.unique(np.linspace(0, len(frames) - 3, min(_EVIDENCE_BURSTS, len(frames) - 2)).round().astype(int))
-    chosen = np.unique((starts[:, None] + np.arange(3)).ravel())
+    chosen = neighbours([frame.time_s for frame in frames], _EVIDENCE_BURSTS)
     median = background.median if detector.uses_background else None
     evidence = evidence_of(detector, [frames[k] for k in chosen], median, config)
     if not np.isfinite(evidence.chosen):
