@@ -175,6 +175,8 @@ class TrackingConfig(Model):
     """Align the patches of a link below the pixel, and let the tracklet carry that displacement."""
     join_gap_s: float = Field(2.0, ge=0)
     """A vehicle that is lost from sight for no longer than this goes on as the same passage; 0: as another one."""
+    join_standing_gap_s: float = Field(30.0, ge=0)
+    """The same for one that stands, and is found again where it stood."""
 
 
 class FieldConfig(Model):

@@ -115,7 +115,7 @@ def test_patches_from_afar_do_not_pull_what_lies_near_by() -> None:
 def test_patches_are_looked_for_farther_off_where_key_points_mislead() -> None:
     """All key points lie four pixels beside what they show: patches near by are few, and farther off they are right."""
     grey, key_points = seen("still", 0)
-    beside = KeyPoints(key_points.xy + [3.0, -3.0], key_points.descriptors)
+    beside = KeyPoints(key_points.xy + np.array([3.0, -3.0]), key_points.descriptors)
     results = register_segment([(0, grey, beside)], base_of("still"), lens_of(flight_of("still")), CONFIG)
     assert errors_px("still", results)[0] < 0.1
 

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from velfield.tracking.joining import END_COLUMNS, join_chains
+from velfield.tracking.joining import END_COLUMNS, Gaps, join_chains
 
 GSD_M = 0.25
 INTERVAL_S = 0.2
@@ -22,10 +22,10 @@ def seen(start_s: float, frames: int, place_m: float, speed: float, acceleration
     return pd.DataFrame({**columns, "vy_01_px_per_s": 0.0, "vy_12_px_per_s": 0.0})[END_COLUMNS]
 
 
-def joined(parts: Sequence[pd.DataFrame], gap_s: float = 2.0) -> list[int]:
+def joined(parts: Sequence[pd.DataFrame], gap_s: float = 2.0, standing_gap_s: float = 0.0) -> list[int]:
     """The passage of each part, each a chain of its own."""
     chains = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    passages = join_chains(pd.concat(parts, ignore_index=True), chains, gap_s, gsd_m=GSD_M)
+    passages = join_chains(pd.concat(parts, ignore_index=True), chains, Gaps(gap_s, standing_gap_s), gsd_m=GSD_M)
     assert all(len(set(passages[chains == k])) == 1 for k in range(len(parts)))
     return [int(passages[chains == k][0]) for k in range(len(parts))]
 
@@ -39,6 +39,17 @@ def test_lost_for_a_second_it_goes_on(speed: float, acceleration: float) -> None
     assert joined([before, after]) == [0, 0]
     assert joined([before, after], gap_s=1.0) == [0, 1]
     assert joined([before, after], gap_s=0.0) == [0, 1]
+
+
+def test_what_stands_is_itself_however_long_it_is_lost() -> None:
+    standing, again = seen(0.0, 6, 0.0, 0.1), seen(20.0, 6, 0.5, 0.0)
+    assert joined([standing, again], standing_gap_s=30.0) == [0, 0]
+    assert joined([standing, again]) == [0, 1]
+    assert joined([standing, again], standing_gap_s=10.0) == [0, 1]
+    assert joined([standing, seen(20.0, 6, 1.5, 0.0)], standing_gap_s=30.0) == [0, 1]
+    rolling = seen(20.0, 6, 0.5, 3.0)  # the next in its place, and one that passes through it
+    assert joined([standing, rolling], standing_gap_s=30.0) == [0, 1]
+    assert joined([seen(0.0, 6, -2.0, 3.0), again], standing_gap_s=30.0) == [0, 1]
 
 
 def test_three_parts_are_one_whatever_their_order() -> None:
@@ -72,4 +83,4 @@ def test_an_end_goes_on_once() -> None:
 
 def test_no_tracklets() -> None:
     empty = seen(0.0, 2, 0.0, 1.0)
-    assert join_chains(empty, np.zeros(0, np.int64), 2.0, gsd_m=None).size == 0
+    assert join_chains(empty, np.zeros(0, np.int64), Gaps(2.0), gsd_m=None).size == 0

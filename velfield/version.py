@@ -10,7 +10,7 @@ STAGE_VERSIONS: dict[str, int] = {
     "detector": 7,
     "detections": 3,
     "links": 1,
-    "tracklets": 2,
+    "tracklets": 3,
     "field": 2,
     "maps": 4,
 }

@@ -79,7 +79,8 @@ class MotionEvidence:
     recall : float64 (m,)
         Share of all that move that are above it.
     chosen : float
-        The middle of the thresholds at which precision and recall together are nearly best; NaN where too few move to tell.
+        The middle of the thresholds at which precision and recall together are nearly best; NaN where too few move
+        to tell.
     """
 
     threshold: Floats

@@ -13,7 +13,7 @@ from velfield.steps.outcome import Outcome
 from velfield.steps.registration import MAP_PARAMETERS, usable_frames
 from velfield.stores import open_frames, open_registration
 from velfield.tables import Patches, read_patches, read_tables, write_table
-from velfield.tracking.joining import END_COLUMNS, join_chains
+from velfield.tracking.joining import END_COLUMNS, Gaps, join_chains
 from velfield.tracking.passages import assign_passages
 from velfield.tracking.tracklets import FrameTable, link_windows, window_frames
 
@@ -103,7 +103,9 @@ def chain_passages(plan: Plan, units: list[range]) -> Outcome:
     sources = link_files(plan, units)
     tracklets = read_tables(sources, TRACKLET_COLUMNS, only=[*ids, *END_COLUMNS])
     chains = assign_passages(tracklets[ids].to_numpy(np.int64))
-    chains = join_chains(tracklets, chains, plan.config.tracking.join_gap_s, gsd_m=read_grid(plan).gsd_m)
+    config = plan.config.tracking
+    gaps = Gaps(config.join_gap_s, config.join_standing_gap_s, config.slow_m_per_s)
+    chains = join_chains(tracklets, chains, gaps, gsd_m=read_grid(plan).gsd_m)
     written, start = [], 0
     for path in sources:
         table = read_tables([path], TRACKLET_COLUMNS)

@@ -3,7 +3,7 @@
 A detector misses a car now and then, and a chain of tracklets ends there; without this, a flight counted four passages
 of each vehicle, and a queue many more. Both ends of a gap say where and how fast: at a constant acceleration between
 them the way is the mean of both velocities times the gap, whatever the acceleration, so the place where the later chain
-starts is foretold below a metre for gaps of a second or two.
+starts is foretold below a metre for gaps of a second or two. One that stands stays where it is, however long.
 """
 
 from dataclasses import dataclass
@@ -21,6 +21,11 @@ _CHANGE_M_PER_S2 = 4.0
 _WITHIN_M = 2.2
 """Never farther than this: half a car, so that the neighbour in a queue is not meant."""
 
+_SOONER_PER_S = 0.5
+"""A second later counts as much as half of what the place may be off."""
+_STANDING_WITHIN_M = 1.0
+"""A vehicle that stood is found where it stood; the next in its place would come rolling."""
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -33,6 +38,19 @@ class _Ends:
     place_m: Floats
     velocity_m_per_s: Floats
 
+    @property
+    def speed_m_per_s(self) -> Floats:
+        return np.asarray(np.hypot(self.velocity_m_per_s[:, 0], self.velocity_m_per_s[:, 1]))
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """How long a vehicle may be lost from sight, s; one slower than ``slow_m_per_s`` at both ends stands."""
+
+    moving_s: float
+    standing_s: float = 0.0
+    slow_m_per_s: float = 1.15
+
 
 END_COLUMNS = [
     *("time_0_s", "x_0_px", "y_0_px", "vx_01_px_per_s", "vy_01_px_per_s"),
@@ -41,8 +59,8 @@ END_COLUMNS = [
 """Columns of tracklets that `join_chains` reads."""
 
 
-def join_chains(tracklets: pd.DataFrame, chains: Ints, max_gap_s: float, *, gsd_m: float | None) -> Ints:
-    """The passage of each tracklet: chains of one vehicle, with gaps of up to ``max_gap_s`` between them, are one.
+def join_chains(tracklets: pd.DataFrame, chains: Ints, gaps: Gaps, *, gsd_m: float | None) -> Ints:
+    """The passage of each tracklet: chains of one vehicle, with gaps between them, are one.
 
     Every end goes on in one start at most, the likeliest pairs first.
 
@@ -52,8 +70,8 @@ def join_chains(tracklets: pd.DataFrame, chains: Ints, max_gap_s: float, *, gsd_
         `END_COLUMNS`.
     chains
         (n,) chain of each tracklet, by `velfield.tracking.passages.assign_passages`.
-    max_gap_s
-        Longest gap; 0 leaves the chains as they are.
+    gaps
+        The longest ones; 0 leaves the chains as they are.
     gsd_m
         Metres a base pixel; None: the paper's.
 
@@ -71,7 +89,7 @@ def join_chains(tracklets: pd.DataFrame, chains: Ints, max_gap_s: float, *, gsd_
     ends = _ends(tracklets.iloc[last], "2", "12", metres)
     before = np.full(len(names), -1)  # the chain that each goes on from
     taken = np.zeros(len(names), bool)
-    for end, start in _pairs(ends, starts, max_gap_s):
+    for end, start in _pairs(ends, starts, gaps):
         if not taken[end] and before[start] < 0:
             taken[end], before[start] = True, end
     passage = names.copy()
@@ -92,22 +110,31 @@ def _ends(rows: pd.DataFrame, place: str, link: str, metres: float) -> _Ends:
     )
 
 
-def _pairs(ends: _Ends, starts: _Ends, max_gap_s: float) -> Ints:
+def _pairs(ends: _Ends, starts: _Ends, gaps: Gaps) -> Ints:
     """(m, 2) ends and starts that may be one vehicle, the likeliest first."""
     order = np.argsort(starts.time_s, kind="stable")
     times = starts.time_s[order]
+    stands = starts.speed_m_per_s < gaps.slow_m_per_s
+    stood = ends.speed_m_per_s < gaps.slow_m_per_s
+    longest = np.where(stood, max(gaps.moving_s, gaps.standing_s), gaps.moving_s)
     low = np.searchsorted(times, ends.time_s, side="right")
-    high = np.searchsorted(times, ends.time_s + max_gap_s, side="right")
+    high = np.searchsorted(times, ends.time_s + longest, side="right")
     found = []
     for end in np.flatnonzero(high > low):
         start = order[low[end] : high[end]]
         gap = starts.time_s[start] - ends.time_s[end]
+        way = starts.place_m[start] - ends.place_m[end]
         mean = (ends.velocity_m_per_s[end] + starts.velocity_m_per_s[start]) / 2
-        off = np.hypot(*(starts.place_m[start] - ends.place_m[end] - mean * gap[:, None]).T)
+        off = np.hypot(*(way - mean * gap[:, None]).T)
         share = off / np.minimum(_SLACK_M + _CHANGE_M_PER_S2 * gap**2 / 8, _WITHIN_M)
+        share[gap > gaps.moving_s] = np.inf
+        if stood[end]:
+            stays = stands[start] & (gap <= gaps.standing_s)
+            share = np.where(stays, np.minimum(share, np.hypot(*way.T) / _STANDING_WITHIN_M), share)
         may = share <= 1
         # Of two that fit alike, the one that comes sooner.
-        found.append(np.stack([share[may] + gap[may] / max_gap_s, np.full(may.sum(), end), start[may]], axis=1))
+        rank = share[may] + _SOONER_PER_S * gap[may]
+        found.append(np.stack([rank, np.full(may.sum(), end), start[may]], axis=1))
     table = np.concatenate(found) if found else np.empty((0, 3))
     pairs = table[:, 1:].astype(np.int64)
     return np.asarray(pairs[np.lexsort((pairs[:, 1], pairs[:, 0], table[:, 0]))], np.int64)
