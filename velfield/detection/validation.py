@@ -26,8 +26,8 @@ _LOST, _MARGIN = 0.02, 0.1
 """The cascade's cuts: the share of held-out cars that they would lose, and a margin for sites that look otherwise."""
 _KEPT_RECALL = 0.95
 _BETA = 0.8
-"""Precision counts half as much again: the field wants few wrong tracks; but what is tried on cars that were left out is
-worse than the detector of all of them."""
+"""Precision counts half as much again: the field wants few wrong tracks; but detectors tried on cars that were left out
+are worse than the one that learnt from all."""
 _AS_GOOD = 0.985
 
 
