@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from velfield.errors import InputError
-from velfield.registration.alignment import Templates, align, blurred, make_templates
+from velfield.registration.alignment import FEW, MANY, Templates, align, blurred, make_templates
 from velfield.registration.transforms import FrameTransform
 from velfield.run import Run
 from velfield.sources.pictures import read_picture_grey
@@ -77,7 +77,8 @@ def _unused_corners(run: Run) -> Templates:
     own = run.grid.frames_to == "own"
     grey = read_picture_grey(layout.own_base_image, limit) if own else run.base_image
     known = read_picture_grey(layout.own_base_mask, limit) > 0 if own else np.ones(grey.shape, np.bool_)
-    return make_templates(grey, known, apart_from=make_templates(grey, known).xy)
+    used = [make_templates(grey, known, count=count).xy for count in (FEW, MANY)]
+    return make_templates(grey, known, apart_from=np.concatenate(used))
 
 
 def _places(grey: NDArray[np.uint8], transform: FrameTransform, templates: Templates) -> FloatArray:

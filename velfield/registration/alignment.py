@@ -18,8 +18,9 @@ from velfield.registration.transforms import FrameTransform
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 
-_POINTS_A_PICTURE = 3000
-_CELL_PX = (16.0, 40.0)
+FEW, MANY = 3000, 6000
+"""Patches of a base image: where the frames' own camera made it, and where half of them will not be found."""
+_CELL_PX = (10.0, 40.0)
 _HALF_PATCH = 7
 _FINE_SIGMA_PX = 0.8
 """Blur of both pictures before they are compared; the bilinear sampling of the raw frame is exact enough then."""
@@ -57,9 +58,13 @@ class Templates:
 
 
 def make_templates(
-    base: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None, *, apart_from: FloatArray | None = None
+    base: NDArray[np.uint8],
+    mask: NDArray[np.bool_] | None = None,
+    *,
+    count: int = FEW,
+    apart_from: FloatArray | None = None,
 ) -> Templates:
-    """The best corner of each cell of a base image (h, w), with its patches.
+    """The best corner of each of ``count`` cells of a base image (h, w), with its patches.
 
     ``mask`` (h, w) is where the image is known; no corner lies within half a patch of ``apart_from`` (n, 2).
     """
@@ -77,7 +82,7 @@ def make_templates(
     least *= usable
     if apart_from is not None:
         least *= _far_from(apart_from, base.shape)
-    cell = float(np.clip(np.sqrt(base.size / _POINTS_A_PICTURE), *_CELL_PX))
+    cell = float(np.clip(np.sqrt(base.size / count), *_CELL_PX))
     xy, strength = _best_of_cells(least, max(1, round(cell)), (_NOISE_GREY / _MAX_SIGMA_PX) ** 2)
     sigma = np.sqrt(_FLOOR_PX**2 + _NOISE_GREY**2 / np.maximum(strength, 1e-9))
     at = xy.astype(np.int64)

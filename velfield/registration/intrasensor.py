@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
-from velfield.registration.alignment import Templates, align, blurred, make_templates
+from velfield.registration.alignment import MANY, Templates, align, blurred, make_templates
 from velfield.registration.fitting import case_deletion
 from velfield.registration.joint import ControlPoints, JointFit, joint_fit
 from velfield.registration.keypoints import KeyPoints, detect_key_points
@@ -51,6 +51,8 @@ _COARSE_SHIFT_PX = 7.0
 _FINE_SHIFT_PX = 2.5
 _SURE_SHARE = 0.3
 """More of the base image's patches than this found near by: the key points' fit is near enough everywhere."""
+_PLENTY_SHARE = 0.8
+"""Fewer than this found, and more are looked for: of another sensor's picture half are, too few at the borders."""
 _MIN_FOUND_SHARE = 0.15
 """Less than this share of the base image's patches found: it is not this place, whatever the prior says."""
 _BASE_KEY_POINTS = 3
@@ -65,12 +67,13 @@ class BaseReference:
     ----------
     shape : (height, width) of the base image, px.
     key_points : of the base image, base px.
-    templates : patches about its corners.
+    templates, many : patches about its corners; more of them where half are not found.
     """
 
     shape: tuple[int, int]
     key_points: KeyPoints
     templates: Templates
+    many: Templates
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +130,8 @@ def prepare_base(
     frame_area = grey.size if frame_shape is None else frame_shape[0] * frame_shape[1]
     share = float(np.clip(grey.size / frame_area, 1.0, _BASE_KEY_POINTS))
     key_points = detect_key_points(grey, config, mask, count=round(config.key_points * share))
-    return BaseReference((grey.shape[0], grey.shape[1]), key_points, make_templates(grey, mask))
+    few, many = make_templates(grey, mask), make_templates(grey, mask, count=MANY)
+    return BaseReference((grey.shape[0], grey.shape[1]), key_points, few, many)
 
 
 def register_segment(
@@ -288,16 +292,18 @@ class _Task:
         if isinstance(fit, Failure):
             return fit
         fine, coarse = blurred(self.grey)
-        near, looked_for = align(fine, fit.transform, self.base.templates, coarse=False, max_shift_px=_FINE_SHIFT_PX)
-        used, steps = points, [(fine, False, _FINE_SHIFT_PX)] * 2
-        if len(near) < _SURE_SHARE * looked_for:
+        templates = self.base.templates
+        found, looked_for = align(fine, fit.transform, templates, coarse=False, max_shift_px=_FINE_SHIFT_PX)
+        plenty = len(found) >= _PLENTY_SHARE * looked_for
+        if not plenty:
+            templates = self.base.many
+        steps = [(fine, False, _FINE_SHIFT_PX)] * 2
+        if len(found) < _SURE_SHARE * looked_for:
             steps.insert(0, (coarse, True, _COARSE_SHIFT_PX))
+        used = points
         for k, (picture, is_coarse, limit) in enumerate(steps):
-            found = near
-            if k or is_coarse:
-                found, looked_for = align(
-                    picture, fit.transform, self.base.templates, coarse=is_coarse, max_shift_px=limit
-                )
+            if k or not plenty:
+                found, looked_for = align(picture, fit.transform, templates, coarse=is_coarse, max_shift_px=limit)
             if len(found) < _MIN_FOUND_SHARE * looked_for:
                 return Failure(f"{len(found)} of {looked_for} patches of the base image found")
             used = found.joined(_elsewhere(points, found, *self.size))
