@@ -114,6 +114,21 @@ def test_a_still_camera_pays_nothing_for_the_spline() -> None:
     assert mean_error(with_spline.transform, **still) < mean_error(without.transform, **still) + 0.01
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_roofs_that_lean_in_the_first_rows_do_not_bend_them(seed: int) -> None:
+    """Twenty points in the first rows, most of them on roofs that lean alike; the other rows hardly move."""
+    motion = {"amplitude_px": 1.5, "cycles": 2.0}
+    rng = np.random.default_rng(seed)
+    points = control_points(rng, count=700, noise_px=0.3, wrong=0.2, **motion)
+    ground = points.where(points.xy_raw[:, 1] > 45)
+    raw = rng.uniform(0, 1, (20, 2)) * [WIDTH - 1, 45]
+    base = shaken(raw, **motion) + rng.normal(0, 0.3, raw.shape)
+    base[:12] += [-5.0, 4.0]
+    found = fit(ground.joined(ControlPoints(raw, base, np.full(20, 0.5))))
+    first = np.stack([np.linspace(100, WIDTH - 100, 30), np.full(30, 15.0)], axis=1)
+    assert np.linalg.norm(found.transform.to_base(first) - shaken(first, **motion), axis=1).mean() < 1.0
+
+
 def test_held_out_residual_is_that_of_a_fit_without_the_fold() -> None:
     points = control_points(np.random.default_rng(7), count=600, noise_px=0.5, wrong=0.0, amplitude_px=0.0, cycles=0.0)
     found = fit(points, knots=0)

@@ -42,6 +42,8 @@ _STIFF = (10.0, 1e4)
 _HALVINGS = 6
 _STIFFNESS = tuple(10.0**k for k in (-2, -1, 0, 1, 2, 4, 6))
 """Candidates for the weight of the spline's squared second differences, over the noise variance."""
+_END_SHARE = 0.06
+"""The first and last rows, of the height, have no say in the stiffness: a roof that leans in there would bend them."""
 _WORTH = 1.002
 """A softer spline must make the held-out squares smaller by this factor at least."""
 _ROLL_STIFFNESS = tuple(10.0**k for k in (0, 1, 2, 4, 6))
@@ -442,7 +444,8 @@ def _stiffness_by_evidence(
     """The stiffness of the row's shift, then of its roll, with the least held-out squares; ``near`` is earlier's."""
     if problem.knots == 0:
         return (1.0, 1.0)
-    equations = problem.equations(theta, _precision(problem, weights, scale))
+    inner = np.abs(problem.rows / (problem.height - 1) - 0.5) < 0.5 - _END_SHARE
+    equations = problem.equations(theta, _precision(problem, np.where(inner, weights, 0.0), scale))
     shifts = _neighbours(_STIFFNESS, None if near is None else near[0])
     rolls = _neighbours(_ROLL_STIFFNESS, None if near is None else near[1])
     roll = _ROLL_STIFFNESS[-1] if near is None else near[1]
