@@ -199,7 +199,7 @@ def register_frame(
         prior.matrix, normalisation_of(corners), normalisation_of(prior(corners))
     )
     task = _Task(grey, base, lens, config)
-    points = from_base.joined(from_previous)
+    points = from_base.joined(_elsewhere(from_previous, from_base, width, height))
     if config.model == "polyprojective":
         fitted = task.deleted(points)
     else:
