@@ -142,7 +142,8 @@ def test_where_a_map_pixel_is_wider_than_a_finger_the_click_means_itself(page: P
 
 
 def test_degrees_say_what_they_are_counted_from(chromium: Browser, address: str, north_up: str, run: Run) -> None:
-    x, y = busiest(run)
+    goes = np.where(np.isfinite(run.field.modal_direction_rad()), run.field.count(), 0)
+    y, x = (int(k) for k in np.unravel_index(int(goes.argmax()), goes.shape))
     vx, vy = run.field.at(x, y).modal_velocity_px_per_s
     degrees = f"{round(np.degrees(np.arctan2(vx, -vy))) % 360}°"
     with chromium.page() as page:
