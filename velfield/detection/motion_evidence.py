@@ -174,7 +174,7 @@ def evidence_of(
     ----------
     detector : Detector
     frames : sequence of MotionFrame
-        Two or three bursts of three tell enough (`choose_frames`); more where few cars move.
+        Bursts of three (`neighbours`); six tell enough.
     background : uint8 (h, w) or None
         Temporal median, for a detector that looks at the difference to it.
     config : DetectionConfig

@@ -199,11 +199,10 @@ def register_frame(
         prior.matrix, normalisation_of(corners), normalisation_of(prior(corners))
     )
     task = _Task(grey, base, lens, config)
-    points = from_base.joined(_elsewhere(from_previous, from_base, width, height))
-    if config.model == "polyprojective":
-        fitted = task.deleted(points)
+    if config.model == "polyprojective":  # the paper's, to both alike
+        fitted = task.deleted(from_base.joined(from_previous))
     else:
-        fitted = task.aligned(points, start)
+        fitted = task.aligned(from_base.joined(_elsewhere(from_previous, from_base, width, height)), start)
     if isinstance(fitted, Failure):
         return FrameRegistration(None, f"failed:{fitted.reason}", len(from_base), len(from_previous))
     used, fit = fitted
