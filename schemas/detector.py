@@ -83,3 +83,16 @@ class DetectorRecord(Model):
         if self.method == "aligned" and (self.contrast_floor is None or self.proposer is None):
             raise ValueError("a detector of the aligned method needs contrast_floor and proposer")
         return self
+
+
+class LongVehicleRecord(Model):
+    """A classifier that tells the middle of a lorry or bus from all other places along its axis, and from cars."""
+
+    kind: Literal["velfield-long-vehicles"] = "velfield-long-vehicles"
+    version: Literal[1] = 1
+    working_car_length_px: PositiveFloat = Field(le=200)
+    rounds: tuple[Round, ...] = Field(min_length=1, max_length=5000)
+    threshold: float
+    """Above it a place is the middle of something long."""
+    contrast_floor: PositiveFloat
+    attribution: tuple[str, ...] = Field(default=(), max_length=50)

@@ -8,7 +8,7 @@ STAGE_VERSIONS: dict[str, int] = {
     "base": 3,
     "registration": 3,
     "detector": 7,
-    "detections": 3,
+    "detections": 4,
     "links": 1,
     "tracklets": 3,
     "field": 2,

@@ -1,13 +1,14 @@
-"""Makes the detector that ships anew and prints how good it is on places left out: ``make detector DATA=FOLDER``."""
+"""Makes the classifiers that ship anew and prints how good it is on places left out: ``make detector DATA=FOLDER``."""
 
 import sys
 from pathlib import Path
 
 import velfield.detection
-from velfield.detection.ship import ship
+from velfield.detection.ship import ship, ship_long_vehicles
 
 if __name__ == "__main__":
     if len(sys.argv) != 2:
         sys.exit("usage: make detector DATA=FOLDER   (one that holds songdo and kit_ais)")
-    shipped = Path(velfield.detection.__path__[0]) / "shipped_detector.json"
-    print("\n".join(ship(Path(sys.argv[1]), shipped)))
+    data, folder = Path(sys.argv[1]), Path(velfield.detection.__path__[0])
+    print(ship_long_vehicles(data, folder / "shipped_long_vehicles.json"))
+    print("\n".join(ship(data, folder / "shipped_detector.json")))

@@ -10,6 +10,7 @@ from velfield.detection.aligned import Look, distinct, find_cars
 from velfield.detection.dense import find_cars_densely
 from velfield.detection.detector import Detector
 from velfield.detection.label_axis import CAR_ASPECT
+from velfield.detection.long_vehicles import LONG, shipped_long_vehicles
 from velfield.detection.patches import oriented_patches, upright_chips
 from velfield.detection.scan import propose
 from velfield.detection.turned import COARSE, picture_of
@@ -90,7 +91,9 @@ def _aligned(
     )
     look = Look(picture_of(image, background), detector.sums, floor)
     found = find_cars(look, places, least_score=threshold, least_first_score=proposer.least_first_score)
-    return distinct(found, detector.record.working_car_length_px)
+    length = detector.record.working_car_length_px
+    cars, long = distinct(found, length), shipped_long_vehicles()
+    return long.centred(picture_of(image, None, LONG), cars) if length == long.record.working_car_length_px else cars
 
 
 def pictured(image: Grey, cars: Floats, area_px: Floats) -> FrameDetections:

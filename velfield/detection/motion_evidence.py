@@ -34,7 +34,7 @@ _MOVES_LENGTHS = 0.35
 _MISMATCH_LENGTHS = 0.3  # a detection lies within a pixel or two; regions of motion within less
 _MISMATCH_SHARE = 0.08
 _MIN_MOVING = 20
-MAX_INTERVAL_S = 0.45
+_MAX_INTERVAL_S = 0.45
 """Frames farther apart than this are no neighbours."""
 _SUREST = 0.5
 """This share of the moving detections, those liked best, are cars all but surely, and so are those alone among them."""
@@ -118,14 +118,12 @@ def neighbours(times_s: Sequence[float], wanted: int) -> Ints:
     [0, 1, 2, 6, 7, 8]
     """
     gaps = np.diff(np.asarray(times_s, np.float64))
-    starts = np.flatnonzero(np.maximum(gaps[:-1], gaps[1:]) <= MAX_INTERVAL_S)
+    starts = np.flatnonzero(np.maximum(gaps[:-1], gaps[1:]) <= _MAX_INTERVAL_S)
     chosen = starts[np.unique(np.linspace(0, len(starts) - 1, min(wanted, len(starts))).round().astype(int))]
     return np.unique((chosen[:, None] + np.arange(3)).ravel())
 
 
-def evidence_from_motion(
-    frames: Sequence[Found], *, car_length_px: float, max_interval_s: float = MAX_INTERVAL_S
-) -> MotionEvidence:
+def evidence_from_motion(frames: Sequence[Found], *, car_length_px: float) -> MotionEvidence:
     """Precision and recall of a detector from how its detections move.
 
     Parameters
@@ -134,12 +132,10 @@ def evidence_from_motion(
         In time order; bursts of three or more will do.
     car_length_px : float
         A car's length, working px.
-    max_interval_s : float
-        Frames farther apart than this are not neighbours.
     """
     scores, kinds = [np.empty(0)], [np.empty(0, np.int8)]
     for before, middle, after in zip(frames, frames[1:], frames[2:], strict=False):
-        if max(middle.time_s - before.time_s, after.time_s - middle.time_s) <= max_interval_s:
+        if max(middle.time_s - before.time_s, after.time_s - middle.time_s) <= _MAX_INTERVAL_S:
             scores.append(middle.score)
             kinds.append(conduct(before, middle, after, car_length_px=car_length_px))
     score, kind = np.concatenate(scores), np.concatenate(kinds)

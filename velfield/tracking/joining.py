@@ -13,6 +13,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from schemas.flight import PAPER_GSD_M
+from velfield.tracking.passages import smallest_joined
 
 _SLACK_M = 1.5
 """How far a vehicle may be from where it is foretold, besides: places of detections wander along a car."""
@@ -87,19 +88,14 @@ def join_chains(tracklets: pd.DataFrame, chains: Ints, gaps: Gaps, *, gsd_m: flo
     last = order[np.searchsorted(chain[order], np.arange(len(names)), side="right") - 1]
     starts = _ends(tracklets.iloc[first], "0", "01", metres)
     ends = _ends(tracklets.iloc[last], "2", "12", metres)
-    before = np.full(len(names), -1)  # the chain that each goes on from
-    taken = np.zeros(len(names), bool)
-    for end, start in _pairs(ends, starts, gaps):
-        if not taken[end] and before[start] < 0:
-            taken[end], before[start] = True, end
-    passage = names.copy()
-    for k in np.argsort(starts.time_s, kind="stable"):  # a chain's forerunner starts before it
-        if before[k] >= 0:
-            passage[k] = passage[before[k]]
-    smallest: dict[int, int] = {}
-    for name, whole in zip(names.tolist(), passage.tolist(), strict=True):
-        smallest[whole] = min(name, smallest.get(whole, name))
-    return np.array([smallest[whole] for whole in passage.tolist()], np.int64)[chain]
+    goes_on, is_gone_on = np.zeros(len(names), bool), np.zeros(len(names), bool)
+    joined: list[Ints] = []
+    for pair in _pairs(ends, starts, gaps):
+        end, start = pair
+        if not goes_on[end] and not is_gone_on[start]:
+            goes_on[end] = is_gone_on[start] = True
+            joined.append(pair)
+    return smallest_joined(names, np.array(joined, np.int64).reshape(-1, 2))[chain]
 
 
 def _ends(rows: pd.DataFrame, place: str, link: str, metres: float) -> _Ends:

@@ -28,8 +28,14 @@ def assign_passages(detection_ids: NDArray[np.int64]) -> NDArray[np.int64]:
     ids, flat = np.unique(detection_ids, return_inverse=True)
     node = flat.reshape(detection_ids.shape)
     edges = np.concatenate([node[:, :2], node[:, 1:]])
-    graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(ids.size, ids.size))
+    return smallest_joined(ids, edges)[node[:, 0]]
+
+
+def smallest_joined(names: NDArray[np.int64], edges: NDArray[np.int64]) -> NDArray[np.int64]:
+    """For each of names (n,), the smallest of those that edges (m, 2), pairs of their indices, join it to."""
+    count = len(names)
+    graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
     _, label = connected_components(graph, directed=False)
-    smallest = np.full(int(label.max()) + 1, np.iinfo(np.int64).max)
-    np.minimum.at(smallest, label, ids)
-    return np.asarray(smallest[label[node[:, 0]]], dtype=np.int64)
+    smallest = np.full(count, np.iinfo(np.int64).max)
+    np.minimum.at(smallest, label, names)
+    return np.asarray(smallest[label], dtype=np.int64)
