@@ -137,8 +137,8 @@ class DetectionConfig(Model):
     car_length_m: PositiveFloat = 4.0
     """A usual car's length, which with the ground sample distance sets the working scale."""
     motion_channel: Literal["auto", "always", "never"] = "auto"
-    """Whether |frame - background| is a channel of the classifier; ``auto``: where the evidence is that roofs stand
-    still."""
+    """Whether |frame - background| is a channel of what is learnt from motion; ``auto``: where looks alone do not tell
+    cars."""
     seed: int = Field(0, ge=0)
     """Seed of everything random in training."""
 

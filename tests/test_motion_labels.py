@@ -1,7 +1,7 @@
 """Labels from motion, on made scenes: cars with shadows, parked cars, swaying things, roofs that shift."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import av
@@ -20,7 +20,7 @@ from velfield.detection.motion_difference import (
     motion_difference,
     noise_sigma,
 )
-from velfield.detection.motion_evidence import Conduct, Found, conduct, evidence_from_motion
+from velfield.detection.motion_evidence import Conduct, Found, MotionEvidence, conduct, evidence_from_motion
 from velfield.detection.motion_labels import MotionLabels, choose_frames, labels_from_motion, working_scale
 from velfield.errors import InputError
 
@@ -331,6 +331,32 @@ def test_cars_missed_in_a_frame_beside_are_no_false_finds() -> None:
     evidence = evidence_from_motion(frames, car_length_px=16.0)
     assert evidence.precision[-1] > 0.93  # of all that are told, 0.79 move
     assert evidence.chosen < 0.9
+
+
+def test_what_stands_and_is_missed_in_one_frame_is_not_alone() -> None:
+    nothing, parked = np.empty((0, 2)), np.array([[200.0, 50.0]])
+    for before, after in ((parked, nothing), (nothing, parked + 1.0)):
+        frames = [found_at(xy, 0.0, np.ones(len(xy)), 0.2 * k) for k, xy in enumerate((before, parked, after))]
+        assert list(conduct(*frames, car_length_px=16.0)) == [Conduct.STANDS]
+
+
+def moving_and_standing(standing: NDArray[np.float64]) -> MotionEvidence:
+    """Sixty cars that move, liked at about 0.3, among what stands and is liked so much."""
+    rng = np.random.default_rng(6)
+    cars = np.column_stack([rng.uniform(0, 900, 60), np.arange(60) * 16.0])
+    parked = np.column_stack([np.full(len(standing), 2000.0), np.arange(len(standing)) * 30.0])
+    score = np.concatenate([rng.normal(0.3, 0.05, 60), standing])
+    frames = [found_at(np.concatenate([cars + np.array([11.0 * k, 0]), parked]), 0.0, score, 0.2 * k) for k in range(6)]
+    return evidence_from_motion(frames, car_length_px=16.0)
+
+
+def test_looks_tell_cars_where_what_stands_is_liked_as_much_as_what_moves() -> None:
+    rng = np.random.default_rng(7)
+    assert moving_and_standing(rng.normal(0.3, 0.05, 120)).tells_cars(0.3)
+    assert moving_and_standing(np.empty(0)).tells_cars(0.3)
+    assert not moving_and_standing(rng.uniform(0.15, 0.29, 3000)).tells_cars(0.3)
+    disliked = replace(moving_and_standing(np.empty(0)), chosen=-0.01)
+    assert not disliked.tells_cars(0.3)
 
 
 def test_without_motion_there_is_no_evidence() -> None:

@@ -7,7 +7,7 @@ STAGE_VERSIONS: dict[str, int] = {
     "lens": 3,
     "base": 3,
     "registration": 3,
-    "detector": 7,
+    "detector": 8,
     "detections": 4,
     "links": 1,
     "tracklets": 3,
