@@ -93,7 +93,9 @@ def _aligned(
     found = find_cars(look, places, least_score=threshold, least_first_score=proposer.least_first_score)
     length = detector.record.working_car_length_px
     cars, long = distinct(found, length), shipped_long_vehicles()
-    return long.centred(picture_of(image, None, LONG), cars) if length == long.record.working_car_length_px else cars
+    if length != long.record.working_car_length_px:
+        return cars
+    return long.centred(picture_of(image, None, LONG), cars, np.ones(image.shape, bool) if valid is None else valid)
 
 
 def pictured(image: Grey, cars: Floats, area_px: Floats) -> FrameDetections:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from schemas.detector import LongVehicleRecord
 from velfield.detection.aligned import moved
 from velfield.detection.detector import BoostedSums, sums_of
+from velfield.detection.samples import lies_in
 from velfield.detection.turned import Grain, Picture, scores_at
 
 Floats = NDArray[np.float64]
@@ -40,21 +41,24 @@ class LongVehicles:
         """How much places (n, 2), moved by `OFFSETS` along their axes (n,), look like a middle: (n, offsets)."""
         return scores_at(self.sums, picture, xy, axes, OFFSETS, contrast_floor=self.record.contrast_floor)
 
-    def centred(self, picture: Picture, cars: Floats) -> Floats:
+    def centred(self, picture: Picture, cars: Floats, seen: Bools) -> Floats:
         """Distinct cars (n, 2...) as x, y, axis, the best first, what is long at its middle and once.
 
         Parameters
         ----------
         picture
             Packed at `LONG`.
+        seen
+            (h, w): where the frame covers the picture; what has its middle elsewhere stays where it was found.
         """
         if not len(cars):
             return cars
         scores = self.scores(picture, cars[:, :2], cars[:, 2])
         offsets = OFFSETS[scores.argmax(axis=1)].astype(np.float64) * picture.grain.step
-        long = scores.max(axis=1) > self.record.threshold
-        middles = moved(cars[:, :2], cars[:, 2], np.where(long[:, None], offsets, 0.0))
-        cars = np.column_stack([middles, cars[:, 2:]])
+        middles = moved(cars[:, :2], cars[:, 2], offsets)
+        within = (np.rint(middles) >= 0).all(axis=1) & (np.rint(middles) < seen.shape[::-1]).all(axis=1)
+        long = (scores.max(axis=1) > self.record.threshold) & within & lies_in(seen, middles)
+        cars = np.column_stack([np.where(long[:, None], middles, cars[:, :2]), cars[:, 2:]])
         return np.asarray(cars[~self._on_another(cars, long)])
 
     def _on_another(self, cars: Floats, long: Bools) -> Bools:
