@@ -68,6 +68,8 @@ class DetectorRecord(Model):
     """A car's length on the grid that it was learnt on."""
     rounds: tuple[Round, ...] = Field(min_length=1, max_length=5000)
     threshold: float
+    grey_bits: int = Field(default=8, ge=1, le=8)
+    """Dense: so many bits of the grey are looked at."""
     contrast_floor: PositiveFloat | None = None
     """Aligned: sums are divided by the mean gradient about the place plus this; none: they are taken as they are."""
     proposer: Proposer | None = None

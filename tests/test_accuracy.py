@@ -27,7 +27,12 @@ def test_a_flight_with_base_image_and_labels_is_near_the_truth(server: None, tmp
         base=str(flight / "base.png"),
         labels=str(flight / "labels.csv"),
     )
-    settings = ["detection.rounds=120", "detection.feature_pool=800", "registration.key_points=1500"]
+    settings = [
+        "detection.rounds=120",
+        "detection.feature_pool=800",
+        "detection.folds=2",
+        "registration.key_points=1500",
+    ]
     config = resolve_config(settings=settings, overrides={"gsd_m": 0.23})
     run_flight(Job(root=str(tmp_path / "run"), inputs=inputs, config=config), RunnerConfig(), Console("quiet"))
     score = score_run(tmp_path / "run", flight)

@@ -14,6 +14,6 @@ def detection(*, size: str = "2560x1920") -> int:
     from velfield.bench.detection import cascade_speed, city, response_speed
 
     image = city(*frame_size(size, "128 or more each, as 2560x1920", least_px=128))
-    for speed in (response_speed(image), cascade_speed(image)):
+    for speed in (*response_speed(image), cascade_speed(image)):
         print(speed.text())
     return 0

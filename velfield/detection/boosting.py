@@ -45,16 +45,26 @@ def random_pool(
     reach_xy_px: tuple[int, int],
     max_rectangles: int,
     rng: np.random.Generator,
+    max_area_px: int | None = None,
 ) -> RectanglePool:
-    """Features of 1 to ``max_rectangles`` rectangles of either sign, corners Gaussian about the centre."""
+    """Features of 1 to ``max_rectangles`` rectangles of either sign, corners Gaussian about the centre.
+
+    ``max_area_px``: those of one sign cover no more than this together, counted as often as they do.
+    """
     table: list[tuple[int, int, int, int, int]] = []
     starts, chosen = [0], []
+
+    def of_sign(sign: int) -> list[tuple[int, int, int, int, int]]:
+        drawn = []
+        for _ in range(int(rng.integers(1, max_rectangles + 1))):
+            x0, x1 = _interval(sigma_xy_px[0], reach_xy_px[0], rng)
+            y0, y1 = _interval(sigma_xy_px[1], reach_xy_px[1], rng)
+            drawn.append((sign, x0, y0, x1, y1))
+        fits = max_area_px is None or sum((x1 - x0) * (y1 - y0) for _, x0, y0, x1, y1 in drawn) <= max_area_px
+        return drawn if fits else of_sign(sign)
+
     for _ in range(count):
-        for sign in (1, -1):
-            for _ in range(int(rng.integers(1, max_rectangles + 1))):
-                x0, x1 = _interval(sigma_xy_px[0], reach_xy_px[0], rng)
-                y0, y1 = _interval(sigma_xy_px[1], reach_xy_px[1], rng)
-                table.append((sign, x0, y0, x1, y1))
+        table += of_sign(1) + of_sign(-1)
         starts.append(len(table))
         chosen.append(int(rng.integers(channels)))
     return RectanglePool(np.array(table, np.int32), np.array(starts, np.int32), np.array(chosen, np.int32))

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from schemas.detector import DetectorRecord
 from schemas.flight import DetectionConfig
 from velfield.detection.boosting import RectanglePool, bin_edges, binned, boost, random_pool, rounds_of
-from velfield.detection.detector import BoostedSums, Detector
-from velfield.detection.response import MARGIN_PX, dense_response
+from velfield.detection.detector import Detector
+from velfield.detection.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, continued, dense_response
 from velfield.detection.segmentation import moments, segment_response
 
 if TYPE_CHECKING:
@@ -28,12 +28,12 @@ _EDGE_SAMPLES = 4000
 def find_cars_densely(
     image: NDArray[np.uint8],
     valid: NDArray[np.bool_] | None,
-    sums: BoostedSums,
+    detector: Detector,
     config: DetectionConfig,
     threshold: float,
 ) -> tuple[Floats, Floats]:
     """Cars (n, 5) as x, y, axis, score, axis' standard deviation; and areas (n,), working px."""
-    response = dense_response(image, sums)
+    response = dense_response(image, detector.sums, grey_bits=detector.record.grey_bits)
     if valid is not None:
         response[~valid] = response.min(initial=0.0)
     smooth, labels = segment_response(
@@ -53,6 +53,7 @@ def train_densely(samples: Sequence["LabelledImage"], config: DetectionConfig) -
         reach_xy_px=(_REACH_PX, _REACH_PX),
         max_rectangles=config.max_rectangles,
         rng=rng,
+        max_area_px=MAX_AREA_PX,
     )
     values, is_car = [], []
     for sample in samples:
@@ -67,6 +68,7 @@ def train_densely(samples: Sequence["LabelledImage"], config: DetectionConfig) -
     fields = {
         "method": "dense",
         "working_car_length_px": config.working_car_length_px,
+        "grey_bits": GREY_BITS,
         "rounds": rounds_of(pool, stumps),
         "threshold": 0.0,
         "cars": sum(len(sample.cars) for sample in samples),
@@ -107,7 +109,7 @@ def _nearest(height, width, cars):  # type: ignore[no-untyped-def]
 
 def _values(image: NDArray[np.uint8], places: NDArray[np.int64], pool: RectanglePool) -> NDArray[np.int32]:
     """Values (n, features) of all features at pixels (n, 2)."""
-    padded = np.pad(image, MARGIN_PX, mode="reflect" if min(image.shape) > MARGIN_PX else "edge").astype(np.int32)
+    padded = continued(image, GREY_BITS).astype(np.int32)
     integral = np.pad(padded, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
     x, y = places[:, 0] + MARGIN_PX, places[:, 1] + MARGIN_PX
     out = np.zeros((len(places), len(pool)), np.int32)

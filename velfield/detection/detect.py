@@ -66,7 +66,7 @@ def detect_frame(
     threshold = detector.threshold if config.threshold is None else config.threshold
     length = detector.record.working_car_length_px
     if detector.record.method == "dense":
-        cars, area = find_cars_densely(image, valid, detector.sums, config, threshold)
+        cars, area = find_cars_densely(image, valid, detector, config, threshold)
     else:
         cars = _aligned(image, valid, detector, threshold, background if detector.uses_background else None)
         area = np.full(len(cars), length * length * CAR_ASPECT)
