@@ -231,6 +231,18 @@ def test_averaging_halves_the_error_of_places_and_keeps_steady_acceleration() ->
     assert abs(error[0.6][1:-1].mean()) < 0.5
 
 
+def test_a_displacement_that_did_not_align_has_hardly_a_say_beside_those_that_did() -> None:
+    table = tracklets(6)
+    for pair in ("01", "12"):
+        table[f"displacement_sd_{pair}_px"] = 0.1
+    wrong = 3  # the segment from frame 3 to 4, 3 px too long, known to a pixel and a half
+    table.loc[wrong, "vx_01_px_per_s"] = table.loc[wrong - 1, "vx_12_px_per_s"] = 65.0
+    table.loc[wrong, "displacement_sd_01_px"] = table.loc[wrong - 1, "displacement_sd_12_px"] = 1.5
+    segments = segment_table(table, FieldConfig(velocity_span_s=0.6))
+    np.testing.assert_allclose(segments["vx_px_per_s"], 50.0, atol=0.2)
+    assert segments["sd_px_per_s"].max() < 0.1 * 5  # less than one that aligned has by itself
+
+
 def test_averaging_stops_where_a_passage_is_broken() -> None:
     table = tracklets(6)
     table["passage_id"] = [0, 0, 0, 1, 1, 1]

@@ -11,7 +11,7 @@ STAGE_VERSIONS: dict[str, int] = {
     "detections": 5,
     "links": 1,
     "tracklets": 3,
-    "field": 2,
+    "field": 3,
     "maps": 4,
 }
 

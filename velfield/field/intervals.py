@@ -23,18 +23,17 @@ from velfield.field.speeds import CELLS_PER_BIN, blur_variance, most_cells, narr
 
 PLATOON = 20.0
 """Passages beyond this many are of another platoon."""
-SPEED_CORRELATION = 0.13
-DIRECTION_CORRELATION = 0.02
-"""Correlation of two passages of a platoon."""
-USUAL_COUNTS_FOR = 3.0
-"""Passages that the usual spread counts for."""
+SPEED_CORRELATION, DIRECTION_CORRELATION = 0.13, 0.0
+"""Correlation of two passages of a platoon: one goes as fast as the one ahead, but sways as it will."""
+SPEED_COUNTS_FOR, DIRECTION_COUNTS_FOR = 3.0, 1.5
+"""Passages that the usual spread counts for: lateral errors are seldom and then large, where lanes part or join."""
 USUAL_SPEED_SPREAD = 0.07
 """Standard deviation of speed at a place, as a share of it."""
-USUAL_SWAY = 0.01
+USUAL_SWAY = 0.008
 """Standard deviation of the sideways velocity at a place, as a share of the speed."""
 LEAST_SPEED_SD_BINS = 0.15
 """Usual spread of what stands, and what spreading bins over cells costs."""
-LEAST_SWAY_BINS = 0.007
+LEAST_SWAY_BINS = 0.002
 """Standard deviation of a mode by the bins it is found in."""
 MODE_REACH_BINS = 2.5
 """What is so near to the mode belongs to it."""
@@ -48,6 +47,8 @@ Float = NDArray[np.float64]
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _student(freedom: float) -> float:
     """95 % quantile of Student's t, by its expansion about the normal: within 0.3 % from 3 degrees of freedom on.
+
+    Of fewer it falls short; the constants were set with it.
 
     Examples
     --------
@@ -64,11 +65,11 @@ def _student(freedom: float) -> float:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _half_width(variance: float, usual: float, passages: float, correlation: float) -> float:
+def _half_width(variance: float, usual: float, counts_for: float, passages: float, correlation: float) -> float:
     """Half the 90 % interval of a mean of ``passages`` whose sample has ``variance`` (about its mean, divisor n)."""
     repeats = 1.0 + correlation * (min(passages, PLATOON) - 1.0)
-    freedom = max(passages - repeats, 0.0) + USUAL_COUNTS_FOR
-    pooled = (variance * passages + USUAL_COUNTS_FOR * usual) / freedom
+    freedom = max(passages - repeats, 0.0) + counts_for
+    pooled = (variance * passages + counts_for * usual) / freedom
     return float(_student(freedom) * sqrt(pooled * repeats / passages))
 
 
@@ -87,7 +88,7 @@ def _median_speed(
     mean /= total
     variance = max(square / total - mean * mean - blur, 0.0)
     usual = noise + (USUAL_SPEED_SPREAD * median) ** 2 + LEAST_SPEED_SD_BINS**2
-    half = MEDIAN_COSTS * _half_width(variance, usual, passages, SPEED_CORRELATION)
+    half = MEDIAN_COSTS * _half_width(variance, usual, SPEED_COUNTS_FOR, passages, SPEED_CORRELATION)
     alone = max(passages / (1.0 + SPEED_CORRELATION * (min(passages, PLATOON) - 1.0)), 1.0)
     rank = 0.5 * _Z / sqrt(alone + 2.0)
     narrowing = narrowing_by(cells, total, blur)
@@ -121,7 +122,8 @@ def _modal_direction(
     mean /= near
     variance = max(square / near - mean * mean - blur, 0.0)
     usual = noise + (USUAL_SWAY * speed) ** 2
-    half = _half_width(variance, usual, max(passages * near / total, 1.0), DIRECTION_CORRELATION)
+    alone = max(passages * near / total, 1.0)
+    half = _half_width(variance, usual, DIRECTION_COUNTS_FOR, alone, DIRECTION_CORRELATION)
     return min(hypot(half, _Z * LEAST_SWAY_BINS) / speed, float(np.pi))
 
 

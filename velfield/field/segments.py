@@ -28,6 +28,9 @@ SEGMENT_DTYPE = np.dtype(
 ``sd_px_per_s``: standard deviation of either component of its velocity, by registration and displacement.
 """
 
+_EQUALLY_SURE_PX = 0.15
+"""Displacements with a standard deviation below this have about the same say in a mean."""
+
 Segments = NDArray[np.void]
 """(n,) structured array of `SEGMENT_DTYPE`."""
 
@@ -58,7 +61,8 @@ def _averaged(segments: Segments, span_s: float) -> Segments:
     """Velocities averaged by time over the neighbours, unbroken, whose middles are within half a span.
 
     The error of a detection's place enters two neighbouring segments with opposite signs, so their mean loses most of
-    it; within half a second or so a vehicle's acceleration is constant, and the mean is that of the middle.
+    it; within half a second or so a vehicle's acceleration is constant, and the mean is that of the middle. A segment
+    whose crops did not align, and is a pixel or more off, has hardly a say beside those that did.
     """
     if not len(segments):
         return segments
@@ -71,13 +75,14 @@ def _averaged(segments: Segments, span_s: float) -> Segments:
     reach = np.maximum(np.minimum(before, after), 1)
     before, after = np.minimum(before, reach), np.minimum(after, reach)
     out = segments.copy()
-    duration = segments["duration_s"]
-    time = _windowed(duration, before, after)
+    sd_px = segments["sd_px_per_s"] * segments["duration_s"]
+    trust = segments["duration_s"] / (sd_px**2 + _EQUALLY_SURE_PX**2)
+    total = _windowed(trust, before, after)
     for name in ("vx_px_per_s", "vy_px_per_s"):
-        out[name] = _windowed(segments[name] * duration, before, after) / time
+        out[name] = _windowed(segments[name] * trust, before, after) / total
     # Errors of two displacements are taken as independent. Those of places cancel in part, so that where the crops did
     # not align this is a little too large.
-    out["sd_px_per_s"] = np.sqrt(_windowed((segments["sd_px_per_s"] * duration) ** 2, before, after)) / time
+    out["sd_px_per_s"] = np.sqrt(_windowed((segments["sd_px_per_s"] * trust) ** 2, before, after)) / total
     return out
 
 
