@@ -206,7 +206,7 @@ def demo(
     seed: int = 1,
     quiet: Quiet = False,
 ) -> int:
-    """A simulated flight, the whole job by the preset `fast`, the report.
+    """A simulated flight, the whole job by the preset `fast` with a small detector, the report.
 
     Parameters
     ----------
@@ -243,6 +243,10 @@ def demo(
         status = _process(job, verbosity="quiet" if quiet else "normal")
     if status in (DONE, INCOMPLETE):
         _score(out / "run", flight)
+        if not quiet:
+            settings = " ".join(f"--set {name}={value}" for name, value in quick.items())
+            given = " ".join(f"--{name} {getattr(inputs, name)}" for name in ("timestamps", "base", "labels"))
+            print(f"by: velfield run {inputs.source} {given} --gsd-m 0.23 --preset fast {settings} --out {out / 'run'}")
     return status
 
 

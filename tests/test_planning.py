@@ -45,6 +45,12 @@ def test_task_runs_grow_with_chunks_not_with_frames(tmp_path: Path) -> None:
     assert runs[300] >= 4  # and yet several workers have something to do
 
 
+@pytest.mark.parametrize("text", ["nonsense", "6-0", "0-3,2-5"])
+def test_slices_that_cannot_be_are_told_before_any_work(flight: Path, tmp_path: Path, text: str) -> None:
+    with pytest.raises(InputError, match="slice"):
+        make_plan(job(flight, tmp_path, f"field.slice={text}"))
+
+
 @pytest.mark.parametrize("option", ["base", "labels", "detector", "detections"])
 def test_what_is_not_what_it_was_given_as_is_told_before_any_work(flight: Path, tmp_path: Path, option: str) -> None:
     (tmp_path / "hello.txt").write_text("hello\n")

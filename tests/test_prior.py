@@ -65,6 +65,9 @@ def test_where_all_stand_the_density_is_finite_and_standing_the_likeliest() -> N
 def test_a_gate_of_no_place_is_refused(one_way: VelocityField) -> None:
     with pytest.raises(InputError, match="finite place"):
         one_way.gate(np.array([np.nan, 3.0]))
+    for covariance in (np.eye(3), -np.eye(2), np.array([[1.0, 2.0], [0.0, 1.0]])):
+        with pytest.raises(InputError, match="covariance"):
+            one_way.gate(np.array([80.0, 50.0]), covariance)
     with pytest.raises(InputError, match="rising times"):
         one_way.anomaly(np.array([0.0, 0.0]), np.zeros((2, 2)))
 

@@ -11,6 +11,7 @@ from schemas.flight import FlightConfig
 from schemas.job import Job
 from schemas.records import FlightRecord, InputsRecord, SourceRecord
 from velfield.errors import InputError
+from velfield.field.slices import parse_slices
 from velfield.layout import STAGES, RunLayout
 from velfield.provenance import content_key, digest_path, write_atomically
 from velfield.sources.source import SourceInfo, check_source, probe, select_frames
@@ -116,6 +117,8 @@ def make_plan(job: Job) -> Plan:
             f"{job.inputs.source}: {len(indices)} frames to work on, 3 or more needed for a tracklet; "
             "widen --start-s/--stop-s or lower --every"
         )
+    if job.config.field.slice is not None:  # told now, not where the field is built
+        parse_slices(job.config.field.slice, float(info.times_s[indices[0]]), float(info.times_s[indices[-1]]))
     info = replace(info, warnings=(*info.warnings, *_gaps(info.times_s[indices], job.config.tracking.max_interval_s)))
     inputs = _digest_inputs(job, info)
     return Plan(job=job.anywhere(), info=info, indices=indices, inputs=inputs, keys=stage_keys(job.config, inputs))

@@ -1,6 +1,6 @@
 """The distribution over velocity at one pixel, with all that is said of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +43,8 @@ class PixelDistribution:
     x: int
     y: int
     n: int
-    bins: VelocityBins
-    weights: Float
+    bins: VelocityBins = field(repr=False)
+    weights: Float = field(repr=False)
     modes: Float
     modal_velocity_px_per_s: Float
     mean_velocity_px_per_s: Float

@@ -117,7 +117,7 @@ def _stages(stages: Sequence[ReportStage]) -> str:
         for stage in stages
     )
     total = sum(stage.seconds for stage in stages)
-    head = _head("Stage", "Result", number="Seconds")
+    head = _head("Stage", "Result", number="Seconds of work")
     foot = f'<tfoot><tr><th scope="row">all</th><td></td><td class="number">{total:.1f}</td></tr></tfoot>'
     return _section("Stages", f'<div class="scroll"><table>{head}<tbody>{rows}</tbody>{foot}</table></div>')
 
