@@ -69,14 +69,16 @@ def test_a_command_of_the_pages(page: str, line: str, place: Path) -> None:
 
 @pytest.mark.parametrize(("page", "text"), blocks("python"))
 def test_a_snippet_of_the_pages(page: str, text: str, place: Path) -> None:
-    exec(compile(text, page, "exec"), {"xy": [[100.0, 100.0]], "v": [[10.0, 0.0]]})
+    names: dict[str, object] = {"xy": [[100.0, 100.0]], "v": [[10.0, 0.0]]}
+    exec(compile(text, page, "exec"), names)
+    assert names.keys() - {"xy", "v", "__builtins__"}, "it says nothing, not even an import"
 
 
 @pytest.mark.parametrize(("page", "text"), blocks("yaml"))
 def test_a_configuration_of_the_pages(page: str, text: str, tmp_path: Path) -> None:
     file = tmp_path / "flight.yaml"
     file.write_text(text)
-    resolve_config(file=file)
+    assert resolve_config(file=file) != resolve_config(), "it changes nothing"
 
 
 def test_links_between_the_pages_lead_somewhere() -> None:
