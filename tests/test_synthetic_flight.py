@@ -1,6 +1,7 @@
 """Rendered frames, the base image, what is written, what is read back, and the scores."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -22,7 +23,7 @@ from velfield.synthetic import (
     write_flight,
 )
 from velfield.synthetic.cases import FLAT
-from velfield.synthetic.truth import CAR_COLUMNS, Truth
+from velfield.synthetic.truth import CAR_COLUMNS, LanePath, Truth
 
 STEADY = CameraSimulation(noise_grey=0, motion_blur_px=0, exposure_share=0)
 
@@ -255,9 +256,21 @@ def test_a_field_along_the_lanes_scores_perfectly_and_one_across_does_not(truth:
     inside = (at >= 0).all(axis=1) & (at < [w, h]).all(axis=1)
     velocity[at[inside, 1], at[inside, 0]] = steps.loc[inside, ["vx_px_per_s", "vy_px_per_s"]].to_numpy()
     count[at[inside, 1], at[inside, 0]] = 5
-    assert score_field(truth, velocity, count).share_within > 0.97
+    assert score_field(truth, velocity, count).share_within > 0.99
     across = np.stack([-velocity[..., 1], velocity[..., 0]], axis=-1)
     assert score_field(truth, across, count).share_within < 0.2
     half = np.diag([0.5, 0.5, 1.0])
     shrunk, few = velocity[::2, ::2], count[::2, ::2]
     assert score_field(truth, shrunk, few, to_truth=np.linalg.inv(half)).share_within > 0.97
+
+
+def test_direction_in_a_tight_turn_is_that_of_the_lane_at_the_pixel(truth: Truth) -> None:
+    """A roundabout of 9 m: along the lane there is no error, on either side of its middle, nor before or behind."""
+    angle = np.linspace(0, 1.5 * np.pi, 60)
+    path = 150 + 40 * np.column_stack([np.cos(angle), np.sin(angle)])
+    turn = replace(truth, lanes=[LanePath("turn", path, 20.0)])
+    y, x = np.mgrid[: truth.base_shape[0], : truth.base_shape[1]].astype(float) - 150
+    error = turn.direction_error_rad(np.arctan2(x, -y))
+    here = (np.abs(np.hypot(x, y) - 40) < 9) & (np.mod(np.arctan2(y, x), 2 * np.pi) < 1.45 * np.pi)
+    assert np.degrees(error[here].max()) < 4.0
+    assert (error[np.abs(np.hypot(x, y) - 40) > 11] == np.pi).all()

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from velfield.errors import InputError
 from velfield.synthetic.camera import Camera, Waves
@@ -170,17 +170,26 @@ def _camera_from(record: dict[str, Any]) -> Camera:
 
 
 def _least_error(path: FloatArray, width: int, direction_rad: FloatArray, error: FloatArray) -> None:
-    """Lower ``error`` where a lane's direction is nearer, in place, within the lane's own bounding box."""
+    """Lower ``error`` where a lane's direction is nearer, in place, within half a ``width`` of its path.
+
+    A pixel's is the heading of the path where it is nearest: a thick line drawn piece by piece would give, in a tight
+    turn, that of a piece half a width farther on, 14 degrees off.
+    """
     h, w = direction_rad.shape
     x0, y0 = np.maximum(np.floor(path.min(axis=0)).astype(int) - width, 0)
     x1, y1 = np.minimum(np.ceil(path.max(axis=0)).astype(int) + width + 1, [w, h])
     if x1 <= x0 or y1 <= y0:
         return
-    lane = np.full((y1 - y0, x1 - x0), np.nan, np.float32)
-    points = np.rint((path - [x0, y0]) * 16).astype(np.int32)
+    rows, columns = np.nonzero(np.isfinite(direction_rad[y0:y1, x0:x1]))
+    rows, columns = rows + y0, columns + x0
     step = np.diff(path, axis=0)
-    for a, b, heading in zip(points, points[1:], np.arctan2(step[:, 1], step[:, 0]), strict=False):
-        cv2.line(lane, a.tolist(), b.tolist(), float(heading), width, cv2.LINE_8, 4)
-    window = np.s_[y0:y1, x0:x1]
-    here = np.abs(np.angle(np.exp(1j * (direction_rad[window] - lane))))
-    error[window] = np.where(np.isnan(here), error[window], np.minimum(error[window], here))
+    length = np.hypot(*step.T)
+    step, start, length = step[length > 0], path[:-1][length > 0], length[length > 0]
+    pieces = np.repeat(np.arange(len(step)), np.ceil(length).astype(int))
+    along = (np.arange(len(pieces)) - np.searchsorted(pieces, pieces) + 0.5) / np.ceil(length)[pieces]
+    paths = KDTree(start[pieces] + along[:, None] * step[pieces])
+    gap, nearest = (np.atleast_1d(found) for found in paths.query(np.column_stack([columns, rows])))
+    near = gap <= width / 2
+    rows, columns, heading = rows[near], columns[near], np.arctan2(*step[pieces[nearest[near]]].T[::-1])
+    off = np.abs(np.angle(np.exp(1j * (direction_rad[rows, columns] - heading))))
+    error[rows, columns] = np.minimum(error[rows, columns], off)
