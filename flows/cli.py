@@ -244,9 +244,10 @@ def demo(
     if status in (DONE, INCOMPLETE):
         _score(out / "run", flight)
         if not quiet:
-            settings = " ".join(f"--set {name}={value}" for name, value in quick.items())
-            given = " ".join(f"--{name} {getattr(inputs, name)}" for name in ("timestamps", "base", "labels"))
-            print(f"by: velfield run {inputs.source} {given} --gsd-m 0.23 --preset fast {settings} --out {out / 'run'}")
+            given = [word for name in ("timestamps", "base", "labels") for word in (f"--{name}", getattr(inputs, name))]
+            chosen = [word for name, value in quick.items() for word in ("--set", f"{name}={value}")]
+            words = ["velfield", "run", inputs.source, *given, "--gsd-m", "0.23", "--preset", "fast", *chosen]
+            print("by:", shlex.join([*words, "--out", str(out / "run")]))
     return status
 
 

@@ -40,6 +40,8 @@ def test_the_python_side_of_the_contract(whole: tuple[Path, RunSummary]) -> None
     np.testing.assert_allclose(run.to_raw(4, run.to_base(4, raw)), raw, atol=1e-2)
     with pytest.raises(InputError, match=f"frames go from 0 to {FRAMES - 1}"):
         run.to_base(FRAMES, raw)
+    with pytest.raises(InputError, match=f"frames go from 0 to {FRAMES - 1}"):
+        run.frames.read(-1)
     count, velocity = run.field.count(), run.field.modal_velocity()
     assert count.shape == velocity.shape[:2] == run.base_image.shape
     assert np.isfinite(velocity[count > 0]).all()

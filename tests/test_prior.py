@@ -68,6 +68,8 @@ def test_a_gate_of_no_place_is_refused(one_way: VelocityField) -> None:
     for covariance in (np.eye(3), -np.eye(2), np.array([[1.0, 2.0], [0.0, 1.0]])):
         with pytest.raises(InputError, match="covariance"):
             one_way.gate(np.array([80.0, 50.0]), covariance)
+    line = np.outer([3.0, 0.1], [3.0, 0.1])  # known across a lane, and rounded to a hair less than nothing
+    assert np.isfinite(one_way.gate(np.array([80.0, 50.0]), line).mean_px_per_s).all()
     with pytest.raises(InputError, match="rising times"):
         one_way.anomaly(np.array([0.0, 0.0]), np.zeros((2, 2)))
 

@@ -270,7 +270,8 @@ def test_direction_in_a_tight_turn_is_that_of_the_lane_at_the_pixel(truth: Truth
     path = 150 + 40 * np.column_stack([np.cos(angle), np.sin(angle)])
     turn = replace(truth, lanes=[LanePath("turn", path, 20.0)])
     y, x = np.mgrid[: truth.base_shape[0], : truth.base_shape[1]].astype(float) - 150
-    error = turn.direction_error_rad(np.arctan2(x, -y))
+    error = turn.direction_error_rad(np.stack([x, y], axis=-1).reshape(-1, 2) + 150, np.arctan2(x, -y).ravel())
+    error = error.reshape(x.shape)
     here = (np.abs(np.hypot(x, y) - 40) < 9) & (np.mod(np.arctan2(y, x), 2 * np.pi) < 1.45 * np.pi)
     assert np.degrees(error[here].max()) < 4.0
     assert (error[np.abs(np.hypot(x, y) - 40) > 11] == np.pi).all()

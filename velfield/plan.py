@@ -11,7 +11,7 @@ from schemas.flight import FlightConfig
 from schemas.job import Job
 from schemas.records import FlightRecord, InputsRecord, SourceRecord
 from velfield.errors import InputError
-from velfield.field.slices import parse_slices
+from velfield.field.slices import TimeSlice, parse_slices
 from velfield.layout import STAGES, RunLayout
 from velfield.provenance import content_key, digest_path, write_atomically
 from velfield.sources.source import SourceInfo, check_source, probe, select_frames
@@ -65,6 +65,18 @@ class Plan:
         n, step = self.frame_count, self.unit_frames
         return [range(start, min(start + step, n)) for start in range(0, n, step)]
 
+    @property
+    def slices(self) -> list[TimeSlice]:
+        """Slices of time that fields are asked for of, in their order; none where none were.
+
+        Raises
+        ------
+        InputError
+            The text that asks for them is not understood, or they overlap.
+        """
+        text, times_s = self.config.field.slice, self.info.times_s[self.indices]
+        return [] if text is None else parse_slices(text, float(times_s[0]), float(times_s[-1]))
+
     def despite(self, lost: Sequence[str]) -> "Plan":
         """The plan for what comes after units were lost: under keys of its own.
 
@@ -117,11 +129,11 @@ def make_plan(job: Job) -> Plan:
             f"{job.inputs.source}: {len(indices)} frames to work on, 3 or more needed for a tracklet; "
             "widen --start-s/--stop-s or lower --every"
         )
-    if job.config.field.slice is not None:  # told now, not where the field is built
-        parse_slices(job.config.field.slice, float(info.times_s[indices[0]]), float(info.times_s[indices[-1]]))
     info = replace(info, warnings=(*info.warnings, *_gaps(info.times_s[indices], job.config.tracking.max_interval_s)))
     inputs = _digest_inputs(job, info)
-    return Plan(job=job.anywhere(), info=info, indices=indices, inputs=inputs, keys=stage_keys(job.config, inputs))
+    plan = Plan(job=job.anywhere(), info=info, indices=indices, inputs=inputs, keys=stage_keys(job.config, inputs))
+    _ = plan.slices  # what cannot be is told now, not where the field is built
+    return plan
 
 
 def _gaps(times_s: NDArray[np.float64], max_interval_s: float) -> list[str]:

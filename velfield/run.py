@@ -100,9 +100,7 @@ class Run:
         return self._mapped("to_raw", frame, xy_base)
 
     def _mapped(self, direction: str, frame: int, xy: Points) -> Points:
-        points, count = np.asarray(xy, np.float64).reshape(-1, 2), self.frames.count
-        if not 0 <= frame < count:
-            raise InputError(f"frame {frame} is not in the run: its frames go from 0 to {count - 1}")
+        points = np.asarray(xy, np.float64).reshape(-1, 2)
         transform = self.maps.transform(frame)
         if transform is None:
             return np.full_like(points, np.nan)

@@ -96,6 +96,12 @@ def _read(path: Path, group: _Group, name: str, selection: Any) -> NDArray[Any]:
         ) from error
 
 
+def _check_frame(path: Path, frame: int, count: int) -> None:
+    """Before a chunk that never was is taken for one that is gone or damaged."""
+    if not 0 <= frame < count:
+        raise InputError(f"{path}: frame {frame} is not in the run: its frames go from 0 to {count - 1}")
+
+
 def _metadata(path: Path) -> list[Path]:
     """What describes a store and its arrays: as much part of it as its chunks."""
     return [path / "zarr.json", *sorted(path.glob("*/zarr.json"))]
@@ -161,9 +167,12 @@ class FrameStore:
 
         Raises
         ------
+        InputError
+            There is no such frame.
         StoreError
             The chunk is damaged or gone.
         """
+        _check_frame(self.path, frame, self.count)
         if not (self.path / "raw" / "c" / str(frame) / "0" / "0").exists():
             raise StoreError(f"{self.path}: the chunk of frame {frame} is gone; `velfield run` writes it again")
         try:
@@ -251,6 +260,7 @@ class RegistrationStore:
 
     def vector(self, frame: int) -> NDArray[np.float64]:
         """Flat parameters of one frame's transform; NaN where it is not registered."""
+        _check_frame(self.path, frame, self.group["vector"].shape[0])
         return _read(self.path, self.group, "vector", frame)
 
     def vectors(self, start: int, stop: int) -> NDArray[np.float64]:

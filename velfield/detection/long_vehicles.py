@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from schemas.detector import LongVehicleRecord
 from velfield.detection.aligned import moved
 from velfield.detection.detector import BoostedSums, sums_of
-from velfield.detection.samples import lies_in
+from velfield.detection.scan import in_sight
 from velfield.detection.turned import Grain, Picture, scores_at
 
 Floats = NDArray[np.float64]
@@ -56,8 +56,7 @@ class LongVehicles:
         scores = self.scores(picture, cars[:, :2], cars[:, 2])
         offsets = OFFSETS[scores.argmax(axis=1)].astype(np.float64) * picture.grain.step
         middles = moved(cars[:, :2], cars[:, 2], offsets)
-        within = (np.rint(middles) >= 0).all(axis=1) & (np.rint(middles) < seen.shape[::-1]).all(axis=1)
-        long = (scores.max(axis=1) > self.record.threshold) & within & lies_in(seen, middles)
+        long = (scores.max(axis=1) > self.record.threshold) & in_sight(middles, seen.shape, seen)
         cars = np.column_stack([np.where(long[:, None], middles, cars[:, :2]), cars[:, 2:]])
         return np.asarray(cars[~self._on_another(cars, long)])
 

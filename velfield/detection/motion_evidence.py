@@ -97,6 +97,11 @@ class MotionEvidence:
     chosen: float
     standing: Floats
 
+    @property
+    def at(self) -> int:
+        """Where on the curve the chosen threshold is."""
+        return int(np.argmin(np.abs(self.threshold - self.chosen)))
+
     def tells_cars(self, usual: float) -> bool:
         """Whether cars are told from all else, so that what stands and is found may be taken for cars as well.
 
@@ -110,7 +115,7 @@ class MotionEvidence:
         """
         if not self.chosen >= 0:  # below, what is found is liked less than disliked
             return False
-        at = int(np.argmin(np.abs(self.threshold - self.chosen)))
+        at = self.at
         stand = self.standing[self.standing > self.chosen]
         few = len(stand) < _FEW_STANDING * at
         alike = few or float((stand > usual).mean()) > _ALIKE_SHARE

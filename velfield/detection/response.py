@@ -84,14 +84,20 @@ def _phases(integral: NDArray[np.signedinteger]) -> NDArray[np.signedinteger]:
 
 def _corners(phases: NDArray[np.signedinteger], rectangles: NDArray[np.int32]) -> NDArray[np.uint64]:
     """(r, 4): where in the flat phases each rectangle's corners lie for the first pixel; the first and last count."""
-    sign, x0, y0, x1, y1 = rectangles.T.astype(np.int64) + MARGIN_PX
+    x0, y0, x1, y1 = rectangles[:, 1:].T.astype(np.int64) + MARGIN_PX
     # One that is taken off is one whose left and right are changed about.
-    left, right = np.where(sign > MARGIN_PX, x0, x1), np.where(sign > MARGIN_PX, x1, x0)
+    counts = rectangles[:, 0] > 0
+    left, right = np.where(counts, x0, x1), np.where(counts, x1, x0)
     places = [(y1, right), (y1, left), (y0, right), (y0, left)]
     flat = [
         np.ravel_multi_index((y % STEP_PX, x % STEP_PX, y // STEP_PX, x // STEP_PX), phases.shape) for y, x in places
     ]
     return np.stack(flat, axis=1).astype(np.uint64)
+
+
+@njit(cache=True, nogil=True)
+def _corners_of(corners, r, down):  # type: ignore[no-untyped-def]
+    return corners[r, 0] + down, corners[r, 1] + down, corners[r, 2] + down, corners[r, 3] + down
 
 
 @njit(cache=True, nogil=True)
@@ -106,15 +112,14 @@ def _add_rounds(flat, stride, corners, starts, rounds, least, steps, out):  # ty
             r, end = np.uint64(starts[rounds[k]]), np.uint64(starts[rounds[k] + 1])
             row[:] = 0
             while r + one < end:  # two at once: what is summed is fetched and put back half as often
-                a, b, c, d = corners[r, 0] + down, corners[r, 1] + down, corners[r, 2] + down, corners[r, 3] + down
-                r += one
-                e, f, g, h = corners[r, 0] + down, corners[r, 1] + down, corners[r, 2] + down, corners[r, 3] + down
-                r += one
+                a, b, c, d = _corners_of(corners, r, down)
+                e, f, g, h = _corners_of(corners, r + one, down)
+                r += one + one
                 for x in range(columns):
                     row[x] += flat[a + x] - flat[b + x] - flat[c + x] + flat[d + x]
                     row[x] += flat[e + x] - flat[f + x] - flat[g + x] + flat[h + x]
             if r < end:
-                a, b, c, d = corners[r, 0] + down, corners[r, 1] + down, corners[r, 2] + down, corners[r, 3] + down
+                a, b, c, d = _corners_of(corners, r, down)
                 for x in range(columns):
                     row[x] += flat[a + x] - flat[b + x] - flat[c + x] + flat[d + x]
             threshold, step = least[k], steps[k]

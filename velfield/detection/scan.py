@@ -52,16 +52,19 @@ def propose(
     (n, 4): x, y in px of the picture, axis, score; the best first.
     """
     rows = np.concatenate([_peaks(coarse, shape, sums, float(turn), contrast_floor) for turn in TURNS])
-    x, y = (np.clip(np.rint(rows[:, k]), 0, shape[1 - k] - 1).astype(np.int64) for k in (0, 1))
-    within = (np.abs(rows[:, 0] - x) <= 0.5) & (np.abs(rows[:, 1] - y) <= 0.5) & (rows[:, 3] > least_score)
-    if valid is not None:
-        within &= valid[y, x]
-    rows = rows[within]
+    rows = rows[in_sight(rows, shape, valid) & (rows[:, 3] > least_score)]
     rows = rows[np.argsort(-rows[:, 3], kind="stable")]
     most = int(per_megapixel * shape[0] * shape[1] / 1e6) + 8
     turn = np.rint(rows[:, 2] / TURNS[1]).astype(np.int64)
     taken = np.zeros((len(TURNS), shape[0] // _CELL_PX + 1, shape[1] // _CELL_PX + 1), np.bool_)
     return np.asarray(rows[_first_of_each(rows[:, :2].copy(), turn, taken, _NEAR_PX, _CELL_PX, most)])
+
+
+def in_sight(xy: Floats, shape: tuple[int, int], valid: Bools | None) -> Bools:
+    """Whether places (n, 2...) lie in a picture (h, w), and where it is ``valid``."""
+    x, y = (np.clip(np.rint(xy[:, k]), 0, shape[1 - k] - 1).astype(np.int64) for k in (0, 1))
+    within = (np.abs(xy[:, 0] - x) <= 0.5) & (np.abs(xy[:, 1] - y) <= 0.5)
+    return np.asarray(within if valid is None else within & valid[y, x])
 
 
 def _peaks(coarse: Picture, shape: tuple[int, int], sums: BoostedSums, turn: float, contrast_floor: float) -> Floats:

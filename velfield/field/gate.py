@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from velfield.errors import InputError
 from velfield.field.bins import VelocityBins
 
 Float = NDArray[np.float64]
@@ -14,6 +15,8 @@ Densities = Callable[[Float, Float], Float]
 
 SHARE = 0.99
 """Share of the vehicles that a gate lets pass, if they drive as those before them did."""
+_ROUNDING = 1e-9
+"""A variance this far below nothing, as a share of the other, is one of nothing."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +62,18 @@ def make_gate(densities: Densities, xy: Float, covariance: Float, bins: Velocity
         (2,) base pixel and (2, 2) px^2.
     share
         In (0, 1).
+
+    Raises
+    ------
+    InputError
+        What is given as a covariance is none.
     """
-    values, axes = np.linalg.eigh(np.asarray(covariance, np.float64))
+    covariance = np.asarray(covariance, np.float64)
+    if covariance.shape != (2, 2) or not np.allclose(covariance, covariance.T):
+        raise InputError(f"gate needs a symmetric covariance (2, 2) in px^2, found {covariance.tolist()}")
+    values, axes = np.linalg.eigh(covariance)
+    if values[0] < -_ROUNDING * abs(values[1]):
+        raise InputError(f"gate needs a covariance of no negative variance, in px^2, found {covariance.tolist()}")
     steps = (np.sqrt(3.0 * np.maximum(values, 0.0)) * axes).T
     offsets = np.concatenate([np.zeros((1, 2)), steps, -steps])
     # A place known to within half a pixel is one pixel.

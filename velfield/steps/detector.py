@@ -121,9 +121,11 @@ def _by_motion(
         by_looks = train_detector(samples, config.model_copy(update={"motion_channel": "never"}))
         evidence = _evidence(by_looks, frames, background, config)
         if evidence.tells_cars(_usual_score(by_looks)):
-            return _judged(by_looks, evidence, config)
+            return by_looks if config.threshold is not None else _judged(by_looks, evidence)
     detector = train_detector(samples, config)
-    return _judged(detector, _evidence(detector, frames, background, config), config)
+    if config.threshold is not None:
+        return detector
+    return _judged(detector, _evidence(detector, frames, background, config))
 
 
 def _usual_score(detector: Detector) -> float:
@@ -142,17 +144,16 @@ def _evidence(
     return evidence_of(detector, [frames[k] for k in chosen], median, config)
 
 
-def _judged(detector: Detector, evidence: MotionEvidence, config: DetectionConfig) -> Detector:
+def _judged(detector: Detector, evidence: MotionEvidence) -> Detector:
     """The detector with the threshold at which what it finds moves as cars do; as it is where too few move to tell."""
-    if not np.isfinite(evidence.chosen) or config.threshold is not None:
+    if not np.isfinite(evidence.chosen):
         return detector
-    at = int(np.argmin(np.abs(evidence.threshold - evidence.chosen)))
-    keep = np.unique(np.r_[np.linspace(0, len(evidence.threshold) - 1, 300).astype(int), at])
+    keep = np.unique(np.r_[np.linspace(0, len(evidence.threshold) - 1, 300).astype(int), evidence.at])
     curve = PrecisionRecallCurve(
         recall=tuple(np.round(evidence.recall[keep], 4).tolist()),
         precision=tuple(np.round(evidence.precision[keep], 4).tolist()),
         threshold=tuple(np.round(evidence.threshold[keep], 4).tolist()),
-        chosen=int(np.searchsorted(keep, at)),
+        chosen=int(np.searchsorted(keep, evidence.at)),
         evidence="how detections in bursts of three frames move: along their axis, at one velocity, or not",
     )
     return Detector(detector.record.model_copy(update={"threshold": evidence.chosen, "curve": curve}))

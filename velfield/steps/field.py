@@ -12,7 +12,7 @@ from schemas.tables import TRACKLET_COLUMNS
 from velfield.field.accumulate import Weight, accumulate_tile
 from velfield.field.bins import VelocityBins, band_radius_px
 from velfield.field.segments import SEGMENT_DTYPE, Segments, segment_table, segments_by_tile
-from velfield.field.slices import TimeSlice, parse_slices, slice_of_passages
+from velfield.field.slices import TimeSlice, slice_of_passages
 from velfield.places import remove_tree
 from velfield.plan import Plan
 from velfield.progress import advance
@@ -78,11 +78,7 @@ def lay_out_field(plan: Plan) -> None:
 
 def slice_stores(plan: Plan) -> list[tuple[Path, TimeSlice]]:
     """Stores of the slices of time, in their order; none where none were asked for."""
-    if plan.config.field.slice is None:
-        return []
-    times_s = plan.info.times_s[plan.indices]
-    slices = parse_slices(plan.config.field.slice, float(times_s[0]), float(times_s[-1]))
-    return [(plan.layout.slices / f"{k:03d}.zarr", part) for k, part in enumerate(slices)]
+    return [(plan.layout.slices / f"{k:03d}.zarr", part) for k, part in enumerate(plan.slices)]
 
 
 def accumulate_group(plan: Plan, group: Group) -> Outcome:

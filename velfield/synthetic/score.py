@@ -288,18 +288,10 @@ def score_field(
 def _direction_errors(truth: Truth, place: FloatArray, angle: FloatArray) -> FloatArray:
     """Errors at places (n, 2): each place's angle against the lanes at its nearest pixel."""
     h, w = truth.base_shape
-    at = np.rint(place).astype(np.int64)
-    inside = (at >= 0).all(axis=1) & (at < [w, h]).all(axis=1)
+    at = np.rint(place)
+    inside = ((at >= 0) & (at < [w, h])).all(axis=1)
     errors = np.full(len(place), np.pi)
-    left = np.flatnonzero(inside)
-    while len(left):
-        # several places may fall on one pixel: one of them a round
-        _, first = np.unique(at[left] @ [1, w], return_index=True)
-        some = left[first]
-        direction = np.full((h, w), np.nan)
-        direction[at[some, 1], at[some, 0]] = angle[some]
-        errors[some] = truth.direction_error_rad(direction)[at[some, 1], at[some, 0]]
-        left = np.setdiff1d(left, some)
+    errors[inside] = truth.direction_error_rad(at[inside], angle[inside])
     return errors
 
 

@@ -67,15 +67,16 @@ class Truth:
         """Base pixels (n, 2) -> raw pixels (n, 2) of a frame, also beyond its border, exact."""
         return self.camera.to_raw(frame, xy_base)
 
-    def direction_error_rad(self, direction_rad: FloatArray) -> FloatArray:
-        """How far a direction at each base pixel (h, w) is from the nearest direction of a lane there.
+    def direction_error_rad(self, xy: FloatArray, direction_rad: FloatArray) -> FloatArray:
+        """How far directions (n,) at base pixels (n, 2) are from the nearest direction of a lane there.
 
-        NaN where ``direction_rad`` is; pi where no lane is within half a lane's width and half a metre.
+        pi where no lane is within half a lane's width and half a metre. In a tight turn a lane's direction is that of
+        its path where the path is nearest.
         """
-        error = np.where(np.isnan(direction_rad), np.nan, np.pi)
-        width = max(round((LANE_WIDTH_M + 1.0) / self.gsd_m), 1)
+        error = np.full(len(xy), np.pi)
+        reach_px = max(round((LANE_WIDTH_M + 1.0) / self.gsd_m), 1) / 2
         for lane in self.lanes:
-            _least_error(lane.path_px, width, direction_rad, error)
+            _least_error(lane.path_px, reach_px, xy, direction_rad, error)
         return error
 
     def segments(self, *, max_interval_s: float = 0.45) -> pd.DataFrame:
@@ -169,27 +170,16 @@ def _camera_from(record: dict[str, Any]) -> Camera:
     return Camera(**values)
 
 
-def _least_error(path: FloatArray, width: int, direction_rad: FloatArray, error: FloatArray) -> None:
-    """Lower ``error`` where a lane's direction is nearer, in place, within half a ``width`` of its path.
-
-    A pixel's is the heading of the path where it is nearest: a thick line drawn piece by piece would give, in a tight
-    turn, that of a piece half a width farther on, 14 degrees off.
-    """
-    h, w = direction_rad.shape
-    x0, y0 = np.maximum(np.floor(path.min(axis=0)).astype(int) - width, 0)
-    x1, y1 = np.minimum(np.ceil(path.max(axis=0)).astype(int) + width + 1, [w, h])
-    if x1 <= x0 or y1 <= y0:
-        return
-    rows, columns = np.nonzero(np.isfinite(direction_rad[y0:y1, x0:x1]))
-    rows, columns = rows + y0, columns + x0
+def _least_error(path: FloatArray, reach: float, xy: FloatArray, direction_rad: FloatArray, error: FloatArray) -> None:
+    """Lower ``error`` (n,) where a lane's direction is nearer, in place, within ``reach`` of its path."""
+    around = np.flatnonzero(((xy > path.min(axis=0) - reach) & (xy < path.max(axis=0) + reach)).all(axis=1))
     step = np.diff(path, axis=0)
     length = np.hypot(*step.T)
     step, start, length = step[length > 0], path[:-1][length > 0], length[length > 0]
     pieces = np.repeat(np.arange(len(step)), np.ceil(length).astype(int))
     along = (np.arange(len(pieces)) - np.searchsorted(pieces, pieces) + 0.5) / np.ceil(length)[pieces]
     paths = KDTree(start[pieces] + along[:, None] * step[pieces])
-    gap, nearest = (np.atleast_1d(found) for found in paths.query(np.column_stack([columns, rows])))
-    near = gap <= width / 2
-    rows, columns, heading = rows[near], columns[near], np.arctan2(*step[pieces[nearest[near]]].T[::-1])
-    off = np.abs(np.angle(np.exp(1j * (direction_rad[rows, columns] - heading))))
-    error[rows, columns] = np.minimum(error[rows, columns], off)
+    gap, nearest = (np.atleast_1d(found) for found in paths.query(xy[around]))
+    near = gap <= reach
+    here, heading = around[near], np.arctan2(*step[pieces[nearest[near]]].T[::-1])
+    error[here] = np.minimum(error[here], np.abs(np.angle(np.exp(1j * (direction_rad[here] - heading)))))
