@@ -12,6 +12,7 @@ from schemas.flight import FieldConfig, FlightConfig
 from schemas.records import FlightRecord, GridRecord, InputsRecord, SourceRecord
 from schemas.simulation import SimulationConfig
 from schemas.tables import TRACKLET_COLUMNS
+from velfield.field.slices import parse_slices
 from velfield.layout import RunLayout
 from velfield.run import Run, open_run
 from velfield.steps.field import accumulate_group, field_groups, lay_out_field
@@ -68,6 +69,7 @@ def field_run(
         keys={"field": "test"},
         info=SimpleNamespace(times_s=np.array([0.0, seconds])),
         indices=np.arange(2),
+        slices=parse_slices(flight_config.field.slice, 0.0, seconds) if flight_config.field.slice else [],
     )
     lay_out_field(plan)  # type: ignore[arg-type]  # all of a plan that the field reads
     for group in field_groups(plan):  # type: ignore[arg-type]

@@ -62,6 +62,15 @@ def test_where_all_stand_the_density_is_finite_and_standing_the_likeliest() -> N
     assert still.gate(where[0]).accepts(np.zeros((1, 2)))[0]
 
 
+def test_a_queue_is_reckoned_with_where_none_has_stood_but_is_not_usual_there(one_way: VelocityField) -> None:
+    place, stands, wrong_way = np.array([[80.0, 50.0]]), np.zeros((1, 2)), polar(np.array([13.0]), np.array([180.0]))
+    assert one_way.log_density(place, stands)[0] > one_way.log_density(place, wrong_way)[0] + 1.0
+    gate = one_way.gate(place[0])
+    assert one_way.log_density(place, stands)[0] > gate.log_density(stands)[0] + 1.0
+    times_s = np.array([0.0, 0.2, 0.4])
+    assert one_way.anomaly(times_s, np.repeat(place, 3, axis=0)) > 3.0
+
+
 def test_a_gate_of_no_place_is_refused(one_way: VelocityField) -> None:
     with pytest.raises(InputError, match="finite place"):
         one_way.gate(np.array([np.nan, 3.0]))

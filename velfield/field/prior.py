@@ -2,7 +2,9 @@
 
 Three levels, each speaking as loud as its data: the pixel's own passages; those of the pixels around; all of the map.
 A level with n passages stands against the next with weight n : `STRENGTH`, so that where nothing is known the density
-is the map's, and where the map is empty a broad Gaussian.
+is the map's, and where the map is empty a broad Gaussian. For who foretells, standing still counts for `STANDING`
+passages more on every level: a queue of another cycle of the signals stands where in this one all drove. For who asks
+what is usual at a place (gate, anomaly) it does not.
 
 Of a pixel, and of those around, each mode is a Gaussian: its weights' mean, and their covariance with the kernel and
 the bins taken out, which are wider than traffic that keeps its lane. The covariance of few passages is taken together
@@ -20,6 +22,8 @@ from velfield.field.modes import MAX_MODES, pixel_modes, window_bins
 
 STRENGTH = 1.0
 """Passages that a level counts for against the one before it."""
+STANDING = 0.1
+"""Passages that standing still counts for on every level, whether one stood there or not."""
 SPREAD_SIGMA_BINS = 0.5
 """Standard deviation of a bin's spread: below half a bin the density would ripple."""
 LEAST_SIGMA_BINS = 0.25
@@ -148,11 +152,23 @@ def _around(
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _about_rest(v_y: float, v_x: float, reach: float, sigma: float) -> float:
+    """Density per square bin of a round Gaussian about standing still, the bin ``reach`` of either axis."""
+    square = (v_x - reach) ** 2 + (v_y - reach) ** 2
+    return exp(-0.5 * square / (sigma * sigma)) / (2.0 * pi * sigma * sigma)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _with_next(n: float, level: float, below: float, stands: float, counts: float) -> float:
+    """A level's density with that of the level before it and of what stands, each by the passages it counts for."""
+    return (n * level + STRENGTH * below + counts * stands) / (n + STRENGTH + counts)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _of_the_map(everywhere: Float, known: bool, v_y: float, v_x: float) -> float:
     """Density per square bin where nothing is known of the place; ``known``: whether anything is of the map."""
     reach = (everywhere.shape[0] - 1) / 2
-    broad = reach / 2
-    of_broad = exp(-0.5 * ((v_x - reach) ** 2 + (v_y - reach) ** 2) / (broad * broad)) / (2.0 * pi * broad * broad)
+    of_broad = _about_rest(v_y, v_x, reach, reach / 2)
     share = BROAD_SHARE if known else 1.0
     return float((1.0 - share) * _spread(everywhere, v_y, v_x) + share * of_broad)
 
@@ -167,10 +183,11 @@ def densities_at_pixel(
     velocity_bins: Float,
     radius: int,
     blur: float,
+    standing: float,
 ) -> Float:
     """Density per square bin of velocities (n, 2) as (vx, vy) at one pixel of a window of the field, (n,).
 
-    Parameters are those of `log_density_in_window`.
+    ``standing``: passages that standing still counts for. The other parameters are those of `log_density_in_window`.
     """
     around: Float = np.zeros(everywhere.shape)
     near = _around(histogram, count, x, y, radius, around)
@@ -187,11 +204,12 @@ def densities_at_pixel(
     out = np.empty(velocity_bins.shape[0])
     for k in range(velocity_bins.shape[0]):
         v_x, v_y = velocity_bins[k, 0], velocity_bins[k, 1]
-        density = _of_the_map(everywhere, known, v_y, v_x)
+        stands = _about_rest(v_y, v_x, (everywhere.shape[0] - 1) / 2, LEAST_SIGMA_BINS)
+        density = _with_next(0.0, 0.0, _of_the_map(everywhere, known, v_y, v_x), stands, standing)
         if near > 0.0:
-            density = (near * _level(around, of_near, v_y, v_x) + STRENGTH * density) / (near + STRENGTH)
+            density = _with_next(near, _level(around, of_near, v_y, v_x), density, stands, standing)
         if here > 0.0:
-            density = (here * _level(own, of_here, v_y, v_x) + STRENGTH * density) / (here + STRENGTH)
+            density = _with_next(here, _level(own, of_here, v_y, v_x), density, stands, standing)
         out[k] = density
     return out
 
@@ -230,6 +248,7 @@ def log_density_in_window(
             out[k] = nan
             continue
         x, y = pixels[k, 0], pixels[k, 1]
-        density = densities_at_pixel(histogram, count, everywhere, x, y, velocity_bins[k : k + 1], radius, blur)[0]
+        here = velocity_bins[k : k + 1]
+        density = densities_at_pixel(histogram, count, everywhere, x, y, here, radius, blur, STANDING)[0]
         out[k] = log(max(density, 1e-300))
     return out

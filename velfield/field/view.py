@@ -190,7 +190,7 @@ class VelocityField:
     # -- a prior for another tracker ----------------------------------------------------------------------------------
 
     def log_density(self, xy: Float, v: Float) -> Float:
-        """Log of p(v | x), density per (px/s)^2: see `velfield.field.prior`.
+        """Log of p(v | x) of the next vehicle, density per (px/s)^2: see `velfield.field.prior`.
 
         Parameters
         ----------
@@ -231,7 +231,9 @@ class VelocityField:
         return out
 
     def gate(self, xy: Float, covariance: Float | None = None, *, share: float = SHARE) -> VelocityGate:
-        """What velocities to expect at a place: a gate for another tracker (`velfield.field.gate`).
+        """What velocities are usual at a place: a gate for another tracker (`velfield.field.gate`).
+
+        Unlike `log_density` it does not reckon with a queue where none has stood yet.
 
         Parameters
         ----------
@@ -272,14 +274,14 @@ class VelocityField:
         return float(np.mean(surprise))
 
     def _densities(self, xy: Float, v: Float) -> Float:
-        """Density per (px/s)^2 at one place (2,) of velocities (n, 2)."""
+        """Density per (px/s)^2 at one place (2,) of velocities (n, 2), by what was seen alone."""
         radius = self._neighbourhood_px()
         limit = float(max(self.shape)) * 2
         x, y = np.floor(np.clip(xy, -limit, limit) + 0.5).astype(np.int64)
         histogram, count = self._cut(int(x) - radius, int(y) - radius, 2 * radius + 1, 2 * radius + 1)
         everywhere = self._map_distribution()
         density = densities_at_pixel(
-            histogram, count, everywhere, radius, radius, self.bins.to_bins(v), radius, self._blur()
+            histogram, count, everywhere, radius, radius, self.bins.to_bins(v), radius, self._blur(), 0.0
         )
         return np.asarray(density / self.bins.width_px_per_s**2, np.float64)
 
