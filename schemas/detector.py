@@ -66,7 +66,7 @@ class DetectorRecord(Model):
     method: Literal["aligned", "dense"]
     working_car_length_px: PositiveFloat = Field(le=200)
     """A car's length on the grid that it was learnt on."""
-    rounds: tuple[Round, ...] = Field(min_length=1, max_length=5000)
+    rounds: tuple[Round, ...] = Field(min_length=1, max_length=50_000)
     threshold: float
     grey_bits: int = Field(default=8, ge=1, le=8)
     """Dense: so many bits of the grey are looked at."""

@@ -111,7 +111,7 @@ class DetectionConfig(Model):
     """``aligned``: candidates, then a boosted classifier on cars turned to the horizontal; ``dense``: the paper's
     response."""
     rounds: PositiveInt = 800
-    """Rounds of AdaBoost. Paper: 200."""
+    """Rounds of AdaBoost; half as many for each detector of a part of the cars. Paper: 200."""
     feature_pool: PositiveInt = 3000
     """Random features a round chooses from."""
     max_rectangles: PositiveInt = 5
@@ -129,7 +129,8 @@ class DetectionConfig(Model):
     min_region_px: PositiveInt = 10
     """Regions smaller than this are dropped. Paper: 10."""
     folds: int = Field(4, ge=2)
-    """T is chosen on cars left out of training: a so-manieth part of the marked ones at a time."""
+    """T is chosen on cars left out of training: a so-manieth part of the marked ones at a time. Of 40 cars
+    and more the detectors learnt so judge together with the one of all cars."""
     threshold: float | None = None
     """Threshold T on the response; none: chosen from the training evidence and stored with the detector."""
     working_car_length_px: PositiveFloat = 16.0

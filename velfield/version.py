@@ -7,7 +7,7 @@ STAGE_VERSIONS: dict[str, int] = {
     "lens": 3,
     "base": 3,
     "registration": 3,
-    "detector": 9,
+    "detector": 10,
     "detections": 5,
     "links": 1,
     "tracklets": 3,

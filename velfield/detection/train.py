@@ -7,6 +7,7 @@ import numpy as np
 
 from schemas.detector import DetectorRecord, PrecisionRecallCurve, Proposer, Round
 from schemas.flight import DetectionConfig
+from velfield.detection.committee import committee_of
 from velfield.detection.dense import train_densely
 from velfield.detection.detector import Detector, sums_of
 from velfield.detection.learning import CONTRAST_FLOOR, learn_classifier, learn_proposer
@@ -26,6 +27,10 @@ _FOLD_SCENES = 3
 _UNTRIED_THRESHOLD = 0.15
 """T where too few cars are marked to leave some out: what it came to on most sites."""
 _UNTRIED_CUT = -0.4
+_COMMITTEE_MIN_CARS = 40
+"""With fewer marked cars the detectors of a part of them know too little to have a say."""
+_OF_A_COMMITTEE = 0.55
+"""Share of a member's score that a committee gives what it was not trained on: its members do not err alike."""
 _STRIPES_TOLD = "cars in stripes of the pictures, found by detectors trained on the other stripes"
 
 
@@ -67,7 +72,15 @@ def train_detector(
     channels = 4 if has_background else 3
     prior = _rounds_to_continue(continued, config, channels)
     steps = trained([scene_of(sample, has_background) for sample in samples], config, channels, config.seed, prior)
-    evidence = _held_out(steps.scenes, config, channels, prior) if count >= _FOLD_MIN_CARS else None
+    complete = all(sample.complete for sample in samples)
+    if count < _FOLD_MIN_CARS:
+        evidence = None
+    elif not complete or count < _COMMITTEE_MIN_CARS:
+        _, evidence = _folds(steps.scenes, config, channels, prior)
+    else:
+        halved = config.model_copy(update={"rounds": max(config.rounds // 2, 1)})
+        others, evidence = _folds(steps.scenes, halved, channels, prior, members=config.folds + 1)
+        steps = replace(steps, classifier=committee_of([steps.classifier, *(other.classifier for other in others)]))
     record = record_of(steps, evidence, config, count)
     return Detector(record if continued is None else _continuing(record, continued, config, tried=evidence is not None))
 
@@ -118,8 +131,10 @@ def trained(
     return Steps(proposer, classifier, aligned)
 
 
-def _held_out(scenes: Sequence[Scene], config: DetectionConfig, channels: int, prior: tuple[Round, ...]) -> Evidence:
-    """Leave each of some sets of stripes out of training in turn, and try it there.
+def _folds(
+    scenes: Sequence[Scene], config: DetectionConfig, channels: int, prior: tuple[Round, ...], *, members: int = 1
+) -> tuple[list[Steps], Evidence]:
+    """Detectors each learnt with some stripes left out, and what they say there, as one of so many members.
 
     The fewer are left out at once, the nearer T is to the one that the detector of all stripes wants: detectors of half
     of 47 cars liked what is no car better, and T came out so high that a fifth of the cars was lost.
@@ -127,13 +142,20 @@ def _held_out(scenes: Sequence[Scene], config: DetectionConfig, channels: int, p
     folds = config.folds if all(scene.sample.complete for scene in scenes) else 2  # else motion will tell T
     tried = np.unique(np.linspace(0, len(scenes) - 1, min(_FOLD_SCENES, len(scenes))).round().astype(int))
 
-    def of_fold(fold: int) -> list[Evidence]:
+    def of_fold(fold: int) -> tuple[Steps, list[Evidence]]:
         seen = [part_of(scene, ~stripes(scene, fold, folds)) for scene in scenes]
         steps = trained(seen, config, channels, config.seed + 1 + fold, prior)
         proposer, sums = sums_of(steps.proposer), sums_of(steps.classifier)
-        return [evidence_of_part(scenes[k], stripes(scenes[k], fold, folds), proposer, sums) for k in tried]
+        return steps, [
+            evidence_of_part(scenes[k], stripes(scenes[k], fold, folds), proposer, sums, members=members) for k in tried
+        ]
 
-    return joined([part for parts in each(of_fold, range(folds)) for part in parts])
+    found = each(of_fold, range(folds))
+    evidence = joined([part for _, parts in found for part in parts])
+    if members > 1:
+        said = np.where(evidence.score > 0, _OF_A_COMMITTEE * evidence.score, evidence.score)
+        evidence = replace(evidence, score=said)
+    return [steps for steps, _ in found], evidence
 
 
 def record_of(

@@ -61,8 +61,10 @@ def stripes(scene: Scene, fold: int, folds: int) -> Bools:
     return np.broadcast_to(inside if axis == 0 else inside[:, None], (height, width))
 
 
-def evidence_of_part(scene: Scene, region: Bools, proposer: BoostedSums, sums: BoostedSums) -> Evidence:
-    """Try a detector on a part (h, w) of a scene that it was not trained on."""
+def evidence_of_part(
+    scene: Scene, region: Bools, proposer: BoostedSums, sums: BoostedSums, *, members: int = 1
+) -> Evidence:
+    """Try a detector on a part (h, w) of a scene that it was not trained on; one of so many of a committee."""
     places = propose(
         scene.coarse, scene.sample.image.shape, scene.sample.valid, proposer, contrast_floor=CONTRAST_FLOOR
     )
@@ -72,7 +74,7 @@ def evidence_of_part(scene: Scene, region: Bools, proposer: BoostedSums, sums: B
     cars = scene.cars[lies_in(region, scene.cars)]
     counted = is_far(found, scene) | (distance(found, cars) < MATCH_PX)
     found = found[counted]
-    right, first = matched(found, cars), _first_scores(look, found)
+    right, first = matched(found, cars), _first_scores(look, found, max(FIRST_ROUNDS // members, 1))
     return Evidence(found[:, 3], right, _best_near(places, found), first, len(cars), scene.sample.complete)
 
 
@@ -95,10 +97,10 @@ def _best_near(places: Floats, found: Floats) -> Floats:
     return np.asarray(np.where(near, places[:, 3], -np.inf).max(axis=1), np.float64)
 
 
-def _first_scores(look: Look, found: Floats) -> Floats:
+def _first_scores(look: Look, found: Floats, rounds: int) -> Floats:
     if not len(found):
         return np.empty(0)
-    first = look.scores(found[:, :2], found[:, 2], np.zeros(1), np.zeros((1, 2), np.int64), FIRST_ROUNDS)
+    first = look.scores(found[:, :2], found[:, 2], np.zeros(1), np.zeros((1, 2), np.int64), rounds)
     return np.asarray(first[:, 0, 0], np.float64)
 
 

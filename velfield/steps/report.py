@@ -2,6 +2,7 @@
 
 import datetime
 from collections.abc import Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -77,11 +78,18 @@ def write_report(plan: Plan, summary: RunSummary) -> list[str]:
     return []
 
 
+def _name(plan: Plan) -> str:
+    """The video's name; a folder's with the one that it lies in, for it may well be called ``frames``."""
+    source = Path(plan.job.inputs.source)
+    parts = [part for part in source.parts if part != source.anchor]
+    return "/".join(parts[-2:] if plan.info.kind == "folder" else parts[-1:])
+
+
 def make_report(plan: Plan, summary: RunSummary) -> Report:
     """What the report tells."""
     counts = {stage.name: stage.counts for stage in summary.stages}
     return Report(
-        title=f"Velocity field of {plan.job.inputs.source.rstrip('/').rsplit('/', 1)[-1]}",
+        title=f"Velocity field of {_name(plan)}",
         source=plan.job.inputs.source,
         created=datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
         version=code_version(),
