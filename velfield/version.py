@@ -4,7 +4,7 @@ from importlib.metadata import version
 
 STAGE_VERSIONS: dict[str, int] = {
     "frames": 1,
-    "lens": 3,
+    "lens": 4,
     "base": 3,
     "registration": 3,
     "detector": 10,

@@ -177,7 +177,7 @@ def calibrate(frames: Sequence[Grey], config: LensConfig, seed: int = 0) -> Cali
         reason = f"fewer than {MIN_LINES} lines long enough in {len(frames)} frames"
         return CalibrationResult(pinhole(shape), False, reason, shape, frames=len(frames))
     best, lines, candidates = _choose_model(scene, harris, seed)
-    accepted, reason = _judge(scene, harris, best, lines)
+    accepted, reason = _judge(scene, harris, best, lines, bounded=0 < int(np.argmin(grid_entropy)) < len(grid_a) - 1)
     accepted = accepted or config.calibrate == "always"
     spread = np.sqrt(np.diag(harris.covariance))
     centre_sd = spread[-2:] * scene.pinhole.half_diagonal_px
@@ -306,8 +306,12 @@ def _evidence(
     return tuple(rows)
 
 
-def _judge(scene: _Scene, harris: StraightFit, best: StraightFit, lines: LineSet) -> tuple[bool, str]:
-    """Whether a distortion is better than none, and the one line that says why."""
+def _judge(scene: _Scene, harris: StraightFit, best: StraightFit, lines: LineSet, *, bounded: bool) -> tuple[bool, str]:
+    """Whether a distortion is better than none, and the one line that says why.
+
+    ``bounded``: whether the entropy is least within the distortions that were searched. Where it falls to their end, as
+    at a crossroads of bent kerbs, the evidence must be strong.
+    """
     family = scene.family("harris", 1)
     alone = LineSet(scene.arcs.xy, scene.arcs.tangents, scene.arcs.arc, scene.arcs.frame)
     without = scene.lines(scene.pinhole, 2.0)
@@ -328,6 +332,8 @@ def _judge(scene: _Scene, harris: StraightFit, best: StraightFit, lines: LineSet
         f"a = {a:.3f} +- {sd:.3f} from {lines.count} lines, entropy {gain:+.3f} nats less than with none, "
         f"estimates {estimates.min():.3f} to {estimates.max():.3f}, {straighter} of {told} bent lines straighter"
     )
+    if not (bounded or strong):
+        return False, f"{found}: the entropy has no minimum within lens.max_distortion, pin-hole kept"
     if gain < MIN_GAIN_NATS:
         return False, f"{found}: less than {MIN_GAIN_NATS} nats gained, pin-hole kept"
     if abs(a) < MIN_SIGNIFICANCE * sd:
