@@ -73,15 +73,14 @@ def train_detector(
     channels = 4 if has_background else 3
     prior = _rounds_to_continue(continued, config, channels)
     steps = trained([scene_of(sample, has_background) for sample in samples], config, channels, config.seed, prior)
-    complete = all(sample.complete for sample in samples)
-    if count < _FOLD_MIN_CARS:
-        evidence = None
-    elif not complete or count < _COMMITTEE_MIN_CARS:
-        _, evidence = _folds(steps.scenes, config, channels, prior)
-    else:
-        halved = config.model_copy(update={"rounds": max(config.rounds // 2, 1)})
-        others, evidence = _folds(steps.scenes, halved, channels, prior, members=config.folds + 1)
-        steps = replace(steps, classifier=committee_of([steps.classifier, *(other.classifier for other in others)]))
+    evidence = None
+    if count >= _FOLD_MIN_CARS:
+        complete = all(sample.complete for sample in samples)
+        folds = config.folds if complete else 2  # else motion will tell T
+        together = complete and count >= _COMMITTEE_MIN_CARS
+        others, evidence = _folds(steps.scenes, config, channels, prior, folds=folds, together=together)
+        if together:
+            steps = replace(steps, classifier=committee_of([steps.classifier, *(one.classifier for one in others)]))
     record = record_of(steps, evidence, config, count)
     return Detector(record if continued is None else _continuing(record, continued, config, tried=evidence is not None))
 
@@ -133,14 +132,22 @@ def trained(
 
 
 def _folds(
-    scenes: Sequence[Scene], config: DetectionConfig, channels: int, prior: tuple[Round, ...], *, members: int = 1
+    scenes: Sequence[Scene],
+    config: DetectionConfig,
+    channels: int,
+    prior: tuple[Round, ...],
+    *,
+    folds: int,
+    together: bool,
 ) -> tuple[list[Steps], Evidence]:
-    """Detectors each learnt with some stripes left out, and what they say there, as one of so many members.
+    """Detectors each learnt with some stripes left out, and what they say there; ``together``: of a committee with the
+    one of all stripes, each of half the rounds.
 
     The fewer are left out at once, the nearer T is to the one that the detector of all stripes wants: detectors of half
     of 47 cars liked what is no car better, and T came out so high that a fifth of the cars was lost.
     """
-    folds = config.folds if all(scene.sample.complete for scene in scenes) else 2  # else motion will tell T
+    members = folds + 1 if together else 1
+    config = config.model_copy(update={"rounds": max(config.rounds // 2, 1)}) if together else config
     tried = np.unique(np.linspace(0, len(scenes) - 1, min(_FOLD_SCENES, len(scenes))).round().astype(int))
 
     def of_fold(fold: int) -> tuple[Steps, list[Evidence]]:
@@ -153,10 +160,9 @@ def _folds(
 
     found = each(of_fold, range(folds))
     evidence = joined([part for _, parts in found for part in parts])
-    if members > 1:
-        left = 1 - _OF_ITS_OWN * (1 - 1 / members)
-        evidence = replace(evidence, score=np.where(evidence.score > 0, left * evidence.score, evidence.score))
-    return [steps for steps, _ in found], evidence
+    left = 1 - _OF_ITS_OWN * (1 - 1 / members)
+    said = np.where(evidence.score > 0, left * evidence.score, evidence.score)
+    return [steps for steps, _ in found], replace(evidence, score=said)
 
 
 def record_of(
