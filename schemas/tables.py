@@ -48,4 +48,5 @@ LABEL_COLUMNS: dict[str, str] = {
     "orientation_rad": "float64",  # NaN where the label does not tell
     "length_px": "float64",  # NaN where the label does not tell
     "width_px": "float64",
+    "tilt_rad": "float64",  # |angle| to the picture's rows: of a car in an upright box, whose axis it does not tell
 }

@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 
 from flows.cli import app
+from schemas.flight import FramesConfig
+from velfield.detection.axis import axial_difference
 from velfield.detection.detector import load_detector
 from velfield.detection.review import review_sheet
+from velfield.detection.samples import scene_of
 from velfield.errors import InputError
+from velfield.sources.labels import load_labels
+from velfield.sources.source import probe
+from velfield.steps.labelled import labelled_images
 from velfield.synthetic import small_flight
 
 QUICK = ["--set", "detection.rounds=30", "--set", "detection.feature_pool=200"]
@@ -74,3 +80,27 @@ def test_the_sheet_has_a_part_for_each_kind() -> None:
     chips = np.full((20, 32, 32), 90, np.uint8)
     sheet = review_sheet({"found": chips, "none": chips[:0]})
     assert sheet.shape == (2 * 22 + 2 * 64, 1024, 3)
+
+
+def test_a_turned_car_in_an_upright_box_is_learnt_along_its_axis(tmp_path: Path) -> None:
+    """The box tells the angle but for its sign, the picture the sign; a box's length alone says nothing of either."""
+    flight = small_flight(frames=1, width=640, height=480, seed=12)
+    cars = flight.labels(0)
+    cars = cars[cars["length_px"] < 25]
+    turn = cv2.getRotationMatrix2D((320, 240), -30, 1.0)  # its streets lie along rows and columns
+    xy = cars[["x_px", "y_px"]].to_numpy() @ turn[:, :2].T + turn[:, 2]
+    length, width, axis = (cars[name].to_numpy() for name in ("length_px", "width_px", "orientation_rad"))
+    axis = axis + np.radians(30)
+    c, s = np.abs(np.cos(axis)), np.abs(np.sin(axis))
+    boxes = np.column_stack([(xy + 0.5) / [640, 480], (length * c + width * s) / 640, (length * s + width * c) / 480])
+    seen = (np.abs(boxes[:, :2] - 0.5) < 0.48).all(axis=1)
+    rows, axis = np.column_stack([np.zeros(len(boxes)), boxes])[seen], axis[seen]
+    picture = cv2.warpAffine(flight.frame(0), turn, (640, 480), borderMode=cv2.BORDER_REFLECT)
+    cv2.imwrite(str(tmp_path / "0.png"), picture)
+    (tmp_path / "labels").mkdir()
+    np.savetxt(tmp_path / "labels" / "0.txt", rows, fmt="%.6f")
+    info = probe(tmp_path, frames=FramesConfig(fps=1.0))
+    (image,) = labelled_images(tmp_path, info, load_labels(tmp_path / "labels", info), work_per_raw=0.92)
+    off = np.degrees(axial_difference(scene_of(image, has_background=False).cars[:, 2], axis))
+    assert len(off) > 15
+    assert np.mean(off < 15) > 0.85

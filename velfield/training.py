@@ -13,10 +13,9 @@ from velfield.detection.samples import LabelledImage
 from velfield.detection.train import train_detector
 from velfield.errors import InputError
 from velfield.render.figures import png_bytes
-from velfield.sources.flags import UNUSABLE
 from velfield.sources.labels import Labels, load_labels
-from velfield.sources.source import SourceInfo, iter_frames, probe
-from velfield.steps.labelled import boxes, car_length_raw_px, left_out, scaled
+from velfield.sources.source import probe
+from velfield.steps.labelled import car_length_raw_px, labelled_images
 
 SHIPPED = "shipped"
 
@@ -50,7 +49,7 @@ def train_from_labels(source: Path, labels: Path, config: FlightConfig, *, conti
     fps = (config.frames.fps or 1.0) if source.is_dir() else None  # pictures need no times to be learnt from
     info = probe(source, frames=config.frames.model_copy(update={"fps": fps}))
     found = load_labels(labels, info)
-    samples = tuple(_samples(source, info, found, _scale(config, found)))
+    samples = tuple(labelled_images(source, info, found, work_per_raw=_scale(config, found)))
     detector = train_detector(samples, config.detection, continued=_earlier(continued))
     return Training(detector, samples, found)
 
@@ -69,18 +68,6 @@ def _earlier(name: str | None) -> Detector | None:
     if name is None:
         return None
     return shipped_detector() if name == SHIPPED else load_detector(Path(name))
-
-
-def _samples(source: Path, info: SourceInfo, labels: Labels, scale: float) -> list[LabelledImage]:
-    place = {name: index for index, name in enumerate(info.names)}
-    samples = []
-    for frame in iter_frames(source, info, np.array(sorted(place[name] for name in labels.frames), np.int64)):
-        if frame.flags & UNUSABLE:
-            raise InputError(f"the labelled frame {frame.name} cannot be used: {frame.reason}; mark another")
-        cars = boxes(labels.cars, frame.name, scale)
-        circles = left_out(labels.ignored, frame.name, scale)
-        samples.append(LabelledImage(image=scaled(frame.grey, scale), cars=cars, ignore=circles))
-    return samples
 
 
 def write_training(training: Training, out: Path, review: Path | None = None) -> list[str]:

@@ -1,50 +1,76 @@
-"""The axis of a marked car whose label does not tell it: from the box's shape, whose side the picture decides."""
+"""The axis of a marked car whose label does not tell it: where its outline runs, as far as a box leaves that open."""
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-
-from velfield.detection.axis import at_places, axial_difference, structure_axis
 
 Floats = NDArray[np.float64]
 
 CAR_ASPECT = 0.45
 """A usual car's width over its length."""
-_SHAPE_SD_RAD = 0.2
+_USUAL_LENGTH_PX = 16.0
 _TRIED = np.radians(np.arange(0, 180, 3.0))
+_SHAPE_SD_RAD = 0.2
+_SIGMA_PX = 1.0
+_ALONG = np.linspace(-0.4, 0.4, 9)
+"""Of a side so much is looked at: the corners are round."""
+_SIZES = (0.85, 1.0, 1.15)
+_ENDS = 0.5
+"""Bumpers are shorter than sides, and a windscreen's edge is as sharp."""
 
 
-def with_axes(image: NDArray[np.uint8], cars: Floats) -> Floats:
-    """Cars (n, 5) with every axis finite.
+def with_axes(image: NDArray[np.uint8], cars: Floats, tilts: Floats | None = None) -> Floats:
+    """Cars (n, 5) as x, y, axis, length, width, working px, with every axis finite.
 
-    An upright box about a turned rectangle tells the angle but for its sign: w = L |cos| + W |sin|, and h = L |sin| +
-    W |cos|. The structure tensor, alone wrong for one car in six among parked neighbours, tells the sign, and all where
-    there is no box.
+    An upright box about a turned rectangle tells the angle but for its sign: ``tilts`` (n,), NaN where there was none.
+    The outline in the picture tells the sign, and all where there is no box. (The structure tensor is misled by
+    windscreens, which lie across, and by parked neighbours: of the marked cars of songdo it has .60 within 30 degrees,
+    of KIT AIS .83, of simulated cities .47; the outline .92, .96 and .76, and with a box .95 to 1.00.)
     """
     cars = cars.copy()
     unknown = np.flatnonzero(~np.isfinite(cars[:, 2]))
     if not unknown.size:
         return cars
-    axes, coherences = structure_axis(image)
-    axis, coherence = (at_places(values, cars[unknown]) for values in (axes, coherences))
-    off_axis = axial_difference(_TRIED[None], axis[:, None])
-    evidence = coherence[:, None] * np.cos(2 * off_axis)
-    boxed = np.isfinite(cars[unknown, 3:]).all(axis=1) & (cars[unknown, 3:] > 0).all(axis=1)
-    tilt = tilt_of_box(cars[unknown[boxed], 3], cars[unknown[boxed], 4])
-    upright = np.minimum(_TRIED, np.pi - _TRIED)
-    evidence[boxed] -= 0.5 * ((upright - tilt[:, None]) / _SHAPE_SD_RAD) ** 2
+    evidence = _outlines(image, cars[unknown])
+    if tilts is not None:
+        upright = np.minimum(_TRIED, np.pi - _TRIED)
+        evidence -= np.nan_to_num(0.5 * ((upright - tilts[unknown, None]) / _SHAPE_SD_RAD) ** 2)
     cars[unknown, 2] = _TRIED[evidence.argmax(axis=1)]
     return cars
 
 
-def tilt_of_box(width: Floats, height: Floats, *, aspect: float = CAR_ASPECT) -> Floats:
-    """|angle| to the x axis, [0, pi / 2], of a rectangle whose upright box has these sides.
+def _outlines(image: NDArray[np.uint8], cars: Floats) -> Floats:
+    """How much a car's outline is seen at each of the axes tried (n, tried), by its best one."""
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _SIGMA_PX)
+    slopes = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
+    length = np.where(np.isfinite(cars[:, 3]), cars[:, 3], _USUAL_LENGTH_PX)
+    width = np.where(np.isfinite(cars[:, 4]), cars[:, 4], CAR_ASPECT * length)
+    sides = _pair_of_sides(slopes, cars[:, :2], _TRIED, length, width)
+    ends = _pair_of_sides(slopes, cars[:, :2], _TRIED + np.pi / 2, width, length)
+    seen = sides + _ENDS * ends
+    return np.asarray(seen / np.maximum(seen.max(axis=1, keepdims=True), 1e-6))
 
-    Examples
-    --------
-    >>> tilt_of_box(np.array([20.0, 9.0, 10.0]), np.array([9.0, 20.0, 10.0])).round(2).tolist()
-    [0.0, 1.57, 0.79]
-    """
-    ratio = height / width
-    # h (c + a s) = w (s + a c) with c, s >= 0.
-    tilt = np.arctan2(ratio - aspect, 1 - aspect * ratio)
-    return np.asarray(np.clip(np.where(1 - aspect * ratio <= 0, np.pi / 2, tilt), 0, np.pi / 2))
+
+def _pair_of_sides(
+    slopes: tuple[NDArray[np.float32], NDArray[np.float32]], xy: Floats, angles: Floats, length: Floats, gap: Floats
+) -> Floats:
+    """The slope across two parallel sides (n, angles), so long and so far apart (n,), at their best distance."""
+    n, c, s = len(xy), np.cos(angles)[:, None], np.sin(angles)[:, None]
+    along = length[:, None, None] * _ALONG
+    total = np.zeros((n, len(angles)))
+    for side in (-0.5, 0.5):
+        best = np.zeros((n, len(angles)))
+        for size in _SIZES:
+            off = (side * size * gap)[:, None, None]
+            x, y = xy[:, 0, None, None] + along * c - off * s, xy[:, 1, None, None] + along * s + off * c
+            gx, gy = (_looked_up(slope, x, y) for slope in slopes)
+            best = np.maximum(best, np.abs((gy * c - gx * s).mean(axis=2)))
+        total += best
+    return total
+
+
+def _looked_up(values: NDArray[np.float32], x: Floats, y: Floats) -> Floats:
+    flat = (len(x), -1)
+    maps = x.reshape(flat).astype(np.float32), y.reshape(flat).astype(np.float32)
+    found = cv2.remap(values, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(found.reshape(x.shape), np.float64)

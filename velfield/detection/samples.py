@@ -36,6 +36,7 @@ class LabelledImage:
     ----------
     image : (h, w) uint8.
     cars : (n, 5): x, y, orientation, length, width in working px; NaN where it is not told.
+    tilts : (n,) of cars whose orientation is not told |angle| to the rows, NaN where that is not either; none: of none.
     ignore : (k, 3): x, y, radius of what is neither car nor background.
     valid : (h, w) bool, none: everywhere.
     background : (h, w) uint8, none: not known.
@@ -48,6 +49,7 @@ class LabelledImage:
     valid: Bools | None = None
     background: Grey | None = None
     complete: bool = True
+    tilts: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ def scene_of(sample: LabelledImage, has_background: bool) -> Scene:
     xy = candidate_places(sample.image, sample.valid)
     axis, _ = structure_axis(sample.image)
     places = np.column_stack([xy, at_places(axis, xy)])
-    cars = with_axes(sample.image, sample.cars)
+    cars = with_axes(sample.image, sample.cars, sample.tilts)
     return Scene(sample, fine, coarse, cars[:, :3], np.isfinite(sample.cars[:, 2]), places)
 
 
@@ -85,7 +87,8 @@ def part_of(scene: Scene, region: Bools) -> Scene:
     """The scene with nothing known outside a region (h, w)."""
     valid = region if scene.sample.valid is None else region & scene.sample.valid
     inside = lies_in(region, scene.cars)
-    sample = replace(scene.sample, valid=valid, cars=scene.sample.cars[inside])
+    tilts = None if scene.sample.tilts is None else scene.sample.tilts[inside]
+    sample = replace(scene.sample, valid=valid, cars=scene.sample.cars[inside], tilts=tilts)
     places = scene.places[lies_in(region, scene.places)]
     return replace(scene, sample=sample, cars=scene.cars[inside], told=scene.told[inside], places=places)
 

@@ -21,7 +21,7 @@ from velfield.detection.places import Place, left_out, train_on_places
 from velfield.detection.samples import LabelledImage
 from velfield.detection.validation import Evidence, joined
 from velfield.errors import InputError
-from velfield.sources.yolo import length_from_upright_box
+from velfield.sources.yolo import length_from_upright_box, shape_of_upright_box
 from velfield.threads import each
 
 ATTRIBUTION = (
@@ -72,11 +72,11 @@ def _scaled(grey: NDArray[np.uint8], boxes: NDArray[np.float64], factor: float) 
     size = round(grey.shape[1] * factor), round(grey.shape[0] * factor)
     image = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
     xy, sides = (boxes[:, 1:3] + 0.5) * factor - 0.5, boxes[:, 3:5] * factor
-    axis = np.where(sides[:, 0] > sides[:, 1], 0.0, np.pi / 2)
-    axis[sides.max(axis=1) < 2 * sides.min(axis=1)] = np.nan
     car = boxes[:, 0] == 0
+    shapes = np.array([shape_of_upright_box(w, h) for w, h in sides[car]]).reshape(-1, 4)
     left_alone = np.column_stack([xy, np.maximum(sides.max(axis=1) / 2, 8.0)])[~car]
-    return LabelledImage(image=image, cars=np.column_stack([xy, axis, sides])[car], ignore=left_alone)
+    cars = np.column_stack([xy[car], shapes[:, :3]])
+    return LabelledImage(image=image, cars=cars, ignore=left_alone, tilts=shapes[:, 3])
 
 
 def simulated(seed: int, size: tuple[int, int] = (640, 480), large_share: float | None = None) -> LabelledImage:
@@ -133,7 +133,7 @@ def ship_long_vehicles(data: Path, out: Path) -> str:
     seen = each(partial(simulated, size=_LORRIES_IN, large_share=_LARGE_SHARE), LORRY_SEEDS)
     samples = [sample if k % 3 == 0 else _toned(sample, *_TONES[k % 3 - 1]) for k, sample in enumerate(seen)]
     for place in places_of(data):
-        samples += [replace(sample, cars=with_axes(sample.image, sample.cars)) for sample in place.learnt]
+        samples += [replace(sample, cars=with_axes(sample.image, sample.cars, sample.tilts)) for sample in place.learnt]
     left_out = each(partial(simulated, size=_LORRIES_IN), LORRY_SEEDS_LEFT_OUT)
     record = learn_long_vehicles(samples, left_out, CONFIG, ATTRIBUTION)
     out.write_text(record.model_dump_json())

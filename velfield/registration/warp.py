@@ -40,6 +40,7 @@ def warp_to_base(
     scale: float = 1.0,
     step: int = 8,
     interpolation: int = cv2.INTER_LINEAR,
+    continued: bool = False,
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """A raw frame on a window of the base image's grid.
 
@@ -54,11 +55,14 @@ def warp_to_base(
     step
         Side of the cells at whose centres the map is exact, working px.
     interpolation
-        OpenCV's: linear by default, cubic where the result is a base image.
+        OpenCV's: linear by default, cubic where the result is a base image or looked at closely.
+    continued
+        Outside the frame its edge goes on, rather than zeros: no edge where there is none.
 
     Returns
     -------
-    Image (round(h scale), round(w scale)) uint8, zero outside the frame, and mask, bool, where it is not outside.
+    Image (round(h scale), round(w scale)) uint8, zero outside the frame unless continued, and mask, bool, where it is
+    not outside.
     """
     shape = round(window[3] * scale), round(window[2] * scale)
     coarse = _coarse_map(transform, window=window, scale=scale, step=step, shape=shape)
@@ -69,7 +73,8 @@ def warp_to_base(
     image = cv2.remap(source, map_x, map_y, interpolation, borderMode=cv2.BORDER_REPLICATE)
     height, width = source.shape
     mask = (map_x >= -0.5) & (map_x <= width - 0.5) & (map_y >= -0.5) & (map_y <= height - 0.5)
-    image[~mask] = 0
+    if not continued:
+        image[~mask] = 0
     return np.asarray(image, dtype=np.uint8), np.asarray(mask)
 
 

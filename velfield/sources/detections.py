@@ -21,6 +21,7 @@ RAW_DETECTION_COLUMNS: dict[str, str] = {
     "orientation_rad": "float64",  # axial, raw picture; NaN where not told
     "length_px": "float64",  # NaN where not told
     "width_px": "float64",
+    "tilt_rad": "float64",  # as of `schemas.tables.LABEL_COLUMNS`
     "score": "float64",  # 1 where not told
 }
 FORMATS = "a CSV `frame,x_px,y_px[,orientation_rad,length_px,width_px,score]` in raw pixels, or a YOLO folder"
@@ -79,6 +80,7 @@ def _from_yolo(path: Path, info: SourceInfo) -> pd.DataFrame:
                 box.orientation_rad,
                 box.length_px,
                 box.width_px,
+                box.tilt_rad,
                 box.score,
             )
             for box in boxes
@@ -98,10 +100,12 @@ def _from_csv(path: Path, info: SourceInfo) -> pd.DataFrame:
                 f"{path.name}: line {line}: found frame {row['frame']!r}, expected a frame such as {info.names[0]!r}; "
                 "mend it"
             )
-        x, y, orientation, *rest = (finite_cell(path, line, row, name) for name in ("x_px", "y_px", *_OPTIONAL))
+        x, y, orientation, length, width, score = (
+            finite_cell(path, line, row, name) for name in ("x_px", "y_px", *_OPTIONAL)
+        )
         if math.isnan(x) or math.isnan(y):
             raise InputError(f"{path.name}: line {line}: found x_px or y_px empty, expected both; mend that line")
-        rows.append((row["frame"], place[row["frame"]], x, y, orientation % math.pi, *rest))
+        rows.append((row["frame"], place[row["frame"]], x, y, orientation % math.pi, length, width, math.nan, score))
     return _table(rows)
 
 

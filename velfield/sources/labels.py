@@ -20,6 +20,7 @@ FORMATS = (
     "folder, a .txt a picture; COCO; LabelMe; VIA"
 )
 _OPTIONAL = ("orientation_rad", "length_px", "width_px")
+CSV_COLUMNS = ("frame", "x_px", "y_px", *_OPTIONAL)
 _FOREIGN = {".xml": "XML", ".jpg": "a picture", ".png": "a picture", ".zip": "an archive", ".shp": "a shapefile"}
 
 
@@ -114,7 +115,7 @@ def _read_csv(path: Path, info: SourceInfo) -> tuple[pd.DataFrame, list[str]]:
                 f"{path.name}: line {line}: found a car of {length:g} x {width:g} px, expected both > 0; mend it"
             )
         if not math.isnan(x):
-            boxes.append(Box(frame, True, x, y, orientation % math.pi, length, width, math.nan))
+            boxes.append(Box(frame, True, x, y, orientation % math.pi, length, width, math.nan, math.nan))
     _check_inside(path, ((box.frame, box.x_px, box.y_px) for box in boxes), info)
     return label_table(boxes), list(frames)
 

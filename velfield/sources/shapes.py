@@ -10,7 +10,7 @@ import numpy as np
 
 from velfield.errors import InputError
 from velfield.sources.frames import SourceInfo
-from velfield.sources.yolo import Box, cars_among, shape_of_upright_box
+from velfield.sources.yolo import Box, Shape, cars_among, shape_of_upright_box
 
 Point = tuple[float, float]
 
@@ -58,7 +58,8 @@ def boxes_of(
         frame = frame_of.get(one.picture)
         if frame is not None:
             is_car = not one.name or names.index(one.name) in cars
-            boxes.append(Box(frame, is_car, *shape_of(one.points), math.nan))
+            x, y, shape = shape_of(one.points)
+            boxes.append(Box(frame, is_car, x, y, *shape, math.nan))
     strangers = len(pictures) - len(frames)
     notes = [f"{strangers} labelled pictures are no frames of this source and are not used"] if strangers else []
     return boxes, frames, notes
@@ -79,25 +80,26 @@ def _frame(name: str, info: SourceInfo) -> str | None:
     return alike[0] if len(alike) == 1 else None
 
 
-def shape_of(points: Sequence[Point]) -> tuple[float, float, float, float, float]:
-    """(x, y, orientation, length, width) of points as `Drawn` has them; NaN where they do not tell.
+def shape_of(points: Sequence[Point]) -> tuple[float, float, Shape]:
+    """x, y and shape of points as `Drawn` has them.
 
     Examples
     --------
-    >>> [round(v, 2) for v in shape_of([(0, 0), (20, 8)])]
-    [10.0, 4.0, 0.0, 19.64, 8.84]
-    >>> [round(v, 2) for v in shape_of([(0, 0), (20, 0), (20, 8), (0, 8)])][:4]
-    [10.0, 4.0, 0.0, 20.0]
+    >>> x, y, shape = shape_of([(0, 0), (20, 8)])
+    >>> x, y, [round(v, 2) for v in shape]
+    (10.0, 4.0, [0.0, 19.64, 8.84, nan])
+    >>> shape_of([(0, 0), (20, 0), (20, 8), (0, 8)])[2].length_px
+    20.0
     """
     if len(points) == 1:
-        return points[0][0], points[0][1], math.nan, math.nan, math.nan
+        return points[0][0], points[0][1], Shape()
     if len(points) == 2:
         (x0, y0), (x1, y1) = points
-        return (x0 + x1) / 2, (y0 + y1) / 2, *shape_of_upright_box(abs(x1 - x0), abs(y1 - y0))
+        return (x0 + x1) / 2, (y0 + y1) / 2, shape_of_upright_box(abs(x1 - x0), abs(y1 - y0))
     (x, y), (width, height), degrees = cv2.minAreaRect(np.asarray(points, np.float32))
     angle = math.radians(degrees) + (0 if width >= height else math.pi / 2)
     turned = angle % math.pi
     near_zero = 0.0 if math.isclose(turned, math.pi, abs_tol=1e-6) else turned
     if min(width, height) <= 0:
-        return x, y, math.nan, math.nan, math.nan
-    return x, y, near_zero, max(width, height), min(width, height)
+        return x, y, Shape()
+    return x, y, Shape(near_zero, max(width, height), min(width, height))

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import yaml
 
@@ -44,7 +45,20 @@ class Box:
     orientation_rad: float
     length_px: float
     width_px: float
+    tilt_rad: float
     score: float
+
+
+class Shape(NamedTuple):
+    """What a box tells of the car in it; NaN where it does not tell.
+
+    ``tilt_rad``: |angle| to the picture's rows, where the box is upright and the axis is therefore not known.
+    """
+
+    orientation_rad: float = math.nan
+    length_px: float = math.nan
+    width_px: float = math.nan
+    tilt_rad: float = math.nan
 
 
 def looks_like_yolo(path: Path) -> bool:
@@ -147,8 +161,8 @@ def _read_file(file: Path, frame: str, info: SourceInfo, cars: set[int]) -> Iter
         _check_normalised(file, number, values[1:5] if len(words) < 9 else values[1:9])
         is_car = int(values[0]) in cars
         score = values[-1] if len(words) in (6, 10) else math.nan
-        shape = _upright(values[1:5], info) if len(words) < 9 else _oriented(values[1:9], info)
-        yield Box(frame, is_car, *shape, score)
+        x, y, shape = _upright(values[1:5], info) if len(words) < 9 else _oriented(values[1:9], info)
+        yield Box(frame, is_car, x, y, *shape, score)
 
 
 def _check_normalised(file: Path, number: int, values: Sequence[float]) -> None:
@@ -160,25 +174,38 @@ def _check_normalised(file: Path, number: int, values: Sequence[float]) -> None:
         )
 
 
-def _upright(values: Sequence[float], info: SourceInfo) -> tuple[float, float, float, float, float]:
-    """(x, y, orientation, length, width) of an upright box.
+def _upright(values: Sequence[float], info: SourceInfo) -> tuple[float, float, Shape]:
+    """x, y and shape of an upright box.
 
     Edges of a normalised box run from 0 to 1 over the picture, whose first pixel's centre is our 0: half a pixel less.
     """
     x, y = values[0] * info.width - 0.5, values[1] * info.height - 0.5
     w, h = values[2] * info.width, values[3] * info.height
-    return x, y, *shape_of_upright_box(w, h)
+    return x, y, shape_of_upright_box(w, h)
 
 
-def shape_of_upright_box(w: float, h: float) -> tuple[float, float, float]:
-    """Orientation, length and width of the car in an upright box; NaN where it does not tell."""
+def shape_of_upright_box(w: float, h: float) -> Shape:
+    """Shape of the car in an upright box."""
     if min(w, h) <= 0:
-        return math.nan, math.nan, math.nan
-    orientation = math.nan
-    if max(w, h) >= _UPRIGHT_ASPECT * min(w, h):
-        orientation = 0.0 if w > h else math.pi / 2
+        return Shape()
     length = length_from_upright_box(w, h)
-    return orientation, length, CAR_ASPECT * length
+    if max(w, h) >= _UPRIGHT_ASPECT * min(w, h):
+        return Shape(0.0 if w > h else math.pi / 2, length, CAR_ASPECT * length)
+    return Shape(length_px=length, width_px=CAR_ASPECT * length, tilt_rad=tilt_of_upright_box(w, h))
+
+
+def tilt_of_upright_box(w: float, h: float, *, aspect: float = CAR_ASPECT) -> float:
+    """|angle| to the x axis, [0, pi / 2], of a car of a known aspect in an upright box of w x h.
+
+    With c, s >= 0 the cosine and the sine, h (c + r s) = w (s + r c).
+
+    Examples
+    --------
+    >>> [round(tilt_of_upright_box(w, h), 2) for w, h in ((20.0, 9.0), (9.0, 20.0), (10.0, 10.0))]
+    [0.0, 1.57, 0.79]
+    """
+    tilt = math.atan2(h - aspect * w, w - aspect * h)
+    return min(max(tilt, 0.0), math.pi / 2)
 
 
 def length_from_upright_box(w: float, h: float, *, aspect: float = CAR_ASPECT) -> float:
@@ -202,15 +229,15 @@ def length_from_upright_box(w: float, h: float, *, aspect: float = CAR_ASPECT) -
     return math.sqrt(squares / (1 + aspect**2 + 2 * aspect * turned))
 
 
-def _oriented(values: Sequence[float], info: SourceInfo) -> tuple[float, float, float, float, float]:
-    """(x, y, orientation, length, width) of four corners in order around the box."""
+def _oriented(values: Sequence[float], info: SourceInfo) -> tuple[float, float, Shape]:
+    """x, y and shape of four corners in order around the box."""
     corners = [(values[i] * info.width - 0.5, values[i + 1] * info.height - 0.5) for i in (0, 2, 4, 6)]
     x, y = (sum(corner[axis] for corner in corners) / 4 for axis in (0, 1))
     sides = [_mean_side(corners, 0, 1), _mean_side(corners, 1, 2)]
     lengths = [math.hypot(*side) for side in sides]
     along = 0 if lengths[0] >= lengths[1] else 1
     orientation = math.atan2(sides[along][1], sides[along][0]) % math.pi
-    return x, y, orientation % math.pi, lengths[along], lengths[1 - along]
+    return x, y, Shape(orientation % math.pi, lengths[along], lengths[1 - along])
 
 
 def _mean_side(corners: Sequence[tuple[float, float]], first: int, second: int) -> tuple[float, float]:

@@ -18,7 +18,7 @@ from velfield.plan import Plan
 from velfield.progress import advance
 from velfield.provenance import write_atomically
 from velfield.steps.grid import read_grid
-from velfield.steps.labelled import base_px_per_raw_px, car_length_raw_px, marked_cars, marked_frames
+from velfield.steps.labelled import base_px_per_raw_px, car_length_raw_px, labelled_images, marked_cars
 from velfield.steps.outcome import Outcome
 from velfield.steps.registration import usable_frames
 from velfield.steps.working import WorkingGrid, write_background
@@ -64,10 +64,8 @@ def _from_labels(plan: Plan) -> Outcome:
                 "the size of a car is not known: the labels have no length_px and --gsd-m is not given; give either"
             )
         scale = plan.config.detection.working_car_length_px / (length * base_per_raw)
-    samples = [
-        LabelledImage(image=frame.image, cars=frame.cars, ignore=frame.ignore, complete=True)
-        for frame in marked_frames(plan, labels, work_per_raw=scale * base_per_raw)
-    ]
+    source, work_per_raw = Path(plan.job.inputs.source), scale * base_per_raw
+    samples = list(labelled_images(source, plan.info, labels, work_per_raw=work_per_raw))
     continued = _to_continue(plan.config.detection, len(labels.cars))
     detector = train_detector(samples, plan.config.detection, continued=continued)
     return _finish(plan, detector, scale, "labels", count=len(labels.cars))

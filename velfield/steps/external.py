@@ -7,9 +7,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from velfield.detection.axis import at_places, structure_axis
+from velfield.detection.axis import axial_difference
 from velfield.detection.detect import FrameDetections, pictured
-from velfield.detection.label_axis import CAR_ASPECT
+from velfield.detection.label_axis import CAR_ASPECT, with_axes
 from velfield.plan import Plan
 from velfield.sources.detections import read_detections
 from velfield.steps.frame_maps import FrameMap
@@ -36,7 +36,7 @@ def external_detections(plan: Plan, seen: WorkingFrame, transform: FrameMap, fra
     xy = seen.to_work(transform.to_base(raw))
     axis = _turned(transform, raw, mine["orientation_rad"].to_numpy(np.float64))
     unknown = ~np.isfinite(axis)
-    axis[unknown] = at_places(structure_axis(seen.image)[0], xy[unknown]) if unknown.any() else axis[unknown]
+    axis[unknown] = _looked_for(seen, xy[unknown], transform, mine[unknown])
     length = plan.config.detection.working_car_length_px
     area = np.full(len(xy), length * length * CAR_ASPECT)
     cars = np.column_stack(
@@ -54,15 +54,27 @@ def free_of_vehicles(plan: Plan, frame: int, shape: tuple[int, int]) -> NDArray[
     if plan.job.inputs.detections is None:
         return None
     table = _boxes(plan)
-    mine = table[table["source_index"] == plan.indices[frame]]
-    length, width = mine["length_px"].to_numpy(np.float64), mine["width_px"].to_numpy(np.float64)
-    axis = np.nan_to_num(mine["orientation_rad"].to_numpy(np.float64))
+    mine = table[table["source_index"] == plan.indices[frame]].dropna(subset=["length_px", "width_px"])
+    boxes = mine[["x_px", "y_px", "length_px", "width_px"]].to_numpy(np.float64)
     free = np.ones(shape, np.uint8)
-    for x, y, a, b, turn in zip(mine["x_px"], mine["y_px"], length, width, axis, strict=True):
-        if np.isfinite(a) and np.isfinite(b):
-            rectangle = ((float(x), float(y)), (float(a), float(b)), float(np.degrees(turn)))
-            cv2.fillPoly(free, [np.rint(cv2.boxPoints(rectangle)).astype(np.int32)], (0,))
+    for sign in (1, -1):  # a car in an upright box lies either way
+        turns = np.degrees(mine["orientation_rad"].fillna(sign * mine["tilt_rad"].fillna(0.0)))
+        for (x, y, length, width), turn in zip(boxes, turns, strict=True):
+            corners = cv2.boxPoints(((x, y), (length, width), turn))
+            cv2.fillPoly(free, [np.rint(corners).astype(np.int32)], (0,))
     return free.astype(np.bool_)
+
+
+def _looked_for(
+    seen: WorkingFrame, xy: NDArray[np.float64], transform: FrameMap, boxes: pd.DataFrame
+) -> NDArray[np.float64]:
+    """Axes (n,) of boxes that do not tell them: the picture's, or of the two that an upright box leaves the nearer."""
+    untold = np.full((len(xy), 3), np.nan)
+    own = with_axes(seen.image, np.column_stack([np.nan_to_num(xy), untold]))[:, 2]
+    raw, tilt = boxes[["x_px", "y_px"]].to_numpy(np.float64), boxes["tilt_rad"].to_numpy(np.float64)
+    one, other = (_turned(transform, raw, sign * tilt) for sign in (1, -1))
+    nearer = np.where(axial_difference(one, own) <= axial_difference(other, own), one, other)
+    return np.where(np.isfinite(nearer), nearer, own)
 
 
 def _turned(transform: FrameMap, raw: NDArray[np.float64], axis_raw: NDArray[np.float64]) -> NDArray[np.float64]:

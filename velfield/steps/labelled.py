@@ -6,7 +6,6 @@ So labels are learnt from raw frames, brought to the working scale by the local 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -14,32 +13,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 from velfield.plan import Plan
 from velfield.sources.flags import UNUSABLE
+from velfield.sources.frames import SourceInfo
 from velfield.sources.labels import Labels, load_labels
 from velfield.sources.source import iter_frames
 from velfield.steps.frame_maps import FrameMaps
 from velfield.stores import open_registration
-
-
-@dataclass(frozen=True)
-class MarkedFrame:
-    """One labelled frame at the working scale.
-
-    Attributes
-    ----------
-    image
-        (h, w) uint8, the raw frame scaled.
-    cars
-        (n, 5): x, y, orientation, length, width in pixels of ``image``; NaN where the label does not tell.
-    ignore
-        (k, 3): x, y, radius of what is neither car nor background.
-    """
-
-    image: NDArray[np.uint8]
-    cars: NDArray[np.float64]
-    ignore: NDArray[np.float64]
 
 
 def marked_cars(plan: Plan) -> Labels:
@@ -80,35 +62,38 @@ def car_length_raw_px(labels: pd.DataFrame) -> float:
     return float(longest.median()) if len(longest) else float("nan")
 
 
-def marked_frames(plan: Plan, labels: Labels, *, work_per_raw: float) -> Iterator[MarkedFrame]:
-    """Every labelled frame of the source at the working scale.
+def labelled_images(source: Path, info: SourceInfo, labels: Labels, *, work_per_raw: float) -> Iterator[LabelledImage]:
+    """Every labelled frame of a source at the working scale, to learn from.
 
     Raises
     ------
     InputError
         A labelled frame cannot be read.
     """
-    place = {name: index for index, name in enumerate(plan.info.names)}
-    indices = np.array(sorted(place[name] for name in labels.frames), np.int64)
-    for found in iter_frames(Path(plan.job.inputs.source), plan.info, indices):
-        if found.flags & UNUSABLE:
-            raise InputError(f"--labels: the labelled frame {found.name} cannot be used: {found.reason}; mark another")
-        cars = boxes(labels.cars, found.name, work_per_raw)
-        circles = left_out(labels.ignored, found.name, work_per_raw)
-        yield MarkedFrame(scaled(found.grey, work_per_raw), cars, circles)
+    place = {name: index for index, name in enumerate(info.names)}
+    for frame in iter_frames(source, info, np.array(sorted(place[name] for name in labels.frames), np.int64)):
+        if frame.flags & UNUSABLE:
+            raise InputError(f"--labels: the labelled frame {frame.name} cannot be used: {frame.reason}; mark another")
+        mine = labels.cars[labels.cars["frame"] == frame.name]
+        yield LabelledImage(
+            image=scaled(frame.grey, work_per_raw),
+            cars=boxes(mine, work_per_raw),
+            ignore=left_out(labels.ignored[labels.ignored["frame"] == frame.name], work_per_raw),
+            tilts=mine["tilt_rad"].to_numpy(np.float64),
+        )
 
 
-def left_out(table: pd.DataFrame, frame: str, work_per_raw: float) -> NDArray[np.float64]:
+def left_out(table: pd.DataFrame, work_per_raw: float) -> NDArray[np.float64]:
     """Circles (k, 3) as x, y, radius, working px, about a frame's objects that are neither car nor background."""
-    around = boxes(table, frame, work_per_raw)
+    around = boxes(table, work_per_raw)
     radius = np.nanmax(np.column_stack([around[:, 3:] / 2, np.full(len(around), 8.0)]), axis=1)
     return np.column_stack([around[:, :2], radius])
 
 
-def boxes(table: pd.DataFrame, frame: str, work_per_raw: float) -> NDArray[np.float64]:
+def boxes(table: pd.DataFrame, work_per_raw: float) -> NDArray[np.float64]:
     """A frame's boxes (n, 5) as x, y, orientation, length, width, working px."""
     columns = ["x_px", "y_px", "orientation_rad", "length_px", "width_px"]
-    found = table.loc[table["frame"] == frame, columns].to_numpy(np.float64, copy=True)
+    found = table[columns].to_numpy(np.float64, copy=True)
     found[:, :2] = (found[:, :2] + 0.5) * work_per_raw - 0.5
     found[:, 3:] *= work_per_raw
     return found

@@ -3,6 +3,7 @@
 import io
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,7 +29,7 @@ class WorkingFrame:
     Attributes
     ----------
     image, valid
-        (h, w) uint8 grey and bool: where the frame covers the window.
+        (h, w) uint8 grey and bool: where the frame covers the window; elsewhere its edge goes on.
     window
         The window, base px.
     scale
@@ -78,7 +79,14 @@ class WorkingGrid:
         box = window or self._footprint(transform)
         if box is None:
             return None
-        image, valid = warp_to_base(self.frames.read(frame), transform, window=box, scale=self.scale)
+        image, valid = warp_to_base(
+            self.frames.read(frame),
+            transform,
+            window=box,
+            scale=self.scale,
+            interpolation=cv2.INTER_CUBIC,
+            continued=True,
+        )
         return WorkingFrame(image, valid, box, self.scale)
 
     def _footprint(self, transform: FrameMap) -> Window | None:

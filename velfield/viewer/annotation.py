@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from schemas.annotation import MarkedCar, Marks
 from schemas.flight import FramesConfig
-from schemas.tables import LABEL_COLUMNS
 from velfield.errors import InputError
 from velfield.layout import RunLayout
 from velfield.provenance import write_atomically
 from velfield.run import Run, open_run
+from velfield.sources.labels import CSV_COLUMNS
 from velfield.sources.pictures import read_picture_grey
 from velfield.sources.source import probe
 from velfield.sources.table import finite_cell, read_csv_rows
@@ -145,7 +145,7 @@ def _csv(marks: Marks) -> str:
     """A row a car; of a frame without cars a row that names it."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(LABEL_COLUMNS)
+    writer.writerow(CSV_COLUMNS)
     for name in marks.frames:
         writer.writerows(_rows(name, (car for car in marks.cars if car.frame == name)))
     return out.getvalue()
