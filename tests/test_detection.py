@@ -14,6 +14,7 @@ from velfield.detection.aligned import distinct
 from velfield.detection.axis import axial_difference, structure_axis
 from velfield.detection.detect import FrameDetections, detect_frame
 from velfield.detection.detector import BoostedSums, Detector, load_detector, save_detector, shipped_detector
+from velfield.detection.label_axis import with_axes
 from velfield.detection.patches import oriented_patches, upright_chips
 from velfield.detection.response import dense_response
 from velfield.detection.segmentation import moments, segment_response
@@ -164,6 +165,21 @@ def bar(angle: float, side: int = 64) -> np.ndarray:
     u, v = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
     inside = 1 / (1 + np.exp(2 * (np.abs(u) - 8))) / (1 + np.exp(2 * (np.abs(v) - 4)))
     return (60 + 150 * inside).astype(np.uint8)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 20.0, 45.0, 90.0, 130.0])
+@pytest.mark.parametrize("boxed", [False, True])
+def test_a_windscreen_does_not_turn_the_axis_of_a_marked_car(degrees: float, *, boxed: bool) -> None:
+    """What lies across a car is sharper than its sides, and there is as much of it."""
+    image, angle = np.full((64, 64), 100, np.uint8), np.radians(degrees)
+    c, s = np.cos(angle), np.sin(angle)
+    for along, length, width, grey in ((0.0, 16, 7, 170), (-3.5, 2.0, 5.5, 60), (3.5, 2.0, 5.5, 60)):
+        corners = cv2.boxPoints(((32 + along * c, 32 + along * s), (length, width), degrees))
+        cv2.fillConvexPoly(image, np.rint(corners * 16).astype(np.int32), (grey,), cv2.LINE_AA, 4)
+    car = np.array([[32.0, 32.0, np.nan, np.nan, np.nan]])
+    tilts = np.array([np.arcsin(abs(s))]) if boxed else None
+    found = with_axes(cv2.GaussianBlur(image, (0, 0), 0.8), car, tilts)[0, 2]
+    assert np.degrees(axial_difference(found, angle)) < (4 if boxed else 8)
 
 
 @pytest.mark.parametrize("angle", np.linspace(0, np.pi, 7, endpoint=False))

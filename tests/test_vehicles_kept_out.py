@@ -44,3 +44,24 @@ def test_no_key_point_lies_on_a_given_vehicle(tmp_path: Path) -> None:
     assert on_the_vehicle(everywhere) > 0
     assert on_the_vehicle(masked) == 0
     assert on_the_vehicle(unsized) == on_the_vehicle(everywhere)
+
+
+def test_a_turned_car_in_an_upright_box_keeps_both_its_ways_free(tmp_path: Path) -> None:
+    """A YOLO box of 60 x 60 px is a car of 60 px at 45 degrees, one way or the other."""
+    folder, boxes = tmp_path / "frames", tmp_path / "boxes"
+    folder.mkdir()
+    boxes.mkdir()
+    for name in ("a.png", "b.png", "c.png"):
+        cv2.imwrite(str(folder / name), np.full((120, 160), 90, np.uint8))
+    (boxes / "a.txt").write_text(f"0 {80.5 / 160} {60.5 / 120} {60 / 160} {60 / 120}\n")
+    job = Job(
+        root=str(tmp_path / "run"),
+        inputs=Inputs(source=str(folder), detections=str(boxes)),
+        config=resolve_config(overrides={"frames.fps": 5}),
+    )
+    free = free_of_vehicles(make_plan(job), 0, (120, 160))
+    assert free is not None
+    ends = [(80 + dx, 60 + dy) for dx in (-18, 18) for dy in (-18, 18)]
+    assert not any(free[y, x] for x, y in ends)
+    assert free[60, 55]
+    assert free[40, 80]

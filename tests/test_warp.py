@@ -61,6 +61,16 @@ def test_shrinking_averages_in_place_of_skipping() -> None:
     assert np.abs(image.astype(int) - 100).max() <= 2
 
 
+def test_continued_a_frame_ends_without_an_edge() -> None:
+    """A detector would take the border to nothing for a car's side."""
+    angle = 0.2
+    matrix = np.array([[np.cos(angle), -np.sin(angle), 20.0], [np.sin(angle), np.cos(angle), 10.0], [0, 0, 1.0]])
+    window = (-20, -20, WIDTH + 40, HEIGHT + 40)
+    image, mask = warp_to_base(np.full((HEIGHT, WIDTH), 170, np.uint8), moved(matrix), window=window, continued=True)
+    assert not mask.all()
+    assert (image == 170).all()
+
+
 def test_footprint_holds_the_frame() -> None:
     shift = np.array([[1.0, 0.0, 7.0], [0.0, 1.0, -3.0], [0.0, 0.0, 1.0]])
     assert footprint(moved(shift), (HEIGHT, WIDTH)) == pytest.approx((7, -3, WIDTH + 6, HEIGHT - 4))

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 
-def still(run_folder: Path, /, *, frames: int = 200) -> int:
+def still(run_folder: Path, /, *, frames: int = 200, within: Path | None = None) -> int:
     """Follow corners that registration does not use through the frames of a run, and tell how they seem to move.
 
     Parameters
@@ -12,9 +12,13 @@ def still(run_folder: Path, /, *, frames: int = 200) -> int:
         The run folder.
     frames
         At most so many frames, spread over the run.
+    within
+        A CSV `x_px,y_px`: corners around the area to look at, base pixels. Roofs and trees move on the map of a camera
+        that flies by; a road does not.
     """
-    from velfield.bench.still import still_things
+    from velfield.bench.still import read_area, still_things
     from velfield.run import open_run
 
-    print(still_things(open_run(run_folder), max_frames=frames).text())
+    area = None if within is None else read_area(within)
+    print(still_things(open_run(run_folder), max_frames=frames, within=area).text())
     return 0

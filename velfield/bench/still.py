@@ -2,11 +2,15 @@
 
 Corners of the base image that registration itself does not use (those at least a patch's half away from its own) are
 found in every registered frame below the pixel, and carried to the map by the frame's transform. What is left of their
-motion is what a standing car would seem to do: registration's residual, and the alignment's own noise.
+motion is what a standing car would seem to do: registration's residual, and the alignment's own noise, for which only
+sharp corners are followed. What is higher than the ground moves on the map of a camera that flies by, as it must: an
+area tells where the ground is.
 """
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,11 +19,14 @@ from velfield.registration.alignment import FEW, MANY, Templates, align, blurred
 from velfield.registration.transforms import FrameTransform
 from velfield.run import Run
 from velfield.sources.pictures import read_picture_grey
+from velfield.sources.table import finite_cell, read_csv_rows
 
 FloatArray = NDArray[np.float64]
 
 _MAX_SHIFT_PX = 3.0
 _MIN_SHARE = 0.5
+_SHARP_PX, _AT_LEAST = 0.1, 30
+"""Corners that noise would move by more are not followed; but so many at least are."""
 _MAD_TO_SD = 1.4826
 
 
@@ -33,10 +40,12 @@ class StillScore:
     sd_median_px, sd_p90_px : robust standard deviation of a corner's place an axis, its median and 90th percentile over
         the corners, base px.
     drift_px : how far the corners' mean place moved from the first to the last tenth of the frames, base px.
+    noise_px : what noise of the pictures alone would move the usual corner an axis.
     """
 
     points: int
     frames: int
+    noise_px: float
     sd_median_px: float
     sd_p90_px: float
     drift_px: float
@@ -45,12 +54,30 @@ class StillScore:
         """One line."""
         return (
             f"{self.points} still corners in {self.frames} frames: standard deviation {self.sd_median_px:.3f} px "
-            f"an axis (median; 90 % below {self.sd_p90_px:.3f}), drift from first to last tenth {self.drift_px:.3f} px"
+            f"an axis (median; 90 % below {self.sd_p90_px:.3f}; {self.noise_px:.3f} by the pictures' noise), "
+            f"drift from first to last tenth {self.drift_px:.3f} px"
         )
 
 
-def still_things(run: Run, *, max_frames: int = 200) -> StillScore:
+def read_area(path: Path) -> FloatArray:
+    """Corners (n, 2) in order around an area, base px: a CSV ``x_px,y_px``.
+
+    Raises
+    ------
+    InputError
+        No such file, a cell that is no number, fewer than three corners.
+    """
+    rows = read_csv_rows(path, required=("x_px", "y_px"), what="an area")
+    corners = np.array([[finite_cell(path, line, row, name) for name in ("x_px", "y_px")] for line, row in rows])
+    if len(corners) < 3 or not np.isfinite(corners).all():
+        raise InputError(f"{path.name}: found {len(corners)} corners, expected 3 or more, each with x_px and y_px")
+    return corners
+
+
+def still_things(run: Run, *, max_frames: int = 200, within: FloatArray | None = None) -> StillScore:
     """Follow still corners through at most ``max_frames`` frames, spread over the run.
+
+    ``within`` (n, 2): corners around the area to look at, base px; none: everywhere.
 
     Raises
     ------
@@ -62,23 +89,33 @@ def still_things(run: Run, *, max_frames: int = 200) -> StillScore:
     chosen = np.unique(np.linspace(0, len(registered) - 1, min(max_frames, len(registered))).astype(int))
     if len(chosen) < 3:
         raise InputError(f"{run.layout.root}: {len(registered)} registered frames, 3 or more needed to see jitter")
-    templates = _unused_corners(run)
+    templates = _unused_corners(run, within)
     places = np.full((len(chosen), len(templates), 2), np.nan)
     for row, k in enumerate(chosen):
         transform = maps.transform(registered[k])
         assert isinstance(transform, FrameTransform), "a registered frame has a map"
         places[row] = _places(run.frames.read(registered[k]), transform, templates)
-    return _score(places, run)
+    return _score(places, run, float(np.median(templates.sigma_px)))
 
 
-def _unused_corners(run: Run) -> Templates:
-    """Corners of the picture that frames were registered to, away from those that registration aligns."""
+def _unused_corners(run: Run, within: FloatArray | None) -> Templates:
+    """The sharpest corners of the picture that frames were registered to, away from those that registration aligns."""
     layout, limit = run.layout, run.record.config.frames.max_pixels
     own = run.grid.frames_to == "own"
     grey = read_picture_grey(layout.own_base_image, limit) if own else run.base_image
     known = read_picture_grey(layout.own_base_mask, limit) > 0 if own else np.ones(grey.shape, np.bool_)
     used = [make_templates(grey, known, count=count).xy for count in (FEW, MANY)]
-    return make_templates(grey, known, apart_from=np.concatenate(used))
+    found = make_templates(grey, known, apart_from=np.concatenate(used))
+    inside = np.ones(len(found), np.bool_)
+    if within is not None:
+        area = cv2.fillPoly(np.zeros(grey.shape, np.uint8), [np.rint(within).astype(np.int32)], (1,))
+        inside = area[found.xy[:, 1].astype(np.int64), found.xy[:, 0].astype(np.int64)] > 0
+    if not inside.any():
+        raise InputError(f"{run.layout.root}: no corner there that registration does not use; give a larger area")
+    noise = np.where(inside, found.sigma_px, np.inf)
+    wanted = max(int((noise <= _SHARP_PX).sum()), min(_AT_LEAST, int(inside.sum())))
+    order = np.argsort(noise, kind="stable")[:wanted]
+    return Templates(found.xy[order], found.sigma_px[order], found.fine[order], found.coarse[order])
 
 
 def _places(grey: NDArray[np.uint8], transform: FrameTransform, templates: Templates) -> FloatArray:
@@ -91,7 +128,7 @@ def _places(grey: NDArray[np.uint8], transform: FrameTransform, templates: Templ
     return places
 
 
-def _score(places: FloatArray, run: Run) -> StillScore:
+def _score(places: FloatArray, run: Run, noise_px: float) -> StillScore:
     """Of places (frames, corners, 2)."""
     seen = np.isfinite(places[..., 0])
     followed = seen.mean(axis=0) >= _MIN_SHARE
@@ -105,6 +142,7 @@ def _score(places: FloatArray, run: Run) -> StillScore:
     return StillScore(
         points=int(followed.sum()),
         frames=len(places),
+        noise_px=noise_px,
         sd_median_px=float(np.median(sd)),
         sd_p90_px=float(np.percentile(sd, 90)),
         drift_px=float(np.hypot(*drift)),

@@ -29,7 +29,7 @@ ATTRIBUTION = (
     "KIT AIS Vehicle Data Set (DLR, KIT; 3K camera, Munich), CC-BY 3.0: frames of two sequences, scaled likewise",
     "cities simulated by velfield",
 )
-CONFIG = DetectionConfig(rounds=1200, feature_pool=4000, seed=7)
+CONFIG = DetectionConfig(rounds=400, feature_pool=4000, seed=7)
 SIMULATED_SEEDS = range(9001, 9007)
 LORRY_SEEDS, LORRY_SEEDS_LEFT_OUT = range(9101, 9181), range(9201, 9225)
 _LORRIES_IN = (1280, 960)

@@ -27,7 +27,7 @@ _FOLD_SCENES = 3
 _UNTRIED_THRESHOLD = 0.15
 """T where too few cars are marked to leave some out: what it came to on most sites."""
 _UNTRIED_CUT = -0.4
-_COMMITTEE_MIN_CARS = 40
+_COMMITTEE_MIN_CARS = 20
 """With fewer marked cars the detectors of a part of them know too little to have a say."""
 _OF_ITS_OWN = 0.56
 """Share of what a member says of a find that it was not trained on which is its own error: of a committee's mean the

@@ -26,7 +26,7 @@ from velfield.stores import open_frames
 
 _TRAINING_FRAMES = 6
 _EVIDENCE_BURSTS = 6
-_FEW_CARS = 40
+_FEW_CARS = 20
 """Fewer marked cars than this continue the shipped detector."""
 
 
