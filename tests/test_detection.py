@@ -231,9 +231,9 @@ def test_few_cars_continue_the_shipped_detector() -> None:
     few = LabelledImage(image=truth.image, cars=truth.cars[:12], complete=False)
     shipped = shipped_detector()
     continued = train_detector([few], SMALL, continued=shipped)
-    assert len(continued.record.rounds) == len(shipped.record.rounds) + SMALL.rounds
+    assert 0.9 * SMALL.rounds < len(continued.record.rounds) - len(shipped.record.rounds) <= SMALL.rounds
     assert continued.record.attribution == shipped.record.attribution
-    assert continued.threshold == shipped.threshold
+    assert continued.threshold == pytest.approx((0.15 + 4 * shipped.threshold) / 5)
     assert f_measure(continued, sample(flight(6), 1)) > 0.7
 
 

@@ -7,7 +7,7 @@ STAGE_VERSIONS: dict[str, int] = {
     "lens": 4,
     "base": 3,
     "registration": 3,
-    "detector": 11,
+    "detector": 12,
     "detections": 6,
     "links": 1,
     "tracklets": 3,

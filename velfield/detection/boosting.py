@@ -95,7 +95,6 @@ def boost(
     car_fraction: float,
     rng: np.random.Generator,
     shrinkage: float = 1.0,
-    margins: Floats | None = None,
 ) -> Stumps:
     """Train.
 
@@ -113,13 +112,9 @@ def boost(
         Chooses each round's features: the same seed, the same detector.
     shrinkage
         Share of what AdaBoost would say that a round does say. Paper: 1.
-    margins
-        (samples,) what rounds learnt before say of each: the new ones mend what these get wrong.
     """
     weights = start_weights(is_car, car_fraction)
-    if margins is not None:
-        weights *= np.exp(np.where(is_car, -margins, margins))
-        weights /= weights.sum()
+    weights /= weights.sum()  # one but for rounding, which decides between stumps that are alike
     smallest = 0.5 / len(is_car)
     cars, others = np.flatnonzero(is_car), np.flatnonzero(~is_car)
     features, thresholds, leaves = [], [], []

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from schemas.detector import Round
 from schemas.flight import DetectionConfig
 from velfield.detection.aligned import Look, find_cars, moved, offset_grid
-from velfield.detection.bank import Bank, Samples, bank_of
-from velfield.detection.boosting import boost, random_pool, rounds_of, start_weights
+from velfield.detection.bank import Bank, bank_of
+from velfield.detection.boosting import Bytes, random_pool
 from velfield.detection.detector import BoostedSums, sums_of
 from velfield.detection.samples import Poses, Scene, is_far, is_wrong, other_poses, varied
 from velfield.detection.scan import propose
@@ -62,7 +62,7 @@ def learn_proposer(
     for _ in range(2):
         sums = sums_of(_boosted(bank, known_cars, known_others, COARSE_ROUNDS, rng))
         mined = [varied(wrong, rng) for wrong in each(partial(_wrongly_proposed, sums=sums, most=most), scenes)]
-        known_others += bank.samples(zip((scene.coarse for scene in scenes), mined, strict=True))
+        known_others = np.hstack([known_others, bank.samples(zip((s.coarse for s in scenes), mined, strict=True))])
     return _boosted(bank, known_cars, known_others, COARSE_ROUNDS, rng)
 
 
@@ -71,28 +71,24 @@ def learn_classifier(
     config: DetectionConfig,
     channels: int,
     rng: np.random.Generator,
-    prior: Sequence[Round] = (),
 ) -> tuple[tuple[Round, ...], tuple[Scene, ...]]:
-    """The classifier of step two, and the scenes with the cars' axes as it sees them.
-
-    ``prior``: rounds of an earlier classifier, which the new ones continue.
-    """
+    """The classifier of step two, and the scenes with the cars' axes as it sees them."""
     scenes = tuple(scenes)
     cars = [_fine_cars(scene, _copies(scenes), rng) for scene in scenes]
     others = [other_poses(scene, _OTHERS // len(scenes), rng) for scene in scenes]
     sigma = config.corner_sigma_px * _SIGMA_SHARE_XY[0], config.corner_sigma_px * _SIGMA_SHARE_XY[1]
-    bank = _bank(scenes, FINE, cars, others, config.feature_pool, sigma, channels, rng, prior)
+    bank = _bank(scenes, FINE, cars, others, config.feature_pool, sigma, channels, rng)
     known_others = bank.samples(zip((scene.fine for scene in scenes), others, strict=True))
     most = _MINED // len(scenes)
     for rounds in _FINE_STAGES:
         known_cars = bank.samples(zip((scene.fine for scene in scenes), cars, strict=True))
-        sums = sums_of(_boosted(bank, known_cars, known_others, rounds, rng, prior))
+        sums = sums_of(_boosted(bank, known_cars, known_others, rounds, rng))
         scenes = tuple(each(partial(_realigned, sums=sums), scenes))
         mined = [varied(wrong, rng) for wrong in each(partial(_wrongly_found, sums=sums, most=most), scenes)]
-        known_others += bank.samples(zip((scene.fine for scene in scenes), mined, strict=True))
+        known_others = np.hstack([known_others, bank.samples(zip((s.fine for s in scenes), mined, strict=True))])
         cars = [_fine_cars(scene, _copies(scenes), rng) for scene in scenes]
     known_cars = bank.samples(zip((scene.fine for scene in scenes), cars, strict=True))
-    return _boosted(bank, known_cars, known_others, config.rounds, rng, prior), scenes
+    return _boosted(bank, known_cars, known_others, config.rounds, rng), scenes
 
 
 def _copies(scenes: Sequence[Scene]) -> int:
@@ -108,7 +104,6 @@ def _bank(
     sigma_xy_px: tuple[float, float],
     channels: int,
     rng: np.random.Generator,
-    prior: Sequence[Round] = (),
 ) -> Bank:
     pool = random_pool(
         features,
@@ -120,39 +115,11 @@ def _bank(
     )
     pictures = [scene.fine if grain is FINE else scene.coarse for scene in scenes]
     parts = [*zip(pictures, cars, strict=True), *zip(pictures, others, strict=True)]
-    return bank_of(pool, CONTRAST_FLOOR, parts, rng, sums_of(prior) if prior else None)
+    return bank_of(pool, CONTRAST_FLOOR, parts, rng)
 
 
-def _boosted(
-    bank: Bank, cars: Samples, others: Samples, rounds: int, rng: np.random.Generator, prior: Sequence[Round] = ()
-) -> tuple[Round, ...]:
-    """New rounds; woven among an earlier classifier's, so that a cascade's first rounds hear both."""
-    known = cars + others
-    is_car = np.arange(len(known.margins)) < len(cars.margins)
-    trust = _trust(known.margins, is_car) if prior else 0.0
-    stumps = boost(
-        known.bins,
-        bank.edges,
-        is_car,
-        rounds=rounds,
-        car_fraction=_CAR_FRACTION,
-        shrinkage=_SHRINKAGE,
-        rng=rng,
-        margins=trust * known.margins,
-    )
-    new = [Round.model_validate(one) for one in rounds_of(bank.pool, stumps)]
-    if not trust:
-        return tuple(new)
-    old = [r.model_copy(update={"below": trust * r.below, "above": trust * r.above}) for r in prior]
-    at = np.concatenate([(np.arange(len(part)) + 0.5) / len(part) for part in (new, old)])
-    return tuple((new + old)[k] for k in np.argsort(at, kind="stable"))
-
-
-def _trust(margins: Floats, is_car: NDArray[np.bool_]) -> float:
-    """How far an earlier classifier's word holds here: the factor on it at which the exponential loss is least."""
-    weights, sign = start_weights(is_car, _CAR_FRACTION), np.where(is_car, -1.0, 1.0)
-    tried = np.linspace(0, 1, 41)
-    return float(tried[np.argmin([weights @ np.exp(trust * sign * margins) for trust in tried])])
+def _boosted(bank: Bank, cars: Bytes, others: Bytes, rounds: int, rng: np.random.Generator) -> tuple[Round, ...]:
+    return bank.learnt(cars, others, rounds=rounds, fraction=_CAR_FRACTION, shrinkage=_SHRINKAGE, rng=rng)
 
 
 def _fine_cars(scene: Scene, copies: int, rng: np.random.Generator) -> Poses:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from schemas.detector import LongVehicleRecord, Round
 from schemas.flight import DetectionConfig
 from velfield.detection.aligned import moved
-from velfield.detection.bank import Bank, Samples, bank_of
-from velfield.detection.boosting import boost, random_pool, rounds_of
+from velfield.detection.bank import Bank, bank_of
+from velfield.detection.boosting import Bytes, random_pool
 from velfield.detection.detector import BoostedSums, sums_of
 from velfield.detection.learning import CONTRAST_FLOOR
 from velfield.detection.long_vehicles import LEAST_LENGTH, LONG, OFFSETS, LongVehicles
@@ -81,7 +81,7 @@ def learn_long_vehicles(
         found = _boosted(bank, known, known_others, rounds, rng)
         tried = [(scene, _beside(scene.long, 9.0, rng), _beside(scene.cars, 2.0, rng)) for scene in scenes]
         mined = [varied(wrong, rng) for wrong in each(partial(_wrongly_liked, sums=sums_of(found)), tried)]
-        known_others += bank.samples(zip(pictures, mined, strict=True))
+        known_others = np.hstack([known_others, bank.samples(zip(pictures, mined, strict=True))])
     found = _boosted(bank, known, known_others, ROUNDS, rng)
     return LongVehicleRecord(
         working_car_length_px=config.working_car_length_px,
@@ -133,13 +133,8 @@ def _others(scene: _Scene, share: float, rng: np.random.Generator) -> Poses:
     return varied(np.concatenate(parts), rng)
 
 
-def _boosted(bank: Bank, middles: Samples, others: Samples, rounds: int, rng: np.random.Generator) -> tuple[Round, ...]:
-    known = middles + others
-    is_middle = np.arange(len(known.margins)) < len(middles.margins)
-    stumps = boost(
-        known.bins, bank.edges, is_middle, rounds=rounds, car_fraction=_FRACTION, shrinkage=_SHRINKAGE, rng=rng
-    )
-    return tuple(Round.model_validate(one) for one in rounds_of(bank.pool, stumps))
+def _boosted(bank: Bank, middles: Bytes, others: Bytes, rounds: int, rng: np.random.Generator) -> tuple[Round, ...]:
+    return bank.learnt(middles, others, rounds=rounds, fraction=_FRACTION, shrinkage=_SHRINKAGE, rng=rng)
 
 
 def _wrongly_liked(tried: tuple[_Scene, _Finds, _Finds], sums: BoostedSums) -> Floats:

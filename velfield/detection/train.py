@@ -32,6 +32,8 @@ _COMMITTEE_MIN_CARS = 20
 _OF_ITS_OWN = 0.56
 """Share of what a member says of a find that it was not trained on which is its own error: of a committee's mean the
 less is left, the more members. Measured on KIT AIS and simulated cities by T."""
+_EARLIER_SAYS = 4
+"""Votes of an earlier detector beside the one of the new: what knows many cars is less sure of each."""
 _STRIPES_TOLD = "cars in stripes of the pictures, found by detectors trained on the other stripes"
 
 
@@ -57,7 +59,7 @@ def train_detector(
     config
         ``method`` chooses the paper's dense response or the aligned classifier.
     continued
-        An earlier detector, whose rounds the new ones mend: where few cars are marked, it knows more of them.
+        An earlier detector, which judges together with the new one: where few cars are marked, it knows more of them.
 
     Raises
     ------
@@ -77,7 +79,7 @@ def train_detector(
     if count >= _FOLD_MIN_CARS:
         complete = all(sample.complete for sample in samples)
         folds = config.folds if complete else 2  # else motion will tell T
-        together = complete and count >= _COMMITTEE_MIN_CARS
+        together = complete and not prior and count >= _COMMITTEE_MIN_CARS
         others, evidence = _folds(steps.scenes, config, channels, prior, folds=folds, together=together)
         if together:
             steps = replace(steps, classifier=committee_of([steps.classifier, *(one.classifier for one in others)]))
@@ -86,10 +88,10 @@ def train_detector(
 
 
 def _continuing(record: DetectorRecord, earlier: Detector, config: DetectionConfig, *, tried: bool) -> DetectorRecord:
-    """The record with whose pictures the earlier detector had learnt from; and its T, where there is no evidence."""
+    """The record with whose pictures the earlier detector had learnt from; T by the votes where nothing was tried."""
     update: dict[str, object] = {"attribution": earlier.record.attribution}
     if not tried and config.threshold is None:
-        update["threshold"] = earlier.threshold
+        update["threshold"] = (_UNTRIED_THRESHOLD + _EARLIER_SAYS * earlier.threshold) / (1 + _EARLIER_SAYS)
     return record.model_copy(update=update)
 
 
@@ -117,7 +119,7 @@ def _rounds_to_continue(earlier: Detector | None, config: DetectionConfig, chann
 def trained(
     scenes: Sequence[Scene], config: DetectionConfig, channels: int, seed: int, prior: tuple[Round, ...] = ()
 ) -> Steps:
-    """Both steps of the aligned method, learnt from scenes."""
+    """Both steps of the aligned method, learnt from scenes; ``prior``: of an earlier one, which has a say as well."""
     rng = np.random.default_rng(seed)
     proposer = learn_proposer(scenes, config, channels, rng)
     sums = sums_of(proposer)
@@ -127,7 +129,9 @@ def trained(
         places = propose(scene.coarse, shape, valid, sums, contrast_floor=CONTRAST_FLOOR)
         return replace(scene, places=places[:, :3])
 
-    classifier, aligned = learn_classifier(each(looked_at, scenes), config, channels, rng, prior)
+    classifier, aligned = learn_classifier(each(looked_at, scenes), config, channels, rng)
+    if prior:
+        classifier = committee_of([classifier, *[prior] * _EARLIER_SAYS])
     return Steps(proposer, classifier, aligned)
 
 
