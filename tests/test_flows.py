@@ -173,3 +173,31 @@ def test_detections_of_another_detector_take_the_place_of_ours(
     counts = {stage.name: stage.counts for stage in summary.stages}
     assert counts["detections"]["cars"] == pytest.approx(inside.sum(), rel=0.02)
     assert counts["tracklets"]["passages"] > 20
+    assert "another program's boxes" in next(stage.text for stage in summary.stages if stage.name == "detector")
+
+
+def test_the_size_of_given_boxes_tells_the_working_scale(flight: Path, tmp_path: Path) -> None:
+    """Where no ground sample distance is given; boxes without a size are told of."""
+    from velfield.synthetic import load_truth
+
+    cars = load_truth(flight).cars
+    names = sorted(path.name for path in (flight / "frames").iterdir())
+    cars = cars[cars["visible"] & cars["x_raw_px"].between(0, 639) & cars["y_raw_px"].between(0, 479)]
+    table = pd.DataFrame(
+        {"frame": [names[k] for k in cars["frame"]], "x_px": cars["x_raw_px"], "y_px": cars["y_raw_px"]}
+    )
+    sized, bare = tmp_path / "sized.csv", tmp_path / "bare.csv"
+    table.to_csv(bare, index=False)
+    table.assign(length_px=20.0, width_px=9.0).to_csv(sized, index=False)
+    scales, warned = [], []
+    for boxes in (sized, bare):
+        unsized = job(flight, tmp_path / boxes.stem, detections=str(boxes))
+        unsized = unsized.model_copy(update={"config": unsized.config.model_copy(update={"gsd_m": None})})
+        summary = process(unsized)
+        record = json.loads((tmp_path / boxes.stem / "base" / "working.json").read_text())
+        scales.append(record["scale"])
+        warned.append([line for stage in summary.stages if stage.name == "detector" for line in stage.warnings])
+    assert scales[0] == pytest.approx(0.8, rel=0.1)
+    assert scales[1] == 1.0
+    assert not warned[0]
+    assert "give one" in warned[1][0]

@@ -7,7 +7,7 @@ STAGE_VERSIONS: dict[str, int] = {
     "lens": 4,
     "base": 3,
     "registration": 3,
-    "detector": 12,
+    "detector": 13,
     "detections": 6,
     "links": 1,
     "tracklets": 3,

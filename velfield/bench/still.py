@@ -70,7 +70,9 @@ def read_area(path: Path) -> FloatArray:
     rows = read_csv_rows(path, required=("x_px", "y_px"), what="an area")
     corners = np.array([[finite_cell(path, line, row, name) for name in ("x_px", "y_px")] for line, row in rows])
     if len(corners) < 3 or not np.isfinite(corners).all():
-        raise InputError(f"{path.name}: found {len(corners)} corners, expected 3 or more, each with x_px and y_px")
+        raise InputError(
+            f"{path.name}: found {len(corners)} corners, expected 3 or more, each with x_px and y_px; add those missing"
+        )
     return corners
 
 
@@ -111,7 +113,10 @@ def _unused_corners(run: Run, within: FloatArray | None) -> Templates:
         area = cv2.fillPoly(np.zeros(grey.shape, np.uint8), [np.rint(within).astype(np.int32)], (1,))
         inside = area[found.xy[:, 1].astype(np.int64), found.xy[:, 0].astype(np.int64)] > 0
     if not inside.any():
-        raise InputError(f"{run.layout.root}: no corner there that registration does not use; give a larger area")
+        raise InputError(
+            f"{run.layout.root}: found no corner in the area that registration does not use, expected an area on the "
+            f"base image of {grey.shape[1]}x{grey.shape[0]} px; move it there or give a larger one"
+        )
     noise = np.where(inside, found.sigma_px, np.inf)
     wanted = max(int((noise <= _SHARP_PX).sum()), min(_AT_LEAST, int(inside.sum())))
     order = np.argsort(noise, kind="stable")[:wanted]

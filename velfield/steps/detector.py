@@ -17,6 +17,7 @@ from velfield.errors import InputError
 from velfield.plan import Plan
 from velfield.progress import advance
 from velfield.provenance import write_atomically
+from velfield.sources.detections import read_detections
 from velfield.steps.grid import read_grid
 from velfield.steps.labelled import base_px_per_raw_px, car_length_raw_px, labelled_images, marked_cars
 from velfield.steps.outcome import Outcome
@@ -33,13 +34,36 @@ _FEW_CARS = 20
 def make_detector(plan: Plan) -> Outcome:
     """Choose the working grid, make the background, and train or load the detector."""
     if plan.job.inputs.detections:
-        return _finish(plan, None, _scale_of_gsd(plan) or 1.0, "detections")
+        return _from_detections(plan)
     if plan.job.inputs.detector:
         detector = load_detector(Path(plan.job.inputs.detector))
         return _finish(plan, detector, _known_scale(plan), "file")
     if plan.job.inputs.labels:
         return _from_labels(plan)
     return _from_motion(plan)
+
+
+def _from_detections(plan: Plan) -> Outcome:
+    """Another program's boxes are taken; their size tells the working scale where ``--gsd-m`` does not."""
+    scale = _scale_of_gsd(plan)
+    if scale is None:
+        boxes = read_detections(Path(str(plan.job.inputs.detections)), plan.info)
+        scale = _scale_of_length(plan, car_length_raw_px(boxes))
+    if scale is not None:
+        return _finish(plan, None, scale, "detections")
+    usual = plan.config.detection.working_car_length_px
+    outcome = _finish(plan, None, 1.0, "detections")
+    told = (
+        f"the size of a car is not known: found no --gsd-m and boxes without a length; taken for {usual:g} px, give one"
+    )
+    return Outcome(outcome.outputs, outcome.counts, outcome.notes, [told])
+
+
+def _scale_of_length(plan: Plan, length_raw_px: float) -> float | None:
+    """Working px a base px, from a car's usual length in raw px; none where that is not known."""
+    if not np.isfinite(length_raw_px):
+        return None
+    return plan.config.detection.working_car_length_px / (length_raw_px * base_px_per_raw_px(plan))
 
 
 def _scale_of_gsd(plan: Plan) -> float | None:
@@ -57,13 +81,11 @@ def _known_scale(plan: Plan) -> float:
 def _from_labels(plan: Plan) -> Outcome:
     labels = marked_cars(plan)
     base_per_raw = base_px_per_raw_px(plan)
-    scale, length = _scale_of_gsd(plan), car_length_raw_px(labels.cars)
+    scale = _scale_of_gsd(plan) or _scale_of_length(plan, car_length_raw_px(labels.cars))
     if scale is None:
-        if not np.isfinite(length):
-            raise InputError(
-                "the size of a car is not known: the labels have no length_px and --gsd-m is not given; give either"
-            )
-        scale = plan.config.detection.working_car_length_px / (length * base_per_raw)
+        raise InputError(
+            "the size of a car is not known: the labels have no length_px and --gsd-m is not given; give either"
+        )
     source, work_per_raw = Path(plan.job.inputs.source), scale * base_per_raw
     samples = list(labelled_images(source, plan.info, labels, work_per_raw=work_per_raw))
     continued = _to_continue(plan.config.detection, len(labels.cars))

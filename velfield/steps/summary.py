@@ -18,6 +18,7 @@ _LINES: dict[str, str] = {
     "maps": "{maps:.0f} maps",
 }
 _PIN_HOLE = "no distortion to be told from none: taken for a pin-hole"
+_NO_DETECTOR = "none: another program's boxes are taken"
 _MEANS = frozenset({"heldout_px", "residual_px"})
 """Counts that are averaged over units, weighted by frames; all others are summed."""
 
@@ -34,6 +35,8 @@ def summarise_stage(
     """Add up a stage's units; ``before``: those that an earlier run had finished."""
     counts = _total([record.counts for record in records])
     line = _PIN_HOLE if name == "lens" and not counts.get("corner_px") else _LINES[name]
+    if name == "detector" and records and "threshold" not in counts:
+        line = _NO_DETECTOR
     text = line.format_map({key: counts.get(key, float("nan")) for key in _keys(line)})
     if before:
         text += f" ({len(before)} of {units} units were done before)" if len(before) < units else " (done before)"
