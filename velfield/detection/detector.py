@@ -102,7 +102,9 @@ def load_detector(path: Path) -> Detector:
         Not there, too large, not ours, or a number out of range.
     """
     if not path.is_file():
-        raise InputError(f"{path}: no such detector file; train one with --labels, or leave --detector out")
+        raise InputError(
+            f"{path}: no such detector file; give one that `velfield train` wrote, or leave the option out"
+        )
     if path.stat().st_size > MAX_BYTES:
         raise InputError(
             f"{path}: found {path.stat().st_size} bytes, a detector file has {MAX_BYTES} at most; is it ours?"
