@@ -113,8 +113,7 @@ def boost(
     shrinkage
         Share of what AdaBoost would say that a round does say. Paper: 1.
     """
-    weights = start_weights(is_car, car_fraction)
-    weights /= weights.sum()  # one but for rounding, which decides between stumps that are alike
+    weights = _start_weights(is_car, car_fraction)
     smallest = 0.5 / len(is_car)
     cars, others = np.flatnonzero(is_car), np.flatnonzero(~is_car)
     features, thresholds, leaves = [], [], []
@@ -139,9 +138,10 @@ def boost(
     return Stumps(np.array(features, np.int64), np.array(thresholds, np.float32), np.array(leaves, np.float32))
 
 
-def start_weights(is_car: NDArray[np.bool_], car_fraction: float) -> Floats:
+def _start_weights(is_car: NDArray[np.bool_], car_fraction: float) -> Floats:
     """Weights of the samples before the first round: all cars together weigh ``car_fraction``."""
-    return np.asarray(np.where(is_car, car_fraction / is_car.sum(), (1 - car_fraction) / (~is_car).sum()))
+    weights = np.where(is_car, car_fraction / is_car.sum(), (1 - car_fraction) / (~is_car).sum())
+    return np.asarray(weights / weights.sum())  # one but for rounding, which decides between stumps that are alike
 
 
 def _that_matter(weights: Floats, rows: Ints) -> Ints:

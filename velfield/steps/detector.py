@@ -17,7 +17,7 @@ from velfield.errors import InputError
 from velfield.plan import Plan
 from velfield.progress import advance
 from velfield.provenance import write_atomically
-from velfield.sources.detections import read_detections
+from velfield.steps.external import given_boxes
 from velfield.steps.grid import read_grid
 from velfield.steps.labelled import base_px_per_raw_px, car_length_raw_px, labelled_images, marked_cars
 from velfield.steps.outcome import Outcome
@@ -47,8 +47,7 @@ def _from_detections(plan: Plan) -> Outcome:
     """Another program's boxes are taken; their size tells the working scale where ``--gsd-m`` does not."""
     scale = _scale_of_gsd(plan)
     if scale is None:
-        boxes = read_detections(Path(str(plan.job.inputs.detections)), plan.info)
-        scale = _scale_of_length(plan, car_length_raw_px(boxes))
+        scale = _scale_of_length(plan, car_length_raw_px(given_boxes(plan)), base_px_per_raw_px(plan))
     if scale is not None:
         return _finish(plan, None, scale, "detections")
     usual = plan.config.detection.working_car_length_px
@@ -59,11 +58,11 @@ def _from_detections(plan: Plan) -> Outcome:
     return Outcome(outcome.outputs, outcome.counts, outcome.notes, [told])
 
 
-def _scale_of_length(plan: Plan, length_raw_px: float) -> float | None:
+def _scale_of_length(plan: Plan, length_raw_px: float, base_per_raw: float) -> float | None:
     """Working px a base px, from a car's usual length in raw px; none where that is not known."""
     if not np.isfinite(length_raw_px):
         return None
-    return plan.config.detection.working_car_length_px / (length_raw_px * base_px_per_raw_px(plan))
+    return plan.config.detection.working_car_length_px / (length_raw_px * base_per_raw)
 
 
 def _scale_of_gsd(plan: Plan) -> float | None:
@@ -81,7 +80,7 @@ def _known_scale(plan: Plan) -> float:
 def _from_labels(plan: Plan) -> Outcome:
     labels = marked_cars(plan)
     base_per_raw = base_px_per_raw_px(plan)
-    scale = _scale_of_gsd(plan) or _scale_of_length(plan, car_length_raw_px(labels.cars))
+    scale = _scale_of_gsd(plan) or _scale_of_length(plan, car_length_raw_px(labels.cars), base_per_raw)
     if scale is None:
         raise InputError(
             "the size of a car is not known: the labels have no length_px and --gsd-m is not given; give either"

@@ -19,7 +19,7 @@ _AXIS_SD_RAD = 0.1
 _BOXES: dict[str, pd.DataFrame] = {}
 
 
-def _boxes(plan: Plan) -> pd.DataFrame:
+def given_boxes(plan: Plan) -> pd.DataFrame:
     """The boxes of the whole flight, read once a process."""
     key = f"{plan.job.inputs.source} {plan.inputs.detections}"
     if key not in _BOXES:
@@ -30,7 +30,7 @@ def _boxes(plan: Plan) -> pd.DataFrame:
 
 def external_detections(plan: Plan, seen: WorkingFrame, transform: FrameMap, frame: int) -> FrameDetections:
     """The given boxes of a frame, raw pixels, on its working picture; an axis that is not told is looked for there."""
-    table = _boxes(plan)
+    table = given_boxes(plan)
     mine = table[table["source_index"] == plan.indices[frame]]
     raw = mine[["x_px", "y_px"]].to_numpy(np.float64)
     xy = seen.to_work(transform.to_base(raw))
@@ -53,15 +53,15 @@ def free_of_vehicles(plan: Plan, frame: int, shape: tuple[int, int]) -> NDArray[
     """
     if plan.job.inputs.detections is None:
         return None
-    table = _boxes(plan)
+    table = given_boxes(plan)
     mine = table[table["source_index"] == plan.indices[frame]].dropna(subset=["length_px", "width_px"])
-    boxes = mine[["x_px", "y_px", "length_px", "width_px"]].to_numpy(np.float64)
+    turns = np.degrees(mine["orientation_rad"].fillna(mine["tilt_rad"]).fillna(0.0))
+    boxes = np.column_stack([mine[["x_px", "y_px", "length_px", "width_px"]], turns])
+    other_way = boxes[mine["orientation_rad"].isna()] * [1, 1, 1, 1, -1]  # a car in an upright box lies either way
     free = np.ones(shape, np.uint8)
-    for sign in (1, -1):  # a car in an upright box lies either way
-        turns = np.degrees(mine["orientation_rad"].fillna(sign * mine["tilt_rad"].fillna(0.0)))
-        for (x, y, length, width), turn in zip(boxes, turns, strict=True):
-            corners = cv2.boxPoints(((x, y), (length, width), turn))
-            cv2.fillPoly(free, [np.rint(corners).astype(np.int32)], (0,))
+    for x, y, length, width, turn in np.concatenate([boxes, other_way]):
+        corners = cv2.boxPoints(((x, y), (length, width), turn))
+        cv2.fillPoly(free, [np.rint(corners).astype(np.int32)], (0,))
     return free.astype(np.bool_)
 
 
