@@ -176,6 +176,22 @@ def test_detections_of_another_detector_take_the_place_of_ours(
     assert "another program's boxes" in next(stage.text for stage in summary.stages if stage.name == "detector")
 
 
+def test_boxes_of_few_frames_what_is_not_used_and_why_the_maps_stay_empty_are_told(
+    flight: Path, tmp_path: Path
+) -> None:
+    first = sorted(path.name for path in (flight / "frames").iterdir())[0]
+    boxes = tmp_path / "boxes.csv"
+    boxes.write_text(f"frame,x_px,y_px,length_px,width_px\n{first},320,240,20,9\n")
+    settings = ("tracking.max_interval_s=0.05", "frames.stop_s=1.0")
+    summary = process(job(flight, tmp_path / "run", *settings, detections=str(boxes)))  # labels are given as well
+    warned = {stage.name: stage.warnings for stage in summary.stages}
+    assert any("boxes in 1 of the" in line for line in warned["detector"])
+    assert any("--labels not used" in line for line in warned["detector"])
+    (told,) = warned["tracklets"]
+    assert "no tracklets, so the maps stay empty" in told
+    assert "--set tracking.max_interval_s=0." in told
+
+
 def test_the_size_of_given_boxes_tells_the_working_scale(flight: Path, tmp_path: Path) -> None:
     """Where no ground sample distance is given; boxes without a size are told of."""
     from velfield.synthetic import load_truth
@@ -196,7 +212,9 @@ def test_the_size_of_given_boxes_tells_the_working_scale(flight: Path, tmp_path:
         summary = process(unsized)
         record = json.loads((tmp_path / boxes.stem / "base" / "working.json").read_text())
         scales.append(record["scale"])
-        warned.append([line for stage in summary.stages if stage.name == "detector" for line in stage.warnings])
+        warned.append(
+            [line for stage in summary.stages if stage.name == "detector" for line in stage.warnings if "size" in line]
+        )
     assert scales[0] == pytest.approx(0.8, rel=0.1)
     assert scales[1] == 1.0
     assert not warned[0]

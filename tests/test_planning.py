@@ -64,7 +64,8 @@ def test_what_is_not_what_it_was_given_as_is_told_before_any_work(flight: Path, 
 def test_frames_too_far_apart_to_follow_a_car_are_told(flight: Path, tmp_path: Path) -> None:
     assert make_plan(job(flight, tmp_path)).info.warnings == ()
     (warning,) = make_plan(job(flight, tmp_path, "frames.every=4")).info.warnings
-    assert "set tracking.max_interval_s" in warning
+    assert "--set tracking.max_interval_s=1.3" in warning
+    assert make_plan(job(flight, tmp_path, "frames.every=4", "tracking.max_interval_s=1.3")).info.warnings == ()
 
 
 def test_a_plan_is_small(tmp_path: Path) -> None:

@@ -19,6 +19,8 @@ from velfield.version import STAGE_VERSIONS, code_version
 
 _MANY_GAPS = 0.3
 """Share of frames without a near one before them from which it is said."""
+_LATE = 1.5
+"""A frame may come late by half an interval."""
 _BESIDES = ("base", "labels", "detector", "detections", "timestamps")
 """What may be given besides the source."""
 _UNITS = ((256, 16), (4096, 64))
@@ -137,14 +139,23 @@ def make_plan(job: Job) -> Plan:
 
 
 def _gaps(times_s: NDArray[np.float64], max_interval_s: float) -> list[str]:
-    wide = np.diff(times_s) > max_interval_s
+    gaps = np.diff(times_s)
+    wide = gaps > max_interval_s
     if wide.mean() < _MANY_GAPS:
         return []
     return [
         f"{wide.mean():.0%} of the frames come more than {max_interval_s:g} s after the one before (median "
-        f"{np.median(np.diff(times_s)):.2f} s), over which no car is followed: few tracklets or none; take frames "
-        "closer together, or set tracking.max_interval_s"
+        f"{np.median(gaps):.2f} s), over which no car is followed: few tracklets or none; {widen_interval(gaps)}"
     ]
+
+
+def widen_interval(gaps_s: NDArray[np.float64]) -> str:
+    """What to do where the frames (gaps between them, s) come too far apart to follow a car."""
+    enough = np.ceil(20 * _LATE * float(np.median(gaps_s))) / 20
+    return (
+        f"take frames closer together, or --set tracking.max_interval_s={enough:g} where traffic is thin (the farther "
+        "apart, the more often one car is taken for another)"
+    )
 
 
 def _digest_inputs(job: Job, info: SourceInfo) -> InputsRecord:
@@ -181,7 +192,12 @@ def stage_keys(config: FlightConfig, inputs: InputsRecord) -> dict[str, str]:
     key("lens", [config.lens], ["frames"])
     key("base", [config.base, config.registration, config.gsd_m], ["lens"], [inputs.base, inputs.detections])
     key("registration", [config.registration, units], ["base"], [inputs.detections])
-    key("detector", [config.detection], ["registration"], [inputs.labels, inputs.detector, inputs.detections])
+    key(
+        "detector",
+        [config.detection, config.tracking.max_interval_s],
+        ["registration"],
+        [inputs.labels, inputs.detector, inputs.detections],
+    )
     key("detections", [config.detection], ["detector"])
     key("links", [config.tracking], ["detections"])
     key("tracklets", [], ["links"])

@@ -7,7 +7,7 @@ STAGE_VERSIONS: dict[str, int] = {
     "lens": 4,
     "base": 3,
     "registration": 3,
-    "detector": 13,
+    "detector": 14,
     "detections": 6,
     "links": 1,
     "tracklets": 3,

@@ -17,6 +17,8 @@ from velfield import open_run
 from velfield.detection.ship import boxes_of
 from velfield.run import Run
 
+_STANDS_WITHIN = 0.3
+"""Car lengths on the map."""
 FPS = "2"  # the interval is not stated; the cars' speeds make sense with this one
 
 
@@ -39,32 +41,47 @@ def main() -> None:
         command += [] if asked.no_labels else ["--labels", str(root / "labels")]
         command += [word for setting in asked.settings for word in ("--set", setting)]
         subprocess.run([*command, "--out", str(root / "run")], check=True)
-        right, found, there = np.sum(
-            [_judge(open_run(root / "run"), k, p) for k, p in enumerate(pictures) if k], axis=0
-        )
-    print(
-        f"{asked.folder.name}: {len(pictures) - 1} pictures, {there} cars, {found} found: "
-        f"precision {right / max(found, 1):.3f}, recall {right / there:.3f}"
-    )
+        run = open_run(root / "run")
+        boxes = [boxes_of(picture)[1] for picture in pictures]
+        moving = _moving(run, boxes)
+        judged = [_judge(run, k, boxes[k], moving[k]) for k in range(1, len(pictures))]
+    right, right_moving, wrong, there, move = np.sum(judged, axis=0)
+    print(f"{asked.folder.name}: {len(judged)} pictures, {right + wrong} found")
+    for name, hits, cars in (("all cars", right, there), ("those that move", right_moving, move)):
+        precision, recall = hits / max(hits + wrong, 1), hits / cars
+        f1 = 2 * precision * recall / max(precision + recall, 1e-9)
+        print(f"{name:16} {cars:5}: precision {precision:.3f}, recall {recall:.3f}, F1 {f1:.3f}")
 
 
-def _judge(run: Run, frame: int, picture: Path) -> tuple[int, int, int]:
-    """How many of a picture's finds are on a car of their own (within half its length), finds, and marked cars."""
-    _, boxes = boxes_of(picture)
+def _moving(run: Run, boxes: list[NDArray[np.float64]]) -> list[NDArray[np.bool_]]:
+    """Which of the marked cars of each picture have none in their place on the map in the picture before or after."""
+    cars = [table[table[:, 0] == 0] for table in boxes]
+    places = [run.to_base(k, np.ascontiguousarray(table[:, 1:3])) for k, table in enumerate(cars)]
+    moving = []
+    for k, (here, table) in enumerate(zip(places, cars, strict=True)):
+        beside = [places[j] for j in (k - 1, k + 1) if 0 <= j < len(places) and len(places[j])]
+        gaps = [np.hypot(*(here[:, None] - other).transpose(2, 0, 1)).min(axis=1) for other in beside]
+        moving.append(np.max(gaps, axis=0) > _STANDS_WITHIN * table[:, 5] if gaps else np.zeros(len(here), np.bool_))
+    return moving
+
+
+def _judge(
+    run: Run, frame: int, boxes: NDArray[np.float64], moving: NDArray[np.bool_]
+) -> tuple[int, int, int, int, int]:
+    """Finds on a car of their own (within half its length), of these on one that moves, on none; cars, and moving."""
     cars = boxes[boxes[:, 0] == 0]
     table = run.detections()
     table = table[table["frame"] == frame].sort_values("score", ascending=False)
     found = run.to_raw(frame, table[["x_px", "y_px"]].to_numpy())
-    taken, right, left_alone = np.zeros(len(cars), bool), 0, 0
+    taken, wrong = np.zeros(len(cars), np.bool_), 0
     for place in found:
         gap = np.hypot(*(cars[:, 1:3] - place).T) / (cars[:, 3:5].max(axis=1) / 2)
         gap[taken] = np.inf
         if len(cars) and gap.min() <= 1:
             taken[gap.argmin()] = True
-            right += 1
-        elif _inside(place, boxes[boxes[:, 0] != 0]):  # a lorry, a bus: neither right nor wrong
-            left_alone += 1
-    return right, len(found) - left_alone, len(cars)
+        elif not _inside(place, boxes[boxes[:, 0] != 0]):  # a lorry, a bus: neither right nor wrong
+            wrong += 1
+    return int(taken.sum()), int((taken & moving).sum()), wrong, len(cars), int(moving.sum())
 
 
 def _inside(place: NDArray[np.float64], boxes: NDArray[np.float64]) -> bool:

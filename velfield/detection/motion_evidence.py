@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from schemas.flight import DetectionConfig
+from schemas.flight import DetectionConfig, TrackingConfig
 from velfield.detection.detect import detect_frame
 from velfield.detection.detector import Detector
 from velfield.detection.motion_bodies import MAX_AXIS_OFFSET_RAD
@@ -34,8 +34,7 @@ _MOVES_LENGTHS = 0.35
 _MISMATCH_LENGTHS = 0.3  # a detection lies within a pixel or two; regions of motion within less
 _MISMATCH_SHARE = 0.08
 _MIN_MOVING = 20
-_MAX_INTERVAL_S = 0.45
-"""Frames farther apart than this are no neighbours."""
+_MAX_INTERVAL_S = TrackingConfig().max_interval_s
 _SUREST = 0.5
 """This share of the moving detections, those liked best, are cars all but surely, and so are those alone among them."""
 
@@ -145,8 +144,10 @@ def conduct(before: Found, middle: Found, after: Found, *, car_length_px: float)
     return kinds
 
 
-def neighbours(times_s: Sequence[float], wanted: int) -> Ints:
+def neighbours(times_s: Sequence[float], wanted: int, max_interval_s: float = _MAX_INTERVAL_S) -> Ints:
     """Frames, by their place, of up to ``wanted`` bursts of three neighbours in time, spread evenly.
+
+    Frames farther apart than ``max_interval_s`` are none.
 
     Examples
     --------
@@ -154,12 +155,14 @@ def neighbours(times_s: Sequence[float], wanted: int) -> Ints:
     [0, 1, 2, 6, 7, 8]
     """
     gaps = np.diff(np.asarray(times_s, np.float64))
-    starts = np.flatnonzero(np.maximum(gaps[:-1], gaps[1:]) <= _MAX_INTERVAL_S)
+    starts = np.flatnonzero(np.maximum(gaps[:-1], gaps[1:]) <= max_interval_s)
     chosen = starts[np.unique(np.linspace(0, len(starts) - 1, min(wanted, len(starts))).round().astype(int))]
     return np.unique((chosen[:, None] + np.arange(3)).ravel())
 
 
-def evidence_from_motion(frames: Sequence[Found], *, car_length_px: float) -> MotionEvidence:
+def evidence_from_motion(
+    frames: Sequence[Found], *, car_length_px: float, max_interval_s: float = _MAX_INTERVAL_S
+) -> MotionEvidence:
     """Precision and recall of a detector from how its detections move.
 
     Parameters
@@ -168,10 +171,12 @@ def evidence_from_motion(frames: Sequence[Found], *, car_length_px: float) -> Mo
         In time order; bursts of three or more will do.
     car_length_px : float
         A car's length, working px.
+    max_interval_s : float
+        Frames farther apart than this are no neighbours.
     """
     scores, kinds = [np.empty(0)], [np.empty(0, np.int8)]
     for before, middle, after in zip(frames, frames[1:], frames[2:], strict=False):
-        if max(middle.time_s - before.time_s, after.time_s - middle.time_s) <= _MAX_INTERVAL_S:
+        if max(middle.time_s - before.time_s, after.time_s - middle.time_s) <= max_interval_s:
             scores.append(middle.score)
             kinds.append(conduct(before, middle, after, car_length_px=car_length_px))
     score, kind = np.concatenate(scores), np.concatenate(kinds)
@@ -199,6 +204,7 @@ def evidence_of(
     config: DetectionConfig,
     *,
     least_score: float = LEAST_SCORE,
+    max_interval_s: float = _MAX_INTERVAL_S,
 ) -> MotionEvidence:
     """Precision and recall of a detector on registered frames that nobody marked.
 
@@ -212,6 +218,8 @@ def evidence_of(
     config : DetectionConfig
     least_score : float
         Detections below this are not looked at.
+    max_interval_s : float
+        Frames farther apart than this are no neighbours.
     """
     low = config.model_copy(update={"threshold": least_score})
 
@@ -219,7 +227,8 @@ def evidence_of(
         cars = detect_frame(frame.image, frame.valid, detector, low, background)
         return Found(cars.xy, cars.orientation_rad, np.asarray(cars.score, np.float64), frame.time_s)
 
-    return evidence_from_motion(each(found, frames), car_length_px=detector.record.working_car_length_px)
+    length = detector.record.working_car_length_px
+    return evidence_from_motion(each(found, frames), car_length_px=length, max_interval_s=max_interval_s)
 
 
 def _neighbours(

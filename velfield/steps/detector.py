@@ -27,6 +27,8 @@ from velfield.stores import open_frames
 
 _TRAINING_FRAMES = 6
 _EVIDENCE_BURSTS = 6
+_MOST_FRAMES = 0.5
+"""Share of the frames that another program's boxes are expected to be in."""
 _FEW_CARS = 20
 """Fewer marked cars than this continue the shipped detector."""
 
@@ -45,17 +47,23 @@ def make_detector(plan: Plan) -> Outcome:
 
 def _from_detections(plan: Plan) -> Outcome:
     """Another program's boxes are taken; their size tells the working scale where ``--gsd-m`` does not."""
-    scale = _scale_of_gsd(plan)
+    boxes, scale = given_boxes(plan), _scale_of_gsd(plan)
     if scale is None:
-        scale = _scale_of_length(plan, car_length_raw_px(given_boxes(plan)), base_px_per_raw_px(plan))
-    if scale is not None:
-        return _finish(plan, None, scale, "detections")
-    usual = plan.config.detection.working_car_length_px
-    outcome = _finish(plan, None, 1.0, "detections")
-    told = (
-        f"the size of a car is not known: found no --gsd-m and boxes without a length; taken for {usual:g} px, give one"
-    )
-    return Outcome(outcome.outputs, outcome.counts, outcome.notes, [told])
+        scale = _scale_of_length(plan, car_length_raw_px(boxes), base_px_per_raw_px(plan))
+    outcome = _finish(plan, None, 1.0 if scale is None else scale, "detections")
+    warnings = []
+    if scale is None:
+        usual = plan.config.detection.working_car_length_px
+        told = "the size of a car is not known: found no --gsd-m and boxes without a length"
+        warnings.append(f"{told}; taken for {usual:g} px, give one")
+    named = int(np.isin(plan.indices, boxes["source_index"]).sum())
+    if named < _MOST_FRAMES * plan.frame_count:
+        told = f"--detections has boxes in {named} of the {plan.frame_count} frames worked on"
+        warnings.append(f"{told}: the others count as free of cars; give boxes of all frames, or use it as --labels")
+    unused = [f"--{name}" for name in ("labels", "detector") if getattr(plan.job.inputs, name)]
+    if unused:
+        warnings.append(f"--detections is given, so nothing is learnt or looked for: {' and '.join(unused)} not used")
+    return Outcome(outcome.outputs, outcome.counts, outcome.notes, warnings)
 
 
 def _scale_of_length(plan: Plan, length_raw_px: float, base_per_raw: float) -> float | None:
@@ -105,12 +113,13 @@ def _from_motion(plan: Plan) -> Outcome:
     frames = _motion_frames(plan, scale)
     background = motion_background(frames)
     wanted = plan.config.detection.working_car_length_px
-    labels = labels_from_motion(frames, background, car_length_px=wanted if known else None)
+    near_s = plan.config.tracking.max_interval_s
+    labels = labels_from_motion(frames, background, car_length_px=wanted if known else None, max_interval_s=near_s)
     if known is None and labels.usable:
         scale = working_scale(plan.config.detection, None, labels, labels_scale=scale)
         frames = _motion_frames(plan, scale)
         background = motion_background(frames)
-        labels = labels_from_motion(frames, background, car_length_px=wanted)
+        labels = labels_from_motion(frames, background, car_length_px=wanted, max_interval_s=near_s)
     if not labels.usable:
         return _without_labels(plan, known, labels)
     samples = [
@@ -124,27 +133,28 @@ def _from_motion(plan: Plan) -> Outcome:
         )
         for frame, found in _training_frames(frames, labels)
     ]
-    detector = _by_motion(samples, frames, background, plan.config.detection)
+    detector = _by_motion(plan, samples, frames, background)
     return _finish(plan, detector, scale, "motion", count=labels.count, motion=labels, background=background)
 
 
 def _by_motion(
-    samples: list[LabelledImage], frames: list[MotionFrame], background: MotionBackground, config: DetectionConfig
+    plan: Plan, samples: list[LabelledImage], frames: list[MotionFrame], background: MotionBackground
 ) -> Detector:
     """A detector of cars that move: by their looks alone where these tell them, so that it finds what stands too.
 
     By the difference to the background what waits at a light for long, and is in the background, is not found: in a
     simulated city .79 of the cars that move at some time, .91 by their looks.
     """
+    config = plan.config.detection
     if config.motion_channel == "auto":
         by_looks = train_detector(samples, config.model_copy(update={"motion_channel": "never"}))
-        evidence = _evidence(by_looks, frames, background, config)
+        evidence = _evidence(plan, by_looks, frames, background)
         if evidence.tells_cars(_usual_score(by_looks)):
             return by_looks if config.threshold is not None else _judged(by_looks, evidence)
     detector = train_detector(samples, config)
     if config.threshold is not None:
         return detector
-    return _judged(detector, _evidence(detector, frames, background, config))
+    return _judged(detector, _evidence(plan, detector, frames, background))
 
 
 def _usual_score(detector: Detector) -> float:
@@ -156,11 +166,13 @@ def _usual_score(detector: Detector) -> float:
 
 
 def _evidence(
-    detector: Detector, frames: list[MotionFrame], background: MotionBackground, config: DetectionConfig
+    plan: Plan, detector: Detector, frames: list[MotionFrame], background: MotionBackground
 ) -> MotionEvidence:
-    chosen = neighbours([frame.time_s for frame in frames], _EVIDENCE_BURSTS)
+    near_s = plan.config.tracking.max_interval_s
+    chosen = neighbours([frame.time_s for frame in frames], _EVIDENCE_BURSTS, near_s)
     median = background.median if detector.uses_background else None
-    return evidence_of(detector, [frames[k] for k in chosen], median, config)
+    some = [frames[k] for k in chosen]
+    return evidence_of(detector, some, median, plan.config.detection, max_interval_s=near_s)
 
 
 def _judged(detector: Detector, evidence: MotionEvidence) -> Detector:

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
-from velfield.plan import Plan
+from velfield.plan import Plan, widen_interval
 from velfield.progress import advance
 from velfield.steps.grid import read_grid
 from velfield.steps.outcome import Outcome
@@ -115,4 +115,24 @@ def chain_passages(plan: Plan, units: list[range]) -> Outcome:
         write_table(target, table, TRACKLET_COLUMNS)
         written.append(target)
     advance("tracklets")
-    return Outcome(written, {"tracklets": len(chains), "passages": len(np.unique(chains))})
+    warnings = [] if len(chains) else [_why_none(plan)]
+    return Outcome(written, {"tracklets": len(chains), "passages": len(np.unique(chains))}, warnings=warnings)
+
+
+def _why_none(plan: Plan) -> str:
+    """Why no car was followed, so that the maps stay empty, and what to do."""
+    told, near_s = "no tracklets, so the maps stay empty", plan.config.tracking.max_interval_s
+    times_s = open_frames(plan.layout.frames).column("time_s")[usable_frames(plan)]
+    if len(times_s) < 3:
+        return f"{told}: {len(times_s)} frames are registered well enough, 3 or more needed; see registration's notes"
+    gaps = np.diff(times_s)
+    near = gaps <= near_s
+    if (near[1:] & near[:-1]).any():
+        return (
+            f"{told}: no find goes on over three frames as a car does; see in the page whether what is found is cars, "
+            "and else mark one frame and give it with --labels"
+        )
+    return (
+        f"{told}: no three registered frames come within tracking.max_interval_s = {near_s:g} s of one another (median "
+        f"{np.median(gaps):.2f} s); {widen_interval(gaps)}"
+    )
