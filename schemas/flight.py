@@ -92,8 +92,8 @@ class RegistrationConfig(Model):
     """Share of worst control points dropped a round of case deletion. Paper: 5 %."""
     max_mean_error_px: PositiveFloat = 0.8
     """Case deletion ends when the mean error is below this. Paper: 2 px, at which 10 % wrong matches survive."""
-    cell_size_px: PositiveInt = 200
-    """Cell of the displacement mesh. Paper: 200 x 200."""
+    cell_size_px: PositiveInt = 120
+    """Cell of the displacement mesh, whose stiffness the evidence chooses. Paper: 200 x 200."""
     mesh: bool = True
     """Whether the residual displacement of each cell is measured and interpolated."""
     min_control_points: PositiveInt = 40
@@ -248,7 +248,12 @@ PRESETS: dict[Preset, dict[str, dict[str, object]]] = {
     },
     "paper": {
         "lens": {"refine": "never"},
-        "registration": {"model": "polyprojective", "max_mean_error_px": 2.0, "key_point_scale": 1.0},
+        "registration": {
+            "model": "polyprojective",
+            "max_mean_error_px": 2.0,
+            "key_point_scale": 1.0,
+            "cell_size_px": 200,
+        },
         "detection": {"method": "dense", "rounds": 200, "feature_pool": 1000, "motion_channel": "never"},
         "tracking": {"refine": False, "linking": "links", "min_confidence": 0.0},
         "field": {"one_pixel_wide": True, "weigh_shared_segments": "twice", "velocity_span_s": 0.0},

@@ -6,9 +6,9 @@ import pytest
 from velfield.camera.lens import HarrisLens
 from velfield.errors import Failure
 from velfield.registration.fitting import case_deletion, fit_by_simplex, fit_polyprojective
-from velfield.registration.joint import ControlPoints, joint_fit
+from velfield.registration.joint import ControlPoints, JointFit, joint_fit, weights_of
 from velfield.registration.kernels import solve_positive
-from velfield.registration.mesh import fit_mesh
+from velfield.registration.mesh import fit_mesh, robust_mesh
 from velfield.registration.transforms import HomographyTransform, PolyprojectiveTransform, normalisation_of
 
 WIDTH, HEIGHT = 1280, 960
@@ -157,6 +157,33 @@ def test_mesh_takes_up_slow_relief_and_nothing_else() -> None:
     assert found.mesh is not None
     assert (found.heldout**2).mean() < 0.15 * ((noise + relief) ** 2).mean()
     assert fit_mesh(raw, noise, noise, np.ones(len(raw)), **size).mesh is None
+
+
+def test_the_mesh_follows_a_hill_whose_points_disagree_with_the_smooth_map_and_no_roofs() -> None:
+    """On the hill the smooth map's weights are next to nothing; roofs stand among the ground's points everywhere."""
+    rng = np.random.default_rng(12)
+    raw, sigma = places(rng, 3000), 0.1
+
+    def hill(xy: np.ndarray) -> np.ndarray:
+        return np.exp(-(((xy - [800, 500]) / 180) ** 2).sum(axis=1))[:, None] * [1.5, -0.5]
+
+    roofs = (rng.random(len(raw)) < 0.25)[:, None] * [0.0, 2.0]
+    residuals = hill(raw) + roofs + rng.normal(0, sigma, raw.shape)
+    points = ControlPoints(raw, raw, np.full(len(raw), sigma))
+    weights = weights_of(residuals, points.sigma_px, 1.0)
+    transform = fit(control_points(rng, count=400, noise_px=0.1, wrong=0.0, amplitude_px=0.0, cycles=0.0)).transform
+    smooth = JointFit(transform, weights, residuals, residuals, 1.0, (1.0, 1.0))
+    on_hill = np.hypot(*(raw - [800, 500]).T) < 150
+    assert weights[on_hill].mean() < 0.05
+    size = {"width": WIDTH, "height": HEIGHT, "cell_size_px": 120}
+
+    def off(turns: int) -> float:
+        found, kept = robust_mesh(points, smooth, turns=turns, **size)
+        left = found.residuals - roofs  # the mesh against the hill, but for the noise of each point
+        assert (turns == 1) == (kept[on_hill].mean() < 0.1)
+        return float(np.abs(np.median(left[on_hill], axis=0)).max())
+
+    assert off(3) < 0.15 < 0.4 * off(1)
 
 
 def test_small_systems_are_solved_as_lapack_does() -> None:

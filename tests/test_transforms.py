@@ -142,7 +142,12 @@ def test_vector_brings_the_transform_back(model: str) -> None:
     t = frame_transform(np.random.default_rng(5))
     if model != "row_spline":
         t = FrameTransform(
-            width=WIDTH, height=HEIGHT, lens=t.lens, polyprojective=t.polyprojective, mesh=t.mesh, cell_size_px=200
+            width=WIDTH,
+            height=HEIGHT,
+            lens=t.lens,
+            polyprojective=t.polyprojective,
+            mesh=t.mesh,
+            cell_size_px=CONFIG.cell_size_px,
         )
     vector = t.to_vector(config)
     assert vector.shape == (vector_length(WIDTH, HEIGHT, config),)

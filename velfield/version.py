@@ -5,8 +5,8 @@ from importlib.metadata import version
 STAGE_VERSIONS: dict[str, int] = {
     "frames": 1,
     "lens": 4,
-    "base": 3,
-    "registration": 3,
+    "base": 4,
+    "registration": 4,
     "detector": 14,
     "detections": 6,
     "links": 1,

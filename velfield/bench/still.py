@@ -1,10 +1,11 @@
 """How still things that stand lie on the map of a run: the jitter of registration, measured without any truth.
 
-Corners of the base image that registration itself does not use (those at least a patch's half away from its own) are
-found in every registered frame below the pixel, and carried to the map by the frame's transform. What is left of their
-motion is what a standing car would seem to do: registration's residual, and the alignment's own noise, for which only
-sharp corners are followed. What is higher than the ground moves on the map of a camera that flies by, as it must: an
-area tells where the ground is.
+Corners of the base image that registration itself does not use (those at least half of its patches away from its own)
+are found in every registered frame below the pixel, and carried to the map by the frame's transform. What is left of
+their motion is what a standing car would seem to do: registration's residual, and the alignment's own noise. For the
+latter's sake only sharp corners are followed, and by patches larger than registration's: by those, compressed pictures
+alone moved a road's marks by .15 px. What is higher than the ground moves on the map of a camera that flies by, as it
+must: an area tells where the ground is.
 """
 
 from dataclasses import dataclass, replace
@@ -25,6 +26,7 @@ FloatArray = NDArray[np.float64]
 
 _MAX_SHIFT_PX = 3.0
 _MIN_SHARE = 0.5
+_HALF_PATCH = 12
 _SHARP_PX, _AT_LEAST = 0.1, 30
 """Corners that noise would move by more are not followed; but so many at least are."""
 _MAD_TO_SD = 1.4826
@@ -107,7 +109,7 @@ def _unused_corners(run: Run, within: FloatArray | None) -> Templates:
     grey = read_picture_grey(layout.own_base_image, limit) if own else run.base_image
     known = read_picture_grey(layout.own_base_mask, limit) > 0 if own else np.ones(grey.shape, np.bool_)
     used = [make_templates(grey, known, count=count).xy for count in (FEW, MANY)]
-    found = make_templates(grey, known, apart_from=np.concatenate(used))
+    found = make_templates(grey, known, apart_from=np.concatenate(used), half_patch=_HALF_PATCH)
     inside = np.ones(len(found), np.bool_)
     if within is not None:
         area = cv2.fillPoly(np.zeros(grey.shape, np.uint8), [np.rint(within).astype(np.int32)], (1,))

@@ -21,7 +21,7 @@ Float32Array = NDArray[np.float32]
 FEW, MANY = 3000, 6000
 """Patches of a base image: where the frames' own camera made it, and where half of them will not be found."""
 _CELL_PX = (10.0, 40.0)
-_HALF_PATCH = 7
+HALF_PATCH = 7
 _FINE_SIGMA_PX = 0.8
 """Blur of both pictures before they are compared; the bilinear sampling of the raw frame is exact enough then."""
 _COARSE_SPACING_PX = 2
@@ -45,7 +45,7 @@ class Templates:
     ----------
     xy : (n, 2) base px, whole numbers.
     sigma_px : (n,) how far noise would move each.
-    fine, coarse : (n, 15 * 15) float32 grey levels about the corner, at every pixel and at every second.
+    fine, coarse : (n, side * side) float32 grey levels about the corner, at every pixel and at every second.
     """
 
     xy: FloatArray
@@ -63,18 +63,20 @@ def make_templates(
     *,
     count: int = FEW,
     apart_from: FloatArray | None = None,
+    half_patch: int = HALF_PATCH,
 ) -> Templates:
     """The best corner of each of ``count`` cells of a base image (h, w), with its patches.
 
-    ``mask`` (h, w) is where the image is known; no corner lies within half a patch of ``apart_from`` (n, 2).
+    ``mask`` (h, w) is where the image is known; no corner lies within `HALF_PATCH` of ``apart_from`` (n, 2).
+    ``half_patch``: px from a corner to its patch's edge; a larger patch is less moved by noise, and sees more depth.
     """
     height, width = base.shape
     fine, coarse = blurred(base)
-    side = 2 * _HALF_PATCH + 1
+    side = 2 * half_patch + 1
     gradient = cv2.cornerMinEigenVal(cv2.GaussianBlur(base, (0, 0), _FINE_SIGMA_PX), side, ksize=3)
     # OpenCV gives the mean over the block of gradients in units of (grey / 255) a pixel, Sobel's 4 taken out
     least = np.maximum(np.asarray(gradient, dtype=np.float64), 0.0) * 255.0**2 * side**2
-    reach = _HALF_PATCH * _COARSE_SPACING_PX + 2
+    reach = half_patch * _COARSE_SPACING_PX + 2
     usable = np.zeros(base.shape, np.uint8)
     usable[reach : height - reach, reach : width - reach] = 1
     if mask is not None:
@@ -86,7 +88,7 @@ def make_templates(
     xy, strength = _best_of_cells(least, max(1, round(cell)), (_NOISE_GREY / _MAX_SIGMA_PX) ** 2)
     sigma = np.sqrt(_FLOOR_PX**2 + _NOISE_GREY**2 / np.maximum(strength, 1e-9))
     at = xy.astype(np.int64)
-    offsets = np.arange(-_HALF_PATCH, _HALF_PATCH + 1)
+    offsets = np.arange(-half_patch, half_patch + 1)
     dy, dx = (grid.ravel() for grid in np.meshgrid(offsets, offsets, indexing="ij"))
     return Templates(
         xy=xy,
@@ -100,7 +102,7 @@ def _far_from(xy: FloatArray, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     free = np.ones(shape, np.uint8)
     at = np.rint(xy).astype(np.int64)
     free[at[:, 1], at[:, 0]] = 0
-    return np.asarray(cv2.distanceTransform(free, cv2.DIST_C, 3) > _HALF_PATCH)
+    return np.asarray(cv2.distanceTransform(free, cv2.DIST_C, 3) > HALF_PATCH)
 
 
 def _best_of_cells(strength: FloatArray, cell: int, least: float) -> tuple[FloatArray, FloatArray]:

@@ -25,10 +25,10 @@ from velfield.camera.lens import Lens
 from velfield.errors import Failure
 from velfield.registration.alignment import MANY, Templates, align, blurred, make_templates
 from velfield.registration.fitting import case_deletion
-from velfield.registration.joint import ControlPoints, JointFit, joint_fit
+from velfield.registration.joint import ControlPoints, JointFit, joint_fit, kept_of
 from velfield.registration.keypoints import KeyPoints, detect_key_points
 from velfield.registration.matching import homography_prior, match_guided
-from velfield.registration.mesh import fit_mesh
+from velfield.registration.mesh import MESH_TURNS, robust_mesh
 from velfield.registration.transforms import (
     FrameTransform,
     HomographyTransform,
@@ -336,23 +336,22 @@ class _Task:
         residuals = kept.xy_base - transform.to_base(kept.xy_raw)
         heldout = refit.heldout - refit.residuals + residuals
         ones = np.ones(len(kept))
-        return kept, JointFit(transform, ones, residuals, heldout, refit.scale_px, refit.stiffness)
+        return kept, JointFit(transform, ones, residuals, heldout, refit.scale, refit.stiffness)
 
     def certified(
         self, points: ControlPoints, fit: JointFit, count_base: int, count_previous: int
     ) -> FrameRegistration:
         """The mesh, the counts and the held-out errors; a failure where they do not bear the frame out."""
         width, height = self.size
-        transform, residuals, heldout = fit.transform, fit.residuals, fit.heldout
+        transform, residuals, heldout, weights = fit.transform, fit.residuals, fit.heldout, fit.weights
         if self.config.mesh and self.config.model != "homography":
-            found = fit_mesh(
-                points.xy_raw,
-                residuals,
-                heldout,
-                fit.weights,
+            found, weights = robust_mesh(
+                points,
+                fit,
                 width=width,
                 height=height,
                 cell_size_px=self.config.cell_size_px,
+                turns=1 if self.config.model == "polyprojective" else MESH_TURNS,
             )
             heldout = found.heldout
             transform = FrameTransform(
@@ -365,7 +364,7 @@ class _Task:
                 cell_size_px=self.config.cell_size_px,
             )
             residuals = points.xy_base - transform.to_base(points.xy_raw)
-        kept = fit.kept
+        kept = kept_of(weights)
         error_map = _error_map(points.xy_raw[kept], heldout[kept], width, height)
         count, heldout_px = int(kept.sum()), _rms(heldout[kept])
         counts = (count_base, count_previous, count)

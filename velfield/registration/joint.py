@@ -97,7 +97,7 @@ class JointFit:
     weights : (n,) robust weight of each control point, in [0, 1].
     residuals : (n, 2) base px, wanted minus mapped.
     heldout : (n, 2) the same with the point's own fold left out of the fit; NaN where it was not asked for.
-    scale_px : robust standard deviation of the residuals in one coordinate.
+    scale : robust standard deviation of the residuals in one coordinate, over the control points' own.
     stiffness : chosen for the row's shift and for its roll.
     """
 
@@ -105,13 +105,13 @@ class JointFit:
     weights: FloatArray
     residuals: FloatArray
     heldout: FloatArray
-    scale_px: float
+    scale: float
     stiffness: tuple[float, float]
 
     @property
     def kept(self) -> NDArray[np.bool_]:
         """(n,) the control points that the fit rests on."""
-        return np.asarray(self.weights >= _KEPT_WEIGHT)
+        return kept_of(self.weights)
 
     @property
     def residual_px(self) -> float:
@@ -339,9 +339,31 @@ def _robust(residuals: FloatArray, sigma: FloatArray, width: float, limit: float
     finite = size[np.isfinite(size)]
     scale = min(float(np.median(finite)) / 1.1774 if finite.size else limit, limit)
     scale = max(scale, _MIN_SIGMA_PX)
+    return _geman_mcclure(size / (width * scale)), scale
+
+
+def _geman_mcclure(size: FloatArray) -> FloatArray:
     with np.errstate(invalid="ignore"):
-        weights = 1.0 / (1.0 + (size / (width * scale)) ** 2) ** 2
-    return np.where(np.isfinite(weights), weights, 0.0), scale
+        weights = 1.0 / (1.0 + size**2) ** 2
+    return np.where(np.isfinite(weights), weights, 0.0)
+
+
+def kept_of(weights: FloatArray) -> NDArray[np.bool_]:
+    """(n,) which control points a fit with these robust weights rests on."""
+    return np.asarray(weights >= _KEPT_WEIGHT)
+
+
+def weights_of(residuals: FloatArray, sigma: FloatArray, scale: float) -> FloatArray:
+    """Robust weights (n,) of residuals (n, 2), as the joint fit ends with them.
+
+    Parameters
+    ----------
+    sigma
+        (n,) of the control points.
+    scale
+        `JointFit.scale`.
+    """
+    return _geman_mcclure(np.linalg.norm(residuals, axis=1) / (sigma * scale * _ANNEALING[-1]))
 
 
 def _annealed(

@@ -1,8 +1,9 @@
 """The displacement mesh: what a frame's smooth map leaves, cell by cell, where the evidence supports it.
 
-Paper: registration, 200 x 200 cells. The mesh carries what the polyprojective cannot: slow relief of the ground, a lens
-that is not quite the model. Its nodes are the cells' centres; neighbours are tied to each other, how strongly the
-held-out control points decide, and where a mesh does not predict them better than none there is none.
+Paper: registration, 200 x 200 cells; finer ones follow the ground better, as their ties are chosen by the evidence.
+The mesh carries what the polyprojective cannot: slow relief of the ground, a lens that is not quite the model. Its
+nodes are the cells' centres; neighbours are tied to each other, how strongly the held-out control points decide, and
+where a mesh does not predict them better than none there is none.
 """
 
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from velfield.registration.joint import FOLDS, folds_of
+from velfield.registration.joint import FOLDS, ControlPoints, JointFit, folds_of, weights_of
 from velfield.registration.kernels import solve_positive
 from velfield.registration.transforms import mesh_shape
 
@@ -21,14 +22,44 @@ _TIES = tuple(10.0**k for k in (-1, 0, 1, 2, 3))
 _LEAST_GAIN = 0.01
 """A mesh must take this share off the held-out squares."""
 _LEAST_POINTS_A_CELL = 2.0
+MESH_TURNS = 3
+"""Meshes, each fitted to the control points that agree with the one before."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeshFit:
-    """Mesh (my, mx, 2), base px, or none; ``heldout`` (n, 2): held-out residuals with it."""
+    """Mesh (my, mx, 2), base px, or none; ``residuals`` and ``heldout`` (n, 2) with it."""
 
     mesh: FloatArray | None
+    residuals: FloatArray
     heldout: FloatArray
+
+
+def robust_mesh(
+    points: ControlPoints, fit: JointFit, *, width: int, height: int, cell_size_px: int, turns: int = MESH_TURNS
+) -> tuple[MeshFit, FloatArray]:
+    """Mesh of what a joint fit leaves, and the robust weights (n,) of its control points, which count by variance too.
+
+    Where the ground rises or falls its control points all disagree with the smooth map, and would have no say in the
+    mesh that is there for them; with the mesh before they agree, and a roof's among them do not.
+    """
+    found, weights = MeshFit(None, fit.residuals, fit.heldout), fit.weights
+    for turn in range(turns):
+        if turn:
+            weights = weights_of(found.residuals, points.sigma_px, fit.scale)
+        precise = weights / points.sigma_px**2
+        found = fit_mesh(
+            points.xy_raw,
+            fit.residuals,
+            fit.heldout,
+            precise * (weights.sum() / max(float(precise.sum()), 1e-12)),  # ties are weighed against control points
+            width=width,
+            height=height,
+            cell_size_px=cell_size_px,
+        )
+        if found.mesh is None:
+            return found, fit.weights
+    return found, weights
 
 
 def fit_mesh(
@@ -50,13 +81,13 @@ def fit_mesh(
     heldout
         (n, 2) the same residuals with each point's fold left out of the smooth fit.
     weights
-        (n,) robust weights.
+        (n,) how much each control point counts: robust weights, over its variance.
     width, height
         Raw frame, px.
     """
     my, mx = mesh_shape(width, height, cell_size_px)
     if len(xy_raw) < _LEAST_POINTS_A_CELL * my * mx or my * mx < 4:
-        return MeshFit(None, heldout)
+        return MeshFit(None, residuals, heldout)
     basis = _bilinear(xy_raw, my, mx, cell_size_px)
     fold = folds_of(xy_raw)
     weighted = basis * weights[:, None]
@@ -74,9 +105,9 @@ def fit_mesh(
         if squares < best_squares:
             best, best_squares, best_left = tie, squares, left
     if best is None:
-        return MeshFit(None, heldout)
+        return MeshFit(None, residuals, heldout)
     mesh = solve_positive(normal.sum(axis=0) + best * ties, right.sum(axis=0))
-    return MeshFit(np.ascontiguousarray(mesh.reshape(my, mx, 2)), best_left)
+    return MeshFit(np.ascontiguousarray(mesh.reshape(my, mx, 2)), residuals - basis @ mesh, best_left)
 
 
 def _bilinear(xy_raw: FloatArray, my: int, mx: int, cell: int) -> FloatArray:
