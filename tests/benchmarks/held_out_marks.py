@@ -1,0 +1,105 @@
+"""How still a road's marks lie on the map of a run: registered anew without half of the base image's patches.
+
+python -m tests.benchmarks.held_out_marks RUN AREA.csv    AREA: corners around the road, base px
+
+`velfield bench still` follows corners that registration does not use, and registration uses a road's marks: what is
+left there is asphalt. Here the patches in every other cell of a chessboard are left out of the base image, every frame
+is registered by the others alone, and the sharp ones left out are followed; then the other half. The run must be one
+whose frames are registered to its own base image.
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from velfield import open_run
+from velfield.bench.still import read_area
+from velfield.registration.alignment import Templates, align, blurred
+from velfield.registration.intrasensor import BaseReference, prepare_base, register_frame
+from velfield.registration.keypoints import detect_key_points
+from velfield.run import Run
+from velfield.sources.pictures import read_picture_grey
+from velfield.steps.frame_maps import read_lens
+
+FloatArray = NDArray[np.float64]
+
+CELL_PX, MARGIN_PX = 40, 8
+"""Of the chessboard; marks so near to a cell's border are not followed: patches of the fit reach over it."""
+HALF_PATCH, SHARP_PX = 12, 0.1
+
+
+def main() -> None:
+    """Register both halves, follow, print."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("run", type=Path)
+    parser.add_argument("area", type=Path)
+    asked = parser.parse_args()
+    run, area = open_run(asked.run), read_area(asked.area)
+    limit = run.record.config.frames.max_pixels
+    grey = read_picture_grey(run.layout.own_base_image, limit)
+    known = read_picture_grey(run.layout.own_base_mask, limit) > 0
+    config, lens = run.record.config.registration, read_lens(run.layout)
+    frames = [k for k, status in enumerate(run.registration_status) if status == "ok"]
+    pictures = [run.frames.read(k) for k in frames]
+    key_points = [detect_key_points(picture, config, None) for picture in pictures]
+    whole = prepare_base(grey, config, mask=known, frame_shape=pictures[0].shape)
+    on_road = cv2.fillPoly(np.zeros(grey.shape, np.uint8), [np.rint(area).astype(np.int32)], (1,)) > 0
+    for phase in (0, 1):
+        half = _without(whole, phase)
+        marks = _marks(whole.templates, grey, on_road, phase)
+        places = np.full((len(frames), len(marks), 2), np.nan)
+        for row, (picture, found) in enumerate(zip(pictures, key_points, strict=True)):
+            result = register_frame(picture, found, half, lens, config)
+            if result.transform is not None:
+                points, _ = align(blurred(picture)[0], result.transform, marks, coarse=False, max_shift_px=3.0)
+                number = {(float(x), float(y)): k for k, (x, y) in enumerate(marks.xy)}
+                rows = [number[(float(x), float(y))] for x, y in points.xy_base]
+                places[row, rows] = result.transform.to_base(points.xy_raw)
+        _tell(run, places, phase)
+
+
+def _cell_is(xy: FloatArray, phase: int) -> NDArray[np.bool_]:
+    return np.asarray((xy // CELL_PX).sum(axis=1) % 2 == phase)
+
+
+def _chosen(templates: Templates, which: NDArray[np.bool_]) -> Templates:
+    return Templates(templates.xy[which], templates.sigma_px[which], templates.fine[which], templates.coarse[which])
+
+
+def _without(base: BaseReference, phase: int) -> BaseReference:
+    few, many = (_chosen(part, ~_cell_is(part.xy, phase)) for part in (base.templates, base.many))
+    return replace(base, templates=few, many=many)
+
+
+def _marks(templates: Templates, grey: NDArray[np.uint8], on_road: NDArray[np.bool_], phase: int) -> Templates:
+    """The sharp corners on the road that are left out, with larger patches."""
+    xy = templates.xy
+    at = xy.astype(np.int64)
+    within = np.minimum(xy % CELL_PX, CELL_PX - xy % CELL_PX).min(axis=1) > MARGIN_PX
+    size = np.array([grey.shape[1], grey.shape[0]])
+    inside = ((at > HALF_PATCH) & (at < size - HALF_PATCH - 1)).all(axis=1)
+    sharp = templates.sigma_px < SHARP_PX
+    marks = _chosen(templates, within & inside & sharp & on_road[at[:, 1], at[:, 0]] & _cell_is(xy, phase))
+    offsets = np.arange(-HALF_PATCH, HALF_PATCH + 1)
+    dy, dx = (grid.ravel() for grid in np.meshgrid(offsets, offsets, indexing="ij"))
+    at = marks.xy.astype(np.int64)
+    fine, coarse = (picture[at[:, 1:] + dy, at[:, :1] + dx] for picture in blurred(grey))
+    return replace(marks, fine=fine, coarse=coarse)
+
+
+def _tell(run: Run, places: FloatArray, phase: int) -> None:
+    followed = places[:, np.isfinite(places[..., 0]).mean(axis=0) >= 0.5]
+    rest = followed - np.nanmedian(followed, axis=0)
+    sd = 1.4826 * np.sqrt(np.mean(np.nanmedian(np.abs(rest), axis=0) ** 2, axis=1))
+    print(
+        f"{run.layout.root.name}, half {phase + 1}: {followed.shape[1]} marks in {len(followed)} frames: standard "
+        f"deviation {np.median(sd):.3f} px an axis (median; 90 % below {np.percentile(sd, 90):.3f})"
+    )
+
+
+if __name__ == "__main__":
+    main()
