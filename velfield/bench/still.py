@@ -42,7 +42,7 @@ class StillScore:
     sd_median_px, sd_p90_px : robust standard deviation of a corner's place an axis, its median and 90th percentile over
         the corners, base px.
     drift_px : how far the corners' mean place moved from the first to the last tenth of the frames, base px.
-    noise_px : what noise of the pictures alone would move the usual corner an axis.
+    noise_px : what noise of three grey levels alone would move the usual corner an axis; clean pictures have less.
     """
 
     points: int
@@ -56,7 +56,7 @@ class StillScore:
         """One line."""
         return (
             f"{self.points} still corners in {self.frames} frames: standard deviation {self.sd_median_px:.3f} px "
-            f"an axis (median; 90 % below {self.sd_p90_px:.3f}; {self.noise_px:.3f} by the pictures' noise), "
+            f"an axis (median; 90 % below {self.sd_p90_px:.3f}; noise of 3 grey levels alone: {self.noise_px:.3f}), "
             f"drift from first to last tenth {self.drift_px:.3f} px"
         )
 
