@@ -1,5 +1,7 @@
 """Maps of registration: each against plain numpy, its inverse, and its place in a vector."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -141,14 +143,7 @@ def test_vector_brings_the_transform_back(model: str) -> None:
     config = RegistrationConfig.model_validate({"model": model, "row_spline_knots": 20})
     t = frame_transform(np.random.default_rng(5))
     if model != "row_spline":
-        t = FrameTransform(
-            width=WIDTH,
-            height=HEIGHT,
-            lens=t.lens,
-            polyprojective=t.polyprojective,
-            mesh=t.mesh,
-            cell_size_px=CONFIG.cell_size_px,
-        )
+        t = replace(t, row_coefficients=np.zeros((3, 0)))
     vector = t.to_vector(config)
     assert vector.shape == (vector_length(WIDTH, HEIGHT, config),)
     back = FrameTransform.from_vector(vector, width=WIDTH, height=HEIGHT, lens=t.lens, config=config)

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from velfield import open_run
-from velfield.bench.still import read_area
-from velfield.registration.alignment import Templates, align, blurred
+from velfield.bench.still import PATCH_HALF_PX, SHARP_PX, about_their_middles, places_on_map, read_area
+from velfield.registration.alignment import Templates, cut_templates
 from velfield.registration.intrasensor import BaseReference, prepare_base, register_frame
 from velfield.registration.keypoints import detect_key_points
 from velfield.run import Run
@@ -29,7 +29,6 @@ FloatArray = NDArray[np.float64]
 
 CELL_PX, MARGIN_PX = 40, 8
 """Of the chessboard; marks so near to a cell's border are not followed: patches of the fit reach over it."""
-HALF_PATCH, SHARP_PX = 12, 0.1
 
 
 def main() -> None:
@@ -55,10 +54,7 @@ def main() -> None:
         for row, (picture, found) in enumerate(zip(pictures, key_points, strict=True)):
             result = register_frame(picture, found, half, lens, config)
             if result.transform is not None:
-                points, _ = align(blurred(picture)[0], result.transform, marks, coarse=False, max_shift_px=3.0)
-                number = {(float(x), float(y)): k for k, (x, y) in enumerate(marks.xy)}
-                rows = [number[(float(x), float(y))] for x, y in points.xy_base]
-                places[row, rows] = result.transform.to_base(points.xy_raw)
+                places[row] = places_on_map(picture, result.transform, marks)
         _tell(run, places, phase)
 
 
@@ -66,12 +62,8 @@ def _cell_is(xy: FloatArray, phase: int) -> NDArray[np.bool_]:
     return np.asarray((xy // CELL_PX).sum(axis=1) % 2 == phase)
 
 
-def _chosen(templates: Templates, which: NDArray[np.bool_]) -> Templates:
-    return Templates(templates.xy[which], templates.sigma_px[which], templates.fine[which], templates.coarse[which])
-
-
 def _without(base: BaseReference, phase: int) -> BaseReference:
-    few, many = (_chosen(part, ~_cell_is(part.xy, phase)) for part in (base.templates, base.many))
+    few, many = (part.where(~_cell_is(part.xy, phase)) for part in (base.templates, base.many))
     return replace(base, templates=few, many=many)
 
 
@@ -80,23 +72,17 @@ def _marks(templates: Templates, grey: NDArray[np.uint8], on_road: NDArray[np.bo
     xy = templates.xy
     at = xy.astype(np.int64)
     within = np.minimum(xy % CELL_PX, CELL_PX - xy % CELL_PX).min(axis=1) > MARGIN_PX
-    size = np.array([grey.shape[1], grey.shape[0]])
-    inside = ((at > HALF_PATCH) & (at < size - HALF_PATCH - 1)).all(axis=1)
+    reach = 2 * PATCH_HALF_PX + 1
+    inside = ((at >= reach) & (at < np.array([grey.shape[1], grey.shape[0]]) - reach)).all(axis=1)
     sharp = templates.sigma_px < SHARP_PX
-    marks = _chosen(templates, within & inside & sharp & on_road[at[:, 1], at[:, 0]] & _cell_is(xy, phase))
-    offsets = np.arange(-HALF_PATCH, HALF_PATCH + 1)
-    dy, dx = (grid.ravel() for grid in np.meshgrid(offsets, offsets, indexing="ij"))
-    at = marks.xy.astype(np.int64)
-    fine, coarse = (picture[at[:, 1:] + dy, at[:, :1] + dx] for picture in blurred(grey))
-    return replace(marks, fine=fine, coarse=coarse)
+    marks = templates.where(within & inside & sharp & on_road[at[:, 1], at[:, 0]] & _cell_is(xy, phase))
+    return cut_templates(grey, marks.xy, marks.sigma_px, PATCH_HALF_PX)
 
 
 def _tell(run: Run, places: FloatArray, phase: int) -> None:
-    followed = places[:, np.isfinite(places[..., 0]).mean(axis=0) >= 0.5]
-    rest = followed - np.nanmedian(followed, axis=0)
-    sd = 1.4826 * np.sqrt(np.mean(np.nanmedian(np.abs(rest), axis=0) ** 2, axis=1))
+    rest, sd = about_their_middles(places)
     print(
-        f"{run.layout.root.name}, half {phase + 1}: {followed.shape[1]} marks in {len(followed)} frames: standard "
+        f"{run.layout.root.name}, half {phase + 1}: {len(sd)} marks in {len(rest)} frames: standard "
         f"deviation {np.median(sd):.3f} px an axis (median; 90 % below {np.percentile(sd, 90):.3f})"
     )
 

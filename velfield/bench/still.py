@@ -26,8 +26,8 @@ FloatArray = NDArray[np.float64]
 
 _MAX_SHIFT_PX = 3.0
 _MIN_SHARE = 0.5
-_HALF_PATCH = 12
-_SHARP_PX, _AT_LEAST = 0.1, 30
+PATCH_HALF_PX = 12
+SHARP_PX, _AT_LEAST = 0.1, 30
 """Corners that noise would move by more are not followed; but so many at least are."""
 _MAD_TO_SD = 1.4826
 
@@ -98,7 +98,7 @@ def still_things(run: Run, *, max_frames: int = 200, within: FloatArray | None =
     for row, k in enumerate(chosen):
         transform = maps.transform(registered[k])
         assert isinstance(transform, FrameTransform), "a registered frame has a map"
-        places[row] = _places(run.frames.read(registered[k]), transform, templates)
+        places[row] = places_on_map(run.frames.read(registered[k]), transform, templates)
     return _score(places, run, float(np.median(templates.sigma_px)))
 
 
@@ -109,7 +109,7 @@ def _unused_corners(run: Run, within: FloatArray | None) -> Templates:
     grey = read_picture_grey(layout.own_base_image, limit) if own else run.base_image
     known = read_picture_grey(layout.own_base_mask, limit) > 0 if own else np.ones(grey.shape, np.bool_)
     used = [make_templates(grey, known, count=count).xy for count in (FEW, MANY)]
-    found = make_templates(grey, known, apart_from=np.concatenate(used), half_patch=_HALF_PATCH)
+    found = make_templates(grey, known, apart_from=np.concatenate(used), half_patch=PATCH_HALF_PX)
     inside = np.ones(len(found), np.bool_)
     if within is not None:
         area = cv2.fillPoly(np.zeros(grey.shape, np.uint8), [np.rint(within).astype(np.int32)], (1,))
@@ -120,12 +120,12 @@ def _unused_corners(run: Run, within: FloatArray | None) -> Templates:
             f"base image of {grey.shape[1]}x{grey.shape[0]} px; move it there or give a larger one"
         )
     noise = np.where(inside, found.sigma_px, np.inf)
-    wanted = max(int((noise <= _SHARP_PX).sum()), min(_AT_LEAST, int(inside.sum())))
+    wanted = max(int((noise <= SHARP_PX).sum()), min(_AT_LEAST, int(inside.sum())))
     order = np.argsort(noise, kind="stable")[:wanted]
-    return Templates(found.xy[order], found.sigma_px[order], found.fine[order], found.coarse[order])
+    return found.where(order)
 
 
-def _places(grey: NDArray[np.uint8], transform: FrameTransform, templates: Templates) -> FloatArray:
+def places_on_map(grey: NDArray[np.uint8], transform: FrameTransform, templates: Templates) -> FloatArray:
     """Where a frame puts the corners on the map, (n, 2) base px; NaN where it does not show them."""
     found, _ = align(blurred(grey)[0], transform, templates, coarse=False, max_shift_px=_MAX_SHIFT_PX)
     number = {(float(x), float(y)): k for k, (x, y) in enumerate(templates.xy)}
@@ -135,19 +135,25 @@ def _places(grey: NDArray[np.uint8], transform: FrameTransform, templates: Templ
     return places
 
 
+def about_their_middles(places: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Of places (frames, n, 2), those followed in half of the frames (m of n), about their medians: (frames, m, 2).
+
+    And the robust standard deviation an axis of each, (m,).
+    """
+    kept = places[:, np.isfinite(places[..., 0]).mean(axis=0) >= _MIN_SHARE]
+    rest = kept - np.nanmedian(kept, axis=0)
+    return rest, _MAD_TO_SD * np.sqrt(np.mean(np.nanmedian(np.abs(rest), axis=0) ** 2, axis=1))
+
+
 def _score(places: FloatArray, run: Run, noise_px: float) -> StillScore:
     """Of places (frames, corners, 2)."""
-    seen = np.isfinite(places[..., 0])
-    followed = seen.mean(axis=0) >= _MIN_SHARE
-    if not followed.any():
+    rest, sd = about_their_middles(places)
+    if not len(sd):
         raise InputError(f"{run.layout.root}: no corner of the base image is seen in half of the frames")
-    kept = places[:, followed]
-    rest = kept - np.nanmedian(kept, axis=0)
-    sd = _MAD_TO_SD * np.sqrt(np.mean(np.nanmedian(np.abs(rest), axis=0) ** 2, axis=1))
-    tenth = max(1, len(kept) // 10)
+    tenth = max(1, len(places) // 10)
     drift = np.nanmedian(rest[-tenth:], axis=(0, 1)) - np.nanmedian(rest[:tenth], axis=(0, 1))
     return StillScore(
-        points=int(followed.sum()),
+        points=len(sd),
         frames=len(places),
         noise_px=noise_px,
         sd_median_px=float(np.median(sd)),

@@ -56,6 +56,26 @@ class Templates:
     def __len__(self) -> int:
         return len(self.xy)
 
+    def where(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> "Templates":
+        """Those that a mask (n,) or indices choose."""
+        return Templates(self.xy[chosen], self.sigma_px[chosen], self.fine[chosen], self.coarse[chosen])
+
+
+def cut_templates(
+    base: NDArray[np.uint8], xy: FloatArray, sigma_px: FloatArray, half_patch: int = HALF_PATCH
+) -> Templates:
+    """Patches of a base image (h, w) about corners (n, 2), whole numbers; all of each must lie in it."""
+    fine, coarse = blurred(base)
+    at = xy.astype(np.int64)
+    offsets = np.arange(-half_patch, half_patch + 1)
+    dy, dx = (grid.ravel() for grid in np.meshgrid(offsets, offsets, indexing="ij"))
+    return Templates(
+        xy=xy,
+        sigma_px=sigma_px,
+        fine=fine[at[:, 1:] + dy, at[:, :1] + dx],
+        coarse=coarse[at[:, 1:] + _COARSE_SPACING_PX * dy, at[:, :1] + _COARSE_SPACING_PX * dx],
+    )
+
 
 def make_templates(
     base: NDArray[np.uint8],
@@ -71,7 +91,6 @@ def make_templates(
     ``half_patch``: px from a corner to its patch's edge; a larger patch is less moved by noise, and sees more depth.
     """
     height, width = base.shape
-    fine, coarse = blurred(base)
     side = 2 * half_patch + 1
     gradient = cv2.cornerMinEigenVal(cv2.GaussianBlur(base, (0, 0), _FINE_SIGMA_PX), side, ksize=3)
     # OpenCV gives the mean over the block of gradients in units of (grey / 255) a pixel, Sobel's 4 taken out
@@ -87,15 +106,7 @@ def make_templates(
     cell = float(np.clip(np.sqrt(base.size / count), *_CELL_PX))
     xy, strength = _best_of_cells(least, max(1, round(cell)), (_NOISE_GREY / _MAX_SIGMA_PX) ** 2)
     sigma = np.sqrt(_FLOOR_PX**2 + _NOISE_GREY**2 / np.maximum(strength, 1e-9))
-    at = xy.astype(np.int64)
-    offsets = np.arange(-half_patch, half_patch + 1)
-    dy, dx = (grid.ravel() for grid in np.meshgrid(offsets, offsets, indexing="ij"))
-    return Templates(
-        xy=xy,
-        sigma_px=sigma,
-        fine=fine[at[:, 1:] + dy, at[:, :1] + dx],
-        coarse=coarse[at[:, 1:] + _COARSE_SPACING_PX * dy, at[:, :1] + _COARSE_SPACING_PX * dx],
-    )
+    return cut_templates(base, xy, sigma, half_patch)
 
 
 def _far_from(xy: FloatArray, shape: tuple[int, ...]) -> NDArray[np.bool_]:

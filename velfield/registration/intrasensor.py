@@ -15,7 +15,7 @@ the chain began.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -354,15 +354,7 @@ class _Task:
                 turns=1 if self.config.model == "polyprojective" else MESH_TURNS,
             )
             heldout = found.heldout
-            transform = FrameTransform(
-                width=width,
-                height=height,
-                lens=self.lens,
-                polyprojective=transform.polyprojective,
-                row_coefficients=transform.row_coefficients,
-                mesh=found.mesh,
-                cell_size_px=self.config.cell_size_px,
-            )
+            transform = replace(transform, mesh=found.mesh, cell_size_px=self.config.cell_size_px)
             residuals = points.xy_base - transform.to_base(points.xy_raw)
         kept = kept_of(weights)
         error_map = _error_map(points.xy_raw[kept], heldout[kept], width, height)
