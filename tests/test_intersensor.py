@@ -125,7 +125,7 @@ def test_a_mirrored_base_image_is_refused_and_called_so(ground: np.ndarray, base
     image = photograph(ground, view(1.0, 5.0), LENS, SHAPE, 1)
     result = register_intersensor(image, np.ascontiguousarray(base[:, ::-1]), CONFIG, lens=LENS)
     assert isinstance(result, Failure)
-    assert "so it is flipped" in result.reason
+    assert result.reason.startswith("the base image is mirrored, flip it")
 
 
 def test_a_black_frame_is_refused(base: np.ndarray) -> None:

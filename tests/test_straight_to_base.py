@@ -10,7 +10,7 @@ from schemas.job import Inputs, Job
 from tests.scenes import city, photograph, similarity
 from velfield.camera.lens import pinhole
 from velfield.configuration import resolve_config
-from velfield.errors import Failure
+from velfield.errors import Failure, InputError
 from velfield.plan import Plan, make_plan
 from velfield.registration.intersensor import register_intersensor
 from velfield.steps.base import build_base, key_points_of
@@ -34,19 +34,62 @@ def base() -> np.ndarray:
     return city(3, 640)
 
 
-def plan_on(base: np.ndarray, frames: list[np.ndarray], folder: Path) -> Plan:
+def plan_on(base: np.ndarray, frames: list[np.ndarray], folder: Path, gsd_m: float | None = None) -> Plan:
     """The plan of a flight of these frames, lens and frames done."""
     (folder / "frames").mkdir()
     for number, frame in enumerate(frames):
         cv2.imwrite(str(folder / "frames" / f"{number}.png"), frame)
     cv2.imwrite(str(folder / "base.png"), base)
     inputs = Inputs(source=str(folder / "frames"), base=str(folder / "base.png"))
-    config = resolve_config(overrides={"frames.fps": 5, "lens.calibrate": "never"})
+    config = resolve_config(overrides={"frames.fps": 5, "lens.calibrate": "never", "gsd_m": gsd_m})
     plan = make_plan(Job(root=str(folder / "run"), inputs=inputs, config=config))
     lay_out_frames(plan)
     read_unit(plan, range(len(frames)))
     calibrate_flight(plan)
     return plan
+
+
+def seen(base: np.ndarray) -> list[np.ndarray]:
+    """Three frames that look at the middle of the base image, turned a little."""
+    views = [similarity(1.0, 4.0 + k, MIDDLE, np.array([310.0 + 5 * k, 320.0])) for k in range(3)]
+    return [photograph(base, view, pinhole(SHAPE), SHAPE, k) for k, view in enumerate(views)]
+
+
+def test_how_the_flight_lies_on_a_given_picture_is_told(base: np.ndarray, tmp_path: Path) -> None:
+    plan = plan_on(base, seen(base), tmp_path, gsd_m=0.2)
+    outcome = build_base(plan, [key_points_of(plan, range(3))])
+    assert "a frame pixel is 1.00 base pixels in the frame's middle, turned by" in outcome.notes[0]
+    assert not outcome.warnings
+    assert outcome.counts["covered"] == 1.0
+    assert outcome.counts["intersensor_error_px"] < 0.5
+
+
+def test_another_scale_is_told_of_gsd_m(base: np.ndarray, tmp_path: Path) -> None:
+    small = cv2.resize(base, None, fx=0.7, fy=0.7, interpolation=cv2.INTER_AREA)
+    plan = plan_on(small, seen(base), tmp_path, gsd_m=0.2)
+    (warning,) = build_base(plan, [key_points_of(plan, range(3))]).warnings
+    assert "--gsd-m 0.2 is taken for metres a pixel of the base picture, which makes 0.14 m of a frame pixel" in warning
+    assert "give --gsd-m 0.286" in warning
+
+
+def test_a_picture_much_coarser_than_the_frames_is_refused_with_the_size_that_serves(
+    base: np.ndarray, tmp_path: Path
+) -> None:
+    small = cv2.resize(base, None, fx=0.35, fy=0.35, interpolation=cv2.INTER_AREA)
+    plan = plan_on(small, seen(base), tmp_path)
+    with pytest.raises(
+        InputError, match=r"found 0\.35 base pixels a frame pixel, expected 0\.5 to 2; .* (639|640|641) x"
+    ):
+        build_base(plan, [key_points_of(plan, range(3))])
+
+
+def test_a_picture_of_a_part_of_the_flight_warns_how_much_it_shows(base: np.ndarray, tmp_path: Path) -> None:
+    part = np.ascontiguousarray(base[:, :420])
+    plan = plan_on(part, seen(base), tmp_path)
+    warnings = build_base(plan, [key_points_of(plan, range(3))]).warnings
+    # Frames are 480 px wide about column 315: from 75 on, so that 345 of 480 columns are on the picture.
+    (share,) = (int(word[:-1]) for line in warnings for word in line.split() if word.endswith("%"))
+    assert 66 <= share <= 78
 
 
 def test_frames_whose_rows_wobble_lie_straight_on_their_base_image(base: np.ndarray, tmp_path: Path) -> None:

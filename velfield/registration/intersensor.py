@@ -148,10 +148,11 @@ def _is_mirrored(pair: Pair) -> bool:
 
 def _why_not(pair: Pair, scores: list[str]) -> str:
     mirrored = sift_agreement(pair.image, pair.base, pair.lens, wanted_scale=pair.config.coarse_scale, mirrored=True)
+    told = "the base image does not show this place"
     if mirrored.matrix is not None:
-        scores = [*scores, f"mirrored: {mirrored.inliers} of {mirrored.matches} SIFT matches agree, so it is flipped"]
+        told = f"the base image is mirrored, flip it ({mirrored.inliers} of {mirrored.matches} SIFT matches agree then)"
     needed = f"{pair.config.min_control_points} control points and {MIN_AGREEING_SHARE:.0%} of separate patches needed"
-    return f"the base image does not show this place ({needed}); " + "; ".join(scores)
+    return f"{told}; found {'; '.join(scores)}; {needed}"
 
 
 def _candidates(pair: Pair, initial: Floats | None, scores: list[str]) -> Iterator[Coarse]:
@@ -249,7 +250,7 @@ def _motion_of_rows(fitted: Fitted, raw: Floats, *, apart_px: float) -> Floats:
 def _result(pair: Pair, fitted: Fitted, candidate: Coarse, scores: tuple[str, ...]) -> IntersensorResult:
     source_raw, target = fitted.source_raw[fitted.kept], fitted.target[fitted.kept]
     errors = left_out_errors(pair.lens.undistort_points(source_raw), target, fitted.model)
-    scale, rotation = _scale_and_rotation(fitted.transform)
+    scale, rotation = fitted.transform.scale_and_rotation()
     spacing = max(1, pair.config.grid_spacing_px)
     return IntersensorResult(
         transform=fitted.transform,
@@ -267,13 +268,6 @@ def _result(pair: Pair, fitted: Fitted, candidate: Coarse, scores: tuple[str, ..
         error_map=_error_map(target, errors, (pair.base.shape[0], pair.base.shape[1]), spacing),
         error_map_spacing_px=spacing,
     )
-
-
-def _scale_and_rotation(transform: FrameTransform) -> tuple[float, float]:
-    """Of the similarity nearest to the map's derivative at the frame's middle."""
-    jacobian = transform.jacobian(np.array([[(transform.width - 1) / 2, (transform.height - 1) / 2]]))[0]
-    cosine, sine = jacobian[0, 0] + jacobian[1, 1], jacobian[1, 0] - jacobian[0, 1]
-    return float(0.5 * np.hypot(cosine, sine)), float(np.arctan2(sine, cosine))
 
 
 def _error_map(points: Floats, errors: Floats, shape: tuple[int, int], spacing: int) -> NDArray[np.float32]:

@@ -269,6 +269,12 @@ class FrameTransform:
             columns.append((self.to_base(raw + step) - self.to_base(raw - step)) / (2 * _DIFFERENCE_PX))
         return np.stack(columns, axis=2)
 
+    def scale_and_rotation(self) -> tuple[float, float]:
+        """Base px a frame px, and turn from +x to +y, rad: of the similarity nearest to the map in the middle."""
+        jacobian = self.jacobian(self.centre[None])[0]
+        cosine, sine = jacobian[0, 0] + jacobian[1, 1], jacobian[1, 0] - jacobian[0, 1]
+        return float(0.5 * np.hypot(cosine, sine)), float(np.arctan2(sine, cosine))
+
     def followed_by(self, transform: PolyprojectiveTransform) -> "ComposedTransform":
         """This map, then another: from the flight's own base image on to a given one."""
         return ComposedTransform(self, transform)

@@ -16,6 +16,7 @@ _LINE_RGB = (255, 176, 32)
 _SIDE_PX = 900
 """A frame is shown this wide at most."""
 _COVER = 0.55
+_LEGEND_PX = 32
 
 
 def lens_picture(grey: NDArray[np.uint8], lens: Lens) -> RGB:
@@ -84,6 +85,20 @@ def error_picture(grey: NDArray[np.uint8], error_px: NDArray[np.floating], *, fu
         for j in range(columns):
             told = f"{error_px[i, j]:.2f}" if np.isfinite(error_px[i, j]) else "no points"
             _label(draw, told, (j + 0.5) * width / columns, (i + 0.5) * height / rows, anchor="mm")
+    return np.concatenate([np.asarray(picture, dtype=np.uint8), _error_legend(width, full_px)])
+
+
+def _error_legend(width: int, full_px: float) -> RGB:
+    """What the figures are, and the ramp from none to ``full_px``: (height, width, 3), to stand below the picture."""
+    picture = Image.new("RGB", (width, _LEGEND_PX))
+    draw = ImageDraw.Draw(picture)
+    bar = max(1, width // 5)
+    ramp = np.broadcast_to(np.linspace(0.0, 1.0, bar), (_LEGEND_PX // 2, bar))
+    end = width - _LEGEND_PX * 3
+    picture.paste(Image.fromarray(ramp_colours(ramp)), (end - bar, _LEGEND_PX // 4))
+    _label(draw, "0", end - bar - 6, _LEGEND_PX / 2, anchor="rm")
+    _label(draw, f"{full_px:g} px", end + 6, _LEGEND_PX / 2, anchor="lm")
+    _label(draw, "error held out of the fit, RMS", 8, _LEGEND_PX / 2, anchor="lm")
     return np.asarray(picture, dtype=np.uint8)
 
 

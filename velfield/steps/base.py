@@ -7,9 +7,10 @@ built, and registered once to the own one.
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -31,6 +32,7 @@ from velfield.registration.own_base import OwnBase, build_own_base
 from velfield.render.figures import png_bytes
 from velfield.sources.geo import BasePicture, agreed_gsd, read_base_picture
 from velfield.sources.pictures import read_picture_grey
+from velfield.steps.base_fit import BaseFit, check_scale, covered_share
 from velfield.steps.external import free_of_vehicles
 from velfield.steps.frame_maps import polyprojective_record, read_lens
 from velfield.steps.grid import read_grid
@@ -84,13 +86,9 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeyPoints]]) -> Outcom
     if given is not None:
         direct = _straight_to(plan, given, key_points, lens)
         if direct is not None:  # to half a pixel all over the frame: no other place does that
-            grid, outputs, used = (
-                _given_grid(plan, given, reference, direct),
-                write_given_picture(plan.layout, given),
-                len(key_points),
-            )
+            grid = _given_grid(plan, given, reference, direct, frames_to="given")
             layout.own_to_base.unlink(missing_ok=True)
-            return _finish(plan, grid, outputs, used, given)
+            return _finish(plan, grid, write_given_picture(layout, given), given=given, fit=direct)
         _check_place(plan, store.read(reference), given, lens)
     own = build_own_base(
         store.read,
@@ -105,6 +103,7 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeyPoints]]) -> Outcom
     write_atomically(layout.own_base_image, png_bytes(own.image))
     write_atomically(layout.own_base_mask, png_bytes(own.valid.astype(np.uint8) * 255))
     outputs = [layout.own_base_image, layout.own_base_mask]
+    fit = None
     if given is None:
         grid = _own_grid(plan, own, reference)
         write_atomically(layout.base_image, png_bytes(own.image))
@@ -112,21 +111,35 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeyPoints]]) -> Outcom
         layout.own_to_base.unlink(missing_ok=True)
         outputs.append(layout.base_image)
     else:
-        grid, written = _onto_given(plan, own, given, reference)
+        fit, written = _onto_given(plan, own, given)
+        grid = _given_grid(plan, given, reference, fit, frames_to="own")
         outputs += written
-    return _finish(plan, grid, outputs, own.frames, given)
+    return _finish(plan, grid, outputs, frames=own.frames, given=given, fit=fit)
 
 
-def _finish(plan: Plan, grid: GridRecord, outputs: list[Path], frames: int, given: BasePicture | None) -> Outcome:
+def _finish(
+    plan: Plan,
+    grid: GridRecord,
+    outputs: list[Path],
+    *,
+    frames: int | None = None,
+    given: BasePicture | None = None,
+    fit: BaseFit | None = None,
+) -> Outcome:
+    """Write the grid; ``frames``: of how many the own base image was made, none where none was."""
     layout = plan.layout
     layout.rebased.unlink(missing_ok=True)
     write_atomically(layout.grid, grid.model_dump_json(indent=1).encode())
     outputs.append(layout.grid)
     advance("base")
-    counts = {"width": float(grid.width_px), "height": float(grid.height_px), "frames": float(frames)}
-    if grid.intersensor_error_px is not None:
-        counts["intersensor_error_px"] = grid.intersensor_error_px
-    return Outcome(outputs, counts, [] if given is None else list(given.notes))
+    counts = {"width": float(grid.width_px), "height": float(grid.height_px)}
+    if frames is not None:
+        counts["frames"] = float(frames)
+    if given is None or fit is None:
+        return Outcome(outputs, counts)
+    counts |= {"intersensor_error_px": fit.error_px, "scale": fit.scale, "covered": fit.covered}
+    by_hand = plan.config.gsd_m if given.gsd_m is None else None
+    return Outcome(outputs, counts, [*given.notes, fit.note()], fit.warnings(by_hand))
 
 
 def _given_picture(plan: Plan) -> BasePicture | None:
@@ -142,6 +155,7 @@ def _check_place(plan: Plan, grey: NDArray[np.uint8], given: BasePicture, lens: 
             f"--base {plan.job.inputs.base}: not a picture of this flight's place: {found.reason}; "
             "give a picture of the place, seen from above, neither mirrored nor of another scale than 0.5 to 2"
         )
+    check_scale(found.scale, given, plan.job.inputs.base or "")
 
 
 def _own_grid(plan: Plan, own: OwnBase, reference: int) -> GridRecord:
@@ -157,7 +171,7 @@ def _own_grid(plan: Plan, own: OwnBase, reference: int) -> GridRecord:
     )
 
 
-def _onto_given(plan: Plan, own: OwnBase, given: BasePicture, reference: int) -> tuple[GridRecord, list[Path]]:
+def _onto_given(plan: Plan, own: OwnBase, given: BasePicture) -> tuple[BaseFit, list[Path]]:
     """Register the own base image to the given picture, and write what follows from it."""
     layout = plan.layout
     found = register_intersensor(own.image, given.grey, plan.config.base, lens=pinhole(own.image.shape))
@@ -167,23 +181,20 @@ def _onto_given(plan: Plan, own: OwnBase, given: BasePicture, reference: int) ->
     write_atomically(layout.own_to_base, record.model_dump_json(indent=1).encode())
     write_atomically(layout.base_error_map, png_bytes(_error_picture(found)))
     written = [layout.own_to_base, layout.base_error_map, *write_given_picture(plan.layout, given)]
-    grid = _given_grid(plan, given, reference, None)
-    found_so = {"intersensor_error_px": found.left_out_error_px, "intersensor_points": len(found.error_left_out_px)}
-    return grid.model_copy(update=found_so), written
+    fit = BaseFit(
+        error_px=found.left_out_error_px,
+        points=len(found.error_left_out_px),
+        scale=found.scale,
+        rotation_rad=found.rotation_rad,
+        covered=covered_share(found.transform, own.valid, given),
+    )
+    return fit, written
 
 
-@dataclass(frozen=True)
-class _Direct:
-    """How well frames lie straight on the given picture."""
+def _straight_to(plan: Plan, given: BasePicture, key_points: dict[int, KeyPoints], lens: Lens) -> BaseFit | None:
+    """How frames lie straight on the given picture, by some that are spread over the flight; none where they do not.
 
-    heldout_px: float
-    points: int
-
-
-def _straight_to(plan: Plan, given: BasePicture, key_points: dict[int, KeyPoints], lens: Lens) -> _Direct | None:
-    """Whether frames can be registered straight to the given picture, by trying some that are spread over the flight.
-
-    Where they can, nothing stands between a frame and the map. Where they cannot (other season, other light), the
+    Where they do, nothing stands between a frame and the map. Where they do not (other season, other light), the
     flight's own base image does, and one smooth map from it to the picture.
     """
     config = plan.config.registration
@@ -193,14 +204,19 @@ def _straight_to(plan: Plan, given: BasePicture, key_points: dict[int, KeyPoints
     tried = [
         frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, min(_TRIED, len(frames))).round().astype(int))
     ]
-    heldout, points = [], []
+    fits = []
     for frame in tried:
         found = register_frame(store.read(frame), key_points[frame], reference, lens, config)
         if found.transform is None or not found.heldout_px <= _DIRECT_HELDOUT_PX or found.spread < _DIRECT_SPREAD:
             return None
-        heldout.append(found.heldout_px)
-        points.append(found.count_kept)
-    return _Direct(float(np.mean(heldout)), int(np.mean(points)))
+        scale, rotation = found.transform.scale_and_rotation()
+        check_scale(scale, given, plan.job.inputs.base or "")
+        covered = covered_share(found.transform, None, given)
+        fits.append(BaseFit(found.heldout_px, found.count_kept, scale, rotation, covered))
+    error_px, points, covered = (
+        float(np.mean([getattr(fit, name) for fit in fits])) for name in ("error_px", "points", "covered")
+    )
+    return replace(fits[len(fits) // 2], error_px=error_px, points=int(points), covered=covered)
 
 
 def write_given_picture(layout: RunLayout, given: BasePicture) -> list[Path]:
@@ -215,7 +231,9 @@ def write_given_picture(layout: RunLayout, given: BasePicture) -> list[Path]:
     return [layout.base_image]
 
 
-def _given_grid(plan: Plan, given: BasePicture, reference: int, direct: _Direct | None) -> GridRecord:
+def _given_grid(
+    plan: Plan, given: BasePicture, reference: int, fit: BaseFit, *, frames_to: Literal["own", "given"]
+) -> GridRecord:
     height, width = given.grey.shape
     return GridRecord(
         width_px=width,
@@ -224,10 +242,10 @@ def _given_grid(plan: Plan, given: BasePicture, reference: int, direct: _Direct 
         crs_wkt=given.crs_wkt,
         affine=given.affine,
         how="given",
-        frames_to="own" if direct is None else "given",
+        frames_to=frames_to,
         reference_frame=reference,
-        intersensor_error_px=None if direct is None else direct.heldout_px,
-        intersensor_points=None if direct is None else direct.points,
+        intersensor_error_px=fit.error_px,
+        intersensor_points=fit.points,
     )
 
 

@@ -55,7 +55,7 @@ def calibrate_flight(plan: Plan) -> Outcome:
 
 def _notes(record: CameraRecord) -> list[str]:
     if not record.accepted:
-        return ["why the lens is taken for a pin-hole, and how near it was: camera.json"]
+        return [f"the lens: {record.reason}"]
     if record.overlap is not None and record.overlap.used:
         return [f"the lens was refined by control points: {record.overlap.reason}"]
     return []

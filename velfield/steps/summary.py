@@ -17,7 +17,10 @@ _LINES: dict[str, str] = {
     "field": "vehicles passed {pixels:.0f} pixels, 5 or more vehicles {pixels_5:.0f} of them",
     "maps": "{maps:.0f} maps",
 }
-_PIN_HOLE = "no distortion to be told from none: taken for a pin-hole"
+_GIVEN_BASE = (
+    "base image {width:.0f} x {height:.0f} px as given, the flight lies on it to {intersensor_error_px:.2f} px"
+)
+_PIN_HOLE = "no distortion that the evidence bears out: taken for a pin-hole"
 _NO_DETECTOR = "none: another program's boxes are taken"
 _MEANS = frozenset({"heldout_px", "residual_px"})
 """Counts that are averaged over units, weighted by frames; all others are summed."""
@@ -34,9 +37,7 @@ def summarise_stage(
 ) -> StageSummary:
     """Add up a stage's units; ``before``: those that an earlier run had finished."""
     counts = _total([record.counts for record in records])
-    line = _PIN_HOLE if name == "lens" and not counts.get("corner_px") else _LINES[name]
-    if name == "detector" and records and "threshold" not in counts:
-        line = _NO_DETECTOR
+    line = _line(name, counts)
     text = line.format_map({key: counts.get(key, float("nan")) for key in _keys(line)})
     if before:
         text += f" ({len(before)} of {units} units were done before)" if len(before) < units else " (done before)"
@@ -54,6 +55,16 @@ def summarise_stage(
         seconds_before=sum(record.seconds for record in before),
         text=text,
     )
+
+
+def _line(name: str, counts: Mapping[str, float]) -> str:
+    if name == "lens" and not counts.get("corner_px"):
+        return _PIN_HOLE
+    if name == "base" and "intersensor_error_px" in counts:
+        return _GIVEN_BASE
+    if name == "detector" and counts and "threshold" not in counts:
+        return _NO_DETECTOR
+    return _LINES[name]
 
 
 def _keys(line: str) -> list[str]:
