@@ -13,7 +13,7 @@ from schemas.job import Inputs, Job
 from tests.scenes import by_homography, city, photograph, rms_after_homography, similarity
 from velfield.camera.lens import HarrisLens, lens_from_record, pinhole
 from velfield.camera.overlap import LensLine, Overlap, OverlapFit, fit_overlap
-from velfield.camera.refine import CONFIRMED_SIGMAS, LINES_FACTOR, refine
+from velfield.camera.refine import CONFIRMED_SIGMAS, LEAST_GAIN, LINES_FACTOR, refine
 from velfield.configuration import resolve_config
 from velfield.plan import make_plan
 from velfield.registration.pairing import matched_pairs
@@ -174,6 +174,19 @@ def test_a_distortion_that_few_lines_only_hint_at_is_brought_in() -> None:
     assert refined.overlap is not None
     assert refined.accepted, refined.overlap.reason
     assert off_the_truth_px(refined, 0.05) < 0.3
+
+
+def test_where_rows_move_by_more_than_the_lens_both_witnesses_are_believed_if_both_are_sure() -> None:
+    shaken = flown("along", 0.07, 11, wobble_px=4.0)
+    found = fitted(shaken)
+    assert (1.0 - LEAST_GAIN) * found.before_px < found.after_px < found.before_px
+    refined = refine(lined(0.072, 0.004, accepted=False), shaken)
+    assert refined.accepted
+    assert off_the_truth_px(refined, 0.07) < 0.3
+    unsure = refine(lined(0.072, 0.02, accepted=False), shaken)
+    assert not unsure.accepted
+    assert unsure.overlap is not None
+    assert "frames left out do not show it" in unsure.overlap.reason
 
 
 def test_a_distortion_that_lines_are_silent_of_is_brought_in_by_strong_evidence_alone() -> None:

@@ -30,7 +30,8 @@ BRING_IN_SIGMAS = 10.0
 CONFIRMED_SIGMAS = 4.0
 """... or this, where the lines' own fit, too weak to be accepted, says the same."""
 LEAST_GAIN = 0.03
-"""Share by which control points of frames left out must miss less with it than with the pin-hole."""
+"""Share by which control points of frames left out must miss less with it than with the pin-hole; where both stand as
+far above none and agree, less by anything: rows that move may be most of what they miss by."""
 MOST_LOSS = 0.02
 """Share by which they may miss more with a refined lens: that is noise."""
 LEAST_CORNER_PX = 2.0
@@ -160,7 +161,7 @@ def _joined(case: _Case, lines_a: float, lines_sd: float) -> CameraRecord:
 
 def _brought_in(case: _Case) -> CameraRecord:
     """A distortion that lines did not bear out, on strong evidence only; else the pin-hole."""
-    fit, value, said = case.fit, case.fit.amount, ""
+    fit, value, said, gain = case.fit, case.fit.amount, "", LEAST_GAIN
     needed = BRING_IN_SIGMAS if case.lines is None else CONFIRMED_SIGMAS
     if case.relief:
         return case.kept(f": {fit.fit_px:.1f} px off any plane, pin-hole kept")
@@ -172,8 +173,10 @@ def _brought_in(case: _Case) -> CameraRecord:
             return case.kept(f", {lines_a:.3f} by lines: they disagree, pin-hole kept")
         value = float(np.average([fit.amount, lines_a], weights=[fit.amount_sd**-2, lines_sd**-2]))
         said = f", {lines_a:.3f} +- {lines_sd:.3f} by lines"
-    if fit.after_px > (1.0 - LEAST_GAIN) * fit.before_px:
-        return case.kept(": frames left out do not show it, pin-hole kept")
+        agree = abs(fit.amount - lines_a) <= AGREEMENT_SIGMAS * float(np.hypot(fit.amount_sd, lines_sd))
+        gain = 0.0 if agree and abs(lines_a) >= CONFIRMED_SIGMAS * lines_sd else LEAST_GAIN
+    if fit.after_px >= (1.0 - gain) * fit.before_px:
+        return case.kept(f"{said}: frames left out do not show it, pin-hole kept")
     if case.corner_px(value) < LEAST_CORNER_PX:
         return case.kept(f": less than {LEAST_CORNER_PX:g} px at a corner, pin-hole kept")
     return case.changed(value, f"{said}: a distortion of {value:.3f} accepted")
