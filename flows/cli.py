@@ -35,6 +35,7 @@ app = App(
     version=_version,
     version_flags=["--version"],
     help_format="plaintext",  # Markdown takes a third of the time of --help
+    suppress_keyboard_interrupt=False,  # it would end without a word, and leave children behind
 )
 
 # Each in a file of its own, imported when it runs.
@@ -193,7 +194,8 @@ def simulate(
         Warnings only.
     """
     _simulate(out, frames=frames, size=size, seed=seed, quiet=quiet)
-    print(f"{out}: try  velfield run {out}/frames --timestamps {out}/timestamps.csv --gsd-m 0.23 --out RUN")
+    given = f"--timestamps {out}/timestamps.csv --base {out}/base.png --labels {out}/labels.csv --gsd-m 0.23"
+    print(f"{out}: try  velfield run {out}/frames {given} --out RUN")
     return DONE
 
 

@@ -17,6 +17,7 @@ _ENDING = (signal.SIGTERM, signal.SIGINT)
 _GRACE_S = 5.0
 """For Prefect to be told that the run ended; the frames under way, half a minute of work perhaps, are given up."""
 _END_S = 3.0
+_resumes = threading.Event()
 _MARK = "VELFIELD_STARTED_BY"
 """Environment: by which process, of which moment, all of its children were started."""
 _WATCH = """if True:
@@ -34,7 +35,11 @@ _WATCH = """if True:
 
 
 def stop_when_told() -> None:
-    """From now on SIGTERM is as Ctrl-C, and neither waits for the work under way. Call in the main thread."""
+    """From now on SIGTERM is as Ctrl-C, and neither waits for the work under way, which the same command resumes.
+
+    Call in the main thread.
+    """
+    _resumes.set()
     as_ctrl_c()
     # Prefect puts a handler of its own in the place of ours, then waits for the threads: this hears of it all the same.
     told, tell = socket.socketpair()
@@ -88,7 +93,8 @@ def _end_late(told: socket.socket, _tell: socket.socket) -> None:
 def leave(status: int) -> None:
     """Say so and end at once, with all that this process has started."""
     shown = "\x1b[?25h" if sys.stderr.isatty() else ""  # the cursor, which a progress bar hides
-    print(f"{shown}\nvelfield: stopped; the same command resumes", file=sys.stderr, flush=True)
+    told = "stopped; the same command resumes" if _resumes.is_set() else "stopped"
+    print(f"{shown}\nvelfield: {told}", file=sys.stderr, flush=True)
     end_children(_END_S)
     os._exit(status)
 

@@ -115,7 +115,7 @@ def test_another_place_is_refused_with_the_scores(base: np.ndarray) -> None:
     image = photograph(city(77, 900, blocks=220), view(1.0, 5.0), LENS, SHAPE, 1)
     result = register_intersensor(image, base, CONFIG, lens=LENS)
     assert isinstance(result, Failure)
-    assert "does not show this place" in result.reason
+    assert "not a picture of this flight's place; give one" in result.reason
     assert "SIFT: " in result.reason
     assert "matches agree" in result.reason
     assert "\n" not in result.reason
@@ -125,7 +125,8 @@ def test_a_mirrored_base_image_is_refused_and_called_so(ground: np.ndarray, base
     image = photograph(ground, view(1.0, 5.0), LENS, SHAPE, 1)
     result = register_intersensor(image, np.ascontiguousarray(base[:, ::-1]), CONFIG, lens=LENS)
     assert isinstance(result, Failure)
-    assert result.reason.startswith("the base image is mirrored, flip it")
+    assert result.reason.startswith("found a mirrored picture (")
+    assert result.reason.endswith("flip it")
 
 
 def test_a_black_frame_is_refused(base: np.ndarray) -> None:

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import psutil
@@ -38,3 +39,18 @@ def test_what_a_process_started_ends_with_it(kill: bool) -> None:
         assert bystander.poll() is None
         bystander.kill()
         bystander.wait()
+
+
+def test_ctrl_c_is_answered(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "flows.cli", "simulate", str(tmp_path / "flight"), "--frames", "500"]
+    checkout = str(Path(__file__).parents[1])
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": checkout}, text=True
+    ) as process:
+        deadline = time.monotonic() + 60
+        while not (tmp_path / "flight").exists() and time.monotonic() < deadline:
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert told.strip().splitlines()[-1] == "velfield: stopped"

@@ -16,7 +16,7 @@ from velfield.detection.samples import scene_of
 from velfield.errors import InputError
 from velfield.sources.labels import load_labels
 from velfield.sources.source import probe
-from velfield.steps.labelled import labelled_images
+from velfield.steps.labelled import labelled_images, odd_length
 from velfield.synthetic import small_flight
 
 QUICK = ["--set", "detection.rounds=30", "--set", "detection.feature_pool=200"]
@@ -104,3 +104,11 @@ def test_a_turned_car_in_an_upright_box_is_learnt_along_its_axis(tmp_path: Path)
     off = np.degrees(axial_difference(scene_of(image, has_background=False).cars[:, 2], axis))
     assert len(off) > 15
     assert np.mean(off < 15) > 0.85
+
+
+def test_marked_cars_that_are_not_as_long_as_cars_are_warned_of() -> None:
+    assert odd_length(20.0, 0.23) == odd_length(float("nan"), 0.23) == odd_length(20.0, None) == []
+    (short,), (long,) = odd_length(13.0, 0.23), odd_length(13.0, 0.8)
+    assert "3.0 m long, expected 3.3 to 6" in short
+    assert "give 0.34 if they are cars" in short
+    assert "10.4 m long" in long

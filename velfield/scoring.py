@@ -51,7 +51,7 @@ class RunScore:
         )
 
 
-def score_run(root: str | Path, flight: Path, *, min_count: int = 5) -> RunScore:
+def score_run(root: str | Path, flight: str | Path, *, min_count: int = 5) -> RunScore:
     """Score a run folder against the simulated flight that it is of.
 
     Where the run built its own base image, its base pixels are first brought to the truth's by the best homography.
@@ -61,7 +61,7 @@ def score_run(root: str | Path, flight: Path, *, min_count: int = 5) -> RunScore
     InputError
         The flight has no truth, or the run is not whole.
     """
-    run, truth = open_run(root), load_truth(flight)
+    run, truth = open_run(root), load_truth(Path(flight))
     source_index = run.frames.column("source_index")
     frame_of = {frame: int(index) for frame, index in enumerate(source_index)}
     registered = [frame for frame, status in enumerate(run.registration_status) if status == "ok"]

@@ -59,8 +59,14 @@ class _Case:
     def changed(self, amount: float, why: str) -> CameraRecord:
         """The lens of that amount."""
         evidence = self.evidence.model_copy(update={"used": True, "reason": f"{self.evidence.reason}{why}"})
-        lens = self._lens(amount).to_record()
-        return self.record.model_copy(update={"lens": lens, "accepted": True, "overlap": evidence})
+        record = self.record
+        if not record.accepted:  # the lens is not the one that lines had on trial
+            centre_sd_px = self.line.centre_sd * self.line.unit.half_diagonal_px
+            record = record.model_copy(update={"residual_px": None, "centre_sd_px": (centre_sd_px, centre_sd_px)})
+        told = {"lens": self._lens(amount).to_record(), "overlap": evidence}
+        return record.model_copy(
+            update={**told, "accepted": True, "reason": f"{record.reason}; then {evidence.reason}"}
+        )
 
     def corner_px(self, amount: float) -> float:
         """How far a lens of that amount moves the picture's corner."""

@@ -44,6 +44,7 @@ _WITNESS_COUNT, _WITNESS_SIDES_PX = 200, (21, 75)
 _WITNESS_TOLERANCE_PX = 2.0
 _BY_ROWS_SHARE = 0.45
 """Share of them that must agree by their rows where fewer do straight; of frames whose rows wobble by 4 px, .6 do."""
+_LEAST_CONTRAST_GREY = 1.0
 _ROW_BANDS, _ROW_POINTS = 64, 8
 """Rows within a 64th of the frame were taken at about one time; so many points tell how they moved."""
 _NEAR_SCALES = (0.8, 0.89, 1.0, 1.12, 1.25)
@@ -124,6 +125,8 @@ def register_intersensor(
     IntersensorResult or Failure
         The failure's reason is one line with each candidate's scores.
     """
+    if float(base.std()) < _LEAST_CONTRAST_GREY:
+        return Failure("found a picture of one grey level, expected one of the flight's place; give another")
     pair = Pair(image, base, lens, config)
     scores: list[str] = []
     for candidate in _candidates(pair, initial, scores):
@@ -147,12 +150,15 @@ def _is_mirrored(pair: Pair) -> bool:
 
 
 def _why_not(pair: Pair, scores: list[str]) -> str:
+    """What was found and what to do first, for people; then the scores."""
     mirrored = sift_agreement(pair.image, pair.base, pair.lens, wanted_scale=pair.config.coarse_scale, mirrored=True)
-    told = "the base image does not show this place"
     if mirrored.matrix is not None:
-        told = f"the base image is mirrored, flip it ({mirrored.inliers} of {mirrored.matches} SIFT matches agree then)"
+        return f"found a mirrored picture ({mirrored.inliers} of {mirrored.matches} SIFT matches agree so); flip it"
     needed = f"{pair.config.min_control_points} control points and {MIN_AGREEING_SHARE:.0%} of separate patches needed"
-    return f"{told}; found {'; '.join(scores)}; {needed}"
+    return (
+        "not a picture of this flight's place; give one of the place, seen from above, at 0.5 to 2 times the frames' "
+        f"scale. Tried ({needed}): {'; '.join(scores)}"
+    )
 
 
 def _candidates(pair: Pair, initial: Floats | None, scores: list[str]) -> Iterator[Coarse]:

@@ -139,7 +139,7 @@ def _finish(
         return Outcome(outputs, counts)
     counts |= {"intersensor_error_px": fit.error_px, "scale": fit.scale, "covered": fit.covered}
     by_hand = plan.config.gsd_m if given.gsd_m is None else None
-    return Outcome(outputs, counts, [*given.notes, fit.note()], fit.warnings(by_hand))
+    return Outcome(outputs, counts, [*given.notes, fit.note(by_hand)], fit.warnings())
 
 
 def _given_picture(plan: Plan) -> BasePicture | None:
@@ -151,10 +151,7 @@ def _check_place(plan: Plan, grey: NDArray[np.uint8], given: BasePicture, lens: 
     """Refuse a picture of another place before any frame is worked on."""
     found = register_intersensor(grey, given.grey, plan.config.base, lens=lens)
     if isinstance(found, Failure):
-        raise InputError(
-            f"--base {plan.job.inputs.base}: not a picture of this flight's place: {found.reason}; "
-            "give a picture of the place, seen from above, neither mirrored nor of another scale than 0.5 to 2"
-        )
+        raise InputError(f"--base {plan.job.inputs.base}: {found.reason}")
     check_scale(found.scale, given, plan.job.inputs.base or "")
 
 
@@ -182,6 +179,7 @@ def _onto_given(plan: Plan, own: OwnBase, given: BasePicture) -> tuple[BaseFit, 
     write_atomically(layout.base_error_map, png_bytes(_error_picture(found)))
     written = [layout.own_to_base, layout.base_error_map, *write_given_picture(plan.layout, given)]
     fit = BaseFit(
+        straight=False,
         error_px=found.left_out_error_px,
         points=len(found.error_left_out_px),
         scale=found.scale,
@@ -212,7 +210,7 @@ def _straight_to(plan: Plan, given: BasePicture, key_points: dict[int, KeyPoints
         scale, rotation = found.transform.scale_and_rotation()
         check_scale(scale, given, plan.job.inputs.base or "")
         covered = covered_share(found.transform, None, given)
-        fits.append(BaseFit(found.heldout_px, found.count_kept, scale, rotation, covered))
+        fits.append(BaseFit(True, found.heldout_px, found.count_kept, scale, rotation, covered))
     error_px, points, covered = (
         float(np.mean([getattr(fit, name) for fit in fits])) for name in ("error_px", "points", "covered")
     )

@@ -14,7 +14,7 @@ LEAST_SCALE, MOST_SCALE = 0.5, 2.0
 _SLACK = 1.05
 """The scale of a tilted frame differs over it."""
 _SAME_SCALE = 0.1
-"""Scales farther from 1 than this let metres a pixel of the one be mistaken for the other's."""
+"""Scales farther from 1 than this let metres a pixel of the base picture be mistaken for the frames'."""
 _COVERED = 0.95
 _SIDE = 25
 
@@ -25,38 +25,43 @@ class BaseFit:
 
     Attributes
     ----------
+    straight : whether frames are registered straight to it, not by way of the flight's own base image.
     error_px : distance of points left out of the fit, base px.
     points : how many of them.
-    scale, rotation_rad : base px a frame px in the frame's middle, and the turn there, from +x towards +y.
+    scale, rotation_rad : base px a frame px in the middle of a frame in the midst of the flight, and the turn there,
+        from +x towards +y.
     covered : share of what the flight shows that the picture does.
     """
 
+    straight: bool
     error_px: float
     points: int
     scale: float
     rotation_rad: float
     covered: float
 
-    def note(self) -> str:
-        """Where it lies, in one line."""
-        turn = np.degrees(self.rotation_rad)
-        return f"a frame pixel is {self.scale:.2f} base pixels in the frame's middle, turned by {turn:.0f} degrees"
-
-    def warnings(self, given_gsd_m: float | None) -> list[str]:
-        """What is to be minded of it; ``given_gsd_m``: ``--gsd-m`` where it alone tells the scale of the map."""
-        told = []
-        if self.covered < _COVERED:
-            told.append(
-                f"the base picture shows {self.covered:.0%} of what the flight does: vehicles beyond it are not on the "
-                "map; give a larger picture, or none"
-            )
+    def note(self, given_gsd_m: float | None) -> str:
+        """Where it lies, in one line; ``given_gsd_m``: ``--gsd-m`` where it alone tells the scale of the map."""
+        turn = round(float(np.degrees(self.rotation_rad)))
+        sense = "" if turn == 0 else ", clockwise" if turn > 0 else ", anticlockwise"
+        route = "straight" if self.straight else "by way of the flight's own base image"
+        told = (
+            f"frames are registered to it {route}: a frame pixel is about {self.scale:.2f} base pixels, "
+            f"turned by about {abs(turn)} degrees{sense}"
+        )
         if given_gsd_m is not None and abs(np.log(self.scale)) > _SAME_SCALE:
-            of_frame = f"{given_gsd_m * self.scale:.3g} m of a frame pixel"
-            told.append(
-                f"--gsd-m {given_gsd_m:g} is taken for metres a pixel of the base picture, which makes {of_frame}; if "
-                f"it is the frames', give --gsd-m {given_gsd_m / self.scale:.3g}"
-            )
+            of_frame = f"a frame pixel is {given_gsd_m * self.scale:.3g} m"
+            told += f"; --gsd-m {given_gsd_m:g} is of the base pixels, so that {of_frame}"
         return told
+
+    def warnings(self) -> list[str]:
+        """What is to be minded of it."""
+        if self.covered >= _COVERED:
+            return []
+        return [
+            f"the base picture shows {self.covered:.0%} of what the flight does: vehicles beyond it are not on the "
+            "map; give a larger picture, or none"
+        ]
 
 
 def check_scale(scale: float, given: BasePicture, name: str) -> None:

@@ -1,6 +1,7 @@
 """The detector of a flight: given, learnt from marked cars, or learnt from what moves; and the grid cars are looked
 for on."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from velfield.progress import advance
 from velfield.provenance import write_atomically
 from velfield.steps.external import given_boxes
 from velfield.steps.grid import read_grid
-from velfield.steps.labelled import base_px_per_raw_px, car_length_raw_px, labelled_images, marked_cars
+from velfield.steps.labelled import base_px_per_raw_px, car_length_raw_px, labelled_images, marked_cars, odd_length
 from velfield.steps.outcome import Outcome
 from velfield.steps.registration import usable_frames
 from velfield.steps.working import WorkingGrid, write_background
@@ -88,7 +89,8 @@ def _known_scale(plan: Plan) -> float:
 def _from_labels(plan: Plan) -> Outcome:
     labels = marked_cars(plan)
     base_per_raw = base_px_per_raw_px(plan)
-    scale = _scale_of_gsd(plan) or _scale_of_length(plan, car_length_raw_px(labels.cars), base_per_raw)
+    length_px = car_length_raw_px(labels.cars)
+    scale = _scale_of_gsd(plan) or _scale_of_length(plan, length_px, base_per_raw)
     if scale is None:
         raise InputError(
             "the size of a car is not known: the labels have no length_px and --gsd-m is not given; give either"
@@ -97,7 +99,8 @@ def _from_labels(plan: Plan) -> Outcome:
     samples = list(labelled_images(source, plan.info, labels, work_per_raw=work_per_raw))
     continued = _to_continue(plan.config.detection, len(labels.cars))
     detector = train_detector(samples, plan.config.detection, continued=continued)
-    return _finish(plan, detector, scale, "labels", count=len(labels.cars))
+    outcome = _finish(plan, detector, scale, "labels", count=len(labels.cars))
+    return replace(outcome, warnings=odd_length(length_px * base_per_raw, read_grid(plan).gsd_m))
 
 
 def _to_continue(config: DetectionConfig, cars: int) -> Detector | None:

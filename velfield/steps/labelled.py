@@ -23,6 +23,9 @@ from velfield.sources.source import iter_frames
 from velfield.steps.frame_maps import FrameMaps
 from velfield.stores import open_registration
 
+_SHORTEST_M, _USUAL_M, _LONGEST_M = 3.3, 4.4, 6.0
+"""Of what is marked as cars in a frame, half are shorter and half longer than something between."""
+
 
 def marked_cars(plan: Plan) -> Labels:
     """The labels of ``--labels``.
@@ -60,6 +63,19 @@ def car_length_raw_px(labels: pd.DataFrame) -> float:
     """Usual length of the marked cars, raw px; NaN where no label tells."""
     longest = labels[["length_px", "width_px"]].max(axis=1).dropna()
     return float(longest.median()) if len(longest) else float("nan")
+
+
+def odd_length(length_px: float, gsd_m: float | None) -> list[str]:
+    """A warning where marked cars of that usual length, px of ``gsd_m``, are not as long as cars; else none."""
+    if gsd_m is None or not np.isfinite(length_px):
+        return []
+    length_m = length_px * gsd_m
+    if _SHORTEST_M <= length_m <= _LONGEST_M:
+        return []
+    return [
+        f"the marked cars are {length_m:.1f} m long, expected {_SHORTEST_M:g} to {_LONGEST_M:g}: --gsd-m is metres a "
+        f"pixel of the base image; give {gsd_m * _USUAL_M / length_m:.2g} if they are cars, or mend the labels' lengths"
+    ]
 
 
 def labelled_images(source: Path, info: SourceInfo, labels: Labels, *, work_per_raw: float) -> Iterator[LabelledImage]:

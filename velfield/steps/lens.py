@@ -57,7 +57,7 @@ def _notes(record: CameraRecord) -> list[str]:
     if not record.accepted:
         return [f"the lens: {record.reason}"]
     if record.overlap is not None and record.overlap.used:
-        return [f"the lens was refined by control points: {record.overlap.reason}"]
+        return [f"the lens, refined by control points: {record.overlap.reason}"]
     return []
 
 

@@ -37,7 +37,8 @@ _CAPTIONS = {
     ),
     "lens": (
         "The lens",
-        "A frame as it was taken, and as a pin-hole would have taken it: the lines are straight in the second.",
+        "A frame as it was taken, and as a pin-hole would have taken it. The orange grid is straight on the ground: "
+        "kerbs and roofs along it follow it in both.",
         "a frame before and after the lens's distortion is taken out",
     ),
     "registration": (

@@ -18,8 +18,10 @@ _LINES: dict[str, str] = {
     "maps": "{maps:.0f} maps",
 }
 _GIVEN_BASE = (
-    "base image {width:.0f} x {height:.0f} px as given, the flight lies on it to {intersensor_error_px:.2f} px"
+    "base image {width:.0f} x {height:.0f} px as given, points left out of the fit to it miss by "
+    "{intersensor_error_px:.2f} px"
 )
+_LENS_BY_POINTS = "distortion of {corner_px:.1f} px at the corners"
 _PIN_HOLE = "no distortion that the evidence bears out: taken for a pin-hole"
 _NO_DETECTOR = "none: another program's boxes are taken"
 _MEANS = frozenset({"heldout_px", "residual_px"})
@@ -60,6 +62,8 @@ def summarise_stage(
 def _line(name: str, counts: Mapping[str, float]) -> str:
     if name == "lens" and not counts.get("corner_px"):
         return _PIN_HOLE
+    if name == "lens" and "residual_px" not in counts:
+        return _LENS_BY_POINTS
     if name == "base" and "intersensor_error_px" in counts:
         return _GIVEN_BASE
     if name == "detector" and counts and "threshold" not in counts:
