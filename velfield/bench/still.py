@@ -57,7 +57,8 @@ class StillScore:
         return (
             f"{self.points} still corners in {self.frames} frames: standard deviation {self.sd_median_px:.3f} px "
             f"an axis (median; 90 % below {self.sd_p90_px:.3f}; noise of 3 grey levels, as in "
-            f"compressed pictures, would move one by {self.noise_px:.3f}), drift from first to last tenth {self.drift_px:.3f} px"
+            f"compressed pictures, would move one by {self.noise_px:.3f}), "
+            f"drift from first to last tenth {self.drift_px:.3f} px"
         )
 
 
