@@ -22,7 +22,7 @@ from schemas.summary import RunSummary
 from velfield import graphs
 from velfield.layout import RunLayout
 from velfield.locking import locked
-from velfield.plan import Plan, make_plan, write_flight_record
+from velfield.plan import Plan, changed_since, make_plan, write_flight_record
 from velfield.provenance import sweep_partial
 from velfield.steps.field import field_groups, group_name, lay_out_field
 from velfield.steps.frames import lay_out_frames
@@ -55,8 +55,12 @@ def process_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSumma
         plan = make_plan(job)
         check_given(plan)
         check_space(plan)
+        changed = changed_since(plan)
         write_flight_record(plan)
         console.event("start", f"{job.inputs.source}: {plan.frame_count} frames to work on, {where.description}")
+        if changed:
+            told = f"{', '.join(changed)} given otherwise than before, so what follows from it is done anew"
+            console.event("changed", f"{job.root}: {told}", changed=changed)
         for warning in plan.info.warnings:
             console.warn(warning)
         work = Work(plan, where, console)

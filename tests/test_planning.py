@@ -12,7 +12,7 @@ from schemas.records import InputsRecord, SourceRecord
 from tests.small_flight import job
 from velfield.configuration import resolve_config
 from velfield.errors import InputError
-from velfield.plan import Plan, make_plan, stage_keys
+from velfield.plan import Plan, changed_since, make_plan, stage_keys, write_flight_record
 from velfield.sources.frames import SourceInfo
 from velfield.steps.given import check_given
 from velfield.steps.planning import describe_plan, planned_units
@@ -43,6 +43,18 @@ def test_task_runs_grow_with_chunks_not_with_frames(tmp_path: Path) -> None:
     runs = {frames: len(planned(frames, tmp_path).units) for frames in (18, 300, 3000, 30_000, FOUR_HOURS)}
     assert max(runs.values()) < 300
     assert runs[300] >= 4  # and yet several workers have something to do
+
+
+def test_what_is_given_otherwise_than_before_is_known(flight: Path, tmp_path: Path) -> None:
+    first = make_plan(job(flight, tmp_path / "run"))
+    assert changed_since(first) == []
+    write_flight_record(first)
+    assert changed_since(make_plan(job(flight, tmp_path / "run"))) == []
+    given = job(flight, tmp_path / "run", "tracking.max_interval_s=0.6")
+    given = given.model_copy(update={"inputs": given.inputs.model_copy(update={"base": None})})
+    assert changed_since(make_plan(given)) == ["base", "settings"]
+    first.layout.flight.write_text('{"format_version": 999}')
+    assert changed_since(first) == []
 
 
 @pytest.mark.parametrize("text", ["nonsense", "6-0", "0-3,2-5"])

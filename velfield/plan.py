@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from schemas.flight import FlightConfig
 from schemas.job import Job
@@ -205,6 +206,20 @@ def stage_keys(config: FlightConfig, inputs: InputsRecord) -> dict[str, str]:
     key("maps", [], ["field"])
     assert tuple(keys) == STAGES
     return keys
+
+
+def changed_since(plan: Plan) -> list[str]:
+    """What was given otherwise when the run folder was last worked on; none where it is new, or by another version."""
+    if not plan.layout.flight.exists():
+        return []
+    try:
+        old = FlightRecord.model_validate_json(plan.layout.flight.read_bytes())
+    except ValidationError:
+        return []  # that version's stages have other keys as well: all is done anew
+    moved = old.inputs.source.model_copy(update={"path": plan.inputs.source.path})
+    before = old.inputs.model_copy(update={"source": moved})
+    inputs = [name for name in InputsRecord.model_fields if getattr(before, name) != getattr(plan.inputs, name)]
+    return inputs + (["settings"] if old.config != plan.config else [])
 
 
 def write_flight_record(plan: Plan) -> None:

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -86,7 +85,7 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeyPoints]]) -> Outcom
     if given is not None:
         direct = _straight_to(plan, given, key_points, lens)
         if direct is not None:  # to half a pixel all over the frame: no other place does that
-            grid = _given_grid(plan, given, reference, direct, frames_to="given")
+            grid = _given_grid(plan, given, reference, direct)
             layout.own_to_base.unlink(missing_ok=True)
             return _finish(plan, grid, write_given_picture(layout, given), given=given, fit=direct)
         _check_place(plan, store.read(reference), given, lens)
@@ -112,7 +111,7 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeyPoints]]) -> Outcom
         outputs.append(layout.base_image)
     else:
         fit, written = _onto_given(plan, own, given)
-        grid = _given_grid(plan, given, reference, fit, frames_to="own")
+        grid = _given_grid(plan, given, reference, fit)
         outputs += written
     return _finish(plan, grid, outputs, frames=own.frames, given=given, fit=fit)
 
@@ -229,9 +228,7 @@ def write_given_picture(layout: RunLayout, given: BasePicture) -> list[Path]:
     return [layout.base_image]
 
 
-def _given_grid(
-    plan: Plan, given: BasePicture, reference: int, fit: BaseFit, *, frames_to: Literal["own", "given"]
-) -> GridRecord:
+def _given_grid(plan: Plan, given: BasePicture, reference: int, fit: BaseFit) -> GridRecord:
     height, width = given.grey.shape
     return GridRecord(
         width_px=width,
@@ -240,7 +237,7 @@ def _given_grid(
         crs_wkt=given.crs_wkt,
         affine=given.affine,
         how="given",
-        frames_to=frames_to,
+        frames_to="given" if fit.straight else "own",
         reference_frame=reference,
         intersensor_error_px=fit.error_px,
         intersensor_points=fit.points,
