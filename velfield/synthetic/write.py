@@ -56,9 +56,13 @@ def write_flight(
         _write_picture(out / "frames" / names[k], flight.frame(k), options)
 
     with ThreadPoolExecutor(threads) as pool:
-        for done, _ in enumerate(pool.map(one, range(config.frames)), start=1):
-            if progress is not None:
-                progress(done, config.frames)
+        try:
+            for done, _ in enumerate(pool.map(one, range(config.frames)), start=1):
+                if progress is not None:
+                    progress(done, config.frames)
+        except BaseException:  # Ctrl-C above all: the frames not begun are not waited for
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
     return flight
 
 
