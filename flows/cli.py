@@ -193,6 +193,9 @@ def simulate(
     quiet
         Warnings only.
     """
+    from flows.stopping import as_ctrl_c
+
+    as_ctrl_c()
     _simulate(out, frames=frames, size=size, seed=seed, quiet=quiet)
     given = f"--timestamps {out}/timestamps.csv --base {out}/base.png --labels {out}/labels.csv --gsd-m 0.23"
     print(f"{out}: try  velfield run {out}/frames {given} --out RUN")
