@@ -10,7 +10,7 @@ from cyclopts import App, Parameter
 
 from flows.launch import limit_threads
 from flows.options import Preset, Settings, frame_size
-from flows.stopping import STOPPED, leave
+from flows.stopping import STOPPED, as_ctrl_c, leave
 from velfield.errors import InputError
 
 if TYPE_CHECKING:
@@ -193,9 +193,6 @@ def simulate(
     quiet
         Warnings only.
     """
-    from flows.stopping import as_ctrl_c
-
-    as_ctrl_c()
     _simulate(out, frames=frames, size=size, seed=seed, quiet=quiet)
     given = f"--timestamps {out}/timestamps.csv --base {out}/base.png --labels {out}/labels.csv --gsd-m 0.23"
     print(f"{out}: try  velfield run {out}/frames {given} --out RUN")
@@ -365,6 +362,7 @@ def _verbosity(quiet: bool, verbose: bool, log_json: bool) -> "Verbosity":
 def main() -> None:
     """Run the command; bad input is one clear line, never a traceback."""
     limit_threads()
+    as_ctrl_c()
     try:
         status = app(result_action="return_value")
     except InputError as error:

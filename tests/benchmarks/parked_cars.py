@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from velfield import open_run
-from velfield.bench.still import PATCH_HALF_PX, SHARP_PX, about_their_middles, places_on_map
+from velfield.bench.still import SHARP_PX, about_their_middles, places_on_map, unused_corners
 from velfield.detection.ship import boxes_of
-from velfield.registration.alignment import FEW, MANY, Templates, make_templates
+from velfield.registration.alignment import Templates
 from velfield.run import Run
-from velfield.sources.pictures import read_picture_grey
 
 FloatArray = NDArray[np.float64]
 
@@ -66,11 +65,7 @@ def _parked(run: Run, boxes: list[NDArray[np.float64]]) -> FloatArray:
 
 def _corners_on(run: Run, parked: FloatArray) -> Templates:
     """The sharp corners on these cars that registration does not use."""
-    limit = run.record.config.frames.max_pixels
-    grey = read_picture_grey(run.layout.own_base_image, limit)
-    known = read_picture_grey(run.layout.own_base_mask, limit) > 0
-    used = np.concatenate([make_templates(grey, known, count=count).xy for count in (FEW, MANY)])
-    found = make_templates(grey, known, apart_from=used, half_patch=PATCH_HALF_PX)
+    found, _ = unused_corners(run)
     on_car = np.zeros(len(found), np.bool_)
     for x, y, length in parked:
         on_car |= np.hypot(*(found.xy - (x, y)).T) < ITS_OWN * length

@@ -94,7 +94,7 @@ def still_things(run: Run, *, max_frames: int = 200, within: FloatArray | None =
     chosen = np.unique(np.linspace(0, len(registered) - 1, min(max_frames, len(registered))).astype(int))
     if len(chosen) < 3:
         raise InputError(f"{run.layout.root}: {len(registered)} registered frames, 3 or more needed to see jitter")
-    templates = _unused_corners(run, within)
+    templates = _sharpest(run, within)
     places = np.full((len(chosen), len(templates), 2), np.nan)
     for row, k in enumerate(chosen):
         transform = maps.transform(registered[k])
@@ -103,14 +103,19 @@ def still_things(run: Run, *, max_frames: int = 200, within: FloatArray | None =
     return _score(places, run, float(np.median(templates.sigma_px)))
 
 
-def _unused_corners(run: Run, within: FloatArray | None) -> Templates:
-    """The sharpest corners of the picture that frames were registered to, away from those that registration aligns."""
+def unused_corners(run: Run) -> tuple[Templates, NDArray[np.uint8]]:
+    """Corners that registration does not align, of the picture (h, w) that frames were registered to; and that."""
     layout, limit = run.layout, run.record.config.frames.max_pixels
     own = run.grid.frames_to == "own"
     grey = read_picture_grey(layout.own_base_image, limit) if own else run.base_image
     known = read_picture_grey(layout.own_base_mask, limit) > 0 if own else np.ones(grey.shape, np.bool_)
     used = [make_templates(grey, known, count=count).xy for count in (FEW, MANY)]
-    found = make_templates(grey, known, apart_from=np.concatenate(used), half_patch=PATCH_HALF_PX)
+    return make_templates(grey, known, apart_from=np.concatenate(used), half_patch=PATCH_HALF_PX), grey
+
+
+def _sharpest(run: Run, within: FloatArray | None) -> Templates:
+    """The sharpest of those corners, in an area where one is given."""
+    found, grey = unused_corners(run)
     inside = np.ones(len(found), np.bool_)
     if within is not None:
         area = cv2.fillPoly(np.zeros(grey.shape, np.uint8), [np.rint(within).astype(np.int32)], (1,))

@@ -78,6 +78,10 @@ class _Case:
         """Whether the points miss by more than any plane explains."""
         return self.fit.fit_px > LARGEST_FIT * self.line.unit.half_diagonal_px
 
+    def agrees(self, lines_a: float, lines_sd: float) -> bool:
+        """Whether the control points say what the lines do, within both deviations."""
+        return abs(self.fit.amount - lines_a) <= AGREEMENT_SIGMAS * float(np.hypot(self.fit.amount_sd, lines_sd))
+
     def _lens(self, amount: float) -> AnyLens:
         return self.line.lens(np.array([amount, 0.0, 0.0]))
 
@@ -155,7 +159,7 @@ def _joined(case: _Case, lines_a: float, lines_sd: float) -> CameraRecord:
     said = f", {lines_a:.3f} +- {lines_sd:.3f} by lines"
     if case.relief:
         return case.kept(f"{said}: {fit.fit_px:.1f} px off any plane, the lines' lens kept")
-    if abs(fit.amount - lines_a) > AGREEMENT_SIGMAS * float(np.hypot(fit.amount_sd, lines_sd)):
+    if not case.agrees(lines_a, lines_sd):
         return case.kept(f"{said}: they disagree, the lines' lens kept")
     if share < LEAST_SHARE:
         return case.kept(f"{said}: the frames differ too little in place to say more, the lines' lens kept")
@@ -179,8 +183,8 @@ def _brought_in(case: _Case) -> CameraRecord:
             return case.kept(f", {lines_a:.3f} by lines: they disagree, pin-hole kept")
         value = float(np.average([fit.amount, lines_a], weights=[fit.amount_sd**-2, lines_sd**-2]))
         said = f", {lines_a:.3f} +- {lines_sd:.3f} by lines"
-        agree = abs(fit.amount - lines_a) <= AGREEMENT_SIGMAS * float(np.hypot(fit.amount_sd, lines_sd))
-        gain = 0.0 if agree and abs(lines_a) >= CONFIRMED_SIGMAS * lines_sd else LEAST_GAIN
+        sure = abs(lines_a) >= CONFIRMED_SIGMAS * lines_sd and case.agrees(lines_a, lines_sd)
+        gain = 0.0 if sure else LEAST_GAIN
     if fit.after_px >= (1.0 - gain) * fit.before_px:
         return case.kept(f"{said}: frames left out do not show it, pin-hole kept")
     if case.corner_px(value) < LEAST_CORNER_PX:

@@ -210,10 +210,12 @@ def _straight_to(plan: Plan, given: BasePicture, key_points: dict[int, KeyPoints
         check_scale(scale, given, plan.job.inputs.base or "")
         covered = covered_share(found.transform, None, given)
         fits.append(BaseFit(True, found.heldout_px, found.count_kept, scale, rotation, covered))
-    error_px, points, covered = (
-        float(np.mean([getattr(fit, name) for fit in fits])) for name in ("error_px", "points", "covered")
+    return replace(
+        fits[len(fits) // 2],
+        error_px=float(np.mean([fit.error_px for fit in fits])),
+        points=int(np.mean([fit.points for fit in fits])),
+        covered=float(np.mean([fit.covered for fit in fits])),
     )
-    return replace(fits[len(fits) // 2], error_px=error_px, points=int(points), covered=covered)
 
 
 def write_given_picture(layout: RunLayout, given: BasePicture) -> list[Path]:
