@@ -4,7 +4,7 @@ from importlib.metadata import version
 
 STAGE_VERSIONS: dict[str, int] = {
     "frames": 1,
-    "lens": 5,
+    "lens": 6,
     "base": 4,
     "registration": 4,
     "detector": 14,

@@ -265,7 +265,8 @@ def find_arcs(
     max_curvature_per_px
         Most bent arc, 1 / px: what the strongest lens considered makes of a straight line.
     """
-    smooth = cv2.GaussianBlur(grey, (0, 0), smoothing_px).astype(np.float32)
+    # In whole grey values a faint edge is lost among steps.
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), smoothing_px)
     sample = smooth[::4, ::4]
     steepness = np.hypot(np.diff(sample, axis=0)[:, :-1], np.diff(sample, axis=1)[:-1]) / 4.0
     threshold = max(min_gradient, float(np.quantile(steepness, 1.0 - edge_share)))
@@ -282,7 +283,8 @@ def find_arcs(
 
 
 def pool_arcs(parts: list[Arcs], *, max_points: int) -> Arcs:
-    """Arcs of several frames as one set, evenly thinned along each arc, the longest arcs where all would be too many.
+    """Arcs of several frames as one set, as points that are means of pieces of their arc, the longest arcs where all
+    would be too many.
 
     Parameters
     ----------
@@ -290,25 +292,29 @@ def pool_arcs(parts: list[Arcs], *, max_points: int) -> Arcs:
         Arcs of each frame.
     max_points
         Points kept, all frames together. A long arc tells more by its length, not by its number of points, whose noise
-        neighbours share: so each arc keeps the same number, 10 to 24, the fewer the more arcs there are.
+        neighbours share: so each arc is cut into the same number of pieces, 10 to 24, the fewer the more arcs there
+        are. A piece's mean has less noise than any of its points, and its bow is the same all along an arc.
     """
     offsets = np.cumsum([0, *(part.length_px.size for part in parts)])
     arc = np.concatenate([part.arc + offset for part, offset in zip(parts, offsets, strict=False)])
-    pooled = Arcs(
-        np.concatenate([part.xy for part in parts]),
-        np.concatenate([part.tangents for part in parts]),
-        arc,
-        np.concatenate([part.frame for part in parts]),
-        np.concatenate([part.length_px for part in parts]),
-    )
-    count = pooled.length_px.size
+    length_px = np.concatenate([part.length_px for part in parts])
+    frame = np.concatenate([part.frame for part in parts])
+    count = length_px.size
     points_per_arc = int(np.clip(max_points // max(count, 1), _FEWEST_POINTS, _MOST_POINTS))
     sizes = np.bincount(arc, minlength=count)
     within = np.arange(arc.size) - (np.cumsum(sizes) - sizes)[arc]
-    share = np.minimum(sizes, points_per_arc)[arc] / sizes[arc]
-    wanted = np.floor((within + 0.5) * share + 0.5) != np.floor((within - 0.5) * share + 0.5)
-    longest = np.argsort(-pooled.length_px, kind="stable")
+    pieces = np.minimum(sizes, points_per_arc)
+    piece = (np.cumsum(pieces) - pieces)[arc] + within * pieces[arc] // sizes[arc]
+    xy = _means(np.concatenate([part.xy for part in parts]), piece)
+    tangents = _means(np.concatenate([part.tangents for part in parts]), piece)
+    tangents /= np.hypot(tangents[:, :1], tangents[:, 1:])
+    longest = np.argsort(-length_px, kind="stable")
     kept = np.zeros(count, dtype=bool)
     kept[longest[: max_points // points_per_arc]] = True
-    thinned = Arcs(pooled.xy[wanted], pooled.tangents[wanted], arc[wanted], pooled.frame, pooled.length_px)
-    return thinned.only(kept)
+    return Arcs(xy, tangents, np.repeat(np.arange(count), pieces), frame, length_px).only(kept)
+
+
+def _means(values: Floats, group: Ints) -> Floats:
+    """Mean of the values (n, 2) of each group, (groups, 2); no group is empty."""
+    size = np.bincount(group)
+    return np.stack([np.bincount(group, weights=values[:, k]) / size for k in (0, 1)], axis=1)

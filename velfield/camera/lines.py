@@ -40,7 +40,7 @@ class LineSet:
         return LineSet(self.xy[points], self.tangents[points], number[self.line[points]], self.frame[lines])
 
 
-def _fitted(xy: Floats, line: Ints, count: int) -> tuple[Floats, Floats]:
+def fitted_lines(xy: Floats, line: Ints, count: int) -> tuple[Floats, Floats]:
     """Mean (count, 2) and unit direction (count, 2) of the least-squares line of each group of points."""
     size = np.maximum(np.bincount(line, minlength=count), 1)
     mean = np.stack([np.bincount(line, weights=xy[:, k], minlength=count) / size for k in (0, 1)], axis=1)
@@ -58,7 +58,7 @@ def line_residuals(lines: LineSet, lens: Lens) -> Floats:
     The distance is taken in the undistorted picture and divided by the stretch there: no lens gains by shrinking.
     """
     xy = lens.undistort_points(lines.xy)
-    mean, direction = _fitted(xy, lines.line, lines.count)
+    mean, direction = fitted_lines(xy, lines.line, lines.count)
     normal = np.stack([-direction[:, 1], direction[:, 0]], axis=1)[lines.line]
     across = lens.undistort_tangents(lines.xy, np.stack([-lines.tangents[:, 1], lines.tangents[:, 0]], axis=1))
     stretch = np.abs(np.sum(normal * across, axis=1))
@@ -94,7 +94,7 @@ def join_arcs(arcs: Arcs, lens: Lens, *, tolerance_px: float, max_turn_rad: floa
         return join_arcs(
             arcs.only(~outside), lens, tolerance_px=tolerance_px, max_turn_rad=max_turn_rad, min_length_px=min_length_px
         )
-    mean, direction = _fitted(xy, arcs.arc, count)
+    mean, direction = fitted_lines(xy, arcs.arc, count)
     along = np.sum((xy - mean[arcs.arc]) * direction[arcs.arc], axis=1)
     low, high = np.full(count, np.inf), np.full(count, -np.inf)
     np.minimum.at(low, arcs.arc, along)
@@ -110,7 +110,7 @@ def join_arcs(arcs: Arcs, lens: Lens, *, tolerance_px: float, max_turn_rad: floa
     frame = np.zeros(label.max() + 1, dtype=np.int64)
     frame[label] = arcs.frame
     joined = LineSet(arcs.xy, arcs.tangents, line, frame)
-    return joined.only(_chord(joined) >= min_length_px)
+    return joined.only(chords(joined) >= min_length_px)
 
 
 def _joinable(
@@ -133,9 +133,9 @@ def _joinable(
     return arcs[longer], arcs[shorter]
 
 
-def _chord(lines: LineSet) -> Floats:
+def chords(lines: LineSet) -> Floats:
     """Extent of each line along itself, raw px."""
-    mean, direction = _fitted(lines.xy, lines.line, lines.count)
+    mean, direction = fitted_lines(lines.xy, lines.line, lines.count)
     along = np.sum((lines.xy - mean[lines.line]) * direction[lines.line], axis=1)
     low, high = np.full(lines.count, np.inf), np.full(lines.count, -np.inf)
     np.minimum.at(low, lines.line, along)

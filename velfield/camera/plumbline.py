@@ -6,7 +6,8 @@
 3. Arcs that one line explains are joined, and the lens fitted below the pixel by the lines' straightness (`lines`,
    `straighten`): Harris' model, the division model, polynomials of two and three terms, of which lines left out of the
    fit choose.
-4. The evidence: a city has kerbs that bend, and from few lines any lens can be had. A distortion is accepted where it
+4. Families of parallels say by their directions what bows are too small to say (`parallels`).
+5. The evidence: a city has kerbs that bend, and from few lines any lens can be had. A distortion is accepted where it
    lowers the entropy, stands well above its own uncertainty, comes out alike from arcs alone, from lines joined without
    a lens and from lines joined with it, and straightens most of the lines that it changes at all. Otherwise the
    pin-hole stays, and the reason is given.
@@ -25,6 +26,7 @@ from velfield.camera.edges import Arcs, find_arcs, pool_arcs
 from velfield.camera.entropy import hough_entropy
 from velfield.camera.lens import HarrisLens, pinhole
 from velfield.camera.lines import LineSet, join_arcs, line_residuals, line_rms
+from velfield.camera.parallels import refine_by_parallels
 from velfield.camera.straighten import AnyLens, LensFamily, StraightFit, fit_lens, heldout_rms
 from velfield.errors import InputError
 
@@ -176,20 +178,26 @@ def calibrate(frames: Sequence[Grey], config: LensConfig, seed: int = 0) -> Cali
     if harris is None:
         reason = f"fewer than {MIN_LINES} lines long enough in {len(frames)} frames"
         return CalibrationResult(pinhole(shape), False, reason, shape, frames=len(frames))
-    best, lines, candidates = _choose_model(scene, harris, seed)
-    accepted, reason = _judge(scene, harris, best, lines, bounded=0 < int(np.argmin(grid_entropy)) < len(grid_a) - 1)
+    fits, chosen, lines, heldout = _choose_model(scene, harris, seed)
+    bounded = 0 < int(np.argmin(grid_entropy)) < len(grid_a) - 1
+    accepted, reason = _judge(scene, harris, fits[chosen], lines, bounded=bounded)
     accepted = accepted or config.calibrate == "always"
-    spread = np.sqrt(np.diag(harris.covariance))
+    for number in {0, chosen}:
+        fits[number] = refine_by_parallels(fits[number], lines, seed)
+    candidates = _evidence(scene, fits, lines, heldout)
+    spread = np.sqrt(np.diag(fits[0].covariance))
     centre_sd = spread[-2:] * scene.pinhole.half_diagonal_px
+    if accepted:
+        reason += f"; with what parallels say, a = {fits[0].parameters[0]:.3f} +- {spread[0]:.3f}"
     return CalibrationResult(
-        lens=best.lens if accepted else scene.pinhole,
+        lens=fits[chosen].lens if accepted else scene.pinhole,
         accepted=accepted,
         reason=reason,
         frame_shape=shape,
         frames=len(frames),
         lines=lines.count,
         edge_points=int(lines.line.size),
-        residual_px=best.residual_px,
+        residual_px=fits[chosen].residual_px,
         residual_without_px=candidates[0].residual_px,
         a_sd=float(spread[0]),
         centre_sd_px=(float(centre_sd[0]), float(centre_sd[1])),
@@ -262,10 +270,9 @@ def _fit_harris(scene: _Scene, start: Floats) -> StraightFit | None:
     return fit
 
 
-def _choose_model(
-    scene: _Scene, harris: StraightFit, seed: int
-) -> tuple[StraightFit, LineSet, tuple[ModelEvidence, ...]]:
-    """The simplest model that lines left out of the fit do not tell from the best; the lines; the evidence of each."""
+def _choose_model(scene: _Scene, harris: StraightFit, seed: int) -> tuple[list[StraightFit], int, LineSet, list[float]]:
+    """A fit of each model, the number of the simplest that lines left out of the fit do not tell from the best, the
+    lines, and the usual RMS of those left out, px, without a lens and by each model."""
     a = float(harris.parameters[0])
     series = np.array([a / 2.0, 3.0 / 8.0 * a * a, 5.0 / 16.0 * a**3])
     centre = harris.parameters[1:]
@@ -285,7 +292,7 @@ def _choose_model(
     for number in range(1, len(fits)):
         if typical[1 + number] < (1.0 - MODEL_GAIN) * typical[1 + chosen]:
             chosen = number
-    return fits[chosen], lines, _evidence(scene, fits, lines, typical)
+    return fits, chosen, lines, typical
 
 
 def _evidence(

@@ -5,7 +5,7 @@ no lens straightens (a kerb that bends) is weighed down as a whole, by its own R
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -176,8 +176,14 @@ def _finished(lines: LineSet, family: LensFamily, parameters: Floats, residuals:
     jacobian = _jacobian(lines, family, parameters, residuals)
     information, by_line = _information(lines, jacobian, residuals, point_weight)
     bread = np.linalg.inv(information + np.diag(_prior(information, by_line)))
-    residual = float(np.sqrt(np.sum(point_weight * residuals**2) / np.sum(point_weight)))
-    return StraightFit(family, parameters, bread @ by_line @ bread, residual, weights)
+    fit = StraightFit(family, parameters, bread @ by_line @ bread, 0.0, weights)
+    return replace(fit, residual_px=usual_residual(lines, fit))
+
+
+def usual_residual(lines: LineSet, fit: StraightFit) -> float:
+    """RMS distance of the points from their lines under a fit's lens, by the lines' weights, raw px."""
+    residuals, weight = line_residuals(lines, fit.lens), fit.weights[lines.line]
+    return float(np.sqrt(np.sum(weight * residuals**2) / np.sum(weight)))
 
 
 def heldout_rms(lines: LineSet, families: Sequence[tuple[LensFamily, Floats]], *, folds: int, seed: int) -> Floats:
