@@ -91,7 +91,8 @@ def refine_by_parallels(fit: StraightFit, lines: LineSet, seed: int = 0) -> Stra
     Returns
     -------
     StraightFit
-        The same fit where no frame has a family.
+        The same fit where no frame has a family, where straightness is surer than parallels can be, and where the
+        model ends within the picture.
     """
     if float(np.sqrt(fit.covariance[0, 0])) < LEAST_DOUBT * abs(float(fit.parameters[0])):
         return fit
