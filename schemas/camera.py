@@ -97,7 +97,7 @@ class CameraRecord(Model):
     residual_without_px: float | None = None
     """The same with no lens."""
     a_sd: float | None = None
-    """Standard deviation of the distortion, lines resampled as wholes."""
+    """Standard deviation of the distortion by all that was heard of it, kerbs that bend alike allowed for."""
     centre_sd_px: tuple[float, float] | None = None
     frames: NonNegativeInt = 0
     lines: NonNegativeInt = 0

@@ -65,6 +65,20 @@ def test_it_is_as_good_as_a_small_flight_lets_it_be(whole: tuple[Path, RunSummar
     assert score.field.pixels > 1000
 
 
+def test_a_run_on_another_base_image_has_no_score(
+    whole: tuple[Path, RunSummary], flight: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from velfield.scoring import score_run
+    from velfield.synthetic.truth import Truth
+
+    def turned(truth: Truth, frame: int, xy_raw: np.ndarray) -> np.ndarray:
+        return truth.camera.to_base(frame, xy_raw)[:, ::-1] * (1, -1) + (0, 400)
+
+    monkeypatch.setattr(Truth, "to_base", turned)
+    with pytest.raises(InputError, match=r"px off those of .* its base image is another one; score a run with --base"):
+        score_run(whole[0], flight)
+
+
 def test_a_second_run_does_nothing_again(whole: tuple[Path, RunSummary], flight: Path) -> None:
     root, _ = whole
     before = digests(root)

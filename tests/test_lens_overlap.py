@@ -13,7 +13,8 @@ from schemas.job import Inputs, Job
 from tests.scenes import by_homography, city, photograph, rms_after_homography, similarity
 from velfield.camera.lens import HarrisLens, lens_from_record, pinhole
 from velfield.camera.overlap import LensLine, Overlap, OverlapFit, fit_overlap
-from velfield.camera.refine import CONFIRMED_SIGMAS, LEAST_GAIN, LINES_FACTOR, refine
+from velfield.camera.plumbline import LINES_FACTOR
+from velfield.camera.refine import CONFIRMED_SIGMAS, LEAST_GAIN, refine
 from velfield.configuration import resolve_config
 from velfield.plan import make_plan
 from velfield.registration.pairing import matched_pairs
@@ -94,7 +95,7 @@ def lined(a: float, a_sd: float, *, accepted: bool = True) -> CameraRecord:
         frame_height_px=HEIGHT,
         accepted=accepted,
         reason="by lines",
-        a_sd=a_sd,
+        a_sd=LINES_FACTOR * a_sd,
         centre_sd_px=(4.0, 4.0),
         candidates=(ModelEvidence(model="harris", parameters=(a, 0.0, 0.0), residual_px=0.2, heldout_px=0.2),),
     )
@@ -247,10 +248,15 @@ def test_the_same_matches_give_the_same_lens_however_linear_algebra_rounds() -> 
     assert fitted(rounded) == fitted(overlap)
 
 
-def test_the_lines_deviation_is_told_as_it_was_found_to_be() -> None:
-    refined = refine(lined(0.22, 0.01), flown("turns", 0.2, 1))
+def test_the_deviation_is_that_of_all_that_was_joined() -> None:
+    by_lines = lined(0.22, 0.01)
+    refined = refine(by_lines, flown("turns", 0.2, 1))
     assert refined.overlap is not None
-    assert refined.overlap.lines_a_sd == LINES_FACTOR * 0.01
+    assert refined.overlap.used
+    assert refined.overlap.lines_a_sd == by_lines.a_sd
+    assert refined.overlap.a_sd is not None
+    assert by_lines.a_sd is not None
+    assert refined.a_sd == pytest.approx((by_lines.a_sd**-2 + refined.overlap.a_sd**-2) ** -0.5)
 
 
 def test_a_record_of_before_still_reads() -> None:

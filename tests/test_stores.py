@@ -128,3 +128,12 @@ def test_untouched_tiles_take_no_space(tmp_path: Path) -> None:
         layers={},
     )
     assert sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) < 100_000
+
+
+def test_a_column_that_never_was_is_not_called_damaged(tmp_path: Path) -> None:
+    frames = frame_store(tmp_path / "f.zarr", noise(1, 2, 24, 32))
+    with pytest.raises(InputError, match="found no column 'bogus'; it has time_s, source_index"):
+        frames.column("bogus")
+    create_registration(tmp_path / "r.zarr", key="k", count=2, vector_length=3, unit_frames=2)
+    with pytest.raises(InputError, match=r"found no column 'bogus'; it has .*heldout_px"):
+        open_registration(tmp_path / "r.zarr").column("bogus")

@@ -73,6 +73,16 @@ def test_what_is_gone_or_was_never_done_is_told(copy: Path) -> None:
     assert found(copy) == {"frames.zarr/raw/c/5/0/0": "gone", "links 000008-000015": "not finished"}
 
 
+def test_a_run_that_never_came_to_its_end_is_not_called_damaged(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for record in (copy / "commits" / "maps").glob("*.json"):
+        record.unlink()
+    assert verify(copy) == 3
+    said = capsys.readouterr().out
+    assert "what is there is whole; 1 units were never finished" in said
+    assert "--repair" not in said
+    assert f"velfield run ... --out {copy}" in said
+
+
 def test_reading_a_damaged_chunk_raises_and_names_it(copy: Path) -> None:
     path = copy / "frames.zarr/raw/c/5/0/0"
     path.write_bytes(path.read_bytes()[:-20])

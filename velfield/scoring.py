@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from velfield.errors import InputError
 from velfield.run import open_run
 from velfield.synthetic.score import (
     DetectionScore,
@@ -19,6 +20,8 @@ from velfield.synthetic.score import (
     score_tracklets,
 )
 from velfield.synthetic.truth import load_truth
+
+_ANOTHER_BASE_PX = 30.0  # no registered frame is that far off its own base image
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ def score_run(root: str | Path, flight: str | Path, *, min_count: int = 5) -> Ru
     Raises
     ------
     InputError
-        The flight has no truth, or the run is not whole.
+        The flight has no truth, the run is not whole, or its base image is another one than the flight's.
     """
     run, truth = open_run(root), load_truth(Path(flight))
     source_index = run.frames.column("source_index")
@@ -73,9 +76,16 @@ def score_run(root: str | Path, flight: str | Path, *, min_count: int = 5) -> Ru
     frames = sorted(flight_frames)
     velocity = run.field.modal_velocity().astype(np.float64)
     velocity[np.isnan(run.field.modal_direction_rad())] = np.nan  # who stands has no direction
-    to_truth = None if run.grid.how == "given" else fit_homography(truth, to_base, frames[:: max(1, len(frames) // 20)])
+    some = frames[:: max(1, len(frames) // 20)]
+    to_truth = None if run.grid.how == "given" else fit_homography(truth, to_base, some)
+    registration = score_registration(truth, to_base, frames, to_truth=to_truth)
+    if to_truth is None and registration.mean_px > _ANOTHER_BASE_PX:
+        raise InputError(
+            f"{run.layout.root}: places lie {registration.mean_px:.0f} px off those of {flight} (mean): its base image "
+            f"is another one; score a run with --base {Path(flight) / 'base.png'}, or with none"
+        )
     return RunScore(
-        registration=score_registration(truth, to_base, frames, to_truth=to_truth),
+        registration=registration,
         detection=score_detections(truth, run.detections(), frame_of=frame_of, to_truth=to_truth),
         tracking=score_tracklets(truth, run.tracklets(), frame_of=frame_of, to_truth=to_truth),
         field=score_field(

@@ -96,6 +96,12 @@ def _read(path: Path, group: _Group, name: str, selection: Any) -> NDArray[Any]:
         ) from error
 
 
+def _check_column(path: Path, name: str, known: Iterable[str]) -> None:
+    """Before a name that never was is taken for a column that is damaged."""
+    if name not in known:
+        raise InputError(f"{path}: found no column {name!r}; it has {', '.join(known)}")
+
+
 def _check_frame(path: Path, frame: int, count: int) -> None:
     """Before a chunk that never was is taken for one that is gone or damaged."""
     if not 0 <= frame < count:
@@ -186,6 +192,7 @@ class FrameStore:
 
     def column(self, name: str) -> NDArray[Any]:
         """One column: ``time_s``, ``source_index``, ``flags``, ``sharpness`` or ``brightness``, (frames,)."""
+        _check_column(self.path, name, FRAME_COLUMNS)
         return _read(self.path, self.group, name, slice(None))
 
     def write_columns(self, start: int, columns: Mapping[str, NDArray[Any]]) -> None:
@@ -274,6 +281,7 @@ class RegistrationStore:
 
     def column(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
         """One of ``REGISTRATION_COLUMNS``, (frames,); or ``error_px``, (frames, 6, 8): held-out error by cell."""
+        _check_column(self.path, name, (*REGISTRATION_COLUMNS, "error_px"))
         return _read(self.path, self.group, name, slice(start, stop))
 
     def files(self, start: int) -> list[Path]:

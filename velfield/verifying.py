@@ -18,6 +18,9 @@ _STORES = {"frames": "frames.zarr", "registration": "registration.zarr", "field"
 _THREADS = min(4, os.cpu_count() or 1)
 
 
+NOT_FINISHED = "not finished"
+
+
 @dataclass(frozen=True)
 class Damage:
     """One thing that is not as its commit record says, or a unit that has none."""
@@ -61,7 +64,7 @@ def _unfinished(by_stage: dict[str, list[CommitRecord]]) -> Iterator[Damage]:
     for stage, records in by_stage.items():
         there = {record.unit for record in records}
         wanted = cut if stage in _BY_FRAMES else set() if there else {"all"}
-        yield from (Damage(stage, unit, None, "not finished") for unit in sorted(wanted - there))
+        yield from (Damage(stage, unit, None, NOT_FINISHED) for unit in sorted(wanted - there))
 
 
 def _other_keys(by_stage: dict[str, list[CommitRecord]], flight: FlightRecord) -> Iterator[Damage]:
@@ -91,4 +94,12 @@ def describe_damage(root: Path, damages: Sequence[Damage]) -> str:
     if not damages:
         return f"{root}: whole"
     units = len({(damage.stage, damage.unit) for damage in damages})
-    return "\n".join([*(damage.text() for damage in damages), f"{root}: {len(damages)} faults in {units} units"])
+    told = [damage.text() for damage in damages]
+    if not has_damage(damages):
+        return "\n".join([*told, f"{root}: what is there is whole; {units} units were never finished"])
+    return "\n".join([*told, f"{root}: {len(damages)} faults in {units} units"])
+
+
+def has_damage(damages: Sequence[Damage]) -> bool:
+    """Whether anything is amiss beyond units that a run which stopped, or was refused, never came to."""
+    return any(damage.what != NOT_FINISHED for damage in damages)

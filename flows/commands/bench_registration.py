@@ -38,6 +38,8 @@ def registration(
     unknown = sorted(set(cases) - set(CASES))
     if unknown:
         raise InputError(f"--cases {' '.join(unknown)}: expected some of {', '.join(CASES)}")
+    if frames is not None and frames < 2:
+        raise InputError(f"--frames {frames}: expected 2 or more, to see jitter from one to the next")
     measured = []
     for case in cases:
         for seed in seeds:

@@ -28,7 +28,7 @@ def verify(run_folder: Path, /, *, repair: Annotated[bool, Parameter(negative=()
         Do the damaged units again, from the same inputs.
     """
     from velfield.run import open_run
-    from velfield.verifying import describe_damage, verify_run
+    from velfield.verifying import describe_damage, has_damage, verify_run
 
     run = open_run(run_folder)
     damages = verify_run(run.layout, run.record)
@@ -36,7 +36,10 @@ def verify(run_folder: Path, /, *, repair: Annotated[bool, Parameter(negative=()
     if not damages:
         return WHOLE
     if not repair:
-        print(f"velfield verify {run_folder} --repair  does these units again")
+        if has_damage(damages):
+            print(f"velfield verify {run_folder} --repair  does these units again")
+        else:
+            print(f"velfield run ... --out {run_folder}  goes on where it stopped, or says again why it was refused")
         return DAMAGED
     _repair(run)
     damages = verify_run(run.layout, open_run(run_folder).record)

@@ -16,9 +16,6 @@ from velfield.camera.straighten import AnyLens
 
 LEAST_FRAMES, LEAST_PAIRS = 5, 6
 """Fewer say nothing of how far frames disagree."""
-LINES_FACTOR = 3.0
-"""The lines' standard deviation knows nothing of kerbs that bend alike: on simulated flights they err by up to five of
-it, RMS three."""
 AGREEMENT_SIGMAS = 3.0
 """How far apart lines and control points may lie, in standard deviations of their difference."""
 LEAST_SHARE = 0.25
@@ -60,13 +57,14 @@ class _Case:
         """The lens of that amount."""
         evidence = self.evidence.model_copy(update={"used": True, "reason": f"{self.evidence.reason}{why}"})
         record = self.record
+        reason = record.reason.removesuffix(", pin-hole kept")
+        told = [self.fit.amount_sd, *([self.lines[1]] if self.lines else [])]
+        a_sd = float(np.sum(np.power(told, -2.0)) ** -0.5)
         if not record.accepted:  # the lens is not the one that lines had on trial
             centre_sd_px = self.line.centre_sd * self.line.unit.half_diagonal_px
             record = record.model_copy(update={"residual_px": None, "centre_sd_px": (centre_sd_px, centre_sd_px)})
-        told = {"lens": self._lens(amount).to_record(), "overlap": evidence}
-        return record.model_copy(
-            update={**told, "accepted": True, "reason": f"{record.reason}; then {evidence.reason}"}
-        )
+        found = {"lens": self._lens(amount).to_record(), "a_sd": a_sd, "overlap": evidence}
+        return record.model_copy(update={**found, "accepted": True, "reason": f"{reason}; then {evidence.reason}"})
 
     def corner_px(self, amount: float) -> float:
         """How far a lens of that amount moves the picture's corner."""
@@ -121,7 +119,7 @@ def _kept(record: CameraRecord, evidence: OverlapEvidence, reason: str) -> Camer
 def _by_lines(record: CameraRecord) -> tuple[float, float] | None:
     """The lines' distortion as Harris' a, and its standard deviation with what lines do not know of themselves."""
     harris = [row for row in record.candidates if row.model == "harris"]
-    return (harris[0].parameters[0], LINES_FACTOR * record.a_sd) if harris and record.a_sd is not None else None
+    return (harris[0].parameters[0], record.a_sd) if harris and record.a_sd is not None else None
 
 
 def _centre_sd(record: CameraRecord) -> float:
@@ -156,7 +154,7 @@ def _joined(case: _Case, lines_a: float, lines_sd: float) -> CameraRecord:
     """The lines' lens joined with the control points' by inverse variance, or kept."""
     fit = case.fit
     share = fit.amount_sd**-2 / (fit.amount_sd**-2 + lines_sd**-2)
-    said = f", {lines_a:.3f} +- {lines_sd:.3f} by lines"
+    said = f", {lines_a:.3f} +- {lines_sd:.3f} by lines and their parallels"
     if case.relief:
         return case.kept(f"{said}: {fit.fit_px:.1f} px off any plane, the lines' lens kept")
     if not case.agrees(lines_a, lines_sd):
@@ -182,7 +180,7 @@ def _brought_in(case: _Case) -> CameraRecord:
         if abs(fit.amount - lines_a) > _MAX_DISAGREEMENT * abs(fit.amount):
             return case.kept(f", {lines_a:.3f} by lines: they disagree, pin-hole kept")
         value = float(np.average([fit.amount, lines_a], weights=[fit.amount_sd**-2, lines_sd**-2]))
-        said = f", {lines_a:.3f} +- {lines_sd:.3f} by lines"
+        said = f", {lines_a:.3f} +- {lines_sd:.3f} by lines and their parallels"
         sure = abs(lines_a) >= CONFIRMED_SIGMAS * lines_sd and case.agrees(lines_a, lines_sd)
         gain = 0.0 if sure else LEAST_GAIN
     if fit.after_px >= (1.0 - gain) * fit.before_px:
