@@ -1,7 +1,5 @@
 """Families of parallels: their directions mend a lens that straightness left uncertain, and leave alone a sure one."""
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,21 +41,17 @@ def streets(
     )
 
 
-def by_straightness(a_sd: float, off: float) -> StraightFit:
+def by_straightness(lines: LineSet, a_sd: float, off: float) -> StraightFit:
     """What straightness might have said: off by ``off`` of its deviations, the centre by as much of 4 px."""
     spread = np.array([a_sd, 4.0 / HALF, 4.0 / HALF])
-    return StraightFit(FAMILY, TRUTH + off * spread * (1, -1, 1), np.diag(spread**2), 0.2, np.ones(1))
-
-
-def weighed(lines: LineSet, fit: StraightFit) -> StraightFit:
-    return replace(fit, weights=np.ones(lines.count))
+    return StraightFit(FAMILY, TRUTH + off * spread * (1, -1, 1), np.diag(spread**2), 0.2, np.ones(lines.count))
 
 
 def test_streets_of_two_directions_tell_the_lens() -> None:
     before, after, deviations = [], [], []
     for seed in range(6):
         lines = streets(np.repeat([0.1, 0.1 + np.pi / 2], 40), seed)
-        fit = weighed(lines, by_straightness(0.004, 1.5))
+        fit = by_straightness(lines, 0.004, 1.5)
         refined = refine_by_parallels(fit, lines)
         before.append(fit.parameters - TRUTH)
         after.append(refined.parameters - TRUTH)
@@ -71,7 +65,7 @@ def test_streets_of_two_directions_tell_the_lens() -> None:
 def test_a_tilted_camera_makes_no_lens() -> None:
     """Parallels that run together in the picture are what a vanishing point is for."""
     lines = streets(np.repeat([0.1, 0.1 + np.pi / 2], 40), 3, tilt=0.4)
-    refined = refine_by_parallels(weighed(lines, by_straightness(0.004, 1.5)), lines)
+    refined = refine_by_parallels(by_straightness(lines, 0.004, 1.5), lines)
     assert abs(refined.parameters[0] - 0.2) < 0.002
 
 
@@ -79,25 +73,25 @@ def test_crooked_streets_say_less() -> None:
     spread = []
     for crooked_deg in (0.1, 1.0):
         lines = streets(np.repeat([0.1, 0.1 + np.pi / 2], 40), 5, crooked_deg=crooked_deg)
-        refined = refine_by_parallels(weighed(lines, by_straightness(0.02, 0.0)), lines)
+        refined = refine_by_parallels(by_straightness(lines, 0.02, 0.0), lines)
         spread.append(float(np.sqrt(refined.covariance[0, 0])))
     assert spread[1] > 2.0 * spread[0]
 
 
 def test_lines_that_run_anywhere_hardly_move_the_lens() -> None:
     lines = streets(np.random.default_rng(0).uniform(0, np.pi, 60), 6)
-    fit = weighed(lines, by_straightness(0.004, 0.0))
+    fit = by_straightness(lines, 0.004, 0.0)
     refined = refine_by_parallels(fit, lines)
     assert abs(refined.parameters[0] - fit.parameters[0]) < 2.0 * 0.004
 
 
 def test_fewer_lines_than_a_family_leave_the_fit_as_it_was() -> None:
     lines = streets(np.full(FEWEST - 1, 0.1), 7)
-    fit = weighed(lines, by_straightness(0.004, 1.0))
+    fit = by_straightness(lines, 0.004, 1.0)
     assert refine_by_parallels(fit, lines) is fit
 
 
 def test_a_fit_that_is_surer_than_streets_are_parallel_stays() -> None:
     lines = streets(np.repeat([0.1, 0.1 + np.pi / 2], 40), 8)
-    fit = weighed(lines, by_straightness(0.0005, 1.0))
+    fit = by_straightness(lines, 0.0005, 1.0)
     assert refine_by_parallels(fit, lines) is fit

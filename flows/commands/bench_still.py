@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from velfield.errors import InputError
+
 
 def still(run_folder: Path, /, *, frames: int = 200, within: Path | None = None) -> int:
     """Follow corners that registration does not use through the frames of a run, and tell how they seem to move.
@@ -19,6 +21,8 @@ def still(run_folder: Path, /, *, frames: int = 200, within: Path | None = None)
     from velfield.bench.still import read_area, still_things
     from velfield.run import open_run
 
+    if frames < 3:
+        raise InputError(f"--frames {frames}: expected 3 or more, to see jitter")
     area = None if within is None else read_area(within)
     print(still_things(open_run(run_folder), max_frames=frames, within=area).text())
     return 0

@@ -92,8 +92,6 @@ def still_things(run: Run, *, max_frames: int = 200, within: FloatArray | None =
     maps = replace(run.maps, onward=())
     registered = [frame for frame, status in enumerate(run.registration_status) if status == "ok"]
     chosen = np.unique(np.linspace(0, len(registered) - 1, min(max_frames, len(registered))).astype(int))
-    if max_frames < 3:
-        raise InputError(f"--frames {max_frames}: expected 3 or more, to see jitter")
     if len(chosen) < 3:
         raise InputError(f"{run.layout.root}: {len(registered)} registered frames, 3 or more needed to see jitter")
     templates = _sharpest(run, within)

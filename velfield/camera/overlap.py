@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from velfield.camera.lens import HarrisLens, PolynomialLens
-from velfield.camera.straighten import AnyLens
+from velfield.camera.straighten import AnyLens, robust_weights
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -44,7 +44,6 @@ SYSTEMATIC = 0.05
 _ROUNDS = 10
 _LEAST_STEP = 1e-4
 _LARGEST_STEP = 0.1
-_ROBUST_FACTOR = 2.5
 _LEAST_SCALE_PX = 0.1
 _WAVES = 14  # of the rows: half a cycle, one, one and a half, ...
 _BUMP = 0.8  # half-diagonals: width and spacing of the ground's bumps
@@ -238,7 +237,7 @@ def _medians(misses: Floats, there: NDArray[np.bool_]) -> Floats:
 def _weights(misses: Floats, there: NDArray[np.bool_]) -> Floats:
     """Geman-McClure weights (pairs, n) over each pair's own variance, px^-2."""
     scale = np.maximum(_medians(misses, there)[:, None] / 1.1774, _LEAST_SCALE_PX)
-    return _finite(1.0 / (1.0 + (_distances(misses, there) / (_ROBUST_FACTOR * scale)) ** 2) ** 2 / scale**2)
+    return _finite(robust_weights(_distances(misses, there), scale) / scale**2)
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from velfield.camera.lines import LineSet, chords, fitted_lines
-from velfield.camera.straighten import StraightFit, usual_residual
+from velfield.camera.lines import LineSet, chords, fitted_lines, line_residuals
+from velfield.camera.straighten import StraightFit, robust_weights, usual_residual
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -33,7 +33,6 @@ parallel enough to say more: GoPro pictures of a board were 0.25 px the worse fo
 _TRIED_PAIRS = 3000
 _LONG_PX = 200.0  # a longer line's direction is no better known
 _LEAST_SCATTER_RAD = 5e-4
-_ROBUST_FACTOR = 2.5
 _ROUNDS = 6
 _NUDGE = 1e-5
 
@@ -100,19 +99,23 @@ def refine_by_parallels(fit: StraightFit, lines: LineSet, seed: int = 0) -> Stra
     if not families:
         return fit
     known = np.linalg.inv(fit.covariance)
-    parameters, heard = fit.parameters, known
+    parameters, said = fit.parameters, np.zeros_like(known)
     for _ in range(_ROUNDS):
         parts = _parts(lines, fit, parameters, families)
-        said = sum(part.information for part in parts)
-        heard = known + HEARD * said
+        said = np.sum([part.information for part in parts], axis=0)
         pull = known @ (fit.parameters - parameters) + sum(part.pull for part in parts)
         step = np.linalg.solve(known + said, pull)
         if not np.all(np.isfinite(fit.family.lens(parameters + step).undistort_points(lines.xy))):
             return fit  # its domain ends within the picture: no model to be refined
         parameters = parameters + step
         families = [part.moved(step) for part in parts]
-    refined = replace(fit, parameters=parameters, covariance=np.linalg.inv(heard))
-    return replace(refined, residual_px=usual_residual(lines, refined))
+    residuals = line_residuals(lines, fit.family.lens(parameters))
+    return replace(
+        fit,
+        parameters=parameters,
+        covariance=np.asarray(np.linalg.inv(known + HEARD * said), np.float64),
+        residual_px=usual_residual(residuals, fit.weights[lines.line]),
+    )
 
 
 def _placed(lines: LineSet, fit: StraightFit, parameters: Floats) -> _Placed:
@@ -170,7 +173,7 @@ def _parts(lines: LineSet, fit: StraightFit, parameters: Floats, families: list[
 def _part(family: _Family, here: _Placed, nudged: list[_Placed]) -> _Part:
     off = family.off(here)
     scale = max(1.4826 * float(np.median(np.abs(off))), _LEAST_SCATTER_RAD)
-    weight = 1.0 / (1.0 + (off / (_ROBUST_FACTOR * scale)) ** 2) ** 2 / scale**2
+    weight = robust_weights(off, scale) / scale**2
     basis = np.linalg.svd(family.point[None])[2][1:]
     shared = np.stack([(family.off(placed) - off) / _NUDGE for placed in nudged], axis=1)
     own = np.stack([(family.off(here, family.point + _NUDGE * row) - off) / _NUDGE for row in basis], axis=1)

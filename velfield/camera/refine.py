@@ -53,13 +53,19 @@ class _Case:
         """The lens as it was."""
         return _kept(self.record, self.evidence, f"{self.evidence.reason}{why}")
 
-    def changed(self, amount: float, why: str) -> CameraRecord:
-        """The lens of that amount."""
+    @property
+    def joined(self) -> tuple[float, float]:
+        """Amount and deviation by inverse variance of both witnesses; the control points' where lines have none."""
+        amounts, deviations = np.array([(self.fit.amount, self.fit.amount_sd), *([self.lines] if self.lines else [])]).T
+        precision = deviations**-2
+        return float(np.average(amounts, weights=precision)), float(precision.sum() ** -0.5)
+
+    def changed(self, why: str) -> CameraRecord:
+        """The lens of the amount that is joined."""
+        amount, a_sd = self.joined
         evidence = self.evidence.model_copy(update={"used": True, "reason": f"{self.evidence.reason}{why}"})
         record = self.record
         reason = record.reason.removesuffix(", pin-hole kept")
-        told = [self.fit.amount_sd, *([self.lines[1]] if self.lines else [])]
-        a_sd = float(np.sum(np.power(told, -2.0)) ** -0.5)
         if not record.accepted:  # the lens is not the one that lines had on trial
             centre_sd_px = self.line.centre_sd * self.line.unit.half_diagonal_px
             record = record.model_copy(update={"residual_px": None, "centre_sd_px": (centre_sd_px, centre_sd_px)})
@@ -163,13 +169,12 @@ def _joined(case: _Case, lines_a: float, lines_sd: float) -> CameraRecord:
         return case.kept(f"{said}: the frames differ too little in place to say more, the lines' lens kept")
     if fit.after_px > (1.0 + MOST_LOSS) * fit.before_px:
         return case.kept(f"{said}: frames left out do not show it, the lines' lens kept")
-    joined = (1.0 - share) * lines_a + share * fit.amount
-    return case.changed(joined, f"{said}: joined to {joined:.3f}")
+    return case.changed(f"{said}: joined to {case.joined[0]:.3f}")
 
 
 def _brought_in(case: _Case) -> CameraRecord:
     """A distortion that lines did not bear out, on strong evidence only; else the pin-hole."""
-    fit, value, said, gain = case.fit, case.fit.amount, "", LEAST_GAIN
+    fit, value, said, gain = case.fit, case.joined[0], "", LEAST_GAIN
     needed = BRING_IN_SIGMAS if case.lines is None else CONFIRMED_SIGMAS
     if case.relief:
         return case.kept(f": {fit.fit_px:.1f} px off any plane, pin-hole kept")
@@ -179,7 +184,6 @@ def _brought_in(case: _Case) -> CameraRecord:
         lines_a, lines_sd = case.lines
         if abs(fit.amount - lines_a) > _MAX_DISAGREEMENT * abs(fit.amount):
             return case.kept(f", {lines_a:.3f} by lines: they disagree, pin-hole kept")
-        value = float(np.average([fit.amount, lines_a], weights=[fit.amount_sd**-2, lines_sd**-2]))
         said = f", {lines_a:.3f} +- {lines_sd:.3f} by lines and their parallels"
         sure = abs(lines_a) >= CONFIRMED_SIGMAS * lines_sd and case.agrees(lines_a, lines_sd)
         gain = 0.0 if sure else LEAST_GAIN
@@ -187,4 +191,4 @@ def _brought_in(case: _Case) -> CameraRecord:
         return case.kept(f"{said}: frames left out do not show it, pin-hole kept")
     if case.corner_px(value) < LEAST_CORNER_PX:
         return case.kept(f": less than {LEAST_CORNER_PX:g} px at a corner, pin-hole kept")
-    return case.changed(value, f"{said}: a distortion of {value:.3f} accepted")
+    return case.changed(f"{said}: a distortion of {value:.3f} accepted")

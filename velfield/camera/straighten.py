@@ -5,7 +5,7 @@ no lens straightens (a kerb that bends) is weighed down as a whole, by its own R
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -68,8 +68,12 @@ def line_weights(rms: Floats, sizes: Floats) -> Floats:
     """Weight of each line by its RMS residual, (lines,) in (0, 1]: Geman-McClure about the usual line."""
     order = np.argsort(rms)
     half = np.searchsorted(np.cumsum(sizes[order]), 0.5 * sizes.sum())
-    scale = _ROBUST_FACTOR * max(float(rms[order[min(half, rms.size - 1)]]), _LEAST_SCALE_PX)
-    return np.asarray(1.0 / (1.0 + (rms / scale) ** 2) ** 2)
+    return robust_weights(rms, max(float(rms[order[min(half, rms.size - 1)]]), _LEAST_SCALE_PX))
+
+
+def robust_weights(residuals: Floats, scale: float | Floats) -> Floats:
+    """Geman-McClure weights in (0, 1] of residuals whose usual size is ``scale``, both of any one unit."""
+    return np.asarray(1.0 / (1.0 + (residuals / (_ROBUST_FACTOR * scale)) ** 2) ** 2)
 
 
 def fit_lens(lines: LineSet, family: LensFamily, start: Floats) -> StraightFit:
@@ -176,14 +180,12 @@ def _finished(lines: LineSet, family: LensFamily, parameters: Floats, residuals:
     jacobian = _jacobian(lines, family, parameters, residuals)
     information, by_line = _information(lines, jacobian, residuals, point_weight)
     bread = np.linalg.inv(information + np.diag(_prior(information, by_line)))
-    fit = StraightFit(family, parameters, bread @ by_line @ bread, 0.0, weights)
-    return replace(fit, residual_px=usual_residual(lines, fit))
+    return StraightFit(family, parameters, bread @ by_line @ bread, usual_residual(residuals, point_weight), weights)
 
 
-def usual_residual(lines: LineSet, fit: StraightFit) -> float:
-    """RMS distance of the points from their lines under a fit's lens, by the lines' weights, raw px."""
-    residuals, weight = line_residuals(lines, fit.lens), fit.weights[lines.line]
-    return float(np.sqrt(np.sum(weight * residuals**2) / np.sum(weight)))
+def usual_residual(residuals: Floats, point_weight: Floats) -> float:
+    """Weighted RMS distance of points (n,) from their lines, raw px."""
+    return float(np.sqrt(np.sum(point_weight * residuals**2) / np.sum(point_weight)))
 
 
 def heldout_rms(lines: LineSet, families: Sequence[tuple[LensFamily, Floats]], *, folds: int, seed: int) -> Floats:
