@@ -1,8 +1,9 @@
 """The detector file: JSON with a schema, never pickle. Numbers only: no picture that it was learnt from."""
 
+from base64 import b64decode
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, NonNegativeInt, PositiveFloat, model_validator
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from schemas.model import Model
 
@@ -58,15 +59,37 @@ class Proposer(Model):
     """Places that the first rounds of step two like less are let go."""
 
 
+class LayerRecord(Model):
+    """A layer of the network: its weights by neighbour, channel in and channel out, then its biases."""
+
+    shape: tuple[PositiveInt, PositiveInt, PositiveInt]
+    """Neighbours looked at (1 or 9), channels in, channels out."""
+    numbers: str = Field(max_length=2_000_000)
+    """Base64 of little-endian half-precision floats."""
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Self:
+        neighbours, into, out = self.shape
+        try:
+            found = len(b64decode(self.numbers, validate=True))
+        except ValueError:
+            raise ValueError("the numbers of a layer are not base64") from None
+        if found != 2 * (neighbours * into * out + out):
+            raise ValueError(f"a layer of {neighbours} x {into} x {out} with {found} bytes of numbers")
+        return self
+
+
 class DetectorRecord(Model):
     """A trained detector."""
 
     kind: Literal["velfield-detector"] = "velfield-detector"
     version: Literal[1] = 1
-    method: Literal["aligned", "dense"]
+    method: Literal["aligned", "dense", "network"]
     working_car_length_px: PositiveFloat = Field(le=200)
     """A car's length on the grid that it was learnt on."""
-    rounds: tuple[Round, ...] = Field(min_length=1, max_length=50_000)
+    rounds: tuple[Round, ...] = Field(default=(), max_length=50_000)
+    network: dict[str, LayerRecord] | None = Field(default=None, max_length=100)
+    """The layers of the network, by name."""
     threshold: float
     grey_bits: int = Field(default=8, ge=1, le=8)
     """Dense: so many bits of the grey are looked at."""
@@ -84,6 +107,10 @@ class DetectorRecord(Model):
     def _is_whole(self) -> Self:
         if self.method == "aligned" and (self.contrast_floor is None or self.proposer is None):
             raise ValueError("a detector of the aligned method needs contrast_floor and proposer")
+        if self.method == "network" and self.network is None:
+            raise ValueError("a detector of the network method needs network")
+        if self.method != "network" and not self.rounds:
+            raise ValueError(f"a detector of the {self.method} method needs rounds")
         return self
 
 

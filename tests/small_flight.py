@@ -12,6 +12,7 @@ from velfield.layout import RunLayout
 from velfield.provenance import digest_bytes
 
 SMALL = (
+    "detection.method=aligned",
     "detection.rounds=40",
     "detection.feature_pool=250",
     "detection.folds=2",

@@ -34,7 +34,7 @@ def test_an_option_that_was_not_given_changes_nothing() -> None:
         (["tracking.max_speed_m_per_s=.nan"], "finite"),
         (["tracking.max_speed_m_per_s=.inf"], "finite"),
         (["tracking.max_speed_m_per_s=-1"], "greater than 0"),
-        (["detection.method=dnse"], "'aligned' or 'dense'"),
+        (["detection.method=dnse"], "'network', 'aligned' or 'dense'"),
         (["gsd_m"], "expected section.key=value"),
         (["gsd_m.metres=1", "gsd_m=2"], ""),
         (["preset=worst"], "best, fast, paper"),

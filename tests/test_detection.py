@@ -24,7 +24,7 @@ from velfield.steps.labelled import scaled
 from velfield.synthetic import Flight, small_flight
 
 SCALE = 0.92  # 16 px a car at 0.23 m a pixel
-SMALL = DetectionConfig(rounds=120, feature_pool=800, folds=2)
+SMALL = DetectionConfig(method="aligned", rounds=120, feature_pool=800, folds=2)
 MATCH_PX = 8.0
 
 
@@ -226,15 +226,24 @@ def test_of_two_finds_on_one_car_the_better_stays() -> None:
     assert distinct(np.empty((0, 5)), 16.0).shape == (0, 5)
 
 
-def test_few_cars_continue_the_shipped_detector() -> None:
+def test_few_cars_continue_an_earlier_detector() -> None:
     truth = sample(flight(5), 0)
     few = LabelledImage(image=truth.image, cars=truth.cars[:12], complete=False)
-    shipped = shipped_detector()
-    continued = train_detector([few], SMALL, continued=shipped)
-    assert 0.9 * SMALL.rounds < len(continued.record.rounds) - len(shipped.record.rounds) <= SMALL.rounds
-    assert continued.record.attribution == shipped.record.attribution
-    assert continued.threshold == pytest.approx((0.15 + 4 * shipped.threshold) / 5)
+    earlier = detector("aligned")
+    continued = train_detector([few], SMALL, continued=earlier)
+    assert 0.9 * SMALL.rounds < len(continued.record.rounds) - len(earlier.record.rounds) <= SMALL.rounds
+    assert continued.record.attribution == earlier.record.attribution
+    assert continued.threshold == pytest.approx((0.15 + 4 * earlier.threshold) / 5)
     assert f_measure(continued, sample(flight(6), 1)) > 0.7
+
+
+def test_marked_cars_teach_the_network_where_it_knows_their_size() -> None:
+    config = DetectionConfig(network_steps=3)
+    truth = sample(flight(5), 0)
+    few = LabelledImage(image=truth.image, cars=truth.cars[:12], complete=False)
+    assert train_detector([few], config).record.method == "network"
+    other = SMALL.model_copy(update={"method": "network", "working_car_length_px": 20.0})
+    assert train_detector([few], other).record.method == "aligned"
 
 
 def f_measure(of: Detector, truth: LabelledImage) -> float:

@@ -10,7 +10,7 @@ import pytest
 from flows.cli import app
 from schemas.flight import FramesConfig
 from velfield.detection.axis import axial_difference
-from velfield.detection.detector import load_detector
+from velfield.detection.detector import load_detector, shipped_detector
 from velfield.detection.review import review_sheet
 from velfield.detection.samples import scene_of
 from velfield.errors import InputError
@@ -19,7 +19,7 @@ from velfield.sources.source import probe
 from velfield.steps.labelled import labelled_images, odd_length
 from velfield.synthetic import small_flight
 
-QUICK = ["--set", "detection.rounds=30", "--set", "detection.feature_pool=200"]
+QUICK = ["--set", "detection.network_steps=6"]
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +53,11 @@ def test_marked_cars_become_a_detector_and_a_sheet(
     marked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, sheet = tmp_path / "d.json", tmp_path / "sheet.png"
-    assert train(marked, "--out", str(out), "--review", str(sheet), "--continue", "shipped") == 0
+    assert train(marked, "--out", str(out), "--review", str(sheet)) == 0
     detector = load_detector(out)
     assert detector.record.cars == 14
-    assert len(detector.record.rounds) > 1000
+    assert detector.record.method == "network"
+    assert detector.record.network != shipped_detector().record.network
     assert cv2.imread(str(sheet)).shape[1] == 1024
     said = capsys.readouterr().out
     assert "14 cars of 1 frames" in said

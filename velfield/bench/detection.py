@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from schemas.flight import DetectionConfig
 from velfield.detection.aligned import Look, offset_grid
 from velfield.detection.boosting import random_pool
+from velfield.detection.convolution import Layout, convolved
 from velfield.detection.detect import detect_frame
 from velfield.detection.detector import BoostedSums, Detector
 from velfield.detection.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, continued, dense_response
@@ -26,6 +28,27 @@ _NUMPY_ROUNDS = 10
 _TILE_PX = 8
 _LEARNT_FROM = 978
 """Seed of the city; `city` shows that of seed 77."""
+
+
+def _c2f(step: int, into: int, out: int, repeats: int) -> list[tuple[int, int, int, int]]:
+    half = out // 2
+    inner = [(step, 9, half, half)] * (2 * repeats)
+    return [(step, 1, into, out), *inner, (step, 1, (2 + repeats) * half, out)]
+
+
+def _head(step: int, into: int) -> list[tuple[int, int, int, int]]:
+    box = [(step, 9, into, 64), (step, 9, 64, 64), (step, 1, 64, 64)]
+    return [*box, (step, 9, into, 80), (step, 9, 80, 80), (step, 1, 80, 80)]
+
+
+YOLOV8N = (
+    *((2, 9, 3, 16), (4, 9, 16, 32), *_c2f(4, 32, 32, 1), (8, 9, 32, 64), *_c2f(8, 64, 64, 2)),
+    *((16, 9, 64, 128), *_c2f(16, 128, 128, 2), (32, 9, 128, 256), *_c2f(32, 256, 256, 1)),
+    *((32, 1, 256, 128), (32, 1, 512, 256), *_c2f(16, 384, 128, 1), *_c2f(8, 192, 64, 1)),
+    *((16, 9, 64, 64), *_c2f(16, 192, 128, 1), (32, 9, 128, 128), *_c2f(32, 384, 256, 1)),
+    *(*_head(8, 64), *_head(16, 128), *_head(32, 256)),
+)
+"""Its convolutions: px a cell of what comes out, neighbours, channels in and out."""
 
 
 @dataclass(frozen=True)
@@ -131,14 +154,24 @@ def response_speed(image: NDArray[np.uint8]) -> tuple[Speed, Speed]:
 
 def learnt_there() -> Detector:
     """A detector of the usual size, learnt from the marked cars of one frame of another simulated city."""
-    return train_detector([simulated(_LEARNT_FROM)], DetectionConfig())
+    return train_detector([simulated(_LEARNT_FROM)], DetectionConfig(method="aligned"))
+
+
+def network_speed(image: NDArray[np.uint8], detector: Detector) -> Speed:
+    """The network, places that it likes looked at again, beside convolutions of YOLOv8n's sizes on such a frame."""
+    fast = _fastest(lambda: detect_frame(image, None, detector, DetectionConfig()), 2)
+    peer = 0.0
+    for step, taps, into, out in YOLOV8N:
+        layout = Layout(1, image.shape[0] // step, image.shape[1] // step)
+        values, weights = np.ones((layout.rows, into), np.float32), np.ones((taps, into, out), np.float32)
+        peer += _fastest(partial(convolved, values, weights, layout), 1)
+    return Speed("the network, shipped", "convolutions of YOLOv8n's sizes", fast, peer)
 
 
 def cascade_speed(image: NDArray[np.uint8], detector: Detector, name: str, *, crop_px: int = 96) -> Speed:
     """Both steps against the second step's classifier at every pixel and turn, of a crop, scaled up.
 
-    The surer a detector is, the fewer places it looks at twice: the shipped one, which has seen little of any one
-    site, looks at the most.
+    The surer a detector is, the fewer places it looks at twice.
     """
     fast = _fastest(lambda: detect_frame(image, None, detector, DetectionConfig()), 2)
     look = Look(picture_of(image), detector.sums, float(detector.record.contrast_floor or 0.0))

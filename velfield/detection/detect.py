@@ -11,6 +11,7 @@ from velfield.detection.dense import find_cars_densely
 from velfield.detection.detector import Detector
 from velfield.detection.label_axis import CAR_ASPECT
 from velfield.detection.long_vehicles import LONG, shipped_long_vehicles
+from velfield.detection.network_finds import network_finds
 from velfield.detection.patches import oriented_patches, upright_chips
 from velfield.detection.scan import propose
 from velfield.detection.turned import COARSE, picture_of
@@ -67,6 +68,10 @@ def detect_frame(
     length = detector.record.working_car_length_px
     if detector.record.method == "dense":
         cars, area = find_cars_densely(image, valid, detector, config, threshold)
+    elif detector.record.method == "network":
+        found = network_finds(detector.network, image, valid)
+        cars = _middles(image, valid, distinct(found[found[:, 3] > threshold], length), length)
+        area = np.full(len(cars), length * length * CAR_ASPECT)
     else:
         cars = _aligned(image, valid, detector, threshold, background if detector.uses_background else None)
         area = np.full(len(cars), length * length * CAR_ASPECT)
@@ -92,7 +97,12 @@ def _aligned(
     look = Look(picture_of(image, background), detector.sums, floor)
     found = find_cars(look, places, least_score=threshold, least_first_score=proposer.least_first_score)
     length = detector.record.working_car_length_px
-    cars, long = distinct(found, length), shipped_long_vehicles()
+    return _middles(image, valid, distinct(found, length), length)
+
+
+def _middles(image: Grey, valid: NDArray[np.bool_] | None, cars: Floats, length: float) -> Floats:
+    """The cars, lorries and buses among them at their middle."""
+    long = shipped_long_vehicles()
     if length != long.record.working_car_length_px:
         return cars
     return long.centred(picture_of(image, None, LONG), cars, np.ones(image.shape, bool) if valid is None else valid)

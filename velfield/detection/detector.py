@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from schemas.detector import DetectorRecord, PrecisionRecallCurve, Round
+from velfield.detection.network import Network, network_of
 from velfield.errors import InputError
 
 MAX_BYTES = 20_000_000
@@ -63,6 +64,11 @@ class Detector:
     def uses_background(self) -> bool:
         """Whether it looks at |frame - background|."""
         return any(r.channel == 3 for r in self.record.rounds)
+
+    @cached_property
+    def network(self) -> Network:
+        """The network's weights; only of the method of that name."""
+        return network_of(self.record.network or {})
 
     @cached_property
     def sums(self) -> BoostedSums:

@@ -1,19 +1,25 @@
-"""Training on several places, each left out in turn: how good the detector will be where it has never been."""
+"""The network learnt on several places, each left out in turn: how good it is where it has never been."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-
-import numpy as np
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from schemas.flight import DetectionConfig
-from velfield.detection.committee import committee_of
-from velfield.detection.detector import Detector, sums_of
-from velfield.detection.samples import LabelledImage, Scene, scene_of
-from velfield.detection.train import Steps, record_of, trained
-from velfield.detection.validation import Evidence, evidence_of_part, joined
+from velfield.detection.detector import Detector
+from velfield.detection.network import Network
+from velfield.detection.network_training import (
+    chosen_threshold,
+    evidence_of_network,
+    network_from_nothing,
+    record_of,
+)
+from velfield.detection.samples import LabelledImage
+from velfield.detection.validation import Evidence, joined
+from velfield.threads import each
 
-_MEMBERS, _APART = 3, 1000
-"""Classifiers in the committee, and the seeds between them."""
+_ALWAYS_SHARE = 2.0
+"""How often what is always learnt is looked at, beside a place."""
+_STEPS_TRIED = 0.3
+"""Of the steps: what is left out is there for T and to be told, not to be kept."""
 
 
 @dataclass(frozen=True)
@@ -25,48 +31,31 @@ class Place:
     tried: Sequence[LabelledImage]
 
 
-def left_out(
-    places: Sequence[Place], always: Sequence[LabelledImage], config: DetectionConfig
-) -> Iterator[tuple[str, Evidence]]:
-    """What detectors say of each place, trained on all others and on what is ``always`` learnt."""
-    for k, place in enumerate(places):
-        others = [sample for j, other in enumerate(places) if j != k for sample in other.learnt]
-        steps = _together([*others, *always], config, config.seed + 1 + k)
-        proposer, sums = sums_of(steps.proposer), sums_of(steps.classifier)
-        parts = [
-            evidence_of_part(scene, np.ones(scene.sample.image.shape, bool), proposer, sums)
-            for scene in _scenes(place.tried)
-        ]
-        yield place.name, joined(parts)
-
-
 def train_on_places(
-    places: Sequence[Place], always: Sequence[LabelledImage], config: DetectionConfig, evidence: Sequence[Evidence]
-) -> Detector:
-    """Train on all places; T and the cascade's cuts come from the places left out.
+    places: Sequence[Place], always: Sequence[LabelledImage], *, seed: int, steps: int
+) -> tuple[Detector, dict[str, Evidence]]:
+    """Learn from all places, and from what is ``always`` learnt; T comes from places left out.
 
-    Parameters
-    ----------
-    places, always
-        As for `left_out`.
-    config
-        The aligned method's rounds (of each member of a committee), pool and seed.
-    evidence
-        What `left_out` gave, a place each.
+    Returns
+    -------
+    The detector, and by place what networks said that were learnt on all others and on what is always learnt.
     """
-    samples = [*(sample for place in places for sample in place.learnt), *always]
-    steps = _together(samples, config, config.seed)
-    cars = sum(len(sample.cars) for place in places for sample in place.tried) + sum(len(s.cars) for s in always)
+
+    def without(k: int | None) -> tuple[Network, Evidence | None]:
+        if k is None:
+            return _learnt(places, always, seed, steps), None
+        others = [place for j, place in enumerate(places) if j != k]
+        network = _learnt(others, always, seed + 1 + k, round(_STEPS_TRIED * steps))
+        return network, joined([evidence_of_network(network, sample) for sample in places[k].tried])
+
+    (network, _), *tried = each(without, [None, *range(len(places))])
+    found = {place.name: said for place, (_, said) in zip(places, tried, strict=True) if said is not None}
     told = f"cars of {len(places)} places, each found by a detector that never saw its place"
-    return Detector(record_of(steps, joined(evidence), config, cars, told))
+    threshold, curve = chosen_threshold(joined(list(found.values())), 0.0, told)
+    cars = sum(len(sample.cars) for place in places for sample in place.tried) + sum(len(s.cars) for s in always)
+    return Detector(record_of(network, threshold, curve, cars, DetectionConfig())), found
 
 
-def _together(samples: Sequence[LabelledImage], config: DetectionConfig, seed: int) -> Steps:
-    """Several classifiers that differ by their seed, as one: on places unseen better than one of as many rounds."""
-    scenes = _scenes(samples)
-    members = [trained(scenes, config, 3, seed + _APART * k) for k in range(_MEMBERS)]
-    return replace(members[0], classifier=committee_of([one.classifier for one in members]))
-
-
-def _scenes(samples: Sequence[LabelledImage]) -> list[Scene]:
-    return [scene_of(sample, has_background=False) for sample in samples]
+def _learnt(places: Sequence[Place], always: Sequence[LabelledImage], seed: int, steps: int) -> Network:
+    groups = [*(place.learnt for place in places), always]
+    return network_from_nothing(groups, [*(1.0 for _ in places), _ALWAYS_SHARE], seed, steps=steps)

@@ -17,7 +17,7 @@ from schemas.flight import DetectionConfig
 from velfield.detection.detector import Detector, save_detector
 from velfield.detection.label_axis import with_axes
 from velfield.detection.long_learning import learn_long_vehicles
-from velfield.detection.places import Place, left_out, train_on_places
+from velfield.detection.places import Place, train_on_places
 from velfield.detection.samples import LabelledImage
 from velfield.detection.validation import Evidence, joined
 from velfield.errors import InputError
@@ -30,18 +30,27 @@ ATTRIBUTION = (
     "cities simulated by velfield",
 )
 CONFIG = DetectionConfig(rounds=400, feature_pool=4000, seed=7)
-SIMULATED_SEEDS = range(9001, 9007)
+"""Of the classifier of what is long."""
+STEPS, SEED = 2500, 7
+SIMULATED_SEEDS = range(9001, 9061)
 LORRY_SEEDS, LORRY_SEEDS_LEFT_OUT = range(9101, 9181), range(9201, 9225)
 _LORRIES_IN = (1280, 960)
 _LARGE_SHARE = 0.35
 """Of the simulated traffic that lorries and buses are learnt from: in a city's own there are too few."""
 _KIT_FRAMES = 4
+"""Of each sequence, to try on: neighbours show the same cars."""
+_KIT_EVERY = 3
+_MIXES = 7
+"""So many other greys of each colour picture: what is as dark as the road to one sensor is bright to another."""
+_MIXED = (1.5, 3.0, 1.5)
+"""How much blue, green and red go into them: parameters of a Dirichlet distribution."""
 _TONES = ((1.7, 0.7, 0.0), (0.6, 0.0, 4.0))
 """Other sensors: exponent of grey, blur in px, noise in grey levels."""
 
 
-def read_pictures(files: Sequence[Path], *, car_length_px: float = 16.0) -> list[LabelledImage]:
-    """Pictures with a YOLO file each beside them, all scaled by one factor that makes the usual car so long.
+def read_pictures(files: Sequence[Path], *, car_length_px: float = 16.0, mixes: int = 0) -> list[LabelledImage]:
+    """Pictures with a YOLO file each beside them, all scaled by one factor that makes the usual car so long; each
+    as grey, then in so many other mixtures of its colours.
 
     Raises
     ------
@@ -54,18 +63,31 @@ def read_pictures(files: Sequence[Path], *, car_length_px: float = 16.0) -> list
         )
     parts = [boxes_of(file) for file in files]
     usual = np.median(np.concatenate([boxes[boxes[:, 0] == 0, 5] for _, boxes in parts]))
-    return [_scaled(grey, boxes, car_length_px / float(usual)) for grey, boxes in parts]
+    rng = np.random.default_rng(SEED)
+    return [
+        _scaled(grey, boxes, car_length_px / float(usual))
+        for colours, boxes in parts
+        for grey in (_grey(colours), *(_mixed(colours, rng) for _ in range(mixes)))
+    ]
 
 
 def boxes_of(file: Path) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """A grey picture, and (n, 6): class, x, y, width, height of the upright box, length of the car in it, px."""
-    grey = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-    if grey is None:
+    """A picture (h, w, 3), and (n, 6): class, x, y, width, height of the upright box, length of the car in it, px."""
+    colours = cv2.imread(str(file), cv2.IMREAD_COLOR)
+    if colours is None:
         raise InputError(f"{file}: cannot be read as a picture; fetch it again")
-    size = [grey.shape[1], grey.shape[0]] * 2
+    size = [colours.shape[1], colours.shape[0]] * 2
     boxes = np.loadtxt(file.with_suffix(".txt"), ndmin=2)[:, :5] * [1, *size] - [0, 0.5, 0.5, 0, 0]
     lengths = [length_from_upright_box(w, h) for w, h in boxes[:, 3:]]
-    return np.asarray(grey, np.uint8), np.column_stack([boxes, lengths])
+    return np.asarray(colours, np.uint8), np.column_stack([boxes, lengths])
+
+
+def _grey(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.asarray(cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY), np.uint8)
+
+
+def _mixed(colours: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    return np.asarray(cv2.transform(colours, rng.dirichlet(_MIXED)[None]), np.uint8).reshape(colours.shape[:2])
 
 
 def _scaled(grey: NDArray[np.uint8], boxes: NDArray[np.float64], factor: float) -> LabelledImage:
@@ -102,21 +124,19 @@ def simulated(seed: int, size: tuple[int, int] = (640, 480), large_share: float 
 def places_of(data: Path) -> list[Place]:
     """The sites of songdo and the sequences of kit_ais."""
     songdo = sorted((data / "songdo").glob("*.jpg"))
+    learnt = read_pictures(songdo, mixes=_MIXES)
     places = [
-        _place(f"songdo {file.stem}", [sample]) for file, sample in zip(songdo, read_pictures(songdo), strict=True)
+        Place(f"songdo {file.stem}", learnt[k : k + _MIXES + 1], learnt[k : k + 1])
+        for k, file in zip(range(0, len(learnt), _MIXES + 1), songdo, strict=True)
     ]
     for folder in sorted((data / "kit_ais").glob("MOS*")):
         files = sorted(
             (f for f in folder.glob("*.png") if f.with_suffix(".txt").exists()), key=lambda f: int(f.stem[3:])
         )
-        chosen = np.unique(np.linspace(0, len(files) - 1, _KIT_FRAMES).round().astype(int))
-        places.append(_place(f"kit_ais {folder.name}", read_pictures([files[k] for k in chosen])))
+        tried = np.unique(np.linspace(0, len(files) - 1, _KIT_FRAMES).round().astype(int))
+        learnt = read_pictures(files[::_KIT_EVERY], mixes=_MIXES)
+        places.append(Place(f"kit_ais {folder.name}", learnt, read_pictures([files[k] for k in tried])))
     return places
-
-
-def _place(name: str, samples: Sequence[LabelledImage]) -> Place:
-    learnt = [*samples, *(_toned(sample, *tone) for sample in samples for tone in _TONES)]
-    return Place(name, learnt, samples)
 
 
 def _toned(sample: LabelledImage, exponent: float, blur_px: float, noise_grey: float) -> LabelledImage:
@@ -133,18 +153,18 @@ def ship_long_vehicles(data: Path, out: Path) -> str:
     seen = each(partial(simulated, size=_LORRIES_IN, large_share=_LARGE_SHARE), LORRY_SEEDS)
     samples = [sample if k % 3 == 0 else _toned(sample, *_TONES[k % 3 - 1]) for k, sample in enumerate(seen)]
     for place in places_of(data):
-        samples += [replace(sample, cars=with_axes(sample.image, sample.cars, sample.tilts)) for sample in place.learnt]
+        toned = [*place.tried, *(_toned(sample, *tone) for sample in place.tried for tone in _TONES)]
+        samples += [replace(sample, cars=with_axes(sample.image, sample.cars, sample.tilts)) for sample in toned]
     left_out = each(partial(simulated, size=_LORRIES_IN), LORRY_SEEDS_LEFT_OUT)
     record = learn_long_vehicles(samples, left_out, CONFIG, ATTRIBUTION)
     out.write_text(record.model_dump_json())
     return f"what is long: {len(record.rounds)} rounds, threshold {record.threshold:.3f}"
 
 
-def ship(data: Path, out: Path) -> list[str]:
+def ship(data: Path, out: Path, steps: int = STEPS) -> list[str]:
     """Train and write the detector that ships; lines that tell what is measured on places left out."""
-    places, always = places_of(data), [simulated(seed) for seed in SIMULATED_SEEDS]
-    found = dict(left_out(places, always, CONFIG))
-    detector = train_on_places(places, always, CONFIG, list(found.values()))
+    places, always = places_of(data), each(simulated, SIMULATED_SEEDS)
+    detector, found = train_on_places(places, always, seed=SEED, steps=steps)
     save_detector(Detector(detector.record.model_copy(update={"attribution": ATTRIBUTION})), out)
     return [_told(*one, detector.threshold) for one in (*found.items(), ("all", joined(list(found.values()))))]
 

@@ -9,8 +9,9 @@ from schemas.detector import DetectorRecord, PrecisionRecallCurve, Proposer, Rou
 from schemas.flight import DetectionConfig
 from velfield.detection.committee import committee_of
 from velfield.detection.dense import train_densely
-from velfield.detection.detector import Detector, sums_of
+from velfield.detection.detector import Detector, shipped_detector, sums_of
 from velfield.detection.learning import CONTRAST_FLOOR, learn_classifier, learn_proposer
+from velfield.detection.network_training import train_on
 from velfield.detection.samples import LabelledImage, Scene, part_of, scene_of
 from velfield.detection.scan import propose
 from velfield.detection.validation import Evidence, curve_of, cut_of, evidence_of_part, joined, stripes
@@ -57,9 +58,10 @@ def train_detector(
         Labelled pictures. The channel |frame - background| is used where all have a background and the configuration
         lets it.
     config
-        ``method`` chooses the paper's dense response or the aligned classifier.
+        ``method`` chooses the network, the aligned classifier or the paper's dense response; where cars are not of the
+        size that the network which ships knows, the aligned one stands in for it.
     continued
-        An earlier detector, which judges together with the new one: where few cars are marked, it knows more of them.
+        An earlier detector: a network learns on, one of the aligned method judges together with the new one.
 
     Raises
     ------
@@ -71,6 +73,9 @@ def train_detector(
         raise InputError(f"{count} cars to learn from, {MIN_CARS} needed; mark the cars of one frame")
     if config.method == "dense":
         return train_densely(samples, config)
+    earlier = _network_to_continue(continued, config)
+    if earlier is not None:
+        return train_on(samples, earlier, config)
     has_background = config.motion_channel != "never" and all(sample.background is not None for sample in samples)
     channels = 4 if has_background else 3
     prior = _rounds_to_continue(continued, config, channels)
@@ -85,6 +90,15 @@ def train_detector(
             steps = replace(steps, classifier=committee_of([steps.classifier, *(one.classifier for one in others)]))
     record = record_of(steps, evidence, config, count)
     return Detector(record if continued is None else _continuing(record, continued, config, tried=evidence is not None))
+
+
+def _network_to_continue(continued: Detector | None, config: DetectionConfig) -> Detector | None:
+    """The network that learns on: the one given, or of its method the one that ships, where its cars are as large."""
+    if continued is not None:
+        return continued if continued.record.method == "network" else None
+    shipped = shipped_detector()
+    fits = config.working_car_length_px == shipped.record.working_car_length_px
+    return shipped if config.method == "network" and fits else None
 
 
 def _continuing(record: DetectorRecord, earlier: Detector, config: DetectionConfig, *, tried: bool) -> DetectorRecord:
@@ -155,11 +169,12 @@ def _folds(
     tried = np.unique(np.linspace(0, len(scenes) - 1, min(_FOLD_SCENES, len(scenes))).round().astype(int))
 
     def of_fold(fold: int) -> tuple[Steps, list[Evidence]]:
-        seen = [part_of(scene, ~stripes(scene, fold, folds)) for scene in scenes]
+        seen = [part_of(scene, ~stripes(scene.sample, fold, folds)) for scene in scenes]
         steps = trained(seen, config, channels, config.seed + 1 + fold, prior)
         proposer, sums = sums_of(steps.proposer), sums_of(steps.classifier)
         return steps, [
-            evidence_of_part(scenes[k], stripes(scenes[k], fold, folds), proposer, sums, members=members) for k in tried
+            evidence_of_part(scenes[k], stripes(scenes[k].sample, fold, folds), proposer, sums, members=members)
+            for k in tried
         ]
 
     found = each(of_fold, range(folds))

@@ -10,7 +10,7 @@ from schemas.detector import PrecisionRecallCurve
 from velfield.detection.aligned import FIRST_ROUNDS, Look, distinct, find_cars
 from velfield.detection.detector import BoostedSums
 from velfield.detection.learning import CONTRAST_FLOOR
-from velfield.detection.samples import Scene, distance, is_far, lies_in
+from velfield.detection.samples import LabelledImage, Scene, distance, is_far, lies_in
 from velfield.detection.scan import propose
 
 Floats = NDArray[np.float64]
@@ -51,11 +51,11 @@ class Evidence:
     complete: bool
 
 
-def stripes(scene: Scene, fold: int, folds: int) -> Bools:
+def stripes(sample: LabelledImage, fold: int, folds: int) -> Bools:
     """(h, w) the two stripes across the longer side that a fold leaves out: with as many cars in each."""
-    height, width = scene.sample.image.shape
+    height, width = sample.image.shape
     axis, count = 0 if width >= height else 1, 2 * folds
-    borders = np.quantile(scene.cars[:, axis], np.arange(1, count) / count) if len(scene.cars) else np.empty(0)
+    borders = np.quantile(sample.cars[:, axis], np.arange(1, count) / count) if len(sample.cars) else np.empty(0)
     stripe = np.searchsorted(borders, np.arange(max(width, height)))
     inside = stripe % folds == fold
     return np.broadcast_to(inside if axis == 0 else inside[:, None], (height, width))

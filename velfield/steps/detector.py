@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from schemas.detector import PrecisionRecallCurve
-from schemas.flight import DetectionConfig
 from schemas.records import WorkingRecord
 from velfield.detection.detector import Detector, load_detector, shipped_detector
 from velfield.detection.motion_difference import MotionBackground, MotionFrame, motion_background
@@ -28,10 +27,11 @@ from velfield.stores import open_frames
 
 _TRAINING_FRAMES = 6
 _EVIDENCE_BURSTS = 6
+_BY_LOOKS = {"network": ("aligned", "network"), "aligned": ("aligned",), "dense": ("dense",)}
+"""What learns from motion by looks alone, in turn: the boosted classifier is four times as fast, and where cars are
+like those that move, as good."""
 _MOST_FRAMES = 0.5
 """Share of the frames that another program's boxes are expected to be in."""
-_FEW_CARS = 20
-"""Fewer marked cars than this continue the shipped detector."""
 
 
 def make_detector(plan: Plan) -> Outcome:
@@ -97,17 +97,9 @@ def _from_labels(plan: Plan) -> Outcome:
         )
     source, work_per_raw = Path(plan.job.inputs.source), scale * base_per_raw
     samples = list(labelled_images(source, plan.info, labels, work_per_raw=work_per_raw))
-    continued = _to_continue(plan.config.detection, len(labels.cars))
-    detector = train_detector(samples, plan.config.detection, continued=continued)
+    detector = train_detector(samples, plan.config.detection)
     outcome = _finish(plan, detector, scale, "labels", count=len(labels.cars))
     return replace(outcome, warnings=odd_length(length_px * base_per_raw, read_grid(plan).gsd_m))
-
-
-def _to_continue(config: DetectionConfig, cars: int) -> Detector | None:
-    """Few marked cars mend the shipped detector, many are better off without it; none where it does not fit."""
-    shipped = shipped_detector()
-    fits = config.method == "aligned" and config.working_car_length_px == shipped.record.working_car_length_px
-    return shipped if fits and cars < _FEW_CARS else None
 
 
 def _from_motion(plan: Plan) -> Outcome:
@@ -150,11 +142,13 @@ def _by_motion(
     """
     config = plan.config.detection
     if config.motion_channel == "auto":
-        by_looks = train_detector(samples, config.model_copy(update={"motion_channel": "never"}))
-        evidence = _evidence(plan, by_looks, frames, background)
-        if evidence.tells_cars(_usual_score(by_looks)):
-            return by_looks if config.threshold is not None else _judged(by_looks, evidence)
-    detector = train_detector(samples, config)
+        for method in _BY_LOOKS[config.method]:
+            by_looks = train_detector(samples, config.model_copy(update={"method": method, "motion_channel": "never"}))
+            evidence = _evidence(plan, by_looks, frames, background)
+            if evidence.tells_cars(_usual_score(by_looks)):
+                return by_looks if config.threshold is not None else _judged(by_looks, evidence)
+    method = "dense" if config.method == "dense" else "aligned"  # the network knows no difference to a background
+    detector = train_detector(samples, config.model_copy(update={"method": method}))
     if config.threshold is not None:
         return detector
     return _judged(detector, _evidence(plan, detector, frames, background))
