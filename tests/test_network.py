@@ -11,7 +11,7 @@ from scipy.signal import correlate
 from schemas.flight import DetectionConfig
 from velfield.detection.axis import axial_difference
 from velfield.detection.convolution import Layout, convolved, gathered, handed_back, spread
-from velfield.detection.detector import shipped_detector
+from velfield.detection.detector import Detector, shipped_detector
 from velfield.detection.label_axis import with_axes
 from velfield.detection.network import LAYERS, Network, network_of, odds_map, record_of_network, said_of
 from velfield.detection.network_finds import network_finds
@@ -187,3 +187,33 @@ def test_learning_on_is_deterministic_and_keeps_whose_pictures_it_learnt_from() 
     assert one.record.attribution == shipped_detector().record.attribution
     assert one.threshold == shipped_detector().threshold  # too few to leave some out
     assert one.record.network != shipped_detector().record.network
+
+
+def test_the_threshold_of_few_cars_is_drawn_towards_the_one_of_before() -> None:
+    marked = city(9504)
+    own = train_on([marked], shipped_detector(), DetectionConfig(network_steps=2)).record
+    strict = shipped_detector().record.model_copy(update={"threshold": shipped_detector().threshold + 0.1})
+    drawn = train_on([marked], Detector(strict), DetectionConfig(network_steps=2)).record
+    share = len(marked.cars) / (len(marked.cars) + 50)
+    assert drawn.threshold - own.threshold == pytest.approx(0.1 * (1 - share))
+    assert own.curve is not None
+    assert own.curve.chosen is not None
+    assert own.curve.threshold[own.curve.chosen] == pytest.approx(own.threshold, abs=0.03)
+
+
+def test_cars_of_another_size_are_not_learnt_on_from() -> None:
+    with pytest.raises(InputError, match="cars of 16 px to continue, expected 20 px"):
+        train_on([city(9504)], shipped_detector(), DetectionConfig(working_car_length_px=20.0))
+
+
+def test_what_the_frame_cuts_deep_is_no_find() -> None:
+    """A car alone on a road, whole and cut: of the half car there is no find, of the whole one there is."""
+    image = np.full((96, 160), 90, np.uint8)
+    image[:] += np.random.default_rng(0).integers(0, 12, image.shape).astype(np.uint8)
+    for x in (0, 80):
+        image[44:52, max(x - 8, 0) : x + 8] = 225
+        image[46:50, max(x - 3, 0) : x + 3] = 60
+    found = network_finds(shipped(), image, None)
+    sure = found[found[:, 3] > 0]
+    assert (np.hypot(sure[:, 0] - 79.5, sure[:, 1] - 47.5) < 4).any()
+    assert not (sure[:, 0] < 3).any()

@@ -24,6 +24,8 @@ _MIDDLE_SIGMA_PX = 2.2
 _AT_A_CAR, _ABOUT_IT_PX = 0.7, 19.0
 """Share of the pieces about a marked car, and how far its place in them varies."""
 _SCALE_SPREAD = 0.2
+_REACH = 2
+"""Sides of a piece from its middle within which lies all that it can show."""
 _GAMMA_SPREAD, _CONTRAST, _LIGHT = 0.7, (0.5, 1.4), 0.15
 _GREY_MIDDLE = 0.45
 _BLURRED, _BLUR_PX = 0.3, (0.3, 0.9)
@@ -71,19 +73,23 @@ def _ready(sample: LabelledImage) -> LabelledImage:
 
 def _piece(sample: LabelledImage, rng: np.random.Generator) -> tuple[Array, Array, Array, Array, Array]:
     matrix = _placed(sample, rng)
-    picture = cv2.warpAffine(
-        sample.image.astype(np.float32) / 255, matrix, (SIDE_PX, SIDE_PX), borderMode=cv2.BORDER_REFLECT_101
-    )
+    rows, columns, near = _about(matrix)
+    image = sample.image[rows, columns].astype(np.float32) / 255
+    picture = cv2.warpAffine(image, near, (SIDE_PX, SIDE_PX), borderMode=cv2.BORDER_REFLECT_101)
     cars = sample.cars[:, :2] @ matrix[:, :2].T + matrix[:, 2]
     along = np.column_stack([np.cos(sample.cars[:, 2]), np.sin(sample.cars[:, 2])]) @ matrix[:, :2].T
     middles, axes, counted_axes = _told_of(cars, np.arctan2(along[:, 1], along[:, 0]))
-    seen = np.ones(sample.image.shape, np.uint8) if sample.valid is None else sample.valid.astype(np.uint8)
-    counted = cv2.warpAffine(seen, matrix, (SIDE_PX, SIDE_PX), flags=cv2.INTER_NEAREST)[::STRIDE, ::STRIDE] > 0
+    seen = np.ones(image.shape, bool) if sample.valid is None else sample.valid[rows, columns]
+    counted = (
+        cv2.warpAffine(seen.astype(np.uint8), near, (SIDE_PX, SIDE_PX), flags=cv2.INTER_NEAREST)[::STRIDE, ::STRIDE] > 0
+    )
     scale = float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
-    for x, y, radius in sample.ignore:
-        at = matrix[:, :2] @ (x, y) + matrix[:, 2]
-        near = np.hypot(_CELLS[None, :] - at[0], _CELLS[:, None] - at[1]) < radius * scale + STRIDE
-        counted &= ~near | (middles > 0.1)
+    circles = np.column_stack([sample.ignore[:, :2] @ matrix[:, :2].T + matrix[:, 2], scale * sample.ignore[:, 2]])
+    reach = circles[:, 2:] + STRIDE
+    within = ((circles[:, :2] > -reach) & (circles[:, :2] < SIDE_PX + reach)).all(axis=1)
+    for x, y, radius in circles[within]:
+        circle = np.hypot(_CELLS[None, :] - x, _CELLS[:, None] - y) < radius + STRIDE
+        counted &= ~circle | (middles > 0.1)
     return _toned(picture, rng), middles, counted.astype(np.float32), axes, counted_axes * counted
 
 
@@ -101,6 +107,15 @@ def _placed(sample: LabelledImage, rng: np.random.Generator) -> Floats:
     c, s = scale * np.cos(turn), scale * np.sin(turn)
     turned = np.array([[c, -s], [s, c]]) * (rng.choice([-1.0, 1.0]), 1.0)
     return np.column_stack([turned, np.full(2, SIDE_PX / 2) - turned @ at])
+
+
+def _about(matrix: Floats) -> tuple[slice, slice, Floats]:
+    """Rows and columns of all that a piece can show, mirrored at the picture's edge too, and the matrix from there."""
+    middle = np.linalg.solve(matrix[:, :2], np.full(2, SIDE_PX / 2) - matrix[:, 2])
+    first = np.maximum(middle - _REACH * SIDE_PX, 0).astype(int)
+    last = np.maximum(middle + _REACH * SIDE_PX, 1).astype(int)
+    moved = np.column_stack([matrix[:, :2], matrix[:, 2] + matrix[:, :2] @ first])
+    return slice(first[1], last[1]), slice(first[0], last[0]), moved
 
 
 def _told_of(cars: Floats, axis: Floats) -> tuple[Array, Array, Array]:

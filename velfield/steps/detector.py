@@ -27,9 +27,6 @@ from velfield.stores import open_frames
 
 _TRAINING_FRAMES = 6
 _EVIDENCE_BURSTS = 6
-_BY_LOOKS = {"network": ("aligned", "network"), "aligned": ("aligned",), "dense": ("dense",)}
-"""What learns from motion by looks alone, in turn: the boosted classifier is four times as fast, and where cars are
-like those that move, as good."""
 _MOST_FRAMES = 0.5
 """Share of the frames that another program's boxes are expected to be in."""
 
@@ -141,14 +138,15 @@ def _by_motion(
     simulated city .79 of the cars that move at some time, .91 by their looks.
     """
     config = plan.config.detection
+    if config.method == "network":
+        # What moves is hundreds of labels, of which the boosted classifier learns as much, and is four times as fast.
+        config = config.model_copy(update={"method": "aligned"})
     if config.motion_channel == "auto":
-        for method in _BY_LOOKS[config.method]:
-            by_looks = train_detector(samples, config.model_copy(update={"method": method, "motion_channel": "never"}))
-            evidence = _evidence(plan, by_looks, frames, background)
-            if evidence.tells_cars(_usual_score(by_looks)):
-                return by_looks if config.threshold is not None else _judged(by_looks, evidence)
-    method = "dense" if config.method == "dense" else "aligned"  # the network knows no difference to a background
-    detector = train_detector(samples, config.model_copy(update={"method": method}))
+        by_looks = train_detector(samples, config.model_copy(update={"motion_channel": "never"}))
+        evidence = _evidence(plan, by_looks, frames, background)
+        if evidence.tells_cars(_usual_score(by_looks)):
+            return by_looks if config.threshold is not None else _judged(by_looks, evidence)
+    detector = train_detector(samples, config)
     if config.threshold is not None:
         return detector
     return _judged(detector, _evidence(plan, detector, frames, background))
