@@ -60,6 +60,15 @@ class Detector:
         """Precision and recall on cars left out of training."""
         return self.record.curve
 
+    def check_car_length(self, wanted_px: float) -> None:
+        """Raise InputError where cars of this length, working px, are not those that it can be continued on."""
+        length_px = self.record.working_car_length_px
+        if length_px != wanted_px:
+            raise InputError(
+                f"found a detector of cars of {length_px:g} px to continue, expected {wanted_px:g} px; "
+                "set detection.working_car_length_px"
+            )
+
     @cached_property
     def uses_background(self) -> bool:
         """Whether it looks at |frame - background|."""

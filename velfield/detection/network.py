@@ -65,10 +65,8 @@ class Network:
 
     def rectified(self, name: str, values: Array, layout: Layout) -> Array:
         """The same, what is below zero set to it."""
-        out = convolved(values, self.weights[name], layout)
-        out += self.biases[name]
+        out = self.layer(name, values, layout)
         np.maximum(out, 0, out=out)
-        layout.clear_border(out)
         return out
 
 
@@ -150,7 +148,7 @@ def odds_map(network: Network, image: Grey) -> tuple[Array, Array]:
     for y in range(0, rows * tile_h, tile_h):
         for x in range(0, columns * tile_w, tile_w):
             tile = around[y : y + tile_h + 2 * _REACH_PX, x : x + tile_w + 2 * _REACH_PX]
-            answer = said_of(network, (tile / np.float32(255))[None].astype(np.float32))[0]
+            answer = said_of(network, (tile / np.float32(255))[None])[0]
             place = slice(y // STRIDE, (y + tile_h) // STRIDE), slice(x // STRIDE, (x + tile_w) // STRIDE)
             said[place] = answer[margin : margin + tile_h // STRIDE, margin : margin + tile_w // STRIDE]
     said = said[: -(-height // STRIDE), : -(-width // STRIDE)]

@@ -13,19 +13,16 @@ from velfield.detection.aligned import distinct
 from velfield.detection.detector import Detector
 from velfield.detection.label_axis import with_axes
 from velfield.detection.network import Network, odds_map, record_of_network
-from velfield.detection.network_finds import LIKELY, network_finds
+from velfield.detection.network_finds import network_finds
 from velfield.detection.network_learning import Learner, learnt
 from velfield.detection.network_samples import Pieces
-from velfield.detection.samples import LabelledImage, lies_in
-from velfield.detection.validation import Evidence, curve_of, joined, matched, stripes
-from velfield.errors import InputError
+from velfield.detection.samples import LabelledImage, lies_in, within
+from velfield.detection.validation import FOLD_MIN_CARS, Evidence, curve_of, joined, matched, stripes
 from velfield.threads import each
 
-FOLD_MIN_CARS = 16
-"""With fewer marked cars none are left out to choose T."""
 _FOLDS = 2
 _SIZE_ON = 1e-3
-_STEPS, _SIZE = 2500, 3e-3
+_SIZE = 3e-3
 _MAYBE, _ABOUT_CAR_PX, _ABOUT_LIKED_PX = 0.12, 9, 3
 """Where not every car is marked: places likelier than this may be one; about those that are marked it is known."""
 _CURVE_FROM = -0.25
@@ -36,7 +33,7 @@ _TOLD = "cars in stripes of the pictures, found by detectors trained on the othe
 
 
 def network_from_nothing(
-    groups: Sequence[Sequence[LabelledImage]], shares: Sequence[float], seed: int, *, steps: int = _STEPS
+    groups: Sequence[Sequence[LabelledImage]], shares: Sequence[float], seed: int, *, steps: int
 ) -> Network:
     """Learn a network; ``groups`` of pictures and how often each is taken from, as for `Pieces`."""
     return learnt(Learner.from_nothing(seed), Pieces(groups, shares, seed), steps=steps, size=_SIZE)
@@ -55,11 +52,7 @@ def train_on(samples: Sequence[LabelledImage], earlier: Detector, config: Detect
     InputError
         An earlier detector of cars of another size.
     """
-    if earlier.record.working_car_length_px != config.working_car_length_px:
-        raise InputError(
-            f"found a detector of cars of {earlier.record.working_car_length_px:g} px to continue, expected "
-            f"{config.working_car_length_px:g} px; set detection.working_car_length_px"
-        )
+    earlier.check_car_length(config.working_car_length_px)
     known = [_known(sample, earlier.network) for sample in samples]
     count = sum(len(sample.cars) for sample in samples)
     network, *tried = each(
@@ -109,15 +102,10 @@ def _on(
     if fold < 0:
         return learnt(Learner.of(earlier), Pieces([samples], [1.0], seed), steps=steps, size=_SIZE_ON), []
     left = [stripes(sample, fold, _FOLDS) for sample in samples]
-    seen = [_without(sample, region) for sample, region in zip(samples, left, strict=True)]
+    seen = [within(sample, ~region) for sample, region in zip(samples, left, strict=True)]
     pieces = Pieces([seen], [1.0], seed + 1 + fold)
     network = learnt(Learner.of(earlier), pieces, steps=steps, size=_SIZE_ON)
     return network, [evidence_of_network(network, sample, region) for sample, region in zip(samples, left, strict=True)]
-
-
-def _without(sample: LabelledImage, region: NDArray[np.bool_]) -> LabelledImage:
-    valid = ~region if sample.valid is None else sample.valid & ~region
-    return replace(sample, cars=sample.cars[~lies_in(region, sample.cars)], valid=valid)
 
 
 def _known(sample: LabelledImage, network: Network) -> LabelledImage:
@@ -147,6 +135,3 @@ def evidence_of_network(network: Network, sample: LabelledImage, region: NDArray
         found, right = found[counted], right[counted]
     never = np.full(len(found), -1.0)
     return Evidence(found[:, 3], right, never, never, len(cars), sample.complete)
-
-
-__all__ = ["LIKELY", "chosen_threshold", "evidence_of_network", "network_from_nothing", "record_of", "train_on"]

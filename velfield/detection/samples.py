@@ -85,12 +85,18 @@ def scene_of(sample: LabelledImage, has_background: bool) -> Scene:
 
 def part_of(scene: Scene, region: Bools) -> Scene:
     """The scene with nothing known outside a region (h, w)."""
-    valid = region if scene.sample.valid is None else region & scene.sample.valid
     inside = lies_in(region, scene.cars)
-    tilts = None if scene.sample.tilts is None else scene.sample.tilts[inside]
-    sample = replace(scene.sample, valid=valid, cars=scene.sample.cars[inside], tilts=tilts)
     places = scene.places[lies_in(region, scene.places)]
-    return replace(scene, sample=sample, cars=scene.cars[inside], told=scene.told[inside], places=places)
+    return replace(
+        scene, sample=within(scene.sample, region), cars=scene.cars[inside], told=scene.told[inside], places=places
+    )
+
+
+def within(sample: LabelledImage, region: Bools) -> LabelledImage:
+    """The picture with nothing known outside a region (h, w)."""
+    valid, inside = region if sample.valid is None else region & sample.valid, lies_in(region, sample.cars)
+    tilts = None if sample.tilts is None else sample.tilts[inside]
+    return replace(sample, valid=valid, cars=sample.cars[inside], tilts=tilts)
 
 
 def lies_in(region: Bools, xy: Floats) -> Bools:

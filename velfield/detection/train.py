@@ -14,7 +14,7 @@ from velfield.detection.learning import CONTRAST_FLOOR, learn_classifier, learn_
 from velfield.detection.network_training import train_on
 from velfield.detection.samples import LabelledImage, Scene, part_of, scene_of
 from velfield.detection.scan import propose
-from velfield.detection.validation import Evidence, curve_of, cut_of, evidence_of_part, joined, stripes
+from velfield.detection.validation import FOLD_MIN_CARS, Evidence, curve_of, cut_of, evidence_of_part, joined, stripes
 from velfield.errors import InputError
 from velfield.threads import each
 
@@ -22,7 +22,6 @@ __all__ = ["LabelledImage", "record_of", "train_detector", "trained"]
 
 MIN_CARS = 8
 """Fewer marked cars than this do not train a detector."""
-_FOLD_MIN_CARS = 16
 _FOLD_SCENES = 3
 """Pictures that the folds are tried on, spread over those that there are."""
 _UNTRIED_THRESHOLD = 0.15
@@ -81,7 +80,7 @@ def train_detector(
     prior = _rounds_to_continue(continued, config, channels)
     steps = trained([scene_of(sample, has_background) for sample in samples], config, channels, config.seed, prior)
     evidence = None
-    if count >= _FOLD_MIN_CARS:
+    if count >= FOLD_MIN_CARS:
         complete = all(sample.complete for sample in samples)
         folds = config.folds if complete else 2  # else motion will tell T
         together = complete and not prior and count >= _COMMITTEE_MIN_CARS
@@ -122,11 +121,7 @@ def _rounds_to_continue(earlier: Detector | None, config: DetectionConfig, chann
             f"found a detector of the {record.method} method{' with' if earlier.uses_background else ' without'} a "
             "background to continue, expected one of the aligned method that looks at what is there; train anew"
         )
-    if record.working_car_length_px != config.working_car_length_px:
-        raise InputError(
-            f"found a detector of cars of {record.working_car_length_px:g} px to continue, expected "
-            f"{config.working_car_length_px:g} px; set detection.working_car_length_px"
-        )
+    earlier.check_car_length(config.working_car_length_px)
     return record.rounds
 
 

@@ -16,6 +16,8 @@ from velfield.detection.scan import propose
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+FOLD_MIN_CARS = 16
+"""With fewer marked cars none are left out to choose T."""
 MATCH_PX = 8.0
 """A find this near to a car's middle is that car, working px: half its length."""
 _NEAR_PX = 6.0
