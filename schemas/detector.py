@@ -3,7 +3,7 @@
 from base64 import b64decode
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from schemas.model import Model
 
@@ -79,6 +79,23 @@ class LayerRecord(Model):
         return self
 
 
+class MotionRecord(Model):
+    """How much less what differs from the background needs to be liked, where a network looks at it."""
+
+    still_grey: NonNegativeFloat
+    """What stands differs by no more, mean grey levels about a find."""
+    moving_grey: PositiveFloat
+    """What differs by so much moves."""
+    lift: NonNegativeFloat
+    """What moves is liked so much more; from the one to the other it grows evenly."""
+
+    @model_validator(mode="after")
+    def _is_a_ramp(self) -> Self:
+        if self.moving_grey <= self.still_grey:
+            raise ValueError(f"what moves differs by {self.moving_grey:g}, what stands by {self.still_grey:g}")
+        return self
+
+
 class DetectorRecord(Model):
     """A trained detector."""
 
@@ -90,6 +107,8 @@ class DetectorRecord(Model):
     rounds: tuple[Round, ...] = Field(default=(), max_length=50_000)
     network: dict[str, LayerRecord] | None = Field(default=None, max_length=100)
     """The layers of the network, by name."""
+    motion: MotionRecord | None = None
+    """Network: what is made of the difference to the background; none: nothing."""
     threshold: float
     grey_bits: int = Field(default=8, ge=1, le=8)
     """Dense: so many bits of the grey are looked at."""

@@ -11,6 +11,7 @@ from velfield.detection.dense import find_cars_densely
 from velfield.detection.detector import Detector
 from velfield.detection.label_axis import CAR_ASPECT
 from velfield.detection.long_vehicles import LONG, shipped_long_vehicles
+from velfield.detection.motion_lift import difference_about, lift_of
 from velfield.detection.network_finds import network_finds
 from velfield.detection.patches import oriented_patches, upright_chips
 from velfield.detection.scan import propose
@@ -70,6 +71,9 @@ def detect_frame(
         cars, area = find_cars_densely(image, valid, detector, config, threshold)
     elif detector.record.method == "network":
         found = network_finds(detector.network, image, valid)
+        motion = detector.record.motion
+        if motion is not None and background is not None:
+            found[:, 3] += lift_of(motion, difference_about(image, background, found[:, :2], length))
         cars = _middles(image, valid, distinct(found[found[:, 3] > threshold], length), length)
         area = np.full(len(cars), length * length * CAR_ASPECT)
     else:

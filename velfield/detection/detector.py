@@ -72,7 +72,7 @@ class Detector:
     @cached_property
     def uses_background(self) -> bool:
         """Whether it looks at |frame - background|."""
-        return any(r.channel == 3 for r in self.record.rounds)
+        return self.record.motion is not None or any(r.channel == 3 for r in self.record.rounds)
 
     @cached_property
     def network(self) -> Network:

@@ -144,6 +144,18 @@ def conduct(before: Found, middle: Found, after: Found, *, car_length_px: float)
     return kinds
 
 
+def conduct_of_bursts(
+    frames: Sequence[Found], *, car_length_px: float, max_interval_s: float = _MAX_INTERVAL_S
+) -> tuple[list[int], list[NDArray[np.int8]]]:
+    """Frames, by their place, that have a neighbour in time on both sides, and what each one's detections do."""
+    middles = [
+        k
+        for k in range(1, len(frames) - 1)
+        if max(frames[k].time_s - frames[k - 1].time_s, frames[k + 1].time_s - frames[k].time_s) <= max_interval_s
+    ]
+    return middles, [conduct(*frames[k - 1 : k + 2], car_length_px=car_length_px) for k in middles]
+
+
 def neighbours(times_s: Sequence[float], wanted: int, max_interval_s: float = _MAX_INTERVAL_S) -> Ints:
     """Frames, by their place, of up to ``wanted`` bursts of three neighbours in time, spread evenly.
 
@@ -174,12 +186,9 @@ def evidence_from_motion(
     max_interval_s : float
         Frames farther apart than this are no neighbours.
     """
-    scores, kinds = [np.empty(0)], [np.empty(0, np.int8)]
-    for before, middle, after in zip(frames, frames[1:], frames[2:], strict=False):
-        if max(middle.time_s - before.time_s, after.time_s - middle.time_s) <= max_interval_s:
-            scores.append(middle.score)
-            kinds.append(conduct(before, middle, after, car_length_px=car_length_px))
-    score, kind = np.concatenate(scores), np.concatenate(kinds)
+    middles, kinds = conduct_of_bursts(frames, car_length_px=car_length_px, max_interval_s=max_interval_s)
+    score = np.concatenate([np.empty(0), *(frames[k].score for k in middles)])
+    kind = np.concatenate([np.empty(0, np.int8), *kinds])
     told = kind != Conduct.STANDS
     order = np.argsort(-score[told], kind="stable")
     threshold, moves = score[told][order], kind[told][order] == Conduct.MOVES

@@ -22,6 +22,8 @@ LIKELY = 0.35
 _BLUR_CELLS = 0.8
 _LEAST = 0.2
 """Places less likely than this at the first look are let go."""
+SCORE_FLOOR = _LEAST - LIKELY
+"""Finds are hardly ever liked less."""
 _QUARTER_CAR_PX = 4.0
 _AGAIN_PX = 44
 _MIDDLE = _AGAIN_PX // (2 * STRIDE)

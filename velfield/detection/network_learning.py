@@ -11,6 +11,7 @@ import numpy as np
 
 from velfield.detection.convolution import Array, Layout, convolved, gathered, handed_back, spread
 from velfield.detection.network import BODIES, CORNERS, LAYERS, Network
+from velfield.threads import each
 
 _NORMALISED = tuple(name for name in LAYERS if name not in ("back", "told"))
 _MOMENTUM, _LEAST_VARIANCE = 0.05, 1e-5
@@ -40,6 +41,29 @@ class Batch:
     counted: Array
     axes: Array
     axes_counted: Array
+
+    def halves(self) -> "tuple[Batch, Batch]":
+        """The first and the second half of the pictures."""
+        middle = len(self.pictures) // 2
+        parts = (self.pictures, self.middles, self.counted, self.axes, self.axes_counted)
+        return Batch(*(part[:middle] for part in parts)), Batch(*(part[middle:] for part in parts))
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """What the losses of cars and of axes are divided by: how many there are in a batch."""
+
+    cars: float
+    axes: float
+
+    @classmethod
+    def of(cls, batch: Batch) -> "Weighed":
+        """Of a batch."""
+        return cls(float(_at_cars(batch).sum()) + 1, float(batch.axes_counted.sum()) + 1)
+
+
+def _at_cars(batch: Batch) -> Array:
+    return np.asarray(batch.middles**4 * batch.counted, np.float32)
 
 
 @dataclass
@@ -111,7 +135,18 @@ class Learner:
         self.values[name] = (value * (1 - size * _DECAY) - size * step).astype(np.float32)
 
     def slopes(self, batch: Batch) -> tuple[float, dict[str, Array]]:
-        """The loss, and its slope by everything that is learnt."""
+        """The loss, and its slope by everything that is learnt.
+
+        Where no layer is normalised by its batch, both halves of it are gone through at once: what they hand back adds
+        up to the same, whatever the number of processors.
+        """
+        weighed = Weighed.of(batch)
+        if any(f"{name}.g" in self.values for name in LAYERS) or len(batch.pictures) < 2:
+            return self._slopes(batch, weighed)
+        (first, of_first), (second, of_second) = each(lambda half: self._slopes(half, weighed), batch.halves())
+        return first + second, {name: slope + of_second[name] for name, slope in of_first.items()}
+
+    def _slopes(self, batch: Batch, weighed: Weighed) -> tuple[float, dict[str, Array]]:
         tape = _Tape(self)
         whole = Layout(*batch.pictures.shape)
         half = whole.halved()
@@ -125,7 +160,7 @@ class Learner:
             body = body + tape.rectified(second, tape.rectified(first, body, quarter), quarter)
         joined = np.maximum(spread(tape.summed("back", body, quarter), half) + corners, 0)
         said = tape.summed("told", tape.rectified("middle", joined, half), half)
-        loss, slope = loss_of(half.inner(said), batch)
+        loss, slope = loss_of(half.inner(said), batch, weighed)
 
         back = tape.back("middle", tape.back("told", half.laid_out(slope))) * (joined > 0)
         by_body = tape.back("back", gathered(back, half))
@@ -206,7 +241,7 @@ class _Tape:
         return np.asarray(self._undo.pop(name)(slope), np.float32)
 
 
-def loss_of(said: Array, batch: Batch) -> tuple[float, Array]:
+def loss_of(said: Array, batch: Batch, weighed: Weighed) -> tuple[float, Array]:
     """How wrong what is said is, and the slope of that by it, (n, h / 2, w / 2, 3).
 
     A focal loss: places that are told well count little, and near a car's middle it is no fault to like a place.
@@ -214,8 +249,7 @@ def loss_of(said: Array, batch: Batch) -> tuple[float, Array]:
     middles, counted = batch.middles, batch.counted
     odds = np.clip(said[..., 0], -11, 11)
     likely = 1 / (1 + np.exp(-odds))
-    car, other = middles**4 * counted, (1 - middles) ** 2 * counted
-    cars = float(car.sum()) + 1
+    car, other, cars = _at_cars(batch), (1 - middles) ** 2 * counted, weighed.cars
     above = np.maximum(likely - middles, 0)
     log_car, log_other = np.log(likely), np.log1p(-likely)
     loss = float((-car * (1 - likely) ** 2 * log_car - other * above**2 * log_other).sum()) / cars
@@ -224,7 +258,7 @@ def loss_of(said: Array, batch: Batch) -> tuple[float, Array]:
     slope = np.zeros_like(said)
     slope[..., 0] = by_likely * likely * (1 - likely) / cars
     off = said[..., 1:] - batch.axes
-    weight = np.float32(_AXIS_WEIGHT / (float(batch.axes_counted.sum()) + 1)) * batch.axes_counted[..., None]
+    weight = np.float32(_AXIS_WEIGHT / weighed.axes) * batch.axes_counted[..., None]
     slope[..., 1:] = 2 * weight * off
     return loss + float((weight * off**2).sum()), slope
 

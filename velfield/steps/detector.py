@@ -11,7 +11,8 @@ from schemas.records import WorkingRecord
 from velfield.detection.detector import Detector, load_detector, shipped_detector
 from velfield.detection.motion_difference import MotionBackground, MotionFrame, motion_background
 from velfield.detection.motion_evidence import MotionEvidence, evidence_of, neighbours
-from velfield.detection.motion_labels import FrameLabels, MotionLabels, choose_frames, labels_from_motion, working_scale
+from velfield.detection.motion_labels import MotionLabels, choose_frames, labels_from_motion, working_scale
+from velfield.detection.network_motion import network_of_motion
 from velfield.detection.train import LabelledImage, train_detector
 from velfield.errors import InputError
 from velfield.plan import Plan
@@ -25,7 +26,7 @@ from velfield.steps.registration import usable_frames
 from velfield.steps.working import WorkingGrid, write_background
 from velfield.stores import open_frames
 
-_TRAINING_FRAMES = 6
+_TRAINING_FRAMES, _NETWORK_FRAMES = 6, 12
 _EVIDENCE_BURSTS = 6
 _MOST_FRAMES = 0.5
 """Share of the frames that another program's boxes are expected to be in."""
@@ -114,31 +115,21 @@ def _from_motion(plan: Plan) -> Outcome:
         labels = labels_from_motion(frames, background, car_length_px=wanted, max_interval_s=near_s)
     if not labels.usable:
         return _without_labels(plan, known, labels)
-    samples = [
-        LabelledImage(
-            image=frame.image,
-            valid=frame.valid & background.valid,
-            background=background.median,
-            cars=found.cars,
-            ignore=found.ignore,
-            complete=False,
-        )
-        for frame, found in _training_frames(frames, labels)
-    ]
-    detector = _by_motion(plan, samples, frames, background)
+    detector = _by_motion(plan, frames, labels, background)
     return _finish(plan, detector, scale, "motion", count=labels.count, motion=labels, background=background)
 
 
-def _by_motion(
-    plan: Plan, samples: list[LabelledImage], frames: list[MotionFrame], background: MotionBackground
-) -> Detector:
+def _by_motion(plan: Plan, frames: list[MotionFrame], labels: MotionLabels, background: MotionBackground) -> Detector:
     """A detector of cars that move: by their looks alone where these tell them, so that it finds what stands too.
 
     By the difference to the background what waits at a light for long, and is in the background, is not found: in a
     simulated city .79 of the cars that move at some time, .91 by their looks.
     """
     config = plan.config.detection
-    if config.method == "network":
+    samples = _samples(frames, labels, background, _TRAINING_FRAMES)
+    shipped = shipped_detector()
+    has_network = config.method == "network" and config.working_car_length_px == shipped.record.working_car_length_px
+    if has_network:
         # What moves is hundreds of labels, of which the boosted classifier learns as much, and is four times as fast.
         config = config.model_copy(update={"method": "aligned"})
     if config.motion_channel == "auto":
@@ -146,6 +137,17 @@ def _by_motion(
         evidence = _evidence(plan, by_looks, frames, background)
         if evidence.tells_cars(_usual_score(by_looks)):
             return by_looks if config.threshold is not None else _judged(by_looks, evidence)
+    if has_network and config.motion_channel != "never":
+        learnt = network_of_motion(
+            _samples(frames, labels, background, _NETWORK_FRAMES),
+            shipped,
+            _bursts(plan, frames),
+            background.median,
+            plan.config.detection,
+            max_interval_s=plan.config.tracking.max_interval_s,
+        )
+        if learnt is not None:
+            return learnt
     detector = train_detector(samples, config)
     if config.threshold is not None:
         return detector
@@ -163,11 +165,15 @@ def _usual_score(detector: Detector) -> float:
 def _evidence(
     plan: Plan, detector: Detector, frames: list[MotionFrame], background: MotionBackground
 ) -> MotionEvidence:
-    near_s = plan.config.tracking.max_interval_s
-    chosen = neighbours([frame.time_s for frame in frames], _EVIDENCE_BURSTS, near_s)
     median = background.median if detector.uses_background else None
-    some = [frames[k] for k in chosen]
-    return evidence_of(detector, some, median, plan.config.detection, max_interval_s=near_s)
+    near_s = plan.config.tracking.max_interval_s
+    return evidence_of(detector, _bursts(plan, frames), median, plan.config.detection, max_interval_s=near_s)
+
+
+def _bursts(plan: Plan, frames: list[MotionFrame]) -> list[MotionFrame]:
+    """Bursts of three frames, in which it shows how what is found moves."""
+    chosen = neighbours([frame.time_s for frame in frames], _EVIDENCE_BURSTS, plan.config.tracking.max_interval_s)
+    return [frames[k] for k in chosen]
 
 
 def _judged(detector: Detector, evidence: MotionEvidence) -> Detector:
@@ -185,11 +191,23 @@ def _judged(detector: Detector, evidence: MotionEvidence) -> Detector:
     return Detector(detector.record.model_copy(update={"threshold": evidence.chosen, "curve": curve}))
 
 
-def _training_frames(frames: list[MotionFrame], labels: MotionLabels) -> list[tuple[MotionFrame, FrameLabels]]:
+def _samples(
+    frames: list[MotionFrame], labels: MotionLabels, background: MotionBackground, most: int
+) -> list[LabelledImage]:
     """Labelled frames spread over the flight: more of them show the same cars on the same ground."""
     labelled = [pair for pair in zip(frames, labels.frames, strict=True) if pair[1].labelled and len(pair[1].cars)]
-    chosen = np.unique(np.linspace(0, len(labelled) - 1, min(_TRAINING_FRAMES, len(labelled))).round().astype(int))
-    return [labelled[k] for k in chosen]
+    chosen = np.unique(np.linspace(0, len(labelled) - 1, min(most, len(labelled))).round().astype(int))
+    return [
+        LabelledImage(
+            image=frame.image,
+            valid=frame.valid & background.valid,
+            background=background.median,
+            cars=found.cars,
+            ignore=found.ignore,
+            complete=False,
+        )
+        for frame, found in (labelled[k] for k in chosen)
+    ]
 
 
 def _without_labels(plan: Plan, scale: float | None, labels: MotionLabels) -> Outcome:
