@@ -9,13 +9,18 @@ import pandas as pd
 import pytest
 
 from flows.runners import RunnerConfig
+from schemas.detector import MotionRecord
 from schemas.summary import RunSummary
 from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
 from tests.small_flight import FRAMES, digests, job, process, redone
 from velfield import open_run
+from velfield.detection.detector import Detector, save_detector, shipped_detector
 from velfield.errors import InputError
 from velfield.layout import STAGES, RunLayout
+from velfield.plan import make_plan
 from velfield.results import share
+from velfield.steps.detections import detect_block
+from velfield.steps.detector import make_detector
 
 
 def test_it_leaves_what_the_contract_says(whole: tuple[Path, RunSummary]) -> None:
@@ -97,6 +102,22 @@ def test_a_changed_gate_redoes_tracking_onward(whole: tuple[Path, RunSummary], f
     speeds = np.hypot(*velocities.to_numpy().T) * 0.23
     assert np.quantile(speeds, 0.99) < 10.5  # 5 m/s and what jitter adds
     assert speeds.max() < 14  # a place may be mended by a pixel or two after the gates
+
+
+def test_a_detector_that_looks_at_the_background_is_given_that_of_this_flight(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
+) -> None:
+    root, file, found = tmp_path / "copy", tmp_path / "detector.json", []
+    shutil.copytree(whole[0], root)
+    for motion in (None, MotionRecord(still_grey=8, moving_grey=20, lift=0.3)):
+        save_detector(
+            Detector(shipped_detector().record.model_copy(update={"motion": motion, "threshold": 0.35})), file
+        )
+        plan = make_plan(job(flight, root, detector=str(file)))
+        outcome = make_detector(plan)
+        assert (RunLayout(root).background in outcome.outputs) == (motion is not None)
+        found.append(len(detect_block(plan, range(8, 9)).table))
+    assert found[1] > found[0] + 5
 
 
 def test_workers_give_the_same_bits(whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path) -> None:

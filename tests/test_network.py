@@ -194,7 +194,7 @@ def test_the_threshold_of_few_cars_is_drawn_towards_the_one_of_before() -> None:
     own = train_on([marked], shipped_detector(), DetectionConfig(network_steps=2)).record
     strict = shipped_detector().record.model_copy(update={"threshold": shipped_detector().threshold + 0.1})
     drawn = train_on([marked], Detector(strict), DetectionConfig(network_steps=2)).record
-    share = len(marked.cars) / (len(marked.cars) + 50)
+    share = len(marked.cars) / (len(marked.cars) + 150)
     assert drawn.threshold - own.threshold == pytest.approx(0.1 * (1 - share))
     assert own.curve is not None
     assert own.curve.chosen is not None

@@ -55,7 +55,7 @@ def train_on(samples: Sequence[LabelledImage], earlier: Detector, config: Detect
         An earlier detector of cars of another size.
     """
     earlier.check_car_length(config.working_car_length_px)
-    known = [_known(sample, earlier.network) for sample in samples]
+    known = each(lambda sample: _known(sample, earlier.network), samples)
     count = sum(len(sample.cars) for sample in samples)
     network, *tried = each(
         lambda fold: _on(known, earlier.network, config, fold),
@@ -75,7 +75,7 @@ def train_on(samples: Sequence[LabelledImage], earlier: Detector, config: Detect
 def learnt_on(samples: Sequence[LabelledImage], earlier: Detector, config: DetectionConfig, *, share: float) -> Network:
     """An earlier network, its weights so far (0 to 1) towards those that it learnt on from labelled pictures."""
     before = earlier.network
-    network, _ = _on([_known(sample, before) for sample in samples], before, config, -1)
+    network, _ = _on(each(lambda sample: _known(sample, before), samples), before, config, -1)
 
     def between(old: Array, new: Array) -> Array:
         return old + np.float32(share) * (new - old)

@@ -37,11 +37,17 @@ def make_detector(plan: Plan) -> Outcome:
     if plan.job.inputs.detections:
         return _from_detections(plan)
     if plan.job.inputs.detector:
-        detector = load_detector(Path(plan.job.inputs.detector))
-        return _finish(plan, detector, _known_scale(plan), "file")
+        return _from_file(plan)
     if plan.job.inputs.labels:
         return _from_labels(plan)
     return _from_motion(plan)
+
+
+def _from_file(plan: Plan) -> Outcome:
+    """A detector trained before; the background of this flight, where it looks at the difference to one."""
+    detector, scale = load_detector(Path(plan.job.inputs.detector or "")), _known_scale(plan)
+    background = motion_background(_motion_frames(plan, scale)) if detector.uses_background else None
+    return _finish(plan, detector, scale, "file", background=background)
 
 
 def _from_detections(plan: Plan) -> Outcome:

@@ -1,0 +1,47 @@
+"""What a run of the kharkiv clip found in the frame whose cars are marked by eye, tests/data/kharkiv_marks.csv.
+
+velfield run FOLDER/kharkiv/drone.mp4 --gsd-m 0.426 --out RUN
+python -m tests.benchmarks.marked_frame RUN
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from velfield import open_run
+
+MARKS = Path(__file__).parents[1] / "data" / "kharkiv_marks.csv"
+TIME_S = 90 / 25
+"""Of the marked frame."""
+_NEAR_PX = 5.0
+"""Half a car's length."""
+
+
+def main() -> None:
+    """Judge, print."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("run", type=Path)
+    run, marks = open_run(parser.parse_args().run), pd.read_csv(MARKS)
+    found = run.detections()
+    frame = int(found["frame"].iloc[(found["time_s"] - TIME_S).abs().argmin()])
+    found = found[found["frame"] == frame].sort_values("score", ascending=False, kind="stable")
+    places = run.to_base(frame, marks[["x_px", "y_px"]].to_numpy(float))
+    kind, unclear = marks["kind"].to_numpy(), (marks["kind"] == "unclear").to_numpy()
+    radius = np.nan_to_num(marks["radius_px"].to_numpy(float), nan=_NEAR_PX)
+    taken, wrong = np.zeros(len(marks), bool), 0
+    for place in found[["x_px", "y_px"]].to_numpy():
+        off = np.hypot(*(places - place).T)
+        to_be_found = np.where(unclear | taken, np.inf, off)
+        if to_be_found.min() <= _NEAR_PX:
+            taken[to_be_found.argmin()] = True
+        elif not (unclear & (off <= radius)).any():
+            wrong += 1
+    print(f"frame {frame}: precision {taken.sum() / (taken.sum() + wrong):.3f}, recall {taken[~unclear].mean():.3f}")
+    for name in ("moving", "standing"):
+        print(f"{name:9} {(kind == name).sum():3}: recall {taken[kind == name].mean():.3f}")
+
+
+if __name__ == "__main__":
+    main()
