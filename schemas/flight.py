@@ -140,8 +140,7 @@ class DetectionConfig(Model):
     car_length_m: PositiveFloat = 4.0
     """A usual car's length, which with the ground sample distance sets the working scale."""
     motion_channel: Literal["auto", "always", "never"] = "auto"
-    """Whether |frame - background| is a channel of what is learnt from motion; ``auto``: where looks alone do not tell
-    cars."""
+    """Whether what is learnt from motion sees |frame - background|; ``auto``: where looks alone do not tell cars."""
     seed: int = Field(0, ge=0)
     """Seed of everything random in training."""
 

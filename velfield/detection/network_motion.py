@@ -21,7 +21,7 @@ from velfield.detection.network import record_of_network
 from velfield.detection.network_finds import SCORE_FLOOR
 from velfield.detection.network_training import learnt_on
 from velfield.detection.samples import LabelledImage
-from velfield.detection.validation import nearly_best
+from velfield.detection.validation import nearly_best, thinned_curve
 from velfield.threads import each
 
 Floats = NDArray[np.float64]
@@ -125,14 +125,8 @@ def thresholds_of(
     least = float(threshold[good[0]] + threshold[good[-1]]) / 2
     standing = max(threshold_of_standing(score[moves], score[stands & ~off]), least)
     at = int(np.abs(threshold - least).argmin())
-    keep = np.unique(np.r_[np.linspace(0, len(threshold) - 1, 300).astype(int), at])
-    curve = PrecisionRecallCurve(
-        recall=tuple(np.round(recall[keep], 4).tolist()),
-        precision=tuple(np.round(precision[keep], 4).tolist()),
-        threshold=tuple(np.round(threshold[keep] + standing - least, 4).tolist()),
-        chosen=int(np.searchsorted(keep, at)),
-        evidence="how what differs from the background moves in bursts of three frames: as cars do, or alone",
-    )
+    told = "how what differs from the background moves in bursts of three frames: as cars do, or alone"
+    curve = thinned_curve(precision, recall, threshold + standing - least, at, told)
     return standing, MotionRecord(still_grey=still, moving_grey=moving, lift=standing - least), curve
 
 

@@ -139,13 +139,20 @@ def curve_of(evidence: Evidence, told: str) -> PrecisionRecallCurve | None:
     best = int(np.median(nearly_best(precision, recall, beta=_BETA)))
     if not evidence.complete:
         best = int(np.searchsorted(recall, _KEPT_RECALL * recall[-1]))
-    kept = np.unique(np.r_[np.linspace(0, len(score) - 1, min(_CURVE_POINTS, len(score))).astype(int), best])
+    return thinned_curve(precision, recall, score, best, f"{evidence.cars} {told}")
+
+
+def thinned_curve(
+    precision: Floats, recall: Floats, threshold: Floats, chosen: int, evidence: str
+) -> PrecisionRecallCurve:
+    """For a detector file: some points of a curve (n,) by falling threshold, the chosen one among them."""
+    kept = np.unique(np.r_[np.linspace(0, len(threshold) - 1, min(_CURVE_POINTS, len(threshold))).astype(int), chosen])
     return PrecisionRecallCurve(
         recall=tuple(np.round(recall[kept], 4).tolist()),
         precision=tuple(np.round(precision[kept], 4).tolist()),
-        threshold=tuple(np.round(score[kept], 4).tolist()),
-        chosen=int(np.searchsorted(kept, best)),
-        evidence=f"{evidence.cars} {told}",
+        threshold=tuple(np.round(threshold[kept], 4).tolist()),
+        chosen=int(np.searchsorted(kept, chosen)),
+        evidence=evidence,
     )
 
 

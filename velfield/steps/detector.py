@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.detector import PrecisionRecallCurve
 from schemas.records import WorkingRecord
 from velfield.detection.detector import Detector, load_detector, shipped_detector
 from velfield.detection.motion_difference import MotionBackground, MotionFrame, motion_background
@@ -14,6 +13,7 @@ from velfield.detection.motion_evidence import MotionEvidence, evidence_of, neig
 from velfield.detection.motion_labels import MotionLabels, choose_frames, labels_from_motion, working_scale
 from velfield.detection.network_motion import network_of_motion
 from velfield.detection.train import LabelledImage, train_detector
+from velfield.detection.validation import thinned_curve
 from velfield.errors import InputError
 from velfield.plan import Plan
 from velfield.progress import advance
@@ -27,6 +27,8 @@ from velfield.steps.working import WorkingGrid, write_background
 from velfield.stores import open_frames
 
 _TRAINING_FRAMES, _NETWORK_FRAMES = 6, 12
+_NETWORK_VEHICLES = 20
+"""Of fewer that move the network would learn these ones."""
 _EVIDENCE_BURSTS = 6
 _MOST_FRAMES = 0.5
 """Share of the frames that another program's boxes are expected to be in."""
@@ -129,7 +131,8 @@ def _by_motion(plan: Plan, frames: list[MotionFrame], labels: MotionLabels, back
     """A detector of cars that move: by their looks alone where these tell them, so that it finds what stands too.
 
     By the difference to the background what waits at a light for long, and is in the background, is not found: in a
-    simulated city .79 of the cars that move at some time, .91 by their looks.
+    simulated city .79 of the cars that move at some time, .91 by their looks. Where looks do not tell them, the network
+    that ships knows more of what stands; of few vehicles the boosted classifier makes more.
     """
     config = plan.config.detection
     samples = _samples(frames, labels, background, _TRAINING_FRAMES)
@@ -143,7 +146,7 @@ def _by_motion(plan: Plan, frames: list[MotionFrame], labels: MotionLabels, back
         evidence = _evidence(plan, by_looks, frames, background)
         if evidence.tells_cars(_usual_score(by_looks)):
             return by_looks if config.threshold is not None else _judged(by_looks, evidence)
-    if has_network and config.motion_channel != "never":
+    if has_network and config.motion_channel != "never" and labels.vehicles >= _NETWORK_VEHICLES:
         learnt = network_of_motion(
             _samples(frames, labels, background, _NETWORK_FRAMES),
             shipped,
@@ -186,14 +189,8 @@ def _judged(detector: Detector, evidence: MotionEvidence) -> Detector:
     """The detector with the threshold at which what it finds moves as cars do; as it is where too few move to tell."""
     if not np.isfinite(evidence.chosen):
         return detector
-    keep = np.unique(np.r_[np.linspace(0, len(evidence.threshold) - 1, 300).astype(int), evidence.at])
-    curve = PrecisionRecallCurve(
-        recall=tuple(np.round(evidence.recall[keep], 4).tolist()),
-        precision=tuple(np.round(evidence.precision[keep], 4).tolist()),
-        threshold=tuple(np.round(evidence.threshold[keep], 4).tolist()),
-        chosen=int(np.searchsorted(keep, evidence.at)),
-        evidence="how detections in bursts of three frames move: along their axis, at one velocity, or not",
-    )
+    told = "how detections in bursts of three frames move: along their axis, at one velocity, or not"
+    curve = thinned_curve(evidence.precision, evidence.recall, evidence.threshold, evidence.at, told)
     return Detector(detector.record.model_copy(update={"threshold": evidence.chosen, "curve": curve}))
 
 
