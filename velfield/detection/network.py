@@ -39,7 +39,7 @@ LAYERS: dict[str, tuple[int, int, int]] = {
 CORNERS = ("corners_0", "corners_1")
 BODIES = (("body_0", "body_1"), ("body_2", "body_3"))
 """Pairs of layers that add to what went into them."""
-_TILE_PX, _REACH_PX = 384, 32
+_TILE_PX, _REACH_PX = 768, 32
 """A picture is looked at in tiles, each with so much around it: more than any answer depends on."""
 
 

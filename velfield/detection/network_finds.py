@@ -29,7 +29,7 @@ _AGAIN_PX = 44
 _MIDDLE = _AGAIN_PX // (2 * STRIDE)
 _TURNS = np.radians([0.0, 90.0])
 """Four turns, or more about a place, found no more on minsk, and took up to three times as long."""
-_AT_ONCE = 64
+_AT_ONCE = 8
 
 
 def network_finds(network: Network, image: Grey, valid: NDArray[np.bool_] | None) -> Floats:
