@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from flows.cli import app
+from flows.commands import train as train_command
 from schemas.flight import FramesConfig
 from velfield.detection.axis import axial_difference
 from velfield.detection.detector import load_detector, shipped_detector
@@ -113,3 +114,9 @@ def test_marked_cars_that_are_not_as_long_as_cars_are_warned_of() -> None:
     assert "3.0 m long, expected 3.3 to 6" in short
     assert "give 0.34 if they are cars" in short
     assert "10.4 m long" in long
+
+
+def test_a_folder_that_is_not_there_is_said_before_anything_is_learnt(tmp_path: Path) -> None:
+    out = tmp_path / "no" / "d.json"
+    with pytest.raises(InputError, match=r"found no folder .*no, expected one to write to; make it"):
+        train_command.train(tmp_path, labels=tmp_path / "labels.csv", out=out)

@@ -74,7 +74,7 @@ def write_training(training: Training, out: Path, review: Path | None = None) ->
     """Write the detector file, and where asked for the contact sheet; lines for people."""
     save_detector(training.detector, out)
     record, lines = training.detector.record, [*training.labels.notes]
-    lines.append(f"{out}: {record.cars} cars of {len(training.samples)} frames, threshold {record.threshold:.3f}")
+    lines.append(f"{out}: {record.cars} cars, frames marked: {len(training.samples)}, threshold {record.threshold:.3f}")
     if record.curve is not None and record.curve.chosen is not None:
         k = record.curve.chosen
         precision, recall = record.curve.precision[k], record.curve.recall[k]

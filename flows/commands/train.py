@@ -1,11 +1,13 @@
 """``velfield train``: marked cars in, a detector file out."""
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
 from flows.options import Preset, Settings
+from velfield.errors import InputError
 
 
 def train(
@@ -48,6 +50,10 @@ def train(
     from velfield.training import train_from_labels, write_training
 
     resolved = resolve_config(preset=preset, file=config, settings=settings, overrides={"gsd_m": gsd_m})
+    for file in (out, review):
+        if file is not None and not file.parent.is_dir():
+            raise InputError(f"{file}: found no folder {file.parent}, expected one to write to; make it")
+    print("learning from the marked cars: up to some minutes", file=sys.stderr, flush=True)
     training = train_from_labels(source, labels, resolved, continued=continued)
     print("\n".join(write_training(training, out, review)))
     return 0

@@ -134,7 +134,8 @@ def _parsed(data: bytes, name: str) -> Detector:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "the file"
         raise InputError(
-            f"{name}: {where}: {first['msg'].lower()}; expected a detector file as velfield writes it (detector.json)"
+            f"{name}: {where}: {first['msg'].lower()}; expected a detector file as velfield writes it (detector.json): "
+            "make one with `velfield train`"
         ) from None
 
 

@@ -23,6 +23,7 @@ _GIVEN_BASE = (
 )
 _LENS_BY_POINTS = "distortion of {corner_px:.1f} px at the corners"
 _PIN_HOLE = "no distortion that the evidence bears out: taken for a pin-hole"
+_LEARNT_ELSEWHERE = "learnt elsewhere, threshold {threshold:.3f}"
 _NO_DETECTOR = "none: another program's boxes are taken"
 _MEANS = frozenset({"heldout_px", "residual_px"})
 """Counts that are averaged over units, weighted by frames; all others are summed."""
@@ -68,6 +69,8 @@ def _line(name: str, counts: Mapping[str, float]) -> str:
         return _GIVEN_BASE
     if name == "detector" and counts and "threshold" not in counts:
         return _NO_DETECTOR
+    if name == "detector" and counts.get("labels") == 0:
+        return _LEARNT_ELSEWHERE
     return _LINES[name]
 
 
