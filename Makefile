@@ -58,7 +58,7 @@ docs: $(STAMP)  ## the documentation as pages, in build/docs
 	$(BIN)/mkdocs build --quiet
 
 detector: $(STAMP)  ## make the detector that ships anew: make detector DATA=folder with songdo/ and kit_ais/
-	$(BIN)/python -m tests.benchmarks.ship_detector $(DATA)
+	$(BIN)/python -m tools.make_detector $(DATA)
 
 # Universal, with hashes, and without a registry's address in it.
 lock: $(STAMP)
@@ -66,4 +66,4 @@ lock: $(STAMP)
 	  --generate-hashes --no-annotate --no-header --python-version 3.11 -o requirements.lock
 
 clean:
-	rm -rf $(VENV) demo dist build velfield/render/page page/node_modules
+	rm -rf $(VENV) demo dist build velfield/report/page page/node_modules

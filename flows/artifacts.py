@@ -18,10 +18,10 @@ from prefect.artifacts import (
 
 from flows.launch import PAGES, PAGES_OF
 from schemas.summary import RunSummary
-from velfield.layout import RunLayout
-from velfield.places import is_remote
-from velfield.plan import Plan
-from velfield.results import named
+from velfield.pipeline.plan import Plan
+from velfield.run.layout import RunLayout
+from velfield.run.paths import is_remote
+from velfield.run.results import named
 
 _PICTURE_BYTES = 600_000
 """A markdown artifact of about this size was seen to show; a larger picture is left to the report."""

@@ -24,7 +24,7 @@ DONE, BAD_INPUT, USAGE, INCOMPLETE = 0, 1, 2, 3
 
 
 def _version() -> str:
-    from velfield.version import code_version
+    from velfield.pipeline.version import code_version
 
     return code_version()
 
@@ -142,7 +142,7 @@ def run(
         Lines of JSON in place of text.
     """
     from schemas.job import Inputs, Job
-    from velfield.configuration import resolve_config
+    from velfield.pipeline.configuration import resolve_config
 
     overrides = {
         "gsd_m": gsd_m,
@@ -225,7 +225,7 @@ def demo(
     """
     from flows.launch import first_start_beside, kernels_beside, prepare_process
     from schemas.job import Inputs, Job
-    from velfield.configuration import resolve_config
+    from velfield.pipeline.configuration import resolve_config
 
     prepare_process(verbose=False)
     flight = out / "flight"
@@ -278,7 +278,7 @@ def _simulate(out: Path, *, frames: int, size: str, seed: int, quiet: bool) -> N
 
 
 def _score(run_folder: Path, flight: Path) -> None:
-    from velfield.scoring import score_run
+    from velfield.synthetic.run_score import score_run
 
     print(score_run(run_folder, flight).text())
 
@@ -299,7 +299,7 @@ def _process(
 ) -> int:
     from flows.launch import first_start, prepare_process
     from flows.stopping import stop_when_told
-    from velfield.plan import check_inputs
+    from velfield.pipeline.plan import check_inputs
 
     stop_when_told()
     check_inputs(job)  # before Prefect: its start takes seconds
@@ -334,8 +334,8 @@ def _conclude(summary: "RunSummary", console: "Console") -> int:
 
 def _show_plan(job: "Job", runner: "RunnerConfig") -> int:
     from flows.runners import parallel_units
-    from velfield.plan import make_plan
-    from velfield.steps.planning import describe_plan
+    from velfield.pipeline.estimate import describe_plan
+    from velfield.pipeline.plan import make_plan
 
     print(describe_plan(make_plan(job), parallel_units(runner)))
     return DONE

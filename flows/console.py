@@ -12,7 +12,7 @@ from typing import Literal
 from rich.console import Console as RichConsole
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from velfield.progress import listening
+from velfield.pipeline.progress import listening
 
 Verbosity = Literal["quiet", "normal", "verbose", "json"]
 

@@ -10,10 +10,10 @@ from flows.launch import prepare_process
 from flows.process_flight import run_flight
 from flows.reprocess import run_reprocess
 from flows.runners import RunnerConfig, read_runner
-from velfield.configuration import resolve_config
 from velfield.errors import InputError
-from velfield.incoming import inputs_of, newest_picture, picture_named, run_folders, run_name
-from velfield.layout import RunLayout
+from velfield.pipeline.configuration import resolve_config
+from velfield.pipeline.watch import inputs_of, newest_picture, picture_named, run_folders, run_name
+from velfield.run.layout import RunLayout
 
 if TYPE_CHECKING:
     from schemas.job import Job

@@ -118,7 +118,7 @@ def kernels_beside() -> Iterator[None]:
     ):
         yield
         return
-    command = [sys.executable, "-m", "velfield.plain_run"]
+    command = [sys.executable, "-m", "velfield.pipeline.local"]
     with Popen(command, stdout=DEVNULL, stderr=DEVNULL) as beside:
         try:
             yield

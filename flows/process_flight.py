@@ -1,8 +1,8 @@
 """The whole job in the paper's order: frames, lens, base image, registration, cars, tracklets, velocity field, maps.
 
-A task is thin glue: it asks ``velfield.graphs`` for the Dask graph of its unit and computes it on the runner. What is
-finished is known from the run folder's commit records, so a task whose unit stands there returns at once, whatever
-Prefect remembers of it. Futures of one stage are handed to the next, which is what draws the lineage in the UI.
+A task is thin glue: it asks ``velfield.pipeline.graphs`` for the Dask graph of its unit and computes it on the runner.
+What is finished is known from the run folder's commit records, so a task whose unit stands there returns at once,
+whatever Prefect remembers of it. Futures of one stage are handed to the next, which draws the lineage in the UI.
 """
 
 from collections.abc import Callable
@@ -19,18 +19,18 @@ from flows.stale import mark_crashed
 from flows.work import Unit, Work
 from schemas.job import Job
 from schemas.summary import RunSummary
-from velfield import graphs
-from velfield.layout import RunLayout
-from velfield.locking import locked
-from velfield.plan import Plan, changed_since, make_plan, write_flight_record
-from velfield.provenance import sweep_partial
-from velfield.steps.field import field_groups, group_name, lay_out_field
-from velfield.steps.frames import lay_out_frames
-from velfield.steps.given import check_given
-from velfield.steps.outcome import unit_name
-from velfield.steps.planning import check_space
-from velfield.steps.registration import lay_out_registration, lost_frames
-from velfield.steps.report import write_report
+from velfield.pipeline import graphs
+from velfield.pipeline.check_inputs import check_given
+from velfield.pipeline.estimate import check_space
+from velfield.pipeline.plan import Plan, changed_since, make_plan, write_flight_record
+from velfield.pipeline.result import unit_name
+from velfield.pipeline.stages.field import field_groups, group_name, lay_out_field
+from velfield.pipeline.stages.frames import lay_out_frames
+from velfield.pipeline.stages.registration import lay_out_registration, lost_frames
+from velfield.pipeline.stages.report import write_report
+from velfield.run.commits import sweep_partial
+from velfield.run.layout import RunLayout
+from velfield.run.lock import locked
 
 
 def run_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:

@@ -19,19 +19,19 @@ from flows.work import Unit, Work
 from schemas.job import Inputs, Job, absolute
 from schemas.records import RebaseRecord
 from schemas.summary import RunSummary
-from velfield import graphs
 from velfield.errors import Failure, InputError
-from velfield.layout import RunLayout
-from velfield.locking import locked
-from velfield.plan import write_flight_record
-from velfield.provenance import sweep_partial
-from velfield.results import discard, made_before, publish, result_name, share, unfinished
-from velfield.run import Run, open_run
-from velfield.steps.field import field_groups, group_name, lay_out_field
-from velfield.steps.outcome import unit_name
-from velfield.steps.rebase import Rebase, measure_rebase, rebased_plan
-from velfield.steps.registration import lost_frames
-from velfield.steps.report import write_report
+from velfield.pipeline import graphs
+from velfield.pipeline.plan import write_flight_record
+from velfield.pipeline.result import unit_name
+from velfield.pipeline.stages.field import field_groups, group_name, lay_out_field
+from velfield.pipeline.stages.rebase import Rebase, measure_rebase, rebased_plan
+from velfield.pipeline.stages.registration import lost_frames
+from velfield.pipeline.stages.report import write_report
+from velfield.run.commits import sweep_partial
+from velfield.run.layout import RunLayout
+from velfield.run.lock import locked
+from velfield.run.results import discard, made_before, publish, result_name, share, unfinished
+from velfield.run.run import Run, open_run
 
 MAX_ADDED_ERROR_PX = 1.0
 """A new base image that lies on the old one worse than this, in the mean, has the frames registered again."""

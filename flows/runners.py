@@ -16,7 +16,7 @@ from pydantic import Field, PositiveInt, ValidationError
 
 from schemas.model import Model
 from velfield.errors import InputError
-from velfield.threads import usable_processors
+from velfield.parallel import usable_processors
 
 
 class RunnerConfig(Model):

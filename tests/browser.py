@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
-from velfield.render.viewer_page import page_is_built
+from velfield.report.viewer_page import page_is_built
 
 _FLAGS = (
     "--headless=new",

@@ -13,12 +13,12 @@ from schemas.records import FlightRecord, GridRecord, InputsRecord, SourceRecord
 from schemas.simulation import SimulationConfig
 from schemas.tables import TRACKLET_COLUMNS
 from velfield.field.slices import parse_slices
-from velfield.layout import RunLayout
-from velfield.run import Run, open_run
-from velfield.steps.field import accumulate_group, field_groups, lay_out_field
+from velfield.pipeline.stages.field import accumulate_group, field_groups, lay_out_field
+from velfield.run.layout import RunLayout
+from velfield.run.run import Run, open_run
+from velfield.run.tables import write_table
 from velfield.synthetic.flight import Flight
 from velfield.synthetic.observed import observed_tracklets
-from velfield.tables import write_table
 
 GSD_M = 0.23
 

@@ -7,9 +7,9 @@ from flows.console import Console
 from flows.runners import RunnerConfig
 from schemas.job import Inputs, Job
 from schemas.summary import RunSummary
-from velfield.configuration import resolve_config
-from velfield.layout import RunLayout
-from velfield.provenance import digest_bytes
+from velfield.pipeline.configuration import resolve_config
+from velfield.run.commits import digest_bytes
+from velfield.run.layout import RunLayout
 
 SMALL = (
     "detection.method=aligned",

@@ -8,7 +8,7 @@ from flows.console import Console
 from flows.runners import RunnerConfig
 from schemas.job import Inputs, Job
 from schemas.simulation import SimulationConfig
-from velfield.configuration import resolve_config
+from velfield.pipeline.configuration import resolve_config
 from velfield.synthetic import write_flight
 
 FRAMES = 64
@@ -17,7 +17,7 @@ FRAMES = 64
 @pytest.mark.slow
 def test_a_flight_with_base_image_and_labels_is_near_the_truth(server: None, tmp_path: Path) -> None:
     from flows.process_flight import run_flight
-    from velfield.scoring import score_run
+    from velfield.synthetic.run_score import score_run
 
     flight = tmp_path / "flight"
     write_flight(flight, SimulationConfig(frames=FRAMES, width=960, height=720, seed=33))

@@ -13,7 +13,7 @@ import pytest
 from flows.cli import app
 from schemas.summary import RunSummary
 from tests.media import drifting, write_video
-from velfield.configuration import resolve_config
+from velfield.pipeline.configuration import resolve_config
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]

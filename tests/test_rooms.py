@@ -4,23 +4,16 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-FLOORS = {"schemas": 0, "velfield": 1, "flows": 2}
-NO_STORE_NO_GRAPH = (
-    "sources",
-    "camera",
-    "registration",
-    "detection",
-    "tracking",
-    "field",
-    "insight",
-    "render",
-    "exports",
-)
+FLOORS = {"schemas": 0, "velfield": 1, "flows": 2, "tools": 3}
+SCIENCE = ("sources", "camera", "registration", "detection", "tracking", "field", "analysis")
+"""Arrays in, arrays out: no run folder, no graph."""
+MAX_ROOMS, MAX_ARROWS, MAX_LOOSE_MODULES, MAX_FILES = 18, 55, 5, 18
 
 
 def modules() -> list[Path]:
@@ -67,27 +60,76 @@ def test_only_flows_imports_prefect() -> None:
 
 
 def test_only_the_stores_import_zarr() -> None:
-    assert violations({"zarr": {"velfield/stores.py"}}) == []
+    assert violations({"zarr": {"velfield/run/stores.py"}}) == []
 
 
 def test_only_graphs_and_runners_import_dask() -> None:
-    may = {"velfield/graphs.py", "flows/runners.py"}
+    may = {"velfield/pipeline/graphs.py", "flows/runners.py"}
     assert violations({"dask": may, "distributed": may}) == []
 
 
-@pytest.mark.parametrize("room", NO_STORE_NO_GRAPH)
-def test_stages_know_neither_stores_nor_graphs(room: str) -> None:
-    stage = [path for path in modules() if path.is_relative_to(ROOT / "velfield" / room)]
-    forbidden = ("velfield.stores", "velfield.graphs", "velfield.steps", "velfield.plan", "velfield.run")
-    found = [f"{path.name} imports {name}" for path in stage for name in imports(path) if name.startswith(forbidden)]
+@pytest.mark.parametrize("room", SCIENCE)
+def test_science_knows_neither_run_folder_nor_pipeline(room: str) -> None:
+    found = [
+        f"{path.relative_to(ROOT)} imports {name}"
+        for path in modules()
+        if path.is_relative_to(ROOT / "velfield" / room)
+        for name in imports(path)
+        if name.startswith(
+            ("velfield.run", "velfield.pipeline", "velfield.exports", "velfield.report", "velfield.viewer")
+        )
+    ]
     assert found == []
+
+
+def room_of(module: str) -> str | None:
+    """The room of ``velfield`` that a dotted module name lies in: a package or a loose module."""
+    parts = module.split(".")
+    return parts[1] if parts[0] == "velfield" and len(parts) > 1 else None
+
+
+def arrows() -> set[tuple[str, str]]:
+    """Imports between rooms of ``velfield``, each once."""
+    found = set()
+    for path in modules():
+        own = path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".")
+        room = room_of(own)
+        found |= {(room, other) for name in imports(path) if room and (other := room_of(name)) and other != room}
+    return found
+
+
+def test_no_package_cycles() -> None:
+    after: dict[str, set[str]] = {}
+    for room, other in arrows():
+        after.setdefault(room, set()).add(other)
+    graph = TopologicalSorter(after)
+    try:
+        graph.prepare()
+    except CycleError as error:
+        pytest.fail(f"packages import each other in a circle: {' -> '.join(error.args[1])}")
+
+
+def test_the_house_stays_small() -> None:
+    velfield = ROOT / "velfield"
+    rooms = {room_of(".".join(path.relative_to(ROOT).with_suffix("").parts)) for path in velfield.rglob("*.py")}
+    loose = [path.name for path in velfield.glob("*.py") if path.name != "__init__.py"]
+    crowded = {
+        folder.relative_to(ROOT).as_posix(): count
+        for top in FLOORS
+        for folder in {path.parent for path in (ROOT / top).rglob("*.py")}
+        if (count := len([path for path in folder.glob("*.py") if path.name != "__init__.py"])) > MAX_FILES
+    }
+    assert len(rooms) <= MAX_ROOMS, sorted(map(str, rooms))
+    assert len(arrows()) <= MAX_ARROWS, sorted(arrows())
+    assert len(loose) <= MAX_LOOSE_MODULES, loose
+    assert crowded == {}
 
 
 def test_no_print_no_exit_in_the_library() -> None:
     calls = [
         f"{path.relative_to(ROOT)}:{node.lineno}"
         for path in modules()
-        if not path.is_relative_to(ROOT / "flows")
+        if not path.is_relative_to(ROOT / "flows") and not path.is_relative_to(ROOT / "tools")
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.Call) and getattr(node.func, "id", getattr(node.func, "attr", "")) in ("print", "exit")
     ]

@@ -10,7 +10,7 @@ True
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from velfield.run import Run, open_run
+    from velfield.run.run import Run, open_run
 
 __all__ = ["Run", "open_run"]
 
@@ -18,7 +18,7 @@ __all__ = ["Run", "open_run"]
 def __getattr__(name: str) -> Any:
     # Late: `velfield --help` must not wait for zarr and pandas.
     if name in __all__:
-        from velfield import run
+        from velfield.run import run
 
         return getattr(run, name)
     raise AttributeError(f"module 'velfield' has no attribute {name!r}")

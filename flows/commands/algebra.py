@@ -13,7 +13,7 @@ def merge(*run_folders: Path, out: Path) -> int:
     out
         New folder for the sum.
     """
-    from velfield.steps.field_algebra import merge_fields
+    from velfield.run.field_algebra import merge_fields
 
     merge_fields(run_folders, out)
     print(out / "field.zarr")
@@ -32,7 +32,7 @@ def subtract(whole: Path, part: Path, /, *, out: Path) -> int:
     out
         New folder for what is left.
     """
-    from velfield.steps.field_algebra import subtract_fields
+    from velfield.run.field_algebra import subtract_fields
 
     subtract_fields(whole, part, out)
     print(out / "field.zarr")
@@ -53,7 +53,7 @@ def compare(before: Path, after: Path, /, *, out: Path | None = None, min_count:
     min_count
         Passages that both fields must have at a pixel for direction and speed to be compared.
     """
-    from velfield.comparing import compare_runs
+    from velfield.pipeline.compare import compare_runs
 
     for line in compare_runs(before, after, out or after / "comparison", min_count=min_count):
         print(line)

@@ -31,7 +31,7 @@ def annotate(
     open_browser
         Open the browser, where there is a screen.
     """
-    from velfield.viewer.annotation import frames_of
+    from velfield.viewer.annotations import frames_of
     from velfield.viewer.annotator import annotate_app
     from velfield.viewer.server import serve
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from schemas.job import Job
-    from velfield.plan import Plan
+    from velfield.pipeline.plan import Plan
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def overhead(flight: Path, /, *, work: Path, workers: int = 2) -> int:
     """
     from flows.launch import prepare_process
     from schemas.job import Inputs, Job
-    from velfield.configuration import resolve_config
+    from velfield.pipeline.configuration import resolve_config
 
     prepare_process(verbose=False)
     inputs = Inputs(
@@ -93,7 +93,7 @@ def _flow(job: "Job", workers: int) -> Cost:
 def _bare(job: "Job", workers: int) -> Cost:
     import multiprocessing
 
-    from velfield.plan import make_plan, write_flight_record
+    from velfield.pipeline.plan import make_plan, write_flight_record
 
     begun = time.monotonic()
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
@@ -107,7 +107,9 @@ def _bare(job: "Job", workers: int) -> Cost:
 
 def _stages(plan: "Plan", pool: Executor) -> None:
     """The stages in the order of `flows.process_flight`, each on the pool."""
-    from velfield.steps import base, detections, detector, field, frames, lens, maps, registration, tracking
+    from velfield.pipeline.stages import base_image as base
+    from velfield.pipeline.stages import detections, detector, field, frames, lens, maps, registration
+    from velfield.pipeline.stages import tracklets as tracking
 
     frames.lay_out_frames(plan)
     _by_unit(plan, pool, "frames", frames.read_unit)
@@ -133,7 +135,7 @@ def _stages(plan: "Plan", pool: Executor) -> None:
 
 
 def _one(plan: "Plan", stage: str, unit: str, function: Callable[..., Any], *arguments: Any) -> None:
-    from velfield.steps.outcome import commit
+    from velfield.pipeline.result import commit
 
     started = time.time()
     commit(plan, stage, unit, function(plan, *arguments), started=started)
@@ -144,7 +146,7 @@ def _whole(plan: "Plan", pool: Executor, stage: str, function: Callable[..., Any
 
 
 def _by_unit(plan: "Plan", pool: Executor, stage: str, function: Callable[..., Any]) -> None:
-    from velfield.steps.outcome import unit_name
+    from velfield.pipeline.result import unit_name
 
     for done in [pool.submit(_one, plan, stage, unit_name(unit), function, unit) for unit in plan.units]:
         done.result()
@@ -154,7 +156,7 @@ def _by_blocks(
     plan: "Plan", pool: Executor, stage: str, of_block: Callable[..., Any], of_unit: Callable[..., Any]
 ) -> None:
     """Blocks of all units at once, then what puts a unit's together, as soon as they are there."""
-    from velfield.steps.outcome import unit_name
+    from velfield.pipeline.result import unit_name
 
     under_way = {unit: [pool.submit(of_block, plan, block) for block in plan.blocks(unit)] for unit in plan.units}
     ends = []

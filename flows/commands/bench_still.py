@@ -19,7 +19,7 @@ def still(run_folder: Path, /, *, frames: int = 200, within: Path | None = None)
         that flies by; a road does not.
     """
     from velfield.bench.still import read_area, still_things
-    from velfield.run import open_run
+    from velfield.run.run import open_run
 
     if frames < 3:
         raise InputError(f"--frames {frames}: expected 3 or more, to see jitter")

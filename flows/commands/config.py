@@ -18,7 +18,7 @@ def show(run_folder: Path, /) -> int:
     """
     import yaml
 
-    from velfield.run import open_run
+    from velfield.run.run import open_run
 
     record = open_run(run_folder).record
     print(f"# made by velfield {record.code_version} from {record.inputs.source.path}")

@@ -39,8 +39,8 @@ def export(
     start
         When the flight began, as 2024-05-01T12:00:00Z; for `stac`.
     """
-    from velfield.exporting import ExportOptions, export_run
-    from velfield.run import open_run
+    from velfield.exports.export import ExportOptions, export_run
+    from velfield.run.run import open_run
 
     options = ExportOptions(width_px=width, unit=unit, start=_moment(start))
     print(export_run(open_run(run_folder), format_name, out, options))

@@ -25,11 +25,11 @@ def init(
         Frame rate of a folder of pictures that has no times.
     """
     from schemas.flight import FramesConfig
-    from velfield.configuration import resolve_config
     from velfield.errors import InputError
-    from velfield.provenance import write_atomically
+    from velfield.pipeline.config_template import found_lines, starting_config
+    from velfield.pipeline.configuration import resolve_config
+    from velfield.run.commits import write_atomically
     from velfield.sources.source import probe
-    from velfield.starting import found_lines, starting_config
 
     if out.exists():
         raise InputError(f"{out} is there already; name another file with --out, or move it away")

@@ -33,7 +33,7 @@ def lineage(
         JSON in place of text.
     """
     from velfield import lineage as told
-    from velfield.run import open_run
+    from velfield.run.run import open_run
 
     where = _pixel(x, y, pixel)
     run = open_run(run_folder)

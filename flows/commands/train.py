@@ -46,8 +46,8 @@ def train(
     settings
         `section.key=value`, any number of times.
     """
-    from velfield.configuration import resolve_config
-    from velfield.training import train_from_labels, write_training
+    from velfield.pipeline.configuration import resolve_config
+    from velfield.pipeline.train import train_from_labels, write_training
 
     resolved = resolve_config(preset=preset, file=config, settings=settings, overrides={"gsd_m": gsd_m})
     for file in (out, review):

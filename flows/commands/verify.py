@@ -10,7 +10,7 @@ from velfield.errors import InputError
 if TYPE_CHECKING:
     from schemas.job import Inputs, Job
     from schemas.records import FlightRecord
-    from velfield.run import Run
+    from velfield.run.run import Run
 
 WHOLE, DAMAGED = 0, 3
 
@@ -27,8 +27,8 @@ def verify(run_folder: Path, /, *, repair: Annotated[bool, Parameter(negative=()
     repair
         Do the damaged units again, from the same inputs.
     """
-    from velfield.run import open_run
-    from velfield.verifying import describe_damage, has_damage, verify_run
+    from velfield.pipeline.verify import describe_damage, has_damage, verify_run
+    from velfield.run.run import open_run
 
     run = open_run(run_folder)
     damages = verify_run(run.layout, run.record)
@@ -55,8 +55,8 @@ def _repair(run: "Run") -> None:
     from flows.process_flight import run_flight
     from flows.runners import RunnerConfig
     from schemas.job import Job
-    from velfield.locking import locked
-    from velfield.verifying import forget, verify_run
+    from velfield.pipeline.verify import forget, verify_run
+    from velfield.run.lock import locked
 
     given = _inputs(run.record, run.layout.root)
     job = Job(root=str(run.layout.root), inputs=given, config=run.record.config)
@@ -74,7 +74,7 @@ def _inputs(record: "FlightRecord", root: Path) -> "Inputs":
 
 def _same_inputs(job: "Job", record: "FlightRecord") -> None:
     """Nothing is taken back where the inputs changed since: then it is another run, not this one repaired."""
-    from velfield.plan import make_plan
+    from velfield.pipeline.plan import make_plan
 
     if make_plan(job).keys != record.keys:
         raise InputError(

@@ -1,4 +1,4 @@
-// The two colour scales of velfield/render/colours.py, handed over with the page: a wheel and a ramp.
+// The two colour scales of velfield/report/colours.py, handed over with the page: a wheel and a ramp.
 
 import { find } from "./dom";
 import type { Layer } from "./run";

@@ -1,4 +1,4 @@
-// Who crosses a line: velfield/insight/crossings.py in TypeScript, number for number.
+// Who crosses a line: velfield/analysis/crossings.py in TypeScript, number for number.
 
 import type { Point } from "./place";
 import type { Segments } from "./tracks";

@@ -32,8 +32,8 @@ def _stages(root: Path, frames: int, unit: Any) -> int:
     from flows.console import Console
     from flows.runners import ThreadsRunner
     from flows.work import Stage, Unit, Work
-    from tests.test_planning import planned
-    from velfield.steps.outcome import unit_name
+    from tests.pipeline.test_estimate import planned
+    from velfield.pipeline.result import unit_name
 
     plan = planned(frames, root, unit_frames=unit)
     work = Work(plan, ThreadsRunner(2), Console("quiet"))
@@ -52,8 +52,8 @@ def _stages(root: Path, frames: int, unit: Any) -> int:
 def _commit(plan: Any, stage: str, part: range) -> Any:
     """A record as large as a true one's, written as a true one is."""
     from schemas.records import CommitRecord
-    from velfield.provenance import write_commit
-    from velfield.steps.outcome import unit_name
+    from velfield.pipeline.result import unit_name
+    from velfield.run.commits import write_commit
 
     counts = dict.fromkeys(("frames", "usable", "registered", "heldout_px", "cars", "tracklets"), 1.0)
     outputs = {f"frames.zarr/raw/c/{frame}/0/0": "0" * 32 for frame in part}

@@ -42,9 +42,9 @@ def _plan(root: Path, shape: tuple[int, int], tracklets: Any) -> Any:
     """A run folder whose tracklets are these."""
     from schemas.records import GridRecord
     from schemas.tables import TRACKLET_COLUMNS
-    from tests.test_planning import planned
-    from velfield.provenance import write_atomically
-    from velfield.tables import write_table
+    from tests.pipeline.test_estimate import planned
+    from velfield.run.commits import write_atomically
+    from velfield.run.tables import write_table
 
     plan = planned(FRAMES, root, WIDTH, HEIGHT)
     grid = GridRecord(width_px=shape[1], height_px=shape[0], gsd_m=GSD_M, how="given", reference_frame=0)
@@ -55,7 +55,7 @@ def _plan(root: Path, shape: tuple[int, int], tracklets: Any) -> Any:
 
 def _build(plan: Any) -> tuple[float, int, float, float]:
     """Seconds, pixels known, and MB of memory before and at most, in a process of its own."""
-    from velfield.steps.field import accumulate_group, field_groups, lay_out_field
+    from velfield.pipeline.stages.field import accumulate_group, field_groups, lay_out_field
 
     idle_mb = _most_mb()
     started = time.monotonic()

@@ -21,9 +21,9 @@ from velfield.bench.still import PATCH_HALF_PX, SHARP_PX, about_their_middles, p
 from velfield.registration.alignment import Templates, cut_templates
 from velfield.registration.intrasensor import BaseReference, prepare_base, register_frame
 from velfield.registration.keypoints import detect_key_points
-from velfield.run import Run
-from velfield.sources.pictures import read_picture_grey
-from velfield.steps.frame_maps import read_lens
+from velfield.run.frame_transforms import read_lens
+from velfield.run.run import Run
+from velfield.sources.images import read_picture_grey
 
 FloatArray = NDArray[np.float64]
 

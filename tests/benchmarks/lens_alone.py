@@ -15,10 +15,10 @@ import numpy as np
 from schemas.job import Inputs, Job
 from schemas.simulation import CameraSimulation, SimulationConfig, TimesSimulation
 from tests.scenes import frame_grid, rms_after_homography
-from velfield.configuration import resolve_config
-from velfield.plain_run import compute_stages
-from velfield.plan import make_plan, write_flight_record
-from velfield.steps.frame_maps import read_lens
+from velfield.pipeline.configuration import resolve_config
+from velfield.pipeline.local import compute_stages
+from velfield.pipeline.plan import make_plan, write_flight_record
+from velfield.run.frame_transforms import read_lens
 from velfield.synthetic import write_flight
 from velfield.synthetic.cases import lens_only
 from velfield.synthetic.truth import load_truth

@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tools.shipped_detector import boxes_of
 from velfield import open_run
 from velfield.bench.still import SHARP_PX, about_their_middles, places_on_map, unused_corners
-from velfield.detection.ship import boxes_of
 from velfield.registration.alignment import Templates
-from velfield.run import Run
+from velfield.run.run import Run
 
 FloatArray = NDArray[np.float64]
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tools.shipped_detector import boxes_of
 from velfield import open_run
-from velfield.detection.ship import boxes_of
-from velfield.run import Run
+from velfield.run.run import Run
 
 _STANDS_WITHIN = 0.3
 """Car lengths on the map."""

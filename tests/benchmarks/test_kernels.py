@@ -8,7 +8,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from schemas.flight import FieldConfig
 from velfield.bench.detection import plain_response, random_sums, row_response
-from velfield.detection.response import dense_response
+from velfield.detection.paper.response import dense_response
 from velfield.field.accumulate import accumulate_tile
 from velfield.field.bins import VelocityBins
 from velfield.field.segments import SEGMENT_DTYPE

@@ -11,15 +11,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from schemas.flight import DetectionConfig
-from velfield.detection.aligned import Look, offset_grid
+from velfield.bench.scenes import simulated_image
 from velfield.detection.boosting import random_pool
-from velfield.detection.convolution import Layout, convolved
+from velfield.detection.cascade.classifier import Look, offset_grid
+from velfield.detection.cascade.feature_image import picture_of
+from velfield.detection.cnn.convolution import Layout, convolved
 from velfield.detection.detect import detect_frame
 from velfield.detection.detector import BoostedSums, Detector
-from velfield.detection.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, continued, dense_response
-from velfield.detection.ship import simulated
+from velfield.detection.paper.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, continued, dense_response
 from velfield.detection.train import train_detector
-from velfield.detection.turned import picture_of
 from velfield.synthetic import small_flight
 
 _TURNS = np.radians(np.arange(0.0, 180.0, 15.0))
@@ -154,7 +154,7 @@ def response_speed(image: NDArray[np.uint8]) -> tuple[Speed, Speed]:
 
 def learnt_there() -> Detector:
     """A detector of the usual size, learnt from the marked cars of one frame of another simulated city."""
-    return train_detector([simulated(_LEARNT_FROM)], DetectionConfig(method="aligned"))
+    return train_detector([simulated_image(_LEARNT_FROM)], DetectionConfig(method="aligned"))
 
 
 def network_speed(image: NDArray[np.uint8], detector: Detector) -> Speed:

@@ -8,9 +8,9 @@ import numpy as np
 from schemas.flight import FieldConfig
 from schemas.simulation import SimulationConfig
 from velfield.errors import InputError
-from velfield.field.foretelling import foretell
+from velfield.field.heldout import foretell
 from velfield.field.segments import Segments, segment_table
-from velfield.run import open_run
+from velfield.run.run import open_run
 from velfield.synthetic.flight import Flight
 from velfield.synthetic.observed import observed_tracklets
 

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from schemas.job import Inputs, Job
 from schemas.simulation import OtherSensorSimulation, SimulationConfig
-from velfield.configuration import resolve_config
 from velfield.errors import InputError
-from velfield.plain_run import compute_stages
-from velfield.plan import Plan, make_plan, write_flight_record
+from velfield.pipeline.configuration import resolve_config
+from velfield.pipeline.local import compute_stages
+from velfield.pipeline.plan import Plan, make_plan, write_flight_record
 from velfield.registration.transforms import as_points
-from velfield.sources.pictures import read_picture_grey
-from velfield.steps.frame_maps import FrameMaps
+from velfield.run.frame_transforms import FrameMaps
+from velfield.sources.images import read_picture_grey
 from velfield.synthetic import cases, write_flight
 from velfield.synthetic.score import RegistrationScore, score_registration
 from velfield.synthetic.truth import Truth, load_truth

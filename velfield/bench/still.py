@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from velfield.errors import InputError
 from velfield.registration.alignment import FEW, MANY, Templates, align, blurred, make_templates
 from velfield.registration.transforms import FrameTransform
-from velfield.run import Run
-from velfield.sources.pictures import read_picture_grey
+from velfield.run.run import Run
+from velfield.sources.images import read_picture_grey
 from velfield.sources.table import finite_cell, read_csv_rows
 
 FloatArray = NDArray[np.float64]

@@ -6,16 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.flight import DetectionConfig
-from velfield.detection.aligned import Look, distinct, find_cars
-from velfield.detection.dense import find_cars_densely
+from velfield.detection.cascade.classifier import Look, distinct, find_cars
+from velfield.detection.cascade.feature_image import COARSE, picture_of
+from velfield.detection.cascade.long_vehicles import LONG, shipped_long_vehicles
+from velfield.detection.cascade.proposals import propose
+from velfield.detection.cnn.inference import network_finds
+from velfield.detection.cnn.motion_bonus import difference_about, lift_of
+from velfield.detection.crops import oriented_patches, upright_chips
 from velfield.detection.detector import Detector
-from velfield.detection.label_axis import CAR_ASPECT
-from velfield.detection.long_vehicles import LONG, shipped_long_vehicles
-from velfield.detection.motion_lift import difference_about, lift_of
-from velfield.detection.network_finds import network_finds
-from velfield.detection.patches import oriented_patches, upright_chips
-from velfield.detection.scan import propose
-from velfield.detection.turned import COARSE, picture_of
+from velfield.detection.label_orientation import CAR_ASPECT
+from velfield.detection.paper.classifier import find_cars_densely
 
 Floats = NDArray[np.float64]
 Grey = NDArray[np.uint8]

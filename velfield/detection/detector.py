@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from schemas.detector import DetectorRecord, PrecisionRecallCurve, Round
-from velfield.detection.network import Network, network_of
+from velfield.detection.cnn.model import Network, network_of
 from velfield.errors import InputError
 
 MAX_BYTES = 20_000_000

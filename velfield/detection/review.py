@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.flight import DetectionConfig
+from velfield.detection.crops import upright_chips
 from velfield.detection.detect import detect_frame
 from velfield.detection.detector import Detector
-from velfield.detection.patches import upright_chips
+from velfield.detection.evaluation import MATCH_PX, matched
 from velfield.detection.samples import LabelledImage
-from velfield.detection.validation import MATCH_PX, matched
 
 Chips = NDArray[np.uint8]
 

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from velfield.detection.axis import at_places, axial_difference, structure_axis
-from velfield.detection.candidates import candidate_places
-from velfield.detection.label_axis import with_axes
-from velfield.detection.turned import COARSE, FINE, Picture, picture_of
+from velfield.detection.cascade.candidates import candidate_places
+from velfield.detection.cascade.feature_image import COARSE, FINE, Picture, picture_of
+from velfield.detection.label_orientation import with_axes
+from velfield.detection.orientation import at_places, axial_difference, structure_axis
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -7,16 +7,16 @@ import numpy as np
 
 from schemas.detector import DetectorRecord, PrecisionRecallCurve, Proposer, Round
 from schemas.flight import DetectionConfig
-from velfield.detection.committee import committee_of
-from velfield.detection.dense import train_densely
+from velfield.detection.cascade.ensemble import committee_of
+from velfield.detection.cascade.proposals import propose
+from velfield.detection.cascade.training import CONTRAST_FLOOR, learn_classifier, learn_proposer
+from velfield.detection.cnn.fine_tuning import train_on
 from velfield.detection.detector import Detector, shipped_detector, sums_of
-from velfield.detection.learning import CONTRAST_FLOOR, learn_classifier, learn_proposer
-from velfield.detection.network_training import train_on
+from velfield.detection.evaluation import FOLD_MIN_CARS, Evidence, curve_of, cut_of, evidence_of_part, joined, stripes
+from velfield.detection.paper.classifier import train_densely
 from velfield.detection.samples import LabelledImage, Scene, part_of, scene_of
-from velfield.detection.scan import propose
-from velfield.detection.validation import FOLD_MIN_CARS, Evidence, curve_of, cut_of, evidence_of_part, joined, stripes
 from velfield.errors import InputError
-from velfield.threads import each
+from velfield.parallel import each
 
 __all__ = ["LabelledImage", "record_of", "train_detector", "trained"]
 

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from velfield.exports.passages import MPS_TO_KMH
 from velfield.exports.place import Place
+from velfield.exports.tracks import MPS_TO_KMH
 
 _HEAD_SHARE, _HEAD_TURN = 0.35, 2.6  # length of the barbs by the shaft's, and how far they turn back, rad
 

@@ -11,7 +11,7 @@ from rasterio.io import MemoryFile
 from rasterio.shutil import copy
 from rasterio.transform import Affine
 
-from velfield.provenance import write_atomically
+from velfield.run.commits import write_atomically
 
 Georeference = tuple[float, float, float, float, float, float]
 

@@ -5,8 +5,8 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import pandas as pd
 
-from velfield.exports.passages import passage_points
 from velfield.exports.place import Place
+from velfield.exports.tracks import passage_points
 
 
 def sumo_fcd(tracklets: pd.DataFrame, place: Place, *, vehicle_type: str = "car") -> str:

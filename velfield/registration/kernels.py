@@ -4,7 +4,8 @@ Everything here takes plain arrays. The map of one point, in order, is
 
     undistorted u, raw row y  ->  v = u + shift(y) + roll(y) x (u - c)  ->  P(v)  ->  + mesh(raw x, raw y)
 
-with P the rational function in normalised coordinates. The plain numpy form stands in ``tests/test_transforms.py``.
+with P the rational function in normalised coordinates. The plain numpy form stands in
+``tests/registration/test_transforms.py``.
 """
 
 import math

@@ -11,7 +11,7 @@ from schemas.flight import FramesConfig
 from velfield.errors import InputError
 from velfield.sources.flags import FrameFlag
 from velfield.sources.frames import SourceFrame, SourceInfo, unreadable_frame
-from velfield.sources.pictures import PICTURE_SUFFIXES, check_size, picture_size, read_picture_grey
+from velfield.sources.images import PICTURE_SUFFIXES, check_size, picture_size, read_picture_grey
 from velfield.sources.timestamps import read_timestamps
 
 _DIGITS = re.compile(r"(\d+)")

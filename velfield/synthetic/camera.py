@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from schemas.simulation import CameraSimulation, SimulationConfig
-from velfield.synthetic.relief import Relief, ground_height, ground_height_at
+from velfield.synthetic.city.relief import Relief, ground_height, ground_height_at
 
 FloatArray = NDArray[np.float64]
 

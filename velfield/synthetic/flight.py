@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from schemas.simulation import SimulationConfig, TimesSimulation
 from velfield.synthetic.camera import Camera, make_camera
-from velfield.synthetic.city import PAD_PX, City
-from velfield.synthetic.plan import view_centre_m
-from velfield.synthetic.relief import make_relief
+from velfield.synthetic.city.city import PAD_PX, City
+from velfield.synthetic.city.city_plan import view_centre_m
+from velfield.synthetic.city.relief import make_relief
 from velfield.synthetic.render import Grey, Sprites, draw_sprites, hidden, render_ground
 from velfield.synthetic.seeds import Matter, stream
 

@@ -12,8 +12,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from schemas.tables import TRACKLET_COLUMNS
-from velfield.synthetic.traffic import STEP_S, Traffic
-from velfield.tracking.passages import assign_passages
+from velfield.synthetic.traffic.traffic import STEP_S, Traffic
+from velfield.tracking.chains import assign_passages
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

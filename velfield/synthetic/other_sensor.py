@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.simulation import OtherSensorSimulation
-from velfield.synthetic.ground import light_map, shade
+from velfield.synthetic.city.ground import light_map, shade
 from velfield.synthetic.render import MOSAIC_SCALE, Grey, Sprites, draw_sprites
-from velfield.synthetic.traffic import draw_kinds
-from velfield.synthetic.vehicles import draw_tones
+from velfield.synthetic.traffic.traffic import draw_kinds
+from velfield.synthetic.traffic.vehicles import draw_tones
 
 FloatArray = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from velfield.synthetic.relief import ground_height_at
-from velfield.synthetic.vehicles import LAYERS
+from velfield.synthetic.city.relief import ground_height_at
+from velfield.synthetic.traffic.vehicles import LAYERS
 
 FloatArray = NDArray[np.float64]
 Grey = NDArray[np.uint8]

@@ -12,8 +12,8 @@ from scipy.spatial import KDTree
 
 from velfield.errors import InputError
 from velfield.synthetic.camera import Camera, Waves
+from velfield.synthetic.city.relief import Relief
 from velfield.synthetic.flight import Flight
-from velfield.synthetic.relief import Relief
 
 FloatArray = NDArray[np.float64]
 

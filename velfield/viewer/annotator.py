@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from schemas.annotation import Marks
 from velfield.errors import InputError
-from velfield.render.figures import png_bytes
-from velfield.render.viewer_page import page_is_built, render_annotator
-from velfield.viewer.annotation import Frames, read_marks, write_marks
+from velfield.report.figures import png_bytes
+from velfield.report.viewer_page import page_is_built, render_annotator
+from velfield.viewer.annotations import Frames, read_marks, write_marks
 from velfield.viewer.server import headers_for, own_names
 
 if TYPE_CHECKING:

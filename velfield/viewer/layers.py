@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.view import LayerKind, ViewLayer
-from velfield.render.figures import speed_reach
+from velfield.report.figures import speed_reach
 
 _REACH_PERCENT = 98.0
 """Colours end where so many per cent of the known pixels are reached: a few outliers would flatten all else."""

@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 
 from schemas.records import FlightRecord, GridRecord
 from schemas.view import ViewArray, ViewBase, ViewLayer, ViewRecord, ViewSegments
+from velfield.analysis.coverage import few_vehicles
+from velfield.analysis.crossings import settle_px
 from velfield.field.bins import band_radius_px, standing_px_per_s
 from velfield.field.segments import Segments
-from velfield.insight.coverage import few_vehicles
-from velfield.insight.crossings import settle_px
-from velfield.layout import RunLayout
-from velfield.places import remove_tree
-from velfield.provenance import write_atomically
-from velfield.run import open_run
-from velfield.steps.grid import north_of
-from velfield.stores import HISTOGRAM, FieldStore, open_field, write_extra_layers, write_segments
+from velfield.run.commits import write_atomically
+from velfield.run.grid import north_of
+from velfield.run.layout import RunLayout
+from velfield.run.paths import remove_tree
+from velfield.run.run import open_run
+from velfield.run.stores import HISTOGRAM, FieldStore, open_field, write_extra_layers, write_segments
 from velfield.viewer.layers import view_layers
 from velfield.viewer.pyramid import TILE_PX, pyramid_levels, pyramid_tiles
 

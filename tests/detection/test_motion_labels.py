@@ -1,0 +1,409 @@
+"""Labels from motion, on made scenes: cars with shadows, parked cars, swaying things, roofs that shift."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.typing import NDArray
+
+from schemas.flight import DetectionConfig
+from velfield.detection.motion.blobs import Blobs, find_blobs, merged
+from velfield.detection.motion.difference import (
+    MotionFrame,
+    background_of,
+    motion_background,
+    motion_difference,
+    noise_sigma,
+)
+from velfield.detection.motion.evidence import Conduct, Found, MotionEvidence, conduct, evidence_from_motion
+from velfield.detection.motion.labels import MotionLabels, choose_frames, labels_from_motion, working_scale
+from velfield.errors import InputError
+
+INTERVAL_S = 0.2
+LENGTH, WIDTH = 16.0, 7.0
+SHADOW = np.array([5.0, 2.0])
+SIZE = (420, 520)
+
+
+@dataclass(frozen=True)
+class Car:
+    """A car of the made scene: place at time 0, velocity px/s (its axis, where it moves), grey."""
+
+    x: float
+    y: float
+    vx: float
+    vy: float
+    grey: int
+
+    def at(self, time_s: float) -> tuple[float, float]:
+        return self.x + self.vx * time_s, self.y + self.vy * time_s
+
+    @property
+    def heading(self) -> float:
+        return float(np.arctan2(self.vy, self.vx)) if (self.vx or self.vy) else 0.0
+
+
+def traffic() -> list[Car]:
+    """Two roads that do not meet: three lanes either way along x, two along a diagonal; bright and dark cars."""
+    cars = []
+    for lane in range(6):
+        speed = (1 if lane < 3 else -1) * (70 + 12 * lane)
+        for k in range(6):
+            grey = (235, 30)[(k + lane) % 2]
+            cars.append(Car(90.0 * k + 11 * lane, 40.0 + 22 * lane, speed, 0.0, grey))
+    for lane in range(2):
+        for k in range(6):
+            cars.append(Car(70.0 * k, 230.0 + 35 * k + 30 * lane, 60.0, 30.0, (230, 35)[k % 2]))
+    return cars
+
+
+def box(picture: NDArray[np.uint8], x: float, y: float, heading: float, grey: int) -> None:
+    corners = cv2.boxPoints(((x, y), (LENGTH, WIDTH), float(np.degrees(heading))))
+    cv2.fillConvexPoly(picture, np.round(corners * 16).astype(np.int32), grey, cv2.LINE_AA, 4)
+
+
+def ground(rng: np.random.Generator) -> NDArray[np.uint8]:
+    rough = cv2.GaussianBlur(rng.normal(0, 60, SIZE), (0, 0), 3)
+    return np.clip(130 + rough, 60, 200).astype(np.uint8)
+
+
+def scene(cars: list[Car], *, frames: int = 12, seed: int = 0) -> list[MotionFrame]:
+    """Frames of moving cars, each with its shadow, over a rough road; sensor noise of two grey levels."""
+    rng = np.random.default_rng(seed)
+    road = ground(rng)
+    made = []
+    for k in range(frames):
+        picture = road.copy()
+        for car in cars:
+            x, y = car.at(k * INTERVAL_S)
+            for step in np.linspace(1, 0, 6):
+                box(picture, x + step * SHADOW[0], y + step * SHADOW[1], car.heading, 15)
+            box(picture, x, y, car.heading, car.grey)
+        noisy = np.clip(picture + rng.normal(0, 2, SIZE), 0, 255).astype(np.uint8)
+        made.append(MotionFrame(noisy, np.ones(SIZE, np.bool_), k * INTERVAL_S))
+    return made
+
+
+def hits(labels: MotionLabels, cars: list[Car], radius: float = 4.0) -> tuple[float, float]:
+    """Share of labels that lie on a car, and of cars well inside the picture that are labelled."""
+    right = total = found = there = 0
+    for k, part in enumerate(labels.frames):
+        if not part.labelled:
+            continue
+        truth = np.array([car.at(k * INTERVAL_S) for car in cars if car.vx or car.vy])
+        inside = np.all((truth > 30) & (truth < np.array(SIZE[::-1]) - 30), axis=1)
+        gap = np.hypot(*(part.cars[:, None, :2] - truth[None]).transpose(2, 0, 1))
+        right, total = right + int((gap.min(axis=1) < radius).sum()), total + len(part.cars)
+        found, there = found + int((gap.min(axis=0)[inside] < radius).sum()), there + int(inside.sum())
+    return right / total, found / there
+
+
+def test_moving_cars_are_labelled_at_their_bodies_not_their_shadows() -> None:
+    cars = traffic()
+    labels = labels_from_motion(scene(cars), car_length_px=LENGTH)
+    precision, recall = hits(labels, cars)
+    assert precision > 0.97
+    assert recall > 0.8
+    assert labels.usable
+    assert not labels.warnings
+    assert labels.purity > 0.9
+    assert np.hypot(*(labels.shadow_px - SHADOW)) < 2.5
+
+
+def test_orientation_length_and_heading_are_the_cars() -> None:
+    cars = traffic()
+    labels = labels_from_motion(scene(cars), car_length_px=LENGTH)
+    table = np.concatenate([part.cars for part in labels.frames])
+    heading = np.concatenate([part.heading_rad for part in labels.frames])
+    known = np.array([0.0, np.arctan2(30, 60)])
+    off = np.abs(np.mod(table[:, None, 2] - known + np.pi / 2, np.pi) - np.pi / 2).min(axis=1)
+    assert np.median(off) < np.radians(2)
+    assert np.all((table[:, 2] >= 0) & (table[:, 2] < np.pi))
+    assert np.allclose(np.mod(heading, np.pi), table[:, 2])
+    assert abs(np.median(table[:, 3]) - LENGTH) < 2.5
+    assert abs(np.median(table[:, 4]) - WIDTH) < 2
+
+
+@pytest.mark.parametrize("scale", [0.7, 1.0, 1.8])
+def test_the_length_of_a_car_is_found_when_it_is_not_known(scale: float) -> None:
+    frames = [
+        MotionFrame(
+            np.asarray(cv2.resize(frame.image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8),
+            np.ones(cv2.resize(frame.image, None, fx=scale, fy=scale).shape, np.bool_),
+            frame.time_s,
+        )
+        for frame in scene(traffic())
+    ]
+    labels = labels_from_motion(frames)
+    assert labels.usable
+    assert labels.car_length_px == pytest.approx(LENGTH * scale, rel=0.15)
+    assert working_scale(DetectionConfig(), None, labels, labels_scale=scale) == pytest.approx(1.0, rel=0.15)
+
+
+def test_a_standing_car_is_no_label_and_no_ignore_region() -> None:
+    standing = [Car(100.0 + 60 * k, 210.0, 0.0, 0.0, 240) for k in range(5)]
+    labels = labels_from_motion(scene(traffic() + standing), car_length_px=LENGTH)
+    places = np.array([[car.x, car.y] for car in standing])
+    for part in labels.frames:
+        for table in (part.cars, part.ignore):
+            gap = np.hypot(*(table[:, None, :2] - places[None]).transpose(2, 0, 1))
+            assert np.all(gap > 6)
+
+
+def test_what_appears_once_is_ignored_not_labelled() -> None:
+    frames = scene(traffic())
+    image = frames[5].image.copy()
+    box(image, 300.0, 212.0, 0.3, 250)
+    frames[5] = MotionFrame(image, frames[5].valid, frames[5].time_s)
+    part = labels_from_motion(frames, car_length_px=LENGTH).frames[5]
+    assert np.hypot(part.cars[:, 0] - 300, part.cars[:, 1] - 212).min() > 10
+    assert np.hypot(part.ignore[:, 0] - 300, part.ignore[:, 1] - 212).min() < 6
+
+
+def test_first_and_last_frame_have_no_neighbours_and_no_labels() -> None:
+    labels = labels_from_motion(scene(traffic()), car_length_px=LENGTH)
+    assert [part.labelled for part in labels.frames] == [False] + [True] * 10 + [False]
+    assert len(labels.frames[0].cars) == 0
+    assert len(labels.frames[0].ignore) > 10
+
+
+def test_too_few_cars_is_said_with_what_to_do() -> None:
+    labels = labels_from_motion(scene(traffic()[:3]), car_length_px=LENGTH)
+    assert not labels.usable
+    assert "too few cars move" in labels.warnings[0]
+    assert "--labels" in labels.warnings[0]
+
+
+def test_a_still_scene_gives_no_label_even_without_a_known_length() -> None:
+    labels = labels_from_motion(scene([]))
+    assert labels.count == 0
+    assert not labels.usable
+    with pytest.raises(InputError, match="--gsd-m"):
+        working_scale(DetectionConfig(), None, labels)
+
+
+def test_roofs_that_shift_against_the_ground_are_not_taken_for_cars() -> None:
+    """Parallax: every roof moves by one vector, whichever way its edges lie."""
+    rng = np.random.default_rng(3)
+    road, frames = ground(rng), []
+    roofs = [(rng.uniform(20, 500), rng.uniform(20, 400), rng.uniform(0, np.pi)) for _ in range(60)]
+    for k in range(12):
+        picture = road.copy()
+        for x, y, angle in roofs:
+            box(picture, x + 3.2 * (k - 6), y + 1.0 * (k - 6), angle, 225)
+        frames.append(MotionFrame(picture, np.ones(SIZE, np.bool_), k * INTERVAL_S))
+    labels = labels_from_motion(frames, car_length_px=LENGTH)
+    assert not labels.usable
+    assert "parallax" in labels.warnings[0]
+    assert "--labels" in labels.warnings[0]
+
+
+def test_bad_frames_are_refused_in_one_line() -> None:
+    frames = scene(traffic(), frames=3)
+    with pytest.raises(InputError, match="3 registered frames or more"):
+        labels_from_motion(frames[:2])
+    with pytest.raises(InputError, match="time order"):
+        labels_from_motion([frames[0], frames[2], frames[1]])
+    small = MotionFrame(frames[0].image[:50], frames[0].valid[:50], 9.0)
+    with pytest.raises(InputError, match="of one shape"):
+        labels_from_motion([*frames, small])
+
+
+def test_a_frame_is_not_linked_over_a_gap_in_time() -> None:
+    frames = scene(traffic())
+    gapped = [MotionFrame(f.image, f.valid, f.time_s + (5.0 if k >= 6 else 0.0)) for k, f in enumerate(frames)]
+    labelled = [part.labelled for part in labels_from_motion(gapped, car_length_px=LENGTH).frames]
+    assert labelled == [False, True, True, True, True, False, False, True, True, True, True, False]
+
+
+def test_long_flights_are_sampled_in_bursts_of_three() -> None:
+    chosen = choose_frames(np.arange(1000) * 0.2)
+    assert len(chosen) == 48
+    assert chosen[0] == 0
+    assert chosen[-1] == 999
+    assert np.all(np.diff(chosen).reshape(-1)[0::3] == 1)
+    assert np.array_equal(choose_frames(np.arange(36) * 0.2), np.arange(36))
+
+
+def test_where_too_few_frames_stand_there_is_no_background() -> None:
+    frames = scene(traffic(), frames=6)
+    for frame in frames[2:]:
+        frame.valid[:, :40] = False
+    background = motion_background(frames)
+    assert not background.valid[:, :40].any()
+    assert background.valid[:, 40:].all()
+    assert motion_difference(frames[0].image, frames[0].valid, background)[:, :38].max() == 0
+
+
+def test_half_a_pixel_of_misregistration_makes_no_motion() -> None:
+    rng = np.random.default_rng(2)
+    sharp = np.where(rng.random((40, 40)) > 0.5, 200, 60).astype(np.uint8).repeat(8, 0).repeat(8, 1)
+    smooth = cv2.GaussianBlur(sharp, (0, 0), 1.0)
+    shifted = cv2.warpAffine(
+        smooth, np.array([[1, 0, 0.5], [0, 1, 0.5]]), smooth.shape[::-1], borderMode=cv2.BORDER_REPLICATE
+    )
+    everywhere = np.ones(smooth.shape, np.bool_)
+    plain = np.abs(shifted.astype(float) - smooth)
+    assert plain.max() > 15
+    assert motion_difference(shifted, everywhere, background_of(smooth)).max() < 4
+
+
+def test_a_change_of_exposure_makes_no_motion() -> None:
+    frames = scene([], frames=5)
+    background = motion_background(frames)
+    ramp = np.linspace(0, 40, SIZE[1])[None]
+    brighter = np.clip(frames[2].image + ramp, 0, 255).astype(np.uint8)
+    assert np.percentile(motion_difference(brighter, frames[2].valid, background), 99.5) < 8
+    assert 1.0 < noise_sigma(frames[2].image, frames[2].valid, background) < 4
+
+
+def test_merged_regions_have_the_moments_of_their_pixels_together() -> None:
+    picture = np.zeros((40, 60), np.float32)
+    picture[10:16, 10:20] = 50
+    picture[10:16, 24:30] = 50
+    both, pixels = find_blobs(picture, noise=0.0, car_length_px=16.0)
+    assert len(both) == 2
+    assert np.array_equal(np.bincount(pixels.region), both.area)
+    one = merged(both, np.zeros(2, np.int64), 1)
+    ys, xs = np.nonzero(picture)
+    assert one.x[0] == pytest.approx(xs.mean())
+    assert one.cxx[0] == pytest.approx(xs.var() + 1 / 12)
+    assert one.cyy[0] == pytest.approx(ys.var() + 1 / 12)
+
+
+def test_length_width_and_axis_of_a_rectangle() -> None:
+    c, s = np.cos(0.5), np.sin(0.5)
+    along, across = 18.0**2 / 12, 6.0**2 / 12
+    cxx, cyy, cxy = c * c * along + s * s * across, s * s * along + c * c * across, c * s * (along - across)
+    zero = np.zeros(1)
+    blob = Blobs(zero, zero, zero + cxx, zero + cxy, zero + cyy, zero + 108, zero + 1)
+    assert blob.length[0] == pytest.approx(18)
+    assert blob.width[0] == pytest.approx(6)
+    assert blob.axis_rad[0] == pytest.approx(0.5)
+    assert blob.extent_along(np.array([0.5]))[0] == pytest.approx(18)
+
+
+def found_at(places: NDArray[np.float64], axis: float, score: NDArray[np.float64], time_s: float) -> Found:
+    return Found(places, np.full(len(places), axis), score, time_s)
+
+
+def test_what_moves_along_its_axis_is_told_from_what_stands_and_what_is_alone() -> None:
+    moving, standing = np.array([[50.0, 50.0], [50.0, 90.0]]), np.array([[200.0, 50.0]])
+    across = np.array([[120.0, 150.0]])
+    frames = []
+    for k in range(3):
+        along, aside = np.array([9 * k, 0]), np.array([0, 9 * k])
+        places = np.concatenate([moving + along, standing, across + aside])
+        frames.append(found_at(places, 0.0, np.ones(4), 0.2 * k))
+    kinds = conduct(*frames, car_length_px=16.0)
+    assert list(kinds) == [Conduct.MOVES, Conduct.MOVES, Conduct.STANDS, Conduct.ALONE]
+
+
+def test_the_threshold_by_motion_keeps_the_cars_and_drops_chance_finds() -> None:
+    rng = np.random.default_rng(4)
+    cars = np.column_stack([rng.uniform(0, 900, 60), np.arange(60) * 16.0])
+    frames = []
+    for k in range(6):
+        chance = rng.uniform(0, 960, (200, 2))
+        score = np.concatenate([rng.normal(1.0, 0.2, 60), rng.normal(0.0, 0.2, 200)])
+        frames.append(found_at(np.concatenate([cars + np.array([11.0 * k, 0]), chance]), 0.0, score, 0.2 * k))
+    evidence = evidence_from_motion(frames, car_length_px=16.0)
+    assert 0.35 < evidence.chosen < 0.75
+    at = np.searchsorted(-evidence.threshold, -evidence.chosen)
+    assert evidence.precision[at] > 0.9
+    assert evidence.recall[at] > 0.85
+
+
+def test_cars_missed_in_a_frame_beside_are_no_false_finds() -> None:
+    """One car in ten is missed in each frame: what the surest of them tell is taken off the others."""
+    rng = np.random.default_rng(5)
+    cars = np.column_stack([rng.uniform(0, 900, 60), np.arange(60) * 16.0])
+    frames = []
+    for k in range(9):
+        kept = rng.random(60) < 0.9
+        places = cars[kept] + np.array([11.0 * k, 0])
+        frames.append(found_at(places, 0.0, rng.normal(1.0, 0.2, len(places)), 0.2 * k))
+    evidence = evidence_from_motion(frames, car_length_px=16.0)
+    assert evidence.precision[-1] > 0.93  # of all that are told, 0.79 move
+    assert evidence.chosen < 0.9
+
+
+def test_what_stands_and_is_missed_in_one_frame_is_not_alone() -> None:
+    nothing, parked = np.empty((0, 2)), np.array([[200.0, 50.0]])
+    for before, after in ((parked, nothing), (nothing, parked + 1.0)):
+        frames = [found_at(xy, 0.0, np.ones(len(xy)), 0.2 * k) for k, xy in enumerate((before, parked, after))]
+        assert list(conduct(*frames, car_length_px=16.0)) == [Conduct.STANDS]
+
+
+def moving_and_standing(standing: NDArray[np.float64]) -> MotionEvidence:
+    """Sixty cars that move, liked at about 0.3, among what stands and is liked so much."""
+    rng = np.random.default_rng(6)
+    cars = np.column_stack([rng.uniform(0, 900, 60), np.arange(60) * 16.0])
+    parked = np.column_stack([np.full(len(standing), 2000.0), np.arange(len(standing)) * 30.0])
+    score = np.concatenate([rng.normal(0.3, 0.05, 60), standing])
+    frames = [found_at(np.concatenate([cars + np.array([11.0 * k, 0]), parked]), 0.0, score, 0.2 * k) for k in range(6)]
+    return evidence_from_motion(frames, car_length_px=16.0)
+
+
+def test_looks_tell_cars_where_what_stands_is_liked_as_much_as_what_moves() -> None:
+    rng = np.random.default_rng(7)
+    assert moving_and_standing(rng.normal(0.3, 0.05, 120)).tells_cars(0.3)
+    assert moving_and_standing(np.empty(0)).tells_cars(0.3)
+    assert not moving_and_standing(rng.uniform(0.15, 0.29, 3000)).tells_cars(0.3)
+    disliked = replace(moving_and_standing(np.empty(0)), chosen=-0.01)
+    assert not disliked.tells_cars(0.3)
+
+
+def test_without_motion_there_is_no_evidence() -> None:
+    frames = [found_at(np.array([[50.0, 50.0]]), 0.0, np.ones(1), 0.2 * k) for k in range(4)]
+    assert np.isnan(evidence_from_motion(frames, car_length_px=16.0).chosen)
+    empty = [found_at(np.empty((0, 2)), 0.0, np.empty(0), 0.2 * k) for k in range(3)]
+    assert np.isnan(evidence_from_motion(empty, car_length_px=16.0).chosen)
+
+
+def still_frames(path: Path, wanted: list[int]) -> list[MotionFrame]:
+    """Frames of a nearly still video on the grid of the first, by one homography each."""
+    with av.open(str(path)) as container:
+        greys = {
+            k: cv2.cvtColor(frame.to_ndarray(format="rgb24"), cv2.COLOR_RGB2GRAY)
+            for k, frame in enumerate(container.decode(video=0))
+            if k in wanted
+        }
+    sift, matcher = cv2.SIFT_create(2000), cv2.BFMatcher(crossCheck=True)
+    found = {k: sift.detectAndCompute(cv2.pyrDown(grey), None) for k, grey in greys.items()}
+    points = {k: 2.0 * cv2.KeyPoint_convert(keys) for k, (keys, _) in found.items()}
+    frames, reference = [], found[wanted[0]][1]
+    for k in sorted(wanted):
+        pairs = [(m.queryIdx, m.trainIdx) for m in matcher.match(found[k][1], reference)]
+        here, there = (np.array([points[n][pair[side]] for pair in pairs]) for side, n in ((0, k), (1, wanted[0])))
+        near = np.hypot(*(here - there).T) < 8
+        matrix, _ = cv2.findHomography(here[near], there[near], cv2.USAC_MAGSAC, 1.0)
+        size = greys[k].shape[::-1]
+        image = cv2.warpPerspective(greys[k], matrix, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        valid = cv2.warpPerspective(np.full(size[::-1], 255, np.uint8), matrix, size) == 255
+        frames.append(MotionFrame(image, valid, k / 25))
+    return frames
+
+
+@pytest.mark.footage
+@pytest.mark.slow
+def test_labels_on_real_video_are_cars_by_eye(footage: Callable[[str], Path]) -> None:
+    """Frame 90 of kharkiv, against the cars marked in it by eye: labels are cars, and most that move are labelled."""
+    marks = pd.read_csv(Path(__file__).parents[1] / "data" / "kharkiv_marks.csv")
+    wanted = [90, 85, 95, 0, 30, 60, 120, 150, 175]
+    frames = still_frames(footage("kharkiv") / "drone.mp4", wanted)
+    labels = labels_from_motion(frames, car_length_px=10.0)
+    cars = labels.frames[sorted(wanted).index(90)].cars
+    places = marks[["x_px", "y_px"]].to_numpy(float)
+    gap = np.hypot(*(cars[:, None, :2] - places[None]).transpose(2, 0, 1))
+    known = (marks["kind"] != "unclear").to_numpy()
+    on_car = gap[:, known].min(axis=1) <= 5
+    on_unclear = (gap[:, ~known] <= marks["radius_px"].to_numpy()[~known]).any(axis=1)
+    moving = (marks["kind"] == "moving").to_numpy()
+    assert on_car.sum() / (on_car | ~on_unclear).sum() > 0.85
+    assert (gap[:, moving].min(axis=0) <= 5).mean() > 0.5

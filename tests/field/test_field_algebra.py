@@ -1,0 +1,200 @@
+"""Fields of run folders added, subtracted, compared: `velfield merge`, `subtract`, `compare`."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import rasterio
+import xarray as xr
+from rasterio.errors import NotGeoreferencedWarning
+
+from schemas.flight import FieldConfig
+from tests.field_runs import field_run, flight, traffic_tracklets
+from velfield.errors import InputError
+from velfield.field.comparison import significant
+from velfield.field.slices import DAY_S, parse_slices
+from velfield.pipeline.compare import compare_runs
+from velfield.run.field_algebra import merge_fields, subtract_fields
+from velfield.run.field_reader import known_tiles
+from velfield.run.run import open_run
+from velfield.run.stores import open_field
+
+
+def everything(root: Path) -> dict[str, np.ndarray]:
+    """The histogram and all layers."""
+    store = open_field(root / "field.zarr")
+    tiles = known_tiles(store.layer("count"), store.tile)
+    histograms = {f"{name} {tile}": store.read_tile(*tile, name) for tile in tiles for name in store.histogram_names()}
+    return histograms | {name: store.layer(name) for name in store.layer_names()}
+
+
+def assert_equal(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> None:
+    assert a.keys() == b.keys()
+    for name, values in a.items():
+        np.testing.assert_array_equal(values, b[name], err_msg=name)
+
+
+@pytest.fixture(scope="module")
+def table() -> pd.DataFrame:
+    return traffic_tracklets(3)
+
+
+@pytest.fixture(scope="module")
+def shape() -> tuple[int, int]:
+    return flight(3).base_shape
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory, table: pd.DataFrame, shape: tuple[int, int]) -> Path:
+    return field_run(tmp_path_factory.mktemp("whole") / "run", table, shape=shape).layout.root
+
+
+def test_ten_disjoint_sets_added_equal_the_field_of_all_to_the_bit(
+    tmp_path: Path, table: pd.DataFrame, shape: tuple[int, int], whole: Path
+) -> None:
+    parts = []
+    passages = np.unique(table["passage_id"])
+    for k in range(10):
+        mine = table[table["passage_id"].isin(passages[k::10])]
+        parts.append(field_run(tmp_path / f"part{k}", mine, shape=shape).layout.root)
+    merge_fields(parts, tmp_path / "sum")
+    found = everything(tmp_path / "sum")
+    assert found["count"].max() >= 3
+    assert_equal(found, everything(whole))
+    subtract_fields(whole, parts[0], tmp_path / "left")
+    merge_fields([tmp_path / "left", parts[0]], tmp_path / "again")
+    assert_equal(everything(tmp_path / "again"), found)
+    merged = open_run(tmp_path / "sum")
+    y, x = np.unravel_index(int(merged.field.count().argmax()), merged.field.shape)
+    assert merged.field.at(int(x), int(y)).n == merged.field.count().max()
+
+
+def test_fields_on_different_grids_are_refused_in_one_line(
+    tmp_path: Path, table: pd.DataFrame, shape: tuple[int, int], whole: Path
+) -> None:
+    smaller = field_run(tmp_path / "smaller", table, shape=(shape[0] - 8, shape[1])).layout.root
+    coarser = field_run(tmp_path / "coarser", table, shape=shape, config=FieldConfig(bin_width_m_per_s=4.0)).layout.root
+    for other, what in ((smaller, "size"), (coarser, "bin_width")):
+        for attempt in (
+            lambda other=other: merge_fields([whole, other], tmp_path / "out"),
+            lambda other=other: subtract_fields(whole, other, tmp_path / "out"),
+            lambda other=other: compare_runs(whole, other, tmp_path / "out"),
+        ):
+            with pytest.raises(InputError, match=what) as caught:
+                attempt()
+            assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_holds_something_is_not_written_over(whole: Path) -> None:
+    with pytest.raises(InputError, match="not there yet"):
+        merge_fields([whole, whole], whole)
+
+
+def slowed(table: pd.DataFrame, share: float) -> pd.DataFrame:
+    """The same passages at a share of their speed."""
+    out = table.copy()
+    out[[name for name in out if name.startswith("v")]] *= share
+    return out
+
+
+def test_comparing_tells_a_change_from_chance(
+    tmp_path: Path, table: pd.DataFrame, shape: tuple[int, int], whole: Path
+) -> None:
+    """Half of the passages against the other half: chance. All at 40 % of their speed: a change, of that size."""
+    passages = np.random.default_rng(0).permutation(np.unique(table["passage_id"]))
+    halves = [
+        field_run(tmp_path / name, table[table["passage_id"].isin(passages[k::2])], shape=shape).layout.root
+        for k, name in enumerate(("even", "odd"))
+    ]
+    lines = compare_runs(*halves, tmp_path / "chance", min_count=2)
+    assert sum("no significant change" in line for line in lines[:3]) >= 2, lines
+    slow = field_run(tmp_path / "slow", slowed(table, 0.4), shape=shape).layout.root
+    lines = compare_runs(whole, slow, tmp_path / "change", min_count=2)
+    assert "no significant" not in lines[1]
+    assert "no significant" in lines[0]
+    assert "no significant" in lines[2]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        dataset = rasterio.open(tmp_path / "change" / "change.tif")
+    with dataset:
+        assert dataset.descriptions[2] == "speed change"
+        change, chance = dataset.read(3), dataset.read(4)
+    before = open_run(whole).field.statistics().speed_percentiles_px_per_s[..., 1] * 0.23 * 3.6
+    fast = (before > 30) & np.isfinite(change)
+    assert np.nanmedian(change[fast] / before[fast]) == pytest.approx(-0.6, abs=0.05)
+    assert (chance[np.isfinite(chance)] >= 0).all()
+    assert sorted(path.name for path in (tmp_path / "change").glob("*.png")) == [
+        "direction_change.png",
+        "speed_change.png",
+        "volume_change.png",
+    ]
+
+
+def test_of_many_tests_of_nothing_hardly_any_is_called_significant() -> None:
+    rng = np.random.default_rng(5)
+    assert significant(rng.uniform(size=100_000)).mean() < 1e-3
+    mixed = np.concatenate([rng.uniform(size=90_000), rng.uniform(0, 1e-5, 10_000)])
+    found = significant(mixed)
+    assert found[90_000:].mean() > 0.99
+    assert found[:90_000].sum() < 0.08 * found.sum()
+
+
+@pytest.mark.parametrize("text", ["4s", "2-5,7-9"])
+def test_slices_of_time_add_up_to_the_whole(
+    tmp_path: Path, table: pd.DataFrame, shape: tuple[int, int], whole: Path, text: str
+) -> None:
+    run = field_run(tmp_path / "run", table, shape=shape, config=FieldConfig(slice=text))
+    assert_equal(everything(run.layout.root), everything(whole))
+    slices = run.field_slices
+    assert list(slices) == {"4s": ["0-4", "4-8", "8-12"], "2-5,7-9": ["2-5", "7-9", "rest"]}[text]
+    assert sum(part.field.count() for part in slices.values()).tolist() == run.field.count().tolist()
+    assert min(int(part.field.count().sum()) for part in list(slices.values())[:2]) > 0
+    y, x = np.unravel_index(int(run.field.count().argmax()), shape)
+    parts = [part.field.at(int(x), int(y)) for part in slices.values()]
+    mixed = sum(part.weights * part.n for part in parts) / sum(part.n for part in parts)
+    np.testing.assert_allclose(mixed, run.field.at(int(x), int(y)).weights, atol=1e-12)
+    data = xr.open_zarr(run.layout.slices / "000.zarr", consolidated=False)
+    assert data.attrs["slice"] == next(iter(slices))
+    assert data["velocity_histogram"].dims == ("y", "x", "vy", "vx")
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("fortnight", "not understood"),
+        ("5-2", "ends before"),
+        ("0-10,5-20", "overlap"),
+        ("0.01s", "at most"),
+        ("0s", "no length"),
+    ],
+)
+def test_slices_that_make_no_sense_are_refused(text: str, complaint: str) -> None:
+    with pytest.raises(InputError, match=complaint):
+        parse_slices(text, 0.0, 60.0)
+
+
+def test_time_of_day_is_that_of_the_flights_day() -> None:
+    morning, rest = parse_slices("07:30-09:00", 3 * DAY_S + 20_000.0, 3 * DAY_S + 40_000.0)
+    assert (morning.start_s, morning.stop_s) == (3 * DAY_S + 27_000.0, 3 * DAY_S + 32_400.0)
+    assert rest.name == "rest"
+
+
+def test_both_weights_are_kept_and_named(whole: Path) -> None:
+    """By passage every vehicle counts alike; by time those that stay count for longer, so that speeds are lower."""
+    run = open_run(whole)
+    by_passage, by_time = run.field, run.field_by_time
+    passing, watched = by_passage.statistics(), by_time.statistics()
+    speed = np.hypot(*np.moveaxis(passing.mean_velocity_px_per_s, -1, 0))
+    in_time = np.hypot(*np.moveaxis(watched.mean_velocity_px_per_s, -1, 0))
+    busy = passing.n >= 3
+    assert busy.sum() > 50
+    assert np.mean(in_time[busy] <= speed[busy] + 0.5) > 0.95
+    data = xr.open_zarr(run.layout.field, consolidated=False)
+    assert data["velocity_histogram"].attrs["weighted_by"] == "passage"
+    assert data["velocity_histogram_by_time"].attrs["weighted_by"] == "time"
+    y, x = np.unravel_index(int(by_passage.count().argmax()), by_passage.shape)
+    seconds = int(data["velocity_histogram_by_time"][y, x].sum()) / data.attrs["weight_unit"]
+    assert seconds == pytest.approx(int(data["dwell_ms"][y, x]) / 1000, rel=0.02)

@@ -1,0 +1,161 @@
+"""The command: exit statuses, one clear line for bad input; the wheel among decoys."""
+
+import os
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def velfield(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "flows.cli", *arguments], capture_output=True, text=True, check=False, cwd=cwd or ROOT
+    )
+
+
+def test_help_lists_the_commands() -> None:
+    told = velfield("--help")
+    assert told.returncode == 0
+    assert [name for name in ("demo", "run", "schema", "simulate") if name not in told.stdout] == []
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    assert velfield("--version").stdout.strip() == version("velfield")
+
+
+def test_usage_is_status_2() -> None:
+    assert velfield("run").returncode == 2
+    assert velfield("fly").returncode == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("run", "none.mp4", "--out", "out"), "none.mp4"),
+        (("run", "http://host/video.mp4", "--out", "out"), "http"),
+        (("run", "none.mp4", "--out", "out", "--set", "tracking.max_sped_m_per_s=1"), "did you mean"),
+        (("run", "none.mp4", "--out", "out", "--every", "often"), "--every often"),
+        (("simulate", "out", "--size", "big"), "WIDTHxHEIGHT"),
+    ],
+)
+def test_bad_input_is_one_clear_line_and_status_1(tmp_path: Path, arguments: tuple[str, ...], told: str) -> None:
+    result = subprocess.run(
+        [sys.executable, "-m", "flows.cli", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    assert result.returncode == 1
+    lines = result.stderr.strip().splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("velfield: ")
+    assert told in lines[0]
+    assert not (tmp_path / "out" / "commits").exists()
+
+
+def test_schema_is_the_configuration() -> None:
+    import json
+
+    from schemas.flight import FlightConfig
+
+    assert json.loads(velfield("schema").stdout) == FlightConfig.model_json_schema()
+
+
+def test_the_example_configuration_is_read() -> None:
+    from schemas.flight import FlightConfig
+    from velfield.pipeline.configuration import resolve_config
+
+    assert resolve_config(file=ROOT / "examples" / "flight.yaml") == FlightConfig(gsd_m=0.23)
+
+
+def test_a_plan_is_shown_and_nothing_is_done(tmp_path: Path) -> None:
+    import numpy as np
+    from PIL import Image
+
+    (tmp_path / "frames").mkdir()
+    for k in range(40):
+        Image.fromarray(np.full((96, 128), k, np.uint8)).save(tmp_path / "frames" / f"{k:03d}.png")
+    told = velfield("run", str(tmp_path / "frames"), "--fps", "5", "--out", str(tmp_path / "run"), "--plan")
+    assert told.returncode == 0, told.stderr
+    assert "40 of them to work on" in told.stdout
+    assert "GB needed" in told.stdout
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("database", "api", "first"),
+    [
+        ("sqlite+aiosqlite:///{folder}/none.db", None, True),
+        ("sqlite+aiosqlite:///{folder}/there.db", None, False),
+        ("sqlite+aiosqlite:///{folder}/none.db", "http://127.0.0.1:4200/api", False),
+        ("postgresql+asyncpg://host/prefect", None, False),
+    ],
+)
+def test_prefects_first_start_is_known_beforehand(tmp_path: Path, database: str, api: str | None, first: bool) -> None:
+    from prefect.settings import PREFECT_API_DATABASE_CONNECTION_URL, PREFECT_API_URL, temporary_settings
+
+    from flows.launch import first_start
+
+    (tmp_path / "there.db").touch()
+    settings = {PREFECT_API_DATABASE_CONNECTION_URL: database.format(folder=tmp_path), PREFECT_API_URL: api}
+    with temporary_settings(settings):
+        assert first_start() == first
+
+
+@pytest.fixture(scope="module")
+def wheel_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The built wheel, unpacked where nothing else is."""
+    import zipfile
+
+    place = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(place), str(ROOT)]
+    subprocess.run(command, check=True, capture_output=True)
+    (wheel,) = place.glob("*.whl")
+    zipfile.ZipFile(wheel).extractall(place / "site")
+    return place / "site"
+
+
+def test_the_wheel_runs_from_a_folder_with_decoys(wheel_folder: Path, tmp_path: Path) -> None:
+    for name in ("flows", "velfield", "schemas"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("raise RuntimeError('a decoy was imported')")
+    for name in ("types.py", "utils.py", "stores.py", "logging.py"):
+        (tmp_path / name).write_text("raise RuntimeError('a decoy was imported')")
+    code = "import flows.cli, velfield, schemas, sys; print(flows.cli.__file__); flows.cli.app(['--version'])"
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(wheel_folder), "PYTHONSAFEPATH": "1"},
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith(str(wheel_folder))
+
+
+def test_the_wheel_ships_what_it_reads_at_run_time(wheel_folder: Path) -> None:
+    wanted = ("velfield/report/report.css", "velfield/py.typed", "schemas/py.typed", "flows/cli.py")
+    wanted += tuple(
+        f"velfield/report/page/{name}" for name in ("viewer.js", "viewer.html", "annotate.js", "LICENSES.txt")
+    )
+    assert [name for name in wanted if not (wheel_folder / name).exists()] == []
+
+
+def test_no_file_names_a_registry_host() -> None:
+    tracked = subprocess.run(["git", "ls-files"], capture_output=True, text=True, check=True, cwd=ROOT).stdout.split()
+    hosts = ("pypi." + "org", "pythonhosted." + "org", "registry.npmjs." + "org", "deb.debian." + "org")
+    texts = [ROOT / name for name in tracked if (ROOT / name).suffix not in (".jpg", ".png", ".npz")]
+    found = [
+        path.name
+        for path in texts
+        if path.is_file() and any(host in path.read_text(errors="replace") for host in hosts)
+    ]
+    assert found == []
+    assert "uv.lock" not in tracked

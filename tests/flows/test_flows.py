@@ -1,0 +1,258 @@
+"""The whole job as a flow: what it leaves, what a second run does again, what a failing unit costs."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from flows.runners import RunnerConfig
+from schemas.detector import MotionRecord
+from schemas.summary import RunSummary
+from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
+from tests.small_flight import FRAMES, digests, job, process, redone
+from velfield import open_run
+from velfield.detection.detector import Detector, save_detector, shipped_detector
+from velfield.errors import InputError
+from velfield.pipeline.plan import make_plan
+from velfield.pipeline.stages.detections import detect_block
+from velfield.pipeline.stages.detector import make_detector
+from velfield.run.layout import STAGES, RunLayout
+from velfield.run.results import share
+
+
+def test_it_leaves_what_the_contract_says(whole: tuple[Path, RunSummary]) -> None:
+    root, summary = whole
+    assert [stage.name for stage in summary.stages] == list(STAGES)
+    assert summary.complete
+    names = ("flight.json", "frames.zarr", "camera.json", "base/grid.json", "base/base_image.png", "registration.zarr")
+    names += ("detector.json", "detections", "tracklets", "field.zarr", "maps/direction.png", "maps/speed.png")
+    names += ("maps/direction.tif", "maps/speed.tif", "index.html", "commits")
+    assert [name for name in names if not (root / name).exists()] == []
+
+
+def test_the_python_side_of_the_contract(whole: tuple[Path, RunSummary]) -> None:
+    run = open_run(whole[0])
+    assert run.times_s.shape == (FRAMES,)
+    assert list(run.registration_status) == ["ok"] * FRAMES
+    assert list(run.detections().columns) == list(DETECTION_COLUMNS)
+    tracklets = run.tracklets()
+    assert list(tracklets.columns) == list(TRACKLET_COLUMNS)
+    assert len(tracklets) > 50
+    raw = np.array([[100.0, 90.0], [500.0, 400.0]])
+    np.testing.assert_allclose(run.to_raw(4, run.to_base(4, raw)), raw, atol=1e-2)
+    with pytest.raises(InputError, match=f"frames go from 0 to {FRAMES - 1}"):
+        run.to_base(FRAMES, raw)
+    with pytest.raises(InputError, match=f"frames go from 0 to {FRAMES - 1}"):
+        run.frames.read(-1)
+    count, velocity = run.field.count(), run.field.modal_velocity()
+    assert count.shape == velocity.shape[:2] == run.base_image.shape
+    assert np.isfinite(velocity[count > 0]).all()
+    assert np.isnan(velocity[count == 0]).all()
+    y, x = np.unravel_index(count.argmax(), count.shape)
+    here = run.field.at(int(x), int(y))
+    assert here.n == count[y, x]
+    assert here.weights.sum() == pytest.approx(1)
+    np.testing.assert_allclose(run.field.modal_velocity()[y, x], here.modal_velocity_px_per_s, rtol=1e-5)
+    fast, slow = run.field.log_density(np.array([[x, y], [x, y]]), np.array([velocity[y, x], velocity[y, x] + 90]))
+    assert fast > slow
+
+
+def test_it_is_as_good_as_a_small_flight_lets_it_be(whole: tuple[Path, RunSummary], flight: Path) -> None:
+    from velfield.synthetic.run_score import score_run
+
+    score = score_run(whole[0], flight, min_count=1)
+    assert score.registration.mean_px < 1.0
+    assert score.registration.jitter_px < 0.25
+    assert score.tracking.precision_moving > 0.95
+    assert score.field.pixels > 1000
+
+
+def test_a_run_on_another_base_image_has_no_score(
+    whole: tuple[Path, RunSummary], flight: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from velfield.synthetic.run_score import score_run
+    from velfield.synthetic.truth import Truth
+
+    def turned(truth: Truth, frame: int, xy_raw: np.ndarray) -> np.ndarray:
+        return truth.camera.to_base(frame, xy_raw)[:, ::-1] * (1, -1) + (0, 400)
+
+    monkeypatch.setattr(Truth, "to_base", turned)
+    with pytest.raises(InputError, match=r"px off those of .* its base image is another one; score a run with --base"):
+        score_run(whole[0], flight)
+
+
+def test_a_second_run_does_nothing_again(whole: tuple[Path, RunSummary], flight: Path) -> None:
+    root, _ = whole
+    before = digests(root)
+    again = process(job(flight, root))
+    assert redone(again) == []
+    assert digests(root) == before
+    assert all(stage.seconds_before > 0 for stage in again.stages)  # the report tells what the work took, once done
+
+
+def test_a_changed_gate_redoes_tracking_onward(whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path) -> None:
+    root = tmp_path / "copy"
+    shutil.copytree(whole[0], root)
+    changed = process(job(flight, root, "tracking.max_speed_m_per_s=5"))
+    assert redone(changed) == ["links", "tracklets", "field", "maps"]
+    velocities = open_run(root).tracklets()[["vx_01_px_per_s", "vy_01_px_per_s"]]
+    speeds = np.hypot(*velocities.to_numpy().T) * 0.23
+    assert np.quantile(speeds, 0.99) < 10.5  # 5 m/s and what jitter adds
+    assert speeds.max() < 14  # a place may be mended by a pixel or two after the gates
+
+
+def test_a_detector_that_looks_at_the_background_is_given_that_of_this_flight(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
+) -> None:
+    root, file, found = tmp_path / "copy", tmp_path / "detector.json", []
+    shutil.copytree(whole[0], root)
+    for motion in (None, MotionRecord(still_grey=8, moving_grey=20, lift=0.3)):
+        save_detector(
+            Detector(shipped_detector().record.model_copy(update={"motion": motion, "threshold": 0.35})), file
+        )
+        plan = make_plan(job(flight, root, detector=str(file)))
+        outcome = make_detector(plan)
+        assert (RunLayout(root).background in outcome.outputs) == (motion is not None)
+        found.append(len(detect_block(plan, range(8, 9)).table))
+    assert found[1] > found[0] + 5
+
+
+def test_workers_give_the_same_bits(whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path) -> None:
+    process(job(flight, tmp_path / "workers"), RunnerConfig(workers=2))
+    assert digests(tmp_path / "workers") == digests(whole[0])
+
+
+def test_a_unit_that_fails_once_is_tried_again(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from velfield.pipeline.stages import frames as step
+
+    calls: list[range] = []
+    true = step.read_unit
+
+    def failing(plan: object, frames: range) -> object:
+        calls.append(frames)
+        if len(calls) == 1:
+            raise OSError("the disk blinked")
+        return true(plan, frames)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(step, "read_unit", failing)
+    root = tmp_path / "run"
+    shutil.copytree(whole[0], root)
+    shutil.rmtree(root / "commits/frames")
+    summary = process(job(flight, root))
+    assert redone(summary) == ["frames"]
+    assert not summary.stages[0].lost
+    assert len(calls) == summary.stages[0].units + 1
+
+
+def test_a_unit_that_always_fails_is_lost_and_done_by_the_next_run(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from velfield.pipeline.stages import detections as step
+
+    true = step.detect_block
+
+    def failing(plan: object, frames: range) -> object:
+        if 8 in frames:
+            raise RuntimeError("this chunk kills its worker")
+        return true(plan, frames)  # type: ignore[arg-type]
+
+    root = tmp_path / "run"
+    share(RunLayout(whole[0]), RunLayout(root), ("lens", "base", "detector"))
+    monkeypatch.setattr(step, "detect_block", failing)
+    summary = process(job(flight, root))
+    lost = {stage.name: stage.lost for stage in summary.stages if stage.lost}
+    assert lost["detections"] == ("000008-000015",)
+    assert not summary.complete
+    monkeypatch.setattr(step, "detect_block", true)
+    again = process(job(flight, root))
+    assert again.complete
+    assert digests(root) == digests(whole[0])
+
+
+def test_a_base_image_of_another_place_is_refused(flight: Path, server: None, tmp_path: Path) -> None:
+    import cv2
+
+    picture = cv2.imread(str(flight / "base.png"), cv2.IMREAD_GRAYSCALE)
+    wrong = tmp_path / "mirrored.png"
+    cv2.imwrite(str(wrong), picture[:, ::-1])
+    with pytest.raises(InputError, match="found a mirrored picture"):
+        process(job(flight, tmp_path / "run", base=str(wrong)))
+    assert not (tmp_path / "run" / "commits" / "registration").exists()
+
+
+def test_commit_records_say_what_was_done(whole: tuple[Path, RunSummary]) -> None:
+    root, _ = whole
+    record = json.loads((root / "commits" / "detections" / "000008-000015.json").read_text())
+    assert record["counts"]["frames"] == 8
+    assert record["counts"]["cars"] == int((open_run(root).detections()["frame"].between(8, 15)).sum())
+    assert all(digest for name, digest in record["outputs"].items() if name.endswith(".parquet"))
+
+
+def test_detections_of_another_detector_take_the_place_of_ours(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
+) -> None:
+    from velfield.synthetic import load_truth
+
+    cars = load_truth(flight).cars
+    cars = cars[cars["visible"]]
+    names = sorted(path.name for path in (flight / "frames").iterdir())
+    table = pd.DataFrame(
+        {"frame": [names[k] for k in cars["frame"]], "x_px": cars["x_raw_px"], "y_px": cars["y_raw_px"]}
+    )
+    inside = table["x_px"].between(0, 639) & table["y_px"].between(0, 479)
+    table[inside].to_csv(tmp_path / "boxes.csv", index=False)
+    summary = process(job(flight, tmp_path / "run", detections=str(tmp_path / "boxes.csv")))
+    counts = {stage.name: stage.counts for stage in summary.stages}
+    assert counts["detections"]["cars"] == pytest.approx(inside.sum(), rel=0.02)
+    assert counts["tracklets"]["passages"] > 20
+    assert "another program's boxes" in next(stage.text for stage in summary.stages if stage.name == "detector")
+
+
+def test_boxes_of_few_frames_what_is_not_used_and_why_the_maps_stay_empty_are_told(
+    flight: Path, tmp_path: Path
+) -> None:
+    first = sorted(path.name for path in (flight / "frames").iterdir())[0]
+    boxes = tmp_path / "boxes.csv"
+    boxes.write_text(f"frame,x_px,y_px,length_px,width_px\n{first},320,240,20,9\n")
+    settings = ("tracking.max_interval_s=0.05", "frames.stop_s=1.0")
+    summary = process(job(flight, tmp_path / "run", *settings, detections=str(boxes)))  # labels are given as well
+    warned = {stage.name: stage.warnings for stage in summary.stages}
+    assert any("boxes in 1 of the" in line for line in warned["detector"])
+    assert any("--labels not used" in line for line in warned["detector"])
+    (told,) = warned["tracklets"]
+    assert "no tracklets, so the maps stay empty" in told
+    assert "--set tracking.max_interval_s=0." in told
+
+
+def test_the_size_of_given_boxes_tells_the_working_scale(flight: Path, tmp_path: Path) -> None:
+    """Where no ground sample distance is given; boxes without a size are told of."""
+    from velfield.synthetic import load_truth
+
+    cars = load_truth(flight).cars
+    names = sorted(path.name for path in (flight / "frames").iterdir())
+    cars = cars[cars["visible"] & cars["x_raw_px"].between(0, 639) & cars["y_raw_px"].between(0, 479)]
+    table = pd.DataFrame(
+        {"frame": [names[k] for k in cars["frame"]], "x_px": cars["x_raw_px"], "y_px": cars["y_raw_px"]}
+    )
+    sized, bare = tmp_path / "sized.csv", tmp_path / "bare.csv"
+    table.to_csv(bare, index=False)
+    table.assign(length_px=20.0, width_px=9.0).to_csv(sized, index=False)
+    scales, warned = [], []
+    for boxes in (sized, bare):
+        unsized = job(flight, tmp_path / boxes.stem, detections=str(boxes))
+        unsized = unsized.model_copy(update={"config": unsized.config.model_copy(update={"gsd_m": None})})
+        summary = process(unsized)
+        record = json.loads((tmp_path / boxes.stem / "base" / "working.json").read_text())
+        scales.append(record["scale"])
+        warned.append(
+            [line for stage in summary.stages if stage.name == "detector" for line in stage.warnings if "size" in line]
+        )
+    assert scales[0] == pytest.approx(0.8, rel=0.1)
+    assert scales[1] == 1.0
+    assert not warned[0]
+    assert "give one" in warned[1][0]

@@ -1,0 +1,29 @@
+"""Killed at random moments, resumed by the same command: the same bits, and no run that seems to run for ever."""
+
+from pathlib import Path
+
+import pytest
+
+from schemas.summary import RunSummary
+from tests.kills import run_with_kills
+from tests.small_flight import digests
+from velfield.run.layout import RunLayout
+from velfield.run.results import share
+
+
+def test_three_kills_and_the_same_bits(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from prefect.client.orchestration import get_client
+    from prefect.settings import PREFECT_API_URL
+
+    monkeypatch.setenv("PREFECT_API_URL", str(PREFECT_API_URL.value()))  # the session's server: none of its own
+    # Lens, base image and detector take longest and are one unit each: `make soak` kills those too.
+    share(RunLayout(whole[0]), RunLayout(tmp_path / "run"), ("lens", "base", "detector"))
+    met = run_with_kills(flight, tmp_path / "run", 3, seed=0)
+    assert met >= 2
+    assert digests(tmp_path / "run") == digests(whole[0])
+    with get_client(sync_client=True) as client:
+        states = [run.state_name for run in client.read_flow_runs() if run.name == str(tmp_path / "run")]
+    # A kill in the first seconds leaves no flow run at all, one in the last a run that is done.
+    assert set(states) == {"Completed", "Crashed"}

@@ -1,0 +1,299 @@
+"""`velfield serve`: a real server and real flow runs, from an event to a finished result; and what it refuses."""
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import psutil
+import pytest
+import yaml
+
+from flows.serve import ServeConfig, check, deployments, settings
+from schemas.summary import RunSummary
+from tests.browser import browser
+from velfield.errors import InputError
+from velfield.pipeline.watch import Watch, inputs_of, newest_picture, picture_named, run_folders, run_name
+
+ROOT = Path(__file__).resolve().parents[2]
+AUTH = "somebody:secret"
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+# -------------------------------------------------------------------------------------------------- what is refused
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "10.0.0.1"])
+def test_another_address_is_refused_without_an_auth_string(host: str) -> None:
+    with pytest.raises(InputError, match="give --auth USER:PASSWORD"):
+        check(ServeConfig(Path("x"), host=host, port=free_port()))
+
+
+def test_another_address_is_served_with_one() -> None:
+    check(ServeConfig(Path("x"), host="0.0.0.0", port=free_port(), auth=AUTH))
+    with pytest.raises(InputError, match="expected USER:PASSWORD"):
+        check(ServeConfig(Path("x"), auth="secret"))
+
+
+def test_a_port_that_is_taken_is_told() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(InputError, match="cannot be had"):
+            check(ServeConfig(Path("x"), port=taken.getsockname()[1]))
+
+
+def test_no_analytics_and_no_other_origin() -> None:
+    given = settings(ServeConfig(Path("x"), port=4321, auth=AUTH, database="postgresql+asyncpg://db/velfield"))
+    assert given["PREFECT_SERVER_ANALYTICS_ENABLED"] == "false"
+    assert given["PREFECT_SERVER_CORS_ALLOWED_ORIGINS"] == "http://127.0.0.1:4321"
+    assert given["PREFECT_API_DATABASE_CONNECTION_URL"].startswith("postgresql")
+    assert given["PREFECT_SERVER_API_AUTH_STRING"] == AUTH
+
+
+# -------------------------------------------------------------------------------------------------- what arrives
+
+
+def test_what_arrives_is_told_once_when_it_no_longer_grows(tmp_path: Path) -> None:
+    (tmp_path / "old.mp4").write_bytes(b"1")
+    told: list[str] = []
+    watch = Watch(tmp_path, 5.0, lambda path: told.append(path.name), old_too=False)
+    (tmp_path / "new.mp4").write_bytes(b"1")
+    watch.look(0.0)
+    (tmp_path / "new.mp4").write_bytes(b"12")
+    watch.look(6.0)
+    watch.look(10.0)
+    assert told == []
+    watch.look(11.0)
+    watch.look(99.0)
+    assert told == ["new.mp4"]
+
+
+def test_a_dropped_folder_is_read_by_its_names(tmp_path: Path) -> None:
+    drop = tmp_path / "Main St"
+    for name in ("frames/1.png", "base.png", "labels.csv", "timestamps.csv", "flight.yaml"):
+        (drop / name).parent.mkdir(parents=True, exist_ok=True)
+        (drop / name).touch()
+    inputs, config = inputs_of(drop)
+    assert inputs.source == str(drop / "frames")
+    assert (inputs.base, inputs.labels) == (str(drop / "base.png"), str(drop / "labels.csv"))
+    assert config == drop / "flight.yaml"
+    assert run_name(drop) == "Main-St"
+
+
+@pytest.mark.parametrize("name", ["../secret.png", "/etc/hostname", "link.png", "none.png"])
+def test_base_images_are_taken_from_their_folder_alone(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "base-images"
+    folder.mkdir()
+    (tmp_path / "secret.png").touch()
+    (folder / "link.png").symlink_to(tmp_path / "secret.png")
+    with pytest.raises(InputError, match="base-images"):
+        picture_named(folder, name)
+
+
+def test_runs_are_taken_from_their_folder_alone(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/flight.json").touch()
+    (tmp_path / "runs").mkdir()
+    with pytest.raises(InputError, match="is not in"):
+        run_folders(tmp_path / "runs", "../run")
+    assert run_folders(tmp_path / "runs") == []
+    assert newest_picture(tmp_path / "runs") is None
+
+
+# -------------------------------------------------------------------------------------------------- prefect.yaml
+
+
+def test_prefect_yaml_has_the_same_deployments(server: None, tmp_path: Path) -> None:
+    told = {found["name"]: found for found in yaml.safe_load((ROOT / "prefect.yaml").read_text())["deployments"]}
+    ours = {found.name: found for found in deployments(ServeConfig(tmp_path))}
+    assert set(told) == set(ours)
+    for name, deployment in ours.items():
+        written = told[name]
+        path, _, function = written["entrypoint"].partition(":")
+        assert deployment.entrypoint == f"{path.removesuffix('.py').replace('/', '.')}.{function}"
+        assert set(written["parameters"]) == set(deployment.parameters)
+        assert written["description"] == deployment.description
+        crons = [schedule.schedule.cron for schedule in deployment.schedules or []]
+        assert [schedule["cron"] for schedule in written.get("schedules", [])] == crons
+        events = [set(trigger.expect) for trigger in deployment.triggers]
+        assert [set(trigger["expect"]) for trigger in written.get("triggers", [])] == events
+        for trigger, here in zip(written.get("triggers", []), deployment.triggers, strict=True):
+            assert set(trigger["parameters"]) == set(here.parameters or {})
+
+
+# -------------------------------------------------------------------------------------------------- end to end
+
+
+@dataclass
+class Served:
+    """A `velfield serve` of our own."""
+
+    process: subprocess.Popen[str]
+    folder: Path
+    url: str
+
+    def ask(self, path: str, body: object = None) -> Any:
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(f"{self.url}/api{path}", data=data)
+        request.add_header("Content-Type", "application/json")
+        with urllib.request.urlopen(request, timeout=30) as answer:
+            text = answer.read()
+        return json.loads(text) if text else None
+
+    def states(self) -> dict[str, str]:
+        """Deployed flow runs that have begun, by name."""
+        runs = self.ask("/flow_runs/filter", {"sort": "START_TIME_DESC"})
+        begun = [run for run in runs if run["deployment_id"] and run["state"]["type"] != "SCHEDULED"]
+        return {run["name"]: run["state"]["type"] for run in begun}
+
+
+@pytest.fixture(scope="module")
+def served(whole: tuple[Path, RunSummary], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A served folder with one run in it, from a working folder with a decoy."""
+    tmp_path = tmp_path_factory.mktemp("serve")
+    folder, port = tmp_path / "served", free_port()
+    shutil.copytree(whole[0], folder / "runs" / "main-street")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere/flows.py").write_text("raise RuntimeError('a decoy was imported')")
+    ours = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
+    environment = {**ours, "PREFECT_HOME": str(tmp_path / "home"), "PYTHONPATH": str(ROOT), "PYTHONSAFEPATH": "1"}
+    command = [sys.executable, "-m", "flows.cli", "serve", str(folder), "--port", str(port), "--settle-s", "1"]
+    process = subprocess.Popen(
+        command, env=environment, cwd=tmp_path / "elsewhere", stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline().strip() == f"Prefect UI  http://127.0.0.1:{port}"
+        yield Served(process, folder, f"http://127.0.0.1:{port}")
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(60)
+            process.kill()
+        process.stdout.close()
+
+
+def wait_for(what: Callable[[], bool], seconds: float = 180) -> None:
+    deadline = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.5)
+
+
+def sockets_of(process: psutil.Process) -> set[str]:
+    return {found.laddr.ip for found in process.net_connections(kind="tcp") if found.status == psutil.CONN_LISTEN}
+
+
+def test_from_the_event_to_the_finished_reprocess(served: Served, flight: Path) -> None:
+    picture = cv2.imread(str(flight / "base.png"), cv2.IMREAD_GRAYSCALE)
+    # Hidden names are not watched, so that only the event tells of it.
+    cv2.imwrite(str(served.folder / "base-images/.spring.png"), cv2.GaussianBlur(picture, (0, 0), 0.8))
+    wait_for(lambda: len(served.ask("/deployments/filter", {})) == 3)
+    event = {
+        "occurred": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "event": "velfield.base-image.arrived",
+        "resource": {"prefect.resource.id": "velfield.base-image.spring"},
+        "payload": {"base": ".spring.png", "run": "main-street"},
+        "id": "11111111-1111-4111-8111-111111111111",
+    }
+    served.ask("/events", [event])
+    wait_for(lambda: "COMPLETED" in served.states().values() or "FAILED" in served.states().values())
+    assert served.states() == {".spring.png": "COMPLETED"}
+    results = json.loads((served.folder / "runs/main-street/results.json").read_text())["results"]
+    assert [(result["name"], result["how"]) for result in results] == [("first", "run"), ("spring", "mapped")]
+    (link,) = served.ask("/artifacts/filter", {"artifacts": {"key": {"any_": ["report"]}}})
+    address = re.fullmatch(r"\[report\]\((http://127\.0\.0\.1:\d+/main-street/\S+)\)", link["data"])
+    assert address is not None, link["data"]
+    with urllib.request.urlopen(address[1], timeout=30) as answer:
+        assert b"<title>" in answer.read()
+
+
+_BLINKS = """if True:
+    import sys
+    from flows.launch import limit_threads, prepare_process
+    limit_threads()
+    prepare_process(verbose=False)
+    from pathlib import Path
+    from tests.small_flight import job, process
+    from velfield.pipeline.stages import tracklets as tracking
+    true, calls = tracking.link_unit, []
+
+    def blinks(plan, frames):
+        calls.append(frames)
+        if len(calls) == 1:
+            raise OSError("the disk blinked")
+        return true(plan, frames)
+
+    tracking.link_unit = blinks
+    process(job(Path(sys.argv[1]), Path(sys.argv[2])))
+"""
+
+
+def test_the_ui_shows_graph_retry_and_artifacts(
+    served: Served, whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
+) -> None:
+    """In a real browser: the graph drawn, a task that was tried twice shown so, the summary with its maps."""
+    root = tmp_path / "blinks"
+    shutil.copytree(whole[0], root)
+    (root / "commits/links/000008-000015.json").unlink()
+    environment = {**os.environ, "PREFECT_API_URL": f"{served.url}/api", "PYTHONPATH": str(ROOT)}
+    subprocess.run([sys.executable, "-c", _BLINKS, str(flight), str(root)], env=environment, check=True)
+    (run,) = served.ask("/flow_runs/filter", {"flow_runs": {"name": {"any_": [str(root)]}}})
+    tasks = served.ask("/task_runs/filter", {"flow_runs": {"id": {"any_": [run["id"]]}}})
+    (twice,) = [task for task in tasks if task["run_count"] > 1]
+    assert twice["name"] == "links 000008-000015"
+    with browser(tmp_path / "profile") as found, found.page() as page:
+        page.open(f"{served.url}/runs/flow-run/{run['id']}")
+        page.wait("document.body.innerText.includes('Completed')")
+        page.wait("document.querySelector('canvas')?.clientHeight > 100")
+        assert f"{len(tasks)} Task runs" in page.value("document.body.innerText")
+        page.open(f"{served.url}/runs/task-run/{twice['id']}")
+        page.wait("document.body.innerText.includes('the disk blinked')")
+        page.wait("/Run Count\\s+2/.test(document.body.innerText)")
+        assert "Retry 1/1 will start" in page.value("document.body.innerText")
+        (summary,) = served.ask(
+            "/artifacts/filter",
+            {"flow_runs": {"id": {"any_": [run["id"]]}}, "artifacts": {"key": {"any_": ["summary"]}}},
+        )
+        page.open(f"{served.url}/artifacts/artifact/{summary['id']}")
+        page.wait("document.querySelectorAll('img[src^=data]').length == 2")
+        page.wait("[...document.querySelectorAll('img')].every(img => img.naturalWidth > 100)")
+        asked = {request for request in page.requests if request.startswith("http")}
+        assert [request for request in asked if not request.startswith(served.url)] == []
+
+
+def test_sockets_and_origins_and_that_ctrl_c_leaves_nothing(served: Served) -> None:
+    """Last of all."""
+    serving = psutil.Process(served.process.pid)
+    family = [serving, *serving.children(recursive=True)]
+    assert set().union(*(sockets_of(process) for process in family)) <= {"127.0.0.1"}
+    request = urllib.request.Request(f"{served.url}/api/health", headers={"Origin": "http://evil.example"})
+    with urllib.request.urlopen(request, timeout=30) as answer:
+        assert answer.headers["access-control-allow-origin"] not in ("*", "http://evil.example")
+
+    served.process.send_signal(signal.SIGINT)
+    assert served.process.wait(60) == 0
+    psutil.wait_procs(family, timeout=5)
+    assert [process for process in family if process.is_running() and process.status() != psutil.STATUS_ZOMBIE] == []
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(f"{served.url}/api/health", timeout=5)

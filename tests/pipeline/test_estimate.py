@@ -1,0 +1,124 @@
+"""Scale: what is planned for four hours, and that a driver's memory does not grow with the flight."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from schemas.job import Inputs, Job
+from schemas.records import InputsRecord, SourceRecord
+from tests.small_flight import job
+from velfield.errors import InputError
+from velfield.pipeline.check_inputs import check_given
+from velfield.pipeline.configuration import resolve_config
+from velfield.pipeline.estimate import describe_plan, planned_units
+from velfield.pipeline.plan import Plan, changed_since, make_plan, stage_keys, write_flight_record
+from velfield.sources.frames import SourceInfo
+
+FOUR_HOURS = 72_000
+
+
+def planned(frames: int, root: Path, width: int = 2560, height: int = 1920, unit_frames: int | str = "auto") -> Plan:
+    """The plan of a flight at 5 frames a second that need not exist."""
+    source = SourceRecord(path="flight.mp4", kind="video", digest="d", width=width, height=height, frame_count=frames)
+    inputs, config = InputsRecord(source=source), resolve_config(overrides={"work.unit_frames": unit_frames})
+    info = SourceInfo("video", width, height, frames, np.arange(frames) / 5, ())
+    job = Job(root=str(root), inputs=Inputs(source="flight.mp4"), config=config)
+    return Plan(job, info, np.arange(frames), inputs, stage_keys(config, inputs))
+
+
+def test_four_hours_are_fewer_than_3000_task_runs(tmp_path: Path) -> None:
+    plan = planned(FOUR_HOURS, tmp_path)
+    total = sum(len(units) for units in planned_units(plan).values())
+    assert total < 3000
+    told = describe_plan(plan)
+    assert f"{total} task runs" in told
+    assert "memory" in told
+    assert "GB needed" in told
+
+
+def test_task_runs_grow_with_chunks_not_with_frames(tmp_path: Path) -> None:
+    runs = {frames: len(planned(frames, tmp_path).units) for frames in (18, 300, 3000, 30_000, FOUR_HOURS)}
+    assert max(runs.values()) < 300
+    assert runs[300] >= 4  # and yet several workers have something to do
+
+
+def test_what_is_given_otherwise_than_before_is_known(flight: Path, tmp_path: Path) -> None:
+    first = make_plan(job(flight, tmp_path / "run"))
+    assert changed_since(first) == []
+    write_flight_record(first)
+    assert changed_since(make_plan(job(flight, tmp_path / "run"))) == []
+    given = job(flight, tmp_path / "run", "tracking.max_interval_s=0.6")
+    given = given.model_copy(update={"inputs": given.inputs.model_copy(update={"base": None})})
+    assert changed_since(make_plan(given)) == ["base", "settings"]
+    first.layout.flight.write_text('{"format_version": 999}')
+    assert changed_since(first) == []
+
+
+@pytest.mark.parametrize("text", ["nonsense", "6-0", "0-3,2-5"])
+def test_slices_that_cannot_be_are_told_before_any_work(flight: Path, tmp_path: Path, text: str) -> None:
+    with pytest.raises(InputError, match="slice"):
+        make_plan(job(flight, tmp_path, f"field.slice={text}"))
+
+
+@pytest.mark.parametrize("option", ["base", "labels", "detector", "detections"])
+def test_what_is_not_what_it_was_given_as_is_told_before_any_work(flight: Path, tmp_path: Path, option: str) -> None:
+    (tmp_path / "hello.txt").write_text("hello\n")
+    given = job(flight, tmp_path / "run")
+    given = given.model_copy(update={"inputs": given.inputs.model_copy(update={option: str(tmp_path / "hello.txt")})})
+    with pytest.raises(InputError, match=f"^--{option}: .*hello.txt") as caught:
+        check_given(make_plan(given))
+    assert "b'" not in str(caught.value)
+
+
+def test_frames_too_far_apart_to_follow_a_car_are_told(flight: Path, tmp_path: Path) -> None:
+    assert make_plan(job(flight, tmp_path)).info.warnings == ()
+    (warning,) = make_plan(job(flight, tmp_path, "frames.every=4")).info.warnings
+    assert "--set tracking.max_interval_s=1.3" in warning
+    assert make_plan(job(flight, tmp_path, "frames.every=4", "tracking.max_interval_s=1.3")).info.warnings == ()
+
+
+def test_a_plan_is_small(tmp_path: Path) -> None:
+    """It goes with every node of every graph."""
+    import pickle
+
+    assert len(pickle.dumps(planned(FOUR_HOURS, tmp_path))) < 3_000_000
+    small = len(pickle.dumps(planned(300, tmp_path)))
+    assert small < 20_000
+
+
+@pytest.mark.parametrize("frames", [300, FOUR_HOURS])
+def test_the_estimate_of_bytes_is_of_the_order_of_what_was_measured(tmp_path: Path, frames: int) -> None:
+    """354 GB are four hours of raw frames of that size; Zstandard leaves 0.6 to 0.8 of them."""
+    from velfield.pipeline.estimate import estimated_bytes
+
+    raw = frames * 2560 * 1920
+    assert 0.6 * raw < estimated_bytes(planned(frames, tmp_path)) < 1.1 * raw
+
+
+def test_a_disk_that_is_too_small_is_told_before_anything_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from velfield.errors import InputError
+    from velfield.pipeline import estimate as planning
+
+    monkeypatch.setattr(planning, "_free_bytes", lambda root: 300_000_000_000)
+    planning.check_space(planned(FOUR_HOURS, tmp_path))
+    monkeypatch.setattr(planning, "_free_bytes", lambda root: 100_000_000_000)
+    with pytest.raises(InputError, match=r"about 29\d.\d\d GB needed, 100.00 GB free"):
+        planning.check_space(planned(FOUR_HOURS, tmp_path))
+
+
+def test_memory_does_not_grow_with_the_flight(tmp_path: Path) -> None:
+    from velfield.pipeline.estimate import estimated_memory
+
+    assert estimated_memory(planned(300, tmp_path), 4) == estimated_memory(planned(FOUR_HOURS, tmp_path), 4)
+
+
+def test_no_stage_function_is_imported_by_planning() -> None:
+    code = (
+        "import sys, velfield.pipeline.plan; sys.exit(any(name in sys.modules for name in ('prefect', 'dask', 'zarr')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

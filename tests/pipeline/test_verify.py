@@ -1,0 +1,121 @@
+"""Damage: every flipped bit and every missing chunk is named, and only the units it is in are done again."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flows.commands.verify import verify
+from schemas.summary import RunSummary
+from tests.small_flight import digests
+from velfield import open_run
+from velfield.pipeline.verify import forget, verify_run
+from velfield.run.commits import commit_path, read_commits
+from velfield.run.layout import STAGES, RunLayout
+from velfield.run.stores import StoreError
+
+FLIPS = 200
+
+
+@pytest.fixture
+def copy(whole: tuple[Path, RunSummary], tmp_path: Path) -> Path:
+    """A run that may be damaged."""
+    shutil.copytree(whole[0], tmp_path / "run")
+    return tmp_path / "run"
+
+
+def flip_a_bit(path: Path, rng: np.random.Generator) -> None:
+    data = bytearray(path.read_bytes())
+    data[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
+    path.write_bytes(bytes(data))
+
+
+def committed_files(root: Path) -> list[str]:
+    layout = RunLayout(root)
+    return sorted({name for stage in STAGES for record in read_commits(layout, stage) for name in record.outputs})
+
+
+def found(root: Path) -> dict[str, str]:
+    run = open_run(root)
+    return {
+        damage.path or f"{damage.stage} {damage.unit}": damage.what for damage in verify_run(run.layout, run.record)
+    }
+
+
+def test_a_whole_run_is_whole(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert verify(copy) == 0
+    assert capsys.readouterr().out.strip() == f"{copy}: whole"
+
+
+def test_every_file_of_the_stores_and_tables_is_in_a_record(copy: Path) -> None:
+    on_disk = {
+        path.relative_to(copy).as_posix()
+        for folder in ("frames.zarr", "registration.zarr", "field.zarr", "base", "detections", "links", "tracklets")
+        for path in (copy / folder).rglob("*")
+        if path.is_file()
+    }
+    assert on_disk - set(committed_files(copy)) == set()
+
+
+def test_every_one_of_200_flipped_bits_is_found(copy: Path) -> None:
+    rng = np.random.default_rng(0)
+    files = committed_files(copy)
+    hit = {files[k] for k in rng.choice(len(files), min(FLIPS, len(files)), replace=False)}
+    for name in sorted(hit):
+        flip_a_bit(copy / name, rng)
+    assert found(copy) == dict.fromkeys(hit, "damaged")
+
+
+def test_what_is_gone_or_was_never_done_is_told(copy: Path) -> None:
+    (copy / "frames.zarr/raw/c/5/0/0").unlink()
+    commit_path(RunLayout(copy), "links", "000008-000015").unlink()
+    assert found(copy) == {"frames.zarr/raw/c/5/0/0": "gone", "links 000008-000015": "not finished"}
+
+
+def test_a_run_that_never_came_to_its_end_is_not_called_damaged(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for record in (copy / "commits" / "maps").glob("*.json"):
+        record.unlink()
+    assert verify(copy) == 3
+    said = capsys.readouterr().out
+    assert "what is there is whole; 1 units were never finished" in said
+    assert "--repair" not in said
+    assert f"velfield run ... --out {copy}" in said
+
+
+def test_reading_a_damaged_chunk_raises_and_names_it(copy: Path) -> None:
+    path = copy / "frames.zarr/raw/c/5/0/0"
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(StoreError, match="frame 5 is damaged"):
+        open_run(copy).frames.read(5)
+    status = copy / "registration.zarr/status/c/1/0"
+    status.write_bytes(status.read_bytes()[:-2])
+    with pytest.raises(StoreError, match="status"):
+        open_run(copy).registration.statuses()
+
+
+def test_only_the_damaged_units_are_done_again_and_come_out_the_same(
+    copy: Path, whole: tuple[Path, RunSummary], capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path: path.stat().st_mtime_ns for path in (copy / "commits").rglob("*.json")}
+    rng = np.random.default_rng(1)
+    for name in ("frames.zarr/raw/c/3/0/0", "registration.zarr/vector/c/1/0", "tracklets/unit-00000.parquet"):
+        flip_a_bit(copy / name, rng)
+    (copy / "frames.zarr/raw/c/17/0/0").unlink()
+    assert verify(copy) == 3
+    assert verify(copy, repair=True) == 0
+    assert capsys.readouterr().out.strip().endswith(f"{copy}: whole")
+    assert digests(copy) == digests(whole[0])
+    again = {
+        path.relative_to(copy / "commits").as_posix() for path in before if path.stat().st_mtime_ns != before[path]
+    }
+    units = ("frames/000000-000007", "frames/000016-000017", "registration/000008-000015", "tracklets/all")
+    assert again == {f"{unit}.json" for unit in units}
+
+
+def test_a_store_whose_description_is_damaged_is_made_again(copy: Path) -> None:
+    (copy / "registration.zarr/zarr.json").write_text("{")
+    run = open_run(copy)
+    taken_back = forget(run.layout, verify_run(run.layout, run.record))
+    assert taken_back == [f"registration {unit}" for unit in ("000000-000007", "000008-000015", "000016-000017")]
+    assert not (copy / "registration.zarr").exists()

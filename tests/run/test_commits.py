@@ -1,0 +1,112 @@
+"""Content keys, commit records and the lock."""
+
+import multiprocessing
+import os
+from pathlib import Path
+
+import pytest
+
+from schemas.flight import FlightConfig, TrackingConfig
+from schemas.records import CommitRecord, InputsRecord, SourceRecord
+from velfield.errors import InputError
+from velfield.pipeline.configuration import resolve_config
+from velfield.pipeline.plan import stage_keys
+from velfield.run.commits import content_key, digest_file, finished, sweep_partial, write_atomically, write_commit
+from velfield.run.layout import STAGES, RunLayout
+from velfield.run.lock import locked
+
+INPUTS = InputsRecord(source=SourceRecord(path="a", kind="video", digest="d", width=10, height=10, frame_count=3))
+
+
+def first_changed(a: dict[str, str], b: dict[str, str]) -> str | None:
+    """The first stage whose key differs; asserts that every later one that reads it differs too."""
+    changed = [stage for stage in STAGES if a[stage] != b[stage]]
+    return changed[0] if changed else None
+
+
+@pytest.mark.parametrize(
+    ("setting", "stage"),
+    [
+        ("frames.every=3", "frames"),
+        ("lens.angle_bins=360", "lens"),
+        ("base.median_frames=32", "base"),
+        ("registration.window_px=60", "base"),  # the own base image is made by registration
+        ("detection.rounds=100", "detector"),
+        ("tracking.max_turn_rad=0.4", "links"),
+        ("field.bin_width_m_per_s=1", "field"),
+        ("work.retries=5", None),
+    ],
+)
+def test_a_changed_parameter_redoes_what_reads_it_and_what_follows(setting: str, stage: str | None) -> None:
+    keys = stage_keys(resolve_config(), INPUTS)
+    changed = stage_keys(resolve_config(settings=[setting]), INPUTS)
+    assert first_changed(keys, changed) == stage
+    if stage:
+        later = STAGES[STAGES.index(stage) :]
+        assert [s for s in later if keys[s] == changed[s]] == []
+
+
+def test_other_labels_redo_the_detector_and_not_the_registration() -> None:
+    keys = stage_keys(FlightConfig(), INPUTS)
+    changed = stage_keys(FlightConfig(), INPUTS.model_copy(update={"labels": "other"}))
+    assert first_changed(keys, changed) == "detector"
+
+
+def test_keys_do_not_depend_on_the_order_of_fields() -> None:
+    one = content_key("s", 1, parameters=[{"a": 1, "b": 2}])
+    assert one == content_key("s", 1, parameters=[{"b": 2, "a": 1}])
+    assert one != content_key("s", 1, parameters=[TrackingConfig()])
+
+
+def test_a_unit_is_finished_under_its_own_key_and_with_its_outputs(tmp_path: Path) -> None:
+    layout = RunLayout(tmp_path)
+    (tmp_path / "out.bin").write_bytes(b"x")
+    write_commit(layout, CommitRecord(stage="lens", unit="all", key="k", outputs={"out.bin": ""}, code_version="1"))
+    assert finished(layout, "lens", "all", "k")
+    assert finished(layout, "lens", "all", "another") is None
+    assert finished(layout, "lens", "other", "k") is None
+    (tmp_path / "out.bin").unlink()
+    assert finished(layout, "lens", "all", "k") is None
+
+
+def test_a_file_of_any_size_has_a_digest_of_its_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "video"
+    monkeypatch.setattr("velfield.run.commits._WHOLE_FILE_BYTES", 1000)
+    monkeypatch.setattr("velfield.run.commits._SAMPLE_BYTES", 16)
+    file.write_bytes(bytes(4096))
+    digest = digest_file(file)
+    file.write_bytes(bytes(4095) + b"x")
+    assert digest_file(file) != digest
+    file.write_bytes(bytes(4097))
+    assert digest_file(file) != digest
+
+
+def test_partial_files_are_swept(tmp_path: Path) -> None:
+    write_atomically(tmp_path / "a" / "whole", b"1")
+    (tmp_path / "a" / "torn.77.partial").write_bytes(b"1")
+    assert sweep_partial(tmp_path) == 1
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["whole"]
+
+
+def _try_lock(root: str, answer: "multiprocessing.Queue[str]") -> None:
+    try:
+        with locked(RunLayout(Path(root))):
+            answer.put("got it")
+    except InputError as error:
+        answer.put(str(error))
+
+
+def _told(root: Path) -> str:
+    context = multiprocessing.get_context("spawn")
+    answer: multiprocessing.Queue[str] = context.Queue()
+    process = context.Process(target=_try_lock, args=(str(root), answer))
+    process.start()
+    told = answer.get(timeout=60)
+    process.join()
+    return told
+
+
+def test_two_runs_on_one_folder(tmp_path: Path) -> None:
+    with locked(RunLayout(tmp_path)):
+        assert f"locked by pid {os.getpid()} on" in _told(tmp_path)
+    assert _told(tmp_path) == "got it"

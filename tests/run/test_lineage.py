@@ -1,0 +1,76 @@
+"""Lineage: what is told to stand behind a pixel is exactly what the field counts there."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flows.commands.lineage import lineage
+from schemas.summary import RunSummary
+from velfield import open_run
+from velfield.errors import InputError
+from velfield.run.commits import digest_file
+from velfield.run.layout import STAGES
+from velfield.run.lineage import pixel_lineage, stage_lineage
+
+
+@pytest.fixture
+def pixel(whole: tuple[Path, RunSummary]) -> tuple[int, int]:
+    """The busiest pixel, (x, y)."""
+    count = open_run(whole[0]).field.count()
+    y, x = np.unravel_index(count.argmax(), count.shape)
+    return int(x), int(y)
+
+
+def test_as_many_vehicles_as_the_field_counts(whole: tuple[Path, RunSummary]) -> None:
+    run = open_run(whole[0])
+    count = run.field.count()
+    rng = np.random.default_rng(0)
+    ys, xs = np.nonzero(count)
+    known = rng.integers(0, len(ys), 12)
+    places = [
+        *zip(xs[known], ys[known], strict=True),
+        *zip(rng.integers(0, 640, 6), rng.integers(0, 480, 6), strict=True),
+    ]
+    told = [len(pixel_lineage(run, int(x), int(y)).passages) for x, y in places]
+    assert told == [int(count[y, x]) for x, y in places]
+
+
+def test_the_frames_are_those_of_the_tracklets_with_their_true_times(
+    whole: tuple[Path, RunSummary], pixel: tuple[int, int]
+) -> None:
+    run = open_run(whole[0])
+    found = pixel_lineage(run, *pixel)
+    tracklets = run.tracklets().set_index("tracklet_id")
+    ids = [tracklet for passage in found.passages for tracklet in passage.tracklets]
+    frames = np.unique(tracklets.loc[ids, ["frame_0", "frame_1", "frame_2"]].to_numpy())
+    assert [frame.frame for frame in found.frames] == frames.tolist()
+    assert [frame.time_s for frame in found.frames] == run.times_s[frames].tolist()
+    assert all(0 < frame.heldout_px < 2 for frame in found.frames)
+
+
+def test_the_chain_of_stages(whole: tuple[Path, RunSummary]) -> None:
+    run = open_run(whole[0])
+    stages = stage_lineage(run)
+    assert [stage.name for stage in stages] == list(STAGES)
+    assert {stage.name: stage.key for stage in stages} == run.record.keys
+
+
+def test_the_command_tells_it_offline(
+    whole: tuple[Path, RunSummary], pixel: tuple[int, int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, (x, y) = whole[0], pixel
+    assert lineage(root) == lineage(root, str(x), y) == lineage(root, f"{x},{y}") == 0
+    told = capsys.readouterr().out
+    assert digest_file(root / "detector.json") in told
+    assert digest_file(root / "base/base_image.png") in told
+    assert "marked cars" in told
+    lineage(root, pixel=f"{x},{y}", as_json=True)
+    assert json.loads(capsys.readouterr().out)["x"] == x
+
+
+@pytest.mark.parametrize("wrong", ["7", "7,a", "-1,5", "9999,5"])
+def test_a_pixel_that_is_none_is_refused(whole: tuple[Path, RunSummary], wrong: str) -> None:
+    with pytest.raises(InputError, match=r"pixel"):
+        lineage(whole[0], pixel=wrong)

@@ -1,0 +1,139 @@
+"""The stores: what is written is read, and what is damaged says so."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from velfield.errors import InputError
+from velfield.run.stores import (
+    HISTOGRAM,
+    FrameStore,
+    StoreError,
+    create_field,
+    create_frames,
+    create_registration,
+    open_field,
+    open_frames,
+    open_registration,
+    store_key,
+)
+
+
+def frame_store(path: Path, frames: np.ndarray) -> FrameStore:
+    count, height, width = frames.shape
+    create_frames(path, key="k", count=count, height=height, width=width, unit_frames=2, source={})
+    store = open_frames(path, "r+")
+    for k, frame in enumerate(frames):
+        store.write(k, frame)
+    return store
+
+
+def noise(seed: int, *shape: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
+
+
+def test_frames_come_back(tmp_path: Path) -> None:
+    frames = noise(1, 5, 24, 32)
+    store = frame_store(tmp_path / "f.zarr", frames)
+    store.write_columns(2, {"time_s": np.array([1.5, 1.75]), "flags": np.array([4, 1], np.uint16)})
+    store = open_frames(tmp_path / "f.zarr")
+    assert store.count == 5
+    assert store.shape == (24, 32)
+    assert all(np.array_equal(store.read(k), frames[k]) for k in range(5))
+    np.testing.assert_array_equal(store.column("time_s"), [np.nan, np.nan, 1.5, 1.75, np.nan])
+    np.testing.assert_array_equal(store.column("flags"), [2, 2, 4, 1, 2])
+
+
+@pytest.mark.parametrize("bit", range(0, 4000, 97))
+def test_a_flipped_bit_is_never_read_as_a_picture(tmp_path: Path, bit: int) -> None:
+    frames = noise(2, 1, 24, 32)
+    store = frame_store(tmp_path / "f.zarr", frames)
+    chunk = store.path / "raw" / "c" / "0" / "0" / "0"
+    data = bytearray(chunk.read_bytes())
+    data[(bit // 8) % len(data)] ^= 1 << (bit % 8)
+    chunk.write_bytes(data)
+    with pytest.raises(StoreError, match="frame 0 is damaged"):
+        store.read(0)
+
+
+def test_a_chunk_that_is_gone_is_not_read_as_black(tmp_path: Path) -> None:
+    store = frame_store(tmp_path / "f.zarr", noise(3, 2, 24, 32))
+    (store.path / "raw" / "c" / "1" / "0" / "0").unlink()
+    with pytest.raises(StoreError, match="frame 1 is gone"):
+        store.read(1)
+
+
+def test_a_store_that_is_not_there_says_what_to_run(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="run `velfield run`"):
+        open_frames(tmp_path / "none.zarr")
+    assert store_key(tmp_path / "none.zarr") is None
+
+
+def test_registration_comes_back(tmp_path: Path) -> None:
+    path = tmp_path / "r.zarr"
+    create_registration(path, key="k", count=5, vector_length=3, unit_frames=2)
+    statuses = ["ok", "failed:12 control points, 40 needed"]
+    columns = {"heldout_px": np.array([0.25, np.nan], np.float32), "count_kept": np.array([900, 12], np.int32)}
+    open_registration(path, "r+").write(2, np.arange(6.0).reshape(2, 3), statuses, columns)
+    store = open_registration(path)
+    assert store.statuses() == ["", "", *statuses, ""]
+    np.testing.assert_array_equal(store.vector(3), [3, 4, 5])
+    assert np.isnan(store.vector(0)).all()
+    np.testing.assert_array_equal(store.column("count_kept"), [0, 0, 900, 12, 0])
+
+
+def test_the_field_opens_with_xarray_labelled(tmp_path: Path) -> None:
+    path = tmp_path / "field.zarr"
+    centres = np.array([-10.0, 0, 10])
+    create_field(
+        path,
+        key="k",
+        height=20,
+        width=30,
+        tile=8,
+        group_tiles=2,
+        velocities_px_per_s=centres,
+        attributes={"gsd_m": 0.5, "crs_wkt": "LOCAL_CS[]"},
+        layers={"count": {"dtype": "int32", "units": "1"}, "modal_vx": {"units": "px s-1"}},
+    )
+    tile = np.arange(4 * 6 * 9, dtype=np.int32).reshape(4, 6, 3, 3)
+    store = open_field(path, "r+")
+    store.write_tile(2, 3, tile)
+    np.testing.assert_array_equal(store.read_tile(2, 3), tile)
+    assert store.has_tile(2, 3)
+    assert not store.has_tile(0, 0)
+    with xr.open_zarr(path, consolidated=False) as field:
+        assert field[HISTOGRAM].dims == ("y", "x", "vy", "vx")
+        assert field[HISTOGRAM].attrs["grid_mapping"] == "crs"
+        np.testing.assert_array_equal(field["vx"], centres)
+        assert field["vx"].attrs["units"] == "px s-1"
+        np.testing.assert_array_equal(field["vx_m_per_s"], centres / 2)
+        assert field[HISTOGRAM].sel(y=17, x=25, vy=0, vx=10) == tile[1, 1, 1, 2]
+        assert int(field["count"].sum()) == 0
+
+
+def test_untouched_tiles_take_no_space(tmp_path: Path) -> None:
+    path = tmp_path / "field.zarr"
+    create_field(
+        path,
+        key="k",
+        height=2048,
+        width=2048,
+        tile=64,
+        group_tiles=8,
+        velocities_px_per_s=np.arange(37.0),
+        attributes={},
+        layers={},
+    )
+    assert sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) < 100_000
+
+
+def test_a_column_that_never_was_is_not_called_damaged(tmp_path: Path) -> None:
+    frames = frame_store(tmp_path / "f.zarr", noise(1, 2, 24, 32))
+    with pytest.raises(InputError, match="found no column 'bogus'; it has time_s, source_index"):
+        frames.column("bogus")
+    create_registration(tmp_path / "r.zarr", key="k", count=2, vector_length=3, unit_frames=2)
+    with pytest.raises(InputError, match=r"found no column 'bogus'; it has .*heldout_px"):
+        open_registration(tmp_path / "r.zarr").column("bogus")

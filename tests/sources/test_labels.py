@@ -1,0 +1,171 @@
+"""Labels and other people's detections: what people wrote comes out in raw pixels; what is not labels is refused."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from schemas.tables import LABEL_COLUMNS
+from velfield.errors import InputError
+from velfield.sources.frames import SourceInfo
+from velfield.sources.labels.detections import RAW_DETECTION_COLUMNS, read_detections
+from velfield.sources.labels.labels import load_labels, read_labels
+from velfield.sources.labels.yolo import length_from_upright_box
+
+FOLDER = SourceInfo("folder", 200, 100, 3, np.arange(3) / 5, ("a.png", "b.png", "c.png"))
+VIDEO = SourceInfo("video", 200, 100, 50, np.arange(50) / 25, tuple(str(index) for index in range(50)))
+
+
+def write(path, text):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def assert_refused(path, match, info=FOLDER, read=read_labels):
+    with pytest.raises(InputError, match=match) as caught:
+        read(path, info)
+    assert "\n" not in str(caught.value)
+    assert ";" in str(caught.value)
+
+
+def test_a_csv_of_all_columns_is_read_in_raw_pixels(tmp_path):
+    path = write(
+        tmp_path / "l.csv",
+        "frame,x_px,y_px,orientation_rad,length_px,width_px\na.png,10.5,20,0.5,16,7\na.png,30,40,-0.5,,\nb.png,,,,,\n",
+    )
+    labels = load_labels(path, FOLDER)
+    assert labels.cars.dtypes.astype(str).to_dict() == LABEL_COLUMNS
+    assert labels.cars["x_px"].tolist() == [10.5, 30.0]
+    assert labels.cars["orientation_rad"].tolist() == pytest.approx([0.5, math.pi - 0.5])
+    assert labels.cars["length_px"].isna().tolist() == [False, True]
+    assert labels.frames == ("a.png", "b.png")
+
+
+def test_a_video_is_labelled_by_frame_index_before_every(tmp_path):
+    path = write(tmp_path / "l.csv", "\ufeffframe,x_px,y_px\n17,10,20\n3,1,2\n")
+    labels = load_labels(path, VIDEO)
+    assert labels.cars["frame"].tolist() == ["17", "3"]
+    assert labels.frames == ("3", "17")
+
+
+def test_a_yolo_folder_is_read_by_stem_and_other_classes_are_left_alone(tmp_path):
+    write(tmp_path / "y" / "a.txt", "0 0.5 0.5 0.1 0.05\n2 0.25 0.5 0.2 0.2\n")
+    write(tmp_path / "y" / "b.txt", "")
+    write(tmp_path / "y" / "elsewhere.txt", "0 0.5 0.5 0.1 0.1\n")
+    labels = load_labels(tmp_path / "y", FOLDER)
+    assert labels.frames == ("a.png", "b.png")
+    assert (len(labels.cars), len(labels.ignored)) == (1, 1)
+    assert labels.cars.loc[0, ["x_px", "y_px"]].tolist() == [99.5, 49.5]
+    assert labels.notes == ("1 label files name no frame of this source and are not used",)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("y/classes.txt", "bus\nCar\nfreight-truck\n"),
+        ("y/data.yaml", "names: [bus, car, truck]\n"),
+        ("data.yaml", "names: {0: bus, 1: vehicle-small}\n"),
+    ],
+)
+def test_class_names_say_which_are_cars(tmp_path, name, content):
+    write(tmp_path / name, content)
+    write(tmp_path / "y" / "a.txt", "0 0.5 0.5 0.1 0.05\n1 0.25 0.5 0.1 0.05\n")
+    labels = load_labels(tmp_path / "y", FOLDER)
+    assert labels.cars["x_px"].tolist() == [49.5]
+    assert labels.ignored["x_px"].tolist() == [99.5]
+
+
+def test_oriented_yolo_boxes_tell_axis_length_and_width(tmp_path):
+    angle, centre = math.radians(30), np.array([100.0, 50.0])
+    along, across = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
+    corners = [centre + a * 8 * along + b * 3.5 * across for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    numbers = " ".join(f"{(x + 0.5) / 200} {(y + 0.5) / 100}" for x, y in corners)
+    path = write(tmp_path / "a.txt", f"0 {numbers}\n")
+    (car,) = read_labels(path, FOLDER).to_dict("records")
+    assert (car["x_px"], car["y_px"]) == pytest.approx((100, 50))
+    assert (car["orientation_rad"], car["length_px"], car["width_px"]) == pytest.approx((angle, 16, 7))
+
+
+@given(st.floats(0, math.pi), st.floats(4, 100))
+def test_length_of_a_usual_car_comes_out_of_its_upright_box_at_any_turn(angle, length):
+    width = 0.45 * length
+    w = length * abs(math.cos(angle)) + width * abs(math.sin(angle))
+    h = length * abs(math.sin(angle)) + width * abs(math.cos(angle))
+    assert length_from_upright_box(w, h) == pytest.approx(length, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "match"),
+    [
+        ("l.csv", "frame,x_px,y_px\na.png,500,20\n", "1 labels outside the picture .*200x100"),
+        ("l.csv", "frame,x_px,y_px\na.png,-1,20\n", "outside the picture"),
+        ("l.csv", "frame,x_px,y_px\nz.png,5,20\n", "line 2: found frame 'z.png', expected a picture's file name"),
+        ("l.csv", "frame,x_px,y_px\na.png,nan,20\n", "finite number"),
+        ("l.csv", "frame,x_px,y_px\na.png,5,\n", "one of x_px and y_px empty"),
+        ("l.csv", "frame,x_px,y_px\n", "found no cars"),
+        ("l.csv", "frame,x_px,y_px\na.png,,\n", "found no cars"),
+        ("l.csv", "frame,x_px,y_px,length_px\na.png,5,5,-2\n", "both > 0"),
+        ("l.csv", "filename,xmin,ymin,xmax,ymax,label\na.png,1,2,3,4,car\n", "expected labels as CSV `frame,x_px,y_px"),
+        ("l.csv", "frame,x_px,y_px,angle\na.png,5,5,3\n", "expected labels as CSV"),
+        ("l.json", '{"shapes": []}', "found JSON of another kind, expected COCO, LabelMe, VIA or GeoJSON"),
+        ("l.xml", "<annotation/>", "found XML"),
+        ("l.txt", "1,2,3,4\n", "a .txt that is not YOLO"),
+        ("a.txt", "0 0.5 0.5 0.1 0.1\n0 12 34 10 10\n", "shares of the picture"),
+        ("a.txt", "0 0.5 0.5 0.1 0.1\ncar 1 2\n", "line 2: found 'car 1 2', expected YOLO"),
+        ("q.txt", "0 0.5 0.5 0.1 0.1\n", "none named as a frame"),
+        ("y/z.txt", "0 0.5 0.5 0.1 0.1\n", "none named as a frame"),
+        ("y/readme.md", "", "no .txt files"),
+    ],
+)
+def test_what_is_no_label_of_these_frames_is_refused(tmp_path, name, content, match):
+    path = write(tmp_path / name, content)
+    assert_refused(path.parent if name.startswith("y/") else path, match)
+
+
+def test_addresses_and_nothing_there_are_refused(tmp_path):
+    assert_refused("http://example.org/labels.csv", "is refused")
+    assert_refused(tmp_path / "none.csv", "found no labels")
+
+
+def test_two_pictures_of_one_stem_cannot_have_yolo_labels(tmp_path):
+    info = SourceInfo("folder", 200, 100, 2, np.arange(2) / 5, ("a.jpg", "a.png"))
+    assert_refused(write(tmp_path / "a.txt", "0 0.5 0.5 0.1 0.1\n"), "of one stem", info)
+
+
+def test_detections_of_others_are_read_with_what_they_know(tmp_path):
+    path = write(tmp_path / "d.csv", "frame,x_px,y_px,score,track\nb.png,10,20,0.7,x\na.png,30,40,,y\n")
+    table = read_detections(path, FOLDER)
+    assert table.dtypes.astype(str).to_dict() == RAW_DETECTION_COLUMNS
+    assert table["source_index"].tolist() == [0, 1]
+    assert table["score"].tolist() == [1.0, 0.7]
+    yolo = write(tmp_path / "y" / "c.txt", "0 0.5 0.5 0.1 0.05 0.25\n").parent
+    assert read_detections(yolo, FOLDER)[["frame", "score"]].to_numpy().tolist() == [["c.png", 0.25]]
+
+
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [
+        ("frame,x_px,y_px\na.png,500,20\n", "1 detections outside the picture"),
+        ("frame,x_px,y_px\n", "found no detections"),
+        ("frame,x_px,y_px\nz.png,5,20\n", "found frame 'z.png'"),
+        ("frame,x_px,y_px\na.png,,20\n", "x_px or y_px empty"),
+        ("frame,x,y\na.png,1,20\n", "expected detections as CSV"),
+    ],
+)
+def test_bad_detections_are_refused(tmp_path, content, match):
+    assert_refused(write(tmp_path / "d.csv", content), match, read=read_detections)
+
+
+@pytest.mark.footage
+def test_kit_ais_labels_are_read_as_they_are(footage):
+    from schemas.flight import FramesConfig
+    from velfield.sources.source import probe
+
+    folder = footage("kit_ais") / "MOS155_street"
+    info = probe(folder, frames=FramesConfig(fps=2))
+    labels = load_labels(folder, info)
+    assert (len(labels.cars), len(labels.ignored), len(labels.frames)) == (1311, 27, 25)
+    assert 28 < labels.cars["length_px"].median() < 40  # its source says about 37 x 17 px

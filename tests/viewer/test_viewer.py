@@ -1,0 +1,376 @@
+"""The page of a run in a real browser, from a plain static server: what it shows is what Python says."""
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import pytest
+
+from schemas.summary import RunSummary
+from tests.browser import MIDDLE_OF_MAP, NEEDS_PAGE, Browser, Page, browser, served
+from velfield import open_run
+from velfield.analysis import coverage
+from velfield.report.figures import round_up, speed_reach
+from velfield.run.layout import RunLayout
+from velfield.run.run import Run
+from velfield.run.stores import open_field
+
+pytestmark = NEEDS_PAGE
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with browser(tmp_path_factory.mktemp("chromium")) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def address(whole: tuple[Path, RunSummary]) -> Iterator[str]:
+    """The run folder behind Python's plain static server."""
+    with served(whole[0]) as there:
+        yield there
+
+
+@pytest.fixture
+def page(chromium: Browser, address: str) -> Iterator[Page]:
+    """A page that complains of nothing and asks no other host for anything."""
+    with chromium.page() as opened:
+        yield opened
+        assert opened.complaints == []
+        assert [r for r in opened.requests if not r.startswith((address, "data:", "blob:"))] == []
+
+
+@pytest.fixture(scope="module")
+def run(whole: tuple[Path, RunSummary]) -> Run:
+    return open_run(whole[0])
+
+
+def told(page: Page, name: str) -> Any:
+    """The number behind a cell of the answer."""
+    return json.loads(page.value(f"document.querySelector('#answer [data-name={name}]').dataset.value"))
+
+
+def busiest(run: Run) -> tuple[int, int]:
+    count = run.field.count()
+    y, x = np.unravel_index(int(count.argmax()), count.shape)
+    return int(x), int(y)
+
+
+def click_pixel(page: Page, x: float, y: float) -> None:
+    """Click a base pixel, the map standing at zoom 3 around it."""
+    page.click(*page.value(MIDDLE_OF_MAP))
+    page.wait(f"document.querySelector('#answer h2')?.textContent === 'Pixel ({x}, {y})'")
+
+
+ANSWERED = "document.querySelector('#answer [data-name=n]') !== null"
+
+
+def test_a_click_shows_what_python_says(page: Page, address: str, run: Run) -> None:
+    x, y = busiest(run)
+    page.open(f"{address}#view={x},{y},3")
+    page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
+    click_pixel(page, x, y)
+    here = run.field.at(x, y)
+    assert told(page, "n") == here.n
+    vx, vy = here.modal_velocity_px_per_s
+    assert told(page, "direction") == pytest.approx(np.arctan2(vy, vx), abs=1e-5)
+    assert told(page, "modal_speed") == pytest.approx(np.hypot(vx, vy), rel=1e-5)
+    assert told(page, "standing_share") == pytest.approx(here.standing_share, abs=1e-6)
+    for percent, speed in here.percentiles_px_per_s.items():
+        assert told(page, f"speed_p{percent}") == pytest.approx(speed, rel=1e-5)
+        shown = page.value(f"document.querySelector('#answer [data-name=speed_p{percent}]').textContent")
+        assert shown == f"{speed * 0.23 * 3.6:.1f} km/h"
+    assert page.value("document.querySelector('#answer canvas').getContext('2d') !== null")
+    assert page.value("document.querySelectorAll('#answer [data-name^=mode_]').length") == len(here.modes)
+    for k, mode in enumerate(here.modes):
+        np.testing.assert_allclose(told(page, f"mode_{k}"), mode, rtol=1e-4, atol=0.02)
+
+
+@pytest.fixture
+def north_up(whole: tuple[Path, RunSummary], tmp_path: Path) -> Iterator[str]:
+    """The same run, had its base image north at its upper edge."""
+    for path in whole[0].iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    (tmp_path / "view").unlink()
+    (tmp_path / "view").mkdir()
+    for path in (whole[0] / "view").iterdir():
+        (tmp_path / "view" / path.name).symlink_to(path)
+    record = json.loads((tmp_path / "view" / "run.json").read_bytes())
+    (tmp_path / "view" / "run.json").unlink()
+    (tmp_path / "view" / "run.json").write_text(json.dumps({**record, "north_rad": -np.pi / 2}))
+    with served(tmp_path) as there:
+        yield there
+
+
+def beside(run: Run, away: int) -> tuple[int, int]:
+    """A pixel that no vehicle passed, so far above one that was passed, none nearer."""
+    count = run.field.count()
+    height, width = count.shape
+    for y, x in np.argwhere(count > 0).tolist():
+        if away <= y < height - away and away <= x < width - away:
+            around = count[y - 2 * away : y, x - away : x + away + 1]
+            if around.size and not around.any():
+                return x, y - away
+    raise AssertionError("no such place")
+
+
+def test_a_tap_beside_a_lane_means_the_lane_where_a_screen_pixel_is_many(page: Page, address: str, run: Run) -> None:
+    x, y = beside(run, 3)
+    page.open(f"{address}#view={x},{y},1")
+    page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
+    page.click(*page.value(MIDDLE_OF_MAP))
+    page.wait(ANSWERED)
+    away = told(page, "away")
+    pixel = [int(part) for part in page.value("new URLSearchParams(location.hash.slice(1)).get('pixel')").split(",")]
+    assert page.value("document.querySelector('#answer h2').textContent") == f"Pixel ({pixel[0]}, {pixel[1]})"
+    assert away == pytest.approx(np.hypot(pixel[0] - x, pixel[1] - y), abs=1.0)
+    assert 2 < away <= 4
+    assert told(page, "n") == run.field.at(*pixel).n > 0
+    assert "m away" in page.value("document.querySelector('#answer').textContent")
+
+
+def test_where_a_map_pixel_is_wider_than_a_finger_the_click_means_itself(page: Page, address: str, run: Run) -> None:
+    x, y = beside(run, 1)
+    page.open(f"{address}#view={x},{y},3")
+    page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
+    click_pixel(page, x, y)
+    assert told(page, "n") == 0
+
+
+def test_degrees_say_what_they_are_counted_from(chromium: Browser, address: str, north_up: str, run: Run) -> None:
+    goes = np.where(np.isfinite(run.field.modal_direction_rad()), run.field.count(), 0)
+    y, x = (int(k) for k in np.unravel_index(int(goes.argmax()), goes.shape))
+    vx, vy = run.field.at(x, y).modal_velocity_px_per_s
+    degrees = f"{round(np.degrees(np.arctan2(vx, -vy))) % 360}°"
+    with chromium.page() as page:
+        for there, counted_from in ((address, " from up"), (north_up, " [NESW]{1,2}")):
+            page.open(f"{there}#pixel={x},{y}&view={x},{y},3")
+            page.wait(ANSWERED)
+            direction = page.value("document.querySelector('#answer [data-name=direction]').closest('td').textContent")
+            assert re.search(rf"{degrees} .*{counted_from.strip()}$", direction)
+            page.mouse("mouseMoved", *page.value(MIDDLE_OF_MAP))
+            page.wait("document.getElementById('readout').textContent.includes('vehicle')")
+            assert re.search(rf"{degrees}{counted_from} ", page.value("document.getElementById('readout').textContent"))
+            titles = page.value("[...document.querySelectorAll('#answer thead th')].map((cell) => cell.textContent)")
+            assert ("From up" in titles) == (there == address)
+            page.open("about:blank")
+        page.open(f"{address}#line=10,200,600,200")
+        page.wait("document.querySelector('#answer h3') !== null")
+        assert page.value("document.querySelector('#answer h3').textContent").endswith("towards 180° from up")
+
+
+def test_the_labels_of_a_histogram_do_not_touch(page: Page, address: str, run: Run) -> None:
+    height, width = run.field.shape
+    page.open(f"{address}#line=0,0,{width},{height}")
+    page.wait("document.querySelector('#answer svg text') !== null")
+    boxes = page.value(
+        "[...document.querySelector('#answer svg').querySelectorAll('text')].map((text) => "
+        "(({left, right, top, bottom}) => [left, right, top, bottom])(text.getBoundingClientRect()))"
+    )
+    texts = page.value("[...document.querySelector('#answer svg').querySelectorAll('text')].map((t) => t.textContent)")
+    assert len(texts) >= 4
+    assert [text for text in texts if not text.isdecimal()] == ["km/h"]
+    for k, (left, right, top, bottom) in enumerate(boxes):
+        for other in boxes[k + 1 :]:
+            assert right < other[0] or other[1] < left or bottom < other[2] + 2 or other[3] < top + 2
+
+
+def test_the_page_colours_speeds_as_the_figure_does_and_says_what_is_cut_off(
+    page: Page, address: str, whole: tuple[Path, RunSummary]
+) -> None:
+    store = open_field(RunLayout(whole[0]).field)
+    modal = np.hypot(store.layer("modal_vx"), store.layer("modal_vy")).astype(np.float64) * 0.23 * 3.6
+    reach = speed_reach(modal)
+    assert reach is not None
+    page.open(address)
+    page.wait("document.querySelector('#layer option') !== null")
+    cut_off = []
+    for layer, values in (("speed", modal), ("speed_p50_high90", store.layer("speed_p50_high90") * 0.23 * 3.6)):
+        page.value(f"layer.value = '{layer}'; layer.dispatchEvent(new Event('change'))")
+        top = float(page.value("[...document.querySelectorAll('#legend .ticks span')].at(-1).textContent"))
+        assert top == round_up(reach)
+        said = page.value("document.getElementById('legend').textContent")
+        cut_off.append(f"Above {top:g} all has the last colour; the highest is {np.nanmax(values):.3g} km/h" in said)
+        assert cut_off[-1] == bool(np.nanmax(values) > top)
+    assert cut_off[-1], "the test needs a layer that is cut off"
+
+
+def test_clicks_all_over_the_map_agree_and_are_quick(
+    page: Page, address: str, run: Run, record_property: Callable[[str, object], None]
+) -> None:
+    count = run.field.count()
+    places = np.argwhere(count > 0)[:: max(1, int((count > 0).sum()) // 8)]
+    taken = []
+    for y, x in places.tolist():
+        page.open("about:blank")
+        page.open(f"{address}#view={x},{y},2")
+        page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
+        click_pixel(page, x, y)
+        here = run.field.at(x, y)
+        assert told(page, "n") == here.n
+        assert told(page, "speed_p85") == pytest.approx(here.percentiles_px_per_s[85], rel=1e-5)
+        assert page.value("document.querySelectorAll('#answer [data-name^=mode_]').length") == len(here.modes)
+        taken.append(float(page.value("document.getElementById('answer').dataset.milliseconds")))
+    record_property("median_click_ms", median(taken))
+
+
+def test_the_line_counts_as_python_does(page: Page, address: str, run: Run) -> None:
+    crossed = 0
+    height, width = run.field.shape
+    for ends in (
+        (10, height / 2, width - 10, height / 2),
+        (width / 2, 10, width / 2, height - 10),
+        (0, 0, width, height),
+    ):
+        page.open("about:blank")
+        page.open(f"{address}#line={','.join(map(str, ends))}")
+        page.wait("document.querySelector('#answer [data-name=forward_count]') !== null")
+        crossings = run.crossings(ends[:2], ends[2:])
+        crossed += len(crossings)
+        for name, direction in (("forward", 1), ("back", -1)):
+            part = crossings[crossings["direction"] == direction]
+            assert told(page, f"{name}_count") == len(part)
+            if len(part):
+                speeds = np.percentile(part["speed_px_per_s"], (15, 50, 85))
+                found = [told(page, f"{name}_p{percent}") for percent in (15, 50, 85)]
+                np.testing.assert_allclose(found, speeds, rtol=1e-4)
+    assert crossed > 3
+
+
+def test_a_line_is_drawn_by_two_clicks_and_by_the_keyboard(page: Page, address: str) -> None:
+    page.open(address)
+    page.wait("document.getElementById('draw-line') !== null && document.querySelector('#layer option') !== null")
+    page.value("document.getElementById('draw-line').click()")
+    left, top = page.value("(({left, top}) => [left, top])(map.getBoundingClientRect())")
+    page.click(left + 200, top + 300)
+    page.click(left + 600, top + 300)
+    page.wait("document.querySelector('#answer [data-name=forward_count]') !== null")
+    assert "line=" in page.value("location.hash")
+    page.value("document.getElementById('map').focus()")
+    page.key("Enter", 13)
+    page.wait("document.querySelector('#answer h2').textContent.startsWith('Pixel')")
+    assert "line=" not in page.value("location.hash")
+
+
+def test_a_link_holds_the_view(page: Page, address: str, run: Run) -> None:
+    x, y = busiest(run)
+    page.open(f"{address}#layer=speed_p85&unit=mph&opacity=40&least=2&view={x},{y},1&pixel={x},{y}")
+    page.wait(ANSWERED)
+    shown = {
+        name: page.value(f"document.getElementById('{name}').value") for name in ("layer", "unit", "opacity", "least")
+    }
+    assert shown == {"layer": "speed_p85", "unit": "mph", "opacity": "40", "least": "2"}
+    speed = run.field.at(x, y).percentiles_px_per_s[85] * 0.23 * 2.2369362920544
+    assert page.value("document.querySelector('#answer [data-name=speed_p85]').textContent") == f"{speed:.1f} mph"
+    page.value("document.getElementById('layer').value = 'count'; layer.dispatchEvent(new Event('change'))")
+    assert "layer=count" in page.value("location.hash")
+    assert f"pixel={x},{y}" in page.value("location.hash")
+
+
+def test_every_layer_is_painted(page: Page, address: str) -> None:
+    page.open(address)
+    page.wait("document.querySelector('#layer option') !== null")
+    names = page.value("[...document.querySelectorAll('#layer option')].map((option) => option.value)")
+    assert {"direction", "speed", "speed_p85", "count", "direction_half90"} <= set(names)
+    painted = """(() => [...document.querySelectorAll('canvas.leaflet-tile-loaded')].some((canvas) => {
+      const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext('2d', {willReadFrequently: true});
+      copy.drawImage(canvas, 0, 0);
+      return copy.getImageData(0, 0, canvas.width, canvas.height).data.some((value) => value > 0);
+    }))()"""
+    for name in names:
+        page.value(f"layer.value = '{name}'; layer.dispatchEvent(new Event('change'))")
+        page.wait(painted)
+
+
+def test_tracks_under_the_cursor(page: Page, address: str, run: Run) -> None:
+    x, y = busiest(run)
+    page.open(f"{address}#view={x},{y},3&tracks=1&pixel={x},{y}")
+    page.wait("document.querySelector('#answer details.passages') !== null")
+    near = int(page.value("document.querySelector('#answer details.passages').dataset.count"))
+    assert 0 < near <= run.field.at(x, y).n + 2  # passages within a pixel and a half; the field's band is wider or not
+
+
+def test_hover_reads_direction_and_speed(page: Page, address: str, run: Run) -> None:
+    x, y = busiest(run)
+    page.open(f"{address}#view={x},{y},3")
+    page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
+    box = page.value(
+        "(({left, top, width, height}) => [left + width / 2, top + height / 2])(map.getBoundingClientRect())"
+    )
+    page.mouse("mouseMoved", *box)
+    page.wait("document.getElementById('readout').textContent.includes('vehicle')")
+    text = page.value("document.getElementById('readout').textContent")
+    vx, vy = run.field.at(x, y).modal_velocity_px_per_s
+    assert text.startswith(f"({x}, {y})")
+    assert f"{np.hypot(vx, vy) * 0.23 * 3.6:.1f} km/h" in text
+
+
+def test_the_summary_is_the_report(page: Page, address: str) -> None:
+    page.open(f"{address}#tab=summary")
+    page.wait("document.querySelector('#summary-panel').hidden === false")
+    text = page.value("document.getElementById('summary-panel').innerText")
+    for words in ("Which way traffic goes", "Registration", "What was tried and kept", "What went in"):
+        assert words in text
+    page.wait("[...document.querySelectorAll('figure img')][0].naturalWidth > 300")
+
+
+def test_a_short_clip_says_that_few_vehicles_passed_a_pixel(page: Page, address: str, run: Run) -> None:
+    count = run.field.count()
+    known, well = int((count > 0).sum()), int((count >= 5).sum())
+    assert well < known / 20, "the test needs a short clip"
+    page.open(f"{address}#tab=summary")
+    page.wait("document.querySelector('#summary-panel').hidden === false && document.getElementById('few').textContent")
+    for place in ("#few", "#summary-panel .few"):
+        text = page.value(f"document.querySelector('{place}').textContent")
+        assert "Directions hold; speeds and percentiles are those of single vehicles" in text
+    facts = dict(
+        page.value(
+            "[...document.querySelectorAll('.facts dl div')].map((d) => [...d.children].map((c) => c.textContent))"
+        )
+    )
+    assert facts["of the map, passed by vehicles"] == coverage.percent(known, count.size)
+    assert facts["of that, by 5 or more"] == coverage.percent(well, known)
+
+
+LABELS = """[...document.querySelectorAll('svg.plot')].filter((plot) => plot.checkVisibility()).map((plot) =>
+  [...plot.querySelectorAll('text')].map((text) => (({left, right, top, bottom}) => [left, right, top, bottom])(
+    text.getBoundingClientRect())))"""
+
+
+@pytest.mark.parametrize("width", [390, 1400])
+def test_the_labels_of_the_plots_can_be_read_on_any_screen(chromium: Browser, address: str, width: int) -> None:
+    with chromium.page(width=width, height=844) as opened:
+        opened.open(f"{address}#tab=summary")
+        opened.wait("document.querySelector('#summary-panel').hidden === false")
+        plots = opened.value(LABELS)
+    assert plots
+    for boxes in plots:
+        assert min(bottom - top for _, _, top, bottom in boxes) >= 13  # a letter of 11 px or more
+        for k, (left, right, top, bottom) in enumerate(boxes):
+            for a, b, c, d in boxes[k + 1 :]:
+                assert right < a or b < left or bottom < c + 3 or d < top + 3
+
+
+@pytest.mark.parametrize("tab", ["map", "summary"])
+def test_a_small_screen_shows_it_without_scrolling_sideways(
+    chromium: Browser, address: str, run: Run, tab: str
+) -> None:
+    x, y = busiest(run)
+    with chromium.page(width=390, height=844) as small:
+        small.open(f"{address}#tab={tab}&pixel={x},{y}")
+        small.wait(ANSWERED)
+        assert small.value("document.documentElement.scrollWidth") <= 390
+        if tab == "map":
+            assert small.value("map.getBoundingClientRect().height") > 300
+
+
+def test_opened_from_the_disk_it_says_what_to_do(chromium: Browser, whole: tuple[Path, RunSummary]) -> None:
+    with chromium.page() as opened:
+        opened.open((whole[0] / "index.html").as_uri())
+        opened.wait("document.querySelector('#map .alarm') !== null")
+        assert "velfield view RUN" in opened.value("document.querySelector('#map .alarm').textContent")
+        assert opened.value("document.getElementById('summary-panel').hidden") is False

@@ -1,0 +1,21 @@
+"""Makes the detectors that ship anew and prints how good they are on places left out: ``make detector DATA=FOLDER``.
+
+Half an hour on two cores.
+"""
+
+import sys
+from pathlib import Path
+
+from flows.launch import limit_threads, prepare_process
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit("usage: make detector DATA=FOLDER   (one that holds songdo and kit_ais)")
+    limit_threads()
+    prepare_process(verbose=False)
+    import velfield.detection
+    from tools.shipped_detector import ship, ship_long_vehicles
+
+    data, folder = Path(sys.argv[1]), Path(velfield.detection.__path__[0])
+    print(ship_long_vehicles(data, folder / "shipped_long_vehicles.json"))
+    print("\n".join(ship(data, folder / "shipped_detector.json")))

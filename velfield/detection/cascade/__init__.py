@@ -1,0 +1,1 @@
+"""The boosted cascade: proposals, then a classifier on crops turned to the horizontal."""

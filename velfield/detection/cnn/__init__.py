@@ -1,0 +1,1 @@
+"""The convolutional network: model, inference, training, self-training from motion."""

@@ -1,0 +1,1 @@
+"""Training labels from motion: background difference, blobs, three-frame links, boxes."""

@@ -1,0 +1,1 @@
+"""The paper's detector: dense response of boosted rectangle features, region growing."""

@@ -1,0 +1,102 @@
+"""Two run folders compared: figures, layers for GIS, and a line of summary a quantity."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from velfield.exports.cog import write_cog
+from velfield.field.bins import standing_px_per_s
+from velfield.field.comparison import FALSE_SHARE, MIN_COUNT, Change, compare_fields
+from velfield.report.change import change_figure
+from velfield.report.figures import MapScale, png_bytes
+from velfield.run.commits import write_atomically
+from velfield.run.field_algebra import check_same_grid
+from velfield.run.grid import north_of
+from velfield.run.run import Run, open_run
+from velfield.run.stores import open_field
+from velfield.viewer.record import write_change_layers
+
+
+def compare_runs(before: Path, after: Path, out: Path, *, min_count: int = MIN_COUNT) -> list[str]:
+    """Write ``direction_change.png``, ``speed_change.png``, ``volume_change.png`` and ``change.tif`` into ``out``.
+
+    The later run's page shows the changes too.
+
+    Returns
+    -------
+    list of str
+        For people: of each quantity, how much of the map changed.
+
+    Raises
+    ------
+    InputError
+        The fields are on different grids.
+    """
+    runs = open_run(before), open_run(after)
+    check_same_grid(before, after)
+    stores = [open_field(run.layout.field) for run in runs]
+    seconds = [float(store.attributes["observed_s"]) for store in stores]
+    changes = compare_fields(
+        stores[0].layer,
+        stores[1].layer,
+        observed_s=(seconds[0], seconds[1]),
+        standing_px_per_s=standing_px_per_s(runs[0].record.config.field, runs[0].grid.gsd_m),
+        min_count=min_count,
+    )
+    shown = {name: _shown(name, change, runs[1]) for name, change in changes.items()}
+    scale = MapScale(gsd_m=runs[1].grid.gsd_m, north_rad=north_of(runs[1].grid))
+    for name, (values, unit) in shown.items():
+        real = np.where(changes[name].significant, values, np.nan)
+        figure = change_figure(runs[1].base_image, real, scale, title=f"Change of {name}, {unit}")
+        write_atomically(out / f"{name}_change.png", png_bytes(figure))
+    _write_layers(out / "change.tif", changes, shown, runs[1])
+    _show_in_the_viewer(changes, before, runs[1])
+    return [
+        *(_line(name, changes[name], *shown[name]) for name in changes),
+        f"significant: at most {FALSE_SHARE:.0%} of what is shown is chance; figures and change.tif in {out}",
+    ]
+
+
+def _show_in_the_viewer(changes: dict[str, Change], before: Path, run: Run) -> None:
+    """Leave what changed for real as layers of the later run's page, where it has one, in the units of its field."""
+    if not run.layout.view_record.exists():
+        return
+    units = {"direction": "rad", "speed": "px s-1", "volume": "vehicles h-1"}
+    layers = {
+        f"{name}_change": (
+            np.where(change.significant, change.change, np.nan),
+            {"long_name": f"change of {name} since {before.name}", "units": units[name]},
+        )
+        for name, change in changes.items()
+    }
+    write_change_layers(run.layout, layers)
+
+
+def _shown(name: str, change: Change, run: Run) -> tuple[NDArray[np.float64], str]:
+    """A change in the unit that people read."""
+    gsd_m = run.grid.gsd_m
+    if name == "direction":
+        return np.degrees(change.change), "degrees"
+    if name == "speed":
+        return (change.change * gsd_m * 3.6, "km/h") if gsd_m else (change.change, "px/s")
+    return change.change, "vehicles an hour"
+
+
+def _line(name: str, change: Change, values: NDArray[np.float64], unit: str) -> str:
+    compared, real = change.summary()
+    if not real:
+        return f"{name:10} no significant change at {compared} pixels compared"
+    middle = float(np.median(values[change.significant]))
+    return f"{name:10} changed at {real} of {compared} pixels compared, by {middle:+.1f} {unit} (median)"
+
+
+def _write_layers(
+    path: Path, changes: dict[str, Change], shown: dict[str, tuple[NDArray[np.float64], str]], run: Run
+) -> None:
+    layers, names, units = [], [], []
+    for name, (values, unit) in shown.items():
+        layers += [values.astype(np.float32), changes[name].chance.astype(np.float32)]
+        names += [f"{name} change", f"probability of such a {name} change by chance"]
+        units += [unit, "1"]
+    write_cog(path, layers, names=names, units=units, crs_wkt=run.grid.crs_wkt, affine=run.grid.affine)

@@ -1,0 +1,89 @@
+"""A commented ``flight.yaml`` to begin with: what was found in the source, and every key with its default."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import yaml
+from pydantic import BaseModel
+
+from schemas.flight import PRESETS, FlightConfig
+from velfield.pipeline.configuration import resolve_config
+from velfield.sources.frames import SourceInfo
+from velfield.sources.selection import select_frames
+
+_WIDTH = 116
+_GSD = (
+    "Metres a base pixel: the ground sample distance. Known from the height and the camera, from a car (4.5 m long) or "
+    "a lane (3 to 3.7 m wide) in the picture, or from a --base with coordinates. Without it speeds stay in px/s."
+)
+
+
+def starting_config(source: str, info: SourceInfo) -> str:
+    """YAML text that is the default configuration: each key stands in it, commented out, under what it means.
+
+    Parameters
+    ----------
+    source
+        What the person named; said in the heading.
+    info
+        The source, as `velfield.sources.frames.probe` found it.
+    """
+    config = resolve_config()
+    lines = [
+        "# The configuration of a flight. Every key is optional; those below are commented out at their defaults.",
+        "# To set one, take its `#` away: its section stands above it.",
+        f"# Use it:  velfield run {source} --out RUN --config flight.yaml",
+        "#",
+        *(f"# {line}" for line in found_lines(info, config)),
+        "",
+        f"preset: {config.preset}  # one of: {', '.join(PRESETS)}",
+        "",
+        *_comment(_GSD, ""),
+        "# gsd_m: 0.23",
+    ]
+    for name, section in _sections(config):
+        lines += ["", *_comment(type(section).__doc__ or "", ""), f"{name}:", *_keys(section)]
+    return "\n".join(lines) + "\n"
+
+
+def found_lines(info: SourceInfo, config: FlightConfig) -> list[str]:
+    """What the source is, a line each."""
+    lines = [f"Found: {info.kind}, {info.frame_count} frames of {info.width} x {info.height} px."]
+    if len(info.times_s) > 1:
+        step = np.diff(info.times_s)
+        lines.append(
+            f"It lasts {info.times_s[-1] - info.times_s[0]:.1f} s; frames are {np.median(step):.3f} s apart "
+            f"(median), the longest gap is {step.max():.3f} s."
+        )
+        taken = select_frames(info.times_s, config.frames)
+        lines.append(f"With every: auto, {len(taken)} frames are worked on, those nearest to 0.2 s apart.")
+    return [*lines, *(f"Warning: {warning}" for warning in info.warnings)]
+
+
+def _sections(config: FlightConfig) -> Iterator[tuple[str, BaseModel]]:
+    for name in type(config).model_fields:
+        value = getattr(config, name)
+        if isinstance(value, BaseModel):
+            yield name, value
+
+
+def _keys(section: BaseModel) -> list[str]:
+    lines = []
+    for name, info in type(section).model_fields.items():
+        lines += _comment(info.description or "", "  ")
+        lines.append(f"#   {name}: {_value(getattr(section, name))}")
+    return lines
+
+
+def _value(value: Any) -> str:
+    return yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("\n").removesuffix("\n...")
+
+
+def _comment(text: str, indent: str) -> list[str]:
+    """A paragraph as lines that start with ``##``: not mistaken for a key."""
+    words, lines = " ".join(text.split()).split(), [""]
+    for word in words:
+        longer = f"{lines[-1]} {word}".strip()
+        lines[-1:] = [longer] if len(longer) <= _WIDTH - len(indent) else [lines[-1], word]
+    return [f"##{indent} {line}" for line in lines if line]

@@ -1,0 +1,93 @@
+"""What a run would do, said before it is done: units, task runs, bytes, what is finished already."""
+
+import shutil
+from pathlib import Path
+
+from velfield.errors import InputError
+from velfield.pipeline.plan import Plan
+from velfield.pipeline.result import committed, unit_name
+from velfield.run.field_writer import GROUP_TILES
+from velfield.run.layout import STAGES
+from velfield.run.paths import is_remote
+
+_PER_FRAME = ("frames", "registration", "detections", "links")
+_FRAME_COMPRESSION = 0.8
+"""Zstandard leaves about this much of a noisy grey frame."""
+_BYTES_A_DETECTION_FRAME = 150_000
+_BYTES_A_TILE = 200_000
+_TOUCHED = 0.1
+"""Share of the map that traffic touches: a few per cent, with a margin."""
+
+
+_PROCESS_BYTES = 500_000_000
+_BYTES_A_PIXEL_IN_HAND = 350
+"""What a process takes by itself, and for each unit at a time: peaks of runs of 1280 x 960 and 1920 x 1080 px."""
+
+
+def planned_units(plan: Plan) -> dict[str, list[str]]:
+    """Names of every stage's units; the field's are an estimate until the base image's size is known."""
+    units = {stage: ["all"] for stage in STAGES}
+    for stage in _PER_FRAME:
+        units[stage] = [unit_name(frames) for frames in plan.units]
+    side = plan.config.field.tile_size_px * GROUP_TILES
+    rows, columns = -(-plan.info.height // side), -(-plan.info.width // side)
+    units["field"] = [f"group-{row:03d}-{column:03d}" for row in range(rows) for column in range(columns)]
+    return units
+
+
+def estimated_bytes(plan: Plan) -> int:
+    """Bytes that the run folder will take."""
+    pixels = plan.info.width * plan.info.height
+    frames = plan.frame_count * (pixels * _FRAME_COMPRESSION + _BYTES_A_DETECTION_FRAME)
+    tiles = pixels / plan.config.field.tile_size_px**2 * _TOUCHED * _BYTES_A_TILE
+    return int(frames + tiles + 8 * pixels)
+
+
+def estimated_memory(plan: Plan, at_a_time: int) -> int:
+    """Bytes of memory that ``at_a_time`` units take together, whatever the flight's length."""
+    return _PROCESS_BYTES + at_a_time * plan.info.width * plan.info.height * _BYTES_A_PIXEL_IN_HAND
+
+
+def check_space(plan: Plan) -> None:
+    """Refuse a run that cannot end well, before it starts.
+
+    Raises
+    ------
+    InputError
+        The disk has less free than what is still to be written.
+    """
+    if is_remote(plan.layout.root):
+        return
+    names = [unit_name(frames) for frames in plan.units]
+    undone = sum(committed(plan, "frames", name) is None for name in names)
+    needed, free = int(estimated_bytes(plan) * undone / len(names)), _free_bytes(plan.layout.root)
+    if needed > free:
+        raise InputError(
+            f"{plan.layout.root}: about {needed / 1e9:.2f} GB needed, {free / 1e9:.2f} GB free; "
+            "make room, give --out on another disk, or fewer frames with --every or --stop-s"
+        )
+
+
+def describe_plan(plan: Plan, at_a_time: int = 2) -> str:
+    """The plan as text: a line a stage, then bytes needed and free, and memory for so many units at a time."""
+    lines = [f"{plan.job.inputs.source}: {plan.info.frame_count} frames of {plan.info.width} x {plan.info.height} px, "]
+    lines[0] += f"{plan.frame_count} of them to work on, {plan.unit_frames} a unit"
+    total = 0
+    for stage, units in planned_units(plan).items():
+        done = sum(committed(plan, stage, unit) is not None for unit in units)
+        total += len(units)
+        lines.append(f"  {stage:<13} {len(units):>5} units, {done:>5} done")
+    root = plan.layout.root
+    lines.append(f"{total} task runs; about {estimated_bytes(plan) / 1e9:.2f} GB needed in {root}{_free(root)}")
+    memory = estimated_memory(plan, at_a_time) / 1e9
+    lines.append(f"about {memory:.1f} GB of memory with {at_a_time} units at a time")
+    return "\n".join(lines)
+
+
+def _free(root: Path) -> str:
+    return "" if is_remote(root) else f", {_free_bytes(root) / 1e9:.1f} GB free"
+
+
+def _free_bytes(root: Path) -> int:
+    existing = next(path for path in (root, *root.resolve().parents) if path.exists())
+    return shutil.disk_usage(existing).free

@@ -1,0 +1,132 @@
+"""Cars of a block of frames; one table a unit, in base pixels, with their patches beside it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from schemas.tables import DETECTION_COLUMNS
+from velfield.detection.detect import FrameDetections, detect_frame
+from velfield.detection.detector import Detector, load_detector
+from velfield.pipeline.plan import Plan
+from velfield.pipeline.progress import advance
+from velfield.pipeline.result import Outcome
+from velfield.pipeline.stages.external_detections import external_detections
+from velfield.pipeline.stages.rectified_frames import WorkingFrame, WorkingGrid, read_background
+from velfield.pipeline.stages.registration import usable_frames
+from velfield.run.frame_transforms import FrameMap
+from velfield.run.grid import read_working
+from velfield.run.stores import open_frames
+from velfield.run.tables import write_patches, write_table
+
+ID_STEP = 1 << 20
+"""Detections of a frame are numbered from ``frame * ID_STEP``: unique, and the same however the flight is cut."""
+
+
+@dataclass(frozen=True)
+class BlockDetections:
+    """Cars of a block of frames: the table, and beside it their pictures and places on the working grid."""
+
+    table: pd.DataFrame
+    patches: NDArray[np.uint8]
+    chips: NDArray[np.uint8]
+    place_work: NDArray[np.float64]
+
+
+def detect_block(plan: Plan, frames: range) -> BlockDetections:
+    """Cars of those frames of a block that are registered and that nothing is wrong with."""
+    record = read_working(plan.layout)
+    working = WorkingGrid.open(plan, record.scale)
+    times_s = open_frames(plan.layout.frames).column("time_s")
+    usable = usable_frames(plan)
+    parts = []
+    for frame in frames:
+        seen = working.frame(frame) if usable[frame] else None
+        if seen is not None:
+            found = _cars(plan, seen, working.maps.transform(frame), frame, has_background=record.has_background)
+            parts.append(_frame_part(found, seen, frame, float(times_s[frame])))
+        advance("detections")
+    return _joined(parts)
+
+
+def _cars(
+    plan: Plan, seen: WorkingFrame, transform: FrameMap | None, frame: int, *, has_background: bool
+) -> FrameDetections:
+    if plan.job.inputs.detections and transform is not None:
+        return external_detections(plan, seen, transform, frame)
+    detector = _detector(plan.layout.detector, plan.keys["detector"])
+    background = _background_under(plan, seen) if has_background else None
+    return detect_frame(seen.image, seen.valid, detector, plan.config.detection, background=background)
+
+
+@lru_cache(maxsize=2)
+def _detector(path: Path, _key: str) -> Detector:
+    return load_detector(path)
+
+
+@lru_cache(maxsize=2)
+def _background(plan_root: Path, _key: str) -> NDArray[np.uint8]:
+    from velfield.run.layout import RunLayout
+
+    return read_background(RunLayout(plan_root)).median
+
+
+def _background_under(plan: Plan, seen: WorkingFrame) -> NDArray[np.uint8]:
+    """The background in the frame's window, whose corner need not fall on a pixel of the whole working grid."""
+    whole = _background(plan.layout.root, plan.keys["detector"])
+    shift = np.array(seen.window[:2]) * seen.scale
+    matrix = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]]])
+    size = (seen.image.shape[1], seen.image.shape[0])
+    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(whole, matrix, size, flags=how, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+
+
+def _frame_part(found: FrameDetections, seen: WorkingFrame, frame: int, time_s: float) -> BlockDetections:
+    xy = seen.to_base(found.xy)
+    table = pd.DataFrame(
+        {
+            "detection_id": frame * ID_STEP + np.arange(len(xy), dtype=np.int64),
+            "frame": frame,
+            "time_s": time_s,
+            "x_px": xy[:, 0],
+            "y_px": xy[:, 1],
+            "orientation_rad": found.orientation_rad,
+            "orientation_sd_rad": found.orientation_sd_rad,
+            "area_px": found.area_px / seen.scale**2,
+            "score": found.score,
+        }
+    ).astype(DETECTION_COLUMNS)
+    return BlockDetections(table, found.patches, found.chips, found.xy)
+
+
+def _joined(parts: Sequence[BlockDetections]) -> BlockDetections:
+    if not parts:
+        table = pd.DataFrame({name: np.empty(0, dtype) for name, dtype in DETECTION_COLUMNS.items()})
+        return BlockDetections(table, np.empty((0, 16, 8), np.uint8), np.empty((0, 32, 32), np.uint8), np.empty((0, 2)))
+    return BlockDetections(
+        pd.concat([part.table for part in parts], ignore_index=True),
+        np.concatenate([part.patches for part in parts]),
+        np.concatenate([part.chips for part in parts]),
+        np.concatenate([part.place_work for part in parts]),
+    )
+
+
+def write_detections(plan: Plan, frames: range, blocks: Sequence[BlockDetections]) -> Outcome:
+    """Write the table of a unit, and its patches."""
+    whole = _joined([block for block in blocks if len(block.table)])
+    unit = frames.start // plan.unit_frames
+    path = plan.layout.unit_file(plan.layout.detections, unit, ".parquet")
+    pictures = plan.layout.unit_file(plan.layout.detections, unit, ".patches.npz")
+    scale = np.array(read_working(plan.layout).scale)
+    write_patches(
+        pictures,
+        {"patches": whole.patches, "chips": whole.chips, "place_work": whole.place_work, "working_scale": scale},
+    )
+    write_table(path, whole.table, DETECTION_COLUMNS)
+    used = int(usable_frames(plan)[frames.start : frames.stop].sum())
+    return Outcome([path, pictures], {"frames": used, "cars": len(whole.table)})

@@ -1,0 +1,123 @@
+"""Marked cars, from raw pixels of their frame onto a picture that a detector can learn from.
+
+A labelled frame need not be among the frames worked on, nor be registered: a car looks the same in its raw frame,
+scaled.
+So labels are learnt from raw frames, brought to the working scale by the local scale of the map raw -> base.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from velfield.detection.samples import LabelledImage
+from velfield.errors import InputError
+from velfield.pipeline.plan import Plan
+from velfield.run.frame_transforms import FrameMaps
+from velfield.run.stores import open_registration
+from velfield.sources.flags import UNUSABLE
+from velfield.sources.frames import SourceInfo
+from velfield.sources.labels.labels import Labels, load_labels
+from velfield.sources.source import iter_frames
+
+_SHORTEST_M, _USUAL_M, _LONGEST_M = 3.3, 4.4, 6.0
+"""Of what is marked as cars in a frame, half are shorter and half longer than something between."""
+
+
+def marked_cars(plan: Plan) -> Labels:
+    """The labels of ``--labels``.
+
+    Raises
+    ------
+    InputError
+        The labels cannot be read, or hold no car.
+    """
+    labels = load_labels(Path(str(plan.job.inputs.labels)), plan.info)
+    if labels.cars.empty:
+        raise InputError(f"--labels {plan.job.inputs.labels}: no car in it; mark the cars of one frame")
+    return labels
+
+
+def base_px_per_raw_px(plan: Plan) -> float:
+    """Local scale of the map raw -> base at the frames' centre: the median over registered frames."""
+    maps = FrameMaps.open(plan.layout, plan.config)
+    statuses = open_registration(plan.layout.registration).statuses()
+    registered = [k for k, status in enumerate(statuses) if status == "ok"]
+    if not registered:
+        raise InputError("no frame could be registered: is the video of one place, seen from above?")
+    cross = np.array([[-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]]) * 64 + np.array([[maps.width, maps.height]]) / 2
+    scales = []
+    for k in registered[:: max(1, len(registered) // 15)]:
+        transform = maps.transform(k)
+        if transform is not None:
+            base = transform.to_base(cross) / 64
+            a, b = base[1] - base[0], base[3] - base[2]
+            scales.append(np.sqrt(abs(a[0] * b[1] - a[1] * b[0])))
+    return float(np.median(scales))
+
+
+def car_length_raw_px(labels: pd.DataFrame) -> float:
+    """Usual length of the marked cars, raw px; NaN where no label tells."""
+    longest = labels[["length_px", "width_px"]].max(axis=1).dropna()
+    return float(longest.median()) if len(longest) else float("nan")
+
+
+def odd_length(length_px: float, gsd_m: float | None) -> list[str]:
+    """A warning where marked cars of that usual length, px of ``gsd_m``, are not as long as cars; else none."""
+    if gsd_m is None or not np.isfinite(length_px):
+        return []
+    length_m = length_px * gsd_m
+    if _SHORTEST_M <= length_m <= _LONGEST_M:
+        return []
+    return [
+        f"the marked cars are {length_m:.1f} m long, expected {_SHORTEST_M:g} to {_LONGEST_M:g}: --gsd-m is metres a "
+        f"pixel of the base image; give {gsd_m * _USUAL_M / length_m:.2g} if they are cars, or mend the labels' lengths"
+    ]
+
+
+def labelled_images(source: Path, info: SourceInfo, labels: Labels, *, work_per_raw: float) -> Iterator[LabelledImage]:
+    """Every labelled frame of a source at the working scale, to learn from.
+
+    Raises
+    ------
+    InputError
+        A labelled frame cannot be read.
+    """
+    place = {name: index for index, name in enumerate(info.names)}
+    for frame in iter_frames(source, info, np.array(sorted(place[name] for name in labels.frames), np.int64)):
+        if frame.flags & UNUSABLE:
+            raise InputError(f"--labels: the labelled frame {frame.name} cannot be used: {frame.reason}; mark another")
+        mine = labels.cars[labels.cars["frame"] == frame.name]
+        yield LabelledImage(
+            image=scaled(frame.grey, work_per_raw),
+            cars=boxes(mine, work_per_raw),
+            ignore=left_out(labels.ignored[labels.ignored["frame"] == frame.name], work_per_raw),
+            tilts=mine["tilt_rad"].to_numpy(np.float64),
+        )
+
+
+def left_out(table: pd.DataFrame, work_per_raw: float) -> NDArray[np.float64]:
+    """Circles (k, 3) as x, y, radius, working px, about a frame's objects that are neither car nor background."""
+    around = boxes(table, work_per_raw)
+    radius = np.nanmax(np.column_stack([around[:, 3:] / 2, np.full(len(around), 8.0)]), axis=1)
+    return np.column_stack([around[:, :2], radius])
+
+
+def boxes(table: pd.DataFrame, work_per_raw: float) -> NDArray[np.float64]:
+    """A frame's boxes (n, 5) as x, y, orientation, length, width, working px."""
+    columns = ["x_px", "y_px", "orientation_rad", "length_px", "width_px"]
+    found = table[columns].to_numpy(np.float64, copy=True)
+    found[:, :2] = (found[:, :2] + 0.5) * work_per_raw - 0.5
+    found[:, 3:] *= work_per_raw
+    return found
+
+
+def scaled(grey: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
+    """A grey picture scaled about its outer corner, area-averaged where it shrinks."""
+    height, width = grey.shape
+    size = max(1, round(width * factor)), max(1, round(height * factor))
+    how = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(grey, size, interpolation=how), np.uint8)

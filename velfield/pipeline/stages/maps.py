@@ -1,0 +1,91 @@
+"""The maps people look at: modal direction and speed, as figures and as layers for GIS; and what the viewer reads."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from velfield.exports.cog import write_cog
+from velfield.field.bins import standing_px_per_s
+from velfield.field.statistics import direction_rad, speed_px_per_s
+from velfield.pipeline.plan import Plan
+from velfield.pipeline.progress import advance
+from velfield.pipeline.result import Outcome
+from velfield.pipeline.stages.certificates import write_certificates
+from velfield.report.figures import MapScale, direction_figure, png_bytes, speed_figure
+from velfield.run.commits import write_atomically
+from velfield.run.grid import north_of, read_grid
+from velfield.run.paths import local_copy, written_locally
+from velfield.run.stores import open_field
+from velfield.sources.images import read_picture_grey
+from velfield.viewer.record import write_view_data
+
+Layer = NDArray[np.float64]
+PREVIEW_SIDE_PX = 900
+
+
+def make_maps(plan: Plan) -> Outcome:
+    """Write ``maps/``, direction and speed as PNG and as GeoTIFF, small pictures of both for the Prefect UI; and
+    what the viewer reads of the run beside the field's tiles."""
+    grid, config, layout = read_grid(plan.layout), plan.config.field, plan.layout
+    store = open_field(layout.field)
+    velocity = np.stack([store.layer("modal_vx"), store.layer("modal_vy")], axis=-1).astype(np.float64)
+    direction = direction_rad(velocity, standing_px_per_s=standing_px_per_s(config, grid.gsd_m))
+    speed = speed_px_per_s(velocity)
+    grey = read_base_image(plan)
+    scale = MapScale(gsd_m=grid.gsd_m, north_rad=north_of(grid))
+    figures = {
+        "direction": direction_figure(grey, direction, scale),
+        "speed": speed_figure(grey, speed, scale),
+    }
+    written = []
+    for name, figure in figures.items():
+        for suffix, picture in (("", figure), ("_preview", small_picture(figure))):
+            path = layout.maps / f"{name}{suffix}.png"
+            write_atomically(path, png_bytes(picture))
+            written.append(path)
+    written += _layers(plan, direction, speed)
+    written += write_certificates(plan)
+    written += write_view_data(layout)
+    advance("maps")
+    return Outcome(written, {"maps": float(len(figures))})
+
+
+def read_base_image(plan: Plan) -> NDArray[np.uint8]:
+    """The base image, (y, x) uint8."""
+    layout = plan.layout
+    path = layout.base_image_tif if layout.base_image_tif.exists() else layout.base_image
+    with local_copy(path) as here:
+        return read_picture_grey(here, plan.config.frames.max_pixels)
+
+
+def _layers(plan: Plan, direction: Layer, speed: Layer) -> list[Path]:
+    """Direction as heading and speed as GeoTIFF, each value with its unit."""
+    grid, maps = read_grid(plan.layout), plan.layout.maps
+    north = north_of(grid)
+    heading = np.mod(np.degrees(direction - (-np.pi / 2 if north is None else north)), 360.0)
+    unit, factor = ("m s-1", grid.gsd_m) if grid.gsd_m else ("px s-1", 1.0)
+    about = "heading, clockwise from north" if north is not None else "heading, clockwise from the picture's up"
+    for name, values, label, units in (
+        ("direction", heading, about, "degree"),
+        ("speed", speed * factor, "modal speed", unit),
+    ):
+        with written_locally(maps / f"{name}.tif") as here:
+            write_cog(
+                here,
+                [values.astype(np.float32)],
+                names=[label],
+                units=[units],
+                crs_wkt=grid.crs_wkt,
+                affine=grid.affine,
+            )
+    return [maps / "direction.tif", maps / "speed.tif"]
+
+
+def small_picture(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A picture reduced for the Prefect UI."""
+    factor = PREVIEW_SIDE_PX / max(picture.shape[:2])
+    if factor >= 1:
+        return picture
+    return np.asarray(cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)

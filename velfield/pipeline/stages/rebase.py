@@ -1,0 +1,210 @@
+"""A new base image under a finished run: what is known on the old one is mapped, frames and cars are not looked at.
+
+The new picture is registered to the old base image, another sensor's picture to another's. Every frame's map is then
+the old one followed by that map, detections and tracklets are mapped by it, and the field is built anew. What this adds
+to the place of everything is that registration's own error, at control points left out of its fit.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from schemas.job import Job
+from schemas.records import FlightRecord, GridRecord, InputsRecord, RebaseRecord, WorkingRecord
+from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
+from velfield.camera.lens import pinhole
+from velfield.errors import Failure
+from velfield.pipeline.plan import Plan
+from velfield.pipeline.progress import advance
+from velfield.pipeline.result import Outcome
+from velfield.pipeline.stages.base_image import write_given_picture
+from velfield.pipeline.version import STAGE_VERSIONS
+from velfield.registration.intersensor import register_intersensor
+from velfield.registration.transforms import PolyprojectiveTransform
+from velfield.run.commits import content_key, digest_path, read_commit, write_atomically
+from velfield.run.frame_transforms import polyprojective_of, polyprojective_record
+from velfield.run.grid import read_grid, read_working
+from velfield.run.layout import RunLayout
+from velfield.run.run import Run
+from velfield.run.tables import link_file, read_tables, write_table
+from velfield.sources.frames import SourceInfo
+from velfield.sources.geo import BasePicture, read_base_picture
+
+
+@dataclass(frozen=True)
+class Rebase:
+    """What a unit of the new result needs besides its plan: where the old one stands, and the map between them."""
+
+    old: RunLayout
+    record: RebaseRecord
+
+
+def measure_rebase(run: Run, base: Path) -> RebaseRecord | Failure:
+    """Register a new base image to a run's.
+
+    Raises
+    ------
+    InputError
+        The picture cannot be read.
+    """
+    config = run.record.config
+    given = read_base_picture(base, config.frames)
+    old = run.base_image
+    found = register_intersensor(old, given.grey, config.base, lens=pinhole(old.shape))
+    if isinstance(found, Failure):
+        return found
+    return RebaseRecord(
+        transform=polyprojective_record(found.transform.polyprojective),
+        added_error_px=found.left_out_error_px,
+        added_error_95_px=float(np.percentile(found.error_left_out_px, 95)),
+        points=len(found.error_left_out_px),
+        scale=found.scale,
+        rotation_rad=found.rotation_rad,
+        old_base=run.record.keys.get("base", ""),
+        gsd_m=given.gsd_m or (run.grid.gsd_m and run.grid.gsd_m / found.scale),
+    )
+
+
+def rebased_plan(run: Run, job: Job, record: RebaseRecord) -> Plan:
+    """The plan of the new result, made from the run folder alone: its source need not be there any more."""
+    assert job.inputs.base is not None, "a new base image is what this is about"
+    digest = digest_path(Path(job.inputs.base))
+    inputs = run.record.inputs.model_copy(update={"base": digest})
+    return Plan(
+        job=job.model_copy(update={"config": job.config.model_copy(update={"gsd_m": record.gsd_m})}),
+        info=_source_of(run),
+        indices=np.arange(run.frames.count),
+        inputs=inputs,
+        keys=_rebased_keys(run.record, inputs),
+    )
+
+
+def _source_of(run: Run) -> SourceInfo:
+    source = run.record.inputs.source
+    return SourceInfo(
+        kind="video" if source.kind == "video" else "folder",
+        width=source.width,
+        height=source.height,
+        frame_count=source.frame_count,
+        times_s=run.times_s,
+        names=(),
+    )
+
+
+def _rebased_keys(old: FlightRecord, inputs: InputsRecord) -> dict[str, str]:
+    """Keys of their own for what is mapped; what the new picture does not touch keeps its key."""
+    keys = dict(old.keys)
+    base = content_key("base", STAGE_VERSIONS["base"], parameters=["mapped"], inputs=[keys["base"], inputs.base])
+    keys["base"] = base
+    for stage in ("detections", "tracklets", "field", "maps"):
+        keys[stage] = content_key(stage, STAGE_VERSIONS[stage], inputs=[keys[stage], base])
+    return keys
+
+
+def rebase_image(plan: Plan, rebase: Rebase) -> Outcome:
+    """Write ``base/`` on the new picture's grid."""
+    layout, old, record = plan.layout, rebase.old, rebase.record
+    assert plan.job.inputs.base is not None, "a new base image is what this is about"
+    given = read_base_picture(Path(plan.job.inputs.base), plan.config.frames)
+    outputs = write_given_picture(layout, given)
+    grid = _rebased_grid(read_grid(old), given, record)
+    working = read_working(old)
+    moved = WorkingRecord.model_validate(
+        working.model_dump() | {"scale": working.scale / record.scale, "has_background": False}
+    )
+    for path, model in ((layout.rebased, record), (layout.grid, grid), (layout.working, moved)):
+        write_atomically(path, model.model_dump_json(indent=1).encode())
+        outputs.append(path)
+    for name in (old.own_to_base, old.own_base_image, old.own_base_mask):
+        if name.exists():
+            outputs.append(link_file(name, layout.base / name.name))
+    advance("base")
+    committed = read_commit(old, "base", "all")
+    counts = {
+        "width": float(grid.width_px),
+        "height": float(grid.height_px),
+        "frames": committed.counts.get("frames", 0.0) if committed else 0.0,
+        "intersensor_error_px": float(grid.intersensor_error_px or 0.0),
+    }
+    return Outcome(outputs, counts, [*given.notes, record.text()])
+
+
+def _rebased_grid(old: GridRecord, given: BasePicture, record: RebaseRecord) -> GridRecord:
+    height, width = given.grey.shape
+    before = (old.intersensor_error_px or 0.0) * record.scale
+    return GridRecord(
+        width_px=width,
+        height_px=height,
+        gsd_m=record.gsd_m,
+        crs_wkt=given.crs_wkt,
+        affine=given.affine,
+        how="given",
+        frames_to=old.frames_to,
+        reference_frame=old.reference_frame,
+        intersensor_error_px=float(np.hypot(before, record.added_error_px)),
+        intersensor_points=record.points,
+    )
+
+
+def rebase_detections(plan: Plan, frames: range, rebase: Rebase) -> Outcome:
+    """Map the cars of a unit; their pictures stay."""
+    unit = frames.start // plan.unit_frames
+    source = plan.layout.unit_file(rebase.old.detections, unit, ".parquet")
+    if not source.exists():
+        told = f"frames {frames.start} to {frames.stop - 1} have no cars"
+        return Outcome([], {"frames": 0.0, "cars": 0.0}, warnings=[told])
+    table = mapped_detections(read_tables([source], DETECTION_COLUMNS), polyprojective_of(rebase.record.transform))
+    path = plan.layout.unit_file(plan.layout.detections, unit, ".parquet")
+    write_table(path, table, DETECTION_COLUMNS)
+    pictures = plan.layout.unit_file(rebase.old.detections, unit, ".patches.npz")
+    linked = link_file(pictures, plan.layout.detections / pictures.name)
+    advance("detections", len(frames))
+    return Outcome([path, linked], {"frames": float(table["frame"].nunique()), "cars": float(len(table))})
+
+
+def rebase_tracklets(plan: Plan, rebase: Rebase) -> Outcome:
+    """Map all tracklets, unit by unit."""
+    transform, written, passages, count = polyprojective_of(rebase.record.transform), [], set[int](), 0
+    for source in sorted(rebase.old.tracklets.glob("unit-*.parquet")):
+        table = mapped_tracklets(read_tables([source], TRACKLET_COLUMNS), transform)
+        written.append(plan.layout.tracklets / source.name)
+        write_table(written[-1], table, TRACKLET_COLUMNS)
+        passages.update(table["passage_id"].unique().tolist())
+        count += len(table)
+    advance("tracklets")
+    return Outcome(written, {"tracklets": float(count), "passages": float(len(passages))})
+
+
+def mapped_detections(table: pd.DataFrame, transform: PolyprojectiveTransform) -> pd.DataFrame:
+    """Detections, in the columns of the contract, on the other picture: place, axis and area."""
+    table = table.copy()
+    xy = table[["x_px", "y_px"]].to_numpy(np.float64)
+    jacobian = transform.jacobian(xy)
+    axis = table["orientation_rad"].to_numpy(np.float64)
+    turned = np.einsum("nij,nj->ni", jacobian, np.column_stack([np.cos(axis), np.sin(axis)]))
+    table[["x_px", "y_px"]] = transform(xy)
+    table["orientation_rad"] = np.mod(np.arctan2(turned[:, 1], turned[:, 0]), np.pi)
+    table["area_px"] = table["area_px"].to_numpy(np.float64) * _area_factor(jacobian)
+    return table
+
+
+def mapped_tracklets(table: pd.DataFrame, transform: PolyprojectiveTransform) -> pd.DataFrame:
+    """Tracklets, in the columns of the contract, on the other picture: places, velocities and their errors."""
+    table = table.copy()
+    places = [table[[f"x_{k}_px", f"y_{k}_px"]].to_numpy(np.float64) for k in range(3)]
+    for k, link in enumerate(("01", "12")):
+        jacobian = transform.jacobian((places[k] + places[k + 1]) / 2)
+        names = [f"v{axis}_{link}_px_per_s" for axis in "xy"]
+        table[names] = np.einsum("nij,nj->ni", jacobian, table[names].to_numpy(np.float64))
+        name = f"displacement_sd_{link}_px"
+        table[name] = table[name].to_numpy(np.float64) * np.sqrt(_area_factor(jacobian))
+    for k, place in enumerate(places):
+        table[[f"x_{k}_px", f"y_{k}_px"]] = transform(place)
+    return table
+
+
+def _area_factor(jacobian: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.abs(np.linalg.det(jacobian)))

@@ -1,0 +1,117 @@
+"""Frames on the working grid: the base image's, scaled so that a car is about 8 x 16 px whatever the footage."""
+
+import io
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.records import GridRecord
+from velfield.detection.motion.difference import MotionBackground
+from velfield.pipeline.plan import Plan
+from velfield.registration.warp import footprint, warp_to_base
+from velfield.run.commits import write_atomically
+from velfield.run.frame_transforms import FrameMap, FrameMaps
+from velfield.run.grid import read_grid
+from velfield.run.layout import RunLayout
+from velfield.run.stores import FrameStore, open_frames
+
+Window = tuple[int, int, int, int]
+"""x, y, width, height in base px."""
+
+
+@dataclass(frozen=True)
+class WorkingFrame:
+    """A window of one frame on the working grid.
+
+    Attributes
+    ----------
+    image, valid
+        (h, w) uint8 grey and bool: where the frame covers the window; elsewhere its edge goes on.
+    window
+        The window, base px.
+    scale
+        Working px a base px.
+    """
+
+    image: NDArray[np.uint8]
+    valid: NDArray[np.bool_]
+    window: Window
+    scale: float
+
+    def to_base(self, xy_work: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Working pixels (n, 2) -> base pixels (n, 2)."""
+        return (xy_work + 0.5) / self.scale - 0.5 + self.window[:2]
+
+    def to_work(self, xy_base: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Base pixels (n, 2) -> working pixels (n, 2)."""
+        return (xy_base - self.window[:2] + 0.5) * self.scale - 0.5
+
+
+@dataclass(frozen=True)
+class WorkingGrid:
+    """Gives any registered frame of a run on the working grid."""
+
+    frames: FrameStore
+    maps: FrameMaps
+    grid: GridRecord
+    scale: float
+
+    @classmethod
+    def open(cls, plan: Plan, scale: float) -> "WorkingGrid":
+        """The working grid of a plan's run folder at a scale."""
+        maps = FrameMaps.open(plan.layout, plan.config)
+        return cls(open_frames(plan.layout.frames), maps, read_grid(plan.layout), scale)
+
+    @property
+    def whole(self) -> Window:
+        """The whole base image."""
+        return 0, 0, self.grid.width_px, self.grid.height_px
+
+    def frame(self, frame: int, window: Window | None = None) -> WorkingFrame | None:
+        """One frame; none where it is not registered or does not meet the base image. ``window`` none: its
+        footprint."""
+        transform = self.maps.transform(frame)
+        if transform is None:
+            return None
+        box = window or self._footprint(transform)
+        if box is None:
+            return None
+        image, valid = warp_to_base(
+            self.frames.read(frame),
+            transform,
+            window=box,
+            scale=self.scale,
+            interpolation=cv2.INTER_CUBIC,
+            continued=True,
+        )
+        return WorkingFrame(image, valid, box, self.scale)
+
+    def _footprint(self, transform: FrameMap) -> Window | None:
+        x0, y0, x1, y1 = footprint(transform, self.frames.shape)
+        if not np.isfinite(x0):
+            return None
+        left, top = max(0, int(np.floor(x0))), max(0, int(np.floor(y0)))
+        right, bottom = min(self.grid.width_px, int(np.ceil(x1)) + 1), min(self.grid.height_px, int(np.ceil(y1)) + 1)
+        return (left, top, right - left, bottom - top) if right > left and bottom > top else None
+
+
+def write_background(layout: RunLayout, background: MotionBackground) -> None:
+    """Write ``base/background.npz``."""
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        allow_pickle=False,
+        median=background.median,
+        low=background.low,
+        high=background.high,
+        valid=background.valid,
+    )
+    write_atomically(layout.background, buffer.getvalue())
+
+
+def read_background(layout: RunLayout) -> MotionBackground:
+    """Read ``base/background.npz``."""
+    with np.load(io.BytesIO(layout.background.read_bytes()), allow_pickle=False) as file:
+        return MotionBackground(file["median"], file["low"], file["high"], file["valid"])

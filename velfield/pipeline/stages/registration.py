@@ -1,0 +1,116 @@
+"""Every frame of a unit to the flight's own base image and to the frame before it, chained in segments."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from velfield.pipeline.plan import Plan
+from velfield.pipeline.progress import advance
+from velfield.pipeline.result import Outcome
+from velfield.pipeline.stages.base_image import FrameKeyPoints, base_reference
+from velfield.registration.intrasensor import FrameRegistration, register_segment
+from velfield.registration.keypoints import KeyPoints
+from velfield.registration.transforms import vector_length
+from velfield.run.frame_transforms import read_lens
+from velfield.run.stores import (
+    ERROR_CELLS,
+    REGISTRATION_COLUMNS,
+    FrameStore,
+    create_registration,
+    open_frames,
+    open_registration,
+    store_key,
+)
+from velfield.sources.flags import UNUSABLE, describe_flags
+
+MAP_PARAMETERS = 65
+"""About how many parameters a frame's map has: its standard error is the residual times sqrt(parameters / points)."""
+
+
+def lay_out_registration(plan: Plan) -> None:
+    """Create ``registration.zarr`` unless it stands as this plan wants it."""
+    path = plan.layout.registration
+    if store_key(path) == plan.keys["registration"]:
+        return
+    length = vector_length(plan.info.width, plan.info.height, plan.config.registration)
+    create_registration(
+        path,
+        key=plan.keys["registration"],
+        count=plan.frame_count,
+        vector_length=length,
+        unit_frames=plan.unit_frames,
+    )
+
+
+def register_unit(plan: Plan, frames: range, blocks: Sequence[Sequence[FrameKeyPoints]]) -> Outcome:
+    """Chain a unit's frames in segments of ``segment_frames``, each seeded anew from the base image."""
+    key_points = {found.frame: found.key_points for block in blocks for found in block}
+    store = open_frames(plan.layout.frames)
+    flags = store.column("flags")
+    reference, lens, config = base_reference(plan), read_lens(plan.layout), plan.config.registration
+    results: dict[int, FrameRegistration] = {}
+    for start in range(frames.start, frames.stop, config.segment_frames):
+        segment = range(start, min(start + config.segment_frames, frames.stop))
+        usable = [frame for frame in segment if not flags[frame] & int(UNUSABLE)]
+        found = register_segment(_read(store, usable, key_points), reference, lens, config)
+        results.update(zip(usable, found, strict=True))
+        advance("registration", len(segment))
+    return _write(plan, frames, flags, results)
+
+
+def _read(
+    store: FrameStore, frames: Sequence[int], key_points: dict[int, KeyPoints]
+) -> Iterator[tuple[int, NDArray[np.uint8], KeyPoints]]:
+    for frame in frames:
+        yield frame, store.read(frame), key_points[frame]
+
+
+def _write(plan: Plan, frames: range, flags: NDArray[np.uint16], results: dict[int, FrameRegistration]) -> Outcome:
+    config = plan.config.registration
+    length = vector_length(plan.info.width, plan.info.height, config)
+    vectors = np.full((len(frames), length), np.nan)
+    columns = {
+        name: np.full(len(frames), np.nan if dtype.startswith("float") else 0, dtype)
+        for name, dtype in REGISTRATION_COLUMNS.items()
+    }
+    errors = np.full((len(frames), *ERROR_CELLS), np.nan, np.float32)
+    statuses = []
+    for k, frame in enumerate(frames):
+        result = results.get(frame)
+        if result is None:
+            statuses.append(f"skipped:{describe_flags(int(flags[frame]))}")
+            continue
+        statuses.append(result.status)
+        if result.transform is not None:
+            vectors[k] = result.transform.to_vector(config)
+        for name in columns:
+            columns[name][k] = getattr(result, name)
+        if result.error_map is not None:
+            errors[k] = result.error_map
+    store = open_registration(plan.layout.registration, "r+")
+    store.write(frames.start, vectors, statuses, {**columns, "error_px": errors})
+    registered = statuses.count("ok")
+    counts = {"frames": float(len(frames)), "registered": float(registered)}
+    if registered:
+        counts["heldout_px"] = float(np.nanmean(columns["heldout_px"]))
+    return Outcome(store.files(frames.start), counts)
+
+
+def usable_frames(plan: Plan) -> NDArray[np.bool_]:
+    """Frames that are registered and that nothing is wrong with, (frames,)."""
+    flags = open_frames(plan.layout.frames).column("flags")
+    statuses = open_registration(plan.layout.registration).statuses()
+    registered = np.array([status == "ok" for status in statuses], np.bool_)
+    return np.asarray(registered & ((flags & int(UNUSABLE)) == 0), np.bool_)
+
+
+def lost_frames(plan: Plan) -> tuple[str, ...]:
+    """Frames in no tracklet, and why, one line each."""
+    times_s = open_frames(plan.layout.frames).column("time_s")
+    statuses = open_registration(plan.layout.registration).statuses()
+    return tuple(
+        f"frame {frame} ({times_s[frame]:.3f} s): {status or 'not worked on'}"
+        for frame, status in enumerate(statuses)
+        if status != "ok"
+    )

@@ -1,0 +1,149 @@
+"""The page of a run, ``index.html``: the viewer, and as its summary the report: what was done, how well, the maps."""
+
+import datetime
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from schemas.report import PrecisionRecall, Report, ReportStage, ResidualSeries
+from schemas.summary import RunSummary, StageSummary
+from velfield.analysis.coverage import few_vehicles, percent
+from velfield.detection.detector import load_detector
+from velfield.pipeline.plan import Plan
+from velfield.pipeline.version import code_version
+from velfield.report.report import render_report
+from velfield.report.run_figures import report_figures
+from velfield.report.viewer_page import NOT_BUILT, licences, page_is_built, render_viewer
+from velfield.run.commits import write_atomically
+from velfield.run.grid import north_of, read_grid, read_working
+from velfield.run.stores import open_frames, open_registration
+from velfield.viewer.record import write_view_record
+
+_LEARNT_FROM = {
+    "labels": "marked cars",
+    "motion": "what moves in the flight",
+    "file": "a detector file",
+    "shipped": "the shipped detector",
+    "detections": "another detector's boxes",
+}
+
+
+def write_report(plan: Plan, summary: RunSummary) -> list[str]:
+    """Write ``index.html``, the viewer with the report as its summary, and what both are made from.
+
+    Returns
+    -------
+    Warnings, one line each: the viewer is not built, and the report stands alone.
+    """
+    layout, report = plan.layout, make_report(plan, summary)
+    write_atomically(layout.report_record, report.model_dump_json().encode())
+    write_view_record(layout)
+    figures = report_figures(layout.maps)
+    if not page_is_built():
+        write_atomically(layout.report, render_report(report, list(figures.values())).encode())
+        return [NOT_BUILT]
+    named = [figure.model_copy(update={"data": b"", "file": f"view/{name}.jpg"}) for name, figure in figures.items()]
+    for name, figure in figures.items():
+        write_atomically(layout.view / f"{name}.jpg", figure.data)
+    write_atomically(layout.view / "LICENSES.txt", licences().encode())
+    write_atomically(layout.report, render_viewer(report, named).encode())
+    return []
+
+
+def _name(plan: Plan) -> str:
+    """The video's name; a folder's with the one that it lies in, for it may well be called ``frames``."""
+    source = Path(plan.job.inputs.source)
+    parts = [part for part in source.parts if part != source.anchor]
+    return "/".join(parts[-2:] if plan.info.kind == "folder" else parts[-1:])
+
+
+def make_report(plan: Plan, summary: RunSummary) -> Report:
+    """What the report tells."""
+    counts = {stage.name: stage.counts for stage in summary.stages}
+    return Report(
+        title=f"Velocity field of {_name(plan)}",
+        source=plan.job.inputs.source,
+        created=datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
+        version=code_version(),
+        facts=tuple(_facts(plan, counts)),
+        few=few_vehicles(int(counts["field"].get("pixels", 0)), int(counts["field"].get("pixels_5", 0))),
+        inputs=tuple(_inputs(plan)),
+        stages=tuple(
+            ReportStage(name=s.name, text=s.text, seconds=s.seconds + s.seconds_before, lost=len(s.lost))
+            for s in summary.stages
+        ),
+        residual=_residual(plan),
+        detection=_curve(plan),
+        gates=_gates(summary.stages),
+        notes=tuple(note for stage in summary.stages for note in stage.notes),
+        warnings=(*plan.info.warnings, *(warning for stage in summary.stages for warning in stage.warnings)),
+        frames_lost=summary.frames_lost,
+        files=tuple(_files(plan)),
+    )
+
+
+def _facts(plan: Plan, counts: dict[str, dict[str, float]]) -> list[tuple[str, str]]:
+    times_s = plan.info.times_s[plan.indices]
+    grid, field = read_grid(plan.layout), counts["field"]
+    pixels = field.get("pixels", 0)
+    frames, registered = counts["registration"].get("frames", 0), counts["registration"].get("registered", 0)
+    return [
+        ("flight", f"{times_s[-1] - times_s[0]:.1f} s, {plan.frame_count} frames"),
+        ("registered", f"{registered:.0f} of {frames:.0f} frames"),
+        ("residual", f"{counts['registration'].get('heldout_px', float('nan')):.2f} px held out"),
+        ("cars found", f"{counts['detections'].get('cars', 0):.0f}"),
+        ("vehicles going by", f"{counts['tracklets'].get('passages', 0):.0f}"),
+        ("of the map, passed by vehicles", percent(pixels, grid.width_px * grid.height_px)),
+        ("of that, by 5 or more", percent(field.get("pixels_5", 0), pixels)),
+    ]
+
+
+def _inputs(plan: Plan) -> list[tuple[str, str]]:
+    grid, working = read_grid(plan.layout), read_working(plan.layout)
+    gsd = f"{grid.gsd_m:.4g} m a pixel" if grid.gsd_m else "not known: speeds in px/s"
+    return [
+        ("base image", plan.job.inputs.base or "built from the flight"),
+        ("ground sample distance", gsd),
+        ("cars learnt from", _LEARNT_FROM[working.learnt_from]),
+        ("preset", plan.config.preset),
+        ("frame size", f"{plan.info.width} x {plan.info.height} px"),
+    ]
+
+
+def _residual(plan: Plan) -> ResidualSeries:
+    times_s = open_frames(plan.layout.frames).column("time_s")
+    heldout = open_registration(plan.layout.registration).column("heldout_px")
+    return ResidualSeries(
+        times_s=tuple(float(time) for time in times_s),
+        residual_px=tuple(float(value) if np.isfinite(value) else None for value in heldout),
+        limit_px=plan.config.registration.max_residual_px,
+    )
+
+
+def _curve(plan: Plan) -> PrecisionRecall | None:
+    if not plan.layout.detector.exists():
+        return None
+    curve = load_detector(plan.layout.detector).curve
+    if curve is None:
+        return None
+    return PrecisionRecall(recall=curve.recall, precision=curve.precision, chosen=curve.chosen, evidence=curve.evidence)
+
+
+def _gates(stages: Sequence[StageSummary]) -> dict[str, int]:
+    links = next(stage for stage in stages if stage.name == "links")
+    return {name.removeprefix("gate_"): int(count) for name, count in links.counts.items() if name.startswith("gate_")}
+
+
+def _files(plan: Plan) -> list[tuple[str, str]]:
+    layout, told = plan.layout, []
+    north = "the picture's up: north is not known" if north_of(read_grid(plan.layout)) is None else "north"
+    for path, what in (
+        (layout.maps / "direction.png", "modal direction"),
+        (layout.maps / "speed.png", "modal speed"),
+        (layout.maps / "direction.tif", f"modal direction for GIS, degrees clockwise from {north}"),
+        (layout.maps / "speed.tif", "modal speed for GIS"),
+    ):
+        if path.exists():
+            told.append((path.relative_to(layout.root).as_posix(), what))
+    return told

@@ -1,0 +1,91 @@
+"""A detector from marked cars, apart from any run: what `velfield train` does."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from schemas.flight import FlightConfig
+from velfield.detection.detector import Detector, load_detector, save_detector, shipped_detector
+from velfield.detection.motion.labels import working_scale
+from velfield.detection.review import review_sheet, taken_for_cars
+from velfield.detection.samples import LabelledImage
+from velfield.detection.train import train_detector
+from velfield.errors import InputError
+from velfield.pipeline.stages.labels import car_length_raw_px, labelled_images
+from velfield.report.figures import png_bytes
+from velfield.sources.labels.labels import Labels, load_labels
+from velfield.sources.source import probe
+
+SHIPPED = "shipped"
+
+
+@dataclass(frozen=True)
+class Training:
+    """A detector, and the pictures that it was learnt from, on the working grid."""
+
+    detector: Detector
+    samples: tuple[LabelledImage, ...]
+    labels: Labels
+
+
+def train_from_labels(source: Path, labels: Path, config: FlightConfig, *, continued: str | None = None) -> Training:
+    """Train on the labelled frames of a video or picture folder.
+
+    Parameters
+    ----------
+    source, labels
+        As for ``velfield run``.
+    config
+        ``gsd_m`` sets the working scale where it is known, else the labels' length does.
+    continued
+        A detector file whose rounds the new ones mend, or ``shipped``.
+
+    Raises
+    ------
+    InputError
+        Labels that cannot be read, of unknown size, or too few.
+    """
+    fps = (config.frames.fps or 1.0) if source.is_dir() else None  # pictures need no times to be learnt from
+    info = probe(source, frames=config.frames.model_copy(update={"fps": fps}))
+    found = load_labels(labels, info)
+    samples = tuple(labelled_images(source, info, found, work_per_raw=_scale(config, found)))
+    detector = train_detector(samples, config.detection, continued=_earlier(continued))
+    return Training(detector, samples, found)
+
+
+def _scale(config: FlightConfig, labels: Labels) -> float:
+    """Working px a raw px."""
+    if config.gsd_m is not None:
+        return working_scale(config.detection, config.gsd_m)
+    length = car_length_raw_px(labels.cars)
+    if not np.isfinite(length):
+        raise InputError("the labels have no length_px and --gsd-m is not given, expected either; give --gsd-m")
+    return config.detection.working_car_length_px / length
+
+
+def _earlier(name: str | None) -> Detector | None:
+    if name is None:
+        return None
+    return shipped_detector() if name == SHIPPED else load_detector(Path(name))
+
+
+def write_training(training: Training, out: Path, review: Path | None = None) -> list[str]:
+    """Write the detector file, and where asked for the contact sheet; lines for people."""
+    save_detector(training.detector, out)
+    record, lines = training.detector.record, [*training.labels.notes]
+    lines.append(f"{out}: {record.cars} cars, frames marked: {len(training.samples)}, threshold {record.threshold:.3f}")
+    if record.curve is not None and record.curve.chosen is not None:
+        k = record.curve.chosen
+        precision, recall = record.curve.precision[k], record.curve.recall[k]
+        lines.append(f"precision {precision:.2f} at recall {recall:.2f}: {record.curve.evidence}")
+    else:
+        lines.append(
+            "too few cars are marked to leave some out: how good the detector is, is not known; mark 16 or more"
+        )
+    if review is not None:
+        kinds = taken_for_cars(training.detector, training.samples)
+        review.write_bytes(png_bytes(review_sheet(kinds)))
+        counts = ", ".join(f"{len(chips)} {name}" for name, chips in kinds.items())
+        lines.append(f"{review}: {counts}")
+    return lines

@@ -1,0 +1,38 @@
+"""A change between two fields over the dimmed base image: blue for less, orange for more."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from velfield.report.colours import RGB, change_colours
+from velfield.report.figures import MapScale, over_picture, round_up
+from velfield.report.panel import Legend, draw_bar_panel
+
+
+def change_figure(grey: NDArray[np.uint8], change: NDArray[np.floating], scale: MapScale, *, title: str) -> RGB:
+    """The figure of one quantity's change.
+
+    Parameters
+    ----------
+    grey
+        (h, w) base image.
+    change
+        (h, w) change, in the unit that the title names. Nothing is drawn where it is NaN.
+    scale
+        What the legend says of the map.
+
+    Returns
+    -------
+    ndarray
+        (h, w + legend, 3) uint8 RGB.
+
+    Raises
+    ------
+    InputError
+        Where the shapes differ.
+    """
+    known = np.isfinite(change)
+    top = round_up(float(np.percentile(np.abs(change[known]), 99))) if known.any() else 10.0
+    picture = over_picture(grey, change, change_colours(change / top))
+    legend = Legend(title, "After less before, where it is more than chance. Bare grey: no change that can be told.")
+    panel = draw_bar_panel(grey.shape, legend, top=top, gsd_m=scale.gsd_m, north_rad=scale.north_rad, changes=True)
+    return np.hstack([picture, panel])

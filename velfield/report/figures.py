@@ -1,0 +1,185 @@
+"""The field's two figures over the dimmed base image (paper: velocity field): direction as hue, speed as colour."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from velfield.errors import InputError
+from velfield.report.colours import RGB, direction_colours, ramp_colours
+from velfield.report.panel import Legend, draw_bar_panel, draw_wheel_panel
+
+SpeedUnit = Literal["km/h", "mph", "m/s", "px/s"]
+PER_M_PER_S: dict[SpeedUnit, float] = {"km/h": 3.6, "mph": 2.2369362920544, "m/s": 1.0}
+"""How many of a unit make one metre a second; px/s is not metric."""
+
+_DIMMED = 0.5
+"""Brightness of the base image under the colours."""
+_COVER = 0.88
+"""How much of a known pixel is colour; the rest lets the picture's texture through."""
+
+
+@dataclass(frozen=True)
+class MapScale:
+    """What the legend needs to know of the map.
+
+    Attributes
+    ----------
+    gsd_m
+        Metres a base pixel; None: speeds are shown in px/s and the scale bar in px.
+    unit
+        Unit of speed for people.
+    north_rad
+        Where north is in the picture, from +x towards +y (down): -pi/2 where it is up. None: not known, and said so.
+    """
+
+    gsd_m: float | None = None
+    unit: SpeedUnit = "km/h"
+    north_rad: float | None = None
+
+    @property
+    def shown_unit(self) -> SpeedUnit:
+        """The unit that speeds can be shown in."""
+        return "px/s" if self.gsd_m is None else self.unit
+
+    def shown_speed(self, speed_px_per_s: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Speeds in the unit that they are shown in."""
+        speed = np.asarray(speed_px_per_s, np.float64)
+        if self.gsd_m is None or self.unit == "px/s":
+            return speed
+        return speed * self.gsd_m * PER_M_PER_S[self.unit]
+
+
+def direction_figure(grey: NDArray[np.uint8], direction_rad: NDArray[np.floating], scale: MapScale) -> RGB:
+    """The modal direction as hue, with a colour wheel beside it.
+
+    Parameters
+    ----------
+    grey
+        (h, w) base image.
+    direction_rad
+        (h, w) direction of motion, from +x towards +y (down). Nothing is drawn where it is NaN.
+    scale
+        What the legend says of the map.
+
+    Returns
+    -------
+    ndarray
+        (h, w + legend, 3) uint8 RGB; the map itself at base resolution, its pixels where they were.
+
+    Raises
+    ------
+    InputError
+        Where the shapes differ.
+    """
+    _same_shape(grey, direction_rad)
+    picture = _over(grey, direction_colours(direction_rad), ~np.isnan(direction_rad))
+    legend = Legend("Direction of travel", "Hue: the way most vehicles go. Bare grey: none seen, or they stand.")
+    return np.hstack([picture, draw_wheel_panel(grey.shape, legend, gsd_m=scale.gsd_m, north_rad=scale.north_rad)])
+
+
+def speed_figure(
+    grey: NDArray[np.uint8],
+    speed_px_per_s: NDArray[np.floating],
+    scale: MapScale,
+    *,
+    top: float | None = None,
+    bar_gsd_m: float | None = None,
+) -> RGB:
+    """The modal speed as colour, with a bar beside it; parameters as in `direction_figure`.
+
+    Parameters
+    ----------
+    speed_px_per_s
+        (h, w) speed, px/s. Nothing is drawn where it is NaN.
+    top
+        Speed at the bar's end, in the shown unit; None: the round number above `speed_reach`, as on the page.
+    bar_gsd_m
+        Metres a pixel of the figure, for the scale bar, where it is not drawn at base resolution.
+    """
+    _same_shape(grey, speed_px_per_s)
+    shown = scale.shown_speed(speed_px_per_s)
+    if top is None:
+        reach = speed_reach(shown)
+        top = 10.0 if reach is None else round_up(reach)
+    picture = _over(grey, ramp_colours(shown / top), np.isfinite(shown))
+    note = "Colour: the speed that most vehicles have. Bare grey: none seen."
+    highest = float(np.nanmax(shown, initial=0.0))
+    if highest > top:
+        note += f" Above {top:g} all has the last colour; the highest is {highest:.3g}."
+    legend = Legend(f"Speed, {scale.shown_unit}", note)
+    gsd_m = scale.gsd_m if bar_gsd_m is None else bar_gsd_m
+    panel = draw_bar_panel(grey.shape, legend, top=top, gsd_m=gsd_m, north_rad=scale.north_rad)
+    return np.hstack([picture, panel])
+
+
+def speed_reach(speed: NDArray[np.floating]) -> float | None:
+    """What 99 % of the known speeds stay below: where the colours end, then rounded up. One false fast track does not
+    flatten all others. None where none is known."""
+    known = speed[np.isfinite(speed)]
+    return float(np.percentile(known, 99)) if known.size else None
+
+
+def round_up(value: float) -> float:
+    """The next number of 1, 1.2, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten.
+
+    Examples
+    --------
+    >>> round_up(53.0), round_up(0.0), round_up(106.0), round_up(140.0)
+    (60.0, 1.0, 120.0, 150.0)
+    """
+    if not value > 0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(value))
+    for step in (1.0, 1.2, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0):
+        if value <= step * power * (1 + 1e-9):
+            return float(step * power)
+    return float(10 * power)
+
+
+def png_bytes(rgb: RGB) -> bytes:
+    """An RGB or grey picture as PNG."""
+    order = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR) if rgb.ndim == 3 else rgb
+    done, data = cv2.imencode(".png", order)
+    if not done:
+        raise ValueError(f"no PNG can be made of an array of shape {rgb.shape} and type {rgb.dtype}")
+    return bytes(data)
+
+
+def jpeg_bytes(rgb: RGB, *, quality: int = 88, max_side: int | None = None) -> bytes:
+    """An RGB picture as JPEG, reduced so that no side is longer than ``max_side``: for pages that must stay small."""
+    if max_side is not None and max(rgb.shape[:2]) > max_side:
+        factor = max_side / max(rgb.shape[:2])
+        rgb = np.asarray(cv2.resize(rgb, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise ValueError(f"no JPEG can be made of an array of shape {rgb.shape} and type {rgb.dtype}")
+    return bytes(data)
+
+
+def over_picture(grey: NDArray[np.uint8], values: NDArray[np.floating], colours: RGB) -> RGB:
+    """(h, w, 3) colours over the dimmed picture where the values are known.
+
+    Raises
+    ------
+    InputError
+        Where the shapes differ.
+    """
+    _same_shape(grey, values)
+    return _over(grey, colours, np.isfinite(values))
+
+
+def _over(grey: NDArray[np.uint8], colours: RGB, known: NDArray[np.bool_]) -> RGB:
+    """Colours over the dimmed picture where known, modulated a little by it so that kerbs and lanes stay visible."""
+    base = np.repeat((grey.astype(np.float32) * _DIMMED)[..., None], 3, axis=2)
+    tinted = colours * (_COVER + (1 - _COVER) * grey[..., None].astype(np.float32) / 255)
+    return np.where(known[..., None], tinted, base).astype(np.uint8)
+
+
+def _same_shape(grey: NDArray[np.uint8], values: NDArray[np.floating]) -> None:
+    if grey.shape != values.shape:
+        raise InputError(
+            f"the base image is {grey.shape} and the field {values.shape} (height, width): they must agree"
+        )

@@ -1,0 +1,194 @@
+"""The report: one HTML file that holds all it shows, opens offline, and runs no script.
+
+A content security policy in the page lets nothing in from elsewhere: pictures are ``data:``, the one style sheet is
+admitted by its hash, everything that came from outside (names, messages) is escaped.
+"""
+
+from base64 import b64encode
+from collections.abc import Iterable, Sequence
+from hashlib import sha256
+from html import escape
+from importlib.resources import files
+from urllib.parse import quote
+
+from schemas.report import Report, ReportFigure, ReportStage
+from velfield.report.gates import left_out, totals
+from velfield.report.plots import precision_recall_plot, residual_plot
+
+
+def render_report(report: Report, figures: Sequence[ReportFigure]) -> str:
+    """The report as one HTML document.
+
+    Parameters
+    ----------
+    report
+        What is told.
+    figures
+        What is shown: the maps first.
+    """
+    style = report_style()
+    digest = b64encode(sha256(style.encode()).digest()).decode()
+    policy = (
+        f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'; "
+        "base-uri 'none'; form-action 'none'"
+    )  # fmt: skip
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<meta name="referrer" content="no-referrer">\n<link rel="icon" href="data:,">\n'
+        f"<title>{escape(report.title)}</title>\n<style>{style}</style>\n</head>\n<body>\n"
+        f"<header><h1>{escape(report.title)}</h1><p>{escape(report.source)}</p></header>\n"
+        f"{render_sections(report, figures)}\n</body>\n</html>\n"
+    )
+
+
+def report_style() -> str:
+    """The style sheet of what `render_sections` gives."""
+    return files("velfield.report").joinpath("report.css").read_text(encoding="utf-8")
+
+
+def render_sections(report: Report, figures: Sequence[ReportFigure]) -> str:
+    """The report's sections and footer: what stands in a page's body below its title."""
+    sections = [
+        _warnings(report),
+        _section("Few vehicles at each pixel", f"<p>{escape(report.few)}</p>", "few") if report.few else "",
+        _facts(report.facts),
+        _section("Notes", _items(report.notes), "notes") if report.notes else "",
+        *map(_figure, figures),
+        _stages(report.stages),
+        _registration(report),
+        _detection(report),
+        _gates(report.gates),
+        _frames_lost(report.frames_lost),
+        _pairs("What went in", report.inputs),
+        _files(report.files),
+    ]
+    return (
+        "<main>\n"
+        + "\n".join(section for section in sections if section)
+        + f"\n</main>\n<footer>velfield {escape(report.version)}, {escape(report.created)}</footer>"
+    )
+
+
+def _section(title: str, body: str, kind: str = "") -> str:
+    attribute = f' class="{kind}"' if kind else ""
+    return f"<section{attribute}><h2>{escape(title)}</h2>{body}</section>"
+
+
+def _items(texts: Iterable[str]) -> str:
+    return "<ul>" + "".join(f"<li>{escape(text)}</li>" for text in texts) + "</ul>"
+
+
+def _warnings(report: Report) -> str:
+    lost = sum(stage.lost for stage in report.stages)
+    said = list(report.warnings)
+    if report.frames_lost or lost:
+        said.insert(0, f"Not complete: {len(report.frames_lost)} frames and {lost} units lost. They are listed below.")
+    return _section("Warnings", _items(said), "warnings") if said else ""
+
+
+def _facts(facts: Sequence[tuple[str, str]]) -> str:
+    if not facts:
+        return ""
+    cells = "".join(f"<div><dt>{escape(label)}</dt><dd>{escape(value)}</dd></div>" for label, value in facts)
+    return f'<section class="facts" aria-label="In short"><dl>{cells}</dl></section>'
+
+
+def _figure(figure: ReportFigure) -> str:
+    if figure.file is None:
+        source = f'src="data:{figure.mime};base64,{b64encode(figure.data).decode()}"'
+    else:
+        source = f'loading="lazy" src="{_path(figure.file)}"'
+    image = f'<img alt="{escape(figure.alternative)}" {source}>'
+    link = ""
+    if figure.full_size:
+        link = f' <a href="{_path(figure.full_size)}">Full size</a>'
+    body = f"<figure>{image}<figcaption>{escape(figure.caption)}{link}</figcaption></figure>"
+    return _section(figure.title, body)
+
+
+def _stages(stages: Sequence[ReportStage]) -> str:
+    if not stages:
+        return ""
+    rows = "".join(
+        f'<tr><th scope="row">{escape(stage.name)}</th><td>{escape(stage.text)}</td>'
+        f'<td class="number">{stage.seconds:.1f}</td></tr>'
+        for stage in stages
+    )
+    total = sum(stage.seconds for stage in stages)
+    head = _head("Stage", "Result", number="Seconds of work")
+    foot = f'<tfoot><tr><th scope="row">all</th><td></td><td class="number">{total:.1f}</td></tr></tfoot>'
+    return _section("Stages", f'<div class="scroll"><table>{head}<tbody>{rows}</tbody>{foot}</table></div>')
+
+
+def _head(*names: str, number: str) -> str:
+    cells = "".join(f'<th scope="col">{name}</th>' for name in names)
+    return f'<thead><tr>{cells}<th scope="col" class="number">{number}</th></tr></thead>'
+
+
+def _registration(report: Report) -> str:
+    series = report.residual
+    if series is None or not series.times_s:
+        return ""
+    good = sorted(r for r in series.residual_px if r is not None)
+    text = f"{len(good)} of {len(series.times_s)} frames registered."
+    if good:
+        middle, late = good[len(good) // 2], good[min(int(len(good) * 0.95), len(good) - 1)]
+        text += f" Residual on control points left out of the fit: median {middle:.2f} px, 95 % below {late:.2f} px."
+    return _section("Registration", f"<p>{escape(text)}</p>{residual_plot(series)}")
+
+
+def _detection(report: Report) -> str:
+    curve = report.detection
+    if curve is None or not curve.recall:
+        return ""
+    evidence = f"<p>Measured on {escape(curve.evidence)}.</p>" if curve.evidence else ""
+    return _section("Detection", evidence + precision_recall_plot(curve))
+
+
+def _gates(gates: dict[str, int]) -> str:
+    if not gates:
+        return ""
+    kept = _table(["What was tried and kept", "Number"], totals(gates), numbers=1)
+    lost = _table(["Left out", "Why", "Number", "Share"], left_out(gates), numbers=2)
+    return _section("Tracking", f'<div class="scroll narrow">{kept}</div><div class="scroll narrow">{lost}</div>')
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: int) -> str:
+    """A table whose last columns are numbers; nothing where it has no rows."""
+    if not rows:
+        return ""
+    kinds = [""] * (len(head) - numbers) + [' class="number"'] * numbers
+    titles = "".join(f'<th scope="col"{kind}>{title}</th>' for title, kind in zip(head, kinds, strict=True))
+    body = "".join(
+        "<tr>" + "".join(f"<td{kind}>{escape(cell)}</td>" for cell, kind in zip(row, kinds, strict=True)) + "</tr>"
+        for row in rows
+    )
+    return f"<table><thead><tr>{titles}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _frames_lost(frames: Sequence[str]) -> str:
+    if not frames:
+        return ""
+    body = f"<details><summary>{len(frames)} frames are in no tracklet</summary>{_items(frames)}</details>"
+    return _section("Frames lost", body)
+
+
+def _pairs(title: str, pairs: Sequence[tuple[str, str]]) -> str:
+    if not pairs:
+        return ""
+    rows = "".join(f'<tr><th scope="row">{escape(a)}</th><td>{escape(b)}</td></tr>' for a, b in pairs)
+    return _section(title, f'<div class="scroll narrow"><table><tbody>{rows}</tbody></table></div>')
+
+
+def _files(listed: Sequence[tuple[str, str]]) -> str:
+    if not listed:
+        return ""
+    items = "".join(f'<li><a href="{_path(path)}">{escape(path)}</a> {escape(what)}</li>' for path, what in listed)
+    return _section("Files", f"<ul>{items}</ul>")
+
+
+def _path(relative: str) -> str:
+    """A path inside the run folder as a link; quoting the colon keeps it from being read as a scheme."""
+    return "./" + quote(relative)

@@ -1,0 +1,54 @@
+"""The figures of a run's report, read from its maps."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from schemas.report import ReportFigure
+from velfield.report.figures import jpeg_bytes
+
+_PICTURE_SIDE_PX = 1600
+_CAPTIONS = {
+    "direction": (
+        "Which way traffic goes",
+        "The modal direction of travel at every pixel that vehicles passed, as hue; none where they stand.",
+        "map of the modal direction over the base image",
+    ),
+    "speed": (
+        "How fast it goes",
+        "The modal speed at every pixel that vehicles passed.",
+        "map of the modal speed over the base image",
+    ),
+    "lens": (
+        "The lens",
+        "A frame as it was taken, and as a pin-hole would have taken it. The orange grid is straight on the ground: "
+        "kerbs and roofs along it follow it in both.",
+        "a frame before and after the lens's distortion is taken out",
+    ),
+    "registration": (
+        "How well frames lie on the map",
+        "Error of control points held out of the fit, px, by cell of the frame, all frames together.",
+        "registration error by cell over a frame",
+    ),
+}
+"""Picture of ``maps/`` -> title, caption, and what it shows for those who do not see it."""
+
+
+def report_figures(maps: Path) -> dict[str, ReportFigure]:
+    """The figures of a run's report from its folder of maps, their bytes in them, by name."""
+    figures = {}
+    for name, (title, caption, alternative) in _CAPTIONS.items():
+        if not (maps / f"{name}.png").exists():
+            continue  # a pin-hole has no before and after
+        encoded = np.frombuffer((maps / f"{name}.png").read_bytes(), np.uint8)
+        picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+        figures[name] = ReportFigure(
+            title=title,
+            caption=caption,
+            alternative=alternative,
+            mime="image/jpeg",
+            data=jpeg_bytes(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), max_side=_PICTURE_SIDE_PX),
+            full_size=f"maps/{name}.png",
+        )
+    return figures

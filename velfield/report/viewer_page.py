@@ -1,0 +1,81 @@
+"""The pages with scripts: a run's viewer and the annotator, each one HTML file with its script and style inside.
+
+The scripts are built from ``page/`` in the repository (`make page`) into ``velfield/report/page/``, which the wheel
+ships. Where they are not built there is no page, and whoever asks is told so.
+"""
+
+import json
+from base64 import b64encode
+from collections.abc import Mapping, Sequence
+from hashlib import sha256
+from html import escape
+from importlib.resources import files
+
+import numpy as np
+
+from schemas.report import Report, ReportFigure
+from velfield.report.colours import direction_colours, ramp_colours
+from velfield.report.report import render_sections, report_style
+
+_COLOURS = 512
+NOT_BUILT = "the viewer page is not built in this checkout, index.html is the report alone: `make page`, then run again"
+
+
+def page_is_built() -> bool:
+    """Whether the pages' scripts are there."""
+    return files("velfield.report").joinpath("page/viewer.js").is_file()
+
+
+def licences() -> str:
+    """Licences of the packages that the scripts hold."""
+    return _built("LICENSES.txt")
+
+
+def render_viewer(report: Report, figures: Sequence[ReportFigure]) -> str:
+    """A run's page: the map, which reads the run folder's tiles, and the report as its summary.
+
+    A content security policy lets nothing in from elsewhere; ``wasm-unsafe-eval`` admits the decoder of the tiles,
+    ``data:`` among what may be connected to is where that decoder stands.
+    """
+    return _page(
+        "viewer",
+        {"title": escape(report.title), "source": escape(report.source), "report": render_sections(report, figures)},
+    )
+
+
+def render_annotator(title: str, told: Mapping[str, object]) -> str:
+    """The page to mark cars on; ``told`` is what its server tells it."""
+    return _page("annotate", {"title": escape(title), "told": _json(told)})
+
+
+def _page(name: str, parts: Mapping[str, str]) -> str:
+    style, script = report_style() + _built(f"{name}.css"), _built(f"{name}.js")
+    policy = (
+        f"default-src 'none'; script-src '{_hash(script)}' 'wasm-unsafe-eval'; style-src '{_hash(style)}'; "
+        "img-src 'self' data: blob:; connect-src 'self' data:; base-uri 'none'; form-action 'none'"
+    )
+    filled = {"policy": policy, "style": style, "colours": _json(_colours()), "script": script, **parts}
+    pieces = _built(f"{name}.html").split("{{")
+    html = [pieces[0]]
+    for piece in pieces[1:]:  # each part once, and nothing that a part holds is looked at
+        part, _, rest = piece.partition("}}")
+        html += [filled[part], rest]
+    return "".join(html)
+
+
+def _built(name: str) -> str:
+    return files("velfield.report").joinpath(f"page/{name}").read_text(encoding="utf-8")
+
+
+def _hash(text: str) -> str:
+    return "sha256-" + b64encode(sha256(text.encode()).digest()).decode()
+
+
+def _json(value: object) -> str:
+    """JSON that may stand in a script element: no end tag, no comment can be in it."""
+    return json.dumps(value).replace("<", "\\u003c")
+
+
+def _colours() -> dict[str, str]:
+    wheel = direction_colours(np.arange(_COLOURS) * (2 * np.pi / _COLOURS))
+    return {"wheel": wheel.tobytes().hex(), "ramp": ramp_colours(np.linspace(0, 1, _COLOURS)).tobytes().hex()}

@@ -1,0 +1,144 @@
+"""Content keys and commit records: what is finished is known from these alone.
+
+A unit is done when its record stands under ``commits/`` with the key that the present inputs, parameters and code give,
+and what it names is there. The record is written last, atomically; a run killed before it does the unit again.
+"""
+
+import hashlib
+import io
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import IO
+
+from pydantic import BaseModel, ValidationError
+
+from schemas.records import CommitRecord
+from velfield.run.layout import RunLayout
+from velfield.run.paths import is_remote
+
+_WHOLE_FILE_BYTES = 256 * 2**20
+_SAMPLE_BYTES = 2**20
+_SAMPLES = 64
+
+
+def digest_bytes(data: bytes) -> str:
+    """BLAKE2b of ``data``, 128 bits, hexadecimal."""
+    return hashlib.blake2b(data, digest_size=16).hexdigest()
+
+
+def digest_file(path: Path) -> str:
+    """Digest of a file's content; of a file above 256 MiB, of its size and 64 blocks of 1 MiB spread over it.
+
+    Hashing a flight of hours whole would cost more than decoding its first minutes.
+    """
+    if is_remote(path):
+        data = path.read_bytes()  # one request; its size and its blocks would be more
+        return _digest_stream(io.BytesIO(data), len(data))
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        return _digest_stream(file, size)
+
+
+def _digest_stream(file: IO[bytes], size: int) -> str:
+    digest = hashlib.blake2b(str(size).encode(), digest_size=16)
+    if size <= _WHOLE_FILE_BYTES:
+        while block := file.read(_SAMPLE_BYTES):
+            digest.update(block)
+    else:
+        for k in range(_SAMPLES):
+            file.seek((size - _SAMPLE_BYTES) * k // (_SAMPLES - 1))
+            digest.update(file.read(_SAMPLE_BYTES))
+    return digest.hexdigest()
+
+
+def digest_path(path: Path) -> str:
+    """Digest of a file, or of a folder's files by name and content."""
+    if path.is_dir():
+        files = sorted(p for p in path.rglob("*") if p.is_file())
+        return digest_bytes("".join(f"{p.relative_to(path)}\0{digest_file(p)}\n" for p in files).encode())
+    return digest_file(path)
+
+
+def content_key(
+    stage: str, version: int, *, parameters: Iterable[object] = (), inputs: Iterable[str | None] = ()
+) -> str:
+    """Key of a stage: equal exactly when its inputs, its parameters and its code's version are.
+
+    Examples
+    --------
+    >>> content_key("lens", 1, inputs=["a"]) == content_key("lens", 1, inputs=["a"])
+    True
+    >>> content_key("lens", 1, inputs=["a"]) == content_key("lens", 2, inputs=["a"])
+    False
+    """
+    plain = [p.model_dump(mode="json") if isinstance(p, BaseModel) else p for p in parameters]
+    text = json.dumps([stage, version, plain, list(inputs)], sort_keys=True, allow_nan=False)
+    return digest_bytes(text.encode())
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write ``data`` so that ``path`` is either as it was or whole."""
+    if is_remote(path):
+        path.write_bytes(data)
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    with partial.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
+
+
+def sweep_partial(root: Path) -> int:
+    """Remove ``.partial`` files that a killed run left behind; returns how many. On S3 there are none."""
+    if is_remote(root):
+        return 0
+    found = list(root.rglob("*.partial"))
+    for path in found:
+        path.unlink(missing_ok=True)
+    return len(found)
+
+
+def commit_path(layout: RunLayout, stage: str, unit: str) -> Path:
+    """Path of the record of one unit."""
+    return layout.commits / stage / f"{unit}.json"
+
+
+def write_commit(layout: RunLayout, record: CommitRecord) -> None:
+    """Say that a unit is finished: the last thing a unit does."""
+    write_atomically(commit_path(layout, record.stage, record.unit), record.model_dump_json(indent=1).encode())
+
+
+def read_commit(layout: RunLayout, stage: str, unit: str) -> CommitRecord | None:
+    """The record of a unit, or ``None`` where it is not finished: one that cannot be read says nothing."""
+    path = commit_path(layout, stage, unit)
+    try:
+        return CommitRecord.model_validate_json(path.read_bytes())
+    except (FileNotFoundError, ValidationError):
+        return None
+
+
+def read_commits(layout: RunLayout, stage: str) -> list[CommitRecord]:
+    """The records of all units of a stage that are finished, in the order of their names."""
+    found = (read_commit(layout, stage, path.stem) for path in sorted((layout.commits / stage).glob("*.json")))
+    return [record for record in found if record is not None]
+
+
+def finished(layout: RunLayout, stage: str, unit: str, key: str) -> CommitRecord | None:
+    """The record of a unit where it was finished under this very key and its outputs still stand."""
+    record = read_commit(layout, stage, unit)
+    if record is None or record.key != key:
+        return None
+    outputs = list(record.outputs)
+    if is_remote(layout.root):
+        # A request each, for hundreds a unit: S3 loses no objects, and `velfield verify` looks at all of them.
+        outputs = outputs[-1:]
+    return record if all((layout.root / output).exists() for output in outputs) else None
+
+
+def digest_outputs(layout: RunLayout, paths: Iterable[Path]) -> dict[str, str]:
+    """Digests of files a unit wrote, by path in the run folder."""
+    return {path.relative_to(layout.root).as_posix(): digest_file(path) for path in paths}

@@ -1,0 +1,154 @@
+"""Fields of run folders added and subtracted, tile by tile: exact, and never more than a tile of each in memory."""
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from schemas.records import FlightRecord
+from velfield.errors import InputError
+from velfield.field.accumulate import FieldTile
+from velfield.field.algebra import merge_tiles, subtract_tile
+from velfield.field.bins import VelocityBins
+from velfield.run.commits import content_key, digest_file
+from velfield.run.field_reader import TileReader, tile_reader
+from velfield.run.field_writer import GroupWriter, create_field_store, groups_of
+from velfield.run.grid import read_grid
+from velfield.run.layout import RunLayout
+from velfield.run.stores import HISTOGRAM_BY_TIME, FieldStore, open_field, store_key
+
+Combine = Callable[[Sequence[FieldTile | None]], FieldTile | None]
+
+_SAME = ("bin_width_px_per_s", "kernel_sigma_px_per_s", "band_radius_px", "velocity_span_s", "weighted_by", "gsd_m")
+_SAME_PLACE = ("crs_wkt", "geotransform")
+
+
+def merge_fields(roots: Sequence[Path], out: Path) -> None:
+    """The sum of the fields of run folders, into a new folder that `open_run(out).field` reads.
+
+    Raises
+    ------
+    InputError
+        Fewer than two folders, fields on different grids, or ``out`` holds something.
+    """
+    if len(roots) < 2:
+        raise InputError(f"merge needs two or more run folders, found {len(roots)}")
+
+    def add(tiles: Sequence[FieldTile | None]) -> FieldTile | None:
+        there = [tile for tile in tiles if tile is not None]
+        return merge_tiles(there) if there else None
+
+    stores = _open_alike(roots)
+    observed_s = sum(float(store.attributes.get("observed_s", 0.0)) for store in stores)
+    _write(roots, stores, out, add, observed_s, {"merged_from": [str(root) for root in roots]})
+
+
+def subtract_fields(whole: Path, part: Path, out: Path) -> None:
+    """What is left of the field of ``whole`` without that of ``part``, into a new folder.
+
+    Raises
+    ------
+    InputError
+        The fields are on different grids, ``part`` is no part of ``whole``, or ``out`` holds something.
+    """
+
+    def take_away(tiles: Sequence[FieldTile | None]) -> FieldTile | None:
+        large, small = tiles
+        if small is None:
+            return large
+        if large is None:
+            raise InputError(f"{part} has passages where {whole} has none: it is no part of it")
+        return subtract_tile(large, small)
+
+    stores = _open_alike([whole, part])
+    seconds = [float(store.attributes.get("observed_s", 0.0)) for store in stores]
+    made_from = {"subtracted_from": str(whole), "subtracted": str(part)}
+    _write([whole, part], stores, out, take_away, max(seconds[0] - seconds[1], 0.0), made_from)
+
+
+def check_same_grid(first: Path, other: Path) -> None:
+    """Fields can be put together only where a pixel and a bin of one are those of the other.
+
+    Raises
+    ------
+    InputError
+        One line: what differs, and what to do.
+    """
+    a, b = (open_field(RunLayout(root).field) for root in (first, other))
+    if a.shape != b.shape or a.tile != b.tile:
+        raise InputError(_apart(first, other, "size", f"{a.shape[::-1]} px", f"{b.shape[::-1]} px"))
+    for name in (*_SAME, *_SAME_PLACE):
+        if a.attributes.get(name) != b.attributes.get(name):
+            raise InputError(_apart(first, other, name, a.attributes.get(name), b.attributes.get(name)))
+    if "velocity_noise" not in a.layer_names() or "velocity_noise" not in b.layer_names():
+        raise InputError(f"{first} or {other} was written by an older velfield: run the flight again")
+    if not a.attributes.get("crs_wkt") and _base_digest(first) != _base_digest(other):
+        raise InputError(
+            f"{first} and {other} have different base images, and no coordinates that tie their pixels together: "
+            "run both with the same --base"
+        )
+
+
+def _apart(first: Path, other: Path, what: str, a: object, b: object) -> str:
+    return (
+        f"the fields of {first} and {other} are on different grids: {what} is {_short(a)} and {_short(b)}; "
+        "run both with the same --base, --gsd-m and field settings"
+    )
+
+
+def _short(value: object) -> str:
+    text = str(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _base_digest(root: Path) -> str:
+    layout = RunLayout(root)
+    path = layout.base_image_tif if layout.base_image_tif.exists() else layout.base_image
+    return digest_file(path)
+
+
+def _open_alike(roots: Sequence[Path]) -> list[FieldStore]:
+    for other in roots[1:]:
+        check_same_grid(roots[0], other)
+    return [open_field(RunLayout(root).field) for root in roots]
+
+
+def _write(
+    roots: Sequence[Path],
+    stores: Sequence[FieldStore],
+    out: Path,
+    combine: Combine,
+    observed_s: float,
+    made_from: Mapping[str, object],
+) -> None:
+    layout, like = RunLayout(out), RunLayout(roots[0])
+    if out.exists() and any(out.iterdir()):
+        raise InputError(f"--out {out} is there and holds files: give a folder that is not there yet")
+    config = FlightRecord.model_validate_json(like.flight.read_bytes()).config.field
+    grid = read_grid(like)
+    out.mkdir(parents=True, exist_ok=True)
+    shutil.copytree(like.base, layout.base)
+    key = content_key("algebra", 1, parameters=list(made_from), inputs=[store_key(store.path) for store in stores])
+    create_field_store(
+        layout.field,
+        key=key,
+        grid=grid,
+        config=config,
+        weighted_by=stores[0].attributes["weighted_by"],
+        observed_s=observed_s,
+        by_time=all(HISTOGRAM_BY_TIME in store.histogram_names() for store in stores),
+        more=made_from,
+    )
+    target = open_field(layout.field, "r+")
+    kinds = [[tile_reader(store, name) for store in stores] for name in target.histogram_names()]
+    bins = VelocityBins.from_config(config, grid.gsd_m)
+    for group in groups_of(grid, config):
+        _write_group(GroupWriter(target, group, grid=grid, config=config, bins=bins), kinds, combine)
+    shutil.copy(like.flight, layout.flight)  # last: a folder without it was not written whole
+
+
+def _write_group(writer: GroupWriter, kinds: Sequence[Sequence[TileReader]], combine: Combine) -> None:
+    for row, column in writer.tiles():
+        tile, *timed = (combine([read(row, column) for read in readers]) for readers in kinds)
+        if tile is not None:
+            writer.put(row, column, tile, timed[0].histogram if timed and timed[0] else None)
+    writer.close()

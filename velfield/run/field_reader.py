@@ -1,0 +1,108 @@
+"""The velocity field of a run folder, read tile by tile; a tile that must be there and is not is an error."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+
+from schemas.flight import FieldConfig
+from schemas.records import FlightRecord, GridRecord
+from velfield.errors import InputError
+from velfield.field.accumulate import FieldTile
+from velfield.field.bins import VelocityBins, standing_px_per_s
+from velfield.field.view import Tile, VelocityField
+from velfield.run.grid import read_grid
+from velfield.run.layout import RunLayout
+from velfield.run.stores import HISTOGRAM, HISTOGRAM_BY_TIME, FieldStore, StoreError, open_field
+
+TileReader = Callable[[int, int], FieldTile | None]
+"""Gives the tile (row, column); None where nobody passed."""
+
+
+@dataclass(frozen=True)
+class FieldSlice:
+    """The field of a slice of time; the ends of what lies in no interval asked for are infinite."""
+
+    name: str
+    start_s: float
+    stop_s: float
+    observed_s: float
+    field: VelocityField
+
+
+def open_velocity_field(layout: RunLayout, *, by_time: bool = False) -> VelocityField:
+    """The field of a run folder, weighed by passage or by time.
+
+    Raises
+    ------
+    InputError
+        The field was not built yet, or not with that weight.
+    """
+    config = FlightRecord.model_validate_json(layout.flight.read_bytes()).config.field
+    return field_of_store(open_field(layout.field), config, read_grid(layout), by_time=by_time)
+
+
+def open_field_slices(layout: RunLayout) -> list[FieldSlice]:
+    """The slices of time of a run folder, in their order; none where none were asked for."""
+    config = FlightRecord.model_validate_json(layout.flight.read_bytes()).config.field
+    grid = read_grid(layout)
+    found = []
+    for path in sorted(layout.slices.glob("*.zarr")):
+        store = open_field(path)
+        about = store.attributes
+        ends = float(about.get("start_s", -inf)), float(about.get("stop_s", inf))
+        field = field_of_store(store, config, grid)
+        found.append(FieldSlice(str(about["slice"]), *ends, float(about["observed_s"]), field))
+    return found
+
+
+def field_of_store(store: FieldStore, config: FieldConfig, grid: GridRecord, *, by_time: bool = False) -> VelocityField:
+    """The field in a store that was laid out under a configuration."""
+    path, histogram = store.path, HISTOGRAM_BY_TIME if by_time else HISTOGRAM
+    if histogram not in store.histogram_names():
+        raise InputError(f"{path} holds no {histogram}: run the flight again with --set field.by_time=true")
+    if "velocity_noise" not in store.layer_names():
+        raise InputError(f"{path} was written by an older velfield and has no intervals: run the flight again")
+    count = store.layer("count")
+    read = tile_reader(store, histogram)
+
+    def tile(row: int, column: int) -> Tile | None:
+        found = read(row, column)
+        return None if found is None else (found.histogram, found.count, found.noise)
+
+    return VelocityField(
+        tile,
+        tiles=known_tiles(count, store.tile),
+        shape=store.shape,
+        tile_size=store.tile,
+        bins=VelocityBins.from_config(config, grid.gsd_m),
+        standing_px_per_s=standing_px_per_s(config, grid.gsd_m),
+        layers=None if by_time else store.layer,
+    )
+
+
+def tile_reader(store: FieldStore, histogram: str = HISTOGRAM) -> TileReader:
+    """Reads whole tiles: a histogram, and the layers that add up with it."""
+    sums = {name: store.layer(name) for name in ("count", "dwell_ms", "velocity_noise")}
+    side = store.tile
+
+    def read(row: int, column: int) -> FieldTile | None:
+        place = np.s_[row * side : (row + 1) * side, column * side : (column + 1) * side]
+        count, dwell_ms, noise = (layer[place] for layer in sums.values())
+        if not count.any():
+            return None
+        if not store.has_tile(row, column, histogram):
+            raise StoreError(
+                f"{store.path / histogram}: the chunk of tile ({row}, {column}) is gone; run the flight again"
+            )
+        return FieldTile(store.read_tile(row, column, histogram), count, dwell_ms, noise)
+
+    return read
+
+
+def known_tiles(count: np.ndarray, side: int) -> list[tuple[int, int]]:
+    """Tiles that hold a passage: these must be in the store."""
+    rows, columns = np.nonzero(count)
+    tiles = np.unique(np.column_stack([rows // side, columns // side]), axis=0)
+    return [(int(row), int(column)) for row, column in tiles]

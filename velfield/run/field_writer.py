@@ -1,0 +1,158 @@
+"""Groups of tiles into ``field.zarr``: the histogram tile by tile, the layers of the whole group at once."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.flight import FieldConfig
+from schemas.records import GridRecord
+from velfield.field.accumulate import UNIT, FieldTile, Weight
+from velfield.field.bins import VelocityBins, band_radius_px
+from velfield.run.field_layers import LAYERS, tile_layers
+from velfield.run.stores import HISTOGRAM, HISTOGRAM_BY_TIME, FieldStore, create_field
+
+GROUP_TILES = 8
+"""A group is so many tiles high and wide: 512 x 512 px, a unit of work and a chunk of the layers."""
+
+Group = tuple[int, int]
+"""(row, column)."""
+
+
+def groups_of(grid: GridRecord, config: FieldConfig) -> list[Group]:
+    """All groups of tiles of a base image."""
+    side = config.tile_size_px * GROUP_TILES
+    rows, columns = -(-grid.height_px // side), -(-grid.width_px // side)
+    return [(row, column) for row in range(rows) for column in range(columns)]
+
+
+class GroupWriter:
+    """Writes one group of tiles: the tiles as they come, the layers when all have."""
+
+    def __init__(
+        self, store: FieldStore, group: Group, *, grid: GridRecord, config: FieldConfig, bins: VelocityBins
+    ) -> None:
+        self.store, self.group, self.config, self.bins = store, group, config, bins
+        self.side = config.tile_size_px * GROUP_TILES
+        self.y0, self.x0 = group[0] * self.side, group[1] * self.side
+        self.height, self.width = min(self.side, grid.height_px - self.y0), min(self.side, grid.width_px - self.x0)
+        self.touched: list[tuple[int, int]] = []
+        self.layers: dict[str, NDArray[Any]] = {
+            name: np.full((self.height, self.width), _fill(attrs), attrs.get("dtype", "float32"))
+            for name, attrs in LAYERS.items()
+        }
+
+    def tiles(self) -> list[tuple[int, int]]:
+        """Tiles (row, column) of the group."""
+        size = self.config.tile_size_px
+        rows = range(self.y0 // size, -(-(self.y0 + self.height) // size))
+        columns = range(self.x0 // size, -(-(self.x0 + self.width) // size))
+        return [(row, column) for row in rows for column in columns]
+
+    def origin_xy(self, row: int, column: int) -> tuple[int, int]:
+        """Base pixel (x, y) of a tile's first pixel."""
+        return column * self.config.tile_size_px, row * self.config.tile_size_px
+
+    def tile_shape(self, row: int, column: int) -> tuple[int, int]:
+        """(height, width) of a tile: less at the map's edge."""
+        x, y = self.origin_xy(row, column)
+        size = self.config.tile_size_px
+        return min(size, self.y0 + self.height - y), min(size, self.x0 + self.width - x)
+
+    def put(self, row: int, column: int, tile: FieldTile, by_time: NDArray[np.int32] | None = None) -> None:
+        """Write one tile, and its histogram weighed by time where there is one; a tile nobody passed is left out."""
+        if not tile.count.any():
+            return
+        self.store.write_tile(row, column, tile.histogram)
+        if by_time is not None:
+            self.store.write_tile(row, column, by_time, HISTOGRAM_BY_TIME)
+        self.touched.append((row, column))
+        x, y = self.origin_xy(row, column)
+        height, width = tile.count.shape
+        place = np.s_[y - self.y0 : y - self.y0 + height, x - self.x0 : x - self.x0 + width]
+        for name, values in tile_layers(tile, self.bins, self.config).items():
+            self.layers[name][place] = values
+
+    def close(self) -> None:
+        """Write the layers."""
+        for name, values in self.layers.items():
+            self.store.write_layer(name, self.y0, self.x0, values)
+
+    def files(self) -> list[Path]:
+        """What was written, once closed; and what describes it."""
+        return self.store.files(self.touched, self.group)
+
+
+def _fill(attributes: dict[str, object]) -> float:
+    return np.nan if str(attributes.get("dtype", "float32")).startswith("float") else 0
+
+
+def create_field_store(
+    path: Path,
+    *,
+    key: str,
+    grid: GridRecord,
+    config: FieldConfig,
+    weighted_by: Weight,
+    observed_s: float,
+    by_time: bool,
+    more: Mapping[str, object] | None = None,
+) -> None:
+    """Lay out a field's store; ``more`` goes to its attributes beside what a reader needs.
+
+    Parameters
+    ----------
+    weighted_by
+        What a passage adds at a pixel.
+    observed_s
+        How long traffic was watched, s: what counts are compared by.
+    by_time
+        Whether the histogram weighed by time is kept too.
+    """
+    bins = VelocityBins.from_config(config, grid.gsd_m)
+    attributes = {
+        "title": "velocity field",
+        "weight_unit": UNIT,
+        "weighted_by": weighted_by,
+        "bin_width_px_per_s": bins.width_px_per_s,
+        "kernel_sigma_px_per_s": bins.kernel_sigma_px_per_s,
+        "band_radius_px": band_radius_px(config, grid.gsd_m),
+        "velocity_span_s": config.velocity_span_s,
+        "observed_s": observed_s,
+        "gsd_m": grid.gsd_m,
+        "crs_wkt": grid.crs_wkt,
+        "geotransform": " ".join(repr(v) for v in grid.affine) if grid.affine else None,
+        **(more or {}),
+    }
+    create_field(
+        path,
+        key=key,
+        height=grid.height_px,
+        width=grid.width_px,
+        tile=config.tile_size_px,
+        group_tiles=GROUP_TILES,
+        velocities_px_per_s=bins.centres_px_per_s,
+        attributes={name: value for name, value in attributes.items() if value is not None},
+        histograms=_histograms(weighted_by, by_time),
+        layers=LAYERS,
+    )
+
+
+def _histograms(weighted_by: Weight, by_time: bool) -> dict[str, dict[str, str]]:
+    """Attributes of the histograms kept, by name."""
+    found = {
+        HISTOGRAM: {
+            "long_name": f"velocity histogram, weighted by {weighted_by}",
+            "units": f"1/{UNIT} {weighted_by}",
+            "weighted_by": weighted_by,
+        }
+    }
+    if by_time:
+        found[HISTOGRAM_BY_TIME] = {
+            "long_name": "velocity histogram, weighted by time",
+            "units": f"1/{UNIT} s",
+            "weighted_by": "time",
+        }
+    return found

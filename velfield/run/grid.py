@@ -1,0 +1,50 @@
+"""The grid of base pixels of a run."""
+
+from functools import lru_cache
+
+import numpy as np
+
+from schemas.records import GridRecord, WorkingRecord
+from velfield.errors import InputError
+from velfield.run.layout import RunLayout
+
+
+def read_grid(layout: RunLayout) -> GridRecord:
+    """``base/grid.json``.
+
+    Raises
+    ------
+    InputError
+        The base image was not made yet.
+    """
+    if not layout.grid.exists():
+        raise InputError(f"{layout.grid} is not there: run `velfield run` on this folder first")
+    return _parse(layout.grid.read_bytes())
+
+
+def read_working(layout: RunLayout) -> WorkingRecord:
+    """``base/working.json``.
+
+    Raises
+    ------
+    InputError
+        The detector was not made yet.
+    """
+    if not layout.working.exists():
+        raise InputError(f"{layout.working} is not there: run `velfield run` on this folder first")
+    return WorkingRecord.model_validate_json(layout.working.read_bytes())
+
+
+def north_of(grid: GridRecord) -> float | None:
+    """Where north is in the picture, from +x towards +y (down); none where the base image has no place on earth."""
+    if grid.affine is None:
+        return None
+    a, b, _, d, e, _ = grid.affine
+    # One step north in the CRS, as a step of pixels: the inverse of [[a, b], [d, e]] times (0, 1).
+    determinant = a * e - b * d
+    return float(np.arctan2(a / determinant, -b / determinant))
+
+
+@lru_cache(maxsize=8)
+def _parse(data: bytes) -> GridRecord:
+    return GridRecord.model_validate_json(data)

@@ -1,0 +1,198 @@
+"""What stands behind a result, told offline from the run folder alone: stages and keys, or a pixel's evidence."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from schemas.records import CommitRecord, RebaseRecord
+from velfield.errors import InputError
+from velfield.field.accumulate import accumulate_tile
+from velfield.field.bins import VelocityBins, band_radius_px
+from velfield.field.segments import SEGMENT_DTYPE, Segments, segment_table
+from velfield.run.commits import read_commits
+from velfield.run.grid import read_working
+from velfield.run.layout import STAGES
+from velfield.run.run import Run
+
+
+@dataclass(frozen=True)
+class StageLineage:
+    """One stage: its content key and the units that are finished."""
+
+    name: str
+    key: str
+    units: int
+    outputs: int
+    code_versions: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PassageLineage:
+    """One vehicle that went over the pixel: its tracklets there, and the frames that they were seen in."""
+
+    passage_id: int
+    tracklets: tuple[int, ...]
+    frames: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class FrameLineage:
+    """One frame behind the pixel."""
+
+    frame: int
+    source_index: int
+    time_s: float
+    heldout_px: float
+    """RMS of the control points that its registration left out, base px."""
+
+
+@dataclass(frozen=True)
+class PixelLineage:
+    """All that stands behind one pixel of the field."""
+
+    x: int
+    y: int
+    passages: tuple[PassageLineage, ...]
+    frames: tuple[FrameLineage, ...]
+
+
+def stage_lineage(run: Run) -> list[StageLineage]:
+    """The run's stages in the order of the work, those that are done."""
+    found = []
+    for stage in STAGES:
+        records = read_commits(run.layout, stage)
+        if records:
+            key = run.record.keys.get(stage) or records[0].key
+            outputs = sum(len(record.outputs) for record in records)
+            versions = tuple(sorted({record.code_version for record in records}))
+            found.append(StageLineage(stage, key, len(records), outputs, versions))
+    return found
+
+
+def pixel_lineage(run: Run, x: int, y: int) -> PixelLineage:
+    """The vehicles, tracklets and frames behind a pixel: exactly those that the field counts there.
+
+    Raises
+    ------
+    InputError
+        The pixel is outside the base image.
+    """
+    width, height = run.grid.width_px, run.grid.height_px
+    if not (0 <= x < width and 0 <= y < height):
+        raise InputError(f"pixel ({x}, {y}) is outside the base image of {width} x {height} px")
+    tracklets = run.tracklets()
+    touching = _touching(run, _near(tracklets, x, y, _reach(run)), x, y)
+    passages = tuple(_passages(tracklets, touching))
+    return PixelLineage(x, y, passages, _frames(run, sorted({f for passage in passages for f in passage.frames})))
+
+
+def _reach(run: Run) -> float:
+    return (band_radius_px(run.record.config.field, run.grid.gsd_m) or 0.0) + 1.0
+
+
+def _near(tracklets: pd.DataFrame, x: int, y: int, reach: float) -> pd.DataFrame:
+    """All tracklets of the passages that come near: a shared segment's velocity is averaged along its passage."""
+    xs = tracklets[[f"x_{k}_px" for k in range(3)]].to_numpy()
+    ys = tracklets[[f"y_{k}_px" for k in range(3)]].to_numpy()
+    across = (xs.min(axis=1, initial=np.inf) - reach <= x) & (x <= xs.max(axis=1, initial=-np.inf) + reach)
+    down = (ys.min(axis=1, initial=np.inf) - reach <= y) & (y <= ys.max(axis=1, initial=-np.inf) + reach)
+    return tracklets[tracklets["passage_id"].isin(tracklets.loc[across & down, "passage_id"])]
+
+
+def _touching(run: Run, tracklets: pd.DataFrame, x: int, y: int) -> Segments:
+    """Segments that the field's own kernel counts at the pixel, each asked by itself."""
+    config, gsd_m = run.record.config.field, run.grid.gsd_m
+    segments = segment_table(tracklets, config) if len(tracklets) else np.empty(0, SEGMENT_DTYPE)
+    bins, radius = VelocityBins.from_config(config, gsd_m), band_radius_px(config, gsd_m)
+    touches = (
+        [
+            bool(accumulate_tile(one, origin_xy=(x, y), shape=(1, 1), bins=bins, radius_px=radius).count.any())
+            for one in np.split(segments, len(segments))
+        ]
+        if len(segments)
+        else []
+    )
+    return segments[np.array(touches, np.bool_)]
+
+
+def _passages(tracklets: pd.DataFrame, segments: Segments) -> Iterator[PassageLineage]:
+    for passage in np.unique(segments["passage"]):
+        mine = segments[segments["passage"] == passage]
+        pairs = set(zip(mine["detection_0"].tolist(), mine["detection_1"].tolist(), strict=True))
+        rows = tracklets[(tracklets["passage_id"] == passage) & _has_pair(tracklets, pairs)]
+        frames = np.unique(rows[["frame_0", "frame_1", "frame_2"]].to_numpy())
+        yield PassageLineage(int(passage), tuple(map(int, rows["tracklet_id"])), tuple(map(int, frames)))
+
+
+def _has_pair(tracklets: pd.DataFrame, pairs: set[tuple[int, int]]) -> NDArray[np.bool_]:
+    ids = tracklets[[f"detection_id_{k}" for k in range(3)]].to_numpy()
+    return np.array([(a, b) in pairs or (b, c) in pairs for a, b, c in ids.tolist()], np.bool_)
+
+
+def _frames(run: Run, frames: list[int]) -> tuple[FrameLineage, ...]:
+    index, times_s = run.frames.column("source_index"), run.times_s
+    heldout = run.registration.column("heldout_px")
+    return tuple(FrameLineage(f, int(index[f]), float(times_s[f]), float(heldout[f])) for f in frames)
+
+
+def describe_detector(run: Run) -> str:
+    """The detector in one line: its file's digest, and what it was learnt from."""
+    working = read_working(run.layout)
+    if working.learnt_from == "detections":
+        return f"another detector's boxes, digest {run.record.inputs.detections}"
+    how = {
+        "labels": f"learnt from {working.labels} marked cars (digest of the labels {run.record.inputs.labels})",
+        "motion": f"learnt from {working.labels} cars that moved",
+        "file": f"given as a file, digest {run.record.inputs.detector}",
+        "shipped": "the shipped one",
+    }[working.learnt_from]
+    return f"detector.json, digest {_output(run, 'detector', 'detector.json')}, {how}"
+
+
+def describe_base_image(run: Run) -> str:
+    """The base image in one line: whence it is, and how well the flight lies on it."""
+    grid = run.grid
+    name = (run.layout.base_image_tif if run.layout.base_image_tif.exists() else run.layout.base_image).name
+    digest = _output(run, "base", f"base/{name}")
+    whence = f"given, digest {run.record.inputs.base}" if grid.how == "given" else "built from the flight"
+    line = f"base/{name}, digest {digest}, {grid.width_px} x {grid.height_px} px, {whence}"
+    if grid.intersensor_error_px is not None:
+        line += f"; the flight lies on it to {grid.intersensor_error_px:.2f} px"
+    if run.layout.rebased.exists():
+        line += f"; {RebaseRecord.model_validate_json(run.layout.rebased.read_bytes()).text()}"
+    return line
+
+
+def _output(run: Run, stage: str, name: str) -> str:
+    records: list[CommitRecord] = read_commits(run.layout, stage)
+    return next((record.outputs[name] for record in records if name in record.outputs), "not recorded")
+
+
+def describe_lineage(run: Run) -> str:
+    """The run's chain of stages and keys, for people."""
+    source = run.record.inputs.source
+    lines = [f"source        {source.path}, digest {source.digest}, {source.frame_count} frames"]
+    lines += [
+        f"{s.name:<14}{s.key}  units {s.units}, files {s.outputs}, velfield {', '.join(s.code_versions)}"
+        for s in stage_lineage(run)
+    ]
+    return "\n".join([*lines, f"base image    {describe_base_image(run)}", f"cars by       {describe_detector(run)}"])
+
+
+def describe_pixel(run: Run, pixel: PixelLineage) -> str:
+    """A pixel's lineage, for people."""
+    vehicles, tracklets = len(pixel.passages), sum(len(p.tracklets) for p in pixel.passages)
+    head = f"pixel ({pixel.x}, {pixel.y}): {vehicles} vehicles went by, {tracklets} tracklets in "
+    lines = [f"{head}{len(pixel.frames)} frames of {run.record.inputs.source.path}"]
+    for passage in pixel.passages:
+        lines.append(f"passage {passage.passage_id}: tracklets {', '.join(map(str, passage.tracklets))}")
+        lines.append(f"  seen in frames {', '.join(map(str, passage.frames))}")
+    if pixel.frames:
+        lines.append("frame  source frame  time        held-out residual")
+        lines += [
+            f"{f.frame:>5}  {f.source_index:>12}  {f.time_s:>8.3f} s  {f.heldout_px:.2f} px" for f in pixel.frames
+        ]
+    return "\n".join([*lines, f"base image    {describe_base_image(run)}", f"cars by       {describe_detector(run)}"])

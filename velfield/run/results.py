@@ -1,0 +1,146 @@
+"""The results of one flight on several base images: each a run folder of its own, sharing what did not change.
+
+``RUN`` is the first; others stand under ``RUN/results/NAME`` and are named in ``RUN/results.json``. One in the making
+has a name that begins with a full stop, and gets its own in one step when it is whole.
+"""
+
+import datetime
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+from schemas.records import FlightRecord, RebaseRecord, ResultRecord, ResultsRecord
+from velfield.errors import InputError
+from velfield.run.commits import commit_path, digest_path, finished, read_commits, write_atomically
+from velfield.run.layout import RunLayout
+from velfield.run.paths import remove_tree, rename_tree
+from velfield.run.run import Run
+from velfield.run.tables import link_files
+
+FIRST = "first"
+_LAST = "flight.json"
+"""What stands in a result that has its name: where names are given file by file, it is the last of them."""
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+
+
+def result_name(asked: str | None, base: Path) -> str:
+    """Name of a new result: the one asked for, else the base image's.
+
+    Raises
+    ------
+    InputError
+        It is no plain name: results stay inside the run folder.
+
+    Examples
+    --------
+    >>> result_name(None, Path("maps/spring 2026.tif"))
+    'spring-2026'
+    """
+    name = re.sub(r"[^A-Za-z0-9._-]+", "-", base.stem).strip(".-") if asked is None else asked
+    if not _NAME.fullmatch(name) or name == FIRST:
+        raise InputError(f"--out {name!r}: expected a name of letters, digits, '.', '_' and '-', other than {FIRST!r}")
+    return name
+
+
+def unfinished(layout: RunLayout, name: str) -> RunLayout:
+    """Where a result stands until it is whole."""
+    return RunLayout(layout.results / f".{name}.unfinished")
+
+
+def named(root: Path) -> Path:
+    """Where a run folder stands once it is whole: elsewhere only while it is a result in the making.
+
+    Examples
+    --------
+    >>> named(Path("RUN/results/.spring.unfinished")).as_posix()
+    'RUN/results/spring'
+    """
+    name = root.name
+    return root.with_name(name[1:-11]) if name.startswith(".") and name.endswith(".unfinished") else root
+
+
+def read_results(layout: RunLayout) -> tuple[ResultRecord, ...]:
+    """All results, the first one first; none where there is but the one."""
+    path = layout.results_index
+    return ResultsRecord.model_validate_json(path.read_bytes()).results if path.exists() else ()
+
+
+def made_before(layout: RunLayout, name: str, base: Path) -> bool:
+    """Whether this very result is there already.
+
+    Raises
+    ------
+    InputError
+        A result of that name stands there, of another base image.
+    """
+    if not (layout.results / name / _LAST).exists():
+        return False
+    record = FlightRecord.model_validate_json((layout.results / name / _LAST).read_bytes())
+    if record.inputs.base != digest_path(base):
+        raise InputError(f"{layout.results / name} is another base image's result; name this one with --out")
+    return True
+
+
+def share(old: RunLayout, new: RunLayout, stages: Iterable[str], *, without: tuple[str, ...] = ()) -> None:
+    """Give the new result what it has in common with the old: the outputs of stages, then their commit records.
+
+    Outputs whose path begins as one of ``without`` does are the new result's own, and so not in those records.
+    """
+    for stage in stages:
+        for record in read_commits(old, stage):
+            if finished(new, stage, record.unit, record.key):
+                continue
+            outputs = {name: digest for name, digest in record.outputs.items() if not name.startswith(without)}
+            link_files([(old.root / name, new.root / name) for name in outputs])
+            kept = record.model_copy(update={"outputs": outputs})
+            write_atomically(commit_path(new, stage, record.unit), kept.model_dump_json(indent=1).encode())
+
+
+def discard(layout: RunLayout) -> None:
+    """Remove a result that came to nothing."""
+    remove_tree(layout.root)
+
+
+def publish(run: Run, name: str, base: Path) -> Path:
+    """The new result is whole: give it its name, and write down both."""
+    layout = run.layout
+    target = layout.results / name
+    waiting = unfinished(layout, name).root
+    if (target / _LAST).exists():
+        remove_tree(waiting)  # what a process that was killed while it gave the name left
+    else:
+        rename_tree(waiting, target, last=_LAST)
+    others = [result for result in read_results(layout) if result.name != name] or [_first(run)]
+    records = ResultsRecord(results=(*others, _result(name, target, base)))
+    write_atomically(layout.results_index, records.model_dump_json(indent=1).encode())
+    return target
+
+
+def _first(run: Run) -> ResultRecord:
+    given = run.record.given
+    return ResultRecord(
+        name=FIRST,
+        path=".",
+        base=given.base if given else None,
+        base_digest=run.record.inputs.base,
+        how="run",
+        created=_time_of(run.layout.flight),
+    )
+
+
+def _result(name: str, root: Path, base: Path) -> ResultRecord:
+    path = RunLayout(root).rebased
+    mapped = RebaseRecord.model_validate_json(path.read_bytes()) if path.exists() else None
+    return ResultRecord(
+        name=name,
+        path=f"results/{name}",
+        base=str(base),
+        base_digest=digest_path(base),
+        how="mapped" if mapped else "registered again",
+        added_error_px=mapped.added_error_px if mapped else None,
+        created=_time_of(RunLayout(root).flight),
+    )
+
+
+def _time_of(path: Path) -> str:
+    return datetime.datetime.fromtimestamp(path.stat().st_mtime).astimezone().isoformat(timespec="seconds")

@@ -1,0 +1,148 @@
+"""`open_run`: one object over a run folder, the Python side of the contract of outputs."""
+
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from schemas.records import FORMAT_VERSION, FlightRecord, GridRecord
+from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
+from velfield.analysis.crossings import line_crossings, settle_px
+from velfield.errors import InputError
+from velfield.field.segments import Segments, segment_table
+from velfield.field.view import VelocityField
+from velfield.run.field_reader import FieldSlice, open_field_slices, open_velocity_field
+from velfield.run.frame_transforms import FrameMaps
+from velfield.run.grid import read_grid
+from velfield.run.layout import RunLayout
+from velfield.run.paths import local_copy
+from velfield.run.stores import FrameStore, RegistrationStore, open_frames, open_registration
+from velfield.run.tables import read_tables
+
+Points = NDArray[np.float64]
+_EACH_ONCE = {"weigh_shared_segments": "once"}
+"""The preset `paper` weighs segments that two tracklets share twice; who counts vehicles does not."""
+
+
+def open_run(root: str | Path) -> "Run":
+    """Open a run folder for reading.
+
+    Raises
+    ------
+    InputError
+        The folder is not a run folder, or one of another format.
+    """
+    layout = RunLayout(Path(root))
+    if not layout.flight.exists():
+        raise InputError(
+            f"{root} is not a run folder: it has no flight.json; make one with `velfield run ... --out {root}`"
+        )
+    record = FlightRecord.model_validate_json(layout.flight.read_bytes())
+    if record.format_version != FORMAT_VERSION:
+        raise InputError(
+            f"{root} is a run folder of format {record.format_version}, this velfield reads {FORMAT_VERSION}; "
+            "run the flight again into a new folder"
+        )
+    return Run(layout, record)
+
+
+class Run:
+    """A run folder, read lazily: opening one reads no picture and no table.
+
+    Frames are numbered as in ``frames.zarr``; points are (x, y), pixel (0, 0) being the centre of the top-left pixel.
+    """
+
+    def __init__(self, layout: RunLayout, record: FlightRecord) -> None:
+        self.layout = layout
+        self.record = record
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.layout.root)!r}, {self.frames.count} frames)"
+
+    @cached_property
+    def frames(self) -> FrameStore:
+        """The frames: ``run.frames.read(frame)`` is (h, w) uint8."""
+        return open_frames(self.layout.frames)
+
+    @cached_property
+    def registration(self) -> RegistrationStore:
+        """Per-frame results of registration."""
+        return open_registration(self.layout.registration)
+
+    @cached_property
+    def grid(self) -> GridRecord:
+        """The grid of base pixels."""
+        return read_grid(self.layout)
+
+    @cached_property
+    def maps(self) -> FrameMaps:
+        """Raw pixels <-> base pixels of each frame."""
+        return FrameMaps.open(self.layout, self.record.config)
+
+    @property
+    def times_s(self) -> NDArray[np.float64]:
+        """(frames,) true times, s."""
+        return self.frames.column("time_s")
+
+    @property
+    def registration_status(self) -> list[str]:
+        """(frames,) ``ok``, ``failed:<reason>`` or ``skipped:<reason>``."""
+        return self.registration.statuses()
+
+    def to_base(self, frame: int, xy_raw: Points) -> Points:
+        """Raw pixels of a frame -> base pixels, (n, 2) -> (n, 2); NaN rows where the frame is not registered."""
+        return self._mapped("to_base", frame, xy_raw)
+
+    def to_raw(self, frame: int, xy_base: Points) -> Points:
+        """Base pixels -> raw pixels of a frame, (n, 2) -> (n, 2); NaN rows where there is no such pixel."""
+        return self._mapped("to_raw", frame, xy_base)
+
+    def _mapped(self, direction: str, frame: int, xy: Points) -> Points:
+        points = np.asarray(xy, np.float64).reshape(-1, 2)
+        transform = self.maps.transform(frame)
+        if transform is None:
+            return np.full_like(points, np.nan)
+        mapped: Points = getattr(transform, direction)(points)
+        return mapped
+
+    def detections(self) -> pd.DataFrame:
+        """All cars found, in base pixels: the columns of ``schemas.tables.DETECTION_COLUMNS``."""
+        return read_tables(sorted(self.layout.detections.glob("unit-*.parquet")), DETECTION_COLUMNS)
+
+    def tracklets(self) -> pd.DataFrame:
+        """All tracklets, in base pixels: the columns of ``schemas.tables.TRACKLET_COLUMNS``."""
+        return read_tables(sorted(self.layout.tracklets.glob("unit-*.parquet")), TRACKLET_COLUMNS)
+
+    def segments(self) -> Segments:
+        """Vehicles from one frame to the next, each once: by passage and time (`velfield.field.segments`)."""
+        return segment_table(self.tracklets(), self.record.config.field.model_copy(update=_EACH_ONCE))
+
+    def crossings(self, start_xy: tuple[float, float], end_xy: tuple[float, float]) -> pd.DataFrame:
+        """Who crosses the line between two base pixels, which way and how fast: `line_crossings`."""
+        return line_crossings(self.segments(), start_xy, end_xy, settle_px=settle_px(self.grid.gsd_m))
+
+    @cached_property
+    def field(self) -> VelocityField:
+        """The velocity field."""
+        return open_velocity_field(self.layout)
+
+    @cached_property
+    def field_by_time(self) -> VelocityField:
+        """The velocity field weighed by time: a vehicle that stays counts for as long as it does."""
+        return open_velocity_field(self.layout, by_time=True)
+
+    @cached_property
+    def field_slices(self) -> dict[str, FieldSlice]:
+        """Fields of slices of time by name, in their order; empty where none were asked for (``--slice``)."""
+        return {found.name: found for found in open_field_slices(self.layout)}
+
+    @cached_property
+    def base_image(self) -> NDArray[np.uint8]:
+        """The base image, (y, x) grey uint8."""
+        from velfield.sources.images import read_picture_grey
+
+        path = self.layout.base_image_tif if self.layout.base_image_tif.exists() else self.layout.base_image
+        with local_copy(path) as here:
+            return read_picture_grey(here, self.record.config.frames.max_pixels)

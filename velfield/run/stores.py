@@ -1,0 +1,492 @@
+"""The Zarr stores of a run folder: create, open, check. The only module that imports zarr.
+
+Three rules that were paid for (each is a fault seen in zarr or in its use):
+
+- ``ZstdCodec(checksum=True)`` everywhere: the default codec returns wrong pixels for one bit in seven, silently;
+- a chunk has one writer: two writers on parts of one chunk lose each other's work, so the chunks of per-frame columns
+  are exactly the units of work;
+- a missing chunk reads as the fill value: whoever reads asks the commit records which chunks must exist.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from zarr.codecs import ZstdCodec
+
+from velfield.errors import InputError
+from velfield.run.paths import S3_OPTIONS, RemotePath
+
+_STATUS_BYTES = 160
+HISTOGRAM = "velocity_histogram"
+HISTOGRAM_BY_TIME = "velocity_histogram_by_time"
+HISTOGRAMS: dict[str, dict[str, str]] = {HISTOGRAM: {"long_name": "velocity histogram", "units": "1"}}
+"""What a field holds at least, with its attributes."""
+
+
+class StoreError(RuntimeError):
+    """A store is damaged or is not what was expected: names the store and the chunk."""
+
+
+def _create(
+    group: zarr.Group, name: str, shape: Sequence[int], chunks: Sequence[int], dtype: str, **kw: Any
+) -> zarr.Array[Any]:
+    level = kw.pop("level", 1)
+    return group.create_array(
+        name,
+        shape=tuple(shape),
+        chunks=tuple(chunks),
+        dtype=dtype,
+        compressors=ZstdCodec(level=level, checksum=True),
+        **kw,
+    )
+
+
+def _place(path: Path) -> dict[str, Any]:
+    """What zarr asks for to find a store."""
+    if isinstance(path, RemotePath):
+        return {"store": path.url, "storage_options": S3_OPTIONS}
+    return {"store": path}
+
+
+class _Group:
+    """A group, opened, whose arrays are looked up once: on S3 each look is a request or two."""
+
+    def __init__(self, group: zarr.Group) -> None:
+        self._group = group
+        self._arrays: dict[str, zarr.Array[Any]] = {}
+
+    @property
+    def attrs(self) -> Mapping[str, Any]:
+        return self._group.attrs
+
+    def __getitem__(self, name: str) -> zarr.Array[Any]:
+        if name not in self._arrays:
+            self._arrays[name] = cast("zarr.Array[Any]", self._group[name])
+        return self._arrays[name]
+
+    @cached_property
+    def by_axes(self) -> dict[int, list[str]]:
+        """Names of the arrays of so many axes, in one order whatever the disk lists first."""
+        self._arrays |= dict(self._group.arrays())
+        names: dict[int, list[str]] = {}
+        for name in sorted(self._arrays):
+            names.setdefault(self._arrays[name].ndim, []).append(name)
+        return names
+
+
+def _open(path: Path, mode: str) -> _Group:
+    try:
+        return _Group(zarr.open_group(**_place(path), mode=cast(Any, mode), zarr_format=3, use_consolidated=False))
+    except FileNotFoundError:
+        raise InputError(f"{path} is not there: run `velfield run` on this folder first") from None
+
+
+def _read(path: Path, group: _Group, name: str, selection: Any) -> NDArray[Any]:
+    try:
+        return np.asarray(group[name][selection])
+    except Exception as error:
+        raise StoreError(
+            f"{path / name}: a chunk is damaged ({error}); `velfield verify {path.parent}` says which"
+        ) from error
+
+
+def _check_column(path: Path, name: str, known: Iterable[str]) -> None:
+    """Before a name that never was is taken for a column that is damaged."""
+    if name not in known:
+        raise InputError(f"{path}: found no column {name!r}; it has {', '.join(known)}")
+
+
+def _check_frame(path: Path, frame: int, count: int) -> None:
+    """Before a chunk that never was is taken for one that is gone or damaged."""
+    if not 0 <= frame < count:
+        raise InputError(f"{path}: frame {frame} is not in the run: its frames go from 0 to {count - 1}")
+
+
+def _metadata(path: Path) -> list[Path]:
+    """What describes a store and its arrays: as much part of it as its chunks."""
+    return [path / "zarr.json", *sorted(path.glob("*/zarr.json"))]
+
+
+def _existing(paths: Iterable[Path]) -> list[Path]:
+    """Chunks that were written: zarr leaves out those that hold nothing but the fill value."""
+    return [path for path in paths if path.exists()]
+
+
+# ------------------------------------------------------------------------------------------------------------- frames
+
+
+def store_key(path: Path) -> str | None:
+    """Content key that a store was laid out under; none where it is not there or not whole."""
+    try:
+        return str(zarr.open_group(**_place(path), mode="r", zarr_format=3, use_consolidated=False).attrs["key"])
+    except (FileNotFoundError, KeyError, ValueError):
+        return None
+
+
+FRAME_COLUMNS: dict[str, tuple[str, float]] = {
+    "time_s": ("float64", np.nan),
+    "source_index": ("int64", -1),
+    "flags": ("uint16", 2),
+    "sharpness": ("float32", np.nan),
+    "brightness": ("float32", np.nan),
+}
+"""Column -> type, and what stands there until it is written."""
+
+
+def create_frames(
+    path: Path, *, key: str, count: int, height: int, width: int, unit_frames: int, source: Mapping[str, Any]
+) -> None:
+    """Lay out ``frames.zarr``: one frame a chunk; a unit of a column a chunk. Frames are unreadable until written."""
+    group = zarr.create_group(**_place(path), overwrite=True, attributes={"source": dict(source)})
+    chunk = min(unit_frames, max(count, 1))
+    _create(group, "raw", (count, height, width), (1, height, width), "uint8", dimension_names=("frame", "y", "x"))
+    for name, (dtype, fill) in FRAME_COLUMNS.items():
+        _create(group, name, (count,), (chunk,), dtype, fill_value=fill, dimension_names=("frame",))
+    group.attrs["key"] = key  # last: a store without it was not laid out whole
+
+
+@dataclass(frozen=True)
+class FrameStore:
+    """``frames.zarr``, opened."""
+
+    path: Path
+    group: _Group
+
+    @property
+    def count(self) -> int:
+        return int(self.group["raw"].shape[0])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width) of a frame, px."""
+        _, height, width = self.group["raw"].shape
+        return int(height), int(width)
+
+    def read(self, frame: int) -> NDArray[np.uint8]:
+        """One grey frame, (h, w) uint8.
+
+        Raises
+        ------
+        InputError
+            There is no such frame.
+        StoreError
+            The chunk is damaged or gone.
+        """
+        _check_frame(self.path, frame, self.count)
+        if not (self.path / "raw" / "c" / str(frame) / "0" / "0").exists():
+            raise StoreError(f"{self.path}: the chunk of frame {frame} is gone; `velfield run` writes it again")
+        try:
+            return np.asarray(self.group["raw"][frame], dtype=np.uint8)
+        except Exception as error:
+            raise StoreError(f"{self.path}: the chunk of frame {frame} is damaged ({error})") from error
+
+    def write(self, frame: int, grey: NDArray[np.uint8]) -> None:
+        """Write one frame: one chunk, a black frame's too, or it could not be told from one that is gone."""
+        self.group["raw"].with_config({"write_empty_chunks": True})[frame] = grey
+
+    def column(self, name: str) -> NDArray[Any]:
+        """One column: ``time_s``, ``source_index``, ``flags``, ``sharpness`` or ``brightness``, (frames,)."""
+        _check_column(self.path, name, FRAME_COLUMNS)
+        return _read(self.path, self.group, name, slice(None))
+
+    def write_columns(self, start: int, columns: Mapping[str, NDArray[Any]]) -> None:
+        """Write a whole unit of columns, from frame ``start`` on."""
+        for name, values in columns.items():
+            self.group[name][start : start + len(values)] = values
+
+    def files(self, start: int, stop: int) -> list[Path]:
+        """Files that hold the frames ``[start, stop)``, a unit, and their columns; and the store's metadata."""
+        raw = [self.path / "raw" / "c" / str(frame) / "0" / "0" for frame in range(start, stop)]
+        unit = start // int(self.group["time_s"].chunks[0])
+        columns = [self.path / name / "c" / str(unit) for name in FRAME_COLUMNS]
+        return [*_metadata(self.path), *_existing([*raw, *columns])]
+
+
+def open_frames(path: Path, mode: str = "r") -> FrameStore:
+    """Open ``frames.zarr``."""
+    return FrameStore(path, _open(path, mode))
+
+
+# ------------------------------------------------------------------------------------------------------- registration
+
+REGISTRATION_COLUMNS: dict[str, str] = {
+    "count_base": "int32",  # matches with the base image
+    "count_previous": "int32",  # matches with the previous registered frame
+    "count_kept": "int32",  # control points that the robust fit kept
+    "residual_px": "float32",  # RMS of what was fitted
+    "heldout_px": "float32",  # RMS of what was held out of the fit
+    "spread": "float32",  # share of the picture's cells that hold control points
+}
+
+
+ERROR_CELLS = (6, 8)
+"""Rows and columns of the cells of a frame that held-out errors are told by."""
+
+
+def create_registration(path: Path, *, key: str, count: int, vector_length: int, unit_frames: int) -> None:
+    """Lay out ``registration.zarr``: chunks are units, so that a unit has one writer."""
+    group = zarr.create_group(**_place(path), overwrite=True)
+    chunk = min(unit_frames, max(count, 1))
+    _create(group, "vector", (count, vector_length), (chunk, vector_length), "float64", fill_value=np.nan)
+    _create(group, "status", (count, _STATUS_BYTES), (chunk, _STATUS_BYTES), "uint8", fill_value=0)
+    for name, dtype in REGISTRATION_COLUMNS.items():
+        fill = np.nan if dtype.startswith("float") else 0
+        _create(group, name, (count,), (chunk,), dtype, fill_value=fill, dimension_names=("frame",))
+    axes = ("frame", "row", "column")
+    shape, chunks = (count, *ERROR_CELLS), (chunk, *ERROR_CELLS)
+    _create(group, "error_px", shape, chunks, "float32", fill_value=np.nan, dimension_names=axes)
+    group.attrs["key"] = key
+
+
+@dataclass(frozen=True)
+class RegistrationStore:
+    """``registration.zarr``, opened."""
+
+    path: Path
+    group: _Group
+
+    def write(
+        self, start: int, vectors: NDArray[np.float64], statuses: Sequence[str], columns: Mapping[str, NDArray[Any]]
+    ) -> None:
+        """Write a whole unit from frame ``start`` on; ``columns`` are ``REGISTRATION_COLUMNS`` and ``error_px``."""
+        stop = start + len(statuses)
+        text = np.zeros((len(statuses), _STATUS_BYTES), np.uint8)
+        for row, status in zip(text, statuses, strict=True):
+            data = np.frombuffer(status.encode()[:_STATUS_BYTES], np.uint8)
+            row[: len(data)] = data
+        self.group["vector"][start:stop] = vectors
+        self.group["status"][start:stop] = text
+        for name, values in columns.items():
+            self.group[name][start:stop] = values
+
+    def vector(self, frame: int) -> NDArray[np.float64]:
+        """Flat parameters of one frame's transform; NaN where it is not registered."""
+        _check_frame(self.path, frame, self.group["vector"].shape[0])
+        return _read(self.path, self.group, "vector", frame)
+
+    def vectors(self, start: int, stop: int) -> NDArray[np.float64]:
+        """Flat parameters of the frames ``[start, stop)``."""
+        return _read(self.path, self.group, "vector", slice(start, stop))
+
+    def statuses(self, start: int = 0, stop: int | None = None) -> list[str]:
+        """``ok``, ``failed:<reason>`` or ``skipped:<reason>`` of each frame; empty where nothing was done yet."""
+        rows = _read(self.path, self.group, "status", slice(start, stop))
+        return [bytes(row).rstrip(b"\0").decode(errors="replace") for row in rows]
+
+    def column(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
+        """One of ``REGISTRATION_COLUMNS``, (frames,); or ``error_px``, (frames, 6, 8): held-out error by cell."""
+        _check_column(self.path, name, (*REGISTRATION_COLUMNS, "error_px"))
+        return _read(self.path, self.group, name, slice(start, stop))
+
+    def files(self, start: int) -> list[Path]:
+        """Files that hold the unit from frame ``start`` on, and the store's metadata."""
+        unit = start // int(self.group["vector"].chunks[0])
+        tables = [self.path / name / "c" / str(unit) / "0" for name in ("vector", "status")]
+        columns = [self.path / name / "c" / str(unit) for name in REGISTRATION_COLUMNS]
+        errors = self.path / "error_px" / "c" / str(unit) / "0" / "0"
+        return [*_metadata(self.path), *_existing([*tables, *columns, errors])]
+
+
+def open_registration(path: Path, mode: str = "r") -> RegistrationStore:
+    """Open ``registration.zarr``."""
+    return RegistrationStore(path, _open(path, mode))
+
+
+# -------------------------------------------------------------------------------------------------------------- field
+
+
+def create_field(
+    path: Path,
+    *,
+    key: str,
+    height: int,
+    width: int,
+    tile: int,
+    group_tiles: int,
+    velocities_px_per_s: NDArray[np.float64],
+    attributes: Mapping[str, Any],
+    histograms: Mapping[str, Mapping[str, Any]] = HISTOGRAMS,
+    layers: Mapping[str, Mapping[str, Any]],
+) -> None:
+    """Lay out ``field.zarr``: the histogram in sparse tiles, whole layers in chunks of one tile group, labelled axes.
+
+    Parameters
+    ----------
+    velocities_px_per_s : (n,) float64
+        Bin centres of both velocity axes.
+    histograms : name -> attributes
+        (y, x, vy, vx) histograms; `HISTOGRAM` is one of them.
+    layers : name -> attributes
+        (y, x) layers beside the histogram; ``dtype`` among the attributes says their type, float32 where absent.
+    """
+    group = zarr.create_group(**_place(path), overwrite=True, attributes=dict(attributes))
+    n = len(velocities_px_per_s)
+    grid_mapping = {"grid_mapping": "crs"} if attributes.get("crs_wkt") else {}
+    for name, what in histograms.items():
+        histogram = _create(
+            group,
+            name,
+            (height, width, n, n),
+            (tile, tile, n, n),
+            "int32",
+            fill_value=0,
+            dimension_names=("y", "x", "vy", "vx"),
+        )
+        histogram.attrs.update({**what, **grid_mapping})
+    side = tile * group_tiles
+    for name, attrs in layers.items():
+        attrs = dict(attrs)
+        dtype = attrs.pop("dtype", "float32")
+        fill: float = np.nan if dtype.startswith("float") else 0
+        layer = _create(group, name, (height, width), (side, side), dtype, fill_value=fill, dimension_names=("y", "x"))
+        layer.attrs.update({**attrs, **grid_mapping})
+    _write_axes(group, height, width, velocities_px_per_s, attributes)
+    group.attrs["key"] = key
+
+
+def _write_axes(
+    group: zarr.Group, height: int, width: int, velocities: NDArray[np.float64], attributes: Mapping[str, Any]
+) -> None:
+    axes: dict[str, tuple[NDArray[np.float64], str]] = {
+        "y": (np.arange(height, dtype=np.float64), "px"),
+        "x": (np.arange(width, dtype=np.float64), "px"),
+        "vy": (velocities, "px s-1"),
+        "vx": (velocities, "px s-1"),
+    }
+    for name, (values, units) in axes.items():
+        axis = _create(group, name, values.shape, values.shape, "float64", dimension_names=(name,))
+        axis[:] = values
+        axis.attrs["units"] = units
+    gsd_m = attributes.get("gsd_m")
+    if gsd_m:
+        for name in ("vy", "vx"):
+            metric = _create(
+                group, f"{name}_m_per_s", velocities.shape, velocities.shape, "float64", dimension_names=(name,)
+            )
+            metric[:] = velocities * float(gsd_m)
+            metric.attrs["units"] = "m s-1"
+    if attributes.get("crs_wkt"):
+        crs = _create(group, "crs", (), (), "int32", fill_value=0)
+        crs.attrs.update({"crs_wkt": attributes["crs_wkt"], "GeoTransform": attributes.get("geotransform", "")})
+
+
+@dataclass(frozen=True)
+class FieldStore:
+    """``field.zarr``, opened."""
+
+    path: Path
+    group: _Group
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        return dict(self.group.attrs)
+
+    @property
+    def tile(self) -> int:
+        return int(self.group[HISTOGRAM].chunks[0])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width) of the base image, px."""
+        height, width = self.group[HISTOGRAM].shape[:2]
+        return int(height), int(width)
+
+    def velocities(self) -> NDArray[np.float64]:
+        """Bin centres, px/s."""
+        return np.asarray(self.group["vx"][:])
+
+    def histogram_names(self) -> list[str]:
+        """Names of the (y, x, vy, vx) histograms."""
+        return [name for name in (HISTOGRAM, HISTOGRAM_BY_TIME) if name in self.group.by_axes.get(4, ())]
+
+    def write_tile(self, row: int, column: int, histogram: NDArray[np.int32], name: str = HISTOGRAM) -> None:
+        """Write one tile of a histogram, (ty, tx, nvy, nvx): one chunk."""
+        y, x, side = row * self.tile, column * self.tile, self.tile
+        self.group[name][y : y + side, x : x + side] = histogram
+
+    def has_tile(self, row: int, column: int, name: str = HISTOGRAM) -> bool:
+        """Whether the tile's chunk exists."""
+        return (self.path / name / "c" / str(row) / str(column) / "0" / "0").exists()
+
+    def read_tile(self, row: int, column: int, name: str = HISTOGRAM) -> NDArray[np.int32]:
+        """One tile of a histogram, (ty, tx, nvy, nvx) int32; clipped at the border.
+
+        Raises
+        ------
+        StoreError
+            The chunk is damaged.
+        """
+        y, x, side = row * self.tile, column * self.tile, self.tile
+        try:
+            return np.asarray(self.group[name][y : y + side, x : x + side], dtype=np.int32)
+        except Exception as error:
+            raise StoreError(f"{self.path}: the chunk of tile ({row}, {column}) is damaged ({error})") from error
+
+    def write_layer(self, name: str, y: int, x: int, values: NDArray[Any]) -> None:
+        """Write a window of a layer: whole chunks."""
+        self.group[name][y : y + values.shape[0], x : x + values.shape[1]] = values
+
+    def layer(self, name: str) -> NDArray[Any]:
+        """A whole layer, (y, x)."""
+        return _read(self.path, self.group, name, slice(None))
+
+    def files(self, tiles: Iterable[tuple[int, int]], group: tuple[int, int]) -> list[Path]:
+        """Files that hold the tiles (row, column) and the layers of one group; and the store's metadata."""
+        places = [Path("c", str(row), str(column), "0", "0") for row, column in tiles]
+        histogram = [self.path / name / place for name in self.histogram_names() for place in places]
+        layers = [self.path / name / "c" / str(group[0]) / str(group[1]) for name in self.layer_names()]
+        axes = [self.path / name / "c" / "0" for name in self.group.by_axes.get(1, ())]
+        return [*_metadata(self.path), *_existing([*histogram, *layers, *axes])]
+
+    def layer_names(self) -> list[str]:
+        """Names of the (y, x) layers, in one order whatever the disk lists first."""
+        return self.group.by_axes.get(2, [])
+
+    def layer_attributes(self, name: str) -> dict[str, Any]:
+        """Units and long name of a layer."""
+        return dict(self.group[name].attrs)
+
+    def chunk_shape(self, name: str) -> tuple[int, int]:
+        """(height, width) of a chunk of an array, px."""
+        height, width = self.group[name].chunks[:2]
+        return int(height), int(width)
+
+    def stored_chunks(self, name: str) -> list[tuple[int, int]]:
+        """(row, column) of the chunks of an array that are stored: one that is all fill value is not."""
+        return sorted((int(path.parent.name), int(path.name)) for path in (self.path / name / "c").glob("*/*"))
+
+
+def open_field(path: Path, mode: str = "r") -> FieldStore:
+    """Open ``field.zarr``."""
+    return FieldStore(path, _open(path, mode))
+
+
+# ------------------------------------------------------------------------------------------------------------- viewer
+
+_SEGMENTS_A_CHUNK = 65536
+_LAYER_CHUNK_PX = 512
+
+
+def write_segments(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Write ``view/segments.zarr`` anew: columns of one length, (segments,) each; every chunk is there to be read."""
+    group = zarr.create_group(**_place(path), overwrite=True)
+    for name, values in columns.items():
+        chunk = (min(_SEGMENTS_A_CHUNK, max(len(values), 1)),)
+        column = _create(group, name, values.shape, chunk, values.dtype.name, dimension_names=("segment",))
+        column.with_config({"write_empty_chunks": True})[:] = values
+
+
+def write_extra_layers(path: Path, layers: Mapping[str, tuple[NDArray[np.floating], Mapping[str, Any]]]) -> None:
+    """Write float32 (y, x) layers with their attributes, to be shown beside a field's own: `open_field` reads them."""
+    group = zarr.create_group(**_place(path), overwrite=True)
+    for name, (values, attributes) in layers.items():
+        chunk = (_LAYER_CHUNK_PX, _LAYER_CHUNK_PX)
+        layer = _create(group, name, values.shape, chunk, "float32", fill_value=np.nan, dimension_names=("y", "x"))
+        layer[:] = values
+        layer.attrs.update(dict(attributes))

@@ -1,0 +1,94 @@
+"""Tables of a run folder: Parquet parts of one unit each, and the patches beside them."""
+
+import io
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from velfield.run.commits import write_atomically
+from velfield.run.paths import copy_objects, is_remote
+
+Patches = dict[str, NDArray[Any]]
+
+
+def conform(table: pd.DataFrame, columns: Mapping[str, str]) -> pd.DataFrame:
+    """The table with exactly these columns, in this order and of these types.
+
+    Raises
+    ------
+    KeyError
+        A column is missing.
+    """
+    return table[list(columns)].astype(dict(columns))
+
+
+def empty(columns: Mapping[str, str]) -> pd.DataFrame:
+    """A table of no rows.
+
+    Examples
+    --------
+    >>> len(empty({"frame": "int32"}))
+    0
+    """
+    return pd.DataFrame({name: np.empty(0, dtype) for name, dtype in columns.items()})
+
+
+def write_table(path: Path, table: pd.DataFrame, columns: Mapping[str, str]) -> None:
+    """Write one part, whole or not at all."""
+    buffer = io.BytesIO()
+    conform(table, columns).to_parquet(buffer, index=False, compression="zstd")
+    write_atomically(path, buffer.getvalue())
+
+
+def link_file(source: Path, target: Path) -> Path:
+    """A file under a second name, whole or not at all; no bytes are copied where the disk can do without.
+
+    Files of a run folder are replaced, never changed in place, so what is done to one name is not seen under the other.
+    """
+    if is_remote(source) and is_remote(target):
+        copy_objects([(source, target)])
+        return target
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.unlink(missing_ok=True)
+    try:
+        os.link(source, target)
+    except (OSError, TypeError):  # another disk, or no disk at all
+        write_atomically(target, source.read_bytes())
+    return target
+
+
+def link_files(pairs: Sequence[tuple[Path, Path]]) -> None:
+    """Many files at once, as by `link_file`: pairs of a file and its further name."""
+    if all(is_remote(source) and is_remote(target) for source, target in pairs):
+        copy_objects(pairs)
+        return
+    for source, target in pairs:
+        link_file(source, target)
+
+
+def read_tables(
+    paths: Sequence[Path], columns: Mapping[str, str], *, only: Sequence[str] | None = None
+) -> pd.DataFrame:
+    """Parts put together in order; ``only`` names the columns that are wanted."""
+    wanted = {name: columns[name] for name in (only or columns)}
+    parts = [pd.read_parquet(io.BytesIO(path.read_bytes()), columns=list(wanted)) for path in paths]
+    parts = [part for part in parts if len(part)]
+    return conform(pd.concat(parts, ignore_index=True), wanted) if parts else empty(wanted)
+
+
+def write_patches(path: Path, patches: Mapping[str, NDArray[Any]]) -> None:
+    """Write pictures of the detections, each (n, h, w) uint8, in the table's order."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **patches)
+    write_atomically(path, buffer.getvalue())
+
+
+def read_patches(path: Path) -> Patches:
+    """Pictures of the detections by name."""
+    with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}

@@ -1,0 +1,1 @@
+"""Labels and boxes: CSV, YOLO, COCO, LabelMe, VIA, GeoJSON."""

@@ -1,0 +1,1 @@
+"""Video files: probing, decoding with true timestamps, damage in the bitstream."""

@@ -1,0 +1,98 @@
+"""A run of a simulated flight against that flight's truth: what `velfield demo` says at its end, and the tests hold
+to."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from velfield.errors import InputError
+from velfield.run.run import open_run
+from velfield.synthetic.score import (
+    DetectionScore,
+    FieldScore,
+    RegistrationScore,
+    TrackletScore,
+    fit_homography,
+    score_detections,
+    score_field,
+    score_registration,
+    score_tracklets,
+)
+from velfield.synthetic.truth import load_truth
+
+_ANOTHER_BASE_PX = 30.0  # no registered frame is that far off its own base image
+
+
+@dataclass(frozen=True)
+class RunScore:
+    """All four scores of a run."""
+
+    registration: RegistrationScore
+    detection: DetectionScore
+    tracking: TrackletScore
+    field: FieldScore
+
+    def text(self) -> str:
+        """The scores for people, a line each."""
+        r, d, t, f = self.registration, self.detection, self.tracking, self.field
+        return "\n".join(
+            (
+                "against the truth of the simulated flight:",
+                f"  registration  error {r.mean_px:.2f} px (mean), 95 % within {r.p95_px:.2f}, "
+                f"jitter {r.jitter_px:.2f} px",
+                f"  cars          precision {d.precision:.3f}, recall {d.recall:.3f}, "
+                f"of the moving {d.recall_moving:.3f}, "
+                f"axis off by {np.degrees(d.axis_median_rad):.1f} degrees (median)",
+                f"  tracklets     precision {t.precision:.3f} ({t.precision_on_vehicle:.3f} where any place on a "
+                f"vehicle counts), recall of the moving {t.recall_moving:.3f}, "
+                f"speed off by {t.speed_error_mean_km_per_h:.2f} km/h (mean), "
+                f"each vehicle counted {t.passages_per_vehicle:.2f} times",
+                f"  field         modal direction within 10 degrees at {f.share_within:.1%} of "
+                f"{f.pixels} pixels with 5 or more vehicles; {f.undirected} where most stand have none",
+            )
+        )
+
+
+def score_run(root: str | Path, flight: str | Path, *, min_count: int = 5) -> RunScore:
+    """Score a run folder against the simulated flight that it is of.
+
+    Where the run built its own base image, its base pixels are first brought to the truth's by the best homography.
+
+    Raises
+    ------
+    InputError
+        The flight has no truth, the run is not whole, or its base image is another one than the flight's.
+    """
+    run, truth = open_run(root), load_truth(Path(flight))
+    source_index = run.frames.column("source_index")
+    frame_of = {frame: int(index) for frame, index in enumerate(source_index)}
+    registered = [frame for frame, status in enumerate(run.registration_status) if status == "ok"]
+    flight_frames = {frame_of[frame]: frame for frame in registered}
+
+    def to_base(flight_frame: int, xy_raw: np.ndarray) -> np.ndarray:
+        return run.to_base(flight_frames[flight_frame], xy_raw)
+
+    frames = sorted(flight_frames)
+    velocity = run.field.modal_velocity().astype(np.float64)
+    velocity[np.isnan(run.field.modal_direction_rad())] = np.nan  # who stands has no direction
+    some = frames[:: max(1, len(frames) // 20)]
+    to_truth = None if run.grid.how == "given" else fit_homography(truth, to_base, some)
+    registration = score_registration(truth, to_base, frames, to_truth=to_truth)
+    if to_truth is None and registration.mean_px > _ANOTHER_BASE_PX:
+        raise InputError(
+            f"{run.layout.root}: places lie {registration.mean_px:.0f} px off those of {flight} (mean): its base image "
+            f"is another one; score a run with --base {Path(flight) / 'base.png'}, or with none"
+        )
+    return RunScore(
+        registration=registration,
+        detection=score_detections(truth, run.detections(), frame_of=frame_of, to_truth=to_truth),
+        tracking=score_tracklets(truth, run.tracklets(), frame_of=frame_of, to_truth=to_truth),
+        field=score_field(
+            truth,
+            velocity,
+            run.field.count(),
+            to_truth=to_truth,
+            min_count=min_count,
+        ),
+    )

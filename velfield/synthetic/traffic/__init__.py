@@ -1,0 +1,1 @@
+"""The simulated traffic: vehicles and how they drive."""
