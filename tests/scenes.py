@@ -2,15 +2,14 @@
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, GreyImage
 from velfield.camera.lens import Lens
 
-Grey = NDArray[np.uint8]
-Floats = NDArray[np.float64]
 
-
-def city(seed: int, side_px: int = 1200, *, blocks: int = 160, angles_deg: tuple[float, ...] = (8.0, 98.0)) -> Grey:
+def city(
+    seed: int, side_px: int = 1200, *, blocks: int = 160, angles_deg: tuple[float, ...] = (8.0, 98.0)
+) -> GreyImage:
     """A square of roofs and straight roads of a few directions, drawn anti-aliased."""
     rng = np.random.default_rng(seed)
     picture = np.full((side_px, side_px), 105, dtype=np.uint8)
@@ -31,7 +30,7 @@ def city(seed: int, side_px: int = 1200, *, blocks: int = 160, angles_deg: tuple
     return np.asarray(np.clip(picture + 60 * grain, 0, 255), dtype=np.uint8)
 
 
-def similarity(scale: float, rotation_deg: float, source: Floats, target: Floats) -> Floats:
+def similarity(scale: float, rotation_deg: float, source: FloatArray, target: FloatArray) -> FloatArray:
     """(3, 3): turn from +x towards +y, scale, and take one point to another."""
     cosine, sine = scale * np.cos(np.radians(rotation_deg)), scale * np.sin(np.radians(rotation_deg))
     turn = np.array([[cosine, -sine], [sine, cosine]])
@@ -40,13 +39,13 @@ def similarity(scale: float, rotation_deg: float, source: Floats, target: Floats
     return matrix
 
 
-def by_homography(matrix: Floats, xy: Floats) -> Floats:
+def by_homography(matrix: FloatArray, xy: FloatArray) -> FloatArray:
     """Points (n, 2) mapped by (3, 3)."""
     mapped = np.column_stack([xy, np.ones(len(xy))]) @ matrix.T
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
-def photograph(ground: Grey, to_ground: Floats, lens: Lens, shape: tuple[int, int], seed: int) -> Grey:
+def photograph(ground: GreyImage, to_ground: FloatArray, lens: Lens, shape: tuple[int, int], seed: int) -> GreyImage:
     """What a camera sees: ``to_ground`` (3, 3) takes undistorted frame px to ground px; twofold oversampled, noisy."""
     height, width = shape
     y, x = np.mgrid[0 : 2 * height, 0 : 2 * width]
@@ -58,13 +57,13 @@ def photograph(ground: Grey, to_ground: Floats, lens: Lens, shape: tuple[int, in
     return np.asarray(np.clip(seen + noise, 0, 255), dtype=np.uint8)
 
 
-def frame_grid(shape: tuple[int, int], step_px: int = 40) -> Floats:
+def frame_grid(shape: tuple[int, int], step_px: int = 40) -> FloatArray:
     """Points (n, 2) all over a frame."""
     y, x = np.mgrid[0 : shape[0] : step_px, 0 : shape[1] : step_px]
     return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
 
 
-def rms_after_homography(found: Floats, true: Floats) -> float:
+def rms_after_homography(found: FloatArray, true: FloatArray) -> float:
     """RMS distance, px, of points (n, 2) from their truth, up to a homography: what straight lines cannot tell."""
     matrix, _ = cv2.findHomography(found, true, 0)
     return float(np.sqrt(np.mean(np.sum((by_homography(np.asarray(matrix), found) - true) ** 2, axis=1))))

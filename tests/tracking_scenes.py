@@ -13,9 +13,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from velfield.tracking.windows import FrameTable
 
-Floats = NDArray[np.float64]
 OVERSAMPLING = 4
 CHIP = 32
 
@@ -71,7 +71,7 @@ def looks(rng: np.random.Generator, alike: float = 0.0) -> tuple[float, float, f
     return tuple(alike * s + (1 - alike) * m for s, m in zip(same, mine, strict=True))  # type: ignore[return-value]
 
 
-def road(rng: np.random.Generator, shape: tuple[int, int]) -> Floats:
+def road(rng: np.random.Generator, shape: tuple[int, int]) -> FloatArray:
     """Asphalt with patches and lane marks, oversampled."""
     h, w = shape[0] * OVERSAMPLING, shape[1] * OVERSAMPLING
     ground = cv2.resize(rng.normal(105, 12, (h // 40 + 1, w // 40 + 1)), (w, h), interpolation=cv2.INTER_CUBIC)
@@ -79,7 +79,7 @@ def road(rng: np.random.Generator, shape: tuple[int, int]) -> Floats:
     return ground.astype(np.float32)
 
 
-def draw(ground: Floats, cars: Sequence[Car], time_s: float) -> Floats:
+def draw(ground: FloatArray, cars: Sequence[Car], time_s: float) -> FloatArray:
     """The picture at a time, at base resolution."""
     picture = ground.copy()
     o = OVERSAMPLING
@@ -100,7 +100,9 @@ def draw(ground: Floats, cars: Sequence[Car], time_s: float) -> Floats:
     return cv2.resize(picture, (picture.shape[1] // o, picture.shape[0] // o), interpolation=cv2.INTER_AREA)
 
 
-def patches_of(picture: Floats, xy: Floats, axis: Floats, width: int = 8, length: int = 16) -> NDArray[np.uint8]:
+def patches_of(
+    picture: FloatArray, xy: FloatArray, axis: FloatArray, width: int = 8, length: int = 16
+) -> NDArray[np.uint8]:
     """Oriented patches, the axis along their rows' order."""
     if not len(xy):
         return np.zeros((0, length, width), np.uint8)
@@ -114,7 +116,7 @@ def patches_of(picture: Floats, xy: Floats, axis: Floats, width: int = 8, length
     return np.clip(np.rint(flat), 0, 255).astype(np.uint8).reshape(-1, length, width)
 
 
-def chips_of(picture: Floats, xy: Floats) -> NDArray[np.uint8]:
+def chips_of(picture: FloatArray, xy: FloatArray) -> NDArray[np.uint8]:
     """Upright crops centred on the rounded places."""
     padded = np.pad(np.clip(np.rint(picture), 0, 255).astype(np.uint8), CHIP, mode="edge")
     corner = np.rint(xy).astype(np.int64) + CHIP - CHIP // 2
@@ -216,7 +218,7 @@ def score(
     )
 
 
-def _possible(seen: Watched, max_interval_s: float) -> dict[tuple[int, ...], tuple[float, Floats]]:
+def _possible(seen: Watched, max_interval_s: float) -> dict[tuple[int, ...], tuple[float, FloatArray]]:
     """Every tracklet that the detections allow: its ids, true speed and velocity."""
     good = [t for t in seen.tables if t.registered]
     out = {}

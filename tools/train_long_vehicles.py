@@ -6,11 +6,11 @@ from functools import partial
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import ByteArray, FloatArray
 from schemas.detector import LongVehicleRecord, Round
 from schemas.flight import DetectionConfig
-from velfield.detection.boosting import Bytes, random_pool
+from velfield.detection.boosting import random_pool
 from velfield.detection.cascade.classifier import moved
 from velfield.detection.cascade.feature_image import Picture, picture_of, scores_at
 from velfield.detection.cascade.feature_matrix import Bank, bank_of
@@ -19,8 +19,6 @@ from velfield.detection.cascade.training import CONTRAST_FLOOR
 from velfield.detection.detector import BoostedSums, sums_of
 from velfield.detection.samples import LabelledImage, Poses, varied
 from velfield.parallel import each
-
-Floats = NDArray[np.float64]
 
 ROUNDS = 800
 _STAGES = (80, 160)
@@ -37,15 +35,15 @@ _FALSE_SHARE = 0.0005
 """So many cars may be taken for the end of something long, where the classifier was not trained."""
 
 
-_Finds: TypeAlias = tuple[Floats, Floats]
+_Finds: TypeAlias = tuple[FloatArray, FloatArray]
 """Poses, and whose they are."""
 
 
 @dataclass(frozen=True)
 class _Scene:
     picture: Picture
-    long: Floats
-    cars: Floats
+    long: FloatArray
+    cars: FloatArray
 
 
 def learn_long_vehicles(
@@ -97,7 +95,7 @@ def _scene(sample: LabelledImage, car_length_px: float) -> _Scene:
     return _Scene(picture_of(sample.image, None, LONG), sample.cars[long, :3], sample.cars[~long, :3])
 
 
-def _along(rows: Floats, copies: int, along: Floats, rng: np.random.Generator) -> Floats:
+def _along(rows: FloatArray, copies: int, along: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Poses (n * copies, 3), moved along their axes, a little beside them and a little turned."""
     rows = np.repeat(rows, copies, axis=0)
     rows[:, :2] = moved(rows[:, :2], rows[:, 2], np.column_stack([along, rng.normal(0, _BESIDE_SD_PX, len(rows))]))
@@ -105,11 +103,11 @@ def _along(rows: Floats, copies: int, along: Floats, rng: np.random.Generator) -
     return rows
 
 
-def _either_way(count: int, between: tuple[float, float], rng: np.random.Generator) -> Floats:
+def _either_way(count: int, between: tuple[float, float], rng: np.random.Generator) -> FloatArray:
     return rng.uniform(*between, count) * np.where(rng.random(count) < 0.5, -1, 1)
 
 
-def _beside(rows: Floats, reach_px: float, rng: np.random.Generator) -> _Finds:
+def _beside(rows: FloatArray, reach_px: float, rng: np.random.Generator) -> _Finds:
     """Where finds may lie."""
     return _along(rows, 2, rng.uniform(-reach_px, reach_px, 2 * len(rows)), rng), np.repeat(rows, 2, axis=0)
 
@@ -133,11 +131,13 @@ def _others(scene: _Scene, share: float, rng: np.random.Generator) -> Poses:
     return varied(np.concatenate(parts), rng)
 
 
-def _boosted(bank: Bank, middles: Bytes, others: Bytes, rounds: int, rng: np.random.Generator) -> tuple[Round, ...]:
+def _boosted(
+    bank: Bank, middles: ByteArray, others: ByteArray, rounds: int, rng: np.random.Generator
+) -> tuple[Round, ...]:
     return bank.learnt(middles, others, rounds=rounds, fraction=_FRACTION, shrinkage=_SHRINKAGE, rng=rng)
 
 
-def _wrongly_liked(tried: tuple[_Scene, _Finds, _Finds], sums: BoostedSums) -> Floats:
+def _wrongly_liked(tried: tuple[_Scene, _Finds, _Finds], sums: BoostedSums) -> FloatArray:
     """The two best places along each find's axis, where they are no middle."""
     scene, long, cars = tried
     wrong = [np.empty((0, 3))]

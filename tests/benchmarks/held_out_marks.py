@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from velfield import open_run
 from velfield.bench.still import PATCH_HALF_PX, SHARP_PX, about_their_middles, places_on_map, read_area
 from velfield.registration.alignment import Templates, cut_templates
@@ -24,8 +25,6 @@ from velfield.registration.keypoints import detect_key_points
 from velfield.run.frame_transforms import read_lens
 from velfield.run.run import Run
 from velfield.sources.images import read_picture_grey
-
-FloatArray = NDArray[np.float64]
 
 CELL_PX, MARGIN_PX = 40, 8
 """Of the chessboard; marks so near to a cell's border are not followed: patches of the fit reach over it."""

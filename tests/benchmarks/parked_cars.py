@@ -15,13 +15,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from tools.shipped_detector import boxes_of
 from velfield import open_run
 from velfield.bench.still import SHARP_PX, about_their_middles, places_on_map, unused_corners
 from velfield.registration.alignment import Templates
 from velfield.run.run import Run
-
-FloatArray = NDArray[np.float64]
 
 STANDS_WITHIN, ITS_OWN, SEEN = 0.3, 0.35, 0.6
 """Car lengths that a parked car's mark strays by; that a corner of it lies from its middle; share of pictures."""

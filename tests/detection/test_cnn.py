@@ -5,9 +5,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import correlate
 
+from schemas.arrays import FloatArray
 from schemas.flight import DetectionConfig
 from tools.shipped_detector import simulated
 from velfield.detection.cnn.convolution import Layout, convolved, gathered, handed_back, spread
@@ -22,10 +22,8 @@ from velfield.detection.orientation import axial_difference
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 
-Floats = NDArray[np.float32]
 
-
-def random(*shape: int, seed: int = 0) -> Floats:
+def random(*shape: int, seed: int = 0) -> FloatArray:
     return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
 
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from tools.shipped_detector import LORRY_SEEDS, LORRY_SEEDS_LEFT_OUT, simulated
 from velfield.detection.cascade.classifier import moved
 from velfield.detection.cascade.feature_image import Picture, picture_of
 from velfield.detection.cascade.long_vehicles import LONG, OFFSETS, LongVehicles, shipped_long_vehicles
 from velfield.detection.samples import LabelledImage
 
-Floats = NDArray[np.float64]
 SEED = 40
 assert SEED not in LORRY_SEEDS
 assert SEED not in LORRY_SEEDS_LEFT_OUT
@@ -23,12 +23,12 @@ def city() -> LabelledImage:
     return simulated(SEED, (1280, 960), 0.5)
 
 
-def rows(xy: Floats, axes: Floats) -> Floats:
+def rows(xy: FloatArray, axes: FloatArray) -> FloatArray:
     """Finds, the best first."""
     return np.column_stack([xy, axes, np.linspace(0.9, 0.3, len(xy)), np.full(len(xy), 0.05)])
 
 
-def alone(cars: Floats) -> Floats:
+def alone(cars: FloatArray) -> FloatArray:
     """Vehicles that lie well within the picture, and so far from all others that finds on them are theirs."""
     gap = np.hypot(*(cars[:, None, :2] - cars[None, :, :2]).transpose(2, 0, 1)) + 1e9 * np.eye(len(cars))
     size = np.array(city().image.shape[::-1])
@@ -59,12 +59,12 @@ def test_cars_stay_where_they_were_found() -> None:
     assert sum(tuple(row) not in kept for row in found[:, :2]) <= 0.02 * len(found)
 
 
-def liking(places_px: Floats) -> LongVehicles:
+def liking(places_px: FloatArray) -> LongVehicles:
     """A classifier that sees a middle at these places (n, 2), and nowhere else."""
     known = shipped_long_vehicles()
 
     class Told(LongVehicles):
-        def scores(self, picture: Picture, xy: Floats, axes: Floats) -> NDArray[np.float32]:
+        def scores(self, picture: Picture, xy: FloatArray, axes: FloatArray) -> NDArray[np.float32]:
             there = np.stack([moved(xy, axes, np.tile(offset * 2.0, (len(xy), 1))) for offset in OFFSETS], axis=1)
             gap = np.hypot(*(there[:, :, None] - places_px).transpose(3, 0, 1, 2)).min(axis=2)
             return np.where(gap < 1, 1.0, -1.0).astype(np.float32)

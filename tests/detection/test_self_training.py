@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from schemas.arrays import FloatArray
 from schemas.detector import MotionRecord
 from schemas.flight import DetectionConfig
 from velfield.detection.cnn.motion_bonus import difference_about, lift_of
@@ -22,10 +23,8 @@ from velfield.detection.samples import LabelledImage
 from velfield.synthetic import small_flight
 from velfield.synthetic.cases import PIN_HOLE
 
-Floats = NDArray[np.float64]
 
-
-def liked(cars: int, others: int, seed: int) -> tuple[Floats, Floats]:
+def liked(cars: int, others: int, seed: int) -> tuple[FloatArray, FloatArray]:
     """Scores of cars and of what is none, of one kind of scene."""
     rng = np.random.default_rng(seed)
     return rng.normal(0.2, 0.1, cars), rng.normal(-0.05, 0.08, others)
@@ -47,7 +46,7 @@ def test_where_all_that_stands_is_cars_nearly_all_of_it_is_taken() -> None:
     assert (cars > threshold_of_standing(moving, cars)).mean() > 0.85
 
 
-def told(moves: int, alone: int, off: float = 40.0) -> tuple[Floats, NDArray[np.int8], Floats]:
+def told(moves: int, alone: int, off: float = 40.0) -> tuple[FloatArray, NDArray[np.int8], FloatArray]:
     """Scores, conduct and difference to the background: what moves differs by ``off``, what stands by 5."""
     rng = np.random.default_rng(7)
     moving, false = liked(moves, alone, 3)
@@ -96,7 +95,7 @@ STILL = PIN_HOLE.model_copy(update={"drift_m": 0.0, "climb_share": 0.0, "turn_de
 
 
 @cache
-def flight() -> tuple[list[MotionFrame], list[Floats], NDArray[np.uint8]]:
+def flight() -> tuple[list[MotionFrame], list[FloatArray], NDArray[np.uint8]]:
     """Frames of a camera that hangs still, on the working grid, the cars in them, and the background."""
     made = small_flight(frames=15, width=960, height=720, seed=9601, camera=STILL)
     factor = 16.0 * made.config.gsd_m / DetectionConfig().car_length_m

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from schemas.simulation import (
     CameraSimulation,
     OtherSensorSimulation,
@@ -16,8 +16,6 @@ from schemas.simulation import (
 )
 from velfield.synthetic import homography_only, lens_and_wobble, lens_only, simulate, small_flight, vibration_and_drift
 from velfield.synthetic.cases import FLAT, PIN_HOLE
-
-FloatArray = NDArray[np.float64]
 
 EMPTY = TrafficSimulation(flow_veh_per_h=0, warm_up_s=0)
 QUIET = OtherSensorSimulation(same_sensor=True, noise_grey=0)

@@ -4,16 +4,14 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from schemas.arrays import FloatArray
 from schemas.simulation import TrafficSimulation
 from velfield.synthetic.city.city_plan import make_plan
 from velfield.synthetic.city.road_network import Network, Node, clear_until_m, least_radius_m, smooth_curve
 from velfield.synthetic.traffic.driving import is_green
 from velfield.synthetic.traffic.traffic import Traffic, roads_of, simulate_traffic
-
-FloatArray = NDArray[np.float64]
 
 CITY_M = (-190.0, -160.0, 200.0, 140.0)
 CONFIG = TrafficSimulation()

@@ -6,13 +6,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from schemas.flight import PAPER_GSD_M
 from velfield.field.segments import Segments
 
 CROSSING_COLUMNS = ["passage", "time_s", "x_px", "y_px", "vx_px_per_s", "vy_px_per_s", "speed_px_per_s", "direction"]
 _SETTLE_M = 2.0
-
-Float = NDArray[np.float64]
 
 
 def settle_px(gsd_m: float | None) -> float:
@@ -64,7 +63,9 @@ def line_crossings(
     )
 
 
-def _beside(x: Float, y: Float, start: tuple[float, float], end: tuple[float, float]) -> tuple[Float, Float]:
+def _beside(
+    x: FloatArray, y: FloatArray, start: tuple[float, float], end: tuple[float, float]
+) -> tuple[FloatArray, FloatArray]:
     """Distance of points to the right of the line, px, and their place along it, 0 at its start and 1 at its end."""
     dx, dy = end[0] - start[0], end[1] - start[1]
     length = max(float(np.hypot(dx, dy)), 1e-9)
@@ -73,7 +74,7 @@ def _beside(x: Float, y: Float, start: tuple[float, float], end: tuple[float, fl
     return right, along
 
 
-def _settled(passage: NDArray[np.int64], after: Float, rows: NDArray[np.int64], settle_px: float) -> Iterator[int]:
+def _settled(passage: NDArray[np.int64], after: FloatArray, rows: NDArray[np.int64], settle_px: float) -> Iterator[int]:
     """Rows that cross, without the pairs of a vehicle that went over the line and back within ``settle_px``."""
     stack: list[int] = []
     for row in rows:
@@ -87,6 +88,6 @@ def _settled(passage: NDArray[np.int64], after: Float, rows: NDArray[np.int64], 
     yield from stack
 
 
-def _excursion(after: Float, out: int, back: int) -> float:
+def _excursion(after: FloatArray, out: int, back: int) -> float:
     """Farthest from the line between crossing out and back, px."""
     return float(np.abs(after[out:back]).max())

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, GreyImage
 from schemas.job import Inputs, Job
 from schemas.simulation import OtherSensorSimulation, SimulationConfig
 from velfield.errors import InputError
@@ -28,8 +29,6 @@ from velfield.synthetic.score import RegistrationScore, score_registration
 from velfield.synthetic.truth import Truth, load_truth
 from velfield.synthetic.write import frame_name
 
-FloatArray = NDArray[np.float64]
-Grey = NDArray[np.uint8]
 Mapped = Callable[[int, FloatArray], FloatArray]
 
 SAME_SENSOR = OtherSensorSimulation(same_sensor=True)
@@ -237,7 +236,7 @@ def _undistortion(truth: Truth) -> tuple[NDArray[np.float32], NDArray[np.float32
     return np.ascontiguousarray(raw[..., 0]), np.ascontiguousarray(raw[..., 1])
 
 
-def _coloured(grey: Grey) -> Grey:
+def _coloured(grey: GreyImage) -> GreyImage:
     return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
 
 

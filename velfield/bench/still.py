@@ -15,14 +15,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from velfield.errors import InputError
 from velfield.registration.alignment import FEW, MANY, Templates, align, blurred, make_templates
 from velfield.registration.transforms import FrameTransform
 from velfield.run.run import Run
 from velfield.sources.images import read_picture_grey
 from velfield.sources.table import finite_cell, read_csv_rows
-
-FloatArray = NDArray[np.float64]
 
 _MAX_SHIFT_PX = 3.0
 _MIN_SHARE = 0.5

@@ -13,9 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Grey = NDArray[np.uint8]
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from schemas.arrays import FloatArray, GreyImage, IntArray
 
 _FEWEST_POINTS, _MOST_POINTS = 10, 24  # kept of an arc
 
@@ -27,11 +25,11 @@ class Arcs:
     ``frame`` (arcs,) is the frame of each arc and ``length_px`` (arcs,) its chord.
     """
 
-    xy: Floats
-    tangents: Floats
-    arc: Ints
-    frame: Ints
-    length_px: Floats
+    xy: FloatArray
+    tangents: FloatArray
+    arc: IntArray
+    frame: IntArray
+    length_px: FloatArray
 
     def only(self, arcs: NDArray[np.bool_]) -> "Arcs":
         """The arcs of a mask (arcs,), numbered anew."""
@@ -234,7 +232,7 @@ def _arcs(points, order, starts, min_length, tolerance, max_curvature):  # type:
 
 
 def find_arcs(
-    grey: Grey,
+    grey: GreyImage,
     *,
     frame: int,
     smoothing_px: float = 1.2,
@@ -314,7 +312,7 @@ def pool_arcs(parts: list[Arcs], *, max_points: int) -> Arcs:
     return Arcs(xy, tangents, np.repeat(np.arange(count), pieces), frame, length_px).only(kept)
 
 
-def _means(values: Floats, group: Ints) -> Floats:
+def _means(values: FloatArray, group: IntArray) -> FloatArray:
     """Mean of the values (n, 2) of each group, (groups, 2); no group is empty."""
     size = np.bincount(group)
     return np.stack([np.bincount(group, weights=values[:, k]) / size for k in (0, 1)], axis=1)

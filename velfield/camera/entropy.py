@@ -11,13 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from velfield.camera.edges import Arcs
 from velfield.camera.lens import Lens
 
-Floats = NDArray[np.float64]
 
-
-def _soft_bins(values: Floats, width: float) -> tuple[NDArray[np.int64], Floats]:
+def _soft_bins(values: FloatArray, width: float) -> tuple[NDArray[np.int64], FloatArray]:
     """Each value's lower bin and its share in the next: the entropy must not jump as a value crosses a border."""
     position = values / width
     lower = np.floor(position)
@@ -66,10 +65,10 @@ def hough_entropy(arcs: Arcs, lens: Lens, *, angle_bins: int, distance_bin_px: f
 
 def _joint_entropy(
     arcs: Arcs,
-    xy: Floats,
-    tangents: Floats,
+    xy: FloatArray,
+    tangents: FloatArray,
     angle_keys: Sequence[NDArray[np.int64]],
-    angle_shares: Sequence[Floats],
+    angle_shares: Sequence[FloatArray],
     angle_bins: int,
     distance_bin_px: float,
 ) -> float:
@@ -92,7 +91,7 @@ def _joint_entropy(
     return entropy - area
 
 
-def _log_area_stretch(arcs: Arcs, xy: Floats, tangents: Floats) -> float:
+def _log_area_stretch(arcs: Arcs, xy: FloatArray, tangents: FloatArray) -> float:
     """Mean logarithm of the stretch across the lines, from the arcs' own points: distances between lines grow by it."""
     radius_raw = np.linalg.norm(arcs.xy - arcs.xy.mean(axis=0), axis=1)
     radius = np.linalg.norm(xy - arcs.xy.mean(axis=0), axis=1)

@@ -14,9 +14,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import Points
 from schemas.camera import DivisionLensRecord, HarrisLensRecord, LensRecord, PolynomialLensRecord
-
-Points = NDArray[np.float64]
 
 _NEWTON_STEPS = 60
 _NEWTON_TOLERANCE = 1e-13

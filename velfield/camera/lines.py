@@ -12,21 +12,19 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from schemas.arrays import FloatArray, IntArray
 from velfield.camera.edges import Arcs
 from velfield.camera.lens import Lens
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class LineSet:
     """Points of straight lines: raw ``xy`` and unit ``tangents`` (n, 2), ``line`` (n,) number; ``frame`` (lines,)."""
 
-    xy: Floats
-    tangents: Floats
-    line: Ints
-    frame: Ints
+    xy: FloatArray
+    tangents: FloatArray
+    line: IntArray
+    frame: IntArray
 
     @property
     def count(self) -> int:
@@ -40,7 +38,7 @@ class LineSet:
         return LineSet(self.xy[points], self.tangents[points], number[self.line[points]], self.frame[lines])
 
 
-def fitted_lines(xy: Floats, line: Ints, count: int) -> tuple[Floats, Floats]:
+def fitted_lines(xy: FloatArray, line: IntArray, count: int) -> tuple[FloatArray, FloatArray]:
     """Mean (count, 2) and unit direction (count, 2) of the least-squares line of each group of points."""
     size = np.maximum(np.bincount(line, minlength=count), 1)
     mean = np.stack([np.bincount(line, weights=xy[:, k], minlength=count) / size for k in (0, 1)], axis=1)
@@ -52,7 +50,7 @@ def fitted_lines(xy: Floats, line: Ints, count: int) -> tuple[Floats, Floats]:
     return mean, np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def line_residuals(lines: LineSet, lens: Lens) -> Floats:
+def line_residuals(lines: LineSet, lens: Lens) -> FloatArray:
     """Distance of each point from its own straight line, (n,) raw px, signed; NaN outside the lens's domain.
 
     The distance is taken in the undistorted picture and divided by the stretch there: no lens gains by shrinking.
@@ -65,7 +63,7 @@ def line_residuals(lines: LineSet, lens: Lens) -> Floats:
     return np.asarray(np.sum((xy - mean[lines.line]) * normal, axis=1) / np.maximum(stretch, 0.1))
 
 
-def line_rms(lines: LineSet, residuals: Floats) -> Floats:
+def line_rms(lines: LineSet, residuals: FloatArray) -> FloatArray:
     """RMS residual of each line, (lines,) px."""
     size = np.maximum(np.bincount(lines.line, minlength=lines.count), 1)
     return np.asarray(np.sqrt(np.bincount(lines.line, weights=residuals**2, minlength=lines.count) / size))
@@ -114,8 +112,14 @@ def join_arcs(arcs: Arcs, lens: Lens, *, tolerance_px: float, max_turn_rad: floa
 
 
 def _joinable(
-    arcs: Ints, mean: Floats, direction: Floats, low: Floats, high: Floats, tolerance_px: float, max_turn_rad: float
-) -> tuple[Ints, Ints]:
+    arcs: IntArray,
+    mean: FloatArray,
+    direction: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    tolerance_px: float,
+    max_turn_rad: float,
+) -> tuple[IntArray, IntArray]:
     """Pairs (longer, shorter) of one frame's arcs that lie on one line, one ending near where the other begins."""
     ends = np.stack([mean[arcs] + low[arcs, None] * direction[arcs], mean[arcs] + high[arcs, None] * direction[arcs]])
     offset = ends[:, None] - mean[arcs][None, :, None]  # (end, longer, shorter, 2)
@@ -133,7 +137,7 @@ def _joinable(
     return arcs[longer], arcs[shorter]
 
 
-def chords(lines: LineSet) -> Floats:
+def chords(lines: LineSet) -> FloatArray:
     """Extent of each line along itself, raw px."""
     mean, direction = fitted_lines(lines.xy, lines.line, lines.count)
     along = np.sum((lines.xy - mean[lines.line]) * direction[lines.line], axis=1)

@@ -25,11 +25,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, IntArray
 from velfield.camera.lens import HarrisLens, PolynomialLens
 from velfield.camera.straighten import AnyLens, robust_weights
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 RELIEF_SD = 0.005
 """How far ground usually bulges from its plane by a picture's corner, as a share of the flight's height."""
@@ -72,9 +70,9 @@ class Overlap:
     """
 
     frame_shape: tuple[int, int]
-    frames: Ints
-    xy_i: Floats
-    xy_j: Floats
+    frames: IntArray
+    xy_i: FloatArray
+    xy_j: FloatArray
     there: NDArray[np.bool_]
 
     def only(self, pairs: NDArray[np.bool_]) -> "Overlap":
@@ -95,15 +93,15 @@ class LensLine:
     unit: AnyLens
     centre_sd: float
 
-    def lens(self, shared: Floats) -> AnyLens:
+    def lens(self, shared: FloatArray) -> AnyLens:
         """The lens of (amount, centre x, centre y, ...), the centre in half-diagonals from that of ``unit``."""
         return scaled(self.unit, float(shared[0]), (float(shared[1]), float(shared[2])))
 
-    def normal(self, xy: Floats) -> Floats:
+    def normal(self, xy: FloatArray) -> FloatArray:
         """Pixels (..., 2) in half-diagonals about the centre."""
         return np.asarray((xy - (self.unit.centre_x_px, self.unit.centre_y_px)) / self.unit.half_diagonal_px)
 
-    def pixels(self, normal: Floats) -> Floats:
+    def pixels(self, normal: FloatArray) -> FloatArray:
         """The inverse of ``normal``."""
         return np.asarray(normal * self.unit.half_diagonal_px + (self.unit.centre_x_px, self.unit.centre_y_px))
 
@@ -143,8 +141,8 @@ class OverlapFit:
 class _State:
     """Where a fit stands: what pairs share, and each pair's homography (pairs, 3, 3) of normalised pixels."""
 
-    shared: Floats
-    matrices: Floats
+    shared: FloatArray
+    matrices: FloatArray
 
 
 @dataclass(frozen=True)
@@ -154,8 +152,8 @@ class _Problem:
 
     overlap: Overlap
     line: LensLine
-    bumps: Floats
-    shift: Floats
+    bumps: FloatArray
+    shift: FloatArray
     bump_sd: float = _BUMP_SD
 
     def only(self, pairs: NDArray[np.bool_]) -> "_Problem":
@@ -166,21 +164,21 @@ class _Problem:
         return int(self.overlap.frames.max()) + 1
 
     @cached_property
-    def waves(self) -> tuple[Floats, Floats]:
+    def waves(self) -> tuple[FloatArray, FloatArray]:
         """(pairs, n, waves) at the rows of i and of j."""
         height = self.overlap.frame_shape[0]
         cycle = np.pi * (1.0 + np.arange(_WAVES)) / height
         return tuple(np.cos((xy[..., 1:] + 0.5) * cycle) for xy in (self.overlap.xy_i, self.overlap.xy_j))  # type: ignore[return-value]
 
     @cached_property
-    def precision(self) -> Floats:
+    def precision(self) -> FloatArray:
         """(shared,) of what is known beforehand: nothing of the amount."""
         centre, bumps = np.full(2, self.line.centre_sd**-2), np.full(self.bumps.shape[2], self.bump_sd**-2)
         rows = np.full(self.frame_count * _WAVES * 2, ROW_SD_PX**-2)
         return np.concatenate([[1e-9], centre, bumps, rows])
 
     @cached_property
-    def places(self) -> Ints:
+    def places(self) -> IntArray:
         """(pairs, m) of what each pair shares: the lens, the bumps, the waves of i, those of j."""
         first = 3 + self.bumps.shape[2]
         waves = np.arange(2 * _WAVES)
@@ -188,12 +186,12 @@ class _Problem:
         common = np.broadcast_to(np.arange(first), (len(rows[0]), first))
         return np.concatenate([common, *rows], axis=1)
 
-    def parts(self, shared: Floats) -> tuple[Floats, Floats]:
+    def parts(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The bumps' heights (bumps,) and the rows' waves (frames, waves, 2), px."""
         count = self.bumps.shape[2]
         return shared[3 : 3 + count], shared[3 + count :].reshape(self.frame_count, _WAVES, 2)
 
-    def mapped(self, state: _State) -> Floats:
+    def mapped(self, state: _State) -> FloatArray:
         """Where each pair's map takes the points of i, normalised undistorted, (pairs, n, 2)."""
         heights, rows = self.parts(state.shared)
         moved = self.overlap.xy_i - self.waves[0] @ rows[self.overlap.frames[:, 0]]
@@ -201,40 +199,40 @@ class _Problem:
         relief = (self.bumps @ heights)[..., None] * self.shift[:, None]
         return _by(state.matrices, self.line.normal(straight)) + relief
 
-    def raw(self, shared: Floats, mapped: Floats) -> Floats:
+    def raw(self, shared: FloatArray, mapped: FloatArray) -> FloatArray:
         """Normalised undistorted points (pairs, n, 2) of j as raw px."""
         raw = self.line.lens(shared).distort_points(self.line.pixels(mapped).reshape(-1, 2)).reshape(mapped.shape)
         return np.asarray(raw + self.waves[1] @ self.parts(shared)[1][self.overlap.frames[:, 1]])
 
-    def misses(self, state: _State) -> Floats:
+    def misses(self, state: _State) -> FloatArray:
         """(pairs, n, 2) raw px of j; NaN outside the lens's domain."""
         return np.asarray(self.overlap.xy_j - self.raw(state.shared, self.mapped(state)))
 
 
-def _by(matrices: Floats, xy: Floats) -> Floats:
+def _by(matrices: FloatArray, xy: FloatArray) -> FloatArray:
     """Points (pairs, n, 2) by (pairs, 3, 3)."""
     mapped = xy @ matrices[:, :, :2].transpose(0, 2, 1) + matrices[:, None, :, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(mapped[..., :2] / mapped[..., 2:])
 
 
-def _finite(values: Floats) -> Floats:
+def _finite(values: FloatArray) -> FloatArray:
     """Zero in place of what is beyond a lens's domain or a map's horizon: it says nothing."""
     return np.where(np.isfinite(values), values, 0.0)
 
 
-def _distances(misses: Floats, there: NDArray[np.bool_]) -> Floats:
+def _distances(misses: FloatArray, there: NDArray[np.bool_]) -> FloatArray:
     """(pairs, n) px; NaN where a place is padding, far off where a point has no image."""
     distance = np.hypot(misses[..., 0], misses[..., 1])
     return np.where(there, np.where(np.isfinite(distance), distance, _FAR_PX), np.nan)
 
 
-def _medians(misses: Floats, there: NDArray[np.bool_]) -> Floats:
+def _medians(misses: FloatArray, there: NDArray[np.bool_]) -> FloatArray:
     """Median miss of each pair (pairs,), px."""
     return np.asarray(np.nanmedian(_distances(misses, there), axis=1))
 
 
-def _weights(misses: Floats, there: NDArray[np.bool_]) -> Floats:
+def _weights(misses: FloatArray, there: NDArray[np.bool_]) -> FloatArray:
     """Geman-McClure weights (pairs, n) over each pair's own variance, px^-2."""
     scale = np.maximum(_medians(misses, there)[:, None] / 1.1774, _LEAST_SCALE_PX)
     return _finite(robust_weights(_distances(misses, there), scale) / scale**2)
@@ -246,13 +244,13 @@ class _Normal:
     others, ``places`` (pairs, m) among all that is shared, homographies solved for; ``own`` (pairs, 8) and ``coupling``
     (pairs, 8, m) give the homographies after a step."""
 
-    places: Ints
-    information: Floats
-    pull: Floats
-    own: Floats
-    coupling: Floats
+    places: IntArray
+    information: FloatArray
+    pull: FloatArray
+    own: FloatArray
+    coupling: FloatArray
 
-    def gathered(self, problem: _Problem, pairs: NDArray[np.bool_] | None = None) -> tuple[Floats, Floats]:
+    def gathered(self, problem: _Problem, pairs: NDArray[np.bool_] | None = None) -> tuple[FloatArray, FloatArray]:
         """Normal matrix (s, s), what is known beforehand in it, and pull (s,) of all pairs or those of a mask."""
         kept = slice(None) if pairs is None else pairs
         places = self.places[kept]
@@ -261,7 +259,7 @@ class _Normal:
         np.add.at(pull, places, HEARD * self.pull[kept])
         return normal, pull
 
-    def step(self, problem: _Problem, shared: Floats, pairs: NDArray[np.bool_] | None = None) -> Floats:
+    def step(self, problem: _Problem, shared: FloatArray, pairs: NDArray[np.bool_] | None = None) -> FloatArray:
         """The step (s,) of the shared from all pairs or those of a mask."""
         normal, pull = self.gathered(problem, pairs)
         return np.asarray(np.linalg.solve(normal, pull - problem.precision * shared))
@@ -284,13 +282,13 @@ def _linearised(problem: _Problem, state: _State) -> _Normal:
     return _Normal(problem.places, left[:, :, :-1], left[:, :, -1], solved[:, :, -1], solved[:, :, :-1])
 
 
-def _stepped(state: _State, normal: _Normal, step: Floats) -> _State:
+def _stepped(state: _State, normal: _Normal, step: FloatArray) -> _State:
     change = normal.own - (normal.coupling @ step[normal.places][..., None])[..., 0]
     change = np.concatenate([change, np.zeros((len(change), 1))], axis=1)
     return _State(state.shared + step, state.matrices + change.reshape(-1, 3, 3))
 
 
-def _own_jacobian(problem: _Problem, state: _State, bent: Floats) -> Floats:
+def _own_jacobian(problem: _Problem, state: _State, bent: FloatArray) -> FloatArray:
     """(pairs, n, 2, 8): raw px by the eight free elements of each pair's homography."""
     lens = problem.line.lens(state.shared)
     xy = problem.line.normal(lens.undistort_points(problem.overlap.xy_i.reshape(-1, 2))).reshape(
@@ -305,7 +303,7 @@ def _own_jacobian(problem: _Problem, state: _State, bent: Floats) -> Floats:
     return np.asarray(bent @ np.stack([x, y], axis=2))
 
 
-def _bent(problem: _Problem, state: _State) -> Floats:
+def _bent(problem: _Problem, state: _State) -> FloatArray:
     """(pairs, n, 2, 2): derivative of the distortion at each mapped point, raw px by normalised px."""
     here = problem.mapped(state)
     columns = []
@@ -315,7 +313,7 @@ def _bent(problem: _Problem, state: _State) -> Floats:
     return np.stack(columns, axis=-1)
 
 
-def _shared_jacobian(problem: _Problem, state: _State, misses: Floats, bent: Floats) -> Floats:
+def _shared_jacobian(problem: _Problem, state: _State, misses: FloatArray, bent: FloatArray) -> FloatArray:
     """(pairs, n, 2, m): raw px by what a pair shares with others, see ``_Problem.places``."""
     columns = []
     for k in range(3):
@@ -331,7 +329,7 @@ def _shared_jacobian(problem: _Problem, state: _State, misses: Floats, bent: Flo
     return np.concatenate([*columns, relief * problem.bumps[:, :, None, :], *rows], axis=3)
 
 
-def _homographies(overlap: Overlap, line: LensLine, amount: float) -> Floats:
+def _homographies(overlap: Overlap, line: LensLine, amount: float) -> FloatArray:
     """(pairs, 3, 3), normalised px, by MAGSAC under the lens of that amount."""
     lens = line.lens(np.array([amount, 0.0, 0.0]))
     limit = _START_ERROR_PX / line.unit.half_diagonal_px
@@ -344,7 +342,7 @@ def _homographies(overlap: Overlap, line: LensLine, amount: float) -> Floats:
     return np.array(matrices, dtype=np.float64)
 
 
-def _problem(overlap: Overlap, line: LensLine, matrices: Floats) -> _Problem:
+def _problem(overlap: Overlap, line: LensLine, matrices: FloatArray) -> _Problem:
     ground = _by(_places(overlap, matrices), line.normal(overlap.xy_i))
     inside = ground[overlap.there & np.isfinite(ground).all(axis=2)]
     low, high = np.percentile(inside, 1, axis=0), np.percentile(inside, 99, axis=0)
@@ -357,17 +355,17 @@ def _problem(overlap: Overlap, line: LensLine, matrices: Floats) -> _Problem:
     return _Problem(overlap, line, _finite(bumps), shift)
 
 
-def _bumps(places: Floats, low: float, high: float, spacing: float) -> Floats:
+def _bumps(places: FloatArray, low: float, high: float, spacing: float) -> FloatArray:
     """(..., bumps): bell curves along one axis, evenly over the range and a little beyond."""
     count = int(np.ceil((high - low) / spacing)) + 1
     nodes = 0.5 * (low + high) + spacing * (np.arange(count) - 0.5 * (count - 1))
     return np.asarray(np.exp(-0.5 * ((places[..., None] - nodes) / spacing) ** 2))
 
 
-def _places(overlap: Overlap, matrices: Floats) -> Floats:
+def _places(overlap: Overlap, matrices: FloatArray) -> FloatArray:
     """(pairs, 3, 3) from each frame i to the frame in most pairs, joined by the fullest pairs; NaN: not joined."""
     frames, size = overlap.frames, overlap.there.sum(axis=1)
-    placed: dict[int, Floats] = {int(np.argmax(np.bincount(frames.ravel()))): np.eye(3)}
+    placed: dict[int, FloatArray] = {int(np.argmax(np.bincount(frames.ravel()))): np.eye(3)}
     while edges := [p for p, (i, j) in enumerate(frames.tolist()) if (i in placed) != (j in placed)]:
         best = max(edges, key=lambda p: (size[p], -p))
         i, j = frames[best].tolist()
@@ -424,7 +422,7 @@ def _hidden(problem: _Problem, normal: _Normal, weight: float, fit_px: float) ->
 
 
 def _left_out(
-    problem: _Problem, state: _State, lenses: Floats, without: Sequence[NDArray[np.bool_]], before: float
+    problem: _Problem, state: _State, lenses: FloatArray, without: Sequence[NDArray[np.bool_]], before: float
 ) -> tuple[float, float]:
     """Usual miss, px, with the lens before and with those (frames, 3) found without a frame, on that frame's pairs."""
     found = []
@@ -468,12 +466,12 @@ def _hilly(problem: _Problem, state: _State) -> tuple[_Problem, _State]:
     return problem, state
 
 
-def _typical(misses: Floats, there: NDArray[np.bool_]) -> float:
+def _typical(misses: FloatArray, there: NDArray[np.bool_]) -> float:
     """Mean over pairs of the logarithm of the median miss: no pair's outliers decide."""
     return float(np.mean(np.log(np.maximum(_medians(misses, there), _LEAST_SCALE_PX))))
 
 
-def _heldout(problem: _Problem, lens: Floats, matrices: Floats) -> Floats:
+def _heldout(problem: _Problem, lens: FloatArray, matrices: FloatArray) -> FloatArray:
     """Median miss of each pair, raw px, under a lens and a homography of its own, nothing else."""
     shared = np.zeros(len(problem.precision))
     shared[:3] = lens

@@ -11,13 +11,10 @@ This goes beyond the paper, whose entropy of the lines' directions has the same 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, IntArray
 from velfield.camera.lines import LineSet, chords, fitted_lines, line_residuals
 from velfield.camera.straighten import StraightFit, robust_weights, usual_residual
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 NEAR_RAD = 0.026
 """Largest angle between a line and the way to its vanishing point, 1.5 degrees."""
@@ -41,10 +38,10 @@ _NUDGE = 1e-5
 class _Family:
     """Numbers of its lines (n,) and its vanishing point, a unit 3-vector of half-diagonals about the middle."""
 
-    lines: Ints
-    point: Floats
+    lines: IntArray
+    point: FloatArray
 
-    def off(self, placed: "_Placed", point: Floats | None = None) -> Floats:
+    def off(self, placed: "_Placed", point: FloatArray | None = None) -> FloatArray:
         """Angle, rad, of each line (n,) to the way to the family's point, or to one tried in its place."""
         return _angles(placed, self.lines, self.point if point is None else point)
 
@@ -53,8 +50,8 @@ class _Family:
 class _Placed:
     """Undistorted lines: middles (lines, 2), in half-diagonals about the picture's middle, and unit directions."""
 
-    middle: Floats
-    direction: Floats
+    middle: FloatArray
+    direction: FloatArray
 
 
 @dataclass(frozen=True)
@@ -63,13 +60,13 @@ class _Part:
     parameters; ``own`` (2,) and ``coupling`` (2, p) move the point along ``basis`` (2, 3) after a step of theirs."""
 
     family: _Family
-    information: Floats
-    pull: Floats
-    own: Floats
-    coupling: Floats
-    basis: Floats
+    information: FloatArray
+    pull: FloatArray
+    own: FloatArray
+    coupling: FloatArray
+    basis: FloatArray
 
-    def moved(self, step: Floats) -> _Family:
+    def moved(self, step: FloatArray) -> _Family:
         """The family, its point where it belongs after a step (p,) of the parameters."""
         point = self.family.point + (self.own - self.coupling @ step) @ self.basis
         return replace(self.family, point=point / np.linalg.norm(point))
@@ -118,13 +115,13 @@ def refine_by_parallels(fit: StraightFit, lines: LineSet, seed: int = 0) -> Stra
     )
 
 
-def _placed(lines: LineSet, fit: StraightFit, parameters: Floats) -> _Placed:
+def _placed(lines: LineSet, fit: StraightFit, parameters: FloatArray) -> _Placed:
     xy = fit.family.lens(parameters).undistort_points(lines.xy)
     middle, direction = fitted_lines(xy, lines.line, lines.count)
     return _Placed((middle - fit.family.middle) / fit.family.half_diagonal_px, direction)
 
 
-def _angles(placed: _Placed, chosen: Ints, points: Floats) -> Floats:
+def _angles(placed: _Placed, chosen: IntArray, points: FloatArray) -> FloatArray:
     """Angle, rad in (-pi/2, pi/2], of chosen lines (n,) to the way to each of the points (..., 3), (..., n)."""
     direction = placed.direction[chosen]
     way = points[..., None, :2] - points[..., None, 2:] * placed.middle[chosen]
@@ -153,7 +150,7 @@ def _families(lines: LineSet, placed: _Placed, seed: int) -> list[_Family]:
     return found
 
 
-def _meeting_points(placed: _Placed, pairs: Ints) -> Floats:
+def _meeting_points(placed: _Placed, pairs: IntArray) -> FloatArray:
     """Where the lines of pairs (2, n) meet: unit vectors (m, 3)."""
     (mx, my), (dx, dy) = placed.middle.T, placed.direction.T
     through = np.stack([dy, -dx, dx * my - dy * mx], axis=1)
@@ -163,7 +160,7 @@ def _meeting_points(placed: _Placed, pairs: Ints) -> Floats:
     return np.asarray(points[apart] / size[apart, None])
 
 
-def _parts(lines: LineSet, fit: StraightFit, parameters: Floats, families: list[_Family]) -> list[_Part]:
+def _parts(lines: LineSet, fit: StraightFit, parameters: FloatArray, families: list[_Family]) -> list[_Part]:
     here = _placed(lines, fit, parameters)
     nudges = _NUDGE * np.eye(parameters.size)
     nudged = [_placed(lines, fit, parameters + nudge) for nudge in nudges]

@@ -17,9 +17,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from schemas.arrays import FloatArray, GreyImage
 from schemas.camera import CameraRecord, ModelEvidence
 from schemas.flight import LensConfig
 from velfield.camera.edges import Arcs, find_arcs, pool_arcs
@@ -29,9 +29,6 @@ from velfield.camera.lines import LineSet, join_arcs, line_residuals, line_rms
 from velfield.camera.parallels import refine_by_parallels
 from velfield.camera.straighten import AnyLens, LensFamily, StraightFit, fit_lens, heldout_rms
 from velfield.errors import InputError
-
-Grey = NDArray[np.uint8]
-Floats = NDArray[np.float64]
 
 MIN_LINES = 30
 """Fewer straight lines than this say nothing of a lens."""
@@ -147,7 +144,7 @@ class _Scene:
         return join_arcs(self.arcs, lens, tolerance_px=tolerance_px, max_turn_rad=_MAX_TURN_RAD, min_length_px=length)
 
 
-def calibrate(frames: Sequence[Grey], config: LensConfig, seed: int = 0) -> CalibrationResult:
+def calibrate(frames: Sequence[GreyImage], config: LensConfig, seed: int = 0) -> CalibrationResult:
     """Estimate the lens from frames of one camera.
 
     Parameters
@@ -212,7 +209,7 @@ def calibrate(frames: Sequence[Grey], config: LensConfig, seed: int = 0) -> Cali
     )
 
 
-def _common_shape(frames: Sequence[Grey]) -> tuple[int, int]:
+def _common_shape(frames: Sequence[GreyImage]) -> tuple[int, int]:
     if not frames:
         raise InputError("no frame to calibrate the lens from; give at least one")
     height, width = frames[0].shape[:2]
@@ -225,7 +222,7 @@ def _common_shape(frames: Sequence[Grey]) -> tuple[int, int]:
     return height, width
 
 
-def _pooled_arcs(frames: Sequence[Grey], shape: tuple[int, int], config: LensConfig) -> Arcs:
+def _pooled_arcs(frames: Sequence[GreyImage], shape: tuple[int, int], config: LensConfig) -> Arcs:
     half_diagonal = pinhole(shape).half_diagonal_px
     parts = [
         find_arcs(
@@ -239,14 +236,14 @@ def _pooled_arcs(frames: Sequence[Grey], shape: tuple[int, int], config: LensCon
     return pool_arcs(parts, max_points=config.max_edge_points)
 
 
-def _search(scene: _Scene, max_distortion: float) -> tuple[Floats, Floats, Floats]:
+def _search(scene: _Scene, max_distortion: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Grid of distortions, its entropies, and the parameters (a, x, y) of least entropy after a descent."""
     steps = max(1, round(max_distortion / _GRID_STEP))
     grid = np.linspace(-max_distortion, max_distortion, 2 * steps + 1)
     thinned = scene.arcs.every(max(1, scene.arcs.arc.size // _SEARCH_POINTS))
     family = scene.family("harris", 1)
 
-    def entropy(parameters: Floats) -> float:
+    def entropy(parameters: FloatArray) -> float:
         return scene.entropy(family.lens(parameters), thinned)
 
     values = np.array([entropy(np.array([a, 0.0, 0.0])) for a in grid])
@@ -262,7 +259,7 @@ def _search(scene: _Scene, max_distortion: float) -> tuple[Floats, Floats, Float
     return grid, values, start if wandered else best
 
 
-def _fit_harris(scene: _Scene, start: Floats) -> StraightFit | None:
+def _fit_harris(scene: _Scene, start: FloatArray) -> StraightFit | None:
     """Harris' model on joined lines, joined anew as the lens gets better; None where lines are too few."""
     family = scene.family("harris", 1)
     parameters, fit = start, None

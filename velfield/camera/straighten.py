@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from velfield.camera.lens import DivisionLens, HarrisLens, Lens, PolynomialLens
 from velfield.camera.lines import LineSet, line_residuals, line_rms
 
-Floats = NDArray[np.float64]
 AnyLens = HarrisLens | DivisionLens | PolynomialLens
 
 CENTRE_SD = 0.03
@@ -37,7 +36,7 @@ class LensFamily:
     middle: tuple[float, float]
     half_diagonal_px: float
 
-    def lens(self, parameters: Floats) -> AnyLens:
+    def lens(self, parameters: FloatArray) -> AnyLens:
         """The lens of a parameter vector (terms + 2,)."""
         x = self.middle[0] + float(parameters[-2]) * self.half_diagonal_px
         y = self.middle[1] + float(parameters[-1]) * self.half_diagonal_px
@@ -53,10 +52,10 @@ class StraightFit:
     """A fitted lens: ``parameters`` of its family, their ``covariance``, RMS residual, the lines' ``weights``."""
 
     family: LensFamily
-    parameters: Floats
-    covariance: Floats
+    parameters: FloatArray
+    covariance: FloatArray
     residual_px: float
-    weights: Floats
+    weights: FloatArray
 
     @property
     def lens(self) -> AnyLens:
@@ -64,19 +63,19 @@ class StraightFit:
         return self.family.lens(self.parameters)
 
 
-def line_weights(rms: Floats, sizes: Floats) -> Floats:
+def line_weights(rms: FloatArray, sizes: FloatArray) -> FloatArray:
     """Weight of each line by its RMS residual, (lines,) in (0, 1]: Geman-McClure about the usual line."""
     order = np.argsort(rms)
     half = np.searchsorted(np.cumsum(sizes[order]), 0.5 * sizes.sum())
     return robust_weights(rms, max(float(rms[order[min(half, rms.size - 1)]]), _LEAST_SCALE_PX))
 
 
-def robust_weights(residuals: Floats, scale: float | Floats) -> Floats:
+def robust_weights(residuals: FloatArray, scale: float | FloatArray) -> FloatArray:
     """Geman-McClure weights in (0, 1] of residuals whose usual size is ``scale``, both of any one unit."""
     return np.asarray(1.0 / (1.0 + (residuals / (_ROBUST_FACTOR * scale)) ** 2) ** 2)
 
 
-def fit_lens(lines: LineSet, family: LensFamily, start: Floats) -> StraightFit:
+def fit_lens(lines: LineSet, family: LensFamily, start: FloatArray) -> StraightFit:
     """Fit a model's parameters to straight lines.
 
     Parameters
@@ -114,7 +113,7 @@ def fit_lens(lines: LineSet, family: LensFamily, start: Floats) -> StraightFit:
     return _finished(lines, family, parameters, residuals, sizes)
 
 
-def _jacobian(lines: LineSet, family: LensFamily, parameters: Floats, residuals: Floats) -> Floats:
+def _jacobian(lines: LineSet, family: LensFamily, parameters: FloatArray, residuals: FloatArray) -> FloatArray:
     """Forward differences (points, parameters); the lines are fitted anew at each."""
     columns = []
     for k in range(parameters.size):
@@ -124,14 +123,16 @@ def _jacobian(lines: LineSet, family: LensFamily, parameters: Floats, residuals:
     return np.nan_to_num(np.stack(columns, axis=1))
 
 
-def _information(lines: LineSet, jacobian: Floats, residuals: Floats, point_weight: Floats) -> tuple[Floats, Floats]:
+def _information(
+    lines: LineSet, jacobian: FloatArray, residuals: FloatArray, point_weight: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """What the points say of the parameters, in units of the cost, and the spread of what the lines do, both (p, p)."""
     scores = jacobian * (point_weight * residuals)[:, None]
     by_line = np.stack([np.bincount(lines.line, weights=column, minlength=lines.count) for column in scores.T], axis=1)
     return (jacobian * point_weight[:, None]).T @ jacobian, np.asarray(by_line.T @ by_line, dtype=np.float64)
 
 
-def _prior(information: Floats, by_line: Floats) -> Floats:
+def _prior(information: FloatArray, by_line: FloatArray) -> FloatArray:
     """Diagonal of the prior on the centre, in units of the cost.
 
     A point's say is worth its variance as the lines spread, not as points do: those of a line err together.
@@ -143,19 +144,26 @@ def _prior(information: Floats, by_line: Floats) -> Floats:
     return diagonal
 
 
-def _cost(residuals: Floats, point_weight: Floats, prior: Floats, parameters: Floats) -> float:
+def _cost(residuals: FloatArray, point_weight: FloatArray, prior: FloatArray, parameters: FloatArray) -> float:
     if not np.all(np.isfinite(residuals)):
         return float("inf")
     return float(np.sum(point_weight * residuals**2) + np.sum(prior * parameters**2))
 
 
-def _trial(lines: LineSet, family: LensFamily, parameters: Floats, *, point_weight: Floats, prior: Floats) -> float:
+def _trial(
+    lines: LineSet, family: LensFamily, parameters: FloatArray, *, point_weight: FloatArray, prior: FloatArray
+) -> float:
     return _cost(line_residuals(lines, family.lens(parameters)), point_weight, prior, parameters)
 
 
 def _damped_step(
-    trial: Callable[[Floats], float], parameters: Floats, normal: Floats, gradient: Floats, cost: float, damping: float
-) -> tuple[Floats, float, float]:
+    trial: Callable[[FloatArray], float],
+    parameters: FloatArray,
+    normal: FloatArray,
+    gradient: FloatArray,
+    cost: float,
+    damping: float,
+) -> tuple[FloatArray, float, float]:
     """The first damped step that lowers the cost, by how much it does, and the damping after it."""
     for _ in range(8):
         step = np.asarray(-np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient), dtype=np.float64)
@@ -166,7 +174,7 @@ def _damped_step(
     return np.zeros_like(parameters), 0.0, damping
 
 
-def _inside_domain(lines: LineSet, family: LensFamily, start: Floats) -> Floats:
+def _inside_domain(lines: LineSet, family: LensFamily, start: FloatArray) -> FloatArray:
     """The start, drawn towards the pin-hole until every point is inside the lens's domain."""
     parameters = np.array(start, dtype=np.float64)
     while not np.all(np.isfinite(line_residuals(lines, family.lens(parameters)))):
@@ -174,7 +182,9 @@ def _inside_domain(lines: LineSet, family: LensFamily, start: Floats) -> Floats:
     return parameters
 
 
-def _finished(lines: LineSet, family: LensFamily, parameters: Floats, residuals: Floats, sizes: Floats) -> StraightFit:
+def _finished(
+    lines: LineSet, family: LensFamily, parameters: FloatArray, residuals: FloatArray, sizes: FloatArray
+) -> StraightFit:
     weights = line_weights(line_rms(lines, residuals), sizes)
     point_weight = weights[lines.line]
     jacobian = _jacobian(lines, family, parameters, residuals)
@@ -183,12 +193,14 @@ def _finished(lines: LineSet, family: LensFamily, parameters: Floats, residuals:
     return StraightFit(family, parameters, bread @ by_line @ bread, usual_residual(residuals, point_weight), weights)
 
 
-def usual_residual(residuals: Floats, point_weight: Floats) -> float:
+def usual_residual(residuals: FloatArray, point_weight: FloatArray) -> float:
     """Weighted RMS distance of points (n,) from their lines, raw px."""
     return float(np.sqrt(np.sum(point_weight * residuals**2) / np.sum(point_weight)))
 
 
-def heldout_rms(lines: LineSet, families: Sequence[tuple[LensFamily, Floats]], *, folds: int, seed: int) -> Floats:
+def heldout_rms(
+    lines: LineSet, families: Sequence[tuple[LensFamily, FloatArray]], *, folds: int, seed: int
+) -> FloatArray:
     """RMS of each line left out of the fit, (models, lines) px: every model sees the same folds."""
     fold = np.random.default_rng(seed).permutation(lines.count) % folds
     rms = np.zeros((len(families), lines.count))

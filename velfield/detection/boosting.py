@@ -6,11 +6,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Ints = NDArray[np.int64]
+from schemas.arrays import ByteArray, Float32Array, FloatArray, IntArray
+
 Int32s = NDArray[np.int32]
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Bytes = NDArray[np.uint8]
 
 N_BINS = 64
 ROUND_POOL = 700
@@ -81,14 +79,14 @@ def _interval(sigma: float, reach: int, rng: np.random.Generator) -> tuple[int, 
 class Stumps:
     """The rounds of a training: which feature, its threshold, what is said at or below and above it."""
 
-    features: Ints
+    features: IntArray
     thresholds: NDArray[np.float32]
     leaves: NDArray[np.float32]
 
 
 def boost(
-    bins: Bytes,
-    edges: Singles,
+    bins: ByteArray,
+    edges: Float32Array,
     is_car: NDArray[np.bool_],
     *,
     rounds: int,
@@ -138,20 +136,20 @@ def boost(
     return Stumps(np.array(features, np.int64), np.array(thresholds, np.float32), np.array(leaves, np.float32))
 
 
-def _start_weights(is_car: NDArray[np.bool_], car_fraction: float) -> Floats:
+def _start_weights(is_car: NDArray[np.bool_], car_fraction: float) -> FloatArray:
     """Weights of the samples before the first round: all cars together weigh ``car_fraction``."""
     weights = np.where(is_car, car_fraction / is_car.sum(), (1 - car_fraction) / (~is_car).sum())
     return np.asarray(weights / weights.sum())  # one but for rounding, which decides between stumps that are alike
 
 
-def _that_matter(weights: Floats, rows: Ints) -> Ints:
+def _that_matter(weights: FloatArray, rows: IntArray) -> IntArray:
     """Rows without the lightest, which together weigh next to nothing: three times fewer, the same stumps."""
     order = rows[np.argsort(weights[rows], kind="stable")]
     weight = np.cumsum(weights[order])
     return np.sort(order[np.searchsorted(weight, _TRIMMED_WEIGHT * weight[-1]) :])
 
 
-def bin_edges(values: Singles) -> Singles:
+def bin_edges(values: Float32Array) -> Float32Array:
     """(features, bins - 1) edges from values (features, samples): as many samples in each bin."""
     return np.asarray(np.quantile(values, np.linspace(0, 1, N_BINS + 1)[1:-1], axis=1).T, np.float32)
 

@@ -2,13 +2,13 @@
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Grey = NDArray[np.uint8]
+from schemas.arrays import FloatArray, GreyImage
 
 
-def oriented_patches(image: Grey, xy: Floats, orientation_rad: Floats, *, width: int = 8, length: int = 16) -> Grey:
+def oriented_patches(
+    image: GreyImage, xy: FloatArray, orientation_rad: FloatArray, *, width: int = 8, length: int = 16
+) -> GreyImage:
     """Patches turned so that the car's axis runs down the rows (paper: the 8 x 16 oriented patch).
 
     Parameters
@@ -33,7 +33,7 @@ def oriented_patches(image: Grey, xy: Floats, orientation_rad: Floats, *, width:
     return _sampled(image, x, y)
 
 
-def upright_chips(image: Grey, xy: Floats, *, side: int = 32) -> Grey:
+def upright_chips(image: GreyImage, xy: FloatArray, *, side: int = 32) -> GreyImage:
     """Crops centred on the rounded places, (n, side, side) uint8: pixel (side / 2, side / 2) is the rounded place."""
     padded = np.pad(image, side, mode="edge")
     corner = np.rint(xy).astype(np.int64) + side - side // 2
@@ -41,7 +41,7 @@ def upright_chips(image: Grey, xy: Floats, *, side: int = 32) -> Grey:
     return np.stack(chips) if chips else np.empty((0, side, side), np.uint8)
 
 
-def _sampled(image: Grey, x: Floats, y: Floats) -> Grey:
+def _sampled(image: GreyImage, x: FloatArray, y: FloatArray) -> GreyImage:
     shape = x.shape
     flat_x, flat_y = (np.ascontiguousarray(c.reshape(shape[0], -1), np.float32) for c in (x, y))
     rows = []

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, GreyImage
 from schemas.flight import DetectionConfig
 from velfield.detection.cascade.classifier import Look, distinct, find_cars
 from velfield.detection.cascade.feature_image import COARSE, picture_of
@@ -16,9 +17,6 @@ from velfield.detection.crops import oriented_patches, upright_chips
 from velfield.detection.detector import Detector
 from velfield.detection.label_orientation import CAR_ASPECT
 from velfield.detection.paper.classifier import find_cars_densely
-
-Floats = NDArray[np.float64]
-Grey = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -36,21 +34,21 @@ class FrameDetections:
     chips : (n, 32, 32) uint8, upright about the rounded place.
     """
 
-    xy: Floats
-    orientation_rad: Floats
-    orientation_sd_rad: Floats
-    area_px: Floats
-    score: Floats
-    patches: Grey
-    chips: Grey
+    xy: FloatArray
+    orientation_rad: FloatArray
+    orientation_sd_rad: FloatArray
+    area_px: FloatArray
+    score: FloatArray
+    patches: GreyImage
+    chips: GreyImage
 
 
 def detect_frame(
-    image: Grey,
+    image: GreyImage,
     valid: NDArray[np.bool_] | None,
     detector: Detector,
     config: DetectionConfig,
-    background: Grey | None = None,
+    background: GreyImage | None = None,
 ) -> FrameDetections:
     """Find cars.
 
@@ -84,8 +82,12 @@ def detect_frame(
 
 
 def _aligned(
-    image: Grey, valid: NDArray[np.bool_] | None, detector: Detector, threshold: float, background: Grey | None
-) -> Floats:
+    image: GreyImage,
+    valid: NDArray[np.bool_] | None,
+    detector: Detector,
+    threshold: float,
+    background: GreyImage | None,
+) -> FloatArray:
     """Cars (n, 5) as x, y, axis, score, axis' standard deviation."""
     proposer, floor = detector.record.proposer, detector.record.contrast_floor
     assert proposer is not None  # the schema says so of the aligned method
@@ -104,7 +106,7 @@ def _aligned(
     return _middles(image, valid, distinct(found, length), length)
 
 
-def _middles(image: Grey, valid: NDArray[np.bool_] | None, cars: Floats, length: float) -> Floats:
+def _middles(image: GreyImage, valid: NDArray[np.bool_] | None, cars: FloatArray, length: float) -> FloatArray:
     """The cars, lorries and buses among them at their middle."""
     long = shipped_long_vehicles()
     if length != long.record.working_car_length_px:
@@ -112,7 +114,7 @@ def _middles(image: Grey, valid: NDArray[np.bool_] | None, cars: Floats, length:
     return long.centred(picture_of(image, None, LONG), cars, np.ones(image.shape, bool) if valid is None else valid)
 
 
-def pictured(image: Grey, cars: Floats, area_px: Floats) -> FrameDetections:
+def pictured(image: GreyImage, cars: FloatArray, area_px: FloatArray) -> FrameDetections:
     """Cars (n, 5) as x, y, axis, score, axis' standard deviation, with their pictures."""
     xy, axis = np.ascontiguousarray(cars[:, :2]), np.ascontiguousarray(cars[:, 2])
     return FrameDetections(

@@ -6,15 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, Mask
 from schemas.detector import PrecisionRecallCurve
 from velfield.detection.cascade.classifier import FIRST_ROUNDS, Look, distinct, find_cars
 from velfield.detection.cascade.proposals import propose
 from velfield.detection.cascade.training import CONTRAST_FLOOR
 from velfield.detection.detector import BoostedSums
 from velfield.detection.samples import LabelledImage, Scene, distance, is_far, lies_in
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 FOLD_MIN_CARS = 16
 """With fewer marked cars none are left out to choose T."""
@@ -45,15 +43,15 @@ class Evidence:
     complete : whether what is not marked is no car.
     """
 
-    score: Floats
-    right: Bools
-    proposed: Floats
-    first: Floats
+    score: FloatArray
+    right: Mask
+    proposed: FloatArray
+    first: FloatArray
     cars: int
     complete: bool
 
 
-def stripes(sample: LabelledImage, fold: int, folds: int) -> Bools:
+def stripes(sample: LabelledImage, fold: int, folds: int) -> Mask:
     """(h, w) the two stripes across the longer side that a fold leaves out: with as many cars in each."""
     height, width = sample.image.shape
     axis, count = 0 if width >= height else 1, 2 * folds
@@ -64,7 +62,7 @@ def stripes(sample: LabelledImage, fold: int, folds: int) -> Bools:
 
 
 def evidence_of_part(
-    scene: Scene, region: Bools, proposer: BoostedSums, sums: BoostedSums, *, members: int = 1
+    scene: Scene, region: Mask, proposer: BoostedSums, sums: BoostedSums, *, members: int = 1
 ) -> Evidence:
     """Try a detector on a part (h, w) of a scene that it was not trained on; one of so many of a committee."""
     places = propose(
@@ -80,7 +78,7 @@ def evidence_of_part(
     return Evidence(found[:, 3], right, _best_near(places, found), first, len(cars), scene.sample.complete)
 
 
-def matched(found: Floats, cars: Floats) -> Bools:
+def matched(found: FloatArray, cars: FloatArray) -> Mask:
     """Whether each find, the best first, is the first on a car."""
     taken = np.zeros(len(cars), bool)
     right = np.zeros(len(found), bool)
@@ -92,14 +90,14 @@ def matched(found: Floats, cars: Floats) -> Bools:
     return right
 
 
-def _best_near(places: Floats, found: Floats) -> Floats:
+def _best_near(places: FloatArray, found: FloatArray) -> FloatArray:
     if not len(found):
         return np.empty(0)
     near = np.hypot(found[:, None, 0] - places[:, 0], found[:, None, 1] - places[:, 1]) < _NEAR_PX
     return np.asarray(np.where(near, places[:, 3], -np.inf).max(axis=1), np.float64)
 
 
-def _first_scores(look: Look, found: Floats, rounds: int) -> Floats:
+def _first_scores(look: Look, found: FloatArray, rounds: int) -> FloatArray:
     if not len(found):
         return np.empty(0)
     first = look.scores(found[:, :2], found[:, 2], np.zeros(1), np.zeros((1, 2), np.int64), rounds)
@@ -118,7 +116,7 @@ def joined(parts: Sequence[Evidence]) -> Evidence:
     )
 
 
-def cut_of(scores: Floats) -> float:
+def cut_of(scores: FloatArray) -> float:
     """A score that nearly all of these exceed."""
     known = scores[np.isfinite(scores)]
     return float(np.quantile(known, _LOST) - _MARGIN) if len(known) else -1.0
@@ -143,7 +141,7 @@ def curve_of(evidence: Evidence, told: str) -> PrecisionRecallCurve | None:
 
 
 def thinned_curve(
-    precision: Floats, recall: Floats, threshold: Floats, chosen: int, evidence: str
+    precision: FloatArray, recall: FloatArray, threshold: FloatArray, chosen: int, evidence: str
 ) -> PrecisionRecallCurve:
     """For a detector file: some points of a curve (n,) by falling threshold, the chosen one among them."""
     kept = np.unique(np.r_[np.linspace(0, len(threshold) - 1, min(_CURVE_POINTS, len(threshold))).astype(int), chosen])
@@ -156,7 +154,7 @@ def thinned_curve(
     )
 
 
-def nearly_best(precision: Floats, recall: Floats, *, beta: float) -> NDArray[np.int64]:
+def nearly_best(precision: FloatArray, recall: FloatArray, *, beta: float) -> NDArray[np.int64]:
     """Where on a curve, by falling threshold, the F measure, recall weighed ``beta`` times, is all but greatest."""
     merit = (1 + beta**2) * precision * recall / np.maximum(beta**2 * precision + recall, 1e-9)
     return np.flatnonzero(merit > _AS_GOOD * merit.max())

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from schemas.arrays import FloatArray
 
 CAR_ASPECT = 0.45
 """A usual car's width over its length."""
@@ -19,7 +19,7 @@ _ENDS = 0.5
 """Bumpers are shorter than sides, and a windscreen's edge is as sharp."""
 
 
-def with_axes(image: NDArray[np.uint8], cars: Floats, tilts: Floats | None = None) -> Floats:
+def with_axes(image: NDArray[np.uint8], cars: FloatArray, tilts: FloatArray | None = None) -> FloatArray:
     """Cars (n, 5) as x, y, axis, length, width, working px, with every axis finite.
 
     An upright box about a turned rectangle tells the angle but for its sign: ``tilts`` (n,), NaN where there was none.
@@ -39,7 +39,7 @@ def with_axes(image: NDArray[np.uint8], cars: Floats, tilts: Floats | None = Non
     return cars
 
 
-def _outlines(image: NDArray[np.uint8], cars: Floats) -> Floats:
+def _outlines(image: NDArray[np.uint8], cars: FloatArray) -> FloatArray:
     """How much a car's outline is seen at each of the axes tried (n, tried), by its best one."""
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _SIGMA_PX)
     slopes = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
@@ -52,8 +52,12 @@ def _outlines(image: NDArray[np.uint8], cars: Floats) -> Floats:
 
 
 def _pair_of_sides(
-    slopes: tuple[NDArray[np.float32], NDArray[np.float32]], xy: Floats, angles: Floats, length: Floats, gap: Floats
-) -> Floats:
+    slopes: tuple[NDArray[np.float32], NDArray[np.float32]],
+    xy: FloatArray,
+    angles: FloatArray,
+    length: FloatArray,
+    gap: FloatArray,
+) -> FloatArray:
     """The slope across two parallel sides (n, angles), so long and so far apart (n,), at their best distance."""
     n, c, s = len(xy), np.cos(angles)[:, None], np.sin(angles)[:, None]
     along = length[:, None, None] * _ALONG
@@ -69,7 +73,7 @@ def _pair_of_sides(
     return total
 
 
-def _looked_up(values: NDArray[np.float32], x: Floats, y: Floats) -> Floats:
+def _looked_up(values: NDArray[np.float32], x: FloatArray, y: FloatArray) -> FloatArray:
     flat = (len(x), -1)
     maps = x.reshape(flat).astype(np.float32), y.reshape(flat).astype(np.float32)
     found = cv2.remap(values, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from schemas.arrays import FloatArray
 
 GRADIENT_SIGMA_PX = 0.8
 WINDOW_SIGMA_PX = 3.0
@@ -26,14 +26,14 @@ def structure_axis(image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArr
     return np.mod(axis, np.pi).astype(np.float32), coherence.astype(np.float32)
 
 
-def at_places(values: NDArray[np.float32], xy: Floats) -> Floats:
+def at_places(values: NDArray[np.float32], xy: FloatArray) -> FloatArray:
     """Values of a picture at the nearest pixels to (n, 2) places."""
     x = np.clip(np.rint(xy[:, 0]), 0, values.shape[1] - 1).astype(np.int64)
     y = np.clip(np.rint(xy[:, 1]), 0, values.shape[0] - 1).astype(np.int64)
     return np.asarray(values[y, x], np.float64)
 
 
-def axial_difference(a: Floats, b: Floats) -> Floats:
+def axial_difference(a: FloatArray, b: FloatArray) -> FloatArray:
     """Angle between axes, [0, pi / 2].
 
     Examples

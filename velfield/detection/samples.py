@@ -3,17 +3,13 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from schemas.arrays import FloatArray, GreyImage, Mask
 from velfield.detection.cascade.candidates import candidate_places
 from velfield.detection.cascade.feature_image import COARSE, FINE, Picture, picture_of
 from velfield.detection.label_orientation import with_axes
 from velfield.detection.orientation import at_places, axial_difference, structure_axis
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Grey = NDArray[np.uint8]
 
 OFF_CENTRE_PX = (4.5, 10.0)
 WRONG_TURN_RAD = 0.45
@@ -24,7 +20,7 @@ _CANDIDATES, _ANYWHERE, _TURNED, _BESIDE = 0.5, 0.15, 0.15, 0.2
 """Shares of the poses that are no car."""
 
 
-def _no_circles() -> Floats:
+def _no_circles() -> FloatArray:
     return np.empty((0, 3))
 
 
@@ -43,13 +39,13 @@ class LabelledImage:
     complete : whether every car is marked, so that all else is background; else what looks like a car may be one.
     """
 
-    image: Grey
-    cars: Floats
-    ignore: Floats = field(default_factory=_no_circles)
-    valid: Bools | None = None
-    background: Grey | None = None
+    image: GreyImage
+    cars: FloatArray
+    ignore: FloatArray = field(default_factory=_no_circles)
+    valid: Mask | None = None
+    background: GreyImage | None = None
     complete: bool = True
-    tilts: Floats | None = None
+    tilts: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -67,9 +63,9 @@ class Scene:
     sample: LabelledImage
     fine: Picture
     coarse: Picture
-    cars: Floats
-    told: Bools
-    places: Floats
+    cars: FloatArray
+    told: Mask
+    places: FloatArray
 
 
 def scene_of(sample: LabelledImage, has_background: bool) -> Scene:
@@ -83,7 +79,7 @@ def scene_of(sample: LabelledImage, has_background: bool) -> Scene:
     return Scene(sample, fine, coarse, cars[:, :3], np.isfinite(sample.cars[:, 2]), places)
 
 
-def part_of(scene: Scene, region: Bools) -> Scene:
+def part_of(scene: Scene, region: Mask) -> Scene:
     """The scene with nothing known outside a region (h, w)."""
     inside = lies_in(region, scene.cars)
     places = scene.places[lies_in(region, scene.places)]
@@ -92,14 +88,14 @@ def part_of(scene: Scene, region: Bools) -> Scene:
     )
 
 
-def within(sample: LabelledImage, region: Bools) -> LabelledImage:
+def within(sample: LabelledImage, region: Mask) -> LabelledImage:
     """The picture with nothing known outside a region (h, w)."""
     valid, inside = region if sample.valid is None else region & sample.valid, lies_in(region, sample.cars)
     tilts = None if sample.tilts is None else sample.tilts[inside]
     return replace(sample, valid=valid, cars=sample.cars[inside], tilts=tilts)
 
 
-def lies_in(region: Bools, xy: Floats) -> Bools:
+def lies_in(region: Mask, xy: FloatArray) -> Mask:
     """Whether places (n, 2...) lie in a region (h, w)."""
     x, y = (np.clip(np.rint(xy[:, k]), 0, region.shape[1 - k] - 1).astype(np.int64) for k in (0, 1))
     return np.asarray(region[y, x])
@@ -109,9 +105,9 @@ def lies_in(region: Bools, xy: Floats) -> Bools:
 class Poses:
     """Poses (n, 3) as x, y, axis; with a size and a mirroring each."""
 
-    rows: Floats
-    sizes: Floats
-    mirrored: Bools
+    rows: FloatArray
+    sizes: FloatArray
+    mirrored: Mask
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -119,12 +115,12 @@ class Poses:
     def __getitem__(self, part: slice) -> "Poses":
         return Poses(self.rows[part], self.sizes[part], self.mirrored[part])
 
-    def where(self, chosen: Bools) -> "Poses":
+    def where(self, chosen: Mask) -> "Poses":
         """Those that are chosen (n,)."""
         return Poses(self.rows[chosen], self.sizes[chosen], self.mirrored[chosen])
 
 
-def varied(rows: Floats, rng: np.random.Generator, spread: float = _SIZE_SPREAD) -> Poses:
+def varied(rows: FloatArray, rng: np.random.Generator, spread: float = _SIZE_SPREAD) -> Poses:
     """Either way round, mirrored or not, a little larger or smaller: a car is as likely one as the other."""
     rows = rows[:, :3].copy()
     rows[:, 2] += np.where(rng.random(len(rows)) < 0.5, np.pi, 0)
@@ -139,7 +135,7 @@ def other_poses(scene: Scene, wanted: int, rng: np.random.Generator) -> Poses:
     return varied(np.concatenate(parts), rng)
 
 
-def _candidates(scene: Scene, wanted: int, rng: np.random.Generator) -> Floats:
+def _candidates(scene: Scene, wanted: int, rng: np.random.Generator) -> FloatArray:
     far = np.flatnonzero(is_far(scene.places, scene))
     if not len(far):
         return np.empty((0, 3))
@@ -151,7 +147,7 @@ def _candidates(scene: Scene, wanted: int, rng: np.random.Generator) -> Floats:
     return np.asarray(rows)
 
 
-def _anywhere(scene: Scene, wanted: int, rng: np.random.Generator) -> Floats:
+def _anywhere(scene: Scene, wanted: int, rng: np.random.Generator) -> FloatArray:
     height, width = scene.sample.image.shape
     xy = rng.uniform(0, 1, (3 * wanted, 2)) * [width - 1, height - 1]
     if scene.sample.valid is not None:
@@ -160,13 +156,13 @@ def _anywhere(scene: Scene, wanted: int, rng: np.random.Generator) -> Floats:
     return np.column_stack([xy, rng.uniform(0, np.pi, len(xy))])
 
 
-def _turned(scene: Scene, wanted: int, rng: np.random.Generator) -> Floats:
+def _turned(scene: Scene, wanted: int, rng: np.random.Generator) -> FloatArray:
     rows = scene.cars[rng.integers(len(scene.cars), size=wanted)]
     turn = rng.uniform(WRONG_TURN_RAD, np.pi - WRONG_TURN_RAD, wanted)
     return np.asarray(rows + np.column_stack([rng.normal(0, 1.5, (wanted, 2)), turn]))
 
 
-def _beside(scene: Scene, wanted: int, rng: np.random.Generator) -> Floats:
+def _beside(scene: Scene, wanted: int, rng: np.random.Generator) -> FloatArray:
     rows = scene.cars[rng.integers(len(scene.cars), size=wanted)].copy()
     radius, angle = rng.uniform(*OFF_CENTRE_PX, wanted), rng.uniform(0, 2 * np.pi, wanted)
     rows[:, :2] += radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -174,7 +170,7 @@ def _beside(scene: Scene, wanted: int, rng: np.random.Generator) -> Floats:
     return np.asarray(rows[distance(rows, scene.cars) >= OFF_CENTRE_PX[0]])
 
 
-def is_far(xy: Floats, scene: Scene) -> Bools:
+def is_far(xy: FloatArray, scene: Scene) -> Mask:
     """Whether places (n, 2...) are background: away from every car and all that is to be ignored."""
     far = distance(xy, scene.cars) > FAR_PX
     ignore = scene.sample.ignore
@@ -189,7 +185,7 @@ def is_far(xy: Floats, scene: Scene) -> Bools:
     return np.asarray(far)
 
 
-def is_wrong(found: Floats, scene: Scene) -> Bools:
+def is_wrong(found: FloatArray, scene: Scene) -> Mask:
     """Whether finds (n, 3...) are no car: background, or on a car but across it."""
     wrong = is_far(found, scene)
     if len(scene.cars) and len(found):
@@ -199,7 +195,7 @@ def is_wrong(found: Floats, scene: Scene) -> Bools:
     return np.asarray(wrong)
 
 
-def distance(xy: Floats, cars: Floats) -> Floats:
+def distance(xy: FloatArray, cars: FloatArray) -> FloatArray:
     """From places (n, 2...) to the nearest car."""
     if not len(cars):
         return np.full(len(xy), np.inf)

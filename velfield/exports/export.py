@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from schemas.report import Report
 from velfield.errors import InputError
 from velfield.exports.arrows import arrows_geojson
@@ -30,7 +31,6 @@ from velfield.run.grid import north_of
 from velfield.run.run import Run
 from velfield.run.stores import open_field
 
-Layer = NDArray[np.float64]
 _LARGEST_SIDE_PX = 20_000
 
 
@@ -123,7 +123,7 @@ def _speed(run: Run, path: Path, options: ExportOptions) -> None:
     write_atomically(path, png_bytes(speed_figure(grey, values, shown, bar_gsd_m=scale.gsd_m)))
 
 
-def _at_width(run: Run, values: Layer, options: ExportOptions) -> tuple[NDArray[np.uint8], Layer, MapScale]:
+def _at_width(run: Run, values: FloatArray, options: ExportOptions) -> tuple[NDArray[np.uint8], FloatArray, MapScale]:
     """Base image and layer at the wanted width, and what the legend says at that size."""
     grey, grid = run.base_image, run.grid
     factor = 1.0 if options.width_px is None else options.width_px / grid.width_px
@@ -139,7 +139,7 @@ def _at_width(run: Run, values: Layer, options: ExportOptions) -> tuple[NDArray[
     return np.asarray(picture, np.uint8), np.asarray(layer, np.float64), scale
 
 
-def _standing_left_out(run: Run, direction: Layer) -> Layer:
+def _standing_left_out(run: Run, direction: FloatArray) -> FloatArray:
     slow = standing_px_per_s(run.record.config.field, run.grid.gsd_m)
     return np.where(run.field.modal_speed_px_per_s() >= slow, direction, np.nan)
 

@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.warp import transform
 
+from schemas.arrays import Points
 from velfield.errors import InputError
-
-Points = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-Float = NDArray[np.float64]
+from schemas.arrays import FloatArray
+
 Layer = Callable[[str], NDArray[np.generic]]
 """Gives a (y, x) layer of a field by its name."""
 
@@ -38,8 +39,8 @@ class Change:
         (y, x) whether it is taken for real.
     """
 
-    change: Float
-    chance: Float
+    change: FloatArray
+    chance: FloatArray
     significant: NDArray[np.bool_]
 
     def summary(self) -> tuple[int, int]:
@@ -77,7 +78,7 @@ def compare_fields(
     }
 
 
-def significant(chance: Float, false_share: float = FALSE_SHARE) -> NDArray[np.bool_]:
+def significant(chance: FloatArray, false_share: float = FALSE_SHARE) -> NDArray[np.bool_]:
     """Benjamini and Hochberg's rule: which of many tests hold, NaN never.
 
     Examples
@@ -93,16 +94,16 @@ def significant(chance: Float, false_share: float = FALSE_SHARE) -> NDArray[np.b
     return np.asarray(np.nan_to_num(chance, nan=2.0) <= limit)
 
 
-def _change(change: Float, chance: Float) -> Change:
+def _change(change: FloatArray, chance: FloatArray) -> Change:
     chance = np.where(np.isfinite(change), chance, np.nan)
     return Change(np.where(np.isfinite(chance), change, np.nan), chance, significant(chance))
 
 
-def _two_sided(z: Float) -> Float:
+def _two_sided(z: FloatArray) -> FloatArray:
     return np.asarray(2.0 * ndtr(-np.abs(z)), np.float64)
 
 
-def _numbers(layer: Layer, name: str) -> Float:
+def _numbers(layer: Layer, name: str) -> FloatArray:
     return np.asarray(layer(name), np.float64)
 
 

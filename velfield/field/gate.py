@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from velfield.errors import InputError
 from velfield.field.bins import VelocityBins
 
-Float = NDArray[np.float64]
-Densities = Callable[[Float, Float], Float]
+Densities = Callable[[FloatArray, FloatArray], FloatArray]
 """Density per (px/s)^2 at a place (2,) of velocities (n, 2)."""
 
 SHARE = 0.99
@@ -35,23 +35,25 @@ class VelocityGate:
         That share.
     """
 
-    mean_px_per_s: Float
-    covariance: Float
+    mean_px_per_s: FloatArray
+    covariance: FloatArray
     expected_log_density: float
     least_density: float
     share: float
-    _densities: Callable[[Float], Float]
+    _densities: Callable[[FloatArray], FloatArray]
 
-    def log_density(self, v: Float) -> Float:
+    def log_density(self, v: FloatArray) -> FloatArray:
         """(n,) log density per (px/s)^2 of velocities (n, 2), px/s."""
         return np.log(np.maximum(self._densities(np.atleast_2d(np.asarray(v, np.float64))), 1e-300))
 
-    def accepts(self, v: Float) -> NDArray[np.bool_]:
+    def accepts(self, v: FloatArray) -> NDArray[np.bool_]:
         """(n,) whether velocities (n, 2), px/s, lie in the region."""
         return np.asarray(self.log_density(v) >= np.log(self.least_density))
 
 
-def make_gate(densities: Densities, xy: Float, covariance: Float, bins: VelocityBins, share: float) -> VelocityGate:
+def make_gate(
+    densities: Densities, xy: FloatArray, covariance: FloatArray, bins: VelocityBins, share: float
+) -> VelocityGate:
     """The gate at a place, its uncertainty taken in by five points of the ellipse (unscented transform).
 
     Parameters
@@ -81,7 +83,7 @@ def make_gate(densities: Densities, xy: Float, covariance: Float, bins: Velocity
         [(1.0, np.zeros(2))] if np.abs(offsets).max() < 0.5 else list(zip([1 / 3] + 4 * [1 / 6], offsets, strict=True))
     )
 
-    def mixed(v: Float) -> Float:
+    def mixed(v: FloatArray) -> FloatArray:
         return np.asarray(sum(weight * densities(np.asarray(xy) + offset, v) for weight, offset in points), np.float64)
 
     # Modes may be half a bin wide: at steps of a whole one their mass would be found wrong.

@@ -8,15 +8,13 @@ see the same traffic.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from schemas.arrays import FloatArray
 from schemas.flight import FieldConfig
 from velfield.field.bins import VelocityBins, band_radius_px, standing_px_per_s
 from velfield.field.segments import Segments
 from velfield.field.view import VelocityField
-
-Float = NDArray[np.float64]
 
 LEAST_SD_M_PER_S = 0.5
 """A Gaussian of a pixel's passages is not believed narrower than this."""
@@ -77,12 +75,14 @@ def _halves(segments: Segments) -> tuple[Segments, Segments]:
     return segments[learnt], segments[~learnt]
 
 
-def _middles(segments: Segments) -> tuple[Float, Float]:
+def _middles(segments: Segments) -> tuple[FloatArray, FloatArray]:
     place = 0.5 * np.column_stack([segments["x0_px"] + segments["x1_px"], segments["y0_px"] + segments["y1_px"]])
     return place, np.column_stack([segments["vx_px_per_s"], segments["vy_px_per_s"]])
 
 
-def _gaussian(learnt: Segments, place: Float, velocity: Float, config: FieldConfig, gsd_m: float) -> Float:
+def _gaussian(
+    learnt: Segments, place: FloatArray, velocity: FloatArray, config: FieldConfig, gsd_m: float
+) -> FloatArray:
     """Log density by one Gaussian a place: mean and covariance of what passed within the band, shrunk to the map's."""
     at, v = _middles(learnt)
     mean, spread = v.mean(axis=0), np.cov(v.T)
@@ -105,6 +105,6 @@ def _gaussian(learnt: Segments, place: Float, velocity: Float, config: FieldConf
     return out
 
 
-def _log_normal(v: Float, mean: Float, covariance: Float) -> float:
+def _log_normal(v: FloatArray, mean: FloatArray, covariance: FloatArray) -> float:
     off = v - mean
     return float(-0.5 * off @ np.linalg.solve(covariance, off) - 0.5 * np.log(np.linalg.det(2 * np.pi * covariance)))

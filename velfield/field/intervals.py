@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from velfield.field.speeds import CELLS_PER_BIN, blur_variance, most_cells, narrowing_by, quantile, speed_cells
 
 PLATOON = 20.0
@@ -40,8 +41,6 @@ MODE_REACH_BINS = 2.5
 MEDIAN_COSTS = 1.2533
 """Standard error of a median over that of a mean."""
 _Z = 1.6449
-
-Float = NDArray[np.float64]
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -75,7 +74,7 @@ def _half_width(variance: float, usual: float, counts_for: float, passages: floa
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _median_speed(
-    h: NDArray[np.int32], passages: float, noise: float, blur: float, cells: Float
+    h: NDArray[np.int32], passages: float, noise: float, blur: float, cells: FloatArray
 ) -> tuple[float, float]:
     """90 % interval of the median speed, bins."""
     total = speed_cells(h, (h.shape[0] - 1) // 2, cells)
@@ -131,11 +130,11 @@ def _modal_direction(
 def tile_intervals(
     histogram: NDArray[np.int32],
     count: NDArray[np.int32],
-    noise_bins2: Float,
-    mode_bins: Float,
+    noise_bins2: FloatArray,
+    mode_bins: FloatArray,
     sigma_bins: float,
     standing_bins: float,
-    out: Float,
+    out: FloatArray,
 ) -> None:
     """Fill ``out`` (ty, tx, 3), in bins and rad: half the interval of the modal direction, ends of the median speed's.
 

@@ -5,11 +5,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from velfield.field.bins import VelocityBins
 from velfield.field.modes import velocity_modes
 from velfield.field.statistics import TileStatistics
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -44,10 +43,10 @@ class PixelDistribution:
     y: int
     n: int
     bins: VelocityBins = field(repr=False)
-    weights: Float = field(repr=False)
-    modes: Float
-    modal_velocity_px_per_s: Float
-    mean_velocity_px_per_s: Float
+    weights: FloatArray = field(repr=False)
+    modes: FloatArray
+    modal_velocity_px_per_s: FloatArray
+    mean_velocity_px_per_s: FloatArray
     percentiles_px_per_s: dict[int, float]
     standing_share: float
     circular_variance: float

@@ -18,6 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from velfield.field.modes import MAX_MODES, pixel_modes, window_bins
 
 STRENGTH = 1.0
@@ -37,11 +38,9 @@ BINS_SHARE = 0.1
 BROAD_SHARE = 0.02
 """Share of the map's level that is a broad Gaussian, so that no velocity is impossible."""
 
-Float = NDArray[np.float64]
-
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _spread(h: Float, v_y: float, v_x: float) -> float:
+def _spread(h: FloatArray, v_y: float, v_x: float) -> float:
     """Density per square bin at (v_y, v_x) of weights ``h``, each spread by a Gaussian; they need not sum to one."""
     reach = 3.5 * SPREAD_SIGMA_BINS
     total = 0.0
@@ -54,7 +53,7 @@ def _spread(h: Float, v_y: float, v_x: float) -> float:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _mode_gaussians(h: Float, n: float, blur: float, out: Float) -> int:
+def _mode_gaussians(h: FloatArray, n: float, blur: float, out: FloatArray) -> int:
     """Fill ``out`` (k, 6) with a Gaussian a mode: share, mean x and y, covariance xx, xy, yy, in bins; returns k.
 
     ``n``: passages that the weights (summing to one) stand for; ``blur``: what kernel and bins add to a variance.
@@ -113,7 +112,7 @@ def _mode_gaussians(h: Float, n: float, blur: float, out: Float) -> int:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _level(h: Float, gaussians: Float, v_y: float, v_x: float) -> float:
+def _level(h: FloatArray, gaussians: FloatArray, v_y: float, v_x: float) -> float:
     """Density per square bin of a level: its modes, and a share of its bins."""
     density = 0.0
     for k in range(gaussians.shape[0]):
@@ -127,7 +126,7 @@ def _level(h: Float, gaussians: Float, v_y: float, v_x: float) -> float:
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _around(
-    histogram: NDArray[np.int32], count: NDArray[np.int32], x: int, y: int, radius: int, around: Float
+    histogram: NDArray[np.int32], count: NDArray[np.int32], x: int, y: int, radius: int, around: FloatArray
 ) -> float:
     """Fill ``around`` with the weights of the pixels near (x, y), summing to one; returns their mean passages, 0 where
     there are none."""
@@ -165,7 +164,7 @@ def _with_next(n: float, level: float, below: float, stands: float, counts: floa
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _of_the_map(everywhere: Float, known: bool, v_y: float, v_x: float) -> float:
+def _of_the_map(everywhere: FloatArray, known: bool, v_y: float, v_x: float) -> float:
     """Density per square bin where nothing is known of the place; ``known``: whether anything is of the map."""
     reach = (everywhere.shape[0] - 1) / 2
     of_broad = _about_rest(v_y, v_x, reach, reach / 2)
@@ -177,24 +176,24 @@ def _of_the_map(everywhere: Float, known: bool, v_y: float, v_x: float) -> float
 def densities_at_pixel(
     histogram: NDArray[np.int32],
     count: NDArray[np.int32],
-    everywhere: Float,
+    everywhere: FloatArray,
     x: int,
     y: int,
-    velocity_bins: Float,
+    velocity_bins: FloatArray,
     radius: int,
     blur: float,
     standing: float,
-) -> Float:
+) -> FloatArray:
     """Density per square bin of velocities (n, 2) as (vx, vy) at one pixel of a window of the field, (n,).
 
     ``standing``: passages that standing still counts for. The other parameters are those of `log_density_in_window`.
     """
-    around: Float = np.zeros(everywhere.shape)
+    around: FloatArray = np.zeros(everywhere.shape)
     near = _around(histogram, count, x, y, radius, around)
     inside = 0 <= y < count.shape[0] and 0 <= x < count.shape[1]
     here = float(count[y, x]) if inside else 0.0
     known = everywhere.sum() > 0.0
-    own: Float = np.zeros(everywhere.shape)
+    own: FloatArray = np.zeros(everywhere.shape)
     if here > 0.0:
         own += histogram[y, x]
         own /= own.sum()
@@ -218,12 +217,12 @@ def densities_at_pixel(
 def log_density_in_window(
     histogram: NDArray[np.int32],
     count: NDArray[np.int32],
-    everywhere: Float,
+    everywhere: FloatArray,
     pixels: NDArray[np.int64],
-    velocity_bins: Float,
+    velocity_bins: FloatArray,
     radius: int,
     blur: float,
-) -> Float:
+) -> FloatArray:
     """Log density per square bin of velocities at pixels of a window of the field.
 
     Parameters

@@ -6,10 +6,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
+
 CELLS_PER_BIN = 8
 """Speed is counted in cells of this part of a bin."""
-
-Float = NDArray[np.float64]
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -26,7 +26,7 @@ def blur_variance(sigma: float) -> float:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def speed_cells(h: NDArray[np.int32], reach: int, cells: Float) -> float:
+def speed_cells(h: NDArray[np.int32], reach: int, cells: FloatArray) -> float:
     """Weight by speed in cells of 1/8 bin: each bin spreads evenly over one bin's width of speed. Returns the sum."""
     cells[:] = 0.0
     total = 0.0
@@ -51,7 +51,7 @@ def speed_cells(h: NDArray[np.int32], reach: int, cells: Float) -> float:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def quantile(cells: Float, total: float, share: float) -> float:
+def quantile(cells: FloatArray, total: float, share: float) -> float:
     """Speed, in bins, below which ``share`` of the weight lies; linear within a cell."""
     target = min(max(share, 0.0), 1.0) * total
     below = 0.0
@@ -63,7 +63,7 @@ def quantile(cells: Float, total: float, share: float) -> float:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def narrowing_by(cells: Float, total: float, blur: float) -> float:
+def narrowing_by(cells: FloatArray, total: float, blur: float) -> float:
     """By how much quantiles are pulled towards the median: what is left of the spread without the variance ``blur``."""
     mean, square = 0.0, 0.0
     for c in range(cells.size):

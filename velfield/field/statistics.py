@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from velfield.field.accumulate import NOISE_UNIT
 from velfield.field.bins import VelocityBins
 from velfield.field.intervals import tile_intervals
@@ -19,8 +20,6 @@ from velfield.field.speeds import blur_variance, most_cells, narrowing_by, quant
 
 PERCENTILES = (15.0, 50.0, 85.0)
 """The speed percentiles kept, %; p85 is what speed limits are set by."""
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -58,22 +57,22 @@ class TileStatistics:
     """
 
     n: NDArray[np.int32]
-    modal_velocity_px_per_s: Float
-    mode_share: Float
-    mean_velocity_px_per_s: Float
-    speed_percentiles_px_per_s: Float
-    standing_share: Float
-    circular_variance: Float
-    entropy_nats: Float
-    direction_se_rad: Float
-    speed_se_px_per_s: Float
-    direction_half_width_rad: Float
-    median_speed_low_px_per_s: Float
-    median_speed_high_px_per_s: Float
+    modal_velocity_px_per_s: FloatArray
+    mode_share: FloatArray
+    mean_velocity_px_per_s: FloatArray
+    speed_percentiles_px_per_s: FloatArray
+    standing_share: FloatArray
+    circular_variance: FloatArray
+    entropy_nats: FloatArray
+    direction_se_rad: FloatArray
+    speed_se_px_per_s: FloatArray
+    direction_half_width_rad: FloatArray
+    median_speed_low_px_per_s: FloatArray
+    median_speed_high_px_per_s: FloatArray
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _moments(h: NDArray[np.int32], reach: int, standing: float, mode_y: float, mode_x: float, out: Float) -> None:
+def _moments(h: NDArray[np.int32], reach: int, standing: float, mode_y: float, mode_x: float, out: FloatArray) -> None:
     """Of one pixel, in bins: 0 mode share, 1-2 mean (x, y), 3 resting, 4 circular variance, 5 entropy, 6 dispersion."""
     total, near, sum_x, sum_y = 0.0, 0.0, 0.0, 0.0
     moving, cosine, sine, plogp = 0.0, 0.0, 0.0, 0.0
@@ -126,13 +125,13 @@ def _circular_dispersion(
 def _tile(
     histogram: NDArray[np.int32],
     count: NDArray[np.int32],
-    mode: Float,
+    mode: FloatArray,
     standing: float,
     sigma: float,
-    percentiles: Float,
-    moments: Float,
-    speeds: Float,
-    errors: Float,
+    percentiles: FloatArray,
+    moments: FloatArray,
+    speeds: FloatArray,
+    errors: FloatArray,
 ) -> None:
     reach = (histogram.shape[2] - 1) // 2
     cells = np.zeros(most_cells(reach))
@@ -212,7 +211,7 @@ def tile_statistics(
     )
 
 
-def direction_rad(velocity_px_per_s: Float, *, standing_px_per_s: float = 0.0) -> Float:
+def direction_rad(velocity_px_per_s: FloatArray, *, standing_px_per_s: float = 0.0) -> FloatArray:
     """Direction of motion in (-pi, pi] from +x towards +y (down); NaN where slower than standing, or empty."""
     vx, vy = velocity_px_per_s[..., 0], velocity_px_per_s[..., 1]
     direction = np.arctan2(vy, vx)
@@ -221,6 +220,6 @@ def direction_rad(velocity_px_per_s: Float, *, standing_px_per_s: float = 0.0) -
     return np.where(slow, np.nan, direction)
 
 
-def speed_px_per_s(velocity_px_per_s: Float) -> Float:
+def speed_px_per_s(velocity_px_per_s: FloatArray) -> FloatArray:
     """Length of the velocity, px/s; NaN where empty."""
     return np.hypot(velocity_px_per_s[..., 0], velocity_px_per_s[..., 1])

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from velfield.errors import InputError
 from velfield.field.accumulate import accumulate_tile
 from velfield.field.bins import VelocityBins
@@ -30,7 +31,6 @@ LayerSource = Callable[[str], NDArray[Any]]
 
 T = TypeVar("T")
 _Place = tuple[slice, slice]
-Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 _TILES_KEPT = 6
 _TILES_OF_THE_MAP = 64
@@ -82,7 +82,7 @@ class VelocityField:
         self._kept: OrderedDict[tuple[int, int], Tile | None] = OrderedDict()
         self._lock = Lock()
         self._modal: Float32 | None = None
-        self._everywhere: Float | None = None
+        self._everywhere: FloatArray | None = None
 
     @classmethod
     def from_segments(
@@ -124,12 +124,12 @@ class VelocityField:
             self._modal = out
         return self._modal.copy()
 
-    def modal_direction_rad(self, *, standing_px_per_s: float | None = None) -> Float:
+    def modal_direction_rad(self, *, standing_px_per_s: float | None = None) -> FloatArray:
         """(y, x) direction of the largest mode in (-pi, pi], from +x towards +y (down); NaN where empty or standing."""
         limit = self.standing_px_per_s if standing_px_per_s is None else standing_px_per_s
         return direction_rad(self.modal_velocity().astype(np.float64), standing_px_per_s=limit)
 
-    def modal_speed_px_per_s(self) -> Float:
+    def modal_speed_px_per_s(self) -> FloatArray:
         """(y, x) speed of the largest mode, px/s; NaN where no vehicle passed."""
         return speed_px_per_s(self.modal_velocity().astype(np.float64))
 
@@ -189,7 +189,7 @@ class VelocityField:
 
     # -- a prior for another tracker ----------------------------------------------------------------------------------
 
-    def log_density(self, xy: Float, v: Float) -> Float:
+    def log_density(self, xy: FloatArray, v: FloatArray) -> FloatArray:
         """Log of p(v | x) of the next vehicle, density per (px/s)^2: see `velfield.field.prior`.
 
         Parameters
@@ -230,7 +230,7 @@ class VelocityField:
         out -= 2 * np.log(self.bins.width_px_per_s)
         return out
 
-    def gate(self, xy: Float, covariance: Float | None = None, *, share: float = SHARE) -> VelocityGate:
+    def gate(self, xy: FloatArray, covariance: FloatArray | None = None, *, share: float = SHARE) -> VelocityGate:
         """What velocities are usual at a place: a gate for another tracker (`velfield.field.gate`).
 
         Unlike `log_density` it does not reckon with a queue where none has stood yet.
@@ -251,7 +251,7 @@ class VelocityField:
             self._densities, place, np.zeros((2, 2)) if covariance is None else covariance, self.bins, share
         )
 
-    def anomaly(self, times_s: Float, xy: Float) -> float:
+    def anomaly(self, times_s: FloatArray, xy: FloatArray) -> float:
         """How unusual a track is: by how many nats a step its velocities are less likely than what is usual there.
 
         About 0 for a track like those that the field was made of; 3 and more for a wrong-way driver, or for one who
@@ -273,7 +273,7 @@ class VelocityField:
         ]
         return float(np.mean(surprise))
 
-    def _densities(self, xy: Float, v: Float) -> Float:
+    def _densities(self, xy: FloatArray, v: FloatArray) -> FloatArray:
         """Density per (px/s)^2 at one place (2,) of velocities (n, 2), by what was seen alone."""
         radius = self._neighbourhood_px()
         limit = float(max(self.shape)) * 2
@@ -295,7 +295,7 @@ class VelocityField:
             return _NEIGHBOURHOOD_PX
         return max(1, round(_NEIGHBOURHOOD_M / self.bins.gsd_m))
 
-    def _map_distribution(self) -> Float:
+    def _map_distribution(self) -> FloatArray:
         """(nvy, nvx) the whole map's distribution, from tiles spread over it; zero where it is empty."""
         if self._everywhere is None:
             total = np.zeros((self.bins.n, self.bins.n))

@@ -12,10 +12,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from velfield.registration.joint import ControlPoints
 from velfield.registration.transforms import FrameTransform
 
-FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 
 FEW, MANY = 3000, 6000

@@ -12,11 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, GreyImage
 from velfield.camera.lens import Lens
 from velfield.registration.correlation import Look, seen_as
-
-Grey = NDArray[np.uint8]
-Floats = NDArray[np.float64]
 
 LEAST_INLIERS = 10
 """Fewer agreeing SIFT matches than this are chance."""
@@ -34,7 +32,7 @@ _DISK_SHARE = 0.7  # of half the shorter side: the part of the frame that a sear
 class Coarse:
     """A candidate: ``matrix`` (3, 3) undistorted frame px -> base px, how it was found, and its score."""
 
-    matrix: Floats
+    matrix: FloatArray
     how: str
     look: Look
     score: float
@@ -44,18 +42,18 @@ class Coarse:
 class SiftAgreement:
     """How many SIFT matches there were and how many one homography explains; ``matrix`` None where too few."""
 
-    matrix: Floats | None
+    matrix: FloatArray | None
     matches: int
     inliers: int
 
 
-def scaling(scale: float) -> Floats:
+def scaling(scale: float) -> FloatArray:
     """(3, 3) from a picture's pixels to those of the picture reduced by ``scale``; pixel (0, 0) is a centre."""
     shift = 0.5 * scale - 0.5
     return np.array([[scale, 0.0, shift], [0.0, scale, shift], [0.0, 0.0, 1.0]])
 
 
-def reduced(grey: Grey, scale: float) -> Grey:
+def reduced(grey: GreyImage, scale: float) -> GreyImage:
     """The picture at ``scale``, averaged over areas."""
     if scale >= 1.0:
         return grey
@@ -74,7 +72,7 @@ def coarse_scale(shape: tuple[int, ...], wanted: float) -> float:
     return float(min(1.0, max(wanted, _SIFT_LEAST_SIDE_PX / max(shape))))
 
 
-def _key_points(grey: Grey, scale: float) -> tuple[Floats, NDArray[np.float32]]:
+def _key_points(grey: GreyImage, scale: float) -> tuple[FloatArray, NDArray[np.float32]]:
     """Places (n, 2), px of the full picture, and root-SIFT descriptors (n, 128)."""
     sift = cv2.SIFT.create(nfeatures=_SIFT_FEATURES, contrastThreshold=0.02)
     key_points, descriptors = sift.detectAndCompute(reduced(grey, scale), None)
@@ -86,7 +84,7 @@ def _key_points(grey: Grey, scale: float) -> tuple[Floats, NDArray[np.float32]]:
 
 
 def sift_agreement(
-    image: Grey, base: Grey, lens: Lens, *, wanted_scale: float, mirrored: bool = False
+    image: GreyImage, base: GreyImage, lens: Lens, *, wanted_scale: float, mirrored: bool = False
 ) -> SiftAgreement:
     """SIFT matches between a frame and the base image, and the homography that most of them follow.
 
@@ -117,8 +115,8 @@ def sift_agreement(
 
 
 def _mutual_matches(
-    xy: Floats, descriptors: NDArray[np.float32], base_xy: Floats, base_descriptors: NDArray[np.float32]
-) -> tuple[Floats, Floats]:
+    xy: FloatArray, descriptors: NDArray[np.float32], base_xy: FloatArray, base_descriptors: NDArray[np.float32]
+) -> tuple[FloatArray, FloatArray]:
     """Pairs of points whose descriptors are each other's nearest, and clearly so one way."""
     likeness = descriptors @ base_descriptors.T
     best = likeness.argmax(axis=1)
@@ -130,7 +128,7 @@ def _mutual_matches(
     return xy[chosen], base_xy[best[chosen]]
 
 
-def _plausible(matrix: Floats, shape: tuple[int, ...]) -> bool:
+def _plausible(matrix: FloatArray, shape: tuple[int, ...]) -> bool:
     """Whether a homography keeps the frame's handedness and shape about, as a camera looking down does."""
     height, width = shape[:2]
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=np.float64)
@@ -144,7 +142,7 @@ def _plausible(matrix: Floats, shape: tuple[int, ...]) -> bool:
     return bool(np.all(turn > 0) and scale.max() < 5.0 * scale.min() and 0.1 < scale.mean() < 10.0)
 
 
-def similarity(scale: float, rotation_rad: float, source: Floats, target: Floats) -> Floats:
+def similarity(scale: float, rotation_rad: float, source: FloatArray, target: FloatArray) -> FloatArray:
     """(3, 3) similarity that turns from +x towards +y, scales, and takes ``source`` (2,) to ``target`` (2,)."""
     cosine, sine = scale * np.cos(rotation_rad), scale * np.sin(rotation_rad)
     turn = np.array([[cosine, -sine], [sine, cosine]])
@@ -155,13 +153,13 @@ def similarity(scale: float, rotation_rad: float, source: Floats, target: Floats
 
 
 def search_similarity(
-    image: Grey,
-    base: Grey,
+    image: GreyImage,
+    base: GreyImage,
     lens: Lens,
     *,
     scales: Sequence[float],
     rotations_rad: Sequence[float],
-    near: Floats | None = None,
+    near: FloatArray | None = None,
     disk_px: int = 40,
 ) -> list[Coarse]:
     """Try scales and rotations, and correlate a disk of the frame with all of the base image, both small.
@@ -208,13 +206,13 @@ def search_similarity(
 class _Small:
     """The base image reduced for a search: its grey, its edges, the reduction, half the disk's side in its pixels."""
 
-    grey: Grey
-    edges: Grey
+    grey: GreyImage
+    edges: GreyImage
     shrink: float
     half: int
 
 
-def _small(base: Grey, about: Floats, middle: Floats, disk_px: int, side_px: int) -> _Small:
+def _small(base: GreyImage, about: FloatArray, middle: FloatArray, disk_px: int, side_px: int) -> _Small:
     """The base image reduced so that the frame's disk has the wanted size, or less where the base image is large."""
     stretch = float(np.linalg.norm(_mapped(about, middle + np.array([1.0, 0.0])) - _mapped(about, middle)))
     reach = _DISK_SHARE * 0.5 * side_px * stretch
@@ -223,12 +221,12 @@ def _small(base: Grey, about: Floats, middle: Floats, disk_px: int, side_px: int
     return _Small(grey, seen_as(grey, "edges"), shrink, max(int(reach * shrink), 1))
 
 
-def _mapped(matrix: Floats, point: Floats) -> Floats:
+def _mapped(matrix: FloatArray, point: FloatArray) -> FloatArray:
     mapped = matrix @ np.array([point[0], point[1], 1.0])
     return np.asarray(mapped[:2] / mapped[2])
 
 
-def _disk(image: Grey, lens: Lens, to_small: Floats, middle: Floats, half: int) -> Grey:
+def _disk(image: GreyImage, lens: Lens, to_small: FloatArray, middle: FloatArray, half: int) -> GreyImage:
     """The frame's middle as a square of the small base image's pixels, its own middle pixel the frame's middle."""
     centre = _mapped(to_small, middle)
     stretch = float(np.linalg.norm(_mapped(to_small, middle + np.array([1.0, 0.0])) - centre))
@@ -240,7 +238,7 @@ def _disk(image: Grey, lens: Lens, to_small: Floats, middle: Floats, half: int) 
     return np.asarray(cv2.remap(reduced(image, shrunk), raw_small, None, cv2.INTER_LINEAR), dtype=np.uint8)
 
 
-def _best_places(disk: Grey, small: _Small) -> list[tuple[Look, float, int, int]]:
+def _best_places(disk: GreyImage, small: _Small) -> list[tuple[Look, float, int, int]]:
     """By each look, the highest correlation of the disk with the small base image and its offset (x, y)."""
     if small.half < _LEAST_HALF_PX or min(np.subtract(small.grey.shape, disk.shape)) < 0 or disk.std() < 1.0:
         return []

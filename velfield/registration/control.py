@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, GreyImage
 from schemas.flight import BaseConfig
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
@@ -21,9 +22,6 @@ from velfield.registration.correlation import GridMatches, Look, match_grid
 from velfield.registration.fitting import Model, case_deletion, fit_polyprojective
 from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, normalisation_of
 from velfield.registration.warp import footprint, warp_to_base
-
-Grey = NDArray[np.uint8]
-Floats = NDArray[np.float64]
 
 FINE_RADIUS_PX = 10
 """How far a patch is searched once the map is about right, px."""
@@ -39,8 +37,8 @@ _FOLDS = 5
 class Pair:
     """The two pictures and what maps between them needs."""
 
-    image: Grey
-    base: Grey
+    image: GreyImage
+    base: GreyImage
     lens: Lens
     config: BaseConfig
 
@@ -49,7 +47,7 @@ class Pair:
         height, width = self.image.shape
         return FrameTransform(width=width, height=height, lens=self.lens, polyprojective=polyprojective)
 
-    def from_homography(self, matrix: Floats) -> FrameTransform:
+    def from_homography(self, matrix: FloatArray) -> FrameTransform:
         """The same of a homography (3, 3)."""
         height, width = self.image.shape
         corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=np.float64)
@@ -66,8 +64,8 @@ class Fitted:
 
     transform: FrameTransform
     model: Model
-    source_raw: Floats
-    target: Floats
+    source_raw: FloatArray
+    target: FloatArray
     kept: NDArray[np.bool_]
     mean_error_px: float
     left_out_error_px: float
@@ -127,7 +125,7 @@ def _level(
 
 def on_base_grid(
     pair: Pair, transform: FrameTransform, scale: float
-) -> tuple[Grey, NDArray[np.bool_], Grey, tuple[int, int]] | None:
+) -> tuple[GreyImage, NDArray[np.bool_], GreyImage, tuple[int, int]] | None:
     """The frame on the base image's grid at a scale, its mask, that part of the base image, the part's origin."""
     window = _window(pair, transform)
     if window is None:
@@ -192,7 +190,7 @@ def _fit_matches(
 
 
 def _by_case_deletion(
-    source: Floats, target: Floats, near: NDArray[np.bool_], model: Model, scale: float, config: BaseConfig
+    source: FloatArray, target: FloatArray, near: NDArray[np.bool_], model: Model, scale: float, config: BaseConfig
 ) -> tuple[PolyprojectiveTransform, NDArray[np.bool_], float] | Failure:
     """The paper's case deletion among the points ``near`` one homography, then on until the points settle."""
     deleted = case_deletion(
@@ -220,7 +218,7 @@ def _sound(transform: FrameTransform) -> bool:
     return bool(np.all(np.isfinite(area)) and area.min() > 0 and area.max() < 16.0 * area.min())
 
 
-def _near_one_homography(source: Floats, target: Floats, unit_px: float) -> NDArray[np.bool_]:
+def _near_one_homography(source: FloatArray, target: FloatArray, unit_px: float) -> NDArray[np.bool_]:
     """Matches (n,) roughly on the homography that most follow: seventeen parameters fitted to wrong matches fold."""
     if len(source) < _LEAST_POINTS:
         return np.zeros(len(source), dtype=bool)
@@ -231,7 +229,7 @@ def _near_one_homography(source: Floats, target: Floats, unit_px: float) -> NDAr
 
 
 def _settle(
-    source: Floats, target: Floats, kept: NDArray[np.bool_], model: Model, *, least_px: float
+    source: FloatArray, target: FloatArray, kept: NDArray[np.bool_], model: Model, *, least_px: float
 ) -> tuple[PolyprojectiveTransform, NDArray[np.bool_], float] | Failure:
     """Refit and choose the points anew, within three of the residual's own scale, until the choice stays."""
     for _ in range(20):
@@ -252,7 +250,7 @@ def _settle(
     return fit, kept, float(error.mean())
 
 
-def left_out_errors(source: Floats, target: Floats, model: Model) -> Floats:
+def left_out_errors(source: FloatArray, target: FloatArray, model: Model) -> FloatArray:
     """Each point's error (n,) under the map fitted to the other folds."""
     fold = np.arange(len(source)) * 7 % _FOLDS
     errors = np.full(len(source), np.inf)
@@ -263,6 +261,6 @@ def left_out_errors(source: Floats, target: Floats, model: Model) -> Floats:
     return np.asarray(np.nan_to_num(errors, nan=np.inf), dtype=np.float64)
 
 
-def _by_homography(matrix: Floats, xy: Floats) -> Floats:
+def _by_homography(matrix: FloatArray, xy: FloatArray) -> FloatArray:
     mapped = np.column_stack([xy, np.ones(len(xy))]) @ matrix.T
     return np.asarray(mapped[:, :2] / mapped[:, 2:])

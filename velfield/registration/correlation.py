@@ -10,11 +10,8 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Grey = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
-Floats = NDArray[np.float64]
+from schemas.arrays import FloatArray, GreyImage, Mask
 
 Look = Literal["tones", "inverted", "edges"]
 """How two pictures are compared: by grey, by grey with its sign turned, or by steepness."""
@@ -27,12 +24,12 @@ _LEAST_COVER = 0.9
 class GridMatches:
     """Matches at grid points: ``points`` (n, 2) px, ``displacement`` (n, 2) px, ``score`` (n,) the peak's height."""
 
-    points: Floats
-    displacement: Floats
-    score: Floats
+    points: FloatArray
+    displacement: FloatArray
+    score: FloatArray
 
 
-def seen_as(grey: Grey, look: Look) -> Grey:
+def seen_as(grey: GreyImage, look: Look) -> GreyImage:
     """The picture as a look sees it: its grey, or its steepness."""
     if look != "edges":
         return grey
@@ -43,7 +40,14 @@ def seen_as(grey: Grey, look: Look) -> Grey:
 
 
 def match_grid(
-    moving: Grey, mask: Mask, reference: Grey, *, spacing_px: int, patch_px: int, radius_px: int, look: Look = "tones"
+    moving: GreyImage,
+    mask: Mask,
+    reference: GreyImage,
+    *,
+    spacing_px: int,
+    patch_px: int,
+    radius_px: int,
+    look: Look = "tones",
 ) -> GridMatches:
     """Where patches of a moving picture lie on a reference picture of the same grid.
 
@@ -91,7 +95,7 @@ def match_grid(
     return GridMatches(table[:, :2], table[:, 2:4], table[:, 4])
 
 
-def _peak(patch: Grey, window: Grey, sign: float) -> tuple[float, float, float] | None:
+def _peak(patch: GreyImage, window: GreyImage, sign: float) -> tuple[float, float, float] | None:
     """Offset (x, y) of the best correlation, by parabolas, and its height; None on the border or in a flat window."""
     if window.std() < _LEAST_CONTRAST:
         return None

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from schemas.arrays import FloatArray
 from velfield.errors import Failure
 from velfield.registration.transforms import PolyprojectiveTransform, as_points, normalisation_of
 
-FloatArray = NDArray[np.float64]
 Model = Literal["polyprojective", "homography"]
 
 FREE = {"homography": 8, "polyprojective": 17}

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, GreyImage
 from schemas.flight import BaseConfig
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
@@ -29,9 +30,6 @@ from velfield.registration.control import (
 from velfield.registration.correlation import Look, match_grid
 from velfield.registration.fitting import Model
 from velfield.registration.transforms import FrameTransform
-
-Grey = NDArray[np.uint8]
-Floats = NDArray[np.float64]
 
 _SURE_SHARE = 0.5
 """Below this share of agreeing patches a place is believed only if its mirror picture is not."""
@@ -83,9 +81,9 @@ class IntersensorResult:
 
     transform: FrameTransform
     model: Model
-    source_raw: Floats
-    target: Floats
-    error_left_out_px: Floats
+    source_raw: FloatArray
+    target: FloatArray
+    error_left_out_px: FloatArray
     mean_error_px: float
     left_out_error_px: float
     tried_points: int
@@ -98,12 +96,12 @@ class IntersensorResult:
 
 
 def register_intersensor(
-    image: Grey,
-    base: Grey,
+    image: GreyImage,
+    base: GreyImage,
     config: BaseConfig,
     *,
     lens: Lens,
-    initial: Floats | None = None,
+    initial: FloatArray | None = None,
 ) -> IntersensorResult | Failure:
     """Register a raw frame to another sensor's picture.
 
@@ -161,7 +159,7 @@ def _why_not(pair: Pair, scores: list[str]) -> str:
     )
 
 
-def _candidates(pair: Pair, initial: Floats | None, scores: list[str]) -> Iterator[Coarse]:
+def _candidates(pair: Pair, initial: FloatArray | None, scores: list[str]) -> Iterator[Coarse]:
     """Coarse maps, the likeliest first; the slow search only when the others failed. ``scores`` gets what had none."""
     if initial is not None:
         yield from _searched(pair, "given", (_NEAR_SCALES, _NEAR_TURNS), np.asarray(initial, dtype=np.float64), scores)
@@ -177,7 +175,7 @@ def _candidates(pair: Pair, initial: Floats | None, scores: list[str]) -> Iterat
 
 
 def _searched(
-    pair: Pair, how: str, tried: tuple[tuple[float, ...], tuple[float, ...]], near: Floats | None, scores: list[str]
+    pair: Pair, how: str, tried: tuple[tuple[float, ...], tuple[float, ...]], near: FloatArray | None, scores: list[str]
 ) -> Iterator[Coarse]:
     """The best of a search by each look, each searched again more finely about itself."""
     found = search_similarity(pair.image, pair.base, pair.lens, scales=tried[0], rotations_rad=tried[1], near=near)
@@ -239,7 +237,7 @@ def _witnesses(pair: Pair, fitted: Fitted, look: Look) -> _Witnesses:
     return _Witnesses(len(matches.points), straight, by_rows)
 
 
-def _motion_of_rows(fitted: Fitted, raw: Floats, *, apart_px: float) -> Floats:
+def _motion_of_rows(fitted: Fitted, raw: FloatArray, *, apart_px: float) -> FloatArray:
     """Median displacement (n, 2), base px, of the control points in the rows of raw places (n, 2), none too near."""
     rest = fitted.target - fitted.transform.to_base(fitted.source_raw)
     usable = np.linalg.norm(rest, axis=1) < 2.0 * FINE_RADIUS_PX
@@ -276,7 +274,7 @@ def _result(pair: Pair, fitted: Fitted, candidate: Coarse, scores: tuple[str, ..
     )
 
 
-def _error_map(points: Floats, errors: Floats, shape: tuple[int, int], spacing: int) -> NDArray[np.float32]:
+def _error_map(points: FloatArray, errors: FloatArray, shape: tuple[int, int], spacing: int) -> NDArray[np.float32]:
     """Mean error about each node, points weighed by a Gaussian of one spacing; NaN farther than two from any point."""
     ys, xs = np.arange(0, shape[0], spacing), np.arange(0, shape[1], spacing)
     weight, total = np.zeros((ys.size, xs.size)), np.zeros((ys.size, xs.size))

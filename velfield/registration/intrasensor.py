@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
@@ -37,8 +38,6 @@ from velfield.registration.transforms import (
     normalisation_of,
     row_knots,
 )
-
-FloatArray = NDArray[np.float64]
 
 CERTIFICATE_CELLS = (6, 8)
 """Rows and columns of cells over the frame, for the spread of the control points and the map of their errors."""

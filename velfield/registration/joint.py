@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
 from velfield.registration import kernels
@@ -22,8 +23,6 @@ from velfield.registration.transforms import (
     as_points,
     normalisation_of,
 )
-
-FloatArray = NDArray[np.float64]
 
 FOLDS = 5
 FOLD_CELL_PX = 48

@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from schemas.flight import RegistrationConfig
-
-FloatArray = NDArray[np.float64]
 
 _SPREAD_CELLS = 12
 """Cells along the frame's longer side from each of which key points are taken in turn."""

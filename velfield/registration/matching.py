@@ -8,11 +8,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from velfield.errors import Failure
 from velfield.registration.keypoints import KeyPoints
 from velfield.registration.transforms import HomographyTransform
 
-FloatArray = NDArray[np.float64]
 Pairs = NDArray[np.int64]
 """(m, 2) indices: of the moving, of the reference key points."""
 

@@ -9,13 +9,11 @@ where a mesh does not predict them better than none there is none.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from velfield.registration.joint import FOLDS, ControlPoints, JointFit, folds_of, weights_of
 from velfield.registration.kernels import solve_positive
 from velfield.registration.transforms import mesh_shape
-
-FloatArray = NDArray[np.float64]
 
 _TIES = tuple(10.0**k for k in (-1, 0, 1, 2, 3))
 """Candidates for the weight of squared differences between neighbours, in control points."""

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, GreyImage
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
@@ -29,9 +30,7 @@ from velfield.registration.keypoints import KeyPoints
 from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, as_points, normalisation_of
 from velfield.registration.warp import Window, footprint, warp_to_base
 
-FloatArray = NDArray[np.float64]
-Grey = NDArray[np.uint8]
-Read = Callable[[int], Grey]
+Read = Callable[[int], GreyImage]
 
 _MIN_FRAMES = 3
 _FIRST_FRAMES = 24
@@ -58,7 +57,7 @@ class OwnBase:
     row_motion_px : (rows, 2) motion of the reference frame's rows that was taken out, undistorted px.
     """
 
-    image: Grey
+    image: GreyImage
     valid: NDArray[np.bool_]
     origin_xy: tuple[int, int]
     frames: int
@@ -161,7 +160,7 @@ def build_own_base(
     return OwnBase(base, mask, grid.origin, len(found), motion_px)
 
 
-def _reference_picture(grey: Grey, lens: Lens) -> tuple[_Grid, Grey, NDArray[np.bool_]]:
+def _reference_picture(grey: GreyImage, lens: Lens) -> tuple[_Grid, GreyImage, NDArray[np.bool_]]:
     """The reference frame undistorted: its grid, picture and mask."""
     height, width = grey.shape
     x0, y0, x1, y1 = footprint(_Grid(width, height, lens, (0, 0)).transform, grey.shape)
@@ -231,7 +230,7 @@ def _motion_at(coefficients: FloatArray, grid: _Grid, xy_base: FloatArray) -> Fl
 
 def _mosaic(
     read: Read, found: Mapping[int, tuple[FrameTransform, ControlPoints]], grid: _Grid, motion: FloatArray
-) -> tuple[tuple[int, int], Grey, NDArray[np.bool_]]:
+) -> tuple[tuple[int, int], GreyImage, NDArray[np.bool_]]:
     """Offset from the grid's origin, median of the frames, and where enough of them see."""
     width, height = grid.width, grid.height
     maps = {frame: _Straightened(found[frame][0], grid, motion) for frame in sorted(found)}

@@ -11,14 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, GreyImage
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import HarrisLens, Lens, pinhole
 from velfield.camera.overlap import Overlap
 from velfield.registration.keypoints import KeyPoints, detect_key_points
 from velfield.registration.matching import Pairs, match_everywhere
-
-Grey = NDArray[np.uint8]
-Floats = NDArray[np.float64]
 
 _LARGEST_PX = 250_000
 """SIFT is fast on pictures of so many pixels and finds enough there."""
@@ -32,7 +30,7 @@ _ERROR_SHARE = 0.012
 _TRIAL = 0.05
 
 
-def matched_pairs(frames: Sequence[Grey], lens: Lens) -> Overlap | None:
+def matched_pairs(frames: Sequence[GreyImage], lens: Lens) -> Overlap | None:
     """The pairs that tell most of the lens, with up to 200 matches spread over each; None where no two frames match.
 
     Parameters
@@ -62,12 +60,12 @@ def matched_pairs(frames: Sequence[Grey], lens: Lens) -> Overlap | None:
     return _padded(pairs, shape) if pairs else None
 
 
-def _key_points(frame: Grey) -> KeyPoints:
+def _key_points(frame: GreyImage) -> KeyPoints:
     scale = min(1.0, float(np.sqrt(_LARGEST_PX / frame.size)))
     return detect_key_points(frame, RegistrationConfig(key_point_scale=scale), count=_KEY_POINTS)
 
 
-def _agreeing(source: Floats, target: Floats, shape: tuple[int, int]) -> tuple[NDArray[np.bool_], float]:
+def _agreeing(source: FloatArray, target: FloatArray, shape: tuple[int, int]) -> tuple[NDArray[np.bool_], float]:
     """Which matches follow a homography, and how many px a little distortion would take them off one (RMS)."""
     nothing = np.zeros(len(source), dtype=bool)
     if len(source) < _LEAST_AGREEING:
@@ -99,7 +97,7 @@ def _most_telling(pairs: Sequence[tuple[float, int, int]], frames: int) -> list[
     return sorted(chosen, key=lambda pair: pair[1:])
 
 
-def _padded(pairs: Sequence[tuple[int, int, Floats, Floats]], shape: tuple[int, int]) -> Overlap:
+def _padded(pairs: Sequence[tuple[int, int, FloatArray, FloatArray]], shape: tuple[int, int]) -> Overlap:
     """Every pair to one length; padding repeats the first match."""
     most = max(len(xy) for _, _, xy, _ in pairs)
     places = [np.where(np.arange(most) < len(xy), np.arange(most), 0) for _, _, xy, _ in pairs]

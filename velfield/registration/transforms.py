@@ -9,11 +9,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
 from velfield.registration import kernels
-
-FloatArray = NDArray[np.float64]
 
 _INVERSE_STEPS = 25
 _INVERSE_TOLERANCE_PX = 1e-5

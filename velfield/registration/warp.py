@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from schemas.arrays import FloatArray
+
 Window = tuple[int, int, int, int]
 """x, y, width, height in base px."""
 

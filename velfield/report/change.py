@@ -3,12 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from velfield.report.colours import RGB, change_colours
+from schemas.arrays import RGBImage
+from velfield.report.colours import change_colours
 from velfield.report.figures import MapScale, over_picture, round_up
 from velfield.report.panel import Legend, draw_bar_panel
 
 
-def change_figure(grey: NDArray[np.uint8], change: NDArray[np.floating], scale: MapScale, *, title: str) -> RGB:
+def change_figure(grey: NDArray[np.uint8], change: NDArray[np.floating], scale: MapScale, *, title: str) -> RGBImage:
     """The figure of one quantity's change.
 
     Parameters

@@ -10,8 +10,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-RGB = NDArray[np.uint8]
+from schemas.arrays import FloatArray, RGBImage
 
 _STEPS = 1024
 _WHEEL_TURN_DEG = 29.0  # red points along +x, as on the usual hue wheel
@@ -20,7 +19,7 @@ _RAMP = np.array(  # lightness, chroma, hue (degrees)
 )
 
 
-def direction_colours(direction_rad: NDArray[np.floating]) -> RGB:
+def direction_colours(direction_rad: NDArray[np.floating]) -> RGBImage:
     """(..., 3) colours of directions; opposite directions get opposite hues. NaN is black.
 
     Examples
@@ -34,13 +33,13 @@ def direction_colours(direction_rad: NDArray[np.floating]) -> RGB:
     return np.where(np.isnan(direction_rad)[..., None], np.uint8(0), _wheel()[index])
 
 
-def ramp_colours(share: NDArray[np.floating]) -> RGB:
+def ramp_colours(share: NDArray[np.floating]) -> RGBImage:
     """(..., 3) colours of numbers in [0, 1], clipped to it. NaN is black."""
     index = np.floor(np.nan_to_num(share).clip(0, 1) * (_STEPS - 1) + 0.5).astype(np.int64)
     return np.where(np.isnan(share)[..., None], np.uint8(0), _ramp()[index])
 
 
-def change_colours(share: NDArray[np.floating]) -> RGB:
+def change_colours(share: NDArray[np.floating]) -> RGBImage:
     """(..., 3) colours of changes from -1 (blue) by 0 (white) to 1 (orange). NaN is black.
 
     Examples
@@ -54,7 +53,7 @@ def change_colours(share: NDArray[np.floating]) -> RGB:
 
 
 @cache
-def _wheel() -> RGB:
+def _wheel() -> RGBImage:
     hue = np.radians(np.arange(_STEPS) * 360 / _STEPS + _WHEEL_TURN_DEG)
     lightness = 0.72 + 0.06 * np.cos(hue - np.radians(120))
     chroma = np.full(_STEPS, 0.30)
@@ -65,21 +64,21 @@ def _wheel() -> RGB:
 
 
 @cache
-def _ramp() -> RGB:
+def _ramp() -> RGBImage:
     at = np.linspace(0, 1, _STEPS)
     knots = np.linspace(0, 1, len(_RAMP))
     lightness, chroma, hue = (np.interp(at, knots, column) for column in _RAMP.T)
     return _srgb(_linear_rgb(lightness, chroma, np.radians(hue)))
 
 
-def _smooth_round(values: Float) -> Float:
+def _smooth_round(values: FloatArray) -> FloatArray:
     """A moving mean around the circle, so that the gamut's corners do not show as seams."""
     width = _STEPS // 16
     around = np.concatenate([values[-width:], values, values[:width]])
     return np.convolve(around, np.ones(2 * width + 1) / (2 * width + 1), mode="valid")
 
 
-def _linear_rgb(lightness: Float, chroma: Float, hue_rad: Float) -> Float:
+def _linear_rgb(lightness: FloatArray, chroma: FloatArray, hue_rad: FloatArray) -> FloatArray:
     """OKLCH to linear sRGB (Ottosson's matrices), not clipped."""
     a, b = chroma * np.cos(hue_rad), chroma * np.sin(hue_rad)
     lms = np.stack(
@@ -100,7 +99,7 @@ def _linear_rgb(lightness: Float, chroma: Float, hue_rad: Float) -> Float:
     return np.asarray(lms**3 @ to_rgb.T)
 
 
-def _srgb(linear: Float) -> RGB:
+def _srgb(linear: FloatArray) -> RGBImage:
     linear = linear.clip(0, 1)
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     return np.floor(encoded * 255 + 0.5).astype(np.uint8)

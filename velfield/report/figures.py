@@ -7,8 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import RGBImage
 from velfield.errors import InputError
-from velfield.report.colours import RGB, direction_colours, ramp_colours
+from velfield.report.colours import direction_colours, ramp_colours
 from velfield.report.panel import Legend, draw_bar_panel, draw_wheel_panel
 
 SpeedUnit = Literal["km/h", "mph", "m/s", "px/s"]
@@ -52,7 +53,7 @@ class MapScale:
         return speed * self.gsd_m * PER_M_PER_S[self.unit]
 
 
-def direction_figure(grey: NDArray[np.uint8], direction_rad: NDArray[np.floating], scale: MapScale) -> RGB:
+def direction_figure(grey: NDArray[np.uint8], direction_rad: NDArray[np.floating], scale: MapScale) -> RGBImage:
     """The modal direction as hue, with a colour wheel beside it.
 
     Parameters
@@ -87,7 +88,7 @@ def speed_figure(
     *,
     top: float | None = None,
     bar_gsd_m: float | None = None,
-) -> RGB:
+) -> RGBImage:
     """The modal speed as colour, with a bar beside it; parameters as in `direction_figure`.
 
     Parameters
@@ -139,7 +140,7 @@ def round_up(value: float) -> float:
     return float(10 * power)
 
 
-def png_bytes(rgb: RGB) -> bytes:
+def png_bytes(rgb: RGBImage) -> bytes:
     """An RGB or grey picture as PNG."""
     order = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR) if rgb.ndim == 3 else rgb
     done, data = cv2.imencode(".png", order)
@@ -148,7 +149,7 @@ def png_bytes(rgb: RGB) -> bytes:
     return bytes(data)
 
 
-def jpeg_bytes(rgb: RGB, *, quality: int = 88, max_side: int | None = None) -> bytes:
+def jpeg_bytes(rgb: RGBImage, *, quality: int = 88, max_side: int | None = None) -> bytes:
     """An RGB picture as JPEG, reduced so that no side is longer than ``max_side``: for pages that must stay small."""
     if max_side is not None and max(rgb.shape[:2]) > max_side:
         factor = max_side / max(rgb.shape[:2])
@@ -159,7 +160,7 @@ def jpeg_bytes(rgb: RGB, *, quality: int = 88, max_side: int | None = None) -> b
     return bytes(data)
 
 
-def over_picture(grey: NDArray[np.uint8], values: NDArray[np.floating], colours: RGB) -> RGB:
+def over_picture(grey: NDArray[np.uint8], values: NDArray[np.floating], colours: RGBImage) -> RGBImage:
     """(h, w, 3) colours over the dimmed picture where the values are known.
 
     Raises
@@ -171,7 +172,7 @@ def over_picture(grey: NDArray[np.uint8], values: NDArray[np.floating], colours:
     return _over(grey, colours, np.isfinite(values))
 
 
-def _over(grey: NDArray[np.uint8], colours: RGB, known: NDArray[np.bool_]) -> RGB:
+def _over(grey: NDArray[np.uint8], colours: RGBImage, known: NDArray[np.bool_]) -> RGBImage:
     """Colours over the dimmed picture where known, modulated a little by it so that kerbs and lanes stay visible."""
     base = np.repeat((grey.astype(np.float32) * _DIMMED)[..., None], 3, axis=2)
     tinted = colours * (_COVER + (1 - _COVER) * grey[..., None].astype(np.float32) / 255)

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from velfield.report.colours import RGB, change_colours, direction_colours, ramp_colours
+from schemas.arrays import RGBImage
+from velfield.report.colours import change_colours, direction_colours, ramp_colours
 
 _BACKGROUND = (18, 21, 26)
 _TEXT, _FAINT = (240, 242, 245), (168, 175, 184)
@@ -63,7 +64,7 @@ class _Panel:
                 lines.append(word)
         return [line for line in lines if line]
 
-    def finish(self, gsd_m: float | None, north_rad: float | None) -> RGB:
+    def finish(self, gsd_m: float | None, north_rad: float | None) -> RGBImage:
         self.write(self.note, 0.8, _FAINT)
         if north_rad is None:
             self.write("North is not known: up is the picture's.", 0.8, _FAINT)
@@ -85,7 +86,7 @@ class _Panel:
 
 def draw_wheel_panel(
     map_shape: tuple[int, ...], legend: Legend, *, gsd_m: float | None, north_rad: float | None
-) -> RGB:
+) -> RGBImage:
     """(h, legend, 3) legend of directions; the wheel stands as the map does, N where north is."""
     panel = _Panel(map_shape, legend)
     side = min(panel.inner, max(panel.height // 3, 3 * panel.text_px))
@@ -134,7 +135,7 @@ def draw_bar_panel(
     gsd_m: float | None,
     north_rad: float | None,
     changes: bool = False,
-) -> RGB:
+) -> RGBImage:
     """(h, legend, 3) legend of a quantity from 0 to ``top``, of changes from ``-top``; an arrow to north where it is
     known."""
     panel = _Panel(map_shape, legend)

@@ -5,10 +5,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from schemas.arrays import FloatArray, RGBImage
 from velfield.camera.lens import Lens
-from velfield.report.colours import RGB, ramp_colours
-
-FloatArray = NDArray[np.float64]
+from velfield.report.colours import ramp_colours
 
 _LINES = 9
 """Straight lines laid over the picture each way."""
@@ -19,7 +18,7 @@ _COVER = 0.55
 _LEGEND_PX = 32
 
 
-def lens_picture(grey: NDArray[np.uint8], lens: Lens) -> RGB:
+def lens_picture(grey: NDArray[np.uint8], lens: Lens) -> RGBImage:
     """A raw frame (h, w) and the same undistorted, side by side; lines that are straight on the ground over both."""
     height, width = grey.shape
     y, x = np.mgrid[0:height, 0:width].astype(np.float64)
@@ -45,7 +44,7 @@ def _straight_lines(width: int, height: int) -> list[FloatArray]:
     return lines
 
 
-def _with_lines(grey: NDArray[np.uint8], lines: list[FloatArray], title: str) -> RGB:
+def _with_lines(grey: NDArray[np.uint8], lines: list[FloatArray], title: str) -> RGBImage:
     scale = min(1.0, _SIDE_PX / grey.shape[1])
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     picture = Image.fromarray(np.repeat(small[..., None], 3, axis=2))
@@ -57,7 +56,7 @@ def _with_lines(grey: NDArray[np.uint8], lines: list[FloatArray], title: str) ->
     return np.asarray(picture, dtype=np.uint8)
 
 
-def error_picture(grey: NDArray[np.uint8], error_px: NDArray[np.floating], *, full_px: float) -> RGB:
+def error_picture(grey: NDArray[np.uint8], error_px: NDArray[np.floating], *, full_px: float) -> RGBImage:
     """Registration's held-out error by cell of the frame, its figure in each cell, over a raw frame.
 
     Parameters
@@ -88,7 +87,7 @@ def error_picture(grey: NDArray[np.uint8], error_px: NDArray[np.floating], *, fu
     return np.concatenate([np.asarray(picture, dtype=np.uint8), _error_legend(width, full_px)])
 
 
-def _error_legend(width: int, full_px: float) -> RGB:
+def _error_legend(width: int, full_px: float) -> RGBImage:
     """What the figures are, and the ramp from none to ``full_px``: (height, width, 3), to stand below the picture."""
     picture = Image.new("RGB", (width, _LEGEND_PX))
     draw = ImageDraw.Draw(picture)

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from schemas.arrays import Points
 from schemas.records import FORMAT_VERSION, FlightRecord, GridRecord
 from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
 from velfield.analysis.crossings import line_crossings, settle_px
@@ -21,7 +22,6 @@ from velfield.run.paths import local_copy
 from velfield.run.stores import FrameStore, RegistrationStore, open_frames, open_registration
 from velfield.run.tables import read_tables
 
-Points = NDArray[np.float64]
 _EACH_ONCE = {"weigh_shared_segments": "once"}
 """The preset `paper` weighs segments that two tracklets share twice; who counts vehicles does not."""
 

@@ -12,12 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from schemas.simulation import CameraSimulation, SimulationConfig
 from velfield.synthetic.city.relief import Relief, ground_height, ground_height_at
-
-FloatArray = NDArray[np.float64]
 
 ROW_FIELDS = 14
 """Columns of a row table: rotation camera -> base (9, row-major), camera place (3), shake (2)."""

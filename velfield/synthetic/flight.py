@@ -9,15 +9,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, GreyImage
 from schemas.simulation import SimulationConfig, TimesSimulation
 from velfield.synthetic.camera import Camera, make_camera
 from velfield.synthetic.city.city import PAD_PX, City
 from velfield.synthetic.city.city_plan import view_centre_m
 from velfield.synthetic.city.relief import make_relief
-from velfield.synthetic.render import Grey, Sprites, draw_sprites, hidden, render_ground
+from velfield.synthetic.render import Sprites, draw_sprites, hidden, render_ground
 from velfield.synthetic.seeds import Matter, stream
-
-FloatArray = NDArray[np.float64]
 
 
 def frame_times(times: TimesSimulation, frames: int, rng: np.random.Generator) -> FloatArray:
@@ -58,7 +57,7 @@ class Flight:
         )
 
     @property
-    def base_image(self) -> Grey:
+    def base_image(self) -> GreyImage:
         """The base image, uint8 (base_shape): orthographic, by the other sensor, without the traffic."""
         return self.city.base_image
 
@@ -151,7 +150,7 @@ class Flight:
         r2 = ((x - (c.width - 1) / 2) ** 2 + (y - (c.height - 1) / 2) ** 2) / self.camera.half_diagonal_px**2
         return np.asarray(1 - c.camera.vignetting * r2, dtype=np.float32)
 
-    def frame(self, index: int) -> Grey:
+    def frame(self, index: int) -> GreyImage:
         """Render a raw frame: uint8 (height, width). Frames may be asked for in any order, and from several threads."""
         c, camera, scene = self.config.camera, self.camera, self.city.scene
         rng = stream(self.config.seed, Matter.FRAME, index)
@@ -178,7 +177,7 @@ class Flight:
         """Make all that frames share; call it before frames are rendered from several threads."""
         _ = self.city.traffic, self.city.scene, self.city.vehicles, self._undistorted, self._light
 
-    def frames(self) -> Iterator[Grey]:
+    def frames(self) -> Iterator[GreyImage]:
         """All frames in order."""
         return (self.frame(i) for i in range(self.config.frames))
 

@@ -11,12 +11,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, IntArray
 from schemas.tables import TRACKLET_COLUMNS
 from velfield.synthetic.traffic.traffic import STEP_S, Traffic
 from velfield.tracking.chains import assign_passages
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _MAX_INTERVAL_S = 0.45
 

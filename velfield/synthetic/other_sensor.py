@@ -6,13 +6,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, GreyImage
 from schemas.simulation import OtherSensorSimulation
 from velfield.synthetic.city.ground import light_map, shade
-from velfield.synthetic.render import MOSAIC_SCALE, Grey, Sprites, draw_sprites
+from velfield.synthetic.render import MOSAIC_SCALE, Sprites, draw_sprites
 from velfield.synthetic.traffic.traffic import draw_kinds
 from velfield.synthetic.traffic.vehicles import draw_tones
-
-FloatArray = NDArray[np.float64]
 
 FAR_PX = 1e8
 """Height of a camera whose rays are as good as upright."""
@@ -22,9 +21,9 @@ FAR_PX = 1e8
 class Standing:
     """What stands still: ``tone`` mosaic, ``height`` and ``reach`` maps, base px a count, and the mosaic's border."""
 
-    tone: Grey
-    height: Grey
-    reach: Grey
+    tone: GreyImage
+    height: GreyImage
+    reach: GreyImage
     height_step_px: float
     pad_px: int
 
@@ -38,7 +37,7 @@ def other_sensor_image(
     parked: FloatArray,
     gsd_m: float,
     rng: np.random.Generator,
-) -> Grey:
+) -> GreyImage:
     """Picture (shape) with its own light, blur, tone curve and noise, and cars at ``parked`` (n, 3) x, y, direction."""
     light = light_map(standing.height, standing.reach, step_px=standing.height_step_px, direction=sun)
     lit = shade(standing.tone, light)

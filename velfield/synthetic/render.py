@@ -11,11 +11,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, GreyImage
 from velfield.synthetic.city.relief import ground_height_at
 from velfield.synthetic.traffic.vehicles import LAYERS
-
-FloatArray = NDArray[np.float64]
-Grey = NDArray[np.uint8]
 
 MOSAIC_SCALE = 2
 """Mosaic pixels a base pixel."""
@@ -39,9 +37,9 @@ class Scene:
     uint8 (cells of REACH_CELL: greatest height within a ray's reach); all start at base pixel ``origin``.
     """
 
-    mosaic: Grey
-    height: Grey
-    reach: Grey
+    mosaic: GreyImage
+    height: GreyImage
+    reach: GreyImage
     origin: FloatArray
     height_step_px: float
 
@@ -224,7 +222,7 @@ def hidden(place, slope, height, origin, step):  # type: ignore[no-untyped-def]
 
 def draw_sprites(
     out: NDArray[np.float32],
-    tall: Grey,
+    tall: GreyImage,
     sprites: Sprites,
     *,
     table: FloatArray,

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
+from schemas.arrays import FloatArray
 from velfield.synthetic.truth import Truth
 
-FloatArray = NDArray[np.float64]
 ToBase = Callable[[int, FloatArray], FloatArray]
 
 MATCH_PX = 8.0

@@ -7,15 +7,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from schemas.arrays import FloatArray
 from velfield.errors import InputError
 from velfield.synthetic.camera import Camera, Waves
 from velfield.synthetic.city.relief import Relief
 from velfield.synthetic.flight import Flight
-
-FloatArray = NDArray[np.float64]
 
 CAR_COLUMNS: dict[str, str] = {
     "frame": "int32",

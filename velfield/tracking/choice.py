@@ -17,8 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from schemas.arrays import FloatArray, IntArray
 
 LOOKS_EXPONENT = 4.0
 """Likelihood of a pair of patches falls as this power of (1 + difference / usual difference of one car to itself)."""
@@ -42,11 +41,11 @@ class Triples:
         (m,) what looks and motion say against it.
     """
 
-    detections: Ints
-    cost: Floats
+    detections: IntArray
+    cost: FloatArray
 
 
-def usual_difference(differences: Floats, first: Ints) -> float:
+def usual_difference(differences: FloatArray, first: IntArray) -> float:
     """Difference of patches that one car usually has to itself: the median over detections of their best link's.
 
     Parameters
@@ -62,12 +61,12 @@ def usual_difference(differences: Floats, first: Ints) -> float:
     return max(float(np.median(best[np.isfinite(best)])), MIN_USUAL_DIFFERENCE)
 
 
-def looks_cost(differences: Floats, usual: float) -> Floats:
+def looks_cost(differences: FloatArray, usual: float) -> FloatArray:
     """What a difference of patches says against a pair being one car; zero where there are no patches."""
     return np.where(np.isfinite(differences), LOOKS_EXPONENT * np.log1p(differences / usual), 0.0)
 
 
-def best_triples(triples: Triples, counts: tuple[int, int, int]) -> tuple[NDArray[np.bool_], Floats]:
+def best_triples(triples: Triples, counts: tuple[int, int, int]) -> tuple[NDArray[np.bool_], FloatArray]:
     """Which triples are mutually best, and the confidence of each.
 
     Parameters
@@ -119,7 +118,7 @@ def _best(detections, cost, counts, chance_cost):  # type: ignore[no-untyped-def
     return best, confidence
 
 
-def mutual_best_links(differences: Floats, first: Ints, second: Ints) -> NDArray[np.bool_]:
+def mutual_best_links(differences: FloatArray, first: IntArray, second: IntArray) -> NDArray[np.bool_]:
     """The paper's choice: links whose two detections each look most like the other.
 
     Parameters

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, IntArray
 from schemas.flight import PAPER_GSD_M
 from velfield.tracking.chains import smallest_joined
 
@@ -27,20 +27,17 @@ _SOONER_PER_S = 0.5
 _STANDING_WITHIN_M = 1.0
 """A vehicle that stood is found where it stood; the next in its place would come rolling."""
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-
 
 @dataclass(frozen=True)
 class _Ends:
     """One end of each chain: time (n,) s, place (n, 2) m, velocity (n, 2) m/s."""
 
-    time_s: Floats
-    place_m: Floats
-    velocity_m_per_s: Floats
+    time_s: FloatArray
+    place_m: FloatArray
+    velocity_m_per_s: FloatArray
 
     @property
-    def speed_m_per_s(self) -> Floats:
+    def speed_m_per_s(self) -> FloatArray:
         return np.asarray(np.hypot(self.velocity_m_per_s[:, 0], self.velocity_m_per_s[:, 1]))
 
 
@@ -60,7 +57,7 @@ END_COLUMNS = [
 """Columns of tracklets that `join_chains` reads."""
 
 
-def join_chains(tracklets: pd.DataFrame, chains: Ints, gaps: Gaps, *, gsd_m: float | None) -> Ints:
+def join_chains(tracklets: pd.DataFrame, chains: IntArray, gaps: Gaps, *, gsd_m: float | None) -> IntArray:
     """The passage of each tracklet: chains of one vehicle, with gaps between them, are one.
 
     Every end goes on in one start at most, the likeliest pairs first.
@@ -89,7 +86,7 @@ def join_chains(tracklets: pd.DataFrame, chains: Ints, gaps: Gaps, *, gsd_m: flo
     starts = _ends(tracklets.iloc[first], "0", "01", metres)
     ends = _ends(tracklets.iloc[last], "2", "12", metres)
     goes_on, is_gone_on = np.zeros(len(names), bool), np.zeros(len(names), bool)
-    joined: list[Ints] = []
+    joined: list[IntArray] = []
     for pair in _pairs(ends, starts, gaps):
         end, start = pair
         if not goes_on[end] and not is_gone_on[start]:
@@ -106,7 +103,7 @@ def _ends(rows: pd.DataFrame, place: str, link: str, metres: float) -> _Ends:
     )
 
 
-def _pairs(ends: _Ends, starts: _Ends, gaps: Gaps) -> Ints:
+def _pairs(ends: _Ends, starts: _Ends, gaps: Gaps) -> IntArray:
     """(m, 2) ends and starts that may be one vehicle, the likeliest first."""
     order = np.argsort(starts.time_s, kind="stable")
     times = starts.time_s[order]

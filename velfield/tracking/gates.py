@@ -12,12 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, IntArray
 from velfield.tracking.limits import Limits
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 DEFAULT_AXIS_SD_RAD = 0.1
 """Standard deviation of an axis that came without one: what the structure tensor reaches (median error 3.4-5
@@ -42,10 +39,10 @@ class Places:
         Time of the frame.
     """
 
-    x_px: Floats
-    y_px: Floats
-    axis_rad: Floats
-    axis_sd_rad: Floats
+    x_px: FloatArray
+    y_px: FloatArray
+    axis_rad: FloatArray
+    axis_sd_rad: FloatArray
     sd_px: float
     time_s: float
 
@@ -66,9 +63,9 @@ class Links:
         Counts: tried, by speed, by axis.
     """
 
-    first: Ints
-    second: Ints
-    axis_cost: Floats
+    first: IntArray
+    second: IntArray
+    axis_cost: FloatArray
     interval_s: float
     rejected: tuple[int, int, int]
 
@@ -189,9 +186,9 @@ class LinkPairs:
         Counts: tried, by turn, by acceleration.
     """
 
-    link_01: Ints
-    link_12: Ints
-    motion_cost: Floats
+    link_01: IntArray
+    link_12: IntArray
+    motion_cost: FloatArray
     rejected: tuple[int, int, int]
 
 

@@ -24,8 +24,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from schemas.arrays import FloatArray, IntArray
 
 CAR_LENGTH_PX = 14.0
 CAR_WIDTH_PX = 6.0
@@ -69,9 +68,9 @@ class Chips:
     """
 
     pixels: NDArray[np.uint8]
-    centre_x_px: Floats
-    centre_y_px: Floats
-    axis_rad: Floats
+    centre_x_px: FloatArray
+    centre_y_px: FloatArray
+    axis_rad: FloatArray
     scale: float
 
 
@@ -79,12 +78,12 @@ class Chips:
 class Displacements:
     """Displacements of links, base px; ``sd_px`` is NaN where the crops did not align."""
 
-    x_px: Floats
-    y_px: Floats
-    sd_px: Floats
+    x_px: FloatArray
+    y_px: FloatArray
+    sd_px: FloatArray
 
 
-def refine_links(before: Chips, after: Chips, first: Ints, second: Ints) -> Displacements:
+def refine_links(before: Chips, after: Chips, first: IntArray, second: IntArray) -> Displacements:
     """Displacement of each link from its two crops.
 
     Parameters
@@ -113,11 +112,11 @@ def refine_links(before: Chips, after: Chips, first: Ints, second: Ints) -> Disp
 def align_crops(
     before: NDArray[np.uint8],
     after: NDArray[np.uint8],
-    axis_before: Floats,
-    axis_after: Floats,
-    first: Ints,
-    second: Ints,
-) -> Floats:
+    axis_before: FloatArray,
+    axis_after: FloatArray,
+    first: IntArray,
+    second: IntArray,
+) -> FloatArray:
     """Shift of the car between pairs of crops, and its standard deviation.
 
     Parameters

@@ -8,13 +8,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, IntArray
 from schemas.tables import TRACKLET_COLUMNS
 from velfield.tracking.limits import Limits
 from velfield.tracking.refine import refine_links
 from velfield.tracking.windows import FrameTable
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -34,9 +32,9 @@ class Found:
     """
 
     start: int
-    detections: Ints
-    differences: Floats
-    confidence: Floats
+    detections: IntArray
+    differences: FloatArray
+    confidence: FloatArray
 
 
 def tracklet_table(
@@ -82,7 +80,7 @@ def _joined(parts: Sequence[NDArray[Any]], kind: type) -> NDArray[Any]:
     return np.concatenate(parts).astype(kind) if parts else np.zeros(0, kind)
 
 
-def _places(tables: Sequence[FrameTable], start: Ints, picked: Ints) -> dict[str, NDArray[Any]]:
+def _places(tables: Sequence[FrameTable], start: IntArray, picked: IntArray) -> dict[str, NDArray[Any]]:
     """Frames, times, ids and places of the detections of each tracklet."""
     frames = np.array([t.frame for t in tables], np.int64)
     times = np.array([t.time_s for t in tables], np.float64)
@@ -98,7 +96,9 @@ def _places(tables: Sequence[FrameTable], start: Ints, picked: Ints) -> dict[str
     return column
 
 
-def _displacements(tables: Sequence[FrameTable], start: Ints, picked: Ints, limits: Limits, *, refine: bool) -> Floats:
+def _displacements(
+    tables: Sequence[FrameTable], start: IntArray, picked: IntArray, limits: Limits, *, refine: bool
+) -> FloatArray:
     """(n, 2, 4): displacement in x and y, its standard deviation, and whether the crops gave it, of both links of
     each tracklet."""
     keys = np.concatenate([np.stack([start + k, picked[:, k], picked[:, k + 1]], axis=1) for k in (0, 1)])
@@ -112,8 +112,8 @@ def _displacements(tables: Sequence[FrameTable], start: Ints, picked: Ints, limi
 
 
 def _frame_displacements(
-    before: FrameTable, after: FrameTable, first: Ints, second: Ints, limits: Limits, *, refine: bool
-) -> Floats:
+    before: FrameTable, after: FrameTable, first: IntArray, second: IntArray, limits: Limits, *, refine: bool
+) -> FloatArray:
     """(k, 4) of the links between two frames: from the crops where they align, else from the detections' places."""
     noise = float(np.hypot(limits.place_sd_px(before.residual_px), limits.place_sd_px(after.residual_px)))
     x = after.x_px[second] - before.x_px[first]

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from schemas.arrays import ByteArray, FloatArray, IntArray
 from schemas.flight import TrackingConfig
 from velfield.errors import InputError
 from velfield.tracking.appearance import Looks, faces, look_differences
@@ -31,10 +31,6 @@ from velfield.tracking.windows import FrameTable, window_frames
 
 __all__ = ["FrameTable", "link_windows", "window_frames"]
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bytes = NDArray[np.uint8]
-
 
 @dataclass(frozen=True)
 class _Pair:
@@ -44,7 +40,7 @@ class _Pair:
     """
 
     links: Links
-    differences: Floats
+    differences: FloatArray
     usual: float
     rejected: tuple[int, int, int, int]
 
@@ -180,7 +176,9 @@ def _choose(start: int, frames: _Frames, min_confidence: float, log: GateLog) ->
     return Found(start, picked, np.stack(differences, axis=1), confidence[chosen])
 
 
-def _patch_differences(before: Bytes | None, after: Bytes | None, first: Ints, second: Ints) -> Floats:
+def _patch_differences(
+    before: ByteArray | None, after: ByteArray | None, first: IntArray, second: IntArray
+) -> FloatArray:
     return look_differences(Looks(before, None), Looks(after, None), first, second)
 
 

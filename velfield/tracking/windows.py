@@ -4,15 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import ByteArray, FloatArray, IntArray
 from velfield.tracking.gates import Places
 from velfield.tracking.limits import Limits
 from velfield.tracking.refine import Chips
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -46,16 +42,16 @@ class FrameTable:
     time_s: float
     registered: bool
     residual_px: float
-    detection_id: Ints
-    x_px: Floats
-    y_px: Floats
-    orientation_rad: Floats
-    orientation_sd_rad: Floats
-    score: Floats
-    patches: Bytes | None = None
-    chips: Bytes | None = None
-    x_work: Floats | None = None
-    y_work: Floats | None = None
+    detection_id: IntArray
+    x_px: FloatArray
+    y_px: FloatArray
+    orientation_rad: FloatArray
+    orientation_sd_rad: FloatArray
+    score: FloatArray
+    patches: ByteArray | None = None
+    chips: ByteArray | None = None
+    x_work: FloatArray | None = None
+    y_work: FloatArray | None = None
     working_scale: float = 1.0
     registration_sd_px: float = 0.0
 

@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from schemas.records import FlightRecord, GridRecord
 from schemas.view import ViewArray, ViewBase, ViewLayer, ViewRecord, ViewSegments
 from velfield.analysis.coverage import few_vehicles
@@ -30,7 +30,6 @@ from velfield.run.stores import HISTOGRAM, FieldStore, open_field, write_extra_l
 from velfield.viewer.layers import view_layers
 from velfield.viewer.pyramid import TILE_PX, pyramid_levels, pyramid_tiles
 
-Layer = NDArray[np.float64]
 _LINE_REACH_PX = 1.5
 """Around a path that is a pixel wide."""
 
@@ -70,7 +69,7 @@ def write_view_record(layout: RunLayout) -> None:
     write_atomically(layout.view_record, record.model_dump_json().encode())
 
 
-def write_change_layers(layout: RunLayout, layers: Mapping[str, tuple[Layer, Mapping[str, str]]]) -> None:
+def write_change_layers(layout: RunLayout, layers: Mapping[str, tuple[FloatArray, Mapping[str, str]]]) -> None:
     """Leave layers of change in a run's view: name -> (y, x) values, NaN where nothing changed, and attributes."""
     write_extra_layers(layout.view_changes, layers)
     write_view_record(layout)

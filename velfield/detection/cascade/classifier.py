@@ -9,15 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from schemas.arrays import Float32Array, FloatArray, IntArray
 from velfield.detection.cascade.feature_image import Picture, scores_at
 from velfield.detection.detector import BoostedSums
 from velfield.detection.label_orientation import CAR_ASPECT
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Singles = NDArray[np.float32]
 
 FIRST_ROUNDS, SECOND_ROUNDS = 60, 150
 _FIRST_TURNS = np.radians([-18.0, 0.0, 18.0])
@@ -35,7 +31,7 @@ _SHARP = 15.0
 _LEAST_SD_RAD = 0.02
 
 
-def offset_grid(along: int, across: int, step: int = 1) -> Ints:
+def offset_grid(along: int, across: int, step: int = 1) -> IntArray:
     """Whole-pixel offsets (m, 2)."""
     return np.array(
         [(u, v) for u in range(-along, along + 1, step) for v in range(-across, across + 1, step)], np.int64
@@ -53,7 +49,9 @@ class Look:
     sums: BoostedSums
     contrast_floor: float
 
-    def scores(self, xy: Floats, axes: Floats, turns: Floats, offsets: Ints, rounds: int | None = None) -> Singles:
+    def scores(
+        self, xy: FloatArray, axes: FloatArray, turns: FloatArray, offsets: IntArray, rounds: int | None = None
+    ) -> Float32Array:
         """Scores (n, turns, offsets) of places (n, 2), turned and moved from their axes (n,)."""
         found = scores_at(
             self.sums,
@@ -67,8 +65,8 @@ class Look:
         return found.reshape(len(xy), len(turns), len(offsets))
 
     def best(
-        self, xy: Floats, axes: Floats, turns: Floats, offsets: Ints, rounds: int | None = None
-    ) -> tuple[Floats, Floats, Singles]:
+        self, xy: FloatArray, axes: FloatArray, turns: FloatArray, offsets: IntArray, rounds: int | None = None
+    ) -> tuple[FloatArray, FloatArray, Float32Array]:
         """Each place moved and turned to where the first rounds like it best, and how much they do."""
         found = self.scores(xy, axes, turns, offsets, rounds)
         flat = found.reshape(len(xy), -1)
@@ -78,7 +76,7 @@ class Look:
         return moved(xy, axes, offsets[offset].astype(np.float64)), axes, flat[np.arange(len(xy)), best]
 
 
-def find_cars(look: Look, places: Floats, *, least_score: float, least_first_score: float = -np.inf) -> Floats:
+def find_cars(look: Look, places: FloatArray, *, least_score: float, least_first_score: float = -np.inf) -> FloatArray:
     """Where the classifier sees a car: one row a place, so several a car (see `distinct`).
 
     Parameters
@@ -107,7 +105,7 @@ def find_cars(look: Look, places: Floats, *, least_score: float, least_first_sco
     return _closely(look, xy[kept], axes[kept], least_score)
 
 
-def _one_each(xy: Floats, axes: Floats, score: Singles) -> Ints:
+def _one_each(xy: FloatArray, axes: FloatArray, score: Float32Array) -> IntArray:
     """The best of the places that came to lie on one another."""
     order = np.argsort(-score, kind="stable")
     key = np.column_stack([np.rint(xy / 2), np.rint(np.mod(axes, np.pi) * (9 / np.pi)) % 9])[order]
@@ -115,7 +113,7 @@ def _one_each(xy: Floats, axes: Floats, score: Singles) -> Ints:
     return np.asarray(np.sort(order[first]), np.int64)
 
 
-def _closely(look: Look, xy: Floats, axes: Floats, least_score: float) -> Floats:
+def _closely(look: Look, xy: FloatArray, axes: FloatArray, least_score: float) -> FloatArray:
     """All rounds; the place and the turn below the step, from how the score falls about its peak."""
     found = look.scores(xy, axes, _LAST_TURNS, _CLOSE) if len(xy) else np.empty((0, 1, 1), np.float32)
     hopeful = found.max(axis=(1, 2), initial=-np.inf) > least_score
@@ -132,14 +130,14 @@ def _closely(look: Look, xy: Floats, axes: Floats, least_score: float) -> Floats
     return np.column_stack([xy, np.mod(axes + turn, np.pi), peak, np.maximum(spread, _LEAST_SD_RAD)])
 
 
-def moved(xy: Floats, angles: Floats, offsets: Floats) -> Floats:
+def moved(xy: FloatArray, angles: FloatArray, offsets: FloatArray) -> FloatArray:
     """Places moved by offsets along and across their axes."""
     c, s = np.cos(angles), np.sin(angles)
     u, v = offsets[:, 0], offsets[:, 1]
     return xy + np.column_stack([u * c - v * s, u * s + v * c])
 
 
-def distinct(cars: Floats, car_length_px: float) -> Floats:
+def distinct(cars: FloatArray, car_length_px: float) -> FloatArray:
     """The cars without those that better ones stand on, the best first."""
     cars = np.ascontiguousarray(cars[np.argsort(-cars[:, 3], kind="stable")])
     return np.asarray(cars[_free(cars, car_length_px, CAR_ASPECT * car_length_px)])

@@ -7,13 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray
 from velfield.detection.cascade import kernels
 from velfield.detection.detector import BoostedSums
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Singles = NDArray[np.float32]
-Grey = NDArray[np.uint8]
 Offsets = NDArray[np.uint64]
 
 PAD_PX = 48
@@ -52,12 +49,12 @@ class Picture:
 
     grain: Grain
     words: NDArray[np.uint32]
-    difference: Grey
+    difference: GreyImage
     stride: int
     channels: int
 
 
-def picture_of(image: Grey, background: Grey | None = None, grain: Grain = FINE) -> Picture:
+def picture_of(image: GreyImage, background: GreyImage | None = None, grain: Grain = FINE) -> Picture:
     """Pack a picture (h, w) and, where there is one, its difference to the background."""
     grey, window = _smooth(image, grain), np.ones((3, 3), np.uint8)
     zero = kernels.GRADIENT_ZERO
@@ -72,7 +69,7 @@ def picture_of(image: Grey, background: Grey | None = None, grain: Grain = FINE)
     return Picture(grain, words.ravel(), difference.ravel(), grey.shape[1], 3 if background is None else 4)
 
 
-def _smooth(image: Grey, grain: Grain) -> Grey:
+def _smooth(image: GreyImage, grain: Grain) -> GreyImage:
     height, width = image.shape
     if grain.step > 1:
         image = np.pad(image, ((0, -height % grain.step), (0, -width % grain.step)), mode="edge")
@@ -83,8 +80,13 @@ def _smooth(image: Grey, grain: Grain) -> Grey:
 
 
 def poses_of(
-    xy: Floats, angles: Floats, grain: Grain, *, sizes: Floats | None = None, mirrored: NDArray[np.bool_] | None = None
-) -> Singles:
+    xy: FloatArray,
+    angles: FloatArray,
+    grain: Grain,
+    *,
+    sizes: FloatArray | None = None,
+    mirrored: NDArray[np.bool_] | None = None,
+) -> Float32Array:
     """Poses (groups, 8, LANES) of places (n, 2) and axes (n,), the last group filled up with the last pose."""
     n = len(xy)
     size = np.ones(n) if sizes is None else sizes
@@ -106,7 +108,7 @@ class Patch:
     grain: Grain
 
     @classmethod
-    def for_offsets(cls, offsets: Ints, channels: int, grain: Grain) -> "Patch":
+    def for_offsets(cls, offsets: IntArray, channels: int, grain: Grain) -> "Patch":
         """The smallest patch in which rectangles stay at all of these offsets (m, 2)."""
         reach = np.abs(offsets).max(axis=0) + grain.reach
         return cls(2 * int(reach[0]), 2 * int(reach[1]), channels, grain)
@@ -115,11 +117,11 @@ class Patch:
         """Integral pictures to be filled, zero in the first row and column."""
         return np.zeros((self.channels, self.across + 1, self.along + 1, kernels.LANES), np.int32)
 
-    def flat(self, x: Ints, y: Ints) -> Ints:
+    def flat(self, x: IntArray, y: IntArray) -> IntArray:
         """Distance of (x, y) from the first corner, in elements."""
         return (y * (self.along + 1) + x) * kernels.LANES
 
-    def bases(self, offsets: Ints) -> Offsets:
+    def bases(self, offsets: IntArray) -> Offsets:
         """Where the centre, moved by offsets (m, 2), stands."""
         return self.flat(offsets[:, 0] + self.along // 2, offsets[:, 1] + self.across // 2).astype(np.uint64)
 
@@ -140,7 +142,7 @@ class Patch:
         return (channels.astype(np.int64) * ((self.along + 1) * (self.across + 1) * kernels.LANES)).astype(np.uint64)
 
 
-def grey_areas(table: NDArray[np.int32], starts: NDArray[np.int32], channels: NDArray[np.int32]) -> Singles:
+def grey_areas(table: NDArray[np.int32], starts: NDArray[np.int32], channels: NDArray[np.int32]) -> Float32Array:
     """Signed area of each feature on grey, by which the mean grey is taken out; 0 on the other channels."""
     areas = table[:, 0] * (table[:, 3] - table[:, 1]) * (table[:, 4] - table[:, 2])
     total = np.add.reduceat(areas, starts[:-1]) if len(areas) else np.empty(0)
@@ -150,13 +152,13 @@ def grey_areas(table: NDArray[np.int32], starts: NDArray[np.int32], channels: ND
 def scores_at(
     sums: BoostedSums,
     picture: Picture,
-    xy: Floats,
-    angles: Floats,
-    offsets: Ints,
+    xy: FloatArray,
+    angles: FloatArray,
+    offsets: IntArray,
     *,
     contrast_floor: float,
     rounds: int | None = None,
-) -> Singles:
+) -> Float32Array:
     """Scores (n, offsets) of places (n, 2), per square root of the rounds: comparable from training to training.
 
     ``offsets`` (m, 2) are whole px along and across the axis.

@@ -4,15 +4,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import ByteArray, Float32Array
 from schemas.detector import Round
-from velfield.detection.boosting import Bytes, RectanglePool, bin_edges, binned, boost, rounds_of
+from velfield.detection.boosting import RectanglePool, bin_edges, binned, boost, rounds_of
 from velfield.detection.cascade import kernels
 from velfield.detection.cascade.feature_image import Patch, Picture, grey_areas, poses_of
 from velfield.detection.samples import Poses
-
-Singles = NDArray[np.float32]
 
 _BLOCK = 2048
 """Samples measured at a time: their values, four bytes each, are soon bins."""
@@ -26,9 +24,9 @@ class Bank:
 
     pool: RectanglePool
     contrast_floor: float
-    edges: Singles
+    edges: Float32Array
 
-    def bins(self, picture: Picture, poses: Poses) -> Bytes:
+    def bins(self, picture: Picture, poses: Poses) -> ByteArray:
         """(features, poses) uint8."""
         parts = [
             binned(feature_values(picture, poses[start : start + _BLOCK], self.pool, self.contrast_floor), self.edges)
@@ -36,14 +34,14 @@ class Bank:
         ]
         return np.concatenate(parts, axis=1) if parts else np.empty((len(self.pool), 0), np.uint8)
 
-    def samples(self, parts: Iterable[tuple[Picture, Poses]]) -> Bytes:
+    def samples(self, parts: Iterable[tuple[Picture, Poses]]) -> ByteArray:
         """Several pictures' poses, side by side (features, n)."""
         return np.concatenate([self.bins(picture, poses) for picture, poses in parts], axis=1)
 
     def learnt(
         self,
-        wanted: Bytes,
-        others: Bytes,
+        wanted: ByteArray,
+        others: ByteArray,
         *,
         rounds: int,
         fraction: float,
@@ -78,7 +76,7 @@ def bank_of(
     return Bank(pool, contrast_floor, bin_edges(np.concatenate(values, axis=1)))
 
 
-def feature_values(picture: Picture, poses: Poses, pool: RectanglePool, contrast_floor: float) -> Singles:
+def feature_values(picture: Picture, poses: Poses, pool: RectanglePool, contrast_floor: float) -> Float32Array:
     """Values (features, poses) of all features of a pool."""
     patch = Patch.for_offsets(_ON_SPOT, picture.channels, picture.grain)
     packed = poses_of(poses.rows[:, :2], poses.rows[:, 2], picture.grain, sizes=poses.sizes, mirrored=poses.mirrored)

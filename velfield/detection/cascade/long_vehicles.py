@@ -9,17 +9,13 @@ from functools import cache
 from importlib.resources import files
 
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import Float32Array, FloatArray, Mask
 from schemas.detector import LongVehicleRecord
 from velfield.detection.cascade.classifier import moved
 from velfield.detection.cascade.feature_image import Grain, Picture, scores_at
 from velfield.detection.cascade.proposals import in_sight
 from velfield.detection.detector import BoostedSums, sums_of
-
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 LONG = Grain(2, (16, 7))
 LEAST_LENGTH = 1.4
@@ -37,11 +33,11 @@ class LongVehicles:
     record: LongVehicleRecord
     sums: BoostedSums
 
-    def scores(self, picture: Picture, xy: Floats, axes: Floats) -> Singles:
+    def scores(self, picture: Picture, xy: FloatArray, axes: FloatArray) -> Float32Array:
         """How much places (n, 2), moved by `OFFSETS` along their axes (n,), look like a middle: (n, offsets)."""
         return scores_at(self.sums, picture, xy, axes, OFFSETS, contrast_floor=self.record.contrast_floor)
 
-    def centred(self, picture: Picture, cars: Floats, seen: Bools) -> Floats:
+    def centred(self, picture: Picture, cars: FloatArray, seen: Mask) -> FloatArray:
         """Distinct cars (n, 2...) as x, y, axis, the best first, what is long at its middle and once.
 
         Parameters
@@ -60,7 +56,7 @@ class LongVehicles:
         cars = np.column_stack([np.where(long[:, None], middles, cars[:, :2]), cars[:, 2:]])
         return np.asarray(cars[~self._on_another(cars, long)])
 
-    def _on_another(self, cars: Floats, long: Bools) -> Bools:
+    def _on_another(self, cars: FloatArray, long: Mask) -> Mask:
         """Whether each car lies on something long: of two that are long the better one stays."""
         on_another = np.zeros(len(cars), np.bool_)
         along, across = (share * self.record.working_car_length_px for share in (_BODY_ALONG, _BODY_ACROSS))

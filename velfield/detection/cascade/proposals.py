@@ -7,13 +7,10 @@ little turned. Of extrema of a difference of Gaussians three times as many are w
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, Mask
 from velfield.detection.cascade.feature_image import Picture, scores_at
 from velfield.detection.detector import BoostedSums
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 TURNS = np.arange(6) * (np.pi / 6)
 PER_MEGAPIXEL = 4000
@@ -31,13 +28,13 @@ _CELL_PX = 2
 def propose(
     coarse: Picture,
     shape: tuple[int, int],
-    valid: Bools | None,
+    valid: Mask | None,
     sums: BoostedSums,
     *,
     contrast_floor: float,
     least_score: float = -np.inf,
     per_megapixel: float = PER_MEGAPIXEL,
-) -> Floats:
+) -> FloatArray:
     """Places and turns that the coarse classifier likes better than their neighbours.
 
     Parameters
@@ -60,14 +57,16 @@ def propose(
     return np.asarray(rows[_first_of_each(rows[:, :2].copy(), turn, taken, _NEAR_PX, _CELL_PX, most)])
 
 
-def in_sight(xy: Floats, shape: tuple[int, int], valid: Bools | None) -> Bools:
+def in_sight(xy: FloatArray, shape: tuple[int, int], valid: Mask | None) -> Mask:
     """Whether places (n, 2...) lie in a picture (h, w), and where it is ``valid``."""
     x, y = (np.clip(np.rint(xy[:, k]), 0, shape[1 - k] - 1).astype(np.int64) for k in (0, 1))
     within = (np.abs(xy[:, 0] - x) <= 0.5) & (np.abs(xy[:, 1] - y) <= 0.5)
     return np.asarray(within if valid is None else within & valid[y, x])
 
 
-def _peaks(coarse: Picture, shape: tuple[int, int], sums: BoostedSums, turn: float, contrast_floor: float) -> Floats:
+def _peaks(
+    coarse: Picture, shape: tuple[int, int], sums: BoostedSums, turn: float, contrast_floor: float
+) -> FloatArray:
     """Local maxima (n, 4) at one turn, on a grid turned likewise: tiles lie side by side, whatever the turn."""
     step = coarse.grain.step
     pitch = float(_TILE * _STEP * step)

@@ -7,9 +7,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import ByteArray, FloatArray
 from schemas.detector import Round
 from schemas.flight import DetectionConfig
-from velfield.detection.boosting import Bytes, random_pool
+from velfield.detection.boosting import random_pool
 from velfield.detection.cascade.classifier import Look, find_cars, moved, offset_grid
 from velfield.detection.cascade.feature_image import COARSE, FINE, Grain
 from velfield.detection.cascade.feature_matrix import Bank, bank_of
@@ -17,8 +18,6 @@ from velfield.detection.cascade.proposals import propose
 from velfield.detection.detector import BoostedSums, sums_of
 from velfield.detection.samples import Poses, Scene, is_far, is_wrong, other_poses, varied
 from velfield.parallel import each
-
-Floats = NDArray[np.float64]
 
 CONTRAST_FLOOR = 12.0
 """Grey levels a px added to the mean gradient, by which sums are divided: what is flat is not blown up."""
@@ -118,7 +117,9 @@ def _bank(
     return bank_of(pool, CONTRAST_FLOOR, parts, rng)
 
 
-def _boosted(bank: Bank, cars: Bytes, others: Bytes, rounds: int, rng: np.random.Generator) -> tuple[Round, ...]:
+def _boosted(
+    bank: Bank, cars: ByteArray, others: ByteArray, rounds: int, rng: np.random.Generator
+) -> tuple[Round, ...]:
     return bank.learnt(cars, others, rounds=rounds, fraction=_CAR_FRACTION, shrinkage=_SHRINKAGE, rng=rng)
 
 
@@ -136,20 +137,20 @@ def _coarse_cars(scene: Scene, copies: int, rng: np.random.Generator) -> Poses:
     return varied(rows + noise, rng)
 
 
-def _wrongly_proposed(scene: Scene, sums: BoostedSums, most: int) -> Floats:
+def _wrongly_proposed(scene: Scene, sums: BoostedSums, most: int) -> FloatArray:
     shape = scene.sample.image.shape
     found = propose(scene.coarse, shape, scene.sample.valid, sums, contrast_floor=CONTRAST_FLOOR, per_megapixel=_WIDE)
     return _surely_wrong(found, is_far(found, scene), scene, Look(scene.coarse, sums, CONTRAST_FLOOR))[:most]
 
 
-def _wrongly_found(scene: Scene, sums: BoostedSums, most: int) -> Floats:
+def _wrongly_found(scene: Scene, sums: BoostedSums, most: int) -> FloatArray:
     look = Look(scene.fine, sums, CONTRAST_FLOOR)
     found = find_cars(look, scene.places[: _LOOKED_AT * most], least_score=-1.0)
     found = found[np.argsort(-found[:, 3], kind="stable")]
     return _surely_wrong(found, is_wrong(found, scene), scene, look)[:most]
 
 
-def _surely_wrong(found: Floats, wrong: NDArray[np.bool_], scene: Scene, look: Look) -> Floats:
+def _surely_wrong(found: FloatArray, wrong: NDArray[np.bool_], scene: Scene, look: Look) -> FloatArray:
     """Of a picture not wholly marked, what is liked less than most marked cars: the rest may be cars that stand."""
     if not scene.sample.complete and len(scene.cars):
         here = look.scores(scene.cars[:, :2], scene.cars[:, 2], np.zeros(1), np.zeros((1, 2), np.int64))

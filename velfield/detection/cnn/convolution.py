@@ -9,9 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
-from numpy.typing import NDArray
 
-Array = NDArray[np.float32]
+from schemas.arrays import Float32Array
 
 _PIECE = 512
 """Rows at once: their neighbourhoods stay in the second cache."""
@@ -34,27 +33,27 @@ class Layout:
         """Of the same pictures at every second pixel."""
         return Layout(self.count, self.height // 2, self.width // 2)
 
-    def framed(self, values: Array) -> Array:
+    def framed(self, values: Float32Array) -> Float32Array:
         """(count, height + 2, width + 2, channels), a view."""
         return values.reshape(self.count, self.height + 2, self.width + 2, -1)
 
-    def inner(self, values: Array) -> Array:
+    def inner(self, values: Float32Array) -> Float32Array:
         """(count, height, width, channels) without the border, a view."""
         return self.framed(values)[:, 1:-1, 1:-1]
 
-    def laid_out(self, inner: Array) -> Array:
+    def laid_out(self, inner: Float32Array) -> Float32Array:
         """(rows, channels) of what lies within the borders, (count, height, width, channels)."""
         values = np.zeros((self.rows, inner.shape[-1]), np.float32)
         self.inner(values)[...] = inner
         return values
 
-    def clear_border(self, values: Array) -> None:
+    def clear_border(self, values: Float32Array) -> None:
         """Zero where no picture is."""
         framed = self.framed(values)
         framed[:, 0], framed[:, -1], framed[:, :, 0], framed[:, :, -1] = 0, 0, 0, 0
 
 
-def convolved(values: Array, weights: Array, layout: Layout) -> Array:
+def convolved(values: Float32Array, weights: Float32Array, layout: Layout) -> Float32Array:
     """Convolve with 1 x 1 or 3 x 3 weights.
 
     Parameters
@@ -78,7 +77,9 @@ def convolved(values: Array, weights: Array, layout: Layout) -> Array:
     return out
 
 
-def handed_back(values: Array, weights: Array, slope: Array, layout: Layout) -> tuple[Array, Array]:
+def handed_back(
+    values: Float32Array, weights: Float32Array, slope: Float32Array, layout: Layout
+) -> tuple[Float32Array, Float32Array]:
     """What a convolution hands back: the loss's slope by its values (rows, c), and by its weights, from that by what
     came out (rows, k), zero in the border."""
     if len(weights) == 1:
@@ -90,7 +91,7 @@ def handed_back(values: Array, weights: Array, slope: Array, layout: Layout) -> 
     return convolved(slope, mirrored, layout), by_weights.reshape(weights.shape)
 
 
-def _pieces(values: Array, layout: Layout) -> Iterator[tuple[int, int, Array]]:
+def _pieces(values: Float32Array, layout: Layout) -> Iterator[tuple[int, int, Float32Array]]:
     """Pieces of rows: start, stop, and each row's neighbourhood (n, 9 c)."""
     line, channels = layout.width + 2, values.shape[1]
     reach = line + 1
@@ -105,7 +106,7 @@ def _pieces(values: Array, layout: Layout) -> Iterator[tuple[int, int, Array]]:
         yield start, stop, near[:n].reshape(n, 9 * channels)
 
 
-def gathered(values: Array, layout: Layout) -> Array:
+def gathered(values: Float32Array, layout: Layout) -> Float32Array:
     """Squares of 2 x 2 pixels as one pixel of four times the channels, of the halved layout."""
     inner = layout.inner(values)
     count, height, width, channels = inner.shape
@@ -113,7 +114,7 @@ def gathered(values: Array, layout: Layout) -> Array:
     return layout.halved().laid_out(squares.reshape(count, height // 2, width // 2, 4 * channels))
 
 
-def spread(values: Array, layout: Layout) -> Array:
+def spread(values: Float32Array, layout: Layout) -> Float32Array:
     """The reverse of `gathered`: from the halved layout to this one, a quarter of the channels."""
     inner = layout.halved().inner(values)
     count, height, width, channels = inner.shape

@@ -8,13 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from velfield.detection.cnn.convolution import Array
+from schemas.arrays import Float32Array, FloatArray
 from velfield.detection.cnn.model import STRIDE
 from velfield.detection.cnn.trainer import Batch
 from velfield.detection.label_orientation import with_axes
 from velfield.detection.samples import LabelledImage
-
-Floats = NDArray[np.float64]
 
 SIDE_PX = 96
 """Side of a piece: six cars."""
@@ -71,7 +69,9 @@ def _ready(sample: LabelledImage) -> LabelledImage:
     return replace(sample, cars=with_axes(sample.image, sample.cars, sample.tilts))
 
 
-def _piece(sample: LabelledImage, rng: np.random.Generator) -> tuple[Array, Array, Array, Array, Array]:
+def _piece(
+    sample: LabelledImage, rng: np.random.Generator
+) -> tuple[Float32Array, Float32Array, Float32Array, Float32Array, Float32Array]:
     matrix = _placed(sample, rng)
     rows, columns, near = _about(matrix)
     image = sample.image[rows, columns].astype(np.float32) / 255
@@ -96,7 +96,7 @@ def _piece(sample: LabelledImage, rng: np.random.Generator) -> tuple[Array, Arra
 _CELLS = np.arange(SIDE_PX // STRIDE) * STRIDE + (STRIDE - 1) / 2
 
 
-def _placed(sample: LabelledImage, rng: np.random.Generator) -> Floats:
+def _placed(sample: LabelledImage, rng: np.random.Generator) -> FloatArray:
     """From the picture to the piece: about a car or anywhere, turned, mirrored, scaled."""
     height, width = sample.image.shape
     if len(sample.cars) and rng.random() < _AT_A_CAR:
@@ -109,7 +109,7 @@ def _placed(sample: LabelledImage, rng: np.random.Generator) -> Floats:
     return np.column_stack([turned, np.full(2, SIDE_PX / 2) - turned @ at])
 
 
-def _about(matrix: Floats) -> tuple[slice, slice, Floats]:
+def _about(matrix: FloatArray) -> tuple[slice, slice, FloatArray]:
     """Rows and columns of all that a piece can show, mirrored at the picture's edge too, and the matrix from there."""
     middle = np.linalg.solve(matrix[:, :2], np.full(2, SIDE_PX / 2) - matrix[:, 2])
     first = np.maximum(middle - _REACH * SIDE_PX, 0).astype(int)
@@ -118,7 +118,7 @@ def _about(matrix: Floats) -> tuple[slice, slice, Floats]:
     return slice(first[1], last[1]), slice(first[0], last[0]), moved
 
 
-def _told_of(cars: Floats, axis: Floats) -> tuple[Array, Array, Array]:
+def _told_of(cars: FloatArray, axis: FloatArray) -> tuple[Float32Array, Float32Array, Float32Array]:
     """Middles, axes and how much these count, in cells."""
     cells = len(_CELLS)
     middles, axes = np.zeros((cells, cells), np.float32), np.zeros((cells, cells, 2), np.float32)
@@ -133,7 +133,7 @@ def _told_of(cars: Floats, axis: Floats) -> tuple[Array, Array, Array]:
     return middles, axes, np.square(middles)
 
 
-def _toned(picture: NDArray[np.float32], rng: np.random.Generator) -> Array:
+def _toned(picture: NDArray[np.float32], rng: np.random.Generator) -> Float32Array:
     """The piece as another sensor, or in other light, would show it."""
     tone = np.clip(picture, 0, 1) ** np.exp(rng.uniform(-_GAMMA_SPREAD, _GAMMA_SPREAD))
     tone = (tone - _GREY_MIDDLE) * rng.uniform(*_CONTRAST) + _GREY_MIDDLE + rng.uniform(-_LIGHT, _LIGHT)
@@ -145,7 +145,7 @@ def _toned(picture: NDArray[np.float32], rng: np.random.Generator) -> Array:
     return np.asarray(np.clip(tone, 0, 1), np.float32)
 
 
-def _shade(rng: np.random.Generator) -> Floats:
+def _shade(rng: np.random.Generator) -> FloatArray:
     """0 to 1: a shadow's straight edge across the piece."""
     turn, off = rng.uniform(0, 2 * np.pi), rng.uniform(-SIDE_PX / 3, SIDE_PX / 3)
     place = np.arange(SIDE_PX) - SIDE_PX / 2

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import Float32Array
 from schemas.detector import DetectorRecord, PrecisionRecallCurve
 from schemas.flight import DetectionConfig
 from velfield.detection.cascade.classifier import distinct
-from velfield.detection.cnn.convolution import Array
 from velfield.detection.cnn.dataset import Pieces
 from velfield.detection.cnn.inference import network_finds
 from velfield.detection.cnn.model import Network, odds_map, record_of_network
@@ -77,7 +77,7 @@ def learnt_on(samples: Sequence[LabelledImage], earlier: Detector, config: Detec
     before = earlier.network
     network, _ = _on(each(lambda sample: _known(sample, before), samples), before, config, -1)
 
-    def between(old: Array, new: Array) -> Array:
+    def between(old: Float32Array, new: Float32Array) -> Float32Array:
         return old + np.float32(share) * (new - old)
 
     weights = {name: between(old, network.weights[name]) for name, old in before.weights.items()}

@@ -8,14 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray
 from velfield.detection.cascade.classifier import moved
 from velfield.detection.cascade.proposals import in_sight
-from velfield.detection.cnn.convolution import Array
 from velfield.detection.cnn.model import STRIDE, Network, odds_map, said_of
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Grey = NDArray[np.uint8]
 
 LIKELY = 0.35
 """Said of a place that is as often a car as not: near middles the loss lets it say less than it knows."""
@@ -32,7 +28,7 @@ _TURNS = np.radians([0.0, 90.0])
 _AT_ONCE = 8
 
 
-def network_finds(network: Network, image: Grey, valid: NDArray[np.bool_] | None) -> Floats:
+def network_finds(network: Network, image: GreyImage, valid: NDArray[np.bool_] | None) -> FloatArray:
     """Cars (n, 5) as x, y, axis, score, axis' standard deviation, working px; several a car (see `aligned.distinct`).
 
     The score is how likely a car is, less `LIKELY`.
@@ -57,7 +53,7 @@ def network_finds(network: Network, image: Grey, valid: NDArray[np.bool_] | None
     return found[_mostly_seen(found, image.shape, valid)]
 
 
-def _mostly_seen(cars: Floats, shape: tuple[int, int], valid: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+def _mostly_seen(cars: FloatArray, shape: tuple[int, int], valid: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
     """Whether three quarters of a car lie in the frame: of what is cut farther in, the middle is not where it seems."""
     seen = np.ones(len(cars), bool)
     for along in (-_QUARTER_CAR_PX, _QUARTER_CAR_PX):
@@ -65,7 +61,7 @@ def _mostly_seen(cars: Floats, shape: tuple[int, int], valid: NDArray[np.bool_] 
     return seen
 
 
-def _below_the_cell(values: Array, y: Ints, x: Ints) -> Floats:
+def _below_the_cell(values: Float32Array, y: IntArray, x: IntArray) -> FloatArray:
     """How far off a cell's middle, right and down, parabolas through it and its neighbours have their peak, (n, 2)."""
     at = np.log(np.maximum(np.pad(values, 1, mode="edge"), 1e-6)).astype(np.float64)
     here, off = at[y + 1, x + 1], []
@@ -75,7 +71,9 @@ def _below_the_cell(values: Array, y: Ints, x: Ints) -> Floats:
     return np.column_stack(off)
 
 
-def _looked_at_again(network: Network, image: Grey, xy: Floats, axis: Floats) -> tuple[Floats, Floats]:
+def _looked_at_again(
+    network: Network, image: GreyImage, xy: FloatArray, axis: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """How likely (n, 2) places are, turned by their axis and across, and twice their axis (n, 2, 2) in the picture."""
     turns = axis[:, None] + _TURNS
     place = np.arange(_AGAIN_PX) - (_MIDDLE * STRIDE + (STRIDE - 1) / 2)
@@ -93,7 +91,7 @@ def _looked_at_again(network: Network, image: Grey, xy: Floats, axis: Floats) ->
     return likely, vectors
 
 
-def _at_the_middle(said: Array, turns: Floats) -> tuple[Floats, Floats]:
+def _at_the_middle(said: Float32Array, turns: FloatArray) -> tuple[FloatArray, FloatArray]:
     about = said[:, _MIDDLE - 3 : _MIDDLE + 4, _MIDDLE - 3 : _MIDDLE + 4]
     odds = 1 / (1 + np.exp(-about[..., 0].astype(np.float64)))
     kernel = cv2.getGaussianKernel(5, _BLUR_CELLS)[:, 0]

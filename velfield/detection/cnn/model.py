@@ -10,14 +10,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import Float32Array, GreyImage
 from schemas.detector import LayerRecord
-from velfield.detection.cnn.convolution import Array, Layout, convolved, gathered, spread
+from velfield.detection.cnn.convolution import Layout, convolved, gathered, spread
 from velfield.errors import InputError
-
-Floats = NDArray[np.float64]
-Grey = NDArray[np.uint8]
 
 STRIDE = 2
 """Working px a cell of what the network says."""
@@ -53,17 +50,17 @@ class Network:
     biases : of each layer, float32 (channels out,).
     """
 
-    weights: Mapping[str, Array]
-    biases: Mapping[str, Array]
+    weights: Mapping[str, Float32Array]
+    biases: Mapping[str, Float32Array]
 
-    def layer(self, name: str, values: Array, layout: Layout) -> Array:
+    def layer(self, name: str, values: Float32Array, layout: Layout) -> Float32Array:
         """A layer's sums with its bias, zero in the border."""
         out = convolved(values, self.weights[name], layout)
         out += self.biases[name]
         layout.clear_border(out)
         return out
 
-    def rectified(self, name: str, values: Array, layout: Layout) -> Array:
+    def rectified(self, name: str, values: Float32Array, layout: Layout) -> Float32Array:
         """The same, what is below zero set to it."""
         out = self.layer(name, values, layout)
         np.maximum(out, 0, out=out)
@@ -101,7 +98,7 @@ def record_of_network(network: Network) -> dict[str, LayerRecord]:
     return record
 
 
-def said_of(network: Network, pictures: Array) -> Array:
+def said_of(network: Network, pictures: Float32Array) -> Float32Array:
     """What the network says of pictures.
 
     Parameters
@@ -129,7 +126,7 @@ def said_of(network: Network, pictures: Array) -> Array:
     return np.ascontiguousarray(half.inner(network.layer("told", network.rectified("middle", joined, half), half)))
 
 
-def odds_map(network: Network, image: Grey) -> tuple[Array, Array]:
+def odds_map(network: Network, image: GreyImage) -> tuple[Float32Array, Float32Array]:
     """How likely a car's middle is, and twice its axis, over a picture (h, w).
 
     Returns

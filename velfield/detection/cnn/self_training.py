@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, GreyImage
 from schemas.detector import MotionRecord, PrecisionRecallCurve
 from schemas.flight import DetectionConfig
 from velfield.detection.cnn.fine_tuning import learnt_on
@@ -23,9 +24,6 @@ from velfield.detection.motion.difference import MotionFrame
 from velfield.detection.motion.evidence import Conduct, Found, conduct_of_bursts
 from velfield.detection.samples import LabelledImage
 from velfield.parallel import each
-
-Floats = NDArray[np.float64]
-Grey = NDArray[np.uint8]
 
 _STEPS_MORE = 3
 """What moves is hundreds of labels: so many times the steps that it takes from a marked frame."""
@@ -43,7 +41,7 @@ def network_of_motion(
     samples: Sequence[LabelledImage],
     earlier: Detector,
     bursts: Sequence[MotionFrame],
-    background: Grey,
+    background: GreyImage,
     config: DetectionConfig,
     *,
     max_interval_s: float,
@@ -74,7 +72,7 @@ def network_of_motion(
     length_px = record.working_car_length_px
     low = config.model_copy(update={"threshold": SCORE_FLOOR})
 
-    def found(frame: MotionFrame) -> tuple[Found, Floats]:
+    def found(frame: MotionFrame) -> tuple[Found, FloatArray]:
         cars = detect_frame(frame.image, frame.valid, Detector(record), low)
         difference = difference_about(frame.image, background, cars.xy, length_px)
         return Found(cars.xy, cars.orientation_rad, cars.score, frame.time_s), difference
@@ -95,7 +93,7 @@ def network_of_motion(
 
 
 def thresholds_of(
-    score: Floats, kind: NDArray[np.int8], difference: Floats
+    score: FloatArray, kind: NDArray[np.int8], difference: FloatArray
 ) -> tuple[float, MotionRecord, PrecisionRecallCurve] | None:
     """T of what stands, how much less what moves needs, and the curve of what moves.
 
@@ -130,7 +128,7 @@ def thresholds_of(
     return standing, MotionRecord(still_grey=still, moving_grey=moving, lift=standing - least), curve
 
 
-def threshold_of_standing(moving: Floats, standing: Floats) -> float:
+def threshold_of_standing(moving: FloatArray, standing: FloatArray) -> float:
     """T of finds that stand, from how well cars that move are liked.
 
     Cars that stand are liked as those that move. At no score can there be more of them than finds that stand: the

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from velfield.detection.cnn.convolution import Array, Layout, convolved, gathered, handed_back, spread
+from schemas.arrays import Float32Array
+from velfield.detection.cnn.convolution import Layout, convolved, gathered, handed_back, spread
 from velfield.detection.cnn.model import BODIES, CORNERS, LAYERS, Network
 from velfield.parallel import each
 
@@ -36,11 +37,11 @@ class Batch:
     axes_counted : (n, h / 2, w / 2) how much these count.
     """
 
-    pictures: Array
-    middles: Array
-    counted: Array
-    axes: Array
-    axes_counted: Array
+    pictures: Float32Array
+    middles: Float32Array
+    counted: Float32Array
+    axes: Float32Array
+    axes_counted: Float32Array
 
     def halves(self) -> "tuple[Batch, Batch]":
         """The first and the second half of the pictures."""
@@ -62,7 +63,7 @@ class Weighed:
         return cls(float(_at_cars(batch).sum()) + 1, float(batch.axes_counted.sum()) + 1)
 
 
-def _at_cars(batch: Batch) -> Array:
+def _at_cars(batch: Batch) -> Float32Array:
     return np.asarray(batch.middles**4 * batch.counted, np.float32)
 
 
@@ -76,10 +77,10 @@ class Learner:
     means, variances : of what normalised layers sum, over the last batches.
     """
 
-    values: dict[str, Array]
-    means: dict[str, Array] = field(default_factory=dict)
-    variances: dict[str, Array] = field(default_factory=dict)
-    _moments: dict[str, tuple[Array, Array]] = field(default_factory=dict)
+    values: dict[str, Float32Array]
+    means: dict[str, Float32Array] = field(default_factory=dict)
+    variances: dict[str, Float32Array] = field(default_factory=dict)
+    _moments: dict[str, tuple[Float32Array, Float32Array]] = field(default_factory=dict)
     _steps: int = 0
 
     @classmethod
@@ -123,7 +124,7 @@ class Learner:
             self._move(name, slope * shrink, size)
         return loss
 
-    def _move(self, name: str, slope: Array, size: float) -> None:
+    def _move(self, name: str, slope: Float32Array, size: float) -> None:
         """Adam's step with decay apart from it (Loshchilov and Hutter)."""
         value = self.values[name]
         first, second = self._moments.get(name, (np.zeros_like(value), np.zeros_like(value)))
@@ -134,7 +135,7 @@ class Learner:
         step = first / grown[0] / (np.sqrt(second / grown[1]) + 1e-8)
         self.values[name] = (value * (1 - size * _DECAY) - size * step).astype(np.float32)
 
-    def slopes(self, batch: Batch) -> tuple[float, dict[str, Array]]:
+    def slopes(self, batch: Batch) -> tuple[float, dict[str, Float32Array]]:
         """The loss, and its slope by everything that is learnt.
 
         Where no layer is normalised by its batch, both halves of it are gone through at once: what they hand back adds
@@ -146,7 +147,7 @@ class Learner:
         (first, of_first), (second, of_second) = each(lambda half: self._slopes(half, weighed), batch.halves())
         return first + second, {name: slope + of_second[name] for name, slope in of_first.items()}
 
-    def _slopes(self, batch: Batch, weighed: Weighed) -> tuple[float, dict[str, Array]]:
+    def _slopes(self, batch: Batch, weighed: Weighed) -> tuple[float, dict[str, Float32Array]]:
         tape = _Tape(self)
         whole = Layout(*batch.pictures.shape)
         half = whole.halved()
@@ -178,17 +179,17 @@ class _Tape:
 
     def __init__(self, learner: Learner) -> None:
         self.learner = learner
-        self.slopes: dict[str, Array] = {}
-        self._undo: dict[str, Callable[[Array], Array]] = {}
+        self.slopes: dict[str, Float32Array] = {}
+        self._undo: dict[str, Callable[[Float32Array], Float32Array]] = {}
 
-    def summed(self, name: str, values: Array, layout: Layout) -> Array:
+    def summed(self, name: str, values: Float32Array, layout: Layout) -> Float32Array:
         """A layer without more."""
         learnt = self.learner.values
         weights = learnt[f"{name}.w"]
         out = convolved(values, weights, layout) + learnt[f"{name}.b"]
         layout.clear_border(out)
 
-        def undo(slope: Array) -> Array:
+        def undo(slope: Float32Array) -> Float32Array:
             self.slopes[f"{name}.b"] = slope.sum(axis=0)
             by_values, self.slopes[f"{name}.w"] = handed_back(values, weights, slope, layout)
             return by_values
@@ -196,7 +197,7 @@ class _Tape:
         self._undo[name] = undo
         return out
 
-    def rectified(self, name: str, values: Array, layout: Layout) -> Array:
+    def rectified(self, name: str, values: Float32Array, layout: Layout) -> Float32Array:
         """A layer, normalised where it is learnt so, and what is below zero set to it."""
         if f"{name}.g" in self.learner.values:
             out = self._normalised(name, values, layout)
@@ -207,7 +208,7 @@ class _Tape:
         self._undo[name] = lambda slope: undo(slope * (out > 0))
         return out
 
-    def _normalised(self, name: str, values: Array, layout: Layout) -> Array:
+    def _normalised(self, name: str, values: Float32Array, layout: Layout) -> Float32Array:
         learner = self.learner
         weights, gain = learner.values[f"{name}.w"], learner.values[f"{name}.g"]
         summed = convolved(values, weights, layout)
@@ -222,7 +223,7 @@ class _Tape:
         layout.clear_border(out)
         pixels = layout.count * layout.height * layout.width
 
-        def undo(slope: Array) -> Array:
+        def undo(slope: Float32Array) -> Float32Array:
             self.slopes[f"{name}.b"], self.slopes[f"{name}.g"] = slope.sum(axis=0), (slope * normal).sum(axis=0)
             through = slope - (self.slopes[f"{name}.b"] + normal * self.slopes[f"{name}.g"]) / np.float32(pixels)
             through *= gain * scale
@@ -233,7 +234,7 @@ class _Tape:
         self._undo[name] = undo
         return np.asarray(out, np.float32)
 
-    def back(self, name: str, slope: Array) -> Array:
+    def back(self, name: str, slope: Float32Array) -> Float32Array:
         """The slope by what a layer was given, from that by what came out; its own are kept.
 
         What the layer was given is let go: kept until rubbish is collected, it is hundreds of megabytes a step.
@@ -241,7 +242,7 @@ class _Tape:
         return np.asarray(self._undo.pop(name)(slope), np.float32)
 
 
-def loss_of(said: Array, batch: Batch, weighed: Weighed) -> tuple[float, Array]:
+def loss_of(said: Float32Array, batch: Batch, weighed: Weighed) -> tuple[float, Float32Array]:
     """How wrong what is said is, and the slope of that by it, (n, h / 2, w / 2, 3).
 
     A focal loss: places that are told well count little, and near a car's middle it is no fault to like a place.

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from schemas.arrays import FloatArray
 
 _SHARE_OF_MAXIMUM = 0.25
 _NOISE_SIGMAS = 4.0  # of what already lies outside the range of the background
@@ -30,13 +30,13 @@ class Blobs:
         Mean difference to the background, grey levels; positive: brighter.
     """
 
-    x: Floats
-    y: Floats
-    cxx: Floats
-    cxy: Floats
-    cyy: Floats
-    area: Floats
-    contrast: Floats
+    x: FloatArray
+    y: FloatArray
+    cxx: FloatArray
+    cxy: FloatArray
+    cyy: FloatArray
+    area: FloatArray
+    contrast: FloatArray
 
     def __len__(self) -> int:
         return len(self.x)
@@ -51,25 +51,25 @@ class Blobs:
         return Blobs(*(np.where(where, getattr(other, name), getattr(self, name)) for name in names))
 
     @property
-    def axis_rad(self) -> Floats:
+    def axis_rad(self) -> FloatArray:
         """Long axis, axial, from +x towards +y, [0, pi)."""
         return np.mod(0.5 * np.arctan2(2 * self.cxy, self.cxx - self.cyy), np.pi)
 
     @property
-    def length(self) -> Floats:
+    def length(self) -> FloatArray:
         """Length of the rectangle that has the region's covariance, px."""
         return self._side(+1.0)
 
     @property
-    def width(self) -> Floats:
+    def width(self) -> FloatArray:
         """Width of the rectangle that has the region's covariance, px."""
         return self._side(-1.0)
 
-    def _side(self, sign: float) -> Floats:
+    def _side(self, sign: float) -> FloatArray:
         spread = np.hypot(self.cxx - self.cyy, 2 * self.cxy)
         return np.sqrt(np.maximum(6 * (self.cxx + self.cyy + sign * spread), 0))
 
-    def extent_along(self, angle_rad: Floats) -> Floats:
+    def extent_along(self, angle_rad: FloatArray) -> FloatArray:
         """Side of the rectangle of the region's covariance along a direction, px."""
         c, s = np.cos(angle_rad), np.sin(angle_rad)
         return np.sqrt(np.maximum(12 * (c * c * self.cxx + 2 * c * s * self.cxy + s * s * self.cyy), 0))
@@ -87,8 +87,8 @@ class Pixels:
         Index into the frame's `Blobs`.
     """
 
-    x: Floats
-    y: Floats
+    x: FloatArray
+    y: FloatArray
     region: NDArray[np.int64]
 
 
@@ -148,7 +148,7 @@ def merged(blobs: Blobs, group: NDArray[np.int64], count: int) -> Blobs:
     members = blobs.take(group >= 0)
     which = group[group >= 0]
 
-    def total(values: Floats) -> Floats:
+    def total(values: FloatArray) -> FloatArray:
         return np.asarray(np.bincount(which, weights=values, minlength=count), np.float64)
 
     area = total(members.area)
@@ -169,7 +169,7 @@ def _regions(mask: NDArray[np.bool_], signed: NDArray[np.float32]) -> tuple[Blob
     area = np.bincount(which, minlength=count).astype(np.float64)
     divisor = np.maximum(area, 1)
 
-    def mean(values: Floats) -> Floats:
+    def mean(values: FloatArray) -> FloatArray:
         return np.asarray(np.bincount(which, weights=values, minlength=count) / divisor)
 
     x, y = mean(xs.astype(np.float64)), mean(ys.astype(np.float64))

@@ -10,11 +10,9 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, IntArray
 from velfield.detection.motion.blobs import merged
 from velfield.detection.motion.links import Groups
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 # A car's measures against the usual length: from 9-24 x 4-12 px where a car is 16 px long.
 _LENGTHS = (0.56, 1.5)
@@ -54,23 +52,23 @@ class Bodies:
         Whether the bright part alone is a body.
     """
 
-    x: Floats
-    y: Floats
-    heading_rad: Floats
-    length: Floats
-    width: Floats
-    speed: Floats
-    fill: Floats
-    cxx: Floats
-    cxy: Floats
-    cyy: Floats
+    x: FloatArray
+    y: FloatArray
+    heading_rad: FloatArray
+    length: FloatArray
+    width: FloatArray
+    speed: FloatArray
+    fill: FloatArray
+    cxx: FloatArray
+    cxy: FloatArray
+    cyy: FloatArray
     bright: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.x)
 
     @property
-    def axis_offset_rad(self) -> Floats:
+    def axis_offset_rad(self) -> FloatArray:
         """Angle between the regions' own long axis and the heading, [0, pi/2]."""
         axis = 0.5 * np.arctan2(2 * self.cxy, self.cxx - self.cyy)
         return np.asarray(np.abs(np.mod(axis - self.heading_rad + np.pi / 2, np.pi) - np.pi / 2), np.float64)
@@ -122,7 +120,7 @@ def bodies_of(groups: Groups, *, car_length_px: float) -> Bodies:
     )
 
 
-def shadow_samples(groups: Groups, *, car_length_px: float) -> Floats:
+def shadow_samples(groups: Groups, *, car_length_px: float) -> FloatArray:
     """How each group with a bright body and a dark part reaches beyond that body.
 
     Returns
@@ -142,7 +140,7 @@ def shadow_samples(groups: Groups, *, car_length_px: float) -> Floats:
     return np.stack([heading[both], *reach, (dark.x - bright.x)[both], (dark.y - bright.y)[both]], axis=1)
 
 
-def shadow_vector(samples: Floats) -> Floats:
+def shadow_vector(samples: FloatArray) -> FloatArray:
     """Where a car's shadow lies and how far it reaches beyond the car, px, (2,); zero where the cars do not agree.
 
     Least absolute deviations over what the groups say across their heading, and, with little weight, along it: a
@@ -171,7 +169,7 @@ def shadow_vector(samples: Floats) -> Floats:
     return np.asarray(shadow, np.float64)
 
 
-def without_shadow(bodies: Bodies, shadow: Floats) -> Bodies:
+def without_shadow(bodies: Bodies, shadow: FloatArray) -> Bodies:
     """The rectangles less their shadow: shorter, narrower and moved towards the sun.
 
     Parameters
@@ -220,7 +218,7 @@ def goes_lengthwise(bodies: Bodies) -> NDArray[np.bool_]:
     return np.asarray(oblong & (~bodies.has_axis | (bodies.axis_offset_rad < MAX_AXIS_OFFSET_RAD)), np.bool_)
 
 
-def _ends(groups: Groups, group: Ints, angle: Floats) -> tuple[Floats, Floats]:
+def _ends(groups: Groups, group: IntArray, angle: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Least and greatest coordinate of each group's pixels along its own direction.
 
     Pixel centres, not corners: the half pixel at either end is what blur and threshold have added.

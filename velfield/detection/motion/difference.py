@@ -12,11 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import GreyImage, Mask
 from velfield.errors import InputError
 from velfield.registration.background import median_background
-
-Grey = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 _BLUR_SIGMA_PX = 0.8
 _OFFSET_CELL_PX = 64
@@ -36,7 +34,7 @@ class MotionFrame:
         True time of the frame, s.
     """
 
-    image: Grey
+    image: GreyImage
     valid: Mask
     time_s: float
 
@@ -53,13 +51,13 @@ class MotionBackground:
         Where enough frames stood behind the median.
     """
 
-    median: Grey
-    low: Grey
-    high: Grey
+    median: GreyImage
+    low: GreyImage
+    high: GreyImage
     valid: Mask
 
 
-def background_of(median: Grey, valid: Mask | None = None, *, reach_px: int = 1) -> MotionBackground:
+def background_of(median: GreyImage, valid: Mask | None = None, *, reach_px: int = 1) -> MotionBackground:
     """Background from a median picture that is there already, such as a base image built from the flight.
 
     Parameters
@@ -107,7 +105,7 @@ def motion_background(frames: Sequence[MotionFrame], *, max_frames: int = 15, mi
     return background_of(ranked.median, ranked.count >= min_frames)
 
 
-def signed_motion(image: Grey, valid: Mask, background: MotionBackground) -> NDArray[np.float32]:
+def signed_motion(image: GreyImage, valid: Mask, background: MotionBackground) -> NDArray[np.float32]:
     """How far a registered frame is above (+) or below (-) the background's range, grey levels, blurred by 0.8 px.
 
     The sign tells a bright car from its own shadow, which is never brighter than the road.
@@ -131,12 +129,12 @@ def signed_motion(image: Grey, valid: Mask, background: MotionBackground) -> NDA
     return np.where(known, blurred, np.float32(0))
 
 
-def motion_difference(image: Grey, valid: Mask, background: MotionBackground) -> NDArray[np.float32]:
+def motion_difference(image: GreyImage, valid: Mask, background: MotionBackground) -> NDArray[np.float32]:
     """Distance of a registered frame outside the background's range, grey levels: the size of `signed_motion`."""
     return np.abs(signed_motion(image, valid, background))
 
 
-def noise_sigma(image: Grey, valid: Mask, background: MotionBackground) -> float:
+def noise_sigma(image: GreyImage, valid: Mask, background: MotionBackground) -> float:
     """Standard deviation of frame minus background by the median absolute deviation, grey levels."""
     known = valid & background.valid
     if not known.any():

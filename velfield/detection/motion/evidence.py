@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from schemas.arrays import FloatArray, GreyImage, IntArray
 from schemas.flight import DetectionConfig, TrackingConfig
 from velfield.detection.detect import detect_frame
 from velfield.detection.detector import Detector
@@ -22,10 +23,6 @@ from velfield.detection.motion.boxes import MAX_AXIS_OFFSET_RAD
 from velfield.detection.motion.difference import MotionFrame
 from velfield.detection.motion.links import MAX_LENGTHS_PER_S
 from velfield.parallel import each
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Grey = NDArray[np.uint8]
 
 LEAST_SCORE = -0.3
 """Detections below this are noise whatever the detector."""
@@ -65,9 +62,9 @@ class Found:
     time_s : float
     """
 
-    xy: Floats
-    orientation_rad: Floats
-    score: Floats
+    xy: FloatArray
+    orientation_rad: FloatArray
+    score: FloatArray
     time_s: float
 
 
@@ -90,11 +87,11 @@ class MotionEvidence:
         Scores of what stands.
     """
 
-    threshold: Floats
-    precision: Floats
-    recall: Floats
+    threshold: FloatArray
+    precision: FloatArray
+    recall: FloatArray
     chosen: float
-    standing: Floats
+    standing: FloatArray
 
     @property
     def at(self) -> int:
@@ -156,7 +153,7 @@ def conduct_of_bursts(
     return middles, [conduct(*frames[k - 1 : k + 2], car_length_px=car_length_px) for k in middles]
 
 
-def neighbours(times_s: Sequence[float], wanted: int, max_interval_s: float = _MAX_INTERVAL_S) -> Ints:
+def neighbours(times_s: Sequence[float], wanted: int, max_interval_s: float = _MAX_INTERVAL_S) -> IntArray:
     """Frames, by their place, of up to ``wanted`` bursts of three neighbours in time, spread evenly.
 
     Frames farther apart than ``max_interval_s`` are none.
@@ -209,7 +206,7 @@ def evidence_from_motion(
 def evidence_of(
     detector: Detector,
     frames: Sequence[MotionFrame],
-    background: Grey | None,
+    background: GreyImage | None,
     config: DetectionConfig,
     *,
     least_score: float = LEAST_SCORE,
@@ -242,9 +239,9 @@ def evidence_of(
 
 def _neighbours(
     before: Found, middle: Found, after: Found, first_s: float, second_s: float, car_length_px: float
-) -> list[tuple[Ints, Ints]]:
+) -> list[tuple[IntArray, IntArray]]:
     """Of each detection of the middle frame, those before and after that a car could have come from or gone to."""
-    near: list[list[Ints]] = []
+    near: list[list[IntArray]] = []
     for other, interval in ((before, first_s), (after, second_s)):
         radius = MAX_LENGTHS_PER_S * interval * car_length_px
         tree = KDTree(other.xy.reshape(-1, 2))

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, IntArray
 from schemas.flight import DetectionConfig, TrackingConfig
 from velfield.detection.motion.blobs import Blobs
 from velfield.detection.motion.boxes import (
@@ -48,8 +48,6 @@ __all__ = [
     "working_scale",
 ]
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 MIN_LABELS, MIN_VEHICLES = 30, 5
 """Fewer labels, or labels of fewer vehicles, do not train a detector."""
@@ -79,10 +77,10 @@ class FrameLabels:
         Whether the frame had a neighbour on either side, so that its cars could be confirmed.
     """
 
-    cars: Floats
-    heading_rad: Floats
-    speed_px_per_s: Floats
-    ignore: Floats
+    cars: FloatArray
+    heading_rad: FloatArray
+    speed_px_per_s: FloatArray
+    ignore: FloatArray
     labelled: bool
 
 
@@ -118,7 +116,7 @@ class MotionLabels:
     purity: float
     coherence: float
     car_length_px: float
-    shadow_px: Floats
+    shadow_px: FloatArray
     usable: bool
     warnings: tuple[str, ...]
 
@@ -173,7 +171,7 @@ def labels_from_motion(
     return _judged(labels, triplets, count_decoys(regions, times, middles, shadow, length), times, shadow, length)
 
 
-def choose_frames(times_s: Floats, *, bursts: int = 16, all_below: int = 48) -> Ints:
+def choose_frames(times_s: FloatArray, *, bursts: int = 16, all_below: int = 48) -> IntArray:
     """Frames to take labels from: all of a short flight, else bursts of three spread evenly over it.
 
     Parameters
@@ -226,7 +224,7 @@ def working_scale(
     return config.working_car_length_px * labels_scale / labels.car_length_px
 
 
-def _frame_labels(triplet: Triplet, blobs: Blobs, shadow: Floats, length: float) -> FrameLabels:
+def _frame_labels(triplet: Triplet, blobs: Blobs, shadow: FloatArray, length: float) -> FrameLabels:
     """Confirmed cars of a frame, and circles over all else that differs."""
     bodies = without_shadow(triplet.bodies, shadow)
     confirmed = of_car_size(bodies, car_length_px=length) & goes_lengthwise(bodies)
@@ -247,7 +245,7 @@ def _unlabelled(blobs: Blobs, length: float) -> FrameLabels:
     return FrameLabels(np.empty((0, 5)), empty, empty, circles, False)
 
 
-def _circles(x: Floats, y: Floats, axis: Floats, length: Floats, width: Floats) -> Floats:
+def _circles(x: FloatArray, y: FloatArray, axis: FloatArray, length: FloatArray, width: FloatArray) -> FloatArray:
     """Circles that cover rectangles: one for a square, a row of them for a bus."""
     number = np.maximum(1, np.ceil(length / np.maximum(width, 2.0))).astype(np.int64)
     which = np.repeat(np.arange(len(x)), number)
@@ -257,7 +255,7 @@ def _circles(x: Floats, y: Floats, axis: Floats, length: Floats, width: Floats) 
     return np.stack([x[which] + np.cos(axis[which]) * along, y[which] + np.sin(axis[which]) * along, radius], axis=1)
 
 
-def _away_from(circles: Floats, cars: Floats, length: float) -> Floats:
+def _away_from(circles: FloatArray, cars: FloatArray, length: float) -> FloatArray:
     """Circles that are not a confirmed car's own odds and ends."""
     if not len(cars) or not len(circles):
         return circles
@@ -266,7 +264,12 @@ def _away_from(circles: Floats, cars: Floats, length: float) -> Floats:
 
 
 def _judged(
-    labels: list[FrameLabels], triplets: list[Triplet], decoys: int, times: Floats, shadow: Floats, length: float
+    labels: list[FrameLabels],
+    triplets: list[Triplet],
+    decoys: int,
+    times: FloatArray,
+    shadow: FloatArray,
+    length: float,
 ) -> MotionLabels:
     """The labels with their purity, coherence and what stands against them."""
     sized = [_sized(triplet, shadow, length) for triplet in triplets]
@@ -288,12 +291,12 @@ def _nothing(n: int) -> MotionLabels:
     return MotionLabels((empty,) * n, 0, 0, 0.0, 0.0, float("nan"), np.zeros(2), False, (_objection(0, 0, 0.0, 0.0),))
 
 
-def _sized(triplet: Triplet, shadow: Floats, length: float) -> Bodies:
+def _sized(triplet: Triplet, shadow: FloatArray, length: float) -> Bodies:
     bodies = without_shadow(triplet.bodies, shadow)
     return bodies.take(of_car_size(bodies, car_length_px=length))
 
 
-def _vehicles(labels: list[FrameLabels], times: Floats, length: float) -> int:
+def _vehicles(labels: list[FrameLabels], times: FloatArray, length: float) -> int:
     """Labels that no label of the frame before foretold: first sights."""
     first = 0
     for k, part in enumerate(labels):

@@ -8,10 +8,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from schemas.arrays import FloatArray, IntArray
 from velfield.detection.motion.blobs import Blobs, Pixels
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 MAX_LENGTHS_PER_S = 34.5 / 4.0
 """The paper's 78 mph in car lengths of 4 m: a speed limit that needs no ground sample distance."""
@@ -37,7 +35,7 @@ class Links:
     """
 
     linked: NDArray[np.bool_]
-    velocity: Floats
+    velocity: FloatArray
 
 
 @dataclass(frozen=True)
@@ -56,11 +54,11 @@ class Groups:
     blobs: Blobs
     pixels: Pixels
     links: Links
-    group: Ints
+    group: IntArray
     count: int
 
     @property
-    def velocity(self) -> Floats:
+    def velocity(self) -> FloatArray:
         """Mean velocity of each group, weighted by area, px/s, (count, 2)."""
         inside = self.group >= 0
         which, area = self.group[inside], self.blobs.area[inside]
@@ -70,12 +68,12 @@ class Groups:
         return np.asarray(np.stack(sums, axis=1) / np.maximum(whole, 1e-9)[:, None], np.float64)
 
     @property
-    def bright(self) -> Ints:
+    def bright(self) -> IntArray:
         """Group of each region that is brighter than the background, -1 for the others."""
         return np.where(self.blobs.contrast > 0, self.group, -1)
 
     @property
-    def dark(self) -> Ints:
+    def dark(self) -> IntArray:
         """Group of each region that is darker than the background, -1 for the others."""
         return np.where(self.blobs.contrast < 0, self.group, -1)
 
@@ -156,11 +154,11 @@ def group_linked(blobs: Blobs, pixels: Pixels, links: Links, *, interval_s: floa
     return Groups(blobs, pixels, links, group, int(count))
 
 
-def _xy(blobs: Blobs) -> Floats:
+def _xy(blobs: Blobs) -> FloatArray:
     return np.stack([blobs.x, blobs.y], axis=1)
 
 
-def _candidates(middle: Blobs, other: Blobs, radius: float) -> tuple[Ints, Ints]:
+def _candidates(middle: Blobs, other: Blobs, radius: float) -> tuple[IntArray, IntArray]:
     """Pairs (index in middle, index in other) within a radius, of one sign and like area."""
     if not len(middle) or not len(other):
         return np.empty(0, np.int64), np.empty(0, np.int64)
@@ -171,7 +169,7 @@ def _candidates(middle: Blobs, other: Blobs, radius: float) -> tuple[Ints, Ints]
     return i[like], j[like]
 
 
-def _pairs_of_equal(left: Ints, right: Ints, n: int) -> tuple[Ints, Ints]:
+def _pairs_of_equal(left: IntArray, right: IntArray, n: int) -> tuple[IntArray, IntArray]:
     """All pairs of positions (p, q) with left[p] == right[q]."""
     order = np.argsort(right, kind="stable")
     starts = np.searchsorted(right[order], np.arange(n + 1))
@@ -181,7 +179,7 @@ def _pairs_of_equal(left: Ints, right: Ints, n: int) -> tuple[Ints, Ints]:
     return p, order[np.repeat(starts[left], counts) + within] if len(p) else p
 
 
-def _gaps(a: Blobs, b: Blobs, heading: Floats) -> tuple[Floats, Floats]:
+def _gaps(a: Blobs, b: Blobs, heading: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Gaps between rectangles that lie along the heading: along it and across it, px; negative where they overlap."""
     dx, dy = b.x - a.x, b.y - a.y
     c, s = np.cos(heading), np.sin(heading)

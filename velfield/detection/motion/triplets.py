@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, IntArray
 from velfield.detection.motion.blobs import Blobs, Pixels, find_blobs
 from velfield.detection.motion.boxes import (
     Bodies,
@@ -20,8 +21,6 @@ from velfield.detection.motion.boxes import (
 from velfield.detection.motion.difference import MotionBackground, MotionFrame, noise_sigma, signed_motion
 from velfield.detection.motion.links import Links, group_linked, link_three
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Regions = tuple[Blobs, Pixels]
 
 _GUESSES_PX = np.geomspace(6.0, 60.0, 9)
@@ -36,7 +35,7 @@ class Triplet:
     middle: int
     bodies: Bodies
     links: Links
-    shadows: Floats
+    shadows: FloatArray
 
 
 class Differences:
@@ -61,7 +60,7 @@ class Differences:
         return find_blobs(signed, noise=noise, car_length_px=car_length_px / shrink)
 
 
-def estimate_car_length(signed: Differences, times: Floats, max_interval_s: float) -> float:
+def estimate_car_length(signed: Differences, times: FloatArray, max_interval_s: float) -> float:
     """Length at which most things are confirmed and are themselves of that length, px; NaN where nothing is.
 
     Each guess sets speed limit, tolerances and sizes; the guess that agrees best with what it finds is refined by it.
@@ -81,7 +80,7 @@ def estimate_car_length(signed: Differences, times: Floats, max_interval_s: floa
     return length
 
 
-def _confirmed_lengths(signed: Differences, times: Floats, middles: Ints, car_length_px: float) -> Floats:
+def _confirmed_lengths(signed: Differences, times: FloatArray, middles: IntArray, car_length_px: float) -> FloatArray:
     """Lengths of the things that one guess confirms; a large guess is tried on a coarser grid, which is quicker."""
     shrink = max(1, int(car_length_px / _COARSE_LENGTH_PX))
     indices = np.unique(middles[:, None] + np.array([-1, 0, 1]))
@@ -93,7 +92,7 @@ def _confirmed_lengths(signed: Differences, times: Floats, middles: Ints, car_le
     return np.concatenate(lengths) * shrink
 
 
-def middles_of(times: Floats, max_interval_s: float) -> Ints:
+def middles_of(times: FloatArray, max_interval_s: float) -> IntArray:
     """Frames that have a neighbour on either side."""
     near = np.diff(times) <= max_interval_s
     return np.flatnonzero(near[:-1] & near[1:]) + 1
@@ -101,7 +100,7 @@ def middles_of(times: Floats, max_interval_s: float) -> Ints:
 
 def triplet_of(
     regions: Sequence[Regions] | dict[int, Regions],
-    times: Floats,
+    times: FloatArray,
     order: tuple[int, int, int],
     car_length_px: float,
     intervals_s: tuple[float, float] | None = None,
@@ -121,7 +120,9 @@ def cars_of(bodies: Bodies, car_length_px: float) -> Bodies:
     return bodies.take(of_car_size(bodies, car_length_px=car_length_px) & goes_lengthwise(bodies))
 
 
-def count_decoys(regions: Sequence[Regions], times: Floats, middles: Ints, shadow: Floats, length: float) -> int:
+def count_decoys(
+    regions: Sequence[Regions], times: FloatArray, middles: IntArray, shadow: FloatArray, length: float
+) -> int:
     """Cars confirmed when frames are linked in an order that no vehicle can follow: later, earlier, between."""
     found = 0
     for k in middles:

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from schemas.detector import DetectorRecord
 from schemas.flight import DetectionConfig
 from velfield.detection.boosting import RectanglePool, bin_edges, binned, boost, random_pool, rounds_of
@@ -18,7 +19,6 @@ from velfield.detection.paper.segmentation import moments, segment_response
 if TYPE_CHECKING:
     from velfield.detection.samples import LabelledImage
 
-Floats = NDArray[np.float64]
 _REACH_PX = 40
 _MAX_CAR_SAMPLES = 4000
 _QUANTILE = 0.2
@@ -31,7 +31,7 @@ def find_cars_densely(
     detector: Detector,
     config: DetectionConfig,
     threshold: float,
-) -> tuple[Floats, Floats]:
+) -> tuple[FloatArray, FloatArray]:
     """Cars (n, 5) as x, y, axis, score, axis' standard deviation; and areas (n,), working px."""
     response = dense_response(image, detector.sums, grey_bits=detector.record.grey_bits)
     if valid is not None:

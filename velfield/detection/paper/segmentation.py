@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.segmentation import watershed
 
-Floats = NDArray[np.float64]
+from schemas.arrays import FloatArray
 
 
 def segment_response(
@@ -28,7 +28,7 @@ def segment_response(
     return smooth, labels
 
 
-def moments(labels: NDArray[np.int32], smooth: NDArray[np.float32]) -> Floats:
+def moments(labels: NDArray[np.int32], smooth: NDArray[np.float32]) -> FloatArray:
     """Place, axis and peak of each region.
 
     Returns

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from velfield.exports.cog import write_cog
 from velfield.field.bins import standing_px_per_s
 from velfield.field.statistics import direction_rad, speed_px_per_s
@@ -21,7 +22,6 @@ from velfield.run.stores import open_field
 from velfield.sources.images import read_picture_grey
 from velfield.viewer.record import write_view_data
 
-Layer = NDArray[np.float64]
 PREVIEW_SIDE_PX = 900
 
 
@@ -60,7 +60,7 @@ def read_base_image(plan: Plan) -> NDArray[np.uint8]:
         return read_picture_grey(here, plan.config.frames.max_pixels)
 
 
-def _layers(plan: Plan, direction: Layer, speed: Layer) -> list[Path]:
+def _layers(plan: Plan, direction: FloatArray, speed: FloatArray) -> list[Path]:
     """Direction as heading and speed as GeoTIFF, each value with its unit."""
     grid, maps = read_grid(plan.layout), plan.layout.maps
     north = north_of(grid)

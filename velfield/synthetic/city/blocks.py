@@ -6,11 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from schemas.simulation import SceneSimulation
 from velfield.synthetic.city import city_plan as p
 from velfield.synthetic.city.ground import GRASS, GRAVEL, OLD_ASPHALT, PAVEMENT, SOIL, Canvas, Tone, toned
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass

@@ -7,17 +7,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, GreyImage
 from schemas.simulation import SimulationConfig
 from velfield.synthetic.city.city_plan import Plan, make_plan
 from velfield.synthetic.city.ground import Canvas, light_map, reach_map, shade, texture
 from velfield.synthetic.city.streets import paint_city
 from velfield.synthetic.other_sensor import Standing, other_sensor_image
-from velfield.synthetic.render import MOSAIC_SCALE, Grey, Scene
+from velfield.synthetic.render import MOSAIC_SCALE, Scene
 from velfield.synthetic.seeds import Matter, stream
 from velfield.synthetic.traffic.traffic import Traffic, VehicleKinds, draw_kinds, simulate_traffic
 from velfield.synthetic.traffic.vehicles import draw_tones
-
-FloatArray = NDArray[np.float64]
 
 WORLD_MARGIN_M = 45.0
 """Traffic starts this far outside of what any frame shows."""
@@ -109,7 +108,7 @@ class City:
         return Scene(mosaic, *self._heights, np.array([-float(PAD_PX)] * 2), self._step_px)
 
     @cached_property
-    def base_image(self) -> Grey:
+    def base_image(self) -> GreyImage:
         """The base image, uint8 (base_shape): orthographic, by the other sensor, without the traffic."""
         c = self.config
         same = c.base.same_sensor
@@ -140,7 +139,7 @@ class City:
         return canvas, paint_city(canvas, self.plan, self.config.scene, self._rng(Matter.PAINT))
 
     @cached_property
-    def _tones(self) -> tuple[Grey, Grey]:
+    def _tones(self) -> tuple[GreyImage, GreyImage]:
         shift = self.config.base.vegetation_shift_grey
         paint, rng = self._painted[0].paint, self._rng(Matter.GRAIN)
         return texture(paint, strength=self.config.scene.texture, vegetation_shift=shift, rng=rng)
@@ -150,7 +149,7 @@ class City:
         return HEIGHT_STEP_M / self.config.gsd_m
 
     @cached_property
-    def _heights(self) -> tuple[Grey, Grey]:
+    def _heights(self) -> tuple[GreyImage, GreyImage]:
         """Height map in steps of HEIGHT_STEP_M, and its reach map."""
         height = np.clip(np.rint(self._painted[0].height_m / HEIGHT_STEP_M), 0, 255).astype(np.uint8)
         lean = max(self._lean, self.config.scene.sun_length, self.config.base.sun_length)

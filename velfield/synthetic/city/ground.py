@@ -11,9 +11,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from velfield.synthetic.render import MOSAIC_SCALE, REACH_CELL, SHADE, Grey
+from schemas.arrays import FloatArray, GreyImage
+from velfield.synthetic.render import MOSAIC_SCALE, REACH_CELL, SHADE
 
-FloatArray = NDArray[np.float64]
 Tone = tuple[int, int, int, int]
 
 NOON = 1.22
@@ -100,13 +100,15 @@ class Canvas:
 class Ground:
     """The painted city. ``camera`` and ``other`` uint8 mosaics without blur, ``height`` uint8 and its step, m."""
 
-    camera: Grey
-    other: Grey
-    height: Grey
+    camera: GreyImage
+    other: GreyImage
+    height: GreyImage
     height_step_m: float
 
 
-def texture(paint: Grey, *, strength: float, vegetation_shift: float, rng: np.random.Generator) -> tuple[Grey, Grey]:
+def texture(
+    paint: GreyImage, *, strength: float, vegetation_shift: float, rng: np.random.Generator
+) -> tuple[GreyImage, GreyImage]:
     """Tones of the two sensors: paint plus grain and patches as each surface shows them (in strips, to save memory).
 
     ``vegetation_shift``: how much lighter the other sensor sees what is green, known by its patches.
@@ -144,7 +146,7 @@ def _octave(noise: NDArray[np.float32], cell: int, y0: int, y1: int, width: int)
     return out
 
 
-def reach_map(height: Grey, lean: float, step_px: float) -> Grey:
+def reach_map(height: GreyImage, lean: float, step_px: float) -> GreyImage:
     """Greatest height within a ray's reach, for cells of REACH_CELL base px; ``lean`` the steepest ray, px a px."""
     h, w = height.shape
     ny, nx = -(-h // REACH_CELL), -(-w // REACH_CELL)
@@ -160,7 +162,7 @@ def reach_map(height: Grey, lean: float, step_px: float) -> Grey:
     return np.asarray(reach)
 
 
-def light_map(height: Grey, reach: Grey, *, step_px: float, direction: FloatArray) -> NDArray[np.float32]:
+def light_map(height: GreyImage, reach: GreyImage, *, step_px: float, direction: FloatArray) -> NDArray[np.float32]:
     """Share of the light that reaches the ground (base resolution); ``direction`` (2,): shadow px a px of height."""
     sunny = np.ones(height.shape, np.float32)
     if direction.any() and height.any():
@@ -169,7 +171,7 @@ def light_map(height: Grey, reach: Grey, *, step_px: float, direction: FloatArra
     return np.asarray(NOON * (SHADE + (1 - SHADE) * sunny), dtype=np.float32)
 
 
-def shade(tone: Grey, light: NDArray[np.float32]) -> Grey:
+def shade(tone: GreyImage, light: NDArray[np.float32]) -> GreyImage:
     """``tone`` under a light map."""
     enlarged = cv2.resize(light, (tone.shape[1], tone.shape[0]), interpolation=cv2.INTER_LINEAR)
     return np.asarray(cv2.multiply(tone, enlarged, dtype=cv2.CV_8U))

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from schemas.arrays import FloatArray
 
 GRID_PX = 16.0
 """Spacing of the relief's grid, base px."""

@@ -9,10 +9,10 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-FloatArray = NDArray[np.float64]
+from schemas.arrays import FloatArray
+
 EdgeKind = Literal["avenue", "street", "box", "turn", "ring", "aisle"]
 
 STEP_M = 0.5

@@ -1,8 +1,8 @@
 """Paints the plan: roads, then what lies beside them, then what stands there."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from schemas.simulation import SceneSimulation
 from velfield.synthetic.city import city_plan as p
 from velfield.synthetic.city.blocks import Free, box, paint_fields, put_buildings, put_tree, put_trees, turned_box
@@ -17,8 +17,6 @@ from velfield.synthetic.city.ground import (
     toned,
 )
 from velfield.synthetic.city.road_network import STEP_M
-
-FloatArray = NDArray[np.float64]
 
 FAR = 260.0
 """Avenues are painted this far beyond the plan's rectangle, m."""

@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+
+from schemas.arrays import FloatArray, IntArray
 
 ACCELERATION, BRAKING, LEAST_GAP = 2.2, 2.4, 1.8
 """m/s^2, m/s^2, m: the driver model's a, b, s0."""
@@ -20,26 +21,23 @@ MERGE_AHEAD_M = 70.0
 PATIENCE_S = 18.0
 FAR = 1e9
 
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
-
 
 class Roads(NamedTuple):
     """The network as arrays, one row an edge; lists of lists are ``*_first`` (rows + 1) and the values between."""
 
-    length: Floats
-    limit: Floats
-    end: Ints  # node
-    signal: Ints  # group of lights at the end, -1: none
-    yields: Ints  # 1: gives way at its end
-    clear_end: Floats  # how far along it is still clear of the paths it joins
-    sibling_first: Ints
-    sibling: Ints  # edges that leave the same node
-    sibling_clear: Floats  # how far along the sibling a tail no longer stands in this edge's way
-    merges: Ints  # 1: several edges reach this edge's end
-    boxes_first: Ints  # groups of lights + 1
-    boxes: Ints  # the edges each group lets cars onto
-    offsets: Floats  # of the signals, one a crossing
+    length: FloatArray
+    limit: FloatArray
+    end: IntArray  # node
+    signal: IntArray  # group of lights at the end, -1: none
+    yields: IntArray  # 1: gives way at its end
+    clear_end: FloatArray  # how far along it is still clear of the paths it joins
+    sibling_first: IntArray
+    sibling: IntArray  # edges that leave the same node
+    sibling_clear: FloatArray  # how far along the sibling a tail no longer stands in this edge's way
+    merges: IntArray  # 1: several edges reach this edge's end
+    boxes_first: IntArray  # groups of lights + 1
+    boxes: IntArray  # the edges each group lets cars onto
+    offsets: FloatArray  # of the signals, one a crossing
     cycle_s: float
     all_red_s: float
 
@@ -47,16 +45,16 @@ class Roads(NamedTuple):
 class Cars(NamedTuple):
     """The state of all cars that ever drive; ``route[route_first[i] + hop[i]]`` is the edge of car i."""
 
-    s: Floats
-    v: Floats
-    hop: Ints
-    commit: Ints  # the node whose gap has been accepted, -1: none
-    wait: Floats  # how long it has stood, s
-    length: Floats
-    wanted: Floats
-    headway: Floats
-    route: Ints
-    route_first: Ints
+    s: FloatArray
+    v: FloatArray
+    hop: IntArray
+    commit: IntArray  # the node whose gap has been accepted, -1: none
+    wait: FloatArray  # how long it has stood, s
+    length: FloatArray
+    wanted: FloatArray
+    headway: FloatArray
+    route: IntArray
+    route_first: IntArray
 
 
 @njit(cache=True, nogil=True)

@@ -11,12 +11,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, IntArray
 from schemas.simulation import TrafficSimulation
 from velfield.synthetic.city.road_network import Network, clear_until_m
 from velfield.synthetic.traffic.driving import Cars, Roads, advance, enter
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 STEP_S = 0.1
 MAX_HOPS = 60

@@ -1,9 +1,8 @@
 """What vehicles look like from above: stacked layers, so that roofs lean with the view and windows show between."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from schemas.arrays import FloatArray
 
 BODY, GLASS, SIDE, SECOND, DARK = 0.0, 1.0, 2.0, 3.0, 4.0
 """Which of a vehicle's tones a layer has."""
