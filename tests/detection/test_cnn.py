@@ -9,7 +9,7 @@ from scipy.signal import correlate
 
 from schemas.arrays import FloatArray
 from schemas.flight import DetectionConfig
-from tools.shipped_detector import simulated
+from velfield.bench.scenes import simulated_image
 from velfield.detection.cnn.convolution import Layout, convolved, gathered, handed_back, spread
 from velfield.detection.cnn.dataset import Pieces
 from velfield.detection.cnn.fine_tuning import evidence_of_network, train_on
@@ -88,7 +88,7 @@ def test_slopes_are_what_small_changes_make_of_the_loss(normalised: bool) -> Non
 
 @cache
 def city(seed: int) -> LabelledImage:
-    return simulated(seed)
+    return simulated_image(seed)
 
 
 def shipped() -> Network:

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray
-from tools.shipped_detector import LORRY_SEEDS, LORRY_SEEDS_LEFT_OUT, simulated
+from tools.shipped_detector import LORRY_SEEDS, LORRY_SEEDS_LEFT_OUT
 from velfield.detection.cascade.classifier import moved
 from velfield.detection.cascade.feature_image import Picture, picture_of
 from velfield.detection.cascade.long_vehicles import LONG, OFFSETS, LongVehicles, shipped_long_vehicles
@@ -20,7 +20,7 @@ assert SEED not in LORRY_SEEDS_LEFT_OUT
 
 @cache
 def city() -> LabelledImage:
-    return simulated(SEED, (1280, 960), 0.5)
+    return simulated_image(SEED, (1280, 960), 0.5)
 
 
 def rows(xy: FloatArray, axes: FloatArray) -> FloatArray:
@@ -50,7 +50,7 @@ def test_a_lorry_found_at_its_load_or_cab_is_told_at_its_middle(off_px: float) -
 
 
 def test_cars_stay_where_they_were_found() -> None:
-    plain = simulated(SEED + 1, (960, 720))
+    plain = simulated_image(SEED + 1, (960, 720))
     cars = plain.cars[plain.cars[:, 3] < 22]
     assert len(cars) >= 30
     found = rows(cars[:, :2], cars[:, 2])
