@@ -12,7 +12,7 @@ from schemas.flight import FramesConfig
 from tests.media import drifting, flip_bytes, ground, write_pictures, write_times, write_video
 from velfield.errors import InputError
 from velfield.sources.flags import UNUSABLE, FrameFlag, describe_flags
-from velfield.sources.quality import flag_blurred, flag_foreign, frame_quality
+from velfield.sources.quality import flag_blurred, flag_outlier_frames, frame_quality
 from velfield.sources.source import iter_frames, probe
 
 ALL = FramesConfig()
@@ -134,7 +134,7 @@ def test_a_png_with_flipped_bytes_is_flagged(tmp_path, frames):
     assert [bool(frame.flags & FrameFlag.UNREADABLE) for frame in read] == [True, False, False]
 
 
-def test_missing_duplicate_black_blurred_and_foreign_frames_are_flagged(tmp_path, frames):
+def test_missing_duplicate_black_blurred_and_outlier_frames_are_flagged(tmp_path, frames):
     import cv2
 
     sequence = [frame.copy() for frame in frames[:9]]
@@ -151,7 +151,7 @@ def test_missing_duplicate_black_blurred_and_foreign_frames_are_flagged(tmp_path
     assert [describe_flags(frame.flags) for frame in read[:5]] == ["", "", "duplicate", "black", ""]
     quality = [frame_quality(frame.grey) for frame in [*read, *read[4:5]]]
     assert np.flatnonzero(flag_blurred(np.array([q.sharpness for q in quality]))).tolist() == [3, 5]
-    assert np.flatnonzero(flag_foreign(np.array([q.thumbnail for q in quality]))).tolist() == [3, 7]
+    assert np.flatnonzero(flag_outlier_frames(np.array([q.thumbnail for q in quality]))).tolist() == [3, 7]
 
 
 def test_a_flight_cut_into_units_finds_the_same_duplicates(tmp_path, frames):

@@ -1,10 +1,10 @@
-"""What can be wrong with a frame, as bits of one number, so that a row of ``frames.zarr`` holds it."""
+"""Defects of a frame as the bits of one integer, a column of ``frames.zarr``."""
 
 from enum import IntFlag
 
 
 class FrameFlag(IntFlag):
-    """Why a frame is not to be trusted; 0 where nothing is known against it.
+    """Why a frame is not to be trusted; 0 where no defect is known.
 
     Examples
     --------
@@ -13,16 +13,16 @@ class FrameFlag(IntFlag):
     """
 
     SUSPECT = 1
-    """The bitstream was damaged here or since the last key frame: the picture may be wrong."""
+    """The bitstream was damaged here or since the last key frame: the image may be wrong."""
     UNREADABLE = 2
-    """No picture could be read; what stands in its place is zeros."""
+    """No image could be read; its pixels are zeros."""
     DUPLICATE = 4
-    """The same picture as the frame before, or the same time: between the two nothing moved or nothing can be said."""
+    """The same image as the frame before, or the same time: no motion can be measured between the two."""
     BLACK = 8
     """Black, or without any detail."""
     BLURRED = 16
     """Far less sharp than its neighbours. Advice only: registration decides."""
-    FOREIGN = 32
+    OUTLIER = 32
     """Unlike its neighbours, which are like each other. Advice only: registration decides."""
 
 
@@ -31,7 +31,7 @@ UNUSABLE = FrameFlag.SUSPECT | FrameFlag.UNREADABLE | FrameFlag.DUPLICATE | Fram
 
 
 def describe_flags(flags: int) -> str:
-    """Name the bits that are set, for people.
+    """Names of the bits that are set.
 
     Examples
     --------
