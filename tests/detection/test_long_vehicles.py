@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray
 from tools.shipped_detector import LORRY_SEEDS, LORRY_SEEDS_LEFT_OUT
+from velfield.bench.scenes import simulated_image
 from velfield.detection.cascade.classifier import moved
 from velfield.detection.cascade.feature_image import Picture, picture_of
 from velfield.detection.cascade.long_vehicles import LONG, OFFSETS, LongVehicles, shipped_long_vehicles
