@@ -7,7 +7,7 @@ export UV_LINK_MODE := copy
 # Where this is set, every process of ours compiles all that it imports anew: 12 s each for Prefect.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test lint types check format env lock bench detector soak clean
+.PHONY: demo test page docs lint types check format env lock bench detector soak clean
 
 demo: page  ## simulate a flight, run the whole job, say where the report is
 	$(BIN)/velfield demo --out demo

