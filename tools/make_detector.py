@@ -17,5 +17,5 @@ if __name__ == "__main__":
     from tools.shipped_detector import ship, ship_long_vehicles
 
     data, folder = Path(sys.argv[1]), Path(velfield.detection.__path__[0])
-    print(ship_long_vehicles(data, folder / "shipped_long_vehicles.json"))
+    print(ship_long_vehicles(data, folder / "cascade" / "shipped_long_vehicles.json"))
     print("\n".join(ship(data, folder / "shipped_detector.json")))

@@ -74,6 +74,6 @@ class LongVehicles:
 @cache
 def shipped_long_vehicles() -> LongVehicles:
     """The classifier that comes with velfield."""
-    data = files("velfield.detection").joinpath("shipped_long_vehicles.json").read_bytes()
+    data = files("velfield.detection.cascade").joinpath("shipped_long_vehicles.json").read_bytes()
     record = LongVehicleRecord.model_validate_json(data)
     return LongVehicles(record, sums_of(record.rounds))
