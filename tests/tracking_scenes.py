@@ -1,7 +1,7 @@
-"""Traffic with a name, for tests of tracking: cars drawn on a road, seen by a detector that jitters, misses and
-raises false alarms.
+"""Named traffic scenes for tests of tracking: cars drawn on a road, and a detector with jitter, misses and false
+alarms.
 
-Pictures are drawn in working pixels (one a base pixel), a car 16 x 8 px. Every scene is a list of `Car`; `watch`
+Images are drawn in working pixels (one a base pixel), a car 16 x 8 px. Every scene is a list of `Car`; `watch`
 turns it into frame tables and the truth: which car each detection shows (-1: none).
 """
 
@@ -17,14 +17,15 @@ from schemas.arrays import FloatArray
 from velfield.tracking.windows import FrameTable
 
 OVERSAMPLING = 4
-CHIP = 32
+CROP_PX = 32
 
 
 @dataclass(frozen=True)
 class Car:
-    """A car: its place (x, y) px at a time s, and its looks (greys of body, glass, bonnet line; length, width px)."""
+    """A car: its position (x, y) px at a time s, and its appearance (greys of body, glass, bonnet line; length, width
+    px)."""
 
-    place: Callable[[float], tuple[float, float]]
+    position: Callable[[float], tuple[float, float]]
     heading: Callable[[float], float]
     body: float
     glass: float
@@ -35,7 +36,7 @@ class Car:
 
 @dataclass(frozen=True)
 class Detector:
-    """How well the detector sees; the defaults are those of the real one."""
+    """Errors of the detector; the defaults are those of the real one."""
 
     jitter_px: float = 0.7
     axis_sd_rad: float = 0.07
@@ -50,25 +51,27 @@ class Watched:
 
     tables: list[FrameTable]
     car_of: dict[int, int] = field(default_factory=dict)
-    place_of: dict[int, tuple[float, float]] = field(default_factory=dict)
+    position_of: dict[int, tuple[float, float]] = field(default_factory=dict)
 
 
 def car(
-    rng: np.random.Generator, start: tuple[float, float], velocity: tuple[float, float], *, alike: float = 0.0
+    rng: np.random.Generator, start: tuple[float, float], velocity: tuple[float, float], *, similarity: float = 0.0
 ) -> Car:
-    """A car at constant velocity, its looks at random; ``alike`` = 1: all cars look the same."""
+    """A car at constant velocity, its appearance random; ``similarity`` = 1: all cars are identical."""
     heading = float(np.arctan2(velocity[1], velocity[0])) if np.hypot(*velocity) else float(rng.choice([0.0, np.pi]))
     return Car(
-        lambda t: (start[0] + velocity[0] * t, start[1] + velocity[1] * t), lambda t: heading, *looks(rng, alike)
+        lambda t: (start[0] + velocity[0] * t, start[1] + velocity[1] * t),
+        lambda t: heading,
+        *appearance(rng, similarity),
     )
 
 
-def looks(rng: np.random.Generator, alike: float = 0.0) -> tuple[float, float, float, float, float]:
+def appearance(rng: np.random.Generator, similarity: float = 0.0) -> tuple[float, float, float, float, float]:
     """Greys and size of a car: most are white, grey or black."""
     body = float(rng.choice([225.0, 190.0, 140.0, 60.0, 35.0]) + rng.normal(0, 12))
     mine = (body, float(rng.uniform(20, 70)), float(rng.normal(0, 25)), rng.uniform(14, 18), rng.uniform(6.8, 8.2))
     same = (190.0, 45.0, 10.0, 16.0, 7.5)
-    return tuple(alike * s + (1 - alike) * m for s, m in zip(same, mine, strict=True))  # type: ignore[return-value]
+    return tuple(similarity * s + (1 - similarity) * m for s, m in zip(same, mine, strict=True))  # type: ignore[return-value]
 
 
 def road(rng: np.random.Generator, shape: tuple[int, int]) -> FloatArray:
@@ -80,11 +83,11 @@ def road(rng: np.random.Generator, shape: tuple[int, int]) -> FloatArray:
 
 
 def draw(ground: FloatArray, cars: Sequence[Car], time_s: float) -> FloatArray:
-    """The picture at a time, at base resolution."""
-    picture = ground.copy()
+    """The image at a time, at base resolution."""
+    image = ground.copy()
     o = OVERSAMPLING
     for c in cars:
-        (x, y), heading = c.place(time_s), c.heading(time_s)
+        (x, y), heading = c.position(time_s), c.heading(time_s)
         for begin, end, width, grey in (
             (-0.5, 0.5, 1.0, c.body),
             (-0.32, -0.2, 0.8, c.glass),
@@ -96,12 +99,12 @@ def draw(ground: FloatArray, cars: Sequence[Car], time_s: float) -> FloatArray:
             corners_x = x + along * np.cos(heading) - across * np.sin(heading)
             corners_y = y + along * np.sin(heading) + across * np.cos(heading)
             corners = np.stack([(corners_x + 0.5) * o - 0.5, (corners_y + 0.5) * o - 0.5], axis=1)
-            cv2.fillConvexPoly(picture, np.rint(corners * 16).astype(np.int32), grey, cv2.LINE_8, 4)
-    return cv2.resize(picture, (picture.shape[1] // o, picture.shape[0] // o), interpolation=cv2.INTER_AREA)
+            cv2.fillConvexPoly(image, np.rint(corners * 16).astype(np.int32), grey, cv2.LINE_8, 4)
+    return cv2.resize(image, (image.shape[1] // o, image.shape[0] // o), interpolation=cv2.INTER_AREA)
 
 
 def patches_of(
-    picture: FloatArray, xy: FloatArray, axis: FloatArray, width: int = 8, length: int = 16
+    image: FloatArray, xy: FloatArray, axis: FloatArray, width: int = 8, length: int = 16
 ) -> NDArray[np.uint8]:
     """Oriented patches, the axis along their rows' order."""
     if not len(xy):
@@ -111,16 +114,18 @@ def patches_of(
     x = xy[:, 0, None, None] + along[None, :, None] * cos - across[None, None, :] * sin
     y = xy[:, 1, None, None] + along[None, :, None] * sin + across[None, None, :] * cos
     flat = cv2.remap(
-        picture, x.reshape(-1, width).astype(np.float32), y.reshape(-1, width).astype(np.float32), cv2.INTER_LINEAR
+        image, x.reshape(-1, width).astype(np.float32), y.reshape(-1, width).astype(np.float32), cv2.INTER_LINEAR
     )
     return np.clip(np.rint(flat), 0, 255).astype(np.uint8).reshape(-1, length, width)
 
 
-def chips_of(picture: FloatArray, xy: FloatArray) -> NDArray[np.uint8]:
-    """Upright crops centred on the rounded places."""
-    padded = np.pad(np.clip(np.rint(picture), 0, 255).astype(np.uint8), CHIP, mode="edge")
-    corner = np.rint(xy).astype(np.int64) + CHIP - CHIP // 2
-    return np.array([padded[y : y + CHIP, x : x + CHIP] for x, y in corner], np.uint8).reshape(-1, CHIP, CHIP)
+def crops_of(image: FloatArray, xy: FloatArray) -> NDArray[np.uint8]:
+    """Upright crops centred on the rounded positions."""
+    padded = np.pad(np.clip(np.rint(image), 0, 255).astype(np.uint8), CROP_PX, mode="edge")
+    corner = np.rint(xy).astype(np.int64) + CROP_PX - CROP_PX // 2
+    return np.array([padded[y : y + CROP_PX, x : x + CROP_PX] for x, y in corner], np.uint8).reshape(
+        -1, CROP_PX, CROP_PX
+    )
 
 
 def watch(
@@ -132,13 +137,13 @@ def watch(
     shape: tuple[int, int] = (160, 480),
     dropped: Sequence[int] = (),
 ) -> Watched:
-    """What the detector reports of a scene, frame by frame; ``dropped`` frames are there but not registered."""
+    """The detections of a scene, frame by frame; ``dropped`` frames are there but not registered."""
     ground = road(rng, shape)
     seen = Watched([])
     for frame, time_s in enumerate(times_s):
-        picture = draw(ground, cars, time_s)
-        picture = picture + rng.normal(0, detector.noise_grey, picture.shape).astype(np.float32)
-        truth = np.array([(*c.place(time_s), c.heading(time_s)) for c in cars]).reshape(-1, 3)
+        image = draw(ground, cars, time_s)
+        image = image + rng.normal(0, detector.noise_grey, image.shape).astype(np.float32)
+        truth = np.array([(*c.position(time_s), c.heading(time_s)) for c in cars]).reshape(-1, 3)
         inside = (truth[:, 0] > 4) & (truth[:, 0] < shape[1] - 4) & (truth[:, 1] > 4) & (truth[:, 1] < shape[0] - 4)
         who = np.flatnonzero(inside & (rng.random(len(cars)) < detector.recall))
         false = rng.poisson(detector.false_alarms)
@@ -148,7 +153,7 @@ def watch(
         axis = np.concatenate([true_axis, rng.uniform(0, np.pi, false)]) % np.pi
         ids = frame * 2**20 + np.arange(len(xy), dtype=np.int64)
         seen.car_of.update(zip(ids.tolist(), [*who.tolist(), *[-1] * false], strict=True))
-        seen.place_of.update(zip(ids[: who.size].tolist(), map(tuple, truth[who, :2].tolist()), strict=True))
+        seen.position_of.update(zip(ids[: who.size].tolist(), map(tuple, truth[who, :2].tolist()), strict=True))
         seen.tables.append(
             FrameTable(
                 frame=frame,
@@ -161,8 +166,8 @@ def watch(
                 orientation_rad=axis,
                 orientation_sd_rad=np.full(len(xy), detector.axis_sd_rad),
                 score=np.ones(len(xy)),
-                patches=patches_of(picture, xy, axis),
-                chips=chips_of(picture, xy),
+                patches=patches_of(image, xy, axis),
+                crops=crops_of(image, xy),
                 x_work=xy[:, 0],
                 y_work=xy[:, 1],
             )
@@ -172,10 +177,11 @@ def watch(
 
 @dataclass(frozen=True)
 class Score:
-    """How right tracklets are.
+    """Precision, recall and speed error of tracklets.
 
-    ``precision``: share of tracklets whose three detections show one car. ``recall``: share of cars detected in three
-    consecutive frames of a window that have their tracklet. ``moving_...``: of those that truly or reportedly move.
+    ``precision``: fraction of tracklets whose three detections show one car. ``recall``: fraction of cars detected in
+    three consecutive frames of a window that have their tracklet. ``moving_...``: of those that move by the truth or by
+    the tracklet.
     Errors are of the mean velocity, right and moving tracklets, px/s.
     """
 
@@ -188,7 +194,7 @@ class Score:
 
 
 def score(
-    seen: Watched, tracklets: pd.DataFrame, *, max_interval_s: float = 0.45, slow_px_per_s: float = 15.0
+    seen: Watched, tracklets: pd.DataFrame, *, max_interval_s: float = 0.45, min_speed_px_per_s: float = 15.0
 ) -> Score:
     """Tracklets against the truth of their detections."""
     possible = _possible(seen, max_interval_s)
@@ -197,8 +203,8 @@ def score(
     right = (who[:, 0] == who[:, 1]) & (who[:, 1] == who[:, 2]) & (who[:, 0] >= 0)
     span = (tracklets["time_2_s"] - tracklets["time_0_s"]).to_numpy()
     apart = (tracklets[["x_2_px", "y_2_px"]].to_numpy() - tracklets[["x_0_px", "y_0_px"]].to_numpy()) / span[:, None]
-    moves = np.hypot(*apart.T) > slow_px_per_s
-    fast = {key: speed > slow_px_per_s for key, (speed, _) in possible.items()}
+    moves = np.hypot(*apart.T) > min_speed_px_per_s
+    fast = {key: speed > min_speed_px_per_s for key, (speed, _) in possible.items()}
     found = {tuple(row) for row in ids[right].tolist()}
     moving = [key for key, value in fast.items() if value]
     errors = []
@@ -228,7 +234,7 @@ def _possible(seen: Watched, max_interval_s: float) -> dict[tuple[int, ...], tup
         maps = [{seen.car_of[i]: i for i in t.detection_id.tolist() if seen.car_of[i] >= 0} for t in (a, b, c)]
         for who in maps[0].keys() & maps[1].keys() & maps[2].keys():
             ids = tuple(m[who] for m in maps)
-            moved = np.subtract(seen.place_of[ids[2]], seen.place_of[ids[0]]) / (c.time_s - a.time_s)
+            moved = np.subtract(seen.position_of[ids[2]], seen.position_of[ids[0]]) / (c.time_s - a.time_s)
             out[ids] = (float(np.hypot(*moved)), moved)
     return out
 
@@ -243,7 +249,7 @@ def two_lanes_opposed(rng: np.random.Generator) -> list[Car]:
 def dense_car_park(rng: np.random.Generator) -> list[Car]:
     """Rows of parked cars 11 px apart, and two that drive between the rows."""
     parked = [car(rng, (30.0 + 11 * k, y), (0.0, 0.0)) for k in range(38) for y in (30.0, 47.0, 90.0, 107.0)]
-    turned = [Car(c.place, lambda t: np.pi / 2, c.body, c.glass, c.mark, c.length, c.width) for c in parked]
+    turned = [Car(c.position, lambda t: np.pi / 2, c.body, c.glass, c.mark, c.length, c.width) for c in parked]
     return [*turned, car(rng, (20.0, 68.0), (30.0, 0.0)), car(rng, (460.0, 68.0), (-40.0, 0.0))]
 
 
@@ -253,22 +259,25 @@ def queue_at_red(rng: np.random.Generator) -> list[Car]:
     def starter(k: int) -> Car:
         begin, x0 = 0.8 + 0.5 * k, 300.0 - 24.0 * k
 
-        def place(t: float) -> tuple[float, float]:
+        def position(t: float) -> tuple[float, float]:
             s = max(t - begin, 0.0)
             up = min(s, 6.0)
             return x0 + 0.5 * 9.0 * up**2 + 54.0 * (s - up), 60.0
 
-        return Car(place, lambda t: 0.0, *looks(rng))
+        return Car(position, lambda t: 0.0, *appearance(rng))
 
     flow = [car(rng, (x, 72.0), (-60.0, 0.0)) for x in np.cumsum(rng.uniform(26, 90, 20)) - 50]
     return [starter(k) for k in range(12)] + flow
 
 
 def platoon(
-    rng: np.random.Generator, *, speed_px_per_s: float = 60.0, spacing_px: float = 25.0, alike: float = 0.0
+    rng: np.random.Generator, *, speed_px_per_s: float = 60.0, spacing_px: float = 25.0, similarity: float = 0.0
 ) -> list[Car]:
     """Cars at one spacing and one speed: each linked to the one behind is as smooth a motion as the true one."""
-    return [car(rng, (x, 60.0), (speed_px_per_s, 0.0), alike=alike) for x in spacing_px * np.arange(40) - 25.0 * 25]
+    return [
+        car(rng, (x, 60.0), (speed_px_per_s, 0.0), similarity=similarity)
+        for x in spacing_px * np.arange(40) - 25.0 * 25
+    ]
 
 
 def crossing(rng: np.random.Generator) -> list[Car]:
@@ -280,11 +289,11 @@ def crossing(rng: np.random.Generator) -> list[Car]:
         def phase(t: float) -> float:
             return float(np.clip((t - delay) * 30.0 / 30.0, 0.0, np.pi / 2))
 
-        def place(t: float) -> tuple[float, float]:
+        def position(t: float) -> tuple[float, float]:
             a, before, after = phase(t), min(t - delay, 0.0) * 30, max(t - delay - np.pi / 2, 0.0) * 30
             return 260 + before + 30 * np.sin(a), 84 + 30 * (1 - np.cos(a)) + after
 
-        return Car(place, phase, *looks(rng))
+        return Car(position, phase, *appearance(rng))
 
     return across + down + [turner(d) for d in (0.5, 1.6, 2.7)]
 

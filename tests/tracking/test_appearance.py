@@ -1,4 +1,4 @@
-"""Looks: kernels equal their plain definitions; an axis has no front."""
+"""Appearance differences: kernels equal their definitions; an axis is known up to 180 degrees."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,12 +6,12 @@ from numpy.typing import NDArray
 from velfield.tracking.appearance import (
     CAR_LENGTH_PX,
     CAR_WIDTH_PX,
-    FACE_SHIFT_PX,
-    Looks,
-    face_differences,
-    faces,
-    look_differences,
+    MAX_CROP_SHIFT_PX,
+    AppearanceFeatures,
+    appearance_differences,
+    crop_differences,
     patch_differences,
+    prepare_crops,
 )
 
 RNG = np.random.default_rng(5)
@@ -31,8 +31,8 @@ def plain_patch_difference(p: NDArray[np.uint8], q: NDArray[np.uint8], shift: in
     )
 
 
-def plain_face_difference(i: int, j: int) -> float:
-    """Birchfield and Tomasi's difference over every second pixel of the car, least over the shifts."""
+def plain_crop_difference(i: int, j: int) -> float:
+    """Birchfield and Tomasi's difference over every second pixel of the car, minimum over the shifts."""
 
     def ranges(crop: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         near = [0.5 * (crop + np.roll(crop, s, axis)) for axis in (0, 1) for s in (1, -1)]
@@ -48,10 +48,10 @@ def plain_face_difference(i: int, j: int) -> float:
     p, q = CROPS[i].astype(float), CROPS[j].astype(float)
     (p_low, p_high), (q_low, q_high) = ranges(p), ranges(q)
     every_second = np.zeros((32, 32), bool)
-    every_second[FACE_SHIFT_PX : 32 - FACE_SHIFT_PX : 2, FACE_SHIFT_PX : 32 - FACE_SHIFT_PX : 2] = True
+    every_second[MAX_CROP_SHIFT_PX : 32 - MAX_CROP_SHIFT_PX : 2, MAX_CROP_SHIFT_PX : 32 - MAX_CROP_SHIFT_PX : 2] = True
     mine = car(AXES[i]) & every_second
     best = 255.0
-    steps = range(-FACE_SHIFT_PX, FACE_SHIFT_PX + 1)
+    steps = range(-MAX_CROP_SHIFT_PX, MAX_CROP_SHIFT_PX + 1)
     for dy, dx in ((dy, dx) for dy in steps for dx in steps):
         moved, low, high, on = (np.roll(a, (-dy, -dx), (0, 1)) for a in (q, q_low, q_high, car(AXES[j])))
         both = mine & on
@@ -61,26 +61,27 @@ def plain_face_difference(i: int, j: int) -> float:
     return best
 
 
-def test_patch_differences_equal_the_plain_ones() -> None:
+def test_patch_differences_equal_their_definition() -> None:
     for shift in (0, 1, 2):
         got = patch_differences(PATCHES, PATCHES, FIRST, SECOND, max_shift_px=shift)
         plain = [plain_patch_difference(PATCHES[i], PATCHES[j], shift) for i, j in zip(FIRST, SECOND, strict=True)]
         assert np.allclose(got, plain)
 
 
-def test_a_patch_turned_about_is_the_same_car() -> None:
-    turned = np.ascontiguousarray(PATCHES[:, ::-1, ::-1])
-    assert np.all(patch_differences(PATCHES, turned, np.arange(6), np.arange(6)) == 0)
+def test_a_patch_rotated_by_180_degrees_is_the_same_car() -> None:
+    rotated = np.ascontiguousarray(PATCHES[:, ::-1, ::-1])
+    assert np.all(patch_differences(PATCHES, rotated, np.arange(6), np.arange(6)) == 0)
 
 
-def test_face_differences_equal_the_plain_ones() -> None:
-    prepared = faces(CROPS, AXES)
-    got = face_differences(prepared, prepared, FIRST, SECOND)
-    assert np.allclose(got, [plain_face_difference(i, j) for i, j in zip(FIRST, SECOND, strict=True)])
+def test_crop_differences_equal_their_definition() -> None:
+    prepared = prepare_crops(CROPS, AXES)
+    got = crop_differences(prepared, prepared, FIRST, SECOND)
+    assert np.allclose(got, [plain_crop_difference(i, j) for i, j in zip(FIRST, SECOND, strict=True)])
 
 
-def test_unknown_looks_differ_by_nothing_known() -> None:
-    nothing = Looks(None, None)
+def test_the_difference_to_an_unknown_appearance_is_unknown() -> None:
+    unknown, patches = AppearanceFeatures(None, None), AppearanceFeatures(PATCHES, None)
     one = np.zeros(1, np.int64)
-    assert np.isnan(look_differences(nothing, Looks(PATCHES, None), one, one)).all()
-    assert look_differences(Looks(PATCHES, None), Looks(PATCHES, faces(CROPS, AXES)), one, one) == 0
+    assert np.isnan(appearance_differences(unknown, patches, one, one)).all()
+    both = AppearanceFeatures(PATCHES, prepare_crops(CROPS, AXES))
+    assert appearance_differences(patches, both, one, one) == 0  # by the patches, which both have

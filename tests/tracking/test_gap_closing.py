@@ -1,4 +1,4 @@
-"""Passages over gaps: who is lost from sight for a moment goes on, and nobody else goes on in his place."""
+"""Gap closing: a track that was interrupted goes on as itself, and no other vehicle's does in its place."""
 
 from collections.abc import Sequence
 
@@ -6,81 +6,83 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from velfield.tracking.gap_closing import END_COLUMNS, Gaps, join_chains
+from velfield.tracking.gap_closing import END_COLUMNS, GapLimits, reconnect_tracks
 
 GSD_M = 0.25
 INTERVAL_S = 0.2
 
 
-def seen(start_s: float, frames: int, place_m: float, speed: float, acceleration: float = 0.0, lane_m: float = 0.0):  # type: ignore[no-untyped-def]
-    """Tracklets of a vehicle along x, seen in so many frames: `END_COLUMNS`."""
+def seen(start_s: float, frames: int, x_m: float, speed: float, acceleration: float = 0.0, lane_m: float = 0.0):  # type: ignore[no-untyped-def]
+    """Tracklets of a vehicle along x, detected in so many frames: `END_COLUMNS`."""
     t = start_s + INTERVAL_S * np.arange(frames)
-    x = place_m + speed * (t - start_s) + acceleration * (t - start_s) ** 2 / 2
+    x = x_m + speed * (t - start_s) + acceleration * (t - start_s) ** 2 / 2
     v = np.diff(x) / INTERVAL_S
     columns = {"time_0_s": t[:-2], "x_0_px": x[:-2] / GSD_M, "y_0_px": lane_m / GSD_M, "vx_01_px_per_s": v[:-1] / GSD_M}
     columns |= {"time_2_s": t[2:], "x_2_px": x[2:] / GSD_M, "y_2_px": lane_m / GSD_M, "vx_12_px_per_s": v[1:] / GSD_M}
     return pd.DataFrame({**columns, "vy_01_px_per_s": 0.0, "vy_12_px_per_s": 0.0})[END_COLUMNS]
 
 
-def joined(parts: Sequence[pd.DataFrame], gap_s: float = 2.0, standing_gap_s: float = 0.0) -> list[int]:
-    """The passage of each part, each a chain of its own."""
-    chains = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    passages = join_chains(pd.concat(parts, ignore_index=True), chains, Gaps(gap_s, standing_gap_s), gsd_m=GSD_M)
-    assert all(len(set(passages[chains == k])) == 1 for k in range(len(parts)))
-    return [int(passages[chains == k][0]) for k in range(len(parts))]
+def reconnected(parts: Sequence[pd.DataFrame], gap_s: float = 2.0, stationary_gap_s: float = 0.0) -> list[int]:
+    """The track of each part, each a track of its own before."""
+    tracks = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    after = reconnect_tracks(
+        pd.concat(parts, ignore_index=True), tracks, GapLimits(gap_s, stationary_gap_s), gsd_m=GSD_M
+    )
+    assert all(len(set(after[tracks == k])) == 1 for k in range(len(parts)))
+    return [int(after[tracks == k][0]) for k in range(len(parts))]
 
 
 @pytest.mark.parametrize(("speed", "acceleration"), [(0.0, 0.0), (14.0, 0.0), (12.0, -3.0), (3.0, 2.5)])
-def test_lost_for_a_second_it_goes_on(speed: float, acceleration: float) -> None:
+def test_a_gap_of_a_second_is_closed(speed: float, acceleration: float) -> None:
     before = seen(0.0, 6, 0.0, speed, acceleration)
-    gone_s = 1.0 + 1.2  # five intervals seen, six not
-    later_place = speed * gone_s + acceleration * gone_s**2 / 2
-    after = seen(gone_s, 5, later_place, speed + acceleration * gone_s, acceleration)
-    assert joined([before, after]) == [0, 0]
-    assert joined([before, after], gap_s=1.0) == [0, 1]
-    assert joined([before, after], gap_s=0.0) == [0, 1]
+    gap_seconds = 1.0 + 1.2  # five intervals detected, six not
+    x_after = speed * gap_seconds + acceleration * gap_seconds**2 / 2
+    after = seen(gap_seconds, 5, x_after, speed + acceleration * gap_seconds, acceleration)
+    assert reconnected([before, after]) == [0, 0]
+    assert reconnected([before, after], gap_s=1.0) == [0, 1]
+    assert reconnected([before, after], gap_s=0.0) == [0, 1]
 
 
-def test_what_stands_is_itself_however_long_it_is_lost() -> None:
-    standing, again = seen(0.0, 6, 0.0, 0.1), seen(20.0, 6, 0.5, 0.0)
-    assert joined([standing, again], standing_gap_s=30.0) == [0, 0]
-    assert joined([standing, again]) == [0, 1]
-    assert joined([standing, again], standing_gap_s=10.0) == [0, 1]
-    assert joined([standing, seen(20.0, 6, 1.5, 0.0)], standing_gap_s=30.0) == [0, 1]
-    rolling = seen(20.0, 6, 0.5, 3.0)  # the next in its place, and one that passes through it
-    assert joined([standing, rolling], standing_gap_s=30.0) == [0, 1]
-    assert joined([seen(0.0, 6, -2.0, 3.0), again], standing_gap_s=30.0) == [0, 1]
+def test_a_stationary_vehicle_is_reconnected_however_long_the_gap() -> None:
+    stationary, again = seen(0.0, 6, 0.0, 0.1), seen(20.0, 6, 0.5, 0.0)
+    assert reconnected([stationary, again], stationary_gap_s=30.0) == [0, 0]
+    assert reconnected([stationary, again]) == [0, 1]
+    assert reconnected([stationary, again], stationary_gap_s=10.0) == [0, 1]
+    assert reconnected([stationary, seen(20.0, 6, 1.5, 0.0)], stationary_gap_s=30.0) == [0, 1]
+    rolling = seen(20.0, 6, 0.5, 3.0)  # the next vehicle at its position, and one that passes through it
+    assert reconnected([stationary, rolling], stationary_gap_s=30.0) == [0, 1]
+    assert reconnected([seen(0.0, 6, -2.0, 3.0), again], stationary_gap_s=30.0) == [0, 1]
 
 
-def test_three_parts_are_one_whatever_their_order() -> None:
+def test_three_parts_are_one_track_in_any_order() -> None:
     first, second, third = (seen(k * 2.0, 6, 20.0 * k, 10.0) for k in range(3))
-    assert joined([first, second, third]) == [0, 0, 0]
-    assert joined([third, first, second]) == [0, 0, 0]
+    assert reconnected([first, second, third]) == [0, 0, 0]
+    assert reconnected([third, first, second]) == [0, 0, 0]
 
 
-def test_the_next_in_a_queue_is_another() -> None:
-    standing = seen(0.0, 6, 0.0, 0.0)
-    assert joined([standing, seen(1.8, 6, 6.0, 0.0)]) == [0, 1]
-    assert joined([standing, seen(1.8, 6, 0.0, 0.0, lane_m=3.2)]) == [0, 1]
+def test_the_next_vehicle_of_a_queue_is_another_track() -> None:
+    stationary = seen(0.0, 6, 0.0, 0.0)
+    assert reconnected([stationary, seen(1.8, 6, 6.0, 0.0)]) == [0, 1]
+    assert reconnected([stationary, seen(1.8, 6, 0.0, 0.0, lane_m=3.2)]) == [0, 1]
 
 
-def test_what_comes_the_other_way_is_another() -> None:
-    assert joined([seen(0.0, 6, 0.0, 12.0), seen(1.6, 6, 19.2, -12.0)]) == [0, 1]
+def test_opposite_traffic_is_another_track() -> None:
+    assert reconnected([seen(0.0, 6, 0.0, 12.0), seen(1.6, 6, 19.2, -12.0)]) == [0, 1]
 
 
-def test_two_that_are_lost_at_once_keep_their_ways() -> None:
-    """Side by side and one behind the other, all lost for as long: each goes on as itself."""
+def test_vehicles_lost_at_the_same_time_are_not_exchanged() -> None:
+    """Side by side and one behind the other, with equal gaps: each is reconnected to itself."""
     ways = [(0.0, 0.0, 13.0), (9.0, 0.0, 13.0), (0.0, 3.3, 15.0)]
-    before = [seen(0.0, 6, place, speed, lane_m=lane) for place, lane, speed in ways]
-    after = [seen(2.4, 6, place + 2.4 * speed, speed, lane_m=lane) for place, lane, speed in ways]
-    assert joined([*before, *after]) == [0, 1, 2, 0, 1, 2]
+    before = [seen(0.0, 6, x, speed, lane_m=lane) for x, lane, speed in ways]
+    after = [seen(2.4, 6, x + 2.4 * speed, speed, lane_m=lane) for x, lane, speed in ways]
+    assert reconnected([*before, *after]) == [0, 1, 2, 0, 1, 2]
 
 
-def test_an_end_goes_on_once() -> None:
-    """Two start where one is foretold: the nearer is he, the other is new."""
-    assert joined([seen(0.0, 6, 0.0, 10.0), seen(1.8, 6, 19.0, 10.0), seen(1.8, 6, 18.1, 10.0)]) == [0, 1, 0]
+def test_an_end_is_reconnected_once() -> None:
+    """Two tracks start near one prediction: the nearer is reconnected, the other is new."""
+    assert reconnected([seen(0.0, 6, 0.0, 10.0), seen(1.8, 6, 19.0, 10.0), seen(1.8, 6, 18.1, 10.0)]) == [0, 1, 0]
 
 
 def test_no_tracklets() -> None:
     empty = seen(0.0, 2, 0.0, 1.0)
-    assert join_chains(empty, np.zeros(0, np.int64), Gaps(2.0), gsd_m=None).size == 0
+    assert reconnect_tracks(empty, np.zeros(0, np.int64), GapLimits(2.0), gsd_m=None).size == 0

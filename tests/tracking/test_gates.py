@@ -6,61 +6,61 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.flight import TrackingConfig
-from velfield.tracking.gates import Places, gated_links, gated_pairs
+from velfield.tracking.gates import DetectionStates, gate_link_pairs, gate_links
 from velfield.tracking.limits import GateLog, Limits
 
-PAPER = Limits.of(TrackingConfig(), None)
+PAPER = Limits.from_config(TrackingConfig(), None)
 
 
-def places(xy: list[tuple[float, float]], time_s: float, axis: float = 0.0, sd_px: float = 1.0) -> Places:
+def states(xy: list[tuple[float, float]], time_s: float, axis: float = 0.0, sd_px: float = 1.0) -> DetectionStates:
     at = np.array(xy, np.float64).reshape(-1, 2)
-    return Places(at[:, 0], at[:, 1], np.full(len(at), axis), np.full(len(at), 0.05), sd_px, time_s)
+    return DetectionStates(at[:, 0], at[:, 1], np.full(len(at), axis), np.full(len(at), 0.05), sd_px, time_s)
 
 
 def test_without_ground_sample_distance_the_limits_are_the_papers_in_pixels() -> None:
     assert PAPER.max_speed_px_per_s == pytest.approx(150)
-    assert PAPER.slow_px_per_s == pytest.approx(5)
+    assert PAPER.stationary_speed_px_per_s == pytest.approx(5)
     assert PAPER.max_acceleration_px_per_s2 == pytest.approx(100)
 
 
 def test_with_it_they_are_the_same_in_metres() -> None:
-    assert Limits.of(TrackingConfig(), 0.426).max_speed_px_per_s == pytest.approx(34.5 / 0.426)
+    assert Limits.from_config(TrackingConfig(), 0.426).max_speed_px_per_s == pytest.approx(34.5 / 0.426)
 
 
 @pytest.mark.parametrize(("interval_s", "limit_px"), [(0.04, 6.0), (0.2, 30.0), (0.4, 60.0)])
 def test_the_reach_is_speed_times_interval_plus_jitter(interval_s: float, limit_px: float) -> None:
     reach = limit_px + 3 * np.sqrt(2)
-    after = places([(reach - 0.1, 0), (reach + 0.1, 0)], interval_s)
-    links = gated_links(places([(0, 0)], 0.0), after, PAPER)
+    after = states([(reach - 0.1, 0), (reach + 0.1, 0)], interval_s)
+    links = gate_links(states([(0, 0)], 0.0), after, PAPER)
     assert links.second.tolist() == [0]
     assert links.rejected == (2, 1, 0)
 
 
-def test_motion_across_the_axis_is_rejected_and_slow_motion_is_not_tested() -> None:
-    before = places([(0, 0)], 0.0, axis=np.pi / 2)
-    assert gated_links(before, places([(25, 0)], 0.2, axis=np.pi / 2), PAPER).rejected == (1, 0, 1)
-    assert gated_links(before, places([(4, 0)], 0.2, axis=np.pi / 2), PAPER).second.size == 1
+def test_motion_across_the_axis_is_rejected_unless_slow() -> None:
+    before = states([(0, 0)], 0.0, axis=np.pi / 2)
+    assert gate_links(before, states([(25, 0)], 0.2, axis=np.pi / 2), PAPER).rejected == (1, 0, 1)
+    assert gate_links(before, states([(4, 0)], 0.2, axis=np.pi / 2), PAPER).second.size == 1
 
 
-def test_an_axis_that_is_not_known_is_not_tested() -> None:
-    links = gated_links(places([(0, 0)], 0.0, axis=np.nan), places([(25, 0)], 0.2, axis=np.nan), PAPER)
+def test_an_unknown_axis_is_not_tested() -> None:
+    links = gate_links(states([(0, 0)], 0.0, axis=np.nan), states([(25, 0)], 0.2, axis=np.nan), PAPER)
     assert links.second.size == 1
 
 
-def test_links_equal_the_plain_double_loop() -> None:
+def test_links_equal_a_double_loop() -> None:
     rng = np.random.default_rng(3)
-    before = places([tuple(p) for p in rng.uniform(0, 200, (60, 2))], 0.0, axis=np.nan)
-    after = places([tuple(p) for p in rng.uniform(0, 200, (50, 2))], 0.2, axis=np.nan)
-    links = gated_links(before, after, PAPER)
+    before = states([tuple(p) for p in rng.uniform(0, 200, (60, 2))], 0.0, axis=np.nan)
+    after = states([tuple(p) for p in rng.uniform(0, 200, (50, 2))], 0.2, axis=np.nan)
+    links = gate_links(before, after, PAPER)
     apart = np.hypot(after.x_px[None] - before.x_px[:, None], after.y_px[None] - before.y_px[:, None])
     assert np.array_equal(np.stack([links.first, links.second], 1), np.argwhere(apart <= 30 + 3 * np.sqrt(2)))
 
 
 def window(second: tuple[float, float], third: tuple[float, float], times: tuple[float, float] = (0.2, 0.4)):  # type: ignore[no-untyped-def]
-    """Pairs of links of one car seen at the origin and at two further places; no jitter to speak of."""
-    p = [places([(0, 0)], 0.0, np.nan, 0.01), places([second], times[0], np.nan, 0.01)]
-    p.append(places([third], times[1], np.nan, 0.01))
-    return gated_pairs((p[0], p[1], p[2]), gated_links(p[0], p[1], PAPER), gated_links(p[1], p[2], PAPER), PAPER)
+    """Pairs of links of one car detected at the origin and at two further positions; negligible jitter."""
+    p = [states([(0, 0)], 0.0, np.nan, 0.01), states([second], times[0], np.nan, 0.01)]
+    p.append(states([third], times[1], np.nan, 0.01))
+    return gate_link_pairs((p[0], p[1], p[2]), gate_links(p[0], p[1], PAPER), gate_links(p[1], p[2], PAPER), PAPER)
 
 
 def test_turn_and_acceleration_have_their_limits() -> None:
@@ -73,22 +73,22 @@ def test_turn_and_acceleration_have_their_limits() -> None:
     assert window((12, 0), (12 + 16.2, 0)).rejected == (1, 0, 1)
 
 
-def test_a_late_frame_is_judged_by_its_time() -> None:
+def test_gates_follow_the_time_of_a_late_frame() -> None:
     assert window((12, 0), (12 + 24, 0), times=(0.2, 0.6)).link_01.size == 1
     assert window((12, 0), (12 + 24, 0), times=(0.2, 0.4)).link_01.size == 0
 
 
 @pytest.mark.parametrize("interval_s", [0.04, 0.2, 0.4])
-def test_jitter_drops_few_true_tracklets_at_any_frame_rate(interval_s: float) -> None:
-    """The paper's acceleration gate alone would drop 99 of 100 at 25 frames a second."""
+def test_jitter_rejects_few_true_tracklets_at_any_frame_rate(interval_s: float) -> None:
+    """The paper's acceleration gate alone would reject 99 of 100 at 25 frames a second."""
     rng = np.random.default_rng(1)
     kept = 0
     for _ in range(400):
         speed = rng.uniform(0, 80)
         x = speed * interval_s * np.arange(3)[:, None] * [1, 0] + rng.normal(0, 1, (3, 2))
-        p = [places([tuple(x[k])], interval_s * k, axis=0.0) for k in range(3)]
-        before, after = gated_links(p[0], p[1], PAPER), gated_links(p[1], p[2], PAPER)
-        kept += gated_pairs((p[0], p[1], p[2]), before, after, PAPER).link_01.size
+        p = [states([tuple(x[k])], interval_s * k, axis=0.0) for k in range(3)]
+        before, after = gate_links(p[0], p[1], PAPER), gate_links(p[1], p[2], PAPER)
+        kept += gate_link_pairs((p[0], p[1], p[2]), before, after, PAPER).link_01.size
     assert kept >= 0.97 * 400
 
 

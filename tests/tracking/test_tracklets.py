@@ -1,4 +1,4 @@
-"""Tracklets of named scenes: very likely right, few missed, and the same however the flight is cut."""
+"""Tracklets of named scenes: precise, few missed, and the same however the flight is cut into parts."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -16,7 +16,7 @@ from velfield.errors import InputError
 from velfield.tracking.limits import GateLog
 from velfield.tracking.tracklets import link_windows, window_frames
 
-PAPERS_WAY = TrackingConfig(linking="links", min_confidence=0.0, refine=False)
+PAIRWISE = TrackingConfig(linking="links", min_confidence=0.0, refine=False)
 ALL = range(10**6)
 
 
@@ -62,38 +62,38 @@ def test_a_platoon_is_not_linked_each_to_the_one_behind(speed: float) -> None:
     assert np.median(found["vx_01_px_per_s"]) == pytest.approx(speed, abs=1)
 
 
-def test_near_look_alikes_are_told_apart_where_the_papers_way_loses_half() -> None:
+def test_joint_linking_finds_tracklets_of_similar_cars_where_pairwise_linking_loses_half() -> None:
     rng = np.random.default_rng(8)
-    seen = watch(platoon(rng, alike=0.8), uneven_times(rng, 16), rng=rng)
+    seen = watch(platoon(rng, similarity=0.8), uneven_times(rng, 16), rng=rng)
     joint = score(seen, link_windows(seen.tables, TrackingConfig(), gsd_m=None, starts=ALL)[0])
-    papers = score(seen, link_windows(seen.tables, PAPERS_WAY, gsd_m=None, starts=ALL)[0])
+    pairwise = score(seen, link_windows(seen.tables, PAIRWISE, gsd_m=None, starts=ALL)[0])
     assert joint.precision >= 0.98
     assert joint.recall >= 0.85
-    assert papers.recall < 0.7
+    assert pairwise.recall < 0.7
 
 
-def test_perfect_look_alikes_are_mostly_left_alone() -> None:
+def test_identical_cars_get_few_tracklets() -> None:
     rng = np.random.default_rng(9)
-    seen = watch(platoon(rng, alike=1.0), uneven_times(rng, 16), rng=rng)
+    seen = watch(platoon(rng, similarity=1.0), uneven_times(rng, 16), rng=rng)
     assert score(seen, link_windows(seen.tables, TrackingConfig(), gsd_m=None, starts=ALL)[0]).recall < 0.4
 
 
-def test_the_papers_way_is_there_too() -> None:
+def test_pairwise_linking_as_in_the_paper() -> None:
     seen = scene("queue at red")
-    found, log = link_windows(seen.tables, PAPERS_WAY, gsd_m=None, starts=ALL)
+    found, log = link_windows(seen.tables, PAIRWISE, gsd_m=None, starts=ALL)
     assert score(seen, found).precision >= 0.95
     assert log["appearance"] > 0
 
 
-def test_confidence_says_how_often_a_tracklet_is_right() -> None:
-    """Of tracklets that are half believed, more are wrong than of those that are believed."""
+def test_precision_rises_with_confidence() -> None:
+    """More of the tracklets of low confidence are wrong than of those of high confidence."""
     rng = np.random.default_rng(10)
     poor = Detector(jitter_px=1.2, axis_sd_rad=0.12, recall=0.8, false_alarms=12.0, noise_grey=5.0)
     seen = watch(crossing(rng), uneven_times(rng, 24), rng=rng, detector=poor)
     found, _ = link_windows(seen.tables, TrackingConfig(min_confidence=0.0), gsd_m=None, starts=ALL)
-    sure = found["confidence"] >= 0.9
-    assert score(seen, found[sure]).precision >= 0.97
-    assert score(seen, found[~sure]).precision < 0.9
+    confident = found["confidence"] >= 0.9
+    assert score(seen, found[confident]).precision >= 0.97
+    assert score(seen, found[~confident]).precision < 0.9
     assert found["confidence"].between(0, 1).all()
 
 
@@ -103,7 +103,7 @@ def test_columns_and_keys() -> None:
     assert found["tracklet_id"].is_unique
     assert (found["tracklet_id"] == found["detection_id_1"]).all()
     assert (found["passage_id"] == -1).all()
-    for k in range(3):  # a detection stands at one place of one tracklet only
+    for k in range(3):  # a detection has one role in one tracklet only
         assert found[f"detection_id_{k}"].is_unique
 
 
@@ -178,12 +178,12 @@ def test_frames_without_detections_have_no_tracklets(frames: int) -> None:
     assert list(found.columns) == list(TRACKLET_COLUMNS)
 
 
-def test_places_alone_make_tracklets_too() -> None:
-    """Detections from elsewhere may come without axes and without pictures."""
+def test_positions_alone_give_tracklets() -> None:
+    """External detections may have neither axes nor crops."""
     rng = np.random.default_rng(6)
     cars = [car(rng, (x, y), (50.0, 0.0)) for x, y in [(20.0, 30.0), (80.0, 60.0), (140.0, 90.0), (60.0, 120.0)]]
     seen = watch(cars, uneven_times(rng, 8), rng=rng, detector=Detector(recall=1.0, false_alarms=0.0))
-    unknown = {"patches": None, "chips": None, "x_work": None, "y_work": None}
+    unknown = {"patches": None, "crops": None, "x_work": None, "y_work": None}
     bare = [
         replace(t, orientation_rad=t.x_px * np.nan, orientation_sd_rad=t.x_px * np.nan, **unknown) for t in seen.tables
     ]

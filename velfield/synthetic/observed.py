@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from schemas.arrays import FloatArray, IntArray
 from schemas.tables import TRACKLET_COLUMNS
 from velfield.synthetic.traffic.traffic import STEP_S, Traffic
-from velfield.tracking.chains import assign_passages
+from velfield.tracking.tracks import assign_tracks
 
 _MAX_INTERVAL_S = 0.45
 
@@ -36,13 +36,13 @@ class Errors:
     """
 
     recall: float = 0.97
-    place_sd_px: float = 0.8
+    position_sd_px: float = 0.8
     displacement_sd_px: float = 0.09
     claimed_sd_px: float = 0.13
     unaligned_share: float = 0.05
 
 
-NO_ERRORS = Errors(recall=1.0, place_sd_px=0.0, displacement_sd_px=0.0, claimed_sd_px=0.0, unaligned_share=0.0)
+NO_ERRORS = Errors(recall=1.0, position_sd_px=0.0, displacement_sd_px=0.0, claimed_sd_px=0.0, unaligned_share=0.0)
 
 
 def observed_tracklets(
@@ -92,7 +92,7 @@ def observed_tracklets(
     columns["confidence"] = np.ones(len(start))
     columns["tracklet_id"] = columns["detection_id_1"]
     ids = np.stack([columns[f"detection_id_{k}"] for k in range(3)], axis=1).astype(np.int64)
-    columns["passage_id"] = assign_passages(ids)
+    columns["passage_id"] = assign_tracks(ids)
     return pd.DataFrame({name: columns[name].astype(kind) for name, kind in TRACKLET_COLUMNS.items()})
 
 
@@ -125,7 +125,7 @@ def _detected(
     inside = (true >= 0).all(axis=1) & (true <= np.array(shape[::-1]) - 1).all(axis=1)
     seen = inside & (rng.uniform(size=len(frame)) < errors.recall)
     vehicle, frame, true = vehicle[seen], frame[seen], true[seen]
-    return vehicle, frame, true, true + rng.normal(0, 1, true.shape) * errors.place_sd_px
+    return vehicle, frame, true, true + rng.normal(0, 1, true.shape) * errors.position_sd_px
 
 
 def _appearances(traffic: Traffic, times_s: FloatArray) -> tuple[IntArray, IntArray]:
@@ -148,5 +148,5 @@ def _displacements(
     plain = np.zeros_like(true)
     plain[:-1] = np.diff(place, axis=0)
     unaligned = rng.uniform(size=len(true)) < errors.unaligned_share
-    sd = np.where(unaligned, np.sqrt(2) * errors.place_sd_px, errors.claimed_sd_px)
+    sd = np.where(unaligned, np.sqrt(2) * errors.position_sd_px, errors.claimed_sd_px)
     return np.where(unaligned[:, None], plain, aligned), sd

@@ -1,11 +1,11 @@
-"""What a link between two detections, and a pair of links, may look like: the paper's gates in physical terms.
+"""Gates on links between two detections and on pairs of links (paper: tracking), in physical units.
 
-Every gate is a physical limit times the true interval plus ``jitter_sigmas`` standard deviations of what jitter alone
-does to the tested quantity. Jitter does not shrink with the interval: at 25 frames a second and half a pixel of it,
-the paper's acceleration gate taken alone would drop 99 % of the true tracklets, and 96 % of the parked cars would
+Every gate is a physical limit times the true interval plus ``jitter_sigmas`` standard deviations of the tested
+quantity under detection jitter alone. Jitter does not shrink with the interval: at 25 frames a second and half a pixel
+of it, the paper's acceleration gate alone would reject 99 % of the true tracklets, and 96 % of the parked cars would
 "move".
 
-A rejected candidate is counted once, under the first gate it fails (`velfield.tracking.limits.GateLog`).
+A rejected candidate is counted once, at the first gate that it fails (`velfield.tracking.limits.GateLog`).
 """
 
 from dataclasses import dataclass
@@ -17,24 +17,23 @@ from schemas.arrays import FloatArray, IntArray
 from velfield.tracking.limits import Limits
 
 DEFAULT_AXIS_SD_RAD = 0.1
-"""Standard deviation of an axis that came without one: what the structure tensor reaches (median error 3.4-5
-degrees)."""
+"""Standard deviation of an axis given without one: the structure tensor's (median error 3.4-5 degrees)."""
 MIN_AXIS_SD_RAD = 0.05
-"""No axis is believed better than this: cars slip, turn and lean."""
+"""Lower bound of an axis's standard deviation: cars slip, turn and lean, so motion does not follow the axis exactly."""
 
 
 @dataclass(frozen=True)
-class Places:
-    """Where the detections of one frame are, as the gates read them.
+class DetectionStates:
+    """Positions and axes of the detections of one frame, with their standard deviations.
 
     Attributes
     ----------
     x_px, y_px
         (n,) base px.
     axis_rad, axis_sd_rad
-        (n,) axial, [0, pi); NaN where the axis is not known, and then it is not tested.
+        (n,) axial, [0, pi); NaN: unknown, and not tested.
     sd_px
-        Standard deviation of a place along one axis, base px.
+        Standard deviation of a position along x or y, base px.
     time_s
         Time of the frame.
     """
@@ -70,15 +69,15 @@ class Links:
     rejected: tuple[int, int, int]
 
 
-def gated_links(before: Places, after: Places, limits: Limits) -> Links:
-    """Every pair of detections of two frames that one car could be, by speed and axis.
+def gate_links(before: DetectionStates, after: DetectionStates, limits: Limits) -> Links:
+    """Candidate links: all pairs of detections of two frames that pass the gates on speed and axis.
 
     Parameters
     ----------
     before, after
         Detections of the earlier and of the later frame.
     limits
-        The gates.
+        Limits of the gates.
 
     Returns
     -------
@@ -89,7 +88,7 @@ def gated_links(before: Places, after: Places, limits: Limits) -> Links:
     noise = float(np.hypot(before.sd_px, after.sd_px))
     widening = limits.jitter_sigmas * noise
     reach = limits.max_speed_px_per_s * interval + widening
-    order = np.argsort(after.y_px, kind="stable")  # the reach is a band of rows: two binary searches bound it
+    order = np.argsort(after.y_px, kind="stable")  # detections within reach lie in a band of rows: binary search
     rows = after.y_px[order]
     low = np.searchsorted(rows, before.y_px - 2 * reach, side="left")
     high = np.searchsorted(rows, before.y_px + 2 * reach, side="right")
@@ -106,7 +105,7 @@ def gated_links(before: Places, after: Places, limits: Limits) -> Links:
         low,
         high,
         reach,
-        limits.slow_px_per_s * interval + widening,
+        limits.stationary_speed_px_per_s * interval + widening,
         limits.max_axis_offset_rad,
         noise,
         limits.jitter_sigmas,
@@ -126,7 +125,7 @@ def _axis_offset(dx, dy, axis):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _axis_test(dx, dy, axis, axis_sd, slow, max_offset, noise, sigmas):  # type: ignore[no-untyped-def]
-    """Whether motion follows one detection's axis, and half its squared sideways part in standard deviations."""
+    """Whether motion is along a detection's axis, and half the squared sideways component in standard deviations."""
     if np.isnan(axis):
         return True, 0.0
     sd = DEFAULT_AXIS_SD_RAD if np.isnan(axis_sd) else max(axis_sd, MIN_AXIS_SD_RAD)
@@ -141,7 +140,7 @@ def _axis_test(dx, dy, axis, axis_sd, slow, max_offset, noise, sigmas):  # type:
 
 @njit(cache=True, nogil=True)
 def _links(x0, y0, a0, s0, x1, y1, a1, s1, order, low, high, reach, slow, max_offset, noise, sigmas):  # type: ignore[no-untyped-def]
-    """Pairs within reach whose motion follows both axes; counts of the pairs tried and rejected."""
+    """Pairs within reach whose motion is along both axes; counts of the pairs tried and rejected."""
     capacity = np.sum(high - low)
     first = np.empty(capacity, np.int64)
     second = np.empty(capacity, np.int64)
@@ -181,7 +180,7 @@ class LinkPairs:
     link_01, link_12
         (m,) indices of the links.
     motion_cost
-        (m,) half the squared departure from constant velocity, in standard deviations.
+        (m,) half the squared deviation from constant velocity, in standard deviations.
     rejected
         Counts: tried, by turn, by acceleration.
     """
@@ -192,52 +191,54 @@ class LinkPairs:
     rejected: tuple[int, int, int]
 
 
-def gated_pairs(places: tuple[Places, Places, Places], before: Links, after: Links, limits: Limits) -> LinkPairs:
-    """Every pair of consecutive links that one car could make, by turn and acceleration.
+def gate_link_pairs(
+    states: tuple[DetectionStates, DetectionStates, DetectionStates], before: Links, after: Links, limits: Limits
+) -> LinkPairs:
+    """All pairs of consecutive links that pass the gates on turn and acceleration.
 
     Parameters
     ----------
-    places
+    states
         Detections of the three frames of the window.
     before, after
         Links from the first frame to the middle one, and from the middle one to the last.
     limits
-        The gates.
+        Limits of the gates.
     """
-    begins = np.searchsorted(after.first, np.arange(places[1].x_px.size + 1))
+    begins = np.searchsorted(after.first, np.arange(states[1].x_px.size + 1))
     link_01, link_12, cost, rejected = _pairs(
-        places[0].x_px,
-        places[0].y_px,
-        places[1].x_px,
-        places[1].y_px,
-        places[2].x_px,
-        places[2].y_px,
+        states[0].x_px,
+        states[0].y_px,
+        states[1].x_px,
+        states[1].y_px,
+        states[2].x_px,
+        states[2].y_px,
         before.first,
         before.second,
         after.second,
         begins,
         np.array([before.interval_s, after.interval_s]),
-        np.array([p.sd_px for p in places]),
+        np.array([p.sd_px for p in states]),
         np.array(
             [
                 limits.max_turn_rad,
-                limits.slow_px_per_s,
+                limits.stationary_speed_px_per_s,
                 limits.max_acceleration_px_per_s2,
                 limits.jitter_sigmas,
-                USUAL_ACCELERATION * limits.max_acceleration_px_per_s2,
+                TYPICAL_ACCELERATION_FRACTION * limits.max_acceleration_px_per_s2,
             ]
         ),
     )
     return LinkPairs(link_01, link_12, cost, (int(rejected[0]), int(rejected[1]), int(rejected[2])))
 
 
-USUAL_ACCELERATION = 0.1
-"""Standard deviation of a car's acceleration as a share of the gate: 2.3 m/s^2 of 23."""
+TYPICAL_ACCELERATION_FRACTION = 0.1
+"""Standard deviation of a car's acceleration as a fraction of the gate's limit: 2.3 m/s^2 of 23."""
 
 
 @njit(cache=True, nogil=True)
 def _turn_passes(ax, ay, bx, by, dt, sd, limit):  # type: ignore[no-untyped-def]
-    """Whether two segments turn by no more than the limit; slow ones have no direction and pass."""
+    """Whether the direction changes by no more than the limit between two segments; slow ones have none and pass."""
     length_a = np.hypot(ax, ay)
     length_b = np.hypot(bx, by)
     sigmas = limit[3]
@@ -245,7 +246,7 @@ def _turn_passes(ax, ay, bx, by, dt, sd, limit):  # type: ignore[no-untyped-def]
         return True
     if length_b <= limit[1] * dt[1] + sigmas * np.hypot(sd[1], sd[2]):
         return True
-    # The middle place moves both directions against each other, so its share is larger than the outer ones'.
+    # An error of the middle position changes both directions, in opposite senses.
     noise = np.sqrt((sd[0] / length_a) ** 2 + (sd[1] * (1 / length_a + 1 / length_b)) ** 2 + (sd[2] / length_b) ** 2)
     turn = abs(np.arctan2(ax * by - ay * bx, ax * bx + ay * by))
     return turn <= limit[0] + sigmas * noise
@@ -262,11 +263,11 @@ def _pairs(x0, y0, x1, y1, x2, y2, a_of, b_of, c_of, begins, dt, sd, limit):  # 
     cost = np.empty(capacity, np.float64)
     rejected = np.zeros(3, np.int64)
     ratio = dt[1] / dt[0]
-    # The last place against the one that constant velocity predicts: a change of velocity acts over half of both
-    # intervals.
+    # Deviation of the last position from constant velocity's prediction; an acceleration displaces it by `lever` times
+    # its value.
     lever = dt[1] * 0.5 * (dt[0] + dt[1])
     noise = np.sqrt(sd[2] ** 2 + ((1 + ratio) * sd[1]) ** 2 + (ratio * sd[0]) ** 2)
-    max_miss = limit[2] * lever + limit[3] * noise
+    max_deviation = limit[2] * lever + limit[3] * noise
     variance = noise**2 + (limit[4] * lever) ** 2
     n = 0
     for i in range(b_of.size):
@@ -279,12 +280,12 @@ def _pairs(x0, y0, x1, y1, x2, y2, a_of, b_of, c_of, begins, dt, sd, limit):  # 
             if not _turn_passes(ax, ay, bx, by, dt, sd, limit):
                 rejected[1] += 1
                 continue
-            miss = np.hypot(bx - ratio * ax, by - ratio * ay)
-            if miss > max_miss:
+            deviation = np.hypot(bx - ratio * ax, by - ratio * ay)
+            if deviation > max_deviation:
                 rejected[2] += 1
                 continue
             link_01[n] = i
             link_12[n] = j
-            cost[n] = 0.5 * miss**2 / variance
+            cost[n] = 0.5 * deviation**2 / variance
             n += 1
     return link_01[:n], link_12[:n], cost[:n], rejected

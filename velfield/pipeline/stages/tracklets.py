@@ -13,9 +13,9 @@ from velfield.pipeline.stages.registration import MAP_PARAMETERS, usable_frames
 from velfield.run.grid import read_grid
 from velfield.run.stores import open_frames, open_registration
 from velfield.run.tables import Patches, read_patches, read_tables, write_table
-from velfield.tracking.chains import assign_passages
-from velfield.tracking.gap_closing import END_COLUMNS, Gaps, join_chains
+from velfield.tracking.gap_closing import END_COLUMNS, GapLimits, reconnect_tracks
 from velfield.tracking.tracklets import FrameTable, link_windows, window_frames
+from velfield.tracking.tracks import assign_tracks
 
 
 def link_unit(plan: Plan, frames: range) -> Outcome:
@@ -82,7 +82,7 @@ def _frame_table(
         residual_px=residual_px,
         detection_id=mine["detection_id"].to_numpy(np.int64),
         patches=pictures["patches"][rows],
-        chips=pictures["chips"][rows],
+        crops=pictures["chips"][rows],
         x_work=pictures["place_work"][rows, 0],
         y_work=pictures["place_work"][rows, 1],
         working_scale=float(pictures["working_scale"]),
@@ -102,21 +102,21 @@ def chain_passages(plan: Plan, units: list[range]) -> Outcome:
     ids = [f"detection_id_{k}" for k in range(3)]
     sources = link_files(plan, units)
     tracklets = read_tables(sources, TRACKLET_COLUMNS, only=[*ids, *END_COLUMNS])
-    chains = assign_passages(tracklets[ids].to_numpy(np.int64))
+    tracks = assign_tracks(tracklets[ids].to_numpy(np.int64))
     config = plan.config.tracking
-    gaps = Gaps(config.join_gap_s, config.join_standing_gap_s, config.slow_m_per_s)
-    chains = join_chains(tracklets, chains, gaps, gsd_m=read_grid(plan.layout).gsd_m)
+    gaps = GapLimits(config.join_gap_s, config.join_standing_gap_s, config.slow_m_per_s)
+    tracks = reconnect_tracks(tracklets, tracks, gaps, gsd_m=read_grid(plan.layout).gsd_m)
     written, start = [], 0
     for path in sources:
         table = read_tables([path], TRACKLET_COLUMNS)
-        table["passage_id"] = chains[start : start + len(table)]
+        table["passage_id"] = tracks[start : start + len(table)]
         start += len(table)
         target = plan.layout.tracklets / path.name
         write_table(target, table, TRACKLET_COLUMNS)
         written.append(target)
     advance("tracklets")
-    warnings = [] if len(chains) else [_why_none(plan)]
-    return Outcome(written, {"tracklets": len(chains), "passages": len(np.unique(chains))}, warnings=warnings)
+    warnings = [] if len(tracks) else [_why_none(plan)]
+    return Outcome(written, {"tracklets": len(tracks), "passages": len(np.unique(tracks))}, warnings=warnings)
 
 
 def _why_none(plan: Plan) -> str:

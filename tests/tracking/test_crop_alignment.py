@@ -1,36 +1,36 @@
-"""Displacement below the pixel: the car's, not the ground's, with an honest standard deviation."""
+"""Sub-pixel displacement: the car's, not the background's, with a calibrated standard deviation."""
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.tracking_scenes import CHIP, Car, Detector, car, chips_of, draw, looks, road, watch
-from velfield.tracking.refine import align_crops
+from tests.tracking_scenes import CROP_PX, Car, Detector, appearance, car, crops_of, draw, road, watch
+from velfield.tracking.crop_alignment import align_crops
 
 
 def moved_cars(n: int, *, noise: float = 3.0, jitter: float = 0.8):  # type: ignore[no-untyped-def]
-    """Crops of cars before and after they moved over a standing ground; axes; the true shift between the crops."""
+    """Crops of cars before and after a displacement over a fixed background; axes; the true shift between the crops."""
     rng = np.random.default_rng(11)
     ground = road(rng, (96, 96))
     before, after, axes, shifts = [], [], [], []
     for _ in range(n):
-        heading, style = rng.uniform(0, np.pi), looks(rng)
+        heading, style = rng.uniform(0, np.pi), appearance(rng)
         at = rng.uniform(38, 42, 2)
         step = rng.uniform(8, 20) * np.array([np.cos(heading), np.sin(heading)])
         seen = []
         for k in (0, 1):
             x, y = at + k * step
             it = Car(lambda t, x=x, y=y: (x, y), lambda t, h=heading: h, *style)  # type: ignore[misc]
-            picture = draw(ground, [it], 0.0) + rng.normal(0, noise, (96, 96))
+            image = draw(ground, [it], 0.0) + rng.normal(0, noise, (96, 96))
             found = np.array([[x, y]]) + rng.normal(0, jitter, (1, 2))
-            (before, after)[k].append(chips_of(picture, found)[0])
+            (before, after)[k].append(crops_of(image, found)[0])
             seen.append((x, y) - np.rint(found[0]))
         axes.append(heading + rng.normal(0, 0.05))
         shifts.append(seen[1] - seen[0])
     return np.array(before), np.array(after), np.array(axes) % np.pi, np.array(shifts)
 
 
-def test_alignment_is_ten_times_better_than_the_detections() -> None:
+def test_alignment_is_ten_times_more_accurate_than_the_detections() -> None:
     before, after, axes, shifts = moved_cars(60)
     index = np.arange(60)
     found = align_crops(before, after, axes, axes, index, index)
@@ -41,21 +41,21 @@ def test_alignment_is_ten_times_better_than_the_detections() -> None:
     assert np.mean(np.abs(errors) <= 1.645 * found[aligned, 2:]) >= 0.87
 
 
-def test_the_way_back_is_the_way_forth() -> None:
+def test_forward_and_backward_shifts_are_opposite() -> None:
     before, after, axes, _ = moved_cars(10)
     index = np.arange(10)
-    forth = align_crops(before, after, axes, axes, index, index)
-    back = align_crops(after, before, axes, axes, index, index)
-    assert np.allclose(forth[:, :2], -back[:, :2], atol=0.1, equal_nan=True)
+    forward = align_crops(before, after, axes, axes, index, index)
+    backward = align_crops(after, before, axes, axes, index, index)
+    assert np.allclose(forward[:, :2], -backward[:, :2], atol=0.1, equal_nan=True)
 
 
-def test_crops_without_a_picture_do_not_align() -> None:
-    flat = np.full((1, CHIP, CHIP), 100, np.uint8)
+def test_uniform_crops_do_not_align() -> None:
+    flat = np.full((1, CROP_PX, CROP_PX), 100, np.uint8)
     zero = np.zeros(1, np.int64)
     assert np.isnan(align_crops(flat, flat, np.zeros(1), np.zeros(1), zero, zero)).all()
 
 
-def test_a_link_is_aligned_the_same_alone_and_among_others() -> None:
+def test_an_alignment_does_not_depend_on_the_other_links() -> None:
     before, after, axes, _ = moved_cars(8)
     together = align_crops(before, after, axes, axes, np.arange(8), np.arange(8))
     for k in range(8):
@@ -64,7 +64,7 @@ def test_a_link_is_aligned_the_same_alone_and_among_others() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.8, 1.7])
-def test_working_scale_is_undone(scale: float) -> None:
+def test_displacements_are_in_base_pixels_at_any_working_scale(scale: float) -> None:
     from dataclasses import replace
 
     from schemas.flight import TrackingConfig
@@ -81,10 +81,10 @@ def test_working_scale_is_undone(scale: float) -> None:
     assert np.allclose(found["vx_12_px_per_s"], expected, atol=1.0)
 
 
-def test_crops_of_unlike_cars_keep_the_detections_places() -> None:
+def test_crops_of_different_cars_do_not_align() -> None:
     rng = np.random.default_rng(4)
-    one: NDArray[np.uint8] = rng.integers(0, 255, (1, CHIP, CHIP), np.uint8)
-    other: NDArray[np.uint8] = rng.integers(0, 255, (1, CHIP, CHIP), np.uint8)
+    one: NDArray[np.uint8] = rng.integers(0, 255, (1, CROP_PX, CROP_PX), np.uint8)
+    other: NDArray[np.uint8] = rng.integers(0, 255, (1, CROP_PX, CROP_PX), np.uint8)
     zero = np.zeros(1, np.int64)
     found = align_crops(one, other, np.zeros(1), np.zeros(1), zero, zero)
     assert np.isnan(found).all() or found[0, 2] > 0.1

@@ -1,58 +1,56 @@
-"""Displacement of a link below the pixel: the two upright crops of a car aligned to each other (Lucas-Kanade).
+"""Sub-pixel displacement of a link: robust Lucas-Kanade alignment of the two upright crops of a car.
 
-A detection's place is good to about a pixel, which is 4.7 km/h of a segment's speed at 0.23 m and 5 Hz; the same
-car's two pictures say by themselves how far it went, and far better. What makes it work, by measurement on real cars
-moved over their ground:
+A detection's position is accurate to about a pixel, i.e. 4.7 km/h of a segment's speed at 0.23 m and 5 Hz; the
+alignment of the two crops is far more accurate. The method, as tuned on real cars moved over their background:
 
-- only pixels count that lie on the car in both crops, and no rim about it: the ground stands still, and drags;
-- what of the ground is let in, or glints, is an outlier, and is weighed down by Tukey's biweight about the median
-  difference;
-- a blur of half a pixel, no more: without it cubic interpolation of noise pulls towards whole pixels, with more of it
-  the ground is smeared into the car;
-- the start is the whole-pixel shift of least absolute difference, which a glint does not move;
-- both ways round (one crop sought in the other, and the reverse) must agree; their mean is free of the bias that
-  either has.
+- only pixels on the car in both crops have weight, without a margin: the background is stationary and biases the shift;
+- background pixels that remain, and specular reflections, are outliers, downweighted by Tukey's biweight about the
+  median difference;
+- a blur of half a pixel: without it cubic interpolation of noise biases the shift towards whole pixels, with a larger
+  one the background bleeds into the car;
+- the initial value is the integer shift of minimum absolute difference, which is robust to reflections;
+- the alignments forward and backward must agree (consistency check); their mean cancels the bias of either.
 
-Root mean square error an axis, 660 links of 110 cars 14-16 px long, noise of 3-5 grey levels: 0.04-0.07 px; the
-minimum of the sum of absolute differences gave 0.21, normalised correlation 0.29-0.34, plain Lucas-Kanade with a rim
-0.17-0.19. A link that does not align keeps the detections' places and the standard deviation that goes with them.
+Root mean square error along an axis, 660 links of 110 cars 14-16 px long, noise of 3-5 grey levels: 0.04-0.07 px;
+minimum sum of absolute differences 0.21, normalised cross-correlation 0.29-0.34, Lucas-Kanade with a margin and no
+robust weights 0.17-0.19. A link that does not align keeps the displacement of the detections, with its standard
+deviation.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray, IntArray
+from schemas.arrays import ByteArray, FloatArray, IntArray
 
 CAR_LENGTH_PX = 14.0
 CAR_WIDTH_PX = 6.0
-"""What surely lies on a car, working px, of the paper's 16 x 8."""
-RIM_PX = 2.0
-"""Over which the weights fall to zero beyond it."""
+"""Rectangle that lies on a car, working px, of the paper's 16 x 8."""
+TAPER_PX = 2.0
+"""Width over which the weights fall to zero outside the rectangle, working px."""
 BLUR_SIGMA_PX = 0.5
-"""Blur of both crops before they are aligned."""
+"""Standard deviation of the blur of both crops before alignment, working px."""
 MAX_SHIFT_PX = 6
-"""Largest shift searched, working px: some three standard deviations of two places' jitter."""
+"""Largest shift searched, working px: about three standard deviations of the jitter of two positions."""
 MAX_DISAGREEMENT_PX = 0.75
-"""Largest difference of the shifts found both ways round, working px."""
+"""Largest difference of the forward and backward shifts, working px."""
 MIN_SD_PX = 0.03
-"""No alignment is believed better than this, working px: what is left on crops without noise."""
+"""Lower bound of a shift's standard deviation, working px: the error on crops without noise."""
 MIN_PIXELS = 20
-"""Fewer pixels than this on the car in both crops: they do not align."""
-BIWEIGHT = 4.685
-"""Tukey's constant: differences beyond this many standard deviations have no weight."""
-ROUNDS = 15
-"""Gauss-Newton rounds; four to six are usual."""
-FREE_ROUNDS = 4
-"""Rounds in which the weights follow the shift; later they stay, or two sets of weights could take turns for ever."""
-SETTLED_PX = 0.01
-"""A step shorter than this ends them."""
+"""With fewer pixels on the car in both crops there is no alignment."""
+TUKEY_C = 4.685
+"""Constant of Tukey's biweight: differences beyond this many standard deviations have no weight."""
+MAX_ITERATIONS = 15
+"""Gauss-Newton iterations; four to six are typical."""
+REWEIGHTING_ITERATIONS = 4
+"""Iterations in which the weights follow the shift; fixed afterwards, or they could alternate without convergence."""
+CONVERGENCE_PX = 0.01
+"""A step shorter than this ends the iterations."""
 
 
 @dataclass(frozen=True)
-class Chips:
+class UprightCrops:
     """Upright crops of one frame's detections.
 
     Attributes
@@ -60,14 +58,14 @@ class Chips:
     pixels
         (n, side, side) uint8, working px.
     centre_x_px, centre_y_px
-        (n,) places of the crops' centre pixel (side // 2), base px.
+        (n,) positions of the crops' centre pixel (side // 2), base px.
     axis_rad
         (n,) axis of each car.
     scale
         Working px a base px.
     """
 
-    pixels: NDArray[np.uint8]
+    pixels: ByteArray
     centre_x_px: FloatArray
     centre_y_px: FloatArray
     axis_rad: FloatArray
@@ -83,7 +81,7 @@ class Displacements:
     sd_px: FloatArray
 
 
-def refine_links(before: Chips, after: Chips, first: IntArray, second: IntArray) -> Displacements:
+def refine_links(before: UprightCrops, after: UprightCrops, first: IntArray, second: IntArray) -> Displacements:
     """Displacement of each link from its two crops.
 
     Parameters
@@ -91,7 +89,7 @@ def refine_links(before: Chips, after: Chips, first: IntArray, second: IntArray)
     before, after
         Crops of the earlier and the later frame.
     first, second
-        (k,) which detection of each frame a link is made of.
+        (k,) index of each link's detection in the earlier and the later frame.
 
     Returns
     -------
@@ -110,8 +108,8 @@ def refine_links(before: Chips, after: Chips, first: IntArray, second: IntArray)
 
 
 def align_crops(
-    before: NDArray[np.uint8],
-    after: NDArray[np.uint8],
+    before: ByteArray,
+    after: ByteArray,
     axis_before: FloatArray,
     axis_after: FloatArray,
     first: IntArray,
@@ -124,14 +122,14 @@ def align_crops(
     before, after
         (n, side, side) and (m, side, side) uint8, upright crops centred on a car.
     axis_before, axis_after
-        (n,) and (m,) axes, radians; NaN: a disc is weighed in place of a car.
+        (n,) and (m,) axes, radians; NaN: the weights are a disc.
     first, second
-        (k,) which crops a pair is made of.
+        (k,) index of each pair's crop in the earlier and the later frame.
 
     Returns
     -------
     (k, 3) float64
-        x and y of the car in the later crop less those in the earlier one, and the standard deviation of either,
+        Shift of the car from the earlier to the later crop in x and y, and its standard deviation along either axis,
         working px; NaN where the crops do not align.
     """
     radius = int(np.ceil(3 * BLUR_SIGMA_PX))
@@ -162,7 +160,7 @@ def _blur(crop, taps):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _weights(side, axis):  # type: ignore[no-untyped-def]
-    """One on the car, falling to zero over the rim; a disc where the axis is not known."""
+    """One on the car, tapering to zero around it; a disc where the axis is unknown."""
     out = np.zeros((side, side))
     cos, sin = np.cos(axis), np.sin(axis)
     centre = side // 2
@@ -175,13 +173,13 @@ def _weights(side, axis):  # type: ignore[no-untyped-def]
                 beyond = max(
                     abs(dx * cos + dy * sin) - 0.5 * CAR_LENGTH_PX, abs(dy * cos - dx * sin) - 0.5 * CAR_WIDTH_PX
                 )
-            out[y, x] = min(max(1.0 - beyond / RIM_PX, 0.0), 1.0)
+            out[y, x] = min(max(1.0 - beyond / TAPER_PX, 0.0), 1.0)
     return out
 
 
 @njit(cache=True, nogil=True)
 def _car_pixels(weight):  # type: ignore[no-untyped-def]
-    """Rows and columns of the pixels that have weight and neighbours all round."""
+    """Rows and columns of the pixels of positive weight that have all neighbours."""
     side = weight.shape[0]
     rows = np.empty(side * side, np.int64)
     columns = np.empty(side * side, np.int64)
@@ -195,21 +193,21 @@ def _car_pixels(weight):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _whole_shift(template, image, weight, image_weight, rows, columns):  # type: ignore[no-untyped-def]
-    """Whole-pixel shift of least mean absolute difference over what is car in both."""
+def _integer_shift(template, image, weight, image_weight, rows, columns):  # type: ignore[no-untyped-def]
+    """Integer shift of minimum mean absolute difference over the pixels on the car in both."""
     side = template.shape[0]
     best, best_x, best_y = np.inf, 0, 0
-    least = 0.125 * np.sum(weight)
+    min_weight = 0.125 * np.sum(weight)
     for dy in range(-MAX_SHIFT_PX, MAX_SHIFT_PX + 1):
         for dx in range(-MAX_SHIFT_PX, MAX_SHIFT_PX + 1):
             total, weights = 0.0, 0.0
-            for i in range(0, rows.size, 2):  # half of them finds the whole pixel; what follows takes all
+            for i in range(0, rows.size, 2):  # half of the pixels suffices here; the alignment takes all
                 y, x = rows[i] + dy, columns[i] + dx
                 if 0 <= y < side and 0 <= x < side:
                     w = min(weight[rows[i], columns[i]], image_weight[y, x])
                     total += w * abs(image[y, x] - template[rows[i], columns[i]])
                     weights += w
-            if weights > least and total < best * weights:
+            if weights > min_weight and total < best * weights:
                 best, best_x, best_y = total / weights, dx, dy
     return best_x, best_y
 
@@ -227,7 +225,8 @@ def _cubic(t):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _differences(template, image, weight, image_weight, rows, columns, u, v, near, out):  # type: ignore[no-untyped-def]
-    """Rows of (difference, gradient x, gradient y, weight) of what is car in both at this shift; how many."""
+    """Fill ``out`` with (difference, gradient x, gradient y, weight) of the pixels on the car in both at this shift;
+    returns their number."""
     side = template.shape[0]
     ix, iy = int(np.floor(u)), int(np.floor(v))
     cx, cy = _cubic(u - ix), _cubic(v - iy)
@@ -259,14 +258,14 @@ def _differences(template, image, weight, image_weight, rows, columns, u, v, nea
 
 @njit(cache=True, nogil=True)
 def _step(samples):  # type: ignore[no-untyped-def]
-    """One robust Gauss-Newton step, brightness difference eliminated: (step x, step y, variance), NaN where it is not
-    determined."""
+    """One robust Gauss-Newton step with the brightness offset eliminated: (step x, step y, variance); NaN where it is
+    underdetermined."""
     middle = np.median(samples[:, 0])
     spread = 1.4826 * np.median(np.abs(samples[:, 0] - middle)) + 1.0
     s = sx = sy = sd = xx = xy = yy = xd = yd = dd = 0.0
     for i in range(samples.shape[0]):
         d, gx, gy = samples[i, 0] - middle, samples[i, 1], samples[i, 2]
-        e = d / (BIWEIGHT * spread)
+        e = d / (TUKEY_C * spread)
         if abs(e) >= 1:
             continue
         w = samples[i, 3] * (1 - e * e) ** 2
@@ -291,11 +290,12 @@ def _step(samples):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _lucas_kanade(template, image, weight, image_weight, rows, columns, u, v):  # type: ignore[no-untyped-def]
-    """Shift of the template in the image, and its variance; NaN where it leaves the search or does not settle."""
+    """Shift of the template in the image, and its variance; NaN where it leaves the search range or does not
+    converge."""
     samples = np.empty((rows.size, 4))
     near = (0, 0)
-    for count in range(ROUNDS):
-        if count < FREE_ROUNDS:
+    for count in range(MAX_ITERATIONS):
+        if count < REWEIGHTING_ITERATIONS:
             near = (int(np.rint(u)), int(np.rint(v)))
         n = _differences(template, image, weight, image_weight, rows, columns, u, v, near, samples)
         if n < MIN_PIXELS:
@@ -308,7 +308,7 @@ def _lucas_kanade(template, image, weight, image_weight, rows, columns, u, v):  
         v += dv / max(length, 1.0)
         if max(abs(u), abs(v)) > MAX_SHIFT_PX + 0.5:
             break
-        if length < SETTLED_PX:
+        if length < CONVERGENCE_PX:
             return u, v, variance
     return np.nan, np.nan, np.nan
 
@@ -317,20 +317,20 @@ def _lucas_kanade(template, image, weight, image_weight, rows, columns, u, v):  
 def _align_all(before, after, axis_before, axis_after, first, second, taps):  # type: ignore[no-untyped-def]
     out = np.full((first.size, 3), np.nan)
     side = before.shape[1]
-    # Neighbouring residuals of a blurred picture are alike: the variance grows by the blur's footprint.
-    alike = 4 * np.pi * BLUR_SIGMA_PX**2
+    # Neighbouring residuals of a blurred image are correlated: the variance grows by the blur's footprint.
+    correlated_pixels = 4 * np.pi * BLUR_SIGMA_PX**2
     for k in range(first.size):
         a, b = _blur(before[first[k]], taps), _blur(after[second[k]], taps)
         weight_a, weight_b = _weights(side, axis_before[first[k]]), _weights(side, axis_after[second[k]])
         rows_a, columns_a = _car_pixels(weight_a)
         rows_b, columns_b = _car_pixels(weight_b)
-        x, y = _whole_shift(a, b, weight_a, weight_b, rows_a, columns_a)
-        fx, fy, forth = _lucas_kanade(a, b, weight_a, weight_b, rows_a, columns_a, float(x), float(y))
-        bx, by, back = _lucas_kanade(b, a, weight_b, weight_a, rows_b, columns_b, float(-x), float(-y))
+        x, y = _integer_shift(a, b, weight_a, weight_b, rows_a, columns_a)
+        fx, fy, forward = _lucas_kanade(a, b, weight_a, weight_b, rows_a, columns_a, float(x), float(y))
+        bx, by, backward = _lucas_kanade(b, a, weight_b, weight_a, rows_b, columns_b, float(-x), float(-y))
         disagreement = np.hypot(fx + bx, fy + by)
         if not disagreement <= MAX_DISAGREEMENT_PX:  # NaN too
             continue
         out[k, 0] = 0.5 * (fx - bx)
         out[k, 1] = 0.5 * (fy - by)
-        out[k, 2] = np.sqrt(alike * 0.5 * (forth + back) + (0.5 * disagreement) ** 2 + MIN_SD_PX**2)
+        out[k, 2] = np.sqrt(correlated_pixels * 0.5 * (forward + backward) + (0.5 * disagreement) ** 2 + MIN_SD_PX**2)
     return out
