@@ -86,15 +86,15 @@ def _run_stages(work: Work) -> None:
     units = _by_frames(work.plan, graphs.detections_graph)
     detections = work.run("detections", units, after=[detector], beside=registered)
 
-    links = work.run("links", _by_frames(work.plan, graphs.links_graph), beside=detections, halo=1)
-    chain = [Unit(graphs.WHOLE, _bound(graphs.tracklets_graph, work.plan, work.plan.units))]
-    tracklets = work.run("tracklets", chain, after=[links], essential=True)
+    tracklets = work.run("tracklets", _by_frames(work.plan, graphs.tracklets_graph), beside=detections, halo=1)
+    chain = [Unit(graphs.WHOLE, _bound(graphs.tracks_graph, work.plan, work.plan.units))]
+    tracks = work.run("tracks", chain, after=[tracklets], essential=True)
 
     lay_out_field(work.plan)
     groups = [
         Unit(group_name(group), _bound(graphs.field_graph, work.plan, group)) for group in field_groups(work.plan)
     ]
-    field = work.run("field", groups, after=[tracklets], essential=True)
+    field = work.run("field", groups, after=[tracks], essential=True)
     work.run("maps", _whole(work.plan, graphs.maps_graph), after=[field], essential=True)
 
 

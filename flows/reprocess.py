@@ -36,8 +36,8 @@ from velfield.run.run import Run, open_run
 MAX_ADDED_ERROR_PX = 1.0
 """A new base image that lies on the old one worse than this, in the mean, has the frames registered again."""
 
-_SHARED = ("frames", "lens", "registration", "detector", "links")
-"""Stages that no new base image touches, apart from what stands in ``base/``; of the links only the counts are told."""
+_SHARED = ("frames", "lens", "registration", "detector", "tracklets")
+"""Stages that no new base image touches, apart from what stands in ``base/``; of the tracklets only counts are kept."""
 
 
 def run_reprocess(
@@ -127,7 +127,7 @@ def _again(run: Run, job: Job, runner: RunnerConfig, console: Console) -> RunSum
 
 def _mapped(run: Run, job: Job, found: RebaseRecord, runner: RunnerConfig, console: Console) -> RunSummary:
     layout = RunLayout(Path(job.root))
-    share(run.layout, layout, _SHARED, without=("base/", "links/"))
+    share(run.layout, layout, _SHARED, without=("base/", "tracklets/"))
     sweep_partial(layout.root)
     plan = rebased_plan(run, job, found)
     write_flight_record(plan)
@@ -152,12 +152,12 @@ def _run_stages(work: Work, rebase: Rebase) -> None:
         for frames in plan.units
     ]
     work.run("detections", cars, after=[image], essential=True)
-    work.carry_over("links")
-    chain = [Unit("all", lambda: graphs.rebase_tracklets_graph(plan, rebase))]
-    tracklets = work.run("tracklets", chain, after=[image], essential=True)
+    work.carry_over("tracklets")
+    chain = [Unit("all", lambda: graphs.rebase_tracks_graph(plan, rebase))]
+    tracks = work.run("tracks", chain, after=[image], essential=True)
     lay_out_field(plan)
     groups = [
         Unit(group_name(group), lambda group=group: graphs.field_graph(plan, group)) for group in field_groups(plan)
     ]
-    field = work.run("field", groups, after=[tracklets], essential=True)
+    field = work.run("field", groups, after=[tracks], essential=True)
     work.run("maps", [Unit("all", lambda: graphs.maps_graph(plan))], after=[field], essential=True)

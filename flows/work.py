@@ -28,8 +28,8 @@ _LABELS = {
     "registration": "registration",
     "detector": "detector",
     "detections": "detections",
-    "links": "links",
     "tracklets": "tracklets",
+    "tracks": "tracks",
     "field": "field",
     "maps": "maps",
 }

@@ -53,9 +53,9 @@ def field_run(
 ) -> Run:
     """Write what a field needs, build it as the pipeline does, open it."""
     layout = RunLayout(root)
-    for folder in (layout.tracklets, layout.base):
+    for folder in (layout.tracks, layout.base):
         folder.mkdir(parents=True)
-    write_table(layout.tracklets / "unit-00000.parquet", tracklets, TRACKLET_COLUMNS)
+    write_table(layout.tracks / "unit-00000.parquet", tracklets, TRACKLET_COLUMNS)
     grid = GridRecord(width_px=shape[1], height_px=shape[0], gsd_m=gsd_m, how="given", reference_frame=0)
     layout.grid.write_text(grid.model_dump_json())
     cv2.imwrite(str(layout.base_image), np.full(shape, 90, np.uint8))

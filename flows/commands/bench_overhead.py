@@ -108,8 +108,17 @@ def _bare(job: "Job", workers: int) -> Cost:
 def _stages(plan: "Plan", pool: Executor) -> None:
     """The stages in the order of `flows.process_flight`, each on the pool."""
     from velfield.pipeline.stages import base_image as base
-    from velfield.pipeline.stages import detections, detector, field, frames, lens, maps, registration
-    from velfield.pipeline.stages import tracklets as tracking
+    from velfield.pipeline.stages import (
+        detections,
+        detector,
+        field,
+        frames,
+        lens,
+        maps,
+        registration,
+        tracklets,
+        tracks,
+    )
 
     frames.lay_out_frames(plan)
     _by_unit(plan, pool, "frames", frames.read_unit)
@@ -122,8 +131,8 @@ def _stages(plan: "Plan", pool: Executor) -> None:
     _by_blocks(plan, pool, "registration", base.key_points_of, registration.register_unit)
     _whole(plan, pool, "detector", detector.make_detector)
     _by_blocks(plan, pool, "detections", detections.detect_block, detections.write_detections)
-    _by_unit(plan, pool, "links", tracking.link_unit)
-    _whole(plan, pool, "tracklets", tracking.chain_passages, plan.units)
+    _by_unit(plan, pool, "tracklets", tracklets.link_unit)
+    _whole(plan, pool, "tracks", tracks.chain_tracks, plan.units)
     field.lay_out_field(plan)
     groups = field.field_groups(plan)
     names = [field.group_name(group) for group in groups]

@@ -39,7 +39,7 @@ def _stages(root: Path, frames: int, unit: Any) -> int:
     work = Work(plan, ThreadsRunner(2), Console("quiet"))
     before: Stage | None = None
     count = 0
-    for stage in ("frames", "registration", "detections", "links"):
+    for stage in ("frames", "registration", "detections", "tracklets"):
         units = [
             Unit(unit_name(part), lambda part=part, stage=stage: delayed(_commit, pure=False)(plan, stage, part))
             for part in plan.units

@@ -49,7 +49,7 @@ def _plan(root: Path, shape: tuple[int, int], tracklets: Any) -> Any:
     plan = planned(FRAMES, root, WIDTH, HEIGHT)
     grid = GridRecord(width_px=shape[1], height_px=shape[0], gsd_m=GSD_M, how="given", reference_frame=0)
     write_atomically(plan.layout.grid, grid.model_dump_json().encode())
-    write_table(plan.layout.unit_file(plan.layout.tracklets, 0, ".parquet"), tracklets, TRACKLET_COLUMNS)
+    write_table(plan.layout.unit_file(plan.layout.tracks, 0, ".parquet"), tracklets, TRACKLET_COLUMNS)
     return plan
 
 

@@ -79,7 +79,7 @@ def test_a_worker_killed_in_mid_chunk_on_a_cluster_by_class(
     """Only detection onward is done: all before it is taken from the whole run."""
     root = tmp_path / "run"
     shutil.copytree(whole[0], root)
-    for stage in ("detections", "links", "tracklets", "field", "maps"):
+    for stage in ("detections", "tracklets", "tracks", "field", "maps"):
         shutil.rmtree(root / "commits" / stage)
     asked = {"cluster_class": "distributed.LocalCluster", "workers": 2}
     asked["cluster_kwargs"] = {"n_workers": 0, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0"}

@@ -28,7 +28,15 @@ def test_it_leaves_what_the_contract_says(whole: tuple[Path, RunSummary]) -> Non
     assert [stage.name for stage in summary.stages] == list(STAGES)
     assert summary.complete
     names = ("flight.json", "frames.zarr", "camera.json", "base/grid.json", "base/base_image.png", "registration.zarr")
-    names += ("detector.json", "detections", "tracklets", "field.zarr", "maps/direction.png", "maps/speed.png")
+    names += (
+        "detector.json",
+        "detections",
+        "tracklets",
+        "tracks",
+        "field.zarr",
+        "maps/direction.png",
+        "maps/speed.png",
+    )
     names += ("maps/direction.tif", "maps/speed.tif", "index.html", "commits")
     assert [name for name in names if not (root / name).exists()] == []
 
@@ -97,7 +105,7 @@ def test_a_changed_gate_redoes_tracking_onward(whole: tuple[Path, RunSummary], f
     root = tmp_path / "copy"
     shutil.copytree(whole[0], root)
     changed = process(job(flight, root, "tracking.max_speed_m_per_s=5"))
-    assert redone(changed) == ["links", "tracklets", "field", "maps"]
+    assert redone(changed) == ["tracklets", "tracks", "field", "maps"]
     velocities = open_run(root).tracklets()[["vx_01_px_per_s", "vy_01_px_per_s"]]
     speeds = np.hypot(*velocities.to_numpy().T) * 0.23
     assert np.quantile(speeds, 0.99) < 10.5  # 5 m/s and what jitter adds
@@ -209,7 +217,7 @@ def test_detections_of_another_detector_take_the_place_of_ours(
     summary = process(job(flight, tmp_path / "run", detections=str(tmp_path / "boxes.csv")))
     counts = {stage.name: stage.counts for stage in summary.stages}
     assert counts["detections"]["cars"] == pytest.approx(inside.sum(), rel=0.02)
-    assert counts["tracklets"]["passages"] > 20
+    assert counts["tracks"]["tracks"] > 20
     assert "another program's boxes" in next(stage.text for stage in summary.stages if stage.name == "detector")
 
 
@@ -224,7 +232,7 @@ def test_boxes_of_few_frames_what_is_not_used_and_why_the_maps_stay_empty_are_to
     warned = {stage.name: stage.warnings for stage in summary.stages}
     assert any("boxes in 1 of the" in line for line in warned["detector"])
     assert any("--labels not used" in line for line in warned["detector"])
-    (told,) = warned["tracklets"]
+    (told,) = warned["tracks"]
     assert "no tracklets, so the maps stay empty" in told
     assert "--set tracking.max_interval_s=0." in told
 

@@ -72,7 +72,7 @@ def test_no_frame_is_looked_at_again(mapped: tuple[Path, RunSummary]) -> None:
         "lens",
         "registration",
         "detector",
-        "links",
+        "tracklets",
     ]
 
 

@@ -235,8 +235,8 @@ _BLINKS = """if True:
     prepare_process(verbose=False)
     from pathlib import Path
     from tests.small_flight import job, process
-    from velfield.pipeline.stages import tracklets as tracking
-    true, calls = tracking.link_unit, []
+    from velfield.pipeline.stages import tracklets
+    true, calls = tracklets.link_unit, []
 
     def blinks(plan, frames):
         calls.append(frames)
@@ -244,7 +244,7 @@ _BLINKS = """if True:
             raise OSError("the disk blinked")
         return true(plan, frames)
 
-    tracking.link_unit = blinks
+    tracklets.link_unit = blinks
     process(job(Path(sys.argv[1]), Path(sys.argv[2])))
 """
 
@@ -255,7 +255,7 @@ def test_the_ui_shows_graph_retry_and_artifacts(
     """In a real browser: the graph drawn, a task that was tried twice shown so, the summary with its maps."""
     root = tmp_path / "blinks"
     shutil.copytree(whole[0], root)
-    (root / "commits/links/000008-000015.json").unlink()
+    (root / "commits/tracklets/000008-000015.json").unlink()
     environment = {**os.environ, "PREFECT_API_URL": f"{served.url}/api", "PYTHONPATH": str(ROOT)}
     subprocess.run([sys.executable, "-c", _BLINKS, str(flight), str(root)], env=environment, check=True)
     (run,) = served.ask("/flow_runs/filter", {"flow_runs": {"name": {"any_": [str(root)]}}})

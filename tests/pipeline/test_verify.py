@@ -51,7 +51,7 @@ def test_a_whole_run_is_whole(copy: Path, capsys: pytest.CaptureFixture[str]) ->
 def test_every_file_of_the_stores_and_tables_is_in_a_record(copy: Path) -> None:
     on_disk = {
         path.relative_to(copy).as_posix()
-        for folder in ("frames.zarr", "registration.zarr", "field.zarr", "base", "detections", "links", "tracklets")
+        for folder in ("frames.zarr", "registration.zarr", "field.zarr", "base", "detections", "tracklets", "tracks")
         for path in (copy / folder).rglob("*")
         if path.is_file()
     }
@@ -69,7 +69,7 @@ def test_every_one_of_200_flipped_bits_is_found(copy: Path) -> None:
 
 def test_what_is_gone_or_was_never_done_is_told(copy: Path) -> None:
     (copy / "frames.zarr/raw/c/5/0/0").unlink()
-    commit_path(RunLayout(copy), "links", "000008-000015").unlink()
+    commit_path(RunLayout(copy), "tracklets", "000008-000015").unlink()
     assert found(copy) == {"frames.zarr/raw/c/5/0/0": "gone", "links 000008-000015": "not finished"}
 
 
@@ -99,7 +99,7 @@ def test_only_the_damaged_units_are_done_again_and_come_out_the_same(
 ) -> None:
     before = {path: path.stat().st_mtime_ns for path in (copy / "commits").rglob("*.json")}
     rng = np.random.default_rng(1)
-    for name in ("frames.zarr/raw/c/3/0/0", "registration.zarr/vector/c/1/0", "tracklets/unit-00000.parquet"):
+    for name in ("frames.zarr/raw/c/3/0/0", "registration.zarr/vector/c/1/0", "tracks/unit-00000.parquet"):
         flip_a_bit(copy / name, rng)
     (copy / "frames.zarr/raw/c/17/0/0").unlink()
     assert verify(copy) == 3
@@ -109,7 +109,7 @@ def test_only_the_damaged_units_are_done_again_and_come_out_the_same(
     again = {
         path.relative_to(copy / "commits").as_posix() for path in before if path.stat().st_mtime_ns != before[path]
     }
-    units = ("frames/000000-000007", "frames/000016-000017", "registration/000008-000015", "tracklets/all")
+    units = ("frames/000000-000007", "frames/000016-000017", "registration/000008-000015", "tracks/all")
     assert again == {f"{unit}.json" for unit in units}
 
 

@@ -10,7 +10,7 @@ from velfield.run.field_writer import GROUP_TILES
 from velfield.run.layout import STAGES
 from velfield.run.paths import is_remote
 
-_PER_FRAME = ("frames", "registration", "detections", "links")
+_PER_FRAME = ("frames", "registration", "detections", "tracklets")
 _FRAME_COMPRESSION = 0.8
 """Zstandard leaves about this much of a noisy grey frame."""
 _BYTES_A_DETECTION_FRAME = 150_000

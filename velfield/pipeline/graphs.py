@@ -12,8 +12,8 @@ frames from the store, and only key points, tables and patches go from node to n
     registration   key points of each block  ->  the chain over the unit's frames  ->  commit
     detector       spread windows of three frames: labels, training                ->  commit
     detections     cars of each block        ->  one table, its patches            ->  commit
-    links          three-frame windows over the unit's frames and the halo after   ->  commit
-    tracklets      passages over all units                                         ->  commit
+    tracklets      three-frame windows over the unit's frames and the halo after   ->  commit
+    tracks         the tracks of vehicles over all units                           ->  commit
     field          the tiles of one group, from the segment table                  ->  commit
     maps           figures, GIS layers, the report                                 ->  commit
 """
@@ -107,20 +107,20 @@ def detections_graph(plan: Plan, frames: range) -> Graph:
     return _committed(node, "detections", unit_name(frames), _node(write_detections, node, frames, blocks))
 
 
-def links_graph(plan: Plan, frames: range) -> Graph:
+def tracklets_graph(plan: Plan, frames: range) -> Graph:
     """Windows of three frames that start in this unit."""
     from velfield.pipeline.stages.tracklets import link_unit
 
     node = _plan_node(plan)
-    return _committed(node, "links", unit_name(frames), _node(link_unit, node, frames))
+    return _committed(node, "tracklets", unit_name(frames), _node(link_unit, node, frames))
 
 
-def tracklets_graph(plan: Plan, units: list[range]) -> Graph:
-    """Chain tracklets that share detections into passages."""
-    from velfield.pipeline.stages.tracklets import chain_passages
+def tracks_graph(plan: Plan, units: list[range]) -> Graph:
+    """Chain tracklets that share detections into tracks."""
+    from velfield.pipeline.stages.tracks import chain_tracks
 
     node = _plan_node(plan)
-    return _committed(node, "tracklets", WHOLE, _node(chain_passages, node, units))
+    return _committed(node, "tracks", WHOLE, _node(chain_tracks, node, units))
 
 
 def field_graph(plan: Plan, group: tuple[int, int]) -> Graph:
@@ -155,9 +155,9 @@ def rebase_detections_graph(plan: Plan, frames: range, rebase: "Rebase") -> Grap
     return _committed(node, "detections", unit_name(frames), _node(rebase_detections, node, frames, _constant(rebase)))
 
 
-def rebase_tracklets_graph(plan: Plan, rebase: "Rebase") -> Graph:
+def rebase_tracks_graph(plan: Plan, rebase: "Rebase") -> Graph:
     """All tracklets, mapped onto the new base image."""
-    from velfield.pipeline.stages.rebase import rebase_tracklets
+    from velfield.pipeline.stages.rebase import rebase_tracks
 
     node = _plan_node(plan)
-    return _committed(node, "tracklets", WHOLE, _node(rebase_tracklets, node, _constant(rebase)))
+    return _committed(node, "tracks", WHOLE, _node(rebase_tracks, node, _constant(rebase)))

@@ -29,7 +29,7 @@ _BY_FRAMES = {
     "frames": graphs.frames_graph,
     "registration": graphs.registration_graph,
     "detections": graphs.detections_graph,
-    "links": graphs.links_graph,
+    "tracklets": graphs.tracklets_graph,
 }
 _WHOLE = {
     "lens": graphs.lens_graph,
@@ -55,8 +55,8 @@ def _units(plan: Plan, stage: str) -> list[graphs.Graph]:
         return [_BY_FRAMES[stage](plan, unit) for unit in plan.units]
     if stage in _WHOLE:
         return [_WHOLE[stage](plan)]
-    if stage == "tracklets":
-        return [graphs.tracklets_graph(plan, plan.units)]
+    if stage == "tracks":
+        return [graphs.tracks_graph(plan, plan.units)]
     return [graphs.field_graph(plan, group) for group in field_groups(plan)]
 
 

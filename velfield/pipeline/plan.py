@@ -200,9 +200,9 @@ def stage_keys(config: FlightConfig, inputs: InputsRecord) -> dict[str, str]:
         [inputs.labels, inputs.detector, inputs.detections],
     )
     key("detections", [config.detection], ["detector"])
-    key("links", [config.tracking], ["detections"])
-    key("tracklets", [], ["links"])
-    key("field", [config.field], ["tracklets"])
+    key("tracklets", [config.tracking], ["detections"])
+    key("tracks", [], ["tracklets"])
+    key("field", [config.field], ["tracks"])
     key("maps", [], ["field"])
     assert tuple(keys) == STAGES
     return keys

@@ -12,8 +12,8 @@ _LINES: dict[str, str] = {
     "registration": "{registered:.0f} of {frames:.0f} frames registered, held-out residual {heldout_px:.2f} px",
     "detector": "{labels:.0f} cars to learn from, threshold {threshold:.3f}",
     "detections": "{cars:.0f} cars in {frames:.0f} frames",
-    "links": "{tracklets:.0f} tracklets over three frames",
-    "tracklets": "{passages:.0f} vehicles going by in {tracklets:.0f} tracklets",
+    "tracklets": "{tracklets:.0f} tracklets over three frames",
+    "tracks": "{tracks:.0f} vehicle tracks from {tracklets:.0f} tracklets",
     "field": "vehicles passed {pixels:.0f} pixels, 5 or more vehicles {pixels_5:.0f} of them",
     "maps": "{maps:.0f} maps",
 }

@@ -12,7 +12,7 @@ from velfield.run.commits import commit_path, digest_file, read_commits
 from velfield.run.layout import STAGES, RunLayout
 from velfield.run.paths import remove_tree
 
-_BY_FRAMES = ("registration", "detections", "links")
+_BY_FRAMES = ("registration", "detections", "tracklets")
 """Stages that are cut as the frames are."""
 _STORES = {"frames": "frames.zarr", "registration": "registration.zarr", "field": "field.zarr"}
 _THREADS = min(4, os.cpu_count() or 1)

@@ -9,8 +9,8 @@ STAGE_VERSIONS: dict[str, int] = {
     "registration": 4,
     "detector": 16,
     "detections": 8,
-    "links": 1,
-    "tracklets": 3,
+    "tracklets": 1,
+    "tracks": 3,
     "field": 3,
     "maps": 4,
 }

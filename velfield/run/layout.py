@@ -5,7 +5,7 @@ from pathlib import Path
 
 from velfield.run.paths import place
 
-STAGES = ("frames", "lens", "base", "registration", "detector", "detections", "links", "tracklets", "field", "maps")
+STAGES = ("frames", "lens", "base", "registration", "detector", "detections", "tracklets", "tracks", "field", "maps")
 """The stages in the order of the work."""
 
 
@@ -99,13 +99,14 @@ class RunLayout:
         return self.root / "detections"
 
     @property
-    def links(self) -> Path:
-        """Tracklets by unit, before tracklets that share detections are chained into passages."""
-        return self.root / "links"
+    def tracklets(self) -> Path:
+        """Tracklets by unit, before those that share detections are chained into tracks."""
+        return self.root / "tracklets"
 
     @property
-    def tracklets(self) -> Path:
-        return self.root / "tracklets"
+    def tracks(self) -> Path:
+        """Tracklets by unit, each with the track of the vehicle that it belongs to."""
+        return self.root / "tracks"
 
     @property
     def field(self) -> Path:

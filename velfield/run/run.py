@@ -113,7 +113,7 @@ class Run:
 
     def tracklets(self) -> pd.DataFrame:
         """All tracklets, in base pixels: the columns of ``schemas.tables.TRACKLET_COLUMNS``."""
-        return read_tables(sorted(self.layout.tracklets.glob("unit-*.parquet")), TRACKLET_COLUMNS)
+        return read_tables(sorted(self.layout.tracks.glob("unit-*.parquet")), TRACKLET_COLUMNS)
 
     def segments(self) -> Segments:
         """Vehicles from one frame to the next, each once: by passage and time (`velfield.field.segments`)."""

@@ -134,7 +134,7 @@ def _segments_near(plan: Plan, writer: GroupWriter) -> Segments:
 
 def _tracklets_near(plan: Plan, x0: int, y0: int, width: int, height: int, margin: float) -> pd.DataFrame:
     """All tracklets of the passages that come near the group: whole ones, for a passage shares one unit at a pixel."""
-    paths = sorted(plan.layout.tracklets.glob("unit-*.parquet"))
+    paths = sorted(plan.layout.tracks.glob("unit-*.parquet"))
     table = read_tables(paths, TRACKLET_COLUMNS, only=_SEGMENT_COLUMNS)
     xs = table[[f"x_{k}_px" for k in range(3)]].to_numpy()
     ys = table[[f"y_{k}_px" for k in range(3)]].to_numpy()

@@ -99,7 +99,7 @@ def _rebased_keys(old: FlightRecord, inputs: InputsRecord) -> dict[str, str]:
     keys = dict(old.keys)
     base = content_key("base", STAGE_VERSIONS["base"], parameters=["mapped"], inputs=[keys["base"], inputs.base])
     keys["base"] = base
-    for stage in ("detections", "tracklets", "field", "maps"):
+    for stage in ("detections", "tracks", "field", "maps"):
         keys[stage] = content_key(stage, STAGE_VERSIONS[stage], inputs=[keys[stage], base])
     return keys
 
@@ -165,17 +165,17 @@ def rebase_detections(plan: Plan, frames: range, rebase: Rebase) -> Outcome:
     return Outcome([path, linked], {"frames": float(table["frame"].nunique()), "cars": float(len(table))})
 
 
-def rebase_tracklets(plan: Plan, rebase: Rebase) -> Outcome:
+def rebase_tracks(plan: Plan, rebase: Rebase) -> Outcome:
     """Map all tracklets, unit by unit."""
-    transform, written, passages, count = polyprojective_of(rebase.record.transform), [], set[int](), 0
-    for source in sorted(rebase.old.tracklets.glob("unit-*.parquet")):
+    transform, written, tracks, count = polyprojective_of(rebase.record.transform), [], set[int](), 0
+    for source in sorted(rebase.old.tracks.glob("unit-*.parquet")):
         table = mapped_tracklets(read_tables([source], TRACKLET_COLUMNS), transform)
-        written.append(plan.layout.tracklets / source.name)
+        written.append(plan.layout.tracks / source.name)
         write_table(written[-1], table, TRACKLET_COLUMNS)
-        passages.update(table["passage_id"].unique().tolist())
+        tracks.update(table["passage_id"].unique().tolist())
         count += len(table)
-    advance("tracklets")
-    return Outcome(written, {"tracklets": float(count), "passages": float(len(passages))})
+    advance("tracks")
+    return Outcome(written, {"tracklets": float(count), "tracks": float(len(tracks))})
 
 
 def mapped_detections(table: pd.DataFrame, transform: PolyprojectiveTransform) -> pd.DataFrame:

@@ -93,7 +93,7 @@ def _facts(plan: Plan, counts: dict[str, dict[str, float]]) -> list[tuple[str, s
         ("registered", f"{registered:.0f} of {frames:.0f} frames"),
         ("residual", f"{counts['registration'].get('heldout_px', float('nan')):.2f} px held out"),
         ("cars found", f"{counts['detections'].get('cars', 0):.0f}"),
-        ("vehicles going by", f"{counts['tracklets'].get('passages', 0):.0f}"),
+        ("vehicle tracks", f"{counts['tracks'].get('tracks', 0):.0f}"),
         ("of the map, passed by vehicles", percent(pixels, grid.width_px * grid.height_px)),
         ("of that, by 5 or more", percent(field.get("pixels_5", 0), pixels)),
     ]
@@ -131,8 +131,8 @@ def _curve(plan: Plan) -> PrecisionRecall | None:
 
 
 def _gates(stages: Sequence[StageSummary]) -> dict[str, int]:
-    links = next(stage for stage in stages if stage.name == "links")
-    return {name.removeprefix("gate_"): int(count) for name, count in links.counts.items() if name.startswith("gate_")}
+    counts = next(stage.counts for stage in stages if stage.name == "tracklets")
+    return {name.removeprefix("gate_"): int(count) for name, count in counts.items() if name.startswith("gate_")}
 
 
 def _files(plan: Plan) -> list[tuple[str, str]]:

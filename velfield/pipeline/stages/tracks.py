@@ -1,0 +1,65 @@
+"""The tracks of vehicles: tracklets of the whole flight that share detections, chained."""
+
+from pathlib import Path
+
+import numpy as np
+
+from schemas.tables import TRACKLET_COLUMNS
+from velfield.pipeline.plan import Plan, widen_interval
+from velfield.pipeline.progress import advance
+from velfield.pipeline.result import Outcome
+from velfield.pipeline.stages.registration import usable_frames
+from velfield.run.grid import read_grid
+from velfield.run.stores import open_frames
+from velfield.run.tables import read_tables, write_table
+from velfield.tracking.gap_closing import END_COLUMNS, GapLimits, reconnect_tracks
+from velfield.tracking.tracks import assign_tracks
+
+
+def tracklet_files(plan: Plan, units: list[range]) -> list[Path]:
+    """Tables of the units that are there, in order."""
+    paths = [
+        plan.layout.unit_file(plan.layout.tracklets, frames.start // plan.unit_frames, ".parquet") for frames in units
+    ]
+    return [path for path in paths if path.exists()]
+
+
+def chain_tracks(plan: Plan, units: list[range]) -> Outcome:
+    """Give every tracklet the track that it belongs to: reads a few columns of all units, writes unit by unit."""
+    ids = [f"detection_id_{k}" for k in range(3)]
+    sources = tracklet_files(plan, units)
+    tracklets = read_tables(sources, TRACKLET_COLUMNS, only=[*ids, *END_COLUMNS])
+    tracks = assign_tracks(tracklets[ids].to_numpy(np.int64))
+    config = plan.config.tracking
+    gaps = GapLimits(config.join_gap_s, config.join_standing_gap_s, config.slow_m_per_s)
+    tracks = reconnect_tracks(tracklets, tracks, gaps, gsd_m=read_grid(plan.layout).gsd_m)
+    written, start = [], 0
+    for path in sources:
+        table = read_tables([path], TRACKLET_COLUMNS)
+        table["passage_id"] = tracks[start : start + len(table)]
+        start += len(table)
+        target = plan.layout.tracks / path.name
+        write_table(target, table, TRACKLET_COLUMNS)
+        written.append(target)
+    advance("tracks")
+    warnings = [] if len(tracks) else [_why_none(plan)]
+    return Outcome(written, {"tracklets": len(tracks), "tracks": len(np.unique(tracks))}, warnings=warnings)
+
+
+def _why_none(plan: Plan) -> str:
+    """Why no car was followed, so that the maps stay empty, and what to do."""
+    told, near_s = "no tracklets, so the maps stay empty", plan.config.tracking.max_interval_s
+    times_s = open_frames(plan.layout.frames).column("time_s")[usable_frames(plan)]
+    if len(times_s) < 3:
+        return f"{told}: {len(times_s)} frames are registered well enough, 3 or more needed; see registration's notes"
+    gaps = np.diff(times_s)
+    near = gaps <= near_s
+    if (near[1:] & near[:-1]).any():
+        return (
+            f"{told}: no find goes on over three frames as a car does; see in the page whether what is found is cars, "
+            "and else mark one frame and give it with --labels"
+        )
+    return (
+        f"{told}: no three registered frames come within tracking.max_interval_s = {near_s:g} s of one another (median "
+        f"{np.median(gaps):.2f} s); {widen_interval(gaps)}"
+    )
