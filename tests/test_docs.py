@@ -1,4 +1,4 @@
-"""Every command and snippet of the documentation, run on a small flight or, where that would take long, understood.
+"""Every command and snippet of the documentation, run on a small flight or, where that would take long, parsed.
 
 The words VIDEO, RUN, ... of the pages are replaced by what the test has.
 """
@@ -9,6 +9,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+import yaml
 
 from flows.cli import app
 from schemas.summary import RunSummary
@@ -16,10 +17,12 @@ from tests.media import drifting, write_video
 from velfield.pipeline.configuration import resolve_config
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+DOCS = sorted((ROOT / "docs").rglob("*.md"))
+PAGES = [ROOT / "README.md", *DOCS]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+BARE_DECIMAL = re.compile(r"(?<![\w.)\]*/])\.\d")
 QUICK = {"schema", "config", "export", "init", "lineage", "verify"}
-"""Commands that are run; the others take minutes, or wait for a person: of those the line must be understood."""
+"""Commands that are run; the others take minutes, or wait for a person: their lines must parse."""
 
 
 def blocks(language: str) -> list[tuple[str, str]]:
@@ -42,8 +45,8 @@ def commands() -> list[tuple[str, str]]:
 
 
 @pytest.fixture
-def place(whole: tuple[Path, RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A working folder with what the pages speak of."""
+def folder(whole: tuple[Path, RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder with the files that the pages name."""
     shutil.copytree(whole[0], tmp_path / "RUN")  # the commands write into it
     write_video(tmp_path / "VIDEO.mp4", list(drifting(30)))
     monkeypatch.chdir(tmp_path)
@@ -60,18 +63,18 @@ def test_the_pages_have_commands_and_snippets() -> None:
 
 
 @pytest.mark.parametrize(("page", "line"), commands())
-def test_a_command_of_the_pages(page: str, line: str, place: Path) -> None:
-    asked = words(line)
-    app.parse_args(asked, exit_on_error=False, print_error=False)
-    if asked[0] in QUICK or "--plan" in asked:
-        assert app(asked, result_action="return_value", exit_on_error=False) == 0
+def test_a_command_of_the_pages(page: str, line: str, folder: Path) -> None:
+    arguments = words(line)
+    app.parse_args(arguments, exit_on_error=False, print_error=False)
+    if arguments[0] in QUICK or "--plan" in arguments:
+        assert app(arguments, result_action="return_value", exit_on_error=False) == 0
 
 
 @pytest.mark.parametrize(("page", "text"), blocks("python"))
-def test_a_snippet_of_the_pages(page: str, text: str, place: Path) -> None:
+def test_a_snippet_of_the_pages(page: str, text: str, folder: Path) -> None:
     names: dict[str, object] = {"xy": [[100.0, 100.0]], "v": [[10.0, 0.0]]}
     exec(compile(text, page, "exec"), names)
-    assert names.keys() - {"xy", "v", "__builtins__"}, "it says nothing, not even an import"
+    assert names.keys() - {"xy", "v", "__builtins__"}, "the snippet defines nothing, not even an import"
 
 
 @pytest.mark.parametrize(("page", "text"), blocks("yaml"))
@@ -81,7 +84,7 @@ def test_a_configuration_of_the_pages(page: str, text: str, tmp_path: Path) -> N
     assert resolve_config(file=file) != resolve_config(), "it changes nothing"
 
 
-def test_links_between_the_pages_lead_somewhere() -> None:
+def test_links_between_the_pages_resolve() -> None:
     missing = [
         f"{page.name}: {target}"
         for page in PAGES
@@ -89,3 +92,14 @@ def test_links_between_the_pages_lead_somewhere() -> None:
         if not (page.parent / target).exists()
     ]
     assert missing == []
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    navigation = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
+    assert sorted(file for entry in navigation for file in entry.values()) == [page.name for page in DOCS]
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md"], ids=lambda page: page.name)
+def test_decimals_have_a_leading_zero(page: Path) -> None:
+    prose = BLOCK.sub("", page.read_text())
+    assert [line for line in prose.splitlines() if BARE_DECIMAL.search(re.sub(r"`[^`]*`", "", line))] == []
