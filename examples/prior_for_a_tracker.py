@@ -16,7 +16,7 @@ from scipy.spatial.distance import cdist
 
 from schemas.flight import FieldConfig
 from schemas.simulation import SimulationConfig
-from velfield.field.bins import VelocityBins, band_radius_px, standing_px_per_s
+from velfield.field.bins import VelocityBins, band_radius_px, stationary_speed_px_per_s
 from velfield.field.segments import segment_table
 from velfield.field.view import VelocityField
 from velfield.synthetic.flight import Flight
@@ -48,7 +48,7 @@ def learn(flight: Flight, until_s: float, rng: np.random.Generator) -> VelocityF
         tile_size=16,  # places are asked for all over the map, and small tiles are made quickly
         bins=VelocityBins.from_config(config, GSD_M),
         radius_px=band_radius_px(config, GSD_M),
-        standing_px_per_s=standing_px_per_s(config, GSD_M),
+        stationary_speed_px_per_s=stationary_speed_px_per_s(config, GSD_M),
     )
 
 

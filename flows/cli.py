@@ -3,15 +3,16 @@
 import os
 import shlex
 import sys
+import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 
 from flows.launch import limit_threads
-from flows.options import Preset, Settings, frame_size
+from flows.options import Preset, Settings, frame_size, renamed_option
 from flows.stopping import STOPPED, as_ctrl_c, leave
-from velfield.errors import InputError
+from velfield.errors import InputError, OldNameWarning
 
 if TYPE_CHECKING:
     from flows.console import Console, Verbosity
@@ -80,7 +81,8 @@ def run(
     every: str | None = None,
     start_s: float | None = None,
     stop_s: float | None = None,
-    time_slice: Annotated[str | None, Parameter(name="--slice")] = None,
+    intervals: str | None = None,
+    old_intervals: Annotated[str | None, Parameter(name="--slice", show=False)] = None,
     workers: int | None = None,
     scheduler: str | None = None,
     cluster: Path | None = None,
@@ -124,8 +126,8 @@ def run(
         Leave out what comes before, seconds from the first frame.
     stop_s
         Leave out what comes at or after, seconds from the first frame.
-    time_slice
-        Fields of slices of time besides: `15min`, or `07:00-09:00,15:00-18:00`, or seconds `0-300,300-600`.
+    intervals
+        A field for each time interval too: `15min`, or `07:00-09:00,15:00-18:00`, or seconds `0-300,300-600`.
     workers
         Processes of a local cluster. Default: threads of this process.
     scheduler
@@ -150,7 +152,7 @@ def run(
         "frames.fps": fps,
         "frames.start_s": start_s,
         "frames.stop_s": stop_s,
-        "field.slice": time_slice,
+        "field.time_intervals": renamed_option(intervals, old_intervals, name="--intervals", old_name="--slice"),
     }
     resolved = resolve_config(preset=preset, file=config, settings=settings, overrides=overrides)
     inputs = Inputs(
@@ -359,10 +361,23 @@ def _verbosity(quiet: bool, verbose: bool, log_json: bool) -> "Verbosity":
     return "quiet" if quiet else "verbose" if verbose else "normal"
 
 
+def _warn_of_old_names_in_one_line() -> None:
+    show = warnings.showwarning
+
+    def showwarning(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
+        if issubclass(category, OldNameWarning):
+            print(f"velfield: {message}", file=sys.stderr)
+        else:
+            show(message, category, *where, **options)
+
+    warnings.showwarning = showwarning
+
+
 def main() -> None:
     """Run the command; bad input is one clear line, never a traceback."""
     limit_threads()
     as_ctrl_c()
+    _warn_of_old_names_in_one_line()
     try:
         status = app(result_action="return_value")
     except InputError as error:

@@ -13,6 +13,9 @@ from schemas.model import Model
 Every = PositiveInt | Literal["auto"]
 Preset = Literal["best", "fast", "paper"]
 
+STATIONARY_SPEED_M_PER_S = 1.15
+"""Below this speed a vehicle is stationary and its direction of motion is undefined. Paper: 5 px/s."""
+
 
 class FramesConfig(Model):
     """Which frames of the source are worked on."""
@@ -86,8 +89,8 @@ class RegistrationConfig(Model):
     """Key points kept a frame, spread by cells."""
     key_point_scale: PositiveFloat = Field(0.5, le=1)
     """Key points are found on frames reduced to this scale, then refined below the pixel at full size."""
-    window_px: PositiveInt = 50
-    """A match is searched within a square of this side around the prediction. Paper: 50 x 50."""
+    match_search_px: PositiveInt = 50
+    """Side of the square around the predicted position in which a match is searched. Paper: 50 x 50."""
     drop_fraction: PositiveFloat = Field(0.05, lt=1)
     """Share of worst control points dropped a round of case deletion. Paper: 5 %."""
     max_mean_error_px: PositiveFloat = 0.8
@@ -100,8 +103,8 @@ class RegistrationConfig(Model):
     """Fewer surviving control points than this: the frame is not registered."""
     max_residual_px: PositiveFloat = 3.0
     """A held-out RMS above this: the frame is not registered."""
-    segment_frames: PositiveInt = 64
-    """Frames chained to their predecessors before the chain is seeded anew from the base image."""
+    chain_length_frames: PositiveInt = 64
+    """Frames registered one to the next before the chain starts again from the base image."""
 
 
 class DetectionConfig(Model):
@@ -154,8 +157,8 @@ class TrackingConfig(Model):
     """Paper: 30 degrees between the two segments."""
     max_axis_offset_rad: PositiveFloat = 0.5235987755982988
     """Paper: motion within 30 degrees of the car's axis."""
-    slow_m_per_s: PositiveFloat = 1.15
-    """Below this speed direction means nothing and is not tested. Paper: 5 px/s."""
+    stationary_speed_m_per_s: PositiveFloat = STATIONARY_SPEED_M_PER_S
+    """Below this speed a vehicle is stationary: its direction of motion is not tested. Paper: 5 px/s."""
     max_acceleration_m_per_s2: PositiveFloat = 23.0
     """Paper: 4 px/frame^2, that is 100 px/s^2 at 5 Hz."""
     jitter_sigmas: PositiveFloat = 3.0
@@ -164,21 +167,17 @@ class TrackingConfig(Model):
     """Standard deviation of a detection's place apart from the registration's residual, base px."""
     max_interval_s: PositiveFloat = 0.45
     """Consecutive frames of a window are no farther apart than this."""
-    patch_width_px: PositiveInt = 8
-    """Oriented patch across the car, working px. Paper: 8 x 16."""
-    patch_length_px: PositiveInt = 16
-    """Oriented patch along the car, working px. Paper: 8 x 16."""
-    linking: Literal["joint", "links"] = "joint"
-    """``joint``: the two links of a window are chosen together, by looks and motion; ``links``: the paper's, each link
-    the mutual best by SAD, then the gates."""
+    linking: Literal["joint", "pairwise"] = "joint"
+    """``joint``: the two links of a three-frame window are chosen together, by appearance and motion; ``pairwise``: the
+    paper's, each link the mutual best by SAD, then the gates."""
     min_confidence: float = Field(0.8, ge=0, lt=1)
     """A tracklet less sure than this, against its rivals and chance, is dropped (``joint``)."""
     refine: bool = True
     """Align the patches of a link below the pixel, and let the tracklet carry that displacement."""
-    join_gap_s: float = Field(2.0, ge=0)
-    """A vehicle that is lost from sight for no longer than this goes on as the same passage; 0: as another one."""
-    join_standing_gap_s: float = Field(30.0, ge=0)
-    """The same for one that stands, and is found again where it stood."""
+    max_gap_s: float = Field(2.0, ge=0)
+    """Longest gap in a vehicle's track that gap closing bridges; 0: none."""
+    max_stationary_gap_s: float = Field(30.0, ge=0)
+    """The same for a stationary vehicle that is detected again at the same position."""
 
 
 class FieldConfig(Model):
@@ -193,20 +192,22 @@ class FieldConfig(Model):
     max_speed_m_per_s: PositiveFloat = 36.0
     """The histogram covers velocity components of up to this, either way."""
     lane_width_m: PositiveFloat = 3.5
-    """A segment counts half of this wide across its path; preset ``paper``: one pixel."""
-    one_pixel_wide: bool = False
-    """The paper's one-pixel lines in place of half a lane."""
-    weigh_shared_segments: Literal["once", "twice"] = "once"
-    """A segment that two tracklets share. Paper: twice."""
+    """Width of a lane, from which the width of a path follows."""
+    path_width: Literal["lane", "pixel"] = "lane"
+    """Width of the path that a segment is accumulated along. ``lane``: half of ``lane_width_m``; ``pixel``: one pixel,
+    as in the paper."""
+    shared_segment_weight: Literal[1, 2] = 1
+    """Weight of a segment that two tracklets share. Paper: 2."""
     tile_size_px: PositiveInt = 64
     """Side of a stored tile, base px."""
-    standing_m_per_s: PositiveFloat = 1.15
-    """No direction is drawn where the modal speed is below this."""
-    by_time: bool = True
-    """Keep the histogram weighed by time too (``velocity_histogram_by_time``): what a camera sees at a random moment,
-    where the other is what a detector in the road counts."""
-    slice: str | None = None
-    """Fields of slices of time besides: a length (``15min``), or intervals (``0-300,300-900`` or ``07:00-09:00``)."""
+    stationary_speed_m_per_s: PositiveFloat = STATIONARY_SPEED_M_PER_S
+    """Below this speed a vehicle is stationary: no direction is drawn where the modal speed is below it."""
+    time_weighted: bool = True
+    """Keep a time-weighted histogram too (``velocity_histogram_time_weighted``): its speeds are space-mean, as a camera
+    sees them at a random moment; those of the other are time-mean, as a detector in the road counts them."""
+    time_intervals: str | None = None
+    """Accumulate a field for each time interval too: a length (``15min``), or intervals (``0-300,300-900`` or
+    ``07:00-09:00``)."""
 
 
 class WorkConfig(Model):
@@ -256,8 +257,8 @@ PRESETS: dict[Preset, dict[str, dict[str, object]]] = {
             "cell_size_px": 200,
         },
         "detection": {"method": "dense", "rounds": 200, "feature_pool": 1000, "motion_channel": "never"},
-        "tracking": {"refine": False, "linking": "links", "min_confidence": 0.0},
-        "field": {"one_pixel_wide": True, "weigh_shared_segments": "twice", "velocity_span_s": 0.0},
+        "tracking": {"refine": False, "linking": "pairwise", "min_confidence": 0.0},
+        "field": {"path_width": "pixel", "shared_segment_weight": 2, "velocity_span_s": 0.0},
     },
 }
 """What each preset changes of the defaults."""

@@ -71,7 +71,7 @@ class ViewRecord(Model):
     gsd_m: PositiveFloat | None
     north_rad: float | None
     """Where north is in the picture, from +x towards +y (down)."""
-    standing_px_per_s: PositiveFloat
+    stationary_speed_px_per_s: PositiveFloat
     first_time_s: float
     last_time_s: float
     bin_width_px_per_s: PositiveFloat

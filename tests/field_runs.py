@@ -12,7 +12,7 @@ from schemas.flight import FieldConfig, FlightConfig
 from schemas.records import FlightRecord, GridRecord, InputsRecord, SourceRecord
 from schemas.simulation import SimulationConfig
 from schemas.tables import TRACKLET_COLUMNS
-from velfield.field.slices import parse_slices
+from velfield.field.time_intervals import parse_time_intervals
 from velfield.pipeline.stages.field import accumulate_group, field_groups, lay_out_field
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run, open_run
@@ -60,6 +60,7 @@ def field_run(
     layout.grid.write_text(grid.model_dump_json())
     cv2.imwrite(str(layout.base_image), np.full(shape, 90, np.uint8))
     flight_config = FlightConfig(gsd_m=gsd_m, field=config or FieldConfig())
+    asked = flight_config.field.time_intervals
     source = SourceRecord(path="none", kind="folder", digest="0", width=shape[1], height=shape[0], frame_count=60)
     record = FlightRecord(code_version="0", config=flight_config, inputs=InputsRecord(source=source))
     layout.flight.write_text(record.model_dump_json())
@@ -69,7 +70,7 @@ def field_run(
         keys={"field": "test"},
         info=SimpleNamespace(times_s=np.array([0.0, seconds])),
         indices=np.arange(2),
-        slices=parse_slices(flight_config.field.slice, 0.0, seconds) if flight_config.field.slice else [],
+        time_intervals=[] if asked is None else parse_time_intervals(asked, 0.0, seconds),
     )
     lay_out_field(plan)  # type: ignore[arg-type]  # all of a plan that the field reads
     for group in field_groups(plan):  # type: ignore[arg-type]

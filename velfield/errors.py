@@ -1,10 +1,14 @@
-"""What goes wrong, in two kinds: the user's input, and a frame or chunk that cannot be done."""
+"""What goes wrong, in two kinds: the user's input, and a frame or chunk that cannot be done; and one warning."""
 
 from dataclasses import dataclass
 
 
 class InputError(Exception):
     """Bad input or configuration. The message is one line: what was found, what was expected, what to do."""
+
+
+class OldNameWarning(FutureWarning):
+    """A name of an earlier format was given; it is read for this release. The message says the present name."""
 
 
 @dataclass(frozen=True)

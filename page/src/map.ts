@@ -141,7 +141,7 @@ export class Overlay extends L.GridLayer {
   private picture(data: (Numbers | null)[], side: number, level: number): ImageData {
     const step = 2 ** level;
     const picture = new ImageData(side / step, side / step);
-    const paint = painter(this.shown, this.top, this.field.run.standing_px_per_s);
+    const paint = painter(this.shown, this.top, this.field.run.stationary_speed_px_per_s);
     const [a, b] = [data[0]!, data.length === 3 ? data[1]! : data[0]!];
     const count = data[data.length - 1];
     for (let j = 0, at = 0; j < side; j += step) {

@@ -90,7 +90,7 @@ function errorNote(values: Record<string, number>): string {
 function rows({ n, values }: PixelAnswer, field: Field, units: Units): [string, Node | string][] {
   const direction = Math.atan2(values.modal_vy!, values.modal_vx!);
   const speed = Math.hypot(values.modal_vx!, values.modal_vy!);
-  const moving = speed > field.run.standing_px_per_s;
+  const moving = speed > field.run.stationary_speed_px_per_s;
   const heading = make("span", {}, ...(moving ? [arrow(direction), " "] : []));
   heading.append(
     told("direction", direction, moving ? units.headingDegrees(direction) : "stands"),
@@ -131,7 +131,7 @@ function plusMinus(error: number | undefined, text: (error: number) => string): 
 }
 
 function modeRow(mode: Mode, k: number, field: Field, units: Units): (Node | string)[] {
-  const { bins, bin_width_px_per_s: width, standing_px_per_s: standing } = field.run;
+  const { bins, bin_width_px_per_s: width, stationary_speed_px_per_s: standing } = field.run;
   const [vx, vy] = [(mode.x - (bins - 1) / 2) * width, (mode.y - (bins - 1) / 2) * width];
   const [direction, speed] = [Math.atan2(vy, vx), Math.hypot(vx, vy)];
   const way = speed > standing ? make("span", {}, arrow(direction), ` ${units.headingColumn.text(direction)}`) : "stands";

@@ -29,7 +29,7 @@ export interface Run {
   height_px: number;
   gsd_m: number | null;
   north_rad: number | null;
-  standing_px_per_s: number;
+  stationary_speed_px_per_s: number;
   first_time_s: number;
   last_time_s: number;
   bin_width_px_per_s: number;

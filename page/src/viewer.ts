@@ -217,7 +217,7 @@ class Viewer {
     } else if (!n) readout.textContent = `${where} no vehicle`;
     else {
       const speed = Math.hypot(vx, vy);
-      const way = speed > this.run.standing_px_per_s ? this.units.headingText(Math.atan2(vy, vx)) : "stands";
+      const way = speed > this.run.stationary_speed_px_per_s ? this.units.headingText(Math.atan2(vy, vx)) : "stands";
       readout.textContent = `${where} ${way} · ${this.units.speedText(speed)} · ${n} ${n === 1 ? "vehicle" : "vehicles"}`;
     }
     clearTimeout(this.resting);

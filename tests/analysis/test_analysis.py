@@ -87,11 +87,11 @@ def test_a_u_turn_is_found_where_it_was_and_others_are_not() -> None:
             path(4, np.column_stack([np.arange(0, 100, 8.0), np.full(13, 50.0)])),
         ]
     )
-    found = u_turns(segments, standing_px_per_s=4.0, max_path_px=120)
+    found = u_turns(segments, stationary_speed_px_per_s=4.0, max_path_px=120)
     assert found.passage_id.tolist() == [1]
     assert np.hypot(found.x_px[0] - 120, found.y_px[0] - 100) < 12
     assert found.turn_rad[0] > math.radians(150)
 
 
 def test_no_segments_no_turns() -> None:
-    assert u_turns(np.zeros(0, SEGMENT_DTYPE), standing_px_per_s=4.0, max_path_px=100).empty
+    assert u_turns(np.zeros(0, SEGMENT_DTYPE), stationary_speed_px_per_s=4.0, max_path_px=100).empty

@@ -13,7 +13,7 @@ from schemas.tables import TRACKLET_COLUMNS
 from velfield.errors import InputError
 from velfield.field.accumulate import NOISE_UNIT, REACH_SIGMAS, UNIT, FieldTile, accumulate_tile
 from velfield.field.algebra import merge_tiles, subtract_tile
-from velfield.field.bins import VelocityBins, band_radius_px, standing_px_per_s
+from velfield.field.bins import VelocityBins, band_radius_px, stationary_speed_px_per_s
 from velfield.field.segments import SEGMENT_DTYPE, Segments, segment_table, segments_by_tile, touched_tiles
 
 BINS = VelocityBins(width_px_per_s=10.0, reach=6, kernel_sigma_px_per_s=3.5)
@@ -178,7 +178,7 @@ def test_band_is_half_a_lane_wide_and_the_papers_line_one_pixel() -> None:
     radius = band_radius_px(config, gsd_m=0.2)
     assert radius == pytest.approx(4.5)
     assert (tile_of(segment, radius).count[:, 20] > 0).sum() == 9
-    line = tile_of(segment, band_radius_px(config.model_copy(update={"one_pixel_wide": True}), 0.2))
+    line = tile_of(segment, band_radius_px(config.model_copy(update={"path_width": "pixel"}), 0.2))
     assert (line.count[:, 20] > 0).sum() == 1
     assert (line.count > 0).sum() == 31
 
@@ -202,7 +202,7 @@ def tracklets(n: int) -> pd.DataFrame:
 
 def test_shared_segments_count_once_or_as_the_paper_has_it_twice() -> None:
     once = segment_table(tracklets(4), FieldConfig())
-    twice = segment_table(tracklets(4), FieldConfig(weigh_shared_segments="twice"))
+    twice = segment_table(tracklets(4), FieldConfig(shared_segment_weight=2))
     assert len(once) == 5
     assert len(twice) == 8
     np.testing.assert_array_equal(np.diff(once["x0_px"]), 10.0)
@@ -290,7 +290,7 @@ def test_without_a_ground_distance_the_papers_gives_pixels() -> None:
     bins = VelocityBins.from_config(FieldConfig(), None)
     assert bins.centres_m_per_s is None
     assert bins.width_px_per_s == pytest.approx(2 / 0.23)
-    assert standing_px_per_s(FieldConfig(), None) == pytest.approx(5.0)
+    assert stationary_speed_px_per_s(FieldConfig(), None) == pytest.approx(5.0)
     metric = VelocityBins.from_config(FieldConfig(), 0.5).centres_m_per_s
     assert metric is not None
     assert metric[[0, 18, -1]] == pytest.approx([-36, 0, 36])
@@ -298,5 +298,5 @@ def test_without_a_ground_distance_the_papers_gives_pixels() -> None:
 
 def test_a_full_pixel_is_refused_not_wrapped() -> None:
     long = np.array([(0, 0, 140_000.0, 20.0, 20.0, 20.0, 20.0, 0.0, 0.0, 0, 1, 0.0)], SEGMENT_DTYPE)
-    with pytest.raises(InputError, match="into slices"):
+    with pytest.raises(InputError, match="into time intervals"):
         tile_of(long, weight="time")

@@ -14,7 +14,7 @@ from schemas.flight import FieldConfig
 from tests.field_runs import field_run, flight, traffic_tracklets
 from velfield.errors import InputError
 from velfield.field.comparison import significant
-from velfield.field.slices import DAY_S, parse_slices
+from velfield.field.time_intervals import DAY_S, parse_time_intervals
 from velfield.pipeline.compare import compare_runs
 from velfield.run.field_algebra import merge_fields, subtract_fields
 from velfield.run.field_reader import known_tiles
@@ -146,18 +146,18 @@ def test_of_many_tests_of_nothing_hardly_any_is_called_significant() -> None:
 def test_slices_of_time_add_up_to_the_whole(
     tmp_path: Path, table: pd.DataFrame, shape: tuple[int, int], whole: Path, text: str
 ) -> None:
-    run = field_run(tmp_path / "run", table, shape=shape, config=FieldConfig(slice=text))
+    run = field_run(tmp_path / "run", table, shape=shape, config=FieldConfig(time_intervals=text))
     assert_equal(everything(run.layout.root), everything(whole))
-    slices = run.field_slices
-    assert list(slices) == {"4s": ["0-4", "4-8", "8-12"], "2-5,7-9": ["2-5", "7-9", "rest"]}[text]
-    assert sum(part.field.count() for part in slices.values()).tolist() == run.field.count().tolist()
-    assert min(int(part.field.count().sum()) for part in list(slices.values())[:2]) > 0
+    intervals = run.field_intervals
+    assert list(intervals) == {"4s": ["0-4", "4-8", "8-12"], "2-5,7-9": ["2-5", "7-9", "rest"]}[text]
+    assert sum(part.field.count() for part in intervals.values()).tolist() == run.field.count().tolist()
+    assert min(int(part.field.count().sum()) for part in list(intervals.values())[:2]) > 0
     y, x = np.unravel_index(int(run.field.count().argmax()), shape)
-    parts = [part.field.at(int(x), int(y)) for part in slices.values()]
+    parts = [part.field.at(int(x), int(y)) for part in intervals.values()]
     mixed = sum(part.weights * part.n for part in parts) / sum(part.n for part in parts)
     np.testing.assert_allclose(mixed, run.field.at(int(x), int(y)).weights, atol=1e-12)
-    data = xr.open_zarr(run.layout.slices / "000.zarr", consolidated=False)
-    assert data.attrs["slice"] == next(iter(slices))
+    data = xr.open_zarr(run.layout.intervals / "000.zarr", consolidated=False)
+    assert data.attrs["time_interval"] == next(iter(intervals))
     assert data["velocity_histogram"].dims == ("y", "x", "vy", "vx")
 
 
@@ -173,11 +173,11 @@ def test_slices_of_time_add_up_to_the_whole(
 )
 def test_slices_that_make_no_sense_are_refused(text: str, complaint: str) -> None:
     with pytest.raises(InputError, match=complaint):
-        parse_slices(text, 0.0, 60.0)
+        parse_time_intervals(text, 0.0, 60.0)
 
 
 def test_time_of_day_is_that_of_the_flights_day() -> None:
-    morning, rest = parse_slices("07:30-09:00", 3 * DAY_S + 20_000.0, 3 * DAY_S + 40_000.0)
+    morning, rest = parse_time_intervals("07:30-09:00", 3 * DAY_S + 20_000.0, 3 * DAY_S + 40_000.0)
     assert (morning.start_s, morning.stop_s) == (3 * DAY_S + 27_000.0, 3 * DAY_S + 32_400.0)
     assert rest.name == "rest"
 
@@ -185,8 +185,8 @@ def test_time_of_day_is_that_of_the_flights_day() -> None:
 def test_both_weights_are_kept_and_named(whole: Path) -> None:
     """By passage every vehicle counts alike; by time those that stay count for longer, so that speeds are lower."""
     run = open_run(whole)
-    by_passage, by_time = run.field, run.field_by_time
-    passing, watched = by_passage.statistics(), by_time.statistics()
+    by_passage, time_weighted = run.field, run.field_time_weighted
+    passing, watched = by_passage.statistics(), time_weighted.statistics()
     speed = np.hypot(*np.moveaxis(passing.mean_velocity_px_per_s, -1, 0))
     in_time = np.hypot(*np.moveaxis(watched.mean_velocity_px_per_s, -1, 0))
     busy = passing.n >= 3
@@ -194,7 +194,7 @@ def test_both_weights_are_kept_and_named(whole: Path) -> None:
     assert np.mean(in_time[busy] <= speed[busy] + 0.5) > 0.95
     data = xr.open_zarr(run.layout.field, consolidated=False)
     assert data["velocity_histogram"].attrs["weighted_by"] == "passage"
-    assert data["velocity_histogram_by_time"].attrs["weighted_by"] == "time"
+    assert data["velocity_histogram_time_weighted"].attrs["weighted_by"] == "time"
     y, x = np.unravel_index(int(by_passage.count().argmax()), by_passage.shape)
-    seconds = int(data["velocity_histogram_by_time"][y, x].sum()) / data.attrs["weight_unit"]
+    seconds = int(data["velocity_histogram_time_weighted"][y, x].sum()) / data.attrs["weight_unit"]
     assert seconds == pytest.approx(int(data["dwell_ms"][y, x]) / 1000, rel=0.02)

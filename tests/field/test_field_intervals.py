@@ -6,7 +6,7 @@ import pytest
 from schemas.flight import FieldConfig
 from schemas.simulation import SimulationConfig
 from velfield.field.accumulate import FieldTile, accumulate_tile
-from velfield.field.bins import VelocityBins, band_radius_px, standing_px_per_s
+from velfield.field.bins import VelocityBins, band_radius_px, stationary_speed_px_per_s
 from velfield.field.modes import modal_velocity
 from velfield.field.segments import SEGMENT_DTYPE, Segments, segment_table
 from velfield.field.statistics import TileStatistics, tile_statistics
@@ -18,7 +18,7 @@ GSD_M = 0.23
 CONFIG = FieldConfig()
 BINS = VelocityBins.from_config(CONFIG, GSD_M)
 RADIUS = band_radius_px(CONFIG, GSD_M)
-STANDING = standing_px_per_s(CONFIG, GSD_M)
+STANDING = stationary_speed_px_per_s(CONFIG, GSD_M)
 SECTION_M = 40.0
 REPEATS = 10
 
@@ -40,7 +40,7 @@ def passing(
 def tile_of(segments: Segments, x: int, y: int) -> tuple[FieldTile, TileStatistics]:
     """One pixel's tile and its statistics."""
     tile = accumulate_tile(segments, origin_xy=(x, y), shape=(1, 1), bins=BINS, radius_px=RADIUS)
-    return tile, tile_statistics(tile.histogram, tile.count, tile.noise, bins=BINS, standing_px_per_s=STANDING)
+    return tile, tile_statistics(tile.histogram, tile.count, tile.noise, bins=BINS, stationary_speed_px_per_s=STANDING)
 
 
 def width_m_per_s(statistics: TileStatistics) -> float:

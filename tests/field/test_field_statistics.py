@@ -25,7 +25,7 @@ def drive(velocities: np.ndarray, y0: float = 50.0) -> Segments:
 
 def field(segments: Segments, shape: tuple[int, int] = (100, 160)) -> VelocityField:
     return VelocityField.from_segments(
-        segments, shape=shape, tile_size=64, bins=BINS, radius_px=3.5, standing_px_per_s=1.15 / GSD_M
+        segments, shape=shape, tile_size=64, bins=BINS, radius_px=3.5, stationary_speed_px_per_s=1.15 / GSD_M
     )
 
 

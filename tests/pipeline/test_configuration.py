@@ -1,11 +1,14 @@
 """The configuration: what is stronger than what, and what a wrong key is told."""
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from schemas.flight import FlightConfig
-from velfield.errors import InputError
+from schemas.renames import OLD_KEYS, OLD_VALUES, REMOVED_KEYS, upgrade_config
+from velfield.errors import InputError, OldNameWarning
 from velfield.pipeline.configuration import resolve_config
 
 
@@ -70,3 +73,68 @@ def test_a_section_without_keys_says_nothing(tmp_path: Path) -> None:
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"is not there; give a YAML file"):
         resolve_config(file=tmp_path / "none.yaml")
+
+
+@pytest.mark.parametrize(
+    ("old", "present"),
+    [
+        ("registration.window_px=60", "registration.match_search_px=60"),
+        ("tracking.linking=links", "tracking.linking=pairwise"),
+        ("field.one_pixel_wide=true", "field.path_width=pixel"),
+        ("field.weigh_shared_segments=twice", "field.shared_segment_weight=2"),
+        ("field.slice=15min", "field.time_intervals=15min"),
+    ],
+)
+def test_an_old_name_is_read_with_a_warning_that_gives_the_present_one(old: str, present: str, tmp_path: Path) -> None:
+    with pytest.warns(OldNameWarning, match=present.partition("=")[0]) as caught:
+        from_setting = resolve_config(settings=[old])
+    assert len(caught) == 1
+    assert from_setting == resolve_config(settings=[present]) != resolve_config()
+    dotted, _, value = old.partition("=")
+    section, _, key = dotted.partition(".")
+    file = tmp_path / "flight.yaml"
+    file.write_text(f"{section}:\n  {key}: {value}\n")
+    with pytest.warns(OldNameWarning, match=str(file)):
+        assert resolve_config(file=file) == from_setting
+
+
+def test_an_old_key_warns_in_one_line() -> None:
+    with pytest.warns(OldNameWarning) as caught:
+        resolve_config(settings=["registration.window_px=60"])
+    assert str(caught[0].message) == (
+        "--set: registration.window_px is now registration.match_search_px; the old name works until 0.3"
+    )
+
+
+def test_a_removed_key_is_ignored_with_a_warning() -> None:
+    with pytest.warns(OldNameWarning, match="patch_width_px is ignored"):
+        assert resolve_config(settings=["tracking.patch_width_px=10"]) == resolve_config()
+
+
+def test_an_old_and_a_present_name_of_one_parameter_are_refused() -> None:
+    settings = ["field.slice=15min", "field.time_intervals=15min"]
+    with pytest.raises(InputError, match=r"two names of one parameter; keep field\.time_intervals"):
+        resolve_config(settings=settings)
+
+
+def test_a_setting_by_its_present_name_overrides_the_old_name_in_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "flight.yaml"
+    file.write_text("field: {by_time: true}\n")
+    with pytest.warns(OldNameWarning):
+        assert not resolve_config(file=file, settings=["field.time_weighted=false"]).field.time_weighted
+
+
+def dotted_keys(tree: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    for name, value in tree.items():
+        yield prefix + name
+        if isinstance(value, dict):
+            yield from dotted_keys(value, f"{prefix}{name}.")
+
+
+def test_old_names_are_none_of_the_present_ones() -> None:
+    tree = FlightConfig().model_dump(mode="json")
+    present = set(dotted_keys(tree))
+    assert set(OLD_KEYS.values()) <= present
+    assert set(OLD_VALUES) <= present
+    assert not present & (set(OLD_KEYS) | set(REMOVED_KEYS))
+    assert upgrade_config(tree) == (tree, [])

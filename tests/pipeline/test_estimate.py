@@ -59,8 +59,8 @@ def test_what_is_given_otherwise_than_before_is_known(flight: Path, tmp_path: Pa
 
 @pytest.mark.parametrize("text", ["nonsense", "6-0", "0-3,2-5"])
 def test_slices_that_cannot_be_are_told_before_any_work(flight: Path, tmp_path: Path, text: str) -> None:
-    with pytest.raises(InputError, match="slice"):
-        make_plan(job(flight, tmp_path, f"field.slice={text}"))
+    with pytest.raises(InputError, match="time interval"):
+        make_plan(job(flight, tmp_path, f"field.time_intervals={text}"))
 
 
 @pytest.mark.parametrize("option", ["base", "labels", "detector", "detections"])

@@ -57,7 +57,7 @@ def test_guided_matches_are_those_of_a_plain_search() -> None:
     reference = random_key_points(rng, 300)
     descriptors = np.clip(reference.descriptors.astype(int) + rng.integers(-9, 9, (300, 128)), 0, 255).astype(np.uint8)
     predicted = reference.xy + rng.uniform(-30, 30, (300, 2))
-    pairs = match_guided(predicted, descriptors, reference, window_px=50)
+    pairs = match_guided(predicted, descriptors, reference, search_px=50)
     np.testing.assert_array_equal(pairs, plain_guided(predicted, descriptors, reference, half_px=25.0))
     assert (pairs[:, 0] == pairs[:, 1]).mean() > 0.98
 
@@ -79,7 +79,7 @@ def test_guided_matching_survives_predictions_without_a_value() -> None:
     reference = random_key_points(np.random.default_rng(2), 50)
     predicted = reference.xy.copy()
     predicted[:10] = np.nan
-    pairs = match_guided(predicted, reference.descriptors, reference, window_px=50)
+    pairs = match_guided(predicted, reference.descriptors, reference, search_px=50)
     np.testing.assert_array_equal(pairs[:, 0], np.arange(10, 50))
 
 

@@ -30,7 +30,7 @@ def first_changed(a: dict[str, str], b: dict[str, str]) -> str | None:
         ("frames.every=3", "frames"),
         ("lens.angle_bins=360", "lens"),
         ("base.median_frames=32", "base"),
-        ("registration.window_px=60", "base"),  # the own base image is made by registration
+        ("registration.match_search_px=60", "base"),  # the own base image is made by registration
         ("detection.rounds=100", "detector"),
         ("tracking.max_turn_rad=0.4", "tracklets"),
         ("field.bin_width_m_per_s=1", "field"),

@@ -16,7 +16,7 @@ from velfield.errors import InputError
 from velfield.tracking.limits import GateLog
 from velfield.tracking.tracklets import link_windows, window_frames
 
-PAIRWISE = TrackingConfig(linking="links", min_confidence=0.0, refine=False)
+PAIRWISE = TrackingConfig(linking="pairwise", min_confidence=0.0, refine=False)
 ALL = range(10**6)
 
 

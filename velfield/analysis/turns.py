@@ -14,7 +14,7 @@ U_TURN_COLUMNS = ["passage_id", "time_s", "x_px", "y_px", "turn_rad", "path_px"]
 def u_turns(
     segments: Segments,
     *,
-    standing_px_per_s: float,
+    stationary_speed_px_per_s: float,
     max_path_px: float,
     min_turn_rad: float = math.radians(150),
 ) -> pd.DataFrame:
@@ -24,7 +24,7 @@ def u_turns(
     ----------
     segments
         Segment table, sorted by passage and time.
-    standing_px_per_s
+    stationary_speed_px_per_s
         Slower segments have no direction.
     max_path_px
         Longest path of a U-turn, px: some 40 m.
@@ -37,7 +37,7 @@ def u_turns(
         `U_TURN_COLUMNS`: a row a passage, the place in the middle of its sharpest turn; ``turn_rad`` is positive from
         +x towards +y, that is to the right on a picture seen from above.
     """
-    moving = segments[np.hypot(segments["vx_px_per_s"], segments["vy_px_per_s"]) > standing_px_per_s]
+    moving = segments[np.hypot(segments["vx_px_per_s"], segments["vy_px_per_s"]) > stationary_speed_px_per_s]
     if not len(moving):
         return pd.DataFrame(columns=U_TURN_COLUMNS)
     borders = np.flatnonzero(np.diff(moving["passage"])) + 1

@@ -22,7 +22,7 @@ from velfield.exports.place import Place
 from velfield.exports.stac import stac_item
 from velfield.exports.sumo import sumo_fcd
 from velfield.exports.tracks import geotrax_csv
-from velfield.field.bins import standing_px_per_s
+from velfield.field.bins import stationary_speed_px_per_s
 from velfield.report.figures import MapScale, SpeedUnit, direction_figure, png_bytes, speed_figure
 from velfield.report.report import render_report
 from velfield.report.run_figures import report_figures
@@ -140,7 +140,7 @@ def _at_width(run: Run, values: FloatArray, options: ExportOptions) -> tuple[NDA
 
 
 def _standing_left_out(run: Run, direction: FloatArray) -> FloatArray:
-    slow = standing_px_per_s(run.record.config.field, run.grid.gsd_m)
+    slow = stationary_speed_px_per_s(run.record.config.field, run.grid.gsd_m)
     return np.where(run.field.modal_speed_px_per_s() >= slow, direction, np.nan)
 
 

@@ -111,7 +111,8 @@ def accumulate_tile(
         y, x = np.unravel_index(int(weight_sum.argmax()), shape)
         raise InputError(
             f"the histogram at pixel ({origin_xy[0] + int(x)}, {origin_xy[1] + int(y)}) sums to "
-            f"{weight_sum.max() / UNIT:.0f}, and 32 bits hold {(1 << 31) / UNIT:.0f}: cut the flight into slices"
+            f"{weight_sum.max() / UNIT:.0f}, and 32 bits hold {(1 << 31) / UNIT:.0f}: "
+            "cut the flight into time intervals"
         )
     return FieldTile(histogram, count, dwell_ms, noise)
 

@@ -79,12 +79,12 @@ class VelocityBins:
 
 def band_radius_px(config: FieldConfig, gsd_m: float | None) -> float | None:
     """How far from its path a segment counts, px: a quarter of a lane on either side; None for the paper's line."""
-    if config.one_pixel_wide:
+    if config.path_width == "pixel":
         return None
     # Below 0.71 px a path could slip between the pixel centres and leave no trace.
     return max(config.lane_width_m / 4 / (gsd_m or PAPER_GSD_M), 0.75)
 
 
-def standing_px_per_s(config: FieldConfig, gsd_m: float | None) -> float:
+def stationary_speed_px_per_s(config: FieldConfig, gsd_m: float | None) -> float:
     """The speed below which a vehicle stands and has no direction, px/s."""
-    return config.standing_m_per_s / (gsd_m or PAPER_GSD_M)
+    return config.stationary_speed_m_per_s / (gsd_m or PAPER_GSD_M)

@@ -53,7 +53,7 @@ def compare_fields(
     after: Layer,
     *,
     observed_s: tuple[float, float],
-    standing_px_per_s: float,
+    stationary_speed_px_per_s: float,
     min_count: int = MIN_COUNT,
 ) -> dict[str, Change]:
     """Changes of ``direction`` (rad), ``speed`` (px/s, of the median) and ``volume`` (passages an hour).
@@ -64,7 +64,7 @@ def compare_fields(
         Layers of two fields on one grid, named as in ``field.zarr``.
     observed_s
         How long each field watched, s.
-    standing_px_per_s
+    stationary_speed_px_per_s
         A modal speed below this has no direction.
     min_count
         Passages that either field must have for its direction and speed to be compared: of fewer, another turn taken
@@ -72,7 +72,7 @@ def compare_fields(
     """
     enough = np.minimum(_numbers(before, "count"), _numbers(after, "count")) >= min_count
     return {
-        "direction": _direction(before, after, standing_px_per_s, enough),
+        "direction": _direction(before, after, stationary_speed_px_per_s, enough),
         "speed": _speed(before, after, enough),
         "volume": _volume(before, after, observed_s),
     }
@@ -107,11 +107,11 @@ def _numbers(layer: Layer, name: str) -> FloatArray:
     return np.asarray(layer(name), np.float64)
 
 
-def _direction(before: Layer, after: Layer, standing_px_per_s: float, enough: NDArray[np.bool_]) -> Change:
+def _direction(before: Layer, after: Layer, stationary_speed_px_per_s: float, enough: NDArray[np.bool_]) -> Change:
     angle, half = [], []
     for layer in (before, after):
         vx, vy = _numbers(layer, "modal_vx"), _numbers(layer, "modal_vy")
-        moves = np.hypot(vx, vy) > standing_px_per_s
+        moves = np.hypot(vx, vy) > stationary_speed_px_per_s
         angle.append(np.where(moves, np.arctan2(vy, vx), np.nan))
         half.append(_numbers(layer, "direction_half90"))
     turn = np.where(enough, np.angle(np.exp(1j * (angle[1] - angle[0]))), np.nan)

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray
 from schemas.flight import FieldConfig
-from velfield.field.bins import VelocityBins, band_radius_px, standing_px_per_s
+from velfield.field.bins import VelocityBins, band_radius_px, stationary_speed_px_per_s
 from velfield.field.segments import Segments
 from velfield.field.view import VelocityField
 
@@ -52,7 +52,7 @@ def foretell(segments: Segments, config: FieldConfig, *, gsd_m: float, shape: tu
         tile_size=config.tile_size_px,
         bins=VelocityBins.from_config(config, gsd_m),
         radius_px=band_radius_px(config, gsd_m),
-        standing_px_per_s=standing_px_per_s(config, gsd_m),
+        stationary_speed_px_per_s=stationary_speed_px_per_s(config, gsd_m),
     )
     place, velocity = _middles(held)
     to_metres = -2 * np.log(gsd_m)

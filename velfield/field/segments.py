@@ -39,7 +39,7 @@ def segment_table(tracklets: pd.DataFrame, config: FieldConfig) -> Segments:
     """The segments of a table of tracklets, two a tracklet, sorted by passage and time.
 
     A segment that two tracklets share (the second of one, the first of the next) stands once, and its velocity is the
-    mean along its passage over ``config.velocity_span_s``; with ``config.weigh_shared_segments`` of ``twice``, as in
+    mean along its passage over ``config.velocity_span_s``; with a ``config.shared_segment_weight`` of 2, as in
     the paper, each stands as it is. A tracklet of no passage (-1) is its own.
 
     Raises
@@ -52,7 +52,7 @@ def segment_table(tracklets: pd.DataFrame, config: FieldConfig) -> Segments:
     _check(segments)
     order = np.lexsort((segments["detection_1"], segments["detection_0"], segments["start_s"], segments["passage"]))
     segments = segments[order]
-    if config.weigh_shared_segments == "once":
+    if config.shared_segment_weight == 1:
         segments = _averaged(segments[_first_of_equals(segments)], config.velocity_span_s)
     return segments
 

@@ -163,7 +163,7 @@ def tile_statistics(
     noise: NDArray[np.int32],
     *,
     bins: VelocityBins,
-    standing_px_per_s: float,
+    stationary_speed_px_per_s: float,
     percentiles: tuple[float, ...] = PERCENTILES,
 ) -> TileStatistics:
     """All statistics of a tile.
@@ -176,7 +176,7 @@ def tile_statistics(
         (ty, tx) int32 passages.
     noise
         (ty, tx) int32, their velocities' variance by measurement, summed: as in `FieldTile`.
-    standing_px_per_s
+    stationary_speed_px_per_s
         What is slower has no direction; where a bin and a half is faster, that is the limit.
     percentiles
         Of speed, %.
@@ -186,13 +186,13 @@ def tile_statistics(
     moments, errors = np.full((*shape, 7), np.nan), np.full((*shape, 2), np.nan)
     speeds = np.full((*shape, len(percentiles)), np.nan)
     # A blob at rest spills into the bins next to the central one: direction is taken from beyond them.
-    moving_bins = max(standing_px_per_s / bins.width_px_per_s, 1.5)
+    moving_bins = max(stationary_speed_px_per_s / bins.width_px_per_s, 1.5)
     sigma = bins.kernel_sigma_px_per_s / bins.width_px_per_s
     limits = np.asarray(percentiles, np.float64)
     _tile(histogram, count, bins.to_bins(mode_px_per_s), moving_bins, sigma, limits, moments, speeds, errors)
     intervals = np.full((*shape, 3), np.nan)
     each = noise / (np.maximum(count, 1) * float(NOISE_UNIT))
-    standing_bins = standing_px_per_s / bins.width_px_per_s
+    standing_bins = stationary_speed_px_per_s / bins.width_px_per_s
     tile_intervals(histogram, count, each, mode_px_per_s / bins.width_px_per_s, sigma, standing_bins, intervals)
     return TileStatistics(
         n=count,
@@ -211,12 +211,12 @@ def tile_statistics(
     )
 
 
-def direction_rad(velocity_px_per_s: FloatArray, *, standing_px_per_s: float = 0.0) -> FloatArray:
+def direction_rad(velocity_px_per_s: FloatArray, *, stationary_speed_px_per_s: float = 0.0) -> FloatArray:
     """Direction of motion in (-pi, pi] from +x towards +y (down); NaN where slower than standing, or empty."""
     vx, vy = velocity_px_per_s[..., 0], velocity_px_per_s[..., 1]
     direction = np.arctan2(vy, vx)
     direction = np.where(direction == -pi, pi, direction)
-    slow = ~(np.hypot(vx, vy) > standing_px_per_s)
+    slow = ~(np.hypot(vx, vy) > stationary_speed_px_per_s)
     return np.where(slow, np.nan, direction)
 
 

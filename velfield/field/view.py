@@ -53,7 +53,7 @@ class VelocityField:
         Side of a tile, px.
     bins
         Velocity axes.
-    standing_px_per_s
+    stationary_speed_px_per_s
         A modal speed below this has no direction.
     threads
         Tiles worked on at once by the methods that go over the whole map.
@@ -70,12 +70,12 @@ class VelocityField:
         shape: tuple[int, int],
         tile_size: int,
         bins: VelocityBins,
-        standing_px_per_s: float,
+        stationary_speed_px_per_s: float,
         threads: int = 1,
         layers: LayerSource | None = None,
     ) -> None:
         self.shape, self.tile_size, self.bins = shape, tile_size, bins
-        self.standing_px_per_s = standing_px_per_s
+        self.stationary_speed_px_per_s = stationary_speed_px_per_s
         self.tiles = sorted(tiles)
         self._known = frozenset(self.tiles)
         self._source, self._threads, self._layers = source, threads, layers
@@ -93,7 +93,7 @@ class VelocityField:
         tile_size: int,
         bins: VelocityBins,
         radius_px: float | None,
-        standing_px_per_s: float,
+        stationary_speed_px_per_s: float,
     ) -> "VelocityField":
         """The field of a segment table, its tiles made as they are asked for."""
         rows = segments_by_tile(segments, shape=shape, tile_size=tile_size, radius_px=radius_px)
@@ -106,7 +106,12 @@ class VelocityField:
             return tile.histogram, tile.count, tile.noise
 
         return cls(
-            make, tiles=list(rows), shape=shape, tile_size=tile_size, bins=bins, standing_px_per_s=standing_px_per_s
+            make,
+            tiles=list(rows),
+            shape=shape,
+            tile_size=tile_size,
+            bins=bins,
+            stationary_speed_px_per_s=stationary_speed_px_per_s,
         )
 
     # -- the map ------------------------------------------------------------------------------------------------------
@@ -124,10 +129,10 @@ class VelocityField:
             self._modal = out
         return self._modal.copy()
 
-    def modal_direction_rad(self, *, standing_px_per_s: float | None = None) -> FloatArray:
+    def modal_direction_rad(self, *, stationary_speed_px_per_s: float | None = None) -> FloatArray:
         """(y, x) direction of the largest mode in (-pi, pi], from +x towards +y (down); NaN where empty or standing."""
-        limit = self.standing_px_per_s if standing_px_per_s is None else standing_px_per_s
-        return direction_rad(self.modal_velocity().astype(np.float64), standing_px_per_s=limit)
+        limit = self.stationary_speed_px_per_s if stationary_speed_px_per_s is None else stationary_speed_px_per_s
+        return direction_rad(self.modal_velocity().astype(np.float64), stationary_speed_px_per_s=limit)
 
     def modal_speed_px_per_s(self) -> FloatArray:
         """(y, x) speed of the largest mode, px/s; NaN where no vehicle passed."""
@@ -336,7 +341,9 @@ class VelocityField:
 
     def _tile_statistics(self, tile: Tile) -> TileStatistics:
         histogram, count, noise = tile
-        return tile_statistics(histogram, count, noise, bins=self.bins, standing_px_per_s=self.standing_px_per_s)
+        return tile_statistics(
+            histogram, count, noise, bins=self.bins, stationary_speed_px_per_s=self.stationary_speed_px_per_s
+        )
 
     def _tile(self, ty: int, tx: int) -> Tile | None:
         """A tile, from the few kept in memory where it is one of them."""

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from velfield.exports.cog import write_cog
-from velfield.field.bins import standing_px_per_s
+from velfield.field.bins import stationary_speed_px_per_s
 from velfield.field.comparison import FALSE_SHARE, MIN_COUNT, Change, compare_fields
 from velfield.report.change import change_figure
 from velfield.report.figures import MapScale, png_bytes
@@ -41,7 +41,7 @@ def compare_runs(before: Path, after: Path, out: Path, *, min_count: int = MIN_C
         stores[0].layer,
         stores[1].layer,
         observed_s=(seconds[0], seconds[1]),
-        standing_px_per_s=standing_px_per_s(runs[0].record.config.field, runs[0].grid.gsd_m),
+        stationary_speed_px_per_s=stationary_speed_px_per_s(runs[0].record.config.field, runs[0].grid.gsd_m),
         min_count=min_count,
     )
     shown = {name: _shown(name, change, runs[1]) for name, change in changes.items()}

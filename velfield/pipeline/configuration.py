@@ -1,6 +1,7 @@
 """The configuration from its four sources, each stronger than the one before: preset, file, ``--set``, options."""
 
 import difflib
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -9,7 +10,8 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from schemas.flight import PRESETS, FlightConfig, Preset
-from velfield.errors import InputError
+from schemas.renames import upgrade_config
+from velfield.errors import InputError, OldNameWarning
 
 Tree = dict[str, Any]
 
@@ -44,12 +46,14 @@ def resolve_config(
     >>> resolve_config(settings=["tracking.max_speed_m_per_s=20"]).tracking.max_speed_m_per_s
     20.0
     """
-    given = _read(file) if file else {}
+    given = _present_names(_read(file), str(file)) if file else {}
+    asked: Tree = {}
     for setting in settings:
         key, equals, value = setting.partition("=")
         if not equals:
             raise InputError(f"--set {setting}: found no '='; expected section.key=value")
-        _put(given, key.strip(), _yaml(value, f"--set {setting}"))
+        _put(asked, key.strip(), _yaml(value, f"--set {setting}"))
+    given = _merge(given, _present_names(asked, "--set"))
     for dotted, override in (overrides or {}).items():
         if override is not None:
             _put(given, dotted, override)
@@ -72,6 +76,17 @@ def _read(file: Path) -> Tree:
         )
     # A section all of whose keys are commented out, as `velfield init` writes it, says nothing.
     return {key: value for key, value in tree.items() if value is not None or not _is_section(key)}
+
+
+def _present_names(tree: Tree, what: str) -> Tree:
+    """The tree by the present names; a warning for each old one."""
+    try:
+        tree, messages = upgrade_config(tree)
+    except ValueError as error:
+        raise InputError(f"{what}: {error}") from None
+    for message in messages:
+        warnings.warn(f"{what}: {message}", OldNameWarning, stacklevel=3)
+    return tree
 
 
 def _is_section(key: str) -> bool:

@@ -12,7 +12,7 @@ from schemas.flight import FlightConfig
 from schemas.job import Job
 from schemas.records import FlightRecord, InputsRecord, SourceRecord
 from velfield.errors import InputError
-from velfield.field.slices import TimeSlice, parse_slices
+from velfield.field.time_intervals import TimeInterval, parse_time_intervals
 from velfield.pipeline.version import STAGE_VERSIONS, code_version
 from velfield.run.commits import content_key, digest_path, write_atomically
 from velfield.run.layout import STAGES, RunLayout
@@ -69,16 +69,16 @@ class Plan:
         return [range(start, min(start + step, n)) for start in range(0, n, step)]
 
     @property
-    def slices(self) -> list[TimeSlice]:
-        """Slices of time that fields are asked for of, in their order; none where none were.
+    def time_intervals(self) -> list[TimeInterval]:
+        """Time intervals to accumulate a field for each, in their order; empty where none were asked for.
 
         Raises
         ------
         InputError
             The text that asks for them is not understood, or they overlap.
         """
-        text, times_s = self.config.field.slice, self.info.times_s[self.indices]
-        return [] if text is None else parse_slices(text, float(times_s[0]), float(times_s[-1]))
+        text, times_s = self.config.field.time_intervals, self.info.times_s[self.indices]
+        return [] if text is None else parse_time_intervals(text, float(times_s[0]), float(times_s[-1]))
 
     def despite(self, lost: Sequence[str]) -> "Plan":
         """The plan for what comes after units were lost: under keys of its own.
@@ -135,7 +135,7 @@ def make_plan(job: Job) -> Plan:
     info = replace(info, warnings=(*info.warnings, *_gaps(info.times_s[indices], job.config.tracking.max_interval_s)))
     inputs = _digest_inputs(job, info)
     plan = Plan(job=job.anywhere(), info=info, indices=indices, inputs=inputs, keys=stage_keys(job.config, inputs))
-    _ = plan.slices  # what cannot be is told now, not where the field is built
+    _ = plan.time_intervals  # what cannot be is told now, not where the field is built
     return plan
 
 

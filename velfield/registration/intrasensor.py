@@ -241,7 +241,7 @@ def _matched(
     """Control points from guided matches; none where there is no reference."""
     if reference is None:
         return ControlPoints(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
-    pairs = match_guided(predicted, key_points.descriptors, reference, window_px=config.window_px)
+    pairs = match_guided(predicted, key_points.descriptors, reference, search_px=config.match_search_px)
     return ControlPoints(key_points.xy[pairs[:, 0]], reference.xy[pairs[:, 1]], np.full(len(pairs), sigma_px))
 
 

@@ -81,12 +81,12 @@ def _is_plausible(prior: HomographyTransform, xy: FloatArray) -> bool:
 
 
 def match_guided(
-    predicted: FloatArray, descriptors: NDArray[np.uint8], reference: KeyPoints, *, window_px: float
+    predicted: FloatArray, descriptors: NDArray[np.uint8], reference: KeyPoints, *, search_px: float
 ) -> Pairs:
-    """Mutually best matches within a square of side ``window_px`` about the predicted places (n, 2) in base pixels."""
+    """Mutually best matches within a square of side ``search_px`` about the predicted places (n, 2) in base pixels."""
     if not len(predicted) or not len(reference):
         return np.zeros((0, 2), np.int64)
-    cell = window_px / 2
+    cell = search_px / 2
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(predicted).all(axis=1))
     origin = reference.xy.min(axis=0)
     key = np.floor((reference.xy - origin) / cell).astype(np.int64)

@@ -14,7 +14,7 @@ from velfield.run.field_reader import TileReader, tile_reader
 from velfield.run.field_writer import GroupWriter, create_field_store, groups_of
 from velfield.run.grid import read_grid
 from velfield.run.layout import RunLayout
-from velfield.run.stores import HISTOGRAM_BY_TIME, FieldStore, open_field, store_key
+from velfield.run.stores import HISTOGRAM_TIME_WEIGHTED, FieldStore, open_field, store_key
 
 Combine = Callable[[Sequence[FieldTile | None]], FieldTile | None]
 
@@ -135,7 +135,7 @@ def _write(
         config=config,
         weighted_by=stores[0].attributes["weighted_by"],
         observed_s=observed_s,
-        by_time=all(HISTOGRAM_BY_TIME in store.histogram_names() for store in stores),
+        time_weighted=all(HISTOGRAM_TIME_WEIGHTED in store.histogram_names() for store in stores),
         more=made_from,
     )
     target = open_field(layout.field, "r+")

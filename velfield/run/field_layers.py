@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from schemas.flight import FieldConfig
 from velfield.field.accumulate import NOISE_UNIT, FieldTile
-from velfield.field.bins import VelocityBins, standing_px_per_s
+from velfield.field.bins import VelocityBins, stationary_speed_px_per_s
 from velfield.field.statistics import tile_statistics
 
 _SPEED = {"units": "px s-1"}
@@ -43,8 +43,8 @@ LAYERS: dict[str, dict[str, Any]] = {
 
 def tile_layers(tile: FieldTile, bins: VelocityBins, config: FieldConfig) -> dict[str, NDArray[Any]]:
     """All layers of one tile, each (ty, tx)."""
-    standing = standing_px_per_s(config, bins.gsd_m)
-    s = tile_statistics(tile.histogram, tile.count, tile.noise, bins=bins, standing_px_per_s=standing)
+    standing = stationary_speed_px_per_s(config, bins.gsd_m)
+    s = tile_statistics(tile.histogram, tile.count, tile.noise, bins=bins, stationary_speed_px_per_s=standing)
     values: dict[str, NDArray[Any]] = {
         "count": tile.count,
         "dwell_ms": tile.dwell_ms,

@@ -10,19 +10,19 @@ from schemas.flight import FieldConfig
 from schemas.records import FlightRecord, GridRecord
 from velfield.errors import InputError
 from velfield.field.accumulate import FieldTile
-from velfield.field.bins import VelocityBins, standing_px_per_s
+from velfield.field.bins import VelocityBins, stationary_speed_px_per_s
 from velfield.field.view import Tile, VelocityField
 from velfield.run.grid import read_grid
 from velfield.run.layout import RunLayout
-from velfield.run.stores import HISTOGRAM, HISTOGRAM_BY_TIME, FieldStore, StoreError, open_field
+from velfield.run.stores import HISTOGRAM, HISTOGRAM_TIME_WEIGHTED, FieldStore, StoreError, open_field
 
 TileReader = Callable[[int, int], FieldTile | None]
 """Gives the tile (row, column); None where nobody passed."""
 
 
 @dataclass(frozen=True)
-class FieldSlice:
-    """The field of a slice of time; the ends of what lies in no interval asked for are infinite."""
+class IntervalField:
+    """The field of a time interval; the ends of ``rest``, what lies in no interval asked for, are infinite."""
 
     name: str
     start_s: float
@@ -31,7 +31,7 @@ class FieldSlice:
     field: VelocityField
 
 
-def open_velocity_field(layout: RunLayout, *, by_time: bool = False) -> VelocityField:
+def open_velocity_field(layout: RunLayout, *, time_weighted: bool = False) -> VelocityField:
     """The field of a run folder, weighed by passage or by time.
 
     Raises
@@ -40,28 +40,30 @@ def open_velocity_field(layout: RunLayout, *, by_time: bool = False) -> Velocity
         The field was not built yet, or not with that weight.
     """
     config = FlightRecord.model_validate_json(layout.flight.read_bytes()).config.field
-    return field_of_store(open_field(layout.field), config, read_grid(layout), by_time=by_time)
+    return field_of_store(open_field(layout.field), config, read_grid(layout), time_weighted=time_weighted)
 
 
-def open_field_slices(layout: RunLayout) -> list[FieldSlice]:
-    """The slices of time of a run folder, in their order; none where none were asked for."""
+def open_field_intervals(layout: RunLayout) -> list[IntervalField]:
+    """The fields of the time intervals of a run folder, in their order; empty where none were asked for."""
     config = FlightRecord.model_validate_json(layout.flight.read_bytes()).config.field
     grid = read_grid(layout)
     found = []
-    for path in sorted(layout.slices.glob("*.zarr")):
+    for path in sorted(layout.intervals.glob("*.zarr")):
         store = open_field(path)
         about = store.attributes
         ends = float(about.get("start_s", -inf)), float(about.get("stop_s", inf))
         field = field_of_store(store, config, grid)
-        found.append(FieldSlice(str(about["slice"]), *ends, float(about["observed_s"]), field))
+        found.append(IntervalField(str(about["time_interval"]), *ends, float(about["observed_s"]), field))
     return found
 
 
-def field_of_store(store: FieldStore, config: FieldConfig, grid: GridRecord, *, by_time: bool = False) -> VelocityField:
+def field_of_store(
+    store: FieldStore, config: FieldConfig, grid: GridRecord, *, time_weighted: bool = False
+) -> VelocityField:
     """The field in a store that was laid out under a configuration."""
-    path, histogram = store.path, HISTOGRAM_BY_TIME if by_time else HISTOGRAM
+    path, histogram = store.path, HISTOGRAM_TIME_WEIGHTED if time_weighted else HISTOGRAM
     if histogram not in store.histogram_names():
-        raise InputError(f"{path} holds no {histogram}: run the flight again with --set field.by_time=true")
+        raise InputError(f"{path} holds no {histogram}: run the flight again with --set field.time_weighted=true")
     if "velocity_noise" not in store.layer_names():
         raise InputError(f"{path} was written by an older velfield and has no intervals: run the flight again")
     count = store.layer("count")
@@ -77,8 +79,8 @@ def field_of_store(store: FieldStore, config: FieldConfig, grid: GridRecord, *, 
         shape=store.shape,
         tile_size=store.tile,
         bins=VelocityBins.from_config(config, grid.gsd_m),
-        standing_px_per_s=standing_px_per_s(config, grid.gsd_m),
-        layers=None if by_time else store.layer,
+        stationary_speed_px_per_s=stationary_speed_px_per_s(config, grid.gsd_m),
+        layers=None if time_weighted else store.layer,
     )
 
 

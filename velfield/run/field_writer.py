@@ -12,7 +12,7 @@ from schemas.records import GridRecord
 from velfield.field.accumulate import UNIT, FieldTile, Weight
 from velfield.field.bins import VelocityBins, band_radius_px
 from velfield.run.field_layers import LAYERS, tile_layers
-from velfield.run.stores import HISTOGRAM, HISTOGRAM_BY_TIME, FieldStore, create_field
+from velfield.run.stores import HISTOGRAM, HISTOGRAM_TIME_WEIGHTED, FieldStore, create_field
 
 GROUP_TILES = 8
 """A group is so many tiles high and wide: 512 x 512 px, a unit of work and a chunk of the layers."""
@@ -61,13 +61,13 @@ class GroupWriter:
         size = self.config.tile_size_px
         return min(size, self.y0 + self.height - y), min(size, self.x0 + self.width - x)
 
-    def put(self, row: int, column: int, tile: FieldTile, by_time: NDArray[np.int32] | None = None) -> None:
+    def put(self, row: int, column: int, tile: FieldTile, time_weighted: NDArray[np.int32] | None = None) -> None:
         """Write one tile, and its histogram weighed by time where there is one; a tile nobody passed is left out."""
         if not tile.count.any():
             return
         self.store.write_tile(row, column, tile.histogram)
-        if by_time is not None:
-            self.store.write_tile(row, column, by_time, HISTOGRAM_BY_TIME)
+        if time_weighted is not None:
+            self.store.write_tile(row, column, time_weighted, HISTOGRAM_TIME_WEIGHTED)
         self.touched.append((row, column))
         x, y = self.origin_xy(row, column)
         height, width = tile.count.shape
@@ -97,7 +97,7 @@ def create_field_store(
     config: FieldConfig,
     weighted_by: Weight,
     observed_s: float,
-    by_time: bool,
+    time_weighted: bool,
     more: Mapping[str, object] | None = None,
 ) -> None:
     """Lay out a field's store; ``more`` goes to its attributes beside what a reader needs.
@@ -108,7 +108,7 @@ def create_field_store(
         What a passage adds at a pixel.
     observed_s
         How long traffic was watched, s: what counts are compared by.
-    by_time
+    time_weighted
         Whether the histogram weighed by time is kept too.
     """
     bins = VelocityBins.from_config(config, grid.gsd_m)
@@ -135,12 +135,12 @@ def create_field_store(
         group_tiles=GROUP_TILES,
         velocities_px_per_s=bins.centres_px_per_s,
         attributes={name: value for name, value in attributes.items() if value is not None},
-        histograms=_histograms(weighted_by, by_time),
+        histograms=_histograms(weighted_by, time_weighted),
         layers=LAYERS,
     )
 
 
-def _histograms(weighted_by: Weight, by_time: bool) -> dict[str, dict[str, str]]:
+def _histograms(weighted_by: Weight, time_weighted: bool) -> dict[str, dict[str, str]]:
     """Attributes of the histograms kept, by name."""
     found = {
         HISTOGRAM: {
@@ -149,8 +149,8 @@ def _histograms(weighted_by: Weight, by_time: bool) -> dict[str, dict[str, str]]
             "weighted_by": weighted_by,
         }
     }
-    if by_time:
-        found[HISTOGRAM_BY_TIME] = {
+    if time_weighted:
+        found[HISTOGRAM_TIME_WEIGHTED] = {
             "long_name": "velocity histogram, weighted by time",
             "units": f"1/{UNIT} s",
             "weighted_by": "time",

@@ -113,9 +113,9 @@ class RunLayout:
         return self.root / "field.zarr"
 
     @property
-    def slices(self) -> Path:
-        """Fields of slices of time, a store each."""
-        return self.root / "slices"
+    def intervals(self) -> Path:
+        """Fields of time intervals, a store each."""
+        return self.root / "intervals"
 
     @property
     def maps(self) -> Path:

@@ -14,7 +14,7 @@ from velfield.analysis.crossings import line_crossings, settle_px
 from velfield.errors import InputError
 from velfield.field.segments import Segments, segment_table
 from velfield.field.view import VelocityField
-from velfield.run.field_reader import FieldSlice, open_field_slices, open_velocity_field
+from velfield.run.field_reader import IntervalField, open_field_intervals, open_velocity_field
 from velfield.run.frame_transforms import FrameMaps
 from velfield.run.grid import read_grid
 from velfield.run.layout import RunLayout
@@ -22,7 +22,7 @@ from velfield.run.paths import local_copy
 from velfield.run.stores import FrameStore, RegistrationStore, open_frames, open_registration
 from velfield.run.tables import read_tables
 
-_EACH_ONCE = {"weigh_shared_segments": "once"}
+_EACH_ONCE = {"shared_segment_weight": 1}
 """The preset `paper` weighs segments that two tracklets share twice; who counts vehicles does not."""
 
 
@@ -129,14 +129,14 @@ class Run:
         return open_velocity_field(self.layout)
 
     @cached_property
-    def field_by_time(self) -> VelocityField:
+    def field_time_weighted(self) -> VelocityField:
         """The velocity field weighed by time: a vehicle that stays counts for as long as it does."""
-        return open_velocity_field(self.layout, by_time=True)
+        return open_velocity_field(self.layout, time_weighted=True)
 
     @cached_property
-    def field_slices(self) -> dict[str, FieldSlice]:
-        """Fields of slices of time by name, in their order; empty where none were asked for (``--slice``)."""
-        return {found.name: found for found in open_field_slices(self.layout)}
+    def field_intervals(self) -> dict[str, IntervalField]:
+        """Fields of time intervals by name, in their order; empty where none were asked for (``--intervals``)."""
+        return {found.name: found for found in open_field_intervals(self.layout)}
 
     @cached_property
     def base_image(self) -> NDArray[np.uint8]:

@@ -24,7 +24,7 @@ from velfield.run.paths import S3_OPTIONS, RemotePath
 
 _STATUS_BYTES = 160
 HISTOGRAM = "velocity_histogram"
-HISTOGRAM_BY_TIME = "velocity_histogram_by_time"
+HISTOGRAM_TIME_WEIGHTED = "velocity_histogram_time_weighted"
 HISTOGRAMS: dict[str, dict[str, str]] = {HISTOGRAM: {"long_name": "velocity histogram", "units": "1"}}
 """What a field holds at least, with its attributes."""
 
@@ -403,7 +403,7 @@ class FieldStore:
 
     def histogram_names(self) -> list[str]:
         """Names of the (y, x, vy, vx) histograms."""
-        return [name for name in (HISTOGRAM, HISTOGRAM_BY_TIME) if name in self.group.by_axes.get(4, ())]
+        return [name for name in (HISTOGRAM, HISTOGRAM_TIME_WEIGHTED) if name in self.group.by_axes.get(4, ())]
 
     def write_tile(self, row: int, column: int, histogram: NDArray[np.int32], name: str = HISTOGRAM) -> None:
         """Write one tile of a histogram, (ty, tx, nvy, nvx): one chunk."""

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from schemas.arrays import FloatArray, IntArray
-from schemas.flight import PAPER_GSD_M
+from schemas.flight import PAPER_GSD_M, STATIONARY_SPEED_M_PER_S
 from velfield.tracking.tracks import component_minimum
 
 _SLACK_M = 1.5
@@ -50,7 +50,7 @@ class GapLimits:
 
     moving_s: float
     stationary_s: float = 0.0
-    stationary_speed_m_per_s: float = 1.15
+    stationary_speed_m_per_s: float = STATIONARY_SPEED_M_PER_S
 
 
 END_COLUMNS = [

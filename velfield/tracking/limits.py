@@ -14,7 +14,7 @@ class Limits:
 
     Attributes
     ----------
-    max_speed_px_per_s, slow_px_per_s, max_acceleration_px_per_s2
+    max_speed_px_per_s, stationary_speed_px_per_s, max_acceleration_px_per_s2
         Physical limits, base px.
     max_turn_rad, max_axis_offset_rad
         Angles between the two segments, and between motion and the car's axis.
@@ -46,7 +46,7 @@ class Limits:
         metres = PAPER_GSD_M if gsd_m is None else gsd_m
         return cls(
             max_speed_px_per_s=config.max_speed_m_per_s / metres,
-            stationary_speed_px_per_s=config.slow_m_per_s / metres,
+            stationary_speed_px_per_s=config.stationary_speed_m_per_s / metres,
             max_acceleration_px_per_s2=config.max_acceleration_m_per_s2 / metres,
             max_turn_rad=config.max_turn_rad,
             max_axis_offset_rad=config.max_axis_offset_rad,
@@ -65,7 +65,7 @@ class GateLog(Mapping[str, int]):
     """Counts by gate; logs of disjoint sets of windows add up to the log of their union.
 
     Links of every pair of consecutive frames: ``links_tried`` (within twice the reach), of which rejected by
-    ``speed``, ``axis``, and, with ``linking = links``, ``appearance`` (not the mutual best in appearance). Pairs of
+    ``speed``, ``axis``, and, with ``linking = pairwise``, ``appearance`` (not the mutual best in appearance). Pairs of
     links of every window: ``pairs_tried``, of which rejected by ``turn``, ``acceleration``, ``not_best`` (a pair
     through one of the same detections is cheaper) or ``confidence`` (the best, but ambiguous). Windows: ``windows``,
     ``frames_not_registered``, ``gaps_too_long``. Accepted: ``tracklets``; and of their links, two each,

@@ -63,7 +63,7 @@ class _Frames:
         """Appearance of the detections of frame i; pairwise linking, as in the paper, uses the patches only."""
         if i not in self._features:
             table = self.tables[i]
-            crops = None if self.config.linking == "links" else table.crops
+            crops = None if self.config.linking == "pairwise" else table.crops
             prepared = None if crops is None else prepare_crops(crops, self.states[i].axis_rad)
             self._features[i] = AppearanceFeatures(table.patches, prepared)
         return self._features[i]
@@ -74,7 +74,7 @@ class _Frames:
             links = gate_links(self.states[i], self.states[i + 1], self.limits)
             differences = appearance_differences(self.features(i), self.features(i + 1), links.first, links.second)
             pair = _FramePair(links, differences, typical_difference(differences, links.first), (*links.rejected, 0))
-            self._pairs[i] = _keep_mutual_best(pair) if self.config.linking == "links" else pair
+            self._pairs[i] = _keep_mutual_best(pair) if self.config.linking == "pairwise" else pair
         return self._pairs[i]
 
     def release(self, i: int) -> None:

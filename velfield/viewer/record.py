@@ -19,7 +19,7 @@ from schemas.records import FlightRecord, GridRecord
 from schemas.view import ViewArray, ViewBase, ViewLayer, ViewRecord, ViewSegments
 from velfield.analysis.coverage import few_vehicles
 from velfield.analysis.crossings import settle_px
-from velfield.field.bins import band_radius_px, standing_px_per_s
+from velfield.field.bins import band_radius_px, stationary_speed_px_per_s
 from velfield.field.segments import Segments
 from velfield.run.commits import write_atomically
 from velfield.run.grid import north_of
@@ -91,7 +91,7 @@ def view_record(
         height_px=grid.height_px,
         gsd_m=grid.gsd_m,
         north_rad=north_of(grid),
-        standing_px_per_s=standing_px_per_s(flight.config.field, grid.gsd_m),
+        stationary_speed_px_per_s=stationary_speed_px_per_s(flight.config.field, grid.gsd_m),
         first_time_s=float(known_s[0]) if len(known_s) else 0.0,
         last_time_s=float(known_s[-1]) if len(known_s) else 0.0,
         bin_width_px_per_s=float(store.attributes["bin_width_px_per_s"]),

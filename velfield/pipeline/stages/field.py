@@ -12,7 +12,7 @@ from schemas.tables import TRACKLET_COLUMNS
 from velfield.field.accumulate import Weight, accumulate_tile
 from velfield.field.bins import VelocityBins, band_radius_px
 from velfield.field.segments import SEGMENT_DTYPE, Segments, segment_table, segments_by_tile
-from velfield.field.slices import TimeSlice, slice_of_passages
+from velfield.field.time_intervals import TimeInterval, assign_intervals
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
 from velfield.pipeline.result import Outcome
@@ -51,16 +51,16 @@ def field_groups(plan: Plan) -> list[Group]:
 
 def field_weight(config: FieldConfig) -> Weight:
     """What a passage adds at a pixel: one in all, or one a segment as in the paper."""
-    return "segment" if config.weigh_shared_segments == "twice" else "passage"
+    return "segment" if config.shared_segment_weight == 2 else "passage"
 
 
 def lay_out_field(plan: Plan) -> None:
-    """Create ``field.zarr``, and the slices' stores, unless they stand as this plan wants them."""
+    """Create ``field.zarr``, and a store for each time interval, unless they exist under this plan's key."""
     if store_key(plan.layout.field) == plan.keys["field"]:
         return
     times_s = plan.info.times_s[plan.indices]
     first_s, last_s = float(times_s[0]), float(times_s[-1])
-    remove_tree(plan.layout.slices)
+    remove_tree(plan.layout.intervals)
     config = plan.config.field
     create = partial(
         create_field_store,
@@ -69,32 +69,34 @@ def lay_out_field(plan: Plan) -> None:
         config=config,
         weighted_by=field_weight(config),
     )
-    for path, part in slice_stores(plan):
+    for path, part in interval_stores(plan):
         watched_s = max(min(part.stop_s, last_s) - max(part.start_s, first_s), 0.0)
         ends = {name: value for name, value in (("start_s", part.start_s), ("stop_s", part.stop_s)) if isfinite(value)}
-        create(path, observed_s=watched_s, by_time=False, more={"slice": part.name, **ends})
-    create(plan.layout.field, observed_s=last_s - first_s, by_time=config.by_time)  # last: its key says that all stand
+        create(path, observed_s=watched_s, time_weighted=False, more={"time_interval": part.name, **ends})
+    create(
+        plan.layout.field, observed_s=last_s - first_s, time_weighted=config.time_weighted
+    )  # last: its key says that all stand
 
 
-def slice_stores(plan: Plan) -> list[tuple[Path, TimeSlice]]:
-    """Stores of the slices of time, in their order; none where none were asked for."""
-    return [(plan.layout.slices / f"{k:03d}.zarr", part) for k, part in enumerate(plan.slices)]
+def interval_stores(plan: Plan) -> list[tuple[Path, TimeInterval]]:
+    """Stores of the time intervals, in their order; empty where none were asked for."""
+    return [(plan.layout.intervals / f"{k:03d}.zarr", part) for k, part in enumerate(plan.time_intervals)]
 
 
 def accumulate_group(plan: Plan, group: Group) -> Outcome:
-    """Fill one group of tiles, of the field and of its slices."""
+    """Fill one group of tiles, of the field and of its time intervals."""
     grid, config = read_grid(plan.layout), plan.config.field
     bins = VelocityBins.from_config(config, grid.gsd_m)
     writer = GroupWriter(open_field(plan.layout.field, "r+"), group, grid=grid, config=config, bins=bins)
     segments = _segments_near(plan, writer)
     weight = field_weight(config)
-    accumulate_into(writer, segments, weight=weight, by_time=config.by_time)
+    accumulate_into(writer, segments, weight=weight, time_weighted=config.time_weighted)
     files = writer.files()
-    slices = slice_stores(plan)
-    number = slice_of_passages(segments, [part for _, part in slices]) if slices else None
-    for k, (path, _) in enumerate(slices):
+    stores = interval_stores(plan)
+    number = assign_intervals(segments, [part for _, part in stores]) if stores else None
+    for k, (path, _) in enumerate(stores):
         part = GroupWriter(open_field(path, "r+"), group, grid=grid, config=config, bins=bins)
-        accumulate_into(part, segments[number == k], weight=weight, by_time=False)
+        accumulate_into(part, segments[number == k], weight=weight, time_weighted=False)
         files += part.files()
     advance("field")
     count = writer.layers["count"]
@@ -104,7 +106,7 @@ def accumulate_group(plan: Plan, group: Group) -> Outcome:
     )
 
 
-def accumulate_into(writer: GroupWriter, segments: Segments, *, weight: Weight, by_time: bool) -> None:
+def accumulate_into(writer: GroupWriter, segments: Segments, *, weight: Weight, time_weighted: bool) -> None:
     """Fill a group from the segments that come near it."""
     config, radius = writer.config, band_radius_px(writer.config, writer.bins.gsd_m)
     mine = set(writer.tiles())
@@ -120,7 +122,7 @@ def accumulate_into(writer: GroupWriter, segments: Segments, *, weight: Weight, 
             bins=writer.bins,
             radius_px=radius,
         )
-        timed = accumulate(weight="time").histogram if by_time else None
+        timed = accumulate(weight="time").histogram if time_weighted else None
         writer.put(row, column, accumulate(weight=weight), timed)
     writer.close()
 

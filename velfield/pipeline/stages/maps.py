@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray
 from velfield.exports.cog import write_cog
-from velfield.field.bins import standing_px_per_s
+from velfield.field.bins import stationary_speed_px_per_s
 from velfield.field.statistics import direction_rad, speed_px_per_s
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
@@ -31,7 +31,7 @@ def make_maps(plan: Plan) -> Outcome:
     grid, config, layout = read_grid(plan.layout), plan.config.field, plan.layout
     store = open_field(layout.field)
     velocity = np.stack([store.layer("modal_vx"), store.layer("modal_vy")], axis=-1).astype(np.float64)
-    direction = direction_rad(velocity, standing_px_per_s=standing_px_per_s(config, grid.gsd_m))
+    direction = direction_rad(velocity, stationary_speed_px_per_s=stationary_speed_px_per_s(config, grid.gsd_m))
     speed = speed_px_per_s(velocity)
     grey = read_base_image(plan)
     scale = MapScale(gsd_m=grid.gsd_m, north_rad=north_of(grid))

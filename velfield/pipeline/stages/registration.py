@@ -44,14 +44,14 @@ def lay_out_registration(plan: Plan) -> None:
 
 
 def register_unit(plan: Plan, frames: range, blocks: Sequence[Sequence[FrameKeyPoints]]) -> Outcome:
-    """Chain a unit's frames in segments of ``segment_frames``, each seeded anew from the base image."""
+    """Chain a unit's frames in segments of ``chain_length_frames``, each seeded anew from the base image."""
     key_points = {found.frame: found.key_points for block in blocks for found in block}
     store = open_frames(plan.layout.frames)
     flags = store.column("flags")
     reference, lens, config = base_reference(plan), read_lens(plan.layout), plan.config.registration
     results: dict[int, FrameRegistration] = {}
-    for start in range(frames.start, frames.stop, config.segment_frames):
-        segment = range(start, min(start + config.segment_frames, frames.stop))
+    for start in range(frames.start, frames.stop, config.chain_length_frames):
+        segment = range(start, min(start + config.chain_length_frames, frames.stop))
         usable = [frame for frame in segment if not flags[frame] & int(UNUSABLE)]
         found = register_segment(_read(store, usable, key_points), reference, lens, config)
         results.update(zip(usable, found, strict=True))

@@ -31,7 +31,7 @@ def chain_tracks(plan: Plan, units: list[range]) -> Outcome:
     tracklets = read_tables(sources, TRACKLET_COLUMNS, only=[*ids, *END_COLUMNS])
     tracks = assign_tracks(tracklets[ids].to_numpy(np.int64))
     config = plan.config.tracking
-    gaps = GapLimits(config.join_gap_s, config.join_standing_gap_s, config.slow_m_per_s)
+    gaps = GapLimits(config.max_gap_s, config.max_stationary_gap_s, config.stationary_speed_m_per_s)
     tracks = reconnect_tracks(tracklets, tracks, gaps, gsd_m=read_grid(plan.layout).gsd_m)
     written, start = [], 0
     for path in sources:
