@@ -1,7 +1,8 @@
 """Hand the field to another tracker: a plain nearest-neighbour one at 2 frames a second, with and without the prior.
 
 The first half of a simulated flight makes the field; on the second half the tracker links detections from frame to
-frame, first by distance alone, then only where the field's gate lets it. Compared at one recall, or a better one.
+frame, first by distance alone, then only where the field's gate accepts the velocity. Compared at the same recall or a
+higher one.
 
 python examples/prior_for_a_tracker.py [SEED]
 """
@@ -29,23 +30,23 @@ FASTEST_PX = 34.5 / GSD_M * INTERVAL_S
 
 @dataclass(frozen=True)
 class Score:
-    """Links made, those of them that join two vehicles, and the share of the possible ones that were found."""
+    """Links made, those of them that join two vehicles, and the fraction of the possible ones that were made."""
 
     links: int
     wrong: int
     recall: float
 
 
-def learn(flight: Flight, until_s: float, rng: np.random.Generator) -> VelocityField:
-    """The field of what passed until then."""
+def build_field(flight: Flight, until_s: float, rng: np.random.Generator) -> VelocityField:
+    """The field of the vehicles that passed until then."""
     times_s = flight.times_s[flight.times_s < until_s]
-    place = flight.city.traffic, times_s, flight.city.to_px
-    tracklets = observed_tracklets(*place, shape=flight.base_shape, rng=rng)
+    scene = flight.city.traffic, times_s, flight.city.to_px
+    tracklets = observed_tracklets(*scene, shape=flight.base_shape, rng=rng)
     config = FieldConfig()
     return VelocityField.from_segments(
         segment_table(tracklets, config),
         shape=flight.base_shape,
-        tile_size=16,  # places are asked for all over the map, and small tiles are made quickly
+        tile_size=16,  # positions all over the map are queried, and small tiles are built quickly
         bins=VelocityBins.from_config(config, GSD_M),
         radius_px=band_radius_px(config, GSD_M),
         stationary_speed_px_per_s=stationary_speed_px_per_s(config, GSD_M),
@@ -57,10 +58,10 @@ def link(before: np.ndarray, after: np.ndarray, field: VelocityField | None) -> 
     distance = cdist(before, after)
     distance[distance > FASTEST_PX] = np.inf
     if field is not None:
-        for i, place in enumerate(before):
+        for i, position in enumerate(before):
             near = np.flatnonzero(np.isfinite(distance[i]))
             if near.size:
-                likely = field.gate(place).accepts((after[near] - place) / INTERVAL_S)
+                likely = field.gate(position).accepts((after[near] - position) / INTERVAL_S)
                 distance[i, near[~likely]] = np.inf
     if not distance.size:
         return np.empty((0, 2), int)
@@ -88,10 +89,10 @@ def measure(seed: int, *, frames: int = 600, size: tuple[int, int] = (400, 300))
     rng = np.random.default_rng(seed)
     flight = Flight(SimulationConfig(seed=seed, frames=frames, width=size[0], height=size[1]))
     half = float(flight.times_s[-1]) / 2
-    field = learn(flight, half, rng)
+    field = build_field(flight, half, rng)
     times_s = np.arange(half, float(flight.times_s[-1]), INTERVAL_S)
-    place = flight.city.traffic, times_s, flight.city.to_px
-    detections = observed_detections(*place, shape=flight.base_shape, rng=rng)
+    scene = flight.city.traffic, times_s, flight.city.to_px
+    detections = observed_detections(*scene, shape=flight.base_shape, rng=rng)
     return track(detections, None), track(detections, field)
 
 

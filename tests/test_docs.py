@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from flows.cli import app
+from schemas.renames import OLD_KEYS, REMOVED_KEYS
 from schemas.summary import RunSummary
 from tests.media import drifting, write_video
 from velfield.pipeline.configuration import resolve_config
@@ -103,3 +104,8 @@ def test_every_page_is_in_the_navigation() -> None:
 def test_decimals_have_a_leading_zero(page: Path) -> None:
     prose = BLOCK.sub("", page.read_text())
     assert [line for line in prose.splitlines() if BARE_DECIMAL.search(re.sub(r"`[^`]*`", "", line))] == []
+
+
+@pytest.mark.parametrize("name", [*OLD_KEYS, *OLD_KEYS.values(), *REMOVED_KEYS])
+def test_the_changelog_lists_every_renamed_key(name: str) -> None:
+    assert name in (ROOT / "CHANGELOG.md").read_text()
