@@ -1,61 +1,58 @@
-"""The network learnt on several places, each left out in turn: how good it is where it has never been."""
+"""Trains the network on several sites, and evaluates it by leave-one-site-out cross-validation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from schemas.flight import DetectionConfig
-from velfield.detection.cnn.fine_tuning import (
-    chosen_threshold,
-    evidence_of_network,
-    network_from_nothing,
-    record_of,
-)
+from velfield.detection.cnn.fine_tuning import evaluate_network, make_record, select_threshold, train_from_scratch
 from velfield.detection.cnn.model import Network
 from velfield.detection.detector import Detector
 from velfield.detection.evaluation import Evidence, joined
 from velfield.detection.samples import LabelledImage
 from velfield.parallel import each
 
-_ALWAYS_SHARE = 2.0
-"""How often what is always learnt is looked at, beside a place."""
-_STEPS_TRIED = 0.3
-"""Of the steps: what is left out is there for T and to be told, not to be kept."""
+_EXTRA_WEIGHT = 2.0
+"""Sampling weight of the extra images, where that of a site is 1."""
+_FOLD_STEPS_FRACTION = 0.3
+"""Of the steps: networks of the folds serve the threshold and the report only."""
 
 
 @dataclass(frozen=True)
-class Place:
-    """A place: pictures to learn from, and those, as they were taken, to try a detector on."""
+class Site:
+    """A site: images to train on, and images, unaugmented, to evaluate on."""
 
     name: str
-    learnt: Sequence[LabelledImage]
-    tried: Sequence[LabelledImage]
+    training: Sequence[LabelledImage]
+    evaluation: Sequence[LabelledImage]
 
 
-def train_on_places(
-    places: Sequence[Place], always: Sequence[LabelledImage], *, seed: int, steps: int
+def train_leave_one_site_out(
+    sites: Sequence[Site], extra: Sequence[LabelledImage], *, seed: int, steps: int
 ) -> tuple[Detector, dict[str, Evidence]]:
-    """Learn from all places, and from what is ``always`` learnt; T comes from places left out.
+    """Train on all sites and on the ``extra`` images; choose the threshold on held-out sites.
 
     Returns
     -------
-    The detector, and by place what networks said that were learnt on all others and on what is always learnt.
+    The detector, and the evaluation of each site by a network trained on all others and on the extra images.
     """
 
-    def without(k: int | None) -> tuple[Network, Evidence | None]:
-        if k is None:
-            return _learnt(places, always, seed, steps), None
-        others = [place for j, place in enumerate(places) if j != k]
-        network = _learnt(others, always, seed + 1 + k, round(_STEPS_TRIED * steps))
-        return network, joined([evidence_of_network(network, sample) for sample in places[k].tried])
+    def train_fold(held_out: int | None) -> tuple[Network, Evidence | None]:
+        if held_out is None:
+            return _train(sites, extra, seed, steps), None
+        others = [site for k, site in enumerate(sites) if k != held_out]
+        network = _train(others, extra, seed + 1 + held_out, round(_FOLD_STEPS_FRACTION * steps))
+        return network, joined([evaluate_network(network, sample) for sample in sites[held_out].evaluation])
 
-    (network, _), *tried = each(without, [None, *range(len(places))])
-    found = {place.name: said for place, (_, said) in zip(places, tried, strict=True) if said is not None}
-    told = f"cars of {len(places)} places, each found by a detector that never saw its place"
-    threshold, curve = chosen_threshold(joined(list(found.values())), 0.0, told)
-    cars = sum(len(sample.cars) for place in places for sample in place.tried) + sum(len(s.cars) for s in always)
-    return Detector(record_of(network, threshold, curve, cars, DetectionConfig())), found
+    (network, _), *folds = each(train_fold, [None, *range(len(sites))])
+    by_site = {
+        site.name: evaluation for site, (_, evaluation) in zip(sites, folds, strict=True) if evaluation is not None
+    }
+    description = f"cars of {len(sites)} sites, each detected by a detector that was not trained on its site"
+    threshold, curve = select_threshold(joined(list(by_site.values())), 0.0, description)
+    cars = sum(len(sample.cars) for site in sites for sample in site.evaluation) + sum(len(s.cars) for s in extra)
+    return Detector(make_record(network, threshold, curve, cars, DetectionConfig())), by_site
 
 
-def _learnt(places: Sequence[Place], always: Sequence[LabelledImage], seed: int, steps: int) -> Network:
-    groups = [*(place.learnt for place in places), always]
-    return network_from_nothing(groups, [*(1.0 for _ in places), _ALWAYS_SHARE], seed, steps=steps)
+def _train(sites: Sequence[Site], extra: Sequence[LabelledImage], seed: int, steps: int) -> Network:
+    groups = [*(site.training for site in sites), extra]
+    return train_from_scratch(groups, [*(1.0 for _ in sites), _EXTRA_WEIGHT], seed, steps=steps)

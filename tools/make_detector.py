@@ -1,4 +1,4 @@
-"""Makes the detectors that ship anew and prints how good they are on places left out: ``make detector DATA=FOLDER``.
+"""Trains the shipped detectors again and prints their accuracy on held-out sites: ``make detector DATA=FOLDER``.
 
 Half an hour on two cores.
 """
@@ -14,8 +14,8 @@ if __name__ == "__main__":
     limit_threads()
     prepare_process(verbose=False)
     import velfield.detection
-    from tools.shipped_detector import ship, ship_long_vehicles
+    from tools.shipped_detector import make_shipped_detector, make_shipped_long_vehicles
 
     data, folder = Path(sys.argv[1]), Path(velfield.detection.__path__[0])
-    print(ship_long_vehicles(data, folder / "cascade" / "shipped_long_vehicles.json"))
-    print("\n".join(ship(data, folder / "shipped_detector.json")))
+    print(make_shipped_long_vehicles(data, folder / "cascade" / "shipped_long_vehicles.json"))
+    print("\n".join(make_shipped_detector(data, folder / "shipped_detector.json")))

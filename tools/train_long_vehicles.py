@@ -1,4 +1,4 @@
-"""Learns what the middle of a lorry or bus looks like, for `long_vehicles`; run when what ships is made."""
+"""Trains the classifier of long vehicles (see `long_vehicles`) by boosting with hard-negative mining."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,149 +21,168 @@ from velfield.detection.samples import LabelledImage, Poses, varied
 from velfield.parallel import each
 
 ROUNDS = 800
-_STAGES = (80, 160)
-"""Rounds before each mining of places that are wrongly liked."""
-_POOL, _RECTANGLES = 4000, 2
-_SIGMA_PX = (7.0, 3.0)
+_MINING_ROUNDS = (80, 160)
+"""Rounds of boosting before each mining of hard negatives."""
+_POOL_SIZE, _MAX_RECTANGLES = 4000, 2
+_CORNER_SIGMA_PX = (7.0, 3.0)
 _SHRINKAGE, _FRACTION = 0.5, 0.3
-_COPIES, _OFF_COPIES, _CAR_SAMPLES = 6, 10, 27_000
-_BESIDE_SD_PX, _TURN_SD_RAD = 1.3, 0.08
-"""How far a find of the first classifier lies beside the axis, and how much it is turned."""
-_MIDDLE_SD_PX, _OFF_PX, _CAR_OFF_PX = 1.2, (4.0, 20.0), (2.0, 20.0)
-_MINED_ABOVE, _MINED_OFF_PX = -0.05, 4.0
-_FALSE_SHARE = 0.0005
-"""So many cars may be taken for the end of something long, where the classifier was not trained."""
+_POSITIVE_COPIES, _OFF_CENTRE_COPIES, _CAR_SAMPLES = 6, 10, 27_000
+_ACROSS_SD_PX, _ROTATION_SD_RAD = 1.3, 0.08
+"""Error of a detection of the first classifier: across the vehicle's axis, and in orientation."""
+_CENTRE_SD_PX, _OFF_CENTRE_PX, _OFF_CAR_PX = 1.2, (4.0, 20.0), (2.0, 20.0)
+_DETECTION_REACH_PX, _CAR_DETECTION_REACH_PX = 9.0, 2.0
+"""How far along its axis a long vehicle, or a car, may be detected off its centre."""
+_MINING_MIN_SCORE, _MINING_MIN_DISTANCE_PX = -0.05, 4.0
+_FALSE_POSITIVE_RATE = 0.0005
+"""Of held-out cars that may be taken for part of a long vehicle."""
 
 
-_Finds: TypeAlias = tuple[FloatArray, FloatArray]
-"""Poses, and whose they are."""
+_Detections: TypeAlias = tuple[FloatArray, FloatArray]
+"""Poses, and the pose of the vehicle each belongs to."""
 
 
 @dataclass(frozen=True)
 class _Scene:
-    picture: Picture
+    image: Picture
     long: FloatArray
     cars: FloatArray
 
 
-def learn_long_vehicles(
+def train_long_vehicles(
     samples: Sequence[LabelledImage],
-    left_out: Sequence[LabelledImage],
+    held_out: Sequence[LabelledImage],
     config: DetectionConfig,
     attribution: tuple[str, ...] = (),
 ) -> LongVehicleRecord:
-    """Learn the classifier.
+    """Train the classifier.
 
     Parameters
     ----------
     samples
-        Pictures whose cars have an orientation and a length; what is `LEAST_LENGTH` times as long as a car is long.
-    left_out
-        More of them, from which its threshold follows.
+        Labelled images with the orientation and length of each vehicle; vehicles of more than `LEAST_LENGTH` car
+        lengths are positives.
+    held_out
+        Further ones, on which the threshold is chosen.
     """
     rng = np.random.default_rng(config.seed)
-    scenes = [_scene(sample, config.working_car_length_px) for sample in samples]
-    pictures = [scene.picture for scene in scenes]
-    share = _CAR_SAMPLES / max(1, sum(len(scene.cars) for scene in scenes))
-    middles = [_middles(scene, rng) for scene in scenes]
-    others = [_others(scene, share, rng) for scene in scenes]
+    scenes = [_make_scene(sample, config.working_car_length_px) for sample in samples]
+    images = [scene.image for scene in scenes]
+    copies = _CAR_SAMPLES / max(1, sum(len(scene.cars) for scene in scenes))
+    positive_poses = [_sample_positives(scene, rng) for scene in scenes]
+    negative_poses = [_sample_negatives(scene, copies, rng) for scene in scenes]
     pool = random_pool(
-        _POOL, channels=3, sigma_xy_px=_SIGMA_PX, reach_xy_px=LONG.reach, max_rectangles=_RECTANGLES, rng=rng
+        _POOL_SIZE,
+        channels=3,
+        sigma_xy_px=_CORNER_SIGMA_PX,
+        reach_xy_px=LONG.reach,
+        max_rectangles=_MAX_RECTANGLES,
+        rng=rng,
     )
-    bank = bank_of(
-        pool, CONTRAST_FLOOR, [*zip(pictures, middles, strict=True), *zip(pictures, others, strict=True)], rng
-    )
-    known = bank.samples(zip(pictures, middles, strict=True))
-    known_others = bank.samples(zip(pictures, others, strict=True))
-    for rounds in _STAGES:
-        found = _boosted(bank, known, known_others, rounds, rng)
-        tried = [(scene, _beside(scene.long, 9.0, rng), _beside(scene.cars, 2.0, rng)) for scene in scenes]
-        mined = [varied(wrong, rng) for wrong in each(partial(_wrongly_liked, sums=sums_of(found)), tried)]
-        known_others = np.hstack([known_others, bank.samples(zip(pictures, mined, strict=True))])
-    found = _boosted(bank, known, known_others, ROUNDS, rng)
+    poses = [*zip(images, positive_poses, strict=True), *zip(images, negative_poses, strict=True)]
+    bank = bank_of(pool, CONTRAST_FLOOR, poses, rng)
+    positives = bank.samples(zip(images, positive_poses, strict=True))
+    negatives = bank.samples(zip(images, negative_poses, strict=True))
+    for rounds in _MINING_ROUNDS:
+        boosted = _boost(bank, positives, negatives, rounds, rng)
+        detections = [
+            (
+                scene,
+                _simulate_detections(scene.long, _DETECTION_REACH_PX, rng),
+                _simulate_detections(scene.cars, _CAR_DETECTION_REACH_PX, rng),
+            )
+            for scene in scenes
+        ]
+        mined = each(partial(_mine_hard_negatives, sums=sums_of(boosted)), detections)
+        hard = [varied(poses, rng) for poses in mined]
+        negatives = np.hstack([negatives, bank.samples(zip(images, hard, strict=True))])
+    boosted = _boost(bank, positives, negatives, ROUNDS, rng)
+    held_out_scenes = [_make_scene(sample, config.working_car_length_px) for sample in held_out]
     return LongVehicleRecord(
         working_car_length_px=config.working_car_length_px,
-        rounds=found,
-        threshold=_threshold(found, [_scene(sample, config.working_car_length_px) for sample in left_out], rng),
+        rounds=boosted,
+        threshold=_choose_threshold(boosted, held_out_scenes, rng),
         contrast_floor=CONTRAST_FLOOR,
         attribution=attribution,
     )
 
 
-def _scene(sample: LabelledImage, car_length_px: float) -> _Scene:
+def _make_scene(sample: LabelledImage, car_length_px: float) -> _Scene:
     long = sample.cars[:, 3] > LEAST_LENGTH * car_length_px
     return _Scene(picture_of(sample.image, None, LONG), sample.cars[long, :3], sample.cars[~long, :3])
 
 
-def _along(rows: FloatArray, copies: int, along: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Poses (n * copies, 3), moved along their axes, a little beside them and a little turned."""
-    rows = np.repeat(rows, copies, axis=0)
-    rows[:, :2] = moved(rows[:, :2], rows[:, 2], np.column_stack([along, rng.normal(0, _BESIDE_SD_PX, len(rows))]))
-    rows[:, 2] += rng.normal(0, _TURN_SD_RAD, len(rows))
-    return rows
+def _jitter(poses: FloatArray, copies: int, along: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Copies of poses (n * copies, 3), shifted along their axes, and jittered across them and in orientation."""
+    poses = np.repeat(poses, copies, axis=0)
+    across = rng.normal(0, _ACROSS_SD_PX, len(poses))
+    poses[:, :2] = moved(poses[:, :2], poses[:, 2], np.column_stack([along, across]))
+    poses[:, 2] += rng.normal(0, _ROTATION_SD_RAD, len(poses))
+    return poses
 
 
-def _either_way(count: int, between: tuple[float, float], rng: np.random.Generator) -> FloatArray:
-    return rng.uniform(*between, count) * np.where(rng.random(count) < 0.5, -1, 1)
+def _signed_uniform(count: int, limits: tuple[float, float], rng: np.random.Generator) -> FloatArray:
+    """Uniform between two limits, of either sign."""
+    return rng.uniform(*limits, count) * np.where(rng.random(count) < 0.5, -1, 1)
 
 
-def _beside(rows: FloatArray, reach_px: float, rng: np.random.Generator) -> _Finds:
-    """Where finds may lie."""
-    return _along(rows, 2, rng.uniform(-reach_px, reach_px, 2 * len(rows)), rng), np.repeat(rows, 2, axis=0)
+def _simulate_detections(poses: FloatArray, reach_px: float, rng: np.random.Generator) -> _Detections:
+    """Two detections of each vehicle, off its centre along the axis by no more than ``reach_px``."""
+    along = rng.uniform(-reach_px, reach_px, 2 * len(poses))
+    return _jitter(poses, 2, along, rng), np.repeat(poses, 2, axis=0)
 
 
-def _middles(scene: _Scene, rng: np.random.Generator) -> Poses:
-    along = rng.normal(0, _MIDDLE_SD_PX, _COPIES * len(scene.long))
-    return varied(_along(scene.long, _COPIES, along, rng), rng)
+def _sample_positives(scene: _Scene, rng: np.random.Generator) -> Poses:
+    along = rng.normal(0, _CENTRE_SD_PX, _POSITIVE_COPIES * len(scene.long))
+    return varied(_jitter(scene.long, _POSITIVE_COPIES, along, rng), rng)
 
 
-def _others(scene: _Scene, share: float, rng: np.random.Generator) -> Poses:
-    """Off the middle of what is long; cars, and places before and behind them."""
-    copies = max(1, round(share / 3))
-    off = _either_way(_OFF_COPIES * len(scene.long), _OFF_PX, rng)
-    on_car = rng.normal(0, _MIDDLE_SD_PX, copies * len(scene.cars))
-    by_car = _either_way(2 * copies * len(scene.cars), _CAR_OFF_PX, rng)
+def _sample_negatives(scene: _Scene, samples_per_car: float, rng: np.random.Generator) -> Poses:
+    """Poses off the centre of long vehicles, on cars, and in front of and behind cars."""
+    copies = max(1, round(samples_per_car / 3))
+    off_centre = _signed_uniform(_OFF_CENTRE_COPIES * len(scene.long), _OFF_CENTRE_PX, rng)
+    on_car = rng.normal(0, _CENTRE_SD_PX, copies * len(scene.cars))
+    off_car = _signed_uniform(2 * copies * len(scene.cars), _OFF_CAR_PX, rng)
     parts = [
-        _along(scene.long, _OFF_COPIES, off, rng),
-        _along(scene.cars, copies, on_car, rng),
-        _along(scene.cars, 2 * copies, by_car, rng),
+        _jitter(scene.long, _OFF_CENTRE_COPIES, off_centre, rng),
+        _jitter(scene.cars, copies, on_car, rng),
+        _jitter(scene.cars, 2 * copies, off_car, rng),
     ]
     return varied(np.concatenate(parts), rng)
 
 
-def _boosted(
-    bank: Bank, middles: ByteArray, others: ByteArray, rounds: int, rng: np.random.Generator
+def _boost(
+    bank: Bank, positives: ByteArray, negatives: ByteArray, rounds: int, rng: np.random.Generator
 ) -> tuple[Round, ...]:
-    return bank.learnt(middles, others, rounds=rounds, fraction=_FRACTION, shrinkage=_SHRINKAGE, rng=rng)
+    return bank.learnt(positives, negatives, rounds=rounds, fraction=_FRACTION, shrinkage=_SHRINKAGE, rng=rng)
 
 
-def _wrongly_liked(tried: tuple[_Scene, _Finds, _Finds], sums: BoostedSums) -> FloatArray:
-    """The two best places along each find's axis, where they are no middle."""
-    scene, long, cars = tried
-    wrong = [np.empty((0, 3))]
-    for (rows, whose), far_px in ((long, _MINED_OFF_PX), (cars, -1.0)):
-        if not len(rows):
+def _mine_hard_negatives(detections: tuple[_Scene, _Detections, _Detections], sums: BoostedSums) -> FloatArray:
+    """The two poses of highest score along each detection's axis, where they are not a long vehicle's centre."""
+    scene, long, cars = detections
+    hard = [np.empty((0, 3))]
+    for (poses, vehicles), min_distance_px in ((long, _MINING_MIN_DISTANCE_PX), (cars, -1.0)):
+        if not len(poses):
             continue
-        scores = scores_at(sums, scene.picture, rows[:, :2], rows[:, 2], OFFSETS, contrast_floor=CONTRAST_FLOOR)
-        which = np.arange(len(rows))
+        scores = scores_at(sums, scene.image, poses[:, :2], poses[:, 2], OFFSETS, contrast_floor=CONTRAST_FLOOR)
+        rows = np.arange(len(poses))
         for _ in range(2):
             best = scores.argmax(axis=1)
-            there = moved(rows[:, :2], rows[:, 2], OFFSETS[best].astype(np.float64) * LONG.step)
-            off = np.hypot(*(there - whose[:, :2]).T) > far_px
-            chosen = off & (scores[which, best] > _MINED_ABOVE)
-            wrong.append(np.column_stack([there, rows[:, 2]])[chosen])
-            for beside in range(-2, 3):
-                scores[which, np.clip(best + beside, 0, len(OFFSETS) - 1)] = -np.inf
-    return np.concatenate(wrong)
+            xy = moved(poses[:, :2], poses[:, 2], OFFSETS[best].astype(np.float64) * LONG.step)
+            wrong = np.hypot(*(xy - vehicles[:, :2]).T) > min_distance_px
+            chosen = wrong & (scores[rows, best] > _MINING_MIN_SCORE)
+            hard.append(np.column_stack([xy, poses[:, 2]])[chosen])
+            for neighbour in range(-2, 3):
+                scores[rows, np.clip(best + neighbour, 0, len(OFFSETS) - 1)] = -np.inf
+    return np.concatenate(hard)
 
 
-def _threshold(found: tuple[Round, ...], scenes: Sequence[_Scene], rng: np.random.Generator) -> float:
-    """What all but a few cars of scenes left out stay below."""
-    record = LongVehicleRecord(working_car_length_px=1.0, rounds=found, threshold=0.0, contrast_floor=CONTRAST_FLOOR)
-    classifier = LongVehicles(record, sums_of(found))
-    best = [np.empty(0)]
+def _choose_threshold(boosted: tuple[Round, ...], scenes: Sequence[_Scene], rng: np.random.Generator) -> float:
+    """Score that all but a small fraction of held-out cars stay below."""
+    record = LongVehicleRecord(working_car_length_px=1.0, rounds=boosted, threshold=0.0, contrast_floor=CONTRAST_FLOOR)
+    classifier = LongVehicles(record, sums_of(boosted))
+    highest = [np.empty(0)]
     for scene in scenes:
-        rows, _ = _beside(scene.cars, 2.0, rng)
-        scores = classifier.scores(scene.picture, rows[:, :2], rows[:, 2])
-        best.append(scores.max(axis=1, initial=-1.0))
-    return float(np.quantile(np.concatenate(best), 1 - _FALSE_SHARE))
+        poses, _ = _simulate_detections(scene.cars, _CAR_DETECTION_REACH_PX, rng)
+        scores = classifier.scores(scene.image, poses[:, :2], poses[:, 2])
+        highest.append(scores.max(axis=1, initial=-1.0))
+    return float(np.quantile(np.concatenate(highest), 1 - _FALSE_POSITIVE_RATE))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray
-from tools.shipped_detector import boxes_of
+from tools.shipped_detector import read_boxes
 from velfield import open_run
 from velfield.bench.still import SHARP_PX, about_their_middles, places_on_map, unused_corners
 from velfield.registration.alignment import Templates
@@ -35,7 +35,7 @@ def main() -> None:
     asked = parser.parse_args()
     run = open_run(asked.run)
     pictures = sorted(path for path in asked.folder.glob("*.png") if path.with_suffix(".txt").exists())
-    parked = _parked(run, [boxes_of(picture)[1] for picture in pictures])
+    parked = _parked(run, [read_boxes(picture)[1] for picture in pictures])
     corners = _corners_on(run, parked)
     maps = replace(run.maps, onward=())
     frames = [k for k, status in enumerate(run.registration_status) if status == "ok"]

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.shipped_detector import boxes_of
+from tools.shipped_detector import read_boxes
 from velfield import open_run
 from velfield.run.run import Run
 
@@ -42,7 +42,7 @@ def main() -> None:
         command += [word for setting in asked.settings for word in ("--set", setting)]
         subprocess.run([*command, "--out", str(root / "run")], check=True)
         run = open_run(root / "run")
-        boxes = [boxes_of(picture)[1] for picture in pictures]
+        boxes = [read_boxes(picture)[1] for picture in pictures]
         moving = _moving(run, boxes)
         judged = [_judge(run, k, boxes[k], moving[k]) for k in range(1, len(pictures))]
     right, right_moving, wrong, there, move = np.sum(judged, axis=0)

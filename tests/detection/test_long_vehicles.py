@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray
-from tools.shipped_detector import LORRY_SEEDS, LORRY_SEEDS_LEFT_OUT
+from tools.shipped_detector import LORRY_SEEDS, LORRY_SEEDS_HELD_OUT
 from velfield.bench.scenes import simulated_image
 from velfield.detection.cascade.classifier import moved
 from velfield.detection.cascade.feature_image import Picture, picture_of
@@ -16,7 +16,7 @@ from velfield.detection.samples import LabelledImage
 
 SEED = 40
 assert SEED not in LORRY_SEEDS
-assert SEED not in LORRY_SEEDS_LEFT_OUT
+assert SEED not in LORRY_SEEDS_HELD_OUT
 
 
 @cache

@@ -20,7 +20,13 @@ from velfield.detection.motion.difference import (
     motion_difference,
     noise_sigma,
 )
-from velfield.detection.motion.evidence import Conduct, Found, MotionEvidence, conduct, evidence_from_motion
+from velfield.detection.motion.evaluation import (
+    Detections,
+    MotionEvaluation,
+    MotionState,
+    classify_motion,
+    evaluate_by_motion,
+)
 from velfield.detection.motion.labels import MotionLabels, choose_frames, labels_from_motion, working_scale
 from velfield.errors import InputError
 
@@ -288,8 +294,8 @@ def test_length_width_and_axis_of_a_rectangle() -> None:
     assert blob.extent_along(np.array([0.5]))[0] == pytest.approx(18)
 
 
-def found_at(places: NDArray[np.float64], axis: float, score: NDArray[np.float64], time_s: float) -> Found:
-    return Found(places, np.full(len(places), axis), score, time_s)
+def found_at(places: NDArray[np.float64], axis: float, score: NDArray[np.float64], time_s: float) -> Detections:
+    return Detections(places, np.full(len(places), axis), score, time_s)
 
 
 def test_what_moves_along_its_axis_is_told_from_what_stands_and_what_is_alone() -> None:
@@ -300,8 +306,8 @@ def test_what_moves_along_its_axis_is_told_from_what_stands_and_what_is_alone() 
         along, aside = np.array([9 * k, 0]), np.array([0, 9 * k])
         places = np.concatenate([moving + along, standing, across + aside])
         frames.append(found_at(places, 0.0, np.ones(4), 0.2 * k))
-    kinds = conduct(*frames, car_length_px=16.0)
-    assert list(kinds) == [Conduct.MOVES, Conduct.MOVES, Conduct.STANDS, Conduct.ALONE]
+    kinds = classify_motion(*frames, car_length_px=16.0)
+    assert list(kinds) == [MotionState.MOVING, MotionState.MOVING, MotionState.STATIONARY, MotionState.ISOLATED]
 
 
 def test_the_threshold_by_motion_keeps_the_cars_and_drops_chance_finds() -> None:
@@ -312,9 +318,9 @@ def test_the_threshold_by_motion_keeps_the_cars_and_drops_chance_finds() -> None
         chance = rng.uniform(0, 960, (200, 2))
         score = np.concatenate([rng.normal(1.0, 0.2, 60), rng.normal(0.0, 0.2, 200)])
         frames.append(found_at(np.concatenate([cars + np.array([11.0 * k, 0]), chance]), 0.0, score, 0.2 * k))
-    evidence = evidence_from_motion(frames, car_length_px=16.0)
-    assert 0.35 < evidence.chosen < 0.75
-    at = np.searchsorted(-evidence.threshold, -evidence.chosen)
+    evidence = evaluate_by_motion(frames, car_length_px=16.0)
+    assert 0.35 < evidence.operating_threshold < 0.75
+    at = np.searchsorted(-evidence.thresholds, -evidence.operating_threshold)
     assert evidence.precision[at] > 0.9
     assert evidence.recall[at] > 0.85
 
@@ -328,42 +334,42 @@ def test_cars_missed_in_a_frame_beside_are_no_false_finds() -> None:
         kept = rng.random(60) < 0.9
         places = cars[kept] + np.array([11.0 * k, 0])
         frames.append(found_at(places, 0.0, rng.normal(1.0, 0.2, len(places)), 0.2 * k))
-    evidence = evidence_from_motion(frames, car_length_px=16.0)
+    evidence = evaluate_by_motion(frames, car_length_px=16.0)
     assert evidence.precision[-1] > 0.93  # of all that are told, 0.79 move
-    assert evidence.chosen < 0.9
+    assert evidence.operating_threshold < 0.9
 
 
 def test_what_stands_and_is_missed_in_one_frame_is_not_alone() -> None:
     nothing, parked = np.empty((0, 2)), np.array([[200.0, 50.0]])
     for before, after in ((parked, nothing), (nothing, parked + 1.0)):
         frames = [found_at(xy, 0.0, np.ones(len(xy)), 0.2 * k) for k, xy in enumerate((before, parked, after))]
-        assert list(conduct(*frames, car_length_px=16.0)) == [Conduct.STANDS]
+        assert list(classify_motion(*frames, car_length_px=16.0)) == [MotionState.STATIONARY]
 
 
-def moving_and_standing(standing: NDArray[np.float64]) -> MotionEvidence:
+def moving_and_standing(standing: NDArray[np.float64]) -> MotionEvaluation:
     """Sixty cars that move, liked at about 0.3, among what stands and is liked so much."""
     rng = np.random.default_rng(6)
     cars = np.column_stack([rng.uniform(0, 900, 60), np.arange(60) * 16.0])
     parked = np.column_stack([np.full(len(standing), 2000.0), np.arange(len(standing)) * 30.0])
     score = np.concatenate([rng.normal(0.3, 0.05, 60), standing])
     frames = [found_at(np.concatenate([cars + np.array([11.0 * k, 0]), parked]), 0.0, score, 0.2 * k) for k in range(6)]
-    return evidence_from_motion(frames, car_length_px=16.0)
+    return evaluate_by_motion(frames, car_length_px=16.0)
 
 
 def test_looks_tell_cars_where_what_stands_is_liked_as_much_as_what_moves() -> None:
     rng = np.random.default_rng(7)
-    assert moving_and_standing(rng.normal(0.3, 0.05, 120)).tells_cars(0.3)
-    assert moving_and_standing(np.empty(0)).tells_cars(0.3)
-    assert not moving_and_standing(rng.uniform(0.15, 0.29, 3000)).tells_cars(0.3)
-    disliked = replace(moving_and_standing(np.empty(0)), chosen=-0.01)
-    assert not disliked.tells_cars(0.3)
+    assert moving_and_standing(rng.normal(0.3, 0.05, 120)).appearance_is_sufficient(0.3)
+    assert moving_and_standing(np.empty(0)).appearance_is_sufficient(0.3)
+    assert not moving_and_standing(rng.uniform(0.15, 0.29, 3000)).appearance_is_sufficient(0.3)
+    disliked = replace(moving_and_standing(np.empty(0)), operating_threshold=-0.01)
+    assert not disliked.appearance_is_sufficient(0.3)
 
 
 def test_without_motion_there_is_no_evidence() -> None:
     frames = [found_at(np.array([[50.0, 50.0]]), 0.0, np.ones(1), 0.2 * k) for k in range(4)]
-    assert np.isnan(evidence_from_motion(frames, car_length_px=16.0).chosen)
+    assert np.isnan(evaluate_by_motion(frames, car_length_px=16.0).operating_threshold)
     empty = [found_at(np.empty((0, 2)), 0.0, np.empty(0), 0.2 * k) for k in range(3)]
-    assert np.isnan(evidence_from_motion(empty, car_length_px=16.0).chosen)
+    assert np.isnan(evaluate_by_motion(empty, car_length_px=16.0).operating_threshold)
 
 
 def still_frames(path: Path, wanted: list[int]) -> list[MotionFrame]:

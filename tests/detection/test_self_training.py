@@ -11,13 +11,13 @@ from pydantic import ValidationError
 from schemas.arrays import FloatArray
 from schemas.detector import MotionRecord
 from schemas.flight import DetectionConfig
-from velfield.detection.cnn.motion_bonus import difference_about, lift_of
-from velfield.detection.cnn.self_training import network_of_motion, threshold_of_standing, thresholds_of
+from velfield.detection.cnn.inference import background_difference_at, motion_score_bonus
+from velfield.detection.cnn.self_training import fit_motion_thresholds, self_train_from_motion, stationary_threshold
 from velfield.detection.detect import detect_frame
 from velfield.detection.detector import shipped_detector
 from velfield.detection.evaluation import matched
 from velfield.detection.motion.difference import MotionFrame, motion_background
-from velfield.detection.motion.evidence import Conduct
+from velfield.detection.motion.evaluation import MotionState
 from velfield.detection.motion.labels import labels_from_motion
 from velfield.detection.samples import LabelledImage
 from velfield.synthetic import small_flight
@@ -34,7 +34,7 @@ def liked(cars: int, others: int, seed: int) -> tuple[FloatArray, FloatArray]:
 def test_what_stands_is_held_to_what_tells_it_from_clutter(seed: int) -> None:
     moving, _ = liked(300, 0, seed)
     cars, clutter = liked(200, 3000, seed + 50)
-    threshold = threshold_of_standing(moving, np.concatenate([cars, clutter]))
+    threshold = stationary_threshold(moving, np.concatenate([cars, clutter]))
     right, wrong = (cars > threshold).sum(), (clutter > threshold).sum()
     assert right / (right + wrong) > 0.7
     assert right / len(cars) > 0.5
@@ -43,7 +43,7 @@ def test_what_stands_is_held_to_what_tells_it_from_clutter(seed: int) -> None:
 def test_where_all_that_stands_is_cars_nearly_all_of_it_is_taken() -> None:
     moving, _ = liked(300, 0, 1)
     cars, _ = liked(400, 0, 2)
-    assert (cars > threshold_of_standing(moving, cars)).mean() > 0.85
+    assert (cars > stationary_threshold(moving, cars)).mean() > 0.85
 
 
 def told(moves: int, alone: int, off: float = 40.0) -> tuple[FloatArray, NDArray[np.int8], FloatArray]:
@@ -52,18 +52,20 @@ def told(moves: int, alone: int, off: float = 40.0) -> tuple[FloatArray, NDArray
     moving, false = liked(moves, alone, 3)
     cars, clutter = liked(moves // 2, 10 * moves, 4)
     score = np.concatenate([moving, false, cars, clutter])
-    kind = np.repeat([Conduct.MOVES, Conduct.ALONE, Conduct.STANDS], [moves, alone, len(cars) + len(clutter)])
+    kind = np.repeat(
+        [MotionState.MOVING, MotionState.ISOLATED, MotionState.STATIONARY], [moves, alone, len(cars) + len(clutter)]
+    )
     differs = np.repeat([off, off, 5.0], [moves, alone, len(cars) + len(clutter)]) * rng.uniform(0.8, 1.2, len(score))
     return score, kind.astype(np.int8), differs
 
 
 def test_what_moves_needs_to_be_liked_less() -> None:
     score, kind, differs = told(200, 60)
-    chosen = thresholds_of(score, kind, differs)
+    chosen = fit_motion_thresholds(score, kind, differs)
     assert chosen is not None
     threshold, motion, curve = chosen
-    lifted = score + lift_of(motion, differs)
-    assert (lifted > threshold)[kind == Conduct.MOVES].mean() > 0.95
+    lifted = score + motion_score_bonus(motion, differs)
+    assert (lifted > threshold)[kind == MotionState.MOVING].mean() > 0.95
     assert motion.lift > 0.05
     assert 5 < motion.still_grey < motion.moving_grey < 40
     assert curve.threshold[curve.chosen or 0] == pytest.approx(threshold, abs=0.02)
@@ -72,12 +74,12 @@ def test_what_moves_needs_to_be_liked_less() -> None:
 
 @pytest.mark.parametrize(("moves", "off"), [(39, 40.0), (200, 5.5)])
 def test_without_enough_that_moves_and_differs_nothing_is_chosen(moves: int, off: float) -> None:
-    assert thresholds_of(*told(moves, 10, off)) is None
+    assert fit_motion_thresholds(*told(moves, 10, off)) is None
 
 
 def test_a_lift_grows_between_what_stands_and_what_moves() -> None:
     motion = MotionRecord(still_grey=10, moving_grey=30, lift=0.2)
-    np.testing.assert_allclose(lift_of(motion, np.array([0.0, 10, 20, 30, 90])), [0, 0, 0.1, 0.2, 0.2])
+    np.testing.assert_allclose(motion_score_bonus(motion, np.array([0.0, 10, 20, 30, 90])), [0, 0, 0.1, 0.2, 0.2])
     with pytest.raises(ValidationError, match="what moves differs by 9, what stands by 10"):
         MotionRecord(still_grey=10, moving_grey=9, lift=0.2)
 
@@ -86,7 +88,7 @@ def test_the_difference_is_that_about_a_place() -> None:
     background = np.full((60, 80), 100, np.uint8)
     image = background.copy()
     image[20:41, 30:51] = 140
-    near, far = difference_about(image, background, np.array([[40.0, 30.0], [5.0, 5.0]]), 16.0)
+    near, far = background_difference_at(image, background, np.array([[40.0, 30.0], [5.0, 5.0]]), 16.0)
     assert near == pytest.approx(40, abs=0.5)
     assert far == pytest.approx(0, abs=0.1)
 
@@ -120,7 +122,7 @@ def test_cars_that_stand_are_found_by_a_network_that_learnt_from_those_that_move
         if found.labelled
     ]
     config = DetectionConfig(network_steps=6)
-    learnt = network_of_motion(samples, shipped_detector(), frames[3:12], background, config, max_interval_s=0.45)
+    learnt = self_train_from_motion(samples, shipped_detector(), frames[3:12], background, config, max_interval_s=0.45)
     assert learnt is not None
     assert learnt.uses_background
     assert learnt.record.attribution == shipped_detector().record.attribution
@@ -129,7 +131,7 @@ def test_cars_that_stand_are_found_by_a_network_that_learnt_from_those_that_move
     order = np.argsort(-found.score)
     right = matched(np.column_stack([found.xy, found.orientation_rad, found.score])[order], known)
     assert right.mean() > 0.9
-    differs = difference_about(frame.image, background, known[:, :2], 16.0)
+    differs = background_difference_at(frame.image, background, known[:, :2], 16.0)
     stands = differs < 0.3 * np.median(differs[differs > 15])
     near = np.hypot(*(known[:, None, :2] - found.xy[None]).transpose(2, 0, 1)).min(axis=1) < 8
     assert near[~stands].mean() > 0.9

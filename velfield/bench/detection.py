@@ -15,7 +15,7 @@ from velfield.bench.scenes import simulated_image
 from velfield.detection.boosting import random_pool
 from velfield.detection.cascade.classifier import Look, offset_grid
 from velfield.detection.cascade.feature_image import picture_of
-from velfield.detection.cnn.convolution import Layout, convolved
+from velfield.detection.cnn.convolution import PaddedBatchLayout, conv2d
 from velfield.detection.detect import detect_frame
 from velfield.detection.detector import BoostedSums, Detector
 from velfield.detection.paper.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, continued, dense_response
@@ -162,9 +162,9 @@ def network_speed(image: NDArray[np.uint8], detector: Detector) -> Speed:
     fast = _fastest(lambda: detect_frame(image, None, detector, DetectionConfig()), 2)
     peer = 0.0
     for step, taps, into, out in YOLOV8N:
-        layout = Layout(1, image.shape[0] // step, image.shape[1] // step)
+        layout = PaddedBatchLayout(1, image.shape[0] // step, image.shape[1] // step)
         values, weights = np.ones((layout.rows, into), np.float32), np.ones((taps, into, out), np.float32)
-        peer += _fastest(partial(convolved, values, weights, layout), 1)
+        peer += _fastest(partial(conv2d, values, weights, layout), 1)
     return Speed("the network, shipped", "convolutions of YOLOv8n's sizes", fast, peer)
 
 

@@ -11,8 +11,7 @@ from velfield.detection.cascade.classifier import Look, distinct, find_cars
 from velfield.detection.cascade.feature_image import COARSE, picture_of
 from velfield.detection.cascade.long_vehicles import LONG, shipped_long_vehicles
 from velfield.detection.cascade.proposals import propose
-from velfield.detection.cnn.inference import network_finds
-from velfield.detection.cnn.motion_bonus import difference_about, lift_of
+from velfield.detection.cnn.inference import background_difference_at, detect_cars, motion_score_bonus
 from velfield.detection.crops import oriented_patches, upright_chips
 from velfield.detection.detector import Detector
 from velfield.detection.label_orientation import CAR_ASPECT
@@ -68,10 +67,11 @@ def detect_frame(
     if detector.record.method == "dense":
         cars, area = find_cars_densely(image, valid, detector, config, threshold)
     elif detector.record.method == "network":
-        found = network_finds(detector.network, image, valid)
+        found = detect_cars(detector.network, image, valid)
         motion = detector.record.motion
         if motion is not None and background is not None:
-            found[:, 3] += lift_of(motion, difference_about(image, background, found[:, :2], length))
+            difference = background_difference_at(image, background, found[:, :2], length)
+            found[:, 3] += motion_score_bonus(motion, difference)
         cars = _middles(image, valid, distinct(found[found[:, 3] > threshold], length), length)
         area = np.full(len(cars), length * length * CAR_ASPECT)
     else:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from schemas.detector import DetectorRecord, PrecisionRecallCurve, Round
-from velfield.detection.cnn.model import Network, network_of
+from velfield.detection.cnn.model import Network, network_from_record
 from velfield.errors import InputError
 
 MAX_BYTES = 20_000_000
@@ -77,7 +77,7 @@ class Detector:
     @cached_property
     def network(self) -> Network:
         """The network's weights; only of the method of that name."""
-        return network_of(self.record.network or {})
+        return network_from_record(self.record.network or {})
 
     @cached_property
     def sums(self) -> BoostedSums:

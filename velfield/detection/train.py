@@ -10,7 +10,7 @@ from schemas.flight import DetectionConfig
 from velfield.detection.cascade.ensemble import committee_of
 from velfield.detection.cascade.proposals import propose
 from velfield.detection.cascade.training import CONTRAST_FLOOR, learn_classifier, learn_proposer
-from velfield.detection.cnn.fine_tuning import train_on
+from velfield.detection.cnn.fine_tuning import fine_tune
 from velfield.detection.detector import Detector, shipped_detector, sums_of
 from velfield.detection.evaluation import FOLD_MIN_CARS, Evidence, curve_of, cut_of, evidence_of_part, joined, stripes
 from velfield.detection.paper.classifier import train_densely
@@ -74,7 +74,7 @@ def train_detector(
         return train_densely(samples, config)
     earlier = _network_to_continue(continued, config)
     if earlier is not None:
-        return train_on(samples, earlier, config)
+        return fine_tune(samples, earlier, config)
     has_background = config.motion_channel != "never" and all(sample.background is not None for sample in samples)
     channels = 4 if has_background else 3
     prior = _rounds_to_continue(continued, config, channels)

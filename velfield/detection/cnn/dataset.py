@@ -1,4 +1,9 @@
-"""What the network learns from: pieces of labelled pictures, turned, scaled and toned as others would show them."""
+"""Training patches for the network: random crops of labelled images with augmentation, and their target maps.
+
+A patch is cut by a random similarity transform (position, rotation, mirroring, scale) and then augmented
+photometrically (gamma, contrast, brightness, blur, a shadow's edge, noise), so that it looks as another sensor, or
+other light, would show it. Targets are a Gaussian heatmap of car centres and the orientation at each heatmap pixel.
+"""
 
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -6,7 +11,6 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.arrays import Float32Array, FloatArray
 from velfield.detection.cnn.model import STRIDE
@@ -14,140 +18,156 @@ from velfield.detection.cnn.trainer import Batch
 from velfield.detection.label_orientation import with_axes
 from velfield.detection.samples import LabelledImage
 
-SIDE_PX = 96
-"""Side of a piece: six cars."""
-PIECES = 16
-"""Pieces a step."""
-_MIDDLE_SIGMA_PX = 2.2
-_AT_A_CAR, _ABOUT_IT_PX = 0.7, 19.0
-"""Share of the pieces about a marked car, and how far its place in them varies."""
-_SCALE_SPREAD = 0.2
-_REACH = 2
-"""Sides of a piece from its middle within which lies all that it can show."""
-_GAMMA_SPREAD, _CONTRAST, _LIGHT = 0.7, (0.5, 1.4), 0.15
-_GREY_MIDDLE = 0.45
-_BLURRED, _BLUR_PX = 0.3, (0.3, 0.9)
-_SHADED, _SHADE, _SHADE_EDGE_PX = 0.25, (0.2, 0.6), (0.5, 2.0)
-_NOISE = 0.03
+PATCH_PX = 96
+"""Side of a patch: six cars."""
+BATCH_SIZE = 16
+HEATMAP_SIGMA_PX = 2.2
+_CENTRED_FRACTION, _CENTRING_SD_PX = 0.7, 19.0
+"""Fraction of the patches that are centred near a labelled car, and standard deviation of that position."""
+_LOG_SCALE_RANGE = 0.2
+_WINDOW_PATCHES = 2
+"""Half side of the source window, in patch sides: covers all that a patch can show."""
+_LOG_GAMMA_RANGE, _CONTRAST_RANGE, _BRIGHTNESS_RANGE = 0.7, (0.5, 1.4), 0.15
+_MEAN_GREY = 0.45
+"""Contrast is changed about this grey."""
+_BLUR_PROBABILITY, _BLUR_SIGMA_PX = 0.3, (0.3, 0.9)
+_SHADOW_PROBABILITY, _SHADOW_DEPTH, _SHADOW_EDGE_SIGMA_PX = 0.25, (0.2, 0.6), (0.5, 2.0)
+_MAX_NOISE_SD = 0.03
+_TARGET_MARGIN_PX = 8
+"""Cars beyond the border of a patch by no more than this still show in its targets."""
+_HEATMAP_PX = np.arange(PATCH_PX // STRIDE) * STRIDE + (STRIDE - 1) / 2
+"""Positions of the heatmap's rows and columns in the patch, px."""
 
 
-class Pieces:
-    """Batches of pieces of labelled pictures, each by its number and a seed alone.
+class PatchDataset:
+    """Batches of random patches; each follows from its number and the seed alone.
 
     Parameters
     ----------
     groups
-        Labelled pictures that count together, whatever their number.
-    shares
-        How often each group is taken from.
+        Groups of labelled images, such as one a site.
+    weights
+        Sampling weight of each group, whatever its number of images.
     seed
-        Of all that is random.
+        Of all random numbers.
     """
 
-    def __init__(self, groups: Sequence[Sequence[LabelledImage]], shares: Sequence[float], seed: int) -> None:
-        self._groups = [[_ready(sample) for sample in group] for group in groups]
-        self._shares = np.array(shares, float) / np.sum(shares)
+    def __init__(self, groups: Sequence[Sequence[LabelledImage]], weights: Sequence[float], seed: int) -> None:
+        self._groups = [[_with_orientations(sample) for sample in group] for group in groups]
+        self._probabilities = np.array(weights, float) / np.sum(weights)
         self._seed = seed
         self._pool = ThreadPoolExecutor(1)
         self._next: tuple[int, Future[Batch]] | None = None
 
     def __call__(self, step: int) -> Batch:
-        """The batch of a step; the next one is made meanwhile."""
-        waited, self._next = self._next, (step + 1, self._pool.submit(self._made, step + 1))
-        return waited[1].result() if waited is not None and waited[0] == step else self._made(step)
+        """Batch of a step; that of the next step is prepared in the background."""
+        prepared, self._next = self._next, (step + 1, self._pool.submit(self._make_batch, step + 1))
+        return prepared[1].result() if prepared is not None and prepared[0] == step else self._make_batch(step)
 
-    def _made(self, step: int) -> Batch:
+    def _make_batch(self, step: int) -> Batch:
         rng = np.random.default_rng((self._seed, step))
-        pieces = []
-        for _ in range(PIECES):
-            group = self._groups[rng.choice(len(self._groups), p=self._shares)]
-            pieces.append(_piece(group[rng.integers(len(group))], rng))
-        return Batch(*(np.stack(part) for part in zip(*pieces, strict=True)))
+        patches = []
+        for _ in range(BATCH_SIZE):
+            group = self._groups[rng.choice(len(self._groups), p=self._probabilities)]
+            patches.append(_sample_patch(group[rng.integers(len(group))], rng))
+        return Batch(*(np.stack(part) for part in zip(*patches, strict=True)))
 
 
-def _ready(sample: LabelledImage) -> LabelledImage:
+def _with_orientations(sample: LabelledImage) -> LabelledImage:
     return replace(sample, cars=with_axes(sample.image, sample.cars, sample.tilts))
 
 
-def _piece(
+def _sample_patch(
     sample: LabelledImage, rng: np.random.Generator
 ) -> tuple[Float32Array, Float32Array, Float32Array, Float32Array, Float32Array]:
-    matrix = _placed(sample, rng)
-    rows, columns, near = _about(matrix)
+    """A patch and its targets, in the order of `Batch`."""
+    matrix = _random_similarity(sample, rng)
+    rows, columns, window_matrix = _source_window(matrix)
     image = sample.image[rows, columns].astype(np.float32) / 255
-    picture = cv2.warpAffine(image, near, (SIDE_PX, SIDE_PX), borderMode=cv2.BORDER_REFLECT_101)
-    cars = sample.cars[:, :2] @ matrix[:, :2].T + matrix[:, 2]
-    along = np.column_stack([np.cos(sample.cars[:, 2]), np.sin(sample.cars[:, 2])]) @ matrix[:, :2].T
-    middles, axes, counted_axes = _told_of(cars, np.arctan2(along[:, 1], along[:, 0]))
-    seen = np.ones(image.shape, bool) if sample.valid is None else sample.valid[rows, columns]
-    counted = (
-        cv2.warpAffine(seen.astype(np.uint8), near, (SIDE_PX, SIDE_PX), flags=cv2.INTER_NEAREST)[::STRIDE, ::STRIDE] > 0
-    )
+    patch = cv2.warpAffine(image, window_matrix, (PATCH_PX, PATCH_PX), borderMode=cv2.BORDER_REFLECT_101)
+    centres = sample.cars[:, :2] @ matrix[:, :2].T + matrix[:, 2]
+    direction = np.column_stack([np.cos(sample.cars[:, 2]), np.sin(sample.cars[:, 2])]) @ matrix[:, :2].T
+    heatmap, orientation, orientation_weight = encode_targets(centres, np.arctan2(direction[:, 1], direction[:, 0]))
+    valid = np.ones(image.shape, bool) if sample.valid is None else sample.valid[rows, columns]
+    valid_patch = cv2.warpAffine(valid.astype(np.uint8), window_matrix, (PATCH_PX, PATCH_PX), flags=cv2.INTER_NEAREST)
+    mask = valid_patch[::STRIDE, ::STRIDE] > 0
     scale = float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
     circles = np.column_stack([sample.ignore[:, :2] @ matrix[:, :2].T + matrix[:, 2], scale * sample.ignore[:, 2]])
     reach = circles[:, 2:] + STRIDE
-    within = ((circles[:, :2] > -reach) & (circles[:, :2] < SIDE_PX + reach)).all(axis=1)
-    for x, y, radius in circles[within]:
-        circle = np.hypot(_CELLS[None, :] - x, _CELLS[:, None] - y) < radius + STRIDE
-        counted &= ~circle | (middles > 0.1)
-    return _toned(picture, rng), middles, counted.astype(np.float32), axes, counted_axes * counted
+    nearby = ((circles[:, :2] > -reach) & (circles[:, :2] < PATCH_PX + reach)).all(axis=1)
+    for x, y, radius in circles[nearby]:
+        ignored = np.hypot(_HEATMAP_PX[None, :] - x, _HEATMAP_PX[:, None] - y) < radius + STRIDE
+        mask &= ~ignored | (heatmap > 0.1)
+    return _augment_photometry(patch, rng), heatmap, mask.astype(np.float32), orientation, orientation_weight * mask
 
 
-_CELLS = np.arange(SIDE_PX // STRIDE) * STRIDE + (STRIDE - 1) / 2
-
-
-def _placed(sample: LabelledImage, rng: np.random.Generator) -> FloatArray:
-    """From the picture to the piece: about a car or anywhere, turned, mirrored, scaled."""
+def _random_similarity(sample: LabelledImage, rng: np.random.Generator) -> FloatArray:
+    """Affine matrix (2, 3) from image to patch: centred near a car or anywhere, rotated, mirrored, scaled."""
     height, width = sample.image.shape
-    if len(sample.cars) and rng.random() < _AT_A_CAR:
-        at = sample.cars[rng.integers(len(sample.cars)), :2] + rng.normal(0, _ABOUT_IT_PX, 2)
+    if len(sample.cars) and rng.random() < _CENTRED_FRACTION:
+        centre = sample.cars[rng.integers(len(sample.cars)), :2] + rng.normal(0, _CENTRING_SD_PX, 2)
     else:
-        at = rng.uniform(0, (width, height))
-    turn, scale = rng.uniform(0, 2 * np.pi), np.exp(rng.uniform(-_SCALE_SPREAD, _SCALE_SPREAD))
-    c, s = scale * np.cos(turn), scale * np.sin(turn)
-    turned = np.array([[c, -s], [s, c]]) * (rng.choice([-1.0, 1.0]), 1.0)
-    return np.column_stack([turned, np.full(2, SIDE_PX / 2) - turned @ at])
+        centre = rng.uniform(0, (width, height))
+    angle, scale = rng.uniform(0, 2 * np.pi), np.exp(rng.uniform(-_LOG_SCALE_RANGE, _LOG_SCALE_RANGE))
+    c, s = scale * np.cos(angle), scale * np.sin(angle)
+    linear = np.array([[c, -s], [s, c]]) * (rng.choice([-1.0, 1.0]), 1.0)
+    return np.column_stack([linear, np.full(2, PATCH_PX / 2) - linear @ centre])
 
 
-def _about(matrix: FloatArray) -> tuple[slice, slice, FloatArray]:
-    """Rows and columns of all that a piece can show, mirrored at the picture's edge too, and the matrix from there."""
-    middle = np.linalg.solve(matrix[:, :2], np.full(2, SIDE_PX / 2) - matrix[:, 2])
-    first = np.maximum(middle - _REACH * SIDE_PX, 0).astype(int)
-    last = np.maximum(middle + _REACH * SIDE_PX, 1).astype(int)
-    moved = np.column_stack([matrix[:, :2], matrix[:, 2] + matrix[:, :2] @ first])
-    return slice(first[1], last[1]), slice(first[0], last[0]), moved
+def _source_window(matrix: FloatArray) -> tuple[slice, slice, FloatArray]:
+    """Rows and columns of the image that a patch can show, reflection at the border included, and the matrix from
+    that window to the patch."""
+    centre = np.linalg.solve(matrix[:, :2], np.full(2, PATCH_PX / 2) - matrix[:, 2])
+    first = np.maximum(centre - _WINDOW_PATCHES * PATCH_PX, 0).astype(int)
+    last = np.maximum(centre + _WINDOW_PATCHES * PATCH_PX, 1).astype(int)
+    shifted = np.column_stack([matrix[:, :2], matrix[:, 2] + matrix[:, :2] @ first])
+    return slice(first[1], last[1]), slice(first[0], last[0]), shifted
 
 
-def _told_of(cars: FloatArray, axis: FloatArray) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """Middles, axes and how much these count, in cells."""
-    cells = len(_CELLS)
-    middles, axes = np.zeros((cells, cells), np.float32), np.zeros((cells, cells, 2), np.float32)
-    for (x, y), angle in zip(cars, axis, strict=True):
-        if not (-8 < x < SIDE_PX + 8 and -8 < y < SIDE_PX + 8):
+def encode_targets(centres: FloatArray, orientation_rad: FloatArray) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Target maps of a patch.
+
+    Parameters
+    ----------
+    centres, orientation_rad
+        (n, 2) positions and (n,) axial orientations of cars in the patch, px and rad.
+
+    Returns
+    -------
+    (m, m) heatmap, 1 at a car's centre and a Gaussian around it (the highest one where cars overlap); (m, m, 2) cosine
+    and sine of twice the orientation of that car; (m, m) weight of the orientation in the loss. m = `PATCH_PX` /
+    `STRIDE`.
+    """
+    size = len(_HEATMAP_PX)
+    heatmap, orientation = np.zeros((size, size), np.float32), np.zeros((size, size, 2), np.float32)
+    for (x, y), angle in zip(centres, orientation_rad, strict=True):
+        low, high = -_TARGET_MARGIN_PX, PATCH_PX + _TARGET_MARGIN_PX
+        if not (low < x < high and low < y < high):
             continue
-        off = (_CELLS[None, :] - x) ** 2 + (_CELLS[:, None] - y) ** 2
-        blob = np.exp(-off / (2 * _MIDDLE_SIGMA_PX**2)).astype(np.float32)
-        nearest = blob > middles
-        middles[nearest] = blob[nearest]
-        axes[nearest] = np.cos(2 * angle), np.sin(2 * angle)
-    return middles, axes, np.square(middles)
+        squared_distance = (_HEATMAP_PX[None, :] - x) ** 2 + (_HEATMAP_PX[:, None] - y) ** 2
+        gaussian = np.exp(-squared_distance / (2 * HEATMAP_SIGMA_PX**2)).astype(np.float32)
+        nearest = gaussian > heatmap
+        heatmap[nearest] = gaussian[nearest]
+        orientation[nearest] = np.cos(2 * angle), np.sin(2 * angle)
+    return heatmap, orientation, np.square(heatmap)
 
 
-def _toned(picture: NDArray[np.float32], rng: np.random.Generator) -> Float32Array:
-    """The piece as another sensor, or in other light, would show it."""
-    tone = np.clip(picture, 0, 1) ** np.exp(rng.uniform(-_GAMMA_SPREAD, _GAMMA_SPREAD))
-    tone = (tone - _GREY_MIDDLE) * rng.uniform(*_CONTRAST) + _GREY_MIDDLE + rng.uniform(-_LIGHT, _LIGHT)
-    if rng.random() < _BLURRED:
-        tone = cv2.GaussianBlur(tone, (0, 0), rng.uniform(*_BLUR_PX))
-    if rng.random() < _SHADED:
-        tone = tone * (1 - rng.uniform(*_SHADE) * _shade(rng))
-    tone = tone + rng.normal(0, rng.uniform(0, _NOISE), tone.shape)
-    return np.asarray(np.clip(tone, 0, 1), np.float32)
+def _augment_photometry(patch: Float32Array, rng: np.random.Generator) -> Float32Array:
+    """Photometric augmentation: gamma, contrast, brightness, blur, shadow, noise; grey stays in [0, 1]."""
+    grey = np.clip(patch, 0, 1) ** np.exp(rng.uniform(-_LOG_GAMMA_RANGE, _LOG_GAMMA_RANGE))
+    contrast, brightness = rng.uniform(*_CONTRAST_RANGE), rng.uniform(-_BRIGHTNESS_RANGE, _BRIGHTNESS_RANGE)
+    grey = (grey - _MEAN_GREY) * contrast + _MEAN_GREY + brightness
+    if rng.random() < _BLUR_PROBABILITY:
+        grey = cv2.GaussianBlur(grey, (0, 0), rng.uniform(*_BLUR_SIGMA_PX))
+    if rng.random() < _SHADOW_PROBABILITY:
+        grey = grey * (1 - rng.uniform(*_SHADOW_DEPTH) * _random_shadow(rng))
+    grey = grey + rng.normal(0, rng.uniform(0, _MAX_NOISE_SD), grey.shape)
+    return np.asarray(np.clip(grey, 0, 1), np.float32)
 
 
-def _shade(rng: np.random.Generator) -> FloatArray:
-    """0 to 1: a shadow's straight edge across the piece."""
-    turn, off = rng.uniform(0, 2 * np.pi), rng.uniform(-SIDE_PX / 3, SIDE_PX / 3)
-    place = np.arange(SIDE_PX) - SIDE_PX / 2
-    shaded = place[None, :] * np.cos(turn) + place[:, None] * np.sin(turn) > off
-    return np.asarray(cv2.GaussianBlur(shaded.astype(np.float64), (0, 0), rng.uniform(*_SHADE_EDGE_PX)))
+def _random_shadow(rng: np.random.Generator) -> FloatArray:
+    """Mask of a shadow with a straight, blurred edge across the patch, 0 to 1."""
+    angle, offset = rng.uniform(0, 2 * np.pi), rng.uniform(-PATCH_PX / 3, PATCH_PX / 3)
+    position = np.arange(PATCH_PX) - PATCH_PX / 2
+    shadow = position[None, :] * np.cos(angle) + position[:, None] * np.sin(angle) > offset
+    return np.asarray(cv2.GaussianBlur(shadow.astype(np.float64), (0, 0), rng.uniform(*_SHADOW_EDGE_SIGMA_PX)))

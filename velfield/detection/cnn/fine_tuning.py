@@ -1,20 +1,23 @@
-"""A network learnt from nothing, or going on from an earlier one on a flight's own cars; T from cars left out."""
+"""Training the network from scratch, or fine-tuning a pre-trained one on labelled images; choosing its score threshold.
+
+The threshold comes from held-out spatial folds: the network is fine-tuned once for each fold without that part of the
+images and evaluated there. With few labels it is shrunk towards the pre-trained detector's threshold.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from schemas.arrays import Float32Array
+from schemas.arrays import Float32Array, Mask
 from schemas.detector import DetectorRecord, PrecisionRecallCurve
 from schemas.flight import DetectionConfig
 from velfield.detection.cascade.classifier import distinct
-from velfield.detection.cnn.dataset import Pieces
-from velfield.detection.cnn.inference import network_finds
-from velfield.detection.cnn.model import Network, odds_map, record_of_network
-from velfield.detection.cnn.trainer import Learner, learnt
+from velfield.detection.cnn.dataset import PatchDataset
+from velfield.detection.cnn.inference import detect_cars
+from velfield.detection.cnn.model import Network, network_to_record, predict_heatmap
+from velfield.detection.cnn.trainer import Trainer, train
 from velfield.detection.detector import Detector
 from velfield.detection.evaluation import FOLD_MIN_CARS, Evidence, curve_of, joined, matched, stripes
 from velfield.detection.label_orientation import with_axes
@@ -22,130 +25,139 @@ from velfield.detection.samples import LabelledImage, lies_in, within
 from velfield.parallel import each
 
 _FOLDS = 2
-_SIZE_ON = 1e-3
-_SIZE = 3e-3
-_MAYBE, _ABOUT_CAR_PX, _ABOUT_LIKED_PX = 0.12, 18, 3
-"""Where not every car is marked: places likelier than this may be one; about those that are marked it is known, their
-shadow too."""
-_CURVE_FROM = -0.25
-_EARLIER_CARS = 150
-"""T of so many marked cars counts as much as the one of before: of 47 it came to one at which a third of the cars of
-another place were lost, without a gain; the best one lay nearer to the one of before in four cases of four."""
-_TOLD = "cars in stripes of the pictures, found by detectors trained on the other stripes"
+_FINE_TUNING_RATE, _LEARNING_RATE = 1e-3, 3e-3
+_UNLABELLED_MIN_PROBABILITY, _LABELLED_RADIUS_PX, _UNLABELLED_MARGIN_PX = 0.12, 18, 3
+"""In an incompletely labelled image a pixel of at least this probability may be an unlabelled car, except within a
+radius of a labelled one, its shadow included."""
+_CURVE_MIN_SCORE = -0.25
+_NMS_RADIUS_PX = 16.0
+_PRIOR_CARS = 150
+"""Weight of the pre-trained detector's threshold, in labelled cars. The threshold of 47 cars alone lost a third of the
+cars of another site without a gain; in four cases of four the best threshold lay nearer to the pre-trained one."""
+_HELD_OUT_DESCRIPTION = "cars in held-out stripes of the images, detected by detectors trained on the other stripes"
 
 
-def network_from_nothing(
-    groups: Sequence[Sequence[LabelledImage]], shares: Sequence[float], seed: int, *, steps: int
+def train_from_scratch(
+    groups: Sequence[Sequence[LabelledImage]], weights: Sequence[float], seed: int, *, steps: int
 ) -> Network:
-    """Learn a network; ``groups`` of pictures and how often each is taken from, as for `Pieces`."""
-    return learnt(Learner.from_nothing(seed), Pieces(groups, shares, seed), steps=steps, size=_SIZE)
+    """Train a network from random weights; ``groups`` of images and their sampling ``weights`` as for
+    `PatchDataset`."""
+    dataset = PatchDataset(groups, weights, seed)
+    return train(Trainer.initialise(seed), dataset, steps=steps, learning_rate=_LEARNING_RATE)
 
 
-def train_on(samples: Sequence[LabelledImage], earlier: Detector, config: DetectionConfig) -> Detector:
-    """Let an earlier network learn on from marked cars.
+def fine_tune(samples: Sequence[LabelledImage], pretrained: Detector, config: DetectionConfig) -> Detector:
+    """Fine-tune a pre-trained network on labelled images and choose its score threshold on held-out folds.
 
     Parameters
     ----------
     samples
-        Labelled pictures; where not all cars are marked, what the earlier network likes is no background.
+        Labelled images. Where labels are incomplete, what the pre-trained network detects elsewhere is not used as
+        background.
 
     Raises
     ------
     InputError
-        An earlier detector of cars of another size.
+        The pre-trained detector is for cars of another size.
     """
-    earlier.check_car_length(config.working_car_length_px)
-    known = each(lambda sample: _known(sample, earlier.network), samples)
+    pretrained.check_car_length(config.working_car_length_px)
+    masked = each(lambda sample: _mask_unlabelled_positives(sample, pretrained.network), samples)
     count = sum(len(sample.cars) for sample in samples)
-    network, *tried = each(
-        lambda fold: _on(known, earlier.network, config, fold),
-        range(-1, _FOLDS if count >= FOLD_MIN_CARS else 0),
-    )
-    evidence = joined([part for _, parts in tried for part in parts]) if tried else None
-    threshold, curve = chosen_threshold(evidence, earlier.threshold, _TOLD)
+    folds = _FOLDS if count >= FOLD_MIN_CARS else 0
+    tasks: list[int | None] = [None, *range(folds)]
+    (network, _), *held_out = each(lambda fold: _fine_tune_fold(masked, pretrained.network, config, fold), tasks)
+    evidence = joined([part for _, parts in held_out for part in parts]) if held_out else None
+    threshold, curve = select_threshold(evidence, pretrained.threshold, _HELD_OUT_DESCRIPTION)
     if curve is not None:
-        own = count / (count + _EARLIER_CARS)
-        threshold = own * threshold + (1 - own) * earlier.threshold
-        at = int(np.abs(np.array(curve.threshold) - threshold).argmin())
-        curve = curve.model_copy(update={"chosen": at})
-    record = record_of(network[0], threshold if config.threshold is None else config.threshold, curve, count, config)
-    return Detector(record.model_copy(update={"attribution": earlier.record.attribution}))
+        weight = count / (count + _PRIOR_CARS)
+        threshold = weight * threshold + (1 - weight) * pretrained.threshold
+        nearest = int(np.abs(np.array(curve.threshold) - threshold).argmin())
+        curve = curve.model_copy(update={"chosen": nearest})
+    record = make_record(network, threshold if config.threshold is None else config.threshold, curve, count, config)
+    return Detector(record.model_copy(update={"attribution": pretrained.record.attribution}))
 
 
-def learnt_on(samples: Sequence[LabelledImage], earlier: Detector, config: DetectionConfig, *, share: float) -> Network:
-    """An earlier network, its weights so far (0 to 1) towards those that it learnt on from labelled pictures."""
-    before = earlier.network
-    network, _ = _on(each(lambda sample: _known(sample, before), samples), before, config, -1)
+def fine_tune_interpolated(
+    samples: Sequence[LabelledImage], pretrained: Detector, config: DetectionConfig, *, fraction: float
+) -> Network:
+    """Fine-tune, then interpolate between the weights before (0) and after (1): WiSE-FT (Wortsman et al. 2022)."""
+    before = pretrained.network
+    masked = each(lambda sample: _mask_unlabelled_positives(sample, before), samples)
+    after, _ = _fine_tune_fold(masked, before, config, None)
 
-    def between(old: Float32Array, new: Float32Array) -> Float32Array:
-        return old + np.float32(share) * (new - old)
+    def interpolate(old: Float32Array, new: Float32Array) -> Float32Array:
+        return old + np.float32(fraction) * (new - old)
 
-    weights = {name: between(old, network.weights[name]) for name, old in before.weights.items()}
-    return Network(weights, {name: between(old, network.biases[name]) for name, old in before.biases.items()})
+    weights = {name: interpolate(old, after.weights[name]) for name, old in before.weights.items()}
+    return Network(weights, {name: interpolate(old, after.biases[name]) for name, old in before.biases.items()})
 
 
-def chosen_threshold(
-    evidence: Evidence | None, otherwise: float, told: str
+def select_threshold(
+    evidence: Evidence | None, default: float, description: str
 ) -> tuple[float, PrecisionRecallCurve | None]:
-    """T and the curve of cars that were left out, or the T of before."""
-    curve = None if evidence is None else curve_of(evidence, told)
+    """Score threshold and precision-recall curve on held-out cars; the default where too few were held out."""
+    curve = None if evidence is None else curve_of(evidence, description)
     if curve is None or curve.chosen is None:
-        return otherwise, None
+        return default, None
     return curve.threshold[curve.chosen], curve
 
 
-def record_of(
+def make_record(
     network: Network, threshold: float, curve: PrecisionRecallCurve | None, count: int, config: DetectionConfig
 ) -> DetectorRecord:
-    """The detector's file."""
+    """Content of the detector file."""
     return DetectorRecord(
         method="network",
         working_car_length_px=config.working_car_length_px,
-        network=record_of_network(network),
+        network=network_to_record(network),
         threshold=float(threshold),
         curve=curve,
         cars=count,
     )
 
 
-def _on(
-    samples: Sequence[LabelledImage], earlier: Network, config: DetectionConfig, fold: int
+def _fine_tune_fold(
+    samples: Sequence[LabelledImage], pretrained: Network, config: DetectionConfig, fold: int | None
 ) -> tuple[Network, list[Evidence]]:
-    """Learnt on without a fold's stripes, and what is found there; of fold -1, from all."""
+    """Fine-tune without a fold's stripes and evaluate on them; without a fold, fine-tune on everything."""
     steps, seed = config.network_steps, config.seed
-    if fold < 0:
-        return learnt(Learner.of(earlier), Pieces([samples], [1.0], seed), steps=steps, size=_SIZE_ON), []
-    left = [stripes(sample, fold, _FOLDS) for sample in samples]
-    seen = [within(sample, ~region) for sample, region in zip(samples, left, strict=True)]
-    pieces = Pieces([seen], [1.0], seed + 1 + fold)
-    network = learnt(Learner.of(earlier), pieces, steps=steps, size=_SIZE_ON)
-    return network, [evidence_of_network(network, sample, region) for sample, region in zip(samples, left, strict=True)]
+    if fold is None:
+        dataset = PatchDataset([samples], [1.0], seed)
+        return train(Trainer.from_network(pretrained), dataset, steps=steps, learning_rate=_FINE_TUNING_RATE), []
+    held_out = [stripes(sample, fold, _FOLDS) for sample in samples]
+    training = [within(sample, ~region) for sample, region in zip(samples, held_out, strict=True)]
+    dataset = PatchDataset([training], [1.0], seed + 1 + fold)
+    network = train(Trainer.from_network(pretrained), dataset, steps=steps, learning_rate=_FINE_TUNING_RATE)
+    return network, [
+        evaluate_network(network, sample, region) for sample, region in zip(samples, held_out, strict=True)
+    ]
 
 
-def _known(sample: LabelledImage, network: Network) -> LabelledImage:
-    """Every axis told, without the places that may be a car that is not marked."""
+def _mask_unlabelled_positives(sample: LabelledImage, network: Network) -> LabelledImage:
+    """The sample with every orientation filled in, and without the pixels that may show an unlabelled car."""
     sample = replace(sample, cars=with_axes(sample.image, sample.cars, sample.tilts), tilts=None)
     if sample.complete:
         return sample
-    likely, _ = odds_map(network, sample.image)
-    liked = cv2.resize(likely, sample.image.shape[::-1]) > _MAYBE
-    maybe = cv2.dilate(liked.astype(np.uint8), np.ones((2 * _ABOUT_LIKED_PX + 1,) * 2, np.uint8))
+    probability, _ = predict_heatmap(network, sample.image)
+    likely = cv2.resize(probability, sample.image.shape[::-1]) > _UNLABELLED_MIN_PROBABILITY
+    side = 2 * _UNLABELLED_MARGIN_PX + 1
+    unlabelled = cv2.dilate(likely.astype(np.uint8), np.ones((side, side), np.uint8))
     for x, y in sample.cars[:, :2]:
-        cv2.circle(maybe, (round(float(x)), round(float(y))), _ABOUT_CAR_PX, (0,), -1)
-    known = maybe == 0
+        cv2.circle(unlabelled, (round(float(x)), round(float(y))), _LABELLED_RADIUS_PX, (0,), -1)
+    known = unlabelled == 0
     return replace(sample, valid=known if sample.valid is None else sample.valid & known)
 
 
-def evidence_of_network(network: Network, sample: LabelledImage, region: NDArray[np.bool_] | None = None) -> Evidence:
-    """Try a network on a part (h, w) of a labelled picture, or on all of it."""
-    found = distinct(network_finds(network, sample.image, sample.valid), 16.0)
-    found = found[found[:, 3] > _CURVE_FROM]
+def evaluate_network(network: Network, sample: LabelledImage, region: Mask | None = None) -> Evidence:
+    """Match a network's detections to the labels of an image, or of a region (h, w) of it."""
+    detections = distinct(detect_cars(network, sample.image, sample.valid), _NMS_RADIUS_PX)
+    detections = detections[detections[:, 3] > _CURVE_MIN_SCORE]
     cars = sample.cars
     if region is not None:
-        found, cars = found[lies_in(region, found)], cars[lies_in(region, cars)]
-    right = matched(found, cars)
+        detections, cars = detections[lies_in(region, detections)], cars[lies_in(region, cars)]
+    correct = matched(detections, cars)
     for x, y, radius in sample.ignore:
-        counted = right | (np.hypot(found[:, 0] - x, found[:, 1] - y) > radius)
-        found, right = found[counted], right[counted]
-    never = np.full(len(found), -1.0)
-    return Evidence(found[:, 3], right, never, never, len(cars), sample.complete)
+        counted = correct | (np.hypot(detections[:, 0] - x, detections[:, 1] - y) > radius)
+        detections, correct = detections[counted], correct[counted]
+    not_applicable = np.full(len(detections), -1.0)
+    return Evidence(detections[:, 3], correct, not_applicable, not_applicable, len(cars), sample.complete)

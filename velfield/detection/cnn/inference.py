@@ -1,103 +1,134 @@
-"""Cars from what the network says of every place, those that it likes looked at again in two turns.
+"""Detections of one frame from the network: heatmap peaks, re-scored by test-time augmentation.
 
-The network learnt cars of every direction; what it says of one still depends on how the car lies to its pixels. Turned
-to the axis that was told first, and across it, every car is looked at alike.
+Peaks of the heatmap are candidates at sub-pixel positions. The network was trained on cars of every orientation, yet
+its output depends on how a car lies to the pixel grid. So each candidate is scored again on two crops, one rotated to
+its predicted orientation and one across it, and the outputs are averaged. Non-maximum suppression is left to the
+caller.
+
+A detector adapted to a flight by self-training adds a score bonus where the frame differs from the background.
 """
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray
+from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
+from schemas.detector import MotionRecord
 from velfield.detection.cascade.classifier import moved
 from velfield.detection.cascade.proposals import in_sight
-from velfield.detection.cnn.model import STRIDE, Network, odds_map, said_of
+from velfield.detection.cnn.model import STRIDE, Network, forward, predict_heatmap
+from velfield.detection.orientation import at_places
 
-LIKELY = 0.35
-"""Said of a place that is as often a car as not: near middles the loss lets it say less than it knows."""
-_BLUR_CELLS = 0.8
-_LEAST = 0.2
-"""Places less likely than this at the first look are let go."""
-SCORE_FLOOR = _LEAST - LIKELY
-"""Finds are hardly ever liked less."""
+SCORE_OFFSET = 0.35
+"""Probability predicted where a candidate is as often a car as not: around centres the loss lets the network predict
+less than it should. Scores are probabilities less this."""
+_SMOOTHING_SIGMA = 0.8
+"""Of the heatmap, in its pixels."""
+_MIN_PEAK_PROBABILITY = 0.2
+MIN_SCORE = _MIN_PEAK_PROBABILITY - SCORE_OFFSET
+"""Hardly any detection scores lower."""
 _QUARTER_CAR_PX = 4.0
-_AGAIN_PX = 44
-_MIDDLE = _AGAIN_PX // (2 * STRIDE)
-_TURNS = np.radians([0.0, 90.0])
-"""Four turns, or more about a place, found no more on minsk, and took up to three times as long."""
-_AT_ONCE = 8
+_CROP_PX = 44
+_CENTRE = _CROP_PX // (2 * STRIDE)
+"""Row and column of the heatmap of a crop where the candidate's centre is."""
+_ROTATIONS = np.radians([0.0, 90.0])
+"""Relative to the predicted orientation. Four rotations, or shifted crops as well, detected no more cars on the minsk
+clip at up to three times the cost."""
+_CANDIDATES_PER_BATCH = 8
 
 
-def network_finds(network: Network, image: GreyImage, valid: NDArray[np.bool_] | None) -> FloatArray:
-    """Cars (n, 5) as x, y, axis, score, axis' standard deviation, working px; several a car (see `aligned.distinct`).
+def detect_cars(network: Network, image: GreyImage, valid: Mask | None) -> FloatArray:
+    """Detect cars in a frame; a car may be detected several times, see `classifier.distinct`.
 
-    The score is how likely a car is, less `LIKELY`.
+    Returns
+    -------
+    (n, 5): x, y in working px, orientation (axial, [0, pi)), score (probability - `SCORE_OFFSET`), standard deviation
+    of the orientation, rad.
     """
-    likely, axes = odds_map(network, image)
-    smooth = cv2.GaussianBlur(likely, (0, 0), _BLUR_CELLS)
-    peak = (smooth >= cv2.dilate(smooth, np.ones((3, 3), np.uint8))) & (smooth > _LEAST)
+    probability, orientation = predict_heatmap(network, image)
+    smooth = cv2.GaussianBlur(probability, (0, 0), _SMOOTHING_SIGMA)
+    peak = (smooth >= cv2.dilate(smooth, np.ones((3, 3), np.uint8))) & (smooth > _MIN_PEAK_PROBABILITY)
     if valid is not None:
         peak &= valid[::STRIDE, ::STRIDE]
     y, x = np.nonzero(peak)
     if not len(x):
         return np.empty((0, 5))
-    off = _below_the_cell(smooth, y, x)
-    xy = (np.column_stack([x, y]) + off) * STRIDE + (STRIDE - 1) / 2
-    told = axes[y, x].astype(np.float64)
-    again, vectors = _looked_at_again(network, image, xy, 0.5 * np.arctan2(told[:, 1], told[:, 0]))
-    score = again.mean(axis=1)
-    mean = (vectors * again[..., None]).sum(axis=1) / np.maximum(again.sum(axis=1), 1e-9)[:, None]
-    sure = np.clip(np.hypot(mean[:, 0], mean[:, 1]), 1e-3, 1 - 1e-3)
+    xy = (np.column_stack([x, y]) + _subpixel_peak_offset(smooth, y, x)) * STRIDE + (STRIDE - 1) / 2
+    vector = orientation[y, x].astype(np.float64)
+    probabilities, vectors = _predict_rotated_crops(network, image, xy, 0.5 * np.arctan2(vector[:, 1], vector[:, 0]))
+    score = probabilities.mean(axis=1)
+    mean = (vectors * probabilities[..., None]).sum(axis=1) / np.maximum(probabilities.sum(axis=1), 1e-9)[:, None]
+    resultant = np.clip(np.hypot(mean[:, 0], mean[:, 1]), 1e-3, 1 - 1e-3)
     axis = np.mod(0.5 * np.arctan2(mean[:, 1], mean[:, 0]), np.pi)
-    found = np.column_stack([xy, axis, score - LIKELY, 0.5 * np.sqrt(-2 * np.log(sure))])
-    return found[_mostly_seen(found, image.shape, valid)]
+    detections = np.column_stack([xy, axis, score - SCORE_OFFSET, 0.5 * np.sqrt(-2 * np.log(resultant))])
+    return detections[_is_mostly_visible(detections, image.shape, valid)]
 
 
-def _mostly_seen(cars: FloatArray, shape: tuple[int, int], valid: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
-    """Whether three quarters of a car lie in the frame: of what is cut farther in, the middle is not where it seems."""
-    seen = np.ones(len(cars), bool)
+def background_difference_at(
+    image: GreyImage, background: GreyImage, xy: FloatArray, car_length_px: float
+) -> FloatArray:
+    """Mean absolute difference of a frame to the background around (n, 2) positions, grey levels.
+
+    The mean is weighted by a Gaussian with a standard deviation of a fifth of a car's length.
+    """
+    difference = cv2.absdiff(image, background).astype(np.float32)
+    return at_places(cv2.GaussianBlur(difference, (0, 0), car_length_px / 5), xy)
+
+
+def motion_score_bonus(motion: MotionRecord, difference: FloatArray) -> FloatArray:
+    """Score added to detections by their difference to the background: a linear ramp, clipped at both ends."""
+    fraction = (difference - motion.still_grey) / (motion.moving_grey - motion.still_grey)
+    return motion.lift * np.clip(fraction, 0.0, 1.0)
+
+
+def _is_mostly_visible(cars: FloatArray, shape: tuple[int, int], valid: Mask | None) -> Mask:
+    """Whether three quarters of a car lie in the frame: the centre of a car that is truncated more is unreliable."""
+    visible = np.ones(len(cars), bool)
     for along in (-_QUARTER_CAR_PX, _QUARTER_CAR_PX):
-        seen &= in_sight(moved(cars[:, :2], cars[:, 2], np.array([[along, 0.0]])), shape, valid)
-    return seen
+        visible &= in_sight(moved(cars[:, :2], cars[:, 2], np.array([[along, 0.0]])), shape, valid)
+    return visible
 
 
-def _below_the_cell(values: Float32Array, y: IntArray, x: IntArray) -> FloatArray:
-    """How far off a cell's middle, right and down, parabolas through it and its neighbours have their peak, (n, 2)."""
-    at = np.log(np.maximum(np.pad(values, 1, mode="edge"), 1e-6)).astype(np.float64)
-    here, off = at[y + 1, x + 1], []
+def _subpixel_peak_offset(values: Float32Array, y: IntArray, x: IntArray) -> FloatArray:
+    """Offset (n, 2), right and down, of the peak of a parabola through the logarithms of a pixel and its neighbours."""
+    log = np.log(np.maximum(np.pad(values, 1, mode="edge"), 1e-6)).astype(np.float64)
+    centre, offset = log[y + 1, x + 1], []
     for down, right in ((0, 1), (1, 0)):
-        before, after = at[y + 1 - down, x + 1 - right], at[y + 1 + down, x + 1 + right]
-        off.append(np.clip((after - before) / (2 * np.maximum(2 * here - before - after, 1e-6)), -0.5, 0.5))
-    return np.column_stack(off)
+        before, after = log[y + 1 - down, x + 1 - right], log[y + 1 + down, x + 1 + right]
+        offset.append(np.clip((after - before) / (2 * np.maximum(2 * centre - before - after, 1e-6)), -0.5, 0.5))
+    return np.column_stack(offset)
 
 
-def _looked_at_again(
+def _predict_rotated_crops(
     network: Network, image: GreyImage, xy: FloatArray, axis: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """How likely (n, 2) places are, turned by their axis and across, and twice their axis (n, 2, 2) in the picture."""
-    turns = axis[:, None] + _TURNS
-    place = np.arange(_AGAIN_PX) - (_MIDDLE * STRIDE + (STRIDE - 1) / 2)
-    v, u = np.meshgrid(place, place, indexing="ij")
-    likely, vectors = np.empty(turns.shape), np.empty((*turns.shape, 2))
-    for start in range(0, len(xy), _AT_ONCE):
-        part = slice(start, start + _AT_ONCE)
-        c, s = np.cos(turns[part])[..., None, None], np.sin(turns[part])[..., None, None]
+    """Test-time augmentation: probability (n, 2) and orientation vector (n, 2, 2) on crops along and across the axis.
+
+    Orientation vectors are rotated back into the image.
+    """
+    rotations = axis[:, None] + _ROTATIONS
+    offsets = np.arange(_CROP_PX) - (_CENTRE * STRIDE + (STRIDE - 1) / 2)
+    v, u = np.meshgrid(offsets, offsets, indexing="ij")
+    probability, vectors = np.empty(rotations.shape), np.empty((*rotations.shape, 2))
+    for start in range(0, len(xy), _CANDIDATES_PER_BATCH):
+        part = slice(start, start + _CANDIDATES_PER_BATCH)
+        c, s = np.cos(rotations[part])[..., None, None], np.sin(rotations[part])[..., None, None]
         map_x, map_y = xy[part, 0, None, None, None] + u * c - v * s, xy[part, 1, None, None, None] + u * s + v * c
-        flat = (-1, _AGAIN_PX)
+        flat = (-1, _CROP_PX)
         maps = map_x.reshape(flat).astype(np.float32), map_y.reshape(flat).astype(np.float32)
-        seen = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
-        pictures = seen.reshape(-1, _AGAIN_PX, _AGAIN_PX) / np.float32(255)
-        likely[part], vectors[part] = _at_the_middle(said_of(network, pictures), turns[part])
-    return likely, vectors
+        crops = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+        out = forward(network, crops.reshape(-1, _CROP_PX, _CROP_PX) / np.float32(255))
+        probability[part], vectors[part] = _read_centre(out, rotations[part])
+    return probability, vectors
 
 
-def _at_the_middle(said: Float32Array, turns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    about = said[:, _MIDDLE - 3 : _MIDDLE + 4, _MIDDLE - 3 : _MIDDLE + 4]
-    odds = 1 / (1 + np.exp(-about[..., 0].astype(np.float64)))
-    kernel = cv2.getGaussianKernel(5, _BLUR_CELLS)[:, 0]
-    rows = sum(kernel[k] * odds[:, k : k + 3] for k in range(5))
+def _read_centre(out: Float32Array, rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Highest smoothed probability within a pixel of the crops' centre, and the orientation vector at the centre."""
+    window = out[:, _CENTRE - 3 : _CENTRE + 4, _CENTRE - 3 : _CENTRE + 4]
+    sigmoid = 1 / (1 + np.exp(-window[..., 0].astype(np.float64)))
+    kernel = cv2.getGaussianKernel(5, _SMOOTHING_SIGMA)[:, 0]
+    rows = sum(kernel[k] * sigmoid[:, k : k + 3] for k in range(5))
     smooth = sum(kernel[k] * rows[:, :, k : k + 3] for k in range(5))
-    likely = np.asarray(smooth).max(axis=(1, 2)).reshape(turns.shape)
-    told = said[:, _MIDDLE, _MIDDLE, 1:].astype(np.float64).reshape(*turns.shape, 2)
-    c, s = np.cos(2 * turns), np.sin(2 * turns)
-    return likely, np.stack([told[..., 0] * c - told[..., 1] * s, told[..., 0] * s + told[..., 1] * c], axis=-1)
+    probability = np.asarray(smooth).max(axis=(1, 2)).reshape(rotations.shape)
+    vector = out[:, _CENTRE, _CENTRE, 1:].astype(np.float64).reshape(*rotations.shape, 2)
+    c, s = np.cos(2 * rotations), np.sin(2 * rotations)
+    return probability, np.stack([vector[..., 0] * c - vector[..., 1] * s, vector[..., 0] * s + vector[..., 1] * c], -1)

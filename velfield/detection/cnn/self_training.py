@@ -1,8 +1,8 @@
-"""The network on a registered flight that nobody marked: learnt on from what moves, and two thresholds.
+"""Self-training: adapts the pre-trained network to a flight without labels, with pseudo-labels from moving vehicles.
 
-What differs from the background moves, and is all but surely a car where the network likes it a little. What stands is
-held to more: how well cars that move are liked tells how well those that stand should be, and what is there beyond
-their share is something else.
+The network is fine-tuned on vehicles confirmed by their motion, and its weights are interpolated with those before
+(WiSE-FT). Detections that differ from the background (foreground) get a score bonus. Stationary ones need a higher
+threshold, estimated under the assumption that stationary cars have the score distribution of moving ones.
 """
 
 from collections.abc import Sequence
@@ -13,135 +13,140 @@ from numpy.typing import NDArray
 from schemas.arrays import FloatArray, GreyImage
 from schemas.detector import MotionRecord, PrecisionRecallCurve
 from schemas.flight import DetectionConfig
-from velfield.detection.cnn.fine_tuning import learnt_on
-from velfield.detection.cnn.inference import SCORE_FLOOR
-from velfield.detection.cnn.model import record_of_network
-from velfield.detection.cnn.motion_bonus import difference_about
+from velfield.detection.cnn.fine_tuning import fine_tune_interpolated
+from velfield.detection.cnn.inference import MIN_SCORE, background_difference_at
+from velfield.detection.cnn.model import network_to_record
 from velfield.detection.detect import detect_frame
 from velfield.detection.detector import Detector
 from velfield.detection.evaluation import nearly_best, thinned_curve
 from velfield.detection.motion.difference import MotionFrame
-from velfield.detection.motion.evidence import Conduct, Found, conduct_of_bursts
+from velfield.detection.motion.evaluation import Detections, MotionState, classify_bursts
 from velfield.detection.samples import LabelledImage
 from velfield.parallel import each
 
-_STEPS_MORE = 3
-"""What moves is hundreds of labels: so many times the steps that it takes from a marked frame."""
-_SHARE_OF_NEW = 0.7
-"""Weights lie so far from the earlier network's towards those that were learnt from what moves: of what stands, which
-was not learnt, less is forgotten. In a clip of cars 5 px wide half of those standing were found at a precision of .6;
-with nearly all of the way .5, with none .43."""
-_MIN_MOVING, _MIN_LIKED = 40, 20
-_SURE_SHARE = 0.5
-_MOVING_SHARE, _APART = 0.1, 2.0
-"""Nine of ten that move differ from the background by more: by so many times what stands does."""
+_STEPS_FACTOR = 3
+"""Motion gives hundreds of labels: this many times the steps of fine-tuning on one labelled frame."""
+_FINE_TUNED_FRACTION = 0.7
+"""Interpolation of the weights towards the fine-tuned ones: stationary cars, which have no pseudo-labels, are forgotten
+less. On a clip with cars 5 px wide half of the stationary ones were detected at a precision of 0.60; at almost the
+whole fraction 0.50, at none 0.43."""
+_MIN_MOVING, _MIN_MOVING_FOREGROUND = 40, 20
+_RELIABLE_FRACTION = 0.5
+"""The moving detections of highest score, up to this fraction, do not constrain the number of stationary cars."""
+_MOVING_QUANTILE, _MIN_SEPARATION = 0.1, 2.0
+"""This quantile of the moving detections' difference to the background must be this many times the stationary ones'
+median."""
+_CURVE_DESCRIPTION = (
+    "foreground detections in bursts of three frames: those that move as cars do, against isolated ones"
+)
 
 
-def network_of_motion(
+def self_train_from_motion(
     samples: Sequence[LabelledImage],
-    earlier: Detector,
+    pretrained: Detector,
     bursts: Sequence[MotionFrame],
     background: GreyImage,
     config: DetectionConfig,
     *,
     max_interval_s: float,
 ) -> Detector | None:
-    """A network that learnt on from what moves, and what it is to like of what moves and of what stands.
+    """Fine-tune on pseudo-labels from motion, then estimate the score bonus and the threshold from detections' motion.
 
     Parameters
     ----------
     samples
         Frames with labels from motion.
-    earlier
-        The network to go on from.
+    pretrained
+        Detector to start from.
     bursts
         Registered frames in bursts of three.
     background
         (h, w) temporal median of the flight, working px.
     max_interval_s
-        Frames farther apart than this are no neighbours.
+        Frames farther apart than this are not neighbours.
 
     Returns
     -------
-    None where too little moves to tell, or what moves does not differ from the background.
+    None where too few detections move to estimate thresholds, or those that move do not differ from the background.
     """
-    longer = config.model_copy(update={"network_steps": _STEPS_MORE * config.network_steps})
-    network = learnt_on(samples, earlier, longer, share=_SHARE_OF_NEW)
-    update = {"network": record_of_network(network), "curve": None, "motion": None}
-    record = earlier.record.model_copy(update=update)
+    longer = config.model_copy(update={"network_steps": _STEPS_FACTOR * config.network_steps})
+    network = fine_tune_interpolated(samples, pretrained, longer, fraction=_FINE_TUNED_FRACTION)
+    update = {"network": network_to_record(network), "curve": None, "motion": None}
+    record = pretrained.record.model_copy(update=update)
     length_px = record.working_car_length_px
-    low = config.model_copy(update={"threshold": SCORE_FLOOR})
+    low_threshold = config.model_copy(update={"threshold": MIN_SCORE})
 
-    def found(frame: MotionFrame) -> tuple[Found, FloatArray]:
-        cars = detect_frame(frame.image, frame.valid, Detector(record), low)
-        difference = difference_about(frame.image, background, cars.xy, length_px)
-        return Found(cars.xy, cars.orientation_rad, cars.score, frame.time_s), difference
+    def detect(frame: MotionFrame) -> tuple[Detections, FloatArray]:
+        cars = detect_frame(frame.image, frame.valid, Detector(record), low_threshold)
+        difference = background_difference_at(frame.image, background, cars.xy, length_px)
+        return Detections(cars.xy, cars.orientation_rad, cars.score, frame.time_s), difference
 
-    told, differences = zip(*each(found, bursts), strict=True)
-    middles, kinds = conduct_of_bursts(told, car_length_px=length_px, max_interval_s=max_interval_s)
+    detections, differences = zip(*each(detect, bursts), strict=True)
+    middles, states = classify_bursts(detections, car_length_px=length_px, max_interval_s=max_interval_s)
     if not middles:
         return None
-    score, kind = np.concatenate([told[k].score for k in middles]), np.concatenate(kinds)
+    score, state = np.concatenate([detections[k].score for k in middles]), np.concatenate(states)
     difference = np.concatenate([differences[k] for k in middles])
-    chosen = thresholds_of(score, kind, difference)
-    if chosen is None:
+    fitted = fit_motion_thresholds(score, state, difference)
+    if fitted is None:
         return None
-    standing, motion, curve = chosen
+    threshold, motion, curve = fitted
     cars = sum(len(sample.cars) for sample in samples)
-    chosen_here = {"threshold": standing, "motion": motion, "curve": curve, "cars": cars}
-    return Detector(record.model_copy(update=chosen_here))
+    return Detector(record.model_copy(update={"threshold": threshold, "motion": motion, "curve": curve, "cars": cars}))
 
 
-def thresholds_of(
-    score: FloatArray, kind: NDArray[np.int8], difference: FloatArray
+def fit_motion_thresholds(
+    score: FloatArray, state: NDArray[np.int8], difference: FloatArray
 ) -> tuple[float, MotionRecord, PrecisionRecallCurve] | None:
-    """T of what stands, how much less what moves needs, and the curve of what moves.
+    """Threshold of stationary detections, score bonus of foreground ones, and the latter's precision-recall curve.
 
     Parameters
     ----------
-    score, kind, difference
-        (n,) of finds down to what is hardly liked: score, `Conduct`, grey levels off the background.
+    score, state, difference
+        (n,) of detections at a low threshold: score, `MotionState`, difference to the background in grey levels.
     """
-    moves, stands = kind == Conduct.MOVES, kind == Conduct.STANDS
-    if moves.sum() < _MIN_MOVING:
+    moving, stationary = state == MotionState.MOVING, state == MotionState.STATIONARY
+    if moving.sum() < _MIN_MOVING:
         return None
-    usual = max(float(np.median(difference[stands])), 1.0) if stands.any() else 1.0
-    moving = float(np.quantile(difference[moves], _MOVING_SHARE))
-    if moving < _APART * usual:
+    stationary_grey = max(float(np.median(difference[stationary])), 1.0) if stationary.any() else 1.0
+    moving_grey = float(np.quantile(difference[moving], _MOVING_QUANTILE))
+    if moving_grey < _MIN_SEPARATION * stationary_grey:
         return None
-    # What is seen to stand over a short burst may be slow: the middle one of all that stands does not move.
-    still = float(np.sqrt(usual * moving))
-    off = difference > (still + moving) / 2
-    differs = off & ~stands
-    order = np.argsort(-score[differs], kind="stable")
-    threshold, right = score[differs][order], moves[differs][order]
-    found = np.cumsum(right)
-    if not len(found) or found[-1] < _MIN_LIKED:
+    # Some detections that are stationary over a short burst are slow vehicles: the median is not one of them.
+    ramp_start = float(np.sqrt(stationary_grey * moving_grey))
+    foreground = difference > (ramp_start + moving_grey) / 2
+    counted = foreground & ~stationary
+    order = np.argsort(-score[counted], kind="stable")
+    thresholds, correct = score[counted][order], moving[counted][order]
+    true_positives = np.cumsum(correct)
+    if not len(true_positives) or true_positives[-1] < _MIN_MOVING_FOREGROUND:
         return None
-    precision, recall = found / np.arange(1, len(found) + 1), found / found[-1]
-    good = nearly_best(precision, recall, beta=1.0)
-    least = float(threshold[good[0]] + threshold[good[-1]]) / 2
-    standing = max(threshold_of_standing(score[moves], score[stands & ~off]), least)
-    at = int(np.abs(threshold - least).argmin())
-    told = "how what differs from the background moves in bursts of three frames: as cars do, or alone"
-    curve = thinned_curve(precision, recall, threshold + standing - least, at, told)
-    return standing, MotionRecord(still_grey=still, moving_grey=moving, lift=standing - least), curve
+    precision = true_positives / np.arange(1, len(true_positives) + 1)
+    recall = true_positives / true_positives[-1]
+    plateau = nearly_best(precision, recall, beta=1.0)
+    foreground_threshold = float(thresholds[plateau[0]] + thresholds[plateau[-1]]) / 2
+    threshold = max(stationary_threshold(score[moving], score[stationary & ~foreground]), foreground_threshold)
+    bonus = threshold - foreground_threshold
+    nearest = int(np.abs(thresholds - foreground_threshold).argmin())
+    curve = thinned_curve(precision, recall, thresholds + threshold - foreground_threshold, nearest, _CURVE_DESCRIPTION)
+    return threshold, MotionRecord(still_grey=ramp_start, moving_grey=moving_grey, lift=bonus), curve
 
 
-def threshold_of_standing(moving: FloatArray, standing: FloatArray) -> float:
-    """T of finds that stand, from how well cars that move are liked.
+def stationary_threshold(moving: FloatArray, stationary: FloatArray) -> float:
+    """Score threshold of stationary detections, from the scores of moving ones.
 
-    Cars that stand are liked as those that move. At no score can there be more of them than finds that stand: the
-    score at which there are fewest, for each that moves, bounds how many stand; what is there beyond is no car. Of the
-    few that are liked best, those that move have the network's favour, as it learnt from them: they do not count.
+    Stationary cars are assumed to have the score distribution of moving cars. Above no score can there be more cars
+    than stationary detections, so the lowest ratio of stationary to moving detections over all scores bounds the number
+    of stationary cars, and with it the precision at each score. The moving detections of highest score are left out of
+    this bound: the network was trained on them, which favours them.
     """
-    liked = np.sort(moving)[::-1]
-    count = np.arange(1, len(liked) + 1)
-    above = len(standing) - np.searchsorted(np.sort(standing), liked)
-    sure = count >= _SURE_SHARE * len(liked)
-    if not (above[sure] > 0).all():
-        return float(liked[-1])
-    cars = float((above[sure] / count[sure]).min())
-    precision = np.minimum(cars * count / np.maximum(above, 1), 1.0)
-    good = nearly_best(precision[sure], count[sure] / len(liked), beta=1.0)
-    return float(np.median(liked[sure][good]))
+    thresholds = np.sort(moving)[::-1]
+    count = np.arange(1, len(thresholds) + 1)
+    above = len(stationary) - np.searchsorted(np.sort(stationary), thresholds)
+    reliable = count >= _RELIABLE_FRACTION * len(thresholds)
+    if not (above[reliable] > 0).all():
+        return float(thresholds[-1])
+    cars_per_moving = float((above[reliable] / count[reliable]).min())
+    precision = np.minimum(cars_per_moving * count / np.maximum(above, 1), 1.0)
+    plateau = nearly_best(precision[reliable], count[reliable] / len(thresholds), beta=1.0)
+    return float(np.median(thresholds[reliable][plateau]))

@@ -1,296 +1,370 @@
-"""How the network learns: what each layer hands back, and steps down the slope of the loss.
+"""Training of the network: forward and backward pass, focal loss, AdamW with warm-up and cosine decay.
 
-A layer normalises what it sums by the mean and deviation of the batch while the network is learnt from nothing; these
-go into its weights and bias at the end, and a network that learns on has none.
+From scratch, each convolution followed by a ReLU is batch-normalised, and the running statistics are folded into its
+weights and bias at the end; fine-tuning starts from a folded network and normalises nothing.
+
+The training loop is our own on numpy: jax measured no faster (478 against 443 ms a step from scratch, 309 against 351
+ms fine-tuning) and adds 380 MB of wheels, and the wheel of torch brings CUDA.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
 
-from schemas.arrays import Float32Array
-from velfield.detection.cnn.convolution import Layout, convolved, gathered, handed_back, spread
-from velfield.detection.cnn.model import BODIES, CORNERS, LAYERS, Network
+from schemas.arrays import Float32Array, Mask
+from velfield.detection.cnn.convolution import (
+    PaddedBatchLayout,
+    conv2d,
+    conv2d_backward,
+    depth_to_space,
+    space_to_depth,
+)
+from velfield.detection.cnn.model import (
+    CONVOLUTIONS,
+    TOPOLOGY,
+    Conv,
+    DepthToSpace,
+    Layer,
+    Network,
+    Residual,
+    SpaceToDepth,
+)
 from velfield.parallel import each
 
-_NORMALISED = tuple(name for name in LAYERS if name not in ("back", "told"))
-_MOMENTUM, _LEAST_VARIANCE = 0.05, 1e-5
-_FIRST_ODDS = -4.0
-"""Log odds of a car at any place, before anything is known: the paper's few per cent."""
-_AXIS_WEIGHT = 0.5
-_DECAY, _BETAS, _STEEPEST = 1e-2, (0.9, 0.999), 5.0
-_WARMING = 0.1
-"""Share of the steps over which they grow to their full size."""
+_STATISTICS_MOMENTUM, _MIN_VARIANCE = 0.05, 1e-5
+_PRIOR_LOGIT = -4.0
+"""Initial bias of the heatmap: the logit of a car at any pixel before training, about 2 %."""
+_RESIDUAL_GAIN = 0.5
+"""Initial gain of the last convolution of a residual block."""
+_ORIENTATION_LOSS_WEIGHT = 0.5
+WEIGHT_DECAY, ADAM_BETAS, MAX_GRAD_NORM = 1e-2, (0.9, 0.999), 5.0
+_WARMUP_FRACTION = 0.1
+"""Fraction of the steps over which the learning rate rises linearly."""
+_WARMUP_START, _FINAL_FACTOR = 0.05, 1e-3
+_MAX_LOGIT = 11
+
+Backward: TypeAlias = Callable[[Float32Array], Float32Array]
+"""From the gradient by a layer's output to that by its input; keeps the gradients by its parameters aside."""
 
 
 @dataclass(frozen=True)
 class Batch:
-    """What a step learns from.
+    """Images of one training step and their targets.
 
     Attributes
     ----------
-    pictures : (n, h, w) grey of 0 to 1.
-    middles : (n, h / 2, w / 2) 1 in a car's middle, falling off about it.
-    counted : (n, h / 2, w / 2) 1 where what is told is known, else 0.
-    axes : (n, h / 2, w / 2, 2) cosine and sine of twice the axis.
-    axes_counted : (n, h / 2, w / 2) how much these count.
+    images : (n, h, w) grey in [0, 1].
+    heatmap : (n, h / 2, w / 2) 1 at a car's centre, a Gaussian around it.
+    mask : (n, h / 2, w / 2) 1 where the heatmap is known, else 0.
+    orientation : (n, h / 2, w / 2, 2) cosine and sine of twice the orientation.
+    orientation_weight : (n, h / 2, w / 2) weight of the orientation in the loss.
     """
 
-    pictures: Float32Array
-    middles: Float32Array
-    counted: Float32Array
-    axes: Float32Array
-    axes_counted: Float32Array
+    images: Float32Array
+    heatmap: Float32Array
+    mask: Float32Array
+    orientation: Float32Array
+    orientation_weight: Float32Array
 
     def halves(self) -> "tuple[Batch, Batch]":
-        """The first and the second half of the pictures."""
-        middle = len(self.pictures) // 2
-        parts = (self.pictures, self.middles, self.counted, self.axes, self.axes_counted)
+        """The first and the second half of the images."""
+        middle = len(self.images) // 2
+        parts = (self.images, self.heatmap, self.mask, self.orientation, self.orientation_weight)
         return Batch(*(part[:middle] for part in parts)), Batch(*(part[middle:] for part in parts))
 
 
 @dataclass(frozen=True)
-class Weighed:
-    """What the losses of cars and of axes are divided by: how many there are in a batch."""
+class LossNormaliser:
+    """Divisors of the two losses: the number of cars in a batch, as summed weights, plus one."""
 
     cars: float
-    axes: float
+    orientation: float
 
     @classmethod
-    def of(cls, batch: Batch) -> "Weighed":
-        """Of a batch."""
-        return cls(float(_at_cars(batch).sum()) + 1, float(batch.axes_counted.sum()) + 1)
+    def of(cls, batch: Batch) -> "LossNormaliser":
+        """Of a whole batch; its halves are divided by the same."""
+        return cls(float(_positive_weight(batch).sum()) + 1, float(batch.orientation_weight.sum()) + 1)
 
 
-def _at_cars(batch: Batch) -> Float32Array:
-    return np.asarray(batch.middles**4 * batch.counted, np.float32)
+def _positive_weight(batch: Batch) -> Float32Array:
+    return np.asarray(batch.heatmap**4 * batch.mask, np.float32)
 
 
 @dataclass
-class Learner:
-    """A network that is being learnt.
+class Trainer:
+    """Parameters of a network in training, and the state of the optimiser.
 
     Attributes
     ----------
-    values : what is learnt, by name: ``NAME.w``, ``NAME.b`` and, of a normalised layer, ``NAME.g``, its gain.
-    means, variances : of what normalised layers sum, over the last batches.
+    parameters : by name: ``LAYER.w``, ``LAYER.b`` and, of a batch-normalised layer, ``LAYER.g``, its gain.
+    means, variances : running batch statistics of the normalised layers, by layer.
     """
 
-    values: dict[str, Float32Array]
+    parameters: dict[str, Float32Array]
     means: dict[str, Float32Array] = field(default_factory=dict)
     variances: dict[str, Float32Array] = field(default_factory=dict)
     _moments: dict[str, tuple[Float32Array, Float32Array]] = field(default_factory=dict)
     _steps: int = 0
 
     @classmethod
-    def from_nothing(cls, seed: int) -> "Learner":
-        """Random weights."""
-        rng, values = np.random.default_rng(seed), {}
-        for name, (taps, into, out) in LAYERS.items():
-            values[f"{name}.w"] = rng.normal(0, np.sqrt(2 / (taps * into)), (taps, into, out)).astype(np.float32)
-            values[f"{name}.b"] = np.zeros(out, np.float32)
-            if name in _NORMALISED:
-                values[f"{name}.g"] = np.ones(out, np.float32)
-        values["told.b"][0] = _FIRST_ODDS
-        for _, second in BODIES:
-            values[f"{second}.g"] *= np.float32(0.5)
-        return cls(values)
+    def initialise(cls, seed: int) -> "Trainer":
+        """Random weights (He initialisation), for training from scratch."""
+        rng, parameters = np.random.default_rng(seed), {}
+        for name, conv in CONVOLUTIONS.items():
+            taps, channels_in, channels_out = conv.shape
+            weights = rng.normal(0, np.sqrt(2 / (taps * channels_in)), conv.shape)
+            parameters[f"{name}.w"] = weights.astype(np.float32)
+            parameters[f"{name}.b"] = np.zeros(channels_out, np.float32)
+            if conv.relu:
+                parameters[f"{name}.g"] = np.ones(channels_out, np.float32)
+        for name in _last_of_residual_blocks(TOPOLOGY):
+            parameters[f"{name}.g"] *= np.float32(_RESIDUAL_GAIN)
+        parameters["head.b"][0] = _PRIOR_LOGIT
+        return cls(parameters)
 
     @classmethod
-    def of(cls, network: Network) -> "Learner":
-        """Going on from a network."""
-        values = {f"{name}.w": network.weights[name].copy() for name in LAYERS}
-        return cls({**values, **{f"{name}.b": network.biases[name].copy() for name in LAYERS}})
+    def from_network(cls, network: Network) -> "Trainer":
+        """A trained network, for fine-tuning."""
+        parameters = {f"{name}.w": network.weights[name].copy() for name in CONVOLUTIONS}
+        return cls({**parameters, **{f"{name}.b": network.biases[name].copy() for name in CONVOLUTIONS}})
+
+    @property
+    def is_normalised(self) -> bool:
+        """Whether any layer is batch-normalised."""
+        return any(f"{name}.g" in self.parameters for name in CONVOLUTIONS)
 
     def network(self) -> Network:
-        """What was learnt, gains and means in its weights."""
+        """The trained network, batch normalisation folded into its weights."""
         weights, biases = {}, {}
-        for name in LAYERS:
-            weight, bias = self.values[f"{name}.w"], self.values[f"{name}.b"]
-            if f"{name}.g" in self.values:
-                gain = self.values[f"{name}.g"] / np.sqrt(self.variances[name] + _LEAST_VARIANCE)
+        for name in CONVOLUTIONS:
+            weight, bias = self.parameters[f"{name}.w"], self.parameters[f"{name}.b"]
+            if f"{name}.g" in self.parameters:
+                gain = self.parameters[f"{name}.g"] / np.sqrt(self.variances[name] + _MIN_VARIANCE)
                 weight, bias = weight * gain, bias - self.means[name] * gain
             weights[name], biases[name] = weight.astype(np.float32), bias.astype(np.float32)
         return Network(weights, biases)
 
-    def learn(self, batch: Batch, size: float) -> float:
-        """A step of so large a size; the loss before it."""
-        loss, slopes = self.slopes(batch)
-        steepness = np.sqrt(sum(float((slope.astype(np.float64) ** 2).sum()) for slope in slopes.values()))
-        shrink = np.float32(min(1.0, _STEEPEST / max(steepness, 1e-12)))
+    def train_step(self, batch: Batch, learning_rate: float) -> float:
+        """One step of the optimiser, gradients clipped by their norm; returns the loss before it."""
+        loss, gradients = self.loss_and_gradients(batch)
+        norm = np.sqrt(sum(float((gradient.astype(np.float64) ** 2).sum()) for gradient in gradients.values()))
+        clip = np.float32(min(1.0, MAX_GRAD_NORM / max(norm, 1e-12)))
         self._steps += 1
-        for name, slope in slopes.items():
-            self._move(name, slope * shrink, size)
+        for name, gradient in gradients.items():
+            self._update(name, gradient * clip, learning_rate)
         return loss
 
-    def _move(self, name: str, slope: Float32Array, size: float) -> None:
-        """Adam's step with decay apart from it (Loshchilov and Hutter)."""
-        value = self.values[name]
+    def _update(self, name: str, gradient: Float32Array, learning_rate: float) -> None:
+        """AdamW: Adam with decoupled weight decay (Loshchilov and Hutter 2019)."""
+        value = self.parameters[name]
         first, second = self._moments.get(name, (np.zeros_like(value), np.zeros_like(value)))
-        first = (_BETAS[0] * first + (1 - _BETAS[0]) * slope).astype(np.float32)
-        second = (_BETAS[1] * second + (1 - _BETAS[1]) * slope**2).astype(np.float32)
+        first = (ADAM_BETAS[0] * first + (1 - ADAM_BETAS[0]) * gradient).astype(np.float32)
+        second = (ADAM_BETAS[1] * second + (1 - ADAM_BETAS[1]) * gradient**2).astype(np.float32)
         self._moments[name] = first, second
-        grown = (1 - _BETAS[0] ** self._steps), (1 - _BETAS[1] ** self._steps)
-        step = first / grown[0] / (np.sqrt(second / grown[1]) + 1e-8)
-        self.values[name] = (value * (1 - size * _DECAY) - size * step).astype(np.float32)
+        unbiased = (1 - ADAM_BETAS[0] ** self._steps), (1 - ADAM_BETAS[1] ** self._steps)
+        step = first / unbiased[0] / (np.sqrt(second / unbiased[1]) + 1e-8)
+        decayed = value * (1 - learning_rate * WEIGHT_DECAY)
+        self.parameters[name] = (decayed - learning_rate * step).astype(np.float32)
 
-    def slopes(self, batch: Batch) -> tuple[float, dict[str, Float32Array]]:
-        """The loss, and its slope by everything that is learnt.
+    def loss_and_gradients(self, batch: Batch) -> tuple[float, dict[str, Float32Array]]:
+        """Loss, and its gradient by every parameter.
 
-        Where no layer is normalised by its batch, both halves of it are gone through at once: what they hand back adds
-        up to the same, whatever the number of processors.
+        Without batch normalisation both halves of the batch are computed in parallel: their gradients add up to those
+        of the whole, whatever the number of processors.
         """
-        weighed = Weighed.of(batch)
-        if any(f"{name}.g" in self.values for name in LAYERS) or len(batch.pictures) < 2:
-            return self._slopes(batch, weighed)
-        (first, of_first), (second, of_second) = each(lambda half: self._slopes(half, weighed), batch.halves())
-        return first + second, {name: slope + of_second[name] for name, slope in of_first.items()}
+        normaliser = LossNormaliser.of(batch)
+        if self.is_normalised or len(batch.images) < 2:
+            return self._loss_and_gradients(batch, normaliser)
+        (first, of_first), (second, of_second) = each(
+            lambda half: self._loss_and_gradients(half, normaliser), batch.halves()
+        )
+        return first + second, {name: gradient + of_second[name] for name, gradient in of_first.items()}
 
-    def _slopes(self, batch: Batch, weighed: Weighed) -> tuple[float, dict[str, Float32Array]]:
-        tape = _Tape(self)
-        whole = Layout(*batch.pictures.shape)
-        half = whole.halved()
-        quarter = half.halved()
-        grain = tape.rectified("grain", whole.laid_out(batch.pictures[..., None]), whole)
-        corners = tape.rectified("edges", gathered(grain, whole), half)
-        for name in CORNERS:
-            corners = tape.rectified(name, corners, half)
-        body = tape.rectified("parts", gathered(corners, half), quarter)
-        for first, second in BODIES:
-            body = body + tape.rectified(second, tape.rectified(first, body, quarter), quarter)
-        joined = np.maximum(spread(tape.summed("back", body, quarter), half) + corners, 0)
-        said = tape.summed("told", tape.rectified("middle", joined, half), half)
-        loss, slope = loss_of(half.inner(said), batch, weighed)
-
-        back = tape.back("middle", tape.back("told", half.laid_out(slope))) * (joined > 0)
-        by_body = tape.back("back", gathered(back, half))
-        for first, second in reversed(BODIES):
-            by_body = by_body + tape.back(first, tape.back(second, by_body))
-        by_corners = back + spread(tape.back("parts", by_body), half)
-        for name in reversed(CORNERS):
-            by_corners = tape.back(name, by_corners)
-        tape.back("grain", spread(tape.back("edges", by_corners), whole))
-        return loss, tape.slopes
+    def _loss_and_gradients(self, batch: Batch, normaliser: LossNormaliser) -> tuple[float, dict[str, Float32Array]]:
+        layout = PaddedBatchLayout(*batch.images.shape)
+        differentiable = _Pass(self)
+        out, layout, backward = differentiable.forward(TOPOLOGY, layout.pack(batch.images[..., None]), layout)
+        loss, gradient = focal_loss_and_gradient(layout.interior_view(out), batch, normaliser)
+        backward(layout.pack(gradient))
+        return loss, differentiable.gradients
 
 
-class _Tape:
-    """What each layer was given, so that it can hand the slope back."""
+def _last_of_residual_blocks(layers: Sequence[Layer]) -> list[str]:
+    """Names of the normalised convolutions whose output is added to a residual block's input."""
+    names = []
+    for layer in layers:
+        if isinstance(layer, Residual):
+            names += _last_of_residual_blocks(layer.layers)
+            last = layer.layers[-1]
+            if isinstance(last, Conv) and last.relu:
+                names.append(last.name)
+    return names
 
-    def __init__(self, learner: Learner) -> None:
-        self.learner = learner
-        self.slopes: dict[str, Float32Array] = {}
-        self._undo: dict[str, Callable[[Float32Array], Float32Array]] = {}
 
-    def summed(self, name: str, values: Float32Array, layout: Layout) -> Float32Array:
-        """A layer without more."""
-        learnt = self.learner.values
-        weights = learnt[f"{name}.w"]
-        out = convolved(values, weights, layout) + learnt[f"{name}.b"]
-        layout.clear_border(out)
+class _Pass:
+    """A forward pass that can be differentiated (reverse mode): every layer returns its output and its backward pass.
 
-        def undo(slope: Float32Array) -> Float32Array:
-            self.slopes[f"{name}.b"] = slope.sum(axis=0)
-            by_values, self.slopes[f"{name}.w"] = handed_back(values, weights, slope, layout)
+    Attributes
+    ----------
+    gradients : gradients of the loss by the parameters, filled in by the backward pass.
+    """
+
+    def __init__(self, trainer: Trainer) -> None:
+        self.trainer = trainer
+        self.gradients: dict[str, Float32Array] = {}
+
+    def forward(
+        self, layers: Sequence[Layer], values: Float32Array, layout: PaddedBatchLayout
+    ) -> tuple[Float32Array, PaddedBatchLayout, Backward]:
+        """Output of a sequence of layers, its layout, and the backward pass."""
+        steps: list[Backward] = []
+        for layer in layers:
+            values, layout, step = self._layer(layer, values, layout)
+            steps.append(step)
+
+        def backward(gradient: Float32Array) -> Float32Array:
+            # Each step is dropped once done, with the activations that it holds: hundreds of megabytes a batch.
+            while steps:
+                gradient = steps.pop()(gradient)
+            return gradient
+
+        return values, layout, backward
+
+    def _layer(
+        self, layer: Layer, values: Float32Array, layout: PaddedBatchLayout
+    ) -> tuple[Float32Array, PaddedBatchLayout, Backward]:
+        if isinstance(layer, SpaceToDepth):
+            return space_to_depth(values, layout), layout.halved(), lambda gradient: depth_to_space(gradient, layout)
+        if isinstance(layer, DepthToSpace):
+            doubled = layout.doubled()
+            return depth_to_space(values, doubled), doubled, lambda gradient: space_to_depth(gradient, doubled)
+        if isinstance(layer, Residual):
+            out, backward = self._residual(layer, values, layout)
+        elif f"{layer.name}.g" in self.trainer.parameters:
+            out, backward = self._normalised_conv(layer.name, values, layout)
+        else:
+            out, backward = self._conv(layer.name, values, layout)
+        if not layer.relu:
+            return out, layout, backward
+        positive: Mask = out > 0
+        np.maximum(out, 0, out=out)
+        return out, layout, lambda gradient: backward(np.asarray(gradient * positive, np.float32))
+
+    def _residual(
+        self, block: Residual, values: Float32Array, layout: PaddedBatchLayout
+    ) -> tuple[Float32Array, Backward]:
+        branch, _, backward = self.forward(block.layers, values, layout)
+        branch += values
+        return branch, lambda gradient: gradient + backward(gradient)
+
+    def _conv(self, name: str, values: Float32Array, layout: PaddedBatchLayout) -> tuple[Float32Array, Backward]:
+        weights = self.trainer.parameters[f"{name}.w"]
+        out = conv2d(values, weights, layout) + self.trainer.parameters[f"{name}.b"]
+        layout.zero_border(out)
+
+        def backward(gradient: Float32Array) -> Float32Array:
+            self.gradients[f"{name}.b"] = gradient.sum(axis=0)
+            by_values, self.gradients[f"{name}.w"] = conv2d_backward(values, weights, gradient, layout)
             return by_values
 
-        self._undo[name] = undo
-        return out
+        return out, backward
 
-    def rectified(self, name: str, values: Float32Array, layout: Layout) -> Float32Array:
-        """A layer, normalised where it is learnt so, and what is below zero set to it."""
-        if f"{name}.g" in self.learner.values:
-            out = self._normalised(name, values, layout)
-        else:
-            out = self.summed(name, values, layout)
-        np.maximum(out, 0, out=out)
-        undo = self._undo[name]
-        self._undo[name] = lambda slope: undo(slope * (out > 0))
-        return out
-
-    def _normalised(self, name: str, values: Float32Array, layout: Layout) -> Float32Array:
-        learner = self.learner
-        weights, gain = learner.values[f"{name}.w"], learner.values[f"{name}.g"]
-        summed = convolved(values, weights, layout)
-        inner = layout.inner(summed)
-        mean, variance = inner.mean(axis=(0, 1, 2)), inner.var(axis=(0, 1, 2))
-        for kept, seen in ((learner.means, mean), (learner.variances, variance)):
-            kept[name] = seen if name not in kept else (1 - _MOMENTUM) * kept[name] + _MOMENTUM * seen
-        scale = 1 / np.sqrt(variance + _LEAST_VARIANCE)
-        normal = (summed - mean) * scale
-        layout.clear_border(normal)
-        out = normal * gain + learner.values[f"{name}.b"]
-        layout.clear_border(out)
+    def _normalised_conv(
+        self, name: str, values: Float32Array, layout: PaddedBatchLayout
+    ) -> tuple[Float32Array, Backward]:
+        """Convolution and batch normalisation."""
+        trainer = self.trainer
+        weights, gain = trainer.parameters[f"{name}.w"], trainer.parameters[f"{name}.g"]
+        convolved = conv2d(values, weights, layout)
+        interior = layout.interior_view(convolved)
+        mean, variance = interior.mean(axis=(0, 1, 2)), interior.var(axis=(0, 1, 2))
+        for running, current in ((trainer.means, mean), (trainer.variances, variance)):
+            old = running.get(name)
+            running[name] = (
+                current if old is None else (1 - _STATISTICS_MOMENTUM) * old + _STATISTICS_MOMENTUM * current
+            )
+        scale = 1 / np.sqrt(variance + _MIN_VARIANCE)
+        normalised = (convolved - mean) * scale
+        layout.zero_border(normalised)
+        out = normalised * gain + trainer.parameters[f"{name}.b"]
+        layout.zero_border(out)
         pixels = layout.count * layout.height * layout.width
 
-        def undo(slope: Float32Array) -> Float32Array:
-            self.slopes[f"{name}.b"], self.slopes[f"{name}.g"] = slope.sum(axis=0), (slope * normal).sum(axis=0)
-            through = slope - (self.slopes[f"{name}.b"] + normal * self.slopes[f"{name}.g"]) / np.float32(pixels)
-            through *= gain * scale
-            layout.clear_border(through)
-            by_values, self.slopes[f"{name}.w"] = handed_back(values, weights, through, layout)
+        def backward(gradient: Float32Array) -> Float32Array:
+            by_bias, by_gain = gradient.sum(axis=0), (gradient * normalised).sum(axis=0)
+            self.gradients[f"{name}.b"], self.gradients[f"{name}.g"] = by_bias, by_gain
+            by_convolved = gradient - (by_bias + normalised * by_gain) / np.float32(pixels)
+            by_convolved *= gain * scale
+            layout.zero_border(by_convolved)
+            by_values, self.gradients[f"{name}.w"] = conv2d_backward(values, weights, by_convolved, layout)
             return by_values
 
-        self._undo[name] = undo
-        return np.asarray(out, np.float32)
-
-    def back(self, name: str, slope: Float32Array) -> Float32Array:
-        """The slope by what a layer was given, from that by what came out; its own are kept.
-
-        What the layer was given is let go: kept until rubbish is collected, it is hundreds of megabytes a step.
-        """
-        return np.asarray(self._undo.pop(name)(slope), np.float32)
+        return np.asarray(out, np.float32), backward
 
 
-def loss_of(said: Float32Array, batch: Batch, weighed: Weighed) -> tuple[float, Float32Array]:
-    """How wrong what is said is, and the slope of that by it, (n, h / 2, w / 2, 3).
+def focal_loss_and_gradient(out: Float32Array, batch: Batch, normaliser: LossNormaliser) -> tuple[float, Float32Array]:
+    """Loss of the network's output, and its gradient by that output.
 
-    A focal loss: places that are told well count little, and near a car's middle it is no fault to like a place.
+    The heatmap has a focal loss as in CornerNet (Law and Deng 2018): pixels predicted well count little, and those near
+    a car's centre count less as background. The orientation has a weighted squared error.
+
+    Parameters
+    ----------
+    out
+        (n, h / 2, w / 2, 3) of the network: logit and orientation vector.
+    batch
+        The targets.
+    normaliser
+        Of the whole batch.
     """
-    middles, counted = batch.middles, batch.counted
-    odds = np.clip(said[..., 0], -11, 11)
-    likely = 1 / (1 + np.exp(-odds))
-    car, other, cars = _at_cars(batch), (1 - middles) ** 2 * counted, weighed.cars
-    above = np.maximum(likely - middles, 0)
-    log_car, log_other = np.log(likely), np.log1p(-likely)
-    loss = float((-car * (1 - likely) ** 2 * log_car - other * above**2 * log_other).sum()) / cars
-    by_likely = car * (2 * (1 - likely) * log_car - (1 - likely) ** 2 / likely)
-    by_likely += other * (above**2 / (1 - likely) - 2 * above * log_other)
-    slope = np.zeros_like(said)
-    slope[..., 0] = by_likely * likely * (1 - likely) / cars
-    off = said[..., 1:] - batch.axes
-    weight = np.float32(_AXIS_WEIGHT / weighed.axes) * batch.axes_counted[..., None]
-    slope[..., 1:] = 2 * weight * off
-    return loss + float((weight * off**2).sum()), slope
+    heatmap, mask = batch.heatmap, batch.mask
+    logits = np.clip(out[..., 0], -_MAX_LOGIT, _MAX_LOGIT)
+    p = 1 / (1 + np.exp(-logits))
+    positive, negative, cars = _positive_weight(batch), (1 - heatmap) ** 2 * mask, normaliser.cars
+    excess = np.maximum(p - heatmap, 0)
+    log_p, log_not_p = np.log(p), np.log1p(-p)
+    loss = float((-positive * (1 - p) ** 2 * log_p - negative * excess**2 * log_not_p).sum()) / cars
+    by_p = positive * (2 * (1 - p) * log_p - (1 - p) ** 2 / p)
+    by_p += negative * (excess**2 / (1 - p) - 2 * excess * log_not_p)
+    gradient = np.zeros_like(out)
+    gradient[..., 0] = by_p * p * (1 - p) / cars
+    residual = out[..., 1:] - batch.orientation
+    weight = np.float32(_ORIENTATION_LOSS_WEIGHT / normaliser.orientation) * batch.orientation_weight[..., None]
+    gradient[..., 1:] = 2 * weight * residual
+    return loss + float((weight * residual**2).sum()), gradient
 
 
-def learnt(
-    learner: Learner,
+def train(
+    trainer: Trainer,
     batches: Callable[[int], Batch],
     *,
     steps: int,
-    size: float,
-    tell: Callable[[int, float], None] | None = None,
+    learning_rate: float,
+    on_step: Callable[[int, float], None] | None = None,
 ) -> Network:
-    """Take steps that grow, then shrink along a cosine.
+    """Train for a number of steps with the learning rates of `lr_schedule`.
 
     Parameters
     ----------
     batches
-        A batch by the step's number.
-    size
-        The largest step.
-    tell
-        Hears each step's number and loss.
+        Gives the batch of a step, such as a `PatchDataset`.
+    learning_rate
+        The highest one.
+    on_step
+        Called with each step's number and loss.
     """
     for step in range(steps):
-        loss = learner.learn(batches(step), size * _share(step / max(steps, 1)))
-        if tell is not None:
-            tell(step, loss)
-    return learner.network()
+        loss = trainer.train_step(batches(step), learning_rate * lr_schedule(step / max(steps, 1)))
+        if on_step is not None:
+            on_step(step, loss)
+    return trainer.network()
 
 
-def _share(done: float) -> float:
-    if done < _WARMING:
-        return 0.05 + 0.95 * done / _WARMING
-    return float(0.5 * (1 + np.cos(np.pi * (done - _WARMING) / (1 - _WARMING)))) + 1e-3
+def lr_schedule(progress: float) -> float:
+    """Factor of the learning rate after a fraction of the steps: linear warm-up, then cosine decay."""
+    if progress < _WARMUP_FRACTION:
+        return _WARMUP_START + (1 - _WARMUP_START) * progress / _WARMUP_FRACTION
+    decay = (progress - _WARMUP_FRACTION) / (1 - _WARMUP_FRACTION)
+    return float(0.5 * (1 + np.cos(np.pi * decay))) + _FINAL_FACTOR

@@ -1,5 +1,9 @@
-"""The detector of a flight: given, learnt from marked cars, or learnt from what moves; and the grid cars are looked
-for on."""
+"""Stage `detector`: loads or trains the detector of a flight, and sets the scale of the working grid.
+
+The detector comes from, in this order: other boxes (`--detections`, none is needed), a file (`--detector`), fine-tuning
+or training on the given labels (`--labels`), or self-training on vehicles that move. Where too little moves, the
+shipped pre-trained detector is used.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from schemas.records import WorkingRecord
-from velfield.detection.cnn.self_training import network_of_motion
+from velfield.detection.cnn.self_training import self_train_from_motion
 from velfield.detection.detector import Detector, load_detector, shipped_detector
 from velfield.detection.evaluation import thinned_curve
 from velfield.detection.motion.difference import MotionBackground, MotionFrame, motion_background
-from velfield.detection.motion.evidence import MotionEvidence, evidence_of, neighbours
+from velfield.detection.motion.evaluation import MotionEvaluation, evaluate_detector, select_bursts
 from velfield.detection.motion.labels import MotionLabels, choose_frames, labels_from_motion, working_scale
 from velfield.detection.train import LabelledImage, train_detector
 from velfield.errors import InputError
@@ -32,16 +36,18 @@ from velfield.run.commits import write_atomically
 from velfield.run.grid import read_grid
 from velfield.run.stores import open_frames
 
-_TRAINING_FRAMES, _NETWORK_FRAMES = 6, 12
-_NETWORK_VEHICLES = 20
-"""Of fewer that move the network would learn these ones."""
-_EVIDENCE_BURSTS = 6
-_MOST_FRAMES = 0.5
-"""Share of the frames that another program's boxes are expected to be in."""
+_CASCADE_FRAMES, _CNN_FRAMES = 6, 12
+"""Labelled frames that the cascade, or the network, is trained on."""
+_MIN_CNN_VEHICLES = 20
+"""On fewer moving vehicles the network would overfit."""
+_EVALUATION_BURSTS = 6
+_MIN_FRAMES_WITH_BOXES = 0.5
+"""Fraction of the frames in which another program's boxes are expected."""
+_CURVE_DESCRIPTION = "detections in bursts of three frames: those that move along their axis, against isolated ones"
 
 
 def make_detector(plan: Plan) -> Outcome:
-    """Choose the working grid, make the background, and train or load the detector."""
+    """Set the scale of the working grid, and load or train the detector."""
     if plan.job.inputs.detections:
         return _from_detections(plan)
     if plan.job.inputs.detector:
@@ -52,35 +58,39 @@ def make_detector(plan: Plan) -> Outcome:
 
 
 def _from_file(plan: Plan) -> Outcome:
-    """A detector trained before; the background of this flight, where it looks at the difference to one."""
+    """Load a detector file; one that uses the difference to the background gets that of this flight."""
     detector, scale = load_detector(Path(plan.job.inputs.detector or "")), _known_scale(plan)
     background = motion_background(_motion_frames(plan, scale)) if detector.uses_background else None
     return _finish(plan, detector, scale, "file", background=background)
 
 
 def _from_detections(plan: Plan) -> Outcome:
-    """Another program's boxes are taken; their size tells the working scale where ``--gsd-m`` does not."""
+    """Take another program's boxes; their median length gives the working scale where ``--gsd-m`` does not."""
     boxes, scale = given_boxes(plan), _scale_of_gsd(plan)
     if scale is None:
         scale = _scale_of_length(plan, car_length_raw_px(boxes), base_px_per_raw_px(plan))
     outcome = _finish(plan, None, 1.0 if scale is None else scale, "detections")
     warnings = []
     if scale is None:
-        usual = plan.config.detection.working_car_length_px
-        told = "the size of a car is not known: found no --gsd-m and boxes without a length"
-        warnings.append(f"{told}; taken for {usual:g} px, give one")
-    named = int(np.isin(plan.indices, boxes["source_index"]).sum())
-    if named < _MOST_FRAMES * plan.frame_count:
-        told = f"--detections has boxes in {named} of the {plan.frame_count} frames worked on"
-        warnings.append(f"{told}: the others count as free of cars; give boxes of all frames, or use it as --labels")
+        assumed_px = plan.config.detection.working_car_length_px
+        warnings.append(
+            "the size of a car is not known: found no --gsd-m and boxes without a length; "
+            f"{assumed_px:g} px assumed, give one of them"
+        )
+    with_boxes = int(np.isin(plan.indices, boxes["source_index"]).sum())
+    if with_boxes < _MIN_FRAMES_WITH_BOXES * plan.frame_count:
+        warnings.append(
+            f"--detections has boxes in {with_boxes} of the {plan.frame_count} frames processed: the others count as "
+            "free of cars; give boxes of all frames, or use it as --labels"
+        )
     unused = [f"--{name}" for name in ("labels", "detector") if getattr(plan.job.inputs, name)]
     if unused:
-        warnings.append(f"--detections is given, so nothing is learnt or looked for: {' and '.join(unused)} not used")
+        warnings.append(f"--detections is given, so no detector is trained or run: {' and '.join(unused)} not used")
     return Outcome(outcome.outputs, outcome.counts, outcome.notes, warnings)
 
 
 def _scale_of_length(plan: Plan, length_raw_px: float, base_per_raw: float) -> float | None:
-    """Working px a base px, from a car's usual length in raw px; none where that is not known."""
+    """Working px a base px, from a car's median length in raw px; None where that is not known."""
     if not np.isfinite(length_raw_px):
         return None
     return plan.config.detection.working_car_length_px / (length_raw_px * base_per_raw)
@@ -115,121 +125,135 @@ def _from_labels(plan: Plan) -> Outcome:
 
 
 def _from_motion(plan: Plan) -> Outcome:
+    """Train on vehicles that move; without ``--gsd-m`` a car's length is estimated from them first."""
     known = _scale_of_gsd(plan)
     scale = known or 1.0
     frames = _motion_frames(plan, scale)
     background = motion_background(frames)
-    wanted = plan.config.detection.working_car_length_px
-    near_s = plan.config.tracking.max_interval_s
-    labels = labels_from_motion(frames, background, car_length_px=wanted if known else None, max_interval_s=near_s)
+    length_px = plan.config.detection.working_car_length_px
+    max_interval_s = plan.config.tracking.max_interval_s
+    labels = labels_from_motion(
+        frames, background, car_length_px=length_px if known else None, max_interval_s=max_interval_s
+    )
     if known is None and labels.usable:
         scale = working_scale(plan.config.detection, None, labels, labels_scale=scale)
         frames = _motion_frames(plan, scale)
         background = motion_background(frames)
-        labels = labels_from_motion(frames, background, car_length_px=wanted, max_interval_s=near_s)
+        labels = labels_from_motion(frames, background, car_length_px=length_px, max_interval_s=max_interval_s)
     if not labels.usable:
         return _without_labels(plan, known, labels)
-    detector = _by_motion(plan, frames, labels, background)
+    detector = _train_on_motion(plan, frames, labels, background)
     return _finish(plan, detector, scale, "motion", count=labels.count, motion=labels, background=background)
 
 
-def _by_motion(plan: Plan, frames: list[MotionFrame], labels: MotionLabels, background: MotionBackground) -> Detector:
-    """A detector of cars that move: by their looks alone where these tell them, so that it finds what stands too.
+def _train_on_motion(
+    plan: Plan, frames: list[MotionFrame], labels: MotionLabels, background: MotionBackground
+) -> Detector:
+    """Train on labels from motion, on appearance alone where that suffices, so that stationary cars are detected too.
 
-    By the difference to the background what waits at a light for long, and is in the background, is not found: in a
-    simulated city .79 of the cars that move at some time, .91 by their looks. Where looks do not tell them, the network
-    that ships knows more of what stands; of few vehicles the boosted classifier makes more.
+    A vehicle that waits at a light for long is part of the background, and its difference to it vanishes: on a
+    simulated city a detector that uses the difference found 0.79 of the cars that move at some time, one by appearance
+    0.91. Where appearance does not suffice, the pre-trained network knows more of stationary cars; on few vehicles the
+    cascade generalises better.
     """
     config = plan.config.detection
-    samples = _samples(frames, labels, background, _TRAINING_FRAMES)
+    samples = _samples(frames, labels, background, _CASCADE_FRAMES)
     shipped = shipped_detector()
-    has_network = config.method == "network" and config.working_car_length_px == shipped.record.working_car_length_px
-    if has_network:
-        # What moves is hundreds of labels, of which the boosted classifier learns as much, and is four times as fast.
+    use_cnn = config.method == "network" and config.working_car_length_px == shipped.record.working_car_length_px
+    if use_cnn:
+        # On the hundreds of labels that motion gives, the cascade is as accurate and four times as fast.
         config = config.model_copy(update={"method": "aligned"})
     if config.motion_channel == "auto":
-        by_looks = train_detector(samples, config.model_copy(update={"motion_channel": "never"}))
-        evidence = _evidence(plan, by_looks, frames, background)
-        if evidence.tells_cars(_usual_score(by_looks)):
-            return by_looks if config.threshold is not None else _judged(by_looks, evidence)
-    if has_network and config.motion_channel != "never" and labels.vehicles >= _NETWORK_VEHICLES:
-        learnt = network_of_motion(
-            _samples(frames, labels, background, _NETWORK_FRAMES),
+        by_appearance = train_detector(samples, config.model_copy(update={"motion_channel": "never"}))
+        evaluation = _evaluate(plan, by_appearance, frames, background)
+        if evaluation.appearance_is_sufficient(_median_car_score(by_appearance)):
+            return by_appearance if config.threshold is not None else _with_threshold(by_appearance, evaluation)
+    if use_cnn and config.motion_channel != "never" and labels.vehicles >= _MIN_CNN_VEHICLES:
+        adapted = self_train_from_motion(
+            _samples(frames, labels, background, _CNN_FRAMES),
             shipped,
             _bursts(plan, frames),
             background.median,
             plan.config.detection,
             max_interval_s=plan.config.tracking.max_interval_s,
         )
-        if learnt is not None:
-            return learnt
+        if adapted is not None:
+            return adapted
     detector = train_detector(samples, config)
     if config.threshold is not None:
         return detector
-    return _judged(detector, _evidence(plan, detector, frames, background))
+    return _with_threshold(detector, _evaluate(plan, detector, frames, background))
 
 
-def _usual_score(detector: Detector) -> float:
-    """Half of the cars that were left out of training are liked better; without end where too few were."""
+def _median_car_score(detector: Detector) -> float:
+    """Median score of held-out cars; infinite where half of them were not detected at all."""
     curve = detector.curve
     if curve is None or not curve.recall or curve.recall[-1] < 0.5:
         return float("inf")
     return float(np.interp(0.5, curve.recall, curve.threshold))
 
 
-def _evidence(
+def _evaluate(
     plan: Plan, detector: Detector, frames: list[MotionFrame], background: MotionBackground
-) -> MotionEvidence:
+) -> MotionEvaluation:
+    """Precision and recall of a detector on bursts of the flight."""
     median = background.median if detector.uses_background else None
-    near_s = plan.config.tracking.max_interval_s
-    return evidence_of(detector, _bursts(plan, frames), median, plan.config.detection, max_interval_s=near_s)
+    max_interval_s = plan.config.tracking.max_interval_s
+    return evaluate_detector(
+        detector, _bursts(plan, frames), median, plan.config.detection, max_interval_s=max_interval_s
+    )
 
 
 def _bursts(plan: Plan, frames: list[MotionFrame]) -> list[MotionFrame]:
-    """Bursts of three frames, in which it shows how what is found moves."""
-    chosen = neighbours([frame.time_s for frame in frames], _EVIDENCE_BURSTS, plan.config.tracking.max_interval_s)
+    """Bursts of three frames, over which the motion of detections is classified."""
+    chosen = select_bursts([frame.time_s for frame in frames], _EVALUATION_BURSTS, plan.config.tracking.max_interval_s)
     return [frames[k] for k in chosen]
 
 
-def _judged(detector: Detector, evidence: MotionEvidence) -> Detector:
-    """The detector with the threshold at which what it finds moves as cars do; as it is where too few move to tell."""
-    if not np.isfinite(evidence.chosen):
+def _with_threshold(detector: Detector, evaluation: MotionEvaluation) -> Detector:
+    """The detector with the threshold and curve estimated from motion; unchanged where too few detections move."""
+    threshold = evaluation.operating_threshold
+    if not np.isfinite(threshold):
         return detector
-    told = "how detections in bursts of three frames move: along their axis, at one velocity, or not"
-    curve = thinned_curve(evidence.precision, evidence.recall, evidence.threshold, evidence.at, told)
-    return Detector(detector.record.model_copy(update={"threshold": evidence.chosen, "curve": curve}))
+    curve = thinned_curve(
+        evaluation.precision, evaluation.recall, evaluation.thresholds, evaluation.operating_index, _CURVE_DESCRIPTION
+    )
+    return Detector(detector.record.model_copy(update={"threshold": threshold, "curve": curve}))
 
 
 def _samples(
-    frames: list[MotionFrame], labels: MotionLabels, background: MotionBackground, most: int
+    frames: list[MotionFrame], labels: MotionLabels, background: MotionBackground, max_count: int
 ) -> list[LabelledImage]:
-    """Labelled frames spread over the flight: more of them show the same cars on the same ground."""
+    """Labelled frames spread over the flight; more of them would show the same cars on the same ground."""
     labelled = [pair for pair in zip(frames, labels.frames, strict=True) if pair[1].labelled and len(pair[1].cars)]
-    chosen = np.unique(np.linspace(0, len(labelled) - 1, min(most, len(labelled))).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(labelled) - 1, min(max_count, len(labelled))).round().astype(int))
     return [
         LabelledImage(
             image=frame.image,
             valid=frame.valid & background.valid,
             background=background.median,
-            cars=found.cars,
-            ignore=found.ignore,
+            cars=label.cars,
+            ignore=label.ignore,
             complete=False,
         )
-        for frame, found in (labelled[k] for k in chosen)
+        for frame, label in (labelled[k] for k in chosen)
     ]
 
 
 def _without_labels(plan: Plan, scale: float | None, labels: MotionLabels) -> Outcome:
-    """Neither marked cars nor enough that move: the shipped detector, said aloud, where a car's size is known."""
-    told = "; ".join(labels.warnings)
+    """Neither given labels nor enough vehicles that move: use the shipped detector, with a warning.
+
+    It needs a car's size.
+    """
+    reason = "; ".join(labels.warnings)
     if scale is None:
-        raise InputError(f"{told}; or give --gsd-m, so that the shipped detector can be used")
+        raise InputError(f"{reason}; or give --gsd-m, so that the shipped detector can be used")
     outcome = _finish(plan, shipped_detector(), scale, "shipped", motion=labels)
-    return Outcome(outcome.outputs, outcome.counts, outcome.notes, [f"{told}. The shipped detector is used"])
+    return Outcome(outcome.outputs, outcome.counts, outcome.notes, [f"{reason}. The shipped detector is used"])
 
 
 def _motion_frames(plan: Plan, scale: float) -> list[MotionFrame]:
-    """Frames to take labels from, whole, on the working grid."""
+    """Frames to label by motion, whole, on the working grid."""
     times_s = open_frames(plan.layout.frames).column("time_s")
     usable = np.flatnonzero(usable_frames(plan))
     if len(usable) < 3:
@@ -238,9 +262,9 @@ def _motion_frames(plan: Plan, scale: float) -> list[MotionFrame]:
     working = WorkingGrid.open(plan, scale)
     frames = []
     for frame in chosen:
-        seen = working.frame(frame, working.whole)
-        if seen is not None:
-            frames.append(MotionFrame(seen.image, seen.valid, float(times_s[frame])))
+        rectified = working.frame(frame, working.whole)
+        if rectified is not None:
+            frames.append(MotionFrame(rectified.image, rectified.valid, float(times_s[frame])))
         advance("detector", 0)
     return frames
 
@@ -255,7 +279,7 @@ def _finish(
     motion: MotionLabels | None = None,
     background: MotionBackground | None = None,
 ) -> Outcome:
-    """Write what detection needs: the detector, the working grid, the background where the detector looks at it."""
+    """Write the detector, the working grid, and the background where the detector uses it."""
     layout, outputs, notes = plan.layout, [plan.layout.working], []
     if detector is not None:
         write_atomically(layout.detector, detector.record.model_dump_json().encode())
