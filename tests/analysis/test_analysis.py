@@ -63,7 +63,7 @@ def test_a_slow_stretch_is_a_bottleneck_downstream_of_its_approach() -> None:
 def path(passage: int, points: np.ndarray) -> Segments:
     """One passage along points, five frames a second."""
     out = np.zeros(len(points) - 1, SEGMENT_DTYPE)
-    out["passage"], out["start_s"], out["duration_s"] = passage, np.arange(len(out)) / 5, 0.2
+    out["track"], out["start_s"], out["duration_s"] = passage, np.arange(len(out)) / 5, 0.2
     out["x0_px"], out["y0_px"], out["x1_px"], out["y1_px"] = *points[:-1].T, *points[1:].T
     out["vx_px_per_s"], out["vy_px_per_s"] = (np.diff(points, axis=0) * 5).T
     return out

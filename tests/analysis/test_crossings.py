@@ -16,7 +16,7 @@ def paths(*ways: list[tuple[float, float]], interval_s: float = 0.2) -> Segments
         for k, ((x0, y0), (x1, y1)) in enumerate(pairwise(way)):
             velocity = ((x1 - x0) / interval_s, (y1 - y0) / interval_s)
             rows.append((passage, k * interval_s, interval_s, x0, y0, x1, y1, *velocity))
-    names = ["passage", "start_s", "duration_s", "x0_px", "y0_px", "x1_px", "y1_px", "vx_px_per_s", "vy_px_per_s"]
+    names = ["track", "start_s", "duration_s", "x0_px", "y0_px", "x1_px", "y1_px", "vx_px_per_s", "vy_px_per_s"]
     segments = np.zeros(len(rows), SEGMENT_DTYPE)
     for name, values in zip(names, zip(*rows, strict=True), strict=True):
         segments[name] = values

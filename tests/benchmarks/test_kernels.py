@@ -29,7 +29,7 @@ def test_tile_of_the_field(benchmark: BenchmarkFixture) -> None:
     benchmark.group = "tile of 64 x 64 from 2,000 segments"
     rng = np.random.default_rng(2)
     segments = np.zeros(2000, SEGMENT_DTYPE)
-    segments["passage"] = np.arange(2000)
+    segments["track"] = np.arange(2000)
     segments["duration_s"] = 0.2
     for name in ("x0_px", "y0_px", "x1_px", "y1_px"):
         segments[name] = rng.uniform(0, 64, 2000)

@@ -8,12 +8,14 @@ import pandas as pd
 import pytest
 import rasterio
 import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from rasterio.errors import NotGeoreferencedWarning
 
 from schemas.flight import FieldConfig
 from tests.field_runs import field_run, flight, traffic_tracklets
 from velfield.errors import InputError
-from velfield.field.comparison import significant
+from velfield.field.comparison import FDR_LEVEL, significant
 from velfield.field.time_intervals import DAY_S, parse_time_intervals
 from velfield.pipeline.compare import compare_runs
 from velfield.run.field_algebra import merge_fields, subtract_fields
@@ -55,9 +57,9 @@ def test_ten_disjoint_sets_added_equal_the_field_of_all_to_the_bit(
     tmp_path: Path, table: pd.DataFrame, shape: tuple[int, int], whole: Path
 ) -> None:
     parts = []
-    passages = np.unique(table["passage_id"])
+    tracks = np.unique(table["passage_id"])
     for k in range(10):
-        mine = table[table["passage_id"].isin(passages[k::10])]
+        mine = table[table["passage_id"].isin(tracks[k::10])]
         parts.append(field_run(tmp_path / f"part{k}", mine, shape=shape).layout.root)
     merge_fields(parts, tmp_path / "sum")
     found = everything(tmp_path / "sum")
@@ -93,20 +95,20 @@ def test_a_folder_that_holds_something_is_not_written_over(whole: Path) -> None:
         merge_fields([whole, whole], whole)
 
 
-def slowed(table: pd.DataFrame, share: float) -> pd.DataFrame:
-    """The same passages at a share of their speed."""
+def slowed(table: pd.DataFrame, factor: float) -> pd.DataFrame:
+    """The same tracks at a fraction of their speed."""
     out = table.copy()
-    out[[name for name in out if name.startswith("v")]] *= share
+    out[[name for name in out if name.startswith("v")]] *= factor
     return out
 
 
-def test_comparing_tells_a_change_from_chance(
+def test_comparison_finds_a_change_and_none_in_a_random_split(
     tmp_path: Path, table: pd.DataFrame, shape: tuple[int, int], whole: Path
 ) -> None:
-    """Half of the passages against the other half: chance. All at 40 % of their speed: a change, of that size."""
-    passages = np.random.default_rng(0).permutation(np.unique(table["passage_id"]))
+    """Half of the tracks against the other half: no change. All at 40 % of their speed: a change of that size."""
+    tracks = np.random.default_rng(0).permutation(np.unique(table["passage_id"]))
     halves = [
-        field_run(tmp_path / name, table[table["passage_id"].isin(passages[k::2])], shape=shape).layout.root
+        field_run(tmp_path / name, table[table["passage_id"].isin(tracks[k::2])], shape=shape).layout.root
         for k, name in enumerate(("even", "odd"))
     ]
     lines = compare_runs(*halves, tmp_path / "chance", min_count=2)
@@ -133,13 +135,26 @@ def test_comparing_tells_a_change_from_chance(
     ]
 
 
-def test_of_many_tests_of_nothing_hardly_any_is_called_significant() -> None:
+def test_few_of_many_tests_under_the_null_hypothesis_are_significant() -> None:
     rng = np.random.default_rng(5)
     assert significant(rng.uniform(size=100_000)).mean() < 1e-3
     mixed = np.concatenate([rng.uniform(size=90_000), rng.uniform(0, 1e-5, 10_000)])
     found = significant(mixed)
     assert found[90_000:].mean() > 0.99
     assert found[:90_000].sum() < 0.08 * found.sum()
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10_000), n=st.integers(0, 300), scale=st.sampled_from([1.0, 0.1, 0.01]))
+def test_significance_is_benjamini_and_hochbergs_step_up_rule(seed: int, n: int, scale: float) -> None:
+    """All p-values up to the largest with p_(k) <= level * k / n; NaN never, and not counted in n."""
+    rng = np.random.default_rng(seed)
+    p_value = np.where(rng.uniform(size=n) < 0.5, rng.uniform(size=n), rng.uniform(0, scale, n))
+    p_value[rng.uniform(size=n) < 0.1] = np.nan
+    ranked = np.sort(p_value[np.isfinite(p_value)])
+    below = np.flatnonzero(ranked <= FDR_LEVEL * np.arange(1, ranked.size + 1) / max(ranked.size, 1))
+    limit = ranked[below[-1]] if below.size else -1.0
+    assert significant(p_value).tolist() == (np.nan_to_num(p_value, nan=2.0) <= limit).tolist()
 
 
 @pytest.mark.parametrize("text", ["4s", "2-5,7-9"])
@@ -171,7 +186,7 @@ def test_slices_of_time_add_up_to_the_whole(
         ("0s", "no length"),
     ],
 )
-def test_slices_that_make_no_sense_are_refused(text: str, complaint: str) -> None:
+def test_invalid_slices_are_refused(text: str, complaint: str) -> None:
     with pytest.raises(InputError, match=complaint):
         parse_time_intervals(text, 0.0, 60.0)
 
@@ -183,7 +198,7 @@ def test_time_of_day_is_that_of_the_flights_day() -> None:
 
 
 def test_both_weights_are_kept_and_named(whole: Path) -> None:
-    """By passage every vehicle counts alike; by time those that stay count for longer, so that speeds are lower."""
+    """By track every vehicle has the same weight; by time slow ones have more, so that speeds are lower."""
     run = open_run(whole)
     by_passage, time_weighted = run.field, run.field_time_weighted
     passing, watched = by_passage.statistics(), time_weighted.statistics()

@@ -1,4 +1,4 @@
-"""90 % intervals of a pixel cover what endless traffic would show, and know what they do not know."""
+"""Coverage of the 90 % intervals of a pixel, and their widths."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ GSD_M = 0.23
 CONFIG = FieldConfig()
 BINS = VelocityBins.from_config(CONFIG, GSD_M)
 RADIUS = band_radius_px(CONFIG, GSD_M)
-STANDING = stationary_speed_px_per_s(CONFIG, GSD_M)
+STATIONARY_SPEED = stationary_speed_px_per_s(CONFIG, GSD_M)
 SECTION_M = 40.0
 REPEATS = 10
 
@@ -26,10 +26,10 @@ REPEATS = 10
 def passing(
     speed_m_per_s: np.ndarray, direction_rad: np.ndarray, *, sd_m_per_s: float = 0.0
 ) -> tuple[FieldTile, TileStatistics]:
-    """One pixel that vehicles pass at these velocities, each measured with a standard deviation."""
+    """One pixel with a track at each of these velocities, measured with a standard deviation."""
     n = len(speed_m_per_s)
     out = np.zeros(n, SEGMENT_DTYPE)
-    out["passage"], out["duration_s"], out["sd_px_per_s"] = np.arange(n), 0.2, sd_m_per_s / GSD_M
+    out["track"], out["duration_s"], out["sd_px_per_s"] = np.arange(n), 0.2, sd_m_per_s / GSD_M
     out["vx_px_per_s"] = speed_m_per_s * np.cos(direction_rad) / GSD_M
     out["vy_px_per_s"] = speed_m_per_s * np.sin(direction_rad) / GSD_M
     for axis in "xy":
@@ -40,11 +40,11 @@ def passing(
 def tile_of(segments: Segments, x: int, y: int) -> tuple[FieldTile, TileStatistics]:
     """One pixel's tile and its statistics."""
     tile = accumulate_tile(segments, origin_xy=(x, y), shape=(1, 1), bins=BINS, radius_px=RADIUS)
-    return tile, tile_statistics(tile.histogram, tile.count, tile.noise, bins=BINS, stationary_speed_px_per_s=STANDING)
+    return tile, tile_statistics(*tile[:2], tile.variance_sum, bins=BINS, stationary_speed_px_per_s=STATIONARY_SPEED)
 
 
 def width_m_per_s(statistics: TileStatistics) -> float:
-    """Of the median speed's interval."""
+    """Width of the median speed's interval, m/s."""
     return float((statistics.median_speed_high_px_per_s - statistics.median_speed_low_px_per_s)[0, 0] * GSD_M)
 
 
@@ -53,7 +53,7 @@ def drivers(n: int, seed: int = 0, sd: float = 1.4) -> tuple[np.ndarray, np.ndar
     return rng.normal(14, sd, n), rng.normal(0.3, 0.01, n)
 
 
-def test_more_passages_make_narrower_intervals() -> None:
+def test_more_tracks_make_narrower_intervals() -> None:
     widths = [np.median([width_m_per_s(passing(*drivers(n, seed))[1]) for seed in range(9)]) for n in (3, 10, 40, 160)]
     assert widths[1] > 1.1 * widths[2] > 1.3 * widths[3]
     assert widths[0] > 2.5 * widths[3]
@@ -61,26 +61,26 @@ def test_more_passages_make_narrower_intervals() -> None:
     assert halves[0] > 1.5 * halves[1]
 
 
-def test_noise_of_the_measurement_widens_the_intervals_of_few_passages() -> None:
-    """Two vehicles that happen to be seen at one speed: whether that is luck, the noise of either tells."""
+def test_measurement_variance_widens_the_intervals_of_few_tracks() -> None:
+    """Two vehicles measured at one speed: the interval is as wide as the measurement error of either."""
     speed, direction = np.full(2, 14.0), np.full(2, 0.3)
-    sharp, vague = (passing(speed, direction, sd_m_per_s=sd) for sd in (0.05, 2.0))
-    assert vague[0].noise[0, 0] == pytest.approx(2 * (2.0 / 2.0) ** 2 * 4096, rel=0.01)
-    assert width_m_per_s(vague[1]) > 1.5 * width_m_per_s(sharp[1])
-    assert vague[1].direction_half_width_rad[0, 0] > 3 * sharp[1].direction_half_width_rad[0, 0]
+    precise, noisy = (passing(speed, direction, sd_m_per_s=sd) for sd in (0.05, 2.0))
+    assert noisy[0].variance_sum[0, 0] == pytest.approx(2 * (2.0 / 2.0) ** 2 * 4096, rel=0.01)
+    assert width_m_per_s(noisy[1]) > 1.5 * width_m_per_s(precise[1])
+    assert noisy[1].direction_half_width_rad[0, 0] > 3 * precise[1].direction_half_width_rad[0, 0]
 
 
-def test_some_stand_and_some_pass_the_median_may_be_either() -> None:
+def test_the_median_of_half_stationary_traffic_may_be_either_speed() -> None:
     speed = np.array([0.0] * 6 + [14.0] * 6)
     _, s = passing(speed, np.zeros(12))
     assert s.median_speed_low_px_per_s[0, 0] * GSD_M < 1.5
     assert s.median_speed_high_px_per_s[0, 0] * GSD_M > 13.0
 
 
-def test_what_stands_has_no_direction_and_an_empty_pixel_no_interval() -> None:
-    _, standing = passing(np.zeros(4), np.zeros(4))
-    assert np.isnan(standing.direction_half_width_rad[0, 0])
-    assert standing.median_speed_low_px_per_s[0, 0] * GSD_M < 1.0
+def test_stationary_traffic_has_no_direction_and_an_empty_pixel_no_interval() -> None:
+    _, stationary = passing(np.zeros(4), np.zeros(4))
+    assert np.isnan(stationary.direction_half_width_rad[0, 0])
+    assert stationary.median_speed_low_px_per_s[0, 0] * GSD_M < 1.0
     _, empty = tile_of(np.zeros(0, SEGMENT_DTYPE), 0, 0)
     assert np.isnan(empty.median_speed_low_px_per_s[0, 0])
 
@@ -91,8 +91,8 @@ def sections(flight: Flight) -> list[tuple[int, int]]:
     for edge in flight.city.plan.network.edges:
         along = np.concatenate([[0.0], np.hypot(*np.diff(edge.path, axis=0).T).cumsum()])
         for s in np.arange(min(SECTION_M, along[-1]) / 2, along[-1], SECTION_M):
-            place = np.array([[np.interp(s, along, edge.path[:, k]) for k in (0, 1)]])
-            x, y = np.rint(flight.city.to_px(place)[0]).astype(int)
+            position = np.array([[np.interp(s, along, edge.path[:, k]) for k in (0, 1)]])
+            x, y = np.rint(flight.city.to_px(position)[0]).astype(int)
             if 20 < x < flight.base_shape[1] - 20 and 20 < y < flight.base_shape[0] - 20:
                 found.append((int(x), int(y)))
     return found
@@ -123,15 +123,15 @@ def covered(seed: int) -> np.ndarray:
     """(sections, 2) whether the intervals of one flight cover the truth: median speed, modal direction (NaN: none)."""
     flight = Flight(SimulationConfig(seed=seed, frames=300, width=640, height=480))
     seen = segments_of(flight, flight.city.traffic, seed)
-    repeats = []
+    design_effect = []
     for k in range(REPEATS):  # the same hour of other days
         rng = np.random.default_rng(1000 * seed + k)
         duration_s = float(flight.times_s[-1]) + 1
         other = simulate_traffic(flight.city.plan.network, flight.config.traffic, duration_s=duration_s, rng=rng)
         part = segments_of(flight, other, k, errors=NO_ERRORS)
-        part["passage"] += k << 40
-        repeats.append(part)
-    truth = np.concatenate(repeats)
+        part["track"] += k << 40
+        design_effect.append(part)
+    truth = np.concatenate(design_effect)
     rows = []
     for x, y in sections(flight):
         tile, s = tile_of(near(seen, x, y), x, y)
@@ -142,9 +142,9 @@ def covered(seed: int) -> np.ndarray:
         low, high = s.median_speed_low_px_per_s[0, 0], s.median_speed_high_px_per_s[0, 0]
         mode = modal_velocity(long.histogram, long.count, bins=BINS)[0, 0]
         found, half = s.modal_velocity_px_per_s[0, 0], s.direction_half_width_rad[0, 0]
-        turn = abs(np.angle(np.exp(1j * (np.arctan2(*found[::-1]) - np.arctan2(*mode[::-1])))))
-        moves = np.isfinite(half) and np.hypot(*mode) > STANDING
-        rows.append((float(low <= median <= high), float(turn <= half) if moves else np.nan))
+        error = abs(np.angle(np.exp(1j * (np.arctan2(*found[::-1]) - np.arctan2(*mode[::-1])))))
+        moves = np.isfinite(half) and np.hypot(*mode) > STATIONARY_SPEED
+        rows.append((float(low <= median <= high), float(error <= half) if moves else np.nan))
     return np.array(rows)
 
 

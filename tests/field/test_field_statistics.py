@@ -13,9 +13,9 @@ BINS = VelocityBins(width_px_per_s=2 / GSD_M, reach=18, kernel_sigma_px_per_s=0.
 
 
 def drive(velocities: np.ndarray, y0: float = 50.0) -> Segments:
-    """One passage a velocity (px/s) through (80, y0), half a second long, of one segment."""
+    """One track a velocity (px/s) through (80, y0), half a second long, of one segment."""
     out = np.zeros(len(velocities), SEGMENT_DTYPE)
-    out["passage"], out["duration_s"] = np.arange(len(velocities)), 0.5
+    out["track"], out["duration_s"] = np.arange(len(velocities)), 0.5
     out["vx_px_per_s"], out["vy_px_per_s"] = velocities[:, 0], velocities[:, 1]
     for axis, centre in (("x", 80.0), ("y", y0)):
         out[f"{axis}0_px"] = centre - out[f"v{axis}_px_per_s"] * 0.25
@@ -34,7 +34,7 @@ def polar(speed_m_per_s: np.ndarray, direction_deg: np.ndarray) -> np.ndarray:
     return np.column_stack([np.cos(angle), np.sin(angle)]) * np.asarray(speed_m_per_s)[..., None] / GSD_M
 
 
-def test_peak_is_refined_below_the_bin() -> None:
+def test_modes_have_sub_bin_accuracy() -> None:
     """At any speed and direction: bins of 2 m/s alone would be 1 m/s and 5 degrees off."""
     rng = np.random.default_rng(0)
     for speed, direction in zip(rng.uniform(3, 30, 40), rng.uniform(-180, 180, 40), strict=True):
@@ -56,13 +56,13 @@ def test_mode_of_many_is_their_most_frequent_velocity() -> None:
 def test_percentiles_are_those_of_the_speeds() -> None:
     speeds = np.random.default_rng(2).normal(12, 2.5, 400)
     found = field(drive(polar(speeds, np.full(400, 75.0)))).at(80, 50)
-    for share, value in found.percentiles_px_per_s.items():
-        assert value * GSD_M == pytest.approx(np.percentile(speeds, share), abs=0.35)
+    for percent, value in found.percentiles_px_per_s.items():
+        assert value * GSD_M == pytest.approx(np.percentile(speeds, percent), abs=0.35)
     median_se = 1.2533 * 2.5 / np.sqrt(400)
     assert found.speed_se_px_per_s * GSD_M == pytest.approx(median_se, rel=0.35)
 
 
-def test_two_directions_are_two_modes_with_their_shares() -> None:
+def test_two_directions_are_two_modes_with_their_weights() -> None:
     velocities = np.vstack([polar(np.full(30, 12.0), np.full(30, 0.0)), polar(np.full(10, 9.0), np.full(10, 90.0))])
     modes = field(drive(velocities)).at(80, 50).modes
     assert len(modes) == 2
@@ -70,16 +70,16 @@ def test_two_directions_are_two_modes_with_their_shares() -> None:
     np.testing.assert_allclose(modes[:, :2] * GSD_M, [[12, 0], [0, 9]], atol=0.15)
 
 
-def test_spread_of_direction_and_entropy() -> None:
-    same = field(drive(polar(np.full(8, 12.0), np.zeros(8)))).at(80, 50)
-    every = field(drive(polar(np.full(8, 12.0), np.arange(8) * 45.0))).at(80, 50)
-    assert same.circular_variance < 0.01
-    assert every.circular_variance > 0.99
-    assert every.entropy_nats > same.entropy_nats + 1.5
+def test_circular_variance_and_entropy() -> None:
+    one_direction = field(drive(polar(np.full(8, 12.0), np.zeros(8)))).at(80, 50)
+    all_directions = field(drive(polar(np.full(8, 12.0), np.arange(8) * 45.0))).at(80, 50)
+    assert one_direction.circular_variance < 0.01
+    assert all_directions.circular_variance > 0.99
+    assert all_directions.entropy_nats > one_direction.entropy_nats + 1.5
     assert np.isnan(field(drive(np.zeros((3, 2)))).at(80, 50).circular_variance)
 
 
-def test_maps_are_empty_where_nothing_passed_and_standing_has_no_direction() -> None:
+def test_maps_are_empty_without_tracks_and_stationary_pixels_have_no_direction() -> None:
     segments = drive(np.array([[48.0, 0.0], [0.0, 0.0]]))
     segments["x0_px"][1] = segments["x1_px"][1] = 20.0
     map_ = field(segments)
@@ -110,7 +110,7 @@ def test_a_pixel_that_is_not_on_the_map_is_refused() -> None:
         field(drive(np.array([[48.0, 0.0]]))).at(160, 0)
 
 
-def test_an_empty_map_answers() -> None:
+def test_queries_on_an_empty_map() -> None:
     empty = field(drive(np.array([[48.0, 0.0]]))[:0])
     assert np.isnan(empty.modal_velocity()).all()
     assert empty.at(3, 3).n == 0
@@ -122,35 +122,37 @@ def test_an_empty_map_answers() -> None:
 )
 def test_density_integrates_to_one(place: tuple[float, float]) -> None:
     map_ = field(drive(polar(np.array([8.0, 12.0]), np.array([10.0, 15.0]))))
-    axis = np.arange(-110.0, 110.5, 1.0) / GSD_M  # standing still is a peak half a m/s wide
+    axis = np.arange(-110.0, 110.5, 1.0) / GSD_M  # the peak at zero velocity is half a m/s wide
     v = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     density = np.exp(map_.log_density(np.tile(place, (len(v), 1)), v))
     assert density.sum() / GSD_M**2 == pytest.approx(1, abs=0.01)
 
 
-def test_density_prefers_what_was_seen_here_and_never_says_impossible() -> None:
+def test_density_is_highest_for_velocities_of_the_pixel_and_never_zero() -> None:
     north = drive(polar(np.full(20, 12.0), np.full(20, -90.0)), y0=30.0)
     map_ = field(np.concatenate([drive(polar(np.full(20, 12.0), np.zeros(20)), y0=70.0), north]))
     xy = np.array([[80.0, 70.0]] * 4)
     v = np.array([[48.0, 0.0], [0.0, -48.0], [-48.0, 0.0], [900.0, 0.0]])
-    usual, seen_elsewhere, never, absurd = map_.log_density(xy, v)
-    assert usual > seen_elsewhere > never > absurd
+    here, elsewhere, nowhere, absurd = map_.log_density(xy, v)
+    assert here > elsewhere > nowhere > absurd
     assert np.isfinite(absurd)
     assert np.isnan(map_.log_density(xy[:1], np.array([[np.nan, 0.0]]))).all()
 
 
-def test_held_out_passages_are_likelier_than_under_one_density_for_the_map() -> None:
-    """Two opposed lanes, learnt from 12 passages each: at least 0.7 nats a passage better."""
+def test_held_out_tracks_are_likelier_than_under_one_density_for_the_map() -> None:
+    """Two opposed lanes of 12 tracks each: at least 0.6 nats a track better."""
     rng = np.random.default_rng(5)
 
     def lanes(n: int) -> Segments:
         there = drive(polar(rng.normal(13, 2, n), rng.normal(0, 2, n)), y0=40.0)
         back = drive(polar(rng.normal(11, 2, n), rng.normal(180, 2, n)), y0=60.0)
-        back["passage"] += n
+        back["track"] += n
         return np.concatenate([there, back])
 
     map_, test = field(lanes(12)), lanes(100)
     places = np.column_stack([np.full(200, 80.0), np.repeat([40.0, 60.0], 100)])
     v = np.column_stack([test["vx_px_per_s"], test["vy_px_per_s"]])
-    here, anywhere = map_.log_density(places, v), map_.log_density(np.full((200, 2), -1000.0), v)
-    assert (here - anywhere).mean() > 0.6  # two lanes: log 2 is all that can be gained, less what 12 passages cost
+    by_pixel, by_map = map_.log_density(places, v), map_.log_density(np.full((200, 2), -1000.0), v)
+    assert (
+        by_pixel - by_map
+    ).mean() > 0.6  # two lanes: the gain is at most log 2, less the estimation error of 12 tracks

@@ -1,4 +1,4 @@
-"""The field as a prior: a gate for another tracker, a judge of tracks, and how well it foretells the next passage."""
+"""The field as a prior: gates for another tracker, anomaly scores of tracks, and held-out log-likelihood."""
 
 import importlib.util
 from pathlib import Path
@@ -10,7 +10,7 @@ from schemas.flight import FieldConfig
 from tests.field.test_field_statistics import GSD_M, drive, field, polar
 from tests.field_runs import flight, traffic_tracklets
 from velfield.errors import InputError
-from velfield.field.heldout import foretell
+from velfield.field.heldout import heldout_log_likelihood
 from velfield.field.segments import segment_table
 from velfield.field.view import VelocityField
 
@@ -24,7 +24,7 @@ def one_way() -> VelocityField:
     return field(drive(polar(rng.normal(13, 1.5, 30), rng.normal(0, 3, 30))))
 
 
-def test_a_gate_lets_the_usual_pass_and_the_wrong_way_not(one_way: VelocityField) -> None:
+def test_a_gate_accepts_usual_velocities_and_rejects_the_wrong_way(one_way: VelocityField) -> None:
     gate = one_way.gate(np.array([80.0, 50.0]))
     ways = polar(np.array([13.0, 10.0, 13.0, 13.0, 0.0]), np.array([0.0, 2.0, 180.0, 40.0, 0.0]))
     assert gate.accepts(ways).tolist() == [True, True, False, False, False]
@@ -32,8 +32,8 @@ def test_a_gate_lets_the_usual_pass_and_the_wrong_way_not(one_way: VelocityField
     assert np.sqrt(gate.covariance[0, 0]) * GSD_M == pytest.approx(2.3, abs=1.2)
 
 
-def test_a_gate_is_honest_where_nothing_is_known_or_the_place_is_not(one_way: VelocityField) -> None:
-    """There it lets all pass that drives anywhere, and more the less sure the place is."""
+def test_a_gate_is_wider_where_the_field_is_empty_or_the_position_uncertain(one_way: VelocityField) -> None:
+    """In an empty region it accepts what drives anywhere on the map; with the position's covariance it grows."""
     across = polar(np.array([13.0]), np.array([0.0]))
     nowhere = one_way.gate(np.array([20.0, 10.0]))
     assert nowhere.accepts(across)[0]
@@ -46,44 +46,46 @@ def test_a_gate_is_honest_where_nothing_is_known_or_the_place_is_not(one_way: Ve
     assert sizes[1] >= sizes[0]
 
 
-def test_a_share_of_the_vehicles_passes_as_asked(one_way: VelocityField) -> None:
+def test_a_gate_accepts_the_fraction_of_its_coverage(one_way: VelocityField) -> None:
     rng = np.random.default_rng(8)
     others = polar(rng.normal(13, 1.5, 400), rng.normal(0, 3, 400))
-    passed = [one_way.gate(np.array([80.0, 50.0]), share=share).accepts(others).mean() for share in (0.6, 0.99)]
+    passed = [
+        one_way.gate(np.array([80.0, 50.0]), coverage=coverage).accepts(others).mean() for coverage in (0.6, 0.99)
+    ]
     assert passed[0] < 0.95 < passed[1]
 
 
-def test_where_all_stand_the_density_is_finite_and_standing_the_likeliest() -> None:
-    still = field(drive(np.zeros((5, 2))))
+def test_where_all_are_stationary_the_density_is_finite_and_highest_at_zero() -> None:
+    stationary = field(drive(np.zeros((5, 2))))
     where = np.full((2, 2), [80.0, 50.0])
-    stands, drives = still.log_density(where, np.array([[0.0, 0.0], [40.0, 0.0]]))
+    stands, drives = stationary.log_density(where, np.array([[0.0, 0.0], [40.0, 0.0]]))
     assert np.isfinite([stands, drives]).all()
     assert stands > drives + 3
-    assert still.gate(where[0]).accepts(np.zeros((1, 2)))[0]
+    assert stationary.gate(where[0]).accepts(np.zeros((1, 2)))[0]
 
 
-def test_a_queue_is_reckoned_with_where_none_has_stood_but_is_not_usual_there(one_way: VelocityField) -> None:
-    place, stands, wrong_way = np.array([[80.0, 50.0]]), np.zeros((1, 2)), polar(np.array([13.0]), np.array([180.0]))
-    assert one_way.log_density(place, stands)[0] > one_way.log_density(place, wrong_way)[0] + 1.0
-    gate = one_way.gate(place[0])
-    assert one_way.log_density(place, stands)[0] > gate.log_density(stands)[0] + 1.0
+def test_stopping_is_possible_but_anomalous_where_none_has_stopped(one_way: VelocityField) -> None:
+    where, at_rest, wrong_way = np.array([[80.0, 50.0]]), np.zeros((1, 2)), polar(np.array([13.0]), np.array([180.0]))
+    assert one_way.log_density(where, at_rest)[0] > one_way.log_density(where, wrong_way)[0] + 1.0
+    gate = one_way.gate(where[0])
+    assert one_way.log_density(where, at_rest)[0] > gate.log_density(at_rest)[0] + 1.0
     times_s = np.array([0.0, 0.2, 0.4])
-    assert one_way.anomaly(times_s, np.repeat(place, 3, axis=0)) > 3.0
+    assert one_way.anomaly(times_s, np.repeat(where, 3, axis=0)) > 3.0
 
 
-def test_a_gate_of_no_place_is_refused(one_way: VelocityField) -> None:
-    with pytest.raises(InputError, match="finite place"):
+def test_invalid_positions_and_covariances_are_refused(one_way: VelocityField) -> None:
+    with pytest.raises(InputError, match="finite position"):
         one_way.gate(np.array([np.nan, 3.0]))
     for covariance in (np.eye(3), -np.eye(2), np.array([[1.0, 2.0], [0.0, 1.0]])):
         with pytest.raises(InputError, match="covariance"):
             one_way.gate(np.array([80.0, 50.0]), covariance)
-    line = np.outer([3.0, 0.1], [3.0, 0.1])  # known across a lane, and rounded to a hair less than nothing
+    line = np.outer([3.0, 0.1], [3.0, 0.1])  # of rank one, an eigenvalue rounded to slightly below zero
     assert np.isfinite(one_way.gate(np.array([80.0, 50.0]), line).mean_px_per_s).all()
-    with pytest.raises(InputError, match="rising times"):
+    with pytest.raises(InputError, match="ascending times"):
         one_way.anomaly(np.array([0.0, 0.0]), np.zeros((2, 2)))
 
 
-def test_a_wrong_way_driver_is_an_anomaly_and_the_usual_one_is_not(one_way: VelocityField) -> None:
+def test_a_wrong_way_driver_is_anomalous_and_a_usual_one_is_not(one_way: VelocityField) -> None:
     times_s = np.array([0.0, 0.2, 0.4])
     along = np.column_stack([80 + np.array([-10.0, 0.0, 10.0]), np.full(3, 50.0)])
     assert one_way.anomaly(times_s, along) < 1.0
@@ -92,11 +94,11 @@ def test_a_wrong_way_driver_is_an_anomaly_and_the_usual_one_is_not(one_way: Velo
     assert one_way.anomaly(times_s, unknown[::-1]) < one_way.anomaly(times_s, along[::-1])
 
 
-def test_the_field_foretells_held_out_passages_better_than_simpler_models() -> None:
-    """Nats a passage: against one distribution for all of the map, and against a Gaussian a pixel."""
+def test_the_field_has_a_higher_held_out_likelihood_than_simpler_models() -> None:
+    """Nats a track: against one distribution for the whole map, and against a Gaussian a pixel."""
     table = segment_table(traffic_tracklets(6, 150), FieldConfig())
-    result = foretell(table, FieldConfig(), gsd_m=CITY_GSD_M, shape=flight(6, 150).base_shape)
-    assert result.passages > 20
+    result = heldout_log_likelihood(table, FieldConfig(), gsd_m=CITY_GSD_M, shape=flight(6, 150).base_shape)
+    assert result.tracks > 20
     assert result.field - result.whole_map > 0.7
     assert result.field - result.gaussian > 0.0
 

@@ -79,7 +79,7 @@ def test_a_click_shows_what_python_says(page: Page, address: str, run: Run) -> N
     vx, vy = here.modal_velocity_px_per_s
     assert told(page, "direction") == pytest.approx(np.arctan2(vy, vx), abs=1e-5)
     assert told(page, "modal_speed") == pytest.approx(np.hypot(vx, vy), rel=1e-5)
-    assert told(page, "standing_share") == pytest.approx(here.standing_share, abs=1e-6)
+    assert told(page, "standing_share") == pytest.approx(here.stationary_fraction, abs=1e-6)
     for percent, speed in here.percentiles_px_per_s.items():
         assert told(page, f"speed_p{percent}") == pytest.approx(speed, rel=1e-5)
         shown = page.value(f"document.querySelector('#answer [data-name=speed_p{percent}]').textContent")

@@ -68,7 +68,7 @@ def test_the_record_lists_what_is_stored(whole: tuple[Path, RunSummary]) -> None
     assert (record.height_px, record.width_px) == run.field.shape
     assert record.gsd_m == 0.23
     assert run.record.config.field.lane_width_m / 4 / 0.23 == pytest.approx(record.segments.reach_px)
-    assert record.segments.passages == len(np.unique(run.segments()["passage"]))
+    assert record.segments.passages == len(np.unique(run.segments()["track"]))
     for name, array in record.arrays.items():
         chunks = layout.root / array.store / name / "c"
         listed = set(zip(array.stored[::2], array.stored[1::2], strict=True))

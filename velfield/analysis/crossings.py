@@ -46,11 +46,11 @@ def line_crossings(
     share = np.divide(before, before - after, out=np.zeros(len(segments)), where=crosses)
     place = place + share * (place_after - place)
     rows = np.flatnonzero(crosses & (place >= 0) & (place <= 1))
-    kept = np.array(list(_settled(segments["passage"], after, rows, settle_px)), np.int64)
+    kept = np.array(list(_settled(segments["track"], after, rows, settle_px)), np.int64)
     found, part = segments[kept], share[kept]
     return pd.DataFrame(
         {
-            "passage": found["passage"],
+            "passage": found["track"],
             "time_s": found["start_s"] + part * found["duration_s"],
             "x_px": found["x0_px"] + part * (found["x1_px"] - found["x0_px"]),
             "y_px": found["y0_px"] + part * (found["y1_px"] - found["y0_px"]),

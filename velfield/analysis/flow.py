@@ -10,7 +10,7 @@ from velfield.analysis.regions import label_mask, region_table
 
 
 def stopping_places(
-    standing_share: NDArray[np.floating],
+    stationary_fraction: NDArray[np.floating],
     count: NDArray[np.integer],
     *,
     min_share: float = 0.2,
@@ -22,7 +22,7 @@ def stopping_places(
 
     Parameters
     ----------
-    standing_share
+    stationary_fraction
         (h, w) share of passages that stand.
     count
         (h, w) passages.
@@ -32,9 +32,9 @@ def stopping_places(
     labels
         (h, w) number of the place, 0 where there is none.
     table
-        A row each: ``region, x_px, y_px, area_px, passages, standing_share``, the busiest first.
+        A row each: ``region, x_px, y_px, area_px, passages, stationary_fraction``, the busiest first.
     """
-    share = np.nan_to_num(np.asarray(standing_share, np.float64))
+    share = np.nan_to_num(np.asarray(stationary_fraction, np.float64))
     mask = (count >= min_count) & (share >= min_share) & (share <= max_share)
     labels = label_mask(mask, min_area_px=min_area_px)
     table = region_table(labels, {"passages": np.asarray(count, np.float64), "standing_share": share})

@@ -40,7 +40,7 @@ def u_turns(
     moving = segments[np.hypot(segments["vx_px_per_s"], segments["vy_px_per_s"]) > stationary_speed_px_per_s]
     if not len(moving):
         return pd.DataFrame(columns=U_TURN_COLUMNS)
-    borders = np.flatnonzero(np.diff(moving["passage"])) + 1
+    borders = np.flatnonzero(np.diff(moving["track"])) + 1
     rows = [_sharpest_turn(part, max_path_px) for part in np.split(moving, borders) if len(part) >= 3]
     table = pd.DataFrame(rows, columns=U_TURN_COLUMNS)
     return table[table["turn_rad"].abs() >= min_turn_rad].reset_index(drop=True)
@@ -57,7 +57,7 @@ def _sharpest_turn(passage: Segments, max_path_px: float) -> tuple[int, float, f
     i, j = np.unravel_index(int(np.abs(turn).argmax()), turn.shape)
     middle = int(np.argmin(np.abs(direction - (direction[i] + direction[j]) / 2)[i : j + 1])) + int(i)
     return (
-        int(passage["passage"][0]),
+        int(passage["track"][0]),
         float(passage["start_s"][middle]),
         float(x[middle]),
         float(y[middle]),

@@ -1,4 +1,4 @@
-"""Kernel and bins of the field by the likelihood of passages held out."""
+"""Kernel and bins of the field by the held-out log-likelihood."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 from schemas.flight import FieldConfig
 from schemas.simulation import SimulationConfig
 from velfield.errors import InputError
-from velfield.field.heldout import foretell
+from velfield.field.heldout import heldout_log_likelihood
 from velfield.field.segments import Segments, segment_table
 from velfield.run.run import open_run
 from velfield.synthetic.flight import Flight
@@ -20,7 +20,7 @@ _SIZE_PX = (640, 480)
 def sweep(
     run_folder: Path | None, *, seed: int, frames: int, sigmas: Sequence[float], widths: Sequence[float]
 ) -> Iterator[str]:
-    """A line a combination: nats a held-out passage by the field, by one distribution, by a Gaussian a pixel.
+    """A line a combination: nats a held-out track by the field, by one distribution, by a Gaussian a pixel.
 
     Raises
     ------
@@ -28,13 +28,13 @@ def sweep(
         The run knows no metres.
     """
     segments, gsd_m, shape = _simulated(seed, frames) if run_folder is None else _of_run(run_folder)
-    yield "log density per (m/s)^2 of a held-out passage, nats"
-    yield f"{'bin m/s':>8} {'kernel':>7} {'field':>8} {'map':>8} {'gaussian':>9} {'passages':>9}"
+    yield "log density per (m/s)^2 of a held-out track, nats"
+    yield f"{'bin m/s':>8} {'kernel':>7} {'field':>8} {'map':>8} {'gaussian':>9} {'tracks':>9}"
     for width in widths:
         for sigma in sigmas:
             config = FieldConfig(bin_width_m_per_s=width, kernel_sigma_m_per_s=sigma)
-            r = foretell(segments, config, gsd_m=gsd_m, shape=shape)
-            yield f"{width:8.2f} {sigma:7.2f} {r.field:8.3f} {r.whole_map:8.3f} {r.gaussian:9.3f} {r.passages:9d}"
+            r = heldout_log_likelihood(segments, config, gsd_m=gsd_m, shape=shape)
+            yield f"{width:8.2f} {sigma:7.2f} {r.field:8.3f} {r.whole_map:8.3f} {r.gaussian:9.3f} {r.tracks:9d}"
 
 
 def _simulated(seed: int, frames: int) -> tuple[Segments, float, tuple[int, int]]:

@@ -1,6 +1,6 @@
 """Fields on one grid add and subtract, exactly: ``merge(a, subtract(b, a)) == b`` to the bit.
 
-The field of a whole is the sum of the fields of its parts as long as no passage is split between parts.
+The field of a whole is the sum of the fields of its parts as long as no track is split between parts.
 """
 
 from collections.abc import Sequence
@@ -16,12 +16,12 @@ _LARGEST = np.iinfo(np.int32).max
 
 
 def merge_tiles(tiles: Sequence[FieldTile]) -> FieldTile:
-    """The sum of tiles of one place.
+    """The sum of tiles of the same pixels.
 
     Raises
     ------
     InputError
-        Where the tiles differ in shape, or a sum does not fit 32 bits.
+        The tiles differ in shape, or a sum does not fit 32 bits.
 
     Examples
     --------
@@ -36,15 +36,14 @@ def merge_tiles(tiles: Sequence[FieldTile]) -> FieldTile:
 
 
 def subtract_tile(whole: FieldTile, part: FieldTile) -> FieldTile:
-    """What is left of ``whole`` without ``part``.
+    """The difference ``whole - part``.
 
     Raises
     ------
     InputError
-        Where the tiles differ in shape, or ``part`` holds more than ``whole``, so is no part of it.
+        The tiles differ in shape, or ``part`` exceeds ``whole``, so is no part of it.
     """
-    left = [_difference(a, b, name) for a, b, name in zip(whole, part, FieldTile._fields, strict=True)]
-    return FieldTile(*left)
+    return FieldTile(*(_difference(a, b, name) for a, b, name in zip(whole, part, FieldTile._fields, strict=True)))
 
 
 def _add(a: FieldTile, b: FieldTile) -> FieldTile:
@@ -53,10 +52,10 @@ def _add(a: FieldTile, b: FieldTile) -> FieldTile:
 
 def _sum(a: NDArray[np.int32], b: NDArray[np.int32], name: str) -> NDArray[np.int32]:
     _same_shape(a, b, name)
-    # Neither is negative, so a sum too large is one that comes out below a summand.
+    # Neither is negative, so a sum that overflows is below a summand.
     total = a + b
     if (total < a).any():
-        raise InputError(f"the sum of two fields' {name} passes {_LARGEST}, the most that int32 holds: merge fewer")
+        raise InputError(f"the sum of two fields' {name} exceeds {_LARGEST}, the maximum of int32: merge fewer")
     return total
 
 
@@ -64,7 +63,7 @@ def _difference(a: NDArray[np.int32], b: NDArray[np.int32], name: str) -> NDArra
     _same_shape(a, b, name)
     if (b > a).any():
         raise InputError(
-            f"the field to subtract holds more {name} than the whole at {int((b > a).sum())} places: "
+            f"the field to subtract holds more {name} than the whole at {int((b > a).sum())} positions: "
             "it is no part of it; subtract a field that was merged into this one"
         )
     return a - b

@@ -1,9 +1,9 @@
-"""What changed between two fields of one grid: direction, speed and volume at each pixel, and whether it is chance.
+"""Changes of direction, speed and volume at each pixel between two fields of one grid, and their significance.
 
-A change of direction or median speed is held against the 90 % intervals of both; a change of volume against the Poisson
-law of vehicles that come independently of each other, each field by the time it watched. Thousands of pixels are tested
-at once, so what is called significant is what survives Benjamini and Hochberg's rule: of those pixels at most a share
-``false_share`` is expected to be chance.
+A change of direction or median speed is tested against the 90 % intervals of both fields; a change of volume against
+Poisson arrivals at an equal rate, each field with its own observation time. As many tests are made as there are pixels,
+so the false discovery rate is controlled (Benjamini and Hochberg): of the significant pixels at most the fraction
+``FDR_LEVEL`` is expected to be false.
 """
 
 from collections.abc import Callable
@@ -12,39 +12,40 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
+from scipy.stats import false_discovery_control
 
-from schemas.arrays import FloatArray
+from schemas.arrays import FloatArray, Mask
 
 Layer = Callable[[str], NDArray[np.generic]]
-"""Gives a (y, x) layer of a field by its name."""
+"""Returns a (y, x) layer of a field by its name."""
 
 _Z90 = 1.6449
-FALSE_SHARE = 0.05
-"""Share of chance among what is called significant."""
+FDR_LEVEL = 0.05
+"""False discovery rate: expected fraction of false ones among the significant changes."""
 MIN_COUNT = 5
-"""Passages that a field must have at a pixel for its direction and speed to be compared."""
+"""Tracks that a field needs at a pixel for its direction and speed to be compared."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """How one quantity changed, after less before.
+    """Change of one quantity, after minus before.
 
     Attributes
     ----------
     change
-        (y, x); NaN where either field knows nothing.
-    chance
-        (y, x) two-sided probability of so large a change by chance; NaN where ``change`` is.
+        (y, x); NaN where either field is empty.
+    p_value
+        (y, x) two-sided; NaN where ``change`` is.
     significant
-        (y, x) whether it is taken for real.
+        (y, x) bool, at the false discovery rate `FDR_LEVEL`.
     """
 
     change: FloatArray
-    chance: FloatArray
-    significant: NDArray[np.bool_]
+    p_value: FloatArray
+    significant: Mask
 
     def summary(self) -> tuple[int, int]:
-        """Pixels compared, and of those the significant ones."""
+        """Numbers of pixels compared and of significant ones."""
         return int(np.isfinite(self.change).sum()), int(self.significant.sum())
 
 
@@ -56,21 +57,21 @@ def compare_fields(
     stationary_speed_px_per_s: float,
     min_count: int = MIN_COUNT,
 ) -> dict[str, Change]:
-    """Changes of ``direction`` (rad), ``speed`` (px/s, of the median) and ``volume`` (passages an hour).
+    """Changes of ``direction`` (rad), ``speed`` (px/s, of the median) and ``volume`` (tracks an hour).
 
     Parameters
     ----------
     before, after
         Layers of two fields on one grid, named as in ``field.zarr``.
     observed_s
-        How long each field watched, s.
+        Observation time of each field, s.
     stationary_speed_px_per_s
         A modal speed below this has no direction.
     min_count
-        Passages that either field must have for its direction and speed to be compared: of fewer, another turn taken
-        looks like another direction of all.
+        Tracks that both fields need for direction and speed to be compared: with fewer, one vehicle that turns off is a
+        change of direction.
     """
-    enough = np.minimum(_numbers(before, "count"), _numbers(after, "count")) >= min_count
+    enough = np.minimum(_float_layer(before, "count"), _float_layer(after, "count")) >= min_count
     return {
         "direction": _direction(before, after, stationary_speed_px_per_s, enough),
         "speed": _speed(before, after, enough),
@@ -78,70 +79,68 @@ def compare_fields(
     }
 
 
-def significant(chance: FloatArray, false_share: float = FALSE_SHARE) -> NDArray[np.bool_]:
-    """Benjamini and Hochberg's rule: which of many tests hold, NaN never.
+def significant(p_value: FloatArray, fdr_level: float = FDR_LEVEL) -> Mask:
+    """Which of many tests are significant at a false discovery rate (Benjamini and Hochberg, 1995); NaN never.
 
     Examples
     --------
     >>> significant(np.array([0.001, 0.9, 0.02, np.nan, 0.8])).tolist()
     [True, False, True, False, False]
     """
-    known = np.sort(chance[np.isfinite(chance)])
-    if not known.size:
-        return np.zeros(chance.shape, bool)
-    below = np.flatnonzero(known <= false_share * np.arange(1, known.size + 1) / known.size)
-    limit = known[below[-1]] if below.size else -1.0
-    return np.asarray(np.nan_to_num(chance, nan=2.0) <= limit)
+    out = np.zeros(p_value.shape, np.bool_)
+    known = np.isfinite(p_value)
+    out[known] = false_discovery_control(p_value[known]) <= fdr_level
+    return out
 
 
-def _change(change: FloatArray, chance: FloatArray) -> Change:
-    chance = np.where(np.isfinite(change), chance, np.nan)
-    return Change(np.where(np.isfinite(chance), change, np.nan), chance, significant(chance))
+def _change(change: FloatArray, p_value: FloatArray) -> Change:
+    p_value = np.where(np.isfinite(change), p_value, np.nan)
+    return Change(np.where(np.isfinite(p_value), change, np.nan), p_value, significant(p_value))
 
 
 def _two_sided(z: FloatArray) -> FloatArray:
     return np.asarray(2.0 * ndtr(-np.abs(z)), np.float64)
 
 
-def _numbers(layer: Layer, name: str) -> FloatArray:
+def _float_layer(layer: Layer, name: str) -> FloatArray:
     return np.asarray(layer(name), np.float64)
 
 
-def _direction(before: Layer, after: Layer, stationary_speed_px_per_s: float, enough: NDArray[np.bool_]) -> Change:
+def _direction(before: Layer, after: Layer, stationary_speed_px_per_s: float, enough: Mask) -> Change:
     angle, half = [], []
     for layer in (before, after):
-        vx, vy = _numbers(layer, "modal_vx"), _numbers(layer, "modal_vy")
+        vx, vy = _float_layer(layer, "modal_vx"), _float_layer(layer, "modal_vy")
         moves = np.hypot(vx, vy) > stationary_speed_px_per_s
         angle.append(np.where(moves, np.arctan2(vy, vx), np.nan))
-        half.append(_numbers(layer, "direction_half90"))
-    turn = np.where(enough, np.angle(np.exp(1j * (angle[1] - angle[0]))), np.nan)
-    return _change(turn, _two_sided(turn * _Z90 / np.hypot(half[0], half[1])))
+        half.append(_float_layer(layer, "direction_half90"))
+    change = np.where(enough, np.angle(np.exp(1j * (angle[1] - angle[0]))), np.nan)
+    return _change(change, _two_sided(change * _Z90 / np.hypot(half[0], half[1])))
 
 
-def _speed(before: Layer, after: Layer, enough: NDArray[np.bool_]) -> Change:
-    change = np.where(enough, _numbers(after, "speed_p50") - _numbers(before, "speed_p50"), np.nan)
-    # The ends that face each other: of the slower its upper end, of the faster its lower one.
+def _speed(before: Layer, after: Layer, enough: Mask) -> Change:
+    change = np.where(enough, _float_layer(after, "speed_p50") - _float_layer(before, "speed_p50"), np.nan)
+    # Distances to the interval ends between the two medians: the upper end of the slower, the lower end of the faster.
     up = change > 0
     slower = np.where(
         up,
-        _numbers(before, "speed_p50_high90") - _numbers(before, "speed_p50"),
-        _numbers(after, "speed_p50_high90") - _numbers(after, "speed_p50"),
+        _float_layer(before, "speed_p50_high90") - _float_layer(before, "speed_p50"),
+        _float_layer(after, "speed_p50_high90") - _float_layer(after, "speed_p50"),
     )
     faster = np.where(
         up,
-        _numbers(after, "speed_p50") - _numbers(after, "speed_p50_low90"),
-        _numbers(before, "speed_p50") - _numbers(before, "speed_p50_low90"),
+        _float_layer(after, "speed_p50") - _float_layer(after, "speed_p50_low90"),
+        _float_layer(before, "speed_p50") - _float_layer(before, "speed_p50_low90"),
     )
     return _change(change, _two_sided(change * _Z90 / np.maximum(np.hypot(slower, faster), 1e-9)))
 
 
 def _volume(before: Layer, after: Layer, observed_s: tuple[float, float]) -> Change:
-    n, m = _numbers(before, "count"), _numbers(after, "count")
+    n, m = _float_layer(before, "count"), _float_layer(after, "count")
     hours = observed_s[0] / 3600, observed_s[1] / 3600
-    seen = (n + m > 0) & (min(hours) > 0)
-    change = np.where(seen, m / max(hours[1], 1e-9) - n / max(hours[0], 1e-9), np.nan)
-    # Of n + m passages the later field should have its share by time; the normal law of that binomial.
-    share = hours[1] / max(hours[0] + hours[1], 1e-9)
-    spread = np.sqrt(np.maximum((n + m) * share * (1 - share), 1e-9))
-    off = np.maximum(np.abs(m - (n + m) * share) - 0.5, 0.0)
-    return _change(change, _two_sided(off / spread))
+    known = (n + m > 0) & (min(hours) > 0)
+    change = np.where(known, m / max(hours[1], 1e-9) - n / max(hours[0], 1e-9), np.nan)
+    # At equal rates m of n + m tracks is binomial; normal approximation with continuity correction.
+    expected = hours[1] / max(hours[0] + hours[1], 1e-9)
+    sd = np.sqrt(np.maximum((n + m) * expected * (1 - expected), 1e-9))
+    deviation = np.maximum(np.abs(m - (n + m) * expected) - 0.5, 0.0)
+    return _change(change, _two_sided(deviation / sd))

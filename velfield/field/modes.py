@@ -1,9 +1,9 @@
-"""Modes of the velocity distribution at a pixel, refined below the bin (paper: velocity field).
+"""Modes of the velocity distribution at a pixel, with sub-bin accuracy (paper: velocity field).
 
-A mode is a maximum of the histogram seen through a Gaussian window, found by mean shift from a bin that is the largest
-of its neighbours. The window narrows with the number of passages: of five vehicles each may have a bin of its own.
-Mean shift needs no fitted shape and steps nowhere, where bins of 2 m/s alone would step the direction by 10 degrees at
-12 m/s.
+A mode is a local maximum of the histogram smoothed by a Gaussian kernel, found by mean shift from each bin that is a
+local maximum. The bandwidth decreases with the number of tracks: the bins of few vehicles are sparse. Mean shift
+assumes no shape of the peak and has no discretisation, where the bins of 2 m/s alone would quantise the direction to 10
+degrees at 12 m/s.
 """
 
 from math import exp, floor
@@ -14,20 +14,21 @@ from numpy.typing import NDArray
 
 from velfield.field.bins import VelocityBins
 
-WINDOW_BINS = 2.0
-"""Standard deviation of the window for one passage, bins; for n it is n^(-1/6) times as wide (Scott's rule in 2-D)."""
-LEAST_WINDOW_BINS = 1.0
-"""The window never gets narrower."""
+BANDWIDTH_BINS = 2.0
+"""Standard deviation of the kernel for one track, bins; for n it is n^(-1/6) times that (Scott's rule in 2-D)."""
+MIN_BANDWIDTH_BINS = 1.0
+"""Lower bound of the bandwidth, bins."""
 MAX_MODES = 4
-"""Modes kept a pixel, those of the largest share first."""
+"""Modes kept a pixel, those of the largest weight."""
 _ITERATIONS = 60
-_SETTLED_BINS = 1e-3
+_CONVERGENCE_BINS = 1e-3
 _SAME_MODE_BINS = 1.0
+"""Modes nearer to each other than this are one, bins."""
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _smoothed(h: NDArray[np.int32], y: int, x: int) -> np.int64:
-    """The histogram at a bin under the binomial 3x3 window: a peak over two bins counts as one."""
+    """The histogram at a bin smoothed by a binomial 3x3 kernel, so that a peak spread over two bins is one maximum."""
     total = np.int64(0)
     for j in range(max(y - 1, 0), min(y + 2, h.shape[0])):
         for i in range(max(x - 1, 0), min(x + 2, h.shape[1])):
@@ -36,45 +37,46 @@ def _smoothed(h: NDArray[np.int32], y: int, x: int) -> np.int64:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def window_bins(passages: int) -> float:
-    return max(float(WINDOW_BINS * max(passages, 1) ** (-1.0 / 6.0)), LEAST_WINDOW_BINS)
+def bandwidth_bins(tracks: int) -> float:
+    """Bandwidth for a number of tracks, bins."""
+    return max(float(BANDWIDTH_BINS * max(tracks, 1) ** (-1.0 / 6.0)), MIN_BANDWIDTH_BINS)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _climb(h: NDArray[np.int32], y: float, x: float, window: float) -> tuple[float, float]:
-    """Mean shift from (y, x), in bins, to the maximum of the windowed histogram."""
+def _mean_shift(h: NDArray[np.int32], y: float, x: float, window: float) -> tuple[float, float]:
+    """Mean shift from (y, x), bins, to a maximum of the smoothed histogram."""
     n = h.shape[0]
     reach = 3.0 * window
-    near_x = np.empty(n)
+    kernel_x = np.empty(n)
     for _ in range(_ITERATIONS):
         total, sum_y, sum_x = 0.0, 0.0, 0.0
         first, last = max(0, floor(x - reach + 0.5)), min(n - 1, floor(x + reach + 0.5))
         for i in range(first, last + 1):
-            near_x[i] = exp(-0.5 * (i - x) ** 2 / (window * window))
+            kernel_x[i] = exp(-0.5 * (i - x) ** 2 / (window * window))
         for j in range(max(0, floor(y - reach + 0.5)), min(n - 1, floor(y + reach + 0.5)) + 1):
             row, row_x = 0.0, 0.0
             for i in range(first, last + 1):
-                w = h[j, i] * near_x[i]
+                w = h[j, i] * kernel_x[i]
                 row += w
                 row_x += w * i
             if row > 0.0:
-                near_y = exp(-0.5 * (j - y) ** 2 / (window * window))
-                total += near_y * row
-                sum_y += near_y * row * j
-                sum_x += near_y * row_x
+                kernel_y = exp(-0.5 * (j - y) ** 2 / (window * window))
+                total += kernel_y * row
+                sum_y += kernel_y * row * j
+                sum_x += kernel_y * row_x
         if total <= 0.0:
             break
         step_y, step_x = sum_y / total - y, sum_x / total - x
         y += step_y
         x += step_x
-        if abs(step_y) + abs(step_x) < _SETTLED_BINS:
+        if abs(step_y) + abs(step_x) < _CONVERGENCE_BINS:
             break
     return y, x
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _main_mode(h: NDArray[np.int32], window: float) -> tuple[float, float]:
-    """(y, x) in bins of the largest mode of a histogram that is not empty. Equal peaks: the first in raster order."""
+    """(y, x) in bins of the highest mode of a histogram that is not empty. Equal peaks: the first in raster order."""
     best, best_y, best_x = np.int64(-1), 0, 0
     for y in range(h.shape[0]):
         for x in range(h.shape[1]):
@@ -82,7 +84,7 @@ def _main_mode(h: NDArray[np.int32], window: float) -> tuple[float, float]:
                 value = _smoothed(h, y, x)
                 if value > best:
                     best, best_y, best_x = value, y, x
-    y_mode, x_mode = _climb(h, float(best_y), float(best_x), window)
+    y_mode, x_mode = _mean_shift(h, float(best_y), float(best_x), window)
     return y_mode, x_mode
 
 
@@ -94,7 +96,7 @@ def _is_peak(h: NDArray[np.int32], y: int, x: int) -> bool:
             if (j, i) == (y, x):
                 continue
             there = _smoothed(h, j, i)
-            # Of equal neighbours the first in raster order is the peak.
+            # Of equal neighbours the first in raster order is the maximum.
             if there > here or (there == here and (j, i) < (y, x)):
                 return False
     return True
@@ -102,16 +104,16 @@ def _is_peak(h: NDArray[np.int32], y: int, x: int) -> bool:
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def pixel_modes(h: NDArray[np.int32], window: float, modes: NDArray[np.float64]) -> int:
-    """Fill ``modes`` (k, 3) with (y, x, share) in bins, the largest share first; returns how many there are.
+    """Fill ``modes`` (k, 3) with (y, x, weight) in bins, the largest weight first; returns their number.
 
-    Each bin's weight goes to the nearest mode, so that the shares sum to one.
+    Each bin's weight is assigned to the nearest mode, so that the weights of all modes sum to one.
     """
     found = np.empty((64, 3), np.float64)
     n_found = 0
     for y in range(h.shape[0]):
         for x in range(h.shape[1]):
             if h[y, x] > 0 and n_found < found.shape[0] and _is_peak(h, y, x):
-                mode_y, mode_x = _climb(h, float(y), float(x), window)
+                mode_y, mode_x = _mean_shift(h, float(y), float(x), window)
                 known = False
                 for k in range(n_found):
                     if (found[k, 0] - mode_y) ** 2 + (found[k, 1] - mode_x) ** 2 < _SAME_MODE_BINS**2:
@@ -124,11 +126,11 @@ def pixel_modes(h: NDArray[np.int32], window: float, modes: NDArray[np.float64])
         for x in range(h.shape[1]):
             if h[y, x] > 0:
                 nearest = 0
-                least = np.inf
+                min_distance = np.inf
                 for k in range(n_found):
                     distance = (found[k, 0] - y) ** 2 + (found[k, 1] - x) ** 2
-                    if distance < least:
-                        least, nearest = distance, k
+                    if distance < min_distance:
+                        min_distance, nearest = distance, k
                 found[nearest, 2] += h[y, x]
                 total += h[y, x]
     order = np.argsort(-found[:n_found, 2], kind="mergesort")
@@ -144,7 +146,7 @@ def _modal_tile(histogram: NDArray[np.int32], count: NDArray[np.int32], out: NDA
     for y in range(count.shape[0]):
         for x in range(count.shape[1]):
             if count[y, x] > 0:
-                mode_y, mode_x = _main_mode(histogram[y, x], window_bins(count[y, x]))
+                mode_y, mode_x = _main_mode(histogram[y, x], bandwidth_bins(count[y, x]))
                 out[y, x, 0], out[y, x, 1] = mode_x, mode_y
 
 
@@ -154,7 +156,7 @@ def _modes_tile(histogram: NDArray[np.int32], count: NDArray[np.int32], out: NDA
     for y in range(count.shape[0]):
         for x in range(count.shape[1]):
             if count[y, x] > 0:
-                kept = pixel_modes(histogram[y, x], window_bins(count[y, x]), modes)
+                kept = pixel_modes(histogram[y, x], bandwidth_bins(count[y, x]), modes)
                 for k in range(kept):
                     out[y, x, k] = (modes[k, 1], modes[k, 0], modes[k, 2])
 
@@ -162,7 +164,7 @@ def _modes_tile(histogram: NDArray[np.int32], count: NDArray[np.int32], out: NDA
 def modal_velocity(
     histogram: NDArray[np.int32], count: NDArray[np.int32], *, bins: VelocityBins
 ) -> NDArray[np.float64]:
-    """Velocity of the largest mode at each pixel of a tile: (ty, tx, 2) as (vx, vy) px/s, NaN where empty."""
+    """Velocity of the highest mode at each pixel of a tile: (ty, tx, 2) as (vx, vy) px/s, NaN where empty."""
     out = np.full((*count.shape, 2), np.nan)
     _modal_tile(histogram, count, out)
     return bins.from_bins(out)
@@ -171,10 +173,10 @@ def modal_velocity(
 def velocity_modes(
     histogram: NDArray[np.int32], count: NDArray[np.int32], *, bins: VelocityBins, k: int = MAX_MODES
 ) -> NDArray[np.float64]:
-    """Up to ``k`` modes a pixel: (ty, tx, k, 3) as (vx, vy) px/s and share, the largest share first, NaN-padded.
+    """Up to ``k`` modes a pixel: (ty, tx, k, 3) as (vx, vy) px/s and weight, the largest weight first, NaN-padded.
 
-    Shares of all modes of a pixel sum to one. The first is the mode of the largest share, which need not be the highest
-    peak that `modal_velocity` gives.
+    The weights of all modes of a pixel sum to one. The first mode is that of the largest weight, which need not be the
+    highest, `modal_velocity`.
     """
     out = np.full((*count.shape, k, 3), np.nan)
     _modes_tile(histogram, count, out)

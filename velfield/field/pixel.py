@@ -1,4 +1,4 @@
-"""The distribution over velocity at one pixel, with all that is said of it."""
+"""The distribution over velocity at one pixel, with its statistics."""
 
 from dataclasses import dataclass, field
 
@@ -20,23 +20,23 @@ class PixelDistribution:
     x, y
         The pixel.
     n
-        Passages that it rests on.
+        Number of tracks.
     bins
         Its velocity bins.
     weights
-        (nvy, nvx) shares of the bins, summing to one; all zero where nothing passed.
+        (nvy, nvx) weights of the bins, summing to one; all zero where empty.
     modes
-        (k, 3) as (vx, vy) px/s and share, the largest share first.
+        (k, 3) as (vx, vy) px/s and weight, the largest weight first.
     modal_velocity_px_per_s, mean_velocity_px_per_s
-        (2,) as (vx, vy) px/s, NaN where nothing passed.
+        (2,) as (vx, vy) px/s, NaN where empty.
     percentiles_px_per_s
         Speed by percentage: 15, 50, 85; px/s.
-    standing_share, circular_variance, entropy_nats, direction_se_rad, speed_se_px_per_s
+    stationary_fraction, circular_variance, entropy_nats, direction_se_rad, speed_se_px_per_s
         As in `TileStatistics`.
     direction_interval_rad
-        90 % interval of the modal direction: from, to; rising, so that one end may lie beyond (-pi, pi].
+        90 % interval of the modal direction: lower and upper end, rad; one of them may lie outside (-pi, pi].
     median_speed_interval_px_per_s
-        90 % interval of the median speed: from, to.
+        90 % interval of the median speed: lower and upper end, px/s.
     """
 
     x: int
@@ -48,7 +48,7 @@ class PixelDistribution:
     modal_velocity_px_per_s: FloatArray
     mean_velocity_px_per_s: FloatArray
     percentiles_px_per_s: dict[int, float]
-    standing_share: float
+    stationary_fraction: float
     circular_variance: float
     entropy_nats: float
     direction_se_rad: float
@@ -65,7 +65,7 @@ def describe_pixel(
     bins: VelocityBins,
     statistics: TileStatistics,
 ) -> PixelDistribution:
-    """The distribution of a tile of one pixel, (1, 1, nvy, nvx) and (1, 1), with its statistics."""
+    """The distribution of a tile of one pixel, (1, 1, nvy, nvx) and (1, 1), with given statistics."""
     modes = velocity_modes(histogram, count, bins=bins)[0, 0]
     total = int(histogram.sum(dtype=np.int64))
     return PixelDistribution(
@@ -80,12 +80,12 @@ def describe_pixel(
         percentiles_px_per_s=dict(
             zip((15, 50, 85), map(float, statistics.speed_percentiles_px_per_s[0, 0]), strict=True)
         ),
-        standing_share=float(statistics.standing_share[0, 0]),
+        stationary_fraction=float(statistics.stationary_fraction[0, 0]),
         circular_variance=float(statistics.circular_variance[0, 0]),
         entropy_nats=float(statistics.entropy_nats[0, 0]),
         direction_se_rad=float(statistics.direction_se_rad[0, 0]),
         speed_se_px_per_s=float(statistics.speed_se_px_per_s[0, 0]),
-        direction_interval_rad=_about(statistics),
+        direction_interval_rad=_direction_interval(statistics),
         median_speed_interval_px_per_s=(
             float(statistics.median_speed_low_px_per_s[0, 0]),
             float(statistics.median_speed_high_px_per_s[0, 0]),
@@ -93,8 +93,8 @@ def describe_pixel(
     )
 
 
-def _about(statistics: TileStatistics) -> tuple[float, float]:
-    """The interval of the modal direction of a tile of one pixel."""
+def _direction_interval(statistics: TileStatistics) -> tuple[float, float]:
+    """The 90 % interval of the modal direction of a tile of one pixel, rad."""
     vx, vy = statistics.modal_velocity_px_per_s[0, 0]
     direction, half = float(np.arctan2(vy, vx)), float(statistics.direction_half_width_rad[0, 0])
     return direction - half, direction + half

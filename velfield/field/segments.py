@@ -1,15 +1,16 @@
-"""The segment table, the truth that the histogram is built from, and which tiles it touches."""
+"""The segment table, of which the velocity histogram is built, and the tiles that its segments touch."""
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.flight import FieldConfig
 from velfield.errors import InputError
 
 SEGMENT_DTYPE = np.dtype(
     [
-        ("passage", "i8"),
+        ("track", "i8"),
         ("start_s", "f8"),
         ("duration_s", "f8"),
         ("x0_px", "f8"),
@@ -23,84 +24,86 @@ SEGMENT_DTYPE = np.dtype(
         ("sd_px_per_s", "f8"),
     ]
 )
-"""One vehicle from one frame to the next. Sorted by passage, then time: the order that `accumulate_tile` needs.
+"""A segment: half a tracklet, one vehicle from one frame to the next. Sorted by track, then time, as
+`accumulate_tile` needs it.
 
-``sd_px_per_s``: standard deviation of either component of its velocity, by registration and displacement.
+``sd_px_per_s``: standard deviation of either velocity component, from registration and displacement.
 """
 
-_EQUALLY_SURE_PX = 0.15
-"""Displacements with a standard deviation below this have about the same say in a mean."""
+_MIN_DISPLACEMENT_SD_PX = 0.15
+"""Lower bound of a displacement's standard deviation as a weight: those below have about the same weight in a mean."""
 
 Segments = NDArray[np.void]
 """(n,) structured array of `SEGMENT_DTYPE`."""
 
 
 def segment_table(tracklets: pd.DataFrame, config: FieldConfig) -> Segments:
-    """The segments of a table of tracklets, two a tracklet, sorted by passage and time.
+    """The segments of a table of tracklets, two a tracklet, sorted by track and time.
 
-    A segment that two tracklets share (the second of one, the first of the next) stands once, and its velocity is the
-    mean along its passage over ``config.velocity_span_s``; with a ``config.shared_segment_weight`` of 2, as in
-    the paper, each stands as it is. A tracklet of no passage (-1) is its own.
+    A segment that two tracklets share (the second of one, the first of the next) is kept once, and its velocity is the
+    moving average along its track over ``config.velocity_span_s``; with a ``config.shared_segment_weight`` of 2, as in
+    the paper, both are kept without averaging. A tracklet of no track (-1) is a track of its own.
 
     Raises
     ------
     InputError
-        Where a place, a velocity or a time is not finite, or an interval is not positive.
+        A position, a velocity or a time is not finite, or an interval is not positive.
     """
-    halves = [_half(tracklets, first) for first in (0, 1)]
+    halves = [_half_tracklets(tracklets, first) for first in (0, 1)]
     segments = np.concatenate(halves)
     _check(segments)
-    order = np.lexsort((segments["detection_1"], segments["detection_0"], segments["start_s"], segments["passage"]))
+    order = np.lexsort((segments["detection_1"], segments["detection_0"], segments["start_s"], segments["track"]))
     segments = segments[order]
     if config.shared_segment_weight == 1:
-        segments = _averaged(segments[_first_of_equals(segments)], config.velocity_span_s)
+        segments = _average_velocities(segments[_first_of_duplicates(segments)], config.velocity_span_s)
     return segments
 
 
-def _averaged(segments: Segments, span_s: float) -> Segments:
-    """Velocities averaged by time over the neighbours, unbroken, whose middles are within half a span.
+def _average_velocities(segments: Segments, span_s: float) -> Segments:
+    """Moving average of the velocities, weighted by duration over variance, over the consecutive segments whose
+    midpoints are within half a span.
 
-    The error of a detection's place enters two neighbouring segments with opposite signs, so their mean loses most of
-    it; within half a second or so a vehicle's acceleration is constant, and the mean is that of the middle. A segment
-    whose crops did not align, and is a pixel or more off, has hardly a say beside those that did.
+    The error of a detection's position enters two neighbouring segments with opposite signs, so that it mostly cancels
+    in their mean; for half a second or so a vehicle's acceleration is about constant, and a symmetric mean is
+    unbiased. Segments whose crops did not align, with errors of a pixel or more, have little weight.
     """
     if not len(segments):
         return segments
-    broken = segments["passage"][1:] != segments["passage"][:-1]
+    broken = segments["track"][1:] != segments["track"][:-1]
     broken |= segments["detection_0"][1:] != segments["detection_1"][:-1]
     run = np.concatenate([[0], np.cumsum(broken)])
     middle = segments["start_s"] + segments["duration_s"] / 2
     before, after = _neighbours(run, middle, span_s / 2), _neighbours(run[::-1], -middle[::-1], span_s / 2)[::-1]
-    # As many on either side; at a run's end one neighbour on the side that is there: more would be another moment.
+    # Symmetric; at a run's end one neighbour on the one side, as more would shift the mean in time.
     reach = np.maximum(np.minimum(before, after), 1)
     before, after = np.minimum(before, reach), np.minimum(after, reach)
     out = segments.copy()
     sd_px = segments["sd_px_per_s"] * segments["duration_s"]
-    trust = segments["duration_s"] / (sd_px**2 + _EQUALLY_SURE_PX**2)
-    total = _windowed(trust, before, after)
+    weight = segments["duration_s"] / (sd_px**2 + _MIN_DISPLACEMENT_SD_PX**2)
+    total = _window_sum(weight, before, after)
     for name in ("vx_px_per_s", "vy_px_per_s"):
-        out[name] = _windowed(segments[name] * trust, before, after) / total
-    # Errors of two displacements are taken as independent. Those of places cancel in part, so that where the crops did
-    # not align this is a little too large.
-    out["sd_px_per_s"] = np.sqrt(_windowed((segments["sd_px_per_s"] * trust) ** 2, before, after)) / total
+        out[name] = _window_sum(segments[name] * weight, before, after) / total
+    # Errors of displacements are assumed independent. Those of positions cancel in part, so that for segments whose
+    # crops did not align this is slightly too large.
+    out["sd_px_per_s"] = np.sqrt(_window_sum((segments["sd_px_per_s"] * weight) ** 2, before, after)) / total
     return out
 
 
-def _windowed(values: NDArray[np.float64], before: NDArray[np.int64], after: NDArray[np.int64]) -> NDArray[np.float64]:
+def _window_sum(values: FloatArray, before: IntArray, after: IntArray) -> FloatArray:
     """Sum over the rows from ``before`` rows above to ``after`` rows below each.
 
-    Window by window, not by running sums: these would depend, in the last bit, on which rows are given.
+    Window by window, not by running sums, whose last bits would depend on the rows of other tracks.
     """
     rows = np.arange(len(values))
     total = np.zeros(len(values))
     for step in range(-int(before.max(initial=0)), int(after.max(initial=0)) + 1):
-        mine = rows[(step >= -before) & (step <= after)]
-        total[mine] += values[mine + step]
+        inside = rows[(step >= -before) & (step <= after)]
+        total[inside] += values[inside + step]
     return total
 
 
-def _neighbours(run: NDArray[np.int64], middle: NDArray[np.float64], reach_s: float) -> NDArray[np.int64]:
-    """How many rows before each belong to its run and lie within ``reach_s`` of its time."""
+def _neighbours(run: IntArray, middle: FloatArray, reach_s: float) -> IntArray:
+    """Number of rows before each that belong to its run and lie within ``reach_s`` of its time."""
     count = np.zeros(len(run), np.int64)
     for step in range(1, len(run)):
         near = (run[step:] == run[:-step]) & (np.abs(middle[step:] - middle[:-step]) <= reach_s + 1e-9)
@@ -110,13 +113,13 @@ def _neighbours(run: NDArray[np.int64], middle: NDArray[np.float64], reach_s: fl
     return count
 
 
-def _half(tracklets: pd.DataFrame, first: int) -> Segments:
+def _half_tracklets(tracklets: pd.DataFrame, first: int) -> Segments:
     """The segments between detections ``first`` and ``first + 1`` of every tracklet."""
     a, b = first, first + 1
     half = np.zeros(len(tracklets), SEGMENT_DTYPE)
-    passage = tracklets["passage_id"].to_numpy()
-    # Own passages are negative, so that none meets a chain's id.
-    half["passage"] = np.where(passage >= 0, passage, -2 - tracklets["tracklet_id"].to_numpy())
+    track = tracklets["passage_id"].to_numpy()
+    # The ids of tracklets without a track are negative, so that none equals a track's.
+    half["track"] = np.where(track >= 0, track, -2 - tracklets["tracklet_id"].to_numpy())
     half["start_s"] = tracklets[f"time_{a}_s"]
     half["duration_s"] = tracklets[f"time_{b}_s"].to_numpy() - tracklets[f"time_{a}_s"].to_numpy()
     half["x0_px"], half["y0_px"] = tracklets[f"x_{a}_px"], tracklets[f"y_{a}_px"]
@@ -136,25 +139,26 @@ def _check(segments: Segments) -> None:
         row = segments[int(np.flatnonzero(bad)[0])]
         raise InputError(
             f"{int(bad.sum())} of {len(segments)} tracklet segments are not usable, the first from detection "
-            f"{row['detection_0']} to {row['detection_1']} with interval {row['duration_s']} s: places, times and "
+            f"{row['detection_0']} to {row['detection_1']} with interval {row['duration_s']} s: positions, times and "
             "velocities must be finite and intervals positive; check the tracklets table"
         )
 
 
-def _first_of_equals(segments: Segments) -> NDArray[np.bool_]:
-    """Mask of rows that do not repeat the row before (sorted: the same passage and detections are neighbours)."""
+def _first_of_duplicates(segments: Segments) -> Mask:
+    """Mask of the rows that do not repeat the row before (sorted: rows of equal track and detections are adjacent)."""
     keep = np.ones(len(segments), bool)
-    same = [segments[name][1:] == segments[name][:-1] for name in ("passage", "detection_0", "detection_1")]
+    same = [segments[name][1:] == segments[name][:-1] for name in ("track", "detection_0", "detection_1")]
     keep[1:] = ~np.logical_and.reduce(same)
     return keep
 
 
 def segments_by_tile(
     segments: Segments, *, shape: tuple[int, int], tile_size: int, radius_px: float | None
-) -> dict[tuple[int, int], NDArray[np.int64]]:
-    """Rows of the segments whose band may reach a tile, for every such tile (ty, tx) of a (height, width) grid.
+) -> dict[tuple[int, int], IntArray]:
+    """Rows of the segments whose band's bounding box meets a tile, for every such tile (ty, tx) of a (height, width)
+    grid.
 
-    Rows keep the table's order. A tile that is listed may still turn out empty: bands are boxed here.
+    Rows keep the table's order. A listed tile may still be empty.
     """
     reach = 0.5 if radius_px is None else radius_px
     low_x, high_x = _tile_range(segments["x0_px"], segments["x1_px"], reach, shape[1], tile_size)
@@ -175,20 +179,11 @@ def segments_by_tile(
     return {(int(k) // columns, int(k) % columns): part for k, part in zip(keys, parts, strict=True)}
 
 
-def _tile_range(
-    a: NDArray[np.float64], b: NDArray[np.float64], reach: float, length: int, tile_size: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First and last tile of an axis that [min - reach, max + reach] meets; last < first where it misses the grid."""
+def _tile_range(a: FloatArray, b: FloatArray, reach: float, length: int, tile_size: int) -> tuple[IntArray, IntArray]:
+    """First and last tile of an axis that [min - reach, max + reach] meets; last < first where it is off the grid."""
     low = np.ceil(np.minimum(a, b) - reach).clip(0, length)
     high = np.floor(np.maximum(a, b) + reach).clip(-1, length - 1)
-    missed = high < low
+    outside = high < low
     first = low.astype(np.int64) // tile_size
-    last = np.where(missed, first - 1, high.astype(np.int64) // tile_size)
+    last = np.where(outside, first - 1, high.astype(np.int64) // tile_size)
     return first, last
-
-
-def touched_tiles(
-    segments: Segments, *, shape: tuple[int, int], tile_size: int, radius_px: float | None
-) -> list[tuple[int, int]]:
-    """The tiles (ty, tx) that `segments_by_tile` lists, in raster order."""
-    return sorted(segments_by_tile(segments, shape=shape, tile_size=tile_size, radius_px=radius_px))

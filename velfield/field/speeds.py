@@ -1,4 +1,4 @@
-"""The distribution of speed at a pixel, out of its histogram over velocity."""
+"""The distribution of speed at a pixel, from its velocity histogram."""
 
 from math import floor, hypot, sqrt
 
@@ -9,25 +9,26 @@ from numpy.typing import NDArray
 from schemas.arrays import FloatArray
 
 CELLS_PER_BIN = 8
-"""Speed is counted in cells of this part of a bin."""
+"""Bins of the speed histogram (cells) a bin of velocity."""
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def most_cells(reach: int) -> int:
-    """Cells that the speeds of a histogram with ``reach`` bins on either side need."""
+def max_cells(reach: int) -> int:
+    """Number of cells for the speeds of a velocity histogram with ``reach`` bins on either side."""
     return int((floor(1.5 * reach) + 3) * CELLS_PER_BIN)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def blur_variance(sigma: float) -> float:
-    """Variance that the histogram adds to a speed, bins^2: the kernel; the bins' width when filled, and again when
-    spread over cells."""
+def kernel_variance(sigma: float) -> float:
+    """Variance that the histogram adds to a speed, bins^2: the kernel's, and twice that of a bin's width (once when
+    bins are filled, once when they are spread over cells)."""
     return sigma * sigma + 2.0 / 12.0
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def speed_cells(h: NDArray[np.int32], reach: int, cells: FloatArray) -> float:
-    """Weight by speed in cells of 1/8 bin: each bin spreads evenly over one bin's width of speed. Returns the sum."""
+    """Fill ``cells`` with the histogram of speed, each bin spread uniformly over one bin's width of speed; returns the
+    sum."""
     cells[:] = 0.0
     total = 0.0
     half = CELLS_PER_BIN // 2
@@ -38,7 +39,7 @@ def speed_cells(h: NDArray[np.int32], reach: int, cells: FloatArray) -> float:
             weight = float(h[y, x])
             total += weight
             low = hypot(float(y - reach), float(x - reach)) * CELLS_PER_BIN - half
-            if low < 0.0:  # the bin of standing still: its speeds fold at zero
+            if low < 0.0:  # the central bin: speeds are not negative
                 for c in range(half):
                     cells[c] += weight / half
                 continue
@@ -51,9 +52,9 @@ def speed_cells(h: NDArray[np.int32], reach: int, cells: FloatArray) -> float:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def quantile(cells: FloatArray, total: float, share: float) -> float:
-    """Speed, in bins, below which ``share`` of the weight lies; linear within a cell."""
-    target = min(max(share, 0.0), 1.0) * total
+def quantile(cells: FloatArray, total: float, probability: float) -> float:
+    """Quantile of the speed, bins; linear within a cell."""
+    target = min(max(probability, 0.0), 1.0) * total
     below = 0.0
     for c in range(cells.size):
         if below + cells[c] >= target and cells[c] > 0.0:
@@ -63,8 +64,9 @@ def quantile(cells: FloatArray, total: float, share: float) -> float:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def narrowing_by(cells: FloatArray, total: float, blur: float) -> float:
-    """By how much quantiles are pulled towards the median: what is left of the spread without the variance ``blur``."""
+def deconvolution_factor(cells: FloatArray, total: float, blur: float) -> float:
+    """Standard deviation of the speed without the kernel's variance ``blur`` over that with it: the factor by which
+    quantiles move towards the median."""
     mean, square = 0.0, 0.0
     for c in range(cells.size):
         speed = (c + 0.5) / CELLS_PER_BIN

@@ -1,7 +1,7 @@
-"""What a pixel's histogram says: mean, speed percentiles, spread of direction, entropy, and how sure that is.
+"""Statistics of a pixel's histogram: mean, speed percentiles, circular variance, entropy, and their standard errors.
 
-The histogram weighs each passage once, so these are statistics over passages (in traffic terms: time-mean speeds, as a
-detector loop would give them). A histogram accumulated with ``weight="time"`` gives the space-mean in the same way.
+The histogram weighs each track once, so these are statistics over vehicles (in traffic terms: time-mean speeds, as of
+a loop detector). A histogram accumulated with ``weight="time"`` gives space-mean speeds in the same way.
 """
 
 from dataclasses import dataclass
@@ -12,56 +12,57 @@ from numba import njit
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray
-from velfield.field.accumulate import NOISE_UNIT
+from velfield.field.accumulate import VARIANCE_UNIT
 from velfield.field.bins import VelocityBins
 from velfield.field.intervals import tile_intervals
 from velfield.field.modes import modal_velocity
-from velfield.field.speeds import blur_variance, most_cells, narrowing_by, quantile, speed_cells
+from velfield.field.speeds import deconvolution_factor, kernel_variance, max_cells, quantile, speed_cells
 
 PERCENTILES = (15.0, 50.0, 85.0)
-"""The speed percentiles kept, %; p85 is what speed limits are set by."""
+"""Speed percentiles, %; p85 is the one that speed limits are set by."""
 
 
 @dataclass(frozen=True)
 class TileStatistics:
-    """Statistics of a tile, each (ty, tx) float64 unless it says otherwise, NaN where no vehicle passed.
+    """Statistics of a tile, each (ty, tx) float64 unless stated otherwise, NaN where no vehicle passed.
 
     Attributes
     ----------
     n : int32
-        Distinct passages.
+        Number of tracks.
     modal_velocity_px_per_s : (ty, tx, 2)
-        Velocity of the largest mode, px/s.
-    mode_share
-        Share of the weight within two bins of that mode.
+        Velocity of the highest mode, px/s.
+    mode_fraction
+        Fraction of the weight within two bins of that mode.
     mean_velocity_px_per_s : (ty, tx, 2)
         Mean velocity, px/s.
     speed_percentiles_px_per_s : (ty, tx, 3)
-        15, 50 and 85 % of the speeds, px/s, with the broadening by kernel and bins taken out.
-    standing_share
-        Share of passages that stand: the central bin's weight against that of a blob at rest. A vehicle of half a bin's
-        speed counts for a half.
+        15th, 50th and 85th percentile of speed, px/s, deconvolved: the broadening by kernel and bins is removed.
+    stationary_fraction
+        Fraction of tracks that are stationary: the central bin's weight over that of a kernel at zero velocity. A
+        vehicle of half a bin's speed counts for a half.
     circular_variance
-        1 - length of the mean direction, over what moves: 0 all one way, 1 no direction; NaN where nothing moves.
+        1 - length of the mean direction vector of the moving weight: 0 all in one direction, 1 no mean direction; NaN
+        where none moves.
     entropy_nats
-        Of the normalised histogram, nats; log(number of bins) where all are alike.
+        Of the normalised histogram, nats; log(number of bins) for a uniform one.
     direction_se_rad
-        Standard error of the mean direction of what moves, rad; NaN with fewer than two passages.
+        Standard error of the mean direction of the moving weight, rad; NaN with fewer than two tracks.
     direction_half_width_rad
-        Half the 90 % interval of the modal direction, rad; NaN where the mode stands.
+        Half the 90 % interval of the modal direction, rad; NaN where the mode is stationary.
     median_speed_low_px_per_s, median_speed_high_px_per_s
         90 % interval of the median speed, px/s.
     speed_se_px_per_s
-        Standard error of the median speed, px/s: by its binomial rank's interval, and the kernel as the noise of one
-        passage; NaN with fewer than two passages.
+        Standard error of the median speed, px/s: of its binomial rank, and of the kernel as one track's error; NaN with
+        fewer than two tracks.
     """
 
     n: NDArray[np.int32]
     modal_velocity_px_per_s: FloatArray
-    mode_share: FloatArray
+    mode_fraction: FloatArray
     mean_velocity_px_per_s: FloatArray
     speed_percentiles_px_per_s: FloatArray
-    standing_share: FloatArray
+    stationary_fraction: FloatArray
     circular_variance: FloatArray
     entropy_nats: FloatArray
     direction_se_rad: FloatArray
@@ -72,9 +73,12 @@ class TileStatistics:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _moments(h: NDArray[np.int32], reach: int, standing: float, mode_y: float, mode_x: float, out: FloatArray) -> None:
-    """Of one pixel, in bins: 0 mode share, 1-2 mean (x, y), 3 resting, 4 circular variance, 5 entropy, 6 dispersion."""
-    total, near, sum_x, sum_y = 0.0, 0.0, 0.0, 0.0
+def _moments(
+    h: NDArray[np.int32], reach: int, stationary: float, mode_y: float, mode_x: float, out: FloatArray
+) -> None:
+    """Fill ``out`` of one pixel, in bins: 0 mode fraction, 1-2 mean (x, y), 3 central bin's fraction, 4 circular
+    variance, 5 entropy, 6 circular dispersion."""
+    total, mode_weight, sum_x, sum_y = 0.0, 0.0, 0.0, 0.0
     moving, cosine, sine, plogp = 0.0, 0.0, 0.0, 0.0
     for y in range(h.shape[0]):
         for x in range(h.shape[1]):
@@ -88,12 +92,12 @@ def _moments(h: NDArray[np.int32], reach: int, standing: float, mode_y: float, m
             sum_y += weight * vy
             plogp += weight * log(weight)
             if (x - mode_x) ** 2 + (y - mode_y) ** 2 <= 4.0:
-                near += weight
-            if speed > standing:
+                mode_weight += weight
+            if speed > stationary:
                 moving += weight
                 cosine += weight * vx / speed
                 sine += weight * vy / speed
-    out[0] = near / total
+    out[0] = mode_weight / total
     out[1], out[2] = sum_x / total, sum_y / total
     out[3] = h[reach, reach] / total
     out[5] = max(log(total) - plogp / total, 0.0)
@@ -101,24 +105,25 @@ def _moments(h: NDArray[np.int32], reach: int, standing: float, mode_y: float, m
     if moving > 0.0:
         length = hypot(cosine, sine) / moving
         out[4] = max(1.0 - length, 0.0)
-        out[6] = _circular_dispersion(h, reach, standing, atan2(sine, cosine), moving, length)
+        out[6] = _circular_dispersion(h, reach, stationary, atan2(sine, cosine), moving, length)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _circular_dispersion(
-    h: NDArray[np.int32], reach: int, standing: float, direction: float, moving: float, length: float
+    h: NDArray[np.int32], reach: int, stationary: float, direction: float, moving: float, length: float
 ) -> float:
-    """(1 - mean cos 2(theta - direction)) / (2 length^2): n times the variance of the mean direction, rad^2."""
-    double = 0.0
+    """Circular dispersion (1 - mean cos 2(theta - direction)) / (2 length^2): n times the variance of the mean
+    direction, rad^2."""
+    cosine = 0.0
     for y in range(h.shape[0]):
         for x in range(h.shape[1]):
             if h[y, x] > 0:
                 vx, vy = float(x - reach), float(y - reach)
-                if hypot(vx, vy) > standing:
-                    double += h[y, x] * cos(2.0 * (atan2(vy, vx) - direction))
+                if hypot(vx, vy) > stationary:
+                    cosine += h[y, x] * cos(2.0 * (atan2(vy, vx) - direction))
     if length <= 1e-9:
         return np.inf
-    return max(1.0 - double / moving, 0.0) / (2.0 * length * length)
+    return max(1.0 - cosine / moving, 0.0) / (2.0 * length * length)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -126,7 +131,7 @@ def _tile(
     histogram: NDArray[np.int32],
     count: NDArray[np.int32],
     mode: FloatArray,
-    standing: float,
+    stationary: float,
     sigma: float,
     percentiles: FloatArray,
     moments: FloatArray,
@@ -134,8 +139,8 @@ def _tile(
     errors: FloatArray,
 ) -> None:
     reach = (histogram.shape[2] - 1) // 2
-    cells = np.zeros(most_cells(reach))
-    blur = blur_variance(sigma)
+    cells = np.zeros(max_cells(reach))
+    blur = kernel_variance(sigma)
     at_rest = erf(0.5 / (sigma * sqrt(2.0))) ** 2
     for y in range(count.shape[0]):
         for x in range(count.shape[1]):
@@ -143,24 +148,24 @@ def _tile(
             if n == 0:
                 continue
             h = histogram[y, x]
-            _moments(h, reach, standing, mode[y, x, 1], mode[y, x, 0], moments[y, x])
+            _moments(h, reach, stationary, mode[y, x, 1], mode[y, x, 0], moments[y, x])
             moments[y, x, 3] = min(moments[y, x, 3] / at_rest, 1.0)
             total = speed_cells(h, reach, cells)
-            narrowing = narrowing_by(cells, total, blur)
+            factor = deconvolution_factor(cells, total, blur)
             median = quantile(cells, total, 0.5)
             for k in range(percentiles.size):
-                speeds[y, x, k] = median + narrowing * (quantile(cells, total, percentiles[k] / 100.0) - median)
+                speeds[y, x, k] = median + factor * (quantile(cells, total, percentiles[k] / 100.0) - median)
             if n >= 2:
                 errors[y, x, 0] = sqrt(moments[y, x, 6] / n)
                 half = 0.5 / sqrt(float(n))
                 rank = (quantile(cells, total, 0.5 + half) - quantile(cells, total, 0.5 - half)) / 2.0
-                errors[y, x, 1] = sqrt((narrowing * rank) ** 2 + sigma * sigma / n)
+                errors[y, x, 1] = sqrt((factor * rank) ** 2 + sigma * sigma / n)
 
 
 def tile_statistics(
     histogram: NDArray[np.int32],
     count: NDArray[np.int32],
-    noise: NDArray[np.int32],
+    variance_sum: NDArray[np.int32],
     *,
     bins: VelocityBins,
     stationary_speed_px_per_s: float,
@@ -171,13 +176,13 @@ def tile_statistics(
     Parameters
     ----------
     histogram
-        (ty, tx, nvy, nvx) int32 weights; their unit does not matter.
+        (ty, tx, nvy, nvx) int32 weights, of any unit.
     count
-        (ty, tx) int32 passages.
-    noise
-        (ty, tx) int32, their velocities' variance by measurement, summed: as in `FieldTile`.
+        (ty, tx) int32 tracks.
+    variance_sum
+        (ty, tx) int32, as in `FieldTile`.
     stationary_speed_px_per_s
-        What is slower has no direction; where a bin and a half is faster, that is the limit.
+        Below it there is no direction, nor below a bin and a half.
     percentiles
         Of speed, %.
     """
@@ -185,22 +190,24 @@ def tile_statistics(
     shape = count.shape
     moments, errors = np.full((*shape, 7), np.nan), np.full((*shape, 2), np.nan)
     speeds = np.full((*shape, len(percentiles)), np.nan)
-    # A blob at rest spills into the bins next to the central one: direction is taken from beyond them.
+    # The kernel at zero velocity extends into the bins next to the central one: directions are of the bins beyond.
     moving_bins = max(stationary_speed_px_per_s / bins.width_px_per_s, 1.5)
-    sigma = bins.kernel_sigma_px_per_s / bins.width_px_per_s
+    sigma = bins.kernel_sigma_bins
     limits = np.asarray(percentiles, np.float64)
     _tile(histogram, count, bins.to_bins(mode_px_per_s), moving_bins, sigma, limits, moments, speeds, errors)
     intervals = np.full((*shape, 3), np.nan)
-    each = noise / (np.maximum(count, 1) * float(NOISE_UNIT))
-    standing_bins = stationary_speed_px_per_s / bins.width_px_per_s
-    tile_intervals(histogram, count, each, mode_px_per_s / bins.width_px_per_s, sigma, standing_bins, intervals)
+    variance_bins2 = variance_sum / (np.maximum(count, 1) * float(VARIANCE_UNIT))
+    stationary_bins = stationary_speed_px_per_s / bins.width_px_per_s
+    tile_intervals(
+        histogram, count, variance_bins2, mode_px_per_s / bins.width_px_per_s, sigma, stationary_bins, intervals
+    )
     return TileStatistics(
         n=count,
         modal_velocity_px_per_s=mode_px_per_s,
-        mode_share=moments[..., 0],
+        mode_fraction=moments[..., 0],
         mean_velocity_px_per_s=moments[..., 1:3] * bins.width_px_per_s,
         speed_percentiles_px_per_s=speeds * bins.width_px_per_s,
-        standing_share=moments[..., 3],
+        stationary_fraction=moments[..., 3],
         circular_variance=moments[..., 4],
         entropy_nats=moments[..., 5],
         direction_se_rad=errors[..., 0],
@@ -212,12 +219,12 @@ def tile_statistics(
 
 
 def direction_rad(velocity_px_per_s: FloatArray, *, stationary_speed_px_per_s: float = 0.0) -> FloatArray:
-    """Direction of motion in (-pi, pi] from +x towards +y (down); NaN where slower than standing, or empty."""
+    """Direction of motion in (-pi, pi] from +x towards +y (down); NaN where stationary or empty."""
     vx, vy = velocity_px_per_s[..., 0], velocity_px_per_s[..., 1]
     direction = np.arctan2(vy, vx)
     direction = np.where(direction == -pi, pi, direction)
-    slow = ~(np.hypot(vx, vy) > stationary_speed_px_per_s)
-    return np.where(slow, np.nan, direction)
+    stationary = ~(np.hypot(vx, vy) > stationary_speed_px_per_s)
+    return np.where(stationary, np.nan, direction)
 
 
 def speed_px_per_s(velocity_px_per_s: FloatArray) -> FloatArray:

@@ -7,14 +7,14 @@ from itertools import pairwise
 from math import floor
 
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import IntArray
 from velfield.errors import InputError
 from velfield.field.segments import Segments
 
 DAY_S = 86_400.0
 MAX_INTERVALS = 400
-"""Each is a store of its own."""
+"""Upper bound of the number of intervals: each is a store of its own."""
 _UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 _FORMS = (
     "expected a length (15min, 90s, 1h), or intervals of seconds or of the time of day (0-300,300-900 or 07:00-09:00)"
@@ -23,9 +23,9 @@ _FORMS = (
 
 @dataclass(frozen=True)
 class TimeInterval:
-    """An interval of the flight's clock: ``start_s`` belongs to it, ``stop_s`` to the next.
+    """A half-open interval [``start_s``, ``stop_s``) of the flight's clock.
 
-    The interval ``rest`` holds what lies in none of those asked for; its ends are infinite.
+    The interval ``rest`` holds the tracks in none of the requested ones; its ends are infinite.
     """
 
     name: str
@@ -45,7 +45,7 @@ def parse_time_intervals(text: str, first_s: float, last_s: float) -> list[TimeI
     Raises
     ------
     InputError
-        The text is not understood, intervals overlap or are empty, or there are too many.
+        The text cannot be parsed, intervals overlap or are empty, or there are too many.
 
     Examples
     --------
@@ -96,19 +96,19 @@ def _moment(text: str, part: str, midnight_s: float) -> float:
     return float(text)
 
 
-def assign_intervals(segments: Segments, intervals: Sequence[TimeInterval]) -> NDArray[np.int64]:
-    """Index of the time interval of each segment, (n,): that of the middle of its track, so that no track is split.
+def assign_intervals(segments: Segments, intervals: Sequence[TimeInterval]) -> IntArray:
+    """Index of the time interval of each segment, (n,): that of the midpoint of its track, so that no track is split.
 
     Parameters
     ----------
     segments
-        Whole passages, sorted by passage.
+        Whole tracks, sorted by track.
     intervals
-        As `parse_time_intervals` gives them: what lies in none goes to the last.
+        From `parse_time_intervals`; tracks in none of them go to the last.
     """
     if not len(segments):
         return np.zeros(0, np.int64)
-    _, first, count = np.unique(segments["passage"], return_index=True, return_counts=True)
+    _, first, count = np.unique(segments["track"], return_index=True, return_counts=True)
     begin = np.minimum.reduceat(segments["start_s"], first)
     end = np.maximum.reduceat(segments["start_s"] + segments["duration_s"], first)
     middle = 0.5 * (begin + end)

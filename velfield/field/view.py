@@ -1,4 +1,4 @@
-"""The velocity field to be asked: one object over tiles, wherever they come from, never more than a few in memory."""
+"""`VelocityField`: queries on a velocity field over tiles from any source, few of them in memory at a time."""
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
@@ -10,11 +10,11 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray
+from schemas.arrays import Float32Array, FloatArray
 from velfield.errors import InputError
 from velfield.field.accumulate import accumulate_tile
 from velfield.field.bins import VelocityBins
-from velfield.field.gate import SHARE, VelocityGate, make_gate
+from velfield.field.gate import COVERAGE, VelocityGate, make_gate
 from velfield.field.modes import modal_velocity
 from velfield.field.pixel import PixelDistribution, describe_pixel
 from velfield.field.prior import densities_at_pixel, log_density_in_window
@@ -22,20 +22,20 @@ from velfield.field.segments import Segments, segments_by_tile
 from velfield.field.statistics import TileStatistics, direction_rad, speed_px_per_s, tile_statistics
 
 Tile = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]
-"""(ty, tx, nvy, nvx) histogram, (ty, tx) count of passages and their noise, as in `FieldTile`; tiles at the map's edge
-may be cut or padded."""
+"""(ty, tx, nvy, nvx) histogram, (ty, tx) count of tracks and the sum of their velocities' variances, as in `FieldTile`;
+tiles at the map's edge may be cut or padded."""
 TileSource = Callable[[int, int], Tile | None]
-"""Gives tile (ty, tx); None where nothing was seen."""
+"""Returns tile (ty, tx), or None where it is empty."""
 LayerSource = Callable[[str], NDArray[Any]]
-"""Gives a whole (y, x) layer by its name."""
+"""Returns a whole (y, x) layer by its name."""
 
 T = TypeVar("T")
-_Place = tuple[slice, slice]
-Float32 = NDArray[np.float32]
-_TILES_KEPT = 6
-_TILES_OF_THE_MAP = 64
+_Window = tuple[slice, slice]
+_CACHED_TILES = 6
+_MAP_SAMPLE_TILES = 64
 _NEIGHBOURHOOD_M = 1.5
 _NEIGHBOURHOOD_PX = 6
+"""Radius of a pixel's neighbourhood in the prior, where the ground sample distance is known and where it is not."""
 
 
 class VelocityField:
@@ -44,9 +44,9 @@ class VelocityField:
     Parameters
     ----------
     source
-        Gives the tile (ty, tx), or None; called from several threads where ``threads`` is more than one.
+        Returns the tile (ty, tx), or None; called from several threads if ``threads`` is more than one.
     tiles
-        The tiles that hold anything: no other is asked for.
+        The tiles that are not empty: no other is read.
     shape
         (height, width) of the map, base px.
     tile_size
@@ -56,10 +56,10 @@ class VelocityField:
     stationary_speed_px_per_s
         A modal speed below this has no direction.
     threads
-        Tiles worked on at once by the methods that go over the whole map.
+        Number of tiles that methods over the whole map process in parallel.
     layers
-        Gives a (y, x) layer that was made with the tiles (``modal_vx``, ``modal_vy``, ``count``), so that whole maps
-        need no tile; None: they are made from the tiles.
+        Returns a (y, x) layer stored with the tiles (``modal_vx``, ``modal_vy``, ``count``), so that maps of these need
+        no tile; None: they are computed from the tiles.
     """
 
     def __init__(
@@ -79,10 +79,10 @@ class VelocityField:
         self.tiles = sorted(tiles)
         self._known = frozenset(self.tiles)
         self._source, self._threads, self._layers = source, threads, layers
-        self._kept: OrderedDict[tuple[int, int], Tile | None] = OrderedDict()
+        self._cache: OrderedDict[tuple[int, int], Tile | None] = OrderedDict()
         self._lock = Lock()
-        self._modal: Float32 | None = None
-        self._everywhere: FloatArray | None = None
+        self._modal: Float32Array | None = None
+        self._map_weights: FloatArray | None = None
 
     @classmethod
     def from_segments(
@@ -95,7 +95,7 @@ class VelocityField:
         radius_px: float | None,
         stationary_speed_px_per_s: float,
     ) -> "VelocityField":
-        """The field of a segment table, its tiles made as they are asked for."""
+        """The field of a segment table; its tiles are accumulated when they are read."""
         rows = segments_by_tile(segments, shape=shape, tile_size=tile_size, radius_px=radius_px)
 
         def make(ty: int, tx: int) -> Tile:
@@ -103,7 +103,7 @@ class VelocityField:
             part = segments[rows[ty, tx]]
             size = (tile_size, tile_size)
             tile = accumulate_tile(part, origin_xy=origin, shape=size, bins=bins, radius_px=radius_px)
-            return tile.histogram, tile.count, tile.noise
+            return tile.histogram, tile.count, tile.variance_sum
 
         return cls(
             make,
@@ -116,8 +116,8 @@ class VelocityField:
 
     # -- the map ------------------------------------------------------------------------------------------------------
 
-    def modal_velocity(self) -> Float32:
-        """(y, x, 2) float32 velocity of the largest mode as (vx, vy) px/s; NaN where no vehicle passed."""
+    def modal_velocity(self) -> Float32Array:
+        """(y, x, 2) float32 velocity of the highest mode as (vx, vy) px/s; NaN where no vehicle passed."""
         if self._modal is None:
             out = np.full((*self.shape, 2), np.nan, np.float32)
             if self._layers is not None:
@@ -130,16 +130,16 @@ class VelocityField:
         return self._modal.copy()
 
     def modal_direction_rad(self, *, stationary_speed_px_per_s: float | None = None) -> FloatArray:
-        """(y, x) direction of the largest mode in (-pi, pi], from +x towards +y (down); NaN where empty or standing."""
+        """(y, x) direction of the highest mode in (-pi, pi], from +x to +y (down); NaN where empty or stationary."""
         limit = self.stationary_speed_px_per_s if stationary_speed_px_per_s is None else stationary_speed_px_per_s
         return direction_rad(self.modal_velocity().astype(np.float64), stationary_speed_px_per_s=limit)
 
     def modal_speed_px_per_s(self) -> FloatArray:
-        """(y, x) speed of the largest mode, px/s; NaN where no vehicle passed."""
+        """(y, x) speed of the highest mode, px/s; NaN where no vehicle passed."""
         return speed_px_per_s(self.modal_velocity().astype(np.float64))
 
     def count(self) -> NDArray[np.int32]:
-        """(y, x) distinct passages; 0 where no vehicle passed."""
+        """(y, x) number of tracks; 0 where no vehicle passed."""
         if self._layers is not None:
             return np.array(self._layers("count"), np.int32)
         out = np.zeros(self.shape, np.int32)
@@ -151,7 +151,7 @@ class VelocityField:
         """All statistics of every pixel, as whole maps in float32."""
         names = [field.name for field in fields(TileStatistics)]
         maps: dict[str, NDArray[np.generic]] = {}
-        empty = self._tile_statistics(self._nothing())
+        empty = self._tile_statistics(self._empty_pixel())
         for name in names:
             sample = getattr(empty, name)
             full = (*self.shape, *sample.shape[2:])
@@ -170,7 +170,7 @@ class VelocityField:
         Raises
         ------
         InputError
-            Where the pixel is not on the map.
+            The pixel is not on the map.
         """
         column, row = round(x), round(y)
         if not (0 <= column < self.shape[1] and 0 <= row < self.shape[0]):
@@ -180,13 +180,13 @@ class VelocityField:
             )
         tile = self._tile(row // self.tile_size, column // self.tile_size)
         if tile is None:
-            return self._distribution(column, row, self._nothing())
+            return self._distribution(column, row, self._empty_pixel())
         y0, x0 = row % self.tile_size, column % self.tile_size
         pixel = np.s_[y0 : y0 + 1, x0 : x0 + 1]
         return self._distribution(column, row, (tile[0][pixel], tile[1][pixel], tile[2][pixel]))
 
-    def _nothing(self) -> Tile:
-        """A tile of one pixel that nobody passed."""
+    def _empty_pixel(self) -> Tile:
+        """An empty tile of one pixel."""
         return (np.zeros((1, 1, self.bins.n, self.bins.n), np.int32), *np.zeros((2, 1, 1), np.int32))
 
     def _distribution(self, x: int, y: int, pixel: Tile) -> PixelDistribution:
@@ -195,12 +195,12 @@ class VelocityField:
     # -- a prior for another tracker ----------------------------------------------------------------------------------
 
     def log_density(self, xy: FloatArray, v: FloatArray) -> FloatArray:
-        """Log of p(v | x) of the next vehicle, density per (px/s)^2: see `velfield.field.prior`.
+        """Log predictive density p(v | x) of the next vehicle, per (px/s)^2: see `velfield.field.prior`.
 
         Parameters
         ----------
         xy
-            (n, 2) base pixels; outside of the map the density is the whole map's.
+            (n, 2) base pixels; outside the map the density is the whole map's.
         v
             (n, 2) velocities, px/s.
 
@@ -212,7 +212,7 @@ class VelocityField:
         xy, v = np.atleast_2d(np.asarray(xy, np.float64)), np.atleast_2d(np.asarray(v, np.float64))
         if xy.shape != v.shape or xy.shape[1] != 2:
             raise InputError(
-                f"log_density needs places and velocities of one shape (n, 2), found {xy.shape} and {v.shape}"
+                f"log_density needs positions and velocities of one shape (n, 2), found {xy.shape} and {v.shape}"
             )
         out = np.full(len(xy), np.nan)
         good = np.flatnonzero(np.isfinite(xy).all(axis=1) & np.isfinite(v).all(axis=1))
@@ -230,96 +230,97 @@ class VelocityField:
                 pixels[here] - origin,
                 self.bins.to_bins(v[good[here]]),
                 radius,
-                self._blur(),
+                self.bins.blur_bins2,
             )
         out -= 2 * np.log(self.bins.width_px_per_s)
         return out
 
-    def gate(self, xy: FloatArray, covariance: FloatArray | None = None, *, share: float = SHARE) -> VelocityGate:
-        """What velocities are usual at a place: a gate for another tracker (`velfield.field.gate`).
+    def gate(self, xy: FloatArray, covariance: FloatArray | None = None, *, coverage: float = COVERAGE) -> VelocityGate:
+        """The highest-density region of the velocity at a position, as a gate for another tracker
+        (`velfield.field.gate`).
 
-        Unlike `log_density` it does not reckon with a queue where none has stood yet.
+        Unlike `log_density` it is of the observed distribution, without a pseudocount of zero velocity.
 
         Parameters
         ----------
         xy
             (2,) base pixel.
         covariance
-            (2, 2) px^2, how well the place is known; None: to the pixel.
-        share
-            Share of vehicles that the gate lets pass.
+            (2, 2) px^2, of the position; None: zero.
+        coverage
+            Probability mass of the region, in (0, 1).
         """
-        place = np.asarray(xy, np.float64)
-        if place.shape != (2,) or not np.isfinite(place).all() or not 0 < share < 1:
-            raise InputError(f"gate needs one finite place (2,) and a share between 0 and 1, found {xy} and {share}")
-        return make_gate(
-            self._densities, place, np.zeros((2, 2)) if covariance is None else covariance, self.bins, share
-        )
+        position = np.asarray(xy, np.float64)
+        if position.shape != (2,) or not np.isfinite(position).all() or not 0 < coverage < 1:
+            raise InputError(
+                f"gate needs one finite position (2,) and a coverage between 0 and 1, found {xy} and {coverage}"
+            )
+        covariance = np.zeros((2, 2)) if covariance is None else covariance
+        return make_gate(self._densities, position, covariance, self.bins, coverage)
 
     def anomaly(self, times_s: FloatArray, xy: FloatArray) -> float:
-        """How unusual a track is: by how many nats a step its velocities are less likely than what is usual there.
+        """Anomaly score of a track, nats a step: the expected log density at its positions minus that of its
+        velocities.
 
-        About 0 for a track like those that the field was made of; 3 and more for a wrong-way driver, or for one who
-        stands where nobody does. Where nothing is known, hardly anything is unusual.
+        About 0 for a track like those of the field; 3 and more for a wrong-way driver, or for a vehicle that stops
+        where none does. Low for any track where the field is empty.
 
         Parameters
         ----------
         times_s, xy
-            (n,) rising times and (n, 2) base pixels, n of 2 or more.
+            (n,) ascending times and (n, 2) base pixels, n >= 2.
         """
-        time, place = np.asarray(times_s, np.float64), np.asarray(xy, np.float64)
-        if time.ndim != 1 or len(time) < 2 or place.shape != (len(time), 2) or not (np.diff(time) > 0).all():
-            raise InputError(f"anomaly needs rising times (n,) and places (n, 2), found {time.shape} and {place.shape}")
-        velocity = np.diff(place, axis=0) / np.diff(time)[:, None]
-        middle = 0.5 * (place[1:] + place[:-1])
-        surprise = [
+        time, position = np.asarray(times_s, np.float64), np.asarray(xy, np.float64)
+        if time.ndim != 1 or len(time) < 2 or position.shape != (len(time), 2) or not (np.diff(time) > 0).all():
+            raise InputError(
+                f"anomaly needs ascending times (n,) and positions (n, 2), found {time.shape} and {position.shape}"
+            )
+        velocity = np.diff(position, axis=0) / np.diff(time)[:, None]
+        midpoint = 0.5 * (position[1:] + position[:-1])
+        score = [
             gate.expected_log_density - gate.log_density(v)[0]
-            for gate, v in ((self.gate(where), v) for where, v in zip(middle, velocity, strict=True))
+            for gate, v in ((self.gate(where), v) for where, v in zip(midpoint, velocity, strict=True))
         ]
-        return float(np.mean(surprise))
+        return float(np.mean(score))
 
     def _densities(self, xy: FloatArray, v: FloatArray) -> FloatArray:
-        """Density per (px/s)^2 at one place (2,) of velocities (n, 2), by what was seen alone."""
+        """Observed density per (px/s)^2 at one position (2,) of velocities (n, 2)."""
         radius = self._neighbourhood_px()
         limit = float(max(self.shape)) * 2
         x, y = np.floor(np.clip(xy, -limit, limit) + 0.5).astype(np.int64)
         histogram, count = self._cut(int(x) - radius, int(y) - radius, 2 * radius + 1, 2 * radius + 1)
-        everywhere = self._map_distribution()
+        map_weights = self._map_distribution()
         density = densities_at_pixel(
-            histogram, count, everywhere, radius, radius, self.bins.to_bins(v), radius, self._blur(), 0.0
+            histogram, count, map_weights, radius, radius, self.bins.to_bins(v), radius, self.bins.blur_bins2, 0.0
         )
-        return np.asarray(density / self.bins.width_px_per_s**2, np.float64)
-
-    def _blur(self) -> float:
-        """What the kernel and the bins add to the variance of a velocity component, bins^2."""
-        return (self.bins.kernel_sigma_px_per_s / self.bins.width_px_per_s) ** 2 + 1.0 / 12.0
+        return np.asarray(density / self.bins.area_px2_per_s2, np.float64)
 
     def _neighbourhood_px(self) -> int:
-        """How far the pixels around reach."""
+        """Radius of a pixel's neighbourhood in the prior."""
         if self.bins.gsd_m is None:
             return _NEIGHBOURHOOD_PX
         return max(1, round(_NEIGHBOURHOOD_M / self.bins.gsd_m))
 
     def _map_distribution(self) -> FloatArray:
-        """(nvy, nvx) the whole map's distribution, from tiles spread over it; zero where it is empty."""
-        if self._everywhere is None:
+        """(nvy, nvx) the whole map's distribution, from a sample of its tiles; zero if it is empty."""
+        if self._map_weights is None:
             total = np.zeros((self.bins.n, self.bins.n))
-            step = max(1, len(self.tiles) // _TILES_OF_THE_MAP)
+            step = max(1, len(self.tiles) // _MAP_SAMPLE_TILES)
             for ty, tx in self.tiles[::step]:
                 tile = self._tile(ty, tx)
                 if tile is not None:
                     total += tile[0].sum(axis=(0, 1), dtype=np.int64)
-            self._everywhere = total / max(total.sum(), 1)
-        return self._everywhere
+            self._map_weights = total / max(total.sum(), 1)
+        return self._map_weights
 
     def _window(self, ty: int, tx: int, margin: int) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
-        """A tile with a margin from its neighbours: histogram, count, and the pixel (x, y) of its first corner."""
+        """A tile with a margin: histogram, count, and the pixel (x, y) of its first corner."""
         x0, y0 = tx * self.tile_size - margin, ty * self.tile_size - margin
         extent = self.tile_size + 2 * margin
         return *self._cut(x0, y0, extent, extent), np.array([x0, y0], np.int64)
 
     def _cut(self, x0: int, y0: int, width: int, height: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Histogram and count of a window of the map that may reach beyond it."""
+        """Histogram and count of a window of the map; zero where it is outside the map."""
         size = self.tile_size
         histogram = np.zeros((height, width, self.bins.n, self.bins.n), np.int32)
         count = np.zeros((height, width), np.int32)
@@ -340,29 +341,29 @@ class VelocityField:
     # -- tiles --------------------------------------------------------------------------------------------------------
 
     def _tile_statistics(self, tile: Tile) -> TileStatistics:
-        histogram, count, noise = tile
+        histogram, count, variance_sum = tile
         return tile_statistics(
-            histogram, count, noise, bins=self.bins, stationary_speed_px_per_s=self.stationary_speed_px_per_s
+            histogram, count, variance_sum, bins=self.bins, stationary_speed_px_per_s=self.stationary_speed_px_per_s
         )
 
     def _tile(self, ty: int, tx: int) -> Tile | None:
-        """A tile, from the few kept in memory where it is one of them."""
+        """A tile, from the cache if it is there."""
         key = (ty, tx)
         if key not in self._known:
             return None
         with self._lock:
-            if key in self._kept:
-                self._kept.move_to_end(key)
-                return self._kept[key]
+            if key in self._cache:
+                self._cache.move_to_end(key)
+                return self._cache[key]
         found = self._source(ty, tx)
         with self._lock:
-            self._kept[key] = found
-            while len(self._kept) > _TILES_KEPT:
-                self._kept.popitem(last=False)
+            self._cache[key] = found
+            while len(self._cache) > _CACHED_TILES:
+                self._cache.popitem(last=False)
         return found
 
-    def _over_tiles(self, work: Callable[[Tile], T]) -> Iterator[tuple[_Place, T]]:
-        """Work on every tile, in raster order: where it stands in the map, and the result. Tiles are not kept."""
+    def _over_tiles(self, work: Callable[[Tile], T]) -> Iterator[tuple[_Window, T]]:
+        """The result of ``work`` for every tile with its window in the map, in raster order. Tiles are not cached."""
 
         def one(key: tuple[int, int]) -> T | None:
             tile = self._source(*key)

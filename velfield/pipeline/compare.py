@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from velfield.exports.cog import write_cog
 from velfield.field.bins import stationary_speed_px_per_s
-from velfield.field.comparison import FALSE_SHARE, MIN_COUNT, Change, compare_fields
+from velfield.field.comparison import FDR_LEVEL, MIN_COUNT, Change, compare_fields
 from velfield.report.change import change_figure
 from velfield.report.figures import MapScale, png_bytes
 from velfield.run.commits import write_atomically
@@ -54,7 +54,7 @@ def compare_runs(before: Path, after: Path, out: Path, *, min_count: int = MIN_C
     _show_in_the_viewer(changes, before, runs[1])
     return [
         *(_line(name, changes[name], *shown[name]) for name in changes),
-        f"significant: at most {FALSE_SHARE:.0%} of what is shown is chance; figures and change.tif in {out}",
+        f"significant: at most {FDR_LEVEL:.0%} of what is shown is chance; figures and change.tif in {out}",
     ]
 
 
@@ -96,7 +96,7 @@ def _write_layers(
 ) -> None:
     layers, names, units = [], [], []
     for name, (values, unit) in shown.items():
-        layers += [values.astype(np.float32), changes[name].chance.astype(np.float32)]
+        layers += [values.astype(np.float32), changes[name].p_value.astype(np.float32)]
         names += [f"{name} change", f"probability of such a {name} change by chance"]
         units += [unit, "1"]
     write_cog(path, layers, names=names, units=units, crs_wkt=run.grid.crs_wkt, affine=run.grid.affine)

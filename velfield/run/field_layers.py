@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.flight import FieldConfig
-from velfield.field.accumulate import NOISE_UNIT, FieldTile
+from velfield.field.accumulate import VARIANCE_UNIT, FieldTile
 from velfield.field.bins import VelocityBins, stationary_speed_px_per_s
 from velfield.field.statistics import tile_statistics
 
@@ -19,7 +19,8 @@ LAYERS: dict[str, dict[str, Any]] = {
     "velocity_noise": {
         "dtype": "int32",
         "units": "1",
-        "long_name": f"sum over passages of the variance of a velocity component, in bins squared times {NOISE_UNIT}",
+        "long_name": "sum over passages of the variance of a velocity component, in bins squared times "
+        f"{VARIANCE_UNIT}",
     },
     "modal_vx": {**_SPEED, "long_name": "x component of the modal velocity"},
     "modal_vy": {**_SPEED, "long_name": "y component of the modal velocity, down"},
@@ -43,21 +44,21 @@ LAYERS: dict[str, dict[str, Any]] = {
 
 def tile_layers(tile: FieldTile, bins: VelocityBins, config: FieldConfig) -> dict[str, NDArray[Any]]:
     """All layers of one tile, each (ty, tx)."""
-    standing = stationary_speed_px_per_s(config, bins.gsd_m)
-    s = tile_statistics(tile.histogram, tile.count, tile.noise, bins=bins, stationary_speed_px_per_s=standing)
+    limit = stationary_speed_px_per_s(config, bins.gsd_m)
+    s = tile_statistics(tile.histogram, tile.count, tile.variance_sum, bins=bins, stationary_speed_px_per_s=limit)
     values: dict[str, NDArray[Any]] = {
         "count": tile.count,
-        "dwell_ms": tile.dwell_ms,
-        "velocity_noise": tile.noise,
+        "dwell_ms": tile.occupancy_ms,
+        "velocity_noise": tile.variance_sum,
         "modal_vx": s.modal_velocity_px_per_s[..., 0],
         "modal_vy": s.modal_velocity_px_per_s[..., 1],
-        "mode_share": s.mode_share,
+        "mode_share": s.mode_fraction,
         "mean_vx": s.mean_velocity_px_per_s[..., 0],
         "mean_vy": s.mean_velocity_px_per_s[..., 1],
         "speed_p15": s.speed_percentiles_px_per_s[..., 0],
         "speed_p50": s.speed_percentiles_px_per_s[..., 1],
         "speed_p85": s.speed_percentiles_px_per_s[..., 2],
-        "standing_share": s.standing_share,
+        "standing_share": s.stationary_fraction,
         "circular_variance": s.circular_variance,
         "entropy": s.entropy_nats,
         "direction_se": s.direction_se_rad,

@@ -71,7 +71,7 @@ def field_of_store(
 
     def tile(row: int, column: int) -> Tile | None:
         found = read(row, column)
-        return None if found is None else (found.histogram, found.count, found.noise)
+        return None if found is None else (found.histogram, found.count, found.variance_sum)
 
     return VelocityField(
         tile,

@@ -119,8 +119,8 @@ def _touching(run: Run, tracklets: pd.DataFrame, x: int, y: int) -> Segments:
 
 
 def _passages(tracklets: pd.DataFrame, segments: Segments) -> Iterator[PassageLineage]:
-    for passage in np.unique(segments["passage"]):
-        mine = segments[segments["passage"] == passage]
+    for passage in np.unique(segments["track"]):
+        mine = segments[segments["track"] == passage]
         pairs = set(zip(mine["detection_0"].tolist(), mine["detection_1"].tolist(), strict=True))
         rows = tracklets[(tracklets["passage_id"] == passage) & _has_pair(tracklets, pairs)]
         frames = np.unique(rows[["frame_0", "frame_1", "frame_2"]].to_numpy())

@@ -101,7 +101,7 @@ def view_record(
         arrays={name: array for path, each in stores.items() for name, array in _arrays(path, each).items()},
         segments=ViewSegments(
             count=len(segments),
-            passages=len(np.unique(segments["passage"])),
+            passages=len(np.unique(segments["track"])),
             settle_px=settle_px(grid.gsd_m),
             reach_px=band_radius_px(flight.config.field, grid.gsd_m) or _LINE_REACH_PX,
         ),
@@ -129,7 +129,7 @@ def _arrays(path: str, store: FieldStore) -> dict[str, ViewArray]:
 
 def _columns(segments: Segments) -> dict[str, np.ndarray]:
     """Columns for the page: passages numbered from 0, places and velocities in float32 (a thousandth of a pixel)."""
-    numbers = np.unique(segments["passage"], return_inverse=True)[1]
+    numbers = np.unique(segments["track"], return_inverse=True)[1]
     names = ("duration_s", "x0_px", "y0_px", "x1_px", "y1_px", "vx_px_per_s", "vy_px_per_s")
     return {
         "passage": numbers.astype(np.int32),
