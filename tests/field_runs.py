@@ -1,5 +1,6 @@
-"""Run folders that hold no more than a field: simulated traffic's tracklets, without pictures."""
+"""Run folders with a field only: tracklets of simulated or constructed traffic, without images."""
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -7,7 +8,9 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pandas as pd
+from numpy.lib.stride_tricks import sliding_window_view
 
+from schemas.arrays import FloatArray
 from schemas.flight import FieldConfig, FlightConfig
 from schemas.records import FlightRecord, GridRecord, InputsRecord, SourceRecord
 from schemas.simulation import SimulationConfig
@@ -25,13 +28,13 @@ GSD_M = 0.23
 
 @cache
 def flight(seed: int, frames: int = 50) -> Flight:
-    """A small simulated flight, of which no picture is ever drawn."""
+    """A small simulated flight; no image of it is rendered."""
     return Flight(SimulationConfig(seed=seed, frames=frames, width=240, height=180))
 
 
 @cache
 def traffic_tracklets(seed: int, frames: int = 50) -> pd.DataFrame:
-    """Its tracklets, as the pipeline would see them."""
+    """Its tracklets, with the errors of the pipeline."""
     simulated = flight(seed, frames)
     return observed_tracklets(
         simulated.city.traffic,
@@ -40,6 +43,28 @@ def traffic_tracklets(seed: int, frames: int = 50) -> pd.DataFrame:
         shape=simulated.base_shape,
         rng=np.random.default_rng(seed),
     )
+
+
+def tracklets_along(paths: Sequence[FloatArray], *, interval_s: float = 0.2) -> pd.DataFrame:
+    """Tracklets without errors along paths (n, 2), a position an interval; the low 20 bits of an id are the path's."""
+    rows = []
+    for number, path in enumerate(paths):
+        for frame, window in enumerate(sliding_window_view(path, 3, axis=0).transpose(0, 2, 1)):
+            row: dict[str, float] = {"confidence": 1.0, "passage_id": number}
+            for k, (x, y) in enumerate(window):
+                row |= {
+                    f"frame_{k}": frame + k,
+                    f"time_{k}_s": (frame + k) * interval_s,
+                    f"x_{k}_px": x,
+                    f"y_{k}_px": y,
+                }
+                row[f"detection_id_{k}"] = ((frame + k) << 20) + number
+            for k, (vx, vy) in enumerate(np.diff(window, axis=0) / interval_s):
+                row |= {f"vx_{k}{k + 1}_px_per_s": vx, f"vy_{k}{k + 1}_px_per_s": vy}
+            rows.append(row | {"tracklet_id": row["detection_id_1"]})
+    table = pd.DataFrame(rows)
+    missing = {name: 0 for name in TRACKLET_COLUMNS if name not in table}
+    return table.assign(**missing)[list(TRACKLET_COLUMNS)].astype(TRACKLET_COLUMNS)
 
 
 def field_run(

@@ -1,4 +1,5 @@
-"""What a traffic engineer asks of a field: carriageways and their speeds, where traffic stops, slows or turns back.
+"""Traffic engineering on a velocity field: carriageways, stops, bottlenecks, U-turns, crossings of a line.
 
-Pure functions on the field's (y, x) layers or on the segment table; they return tables of places, in base pixels.
+Pure functions on the field's (y, x) layers or on the segment table; positions are base pixels. `Run.analysis` applies
+them to a run folder.
 """

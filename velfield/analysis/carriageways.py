@@ -1,51 +1,49 @@
-"""Carriageways: where vehicles go the same way, with their direction and speeds."""
+"""Carriageways: connected pixels of one direction of travel, with their direction and speeds."""
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
-from velfield.analysis.regions import keep_large, label_smooth, region_table
+from velfield.analysis.regions import Regions, keep_large, label_smooth, region_table
 
 
-def carriageways(
+def find_carriageways(
     direction_rad: NDArray[np.floating],
     count: NDArray[np.integer],
     *,
-    speeds_px_per_s: dict[str, NDArray[np.floating]] | None = None,
+    speeds_px_per_s: Mapping[str, NDArray[np.floating]] | None = None,
     min_count: int = 3,
     max_step_rad: float = math.radians(15),
     min_area_px: int = 200,
-) -> tuple[NDArray[np.int32], pd.DataFrame]:
-    """Connected pixels whose direction changes smoothly: a carriageway may bend, its opposite is another.
+) -> Regions:
+    """Connected pixels whose direction changes smoothly: a carriageway may bend, the opposite one is another.
 
     Parameters
     ----------
     direction_rad
         (h, w) modal direction; NaN where there is none.
     count
-        (h, w) passages.
+        (h, w) tracks.
     speeds_px_per_s
         (h, w) speed layers by name (``p50``, ``p85``), of which the table gives medians.
     min_count
-        Pixels of fewer passages are left out: a single tracklet is no lane.
+        Fewest tracks of a pixel: a single track is no lane.
     max_step_rad
-        Largest change of direction from a pixel to the next.
+        Largest change of direction between neighbouring pixels.
     min_area_px
-        Smaller regions are dropped.
+        Smaller regions are dropped, px.
 
     Returns
     -------
-    labels
-        (h, w) number of the carriageway, 0 where there is none.
-    table
-        A row each: ``region, x_px, y_px, area_px, passages, direction_rad`` (circular mean), ``straightness`` (1: all
-        one direction, 0: round and round) and ``speed_<name>_px_per_s``.
+    Regions
+        The table's columns: medians ``tracks`` and ``speed_<name>_px_per_s``; ``direction_rad`` (circular mean) and
+        ``straightness`` (resultant length of the directions: 1 all equal, 0 a full circle).
     """
     direction = np.where(count >= min_count, direction_rad, np.nan).astype(np.float64)
     labels = keep_large(label_smooth(direction, max_step_rad), min_area_px=min_area_px)
-    layers: dict[str, NDArray[np.floating]] = {"passages": np.asarray(count, np.float64)}
+    layers: dict[str, NDArray[np.floating]] = {"tracks": np.asarray(count, np.float64)}
     for name, speed in (speeds_px_per_s or {}).items():
         layers[f"speed_{name}_px_per_s"] = speed
     table = region_table(labels, layers)
@@ -56,4 +54,4 @@ def carriageways(
     sine = np.bincount(flat, np.sin(angle), size)[1:]
     table["direction_rad"] = np.arctan2(sine, cosine)
     table["straightness"] = np.hypot(cosine, sine) / np.maximum(table["area_px"].to_numpy(), 1)
-    return labels, table
+    return Regions(labels, table)

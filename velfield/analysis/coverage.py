@@ -1,16 +1,16 @@
-"""How much of a map is known, and by how many vehicles, in words."""
+"""Coverage of a map by vehicles, in words."""
 
-_SEEN_WELL = 0.05
-"""Below this share of pixels that five vehicles passed, a map of speeds is one of single vehicles."""
+_MIN_FRACTION_5 = 0.05
+"""Below this fraction of pixels with five tracks, a map of speeds is one of single vehicles."""
 
 
 def few_vehicles(pixels: int, pixels_5: int) -> str:
-    """What is to be said of a field where hardly any pixel was passed by five vehicles; nothing of any other.
+    """A note on a field where few pixels have five tracks; empty for any other.
 
     Parameters
     ----------
     pixels, pixels_5
-        Pixels that a vehicle passed, and those that 5 or more did.
+        Numbers of pixels with one track or more, and with 5 or more.
 
     Examples
     --------
@@ -19,22 +19,22 @@ def few_vehicles(pixels: int, pixels_5: int) -> str:
     >>> few_vehicles(55251, 20000), few_vehicles(0, 0)
     ('', '')
     """
-    if pixels_5 >= _SEEN_WELL * pixels:
+    if pixels_5 >= _MIN_FRACTION_5 * pixels:
         return ""
-    share = f"{percent(pixels_5, pixels)} of the known pixels were" if pixels_5 else "No pixel was"
+    fraction = f"{percent(pixels_5, pixels)} of the known pixels were" if pixels_5 else "No pixel was"
     return (
-        f"{share} passed by 5 or more vehicles. Directions hold; speeds and percentiles are those of single vehicles. "
-        "Fly longer, or add flights up."
+        f"{fraction} passed by 5 or more vehicles. Directions hold; speeds and percentiles are those of single "
+        "vehicles. Fly longer, or add flights up."
     )
 
 
 def percent(part: float, whole: float) -> str:
-    """A share as people say it, two digits of it at least where it is small.
+    """A fraction in per cent, with two significant digits below 10 %.
 
     Examples
     --------
     >>> percent(55251, 2089710), percent(3, 4), percent(0, 4), percent(1, 10000), percent(0, 0)
     ('2.6 %', '75 %', '0 %', '0.01 %', '0 %')
     """
-    share = 100 * part / whole if whole else 0.0
-    return f"{share:.0f} %" if share >= 9.95 or share == 0 else f"{share:.2g} %"
+    value = 100 * part / whole if whole else 0.0
+    return f"{value:.0f} %" if value >= 9.95 or value == 0 else f"{value:.2g} %"

@@ -1,53 +1,52 @@
-"""Who crosses a line drawn across a road, which way and how fast: a loop detector laid on the map."""
+"""Crossings of a line by vehicles: a virtual loop detector on the map."""
 
 from collections.abc import Iterator
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray
+from schemas.arrays import FloatArray, IntArray
 from schemas.flight import PAPER_GSD_M
 from velfield.field.segments import Segments
 
 CROSSING_COLUMNS = ["passage", "time_s", "x_px", "y_px", "vx_px_per_s", "vy_px_per_s", "speed_px_per_s", "direction"]
-_SETTLE_M = 2.0
+_HYSTERESIS_M = 2.0
 
 
-def settle_px(gsd_m: float | None) -> float:
-    """How far beyond a line a vehicle must get to have crossed it, px: half a car; jitter stays below."""
-    return _SETTLE_M / (gsd_m or PAPER_GSD_M)
+def hysteresis_px(gsd_m: float | None) -> float:
+    """Distance beyond a line at which a vehicle has crossed it, px: half a car, more than jitter."""
+    return _HYSTERESIS_M / (gsd_m or PAPER_GSD_M)
 
 
-def line_crossings(
-    segments: Segments, start_xy: tuple[float, float], end_xy: tuple[float, float], *, settle_px: float
+def find_crossings(
+    segments: Segments, start_xy: tuple[float, float], end_xy: tuple[float, float], *, hysteresis_px: float
 ) -> pd.DataFrame:
     """Crossings of the line from ``start_xy`` to ``end_xy``.
 
     Parameters
     ----------
     segments
-        Segment table, sorted by passage and time.
+        Segment table, sorted by track and time.
     start_xy, end_xy
         Ends of the line, base px.
-    settle_px
-        A vehicle that comes back over the line before it got so far from it has not crossed it, neither time: who
-        stands on the line jitters.
+    hysteresis_px
+        A vehicle that crosses back before it is this far from the line has crossed it neither time: a stationary
+        vehicle on the line jitters.
 
     Returns
     -------
     DataFrame
-        `CROSSING_COLUMNS`, by passage and time; ``direction`` is +1 for who goes from the left of the line to its
-        right, looking from its start to its end as the picture is seen, else -1.
+        `CROSSING_COLUMNS`, by track and time; ``direction`` is +1 from the left of the line to its right, as the image
+        is seen and looking from its start to its end, otherwise -1.
     """
-    before, place = _beside(segments["x0_px"], segments["y0_px"], start_xy, end_xy)
-    after, place_after = _beside(segments["x1_px"], segments["y1_px"], start_xy, end_xy)
+    before, along = _line_coordinates(segments["x0_px"], segments["y0_px"], start_xy, end_xy)
+    after, along_after = _line_coordinates(segments["x1_px"], segments["y1_px"], start_xy, end_xy)
     crosses = (before >= 0) != (after >= 0)
-    share = np.divide(before, before - after, out=np.zeros(len(segments)), where=crosses)
-    place = place + share * (place_after - place)
-    rows = np.flatnonzero(crosses & (place >= 0) & (place <= 1))
-    kept = np.array(list(_settled(segments["track"], after, rows, settle_px)), np.int64)
-    found, part = segments[kept], share[kept]
+    fraction = np.divide(before, before - after, out=np.zeros(len(segments)), where=crosses)
+    along = along + fraction * (along_after - along)
+    rows = np.flatnonzero(crosses & (along >= 0) & (along <= 1))
+    kept = np.array(list(_with_hysteresis(segments["track"], after, rows, hysteresis_px)), np.int64)
+    found, part = segments[kept], fraction[kept]
     return pd.DataFrame(
         {
             "passage": found["track"],
@@ -63,10 +62,11 @@ def line_crossings(
     )
 
 
-def _beside(
+def _line_coordinates(
     x: FloatArray, y: FloatArray, start: tuple[float, float], end: tuple[float, float]
 ) -> tuple[FloatArray, FloatArray]:
-    """Distance of points to the right of the line, px, and their place along it, 0 at its start and 1 at its end."""
+    """Signed distance of points from the line, positive to its right, px, and their position along it, 0 at its start
+    and 1 at its end."""
     dx, dy = end[0] - start[0], end[1] - start[1]
     length = max(float(np.hypot(dx, dy)), 1e-9)
     right = (dx * (y - start[1]) - dy * (x - start[0])) / length
@@ -74,14 +74,15 @@ def _beside(
     return right, along
 
 
-def _settled(passage: NDArray[np.int64], after: FloatArray, rows: NDArray[np.int64], settle_px: float) -> Iterator[int]:
-    """Rows that cross, without the pairs of a vehicle that went over the line and back within ``settle_px``."""
+def _with_hysteresis(track: IntArray, after: FloatArray, rows: IntArray, hysteresis_px: float) -> Iterator[int]:
+    """Rows that cross, without the pairs in which a vehicle crosses and crosses back within ``hysteresis_px``."""
     stack: list[int] = []
     for row in rows:
-        if stack and passage[stack[-1]] != passage[row]:
+        if stack and track[stack[-1]] != track[row]:
             yield from stack
             stack = []
-        if stack and (after[stack[-1]] >= 0) != (after[row] >= 0) and _excursion(after, stack[-1], row) < settle_px:
+        back = bool(stack) and (after[stack[-1]] >= 0) != (after[row] >= 0)
+        if back and _excursion(after, stack[-1], row) < hysteresis_px:
             stack.pop()
         else:
             stack.append(int(row))
@@ -89,5 +90,5 @@ def _settled(passage: NDArray[np.int64], after: FloatArray, rows: NDArray[np.int
 
 
 def _excursion(after: FloatArray, out: int, back: int) -> float:
-    """Farthest from the line between crossing out and back, px."""
+    """Largest distance from the line between a crossing and the crossing back, px."""
     return float(np.abs(after[out:back]).max())

@@ -1,6 +1,7 @@
-"""Connected regions of a map, and a table of them."""
+"""Connected regions of a map, and the table of them."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -8,17 +9,36 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
 
-_EIGHT = np.ones((3, 3), np.int8)
+from schemas.arrays import FloatArray, Mask
+
+_EIGHT_NEIGHBOURS = np.ones((3, 3), np.int8)
 
 
-def label_mask(mask: NDArray[np.bool_], *, min_area_px: int) -> NDArray[np.int32]:
-    """Regions of a mask, corners joined, numbered from 1; smaller ones are dropped (0)."""
-    labels, _ = ndimage.label(mask, structure=_EIGHT)
+@dataclass(frozen=True)
+class Regions:
+    """Connected regions of a map.
+
+    Attributes
+    ----------
+    labels
+        (h, w) int32 number of the region of each pixel, 0 outside all.
+    table
+        One row a region: ``region`` (its number), ``x_px, y_px`` (its pixel nearest to its centroid), ``area_px``, and
+        medians of layers over its pixels.
+    """
+
+    labels: NDArray[np.int32]
+    table: pd.DataFrame
+
+
+def label_mask(mask: Mask, *, min_area_px: int) -> NDArray[np.int32]:
+    """Connected components of a mask (8-connectivity), numbered from 1; smaller ones are dropped (0)."""
+    labels, _ = ndimage.label(mask, structure=_EIGHT_NEIGHBOURS)
     return keep_large(np.asarray(labels, np.int32), min_area_px=min_area_px)
 
 
 def keep_large(labels: NDArray[np.int32], *, min_area_px: int) -> NDArray[np.int32]:
-    """Regions of at least ``min_area_px``, numbered from 1 in the order of their old numbers."""
+    """Regions of at least ``min_area_px``, renumbered from 1 in the same order."""
     area = np.bincount(labels.ravel())
     large = area >= min_area_px
     large[0] = False
@@ -28,11 +48,11 @@ def keep_large(labels: NDArray[np.int32], *, min_area_px: int) -> NDArray[np.int
 
 
 def region_table(labels: NDArray[np.int32], medians: Mapping[str, NDArray[np.floating]]) -> pd.DataFrame:
-    """A row a region: ``region``, ``x_px``, ``y_px`` (of its pixel nearest to its centre), ``area_px``, medians."""
+    """The table of `Regions`, with the medians of the layers in ``medians``; NaN where a layer is unknown."""
     rows = []
     for k, box in enumerate(ndimage.find_objects(labels), start=1):
-        mine = labels[box] == k
-        y, x = np.nonzero(mine)
+        inside = labels[box] == k
+        y, x = np.nonzero(inside)
         nearest = np.argmin((y - y.mean()) ** 2 + (x - x.mean()) ** 2)
         row: dict[str, float] = {
             "region": k,
@@ -41,7 +61,7 @@ def region_table(labels: NDArray[np.int32], medians: Mapping[str, NDArray[np.flo
             "area_px": len(x),
         }
         for name, values in medians.items():
-            known = values[box][mine]
+            known = values[box][inside]
             known = known[np.isfinite(known)]
             row[name] = float(np.median(known)) if len(known) else np.nan
         rows.append(row)
@@ -57,8 +77,8 @@ def _root(parent: NDArray[np.int32], i: int) -> int:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def label_smooth(angle_rad: NDArray[np.float64], max_step_rad: float) -> NDArray[np.int32]:
-    """Regions within which the angle changes by no more than ``max_step_rad`` from pixel to pixel; 0 where NaN."""
+def label_smooth(angle_rad: FloatArray, max_step_rad: float) -> NDArray[np.int32]:
+    """Connected components (4-connectivity) of pixels whose angles differ by at most ``max_step_rad``; 0 where NaN."""
     height, width = angle_rad.shape
     parent = np.arange(height * width).astype(np.int32)
     for y in range(height):
@@ -67,7 +87,7 @@ def label_smooth(angle_rad: NDArray[np.float64], max_step_rad: float) -> NDArray
                 j, i = y + dy, x + dx
                 if j < height and i < width:
                     step = abs((angle_rad[y, x] - angle_rad[j, i] + np.pi) % (2 * np.pi) - np.pi)
-                    if step <= max_step_rad:  # NaN is never
+                    if step <= max_step_rad:  # False for NaN
                         a, b = _root(parent, y * width + x), _root(parent, j * width + i)
                         parent[max(a, b)] = min(a, b)
     labels = np.zeros((height, width), np.int32)

@@ -4,6 +4,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from schemas.arrays import FloatArray
 from schemas.records import GridRecord, WorkingRecord
 from velfield.errors import InputError
 from velfield.run.layout import RunLayout
@@ -43,6 +44,17 @@ def north_of(grid: GridRecord) -> float | None:
     # One step north in the CRS, as a step of pixels: the inverse of [[a, b], [d, e]] times (0, 1).
     determinant = a * e - b * d
     return float(np.arctan2(a / determinant, -b / determinant))
+
+
+def heading_deg(direction_rad: FloatArray, north_rad: float | None) -> FloatArray:
+    """Compass heading of directions of motion in [0, 360), clockwise from north; from the image's up if None.
+
+    Examples
+    --------
+    >>> heading_deg(np.array([0.0, np.pi / 2]), None).tolist()
+    [90.0, 180.0]
+    """
+    return np.mod(np.degrees(direction_rad - (-np.pi / 2 if north_rad is None else north_rad)), 360.0)
 
 
 @lru_cache(maxsize=8)

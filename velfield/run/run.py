@@ -10,16 +10,17 @@ from numpy.typing import NDArray
 from schemas.arrays import Points
 from schemas.records import FORMAT_VERSION, FlightRecord, GridRecord
 from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
-from velfield.analysis.crossings import line_crossings, settle_px
+from velfield.analysis.crossings import find_crossings, hysteresis_px
 from velfield.errors import InputError
 from velfield.field.segments import Segments, segment_table
 from velfield.field.view import VelocityField
+from velfield.run.analysis import RunAnalysis
 from velfield.run.field_reader import IntervalField, open_field_intervals, open_velocity_field
 from velfield.run.frame_transforms import FrameMaps
 from velfield.run.grid import read_grid
 from velfield.run.layout import RunLayout
 from velfield.run.paths import local_copy
-from velfield.run.stores import FrameStore, RegistrationStore, open_frames, open_registration
+from velfield.run.stores import FrameStore, RegistrationStore, open_field, open_frames, open_registration
 from velfield.run.tables import read_tables
 
 _EACH_ONCE = {"shared_segment_weight": 1}
@@ -120,8 +121,8 @@ class Run:
         return segment_table(self.tracklets(), self.record.config.field.model_copy(update=_EACH_ONCE))
 
     def crossings(self, start_xy: tuple[float, float], end_xy: tuple[float, float]) -> pd.DataFrame:
-        """Who crosses the line between two base pixels, which way and how fast: `line_crossings`."""
-        return line_crossings(self.segments(), start_xy, end_xy, settle_px=settle_px(self.grid.gsd_m))
+        """Crossings of the line between two base pixels by vehicles: `find_crossings`."""
+        return find_crossings(self.segments(), start_xy, end_xy, hysteresis_px=hysteresis_px(self.grid.gsd_m))
 
     @cached_property
     def field(self) -> VelocityField:
@@ -137,6 +138,11 @@ class Run:
     def field_intervals(self) -> dict[str, IntervalField]:
         """Fields of time intervals by name, in their order; empty where none were asked for (``--intervals``)."""
         return {found.name: found for found in open_field_intervals(self.layout)}
+
+    @cached_property
+    def analysis(self) -> RunAnalysis:
+        """Carriageways, stops, bottlenecks and U-turns: ``run.analysis.stops().table``."""
+        return RunAnalysis(open_field(self.layout.field).layer, self.segments, self.grid, self.record.config.field)
 
     @cached_property
     def base_image(self) -> NDArray[np.uint8]:

@@ -18,7 +18,7 @@ from schemas.arrays import FloatArray
 from schemas.records import FlightRecord, GridRecord
 from schemas.view import ViewArray, ViewBase, ViewLayer, ViewRecord, ViewSegments
 from velfield.analysis.coverage import few_vehicles
-from velfield.analysis.crossings import settle_px
+from velfield.analysis.crossings import hysteresis_px
 from velfield.field.bins import band_radius_px, stationary_speed_px_per_s
 from velfield.field.segments import Segments
 from velfield.run.commits import write_atomically
@@ -102,7 +102,7 @@ def view_record(
         segments=ViewSegments(
             count=len(segments),
             passages=len(np.unique(segments["track"])),
-            settle_px=settle_px(grid.gsd_m),
+            settle_px=hysteresis_px(grid.gsd_m),
             reach_px=band_radius_px(flight.config.field, grid.gsd_m) or _LINE_REACH_PX,
         ),
         few=few_vehicles(int((count > 0).sum()), int((count >= 5).sum())),

@@ -16,7 +16,7 @@ from velfield.pipeline.result import Outcome
 from velfield.pipeline.stages.certificates import write_certificates
 from velfield.report.figures import MapScale, direction_figure, png_bytes, speed_figure
 from velfield.run.commits import write_atomically
-from velfield.run.grid import north_of, read_grid
+from velfield.run.grid import heading_deg, north_of, read_grid
 from velfield.run.paths import local_copy, written_locally
 from velfield.run.stores import open_field
 from velfield.sources.images import read_picture_grey
@@ -64,7 +64,7 @@ def _layers(plan: Plan, direction: FloatArray, speed: FloatArray) -> list[Path]:
     """Direction as heading and speed as GeoTIFF, each value with its unit."""
     grid, maps = read_grid(plan.layout), plan.layout.maps
     north = north_of(grid)
-    heading = np.mod(np.degrees(direction - (-np.pi / 2 if north is None else north)), 360.0)
+    heading = heading_deg(direction, north)
     unit, factor = ("m s-1", grid.gsd_m) if grid.gsd_m else ("px s-1", 1.0)
     about = "heading, clockwise from north" if north is not None else "heading, clockwise from the picture's up"
     for name, values, label, units in (

@@ -1,0 +1,158 @@
+"""`Run.analysis`: the analyses of `velfield.analysis` on the stored layers and tracks of a run, lengths in metres."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from math import radians
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from schemas.arrays import FloatArray
+from schemas.flight import PAPER_GSD_M, FieldConfig
+from schemas.records import GridRecord
+from velfield.analysis.bottlenecks import find_bottlenecks
+from velfield.analysis.carriageways import find_carriageways
+from velfield.analysis.regions import Regions
+from velfield.analysis.stops import find_stops
+from velfield.analysis.u_turns import find_u_turns
+from velfield.field.bins import stationary_speed_px_per_s
+from velfield.field.segments import Segments
+from velfield.field.statistics import direction_rad
+from velfield.run.grid import heading_deg, north_of
+
+
+@dataclass(frozen=True)
+class RunAnalysis:
+    """Traffic analyses of one run.
+
+    Positions and areas in the results are base pixels, speeds px/s (times ``grid.gsd_m``: m/s). Without a ground sample
+    distance the metres of the parameters are converted by the paper's.
+
+    Attributes
+    ----------
+    layer
+        Returns a (y, x) layer of ``field.zarr`` by its name.
+    segments
+        Returns the segment table of the run.
+    grid, config
+        Base pixels and configuration of the field.
+    """
+
+    layer: Callable[[str], NDArray[np.generic]]
+    segments: Callable[[], Segments]
+    grid: GridRecord
+    config: FieldConfig
+
+    def carriageways(self, *, min_count: int = 3, min_area_m2: float = 10.0) -> Regions:
+        """Connected pixels of one direction of travel: `find_carriageways`.
+
+        The table has ``speed_p50_px_per_s, speed_p85_px_per_s`` and ``heading_deg``, clockwise from north (from the
+        image's up where north is unknown).
+
+        Parameters
+        ----------
+        min_count
+            Fewest tracks of a pixel.
+        min_area_m2
+            Smaller regions are dropped.
+        """
+        speeds = {name: self._float_layer(f"speed_{name}") for name in ("p50", "p85")}
+        area = self._area_px(min_area_m2)
+        found = find_carriageways(
+            self._direction_rad, self._count, speeds_px_per_s=speeds, min_count=min_count, min_area_px=area
+        )
+        direction = found.table["direction_rad"].to_numpy(np.float64)
+        return Regions(found.labels, found.table.assign(heading_deg=heading_deg(direction, north_of(self.grid))))
+
+    def stops(
+        self,
+        *,
+        min_fraction: float = 0.2,
+        max_fraction: float = 0.9,
+        min_count: int = 3,
+        min_area_m2: float = 1.5,
+    ) -> Regions:
+        """Regions where some vehicles are stationary and others are not: `find_stops`.
+
+        Parameters
+        ----------
+        min_fraction, max_fraction
+            Limits of the stationary fraction of the tracks; above the upper one vehicles are parked.
+        min_count
+            Fewest tracks of a pixel.
+        min_area_m2
+            Smaller regions are dropped.
+        """
+        return find_stops(
+            self._float_layer("standing_share"),
+            self._count,
+            min_fraction=min_fraction,
+            max_fraction=max_fraction,
+            min_count=min_count,
+            min_area_px=self._area_px(min_area_m2),
+        )
+
+    def bottlenecks(
+        self, *, distance_m: float = 40.0, max_ratio: float = 0.6, min_count: int = 5, min_area_m2: float = 1.5
+    ) -> Regions:
+        """Regions where the median speed is much lower than upstream on the same carriageway: `find_bottlenecks`.
+
+        Parameters
+        ----------
+        distance_m
+            Distance upstream at which the speed is compared.
+        max_ratio
+            Largest ratio of the speed to that upstream.
+        min_count
+            Fewest tracks of a pixel.
+        min_area_m2
+            Smaller regions are dropped.
+        """
+        return find_bottlenecks(
+            self._float_layer("speed_p50"),
+            self._direction_rad,
+            self._count,
+            distance_px=distance_m / self._gsd_m,
+            max_ratio=max_ratio,
+            min_count=min_count,
+            min_area_px=self._area_px(min_area_m2),
+        )
+
+    def u_turns(self, *, max_path_m: float = 40.0, min_turn_deg: float = 150.0) -> pd.DataFrame:
+        """Tracks that reverse their direction within a short path, one row each: `find_u_turns`.
+
+        Parameters
+        ----------
+        max_path_m
+            Longest path of a U-turn.
+        min_turn_deg
+            Smallest change of direction.
+        """
+        return find_u_turns(
+            self.segments(),
+            stationary_speed_px_per_s=stationary_speed_px_per_s(self.config, self.grid.gsd_m),
+            max_path_px=max_path_m / self._gsd_m,
+            min_turn_rad=radians(min_turn_deg),
+        )
+
+    @cached_property
+    def _direction_rad(self) -> FloatArray:
+        velocity = np.stack([self._float_layer("modal_vx"), self._float_layer("modal_vy")], axis=-1)
+        limit = stationary_speed_px_per_s(self.config, self.grid.gsd_m)
+        return direction_rad(velocity, stationary_speed_px_per_s=limit)
+
+    @cached_property
+    def _count(self) -> NDArray[np.int32]:
+        return np.asarray(self.layer("count"), np.int32)
+
+    @property
+    def _gsd_m(self) -> float:
+        return self.grid.gsd_m or PAPER_GSD_M
+
+    def _area_px(self, area_m2: float) -> int:
+        return max(1, round(area_m2 / self._gsd_m**2))
+
+    def _float_layer(self, name: str) -> FloatArray:
+        return np.asarray(self.layer(name), np.float64)
