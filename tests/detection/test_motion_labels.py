@@ -12,13 +12,13 @@ import pytest
 from numpy.typing import NDArray
 
 from schemas.flight import DetectionConfig
-from velfield.detection.motion.blobs import Blobs, find_blobs, merged
+from velfield.detection.motion.blobs import Blobs, extract_blobs, merge_blobs
 from velfield.detection.motion.difference import (
     MotionFrame,
-    background_of,
+    absolute_difference,
+    background_from_median,
+    estimate_noise,
     motion_background,
-    motion_difference,
-    noise_sigma,
 )
 from velfield.detection.motion.evaluation import (
     Detections,
@@ -117,7 +117,7 @@ def test_moving_cars_are_labelled_at_their_bodies_not_their_shadows() -> None:
     assert recall > 0.8
     assert labels.usable
     assert not labels.warnings
-    assert labels.purity > 0.9
+    assert labels.precision_estimate > 0.9
     assert np.hypot(*(labels.shadow_px - SHADOW)) < 2.5
 
 
@@ -243,7 +243,7 @@ def test_where_too_few_frames_stand_there_is_no_background() -> None:
     background = motion_background(frames)
     assert not background.valid[:, :40].any()
     assert background.valid[:, 40:].all()
-    assert motion_difference(frames[0].image, frames[0].valid, background)[:, :38].max() == 0
+    assert absolute_difference(frames[0].image, frames[0].valid, background)[:, :38].max() == 0
 
 
 def test_half_a_pixel_of_misregistration_makes_no_motion() -> None:
@@ -256,7 +256,7 @@ def test_half_a_pixel_of_misregistration_makes_no_motion() -> None:
     everywhere = np.ones(smooth.shape, np.bool_)
     plain = np.abs(shifted.astype(float) - smooth)
     assert plain.max() > 15
-    assert motion_difference(shifted, everywhere, background_of(smooth)).max() < 4
+    assert absolute_difference(shifted, everywhere, background_from_median(smooth)).max() < 4
 
 
 def test_a_change_of_exposure_makes_no_motion() -> None:
@@ -264,18 +264,18 @@ def test_a_change_of_exposure_makes_no_motion() -> None:
     background = motion_background(frames)
     ramp = np.linspace(0, 40, SIZE[1])[None]
     brighter = np.clip(frames[2].image + ramp, 0, 255).astype(np.uint8)
-    assert np.percentile(motion_difference(brighter, frames[2].valid, background), 99.5) < 8
-    assert 1.0 < noise_sigma(frames[2].image, frames[2].valid, background) < 4
+    assert np.percentile(absolute_difference(brighter, frames[2].valid, background), 99.5) < 8
+    assert 1.0 < estimate_noise(frames[2].image, frames[2].valid, background) < 4
 
 
 def test_merged_regions_have_the_moments_of_their_pixels_together() -> None:
     picture = np.zeros((40, 60), np.float32)
     picture[10:16, 10:20] = 50
     picture[10:16, 24:30] = 50
-    both, pixels = find_blobs(picture, noise=0.0, car_length_px=16.0)
+    both, pixels = extract_blobs(picture, noise=0.0, car_length_px=16.0)
     assert len(both) == 2
-    assert np.array_equal(np.bincount(pixels.region), both.area)
-    one = merged(both, np.zeros(2, np.int64), 1)
+    assert np.array_equal(np.bincount(pixels.blob), both.area)
+    one = merge_blobs(both, np.zeros(2, np.int64), 1)
     ys, xs = np.nonzero(picture)
     assert one.x[0] == pytest.approx(xs.mean())
     assert one.cxx[0] == pytest.approx(xs.var() + 1 / 12)

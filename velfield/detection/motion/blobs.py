@@ -1,33 +1,33 @@
-"""Blobs of what moved: connected regions of the difference picture, with their size and axis."""
+"""Foreground blobs: connected components of the thresholded difference image, with area, moments and contrast."""
 
 from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray
+from schemas.arrays import Float32Array, FloatArray, IntArray, Mask
 
-_SHARE_OF_MAXIMUM = 0.25
-_NOISE_SIGMAS = 4.0  # of what already lies outside the range of the background
-_MIN_STEP_GREY = 8.0
+_MIN_FRACTION_OF_MAXIMUM = 0.25
+"""Of the largest difference within half a car's length: less is the blurred skirt of something stronger."""
+_NOISE_SIGMAS = 4.0
+_MIN_DIFFERENCE_GREY = 8.0
 _MIN_AREA_PX = 8
 
 
 @dataclass(frozen=True)
 class Blobs:
-    """Regions of one frame, one value a region.
+    """Blobs of one frame, one value a blob.
 
     Attributes
     ----------
     x, y : float64 (n,)
-        Mean of the region, working px.
+        Centroid, working px.
     cxx, cxy, cyy : float64 (n,)
-        Covariance of the region's pixels, px^2.
+        Covariance of the pixels (second central moments), px^2.
     area : float64 (n,)
-        Pixels.
+        Number of pixels.
     contrast : float64 (n,)
-        Mean difference to the background, grey levels; positive: brighter.
+        Mean difference to the background, grey levels; positive where brighter.
     """
 
     x: FloatArray
@@ -41,28 +41,28 @@ class Blobs:
     def __len__(self) -> int:
         return len(self.x)
 
-    def take(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> "Blobs":
-        """The chosen regions."""
+    def select(self, chosen: Mask | IntArray) -> "Blobs":
+        """The chosen blobs, by mask or index."""
         return Blobs(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
-    def choose(self, where: NDArray[np.bool_], other: "Blobs") -> "Blobs":
-        """The other set's regions where told, these elsewhere."""
+    def replace_where(self, where: Mask, other: "Blobs") -> "Blobs":
+        """The other set's blobs where the mask (n,) is set, these elsewhere."""
         names = [field.name for field in fields(self)]
         return Blobs(*(np.where(where, getattr(other, name), getattr(self, name)) for name in names))
 
     @property
     def axis_rad(self) -> FloatArray:
-        """Long axis, axial, from +x towards +y, [0, pi)."""
+        """Principal axis, axial, from +x towards +y, [0, pi)."""
         return np.mod(0.5 * np.arctan2(2 * self.cxy, self.cxx - self.cyy), np.pi)
 
     @property
     def length(self) -> FloatArray:
-        """Length of the rectangle that has the region's covariance, px."""
+        """Length of the rectangle with the blob's covariance, px."""
         return self._side(+1.0)
 
     @property
     def width(self) -> FloatArray:
-        """Width of the rectangle that has the region's covariance, px."""
+        """Width of the rectangle with the blob's covariance, px."""
         return self._side(-1.0)
 
     def _side(self, sign: float) -> FloatArray:
@@ -70,82 +70,83 @@ class Blobs:
         return np.sqrt(np.maximum(6 * (self.cxx + self.cyy + sign * spread), 0))
 
     def extent_along(self, angle_rad: FloatArray) -> FloatArray:
-        """Side of the rectangle of the region's covariance along a direction, px."""
+        """Extent along a direction (n,) of a rectangle with the blob's variance in that direction, px."""
         c, s = np.cos(angle_rad), np.sin(angle_rad)
         return np.sqrt(np.maximum(12 * (c * c * self.cxx + 2 * c * s * self.cxy + s * s * self.cyy), 0))
 
 
 @dataclass(frozen=True)
-class Pixels:
-    """The pixels of a frame's regions: whole pixel places, and each one's region.
+class BlobPixels:
+    """Pixels of a frame's blobs.
 
     Attributes
     ----------
     x, y : float64 (m,)
-        Working px.
-    region : int64 (m,)
+        Whole working px.
+    blob : int64 (m,)
         Index into the frame's `Blobs`.
     """
 
     x: FloatArray
     y: FloatArray
-    region: NDArray[np.int64]
+    blob: IntArray
 
 
-def motion_masks(
-    signed: NDArray[np.float32], *, noise: float, car_length_px: float
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Pixels that are brighter, and those that are darker: beyond the noise, and not the skirt of something stronger.
+def foreground_masks(signed: Float32Array, *, noise: float, car_length_px: float) -> tuple[Mask, Mask]:
+    """Pixels significantly brighter, and those significantly darker, than the background.
 
-    Parameters
-    ----------
-    signed : float32 (h, w)
-        From `signed_motion`, grey levels.
-    noise : float
-        Standard deviation of frame minus background, grey levels.
-    car_length_px : float
-        A car's usual length, working px: the reach of the local maximum.
-    """
-    size = np.abs(signed)
-    reach = 2 * max(1, round(0.5 * car_length_px)) + 1
-    maximum = cv2.dilate(size, np.ones((reach, reach), np.uint8))
-    step = max(_NOISE_SIGMAS * noise, _MIN_STEP_GREY)
-    moved = (size > step) & (size > _SHARE_OF_MAXIMUM * maximum)
-    return np.asarray(moved & (signed > 0), np.bool_), np.asarray(moved & (signed < 0), np.bool_)
-
-
-def find_blobs(signed: NDArray[np.float32], *, noise: float, car_length_px: float) -> tuple[Blobs, Pixels]:
-    """Bright and dark regions of one frame's difference to the background.
+    The threshold is the larger of the noise level and a fraction of the local maximum.
 
     Parameters
     ----------
     signed : float32 (h, w)
-        From `signed_motion`, grey levels.
+        From `signed_difference`, grey levels.
     noise : float
         Standard deviation of frame minus background, grey levels.
     car_length_px : float
-        A car's usual length, working px.
+        A car's typical length, working px: side of the window of the local maximum.
     """
-    bright, dark = motion_masks(signed, noise=noise, car_length_px=car_length_px)
-    (light, light_px), (black, black_px) = _regions(bright, signed), _regions(dark, signed)
+    magnitude = np.abs(signed)
+    window = 2 * max(1, round(0.5 * car_length_px)) + 1
+    maximum = cv2.dilate(magnitude, np.ones((window, window), np.uint8))
+    threshold = max(_NOISE_SIGMAS * noise, _MIN_DIFFERENCE_GREY)
+    foreground = (magnitude > threshold) & (magnitude > _MIN_FRACTION_OF_MAXIMUM * maximum)
+    return np.asarray(foreground & (signed > 0), np.bool_), np.asarray(foreground & (signed < 0), np.bool_)
+
+
+def extract_blobs(signed: Float32Array, *, noise: float, car_length_px: float) -> tuple[Blobs, BlobPixels]:
+    """Bright and dark blobs of one frame's difference to the background.
+
+    Parameters
+    ----------
+    signed : float32 (h, w)
+        From `signed_difference`, grey levels.
+    noise : float
+        Standard deviation of frame minus background, grey levels.
+    car_length_px : float
+        A car's typical length, working px.
+    """
+    bright, dark = foreground_masks(signed, noise=noise, car_length_px=car_length_px)
+    brighter, brighter_px = _connected_components(bright, signed)
+    darker, darker_px = _connected_components(dark, signed)
     names = [field.name for field in fields(Blobs)]
-    blobs = Blobs(*(np.concatenate([getattr(light, name), getattr(black, name)]) for name in names))
-    x, y = np.concatenate([light_px.x, black_px.x]), np.concatenate([light_px.y, black_px.y])
-    return blobs, Pixels(x, y, np.concatenate([light_px.region, black_px.region + len(light)]))
+    blobs = Blobs(*(np.concatenate([getattr(brighter, name), getattr(darker, name)]) for name in names))
+    x, y = np.concatenate([brighter_px.x, darker_px.x]), np.concatenate([brighter_px.y, darker_px.y])
+    return blobs, BlobPixels(x, y, np.concatenate([brighter_px.blob, darker_px.blob + len(brighter)]))
 
 
-def merged(blobs: Blobs, group: NDArray[np.int64], count: int) -> Blobs:
-    """One region for each group, of the members' pixels together.
+def merge_blobs(blobs: Blobs, group: IntArray, count: int) -> Blobs:
+    """One blob for each group, with the moments of the members' pixels together.
 
     Parameters
     ----------
     blobs : Blobs
     group : int64 (n,)
-        The group of each region, 0 .. count - 1; -1: in none.
+        Group of each blob, 0 .. count - 1, or -1 for none.
     count : int
         Number of groups; one without members has area 0.
     """
-    members = blobs.take(group >= 0)
+    members = blobs.select(group >= 0)
     which = group[group >= 0]
 
     def total(values: FloatArray) -> FloatArray:
@@ -161,8 +162,8 @@ def merged(blobs: Blobs, group: NDArray[np.int64], count: int) -> Blobs:
     return Blobs(x, y, cxx, cxy, cyy, area, total(members.area * members.contrast) / divisor)
 
 
-def _regions(mask: NDArray[np.bool_], signed: NDArray[np.float32]) -> tuple[Blobs, Pixels]:
-    """Connected regions (8 neighbours) of a mask, with their moments."""
+def _connected_components(mask: Mask, signed: Float32Array) -> tuple[Blobs, BlobPixels]:
+    """Components (8-connected) of a mask, with the moments of their pixels; small ones are dropped."""
     count, labels = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)
     ys, xs = np.nonzero(mask)
     which = labels[ys, xs]
@@ -180,5 +181,5 @@ def _regions(mask: NDArray[np.bool_], signed: NDArray[np.float32]) -> tuple[Blob
     kept = area >= _MIN_AREA_PX
     kept_pixel = kept[which]
     number = np.cumsum(kept) - 1
-    places = xs[kept_pixel].astype(np.float64), ys[kept_pixel].astype(np.float64)
-    return blobs.take(kept), Pixels(*places, number[which[kept_pixel]])
+    positions = xs[kept_pixel].astype(np.float64), ys[kept_pixel].astype(np.float64)
+    return blobs.select(kept), BlobPixels(*positions, number[which[kept_pixel]])

@@ -1,8 +1,8 @@
-"""Difference of a registered frame to the background: what moved, and how sure the noise lets us be of it.
+"""Background subtraction: the difference of a registered frame to the temporal median of the flight.
 
-The background is the temporal median of registered frames. A frame's difference to it is not |frame - background| as it
-stands: half a pixel of registration error lights up every edge of every roof. It is the distance *outside the range*
-that the background takes within a pixel around, after the slow differences of exposure are taken out.
+Half a pixel of registration error makes |frame - background| large at every edge of every roof. The difference is
+therefore the distance of the frame *outside the range* that the background takes in a window around each pixel, after
+smooth differences of exposure are removed.
 """
 
 from collections.abc import Sequence
@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from schemas.arrays import GreyImage, Mask
+from schemas.arrays import Float32Array, GreyImage, Mask
 from velfield.errors import InputError
 from velfield.registration.background import median_background
 
 _BLUR_SIGMA_PX = 0.8
-_OFFSET_CELL_PX = 64
+_EXPOSURE_CELL_PX = 64
+_MAD_TO_SIGMA = 1.4826
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class MotionFrame:
     Attributes
     ----------
     image : uint8 (h, w)
-        Grey picture, warped to the working grid.
+        Grey image, warped to the working grid.
     valid : bool (h, w)
         Where the frame covers the grid.
     time_s : float
@@ -41,14 +41,14 @@ class MotionFrame:
 
 @dataclass(frozen=True)
 class MotionBackground:
-    """Temporal median of registered frames, and the range it takes within a pixel around.
+    """Temporal median of registered frames, and its range in a window around each pixel.
 
     Attributes
     ----------
     median, low, high : uint8 (h, w)
-        The median, and its least and greatest value in the window of 3 x 3.
+        The median, and its minimum and maximum in the window (3 x 3 by default).
     valid : bool (h, w)
-        Where enough frames stood behind the median.
+        Where enough frames contributed to the median.
     """
 
     median: GreyImage
@@ -57,17 +57,17 @@ class MotionBackground:
     valid: Mask
 
 
-def background_of(median: GreyImage, valid: Mask | None = None, *, reach_px: int = 1) -> MotionBackground:
-    """Background from a median picture that is there already, such as a base image built from the flight.
+def background_from_median(median: GreyImage, valid: Mask | None = None, *, reach_px: int = 1) -> MotionBackground:
+    """Background from a given median image, such as a base image built from the flight.
 
     Parameters
     ----------
     median : uint8 (h, w)
         Temporal median of registered frames.
     valid : bool (h, w), optional
-        Where the median stands on frames; everywhere by default.
+        Where the median is known; everywhere by default.
     reach_px : int
-        How far registration may be off, px: the range is taken within this distance.
+        Largest registration error, px: half the window, less the centre pixel.
     """
     window = np.ones((2 * reach_px + 1, 2 * reach_px + 1), np.uint8)
     everywhere = np.ones(median.shape, np.bool_)
@@ -77,16 +77,16 @@ def background_of(median: GreyImage, valid: Mask | None = None, *, reach_px: int
 
 
 def motion_background(frames: Sequence[MotionFrame], *, max_frames: int = 15, min_frames: int = 3) -> MotionBackground:
-    """Temporal median of frames spread over the flight (5 to 7 are enough; 3 consecutive ones are not).
+    """Background from frames spread over the flight (5 to 7 suffice; 3 consecutive ones do not).
 
     Parameters
     ----------
     frames : sequence of MotionFrame
         Registered frames of one shape, in time order.
     max_frames : int
-        So many are used at most, evenly spread.
+        At most this many are used, evenly spread.
     min_frames : int
-        A pixel that fewer frames cover has no background.
+        A pixel covered by fewer frames has no background.
 
     Raises
     ------
@@ -95,20 +95,20 @@ def motion_background(frames: Sequence[MotionFrame], *, max_frames: int = 15, mi
     """
     if len(frames) < min_frames:
         raise InputError(
-            f"a background needs {min_frames} registered frames or more, found {len(frames)}: mark one frame"
+            f"a background needs {min_frames} registered frames or more, found {len(frames)}: label one frame"
         )
     shapes = {frame.image.shape for frame in frames}
     if len(shapes) > 1:
         raise InputError(f"registered frames must be of one shape, found {sorted(shapes)}: warp them to one window")
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(max_frames, len(frames))).round().astype(int))
     ranked = median_background([frames[i].image for i in chosen], [frames[i].valid for i in chosen])
-    return background_of(ranked.median, ranked.count >= min_frames)
+    return background_from_median(ranked.median, ranked.count >= min_frames)
 
 
-def signed_motion(image: GreyImage, valid: Mask, background: MotionBackground) -> NDArray[np.float32]:
-    """How far a registered frame is above (+) or below (-) the background's range, grey levels, blurred by 0.8 px.
+def signed_difference(image: GreyImage, valid: Mask, background: MotionBackground) -> Float32Array:
+    """Distance of a registered frame above (+) or below (-) the background's range, grey levels, blurred by 0.8 px.
 
-    The sign tells a bright car from its own shadow, which is never brighter than the road.
+    The sign separates a bright car from its shadow, which is never brighter than the road.
 
     Parameters
     ----------
@@ -119,44 +119,44 @@ def signed_motion(image: GreyImage, valid: Mask, background: MotionBackground) -
     Returns
     -------
     float32 (h, w)
-        0 where nothing moved and where frame or background are not known.
+        0 within the range, and where frame or background are unknown.
     """
     known = valid & background.valid
-    level = image - _slow_offset(image.astype(np.float32) - background.median, known)
+    level = image - _exposure_offset(image.astype(np.float32) - background.median, known)
     outside = np.maximum(level - background.high, 0) - np.maximum(background.low - level, 0)
     outside[~known] = 0
     blurred = cv2.GaussianBlur(outside, (0, 0), _BLUR_SIGMA_PX)
     return np.where(known, blurred, np.float32(0))
 
 
-def motion_difference(image: GreyImage, valid: Mask, background: MotionBackground) -> NDArray[np.float32]:
-    """Distance of a registered frame outside the background's range, grey levels: the size of `signed_motion`."""
-    return np.abs(signed_motion(image, valid, background))
+def absolute_difference(image: GreyImage, valid: Mask, background: MotionBackground) -> Float32Array:
+    """Magnitude of `signed_difference`, grey levels."""
+    return np.abs(signed_difference(image, valid, background))
 
 
-def noise_sigma(image: GreyImage, valid: Mask, background: MotionBackground) -> float:
-    """Standard deviation of frame minus background by the median absolute deviation, grey levels."""
+def estimate_noise(image: GreyImage, valid: Mask, background: MotionBackground) -> float:
+    """Standard deviation of frame minus background, by the median absolute deviation, grey levels."""
     known = valid & background.valid
     if not known.any():
         return 0.0
     signed = (image.astype(np.int16) - background.median)[known][::7]
-    return float(1.4826 * np.median(np.abs(signed - np.median(signed))))
+    return float(_MAD_TO_SIGMA * np.median(np.abs(signed - np.median(signed))))
 
 
-def _slow_offset(signed: NDArray[np.float32], known: Mask) -> NDArray[np.float32]:
-    """Exposure and vignetting: the median of each cell, which no car is large enough to move, interpolated."""
+def _exposure_offset(signed: Float32Array, known: Mask) -> Float32Array:
+    """Difference in exposure and vignetting: the median of each cell, larger than any car, interpolated."""
     height, width = signed.shape
-    rows, columns = (max(1, round(side / _OFFSET_CELL_PX)) for side in (height, width))
-    # Every fourth pixel is enough for a cell's median, and a sixteenth of the work.
+    rows, columns = (max(1, round(side / _EXPOSURE_CELL_PX)) for side in (height, width))
+    # Every fourth pixel suffices for a cell's median, at a sixteenth of the cost.
     step = 4 if min(height, width) >= 4 * max(rows, columns) else 1
-    thin, thin_known = signed[::step, ::step], known[::step, ::step]
+    sampled, sampled_known = signed[::step, ::step], known[::step, ::step]
     cells = np.zeros((rows, columns), np.float32)
-    edges_y = np.linspace(0, thin.shape[0], rows + 1).astype(int)
-    edges_x = np.linspace(0, thin.shape[1], columns + 1).astype(int)
+    edges_y = np.linspace(0, sampled.shape[0], rows + 1).astype(int)
+    edges_x = np.linspace(0, sampled.shape[1], columns + 1).astype(int)
     for i in range(rows):
         for j in range(columns):
             part = (slice(edges_y[i], edges_y[i + 1]), slice(edges_x[j], edges_x[j + 1]))
-            values = thin[part][thin_known[part]]
+            values = sampled[part][sampled_known[part]]
             cells[i, j] = np.median(values) if values.size else 0
     smooth = cv2.blur(cells, (3, 3), borderType=cv2.BORDER_REPLICATE)
     return np.asarray(cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)

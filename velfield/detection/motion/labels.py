@@ -1,13 +1,12 @@
-"""Training labels for free: cars told from all else by their motion in registered frames.
+"""Training labels from motion: moving vehicles in registered frames, without manual annotation.
 
-The strategy. What differs from the temporal median by more than the noise is a region, bright or dark. A region that
-has partners of like size before and after at one velocity is linked; regions that touch and go together are one thing;
-its rectangle along the heading, less its shadow, is a car's if it has a car's size and moves along its long axis. All
-else that differs is an *ignore* region: neither car nor background. What stands is in the median and shows no
-difference, so a frame labelled so is never *complete*: what looks like a car there may well be one.
+Foreground blobs (background subtraction) are linked over three frames under a constant-velocity model and grouped; the
+oriented box of a group, less its shadow, is labelled a car if it has a car's size and moves along its long axis. Other
+foreground becomes an *ignore* region, neither car nor background. Stationary cars are part of the background, so these
+labels are never *complete*.
 
-The flight is asked how far it may be trusted. Chance links are counted by linking frames in an order that no vehicle
-can follow; roofs that shift against the ground (parallax) move across their long axis as often as along it.
+The precision of the labels is estimated from the flight itself: chance links by a permutation null (see
+`count_false_links`), and parallax of roofs, which move across their long axis as often as along it.
 """
 
 from collections.abc import Sequence
@@ -20,20 +19,20 @@ from schemas.flight import DetectionConfig, TrackingConfig
 from velfield.detection.motion.blobs import Blobs
 from velfield.detection.motion.boxes import (
     MAX_AXIS_OFFSET_RAD,
-    Bodies,
-    goes_lengthwise,
-    of_car_size,
-    shadow_vector,
-    without_shadow,
+    MovingObjects,
+    fit_shadow_vector,
+    has_car_size,
+    moves_along_axis,
+    remove_shadow,
 )
 from velfield.detection.motion.difference import MotionBackground, MotionFrame, motion_background
 from velfield.detection.motion.triplets import (
-    Differences,
+    DifferenceCache,
     Triplet,
-    count_decoys,
+    count_false_links,
     estimate_car_length,
-    middles_of,
-    triplet_of,
+    interior_frames,
+    link_triplet,
 )
 from velfield.errors import InputError
 
@@ -52,29 +51,29 @@ __all__ = [
 MIN_LABELS, MIN_VEHICLES = 30, 5
 """Fewer labels, or labels of fewer vehicles, do not train a detector."""
 FEW_VEHICLES = 15
-"""Fewer vehicles than this train a detector that misses what looks otherwise; said, but not refused."""
-MIN_PURITY = 0.8
-"""Labels less pure than this are not to be trusted."""
-MIN_COHERENCE = 0.6
-"""Less than this share of what moves goes along its length: roofs move, not cars."""
-_REMEDY = "mark the cars of one frame and give them with --labels"
+"""With fewer vehicles than this a warning is given: the detector may miss cars of other appearance."""
+MIN_PRECISION = 0.8
+"""Labels of lower estimated precision are not used."""
+MIN_AXIAL_FRACTION = 0.6
+"""Where a lower fraction of the moving objects moves along its axis, they are roofs (parallax), not cars."""
+_REMEDY = "label the cars of one frame and give them with --labels"
 _OFF_AXIS_RAD = float(np.radians(30.0))
 
 
 @dataclass(frozen=True)
 class FrameLabels:
-    """What motion says of one frame.
+    """Labels of one frame.
 
     Attributes
     ----------
     cars : float64 (n, 5)
-        x, y, orientation (axial, [0, pi)), length, width of the confirmed cars, working px.
+        x, y, orientation (axial, [0, pi)), length, width of the cars, working px.
     heading_rad, speed_px_per_s : float64 (n,)
         Their motion.
     ignore : float64 (k, 3)
-        x, y, radius of what differs from the background but is not confirmed: neither car nor background.
+        x, y, radius of circles over other foreground: neither car nor background.
     labelled : bool
-        Whether the frame had a neighbour on either side, so that its cars could be confirmed.
+        Whether the frame has a neighbour on either side, without which no car is confirmed.
     """
 
     cars: FloatArray
@@ -86,35 +85,35 @@ class FrameLabels:
 
 @dataclass(frozen=True)
 class MotionLabels:
-    """Labels of all frames, and how good they are.
+    """Labels of all frames, and their estimated quality.
 
     Attributes
     ----------
     frames : tuple of FrameLabels
-        One for each frame that was given, in their order.
+        One for each given frame, in their order.
     count : int
-        Confirmed cars, all frames together.
+        Labelled cars of all frames.
     vehicles : int
-        Of these, how many are the first sight of a vehicle: how many different ones there are.
-    purity : float
-        Estimated share of `count` that are cars, by chance links and by motion across the long axis.
-    coherence : float
-        Share of the car-sized things that move which go along their long axis; about 1 for cars, less for parallax.
+        Number of different vehicles: labels without a predecessor in the frame before.
+    precision_estimate : float
+        Estimated fraction of `count` that are cars, from false links and motion across the long axis.
+    axial_motion_fraction : float
+        Fraction of the car-sized moving objects that move along their long axis: about 1 for cars, less for parallax.
     car_length_px : float
-        A car's usual length: as given, or estimated from what moves.
+        A car's typical length: as given, or estimated.
     shadow_px : float64 (2,)
-        Where shadows lie and how far they reach beyond a car; (0, 0) where none was seen.
+        Shadow vector beyond a car; (0, 0) where there is none.
     usable : bool
-        Whether there are enough, and pure enough, to train a detector.
+        Whether the labels are enough, and precise enough, to train a detector.
     warnings : tuple of str
-        What stands against the labels, one line each, with what to do.
+        Problems of the labels, one line each, with the remedy.
     """
 
     frames: tuple[FrameLabels, ...]
     count: int
     vehicles: int
-    purity: float
-    coherence: float
+    precision_estimate: float
+    axial_motion_fraction: float
     car_length_px: float
     shadow_px: FloatArray
     usable: bool
@@ -128,23 +127,23 @@ def labels_from_motion(
     car_length_px: float | None = None,
     max_interval_s: float = TrackingConfig().max_interval_s,
 ) -> MotionLabels:
-    """Cars that move over three registered frames, and what is to be left out of training.
+    """Label moving cars, and foreground to be ignored in training.
 
     Parameters
     ----------
     frames : sequence of MotionFrame
-        In time order, on one grid. Bursts of three or more will do (`choose_frames`).
+        In time order, on one grid. Bursts of three or more suffice (`choose_frames`).
     background : MotionBackground, optional
-        Temporal median of the flight; from these frames where none is given.
+        Temporal median of the flight; computed from these frames by default.
     car_length_px : float, optional
-        A car's usual length on this grid; estimated from what moves where it is not known.
+        A car's typical length on this grid; estimated by default.
     max_interval_s : float
         Frames farther apart than this are not neighbours.
 
     Returns
     -------
     MotionLabels
-        Not usable, with a warning that says what to do, where too little moves or parallax spoils it.
+        Not usable, with a warning and a remedy, where too little moves or parallax dominates.
 
     Raises
     ------
@@ -154,34 +153,35 @@ def labels_from_motion(
     times = np.array([frame.time_s for frame in frames])
     if len(frames) < 3 or np.any(np.diff(times) <= 0):
         raise InputError(
-            f"labels from motion need 3 registered frames or more in time order, found {len(frames)}: mark one frame"
+            f"labels from motion need 3 registered frames or more in time order, found {len(frames)}: label one frame"
         )
-    ground = motion_background(frames) if background is None else background
-    signed = Differences(frames, ground)
-    length = estimate_car_length(signed, times, max_interval_s) if car_length_px is None else car_length_px
+    median = motion_background(frames) if background is None else background
+    differences = DifferenceCache(frames, median)
+    length = estimate_car_length(differences, times, max_interval_s) if car_length_px is None else car_length_px
     if not np.isfinite(length):
-        return _nothing(len(frames))
-    regions = [signed.regions(k, length) for k in range(len(frames))]
-    middles = middles_of(times, max_interval_s)
-    triplets = [triplet_of(regions, times, (k - 1, k, k + 1), length) for k in middles]
-    shadow = shadow_vector(np.concatenate([np.empty((0, 5)), *(triplet.shadows for triplet in triplets)]))
-    labels = [_unlabelled(blobs, length) for blobs, _ in regions]
+        return _no_labels(len(frames))
+    blobs = [differences.blobs(k, length) for k in range(len(frames))]
+    middles = interior_frames(times, max_interval_s)
+    triplets = [link_triplet(blobs, times, (k - 1, k, k + 1), length) for k in middles]
+    shadow = fit_shadow_vector(np.concatenate([np.empty((0, 5)), *(triplet.shadows for triplet in triplets)]))
+    labels = [_ignore_all(frame_blobs) for frame_blobs, _ in blobs]
     for triplet in triplets:
-        labels[triplet.middle] = _frame_labels(triplet, regions[triplet.middle][0], shadow, length)
-    return _judged(labels, triplets, count_decoys(regions, times, middles, shadow, length), times, shadow, length)
+        labels[triplet.middle] = _label_frame(triplet, blobs[triplet.middle][0], shadow, length)
+    false_links = count_false_links(blobs, times, middles, shadow, length)
+    return _assess(labels, triplets, false_links, times, shadow, length)
 
 
 def choose_frames(times_s: FloatArray, *, bursts: int = 16, all_below: int = 48) -> IntArray:
-    """Frames to take labels from: all of a short flight, else bursts of three spread evenly over it.
+    """Choose the frames to label: all of a short flight, else bursts of three spread evenly over it.
 
     Parameters
     ----------
     times_s : float64 (n,)
         Times of the registered frames, s.
     bursts : int
-        Bursts taken from a long flight.
+        Number of bursts from a long flight.
     all_below : int
-        A flight of fewer frames is taken whole.
+        All frames of a flight of fewer are taken.
 
     Returns
     -------
@@ -198,106 +198,106 @@ def choose_frames(times_s: FloatArray, *, bursts: int = 16, all_below: int = 48)
 def working_scale(
     config: DetectionConfig, gsd_m: float | None, labels: MotionLabels | None = None, *, labels_scale: float = 1.0
 ) -> float:
-    """Working pixels a base pixel: what makes a car `working_car_length_px` long.
+    """Scale of the working grid, working pixels a base pixel, at which a car is `working_car_length_px` long.
 
     Parameters
     ----------
     config : DetectionConfig
     gsd_m : float or None
-        Metres a base pixel, where known: it decides.
+        Ground sample distance of the base image, m; has precedence.
     labels : MotionLabels, optional
-        Where the ground sample distance is not known: their cars' length decides.
+        Their estimated length of a car is used where the ground sample distance is unknown.
     labels_scale : float
-        Pixels of the grid that the labels were found on, a base pixel.
+        Scale of the grid of these labels, pixels a base pixel.
 
     Raises
     ------
     InputError
-        Neither is known.
+        Neither is given.
     """
     if gsd_m is not None:
         return config.working_car_length_px * gsd_m / config.car_length_m
     if labels is None or not np.isfinite(labels.car_length_px):
-        raise InputError(
-            "a car's size is not known: found neither --gsd-m nor cars that move; give --gsd-m or --labels"
-        )
+        raise InputError("a car's size is not known: found neither --gsd-m nor moving cars; give --gsd-m or --labels")
     return config.working_car_length_px * labels_scale / labels.car_length_px
 
 
-def _frame_labels(triplet: Triplet, blobs: Blobs, shadow: FloatArray, length: float) -> FrameLabels:
-    """Confirmed cars of a frame, and circles over all else that differs."""
-    bodies = without_shadow(triplet.bodies, shadow)
-    confirmed = of_car_size(bodies, car_length_px=length) & goes_lengthwise(bodies)
-    cars, rest = bodies.take(confirmed), triplet.bodies.take(~confirmed)
+def _label_frame(triplet: Triplet, blobs: Blobs, shadow: FloatArray, length: float) -> FrameLabels:
+    """Cars of a frame, and circles over all other foreground."""
+    objects = remove_shadow(triplet.objects, shadow)
+    confirmed = has_car_size(objects, car_length_px=length) & moves_along_axis(objects)
+    cars, rest = objects.select(confirmed), triplet.objects.select(~confirmed)
     table = np.stack([cars.x, cars.y, np.mod(cars.heading_rad, np.pi), cars.length, cars.width], axis=1)
-    loose = blobs.take(~triplet.links.linked)
+    unlinked = blobs.select(~triplet.links.linked)
     circles = [
-        _circles(rest.x, rest.y, rest.heading_rad, rest.length, rest.width),
-        _away_from(_circles(loose.x, loose.y, loose.axis_rad, loose.length, loose.width), table, length),
+        _cover(rest.x, rest.y, rest.heading_rad, rest.length, rest.width),
+        _away_from_cars(
+            _cover(unlinked.x, unlinked.y, unlinked.axis_rad, unlinked.length, unlinked.width), table, length
+        ),
     ]
     return FrameLabels(table, cars.heading_rad, cars.speed, np.concatenate(circles), True)
 
 
-def _unlabelled(blobs: Blobs, length: float) -> FrameLabels:
-    """A frame without neighbours: all that differs is left out."""
+def _ignore_all(blobs: Blobs) -> FrameLabels:
+    """Labels of a frame without neighbours: all foreground is ignored."""
     empty = np.empty(0)
-    circles = _circles(blobs.x, blobs.y, blobs.axis_rad, blobs.length, blobs.width)
+    circles = _cover(blobs.x, blobs.y, blobs.axis_rad, blobs.length, blobs.width)
     return FrameLabels(np.empty((0, 5)), empty, empty, circles, False)
 
 
-def _circles(x: FloatArray, y: FloatArray, axis: FloatArray, length: FloatArray, width: FloatArray) -> FloatArray:
-    """Circles that cover rectangles: one for a square, a row of them for a bus."""
+def _cover(x: FloatArray, y: FloatArray, axis: FloatArray, length: FloatArray, width: FloatArray) -> FloatArray:
+    """Circles (k, 3) that cover oriented boxes: one for a square, a row of them for a bus."""
     number = np.maximum(1, np.ceil(length / np.maximum(width, 2.0))).astype(np.int64)
     which = np.repeat(np.arange(len(x)), number)
-    within = np.arange(len(which)) - np.repeat(np.cumsum(number) - number, number)
-    along = ((within + 0.5) / number[which] - 0.5) * length[which]
+    position = np.arange(len(which)) - np.repeat(np.cumsum(number) - number, number)
+    along = ((position + 0.5) / number[which] - 0.5) * length[which]
     radius = np.hypot(width[which], length[which] / number[which]) / 2 + 1
     return np.stack([x[which] + np.cos(axis[which]) * along, y[which] + np.sin(axis[which]) * along, radius], axis=1)
 
 
-def _away_from(circles: FloatArray, cars: FloatArray, length: float) -> FloatArray:
-    """Circles that are not a confirmed car's own odds and ends."""
+def _away_from_cars(circles: FloatArray, cars: FloatArray, length: float) -> FloatArray:
+    """Circles farther than half a length from every labelled car: nearer ones are its own parts."""
     if not len(cars) or not len(circles):
         return circles
     gap = np.hypot(circles[:, None, 0] - cars[None, :, 0], circles[:, None, 1] - cars[None, :, 1])
     return np.asarray(circles[gap.min(axis=1) > 0.5 * length], np.float64)
 
 
-def _judged(
+def _assess(
     labels: list[FrameLabels],
     triplets: list[Triplet],
-    decoys: int,
+    false_links: int,
     times: FloatArray,
     shadow: FloatArray,
     length: float,
 ) -> MotionLabels:
-    """The labels with their purity, coherence and what stands against them."""
-    sized = [_sized(triplet, shadow, length) for triplet in triplets]
+    """The labels with their estimated quality."""
+    car_sized = [_car_sized(triplet, shadow, length) for triplet in triplets]
     count = sum(len(part.cars) for part in labels)
-    moving = sum(len(part) for part in sized)
-    across = sum(int((part.has_axis & (part.axis_offset_rad > _OFF_AXIS_RAD)).sum()) for part in sized)
-    by_axis = across * MAX_AXIS_OFFSET_RAD / (np.pi / 2 - _OFF_AXIS_RAD)
-    purity = max(0.0, 1 - (decoys + by_axis) / count) if count else 0.0
-    coherence = count / moving if moving else 0.0
-    vehicles = _vehicles(labels, times, length)
-    objection = _objection(count, vehicles, purity, coherence)
-    warnings = (objection,) if objection else _doubts(vehicles)
-    return MotionLabels(tuple(labels), count, vehicles, purity, coherence, length, shadow, not objection, warnings)
+    moving = sum(len(part) for part in car_sized)
+    across = sum(int((part.has_axis & (part.axis_offset_rad > _OFF_AXIS_RAD)).sum()) for part in car_sized)
+    false_by_axis = across * MAX_AXIS_OFFSET_RAD / (np.pi / 2 - _OFF_AXIS_RAD)
+    precision = max(0.0, 1 - (false_links + false_by_axis) / count) if count else 0.0
+    axial = count / moving if moving else 0.0
+    vehicles = _count_vehicles(labels, times, length)
+    rejection = _rejection(count, vehicles, precision, axial)
+    warnings = (rejection,) if rejection else _caveats(vehicles)
+    return MotionLabels(tuple(labels), count, vehicles, precision, axial, length, shadow, not rejection, warnings)
 
 
-def _nothing(n: int) -> MotionLabels:
-    """Where nothing at all was confirmed, a car's length stays unknown."""
+def _no_labels(n: int) -> MotionLabels:
+    """No car was confirmed at any candidate length, so that a car's length remains unknown."""
     empty = FrameLabels(np.empty((0, 5)), np.empty(0), np.empty(0), np.empty((0, 3)), False)
-    return MotionLabels((empty,) * n, 0, 0, 0.0, 0.0, float("nan"), np.zeros(2), False, (_objection(0, 0, 0.0, 0.0),))
+    return MotionLabels((empty,) * n, 0, 0, 0.0, 0.0, float("nan"), np.zeros(2), False, (_rejection(0, 0, 0.0, 0.0),))
 
 
-def _sized(triplet: Triplet, shadow: FloatArray, length: float) -> Bodies:
-    bodies = without_shadow(triplet.bodies, shadow)
-    return bodies.take(of_car_size(bodies, car_length_px=length))
+def _car_sized(triplet: Triplet, shadow: FloatArray, length: float) -> MovingObjects:
+    objects = remove_shadow(triplet.objects, shadow)
+    return objects.select(has_car_size(objects, car_length_px=length))
 
 
-def _vehicles(labels: list[FrameLabels], times: FloatArray, length: float) -> int:
-    """Labels that no label of the frame before foretold: first sights."""
+def _count_vehicles(labels: list[FrameLabels], times: FloatArray, length: float) -> int:
+    """Number of labels that no label of the frame before predicts: first appearances."""
     first = 0
     for k, part in enumerate(labels):
         before = labels[k - 1] if k else part
@@ -305,33 +305,36 @@ def _vehicles(labels: list[FrameLabels], times: FloatArray, length: float) -> in
             first += len(part.cars)
             continue
         step = (times[k] - times[k - 1]) * before.speed_px_per_s
-        foretold = before.cars[:, :2] + step[:, None] * np.stack(
+        predicted = before.cars[:, :2] + step[:, None] * np.stack(
             [np.cos(before.heading_rad), np.sin(before.heading_rad)], axis=1
         )
-        gap = np.hypot(*(part.cars[:, None, :2] - foretold[None]).transpose(2, 0, 1))
+        gap = np.hypot(*(part.cars[:, None, :2] - predicted[None]).transpose(2, 0, 1))
         first += int((gap.min(axis=1) > 0.5 * length).sum())
     return first
 
 
-def _objection(count: int, vehicles: int, purity: float, coherence: float) -> str:
-    """Why the labels cannot train a detector, and what to do; empty where they can."""
-    if count and coherence < MIN_COHERENCE:
+def _rejection(count: int, vehicles: int, precision: float, axial: float) -> str:
+    """Why the labels cannot train a detector, and the remedy; empty where they can."""
+    if count and axial < MIN_AXIAL_FRACTION:
         return (
-            f"labels from motion are not to be trusted: only {coherence:.0%} of what moves goes along its length "
-            f"({MIN_COHERENCE:.0%} wanted), so roofs shift against the ground (parallax); {_REMEDY}"
+            f"labels from motion are unreliable: only {axial:.0%} of the moving objects move along their long axis "
+            f"({MIN_AXIAL_FRACTION:.0%} required), so roofs shift by parallax; {_REMEDY}"
         )
     if vehicles < MIN_VEHICLES or count < MIN_LABELS:
         return (
-            f"too few cars move to learn from: {count} labels of {vehicles} vehicles confirmed, {MIN_LABELS} of "
-            f"{MIN_VEHICLES} wanted; {_REMEDY}"
+            f"too few cars move to train a detector: found {count} labels of {vehicles} vehicles, expected "
+            f"{MIN_LABELS} of {MIN_VEHICLES}; {_REMEDY}"
         )
-    if purity < MIN_PURITY:
-        return f"labels from motion are not pure enough: {purity:.0%} estimated, {MIN_PURITY:.0%} wanted; {_REMEDY}"
+    if precision < MIN_PRECISION:
+        return (
+            f"labels from motion are unreliable: estimated precision {precision:.0%}, {MIN_PRECISION:.0%} required; "
+            f"{_REMEDY}"
+        )
     return ""
 
 
-def _doubts(vehicles: int) -> tuple[str, ...]:
-    """What is to be said of labels that can be used all the same."""
+def _caveats(vehicles: int) -> tuple[str, ...]:
+    """Warnings about usable labels."""
     if vehicles >= FEW_VEHICLES:
         return ()
-    return (f"only {vehicles} vehicles moved to learn from, so cars that look otherwise may be missed; {_REMEDY}",)
+    return (f"trained on only {vehicles} moving vehicles: cars of other appearance may be missed; {_REMEDY}",)

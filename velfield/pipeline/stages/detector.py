@@ -289,16 +289,16 @@ def _finish(
         outputs.append(layout.background)
     if motion is not None and learnt_from == "motion":
         notes.append(
-            f"{motion.count} labels of {motion.vehicles} vehicles from motion, purity {motion.purity:.0%}, "
-            f"coherence {motion.coherence:.0%}"
+            f"{motion.count} labels of {motion.vehicles} vehicles from motion: estimated precision "
+            f"{motion.precision_estimate:.0%}, {motion.axial_motion_fraction:.0%} of objects move along their axis"
         )
     record = WorkingRecord(
         scale=scale,
         learnt_from=learnt_from,
         has_background=layout.background in outputs,
         labels=count,
-        purity=None if motion is None else motion.purity,
-        coherence=None if motion is None else motion.coherence,
+        purity=None if motion is None else motion.precision_estimate,
+        coherence=None if motion is None else motion.axial_motion_fraction,
     )
     write_atomically(layout.working, record.model_dump_json(indent=1).encode())
     advance("detector")
