@@ -125,10 +125,10 @@ def _stages(plan: "Plan", pool: Executor) -> None:
     _whole(plan, pool, "lens", lens.calibrate_flight)
     spread, step = base.spread_frames(plan), plan.config.work.block_frames
     blocks = [spread[k : k + step] for k in range(0, len(spread), step)]
-    found = list(pool.map(base.key_points_of, [plan] * len(blocks), blocks))
+    found = list(pool.map(base.detect_unit_keypoints, [plan] * len(blocks), blocks))
     _whole(plan, pool, "base", base.build_base, found)
     registration.lay_out_registration(plan)
-    _by_blocks(plan, pool, "registration", base.key_points_of, registration.register_unit)
+    _by_blocks(plan, pool, "registration", base.detect_unit_keypoints, registration.register_unit)
     _whole(plan, pool, "detector", detector.make_detector)
     _by_blocks(plan, pool, "detections", detections.detect_block, detections.write_detections)
     _by_unit(plan, pool, "tracklets", tracklets.link_unit)

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from schemas.arrays import FloatArray
 from velfield import open_run
 from velfield.bench.still import PATCH_HALF_PX, SHARP_PX, about_their_middles, places_on_map, read_area
-from velfield.registration.alignment import Templates, cut_templates
+from velfield.registration.alignment import Templates, extract_templates
 from velfield.registration.intrasensor import BaseReference, prepare_base, register_frame
-from velfield.registration.keypoints import detect_key_points
+from velfield.registration.keypoints import detect_keypoints
 from velfield.run.frame_transforms import read_lens
 from velfield.run.run import Run
 from velfield.sources.images import read_picture_grey
@@ -43,14 +43,14 @@ def main() -> None:
     config, lens = run.record.config.registration, read_lens(run.layout)
     frames = [k for k, status in enumerate(run.registration_status) if status == "ok"]
     pictures = [run.frames.read(k) for k in frames]
-    key_points = [detect_key_points(picture, config, None) for picture in pictures]
+    keypoints = [detect_keypoints(picture, config, None) for picture in pictures]
     whole = prepare_base(grey, config, mask=known, frame_shape=pictures[0].shape)
     on_road = cv2.fillPoly(np.zeros(grey.shape, np.uint8), [np.rint(area).astype(np.int32)], (1,)) > 0
     for phase in (0, 1):
         half = _without(whole, phase)
         marks = _marks(whole.templates, grey, on_road, phase)
         places = np.full((len(frames), len(marks), 2), np.nan)
-        for row, (picture, found) in enumerate(zip(pictures, key_points, strict=True)):
+        for row, (picture, found) in enumerate(zip(pictures, keypoints, strict=True)):
             result = register_frame(picture, found, half, lens, config)
             if result.transform is not None:
                 places[row] = places_on_map(picture, result.transform, marks)
@@ -62,8 +62,8 @@ def _cell_is(xy: FloatArray, phase: int) -> NDArray[np.bool_]:
 
 
 def _without(base: BaseReference, phase: int) -> BaseReference:
-    few, many = (part.where(~_cell_is(part.xy, phase)) for part in (base.templates, base.many))
-    return replace(base, templates=few, many=many)
+    kept = [part.select(~_cell_is(part.xy, phase)) for part in (base.templates, base.dense_templates)]
+    return replace(base, templates=kept[0], dense_templates=kept[1])
 
 
 def _marks(templates: Templates, grey: NDArray[np.uint8], on_road: NDArray[np.bool_], phase: int) -> Templates:
@@ -74,8 +74,8 @@ def _marks(templates: Templates, grey: NDArray[np.uint8], on_road: NDArray[np.bo
     reach = 2 * PATCH_HALF_PX + 1
     inside = ((at >= reach) & (at < np.array([grey.shape[1], grey.shape[0]]) - reach)).all(axis=1)
     sharp = templates.sigma_px < SHARP_PX
-    marks = templates.where(within & inside & sharp & on_road[at[:, 1], at[:, 0]] & _cell_is(xy, phase))
-    return cut_templates(grey, marks.xy, marks.sigma_px, PATCH_HALF_PX)
+    marks = templates.select(within & inside & sharp & on_road[at[:, 1], at[:, 0]] & _cell_is(xy, phase))
+    return extract_templates(grey, marks.xy, marks.sigma_px, PATCH_HALF_PX)
 
 
 def _tell(run: Run, places: FloatArray, phase: int) -> None:

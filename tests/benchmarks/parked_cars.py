@@ -68,7 +68,7 @@ def _corners_on(run: Run, parked: FloatArray) -> Templates:
     on_car = np.zeros(len(found), np.bool_)
     for x, y, length in parked:
         on_car |= np.hypot(*(found.xy - (x, y)).T) < ITS_OWN * length
-    return found.where(np.flatnonzero(on_car & (found.sigma_px < SHARP_PX)))
+    return found.select(np.flatnonzero(on_car & (found.sigma_px < SHARP_PX)))
 
 
 def _less_own_path(places: FloatArray, times_s: FloatArray) -> FloatArray:

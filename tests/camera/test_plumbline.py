@@ -11,7 +11,7 @@ import pytest
 from schemas.camera import CameraRecord
 from schemas.flight import LensConfig
 from tests.scenes import city, frame_grid, photograph, rms_after_homography, similarity
-from velfield.camera.edges import find_arcs, pool_arcs
+from velfield.camera.edges import detect_arcs, pool_arcs
 from velfield.camera.entropy import hough_entropy
 from velfield.camera.lens import HarrisLens, pinhole
 from velfield.camera.plumbline import calibrate
@@ -48,7 +48,7 @@ def test_ten_frames_give_the_lens_to_half_a_pixel(a: float) -> None:
 
 def test_the_entropy_is_least_near_the_true_distortion(barrel: list[np.ndarray]) -> None:
     arcs = pool_arcs(
-        [find_arcs(f, frame=n, min_length_px=24.0, max_curvature_per_px=0.005) for n, f in enumerate(barrel)],
+        [detect_arcs(f, frame=n, min_length_px=24.0, max_curvature_per_px=0.005) for n, f in enumerate(barrel)],
         max_points=20_000,
     )
     grid = np.arange(-0.2, 0.61, 0.1)
@@ -79,7 +79,7 @@ def test_a_pinhole_stays_a_pinhole() -> None:
     result = calibrate(flight(0.0), QUICK)
     assert not result.accepted
     assert result.lens == pinhole(SHAPE)
-    assert "pin-hole kept" in result.reason
+    assert "pinhole model kept" in result.reason
 
 
 def test_blobs_have_no_lines_and_leave_the_lens_alone() -> None:

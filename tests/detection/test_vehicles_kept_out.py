@@ -8,7 +8,7 @@ import numpy as np
 from schemas.job import Inputs, Job
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.plan import make_plan
-from velfield.pipeline.stages.base_image import key_points_of
+from velfield.pipeline.stages.base_image import detect_unit_keypoints
 from velfield.pipeline.stages.external_detections import free_of_vehicles
 from velfield.pipeline.stages.frames import lay_out_frames, read_unit
 
@@ -36,7 +36,7 @@ def test_no_key_point_lies_on_a_given_vehicle(tmp_path: Path) -> None:
     assert not free[46:74, 52:108].any()
     assert free[:43].all()
     assert free[:, 114:].all()
-    everywhere, masked, unsized = (found.key_points.xy for found in key_points_of(plan, [0, 1, 2]))
+    everywhere, masked, unsized = (found.keypoints.xy for found in detect_unit_keypoints(plan, [0, 1, 2]))
 
     def on_the_vehicle(xy: np.ndarray) -> int:
         return int(((np.abs(xy - [80, 60])) < [28, 13]).all(axis=1).sum())

@@ -188,7 +188,7 @@ def test_a_base_image_of_another_place_is_refused(flight: Path, server: None, tm
     picture = cv2.imread(str(flight / "base.png"), cv2.IMREAD_GRAYSCALE)
     wrong = tmp_path / "mirrored.png"
     cv2.imwrite(str(wrong), picture[:, ::-1])
-    with pytest.raises(InputError, match="found a mirrored picture"):
+    with pytest.raises(InputError, match="found a mirrored image"):
         process(job(flight, tmp_path / "run", base=str(wrong)))
     assert not (tmp_path / "run" / "commits" / "registration").exists()
 

@@ -146,7 +146,7 @@ def test_a_base_image_of_another_place_changes_nothing(run: Path, flight: Path, 
     picture = cv2.imread(str(flight / "base.png"), cv2.IMREAD_GRAYSCALE)
     cv2.imwrite(str(tmp_path / "wrong.png"), picture[:, ::-1])
     before = digests(run)
-    with pytest.raises(InputError, match="found a mirrored picture"):
+    with pytest.raises(InputError, match="found a mirrored image"):
         run_reprocess(run, tmp_path / "wrong.png", console=Console("quiet"))
     assert digests(run) == before
     assert not (run / "results" / ".wrong.unfinished").exists()

@@ -5,11 +5,11 @@ import pytest
 
 from velfield.camera.lens import HarrisLens
 from velfield.errors import Failure
-from velfield.registration.fitting import case_deletion, fit_by_simplex, fit_polyprojective
-from velfield.registration.joint import ControlPoints, JointFit, joint_fit, weights_of
-from velfield.registration.kernels import solve_positive
-from velfield.registration.mesh import fit_mesh, robust_mesh
-from velfield.registration.transforms import HomographyTransform, PolyprojectiveTransform, normalisation_of
+from velfield.registration.fitting import fit_by_case_deletion, fit_by_simplex, fit_polyprojective
+from velfield.registration.joint import ControlPoints, JointFit, fit_jointly, robust_weights
+from velfield.registration.kernels import solve_cholesky
+from velfield.registration.mesh import fit_mesh, fit_robust_mesh
+from velfield.registration.transforms import HomographyTransform, PolyprojectiveTransform, fit_normalisation
 
 WIDTH, HEIGHT = 1280, 960
 LENS = HarrisLens(0.2, 645.0, 474.0, 800.0)
@@ -39,8 +39,10 @@ def control_points(
 
 def fit(points: ControlPoints, *, knots: int = 48, **options: bool):
     corners = np.array([[0.0, 0.0], [WIDTH - 1, HEIGHT - 1]])
-    start = PolyprojectiveTransform.from_homography(MATRIX, normalisation_of(corners), normalisation_of(points.xy_base))
-    return joint_fit(points, start=start, lens=LENS, width=WIDTH, height=HEIGHT, knots=knots, **options)
+    start = PolyprojectiveTransform.from_homography(
+        MATRIX, fit_normalisation(corners), fit_normalisation(points.xy_base)
+    )
+    return fit_jointly(points, start=start, lens=LENS, width=WIDTH, height=HEIGHT, knots=knots, **options)
 
 
 def mean_error(transform, **motion: float) -> float:
@@ -74,16 +76,16 @@ def test_case_deletion_drops_the_wrong_matches() -> None:
     target = HomographyTransform(MATRIX)(source) + rng.normal(0, 0.3, (800, 2))
     wrong = rng.random(800) < 0.1
     target[wrong] += rng.uniform(-25, 25, (int(wrong.sum()), 2))
-    found = case_deletion(source, target, max_mean_error_px=0.5)
+    found = fit_by_case_deletion(source, target, max_mean_error_px=0.5)
     assert found
-    assert found.kept[~wrong].mean() > 0.9
-    assert found.kept[wrong].mean() < 0.05
+    assert found.inliers[~wrong].mean() > 0.9
+    assert found.inliers[wrong].mean() < 0.05
     assert found.mean_error_px <= 0.5
 
 
 def test_case_deletion_says_how_many_points_were_left() -> None:
     rng = np.random.default_rng(3)
-    found = case_deletion(places(rng, 100), places(rng, 100), min_control_points=40)
+    found = fit_by_case_deletion(places(rng, 100), places(rng, 100), min_control_points=40)
     assert isinstance(found, Failure)
     assert "of 100, 40 needed" in found.reason
 
@@ -120,11 +122,11 @@ def test_roofs_that_lean_in_the_first_rows_do_not_bend_them(seed: int) -> None:
     motion = {"amplitude_px": 1.5, "cycles": 2.0}
     rng = np.random.default_rng(seed)
     points = control_points(rng, count=700, noise_px=0.3, wrong=0.2, **motion)
-    ground = points.where(points.xy_raw[:, 1] > 45)
+    ground = points.select(points.xy_raw[:, 1] > 45)
     raw = rng.uniform(0, 1, (20, 2)) * [WIDTH - 1, 45]
     base = shaken(raw, **motion) + rng.normal(0, 0.3, raw.shape)
     base[:12] += [-5.0, 4.0]
-    found = fit(ground.joined(ControlPoints(raw, base, np.full(20, 0.5))))
+    found = fit(ground.concatenate(ControlPoints(raw, base, np.full(20, 0.5))))
     first = np.stack([np.linspace(100, WIDTH - 100, 30), np.full(30, 15.0)], axis=1)
     assert np.linalg.norm(found.transform.to_base(first) - shaken(first, **motion), axis=1).mean() < 1.0
 
@@ -132,9 +134,9 @@ def test_roofs_that_lean_in_the_first_rows_do_not_bend_them(seed: int) -> None:
 def test_held_out_residual_is_that_of_a_fit_without_the_fold() -> None:
     points = control_points(np.random.default_rng(7), count=600, noise_px=0.5, wrong=0.0, amplitude_px=0.0, cycles=0.0)
     found = fit(points, knots=0)
-    assert found.residual_px < found.heldout_px < 1.1 * found.residual_px
+    assert found.residual_px < found.cv_error_px < 1.1 * found.residual_px
     # noise of 0.5 px a coordinate; weights fall with the residual, so that the kept ones lie a little nearer
-    assert 0.55 < found.heldout_px < 0.75
+    assert 0.55 < found.cv_error_px < 0.75
 
 
 def test_moving_things_do_not_pull_the_fit() -> None:
@@ -144,7 +146,7 @@ def test_moving_things_do_not_pull_the_fit() -> None:
     moved = ControlPoints(points.xy_raw, points.xy_base + np.where(moving[:, None], [6.0, 0.0], 0.0), points.sigma_px)
     found = fit(moved)
     assert mean_error(found.transform, amplitude_px=0.0, cycles=0.0) < 0.1
-    assert not found.kept[moving].any()
+    assert not found.inliers[moving].any()
 
 
 def test_mesh_takes_up_slow_relief_and_nothing_else() -> None:
@@ -155,7 +157,7 @@ def test_mesh_takes_up_slow_relief_and_nothing_else() -> None:
     size = {"width": WIDTH, "height": HEIGHT, "cell_size_px": 200}
     found = fit_mesh(raw, noise + relief, noise + relief, np.ones(len(raw)), **size)
     assert found.mesh is not None
-    assert (found.heldout**2).mean() < 0.15 * ((noise + relief) ** 2).mean()
+    assert (found.cv_residuals**2).mean() < 0.15 * ((noise + relief) ** 2).mean()
     assert fit_mesh(raw, noise, noise, np.ones(len(raw)), **size).mesh is None
 
 
@@ -170,17 +172,17 @@ def test_the_mesh_follows_a_hill_whose_points_disagree_with_the_smooth_map_and_n
     roofs = (rng.random(len(raw)) < 0.25)[:, None] * [0.0, 2.0]
     residuals = hill(raw) + roofs + rng.normal(0, sigma, raw.shape)
     points = ControlPoints(raw, raw, np.full(len(raw), sigma))
-    weights = weights_of(residuals, points.sigma_px, 1.0)
+    weights = robust_weights(residuals, points.sigma_px, 1.0)
     transform = fit(control_points(rng, count=400, noise_px=0.1, wrong=0.0, amplitude_px=0.0, cycles=0.0)).transform
     smooth = JointFit(transform, weights, residuals, residuals, 1.0, (1.0, 1.0))
     on_hill = np.hypot(*(raw - [800, 500]).T) < 150
     assert weights[on_hill].mean() < 0.05
     size = {"width": WIDTH, "height": HEIGHT, "cell_size_px": 120}
 
-    def off(turns: int) -> float:
-        found, kept = robust_mesh(points, smooth, turns=turns, **size)
+    def off(iterations: int) -> float:
+        found, kept = fit_robust_mesh(points, smooth, iterations=iterations, **size)
         left = found.residuals - roofs  # the mesh against the hill, but for the noise of each point
-        assert (turns == 1) == (kept[on_hill].mean() < 0.1)
+        assert (iterations == 1) == (kept[on_hill].mean() < 0.1)
         return float(np.abs(np.median(left[on_hill], axis=0)).max())
 
     assert off(3) < 0.15 < 0.4 * off(1)
@@ -190,5 +192,5 @@ def test_small_systems_are_solved_as_lapack_does() -> None:
     rng = np.random.default_rng(10)
     half = rng.normal(size=(40, 40))
     matrix, right = half @ half.T + np.eye(40), rng.normal(size=(40, 2))
-    np.testing.assert_allclose(solve_positive(matrix, right), np.linalg.solve(matrix, right), atol=1e-9)
-    assert np.isnan(solve_positive(-matrix, right)).all()
+    np.testing.assert_allclose(solve_cholesky(matrix, right), np.linalg.solve(matrix, right), atol=1e-9)
+    assert np.isnan(solve_cholesky(-matrix, right)).all()

@@ -61,7 +61,7 @@ def test_any_turn_and_scale_is_found_to_a_fraction_of_a_pixel(
     to_base = view(scale, rotation_deg)
     result = found(photograph(ground, to_base, LENS, SHAPE, 1), base)
     assert mean_error_px(result, to_base) < 0.5
-    assert result.left_out_error_px < 1.0
+    assert result.cv_error_px < 1.0
     assert result.scale == pytest.approx(scale, rel=0.02)
     assert np.degrees(result.rotation_rad) == pytest.approx(rotation_deg, abs=1.0)
 
@@ -81,7 +81,7 @@ def test_a_given_coarse_map_may_be_off_by_a_fifth_and_ten_degrees(
     to_base = view(1.0, 15.0)
     off = to_base @ similarity(scale, turn_deg, MIDDLE, MIDDLE + np.array([15.0, -12.0]))
     result = found(photograph(ground, to_base, LENS, SHAPE, 1), base, initial=off)
-    assert result.how.startswith("given")
+    assert result.method.startswith("given")
     assert mean_error_px(result, to_base) < 0.5
 
 
@@ -108,16 +108,16 @@ def test_the_error_map_covers_the_ground_seen_and_nothing_else(ground: np.ndarra
     assert result.error_map.shape == (900 // spacing, 900 // spacing)
     assert np.isfinite(result.error_map[440 // spacing, 450 // spacing])
     assert np.isnan(result.error_map[0, 0])
-    assert result.source_raw.shape == result.target.shape == (len(result.error_left_out_px), 2)
+    assert result.source_raw.shape == result.target.shape == (len(result.cv_errors_px), 2)
 
 
 def test_another_place_is_refused_with_the_scores(base: np.ndarray) -> None:
     image = photograph(city(77, 900, blocks=220), view(1.0, 5.0), LENS, SHAPE, 1)
     result = register_intersensor(image, base, CONFIG, lens=LENS)
     assert isinstance(result, Failure)
-    assert "not a picture of this flight's place; give one" in result.reason
-    assert "SIFT: " in result.reason
-    assert "matches agree" in result.reason
+    assert "not an image of this flight's area; give one" in result.reason
+    assert "SIFT (intensity): " in result.reason
+    assert "inliers of" in result.reason
     assert "\n" not in result.reason
 
 
@@ -125,7 +125,7 @@ def test_a_mirrored_base_image_is_refused_and_called_so(ground: np.ndarray, base
     image = photograph(ground, view(1.0, 5.0), LENS, SHAPE, 1)
     result = register_intersensor(image, np.ascontiguousarray(base[:, ::-1]), CONFIG, lens=LENS)
     assert isinstance(result, Failure)
-    assert result.reason.startswith("found a mirrored picture (")
+    assert result.reason.startswith("found a mirrored image (")
     assert result.reason.endswith("flip it")
 
 
@@ -154,7 +154,7 @@ def test_west_concord(footage: Callable[[str], Path], negative: bool) -> None:
     assert isinstance(result, IntersensorResult), result.reason
     assert result.scale == pytest.approx(0.915, abs=0.012)
     assert np.degrees(result.rotation_rad) == pytest.approx(10.3, abs=0.5)
-    assert result.left_out_error_px < 1.0
+    assert result.cv_error_px < 1.0
     flipped = register_intersensor(
         np.ascontiguousarray(shown[:, ::-1]), base, CONFIG, lens=pinhole((image.shape[0], image.shape[1]))
     )

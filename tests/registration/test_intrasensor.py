@@ -8,15 +8,15 @@ import pytest
 from schemas.flight import RegistrationConfig
 from schemas.simulation import CameraSimulation, OtherSensorSimulation
 from velfield.camera.lens import HarrisLens
-from velfield.registration.alignment import align, blurred, make_templates
+from velfield.registration.alignment import align_patches, make_templates, smooth_levels
 from velfield.registration.intrasensor import (
     BaseReference,
     FrameRegistration,
-    mapped_key_points,
+    map_keypoints,
     prepare_base,
-    register_segment,
+    register_chain,
 )
-from velfield.registration.keypoints import KeyPoints, detect_key_points
+from velfield.registration.keypoints import Keypoints, detect_keypoints
 from velfield.registration.own_base import build_own_base
 from velfield.synthetic.cases import FLAT, PIN_HOLE, small_flight
 from velfield.synthetic.flight import Flight
@@ -49,14 +49,14 @@ def base_of(kind: str) -> BaseReference:
 
 
 @lru_cache(maxsize=16)
-def seen(kind: str, frame: int) -> tuple[np.ndarray, KeyPoints]:
+def seen(kind: str, frame: int) -> tuple[np.ndarray, Keypoints]:
     grey = flight_of(kind).frame(frame)
-    return grey, detect_key_points(grey, CONFIG)
+    return grey, detect_keypoints(grey, CONFIG)
 
 
 def registered(kind: str, frames: list[int], config: RegistrationConfig = CONFIG) -> list[FrameRegistration]:
     stream = ((frame, *seen(kind, frame)) for frame in frames)
-    return register_segment(stream, base_of(kind), lens_of(flight_of(kind)), config)
+    return register_chain(stream, base_of(kind), lens_of(flight_of(kind)), config)
 
 
 def errors_px(kind: str, results: list[FrameRegistration]) -> tuple[float, float]:
@@ -104,9 +104,9 @@ def test_patches_from_afar_do_not_pull_what_lies_near_by() -> None:
     """Another sensor's picture, of whose patches half are found: those looked for farther off are mostly wrong ones."""
     flight = small_flight(frames=4, seed=13)
     shape = flight.camera.height, flight.camera.width
-    frames = [(k, flight.frame(k), detect_key_points(flight.frame(k), CONFIG)) for k in range(4)]
+    frames = [(k, flight.frame(k), detect_keypoints(flight.frame(k), CONFIG)) for k in range(4)]
     base = prepare_base(flight.base_image, CONFIG, frame_shape=shape)
-    results = register_segment(frames, base, lens_of(flight), CONFIG)
+    results = register_chain(frames, base, lens_of(flight), CONFIG)
     score = score_registration(truth_of(flight), lambda frame, xy: results[frame].transform.to_base(xy), range(4))
     assert score.mean_px < 0.12  # 0.15 with them
     assert score.p95_px < 0.3  # 0.39
@@ -114,9 +114,9 @@ def test_patches_from_afar_do_not_pull_what_lies_near_by() -> None:
 
 def test_patches_are_looked_for_farther_off_where_key_points_mislead() -> None:
     """All key points lie four pixels beside what they show: patches near by are few, and farther off they are right."""
-    grey, key_points = seen("still", 0)
-    beside = KeyPoints(key_points.xy + np.array([3.0, -3.0]), key_points.descriptors)
-    results = register_segment([(0, grey, beside)], base_of("still"), lens_of(flight_of("still")), CONFIG)
+    grey, keypoints = seen("still", 0)
+    beside = Keypoints(keypoints.xy + np.array([3.0, -3.0]), keypoints.descriptors)
+    results = register_chain([(0, grey, beside)], base_of("still"), lens_of(flight_of("still")), CONFIG)
     assert errors_px("still", results)[0] < 0.1
 
 
@@ -133,11 +133,11 @@ def test_a_lost_frame_says_why_and_the_next_registers_again() -> None:
     strange = np.random.default_rng(0).integers(0, 255, (60, 80), dtype=np.uint8).repeat(8, 0).repeat(8, 1)
     frames = [
         (0, *seen("still", 0)),
-        (1, black, detect_key_points(black, CONFIG)),
-        (2, strange, detect_key_points(strange, CONFIG)),
+        (1, black, detect_keypoints(black, CONFIG)),
+        (2, strange, detect_keypoints(strange, CONFIG)),
         (3, *seen("still", 3)),
     ]
-    results = register_segment(frames, base_of("still"), lens_of(flight_of("still")), CONFIG)
+    results = register_chain(frames, base_of("still"), lens_of(flight_of("still")), CONFIG)
     assert [r.ok for r in results] == [True, False, False, True]
     for lost in results[1:3]:
         assert lost.status.startswith("failed:no prior, neither from the base image (")
@@ -151,11 +151,11 @@ def test_where_the_base_image_ends_the_previous_frame_carries_on() -> None:
     known = np.zeros(base.shape, bool)
     known[:, : base.shape[1] // 2] = True
     half = prepare_base(base, CONFIG, mask=known)
-    key_points = seen("still", 0)[1]
+    keypoints = seen("still", 0)[1]
     first = registered("still", [0])[0]
-    previous = mapped_key_points(key_points, first.transform)
-    alone = register_segment([(1, *seen("still", 1))], half, lens, CONFIG)[0]
-    chained = register_segment([(1, *seen("still", 1))], half, lens, CONFIG, previous)[0]
+    previous = map_keypoints(keypoints, first.transform)
+    alone = register_chain([(1, *seen("still", 1))], half, lens, CONFIG)[0]
+    chained = register_chain([(1, *seen("still", 1))], half, lens, CONFIG, previous)[0]
     truth = truth_of(flight)
     corner = np.array([[600.0, 240.0]])
     miss = [float(np.linalg.norm(r.transform.to_base(corner) - truth.to_base(1, corner))) for r in (alone, chained)]
@@ -167,12 +167,12 @@ def test_own_base_image_serves_as_well_as_a_given_one() -> None:
     flight = flight_of("city", 6)
     lens = lens_of(flight)
     greys = [flight.frame(k) for k in range(6)]
-    key_points = {k: detect_key_points(grey, CONFIG) for k, grey in enumerate(greys)}
-    own = build_own_base(greys.__getitem__, key_points, reference=4, lens=lens, config=CONFIG, threads=2)
+    keypoints = {k: detect_keypoints(grey, CONFIG) for k, grey in enumerate(greys)}
+    own = build_own_base(greys.__getitem__, keypoints, reference=4, lens=lens, config=CONFIG, threads=2)
     assert own
     assert own.frames == 6
     base = prepare_base(own.image, CONFIG, mask=own.valid, frame_shape=greys[0].shape)
-    results = register_segment(((k, greys[k], key_points[k]) for k in range(6)), base, lens, CONFIG)
+    results = register_chain(((k, greys[k], keypoints[k]) for k in range(6)), base, lens, CONFIG)
     truth = truth_of(flight)
 
     def to_base(frame: int, xy: np.ndarray) -> np.ndarray:
@@ -186,9 +186,9 @@ def test_own_base_image_serves_as_well_as_a_given_one() -> None:
 def test_own_base_of_strange_frames_is_a_failure_with_counts() -> None:
     rng = np.random.default_rng(1)
     greys = [rng.integers(0, 255, (60, 80), dtype=np.uint8).repeat(4, 0).repeat(4, 1) for _ in range(3)]
-    key_points = {k: detect_key_points(grey, CONFIG) for k, grey in enumerate(greys)}
+    keypoints = {k: detect_keypoints(grey, CONFIG) for k, grey in enumerate(greys)}
     found = build_own_base(
-        greys.__getitem__, key_points, reference=0, lens=HarrisLens(0, 159.5, 119.5, 200), config=CONFIG
+        greys.__getitem__, keypoints, reference=0, lens=HarrisLens(0, 159.5, 119.5, 200), config=CONFIG
     )
     assert not found
     assert found.reason == "1 of 3 frames overlap with frame 0, 3 needed"
@@ -202,7 +202,9 @@ def test_patches_are_found_below_the_pixel(shift_px: float) -> None:
     target = transform.polyprojective.target + np.array([shift_px, 0.0, 0.0])
     off = type(transform.polyprojective)(transform.polyprojective.coefficients, transform.polyprojective.source, target)
     moved = type(transform)(width=640, height=480, lens=transform.lens, polyprojective=off)
-    points, looked_for = align(blurred(seen("still", 0)[0])[0], moved, templates, coarse=False, max_shift_px=2.5)
+    points, looked_for = align_patches(
+        smooth_levels(seen("still", 0)[0])[0], moved, templates, coarse=False, max_shift_px=2.5
+    )
     assert len(points) > 0.7 * looked_for
     miss = truth_of(flight).to_base(0, points.xy_raw) - points.xy_base
     assert np.median(np.linalg.norm(miss, axis=1)) < 0.12

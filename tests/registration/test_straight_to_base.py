@@ -12,7 +12,7 @@ from velfield.camera.lens import pinhole
 from velfield.errors import Failure, InputError
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.plan import Plan, make_plan
-from velfield.pipeline.stages.base_image import build_base, key_points_of
+from velfield.pipeline.stages.base_image import build_base, detect_unit_keypoints
 from velfield.pipeline.stages.frames import lay_out_frames, read_unit
 from velfield.pipeline.stages.lens import calibrate_flight
 from velfield.registration.intersensor import register_intersensor
@@ -57,7 +57,7 @@ def seen(base: np.ndarray) -> list[np.ndarray]:
 
 def test_how_the_flight_lies_on_a_given_picture_is_told(base: np.ndarray, tmp_path: Path) -> None:
     plan = plan_on(base, seen(base), tmp_path, gsd_m=0.2)
-    outcome = build_base(plan, [key_points_of(plan, range(3))])
+    outcome = build_base(plan, [detect_unit_keypoints(plan, range(3))])
     assert "straight: a frame pixel is about 1.00 base pixels, turned by about 5 degrees, clockwise" in outcome.notes[0]
     assert not outcome.warnings
     assert outcome.counts["covered"] == 1.0
@@ -67,7 +67,7 @@ def test_how_the_flight_lies_on_a_given_picture_is_told(base: np.ndarray, tmp_pa
 def test_another_scale_is_told_of_gsd_m(base: np.ndarray, tmp_path: Path) -> None:
     small = cv2.resize(base, None, fx=0.7, fy=0.7, interpolation=cv2.INTER_AREA)
     plan = plan_on(small, seen(base), tmp_path, gsd_m=0.2)
-    outcome = build_base(plan, [key_points_of(plan, range(3))])
+    outcome = build_base(plan, [detect_unit_keypoints(plan, range(3))])
     assert "--gsd-m 0.2 is of the base pixels, so that a frame pixel is 0.14 m" in outcome.notes[0]
     assert not outcome.warnings
 
@@ -80,13 +80,13 @@ def test_a_picture_much_coarser_than_the_frames_is_refused_with_the_size_that_se
     with pytest.raises(
         InputError, match=r"found 0\.35 base pixels a frame pixel, expected 0\.5 to 2; .* (639|640|641) x"
     ):
-        build_base(plan, [key_points_of(plan, range(3))])
+        build_base(plan, [detect_unit_keypoints(plan, range(3))])
 
 
 def test_a_picture_of_a_part_of_the_flight_warns_how_much_it_shows(base: np.ndarray, tmp_path: Path) -> None:
     part = np.ascontiguousarray(base[:, :420])
     plan = plan_on(part, seen(base), tmp_path)
-    warnings = build_base(plan, [key_points_of(plan, range(3))]).warnings
+    warnings = build_base(plan, [detect_unit_keypoints(plan, range(3))]).warnings
     # Frames are 480 px wide about column 315: from 75 on, so that 345 of 480 columns are on the picture.
     (share,) = (int(word[:-1]) for line in warnings for word in line.split() if word.endswith("%"))
     assert 66 <= share <= 78
@@ -96,6 +96,6 @@ def test_frames_whose_rows_wobble_lie_straight_on_their_base_image(base: np.ndar
     views = [similarity(1.0, 4.0 + k, MIDDLE, np.array([310.0 + 5 * k, 320.0])) for k in range(3)]
     frames = [shaken(photograph(base, view, pinhole(SHAPE), SHAPE, k)) for k, view in enumerate(views)]
     plan = plan_on(base, frames, tmp_path)
-    build_base(plan, [key_points_of(plan, range(3))])
+    build_base(plan, [detect_unit_keypoints(plan, range(3))])
     assert read_grid(plan.layout).frames_to == "given"
     assert isinstance(register_intersensor(frames[1], base, plan.config.base, lens=pinhole(SHAPE)), Failure)

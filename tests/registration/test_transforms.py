@@ -14,8 +14,8 @@ from velfield.registration.transforms import (
     FrameTransform,
     HomographyTransform,
     PolyprojectiveTransform,
+    fit_normalisation,
     mesh_shape,
-    normalisation_of,
     vector_length,
 )
 
@@ -38,8 +38,8 @@ def homography(rng: np.random.Generator) -> np.ndarray:
 def bent(rng: np.random.Generator) -> PolyprojectiveTransform:
     """A polyprojective that is a homography and some bending of a few pixels."""
     matrix = homography(rng)
-    source = normalisation_of(grid())
-    target = normalisation_of(HomographyTransform(matrix)(grid()))
+    source = fit_normalisation(grid())
+    target = fit_normalisation(HomographyTransform(matrix)(grid()))
     plain = PolyprojectiveTransform.from_homography(matrix, source, target)
     bend = np.zeros((3, 6))
     bend[:, 3:] = rng.uniform(-0.01, 0.01, (3, 3))
@@ -83,7 +83,7 @@ def test_jacobian_is_the_difference_quotient() -> None:
 
 def test_polyprojective_without_bending_is_the_homography() -> None:
     matrix = homography(np.random.default_rng(2))
-    p = PolyprojectiveTransform.from_homography(matrix, normalisation_of(grid()), np.array([3.0, 4.0, 0.01]))
+    p = PolyprojectiveTransform.from_homography(matrix, fit_normalisation(grid()), np.array([3.0, 4.0, 0.01]))
     assert p.is_homography
     np.testing.assert_allclose(p(grid()), HomographyTransform(matrix)(grid()), atol=1e-8)
     np.testing.assert_allclose(p.homography(), matrix, atol=1e-10)
@@ -120,7 +120,7 @@ def test_row_motion_is_a_shift_and_a_roll_by_the_raw_row() -> None:
     undistorted = t.lens.undistort_points(raw)
     offset = undistorted - t.centre
     turned = np.stack([-offset[:, 1], offset[:, 0]], axis=1) * motion[:, 2:]
-    np.testing.assert_allclose(t.row_moved(raw), undistorted + motion[:, :2] + turned, atol=1e-9)
+    np.testing.assert_allclose(t.remove_row_motion(raw), undistorted + motion[:, :2] + turned, atol=1e-9)
 
 
 def test_spline_of_equal_coefficients_is_constant() -> None:
@@ -153,7 +153,7 @@ def test_vector_brings_the_transform_back(model: str) -> None:
 def test_composition_is_one_map_after_the_other() -> None:
     rng = np.random.default_rng(6)
     t, p = frame_transform(rng), bent(rng)
-    both = t.followed_by(p)
+    both = t.then(p)
     raw = grid(inset=20)
     there = both.to_base(raw)
     np.testing.assert_allclose(there, p(t.to_base(raw)))

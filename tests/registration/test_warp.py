@@ -6,7 +6,7 @@ import pytest
 
 from velfield.camera.lens import HarrisLens, pinhole
 from velfield.registration.background import median_background
-from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, normalisation_of
+from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, fit_normalisation
 from velfield.registration.warp import footprint, warp_to_base
 
 WIDTH, HEIGHT = 240, 180
@@ -15,7 +15,7 @@ WIDTH, HEIGHT = 240, 180
 def moved(matrix: np.ndarray, *, a: float = 0.0) -> FrameTransform:
     corners = np.array([[0.0, 0.0], [WIDTH - 1, HEIGHT - 1]])
     lens = HarrisLens(a, 119.5, 89.5, 150.0) if a else pinhole((HEIGHT, WIDTH))
-    p = PolyprojectiveTransform.from_homography(matrix, normalisation_of(corners), normalisation_of(corners))
+    p = PolyprojectiveTransform.from_homography(matrix, fit_normalisation(corners), fit_normalisation(corners))
     return FrameTransform(width=WIDTH, height=HEIGHT, lens=lens, polyprojective=p)
 
 
@@ -66,7 +66,9 @@ def test_continued_a_frame_ends_without_an_edge() -> None:
     angle = 0.2
     matrix = np.array([[np.cos(angle), -np.sin(angle), 20.0], [np.sin(angle), np.cos(angle), 10.0], [0, 0, 1.0]])
     window = (-20, -20, WIDTH + 40, HEIGHT + 40)
-    image, mask = warp_to_base(np.full((HEIGHT, WIDTH), 170, np.uint8), moved(matrix), window=window, continued=True)
+    image, mask = warp_to_base(
+        np.full((HEIGHT, WIDTH), 170, np.uint8), moved(matrix), window=window, replicate_border=True
+    )
     assert not mask.all()
     assert (image == 170).all()
 

@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray
 from velfield.errors import InputError
-from velfield.registration.alignment import FEW, MANY, Templates, align, blurred, make_templates
+from velfield.registration.alignment import (
+    N_PATCHES_CROSS_SENSOR,
+    N_PATCHES_SAME_SENSOR,
+    Templates,
+    align_patches,
+    make_templates,
+    smooth_levels,
+)
 from velfield.registration.transforms import FrameTransform
 from velfield.run.run import Run
 from velfield.sources.images import read_picture_grey
@@ -103,13 +110,13 @@ def still_things(run: Run, *, max_frames: int = 200, within: FloatArray | None =
 
 
 def unused_corners(run: Run) -> tuple[Templates, NDArray[np.uint8]]:
-    """Corners that registration does not align, of the picture (h, w) that frames were registered to; and that."""
+    """Corners that registration does not use, and the image (h, w) that frames were registered to."""
     layout, limit = run.layout, run.record.config.frames.max_pixels
     own = run.grid.frames_to == "own"
     grey = read_picture_grey(layout.own_base_image, limit) if own else run.base_image
     known = read_picture_grey(layout.own_base_mask, limit) > 0 if own else np.ones(grey.shape, np.bool_)
-    used = [make_templates(grey, known, count=count).xy for count in (FEW, MANY)]
-    return make_templates(grey, known, apart_from=np.concatenate(used), half_patch=PATCH_HALF_PX), grey
+    used = [make_templates(grey, known, count=count).xy for count in (N_PATCHES_SAME_SENSOR, N_PATCHES_CROSS_SENSOR)]
+    return make_templates(grey, known, exclude=np.concatenate(used), half_patch=PATCH_HALF_PX), grey
 
 
 def _sharpest(run: Run, within: FloatArray | None) -> Templates:
@@ -127,12 +134,12 @@ def _sharpest(run: Run, within: FloatArray | None) -> Templates:
     noise = np.where(inside, found.sigma_px, np.inf)
     wanted = max(int((noise <= SHARP_PX).sum()), min(_AT_LEAST, int(inside.sum())))
     order = np.argsort(noise, kind="stable")[:wanted]
-    return found.where(order)
+    return found.select(order)
 
 
 def places_on_map(grey: NDArray[np.uint8], transform: FrameTransform, templates: Templates) -> FloatArray:
     """Where a frame puts the corners on the map, (n, 2) base px; NaN where it does not show them."""
-    found, _ = align(blurred(grey)[0], transform, templates, coarse=False, max_shift_px=_MAX_SHIFT_PX)
+    found, _ = align_patches(smooth_levels(grey)[0], transform, templates, coarse=False, max_shift_px=_MAX_SHIFT_PX)
     number = {(float(x), float(y)): k for k, (x, y) in enumerate(templates.xy)}
     rows = [number[(float(x), float(y))] for x, y in found.xy_base]
     places = np.full((len(templates), 2), np.nan)

@@ -1,9 +1,9 @@
-"""Edge points below the pixel, and the smooth arcs they form.
+"""Subpixel edge points, linked into smooth arcs.
 
-The plumb line wants directions that are good to a fraction of a degree. The gradient of one pixel is not; so edge
-points are linked into chains, chains are cut where they are no smooth arc, and the direction at a point is that of the
-parabola through its arc. An arc bent more than a lens bends lines is no image of a straight line and is dropped here; a
-gently curved kerb is not, and is left to the robust fit.
+The plumb line needs tangent directions accurate to a fraction of a degree, which the gradient of one pixel is not. So
+edge points are linked into chains, chains are split until a parabola fits each piece, and the tangent at a point is
+that of the parabola. Arcs of a higher curvature than a lens can cause are dropped; gently curved kerbs remain and are
+left to the robust fit.
 """
 
 from dataclasses import dataclass
@@ -11,18 +11,17 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray, GreyImage, IntArray
+from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
 
-_FEWEST_POINTS, _MOST_POINTS = 10, 24  # kept of an arc
+_MIN_POINTS_PER_ARC, _MAX_POINTS_PER_ARC = 10, 24  # after pooling
 
 
 @dataclass(frozen=True)
 class Arcs:
-    """Points of smooth arcs: ``xy`` (n, 2) raw px, unit ``tangents`` (n, 2), ``arc`` (n,) number of the arc, ascending.
+    """Points of smooth arcs: ``xy`` (n, 2) raw px, unit ``tangents`` (n, 2), ``arc`` (n,) index of the arc, ascending.
 
-    ``frame`` (arcs,) is the frame of each arc and ``length_px`` (arcs,) its chord.
+    ``frame`` (arcs,) is the frame of each arc and ``length_px`` (arcs,) its chord length.
     """
 
     xy: FloatArray
@@ -31,23 +30,23 @@ class Arcs:
     frame: IntArray
     length_px: FloatArray
 
-    def only(self, arcs: NDArray[np.bool_]) -> "Arcs":
-        """The arcs of a mask (arcs,), numbered anew."""
+    def select(self, arcs: Mask) -> "Arcs":
+        """The arcs of a mask (arcs,), renumbered."""
         points = arcs[self.arc]
         number = np.cumsum(arcs) - 1
         return Arcs(
             self.xy[points], self.tangents[points], number[self.arc[points]], self.frame[arcs], self.length_px[arcs]
         )
 
-    def every(self, stride: int) -> "Arcs":
-        """Each ``stride``-th point."""
+    def subsample(self, stride: int) -> "Arcs":
+        """Every ``stride``-th point."""
         step = slice(None, None, stride)
         return Arcs(self.xy[step], self.tangents[step], self.arc[step], self.frame, self.length_px)
 
 
 @njit(cache=True, nogil=True)
 def _edge_points(smooth, min_gradient):  # type: ignore[no-untyped-def]  # numba
-    """Maxima of the gradient along its own direction: place (x, y) below the pixel and unit gradient, raster order."""
+    """Non-maximum suppression of the gradient: subpixel (x, y) and unit gradient, in raster order; index image."""
     height, width = smooth.shape
     gradient = np.zeros((height, width), dtype=np.float32)
     for y in range(1, height - 1):
@@ -55,7 +54,7 @@ def _edge_points(smooth, min_gradient):  # type: ignore[no-untyped-def]  # numba
             gx = smooth[y, x + 1] - smooth[y, x - 1]
             gy = smooth[y + 1, x] - smooth[y - 1, x]
             gradient[y, x] = 0.5 * np.sqrt(gx * gx + gy * gy)
-    place = np.full((height, width), -1, dtype=np.int32)
+    index = np.full((height, width), -1, dtype=np.int32)
     points = np.empty((height * width // 4, 4), dtype=np.float32)
     count = 0
     for y in range(2, height - 2):
@@ -65,8 +64,8 @@ def _edge_points(smooth, min_gradient):  # type: ignore[no-untyped-def]  # numba
                 continue
             ux = 0.5 * (smooth[y, x + 1] - smooth[y, x - 1]) / middle
             uy = 0.5 * (smooth[y + 1, x] - smooth[y - 1, x]) / middle
-            ahead = _between(gradient, x + ux, y + uy)
-            behind = _between(gradient, x - ux, y - uy)
+            ahead = _bilinear(gradient, x + ux, y + uy)
+            behind = _bilinear(gradient, x - ux, y - uy)
             if middle <= behind or middle < ahead or count >= points.shape[0]:
                 continue
             offset = 0.5 * (behind - ahead) / (behind - 2.0 * middle + ahead)
@@ -74,14 +73,14 @@ def _edge_points(smooth, min_gradient):  # type: ignore[no-untyped-def]  # numba
             points[count, 1] = y + offset * uy
             points[count, 2] = ux
             points[count, 3] = uy
-            place[y, x] = count
+            index[y, x] = count
             count += 1
-    return points[:count].copy(), place
+    return points[:count].copy(), index
 
 
 @njit(cache=True, nogil=True)
-def _between(values, x, y):  # type: ignore[no-untyped-def]  # numba
-    """Bilinear value at (x, y), which lies within the picture."""
+def _bilinear(values, x, y):  # type: ignore[no-untyped-def]  # numba
+    """Bilinear value at (x, y), inside the image."""
     x0 = int(x)
     y0 = int(y)
     fx = x - x0
@@ -92,17 +91,17 @@ def _between(values, x, y):  # type: ignore[no-untyped-def]  # numba
 
 
 @njit(cache=True, nogil=True)
-def _next_point(points, place, taken, current, tx, ty, reach, min_cosine):  # type: ignore[no-untyped-def]  # numba
-    """The free point ahead that continues the chain best, or -1."""
-    height, width = place.shape
+def _find_next(points, index, used_points, current, tx, ty, reach, min_cosine):  # type: ignore[no-untyped-def]  # numba
+    """The unused point that continues the chain best, or -1."""
+    height, width = index.shape
     px, py = points[current, 0], points[current, 1]
     column, row = int(px + 0.5), int(py + 0.5)
     best = -1
     best_score = 1e9
     for y in range(max(row - reach, 0), min(row + reach + 1, height)):
         for x in range(max(column - reach, 0), min(column + reach + 1, width)):
-            other = place[y, x]
-            if other < 0 or taken[other]:
+            other = index[y, x]
+            if other < 0 or used_points[other]:
                 continue
             dx, dy = points[other, 0] - px, points[other, 1] - py
             ahead = dx * tx + dy * ty
@@ -118,34 +117,34 @@ def _next_point(points, place, taken, current, tx, ty, reach, min_cosine):  # ty
 
 
 @njit(cache=True, nogil=True)
-def _link(points, place, min_points, min_cosine):  # type: ignore[no-untyped-def]  # numba
-    """Chains of edge points, each followed both ways from its first: numbers of points, and where each chain starts."""
+def _link_chains(points, index, min_points, min_cosine):  # type: ignore[no-untyped-def]  # numba
+    """Link edge points into chains, in both directions from a seed: point indices, and the start of each chain."""
     count = points.shape[0]
-    taken = np.zeros(count, dtype=np.bool_)
+    used_points = np.zeros(count, dtype=np.bool_)
     order = np.empty(count, dtype=np.int64)
     starts = [0]
     used = 0
     ahead_of = np.empty(count, dtype=np.int64)
     for seed in range(count):
-        if taken[seed]:
+        if used_points[seed]:
             continue
-        taken[seed] = True
+        used_points[seed] = True
         begin = used
-        for way in (-1.0, 1.0):
+        for sign in (-1.0, 1.0):
             current = seed
             steps = 0
             while True:
-                tx, ty = -way * points[current, 3], way * points[current, 2]
-                following = _next_point(points, place, taken, current, tx, ty, 1, min_cosine)
-                if following < 0:
-                    following = _next_point(points, place, taken, current, tx, ty, 2, min_cosine)
-                if following < 0:
+                tx, ty = -sign * points[current, 3], sign * points[current, 2]
+                successor = _find_next(points, index, used_points, current, tx, ty, 1, min_cosine)
+                if successor < 0:
+                    successor = _find_next(points, index, used_points, current, tx, ty, 2, min_cosine)
+                if successor < 0:
                     break
-                taken[following] = True
-                ahead_of[steps] = following
+                used_points[successor] = True
+                ahead_of[steps] = successor
                 steps += 1
-                current = following
-            if way < 0:
+                current = successor
+            if sign < 0:
                 for step in range(steps):
                     order[used] = ahead_of[steps - 1 - step]
                     used += 1
@@ -163,8 +162,8 @@ def _link(points, place, min_points, min_cosine):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, nogil=True)
-def _parabola(points, order, begin, end, out):  # type: ignore[no-untyped-def]  # numba
-    """Least-squares parabola over the chord of a stretch of chain; writes the residuals; returns axes and terms."""
+def _fit_parabola(points, order, begin, end, out):  # type: ignore[no-untyped-def]  # numba
+    """Least-squares parabola over the chord of a piece of chain; writes the residuals, returns axes and terms."""
     first, last = order[begin], order[end - 1]
     ox, oy = points[first, 0], points[first, 1]
     tx, ty = points[last, 0] - ox, points[last, 1] - oy
@@ -192,8 +191,8 @@ def _parabola(points, order, begin, end, out):  # type: ignore[no-untyped-def]  
 
 
 @njit(cache=True, nogil=True)
-def _arcs(points, order, starts, min_length, tolerance, max_curvature):  # type: ignore[no-untyped-def]  # numba
-    """Cut chains until a parabola fits each piece; keep long pieces that bend little: (x, y, tx, ty, arc), chords."""
+def _split_into_arcs(points, order, starts, min_length, tolerance, max_curvature):  # type: ignore[no-untyped-def]  # numba
+    """Split chains until a parabola fits each piece; keep long, slightly curved ones: (x, y, tx, ty, arc), chords."""
     rows = np.empty((order.size, 5))
     chords = []  # type: ignore[var-annotated]  # numba infers it
     residual = np.zeros(order.size)
@@ -204,7 +203,7 @@ def _arcs(points, order, starts, min_length, tolerance, max_curvature):  # type:
             begin, end = stack.pop()
             if end - begin < min_length * 0.7:
                 continue
-            ox, oy, tx, ty, chord, terms = _parabola(points, order, begin, end, residual)
+            ox, oy, tx, ty, chord, terms = _fit_parabola(points, order, begin, end, residual)
             worst = begin
             for i in range(begin, end):
                 if abs(residual[i]) > abs(residual[worst]):
@@ -221,56 +220,56 @@ def _arcs(points, order, starts, min_length, tolerance, max_curvature):  # type:
             for i in range(begin, end):
                 px, py = points[order[i], 0], points[order[i], 1]
                 s = ((px - ox) * tx + (py - oy) * ty) / chord
-                slope = (terms[1] + 2.0 * terms[2] * s) / chord
-                norm = np.sqrt(1.0 + slope * slope)
+                derivative = (terms[1] + 2.0 * terms[2] * s) / chord
+                norm = np.sqrt(1.0 + derivative * derivative)
                 rows[used, 0], rows[used, 1] = px, py
-                rows[used, 2], rows[used, 3] = (tx - slope * ty) / norm, (ty + slope * tx) / norm
+                rows[used, 2], rows[used, 3] = (tx - derivative * ty) / norm, (ty + derivative * tx) / norm
                 rows[used, 4] = len(chords)
                 used += 1
             chords.append(chord)
     return rows[:used].copy(), np.array(chords)
 
 
-def find_arcs(
+def detect_arcs(
     grey: GreyImage,
     *,
     frame: int,
     smoothing_px: float = 1.2,
-    edge_share: float = 0.25,
+    edge_fraction: float = 0.25,
     min_gradient: float = 1.2,
     tolerance_px: float = 1.0,
     min_length_px: float,
     max_curvature_per_px: float,
 ) -> Arcs:
-    """Smooth arcs of edge points of one frame.
+    """Detect smooth arcs of edge points in one frame.
 
     Parameters
     ----------
     grey
         (h, w) uint8.
     frame
-        Number given to the arcs' frame.
+        Frame number of the arcs.
     smoothing_px
-        Gaussian blur before the gradient.
-    edge_share
-        Only the steepest share of the pixels may be edge; a city is all texture.
+        Sigma of the Gaussian blur before the gradient.
+    edge_fraction
+        Fraction of the pixels, those of largest gradient, that may be edges: cities are textured everywhere.
     min_gradient
-        Grey values a pixel; below this nothing is an edge.
+        Smallest gradient of an edge, grey levels per pixel.
     tolerance_px
         Largest distance of a point from its arc's parabola.
     min_length_px
         Shortest arc, px of chord.
     max_curvature_per_px
-        Most bent arc, 1 / px: what the strongest lens considered makes of a straight line.
+        Largest curvature, 1 / px: that of a straight line under the strongest lens considered.
     """
-    # In whole grey values a faint edge is lost among steps.
+    # Blurred as float: rounding to integers would quantise faint edges.
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), smoothing_px)
     sample = smooth[::4, ::4]
-    steepness = np.hypot(np.diff(sample, axis=0)[:, :-1], np.diff(sample, axis=1)[:-1]) / 4.0
-    threshold = max(min_gradient, float(np.quantile(steepness, 1.0 - edge_share)))
-    points, place = _edge_points(smooth, np.float32(threshold))
-    order, starts = _link(points, place, int(0.7 * min_length_px), np.cos(np.radians(25.0)))
-    rows, chords = _arcs(points, order, starts, min_length_px, tolerance_px, max_curvature_per_px)
+    magnitude = np.hypot(np.diff(sample, axis=0)[:, :-1], np.diff(sample, axis=1)[:-1]) / 4.0
+    threshold = max(min_gradient, float(np.quantile(magnitude, 1.0 - edge_fraction)))
+    points, index = _edge_points(smooth, np.float32(threshold))
+    order, starts = _link_chains(points, index, int(0.7 * min_length_px), np.cos(np.radians(25.0)))
+    rows, chords = _split_into_arcs(points, order, starts, min_length_px, tolerance_px, max_curvature_per_px)
     return Arcs(
         xy=np.ascontiguousarray(rows[:, :2]),
         tangents=np.ascontiguousarray(rows[:, 2:4]),
@@ -281,38 +280,37 @@ def find_arcs(
 
 
 def pool_arcs(parts: list[Arcs], *, max_points: int) -> Arcs:
-    """Arcs of several frames as one set, as points that are means of pieces of their arc, the longest arcs where all
-    would be too many.
+    """Pool the arcs of several frames, each reduced to means of its points; only the longest if there are too many.
 
     Parameters
     ----------
     parts
         Arcs of each frame.
     max_points
-        Points kept, all frames together. A long arc tells more by its length, not by its number of points, whose noise
-        neighbours share: so each arc is cut into the same number of pieces, 10 to 24, the fewer the more arcs there
-        are. A piece's mean has less noise than any of its points, and its bow is the same all along an arc.
+        Points kept, all frames together. The information of an arc grows with its length, not with its number of
+        points, whose errors are correlated: so each arc is divided into the same number of pieces, 10 to 24, fewer the
+        more arcs there are, and each piece is replaced by its mean.
     """
     offsets = np.cumsum([0, *(part.length_px.size for part in parts)])
     arc = np.concatenate([part.arc + offset for part, offset in zip(parts, offsets, strict=False)])
     length_px = np.concatenate([part.length_px for part in parts])
     frame = np.concatenate([part.frame for part in parts])
     count = length_px.size
-    points_per_arc = int(np.clip(max_points // max(count, 1), _FEWEST_POINTS, _MOST_POINTS))
+    points_per_arc = int(np.clip(max_points // max(count, 1), _MIN_POINTS_PER_ARC, _MAX_POINTS_PER_ARC))
     sizes = np.bincount(arc, minlength=count)
     within = np.arange(arc.size) - (np.cumsum(sizes) - sizes)[arc]
     pieces = np.minimum(sizes, points_per_arc)
     piece = (np.cumsum(pieces) - pieces)[arc] + within * pieces[arc] // sizes[arc]
-    xy = _means(np.concatenate([part.xy for part in parts]), piece)
-    tangents = _means(np.concatenate([part.tangents for part in parts]), piece)
+    xy = _group_means(np.concatenate([part.xy for part in parts]), piece)
+    tangents = _group_means(np.concatenate([part.tangents for part in parts]), piece)
     tangents /= np.hypot(tangents[:, :1], tangents[:, 1:])
     longest = np.argsort(-length_px, kind="stable")
     kept = np.zeros(count, dtype=bool)
     kept[longest[: max_points // points_per_arc]] = True
-    return Arcs(xy, tangents, np.repeat(np.arange(count), pieces), frame, length_px).only(kept)
+    return Arcs(xy, tangents, np.repeat(np.arange(count), pieces), frame, length_px).select(kept)
 
 
-def _means(values: FloatArray, group: IntArray) -> FloatArray:
-    """Mean of the values (n, 2) of each group, (groups, 2); no group is empty."""
+def _group_means(values: FloatArray, group: IntArray) -> FloatArray:
+    """Mean of the values (n, 2) of each group, (groups, 2); groups must not be empty."""
     size = np.bincount(group)
     return np.stack([np.bincount(group, weights=values[:, k]) / size for k in (0, 1)], axis=1)

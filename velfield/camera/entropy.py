@@ -1,9 +1,9 @@
-"""How straight the lines of the scene are under a lens: the entropy of their Hough histogram.
+"""Entropy of the Hough histogram of undistorted edge points: the paper's measure of straightness under a lens.
 
-Paper: camera calibration by the plumb line. Edge points are undistorted together with their tangents; points of one
-straight line then share one angle and one distance from the origin, and the histogram of both is peaked: its entropy is
-least for the lens that makes lines straight. The angle alone gives a wide valley (the search's start), the angle with
-the distance a sharp one.
+Paper: camera calibration by the plumb line. Edge points are undistorted together with their tangents. Points of one
+straight line then have the same angle and the same distance from the origin, so the histogram is peaked: its entropy
+is minimal for the lens that makes lines straight. The angle alone has a wide basin of attraction, angle and distance
+together a sharp minimum.
 """
 
 from collections.abc import Sequence
@@ -11,21 +11,21 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray
+from schemas.arrays import FloatArray, IntArray
 from velfield.camera.edges import Arcs
 from velfield.camera.lens import Lens
 
 
-def _soft_bins(values: FloatArray, width: float) -> tuple[NDArray[np.int64], FloatArray]:
-    """Each value's lower bin and its share in the next: the entropy must not jump as a value crosses a border."""
+def linear_bin_weights(values: FloatArray, width: float) -> tuple[IntArray, FloatArray]:
+    """Lower bin of each value and the weight of the next bin (linear binning): the entropy is continuous."""
     position = values / width
     lower = np.floor(position)
     return lower.astype(np.int64), position - lower
 
 
 def _entropy_nats(weights: NDArray[np.floating | np.integer]) -> float:
-    shares = weights[weights > 0] / weights.sum()
-    return float(-np.sum(shares * np.log(shares)))
+    probability = weights[weights > 0] / weights.sum()
+    return float(-np.sum(probability * np.log(probability)))
 
 
 def hough_entropy(arcs: Arcs, lens: Lens, *, angle_bins: int, distance_bin_px: float | None = None) -> float:
@@ -34,19 +34,19 @@ def hough_entropy(arcs: Arcs, lens: Lens, *, angle_bins: int, distance_bin_px: f
     Parameters
     ----------
     arcs
-        Edge points with tangents; each frame has a histogram of its own.
+        Edge points with tangents; each frame has its own histogram.
     lens
-        The lens that is tried.
+        The trial lens.
     angle_bins
         Bins over half a turn.
     distance_bin_px
-        Bin of the distance from the frame's middle, undistorted px at the centre's scale; None: angle alone.
+        Bin width of the distance from the centroid of the points, undistorted px; None: angle alone.
 
     Returns
     -------
     float
-        Infinity where a point falls outside the lens's domain. A lens that stretches the picture spreads the distances
-        over more bins without bending a line; the mean logarithm of the stretch is taken off again.
+        Infinity if a point is outside the lens's domain. A lens that stretches the image spreads the distances over
+        more bins without bending a line; the mean logarithm of the stretch is subtracted.
     """
     xy = lens.undistort_points(arcs.xy)
     tangents = lens.undistort_tangents(arcs.xy, arcs.tangents)
@@ -54,45 +54,45 @@ def hough_entropy(arcs: Arcs, lens: Lens, *, angle_bins: int, distance_bin_px: f
         return float("inf")
     angle = np.mod(np.arctan2(tangents[:, 1], tangents[:, 0]), np.pi)
     frame = arcs.frame[arcs.arc]
-    low, share = _soft_bins(angle, np.pi / angle_bins)
+    low, upper = linear_bin_weights(angle, np.pi / angle_bins)
     angle_keys = [np.mod(low, angle_bins), np.mod(low + 1, angle_bins)]
-    angle_shares = [1.0 - share, share]
+    angle_weights = [1.0 - upper, upper]
     if distance_bin_px is None:
         keys = np.concatenate([frame * angle_bins + key for key in angle_keys])
-        return _entropy_nats(np.bincount(keys, weights=np.concatenate(angle_shares)))
-    return _joint_entropy(arcs, xy, tangents, angle_keys, angle_shares, angle_bins, distance_bin_px)
+        return _entropy_nats(np.bincount(keys, weights=np.concatenate(angle_weights)))
+    return _joint_entropy(arcs, xy, tangents, angle_keys, angle_weights, angle_bins, distance_bin_px)
 
 
 def _joint_entropy(
     arcs: Arcs,
     xy: FloatArray,
     tangents: FloatArray,
-    angle_keys: Sequence[NDArray[np.int64]],
-    angle_shares: Sequence[FloatArray],
+    angle_keys: Sequence[IntArray],
+    angle_weights: Sequence[FloatArray],
     angle_bins: int,
     distance_bin_px: float,
 ) -> float:
-    """Entropy of (frame, angle, distance), less the mean log of the stretch across the line."""
+    """Entropy of (frame, angle, distance), minus the mean logarithm of the stretch."""
     unit = tangents / np.linalg.norm(tangents, axis=1, keepdims=True)
     normal = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
     normal *= np.where(normal[:, 1:] < 0, -1.0, 1.0)
     origin = arcs.xy.mean(axis=0)
     distance = np.sum((xy - origin) * normal, axis=1)
-    low, share = _soft_bins(distance, distance_bin_px)
+    low, upper = linear_bin_weights(distance, distance_bin_px)
     keys, weights = [], []
     frame = arcs.frame[arcs.arc]
-    for angle_key, angle_share in zip(angle_keys, angle_shares, strict=True):
-        for distance_key, distance_share in ((low, 1.0 - share), (low + 1, share)):
+    for angle_key, angle_weight in zip(angle_keys, angle_weights, strict=True):
+        for distance_key, distance_weight in ((low, 1.0 - upper), (low + 1, upper)):
             keys.append((frame * angle_bins + angle_key) * 65536 + distance_key + 32768)
-            weights.append(angle_share * distance_share)
+            weights.append(angle_weight * distance_weight)
     _, inverse = np.unique(np.concatenate(keys), return_inverse=True)
     entropy = _entropy_nats(np.bincount(inverse, weights=np.concatenate(weights)))
-    area = _log_area_stretch(arcs, xy, tangents)
-    return entropy - area
+    stretch = _mean_log_stretch(arcs, xy, tangents)
+    return entropy - stretch
 
 
-def _log_area_stretch(arcs: Arcs, xy: FloatArray, tangents: FloatArray) -> float:
-    """Mean logarithm of the stretch across the lines, from the arcs' own points: distances between lines grow by it."""
+def _mean_log_stretch(arcs: Arcs, xy: FloatArray, tangents: FloatArray) -> float:
+    """Mean logarithm of the radial stretch at the points: distances between lines grow by about that factor."""
     radius_raw = np.linalg.norm(arcs.xy - arcs.xy.mean(axis=0), axis=1)
     radius = np.linalg.norm(xy - arcs.xy.mean(axis=0), axis=1)
     ratio = np.where(radius_raw > 1.0, radius / np.maximum(radius_raw, 1.0), 1.0)

@@ -1,20 +1,18 @@
-"""Radial lens models: raw pixels to the pixels a pin-hole would have given, and back.
+"""Radial lens models: raw pixels to the pixels of an ideal pinhole camera, and back.
 
-Paper: camera calibration. Undistorted pixels have the unit of raw pixels at the centre of distortion, where the scale
-is one, and extend beyond the frame where the lens is a barrel. A model is a frozen value with a closed undistortion;
-its inverse is closed (Harris, division) or found by Newton's method to 1e-9 px (polynomial), NaN where there is none.
+Paper: camera calibration. The scale is 1 at the centre of distortion; undistorted pixels extend beyond the frame for
+barrel distortion. A model is an immutable value with a closed-form undistortion; its inverse is closed (Harris,
+division) or computed by Newton's method to 1e-9 px (polynomial), NaN where there is none.
 
-Whatever offers ``undistort_points``, ``distort_points`` and ``undistort_tangents`` is a lens (`Lens`), so that the
-rooms after this one need not know which.
+Other packages use the protocol `Lens` and do not depend on the model.
 """
 
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from schemas.arrays import Points
+from schemas.arrays import FloatArray, Points
 from schemas.camera import DivisionLensRecord, HarrisLensRecord, LensRecord, PolynomialLensRecord
 
 _NEWTON_STEPS = 60
@@ -38,7 +36,7 @@ class Lens(Protocol):
         ...
 
     def undistort_tangents(self, xy_raw: Points, tangents: Points) -> Points:
-        """Directions (n, 2) at raw pixels (n, 2) as the undistortion turns and stretches them (its derivative)."""
+        """Directions (n, 2) at raw pixels (n, 2), multiplied by the Jacobian of the undistortion."""
         ...
 
     def to_record(self) -> LensRecord:
@@ -53,9 +51,9 @@ class HarrisLens:
     Parameters
     ----------
     a
-        Distortion, in 1 / half-diagonal^2: positive is barrel, zero the pin-hole.
+        Distortion, in 1 / half-diagonal^2: positive is barrel, zero a pinhole camera.
     centre_x_px, centre_y_px
-        Centre of distortion, raw px; it stays where it is.
+        Centre of distortion, raw px; a fixed point.
     half_diagonal_px
         Unit of the radius, px.
 
@@ -73,7 +71,7 @@ class HarrisLens:
 
     @property
     def is_identity(self) -> bool:
-        """Whether this is the pin-hole."""
+        """Whether there is no distortion."""
         return self.a == 0.0
 
     def _offsets(self, xy: Points) -> tuple[Points, Points]:
@@ -82,25 +80,25 @@ class HarrisLens:
 
     def undistort_points(self, xy_raw: Points) -> Points:
         """Raw pixels (n, 2) to undistorted pixels (n, 2); NaN rows at and beyond r_d = 1 / sqrt(a)."""
-        return self._stretched(xy_raw, -self.a)
+        return self._scale_radially(xy_raw, -self.a)
 
     def distort_points(self, xy: Points) -> Points:
-        """Undistorted pixels (n, 2) to raw pixels (n, 2); NaN rows where a pincushion has no inverse."""
-        return self._stretched(xy, self.a)
+        """Undistorted pixels (n, 2) to raw pixels (n, 2); NaN rows where pincushion distortion has no inverse."""
+        return self._scale_radially(xy, self.a)
 
-    def _stretched(self, xy: Points, a: float) -> Points:
+    def _scale_radially(self, xy: Points, a: float) -> Points:
         offsets, radius2 = self._offsets(xy)
         square = 1.0 + a * radius2
-        stretched = offsets / np.sqrt(np.where(square > 0, square, np.nan))
-        return np.asarray(stretched + np.array([self.centre_x_px, self.centre_y_px]))
+        scaled = offsets / np.sqrt(np.where(square > 0, square, np.nan))
+        return np.asarray(scaled + np.array([self.centre_x_px, self.centre_y_px]))
 
     def undistort_tangents(self, xy_raw: Points, tangents: Points) -> Points:
-        """Directions (n, 2) at raw pixels (n, 2), times the derivative of the undistortion."""
+        """Directions (n, 2) at raw pixels (n, 2), multiplied by the Jacobian of the undistortion."""
         offsets, radius2 = self._offsets(xy_raw)
         square = 1.0 - self.a * radius2
         scale = 1.0 / np.sqrt(np.where(square > 0, square, np.nan))
-        slope = 0.5 * self.a * scale**3  # of the scale with the squared radius
-        return _turned(offsets / self.half_diagonal_px, tangents, scale, slope)
+        derivative_r2 = 0.5 * self.a * scale**3
+        return _differentiate_radially(offsets / self.half_diagonal_px, tangents, scale, derivative_r2)
 
     def to_record(self) -> HarrisLensRecord:
         """The record that ``camera.json`` holds."""
@@ -114,7 +112,7 @@ class HarrisLens:
 
 @dataclass(frozen=True)
 class DivisionLens:
-    """Division model, r = r_d / (1 - k r_d^2), with its closed inverse: one parameter, for lenses wider than Harris'.
+    """Division model, r = r_d / (1 - k r_d^2), with its closed inverse: one parameter, for wide-angle lenses.
 
     Parameters
     ----------
@@ -139,38 +137,38 @@ class DivisionLens:
 
     @property
     def is_identity(self) -> bool:
-        """Whether this is the pin-hole."""
+        """Whether there is no distortion."""
         return self.k == 0.0
 
     def _offsets(self, xy: Points) -> tuple[Points, Points]:
         offsets = (np.asarray(xy, dtype=np.float64) - (self.centre_x_px, self.centre_y_px)) / self.half_diagonal_px
         return offsets, np.sum(offsets * offsets, axis=-1, keepdims=True)
 
-    def _placed(self, offsets: Points) -> Points:
+    def _to_pixels(self, offsets: Points) -> Points:
         return np.asarray(offsets * self.half_diagonal_px + (self.centre_x_px, self.centre_y_px))
 
     def _scale(self, radius2: Points) -> Points:
         divisor = 1.0 - self.k * radius2
-        # A pincushion folds where k r_d^2 = -1; a barrel ends where the divisor is zero.
+        # Pincushion distortion folds at k r_d^2 = -1; barrel distortion diverges where the divisor is zero.
         inside = (divisor > 0) & (self.k * radius2 > -1.0)
         return 1.0 / np.where(inside, divisor, np.nan)
 
     def undistort_points(self, xy_raw: Points) -> Points:
         """Raw pixels (n, 2) to undistorted pixels (n, 2); NaN rows outside the model's domain."""
         offsets, radius2 = self._offsets(xy_raw)
-        return self._placed(offsets * self._scale(radius2))
+        return self._to_pixels(offsets * self._scale(radius2))
 
     def distort_points(self, xy: Points) -> Points:
-        """Undistorted pixels (n, 2) to raw pixels (n, 2); NaN rows where a pincushion has no inverse."""
+        """Undistorted pixels (n, 2) to raw pixels (n, 2); NaN rows where pincushion distortion has no inverse."""
         offsets, radius2 = self._offsets(xy)
         square = 1.0 + 4.0 * self.k * radius2
-        return self._placed(offsets * 2.0 / (1.0 + np.sqrt(np.where(square > 0, square, np.nan))))
+        return self._to_pixels(offsets * 2.0 / (1.0 + np.sqrt(np.where(square > 0, square, np.nan))))
 
     def undistort_tangents(self, xy_raw: Points, tangents: Points) -> Points:
-        """Directions (n, 2) at raw pixels (n, 2), times the derivative of the undistortion."""
+        """Directions (n, 2) at raw pixels (n, 2), multiplied by the Jacobian of the undistortion."""
         offsets, radius2 = self._offsets(xy_raw)
         scale = self._scale(radius2)
-        return _turned(offsets, tangents, scale, self.k * scale**2)
+        return _differentiate_radially(offsets, tangents, scale, self.k * scale**2)
 
     def to_record(self) -> DivisionLensRecord:
         """The record that ``camera.json`` holds."""
@@ -184,7 +182,7 @@ class DivisionLens:
 
 @dataclass(frozen=True)
 class PolynomialLens:
-    """Polynomial model, r = r_d (1 + k_1 r_d^2 + k_2 r_d^4 + ...), for lenses that one parameter cannot follow.
+    """Polynomial model, r = r_d (1 + k_1 r_d^2 + k_2 r_d^4 + ...), for lenses that one parameter cannot describe.
 
     Parameters
     ----------
@@ -197,7 +195,7 @@ class PolynomialLens:
 
     Notes
     -----
-    Its inverse is taken on the branch that holds the centre, up to the radius where the model would fold.
+    The inverse is that of the branch about the centre, up to the radius where the model folds.
     """
 
     coefficients: tuple[float, ...]
@@ -207,10 +205,10 @@ class PolynomialLens:
 
     @property
     def is_identity(self) -> bool:
-        """Whether this is the pin-hole."""
+        """Whether there is no distortion."""
         return not any(self.coefficients)
 
-    def _polynomial(self) -> NDArray[np.float64]:
+    def _polynomial(self) -> FloatArray:
         """The scale as a polynomial in the squared radius, lowest power first."""
         return np.array((1.0, *self.coefficients))
 
@@ -218,7 +216,7 @@ class PolynomialLens:
         """Raw radius, in half-diagonals, at which the undistorted radius stops growing; infinity if never."""
         scale = self._polynomial()
         growth = scale * (1.0 + 2.0 * np.arange(len(scale)))
-        # A vanishing last term has its root at infinity, and the other roots lose their digits to it.
+        # The root of a vanishing last term is at infinity and would spoil the accuracy of the others.
         roots = np.polynomial.polynomial.polyroots(np.polynomial.polynomial.polytrim(growth, tol=1e-9))
         real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
         return float(np.sqrt(real.min())) if real.size else float("inf")
@@ -227,56 +225,56 @@ class PolynomialLens:
         offsets = (np.asarray(xy, dtype=np.float64) - (self.centre_x_px, self.centre_y_px)) / self.half_diagonal_px
         return offsets, np.sum(offsets * offsets, axis=-1, keepdims=True)
 
-    def _placed(self, offsets: Points) -> Points:
+    def _to_pixels(self, offsets: Points) -> Points:
         return np.asarray(offsets * self.half_diagonal_px + (self.centre_x_px, self.centre_y_px))
 
     def undistort_points(self, xy_raw: Points) -> Points:
         """Raw pixels (n, 2) to undistorted pixels (n, 2); NaN rows beyond the radius where the model folds."""
         offsets, radius2 = self._offsets(xy_raw)
         scale = np.polynomial.polynomial.polyval(radius2, self._polynomial())
-        return self._placed(offsets * np.where(radius2 < self.fold_radius() ** 2, scale, np.nan))
+        return self._to_pixels(offsets * np.where(radius2 < self.fold_radius() ** 2, scale, np.nan))
 
     def distort_points(self, xy: Points) -> Points:
-        """Undistorted pixels (n, 2) to raw pixels (n, 2); NaN rows beyond what the model reaches before it folds."""
+        """Undistorted pixels (n, 2) to raw pixels (n, 2); NaN rows beyond the radius where the model folds."""
         offsets, radius2 = self._offsets(xy)
         radius = np.sqrt(radius2)
         raw_radius = self._raw_radius(radius)
         with np.errstate(invalid="ignore", divide="ignore"):
             scale = np.where(radius > 0, raw_radius / radius, 1.0)
-        return self._placed(offsets * scale)
+        return self._to_pixels(offsets * scale)
 
     def _raw_radius(self, radius: Points) -> Points:
-        """Solve r_d * scale(r_d^2) = r by Newton's method kept inside a shrinking bracket."""
+        """Solve r_d * scale(r_d^2) = r by Newton's method safeguarded by bisection."""
         scale = self._polynomial()
         growth = scale * (1.0 + 2.0 * np.arange(len(scale)))
         polyval = np.polynomial.polynomial.polyval
         low = np.zeros_like(radius)
-        # Without a fold the scale is positive and grows in the end: some doubling of the radius reaches past the root.
+        # Without a fold the radius grows without bound: 1e3 half-diagonals bracket every root of interest.
         high = np.full_like(radius, min(self.fold_radius(), 1e3))
         raw = np.minimum(radius, high)
         for _ in range(_NEWTON_STEPS):
             excess = raw * polyval(raw * raw, scale) - radius
             low, high = np.where(excess < 0, raw, low), np.where(excess >= 0, raw, high)
-            slope = polyval(raw * raw, growth)
-            step = np.where(slope > 0, excess / np.where(slope > 0, slope, 1.0), np.inf)
-            stepped = raw - step
-            inside = (stepped >= low) & (stepped <= high)
-            following = np.where(inside, stepped, 0.5 * (low + high))
-            if np.all(np.abs(following - raw) <= _NEWTON_TOLERANCE * np.maximum(raw, 1.0)):
-                raw = following
+            derivative_r2 = polyval(raw * raw, growth)
+            step = np.where(derivative_r2 > 0, excess / np.where(derivative_r2 > 0, derivative_r2, 1.0), np.inf)
+            newton = raw - step
+            inside = (newton >= low) & (newton <= high)
+            updated = np.where(inside, newton, 0.5 * (low + high))
+            if np.all(np.abs(updated - raw) <= _NEWTON_TOLERANCE * np.maximum(raw, 1.0)):
+                raw = updated
                 break
-            raw = following
-        missed = np.abs(raw * polyval(raw * raw, scale) - radius) > 1e-9 * np.maximum(radius, 1.0)
-        return np.where(missed, np.nan, raw)
+            raw = updated
+        failed = np.abs(raw * polyval(raw * raw, scale) - radius) > 1e-9 * np.maximum(radius, 1.0)
+        return np.where(failed, np.nan, raw)
 
     def undistort_tangents(self, xy_raw: Points, tangents: Points) -> Points:
-        """Directions (n, 2) at raw pixels (n, 2), times the derivative of the undistortion."""
+        """Directions (n, 2) at raw pixels (n, 2), multiplied by the Jacobian of the undistortion."""
         offsets, radius2 = self._offsets(xy_raw)
         polynomial = self._polynomial()
         scale = np.asarray(np.polynomial.polynomial.polyval(radius2, polynomial), dtype=np.float64)
         derivative = np.polynomial.polynomial.polyder(polynomial)
-        slope = np.asarray(np.polynomial.polynomial.polyval(radius2, derivative), dtype=np.float64)
-        return _turned(offsets, tangents, scale, slope)
+        derivative_r2 = np.asarray(np.polynomial.polynomial.polyval(radius2, derivative), dtype=np.float64)
+        return _differentiate_radially(offsets, tangents, scale, derivative_r2)
 
     def to_record(self) -> PolynomialLensRecord:
         """The record that ``camera.json`` holds."""
@@ -288,14 +286,17 @@ class PolynomialLens:
         )
 
 
-def _turned(offsets: Points, tangents: Points, scale: Points, slope: Points) -> Points:
-    """Derivative of ``offsets * scale(|offsets|^2)`` along the tangents; offsets in half-diagonals."""
+def _differentiate_radially(offsets: Points, tangents: Points, scale: Points, derivative_r2: Points) -> Points:
+    """Derivative of ``offsets * scale(|offsets|^2)`` along the tangents, offsets in half-diagonals.
+
+    ``derivative_r2`` is that of the scale with respect to the squared radius.
+    """
     along = np.sum(offsets * tangents, axis=-1, keepdims=True)
-    return np.asarray(scale * tangents + 2.0 * slope * along * offsets)
+    return np.asarray(scale * tangents + 2.0 * derivative_r2 * along * offsets)
 
 
 def pinhole(frame_shape: tuple[int, int]) -> HarrisLens:
-    """The lens without distortion of a frame of that (height, width): the identity, centred.
+    """The lens without distortion for frames of (height, width): the identity.
 
     Examples
     --------

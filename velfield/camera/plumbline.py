@@ -1,16 +1,15 @@
 """Lens calibration from the straight lines of the scene (paper: camera calibration, the plumb line).
 
-1. Edge points of several frames, linked into smooth arcs (`edges`).
-2. A grid of starts over the distortion, then a descent with the centre free: the least entropy of the lines' angles and
-   distances (`entropy`). Without the grid the descent falls into false minima.
-3. Arcs that one line explains are joined, and the lens fitted below the pixel by the lines' straightness (`lines`,
-   `straighten`): Harris' model, the division model, polynomials of two and three terms, of which lines left out of the
-   fit choose.
-4. Families of parallels say by their directions what bows are too small to say (`parallels`).
-5. The evidence: a city has kerbs that bend, and from few lines any lens can be had. A distortion is accepted where it
-   lowers the entropy, stands well above its own uncertainty, comes out alike from arcs alone, from lines joined without
-   a lens and from lines joined with it, and straightens most of the lines that it changes at all. Otherwise the
-   pin-hole stays, and the reason is given.
+1. Edge points of several frames are detected and linked into smooth arcs (`edges`).
+2. The entropy of the lines' angles and distances (`entropy`) is minimised: a grid over the distortion, then a simplex
+   descent with the centre free. Without the grid the descent ends in local minima.
+3. Collinear arcs are merged (`lines`) and the lens is fitted to subpixel accuracy by the straightness of the lines
+   (`straighten`): Harris' model, the division model, polynomials of two and three terms, selected by cross-validation.
+4. The fit is refined by the vanishing points of families of parallel lines (`vanishing_points`).
+5. The distortion is tested for significance, because cities have curved kerbs and few lines fit any lens. It is
+   accepted if it lowers the entropy, exceeds five standard deviations, is consistent between arcs before merging, lines
+   merged under the pinhole model and lines merged under the lens, and straightens most of the lines that it changes.
+   Otherwise the pinhole model is kept, and the reason is given.
 """
 
 from collections.abc import Sequence
@@ -22,69 +21,68 @@ from scipy.optimize import minimize
 from schemas.arrays import FloatArray, GreyImage
 from schemas.camera import CameraRecord, ModelEvidence
 from schemas.flight import LensConfig
-from velfield.camera.edges import Arcs, find_arcs, pool_arcs
+from velfield.camera.edges import Arcs, detect_arcs, pool_arcs
 from velfield.camera.entropy import hough_entropy
 from velfield.camera.lens import HarrisLens, pinhole
-from velfield.camera.lines import LineSet, join_arcs, line_residuals, line_rms
-from velfield.camera.parallels import refine_by_parallels
-from velfield.camera.straighten import AnyLens, LensFamily, StraightFit, fit_lens, heldout_rms
+from velfield.camera.lines import LineSet, line_residuals, line_rms, merge_collinear_arcs
+from velfield.camera.straighten import LensFamily, PlumbLineFit, RadialLens, cv_rms, fit_lens
+from velfield.camera.vanishing_points import refine_by_vanishing_points
 from velfield.errors import InputError
 
 MIN_LINES = 30
-"""Fewer straight lines than this say nothing of a lens."""
+"""Smallest number of straight lines."""
 MIN_GAIN_NATS = 0.03
-"""Entropy that a lens must save. Cities through lenses without distortion: up to .03 by bent kerbs alone."""
+"""Smallest decrease of the entropy by a lens. Curved kerbs of cities without distortion: up to 0.03."""
 MIN_SIGNIFICANCE = 5.0
-"""Distortion against its standard deviation."""
+"""Smallest distortion in its standard deviations."""
 MAX_DISAGREEMENT = 0.45
-"""How far apart the estimates of the distortion may lie beyond their own uncertainty, in units of the distortion."""
-STRONG_GAIN_NATS, STRONG_SIGNIFICANCE, STRONG_STRAIGHTER = 0.05, 10.0, 0.75
-"""From here on in all three, arcs alone are heard for the sign only: every kerb that bends is among them, and where few
-lines are long they overrate a lens (0.17 where the truth and the joined lines say 0.10). Real footage without
-distortion stays below in at least two of the three."""
-LINES_FACTOR = 3.0
-"""The lines' standard deviation knows nothing of kerbs that bend alike: by straightness alone they err by up to five of
-it on simulated flights, RMS three; with parallels by RMS two."""
-MODEL_GAIN = 0.1
-"""Share by which lines left out of the fit must lie straighter for a model with more terms."""
+"""Largest difference of the estimates of the distortion beyond their own uncertainty, relative to the distortion."""
+STRONG_GAIN_NATS, STRONG_SIGNIFICANCE, STRONG_STRAIGHTENED_FRACTION = 0.05, 10.0, 0.75
+"""If all three are reached, the estimate by unmerged arcs must agree in sign only: they include every curved kerb, and
+where few lines are long they overestimate the distortion (0.17 for a true 0.10). Real footage without distortion stays
+below in at least two of the three."""
+SD_INFLATION = 3.0
+"""Factor on the standard deviation by lines, which does not include systematically curved kerbs: on simulated flights
+the errors are up to five of it, RMS three, by straightness alone, and RMS two with vanishing points."""
+MIN_MODEL_GAIN = 0.1
+"""Relative decrease of the cross-validated residual for which a model with more terms is chosen."""
 
-MIN_STRAIGHTER = 0.6
-"""Share of the lines that the lens changes noticeably which it must straighten; of random bends, half."""
+MIN_STRAIGHTENED_FRACTION = 0.6
+"""Smallest fraction straightened of the lines that the lens changes by more than 0.05 px; by chance it is half."""
 
 _MODELS = (("harris", 1), ("division", 1), ("polynomial", 2), ("polynomial", 3))  # the simplest first
 _GRID_STEP = 0.05
 _DISTANCE_BIN_PX = 2.0
 _SEARCH_POINTS = 12_000
-_MAX_TURN_RAD = 0.03
-_ARC_SHARE, _LINE_SHARE = 0.012, 0.04  # of the diagonal: the shortest arc, the shortest line
+_MAX_ANGLE_RAD = 0.03
+_ARC_FRACTION, _LINE_FRACTION = 0.012, 0.04  # of the diagonal: the shortest arc, the shortest line
 _FOLDS = 4
-_NOTICEABLE_PX = 0.05
+_MIN_CHANGE_PX = 0.05
 _ALLOWED_SIGMAS = 2.0
-_FARTHEST_CENTRE = 0.1  # half-diagonals from the middle: no lens, but a descent that ran away
+_MAX_CENTRE_OFFSET = 0.1  # half-diagonals from the middle: beyond it the descent has diverged
 
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """A lens and the evidence for it; ``lens`` is the pin-hole where ``accepted`` is false.
+    """A lens and the evidence for it; ``lens`` is the pinhole model if not ``accepted``.
 
     Attributes
     ----------
     lens
-        Harris, polynomial, or the pin-hole.
+        Harris, division or polynomial model, or the pinhole model.
     accepted, reason
-        Whether a distortion was borne out, and why, in one line.
+        Whether the distortion is significant, and why, in one line.
     residual_px, residual_without_px
         RMS distance of edge points from their lines with and without the lens, raw px.
     a_sd, centre_sd_px
-        Standard deviations of Harris' distortion, kerbs that bend alike allowed for, and of the centre, lines as the
-        independent units.
+        Standard deviations of Harris' distortion, inflated by `SD_INFLATION`, and of the centre, clustered by line.
     entropy_a, entropy_nats
-        The grid of starts and the entropy there.
+        The grid of distortions and the entropy there.
     candidates
-        Each model tried, with its RMS on lines left out.
+        Each model, with its cross-validated RMS.
     """
 
-    lens: AnyLens
+    lens: RadialLens
     accepted: bool
     reason: str
     frame_shape: tuple[int, int]
@@ -121,8 +119,8 @@ class CalibrationResult:
 
 
 @dataclass(frozen=True)
-class _Scene:
-    """What every step needs of the frames."""
+class _EdgeData:
+    """The arcs of all frames, with what each step derives from them."""
 
     shape: tuple[int, int]
     arcs: Arcs
@@ -133,15 +131,17 @@ class _Scene:
         return pinhole(self.shape)
 
     def family(self, name: str, terms: int) -> LensFamily:
-        hole = self.pinhole
-        return LensFamily(name, terms, (hole.centre_x_px, hole.centre_y_px), hole.half_diagonal_px)
+        lens = self.pinhole
+        return LensFamily(name, terms, (lens.centre_x_px, lens.centre_y_px), lens.half_diagonal_px)
 
-    def entropy(self, lens: AnyLens, arcs: Arcs | None = None) -> float:
+    def entropy(self, lens: RadialLens, arcs: Arcs | None = None) -> float:
         return hough_entropy(arcs or self.arcs, lens, angle_bins=self.angle_bins, distance_bin_px=_DISTANCE_BIN_PX)
 
-    def lines(self, lens: AnyLens, tolerance_px: float) -> LineSet:
-        length = _LINE_SHARE * 2.0 * self.pinhole.half_diagonal_px
-        return join_arcs(self.arcs, lens, tolerance_px=tolerance_px, max_turn_rad=_MAX_TURN_RAD, min_length_px=length)
+    def lines(self, lens: RadialLens, tolerance_px: float) -> LineSet:
+        length = _LINE_FRACTION * 2.0 * self.pinhole.half_diagonal_px
+        return merge_collinear_arcs(
+            self.arcs, lens, tolerance_px=tolerance_px, max_angle_rad=_MAX_ANGLE_RAD, min_length_px=length
+        )
 
 
 def calibrate(frames: Sequence[GreyImage], config: LensConfig, seed: int = 0) -> CalibrationResult:
@@ -150,16 +150,16 @@ def calibrate(frames: Sequence[GreyImage], config: LensConfig, seed: int = 0) ->
     Parameters
     ----------
     frames
-        (h, w) uint8 grey frames, all of one size; a dozen spread over the flight is plenty.
+        (h, w) uint8 grey frames, all of one size; a dozen spread over the flight suffice.
     config
         The lens section of the flight's configuration.
     seed
-        Seed of the split into lines fitted and lines left out.
+        Seed of the cross-validation folds and of the vanishing points.
 
     Returns
     -------
     CalibrationResult
-        With the pin-hole, and the reason, where the evidence for a distortion is too small.
+        With the pinhole model, and the reason, if no distortion is significant.
 
     Raises
     ------
@@ -169,37 +169,37 @@ def calibrate(frames: Sequence[GreyImage], config: LensConfig, seed: int = 0) ->
     shape = _common_shape(frames)
     if config.calibrate == "never":
         return CalibrationResult(pinhole(shape), False, "calibration is switched off", shape)
-    scene = _Scene(shape, _pooled_arcs(frames, shape, config), config.angle_bins)
-    found = scene.arcs.length_px.size
-    if found < MIN_LINES:
-        reason = f"{found} straight edges in {len(frames)} frames, {MIN_LINES} needed"
+    data = _EdgeData(shape, _detect_and_pool(frames, shape, config), config.angle_bins)
+    count = data.arcs.length_px.size
+    if count < MIN_LINES:
+        reason = f"{count} straight edges in {len(frames)} frames, {MIN_LINES} needed"
         return CalibrationResult(pinhole(shape), False, reason, shape, frames=len(frames))
-    grid_a, grid_entropy, start = _search(scene, config.max_distortion)
-    harris = _fit_harris(scene, start)
+    grid_a, grid_entropy, start = _search_distortion(data, config.max_distortion)
+    harris = _fit_harris(data, start)
     if harris is None:
-        reason = f"fewer than {MIN_LINES} lines long enough in {len(frames)} frames"
+        reason = f"fewer than {MIN_LINES} lines of sufficient length in {len(frames)} frames"
         return CalibrationResult(pinhole(shape), False, reason, shape, frames=len(frames))
-    fits, chosen, lines, heldout = _choose_model(scene, harris, seed)
+    fits, selected, lines, cv_px = _select_model(data, harris, seed)
     bounded = 0 < int(np.argmin(grid_entropy)) < len(grid_a) - 1
-    accepted, reason = _judge(scene, harris, fits[chosen], lines, bounded=bounded)
+    accepted, reason = _decide(data, harris, fits[selected], lines, bounded=bounded)
     accepted = accepted or config.calibrate == "always"
-    for number in {0, chosen}:
-        fits[number] = refine_by_parallels(fits[number], lines, seed)
-    candidates = _evidence(scene, fits, lines, heldout)
+    for number in {0, selected}:
+        fits[number] = refine_by_vanishing_points(fits[number], lines, seed)
+    candidates = _model_evidence(data, fits, lines, cv_px)
     spread = np.sqrt(np.diag(fits[0].covariance))
-    a_sd = LINES_FACTOR * float(spread[0])
-    centre_sd = spread[-2:] * scene.pinhole.half_diagonal_px
+    a_sd = SD_INFLATION * float(spread[0])
+    centre_sd = spread[-2:] * data.pinhole.half_diagonal_px
     if accepted:
-        reason += f"; with parallels, and allowing for kerbs that bend alike, {fits[0].parameters[0]:.3f} +- {a_sd:.3f}"
+        reason += f"; refined by vanishing points {fits[0].parameters[0]:.3f} +- {a_sd:.3f}"
     return CalibrationResult(
-        lens=fits[chosen].lens if accepted else scene.pinhole,
+        lens=fits[selected].lens if accepted else data.pinhole,
         accepted=accepted,
         reason=reason,
         frame_shape=shape,
         frames=len(frames),
         lines=lines.count,
         edge_points=int(lines.line.size),
-        residual_px=fits[chosen].residual_px,
+        residual_px=fits[selected].residual_px,
         residual_without_px=candidates[0].residual_px,
         a_sd=a_sd,
         centre_sd_px=(float(centre_sd[0]), float(centre_sd[1])),
@@ -217,18 +217,18 @@ def _common_shape(frames: Sequence[GreyImage]) -> tuple[int, int]:
         if frame.shape != (height, width):
             raise InputError(
                 f"lens calibration: frame {number} has shape {frame.shape}, frame 0 {(height, width)}; "
-                "all must be grey pictures of one size"
+                "all must be grey images of one size"
             )
     return height, width
 
 
-def _pooled_arcs(frames: Sequence[GreyImage], shape: tuple[int, int], config: LensConfig) -> Arcs:
+def _detect_and_pool(frames: Sequence[GreyImage], shape: tuple[int, int], config: LensConfig) -> Arcs:
     half_diagonal = pinhole(shape).half_diagonal_px
     parts = [
-        find_arcs(
+        detect_arcs(
             frame,
             frame=number,
-            min_length_px=max(24.0, _ARC_SHARE * 2.0 * half_diagonal),
+            min_length_px=max(24.0, _ARC_FRACTION * 2.0 * half_diagonal),
             max_curvature_per_px=2.0 / half_diagonal,
         )
         for number, frame in enumerate(frames)
@@ -236,35 +236,35 @@ def _pooled_arcs(frames: Sequence[GreyImage], shape: tuple[int, int], config: Le
     return pool_arcs(parts, max_points=config.max_edge_points)
 
 
-def _search(scene: _Scene, max_distortion: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Grid of distortions, its entropies, and the parameters (a, x, y) of least entropy after a descent."""
+def _search_distortion(data: _EdgeData, max_distortion: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Grid of distortions, its entropies, and the parameters (a, x, y) of minimum entropy after a descent."""
     steps = max(1, round(max_distortion / _GRID_STEP))
     grid = np.linspace(-max_distortion, max_distortion, 2 * steps + 1)
-    thinned = scene.arcs.every(max(1, scene.arcs.arc.size // _SEARCH_POINTS))
-    family = scene.family("harris", 1)
+    thinned = data.arcs.subsample(max(1, data.arcs.arc.size // _SEARCH_POINTS))
+    family = data.family("harris", 1)
 
     def entropy(parameters: FloatArray) -> float:
-        return scene.entropy(family.lens(parameters), thinned)
+        return data.entropy(family.lens(parameters), thinned)
 
     values = np.array([entropy(np.array([a, 0.0, 0.0])) for a in grid])
     start = np.array([grid[int(np.argmin(values))], 0.0, 0.0])
-    # The simplex opens towards the pin-hole: the other way may leave the model's domain.
+    # The initial simplex opens towards zero distortion: the other direction may leave the model's domain.
     towards = -1.0 if start[0] > 0 else 1.0
     simplex = start + np.array([[0, 0, 0], [0.03 * towards, 0, 0], [0, 0.01, 0], [0, 0, 0.01]])
     descent = minimize(
         entropy, start, method="Nelder-Mead", options={"initial_simplex": simplex, "maxfev": 60, "xatol": 1e-3}
     )
     best = np.asarray(descent.x, dtype=np.float64)
-    wandered = float(np.hypot(best[1], best[2])) > _FARTHEST_CENTRE
-    return grid, values, start if wandered else best
+    diverged = float(np.hypot(best[1], best[2])) > _MAX_CENTRE_OFFSET
+    return grid, values, start if diverged else best
 
 
-def _fit_harris(scene: _Scene, start: FloatArray) -> StraightFit | None:
-    """Harris' model on joined lines, joined anew as the lens gets better; None where lines are too few."""
-    family = scene.family("harris", 1)
+def _fit_harris(data: _EdgeData, start: FloatArray) -> PlumbLineFit | None:
+    """Fit Harris' model to merged lines, merged again under the better lens; None if there are too few lines."""
+    family = data.family("harris", 1)
     parameters, fit = start, None
     for tolerance_px in (3.0, 2.0):
-        lines = scene.lines(family.lens(parameters), tolerance_px)
+        lines = data.lines(family.lens(parameters), tolerance_px)
         if lines.count < MIN_LINES:
             return None
         fit = fit_lens(lines, family, parameters)
@@ -272,91 +272,99 @@ def _fit_harris(scene: _Scene, start: FloatArray) -> StraightFit | None:
     return fit
 
 
-def _choose_model(scene: _Scene, harris: StraightFit, seed: int) -> tuple[list[StraightFit], int, LineSet, list[float]]:
-    """A fit of each model, the number of the simplest that lines left out of the fit do not tell from the best, the
-    lines, and the usual RMS of those left out, px, without a lens and by each model."""
+def _select_model(
+    data: _EdgeData, harris: PlumbLineFit, seed: int
+) -> tuple[list[PlumbLineFit], int, LineSet, list[float]]:
+    """Fit each model; select the simplest that cross-validation cannot distinguish from the best.
+
+    Returns the fits, the index of the selected one, the lines, and the cross-validated RMS, px, without a lens and of
+    each model.
+    """
     a = float(harris.parameters[0])
     series = np.array([a / 2.0, 3.0 / 8.0 * a * a, 5.0 / 16.0 * a**3])
     centre = harris.parameters[1:]
-    families = [scene.family(name, terms) for name, terms in _MODELS]
+    families = [data.family(name, terms) for name, terms in _MODELS]
     starts = [harris.parameters, *(np.concatenate([series[: family.terms], centre]) for family in families[1:])]
-    # All models are judged on one set of lines, joined under a middling one: lines joined under a model flatter it.
-    division = fit_lens(scene.lines(harris.lens, 2.0), families[1], starts[1])
-    lines = scene.lines(division.lens, 1.5)
+    # All models are compared on one set of lines, merged under one of them: lines merged under a model favour it.
+    division = fit_lens(data.lines(harris.lens, 2.0), families[1], starts[1])
+    lines = data.lines(division.lens, 1.5)
     fits = [fit_lens(lines, family, start) for family, start in zip(families, starts, strict=True)]
-    models = [(scene.family("harris", 0), np.zeros(3)), *((fit.family, fit.parameters) for fit in fits)]
-    heldout = heldout_rms(lines, models, folds=_FOLDS, seed=seed)
-    heldout = np.where(np.isfinite(heldout), heldout, np.inf)
-    # A kerb that bends is no line under any model; let it not decide between them.
-    straight = heldout.min(axis=0) < 3.0 * np.median(heldout.min(axis=0))
-    typical = [float(np.sqrt(np.mean(row[straight] ** 2))) for row in heldout]
-    chosen = 0
+    models = [(data.family("harris", 0), np.zeros(3)), *((fit.family, fit.parameters) for fit in fits)]
+    rms = cv_rms(lines, models, folds=_FOLDS, seed=seed)
+    rms = np.where(np.isfinite(rms), rms, np.inf)
+    # Curved kerbs are straight under no model and must not decide between them.
+    straight = rms.min(axis=0) < 3.0 * np.median(rms.min(axis=0))
+    cv_px = [float(np.sqrt(np.mean(row[straight] ** 2))) for row in rms]
+    selected = 0
     for number in range(1, len(fits)):
-        if typical[1 + number] < (1.0 - MODEL_GAIN) * typical[1 + chosen]:
-            chosen = number
-    return fits, chosen, lines, typical
+        if cv_px[1 + number] < (1.0 - MIN_MODEL_GAIN) * cv_px[1 + selected]:
+            selected = number
+    return fits, selected, lines, cv_px
 
 
-def _evidence(
-    scene: _Scene, fits: list[StraightFit], lines: LineSet, typical: list[float]
+def _model_evidence(
+    data: _EdgeData, fits: list[PlumbLineFit], lines: LineSet, cv_px: list[float]
 ) -> tuple[ModelEvidence, ...]:
-    without = float(np.sqrt(np.mean(line_rms(lines, line_residuals(lines, scene.pinhole)) ** 2)))
-    rows = [ModelEvidence(model="none", parameters=(), residual_px=without, heldout_px=typical[0])]
-    for fit, heldout in zip(fits, typical[1:], strict=True):
+    by_pinhole = float(np.sqrt(np.mean(line_rms(lines, line_residuals(lines, data.pinhole)) ** 2)))
+    rows = [ModelEvidence(model="none", parameters=(), residual_px=by_pinhole, heldout_px=cv_px[0])]
+    for fit, model_cv_px in zip(fits, cv_px[1:], strict=True):
         name = fit.family.name if fit.family.terms == 1 else f"{fit.family.name}-{fit.family.terms}"
         rows.append(
             ModelEvidence(
                 model=name,
                 parameters=tuple(float(value) for value in fit.parameters),
                 residual_px=fit.residual_px,
-                heldout_px=min(heldout, 1e6),
+                heldout_px=min(model_cv_px, 1e6),
             )
         )
     return tuple(rows)
 
 
-def _judge(scene: _Scene, harris: StraightFit, best: StraightFit, lines: LineSet, *, bounded: bool) -> tuple[bool, str]:
-    """Whether a distortion is better than none, and the one line that says why.
+def _decide(
+    data: _EdgeData, harris: PlumbLineFit, best: PlumbLineFit, lines: LineSet, *, bounded: bool
+) -> tuple[bool, str]:
+    """Whether the distortion is significant, and the reason in one line.
 
-    ``bounded``: whether the entropy is least within the distortions that were searched. Where it falls to their end, as
-    at a crossroads of bent kerbs, the evidence must be strong.
+    ``bounded``: whether the entropy has its minimum inside the searched range. If it falls to the end of the range, as
+    at a crossroads of curved kerbs, the evidence must be strong.
     """
-    family = scene.family("harris", 1)
-    alone = LineSet(scene.arcs.xy, scene.arcs.tangents, scene.arcs.arc, scene.arcs.frame)
-    without = scene.lines(scene.pinhole, 2.0)
-    fits = [harris, fit_lens(alone, family, harris.parameters)]
-    if without.count >= MIN_LINES:
-        fits.append(fit_lens(without, family, np.zeros(3)))
+    family = data.family("harris", 1)
+    unmerged = LineSet(data.arcs.xy, data.arcs.tangents, data.arcs.arc, data.arcs.frame)
+    by_pinhole = data.lines(data.pinhole, 2.0)
+    fits = [harris, fit_lens(unmerged, family, harris.parameters)]
+    if by_pinhole.count >= MIN_LINES:
+        fits.append(fit_lens(by_pinhole, family, np.zeros(3)))
     estimates = np.array([fit.parameters[0] for fit in fits])
     deviations = np.array([float(np.sqrt(fit.covariance[0, 0])) for fit in fits])
-    # Lines joined as straight with no lens speak against a lens if at all: their vote is the fair one.
-    straighter, told = _vote(without, scene.pinhole, best.lens)
+    # Lines merged as straight under the pinhole model are biased against a lens if at all.
+    straightened, changed = _straightened_fraction(by_pinhole, data.pinhole, best.lens)
     a, sd = float(estimates[0]), float(deviations[0])
-    gain = scene.entropy(scene.pinhole) - scene.entropy(best.lens)
-    strong = gain >= STRONG_GAIN_NATS and abs(a) >= STRONG_SIGNIFICANCE * sd and straighter >= STRONG_STRAIGHTER * told
-    apart = np.abs(estimates - a) - _ALLOWED_SIGMAS * deviations
+    gain = data.entropy(data.pinhole) - data.entropy(best.lens)
+    significant = gain >= STRONG_GAIN_NATS and abs(a) >= STRONG_SIGNIFICANCE * sd
+    strong = significant and straightened >= STRONG_STRAIGHTENED_FRACTION * changed
+    excess = np.abs(estimates - a) - _ALLOWED_SIGMAS * deviations
     if strong and estimates[1] * a > 0:
-        apart[1] = 0.0
-    found = (
-        f"a = {a:.3f} +- {sd:.3f} from {lines.count} lines, entropy {gain:+.3f} nats less than with none, "
-        f"estimates {estimates.min():.3f} to {estimates.max():.3f}, {straighter} of {told} bent lines straighter"
+        excess[1] = 0.0
+    evidence = (
+        f"a = {a:.3f} +- {sd:.3f} from {lines.count} lines, entropy lower by {gain:.3f} nats, estimates "
+        f"{estimates.min():.3f} to {estimates.max():.3f}, {straightened} of {changed} changed lines straighter"
     )
     if not (bounded or strong):
-        return False, f"{found}: the entropy has no minimum within lens.max_distortion, pin-hole kept"
+        return False, f"{evidence}: the entropy has no minimum within lens.max_distortion, pinhole model kept"
     if gain < MIN_GAIN_NATS:
-        return False, f"{found}: less than {MIN_GAIN_NATS} nats gained, pin-hole kept"
+        return False, f"{evidence}: less than {MIN_GAIN_NATS} nats gained, pinhole model kept"
     if abs(a) < MIN_SIGNIFICANCE * sd:
-        return False, f"{found}: below {MIN_SIGNIFICANCE:g} standard deviations, pin-hole kept"
-    if float(apart.max()) > MAX_DISAGREEMENT * abs(a):
-        return False, f"{found}: they disagree, as with kerbs that bend, pin-hole kept"
-    if straighter < MIN_STRAIGHTER * told:
-        return False, f"{found}: {MIN_STRAIGHTER:.0%} needed, pin-hole kept"
-    return True, f"{found}: {best.family.name} accepted"
+        return False, f"{evidence}: below {MIN_SIGNIFICANCE:g} standard deviations, pinhole model kept"
+    if float(excess.max()) > MAX_DISAGREEMENT * abs(a):
+        return False, f"{evidence}: they disagree, as with curved kerbs, pinhole model kept"
+    if straightened < MIN_STRAIGHTENED_FRACTION * changed:
+        return False, f"{evidence}: {MIN_STRAIGHTENED_FRACTION:.0%} needed, pinhole model kept"
+    return True, f"{evidence}: {best.family.name} accepted"
 
 
-def _vote(lines: LineSet, without: AnyLens, lens: AnyLens) -> tuple[int, int]:
-    """Of the lines that a lens changes noticeably: how many it makes straighter, and how many there are."""
+def _straightened_fraction(lines: LineSet, by_pinhole: RadialLens, lens: RadialLens) -> tuple[int, int]:
+    """The fraction as counts: lines that a lens straightens, of those whose RMS it changes by more than 0.05 px."""
     rms = line_rms(lines, line_residuals(lines, lens))
-    change = rms - line_rms(lines, line_residuals(lines, without))
-    told = (np.abs(change) > _NOTICEABLE_PX) & np.isfinite(rms)
-    return int(np.sum(change[told] < 0)), int(told.sum())
+    change = rms - line_rms(lines, line_residuals(lines, by_pinhole))
+    changed = (np.abs(change) > _MIN_CHANGE_PX) & np.isfinite(rms)
+    return int(np.sum(change[changed] < 0)), int(changed.sum())

@@ -71,22 +71,22 @@ def lens_graph(plan: Plan) -> Graph:
 
 def base_graph(plan: Plan) -> Graph:
     """Build the base image, or register the flight to the given one."""
-    from velfield.pipeline.stages.base_image import build_base, key_points_of, spread_frames
+    from velfield.pipeline.stages.base_image import build_base, detect_unit_keypoints, spread_frames
 
     node = _plan_node(plan)
     spread = spread_frames(plan)
     step = plan.config.work.block_frames
-    blocks = [_node(key_points_of, node, spread[k : k + step]) for k in range(0, len(spread), step)]
+    blocks = [_node(detect_unit_keypoints, node, spread[k : k + step]) for k in range(0, len(spread), step)]
     return _committed(node, "base", WHOLE, _node(build_base, node, blocks))
 
 
 def registration_graph(plan: Plan, frames: range) -> Graph:
     """Key points by block, then the light chain over the unit's frames."""
-    from velfield.pipeline.stages.base_image import key_points_of
+    from velfield.pipeline.stages.base_image import detect_unit_keypoints
     from velfield.pipeline.stages.registration import register_unit
 
     node = _plan_node(plan)
-    blocks = [_node(key_points_of, node, list(block)) for block in plan.blocks(frames)]
+    blocks = [_node(detect_unit_keypoints, node, list(block)) for block in plan.blocks(frames)]
     return _committed(node, "registration", unit_name(frames), _node(register_unit, node, frames, blocks))
 
 

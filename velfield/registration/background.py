@@ -1,7 +1,7 @@
-"""The background: what a place looks like with no traffic on it, and how much it varies.
+"""Background model: per-pixel median and trimmed range over rectified frames.
 
-Paper: none; it takes the place of labels where none are given. Median over frames spread over the flight: moving cars
-are gone from it, and its range tells what differs for other reasons (a tree, a roof's edge under jitter).
+Not in the paper; it replaces labels where none are given. In the median over frames spread over the flight moving
+vehicles vanish; the range measures variation from other causes (trees, roof edges under registration jitter).
 """
 
 from collections.abc import Sequence
@@ -9,54 +9,53 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-_MAX_STACK = 255
+from schemas.arrays import ByteArray, GreyImage, Mask
+
+_MAX_IMAGES = 255
 
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """Median and range of a place over the frames.
+    """Median and range of each pixel over the frames.
 
     Attributes
     ----------
-    median, low, high : (h, w) uint8; low and high leave out ``trimmed`` values at either end.
-    count : (h, w) uint8, frames that see the place; 0: nothing is known, and the pictures are 0 there.
+    median, low, high : (h, w) uint8; low and high are trimmed: a fraction ``trim`` is left out at either end.
+    count : (h, w) uint8, number of frames that cover the pixel; where it is 0, so are the images.
     """
 
-    median: NDArray[np.uint8]
-    low: NDArray[np.uint8]
-    high: NDArray[np.uint8]
-    count: NDArray[np.uint8]
+    median: GreyImage
+    low: GreyImage
+    high: GreyImage
+    count: ByteArray
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
-        """(h, w) bool: seen by a frame at least."""
+    def valid(self) -> Mask:
+        """(h, w) bool: covered by at least one frame."""
         return np.asarray(self.count > 0)
 
 
-def median_background(
-    images: Sequence[NDArray[np.uint8]], masks: Sequence[NDArray[np.bool_]], *, trim: float = 0.1
-) -> Background:
-    """Median over the frames that see each pixel.
+def median_background(images: Sequence[GreyImage], masks: Sequence[Mask], *, trim: float = 0.1) -> Background:
+    """Median over the frames that cover each pixel.
 
     Parameters
     ----------
     images
-        Frames on one grid, (h, w) uint8 each, 255 at most.
+        Frames on a common grid, (h, w) uint8 each, at most 255.
     masks
         (h, w) bool each: where the frame covers the grid.
     trim
-        Share of the values left out at either end of the range: cars that went by are no range of the ground. With
-        fewer than 1 / trim frames nothing is left out.
+        Fraction of the values left out at either end of the range: passing vehicles are not variation of the ground.
+        With fewer than 1 / trim frames none is left out.
 
     Raises
     ------
     ValueError
         No images, or more than 255.
     """
-    if not 0 < len(images) <= _MAX_STACK:
-        raise ValueError(f"{len(images)} images for a background; 1 to {_MAX_STACK} can be taken")
+    if not 0 < len(images) <= _MAX_IMAGES:
+        raise ValueError(f"found {len(images)} images for a background, expected 1 to {_MAX_IMAGES}")
     shape = images[0].shape
     median, low, high = (np.zeros(shape, np.uint8) for _ in range(3))
     count = np.zeros(shape, np.uint8)
@@ -64,20 +63,20 @@ def median_background(
     for top in range(0, shape[0], band):
         part = slice(top, top + band)
         stack = np.stack([image[part] for image in images], axis=-1)
-        seen = np.stack([mask[part] for mask in masks], axis=-1)
-        _ranked(stack, seen, trim, median[part], low[part], high[part], count[part])
+        visible = np.stack([mask[part] for mask in masks], axis=-1)
+        _rank_statistics(stack, visible, trim, median[part], low[part], high[part], count[part])
     return Background(median, low, high, count)
 
 
 @njit(cache=True, nogil=True)
-def _ranked(stack, seen, trim, median, low, high, count):  # type: ignore[no-untyped-def]
-    """Fill median, range and count of a band from stack and mask (h, w, n), by counting grey levels."""
+def _rank_statistics(stack, visible, trim, median, low, high, count):  # type: ignore[no-untyped-def]
+    """Fill median, range and count of a band from stack and mask (h, w, n), by insertion sort of each pixel."""
     values = np.empty(stack.shape[2], np.uint8)
     for i in range(stack.shape[0]):
         for j in range(stack.shape[1]):
             n = 0
             for k in range(stack.shape[2]):
-                if seen[i, j, k]:
+                if visible[i, j, k]:
                     value = stack[i, j, k]
                     p = n
                     while p > 0 and values[p - 1] > value:

@@ -1,135 +1,134 @@
-"""The coarse stage of inter-sensor registration: a homography good to some tens of pixels, from nothing.
+"""Coarse inter-sensor registration: homographies accurate to some tens of pixels, without a prior.
 
-Paper: SIFT at quarter size and RANSAC. SIFT knows any rotation and scale but not another season, another sensor's
-tones or a negative; so what it finds is one candidate, and a search over rotations and scales by correlation of whole
-pictures gives others. The grid stage that follows says which is right.
+Paper: SIFT at quarter resolution and RANSAC. SIFT is invariant to rotation and scale, but not to another season,
+another sensor's tones or a negative. So its homography is one candidate, and an exhaustive search over rotations and
+scales by template matching gives others. The grid stage (`control`) and its verification decide between them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray, GreyImage
+from schemas.arrays import Float32Array, FloatArray, GreyImage
 from velfield.camera.lens import Lens
-from velfield.registration.correlation import Look, seen_as
+from velfield.registration.modality import MODALITIES, Modality, Transform
 
-LEAST_INLIERS = 10
-"""Fewer agreeing SIFT matches than this are chance."""
+MIN_INLIERS = 10
+"""Fewer SIFT inliers may be due to chance."""
 
-_SIFT_LEAST_SIDE_PX = 700.0
+_MIN_SIFT_SIDE_PX = 700.0
 _SIFT_FEATURES = 4000
 _RATIO = 0.85
 _INLIER_PX = 4.0
 _SEARCH_SIDE_PX = 640.0
-_LEAST_HALF_PX = 12
-_DISK_SHARE = 0.7  # of half the shorter side: the part of the frame that a search compares
+_MIN_TEMPLATE_HALF_PX = 12
+_TEMPLATE_FRACTION = 0.7  # of half the frame's shorter side: the central part that the search compares
 
 
 @dataclass(frozen=True)
-class Coarse:
-    """A candidate: ``matrix`` (3, 3) undistorted frame px -> base px, how it was found, and its score."""
+class CoarseCandidate:
+    """A candidate: ``matrix`` (3, 3) undistorted frame px -> base px, the method that found it, and its score."""
 
     matrix: FloatArray
-    how: str
-    look: Look
+    method: str
+    modality: Modality
     score: float
 
 
 @dataclass(frozen=True)
-class SiftAgreement:
-    """How many SIFT matches there were and how many one homography explains; ``matrix`` None where too few."""
+class SiftHomography:
+    """Number of SIFT matches and inliers of one homography; ``matrix`` is None if there are too few."""
 
     matrix: FloatArray | None
     matches: int
     inliers: int
 
 
-def scaling(scale: float) -> FloatArray:
-    """(3, 3) from a picture's pixels to those of the picture reduced by ``scale``; pixel (0, 0) is a centre."""
+def scaling_matrix(scale: float) -> FloatArray:
+    """(3, 3) from an image's pixels to those of the image resized by ``scale``; integers are pixel centres."""
     shift = 0.5 * scale - 0.5
     return np.array([[scale, 0.0, shift], [0.0, scale, shift], [0.0, 0.0, 1.0]])
 
 
-def reduced(grey: GreyImage, scale: float) -> GreyImage:
-    """The picture at ``scale``, averaged over areas."""
+def downscale(grey: GreyImage, scale: float) -> GreyImage:
+    """The image area-averaged to ``scale``; unchanged from scale 1 on."""
     if scale >= 1.0:
         return grey
     size = max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale))
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def coarse_scale(shape: tuple[int, ...], wanted: float) -> float:
-    """The reduction for SIFT: as wanted, but a small picture is not made smaller than SIFT can use.
+def sift_scale(shape: tuple[int, ...], scale: float) -> float:
+    """The scale for SIFT: ``scale``, but larger for images that would become too small.
 
     Examples
     --------
-    >>> coarse_scale((1920, 2560), 0.25) > 0.25, coarse_scale((392, 370), 0.25)
+    >>> sift_scale((1920, 2560), 0.25) > 0.25, sift_scale((392, 370), 0.25)
     (True, 1.0)
     """
-    return float(min(1.0, max(wanted, _SIFT_LEAST_SIDE_PX / max(shape))))
+    return float(min(1.0, max(scale, _MIN_SIFT_SIDE_PX / max(shape))))
 
 
-def _key_points(grey: GreyImage, scale: float) -> tuple[FloatArray, NDArray[np.float32]]:
-    """Places (n, 2), px of the full picture, and root-SIFT descriptors (n, 128)."""
+def _detect_root_sift(grey: GreyImage, scale: float) -> tuple[FloatArray, Float32Array]:
+    """Positions (n, 2), px of the full image, and RootSIFT descriptors (n, 128)."""
     sift = cv2.SIFT.create(nfeatures=_SIFT_FEATURES, contrastThreshold=0.02)
-    key_points, descriptors = sift.detectAndCompute(reduced(grey, scale), None)
-    if descriptors is None or len(key_points) < 2:
+    keypoints, descriptors = sift.detectAndCompute(downscale(grey, scale), None)
+    if descriptors is None or len(keypoints) < 2:
         return np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32)
-    small = np.array([point.pt for point in key_points], dtype=np.float64)
+    small = np.array([point.pt for point in keypoints], dtype=np.float64)
     total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)
     return (small + 0.5) / scale - 0.5, np.sqrt(descriptors / total).astype(np.float32)
 
 
-def sift_agreement(
-    image: GreyImage, base: GreyImage, lens: Lens, *, wanted_scale: float, mirrored: bool = False
-) -> SiftAgreement:
-    """SIFT matches between a frame and the base image, and the homography that most of them follow.
+def estimate_sift_homography(
+    image: GreyImage, base: GreyImage, lens: Lens, *, scale: float, mirrored: bool = False
+) -> SiftHomography:
+    """Homography of the SIFT matches between a frame and the base image, by MAGSAC.
 
     Parameters
     ----------
     image, base
         (h, w) uint8.
     lens
-        Undistorts the frame's key points; the homography takes undistorted px to base px.
-    wanted_scale
-        Reduction of both pictures, kept from making small ones too small.
+        Undistorts the frame's keypoints; the homography maps undistorted px to base px.
+    scale
+        Scale at which features are detected; small images are kept larger.
     mirrored
-        Mirror the frame left to right first: to tell the user of a flipped base image, never to register by.
+        Flip the frame left to right first: to recognise a flipped base image, never to register to it.
     """
     if mirrored:
         image = np.ascontiguousarray(image[:, ::-1])
-    xy, descriptors = _key_points(image, coarse_scale(image.shape, wanted_scale))
-    base_xy, base_descriptors = _key_points(base, coarse_scale(base.shape, wanted_scale))
-    if min(len(xy), len(base_xy)) < LEAST_INLIERS:
-        return SiftAgreement(None, min(len(xy), len(base_xy)), 0)
-    source, target = _mutual_matches(lens.undistort_points(xy), descriptors, base_xy, base_descriptors)
-    if len(source) < LEAST_INLIERS:
-        return SiftAgreement(None, len(source), 0)
-    matrix, kept = cv2.findHomography(source, target, cv2.USAC_MAGSAC, _INLIER_PX, maxIters=20_000, confidence=0.9999)
-    inliers = 0 if kept is None else int(kept.sum())
-    plausible = matrix is not None and inliers >= LEAST_INLIERS and _plausible(matrix, image.shape)
-    return SiftAgreement(np.asarray(matrix) if plausible else None, len(source), inliers)
+    xy, descriptors = _detect_root_sift(image, sift_scale(image.shape, scale))
+    base_xy, base_descriptors = _detect_root_sift(base, sift_scale(base.shape, scale))
+    if min(len(xy), len(base_xy)) < MIN_INLIERS:
+        return SiftHomography(None, min(len(xy), len(base_xy)), 0)
+    source, target = _match_mutual(lens.undistort_points(xy), descriptors, base_xy, base_descriptors)
+    if len(source) < MIN_INLIERS:
+        return SiftHomography(None, len(source), 0)
+    matrix, mask = cv2.findHomography(source, target, cv2.USAC_MAGSAC, _INLIER_PX, maxIters=20_000, confidence=0.9999)
+    inliers = 0 if mask is None else int(mask.sum())
+    plausible = matrix is not None and inliers >= MIN_INLIERS and is_plausible(matrix, image.shape)
+    return SiftHomography(np.asarray(matrix) if plausible else None, len(source), inliers)
 
 
-def _mutual_matches(
-    xy: FloatArray, descriptors: NDArray[np.float32], base_xy: FloatArray, base_descriptors: NDArray[np.float32]
+def _match_mutual(
+    xy: FloatArray, descriptors: Float32Array, base_xy: FloatArray, base_descriptors: Float32Array
 ) -> tuple[FloatArray, FloatArray]:
-    """Pairs of points whose descriptors are each other's nearest, and clearly so one way."""
-    likeness = descriptors @ base_descriptors.T
-    best = likeness.argmax(axis=1)
-    mutual = likeness.argmax(axis=0)[best] == np.arange(len(xy))
-    top = np.partition(likeness, -2, axis=1)[:, -2:]
+    """Cross-checked matches that pass the ratio test."""
+    similarities = descriptors @ base_descriptors.T
+    best = similarities.argmax(axis=1)
+    mutual = similarities.argmax(axis=0)[best] == np.arange(len(xy))
+    top = np.partition(similarities, -2, axis=1)[:, -2:]
     distance = np.sqrt(np.maximum(2.0 - 2.0 * np.sort(top, axis=1), 0.0))
-    clear = distance[:, 1] < _RATIO * distance[:, 0]
-    chosen = mutual & clear & np.isfinite(xy).all(axis=1)
-    return xy[chosen], base_xy[best[chosen]]
+    unambiguous = distance[:, 1] < _RATIO * distance[:, 0]
+    matched = mutual & unambiguous & np.isfinite(xy).all(axis=1)
+    return xy[matched], base_xy[best[matched]]
 
 
-def _plausible(matrix: FloatArray, shape: tuple[int, ...]) -> bool:
-    """Whether a homography keeps the frame's handedness and shape about, as a camera looking down does."""
+def is_plausible(matrix: FloatArray, shape: tuple[int, ...]) -> bool:
+    """Whether a homography (3, 3) preserves the frame's handedness and roughly its shape, as a nadir camera does."""
     height, width = shape[:2]
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=np.float64)
     mapped = np.column_stack([corners, np.ones(4)]) @ matrix.T
@@ -137,18 +136,18 @@ def _plausible(matrix: FloatArray, shape: tuple[int, ...]) -> bool:
         return False
     xy = mapped[:, :2] / mapped[:, 2:]
     sides = np.roll(xy, -1, axis=0) - xy
-    turn = sides[:, 0] * np.roll(sides, -1, axis=0)[:, 1] - sides[:, 1] * np.roll(sides, -1, axis=0)[:, 0]
+    cross = sides[:, 0] * np.roll(sides, -1, axis=0)[:, 1] - sides[:, 1] * np.roll(sides, -1, axis=0)[:, 0]
     scale = np.linalg.norm(sides, axis=1) / np.array([width, height, width, height])
-    return bool(np.all(turn > 0) and scale.max() < 5.0 * scale.min() and 0.1 < scale.mean() < 10.0)
+    return bool(np.all(cross > 0) and scale.max() < 5.0 * scale.min() and 0.1 < scale.mean() < 10.0)
 
 
-def similarity(scale: float, rotation_rad: float, source: FloatArray, target: FloatArray) -> FloatArray:
-    """(3, 3) similarity that turns from +x towards +y, scales, and takes ``source`` (2,) to ``target`` (2,)."""
+def similarity_matrix(scale: float, rotation_rad: float, source: FloatArray, target: FloatArray) -> FloatArray:
+    """(3, 3) similarity: rotation from +x towards +y and scale, mapping ``source`` (2,) to ``target`` (2,)."""
     cosine, sine = scale * np.cos(rotation_rad), scale * np.sin(rotation_rad)
-    turn = np.array([[cosine, -sine], [sine, cosine]])
+    rotation = np.array([[cosine, -sine], [sine, cosine]])
     matrix = np.eye(3)
-    matrix[:2, :2] = turn
-    matrix[:2, 2] = np.asarray(target) - turn @ np.asarray(source)
+    matrix[:2, :2] = rotation
+    matrix[:2, 2] = np.asarray(target) - rotation @ np.asarray(source)
     return matrix
 
 
@@ -159,10 +158,10 @@ def search_similarity(
     *,
     scales: Sequence[float],
     rotations_rad: Sequence[float],
-    near: FloatArray | None = None,
-    disk_px: int = 40,
-) -> list[Coarse]:
-    """Try scales and rotations, and correlate a disk of the frame with all of the base image, both small.
+    initial: FloatArray | None = None,
+    template_half_px: int = 40,
+) -> list[CoarseCandidate]:
+    """Search over scales and rotations: match the frame's centre as a template in the base image, both downscaled.
 
     Parameters
     ----------
@@ -171,80 +170,93 @@ def search_similarity(
     lens
         The frame's lens.
     scales, rotations_rad
-        What is tried: base px a frame px, and the turn from +x towards +y; relative to ``near`` where given.
-    near
-        (3, 3) undistorted frame px -> base px; what is tried is put before it, about the frame's middle.
-    disk_px
-        Half the side of the disk, small px: the pictures are reduced until it is that.
+        Candidates: base px per frame px, and rotation from +x towards +y; relative to ``initial`` if given.
+    initial
+        (3, 3) undistorted frame px -> base px; the candidates are applied before it, about the frame's centre.
+    template_half_px
+        Half the side of the template, downscaled px; determines the downscaling.
 
     Returns
     -------
-    list of Coarse
-        The best by each look, the highest correlation first; empty where no disk fits into the base image.
+    list of CoarseCandidate
+        The best of each modality, highest correlation first; empty if no template fits into the base image.
     """
     height, width = image.shape
-    middle = lens.undistort_points(np.array([[(width - 1) / 2, (height - 1) / 2]]))[0]
-    best: dict[Look, Coarse] = {}
+    centre = lens.undistort_points(np.array([[(width - 1) / 2, (height - 1) / 2]]))[0]
+    best: dict[str, CoarseCandidate] = {}
     for scale in scales:
-        small: _Small | None = None
+        small: _ReducedBase | None = None
         for rotation in rotations_rad:
-            about = similarity(scale, rotation, middle, np.zeros(2))
-            if near is not None:
-                about = near @ similarity(scale, rotation, middle, middle)
-                about = similarity(1.0, 0.0, _mapped(about, middle), np.zeros(2)) @ about
-            small = small or _small(base, about, middle, disk_px, min(height, width))
-            disk = _disk(image, lens, scaling(small.shrink) @ about, middle, small.half)
-            for look, score, x, y in _best_places(disk, small):
-                if look not in best or score > best[look].score:
-                    # The disk's middle pixel shows where the frame's middle lies.
-                    place = (np.array([x + small.half, y + small.half]) + 0.5) / small.shrink - 0.5
-                    best[look] = Coarse(similarity(1.0, 0.0, np.zeros(2), place) @ about, "search", look, score)
-    return sorted(best.values(), key=lambda coarse: -coarse.score)
+            to_base = similarity_matrix(scale, rotation, centre, np.zeros(2))
+            if initial is not None:
+                to_base = initial @ similarity_matrix(scale, rotation, centre, centre)
+                to_base = similarity_matrix(1.0, 0.0, _map_point(to_base, centre), np.zeros(2)) @ to_base
+            small = small or _reduce_base(base, to_base, centre, template_half_px, min(height, width))
+            template = _cut_template(image, lens, scaling_matrix(small.scale) @ to_base, centre, small.half)
+            for modality, score, x, y in _best_offsets(template, small):
+                if modality.name not in best or score > best[modality.name].score:
+                    # The template's central pixel shows the frame's centre.
+                    position = (np.array([x + small.half, y + small.half]) + 0.5) / small.scale - 0.5
+                    matrix = similarity_matrix(1.0, 0.0, np.zeros(2), position) @ to_base
+                    best[modality.name] = CoarseCandidate(matrix, "search", modality, score)
+    return sorted(best.values(), key=lambda candidate: -candidate.score)
 
 
 @dataclass(frozen=True)
-class _Small:
-    """The base image reduced for a search: its grey, its edges, the reduction, half the disk's side in its pixels."""
+class _ReducedBase:
+    """The base image downscaled for a search, by each transform of the modalities; the template's half side in it."""
 
     grey: GreyImage
-    edges: GreyImage
-    shrink: float
+    by_transform: Mapping[Transform, GreyImage]
+    scale: float
     half: int
 
 
-def _small(base: GreyImage, about: FloatArray, middle: FloatArray, disk_px: int, side_px: int) -> _Small:
-    """The base image reduced so that the frame's disk has the wanted size, or less where the base image is large."""
-    stretch = float(np.linalg.norm(_mapped(about, middle + np.array([1.0, 0.0])) - _mapped(about, middle)))
-    reach = _DISK_SHARE * 0.5 * side_px * stretch
-    shrink = min(1.0, disk_px / reach, _SEARCH_SIDE_PX / max(base.shape))
-    grey = reduced(base, shrink)
-    return _Small(grey, seen_as(grey, "edges"), shrink, max(int(reach * shrink), 1))
+def _reduce_base(
+    base: GreyImage, to_base: FloatArray, centre: FloatArray, template_half_px: int, side_px: int
+) -> _ReducedBase:
+    """Downscale the base image until the frame's template has the requested size, or further if it is large."""
+    stretch = float(np.linalg.norm(_map_point(to_base, centre + np.array([1.0, 0.0])) - _map_point(to_base, centre)))
+    half_side = _TEMPLATE_FRACTION * 0.5 * side_px * stretch
+    scale = min(1.0, template_half_px / half_side, _SEARCH_SIDE_PX / max(base.shape))
+    grey = downscale(base, scale)
+    by_transform = {modality.transform: modality.transform(grey) for modality in MODALITIES.values()}
+    return _ReducedBase(grey, by_transform, scale, max(int(half_side * scale), 1))
 
 
-def _mapped(matrix: FloatArray, point: FloatArray) -> FloatArray:
+def _map_point(matrix: FloatArray, point: FloatArray) -> FloatArray:
     mapped = matrix @ np.array([point[0], point[1], 1.0])
     return np.asarray(mapped[:2] / mapped[2])
 
 
-def _disk(image: GreyImage, lens: Lens, to_small: FloatArray, middle: FloatArray, half: int) -> GreyImage:
-    """The frame's middle as a square of the small base image's pixels, its own middle pixel the frame's middle."""
-    centre = _mapped(to_small, middle)
-    stretch = float(np.linalg.norm(_mapped(to_small, middle + np.array([1.0, 0.0])) - centre))
+def _cut_template(image: GreyImage, lens: Lens, to_small: FloatArray, centre: FloatArray, half: int) -> GreyImage:
+    """The frame's central square resampled to the downscaled base image's pixels."""
+    mapped_centre = _map_point(to_small, centre)
+    stretch = float(np.linalg.norm(_map_point(to_small, centre + np.array([1.0, 0.0])) - mapped_centre))
     grid = np.stack(np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1)), axis=-1).reshape(-1, 2)
-    there = np.column_stack([grid + centre, np.ones(len(grid))]) @ np.linalg.inv(to_small).T
-    raw = lens.distort_points(there[:, :2] / there[:, 2:])
-    shrunk = min(1.0, stretch)
-    raw_small = ((raw + 0.5) * shrunk - 0.5).reshape(2 * half + 1, 2 * half + 1, 2).astype(np.float32)
-    return np.asarray(cv2.remap(reduced(image, shrunk), raw_small, None, cv2.INTER_LINEAR), dtype=np.uint8)
+    undistorted = np.column_stack([grid + mapped_centre, np.ones(len(grid))]) @ np.linalg.inv(to_small).T
+    raw = lens.distort_points(undistorted[:, :2] / undistorted[:, 2:])
+    scale = min(1.0, stretch)
+    raw_small = ((raw + 0.5) * scale - 0.5).reshape(2 * half + 1, 2 * half + 1, 2).astype(np.float32)
+    return np.asarray(cv2.remap(downscale(image, scale), raw_small, None, cv2.INTER_LINEAR), dtype=np.uint8)
 
 
-def _best_places(disk: GreyImage, small: _Small) -> list[tuple[Look, float, int, int]]:
-    """By each look, the highest correlation of the disk with the small base image and its offset (x, y)."""
-    if small.half < _LEAST_HALF_PX or min(np.subtract(small.grey.shape, disk.shape)) < 0 or disk.std() < 1.0:
+def _best_offsets(template: GreyImage, base: _ReducedBase) -> list[tuple[Modality, float, int, int]]:
+    """The highest correlation of the template with the downscaled base image in each modality, and its offset (x, y).
+
+    Modalities of one transform share its correlation and differ in sign.
+    """
+    too_large = min(np.subtract(base.grey.shape, template.shape)) < 0
+    if base.half < _MIN_TEMPLATE_HALF_PX or too_large or template.std() < 1.0:
         return []
-    tones = np.nan_to_num(cv2.matchTemplate(small.grey, disk, cv2.TM_CCOEFF_NORMED), posinf=0.0, neginf=0.0)
-    edges = cv2.matchTemplate(small.edges, seen_as(disk, "edges"), cv2.TM_CCOEFF_NORMED)
-    edges = np.nan_to_num(edges, posinf=0.0, neginf=0.0)
-    least, most, least_at, most_at = cv2.minMaxLoc(tones)
-    _, steepest, _, steepest_at = cv2.minMaxLoc(edges)
-    return [("tones", most, *most_at), ("inverted", -least, *least_at), ("edges", steepest, *steepest_at)]
+    correlation = {
+        transform: np.nan_to_num(
+            cv2.matchTemplate(image, transform(template), cv2.TM_CCOEFF_NORMED), posinf=0.0, neginf=0.0
+        )
+        for transform, image in base.by_transform.items()
+    }
+    offsets = []
+    for modality in MODALITIES.values():
+        _, score, _, (x, y) = cv2.minMaxLoc(modality.sign * correlation[modality.transform])
+        offsets.append((modality, score, x, y))
+    return offsets

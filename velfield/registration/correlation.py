@@ -1,42 +1,28 @@
-"""Normalised cross-correlation of patches on a grid: where a moving picture lies on a reference one, below the pixel.
+"""Normalised cross-correlation of patches on a grid: the displacement between two images to subpixel accuracy.
 
-Paper: inter-sensor registration. Points every 50 px, patches of 75 x 75, the best normalised correlation within a
-window. Tones of two sensors differ, even in sign; so pictures are compared by one of three looks, and the caller tries
-them.
+Paper: inter-sensor registration. Points every 50 px, patches of 75 x 75, the maximum of the normalised correlation
+within a search window. Images are compared in a `Modality`, because grey levels of two sensors differ.
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 import cv2
 import numpy as np
 
 from schemas.arrays import FloatArray, GreyImage, Mask
+from velfield.registration.modality import INTENSITY, Modality
 
-Look = Literal["tones", "inverted", "edges"]
-"""How two pictures are compared: by grey, by grey with its sign turned, or by steepness."""
-
-_LEAST_CONTRAST = 2.0
-_LEAST_COVER = 0.9
+_MIN_CONTRAST = 2.0
+_MIN_COVERAGE = 0.9
 
 
 @dataclass(frozen=True)
 class GridMatches:
-    """Matches at grid points: ``points`` (n, 2) px, ``displacement`` (n, 2) px, ``score`` (n,) the peak's height."""
+    """Matches at grid points: ``points`` (n, 2) px, ``displacement`` (n, 2) px, ``score`` (n,) peak correlation."""
 
     points: FloatArray
     displacement: FloatArray
     score: FloatArray
-
-
-def seen_as(grey: GreyImage, look: Look) -> GreyImage:
-    """The picture as a look sees it: its grey, or its steepness."""
-    if look != "edges":
-        return grey
-    smooth = cv2.GaussianBlur(grey, (0, 0), 1.0).astype(np.float32)
-    steepness = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
-    # The root: a few roofs must not outweigh all the rest.
-    return np.asarray(np.clip(np.sqrt(steepness) * 8.0, 0, 255), dtype=np.uint8)
 
 
 def match_grid(
@@ -47,68 +33,68 @@ def match_grid(
     spacing_px: int,
     patch_px: int,
     radius_px: int,
-    look: Look = "tones",
+    modality: Modality = INTENSITY,
 ) -> GridMatches:
-    """Where patches of a moving picture lie on a reference picture of the same grid.
+    """Locate patches of a moving image in a reference image on the same grid.
 
     Parameters
     ----------
     moving, mask
-        (h, w) uint8 picture and where it has a value.
+        (h, w) uint8 image and where it is valid.
     reference
         (h, w) uint8.
     spacing_px
-        Distance of the grid's points.
+        Spacing of the grid points.
     patch_px
-        Side of the patches; made odd.
+        Side of the patches; rounded up to an odd number.
     radius_px
-        Farthest displacement searched. A peak on the border is none.
-    look
-        How the pictures are compared.
+        Largest displacement searched. A maximum at the border of the search window is rejected.
+    modality
+        How the images are compared.
 
     Returns
     -------
     GridMatches
-        ``displacement`` leads from a place in the moving picture to the same place in the reference.
+        ``displacement`` points from a position in the moving image to the matching position in the reference.
     """
     half = patch_px // 2
     height, width = reference.shape
     ys = np.arange(half, height - half, spacing_px)
     xs = np.arange(half, width - half, spacing_px)
-    cover = cv2.boxFilter(mask.astype(np.float32), -1, (2 * half + 1, 2 * half + 1), borderType=cv2.BORDER_CONSTANT)
-    moving, reference = seen_as(moving, look), seen_as(reference, look)
+    coverage = cv2.boxFilter(mask.astype(np.float32), -1, (2 * half + 1, 2 * half + 1), borderType=cv2.BORDER_CONSTANT)
+    moving, reference = modality.transform(moving), modality.transform(reference)
     rows = []
     for y in ys:
         for x in xs:
-            if cover[y, x] < _LEAST_COVER:
+            if coverage[y, x] < _MIN_COVERAGE:
                 continue
             patch = moving[y - half : y + half + 1, x - half : x + half + 1]
-            if patch.std() < _LEAST_CONTRAST:
+            if patch.std() < _MIN_CONTRAST:
                 continue
             top, left = max(y - half - radius_px, 0), max(x - half - radius_px, 0)
             window = reference[top : y + half + radius_px + 1, left : x + half + radius_px + 1]
-            found = _peak(patch, window, -1.0 if look == "inverted" else 1.0)
-            if found is not None:
-                dx, dy, score = found
+            peak = _find_peak(patch, window, modality.sign)
+            if peak is not None:
+                dx, dy, score = peak
                 rows.append((x, y, left + dx - (x - half), top + dy - (y - half), score))
     table = np.array(rows, dtype=np.float64).reshape(-1, 5)
     return GridMatches(table[:, :2], table[:, 2:4], table[:, 4])
 
 
-def _peak(patch: GreyImage, window: GreyImage, sign: float) -> tuple[float, float, float] | None:
-    """Offset (x, y) of the best correlation, by parabolas, and its height; None on the border or in a flat window."""
-    if window.std() < _LEAST_CONTRAST:
+def _find_peak(patch: GreyImage, window: GreyImage, sign: float) -> tuple[float, float, float] | None:
+    """Subpixel offset (x, y) of the correlation peak and its height; None at the border or in a flat window."""
+    if window.std() < _MIN_CONTRAST:
         return None
     scores = sign * cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED)
     _, height, _, (x, y) = cv2.minMaxLoc(scores)
     if not (0 < x < scores.shape[1] - 1 and 0 < y < scores.shape[0] - 1) or not np.isfinite(height):
         return None
-    dx = _vertex(scores[y, x - 1], scores[y, x], scores[y, x + 1])
-    dy = _vertex(scores[y - 1, x], scores[y, x], scores[y + 1, x])
+    dx = parabola_vertex(scores[y, x - 1], scores[y, x], scores[y, x + 1])
+    dy = parabola_vertex(scores[y - 1, x], scores[y, x], scores[y + 1, x])
     return x + dx, y + dy, float(height)
 
 
-def _vertex(before: float, middle: float, after: float) -> float:
-    """Where, in (-1, 1) about the middle, the parabola through three equidistant values is highest."""
-    bend = float(before) - 2.0 * float(middle) + float(after)
-    return 0.0 if bend >= 0 else 0.5 * (float(before) - float(after)) / bend
+def parabola_vertex(before: float, middle: float, after: float) -> float:
+    """Abscissa of the maximum of the parabola through three values at -1, 0, 1; 0 if there is no maximum."""
+    curvature = float(before) - 2.0 * float(middle) + float(after)
+    return 0.0 if curvature >= 0 else 0.5 * (float(before) - float(after)) / curvature

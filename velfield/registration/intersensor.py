@@ -1,97 +1,98 @@
-"""A frame registered to another sensor's picture of the place (paper: inter-sensor registration).
+"""Inter-sensor registration: a frame to another sensor's image of the same area (paper: inter-sensor registration).
 
-1. Coarse candidates (`coarse`): SIFT and a robust homography, upright or of the negative; a search over rotations and
-   scales.
-2. Each, coarse to fine, to control points and a polyprojective (`control`).
-3. The verdict: patches that do not overlap, none of them used by the fit, each asked where it lies. Control points
-   50 px apart share much of their 75-px patches, and on a wrong place agree with each other; these do not. Each
-   candidate that fails leaves its scores, and the failure says them in one line.
+1. Coarse candidates (`coarse`): a SIFT homography, of the frame or its negative; a search over rotations and scales.
+2. For each, coarse to fine, control points and a polyprojective (`control`).
+3. Verification: non-overlapping patches that the fit did not use are matched independently. Control points 50 px apart
+   share most of their 75-px patches and agree with each other on a wrong area too; these do not. The first candidate
+   that is verified is the result. Each that fails leaves its scores, and the failure lists them in one line.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray, GreyImage
+from schemas.arrays import Float32Array, FloatArray, GreyImage
 from schemas.flight import BaseConfig
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
-from velfield.registration.coarse import LEAST_INLIERS, Coarse, search_similarity, sift_agreement
+from velfield.registration.coarse import MIN_INLIERS, CoarseCandidate, estimate_sift_homography, search_similarity
 from velfield.registration.control import (
     FINE_RADIUS_PX,
-    Fitted,
-    Pair,
-    coarse_to_fine,
-    left_out_errors,
-    on_base_grid,
+    FineFit,
+    ImagePair,
+    cv_errors,
+    register_coarse_to_fine,
+    warp_to_base_grid,
 )
-from velfield.registration.correlation import Look, match_grid
+from velfield.registration.correlation import match_grid
 from velfield.registration.fitting import Model
+from velfield.registration.modality import GRADIENT, MODALITIES, Modality
 from velfield.registration.transforms import FrameTransform
 
-_SURE_SHARE = 0.5
-"""Below this share of agreeing patches a place is believed only if its mirror picture is not."""
-MIN_AGREEING_SHARE = 0.25
-"""Share of the separate patches that must lie where the map says; on another place, or mirrored, .03 to .15 do."""
-MIN_AGREEING_PATCHES = 12
-"""And no fewer of them than this."""
+_CERTAIN_FRACTION = 0.5
+"""With a smaller fraction of consistent patches, the flipped base image must not match too."""
+MIN_CONSISTENT_FRACTION = 0.25
+"""Smallest fraction of verification patches consistent with the map; wrong or flipped areas have 0.03 to 0.15."""
+MIN_CONSISTENT_PATCHES = 12
+"""And their smallest number."""
 
-_WITNESS_COUNT, _WITNESS_SIDES_PX = 200, (21, 75)
-_WITNESS_TOLERANCE_PX = 2.0
-_BY_ROWS_SHARE = 0.45
-"""Share of them that must agree by their rows where fewer do straight; of frames whose rows wobble by 4 px, .6 do."""
-_LEAST_CONTRAST_GREY = 1.0
-_ROW_BANDS, _ROW_POINTS = 64, 8
-"""Rows within a 64th of the frame were taken at about one time; so many points tell how they moved."""
+_VERIFICATION_COUNT, _VERIFICATION_SIDES_PX = 200, (21, 75)
+_VERIFICATION_TOLERANCE_PX = 2.0
+_MIN_ROW_CORRECTED_FRACTION = 0.45
+"""Smallest fraction consistent after row correction; frames with a row motion of 4 px have 0.6."""
+_MIN_BASE_CONTRAST_GREY = 1.0
+_ROW_BANDS, _MIN_ROW_POINTS = 64, 8
+"""Rows within a 64th of the frame are exposed at about the same time; their motion is the median of so many points."""
 _NEAR_SCALES = (0.8, 0.89, 1.0, 1.12, 1.25)
-_NEAR_TURNS = tuple(np.radians([-10.0, -5.0, 0.0, 5.0, 10.0]))
+_NEAR_ROTATIONS = tuple(np.radians([-10.0, -5.0, 0.0, 5.0, 10.0]))
 _ALL_SCALES = (0.5, 0.63, 0.79, 1.0, 1.26, 1.59, 2.0)
-_ALL_TURNS = tuple(np.radians(np.arange(0.0, 360.0, 10.0)))
+_ALL_ROTATIONS = tuple(np.radians(np.arange(0.0, 360.0, 10.0)))
 _FINER_SCALES = (0.87, 0.93, 1.0, 1.07, 1.15)
-_FINER_TURNS = tuple(np.radians([-6.0, -3.0, 0.0, 3.0, 6.0]))
-_FINER_DISK_PX = 80
+_FINER_ROTATIONS = tuple(np.radians([-6.0, -3.0, 0.0, 3.0, 6.0]))
+_FINER_TEMPLATE_HALF_PX = 80
 
 
 @dataclass(frozen=True)
 class IntersensorResult:
-    """A frame's place on the base image and how good it is.
+    """A frame's registration to the base image, with its quality metrics.
 
     Attributes
     ----------
     transform
-        Raw px -> base px: lens, then the map.
+        Raw px -> base px: lens, then polyprojective.
     model
-        The map that left-out points chose.
-    source_raw, target, error_left_out_px
-        (n, 2) raw px, (n, 2) base px, (n,) base px: control points and each one's error when left out of the fit.
-    mean_error_px, left_out_error_px
-        Mean distance of the control points, fitted and left out, base px.
+        The model of lower cross-validated error.
+    source_raw, target, cv_errors_px
+        (n, 2) raw px, (n, 2) base px, (n,) base px: control points and the cross-validated error of each.
+    mean_error_px, cv_error_px
+        Mean distance of the control points from the fit, and cross-validated, base px.
     tried_points
-        How many points were correlated.
+        Number of grid matches.
     scale, rotation_rad
-        Base px a frame px at the frame's middle, and the turn there, from +x towards +y.
+        Base px per frame px at the frame's centre, and rotation there, from +x towards +y.
+    method
+        How the coarse candidate was found.
     scores
-        What each candidate came to.
+        The verification of each candidate, in words.
     error_map, error_map_spacing_px
-        (rows, columns) float32 mean left-out error about each node of a grid over the base image, base px; NaN where no
-        control point is near. Node (i, j) lies at base (j, i) times the spacing.
+        (rows, columns) float32 mean cross-validated error about each node of a grid over the base image, base px; NaN
+        where no control point is near. Node (i, j) lies at base (j, i) times the spacing.
     """
 
     transform: FrameTransform
     model: Model
     source_raw: FloatArray
     target: FloatArray
-    error_left_out_px: FloatArray
+    cv_errors_px: FloatArray
     mean_error_px: float
-    left_out_error_px: float
+    cv_error_px: float
     tried_points: int
     scale: float
     rotation_rad: float
-    how: str
+    method: str
     scores: tuple[str, ...]
-    error_map: NDArray[np.float32]
+    error_map: Float32Array
     error_map_spacing_px: int
 
 
@@ -103,7 +104,7 @@ def register_intersensor(
     lens: Lens,
     initial: FloatArray | None = None,
 ) -> IntersensorResult | Failure:
-    """Register a raw frame to another sensor's picture.
+    """Register a raw frame to another sensor's image.
 
     Parameters
     ----------
@@ -116,166 +117,188 @@ def register_intersensor(
     lens
         The camera's lens.
     initial
-        (3, 3) undistorted frame px -> base px, tried first; may be off by a fifth in scale and ten degrees.
+        (3, 3) undistorted frame px -> base px, tried first; accurate to a fifth in scale and ten degrees.
 
     Returns
     -------
     IntersensorResult or Failure
         The failure's reason is one line with each candidate's scores.
     """
-    if float(base.std()) < _LEAST_CONTRAST_GREY:
-        return Failure("found a picture of one grey level, expected one of the flight's place; give another")
-    pair = Pair(image, base, lens, config)
+    if float(base.std()) < _MIN_BASE_CONTRAST_GREY:
+        return Failure("found an image of one grey level, expected one of the flight's area; give another")
+    pair = ImagePair(image, base, lens, config)
     scores: list[str] = []
-    for candidate in _candidates(pair, initial, scores):
-        fitted = coarse_to_fine(pair, candidate)
-        if isinstance(fitted, Failure):
-            scores.append(f"{candidate.how}: {fitted.reason}")
+    for candidate in _coarse_candidates(pair, initial, scores):
+        fit = register_coarse_to_fine(pair, candidate)
+        if isinstance(fit, Failure):
+            scores.append(f"{candidate.method}: {fit.reason}")
             continue
-        count, heard = int(fitted.kept.sum()), _witnesses(pair, fitted, candidate.look)
-        scores.append(f"{candidate.how}: {count} control points, {heard.text}")
-        if count >= config.min_control_points and heard.borne_out:
-            if not heard.sure and _is_mirrored(pair):
-                break  # straight roads agree with their own mirror picture well enough to be taken for the place
-            return _result(pair, fitted, candidate, tuple(scores))
-    return Failure(_why_not(pair, scores))
+        count, verification = int(fit.inliers.sum()), verify(pair, fit, candidate.modality)
+        scores.append(f"{candidate.method}: {count} control points, {verification.text}")
+        if count >= config.min_control_points and verification.is_verified:
+            if not verification.is_certain and _matches_flipped(pair):
+                break  # straight roads match their own mirror image well enough to pass the verification
+            return _to_result(pair, fit, candidate, tuple(scores))
+    return Failure(_explain_failure(pair, scores))
 
 
-def _is_mirrored(pair: Pair) -> bool:
-    """Whether the base image, flipped, shows the place beyond doubt."""
-    flipped = sift_agreement(pair.image, pair.base, pair.lens, wanted_scale=pair.config.coarse_scale, mirrored=True)
+def _matches_flipped(pair: ImagePair) -> bool:
+    """Whether the flipped frame matches the base image by SIFT."""
+    flipped = estimate_sift_homography(pair.image, pair.base, pair.lens, scale=pair.config.coarse_scale, mirrored=True)
     return flipped.matrix is not None
 
 
-def _why_not(pair: Pair, scores: list[str]) -> str:
-    """What was found and what to do first, for people; then the scores."""
-    mirrored = sift_agreement(pair.image, pair.base, pair.lens, wanted_scale=pair.config.coarse_scale, mirrored=True)
-    if mirrored.matrix is not None:
-        return f"found a mirrored picture ({mirrored.inliers} of {mirrored.matches} SIFT matches agree so); flip it"
-    needed = f"{pair.config.min_control_points} control points and {MIN_AGREEING_SHARE:.0%} of separate patches needed"
+def _explain_failure(pair: ImagePair, scores: list[str]) -> str:
+    """What was found, what to do, and the scores."""
+    flipped = estimate_sift_homography(pair.image, pair.base, pair.lens, scale=pair.config.coarse_scale, mirrored=True)
+    if flipped.matrix is not None:
+        return f"found a mirrored image ({flipped.inliers} of {flipped.matches} SIFT matches are inliers); flip it"
+    needed = (
+        f"{pair.config.min_control_points} control points and {MIN_CONSISTENT_FRACTION:.0%} of verification patches "
+        "needed"
+    )
     return (
-        "not a picture of this flight's place; give one of the place, seen from above, at 0.5 to 2 times the frames' "
+        "not an image of this flight's area; give one of the area, seen from above, at 0.5 to 2 times the frames' "
         f"scale. Tried ({needed}): {'; '.join(scores)}"
     )
 
 
-def _candidates(pair: Pair, initial: FloatArray | None, scores: list[str]) -> Iterator[Coarse]:
-    """Coarse maps, the likeliest first; the slow search only when the others failed. ``scores`` gets what had none."""
+def _coarse_candidates(pair: ImagePair, initial: FloatArray | None, scores: list[str]) -> Iterator[CoarseCandidate]:
+    """Coarse maps, the most likely first, the slow search last; ``scores`` records the methods that gave none."""
     if initial is not None:
-        yield from _searched(pair, "given", (_NEAR_SCALES, _NEAR_TURNS), np.asarray(initial, dtype=np.float64), scores)
-    for how, image in (("SIFT", pair.image), ("SIFT of the negative", np.bitwise_not(pair.image))):
-        found = sift_agreement(image, pair.base, pair.lens, wanted_scale=pair.config.coarse_scale)
-        if found.matrix is None:
-            scores.append(f"{how}: {found.inliers} of {found.matches} matches agree, {LEAST_INLIERS} needed")
+        near = np.asarray(initial, dtype=np.float64)
+        yield from _search_candidates(pair, "given", (_NEAR_SCALES, _NEAR_ROTATIONS), near, scores)
+    for modality in MODALITIES.values():
+        if modality.sift_transform is None:
             continue
-        look: Look = "tones" if how == "SIFT" else "inverted"
-        yield Coarse(found.matrix, how, look, found.inliers / found.matches)
-        yield Coarse(found.matrix, f"{how}, by edges", "edges", found.inliers / found.matches)
-    yield from _searched(pair, "search", (_ALL_SCALES, _ALL_TURNS), None, scores)
+        image, method = modality.sift_transform(pair.image), f"SIFT ({modality.name})"
+        sift = estimate_sift_homography(image, pair.base, pair.lens, scale=pair.config.coarse_scale)
+        if sift.matrix is None:
+            scores.append(f"{method}: {sift.inliers} inliers of {sift.matches} matches, {MIN_INLIERS} needed")
+            continue
+        yield CoarseCandidate(sift.matrix, method, modality, sift.inliers / sift.matches)
+        yield CoarseCandidate(sift.matrix, f"{method}, then {GRADIENT.name}", GRADIENT, sift.inliers / sift.matches)
+    yield from _search_candidates(pair, "search", (_ALL_SCALES, _ALL_ROTATIONS), None, scores)
 
 
-def _searched(
-    pair: Pair, how: str, tried: tuple[tuple[float, ...], tuple[float, ...]], near: FloatArray | None, scores: list[str]
-) -> Iterator[Coarse]:
-    """The best of a search by each look, each searched again more finely about itself."""
-    found = search_similarity(pair.image, pair.base, pair.lens, scales=tried[0], rotations_rad=tried[1], near=near)
+def _search_candidates(
+    pair: ImagePair,
+    method: str,
+    grid: tuple[tuple[float, ...], tuple[float, ...]],
+    initial: FloatArray | None,
+    scores: list[str],
+) -> Iterator[CoarseCandidate]:
+    """The best of a search over scales and rotations in each modality, each refined by a finer search."""
+    found = search_similarity(pair.image, pair.base, pair.lens, scales=grid[0], rotations_rad=grid[1], initial=initial)
     if not found:
-        scores.append(f"{how}: no turn or scale of the frame's middle fits into the base image")
+        scores.append(f"{method}: at no rotation and scale does the frame's centre fit into the base image")
     for rough in found:
         finer = search_similarity(
             pair.image,
             pair.base,
             pair.lens,
             scales=_FINER_SCALES,
-            rotations_rad=_FINER_TURNS,
-            near=rough.matrix,
-            disk_px=_FINER_DISK_PX,
+            rotations_rad=_FINER_ROTATIONS,
+            initial=rough.matrix,
+            template_half_px=_FINER_TEMPLATE_HALF_PX,
         )
         for fine in finer:
-            if fine.look == rough.look:
-                yield Coarse(fine.matrix, f"{how} by {fine.look}, correlation {fine.score:.2f}", fine.look, fine.score)
+            if fine.modality == rough.modality:
+                described = f"{method} ({fine.modality.name}), correlation {fine.score:.2f}"
+                yield CoarseCandidate(fine.matrix, described, fine.modality, fine.score)
 
 
 @dataclass(frozen=True)
-class _Witnesses:
-    """Patches that do not overlap: how many lie anywhere clearly, where the map says, and where it says by their rows.
+class VerificationPatches:
+    """Independent check of a map: how many non-overlapping patches match at all, and how many where the map predicts.
 
-    The rows of a rolling shutter may have moved by more than the tolerance: a patch agrees by its rows where control
-    points of the same rows, elsewhere in the picture, moved alike. By edges of a wrong place up to a quarter do.
+    A rolling shutter may displace rows by more than the tolerance. ``row_corrected`` counts the patches that are
+    consistent once the median displacement of control points in the same rows, elsewhere in the frame, is subtracted;
+    up to a quarter are by chance on a wrong area in the gradient modality.
     """
 
     count: int = 0
-    agreeing: int = 0
-    by_rows: int = 0
+    consistent: int = 0
+    row_corrected: int = 0
 
     @property
-    def borne_out(self) -> bool:
-        straight = self.agreeing >= max(MIN_AGREEING_PATCHES, MIN_AGREEING_SHARE * self.count)
-        return straight or self.by_rows >= max(2 * MIN_AGREEING_PATCHES, _BY_ROWS_SHARE * self.count)
+    def is_verified(self) -> bool:
+        """Whether enough patches are consistent, with or without row correction."""
+        without = self.consistent >= max(MIN_CONSISTENT_PATCHES, MIN_CONSISTENT_FRACTION * self.count)
+        return without or self.row_corrected >= max(
+            2 * MIN_CONSISTENT_PATCHES, _MIN_ROW_CORRECTED_FRACTION * self.count
+        )
 
     @property
-    def sure(self) -> bool:
-        return max(self.agreeing, self.by_rows) >= _SURE_SHARE * self.count
+    def is_certain(self) -> bool:
+        """Whether so many are that a mirror image is ruled out."""
+        return max(self.consistent, self.row_corrected) >= _CERTAIN_FRACTION * self.count
 
     @property
     def text(self) -> str:
-        return f"{self.agreeing} of {self.count} separate patches agree, {self.by_rows} by rows"
+        """The counts in words."""
+        counts = f"{self.consistent} of {self.count} verification patches consistent"
+        return f"{counts}, {self.row_corrected} after row correction"
 
 
-def _witnesses(pair: Pair, fitted: Fitted, look: Look) -> _Witnesses:
-    pictures = on_base_grid(pair, fitted.transform, 1.0)
-    if pictures is None:
-        return _Witnesses()
-    moving, mask, reference, origin = pictures
-    side = int(np.clip(np.sqrt(mask.sum() / _WITNESS_COUNT), *_WITNESS_SIDES_PX)) | 1
-    matches = match_grid(moving, mask, reference, spacing_px=side, patch_px=side, radius_px=FINE_RADIUS_PX, look=look)
-    raw = fitted.transform.to_raw(matches.points + origin)
-    rest = matches.displacement - _motion_of_rows(fitted, raw, apart_px=1.5 * pair.config.patch_size_px)
-    straight, by_rows = (
-        int((np.linalg.norm(miss, axis=1) < _WITNESS_TOLERANCE_PX).sum()) for miss in (matches.displacement, rest)
+def verify(pair: ImagePair, fit: FineFit, modality: Modality) -> VerificationPatches:
+    """Match non-overlapping patches of the warped frame, independently of the control points, and compare."""
+    images = warp_to_base_grid(pair, fit.transform, 1.0)
+    if images is None:
+        return VerificationPatches()
+    moving, mask, reference, origin = images
+    side = int(np.clip(np.sqrt(mask.sum() / _VERIFICATION_COUNT), *_VERIFICATION_SIDES_PX)) | 1
+    matches = match_grid(
+        moving, mask, reference, spacing_px=side, patch_px=side, radius_px=FINE_RADIUS_PX, modality=modality
     )
-    return _Witnesses(len(matches.points), straight, by_rows)
+    raw = fit.transform.to_raw(matches.points + origin)
+    corrected = matches.displacement - _estimate_row_motion(fit, raw, min_distance_px=1.5 * pair.config.patch_size_px)
+    consistent, row_corrected = (
+        int((np.linalg.norm(displacement, axis=1) < _VERIFICATION_TOLERANCE_PX).sum())
+        for displacement in (matches.displacement, corrected)
+    )
+    return VerificationPatches(len(matches.points), consistent, row_corrected)
 
 
-def _motion_of_rows(fitted: Fitted, raw: FloatArray, *, apart_px: float) -> FloatArray:
-    """Median displacement (n, 2), base px, of the control points in the rows of raw places (n, 2), none too near."""
-    rest = fitted.target - fitted.transform.to_base(fitted.source_raw)
-    usable = np.linalg.norm(rest, axis=1) < 2.0 * FINE_RADIUS_PX
-    at, rest = fitted.source_raw[usable], rest[usable]
-    reach = fitted.transform.height / _ROW_BANDS
+def _estimate_row_motion(fit: FineFit, raw: FloatArray, *, min_distance_px: float) -> FloatArray:
+    """Median residual (n, 2), base px, of the control points in the same rows as raw points (n, 2), but apart."""
+    residuals = fit.target - fit.transform.to_base(fit.source_raw)
+    usable = np.linalg.norm(residuals, axis=1) < 2.0 * FINE_RADIUS_PX
+    source_raw, residuals = fit.source_raw[usable], residuals[usable]
+    half_band = fit.transform.height / _ROW_BANDS
     motion = np.zeros_like(raw)
     for k, (x, y) in enumerate(raw):
-        same = (np.abs(at[:, 1] - y) < reach) & (np.abs(at[:, 0] - x) > apart_px)
-        if same.sum() >= _ROW_POINTS:
-            motion[k] = np.median(rest[same], axis=0)
+        same_rows = (np.abs(source_raw[:, 1] - y) < half_band) & (np.abs(source_raw[:, 0] - x) > min_distance_px)
+        if same_rows.sum() >= _MIN_ROW_POINTS:
+            motion[k] = np.median(residuals[same_rows], axis=0)
     return motion
 
 
-def _result(pair: Pair, fitted: Fitted, candidate: Coarse, scores: tuple[str, ...]) -> IntersensorResult:
-    source_raw, target = fitted.source_raw[fitted.kept], fitted.target[fitted.kept]
-    errors = left_out_errors(pair.lens.undistort_points(source_raw), target, fitted.model)
-    scale, rotation = fitted.transform.scale_and_rotation()
+def _to_result(pair: ImagePair, fit: FineFit, candidate: CoarseCandidate, scores: tuple[str, ...]) -> IntersensorResult:
+    source_raw, target = fit.source_raw[fit.inliers], fit.target[fit.inliers]
+    errors = cv_errors(pair.lens.undistort_points(source_raw), target, fit.model)
+    scale, rotation = fit.transform.scale_and_rotation()
     spacing = max(1, pair.config.grid_spacing_px)
     return IntersensorResult(
-        transform=fitted.transform,
-        model=fitted.model,
+        transform=fit.transform,
+        model=fit.model,
         source_raw=source_raw,
         target=target,
-        error_left_out_px=errors,
-        mean_error_px=fitted.mean_error_px,
-        left_out_error_px=float(errors.mean()),
-        tried_points=int(fitted.kept.size),
+        cv_errors_px=errors,
+        mean_error_px=fit.mean_error_px,
+        cv_error_px=float(errors.mean()),
+        tried_points=int(fit.inliers.size),
         scale=scale,
         rotation_rad=rotation,
-        how=candidate.how,
+        method=candidate.method,
         scores=scores,
-        error_map=_error_map(target, errors, (pair.base.shape[0], pair.base.shape[1]), spacing),
+        error_map=_map_errors(target, errors, (pair.base.shape[0], pair.base.shape[1]), spacing),
         error_map_spacing_px=spacing,
     )
 
 
-def _error_map(points: FloatArray, errors: FloatArray, shape: tuple[int, int], spacing: int) -> NDArray[np.float32]:
-    """Mean error about each node, points weighed by a Gaussian of one spacing; NaN farther than two from any point."""
+def _map_errors(points: FloatArray, errors: FloatArray, shape: tuple[int, int], spacing: int) -> Float32Array:
+    """Gaussian-weighted mean error about each node, sigma one spacing; NaN farther than two spacings from any point."""
     ys, xs = np.arange(0, shape[0], spacing), np.arange(0, shape[1], spacing)
     weight, total = np.zeros((ys.size, xs.size)), np.zeros((ys.size, xs.size))
     for (x, y), error in zip(points, errors, strict=True):

@@ -1,94 +1,101 @@
-"""Every frame to the base image of the same camera, and to the frame before it.
+"""Intra-sensor registration: every frame to the base image of the same camera, and to the frame before it.
 
-Paper: intra-sensor registration. For each frame, in order:
+Paper: intra-sensor registration. For each frame, in time order:
 
-1. a prior straight from the base image: key points, MAGSAC homography, no other frame needed; from the previous
-   registered frame's key points, mapped through its transform, where that fails;
-2. key points matched within a window about the prior, to the base image and to the previous frame;
+1. a prior homography from the base image (SIFT keypoints, ratio test, MAGSAC), which needs no other frame; if it fails,
+   from the keypoints of the previous registered frame, mapped through its transform;
+2. guided matching of the keypoints in a window about the prior, to the base image and to the previous frame;
 3. the joint robust fit of polyprojective and row spline (or the paper's case deletion, or a homography);
-4. patches of the base image found below the pixel through that map, and the fit again, twice;
-5. the displacement mesh, where the held-out points support one.
+4. subpixel alignment of patches of the base image through that map, and the fit again, twice;
+5. the displacement mesh, if cross-validation supports one.
 
-Matches to the previous frame carry its errors on, so that they would drift: they count only in those cells of the
-picture where the base image gives nothing. Where the base image covers the frame, the result does not depend on where
-the chain began.
+Matches to the previous frame propagate its errors and would let the chain drift: they are used only in those cells of
+the frame where the base image gives no match. Where the base image covers the frame, the result does not depend on
+where the chain began.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray
+from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
-from velfield.registration.alignment import MANY, Templates, align, blurred, make_templates
-from velfield.registration.fitting import case_deletion
-from velfield.registration.joint import ControlPoints, JointFit, joint_fit, kept_of
-from velfield.registration.keypoints import KeyPoints, detect_key_points
-from velfield.registration.matching import homography_prior, match_guided
-from velfield.registration.mesh import MESH_TURNS, robust_mesh
+from velfield.registration.alignment import (
+    N_PATCHES_CROSS_SENSOR,
+    Templates,
+    align_patches,
+    make_templates,
+    smooth_levels,
+)
+from velfield.registration.fitting import fit_by_case_deletion
+from velfield.registration.joint import ControlPoints, JointFit, fit_jointly, is_inlier
+from velfield.registration.keypoints import Keypoints, detect_keypoints
+from velfield.registration.matching import estimate_homography_prior, match_guided
+from velfield.registration.mesh import MESH_ITERATIONS, fit_robust_mesh
 from velfield.registration.transforms import (
     FrameTransform,
     HomographyTransform,
     PolyprojectiveTransform,
     as_points,
-    normalisation_of,
-    row_knots,
+    count_row_knots,
+    fit_normalisation,
 )
 
-CERTIFICATE_CELLS = (6, 8)
-"""Rows and columns of cells over the frame, for the spread of the control points and the map of their errors."""
+QUALITY_CELLS = (6, 8)
+"""Rows and columns of cells over the frame, for the coverage of the control points and the map of their errors."""
 
-_KEY_POINT_SIGMA_PX = 0.5
+_BASE_SIGMA_PX = 0.5
 _PREVIOUS_SIGMA_PX = 0.7
-_FIRST_SCALE_PX = 3.0
-_LATER_SCALE_PX = 1.5
+_INITIAL_SCALE_PX = 3.0
+_REFIT_SCALE_PX = 1.5
 _COARSE_SHIFT_PX = 7.0
 _FINE_SHIFT_PX = 2.5
-_SURE_SHARE = 0.3
-"""More of the base image's patches than this found near by: the key points' fit is near enough everywhere."""
-_PLENTY_SHARE = 0.8
-"""Fewer than this found, and more are looked for: of another sensor's picture half are, too few at the borders."""
-_MIN_FOUND_SHARE = 0.15
-"""Less than this share of the base image's patches found: it is not this place, whatever the prior says."""
-_BASE_KEY_POINTS = 3
-"""The base image keeps this many times a frame's key points at most, in proportion to its size."""
+_NEAR_FRACTION = 0.3
+"""If a larger fraction of the patches aligns at the fine level, the fit to keypoints is accurate enough to skip the
+coarse one."""
+_ENOUGH_FRACTION = 0.8
+"""If a smaller fraction aligns, the denser patches are used: half of those of another sensor's image align, too few
+at the borders."""
+_MIN_ALIGNED_FRACTION = 0.15
+"""If a smaller fraction of the patches aligns, the prior was wrong: the frame is not registered."""
+_MAX_BASE_KEYPOINT_RATIO = 3
+"""Keypoints of the base image over those of a frame, at most; in proportion to its area."""
 
 
 @dataclass(frozen=True, eq=False)
 class BaseReference:
-    """What frames are registered to. Picklable.
+    """The base image with the features that frames are registered to. Picklable.
 
     Attributes
     ----------
     shape : (height, width) of the base image, px.
-    key_points : of the base image, base px.
-    templates, many : patches about its corners; more of them where half are not found.
+    keypoints : keypoints, base px.
+    templates, dense_templates : patches at its corners; a denser set for another sensor's image.
     """
 
     shape: tuple[int, int]
-    key_points: KeyPoints
+    keypoints: Keypoints
     templates: Templates
-    many: Templates
+    dense_templates: Templates
 
 
 @dataclass(frozen=True, eq=False)
 class FrameRegistration:
-    """One frame's registration and its certificate.
+    """One frame's registration and its quality metrics.
 
     Attributes
     ----------
-    transform : raw to base pixels; none where it failed.
+    transform : raw to base pixels; None if it failed.
     status : ``ok`` or ``failed:<reason with counts>``.
-    count_base, count_previous : control points offered by the base image and by the previous frame.
-    count_kept : control points that the robust fit rests on.
-    residual_px, heldout_px : RMS distance of the kept control points, fitted and held out of the fit; NaN if failed.
-    spread : share of the picture's cells that hold kept control points.
-    error_map : (6, 8) RMS held-out distance of the kept control points a cell, base px; NaN where there are none.
-    control_points : those kept.
+    count_base, count_previous : control points matched to the base image and to the previous frame.
+    count_kept : inliers of the robust fit.
+    residual_px, heldout_px : RMS residual of the inliers, fitted and cross-validated; NaN if failed.
+    spread : coverage, the fraction of the frame's cells with inliers.
+    error_map : (6, 8) RMS cross-validated residual of the inliers per cell, base px; NaN where there are none.
+    control_points : the inliers.
     """
 
     transform: FrameTransform | None
@@ -109,70 +116,72 @@ class FrameRegistration:
 
 
 def prepare_base(
-    grey: NDArray[np.uint8],
+    grey: GreyImage,
     config: RegistrationConfig,
     *,
-    mask: NDArray[np.bool_] | None = None,
+    mask: Mask | None = None,
     frame_shape: tuple[int, int] | None = None,
 ) -> BaseReference:
-    """Key points and patches of a base image.
+    """Detect keypoints and patches of a base image.
 
     Parameters
     ----------
     grey
         (h, w) uint8.
+    config
+        The registration section of the flight's configuration.
     mask
-        (h, w) bool: where the base image is known; none: everywhere.
+        (h, w) bool: where the base image is valid; None: everywhere.
     frame_shape
-        (height, width) of the frames: a base image of several frames' size keeps more key points.
+        (height, width) of the frames: a base image larger than a frame keeps more keypoints.
     """
     frame_area = grey.size if frame_shape is None else frame_shape[0] * frame_shape[1]
-    share = float(np.clip(grey.size / frame_area, 1.0, _BASE_KEY_POINTS))
-    key_points = detect_key_points(grey, config, mask, count=round(config.key_points * share))
-    few, many = make_templates(grey, mask), make_templates(grey, mask, count=MANY)
-    return BaseReference((grey.shape[0], grey.shape[1]), key_points, few, many)
+    ratio = float(np.clip(grey.size / frame_area, 1.0, _MAX_BASE_KEYPOINT_RATIO))
+    keypoints = detect_keypoints(grey, config, mask, count=round(config.key_points * ratio))
+    templates, dense_templates = make_templates(grey, mask), make_templates(grey, mask, count=N_PATCHES_CROSS_SENSOR)
+    return BaseReference((grey.shape[0], grey.shape[1]), keypoints, templates, dense_templates)
 
 
-def register_segment(
-    frames: Iterable[tuple[int, NDArray[np.uint8], KeyPoints]],
+def register_chain(
+    frames: Iterable[tuple[int, GreyImage, Keypoints]],
     base: BaseReference,
     lens: Lens,
     config: RegistrationConfig,
-    first_previous: KeyPoints | None = None,
+    first_previous: Keypoints | None = None,
 ) -> list[FrameRegistration]:
-    """Register frames in time order; each result in the order of the frames.
+    """Register a chain of frames in time order; results in the order of the frames.
 
     Parameters
     ----------
     frames
-        (index, grey (h, w) uint8, key points in raw px) of each.
+        (index, grey (h, w) uint8, keypoints in raw px) of each.
     first_previous
-        Key points of the frame before the first, in base px (see `mapped_key_points`); none: the chain begins here.
+        Keypoints of the frame before the first, in base px (see `map_keypoints`); None: the chain begins here.
     """
     results = []
     previous = first_previous
-    for _, grey, key_points in frames:
-        result = register_frame(grey, key_points, base, lens, config, previous)
+    for _, grey, keypoints in frames:
+        result = register_frame(grey, keypoints, base, lens, config, previous)
         results.append(result)
         if result.transform is not None:
-            previous = mapped_key_points(key_points, result.transform)
+            previous = map_keypoints(keypoints, result.transform)
     return results
 
 
-def mapped_key_points(key_points: KeyPoints, transform: FrameTransform) -> KeyPoints:
-    """A registered frame's key points in base pixels: they stand for the previous registered image."""
-    xy = transform.to_base(key_points.xy)
+def map_keypoints(keypoints: Keypoints, transform: FrameTransform) -> Keypoints:
+    """A registered frame's keypoints in base pixels: the reference for the next frame."""
+    xy = transform.to_base(keypoints.xy)
     finite = np.isfinite(xy).all(axis=1)
-    return KeyPoints(xy[finite], key_points.descriptors[finite])
+    return Keypoints(xy[finite], keypoints.descriptors[finite])
 
 
 def register_frame(
-    grey: NDArray[np.uint8],
-    key_points: KeyPoints,
+    grey: GreyImage,
+    keypoints: Keypoints,
     base: BaseReference,
     lens: Lens,
     config: RegistrationConfig,
-    previous: KeyPoints | None = None,
+    previous: Keypoints | None = None,
 ) -> FrameRegistration:
     """Register one frame.
 
@@ -180,46 +189,57 @@ def register_frame(
     ----------
     grey
         (h, w) uint8, raw.
-    key_points
-        Its key points, raw px.
+    keypoints
+        Its keypoints, raw px.
+    base
+        Base image, from `prepare_base`.
+    lens, config
+        The camera's lens and the registration section of the configuration.
     previous
-        The previous registered frame's key points, base px.
+        Keypoints of the previous registered frame, base px; None: there is none.
+
+    Returns
+    -------
+    FrameRegistration
+        If it failed: no transform, and the reason in ``status``.
     """
-    undistorted = as_points(lens.undistort_points(key_points.xy))
-    prior = _prior(undistorted, key_points, base, previous)
+    undistorted = as_points(lens.undistort_points(keypoints.xy))
+    prior = _estimate_prior(undistorted, keypoints, base, previous)
     if isinstance(prior, Failure):
         return FrameRegistration(None, f"failed:{prior.reason}")
     predicted = prior(undistorted)
-    from_base = _matched(key_points, predicted, base.key_points, config, _KEY_POINT_SIGMA_PX)
-    from_previous = _matched(key_points, predicted, previous, config, _PREVIOUS_SIGMA_PX)
+    from_base = _match_control_points(keypoints, predicted, base.keypoints, config, _BASE_SIGMA_PX)
+    from_previous = _match_control_points(keypoints, predicted, previous, config, _PREVIOUS_SIGMA_PX)
     height, width = grey.shape
     corners = as_points(lens.undistort_points(_corners(width, height)))
     start = PolyprojectiveTransform.from_homography(
-        prior.matrix, normalisation_of(corners), normalisation_of(prior(corners))
+        prior.matrix, fit_normalisation(corners), fit_normalisation(prior(corners))
     )
-    task = _Task(grey, base, lens, config)
+    fitter = _FrameFitter(grey, base, lens, config)
     if config.model == "polyprojective":  # the paper's, to both alike
-        fitted = task.deleted(from_base.joined(from_previous))
+        fitted = fitter.fit_by_case_deletion(from_base.concatenate(from_previous))
     else:
-        fitted = task.aligned(from_base.joined(_elsewhere(from_previous, from_base, width, height)), start)
+        fitted = fitter.fit_with_alignment(
+            from_base.concatenate(_select_in_empty_cells(from_previous, from_base, width, height)), start
+        )
     if isinstance(fitted, Failure):
         return FrameRegistration(None, f"failed:{fitted.reason}", len(from_base), len(from_previous))
     used, fit = fitted
-    return task.certified(used, fit, len(from_base), len(from_previous))
+    return fitter.with_quality_metrics(used, fit, len(from_base), len(from_previous))
 
 
-def _prior(
-    undistorted: FloatArray, key_points: KeyPoints, base: BaseReference, previous: KeyPoints | None
+def _estimate_prior(
+    undistorted: FloatArray, keypoints: Keypoints, base: BaseReference, previous: Keypoints | None
 ) -> HomographyTransform | Failure:
-    """The homography that starts the frame: from the base image, or chained where that fails."""
-    straight = homography_prior(undistorted, key_points.descriptors, base.key_points)
-    if straight or previous is None:
-        return straight if straight else Failure(f"no prior from the base image ({_reason(straight)})")
-    chained = homography_prior(undistorted, key_points.descriptors, previous)
+    """The prior homography: from the base image, else from the previous frame."""
+    direct = estimate_homography_prior(undistorted, keypoints.descriptors, base.keypoints)
+    if direct or previous is None:
+        return direct if direct else Failure(f"no prior from the base image ({_reason(direct)})")
+    chained = estimate_homography_prior(undistorted, keypoints.descriptors, previous)
     if chained:
         return chained
     return Failure(
-        f"no prior, neither from the base image ({_reason(straight)}) nor from the previous frame ({_reason(chained)})"
+        f"no prior, neither from the base image ({_reason(direct)}) nor from the previous frame ({_reason(chained)})"
     )
 
 
@@ -231,25 +251,25 @@ def _corners(width: int, height: int) -> FloatArray:
     return np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=np.float64)
 
 
-def _matched(
-    key_points: KeyPoints,
+def _match_control_points(
+    keypoints: Keypoints,
     predicted: FloatArray,
-    reference: KeyPoints | None,
+    reference: Keypoints | None,
     config: RegistrationConfig,
     sigma_px: float,
 ) -> ControlPoints:
-    """Control points from guided matches; none where there is no reference."""
+    """Control points by guided matching; empty without a reference."""
     if reference is None:
         return ControlPoints(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
-    pairs = match_guided(predicted, key_points.descriptors, reference, search_px=config.match_search_px)
-    return ControlPoints(key_points.xy[pairs[:, 0]], reference.xy[pairs[:, 1]], np.full(len(pairs), sigma_px))
+    pairs = match_guided(predicted, keypoints.descriptors, reference, search_px=config.match_search_px)
+    return ControlPoints(keypoints.xy[pairs[:, 0]], reference.xy[pairs[:, 1]], np.full(len(pairs), sigma_px))
 
 
 @dataclass(frozen=True, eq=False)
-class _Task:
-    """What stays the same while one frame is fitted."""
+class _FrameFitter:
+    """The fits of one frame, with the data they have in common."""
 
-    grey: NDArray[np.uint8]
+    grey: GreyImage
     base: BaseReference
     lens: Lens
     config: RegistrationConfig
@@ -260,62 +280,63 @@ class _Task:
         return self.grey.shape[1], self.grey.shape[0]
 
     def _fit(
-        self, points: ControlPoints, start: PolyprojectiveTransform, earlier: JointFit | None = None
+        self, points: ControlPoints, start: PolyprojectiveTransform, previous_fit: JointFit | None = None
     ) -> JointFit | Failure:
         if len(points) < self.config.min_control_points:
             return Failure(f"{len(points)} control points, {self.config.min_control_points} needed")
         width, height = self.size
-        return joint_fit(
+        return fit_jointly(
             points,
             start=start,
             lens=self.lens,
             width=width,
             height=height,
-            knots=row_knots(self.config),
+            knots=count_row_knots(self.config),
             homography=self.config.model == "homography",
-            start_rows=None if earlier is None else earlier.transform.row_coefficients,
-            start_scale_px=_FIRST_SCALE_PX if earlier is None else _LATER_SCALE_PX,
-            start_stiffness=None if earlier is None else earlier.stiffness,
+            start_rows=None if previous_fit is None else previous_fit.transform.row_coefficients,
+            start_scale_px=_INITIAL_SCALE_PX if previous_fit is None else _REFIT_SCALE_PX,
+            start_stiffness=None if previous_fit is None else previous_fit.stiffness,
         )
 
-    def aligned(
+    def fit_with_alignment(
         self, points: ControlPoints, start: PolyprojectiveTransform
     ) -> tuple[ControlPoints, JointFit] | Failure:
-        """Fit to matched key points, then twice to patches of the base image found through that fit.
+        """Fit to matched keypoints, then twice to patches of the base image aligned through that fit.
 
-        Where few patches lie near by they are looked for farther off first. Elsewhere that does harm: at a border of
-        another sensor's picture, where few patches are right, wrong ones from afar pulled the rows by two pixels.
+        If few patches align at the fine level, a coarse level with a larger search range comes first. Otherwise it does
+        harm: at the border of another sensor's image, where few patches align correctly, wrong alignments from the
+        larger range shifted the rows by two pixels.
         """
         fit = self._fit(points, start)
         if isinstance(fit, Failure):
             return fit
-        fine, coarse = blurred(self.grey)
+        fine, coarse = smooth_levels(self.grey)
         templates = self.base.templates
-        found, looked_for = align(fine, fit.transform, templates, coarse=False, max_shift_px=_FINE_SHIFT_PX)
-        plenty = len(found) >= _PLENTY_SHARE * looked_for
-        if not plenty:
-            templates = self.base.many
+        aligned, in_frame = align_patches(fine, fit.transform, templates, coarse=False, max_shift_px=_FINE_SHIFT_PX)
+        enough = len(aligned) >= _ENOUGH_FRACTION * in_frame
+        if not enough:
+            templates = self.base.dense_templates
         steps = [(fine, False, _FINE_SHIFT_PX)] * 2
-        if len(found) < _SURE_SHARE * looked_for:
+        if len(aligned) < _NEAR_FRACTION * in_frame:
             steps.insert(0, (coarse, True, _COARSE_SHIFT_PX))
         used = points
-        for k, (picture, is_coarse, limit) in enumerate(steps):
-            if k or not plenty:
-                found, looked_for = align(picture, fit.transform, templates, coarse=is_coarse, max_shift_px=limit)
-            if len(found) < _MIN_FOUND_SHARE * looked_for:
-                return Failure(f"{len(found)} of {looked_for} patches of the base image found")
-            used = found.joined(_elsewhere(points, found, *self.size))
-            following = self._fit(used, fit.transform.polyprojective, fit)
-            if isinstance(following, Failure):
-                return following
-            fit = following
+        for k, (image, is_coarse, limit) in enumerate(steps):
+            if k or not enough:
+                aligned, in_frame = align_patches(image, fit.transform, templates, coarse=is_coarse, max_shift_px=limit)
+            if len(aligned) < _MIN_ALIGNED_FRACTION * in_frame:
+                return Failure(f"{len(aligned)} of {in_frame} patches of the base image align")
+            used = aligned.concatenate(_select_in_empty_cells(points, aligned, *self.size))
+            refit = self._fit(used, fit.transform.polyprojective, fit)
+            if isinstance(refit, Failure):
+                return refit
+            fit = refit
         return used, fit
 
-    def deleted(self, points: ControlPoints) -> tuple[ControlPoints, JointFit] | Failure:
-        """The paper's fit: polyprojective by case deletion on matched key points."""
+    def fit_by_case_deletion(self, points: ControlPoints) -> tuple[ControlPoints, JointFit] | Failure:
+        """The paper's fit: polyprojective by case deletion on matched keypoints."""
         config = self.config
         source = as_points(self.lens.undistort_points(points.xy_raw))
-        result = case_deletion(
+        result = fit_by_case_deletion(
             source,
             points.xy_base,
             drop_fraction=config.drop_fraction,
@@ -326,67 +347,67 @@ class _Task:
             return result
         width, height = self.size
         transform = FrameTransform(width=width, height=height, lens=self.lens, polyprojective=result.transform)
-        kept = points.where(result.kept)
-        refit = joint_fit(
-            kept, start=result.transform, lens=self.lens, width=width, height=height, knots=0, start_scale_px=3.0
+        inliers = points.select(result.inliers)
+        refit = fit_jointly(
+            inliers, start=result.transform, lens=self.lens, width=width, height=height, knots=0, start_scale_px=3.0
         )
         if isinstance(refit, Failure):
             return refit
-        residuals = kept.xy_base - transform.to_base(kept.xy_raw)
-        heldout = refit.heldout - refit.residuals + residuals
-        ones = np.ones(len(kept))
-        return kept, JointFit(transform, ones, residuals, heldout, refit.scale, refit.stiffness)
+        residuals = inliers.xy_base - transform.to_base(inliers.xy_raw)
+        cv_residuals = refit.cv_residuals - refit.residuals + residuals
+        ones = np.ones(len(inliers))
+        return inliers, JointFit(transform, ones, residuals, cv_residuals, refit.scale, refit.stiffness)
 
-    def certified(
+    def with_quality_metrics(
         self, points: ControlPoints, fit: JointFit, count_base: int, count_previous: int
     ) -> FrameRegistration:
-        """The mesh, the counts and the held-out errors; a failure where they do not bear the frame out."""
+        """Add mesh, counts and cross-validated errors; a failure if those exceed the configured limits."""
         width, height = self.size
-        transform, residuals, heldout, weights = fit.transform, fit.residuals, fit.heldout, fit.weights
+        transform, residuals, cv_residuals, weights = fit.transform, fit.residuals, fit.cv_residuals, fit.weights
         if self.config.mesh and self.config.model != "homography":
-            found, weights = robust_mesh(
+            mesh_fit, weights = fit_robust_mesh(
                 points,
                 fit,
                 width=width,
                 height=height,
                 cell_size_px=self.config.cell_size_px,
-                turns=1 if self.config.model == "polyprojective" else MESH_TURNS,
+                iterations=1 if self.config.model == "polyprojective" else MESH_ITERATIONS,
             )
-            heldout = found.heldout
-            transform = replace(transform, mesh=found.mesh, cell_size_px=self.config.cell_size_px)
+            cv_residuals = mesh_fit.cv_residuals
+            transform = replace(transform, mesh=mesh_fit.mesh, cell_size_px=self.config.cell_size_px)
             residuals = points.xy_base - transform.to_base(points.xy_raw)
-        kept = kept_of(weights)
-        error_map = _error_map(points.xy_raw[kept], heldout[kept], width, height)
-        count, heldout_px = int(kept.sum()), _rms(heldout[kept])
+        inliers = is_inlier(weights)
+        error_map = _cell_rms(points.xy_raw[inliers], cv_residuals[inliers], width, height)
+        count, heldout_px = int(inliers.sum()), _rms(cv_residuals[inliers])
         counts = (count_base, count_previous, count)
         if count < self.config.min_control_points:
-            reason = f"{count} of {len(points)} control points agree, {self.config.min_control_points} needed"
+            reason = f"{count} of {len(points)} control points are inliers, {self.config.min_control_points} needed"
             return FrameRegistration(None, f"failed:{reason}", *counts)
         if not heldout_px <= self.config.max_residual_px:
             reason = f"held-out residual {heldout_px:.2f} px, at most {self.config.max_residual_px:g} allowed"
             return FrameRegistration(None, f"failed:{reason}", *counts)
         spread = float(np.isfinite(error_map).mean())
         return FrameRegistration(
-            transform, "ok", *counts, _rms(residuals[kept]), heldout_px, spread, error_map, points.where(kept)
+            transform, "ok", *counts, _rms(residuals[inliers]), heldout_px, spread, error_map, points.select(inliers)
         )
 
 
-def _cell_of(xy_raw: FloatArray, width: int, height: int) -> NDArray[np.int64]:
-    rows, columns = CERTIFICATE_CELLS
+def _cell_index(xy_raw: FloatArray, width: int, height: int) -> IntArray:
+    rows, columns = QUALITY_CELLS
     row = np.clip((xy_raw[:, 1] + 0.5) / height * rows, 0, rows - 1).astype(np.int64)
     column = np.clip((xy_raw[:, 0] + 0.5) / width * columns, 0, columns - 1).astype(np.int64)
     return np.asarray(row * columns + column)
 
 
-def _elsewhere(points: ControlPoints, found: ControlPoints, width: int, height: int) -> ControlPoints:
-    """Those of ``points`` in cells of the picture where ``found`` has none."""
-    taken = np.unique(_cell_of(found.xy_raw, width, height))
-    return points.where(~np.isin(_cell_of(points.xy_raw, width, height), taken))
+def _select_in_empty_cells(points: ControlPoints, aligned: ControlPoints, width: int, height: int) -> ControlPoints:
+    """Those of ``points`` in the cells of the frame where ``aligned`` has none."""
+    occupied = np.unique(_cell_index(aligned.xy_raw, width, height))
+    return points.select(~np.isin(_cell_index(points.xy_raw, width, height), occupied))
 
 
-def _error_map(xy_raw: FloatArray, errors: FloatArray, width: int, height: int) -> FloatArray:
-    rows, columns = CERTIFICATE_CELLS
-    cell = _cell_of(xy_raw, width, height)
+def _cell_rms(xy_raw: FloatArray, errors: FloatArray, width: int, height: int) -> FloatArray:
+    rows, columns = QUALITY_CELLS
+    cell = _cell_index(xy_raw, width, height)
     squares = np.bincount(cell, (errors**2).sum(axis=1), rows * columns)
     counts = np.bincount(cell, minlength=rows * columns)
     with np.errstate(invalid="ignore", divide="ignore"):

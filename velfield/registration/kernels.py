@@ -1,11 +1,11 @@
-"""Numba kernels of the raw-to-base map: second-order rational function, row spline, displacement mesh.
+"""Numba kernels of the raw-to-base map (rational function, row spline, displacement mesh) and of its joint fit.
 
-Everything here takes plain arrays. The map of one point, in order, is
+All take plain arrays. The map of one point, in order, is
 
     undistorted u, raw row y  ->  v = u + shift(y) + roll(y) x (u - c)  ->  P(v)  ->  + mesh(raw x, raw y)
 
-with P the rational function in normalised coordinates. The plain numpy form stands in
-``tests/registration/test_transforms.py``.
+with P the rational function in normalised coordinates. ``tests/registration/test_transforms.py`` compares each kernel
+with its plain numpy form.
 """
 
 import math
@@ -49,7 +49,7 @@ def rational(points, coefficients, source, target):  # type: ignore[no-untyped-d
 
 @njit(cache=True, nogil=True)
 def rational_jacobian(points, coefficients, source, target):  # type: ignore[no-untyped-def]
-    """Derivative (n, 2, 2) of `rational`: [i, a, b] is d out_a / d in_b."""
+    """Jacobian (n, 2, 2) of `rational`: [i, a, b] is d out_a / d in_b."""
     out = np.empty((points.shape[0], 2, 2))
     scale = source[2] / target[2]
     for i in range(points.shape[0]):
@@ -72,9 +72,9 @@ def rational_jacobian(points, coefficients, source, target):  # type: ignore[no-
 
 @njit(cache=True, nogil=True)
 def spline_basis(rows, height, knots):  # type: ignore[no-untyped-def]
-    """Uniform cubic B-spline at rows (n,): first of its four coefficients (n,) and their weights (n, 4).
+    """Uniform cubic B-spline basis at rows (n,): index of the first of four coefficients (n,), their weights (n, 4).
 
-    Rows beyond the frame take the border's value, so that the map does not run away there.
+    Rows outside the frame are clamped to its border.
     """
     first = np.empty(rows.shape[0], np.int64)
     weights = np.empty((rows.shape[0], 4))
@@ -94,8 +94,8 @@ def spline_basis(rows, height, knots):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def row_moved(undistorted, rows, coefficients, height, centre):  # type: ignore[no-untyped-def]
-    """Undistorted points (n, 2) with the row's motion taken out; ``coefficients`` (3, knots): x, y px, roll rad."""
+def remove_row_motion(undistorted, rows, coefficients, height, centre):  # type: ignore[no-untyped-def]
+    """Undistorted points (n, 2) corrected for rolling shutter; ``coefficients`` (3, knots): x, y px, roll rad."""
     out = undistorted.copy()
     if coefficients.shape[1] < 4:
         return out
@@ -112,7 +112,7 @@ def row_moved(undistorted, rows, coefficients, height, centre):  # type: ignore[
 
 @njit(cache=True, nogil=True)
 def mesh_displacement(points, mesh, cell):  # type: ignore[no-untyped-def]
-    """Displacement (n, 2) at raw points from a mesh (my, mx, 2) of nodes at the cells' centres, bilinear."""
+    """Displacement (n, 2) at raw points by bilinear interpolation of a mesh (my, mx, 2) with nodes at cell centres."""
     out = np.zeros((points.shape[0], 2))
     my, mx = mesh.shape[0], mesh.shape[1]
     for i in range(points.shape[0]):
@@ -132,13 +132,15 @@ def mesh_displacement(points, mesh, cell):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def normal_equations(undistorted, moved, first, basis, wanted, weight, fold, folds, knots, coefficients, norms, centre):  # type: ignore[no-untyped-def]
-    """Normal equations of the joint fit, one set a fold: matrices (folds, p, p), right sides (folds, p), squares.
+def normal_equations(  # type: ignore[no-untyped-def]
+    undistorted, corrected, first, basis, observed, weight, fold, folds, knots, coefficients, norms, centre
+):
+    """Gauss-Newton normal equations per fold: matrices (folds, p, p), right-hand sides (folds, p), sums of squares.
 
-    Parameters are the seventeen of the rational function (a, b: 6 each, c without its leading 1), then ``knots`` each
-    of the row's shift in x, in y, and its roll (px at a distance ``norms[3]`` from the centre). Each point touches
-    17 + 12 of them, which is why this is a loop and no matrix product. ``norms`` = source cx, cy, s, roll unit, target
-    cx, cy, s. Residuals are in output px, weighted by ``weight`` (n,).
+    Parameters are the 17 of the rational function (a, b: 6 each, c without its leading 1), then ``knots`` each of the
+    row shift in x, in y, and the roll (px at a distance ``norms[3]`` from the centre). Each point depends on 17 + 12
+    of them, so a loop over points is cheaper than a dense matrix product. ``norms`` = source cx, cy, s, roll unit,
+    target cx, cy, s. Residuals are in output px, weighted by ``weight`` (n,).
     """
     p = 17 + 3 * knots
     normal = np.zeros((folds, p, p))
@@ -153,8 +155,8 @@ def normal_equations(undistorted, moved, first, basis, wanted, weight, fold, fol
     for i in range(undistorted.shape[0]):
         if weight[i] <= 0.0:
             continue
-        x = (moved[i, 0] - norms[0]) * norms[2]
-        y = (moved[i, 1] - norms[1]) * norms[2]
+        x = (corrected[i, 0] - norms[0]) * norms[2]
+        y = (corrected[i, 1] - norms[1]) * norms[2]
         m[0], m[1], m[2], m[3], m[4], m[5] = 1.0, x, y, x * x, x * y, y * y
         px, py, w = 0.0, 0.0, 0.0
         for k in range(6):
@@ -198,8 +200,8 @@ def normal_equations(undistorted, moved, first, basis, wanted, weight, fold, fol
                 index[25 + k] = 17 + 2 * knots + q
                 gx[25 + k] = (jxx * rx + jxy * ry) * b
                 gy[25 + k] = (jyx * rx + jyy * ry) * b
-        ex = wanted[i, 0] - (px / ts + norms[4])
-        ey = wanted[i, 1] - (py / ts + norms[5])
+        ex = observed[i, 0] - (px / ts + norms[4])
+        ey = observed[i, 1] - (py / ts + norms[5])
         f = fold[i]
         squares[f] += weight[i] * (ex * ex + ey * ey)
         for k in range(count):
@@ -216,15 +218,15 @@ def normal_equations(undistorted, moved, first, basis, wanted, weight, fold, fol
 
 
 @njit(cache=True, nogil=True)
-def predicted_change(undistorted, moved, first, basis, step, fold, knots, coefficients, norms, centre):  # type: ignore[no-untyped-def]
-    """First-order change (n, 2) of the mapped points under ``step`` (folds, p), each point by its own fold's."""
+def predict_change(undistorted, corrected, first, basis, step, fold, knots, coefficients, norms, centre):  # type: ignore[no-untyped-def]
+    """First-order change (n, 2) of the mapped points under ``step`` (folds, p), each point by the step of its fold."""
     out = np.zeros((undistorted.shape[0], 2))
     ts = norms[6]
     m = np.empty(6)
     for i in range(undistorted.shape[0]):
         d = step[fold[i]]
-        x = (moved[i, 0] - norms[0]) * norms[2]
-        y = (moved[i, 1] - norms[1]) * norms[2]
+        x = (corrected[i, 0] - norms[0]) * norms[2]
+        y = (corrected[i, 1] - norms[1]) * norms[2]
         m[0], m[1], m[2], m[3], m[4], m[5] = 1.0, x, y, x * x, x * y, y * y
         c = coefficients
         px, py, w, dp, dq, dw = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -267,10 +269,10 @@ def _dot(a, b, count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def solve_positive(matrix, right):  # type: ignore[no-untyped-def]
-    """Solution (p, m) of a positive definite system, by Cholesky; NaN where it is not.
+def solve_cholesky(matrix, right):  # type: ignore[no-untyped-def]
+    """Solution (p, m) of a positive definite system by Cholesky factorisation; NaN if it is not positive definite.
 
-    In place of LAPACK, whose threads, several to each of ours, spin on systems as small as these.
+    LAPACK is not used: its threads, several per worker thread of the pipeline, busy-wait on systems this small.
     """
     p, m = right.shape
     low = np.zeros((p, p))
@@ -296,8 +298,8 @@ def solve_positive(matrix, right):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def left_out(normal, right, squares, penalty, theta):  # type: ignore[no-untyped-def]
-    """Held-out squares over all folds, and each fold's step (folds, p) when the fit is made without it."""
+def solve_without_folds(normal, right, squares, penalty, theta):  # type: ignore[no-untyped-def]
+    """Cross-validated sum of squares over all folds, and the step (folds, p) of the fit without each fold."""
     folds, p = right.shape
     steps = np.zeros((folds, p))
     all_normal = penalty.copy()
@@ -313,7 +315,7 @@ def left_out(normal, right, squares, penalty, theta):  # type: ignore[no-untyped
     for f in range(folds):
         for i in range(p):
             rest[i, 0] = all_right[i, 0] - right[f, i]
-        step = solve_positive(all_normal - normal[f], rest)[:, 0].copy()
+        step = solve_cholesky(all_normal - normal[f], rest)[:, 0].copy()
         steps[f] = step
         total += squares[f]
         for i in range(p):

@@ -1,9 +1,8 @@
-"""The displacement mesh: what a frame's smooth map leaves, cell by cell, where the evidence supports it.
+"""Displacement mesh: a regularised piecewise bilinear correction of a frame's parametric map.
 
-Paper: registration, 200 x 200 cells; finer ones follow the ground better, as their ties are chosen by the evidence.
-The mesh carries what the polyprojective cannot: slow relief of the ground, a lens that is not quite the model. Its
-nodes are the cells' centres; neighbours are tied to each other, how strongly the held-out control points decide, and
-where a mesh does not predict them better than none there is none.
+Paper: registration, 200 x 200 cells. The mesh models what the polyprojective cannot: smooth relief of the ground and
+deviations of the lens from its model. Its nodes are the cell centres. A first-difference penalty couples neighbouring
+nodes; cross-validation selects its weight, and drops the mesh if that does not lower the cross-validated residual.
 """
 
 from dataclasses import dataclass
@@ -11,105 +10,112 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.arrays import FloatArray
-from velfield.registration.joint import FOLDS, ControlPoints, JointFit, folds_of, weights_of
-from velfield.registration.kernels import solve_positive
+from velfield.registration.joint import FOLDS, ControlPoints, JointFit, assign_folds, robust_weights
+from velfield.registration.kernels import solve_cholesky
 from velfield.registration.transforms import mesh_shape
 
-_TIES = tuple(10.0**k for k in (-1, 0, 1, 2, 3))
-"""Candidates for the weight of squared differences between neighbours, in control points."""
-_LEAST_GAIN = 0.01
-"""A mesh must take this share off the held-out squares."""
-_LEAST_POINTS_A_CELL = 2.0
-MESH_TURNS = 3
-"""Meshes, each fitted to the control points that agree with the one before."""
+_STIFFNESSES = tuple(10.0**k for k in (-1, 0, 1, 2, 3))
+"""Candidate weights of the squared differences between neighbouring nodes, in control points."""
+_MIN_GAIN = 0.01
+"""Smallest relative decrease of the cross-validated squares for which a mesh is used."""
+_MIN_POINTS_PER_CELL = 2.0
+MESH_ITERATIONS = 3
+"""Reweighted fits: each uses the robust weights of the residuals of the one before."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeshFit:
-    """Mesh (my, mx, 2), base px, or none; ``residuals`` and ``heldout`` (n, 2) with it."""
+    """Mesh (my, mx, 2), base px, or None; ``residuals`` and ``cv_residuals`` (n, 2) after it."""
 
     mesh: FloatArray | None
     residuals: FloatArray
-    heldout: FloatArray
+    cv_residuals: FloatArray
 
 
-def robust_mesh(
-    points: ControlPoints, fit: JointFit, *, width: int, height: int, cell_size_px: int, turns: int = MESH_TURNS
+def fit_robust_mesh(
+    points: ControlPoints,
+    fit: JointFit,
+    *,
+    width: int,
+    height: int,
+    cell_size_px: int,
+    iterations: int = MESH_ITERATIONS,
 ) -> tuple[MeshFit, FloatArray]:
-    """Mesh of what a joint fit leaves, and the robust weights (n,) of its control points, which count by variance too.
+    """Fit a mesh to the residuals of a joint fit by iteratively reweighted least squares; also the weights (n,).
 
-    Where the ground rises or falls its control points all disagree with the smooth map, and would have no say in the
-    mesh that is there for them; with the mesh before they agree, and a roof's among them do not.
+    Control points on relief are outliers of the parametric map and would have no weight in the mesh that is meant to
+    model it. Relative to the mesh of the previous iteration they are inliers; those on roofs among them are not.
     """
-    found, weights = MeshFit(None, fit.residuals, fit.heldout), fit.weights
-    for turn in range(turns):
-        if turn:
-            weights = weights_of(found.residuals, points.sigma_px, fit.scale)
-        precise = weights / points.sigma_px**2
-        found = fit_mesh(
+    mesh_fit, weights = MeshFit(None, fit.residuals, fit.cv_residuals), fit.weights
+    for iteration in range(iterations):
+        if iteration:
+            weights = robust_weights(mesh_fit.residuals, points.sigma_px, fit.scale)
+        precision = weights / points.sigma_px**2
+        mesh_fit = fit_mesh(
             points.xy_raw,
             fit.residuals,
-            fit.heldout,
-            precise * (weights.sum() / max(float(precise.sum()), 1e-12)),  # ties are weighed against control points
+            fit.cv_residuals,
+            precision * (weights.sum() / max(float(precision.sum()), 1e-12)),  # the penalty counts in control points
             width=width,
             height=height,
             cell_size_px=cell_size_px,
         )
-        if found.mesh is None:
-            return found, fit.weights
-    return found, weights
+        if mesh_fit.mesh is None:
+            return mesh_fit, fit.weights
+    return mesh_fit, weights
 
 
 def fit_mesh(
     xy_raw: FloatArray,
     residuals: FloatArray,
-    heldout: FloatArray,
+    cv_residuals: FloatArray,
     weights: FloatArray,
     *,
     width: int,
     height: int,
     cell_size_px: int,
 ) -> MeshFit:
-    """Mesh of residual displacements by penalised least squares, its stiffness and its very being by cross-validation.
+    """Fit a mesh to residuals by penalised least squares; cross-validation selects the penalty, or no mesh.
 
     Parameters
     ----------
     xy_raw, residuals
-        Control points (n, 2), raw px, and what the smooth map leaves of them (n, 2), base px.
-    heldout
-        (n, 2) the same residuals with each point's fold left out of the smooth fit.
+        Control points (n, 2), raw px, and their residuals (n, 2) after the parametric map, base px.
+    cv_residuals
+        (n, 2) cross-validated residuals of the parametric map.
     weights
-        (n,) how much each control point counts: robust weights, over its variance.
+        (n,) of the control points: robust weight over variance.
     width, height
         Raw frame, px.
     """
     my, mx = mesh_shape(width, height, cell_size_px)
-    if len(xy_raw) < _LEAST_POINTS_A_CELL * my * mx or my * mx < 4:
-        return MeshFit(None, residuals, heldout)
-    basis = _bilinear(xy_raw, my, mx, cell_size_px)
-    fold = folds_of(xy_raw)
+    if len(xy_raw) < _MIN_POINTS_PER_CELL * my * mx or my * mx < 4:
+        return MeshFit(None, residuals, cv_residuals)
+    basis = _bilinear_basis(xy_raw, my, mx, cell_size_px)
+    fold = assign_folds(xy_raw)
     weighted = basis * weights[:, None]
     normal = np.stack([weighted[fold == f].T @ basis[fold == f] for f in range(FOLDS)])
     right = np.stack([weighted[fold == f].T @ residuals[fold == f] for f in range(FOLDS)])
-    # left out of the smooth fit as well as of the mesh: the mesh of the others must explain the held-out residual
-    ties = _ties(my, mx)
-    best, best_squares, best_left = None, float((weights[:, None] * heldout**2).sum()) * (1 - _LEAST_GAIN), heldout
-    for tie in _TIES:
-        left = heldout.copy()
+    # A fold is left out of both fits: the mesh of the others must explain the cross-validated residual.
+    smoothness = _smoothness_matrix(my, mx)
+    squares_without = float((weights[:, None] * cv_residuals**2).sum())
+    best, best_squares, best_cv = None, squares_without * (1 - _MIN_GAIN), cv_residuals
+    for stiffness in _STIFFNESSES:
+        mesh_cv = cv_residuals.copy()
         for f in range(FOLDS):
-            mesh = solve_positive(normal.sum(axis=0) - normal[f] + tie * ties, right.sum(axis=0) - right[f])
-            left[fold == f] -= basis[fold == f] @ mesh
-        squares = float((weights[:, None] * left**2).sum())
+            mesh = solve_cholesky(normal.sum(axis=0) - normal[f] + stiffness * smoothness, right.sum(axis=0) - right[f])
+            mesh_cv[fold == f] -= basis[fold == f] @ mesh
+        squares = float((weights[:, None] * mesh_cv**2).sum())
         if squares < best_squares:
-            best, best_squares, best_left = tie, squares, left
+            best, best_squares, best_cv = stiffness, squares, mesh_cv
     if best is None:
-        return MeshFit(None, residuals, heldout)
-    mesh = solve_positive(normal.sum(axis=0) + best * ties, right.sum(axis=0))
-    return MeshFit(np.ascontiguousarray(mesh.reshape(my, mx, 2)), residuals - basis @ mesh, best_left)
+        return MeshFit(None, residuals, cv_residuals)
+    mesh = solve_cholesky(normal.sum(axis=0) + best * smoothness, right.sum(axis=0))
+    return MeshFit(np.ascontiguousarray(mesh.reshape(my, mx, 2)), residuals - basis @ mesh, best_cv)
 
 
-def _bilinear(xy_raw: FloatArray, my: int, mx: int, cell: int) -> FloatArray:
-    """Weights (n, my * mx) of the nodes at raw points, as `kernels.mesh_displacement` has them."""
+def _bilinear_basis(xy_raw: FloatArray, my: int, mx: int, cell: int) -> FloatArray:
+    """Bilinear weights (n, my * mx) of the nodes at raw points, equal to those of `kernels.mesh_displacement`."""
     gx = np.clip((xy_raw[:, 0] + 0.5) / cell - 0.5, 0.0, mx - 1.0)
     gy = np.clip((xy_raw[:, 1] + 0.5) / cell - 0.5, 0.0, my - 1.0)
     j, k = np.minimum(gx.astype(np.int64), max(mx - 2, 0)), np.minimum(gy.astype(np.int64), max(my - 2, 0))
@@ -123,8 +129,8 @@ def _bilinear(xy_raw: FloatArray, my: int, mx: int, cell: int) -> FloatArray:
     return out
 
 
-def _ties(my: int, mx: int) -> FloatArray:
-    """Matrix of the squared differences between neighbouring nodes, and a little of the nodes themselves."""
+def _smoothness_matrix(my: int, mx: int) -> FloatArray:
+    """Quadratic form of the squared differences between neighbouring nodes, plus a small ridge."""
     node = np.arange(my * mx).reshape(my, mx)
     matrix = 0.05 * np.eye(my * mx)
     for a, b in ((node[:, 1:], node[:, :-1]), (node[1:], node[:-1])):

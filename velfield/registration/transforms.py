@@ -1,15 +1,13 @@
-"""Geometric maps of registration: homography, second-order polyprojective, and the whole raw-to-base map of a frame.
+"""Geometric transforms: homography, second-order polyprojective, and the complete map of a frame, raw to base pixels.
 
 Paper: registration. Points are (n, 2) float64 as (x, y); pixel (0, 0) is the centre of the top-left pixel.
 """
 
-from dataclasses import dataclass, field, replace
-from typing import Protocol
+from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray
+from schemas.arrays import FloatArray, Mask
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
 from velfield.registration import kernels
@@ -17,22 +15,10 @@ from velfield.registration import kernels
 _INVERSE_STEPS = 25
 _INVERSE_TOLERANCE_PX = 1e-5
 _DIFFERENCE_PX = 0.25
-"""Step of the numerical derivative of the whole map: small against a row spline's knots, large against rounding."""
-_OUTSIDE_SHARE = 0.1
+"""Step of the numerical derivative: small against the row spline's knot spacing, large against rounding errors."""
+_OUTSIDE_FRACTION = 0.1
 _OUTSIDE_PX = 64.0
-"""An inverse that lands farther outside the frame than this, or this share of its larger side, is no inverse."""
-
-
-class Transform(Protocol):
-    """A map of the plane; points (n, 2)."""
-
-    def __call__(self, xy: FloatArray) -> FloatArray:
-        """Where the points go."""
-        ...
-
-    def inverse(self, xy: FloatArray) -> FloatArray:
-        """Where they come from; NaN rows where from nowhere."""
-        ...
+"""An inverse that lies farther outside the frame than both this and the fraction of its longer side is rejected."""
 
 
 def as_points(xy: object) -> FloatArray:
@@ -42,12 +28,12 @@ def as_points(xy: object) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class HomographyTransform:
-    """Eight parameters: ``matrix`` (3, 3) on homogeneous (x, y, 1); NaN behind the horizon."""
+    """Homography ``matrix`` (3, 3) on homogeneous (x, y, 1), 8 parameters; NaN beyond the horizon."""
 
     matrix: FloatArray
 
     def __call__(self, xy: FloatArray) -> FloatArray:
-        """Points (n, 2) mapped."""
+        """Map points (n, 2)."""
         points = as_points(xy)
         mapped = points @ self.matrix[:, :2].T + self.matrix[:, 2]
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -55,14 +41,14 @@ class HomographyTransform:
             return np.asarray(mapped[:, :2] / w[:, None])
 
     def inverse(self, xy: FloatArray) -> FloatArray:
-        """Points (n, 2) mapped back, exactly."""
+        """Map points (n, 2) back, in closed form."""
         inverted = np.linalg.inv(self.matrix)
         return HomographyTransform(inverted / inverted[2, 2])(xy)
 
 
 @dataclass(frozen=True, eq=False)
 class PolyprojectiveTransform:
-    """Second-order rational function with one denominator, 17 free parameters.
+    """Second-order rational function with a common denominator, 17 free parameters.
 
     Paper: the polyprojective model. ``x' = a.m / c.m``, ``y' = b.m / c.m`` with ``m = (1, x, y, x^2, xy, y^2)``.
 
@@ -80,8 +66,8 @@ class PolyprojectiveTransform:
 
     @classmethod
     def from_homography(cls, matrix: FloatArray, source: FloatArray, target: FloatArray) -> "PolyprojectiveTransform":
-        """The same map as a homography ``matrix`` (3, 3), in the given normalisations."""
-        inner = normaliser(target) @ matrix @ np.linalg.inv(normaliser(source))
+        """The polyprojective form of a homography ``matrix`` (3, 3), in the given normalisations."""
+        inner = normalisation_matrix(target) @ matrix @ np.linalg.inv(normalisation_matrix(source))
         inner = inner / inner[2, 2]
         coefficients = np.zeros((3, 6))
         coefficients[:, 0], coefficients[:, 1], coefficients[:, 2] = inner[:, 2], inner[:, 0], inner[:, 1]
@@ -93,60 +79,60 @@ class PolyprojectiveTransform:
         return not bool(self.coefficients[:, 3:].any())
 
     def homography(self) -> FloatArray:
-        """The homography (3, 3) of the terms of first order; the map itself where there are no others."""
+        """The homography (3, 3) of the first-order terms; equal to the transform if `is_homography`."""
         c = self.coefficients
         inner = np.stack([c[:, 1], c[:, 2], c[:, 0]], axis=1)
-        matrix = np.linalg.inv(normaliser(self.target)) @ inner @ normaliser(self.source)
+        matrix = np.linalg.inv(normalisation_matrix(self.target)) @ inner @ normalisation_matrix(self.source)
         return np.asarray(matrix / matrix[2, 2])
 
     def __call__(self, xy: FloatArray) -> FloatArray:
-        """Points (n, 2) mapped; NaN rows where the denominator is not positive."""
+        """Map points (n, 2); NaN rows where the denominator is not positive."""
         return np.asarray(kernels.rational(as_points(xy), self.coefficients, self.source, self.target))
 
     def jacobian(self, xy: FloatArray) -> FloatArray:
-        """Derivative (n, 2, 2) at points (n, 2)."""
+        """Jacobian (n, 2, 2) at points (n, 2)."""
         return np.asarray(kernels.rational_jacobian(as_points(xy), self.coefficients, self.source, self.target))
 
     def inverse(self, xy: FloatArray) -> FloatArray:
-        """Points (n, 2) mapped back by Newton's method from the homography's inverse; NaN rows where it fails."""
-        wanted = as_points(xy)
-        guess = HomographyTransform(self.homography()).inverse(wanted)
+        """Map points (n, 2) back by Newton's method from the homography's inverse; NaN rows where it fails."""
+        target = as_points(xy)
+        guess = HomographyTransform(self.homography()).inverse(target)
         for _ in range(_INVERSE_STEPS):
-            miss = wanted - self(guess)
-            if np.nanmax(np.abs(miss), initial=0.0) < _INVERSE_TOLERANCE_PX:
+            residual = target - self(guess)
+            if np.nanmax(np.abs(residual), initial=0.0) < _INVERSE_TOLERANCE_PX:
                 break
-            guess = guess + _solved(self.jacobian(guess), miss)
-        missed = ~(np.abs(wanted - self(guess)).max(axis=1, initial=0.0) < 1e-3)
-        guess[missed] = np.nan
+            guess = guess + _solve_2x2(self.jacobian(guess), residual)
+        failed = ~(np.abs(target - self(guess)).max(axis=1, initial=0.0) < 1e-3)
+        guess[failed] = np.nan
         return guess
 
 
-def normaliser(norm: FloatArray) -> FloatArray:
-    """The matrix (3, 3) of the normalisation (cx, cy, s)."""
+def normalisation_matrix(norm: FloatArray) -> FloatArray:
+    """Matrix (3, 3) of the normalisation (cx, cy, s)."""
     cx, cy, s = norm
     return np.array([[s, 0.0, -cx * s], [0.0, s, -cy * s], [0.0, 0.0, 1.0]])
 
 
-def normalisation_of(xy: FloatArray) -> FloatArray:
-    """(cx, cy, s) that brings points (n, 2) about zero with a largest offset of one."""
+def fit_normalisation(xy: FloatArray) -> FloatArray:
+    """(cx, cy, s) that centres points (n, 2) and scales the largest coordinate to 1."""
     finite = xy[np.isfinite(xy).all(axis=1)]
     centre = 0.5 * (finite.min(axis=0) + finite.max(axis=0))
     reach = float(np.abs(finite - centre).max())
     return np.array([centre[0], centre[1], 1.0 / max(reach, 1e-9)])
 
 
-def _solved(jacobian: FloatArray, miss: FloatArray) -> FloatArray:
-    """Two-by-two systems solved by hand: numpy's solve raises when a single one is singular."""
+def _solve_2x2(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
+    """Solve 2 x 2 systems (n, 2, 2) by Cramer's rule: `numpy.linalg.solve` raises if a single one is singular."""
     a, b, c, d = jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 1, 0], jacobian[:, 1, 1]
     with np.errstate(invalid="ignore", divide="ignore"):
         determinant = a * d - b * c
-        x = (d * miss[:, 0] - b * miss[:, 1]) / determinant
-        y = (a * miss[:, 1] - c * miss[:, 0]) / determinant
+        x = (d * residual[:, 0] - b * residual[:, 1]) / determinant
+        y = (a * residual[:, 1] - c * residual[:, 0]) / determinant
     return np.stack([x, y], axis=1)
 
 
 def mesh_shape(width: int, height: int, cell_size_px: int) -> tuple[int, int]:
-    """Rows and columns of the displacement mesh that covers a frame.
+    """Rows and columns of the displacement mesh over a frame.
 
     Examples
     --------
@@ -157,13 +143,13 @@ def mesh_shape(width: int, height: int, cell_size_px: int) -> tuple[int, int]:
 
 
 def vector_length(width: int, height: int, config: RegistrationConfig) -> int:
-    """Length of `FrameTransform.to_vector` for frames of that size under that configuration."""
+    """Length of `FrameTransform.to_vector` for a frame size and configuration."""
     my, mx = mesh_shape(width, height, config.cell_size_px)
-    return 18 + 6 + 3 * row_knots(config) + 2 * my * mx
+    return 18 + 6 + 3 * count_row_knots(config) + 2 * my * mx
 
 
-def row_knots(config: RegistrationConfig) -> int:
-    """Coefficients of the row spline a component; none but for the model ``row_spline``."""
+def count_row_knots(config: RegistrationConfig) -> int:
+    """Row-spline coefficients per component; 0 unless the model is ``row_spline``."""
     return config.row_spline_knots if config.model == "row_spline" else 0
 
 
@@ -173,10 +159,10 @@ def _empty_rows() -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class FrameTransform:
-    """The map of one frame, raw pixels to base pixels.
+    """The complete map of one frame, raw pixels to base pixels.
 
-    raw -> undistorted by the lens -> the row's motion taken out (rolling shutter) -> polyprojective -> plus the
-    displacement mesh -> base.
+    raw -> lens undistortion -> rolling-shutter correction (row spline) -> polyprojective -> plus displacement mesh ->
+    base.
 
     Parameters
     ----------
@@ -185,14 +171,14 @@ class FrameTransform:
     lens
         The camera's lens.
     polyprojective
-        Undistorted px to base px; a homography has no second-order terms.
+        Undistorted px to base px; a homography has zero second-order terms.
     row_coefficients
-        (3, knots): uniform cubic B-spline over the raw rows of the shift in x and y (undistorted px) and of the roll
+        (3, knots): uniform cubic B-spline over the raw rows of the shift in x and y (undistorted px) and the roll
         about the frame's centre (rad); knots may be 0.
     mesh
-        (my, mx, 2) displacement at the centres of the raw frame's cells, base px; none is as zero.
+        (my, mx, 2) displacement at the cell centres of the raw frame, base px; None is zero displacement.
     cell_size_px
-        Side of a cell, raw px.
+        Side of a mesh cell, raw px.
     """
 
     width: int
@@ -205,18 +191,18 @@ class FrameTransform:
 
     @property
     def centre(self) -> FloatArray:
-        """About which the row's roll turns, px."""
+        """Centre of the roll, px."""
         return np.array([(self.width - 1) / 2, (self.height - 1) / 2])
 
-    def row_moved(self, xy_raw: FloatArray) -> FloatArray:
-        """Raw pixels (n, 2) to undistorted pixels (n, 2) with the row's motion taken out."""
+    def remove_row_motion(self, xy_raw: FloatArray) -> FloatArray:
+        """Raw pixels (n, 2) to undistorted pixels (n, 2), corrected for rolling shutter."""
         raw = as_points(xy_raw)
         undistorted = as_points(self.lens.undistort_points(raw))
         rows = np.ascontiguousarray(raw[:, 1])
-        return np.asarray(kernels.row_moved(undistorted, rows, self.row_coefficients, self.height, self.centre))
+        return np.asarray(kernels.remove_row_motion(undistorted, rows, self.row_coefficients, self.height, self.centre))
 
     def row_motion(self, rows: FloatArray) -> FloatArray:
-        """Motion (n, 3) at raw rows (n,): shift in x and y, undistorted px, and roll, rad."""
+        """Row motion (n, 3) at raw rows (n,): shift in x and y, undistorted px, and roll, rad."""
         if self.row_coefficients.shape[1] < 4:
             return np.zeros((len(rows), 3))
         first, weights = kernels.spline_basis(
@@ -225,9 +211,9 @@ class FrameTransform:
         return np.asarray(np.einsum("nk,cnk->nc", weights, self.row_coefficients[:, first[:, None] + np.arange(4)]))
 
     def to_base(self, xy_raw: FloatArray) -> FloatArray:
-        """Raw pixels (n, 2) to base pixels (n, 2); NaN rows where the lens or the map has no value."""
+        """Raw pixels (n, 2) to base pixels (n, 2); NaN rows outside the domain of the lens or the polyprojective."""
         raw = as_points(xy_raw)
-        base = self.polyprojective(self.row_moved(raw))
+        base = self.polyprojective(self.remove_row_motion(raw))
         if self.mesh is not None:
             base += kernels.mesh_displacement(raw, self.mesh, self.cell_size_px)
         return base
@@ -235,31 +221,31 @@ class FrameTransform:
     def to_raw(self, xy_base: FloatArray) -> FloatArray:
         """Base pixels (n, 2) to raw pixels (n, 2), by Newton's method to well below 1e-3 px.
 
-        NaN rows where there is no inverse, or only one that lies outside the frame by more than a tenth of its size or
-        64 px, whichever is more.
+        NaN rows where there is no inverse, or where it lies outside the frame by more than a tenth of its size and
+        more than 64 px.
         """
-        wanted = as_points(xy_base)
-        raw = as_points(self.lens.distort_points(self.polyprojective.inverse(wanted)))
+        target = as_points(xy_base)
+        raw = as_points(self.lens.distort_points(self.polyprojective.inverse(target)))
         todo = np.flatnonzero(np.isfinite(raw).all(axis=1))
         for _ in range(_INVERSE_STEPS):
-            miss = wanted[todo] - self.to_base(raw[todo])
-            size = np.abs(miss).max(axis=1, initial=0.0)
-            todo, miss = todo[size > _INVERSE_TOLERANCE_PX], miss[size > _INVERSE_TOLERANCE_PX]
+            residual = target[todo] - self.to_base(raw[todo])
+            size = np.abs(residual).max(axis=1, initial=0.0)
+            todo, residual = todo[size > _INVERSE_TOLERANCE_PX], residual[size > _INVERSE_TOLERANCE_PX]
             if not todo.size:
                 break
-            raw[todo] += _solved(self.jacobian(raw[todo]), miss)
-        missed = ~(np.abs(wanted - self.to_base(raw)).max(axis=1, initial=0.0) < 1e-3)
-        raw[missed | self._far_outside(raw)] = np.nan
+            raw[todo] += _solve_2x2(self.jacobian(raw[todo]), residual)
+        failed = ~(np.abs(target - self.to_base(raw)).max(axis=1, initial=0.0) < 1e-3)
+        raw[failed | self._far_outside(raw)] = np.nan
         return raw
 
-    def _far_outside(self, raw: FloatArray) -> NDArray[np.bool_]:
-        margin = max(_OUTSIDE_PX, _OUTSIDE_SHARE * max(self.width, self.height))
+    def _far_outside(self, raw: FloatArray) -> Mask:
+        margin = max(_OUTSIDE_PX, _OUTSIDE_FRACTION * max(self.width, self.height))
         with np.errstate(invalid="ignore"):
             inside = (raw >= -margin) & (raw <= np.array([self.width, self.height]) + margin)
         return np.asarray(~inside.all(axis=1))
 
     def jacobian(self, xy_raw: FloatArray) -> FloatArray:
-        """Derivative (n, 2, 2) of `to_base` at raw pixels (n, 2), by central differences."""
+        """Jacobian (n, 2, 2) of `to_base` at raw pixels (n, 2), by central differences."""
         raw = as_points(xy_raw)
         columns = []
         for axis in range(2):
@@ -269,26 +255,28 @@ class FrameTransform:
         return np.stack(columns, axis=2)
 
     def scale_and_rotation(self) -> tuple[float, float]:
-        """Base px a frame px, and turn from +x to +y, rad: of the similarity nearest to the map in the middle."""
+        """Scale, base px per frame px, and rotation from +x to +y, rad, of the nearest similarity at the centre."""
         jacobian = self.jacobian(self.centre[None])[0]
         cosine, sine = jacobian[0, 0] + jacobian[1, 1], jacobian[1, 0] - jacobian[0, 1]
         return float(0.5 * np.hypot(cosine, sine)), float(np.arctan2(sine, cosine))
 
-    def followed_by(self, transform: PolyprojectiveTransform) -> "ComposedTransform":
-        """This map, then another: from the flight's own base image on to a given one."""
+    def then(self, transform: PolyprojectiveTransform) -> "ComposedTransform":
+        """This map followed by another: from the flight's own base image to a given one."""
         return ComposedTransform(self, transform)
 
     def to_vector(self, config: RegistrationConfig) -> FloatArray:
-        """The parameters as one flat float64 vector of `vector_length`; the lens stands in ``camera.json``."""
+        """The parameters as one flat float64 vector of `vector_length`; the lens is in ``camera.json``."""
         my, mx = mesh_shape(self.width, self.height, config.cell_size_px)
-        rows = np.zeros((3, row_knots(config))) if self.row_coefficients.shape[1] < 4 else self.row_coefficients
+        rows = np.zeros((3, count_row_knots(config))) if self.row_coefficients.shape[1] < 4 else self.row_coefficients
         mesh = np.zeros((my, mx, 2)) if self.mesh is None else self.mesh
         p = self.polyprojective
         parts = [p.coefficients, p.source, p.target, rows, mesh]
         vector = np.concatenate([np.ravel(part) for part in parts])
         expected = vector_length(self.width, self.height, config)
         if len(vector) != expected:
-            message = f"the transform has {len(vector)} parameters, the configuration {expected}: not fitted under it"
+            message = (
+                f"the transform has {len(vector)} parameters, expected {expected}: fitted with another configuration"
+            )
             raise ValueError(message)
         return vector
 
@@ -296,9 +284,9 @@ class FrameTransform:
     def from_vector(
         cls, vector: FloatArray, *, width: int, height: int, lens: Lens, config: RegistrationConfig
     ) -> "FrameTransform":
-        """The transform that `to_vector` wrote, under the same configuration, frame size and lens."""
+        """The inverse of `to_vector`, for the same configuration, frame size and lens."""
         my, mx = mesh_shape(width, height, config.cell_size_px)
-        knots = row_knots(config)
+        knots = count_row_knots(config)
         sizes = np.cumsum([18, 3, 3, 3 * knots])
         coefficients, source, target, rows, mesh = np.split(np.array(vector, dtype=np.float64), sizes)
         polyprojective = PolyprojectiveTransform(coefficients.reshape(3, 6), source, target)
@@ -313,14 +301,10 @@ class FrameTransform:
             cell_size_px=config.cell_size_px,
         )
 
-    def with_mesh(self, mesh: FloatArray | None) -> "FrameTransform":
-        """The same map with another displacement mesh."""
-        return replace(self, mesh=mesh)
-
 
 @dataclass(frozen=True, eq=False)
 class ComposedTransform:
-    """A frame's map followed by another map of the plane."""
+    """A frame's map followed by a polyprojective transform of the base plane."""
 
     first: "FrameTransform | ComposedTransform"
     second: PolyprojectiveTransform
@@ -343,8 +327,8 @@ class ComposedTransform:
         """Base pixels (n, 2) to raw pixels (n, 2); NaN rows where there is no inverse."""
         return self.first.to_raw(self.second.inverse(xy_base))
 
-    def followed_by(self, transform: PolyprojectiveTransform) -> "ComposedTransform":
-        """This map, then another: from one base image on to the next."""
+    def then(self, transform: PolyprojectiveTransform) -> "ComposedTransform":
+        """This map followed by another: from one base image to the next."""
         return ComposedTransform(self, transform)
 
 

@@ -92,5 +92,5 @@ class FrameMaps:
             vector, width=self.width, height=self.height, lens=self.lens, config=self.config
         )
         for transform in self.onward:
-            found = found.followed_by(transform)
+            found = found.then(transform)
         return found

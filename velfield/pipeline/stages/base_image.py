@@ -27,7 +27,7 @@ from velfield.pipeline.stages.external_detections import free_of_vehicles
 from velfield.pipeline.stages.lens import spread_usable
 from velfield.registration.intersensor import IntersensorResult, register_intersensor
 from velfield.registration.intrasensor import BaseReference, prepare_base, register_frame
-from velfield.registration.keypoints import KeyPoints, detect_key_points
+from velfield.registration.keypoints import Keypoints, detect_keypoints
 from velfield.registration.own_base import OwnBase, build_own_base
 from velfield.report.figures import png_bytes
 from velfield.run.commits import write_atomically
@@ -48,11 +48,11 @@ _references: dict[tuple[str, str], BaseReference] = {}
 
 
 @dataclass(frozen=True)
-class FrameKeyPoints:
+class FrameKeypoints:
     """Key points of one frame, raw px."""
 
     frame: int
-    key_points: KeyPoints
+    keypoints: Keypoints
 
 
 def spread_frames(plan: Plan) -> list[int]:
@@ -60,16 +60,16 @@ def spread_frames(plan: Plan) -> list[int]:
     return spread_usable(plan, plan.config.base.median_frames)
 
 
-def key_points_of(plan: Plan, frames: Sequence[int]) -> list[FrameKeyPoints]:
+def detect_unit_keypoints(plan: Plan, frames: Sequence[int]) -> list[FrameKeypoints]:
     """Key points of a block of frames: the costly part of registration, and the parallel one."""
     store, config = open_frames(plan.layout.frames), plan.config.registration
     return [
-        FrameKeyPoints(frame, detect_key_points(store.read(frame), config, free_of_vehicles(plan, frame, store.shape)))
+        FrameKeypoints(frame, detect_keypoints(store.read(frame), config, free_of_vehicles(plan, frame, store.shape)))
         for frame in frames
     ]
 
 
-def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeyPoints]]) -> Outcome:
+def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> Outcome:
     """Write ``base/``.
 
     Raises
@@ -77,13 +77,13 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeyPoints]]) -> Outcom
     InputError
         The given base image is not of this place (with the scores), or too few frames overlap.
     """
-    key_points = {found.frame: found.key_points for block in blocks for found in block}
+    keypoints = {found.frame: found.keypoints for block in blocks for found in block}
     given = _given_picture(plan)
     lens, store, layout = read_lens(plan.layout), open_frames(plan.layout.frames), plan.layout
     sharpness = store.column("sharpness")
-    reference = max(key_points, key=lambda frame: float(np.nan_to_num(sharpness[frame])))
+    reference = max(keypoints, key=lambda frame: float(np.nan_to_num(sharpness[frame])))
     if given is not None:
-        direct = _straight_to(plan, given, key_points, lens)
+        direct = _straight_to(plan, given, keypoints, lens)
         if direct is not None:  # to half a pixel all over the frame: no other place does that
             grid = _given_grid(plan, given, reference, direct)
             layout.own_to_base.unlink(missing_ok=True)
@@ -91,7 +91,7 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeyPoints]]) -> Outcom
         _check_place(plan, store.read(reference), given, lens)
     own = build_own_base(
         store.read,
-        key_points,
+        keypoints,
         reference=reference,
         lens=lens,
         config=plan.config.registration,
@@ -179,8 +179,8 @@ def _onto_given(plan: Plan, own: OwnBase, given: BasePicture) -> tuple[BaseFit, 
     written = [layout.own_to_base, layout.base_error_map, *write_given_picture(plan.layout, given)]
     fit = BaseFit(
         straight=False,
-        error_px=found.left_out_error_px,
-        points=len(found.error_left_out_px),
+        error_px=found.cv_error_px,
+        points=len(found.cv_errors_px),
         scale=found.scale,
         rotation_rad=found.rotation_rad,
         covered=covered_share(found.transform, own.valid, given),
@@ -188,7 +188,7 @@ def _onto_given(plan: Plan, own: OwnBase, given: BasePicture) -> tuple[BaseFit, 
     return fit, written
 
 
-def _straight_to(plan: Plan, given: BasePicture, key_points: dict[int, KeyPoints], lens: Lens) -> BaseFit | None:
+def _straight_to(plan: Plan, given: BasePicture, keypoints: dict[int, Keypoints], lens: Lens) -> BaseFit | None:
     """How frames lie straight on the given picture, by some that are spread over the flight; none where they do not.
 
     Where they do, nothing stands between a frame and the map. Where they do not (other season, other light), the
@@ -197,13 +197,13 @@ def _straight_to(plan: Plan, given: BasePicture, key_points: dict[int, KeyPoints
     config = plan.config.registration
     reference = prepare_base(given.grey, config, mask=given.valid, frame_shape=(plan.info.height, plan.info.width))
     store = open_frames(plan.layout.frames)
-    frames = sorted(key_points)
+    frames = sorted(keypoints)
     tried = [
         frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, min(_TRIED, len(frames))).round().astype(int))
     ]
     fits = []
     for frame in tried:
-        found = register_frame(store.read(frame), key_points[frame], reference, lens, config)
+        found = register_frame(store.read(frame), keypoints[frame], reference, lens, config)
         if found.transform is None or not found.heldout_px <= _DIRECT_HELDOUT_PX or found.spread < _DIRECT_SPREAD:
             return None
         scale, rotation = found.transform.scale_and_rotation()

@@ -4,13 +4,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.camera import CameraRecord
+from velfield.camera.fusion import refine_lens
 from velfield.camera.lens import lens_from_record, pinhole
 from velfield.camera.plumbline import calibrate
-from velfield.camera.refine import refine
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
 from velfield.pipeline.result import Outcome
-from velfield.registration.pairing import matched_pairs
+from velfield.registration.pairing import match_frame_pairs
 from velfield.run.commits import write_atomically
 from velfield.run.stores import open_frames
 from velfield.sources.flags import UNUSABLE
@@ -44,7 +44,7 @@ def calibrate_flight(plan: Plan) -> Outcome:
         pictures = [store.read(frame) for frame in frames]
         record = calibrate(pictures, config).to_record()
         if config.refine == "auto":
-            record = refine(record, matched_pairs(pictures, lens_from_record(record.lens)))
+            record = refine_lens(record, match_frame_pairs(pictures, lens_from_record(record.lens)))
     write_atomically(plan.layout.camera, record.model_dump_json(indent=1).encode())
     advance("lens")
     counts = {"corner_px": _corner_shift(record, width, height)}

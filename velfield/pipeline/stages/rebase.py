@@ -58,9 +58,9 @@ def measure_rebase(run: Run, base: Path) -> RebaseRecord | Failure:
         return found
     return RebaseRecord(
         transform=polyprojective_record(found.transform.polyprojective),
-        added_error_px=found.left_out_error_px,
-        added_error_95_px=float(np.percentile(found.error_left_out_px, 95)),
-        points=len(found.error_left_out_px),
+        added_error_px=found.cv_error_px,
+        added_error_95_px=float(np.percentile(found.cv_errors_px, 95)),
+        points=len(found.cv_errors_px),
         scale=found.scale,
         rotation_rad=found.rotation_rad,
         old_base=run.record.keys.get("base", ""),

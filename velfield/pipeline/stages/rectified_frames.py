@@ -84,7 +84,7 @@ class WorkingGrid:
             window=box,
             scale=self.scale,
             interpolation=cv2.INTER_CUBIC,
-            continued=True,
+            replicate_border=True,
         )
         return WorkingFrame(image, valid, box, self.scale)
 

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
 from velfield.pipeline.result import Outcome
-from velfield.pipeline.stages.base_image import FrameKeyPoints, base_reference
-from velfield.registration.intrasensor import FrameRegistration, register_segment
-from velfield.registration.keypoints import KeyPoints
+from velfield.pipeline.stages.base_image import FrameKeypoints, base_reference
+from velfield.registration.intrasensor import FrameRegistration, register_chain
+from velfield.registration.keypoints import Keypoints
 from velfield.registration.transforms import vector_length
 from velfield.run.frame_transforms import read_lens
 from velfield.run.stores import (
@@ -43,9 +43,9 @@ def lay_out_registration(plan: Plan) -> None:
     )
 
 
-def register_unit(plan: Plan, frames: range, blocks: Sequence[Sequence[FrameKeyPoints]]) -> Outcome:
-    """Chain a unit's frames in segments of ``chain_length_frames``, each seeded anew from the base image."""
-    key_points = {found.frame: found.key_points for block in blocks for found in block}
+def register_unit(plan: Plan, frames: range, blocks: Sequence[Sequence[FrameKeypoints]]) -> Outcome:
+    """Chain a unit's frames in chains of ``chain_length_frames``, each started from the base image."""
+    keypoints = {found.frame: found.keypoints for block in blocks for found in block}
     store = open_frames(plan.layout.frames)
     flags = store.column("flags")
     reference, lens, config = base_reference(plan), read_lens(plan.layout), plan.config.registration
@@ -53,17 +53,17 @@ def register_unit(plan: Plan, frames: range, blocks: Sequence[Sequence[FrameKeyP
     for start in range(frames.start, frames.stop, config.chain_length_frames):
         segment = range(start, min(start + config.chain_length_frames, frames.stop))
         usable = [frame for frame in segment if not flags[frame] & int(UNUSABLE)]
-        found = register_segment(_read(store, usable, key_points), reference, lens, config)
+        found = register_chain(_read(store, usable, keypoints), reference, lens, config)
         results.update(zip(usable, found, strict=True))
         advance("registration", len(segment))
     return _write(plan, frames, flags, results)
 
 
 def _read(
-    store: FrameStore, frames: Sequence[int], key_points: dict[int, KeyPoints]
-) -> Iterator[tuple[int, NDArray[np.uint8], KeyPoints]]:
+    store: FrameStore, frames: Sequence[int], keypoints: dict[int, Keypoints]
+) -> Iterator[tuple[int, NDArray[np.uint8], Keypoints]]:
     for frame in frames:
-        yield frame, store.read(frame), key_points[frame]
+        yield frame, store.read(frame), keypoints[frame]
 
 
 def _write(plan: Plan, frames: range, flags: NDArray[np.uint16], results: dict[int, FrameRegistration]) -> Outcome:

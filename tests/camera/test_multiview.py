@@ -11,15 +11,15 @@ import pytest
 from schemas.camera import CameraRecord, ModelEvidence
 from schemas.job import Inputs, Job
 from tests.scenes import by_homography, city, photograph, rms_after_homography, similarity
+from velfield.camera.fusion import CONFIRMED_SIGMAS, MIN_CV_GAIN, refine_lens
 from velfield.camera.lens import HarrisLens, lens_from_record, pinhole
-from velfield.camera.overlap import LensLine, Overlap, OverlapFit, fit_overlap
-from velfield.camera.plumbline import LINES_FACTOR
-from velfield.camera.refine import CONFIRMED_SIGMAS, LEAST_GAIN, refine
+from velfield.camera.multiview import FramePairs, MultiViewFit, ScaledLens, fit_multiview
+from velfield.camera.plumbline import SD_INFLATION
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.plan import make_plan
 from velfield.pipeline.stages.frames import lay_out_frames, read_unit
 from velfield.pipeline.stages.lens import calibrate_flight
-from velfield.registration.pairing import matched_pairs
+from velfield.registration.pairing import match_frame_pairs
 
 SHAPE = HEIGHT, WIDTH = 720, 960
 MIDDLE = np.array([(WIDTH - 1) / 2, (HEIGHT - 1) / 2])
@@ -63,7 +63,7 @@ class Pose:
 
 
 @cache
-def flown(how: str, a: float, seed: int, bowl: float = 0.0, hills: float = 0.0, wobble_px: float = 2.0) -> Overlap:
+def flown(how: str, a: float, seed: int, bowl: float = 0.0, hills: float = 0.0, wobble_px: float = 2.0) -> FramePairs:
     """Matches with 0.3 px of noise, a fifth of them wrong, rows that move by 2 px."""
     rng = np.random.default_rng(seed)
     poses = [Pose(how, 2.0 * k / (FRAMES - 1) - 1.0, rng) for k in range(FRAMES)]
@@ -79,12 +79,12 @@ def flown(how: str, a: float, seed: int, bowl: float = 0.0, hills: float = 0.0, 
         found[1][wrong] += rng.uniform(-15, 15, (int(wrong.sum()), 2))
         there[p, : len(wrong)] = True
         xy_i[p], xy_j[p] = (np.vstack([xy, np.repeat(xy[:1], MATCHES - len(xy), axis=0)]) for xy in found)
-    return Overlap(SHAPE, np.array(chosen), xy_i, xy_j, there)
+    return FramePairs(SHAPE, np.array(chosen), xy_i, xy_j, there)
 
 
-def fitted(overlap: Overlap) -> OverlapFit:
+def fitted(overlap: FramePairs) -> MultiViewFit:
     """From nothing: the pin-hole, its centre in the middle."""
-    return fit_overlap(overlap, LensLine(HarrisLens(1.0, *MIDDLE, HALF), 0.02), start=None, before=0.0)
+    return fit_multiview(overlap, ScaledLens(HarrisLens(1.0, *MIDDLE, HALF), 0.02), start=None, before=0.0)
 
 
 def lined(a: float, a_sd: float, *, accepted: bool = True) -> CameraRecord:
@@ -95,7 +95,7 @@ def lined(a: float, a_sd: float, *, accepted: bool = True) -> CameraRecord:
         frame_height_px=HEIGHT,
         accepted=accepted,
         reason="by lines",
-        a_sd=LINES_FACTOR * a_sd,
+        a_sd=SD_INFLATION * a_sd,
         centre_sd_px=(4.0, 4.0),
         candidates=(ModelEvidence(model="harris", parameters=(a, 0.0, 0.0), residual_px=0.2, heldout_px=0.2),),
     )
@@ -144,18 +144,18 @@ def test_hills_widen_the_uncertainty() -> None:
 
 def test_a_camera_that_hangs_says_that_it_cannot_tell_and_changes_nothing() -> None:
     overlap, record = flown("hangs", 0.2, 1), lined(0.21, 0.003)
-    refined = refine(record, overlap)
+    refined = refine_lens(record, overlap)
     assert refined.overlap is not None
     assert refined.overlap.a_sd is not None
     assert refined.overlap.a_sd > 0.05
     assert not refined.overlap.used
     assert refined.model_copy(update={"overlap": None}) == record
-    assert "differ too little in place" in refined.overlap.reason
+    assert "camera positions too similar" in refined.overlap.reason
 
 
 def test_lines_and_control_points_that_agree_are_joined_nearer_to_the_truth() -> None:
     record = lined(0.22, 0.01)
-    refined = refine(record, flown("along", 0.2, 3))
+    refined = refine_lens(record, flown("along", 0.2, 3))
     assert refined.overlap is not None
     assert refined.overlap.used, refined.overlap.reason
     assert off_the_truth_px(refined, 0.2) < 0.5 * off_the_truth_px(record, 0.2)
@@ -164,14 +164,14 @@ def test_lines_and_control_points_that_agree_are_joined_nearer_to_the_truth() ->
 
 def test_lines_and_control_points_that_disagree_leave_the_lens_of_the_lines() -> None:
     record = lined(0.3, 0.003)
-    refined = refine(record, flown("along", 0.2, 3))
+    refined = refine_lens(record, flown("along", 0.2, 3))
     assert refined.lens == record.lens
     assert refined.overlap is not None
     assert "disagree" in refined.overlap.reason
 
 
 def test_a_distortion_that_few_lines_only_hint_at_is_brought_in() -> None:
-    refined = refine(lined(0.052, 0.004, accepted=False), flown("along", 0.05, 4, wobble_px=0.5))
+    refined = refine_lens(lined(0.052, 0.004, accepted=False), flown("along", 0.05, 4, wobble_px=0.5))
     assert refined.overlap is not None
     assert refined.accepted, refined.overlap.reason
     assert off_the_truth_px(refined, 0.05) < 0.3
@@ -180,19 +180,19 @@ def test_a_distortion_that_few_lines_only_hint_at_is_brought_in() -> None:
 def test_where_rows_move_by_more_than_the_lens_both_witnesses_are_believed_if_both_are_sure() -> None:
     shaken = flown("along", 0.07, 11, wobble_px=4.0)
     found = fitted(shaken)
-    assert (1.0 - LEAST_GAIN) * found.before_px < found.after_px < found.before_px
-    refined = refine(lined(0.072, 0.004, accepted=False), shaken)
+    assert (1.0 - MIN_CV_GAIN) * found.before_px < found.after_px < found.before_px
+    refined = refine_lens(lined(0.072, 0.004, accepted=False), shaken)
     assert refined.accepted
     assert off_the_truth_px(refined, 0.07) < 0.3
-    unsure = refine(lined(0.072, 0.02, accepted=False), shaken)
+    unsure = refine_lens(lined(0.072, 0.02, accepted=False), shaken)
     assert not unsure.accepted
     assert unsure.overlap is not None
-    assert "frames left out do not show it" in unsure.overlap.reason
+    assert "cross-validated residual not lower" in unsure.overlap.reason
 
 
 def test_a_distortion_that_lines_are_silent_of_is_brought_in_by_strong_evidence_alone() -> None:
-    assert refine(nothing_by_lines(), flown("along", 0.3, 1)).accepted
-    weak = refine(nothing_by_lines(), flown("along", 0.05, 1))
+    assert refine_lens(nothing_by_lines(), flown("along", 0.3, 1)).accepted
+    weak = refine_lens(nothing_by_lines(), flown("along", 0.05, 1))
     assert not weak.accepted
     assert weak.overlap is not None
     assert "below 10 standard deviations" in weak.overlap.reason
@@ -200,7 +200,7 @@ def test_a_distortion_that_lines_are_silent_of_is_brought_in_by_strong_evidence_
 
 @pytest.mark.parametrize(("how", "seed"), [("along", 11), ("turns", 12), ("hangs", 13)])
 def test_without_distortion_none_is_brought_in(how: str, seed: int) -> None:
-    refined = refine(nothing_by_lines(), flown(how, 0.0, seed))
+    refined = refine_lens(nothing_by_lines(), flown(how, 0.0, seed))
     assert not refined.accepted
     assert lens_from_record(refined.lens) == pinhole(SHAPE)
     assert refined.overlap is not None
@@ -211,12 +211,12 @@ def test_without_distortion_none_is_brought_in(how: str, seed: int) -> None:
 
 def test_a_hollow_under_a_camera_that_hardly_moves_is_no_lens() -> None:
     for seed in (21, 22):
-        refined = refine(nothing_by_lines(), flown("turns", 0.0, seed, bowl=0.02))
+        refined = refine_lens(nothing_by_lines(), flown("turns", 0.0, seed, bowl=0.02))
         assert not refined.accepted, refined.overlap
 
 
 def test_a_lens_that_lines_deny_is_not_brought_in() -> None:
-    refined = refine(lined(0.01, 0.003, accepted=False), flown("along", 0.3, 1))
+    refined = refine_lens(lined(0.01, 0.003, accepted=False), flown("along", 0.3, 1))
     assert not refined.accepted
     assert refined.overlap is not None
     assert "disagree" in refined.overlap.reason
@@ -225,17 +225,17 @@ def test_a_lens_that_lines_deny_is_not_brought_in() -> None:
 def test_matches_that_no_plane_explains_are_not_heard() -> None:
     overlap, rng = flown("along", 0.3, 1), np.random.default_rng(0)
     parallax = overlap.xy_j + rng.normal(0, 2.0, overlap.xy_j.shape)
-    refined = refine(nothing_by_lines(), Overlap(SHAPE, overlap.frames, overlap.xy_i, parallax, overlap.there))
+    refined = refine_lens(nothing_by_lines(), FramePairs(SHAPE, overlap.frames, overlap.xy_i, parallax, overlap.valid))
     assert not refined.accepted
     assert refined.overlap is not None
-    assert "off any plane" in refined.overlap.reason
+    assert "scene not planar" in refined.overlap.reason
 
 
 def test_too_few_frames_change_nothing_and_say_so() -> None:
     overlap = flown("along", 0.3, 1)
-    few = overlap.only((overlap.frames < 4).all(axis=1))
+    few = overlap.select((overlap.frames < 4).all(axis=1))
     for given in (None, few):
-        refined = refine(lined(0.2, 0.01), given)
+        refined = refine_lens(lined(0.2, 0.01), given)
         assert refined.lens == lined(0.2, 0.01).lens
         assert refined.overlap is not None
         assert "needed" in refined.overlap.reason
@@ -243,14 +243,14 @@ def test_too_few_frames_change_nothing_and_say_so() -> None:
 
 def test_the_same_matches_give_the_same_lens_however_linear_algebra_rounds() -> None:
     overlap = flown("turns", 0.2, 1)
-    assert refine(lined(0.22, 0.01), overlap) == refine(lined(0.22, 0.01), overlap)
+    assert refine_lens(lined(0.22, 0.01), overlap) == refine_lens(lined(0.22, 0.01), overlap)
     rounded = replace(overlap, xy_i=overlap.xy_i * (1 + 1e-13))
     assert fitted(rounded) == fitted(overlap)
 
 
 def test_the_deviation_is_that_of_all_that_was_joined() -> None:
     by_lines = lined(0.22, 0.01)
-    refined = refine(by_lines, flown("turns", 0.2, 1))
+    refined = refine_lens(by_lines, flown("turns", 0.2, 1))
     assert refined.overlap is not None
     assert refined.overlap.used
     assert refined.overlap.lines_a_sd == by_lines.a_sd
@@ -288,17 +288,17 @@ def test_pairs_are_matched_where_they_see_the_same_and_no_pair_that_tells_nothin
     pictures: tuple[list[np.ndarray], list[np.ndarray]],
 ) -> None:
     frames, views = pictures
-    overlap = matched_pairs(frames, pinhole(SMALL))
+    overlap = match_frame_pairs(frames, pinhole(SMALL))
     assert overlap is not None
     assert (2, 3) not in {tuple(pair) for pair in overlap.frames.tolist()}
     assert np.bincount(overlap.frames.ravel()).max() <= 6
-    for (i, j), xy_i, xy_j, there in zip(overlap.frames, overlap.xy_i, overlap.xy_j, overlap.there, strict=True):
+    for (i, j), xy_i, xy_j, there in zip(overlap.frames, overlap.xy_i, overlap.xy_j, overlap.valid, strict=True):
         miss = by_homography(np.linalg.inv(views[j]) @ views[i], xy_i[there]) - xy_j[there]
         assert np.median(np.hypot(*miss.T)) < 0.5
 
 
 def test_frames_of_different_places_give_no_pairs() -> None:
-    assert matched_pairs([city(seed, 240) for seed in (1, 2)], pinhole((240, 240))) is None
+    assert match_frame_pairs([city(seed, 240) for seed in (1, 2)], pinhole((240, 240))) is None
 
 
 def test_the_stage_asks_the_control_points_unless_told_not_to(

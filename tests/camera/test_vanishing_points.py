@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from velfield.camera.lens import HarrisLens
 from velfield.camera.lines import LineSet
-from velfield.camera.parallels import FEWEST, refine_by_parallels
-from velfield.camera.straighten import LensFamily, StraightFit
+from velfield.camera.straighten import LensFamily, PlumbLineFit
+from velfield.camera.vanishing_points import MIN_FAMILY_LINES, refine_by_vanishing_points
 
 MIDDLE, HALF = (639.5, 479.5), 800.0
 TRUE = HarrisLens(0.2, 648.5, 473.5, HALF)
@@ -41,10 +41,10 @@ def streets(
     )
 
 
-def by_straightness(lines: LineSet, a_sd: float, off: float) -> StraightFit:
+def by_straightness(lines: LineSet, a_sd: float, off: float) -> PlumbLineFit:
     """What straightness might have said: off by ``off`` of its deviations, the centre by as much of 4 px."""
     spread = np.array([a_sd, 4.0 / HALF, 4.0 / HALF])
-    return StraightFit(FAMILY, TRUTH + off * spread * (1, -1, 1), np.diag(spread**2), 0.2, np.ones(lines.count))
+    return PlumbLineFit(FAMILY, TRUTH + off * spread * (1, -1, 1), np.diag(spread**2), 0.2, np.ones(lines.count))
 
 
 def test_streets_of_two_directions_tell_the_lens() -> None:
@@ -52,7 +52,7 @@ def test_streets_of_two_directions_tell_the_lens() -> None:
     for seed in range(6):
         lines = streets(np.repeat([0.1, 0.1 + np.pi / 2], 40), seed)
         fit = by_straightness(lines, 0.004, 1.5)
-        refined = refine_by_parallels(fit, lines)
+        refined = refine_by_vanishing_points(fit, lines)
         before.append(fit.parameters - TRUTH)
         after.append(refined.parameters - TRUTH)
         deviations.append(np.sqrt(np.diag(refined.covariance)))
@@ -65,7 +65,7 @@ def test_streets_of_two_directions_tell_the_lens() -> None:
 def test_a_tilted_camera_makes_no_lens() -> None:
     """Parallels that run together in the picture are what a vanishing point is for."""
     lines = streets(np.repeat([0.1, 0.1 + np.pi / 2], 40), 3, tilt=0.4)
-    refined = refine_by_parallels(by_straightness(lines, 0.004, 1.5), lines)
+    refined = refine_by_vanishing_points(by_straightness(lines, 0.004, 1.5), lines)
     assert abs(refined.parameters[0] - 0.2) < 0.002
 
 
@@ -73,7 +73,7 @@ def test_crooked_streets_say_less() -> None:
     spread = []
     for crooked_deg in (0.1, 1.0):
         lines = streets(np.repeat([0.1, 0.1 + np.pi / 2], 40), 5, crooked_deg=crooked_deg)
-        refined = refine_by_parallels(by_straightness(lines, 0.02, 0.0), lines)
+        refined = refine_by_vanishing_points(by_straightness(lines, 0.02, 0.0), lines)
         spread.append(float(np.sqrt(refined.covariance[0, 0])))
     assert spread[1] > 2.0 * spread[0]
 
@@ -81,17 +81,17 @@ def test_crooked_streets_say_less() -> None:
 def test_lines_that_run_anywhere_hardly_move_the_lens() -> None:
     lines = streets(np.random.default_rng(0).uniform(0, np.pi, 60), 6)
     fit = by_straightness(lines, 0.004, 0.0)
-    refined = refine_by_parallels(fit, lines)
+    refined = refine_by_vanishing_points(fit, lines)
     assert abs(refined.parameters[0] - fit.parameters[0]) < 2.0 * 0.004
 
 
 def test_fewer_lines_than_a_family_leave_the_fit_as_it_was() -> None:
-    lines = streets(np.full(FEWEST - 1, 0.1), 7)
+    lines = streets(np.full(MIN_FAMILY_LINES - 1, 0.1), 7)
     fit = by_straightness(lines, 0.004, 1.0)
-    assert refine_by_parallels(fit, lines) is fit
+    assert refine_by_vanishing_points(fit, lines) is fit
 
 
 def test_a_fit_that_is_surer_than_streets_are_parallel_stays() -> None:
     lines = streets(np.repeat([0.1, 0.1 + np.pi / 2], 40), 8)
     fit = by_straightness(lines, 0.0005, 1.0)
-    assert refine_by_parallels(fit, lines) is fit
+    assert refine_by_vanishing_points(fit, lines) is fit
