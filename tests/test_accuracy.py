@@ -37,4 +37,4 @@ def test_a_flight_with_base_image_and_labels_is_near_the_truth(server: None, tmp
     assert score.registration.mean_px <= 1
     assert score.tracking.precision >= 0.95
     assert score.field.pixels >= 1000
-    assert score.field.share_within >= 0.95
+    assert score.field.fraction_within >= 0.95

@@ -21,7 +21,7 @@ from velfield.detection.motion.evaluation import MotionState
 from velfield.detection.motion.labels import labels_from_motion
 from velfield.detection.samples import LabelledImage
 from velfield.synthetic import small_flight
-from velfield.synthetic.cases import PIN_HOLE
+from velfield.synthetic.cases import PINHOLE
 
 
 def liked(cars: int, others: int, seed: int) -> tuple[FloatArray, FloatArray]:
@@ -93,7 +93,7 @@ def test_the_difference_is_that_about_a_place() -> None:
     assert far == pytest.approx(0, abs=0.1)
 
 
-STILL = PIN_HOLE.model_copy(update={"drift_m": 0.0, "climb_share": 0.0, "turn_deg": 0.0, "tilt_deg": 0.0})
+STILL = PINHOLE.model_copy(update={"drift_m": 0.0, "climb_share": 0.0, "turn_deg": 0.0, "tilt_deg": 0.0})
 
 
 @cache

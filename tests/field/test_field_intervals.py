@@ -88,7 +88,7 @@ def test_stationary_traffic_has_no_direction_and_an_empty_pixel_no_interval() ->
 def sections(flight: Flight) -> list[tuple[int, int]]:
     """A pixel every 40 m along every lane."""
     found = []
-    for edge in flight.city.plan.network.edges:
+    for edge in flight.city.plan.road_network.edges:
         along = np.concatenate([[0.0], np.hypot(*np.diff(edge.path, axis=0).T).cumsum()])
         for s in np.arange(min(SECTION_M, along[-1]) / 2, along[-1], SECTION_M):
             position = np.array([[np.interp(s, along, edge.path[:, k]) for k in (0, 1)]])
@@ -127,7 +127,7 @@ def covered(seed: int) -> np.ndarray:
     for k in range(REPEATS):  # the same hour of other days
         rng = np.random.default_rng(1000 * seed + k)
         duration_s = float(flight.times_s[-1]) + 1
-        other = simulate_traffic(flight.city.plan.network, flight.config.traffic, duration_s=duration_s, rng=rng)
+        other = simulate_traffic(flight.city.plan.road_network, flight.config.traffic, duration_s=duration_s, rng=rng)
         part = segments_of(flight, other, k, errors=NO_ERRORS)
         part["track"] += k << 40
         design_effect.append(part)

@@ -18,10 +18,10 @@ from velfield.registration.intrasensor import (
 )
 from velfield.registration.keypoints import Keypoints, detect_keypoints
 from velfield.registration.own_base import build_own_base
-from velfield.synthetic.cases import FLAT, PIN_HOLE, small_flight
+from velfield.synthetic.cases import FLAT, PINHOLE, small_flight
 from velfield.synthetic.flight import Flight
 from velfield.synthetic.score import fit_homography, score_registration
-from velfield.synthetic.truth import truth_of
+from velfield.synthetic.truth import make_truth
 
 CONFIG = RegistrationConfig(key_points=2000)
 SAME_SENSOR = OtherSensorSimulation(same_sensor=True)
@@ -32,7 +32,7 @@ CUT_TOLERANCE_PX = 0.02
 
 @lru_cache(maxsize=4)
 def flight_of(kind: str, frames: int = 4) -> Flight:
-    camera, scene = {"still": (PIN_HOLE, FLAT), "wobble": (WOBBLE, FLAT), "city": (CameraSimulation(), None)}[kind]
+    camera, scene = {"still": (PINHOLE, FLAT), "wobble": (WOBBLE, FLAT), "city": (CameraSimulation(), None)}[kind]
     sections = {"camera": camera, "base": SAME_SENSOR} | ({} if scene is None else {"scene": scene})
     return small_flight(frames=frames, seed=3, **sections)
 
@@ -61,7 +61,7 @@ def registered(kind: str, frames: list[int], config: RegistrationConfig = CONFIG
 
 def errors_px(kind: str, results: list[FrameRegistration]) -> tuple[float, float]:
     """Mean and 95th percentile of the maps' error over all frames."""
-    truth = truth_of(flight_of(kind))
+    truth = make_truth(flight_of(kind))
     score = score_registration(truth, lambda frame, xy: results[frame].transform.to_base(xy), range(len(results)))
     return score.mean_px, score.p95_px
 
@@ -107,7 +107,7 @@ def test_patches_from_afar_do_not_pull_what_lies_near_by() -> None:
     frames = [(k, flight.frame(k), detect_keypoints(flight.frame(k), CONFIG)) for k in range(4)]
     base = prepare_base(flight.base_image, CONFIG, frame_shape=shape)
     results = register_chain(frames, base, lens_of(flight), CONFIG)
-    score = score_registration(truth_of(flight), lambda frame, xy: results[frame].transform.to_base(xy), range(4))
+    score = score_registration(make_truth(flight), lambda frame, xy: results[frame].transform.to_base(xy), range(4))
     assert score.mean_px < 0.12  # 0.15 with them
     assert score.p95_px < 0.3  # 0.39
 
@@ -156,7 +156,7 @@ def test_where_the_base_image_ends_the_previous_frame_carries_on() -> None:
     previous = map_keypoints(keypoints, first.transform)
     alone = register_chain([(1, *seen("still", 1))], half, lens, CONFIG)[0]
     chained = register_chain([(1, *seen("still", 1))], half, lens, CONFIG, previous)[0]
-    truth = truth_of(flight)
+    truth = make_truth(flight)
     corner = np.array([[600.0, 240.0]])
     miss = [float(np.linalg.norm(r.transform.to_base(corner) - truth.to_base(1, corner))) for r in (alone, chained)]
     assert chained.spread > alone.spread
@@ -173,7 +173,7 @@ def test_own_base_image_serves_as_well_as_a_given_one() -> None:
     assert own.frames == 6
     base = prepare_base(own.image, CONFIG, mask=own.valid, frame_shape=greys[0].shape)
     results = register_chain(((k, greys[k], keypoints[k]) for k in range(6)), base, lens, CONFIG)
-    truth = truth_of(flight)
+    truth = make_truth(flight)
 
     def to_base(frame: int, xy: np.ndarray) -> np.ndarray:
         return results[frame].transform.to_base(xy)
@@ -206,5 +206,5 @@ def test_patches_are_found_below_the_pixel(shift_px: float) -> None:
         smooth_levels(seen("still", 0)[0])[0], moved, templates, coarse=False, max_shift_px=2.5
     )
     assert len(points) > 0.7 * looked_for
-    miss = truth_of(flight).to_base(0, points.xy_raw) - points.xy_base
+    miss = make_truth(flight).to_base(0, points.xy_raw) - points.xy_base
     assert np.median(np.linalg.norm(miss, axis=1)) < 0.12

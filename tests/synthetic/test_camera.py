@@ -15,7 +15,7 @@ from schemas.simulation import (
     TrafficSimulation,
 )
 from velfield.synthetic import homography_only, lens_and_wobble, lens_only, simulate, small_flight, vibration_and_drift
-from velfield.synthetic.cases import FLAT, PIN_HOLE
+from velfield.synthetic.cases import FLAT, PINHOLE
 
 EMPTY = TrafficSimulation(flow_veh_per_h=0, warm_up_s=0)
 QUIET = OtherSensorSimulation(same_sensor=True, noise_grey=0)
@@ -55,8 +55,8 @@ def test_without_lens_shutter_and_relief_the_map_is_a_homography() -> None:
 
 
 def test_wobble_moves_rows_by_its_amplitude_as_often_as_it_says() -> None:
-    camera = PIN_HOLE.model_copy(update={"vibration_px": 4.0, "vibration_cycles": 6.0, "readout_s": 0.1})
-    still = PIN_HOLE.model_copy(update={"readout_s": 0.1})
+    camera = PINHOLE.model_copy(update={"vibration_px": 4.0, "vibration_cycles": 6.0, "readout_s": 0.1})
+    still = PINHOLE.model_copy(update={"readout_s": 0.1})
     shaken, quiet = (small_flight(frames=2, camera=c, scene=FLAT).camera for c in (camera, still))
     rows = np.arange(480.0)
     shift = (shaken.row_table(1, rows) - quiet.row_table(1, rows))[:, 12]
@@ -77,10 +77,10 @@ def test_shake_stays_within_its_band() -> None:
 
 def test_relief_shifts_points_away_from_the_middle() -> None:
     flat, hilly = (
-        small_flight(frames=1, camera=PIN_HOLE, scene=FLAT.model_copy(update={"relief_m": h})) for h in (0.0, 2.0)
+        small_flight(frames=1, camera=PINHOLE, scene=FLAT.model_copy(update={"relief_m": h})) for h in (0.0, 2.0)
     )
     xy = raw_points(flat.config)
-    origin = hilly.camera.place_px[:2] - flat.camera.place_px[:2]
+    origin = hilly.camera.position_px[:2] - flat.camera.position_px[:2]
     shift = hilly.camera.to_base(0, xy) - flat.camera.to_base(0, xy) - origin
     assert 0.3 < np.hypot(*shift.T).max() < 2.0 / 0.23 * 0.6
 
@@ -88,7 +88,7 @@ def test_relief_shifts_points_away_from_the_middle() -> None:
 @pytest.mark.parametrize(
     ("camera", "limit_px"),
     [
-        (PIN_HOLE, 0.1),
+        (PINHOLE, 0.1),
         (CameraSimulation(lens_a=0.2, vibration_px=4.0, vibration_cycles=6.0), 0.1),
         (CameraSimulation(lens_a=0.15, vibration_px=2.0), 0.1),
     ],
@@ -119,7 +119,7 @@ def test_features_land_where_the_truth_says(camera: CameraSimulation, limit_px: 
 
 
 def test_tall_things_lean_away_from_the_middle() -> None:
-    flight = small_flight(frames=1, camera=PIN_HOLE, scene=FLAT)
+    flight = small_flight(frames=1, camera=PINHOLE, scene=FLAT)
     foot = flight.camera.to_base(0, np.array([[600.0, 240.0]]))
     raised = flight.camera.to_raw(0, foot, above_px=40.0)
     assert raised[0, 0] > 605

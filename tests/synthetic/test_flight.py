@@ -14,12 +14,12 @@ from velfield.errors import InputError
 from velfield.synthetic import (
     fit_homography,
     load_truth,
+    make_truth,
     score_detections,
     score_field,
     score_registration,
     score_tracklets,
     small_flight,
-    truth_of,
     write_flight,
 )
 from velfield.synthetic.cases import FLAT
@@ -30,7 +30,7 @@ STEADY = CameraSimulation(noise_grey=0, motion_blur_px=0, exposure_share=0)
 
 @pytest.fixture(scope="module")
 def truth() -> Truth:
-    return truth_of(small_flight(frames=12))
+    return make_truth(small_flight(frames=12))
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +120,7 @@ def test_what_is_written_is_what_the_command_promises(written: Path) -> None:
 def test_truth_read_back_is_the_truth(written: Path) -> None:
     read = load_truth(written)
     flight = small_flight(frames=6, width=320, height=240, labelled_frames=2)
-    memory = truth_of(flight)
+    memory = make_truth(flight)
     xy = np.random.default_rng(0).uniform([0, 0], [319, 239], (100, 2))
     assert np.array_equal(read.to_base(4, xy), memory.to_base(4, xy))
     pd.testing.assert_frame_equal(read.cars, memory.cars)
@@ -165,7 +165,7 @@ def test_a_perfect_run_scores_perfectly(truth: Truth) -> None:
     found = visible.rename(columns={"x_base_px": "x_px", "y_base_px": "y_px"})
     detections = score_detections(truth, found)
     assert (detections.precision, detections.recall) == (1.0, 1.0)
-    assert detections.axis_median_rad == 0
+    assert detections.axis_error_median_rad == 0
 
 
 def test_a_run_on_another_grid_scores_after_the_best_homography(truth: Truth) -> None:
@@ -216,9 +216,9 @@ def test_tracklets_are_right_when_they_follow_one_vehicle(truth: Truth) -> None:
     assert score.precision == 1.0
     assert score.recall_moving > 0.97
     assert score.speed_error_mean_km_per_h < 0.7
-    assert score.passages_per_vehicle == 1.0
+    assert score.tracks_per_vehicle == 1.0
     twice = tracklets.assign(passage_id=2 * tracklets["passage_id"] + tracklets["frame_1"] % 2)
-    assert score_tracklets(truth, twice).passages_per_vehicle > 1.9
+    assert score_tracklets(truth, twice).tracks_per_vehicle > 1.9
     swapped = tracklets.copy()
     swapped[["x_2_px", "y_2_px"]] = swapped[["x_2_px", "y_2_px"]].to_numpy()[::-1]
     assert score_tracklets(truth, swapped).precision < 0.1
@@ -256,12 +256,12 @@ def test_a_field_along_the_lanes_scores_perfectly_and_one_across_does_not(truth:
     inside = (at >= 0).all(axis=1) & (at < [w, h]).all(axis=1)
     velocity[at[inside, 1], at[inside, 0]] = steps.loc[inside, ["vx_px_per_s", "vy_px_per_s"]].to_numpy()
     count[at[inside, 1], at[inside, 0]] = 5
-    assert score_field(truth, velocity, count).share_within > 0.99
+    assert score_field(truth, velocity, count).fraction_within > 0.99
     across = np.stack([-velocity[..., 1], velocity[..., 0]], axis=-1)
-    assert score_field(truth, across, count).share_within < 0.2
+    assert score_field(truth, across, count).fraction_within < 0.2
     half = np.diag([0.5, 0.5, 1.0])
     shrunk, few = velocity[::2, ::2], count[::2, ::2]
-    assert score_field(truth, shrunk, few, to_truth=np.linalg.inv(half)).share_within > 0.97
+    assert score_field(truth, shrunk, few, to_truth=np.linalg.inv(half)).fraction_within > 0.97
 
 
 def test_direction_in_a_tight_turn_is_that_of_the_lane_at_the_pixel(truth: Truth) -> None:

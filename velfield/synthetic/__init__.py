@@ -9,7 +9,7 @@
 from velfield.synthetic.cases import homography_only, lens_and_wobble, lens_only, small_flight, vibration_and_drift
 from velfield.synthetic.flight import Flight, simulate
 from velfield.synthetic.score import fit_homography, score_detections, score_field, score_registration, score_tracklets
-from velfield.synthetic.truth import Truth, load_truth, truth_of
+from velfield.synthetic.truth import Truth, load_truth, make_truth
 from velfield.synthetic.write import write_flight
 
 __all__ = [
@@ -20,13 +20,13 @@ __all__ = [
     "lens_and_wobble",
     "lens_only",
     "load_truth",
+    "make_truth",
     "score_detections",
     "score_field",
     "score_registration",
     "score_tracklets",
     "simulate",
     "small_flight",
-    "truth_of",
     "vibration_and_drift",
     "write_flight",
 ]

@@ -1,11 +1,12 @@
-"""The simulated camera, exact both ways: raw pixel -> ground through lens, rolling shutter, pose and relief, and back.
+"""The simulated camera, exact in both directions: raw pixel -> ground by lens, rolling shutter, pose and relief, and
+back.
 
 Axes: x right, y down (as the base image), z into the ground, all in base pixels; height above the ground is -z. A raw
-pixel's row tells when it was exposed, and with that the pose and the shake that hold for it:
+pixel's row determines its exposure time, and thereby its pose and its vibration:
 
-    raw -> undistort (Harris, closed) -> minus shake(t) -> ray of the pose(t) -> where the ray meets the ground
+    raw -> undistort (Harris, closed form) -> minus shake(t) -> ray of the pose(t) -> intersection with the ground
 
-No step is approximated, so the maps here are the truth that registration is scored against.
+No step is approximated, so these transforms are the ground truth of registration.
 """
 
 from dataclasses import dataclass
@@ -18,15 +19,15 @@ from schemas.simulation import CameraSimulation, SimulationConfig
 from velfield.synthetic.city.relief import Relief, ground_height, ground_height_at
 
 ROW_FIELDS = 14
-"""Columns of a row table: rotation camera -> base (9, row-major), camera place (3), shake (2)."""
+"""Columns of a row table: rotation camera -> base (9, row-major), camera position (3), shake (2)."""
 
-MAX_FIXED_POINT_ROUNDS = 60
-"""Rounds of the search for the row that saw a point; each shrinks the error by at least half, see ``to_raw``."""
+MAX_FIXED_POINT_ITERATIONS = 60
+"""Iterations of the search for the row that images a point; each at least halves the error, see ``to_raw``."""
 
 
 @dataclass(frozen=True)
 class Waves:
-    """A smooth function of time: a sum of sines, one row a channel.
+    """A smooth function of time: a sum of sines for each channel.
 
     ``amplitude``, ``omega_rad_per_s``, ``phase_rad``: (channels, waves).
     """
@@ -43,22 +44,22 @@ class Waves:
 
 
 def motion_waves(amplitudes: FloatArray, *, period_s: float, rng: np.random.Generator) -> Waves:
-    """Slow waves, three a channel, periods spread about ``period_s``, that never exceed ``amplitudes``."""
+    """Slow waves, three a channel, of periods about ``period_s``, whose sums never exceed ``amplitudes``."""
     channels = len(amplitudes)
-    share = rng.dirichlet(np.full(3, 2.0), size=channels)
+    weight = rng.dirichlet(np.full(3, 2.0), size=channels)
     omega = 2 * np.pi / (period_s * rng.uniform(0.6, 2.0, size=(channels, 3)))
-    return Waves(amplitudes[:, None] * share, omega, rng.uniform(0, 2 * np.pi, size=(channels, 3)))
+    return Waves(amplitudes[:, None] * weight, omega, rng.uniform(0, 2 * np.pi, size=(channels, 3)))
 
 
 def shake_waves(camera: CameraSimulation, rng: np.random.Generator) -> Waves:
-    """The shake in x and y: one pure tone where ``vibration_cycles`` is given, else three tones within the band."""
+    """Vibration in x and y: one sine if ``vibration_cycles`` is given, otherwise three within the band."""
     phase = rng.uniform(0, 2 * np.pi, size=(2, 3))
     if camera.vibration_cycles is not None:
         omega = np.full((2, 1), 2 * np.pi * camera.vibration_cycles / max(camera.readout_s, 1e-9))
         return Waves(np.full((2, 1), camera.vibration_px), omega, phase[:, :1])
-    share = rng.dirichlet(np.full(3, 2.0), size=2)
+    weight = rng.dirichlet(np.full(3, 2.0), size=2)
     omega = 2 * np.pi * rng.uniform(camera.vibration_low_hz, camera.vibration_high_hz, size=(2, 3))
-    return Waves(camera.vibration_px * share, omega, phase)
+    return Waves(camera.vibration_px * weight, omega, phase)
 
 
 @dataclass(frozen=True)
@@ -70,12 +71,12 @@ class Camera:
     width, height : frame size, px.
     focal_px : focal length, px.
     lens_a, lens_x_px, lens_y_px : Harris' distortion and its centre; radius in half-diagonals.
-    place_px : (3,) mean place of the camera, base px; z negative (above the ground).
-    heading_rad : mean turn, from +x towards +y.
-    motion : waves of x, y, z (base px), turn, tilt about x, tilt about y (rad).
-    shake : waves of the picture's shake in x and y, undistorted px.
+    position_px : (3,) mean position of the camera, base px; z negative (above the ground).
+    heading_rad : mean rotation about the vertical, from +x towards +y.
+    motion : waves of x, y, z (base px), rotation about z, tilt about x, tilt about y (rad).
+    shake : waves of the image's vibration in x and y, undistorted px.
     readout_s : time from the first row to the last.
-    times_s : (frames,) exposure of each frame's first row.
+    times_s : (frames,) exposure time of each frame's first row.
     relief : height of the ground.
     """
 
@@ -85,7 +86,7 @@ class Camera:
     lens_a: float
     lens_x_px: float
     lens_y_px: float
-    place_px: FloatArray
+    position_px: FloatArray
     heading_rad: float
     motion: Waves
     shake: Waves
@@ -99,47 +100,47 @@ class Camera:
         return float(np.hypot(self.width, self.height) / 2)
 
     def row_time_s(self, frame: int, rows: FloatArray) -> FloatArray:
-        """When rows (n,), also between rows or beyond the frame, were exposed, s."""
+        """Exposure times of rows (n,), s; also of fractional ones and beyond the frame."""
         return np.asarray(self.times_s[frame] + self.readout_s * rows / max(self.height - 1, 1))
 
     def row_table(self, frame: int, rows: FloatArray) -> FloatArray:
         """Pose and shake at rows (n,): (n, ROW_FIELDS)."""
         time_s = self.row_time_s(frame, rows)
-        dx, dy, dz, turn, tilt_x, tilt_y = self.motion(time_s)
+        dx, dy, dz, yaw, tilt_x, tilt_y = self.motion(time_s)
         table = np.empty((len(rows), ROW_FIELDS))
-        table[:, :9] = _rotation(self.heading_rad + turn, tilt_x, tilt_y).reshape(-1, 9)
-        table[:, 9:12] = self.place_px + np.stack([dx, dy, dz], axis=1)
+        table[:, :9] = _rotation(self.heading_rad + yaw, tilt_x, tilt_y).reshape(-1, 9)
+        table[:, 9:12] = self.position_px + np.stack([dx, dy, dz], axis=1)
         table[:, 12:14] = self.shake(time_s).T
         return table
 
     def undistort(self, xy: FloatArray) -> FloatArray:
-        """Raw pixels (n, 2) -> undistorted pixels (n, 2); NaN beyond the lens's reach."""
+        """Raw pixels (n, 2) -> undistorted pixels (n, 2); NaN where the lens model has none."""
         return _radial(xy, (self.lens_x_px, self.lens_y_px), -self.lens_a, self.half_diagonal_px)
 
     def distort(self, xy: FloatArray) -> FloatArray:
-        """Undistorted pixels (n, 2) -> raw pixels (n, 2); NaN beyond the lens's reach."""
+        """Undistorted pixels (n, 2) -> raw pixels (n, 2); NaN where the lens model has none."""
         return _radial(xy, (self.lens_x_px, self.lens_y_px), self.lens_a, self.half_diagonal_px)
 
     def to_base(self, frame: int, xy_raw: FloatArray) -> FloatArray:
-        """Raw pixels (n, 2) of a frame -> the ground they show, base pixels (n, 2)."""
+        """Raw pixels (n, 2) of a frame -> the ground that they show, base pixels (n, 2)."""
         xy_raw = np.asarray(xy_raw, dtype=np.float64).reshape(-1, 2)
         table = self.row_table(frame, xy_raw[:, 1])
         rays = self.undistort(xy_raw)
-        return np.asarray(_rays_to_ground(rays, table, self.pinhole, self.relief.grid, self.relief.frame))
+        return np.asarray(_intersect_ground(rays, table, self.pinhole, self.relief.grid, self.relief.frame))
 
     def to_raw(self, frame: int, xy_base: FloatArray, *, above_px: float | FloatArray = 0.0) -> FloatArray:
-        """Base pixels (n, 2) -> where the frame shows them (n, 2), also beyond its border; NaN where nowhere.
+        """Base pixels (n, 2) -> raw pixels (n, 2) of a frame, also beyond its border; NaN where there are none.
 
-        ``above_px`` lifts the points above the ground. The row that saw a point depends on where the point lands:
-        found by fixed-point iteration, which converges since the shake moves less than a row a row.
+        ``above_px`` is the height of the points above the ground. The pose depends on the row that images a point, and
+        that on the pose: a fixed-point iteration, which converges since vibration moves by less than a row a row.
         """
         xy_base = np.asarray(xy_base, dtype=np.float64).reshape(-1, 2)
         height = self.relief_at(xy_base) + above_px
-        place = np.column_stack([xy_base, -height])
-        rows = np.full(len(place), self.height / 2)
-        xy = np.full((len(place), 2), np.nan)
-        for _ in range(MAX_FIXED_POINT_ROUNDS):
-            xy = self.distort(_project(place, self.row_table(frame, rows), self.pinhole))
+        points = np.column_stack([xy_base, -height])
+        rows = np.full(len(points), self.height / 2)
+        xy = np.full((len(points), 2), np.nan)
+        for _ in range(MAX_FIXED_POINT_ITERATIONS):
+            xy = self.distort(_project(points, self.row_table(frame, rows), self.pinhole))
             step = np.nan_to_num(xy[:, 1] - rows)
             rows = rows + step
             if len(step) == 0 or np.abs(step).max() < 1e-9:
@@ -158,11 +159,12 @@ class Camera:
 
     @property
     def pinhole(self) -> FloatArray:
+        """Focal length and principal point x, y, px."""
         return np.array([self.focal_px, (self.width - 1) / 2, (self.height - 1) / 2])
 
 
 def make_camera(config: SimulationConfig, times_s: FloatArray, relief: Relief, rng: np.random.Generator) -> Camera:
-    """The camera of a configuration, its mean place above base pixel (0, 0)."""
+    """The camera of a configuration, its mean position above base pixel (0, 0)."""
     c = config.camera
     focal = c.focal_widths * config.width
     height_px = focal / c.scale
@@ -184,7 +186,7 @@ def make_camera(config: SimulationConfig, times_s: FloatArray, relief: Relief, r
         lens_a=c.lens_a,
         lens_x_px=(config.width - 1) / 2 + c.lens_offset_x_px,
         lens_y_px=(config.height - 1) / 2 + c.lens_offset_y_px,
-        place_px=np.array([0.0, 0.0, -height_px]),
+        position_px=np.array([0.0, 0.0, -height_px]),
         heading_rad=float(np.radians(c.heading_deg)),
         motion=motion_waves(amplitudes, period_s=c.motion_period_s, rng=rng),
         shake=shake_waves(c, rng),
@@ -194,10 +196,10 @@ def make_camera(config: SimulationConfig, times_s: FloatArray, relief: Relief, r
     )
 
 
-def _rotation(turn: FloatArray, tilt_x: FloatArray, tilt_y: FloatArray) -> FloatArray:
-    """Rotations (n, 3, 3) camera -> base: tilt about x, then about y, then turn about z."""
-    zero, one = np.zeros_like(turn), np.ones_like(turn)
-    c, s = np.cos(turn), np.sin(turn)
+def _rotation(yaw: FloatArray, tilt_x: FloatArray, tilt_y: FloatArray) -> FloatArray:
+    """Rotations (n, 3, 3) camera -> base: tilt about x, then about y, then yaw about z."""
+    zero, one = np.zeros_like(yaw), np.ones_like(yaw)
+    c, s = np.cos(yaw), np.sin(yaw)
     about_z = np.array([[c, -s, zero], [s, c, zero], [zero, zero, one]])
     c, s = np.cos(tilt_y), np.sin(tilt_y)
     about_y = np.array([[c, zero, s], [zero, one, zero], [-s, zero, c]])
@@ -208,7 +210,7 @@ def _rotation(turn: FloatArray, tilt_x: FloatArray, tilt_y: FloatArray) -> Float
 
 
 def _radial(xy: FloatArray, centre: tuple[float, float], a: float, unit: float) -> FloatArray:
-    """Harris' map: r -> r / sqrt(1 + a r^2); its inverse is itself with -a."""
+    """Harris' radial distortion: r -> r / sqrt(1 + a r^2); its inverse is the same with -a."""
     offset = np.asarray(xy, dtype=np.float64) - centre
     under_root = 1 + a * (offset**2).sum(axis=1) / unit**2
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -217,7 +219,7 @@ def _radial(xy: FloatArray, centre: tuple[float, float], a: float, unit: float) 
 
 
 @njit(cache=True, nogil=True)
-def _rays_to_ground(undistorted, table, pinhole, relief, relief_frame):  # type: ignore[no-untyped-def]
+def _intersect_ground(undistorted, table, pinhole, relief, relief_frame):  # type: ignore[no-untyped-def]
     out = np.empty((len(undistorted), 2))
     for i in range(len(undistorted)):
         r = table[i]
@@ -229,7 +231,7 @@ def _rays_to_ground(undistorted, table, pinhole, relief, relief_frame):  # type:
         slope_x, slope_y = dx / dz, dy / dz
         x0, y0 = r[9] - r[11] * slope_x, r[10] - r[11] * slope_y
         x, y = x0, y0
-        # the relief is slow, each round gains three digits
+        # the relief is smooth: each iteration gains three digits
         for _ in range(8):
             z = -ground_height_at(x, y, relief, relief_frame)
             x, y = x0 + z * slope_x, y0 + z * slope_y
@@ -237,9 +239,9 @@ def _rays_to_ground(undistorted, table, pinhole, relief, relief_frame):  # type:
     return out
 
 
-def _project(place: FloatArray, table: FloatArray, pinhole: FloatArray) -> FloatArray:
+def _project(points: FloatArray, table: FloatArray, pinhole: FloatArray) -> FloatArray:
     """Points (n, 3), each by its own pose -> undistorted pixels (n, 2), shake included; NaN behind the camera."""
-    ray = np.einsum("nij,ni->nj", table[:, :9].reshape(-1, 3, 3), place - table[:, 9:12])
+    ray = np.einsum("nij,ni->nj", table[:, :9].reshape(-1, 3, 3), points - table[:, 9:12])
     with np.errstate(invalid="ignore", divide="ignore"):
         scale = np.where(ray[:, 2] > 0, pinhole[0] / ray[:, 2], np.nan)
     return np.asarray(ray[:, :2] * scale[:, None] + pinhole[1:] + table[:, 12:14])

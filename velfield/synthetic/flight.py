@@ -1,4 +1,4 @@
-"""A simulated flight in memory: city and camera drawn from one seed, frames rendered when asked for."""
+"""A simulated flight in memory: city and camera from one seed, frames rendered on demand."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,17 +15,17 @@ from velfield.synthetic.camera import Camera, make_camera
 from velfield.synthetic.city.city import PAD_PX, City
 from velfield.synthetic.city.city_plan import view_centre_m
 from velfield.synthetic.city.relief import make_relief
-from velfield.synthetic.render import Sprites, draw_sprites, hidden, render_ground
-from velfield.synthetic.seeds import Matter, stream
+from velfield.synthetic.random_streams import RandomStream, random_generator
+from velfield.synthetic.render import VehicleSprites, draw_vehicles, occluded, render_ground
 
 
 def frame_times(times: TimesSimulation, frames: int, rng: np.random.Generator) -> FloatArray:
-    """Times of the frames from 0, s: strictly rising, some half a frame or a whole one late."""
+    """Times of the frames from 0, s: strictly ascending, some late by half a frame or a whole one."""
     nominal = 1 / times.fps
-    pick = rng.uniform(size=max(frames - 1, 0))
-    step = np.full(len(pick), nominal)
-    step[pick < times.late_half_share] += 0.5 * nominal
-    whole = (pick >= times.late_half_share) & (pick < times.late_half_share + times.late_whole_share)
+    draw = rng.uniform(size=max(frames - 1, 0))
+    step = np.full(len(draw), nominal)
+    step[draw < times.late_half_share] += 0.5 * nominal
+    whole = (draw >= times.late_half_share) & (draw < times.late_half_share + times.late_whole_share)
     step[whole] += nominal
     step += np.clip(rng.standard_normal(len(step)), -3, 3) * min(times.jitter_s, nominal / 8)
     return np.concatenate([[0.0], np.cumsum(step)])
@@ -38,15 +38,15 @@ class Flight:
     ----------
     config : SimulationConfig
     times_s : (frames,) times of the first rows, from 0.
-    camera : Camera, the exact map between raw and base pixels.
+    camera : Camera, the exact transforms between raw and base pixels.
     base_shape : (height, width) of the base image.
-    city : City, all that is not the camera.
+    city : City, everything but the camera.
     """
 
     def __init__(self, config: SimulationConfig) -> None:
         self.config = config
-        self.times_s = frame_times(config.times, config.frames, stream(config.seed, Matter.TIMES))
-        self.camera, self.base_shape, origin_m = _place_camera(config, self.times_s)
+        self.times_s = frame_times(config.times, config.frames, random_generator(config.seed, RandomStream.TIMES))
+        self.camera, self.base_shape, origin_m = _position_camera(config, self.times_s)
         half = 1.3 * np.hypot(config.width, config.height) / 2
         self.city = City(
             config,
@@ -58,28 +58,28 @@ class Flight:
 
     @property
     def base_image(self) -> GreyImage:
-        """The base image, uint8 (base_shape): orthographic, by the other sensor, without the traffic."""
+        """The base image, uint8 (base_shape): orthographic, by the other sensor, without traffic."""
         return self.city.base_image
 
     def cars(self, frame: int) -> pd.DataFrame:
-        """The vehicles of a frame, each at the time at which its row was exposed; see ``truth.CAR_COLUMNS``."""
+        """The vehicles of a frame, each at the exposure time of its row; see ``truth.CAR_COLUMNS``."""
         moving = self.city.traffic.present(float(self.times_s[frame]) + self.camera.readout_s / 2)
         n_parked = len(self.city.vehicles.parked_pose)
         numbers = np.concatenate([moving, self.city.vehicles.driving + np.arange(n_parked)])
         time_s = np.full(len(moving), self.times_s[frame] + self.camera.readout_s / 2)
         for _ in range(4):
-            place, direction, speed = self.city.traffic.at(moving, time_s)
-            raw = self.camera.to_raw(frame, self.city.to_px(place))
+            position, direction, speed = self.city.traffic.at(moving, time_s)
+            raw = self.camera.to_raw(frame, self.city.to_px(position))
             rows = np.clip(np.nan_to_num(raw[:, 1]), -self.camera.height, 2 * self.camera.height)
             time_s = self.camera.row_time_s(frame, rows)
         parked = self.city.vehicles.parked_pose
-        base = np.concatenate([self.city.to_px(place), parked[:, :2]])
+        base = np.concatenate([self.city.to_px(position), parked[:, :2]])
         raw = np.concatenate([raw, self.camera.to_raw(frame, parked[:, :2])])
         direction = np.concatenate([direction, parked[:, 2]])
         speed_px = np.concatenate([speed, np.zeros(n_parked)]) / self.config.gsd_m
         direction = np.angle(np.exp(1j * direction))
-        kinds = self.city.vehicles.kinds
-        seen = ~self._hidden(frame, base, raw)
+        dimensions = self.city.vehicles.dimensions
+        seen = ~self._is_occluded(frame, base, raw)
         inside = (raw > -0.5).all(axis=1) & (raw < [self.camera.width - 0.5, self.camera.height - 0.5]).all(axis=1)
         return pd.DataFrame(
             {
@@ -94,27 +94,28 @@ class Flight:
                 "direction_rad": direction,
                 "vx_px_per_s": speed_px * np.cos(direction),
                 "vy_px_per_s": speed_px * np.sin(direction),
-                "length_px": kinds.length_m[numbers] / self.config.gsd_m,
-                "width_px": kinds.width_m[numbers] / self.config.gsd_m,
+                "length_px": dimensions.length_m[numbers] / self.config.gsd_m,
+                "width_px": dimensions.width_m[numbers] / self.config.gsd_m,
                 "moving": speed_px * self.config.gsd_m > 0.5,
                 "visible": inside & seen,
             }
         )
 
-    def _hidden(self, frame: int, base: FloatArray, raw: FloatArray) -> NDArray[np.bool_]:
-        """Whether something that stands hides the middle of a car."""
+    def _is_occluded(self, frame: int, base: FloatArray, raw: FloatArray) -> NDArray[np.bool_]:
+        """Whether a building or a tree occludes the centre of a car."""
         scene = self.city.scene
-        place = self.camera.row_table(frame, np.nan_to_num(raw[:, 1]))[:, 9:12]
-        slope = (base - place[:, :2]) / -place[:, 2:]
-        return np.asarray(hidden(base, slope, scene.height, scene.origin, scene.height_step_px))
+        camera = self.camera.row_table(frame, np.nan_to_num(raw[:, 1]))[:, 9:12]
+        slope = (base - camera[:, :2]) / -camera[:, 2:]
+        return np.asarray(occluded(base, slope, scene.height, scene.origin, scene.height_step_px))
 
     def labels(self, frame: int) -> pd.DataFrame:
-        """Boxes a person would draw: x_px, y_px, orientation_rad, length_px, width_px of all visible cars, raw px."""
+        """Boxes as an annotator would draw them: x_px, y_px, orientation_rad, length_px, width_px of all visible cars,
+        raw px."""
         cars = self.cars(frame)
         cars = cars[cars["visible"]].reset_index(drop=True)
         number = cars["vehicle_id"].to_numpy()
         base = cars[["x_base_px", "y_base_px"]].to_numpy()
-        middle = 0.5 * self.city.vehicles.kinds.height_m[number] / self.config.gsd_m
+        middle = 0.5 * self.city.vehicles.dimensions.height_m[number] / self.config.gsd_m
         u = np.column_stack([np.cos(cars["direction_rad"]), np.sin(cars["direction_rad"])])
         side = np.column_stack([-u[:, 1], u[:, 0]])
         centre = self.camera.to_raw(frame, base, above_px=middle)
@@ -132,7 +133,7 @@ class Flight:
                 "width_px": np.hypot(across[:, 0], across[:, 1]),
             }
         )
-        # Nobody marks a car whose middle is not in the picture: tall ones lean out of it at its border.
+        # No annotator marks a car whose centre is outside the image; high ones lean out of it at its border.
         inside = table["x_px"].between(0, self.config.width - 1) & table["y_px"].between(0, self.config.height - 1)
         return table[inside].reset_index(drop=True)
 
@@ -151,20 +152,20 @@ class Flight:
         return np.asarray(1 - c.camera.vignetting * r2, dtype=np.float32)
 
     def frame(self, index: int) -> GreyImage:
-        """Render a raw frame: uint8 (height, width). Frames may be asked for in any order, and from several threads."""
+        """Render a raw frame: uint8 (height, width). Frames may be rendered in any order, and from several threads."""
         c, camera, scene = self.config.camera, self.camera, self.city.scene
-        rng = stream(self.config.seed, Matter.FRAME, index)
+        rng = random_generator(self.config.seed, RandomStream.FRAME, index)
         table = camera.row_table(index, np.arange(camera.height, dtype=np.float64))
         out = np.empty((camera.height, camera.width), np.float32)
-        tall = np.empty((camera.height, camera.width), np.uint8)
+        occluder = np.empty((camera.height, camera.width), np.uint8)
         relief = camera.relief
         render_ground(
             *self._undistorted, table, camera.pinhole, relief.grid, relief.frame,
-            scene.mosaic, scene.height, scene.reach, scene.origin, scene.height_step_px, out, tall,
+            scene.mosaic, scene.height, scene.reach, scene.origin, scene.height_step_px, out, occluder,
         )  # fmt: skip
         lens = np.array([camera.lens_a, camera.lens_x_px, camera.lens_y_px, camera.half_diagonal_px])
-        sprites = self._sprites(index)
-        draw_sprites(out, tall, sprites, table=table, pinhole=camera.pinhole, lens=lens, sun=self.city.sun)
+        sprites = self._vehicle_sprites(index)
+        draw_vehicles(out, occluder, sprites, table=table, pinhole=camera.pinhole, lens=lens, sun=self.city.sun)
         out *= self._light * np.float32(1 + c.exposure_share * float(np.clip(rng.standard_normal(), -2, 2)))
         kernel = _motion_kernel(c.motion_blur_px * rng.uniform(), rng.uniform(0, np.pi))
         if kernel is not None:
@@ -174,14 +175,14 @@ class Flight:
         return np.clip(np.rint(out), 0, 255).astype(np.uint8)
 
     def prepare(self) -> None:
-        """Make all that frames share; call it before frames are rendered from several threads."""
+        """Compute what all frames share; call it before frames are rendered from several threads."""
         _ = self.city.traffic, self.city.scene, self.city.vehicles, self._undistorted, self._light
 
     def frames(self) -> Iterator[GreyImage]:
         """All frames in order."""
         return (self.frame(i) for i in range(self.config.frames))
 
-    def _sprites(self, frame: int) -> Sprites:
+    def _vehicle_sprites(self, frame: int) -> VehicleSprites:
         cars = self.cars(frame)
         near = cars["x_raw_px"].between(-80, self.camera.width + 80) & cars["y_raw_px"].between(
             -80, self.camera.height + 80
@@ -189,7 +190,7 @@ class Flight:
         cars = cars[near]
         number = cars["vehicle_id"].to_numpy()
         base = cars[["x_base_px", "y_base_px"]].to_numpy()
-        height = self.city.vehicles.kinds.height_m[number] / self.config.gsd_m
+        height = self.city.vehicles.dimensions.height_m[number] / self.config.gsd_m
         row_s = self.camera.readout_s / max(self.camera.height - 1, 1)
         pose = np.column_stack(
             [
@@ -206,11 +207,11 @@ class Flight:
         light = self.city.light
         at = np.clip(np.rint(base).astype(int) + PAD_PX, 0, np.array(light.shape[::-1]) - 1)
         tones = self.city.vehicles.tones[number] * light[at[:, 1], at[:, 0], None]
-        shape = self.city.vehicles.kinds.shape[number]
-        return Sprites(pose, shape, tones, self._boxes(frame, pose, self.city.sun))
+        shape = self.city.vehicles.dimensions.shape[number]
+        return VehicleSprites(pose, shape, tones, self._boxes(frame, pose, self.city.sun))
 
     def _boxes(self, frame: int, pose: FloatArray, sun: FloatArray) -> NDArray[np.int64]:
-        """Raw boxes that vehicles and their shadows stay within, cut to the frame."""
+        """Bounding boxes of vehicles and their shadows, raw px, clipped to the frame."""
         c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
         corners = []
         for a, b in ((0.5, 0.5), (0.5, -0.5), (-0.5, 0.5), (-0.5, -0.5)):
@@ -230,14 +231,16 @@ class Flight:
 
 
 def simulate(config: SimulationConfig) -> Flight:
-    """The flight of a configuration; parts of it are made when first asked for."""
+    """The flight of a configuration; its parts are computed at the first access."""
     return Flight(config)
 
 
-def _place_camera(c: SimulationConfig, times_s: FloatArray) -> tuple[Camera, tuple[int, int], FloatArray]:
-    """The camera over a base image that just holds all frames, and where in the plan that image begins, m."""
-    flat = make_relief((0.0, 0.0, 32.0, 32.0), height_px=0.0, length_px=1.0, rng=stream(c.seed, Matter.RELIEF))
-    camera = make_camera(c, times_s, flat, stream(c.seed, Matter.CAMERA))
+def _position_camera(c: SimulationConfig, times_s: FloatArray) -> tuple[Camera, tuple[int, int], FloatArray]:
+    """The camera over a base image that covers all frames with a margin, and that image's origin in the plan, m."""
+    flat = make_relief(
+        (0.0, 0.0, 32.0, 32.0), height_px=0.0, length_px=1.0, rng=random_generator(c.seed, RandomStream.RELIEF)
+    )
+    camera = make_camera(c, times_s, flat, random_generator(c.seed, RandomStream.CAMERA))
     border = _border(c.width, c.height)
     frames = np.unique(np.linspace(0, c.frames - 1, min(c.frames, 400)).astype(int))
     seen = np.concatenate([camera.to_base(int(f), border) for f in frames])
@@ -248,9 +251,9 @@ def _place_camera(c: SimulationConfig, times_s: FloatArray) -> tuple[Camera, tup
         (-64.0, -64.0, shape[1] + 64.0, shape[0] + 64.0),
         height_px=c.scene.relief_m / c.gsd_m,
         length_px=c.scene.relief_length_m / c.gsd_m,
-        rng=stream(c.seed, Matter.RELIEF),
+        rng=random_generator(c.seed, RandomStream.RELIEF),
     )
-    placed = replace(camera, place_px=camera.place_px - np.append(low, 0.0), relief=relief)
+    placed = replace(camera, position_px=camera.position_px - np.append(low, 0.0), relief=relief)
     return placed, shape, np.array(view_centre_m(c.width * c.gsd_m)) + low * c.gsd_m
 
 
@@ -262,7 +265,7 @@ def _border(width: int, height: int) -> FloatArray:
 
 
 def _motion_kernel(sigma: float, angle: float) -> NDArray[np.float32] | None:
-    """A Gaussian along one direction (7 x 7), or none where it would change nothing."""
+    """A Gaussian along one direction (7 x 7), or None where it is negligible."""
     if sigma < 0.15:
         return None
     y, x = np.mgrid[-3:4, -3:4].astype(np.float64)

@@ -1,7 +1,7 @@
-"""Tracklets of a simulated city's traffic without its pictures: true drives with the errors that the pipeline makes.
+"""Tracklets of simulated traffic without rendering: true trajectories with the pipeline's errors.
 
-A picture costs a second, a drive nothing, so an hour of traffic can be had for what ten frames cost: for the long run
-that intervals are held to, and for fields of the size of a long flight.
+Rendering a frame takes a second, simulating an hour of traffic as long as ten frames: for the long-run traffic that
+intervals are compared with, and for fields of the size of a long flight.
 """
 
 from collections.abc import Callable
@@ -21,28 +21,28 @@ _MAX_INTERVAL_S = 0.45
 
 @dataclass(frozen=True)
 class Errors:
-    """What the pipeline does to a true drive; the defaults were measured on simulated flights with pictures.
+    """Errors of the pipeline; the defaults were measured on rendered simulated flights.
 
     Attributes
     ----------
     recall
-        Share of the vehicles in a frame that are detected, each frame for itself.
+        Probability that a vehicle is detected, independently in each frame.
     place_sd_px
-        Standard deviation of a detection's place along one axis, base px.
+        Standard deviation of a detection's position along one axis, base px.
     displacement_sd_px, claimed_sd_px
-        Standard deviation of an aligned link's displacement along one axis, and what the aligner says it is.
-    unaligned_share
-        Share of links whose crops do not align, so that the places alone say how far it went.
+        Standard deviation of an aligned link's displacement along one axis, and the one that the alignment reports.
+    unaligned_fraction
+        Fraction of links whose crops do not align, with the displacement of the detections.
     """
 
     recall: float = 0.97
     position_sd_px: float = 0.8
     displacement_sd_px: float = 0.09
     claimed_sd_px: float = 0.13
-    unaligned_share: float = 0.05
+    unaligned_fraction: float = 0.05
 
 
-NO_ERRORS = Errors(recall=1.0, position_sd_px=0.0, displacement_sd_px=0.0, claimed_sd_px=0.0, unaligned_share=0.0)
+NO_ERRORS = Errors(recall=1.0, position_sd_px=0.0, displacement_sd_px=0.0, claimed_sd_px=0.0, unaligned_fraction=0.0)
 
 
 def observed_tracklets(
@@ -54,12 +54,12 @@ def observed_tracklets(
     rng: np.random.Generator,
     errors: Errors = Errors(),
 ) -> pd.DataFrame:
-    """Tracklets of all vehicles within a (height, width) base image; every window of three frames can have one.
+    """Tracklets of all vehicles within a (height, width) base image, one for each window of three frames.
 
     Parameters
     ----------
     traffic
-        Who drives where.
+        Trajectories of the vehicles.
     times_s
         (frames,) times of the frames.
     to_px
@@ -72,8 +72,8 @@ def observed_tracklets(
     DataFrame
         `schemas.tables.TRACKLET_COLUMNS`; the low 20 bits of a detection's id are the vehicle's number.
     """
-    vehicle, frame, true, place = _detected(traffic, times_s, to_px, shape, rng, errors)
-    moved, sd = _displacements(true, place, errors, rng)
+    vehicle, frame, true, position = _detected(traffic, times_s, to_px, shape, rng, errors)
+    moved, sd = _displacements(true, position, errors, rng)
     # rows are sorted by vehicle, then frame: a window is three rows of one vehicle in consecutive frames
     step = (np.diff(vehicle) == 0) & (np.diff(frame) == 1) & (np.diff(times_s[frame]) <= _MAX_INTERVAL_S)
     start = np.flatnonzero(step[:-1] & step[1:])
@@ -82,7 +82,7 @@ def observed_tracklets(
         rows = start + k
         columns[f"frame_{k}"], columns[f"time_{k}_s"] = frame[rows], times_s[frame[rows]]
         columns[f"detection_id_{k}"] = (frame[rows] << 20) + vehicle[rows]
-        columns[f"x_{k}_px"], columns[f"y_{k}_px"] = place[rows].T
+        columns[f"x_{k}_px"], columns[f"y_{k}_px"] = position[rows].T
     for k, link in ((0, "01"), (1, "12")):
         rows = start + k
         interval = times_s[frame[rows + 1]] - times_s[frame[rows]]
@@ -106,8 +106,8 @@ def observed_detections(
     errors: Errors = Errors(),
 ) -> pd.DataFrame:
     """Detections by frame: ``frame, time_s, x_px, y_px, vehicle_id``; parameters as in `observed_tracklets`."""
-    vehicle, frame, _, place = _detected(traffic, times_s, to_px, shape, rng, errors)
-    columns = {"frame": frame, "time_s": times_s[frame], "x_px": place[:, 0], "y_px": place[:, 1]}
+    vehicle, frame, _, position = _detected(traffic, times_s, to_px, shape, rng, errors)
+    columns = {"frame": frame, "time_s": times_s[frame], "x_px": position[:, 0], "y_px": position[:, 1]}
     return pd.DataFrame({**columns, "vehicle_id": vehicle}).sort_values("frame", kind="stable", ignore_index=True)
 
 
@@ -119,12 +119,12 @@ def _detected(
     rng: np.random.Generator,
     errors: Errors,
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-    """Vehicle, frame, true place and seen place (n, 2) of every detection, by vehicle, then frame."""
+    """Vehicle, frame, true position and detected position (n, 2) of every detection, by vehicle, then frame."""
     vehicle, frame = _appearances(traffic, times_s)
     true = to_px(traffic.at(vehicle, times_s[frame])[0])
     inside = (true >= 0).all(axis=1) & (true <= np.array(shape[::-1]) - 1).all(axis=1)
-    seen = inside & (rng.uniform(size=len(frame)) < errors.recall)
-    vehicle, frame, true = vehicle[seen], frame[seen], true[seen]
+    detected = inside & (rng.uniform(size=len(frame)) < errors.recall)
+    vehicle, frame, true = vehicle[detected], frame[detected], true[detected]
     return vehicle, frame, true, true + rng.normal(0, 1, true.shape) * errors.position_sd_px
 
 
@@ -140,13 +140,14 @@ def _appearances(traffic: Traffic, times_s: FloatArray) -> tuple[IntArray, IntAr
 
 
 def _displacements(
-    true: FloatArray, place: FloatArray, errors: Errors, rng: np.random.Generator
+    true: FloatArray, position: FloatArray, errors: Errors, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Displacement (n, 2) from each row to the next and its claimed standard deviation (n,); the last row's is zero."""
+    """Displacement (n, 2) from each row to the next and its reported standard deviation (n,); the last row's is
+    zero."""
     aligned = np.zeros_like(true)
     aligned[:-1] = np.diff(true, axis=0) + rng.normal(0, 1, (len(true) - 1, 2)) * errors.displacement_sd_px
     plain = np.zeros_like(true)
-    plain[:-1] = np.diff(place, axis=0)
-    unaligned = rng.uniform(size=len(true)) < errors.unaligned_share
+    plain[:-1] = np.diff(position, axis=0)
+    unaligned = rng.uniform(size=len(true)) < errors.unaligned_fraction
     sd = np.where(unaligned, np.sqrt(2) * errors.position_sd_px, errors.claimed_sd_px)
     return np.where(unaligned[:, None], plain, aligned), sd

@@ -1,4 +1,4 @@
-"""The base image: the same ground from straight above, by another sensor, on another day, without the traffic."""
+"""The base image: an orthographic view of the same ground, by another sensor, on another day, without traffic."""
 
 from dataclasses import dataclass
 
@@ -8,18 +8,19 @@ from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, GreyImage
 from schemas.simulation import OtherSensorSimulation
-from velfield.synthetic.city.ground import light_map, shade
-from velfield.synthetic.render import MOSAIC_SCALE, Sprites, draw_sprites
-from velfield.synthetic.traffic.traffic import draw_kinds
+from velfield.synthetic.city.ground import apply_light, light_map
+from velfield.synthetic.render import MOSAIC_SCALE, VehicleSprites, draw_vehicles
+from velfield.synthetic.traffic.traffic import draw_dimensions
 from velfield.synthetic.traffic.vehicles import draw_tones
 
 FAR_PX = 1e8
-"""Height of a camera whose rays are as good as upright."""
+"""Height of a camera whose rays are vertical to within rounding, base px."""
 
 
 @dataclass(frozen=True)
-class Standing:
-    """What stands still: ``tone`` mosaic, ``height`` and ``reach`` maps, base px a count, and the mosaic's border."""
+class StaticScene:
+    """The scene without vehicles: ``tone`` mosaic, ``height`` and ``reach`` maps, base px a count, and the mosaic's
+    border, px."""
 
     tone: GreyImage
     height: GreyImage
@@ -29,7 +30,7 @@ class Standing:
 
 
 def other_sensor_image(
-    standing: Standing,
+    static: StaticScene,
     config: OtherSensorSimulation,
     *,
     shape: tuple[int, int],
@@ -38,11 +39,12 @@ def other_sensor_image(
     gsd_m: float,
     rng: np.random.Generator,
 ) -> GreyImage:
-    """Picture (shape) with its own light, blur, tone curve and noise, and cars at ``parked`` (n, 3) x, y, direction."""
-    light = light_map(standing.height, standing.reach, step_px=standing.height_step_px, direction=sun)
-    lit = shade(standing.tone, light)
+    """Image (shape) with its own illumination, blur, tone curve and noise, and cars at ``parked`` (n, 3) x, y,
+    direction."""
+    light = light_map(static.height, static.reach, step_px=static.height_step_px, direction=sun)
+    lit = apply_light(static.tone, light)
     blurred = cv2.GaussianBlur(lit, (0, 0), MOSAIC_SCALE * float(np.hypot(config.blur_px, 0.29)))
-    first = standing.pad_px * MOSAIC_SCALE
+    first = static.pad_px * MOSAIC_SCALE
     last_y, last_x = (first + n * MOSAIC_SCALE for n in shape)
     tones = np.ascontiguousarray(blurred[first:last_y:MOSAIC_SCALE, first:last_x:MOSAIC_SCALE], dtype=np.float32)
     _draw_parked(tones, parked, sun=sun, gsd_m=gsd_m, rng=rng)
@@ -54,22 +56,22 @@ def other_sensor_image(
 def _draw_parked(
     out: NDArray[np.float32], parked: FloatArray, *, sun: FloatArray, gsd_m: float, rng: np.random.Generator
 ) -> None:
-    """Draw cars seen from straight above, by a camera so high that all rays are upright."""
+    """Draw cars seen vertically from above."""
     h, w = out.shape
     n = len(parked)
-    kinds = draw_kinds(np.zeros(n, bool), rng)
-    sizes = np.column_stack([kinds.length_m, kinds.width_m, kinds.height_m]) / gsd_m
+    dimensions = draw_dimensions(np.zeros(n, bool), rng)
+    sizes = np.column_stack([dimensions.length_m, dimensions.width_m, dimensions.height_m]) / gsd_m
     zero = np.zeros(n)
     pose = np.column_stack([parked, zero, zero, zero, sizes, zero])
     reach = sizes[:, :1] * (0.6 + float(np.hypot(*sun))) + 3
     limit = [w - 1, h - 1]
     box = np.column_stack([np.clip(parked[:, :2] - reach, 0, limit), np.clip(parked[:, :2] + reach, -1, limit)])
-    upright = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, -FAR_PX, 0, 0])
-    draw_sprites(
+    vertical = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, -FAR_PX, 0, 0])
+    draw_vehicles(
         out,
         np.zeros(out.shape, np.uint8),
-        Sprites(pose, kinds.shape, draw_tones(n, rng), box.astype(np.int64)),
-        table=np.tile(upright, (h, 1)),
+        VehicleSprites(pose, dimensions.shape, draw_tones(n, rng), box.astype(np.int64)),
+        table=np.tile(vertical, (h, 1)),
         pinhole=np.array([FAR_PX, 0.0, 0.0]),
         lens=np.array([0.0, 0.0, 0.0, 1.0]),
         sun=sun,

@@ -1,8 +1,8 @@
-"""From the city to a raw frame: every pixel by its own row's pose, nothing resampled twice.
+"""Rendering of raw frames by ray casting: each pixel by the pose of its own row, without intermediate resampling.
 
-The ground is one orthographic mosaic at twice the base image's resolution, already blurred as the optics blur. A raw
-pixel's ray goes down through what stands there (a height map: roofs, walls, crowns) to the ground, and takes the
-mosaic's grey. Vehicles are splatted over it with their own supersampling, each where it was when its row was exposed.
+The ground is an orthographic mosaic at twice the base image's resolution, blurred as by the optics. A raw pixel's ray
+is intersected with a height map (roofs, walls, crowns) and the ground, and the mosaic sampled there. Vehicles are drawn
+over it by supersampling, each at its position when its row was exposed.
 """
 
 from dataclasses import dataclass
@@ -11,30 +11,31 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray, GreyImage
+from schemas.arrays import FloatArray, GreyImage, IntArray
 from velfield.synthetic.city.relief import ground_height_at
 from velfield.synthetic.traffic.vehicles import LAYERS
 
 MOSAIC_SCALE = 2
 """Mosaic pixels a base pixel."""
 REACH_CELL = 16
-"""Cell of the coarse map of what may stand in a ray's way, base px."""
+"""Cell of the coarse map of heights that rays may meet, base px."""
 SAMPLES = 4
-"""Samples a pixel and axis where a vehicle is."""
-SPREAD_PX = 1.6
-"""Side of the square those samples cover: a box this wide blurs about as the optics do."""
-TALL_PX = 6.0
-"""What stands higher than this, base px, hides a vehicle."""
-SHADE = 0.52
-"""Light left in a shadow."""
+"""Samples along each axis of a pixel of a vehicle."""
+SAMPLED_SIDE_PX = 1.6
+"""Side of the square that those samples cover, px: a box filter of this width is about as wide as the optics' blur."""
+MIN_OCCLUDER_PX = 6.0
+"""Heights above this occlude vehicles, base px."""
+SHADOW_LIGHT = 0.52
+"""Fraction of the light in a shadow."""
 
 
 @dataclass(frozen=True)
-class Scene:
-    """What stands still, as the renderer wants it.
+class SceneMaps:
+    """The scene without vehicles, for the renderer.
 
     ``mosaic`` uint8 at MOSAIC_SCALE, ``height`` uint8 (base resolution, ``height_step_px`` base px a count), ``reach``
-    uint8 (cells of REACH_CELL: greatest height within a ray's reach); all start at base pixel ``origin``.
+    uint8 (cells of REACH_CELL: maximum height that a ray through the cell may meet); all start at base pixel
+    ``origin``.
     """
 
     mosaic: GreyImage
@@ -45,20 +46,22 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Sprites:
-    """Vehicles in one frame. ``pose`` (n, 10): x, y base px at its own row, direction rad, velocity x, y in base px a
-    row, that row, length, width, height base px, ground height; ``shape`` (n,); ``tones`` (n, 5); ``box`` (n, 4) raw
-    pixels x0, y0, x1, y1 (inclusive) it may touch."""
+class VehicleSprites:
+    """Vehicles of one frame. ``pose`` (n, 10): x, y base px at its own row, direction rad, velocity x, y in base px a
+    row, that row, length, width, height base px, ground height; ``shape`` (n,); ``tones`` (n, 5); ``box`` (n, 4)
+    bounding box in raw pixels x0, y0, x1, y1 (inclusive)."""
 
     pose: FloatArray
-    shape: NDArray[np.int64]
+    shape: IntArray
     tones: FloatArray
-    box: NDArray[np.int64]
+    box: IntArray
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def render_ground(und_x, und_y, table, pinhole, relief, relief_frame, mosaic, height, reach, origin, step, out, tall):  # type: ignore[no-untyped-def]
-    """Grey of every pixel without vehicles into ``out`` (h, w) float32; ``tall`` 1 where something hides the road."""
+def render_ground(  # type: ignore[no-untyped-def]
+    und_x, und_y, table, pinhole, relief, relief_frame, mosaic, height, reach, origin, step, out, occluder
+):
+    """Fill ``out`` (h, w) float32 with the scene without vehicles, ``occluder`` with 1 where vehicles are hidden."""
     f, cx, cy = pinhole[0], pinhole[1], pinhole[2]
     mh, mw = mosaic.shape
     for i in range(out.shape[0]):
@@ -81,16 +84,16 @@ def render_ground(und_x, und_y, table, pinhole, relief, relief_frame, mosaic, he
             inv = 1.0 / (r6 * u + r7 * v + r8 * f)
             sx, sy = (r0 * u + r1 * v + r2 * f) * inv, (r3 * u + r4 * v + r5 * f) * inv
             x0, y0 = px - pz * sx, py - pz * sy
-            # the neighbour's height is a good start: the relief is slow
+            # the neighbour's height is a good initial value: the relief is smooth
             for _ in range(2):
                 z = -ground_height_at(x0 + z * sx, y0 + z * sy, relief, relief_frame)
             x, y = x0 + z * sx, y0 + z * sy
             ci, cj = int((y - origin[1]) / 16.0), int((x - origin[0]) / 16.0)
-            tall[i, j] = 0
+            occluder[i, j] = 0
             shade = 1.0
             if 0 <= ci < reach.shape[0] and 0 <= cj < reach.shape[1] and reach[ci, cj] > 0:
                 x, y, above, wall = _first_hit(x, y, sx, sy, reach[ci, cj] * step, height, origin, step)
-                tall[i, j] = 1 if above > TALL_PX else 0
+                occluder[i, j] = 1 if above > MIN_OCCLUDER_PX else 0
                 if wall:
                     shade = 0.62 + 0.12 * (int(above / 7.0) & 1)
             gx, gy = (x - origin[0]) * 2.0, (y - origin[1]) * 2.0
@@ -104,9 +107,10 @@ def render_ground(und_x, und_y, table, pinhole, relief, relief_frame, mosaic, he
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _first_hit(x, y, sx, sy, highest, height, origin, step):  # type: ignore[no-untyped-def]
-    """Where a ray that would meet the ground at (x, y) first meets what stands: place, height, whether on a wall.
+    """First intersection of a ray, which meets the ground at (x, y), with the height map: position, height, whether on
+    a wall.
 
-    It comes down from the height ``highest`` in steps of about half a pixel sideways.
+    The ray is marched down from the height ``highest`` in steps of about half a pixel sideways.
     """
     lean = np.sqrt(sx * sx + sy * sy)
     n = int(highest * lean * 1.5) + 1
@@ -120,26 +124,26 @@ def _first_hit(x, y, sx, sy, highest, height, origin, step):  # type: ignore[no-
             continue
         here = height[i, j] * step
         if here >= level and here > 0.0:
-            # stepping in from the side below the top: a wall
+            # entered from the side below the top: a wall
             return qx, qy, level, here - level > 2.5 * drop + 3.0 and before < here - 3.0
         before = here
     return x, y, 0.0, False
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def splat(out, tall, pose, shape, tones, box, table, pinhole, lens, sun, layers):  # type: ignore[no-untyped-def]
+def _draw_vehicles(out, occluder, pose, shape, tones, box, table, pinhole, lens, sun, layers):  # type: ignore[no-untyped-def]
     """Draw vehicles and their shadows over ``out`` (h, w) float32; ``lens`` = a, centre x, centre y, half-diagonal.
 
-    The way from the picture to the vehicle is as good as linear within a pixel: three rays a pixel, and from them all
-    of its samples.
+    The transform from the image to a vehicle's axes is linear within a pixel to a good approximation: three rays a
+    pixel give all samples.
     """
-    step = SPREAD_PX / SAMPLES
+    step = SAMPLED_SIDE_PX / SAMPLES
     for n in range(len(pose)):
         far = 0.5 * np.hypot(pose[n, 6], pose[n, 7]) + 1.5
         lean = pose[n, 8] * np.hypot(sun[0], sun[1])
         for i in range(box[n, 1], box[n, 3] + 1):
             for j in range(box[n, 0], box[n, 2] + 1):
-                if tall[i, j] == 1:
+                if occluder[i, j] == 1:
                     continue
                 a, b, sa, sb = _ray(j, i, pose[n], table, pinhole, lens)
                 if np.hypot(a, b) > far + max(lean, pose[n, 8] * np.hypot(sa, sb)):
@@ -147,25 +151,26 @@ def splat(out, tall, pose, shape, tones, box, table, pinhole, lens, sun, layers)
                 ra, rb, _, _ = _ray(j + step, i, pose[n], table, pinhole, lens)
                 da, db, _, _ = _ray(j, i + step, pose[n], table, pinhole, lens)
                 c, s = np.cos(pose[n, 2]), np.sin(pose[n, 2])
-                seen, light, grey = 0, 0.0, 0.0
+                covered, light, grey = 0, 0.0, 0.0
                 for p in range(SAMPLES):
                     for q in range(SAMPLES):
                         u, v = q - 0.5 * (SAMPLES - 1), p - 0.5 * (SAMPLES - 1)
                         x, y = a + u * (ra - a) + v * (da - a), b + u * (rb - b) + v * (db - b)
                         m = _layer(x, y, sa, sb, pose[n], layers[shape[n]])
                         if m >= 0:
-                            seen += 1
+                            covered += 1
                             grey += tones[n, int(layers[shape[n], m, 5])]
                             continue
                         m = _layer(x, y, c * sun[0] + s * sun[1], c * sun[1] - s * sun[0], pose[n], layers[shape[n]])
-                        light += SHADE if m >= 0 else 1.0
-                if seen > 0 or light < SAMPLES * SAMPLES:
+                        light += SHADOW_LIGHT if m >= 0 else 1.0
+                if covered > 0 or light < SAMPLES * SAMPLES:
                     out[i, j] = (grey + light * out[i, j]) / (SAMPLES * SAMPLES)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _ray(u, v, pose, table, pinhole, lens):  # type: ignore[no-untyped-def]
-    """A raw place's ray in a vehicle's own axes: where it meets the ground along and across, and its two slopes."""
+    """The ray of a raw position in a vehicle's axes: its intersection with the ground along and across, and its
+    slopes."""
     ox, oy = u - lens[1], v - lens[2]
     scale = 1.0 / np.sqrt(1.0 - lens[0] * (ox * ox + oy * oy) / (lens[3] * lens[3]))
     row = min(max(v, 0.0), table.shape[0] - 1.001)
@@ -173,7 +178,7 @@ def _ray(u, v, pose, table, pinhole, lens):  # type: ignore[no-untyped-def]
     t = row - k
     d0 = lens[1] + ox * scale - (table[k, 12] * (1 - t) + table[k + 1, 12] * t + pinhole[1])
     d1 = lens[2] + oy * scale - (table[k, 13] * (1 - t) + table[k + 1, 13] * t + pinhole[2])
-    # pose changes so little from row to row that this row's will do; the shake does not
+    # between two rows the pose is constant to a good approximation, the vibration is not
     r = table[k]
     inv = 1.0 / (r[6] * d0 + r[7] * d1 + r[8] * pinhole[0])
     sx = (r[0] * d0 + r[1] * d1 + r[2] * pinhole[0]) * inv
@@ -187,7 +192,7 @@ def _ray(u, v, pose, table, pinhole, lens):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _layer(a, b, slope_a, slope_b, pose, layers):  # type: ignore[no-untyped-def]
-    """The highest layer that a ray down to the ground at (a, b) meets, -1: none."""
+    """The highest layer that a ray to the ground at (a, b) intersects; -1: none."""
     for m in range(layers.shape[0]):
         z = layers[m, 0] * pose[8]
         if _inside(a - z * slope_a, b - z * slope_b, layers[m], pose[6], pose[7]):
@@ -197,7 +202,7 @@ def _layer(a, b, slope_a, slope_b, pose, layers):  # type: ignore[no-untyped-def
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _inside(a, b, layer, length, width):  # type: ignore[no-untyped-def]
-    """Whether (a along, b across) lies in a layer's rectangle with rounded corners."""
+    """Whether (a along, b across) is in a layer's rectangle with rounded corners."""
     middle, half = 0.5 * (layer[1] + layer[2]) * length, 0.5 * (layer[2] - layer[1]) * length
     radius = layer[4] * width
     da, db = abs(a - middle) - (half - radius), abs(b) - (layer[3] * width - radius)
@@ -207,29 +212,41 @@ def _inside(a, b, layer, length, width):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def hidden(place, slope, height, origin, step):  # type: ignore[no-untyped-def]
-    """Whether the rays of ``slope`` (n, 2) down to the ground at ``place`` (n, 2) meet something tall before."""
-    out = np.zeros(len(place), dtype=np.bool_)
+def occluded(ground, slope, height, origin, step):  # type: ignore[no-untyped-def]
+    """Whether the rays of ``slope`` (n, 2) to the ground at ``ground`` (n, 2) meet an occluder."""
+    out = np.zeros(len(ground), dtype=np.bool_)
     highest = height.max() * step
-    for i in range(len(place)):
+    for i in range(len(ground)):
         if highest > 0:
             _, _, level, _ = _first_hit(
-                place[i, 0], place[i, 1], slope[i, 0], slope[i, 1], highest, height, origin, step
+                ground[i, 0], ground[i, 1], slope[i, 0], slope[i, 1], highest, height, origin, step
             )
-            out[i] = level > TALL_PX
+            out[i] = level > MIN_OCCLUDER_PX
     return out
 
 
-def draw_sprites(
+def draw_vehicles(
     out: NDArray[np.float32],
-    tall: GreyImage,
-    sprites: Sprites,
+    occluder: GreyImage,
+    vehicles: VehicleSprites,
     *,
     table: FloatArray,
     pinhole: FloatArray,
     lens: FloatArray,
     sun: FloatArray,
 ) -> None:
-    """Draw vehicles over ``out`` in place; see ``splat``."""
-    if len(sprites.pose):
-        splat(out, tall, sprites.pose, sprites.shape, sprites.tones, sprites.box, table, pinhole, lens, sun, LAYERS)
+    """Draw vehicles over ``out`` in place; see ``_draw_vehicles``."""
+    if len(vehicles.pose):
+        _draw_vehicles(
+            out,
+            occluder,
+            vehicles.pose,
+            vehicles.shape,
+            vehicles.tones,
+            vehicles.box,
+            table,
+            pinhole,
+            lens,
+            sun,
+            LAYERS,
+        )

@@ -1,5 +1,4 @@
-"""A run of a simulated flight against that flight's truth: what `velfield demo` says at its end, and the tests hold
-to."""
+"""Scores of a run of a simulated flight against its ground truth, as `velfield demo` prints them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,35 +33,35 @@ class RunScore:
     field: FieldScore
 
     def text(self) -> str:
-        """The scores for people, a line each."""
+        """The scores as text, a line for each stage."""
         r, d, t, f = self.registration, self.detection, self.tracking, self.field
         return "\n".join(
             (
-                "against the truth of the simulated flight:",
-                f"  registration  error {r.mean_px:.2f} px (mean), 95 % within {r.p95_px:.2f}, "
+                "against the ground truth of the simulated flight:",
+                f"  registration  error {r.mean_px:.2f} px (mean), {r.p95_px:.2f} px (95th percentile), "
                 f"jitter {r.jitter_px:.2f} px",
-                f"  cars          precision {d.precision:.3f}, recall {d.recall:.3f}, "
-                f"of the moving {d.recall_moving:.3f}, "
-                f"axis off by {np.degrees(d.axis_median_rad):.1f} degrees (median)",
-                f"  tracklets     precision {t.precision:.3f} ({t.precision_on_vehicle:.3f} where any place on a "
-                f"vehicle counts), recall of the moving {t.recall_moving:.3f}, "
-                f"speed off by {t.speed_error_mean_km_per_h:.2f} km/h (mean), "
-                f"each vehicle counted {t.passages_per_vehicle:.2f} times",
-                f"  field         modal direction within 10 degrees at {f.share_within:.1%} of "
-                f"{f.pixels} pixels with 5 or more vehicles; {f.undirected} where most stand have none",
+                f"  detections    precision {d.precision:.3f}, recall {d.recall:.3f}, "
+                f"recall of moving cars {d.recall_moving:.3f}, "
+                f"axis error {np.degrees(d.axis_error_median_rad):.1f} degrees (median)",
+                f"  tracklets     precision {t.precision:.3f} ({t.precision_on_vehicle:.3f} anywhere on a vehicle), "
+                f"recall of moving cars {t.recall_moving:.3f}, "
+                f"speed error {t.speed_error_mean_km_per_h:.2f} km/h (mean), "
+                f"{t.tracks_per_vehicle:.2f} tracks a vehicle",
+                f"  field         modal direction within 10 degrees at {f.fraction_within:.1%} of "
+                f"{f.pixels} pixels with 5 or more vehicles; none at {f.undirected} where most are stationary",
             )
         )
 
 
 def score_run(root: str | Path, flight: str | Path, *, min_count: int = 5) -> RunScore:
-    """Score a run folder against the simulated flight that it is of.
+    """Score a run folder against its simulated flight.
 
-    Where the run built its own base image, its base pixels are first brought to the truth's by the best homography.
+    If the run made its own base image, its base pixels are first transformed to the truth's by a fitted homography.
 
     Raises
     ------
     InputError
-        The flight has no truth, the run is not whole, or its base image is another one than the flight's.
+        The flight has no truth, the run is incomplete, or its base image is another one than the flight's.
     """
     run, truth = open_run(root), load_truth(Path(flight))
     source_index = run.frames.column("source_index")
@@ -75,14 +74,14 @@ def score_run(root: str | Path, flight: str | Path, *, min_count: int = 5) -> Ru
 
     frames = sorted(flight_frames)
     velocity = run.field.modal_velocity().astype(np.float64)
-    velocity[np.isnan(run.field.modal_direction_rad())] = np.nan  # who stands has no direction
+    velocity[np.isnan(run.field.modal_direction_rad())] = np.nan  # stationary: no direction
     some = frames[:: max(1, len(frames) // 20)]
     to_truth = None if run.grid.how == "given" else fit_homography(truth, to_base, some)
     registration = score_registration(truth, to_base, frames, to_truth=to_truth)
     if to_truth is None and registration.mean_px > _ANOTHER_BASE_PX:
         raise InputError(
-            f"{run.layout.root}: places lie {registration.mean_px:.0f} px off those of {flight} (mean): its base image "
-            f"is another one; score a run with --base {Path(flight) / 'base.png'}, or with none"
+            f"{run.layout.root}: positions differ from those of {flight} by {registration.mean_px:.0f} px (mean): its "
+            f"base image is another one; score a run with --base {Path(flight) / 'base.png'}, or with none"
         )
     return RunScore(
         registration=registration,

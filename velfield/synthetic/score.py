@@ -1,7 +1,7 @@
-"""How near a run comes to a simulated flight's truth, in words of the domain.
+"""Scores of a run against the ground truth of a simulated flight.
 
-Where no base image was given, a run's base pixels are another picture's: ``fit_homography`` finds the best homography
-to the truth's, and each score takes it as ``to_truth``.
+Without a given base image a run's base pixels are those of another image: ``fit_homography`` fits the homography to the
+truth's, and each score takes it as ``to_truth``.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,25 +14,25 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
-from schemas.arrays import FloatArray
+from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.synthetic.truth import Truth
 
 ToBase = Callable[[int, FloatArray], FloatArray]
 
 MATCH_PX = 8.0
-"""A detection within this of a car's middle is that car, base px. Paper: half a car's length."""
+"""Largest distance of a detection from the centre of the car it matches, base px. Paper: half a car's length."""
 BORDER_PX = 14.0
-"""Cars whose middle is nearer than this to the frame's border need not be found, raw px."""
+"""Cars whose centre is nearer than this to the frame's border are not evaluated, raw px."""
 CELL_PX = 64.0
-"""Cells in which the error that stays is told from jitter, base px."""
+"""Cells in which the constant error is separated from jitter, base px."""
 
 
 @dataclass(frozen=True)
 class RegistrationScore:
-    """Errors of the raw-to-base map, base px, over a grid of points in all registered frames.
+    """Errors of the raw-to-base transform, base px, over a grid of points in all registered frames.
 
-    ``jitter_px``: root mean square of what changes from frame to frame at one place, the mean of the place taken off.
-    ``drift_px``: how far the places' mean error moved from the first tenth of the frames to the last.
+    ``jitter_px``: root mean square of the error about its mean over the frames at each position.
+    ``drift_px``: change of the mean error from the first tenth of the frames to the last.
     """
 
     mean_px: float
@@ -47,25 +47,25 @@ class RegistrationScore:
 
 @dataclass(frozen=True)
 class DetectionScore:
-    """Cars found. Cars cut by the frame's border are neither wanted nor wrong."""
+    """Detections against cars. Cars cut by the frame's border count neither as missed nor as false positives."""
 
     precision: float
     recall: float
     f1: float
     recall_moving: float
-    place_px: float
-    axis_median_rad: float
+    position_error_px: float
+    axis_error_median_rad: float
     detections: int
     cars: int
 
 
 @dataclass(frozen=True)
 class TrackletScore:
-    """Tracklets whose three detections are one vehicle; speeds of those, against the truth between the same frames.
+    """Tracklets whose three detections are of one vehicle; their speeds against the truth between the same frames.
 
-    ``precision_on_vehicle``: where a place counts that is anywhere along a vehicle, not only near its middle: of a
-    lorry the load may be what is followed.
-    ``passages_per_vehicle``: how often a vehicle is counted in all; one would be right.
+    ``precision_on_vehicle``: with detections anywhere along a vehicle, not only near its centre: of a lorry the load
+    may be tracked.
+    ``tracks_per_vehicle``: mean number of tracks of a vehicle; ideally one.
     """
 
     precision: float
@@ -76,17 +76,17 @@ class TrackletScore:
     speed_bias_km_per_h: float
     direction_error_mean_rad: float
     tracklets: int
-    passages_per_vehicle: float
+    tracks_per_vehicle: float
 
 
 @dataclass(frozen=True)
 class FieldScore:
-    """Pixels with enough passages: how many, and the share whose modal direction is within 10 degrees of a lane's.
+    """Pixels with enough tracks: their number, and the fraction whose modal direction is within 10 degrees of a lane's.
 
-    ``undirected``: pixels with enough passages besides, without a direction (most vehicles stand there).
+    ``undirected``: number of further pixels with enough tracks but without a direction (most vehicles are stationary).
     """
 
-    share_within: float
+    fraction_within: float
     pixels: int
     median_error_rad: float
     undirected: int
@@ -100,7 +100,7 @@ def sample_grid(truth: Truth, *, columns: int = 24, rows: int = 18) -> FloatArra
 
 
 def fit_homography(truth: Truth, to_base: ToBase, frames: list[int] | range) -> FloatArray:
-    """The homography (3, 3) from a run's base pixels to the truth's that fits best over a grid in ``frames``."""
+    """The least-squares homography (3, 3) from a run's base pixels to the truth's over a grid in ``frames``."""
     grid = sample_grid(truth, columns=12, rows=9)
     found = np.concatenate([to_base(frame, grid) for frame in frames])
     true = np.concatenate([truth.to_base(frame, grid) for frame in frames])
@@ -110,7 +110,7 @@ def fit_homography(truth: Truth, to_base: ToBase, frames: list[int] | range) -> 
 
 
 def apply_homography(matrix: FloatArray | None, xy: FloatArray) -> FloatArray:
-    """Points (n, 2) under a homography; unchanged where there is none."""
+    """Points (n, 2) transformed by a homography; unchanged if it is None."""
     if matrix is None:
         return xy
     h = np.column_stack([xy, np.ones(len(xy))]) @ matrix.T
@@ -120,23 +120,23 @@ def apply_homography(matrix: FloatArray | None, xy: FloatArray) -> FloatArray:
 def score_registration(
     truth: Truth, to_base: ToBase, frames: list[int] | range, *, to_truth: FloatArray | None = None
 ) -> RegistrationScore:
-    """Score a run's raw-to-base map over its registered ``frames``.
+    """Score a run's raw-to-base transform over its registered ``frames``.
 
-    Points that the truth sees outside of the base image are left out, as are those where the run gives NaN.
+    Points outside the base image by the truth are not evaluated, nor those where the run gives NaN.
     """
     grid = sample_grid(truth)
-    places, errors, numbers = [], [], []
+    positions, errors, numbers = [], [], []
     for frame in frames:
         true = truth.to_base(frame, grid)
         error = apply_homography(to_truth, to_base(frame, grid)) - true
         inside = (true >= 0).all(axis=1) & (true < truth.base_shape[::-1]).all(axis=1) & np.isfinite(error).all(axis=1)
-        places.append(true[inside])
+        positions.append(true[inside])
         errors.append(error[inside])
         numbers.append(np.full(int(inside.sum()), frame))
-    place, error, number = np.concatenate(places), np.concatenate(errors), np.concatenate(numbers)
+    position, error, number = np.concatenate(positions), np.concatenate(errors), np.concatenate(numbers)
     size = np.hypot(error[:, 0], error[:, 1])
     by_frame = pd.Series(size).groupby(number).mean().to_numpy()
-    rest = _changing(place, error, number)
+    rest = _deviations(position, error, number)
     return RegistrationScore(
         mean_px=float(size.mean()),
         median_px=float(np.median(size)),
@@ -149,9 +149,9 @@ def score_registration(
     )
 
 
-def _changing(place: FloatArray, error: FloatArray, frame: NDArray[np.int64]) -> pd.DataFrame:
-    """Errors ex, ey by cell (i, j) and frame, the cell's mean over the frames taken off."""
-    cell = np.floor(place / CELL_PX).astype(np.int64)
+def _deviations(position: FloatArray, error: FloatArray, frame: IntArray) -> pd.DataFrame:
+    """Errors ex, ey by cell (i, j) and frame, minus the cell's mean over the frames."""
+    cell = np.floor(position / CELL_PX).astype(np.int64)
     table = pd.DataFrame({"i": cell[:, 1], "j": cell[:, 0], "frame": frame, "ex": error[:, 0], "ey": error[:, 1]})
     each = table.groupby(["i", "j", "frame"])[["ex", "ey"]].mean()
     return each - each.groupby(["i", "j"]).transform("mean")
@@ -177,30 +177,31 @@ def score_detections(
         cars = _cars(truth, _flight_frame(frame, frame_of))
         xy = apply_homography(to_truth, found[["x_px", "y_px"]].to_numpy(dtype=np.float64))
         pairs = _match(xy, cars[["x_base_px", "y_base_px"]].to_numpy(), match_px)
-        wanted = cars["wanted"].to_numpy()
-        ignored = ~wanted[pairs[:, 1]]
+        evaluated = cars["evaluated"].to_numpy()
+        ignored = ~evaluated[pairs[:, 1]]
         n_detections += len(xy) - int(ignored.sum())
-        n_cars += int(wanted.sum())
-        n_moving += int((wanted & cars["moving"]).sum())
+        n_cars += int(evaluated.sum())
+        n_moving += int((evaluated & cars["moving"]).sum())
         pairs = pairs[~ignored]
         here = cars.iloc[pairs[:, 1]]
-        turn = 0.0 if to_truth is None else float(np.arctan2(to_truth[1, 0], to_truth[0, 0]))
-        axis = (
-            found["orientation_rad"].to_numpy(dtype=np.float64)[pairs[:, 0]] + turn - here["orientation_rad"].to_numpy()
-        )
-        place = xy[pairs[:, 0]] - here[["x_base_px", "y_base_px"]].to_numpy()
+        rotation = 0.0 if to_truth is None else float(np.arctan2(to_truth[1, 0], to_truth[0, 0]))
+        orientation = found["orientation_rad"].to_numpy(dtype=np.float64)[pairs[:, 0]]
+        axis = orientation + rotation - here["orientation_rad"].to_numpy()
+        position = xy[pairs[:, 0]] - here[["x_base_px", "y_base_px"]].to_numpy()
         matches.append(
-            pd.DataFrame({"moving": here["moving"].to_numpy(), "axis": _axial(axis), "place": np.hypot(*place.T)})
+            pd.DataFrame({"moving": here["moving"].to_numpy(), "axis": _axial(axis), "position": np.hypot(*position.T)})
         )
-    table = pd.concat(matches, ignore_index=True) if matches else pd.DataFrame({"moving": [], "axis": [], "place": []})
+    table = (
+        pd.concat(matches, ignore_index=True) if matches else pd.DataFrame({"moving": [], "axis": [], "position": []})
+    )
     precision, recall = len(table) / max(n_detections, 1), len(table) / max(n_cars, 1)
     return DetectionScore(
         precision=precision,
         recall=recall,
         f1=2 * precision * recall / max(precision + recall, 1e-9),
         recall_moving=float(table["moving"].sum()) / max(n_moving, 1),
-        place_px=float(table["place"].median()),
-        axis_median_rad=float(table["axis"].median()),
+        position_error_px=float(table["position"].median()),
+        axis_error_median_rad=float(table["axis"].median()),
         detections=n_detections,
         cars=n_cars,
     )
@@ -214,40 +215,42 @@ def score_tracklets(
     to_truth: FloatArray | None = None,
     match_px: float = MATCH_PX,
 ) -> TrackletScore:
-    """Score tracklets: right where all three detections are nearest to one vehicle, within ``match_px`` of it."""
+    """Score tracklets: correct if all three detections are nearest to one vehicle, within ``match_px`` of it."""
     frames = [np.array([_flight_frame(f, frame_of) for f in tracklets[f"frame_{k}"]], dtype=np.int64) for k in range(3)]
-    places = [apply_homography(to_truth, tracklets[[f"x_{k}_px", f"y_{k}_px"]].to_numpy(np.float64)) for k in range(3)]
-    vehicles = np.stack([_nearest_vehicle(truth, f, xy, match_px) for f, xy in zip(frames, places, strict=True)])
-    right = _same(vehicles)
-    touched = [_nearest_vehicle(truth, f, xy, match_px, along=True) for f, xy in zip(frames, places, strict=True)]
+    positions = [
+        apply_homography(to_truth, tracklets[[f"x_{k}_px", f"y_{k}_px"]].to_numpy(np.float64)) for k in range(3)
+    ]
+    vehicles = np.stack([_nearest_vehicle(truth, f, xy, match_px) for f, xy in zip(frames, positions, strict=True)])
+    right = _one_vehicle(vehicles)
+    touched = [_nearest_vehicle(truth, f, xy, match_px, along=True) for f, xy in zip(frames, positions, strict=True)]
     cars = truth.cars.set_index(["frame", "vehicle_id"])
     table = pd.DataFrame({"frame": frames[1], "vehicle_id": vehicles[1]})[right]
     here = cars.loc[pd.MultiIndex.from_frame(table)] if len(table) else cars.iloc[:0]
     moving = here["moving"].to_numpy(dtype=bool)
-    v = 0.5 * sum(_velocity(tracklets, name, places[k], to_truth)[right] for k, name in ((0, "01"), (1, "12")))
+    v = 0.5 * sum(_velocity(tracklets, name, positions[k], to_truth)[right] for k, name in ((0, "01"), (1, "12")))
     v = np.asarray(v).reshape(-1, 2)
     true = here[["vx_px_per_s", "vy_px_per_s"]].to_numpy()
     to_km_h = truth.gsd_m * 3.6
     fast = moving & (np.hypot(*true.T) * to_km_h > 20)
     speed = (np.hypot(*v.T) - np.hypot(*true.T)) * to_km_h
-    turn = np.abs(np.angle(np.exp(1j * (np.arctan2(v[:, 1], v[:, 0]) - np.arctan2(true[:, 1], true[:, 0])))))
-    claimed = np.hypot(*_velocity(tracklets, "01", places[0], to_truth).T) * to_km_h > 5
+    direction = np.abs(np.angle(np.exp(1j * (np.arctan2(v[:, 1], v[:, 0]) - np.arctan2(true[:, 1], true[:, 0])))))
+    claimed = np.hypot(*_velocity(tracklets, "01", positions[0], to_truth).T) * to_km_h > 5
     triples = _true_triples(truth, list(zip(*frames, strict=True)))
     hit = set(zip(frames[1][right].tolist(), vehicles[1][right].tolist(), strict=True))
     return TrackletScore(
         precision=float(right.mean()) if len(right) else 0.0,
         precision_moving=float(right[claimed].mean()) if claimed.any() else 0.0,
-        precision_on_vehicle=float(_same(np.stack(touched)).mean()) if len(right) else 0.0,
+        precision_on_vehicle=float(_one_vehicle(np.stack(touched)).mean()) if len(right) else 0.0,
         recall_moving=len(hit & triples) / max(len(triples), 1),
         speed_error_mean_km_per_h=float(np.abs(speed[moving]).mean()) if moving.any() else 0.0,
         speed_bias_km_per_h=float(speed[moving].mean()) if moving.any() else 0.0,
-        direction_error_mean_rad=float(turn[fast].mean()) if fast.any() else 0.0,
+        direction_error_mean_rad=float(direction[fast].mean()) if fast.any() else 0.0,
         tracklets=len(right),
-        passages_per_vehicle=_passages_per_vehicle(tracklets["passage_id"].to_numpy()[right], vehicles[1][right]),
+        tracks_per_vehicle=_tracks_per_vehicle(tracklets["passage_id"].to_numpy()[right], vehicles[1][right]),
     )
 
 
-def _passages_per_vehicle(passage: NDArray[np.int64], vehicle: NDArray[np.int64]) -> float:
+def _tracks_per_vehicle(passage: IntArray, vehicle: IntArray) -> float:
     pairs = np.unique(np.stack([passage, vehicle], axis=1), axis=0)
     return len(pairs) / max(len(np.unique(vehicle)), 1)
 
@@ -269,28 +272,28 @@ def score_field(
     direction = np.arctan2(modal_velocity[..., 1], modal_velocity[..., 0])
     enough = np.asarray(count) >= min_count
     rows, columns = np.nonzero(enough & np.isfinite(direction))
-    place = np.column_stack([columns, rows]).astype(np.float64)
+    position = np.column_stack([columns, rows]).astype(np.float64)
     v = modal_velocity[rows, columns]
     v = v / np.maximum(np.hypot(v[:, 0], v[:, 1])[:, None], 1e-9)
-    ahead = apply_homography(to_truth, place + v)
-    place = apply_homography(to_truth, place)
-    angle = np.arctan2(*(ahead - place).T[::-1])
-    errors = _direction_errors(truth, place, angle)
+    ahead = apply_homography(to_truth, position + v)
+    position = apply_homography(to_truth, position)
+    angle = np.arctan2(*(ahead - position).T[::-1])
+    errors = _direction_errors(truth, position, angle)
     within = float((errors <= within_rad).mean()) if len(errors) else 0.0
     return FieldScore(
-        share_within=within,
+        fraction_within=within,
         pixels=len(errors),
         median_error_rad=float(np.median(errors)) if len(errors) else float("nan"),
         undirected=int((enough & ~np.isfinite(direction)).sum()),
     )
 
 
-def _direction_errors(truth: Truth, place: FloatArray, angle: FloatArray) -> FloatArray:
-    """Errors at places (n, 2): each place's angle against the lanes at its nearest pixel."""
+def _direction_errors(truth: Truth, position: FloatArray, angle: FloatArray) -> FloatArray:
+    """Direction errors at positions (n, 2), against the lanes at the nearest pixel."""
     h, w = truth.base_shape
-    at = np.rint(place)
+    at = np.rint(position)
     inside = ((at >= 0) & (at < [w, h])).all(axis=1)
-    errors = np.full(len(place), np.pi)
+    errors = np.full(len(position), np.pi)
     errors[inside] = truth.direction_error_rad(at[inside], angle[inside])
     return errors
 
@@ -301,18 +304,18 @@ def _flight_frame(frame: object, frame_of: Mapping[int, int] | None) -> int:
 
 
 def _cars(truth: Truth, frame: int) -> pd.DataFrame:
-    """Cars of a frame that may be met, and whether they are ``wanted``: well within the frame."""
+    """Cars within or near a frame, and whether they are ``evaluated``: visible, and not near its border."""
     cars = truth.cars[truth.cars["frame"] == frame]
     size = [truth.camera.width - 1, truth.camera.height - 1]
     raw = cars[["x_raw_px", "y_raw_px"]].to_numpy()
     deep = (raw > BORDER_PX).all(axis=1) & (raw < np.array(size) - BORDER_PX).all(axis=1)
     near = (raw > -BORDER_PX).all(axis=1) & (raw < np.array(size) + BORDER_PX).all(axis=1)
-    wanted = cars.assign(wanted=deep & cars["visible"].to_numpy())
-    return wanted.iloc[np.flatnonzero(near)].reset_index(drop=True)
+    evaluated = cars.assign(evaluated=deep & cars["visible"].to_numpy())
+    return evaluated.iloc[np.flatnonzero(near)].reset_index(drop=True)
 
 
-def _match(found: FloatArray, true: FloatArray, match_px: float) -> NDArray[np.int64]:
-    """Pairs (n, 2) of numbers, one to one, each within ``match_px``, of least total distance."""
+def _match(found: FloatArray, true: FloatArray, match_px: float) -> IntArray:
+    """Pairs (n, 2) of indices: the one-to-one assignment of minimum total distance, each within ``match_px``."""
     if not len(found) or not len(true):
         return np.empty((0, 2), dtype=np.int64)
     distance = np.hypot(found[:, None, 0] - true[None, :, 0], found[:, None, 1] - true[None, :, 1])
@@ -321,66 +324,66 @@ def _match(found: FloatArray, true: FloatArray, match_px: float) -> NDArray[np.i
     return np.column_stack([a[good], b[good]]).astype(np.int64)
 
 
-def _same(vehicles: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """(n,) whether three places, (3, n) vehicles or -1, are one vehicle's."""
+def _one_vehicle(vehicles: IntArray) -> Mask:
+    """(n,) whether the three positions of a tracklet, (3, n) vehicles or -1, are of one vehicle."""
     return np.asarray((vehicles[0] >= 0) & (vehicles[0] == vehicles[1]) & (vehicles[0] == vehicles[2]))
 
 
 def _nearest_vehicle(
-    truth: Truth, frame: NDArray[np.int64], xy: FloatArray, match_px: float, *, along: bool = False
-) -> NDArray[np.int64]:
-    """(n,) the vehicle whose middle, or any place along it, is nearest and within ``match_px``; -1 where none is."""
+    truth: Truth, frame: IntArray, xy: FloatArray, match_px: float, *, along: bool = False
+) -> IntArray:
+    """(n,) the vehicle whose centre, or any position along it, is nearest and within ``match_px``; -1: none."""
     out = np.full(len(xy), -1, dtype=np.int64)
     for f in np.unique(frame):
         cars = truth.cars[truth.cars["frame"] == f]
         here = np.flatnonzero(frame == f)
         if len(cars):
-            places, vehicle = _along(cars, match_px) if along else (_middles(cars), cars["vehicle_id"].to_numpy())
-            distance, k = cKDTree(places).query(xy[here])
+            positions, vehicle = _along(cars, match_px) if along else (_centres(cars), cars["vehicle_id"].to_numpy())
+            distance, k = cKDTree(positions).query(xy[here])
             out[here] = np.where(distance <= match_px, vehicle[np.minimum(k, len(vehicle) - 1)], -1)
     return out
 
 
-def _middles(cars: pd.DataFrame) -> FloatArray:
+def _centres(cars: pd.DataFrame) -> FloatArray:
     return cars[["x_base_px", "y_base_px"]].to_numpy(np.float64)
 
 
-def _along(cars: pd.DataFrame, match_px: float) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Places (m, 2) along the vehicles, none nearer to an end than ``match_px`` but the middle, and whose they are."""
+def _along(cars: pd.DataFrame, match_px: float) -> tuple[FloatArray, IntArray]:
+    """Positions (m, 2) along the vehicles, ``match_px`` or more from the ends except the centre, and their vehicles."""
     half = np.maximum(cars["length_px"].to_numpy(np.float64) / 2 - match_px, 0.0)
     steps = np.linspace(-1.0, 1.0, 13)  # 2 px apart on the longest bus
     axis = cars["orientation_rad"].to_numpy(np.float64)
     ahead = np.column_stack([np.cos(axis), np.sin(axis)]) * half[:, None]
-    places = _middles(cars)[:, None] + steps[:, None] * ahead[:, None]
-    return places.reshape(-1, 2), np.repeat(cars["vehicle_id"].to_numpy(), len(steps))
+    positions = _centres(cars)[:, None] + steps[:, None] * ahead[:, None]
+    return positions.reshape(-1, 2), np.repeat(cars["vehicle_id"].to_numpy(), len(steps))
 
 
-def _velocity(tracklets: pd.DataFrame, part: str, place: FloatArray, to_truth: FloatArray | None) -> FloatArray:
-    """Velocities (n, 2) of one segment, px/s, carried over to the truth's base image."""
+def _velocity(tracklets: pd.DataFrame, part: str, position: FloatArray, to_truth: FloatArray | None) -> FloatArray:
+    """Velocities (n, 2) of one segment, px/s, in the truth's base image."""
     v: FloatArray = tracklets[[f"vx_{part}_px_per_s", f"vy_{part}_px_per_s"]].to_numpy(np.float64)
     if to_truth is None:
         return v
-    back = apply_homography(np.asarray(np.linalg.inv(to_truth), dtype=np.float64), place)
+    back = apply_homography(np.asarray(np.linalg.inv(to_truth), dtype=np.float64), position)
     ahead = apply_homography(to_truth, back + 0.01 * v)
-    return np.asarray((ahead - place) / 0.01)
+    return np.asarray((ahead - position) / 0.01)
 
 
 def _true_triples(truth: Truth, windows: list[tuple[int, int, int]]) -> set[tuple[int, int]]:
-    """(middle frame, vehicle) of all moving cars that are wanted in all three frames of some window."""
-    wanted: dict[int, set[int]] = {}
+    """(middle frame, vehicle) of all moving cars that are evaluated in all three frames of a window."""
+    evaluated: dict[int, set[int]] = {}
     moving: dict[int, set[int]] = {}
     out: set[tuple[int, int]] = set()
     for window in set(windows):
         for frame in window:
-            if frame not in wanted:
+            if frame not in evaluated:
                 cars = _cars(truth, frame)
-                wanted[frame] = set(cars.loc[cars["wanted"], "vehicle_id"].tolist())
-                moving[frame] = set(cars.loc[cars["wanted"] & cars["moving"], "vehicle_id"].tolist())
-        both = wanted[window[0]] & wanted[window[2]] & moving[window[1]]
+                evaluated[frame] = set(cars.loc[cars["evaluated"], "vehicle_id"].tolist())
+                moving[frame] = set(cars.loc[cars["evaluated"] & cars["moving"], "vehicle_id"].tolist())
+        both = evaluated[window[0]] & evaluated[window[2]] & moving[window[1]]
         out |= {(window[1], vehicle) for vehicle in both}
     return out
 
 
 def _axial(angle: FloatArray) -> FloatArray:
-    """Size of the difference of two axes, [0, pi/2]."""
+    """Absolute difference of two axes, [0, pi/2]."""
     return np.asarray(np.abs(np.mod(angle + np.pi / 2, np.pi) - np.pi / 2))

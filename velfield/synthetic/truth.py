@@ -1,4 +1,4 @@
-"""What is true of a simulated flight, in memory or as ``truth/`` keeps it: maps, cars, lanes."""
+"""Ground truth of a simulated flight, in memory or in ``truth/``: transforms, cars, lanes."""
 
 import json
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ from velfield.synthetic.flight import Flight
 CAR_COLUMNS: dict[str, str] = {
     "frame": "int32",
     "vehicle_id": "int64",
-    "time_s": "float64",  # when the row that shows the car was exposed; x, y and the velocity hold for this time
-    "x_raw_px": "float64",  # where its middle meets the ground
+    "time_s": "float64",  # exposure time of the row that shows the car; x, y and the velocity are of this time
+    "x_raw_px": "float64",  # its centre on the ground
     "y_raw_px": "float64",
     "x_base_px": "float64",
     "y_base_px": "float64",
@@ -30,16 +30,18 @@ CAR_COLUMNS: dict[str, str] = {
     "length_px": "float64",  # base pixels
     "width_px": "float64",
     "moving": "bool",  # faster than 0.5 m/s
-    "visible": "bool",  # its middle is within the frame, and no building hides it
+    "visible": "bool",  # its centre is within the frame and not occluded by a building or a tree
 }
-"""Columns of ``truth/cars.parquet``: every vehicle of every frame, also beyond the frame's border."""
+"""Columns of ``truth/cars.parquet``: every vehicle in every frame, also beyond the frame's border."""
 
 LANE_WIDTH_M = 3.5
+_RENAMED = {"place_px": "position_px"}
+"""Keys of ``truth/camera.json`` of flights simulated by the release before, and their names now."""
 
 
 @dataclass(frozen=True)
 class LanePath:
-    """The middle of a lane: ``path_px`` (n, 2) base px in the direction of travel; its limit in base px/s."""
+    """The centre line of a lane: ``path_px`` (n, 2) base px in the direction of travel; its limit in base px/s."""
 
     kind: str
     path_px: FloatArray
@@ -48,7 +50,7 @@ class LanePath:
 
 @dataclass(frozen=True)
 class Truth:
-    """The truth of one flight."""
+    """The ground truth of one flight."""
 
     camera: Camera
     times_s: FloatArray
@@ -66,21 +68,21 @@ class Truth:
         return self.camera.to_raw(frame, xy_base)
 
     def direction_error_rad(self, xy: FloatArray, direction_rad: FloatArray) -> FloatArray:
-        """How far directions (n,) at base pixels (n, 2) are from the nearest direction of a lane there.
+        """Angle between directions (n,) at base pixels (n, 2) and the closest direction of a lane there, rad.
 
-        pi where no lane is within half a lane's width and half a metre. In a tight turn a lane's direction is that of
-        its path where the path is nearest.
+        pi where no lane is within half a lane's width and half a metre. A lane's direction is that of its centre line
+        at the nearest point.
         """
         error = np.full(len(xy), np.pi)
         reach_px = max(round((LANE_WIDTH_M + 1.0) / self.gsd_m), 1) / 2
         for lane in self.lanes:
-            _least_error(lane.path_px, reach_px, xy, direction_rad, error)
+            _lower_errors(lane.path_px, reach_px, xy, direction_rad, error)
         return error
 
     def segments(self, *, max_interval_s: float = 0.45) -> pd.DataFrame:
-        """True moves from frame to frame: vehicle_id, frame, x_0, y_0, x_1, y_1 (base px), vx, vy px/s.
+        """True displacements from frame to frame: vehicle_id, frame, x_0, y_0, x_1, y_1 (base px), vx, vy px/s.
 
-        Of vehicles that are visible and moving in both frames; what a perfect tracker would give to the field.
+        Of vehicles that are visible and moving in both frames: the segments of a perfect tracker.
         """
         cars = self.cars[self.cars["visible"] & self.cars["moving"]].sort_values(["vehicle_id", "frame"])
         later = cars.shift(-1)
@@ -103,12 +105,12 @@ class Truth:
         ).reset_index(drop=True)
 
 
-def truth_of(flight: Flight) -> Truth:
-    """The truth of a flight in memory."""
+def make_truth(flight: Flight) -> Truth:
+    """The ground truth of a flight in memory."""
     cars = pd.concat([flight.cars(frame) for frame in range(flight.config.frames)], ignore_index=True)
     lanes = [
         LanePath(edge.kind, flight.city.to_px(edge.path), edge.speed_m_per_s / flight.config.gsd_m)
-        for edge in flight.city.plan.network.edges
+        for edge in flight.city.plan.road_network.edges
     ]
     cars = cars.astype(CAR_COLUMNS)
     return Truth(flight.camera, flight.times_s, flight.config.gsd_m, flight.base_shape, cars, lanes)
@@ -128,12 +130,12 @@ def save_truth(truth: Truth, folder: Path) -> None:
 
 
 def load_truth(folder: Path) -> Truth:
-    """Read a simulated flight's truth: ``folder`` is the flight's folder or its ``truth/``.
+    """Read the ground truth of a simulated flight: ``folder`` is the flight's folder or its ``truth/``.
 
     Raises
     ------
     InputError
-        Where there is none.
+        There is none.
     """
     inner = folder / "truth" if (folder / "truth").is_dir() else folder
     if not (inner / "camera.json").is_file():
@@ -160,16 +162,16 @@ def _camera_record(camera: Camera) -> dict[str, Any]:
 
 
 def _camera_from(record: dict[str, Any]) -> Camera:
-    values = dict(record)
+    values = {_RENAMED.get(name, name): value for name, value in record.items()}
     for name, kind in (("motion", Waves), ("shake", Waves), ("relief", Relief)):
         values[name] = kind(**{key: np.array(array) for key, array in record[name].items()})
-    for name in ("place_px", "times_s"):
-        values[name] = np.array(record[name])
+    for name in ("position_px", "times_s"):
+        values[name] = np.array(values[name])
     return Camera(**values)
 
 
-def _least_error(path: FloatArray, reach: float, xy: FloatArray, direction_rad: FloatArray, error: FloatArray) -> None:
-    """Lower ``error`` (n,) where a lane's direction is nearer, in place, within ``reach`` of its path."""
+def _lower_errors(path: FloatArray, reach: float, xy: FloatArray, direction_rad: FloatArray, error: FloatArray) -> None:
+    """Lower ``error`` (n,) in place to the angle to a lane's direction where it is smaller, within ``reach`` of it."""
     around = np.flatnonzero(((xy > path.min(axis=0) - reach) & (xy < path.max(axis=0) + reach)).all(axis=1))
     step = np.diff(path, axis=0)
     length = np.hypot(*step.T)

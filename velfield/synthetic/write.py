@@ -1,4 +1,4 @@
-"""Writes a simulated flight as a user would have it (frames, times, base image, labels), and the truth beside it."""
+"""Writing of a simulated flight as a user's input (frames, times, base image, labels), with the ground truth."""
 
 import json
 from collections.abc import Callable
@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from schemas.simulation import SimulationConfig
 from velfield.errors import InputError
 from velfield.synthetic.flight import Flight, simulate
-from velfield.synthetic.truth import save_truth, truth_of
+from velfield.synthetic.truth import make_truth, save_truth
 
 WRITERS = 2
-"""Threads that render and write; numba, OpenCV and NumPy let go of the interpreter while they work."""
+"""Threads that render and write; numba, OpenCV and NumPy release the interpreter lock."""
 
 
 def write_flight(
@@ -26,26 +26,26 @@ def write_flight(
 
     Parameters
     ----------
-    out : folder, made where it is not there; one that holds other things is refused.
+    out : folder, created if needed; one with other files is refused.
     config : SimulationConfig
-    progress : called with (frames done, frames in all).
+    progress : called with (frames done, number of frames).
 
     Raises
     ------
     InputError
-        Where ``out`` holds a flight of another configuration, or other files.
+        ``out`` holds a flight of another configuration, or other files.
     """
     _claim(out, config)
     flight = simulate(config)
     flight.prepare()
-    _write_picture(out / "base.png", flight.base_image, [])
+    _write_image(out / "base.png", flight.base_image, [])
     names = [frame_name(k, config) for k in range(config.frames)]
     pd.DataFrame({"frame": names, "time_s": np.round(flight.times_s, 6)}).to_csv(out / "timestamps.csv", index=False)
     labels = [flight.labels(k).assign(frame=names[k]) for k in labelled_frames(config)]
     columns = ["frame", "x_px", "y_px", "orientation_rad", "length_px", "width_px"]
     if labels:
         pd.concat(labels)[columns].round(3).to_csv(out / "labels.csv", index=False)
-    save_truth(truth_of(flight), out / "truth")
+    save_truth(make_truth(flight), out / "truth")
     options = (
         [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality]
         if config.picture_format == "jpg"
@@ -53,14 +53,14 @@ def write_flight(
     )
 
     def one(k: int) -> None:
-        _write_picture(out / "frames" / names[k], flight.frame(k), options)
+        _write_image(out / "frames" / names[k], flight.frame(k), options)
 
     with ThreadPoolExecutor(threads) as pool:
         try:
             for done, _ in enumerate(pool.map(one, range(config.frames)), start=1):
                 if progress is not None:
                     progress(done, config.frames)
-        except BaseException:  # Ctrl-C above all: the frames not begun are not waited for
+        except BaseException:  # Ctrl-C above all: cancel the frames that have not begun
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     return flight
@@ -72,7 +72,7 @@ def frame_name(index: int, config: SimulationConfig) -> str:
 
 
 def labelled_frames(config: SimulationConfig) -> list[int]:
-    """The frames that labels.csv labels: the first, then evenly spread."""
+    """The frames that labels.csv labels: the first, and others at equal distances."""
     n = min(config.labelled_frames, config.frames)
     return sorted({k * config.frames // n for k in range(n)}) if n else []
 
@@ -88,9 +88,9 @@ def _claim(out: Path, config: SimulationConfig) -> None:
     record.write_text(config.model_dump_json(indent=1))
 
 
-def _write_picture(path: Path, picture: NDArray[np.uint8], options: list[int]) -> None:
-    done, data = cv2.imencode(path.suffix, picture, options)
+def _write_image(path: Path, image: NDArray[np.uint8], options: list[int]) -> None:
+    done, data = cv2.imencode(path.suffix, image, options)
     if not done:
         raise InputError(f"{path.suffix} cannot be encoded here; choose png or jpg")
-    # not cv2.imwrite: on a full disk it returns False and raises nothing
+    # not cv2.imwrite, which on a full disk returns False and raises nothing
     path.write_bytes(data.tobytes())

@@ -1,4 +1,4 @@
-"""The city of a flight: its plan, its traffic and its parked cars, its picture from above for either sensor."""
+"""The city of a flight: its plan, traffic and parked cars, and its orthographic images for both sensors."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,39 +9,39 @@ from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, GreyImage
 from schemas.simulation import SimulationConfig
-from velfield.synthetic.city.city_plan import Plan, make_plan
-from velfield.synthetic.city.ground import Canvas, light_map, reach_map, shade, texture
+from velfield.synthetic.city.city_plan import CityPlan, make_city_plan
+from velfield.synthetic.city.ground import Canvas, add_texture, apply_light, light_map, reach_map
 from velfield.synthetic.city.streets import paint_city
-from velfield.synthetic.other_sensor import Standing, other_sensor_image
-from velfield.synthetic.render import MOSAIC_SCALE, Scene
-from velfield.synthetic.seeds import Matter, stream
-from velfield.synthetic.traffic.traffic import Traffic, VehicleKinds, draw_kinds, simulate_traffic
+from velfield.synthetic.other_sensor import StaticScene, other_sensor_image
+from velfield.synthetic.random_streams import RandomStream, random_generator
+from velfield.synthetic.render import MOSAIC_SCALE, SceneMaps
+from velfield.synthetic.traffic.traffic import Traffic, VehicleDimensions, draw_dimensions, simulate_traffic
 from velfield.synthetic.traffic.vehicles import draw_tones
 
 WORLD_MARGIN_M = 45.0
-"""Traffic starts this far outside of what any frame shows."""
+"""Distance outside the base image at which traffic starts."""
 PAD_PX = 8
-"""The mosaic reaches this far beyond the base image."""
+"""Margin of the mosaic around the base image, base px."""
 HEIGHT_STEP_M = 0.1
 
 
 @dataclass(frozen=True)
 class Vehicles:
-    """All vehicles of a flight: those that drive (numbered as in ``Traffic``), then those that are parked.
+    """All vehicles of a flight: the driving ones (numbered as in ``Traffic``), then the parked ones.
 
     ``parked_pose`` (n, 3): x, y base px and direction.
     """
 
-    kinds: VehicleKinds
+    dimensions: VehicleDimensions
     tones: FloatArray
     driving: int
     parked_pose: FloatArray
 
 
 class City:
-    """A city under a base image of ``base_shape`` (height, width) that begins at ``origin_m`` of the plan.
+    """A city under a base image of ``base_shape`` (height, width) with its origin at ``origin_m`` of the plan.
 
-    ``lean`` is the steepest ray that any camera sees it by, px sideways a px of height.
+    ``lean`` is the largest slope of a camera ray, px sideways a px of height.
     """
 
     def __init__(
@@ -58,10 +58,12 @@ class City:
         x0, y0 = origin_m - WORLD_MARGIN_M
         x1, y1 = origin_m + np.array(base_shape[::-1]) * config.gsd_m + WORLD_MARGIN_M
         turn, cycle = config.traffic.turn_share, config.traffic.cycle_s
-        self.plan: Plan = make_plan((x0, y0, x1, y1), self._rng(Matter.PLAN), turn_share=turn, cycle_s=cycle)
+        self.plan: CityPlan = make_city_plan(
+            (x0, y0, x1, y1), self._rng(RandomStream.PLAN), turn_share=turn, cycle_s=cycle
+        )
 
-    def _rng(self, matter: Matter) -> np.random.Generator:
-        return stream(self.config.seed, matter)
+    def _rng(self, stream: RandomStream) -> np.random.Generator:
+        return random_generator(self.config.seed, stream)
 
     def to_px(self, xy_m: FloatArray) -> FloatArray:
         """Plan metres (n, 2) -> base pixels."""
@@ -69,66 +71,67 @@ class City:
 
     @cached_property
     def traffic(self) -> Traffic:
-        """Everybody's drive."""
-        rng = self._rng(Matter.TRAFFIC)
-        return simulate_traffic(self.plan.network, self.config.traffic, duration_s=self._duration_s, rng=rng)
+        """The trajectories of all vehicles."""
+        rng = self._rng(RandomStream.TRAFFIC)
+        return simulate_traffic(self.plan.road_network, self.config.traffic, duration_s=self._duration_s, rng=rng)
 
     @cached_property
     def vehicles(self) -> Vehicles:
-        """Sizes and looks of all vehicles."""
-        parked = self._parked(self._rng(Matter.PARKED))
+        """Dimensions and tones of all vehicles."""
+        parked = self._parked(self._rng(RandomStream.PARKED))
         driving = len(self.traffic)
-        rng = self._rng(Matter.LOOKS)
-        still, moving = draw_kinds(np.zeros(len(parked), bool), rng), self.traffic.kinds
-        kinds = VehicleKinds(
+        rng = self._rng(RandomStream.APPEARANCE)
+        still, moving = draw_dimensions(np.zeros(len(parked), bool), rng), self.traffic.dimensions
+        dimensions = VehicleDimensions(
             np.concatenate([moving.length_m, still.length_m]),
             np.concatenate([moving.width_m, still.width_m]),
             np.concatenate([moving.height_m, still.height_m]),
             np.concatenate([moving.shape, still.shape]),
         )
-        return Vehicles(kinds, draw_tones(driving + len(parked), rng), driving, parked)
+        return Vehicles(dimensions, draw_tones(driving + len(parked), rng), driving, parked)
 
     @cached_property
     def sun(self) -> FloatArray:
-        """Where shadows reach, px a px of height (2,)."""
-        return sun_vector(self.config.scene.sun_azimuth_deg, self.config.scene.sun_length)
+        """Shadow vector, px a px of height (2,)."""
+        return shadow_vector(self.config.scene.sun_azimuth_deg, self.config.scene.sun_length)
 
     @cached_property
     def light(self) -> NDArray[np.float32]:
-        """Share of the light that reaches the ground, base resolution, PAD_PX wider than the base image."""
+        """Fraction of the light that reaches the ground, base resolution, PAD_PX wider than the base image."""
         height, reach = self._heights
         return light_map(height, reach, step_px=self._step_px, direction=self.sun)
 
     @cached_property
-    def scene(self) -> Scene:
-        """What stands still, in the camera's tones and light, blurred as its optics blur."""
+    def scene(self) -> SceneMaps:
+        """The scene without vehicles in the camera's tones and light, blurred as by its optics."""
         camera = self.config.camera
         sigma = MOSAIC_SCALE * float(np.hypot(camera.optics_blur_px, 0.29)) / camera.scale
-        mosaic = cv2.GaussianBlur(shade(self._tones[0], self.light), (0, 0), sigma)
-        return Scene(mosaic, *self._heights, np.array([-float(PAD_PX)] * 2), self._step_px)
+        mosaic = cv2.GaussianBlur(apply_light(self._tones[0], self.light), (0, 0), sigma)
+        return SceneMaps(mosaic, *self._heights, np.array([-float(PAD_PX)] * 2), self._step_px)
 
     @cached_property
     def base_image(self) -> GreyImage:
-        """The base image, uint8 (base_shape): orthographic, by the other sensor, without the traffic."""
+        """The base image, uint8 (base_shape): orthographic, by the other sensor, without traffic."""
         c = self.config
         same = c.base.same_sensor
-        rng = self._rng(Matter.OTHER_SENSOR)
+        rng = self._rng(RandomStream.OTHER_SENSOR)
         return other_sensor_image(
-            Standing(self._tones[0 if same else 1], *self._heights, self._step_px, PAD_PX),
+            StaticScene(self._tones[0 if same else 1], *self._heights, self._step_px, PAD_PX),
             c.base,
             shape=self.base_shape,
-            sun=self.sun if same else sun_vector(c.base.sun_azimuth_deg, c.base.sun_length),
+            sun=self.sun if same else shadow_vector(c.base.sun_azimuth_deg, c.base.sun_length),
             parked=self._parked(rng),
             gsd_m=c.gsd_m,
             rng=rng,
         )
 
     def _parked(self, rng: np.random.Generator) -> FloatArray:
-        places = self._painted[1]
-        taken = places[rng.uniform(size=len(places)) < self.config.scene.parked_share]
-        xy = taken[:, :2] + rng.normal(0, 0.2, (len(taken), 2))
-        turned = taken[:, 2] + rng.normal(0, 0.03, len(taken)) + np.pi * (rng.uniform(size=len(taken)) < 0.3)
-        return np.column_stack([self.to_px(xy), turned])
+        spaces = self._painted[1]
+        occupied = spaces[rng.uniform(size=len(spaces)) < self.config.scene.parked_share]
+        xy = occupied[:, :2] + rng.normal(0, 0.2, (len(occupied), 2))
+        direction = occupied[:, 2] + rng.normal(0, 0.03, len(occupied))
+        direction = direction + np.pi * (rng.uniform(size=len(occupied)) < 0.3)
+        return np.column_stack([self.to_px(xy), direction])
 
     @cached_property
     def _painted(self) -> tuple[Canvas, FloatArray]:
@@ -136,13 +139,13 @@ class City:
         size = ((w + 2 * PAD_PX) * MOSAIC_SCALE, (h + 2 * PAD_PX) * MOSAIC_SCALE)
         x, y = self._origin_m - PAD_PX * self.config.gsd_m
         canvas = Canvas(size, origin_m=(float(x), float(y)), pixel_m=self.config.gsd_m / MOSAIC_SCALE)
-        return canvas, paint_city(canvas, self.plan, self.config.scene, self._rng(Matter.PAINT))
+        return canvas, paint_city(canvas, self.plan, self.config.scene, self._rng(RandomStream.PAINT))
 
     @cached_property
     def _tones(self) -> tuple[GreyImage, GreyImage]:
         shift = self.config.base.vegetation_shift_grey
-        paint, rng = self._painted[0].paint, self._rng(Matter.GRAIN)
-        return texture(paint, strength=self.config.scene.texture, vegetation_shift=shift, rng=rng)
+        paint, rng = self._painted[0].paint, self._rng(RandomStream.GRAIN)
+        return add_texture(paint, strength=self.config.scene.texture, vegetation_shift=shift, rng=rng)
 
     @property
     def _step_px(self) -> float:
@@ -150,12 +153,12 @@ class City:
 
     @cached_property
     def _heights(self) -> tuple[GreyImage, GreyImage]:
-        """Height map in steps of HEIGHT_STEP_M, and its reach map."""
+        """Height map in units of HEIGHT_STEP_M, and its reach map."""
         height = np.clip(np.rint(self._painted[0].height_m / HEIGHT_STEP_M), 0, 255).astype(np.uint8)
         lean = max(self._lean, self.config.scene.sun_length, self.config.base.sun_length)
         return height, reach_map(height, lean, self._step_px)
 
 
-def sun_vector(azimuth_deg: float, length: float) -> FloatArray:
+def shadow_vector(azimuth_deg: float, length: float) -> FloatArray:
     """Shadow (x, y) of a height of one."""
     return length * np.array([np.cos(np.radians(azimuth_deg)), np.sin(np.radians(azimuth_deg))])

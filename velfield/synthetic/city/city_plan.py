@@ -1,28 +1,28 @@
-"""The city's plan: avenues that cross at signals, circles, car parks, U-turns, on a lattice as large as is wanted.
+"""The city's plan: avenues with signalised intersections, roundabouts, car parks and U-turns, on a lattice of any size.
 
-One cell of the lattice, metres from its crossing: avenue A runs west-east with a median, avenue B north-south; a circle
-lies to the north-east, its legs lead to the avenues around, the western one through the car park back to avenue A.
+One cell of the lattice, in metres from its intersection: avenue A runs west-east with a median, avenue B north-south; a
+roundabout is to the north-east, its arms lead to the avenues around, the western one through a car park to avenue A.
 """
 
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from velfield.synthetic.city.road_network import Lane, Network
+from velfield.synthetic.city.road_network import Lane, RoadNetwork
 
 Rect = tuple[float, float, float, float]
 
 PITCH_X_M, PITCH_Y_M = 300.0, 230.0
-CROSSING_X_M, CROSSING_Y_M = -50.0, 25.0
-"""The crossing nearest to the plan's origin."""
+INTERSECTION_X_M, INTERSECTION_Y_M = -50.0, 25.0
+"""The intersection nearest to the plan's origin."""
 
 LANE_M = 3.5
 MEDIAN_M = 10.0
 CORNER_M = 7.75
-"""Radius of a right turn's path."""
+"""Radius of the path of a right turn."""
 
-CIRCLE_X_M, CIRCLE_Y_M, RING_M, LEG_M = 120.0, -75.0, 13.0, 27.0
-"""A circle's centre from its crossing, its radius along the lane's middle, and where its legs begin."""
+ROUNDABOUT_X_M, ROUNDABOUT_Y_M, RING_M, LEG_M = 120.0, -75.0, 13.0, 27.0
+"""A roundabout's centre from its intersection, the radius of its lane's centre line, and where its arms begin."""
 
 INNER_A, CURB_A = MEDIAN_M / 2 + 0.5 * LANE_M, MEDIAN_M / 2 + 1.5 * LANE_M
 INNER_B, CURB_B = 0.5 * LANE_M, 1.5 * LANE_M
@@ -35,36 +35,38 @@ AVENUE_LIMIT = 22.0
 
 
 @dataclass
-class Plan:
-    """What the painter and the traffic need: lanes, and the places of things, metres."""
+class CityPlan:
+    """Lanes and positions of everything that is painted, metres."""
 
     rect: Rect
-    network: Network
+    road_network: RoadNetwork
     avenues_y: list[float] = field(default_factory=list)
     avenues_x: list[float] = field(default_factory=list)
-    circles: list[tuple[float, float]] = field(default_factory=list)
+    roundabouts: list[tuple[float, float]] = field(default_factory=list)
     car_parks: list[tuple[float, float]] = field(default_factory=list)
     streets: list[Rect] = field(default_factory=list)
 
 
 def view_centre_m(width_m: float) -> tuple[float, float]:
-    """Middle of the view: the whole cell where it fits, else nearer to the crossing and its U-turn."""
-    share = float(np.clip((width_m - 150) / 140, 0, 1))
-    return (-28 + share * 33, 20 - share * 28)
+    """Centre of the view: of a whole cell if it fits, otherwise nearer to the intersection and its U-turn."""
+    fraction = float(np.clip((width_m - 150) / 140, 0, 1))
+    return (-28 + fraction * 33, 20 - fraction * 28)
 
 
-def make_plan(rect: Rect, rng: np.random.Generator, *, turn_share: float, cycle_s: float) -> Plan:
+def make_city_plan(rect: Rect, rng: np.random.Generator, *, turn_share: float, cycle_s: float) -> CityPlan:
     """Plan of all lattice cells that meet ``rect`` (x0, y0, x1, y1), m."""
-    net = Network()
-    plan = Plan(rect, net)
+    net = RoadNetwork()
+    plan = CityPlan(rect, net)
     columns = range(
-        int(np.floor((rect[0] - CROSSING_X_M) / PITCH_X_M)), int(np.ceil((rect[2] - CROSSING_X_M) / PITCH_X_M)) + 1
+        int(np.floor((rect[0] - INTERSECTION_X_M) / PITCH_X_M)),
+        int(np.ceil((rect[2] - INTERSECTION_X_M) / PITCH_X_M)) + 1,
     )
     rows = range(
-        int(np.floor((rect[1] - CROSSING_Y_M) / PITCH_Y_M)), int(np.ceil((rect[3] - CROSSING_Y_M) / PITCH_Y_M)) + 1
+        int(np.floor((rect[1] - INTERSECTION_Y_M) / PITCH_Y_M)),
+        int(np.ceil((rect[3] - INTERSECTION_Y_M) / PITCH_Y_M)) + 1,
     )
-    xs = {i: CROSSING_X_M + i * PITCH_X_M for i in columns}
-    ys = {j: CROSSING_Y_M + j * PITCH_Y_M for j in rows}
+    xs = {i: INTERSECTION_X_M + i * PITCH_X_M for i in columns}
+    ys = {j: INTERSECTION_Y_M + j * PITCH_Y_M for j in rows}
     xs = {i: x for i, x in xs.items() if rect[0] + 20 < x < rect[2] - 20}
     ys = {j: y for j, y in ys.items() if rect[1] + 25 < y < rect[3] - 25}
     plan.avenues_x, plan.avenues_y = list(xs.values()), list(ys.values())
@@ -73,7 +75,7 @@ def make_plan(rect: Rect, rng: np.random.Generator, *, turn_share: float, cycle_
     for i, x in xs.items():
         for j, y in ys.items():
             net.signal_offsets_s.append(float(rng.uniform(0, cycle_s)))
-            _crossing(net, a[j], b[i], x, y, 2 * (len(net.signal_offsets_s) - 1), turn_share)
+            _intersection(net, a[j], b[i], x, y, 2 * (len(net.signal_offsets_s) - 1), turn_share)
             _uturns(net, a[j], x, y, rect, turn_share)
     for i in columns:
         for j in rows:
@@ -88,7 +90,7 @@ def make_plan(rect: Rect, rng: np.random.Generator, *, turn_share: float, cycle_
 Lanes = dict[str, Lane]
 
 
-def _avenue_a(net: Network, y: float, rect: Rect) -> Lanes:
+def _avenue_a(net: RoadNetwork, y: float, rect: Rect) -> Lanes:
     x0, x1 = rect[0], rect[2]
     return {
         "E0": Lane(net, (x0, y + INNER_A), (x1, y + INNER_A), "avenue", AVENUE_LIMIT),
@@ -98,7 +100,7 @@ def _avenue_a(net: Network, y: float, rect: Rect) -> Lanes:
     }
 
 
-def _avenue_b(net: Network, x: float, rect: Rect) -> Lanes:
+def _avenue_b(net: RoadNetwork, x: float, rect: Rect) -> Lanes:
     y0, y1 = rect[1], rect[3]
     return {
         "S0": Lane(net, (x - INNER_B, y0), (x - INNER_B, y1), "avenue", AVENUE_LIMIT),
@@ -108,7 +110,7 @@ def _avenue_b(net: Network, x: float, rect: Rect) -> Lanes:
     }
 
 
-def _crossing(net: Network, a: Lanes, b: Lanes, x: float, y: float, group: int, turn_share: float) -> None:
+def _intersection(net: RoadNetwork, a: Lanes, b: Lanes, x: float, y: float, group: int, turn_share: float) -> None:
     for name, sign in (("E0", 1), ("E1", 1), ("W0", -1), ("W1", -1)):
         a[name].box(x - sign * STOP_A, y, group)
         a[name].at_point(x + sign * STOP_A, y)
@@ -122,8 +124,8 @@ def _crossing(net: Network, a: Lanes, b: Lanes, x: float, y: float, group: int, 
         net.turn(start, end, weight=_odds(turn_share))
 
 
-def _uturns(net: Network, a: Lanes, x: float, y: float, rect: Rect, turn_share: float) -> None:
-    """East-west after the crossing, and west-east: a pocket in the median, then the half circle."""
+def _uturns(net: RoadNetwork, a: Lanes, x: float, y: float, rect: Rect, turn_share: float) -> None:
+    """East-west after the intersection, and west-east: a pocket in the median, then a half circle."""
     for come, back, sign in (("E0", "W0", 1), ("W0", "E0", -1)):
         if not rect[0] + 15 < x + sign * UTURN_M < rect[2] - 15:
             continue
@@ -135,14 +137,14 @@ def _uturns(net: Network, a: Lanes, x: float, y: float, rect: Rect, turn_share: 
         net.turn(end, a[back].at_point(x + sign * UTURN_M, y), weight=1.0)
 
 
-def _cell(plan: Plan, a: dict[int, Lanes], b: dict[int, Lanes], cell: tuple[int, int], turn_share: float) -> None:
-    """The circle of a lattice cell, its legs and its car park, where they fit into the rectangle."""
-    net, rect, (i, j) = plan.network, plan.rect, cell
-    x, y = CROSSING_X_M + i * PITCH_X_M, CROSSING_Y_M + j * PITCH_Y_M
-    cx, cy = x + CIRCLE_X_M, y + CIRCLE_Y_M
+def _cell(plan: CityPlan, a: dict[int, Lanes], b: dict[int, Lanes], cell: tuple[int, int], turn_share: float) -> None:
+    """The roundabout of a lattice cell, its arms and its car park, if they fit into the rectangle."""
+    net, rect, (i, j) = plan.road_network, plan.rect, cell
+    x, y = INTERSECTION_X_M + i * PITCH_X_M, INTERSECTION_Y_M + j * PITCH_Y_M
+    cx, cy = x + ROUNDABOUT_X_M, y + ROUNDABOUT_Y_M
     if not (rect[0] + LEG_M < cx < rect[2] - LEG_M and rect[1] + LEG_M < cy < rect[3] - LEG_M) or j not in a:
         return
-    plan.circles.append((cx, cy))
+    plan.roundabouts.append((cx, cy))
     enter, leave = _ring(net, cx, cy)
     odds = _odds(turn_share)
     half = LANE_M / 2
@@ -160,8 +162,8 @@ def _cell(plan: Plan, a: dict[int, Lanes], b: dict[int, Lanes], cell: tuple[int,
     _car_park(plan, a[j], x, y, leave["W"])
 
 
-def _ring(net: Network, cx: float, cy: float) -> tuple[dict[str, int], dict[str, int]]:
-    """The ring and the mouths of its legs: nodes where lanes enter from, and leave to, each side."""
+def _ring(net: RoadNetwork, cx: float, cy: float) -> tuple[dict[str, int], dict[str, int]]:
+    """The ring and the mouths of its arms: nodes where lanes enter from, and leave to, each side."""
     enter: dict[str, int] = {}
     leave: dict[str, int] = {}
     stops: list[tuple[float, int]] = []
@@ -189,9 +191,9 @@ def _ring(net: Network, cx: float, cy: float) -> tuple[dict[str, int], dict[str,
 
 
 def _east_leg(
-    plan: Plan, b: Lanes | None, centre: tuple[float, float], mouths: tuple[int, int], odds: float, avenue_x: float
+    plan: CityPlan, b: Lanes | None, centre: tuple[float, float], mouths: tuple[int, int], odds: float, avenue_x: float
 ) -> None:
-    net, (cx, cy), half = plan.network, centre, LANE_M / 2
+    net, (cx, cy), half = plan.road_network, centre, LANE_M / 2
     edge = plan.rect[2] if b is None else avenue_x - CURB_B - CORNER_M
     end, start = net.node(edge, cy + half, 0.0), net.node(edge, cy - half, np.pi)
     net.straight(mouths[1], end, "street", STREET_SPEED)
@@ -205,9 +207,9 @@ def _east_leg(
 
 
 def _north_leg(
-    plan: Plan, a: Lanes | None, centre: tuple[float, float], mouths: tuple[int, int], odds: float, avenue_y: float
+    plan: CityPlan, a: Lanes | None, centre: tuple[float, float], mouths: tuple[int, int], odds: float, avenue_y: float
 ) -> None:
-    net, (cx, cy), half = plan.network, centre, LANE_M / 2
+    net, (cx, cy), half = plan.road_network, centre, LANE_M / 2
     edge = plan.rect[1] if a is None else avenue_y + CURB_A + CORNER_M
     end, start = net.node(cx + half, edge, -np.pi / 2), net.node(cx - half, edge, np.pi / 2)
     net.straight(mouths[1], end, "street", STREET_SPEED)
@@ -220,9 +222,9 @@ def _north_leg(
     net.turn(a["E1"].at_point(cx - half - CORNER_M, avenue_y), start, weight=odds, yields=False)
 
 
-def _car_park(plan: Plan, a: Lanes, x: float, y: float, leave: int) -> None:
-    """One way through: west along the first aisle, round, east along the second, south to the avenue."""
-    net = plan.network
+def _car_park(plan: CityPlan, a: Lanes, x: float, y: float, leave: int) -> None:
+    """One way: west along the first aisle, back east along the second, south to the avenue."""
+    net = plan.road_network
     first, second = net.nodes[leave].y, net.nodes[leave].y + 16
     west = net.node(x + 28, first, np.pi)
     net.straight(leave, west, "aisle", AISLE_SPEED)
@@ -237,6 +239,6 @@ def _car_park(plan: Plan, a: Lanes, x: float, y: float, leave: int) -> None:
     plan.car_parks.append((x, first))
 
 
-def _odds(share: float) -> float:
-    """Weight of a turn against straight on (weight 1) that makes it ``share`` of the choices."""
-    return share / max(1 - share, 1e-6)
+def _odds(probability: float) -> float:
+    """Weight of a turn, against 1 for straight on, of a given probability."""
+    return probability / max(1 - probability, 1e-6)

@@ -1,23 +1,21 @@
-"""The ground as a mosaic: surfaces, markings, grain, shadows, in the tones of two sensors at once.
+"""The ground as a mosaic: surfaces, markings, texture and shadows, in the tones of two sensors.
 
-Everything is painted in four channels: the camera's tone, the other sensor's tone, how strongly fine grain shows, how
-strongly patches show. Texture and shadows come over it at the end.
+Everything is painted in four channels: the camera's tone, the other sensor's tone, the contrast of fine grain, the
+contrast of patches. Texture and shadows are applied at the end.
 """
-
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray, GreyImage
-from velfield.synthetic.render import MOSAIC_SCALE, REACH_CELL, SHADE
+from schemas.arrays import ByteArray, Float32Array, FloatArray, GreyImage
+from velfield.synthetic.render import MOSAIC_SCALE, REACH_CELL, SHADOW_LIGHT
 
 Tone = tuple[int, int, int, int]
 
 NOON = 1.22
-"""Grey of sunlit ground per grey of its tone."""
+"""Grey level of sunlit ground per grey level of its tone."""
 
 ASPHALT: Tone = (96, 112, 60, 50)
 OLD_ASPHALT: Tone = (116, 124, 80, 80)
@@ -30,14 +28,14 @@ GRAVEL: Tone = (138, 128, 150, 90)
 SOIL: Tone = (112, 124, 130, 90)
 
 
-def toned(tone: Tone, change: float) -> Tone:
-    """A surface lighter (or darker) by ``change`` grey levels for both sensors."""
+def lightened(tone: Tone, change: float) -> Tone:
+    """A tone lighter (or darker) by ``change`` grey levels for both sensors."""
     first, second = (int(np.clip(t + change, 8, 245)) for t in tone[:2])
     return (first, second, tone[2], tone[3])
 
 
 class Canvas:
-    """Paints in metres on a mosaic of four channels and a height map."""
+    """Drawing in metres on a mosaic of four channels and a height map."""
 
     def __init__(self, size: tuple[int, int], *, origin_m: tuple[float, float], pixel_m: float) -> None:
         self.paint = np.empty((size[1], size[0], 4), dtype=np.uint8)
@@ -54,7 +52,7 @@ class Canvas:
         cv2.fillPoly(self.paint, [self._fixed(points_m, self.pixel_m)], tone, cv2.LINE_AA, 4)
 
     def rect(self, x0: float, y0: float, x1: float, y1: float, tone: Tone) -> None:
-        """Fill an upright rectangle, m."""
+        """Fill an axis-aligned rectangle, m."""
         self.polygon(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]), tone)
 
     def stroke(self, points_m: FloatArray, width_m: float, tone: Tone) -> None:
@@ -78,7 +76,7 @@ class Canvas:
         centre = self._fixed(np.array([x, y]), self.pixel_m).tolist()
         cv2.circle(self.paint, centre, round(radius_m / self.pixel_m * 16), tone, -1, cv2.LINE_AA, 4)
 
-    def mound(self, x: float, y: float, radius_m: float, height_m: float) -> None:
+    def raise_disc(self, x: float, y: float, radius_m: float, height_m: float) -> None:
         """Raise a disc to at least a height, m."""
         pixel = self.pixel_m * MOSAIC_SCALE
         cx, cy = (np.array([x, y]) - self.origin_m) / pixel
@@ -90,28 +88,18 @@ class Canvas:
             window = self.height_m[i0:i1, j0:j1]
             np.maximum(window, np.where((i - cy) ** 2 + (j - cx) ** 2 <= r * r, np.float32(height_m), 0), out=window)
 
-    def stand(self, points_m: FloatArray, height_m: float) -> None:
-        """Raise a polygon (n, 2) m to a height."""
+    def raise_polygon(self, points_m: FloatArray, height_m: float) -> None:
+        """Set the height of a polygon (n, 2), m."""
         mask = self._fixed(points_m, self.pixel_m * MOSAIC_SCALE)
         cv2.fillPoly(self.height_m, [mask], float(height_m), cv2.LINE_8, 4)
 
 
-@dataclass(frozen=True)
-class Ground:
-    """The painted city. ``camera`` and ``other`` uint8 mosaics without blur, ``height`` uint8 and its step, m."""
-
-    camera: GreyImage
-    other: GreyImage
-    height: GreyImage
-    height_step_m: float
-
-
-def texture(
-    paint: GreyImage, *, strength: float, vegetation_shift: float, rng: np.random.Generator
+def add_texture(
+    paint: ByteArray, *, strength: float, vegetation_shift: float, rng: np.random.Generator
 ) -> tuple[GreyImage, GreyImage]:
-    """Tones of the two sensors: paint plus grain and patches as each surface shows them (in strips, to save memory).
+    """Tones of the two sensors: paint plus grain and patches with each surface's contrast (in strips, to save memory).
 
-    ``vegetation_shift``: how much lighter the other sensor sees what is green, known by its patches.
+    ``vegetation_shift``: grey levels by which vegetation, known by its patches, is lighter for the other sensor.
     """
     h, w = paint.shape[:2]
     coarse = [
@@ -136,25 +124,23 @@ def texture(
     return tones
 
 
-def _octave(noise: NDArray[np.float32], cell: int, y0: int, y1: int, width: int) -> NDArray[np.float32]:
-    """Rows y0..y1 of smooth noise: ``noise`` (one value a cell) enlarged by cubic interpolation."""
+def _octave(noise: Float32Array, cell: int, y0: int, y1: int, width: int) -> Float32Array:
+    """Rows y0..y1 of smooth noise: ``noise`` (one value a cell) upsampled by cubic interpolation."""
     matrix = np.array([[1 / cell, 0, 0.5], [0, 1 / cell, y0 / cell + 0.5]])
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    out: NDArray[np.float32] = cv2.warpAffine(
-        noise, matrix, (width, y1 - y0), flags=flags, borderMode=cv2.BORDER_REFLECT
-    )
+    out: Float32Array = cv2.warpAffine(noise, matrix, (width, y1 - y0), flags=flags, borderMode=cv2.BORDER_REFLECT)
     return out
 
 
 def reach_map(height: GreyImage, lean: float, step_px: float) -> GreyImage:
-    """Greatest height within a ray's reach, for cells of REACH_CELL base px; ``lean`` the steepest ray, px a px."""
+    """Maximum height that a ray through a cell of REACH_CELL base px may meet; ``lean``: its largest slope, px a px."""
     h, w = height.shape
     ny, nx = -(-h // REACH_CELL), -(-w // REACH_CELL)
     padded = np.zeros((ny * REACH_CELL, nx * REACH_CELL), np.uint8)
     padded[:h, :w] = height
     cells = padded.reshape(ny, REACH_CELL, nx, REACH_CELL).max(axis=(1, 3))
     reach = np.zeros_like(cells)
-    # low things reach less far: in classes of height
+    # lower heights have a shorter reach: in classes of height
     for low, high in ((0, 30), (30, 60), (60, 100), (100, 255)):
         these = np.where((cells > low) & (cells <= high), cells, 0).astype(np.uint8)
         radius = int(np.ceil((float(these.max()) * step_px * lean + 2) / REACH_CELL))
@@ -162,17 +148,17 @@ def reach_map(height: GreyImage, lean: float, step_px: float) -> GreyImage:
     return np.asarray(reach)
 
 
-def light_map(height: GreyImage, reach: GreyImage, *, step_px: float, direction: FloatArray) -> NDArray[np.float32]:
-    """Share of the light that reaches the ground (base resolution); ``direction`` (2,): shadow px a px of height."""
+def light_map(height: GreyImage, reach: GreyImage, *, step_px: float, direction: FloatArray) -> Float32Array:
+    """Fraction of the light that reaches the ground (base resolution); ``direction`` (2,): shadow px a px of height."""
     sunny = np.ones(height.shape, np.float32)
     if direction.any() and height.any():
         _shadows(height, reach, step_px, direction, sunny)
         sunny = cv2.GaussianBlur(sunny, (0, 0), 0.8)
-    return np.asarray(NOON * (SHADE + (1 - SHADE) * sunny), dtype=np.float32)
+    return np.asarray(NOON * (SHADOW_LIGHT + (1 - SHADOW_LIGHT) * sunny), dtype=np.float32)
 
 
-def shade(tone: GreyImage, light: NDArray[np.float32]) -> GreyImage:
-    """``tone`` under a light map."""
+def apply_light(tone: GreyImage, light: Float32Array) -> GreyImage:
+    """``tone`` multiplied by a light map."""
     enlarged = cv2.resize(light, (tone.shape[1], tone.shape[0]), interpolation=cv2.INTER_LINEAR)
     return np.asarray(cv2.multiply(tone, enlarged, dtype=cv2.CV_8U))
 

@@ -1,4 +1,4 @@
-"""The ground's height: slow waves on a coarse grid, bilinear between; one definition for renderer and truth."""
+"""The ground's height: long waves on a coarse grid, interpolated bilinearly; one definition for renderer and truth."""
 
 from dataclasses import dataclass
 
@@ -28,16 +28,16 @@ def make_relief(
     angle = rng.uniform(0, np.pi, 5)
     number = 2 * np.pi / (length_px * rng.uniform(0.7, 1.6, 5))
     phase = rng.uniform(0, 2 * np.pi, 5)
-    share = rng.dirichlet(np.full(5, 3.0))
+    weight = rng.dirichlet(np.full(5, 3.0))
     grid = np.zeros((len(y), len(x)))
-    for a, k, p, s in zip(angle, number, phase, share, strict=True):
+    for a, k, p, s in zip(angle, number, phase, weight, strict=True):
         grid += s * np.sin(k * (np.cos(a) * x[None, :] + np.sin(a) * y[:, None]) + p)
     return Relief(grid * height_px, np.array([bounds[0], bounds[1], GRID_PX]))
 
 
 @njit(cache=True, nogil=True)
 def ground_height_at(x, y, grid, frame):  # type: ignore[no-untyped-def]
-    """Height at one place, base px; beyond the grid as at its border."""
+    """Height at one position, base px; outside the grid that of its border."""
     gx = min(max((x - frame[0]) / frame[2], 0.0), grid.shape[1] - 1.001)
     gy = min(max((y - frame[1]) / frame[2], 0.0), grid.shape[0] - 1.001)
     i, j = int(gy), int(gx)
@@ -49,7 +49,7 @@ def ground_height_at(x, y, grid, frame):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def ground_height(x, y, grid, frame):  # type: ignore[no-untyped-def]
-    """Heights (n,) at places x, y (n,), base px."""
+    """Heights (n,) at positions x, y (n,), base px."""
     out = np.empty(len(x))
     for i in range(len(x)):
         out[i] = ground_height_at(x[i], y[i], grid, frame)

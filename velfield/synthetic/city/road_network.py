@@ -1,7 +1,7 @@
-"""Lanes as smooth paths: edges between nodes, with signals, turns that give way, and where cars come in and go out.
+"""The road network: lanes as smooth paths, i.e. edges between nodes, with signals, priority rules and sources.
 
-Metres, x right, y down; cars drive on the right. Of the edges that meet at a node at most one kind goes first (lanes,
-boxes of crossings, the ring of a circle); turns give way to it and wait where their path is still clear of its path.
+Metres, x right, y down; right-hand traffic. Of the edges that meet at a node at most one kind has priority (lanes,
+intersection boxes, the ring of a roundabout); turns yield to it and wait where their path is still clear of its path.
 """
 
 from dataclasses import dataclass, field
@@ -19,15 +19,15 @@ STEP_M = 0.5
 """Spacing of the points of an edge's path."""
 
 CLEAR_M = 2.6
-"""Two paths farther apart than this can be driven side by side."""
+"""Paths farther apart than this do not conflict."""
 
 LATERAL_M_PER_S2 = 2.4
-"""Sideways acceleration drivers accept in a turn."""
+"""Lateral acceleration that drivers accept in a turn."""
 
 
 @dataclass(frozen=True)
 class Node:
-    """Where edges meet: a place and the direction of travel, rad."""
+    """Where edges meet: a position and the direction of travel, rad."""
 
     x: float
     y: float
@@ -36,10 +36,10 @@ class Node:
 
 @dataclass(frozen=True)
 class Edge:
-    """One piece of lane.
+    """A section of a lane.
 
-    ``path`` (n, 2) m, about ``STEP_M`` apart; ``speed_m_per_s`` the limit; ``weight`` how likely it is chosen where
-    paths part; ``signal`` the group of lights at its end, -1: none; ``yields``: gives way at its end.
+    ``path`` (n, 2) m, about ``STEP_M`` apart; ``speed_m_per_s`` the limit; ``weight`` of its choice where lanes
+    diverge; ``signal`` the signal group at its end, -1: none; ``yields``: gives way at its end.
     """
 
     start: int
@@ -58,8 +58,8 @@ class Edge:
 
 
 @dataclass
-class Network:
-    """All lanes of a city, and its signals: ``signal_offsets_s`` one a crossing; group = 2 * crossing + axis."""
+class RoadNetwork:
+    """All lanes and signals of a city: ``signal_offsets_s`` one an intersection; group = 2 * intersection + axis."""
 
     nodes: list[Node] = field(default_factory=list)
     edges: list[Edge] = field(default_factory=list)
@@ -67,25 +67,26 @@ class Network:
     signal_offsets_s: list[float] = field(default_factory=list)
 
     def node(self, x: float, y: float, direction: float) -> int:
-        """A new node's number."""
+        """Add a node and return its number."""
         self.nodes.append(Node(x, y, direction))
         return len(self.nodes) - 1
 
     def straight(self, a: int, b: int, kind: EdgeKind, speed: float, *, signal: int = -1, weight: float = 1.0) -> None:
-        """A straight edge from node ``a`` to node ``b``."""
+        """Add a straight edge from node ``a`` to node ``b``."""
         p, q = self.nodes[a], self.nodes[b]
         n = max(int(np.hypot(q.x - p.x, q.y - p.y) / STEP_M), 2)
         path = np.column_stack([np.linspace(p.x, q.x, n + 1), np.linspace(p.y, q.y, n + 1)])
         self.edges.append(Edge(a, b, kind, path, speed, weight, signal))
 
     def turn(self, a: int, b: int, *, weight: float, speed: float | None = None, yields: bool = True) -> None:
-        """A curved edge from node ``a`` to node ``b``, tangent to both, as slow as its curve wants."""
+        """Add a curved edge from node ``a`` to node ``b``, tangent to both, its speed limited by lateral
+        acceleration."""
         path = smooth_curve(self.nodes[a], self.nodes[b])
-        limit = min(speed or 14.0, float(np.sqrt(LATERAL_M_PER_S2 * least_radius_m(path))))
+        limit = min(speed or 14.0, float(np.sqrt(LATERAL_M_PER_S2 * min_radius_m(path))))
         self.edges.append(Edge(a, b, "turn", path, max(limit, 3.0), weight, yields=yields))
 
     def arc(self, a: int, b: int, centre: tuple[float, float], angles: tuple[float, float], speed: float) -> None:
-        """A piece of a circle's ring from angle to angle, rad, in the sense of ``angles``."""
+        """Add an arc of a roundabout from the first of ``angles`` to the second, rad."""
         p = self.nodes[a]
         radius = float(np.hypot(p.x - centre[0], p.y - centre[1]))
         n = max(int(abs(angles[1] - angles[0]) * radius / STEP_M), 2)
@@ -109,10 +110,11 @@ class Network:
 
 
 class Lane:
-    """A straight lane to which others connect: ask ``at`` for nodes along it, then ``finish`` it into edges."""
+    """A straight lane to which others connect: get its nodes by ``at`` and ``at_point``, then ``finish`` it into
+    edges."""
 
     def __init__(
-        self, net: Network, start: tuple[float, float], end: tuple[float, float], kind: EdgeKind, speed: float
+        self, net: RoadNetwork, start: tuple[float, float], end: tuple[float, float], kind: EdgeKind, speed: float
     ) -> None:
         self._net, self._kind, self._speed = net, kind, speed
         self._start = np.array(start)
@@ -138,11 +140,11 @@ class Lane:
         return self.at(float((np.array([x, y]) - self._start) @ self._unit))
 
     def box(self, x: float, y: float, group: int) -> None:
-        """From the node nearest to (x, y) to the next one is the box of a crossing, entered on green only."""
+        """Make the edge from the node nearest to (x, y) an intersection box, entered on green only."""
         self._boxes[self.at_point(x, y)] = group
 
     def finish(self) -> None:
-        """Make the edges between the nodes asked for."""
+        """Add the edges between the lane's nodes."""
         numbers = [self._cuts[s] for s in sorted(self._cuts)]
         for a, b in pairwise(numbers):
             kind: EdgeKind = "box" if a in self._boxes else self._kind
@@ -150,7 +152,8 @@ class Lane:
 
 
 def smooth_curve(a: Node, b: Node) -> FloatArray:
-    """Cubic from ``a`` to ``b``, tangent to both directions, nearly an arc; points about ``STEP_M`` apart (n, 2)."""
+    """Cubic Bezier curve from ``a`` to ``b``, tangent to both directions, close to an arc; points about ``STEP_M``
+    apart (n, 2)."""
     p, q = np.array([a.x, a.y]), np.array([b.x, b.y])
     u, v = np.array([np.cos(a.direction), np.sin(a.direction)]), np.array([np.cos(b.direction), np.sin(b.direction)])
     distance = float(np.hypot(*(q - p)))
@@ -168,8 +171,8 @@ def smooth_curve(a: Node, b: Node) -> FloatArray:
     return np.column_stack([np.interp(s, along, dense[:, 0]), np.interp(s, along, dense[:, 1])])
 
 
-def least_radius_m(path: FloatArray) -> float:
-    """Least radius of curvature along a path, by its steps' change of direction."""
+def min_radius_m(path: FloatArray) -> float:
+    """Minimum radius of curvature along a path, from the changes of direction between its steps."""
     step = np.diff(path, axis=0)
     turn = np.abs(np.diff(np.unwrap(np.arctan2(step[:, 1], step[:, 0]))))
     length = np.hypot(step[:, 0], step[:, 1])[1:]
@@ -177,10 +180,10 @@ def least_radius_m(path: FloatArray) -> float:
 
 
 def clear_until_m(path: FloatArray, other: FloatArray, *, from_end: bool) -> float:
-    """How far along ``path`` (seen from its start) the two paths begin, or end, to be within ``CLEAR_M``.
+    """Distance along ``path``, m, at which two paths begin, or cease, to conflict (to be within ``CLEAR_M``).
 
-    With ``from_end`` they join at their ends: the answer is the last place that is still clear; else they part at
-    their starts: the first place that is clear. Metres from the start of ``path``.
+    With ``from_end`` they merge at their ends: the last position that is clear; otherwise they diverge at their starts:
+    the first position that is clear.
     """
     distance, _ = cKDTree(other).query(path)
     near = np.flatnonzero(distance < CLEAR_M)

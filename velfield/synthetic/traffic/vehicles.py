@@ -1,15 +1,15 @@
-"""What vehicles look like from above: stacked layers, so that roofs lean with the view and windows show between."""
+"""Appearance of vehicles from above: stacked layers, which give parallax of roofs and windows."""
 
 import numpy as np
 
 from schemas.arrays import FloatArray
 
 BODY, GLASS, SIDE, SECOND, DARK = 0.0, 1.0, 2.0, 3.0, 4.0
-"""Which of a vehicle's tones a layer has."""
+"""Index of a layer's tone among the vehicle's tones."""
 
 LAYERS = np.array(
     [
-        # share of the height; rear and front end, of the length; half width and corner radius, of the width; tone
+        # fraction of the height; rear and front end, of the length; half width and corner radius, of the width; tone
         [  # a car: roof, windows, bonnet and boot, sides, wheels
             [1.00, -0.27, 0.10, 0.40, 0.20, BODY],
             [0.84, -0.40, 0.24, 0.44, 0.16, GLASS],
@@ -31,7 +31,7 @@ LAYERS = np.array(
             [0.45, -0.50, 0.22, 0.50, 0.03, SIDE],
             [0.20, -0.48, 0.48, 0.45, 0.03, DARK],
         ],
-        [  # a bus: roof, a hatch on it is drawn by SECOND
+        [  # a bus: roof, a hatch on it
             [1.02, -0.30, -0.12, 0.30, 0.05, SECOND],
             [1.00, -0.50, 0.50, 0.48, 0.08, BODY],
             [0.70, -0.50, 0.50, 0.50, 0.06, GLASS],
@@ -43,13 +43,13 @@ LAYERS = np.array(
 """(shape, layer, 6), highest layer first."""
 
 PAINTS = np.array([[24, 42], [44, 72], [82, 108], [114, 158], [176, 204]], dtype=np.float64)
-"""Ranges of paint: black, dark, like the road, silver, white."""
-PAINT_SHARES = np.array([0.2, 0.18, 0.12, 0.26, 0.24])
+"""Ranges of paint, grey levels: black, dark, as the road, silver, white."""
+PAINT_PROBABILITIES = np.array([0.2, 0.18, 0.12, 0.26, 0.24])
 
 
 def draw_tones(n: int, rng: np.random.Generator) -> FloatArray:
     """Tones (n, 5) of n vehicles in the order BODY, GLASS, SIDE, SECOND, DARK, grey levels."""
-    low, high = PAINTS[rng.choice(len(PAINTS), size=n, p=PAINT_SHARES)].T
+    low, high = PAINTS[rng.choice(len(PAINTS), size=n, p=PAINT_PROBABILITIES)].T
     body = rng.uniform(low, high)
     glass = rng.uniform(28, 52, n)
     second = np.where(rng.uniform(size=n) < 0.6, rng.uniform(185, 225, n), rng.uniform(60, 150, n))
