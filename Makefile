@@ -62,7 +62,7 @@ detector: $(STAMP)  ## make the detector that ships anew: make detector DATA=fol
 
 # Universal, with hashes, and without a registry's address in it.
 lock: $(STAMP)
-	$(BIN)/uv pip compile pyproject.toml --extra dev --extra s3 --universal --no-emit-index-url --no-emit-find-links \
+	$(BIN)/uv pip compile pyproject.toml --extra dev --extra gis --extra s3 --universal --no-emit-index-url --no-emit-find-links \
 	  --generate-hashes --no-annotate --no-header --python-version 3.11 -o requirements.lock
 
 clean:

@@ -1,19 +1,15 @@
 """Content keys, commit records and the lock."""
 
-import multiprocessing
-import os
 from pathlib import Path
 
 import pytest
 
 from schemas.flight import FlightConfig, TrackingConfig
 from schemas.records import CommitRecord, InputsRecord, SourceRecord
-from velfield.errors import InputError
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.plan import stage_keys
 from velfield.run.commits import content_key, digest_file, finished, sweep_partial, write_atomically, write_commit
 from velfield.run.layout import STAGES, RunLayout
-from velfield.run.lock import locked
 
 INPUTS = InputsRecord(source=SourceRecord(path="a", kind="video", digest="d", width=10, height=10, frame_count=3))
 
@@ -86,27 +82,3 @@ def test_partial_files_are_swept(tmp_path: Path) -> None:
     (tmp_path / "a" / "torn.77.partial").write_bytes(b"1")
     assert sweep_partial(tmp_path) == 1
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["whole"]
-
-
-def _try_lock(root: str, answer: "multiprocessing.Queue[str]") -> None:
-    try:
-        with locked(RunLayout(Path(root))):
-            answer.put("got it")
-    except InputError as error:
-        answer.put(str(error))
-
-
-def _told(root: Path) -> str:
-    context = multiprocessing.get_context("spawn")
-    answer: multiprocessing.Queue[str] = context.Queue()
-    process = context.Process(target=_try_lock, args=(str(root), answer))
-    process.start()
-    told = answer.get(timeout=60)
-    process.join()
-    return told
-
-
-def test_two_runs_on_one_folder(tmp_path: Path) -> None:
-    with locked(RunLayout(tmp_path)):
-        assert f"locked by pid {os.getpid()} on" in _told(tmp_path)
-    assert _told(tmp_path) == "got it"

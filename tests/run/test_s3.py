@@ -1,11 +1,6 @@
 """A run folder on S3, a local server's: the same bits as on a disk."""
 
-import os
-import re
-import subprocess
-import sys
-import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,73 +16,45 @@ from tests.foreign_cluster import foreign_cluster
 from tests.new_base import write_new_base
 from tests.small_flight import digests, digests_of, job, process, redone
 from velfield import open_run
-from velfield.errors import InputError
 from velfield.pipeline.verify import verify_run
-from velfield.run import paths as places
+from velfield.run import paths
 from velfield.run.layout import RunLayout
-from velfield.run.lock import locked
-from velfield.run.paths import S3_OPTIONS, RemotePath, copy_objects, place, rename_tree
+from velfield.run.paths import copy_objects, rename_tree, to_path
 from velfield.run.results import share
-
-
-@pytest.fixture(scope="module")
-def s3() -> Iterator[None]:
-    """An S3 of our own with a bucket, on this machine alone, told by the environment as any other would be.
-
-    In a process of its own: in one with its clients, all wait for the interpreter most of the time.
-    """
-    command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", "0"]
-    with (
-        pytest.MonkeyPatch.context() as patch,
-        subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as started,
-    ):
-        assert started.stderr is not None
-        address = next(found[0] for line in started.stderr if (found := re.findall(r"http://127\.0\.0\.1:\d+", line)))
-        threading.Thread(target=started.stderr.read, daemon=True).start()  # or its log would fill the pipe
-        patch.setenv("AWS_ENDPOINT_URL", address)
-        patch.setenv("AWS_ACCESS_KEY_ID", "testing")
-        patch.setenv("AWS_SECRET_ACCESS_KEY", "testing")
-        patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-        import boto3
-
-        boto3.client("s3").create_bucket(Bucket="flights")
-        yield
-        started.terminate()
+from velfield.run.s3 import S3_OPTIONS
 
 
 @pytest.fixture(scope="module")
 def remote(
     s3: None, whole: tuple[Path, RunSummary], flight: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[RemotePath, RunSummary]:
+) -> tuple[Path, RunSummary]:
     """The flight's run on S3, worked on by processes in folders of their own that have nothing but that in common.
 
     All stores are written there; only lens, base image and detector are taken from the disk.
     """
-    root = RemotePath("s3://flights/runs/whole")
-    share(RunLayout(whole[0]), RunLayout(place("s3://flights/runs/whole")), ("lens", "base", "detector"))
+    root = to_path("s3://flights/runs/whole")
+    share(RunLayout(whole[0]), RunLayout(to_path("s3://flights/runs/whole")), ("lens", "base", "detector"))
     with foreign_cluster(tmp_path_factory.mktemp("cluster")) as address:
-        return root, process(job(flight, root), RunnerConfig(scheduler=address))  # type: ignore[arg-type]
+        return root, process(job(flight, root), RunnerConfig(scheduler=address))
 
 
-def remote_digests(root: RemotePath) -> dict[str, str]:
+def remote_digests(root: Path) -> dict[str, str]:
     # All at once: one by one takes half a minute.
     files_there = s3fs.S3FileSystem(**S3_OPTIONS)
-    objects = files_there.cat(files_there.find(root.url))
-    return digests_of(root, {RemotePath("s3:/", key): data for key, data in objects.items()})  # type: ignore[arg-type,misc]
+    objects = files_there.cat(files_there.find(str(root)))
+    return digests_of(root, {to_path(f"s3://{key}"): data for key, data in objects.items()})
 
 
-def test_the_same_bits_as_on_a_disk(remote: tuple[RemotePath, RunSummary], whole: tuple[Path, RunSummary]) -> None:
+def test_the_same_bits_as_on_a_disk(remote: tuple[Path, RunSummary], whole: tuple[Path, RunSummary]) -> None:
     assert remote[1].complete
     assert remote_digests(remote[0]) == digests(whole[0])
 
 
-def test_a_second_run_does_nothing_again(remote: tuple[RemotePath, RunSummary], flight: Path) -> None:
-    assert redone(process(job(flight, remote[0]))) == []  # type: ignore[arg-type]
+def test_a_second_run_does_nothing_again(remote: tuple[Path, RunSummary], flight: Path) -> None:
+    assert redone(process(job(flight, remote[0]))) == []
 
 
-def test_it_is_read_and_verified_from_there(
-    remote: tuple[RemotePath, RunSummary], whole: tuple[Path, RunSummary]
-) -> None:
+def test_it_is_read_and_verified_from_there(remote: tuple[Path, RunSummary], whole: tuple[Path, RunSummary]) -> None:
     run, here = open_run("s3://flights/runs/whole"), open_run(whole[0])
     np.testing.assert_array_equal(run.field.modal_velocity(), here.field.modal_velocity())
     assert run.tracklets().equals(here.tracklets())
@@ -101,7 +68,7 @@ def test_it_is_read_and_verified_from_there(
 
 
 def test_a_new_base_image_under_a_run_that_is_there(
-    remote: tuple[RemotePath, RunSummary], flight: Path, tmp_path: Path
+    remote: tuple[Path, RunSummary], flight: Path, tmp_path: Path
 ) -> None:
     base = write_new_base(flight, tmp_path / "spring.png")
     there, summary = run_reprocess(Path("s3://flights/runs/whole"), base, console=Console("quiet"))
@@ -119,7 +86,7 @@ def test_a_new_base_image_under_a_run_that_is_there(
 def test_a_folder_whose_naming_was_cut_short_has_no_last_file_and_is_named_again(
     s3: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    source, target = (place(f"s3://flights/naming/{name}") for name in ("source", "target"))
+    source, target = (to_path(f"s3://flights/naming/{name}") for name in ("source", "target"))
     written = {"a/1": b"one", "a/2": b"two", "last": b"three"}
     for name, data in written.items():
         (source / name).write_bytes(data)
@@ -129,7 +96,7 @@ def test_a_folder_whose_naming_was_cut_short_has_no_last_file_and_is_named_again
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(places, "copy_objects", cut_short)
+        patch.setattr(paths, "copy_objects", cut_short)
         with pytest.raises(KeyboardInterrupt):
             rename_tree(source, target, last="last")
     assert (target / "a/1").exists()
@@ -137,25 +104,3 @@ def test_a_folder_whose_naming_was_cut_short_has_no_last_file_and_is_named_again
     rename_tree(source, target, last="last")
     assert {name: (target / name).read_bytes() for name in written} == written
     assert not source.exists()
-
-
-def test_two_runs_on_one_folder(s3: None) -> None:
-    layout = RunLayout(place("s3://flights/locked"))
-    with locked(layout), pytest.raises(InputError, match=f"locked by pid {os.getpid()}"), locked(layout):
-        pass
-    with locked(layout):
-        pass
-
-
-def test_the_lock_of_a_process_that_was_killed_is_taken_over(s3: None) -> None:
-    code = """if True:
-        import os
-        from velfield.run.layout import RunLayout
-        from velfield.run.lock import locked
-        from velfield.run.paths import place
-        with locked(RunLayout(place("s3://flights/killed"))):
-            os.kill(os.getpid(), 9)
-    """
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -9
-    with locked(RunLayout(place("s3://flights/killed"))):
-        pass

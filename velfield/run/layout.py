@@ -1,9 +1,9 @@
-"""Where everything stands in a run folder (the contract of outputs)."""
+"""Paths of a run folder (the contract of outputs)."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from velfield.run.paths import place
+from velfield.run.paths import to_path
 
 STAGES = ("frames", "lens", "base", "registration", "detector", "detections", "tracklets", "tracks", "field", "maps")
 """The stages in the order of the work."""
@@ -22,7 +22,7 @@ class RunLayout:
     root: Path
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "root", place(self.root))
+        object.__setattr__(self, "root", to_path(self.root))
 
     @property
     def flight(self) -> Path:

@@ -1,4 +1,8 @@
-"""One run at a time on a run folder."""
+"""One run at a time on a run folder: the kernel's lock on a disk, a lease on S3.
+
+The lease is an object that is never removed. Every change of it is one conditional write, "only if there is none" or
+"only if its content still is what I read", so that of several processes that find it expired one gets it.
+"""
 
 import fcntl
 import json
@@ -6,12 +10,17 @@ import os
 import socket
 import threading
 import time
+import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
 
 from velfield.errors import InputError
 from velfield.run.layout import RunLayout
-from velfield.run.paths import RemotePath
+from velfield.run.paths import is_remote
+
+if TYPE_CHECKING:
+    from velfield.run.s3 import S3ObjectPath
 
 _LEASE_S = 60.0
 """How long a lock on S3 outlives a process that was killed on another machine."""
@@ -24,9 +33,10 @@ def locked(layout: RunLayout) -> Iterator[None]:
     Raises
     ------
     InputError
-        Another process holds it: says which, where and since when.
+        Another process holds it: with its pid, host and since when. Or, on S3, this process stood still for longer
+        than the lease, and another took the lock over meanwhile.
     """
-    if isinstance(layout.lock, RemotePath):
+    if is_remote(layout.lock):
         with _leased(layout.lock, str(layout.root)):
             yield
         return
@@ -36,54 +46,108 @@ def locked(layout: RunLayout) -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             file.seek(0)
-            raise InputError(f"{layout.root} is locked {_holder(file.read())}; wait for it, or stop it") from None
+            raise InputError(_refusal(str(layout.root), file.read())) from None
         file.truncate(0)
-        file.write(_own_record())
+        file.write(_record())
         file.flush()
         yield
 
 
-def _own_record() -> str:
+def _record(lease_s: float = 0.0, lease: str = "") -> str:
+    """JSON of this process; no two are equal, for S3 compares contents."""
     since = time.strftime("%Y-%m-%d %H:%M:%S")
-    until_s = time.time() + _LEASE_S
-    return json.dumps({"pid": os.getpid(), "host": socket.gethostname(), "since": since, "until_s": until_s})
+    owner = {"pid": os.getpid(), "host": socket.gethostname(), "since": since, "lease": lease}
+    return json.dumps(owner | {"until_s": time.time() + lease_s, "write": uuid.uuid4().hex})
+
+
+class _Lease:
+    """The lock object of a run folder on S3, held by this process from `acquire` to `release`."""
+
+    def __init__(self, path: "S3ObjectPath", name: str) -> None:
+        self._path = path
+        self._name = name
+        self._id = uuid.uuid4().hex
+        self._version: str | None = None
+
+    def acquire(self) -> None:
+        while self._version is None:
+            self._version = self._path.create(self._data()) or self._take_over()
+
+    def renew(self, lease_s: float = _LEASE_S) -> bool:
+        """Extend the lease; whether it was still ours."""
+        if self._version is not None:
+            self._version = self._path.replace_version(self._version, self._data(lease_s)) or self._own_version()
+        return self._version is not None
+
+    def release(self) -> bool:
+        """Let it expire; whether it was still ours."""
+        return self.renew(lease_s=0.0)
+
+    def _data(self, lease_s: float = _LEASE_S) -> bytes:
+        return _record(lease_s, self._id).encode()
+
+    def _read(self) -> tuple[str, str]:
+        """Version and content, the version first: should another write come between, the version is the older one."""
+        return self._path.version(), self._path.read_bytes().decode()
+
+    def _take_over(self) -> str | None:
+        """Version of the lock once it is ours; None where another process changed it meanwhile."""
+        try:
+            version, text = self._read()
+        except FileNotFoundError:  # removed by hand
+            return None
+        if self._id in text:  # a write whose answer was lost
+            return version
+        if not _is_expired(text):
+            raise InputError(_refusal(self._name, text))
+        return self._path.replace_version(version, self._data())
+
+    def _own_version(self) -> str | None:
+        """Version of the lock where it is ours though a write was refused: it was a repetition, its answer lost."""
+        try:
+            version, text = self._read()
+        except FileNotFoundError:
+            return None
+        return version if self._id in text else None
 
 
 @contextmanager
-def _leased(lock: RemotePath, name: str) -> Iterator[None]:
-    """No kernel watches over an object: written where none is, renewed while we live, taken over when it is not."""
-    if not lock.write_new(_own_record().encode()):
-        record = lock.read_text()
-        if not _is_over(record):
-            raise InputError(f"{name} is locked {_holder(record)}; wait for it, or stop it")
-        lock.write_bytes(_own_record().encode())
+def _leased(path: "S3ObjectPath", name: str) -> Iterator[None]:
+    lease = _Lease(path, name)
+    lease.acquire()
     ended = threading.Event()
 
-    def renew() -> None:
+    def keep() -> None:
         while not ended.wait(_LEASE_S / 3):
-            lock.write_bytes(_own_record().encode())
+            with suppress(OSError):  # the next attempt comes before the lease expires
+                lease.renew()
 
-    thread = threading.Thread(target=renew, name="lease", daemon=True)
+    thread = threading.Thread(target=keep, name="lease", daemon=True)
     thread.start()
     try:
         yield
     finally:
         ended.set()
         thread.join()
-        lock.unlink(missing_ok=True)
+        kept = lease.release()
+    if not kept:
+        raise InputError(
+            f"{name}: found the lock taken over by another process, expected it renewed every {_LEASE_S / 3:.0f} s; "
+            "this process stood still: check the folder with `velfield verify`"
+        )
 
 
-def _is_over(text: str) -> bool:
-    """Whether whoever wrote it is gone: it was not renewed in time, or its process on this machine ended."""
+def _is_expired(text: str) -> bool:
+    """Whether the writer of the record is gone: it was not renewed in time, or its process on this machine ended."""
     try:
         record = json.loads(text)
-        gone = record["host"] == socket.gethostname() and not _lives(int(record["pid"]))
+        gone = record["host"] == socket.gethostname() and not _is_running(int(record["pid"]))
         return gone or time.time() > float(record["until_s"])
     except (ValueError, KeyError):
         return True
 
 
-def _lives(pid: int) -> bool:
+def _is_running(pid: int) -> bool:
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -93,9 +157,10 @@ def _lives(pid: int) -> bool:
     return True
 
 
-def _holder(text: str) -> str:
+def _refusal(name: str, text: str) -> str:
     try:
         record = json.loads(text)
-        return f"by pid {record['pid']} on {record['host']} since {record['since']}"
+        holder = f"pid {record['pid']} on {record['host']} since {record['since']}"
     except (ValueError, KeyError):
-        return "by another process"
+        holder = "another process"
+    return f"{name} is locked by {holder}; wait for it, or stop it"

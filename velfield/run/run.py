@@ -19,7 +19,7 @@ from velfield.run.field_reader import IntervalField, open_field_intervals, open_
 from velfield.run.frame_transforms import FrameMaps
 from velfield.run.grid import read_grid
 from velfield.run.layout import RunLayout
-from velfield.run.paths import local_copy
+from velfield.run.paths import local_copy, to_path
 from velfield.run.stores import FrameStore, RegistrationStore, open_field, open_frames, open_registration
 from velfield.run.tables import read_tables
 
@@ -35,7 +35,7 @@ def open_run(root: str | Path) -> "Run":
     InputError
         The folder is not a run folder, or one of another format.
     """
-    layout = RunLayout(Path(root))
+    layout = RunLayout(to_path(root))
     if not layout.flight.exists():
         raise InputError(
             f"{root} is not a run folder: it has no flight.json; make one with `velfield run ... --out {root}`"

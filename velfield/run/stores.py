@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from zarr.codecs import ZstdCodec
 
 from velfield.errors import InputError
-from velfield.run.paths import S3_OPTIONS, RemotePath
+from velfield.run.paths import is_remote
 
 _STATUS_BYTES = 160
 HISTOGRAM = "velocity_histogram"
@@ -47,10 +47,10 @@ def _create(
     )
 
 
-def _place(path: Path) -> dict[str, Any]:
-    """What zarr asks for to find a store."""
-    if isinstance(path, RemotePath):
-        return {"store": path.url, "storage_options": S3_OPTIONS}
+def _location(path: Path) -> dict[str, Any]:
+    """Zarr's arguments for the store at a path."""
+    if is_remote(path):
+        return {"store": str(path), "storage_options": dict(path.storage_options)}
     return {"store": path}
 
 
@@ -82,7 +82,7 @@ class _Group:
 
 def _open(path: Path, mode: str) -> _Group:
     try:
-        return _Group(zarr.open_group(**_place(path), mode=cast(Any, mode), zarr_format=3, use_consolidated=False))
+        return _Group(zarr.open_group(**_location(path), mode=cast(Any, mode), zarr_format=3, use_consolidated=False))
     except FileNotFoundError:
         raise InputError(f"{path} is not there: run `velfield run` on this folder first") from None
 
@@ -124,7 +124,7 @@ def _existing(paths: Iterable[Path]) -> list[Path]:
 def store_key(path: Path) -> str | None:
     """Content key that a store was laid out under; none where it is not there or not whole."""
     try:
-        return str(zarr.open_group(**_place(path), mode="r", zarr_format=3, use_consolidated=False).attrs["key"])
+        return str(zarr.open_group(**_location(path), mode="r", zarr_format=3, use_consolidated=False).attrs["key"])
     except (FileNotFoundError, KeyError, ValueError):
         return None
 
@@ -143,7 +143,7 @@ def create_frames(
     path: Path, *, key: str, count: int, height: int, width: int, unit_frames: int, source: Mapping[str, Any]
 ) -> None:
     """Lay out ``frames.zarr``: one frame a chunk; a unit of a column a chunk. Frames are unreadable until written."""
-    group = zarr.create_group(**_place(path), overwrite=True, attributes={"source": dict(source)})
+    group = zarr.create_group(**_location(path), overwrite=True, attributes={"source": dict(source)})
     chunk = min(unit_frames, max(count, 1))
     _create(group, "raw", (count, height, width), (1, height, width), "uint8", dimension_names=("frame", "y", "x"))
     for name, (dtype, fill) in FRAME_COLUMNS.items():
@@ -231,7 +231,7 @@ ERROR_CELLS = (6, 8)
 
 def create_registration(path: Path, *, key: str, count: int, vector_length: int, unit_frames: int) -> None:
     """Lay out ``registration.zarr``: chunks are units, so that a unit has one writer."""
-    group = zarr.create_group(**_place(path), overwrite=True)
+    group = zarr.create_group(**_location(path), overwrite=True)
     chunk = min(unit_frames, max(count, 1))
     _create(group, "vector", (count, vector_length), (chunk, vector_length), "float64", fill_value=np.nan)
     _create(group, "status", (count, _STATUS_BYTES), (chunk, _STATUS_BYTES), "uint8", fill_value=0)
@@ -325,7 +325,7 @@ def create_field(
     layers : name -> attributes
         (y, x) layers beside the histogram; ``dtype`` among the attributes says their type, float32 where absent.
     """
-    group = zarr.create_group(**_place(path), overwrite=True, attributes=dict(attributes))
+    group = zarr.create_group(**_location(path), overwrite=True, attributes=dict(attributes))
     n = len(velocities_px_per_s)
     grid_mapping = {"grid_mapping": "crs"} if attributes.get("crs_wkt") else {}
     for name, what in histograms.items():
@@ -475,7 +475,7 @@ _LAYER_CHUNK_PX = 512
 
 def write_segments(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write ``view/segments.zarr`` anew: columns of one length, (segments,) each; every chunk is there to be read."""
-    group = zarr.create_group(**_place(path), overwrite=True)
+    group = zarr.create_group(**_location(path), overwrite=True)
     for name, values in columns.items():
         chunk = (min(_SEGMENTS_A_CHUNK, max(len(values), 1)),)
         column = _create(group, name, values.shape, chunk, values.dtype.name, dimension_names=("segment",))
@@ -484,7 +484,7 @@ def write_segments(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
 
 def write_extra_layers(path: Path, layers: Mapping[str, tuple[NDArray[np.floating], Mapping[str, Any]]]) -> None:
     """Write float32 (y, x) layers with their attributes, to be shown beside a field's own: `open_field` reads them."""
-    group = zarr.create_group(**_place(path), overwrite=True)
+    group = zarr.create_group(**_location(path), overwrite=True)
     for name, (values, attributes) in layers.items():
         chunk = (_LAYER_CHUNK_PX, _LAYER_CHUNK_PX)
         layer = _create(group, name, values.shape, chunk, "float32", fill_value=np.nan, dimension_names=("y", "x"))

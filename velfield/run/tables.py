@@ -46,29 +46,31 @@ def write_table(path: Path, table: pd.DataFrame, columns: Mapping[str, str]) -> 
 
 
 def link_file(source: Path, target: Path) -> Path:
-    """A file under a second name, whole or not at all; no bytes are copied where the disk can do without.
-
-    Files of a run folder are replaced, never changed in place, so what is done to one name is not seen under the other.
-    """
-    if is_remote(source) and is_remote(target):
-        copy_objects([(source, target)])
-        return target
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.unlink(missing_ok=True)
-    try:
-        os.link(source, target)
-    except (OSError, TypeError):  # another disk, or no disk at all
-        write_atomically(target, source.read_bytes())
+    """Give one file a second name, as `link_files` does; returns it."""
+    link_files([(source, target)])
     return target
 
 
 def link_files(pairs: Sequence[tuple[Path, Path]]) -> None:
-    """Many files at once, as by `link_file`: pairs of a file and its further name."""
-    if all(is_remote(source) and is_remote(target) for source, target in pairs):
+    """Give files a second name each, whole or not at all; no bytes are copied where the disk can do without.
+
+    Files of a run folder are replaced, never changed in place: a change under one name does not show under the other.
+
+    Parameters
+    ----------
+    pairs
+        A file and its second name, each.
+    """
+    if all(is_remote(path) for pair in pairs for path in pair):
         copy_objects(pairs)
         return
     for source, target in pairs:
-        link_file(source, target)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.unlink(missing_ok=True)
+        try:
+            os.link(source, target)
+        except (OSError, TypeError):  # another disk, or an object
+            write_atomically(target, source.read_bytes())
 
 
 def read_tables(

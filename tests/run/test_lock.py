@@ -1,0 +1,161 @@
+"""One run at a time on a run folder, on a disk and on S3, whoever comes and however the last one ended."""
+
+import json
+import multiprocessing
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from velfield.errors import InputError
+from velfield.run import lock
+from velfield.run.layout import RunLayout
+from velfield.run.lock import locked
+from velfield.run.paths import to_path
+
+EXPIRED = json.dumps({"pid": 1, "host": "elsewhere", "since": "2024-05-01 12:00:00", "until_s": 0.0})
+
+
+@pytest.fixture(params=["disk", "s3"])
+def layout(request: pytest.FixtureRequest, tmp_path: Path) -> RunLayout:
+    if request.param == "disk":
+        return RunLayout(tmp_path / "run")
+    request.getfixturevalue("s3")
+    return RunLayout(to_path(f"s3://flights/locks/{tmp_path.name}"))
+
+
+def record(layout: RunLayout) -> dict[str, object]:
+    found: dict[str, object] = json.loads(layout.lock.read_bytes())
+    return found
+
+
+def _try_lock(root: str, answer: "multiprocessing.Queue[str]") -> None:
+    try:
+        with locked(RunLayout(to_path(root))):
+            answer.put("got it")
+    except InputError as error:
+        answer.put(str(error))
+
+
+def answer_of_another_process(root: Path) -> str:
+    context = multiprocessing.get_context("spawn")
+    answer: multiprocessing.Queue[str] = context.Queue()
+    process = context.Process(target=_try_lock, args=(str(root), answer))
+    process.start()
+    found = answer.get(timeout=60)
+    process.join()
+    return found
+
+
+def test_two_runs_on_one_folder(layout: RunLayout) -> None:
+    with locked(layout):
+        assert f"locked by pid {os.getpid()} on" in answer_of_another_process(layout.root)
+        with pytest.raises(InputError, match=f"locked by pid {os.getpid()}"), locked(layout):
+            pass
+    assert answer_of_another_process(layout.root) == "got it"
+    with locked(layout):
+        pass
+
+
+def test_the_lock_of_a_process_that_was_killed_is_taken_over(layout: RunLayout) -> None:
+    code = f"""if True:
+        import os
+        from velfield.run.layout import RunLayout
+        from velfield.run.lock import locked
+        from velfield.run.paths import to_path
+        with locked(RunLayout(to_path({str(layout.root)!r}))):
+            os.kill(os.getpid(), 9)
+    """
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -9
+    with locked(layout):
+        assert record(layout)["pid"] == os.getpid()
+
+
+def test_of_many_that_meet_an_expired_lock_one_takes_it_over(layout: RunLayout) -> None:
+    contenders, rounds = 6, 12
+    start, end = threading.Barrier(contenders), threading.Barrier(contenders)
+    holders: list[list[int]] = [[] for _ in range(rounds)]
+    refusals: list[str] = []
+
+    def contend(number: int) -> None:
+        for k in range(rounds):
+            if start.wait(60) == 0:
+                layout.root.mkdir(parents=True, exist_ok=True)
+                layout.lock.write_bytes(EXPIRED.encode())
+            start.wait(60)
+            try:
+                with locked(layout):
+                    holders[k].append(number)
+                    end.wait(60)  # held until all have tried
+            except InputError as error:
+                refusals.append(str(error))
+                end.wait(60)
+
+    threads = [threading.Thread(target=contend, args=(number,)) for number in range(contenders)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [len(found) for found in holders] == [1] * rounds
+    assert len(refusals) == rounds * (contenders - 1)
+
+
+def test_what_is_no_record_is_an_expired_one(layout: RunLayout) -> None:
+    layout.root.mkdir(parents=True, exist_ok=True)
+    layout.lock.write_bytes(b"not JSON")
+    with locked(layout):
+        assert record(layout)["pid"] == os.getpid()
+
+
+@pytest.fixture
+def lease(s3: None, tmp_path: Path) -> RunLayout:
+    return RunLayout(to_path(f"s3://flights/leases/{tmp_path.name}"))
+
+
+def test_a_lease_is_renewed_while_it_is_held_and_expires_when_it_is_given_back(
+    lease: RunLayout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lock, "_LEASE_S", 0.6)
+    with locked(lease):
+        first = record(lease)
+        time.sleep(0.5)
+        assert record(lease)["until_s"] > first["until_s"]  # type: ignore[operator]
+    assert record(lease)["until_s"] <= time.time()  # type: ignore[operator]
+
+
+def test_a_lease_that_was_taken_over_is_not_taken_back(lease: RunLayout) -> None:
+    theirs = json.dumps({"pid": 1, "host": "elsewhere", "since": "now", "until_s": time.time() + 60})
+    with pytest.raises(InputError, match="taken over by another process"), locked(lease):
+        lease.lock.write_bytes(theirs.encode())
+    assert lease.lock.read_bytes().decode() == theirs
+
+
+def take_over_and_fail(lease: RunLayout) -> None:
+    lease.lock.write_bytes(EXPIRED.encode())
+    raise ZeroDivisionError
+
+
+def test_an_exception_is_not_hidden_by_the_loss_of_the_lease(lease: RunLayout) -> None:
+    with pytest.raises(ZeroDivisionError), locked(lease):
+        take_over_and_fail(lease)
+
+
+def test_a_write_whose_answer_was_lost_is_known_for_ones_own(lease: RunLayout, monkeypatch: pytest.MonkeyPatch) -> None:
+    from velfield.run.s3 import S3ObjectPath
+
+    replace = S3ObjectPath.replace_version
+
+    def lose_answer(path: S3ObjectPath, version: str, data: bytes) -> None:
+        replace(path, version, data)
+
+    def lose_created(path: S3ObjectPath, data: bytes) -> None:
+        path.write_bytes(data)
+
+    monkeypatch.setattr(S3ObjectPath, "create", lose_created)
+    monkeypatch.setattr(S3ObjectPath, "replace_version", lose_answer)
+    with locked(lease):
+        assert record(lease)["pid"] == os.getpid()
