@@ -1,35 +1,34 @@
-"""``velfield export``: a finished run in a format that others read."""
+"""``velfield export``: a finished run in a format of other programs."""
 
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 
-Format = Literal["cog", "geoparquet", "gpkg", "geotrax", "sumo", "arrows", "stac", "direction", "speed", "report"]
-Unit = Literal["km/h", "mph", "m/s", "px/s"]
+from schemas.export import EXPORT_FORMATS, ExportFormat, ExportOptions, SpeedUnit
+
+_FORMATS_HELP = "; ".join(f"`{name}`: {content}" for name, content in EXPORT_FORMATS.items()) + "."
 
 
 def export(
     run_folder: Path,
     /,
     *,
-    format_name: Annotated[Format, Parameter(name="--format")],
+    format_name: Annotated[ExportFormat, Parameter(name="--format", help=_FORMATS_HELP)],
     out: Path | None = None,
     width: int | None = None,
-    unit: Unit = "km/h",
+    unit: SpeedUnit = "km/h",
     start: str | None = None,
 ) -> int:
-    """Write a finished run in a format that others read.
+    """Write a finished run in a format of other programs.
 
     Parameters
     ----------
     run_folder
         The run folder.
     format_name
-        `cog`: the field's layers as GeoTIFF; `geoparquet`, `gpkg`: tracklets as lines; `geotrax`: tracks as CSV;
-        `sumo`: tracks as FCD XML; `arrows`: modal velocities as GeoJSON; `stac`: a catalogue's item; `direction`,
-        `speed`: the figures as PNG; `report`: the summary as one HTML file, to send by mail.
+        One of `schemas.export.EXPORT_FORMATS`.
     out
         File to write. Default: in the run folder's `exports/`.
     width
@@ -39,15 +38,15 @@ def export(
     start
         When the flight began, as 2024-05-01T12:00:00Z; for `stac`.
     """
-    from velfield.exports.export import ExportOptions, export_run
+    from velfield.exports.export import export_run
     from velfield.run.run import open_run
 
-    options = ExportOptions(width_px=width, unit=unit, start=_moment(start))
+    options = ExportOptions(width_px=width, unit=unit, start=_parse_time(start))
     print(export_run(open_run(run_folder), format_name, out, options))
     return 0
 
 
-def _moment(text: str | None) -> datetime | None:
+def _parse_time(text: str | None) -> datetime | None:
     from velfield.errors import InputError
 
     try:

@@ -16,7 +16,7 @@ from velfield.detection.review import review_sheet
 from velfield.detection.samples import scene_of
 from velfield.errors import InputError
 from velfield.pipeline.stages.labels import labelled_images, odd_length
-from velfield.sources.labels.labels import load_labels
+from velfield.sources.labels.labels import read_labels
 from velfield.sources.source import probe
 from velfield.synthetic import small_flight
 
@@ -102,7 +102,7 @@ def test_a_turned_car_in_an_upright_box_is_learnt_along_its_axis(tmp_path: Path)
     (tmp_path / "labels").mkdir()
     np.savetxt(tmp_path / "labels" / "0.txt", rows, fmt="%.6f")
     info = probe(tmp_path, frames=FramesConfig(fps=1.0))
-    (image,) = labelled_images(tmp_path, info, load_labels(tmp_path / "labels", info), work_per_raw=0.92)
+    (image,) = labelled_images(tmp_path, info, read_labels(tmp_path / "labels", info), work_per_raw=0.92)
     off = np.degrees(axial_difference(scene_of(image, has_background=False).cars[:, 2], axis))
     assert len(off) > 15
     assert np.mean(off < 15) > 0.85

@@ -3,16 +3,21 @@
 import json
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
+import pyogrio
 import pytest
+import s3fs
 
+from schemas.export import EXPORT_FORMATS, ExportFormat, ExportOptions
 from schemas.summary import RunSummary
 from tests.exports.test_exports import UTM
 from velfield.errors import InputError
-from velfield.exports.export import FORMATS, ExportOptions, export_run
+from velfield.exports.export import export_module, export_run
 from velfield.run.run import Run, open_run
+from velfield.run.s3 import S3_OPTIONS
 
 
 @pytest.fixture
@@ -36,8 +41,7 @@ def test_a_figure_has_the_width_that_was_asked_for(name: str, run: Run, tmp_path
 
 
 def test_a_stac_item_names_what_is_there(run: Run, tmp_path: Path) -> None:
-    placed = run.grid.model_copy(update={"crs_wkt": UTM.to_wkt(), "affine": (0.23, 0.0, 7e5, 0.0, -0.23, 3.5e6)})
-    run.__dict__["grid"] = placed  # as a run on a base image with coordinates would have it
+    run = georeferenced(run)
     start = datetime(2024, 5, 1, 12, tzinfo=UTC)
     path = export_run(run, "stac", tmp_path / "deep" / "item.json", ExportOptions(start=start))
     item = json.loads(path.read_text())
@@ -51,12 +55,64 @@ def test_stac_wants_to_know_when(run: Run, tmp_path: Path) -> None:
         export_run(run, "stac", tmp_path / "item.json")
 
 
-def test_the_command_knows_the_formats_that_there_are() -> None:
-    from typing import get_args
+def test_each_format_is_described_and_a_module() -> None:
+    assert set(get_args(ExportFormat)) == set(EXPORT_FORMATS)
+    names = [export_module(name).FILE_NAME for name in EXPORT_FORMATS]
+    assert len(set(names)) == len(names)
+    assert [name for name in EXPORT_FORMATS if not callable(export_module(name).encode)] == []
 
-    from flows.commands.export import Format
 
-    assert set(get_args(Format)) == set(FORMATS)
+@pytest.mark.parametrize("name", ["shapefile", "export", "georeference"])
+def test_a_format_that_is_none_is_refused_with_those_that_are(name: str) -> None:
+    with pytest.raises(InputError, match=f"--format {name}: not known; expected one of cog, geoparquet"):
+        export_module(name)
+
+
+def georeferenced(run: Run) -> Run:
+    """As a run on a base image with coordinates would be."""
+    grid = run.grid.model_copy(update={"crs_wkt": UTM.to_wkt(), "affine": (0.23, 0.0, 7e5, 0.0, -0.23, 3.5e6)})
+    run.__dict__["grid"] = grid
+    return run
+
+
+@pytest.fixture(scope="module")
+def remote_root(s3: None, whole: tuple[Path, RunSummary]) -> str:
+    """The run's folder on S3."""
+    s3fs.S3FileSystem(**S3_OPTIONS).put(str(whole[0]), "flights/exports/whole", recursive=True)
+    return "s3://flights/exports/whole"
+
+
+@pytest.mark.parametrize("name", sorted(EXPORT_FORMATS))
+def test_each_format_is_the_same_from_and_to_s3(name: str, run: Run, remote_root: str, tmp_path: Path) -> None:
+    options = ExportOptions(width_px=300, start=datetime(2024, 5, 1, 12, tzinfo=UTC))
+    remote = georeferenced(open_run(remote_root))
+    path = export_run(remote, name, options=options)
+    assert str(path) == f"{remote_root}/exports/{export_module(name).FILE_NAME}"
+    local = export_run(georeferenced(run), name, tmp_path / "whole" / "exports" / path.name, options)
+    if name == "gpkg":  # it holds the time of its writing
+        (tmp_path / "remote.gpkg").write_bytes(path.read_bytes())
+        tables = [pyogrio.read_arrow(file)[1] for file in (local, tmp_path / "remote.gpkg")]
+        assert tables[0].num_rows == len(run.tracklets())
+        assert tables[0].equals(tables[1])
+    elif name == "stac":
+        items = [json.loads(file.read_bytes()) for file in (local, path)]
+        assert items[1]["assets"]["field"]["href"] == "../field.zarr"
+        assert items[0].pop("assets").keys() == items[1].pop("assets").keys()
+        assert items[0] == items[1]
+    else:
+        assert local.read_bytes() == path.read_bytes()
+
+
+def test_a_stac_item_elsewhere_names_files_by_their_whole_address(remote_root: str, tmp_path: Path) -> None:
+    run = georeferenced(open_run(remote_root))
+    path = export_run(run, "stac", tmp_path / "item.json", ExportOptions(start=datetime(2024, 5, 1, tzinfo=UTC)))
+    assert json.loads(path.read_text())["assets"]["field"]["href"] == f"{remote_root}/field.zarr"
+
+
+def test_an_export_that_fails_leaves_nothing_behind(run: Run, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no reference system"):
+        export_run(run, "arrows", tmp_path / "arrows.geojson")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_certificates_are_kept_and_shown(run: Run) -> None:

@@ -20,15 +20,16 @@ from velfield.errors import InputError
 from velfield.exports.arrows import arrows_geojson
 from velfield.exports.cog import write_cog
 from velfield.exports.geoparquet import tracklets_geoparquet
-from velfield.exports.place import Place
+from velfield.exports.georeference import Georeference
+from velfield.exports.geotrax import geotrax_csv, geotrax_table
 from velfield.exports.stac import stac_item
 from velfield.exports.sumo import sumo_fcd
-from velfield.exports.tracks import geotrax_csv, geotrax_table, passage_points
+from velfield.exports.tracks import track_points
 
 GSD_M = 0.25
 UTM = CRS.from_epsg(32636)
-PLACED = Place((200, 300), UTM.to_wkt(), (GSD_M, 0.0, 700_000.0, 0.0, -GSD_M, 3_500_000.0), GSD_M)
-PIXELS = Place((200, 300), gsd_m=GSD_M)
+GEOREFERENCED = Georeference((200, 300), UTM.to_wkt(), (GSD_M, 0.0, 700_000.0, 0.0, -GSD_M, 3_500_000.0), GSD_M)
+PIXELS = Georeference((200, 300), gsd_m=GSD_M)
 
 
 def tracklets_of(paths):
@@ -56,7 +57,7 @@ def tracklets():
 
 
 def test_a_passage_has_each_of_its_detections_once(tracklets):
-    points = passage_points(tracklets)
+    points = track_points(tracklets)
     assert points.groupby("passage_id").size().to_dict() == {1: 5, 2: 3}
     first = points[points["passage_id"] == 1]
     np.testing.assert_allclose(first["x_px"], 10 + 8 * np.arange(5))
@@ -65,7 +66,7 @@ def test_a_passage_has_each_of_its_detections_once(tracklets):
 
 
 def test_geotrax_csv_has_its_columns_and_units(tracklets):
-    table = pd.read_csv(io.StringIO(geotrax_csv(tracklets, PLACED)))
+    table = pd.read_csv(io.StringIO(geotrax_csv(tracklets, GEOREFERENCED)))
     expected = "Vehicle_ID,Timestamp,Frame_Number,Ortho_X,Ortho_Y,Local_X,Local_Y,Latitude,Longitude,Vehicle_Length,"
     expected += "Vehicle_Width,Vehicle_Class,Vehicle_Speed,Vehicle_Acceleration,Road_Section,Lane_Number,Visibility"
     assert ",".join(table.columns) == expected
@@ -82,11 +83,11 @@ def test_without_a_reference_system_geotrax_has_pixels_and_metres(tracklets):
     table = geotrax_table(tracklets, PIXELS)
     assert table["Latitude"].isna().all()
     assert table["Local_Y"].iloc[0] == pytest.approx((199.5 - 100) * GSD_M)
-    assert geotrax_table(tracklets, Place((200, 300)))["Vehicle_Speed"].isna().all()
+    assert geotrax_table(tracklets, Georeference((200, 300)))["Vehicle_Speed"].isna().all()
 
 
 def test_geoparquet_says_where_and_what_and_its_lines_are_the_tracklets(tracklets):
-    table = pq.read_table(io.BytesIO(tracklets_geoparquet(tracklets, PLACED)))
+    table = pq.read_table(io.BytesIO(tracklets_geoparquet(tracklets, GEOREFERENCED)))
     geo = json.loads(table.schema.metadata[b"geo"])
     column = geo["columns"][geo["primary_column"]]
     assert (geo["version"], column["encoding"], column["geometry_types"]) == ("1.1.0", "WKB", ["LineString"])
@@ -124,7 +125,7 @@ def test_sumo_fcd_is_in_metres_seconds_and_navigational_degrees(tracklets):
     assert (north.get("angle"), north.get("speed")) == ("0.00", "7.50")
     assert float(north.get("y")) == pytest.approx((199.5 - 150) * GSD_M, abs=0.01)
     with pytest.raises(InputError, match="run with --gsd-m"):
-        sumo_fcd(tracklets, Place((200, 300)))
+        sumo_fcd(tracklets, Georeference((200, 300)))
 
 
 def test_arrows_stand_on_the_busiest_pixels_and_point_the_way(tracklets):
@@ -132,7 +133,7 @@ def test_arrows_stand_on_the_busiest_pixels_and_point_the_way(tracklets):
     count = np.zeros((200, 300), np.int32)
     velocity[50, :, :], count[50] = (40.0, 0.0), 3
     count[50, 100] = 9
-    arrows = json.loads(json.dumps(arrows_geojson(velocity, count, PLACED, spacing_px=20)))
+    arrows = json.loads(json.dumps(arrows_geojson(velocity, count, GEOREFERENCED, spacing_px=20)))
     assert arrows["type"] == "FeatureCollection"
     assert len(arrows["features"]) == 15
     busiest = next(feature for feature in arrows["features"] if feature["properties"]["count"] == 9)
@@ -144,15 +145,15 @@ def test_arrows_stand_on_the_busiest_pixels_and_point_the_way(tracklets):
     assert barbs[1] == tip
     (x0, x1), _ = transform(CRS.from_epsg(4326), UTM, [tail[0], tip[0]], [tail[1], tip[1]])
     assert x1 - x0 == pytest.approx(40 * 0.5 * GSD_M, abs=0.05)
-    assert arrows_geojson(velocity, count, PLACED, min_count=10)["features"] == []
+    assert arrows_geojson(velocity, count, GEOREFERENCED, min_count=10)["features"] == []
     with pytest.raises(InputError, match="--base GEOTIFF"):
         arrows_geojson(velocity, count, PIXELS)
 
 
-def test_a_stac_item_has_place_time_and_assets():
+def test_a_stac_item_has_footprint_time_and_assets():
     start = datetime(2024, 5, 1, 12, 0, tzinfo=UTC)
     item = stac_item(
-        "flight", PLACED, {"direction": "maps/direction.tif", "field": "field.zarr"}, start=start, duration_s=60
+        "flight", GEOREFERENCED, {"direction": "maps/direction.tif", "field": "field.zarr"}, start=start, duration_s=60
     )
     item = json.loads(json.dumps(item))
     assert (item["type"], item["stac_version"], item["id"]) == ("Feature", "1.1.0", "flight")
@@ -168,10 +169,10 @@ def test_a_stac_item_has_place_time_and_assets():
     assert area > 0  # counter-clockwise, as RFC 7946 wants it
     assert item["assets"]["direction"]["type"].startswith("image/tiff")
     with pytest.raises(InputError, match="without a time zone"):
-        stac_item("f", PLACED, {}, start=datetime(2024, 5, 1), duration_s=1)
+        stac_item("f", GEOREFERENCED, {}, start=datetime(2024, 5, 1), duration_s=1)
 
 
-def test_cog_keeps_names_units_nan_and_place(tmp_path):
+def test_cog_keeps_names_units_nan_and_georeference(tmp_path):
     speed = np.full((600, 700), np.nan, np.float32)
     speed[100:200, 50:80] = 12.5
     path = tmp_path / "speed.tif"
@@ -180,15 +181,15 @@ def test_cog_keeps_names_units_nan_and_place(tmp_path):
         [speed, speed * 2],
         names=["modal speed", "p85"],
         units=["m/s", "m/s"],
-        crs_wkt=PLACED.crs_wkt,
-        affine=PLACED.affine,
+        crs_wkt=GEOREFERENCED.crs_wkt,
+        affine=GEOREFERENCED.affine,
     )
     with rasterio.open(path) as dataset:
         assert dataset.descriptions == ("modal speed", "p85")
         assert dataset.units == ("m/s", "m/s")
         assert math.isnan(dataset.nodata)
         assert dataset.crs == UTM
-        assert tuple(dataset.transform)[:6] == PLACED.affine
+        assert tuple(dataset.transform)[:6] == GEOREFERENCED.affine
         assert dataset.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
         assert dataset.overviews(1)
         np.testing.assert_array_equal(dataset.read(1), speed)

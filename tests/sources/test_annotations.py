@@ -8,7 +8,7 @@ import pytest
 
 from velfield.errors import InputError
 from velfield.sources.frames import SourceInfo
-from velfield.sources.labels.labels import load_labels
+from velfield.sources.labels.labels import read_labels
 
 FOLDER = SourceInfo("folder", 200, 100, 3, np.arange(3) / 5, ("a.png", "b.png", "c.png"))
 VIDEO = SourceInfo("video", 200, 100, 50, np.arange(50) / 25, tuple(str(index) for index in range(50)))
@@ -69,7 +69,7 @@ def via():
 def test_a_car_is_where_it_was_drawn(tmp_path, content, others):
     path = tmp_path / "labels.json"
     path.write_text(json.dumps(content()))
-    labels = load_labels(path, FOLDER)
+    labels = read_labels(path, FOLDER)
     first, second = labels.cars.iloc[0], labels.cars.iloc[1]
     assert first[["x_px", "y_px"]].tolist() == pytest.approx([60, 40], abs=1e-3)
     assert first[["orientation_rad", "length_px", "width_px"]].tolist() == pytest.approx([TURN, 20, 8], abs=1e-2)
@@ -80,23 +80,23 @@ def test_a_car_is_where_it_was_drawn(tmp_path, content, others):
 
 def test_a_picture_on_which_nothing_is_drawn_is_labelled_all_the_same(tmp_path):
     (tmp_path / "l.json").write_text(json.dumps(coco()))
-    assert load_labels(tmp_path / "l.json", FOLDER).frames == ("a.png", "b.png")
+    assert read_labels(tmp_path / "l.json", FOLDER).frames == ("a.png", "b.png")
 
 
 def test_a_folder_of_labelme_files_and_a_csv_of_via(tmp_path):
     (tmp_path / "me").mkdir()
     for name in ("a.png", "c.png"):
         (tmp_path / "me" / f"{name[0]}.json").write_text(json.dumps(labelme() | {"imagePath": name}))
-    assert load_labels(tmp_path / "me", FOLDER).frames == ("a.png", "c.png")
+    assert read_labels(tmp_path / "me", FOLDER).frames == ("a.png", "c.png")
     shape = json.dumps({"name": "rect", "x": 140.5, "y": 16.5, "width": 20, "height": 8}).replace('"', '""')
     csv = f'filename,region_shape_attributes,region_attributes\nb.png,"{shape}","{{}}"\n'
     (tmp_path / "via.csv").write_text(csv)
-    assert load_labels(tmp_path / "via.csv", FOLDER).cars["x_px"].tolist() == [150.0]
+    assert read_labels(tmp_path / "via.csv", FOLDER).cars["x_px"].tolist() == [150.0]
 
 
 def test_frames_of_a_video_are_named_by_number(tmp_path):
     (tmp_path / "l.json").write_text(json.dumps(labelme() | {"imagePath": "frame_000017.jpg"}))
-    assert load_labels(tmp_path / "l.json", VIDEO).frames == ("17",)
+    assert read_labels(tmp_path / "l.json", VIDEO).frames == ("17",)
 
 
 @pytest.mark.parametrize(
@@ -116,6 +116,6 @@ def test_frames_of_a_video_are_named_by_number(tmp_path):
 def test_what_is_no_label_of_these_frames_is_one_clear_line(tmp_path, text, match):
     (tmp_path / "l.json").write_text(text)
     with pytest.raises(InputError, match=match) as caught:
-        load_labels(tmp_path / "l.json", FOLDER)
+        read_labels(tmp_path / "l.json", FOLDER)
     assert "\n" not in str(caught.value)
     assert ";" in str(caught.value)

@@ -11,7 +11,7 @@ from schemas.tables import LABEL_COLUMNS
 from velfield.errors import InputError
 from velfield.sources.frames import SourceInfo
 from velfield.sources.labels.detections import RAW_DETECTION_COLUMNS, read_detections
-from velfield.sources.labels.labels import load_labels, read_labels
+from velfield.sources.labels.labels import read_labels
 from velfield.sources.labels.yolo import length_from_upright_box
 
 FOLDER = SourceInfo("folder", 200, 100, 3, np.arange(3) / 5, ("a.png", "b.png", "c.png"))
@@ -36,7 +36,7 @@ def test_a_csv_of_all_columns_is_read_in_raw_pixels(tmp_path):
         tmp_path / "l.csv",
         "frame,x_px,y_px,orientation_rad,length_px,width_px\na.png,10.5,20,0.5,16,7\na.png,30,40,-0.5,,\nb.png,,,,,\n",
     )
-    labels = load_labels(path, FOLDER)
+    labels = read_labels(path, FOLDER)
     assert labels.cars.dtypes.astype(str).to_dict() == LABEL_COLUMNS
     assert labels.cars["x_px"].tolist() == [10.5, 30.0]
     assert labels.cars["orientation_rad"].tolist() == pytest.approx([0.5, math.pi - 0.5])
@@ -46,7 +46,7 @@ def test_a_csv_of_all_columns_is_read_in_raw_pixels(tmp_path):
 
 def test_a_video_is_labelled_by_frame_index_before_every(tmp_path):
     path = write(tmp_path / "l.csv", "\ufeffframe,x_px,y_px\n17,10,20\n3,1,2\n")
-    labels = load_labels(path, VIDEO)
+    labels = read_labels(path, VIDEO)
     assert labels.cars["frame"].tolist() == ["17", "3"]
     assert labels.frames == ("3", "17")
 
@@ -55,7 +55,7 @@ def test_a_yolo_folder_is_read_by_stem_and_other_classes_are_left_alone(tmp_path
     write(tmp_path / "y" / "a.txt", "0 0.5 0.5 0.1 0.05\n2 0.25 0.5 0.2 0.2\n")
     write(tmp_path / "y" / "b.txt", "")
     write(tmp_path / "y" / "elsewhere.txt", "0 0.5 0.5 0.1 0.1\n")
-    labels = load_labels(tmp_path / "y", FOLDER)
+    labels = read_labels(tmp_path / "y", FOLDER)
     assert labels.frames == ("a.png", "b.png")
     assert (len(labels.cars), len(labels.ignored)) == (1, 1)
     assert labels.cars.loc[0, ["x_px", "y_px"]].tolist() == [99.5, 49.5]
@@ -73,7 +73,7 @@ def test_a_yolo_folder_is_read_by_stem_and_other_classes_are_left_alone(tmp_path
 def test_class_names_say_which_are_cars(tmp_path, name, content):
     write(tmp_path / name, content)
     write(tmp_path / "y" / "a.txt", "0 0.5 0.5 0.1 0.05\n1 0.25 0.5 0.1 0.05\n")
-    labels = load_labels(tmp_path / "y", FOLDER)
+    labels = read_labels(tmp_path / "y", FOLDER)
     assert labels.cars["x_px"].tolist() == [49.5]
     assert labels.ignored["x_px"].tolist() == [99.5]
 
@@ -84,7 +84,7 @@ def test_oriented_yolo_boxes_tell_axis_length_and_width(tmp_path):
     corners = [centre + a * 8 * along + b * 3.5 * across for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     numbers = " ".join(f"{(x + 0.5) / 200} {(y + 0.5) / 100}" for x, y in corners)
     path = write(tmp_path / "a.txt", f"0 {numbers}\n")
-    (car,) = read_labels(path, FOLDER).to_dict("records")
+    (car,) = read_labels(path, FOLDER).cars.to_dict("records")
     assert (car["x_px"], car["y_px"]) == pytest.approx((100, 50))
     assert (car["orientation_rad"], car["length_px"], car["width_px"]) == pytest.approx((angle, 16, 7))
 
@@ -166,6 +166,6 @@ def test_kit_ais_labels_are_read_as_they_are(footage):
 
     folder = footage("kit_ais") / "MOS155_street"
     info = probe(folder, frames=FramesConfig(fps=2))
-    labels = load_labels(folder, info)
+    labels = read_labels(folder, info)
     assert (len(labels.cars), len(labels.ignored), len(labels.frames)) == (1311, 27, 25)
     assert 28 < labels.cars["length_px"].median() < 40  # its source says about 37 x 17 px

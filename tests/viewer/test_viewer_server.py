@@ -24,7 +24,7 @@ from schemas.summary import RunSummary
 from tests.browser import NEEDS_PAGE, browser
 from velfield.errors import InputError
 from velfield.report.figures import png_bytes
-from velfield.sources.labels.labels import load_labels
+from velfield.sources.labels.labels import read_labels
 from velfield.sources.source import probe
 from velfield.viewer.annotations import Frames, frames_of, read_marks, write_marks
 from velfield.viewer.annotator import annotate_app
@@ -185,7 +185,7 @@ def test_a_drag_along_a_car_is_a_label(picture: Path, tmp_path: Path) -> None:
     found = [row[name] for name in ("x_px", "y_px", "orientation_rad", "length_px")]
     np.testing.assert_allclose(found, expected, atol=1.5 / scale, rtol=0.03)
     info = probe(picture.parent, frames=FramesConfig(fps=5.0))
-    assert len(load_labels(labels, info).cars) == 1
+    assert len(read_labels(labels, info).cars) == 1
 
 
 def frames() -> Frames:

@@ -11,9 +11,28 @@ from rasterio.io import MemoryFile
 from rasterio.shutil import copy
 from rasterio.transform import Affine
 
+from schemas.export import ExportOptions
 from velfield.run.commits import write_atomically
+from velfield.run.run import Run
+from velfield.run.stores import open_field
 
-Georeference = tuple[float, float, float, float, float, float]
+FILE_NAME = "field.tif"
+AffineCoefficients = tuple[float, float, float, float, float, float]
+
+
+def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
+    """All float layers of the field as bands, in SI units where metres are known: see `ExportModule`."""
+    store, grid = open_field(run.layout.field), run.grid
+    names = [name for name in store.layer_names() if store.layer(name).dtype.kind == "f"]
+    units = [str(store.group[name].attrs.get("units", "1")) for name in names]
+    factors = [grid.gsd_m if grid.gsd_m and unit == "px s-1" else 1.0 for unit in units]
+    return cog_bytes(
+        [store.layer(name) * factor for name, factor in zip(names, factors, strict=True)],
+        names=names,
+        units=["m s-1" if grid.gsd_m and unit == "px s-1" else unit for unit in units],
+        crs_wkt=grid.crs_wkt,
+        affine=grid.affine,
+    )
 
 
 def write_cog(
@@ -23,9 +42,21 @@ def write_cog(
     names: Sequence[str],
     units: Sequence[str],
     crs_wkt: str | None = None,
-    affine: Georeference | None = None,
+    affine: AffineCoefficients | None = None,
 ) -> None:
-    """Write layers of one type and shape (y, x) as bands of a cloud-optimised GeoTIFF.
+    """Write a cloud-optimised GeoTIFF, whole or not at all: see `cog_bytes`."""
+    write_atomically(path, cog_bytes(layers, names=names, units=units, crs_wkt=crs_wkt, affine=affine))
+
+
+def cog_bytes(
+    layers: Sequence[NDArray[np.generic]],
+    *,
+    names: Sequence[str],
+    units: Sequence[str],
+    crs_wkt: str | None = None,
+    affine: AffineCoefficients | None = None,
+) -> bytes:
+    """Layers of one type and shape (y, x) as the bands of a cloud-optimised GeoTIFF.
 
     Parameters
     ----------
@@ -47,7 +78,7 @@ def write_cog(
     if crs_wkt is not None and affine is not None:
         profile |= {"crs": crs_wkt, "transform": Affine(*affine)}
     with warnings.catch_warnings(), MemoryFile() as plain, MemoryFile() as optimised:
-        # A run without a base image has no place on earth, and its layers are still wanted.
+        # A run without a base image has no georeference; its layers are exported all the same.
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         with plain.open(**profile) as dataset:
             dataset.write(stack)
@@ -56,4 +87,4 @@ def write_cog(
                 dataset.set_band_unit(band, unit)
         with plain.open() as dataset:
             copy(dataset, optimised.name, driver="COG", compress="DEFLATE", overview_resampling="nearest")
-        write_atomically(path, bytes(optimised.read()))
+        return bytes(optimised.read())

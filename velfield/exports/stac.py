@@ -1,14 +1,21 @@
-"""A STAC item: what the run is, where on earth and when, so that catalogues find it."""
+"""A STAC item: the run's footprint, time and files, for catalogues."""
 
+import json
+import os
 from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import numpy as np
 from rasterio.crs import CRS
 
+from schemas.export import ExportOptions
 from velfield.errors import InputError
-from velfield.exports.place import Place
+from velfield.exports.georeference import Georeference
+from velfield.run.paths import is_remote
+from velfield.run.run import Run
 
+FILE_NAME = "item.json"
 _PROJECTION = "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
 _KINDS: dict[str, tuple[str, list[str]]] = {
     ".tif": ("image/tiff; application=geotiff; profile=cloud-optimized", ["data"]),
@@ -23,9 +30,26 @@ _KINDS: dict[str, tuple[str, list[str]]] = {
 }
 
 
+def encode(run: Run, path: Path, options: ExportOptions) -> bytes:
+    """See `velfield.exports.export.ExportModule`."""
+    if options.start is None:
+        raise InputError("--format stac: found no start, expected the flight's; give --start 2024-05-01T12:00:00Z")
+    layout, times_s = run.layout, run.times_s
+    files = [file for file in (*sorted(layout.maps.glob("*.tif")), layout.field, layout.report) if file.exists()]
+    item = stac_item(
+        layout.root.resolve().name,
+        Georeference.from_grid(run.grid),
+        {file.stem: _href(file, path.parent) for file in files},
+        start=options.start,
+        duration_s=float(times_s[-1] - times_s[0]),
+        properties={"velfield:version": run.record.code_version, "velfield:frames": run.frames.count},
+    )
+    return json.dumps(item, indent=1).encode()
+
+
 def stac_item(
     name: str,
-    place: Place,
+    georeference: Georeference,
     assets: Mapping[str, str],
     *,
     start: datetime,
@@ -38,14 +62,14 @@ def stac_item(
     ----------
     name
         The item's id.
-    place
-        With a reference system: an item lies on earth.
+    georeference
+        With a reference system: an item has coordinates.
     assets
         Title -> path relative to the item.
     start, duration_s
-        When the flight began (a time zone is needed; a video seldom tells), and how long it lasted, s.
+        When the flight began (a time zone is needed; few videos record it), and how long it lasted, s.
     properties
-        More of them: counts, versions.
+        Further ones: counts, versions.
 
     Raises
     ------
@@ -54,25 +78,25 @@ def stac_item(
     """
     if start.tzinfo is None:
         raise InputError(f"found the start {start.isoformat()} without a time zone, expected one; add Z or an offset")
-    rows, columns = place.shape
+    rows, columns = georeference.shape
     corners = np.array([[0, rows], [columns, rows], [columns, 0], [0, 0], [0, rows]], np.float64) - 0.5
-    ring = np.round(place.to_lonlat(corners), 7)
+    ring = np.round(georeference.to_lonlat(corners), 7)
     begin = start.astimezone(UTC)
     stamps = [moment.isoformat().replace("+00:00", "Z") for moment in (begin, begin + timedelta(seconds=duration_s))]
-    crs = CRS.from_wkt(place.crs_wkt)
+    crs = CRS.from_wkt(georeference.crs_wkt)
     authority = crs.to_authority()
     described: dict[str, object] = {
         "datetime": None,
         "start_datetime": stamps[0],
         "end_datetime": stamps[1],
         "proj:code": ":".join(authority) if authority else None,
-        "proj:wkt2": place.crs_wkt,
+        "proj:wkt2": georeference.crs_wkt,
         "proj:shape": [rows, columns],
-        "proj:transform": list(place.affine or ()),
+        "proj:transform": list(georeference.affine or ()),
         **(properties or {}),
     }
-    if place.gsd_m is not None:
-        described["gsd"] = round(place.gsd_m, 6)
+    if georeference.gsd_m is not None:
+        described["gsd"] = round(georeference.gsd_m, 6)
     return {
         "type": "Feature",
         "stac_version": "1.1.0",
@@ -90,3 +114,10 @@ def _asset(title: str, href: str) -> dict[str, object]:
     suffix = "." + href.rstrip("/").rsplit(".", 1)[-1].lower()
     media, roles = _KINDS.get(suffix, ("application/octet-stream", ["data"]))
     return {"href": href, "title": title, "type": media, "roles": roles}
+
+
+def _href(file: Path, folder: Path) -> str:
+    """Path of a file relative to a folder; its whole address where one of the two is on S3 and the other is not."""
+    if is_remote(file) != is_remote(folder):
+        return str(file.resolve())
+    return os.path.relpath(str(file), str(folder))

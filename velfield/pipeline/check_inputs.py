@@ -9,7 +9,7 @@ from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import committed
 from velfield.sources.geo import read_base_picture
 from velfield.sources.labels.detections import read_detections
-from velfield.sources.labels.labels import load_labels
+from velfield.sources.labels.labels import read_labels
 
 _WHOLE = "all"
 
@@ -28,7 +28,7 @@ def check_given(plan: Plan) -> None:
     if committed(plan, "detector", _WHOLE) is not None:
         return
     if given.labels:
-        _reading("labels", lambda: load_labels(Path(str(given.labels)), plan.info))
+        _reading("labels", lambda: read_labels(Path(str(given.labels)), plan.info))
     if given.detector:
         _reading("detector", lambda: load_detector(Path(str(given.detector))))
     if given.detections:

@@ -14,7 +14,7 @@ from velfield.detection.train import train_detector
 from velfield.errors import InputError
 from velfield.pipeline.stages.labels import car_length_raw_px, labelled_images
 from velfield.report.figures import png_bytes
-from velfield.sources.labels.labels import Labels, load_labels
+from velfield.sources.labels.labels import Labels, read_labels
 from velfield.sources.source import probe
 
 SHIPPED = "shipped"
@@ -48,7 +48,7 @@ def train_from_labels(source: Path, labels: Path, config: FlightConfig, *, conti
     """
     fps = (config.frames.fps or 1.0) if source.is_dir() else None  # pictures need no times to be learnt from
     info = probe(source, frames=config.frames.model_copy(update={"fps": fps}))
-    found = load_labels(labels, info)
+    found = read_labels(labels, info)
     samples = tuple(labelled_images(source, info, found, work_per_raw=_scale(config, found)))
     detector = train_detector(samples, config.detection, continued=_earlier(continued))
     return Training(detector, samples, found)

@@ -1,18 +1,17 @@
 """The field's two figures over the dimmed base image (paper: velocity field): direction as hue, speed as colour."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.arrays import RGBImage
+from schemas.export import SpeedUnit
 from velfield.errors import InputError
 from velfield.report.colours import direction_colours, ramp_colours
 from velfield.report.panel import Legend, draw_bar_panel, draw_wheel_panel
 
-SpeedUnit = Literal["km/h", "mph", "m/s", "px/s"]
 PER_M_PER_S: dict[SpeedUnit, float] = {"km/h": 3.6, "mph": 2.2369362920544, "m/s": 1.0}
 """How many of a unit make one metre a second; px/s is not metric."""
 

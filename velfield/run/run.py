@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from schemas.arrays import Points
+from schemas.arrays import GreyImage, Points
 from schemas.records import FORMAT_VERSION, FlightRecord, GridRecord
 from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
 from velfield.analysis.crossings import find_crossings, hysteresis_px
@@ -15,11 +15,12 @@ from velfield.errors import InputError
 from velfield.field.segments import Segments, segment_table
 from velfield.field.view import VelocityField
 from velfield.run.analysis import RunAnalysis
+from velfield.run.base_image import read_base_image
 from velfield.run.field_reader import IntervalField, open_field_intervals, open_velocity_field
 from velfield.run.frame_transforms import FrameMaps
 from velfield.run.grid import read_grid
 from velfield.run.layout import RunLayout
-from velfield.run.paths import local_copy, to_path
+from velfield.run.paths import to_path
 from velfield.run.stores import FrameStore, RegistrationStore, open_field, open_frames, open_registration
 from velfield.run.tables import read_tables
 
@@ -145,10 +146,6 @@ class Run:
         return RunAnalysis(open_field(self.layout.field).layer, self.segments, self.grid, self.record.config.field)
 
     @cached_property
-    def base_image(self) -> NDArray[np.uint8]:
+    def base_image(self) -> GreyImage:
         """The base image, (y, x) grey uint8."""
-        from velfield.sources.images import read_picture_grey
-
-        path = self.layout.base_image_tif if self.layout.base_image_tif.exists() else self.layout.base_image
-        with local_copy(path) as here:
-            return read_picture_grey(here, self.record.config.frames.max_pixels)
+        return read_base_image(self.layout, self.record.config.frames)

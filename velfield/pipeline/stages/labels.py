@@ -20,7 +20,7 @@ from velfield.run.frame_transforms import FrameMaps
 from velfield.run.stores import open_registration
 from velfield.sources.flags import UNUSABLE
 from velfield.sources.frames import SourceInfo
-from velfield.sources.labels.labels import Labels, load_labels
+from velfield.sources.labels.labels import Labels, read_labels
 from velfield.sources.source import iter_frames
 
 _SHORTEST_M, _USUAL_M, _LONGEST_M = 3.3, 4.4, 6.0
@@ -35,7 +35,7 @@ def marked_cars(plan: Plan) -> Labels:
     InputError
         The labels cannot be read, or hold no car.
     """
-    labels = load_labels(Path(str(plan.job.inputs.labels)), plan.info)
+    labels = read_labels(Path(str(plan.job.inputs.labels)), plan.info)
     if labels.cars.empty:
         raise InputError(f"--labels {plan.job.inputs.labels}: no car in it; mark the cars of one frame")
     return labels

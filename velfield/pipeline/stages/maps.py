@@ -15,11 +15,11 @@ from velfield.pipeline.progress import advance
 from velfield.pipeline.result import Outcome
 from velfield.pipeline.stages.certificates import write_certificates
 from velfield.report.figures import MapScale, direction_figure, png_bytes, speed_figure
+from velfield.run.base_image import read_base_image
 from velfield.run.commits import write_atomically
 from velfield.run.grid import heading_deg, north_of, read_grid
-from velfield.run.paths import local_copy, written_locally
+from velfield.run.paths import written_locally
 from velfield.run.stores import open_field
-from velfield.sources.images import read_picture_grey
 from velfield.viewer.record import write_view_data
 
 PREVIEW_SIDE_PX = 900
@@ -33,7 +33,7 @@ def make_maps(plan: Plan) -> Outcome:
     velocity = np.stack([store.layer("modal_vx"), store.layer("modal_vy")], axis=-1).astype(np.float64)
     direction = direction_rad(velocity, stationary_speed_px_per_s=stationary_speed_px_per_s(config, grid.gsd_m))
     speed = speed_px_per_s(velocity)
-    grey = read_base_image(plan)
+    grey = read_base_image(layout, plan.config.frames)
     scale = MapScale(gsd_m=grid.gsd_m, north_rad=north_of(grid))
     figures = {
         "direction": direction_figure(grey, direction, scale),
@@ -50,14 +50,6 @@ def make_maps(plan: Plan) -> Outcome:
     written += write_view_data(layout)
     advance("maps")
     return Outcome(written, {"maps": float(len(figures))})
-
-
-def read_base_image(plan: Plan) -> NDArray[np.uint8]:
-    """The base image, (y, x) uint8."""
-    layout = plan.layout
-    path = layout.base_image_tif if layout.base_image_tif.exists() else layout.base_image
-    with local_copy(path) as here:
-        return read_picture_grey(here, plan.config.frames.max_pixels)
 
 
 def _layers(plan: Plan, direction: FloatArray, speed: FloatArray) -> list[Path]:

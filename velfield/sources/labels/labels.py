@@ -46,12 +46,7 @@ class Labels:
     notes: tuple[str, ...] = ()
 
 
-def read_labels(path: Path | str, info: SourceInfo) -> pd.DataFrame:
-    """Cars that are labelled: `load_labels(path, info).cars`."""
-    return load_labels(path, info).cars
-
-
-def load_labels(path: Path | str, info: SourceInfo) -> Labels:
+def read_labels(path: Path | str, info: SourceInfo) -> Labels:
     """Read labels of a source's frames.
 
     Parameters

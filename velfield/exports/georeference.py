@@ -3,17 +3,19 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.warp import transform
 
-from schemas.arrays import Points
+from schemas.arrays import FloatArray, Points
+from schemas.records import GridRecord
 from velfield.errors import InputError
+
+MPS_TO_KMH = 3.6
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where the base image lies.
+class Georeference:
+    """Reference system and scale of the base image.
 
     Attributes
     ----------
@@ -30,9 +32,14 @@ class Place:
     affine: tuple[float, float, float, float, float, float] | None = None
     gsd_m: float | None = None
 
+    @classmethod
+    def from_grid(cls, grid: GridRecord) -> "Georeference":
+        """Of a run's base image."""
+        return cls((grid.height_px, grid.width_px), grid.crs_wkt, grid.affine, grid.gsd_m)
+
     @property
     def has_crs(self) -> bool:
-        """Whether base pixels have a place on earth."""
+        """Whether base pixels have coordinates on earth."""
         return self.crs_wkt is not None and self.affine is not None
 
     def to_crs(self, xy_px: Points) -> Points:
@@ -61,7 +68,7 @@ class Place:
     def to_metres(self, xy_px: Points) -> Points:
         """(n, 2) base pixels to (n, 2) metres east and north of the base image's lower left corner.
 
-        Without a reference system "north" is the picture's up.
+        Without a reference system "north" is the image's up.
 
         Raises
         ------
@@ -75,13 +82,13 @@ class Place:
         rows = self.shape[0]
         return np.column_stack([xy_px[:, 0] + 0.5, rows - 0.5 - xy_px[:, 1]]) * self.gsd_m
 
-    def heading_deg(self, xy_px: Points, velocity_px_per_s: Points) -> NDArray[np.float64]:
-        """Where a vehicle goes, degrees clockwise from north (from the picture's up where there is no reference
-        system).
+    def heading_deg(self, xy_px: Points, velocity_px_per_s: Points) -> FloatArray:
+        """Direction of travel, degrees clockwise from north; from the image's up where there is no reference system.
 
         Examples
         --------
-        >>> Place((10, 10)).heading_deg(np.zeros((3, 2)), np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0]])).tolist()
+        >>> up_right_down = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0]])
+        >>> Georeference((10, 10)).heading_deg(np.zeros((3, 2)), up_right_down).tolist()
         [0.0, 90.0, 180.0]
         """
         if not self.has_crs:

@@ -1,0 +1,36 @@
+"""The formats that a finished run is exported in, and what some of them ask for."""
+
+from datetime import datetime
+from typing import Literal
+
+from pydantic import Field
+
+from schemas.model import Model
+
+ExportFormat = Literal["cog", "geoparquet", "gpkg", "geotrax", "sumo", "arrows", "stac", "direction", "speed", "report"]
+"""Each is a module of `velfield.exports`, of the same name."""
+EXPORT_FORMATS: dict[ExportFormat, str] = {
+    "cog": "the field's layers as GeoTIFF",
+    "geoparquet": "tracklets as lines, as Parquet",
+    "gpkg": "tracklets as lines, as GeoPackage",
+    "geotrax": "tracks as CSV",
+    "sumo": "tracks as FCD XML",
+    "arrows": "modal velocities as GeoJSON",
+    "stac": "a catalogue's item",
+    "direction": "the map of directions as PNG",
+    "speed": "the map of speeds as PNG",
+    "report": "the summary as one HTML file, to send by mail",
+}
+"""Format -> what it holds, for the command's help."""
+SpeedUnit = Literal["km/h", "mph", "m/s", "px/s"]
+
+
+class ExportOptions(Model):
+    """What some formats ask for."""
+
+    width_px: int | None = Field(default=None, gt=0)
+    """Width of a figure's map; None: one pixel a base pixel."""
+    unit: SpeedUnit = "km/h"
+    """Unit of speed in a figure."""
+    start: datetime | None = None
+    """When the flight began, with its time zone: a STAC item needs it, and few videos record it."""

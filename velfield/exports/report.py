@@ -1,0 +1,25 @@
+"""The report as one HTML file that holds all it shows, to send by mail."""
+
+from pathlib import Path
+
+from schemas.export import ExportOptions
+from schemas.report import Report
+from velfield.errors import InputError
+from velfield.report.report import render_report
+from velfield.report.run_figures import report_figures
+from velfield.run.run import Run
+
+FILE_NAME = "report.html"
+
+
+def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
+    """See `velfield.exports.export.ExportModule`."""
+    record = run.layout.report_record
+    if not record.exists():
+        raise InputError(
+            f"{record} is not there: the run was not finished, or an older velfield wrote it; run it again"
+        )
+    report = Report.model_validate_json(record.read_bytes())
+    alone = report.model_copy(update={"files": ()})  # a mail does not carry them
+    figures = [figure.model_copy(update={"full_size": None}) for figure in report_figures(run.layout.maps).values()]
+    return render_report(alone, figures).encode()
