@@ -21,7 +21,7 @@ from schemas.summary import RunSummary
 from velfield.pipeline.plan import Plan
 from velfield.run.layout import RunLayout
 from velfield.run.paths import is_remote
-from velfield.run.results import named
+from velfield.run.results import final_root
 
 _PICTURE_BYTES = 600_000
 """A markdown artifact of about this size was seen to show; a larger picture is left to the report."""
@@ -33,7 +33,7 @@ _LONG_S, _EVERY_S = 20.0, 5.0
 
 def publish_summary(plan: Plan, summary: RunSummary) -> None:
     """Create the artifacts of a finished run."""
-    report = RunLayout(named(plan.layout.root)).report
+    report = RunLayout(final_root(plan.layout.root)).report
     shown = f"velfield view {shlex.quote(str(report.parent))}"
     lines = [f"# {plan.job.inputs.source}", "", f"The map and the report, in a browser: `{shown}`", ""]
     lines += [f"- **{stage.name}**: {stage.text} ({stage.seconds:.1f} s)" for stage in summary.stages]

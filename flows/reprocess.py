@@ -30,7 +30,14 @@ from velfield.pipeline.stages.report import write_report
 from velfield.run.commits import sweep_partial
 from velfield.run.layout import RunLayout
 from velfield.run.lock import locked
-from velfield.run.results import discard, made_before, publish, result_name, share, unfinished
+from velfield.run.results import (
+    discard_result,
+    link_shared_outputs,
+    publish_result,
+    result_exists,
+    result_name,
+    staging_layout,
+)
 from velfield.run.run import Run, open_run
 
 MAX_ADDED_ERROR_PX = 1.0
@@ -75,17 +82,17 @@ def reprocess(
     run = open_run(root)
     with locked(run.layout):
         mark_crashed(f"{root} on {name}")
-        if made_before(run.layout, name, Path(base)):
+        if result_exists(run.layout, name, Path(base)):
             console.event("start", f"{run.layout.results / name} is this base image's result already")
-            return publish(run, name, Path(base)), None
+            return publish_result(run, name, Path(base)), None
         job = _new_job(run, name, base)
         found = None if full else _registered(run, base, max_added_error_px, console)
         try:
             summary = _again(run, job, runner, console) if found is None else _mapped(run, job, found, runner, console)
         except InputError:
-            discard(RunLayout(Path(job.root)))
+            discard_result(RunLayout(Path(job.root)))
             raise
-        return publish(run, name, Path(base)), summary
+        return publish_result(run, name, Path(base)), summary
 
 
 def _new_job(run: Run, name: str, base: str) -> Job:
@@ -95,7 +102,7 @@ def _new_job(run: Run, name: str, base: str) -> Job:
     if given is None:
         raise InputError(f"{run.layout.root} does not say where its inputs are; run `velfield run` on it again")
     inputs = Inputs.model_validate(given.model_dump() | {"base": base})
-    return Job(root=str(unfinished(run.layout, name).root), inputs=inputs, config=run.record.config)
+    return Job(root=str(staging_layout(run.layout, name).root), inputs=inputs, config=run.record.config)
 
 
 def _registered(run: Run, base: str, limit_px: float, console: Console) -> RebaseRecord | None:
@@ -120,14 +127,14 @@ def _registered(run: Run, base: str, limit_px: float, console: Console) -> Rebas
 def _again(run: Run, job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
     """All that depends on the base image, as a run of its own that finds its frames read and its lens known."""
     layout = RunLayout(Path(job.root))
-    share(run.layout, layout, ("frames", "lens"))
+    link_shared_outputs(run.layout, layout, ("frames", "lens"))
     task_runner = ThreadPoolTaskRunner(max_workers=parallel_units(runner))
     return process_flight.with_options(task_runner=task_runner)(job, runner, console)
 
 
 def _mapped(run: Run, job: Job, found: RebaseRecord, runner: RunnerConfig, console: Console) -> RunSummary:
     layout = RunLayout(Path(job.root))
-    share(run.layout, layout, _SHARED, without=("base/", "tracklets/"))
+    link_shared_outputs(run.layout, layout, _SHARED, without=("base/", "tracklets/"))
     sweep_partial(layout.root)
     plan = rebased_plan(run, job, found)
     write_flight_record(plan)

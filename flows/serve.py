@@ -204,9 +204,9 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 @contextlib.contextmanager
 def pages(config: ServeConfig) -> Iterator[None]:
     """The runs' own pages, at the port after the UI's, for this machine alone; the runs' artifacts link to them."""
-    from velfield.viewer.server import files_app, served_beside
+    from velfield.viewer.server import files_app, serve_in_thread
 
-    with served_beside(files_app(config.runs), config.port + 1) as address:
+    with serve_in_thread(files_app(config.runs), config.port + 1) as address:
         os.environ.update({PAGES: address, PAGES_OF: str(config.runs)})
         print(f"pages       {address}/RUN/", flush=True)
         yield

@@ -91,11 +91,12 @@ def whole(flight: Path, server: None, tmp_path_factory: pytest.TempPathFactory) 
     assert digests(root) == left, "a test wrote into the run that all share"
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def s3() -> Iterator[None]:
     """A local S3 server with the bucket `flights`, its address in the environment as any other's would be.
 
-    In a process of its own: in one with its clients, all would wait for the interpreter most of the time.
+    In a process of its own: in one with its clients, all would wait for the interpreter most of the time. Once a
+    session: s3fs keeps a connection by the arguments it was opened with, and the address is none of them.
     """
     command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", "0"]
     with (

@@ -57,7 +57,7 @@ def write_video(
     return path
 
 
-def write_pictures(folder: Path, frames: Sequence[NDArray[np.uint8]], *, name: str = "f{}.png") -> list[str]:
+def write_images(folder: Path, frames: Sequence[NDArray[np.uint8]], *, name: str = "f{}.png") -> list[str]:
     """Save frames as pictures, numbered from 1; their names."""
     folder.mkdir(parents=True, exist_ok=True)
     names = [name.format(number) for number in range(1, len(frames) + 1)]

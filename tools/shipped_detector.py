@@ -24,7 +24,7 @@ from velfield.detection.label_orientation import with_axes
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 from velfield.parallel import each
-from velfield.sources.labels.yolo import length_from_upright_box, shape_of_upright_box
+from velfield.sources.labels.yolo import car_in_upright_box, length_from_upright_box
 
 ATTRIBUTION = (
     "Songdo Vision (R. Fonod and others), CC-BY 4.0: three frames, scaled to cars of 16 px",
@@ -99,7 +99,7 @@ def _scale(grey: GreyImage, boxes: FloatArray, factor: float) -> LabelledImage:
     image = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
     xy, sides = (boxes[:, 1:3] + 0.5) * factor - 0.5, boxes[:, 3:5] * factor
     car = boxes[:, 0] == 0
-    shapes = np.array([shape_of_upright_box(w, h) for w, h in sides[car]]).reshape(-1, 4)
+    shapes = np.array([car_in_upright_box(w, h) for w, h in sides[car]]).reshape(-1, 4)
     ignore = np.column_stack([xy, np.maximum(sides.max(axis=1) / 2, 8.0)])[~car]
     cars = np.column_stack([xy[car], shapes[:, :3]])
     return LabelledImage(image=image, cars=cars, ignore=ignore, tilts=shapes[:, 3])

@@ -31,7 +31,7 @@ def annotate(
     open_browser
         Open the browser, where there is a screen.
     """
-    from velfield.viewer.annotations import frames_of
+    from velfield.viewer.annotations import frames_to_annotate
     from velfield.viewer.annotator import annotate_app
     from velfield.viewer.server import serve
 
@@ -41,7 +41,7 @@ def annotate(
         print(f"{place}: {address}  writes {file}  (Ctrl-C ends)", flush=True)
 
     try:
-        serve(annotate_app(frames_of(place, most=frames), file), port=port, open_browser=open_browser, say=say)
+        serve(annotate_app(frames_to_annotate(place, most=frames), file), port=port, open_browser=open_browser, say=say)
     except KeyboardInterrupt:
         print()
     return 0

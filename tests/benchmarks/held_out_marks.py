@@ -24,7 +24,7 @@ from velfield.registration.intrasensor import BaseReference, prepare_base, regis
 from velfield.registration.keypoints import detect_keypoints
 from velfield.run.frame_transforms import read_lens
 from velfield.run.run import Run
-from velfield.sources.images import read_picture_grey
+from velfield.sources.images import read_grey_image
 
 CELL_PX, MARGIN_PX = 40, 8
 """Of the chessboard; marks so near to a cell's border are not followed: patches of the fit reach over it."""
@@ -38,8 +38,8 @@ def main() -> None:
     asked = parser.parse_args()
     run, area = open_run(asked.run), read_area(asked.area)
     limit = run.record.config.frames.max_pixels
-    grey = read_picture_grey(run.layout.own_base_image, limit)
-    known = read_picture_grey(run.layout.own_base_mask, limit) > 0
+    grey = read_grey_image(run.layout.own_base_image, limit)
+    known = read_grey_image(run.layout.own_base_mask, limit) > 0
     config, lens = run.record.config.registration, read_lens(run.layout)
     frames = [k for k, status in enumerate(run.registration_status) if status == "ok"]
     pictures = [run.frames.read(k) for k in frames]

@@ -13,7 +13,7 @@ from tests.foreign_cluster import foreign_cluster
 from tests.small_flight import digests, job, process
 from velfield.errors import InputError
 from velfield.run.layout import RunLayout
-from velfield.run.results import share
+from velfield.run.results import link_shared_outputs
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("cluster-*.yaml"))
@@ -98,7 +98,7 @@ def test_workers_elsewhere_without_flows_give_the_same(
 ) -> None:
     """All but lens, base image and detector is done there; the run folder is given by a path from where we stand."""
     monkeypatch.chdir(tmp_path)
-    share(RunLayout(whole[0]), RunLayout(tmp_path / "run"), ("lens", "base", "detector"))
+    link_shared_outputs(RunLayout(whole[0]), RunLayout(tmp_path / "run"), ("lens", "base", "detector"))
     with foreign_cluster(tmp_path) as address:
         process(job(flight, Path("run")), RunnerConfig(scheduler=address))
     assert digests(tmp_path / "run") == digests(whole[0])

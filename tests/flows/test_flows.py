@@ -20,7 +20,7 @@ from velfield.pipeline.plan import make_plan
 from velfield.pipeline.stages.detections import detect_block
 from velfield.pipeline.stages.detector import make_detector
 from velfield.run.layout import STAGES, RunLayout
-from velfield.run.results import share
+from velfield.run.results import link_shared_outputs
 
 
 def test_it_leaves_what_the_contract_says(whole: tuple[Path, RunSummary]) -> None:
@@ -170,7 +170,7 @@ def test_a_unit_that_always_fails_is_lost_and_done_by_the_next_run(
         return true(plan, frames)  # type: ignore[arg-type]
 
     root = tmp_path / "run"
-    share(RunLayout(whole[0]), RunLayout(root), ("lens", "base", "detector"))
+    link_shared_outputs(RunLayout(whole[0]), RunLayout(root), ("lens", "base", "detector"))
     monkeypatch.setattr(step, "detect_block", failing)
     summary = process(job(flight, root))
     lost = {stage.name: stage.lost for stage in summary.stages if stage.lost}

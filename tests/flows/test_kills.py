@@ -8,7 +8,7 @@ from schemas.summary import RunSummary
 from tests.kills import run_with_kills
 from tests.small_flight import digests
 from velfield.run.layout import RunLayout
-from velfield.run.results import share
+from velfield.run.results import link_shared_outputs
 
 
 def test_three_kills_and_the_same_bits(
@@ -19,7 +19,7 @@ def test_three_kills_and_the_same_bits(
 
     monkeypatch.setenv("PREFECT_API_URL", str(PREFECT_API_URL.value()))  # the session's server: none of its own
     # Lens, base image and detector take longest and are one unit each: `make soak` kills those too.
-    share(RunLayout(whole[0]), RunLayout(tmp_path / "run"), ("lens", "base", "detector"))
+    link_shared_outputs(RunLayout(whole[0]), RunLayout(tmp_path / "run"), ("lens", "base", "detector"))
     met = run_with_kills(flight, tmp_path / "run", 3, seed=0)
     assert met >= 2
     assert digests(tmp_path / "run") == digests(whole[0])

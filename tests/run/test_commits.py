@@ -8,7 +8,7 @@ from schemas.flight import FlightConfig, TrackingConfig
 from schemas.records import CommitRecord, InputsRecord, SourceRecord
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.plan import stage_keys
-from velfield.run.commits import content_key, digest_file, finished, sweep_partial, write_atomically, write_commit
+from velfield.run.commits import content_key, digest_file, sweep_partial, valid_commit, write_atomically, write_commit
 from velfield.run.layout import STAGES, RunLayout
 
 INPUTS = InputsRecord(source=SourceRecord(path="a", kind="video", digest="d", width=10, height=10, frame_count=3))
@@ -58,11 +58,11 @@ def test_a_unit_is_finished_under_its_own_key_and_with_its_outputs(tmp_path: Pat
     layout = RunLayout(tmp_path)
     (tmp_path / "out.bin").write_bytes(b"x")
     write_commit(layout, CommitRecord(stage="lens", unit="all", key="k", outputs={"out.bin": ""}, code_version="1"))
-    assert finished(layout, "lens", "all", "k")
-    assert finished(layout, "lens", "all", "another") is None
-    assert finished(layout, "lens", "other", "k") is None
+    assert valid_commit(layout, "lens", "all", "k")
+    assert valid_commit(layout, "lens", "all", "another") is None
+    assert valid_commit(layout, "lens", "other", "k") is None
     (tmp_path / "out.bin").unlink()
-    assert finished(layout, "lens", "all", "k") is None
+    assert valid_commit(layout, "lens", "all", "k") is None
 
 
 def test_a_file_of_any_size_has_a_digest_of_its_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ from velfield.pipeline.verify import verify_run
 from velfield.run import paths
 from velfield.run.layout import RunLayout
 from velfield.run.paths import copy_objects, rename_tree, to_path
-from velfield.run.results import share
+from velfield.run.results import link_shared_outputs
 from velfield.run.s3 import S3_OPTIONS
 
 
@@ -33,7 +33,9 @@ def remote(
     All stores are written there; only lens, base image and detector are taken from the disk.
     """
     root = to_path("s3://flights/runs/whole")
-    share(RunLayout(whole[0]), RunLayout(to_path("s3://flights/runs/whole")), ("lens", "base", "detector"))
+    link_shared_outputs(
+        RunLayout(whole[0]), RunLayout(to_path("s3://flights/runs/whole")), ("lens", "base", "detector")
+    )
     with foreign_cluster(tmp_path_factory.mktemp("cluster")) as address:
         return root, process(job(flight, root), RunnerConfig(scheduler=address))
 

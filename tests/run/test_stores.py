@@ -47,7 +47,7 @@ def test_frames_come_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("bit", range(0, 4000, 97))
-def test_a_flipped_bit_is_never_read_as_a_picture(tmp_path: Path, bit: int) -> None:
+def test_a_flipped_bit_is_never_read_as_an_image(tmp_path: Path, bit: int) -> None:
     frames = noise(2, 1, 24, 32)
     store = frame_store(tmp_path / "f.zarr", frames)
     chunk = store.path / "raw" / "c" / "0" / "0" / "0"

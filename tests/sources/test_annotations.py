@@ -51,7 +51,7 @@ def labelme():
         {"label": "car", "points": [[140.5, 16.5], [160.5, 24.5]], "shape_type": "rectangle"},
         {"label": "tree", "points": [[5, 5]], "shape_type": "point"},
     ]
-    return {"imagePath": "..\\pictures\\a.png", "shapes": shapes}
+    return {"imagePath": "..\\images\\a.png", "shapes": shapes}
 
 
 def via():
@@ -78,7 +78,7 @@ def test_a_car_is_where_it_was_drawn(tmp_path, content, others):
     assert labels.frames[0] == "a.png"
 
 
-def test_a_picture_on_which_nothing_is_drawn_is_labelled_all_the_same(tmp_path):
+def test_an_image_on_which_nothing_is_drawn_is_labelled_all_the_same(tmp_path):
     (tmp_path / "l.json").write_text(json.dumps(coco()))
     assert read_labels(tmp_path / "l.json", FOLDER).frames == ("a.png", "b.png")
 
@@ -109,8 +109,8 @@ def test_frames_of_a_video_are_named_by_number(tmp_path):
         (json.dumps(labelme() | {"shapes": [{"points": "x"}]}), "labelme labels with ValueError"),
         (json.dumps(labelme() | {"imagePath": "elsewhere.png"}), "none a frame of this source"),
         (json.dumps(labelme() | {"shapes": [{"label": "tree", "points": [[5, 5]]}]}), "expected one of cars"),
-        (json.dumps(labelme() | {"shapes": [{"label": "car", "points": [[500, 5]]}]}), "outside the picture"),
-        (json.dumps(geojson() | {"features": []}), "found labels of the pictures none"),
+        (json.dumps(labelme() | {"shapes": [{"label": "car", "points": [[500, 5]]}]}), "outside the image"),
+        (json.dumps(geojson() | {"features": []}), "found labels of the images none"),
     ],
 )
 def test_what_is_no_label_of_these_frames_is_one_clear_line(tmp_path, text, match):

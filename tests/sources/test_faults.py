@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from schemas.flight import FramesConfig
-from tests.media import drifting, flip_bytes, ground, write_pictures, write_times, write_video
+from tests.media import drifting, flip_bytes, ground, write_images, write_times, write_video
 from velfield.errors import InputError
 from velfield.sources.flags import UNUSABLE, FrameFlag, describe_flags
 from velfield.sources.quality import flag_blurred, flag_outlier_frames, frame_quality
@@ -53,7 +53,7 @@ def test_a_video_cut_in_half_gives_the_frames_there_are_and_says_so(tmp_path, fr
     info, read = read_all(cut)
     assert 10 < info.frame_count < 50
     if suffix != ".ts":  # a transport stream declares neither frames nor seconds
-        assert any("cut short" in warning for warning in info.warnings), info.warnings
+        assert any("is truncated" in warning for warning in info.warnings), info.warnings
     for frame in read:
         same = np.array_equal(frame.grey, clean[round(frame.time_s, 3)].grey)
         assert same or frame.flags & (FrameFlag.SUSPECT | FrameFlag.UNREADABLE)
@@ -113,8 +113,8 @@ def test_damage_is_flagged_alike_when_a_flight_is_read_in_pieces(tmp_path, frame
     assert [bool(f.flags & UNUSABLE) for f in pieces] == [bool(f.flags & UNUSABLE) for f in whole]
 
 
-def test_a_truncated_or_unreadable_picture_is_flagged_and_the_rest_read(tmp_path, frames):
-    names = write_pictures(tmp_path / "f", frames[:5], name="{}.jpg")
+def test_a_truncated_or_unreadable_image_is_flagged_and_the_rest_read(tmp_path, frames):
+    names = write_images(tmp_path / "f", frames[:5], name="{}.jpg")
     for name, share in ((names[1], 0.5), (names[2], 0.01), (names[3], 0.0)):
         content = (tmp_path / "f" / name).read_bytes()
         (tmp_path / "f" / name).write_bytes(content[: int(share * len(content))])
@@ -123,12 +123,12 @@ def test_a_truncated_or_unreadable_picture_is_flagged_and_the_rest_read(tmp_path
     assert unreadable == [False, True, True, True, False]
     assert not read[1].grey.any()
     assert "truncated" in read[1].reason
-    assert any("2 of 5 pictures cannot be read" in warning for warning in info.warnings)
+    assert any("2 of 5 images cannot be read" in warning for warning in info.warnings)
 
 
 def test_a_png_with_flipped_bytes_is_flagged(tmp_path, frames):
-    (name,) = write_pictures(tmp_path / "f", frames[:1])
-    write_pictures(tmp_path / "f", frames[:2], name="g{}.png")
+    (name,) = write_images(tmp_path / "f", frames[:1])
+    write_images(tmp_path / "f", frames[:2], name="g{}.png")
     flip_bytes(tmp_path / "f" / name, tmp_path / "f" / name, start=0.3, stop=0.8, count=5, seed=0)
     _, read = read_all(tmp_path / "f", FPS)
     assert [bool(frame.flags & FrameFlag.UNREADABLE) for frame in read] == [True, False, False]
@@ -142,7 +142,7 @@ def test_missing_duplicate_black_blurred_and_outlier_frames_are_flagged(tmp_path
     sequence[3] = np.zeros_like(sequence[3])
     sequence[5] = cv2.GaussianBlur(sequence[5], (0, 0), 6)
     sequence[7] = ground(320, 240, seed=99)
-    write_pictures(tmp_path / "f", sequence)
+    write_images(tmp_path / "f", sequence)
     (tmp_path / "f" / "f9.png").unlink()
     side = write_times(tmp_path / "t.csv", [(f"f{i + 1}.png", 0.2 * i) for i in range(9)])
     info = probe(tmp_path / "f", frames=ALL, timestamps=side)
@@ -155,14 +155,14 @@ def test_missing_duplicate_black_blurred_and_outlier_frames_are_flagged(tmp_path
 
 
 def test_a_flight_cut_into_units_finds_the_same_duplicates(tmp_path, frames):
-    write_pictures(tmp_path / "f", [frames[0], frames[1], frames[1], frames[2]])
+    write_images(tmp_path / "f", [frames[0], frames[1], frames[1], frames[2]])
     info, whole = read_all(tmp_path / "f", FPS)
     second = list(iter_frames(tmp_path / "f", info, [2, 3], after=1))
     assert [frame.flags for frame in second] == [frame.flags for frame in whole[2:]] == [int(FrameFlag.DUPLICATE), 0]
 
 
 def test_permuted_times_are_sorted_and_said(tmp_path, frames):
-    names = write_pictures(tmp_path / "f", frames[:4])
+    names = write_images(tmp_path / "f", frames[:4])
     side = write_times(tmp_path / "t.csv", list(zip(names, [0.6, 0.0, 0.4, 0.2], strict=True)))
     info = probe(tmp_path / "f", frames=ALL, timestamps=side)
     assert info.names == ("f2.png", "f4.png", "f3.png", "f1.png")
@@ -170,7 +170,7 @@ def test_permuted_times_are_sorted_and_said(tmp_path, frames):
 
 
 def test_equal_times_are_said_and_flagged(tmp_path, frames):
-    names = write_pictures(tmp_path / "f", frames[:3])
+    names = write_images(tmp_path / "f", frames[:3])
     side = write_times(tmp_path / "t.csv", list(zip(names, [0.0, 0.2, 0.2], strict=True)))
     info = probe(tmp_path / "f", frames=ALL, timestamps=side)
     assert any("1 frames have the time of the frame before" in warning for warning in info.warnings)
@@ -178,14 +178,14 @@ def test_equal_times_are_said_and_flagged(tmp_path, frames):
 
 
 def test_a_folder_without_times_says_what_to_give(tmp_path, frames):
-    write_pictures(tmp_path / "f", frames[:2])
+    write_images(tmp_path / "f", frames[:2])
     assert_stops(tmp_path / "f", "give --timestamps CSV .* or --fps", ALL)
 
 
 def test_time_stamps_that_contradict_the_container_stop(tmp_path, frames):
     path = write_video(tmp_path / "a.mp4", frames[:20])
     assert_stops(
-        path, "as the video's own times say", ALL, write_times(tmp_path / "t.csv", [(i, i * 0.05) for i in range(20)])
+        path, "by the video's own times", ALL, write_times(tmp_path / "t.csv", [(i, i * 0.05) for i in range(20)])
     )
     assert_stops(
         path, "found no time for 1 of 20", ALL, write_times(tmp_path / "u.csv", [(i, i * 0.04) for i in range(19)])
@@ -202,19 +202,19 @@ def test_time_stamps_that_contradict_the_container_stop(tmp_path, frames):
         ("frame,time_s\nf1.png\n", "cells"),
         ("frame,time_s\n", "no rows"),
         ("", "columns"),
-        ("frame,time_s\nelsewhere.png,1\n", "none a picture"),
+        ("frame,time_s\nelsewhere.png,1\n", "none an image"),
         (b"\xff\xfe\0\0", "not UTF-8"),
     ],
 )
 def test_a_bad_time_stamps_file_stops(tmp_path, frames, content, match):
-    write_pictures(tmp_path / "f", frames[:2])
+    write_images(tmp_path / "f", frames[:2])
     side = tmp_path / "t.csv"
     side.write_bytes(content if isinstance(content, bytes) else content.encode())
     assert_stops(tmp_path / "f", match, ALL, side)
 
 
 def test_rate_and_side_file_together_stop(tmp_path, frames):
-    names = write_pictures(tmp_path / "f", frames[:2])
+    names = write_images(tmp_path / "f", frames[:2])
     assert_stops(
         tmp_path / "f",
         "expected one of them",
@@ -224,7 +224,7 @@ def test_rate_and_side_file_together_stop(tmp_path, frames):
 
 
 def test_frames_that_change_size_stop_with_both_sizes(tmp_path, frames):
-    write_pictures(tmp_path / "f", [*frames[:3], frames[3][:200, :300]])
+    write_images(tmp_path / "f", [*frames[:3], frames[3][:200, :300]])
     assert_stops(tmp_path / "f", "found f4.png of 300x200, expected 320x240")
 
 
@@ -285,7 +285,7 @@ def test_playlists_and_other_files_are_no_videos(tmp_path, frames, content):
 
 
 def test_a_vrt_named_tif_is_refused(tmp_path, frames):
-    write_pictures(tmp_path / "other", frames[:1])
+    write_images(tmp_path / "other", frames[:1])
     (tmp_path / "f").mkdir()
     (tmp_path / "f" / "a.tif").write_text(
         '<VRTDataset rasterXSize="320" rasterYSize="240"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>'
@@ -295,14 +295,14 @@ def test_a_vrt_named_tif_is_refused(tmp_path, frames):
 
 
 def test_nothing_there_an_empty_folder_and_a_folder_of_videos_stop(tmp_path, frames):
-    assert_stops(tmp_path / "none", "found no video or picture folder")
+    assert_stops(tmp_path / "none", "found no video or image folder")
     (tmp_path / "empty").mkdir()
-    assert_stops(tmp_path / "empty", "found no pictures in the folder")
+    assert_stops(tmp_path / "empty", "found no images in the folder")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    assert_stops(tmp_path / "loop", "found no video or picture folder")
+    assert_stops(tmp_path / "loop", "found no video or image folder")
 
 
-def test_float_pictures_are_no_frames(tmp_path):
+def test_float_images_are_no_frames(tmp_path):
     Image.fromarray(np.ones((8, 8), np.float32)).save(tmp_path / "a.tif")
     info = probe(tmp_path, frames=FPS)
     (read,) = iter_frames(tmp_path, info, [0])

@@ -59,7 +59,7 @@ def test_a_yolo_folder_is_read_by_stem_and_other_classes_are_left_alone(tmp_path
     assert labels.frames == ("a.png", "b.png")
     assert (len(labels.cars), len(labels.ignored)) == (1, 1)
     assert labels.cars.loc[0, ["x_px", "y_px"]].tolist() == [99.5, 49.5]
-    assert labels.notes == ("1 label files name no frame of this source and are not used",)
+    assert labels.notes == ("1 label files name no frame of this source: not used",)
 
 
 @pytest.mark.parametrize(
@@ -100,9 +100,9 @@ def test_length_of_a_usual_car_comes_out_of_its_upright_box_at_any_turn(angle, l
 @pytest.mark.parametrize(
     ("name", "content", "match"),
     [
-        ("l.csv", "frame,x_px,y_px\na.png,500,20\n", "1 labels outside the picture .*200x100"),
-        ("l.csv", "frame,x_px,y_px\na.png,-1,20\n", "outside the picture"),
-        ("l.csv", "frame,x_px,y_px\nz.png,5,20\n", "line 2: found frame 'z.png', expected a picture's file name"),
+        ("l.csv", "frame,x_px,y_px\na.png,500,20\n", "1 labels outside the image .*200x100"),
+        ("l.csv", "frame,x_px,y_px\na.png,-1,20\n", "outside the image"),
+        ("l.csv", "frame,x_px,y_px\nz.png,5,20\n", "line 2: found frame 'z.png', expected an image's file name"),
         ("l.csv", "frame,x_px,y_px\na.png,nan,20\n", "finite number"),
         ("l.csv", "frame,x_px,y_px\na.png,5,\n", "one of x_px and y_px empty"),
         ("l.csv", "frame,x_px,y_px\n", "found no cars"),
@@ -113,7 +113,7 @@ def test_length_of_a_usual_car_comes_out_of_its_upright_box_at_any_turn(angle, l
         ("l.json", '{"shapes": []}', "found JSON of another kind, expected COCO, LabelMe, VIA or GeoJSON"),
         ("l.xml", "<annotation/>", "found XML"),
         ("l.txt", "1,2,3,4\n", "a .txt that is not YOLO"),
-        ("a.txt", "0 0.5 0.5 0.1 0.1\n0 12 34 10 10\n", "shares of the picture"),
+        ("a.txt", "0 0.5 0.5 0.1 0.1\n0 12 34 10 10\n", "fractions of the image"),
         ("a.txt", "0 0.5 0.5 0.1 0.1\ncar 1 2\n", "line 2: found 'car 1 2', expected YOLO"),
         ("q.txt", "0 0.5 0.5 0.1 0.1\n", "none named as a frame"),
         ("y/z.txt", "0 0.5 0.5 0.1 0.1\n", "none named as a frame"),
@@ -130,7 +130,7 @@ def test_addresses_and_nothing_there_are_refused(tmp_path):
     assert_refused(tmp_path / "none.csv", "found no labels")
 
 
-def test_two_pictures_of_one_stem_cannot_have_yolo_labels(tmp_path):
+def test_two_images_of_one_stem_cannot_have_yolo_labels(tmp_path):
     info = SourceInfo("folder", 200, 100, 2, np.arange(2) / 5, ("a.jpg", "a.png"))
     assert_refused(write(tmp_path / "a.txt", "0 0.5 0.5 0.1 0.1\n"), "of one stem", info)
 
@@ -148,7 +148,7 @@ def test_detections_of_others_are_read_with_what_they_know(tmp_path):
 @pytest.mark.parametrize(
     ("content", "match"),
     [
-        ("frame,x_px,y_px\na.png,500,20\n", "1 detections outside the picture"),
+        ("frame,x_px,y_px\na.png,500,20\n", "1 detections outside the image"),
         ("frame,x_px,y_px\n", "found no detections"),
         ("frame,x_px,y_px\nz.png,5,20\n", "found frame 'z.png'"),
         ("frame,x_px,y_px\na.png,,20\n", "x_px or y_px empty"),

@@ -1,4 +1,4 @@
-"""Videos and picture folders: the frames and times that went in come out, whatever the container does to them."""
+"""Videos and image folders: the frames and times that went in come out, whatever the container does to them."""
 
 from fractions import Fraction
 from pathlib import Path
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from schemas.flight import FramesConfig
-from tests.media import drifting, write_pictures, write_times, write_video
+from tests.media import drifting, write_images, write_times, write_video
 from velfield.errors import InputError
 from velfield.sources.flags import FrameFlag
 from velfield.sources.source import iter_frames, probe, select_frames
@@ -123,9 +123,9 @@ def test_a_side_file_that_agrees_gives_the_times_of_a_video(tmp_path, frames):
 
 
 def test_a_folder_is_read_in_natural_order_with_its_side_files_times(tmp_path, frames):
-    names = write_pictures(tmp_path / "frames", frames[:12])
+    names = write_images(tmp_path / "frames", frames[:12])
     (tmp_path / "frames" / "._f1.png").write_bytes(b"resource fork")
-    (tmp_path / "frames" / "notes.txt").write_text("not a picture")
+    (tmp_path / "frames" / "notes.txt").write_text("not an image")
     side = write_times(tmp_path / "t.csv", [(name, 5 + 0.2 * i) for i, name in enumerate(names)])
     info = probe(tmp_path / "frames", frames=ALL, timestamps=side)
     assert info.names == tuple(names)
@@ -135,7 +135,7 @@ def test_a_folder_is_read_in_natural_order_with_its_side_files_times(tmp_path, f
     assert np.array_equal(read[1].grey, frames[9])
 
 
-def test_pictures_are_read_as_stored_whatever_exif_says(tmp_path, frames):
+def test_images_are_read_as_stored_whatever_exif_says(tmp_path, frames):
     exif = Image.Exif()
     exif[0x0112] = 6  # turn by a quarter
     (tmp_path / "frames").mkdir()
@@ -147,7 +147,7 @@ def test_pictures_are_read_as_stored_whatever_exif_says(tmp_path, frames):
 
 
 @pytest.mark.parametrize("mode", ["L", "RGB", "RGBA", "P", "LA", "I;16", "1", "CMYK"])
-def test_pictures_of_every_usual_mode_become_grey(tmp_path, frames, mode):
+def test_images_of_every_usual_mode_become_grey(tmp_path, frames, mode):
     path = tmp_path / ("a.jpg" if mode == "CMYK" else "a.png")
     if mode == "I;16":
         Image.fromarray(frames[0].astype(np.uint16) * 257).save(path)

@@ -14,7 +14,7 @@ from schemas.report import PrecisionRecall, Report, ReportFigure, ReportStage, R
 from velfield.errors import InputError
 from velfield.report.colours import direction_colours, ramp_colours
 from velfield.report.figures import MapScale, direction_figure, jpeg_bytes, png_bytes, speed_figure
-from velfield.report.gates import left_out, totals
+from velfield.report.gates import rejection_table, totals_table
 from velfield.report.panel import bar_ticks
 from velfield.report.report import render_report
 from velfield.tracking.limits import GateLog
@@ -95,7 +95,7 @@ def test_a_field_of_another_size_is_refused() -> None:
         direction_figure(GREY, np.zeros((10, 10)), MapScale())
 
 
-def test_pictures_come_back_from_their_bytes() -> None:
+def test_images_come_back_from_their_bytes() -> None:
     figure = direction_figure(GREY, lanes()[0], MapScale(0.25))
     read = cv2.imdecode(np.frombuffer(png_bytes(figure), np.uint8), cv2.IMREAD_COLOR)
     np.testing.assert_array_equal(cv2.cvtColor(read, cv2.COLOR_BGR2RGB), figure)
@@ -217,16 +217,19 @@ def test_only_what_is_to_be_minded_is_red() -> None:
 
 def test_what_tracking_left_out_stands_apart_from_what_it_tried() -> None:
     gates = made_report()[0].gates
-    assert totals(gates) == [("Links tried, from a car to one in the next frame", "1,200"), ("of another time", "7")]
-    assert left_out(gates) == [("links", "faster than a vehicle", "30", "2 %")]
+    assert totals_table(gates) == [
+        ("Links tried, from a car to one in the next frame", "1,200"),
+        ("of another time", "7"),
+    ]
+    assert rejection_table(gates) == [("links", "faster than a vehicle", "30", "2 %")]
 
 
 def test_every_gate_that_tracking_counts_has_words() -> None:
     told = set(re.findall(r"``(\w+)``", GateLog.__doc__ or ""))
     assert {"links_tried", "not_best", "windows"} <= told
     counts = dict.fromkeys(sorted(told), 3)
-    assert len(totals(counts)) + len(left_out(counts)) == len(told)
-    assert not {name.replace("_", " ") for name in told} & {words for words, _ in totals(counts)}
+    assert len(totals_table(counts)) + len(rejection_table(counts)) == len(told)
+    assert not {name.replace("_", " ") for name in told} & {words for words, _ in totals_table(counts)}
 
 
 def test_an_empty_report_is_a_page_too() -> None:

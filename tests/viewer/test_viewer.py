@@ -14,7 +14,7 @@ from schemas.summary import RunSummary
 from tests.browser import MIDDLE_OF_MAP, NEEDS_PAGE, Browser, Page, browser, served
 from velfield import open_run
 from velfield.analysis import coverage
-from velfield.report.figures import round_up, speed_reach
+from velfield.report.figures import colour_scale_max, round_up
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run
 from velfield.run.stores import open_field
@@ -184,7 +184,7 @@ def test_the_page_colours_speeds_as_the_figure_does_and_says_what_is_cut_off(
 ) -> None:
     store = open_field(RunLayout(whole[0]).field)
     modal = np.hypot(store.layer("modal_vx"), store.layer("modal_vy")).astype(np.float64) * 0.23 * 3.6
-    reach = speed_reach(modal)
+    reach = colour_scale_max(modal)
     assert reach is not None
     page.open(address)
     page.wait("document.querySelector('#layer option') !== null")

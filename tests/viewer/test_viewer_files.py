@@ -21,7 +21,7 @@ from velfield.viewer.layers import view_layers
 from velfield.viewer.pyramid import TILE_PX, pyramid_levels, pyramid_tiles
 
 
-def test_tiles_make_up_the_picture_at_every_level() -> None:
+def test_tiles_make_up_the_image_at_every_level() -> None:
     y, x = np.mgrid[:900, :1300]
     grey = (127 + 60 * np.sin(x / 40) + 50 * np.cos(y / 55)).astype(np.uint8)
     tiles = {

@@ -26,7 +26,7 @@ from velfield.errors import InputError
 from velfield.report.figures import png_bytes
 from velfield.sources.labels.labels import read_labels
 from velfield.sources.source import probe
-from velfield.viewer.annotations import Frames, frames_of, read_marks, write_marks
+from velfield.viewer.annotations import Frames, frames_to_annotate, read_marks, write_marks
 from velfield.viewer.annotator import annotate_app
 from velfield.viewer.server import page_policy, view_app
 
@@ -141,7 +141,7 @@ def test_view_serves_the_page(whole: tuple[Path, RunSummary], tmp_path: Path) ->
 
 
 @pytest.fixture
-def picture(tmp_path: Path) -> Path:
+def image(tmp_path: Path) -> Path:
     grey = np.random.default_rng(1).integers(60, 180, (480, 640), dtype=np.uint8)
     path = tmp_path / "frames" / "a.png"
     path.parent.mkdir()
@@ -157,9 +157,9 @@ def drag(page: Any, start: tuple[float, float], end: tuple[float, float]) -> Non
 
 
 @NEEDS_PAGE
-def test_a_drag_along_a_car_is_a_label(picture: Path, tmp_path: Path) -> None:
+def test_a_drag_along_a_car_is_a_label(image: Path, tmp_path: Path) -> None:
     labels = tmp_path / "labels.csv"
-    arguments = ("annotate", str(picture), "--labels", str(labels))
+    arguments = ("annotate", str(image), "--labels", str(labels))
     with command(*arguments) as address, browser(tmp_path / "profile") as chromium, chromium.page() as page:
         page.open(address)
         page.wait("document.querySelector('img.frame')?.naturalWidth === 640")
@@ -184,7 +184,7 @@ def test_a_drag_along_a_car_is_a_label(picture: Path, tmp_path: Path) -> None:
     expected = (115, 220, np.arctan2(40, 30), 50)
     found = [row[name] for name in ("x_px", "y_px", "orientation_rad", "length_px")]
     np.testing.assert_allclose(found, expected, atol=1.5 / scale, rtol=0.03)
-    info = probe(picture.parent, frames=FramesConfig(fps=5.0))
+    info = probe(image.parent, frames=FramesConfig(fps=5.0))
     assert len(read_labels(labels, info).cars) == 1
 
 
@@ -236,13 +236,13 @@ def test_only_the_page_it_served_may_write(tmp_path: Path) -> None:
 
 
 def test_a_run_offers_frames_spread_over_the_flight(whole: tuple[Path, RunSummary], flight: Path) -> None:
-    offered = frames_of(whole[0], most=4)
+    offered = frames_to_annotate(whole[0], most=4)
     names = sorted(path.name for path in (flight / "frames").iterdir())
     assert len(offered.names) == 4
     assert (offered.names[0], offered.names[-1]) == (names[0], names[-1])
     assert offered.read(1).shape == (offered.height, offered.width) == (480, 640)
 
 
-def test_neither_a_run_nor_a_picture_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no run folder and no picture"):
-        frames_of(tmp_path, most=3)
+def test_neither_a_run_nor_an_image_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no run folder and no image"):
+        frames_to_annotate(tmp_path, most=3)

@@ -22,8 +22,8 @@ from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import Plan, make_plan, write_flight_record
 from velfield.registration.transforms import as_points
-from velfield.run.frame_transforms import FrameMaps
-from velfield.sources.images import read_picture_grey
+from velfield.run.frame_transforms import FrameTransforms
+from velfield.sources.images import read_grey_image
 from velfield.synthetic import cases, write_flight
 from velfield.synthetic.score import RegistrationScore, score_registration
 from velfield.synthetic.truth import Truth, load_truth
@@ -177,7 +177,7 @@ def register_flight(flight: Path, out: Path) -> tuple[Plan, float]:
 
 def _by_velfield(flight: Path, config: SimulationConfig, truth: Truth) -> tuple[Mapped, list[int], float]:
     plan, seconds = register_flight(flight, flight / "run")
-    maps = FrameMaps.open(plan.layout, plan.config)
+    maps = FrameTransforms.open(plan.layout, plan.config)
     found = {
         int(source): transform
         for frame, source in enumerate(plan.indices)
@@ -190,11 +190,11 @@ def _by_stabilo(flight: Path, config: SimulationConfig, truth: Truth) -> tuple[M
     """One homography a frame by SIFT and MAGSAC; a frame that it gives up on is left out."""
     stabilizer = _stabilizer()
     undistort = _undistortion(truth)
-    stabilizer.set_ref_frame(_coloured(read_picture_grey(flight / "base.png", _MAX_PIXELS)))
+    stabilizer.set_ref_frame(_coloured(read_grey_image(flight / "base.png", _MAX_PIXELS)))
     found: dict[int, FloatArray] = {}
     seconds = 0.0
     for frame in range(config.frames):
-        grey = read_picture_grey(flight / "frames" / frame_name(frame, config), _MAX_PIXELS)
+        grey = read_grey_image(flight / "frames" / frame_name(frame, config), _MAX_PIXELS)
         straight = _coloured(np.asarray(cv2.remap(grey, *undistort, cv2.INTER_CUBIC), dtype=np.uint8))
         started = time.perf_counter()
         stabilizer.stabilize(straight)

@@ -27,7 +27,7 @@ from velfield.registration.alignment import (
 )
 from velfield.registration.transforms import FrameTransform
 from velfield.run.run import Run
-from velfield.sources.images import read_picture_grey
+from velfield.sources.images import read_grey_image
 from velfield.sources.table import finite_cell, read_csv_rows
 
 _MAX_SHIFT_PX = 3.0
@@ -113,8 +113,8 @@ def unused_corners(run: Run) -> tuple[Templates, NDArray[np.uint8]]:
     """Corners that registration does not use, and the image (h, w) that frames were registered to."""
     layout, limit = run.layout, run.record.config.frames.max_pixels
     own = run.grid.frames_to == "own"
-    grey = read_picture_grey(layout.own_base_image, limit) if own else run.base_image
-    known = read_picture_grey(layout.own_base_mask, limit) > 0 if own else np.ones(grey.shape, np.bool_)
+    grey = read_grey_image(layout.own_base_image, limit) if own else run.base_image
+    known = read_grey_image(layout.own_base_mask, limit) > 0 if own else np.ones(grey.shape, np.bool_)
     used = [make_templates(grey, known, count=count).xy for count in (N_PATCHES_SAME_SENSOR, N_PATCHES_CROSS_SENSOR)]
     return make_templates(grey, known, exclude=np.concatenate(used), half_patch=PATCH_HALF_PX), grey
 

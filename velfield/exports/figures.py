@@ -9,7 +9,7 @@ from schemas.arrays import FloatArray, GreyImage
 from schemas.export import ExportOptions
 from velfield.errors import InputError
 from velfield.report.figures import MapScale
-from velfield.run.grid import north_of
+from velfield.run.grid import north_direction_rad
 from velfield.run.run import Run
 
 _MAX_SIDE_PX = 20_000
@@ -43,5 +43,5 @@ def resized_map(run: Run, layer: FloatArray, options: ExportOptions) -> ResizedM
     image = cv2.resize(grey, size, interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC)
     values = cv2.resize(np.asarray(layer, np.float32), size, interpolation=cv2.INTER_NEAREST_EXACT)
     gsd_m = None if grid.gsd_m is None else grid.gsd_m / factor
-    scale = MapScale(gsd_m=gsd_m, unit=options.unit, north_rad=north_of(grid))
+    scale = MapScale(gsd_m=gsd_m, unit=options.unit, north_rad=north_direction_rad(grid))
     return ResizedMap(np.asarray(image, np.uint8), np.asarray(values, np.float64), scale)

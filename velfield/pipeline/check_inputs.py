@@ -7,7 +7,7 @@ from velfield.detection.detector import load_detector
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import committed
-from velfield.sources.geo import read_base_picture
+from velfield.sources.geo import read_base_raster
 from velfield.sources.labels.detections import read_detections
 from velfield.sources.labels.labels import read_labels
 
@@ -24,7 +24,7 @@ def check_given(plan: Plan) -> None:
     """
     given = plan.job.inputs
     if given.base and committed(plan, "base", _WHOLE) is None:
-        _reading("base", lambda: read_base_picture(Path(str(given.base)), plan.config.frames))
+        _reading("base", lambda: read_base_raster(Path(str(given.base)), plan.config.frames))
     if committed(plan, "detector", _WHOLE) is not None:
         return
     if given.labels:

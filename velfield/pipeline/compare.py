@@ -12,7 +12,7 @@ from velfield.report.change import change_figure
 from velfield.report.figures import MapScale, png_bytes
 from velfield.run.commits import write_atomically
 from velfield.run.field_algebra import check_same_grid
-from velfield.run.grid import north_of
+from velfield.run.grid import north_direction_rad
 from velfield.run.run import Run, open_run
 from velfield.run.stores import open_field
 from velfield.viewer.record import write_change_layers
@@ -45,7 +45,7 @@ def compare_runs(before: Path, after: Path, out: Path, *, min_count: int = MIN_C
         min_count=min_count,
     )
     shown = {name: _shown(name, change, runs[1]) for name, change in changes.items()}
-    scale = MapScale(gsd_m=runs[1].grid.gsd_m, north_rad=north_of(runs[1].grid))
+    scale = MapScale(gsd_m=runs[1].grid.gsd_m, north_rad=north_direction_rad(runs[1].grid))
     for name, (values, unit) in shown.items():
         real = np.where(changes[name].significant, values, np.nan)
         figure = change_figure(runs[1].base_image, real, scale, title=f"Change of {name}, {unit}")

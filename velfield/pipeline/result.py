@@ -7,7 +7,7 @@ from pathlib import Path
 from schemas.records import CommitRecord
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.version import code_version
-from velfield.run.commits import digest_outputs, finished, write_commit
+from velfield.run.commits import digest_outputs, valid_commit, write_commit
 
 
 @dataclass(frozen=True)
@@ -53,4 +53,4 @@ def commit(plan: Plan, stage: str, unit: str, outcome: Outcome, *, started: floa
 
 def committed(plan: Plan, stage: str, unit: str) -> CommitRecord | None:
     """The record of a unit where it is finished as this plan wants it."""
-    return finished(plan.layout, stage, unit, plan.keys[stage])
+    return valid_commit(plan.layout, stage, unit, plan.keys[stage])

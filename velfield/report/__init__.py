@@ -1,1 +1,1 @@
-"""Pictures and the report: what people look at."""
+"""Images and the report: what people look at."""

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from schemas.arrays import RGBImage
 from velfield.report.colours import change_colours
-from velfield.report.figures import MapScale, over_picture, round_up
+from velfield.report.figures import MapScale, blend_over_image, round_up
 from velfield.report.panel import Legend, draw_bar_panel
 
 
@@ -33,7 +33,7 @@ def change_figure(grey: NDArray[np.uint8], change: NDArray[np.floating], scale: 
     """
     known = np.isfinite(change)
     top = round_up(float(np.percentile(np.abs(change[known]), 99))) if known.any() else 10.0
-    picture = over_picture(grey, change, change_colours(change / top))
+    image = blend_over_image(grey, change, change_colours(change / top))
     legend = Legend(title, "After less before, where it is more than chance. Bare grey: no change that can be told.")
     panel = draw_bar_panel(grey.shape, legend, top=top, gsd_m=scale.gsd_m, north_rad=scale.north_rad, changes=True)
-    return np.hstack([picture, panel])
+    return np.hstack([image, panel])

@@ -1,7 +1,7 @@
 """Two colour scales, made in OKLab, where equal steps look equal: a wheel for direction, a ramp for speed.
 
 The ramp rises in lightness from violet to yellow, so it reads in grey and to the colour-blind, and it starts light
-enough to stand out from a dimmed aerial picture. The wheel takes of each hue the most chroma that a screen can show,
+enough to stand out from a dimmed aerial image. The wheel takes of each hue the most chroma that a screen can show,
 and swings in lightness a little with it: a wheel of one lightness would be pale all round.
 """
 

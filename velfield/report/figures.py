@@ -18,7 +18,7 @@ PER_M_PER_S: dict[SpeedUnit, float] = {"km/h": 3.6, "mph": 2.2369362920544, "m/s
 _DIMMED = 0.5
 """Brightness of the base image under the colours."""
 _COVER = 0.88
-"""How much of a known pixel is colour; the rest lets the picture's texture through."""
+"""How much of a known pixel is colour; the rest lets the image's texture through."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class MapScale:
     unit
         Unit of speed for people.
     north_rad
-        Where north is in the picture, from +x towards +y (down): -pi/2 where it is up. None: not known, and said so.
+        Where north is in the image, from +x towards +y (down): -pi/2 where it is up. None: not known, and said so.
     """
 
     gsd_m: float | None = None
@@ -75,9 +75,9 @@ def direction_figure(grey: NDArray[np.uint8], direction_rad: NDArray[np.floating
         Where the shapes differ.
     """
     _same_shape(grey, direction_rad)
-    picture = _over(grey, direction_colours(direction_rad), ~np.isnan(direction_rad))
+    image = _over(grey, direction_colours(direction_rad), ~np.isnan(direction_rad))
     legend = Legend("Direction of travel", "Hue: the way most vehicles go. Bare grey: none seen, or they stand.")
-    return np.hstack([picture, draw_wheel_panel(grey.shape, legend, gsd_m=scale.gsd_m, north_rad=scale.north_rad)])
+    return np.hstack([image, draw_wheel_panel(grey.shape, legend, gsd_m=scale.gsd_m, north_rad=scale.north_rad)])
 
 
 def speed_figure(
@@ -95,16 +95,16 @@ def speed_figure(
     speed_px_per_s
         (h, w) speed, px/s. Nothing is drawn where it is NaN.
     top
-        Speed at the bar's end, in the shown unit; None: the round number above `speed_reach`, as on the page.
+        Speed at the bar's end, in the shown unit; None: the round number above `colour_scale_max`, as on the page.
     bar_gsd_m
         Metres a pixel of the figure, for the scale bar, where it is not drawn at base resolution.
     """
     _same_shape(grey, speed_px_per_s)
     shown = scale.shown_speed(speed_px_per_s)
     if top is None:
-        reach = speed_reach(shown)
+        reach = colour_scale_max(shown)
         top = 10.0 if reach is None else round_up(reach)
-    picture = _over(grey, ramp_colours(shown / top), np.isfinite(shown))
+    image = _over(grey, ramp_colours(shown / top), np.isfinite(shown))
     note = "Colour: the speed that most vehicles have. Bare grey: none seen."
     highest = float(np.nanmax(shown, initial=0.0))
     if highest > top:
@@ -112,10 +112,10 @@ def speed_figure(
     legend = Legend(f"Speed, {scale.shown_unit}", note)
     gsd_m = scale.gsd_m if bar_gsd_m is None else bar_gsd_m
     panel = draw_bar_panel(grey.shape, legend, top=top, gsd_m=gsd_m, north_rad=scale.north_rad)
-    return np.hstack([picture, panel])
+    return np.hstack([image, panel])
 
 
-def speed_reach(speed: NDArray[np.floating]) -> float | None:
+def colour_scale_max(speed: NDArray[np.floating]) -> float | None:
     """What 99 % of the known speeds stay below: where the colours end, then rounded up. One false fast track does not
     flatten all others. None where none is known."""
     known = speed[np.isfinite(speed)]
@@ -140,7 +140,7 @@ def round_up(value: float) -> float:
 
 
 def png_bytes(rgb: RGBImage) -> bytes:
-    """An RGB or grey picture as PNG."""
+    """An RGB or grey image as PNG."""
     order = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR) if rgb.ndim == 3 else rgb
     done, data = cv2.imencode(".png", order)
     if not done:
@@ -149,7 +149,7 @@ def png_bytes(rgb: RGBImage) -> bytes:
 
 
 def jpeg_bytes(rgb: RGBImage, *, quality: int = 88, max_side: int | None = None) -> bytes:
-    """An RGB picture as JPEG, reduced so that no side is longer than ``max_side``: for pages that must stay small."""
+    """An RGB image as JPEG, reduced so that no side is longer than ``max_side``: for pages that must stay small."""
     if max_side is not None and max(rgb.shape[:2]) > max_side:
         factor = max_side / max(rgb.shape[:2])
         rgb = np.asarray(cv2.resize(rgb, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)
@@ -159,8 +159,8 @@ def jpeg_bytes(rgb: RGBImage, *, quality: int = 88, max_side: int | None = None)
     return bytes(data)
 
 
-def over_picture(grey: NDArray[np.uint8], values: NDArray[np.floating], colours: RGBImage) -> RGBImage:
-    """(h, w, 3) colours over the dimmed picture where the values are known.
+def blend_over_image(grey: NDArray[np.uint8], values: NDArray[np.floating], colours: RGBImage) -> RGBImage:
+    """(h, w, 3) colours over the dimmed image where the values are known.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def over_picture(grey: NDArray[np.uint8], values: NDArray[np.floating], colours:
 
 
 def _over(grey: NDArray[np.uint8], colours: RGBImage, known: NDArray[np.bool_]) -> RGBImage:
-    """Colours over the dimmed picture where known, modulated a little by it so that kerbs and lanes stay visible."""
+    """Colours over the dimmed image where known, modulated a little by it so that kerbs and lanes stay visible."""
     base = np.repeat((grey.astype(np.float32) * _DIMMED)[..., None], 3, axis=2)
     tinted = colours * (_COVER + (1 - _COVER) * grey[..., None].astype(np.float32) / 255)
     return np.where(known[..., None], tinted, base).astype(np.uint8)

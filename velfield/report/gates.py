@@ -7,10 +7,10 @@ _TOTALS = {
     "links_tried": "Links tried, from a car to one in the next frame",
     "pairs_tried": "Pairs of links tried, over three frames",
     "tracklets": "Pairs kept: tracklets",
-    "links_refined": "Links of tracklets measured again in the pictures",
+    "links_refined": "Links of tracklets measured again in the images",
     "links_not_refined": "Links of tracklets left as the cars were found",
 }
-_LEFT_OUT = {
+_REJECTIONS = {
     "frames_not_registered": ("frames", "not registered to the map", None),
     "gaps_too_long": ("frames", "the next one comes too late", None),
     "speed": ("links", "faster than a vehicle", "links_tried"),
@@ -26,21 +26,21 @@ _LEFT_OUT = {
 Rows = list[tuple[str, ...]]
 
 
-def totals(gates: Mapping[str, int]) -> Rows:
+def totals_table(gates: Mapping[str, int]) -> Rows:
     """What was tried and what was kept: words and count. A count that has no words here stands under its own name."""
     known = [(words, f"{gates[name]:,}") for name, words in _TOTALS.items() if name in gates]
-    others = [name for name in gates if name not in _TOTALS and name not in _LEFT_OUT]
+    others = [name for name in gates if name not in _TOTALS and name not in _REJECTIONS]
     return [*known, *((name.replace("_", " "), f"{gates[name]:,}") for name in others)]
 
 
-def left_out(gates: Mapping[str, int]) -> Rows:
+def rejection_table(gates: Mapping[str, int]) -> Rows:
     """What was left out: of what, why, count, and share of those tried."""
     return [
-        (kind, why, f"{gates[name]:,}", _share(gates[name], gates.get(total or "", 0)))
-        for name, (kind, why, total) in _LEFT_OUT.items()
+        (kind, why, f"{gates[name]:,}", _fraction(gates[name], gates.get(total or "", 0)))
+        for name, (kind, why, total) in _REJECTIONS.items()
         if name in gates
     ]
 
 
-def _share(count: int, tried: int) -> str:
+def _fraction(count: int, tried: int) -> str:
     return f"{100 * count / tried:.0f} %" if tried else ""

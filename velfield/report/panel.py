@@ -67,7 +67,7 @@ class _Panel:
     def finish(self, gsd_m: float | None, north_rad: float | None) -> RGBImage:
         self.write(self.note, 0.8, _FAINT)
         if north_rad is None:
-            self.write("North is not known: up is the picture's.", 0.8, _FAINT)
+            self.write("North is not known: up is the image's.", 0.8, _FAINT)
         self._scale_bar(gsd_m)
         return np.asarray(self.image).copy()
 

@@ -1,6 +1,6 @@
 """Small plots as inline SVG: no script, no library, sharp at any size, coloured by the page's style.
 
-Each is drawn twice, for a wide screen and for a narrow one; the style sheet shows one of them. A picture for a wide
+Each is drawn twice, for a wide screen and for a narrow one; the style sheet shows one of them. An image for a wide
 screen, reduced to a narrow one, has letters that nobody can read.
 """
 

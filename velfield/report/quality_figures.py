@@ -1,4 +1,4 @@
-"""Pictures that show how good the geometry is: the lens before and after, the registration's error over the frame."""
+"""Images that show how good the geometry is: the lens before and after, the registration's error over the frame."""
 
 import cv2
 import numpy as np
@@ -10,7 +10,7 @@ from velfield.camera.lens import Lens
 from velfield.report.colours import ramp_colours
 
 _LINES = 9
-"""Straight lines laid over the picture each way."""
+"""Straight lines laid over the image each way."""
 _LINE_RGB = (255, 176, 32)
 _SIDE_PX = 900
 """A frame is shown this wide at most."""
@@ -18,7 +18,7 @@ _COVER = 0.55
 _LEGEND_PX = 32
 
 
-def lens_picture(grey: NDArray[np.uint8], lens: Lens) -> RGBImage:
+def undistortion_figure(grey: NDArray[np.uint8], lens: Lens) -> RGBImage:
     """A raw frame (h, w) and the same undistorted, side by side; lines that are straight on the ground over both."""
     height, width = grey.shape
     y, x = np.mgrid[0:height, 0:width].astype(np.float64)
@@ -47,16 +47,16 @@ def _straight_lines(width: int, height: int) -> list[FloatArray]:
 def _with_lines(grey: NDArray[np.uint8], lines: list[FloatArray], title: str) -> RGBImage:
     scale = min(1.0, _SIDE_PX / grey.shape[1])
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    picture = Image.fromarray(np.repeat(small[..., None], 3, axis=2))
-    draw = ImageDraw.Draw(picture)
+    image = Image.fromarray(np.repeat(small[..., None], 3, axis=2))
+    draw = ImageDraw.Draw(image)
     for line in lines:
         seen = line[np.isfinite(line).all(axis=1)]
         draw.line([(float(px), float(py)) for px, py in seen * scale], fill=_LINE_RGB, width=1)
     _label(draw, title, 8, 8)
-    return np.asarray(picture, dtype=np.uint8)
+    return np.asarray(image, dtype=np.uint8)
 
 
-def error_picture(grey: NDArray[np.uint8], error_px: NDArray[np.floating], *, full_px: float) -> RGBImage:
+def registration_error_figure(grey: NDArray[np.uint8], error_px: NDArray[np.floating], *, full_px: float) -> RGBImage:
     """Registration's held-out error by cell of the frame, its figure in each cell, over a raw frame.
 
     Parameters
@@ -78,27 +78,27 @@ def error_picture(grey: NDArray[np.uint8], error_px: NDArray[np.floating], *, fu
     colours = ramp_colours(at / full_px).astype(np.float64)
     cover = np.where(np.isfinite(at), _COVER, 0.0)[..., None]
     mixed = (1 - cover) * small[..., None] + cover * colours
-    picture = Image.fromarray(np.rint(mixed).astype(np.uint8))
-    draw = ImageDraw.Draw(picture)
+    image = Image.fromarray(np.rint(mixed).astype(np.uint8))
+    draw = ImageDraw.Draw(image)
     for i in range(rows):
         for j in range(columns):
             told = f"{error_px[i, j]:.2f}" if np.isfinite(error_px[i, j]) else "no points"
             _label(draw, told, (j + 0.5) * width / columns, (i + 0.5) * height / rows, anchor="mm")
-    return np.concatenate([np.asarray(picture, dtype=np.uint8), _error_legend(width, full_px)])
+    return np.concatenate([np.asarray(image, dtype=np.uint8), _error_legend(width, full_px)])
 
 
 def _error_legend(width: int, full_px: float) -> RGBImage:
-    """What the figures are, and the ramp from none to ``full_px``: (height, width, 3), to stand below the picture."""
-    picture = Image.new("RGB", (width, _LEGEND_PX))
-    draw = ImageDraw.Draw(picture)
+    """What the figures are, and the ramp from none to ``full_px``: (height, width, 3), to stand below the image."""
+    image = Image.new("RGB", (width, _LEGEND_PX))
+    draw = ImageDraw.Draw(image)
     bar = max(1, width // 5)
     ramp = np.broadcast_to(np.linspace(0.0, 1.0, bar), (_LEGEND_PX // 2, bar))
     end = width - _LEGEND_PX * 3
-    picture.paste(Image.fromarray(ramp_colours(ramp)), (end - bar, _LEGEND_PX // 4))
+    image.paste(Image.fromarray(ramp_colours(ramp)), (end - bar, _LEGEND_PX // 4))
     _label(draw, "0", end - bar - 6, _LEGEND_PX / 2, anchor="rm")
     _label(draw, f"{full_px:g} px", end + 6, _LEGEND_PX / 2, anchor="lm")
     _label(draw, "error held out of the fit, RMS", 8, _LEGEND_PX / 2, anchor="lm")
-    return np.asarray(picture, dtype=np.uint8)
+    return np.asarray(image, dtype=np.uint8)
 
 
 def _label(draw: ImageDraw.ImageDraw, text: str, x: float, y: float, anchor: str = "la") -> None:

@@ -1,6 +1,6 @@
 """The report: one HTML file that holds all it shows, opens offline, and runs no script.
 
-A content security policy in the page lets nothing in from elsewhere: pictures are ``data:``, the one style sheet is
+A content security policy in the page lets nothing in from elsewhere: images are ``data:``, the one style sheet is
 admitted by its hash, everything that came from outside (names, messages) is escaped.
 """
 
@@ -12,7 +12,7 @@ from importlib.resources import files
 from urllib.parse import quote
 
 from schemas.report import Report, ReportFigure, ReportStage
-from velfield.report.gates import left_out, totals
+from velfield.report.gates import rejection_table, totals_table
 from velfield.report.plots import precision_recall_plot, residual_plot
 
 
@@ -150,8 +150,8 @@ def _detection(report: Report) -> str:
 def _gates(gates: dict[str, int]) -> str:
     if not gates:
         return ""
-    kept = _table(["What was tried and kept", "Number"], totals(gates), numbers=1)
-    lost = _table(["Left out", "Why", "Number", "Share"], left_out(gates), numbers=2)
+    kept = _table(["What was tried and kept", "Number"], totals_table(gates), numbers=1)
+    lost = _table(["Left out", "Why", "Number", "Share"], rejection_table(gates), numbers=2)
     return _section("Tracking", f'<div class="scroll narrow">{kept}</div><div class="scroll narrow">{lost}</div>')
 
 

@@ -32,7 +32,7 @@ _CAPTIONS = {
         "registration error by cell over a frame",
     ),
 }
-"""Picture of ``maps/`` -> title, caption, and what it shows for those who do not see it."""
+"""Image of ``maps/`` -> title, caption, and what it shows for those who do not see it."""
 
 
 def report_figures(maps: Path) -> dict[str, ReportFigure]:
@@ -42,13 +42,13 @@ def report_figures(maps: Path) -> dict[str, ReportFigure]:
         if not (maps / f"{name}.png").exists():
             continue  # a pin-hole has no before and after
         encoded = np.frombuffer((maps / f"{name}.png").read_bytes(), np.uint8)
-        picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+        image = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
         figures[name] = ReportFigure(
             title=title,
             caption=caption,
             alternative=alternative,
             mime="image/jpeg",
-            data=jpeg_bytes(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), max_side=_PICTURE_SIDE_PX),
+            data=jpeg_bytes(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), max_side=_PICTURE_SIDE_PX),
             full_size=f"maps/{name}.png",
         )
     return figures

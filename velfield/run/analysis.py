@@ -20,7 +20,7 @@ from velfield.analysis.u_turns import find_u_turns
 from velfield.field.bins import stationary_speed_px_per_s
 from velfield.field.segments import Segments
 from velfield.field.statistics import direction_rad
-from velfield.run.grid import heading_deg, north_of
+from velfield.run.grid import heading_deg, north_direction_rad
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,9 @@ class RunAnalysis:
             self._direction_rad, self._count, speeds_px_per_s=speeds, min_count=min_count, min_area_px=area
         )
         direction = found.table["direction_rad"].to_numpy(np.float64)
-        return Regions(found.labels, found.table.assign(heading_deg=heading_deg(direction, north_of(self.grid))))
+        return Regions(
+            found.labels, found.table.assign(heading_deg=heading_deg(direction, north_direction_rad(self.grid)))
+        )
 
     def stops(
         self,

@@ -8,8 +8,8 @@ from velfield.run.paths import local_copy
 
 def read_base_image(layout: RunLayout, config: FramesConfig) -> GreyImage:
     """The base image, (y, x) grey uint8: the GeoTIFF where the run has one, else the PNG."""
-    from velfield.sources.images import read_picture_grey  # opening a run loads no rasterio
+    from velfield.sources.images import read_grey_image  # opening a run loads no rasterio
 
     path = layout.base_image_tif if layout.base_image_tif.exists() else layout.base_image
     with local_copy(path) as local:
-        return read_picture_grey(local, config.max_pixels)
+        return read_grey_image(local, config.max_pixels)

@@ -127,7 +127,7 @@ def read_commits(layout: RunLayout, stage: str) -> list[CommitRecord]:
     return [record for record in found if record is not None]
 
 
-def finished(layout: RunLayout, stage: str, unit: str, key: str) -> CommitRecord | None:
+def valid_commit(layout: RunLayout, stage: str, unit: str, key: str) -> CommitRecord | None:
     """The record of a unit where it was finished under this very key and its outputs still stand."""
     record = read_commit(layout, stage, unit)
     if record is None or record.key != key:

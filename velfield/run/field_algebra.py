@@ -11,7 +11,7 @@ from velfield.field.algebra import merge_tiles, subtract_tile
 from velfield.field.bins import VelocityBins
 from velfield.run.commits import content_key, digest_file
 from velfield.run.field_reader import TileReader, tile_reader
-from velfield.run.field_writer import GroupWriter, create_field_store, groups_of
+from velfield.run.field_writer import GroupWriter, create_field_store, tile_groups
 from velfield.run.grid import read_grid
 from velfield.run.layout import RunLayout
 from velfield.run.stores import HISTOGRAM_TIME_WEIGHTED, FieldStore, open_field, store_key
@@ -141,7 +141,7 @@ def _write(
     target = open_field(layout.field, "r+")
     kinds = [[tile_reader(store, name) for store in stores] for name in target.histogram_names()]
     bins = VelocityBins.from_config(config, grid.gsd_m)
-    for group in groups_of(grid, config):
+    for group in tile_groups(grid, config):
         _write_group(GroupWriter(target, group, grid=grid, config=config, bins=bins), kinds, combine)
     shutil.copy(like.flight, layout.flight)  # last: a folder without it was not written whole
 

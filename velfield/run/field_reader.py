@@ -40,7 +40,7 @@ def open_velocity_field(layout: RunLayout, *, time_weighted: bool = False) -> Ve
         The field was not built yet, or not with that weight.
     """
     config = FlightRecord.model_validate_json(layout.flight.read_bytes()).config.field
-    return field_of_store(open_field(layout.field), config, read_grid(layout), time_weighted=time_weighted)
+    return field_from_store(open_field(layout.field), config, read_grid(layout), time_weighted=time_weighted)
 
 
 def open_field_intervals(layout: RunLayout) -> list[IntervalField]:
@@ -52,12 +52,12 @@ def open_field_intervals(layout: RunLayout) -> list[IntervalField]:
         store = open_field(path)
         about = store.attributes
         ends = float(about.get("start_s", -inf)), float(about.get("stop_s", inf))
-        field = field_of_store(store, config, grid)
+        field = field_from_store(store, config, grid)
         found.append(IntervalField(str(about["time_interval"]), *ends, float(about["observed_s"]), field))
     return found
 
 
-def field_of_store(
+def field_from_store(
     store: FieldStore, config: FieldConfig, grid: GridRecord, *, time_weighted: bool = False
 ) -> VelocityField:
     """The field in a store that was laid out under a configuration."""

@@ -21,7 +21,7 @@ Group = tuple[int, int]
 """(row, column)."""
 
 
-def groups_of(grid: GridRecord, config: FieldConfig) -> list[Group]:
+def tile_groups(grid: GridRecord, config: FieldConfig) -> list[Group]:
     """All groups of tiles of a base image."""
     side = config.tile_size_px * GROUP_TILES
     rows, columns = -(-grid.height_px // side), -(-grid.width_px // side)

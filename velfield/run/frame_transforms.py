@@ -2,7 +2,7 @@
 
 A frame is registered to the flight's own base image (same camera, same light: a tenth of a pixel). Where a base image
 was
-given, the own one is registered to it once, and every frame's map is the composition: pictures are resampled only once.
+given, the own one is registered to it once, and every frame's map is the composition: images are resampled only once.
 """
 
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ def read_lens(layout: RunLayout) -> Lens:
     return lens_from_record(CameraRecord.model_validate_json(layout.camera.read_bytes()).lens)
 
 
-def polyprojective_record(transform: PolyprojectiveTransform) -> PolyprojectiveRecord:
+def polyprojective_to_record(transform: PolyprojectiveTransform) -> PolyprojectiveRecord:
     """The transform as a record for JSON."""
     return PolyprojectiveRecord(
         coefficients=tuple(tuple(map(float, row)) for row in np.reshape(transform.coefficients, (3, 6))),
@@ -43,23 +43,23 @@ def polyprojective_record(transform: PolyprojectiveTransform) -> PolyprojectiveR
     )
 
 
-def polyprojective_of(record: PolyprojectiveRecord) -> PolyprojectiveTransform:
-    """The inverse of `polyprojective_record`."""
+def polyprojective_from_record(record: PolyprojectiveRecord) -> PolyprojectiveTransform:
+    """The inverse of `polyprojective_to_record`."""
     return PolyprojectiveTransform(np.array(record.coefficients), np.array(record.source), np.array(record.target))
 
 
 def _onward(layout: RunLayout) -> tuple[PolyprojectiveTransform, ...]:
-    """What stands between the picture that frames are registered to and base pixels, in order; mostly nothing."""
+    """What stands between the image that frames are registered to and base pixels, in order; mostly nothing."""
     records = []
     if layout.own_to_base.exists():
         records.append(PolyprojectiveRecord.model_validate_json(layout.own_to_base.read_bytes()))
     if layout.rebased.exists():
         records.append(RebaseRecord.model_validate_json(layout.rebased.read_bytes()).transform)
-    return tuple(polyprojective_of(record) for record in records)
+    return tuple(polyprojective_from_record(record) for record in records)
 
 
 @dataclass(frozen=True)
-class FrameMaps:
+class FrameTransforms:
     """The maps of all frames of a run, each made when it is asked for."""
 
     width: int
@@ -71,7 +71,7 @@ class FrameMaps:
     config: RegistrationConfig
 
     @classmethod
-    def open(cls, layout: RunLayout, config: FlightConfig) -> "FrameMaps":
+    def open(cls, layout: RunLayout, config: FlightConfig) -> "FrameTransforms":
         """The maps of a run folder."""
         height, width = open_frames(layout.frames).shape
         return cls(

@@ -36,8 +36,8 @@ def read_working(layout: RunLayout) -> WorkingRecord:
     return WorkingRecord.model_validate_json(layout.working.read_bytes())
 
 
-def north_of(grid: GridRecord) -> float | None:
-    """Where north is in the picture, from +x towards +y (down); none where the base image has no place on earth."""
+def north_direction_rad(grid: GridRecord) -> float | None:
+    """Where north is in the image, from +x towards +y (down); none where the base image has no place on earth."""
     if grid.affine is None:
         return None
     a, b, _, d, e, _ = grid.affine

@@ -86,7 +86,7 @@ def local_copy(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def written_locally(path: Path) -> Iterator[Path]:
+def local_output(path: Path) -> Iterator[Path]:
     """A file that libraries can write by name; at the end of the context the object is written from it, whole."""
     if not is_remote(path):
         yield path

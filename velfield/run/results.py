@@ -11,7 +11,7 @@ from pathlib import Path
 
 from schemas.records import FlightRecord, RebaseRecord, ResultRecord, ResultsRecord
 from velfield.errors import InputError
-from velfield.run.commits import commit_path, digest_path, finished, read_commits, write_atomically
+from velfield.run.commits import commit_path, digest_path, read_commits, valid_commit, write_atomically
 from velfield.run.layout import RunLayout
 from velfield.run.paths import remove_tree, rename_tree
 from velfield.run.run import Run
@@ -42,12 +42,12 @@ def result_name(asked: str | None, base: Path) -> str:
     return name
 
 
-def unfinished(layout: RunLayout, name: str) -> RunLayout:
+def staging_layout(layout: RunLayout, name: str) -> RunLayout:
     """Where a result stands until it is whole."""
     return RunLayout(layout.results / f".{name}.unfinished")
 
 
-def named(root: Path) -> Path:
+def final_root(root: Path) -> Path:
     """Where a run folder stands once it is whole: elsewhere only while it is a result in the making.
 
     Examples
@@ -65,7 +65,7 @@ def read_results(layout: RunLayout) -> tuple[ResultRecord, ...]:
     return ResultsRecord.model_validate_json(path.read_bytes()).results if path.exists() else ()
 
 
-def made_before(layout: RunLayout, name: str, base: Path) -> bool:
+def result_exists(layout: RunLayout, name: str, base: Path) -> bool:
     """Whether this very result is there already.
 
     Raises
@@ -81,14 +81,16 @@ def made_before(layout: RunLayout, name: str, base: Path) -> bool:
     return True
 
 
-def share(old: RunLayout, new: RunLayout, stages: Iterable[str], *, without: tuple[str, ...] = ()) -> None:
+def link_shared_outputs(
+    old: RunLayout, new: RunLayout, stages: Iterable[str], *, without: tuple[str, ...] = ()
+) -> None:
     """Give the new result what it has in common with the old: the outputs of stages, then their commit records.
 
     Outputs whose path begins as one of ``without`` does are the new result's own, and so not in those records.
     """
     for stage in stages:
         for record in read_commits(old, stage):
-            if finished(new, stage, record.unit, record.key):
+            if valid_commit(new, stage, record.unit, record.key):
                 continue
             outputs = {name: digest for name, digest in record.outputs.items() if not name.startswith(without)}
             link_files([(old.root / name, new.root / name) for name in outputs])
@@ -96,16 +98,16 @@ def share(old: RunLayout, new: RunLayout, stages: Iterable[str], *, without: tup
             write_atomically(commit_path(new, stage, record.unit), kept.model_dump_json(indent=1).encode())
 
 
-def discard(layout: RunLayout) -> None:
+def discard_result(layout: RunLayout) -> None:
     """Remove a result that came to nothing."""
     remove_tree(layout.root)
 
 
-def publish(run: Run, name: str, base: Path) -> Path:
+def publish_result(run: Run, name: str, base: Path) -> Path:
     """The new result is whole: give it its name, and write down both."""
     layout = run.layout
     target = layout.results / name
-    waiting = unfinished(layout, name).root
+    waiting = staging_layout(layout, name).root
     if (target / _LAST).exists():
         remove_tree(waiting)  # what a process that was killed while it gave the name left
     else:

@@ -17,7 +17,7 @@ from velfield.field.view import VelocityField
 from velfield.run.analysis import RunAnalysis
 from velfield.run.base_image import read_base_image
 from velfield.run.field_reader import IntervalField, open_field_intervals, open_velocity_field
-from velfield.run.frame_transforms import FrameMaps
+from velfield.run.frame_transforms import FrameTransforms
 from velfield.run.grid import read_grid
 from velfield.run.layout import RunLayout
 from velfield.run.paths import to_path
@@ -51,7 +51,7 @@ def open_run(root: str | Path) -> "Run":
 
 
 class Run:
-    """A run folder, read lazily: opening one reads no picture and no table.
+    """A run folder, read lazily: opening one reads no image and no table.
 
     Frames are numbered as in ``frames.zarr``; points are (x, y), pixel (0, 0) being the centre of the top-left pixel.
     """
@@ -79,9 +79,9 @@ class Run:
         return read_grid(self.layout)
 
     @cached_property
-    def maps(self) -> FrameMaps:
+    def maps(self) -> FrameTransforms:
         """Raw pixels <-> base pixels of each frame."""
-        return FrameMaps.open(self.layout, self.record.config)
+        return FrameTransforms.open(self.layout, self.record.config)
 
     @property
     def times_s(self) -> NDArray[np.float64]:

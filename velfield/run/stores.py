@@ -221,7 +221,7 @@ REGISTRATION_COLUMNS: dict[str, str] = {
     "count_kept": "int32",  # control points that the robust fit kept
     "residual_px": "float32",  # RMS of what was fitted
     "heldout_px": "float32",  # RMS of what was held out of the fit
-    "spread": "float32",  # share of the picture's cells that hold control points
+    "spread": "float32",  # share of the image's cells that hold control points
 }
 
 

@@ -84,13 +84,13 @@ def read_tables(
 
 
 def write_patches(path: Path, patches: Mapping[str, NDArray[Any]]) -> None:
-    """Write pictures of the detections, each (n, h, w) uint8, in the table's order."""
+    """Write images of the detections, each (n, h, w) uint8, in the table's order."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **patches)
     write_atomically(path, buffer.getvalue())
 
 
 def read_patches(path: Path) -> Patches:
-    """Pictures of the detections by name."""
+    """Images of the detections by name."""
     with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
         return {name: file[name] for name in file.files}

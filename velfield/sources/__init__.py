@@ -1,1 +1,1 @@
-"""What comes in: video and picture folders with true times, labels, other people's detections, base pictures."""
+"""What comes in: video and image folders with true times, labels, external detections, base images."""

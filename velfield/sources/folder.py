@@ -1,17 +1,17 @@
-"""A folder of pictures as a source: natural order, times from a side file or a rate that the user gives."""
+"""A folder of images as a source: natural order, times from a CSV or from a frame rate that the user gives."""
 
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, IntArray
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
 from velfield.sources.flags import FrameFlag
 from velfield.sources.frames import SourceFrame, SourceInfo, unreadable_frame
-from velfield.sources.images import PICTURE_SUFFIXES, check_size, picture_size, read_picture_grey
+from velfield.sources.images import IMAGE_SUFFIXES, check_size, image_size, read_grey_image
 from velfield.sources.timestamps import read_timestamps
 
 _DIGITS = re.compile(r"(\d+)")
@@ -31,17 +31,17 @@ def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
 
 
 def probe_folder(path: Path, *, frames: FramesConfig, timestamps: Path | None) -> SourceInfo:
-    """Look at a folder: see `velfield.sources.source.probe`. Reads every picture's header, no pixels."""
-    names = list_pictures(path)
-    names, times_s, warnings = _timed(path, names, frames, timestamps)
-    sizes, broken = _sizes(path, names, frames.max_pixels)
+    """Facts of a folder (`velfield.sources.source.probe`). Reads every image's header, no pixels."""
+    names = list_images(path)
+    names, times_s, warnings = _with_times(path, names, frames, timestamps)
+    sizes, broken = _group_by_size(path, names, frames.max_pixels)
     if not sizes:
         raise InputError(
-            f"{path.name}: found {len(names)} pictures, none of them readable, expected frames; {broken[0][1]}"
+            f"{path.name}: found {len(names)} images, none of them readable, expected frames; {broken[0][1]}"
         )
-    width, height = _one_size(path, sizes)
+    width, height = _common_size(path, sizes)
     if broken:
-        warnings += (f"{len(broken)} of {len(names)} pictures cannot be read (first: {broken[0][1]})",)
+        warnings += (f"{len(broken)} of {len(names)} images cannot be read (first: {broken[0][1]})",)
     return SourceInfo(
         kind="folder",
         width=width,
@@ -55,8 +55,8 @@ def probe_folder(path: Path, *, frames: FramesConfig, timestamps: Path | None) -
     )
 
 
-def list_pictures(path: Path) -> tuple[str, ...]:
-    """Names of the pictures in a folder, naturally sorted; hidden files (``._x.jpg`` of a Mac) are none.
+def list_images(path: Path) -> tuple[str, ...]:
+    """Names of the images in a folder, naturally sorted; without hidden files (``._x.jpg`` of a Mac).
 
     Raises
     ------
@@ -64,20 +64,20 @@ def list_pictures(path: Path) -> tuple[str, ...]:
         There is none.
     """
     try:
-        names = [entry.name for entry in path.iterdir() if entry.suffix.lower() in PICTURE_SUFFIXES]
+        names = [entry.name for entry in path.iterdir() if entry.suffix.lower() in IMAGE_SUFFIXES]
     except OSError as error:
         raise InputError(f"{path.name}: the folder cannot be listed ({error.strerror}); check it") from None
     names = [name for name in names if not name.startswith(".")]
     if not names:
         raise InputError(
-            f"{path.name}: found no pictures in the folder, expected {', '.join(PICTURE_SUFFIXES)}; "
+            f"{path.name}: found no images in the folder, expected {', '.join(IMAGE_SUFFIXES)}; "
             "give the folder that holds them, or a video"
         )
     return tuple(sorted(names, key=natural_key))
 
 
-def iter_folder(path: Path, info: SourceInfo, indices: NDArray[np.int64]) -> Iterator[SourceFrame]:
-    """Read the pictures `indices`; one that cannot be read is yielded unreadable, in its place."""
+def iter_folder(path: Path, info: SourceInfo, indices: IntArray) -> Iterator[SourceFrame]:
+    """Read the images `indices`; one that cannot be read is yielded with the flag UNREADABLE."""
     for index in indices:
         yield _read(path, info, int(index))
 
@@ -85,8 +85,8 @@ def iter_folder(path: Path, info: SourceInfo, indices: NDArray[np.int64]) -> Ite
 def _read(path: Path, info: SourceInfo, index: int) -> SourceFrame:
     name = info.names[index]
     try:
-        check_size(path / name, *picture_size(path / name, max_pixels=info.max_pixels), info.max_pixels)
-        grey = read_picture_grey(path / name, info.max_pixels)
+        check_size(path / name, *image_size(path / name, max_pixels=info.max_pixels), info.max_pixels)
+        grey = read_grey_image(path / name, info.max_pixels)
     except InputError as error:
         return unreadable_frame(path, info, index, int(FrameFlag.UNREADABLE), str(error))
     if grey.shape != info.shape:
@@ -97,14 +97,14 @@ def _read(path: Path, info: SourceInfo, index: int) -> SourceFrame:
     return SourceFrame(index, name, float(info.times_s[index]), grey, 0)
 
 
-def _timed(
+def _with_times(
     path: Path, names: tuple[str, ...], frames: FramesConfig, timestamps: Path | None
-) -> tuple[tuple[str, ...], NDArray[np.float64], tuple[str, ...]]:
-    """Names and times in order of time, and what was odd about them."""
+) -> tuple[tuple[str, ...], FloatArray, tuple[str, ...]]:
+    """Names and times in order of time, and notes on irregularities."""
     if timestamps is None:
         if frames.fps is None:
             raise InputError(
-                f"{path.name}: found {len(names)} pictures without times, expected them from a side file or a rate; "
+                f"{path.name}: found {len(names)} images without times, expected them from a side file or a rate; "
                 "give --timestamps CSV (frame,time_s) or --fps F"
             )
         return names, np.arange(len(names)) / frames.fps, ()
@@ -112,28 +112,30 @@ def _timed(
     kept = tuple(name for name in names if name in side)
     if not kept:
         raise InputError(
-            f"{timestamps.name}: found frames such as {next(iter(side))!r}, none a picture of {path.name} "
-            f"(such as {names[0]!r}), expected the pictures' file names as `frame`; mend them"
+            f"{timestamps.name}: found frames such as {next(iter(side))!r}, none an image of {path.name} "
+            f"(such as {names[0]!r}), expected the images' file names as `frame`; fix them"
         )
-    return _in_order(kept, np.array([side[name] for name in kept]), _unmatched(path, timestamps, names, kept, side))
+    return _sorted_by_time(
+        kept, np.array([side[name] for name in kept]), _unmatched_notes(path, timestamps, names, kept, side)
+    )
 
 
-def _unmatched(
+def _unmatched_notes(
     path: Path, timestamps: Path, names: tuple[str, ...], kept: tuple[str, ...], side: dict[str, float]
 ) -> tuple[str, ...]:
     untimed = [name for name in names if name not in side]
     absent = sorted(set(side) - set(kept), key=natural_key)
     notes: tuple[str, ...] = ()
     if untimed:
-        notes += (f"{len(untimed)} of {len(names)} pictures have no time and are left out ({_some(untimed)})",)
+        notes += (f"{len(untimed)} of {len(names)} images have no time and are dropped ({_shorten(untimed)})",)
     if absent:
-        notes += (f"{len(absent)} frames of {timestamps.name} are not in {path.name} ({_some(absent)})",)
+        notes += (f"{len(absent)} frames of {timestamps.name} are not in {path.name} ({_shorten(absent)})",)
     return notes
 
 
-def _in_order(
-    names: tuple[str, ...], times_s: NDArray[np.float64], notes: tuple[str, ...]
-) -> tuple[tuple[str, ...], NDArray[np.float64], tuple[str, ...]]:
+def _sorted_by_time(
+    names: tuple[str, ...], times_s: FloatArray, notes: tuple[str, ...]
+) -> tuple[tuple[str, ...], FloatArray, tuple[str, ...]]:
     order = np.argsort(times_s, kind="stable")
     backwards = int(np.count_nonzero(np.diff(times_s) < 0))
     times_s = times_s[order]
@@ -141,19 +143,19 @@ def _in_order(
     if backwards:
         notes += (f"times run backwards {backwards} times in the order of names: frames are taken in order of time",)
     if equal:
-        notes += (f"{equal} frames have the time of the frame before and are left out",)
+        notes += (f"{equal} frames have the time of the frame before and are dropped",)
     return tuple(names[i] for i in order), times_s, notes
 
 
-def _sizes(
+def _group_by_size(
     path: Path, names: tuple[str, ...], max_pixels: int
 ) -> tuple[dict[tuple[int, int], list[str]], list[tuple[str, str]]]:
-    """Names by size, and the names that have none with the reason. A picture that is too large stops all."""
+    """Names by size, and the names of unreadable images with the reason; one too large is an error."""
     sizes: dict[tuple[int, int], list[str]] = {}
     broken: list[tuple[str, str]] = []
     for name in names:
         try:
-            size = picture_size(path / name, max_pixels=max(max_pixels, 2**62))
+            size = image_size(path / name, max_pixels=max(max_pixels, 2**62))
         except InputError as error:
             broken.append((name, str(error)))
             continue
@@ -162,7 +164,7 @@ def _sizes(
     return sizes, broken
 
 
-def _one_size(path: Path, sizes: dict[tuple[int, int], list[str]]) -> tuple[int, int]:
+def _common_size(path: Path, sizes: dict[tuple[int, int], list[str]]) -> tuple[int, int]:
     size, usual = max(sizes.items(), key=lambda item: len(item[1]))
     if len(sizes) > 1:
         (width, height), odd = next((other, names) for other, names in sizes.items() if other != size)
@@ -173,5 +175,5 @@ def _one_size(path: Path, sizes: dict[tuple[int, int], list[str]]) -> tuple[int,
     return size
 
 
-def _some(names: list[str]) -> str:
+def _shorten(names: list[str]) -> str:
     return ", ".join(names[:_FEW]) + (", ..." if len(names) > _FEW else "")

@@ -1,46 +1,47 @@
-"""What a source of frames is: the facts of the whole (`SourceInfo`) and one decoded frame (`SourceFrame`)."""
+"""A source of frames: its facts (`SourceInfo`) and one decoded frame (`SourceFrame`)."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+
+from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
 
 SourceKind = Literal["video", "folder"]
 
 
 @dataclass(frozen=True)
 class SourceFrame:
-    """One frame as it came.
+    """One decoded frame.
 
     Attributes
     ----------
     source_index
-        Its place in `SourceInfo`, that is, in order of time.
+        Its index in `SourceInfo`, in order of time.
     name
-        A picture's file name, or a video's 0-based frame index, as text: what labels call it.
+        An image's file name, or a video's 0-based frame index, as text: its name in labels.
     time_s
-        True time, s: the container's, the side file's, or index / fps where the user asked for that.
+        True time, s: the container's, the CSV's, or index / fps where the user asked for that.
     grey
         (h, w) uint8, raw pixels as stored (no EXIF rotation); zeros where it is unreadable.
     flags
         Bits of `velfield.sources.flags.FrameFlag`.
     reason
-        What was wrong, one line; empty where nothing was.
+        What was wrong, one line; else empty.
     """
 
     source_index: int
     name: str
     time_s: float
-    grey: NDArray[np.uint8]
+    grey: GreyImage
     flags: int
     reason: str = ""
 
 
 @dataclass(frozen=True)
 class SourceInfo:
-    """What is known of a video or a picture folder before any frame is decoded.
+    """What is known of a video or an image folder before any frame is decoded.
 
     Attributes
     ----------
@@ -49,39 +50,39 @@ class SourceInfo:
     width, height
         Size of every frame, px.
     frame_count
-        Number of frames that can be asked for.
+        Number of frames that can be read.
     times_s
-        (n,) float64, ascending, s; equal times may stand in it, `select_frames` takes the first of them.
+        (n,) float64, ascending, s; it may hold equal times, of which `select_frames` takes the first.
     names
-        (n,) what labels call each frame: file names, or indices as text.
+        (n,) name of each frame in labels: file names, or indices as text.
     warnings
-        One line each, for people: what is missing, out of order, or cut short.
+        One line each, for people: frames missing, out of order, or truncated.
     declared_count
-        Frames that the container says it has, where it says so.
+        Number of frames that the container declares, if it does.
     pts
         (n,) int64 presentation time stamps of a video's frames in `time_base` units; empty for a folder and for a
         video without times. With the file, a frame's identity.
     key_frames
-        (n,) bool, where a damaged stretch ends; empty as `pts`.
+        (n,) bool, key frames, where corruption ends; empty as `pts`.
     entries
-        (n,) bool, the key frames that nothing leans across (closed groups): where a video can be entered.
+        (n,) bool, key frames of closed groups of pictures, where decoding can start.
     fps
-        Rate that made the times, where the user gave one and the source had none.
+        Frame rate behind the times, where the user gave one and the source had none.
     max_pixels
-        Limit on the size of a picture, refused before memory is taken.
+        Limit on the size of an image, refused before memory is taken.
     """
 
     kind: SourceKind
     width: int
     height: int
     frame_count: int
-    times_s: NDArray[np.float64]
+    times_s: FloatArray
     names: tuple[str, ...]
     warnings: tuple[str, ...] = ()
     declared_count: int | None = None
-    pts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    key_frames: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
-    entries: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+    pts: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    key_frames: Mask = field(default_factory=lambda: np.zeros(0, np.bool_))
+    entries: Mask = field(default_factory=lambda: np.zeros(0, np.bool_))
     fps: float | None = None
     max_pixels: int = 400_000_000
 
@@ -92,7 +93,7 @@ class SourceInfo:
 
 
 def unreadable_frame(path: Path, info: SourceInfo, index: int, flags: int, reason: str) -> SourceFrame:
-    """Stand-in for a frame that could not be read: zeros, with the reason and where it happened."""
+    """Stand-in for a frame that could not be read: zeros, with the reason."""
     time_s = float(info.times_s[index])
     where = f"{path.name}: frame {info.names[index]} at {time_s:.3f} s"
     return SourceFrame(index, info.names[index], time_s, np.zeros(info.shape, np.uint8), flags, f"{where}: {reason}")

@@ -1,4 +1,4 @@
-"""The base picture and its place on earth: read safely, brought out of degrees, its pixel measured on the ground."""
+"""The base image and its georeference: read safely, reprojected from degrees, its ground sample distance measured."""
 
 import warnings
 from dataclasses import dataclass
@@ -7,59 +7,58 @@ from typing import Any
 
 import numpy as np
 import rasterio
-from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioError
 from rasterio.transform import Affine
 from rasterio.warp import Resampling, reproject, transform
 
+from schemas.arrays import Float32Array, FloatArray, GreyImage, Mask
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
-from velfield.sources.images import check_size, read_picture_grey
+from velfield.sources.images import check_size, read_grey_image
 from velfield.sources.paths import local_path
 
 _DRIVERS = ((b"II*\0", "GTiff"), (b"MM\0*", "GTiff"), (b"II+\0", "GTiff"), (b"MM\0+", "GTiff"))
 _PICTURE_DRIVERS = ((b"\x89PNG", "PNG"), (b"\xff\xd8\xff", "JPEG"), (b"BM", "BMP"))
 _WGS84_A_M, _WGS84_E2 = 6378137.0, 0.00669437999014
 _SQUARE = 0.02
-"""Pixels whose two sides differ by more than this share are not square; speeds would depend on direction."""
+"""Pixels whose two sides differ by more than this fraction are not square; speeds would depend on direction."""
 MAX_GSD_DISAGREEMENT = 0.02
 
 
 @dataclass(frozen=True)
-class BasePicture:
-    """A base picture as it is worked with.
+class BaseRaster:
+    """The base image's pixels and georeference.
 
     Attributes
     ----------
     grey
         (h, w) uint8: the base image; its pixels are base pixels.
     valid
-        (h, w) bool, or None where all of it is picture: False where there is no data.
+        (h, w) bool, False where there is no data; None where all pixels have some.
     crs_wkt, affine, gsd_m
         Reference system; (a, b, c, d, e, f) from (column, row) of pixel corners to its coordinates, as rasterio's
-        `Affine`; metres a pixel by the reference system's local scale at the centre. None where the picture has none.
+        `Affine`; metres a pixel by the reference system's local scale at the centre. None without a reference system.
     notes
-        What was done to it, one line each.
+        What was changed, one line each.
     """
 
-    grey: NDArray[np.uint8]
+    grey: GreyImage
     crs_wkt: str | None = None
     affine: tuple[float, float, float, float, float, float] | None = None
     gsd_m: float | None = None
-    valid: NDArray[np.bool_] | None = None
+    valid: Mask | None = None
     notes: tuple[str, ...] = ()
 
 
-def read_base_picture(path: Path | str, config: FramesConfig) -> BasePicture:
-    """Read the picture given as ``--base``.
+def read_base_raster(path: Path | str, config: FramesConfig) -> BaseRaster:
+    """Read the base image given as ``--base``.
 
     Parameters
     ----------
     path
         GeoTIFF; or PNG, JPEG, TIFF, BMP, with its reference system where there are a world file and a ``.prj`` or
-        ``.aux.xml`` beside it. In degrees it is reprojected to the UTM zone of its centre, and that picture is the base
-        image.
+        ``.aux.xml`` beside it. An image in degrees is reprojected to the UTM zone of its centre.
     config
         ``max_pixels``.
 
@@ -68,22 +67,22 @@ def read_base_picture(path: Path | str, config: FramesConfig) -> BasePicture:
     InputError
         An address, a VRT, another format, too large, truncated, pixels that are not square on the ground.
     """
-    place = local_path(path, "base picture")
-    head = _head(place)
+    file = local_path(path, "base image")
+    head = _read_magic(file)
     driver = next((name for magic, name in _DRIVERS if head.startswith(magic)), None)
     if driver is not None:
-        raster = _read_geotiff(place, config.max_pixels)
+        raster = _read_geotiff(file, config.max_pixels)
     else:
-        grey = read_picture_grey(place, config.max_pixels)  # says what it is where it is neither
-        raster = _Raster(grey, None, *_georeference(place, head))
-    return _placed(place, raster, config.max_pixels)
+        grey = read_grey_image(file, config.max_pixels)  # refuses what it cannot read
+        raster = _Raster(grey, None, *_georeference(file, head))
+    return _to_base_raster(file, raster, config.max_pixels)
 
 
-def gsd_of(crs: CRS, affine: Affine, shape: tuple[int, int], *, name: str = "base picture") -> float:
-    """Metres a pixel on the ground at the picture's centre, by the reference system's local scale.
+def ground_sample_distance_m(crs: CRS, affine: Affine, shape: tuple[int, int], *, name: str = "base image") -> float:
+    """Metres a pixel on the ground at the image's centre, by the reference system's local scale.
 
-    Measured on the ellipsoid between pixels about the centre, so that Web Mercator (18 % too large at 32 degrees
-    north), feet and any other system come out right.
+    Measured on the ellipsoid between pixels around the centre, which is right for Web Mercator (18 % too large at 32
+    degrees north), feet and any other system.
 
     Raises
     ------
@@ -94,11 +93,11 @@ def gsd_of(crs: CRS, affine: Affine, shape: tuple[int, int], *, name: str = "bas
     step = max(min(rows, columns) / 8, 1.0)
     x0, y0 = columns / 2, rows / 2
     ends = [(x0 - step, y0), (x0 + step, y0), (x0, y0 - step), (x0, y0 + step)]
-    xs, ys = zip(*(_at(affine, *end) for end in ends), strict=True)
+    xs, ys = zip(*(_apply_affine(affine, *end) for end in ends), strict=True)
     longitude, latitude = (np.radians(np.asarray(values)) for values in transform(crs, CRS.from_epsg(4326), xs, ys))
     if not (np.isfinite(longitude).all() and np.isfinite(latitude).all()):
         raise InputError(
-            f"{name}: found a reference system that does not cover the picture, expected one that does; mend it"
+            f"{name}: found a reference system that does not cover the image, expected one that does; fix it"
         )
     across = _ground_distance(longitude[:2], latitude[:2]) / (2 * step)
     down = _ground_distance(longitude[2:], latitude[2:]) / (2 * step)
@@ -110,8 +109,8 @@ def gsd_of(crs: CRS, affine: Affine, shape: tuple[int, int], *, name: str = "bas
     return float(np.sqrt(across * down))
 
 
-def agreed_gsd(from_crs_m: float | None, given_m: float | None) -> float | None:
-    """The ground sample distance to work with, m a pixel: the reference system's, else the one given, else none.
+def reconcile_gsd(from_crs_m: float | None, given_m: float | None) -> float | None:
+    """The ground sample distance, m a pixel: the reference system's, else the one given, else None.
 
     Raises
     ------
@@ -120,60 +119,61 @@ def agreed_gsd(from_crs_m: float | None, given_m: float | None) -> float | None:
 
     Examples
     --------
-    >>> agreed_gsd(0.2301, 0.23), agreed_gsd(None, 0.23), agreed_gsd(None, None)
+    >>> reconcile_gsd(0.2301, 0.23), reconcile_gsd(None, 0.23), reconcile_gsd(None, None)
     (0.2301, 0.23, None)
     """
     if from_crs_m is None or given_m is None:
         return given_m if from_crs_m is None else from_crs_m
     if abs(given_m - from_crs_m) > MAX_GSD_DISAGREEMENT * from_crs_m:
         raise InputError(
-            f"found --gsd-m {given_m:g}, expected {from_crs_m:.4g} m a pixel as the base picture's reference system "
-            "says; "
-            "leave --gsd-m out, or mend the picture's reference"
+            f"found --gsd-m {given_m:g}, expected {from_crs_m:.4g} m a pixel by the base image's reference "
+            "system; leave --gsd-m out, or fix the image's georeference"
         )
     return from_crs_m
 
 
 @dataclass(frozen=True)
 class _Raster:
-    """Grey levels with what reference there is, before anything is done to them."""
+    """Grey levels and georeference as read from the file."""
 
-    grey: NDArray[np.uint8]
-    valid: NDArray[np.bool_] | None
+    grey: GreyImage
+    valid: Mask | None
     crs: CRS | None
     affine: Affine | None
     notes: tuple[str, ...] = ()
 
 
-def _placed(path: Path, raster: _Raster, max_pixels: int) -> BasePicture:
+def _to_base_raster(path: Path, raster: _Raster, max_pixels: int) -> BaseRaster:
     if raster.crs is None or raster.affine is None:
-        return BasePicture(raster.grey, valid=raster.valid, notes=raster.notes)
+        return BaseRaster(raster.grey, valid=raster.valid, notes=raster.notes)
     if raster.crs.is_geographic:
         raster = _to_utm(path, raster, max_pixels)
     assert raster.crs is not None
     assert raster.affine is not None
-    return BasePicture(
+    return BaseRaster(
         grey=raster.grey,
         crs_wkt=raster.crs.to_wkt(),
         affine=tuple(raster.affine)[:6],
-        gsd_m=gsd_of(raster.crs, raster.affine, (raster.grey.shape[0], raster.grey.shape[1]), name=path.name),
+        gsd_m=ground_sample_distance_m(
+            raster.crs, raster.affine, (raster.grey.shape[0], raster.grey.shape[1]), name=path.name
+        ),
         valid=raster.valid,
         notes=raster.notes,
     )
 
 
-def _head(path: Path) -> bytes:
+def _read_magic(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
             return file.read(16)
     except OSError as error:
         raise InputError(
-            f"{path.name}: could not be read ({error.strerror}), expected a base picture; check it"
+            f"{path.name}: could not be read ({error.strerror}), expected a base image; check it"
         ) from None
 
 
 def _read_geotiff(path: Path, max_pixels: int) -> _Raster:
-    """By GDAL's GTiff driver and no other: a VRT named .tif would read other files."""
+    """Read with GDAL's GTiff driver alone: a VRT named .tif would read other files."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
@@ -191,17 +191,17 @@ def _read_geotiff(path: Path, max_pixels: int) -> _Raster:
         prj = _prj(path)
         return _Raster(grey, valid, prj, affine) if prj is not None else _Raster(grey, valid, None, None)
     if affine is None:
-        return _Raster(grey, valid, None, None, ("a reference system without a place: it is not used",))
+        return _Raster(grey, valid, None, None, ("a reference system without a geotransform: it is not used",))
     return _Raster(grey, valid, crs, affine)
 
 
-def _grey_levels(path: Path, dataset: Any) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+def _grey_levels(path: Path, dataset: Any) -> tuple[GreyImage, Mask | None]:
     """Bands to grey: luma of three or more, else the first; other depths by their 0.5 to 99.5 percentile."""
     if any(name.startswith("complex") for name in dataset.dtypes):
         raise InputError(f"{path.name}: found complex pixels, expected grey or colour levels; convert it")
     valid = dataset.dataset_mask() > 0
     if not valid.any():
-        raise InputError(f"{path.name}: found no pixel with data, expected a picture; check its nodata value")
+        raise InputError(f"{path.name}: found no pixel with data, expected an image; check its nodata value")
     if dataset.count >= 3:
         red, green, blue = (dataset.read(band).astype(np.float32) for band in (1, 2, 3))
         levels = 0.299 * red + 0.587 * green + 0.114 * blue
@@ -215,7 +215,7 @@ def _grey_levels(path: Path, dataset: Any) -> tuple[NDArray[np.uint8], NDArray[n
     return grey, None if valid.all() else valid
 
 
-def _first_band(path: Path, dataset: Any) -> NDArray[np.float32]:
+def _first_band(path: Path, dataset: Any) -> Float32Array:
     band = dataset.read(1)
     try:
         palette = dataset.colormap(1)
@@ -229,7 +229,7 @@ def _first_band(path: Path, dataset: Any) -> NDArray[np.float32]:
 
 
 def _georeference(path: Path, head: bytes) -> tuple[CRS | None, Affine | None, tuple[str, ...]]:
-    """Reference system and place of a plain picture, from the world file and ``.prj`` or ``.aux.xml`` beside it."""
+    """Georeference of a plain image, from the world file and ``.prj`` or ``.aux.xml`` beside it."""
     driver = next((name for magic, name in _PICTURE_DRIVERS if head.startswith(magic)), None)
     if driver is None:
         return None, None, ()
@@ -256,22 +256,21 @@ def _prj(path: Path) -> CRS | None:
         return CRS.from_user_input(beside.read_text(encoding="utf-8", errors="replace").strip()[:100_000])
     except (CRSError, OSError) as error:
         raise InputError(
-            f"{beside.name}: found no reference system ({_one_line(error)}), expected WKT; mend or remove it"
+            f"{beside.name}: found no reference system ({_one_line(error)}), expected WKT; fix or remove it"
         ) from None
 
 
 def _to_utm(path: Path, raster: _Raster, max_pixels: int) -> _Raster:
-    """Reproject out of degrees: there a pixel is no length. Cubic, since registration wants the picture sharp."""
+    """Reproject from degrees, where a pixel has no length; bicubic, which keeps the image sharp for registration."""
     assert raster.crs is not None
     assert raster.affine is not None
     rows, columns = raster.grey.shape
-    centre_x, centre_y = _at(raster.affine, columns / 2, rows / 2)
+    centre_x, centre_y = _apply_affine(raster.affine, columns / 2, rows / 2)
     (longitude,), (latitude,) = transform(raster.crs, CRS.from_epsg(4326), [centre_x], [centre_y])
     if not (-180 <= longitude <= 180 and -80 <= latitude <= 84):
         raise InputError(
-            f"{path.name}: found its centre at {longitude:g}, {latitude:g} degrees, expected a place between 80 south "
-            "and 84 "
-            "north; mend its reference"
+            f"{path.name}: found its centre at {longitude:g}, {latitude:g} degrees, expected it between 80 south and "
+            "84 north; fix its georeference"
         )
     zone = min(int((longitude + 180) // 6) + 1, 60)
     crs = CRS.from_epsg((32600 if latitude >= 0 else 32700) + zone)
@@ -280,45 +279,45 @@ def _to_utm(path: Path, raster: _Raster, max_pixels: int) -> _Raster:
     shape = (height, width)
     grey, valid = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     source = np.ones(raster.grey.shape, np.uint8) if raster.valid is None else raster.valid.astype(np.uint8)
-    place = {"src_crs": raster.crs, "src_transform": raster.affine, "dst_crs": crs, "dst_transform": affine}
-    reproject(raster.grey, grey, resampling=Resampling.cubic, **place)
-    reproject(source, valid, resampling=Resampling.nearest, **place)
+    transforms = {"src_crs": raster.crs, "src_transform": raster.affine, "dst_crs": crs, "dst_transform": affine}
+    reproject(raster.grey, grey, resampling=Resampling.cubic, **transforms)
+    reproject(source, valid, resampling=Resampling.nearest, **transforms)
     mask = valid > 0
     note = f"reprojected from degrees to UTM zone {zone}{'N' if latitude >= 0 else 'S'} ({width}x{height} px)"
     return _Raster(grey, None if mask.all() else mask, crs, affine, (*raster.notes, note))
 
 
 def _utm_grid(raster: _Raster, crs: CRS) -> tuple[Affine, int, int]:
-    """North-up grid of square pixels over the picture, as fine as along its diagonal (as GDAL does)."""
+    """North-up grid of square pixels over the image, of the resolution along its diagonal (as GDAL's)."""
     assert raster.affine is not None
     rows, columns = raster.grey.shape
-    share = np.linspace(0, 1, 21)
+    fraction = np.linspace(0, 1, 21)
     border = np.r_[
-        np.c_[share * columns, np.zeros(21)],
-        np.c_[share * columns, np.full(21, rows)],
-        np.c_[np.zeros(21), share * rows],
-        np.c_[np.full(21, columns), share * rows],
+        np.c_[fraction * columns, np.zeros(21)],
+        np.c_[fraction * columns, np.full(21, rows)],
+        np.c_[np.zeros(21), fraction * rows],
+        np.c_[np.full(21, columns), fraction * rows],
     ]
-    xs, ys = zip(*(_at(raster.affine, column, row) for column, row in border), strict=True)
+    xs, ys = zip(*(_apply_affine(raster.affine, column, row) for column, row in border), strict=True)
     east, north = (np.asarray(values) for values in transform(raster.crs, crs, xs, ys))
     pixel = float(np.hypot(np.ptp(east), np.ptp(north)) / np.hypot(columns, rows))
     width, height = (max(int(np.ceil(np.ptp(values) / pixel - 1e-6)), 1) for values in (east, north))
     return Affine(pixel, 0, float(east.min()), 0, -pixel, float(north.max())), width, height
 
 
-def _at(affine: Affine, column: float, row: float) -> tuple[float, float]:
-    """Coordinates of a place in the picture; written out, since `Affine` is changing its operator."""
+def _apply_affine(affine: Affine, column: float, row: float) -> tuple[float, float]:
+    """Coordinates of a point of the image; written out, since `Affine` is changing its operator."""
     a, b, c, d, e, f = tuple(affine)[:6]
     return a * column + b * row + c, d * column + e * row + f
 
 
-def _ground_distance(longitude: NDArray[np.float64], latitude: NDArray[np.float64]) -> float:
-    """Metres between two near points on the WGS 84 ellipsoid, by its radii of curvature at their middle."""
+def _ground_distance(longitude: FloatArray, latitude: FloatArray) -> float:
+    """Metres between two nearby points on the WGS 84 ellipsoid, by its radii of curvature at their midpoint."""
     middle = float(latitude.mean())
     flat = 1 - _WGS84_E2 * np.sin(middle) ** 2
     north = _WGS84_A_M * (1 - _WGS84_E2) / flat**1.5 * (latitude[1] - latitude[0])
-    turn = (longitude[1] - longitude[0] + np.pi) % (2 * np.pi) - np.pi
-    east = _WGS84_A_M / np.sqrt(flat) * np.cos(middle) * turn
+    difference = (longitude[1] - longitude[0] + np.pi) % (2 * np.pi) - np.pi
+    east = _WGS84_A_M / np.sqrt(flat) * np.cos(middle) * difference
     return float(np.hypot(north, east))
 
 

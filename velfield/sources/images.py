@@ -1,4 +1,4 @@
-"""Reading one picture safely: local, of a known format, of bounded size, whole, and as stored (no EXIF rotation)."""
+"""Read one image safely: a local file, of a known format and bounded size, whole, as stored (no EXIF rotation)."""
 
 from pathlib import Path
 
@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import BmpImagePlugin, Image, JpegImagePlugin, PngImagePlugin, TiffImagePlugin
 
+from schemas.arrays import GreyImage
 from velfield.errors import InputError
 from velfield.sources.paths import local_path
 
-PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-"""What is taken for a picture in a folder."""
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+"""Files of a folder that are images."""
 
 # The format comes from the first bytes, never from the name: GDAL and others open a VRT named .tif, which reads other
 # files. The plugins are called directly: `Image.open` would bring its own limit on pixels, a global of the process.
@@ -25,7 +26,7 @@ _READ = "PNG, JPEG, TIFF or BMP"
 
 
 def check_size(path: Path, width: int, height: int, max_pixels: int) -> None:
-    """Refuse a picture whose header promises more than `max_pixels`, before memory is taken.
+    """Refuse an image whose header declares more than `max_pixels`, before memory is taken.
 
     Raises
     ------
@@ -34,7 +35,7 @@ def check_size(path: Path, width: int, height: int, max_pixels: int) -> None:
     """
     if width < 1 or height < 1:
         raise InputError(
-            f"{path.name}: found a picture of {width}x{height} px, expected at least 1x1; the file is damaged"
+            f"{path.name}: found an image of {width}x{height} px, expected at least 1x1; the file is damaged"
         )
     if width * height > max_pixels:
         raise InputError(
@@ -43,28 +44,28 @@ def check_size(path: Path, width: int, height: int, max_pixels: int) -> None:
         )
 
 
-def picture_size(path: Path, *, max_pixels: int) -> tuple[int, int]:
-    """Size of a picture from its header, (width, height).
+def image_size(path: Path, *, max_pixels: int) -> tuple[int, int]:
+    """Size of an image from its header, (width, height).
 
     Raises
     ------
     InputError
-        Not a picture of a format that is read, or too large.
+        Not an image of a format that is read, or too large.
     """
-    with _opened(path) as picture:
-        check_size(path, *picture.size, max_pixels)
-        return int(picture.width), int(picture.height)
+    with _open_image(path) as image:
+        check_size(path, *image.size, max_pixels)
+        return int(image.width), int(image.height)
 
 
-def read_picture_grey(path: Path | str, max_pixels: int) -> NDArray[np.uint8]:
-    """Read a picture as grey.
+def read_grey_image(path: Path | str, max_pixels: int) -> GreyImage:
+    """Read an image as grey.
 
     Parameters
     ----------
     path
         PNG, JPEG, TIFF or BMP on this machine.
     max_pixels
-        Largest number of pixels that memory is taken for.
+        Most pixels that memory is allocated for.
 
     Returns
     -------
@@ -73,26 +74,26 @@ def read_picture_grey(path: Path | str, max_pixels: int) -> NDArray[np.uint8]:
     Raises
     ------
     InputError
-        An address, another format, too large, truncated or damaged, or numbers that are no grey levels (float).
+        An address, another format, too large, truncated or damaged, or pixels that are no grey levels (float).
     """
-    place = local_path(path, "picture")
-    with _opened(place) as picture:
-        check_size(place, *picture.size, max_pixels)
+    file = local_path(path, "image")
+    with _open_image(file) as image:
+        check_size(file, *image.size, max_pixels)
         try:
-            picture.draft("L", picture.size)  # a JPEG's luma is decoded alone
-            return _grey(place, picture)
+            image.draft("L", image.size)  # a JPEG's luma is decoded alone
+            return _to_grey(file, image)
         except InputError:
             raise
         except (OSError, ValueError, SyntaxError, EOFError, OverflowError, MemoryError, UserWarning) as error:
             raise InputError(
-                f"{place.name}: the picture is truncated or damaged ({error}), expected a whole one; replace it"
+                f"{file.name}: the image is truncated or damaged ({error}), expected a whole one; replace it"
             ) from None
 
 
-def _opened(path: Path) -> Image.Image:
-    plugin = _plugin(path)
+def _open_image(path: Path) -> Image.Image:
+    plugin = _image_plugin(path)
     try:
-        picture: Image.Image = plugin(path)
+        image: Image.Image = plugin(path)
     except (
         OSError,
         ValueError,
@@ -105,18 +106,18 @@ def _opened(path: Path) -> Image.Image:
         UserWarning,
     ) as error:
         raise InputError(
-            f"{path.name}: the picture's header is damaged ({error}), expected {_READ}; replace it"
+            f"{path.name}: the image's header is damaged ({error}), expected {_READ}; replace it"
         ) from None
-    return picture
+    return image
 
 
-def _plugin(path: Path) -> type:
+def _image_plugin(path: Path) -> type:
     try:
         with path.open("rb") as file:
             head = file.read(16)
     except OSError as error:
         raise InputError(
-            f"{path.name}: could not be read ({error.strerror}), expected a picture; check the path"
+            f"{path.name}: could not be read ({error.strerror}), expected an image; check the path"
         ) from None
     for magic, plugin in _MAGIC:
         if head.startswith(magic):
@@ -128,24 +129,24 @@ def _plugin(path: Path) -> type:
     raise InputError(f"{path.name}: found the bytes {head[:4].hex(' ')} at its start, expected {_READ}; convert it")
 
 
-def _grey(path: Path, picture: Image.Image) -> NDArray[np.uint8]:
-    mode = picture.mode
+def _to_grey(path: Path, image: Image.Image) -> GreyImage:
+    mode = image.mode
     if mode.startswith("I;16"):
-        return np.asarray(np.asarray(picture).astype(np.uint16) >> 8, np.uint8)
+        return np.asarray(np.asarray(image).astype(np.uint16) >> 8, np.uint8)
     if mode == "I":
-        return _upper_bits(path, np.asarray(picture))
+        return _upper_bits(path, np.asarray(image))
     if mode in ("F", "LAB", "HSV"):
         raise InputError(
             f"{path.name}: found pixels of mode {mode!r}, expected grey or colour levels of 8 or 16 bits; convert it"
         )
     if mode in ("P", "PA"):
-        picture = picture.convert("RGB")
+        image = image.convert("RGB")
     elif mode in ("LA", "La"):
-        return np.ascontiguousarray(np.asarray(picture)[..., 0], np.uint8)
-    return np.array(picture.convert("L"), np.uint8)
+        return np.ascontiguousarray(np.asarray(image)[..., 0], np.uint8)
+    return np.array(image.convert("L"), np.uint8)
 
 
-def _upper_bits(path: Path, values: NDArray[np.int32]) -> NDArray[np.uint8]:
+def _upper_bits(path: Path, values: NDArray[np.int32]) -> GreyImage:
     if values.min() < 0 or values.max() > 65535:
         raise InputError(
             f"{path.name}: found levels {values.min()} to {values.max()}, expected 0 to 65535; convert it to 8 bits"

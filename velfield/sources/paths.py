@@ -1,4 +1,4 @@
-"""Inputs are files of this machine: addresses and protocols are refused before any library sees them."""
+"""Inputs are local files: addresses and protocols are refused before any library sees them."""
 
 import re
 from pathlib import Path
@@ -15,9 +15,9 @@ def local_path(path: Path | str, what: str) -> Path:
     Parameters
     ----------
     path
-        As the user gave it.
+        As given by the user.
     what
-        What it is to the user, for the message: "video or picture folder", "base picture".
+        What it is, for the message: "video or image folder", "base image".
 
     Returns
     -------
@@ -30,7 +30,7 @@ def local_path(path: Path | str, what: str) -> Path:
     """
     text = str(path)
     if "\0" in text:
-        raise InputError(f"found a {what} path with a NUL in it, expected a path; mend the path")
+        raise InputError(f"found a {what} path with a NUL in it, expected a path; fix the path")
     protocol = _PROTOCOL.match(text)
     if protocol and not Path(text).exists():
         raise InputError(

@@ -1,14 +1,14 @@
-"""Which of the source's frames are worked on: every n-th or the nearest to an interval, from a start to a stop."""
+"""Choose the source's frames to process: every n-th, or the nearest to an interval, from a start to a stop."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, IntArray
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
 
 
-def select_frames(times_s: NDArray[np.float64], frames: FramesConfig) -> NDArray[np.int64]:
-    """Choose the frames to work on.
+def select_frames(times_s: FloatArray, frames: FramesConfig) -> IntArray:
+    """Choose the frames to process.
 
     Parameters
     ----------
@@ -57,18 +57,18 @@ def select_frames(times_s: NDArray[np.float64], frames: FramesConfig) -> NDArray
     return inside[:: frames.every]
 
 
-def _nearest_to_interval(times_s: NDArray[np.float64], interval_s: float) -> NDArray[np.int64]:
-    """Walk from frame to frame, each the nearest to one interval after the last.
+def _nearest_to_interval(times_s: FloatArray, interval_s: float) -> IntArray:
+    """Step from frame to frame, each the nearest to one interval after the last.
 
     Measured from the frame last taken, not from a fixed comb: at 24 frames a second a comb of 0.2 s gives steps of 5,
-    5, 4 frames, and uneven intervals are what the acceleration gate likes least.
+    5, 4 frames, and the acceleration gate is sensitive to uneven intervals.
     """
     taken = [0]
     while taken[-1] + 1 < times_s.size:
         target = times_s[taken[-1]] + interval_s
         after = int(np.searchsorted(times_s, target))
         if after >= times_s.size and target - times_s[-1] > (times_s[-1] - times_s[-2]) / 2:
-            break  # the frame that would be nearest was not filmed: the last one would make an odd interval
+            break  # the nearest frame lies beyond the end: the last one would make an uneven interval
         candidates = [i for i in (after - 1, after) if taken[-1] < i < times_s.size]
         if not candidates:
             break

@@ -1,16 +1,16 @@
-"""The two kinds of source behind one door: `probe` it, choose frames (`select_frames`), read them (`iter_frames`)."""
+"""One interface to videos and image folders: `probe` it, choose frames (`select_frames`), read them (`iter_frames`)."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import IntArray
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
 from velfield.sources.flags import FrameFlag
-from velfield.sources.folder import iter_folder, list_pictures, probe_folder
+from velfield.sources.folder import iter_folder, list_images, probe_folder
 from velfield.sources.frames import SourceFrame, SourceInfo
 from velfield.sources.paths import local_path
 from velfield.sources.quality import is_black, is_duplicate
@@ -24,90 +24,90 @@ __all__ = ["SourceFrame", "SourceInfo", "check_source", "iter_frames", "probe", 
 
 
 def probe(path: Path | str, *, frames: FramesConfig, timestamps: Path | None = None) -> SourceInfo:
-    """Look at a video or a picture folder: size, true times, names, what is wrong with it. No frame is decoded.
+    """Facts of a video or an image folder: size, true times, names, defects. No frame is decoded.
 
     Parameters
     ----------
     path
-        A video, or a folder of pictures, on this machine.
+        A video, or a folder of images, on this machine.
     frames
         ``fps`` for a source without times of its own, ``max_pixels``.
     timestamps
-        CSV ``frame,time_s``: a picture's file name or a video's 0-based frame index, and its time in s.
+        CSV ``frame,time_s``: an image's file name or a video's 0-based frame index, and its time in s.
 
     Raises
     ------
     InputError
-        Nothing that can be read, no times, times that disagree, frames of several sizes, a picture too large.
+        The source cannot be read; no times, times that disagree, frames of several sizes, an image too large.
     """
-    place = local_path(path, "video or picture folder")
+    source = local_path(path, "video or image folder")
     if timestamps is not None:
         timestamps = local_path(timestamps, "time stamps file")
         if frames.fps is not None:
             raise InputError("found both --timestamps and --fps, expected one of them; leave --fps out")
-    if place.is_dir():
-        return probe_folder(place, frames=frames, timestamps=timestamps)
-    return probe_video(place, frames=frames, timestamps=timestamps)
+    if source.is_dir():
+        return probe_folder(source, frames=frames, timestamps=timestamps)
+    return probe_video(source, frames=frames, timestamps=timestamps)
 
 
 def check_source(path: Path | str) -> None:
-    """A glance at the source: there, of a kind that we read, not empty. What `probe` finds beyond that takes longer.
+    """Check quickly that a source exists, is of a known kind and not empty; `probe` checks more and takes longer.
 
     Raises
     ------
     InputError
-        Nothing that can be read.
+        The source cannot be read.
     """
-    place = local_path(path, "video or picture folder")
-    if place.is_dir():
-        list_pictures(place)
+    source = local_path(path, "video or image folder")
+    if source.is_dir():
+        list_images(source)
         return
-    with libav_log(), open_video(place) as container:
-        video_stream(container, place)
+    with libav_log(), open_video(source) as container:
+        video_stream(container, source)
 
 
 def iter_frames(
-    path: Path | str, info: SourceInfo, indices: Sequence[int] | NDArray[np.int64], *, after: int | None = None
+    path: Path | str, info: SourceInfo, indices: Sequence[int] | IntArray, *, after: int | None = None
 ) -> Iterator[SourceFrame]:
-    """Read frames, in order; one frame for each index, whatever is wrong with it (its flags say).
+    """Read frames, in order; one frame for each index, defective ones with flags.
 
     A video is decoded in sequence from the key frame before the first index (seeking to a frame number lands
-    elsewhere); of a folder only the pictures asked for are read.
+    elsewhere); of a folder only the requested images are read.
 
     Parameters
     ----------
     path, info
-        The source and what `probe` said of it.
+        The source and its facts from `probe`.
     indices
         Ascending indices into `info`.
     after
-        The index worked on just before the first of `indices`, where there is one: it is read for comparison only, so
+        The frame processed just before the first of `indices`, if any: it is read for comparison only, so
         that a flight cut into units flags the same frames as an uncut one.
 
     Raises
     ------
     InputError
-        The source is gone or no longer what `probe` saw, or its frames change size.
+        The source is gone or was changed since `probe`, or its frames change size.
     """
-    place = local_path(path, "video or picture folder")
-    wanted = np.asarray(indices, np.int64)
-    if wanted.size == 0:
+    source = local_path(path, "video or image folder")
+    requested = np.asarray(indices, np.int64)
+    if requested.size == 0:
         return
-    if wanted[0] < 0 or wanted[-1] >= info.frame_count or np.any(np.diff(wanted) <= 0):
+    if requested[0] < 0 or requested[-1] >= info.frame_count or np.any(np.diff(requested) <= 0):
         raise ValueError(f"indices must ascend within 0 to {info.frame_count - 1}")
-    read = wanted if after is None else np.r_[np.int64(after), wanted]
+    read = requested if after is None else np.r_[np.int64(after), requested]
     reader = iter_video if info.kind == "video" else iter_folder
     previous: SourceFrame | None = None
-    for frame in reader(place, info, read):
-        checked = _checked(frame, previous)
+    for frame in reader(source, info, read):
+        checked = _with_content_flags(frame, previous)
         if not checked.flags & FrameFlag.UNREADABLE:
             previous = checked
         if checked.source_index != after:
             yield checked
 
 
-def _checked(frame: SourceFrame, previous: SourceFrame | None) -> SourceFrame:
-    """Add what the picture itself tells: black, or the same as the last readable one."""
+def _with_content_flags(frame: SourceFrame, previous: SourceFrame | None) -> SourceFrame:
+    """Add the flags that follow from the pixels: black, or the same as the last readable frame."""
     if frame.flags & FrameFlag.UNREADABLE:
         return frame
     flags, reasons = frame.flags, [frame.reason] if frame.reason else []

@@ -1,4 +1,4 @@
-"""Small CSV tables that people write by hand: read row by row, so that a message can name the line."""
+"""Small hand-written CSV tables, read row by row, so that a message can name the line."""
 
 import csv
 import math
@@ -12,7 +12,7 @@ MAX_TABLE_BYTES = 512 * 1024 * 1024
 
 
 def read_text(path: Path, what: str) -> str:
-    """Read a text file, UTF-8 with or without its mark.
+    """Read a text file, UTF-8 with or without a byte order mark.
 
     Raises
     ------
@@ -42,7 +42,7 @@ def read_csv_rows(
     path
         The file.
     required, optional
-        Columns it must and may have; ``optional = None``: any others are let pass.
+        Columns it must and may have; ``optional = None`` allows any others.
     what
         What the table holds, for messages.
 
@@ -59,8 +59,8 @@ def read_csv_rows(
     unknown = [] if optional is None else [name for name in header if name not in (*required, *optional)]
     if missing or unknown or len(set(header)) != len(header):
         raise InputError(
-            f"{path.name}: found the columns {','.join(header)[:120]!r}, expected {what} as CSV `{expected}`; mend "
-            "its first line"
+            f"{path.name}: found the columns {','.join(header)[:120]!r}, expected {what} as CSV `{expected}`; fix "
+            "line 1"
         )
     for row in reader:
         if not row or not any(cell.strip() for cell in row):
@@ -69,7 +69,7 @@ def read_csv_rows(
             raise InputError(
                 f"{path.name}: line {reader.line_num}: found {len(row)} cells, expected {len(header)} "
                 f"({','.join(header)}); "
-                "mend that line"
+                f"fix line {reader.line_num}"
             )
         yield reader.line_num, {name: cell.strip() for name, cell in zip(header, row, strict=True)}
 
@@ -80,7 +80,7 @@ def finite_cell(path: Path, line: int, row: dict[str, str], name: str) -> float:
     Raises
     ------
     InputError
-        Something stands there that is no finite number.
+        The cell is not a finite number.
     """
     text = row.get(name, "")
     if text == "":
@@ -90,5 +90,5 @@ def finite_cell(path: Path, line: int, row: dict[str, str], name: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise InputError(f"{path.name}: line {line}: found {name} {text!r}, expected a finite number; mend that line")
+        raise InputError(f"{path.name}: line {line}: found {name} {text!r}, expected a finite number; fix line {line}")
     return value

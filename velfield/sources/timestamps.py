@@ -1,11 +1,11 @@
-"""The side file of times: CSV ``frame,time_s``."""
+"""Frame times from a CSV: ``frame,time_s``."""
 
 import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from velfield.errors import InputError
 from velfield.sources.table import read_csv_rows
 
@@ -18,7 +18,7 @@ def read_timestamps(path: Path) -> Times:
     Parameters
     ----------
     path
-        CSV with the columns ``frame`` (a picture's file name, or a video's 0-based frame index) and ``time_s``.
+        CSV with the columns ``frame`` (an image's file name, or a video's 0-based frame index) and ``time_s``.
 
     Raises
     ------
@@ -31,8 +31,8 @@ def read_timestamps(path: Path) -> Times:
         time_s = _number(row["time_s"])
         if time_s is None:
             raise InputError(
-                f"{path.name}: line {line}: found time_s {row['time_s']!r}, expected a finite number of seconds; mend "
-                "that line"
+                f"{path.name}: line {line}: found time_s {row['time_s']!r}, expected a finite number of seconds; fix "
+                f"line {line}"
             )
         if name in times:
             raise InputError(
@@ -44,37 +44,35 @@ def read_timestamps(path: Path) -> Times:
     return times
 
 
-def check_against_container(
-    side_s: NDArray[np.float64], container_s: NDArray[np.float64], path: Path, *, share: float = 0.5
-) -> None:
-    """Stop where the side file and the container tell different stories.
+def check_against_container(side_s: FloatArray, container_s: FloatArray, path: Path, *, tolerance: float = 0.5) -> None:
+    """Refuse frame times whose intervals disagree with the container's.
 
-    An offset is no disagreement (a side file often counts from take-off); intervals are.
+    A constant offset is allowed: a CSV often counts from take-off.
 
     Parameters
     ----------
     side_s, container_s
         (n,) times of the same frames, s, in the container's order.
     path
-        The side file, for the message.
-    share
-        Disagreement, in median frame intervals, that stops.
+        The CSV, for the message.
+    tolerance
+        Largest disagreement, in median frame intervals.
 
     Raises
     ------
     InputError
-        Some frame's time since the first differs by more than `share` of the median interval.
+        Some frame's time since the first differs by more than `tolerance` of the median interval.
     """
     if side_s.size < 2:
         return
     difference = (side_s - side_s[0]) - (container_s - container_s[0])
-    limit = share * float(np.median(np.abs(np.diff(container_s))))
+    limit = tolerance * float(np.median(np.abs(np.diff(container_s))))
     worst = int(np.argmax(np.abs(difference)))
     if limit > 0 and abs(difference[worst]) > limit:
         raise InputError(
             f"{path.name}: found frame {worst} {side_s[worst] - side_s[0]:.3f} s after the first, expected "
-            f"{container_s[worst] - container_s[0]:.3f} s as the video's own times say; leave --timestamps out or "
-            "mend it"
+            f"{container_s[worst] - container_s[0]:.3f} s by the video's own times; leave --timestamps out or "
+            "fix it"
         )
 
 

@@ -16,7 +16,7 @@ from velfield.errors import InputError
 from velfield.run.commits import write_atomically
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run, open_run
-from velfield.sources.images import read_picture_grey
+from velfield.sources.images import read_grey_image
 from velfield.sources.labels.labels import CSV_COLUMNS
 from velfield.sources.source import probe
 from velfield.sources.table import finite_cell, read_csv_rows
@@ -44,19 +44,19 @@ class Frames:
     read: Callable[[int], NDArray[np.uint8]]
 
 
-def frames_of(place: Path, *, most: int) -> Frames:
-    """The frames of a picture, or ``most`` frames spread over a run.
+def frames_to_annotate(place: Path, *, most: int) -> Frames:
+    """The frames of an image, or ``most`` frames spread over a run.
 
     Raises
     ------
     InputError
-        It is neither, or the run's pictures are gone, so that their names are not known.
+        It is neither, or the run's images are gone, so that their names are not known.
     """
     if RunLayout(place).flight.exists():
         return _frames_of_run(open_run(place), most)
     if place.is_dir() or not place.exists():
-        raise InputError(f"{place}: found no run folder and no picture, expected one of them; name a frame's file")
-    grey = read_picture_grey(place, FramesConfig().max_pixels)
+        raise InputError(f"{place}: found no run folder and no image, expected one of them; name a frame's file")
+    grey = read_grey_image(place, FramesConfig().max_pixels)
     return Frames((place.name,), grey.shape[1], grey.shape[0], lambda _: grey)
 
 
@@ -75,7 +75,7 @@ def _frames_of_run(run: Run, most: int) -> Frames:
 
 
 def _names(run: Run) -> Callable[[int], str]:
-    """What labels call a frame of the source: a video's index, or a picture's file name."""
+    """What labels call a frame of the source: a video's index, or an image's file name."""
     told = run.record.inputs.source
     if told.kind == "video":
         return str
@@ -83,7 +83,7 @@ def _names(run: Run) -> Callable[[int], str]:
     timestamps = Path(given.timestamps) if given and given.timestamps else None
     if not Path(told.path).is_dir():
         raise InputError(
-            f"{run.layout.root}: its pictures are not at {told.path}, and labels go by their names; put them back, or "
+            f"{run.layout.root}: its images are not at {told.path}, and labels go by their names; put them back, or "
             "annotate a frame's file"
         )
     names = probe(Path(told.path), frames=run.record.config.frames, timestamps=timestamps).names
@@ -116,7 +116,7 @@ def write_marks(path: Path, marks: Marks, frames: Frames) -> Marks:
     Raises
     ------
     InputError
-        A mark is of a frame that was not to be annotated, or stands outside of the picture.
+        A mark is of a frame that was not to be annotated, or stands outside of the image.
     """
     _check(marks, frames)
     before = read_marks(path)

@@ -13,7 +13,7 @@ from velfield.errors import InputError
 from velfield.report.figures import png_bytes
 from velfield.report.viewer_page import page_is_built, render_annotator
 from velfield.viewer.annotations import Frames, read_marks, write_marks
-from velfield.viewer.server import headers_for, own_names
+from velfield.viewer.server import headers_for, trusted_host_middleware
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
@@ -45,7 +45,7 @@ def annotate_app(frames: Frames, labels: Path) -> "Starlette":
         html = render_annotator(f"Cars of {_named(frames)}", _told(frames, labels, token))
         return HTMLResponse(html, headers=headers_for(html))
 
-    def picture(request: Request) -> Response:
+    def image(request: Request) -> Response:
         number = request.path_params["number"]
         if number >= len(frames.names):
             raise HTTPException(404)
@@ -67,10 +67,10 @@ def annotate_app(frames: Frames, labels: Path) -> "Starlette":
 
     routes = [
         Route("/", page),
-        Route("/frame/{number:int}.png", picture),
+        Route("/frame/{number:int}.png", image),
         Route("/labels", save, methods=["POST"]),
     ]
-    return Starlette(routes=routes, middleware=[own_names()])
+    return Starlette(routes=routes, middleware=[trusted_host_middleware()])
 
 
 def _named(frames: Frames) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.view import LayerKind, ViewLayer
-from velfield.report.figures import speed_reach
+from velfield.report.figures import colour_scale_max
 
 _REACH_PERCENT = 98.0
 """Colours end where so many per cent of the known pixels are reached: a few outliers would flatten all else."""
@@ -106,7 +106,7 @@ def view_layers(attributes: Mapping[str, Mapping[str, Any]], read: Reader) -> li
     taken = {*_INNER, *(name for layer in _KNOWN for name in layer.arrays)}
     known += [_unknown(name, attrs) for name, attrs in attributes.items() if name not in taken]
     sizes = {layer.name: _sizes([np.asarray(read(name)) for name in layer.arrays]) for layer in known}
-    speed_top = speed_reach(sizes["speed"]) if "speed" in sizes else None
+    speed_top = colour_scale_max(sizes["speed"]) if "speed" in sizes else None
     return [
         ViewLayer(
             name=layer.name,

@@ -13,7 +13,7 @@ _QUALITY = 88
 
 
 def pyramid_levels(height: int, width: int) -> int:
-    """Levels until the whole picture fits a tile.
+    """Levels until the whole image fits a tile.
 
     Examples
     --------
@@ -28,15 +28,15 @@ def pyramid_levels(height: int, width: int) -> int:
 
 def pyramid_tiles(grey: NDArray[np.uint8]) -> Iterator[tuple[str, bytes]]:
     """Name ``<level>/<row>-<column>.jpg`` and bytes of every tile; those at the right and lower edge are smaller."""
-    picture = grey
+    image = grey
     for level in range(pyramid_levels(*grey.shape)):
         if level:
-            size = (-(-picture.shape[1] // 2), -(-picture.shape[0] // 2))
-            picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-        for row in range(-(-picture.shape[0] // TILE_PX)):
-            for column in range(-(-picture.shape[1] // TILE_PX)):
+            size = (-(-image.shape[1] // 2), -(-image.shape[0] // 2))
+            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        for row in range(-(-image.shape[0] // TILE_PX)):
+            for column in range(-(-image.shape[1] // TILE_PX)):
                 y, x = row * TILE_PX, column * TILE_PX
-                yield f"{level}/{row}-{column}.jpg", _jpeg(picture[y : y + TILE_PX, x : x + TILE_PX])
+                yield f"{level}/{row}-{column}.jpg", _jpeg(image[y : y + TILE_PX, x : x + TILE_PX])
 
 
 def _jpeg(grey: NDArray[np.uint8]) -> bytes:

@@ -22,7 +22,7 @@ from velfield.analysis.crossings import hysteresis_px
 from velfield.field.bins import band_radius_px, stationary_speed_px_per_s
 from velfield.field.segments import Segments
 from velfield.run.commits import write_atomically
-from velfield.run.grid import north_of
+from velfield.run.grid import north_direction_rad
 from velfield.run.layout import RunLayout
 from velfield.run.paths import remove_tree
 from velfield.run.run import open_run
@@ -90,7 +90,7 @@ def view_record(
         width_px=grid.width_px,
         height_px=grid.height_px,
         gsd_m=grid.gsd_m,
-        north_rad=north_of(grid),
+        north_rad=north_direction_rad(grid),
         stationary_speed_px_per_s=stationary_speed_px_per_s(flight.config.field, grid.gsd_m),
         first_time_s=float(known_s[0]) if len(known_s) else 0.0,
         last_time_s=float(known_s[-1]) if len(known_s) else 0.0,

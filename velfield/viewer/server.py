@@ -91,10 +91,10 @@ def files_app(root: Path) -> "Starlette":
             response.headers.update(headers_for(place.read_text("utf-8") if place.suffix == ".html" else None))
             return response
 
-    return Starlette(routes=[Mount("/", RunFiles(directory=root, html=True))], middleware=[own_names()])
+    return Starlette(routes=[Mount("/", RunFiles(directory=root, html=True))], middleware=[trusted_host_middleware()])
 
 
-def own_names() -> Any:
+def trusted_host_middleware() -> Any:
     """Middleware that answers to this machine's own names alone."""
     from starlette.middleware import Middleware
     from starlette.middleware.trustedhost import TrustedHostMiddleware
@@ -103,7 +103,7 @@ def own_names() -> Any:
 
 
 @contextmanager
-def served_beside(app: "Starlette", port: int) -> Iterator[str]:
+def serve_in_thread(app: "Starlette", port: int) -> Iterator[str]:
     """Serve in a thread for the time of the context, at this port, or any where it is taken: the address."""
     import uvicorn
 

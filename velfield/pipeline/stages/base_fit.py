@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from velfield.errors import InputError
 from velfield.registration.transforms import FrameTransform
-from velfield.sources.geo import BasePicture
+from velfield.sources.geo import BaseRaster
 
 LEAST_SCALE, MOST_SCALE = 0.5, 2.0
 """Base px a frame px: the scales that the search for the place covers, and that the map is worth making at."""
@@ -64,7 +64,7 @@ class BaseFit:
         ]
 
 
-def check_scale(scale: float, given: BasePicture, name: str) -> None:
+def check_scale(scale: float, given: BaseRaster, name: str) -> None:
     """Refuse a picture of the place that is much coarser or finer than the frames.
 
     Raises
@@ -81,7 +81,7 @@ def check_scale(scale: float, given: BasePicture, name: str) -> None:
     )
 
 
-def covered_share(to_base: FrameTransform, shown: NDArray[np.bool_] | None, given: BasePicture) -> float:
+def covered_share(to_base: FrameTransform, shown: NDArray[np.bool_] | None, given: BaseRaster) -> float:
     """Share of a frame, or of its part ``shown`` (h, w), that lies on the given picture where that has data."""
     x, y = np.meshgrid(np.linspace(0, to_base.width - 1, _SIDE), np.linspace(0, to_base.height - 1, _SIDE))
     raw = np.column_stack([x.ravel(), y.ravel()])

@@ -31,13 +31,13 @@ from velfield.registration.keypoints import Keypoints, detect_keypoints
 from velfield.registration.own_base import OwnBase, build_own_base
 from velfield.report.figures import png_bytes
 from velfield.run.commits import write_atomically
-from velfield.run.frame_transforms import polyprojective_record, read_lens
+from velfield.run.frame_transforms import polyprojective_to_record, read_lens
 from velfield.run.grid import read_grid
 from velfield.run.layout import RunLayout
-from velfield.run.paths import local_copy, written_locally
+from velfield.run.paths import local_copy, local_output
 from velfield.run.stores import open_frames
-from velfield.sources.geo import BasePicture, agreed_gsd, read_base_picture
-from velfield.sources.images import read_picture_grey
+from velfield.sources.geo import BaseRaster, read_base_raster, reconcile_gsd
+from velfield.sources.images import read_grey_image
 
 _TRIED = 8
 _DIRECT_HELDOUT_PX, _DIRECT_SPREAD = 0.5, 0.8
@@ -122,7 +122,7 @@ def _finish(
     outputs: list[Path],
     *,
     frames: int | None = None,
-    given: BasePicture | None = None,
+    given: BaseRaster | None = None,
     fit: BaseFit | None = None,
 ) -> Outcome:
     """Write the grid; ``frames``: of how many the own base image was made, none where none was."""
@@ -141,12 +141,12 @@ def _finish(
     return Outcome(outputs, counts, [*given.notes, fit.note(by_hand)], fit.warnings())
 
 
-def _given_picture(plan: Plan) -> BasePicture | None:
+def _given_picture(plan: Plan) -> BaseRaster | None:
     path = plan.job.inputs.base
-    return read_base_picture(Path(path), plan.config.frames) if path else None
+    return read_base_raster(Path(path), plan.config.frames) if path else None
 
 
-def _check_place(plan: Plan, grey: NDArray[np.uint8], given: BasePicture, lens: Lens) -> None:
+def _check_place(plan: Plan, grey: NDArray[np.uint8], given: BaseRaster, lens: Lens) -> None:
     """Refuse a picture of another place before any frame is worked on."""
     found = register_intersensor(grey, given.grey, plan.config.base, lens=lens)
     if isinstance(found, Failure):
@@ -167,13 +167,13 @@ def _own_grid(plan: Plan, own: OwnBase, reference: int) -> GridRecord:
     )
 
 
-def _onto_given(plan: Plan, own: OwnBase, given: BasePicture) -> tuple[BaseFit, list[Path]]:
+def _onto_given(plan: Plan, own: OwnBase, given: BaseRaster) -> tuple[BaseFit, list[Path]]:
     """Register the own base image to the given picture, and write what follows from it."""
     layout = plan.layout
     found = register_intersensor(own.image, given.grey, plan.config.base, lens=pinhole(own.image.shape))
     if isinstance(found, Failure):
         raise InputError(f"--base {plan.job.inputs.base}: the flight's base image does not fit on it: {found.reason}")
-    record = polyprojective_record(found.transform.polyprojective)
+    record = polyprojective_to_record(found.transform.polyprojective)
     write_atomically(layout.own_to_base, record.model_dump_json(indent=1).encode())
     write_atomically(layout.base_error_map, png_bytes(_error_picture(found)))
     written = [layout.own_to_base, layout.base_error_map, *write_given_picture(plan.layout, given)]
@@ -188,7 +188,7 @@ def _onto_given(plan: Plan, own: OwnBase, given: BasePicture) -> tuple[BaseFit, 
     return fit, written
 
 
-def _straight_to(plan: Plan, given: BasePicture, keypoints: dict[int, Keypoints], lens: Lens) -> BaseFit | None:
+def _straight_to(plan: Plan, given: BaseRaster, keypoints: dict[int, Keypoints], lens: Lens) -> BaseFit | None:
     """How frames lie straight on the given picture, by some that are spread over the flight; none where they do not.
 
     Where they do, nothing stands between a frame and the map. Where they do not (other season, other light), the
@@ -218,24 +218,24 @@ def _straight_to(plan: Plan, given: BasePicture, keypoints: dict[int, Keypoints]
     )
 
 
-def write_given_picture(layout: RunLayout, given: BasePicture) -> list[Path]:
+def write_given_picture(layout: RunLayout, given: BaseRaster) -> list[Path]:
     """The given picture as the run's base image: GeoTIFF where it has coordinates."""
     for before in (layout.base_image, layout.base_image_tif):
         before.unlink(missing_ok=True)
     if given.crs_wkt is not None and given.affine is not None:
-        with written_locally(layout.base_image_tif) as here:
+        with local_output(layout.base_image_tif) as here:
             write_cog(here, [given.grey], names=["grey"], units=["1"], crs_wkt=given.crs_wkt, affine=given.affine)
         return [layout.base_image_tif]
     write_atomically(layout.base_image, png_bytes(given.grey))
     return [layout.base_image]
 
 
-def _given_grid(plan: Plan, given: BasePicture, reference: int, fit: BaseFit) -> GridRecord:
+def _given_grid(plan: Plan, given: BaseRaster, reference: int, fit: BaseFit) -> GridRecord:
     height, width = given.grey.shape
     return GridRecord(
         width_px=width,
         height_px=height,
-        gsd_m=agreed_gsd(given.gsd_m, plan.config.gsd_m),
+        gsd_m=reconcile_gsd(given.gsd_m, plan.config.gsd_m),
         crs_wkt=given.crs_wkt,
         affine=given.affine,
         how="given",
@@ -271,5 +271,5 @@ def _make_reference(plan: Plan) -> BaseReference:
         assert given is not None, "the grid says that a base image was given"
         return prepare_base(given.grey, plan.config.registration, mask=given.valid, frame_shape=shape)
     with local_copy(plan.layout.own_base_image) as picture, local_copy(plan.layout.own_base_mask) as known:
-        grey, mask = read_picture_grey(picture, limit), read_picture_grey(known, limit) > 0
+        grey, mask = read_grey_image(picture, limit), read_grey_image(known, limit) > 0
     return prepare_base(grey, plan.config.registration, mask=mask, frame_shape=shape)

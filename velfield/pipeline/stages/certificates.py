@@ -6,7 +6,7 @@ import numpy as np
 
 from velfield.pipeline.plan import Plan
 from velfield.report.figures import png_bytes
-from velfield.report.quality_figures import error_picture, lens_picture
+from velfield.report.quality_figures import registration_error_figure, undistortion_figure
 from velfield.run.commits import write_atomically
 from velfield.run.frame_transforms import read_lens
 from velfield.run.stores import open_frames, open_registration
@@ -26,10 +26,10 @@ def write_certificates(plan: Plan) -> list[Path]:
     known = np.isfinite(errors)
     mean_square = np.sum(np.where(known, errors, 0.0) ** 2, axis=0) / np.maximum(known.sum(axis=0), 1)
     by_cell = np.where(known.any(axis=0), np.sqrt(mean_square), np.nan)
-    pictures = {layout.maps / "registration.png": error_picture(grey, by_cell, full_px=_FULL_PX)}
+    pictures = {layout.maps / "registration.png": registration_error_figure(grey, by_cell, full_px=_FULL_PX)}
     lens = read_lens(layout)
     if not lens.is_identity:
-        pictures[layout.maps / "lens.png"] = lens_picture(grey, lens)
+        pictures[layout.maps / "lens.png"] = undistortion_figure(grey, lens)
     else:
         (layout.maps / "lens.png").unlink(missing_ok=True)
     for path, picture in pictures.items():

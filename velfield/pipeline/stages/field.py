@@ -16,7 +16,7 @@ from velfield.field.time_intervals import TimeInterval, assign_intervals
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
 from velfield.pipeline.result import Outcome
-from velfield.run.field_writer import Group, GroupWriter, create_field_store, groups_of
+from velfield.run.field_writer import Group, GroupWriter, create_field_store, tile_groups
 from velfield.run.grid import read_grid
 from velfield.run.paths import remove_tree
 from velfield.run.stores import open_field, store_key
@@ -46,7 +46,7 @@ def group_name(group: tuple[int, int]) -> str:
 
 def field_groups(plan: Plan) -> list[Group]:
     """All groups of tiles of the base image, (row, column)."""
-    return groups_of(read_grid(plan.layout), plan.config.field)
+    return tile_groups(read_grid(plan.layout), plan.config.field)
 
 
 def field_weight(config: FieldConfig) -> Weight:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
-from velfield.run.frame_transforms import FrameMaps
+from velfield.run.frame_transforms import FrameTransforms
 from velfield.run.stores import open_registration
 from velfield.sources.flags import UNUSABLE
 from velfield.sources.frames import SourceInfo
@@ -43,7 +43,7 @@ def marked_cars(plan: Plan) -> Labels:
 
 def base_px_per_raw_px(plan: Plan) -> float:
     """Local scale of the map raw -> base at the frames' centre: the median over registered frames."""
-    maps = FrameMaps.open(plan.layout, plan.config)
+    maps = FrameTransforms.open(plan.layout, plan.config)
     statuses = open_registration(plan.layout.registration).statuses()
     registered = [k for k, status in enumerate(statuses) if status == "ok"]
     if not registered:

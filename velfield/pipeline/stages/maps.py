@@ -17,8 +17,8 @@ from velfield.pipeline.stages.certificates import write_certificates
 from velfield.report.figures import MapScale, direction_figure, png_bytes, speed_figure
 from velfield.run.base_image import read_base_image
 from velfield.run.commits import write_atomically
-from velfield.run.grid import heading_deg, north_of, read_grid
-from velfield.run.paths import written_locally
+from velfield.run.grid import heading_deg, north_direction_rad, read_grid
+from velfield.run.paths import local_output
 from velfield.run.stores import open_field
 from velfield.viewer.record import write_view_data
 
@@ -34,7 +34,7 @@ def make_maps(plan: Plan) -> Outcome:
     direction = direction_rad(velocity, stationary_speed_px_per_s=stationary_speed_px_per_s(config, grid.gsd_m))
     speed = speed_px_per_s(velocity)
     grey = read_base_image(layout, plan.config.frames)
-    scale = MapScale(gsd_m=grid.gsd_m, north_rad=north_of(grid))
+    scale = MapScale(gsd_m=grid.gsd_m, north_rad=north_direction_rad(grid))
     figures = {
         "direction": direction_figure(grey, direction, scale),
         "speed": speed_figure(grey, speed, scale),
@@ -55,7 +55,7 @@ def make_maps(plan: Plan) -> Outcome:
 def _layers(plan: Plan, direction: FloatArray, speed: FloatArray) -> list[Path]:
     """Direction as heading and speed as GeoTIFF, each value with its unit."""
     grid, maps = read_grid(plan.layout), plan.layout.maps
-    north = north_of(grid)
+    north = north_direction_rad(grid)
     heading = heading_deg(direction, north)
     unit, factor = ("m s-1", grid.gsd_m) if grid.gsd_m else ("px s-1", 1.0)
     about = "heading, clockwise from north" if north is not None else "heading, clockwise from the picture's up"
@@ -63,7 +63,7 @@ def _layers(plan: Plan, direction: FloatArray, speed: FloatArray) -> list[Path]:
         ("direction", heading, about, "degree"),
         ("speed", speed * factor, "modal speed", unit),
     ):
-        with written_locally(maps / f"{name}.tif") as here:
+        with local_output(maps / f"{name}.tif") as here:
             write_cog(
                 here,
                 [values.astype(np.float32)],

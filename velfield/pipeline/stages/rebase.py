@@ -25,13 +25,13 @@ from velfield.pipeline.version import STAGE_VERSIONS
 from velfield.registration.intersensor import register_intersensor
 from velfield.registration.transforms import PolyprojectiveTransform
 from velfield.run.commits import content_key, digest_path, read_commit, write_atomically
-from velfield.run.frame_transforms import polyprojective_of, polyprojective_record
+from velfield.run.frame_transforms import polyprojective_from_record, polyprojective_to_record
 from velfield.run.grid import read_grid, read_working
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run
 from velfield.run.tables import link_file, read_tables, write_table
 from velfield.sources.frames import SourceInfo
-from velfield.sources.geo import BasePicture, read_base_picture
+from velfield.sources.geo import BaseRaster, read_base_raster
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,13 @@ def measure_rebase(run: Run, base: Path) -> RebaseRecord | Failure:
         The picture cannot be read.
     """
     config = run.record.config
-    given = read_base_picture(base, config.frames)
+    given = read_base_raster(base, config.frames)
     old = run.base_image
     found = register_intersensor(old, given.grey, config.base, lens=pinhole(old.shape))
     if isinstance(found, Failure):
         return found
     return RebaseRecord(
-        transform=polyprojective_record(found.transform.polyprojective),
+        transform=polyprojective_to_record(found.transform.polyprojective),
         added_error_px=found.cv_error_px,
         added_error_95_px=float(np.percentile(found.cv_errors_px, 95)),
         points=len(found.cv_errors_px),
@@ -108,7 +108,7 @@ def rebase_image(plan: Plan, rebase: Rebase) -> Outcome:
     """Write ``base/`` on the new picture's grid."""
     layout, old, record = plan.layout, rebase.old, rebase.record
     assert plan.job.inputs.base is not None, "a new base image is what this is about"
-    given = read_base_picture(Path(plan.job.inputs.base), plan.config.frames)
+    given = read_base_raster(Path(plan.job.inputs.base), plan.config.frames)
     outputs = write_given_picture(layout, given)
     grid = _rebased_grid(read_grid(old), given, record)
     working = read_working(old)
@@ -132,7 +132,7 @@ def rebase_image(plan: Plan, rebase: Rebase) -> Outcome:
     return Outcome(outputs, counts, [*given.notes, record.text()])
 
 
-def _rebased_grid(old: GridRecord, given: BasePicture, record: RebaseRecord) -> GridRecord:
+def _rebased_grid(old: GridRecord, given: BaseRaster, record: RebaseRecord) -> GridRecord:
     height, width = given.grey.shape
     before = (old.intersensor_error_px or 0.0) * record.scale
     return GridRecord(
@@ -156,7 +156,9 @@ def rebase_detections(plan: Plan, frames: range, rebase: Rebase) -> Outcome:
     if not source.exists():
         told = f"frames {frames.start} to {frames.stop - 1} have no cars"
         return Outcome([], {"frames": 0.0, "cars": 0.0}, warnings=[told])
-    table = mapped_detections(read_tables([source], DETECTION_COLUMNS), polyprojective_of(rebase.record.transform))
+    table = mapped_detections(
+        read_tables([source], DETECTION_COLUMNS), polyprojective_from_record(rebase.record.transform)
+    )
     path = plan.layout.unit_file(plan.layout.detections, unit, ".parquet")
     write_table(path, table, DETECTION_COLUMNS)
     pictures = plan.layout.unit_file(rebase.old.detections, unit, ".patches.npz")
@@ -167,7 +169,7 @@ def rebase_detections(plan: Plan, frames: range, rebase: Rebase) -> Outcome:
 
 def rebase_tracks(plan: Plan, rebase: Rebase) -> Outcome:
     """Map all tracklets, unit by unit."""
-    transform, written, tracks, count = polyprojective_of(rebase.record.transform), [], set[int](), 0
+    transform, written, tracks, count = polyprojective_from_record(rebase.record.transform), [], set[int](), 0
     for source in sorted(rebase.old.tracks.glob("unit-*.parquet")):
         table = mapped_tracklets(read_tables([source], TRACKLET_COLUMNS), transform)
         written.append(plan.layout.tracks / source.name)

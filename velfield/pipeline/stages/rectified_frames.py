@@ -12,7 +12,7 @@ from velfield.detection.motion.difference import MotionBackground
 from velfield.pipeline.plan import Plan
 from velfield.registration.warp import footprint, warp_to_base
 from velfield.run.commits import write_atomically
-from velfield.run.frame_transforms import FrameMap, FrameMaps
+from velfield.run.frame_transforms import FrameMap, FrameTransforms
 from velfield.run.grid import read_grid
 from velfield.run.layout import RunLayout
 from velfield.run.stores import FrameStore, open_frames
@@ -54,14 +54,14 @@ class WorkingGrid:
     """Gives any registered frame of a run on the working grid."""
 
     frames: FrameStore
-    maps: FrameMaps
+    maps: FrameTransforms
     grid: GridRecord
     scale: float
 
     @classmethod
     def open(cls, plan: Plan, scale: float) -> "WorkingGrid":
         """The working grid of a plan's run folder at a scale."""
-        maps = FrameMaps.open(plan.layout, plan.config)
+        maps = FrameTransforms.open(plan.layout, plan.config)
         return cls(open_frames(plan.layout.frames), maps, read_grid(plan.layout), scale)
 
     @property

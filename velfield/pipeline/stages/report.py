@@ -16,7 +16,7 @@ from velfield.report.report import render_report
 from velfield.report.run_figures import report_figures
 from velfield.report.viewer_page import NOT_BUILT, licences, page_is_built, render_viewer
 from velfield.run.commits import write_atomically
-from velfield.run.grid import north_of, read_grid, read_working
+from velfield.run.grid import north_direction_rad, read_grid, read_working
 from velfield.run.stores import open_frames, open_registration
 from velfield.viewer.record import write_view_record
 
@@ -137,7 +137,7 @@ def _gates(stages: Sequence[StageSummary]) -> dict[str, int]:
 
 def _files(plan: Plan) -> list[tuple[str, str]]:
     layout, told = plan.layout, []
-    north = "the picture's up: north is not known" if north_of(read_grid(plan.layout)) is None else "north"
+    north = "the picture's up: north is not known" if north_direction_rad(read_grid(plan.layout)) is None else "north"
     for path, what in (
         (layout.maps / "direction.png", "modal direction"),
         (layout.maps / "speed.png", "modal speed"),

@@ -1,4 +1,4 @@
-"""YOLO label files: one a picture, by file stem; boxes normalised to the picture, upright or oriented."""
+"""YOLO label files: one an image, by file stem; boxes normalised to the image, upright or oriented."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -14,7 +14,7 @@ from velfield.sources.frames import SourceInfo
 from velfield.sources.table import read_text
 
 CAR_ASPECT = 0.45
-"""A usual car's width by its length: what tells the length of a turned car from its upright box."""
+"""Width by length of a typical car: gives the length of a rotated car from its upright box."""
 _UPRIGHT_ASPECT = 2.0  # an upright box this long was drawn around a car within some 5 degrees of an axis
 _CAR_WORDS = ("car", "vehicle", "auto", "van", "suv", "sedan", "pickup", "taxi")
 _NOT_CARS = (
@@ -36,7 +36,7 @@ _NO_LABELS = ("classes.txt", "obj.names", "readme.txt", "license.txt", "source.t
 
 @dataclass(frozen=True)
 class Box:
-    """One labelled object, in raw pixels; NaN where the file does not tell."""
+    """One labelled object, in raw pixels; NaN where unknown."""
 
     frame: str
     is_car: bool
@@ -49,10 +49,10 @@ class Box:
     score: float
 
 
-class Shape(NamedTuple):
-    """What a box tells of the car in it; NaN where it does not tell.
+class CarShape(NamedTuple):
+    """Orientation and size of the car in a box; NaN where unknown.
 
-    ``tilt_rad``: |angle| to the picture's rows, where the box is upright and the axis is therefore not known.
+    ``tilt_rad``: |angle| to the image's rows, where the box is upright and the axis therefore ambiguous.
     """
 
     orientation_rad: float = math.nan
@@ -62,7 +62,7 @@ class Shape(NamedTuple):
 
 
 def looks_like_yolo(path: Path) -> bool:
-    """Whether a path is a folder, or a ``.txt`` whose first line is a class and numbers."""
+    """Whether a path is a folder, or a ``.txt`` whose first line is a class and coordinates."""
     if path.is_dir():
         return True
     if path.suffix.lower() != ".txt":
@@ -90,7 +90,7 @@ def label_files(path: Path) -> list[Path]:
             if found:
                 return sorted(found, key=lambda file: natural_key(file.name))
     raise InputError(
-        f"{path.name}: found no .txt files in the labels folder, expected YOLO files named as the pictures; "
+        f"{path.name}: found no .txt files in the labels folder, expected YOLO files named as the images; "
         "give the folder that holds them, or a CSV `frame,x_px,y_px`"
     )
 
@@ -101,7 +101,7 @@ def read_yolo(path: Path, info: SourceInfo) -> tuple[list[Box], list[str], list[
     Parameters
     ----------
     path
-        A folder of files ``STEM.txt``, or one such file. STEM is a picture's file stem, or a video's frame index.
+        A folder of files ``STEM.txt``, or one such file. STEM is an image's file stem, or a video's frame index.
     info
         The frames that the labels are of; boxes are scaled by their size.
 
@@ -112,7 +112,7 @@ def read_yolo(path: Path, info: SourceInfo) -> tuple[list[Box], list[str], list[
     Raises
     ------
     InputError
-        No file belongs to a frame, a line is not in the format, a box is not of this picture.
+        No file belongs to a frame, a line is not in the format, a box is not of this image.
     """
     by_stem = _frames_by_stem(info)
     files = label_files(path)
@@ -121,12 +121,12 @@ def read_yolo(path: Path, info: SourceInfo) -> tuple[list[Box], list[str], list[
         raise InputError(
             f"{path.name}: found label files such as {files[0].name!r}, none named as a frame (such as "
             f"{info.names[0]!r}), "
-            "expected the picture's file stem or the video's 0-based frame index; rename them"
+            "expected the image's file stem or the video's 0-based frame index; rename them"
         )
     cars = _car_classes(path)
     boxes = [box for file, frame in matched for box in _read_file(file, frame, info, cars)]
-    strangers = len(files) - len(matched)
-    notes = [f"{strangers} label files name no frame of this source and are not used"] if strangers else []
+    unmatched = len(files) - len(matched)
+    notes = [f"{unmatched} label files name no frame of this source: not used"] if unmatched else []
     return boxes, [frame for _, frame in matched], notes
 
 
@@ -136,7 +136,7 @@ def _frames_by_stem(info: SourceInfo) -> dict[str, str]:
         stem = name if info.kind == "video" else Path(name).stem
         if stem in stems:
             raise InputError(
-                f"found the pictures {stems[stem]} and {name} of one stem, expected one picture a YOLO file; "
+                f"found the images {stems[stem]} and {name} of one stem, expected one image a YOLO file; "
                 "rename one, or use a CSV `frame,x_px,y_px`"
             )
         stems[stem] = name
@@ -155,13 +155,13 @@ def _read_file(file: Path, frame: str, info: SourceInfo, cars: set[int]) -> Iter
         if len(words) not in (5, 6, 9, 10) or not all(_is_number(word) for word in words):
             raise InputError(
                 f"{file.name}: line {number}: found {line.strip()[:60]!r}, expected YOLO `class x y width height` or "
-                "`class x1 y1 x2 y2 x3 y3 x4 y4`, normalised to the picture; mend that line"
+                "`class x1 y1 x2 y2 x3 y3 x4 y4`, normalised to the image; fix line {number}"
             )
         values = [float(word) for word in words]
         _check_normalised(file, number, values[1:5] if len(words) < 9 else values[1:9])
         is_car = int(values[0]) in cars
         score = values[-1] if len(words) in (6, 10) else math.nan
-        x, y, shape = _upright(values[1:5], info) if len(words) < 9 else _oriented(values[1:9], info)
+        x, y, shape = _upright_car(values[1:5], info) if len(words) < 9 else _oriented_car(values[1:9], info)
         yield Box(frame, is_car, x, y, *shape, score)
 
 
@@ -169,29 +169,29 @@ def _check_normalised(file: Path, number: int, values: Sequence[float]) -> None:
     if not all(-0.01 <= value <= 1.01 for value in values):
         raise InputError(
             f"{file.name}: line {number}: found a box at {', '.join(f'{value:g}' for value in values)}, expected "
-            "numbers from 0 "
-            "to 1, shares of the picture; labels in pixels go into a CSV `frame,x_px,y_px`"
+            "fractions "
+            "of the image from 0 to 1; labels in pixels go into a CSV `frame,x_px,y_px`"
         )
 
 
-def _upright(values: Sequence[float], info: SourceInfo) -> tuple[float, float, Shape]:
+def _upright_car(values: Sequence[float], info: SourceInfo) -> tuple[float, float, CarShape]:
     """x, y and shape of an upright box.
 
-    Edges of a normalised box run from 0 to 1 over the picture, whose first pixel's centre is our 0: half a pixel less.
+    A normalised box runs from 0 to 1 over the image; our origin is the first pixel's centre, half a pixel less.
     """
     x, y = values[0] * info.width - 0.5, values[1] * info.height - 0.5
     w, h = values[2] * info.width, values[3] * info.height
-    return x, y, shape_of_upright_box(w, h)
+    return x, y, car_in_upright_box(w, h)
 
 
-def shape_of_upright_box(w: float, h: float) -> Shape:
+def car_in_upright_box(w: float, h: float) -> CarShape:
     """Shape of the car in an upright box."""
     if min(w, h) <= 0:
-        return Shape()
+        return CarShape()
     length = length_from_upright_box(w, h)
     if max(w, h) >= _UPRIGHT_ASPECT * min(w, h):
-        return Shape(0.0 if w > h else math.pi / 2, length, CAR_ASPECT * length)
-    return Shape(length_px=length, width_px=CAR_ASPECT * length, tilt_rad=tilt_of_upright_box(w, h))
+        return CarShape(0.0 if w > h else math.pi / 2, length, CAR_ASPECT * length)
+    return CarShape(length_px=length, width_px=CAR_ASPECT * length, tilt_rad=tilt_of_upright_box(w, h))
 
 
 def tilt_of_upright_box(w: float, h: float, *, aspect: float = CAR_ASPECT) -> float:
@@ -209,7 +209,7 @@ def tilt_of_upright_box(w: float, h: float, *, aspect: float = CAR_ASPECT) -> fl
 
 
 def length_from_upright_box(w: float, h: float, *, aspect: float = CAR_ASPECT) -> float:
-    """Length of a car of a known aspect turned in an upright box of w x h, px.
+    """Length of a rotated car of a known aspect in its upright box of w x h, px.
 
     With L the length, r the aspect, S = |sin 2 theta|: w h = L^2 (r + (1 + r^2) S / 2) and
     w^2 + h^2 = L^2 (1 + r^2 + 2 r S); their quotient gives S, then either gives L.
@@ -224,12 +224,12 @@ def length_from_upright_box(w: float, h: float, *, aspect: float = CAR_ASPECT) -
     """
     squares = w * w + h * h
     quotient = w * h / squares
-    turned = (quotient * (1 + aspect**2) - aspect) / ((1 + aspect**2) / 2 - 2 * aspect * quotient)
-    turned = min(max(turned, 0.0), 1.0)
-    return math.sqrt(squares / (1 + aspect**2 + 2 * aspect * turned))
+    sine = (quotient * (1 + aspect**2) - aspect) / ((1 + aspect**2) / 2 - 2 * aspect * quotient)
+    sine = min(max(sine, 0.0), 1.0)
+    return math.sqrt(squares / (1 + aspect**2 + 2 * aspect * sine))
 
 
-def _oriented(values: Sequence[float], info: SourceInfo) -> tuple[float, float, Shape]:
+def _oriented_car(values: Sequence[float], info: SourceInfo) -> tuple[float, float, CarShape]:
     """x, y and shape of four corners in order around the box."""
     corners = [(values[i] * info.width - 0.5, values[i + 1] * info.height - 0.5) for i in (0, 2, 4, 6)]
     x, y = (sum(corner[axis] for corner in corners) / 4 for axis in (0, 1))
@@ -237,7 +237,7 @@ def _oriented(values: Sequence[float], info: SourceInfo) -> tuple[float, float, 
     lengths = [math.hypot(*side) for side in sides]
     along = 0 if lengths[0] >= lengths[1] else 1
     orientation = math.atan2(sides[along][1], sides[along][0]) % math.pi
-    return x, y, Shape(orientation % math.pi, lengths[along], lengths[1 - along])
+    return x, y, CarShape(orientation % math.pi, lengths[along], lengths[1 - along])
 
 
 def _mean_side(corners: Sequence[tuple[float, float]], first: int, second: int) -> tuple[float, float]:
@@ -251,13 +251,13 @@ def _mean_side(corners: Sequence[tuple[float, float]], first: int, second: int) 
 def _car_classes(path: Path) -> set[int]:
     """Numbers of the classes that are cars: by the names beside the labels, where there are names, else class 0."""
     folder = path if path.is_dir() else path.parent
-    for place in (folder, folder.parent):
+    for near in (folder, folder.parent):
         for name in ("classes.txt", "obj.names"):
-            if (place / name).is_file():
-                return cars_among(enumerate(read_text(place / name, "class names").split("\n")), place / name)
+            if (near / name).is_file():
+                return car_class_numbers(enumerate(read_text(near / name, "class names").split("\n")), near / name)
         for name in ("data.yaml", "dataset.yaml"):
-            if (place / name).is_file():
-                return cars_among(_yaml_names(place / name), place / name)
+            if (near / name).is_file():
+                return car_class_numbers(_yaml_names(near / name), near / name)
     return {0}
 
 
@@ -269,11 +269,11 @@ def _yaml_names(path: Path) -> list[tuple[int, str]]:
         return [(int(number), str(name)) for number, name in pairs]
     except (yaml.YAMLError, TypeError, KeyError, ValueError):
         raise InputError(
-            f"{path.name}: found no `names` of classes in it, expected YOLO's data file; mend or move it"
+            f"{path.name}: found no `names` of classes in it, expected YOLO's data file; fix or move it"
         ) from None
 
 
-def cars_among(names: Iterable[tuple[int, str]], path: Path) -> set[int]:
+def car_class_numbers(names: Iterable[tuple[int, str]], path: Path) -> set[int]:
     """Numbers of the names that are of cars.
 
     Raises

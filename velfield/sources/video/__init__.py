@@ -1,1 +1,1 @@
-"""Video files: probing, decoding with true timestamps, damage in the bitstream."""
+"""Video files: probing, decoding with true timestamps, detection of corruption."""

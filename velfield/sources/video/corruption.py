@@ -1,7 +1,7 @@
-"""Damage in a bitstream, known from libav's log alone: decoders hide it and return a picture for every frame.
+"""Corruption of a bitstream, from libav's log: decoders conceal errors and return an image for every frame.
 
-What a damaged packet spoils is every frame decoded after it until the next key frame, which is not the same as every
-frame shown after it. So the log is kept in the order of decoding, and a frame is asked about when it comes out.
+A corrupt packet affects every frame decoded after it until the next key frame, in decoding order, which is not the
+order of presentation. So errors are recorded in decoding order, and a frame is classified when the decoder returns it.
 """
 
 import threading
@@ -11,10 +11,10 @@ from typing import Any
 
 import av.logging
 
-# At this level h264 and mpeg4 say "concealing ... errors" of pictures whose slices ended too soon, and no error.
+# At this level h264 and mpeg4 log "concealing ... errors" for truncated slices, which they log as no error.
 _LEVEL = av.logging.DEBUG
 _CONCEALED = "concealing"
-# Said of sound files too: odd side data of cameras, not pictures.
+# Logged for sound files too: side data of cameras, not frames.
 _HARMLESS = (
     "SEI",
     "skipping unregistered",
@@ -23,7 +23,7 @@ _HARMLESS = (
     "unsupported color",
 )
 
-# The first bytes of a burst often decode without a word: so many frames before the first error are suspect, too.
+# The first bytes of a burst often decode without an error: so many frames before the first one are suspect, too.
 _MARGIN = 4
 
 _lock = threading.Lock()
@@ -33,13 +33,13 @@ _before: tuple[int | None, bool] = (None, True)
 
 @contextmanager
 def libav_log() -> Iterator[None]:
-    """Let libav talk while frames are read, and no longer. Its level is the whole process's, so users are counted."""
+    """Enable libav's log while frames are read. Its level is the whole process's, so users are counted."""
     global _users, _before
     with _lock:
         if _users == 0:
             _before = (av.logging.get_level(), av.logging.get_skip_repeated())
             av.logging.set_level(_LEVEL)
-            av.logging.set_skip_repeated(False)  # the same damage twice is twice damage
+            av.logging.set_skip_repeated(False)  # a repeated error is an error each time
         _users += 1
     try:
         yield
@@ -52,8 +52,8 @@ def libav_log() -> Iterator[None]:
 
 
 @contextmanager
-def captured_errors() -> Iterator[list[str]]:
-    """Collect the errors that libav logs on this thread meanwhile; the list is filled when the block ends."""
+def capture_errors() -> Iterator[list[str]]:
+    """Collect the errors that libav logs on this thread; the list is filled when the context ends."""
     errors: list[str] = []
     with av.logging.Capture(local=True) as lines:
         try:
@@ -68,81 +68,83 @@ def _is_error(level: int, message: str) -> bool:
     return level <= av.logging.ERROR and not any(words in message for words in _HARMLESS)
 
 
-class DamageLog:
-    """Which frames are spoilt, given the packets in decoding order and the errors as they are logged.
+class CorruptionTracker:
+    """Which frames are suspect, given the packets in decoding order and the errors as they are logged.
 
     Attributes
     ----------
     last_error
-        What libav said last, for the message.
+        libav's last message.
     """
 
     def __init__(self, *, lasting: bool = False, midway: bool = False) -> None:
         self.last_error = ""
-        self.lasting = lasting  # frames known by their order alone: after a loss nobody knows which is which
-        self._midway = midway  # entered at a later key frame: it bids the decoder forget pictures that it never saw
+        self.lasting = lasting  # frames identified by order alone: after a loss, all that follow are suspect
+        self._midway = (
+            midway  # decoding started at a later key frame, which may release reference images that were never decoded
+        )
         self._count = 0
-        self._group = 0  # counted by key frames; group 0 stands before the first one and cannot be decoded
+        self._group = 0  # groups are counted by key frames; group 0 precedes the first one and cannot be decoded
         self._key_index = -1
         self._first_error: dict[int, int] = {0: 0}
-        self._place: dict[int, tuple[int, int, bool]] = {}
+        self._position: dict[int, tuple[int, int, bool]] = {}
         self._key_of: dict[int, int] = {}
         self._gradual = False
 
     def feed(self, packet: Any, index: int | None) -> None:
-        """A packet, that of frame `index`, is about to be decoded."""
+        """Register the packet of frame `index`, before it is decoded."""
         self._count += 1
         if packet.is_keyframe and packet.size:
             self._group += 1
             self._key_index = -1 if index is None else index
             self._key_of[self._group] = self._key_index
         if index is not None:
-            # Shown before the key frame it follows in the file: it may lean on the group before, too.
-            self._place[index] = (self._count, self._group, index < self._key_index)
+            # Presented before the key frame it follows in the file: it may refer to the group before, too.
+            self._position[index] = (self._count, self._group, index < self._key_index)
 
     def mark(self, message: str) -> None:
-        """Something was logged while the last packet was decoded."""
+        """Register an error logged while the last packet was decoded."""
         if self._midway and self._group == 1 and message.startswith("mmco"):
             return
         self.last_error = message
         self._first_error.setdefault(self._group, self._count - _MARGIN)
 
     def mark_frame(self, index: int) -> None:
-        """Frame `index` came out marked as corrupt."""
-        place = self._place.get(index)
+        """Register that the decoder marked frame `index` as corrupt."""
+        position = self._position.get(index)
         self.last_error = self.last_error or "marked as corrupt by the decoder"
-        if place is not None:
-            count, group, _ = place
+        if position is not None:
+            count, group, _ = position
             self._first_error[group] = min(count - _MARGIN, self._first_error.get(group, count))
 
-    def mark_break(self, index: int) -> None:
-        """Frame `index` holds blocks that nothing led up to. On a key frame after damage that is the repair."""
-        group = self._place.get(index, (0, self._group, False))[1]
+    def mark_artifacts(self, index: int) -> None:
+        """Register block artefacts in frame `index`. On a key frame after corruption they are the repair."""
+        group = self._position.get(index, (0, self._group, False))[1]
         at_key = index == self._key_of.get(group)
         if at_key and group > 1:
             if group - 1 in self._first_error:
                 return
-            self._first_error[group - 1] = 0  # either of the two may be the wrong one
+            self._first_error[group - 1] = 0  # either of the two groups may be the corrupt one
         self.mark_frame(index)
-        self.last_error = "blocks that the frame before does not lead up to"
+        self.last_error = "block artefacts"
 
     def mark_lost(self, index: int) -> None:
-        """A frame shown before frame `index` never came out: what came after it may lean on it."""
-        place = self._place.get(index)
+        """Register that a frame before frame `index` was lost: later frames may refer to it."""
+        position = self._position.get(index)
         self.last_error = self.last_error or "a frame was lost"
-        if place is not None:
-            self._first_error.setdefault(place[1], 0)
+        if position is not None:
+            self._first_error.setdefault(position[1], 0)
 
     def is_suspect(self, index: int) -> bool:
-        """Whether frame `index` may be wrong, by what is known up to now."""
-        # Where packets carry no time of their own (AVI), the frame's is not known: then any damage since the key frame
+        """Whether frame `index` may be corrupt, by the errors so far."""
+        # Where packets carry no time stamp (AVI), the frame's position is unknown: then any error since the key frame
         # before the last one counts.
-        count, group, leading = self._place.get(index, (self._count, self._group, True))
+        count, group, leading = self._position.get(index, (self._count, self._group, True))
         if self.lasting and len(self._first_error) > 1:
             return True
         own = group in self._first_error and count >= self._first_error[group]
         return own or ((leading or self._gradual) and group - 1 in self._first_error)
 
-    def note_key_picture(self, is_intra: bool) -> None:
-        """A key frame came out. One that is no intra picture starts a gradual refresh, whole only at the next one."""
+    def note_key_frame(self, is_intra: bool) -> None:
+        """Register a decoded key frame. One that is no intra frame starts a gradual refresh, until the next one."""
         self._gradual = self._gradual or not is_intra

@@ -1,4 +1,4 @@
-"""The time stamps of a video's frames, by demuxing alone, and which of them can be trusted."""
+"""Time stamps of a video's frames by demuxing alone, and their outliers."""
 
 import itertools
 from dataclasses import dataclass
@@ -8,39 +8,38 @@ from typing import Any, Literal
 
 import av
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import IntArray, Mask
 from velfield.errors import InputError
-from velfield.sources.video.container import demuxed, open_video, video_stream
-from velfield.sources.video.corruption import captured_errors
+from velfield.sources.video.container import iter_packets, open_video, video_stream
+from velfield.sources.video.corruption import capture_errors
 
 
 @dataclass(frozen=True)
 class Packets:
-    """What demuxing alone tells, in the file's order.
+    """Time stamps of the packets, in the file's order.
 
-    ``pts`` (n,) are the presentation time stamps that identify frames where ``stamps`` is "pts"; decoding time stamps
-    where it is "dts": times are known, but which frame has which only by the order of coming out; 0, 1, 2, ... where
-    "none".
+    ``pts`` (n,) are presentation time stamps, which identify frames, where ``stamps`` is "pts"; decoding time stamps
+    where it is "dts": frames get them by order of presentation; 0, 1, 2, ... where "none".
     """
 
-    pts: NDArray[np.int64]
-    key: NDArray[np.bool_]
+    pts: IntArray
+    key: Mask
     stamps: Literal["pts", "dts", "none"]
     notes: tuple[str, ...]
 
 
 def demux(container: Any, stream: Any, path: Path) -> Packets:
-    """Read all packets, decode none. A packet that is to be decoded but not shown (an edit list) is no frame."""
+    """Read all packets, decode none. A packet to be decoded but not presented (edit list) is no frame."""
     rows: list[tuple[int | None, int | None, bool]] = []
     notes: tuple[str, ...] = ()
-    for packet, _ in demuxed(container, stream):
+    for packet, _ in iter_packets(container, stream):
         if packet.size and not packet.is_discard:
             rows.append((packet.pts, packet.dts, bool(packet.is_keyframe)))
     timed = [(row[0], row[2]) for row in rows if row[0] is not None]
     if len(timed) > 0.8 * len(rows) and stream.time_base is not None and _stamps_ascend(path):
         if len(timed) < len(rows):
-            notes += (f"{len(rows) - len(timed)} frames have lost their time (damaged) and are left out",)
+            notes += (f"{len(rows) - len(timed)} frames have no time stamp (corrupt): dropped",)
         return Packets(
             np.array([p for p, _ in timed], np.int64), np.array([k for _, k in timed], np.bool_), "pts", notes
         )
@@ -51,51 +50,53 @@ def demux(container: Any, stream: Any, path: Path) -> Packets:
     return Packets(np.arange(len(rows), dtype=np.int64), key, "none", notes)
 
 
-def _stamps_ascend(path: Path, *, look: int = 48) -> bool:
-    """Whether pictures come out in the order of their stamps. AVI has those of decoding alone; others are guessed."""
-    with captured_errors(), open_video(path) as container:
+def _stamps_ascend(path: Path, *, frames: int = 48) -> bool:
+    """Whether frames are decoded in the order of their stamps. AVI has those of decoding; libav guesses others."""
+    with capture_errors(), open_video(path) as container:
         if container.format.name != "avi":
             return True
         stream = video_stream(container, path)
         stream.codec_context.thread_count = 1
         try:
-            shown = [frame.pts for frame in itertools.islice(container.decode(stream), look)]
+            presented = [frame.pts for frame in itertools.islice(container.decode(stream), frames)]
         except av.error.FFmpegError:
             return True
-    return None not in shown and all(first < second for first, second in itertools.pairwise(shown))
+    return None not in presented and all(first < second for first, second in itertools.pairwise(presented))
 
 
-def without_strays(path: Path, packets: Packets, time_base: Fraction | None) -> tuple[Packets, tuple[str, ...]]:
-    """Leave out frames whose time cannot be: a damaged stamp, far from those of the frames about it in the file.
+def drop_timestamp_outliers(
+    path: Path, packets: Packets, time_base: Fraction | None
+) -> tuple[Packets, tuple[str, ...]]:
+    """Drop frames whose time stamp is an outlier: far from those of the neighbouring frames in the file.
 
     Raises
     ------
     InputError
-        Time runs back for good: two recordings in one file.
+        Time runs back and stays back: two recordings in one file.
     """
     if packets.stamps != "pts" or time_base is None or packets.pts.size < 3:
         return packets, ()
     pts = packets.pts
-    reach = max(2.0 / float(time_base), 20 * float(np.median(np.abs(np.diff(pts)))))  # more than any reordering
+    max_deviation = max(2.0 / float(time_base), 20 * float(np.median(np.abs(np.diff(pts)))))  # more than any reordering
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(pts, 8, mode="reflect" if pts.size > 8 else "edge"), 17)
-    # On either side of a true gap a frame agrees with its own side, which is the larger half of its window.
-    stray = np.abs(pts - np.median(windows, axis=1)) > reach
+    # Beside a true gap a frame agrees with its own side, the larger half of its window.
+    outlier = np.abs(pts - np.median(windows, axis=1)) > max_deviation
     notes: tuple[str, ...] = ()
-    if stray.any():
-        notes = (f"{np.count_nonzero(stray)} frames have times far from their neighbours' (damaged) and are left out",)
-        packets = Packets(pts[~stray], packets.key[~stray], packets.stamps, packets.notes)
+    if outlier.any():
+        notes = (f"{np.count_nonzero(outlier)} frames have times far from their neighbours' (corrupt): dropped",)
+        packets = Packets(pts[~outlier], packets.key[~outlier], packets.stamps, packets.notes)
     back = np.maximum.accumulate(packets.pts) - packets.pts
-    if back.size and back.max() > reach:
-        place = int(np.argmax(back > reach))
+    if back.size and back.max() > max_deviation:
+        index = int(np.argmax(back > max_deviation))
         raise InputError(
-            f"{path.name}: found that time runs back by {float(back[place] * time_base):.1f} s at frame {place}, "
-            "expected one "
-            "recording in a file; cut it there, or give --timestamps"
+            f"{path.name}: found that time runs back by {float(back[index] * time_base):.1f} s at frame {index}, "
+            "expected one recording "
+            "a file; cut it there, or give --timestamps"
         )
     return packets, notes
 
 
-def closed_keys(packets: Packets) -> NDArray[np.bool_]:
-    """Key frames whose followers in the file are shown after them, so that decoding can begin there."""
-    later_least = np.minimum.accumulate(packets.pts[::-1])[::-1]
-    return np.asarray(packets.key & (later_least == packets.pts), np.bool_)
+def closed_key_frames(packets: Packets) -> Mask:
+    """Key frames that all later packets are presented after (closed groups): decoding can start there."""
+    later_min = np.minimum.accumulate(packets.pts[::-1])[::-1]
+    return np.asarray(packets.key & (later_min == packets.pts), np.bool_)

@@ -1,7 +1,7 @@
-"""Looking at a video: its frames and the container's own times, without decoding.
+"""Probe a video: its frames and the container's own times, without decoding.
 
 A frame's identity is (file, presentation time stamp). Frame numbers and frame / fps are never used to find a frame:
-readers that do so lose start offsets, and land elsewhere in files of variable rate.
+that loses start offsets, and is wrong in files of variable frame rate.
 """
 
 from contextlib import ExitStack
@@ -10,8 +10,8 @@ from typing import Any
 
 import av
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
 from velfield.sources.frames import SourceInfo
@@ -19,18 +19,18 @@ from velfield.sources.images import check_size
 from velfield.sources.timestamps import check_against_container, read_timestamps
 from velfield.sources.video.container import open_video, video_stream
 from velfield.sources.video.corruption import libav_log
-from velfield.sources.video.packets import closed_keys, demux, without_strays
+from velfield.sources.video.packets import closed_key_frames, demux, drop_timestamp_outliers
 
 
 def probe_video(path: Path, *, frames: FramesConfig, timestamps: Path | None) -> SourceInfo:
-    """Look at a video: see `velfield.sources.source.probe`. Reads the file once without decoding."""
+    """Facts of a video (`velfield.sources.source.probe`). Reads the file once without decoding."""
     with libav_log(), ExitStack() as stack:
         container = stack.enter_context(open_video(path))
         stream = video_stream(container, path)
         width, height = int(stream.codec_context.width), int(stream.codec_context.height)
         if width <= 0 or height <= 0:
             raise InputError(
-                f"{path.name}: found no frame size in the video stream, expected one; the file is damaged or cut"
+                f"{path.name}: found no frame size in the video stream, expected one; the file is damaged or truncated"
             )
         check_size(path, width, height, frames.max_pixels)
         declared = int(stream.frames) or None
@@ -40,17 +40,17 @@ def probe_video(path: Path, *, frames: FramesConfig, timestamps: Path | None) ->
         packets = demux(container, stream, path)
     if packets.pts.size == 0:
         raise InputError(
-            f"{path.name}: found no frames in the video stream, expected at least one; the file is damaged or cut"
+            f"{path.name}: found no frames in the video stream, expected at least one; the file is damaged or truncated"
         )
-    packets, stray = without_strays(path, packets, time_base)
+    packets, dropped = drop_timestamp_outliers(path, packets, time_base)
     order = np.argsort(packets.pts, kind="stable")
     trusted = packets.stamps == "pts"
     container_s = None
     if packets.stamps != "none":
         container_s = packets.pts[order] * time_base.numerator / time_base.denominator
     times_s, time_notes = _times(path, container_s, packets.pts.size, frames, timestamps)
-    warnings += packets.notes + stray + time_notes
-    warnings += _cut_short(times_s, declared, declared_s if container_s is not None else None)
+    warnings += packets.notes + dropped + time_notes
+    warnings += _truncation_warning(times_s, declared, declared_s if container_s is not None else None)
     return SourceInfo(
         kind="video",
         width=width,
@@ -62,23 +62,23 @@ def probe_video(path: Path, *, frames: FramesConfig, timestamps: Path | None) ->
         declared_count=declared,
         pts=packets.pts[order] if trusted else np.zeros(0, np.int64),
         key_frames=packets.key[order] if trusted else np.zeros(0, np.bool_),
-        entries=closed_keys(packets)[order] if trusted else np.zeros(0, np.bool_),
+        entries=closed_key_frames(packets)[order] if trusted else np.zeros(0, np.bool_),
         fps=frames.fps if container_s is None and timestamps is None else None,
         max_pixels=frames.max_pixels,
     )
 
 
 def _times(
-    path: Path, container_s: NDArray[np.float64] | None, count: int, frames: FramesConfig, timestamps: Path | None
-) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """The times to work with: the side file's where it agrees, else the container's, else index / fps if asked for."""
+    path: Path, container_s: FloatArray | None, count: int, frames: FramesConfig, timestamps: Path | None
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """The frame times: the CSV's where it agrees, else the container's, else index / fps if --fps is given."""
     if timestamps is not None:
-        return _side_times(path, container_s, count, timestamps)
+        return _times_from_csv(path, container_s, count, timestamps)
     if container_s is not None:
         notes: tuple[str, ...] = ("--fps is not used: the video has times of its own",) if frames.fps else ()
         equal = int(np.count_nonzero(np.diff(container_s) == 0))
         if equal:
-            notes += (f"{equal} frames have the time of the frame before and are left out",)
+            notes += (f"{equal} frames have the time of the frame before and are dropped",)
         return container_s, notes
     if frames.fps is None:
         raise InputError(
@@ -87,26 +87,26 @@ def _times(
     return np.arange(count) / frames.fps, ()
 
 
-def _side_times(
-    path: Path, container_s: NDArray[np.float64] | None, count: int, timestamps: Path
-) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    side = read_timestamps(timestamps)
-    missing = [index for index in range(count) if str(index) not in side]
+def _times_from_csv(
+    path: Path, container_s: FloatArray | None, count: int, timestamps: Path
+) -> tuple[FloatArray, tuple[str, ...]]:
+    given = read_timestamps(timestamps)
+    missing = [index for index in range(count) if str(index) not in given]
     if missing:
         raise InputError(
             f"{timestamps.name}: found no time for {len(missing)} of {count} frames of {path.name} (first: "
             f"{missing[0]}), "
             "expected the 0-based frame index as `frame`; add them"
         )
-    times_s = np.array([side[str(index)] for index in range(count)])
+    times_s = np.array([given[str(index)] for index in range(count)])
     if container_s is not None:
         check_against_container(times_s, container_s, timestamps)
     if np.any(np.diff(times_s) < 0):
         index = int(np.argmax(np.diff(times_s) < 0)) + 1
         raise InputError(
-            f"{timestamps.name}: found frame {index} before frame {index - 1}, expected times that ascend; mend it"
+            f"{timestamps.name}: found frame {index} before frame {index - 1}, expected ascending times; fix it"
         )
-    extra = len(side) - count
+    extra = len(given) - count
     return times_s, (f"{timestamps.name} has {extra} times for frames that are not in the video",) if extra else ()
 
 
@@ -123,13 +123,13 @@ def _stream_warnings(stream: Any) -> tuple[str, ...]:
     return ()
 
 
-def _cut_short(times_s: NDArray[np.float64], declared: int | None, declared_s: float | None) -> tuple[str, ...]:
-    """Say so where the container promised more than the file holds."""
+def _truncation_warning(times_s: FloatArray, declared: int | None, declared_s: float | None) -> tuple[str, ...]:
+    """Warn where the container declares more frames or time than the file holds."""
     if declared is not None and times_s.size < declared:
-        return (f"{times_s.size} frames read of {declared} declared: the file is cut short",)
+        return (f"{times_s.size} frames read of {declared} declared: the file is truncated",)
     if declared is None and declared_s is not None and times_s.size > 1:
         step = float(np.median(np.diff(times_s)))
         lasts = float(times_s[-1] - times_s[0]) + step
         if lasts < declared_s - max(2 * step, 0.02 * declared_s):
-            return (f"{lasts:.1f} s read of {declared_s:.1f} s declared: the file is cut short",)
+            return (f"{lasts:.1f} s read of {declared_s:.1f} s declared: the file is truncated",)
     return ()
