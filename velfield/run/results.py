@@ -52,7 +52,7 @@ def final_root(root: Path) -> Path:
 
     Examples
     --------
-    >>> named(Path("RUN/results/.spring.unfinished")).as_posix()
+    >>> final_root(Path("RUN/results/.spring.unfinished")).as_posix()
     'RUN/results/spring'
     """
     name = root.name
