@@ -1,15 +1,139 @@
-"""The detector file: JSON with a schema, never pickle. Numbers only: no picture that it was learnt from."""
+"""Car detectors: for each method its section of the configuration, and its detector file.
+
+Both are tagged unions, discriminated by ``method``: a key that the chosen method never reads is refused. Another
+detector needs its two models here and a package ``velfield/detection/<method>``, nothing else. A detector file is JSON
+with a schema, never pickle; it holds numbers only, no image that the detector was trained on.
+"""
 
 from base64 import b64decode
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, get_args
 
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import (
+    Discriminator,
+    Field,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    Tag,
+    model_validator,
+)
 
 from schemas.model import Model
 
-DETECTOR_VERSION = 1
+DETECTOR_VERSION = 2
+"""Version of the detector file; `schemas.renames.upgrade_detector` reads those of version 1."""
 
 Coordinate = Annotated[int, Field(ge=-64, le=64)]
+
+
+# The configuration: the section ``detection`` of flight.yaml.
+
+
+class DetectorConfig(Model):
+    """How cars are detected (paper: car detection): the keys that every method reads."""
+
+    method: str
+    """The detector: ``cnn``, a convolutional network, pre-trained and fine-tuned on the flight; ``cascade``, region
+    proposals, then a boosted classifier of crops rotated to the car's axis, three times as fast; ``paper``, the
+    paper's dense response."""
+    threshold: float | None = None
+    """Score threshold; none: chosen in training and stored with the detector."""
+    working_car_length_px: PositiveFloat = 16.0
+    """Frames are rescaled so that a car is about this long: 8 x 16 px at the paper's 0.23 m a pixel."""
+    car_length_m: PositiveFloat = 4.0
+    """Length of a usual car, which with the ground sample distance sets the working scale."""
+    seed: int = Field(0, ge=0)
+    """Seed of all random numbers of the training."""
+
+    def for_method(self, method: str) -> "DetectorConfig":
+        """The section of another method: the keys that both read, and those that this section nests under its name."""
+        if method == self.method:
+            return self
+        (target,) = (model for model in METHODS if model.model_fields["method"].default == method)
+        shared = next(base for base in type(self).__mro__ if base in target.__mro__ and issubclass(base, Model))
+        values = {name: getattr(self, name) for name in shared.model_fields if name != "method"}
+        nested = getattr(self, method, None)
+        return target.model_validate(values | (nested.model_dump() if isinstance(nested, Model) else {}))
+
+
+class CascadeTraining(Model):
+    """Training of the cascade."""
+
+    rounds: PositiveInt = 800
+    """Rounds of AdaBoost of the classifier; half as many for each member of an ensemble. Paper: 200."""
+    feature_pool: PositiveInt = 3000
+    """Random features that a round chooses from."""
+    corner_sigma_px: PositiveFloat = 10.0
+    """Standard deviation of the rectangles' corners, working px. Paper: 10."""
+    folds: int = Field(4, ge=2)
+    """Spatial folds for the score threshold: each holds out one part of the labelled cars. With 20 cars or more, all
+    of them labelled, the detectors of the folds and that of all cars form an ensemble."""
+
+
+class _WithMotionChannel(DetectorConfig):
+    motion_channel: Literal["auto", "always", "never"] = "auto"
+    """Whether a detector that is trained on labels from motion reads |frame - background|; ``auto``: where appearance
+    is not sufficient to tell cars from other objects."""
+
+
+class CnnConfig(_WithMotionChannel):
+    """How cars are detected (paper: car detection), here by the convolutional network."""
+
+    method: Literal["cnn"] = "cnn"
+    fine_tune_steps: PositiveInt = 250
+    """Optimiser steps of the fine-tuning on labelled cars."""
+    cascade: CascadeTraining = CascadeTraining()
+    """The cascade that takes the network's place: where labels come from motion and appearance is sufficient, or few
+    vehicles move, and where cars are not as long as those that the pre-trained network knows."""
+
+
+class CascadeConfig(CascadeTraining, _WithMotionChannel):
+    """How cars are detected (paper: car detection), here by the boosted cascade."""
+
+    method: Literal["cascade"] = "cascade"
+
+
+class PaperConfig(DetectorConfig):
+    """How cars are detected (paper: car detection), here as the paper does."""
+
+    method: Literal["paper"] = "paper"
+    rounds: PositiveInt = 200
+    """Rounds of AdaBoost. Paper: 200."""
+    feature_pool: PositiveInt = 1000
+    """Random features that a round chooses from."""
+    max_rectangles: PositiveInt = 5
+    """1 to this many positive, and as many negative, rectangles a feature. Paper: 5."""
+    corner_sigma_px: PositiveFloat = 10.0
+    """Standard deviation of the rectangles' corners, working px. Paper: 10."""
+    car_radius_px: PositiveFloat = 6.0
+    """Pixels nearer than this to a car's centre are positive samples. Paper: 6."""
+    background_radius_px: PositiveFloat = 20.0
+    """Pixels farther than this from every car are negative samples. Paper: 20."""
+    car_fraction: PositiveFloat = Field(0.15, lt=1)
+    """Fraction of positive samples. Paper: 15 %."""
+    response_sigma_px: PositiveFloat = 3.0
+    """Gaussian blur of the response before its maxima are taken. Paper: 3."""
+    min_region_px: PositiveInt = 10
+    """Regions smaller than this are dropped. Paper: 10."""
+
+
+def _method_of(section: object) -> object:
+    if isinstance(section, dict):
+        return section.get("method", CnnConfig.model_fields["method"].default)
+    return getattr(section, "method", None)
+
+
+DetectionConfig = Annotated[
+    Annotated[CnnConfig, Tag("cnn")] | Annotated[CascadeConfig, Tag("cascade")] | Annotated[PaperConfig, Tag("paper")],
+    Discriminator(_method_of),
+]
+"""The section of the chosen method; without ``method``, that of the network."""
+
+METHODS: tuple[type[DetectorConfig], ...] = tuple(get_args(one)[0] for one in get_args(get_args(DetectionConfig)[0]))
+
+
+# The detector file.
 
 
 class Rectangle(Model):
@@ -29,118 +153,140 @@ class Rectangle(Model):
 
 
 class Round(Model):
-    """One round of boosting: a sum of rectangles, a threshold, and what is said below and above it."""
+    """One round of boosting, a decision stump: a feature, which is a sum of rectangles, its threshold, two leaves."""
 
     channel: Literal[0, 1, 2, 3]
-    """0 grey, 1 gradient along, 2 gradient across, 3 difference to the background."""
+    """0 grey, 1 gradient along the axis, 2 gradient across it, 3 difference to the background."""
     rectangles: tuple[Rectangle, ...] = Field(min_length=1, max_length=16)
     threshold: float
-    below: float
-    above: float
+    leaf_low: float
+    """Added to the score where the feature is at most the threshold ..."""
+    leaf_high: float
+    """... and where it is above."""
 
 
 class PrecisionRecallCurve(Model):
-    """How precision falls as recall rises, on cars that were left out of training."""
+    """Precision and recall against the score threshold, on cars held out of training."""
 
     recall: tuple[float, ...] = Field(max_length=1000)
     precision: tuple[float, ...] = Field(max_length=1000)
     threshold: tuple[float, ...] = Field(max_length=1000)
-    chosen: NonNegativeInt | None = None
-    evidence: str
+    operating_point: NonNegativeInt | None = None
+    """Index of the chosen threshold."""
+    description: str
+    """Which cars it was measured on."""
 
 
 class Proposer(Model):
-    """Step one of the aligned method: a coarse classifier at half the resolution, dense over place and turn."""
+    """Stage 1 of the cascade: a coarse classifier at half the resolution, dense over position and rotation."""
 
     rounds: tuple[Round, ...] = Field(min_length=1, max_length=500)
-    least_score: float
-    """Places that it likes less are not looked at again."""
-    least_first_score: float
-    """Places that the first rounds of step two like less are let go."""
+    min_score: float
+    """Proposals with a lower score are rejected."""
+    min_stage1_score: float
+    """Proposals to which the first rounds of the classifier give a lower score are rejected."""
 
 
 class LayerRecord(Model):
-    """A layer of the network: its weights by neighbour, channel in and channel out, then its biases."""
+    """A layer of the network: its weights by kernel tap, input channel and output channel, then its biases."""
 
     shape: tuple[PositiveInt, PositiveInt, PositiveInt]
-    """Neighbours looked at (1 or 9), channels in, channels out."""
-    numbers: str = Field(max_length=2_000_000)
+    """Kernel taps (1 or 9), input channels, output channels."""
+    weights_f16: str = Field(max_length=2_000_000)
     """Base64 of little-endian half-precision floats."""
 
     @model_validator(mode="after")
     def _is_whole(self) -> Self:
-        neighbours, into, out = self.shape
+        taps, into, out = self.shape
         try:
-            found = len(b64decode(self.numbers, validate=True))
+            found = len(b64decode(self.weights_f16, validate=True))
         except ValueError:
-            raise ValueError("the numbers of a layer are not base64") from None
-        if found != 2 * (neighbours * into * out + out):
-            raise ValueError(f"a layer of {neighbours} x {into} x {out} with {found} bytes of numbers")
+            raise ValueError("the weights of a layer are not base64") from None
+        if found != 2 * (taps * into * out + out):
+            raise ValueError(f"a layer of {taps} x {into} x {out} with {found} bytes of weights")
         return self
 
 
 class MotionRecord(Model):
-    """How much less what differs from the background needs to be liked, where a network looks at it."""
+    """Bonus on the score of a detection that differs from the background: a linear ramp."""
 
-    still_grey: NonNegativeFloat
-    """What stands differs by no more, mean grey levels about a find."""
-    moving_grey: PositiveFloat
-    """What differs by so much moves."""
-    lift: NonNegativeFloat
-    """What moves is liked so much more; from the one to the other it grows evenly."""
+    bonus_ramp_start: NonNegativeFloat
+    """Mean absolute difference, grey levels, up to which there is none."""
+    bonus_ramp_end: PositiveFloat
+    """Difference from which the bonus is full."""
+    max_score_bonus: NonNegativeFloat
 
     @model_validator(mode="after")
     def _is_a_ramp(self) -> Self:
-        if self.moving_grey <= self.still_grey:
-            raise ValueError(f"what moves differs by {self.moving_grey:g}, what stands by {self.still_grey:g}")
+        if self.bonus_ramp_end <= self.bonus_ramp_start:
+            raise ValueError(f"the ramp ends at {self.bonus_ramp_end:g} and starts at {self.bonus_ramp_start:g}")
         return self
 
 
-class DetectorRecord(Model):
-    """A trained detector."""
+class BaseRecord(Model):
+    """What the file of every trained detector holds."""
 
     kind: Literal["velfield-detector"] = "velfield-detector"
-    version: Literal[1] = 1
-    method: Literal["aligned", "dense", "network"]
+    version: Literal[2] = 2
+    method: str
     working_car_length_px: PositiveFloat = Field(le=200)
-    """A car's length on the grid that it was learnt on."""
-    rounds: tuple[Round, ...] = Field(default=(), max_length=50_000)
-    network: dict[str, LayerRecord] | None = Field(default=None, max_length=100)
-    """The layers of the network, by name."""
-    motion: MotionRecord | None = None
-    """Network: what is made of the difference to the background; none: nothing."""
+    """Length of a car on the grid that it was trained on."""
     threshold: float
-    grey_bits: int = Field(default=8, ge=1, le=8)
-    """Dense: so many bits of the grey are looked at."""
-    contrast_floor: PositiveFloat | None = None
-    """Aligned: sums are divided by the mean gradient about the place plus this; none: they are taken as they are."""
-    proposer: Proposer | None = None
-    """Aligned: what finds the places to look at."""
+    """Score threshold."""
     curve: PrecisionRecallCurve | None = None
     cars: NonNegativeInt = 0
-    """How many marked cars it was learnt from."""
+    """How many labelled cars it was trained on."""
     attribution: tuple[str, ...] = Field(default=(), max_length=50)
-    """Whose pictures it was learnt from, and under what licence."""
+    """Whose images it was trained on, and under what licence."""
 
-    @model_validator(mode="after")
-    def _is_whole(self) -> Self:
-        if self.method == "aligned" and (self.contrast_floor is None or self.proposer is None):
-            raise ValueError("a detector of the aligned method needs contrast_floor and proposer")
-        if self.method == "network" and self.network is None:
-            raise ValueError("a detector of the network method needs network")
-        if self.method != "network" and not self.rounds:
-            raise ValueError(f"a detector of the {self.method} method needs rounds")
-        return self
+
+class CnnRecord(BaseRecord):
+    """A trained convolutional network."""
+
+    method: Literal["cnn"] = "cnn"
+    layers: dict[str, LayerRecord] = Field(max_length=100)
+    """By name."""
+    motion: MotionRecord | None = None
+    """The bonus of moving objects; none: it reads no background."""
+
+
+class CascadeRecord(BaseRecord):
+    """A trained cascade."""
+
+    method: Literal["cascade"] = "cascade"
+    proposer: Proposer
+    rounds: tuple[Round, ...] = Field(min_length=1, max_length=50_000)
+    """Stage 2: the classifier of crops rotated to the car's axis."""
+    contrast_floor: PositiveFloat
+    """Features are divided by the mean gradient of the window plus this."""
+
+
+class PaperRecord(BaseRecord):
+    """The paper's trained classifier."""
+
+    method: Literal["paper"] = "paper"
+    rounds: tuple[Round, ...] = Field(min_length=1, max_length=50_000)
+    grey_bits: int = Field(default=8, ge=1, le=8)
+    """So many bits of the grey levels are read."""
+    response_sigma_px: PositiveFloat = 3.0
+    """Gaussian blur of the response before its maxima are taken."""
+    min_region_px: PositiveInt = 10
+    """Regions smaller than this are dropped."""
+
+
+DetectorRecord = Annotated[CnnRecord | CascadeRecord | PaperRecord, Field(discriminator="method")]
+
+RECORDS: tuple[type[BaseRecord], ...] = get_args(get_args(DetectorRecord)[0])
 
 
 class LongVehicleRecord(Model):
-    """A classifier that tells the middle of a lorry or bus from all other places along its axis, and from cars."""
+    """A classifier of the centres of lorries and buses, against all other positions along their axis and cars."""
 
     kind: Literal["velfield-long-vehicles"] = "velfield-long-vehicles"
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     working_car_length_px: PositiveFloat = Field(le=200)
     rounds: tuple[Round, ...] = Field(min_length=1, max_length=5000)
     threshold: float
-    """Above it a place is the middle of something long."""
+    """A position with a higher score is the centre of a long vehicle."""
     contrast_floor: PositiveFloat
     attribution: tuple[str, ...] = Field(default=(), max_length=50)

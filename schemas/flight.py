@@ -8,6 +8,7 @@ from typing import Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt
 
+from schemas.detector import CnnConfig, DetectionConfig
 from schemas.model import Model
 
 Every = PositiveInt | Literal["auto"]
@@ -107,47 +108,6 @@ class RegistrationConfig(Model):
     """Frames registered one to the next before the chain starts again from the base image."""
 
 
-class DetectionConfig(Model):
-    """How cars are found (paper: car detection)."""
-
-    method: Literal["network", "aligned", "dense"] = "network"
-    """What marked cars teach. ``network``: the network that ships learns on from them; ``aligned``: candidates, then a
-    boosted classifier on cars turned to the horizontal, four times as fast; ``dense``: the paper's response."""
-    network_steps: PositiveInt = 250
-    """Steps that the network takes on from the marked cars."""
-    rounds: PositiveInt = 800
-    """Rounds of AdaBoost (aligned, dense); half as many for each detector of a part of the cars. Paper: 200."""
-    feature_pool: PositiveInt = 3000
-    """Random features a round chooses from."""
-    max_rectangles: PositiveInt = 5
-    """1 to this many positive, and as many negative, rectangles a feature. Paper: 5."""
-    corner_sigma_px: PositiveFloat = 10.0
-    """Standard deviation of the rectangles' corners, working px. Paper: 10."""
-    car_radius_px: PositiveFloat = 6.0
-    """Pixels nearer than this to a car's centre are car (dense). Paper: 6."""
-    background_radius_px: PositiveFloat = 20.0
-    """Pixels farther than this from every car are not (dense). Paper: 20."""
-    car_fraction: PositiveFloat = Field(0.15, lt=1)
-    """Share of cars among the training samples. Paper: 15 %."""
-    response_sigma_px: PositiveFloat = 3.0
-    """Blur of the response before maxima are taken. Paper: 3."""
-    min_region_px: PositiveInt = 10
-    """Regions smaller than this are dropped. Paper: 10."""
-    folds: int = Field(4, ge=2)
-    """T is chosen on cars left out of training: a so-manieth part of the marked ones at a time. Of 40 cars
-    and more the detectors learnt so judge together with the one of all cars."""
-    threshold: float | None = None
-    """Threshold T on the response; none: chosen from the training evidence and stored with the detector."""
-    working_car_length_px: PositiveFloat = 16.0
-    """Frames are scaled so that a car is about this long: 8 x 16 px at the paper's 0.23 m a pixel."""
-    car_length_m: PositiveFloat = 4.0
-    """A usual car's length, which with the ground sample distance sets the working scale."""
-    motion_channel: Literal["auto", "always", "never"] = "auto"
-    """Whether what is learnt from motion sees |frame - background|; ``auto``: where looks alone do not tell cars."""
-    seed: int = Field(0, ge=0)
-    """Seed of everything random in training."""
-
-
 class TrackingConfig(Model):
     """Tracklets over three frames (paper: tracking). Limits are physical; jitter widens them by ``jitter_sigmas``."""
 
@@ -233,7 +193,7 @@ class FlightConfig(Model):
     lens: LensConfig = LensConfig()
     base: BaseConfig = BaseConfig()
     registration: RegistrationConfig = RegistrationConfig()
-    detection: DetectionConfig = DetectionConfig()
+    detection: DetectionConfig = CnnConfig()
     tracking: TrackingConfig = TrackingConfig()
     field: FieldConfig = FieldConfig()
     work: WorkConfig = WorkConfig()
@@ -246,7 +206,7 @@ PRESETS: dict[Preset, dict[str, dict[str, object]]] = {
     "best": {},
     "fast": {
         "registration": {"key_points": 1500, "key_point_scale": 0.25},
-        "detection": {"method": "aligned", "rounds": 300, "feature_pool": 1500, "folds": 2},
+        "detection": {"method": "cascade", "rounds": 300, "feature_pool": 1500, "folds": 2},
     },
     "paper": {
         "lens": {"refine": "never"},
@@ -256,7 +216,7 @@ PRESETS: dict[Preset, dict[str, dict[str, object]]] = {
             "key_point_scale": 1.0,
             "cell_size_px": 200,
         },
-        "detection": {"method": "dense", "rounds": 200, "feature_pool": 1000, "motion_channel": "never"},
+        "detection": {"method": "paper"},
         "tracking": {"refine": False, "linking": "pairwise", "min_confidence": 0.0},
         "field": {"path_width": "pixel", "shared_segment_weight": 2, "velocity_span_s": 0.0},
     },

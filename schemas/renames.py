@@ -3,10 +3,13 @@
 from collections.abc import Mapping
 from typing import Any
 
+from schemas.detector import DETECTOR_VERSION, METHODS, RECORDS, CascadeTraining
+
 OLD_NAMES_UNTIL = "0.3"
 """The first version that reads no name of format 1."""
 
 OLD_KEYS: dict[str, str] = {
+    "detection.network_steps": "detection.fine_tune_steps",
     "registration.window_px": "registration.match_search_px",
     "registration.segment_frames": "registration.chain_length_frames",
     "tracking.slow_m_per_s": "tracking.stationary_speed_m_per_s",
@@ -21,6 +24,7 @@ OLD_KEYS: dict[str, str] = {
 """Old configuration key -> key."""
 
 OLD_VALUES: dict[str, dict[object, object]] = {
+    "detection.method": {"network": "cnn", "aligned": "cascade", "dense": "paper"},
     "tracking.linking": {"links": "pairwise"},
     "field.path_width": {True: "pixel", False: "lane"},
     "field.shared_segment_weight": {"once": 1, "twice": 2},
@@ -32,6 +36,57 @@ REMOVED_KEYS: dict[str, str] = {
     "tracking.patch_length_px": "no stage read it; appearance is compared on patches of 8 x 16 working px",
 }
 """Old configuration key -> why it is gone: it is ignored."""
+
+DETECTOR_LAYERS = {
+    "grain": "stem",
+    "edges": "down1",
+    "corners_0": "enc1_0",
+    "corners_1": "enc1_1",
+    "parts": "down2",
+    "body_0": "res1_0",
+    "body_1": "res1_1",
+    "body_2": "res2_0",
+    "body_3": "res2_1",
+    "back": "up1",
+    "middle": "dec1",
+    "told": "head",
+}
+"""Old name of a layer of the network in a detector file -> name."""
+
+DETECTOR_KEYS = {
+    "network": "layers",
+    "numbers": "weights_f16",
+    "below": "leaf_low",
+    "above": "leaf_high",
+    "chosen": "operating_point",
+    "evidence": "description",
+    "least_score": "min_score",
+    "least_first_score": "min_stage1_score",
+    "still_grey": "bonus_ramp_start",
+    "moving_grey": "bonus_ramp_end",
+    "lift": "max_score_bonus",
+}
+"""Old key of a detector file, wherever in it -> key."""
+
+
+def upgrade_detector(record: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of a detector file of version 1 as version 2 has it."""
+    found = _renamed(record, DETECTOR_KEYS)
+    found["version"] = DETECTOR_VERSION
+    found["method"] = _present_value("detection.method", found.get("method"))
+    if isinstance(found.get("layers"), dict):
+        found["layers"] = {DETECTOR_LAYERS.get(name, name): layer for name, layer in found["layers"].items()}
+    of_others = {name for model in RECORDS for name in model.model_fields}
+    for model in RECORDS:
+        if model.model_fields["method"].default == found["method"]:
+            of_others -= set(model.model_fields)
+    return {name: value for name, value in found.items() if name not in of_others}
+
+
+def _renamed(value: Any, names: Mapping[str, str]) -> Any:
+    if isinstance(value, Mapping):
+        return {names.get(name, name): _renamed(inner, names) for name, inner in value.items()}
+    return [_renamed(inner, names) for inner in value] if isinstance(value, list) else value
 
 
 def upgrade_config(tree: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
@@ -63,6 +118,7 @@ def upgrade_config(tree: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
         present = _present_value(key, value)
         also = "" if present is value else f": {_text(value)} is {_text(present)} there"
         messages.append(f"{old} is now {key}{also}; the old name works until {OLD_NAMES_UNTIL}")
+    messages += _regroup_detection(upgraded.get("detection"))
     for key in OLD_VALUES:
         if not _has(upgraded, key):
             continue
@@ -72,6 +128,27 @@ def upgrade_config(tree: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
         if present is not value and key not in OLD_KEYS.values():
             messages.append(f"{key}={value} is now {key}={present}; the old value works until {OLD_NAMES_UNTIL}")
     return upgraded, messages
+
+
+def _regroup_detection(section: Any) -> list[str]:
+    """Take out of a section of format 1, which held the keys of all methods, those that its method never read."""
+    method = _present_value("detection.method", section.get("method")) if isinstance(section, dict) else None
+    if method is None or method == section["method"]:
+        return []
+    (model,) = (model for model in METHODS if model.model_fields["method"].default == method)
+    messages = []
+    for key in [
+        key for key in section if key not in model.model_fields and any(key in m.model_fields for m in METHODS)
+    ]:
+        value = section.pop(key)
+        if method == "cnn" and key in CascadeTraining.model_fields:
+            section.setdefault("cascade", {})[key] = value
+            messages.append(
+                f"detection.{key} is now detection.cascade.{key}; the old name works until {OLD_NAMES_UNTIL}"
+            )
+        else:
+            messages.append(f"detection.{key} is ignored: method {method} does not read it")
+    return messages
 
 
 def _copied(tree: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from velfield.run.commits import digest_bytes
 from velfield.run.layout import RunLayout
 
 SMALL = (
-    "detection.method=aligned",
+    "detection.method=cascade",
     "detection.rounds=40",
     "detection.feature_pool=250",
     "detection.folds=2",

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from schemas.flight import DetectionConfig
+from schemas.detector import CnnConfig
+from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.fine_tuning import evaluate_network, make_record, select_threshold, train_from_scratch
 from velfield.detection.cnn.model import Network
-from velfield.detection.detector import Detector
 from velfield.detection.evaluation import Evidence, joined
 from velfield.detection.samples import LabelledImage
 from velfield.parallel import each
@@ -28,7 +28,7 @@ class Site:
 
 def train_leave_one_site_out(
     sites: Sequence[Site], extra: Sequence[LabelledImage], *, seed: int, steps: int
-) -> tuple[Detector, dict[str, Evidence]]:
+) -> tuple[CnnDetector, dict[str, Evidence]]:
     """Train on all sites and on the ``extra`` images; choose the threshold on held-out sites.
 
     Returns
@@ -50,7 +50,7 @@ def train_leave_one_site_out(
     description = f"cars of {len(sites)} sites, each detected by a detector that was not trained on its site"
     threshold, curve = select_threshold(joined(list(by_site.values())), 0.0, description)
     cars = sum(len(sample.cars) for site in sites for sample in site.evaluation) + sum(len(s.cars) for s in extra)
-    return Detector(make_record(network, threshold, curve, cars, DetectionConfig())), by_site
+    return CnnDetector(make_record(network, threshold, curve, cars, CnnConfig())), by_site
 
 
 def _train(sites: Sequence[Site], extra: Sequence[LabelledImage], seed: int, steps: int) -> Network:

@@ -14,13 +14,13 @@ import cv2
 import numpy as np
 
 from schemas.arrays import FloatArray, GreyImage, RGBImage
-from schemas.flight import DetectionConfig
+from schemas.detector import CascadeConfig
 from tools.leave_one_site_out import Site, train_leave_one_site_out
 from tools.train_long_vehicles import train_long_vehicles
 from velfield.bench.scenes import simulated_image
-from velfield.detection.detector import Detector, save_detector
+from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.evaluation import Evidence, joined
-from velfield.detection.label_orientation import with_axes
+from velfield.detection.orientation import with_axes
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 from velfield.parallel import each
@@ -31,7 +31,7 @@ ATTRIBUTION = (
     "KIT AIS Vehicle Data Set (DLR, KIT; 3K camera, Munich), CC-BY 3.0: frames of two sequences, scaled likewise",
     "cities simulated by velfield",
 )
-CONFIG = DetectionConfig(rounds=400, feature_pool=4000, seed=7)
+CONFIG = CascadeConfig(seed=7)
 """Of the classifier of long vehicles."""
 STEPS, SEED = 2500, 7
 SIMULATED_SEEDS = range(9001, 9061)
@@ -155,7 +155,7 @@ def make_shipped_detector(data: Path, out: Path, steps: int = STEPS) -> list[str
     """Train and write the detector; returns lines with the accuracy on each held-out site."""
     sites, simulated = read_sites(data), each(simulated_image, SIMULATED_SEEDS)
     detector, by_site = train_leave_one_site_out(sites, simulated, seed=SEED, steps=steps)
-    save_detector(Detector(detector.record.model_copy(update={"attribution": ATTRIBUTION})), out)
+    CnnDetector(detector.record.model_copy(update={"attribution": ATTRIBUTION})).save(out)
     evaluations = {**by_site, "all": joined(list(by_site.values()))}
     return [_accuracy_line(name, evaluation, detector.threshold) for name, evaluation in evaluations.items()]
 

@@ -8,16 +8,15 @@ from typing import TypeAlias
 import numpy as np
 
 from schemas.arrays import ByteArray, FloatArray
-from schemas.detector import LongVehicleRecord, Round
-from schemas.flight import DetectionConfig
-from velfield.detection.boosting import random_pool
+from schemas.detector import DetectorConfig, LongVehicleRecord, Round
+from velfield.detection.boosting import BoostedSums, random_pool, sums_of
 from velfield.detection.cascade.classifier import moved
 from velfield.detection.cascade.feature_image import Picture, picture_of, scores_at
 from velfield.detection.cascade.feature_matrix import Bank, bank_of
 from velfield.detection.cascade.long_vehicles import LEAST_LENGTH, LONG, OFFSETS, LongVehicles
+from velfield.detection.cascade.scenes import Poses, varied
 from velfield.detection.cascade.training import CONTRAST_FLOOR
-from velfield.detection.detector import BoostedSums, sums_of
-from velfield.detection.samples import LabelledImage, Poses, varied
+from velfield.detection.samples import LabelledImage
 from velfield.parallel import each
 
 ROUNDS = 800
@@ -51,7 +50,7 @@ class _Scene:
 def train_long_vehicles(
     samples: Sequence[LabelledImage],
     held_out: Sequence[LabelledImage],
-    config: DetectionConfig,
+    config: DetectorConfig,
     attribution: tuple[str, ...] = (),
 ) -> LongVehicleRecord:
     """Train the classifier.

@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import correlate
 
 from schemas.arrays import FloatArray
-from schemas.flight import DetectionConfig
+from schemas.detector import CnnConfig
 from velfield.bench.scenes import simulated_image
 from velfield.detection.cnn.convolution import (
     PaddedBatchLayout,
@@ -22,7 +22,6 @@ from velfield.detection.cnn.fine_tuning import evaluate_network, fine_tune
 from velfield.detection.cnn.inference import detect_cars
 from velfield.detection.cnn.model import (
     CONVOLUTIONS,
-    LAYER_NAMES_V1,
     Network,
     forward,
     network_from_record,
@@ -30,9 +29,9 @@ from velfield.detection.cnn.model import (
     predict_heatmap,
 )
 from velfield.detection.cnn.trainer import Batch, Trainer, train
-from velfield.detection.detector import Detector, shipped_detector
-from velfield.detection.label_orientation import with_axes
-from velfield.detection.orientation import axial_difference
+from velfield.detection.detector import from_record
+from velfield.detection.files import shipped_detector
+from velfield.detection.orientation import axial_difference, with_axes
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 
@@ -142,14 +141,6 @@ def test_a_network_survives_its_record_at_half_precision() -> None:
         np.testing.assert_allclose(again.biases[name], network.biases[name], rtol=1e-3, atol=1e-6)
 
 
-def test_layers_of_a_file_of_version_1_are_renamed() -> None:
-    record = network_to_record(shipped())
-    old_names = {new: old for old, new in LAYER_NAMES_V1.items()}
-    again = network_from_record({old_names[name]: layer for name, layer in record.items()})
-    for name, weights in shipped().weights.items():
-        np.testing.assert_array_equal(again.weights[name], weights)
-
-
 def test_a_network_of_other_layers_is_an_input_error() -> None:
     record = network_to_record(shipped())
     with pytest.raises(InputError, match=r"layer head is None, expected \(1, 32, 3\)"):
@@ -201,29 +192,29 @@ def test_the_shipped_network_detects_cars_of_an_unseen_city() -> None:
 
 def test_fine_tuning_is_deterministic_and_keeps_the_attribution() -> None:
     few = replace(city(9504), cars=city(9504).cars[:12], complete=False)
-    config = DetectionConfig(network_steps=5)
+    config = CnnConfig(fine_tune_steps=5)
     one, again = (fine_tune([few], shipped_detector(), config) for _ in range(2))
     assert one.record == again.record
     assert one.record.attribution == shipped_detector().record.attribution
     assert one.threshold == shipped_detector().threshold  # too few cars for folds
-    assert one.record.network != shipped_detector().record.network
+    assert one.record.layers != shipped_detector().record.layers
 
 
 def test_the_threshold_of_few_cars_is_shrunk_towards_the_pretrained_one() -> None:
     labelled = city(9504)
-    own = fine_tune([labelled], shipped_detector(), DetectionConfig(network_steps=2)).record
+    own = fine_tune([labelled], shipped_detector(), CnnConfig(fine_tune_steps=2)).record
     strict = shipped_detector().record.model_copy(update={"threshold": shipped_detector().threshold + 0.1})
-    shrunk = fine_tune([labelled], Detector(strict), DetectionConfig(network_steps=2)).record
+    shrunk = fine_tune([labelled], from_record(strict), CnnConfig(fine_tune_steps=2)).record
     weight = len(labelled.cars) / (len(labelled.cars) + 150)
     assert shrunk.threshold - own.threshold == pytest.approx(0.1 * (1 - weight))
     assert own.curve is not None
-    assert own.curve.chosen is not None
-    assert own.curve.threshold[own.curve.chosen] == pytest.approx(own.threshold, abs=0.03)
+    assert own.curve.operating_point is not None
+    assert own.curve.threshold[own.curve.operating_point] == pytest.approx(own.threshold, abs=0.03)
 
 
 def test_a_network_for_cars_of_another_size_is_not_fine_tuned() -> None:
     with pytest.raises(InputError, match="cars of 16 px to continue, expected 20 px"):
-        fine_tune([city(9504)], shipped_detector(), DetectionConfig(working_car_length_px=20.0))
+        fine_tune([city(9504)], shipped_detector(), CnnConfig(working_car_length_px=20.0))
 
 
 def test_a_car_truncated_by_the_frame_is_not_detected() -> None:

@@ -8,23 +8,25 @@ import cv2
 import numpy as np
 import pytest
 
-from schemas.flight import DetectionConfig
+from schemas.detector import CascadeConfig, CascadeTraining, CnnConfig, PaperConfig
 from velfield.bench.detection import row_response
+from velfield.detection.boosting import BoostedSums
 from velfield.detection.cascade.classifier import distinct
 from velfield.detection.crops import oriented_patches, upright_chips
 from velfield.detection.detect import FrameDetections, detect_frame
-from velfield.detection.detector import BoostedSums, Detector, load_detector, save_detector, shipped_detector
-from velfield.detection.label_orientation import with_axes
-from velfield.detection.orientation import axial_difference, structure_axis
+from velfield.detection.detector import Detector, train_detector
+from velfield.detection.files import load_detector, shipped_detector
+from velfield.detection.orientation import axial_difference, structure_axis, with_axes
 from velfield.detection.paper.response import dense_response
 from velfield.detection.paper.segmentation import moments, segment_response
-from velfield.detection.train import LabelledImage, train_detector
+from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 from velfield.pipeline.stages.labels import scaled
 from velfield.synthetic import Flight, small_flight
 
 SCALE = 0.92  # 16 px a car at 0.23 m a pixel
-SMALL = DetectionConfig(method="aligned", rounds=120, feature_pool=800, folds=2)
+SMALL = CascadeConfig(rounds=120, feature_pool=800, folds=2)
+PAPER = PaperConfig(rounds=120, feature_pool=800)
 MATCH_PX = 8.0
 
 
@@ -42,12 +44,12 @@ def sample(of: Flight, frame: int) -> LabelledImage:
 
 @cache
 def detector(method: str) -> Detector:
-    return train_detector([sample(flight(5), 0)], SMALL.model_copy(update={"method": method}))
+    return train_detector([sample(flight(5), 0)], {"cascade": SMALL, "paper": PAPER}[method])
 
 
 def found_in(of: Flight, frame: int, method: str) -> tuple[FrameDetections, LabelledImage]:
     truth = sample(of, frame)
-    return detect_frame(truth.image, None, detector(method), SMALL), truth
+    return detect_frame(truth.image, None, detector(method)), truth
 
 
 def matches(found: FrameDetections, truth: LabelledImage) -> list[tuple[int, int]]:
@@ -63,14 +65,14 @@ def matches(found: FrameDetections, truth: LabelledImage) -> list[tuple[int, int
 
 
 def test_cars_of_a_city_that_was_not_trained_on() -> None:
-    found, truth = found_in(flight(6), 1, "aligned")
+    found, truth = found_in(flight(6), 1, "cascade")
     pairs = matches(found, truth)
     assert len(pairs) / len(found.xy) > 0.85
     assert len(pairs) / len(truth.cars) > 0.7
 
 
 def test_the_axis_of_what_is_found() -> None:
-    found, truth = found_in(flight(6), 1, "aligned")
+    found, truth = found_in(flight(6), 1, "cascade")
     k, car = np.array(matches(found, truth)).T
     off = np.degrees(axial_difference(np.asarray(found.orientation_rad[k], np.float64), truth.cars[car, 2]))
     assert np.median(off) < 5
@@ -79,7 +81,7 @@ def test_the_axis_of_what_is_found() -> None:
 
 
 def test_pictures_go_with_each_find() -> None:
-    found, _ = found_in(flight(6), 1, "aligned")
+    found, _ = found_in(flight(6), 1, "cascade")
     n = len(found.xy)
     assert found.patches.shape == (n, 16, 8)
     assert found.chips.shape == (n, 32, 32)
@@ -93,22 +95,22 @@ def test_training_twice_is_one_detector() -> None:
 
 
 def test_the_papers_recipe_finds_cars_where_it_was_trained() -> None:
-    found, truth = found_in(flight(5), 0, "dense")
+    found, truth = found_in(flight(5), 0, "paper")
     assert len(matches(found, truth)) / len(truth.cars) > 0.4
 
 
 def test_the_papers_recipe_finds_as_much_by_the_response_at_every_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sampled at every second pixel, the blurred response is the same to a fortieth, a region's place to half a px."""
-    ours, truth = found_in(flight(5), 0, "dense")
-    sums, sigma = detector("dense").sums, SMALL.response_sigma_px
+    ours, truth = found_in(flight(5), 0, "paper")
+    sums, sigma = detector("paper").sums, PAPER.response_sigma_px
     blurred = [cv2.GaussianBlur(how(truth.image, sums), (0, 0), sigma) for how in (row_response, dense_response)]
     assert np.std(blurred[0] - blurred[1]) < 0.03 * np.std(blurred[0])
 
     def at_every_pixel(image: np.ndarray, sums: BoostedSums, *, grey_bits: int) -> np.ndarray:
         return row_response(image, sums, grey_bits)
 
-    monkeypatch.setattr("velfield.detection.paper.classifier.dense_response", at_every_pixel)
-    plain = detect_frame(truth.image, None, detector("dense"), SMALL)
+    monkeypatch.setattr("velfield.detection.paper.detector.dense_response", at_every_pixel)
+    plain = detect_frame(truth.image, None, detector("paper"))
     gap = np.hypot(*(ours.xy[:, None] - plain.xy[None]).transpose(2, 0, 1))
     for nearest in (gap.min(axis=0), gap.min(axis=1)):
         assert np.median(nearest) < 0.6
@@ -118,34 +120,33 @@ def test_the_papers_recipe_finds_as_much_by_the_response_at_every_pixel(monkeypa
 
 def test_a_higher_threshold_finds_fewer() -> None:
     truth = sample(flight(6), 1)
-    strict = SMALL.model_copy(update={"threshold": detector("aligned").threshold + 0.3})
-    fewer = detect_frame(truth.image, None, detector("aligned"), strict)
-    assert len(fewer.xy) < len(found_in(flight(6), 1, "aligned")[0].xy)
+    fewer = detect_frame(truth.image, None, detector("cascade"), threshold=detector("cascade").threshold + 0.3)
+    assert len(fewer.xy) < len(found_in(flight(6), 1, "cascade")[0].xy)
 
 
 def test_nothing_is_found_where_the_frame_does_not_reach() -> None:
     truth = sample(flight(6), 1)
     valid = np.zeros(truth.image.shape, bool)
     valid[:, : truth.image.shape[1] // 2] = True
-    found = detect_frame(truth.image, valid, detector("aligned"), SMALL)
+    found = detect_frame(truth.image, valid, detector("cascade"))
     assert len(found.xy) > 0
     assert found.xy[:, 0].max() < truth.image.shape[1] // 2 + 4
 
 
 def test_too_few_cars_to_learn_from() -> None:
     truth = sample(flight(5), 0)
-    with pytest.raises(InputError, match="cars to learn from"):
+    with pytest.raises(InputError, match="3 labelled cars, 8 needed"):
         train_detector([LabelledImage(image=truth.image, cars=truth.cars[:3])], SMALL)
 
 
 def test_a_detector_comes_back_from_its_file(tmp_path: Path) -> None:
-    save_detector(detector("aligned"), tmp_path / "d.json")
-    assert load_detector(tmp_path / "d.json").record == detector("aligned").record
+    detector("cascade").save(tmp_path / "d.json")
+    assert load_detector(tmp_path / "d.json").record == detector("cascade").record
 
 
 @pytest.mark.parametrize("damage", ["not json", "another file", "no rounds", "a rectangle without area"])
 def test_a_detector_file_that_is_not_ours_is_one_clear_line(tmp_path: Path, damage: str) -> None:
-    record = json.loads(detector("aligned").record.model_dump_json())
+    record = json.loads(detector("cascade").record.model_dump_json())
     if damage == "no rounds":
         record["rounds"] = []
     if damage == "a rectangle without area":
@@ -229,8 +230,8 @@ def test_of_two_finds_on_one_car_the_better_stays() -> None:
 def test_few_cars_continue_an_earlier_detector() -> None:
     truth = sample(flight(5), 0)
     few = LabelledImage(image=truth.image, cars=truth.cars[:12], complete=False)
-    earlier = detector("aligned")
-    continued = train_detector([few], SMALL, continued=earlier)
+    earlier = detector("cascade")
+    continued = train_detector([few], SMALL, base=earlier)
     assert 0.9 * SMALL.rounds < len(continued.record.rounds) - len(earlier.record.rounds) <= SMALL.rounds
     assert continued.record.attribution == earlier.record.attribution
     assert continued.threshold == pytest.approx((0.15 + 4 * earlier.threshold) / 5)
@@ -238,25 +239,26 @@ def test_few_cars_continue_an_earlier_detector() -> None:
 
 
 def test_marked_cars_teach_the_network_where_it_knows_their_size() -> None:
-    config = DetectionConfig(network_steps=3)
+    config = CnnConfig(fine_tune_steps=3)
     truth = sample(flight(5), 0)
     few = LabelledImage(image=truth.image, cars=truth.cars[:12], complete=False)
-    assert train_detector([few], config).record.method == "network"
-    other = SMALL.model_copy(update={"method": "network", "working_car_length_px": 20.0})
-    assert train_detector([few], other).record.method == "aligned"
+    assert train_detector([few], config).record.method == "cnn"
+    cascade = CascadeTraining(rounds=40, feature_pool=250)
+    other = CnnConfig(working_car_length_px=20.0, cascade=cascade)
+    assert train_detector([few], other).record.method == "cascade"
 
 
 def f_measure(of: Detector, truth: LabelledImage) -> float:
-    found = detect_frame(truth.image, None, of, SMALL)
+    found = detect_frame(truth.image, None, of)
     return 2 * len(matches(found, truth)) / max(len(found.xy) + len(truth.cars), 1)
 
 
 def test_a_detector_of_another_kind_is_not_continued() -> None:
-    with pytest.raises(InputError, match="of the aligned method"):
-        train_detector([sample(flight(5), 0)], SMALL, continued=detector("dense"))
+    with pytest.raises(InputError, match="detector of method paper to continue"):
+        train_detector([sample(flight(5), 0)], SMALL, base=detector("paper"))
     other = SMALL.model_copy(update={"working_car_length_px": 20.0})
     with pytest.raises(InputError, match="cars of 16 px to continue, expected 20 px"):
-        train_detector([sample(flight(5), 0)], other, continued=detector("aligned"))
+        train_detector([sample(flight(5), 0)], other, base=detector("cascade"))
 
 
 def test_the_shipped_detector_names_whose_pictures_it_learnt_from_and_finds_cars_of_unseen_cities() -> None:

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from schemas.detector import Rectangle, Round
-from velfield.detection.boosting import random_pool
+from velfield.detection.boosting import random_pool, sums_of
 from velfield.detection.cascade.ensemble import committee_of
 from velfield.detection.cascade.feature_image import picture_of, scores_at
-from velfield.detection.detector import sums_of
 
 
 def rounds(count: int, seed: int) -> tuple[Round, ...]:
@@ -20,7 +19,7 @@ def rounds(count: int, seed: int) -> tuple[Round, ...]:
         rectangles = tuple(Rectangle(**dict(zip(("sign", "x0", "y0", "x1", "y1"), row, strict=True))) for row in rows)
         below, above = rng.normal(0, 0.3, 2).tolist()
         channel = int(pool.channels[k])
-        said = {"threshold": float(rng.normal(0, 2)), "below": below, "above": above}
+        said = {"threshold": float(rng.normal(0, 2)), "leaf_low": below, "leaf_high": above}
         found.append(Round(channel=channel, rectangles=rectangles, **said))  # type: ignore[arg-type]
     return tuple(found)
 
@@ -29,7 +28,9 @@ def rounds(count: int, seed: int) -> tuple[Round, ...]:
 def test_a_committee_says_the_mean_of_what_its_members_say(shared: int) -> None:
     """Members of different length; with rounds that two of them share and say with different force."""
     members = [rounds(40, 1), rounds(20, 2), rounds(20, 3)]
-    doubled = [r.model_copy(update={"below": 2 * r.below, "above": 2 * r.above}) for r in members[0][:shared]]
+    doubled = [
+        r.model_copy(update={"leaf_low": 2 * r.leaf_low, "leaf_high": 2 * r.leaf_high}) for r in members[0][:shared]
+    ]
     members[1] = (*members[1], *doubled)
     rng = np.random.default_rng(4)
     picture = picture_of(rng.integers(0, 256, (120, 160), dtype=np.uint8))

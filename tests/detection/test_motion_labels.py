@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
-from schemas.flight import DetectionConfig
+from schemas.detector import CnnConfig
 from velfield.detection.motion.blobs import Blobs, extract_blobs, merge_blobs
 from velfield.detection.motion.difference import (
     MotionFrame,
@@ -148,7 +148,7 @@ def test_the_length_of_a_car_is_found_when_it_is_not_known(scale: float) -> None
     labels = labels_from_motion(frames)
     assert labels.usable
     assert labels.car_length_px == pytest.approx(LENGTH * scale, rel=0.15)
-    assert working_scale(DetectionConfig(), None, labels, labels_scale=scale) == pytest.approx(1.0, rel=0.15)
+    assert working_scale(CnnConfig(), None, labels, labels_scale=scale) == pytest.approx(1.0, rel=0.15)
 
 
 def test_a_standing_car_is_no_label_and_no_ignore_region() -> None:
@@ -190,7 +190,7 @@ def test_a_still_scene_gives_no_label_even_without_a_known_length() -> None:
     assert labels.count == 0
     assert not labels.usable
     with pytest.raises(InputError, match="--gsd-m"):
-        working_scale(DetectionConfig(), None, labels)
+        working_scale(CnnConfig(), None, labels)
 
 
 def test_roofs_that_shift_against_the_ground_are_not_taken_for_cars() -> None:

@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from schemas.arrays import FloatArray
-from schemas.detector import MotionRecord
-from schemas.flight import DetectionConfig
+from schemas.detector import CnnConfig, MotionRecord
 from velfield.detection.cnn.inference import background_difference_at, motion_score_bonus
 from velfield.detection.cnn.self_training import fit_motion_thresholds, self_train_from_motion, stationary_threshold
 from velfield.detection.detect import detect_frame
-from velfield.detection.detector import shipped_detector
 from velfield.detection.evaluation import matched
+from velfield.detection.files import shipped_detector
 from velfield.detection.motion.difference import MotionFrame, motion_background
 from velfield.detection.motion.evaluation import MotionState
 from velfield.detection.motion.labels import labels_from_motion
@@ -66,10 +65,10 @@ def test_what_moves_needs_to_be_liked_less() -> None:
     threshold, motion, curve = chosen
     lifted = score + motion_score_bonus(motion, differs)
     assert (lifted > threshold)[kind == MotionState.MOVING].mean() > 0.95
-    assert motion.lift > 0.05
-    assert 5 < motion.still_grey < motion.moving_grey < 40
-    assert curve.threshold[curve.chosen or 0] == pytest.approx(threshold, abs=0.02)
-    assert curve.recall[curve.chosen or 0] > 0.95
+    assert motion.max_score_bonus > 0.05
+    assert 5 < motion.bonus_ramp_start < motion.bonus_ramp_end < 40
+    assert curve.threshold[curve.operating_point or 0] == pytest.approx(threshold, abs=0.02)
+    assert curve.recall[curve.operating_point or 0] > 0.95
 
 
 @pytest.mark.parametrize(("moves", "off"), [(39, 40.0), (200, 5.5)])
@@ -78,10 +77,10 @@ def test_without_enough_that_moves_and_differs_nothing_is_chosen(moves: int, off
 
 
 def test_a_lift_grows_between_what_stands_and_what_moves() -> None:
-    motion = MotionRecord(still_grey=10, moving_grey=30, lift=0.2)
+    motion = MotionRecord(bonus_ramp_start=10, bonus_ramp_end=30, max_score_bonus=0.2)
     np.testing.assert_allclose(motion_score_bonus(motion, np.array([0.0, 10, 20, 30, 90])), [0, 0, 0.1, 0.2, 0.2])
-    with pytest.raises(ValidationError, match="what moves differs by 9, what stands by 10"):
-        MotionRecord(still_grey=10, moving_grey=9, lift=0.2)
+    with pytest.raises(ValidationError, match="the ramp ends at 9 and starts at 10"):
+        MotionRecord(bonus_ramp_start=10, bonus_ramp_end=9, max_score_bonus=0.2)
 
 
 def test_the_difference_is_that_about_a_place() -> None:
@@ -100,7 +99,7 @@ STILL = PINHOLE.model_copy(update={"drift_m": 0.0, "climb_share": 0.0, "turn_deg
 def flight() -> tuple[list[MotionFrame], list[FloatArray], NDArray[np.uint8]]:
     """Frames of a camera that hangs still, on the working grid, the cars in them, and the background."""
     made = small_flight(frames=15, width=960, height=720, seed=9601, camera=STILL)
-    factor = 16.0 * made.config.gsd_m / DetectionConfig().car_length_m
+    factor = 16.0 * made.config.gsd_m / CnnConfig().car_length_m
     frames, cars = [], []
     for k in range(15):
         image = np.asarray(
@@ -121,7 +120,7 @@ def test_cars_that_stand_are_found_by_a_network_that_learnt_from_those_that_move
         for frame, found in list(zip(frames, labels.frames, strict=True))[2:14:4]
         if found.labelled
     ]
-    config = DetectionConfig(network_steps=6)
+    config = CnnConfig(fine_tune_steps=6)
     learnt = self_train_from_motion(samples, shipped_detector(), frames[3:12], background, config, max_interval_s=0.45)
     assert learnt is not None
     assert learnt.uses_background

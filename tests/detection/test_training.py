@@ -10,17 +10,17 @@ import pytest
 from flows.cli import app
 from flows.commands import train as train_command
 from schemas.flight import FramesConfig
-from velfield.detection.detector import load_detector, shipped_detector
+from velfield.detection.cascade.scenes import scene_of
+from velfield.detection.files import load_detector, shipped_detector
 from velfield.detection.orientation import axial_difference
 from velfield.detection.review import review_sheet
-from velfield.detection.samples import scene_of
 from velfield.errors import InputError
 from velfield.pipeline.stages.labels import labelled_images, odd_length
 from velfield.sources.labels.labels import read_labels
 from velfield.sources.source import probe
 from velfield.synthetic import small_flight
 
-QUICK = ["--set", "detection.network_steps=6"]
+QUICK = ["--set", "detection.fine_tune_steps=6"]
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +57,8 @@ def test_marked_cars_become_a_detector_and_a_sheet(
     assert train(marked, "--out", str(out), "--review", str(sheet)) == 0
     detector = load_detector(out)
     assert detector.record.cars == 14
-    assert detector.record.method == "network"
-    assert detector.record.network != shipped_detector().record.network
+    assert detector.record.method == "cnn"
+    assert detector.record.layers != shipped_detector().record.layers
     assert cv2.imread(str(sheet)).shape[1] == 1024
     said = capsys.readouterr().out
     assert "14 cars, frames marked: 1" in said

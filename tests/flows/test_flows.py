@@ -14,7 +14,8 @@ from schemas.summary import RunSummary
 from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
 from tests.small_flight import FRAMES, digests, job, process, redone
 from velfield import open_run
-from velfield.detection.detector import Detector, save_detector, shipped_detector
+from velfield.detection.detector import from_record
+from velfield.detection.files import shipped_detector
 from velfield.errors import InputError
 from velfield.pipeline.plan import make_plan
 from velfield.pipeline.stages.detections import detect_block
@@ -117,10 +118,8 @@ def test_a_detector_that_looks_at_the_background_is_given_that_of_this_flight(
 ) -> None:
     root, file, found = tmp_path / "copy", tmp_path / "detector.json", []
     shutil.copytree(whole[0], root)
-    for motion in (None, MotionRecord(still_grey=8, moving_grey=20, lift=0.3)):
-        save_detector(
-            Detector(shipped_detector().record.model_copy(update={"motion": motion, "threshold": 0.35})), file
-        )
+    for motion in (None, MotionRecord(bonus_ramp_start=8, bonus_ramp_end=20, max_score_bonus=0.3)):
+        from_record(shipped_detector().record.model_copy(update={"motion": motion, "threshold": 0.35})).save(file)
         plan = make_plan(job(flight, root, detector=str(file)))
         outcome = make_detector(plan)
         assert (RunLayout(root).background in outcome.outputs) == (motion is not None)

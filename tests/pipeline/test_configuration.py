@@ -1,11 +1,13 @@
 """The configuration: what is stronger than what, and what a wrong key is told."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from schemas.detector import METHODS, CascadeConfig, CascadeTraining, CnnConfig, DetectorConfig, PaperConfig
 from schemas.flight import FlightConfig
 from schemas.renames import OLD_KEYS, OLD_VALUES, REMOVED_KEYS, upgrade_config
 from velfield.errors import InputError, OldNameWarning
@@ -20,10 +22,61 @@ def test_each_source_is_stronger_than_the_one_before(tmp_path: Path) -> None:
     file = tmp_path / "flight.yaml"
     file.write_text("preset: paper\ngsd_m: 0.3\ndetection: {rounds: 150}\ntracking: {max_speed_m_per_s: 20}\n")
     config = resolve_config(file=file, settings=["tracking.max_speed_m_per_s=25"], overrides={"gsd_m": 0.4})
-    assert config.detection.method == "dense"  # the preset's
+    assert config.detection.method == "paper"  # the preset's
     assert config.detection.rounds == 150  # the file's, over the preset's 200
     assert config.tracking.max_speed_m_per_s == 25
     assert config.gsd_m == 0.4
+
+
+@pytest.mark.parametrize(
+    "settings", list(permutations(["detection.method=paper", "detection.rounds=100", "detection.seed=3"]))
+)
+@pytest.mark.parametrize("preset", ["best", "fast", "paper"])
+def test_a_method_and_its_keys_are_set_in_any_order(settings: Sequence[str], preset: str) -> None:
+    detection = resolve_config(preset=preset, settings=settings).detection
+    assert detection == PaperConfig(rounds=100, seed=3)  # what the preset sets of another method is left out
+
+
+def test_a_preset_sets_keys_of_its_own_method_only() -> None:
+    assert resolve_config(preset="fast").detection == CascadeConfig(rounds=300, feature_pool=1500, folds=2)
+    assert resolve_config(preset="fast", settings=["detection.method=cnn"]).detection == CnnConfig()
+    fast = resolve_config(preset="fast", settings=["detection.method=cascade", "detection.rounds=200"]).detection
+    assert fast == CascadeConfig(rounds=200, feature_pool=1500, folds=2)
+
+
+@pytest.mark.parametrize("model", METHODS)
+def test_no_key_is_accepted_that_the_method_never_reads(model: type[DetectorConfig]) -> None:
+    method = model.model_fields["method"].default
+    for other in METHODS:
+        for key in set(other.model_fields) - set(model.model_fields):
+            with pytest.raises(InputError, match=rf"detection\.{key} is read by .*, not by {method}; "):
+                resolve_config(settings=[f"detection.{key}=1", f"detection.method={method}"])
+
+
+def test_a_key_of_another_method_is_told_where_it_is_read() -> None:
+    with pytest.raises(InputError) as caught:
+        resolve_config(settings=["detection.rounds=100"])
+    assert str(caught.value) == (
+        "configuration: detection.rounds is read by cascade and paper, not by cnn; set detection.cascade.rounds, "
+        "choose detection.method=cascade or leave it out"
+    )
+    with pytest.raises(InputError, match=r"did you mean 'detection\.cascade\.rounds'"):
+        resolve_config(settings=["detection.cascade.round=100"])
+
+
+def test_a_section_of_format_1_is_read_by_its_method() -> None:
+    """It held the keys of all methods; those that its own read elsewhere, or not at all, are said."""
+    old = {"method": "network", "network_steps": 9, "rounds": 70, "folds": 3, "car_radius_px": 6.0, "seed": 4}
+    tree, lines = upgrade_config({"detection": old})
+    assert FlightConfig.model_validate(tree).detection == CnnConfig(
+        fine_tune_steps=9, cascade=CascadeTraining(rounds=70, folds=3), seed=4
+    )
+    assert "detection.car_radius_px is ignored: method cnn does not read it" in lines
+    assert any(line.startswith("detection.rounds is now detection.cascade.rounds") for line in lines)
+    tree, _ = upgrade_config({"detection": old | {"method": "dense"}})
+    assert FlightConfig.model_validate(tree).detection == PaperConfig(rounds=70, seed=4)
+    tree, _ = upgrade_config({"detection": old | {"method": "aligned"}})
+    assert FlightConfig.model_validate(tree).detection == CascadeConfig(rounds=70, folds=3, seed=4)
 
 
 def test_an_option_that_was_not_given_changes_nothing() -> None:
@@ -37,7 +90,7 @@ def test_an_option_that_was_not_given_changes_nothing() -> None:
         (["tracking.max_speed_m_per_s=.nan"], "finite"),
         (["tracking.max_speed_m_per_s=.inf"], "finite"),
         (["tracking.max_speed_m_per_s=-1"], "greater than 0"),
-        (["detection.method=dnse"], "'network', 'aligned' or 'dense'"),
+        (["detection.method=dnse"], "expected one of 'cnn', 'cascade', 'paper'"),
         (["gsd_m"], "expected section.key=value"),
         (["gsd_m.metres=1", "gsd_m=2"], ""),
         (["preset=worst"], "best, fast, paper"),
@@ -80,6 +133,8 @@ def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     [
         ("registration.window_px=60", "registration.match_search_px=60"),
         ("tracking.linking=links", "tracking.linking=pairwise"),
+        ("detection.network_steps=100", "detection.fine_tune_steps=100"),
+        ("detection.method=aligned", "detection.method=cascade"),
         ("field.one_pixel_wide=true", "field.path_width=pixel"),
         ("field.weigh_shared_segments=twice", "field.shared_segment_weight=2"),
         ("field.slice=15min", "field.time_intervals=15min"),

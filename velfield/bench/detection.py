@@ -10,16 +10,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from schemas.flight import DetectionConfig
+from schemas.detector import CascadeConfig
 from velfield.bench.scenes import simulated_image
-from velfield.detection.boosting import random_pool
+from velfield.detection.boosting import BoostedSums, random_pool
 from velfield.detection.cascade.classifier import Look, offset_grid
+from velfield.detection.cascade.detector import CascadeDetector
 from velfield.detection.cascade.feature_image import picture_of
 from velfield.detection.cnn.convolution import PaddedBatchLayout, conv2d
 from velfield.detection.detect import detect_frame
-from velfield.detection.detector import BoostedSums, Detector
+from velfield.detection.detector import Detector
 from velfield.detection.paper.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, continued, dense_response
-from velfield.detection.train import train_detector
 from velfield.synthetic import small_flight
 
 _TURNS = np.radians(np.arange(0.0, 180.0, 15.0))
@@ -152,14 +152,14 @@ def response_speed(image: NDArray[np.uint8]) -> tuple[Speed, Speed]:
     return Speed(what, "whole rows of int32", fast, rows), Speed(what, "numpy", fast, slow)
 
 
-def learnt_there() -> Detector:
+def learnt_there() -> CascadeDetector:
     """A detector of the usual size, learnt from the marked cars of one frame of another simulated city."""
-    return train_detector([simulated_image(_LEARNT_FROM)], DetectionConfig(method="aligned"))
+    return CascadeDetector.train([simulated_image(_LEARNT_FROM)], CascadeConfig())
 
 
 def network_speed(image: NDArray[np.uint8], detector: Detector) -> Speed:
     """The network, places that it likes looked at again, beside convolutions of YOLOv8n's sizes on such a frame."""
-    fast = _fastest(lambda: detect_frame(image, None, detector, DetectionConfig()), 2)
+    fast = _fastest(lambda: detect_frame(image, None, detector), 2)
     peer = 0.0
     for step, taps, into, out in YOLOV8N:
         layout = PaddedBatchLayout(1, image.shape[0] // step, image.shape[1] // step)
@@ -168,13 +168,13 @@ def network_speed(image: NDArray[np.uint8], detector: Detector) -> Speed:
     return Speed("the network, shipped", "convolutions of YOLOv8n's sizes", fast, peer)
 
 
-def cascade_speed(image: NDArray[np.uint8], detector: Detector, name: str, *, crop_px: int = 96) -> Speed:
+def cascade_speed(image: NDArray[np.uint8], detector: CascadeDetector, name: str, *, crop_px: int = 96) -> Speed:
     """Both steps against the second step's classifier at every pixel and turn, of a crop, scaled up.
 
     The surer a detector is, the fewer places it looks at twice.
     """
-    fast = _fastest(lambda: detect_frame(image, None, detector, DetectionConfig()), 2)
-    look = Look(picture_of(image), detector.sums, float(detector.record.contrast_floor or 0.0))
+    fast = _fastest(lambda: detect_frame(image, None, detector), 2)
+    look = Look(picture_of(image), detector.sums, detector.record.contrast_floor)
     spots = np.arange(0, crop_px, _TILE_PX) + _TILE_PX / 2
     tiles = np.stack(np.meshgrid(spots, spots), axis=-1).reshape(-1, 2).astype(np.float64)
     half = offset_grid(_TILE_PX // 2, _TILE_PX // 2)

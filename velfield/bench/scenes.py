@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from schemas.flight import DetectionConfig
+from schemas.detector import CnnConfig
 from velfield.detection.samples import LabelledImage
 from velfield.synthetic import small_flight
 
@@ -18,7 +18,7 @@ def simulated_image(seed: int, size: tuple[int, int] = (640, 480), large_share: 
     }
     traffic = {} if large_share is None else {"large_share": large_share}
     flight = small_flight(frames=1, width=size[0], height=size[1], seed=seed, scene=scene, traffic=traffic)
-    factor = 16.0 * flight.config.gsd_m / DetectionConfig().car_length_m
+    factor = 16.0 * flight.config.gsd_m / CnnConfig().car_length_m
     cars = flight.labels(0)[["x_px", "y_px", "orientation_rad", "length_px", "width_px"]].to_numpy(copy=True)
     cars[:, :2] = (cars[:, :2] + 0.5) * factor - 0.5
     cars[:, 3:] *= factor

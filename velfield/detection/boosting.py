@@ -1,5 +1,6 @@
 """AdaBoost over stumps on random rectangle sums (paper: car detection); binned, so that a round is a histogram."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,6 +8,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from schemas.arrays import ByteArray, Float32Array, FloatArray, IntArray
+from schemas.detector import Round
 
 Int32s = NDArray[np.int32]
 
@@ -197,19 +199,57 @@ def _best_stump(bins, weights, cars, others, chosen):  # type: ignore[no-untyped
     return best_feature, best_edge
 
 
-def rounds_of(pool: RectanglePool, stumps: Stumps) -> list[dict[str, object]]:
-    """The rounds as plain values, for a `schemas.detector.DetectorRecord`."""
-    rounds: list[dict[str, object]] = []
-    for feature, threshold, (below, above) in zip(stumps.features, stumps.thresholds, stumps.leaves, strict=True):
+def rounds_of(pool: RectanglePool, stumps: Stumps) -> tuple[Round, ...]:
+    """The rounds as a detector's record holds them."""
+    rounds = []
+    for feature, threshold, (low, high) in zip(stumps.features, stumps.thresholds, stumps.leaves, strict=True):
         rows = pool.table[pool.starts[feature] : pool.starts[feature + 1]]
         names = ("sign", "x0", "y0", "x1", "y1")
-        rounds.append(
-            {
-                "channel": int(pool.channels[feature]),
-                "rectangles": [dict(zip(names, map(int, row), strict=True)) for row in rows],
-                "threshold": float(threshold),
-                "below": float(below),
-                "above": float(above),
-            }
-        )
-    return rounds
+        fields = {
+            "channel": int(pool.channels[feature]),
+            "rectangles": [dict(zip(names, map(int, row), strict=True)) for row in rows],
+            "threshold": float(threshold),
+            "leaf_low": float(low),
+            "leaf_high": float(high),
+        }
+        rounds.append(Round.model_validate(fields))
+    return tuple(rounds)
+
+
+@dataclass(frozen=True)
+class BoostedSums:
+    """Rounds of boosting as arrays, for the kernels.
+
+    Attributes
+    ----------
+    rectangles
+        (r, 5) int32: sign, x0, y0, x1, y1 from the centre.
+    starts
+        (rounds + 1,) int32: rectangles of round k are ``starts[k]:starts[k + 1]``.
+    channels
+        (rounds,) int32.
+    thresholds, leaves
+        (rounds,) and (rounds, 2) float32: what is said at or below, and above.
+    """
+
+    rectangles: NDArray[np.int32]
+    starts: NDArray[np.int32]
+    channels: NDArray[np.int32]
+    thresholds: NDArray[np.float32]
+    leaves: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.thresholds)
+
+
+def sums_of(rounds: Sequence[Round]) -> BoostedSums:
+    """Rounds as arrays."""
+    table = [(r.sign, r.x0, r.y0, r.x1, r.y1) for one in rounds for r in one.rectangles]
+    starts = np.cumsum([0, *(len(one.rectangles) for one in rounds)])
+    return BoostedSums(
+        rectangles=np.array(table, np.int32).reshape(-1, 5),
+        starts=starts.astype(np.int32),
+        channels=np.array([one.channel for one in rounds], np.int32),
+        thresholds=np.array([one.threshold for one in rounds], np.float32),
+        leaves=np.array([(one.leaf_low, one.leaf_high) for one in rounds], np.float32),
+    )

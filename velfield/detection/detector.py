@@ -1,145 +1,190 @@
-"""A trained detector: boosted sums of rectangles with a threshold, read from and written to JSON."""
+"""What every car detector offers, and the registry of detectors by name of their method.
 
+A detector is trained on labelled images (`Detector.train`), or on a flight without any (`Detector.train_from_motion`),
+detects cars on images in base orientation, rescaled to a car's usual length (`Detector.detect`), and is a record that
+goes into a JSON file and comes back (`Detector.save`, `load_detector`). Another one is a package
+``velfield/detection/<method>`` whose module ``detector`` names its class ``DETECTOR``, and its configuration and record
+in `schemas.detector`.
+"""
+
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from importlib.resources import files
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-import numpy as np
-from numpy.typing import NDArray
-from pydantic import ValidationError
-
-from schemas.detector import DetectorRecord, PrecisionRecallCurve, Round
-from velfield.detection.cnn.model import Network, network_from_record
+from schemas.arrays import FloatArray, GreyImage, Mask
+from schemas.detector import METHODS, BaseRecord, DetectorConfig, PrecisionRecallCurve
 from velfield.errors import InputError
 
-MAX_BYTES = 20_000_000
-_SHIPPED = "shipped_detector.json"
+if TYPE_CHECKING:
+    from velfield.detection.samples import LabelledImage
+    from velfield.detection.unlabelled import UnlabelledFlight
+
+MIN_CARS = 8
+"""Fewer labelled cars than this do not train a detector."""
 
 
 @dataclass(frozen=True)
-class BoostedSums:
-    """Rounds of boosting as arrays, for the kernels.
+class Detections:
+    """Cars of an image, in no order.
 
     Attributes
     ----------
-    rectangles
-        (r, 5) int32: sign, x0, y0, x1, y1 from the centre.
-    starts
-        (rounds + 1,) int32: rectangles of round k are ``starts[k]:starts[k + 1]``.
-    channels
-        (rounds,) int32.
-    thresholds, leaves
-        (rounds,) and (rounds, 2) float32: what is said at or below, and above.
+    xy : (n, 2) float64, working px.
+    orientation_rad : (n,) axial, [0, pi), from +x towards +y (down).
+    orientation_sd_rad : (n,) its standard deviation.
+    area_px : (n,) working px^2.
+    score : (n,) above the score threshold.
     """
 
-    rectangles: NDArray[np.int32]
-    starts: NDArray[np.int32]
-    channels: NDArray[np.int32]
-    thresholds: NDArray[np.float32]
-    leaves: NDArray[np.float32]
+    xy: FloatArray
+    orientation_rad: FloatArray
+    orientation_sd_rad: FloatArray
+    area_px: FloatArray
+    score: FloatArray
+
+    @classmethod
+    def from_rows(cls, rows: FloatArray, area_px: FloatArray) -> "Detections":
+        """Of rows (n, 5): x, y, axis, score, standard deviation of the axis; and areas (n,)."""
+        return cls(rows[:, :2], rows[:, 2], rows[:, 4], area_px, rows[:, 3])
 
     def __len__(self) -> int:
-        return len(self.thresholds)
+        return len(self.score)
 
 
 @dataclass(frozen=True)
-class Detector:
-    """A detector file, in use."""
+class Detector(ABC):
+    """A trained detector; each method has a class of its own, which narrows `record`."""
 
-    record: DetectorRecord
+    record: BaseRecord
+    method: ClassVar[str]
+
+    @abstractmethod
+    def detect(
+        self,
+        image: GreyImage,
+        valid: Mask | None = None,
+        background: GreyImage | None = None,
+        *,
+        threshold: float | None = None,
+    ) -> Detections:
+        """Detect cars.
+
+        Parameters
+        ----------
+        image
+            (h, w) uint8 on the working grid.
+        valid
+            (h, w): where the frame covers it; none: everywhere.
+        background
+            (h, w) uint8 temporal median, for a detector that `uses_background`.
+        threshold
+            Score threshold in place of the detector's own.
+        """
+
+    @classmethod
+    @abstractmethod
+    def train(cls, samples: Sequence["LabelledImage"], config: Any, *, base: "Detector | None" = None) -> "Detector":
+        """Train on labelled images.
+
+        Parameters
+        ----------
+        config
+            The section of this method.
+        base
+            An earlier detector of this method to continue, where the method can.
+
+        Raises
+        ------
+        InputError
+            ``base`` cannot be continued.
+        """
+
+    @classmethod
+    def train_from_motion(cls, flight: "UnlabelledFlight", config: Any) -> "Detector":
+        """Train on cars that move; the score threshold follows from how detections move."""
+        return flight.calibrate(flight.train(config), config)
+
+    @property
+    def uses_background(self) -> bool:
+        """Whether it reads |frame - background|."""
+        return False
 
     @property
     def threshold(self) -> float:
-        """Threshold T on the response."""
+        """Score threshold."""
         return self.record.threshold
 
     @property
     def curve(self) -> PrecisionRecallCurve | None:
-        """Precision and recall on cars left out of training."""
+        """Precision and recall on cars held out of training."""
         return self.record.curve
 
-    def check_car_length(self, wanted_px: float) -> None:
-        """Raise InputError where cars of this length, working px, are not those that it can be continued on."""
+    def with_threshold(self, threshold: float, curve: PrecisionRecallCurve | None) -> Self:
+        """The detector with another score threshold, and the curve that it was chosen on."""
+        return type(self)(self.record.model_copy(update={"threshold": threshold, "curve": curve}))
+
+    def check_car_length(self, expected_px: float) -> None:
+        """Raise InputError where it was trained on cars of another length than this, working px."""
         length_px = self.record.working_car_length_px
-        if length_px != wanted_px:
+        if length_px != expected_px:
             raise InputError(
-                f"found a detector of cars of {length_px:g} px to continue, expected {wanted_px:g} px; "
+                f"found a detector of cars of {length_px:g} px to continue, expected {expected_px:g} px; "
                 "set detection.working_car_length_px"
             )
 
-    @cached_property
-    def uses_background(self) -> bool:
-        """Whether it looks at |frame - background|."""
-        return self.record.motion is not None or any(r.channel == 3 for r in self.record.rounds)
+    def to_json(self) -> str:
+        """The content of its file."""
+        return self.record.model_dump_json()
 
-    @cached_property
-    def network(self) -> Network:
-        """The network's weights; only of the method of that name."""
-        return network_from_record(self.record.network or {})
-
-    @cached_property
-    def sums(self) -> BoostedSums:
-        """The rounds as arrays."""
-        return sums_of(self.record.rounds)
-
-    @cached_property
-    def proposer_sums(self) -> BoostedSums:
-        """The rounds of step one as arrays; none for the dense method."""
-        return sums_of(self.record.proposer.rounds if self.record.proposer else ())
+    def save(self, path: Path) -> None:
+        """Write a detector file."""
+        path.write_text(self.to_json())
 
 
-def sums_of(rounds: Sequence[Round]) -> BoostedSums:
-    """Rounds as arrays."""
-    table = [(r.sign, r.x0, r.y0, r.x1, r.y1) for one in rounds for r in one.rectangles]
-    starts = np.cumsum([0, *(len(one.rectangles) for one in rounds)])
-    return BoostedSums(
-        rectangles=np.array(table, np.int32).reshape(-1, 5),
-        starts=starts.astype(np.int32),
-        channels=np.array([one.channel for one in rounds], np.int32),
-        thresholds=np.array([one.threshold for one in rounds], np.float32),
-        leaves=np.array([(one.below, one.above) for one in rounds], np.float32),
-    )
+_CLASSES: dict[str, type[Detector]] = {}
 
 
-def save_detector(detector: Detector, path: Path) -> None:
-    """Write a detector file."""
-    path.write_text(detector.record.model_dump_json())
+def register(detector: type[Detector]) -> None:
+    """Let a class be known by its method, besides those that lie in ``velfield/detection/<method>``."""
+    _CLASSES[detector.method] = detector
 
 
-def load_detector(path: Path) -> Detector:
-    """Read a detector file.
+def detector_class(method: str) -> type[Detector]:
+    """The class of a method, imported when it is first asked for: some take a second."""
+    if method not in _CLASSES:
+        if method not in {model.model_fields["method"].default for model in METHODS}:
+            raise InputError(f"found no detector {method!r}; expected one that is registered")
+        register(import_module(f"velfield.detection.{method}.detector").DETECTOR)
+    return _CLASSES[method]
+
+
+def from_record(record: BaseRecord) -> Detector:
+    """The detector of a record."""
+    return detector_class(record.method)(record)
+
+
+def train_detector(
+    samples: Sequence["LabelledImage"], config: DetectorConfig, *, base: Detector | None = None
+) -> Detector:
+    """Train a detector on labelled images (paper: car detection).
+
+    Parameters
+    ----------
+    config
+        Its ``method`` chooses the detector.
+    base
+        An earlier detector to continue: its method is trained, whatever the configuration's.
 
     Raises
     ------
     InputError
-        Not there, too large, not ours, or a number out of range.
+        Too few cars; a base that cannot be continued.
     """
-    if not path.is_file():
-        raise InputError(
-            f"{path}: no such detector file; give one that `velfield train` wrote, or leave the option out"
-        )
-    if path.stat().st_size > MAX_BYTES:
-        raise InputError(
-            f"{path}: found {path.stat().st_size} bytes, a detector file has {MAX_BYTES} at most; is it ours?"
-        )
-    return _parsed(path.read_bytes(), str(path))
-
-
-def _parsed(data: bytes, name: str) -> Detector:
-    try:
-        return Detector(DetectorRecord.model_validate_json(data))
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "the file"
-        raise InputError(
-            f"{name}: {where}: {first['msg'].lower()}; expected a detector file as velfield writes it (detector.json): "
-            "make one with `velfield train`"
-        ) from None
-
-
-def shipped_detector() -> Detector:
-    """The detector that comes with velfield, for flights with neither labels nor enough motion."""
-    resource = files("velfield.detection").joinpath(_SHIPPED)
-    return _parsed(resource.read_bytes(), _SHIPPED)
+    count = sum(len(sample.cars) for sample in samples)
+    if count < MIN_CARS:
+        raise InputError(f"{count} labelled cars, {MIN_CARS} needed to train a detector; label the cars of one frame")
+    method = config.method if base is None else base.method
+    return detector_class(method).train(samples, config.for_method(method), base=base)

@@ -1,4 +1,4 @@
-"""How good a detector will be, from cars left out of its training; T and the cascade's cuts follow from it."""
+"""Evaluation on cars held out of training, in spatial folds: precision and recall, and the score threshold."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,22 +8,16 @@ from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, Mask
 from schemas.detector import PrecisionRecallCurve
-from velfield.detection.cascade.classifier import FIRST_ROUNDS, Look, distinct, find_cars
-from velfield.detection.cascade.proposals import propose
-from velfield.detection.cascade.training import CONTRAST_FLOOR
-from velfield.detection.detector import BoostedSums
-from velfield.detection.samples import LabelledImage, Scene, distance, is_far, lies_in
+from velfield.detection.samples import LabelledImage
 
 FOLD_MIN_CARS = 16
 """With fewer marked cars none are left out to choose T."""
 MATCH_PX = 8.0
 """A find this near to a car's middle is that car, working px: half its length."""
-_NEAR_PX = 6.0
-_CURVE_FROM = -0.25
-"""Scores below this are no cars at any precision that is of use."""
+MIN_CURVE_SCORE = -0.25
+"""Detections with a lower score are false at any precision that is of use."""
+FOLDS_DESCRIPTION = "cars in held-out stripes of the images, detected by detectors trained on the other stripes"
 _CURVE_POINTS = 400
-_LOST, _MARGIN = 0.02, 0.1
-"""The cascade's cuts: the share of held-out cars that they would lose, and a margin for sites that look otherwise."""
 _KEPT_RECALL = 0.95
 _BETA = 0.8
 """Precision counts half as much again: the field wants few wrong tracks; but detectors tried on cars that were left out
@@ -38,15 +32,12 @@ class Evidence:
     Attributes
     ----------
     score, right : (n,) of each find, and whether it is a marked car.
-    proposed, first : (n,) how much the proposer, and the first rounds, liked each find.
     cars : how many cars there were to be found.
     complete : whether what is not marked is no car.
     """
 
     score: FloatArray
     right: Mask
-    proposed: FloatArray
-    first: FloatArray
     cars: int
     complete: bool
 
@@ -61,23 +52,6 @@ def stripes(sample: LabelledImage, fold: int, folds: int) -> Mask:
     return np.broadcast_to(inside if axis == 0 else inside[:, None], (height, width))
 
 
-def evidence_of_part(
-    scene: Scene, region: Mask, proposer: BoostedSums, sums: BoostedSums, *, members: int = 1
-) -> Evidence:
-    """Try a detector on a part (h, w) of a scene that it was not trained on; one of so many of a committee."""
-    places = propose(
-        scene.coarse, scene.sample.image.shape, scene.sample.valid, proposer, contrast_floor=CONTRAST_FLOOR
-    )
-    places = places[lies_in(region, places)]
-    look = Look(scene.fine, sums, CONTRAST_FLOOR)
-    found = distinct(find_cars(look, places, least_score=_CURVE_FROM), 16.0)
-    cars = scene.cars[lies_in(region, scene.cars)]
-    counted = is_far(found, scene) | (distance(found, cars) < MATCH_PX)
-    found = found[counted]
-    right, first = matched(found, cars), _first_scores(look, found, max(FIRST_ROUNDS // members, 1))
-    return Evidence(found[:, 3], right, _best_near(places, found), first, len(cars), scene.sample.complete)
-
-
 def matched(found: FloatArray, cars: FloatArray) -> Mask:
     """Whether each find, the best first, is the first on a car."""
     taken = np.zeros(len(cars), bool)
@@ -90,42 +64,20 @@ def matched(found: FloatArray, cars: FloatArray) -> Mask:
     return right
 
 
-def _best_near(places: FloatArray, found: FloatArray) -> FloatArray:
-    if not len(found):
-        return np.empty(0)
-    near = np.hypot(found[:, None, 0] - places[:, 0], found[:, None, 1] - places[:, 1]) < _NEAR_PX
-    return np.asarray(np.where(near, places[:, 3], -np.inf).max(axis=1), np.float64)
-
-
-def _first_scores(look: Look, found: FloatArray, rounds: int) -> FloatArray:
-    if not len(found):
-        return np.empty(0)
-    first = look.scores(found[:, :2], found[:, 2], np.zeros(1), np.zeros((1, 2), np.int64), rounds)
-    return np.asarray(first[:, 0, 0], np.float64)
-
-
 def joined(parts: Sequence[Evidence]) -> Evidence:
     """Evidence of several parts together."""
     return Evidence(
         score=np.concatenate([part.score for part in parts]),
         right=np.concatenate([part.right for part in parts]),
-        proposed=np.concatenate([part.proposed for part in parts]),
-        first=np.concatenate([part.first for part in parts]),
         cars=sum(part.cars for part in parts),
         complete=all(part.complete for part in parts),
     )
 
 
-def cut_of(scores: FloatArray) -> float:
-    """A score that nearly all of these exceed."""
-    known = scores[np.isfinite(scores)]
-    return float(np.quantile(known, _LOST) - _MARGIN) if len(known) else -1.0
+def curve_of(evidence: Evidence, description: str) -> PrecisionRecallCurve | None:
+    """Precision and recall against the threshold; the operating point is the middle of where they are best together.
 
-
-def curve_of(evidence: Evidence, told: str) -> PrecisionRecallCurve | None:
-    """Precision and recall against the threshold; ``chosen`` is the middle of where they are best together.
-
-    ``told``: which cars these are, for people.
+    ``description``: which cars these are, for people.
     """
     if not evidence.right.any():
         return None
@@ -137,11 +89,11 @@ def curve_of(evidence: Evidence, told: str) -> PrecisionRecallCurve | None:
     best = int(np.median(nearly_best(precision, recall, beta=_BETA)))
     if not evidence.complete:
         best = int(np.searchsorted(recall, _KEPT_RECALL * recall[-1]))
-    return thinned_curve(precision, recall, score, best, f"{evidence.cars} {told}")
+    return thinned_curve(precision, recall, score, best, f"{evidence.cars} {description}")
 
 
 def thinned_curve(
-    precision: FloatArray, recall: FloatArray, threshold: FloatArray, chosen: int, evidence: str
+    precision: FloatArray, recall: FloatArray, threshold: FloatArray, chosen: int, description: str
 ) -> PrecisionRecallCurve:
     """For a detector file: some points of a curve (n,) by falling threshold, the chosen one among them."""
     kept = np.unique(np.r_[np.linspace(0, len(threshold) - 1, min(_CURVE_POINTS, len(threshold))).astype(int), chosen])
@@ -149,8 +101,8 @@ def thinned_curve(
         recall=tuple(np.round(recall[kept], 4).tolist()),
         precision=tuple(np.round(precision[kept], 4).tolist()),
         threshold=tuple(np.round(threshold[kept], 4).tolist()),
-        chosen=int(np.searchsorted(kept, chosen)),
-        evidence=evidence,
+        operating_point=int(np.searchsorted(kept, chosen)),
+        description=description,
     )
 
 

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.flight import DetectionConfig
 from velfield.detection.crops import upright_chips
 from velfield.detection.detect import detect_frame
 from velfield.detection.detector import Detector
@@ -23,7 +22,7 @@ def taken_for_cars(detector: Detector, samples: Sequence[LabelledImage]) -> dict
     """Upright crops (n, 32, 32) of each kind, the surest finds first."""
     kinds: dict[str, list[Chips]] = {FOUND: [], MISSED: [], MARKED_NOT: []}
     for sample in samples:
-        found = detect_frame(sample.image, sample.valid, detector, DetectionConfig(), sample.background)
+        found = detect_frame(sample.image, sample.valid, detector, sample.background)
         order = np.argsort(-found.score, kind="stable")
         right = matched(found.xy[order], sample.cars)
         gap = np.hypot(*(sample.cars[:, None, :2] - found.xy[None, :, :2]).transpose(2, 0, 1))

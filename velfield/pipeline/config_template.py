@@ -8,7 +8,7 @@ import yaml
 from pydantic import BaseModel
 
 from schemas.flight import PRESETS, FlightConfig
-from velfield.pipeline.configuration import resolve_config
+from velfield.pipeline.configuration import resolve_config, section_models
 from velfield.sources.frames import SourceInfo
 from velfield.sources.selection import select_frames
 
@@ -43,7 +43,7 @@ def starting_config(source: str, info: SourceInfo) -> str:
         "# gsd_m: 0.23",
     ]
     for name, section in _sections(config):
-        lines += ["", *_comment(type(section).__doc__ or "", ""), f"{name}:", *_keys(section)]
+        lines += ["", *_comment(type(section).__doc__ or "", ""), f"{name}:", *_keys(section), *_of_other_methods(name)]
     return "\n".join(lines) + "\n"
 
 
@@ -68,11 +68,25 @@ def _sections(config: FlightConfig) -> Iterator[tuple[str, BaseModel]]:
             yield name, value
 
 
-def _keys(section: BaseModel) -> list[str]:
+def _keys(section: BaseModel, indent: str = "  ") -> list[str]:
     lines = []
     for name, info in type(section).model_fields.items():
-        lines += _comment(info.description or "", "  ")
-        lines.append(f"#   {name}: {_value(getattr(section, name))}")
+        value = getattr(section, name)
+        lines += _comment(info.description or "", indent)
+        if isinstance(value, BaseModel):
+            lines += [f"# {indent}{name}:", *_keys(value, f"{indent}  ")]
+        else:
+            lines.append(f"# {indent}{name}: {_value(value)}")
+    return lines
+
+
+def _of_other_methods(section: str) -> list[str]:
+    """What the other methods of a section read in place of those keys, a paragraph each."""
+    lines = []
+    for model in section_models(section)[1:]:
+        other = model()
+        keys = ", ".join(f"{name}: {_value(getattr(other, name))}" for name in model.model_fields)
+        lines += _comment(f"In place of all these, another method: {keys}", "  ")
     return lines
 
 

@@ -61,9 +61,20 @@ def resolve_config(
     if name not in get_args(Preset):
         raise InputError(f"preset {name!r} is not known; expected one of {', '.join(get_args(Preset))}")
     chosen = cast(Preset, name)
-    tree = _merge(PRESETS[chosen], given)
+    tree = _merge(_of_methods(PRESETS[chosen], given), given)
     tree["preset"] = chosen
     return _validate(tree, str(file) if file else "configuration")
+
+
+def _of_methods(preset: Mapping[str, Any], given: Mapping[str, Any]) -> Tree:
+    """A preset without the sections for whose ``method`` another one is given: its keys belong to its own method."""
+
+    def is_kept(name: str) -> bool:
+        section = given.get(name)
+        method = section.get("method") if isinstance(section, Mapping) else None
+        return method is None or method == preset[name].get("method", method)
+
+    return {name: section for name, section in preset.items() if is_kept(name)}
 
 
 def _read(file: Path) -> Tree:
@@ -75,7 +86,7 @@ def _read(file: Path) -> Tree:
             f"{file}: found a {type(tree).__name__}; expected sections with keys, see examples/flight.yaml"
         )
     # A section all of whose keys are commented out, as `velfield init` writes it, says nothing.
-    return {key: value for key, value in tree.items() if value is not None or not _is_section(key)}
+    return {key: value for key, value in tree.items() if value is not None or not section_models(key)}
 
 
 def _present_names(tree: Tree, what: str) -> Tree:
@@ -89,9 +100,23 @@ def _present_names(tree: Tree, what: str) -> Tree:
     return tree
 
 
-def _is_section(key: str) -> bool:
-    info = FlightConfig.model_fields.get(key)
-    return info is not None and isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel)
+def section_models(section: str) -> list[type[BaseModel]]:
+    """The models that a section may have: one, or one for each method, the default first; none where it is no section.
+
+    Examples
+    --------
+    >>> [model.__name__ for model in section_models("detection")]
+    ['CnnConfig', 'CascadeConfig', 'PaperConfig']
+    """
+    info = FlightConfig.model_fields.get(section)
+    return [] if info is None else _models(info.annotation)
+
+
+def _models(annotation: object) -> list[type[BaseModel]]:
+    """The models that a key may hold: none, one, or in a tagged union one for each method."""
+    if isinstance(annotation, type):
+        return [annotation] if issubclass(annotation, BaseModel) else []
+    return [model for inner in get_args(annotation) for model in _models(inner)]
 
 
 def _yaml(text: str, what: str) -> Any:
@@ -129,10 +154,43 @@ def _validate(tree: Tree, what: str) -> FlightConfig:
         return FlightConfig.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
+        section, method, path = _parts(first["loc"])
+        where = ".".join((section, *path))
         if first["type"] == "extra_forbidden":
+            if method is not None and len(path) == 1 and (unread := _unread(section, method, path[0])):
+                raise InputError(f"{what}: {unread}") from None
             raise InputError(f"{what}: unknown key {where!r}{_did_you_mean(where)}") from None
-        raise InputError(f"{what}: {where} = {first['input']!r}: {first['msg'].lower()}") from None
+        if first["type"] == "union_tag_invalid":
+            found, expected = first["ctx"]["tag"], first["ctx"]["expected_tags"]
+            raise InputError(f"{what}: {where}.method = {found!r}: expected one of {expected}") from None
+        problem = "expected keys with values" if first["type"] == "union_tag_not_found" else first["msg"].lower()
+        raise InputError(f"{what}: {where} = {first['input']!r}: {problem}") from None
+
+
+def _parts(location: Sequence[str | int]) -> tuple[str, str | None, tuple[str, ...]]:
+    """Section, method where it has some, and path in it, of the place of an error."""
+    section, *path = map(str, location)
+    if len(section_models(section)) > 1 and path:
+        return section, path[0], tuple(path[1:])
+    return section, None, tuple(path)
+
+
+def _unread(section: str, method: str, key: str) -> str:
+    """That a key is read by other methods of a section than the chosen one, and what to do; empty where it is not."""
+    models = {str(m.model_fields["method"].default): m for m in section_models(section)}
+    readers = [name for name, model in models.items() if key in model.model_fields]
+    if not readers:
+        return ""
+    nested = [
+        f"{section}.{name}.{key}"
+        for name, info in models[method].model_fields.items()
+        if any(key in inner.model_fields for inner in _models(info.annotation))
+    ]
+    instead = "".join(f"set {name}, " for name in nested)
+    return (
+        f"{section}.{key} is read by {' and '.join(readers)}, not by {method}; {instead}choose {section}.method="
+        f"{readers[0]} or leave it out"
+    )
 
 
 def _did_you_mean(key: str) -> str:
@@ -143,5 +201,5 @@ def _did_you_mean(key: str) -> str:
 def _keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
     for name, info in model.model_fields.items():
         yield prefix + name
-        if isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel):
-            yield from _keys(info.annotation, f"{prefix}{name}.")
+        for inner in _models(info.annotation):
+            yield from _keys(inner, f"{prefix}{name}.")

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from schemas.flight import FlightConfig
-from velfield.detection.detector import Detector, load_detector, save_detector, shipped_detector
+from velfield.detection.detector import Detector, train_detector
+from velfield.detection.files import load_detector, shipped_detector
 from velfield.detection.motion.labels import working_scale
 from velfield.detection.review import review_sheet, taken_for_cars
 from velfield.detection.samples import LabelledImage
-from velfield.detection.train import train_detector
 from velfield.errors import InputError
 from velfield.pipeline.stages.labels import car_length_raw_px, labelled_images
 from velfield.report.figures import png_bytes
@@ -39,7 +39,7 @@ def train_from_labels(source: Path, labels: Path, config: FlightConfig, *, conti
     config
         ``gsd_m`` sets the working scale where it is known, else the labels' length does.
     continued
-        A detector file whose rounds the new ones mend, or ``shipped``.
+        A detector file to continue, or ``shipped``: a network is fine-tuned, a cascade votes together with the new one.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def train_from_labels(source: Path, labels: Path, config: FlightConfig, *, conti
     info = probe(source, frames=config.frames.model_copy(update={"fps": fps}))
     found = read_labels(labels, info)
     samples = tuple(labelled_images(source, info, found, work_per_raw=_scale(config, found)))
-    detector = train_detector(samples, config.detection, continued=_earlier(continued))
+    detector = train_detector(samples, config.detection, base=_earlier(continued))
     return Training(detector, samples, found)
 
 
@@ -72,13 +72,13 @@ def _earlier(name: str | None) -> Detector | None:
 
 def write_training(training: Training, out: Path, review: Path | None = None) -> list[str]:
     """Write the detector file, and where asked for the contact sheet; lines for people."""
-    save_detector(training.detector, out)
+    training.detector.save(out)
     record, lines = training.detector.record, [*training.labels.notes]
     lines.append(f"{out}: {record.cars} cars, frames marked: {len(training.samples)}, threshold {record.threshold:.3f}")
-    if record.curve is not None and record.curve.chosen is not None:
-        k = record.curve.chosen
+    if record.curve is not None and record.curve.operating_point is not None:
+        k = record.curve.operating_point
         precision, recall = record.curve.precision[k], record.curve.recall[k]
-        lines.append(f"precision {precision:.2f} at recall {recall:.2f}: {record.curve.evidence}")
+        lines.append(f"precision {precision:.2f} at recall {recall:.2f}: {record.curve.description}")
     else:
         lines.append(
             "too few cars are marked to leave some out: how good the detector is, is not known; mark 16 or more"

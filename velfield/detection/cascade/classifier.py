@@ -11,9 +11,9 @@ import numpy as np
 from numba import njit
 
 from schemas.arrays import Float32Array, FloatArray, IntArray
+from velfield.detection.boosting import BoostedSums
 from velfield.detection.cascade.feature_image import Picture, scores_at
-from velfield.detection.detector import BoostedSums
-from velfield.detection.label_orientation import CAR_ASPECT
+from velfield.detection.orientation import CAR_ASPECT
 
 FIRST_ROUNDS, SECOND_ROUNDS = 60, 150
 _FIRST_TURNS = np.radians([-18.0, 0.0, 18.0])
@@ -76,16 +76,16 @@ class Look:
         return moved(xy, axes, offsets[offset].astype(np.float64)), axes, flat[np.arange(len(xy)), best]
 
 
-def find_cars(look: Look, places: FloatArray, *, least_score: float, least_first_score: float = -np.inf) -> FloatArray:
+def find_cars(look: Look, places: FloatArray, *, min_score: float, min_stage1_score: float = -np.inf) -> FloatArray:
     """Where the classifier sees a car: one row a place, so several a car (see `distinct`).
 
     Parameters
     ----------
     places
         (n, 3...): x, y, axis, as `scan.propose` gives them.
-    least_score
+    min_score
         Finds at or below this are not told.
-    least_first_score
+    min_stage1_score
         Places that the first rounds like less are let go.
 
     Returns
@@ -96,13 +96,13 @@ def find_cars(look: Look, places: FloatArray, *, least_score: float, least_first
     if not len(xy):
         return np.empty((0, 5))
     xy, axes, score = look.best(xy, axes, _FIRST_TURNS, _ROUGH, FIRST_ROUNDS)
-    kept = np.flatnonzero(score > least_first_score)
+    kept = np.flatnonzero(score > min_stage1_score)
     kept = kept[_one_each(xy[kept], axes[kept], score[kept])]
     if not len(kept):
         return np.empty((0, 5))
     xy, axes, score = look.best(xy[kept], axes[kept], _SECOND_TURNS, _FINE, SECOND_ROUNDS)
-    kept = np.flatnonzero(score > least_score - _HOPE)
-    return _closely(look, xy[kept], axes[kept], least_score)
+    kept = np.flatnonzero(score > min_score - _HOPE)
+    return _closely(look, xy[kept], axes[kept], min_score)
 
 
 def _one_each(xy: FloatArray, axes: FloatArray, score: Float32Array) -> IntArray:
@@ -113,10 +113,10 @@ def _one_each(xy: FloatArray, axes: FloatArray, score: Float32Array) -> IntArray
     return np.asarray(np.sort(order[first]), np.int64)
 
 
-def _closely(look: Look, xy: FloatArray, axes: FloatArray, least_score: float) -> FloatArray:
+def _closely(look: Look, xy: FloatArray, axes: FloatArray, min_score: float) -> FloatArray:
     """All rounds; the place and the turn below the step, from how the score falls about its peak."""
     found = look.scores(xy, axes, _LAST_TURNS, _CLOSE) if len(xy) else np.empty((0, 1, 1), np.float32)
-    hopeful = found.max(axis=(1, 2), initial=-np.inf) > least_score
+    hopeful = found.max(axis=(1, 2), initial=-np.inf) > min_score
     xy, axes, found = xy[hopeful], axes[hopeful], found[hopeful]
     if not len(xy):
         return np.empty((0, 5))

@@ -33,8 +33,8 @@ def committee_of(members: Sequence[Sequence[Round]]) -> tuple[Round, ...]:
     return tuple(
         seen[0][2].model_copy(
             update={
-                "below": share * sum(weight * one.below for _, weight, one in seen),
-                "above": share * sum(weight * one.above for _, weight, one in seen),
+                "leaf_low": share * sum(weight * one.leaf_low for _, weight, one in seen),
+                "leaf_high": share * sum(weight * one.leaf_high for _, weight, one in seen),
             }
         )
         for seen in order

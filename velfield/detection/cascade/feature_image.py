@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray
+from velfield.detection.boosting import BoostedSums
 from velfield.detection.cascade import kernels
-from velfield.detection.detector import BoostedSums
 
 Offsets = NDArray[np.uint64]
 

@@ -10,7 +10,7 @@ from schemas.detector import Round
 from velfield.detection.boosting import RectanglePool, bin_edges, binned, boost, rounds_of
 from velfield.detection.cascade import kernels
 from velfield.detection.cascade.feature_image import Patch, Picture, grey_areas, poses_of
-from velfield.detection.samples import Poses
+from velfield.detection.cascade.scenes import Poses
 
 _BLOCK = 2048
 """Samples measured at a time: their values, four bytes each, are soon bins."""
@@ -58,7 +58,7 @@ class Bank:
             shrinkage=shrinkage,
             rng=rng,
         )
-        return tuple(Round.model_validate(one) for one in rounds_of(self.pool, stumps))
+        return rounds_of(self.pool, stumps)
 
 
 def bank_of(

@@ -10,12 +10,12 @@ from importlib.resources import files
 
 import numpy as np
 
-from schemas.arrays import Float32Array, FloatArray, Mask
+from schemas.arrays import Float32Array, FloatArray, GreyImage, Mask
 from schemas.detector import LongVehicleRecord
+from velfield.detection.boosting import BoostedSums, sums_of
 from velfield.detection.cascade.classifier import moved
-from velfield.detection.cascade.feature_image import Grain, Picture, scores_at
+from velfield.detection.cascade.feature_image import Grain, Picture, picture_of, scores_at
 from velfield.detection.cascade.proposals import in_sight
-from velfield.detection.detector import BoostedSums, sums_of
 
 LONG = Grain(2, (16, 7))
 LEAST_LENGTH = 1.4
@@ -77,3 +77,11 @@ def shipped_long_vehicles() -> LongVehicles:
     data = files("velfield.detection.cascade").joinpath("shipped_long_vehicles.json").read_bytes()
     record = LongVehicleRecord.model_validate_json(data)
     return LongVehicles(record, sums_of(record.rounds))
+
+
+def centre_long_vehicles(image: GreyImage, valid: Mask | None, cars: FloatArray, car_length_px: float) -> FloatArray:
+    """Distinct cars (n, 2...) with the long vehicles among them at their centre, where cars are as long as it knows."""
+    long = shipped_long_vehicles()
+    if car_length_px != long.record.working_car_length_px:
+        return cars
+    return long.centred(picture_of(image, None, LONG), cars, np.ones(image.shape, bool) if valid is None else valid)

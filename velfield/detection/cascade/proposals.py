@@ -9,8 +9,8 @@ import numpy as np
 from numba import njit
 
 from schemas.arrays import FloatArray, Mask
+from velfield.detection.boosting import BoostedSums
 from velfield.detection.cascade.feature_image import Picture, scores_at
-from velfield.detection.detector import BoostedSums
 
 TURNS = np.arange(6) * (np.pi / 6)
 PER_MEGAPIXEL = 4000
@@ -32,7 +32,7 @@ def propose(
     sums: BoostedSums,
     *,
     contrast_floor: float,
-    least_score: float = -np.inf,
+    min_score: float = -np.inf,
     per_megapixel: float = PER_MEGAPIXEL,
 ) -> FloatArray:
     """Places and turns that the coarse classifier likes better than their neighbours.
@@ -49,7 +49,7 @@ def propose(
     (n, 4): x, y in px of the picture, axis, score; the best first.
     """
     rows = np.concatenate([_peaks(coarse, shape, sums, float(turn), contrast_floor) for turn in TURNS])
-    rows = rows[in_sight(rows, shape, valid) & (rows[:, 3] > least_score)]
+    rows = rows[in_sight(rows, shape, valid) & (rows[:, 3] > min_score)]
     rows = rows[np.argsort(-rows[:, 3], kind="stable")]
     most = int(per_megapixel * shape[0] * shape[1] / 1e6) + 8
     turn = np.rint(rows[:, 2] / TURNS[1]).astype(np.int64)

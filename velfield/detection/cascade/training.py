@@ -8,15 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.arrays import ByteArray, FloatArray
-from schemas.detector import Round
-from schemas.flight import DetectionConfig
-from velfield.detection.boosting import random_pool
+from schemas.detector import CascadeConfig, Round
+from velfield.detection.boosting import BoostedSums, random_pool, sums_of
 from velfield.detection.cascade.classifier import Look, find_cars, moved, offset_grid
 from velfield.detection.cascade.feature_image import COARSE, FINE, Grain
 from velfield.detection.cascade.feature_matrix import Bank, bank_of
 from velfield.detection.cascade.proposals import propose
-from velfield.detection.detector import BoostedSums, sums_of
-from velfield.detection.samples import Poses, Scene, is_far, is_wrong, other_poses, varied
+from velfield.detection.cascade.scenes import Poses, Scene, is_far, is_wrong, other_poses, varied
 from velfield.parallel import each
 
 CONTRAST_FLOOR = 12.0
@@ -46,7 +44,7 @@ _TURN_PRIOR = 0.15
 
 
 def learn_proposer(
-    scenes: Sequence[Scene], config: DetectionConfig, channels: int, rng: np.random.Generator
+    scenes: Sequence[Scene], config: CascadeConfig, channels: int, rng: np.random.Generator
 ) -> tuple[Round, ...]:
     """The coarse classifier of step one."""
     cars = [_coarse_cars(scene, _copies(scenes), rng) for scene in scenes]
@@ -67,7 +65,7 @@ def learn_proposer(
 
 def learn_classifier(
     scenes: Sequence[Scene],
-    config: DetectionConfig,
+    config: CascadeConfig,
     channels: int,
     rng: np.random.Generator,
 ) -> tuple[tuple[Round, ...], tuple[Scene, ...]]:
@@ -145,7 +143,7 @@ def _wrongly_proposed(scene: Scene, sums: BoostedSums, most: int) -> FloatArray:
 
 def _wrongly_found(scene: Scene, sums: BoostedSums, most: int) -> FloatArray:
     look = Look(scene.fine, sums, CONTRAST_FLOOR)
-    found = find_cars(look, scene.places[: _LOOKED_AT * most], least_score=-1.0)
+    found = find_cars(look, scene.places[: _LOOKED_AT * most], min_score=-1.0)
     found = found[np.argsort(-found[:, 3], kind="stable")]
     return _surely_wrong(found, is_wrong(found, scene), scene, look)[:most]
 

@@ -15,7 +15,7 @@ import numpy as np
 from schemas.arrays import Float32Array, FloatArray
 from velfield.detection.cnn.model import STRIDE
 from velfield.detection.cnn.trainer import Batch
-from velfield.detection.label_orientation import with_axes
+from velfield.detection.orientation import with_axes
 from velfield.detection.samples import LabelledImage
 
 PATCH_PX = 96

@@ -6,35 +6,44 @@ images and evaluated there. With few labels it is shrunk towards the pre-trained
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from schemas.arrays import Float32Array, Mask
-from schemas.detector import DetectorRecord, PrecisionRecallCurve
-from schemas.flight import DetectionConfig
+from schemas.detector import CnnConfig, CnnRecord, PrecisionRecallCurve
 from velfield.detection.cascade.classifier import distinct
 from velfield.detection.cnn.dataset import PatchDataset
 from velfield.detection.cnn.inference import detect_cars
 from velfield.detection.cnn.model import Network, network_to_record, predict_heatmap
 from velfield.detection.cnn.trainer import Trainer, train
-from velfield.detection.detector import Detector
-from velfield.detection.evaluation import FOLD_MIN_CARS, Evidence, curve_of, joined, matched, stripes
-from velfield.detection.label_orientation import with_axes
+from velfield.detection.evaluation import (
+    FOLD_MIN_CARS,
+    FOLDS_DESCRIPTION,
+    MIN_CURVE_SCORE,
+    Evidence,
+    curve_of,
+    joined,
+    matched,
+    stripes,
+)
+from velfield.detection.orientation import with_axes
 from velfield.detection.samples import LabelledImage, lies_in, within
 from velfield.parallel import each
+
+if TYPE_CHECKING:
+    from velfield.detection.cnn.detector import CnnDetector
 
 _FOLDS = 2
 _FINE_TUNING_RATE, _LEARNING_RATE = 1e-3, 3e-3
 _UNLABELLED_MIN_PROBABILITY, _LABELLED_RADIUS_PX, _UNLABELLED_MARGIN_PX = 0.12, 18, 3
 """In an incompletely labelled image a pixel of at least this probability may be an unlabelled car, except within a
 radius of a labelled one, its shadow included."""
-_CURVE_MIN_SCORE = -0.25
 _NMS_RADIUS_PX = 16.0
 _PRIOR_CARS = 150
 """Weight of the pre-trained detector's threshold, in labelled cars. The threshold of 47 cars alone lost a third of the
 cars of another site without a gain; in four cases of four the best threshold lay nearer to the pre-trained one."""
-_HELD_OUT_DESCRIPTION = "cars in held-out stripes of the images, detected by detectors trained on the other stripes"
 
 
 def train_from_scratch(
@@ -46,7 +55,7 @@ def train_from_scratch(
     return train(Trainer.initialise(seed), dataset, steps=steps, learning_rate=_LEARNING_RATE)
 
 
-def fine_tune(samples: Sequence[LabelledImage], pretrained: Detector, config: DetectionConfig) -> Detector:
+def fine_tune(samples: Sequence[LabelledImage], pretrained: "CnnDetector", config: CnnConfig) -> "CnnDetector":
     """Fine-tune a pre-trained network on labelled images and choose its score threshold on held-out folds.
 
     Parameters
@@ -67,18 +76,18 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: Detector, config: De
     tasks: list[int | None] = [None, *range(folds)]
     (network, _), *held_out = each(lambda fold: _fine_tune_fold(masked, pretrained.network, config, fold), tasks)
     evidence = joined([part for _, parts in held_out for part in parts]) if held_out else None
-    threshold, curve = select_threshold(evidence, pretrained.threshold, _HELD_OUT_DESCRIPTION)
+    threshold, curve = select_threshold(evidence, pretrained.threshold, FOLDS_DESCRIPTION)
     if curve is not None:
         weight = count / (count + _PRIOR_CARS)
         threshold = weight * threshold + (1 - weight) * pretrained.threshold
         nearest = int(np.abs(np.array(curve.threshold) - threshold).argmin())
-        curve = curve.model_copy(update={"chosen": nearest})
+        curve = curve.model_copy(update={"operating_point": nearest})
     record = make_record(network, threshold if config.threshold is None else config.threshold, curve, count, config)
-    return Detector(record.model_copy(update={"attribution": pretrained.record.attribution}))
+    return type(pretrained)(record.model_copy(update={"attribution": pretrained.record.attribution}))
 
 
 def fine_tune_interpolated(
-    samples: Sequence[LabelledImage], pretrained: Detector, config: DetectionConfig, *, fraction: float
+    samples: Sequence[LabelledImage], pretrained: "CnnDetector", config: CnnConfig, *, fraction: float
 ) -> Network:
     """Fine-tune, then interpolate between the weights before (0) and after (1): WiSE-FT (Wortsman et al. 2022)."""
     before = pretrained.network
@@ -97,19 +106,18 @@ def select_threshold(
 ) -> tuple[float, PrecisionRecallCurve | None]:
     """Score threshold and precision-recall curve on held-out cars; the default where too few were held out."""
     curve = None if evidence is None else curve_of(evidence, description)
-    if curve is None or curve.chosen is None:
+    if curve is None or curve.operating_point is None:
         return default, None
-    return curve.threshold[curve.chosen], curve
+    return curve.threshold[curve.operating_point], curve
 
 
 def make_record(
-    network: Network, threshold: float, curve: PrecisionRecallCurve | None, count: int, config: DetectionConfig
-) -> DetectorRecord:
+    network: Network, threshold: float, curve: PrecisionRecallCurve | None, count: int, config: CnnConfig
+) -> CnnRecord:
     """Content of the detector file."""
-    return DetectorRecord(
-        method="network",
+    return CnnRecord(
         working_car_length_px=config.working_car_length_px,
-        network=network_to_record(network),
+        layers=network_to_record(network),
         threshold=float(threshold),
         curve=curve,
         cars=count,
@@ -117,10 +125,10 @@ def make_record(
 
 
 def _fine_tune_fold(
-    samples: Sequence[LabelledImage], pretrained: Network, config: DetectionConfig, fold: int | None
+    samples: Sequence[LabelledImage], pretrained: Network, config: CnnConfig, fold: int | None
 ) -> tuple[Network, list[Evidence]]:
     """Fine-tune without a fold's stripes and evaluate on them; without a fold, fine-tune on everything."""
-    steps, seed = config.network_steps, config.seed
+    steps, seed = config.fine_tune_steps, config.seed
     if fold is None:
         dataset = PatchDataset([samples], [1.0], seed)
         return train(Trainer.from_network(pretrained), dataset, steps=steps, learning_rate=_FINE_TUNING_RATE), []
@@ -151,7 +159,7 @@ def _mask_unlabelled_positives(sample: LabelledImage, network: Network) -> Label
 def evaluate_network(network: Network, sample: LabelledImage, region: Mask | None = None) -> Evidence:
     """Match a network's detections to the labels of an image, or of a region (h, w) of it."""
     detections = distinct(detect_cars(network, sample.image, sample.valid), _NMS_RADIUS_PX)
-    detections = detections[detections[:, 3] > _CURVE_MIN_SCORE]
+    detections = detections[detections[:, 3] > MIN_CURVE_SCORE]
     cars = sample.cars
     if region is not None:
         detections, cars = detections[lies_in(region, detections)], cars[lies_in(region, cars)]
@@ -159,5 +167,4 @@ def evaluate_network(network: Network, sample: LabelledImage, region: Mask | Non
     for x, y, radius in sample.ignore:
         counted = correct | (np.hypot(detections[:, 0] - x, detections[:, 1] - y) > radius)
         detections, correct = detections[counted], correct[counted]
-    not_applicable = np.full(len(detections), -1.0)
-    return Evidence(detections[:, 3], correct, not_applicable, not_applicable, len(cars), sample.complete)
+    return Evidence(detections[:, 3], correct, len(cars), sample.complete)

@@ -76,8 +76,9 @@ def background_difference_at(
 
 def motion_score_bonus(motion: MotionRecord, difference: FloatArray) -> FloatArray:
     """Score added to detections by their difference to the background: a linear ramp, clipped at both ends."""
-    fraction = (difference - motion.still_grey) / (motion.moving_grey - motion.still_grey)
-    return motion.lift * np.clip(fraction, 0.0, 1.0)
+    ramp = motion.bonus_ramp_end - motion.bonus_ramp_start
+    fraction = (difference - motion.bonus_ramp_start) / ramp
+    return motion.max_score_bonus * np.clip(fraction, 0.0, 1.0)
 
 
 def _is_mostly_visible(cars: FloatArray, shape: tuple[int, int], valid: Mask | None) -> Mask:

@@ -94,21 +94,6 @@ def _convolutions(layers: Sequence[Layer]) -> Iterator[Conv]:
 
 CONVOLUTIONS: dict[str, Conv] = {conv.name: conv for conv in _convolutions(TOPOLOGY)}
 """The layers that have weights, by name, from input to output."""
-LAYER_NAMES_V1: dict[str, str] = {
-    "grain": "stem",
-    "edges": "down1",
-    "corners_0": "enc1_0",
-    "corners_1": "enc1_1",
-    "parts": "down2",
-    "body_0": "res1_0",
-    "body_1": "res1_1",
-    "body_2": "res2_0",
-    "body_3": "res2_1",
-    "back": "up1",
-    "middle": "dec1",
-    "told": "head",
-}
-"""Names of the layers in detector files of version 1, and today's."""
 STRIDE = 2
 """Working px a pixel of the heatmap."""
 _TILE_PX, _HALO_PX = 768, 32
@@ -137,7 +122,6 @@ def network_from_record(record: Mapping[str, LayerRecord]) -> Network:
     InputError
         The layers are not those of `TOPOLOGY`.
     """
-    record = {LAYER_NAMES_V1.get(name, name): layer for name, layer in record.items()}
     expected = {name: conv.shape for name, conv in CONVOLUTIONS.items()}
     found = {name: layer.shape for name, layer in record.items()}
     if found != expected:
@@ -148,7 +132,7 @@ def network_from_record(record: Mapping[str, LayerRecord]) -> Network:
         )
     weights, biases = {}, {}
     for name, shape in expected.items():
-        values = np.frombuffer(b64decode(record[name].numbers), "<f2").astype(np.float32)
+        values = np.frombuffer(b64decode(record[name].weights_f16), "<f2").astype(np.float32)
         weights[name], biases[name] = values[: -shape[2]].reshape(shape), values[-shape[2] :]
     return Network(weights, biases)
 
@@ -158,7 +142,7 @@ def network_to_record(network: Network) -> dict[str, LayerRecord]:
     record = {}
     for name, conv in CONVOLUTIONS.items():
         values = np.concatenate([network.weights[name].ravel(), network.biases[name]]).astype("<f2")
-        record[name] = LayerRecord(shape=conv.shape, numbers=b64encode(values.tobytes()).decode())
+        record[name] = LayerRecord(shape=conv.shape, weights_f16=b64encode(values.tobytes()).decode())
     return record
 
 

@@ -6,23 +6,25 @@ threshold, estimated under the assumption that stationary cars have the score di
 """
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, GreyImage
-from schemas.detector import MotionRecord, PrecisionRecallCurve
-from schemas.flight import DetectionConfig
+from schemas.detector import CnnConfig, MotionRecord, PrecisionRecallCurve
 from velfield.detection.cnn.fine_tuning import fine_tune_interpolated
 from velfield.detection.cnn.inference import MIN_SCORE, background_difference_at
 from velfield.detection.cnn.model import network_to_record
 from velfield.detection.detect import detect_frame
-from velfield.detection.detector import Detector
 from velfield.detection.evaluation import nearly_best, thinned_curve
 from velfield.detection.motion.difference import MotionFrame
 from velfield.detection.motion.evaluation import Detections, MotionState, classify_bursts
 from velfield.detection.samples import LabelledImage
 from velfield.parallel import each
+
+if TYPE_CHECKING:
+    from velfield.detection.cnn.detector import CnnDetector
 
 _STEPS_FACTOR = 3
 """Motion gives hundreds of labels: this many times the steps of fine-tuning on one labelled frame."""
@@ -43,13 +45,13 @@ _CURVE_DESCRIPTION = (
 
 def self_train_from_motion(
     samples: Sequence[LabelledImage],
-    pretrained: Detector,
+    pretrained: "CnnDetector",
     bursts: Sequence[MotionFrame],
     background: GreyImage,
-    config: DetectionConfig,
+    config: CnnConfig,
     *,
     max_interval_s: float,
-) -> Detector | None:
+) -> "CnnDetector | None":
     """Fine-tune on pseudo-labels from motion, then estimate the score bonus and the threshold from detections' motion.
 
     Parameters
@@ -69,15 +71,14 @@ def self_train_from_motion(
     -------
     None where too few detections move to estimate thresholds, or those that move do not differ from the background.
     """
-    longer = config.model_copy(update={"network_steps": _STEPS_FACTOR * config.network_steps})
+    longer = config.model_copy(update={"fine_tune_steps": _STEPS_FACTOR * config.fine_tune_steps})
     network = fine_tune_interpolated(samples, pretrained, longer, fraction=_FINE_TUNED_FRACTION)
-    update = {"network": network_to_record(network), "curve": None, "motion": None}
+    update = {"layers": network_to_record(network), "curve": None, "motion": None}
     record = pretrained.record.model_copy(update=update)
     length_px = record.working_car_length_px
-    low_threshold = config.model_copy(update={"threshold": MIN_SCORE})
 
     def detect(frame: MotionFrame) -> tuple[Detections, FloatArray]:
-        cars = detect_frame(frame.image, frame.valid, Detector(record), low_threshold)
+        cars = detect_frame(frame.image, frame.valid, type(pretrained)(record), threshold=MIN_SCORE)
         difference = background_difference_at(frame.image, background, cars.xy, length_px)
         return Detections(cars.xy, cars.orientation_rad, cars.score, frame.time_s), difference
 
@@ -92,7 +93,8 @@ def self_train_from_motion(
         return None
     threshold, motion, curve = fitted
     cars = sum(len(sample.cars) for sample in samples)
-    return Detector(record.model_copy(update={"threshold": threshold, "motion": motion, "curve": curve, "cars": cars}))
+    estimated = {"threshold": threshold, "motion": motion, "curve": curve, "cars": cars}
+    return type(pretrained)(record.model_copy(update=estimated))
 
 
 def fit_motion_thresholds(
@@ -129,7 +131,11 @@ def fit_motion_thresholds(
     bonus = threshold - foreground_threshold
     nearest = int(np.abs(thresholds - foreground_threshold).argmin())
     curve = thinned_curve(precision, recall, thresholds + threshold - foreground_threshold, nearest, _CURVE_DESCRIPTION)
-    return threshold, MotionRecord(still_grey=ramp_start, moving_grey=moving_grey, lift=bonus), curve
+    return (
+        threshold,
+        MotionRecord(bonus_ramp_start=ramp_start, bonus_ramp_end=moving_grey, max_score_bonus=bonus),
+        curve,
+    )
 
 
 def stationary_threshold(moving: FloatArray, stationary: FloatArray) -> float:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from schemas.arrays import FloatArray, GreyImage, IntArray
-from schemas.flight import DetectionConfig, TrackingConfig
+from schemas.flight import TrackingConfig
 from velfield.detection.detect import detect_frame
 from velfield.detection.detector import Detector
 from velfield.detection.evaluation import nearly_best
@@ -213,7 +213,6 @@ def evaluate_detector(
     detector: Detector,
     frames: Sequence[MotionFrame],
     background: GreyImage | None,
-    config: DetectionConfig,
     *,
     min_score: float = MIN_SCORE,
     max_interval_s: float = _MAX_INTERVAL_S,
@@ -227,16 +226,14 @@ def evaluate_detector(
         Bursts of three (`select_bursts`); six suffice.
     background : uint8 (h, w) or None
         Temporal median, for a detector that uses the difference to it.
-    config : DetectionConfig
     min_score : float
         Detections below this are dropped.
     max_interval_s : float
         Frames farther apart than this are not neighbours.
     """
-    low_threshold = config.model_copy(update={"threshold": min_score})
 
     def detect(frame: MotionFrame) -> Detections:
-        cars = detect_frame(frame.image, frame.valid, detector, low_threshold, background)
+        cars = detect_frame(frame.image, frame.valid, detector, background, threshold=min_score)
         return Detections(cars.xy, cars.orientation_rad, np.asarray(cars.score, np.float64), frame.time_s)
 
     length = detector.record.working_car_length_px

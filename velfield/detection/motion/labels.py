@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.arrays import FloatArray, IntArray
-from schemas.flight import DetectionConfig, TrackingConfig
+from schemas.detector import DetectorConfig
+from schemas.flight import TrackingConfig
 from velfield.detection.motion.blobs import Blobs
 from velfield.detection.motion.boxes import (
     MAX_AXIS_OFFSET_RAD,
@@ -196,13 +197,13 @@ def choose_frames(times_s: FloatArray, *, bursts: int = 16, all_below: int = 48)
 
 
 def working_scale(
-    config: DetectionConfig, gsd_m: float | None, labels: MotionLabels | None = None, *, labels_scale: float = 1.0
+    config: DetectorConfig, gsd_m: float | None, labels: MotionLabels | None = None, *, labels_scale: float = 1.0
 ) -> float:
     """Scale of the working grid, working pixels a base pixel, at which a car is `working_car_length_px` long.
 
     Parameters
     ----------
-    config : DetectionConfig
+    config : DetectorConfig
     gsd_m : float or None
         Ground sample distance of the base image, m; has precedence.
     labels : MotionLabels, optional

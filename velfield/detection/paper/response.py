@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from velfield.detection.detector import BoostedSums
+from velfield.detection.boosting import BoostedSums
 
 MARGIN_PX = 64
 """The picture is continued by so much at its edges: no rectangle reaches farther."""

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from schemas.tables import DETECTION_COLUMNS
 from velfield.detection.detect import FrameDetections, detect_frame
-from velfield.detection.detector import Detector, load_detector
+from velfield.detection.detector import Detector
+from velfield.detection.files import load_detector
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
 from velfield.pipeline.result import Outcome
@@ -61,7 +62,7 @@ def _cars(
         return external_detections(plan, seen, transform, frame)
     detector = _detector(plan.layout.detector, plan.keys["detector"])
     background = _background_under(plan, seen) if has_background else None
-    return detect_frame(seen.image, seen.valid, detector, plan.config.detection, background=background)
+    return detect_frame(seen.image, seen.valid, detector, background, threshold=plan.config.detection.threshold)
 
 
 @lru_cache(maxsize=2)

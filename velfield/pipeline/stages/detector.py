@@ -11,13 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from schemas.records import WorkingRecord
-from velfield.detection.cnn.self_training import self_train_from_motion
-from velfield.detection.detector import Detector, load_detector, shipped_detector
-from velfield.detection.evaluation import thinned_curve
+from velfield.detection.detector import Detector, detector_class, train_detector
+from velfield.detection.files import load_detector, shipped_detector
 from velfield.detection.motion.difference import MotionBackground, MotionFrame, motion_background
-from velfield.detection.motion.evaluation import MotionEvaluation, evaluate_detector, select_bursts
 from velfield.detection.motion.labels import MotionLabels, choose_frames, labels_from_motion, working_scale
-from velfield.detection.train import LabelledImage, train_detector
+from velfield.detection.unlabelled import UnlabelledFlight
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
@@ -36,14 +34,8 @@ from velfield.run.commits import write_atomically
 from velfield.run.grid import read_grid
 from velfield.run.stores import open_frames
 
-_CASCADE_FRAMES, _CNN_FRAMES = 6, 12
-"""Labelled frames that the cascade, or the network, is trained on."""
-_MIN_CNN_VEHICLES = 20
-"""On fewer moving vehicles the network would overfit."""
-_EVALUATION_BURSTS = 6
 _MIN_FRAMES_WITH_BOXES = 0.5
 """Fraction of the frames in which another program's boxes are expected."""
-_CURVE_DESCRIPTION = "detections in bursts of three frames: those that move along their axis, against isolated ones"
 
 
 def make_detector(plan: Plan) -> Outcome:
@@ -142,102 +134,10 @@ def _from_motion(plan: Plan) -> Outcome:
         labels = labels_from_motion(frames, background, car_length_px=length_px, max_interval_s=max_interval_s)
     if not labels.usable:
         return _without_labels(plan, known, labels)
-    detector = _train_on_motion(plan, frames, labels, background)
-    return _finish(plan, detector, scale, "motion", count=labels.count, motion=labels, background=background)
-
-
-def _train_on_motion(
-    plan: Plan, frames: list[MotionFrame], labels: MotionLabels, background: MotionBackground
-) -> Detector:
-    """Train on labels from motion, on appearance alone where that suffices, so that stationary cars are detected too.
-
-    A vehicle that waits at a light for long is part of the background, and its difference to it vanishes: on a
-    simulated city a detector that uses the difference found 0.79 of the cars that move at some time, one by appearance
-    0.91. Where appearance does not suffice, the pre-trained network knows more of stationary cars; on few vehicles the
-    cascade generalises better.
-    """
+    flight = UnlabelledFlight(frames, labels, background, max_interval_s)
     config = plan.config.detection
-    samples = _samples(frames, labels, background, _CASCADE_FRAMES)
-    shipped = shipped_detector()
-    use_cnn = config.method == "network" and config.working_car_length_px == shipped.record.working_car_length_px
-    if use_cnn:
-        # On the hundreds of labels that motion gives, the cascade is as accurate and four times as fast.
-        config = config.model_copy(update={"method": "aligned"})
-    if config.motion_channel == "auto":
-        by_appearance = train_detector(samples, config.model_copy(update={"motion_channel": "never"}))
-        evaluation = _evaluate(plan, by_appearance, frames, background)
-        if evaluation.appearance_is_sufficient(_median_car_score(by_appearance)):
-            return by_appearance if config.threshold is not None else _with_threshold(by_appearance, evaluation)
-    if use_cnn and config.motion_channel != "never" and labels.vehicles >= _MIN_CNN_VEHICLES:
-        adapted = self_train_from_motion(
-            _samples(frames, labels, background, _CNN_FRAMES),
-            shipped,
-            _bursts(plan, frames),
-            background.median,
-            plan.config.detection,
-            max_interval_s=plan.config.tracking.max_interval_s,
-        )
-        if adapted is not None:
-            return adapted
-    detector = train_detector(samples, config)
-    if config.threshold is not None:
-        return detector
-    return _with_threshold(detector, _evaluate(plan, detector, frames, background))
-
-
-def _median_car_score(detector: Detector) -> float:
-    """Median score of held-out cars; infinite where half of them were not detected at all."""
-    curve = detector.curve
-    if curve is None or not curve.recall or curve.recall[-1] < 0.5:
-        return float("inf")
-    return float(np.interp(0.5, curve.recall, curve.threshold))
-
-
-def _evaluate(
-    plan: Plan, detector: Detector, frames: list[MotionFrame], background: MotionBackground
-) -> MotionEvaluation:
-    """Precision and recall of a detector on bursts of the flight."""
-    median = background.median if detector.uses_background else None
-    max_interval_s = plan.config.tracking.max_interval_s
-    return evaluate_detector(
-        detector, _bursts(plan, frames), median, plan.config.detection, max_interval_s=max_interval_s
-    )
-
-
-def _bursts(plan: Plan, frames: list[MotionFrame]) -> list[MotionFrame]:
-    """Bursts of three frames, over which the motion of detections is classified."""
-    chosen = select_bursts([frame.time_s for frame in frames], _EVALUATION_BURSTS, plan.config.tracking.max_interval_s)
-    return [frames[k] for k in chosen]
-
-
-def _with_threshold(detector: Detector, evaluation: MotionEvaluation) -> Detector:
-    """The detector with the threshold and curve estimated from motion; unchanged where too few detections move."""
-    threshold = evaluation.operating_threshold
-    if not np.isfinite(threshold):
-        return detector
-    curve = thinned_curve(
-        evaluation.precision, evaluation.recall, evaluation.thresholds, evaluation.operating_index, _CURVE_DESCRIPTION
-    )
-    return Detector(detector.record.model_copy(update={"threshold": threshold, "curve": curve}))
-
-
-def _samples(
-    frames: list[MotionFrame], labels: MotionLabels, background: MotionBackground, max_count: int
-) -> list[LabelledImage]:
-    """Labelled frames spread over the flight; more of them would show the same cars on the same ground."""
-    labelled = [pair for pair in zip(frames, labels.frames, strict=True) if pair[1].labelled and len(pair[1].cars)]
-    chosen = np.unique(np.linspace(0, len(labelled) - 1, min(max_count, len(labelled))).round().astype(int))
-    return [
-        LabelledImage(
-            image=frame.image,
-            valid=frame.valid & background.valid,
-            background=background.median,
-            cars=label.cars,
-            ignore=label.ignore,
-            complete=False,
-        )
-        for frame, label in (labelled[k] for k in chosen)
-    ]
+    detector = detector_class(config.method).train_from_motion(flight, config)
+    return _finish(plan, detector, scale, "motion", count=labels.count, motion=labels, background=background)
 
 
 def _without_labels(plan: Plan, scale: float | None, labels: MotionLabels) -> Outcome:
@@ -282,7 +182,7 @@ def _finish(
     """Write the detector, the working grid, and the background where the detector uses it."""
     layout, outputs, notes = plan.layout, [plan.layout.working], []
     if detector is not None:
-        write_atomically(layout.detector, detector.record.model_dump_json().encode())
+        write_atomically(layout.detector, detector.to_json().encode())
         outputs.append(layout.detector)
     if background is not None and detector is not None and detector.uses_background:
         write_background(layout, background)

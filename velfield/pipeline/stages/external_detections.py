@@ -7,9 +7,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from velfield.detection.detect import FrameDetections, pictured
-from velfield.detection.label_orientation import CAR_ASPECT, with_axes
-from velfield.detection.orientation import axial_difference
+from velfield.detection.detect import FrameDetections, attach_crops
+from velfield.detection.detector import Detections
+from velfield.detection.orientation import CAR_ASPECT, axial_difference, with_axes
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.stages.rectified_frames import WorkingFrame
 from velfield.run.frame_transforms import FrameMap
@@ -43,7 +43,7 @@ def external_detections(plan: Plan, seen: WorkingFrame, transform: FrameMap, fra
         [xy, np.mod(axis, np.pi), mine["score"].to_numpy(np.float64), np.full(len(xy), _AXIS_SD_RAD)]
     )
     good = np.isfinite(xy).all(axis=1)
-    return pictured(seen.image, cars[good], area[good])
+    return attach_crops(seen.image, Detections.from_rows(cars[good], area[good]))
 
 
 def free_of_vehicles(plan: Plan, frame: int, shape: tuple[int, int]) -> NDArray[np.bool_] | None:

@@ -9,7 +9,7 @@ import numpy as np
 from schemas.report import PrecisionRecall, Report, ReportStage, ResidualSeries
 from schemas.summary import RunSummary, StageSummary
 from velfield.analysis.coverage import few_vehicles, percent
-from velfield.detection.detector import load_detector
+from velfield.detection.files import load_detector
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.version import code_version
 from velfield.report.report import render_report
@@ -127,7 +127,9 @@ def _curve(plan: Plan) -> PrecisionRecall | None:
     curve = load_detector(plan.layout.detector).curve
     if curve is None:
         return None
-    return PrecisionRecall(recall=curve.recall, precision=curve.precision, chosen=curve.chosen, evidence=curve.evidence)
+    return PrecisionRecall(
+        recall=curve.recall, precision=curve.precision, chosen=curve.operating_point, evidence=curve.description
+    )
 
 
 def _gates(stages: Sequence[StageSummary]) -> dict[str, int]:

@@ -1,23 +1,25 @@
-"""The paper's recipe as it stands: 200 rounds on upright pixels, a response at every pixel, regions, moments."""
+"""Training of the paper's classifier: AdaBoost on the pixels of upright images, about the cars and away from them."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray
-from schemas.detector import DetectorRecord
-from schemas.flight import DetectionConfig
-from velfield.detection.boosting import RectanglePool, bin_edges, binned, boost, random_pool, rounds_of
-from velfield.detection.detector import Detector
+from schemas.detector import PaperConfig, PaperRecord
+from velfield.detection.boosting import (
+    BoostedSums,
+    RectanglePool,
+    bin_edges,
+    binned,
+    boost,
+    random_pool,
+    rounds_of,
+    sums_of,
+)
 from velfield.detection.paper.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, continued, dense_response
-from velfield.detection.paper.segmentation import moments, segment_response
-
-if TYPE_CHECKING:
-    from velfield.detection.samples import LabelledImage
+from velfield.detection.samples import LabelledImage
 
 _REACH_PX = 40
 _MAX_CAR_SAMPLES = 4000
@@ -25,26 +27,8 @@ _QUANTILE = 0.2
 _EDGE_SAMPLES = 4000
 
 
-def find_cars_densely(
-    image: NDArray[np.uint8],
-    valid: NDArray[np.bool_] | None,
-    detector: Detector,
-    config: DetectionConfig,
-    threshold: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Cars (n, 5) as x, y, axis, score, axis' standard deviation; and areas (n,), working px."""
-    response = dense_response(image, detector.sums, grey_bits=detector.record.grey_bits)
-    if valid is not None:
-        response[~valid] = response.min(initial=0.0)
-    smooth, labels = segment_response(
-        response, sigma_px=config.response_sigma_px, threshold=threshold, min_region_px=config.min_region_px
-    )
-    found = moments(labels, smooth)
-    return found[:, :5], found[:, 5]
-
-
-def train_densely(samples: Sequence["LabelledImage"], config: DetectionConfig) -> Detector:
-    """Train the paper's classifier: within ``car_radius_px`` of a centre is car, past ``background_radius_px`` not."""
+def train_paper(samples: Sequence[LabelledImage], config: PaperConfig) -> PaperRecord:
+    """Train: within ``car_radius_px`` of a centre a pixel is car, past ``background_radius_px`` of every one not."""
     rng = np.random.default_rng(config.seed)
     pool = random_pool(
         config.feature_pool,
@@ -65,21 +49,21 @@ def train_densely(samples: Sequence["LabelledImage"], config: DetectionConfig) -
     stumps = boost(
         binned(measured, edges), edges, cars, rounds=config.rounds, car_fraction=config.car_fraction, rng=rng
     )
-    fields = {
-        "method": "dense",
-        "working_car_length_px": config.working_car_length_px,
-        "grey_bits": GREY_BITS,
-        "rounds": rounds_of(pool, stumps),
-        "threshold": 0.0,
-        "cars": sum(len(sample.cars) for sample in samples),
-    }
-    record = DetectorRecord.model_validate(fields)
-    threshold = config.threshold if config.threshold is not None else _threshold(samples, Detector(record), config)
-    return Detector(record.model_copy(update={"threshold": threshold}))
+    rounds = rounds_of(pool, stumps)
+    threshold = config.threshold if config.threshold is not None else _threshold(samples, sums_of(rounds), config)
+    return PaperRecord(
+        working_car_length_px=config.working_car_length_px,
+        grey_bits=GREY_BITS,
+        rounds=rounds,
+        threshold=threshold,
+        cars=sum(len(sample.cars) for sample in samples),
+        response_sigma_px=config.response_sigma_px,
+        min_region_px=config.min_region_px,
+    )
 
 
 def _pixels(
-    sample: "LabelledImage", config: DetectionConfig, rng: np.random.Generator, most: int
+    sample: LabelledImage, config: PaperConfig, rng: np.random.Generator, most: int
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Pixels (n, 2) to learn from, and which are car; cars are ``car_fraction`` of them."""
     height, width = sample.image.shape
@@ -125,11 +109,11 @@ def _values(image: NDArray[np.uint8], places: NDArray[np.int64], pool: Rectangle
     return out
 
 
-def _threshold(samples: Sequence["LabelledImage"], detector: Detector, config: DetectionConfig) -> float:
+def _threshold(samples: Sequence[LabelledImage], sums: BoostedSums, config: PaperConfig) -> float:
     """T that the blurred response exceeds at four of five marked cars: the paper gives none, its regions want one."""
     peaks = []
     for sample in samples:
-        smooth = cv2.GaussianBlur(dense_response(sample.image, detector.sums), (0, 0), config.response_sigma_px)
+        smooth = cv2.GaussianBlur(dense_response(sample.image, sums), (0, 0), config.response_sigma_px)
         x, y = (np.rint(sample.cars[:, k]).astype(int) for k in (0, 1))
         inside = (x >= 0) & (y >= 0) & (x < smooth.shape[1]) & (y < smooth.shape[0])
         peaks.append(smooth[y[inside], x[inside]])

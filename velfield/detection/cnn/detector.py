@@ -1,0 +1,108 @@
+"""The convolutional network as a detector: pre-trained, fine-tuned on labelled cars, or self-trained on moving ones."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from schemas.arrays import GreyImage, Mask
+from schemas.detector import CascadeConfig, CnnConfig, CnnRecord
+from velfield.detection.cascade.classifier import distinct
+from velfield.detection.cascade.detector import CascadeDetector
+from velfield.detection.cascade.long_vehicles import centre_long_vehicles
+from velfield.detection.cnn.fine_tuning import fine_tune
+from velfield.detection.cnn.inference import background_difference_at, detect_cars, motion_score_bonus
+from velfield.detection.cnn.model import Network, network_from_record
+from velfield.detection.cnn.self_training import self_train_from_motion
+from velfield.detection.detector import Detections, Detector, train_detector
+from velfield.detection.files import shipped_detector
+from velfield.detection.orientation import CAR_ASPECT
+from velfield.detection.samples import LabelledImage
+from velfield.detection.unlabelled import UnlabelledFlight
+
+_FRAMES = 12
+"""Frames that the self-training samples."""
+_MIN_VEHICLES = 20
+"""With fewer moving vehicles the network would overfit to these."""
+
+
+@dataclass(frozen=True)
+class CnnDetector(Detector):
+    """A fully convolutional network: a heatmap of car centres, and the axis at every cell."""
+
+    record: CnnRecord
+    method: ClassVar[str] = "cnn"
+
+    @cached_property
+    def network(self) -> Network:
+        """Its weights."""
+        return network_from_record(self.record.layers)
+
+    @property
+    def uses_background(self) -> bool:
+        """Whether a detection that differs from the background has a bonus on its score."""
+        return self.record.motion is not None
+
+    def detect(
+        self,
+        image: GreyImage,
+        valid: Mask | None = None,
+        background: GreyImage | None = None,
+        *,
+        threshold: float | None = None,
+    ) -> Detections:
+        """Detect cars: peaks of the heatmap, the motion bonus, non-maximum suppression, long vehicles centred."""
+        length_px, motion = self.record.working_car_length_px, self.record.motion
+        rows = detect_cars(self.network, image, valid)
+        if motion is not None and background is not None:
+            difference = background_difference_at(image, background, rows[:, :2], length_px)
+            rows[:, 3] += motion_score_bonus(motion, difference)
+        above = rows[rows[:, 3] > (self.threshold if threshold is None else threshold)]
+        cars = centre_long_vehicles(image, valid, distinct(above, length_px), length_px)
+        return Detections.from_rows(cars, np.full(len(cars), length_px * length_px * CAR_ASPECT))
+
+    @classmethod
+    def train(cls, samples: Sequence[LabelledImage], config: CnnConfig, *, base: Detector | None = None) -> Detector:
+        """Fine-tune the base, or the pre-trained network; a cascade where cars have another length than it knows."""
+        network = base if isinstance(base, CnnDetector) else _pretrained(config)
+        if network is None:
+            return train_detector(samples, config.for_method("cascade"))
+        return fine_tune(samples, network, config)
+
+    @classmethod
+    def train_from_motion(cls, flight: UnlabelledFlight, config: CnnConfig) -> Detector:
+        """A cascade, where appearance is sufficient or few vehicles move; else the network, self-trained.
+
+        Labels from motion are hundreds: the cascade learns as much from them, and is four times as fast. Where
+        appearance is not sufficient, the pre-trained network knows more of stationary cars.
+        """
+        cascade = config.for_method("cascade")
+        assert isinstance(cascade, CascadeConfig)
+        by_appearance = CascadeDetector.train_by_appearance(flight, cascade)
+        if by_appearance is not None:
+            return by_appearance
+        network = _pretrained(config)
+        if network is not None and config.motion_channel != "never" and flight.labels.vehicles >= _MIN_VEHICLES:
+            trained = self_train_from_motion(
+                flight.samples(_FRAMES),
+                network,
+                flight.bursts(),
+                flight.background.median,
+                config,
+                max_interval_s=flight.max_interval_s,
+            )
+            if trained is not None:
+                return trained
+        return flight.calibrate(flight.train(cascade), cascade)
+
+
+def _pretrained(config: CnnConfig) -> CnnDetector | None:
+    """The network that ships, where it was trained on cars of the configured length."""
+    shipped = shipped_detector()
+    assert isinstance(shipped, CnnDetector)
+    return shipped if shipped.record.working_car_length_px == config.working_car_length_px else None
+
+
+DETECTOR = CnnDetector
