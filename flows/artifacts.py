@@ -73,19 +73,19 @@ def _address(report: Path) -> str:
 
 
 class LongStage:
-    """How far a stage is, told in the UI once it takes long; short ones would only fill the page."""
+    """The progress of a stage, shown in the UI once it takes long; short ones would only fill the page."""
 
     def __init__(self, stage: str, steps: int) -> None:
         self._stage, self._steps = stage, max(steps, 1)
-        self._told_s = time.monotonic() + _LONG_S - _EVERY_S
+        self._updated_s = time.monotonic() + _LONG_S - _EVERY_S
         self._artifact: UUID | None = None
 
-    def tell(self, done: int) -> None:
-        """So many steps are done."""
+    def update(self, done: int) -> None:
+        """Show that so many steps are done."""
         now_s = time.monotonic()
-        if now_s - self._told_s < _EVERY_S and (self._artifact is None or done < self._steps):
+        if now_s - self._updated_s < _EVERY_S and (self._artifact is None or done < self._steps):
             return
-        self._told_s = now_s
+        self._updated_s = now_s
         percent = 100.0 * min(done / self._steps, 1.0)
         if self._artifact is None:
             key, about = f"progress-{self._stage}", f"{self._stage}, per cent"

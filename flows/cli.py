@@ -25,7 +25,7 @@ DONE, BAD_INPUT, USAGE, INCOMPLETE = 0, 1, 2, 3
 
 
 def _version() -> str:
-    from velfield.pipeline.version import code_version
+    from velfield.run.commits import code_version
 
     return code_version()
 

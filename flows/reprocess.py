@@ -4,6 +4,7 @@ Where the new picture registers well to the old base image, all that is known is
 frame is decoded, registered or searched for cars. Where it does not, or when asked to, the frames are registered again.
 """
 
+from functools import partial
 from pathlib import Path
 
 from prefect import flow, task
@@ -15,15 +16,14 @@ from flows.console import Console
 from flows.process_flight import process_flight
 from flows.runners import RunnerConfig, open_runner, parallel_units
 from flows.stale import mark_crashed
-from flows.work import Unit, Work
+from flows.work import Work
 from schemas.job import Inputs, Job, absolute
 from schemas.records import RebaseRecord
 from schemas.summary import RunSummary
 from velfield.errors import Failure, InputError
-from velfield.pipeline import graphs
+from velfield.pipeline.graphs import rebase_graph
 from velfield.pipeline.plan import write_flight_record
-from velfield.pipeline.result import unit_name
-from velfield.pipeline.stages.field import field_groups, group_name, lay_out_field
+from velfield.pipeline.stage import STAGES, NewBase, stages_before
 from velfield.pipeline.stages.rebase import Rebase, measure_rebase, rebased_plan
 from velfield.pipeline.stages.registration import lost_frames
 from velfield.pipeline.stages.report import write_report
@@ -42,9 +42,6 @@ from velfield.run.run import Run, open_run
 
 MAX_ADDED_ERROR_PX = 1.0
 """A new base image that lies on the old one worse than this, in the mean, has the frames registered again."""
-
-_SHARED = ("frames", "lens", "registration", "detector", "tracklets")
-"""Stages that no new base image touches, apart from what stands in ``base/``; of the tracklets only counts are kept."""
 
 
 def run_reprocess(
@@ -127,14 +124,15 @@ def _registered(run: Run, base: str, limit_px: float, console: Console) -> Rebas
 def _again(run: Run, job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
     """All that depends on the base image, as a run of its own that finds its frames read and its lens known."""
     layout = RunLayout(Path(job.root))
-    link_shared_outputs(run.layout, layout, ("frames", "lens"))
+    link_shared_outputs(run.layout, layout, stages_before("base"))
     task_runner = ThreadPoolTaskRunner(max_workers=parallel_units(runner))
     return process_flight.with_options(task_runner=task_runner)(job, runner, console)
 
 
 def _mapped(run: Run, job: Job, found: RebaseRecord, runner: RunnerConfig, console: Console) -> RunSummary:
     layout = RunLayout(Path(job.root))
-    link_shared_outputs(run.layout, layout, _SHARED, without=("base/", "tracklets/"))
+    link_shared_outputs(run.layout, layout, _names(NewBase.SHARED), without=("base/",))
+    link_shared_outputs(run.layout, layout, _names(NewBase.COUNTS), without=("",))  # no outputs, only the records
     sweep_partial(layout.root)
     plan = rebased_plan(run, job, found)
     write_flight_record(plan)
@@ -147,24 +145,14 @@ def _mapped(run: Run, job: Job, found: RebaseRecord, runner: RunnerConfig, conso
     return summary
 
 
+def _names(new_base: NewBase) -> list[str]:
+    return [stage.name for stage in STAGES if stage.new_base is new_base]
+
+
 def _run_stages(work: Work, rebase: Rebase) -> None:
-    plan = work.plan
-    for name in ("frames", "lens"):
-        work.carry_over(name)
-    image = work.run("base", [Unit("all", lambda: graphs.rebase_graph(plan, rebase))], essential=True)
-    for name in ("registration", "detector"):
-        work.carry_over(name)
-    cars = [
-        Unit(unit_name(frames), lambda frames=frames: graphs.rebase_detections_graph(plan, frames, rebase), len(frames))
-        for frames in plan.units
-    ]
-    work.run("detections", cars, after=[image], essential=True)
-    work.carry_over("tracklets")
-    chain = [Unit("all", lambda: graphs.rebase_tracks_graph(plan, rebase))]
-    tracks = work.run("tracks", chain, after=[image], essential=True)
-    lay_out_field(plan)
-    groups = [
-        Unit(group_name(group), lambda group=group: graphs.field_graph(plan, group)) for group in field_groups(plan)
-    ]
-    field = work.run("field", groups, after=[tracks], essential=True)
-    work.run("maps", [Unit("all", lambda: graphs.maps_graph(plan))], after=[field], essential=True)
+    graph = partial(rebase_graph, rebase=rebase)
+    for stage in STAGES:
+        if stage.new_base in (NewBase.SHARED, NewBase.COUNTS):
+            work.carry_over(stage)
+        else:
+            work.run(stage, graph, essential=True)

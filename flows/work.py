@@ -1,4 +1,4 @@
-"""The units of a stage as Prefect tasks: named for people, retried, linked to what they build on."""
+"""The units of a stage as Prefect tasks: named for people, retried, linked to the units that they read."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -15,38 +15,22 @@ from flows.runners import Runner
 from schemas.records import CommitRecord
 from schemas.summary import StageSummary
 from velfield.errors import InputError
+from velfield.pipeline.graphs import unit_graph
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import committed
+from velfield.pipeline.stage import STAGE, Cut, Stage
 from velfield.pipeline.summary import summarise_stage
+from velfield.pipeline.units import WHOLE, Unit, prepare_stage, stage_units
 from velfield.run.commits import read_commits
 
 Future = PrefectFuture[Any]
-_LABELS = {
-    "frames": "frames",
-    "lens": "lens",
-    "base": "base image",
-    "registration": "registration",
-    "detector": "detector",
-    "detections": "detections",
-    "tracklets": "tracklets",
-    "tracks": "tracks",
-    "field": "field",
-    "maps": "maps",
-}
-
-
-@dataclass(frozen=True)
-class Unit:
-    """One unit of a stage: its name, how to get its graph, how many steps of progress it is."""
-
-    name: str
-    graph: Callable[[], Any]
-    steps: int = 1
+GraphOf = Callable[[Plan, Stage, Unit], Any]
+"""The Dask graph of a unit."""
 
 
 @dataclass
-class Stage:
-    """The units of one stage, submitted: their futures in order, and the names of those that were lost."""
+class Submitted:
+    """The units of one stage, submitted: their futures in order, and the names of those that failed."""
 
     futures: list[Future] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
@@ -54,58 +38,58 @@ class Stage:
 
 @dataclass
 class Work:
-    """Runs stage after stage of one plan; ``plan`` changes its keys when units are lost."""
+    """Runs stage after stage of one plan; ``plan`` changes its keys when units fail."""
 
     plan: Plan
     runner: Runner
     console: Console
     summaries: list[StageSummary] = field(default_factory=list)
+    _submitted: dict[str, Submitted] = field(default_factory=dict)
 
-    def run(
-        self,
-        name: str,
-        units: Sequence[Unit],
-        *,
-        after: Sequence[Stage] = (),
-        beside: Stage | None = None,
-        halo: int = 0,
-        essential: bool = False,
-    ) -> Stage:
+    def run(self, stage: Stage, graph: GraphOf = unit_graph, *, essential: bool | None = None) -> None:
         """Compute all units of a stage and wait for them.
+
+        A unit of frames waits for the units of the same frames, and as many after as the stage's halo, of the stages
+        that it reads and that are cut by frames; for the others it waits until all of their units are done or lost:
+        it goes on with what is there.
 
         Parameters
         ----------
-        after
-            Stages of which every unit must be done or lost: what follows goes on with what is there.
-        beside, halo
-            A stage cut in the same way: unit k builds on its units k to k + halo.
+        graph
+            The Dask graph of a unit.
         essential
-            Nothing can follow without this stage: its failure is the run's.
+            Nothing can follow without this stage: its failure is the run's. Default: as the table says.
         """
         started = time.monotonic()
-        whole = [future for stage in after for future in stage.futures if not _is_lost(future)]
-        stage = Stage()
+        prepare_stage(self.plan, stage)
+        units = stage_units(self.plan, stage)
+        submitted = Submitted()
         before: list[CommitRecord] = []
-        with self.console.stage(name, _LABELS[name], sum(unit.steps for unit in units)) as progress:
+        with self.console.stage(stage.name, stage.label, sum(unit.steps for unit in units)) as progress:
             for k, unit in enumerate(units):
-                local = beside.futures[k : k + 1 + halo] if beside else []
-                record = committed(self.plan, name, unit.name)
+                record = committed(self.plan, stage.name, unit.name)
                 before += [] if record is None else [record]
-                stage.futures.append(self._submit(name, unit, [*whole, *local]))
-            records = self._collect(name, stage, units, progress, essential=essential)
-        self.plan = self.plan.despite([f"{name} {unit}" for unit in stage.lost])
+                submitted.futures.append(self._submit(stage, unit, graph, self._upstream(stage, k)))
+            essential = stage.essential if essential is None else essential
+            records = self._collect(stage, submitted, units, progress, essential=essential)
+        self._submitted[stage.name] = submitted
+        # Units that failed change the keys of all that is made without them.
+        self.plan = self.plan.with_lost_units([f"{stage.name} {unit}" for unit in submitted.lost])
         summary = summarise_stage(
-            name,
+            stage.name,
             records,
             units=len(units),
             before=before,
-            lost=stage.lost,
+            lost=submitted.lost,
             seconds=time.monotonic() - started,
         )
         self.summaries.append(summary)
+        self._print(stage, summary)
+
+    def _print(self, stage: Stage, summary: StageSummary) -> None:
         self.console.event(
             "stage",
-            f"{_LABELS[name]:<13} {summary.text}   {summary.seconds:.1f} s",
+            f"{stage.label:<13} {summary.text}   {summary.seconds:.1f} s",
             stage=summary.model_dump(mode="json"),
         )
         for note in summary.notes:
@@ -113,27 +97,37 @@ class Work:
         for warning in summary.warnings[:5]:
             self.console.warn(warning)
         if len(summary.warnings) > 5:
-            self.console.warn(f"... and {len(summary.warnings) - 5} more of {_LABELS[name]}; all are in the report")
-        return stage
+            self.console.warn(f"... and {len(summary.warnings) - 5} more of {stage.label}; all are in the report")
 
-    def carry_over(self, name: str) -> None:
-        """Tell of a stage whose units an earlier result had finished, and that this one takes as they are."""
-        records = read_commits(self.plan.layout, name)
-        summary = summarise_stage(name, records, units=len(records), before=records, lost=(), seconds=0.0)
+    def _upstream(self, stage: Stage, unit: int) -> list[Future]:
+        """What a unit, by its number, waits for."""
+        found: list[Future] = []
+        for name in stage.after:
+            futures = self._submitted.get(name, Submitted()).futures
+            if stage.cut is STAGE[name].cut is Cut.BY_FRAMES:
+                found += futures[unit : unit + 1 + stage.halo]
+            else:
+                found += [future for future in futures if not _is_lost(future)]
+        return found
+
+    def carry_over(self, stage: Stage) -> None:
+        """Summarise a stage whose units an earlier result finished, and that this one takes as they are."""
+        records = read_commits(self.plan.layout, stage.name)
+        summary = summarise_stage(stage.name, records, units=len(records), before=records, lost=(), seconds=0.0)
         self.summaries.append(summary)
 
-    def _submit(self, name: str, unit: Unit, wait_for: list[Future]) -> Future:
+    def _submit(self, stage: Stage, unit: Unit, graph: GraphOf, wait_for: list[Future]) -> Future:
         plan = self.plan
 
         def do() -> CommitRecord:
-            record = committed(plan, name, unit.name) or self.runner.compute(unit.graph())
+            record = committed(plan, stage.name, unit.name) or self.runner.compute(graph(plan, stage, unit))
             # Prefect keeps what a task returns: hundreds of digests a unit would make the driver grow with the flight.
             return record.model_copy(update={"outputs": {}})
 
-        label = _LABELS[name] if unit.name == "all" else f"{_LABELS[name]} {unit.name}"
+        label = stage.label if unit.name == WHOLE else f"{stage.label} {unit.name}"
         return task(
             do,
-            name=_LABELS[name],
+            name=stage.label,
             task_run_name=label,
             retries=self.plan.config.work.retries,
             retry_delay_seconds=1,
@@ -143,30 +137,30 @@ class Work:
         ).submit(wait_for=wait_for)
 
     def _collect(
-        self, name: str, stage: Stage, units: Sequence[Unit], progress: StageProgress, *, essential: bool
+        self, stage: Stage, submitted: Submitted, units: Sequence[Unit], progress: StageProgress, *, essential: bool
     ) -> list[CommitRecord]:
         done = 0
-        shown = LongStage(name, sum(unit.steps for unit in units))
-        steps = {future: unit.steps for future, unit in zip(stage.futures, units, strict=True)}
-        for future in as_completed(stage.futures):
+        artifact = LongStage(stage.name, sum(unit.steps for unit in units))
+        steps = {future: unit.steps for future, unit in zip(submitted.futures, units, strict=True)}
+        for future in as_completed(submitted.futures):
             done += steps[future]
             progress.at_least(done)
-            shown.tell(done)
+            artifact.update(done)
         records = []
-        for future, unit in zip(stage.futures, units, strict=True):
+        for future, unit in zip(submitted.futures, units, strict=True):
             if not _is_lost(future):
                 records.append(future.result())
                 continue
             error = _error_of(future)
             if isinstance(error, InputError) or essential:
                 raise error
-            stage.lost.append(unit.name)
-            self.console.warn(f"{unit.name} was lost: {error}; the next run with the same folder tries it again")
+            submitted.lost.append(unit.name)
+            self.console.warn(f"unit {unit.name} of {stage.label} failed: {error}; re-run to retry")
         return records
 
 
 def _worth_retrying(_task: Any, _run: Any, state: Any) -> bool:
-    """Bad input stays bad: only what may pass (a killed worker, a full disk that empties) is tried again."""
+    """Bad input stays bad: only what may pass (a killed worker, a full disk that empties) is retried."""
     try:
         state.result()
     except InputError:
@@ -183,7 +177,7 @@ def _is_lost(future: Future) -> bool:
 
 def _error_of(future: Future) -> BaseException:
     if not future.state.is_final():
-        return RuntimeError("what it builds on was lost")
+        return RuntimeError("a unit that it reads failed")
     outcome = future.result(raise_on_failure=False)
     if isinstance(outcome, BaseException):
         return outcome

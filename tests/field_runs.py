@@ -16,7 +16,7 @@ from schemas.records import FlightRecord, GridRecord, InputsRecord, SourceRecord
 from schemas.simulation import SimulationConfig
 from schemas.tables import TRACKLET_COLUMNS
 from velfield.field.time_intervals import parse_time_intervals
-from velfield.pipeline.stages.field import accumulate_group, field_groups, lay_out_field
+from velfield.pipeline.stages.field import accumulate_group, create_field_stores, field_groups
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run, open_run
 from velfield.run.tables import write_table
@@ -97,7 +97,7 @@ def field_run(
         indices=np.arange(2),
         time_intervals=[] if asked is None else parse_time_intervals(asked, 0.0, seconds),
     )
-    lay_out_field(plan)  # type: ignore[arg-type]  # all of a plan that the field reads
+    create_field_stores(plan)  # type: ignore[arg-type]  # all of a plan that the field reads
     for group in field_groups(plan):  # type: ignore[arg-type]
         accumulate_group(plan, group)  # type: ignore[arg-type]
     return open_run(root)

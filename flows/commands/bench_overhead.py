@@ -7,7 +7,6 @@ that is what can be told on a machine that others use as well.
 
 import shutil
 import time
-from collections.abc import Callable
 from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from schemas.job import Job
     from velfield.pipeline.plan import Plan
+    from velfield.pipeline.units import Unit
 
 
 @dataclass(frozen=True)
@@ -101,76 +101,32 @@ def _bare(job: "Job", workers: int) -> Cost:
         plan = make_plan(job)
         write_flight_record(plan)
         start, used_before = time.monotonic(), _processor_s()
-        _stages(plan, pool)
+        compute_bare(plan, pool)
         return Cost(time.monotonic() - start, _processor_s() - used_before, start - begun)
 
 
-def _stages(plan: "Plan", pool: Executor) -> None:
-    """The stages in the order of `flows.process_flight`, each on the pool."""
-    from velfield.pipeline.stages import base_image as base
-    from velfield.pipeline.stages import (
-        detections,
-        detector,
-        field,
-        frames,
-        lens,
-        maps,
-        registration,
-        tracklets,
-        tracks,
-    )
+def compute_bare(plan: "Plan", pool: Executor) -> None:
+    """All stages, one after another, each on the pool: blocks of all units at once, then what joins a unit's."""
+    from velfield.pipeline.stage import STAGES, resolve
+    from velfield.pipeline.units import prepare_stage, stage_units, unit_blocks
 
-    frames.lay_out_frames(plan)
-    _by_unit(plan, pool, "frames", frames.read_unit)
-    _whole(plan, pool, "lens", lens.calibrate_flight)
-    spread, step = base.spread_frames(plan), plan.config.work.block_frames
-    blocks = [spread[k : k + step] for k in range(0, len(spread), step)]
-    found = list(pool.map(base.detect_unit_keypoints, [plan] * len(blocks), blocks))
-    _whole(plan, pool, "base", base.build_base, found)
-    registration.lay_out_registration(plan)
-    _by_blocks(plan, pool, "registration", base.detect_unit_keypoints, registration.register_unit)
-    _whole(plan, pool, "detector", detector.make_detector)
-    _by_blocks(plan, pool, "detections", detections.detect_block, detections.write_detections)
-    _by_unit(plan, pool, "tracklets", tracklets.link_unit)
-    _whole(plan, pool, "tracks", tracks.chain_tracks, plan.units)
-    field.lay_out_field(plan)
-    groups = field.field_groups(plan)
-    names = [field.group_name(group) for group in groups]
-    for done in [
-        pool.submit(_one, plan, "field", n, field.accumulate_group, g) for n, g in zip(names, groups, strict=True)
-    ]:
-        done.result()
-    _whole(plan, pool, "maps", maps.make_maps)
+    for stage in STAGES:
+        prepare_stage(plan, stage)
+        under_way = []
+        for unit in stage_units(plan, stage):
+            frames = unit_blocks(plan, stage, unit) if stage.block else []
+            under_way.append((unit, [pool.submit(resolve(str(stage.block)), plan, part) for part in frames]))
+        ends = []
+        for unit, blocks in under_way:
+            results = [[block.result() for block in blocks]] if stage.block else []
+            ends.append(pool.submit(_one, plan, stage.name, unit, *results))
+        for end in ends:
+            end.result()
 
 
-def _one(plan: "Plan", stage: str, unit: str, function: Callable[..., Any], *arguments: Any) -> None:
+def _one(plan: "Plan", stage: str, unit: "Unit", *blocks: Any) -> None:
     from velfield.pipeline.result import commit
+    from velfield.pipeline.stage import STAGE, resolve
 
     started = time.time()
-    commit(plan, stage, unit, function(plan, *arguments), started=started)
-
-
-def _whole(plan: "Plan", pool: Executor, stage: str, function: Callable[..., Any], *arguments: Any) -> None:
-    pool.submit(_one, plan, stage, "all", function, *arguments).result()
-
-
-def _by_unit(plan: "Plan", pool: Executor, stage: str, function: Callable[..., Any]) -> None:
-    from velfield.pipeline.result import unit_name
-
-    for done in [pool.submit(_one, plan, stage, unit_name(unit), function, unit) for unit in plan.units]:
-        done.result()
-
-
-def _by_blocks(
-    plan: "Plan", pool: Executor, stage: str, of_block: Callable[..., Any], of_unit: Callable[..., Any]
-) -> None:
-    """Blocks of all units at once, then what puts a unit's together, as soon as they are there."""
-    from velfield.pipeline.result import unit_name
-
-    under_way = {unit: [pool.submit(of_block, plan, block) for block in plan.blocks(unit)] for unit in plan.units}
-    ends = []
-    for unit, blocks in under_way.items():
-        found = [block.result() for block in blocks]
-        ends.append(pool.submit(_one, plan, stage, unit_name(unit), of_unit, unit, found))
-    for end in ends:
-        end.result()
+    commit(plan, stage, unit.name, resolve(STAGE[stage].unit)(plan, *unit.part, *blocks), started=started)

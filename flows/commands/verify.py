@@ -55,14 +55,14 @@ def _repair(run: "Run") -> None:
     from flows.process_flight import run_flight
     from flows.runners import RunnerConfig
     from schemas.job import Job
-    from velfield.pipeline.verify import forget, verify_run
+    from velfield.pipeline.verify import invalidate, verify_run
     from velfield.run.lock import locked
 
     given = _inputs(run.record, run.layout.root)
     job = Job(root=str(run.layout.root), inputs=given, config=run.record.config)
     _same_inputs(job, run.record)
     with locked(run.layout):
-        forget(run.layout, verify_run(run.layout, run.record))
+        invalidate(run.layout, verify_run(run.layout, run.record))
     run_flight(job, RunnerConfig(), Console("normal"))
 
 

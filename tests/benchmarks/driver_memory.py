@@ -4,6 +4,7 @@ python -m tests.benchmarks.driver_memory
 """
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,34 +32,27 @@ def _stages(root: Path, frames: int, unit: Any) -> int:
 
     from flows.console import Console
     from flows.runners import ThreadsRunner
-    from flows.work import Stage, Unit, Work
+    from flows.work import Work
     from tests.pipeline.test_estimate import planned
-    from velfield.pipeline.result import unit_name
+    from velfield.pipeline.stage import STAGES, Cut
 
     plan = planned(frames, root, unit_frames=unit)
     work = Work(plan, ThreadsRunner(2), Console("quiet"))
-    before: Stage | None = None
-    count = 0
-    for stage in ("frames", "registration", "detections", "tracklets"):
-        units = [
-            Unit(unit_name(part), lambda part=part, stage=stage: delayed(_commit, pure=False)(plan, stage, part))
-            for part in plan.units
-        ]
-        count += len(units)
-        before = work.run(stage, units, beside=before)
-    return count
+    by_frames = [replace(stage, prepare=None) for stage in STAGES if stage.cut is Cut.BY_FRAMES]
+    for stage in by_frames:
+        work.run(stage, lambda plan, stage, part: delayed(_commit, pure=False)(plan, stage.name, part))
+    return len(by_frames) * len(plan.units)
 
 
-def _commit(plan: Any, stage: str, part: range) -> Any:
+def _commit(plan: Any, stage: str, part: Any) -> Any:
     """A record as large as a true one's, written as a true one is."""
     from schemas.records import CommitRecord
-    from velfield.pipeline.result import unit_name
     from velfield.run.commits import write_commit
 
     counts = dict.fromkeys(("frames", "usable", "registered", "heldout_px", "cars", "tracklets"), 1.0)
-    outputs = {f"frames.zarr/raw/c/{frame}/0/0": "0" * 32 for frame in part}
+    outputs = {f"frames.zarr/raw/c/{frame}/0/0": "0" * 32 for frame in part.frames}
     key = plan.keys[stage]
-    record = CommitRecord(stage=stage, unit=unit_name(part), key=key, outputs=outputs, counts=counts, code_version="0")
+    record = CommitRecord(stage=stage, unit=part.name, key=key, outputs=outputs, counts=counts, code_version="0")
     write_commit(plan.layout, record)
     return record
 

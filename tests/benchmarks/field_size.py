@@ -55,11 +55,11 @@ def _plan(root: Path, shape: tuple[int, int], tracklets: Any) -> Any:
 
 def _build(plan: Any) -> tuple[float, int, float, float]:
     """Seconds, pixels known, and MB of memory before and at most, in a process of its own."""
-    from velfield.pipeline.stages.field import accumulate_group, field_groups, lay_out_field
+    from velfield.pipeline.stages.field import accumulate_group, create_field_stores, field_groups
 
     idle_mb = _most_mb()
     started = time.monotonic()
-    lay_out_field(plan)
+    create_field_stores(plan)
     pixels = sum(int(accumulate_group(plan, group).counts["pixels"]) for group in field_groups(plan))
     return time.monotonic() - started, pixels, idle_mb, _most_mb()
 

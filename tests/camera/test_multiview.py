@@ -17,7 +17,7 @@ from velfield.camera.multiview import FramePairs, MultiViewFit, ScaledLens, fit_
 from velfield.camera.plumbline import SD_INFLATION
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.plan import make_plan
-from velfield.pipeline.stages.frames import lay_out_frames, read_unit
+from velfield.pipeline.stages.frames import create_frame_store, read_unit
 from velfield.pipeline.stages.lens import calibrate_flight
 from velfield.registration.pairing import match_frame_pairs
 
@@ -313,7 +313,7 @@ def test_the_stage_asks_the_control_points_unless_told_not_to(
         config = resolve_config(overrides=quick | {"lens.refine": refined})
         inputs = Inputs(source=str(tmp_path / "frames"))
         plan = make_plan(Job(root=str(tmp_path / refined), inputs=inputs, config=config))
-        lay_out_frames(plan)
+        create_frame_store(plan)
         read_unit(plan, range(len(pictures[0])))
         calibrate_flight(plan)
         told[refined] = CameraRecord.model_validate_json(plan.layout.camera.read_bytes())

@@ -10,7 +10,7 @@ from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.plan import make_plan
 from velfield.pipeline.stages.base_image import detect_unit_keypoints
 from velfield.pipeline.stages.external_detections import free_of_vehicles
-from velfield.pipeline.stages.frames import lay_out_frames, read_unit
+from velfield.pipeline.stages.frames import create_frame_store, read_unit
 
 
 def test_no_key_point_lies_on_a_given_vehicle(tmp_path: Path) -> None:
@@ -29,7 +29,7 @@ def test_no_key_point_lies_on_a_given_vehicle(tmp_path: Path) -> None:
             config=resolve_config(overrides={"frames.fps": 5, "lens.refine": "never"}),
         )
     )
-    lay_out_frames(plan)
+    create_frame_store(plan)
     read_unit(plan, range(3))
     free = free_of_vehicles(plan, 1, (120, 160))
     assert free is not None

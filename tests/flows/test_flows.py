@@ -18,15 +18,16 @@ from velfield.detection.detector import from_record
 from velfield.detection.files import shipped_detector
 from velfield.errors import InputError
 from velfield.pipeline.plan import make_plan
+from velfield.pipeline.stage import STAGE
 from velfield.pipeline.stages.detections import detect_block
 from velfield.pipeline.stages.detector import make_detector
-from velfield.run.layout import STAGES, RunLayout
+from velfield.run.layout import RunLayout
 from velfield.run.results import link_shared_outputs
 
 
 def test_it_leaves_what_the_contract_says(whole: tuple[Path, RunSummary]) -> None:
     root, summary = whole
-    assert [stage.name for stage in summary.stages] == list(STAGES)
+    assert [stage.name for stage in summary.stages] == list(STAGE)
     assert summary.complete
     names = ("flight.json", "frames.zarr", "camera.json", "base/grid.json", "base/base_image.png", "registration.zarr")
     names += (
@@ -217,7 +218,7 @@ def test_detections_of_another_detector_take_the_place_of_ours(
     counts = {stage.name: stage.counts for stage in summary.stages}
     assert counts["detections"]["cars"] == pytest.approx(inside.sum(), rel=0.02)
     assert counts["tracks"]["tracks"] > 20
-    assert "another program's boxes" in next(stage.text for stage in summary.stages if stage.name == "detector")
+    assert "external detections" in next(stage.text for stage in summary.stages if stage.name == "detector")
 
 
 def test_boxes_of_few_frames_what_is_not_used_and_why_the_maps_stay_empty_are_told(

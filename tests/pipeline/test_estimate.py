@@ -11,10 +11,11 @@ from schemas.job import Inputs, Job
 from schemas.records import InputsRecord, SourceRecord
 from tests.small_flight import job
 from velfield.errors import InputError
-from velfield.pipeline.check_inputs import check_given
+from velfield.pipeline.check_inputs import validate_inputs
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.estimate import describe_plan, planned_units
-from velfield.pipeline.plan import Plan, changed_since, make_plan, stage_keys, write_flight_record
+from velfield.pipeline.plan import Plan, changed_since, make_plan, write_flight_record
+from velfield.pipeline.stage import stage_keys
 from velfield.sources.frames import SourceInfo
 
 FOUR_HOURS = 72_000
@@ -69,7 +70,7 @@ def test_what_is_not_what_it_was_given_as_is_told_before_any_work(flight: Path, 
     given = job(flight, tmp_path / "run")
     given = given.model_copy(update={"inputs": given.inputs.model_copy(update={option: str(tmp_path / "hello.txt")})})
     with pytest.raises(InputError, match=f"^--{option}: .*hello.txt") as caught:
-        check_given(make_plan(given))
+        validate_inputs(make_plan(given))
     assert "b'" not in str(caught.value)
 
 

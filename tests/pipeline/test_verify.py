@@ -10,9 +10,10 @@ from flows.commands.verify import verify
 from schemas.summary import RunSummary
 from tests.small_flight import digests
 from velfield import open_run
-from velfield.pipeline.verify import forget, verify_run
+from velfield.pipeline.stage import STAGE
+from velfield.pipeline.verify import invalidate, verify_run
 from velfield.run.commits import commit_path, read_commits
-from velfield.run.layout import STAGES, RunLayout
+from velfield.run.layout import RunLayout
 from velfield.run.stores import StoreError
 
 FLIPS = 200
@@ -33,7 +34,7 @@ def flip_a_bit(path: Path, rng: np.random.Generator) -> None:
 
 def committed_files(root: Path) -> list[str]:
     layout = RunLayout(root)
-    return sorted({name for stage in STAGES for record in read_commits(layout, stage) for name in record.outputs})
+    return sorted({name for stage in STAGE for record in read_commits(layout, stage) for name in record.outputs})
 
 
 def found(root: Path) -> dict[str, str]:
@@ -70,7 +71,7 @@ def test_every_one_of_200_flipped_bits_is_found(copy: Path) -> None:
 def test_what_is_gone_or_was_never_done_is_told(copy: Path) -> None:
     (copy / "frames.zarr/raw/c/5/0/0").unlink()
     commit_path(RunLayout(copy), "tracklets", "000008-000015").unlink()
-    assert found(copy) == {"frames.zarr/raw/c/5/0/0": "gone", "links 000008-000015": "not finished"}
+    assert found(copy) == {"frames.zarr/raw/c/5/0/0": "gone", "tracklets 000008-000015": "not finished"}
 
 
 def test_a_run_that_never_came_to_its_end_is_not_called_damaged(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -116,6 +117,6 @@ def test_only_the_damaged_units_are_done_again_and_come_out_the_same(
 def test_a_store_whose_description_is_damaged_is_made_again(copy: Path) -> None:
     (copy / "registration.zarr/zarr.json").write_text("{")
     run = open_run(copy)
-    taken_back = forget(run.layout, verify_run(run.layout, run.record))
+    taken_back = invalidate(run.layout, verify_run(run.layout, run.record))
     assert taken_back == [f"registration {unit}" for unit in ("000000-000007", "000008-000015", "000016-000017")]
     assert not (copy / "registration.zarr").exists()

@@ -7,16 +7,16 @@ import pytest
 from schemas.flight import FlightConfig, TrackingConfig
 from schemas.records import CommitRecord, InputsRecord, SourceRecord
 from velfield.pipeline.configuration import resolve_config
-from velfield.pipeline.plan import stage_keys
+from velfield.pipeline.stage import STAGE, stage_keys
 from velfield.run.commits import content_key, digest_file, sweep_partial, valid_commit, write_atomically, write_commit
-from velfield.run.layout import STAGES, RunLayout
+from velfield.run.layout import RunLayout
 
 INPUTS = InputsRecord(source=SourceRecord(path="a", kind="video", digest="d", width=10, height=10, frame_count=3))
 
 
 def first_changed(a: dict[str, str], b: dict[str, str]) -> str | None:
     """The first stage whose key differs; asserts that every later one that reads it differs too."""
-    changed = [stage for stage in STAGES if a[stage] != b[stage]]
+    changed = [stage for stage in STAGE if a[stage] != b[stage]]
     return changed[0] if changed else None
 
 
@@ -39,7 +39,8 @@ def test_a_changed_parameter_redoes_what_reads_it_and_what_follows(setting: str,
     changed = stage_keys(resolve_config(settings=[setting]), INPUTS)
     assert first_changed(keys, changed) == stage
     if stage:
-        later = STAGES[STAGES.index(stage) :]
+        stages = list(STAGE)
+        later = stages[stages.index(stage) :]
         assert [s for s in later if keys[s] == changed[s]] == []
 
 

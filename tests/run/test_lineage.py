@@ -10,8 +10,8 @@ from flows.commands.lineage import lineage
 from schemas.summary import RunSummary
 from velfield import open_run
 from velfield.errors import InputError
+from velfield.pipeline.stage import STAGE
 from velfield.run.commits import digest_file
-from velfield.run.layout import STAGES
 from velfield.run.lineage import pixel_lineage, stage_lineage
 
 
@@ -53,7 +53,7 @@ def test_the_frames_are_those_of_the_tracklets_with_their_true_times(
 def test_the_chain_of_stages(whole: tuple[Path, RunSummary]) -> None:
     run = open_run(whole[0])
     stages = stage_lineage(run)
-    assert [stage.name for stage in stages] == list(STAGES)
+    assert [stage.name for stage in stages] == list(STAGE)
     assert {stage.name: stage.key for stage in stages} == run.record.keys
 
 

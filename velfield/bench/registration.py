@@ -21,6 +21,7 @@ from velfield.errors import InputError
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import Plan, make_plan, write_flight_record
+from velfield.pipeline.stage import stages_before
 from velfield.registration.transforms import as_points
 from velfield.run.frame_transforms import FrameTransforms
 from velfield.sources.images import read_grey_image
@@ -169,7 +170,7 @@ def register_flight(flight: Path, out: Path) -> tuple[Plan, float]:
     )
     plan = make_plan(job)
     write_flight_record(plan)
-    compute_stages(plan, ("frames", "lens", "base"))
+    compute_stages(plan, stages_before("registration"))
     started = time.perf_counter()
     compute_stages(plan, ("registration",))
     return plan, time.perf_counter() - started

@@ -1,4 +1,4 @@
-"""What was given besides the source is read before any work: a bad file is told at once, not an hour later."""
+"""Optional inputs are read before any work: a bad file is reported at once, not an hour later."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,36 +7,38 @@ from velfield.detection.files import load_detector
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import committed
+from velfield.pipeline.stage import STAGES, Cut
+from velfield.pipeline.units import WHOLE
 from velfield.sources.geo import read_base_raster
 from velfield.sources.labels.detections import read_detections
 from velfield.sources.labels.labels import read_labels
 
-_WHOLE = "all"
+_READ: dict[str, Callable[[Path, Plan], object]] = {
+    "base": lambda path, plan: read_base_raster(path, plan.config.frames),
+    "labels": lambda path, plan: read_labels(path, plan.info),
+    "detector": lambda path, plan: load_detector(path),
+    "detections": lambda path, plan: read_detections(path, plan.info),
+}
 
 
-def check_given(plan: Plan) -> None:
-    """Read each file that a stage is still to read.
+def validate_inputs(plan: Plan) -> None:
+    """Read each file that a stage has yet to read.
 
     Raises
     ------
     InputError
-        One cannot be read or is not what it was given as; it names the option.
+        One cannot be read or is not what its option expects; the message names the option.
     """
-    given = plan.job.inputs
-    if given.base and committed(plan, "base", _WHOLE) is None:
-        _reading("base", lambda: read_base_raster(Path(str(given.base)), plan.config.frames))
-    if committed(plan, "detector", _WHOLE) is not None:
-        return
-    if given.labels:
-        _reading("labels", lambda: read_labels(Path(str(given.labels)), plan.info))
-    if given.detector:
-        _reading("detector", lambda: load_detector(Path(str(given.detector))))
-    if given.detections:
-        _reading("detections", lambda: read_detections(Path(str(given.detections)), plan.info))
+    for option, read in _READ.items():
+        path = getattr(plan.job.inputs, option)
+        if path and _is_pending(plan, option):
+            try:
+                read(Path(path), plan)
+            except InputError as error:
+                raise InputError(f"--{option}: {error}") from None
 
 
-def _reading(option: str, read: Callable[[], object]) -> None:
-    try:
-        read()
-    except InputError as error:
-        raise InputError(f"--{option}: {error}") from None
+def _is_pending(plan: Plan, option: str) -> bool:
+    """Whether a stage that reads this input has yet to be computed."""
+    stages = [stage.name for stage in STAGES if option in stage.inputs and stage.cut is Cut.WHOLE]
+    return any(committed(plan, stage, WHOLE) is None for stage in stages)

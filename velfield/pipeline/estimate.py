@@ -1,38 +1,40 @@
-"""What a run would do, said before it is done: units, task runs, bytes, what is finished already."""
+"""The estimate of a run before it starts: units, task runs, bytes, memory, what is finished already."""
 
 import shutil
 from pathlib import Path
 
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
-from velfield.pipeline.result import committed, unit_name
+from velfield.pipeline.result import committed
+from velfield.pipeline.stage import STAGES, Cut, Stage
+from velfield.pipeline.units import group_name, stage_units, unit_name
 from velfield.run.field_writer import GROUP_TILES
-from velfield.run.layout import STAGES
 from velfield.run.paths import is_remote
 
-_PER_FRAME = ("frames", "registration", "detections", "tracklets")
 _FRAME_COMPRESSION = 0.8
 """Zstandard leaves about this much of a noisy grey frame."""
 _BYTES_A_DETECTION_FRAME = 150_000
 _BYTES_A_TILE = 200_000
 _TOUCHED = 0.1
-"""Share of the map that traffic touches: a few per cent, with a margin."""
+"""Fraction of the map that traffic touches: a few per cent, with a margin."""
 
 
 _PROCESS_BYTES = 500_000_000
-_BYTES_A_PIXEL_IN_HAND = 350
+_MEMORY_BYTES_A_PIXEL = 350
 """What a process takes by itself, and for each unit at a time: peaks of runs of 1280 x 960 and 1920 x 1080 px."""
 
 
 def planned_units(plan: Plan) -> dict[str, list[str]]:
-    """Names of every stage's units; the field's are an estimate until the base image's size is known."""
-    units = {stage: ["all"] for stage in STAGES}
-    for stage in _PER_FRAME:
-        units[stage] = [unit_name(frames) for frames in plan.units]
+    """Names of every stage's units; those by tiles are an estimate until the base image's size is known."""
+    return {stage.name: _unit_names(plan, stage) for stage in STAGES}
+
+
+def _unit_names(plan: Plan, stage: Stage) -> list[str]:
+    if stage.cut is not Cut.BY_TILES:
+        return [unit.name for unit in stage_units(plan, stage)]
     side = plan.config.field.tile_size_px * GROUP_TILES
     rows, columns = -(-plan.info.height // side), -(-plan.info.width // side)
-    units["field"] = [f"group-{row:03d}-{column:03d}" for row in range(rows) for column in range(columns)]
-    return units
+    return [group_name((row, column)) for row in range(rows) for column in range(columns)]
 
 
 def estimated_bytes(plan: Plan) -> int:
@@ -45,11 +47,11 @@ def estimated_bytes(plan: Plan) -> int:
 
 def estimated_memory(plan: Plan, at_a_time: int) -> int:
     """Bytes of memory that ``at_a_time`` units take together, whatever the flight's length."""
-    return _PROCESS_BYTES + at_a_time * plan.info.width * plan.info.height * _BYTES_A_PIXEL_IN_HAND
+    return _PROCESS_BYTES + at_a_time * plan.info.width * plan.info.height * _MEMORY_BYTES_A_PIXEL
 
 
 def check_space(plan: Plan) -> None:
-    """Refuse a run that cannot end well, before it starts.
+    """Refuse a run that the disk has no room for, before it starts.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a run will do: its frames, its units, and the content key of every stage, known before any work is done."""
+"""The plan of a run: its frames, its units, and the content key of every stage, known before any work is done."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -9,21 +9,20 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from schemas.flight import FlightConfig
-from schemas.job import Job
+from schemas.job import Inputs, Job
 from schemas.records import FlightRecord, InputsRecord, SourceRecord
 from velfield.errors import InputError
 from velfield.field.time_intervals import TimeInterval, parse_time_intervals
-from velfield.pipeline.version import STAGE_VERSIONS, code_version
-from velfield.run.commits import content_key, digest_path, write_atomically
-from velfield.run.layout import STAGES, RunLayout
+from velfield.pipeline.stage import stage_keys
+from velfield.run.commits import code_version, content_key, digest_path, write_atomically
+from velfield.run.layout import RunLayout
 from velfield.sources.source import SourceInfo, check_source, probe, select_frames
 
 _MANY_GAPS = 0.3
-"""Share of frames without a near one before them from which it is said."""
+"""Fraction of frames without a near one before them from which a warning is given."""
 _LATE = 1.5
 """A frame may come late by half an interval."""
-_BESIDES = ("base", "labels", "detector", "detections", "timestamps")
-"""What may be given besides the source."""
+OPTIONAL_INPUTS = tuple(name for name in Inputs.model_fields if name != "source")
 _UNITS = ((256, 16), (4096, 64))
 """Up to so many frames, so many a unit: a short flight is cut finely enough for several workers ..."""
 _LARGEST_UNIT = 256
@@ -32,7 +31,7 @@ _LARGEST_UNIT = 256
 
 @dataclass(frozen=True)
 class Plan:
-    """A run, resolved: picklable, small, and all that a worker is told besides a unit's number."""
+    """A run, resolved: picklable, small, and all that a worker needs besides the unit."""
 
     job: Job
     info: SourceInfo = field(repr=False)
@@ -75,15 +74,15 @@ class Plan:
         Raises
         ------
         InputError
-            The text that asks for them is not understood, or they overlap.
+            The setting cannot be parsed, or they overlap.
         """
         text, times_s = self.config.field.time_intervals, self.info.times_s[self.indices]
         return [] if text is None else parse_time_intervals(text, float(times_s[0]), float(times_s[-1]))
 
-    def despite(self, lost: Sequence[str]) -> "Plan":
-        """The plan for what comes after units were lost: under keys of its own.
+    def with_lost_units(self, lost: Sequence[str]) -> "Plan":
+        """The plan of the stages after one of which units failed: under keys of their own.
 
-        The next run does the lost units, and by its other keys does again what was made without them.
+        The next run computes the lost units, and by its other keys computes again what was made without them.
         """
         if not lost:
             return self
@@ -97,33 +96,33 @@ class Plan:
 
 
 def check_inputs(job: Job) -> None:
-    """See at a glance that all that was given is there, before anything that takes long is started.
+    """Check that all inputs exist, before anything that takes long is started.
 
     Raises
     ------
     InputError
-        The source cannot be opened, or another file that was given is not there.
+        The source cannot be opened, or another input does not exist.
     """
     check_source(job.inputs.source)
-    _check_besides(job)
+    _check_optional_inputs(job)
 
 
-def _check_besides(job: Job) -> None:
-    for name in _BESIDES:
+def _check_optional_inputs(job: Job) -> None:
+    for name in OPTIONAL_INPUTS:
         path = getattr(job.inputs, name)
         if path is not None and not Path(path).exists():
             raise InputError(f"--{name}: {path} is not there; give a path that exists")
 
 
 def make_plan(job: Job) -> Plan:
-    """Look at the inputs and resolve the run.
+    """Probe the inputs and resolve the run.
 
     Raises
     ------
     InputError
         The source cannot be read, has no times, or fewer than three frames are left to work on.
     """
-    _check_besides(job)  # `probe` sees whether the source is there
+    _check_optional_inputs(job)  # `probe` checks the source
     timestamps = Path(job.inputs.timestamps) if job.inputs.timestamps else None
     info = probe(Path(job.inputs.source), frames=job.config.frames, timestamps=timestamps)
     indices = select_frames(info.times_s, job.config.frames)
@@ -135,7 +134,7 @@ def make_plan(job: Job) -> Plan:
     info = replace(info, warnings=(*info.warnings, *_gaps(info.times_s[indices], job.config.tracking.max_interval_s)))
     inputs = _digest_inputs(job, info)
     plan = Plan(job=job.anywhere(), info=info, indices=indices, inputs=inputs, keys=stage_keys(job.config, inputs))
-    _ = plan.time_intervals  # what cannot be is told now, not where the field is built
+    _ = plan.time_intervals  # refuses impossible intervals now, not where the field is built
     return plan
 
 
@@ -146,22 +145,22 @@ def _gaps(times_s: NDArray[np.float64], max_interval_s: float) -> list[str]:
         return []
     return [
         f"{wide.mean():.0%} of the frames come more than {max_interval_s:g} s after the one before (median "
-        f"{np.median(gaps):.2f} s), over which no car is followed: few tracklets or none; {widen_interval(gaps)}"
+        f"{np.median(gaps):.2f} s), too far apart to link detections: few tracklets or none; {widen_interval(gaps)}"
     ]
 
 
 def widen_interval(gaps_s: NDArray[np.float64]) -> str:
-    """What to do where the frames (gaps between them, s) come too far apart to follow a car."""
+    """The remedy where the frames (gaps between them, s) are too far apart to link detections."""
     enough = np.ceil(20 * _LATE * float(np.median(gaps_s))) / 20
     return (
-        f"take frames closer together, or --set tracking.max_interval_s={enough:g} where traffic is thin (the farther "
-        "apart, the more often one car is taken for another)"
+        f"take frames closer together, or --set tracking.max_interval_s={enough:g} where traffic is sparse (the "
+        "farther apart, the more wrong links)"
     )
 
 
 def _digest_inputs(job: Job, info: SourceInfo) -> InputsRecord:
     digests: dict[str, str | None] = {}
-    for name in _BESIDES:
+    for name in OPTIONAL_INPUTS:
         path = getattr(job.inputs, name)
         digests[name] = digest_path(Path(path)) if path else None
     source = SourceRecord(
@@ -175,47 +174,14 @@ def _digest_inputs(job: Job, info: SourceInfo) -> InputsRecord:
     return InputsRecord(source=source, **digests)
 
 
-def stage_keys(config: FlightConfig, inputs: InputsRecord) -> dict[str, str]:
-    """Each stage's key holds the keys of the stages that it reads, and the parameters that it reads, no others."""
-    keys: dict[str, str] = {}
-
-    def key(stage: str, parameters: list[object], upstream: list[str], given: list[str | None] | None = None) -> None:
-        keys[stage] = content_key(
-            stage,
-            STAGE_VERSIONS[stage],
-            parameters=parameters,
-            inputs=[*(keys[name] for name in upstream), *(given or [])],
-        )
-
-    # The unit's size decides where chains are seeded anew, so per-frame results belong to it.
-    units = [config.work.unit_frames, config.work.block_frames]
-    key("frames", [config.frames], [], [inputs.source.digest, inputs.timestamps])
-    key("lens", [config.lens], ["frames"])
-    key("base", [config.base, config.registration, config.gsd_m], ["lens"], [inputs.base, inputs.detections])
-    key("registration", [config.registration, units], ["base"], [inputs.detections])
-    key(
-        "detector",
-        [config.detection, config.tracking.max_interval_s],
-        ["registration"],
-        [inputs.labels, inputs.detector, inputs.detections],
-    )
-    key("detections", [config.detection], ["detector"])
-    key("tracklets", [config.tracking], ["detections"])
-    key("tracks", [], ["tracklets"])
-    key("field", [config.field], ["tracks"])
-    key("maps", [], ["field"])
-    assert tuple(keys) == STAGES
-    return keys
-
-
 def changed_since(plan: Plan) -> list[str]:
-    """What was given otherwise when the run folder was last worked on; none where it is new, or by another version."""
+    """Inputs and settings that changed since the last run in this folder; none if it is new or of another format."""
     if not plan.layout.flight.exists():
         return []
     try:
         old = FlightRecord.model_validate_json(plan.layout.flight.read_bytes())
     except ValidationError:
-        return []  # that version's stages have other keys as well: all is done anew
+        return []  # that version's stages have other keys as well: everything is recomputed
     moved = old.inputs.source.model_copy(update={"path": plan.inputs.source.path})
     before = old.inputs.model_copy(update={"source": moved})
     inputs = [name for name in InputsRecord.model_fields if getattr(before, name) != getattr(plan.inputs, name)]

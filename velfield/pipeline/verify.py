@@ -1,4 +1,4 @@
-"""Whether a run folder is whole: every file and chunk that a commit record names is there and is what was written."""
+"""Integrity of a run folder: every file and chunk that a commit record names exists and is what was written."""
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
@@ -8,22 +8,19 @@ from itertools import chain
 from pathlib import Path
 
 from schemas.records import CommitRecord, FlightRecord
+from velfield.pipeline.stage import STAGE, STAGES, Cut
+from velfield.pipeline.units import WHOLE
 from velfield.run.commits import commit_path, digest_file, read_commits
-from velfield.run.layout import STAGES, RunLayout
+from velfield.run.layout import RunLayout
 from velfield.run.paths import remove_tree
 
-_BY_FRAMES = ("registration", "detections", "tracklets")
-"""Stages that are cut as the frames are."""
-_STORES = {"frames": "frames.zarr", "registration": "registration.zarr", "field": "field.zarr"}
 _THREADS = min(4, os.cpu_count() or 1)
-
-
 NOT_FINISHED = "not finished"
 
 
 @dataclass(frozen=True)
 class Damage:
-    """One thing that is not as its commit record says, or a unit that has none."""
+    """A file or unit that differs from its commit record, or a unit that has none."""
 
     stage: str
     unit: str
@@ -38,8 +35,8 @@ class Damage:
 
 
 def verify_run(layout: RunLayout, record: FlightRecord) -> list[Damage]:
-    """Read all that is committed and compare it with its digests; a unit that was never finished is told too."""
-    by_stage = {stage: read_commits(layout, stage) for stage in STAGES}
+    """Read all that is committed and compare it with its digests; units that were never finished are listed too."""
+    by_stage = {stage.name: read_commits(layout, stage.name) for stage in STAGES}
     found = list(_unfinished(by_stage)) + list(_other_keys(by_stage, record))
     with ThreadPoolExecutor(_THREADS) as pool:
         checked = pool.map(lambda unit: _check(layout, unit), chain.from_iterable(by_stage.values()))
@@ -60,11 +57,15 @@ def _check(layout: RunLayout, record: CommitRecord) -> list[Damage]:
 
 
 def _unfinished(by_stage: dict[str, list[CommitRecord]]) -> Iterator[Damage]:
-    cut = {unit.unit for unit in by_stage["frames"]}
-    for stage, records in by_stage.items():
-        there = {record.unit for record in records}
-        wanted = cut if stage in _BY_FRAMES else set() if there else {"all"}
-        yield from (Damage(stage, unit, None, NOT_FINISHED) for unit in sorted(wanted - there))
+    by_frames = {record.unit for name, records in by_stage.items() for record in records if _is_by_frames(name)}
+    for name, records in by_stage.items():
+        finished = {record.unit for record in records}
+        expected = by_frames if _is_by_frames(name) and by_frames else set() if finished else {WHOLE}
+        yield from (Damage(name, unit, None, NOT_FINISHED) for unit in sorted(expected - finished))
+
+
+def _is_by_frames(stage: str) -> bool:
+    return STAGE[stage].cut is Cut.BY_FRAMES
 
 
 def _other_keys(by_stage: dict[str, list[CommitRecord]], flight: FlightRecord) -> Iterator[Damage]:
@@ -75,15 +76,15 @@ def _other_keys(by_stage: dict[str, list[CommitRecord]], flight: FlightRecord) -
                 yield Damage(stage, record.unit, None, "made without units that were lost, or of other inputs")
 
 
-def forget(layout: RunLayout, damages: Iterable[Damage]) -> list[str]:
-    """Take back the records of damaged units, so that the next run does them again; returns ``stage unit`` names.
+def invalidate(layout: RunLayout, damages: Iterable[Damage]) -> list[str]:
+    """Remove the records of damaged units, so that the next run computes them again; returns ``stage unit`` names.
 
-    A store whose description is damaged is of no use to anybody: all of its units are taken back.
+    A store whose metadata is damaged cannot be opened: it is removed, with the records of all of its units.
     """
     units = {(damage.stage, damage.unit) for damage in damages}
     for stage in {damage.stage for damage in damages if (damage.path or "").endswith("zarr.json")}:
         units |= {(stage, record.unit) for record in read_commits(layout, stage)}
-        remove_tree(layout.root / _STORES[stage])
+        remove_tree(layout.root / str(STAGE[stage].store))
     for stage, unit in units:
         commit_path(layout, stage, unit).unlink(missing_ok=True)
     return sorted(f"{stage} {unit}" for stage, unit in units)
@@ -94,12 +95,12 @@ def describe_damage(root: Path, damages: Sequence[Damage]) -> str:
     if not damages:
         return f"{root}: whole"
     units = len({(damage.stage, damage.unit) for damage in damages})
-    told = [damage.text() for damage in damages]
+    lines = [damage.text() for damage in damages]
     if not has_damage(damages):
-        return "\n".join([*told, f"{root}: what is there is whole; {units} units were never finished"])
-    return "\n".join([*told, f"{root}: {len(damages)} faults in {units} units"])
+        return "\n".join([*lines, f"{root}: what is there is whole; {units} units were never finished"])
+    return "\n".join([*lines, f"{root}: {len(damages)} faults in {units} units"])
 
 
 def has_damage(damages: Sequence[Damage]) -> bool:
-    """Whether anything is amiss beyond units that a run which stopped, or was refused, never came to."""
+    """Whether there is damage, beyond units that a run which stopped, or was refused, did not reach."""
     return any(damage.what != NOT_FINISHED for damage in damages)

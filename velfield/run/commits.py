@@ -9,6 +9,7 @@ import io
 import json
 import os
 from collections.abc import Iterable
+from importlib.metadata import version
 from pathlib import Path
 from typing import IO
 
@@ -21,6 +22,11 @@ from velfield.run.paths import is_remote
 _WHOLE_FILE_BYTES = 256 * 2**20
 _SAMPLE_BYTES = 2**20
 _SAMPLES = 64
+
+
+def code_version() -> str:
+    """The installed version of velfield."""
+    return version("velfield")
 
 
 def digest_bytes(data: bytes) -> str:
@@ -62,7 +68,7 @@ def digest_path(path: Path) -> str:
 
 
 def content_key(
-    stage: str, version: int, *, parameters: Iterable[object] = (), inputs: Iterable[str | None] = ()
+    stage: str, stage_version: int, *, parameters: Iterable[object] = (), inputs: Iterable[str | None] = ()
 ) -> str:
     """Key of a stage: equal exactly when its inputs, its parameters and its code's version are.
 
@@ -74,7 +80,7 @@ def content_key(
     False
     """
     plain = [p.model_dump(mode="json") if isinstance(p, BaseModel) else p for p in parameters]
-    text = json.dumps([stage, version, plain, list(inputs)], sort_keys=True, allow_nan=False)
+    text = json.dumps([stage, stage_version, plain, list(inputs)], sort_keys=True, allow_nan=False)
     return digest_bytes(text.encode())
 
 

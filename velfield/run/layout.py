@@ -5,9 +5,6 @@ from pathlib import Path
 
 from velfield.run.paths import to_path
 
-STAGES = ("frames", "lens", "base", "registration", "detector", "detections", "tracklets", "tracks", "field", "maps")
-"""The stages in the order of the work."""
-
 
 @dataclass(frozen=True)
 class RunLayout:

@@ -14,7 +14,6 @@ from velfield.field.bins import VelocityBins, band_radius_px
 from velfield.field.segments import SEGMENT_DTYPE, Segments, segment_table
 from velfield.run.commits import read_commits
 from velfield.run.grid import read_working
-from velfield.run.layout import STAGES
 from velfield.run.run import Run
 
 
@@ -62,13 +61,12 @@ class PixelLineage:
 def stage_lineage(run: Run) -> list[StageLineage]:
     """The run's stages in the order of the work, those that are done."""
     found = []
-    for stage in STAGES:
+    for stage in run.record.keys:
         records = read_commits(run.layout, stage)
         if records:
-            key = run.record.keys.get(stage) or records[0].key
             outputs = sum(len(record.outputs) for record in records)
             versions = tuple(sorted({record.code_version for record in records}))
-            found.append(StageLineage(stage, key, len(records), outputs, versions))
+            found.append(StageLineage(stage, run.record.keys[stage], len(records), outputs, versions))
     return found
 
 

@@ -21,7 +21,7 @@ from velfield.errors import Failure, InputError
 from velfield.exports.cog import write_cog
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
-from velfield.pipeline.result import Outcome
+from velfield.pipeline.result import StageResult
 from velfield.pipeline.stages.base_fit import BaseFit, check_scale, covered_share
 from velfield.pipeline.stages.external_detections import free_of_vehicles
 from velfield.pipeline.stages.lens import spread_usable
@@ -69,7 +69,7 @@ def detect_unit_keypoints(plan: Plan, frames: Sequence[int]) -> list[FrameKeypoi
     ]
 
 
-def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> Outcome:
+def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageResult:
     """Write ``base/``.
 
     Raises
@@ -124,7 +124,7 @@ def _finish(
     frames: int | None = None,
     given: BaseRaster | None = None,
     fit: BaseFit | None = None,
-) -> Outcome:
+) -> StageResult:
     """Write the grid; ``frames``: of how many the own base image was made, none where none was."""
     layout = plan.layout
     layout.rebased.unlink(missing_ok=True)
@@ -135,10 +135,10 @@ def _finish(
     if frames is not None:
         counts["frames"] = float(frames)
     if given is None or fit is None:
-        return Outcome(outputs, counts)
+        return StageResult(outputs, counts)
     counts |= {"intersensor_error_px": fit.error_px, "scale": fit.scale, "covered": fit.covered}
     by_hand = plan.config.gsd_m if given.gsd_m is None else None
-    return Outcome(outputs, counts, [*given.notes, fit.note(by_hand)], fit.warnings())
+    return StageResult(outputs, counts, [*given.notes, fit.note(by_hand)], fit.warnings())
 
 
 def _given_picture(plan: Plan) -> BaseRaster | None:

@@ -16,7 +16,7 @@ from velfield.detection.detector import Detector
 from velfield.detection.files import load_detector
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
-from velfield.pipeline.result import Outcome
+from velfield.pipeline.result import StageResult
 from velfield.pipeline.stages.external_detections import external_detections
 from velfield.pipeline.stages.rectified_frames import WorkingFrame, WorkingGrid, read_background
 from velfield.pipeline.stages.registration import usable_frames
@@ -117,7 +117,7 @@ def _joined(parts: Sequence[BlockDetections]) -> BlockDetections:
     )
 
 
-def write_detections(plan: Plan, frames: range, blocks: Sequence[BlockDetections]) -> Outcome:
+def write_detections(plan: Plan, frames: range, blocks: Sequence[BlockDetections]) -> StageResult:
     """Write the table of a unit, and its patches."""
     whole = _joined([block for block in blocks if len(block.table)])
     unit = frames.start // plan.unit_frames
@@ -130,4 +130,4 @@ def write_detections(plan: Plan, frames: range, blocks: Sequence[BlockDetections
     )
     write_table(path, whole.table, DETECTION_COLUMNS)
     used = int(usable_frames(plan)[frames.start : frames.stop].sum())
-    return Outcome([path, pictures], {"frames": used, "cars": len(whole.table)})
+    return StageResult([path, pictures], {"frames": used, "cars": len(whole.table)})

@@ -19,7 +19,7 @@ from velfield.detection.unlabelled import UnlabelledFlight
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
-from velfield.pipeline.result import Outcome
+from velfield.pipeline.result import StageResult
 from velfield.pipeline.stages.external_detections import given_boxes
 from velfield.pipeline.stages.labels import (
     base_px_per_raw_px,
@@ -38,7 +38,7 @@ _MIN_FRAMES_WITH_BOXES = 0.5
 """Fraction of the frames in which another program's boxes are expected."""
 
 
-def make_detector(plan: Plan) -> Outcome:
+def make_detector(plan: Plan) -> StageResult:
     """Set the scale of the working grid, and load or train the detector."""
     if plan.job.inputs.detections:
         return _from_detections(plan)
@@ -49,14 +49,14 @@ def make_detector(plan: Plan) -> Outcome:
     return _from_motion(plan)
 
 
-def _from_file(plan: Plan) -> Outcome:
+def _from_file(plan: Plan) -> StageResult:
     """Load a detector file; one that uses the difference to the background gets that of this flight."""
     detector, scale = load_detector(Path(plan.job.inputs.detector or "")), _known_scale(plan)
     background = motion_background(_motion_frames(plan, scale)) if detector.uses_background else None
     return _finish(plan, detector, scale, "file", background=background)
 
 
-def _from_detections(plan: Plan) -> Outcome:
+def _from_detections(plan: Plan) -> StageResult:
     """Take another program's boxes; their median length gives the working scale where ``--gsd-m`` does not."""
     boxes, scale = given_boxes(plan), _scale_of_gsd(plan)
     if scale is None:
@@ -78,7 +78,7 @@ def _from_detections(plan: Plan) -> Outcome:
     unused = [f"--{name}" for name in ("labels", "detector") if getattr(plan.job.inputs, name)]
     if unused:
         warnings.append(f"--detections is given, so no detector is trained or run: {' and '.join(unused)} not used")
-    return Outcome(outcome.outputs, outcome.counts, outcome.notes, warnings)
+    return StageResult(outcome.outputs, outcome.counts, outcome.notes, warnings)
 
 
 def _scale_of_length(plan: Plan, length_raw_px: float, base_per_raw: float) -> float | None:
@@ -100,7 +100,7 @@ def _known_scale(plan: Plan) -> float:
     return scale
 
 
-def _from_labels(plan: Plan) -> Outcome:
+def _from_labels(plan: Plan) -> StageResult:
     labels = marked_cars(plan)
     base_per_raw = base_px_per_raw_px(plan)
     length_px = car_length_raw_px(labels.cars)
@@ -116,7 +116,7 @@ def _from_labels(plan: Plan) -> Outcome:
     return replace(outcome, warnings=odd_length(length_px * base_per_raw, read_grid(plan.layout).gsd_m))
 
 
-def _from_motion(plan: Plan) -> Outcome:
+def _from_motion(plan: Plan) -> StageResult:
     """Train on vehicles that move; without ``--gsd-m`` a car's length is estimated from them first."""
     known = _scale_of_gsd(plan)
     scale = known or 1.0
@@ -140,7 +140,7 @@ def _from_motion(plan: Plan) -> Outcome:
     return _finish(plan, detector, scale, "motion", count=labels.count, motion=labels, background=background)
 
 
-def _without_labels(plan: Plan, scale: float | None, labels: MotionLabels) -> Outcome:
+def _without_labels(plan: Plan, scale: float | None, labels: MotionLabels) -> StageResult:
     """Neither given labels nor enough vehicles that move: use the shipped detector, with a warning.
 
     It needs a car's size.
@@ -149,7 +149,7 @@ def _without_labels(plan: Plan, scale: float | None, labels: MotionLabels) -> Ou
     if scale is None:
         raise InputError(f"{reason}; or give --gsd-m, so that the shipped detector can be used")
     outcome = _finish(plan, shipped_detector(), scale, "shipped", motion=labels)
-    return Outcome(outcome.outputs, outcome.counts, outcome.notes, [f"{reason}. The shipped detector is used"])
+    return StageResult(outcome.outputs, outcome.counts, outcome.notes, [f"{reason}. The shipped detector is used"])
 
 
 def _motion_frames(plan: Plan, scale: float) -> list[MotionFrame]:
@@ -178,7 +178,7 @@ def _finish(
     count: int = 0,
     motion: MotionLabels | None = None,
     background: MotionBackground | None = None,
-) -> Outcome:
+) -> StageResult:
     """Write the detector, the working grid, and the background where the detector uses it."""
     layout, outputs, notes = plan.layout, [plan.layout.working], []
     if detector is not None:
@@ -205,4 +205,4 @@ def _finish(
     counts = {"labels": float(count), "working_scale": scale}
     if detector is not None:
         counts["threshold"] = detector.threshold
-    return Outcome(outputs, counts, notes)
+    return StageResult(outputs, counts, notes)

@@ -15,7 +15,7 @@ from velfield.field.segments import SEGMENT_DTYPE, Segments, segment_table, segm
 from velfield.field.time_intervals import TimeInterval, assign_intervals
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
-from velfield.pipeline.result import Outcome
+from velfield.pipeline.result import StageResult
 from velfield.run.field_writer import Group, GroupWriter, create_field_store, tile_groups
 from velfield.run.grid import read_grid
 from velfield.run.paths import remove_tree
@@ -33,17 +33,6 @@ _SEGMENT_COLUMNS = [
 ]
 
 
-def group_name(group: tuple[int, int]) -> str:
-    """Name of a group of tiles, (row, column).
-
-    Examples
-    --------
-    >>> group_name((0, 3))
-    'group-000-003'
-    """
-    return f"group-{group[0]:03d}-{group[1]:03d}"
-
-
 def field_groups(plan: Plan) -> list[Group]:
     """All groups of tiles of the base image, (row, column)."""
     return tile_groups(read_grid(plan.layout), plan.config.field)
@@ -54,7 +43,7 @@ def field_weight(config: FieldConfig) -> Weight:
     return "segment" if config.shared_segment_weight == 2 else "passage"
 
 
-def lay_out_field(plan: Plan) -> None:
+def create_field_stores(plan: Plan) -> None:
     """Create ``field.zarr``, and a store for each time interval, unless they exist under this plan's key."""
     if store_key(plan.layout.field) == plan.keys["field"]:
         return
@@ -83,7 +72,7 @@ def interval_stores(plan: Plan) -> list[tuple[Path, TimeInterval]]:
     return [(plan.layout.intervals / f"{k:03d}.zarr", part) for k, part in enumerate(plan.time_intervals)]
 
 
-def accumulate_group(plan: Plan, group: Group) -> Outcome:
+def accumulate_group(plan: Plan, group: Group) -> StageResult:
     """Fill one group of tiles, of the field and of its time intervals."""
     grid, config = read_grid(plan.layout), plan.config.field
     bins = VelocityBins.from_config(config, grid.gsd_m)
@@ -100,7 +89,7 @@ def accumulate_group(plan: Plan, group: Group) -> Outcome:
         files += part.files()
     advance("field")
     count = writer.layers["count"]
-    return Outcome(
+    return StageResult(
         files,
         {"pixels": float((count > 0).sum()), "pixels_5": float((count >= 5).sum()), "tiles": len(writer.touched)},
     )

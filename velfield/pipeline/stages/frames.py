@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
-from velfield.pipeline.result import Outcome
+from velfield.pipeline.result import StageResult
 from velfield.run.stores import create_frames, open_frames, store_key
 from velfield.sources.flags import UNUSABLE, FrameFlag
 from velfield.sources.quality import frame_quality
 from velfield.sources.source import iter_frames
 
 
-def lay_out_frames(plan: Plan) -> None:
+def create_frame_store(plan: Plan) -> None:
     """Create ``frames.zarr`` unless it stands as this plan wants it."""
     path = plan.layout.frames
     if store_key(path) == plan.keys["frames"]:
@@ -32,7 +32,7 @@ def lay_out_frames(plan: Plan) -> None:
     )
 
 
-def read_unit(plan: Plan, frames: range) -> Outcome:
+def read_unit(plan: Plan, frames: range) -> StageResult:
     """Decode a unit's frames and write them, one chunk each; what could not be read is black and flagged.
 
     Raises
@@ -70,4 +70,6 @@ def read_unit(plan: Plan, frames: range) -> Outcome:
     }
     store.write_columns(frames.start, columns)
     usable = int(np.sum((flags & int(UNUSABLE)) == 0))
-    return Outcome(store.files(frames.start, frames.stop), {"frames": len(frames), "usable": usable}, warnings=warnings)
+    return StageResult(
+        store.files(frames.start, frames.stop), {"frames": len(frames), "usable": usable}, warnings=warnings
+    )

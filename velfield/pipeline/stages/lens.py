@@ -9,7 +9,7 @@ from velfield.camera.lens import lens_from_record, pinhole
 from velfield.camera.plumbline import calibrate
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
-from velfield.pipeline.result import Outcome
+from velfield.pipeline.result import StageResult
 from velfield.registration.pairing import match_frame_pairs
 from velfield.run.commits import write_atomically
 from velfield.run.stores import open_frames
@@ -26,7 +26,7 @@ def spread_usable(plan: Plan, count: int) -> list[int]:
     return [int(frame) for frame in usable[chosen]]
 
 
-def calibrate_flight(plan: Plan) -> Outcome:
+def calibrate_flight(plan: Plan) -> StageResult:
     """Calibrate, or keep the pin-hole where that is asked for."""
     store = open_frames(plan.layout.frames)
     height, width = store.shape
@@ -50,7 +50,7 @@ def calibrate_flight(plan: Plan) -> Outcome:
     counts = {"corner_px": _corner_shift(record, width, height)}
     if record.residual_px is not None:
         counts["residual_px"] = record.residual_px
-    return Outcome([plan.layout.camera], counts, _notes(record))
+    return StageResult([plan.layout.camera], counts, _notes(record))
 
 
 def _notes(record: CameraRecord) -> list[str]:

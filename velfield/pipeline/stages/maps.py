@@ -12,7 +12,7 @@ from velfield.field.bins import stationary_speed_px_per_s
 from velfield.field.statistics import direction_rad, speed_px_per_s
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
-from velfield.pipeline.result import Outcome
+from velfield.pipeline.result import StageResult
 from velfield.pipeline.stages.certificates import write_certificates
 from velfield.report.figures import MapScale, direction_figure, png_bytes, speed_figure
 from velfield.run.base_image import read_base_image
@@ -25,7 +25,7 @@ from velfield.viewer.record import write_view_data
 PREVIEW_SIDE_PX = 900
 
 
-def make_maps(plan: Plan) -> Outcome:
+def make_maps(plan: Plan) -> StageResult:
     """Write ``maps/``, direction and speed as PNG and as GeoTIFF, small pictures of both for the Prefect UI; and
     what the viewer reads of the run beside the field's tiles."""
     grid, config, layout = read_grid(plan.layout), plan.config.field, plan.layout
@@ -49,7 +49,7 @@ def make_maps(plan: Plan) -> Outcome:
     written += write_certificates(plan)
     written += write_view_data(layout)
     advance("maps")
-    return Outcome(written, {"maps": float(len(figures))})
+    return StageResult(written, {"maps": float(len(figures))})
 
 
 def _layers(plan: Plan, direction: FloatArray, speed: FloatArray) -> list[Path]:

@@ -19,9 +19,9 @@ from velfield.camera.lens import pinhole
 from velfield.errors import Failure
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
-from velfield.pipeline.result import Outcome
+from velfield.pipeline.result import StageResult
+from velfield.pipeline.stage import STAGES, NewBase
 from velfield.pipeline.stages.base_image import write_given_picture
-from velfield.pipeline.version import STAGE_VERSIONS
 from velfield.registration.intersensor import register_intersensor
 from velfield.registration.transforms import PolyprojectiveTransform
 from velfield.run.commits import content_key, digest_path, read_commit, write_atomically
@@ -97,14 +97,14 @@ def _source_of(run: Run) -> SourceInfo:
 def _rebased_keys(old: FlightRecord, inputs: InputsRecord) -> dict[str, str]:
     """Keys of their own for what is mapped; what the new picture does not touch keeps its key."""
     keys = dict(old.keys)
-    base = content_key("base", STAGE_VERSIONS["base"], parameters=["mapped"], inputs=[keys["base"], inputs.base])
-    keys["base"] = base
-    for stage in ("detections", "tracks", "field", "maps"):
-        keys[stage] = content_key(stage, STAGE_VERSIONS[stage], inputs=[keys[stage], base])
+    for stage in STAGES:
+        if stage.new_base in (NewBase.MAPPED, NewBase.COMPUTED):
+            read = [keys[stage.name], inputs.base]
+            keys[stage.name] = content_key(stage.name, stage.version, parameters=["mapped"], inputs=read)
     return keys
 
 
-def rebase_image(plan: Plan, rebase: Rebase) -> Outcome:
+def rebase_image(plan: Plan, rebase: Rebase) -> StageResult:
     """Write ``base/`` on the new picture's grid."""
     layout, old, record = plan.layout, rebase.old, rebase.record
     assert plan.job.inputs.base is not None, "a new base image is what this is about"
@@ -129,7 +129,7 @@ def rebase_image(plan: Plan, rebase: Rebase) -> Outcome:
         "frames": committed.counts.get("frames", 0.0) if committed else 0.0,
         "intersensor_error_px": float(grid.intersensor_error_px or 0.0),
     }
-    return Outcome(outputs, counts, [*given.notes, record.text()])
+    return StageResult(outputs, counts, [*given.notes, record.text()])
 
 
 def _rebased_grid(old: GridRecord, given: BaseRaster, record: RebaseRecord) -> GridRecord:
@@ -149,13 +149,13 @@ def _rebased_grid(old: GridRecord, given: BaseRaster, record: RebaseRecord) -> G
     )
 
 
-def rebase_detections(plan: Plan, frames: range, rebase: Rebase) -> Outcome:
+def rebase_detections(plan: Plan, frames: range, rebase: Rebase) -> StageResult:
     """Map the cars of a unit; their pictures stay."""
     unit = frames.start // plan.unit_frames
     source = plan.layout.unit_file(rebase.old.detections, unit, ".parquet")
     if not source.exists():
         told = f"frames {frames.start} to {frames.stop - 1} have no cars"
-        return Outcome([], {"frames": 0.0, "cars": 0.0}, warnings=[told])
+        return StageResult([], {"frames": 0.0, "cars": 0.0}, warnings=[told])
     table = mapped_detections(
         read_tables([source], DETECTION_COLUMNS), polyprojective_from_record(rebase.record.transform)
     )
@@ -164,10 +164,10 @@ def rebase_detections(plan: Plan, frames: range, rebase: Rebase) -> Outcome:
     pictures = plan.layout.unit_file(rebase.old.detections, unit, ".patches.npz")
     linked = link_file(pictures, plan.layout.detections / pictures.name)
     advance("detections", len(frames))
-    return Outcome([path, linked], {"frames": float(table["frame"].nunique()), "cars": float(len(table))})
+    return StageResult([path, linked], {"frames": float(table["frame"].nunique()), "cars": float(len(table))})
 
 
-def rebase_tracks(plan: Plan, rebase: Rebase) -> Outcome:
+def rebase_tracks(plan: Plan, rebase: Rebase) -> StageResult:
     """Map all tracklets, unit by unit."""
     transform, written, tracks, count = polyprojective_from_record(rebase.record.transform), [], set[int](), 0
     for source in sorted(rebase.old.tracks.glob("unit-*.parquet")):
@@ -177,7 +177,7 @@ def rebase_tracks(plan: Plan, rebase: Rebase) -> Outcome:
         tracks.update(table["passage_id"].unique().tolist())
         count += len(table)
     advance("tracks")
-    return Outcome(written, {"tracklets": float(count), "tracks": float(len(tracks))})
+    return StageResult(written, {"tracklets": float(count), "tracks": float(len(tracks))})
 
 
 def mapped_detections(table: pd.DataFrame, transform: PolyprojectiveTransform) -> pd.DataFrame:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
-from velfield.pipeline.result import Outcome
+from velfield.pipeline.result import StageResult
 from velfield.pipeline.stages.base_image import FrameKeypoints, base_reference
 from velfield.registration.intrasensor import FrameRegistration, register_chain
 from velfield.registration.keypoints import Keypoints
@@ -28,7 +28,7 @@ MAP_PARAMETERS = 65
 """About how many parameters a frame's map has: its standard error is the residual times sqrt(parameters / points)."""
 
 
-def lay_out_registration(plan: Plan) -> None:
+def create_registration_store(plan: Plan) -> None:
     """Create ``registration.zarr`` unless it stands as this plan wants it."""
     path = plan.layout.registration
     if store_key(path) == plan.keys["registration"]:
@@ -43,7 +43,7 @@ def lay_out_registration(plan: Plan) -> None:
     )
 
 
-def register_unit(plan: Plan, frames: range, blocks: Sequence[Sequence[FrameKeypoints]]) -> Outcome:
+def register_unit(plan: Plan, frames: range, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageResult:
     """Chain a unit's frames in chains of ``chain_length_frames``, each started from the base image."""
     keypoints = {found.frame: found.keypoints for block in blocks for found in block}
     store = open_frames(plan.layout.frames)
@@ -66,7 +66,7 @@ def _read(
         yield frame, store.read(frame), keypoints[frame]
 
 
-def _write(plan: Plan, frames: range, flags: NDArray[np.uint16], results: dict[int, FrameRegistration]) -> Outcome:
+def _write(plan: Plan, frames: range, flags: NDArray[np.uint16], results: dict[int, FrameRegistration]) -> StageResult:
     config = plan.config.registration
     length = vector_length(plan.info.width, plan.info.height, config)
     vectors = np.full((len(frames), length), np.nan)
@@ -94,7 +94,7 @@ def _write(plan: Plan, frames: range, flags: NDArray[np.uint16], results: dict[i
     counts = {"frames": float(len(frames)), "registered": float(registered)}
     if registered:
         counts["heldout_px"] = float(np.nanmean(columns["heldout_px"]))
-    return Outcome(store.files(frames.start), counts)
+    return StageResult(store.files(frames.start), counts)
 
 
 def usable_frames(plan: Plan) -> NDArray[np.bool_]:

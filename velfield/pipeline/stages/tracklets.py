@@ -6,7 +6,7 @@ import pandas as pd
 from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
-from velfield.pipeline.result import Outcome
+from velfield.pipeline.result import StageResult
 from velfield.pipeline.stages.registration import MAP_PARAMETERS, usable_frames
 from velfield.run.grid import read_grid
 from velfield.run.stores import open_frames, open_registration
@@ -14,7 +14,7 @@ from velfield.run.tables import Patches, read_patches, read_tables, write_table
 from velfield.tracking.tracklets import FrameTable, link_windows, window_frames
 
 
-def link_unit(plan: Plan, frames: range) -> Outcome:
+def link_unit(plan: Plan, frames: range) -> StageResult:
     """Tracklets of all windows that start in ``frames``; reads the detections of as many frames after as they need."""
     times_s = open_frames(plan.layout.frames).column("time_s")
     usable = usable_frames(plan)
@@ -25,7 +25,7 @@ def link_unit(plan: Plan, frames: range) -> Outcome:
     write_table(path, tracklets, TRACKLET_COLUMNS)
     advance("tracklets", len(frames))
     counts = {f"gate_{name}": float(count) for name, count in log.items()}
-    return Outcome([path], {"frames": len(frames), "tracklets": len(tracklets), **counts})
+    return StageResult([path], {"frames": len(frames), "tracklets": len(tracklets), **counts})
 
 
 def _frame_tables(plan: Plan, wanted: range, times_s: np.ndarray, usable: np.ndarray) -> list[FrameTable]:

@@ -7,7 +7,7 @@ import numpy as np
 from schemas.tables import TRACKLET_COLUMNS
 from velfield.pipeline.plan import Plan, widen_interval
 from velfield.pipeline.progress import advance
-from velfield.pipeline.result import Outcome
+from velfield.pipeline.result import StageResult
 from velfield.pipeline.stages.registration import usable_frames
 from velfield.run.grid import read_grid
 from velfield.run.stores import open_frames
@@ -16,18 +16,17 @@ from velfield.tracking.gap_closing import END_COLUMNS, GapLimits, reconnect_trac
 from velfield.tracking.tracks import assign_tracks
 
 
-def tracklet_files(plan: Plan, units: list[range]) -> list[Path]:
-    """Tables of the units that are there, in order."""
-    paths = [
-        plan.layout.unit_file(plan.layout.tracklets, frames.start // plan.unit_frames, ".parquet") for frames in units
-    ]
+def tracklet_files(plan: Plan) -> list[Path]:
+    """Tables of tracklets of the units that are finished, in order."""
+    layout = plan.layout
+    paths = [layout.unit_file(layout.tracklets, unit, ".parquet") for unit in range(len(plan.units))]
     return [path for path in paths if path.exists()]
 
 
-def chain_tracks(plan: Plan, units: list[range]) -> Outcome:
+def chain_tracks(plan: Plan) -> StageResult:
     """Give every tracklet the track that it belongs to: reads a few columns of all units, writes unit by unit."""
     ids = [f"detection_id_{k}" for k in range(3)]
-    sources = tracklet_files(plan, units)
+    sources = tracklet_files(plan)
     tracklets = read_tables(sources, TRACKLET_COLUMNS, only=[*ids, *END_COLUMNS])
     tracks = assign_tracks(tracklets[ids].to_numpy(np.int64))
     config = plan.config.tracking
@@ -42,11 +41,11 @@ def chain_tracks(plan: Plan, units: list[range]) -> Outcome:
         write_table(target, table, TRACKLET_COLUMNS)
         written.append(target)
     advance("tracks")
-    warnings = [] if len(tracks) else [_why_none(plan)]
-    return Outcome(written, {"tracklets": len(tracks), "tracks": len(np.unique(tracks))}, warnings=warnings)
+    warnings = [] if len(tracks) else [explain_no_tracklets(plan)]
+    return StageResult(written, {"tracklets": len(tracks), "tracks": len(np.unique(tracks))}, warnings=warnings)
 
 
-def _why_none(plan: Plan) -> str:
+def explain_no_tracklets(plan: Plan) -> str:
     """Why no car was followed, so that the maps stay empty, and what to do."""
     told, near_s = "no tracklets, so the maps stay empty", plan.config.tracking.max_interval_s
     times_s = open_frames(plan.layout.frames).column("time_s")[usable_frames(plan)]

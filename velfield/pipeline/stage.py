@@ -1,0 +1,294 @@
+"""The stages of a run: the one table that everything else derives from.
+
+Their order, what each one reads (and so its content key), how it is cut into units of work, its functions, and the line
+that it prints when it is done. The plan, the Dask graphs, the Prefect flow, the benchmarks, ``velfield verify`` and the
+estimate ask this table; a new stage is an entry here and a module in ``velfield/pipeline/stages``.
+
+Functions are named, ``module:function``, and resolved where a unit is computed, so that neither the command line nor
+the plan imports anything heavy.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from operator import attrgetter
+from pkgutil import resolve_name
+from typing import Any
+
+from pydantic import BaseModel
+
+from schemas.flight import FlightConfig
+from schemas.records import InputsRecord, SourceRecord
+from velfield.run.commits import content_key
+
+_STAGES = "velfield.pipeline.stages"
+Counts = Mapping[str, float]
+
+
+class Cut(Enum):
+    """How a stage is cut into units; a unit is a Prefect task run and a commit record."""
+
+    WHOLE = "one unit"
+    BY_FRAMES = "a unit a range of frames"
+    BY_TILES = "a unit a group of tiles of the map"
+
+
+class NewBase(Enum):
+    """What becomes of a stage when a finished run is mapped onto a new base image (`velfield reprocess`)."""
+
+    SHARED = "its outputs are shared with the run before, apart from those in base/"
+    COUNTS = "only its counts are kept, in its commit records"
+    MAPPED = "its outputs are mapped, by the function `Stage.remap`"
+    COMPUTED = "it is computed as in any run"
+
+
+@dataclass(frozen=True)
+class Line:
+    """A stage's line in the terminal, filled with its counts, and when it applies."""
+
+    text: str
+    when: Callable[[Counts], bool] = lambda counts: True
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage.
+
+    Attributes
+    ----------
+    name : of its commit records, and wherever a program reads it.
+    version : to be raised when its results change.
+    label : for people.
+    lines : of its summary; the first that applies is printed.
+    unit : function ``(plan, *part, *blocks) -> StageResult``; ``part`` is the unit's frames or group of tiles, none
+        where the stage is whole; ``blocks`` are the results of the stage's blocks, where it has any.
+    block : function ``(plan, frames) -> Any`` of a few frames: the costly part of a unit, and the parallel one.
+    block_frames : function ``(plan) -> frames`` that the blocks of a whole stage are cut of.
+    tiles : function ``(plan) -> groups`` of a stage that is cut by tiles.
+    prepare : function ``(plan) -> None`` that creates the stage's store before its units fill it.
+    store : the store's path in the run folder.
+    after : stages that it reads.
+    inputs : of the inputs (`schemas.records.InputsRecord`), those that it reads.
+    config : of the configuration (`schemas.flight.FlightConfig`), the sections and keys that it reads.
+    unread : keys of those sections that it does not read.
+    cut, halo : how it is cut; a unit of frames also reads so many units after its own.
+    new_base, remap : what `velfield reprocess` makes of it; ``remap`` is ``(plan, *part, rebase) -> StageResult``.
+    """
+
+    name: str
+    version: int
+    label: str
+    lines: tuple[Line, ...]
+    unit: str
+    block: str | None = None
+    block_frames: str | None = None
+    tiles: str | None = None
+    prepare: str | None = None
+    store: str | None = None
+    after: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = ()
+    config: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
+    cut: Cut = Cut.WHOLE
+    halo: int = 0
+    new_base: NewBase = NewBase.COMPUTED
+    remap: str | None = None
+
+    @property
+    def essential(self) -> bool:
+        """Whether nothing can follow without it: of a stage that is cut by frames units may fail."""
+        return self.cut is not Cut.BY_FRAMES
+
+    def settings(self, config: FlightConfig) -> dict[str, object]:
+        """The settings that it reads, by their dotted names."""
+        found: dict[str, object] = {}
+        for name in self.config:
+            value = attrgetter(name)(config)
+            if isinstance(value, BaseModel):
+                found |= {f"{name}.{key}": one for key, one in value.model_dump(mode="json").items()}
+            else:
+                found[name] = value
+        return {name: value for name, value in found.items() if name not in self.unread}
+
+
+STAGES: tuple[Stage, ...] = (
+    Stage(
+        name="frames",
+        version=1,
+        label="frames",
+        lines=(Line("{usable:.0f} of {frames:.0f} frames read"),),
+        prepare=f"{_STAGES}.frames:create_frame_store",
+        unit=f"{_STAGES}.frames:read_unit",
+        store="frames.zarr",
+        inputs=("source", "timestamps"),
+        config=("frames", "work.unit_frames"),
+        cut=Cut.BY_FRAMES,
+        new_base=NewBase.SHARED,
+    ),
+    Stage(
+        name="lens",
+        version=6,
+        label="lens",
+        lines=(
+            Line("no significant distortion; pinhole model used", lambda counts: not counts.get("corner_px")),
+            Line(
+                "distortion of {corner_px:.1f} px at the corners, straight lines to {residual_px:.2f} px",
+                lambda counts: "residual_px" in counts,
+            ),
+            Line("distortion of {corner_px:.1f} px at the corners"),
+        ),
+        unit=f"{_STAGES}.lens:calibrate_flight",
+        after=("frames",),
+        config=("lens",),
+        new_base=NewBase.SHARED,
+    ),
+    Stage(
+        name="base",
+        version=4,
+        label="base image",
+        lines=(
+            Line(
+                "base image {width:.0f} x {height:.0f} px as given, hold-out registration error "
+                "{intersensor_error_px:.2f} px",
+                lambda counts: "intersensor_error_px" in counts,
+            ),
+            Line("base image {width:.0f} x {height:.0f} px from {frames:.0f} frames"),
+        ),
+        block=f"{_STAGES}.base_image:detect_unit_keypoints",
+        block_frames=f"{_STAGES}.base_image:spread_frames",
+        unit=f"{_STAGES}.base_image:build_base",
+        after=("frames", "lens"),
+        inputs=("base", "detections"),
+        config=("base", "registration", "gsd_m"),
+        new_base=NewBase.MAPPED,
+        remap=f"{_STAGES}.rebase:rebase_image",
+    ),
+    Stage(
+        name="registration",
+        version=4,
+        label="registration",
+        lines=(
+            Line("{registered:.0f} of {frames:.0f} frames registered, hold-out registration error {heldout_px:.2f} px"),
+        ),
+        prepare=f"{_STAGES}.registration:create_registration_store",
+        block=f"{_STAGES}.base_image:detect_unit_keypoints",
+        unit=f"{_STAGES}.registration:register_unit",
+        store="registration.zarr",
+        after=("frames", "base"),
+        inputs=("detections",),
+        # The unit's size decides where chains start from the base image again, so per-frame results depend on it.
+        config=("registration", "work.unit_frames"),
+        cut=Cut.BY_FRAMES,
+        new_base=NewBase.SHARED,
+    ),
+    Stage(
+        name="detector",
+        version=16,
+        label="detector",
+        lines=(
+            Line("skipped: external detections", lambda counts: bool(counts) and "threshold" not in counts),
+            Line("pre-trained detector, score threshold {threshold:.3f}", lambda counts: counts.get("labels") == 0),
+            Line("{labels:.0f} training labels, score threshold {threshold:.3f}"),
+        ),
+        unit=f"{_STAGES}.detector:make_detector",
+        after=("registration",),
+        inputs=("labels", "detector", "detections"),
+        config=("detection", "tracking.max_interval_s"),
+        new_base=NewBase.SHARED,
+    ),
+    Stage(
+        name="detections",
+        version=8,
+        label="detections",
+        lines=(Line("{cars:.0f} cars in {frames:.0f} frames"),),
+        block=f"{_STAGES}.detections:detect_block",
+        unit=f"{_STAGES}.detections:write_detections",
+        after=("registration", "detector"),
+        config=("detection",),
+        cut=Cut.BY_FRAMES,
+        new_base=NewBase.MAPPED,
+        remap=f"{_STAGES}.rebase:rebase_detections",
+    ),
+    Stage(
+        name="tracklets",
+        version=1,
+        label="tracklets",
+        lines=(Line("{tracklets:.0f} tracklets over three frames"),),
+        unit=f"{_STAGES}.tracklets:link_unit",
+        after=("detections",),
+        config=("tracking",),
+        unread=("tracking.max_gap_s", "tracking.max_stationary_gap_s"),
+        cut=Cut.BY_FRAMES,
+        halo=1,
+        new_base=NewBase.COUNTS,
+    ),
+    Stage(
+        name="tracks",
+        version=3,
+        label="tracks",
+        lines=(Line("{tracks:.0f} vehicle tracks from {tracklets:.0f} tracklets"),),
+        unit=f"{_STAGES}.tracks:chain_tracks",
+        after=("tracklets",),
+        config=("tracking.max_gap_s", "tracking.max_stationary_gap_s"),
+        new_base=NewBase.MAPPED,
+        remap=f"{_STAGES}.rebase:rebase_tracks",
+    ),
+    Stage(
+        name="field",
+        version=3,
+        label="field",
+        lines=(Line("vehicles passed {pixels:.0f} pixels, 5 or more vehicles {pixels_5:.0f} of them"),),
+        prepare=f"{_STAGES}.field:create_field_stores",
+        tiles=f"{_STAGES}.field:field_groups",
+        unit=f"{_STAGES}.field:accumulate_group",
+        store="field.zarr",
+        after=("tracks",),
+        config=("field",),
+        cut=Cut.BY_TILES,
+    ),
+    Stage(
+        name="maps",
+        version=4,
+        label="maps",
+        lines=(Line("{maps:.0f} maps"),),
+        unit=f"{_STAGES}.maps:make_maps",
+        after=("field",),
+    ),
+)
+"""The stages in the order of the work."""
+
+STAGE: Mapping[str, Stage] = {stage.name: stage for stage in STAGES}
+"""The stages by name."""
+
+
+def stages_before(name: str) -> list[str]:
+    """Names of the stages before one, in the order of the work.
+
+    Examples
+    --------
+    >>> stages_before("base")
+    ['frames', 'lens']
+    """
+    names = list(STAGE)
+    return names[: names.index(name)]
+
+
+def resolve(function: str) -> Callable[..., Any]:
+    """The function that the table names."""
+    found: Callable[..., Any] = resolve_name(function)
+    return found
+
+
+def stage_keys(config: FlightConfig, inputs: InputsRecord) -> dict[str, str]:
+    """Each stage's content key: of the stages, the inputs and the settings that it reads, and of its version."""
+    keys: dict[str, str] = {}
+    for stage in STAGES:
+        read = (getattr(inputs, name) for name in stage.inputs)
+        digests = [one.digest if isinstance(one, SourceRecord) else one for one in read]
+        keys[stage.name] = content_key(
+            stage.name,
+            stage.version,
+            parameters=[stage.settings(config)],
+            inputs=[*(keys[name] for name in stage.after), *digests],
+        )
+    return keys

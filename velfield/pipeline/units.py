@@ -1,0 +1,80 @@
+"""The units of a stage: what is computed, committed and, should it fail, tried again as one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from velfield.pipeline.plan import Plan
+from velfield.pipeline.stage import Cut, Stage, resolve
+
+WHOLE = "all"
+"""Name of the one unit of a stage that is not cut."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One unit of a stage.
+
+    Attributes
+    ----------
+    name : of its commit record.
+    part : its frames (a range) or its group of tiles (row, column), as the one argument of the stage's function; empty
+        where the stage is not cut.
+    """
+
+    name: str
+    part: tuple[Any, ...] = ()
+
+    @property
+    def frames(self) -> range:
+        """Its frames; none where the stage is not cut by frames."""
+        return self.part[0] if self.part and isinstance(self.part[0], range) else range(0)
+
+    @property
+    def steps(self) -> int:
+        """Steps of the progress bar that it is: a step a frame, else one."""
+        return max(1, len(self.frames))
+
+
+def unit_name(frames: range) -> str:
+    """Name of a unit of frames: its range, so that a record says which frames it is about.
+
+    Examples
+    --------
+    >>> unit_name(range(64, 128))
+    '000064-000127'
+    """
+    return f"{frames.start:06d}-{frames.stop - 1:06d}"
+
+
+def group_name(group: tuple[int, int]) -> str:
+    """Name of a group of tiles, (row, column).
+
+    Examples
+    --------
+    >>> group_name((0, 3))
+    'group-000-003'
+    """
+    return f"group-{group[0]:03d}-{group[1]:03d}"
+
+
+def prepare_stage(plan: Plan, stage: Stage) -> None:
+    """Create what the units of a stage write into."""
+    if stage.prepare is not None:
+        resolve(stage.prepare)(plan)
+
+
+def stage_units(plan: Plan, stage: Stage) -> list[Unit]:
+    """The units of a stage, in their order; those by tiles are known once the base image is."""
+    if stage.cut is Cut.BY_FRAMES:
+        return [Unit(unit_name(frames), (frames,)) for frames in plan.units]
+    if stage.tiles is not None:
+        return [Unit(group_name(group), (group,)) for group in resolve(stage.tiles)(plan)]
+    return [Unit(WHOLE)]
+
+
+def unit_blocks(plan: Plan, stage: Stage, unit: Unit) -> list[Sequence[int]]:
+    """The blocks of frames that a unit is computed by, where the stage has such."""
+    frames = unit.frames if stage.block_frames is None else resolve(stage.block_frames)(plan)
+    step = plan.config.work.block_frames
+    return [frames[start : start + step] for start in range(0, len(frames), step)]
