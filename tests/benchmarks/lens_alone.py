@@ -18,6 +18,7 @@ from tests.scenes import frame_grid, rms_after_homography
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import make_plan, write_flight_record
+from velfield.pipeline.stage import stages_before
 from velfield.run.frame_transforms import read_lens
 from velfield.synthetic import write_flight
 from velfield.synthetic.cases import lens_only
@@ -66,7 +67,7 @@ def left(config: SimulationConfig) -> tuple[float, float]:
         flight = resolve_config(overrides={"gsd_m": 0.23, "frames.every": 1})
         plan = make_plan(Job(root=str(folder / "run"), inputs=inputs, config=flight))
         write_flight_record(plan)
-        compute_stages(plan, ("frames", "lens"))
+        compute_stages(plan, stages_before("base"))
         points = frame_grid(SIZE, 24)
         true = load_truth(folder / "flight").camera.undistort(points)
         return (

@@ -16,9 +16,9 @@ from velfield.camera.lens import HarrisLens, lens_from_record, pinhole
 from velfield.camera.multiview import FramePairs, MultiViewFit, ScaledLens, fit_multiview
 from velfield.camera.plumbline import SD_INFLATION
 from velfield.pipeline.configuration import resolve_config
+from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import make_plan
-from velfield.pipeline.stages.frames import create_frame_store, read_unit
-from velfield.pipeline.stages.lens import calibrate_flight
+from velfield.pipeline.stage import stages_before
 from velfield.registration.pairing import match_frame_pairs
 
 SHAPE = HEIGHT, WIDTH = 720, 960
@@ -313,9 +313,7 @@ def test_the_stage_asks_the_control_points_unless_told_not_to(
         config = resolve_config(overrides=quick | {"lens.refine": refined})
         inputs = Inputs(source=str(tmp_path / "frames"))
         plan = make_plan(Job(root=str(tmp_path / refined), inputs=inputs, config=config))
-        create_frame_store(plan)
-        read_unit(plan, range(len(pictures[0])))
-        calibrate_flight(plan)
+        compute_stages(plan, stages_before("base"))
         told[refined] = CameraRecord.model_validate_json(plan.layout.camera.read_bytes())
     assert told["never"].overlap is None
     assert told["auto"].overlap is not None

@@ -69,6 +69,7 @@ def test_no_frame_is_looked_at_again(mapped: tuple[Path, RunSummary]) -> None:
     units = {stage.name: stage.units for stage in mapped[1].stages}
     assert [name for name in done if done[name] == units[name]] == [
         "frames",
+        "quality",
         "lens",
         "registration",
         "detector",

@@ -11,10 +11,10 @@ from tests.scenes import city, photograph, similarity
 from velfield.camera.lens import pinhole
 from velfield.errors import Failure, InputError
 from velfield.pipeline.configuration import resolve_config
+from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import Plan, make_plan
+from velfield.pipeline.stage import stages_before
 from velfield.pipeline.stages.base_image import build_base, detect_unit_keypoints
-from velfield.pipeline.stages.frames import create_frame_store, read_unit
-from velfield.pipeline.stages.lens import calibrate_flight
 from velfield.registration.intersensor import register_intersensor
 from velfield.run.grid import read_grid
 
@@ -43,9 +43,7 @@ def plan_on(base: np.ndarray, frames: list[np.ndarray], folder: Path, gsd_m: flo
     inputs = Inputs(source=str(folder / "frames"), base=str(folder / "base.png"))
     config = resolve_config(overrides={"frames.fps": 5, "lens.calibrate": "never", "gsd_m": gsd_m})
     plan = make_plan(Job(root=str(folder / "run"), inputs=inputs, config=config))
-    create_frame_store(plan)
-    read_unit(plan, range(len(frames)))
-    calibrate_flight(plan)
+    compute_stages(plan, stages_before("base"))
     return plan
 
 

@@ -37,13 +37,21 @@ def noise(seed: int, *shape: int) -> np.ndarray:
 def test_frames_come_back(tmp_path: Path) -> None:
     frames = noise(1, 5, 24, 32)
     store = frame_store(tmp_path / "f.zarr", frames)
-    store.write_columns(2, {"time_s": np.array([1.5, 1.75]), "flags": np.array([4, 1], np.uint16)})
+    store.write_columns(2, {"time_s": np.array([1.5, 1.75]), "decoding_flags": np.array([4, 1], np.uint16)})
     store = open_frames(tmp_path / "f.zarr")
     assert store.count == 5
     assert store.shape == (24, 32)
     assert all(np.array_equal(store.read(k), frames[k]) for k in range(5))
     np.testing.assert_array_equal(store.column("time_s"), [np.nan, np.nan, 1.5, 1.75, np.nan])
-    np.testing.assert_array_equal(store.column("flags"), [2, 2, 4, 1, 2])
+    np.testing.assert_array_equal(store.column("decoding_flags"), [2, 2, 4, 1, 2])
+    np.testing.assert_array_equal(store.column("flags"), [2] * 5)  # unreadable until written
+
+
+def test_flags_are_one_chunk_even_where_all_are_the_fill_value(tmp_path: Path) -> None:
+    store = frame_store(tmp_path / "f.zarr", noise(1, 5, 24, 32))
+    for flags in (np.full(5, 2), np.array([0, 16, 0, 0, 32])):
+        assert store.write_flags(flags).exists()
+        np.testing.assert_array_equal(open_frames(tmp_path / "f.zarr").column("flags"), flags)
 
 
 @pytest.mark.parametrize("bit", range(0, 4000, 97))

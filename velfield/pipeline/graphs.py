@@ -6,6 +6,7 @@ frames from the store, and only key points, tables and patches go from node to n
 ``velfield``, so that a worker needs neither ``flows`` nor Prefect.
 
     frames         decode, write                                                   ->  commit
+    quality        blurred frames and outliers, by their neighbours                 ->  commit
     lens           edge points of spread frames                                    ->  commit
     base           key points of spread frames, two passes to their median         ->  commit
     registration   key points of each block  ->  the chain over the unit's frames  ->  commit

@@ -126,6 +126,21 @@ STAGES: tuple[Stage, ...] = (
         new_base=NewBase.SHARED,
     ),
     Stage(
+        name="quality",
+        version=1,
+        label="frame quality",
+        lines=(
+            Line("every frame is usable", lambda counts: not counts.get("flagged")),
+            Line(
+                "{usable:.0f} frames usable, {flagged:.0f} flagged: {blurred:.0f} blurred, {outliers:.0f} unlike their "
+                "neighbours",
+            ),
+        ),
+        unit=f"{_STAGES}.quality:flag_frames",
+        after=("frames",),
+        new_base=NewBase.SHARED,
+    ),
+    Stage(
         name="lens",
         version=6,
         label="lens",
@@ -138,7 +153,7 @@ STAGES: tuple[Stage, ...] = (
             Line("distortion of {corner_px:.1f} px at the corners"),
         ),
         unit=f"{_STAGES}.lens:calibrate_flight",
-        after=("frames",),
+        after=("frames", "quality"),
         config=("lens",),
         new_base=NewBase.SHARED,
     ),
@@ -267,7 +282,7 @@ def stages_before(name: str) -> list[str]:
     Examples
     --------
     >>> stages_before("base")
-    ['frames', 'lens']
+    ['frames', 'quality', 'lens']
     """
     names = list(STAGE)
     return names[: names.index(name)]

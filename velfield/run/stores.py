@@ -19,6 +19,7 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import ZstdCodec
 
+from schemas.arrays import Float32Array, IntArray
 from velfield.errors import InputError
 from velfield.run.paths import is_remote
 
@@ -132,11 +133,14 @@ def store_key(path: Path) -> str | None:
 FRAME_COLUMNS: dict[str, tuple[str, float]] = {
     "time_s": ("float64", np.nan),
     "source_index": ("int64", -1),
-    "flags": ("uint16", 2),
+    "decoding_flags": ("uint16", 2),
     "sharpness": ("float32", np.nan),
     "brightness": ("float32", np.nan),
 }
-"""Column -> type, and what stands there until it is written."""
+"""Column that units write -> type, and fill value."""
+FLAGS = "flags"
+"""The column of all defects, written once all frames are there."""
+THUMBNAIL_SHAPE = (16, 16)
 
 
 def create_frames(
@@ -148,6 +152,9 @@ def create_frames(
     _create(group, "raw", (count, height, width), (1, height, width), "uint8", dimension_names=("frame", "y", "x"))
     for name, (dtype, fill) in FRAME_COLUMNS.items():
         _create(group, name, (count,), (chunk,), dtype, fill_value=fill, dimension_names=("frame",))
+    shape, chunks = (count, *THUMBNAIL_SHAPE), (chunk, *THUMBNAIL_SHAPE)
+    _create(group, "thumbnail", shape, chunks, "float32", fill_value=0, dimension_names=("frame", "row", "column"))
+    _create(group, FLAGS, (count,), (max(count, 1),), "uint16", fill_value=2, dimension_names=("frame",))
     group.attrs["key"] = key  # last: a store without it was not laid out whole
 
 
@@ -191,12 +198,12 @@ class FrameStore:
         self.group["raw"].with_config({"write_empty_chunks": True})[frame] = grey
 
     def column(self, name: str) -> NDArray[Any]:
-        """One column: ``time_s``, ``source_index``, ``flags``, ``sharpness`` or ``brightness``, (frames,)."""
-        _check_column(self.path, name, FRAME_COLUMNS)
+        """One column: ``flags``, or one of ``FRAME_COLUMNS``, (frames,)."""
+        _check_column(self.path, name, (*FRAME_COLUMNS, FLAGS))
         return _read(self.path, self.group, name, slice(None))
 
     def write_columns(self, start: int, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Write a whole unit of columns, from frame ``start`` on."""
+        """Write a whole unit of columns, ``thumbnail`` too, from frame ``start`` on."""
         for name, values in columns.items():
             self.group[name][start : start + len(values)] = values
 
@@ -205,7 +212,17 @@ class FrameStore:
         raw = [self.path / "raw" / "c" / str(frame) / "0" / "0" for frame in range(start, stop)]
         unit = start // int(self.group["time_s"].chunks[0])
         columns = [self.path / name / "c" / str(unit) for name in FRAME_COLUMNS]
-        return [*_metadata(self.path), *_existing([*raw, *columns])]
+        thumbnails = self.path / "thumbnail" / "c" / str(unit) / "0" / "0"
+        return [*_metadata(self.path), *_existing([*raw, *columns, thumbnails])]
+
+    def thumbnails(self, start: int, stop: int) -> Float32Array:
+        """Thumbnails of the frames ``[start, stop)``, (frames, 16, 16), each with its mean removed."""
+        return _read(self.path, self.group, "thumbnail", slice(start, stop))
+
+    def write_flags(self, flags: IntArray) -> Path:
+        """Write the column ``flags`` whole, as one chunk; returns its file."""
+        self.group[FLAGS].with_config({"write_empty_chunks": True})[:] = flags
+        return self.path / FLAGS / "c" / "0"
 
 
 def open_frames(path: Path, mode: str = "r") -> FrameStore:

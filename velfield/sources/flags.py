@@ -21,12 +21,19 @@ class FrameFlag(IntFlag):
     BLACK = 8
     """Black, or without any detail."""
     BLURRED = 16
-    """Far less sharp than its neighbours. Advice only: registration decides."""
+    """Far less sharp than its neighbours."""
     OUTLIER = 32
-    """Unlike its neighbours, which are like each other. Advice only: registration decides."""
+    """Unlike its neighbours, which are like each other: it does not belong to the flight."""
 
 
-UNUSABLE = FrameFlag.SUSPECT | FrameFlag.UNREADABLE | FrameFlag.DUPLICATE | FrameFlag.BLACK
+UNUSABLE = (
+    FrameFlag.SUSPECT
+    | FrameFlag.UNREADABLE
+    | FrameFlag.DUPLICATE
+    | FrameFlag.BLACK
+    | FrameFlag.BLURRED
+    | FrameFlag.OUTLIER
+)
 """A frame with any of these is in no tracklet."""
 
 

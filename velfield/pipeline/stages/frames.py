@@ -10,7 +10,7 @@ from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
 from velfield.pipeline.result import StageResult
-from velfield.run.stores import create_frames, open_frames, store_key
+from velfield.run.stores import THUMBNAIL_SHAPE, create_frames, open_frames, store_key
 from velfield.sources.flags import UNUSABLE, FrameFlag
 from velfield.sources.quality import frame_quality
 from velfield.sources.source import iter_frames
@@ -45,6 +45,7 @@ def read_unit(plan: Plan, frames: range) -> StageResult:
     before = int(plan.indices[frames.start - 1]) if frames.start else None
     flags = np.zeros(len(frames), np.uint16)
     sharpness, brightness = np.full(len(frames), np.nan, np.float32), np.full(len(frames), np.nan, np.float32)
+    thumbnails = np.zeros((len(frames), *THUMBNAIL_SHAPE), np.float32)
     warnings = []
     source = Path(plan.job.inputs.source)
     for k, found in enumerate(iter_frames(source, plan.info, indices, after=before)):
@@ -54,7 +55,7 @@ def read_unit(plan: Plan, frames: range) -> StageResult:
             warnings.append(f"frame {frames[k]}: {found.reason}")
         if not found.flags & FrameFlag.UNREADABLE:
             quality = frame_quality(found.grey)
-            sharpness[k], brightness[k] = quality.sharpness, quality.brightness
+            sharpness[k], brightness[k], thumbnails[k] = quality.sharpness, quality.brightness, quality.thumbnail
         advance("frames")
     if np.all(flags & FrameFlag.UNREADABLE):
         raise InputError(
@@ -64,9 +65,10 @@ def read_unit(plan: Plan, frames: range) -> StageResult:
     columns: dict[str, NDArray[Any]] = {
         "time_s": times_s,
         "source_index": indices,
-        "flags": flags,
+        "decoding_flags": flags,
         "sharpness": sharpness,
         "brightness": brightness,
+        "thumbnail": thumbnails,
     }
     store.write_columns(frames.start, columns)
     usable = int(np.sum((flags & int(UNUSABLE)) == 0))
