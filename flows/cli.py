@@ -12,7 +12,7 @@ from cyclopts import App, Parameter
 from flows.launch import limit_threads
 from flows.options import Preset, Settings, frame_size, renamed_option
 from flows.stopping import STOPPED, as_ctrl_c, leave
-from velfield.errors import InputError, OldNameWarning
+from velfield.errors import IneffectiveSettingWarning, InputError, OldNameWarning
 
 if TYPE_CHECKING:
     from flows.console import Console, Verbosity
@@ -361,11 +361,11 @@ def _verbosity(quiet: bool, verbose: bool, log_json: bool) -> "Verbosity":
     return "quiet" if quiet else "verbose" if verbose else "normal"
 
 
-def _warn_of_old_names_in_one_line() -> None:
+def _warn_of_settings_in_one_line() -> None:
     show = warnings.showwarning
 
     def showwarning(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
-        if issubclass(category, OldNameWarning):
+        if issubclass(category, OldNameWarning | IneffectiveSettingWarning):
             print(f"velfield: {message}", file=sys.stderr)
         else:
             show(message, category, *where, **options)
@@ -377,7 +377,7 @@ def main() -> None:
     """Run the command; bad input is one clear line, never a traceback."""
     limit_threads()
     as_ctrl_c()
-    _warn_of_old_names_in_one_line()
+    _warn_of_settings_in_one_line()
     try:
         status = app(result_action="return_value")
     except InputError as error:

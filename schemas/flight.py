@@ -4,6 +4,7 @@
 takes its own section and nothing else, so that a changed number redoes only the stages that read it.
 """
 
+from collections.abc import Mapping
 from typing import Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt
@@ -131,7 +132,7 @@ class TrackingConfig(Model):
     """``joint``: the two links of a three-frame window are chosen together, by appearance and motion; ``pairwise``: the
     paper's, each link the mutual best by SAD, then the gates."""
     min_confidence: float = Field(0.8, ge=0, lt=1)
-    """A tracklet less sure than this, against its rivals and chance, is dropped (``joint``)."""
+    """A tracklet less sure than this, against its rivals and chance, is dropped."""
     refine: bool = True
     """Align the patches of a link below the pixel, and let the tracklet carry that displacement."""
     max_gap_s: float = Field(2.0, ge=0)
@@ -222,3 +223,23 @@ PRESETS: dict[Preset, dict[str, dict[str, object]]] = {
     },
 }
 """What each preset changes of the defaults."""
+
+_CALIBRATED: Mapping[str, tuple[object, ...]] = {"lens.calibrate": ("auto", "always")}
+_CASE_DELETION: Mapping[str, tuple[object, ...]] = {"registration.model": ("polyprojective",)}
+_MESH: tuple[object, ...] = ("row_spline", "polyprojective")
+READ_WITH: Mapping[str, Mapping[str, tuple[object, ...]]] = {
+    "frames.target_interval_s": {"frames.every": ("auto",)},
+    "lens.refine": _CALIBRATED,
+    "lens.frames": _CALIBRATED,
+    "lens.max_edge_points": _CALIBRATED,
+    "lens.angle_bins": _CALIBRATED,
+    "lens.max_distortion": _CALIBRATED,
+    "registration.row_spline_knots": {"registration.model": ("row_spline",)},
+    "registration.drop_fraction": _CASE_DELETION,
+    "registration.max_mean_error_px": _CASE_DELETION,
+    "registration.mesh": {"registration.model": _MESH},
+    "registration.cell_size_px": {"registration.mesh": (True,), "registration.model": _MESH},
+    "field.lane_width_m": {"field.path_width": ("lane",)},
+    "field.velocity_span_s": {"field.shared_segment_weight": (1,)},
+}
+"""Key -> the keys that decide whether it is read, and their values with which it is."""

@@ -1,4 +1,4 @@
-"""What goes wrong, in two kinds: the user's input, and a frame or chunk that cannot be done; and one warning."""
+"""What goes wrong, in two kinds: the user's input, and a frame or chunk that cannot be done; and two warnings."""
 
 from dataclasses import dataclass
 
@@ -9,6 +9,10 @@ class InputError(Exception):
 
 class OldNameWarning(FutureWarning):
     """A name of an earlier format was given; it is read for this release. The message says the present name."""
+
+
+class IneffectiveSettingWarning(UserWarning):
+    """A setting that the chosen method does not read. The message says which setting chose the method."""
 
 
 @dataclass(frozen=True)

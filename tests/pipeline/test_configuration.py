@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from schemas.detector import METHODS, CascadeConfig, CascadeTraining, CnnConfig, DetectorConfig, PaperConfig
-from schemas.flight import FlightConfig
+from schemas.flight import READ_WITH, FlightConfig
 from schemas.renames import OLD_KEYS, OLD_VALUES, REMOVED_KEYS, upgrade_config
-from velfield.errors import InputError, OldNameWarning
+from velfield.errors import IneffectiveSettingWarning, InputError, OldNameWarning
 from velfield.pipeline.configuration import resolve_config
 
 
@@ -164,6 +164,39 @@ def test_an_old_key_warns_in_one_line() -> None:
 def test_a_removed_key_is_ignored_with_a_warning() -> None:
     with pytest.warns(OldNameWarning, match="patch_width_px is ignored"):
         assert resolve_config(settings=["tracking.patch_width_px=10"]) == resolve_config()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            ("registration.model=homography", "registration.row_spline_knots=24"),
+            "registration.row_spline_knots has no effect with registration.model=homography",
+        ),
+        (("registration.mesh=false", "registration.cell_size_px=80"), "cell_size_px has no effect with .*mesh=false"),
+        (("registration.drop_fraction=0.1",), "drop_fraction has no effect with registration.model=row_spline"),
+        (("lens.calibrate=never", "lens.frames=20"), "lens.frames has no effect with lens.calibrate=never"),
+        (("frames.every=2", "frames.target_interval_s=0.1"), "target_interval_s has no effect with frames.every=2"),
+        (("field.path_width=pixel", "field.lane_width_m=3"), "lane_width_m has no effect with field.path_width=pixel"),
+    ],
+)
+def test_a_setting_that_the_chosen_method_does_not_read_is_said(settings: tuple[str, ...], message: str) -> None:
+    with pytest.warns(IneffectiveSettingWarning, match=message) as caught:
+        resolve_config(settings=settings)
+    assert len(caught) == 1
+
+
+def test_settings_that_are_read_and_defaults_of_presets_are_not_warned_of() -> None:
+    """Warnings are errors here."""
+    resolve_config(preset="paper", settings=["registration.drop_fraction=0.1", "tracking.min_confidence=0.5"])
+    resolve_config(settings=["registration.model=homography", "field.lane_width_m=3", "frames.target_interval_s=0.1"])
+
+
+def test_what_decides_whether_a_key_is_read_is_a_key_and_its_values_are_valid() -> None:
+    for key, deciding in READ_WITH.items():
+        resolve_config(overrides={other: values[0] for other, values in deciding.items()})
+        section, name = key.split(".")
+        assert name in type(getattr(FlightConfig(), section)).model_fields
 
 
 def test_an_old_and_a_present_name_of_one_parameter_are_refused() -> None:

@@ -3,15 +3,16 @@
 import difflib
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, cast, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from schemas.flight import PRESETS, FlightConfig, Preset
+from schemas.flight import PRESETS, READ_WITH, FlightConfig, Preset
 from schemas.renames import upgrade_config
-from velfield.errors import InputError, OldNameWarning
+from velfield.errors import IneffectiveSettingWarning, InputError, OldNameWarning
 
 Tree = dict[str, Any]
 
@@ -63,7 +64,10 @@ def resolve_config(
     chosen = cast(Preset, name)
     tree = _merge(_of_methods(PRESETS[chosen], given), given)
     tree["preset"] = chosen
-    return _validate(tree, str(file) if file else "configuration")
+    config = _validate(tree, str(file) if file else "configuration")
+    for message in _ineffective(config, given):
+        warnings.warn(message, IneffectiveSettingWarning, stacklevel=2)
+    return config
 
 
 def _of_methods(preset: Mapping[str, Any], given: Mapping[str, Any]) -> Tree:
@@ -117,6 +121,18 @@ def _models(annotation: object) -> list[type[BaseModel]]:
     if isinstance(annotation, type):
         return [annotation] if issubclass(annotation, BaseModel) else []
     return [model for inner in get_args(annotation) for model in _models(inner)]
+
+
+def _ineffective(config: FlightConfig, given: Tree) -> Iterator[str]:
+    """A line for each given key that the methods chosen do not read."""
+    for key, deciding in READ_WITH.items():
+        section, _, name = key.partition(".")
+        if name not in (given.get(section) or {}):
+            continue
+        for other, values in deciding.items():
+            value = attrgetter(other)(config)
+            if value not in values:
+                yield f"{key} has no effect with {other}={yaml.safe_dump(value).split(chr(10))[0]}"
 
 
 def _yaml(text: str, what: str) -> Any:
