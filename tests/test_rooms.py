@@ -1,10 +1,12 @@
 """The rules of the house, read off the imports themselves."""
 
 import ast
+import importlib
 import subprocess
 import sys
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -52,6 +54,21 @@ def test_imports_go_down_the_floors() -> None:
         if FLOORS.get(name.split(".")[0], -1) > FLOORS[path.relative_to(ROOT).parts[0]]
     ]
     assert upward == []
+
+
+def test_every_import_within_the_house_is_there() -> None:
+    """Those inside functions too, which nothing imports before a command runs."""
+    missing = []
+    for path in modules():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in FLOORS:
+                module = importlib.import_module(node.module)
+                missing += [
+                    f"{path.relative_to(ROOT)}:{node.lineno}: {node.module}.{alias.name}"
+                    for alias in node.names
+                    if not hasattr(module, alias.name) and find_spec(f"{node.module}.{alias.name}") is None
+                ]
+    assert missing == []
 
 
 def test_only_flows_imports_prefect() -> None:

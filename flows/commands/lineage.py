@@ -32,16 +32,16 @@ def lineage(
     as_json
         JSON in place of text.
     """
-    from velfield import lineage as told
+    from velfield.run.lineage import describe_lineage, describe_pixel, pixel_lineage, stage_lineage
     from velfield.run.run import open_run
 
     where = _pixel(x, y, pixel)
     run = open_run(run_folder)
     if where is None:
-        print(_json(told.stage_lineage(run)) if as_json else told.describe_lineage(run))
+        print(_json(stage_lineage(run)) if as_json else describe_lineage(run))
     else:
-        found = told.pixel_lineage(run, *where)
-        print(_json(found) if as_json else told.describe_pixel(run, found))
+        found = pixel_lineage(run, *where)
+        print(_json(found) if as_json else describe_pixel(run, found))
     return 0
 
 
