@@ -10,8 +10,11 @@ from pathlib import Path
 
 import pytest
 import yaml
+from pydantic import BaseModel
 
 from flows.cli import app
+from schemas.detector import METHODS
+from schemas.flight import FlightConfig
 from schemas.renames import OLD_KEYS, REMOVED_KEYS
 from schemas.summary import RunSummary
 from tests.media import drifting, write_video
@@ -109,3 +112,23 @@ def test_decimals_have_a_leading_zero(page: Path) -> None:
 @pytest.mark.parametrize("name", [*OLD_KEYS, *OLD_KEYS.values(), *REMOVED_KEYS])
 def test_the_changelog_lists_every_renamed_key(name: str) -> None:
     assert name in (ROOT / "CHANGELOG.md").read_text()
+
+
+def configuration_keys() -> set[str]:
+    sections = {name: field.default for name, field in FlightConfig.model_fields.items()}
+    models = [(name, type(model)) for name, model in sections.items() if isinstance(model, BaseModel)]
+    models += [("detection", method) for method in METHODS]
+    return {f"{name}.{key}" for name, model in models for key in model.model_fields}
+
+
+def test_the_configuration_keys_that_the_pages_name_exist() -> None:
+    keys = configuration_keys()
+    sections = "|".join(sorted({key.partition(".")[0] for key in keys}))
+    named = {
+        (page.name, key)
+        for page in PAGES
+        for code in re.findall(r"`([^`\n]+)`", page.read_text())
+        for key in re.findall(rf"(?<![\w./])((?:{sections})\.(?!zarr)[a-z]\w+)(?![\w/(])", code)
+    }
+    assert len(named) > 20
+    assert sorted(found for found in named if found[1] not in keys) == []
