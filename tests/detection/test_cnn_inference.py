@@ -1,0 +1,158 @@
+"""Detections from the network: decoding of heatmaps, rotation and shift of the image, truncation, the motion bonus."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from schemas.arrays import Float32Array, FloatArray, GreyImage
+from schemas.detector import MotionRecord
+from velfield.bench.scenes import simulated_image
+from velfield.detection.cascade.classifier import distinct
+from velfield.detection.cnn import inference
+from velfield.detection.cnn.dataset import PATCH_PX, encode_targets
+from velfield.detection.cnn.inference import SCORE_OFFSET, background_difference_at, detect_cars, motion_score_bonus
+from velfield.detection.cnn.model import Network
+from velfield.detection.detector import shipped_detector
+from velfield.detection.orientation import axial_difference
+
+
+def network() -> Network:
+    return shipped_detector().network
+
+
+@cache
+def scene() -> GreyImage:
+    return simulated_image(9503).image[120:264, 120:264].copy()
+
+
+@cache
+def scene_detections() -> FloatArray:
+    return detect_cars(network(), scene(), None)
+
+
+def likely(found: FloatArray) -> FloatArray:
+    """Likely cars, each once."""
+    found = distinct(found, 16.0)
+    return found[found[:, 3] > 0.1]
+
+
+def nearest(found: FloatArray, expected: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distance from each expected car to the nearest detection, px, and the difference of their orientations, rad."""
+    gap = np.hypot(*(expected[:, None, :2] - found[None, :, :2]).transpose(2, 0, 1))
+    return gap.min(axis=1), axial_difference(found[gap.argmin(axis=1), 2], expected[:, 2])
+
+
+def test_positions_and_orientations_are_decoded_from_a_heatmap(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The network is replaced by one that predicts the targets of four cars and, on rotated crops, what is set."""
+    centres = np.array([[20.3, 30.9], [60.0, 22.2], [40.7, 70.1], [75.4, 60.6]])
+    angles = np.array([0.2, 1.1, 2.0, 2.9])
+    heatmap, orientation, _ = encode_targets(centres, angles)
+    logit = 1.2
+
+    def predict_crops(_: Network, crops: Float32Array) -> Float32Array:
+        out = np.zeros((len(crops), 22, 22, 3), np.float32)
+        out[..., 0] = logit
+        relative = np.tile([0.0, -np.pi / 2], len(crops) // 2)  # along the axis, and across it
+        out[..., 1], out[..., 2] = (f(2 * relative)[:, None, None] for f in (np.cos, np.sin))
+        return out
+
+    monkeypatch.setattr(inference, "predict_heatmap", lambda network, image: (heatmap, orientation))
+    monkeypatch.setattr(inference, "forward", predict_crops)
+    found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None)
+    assert len(found) == 4
+    distance, difference = nearest(found, np.column_stack([centres, angles]))
+    assert distance.max() < 0.15
+    assert difference.max() < 1e-3
+    np.testing.assert_allclose(found[:, 3], 1 / (1 + np.exp(-logit)) - SCORE_OFFSET, atol=1e-6)
+    assert (found[:, 4] < 0.05).all()  # both crops agree on the orientation
+
+
+def test_crops_that_disagree_on_the_orientation_make_it_uncertain(monkeypatch: pytest.MonkeyPatch) -> None:
+    heatmap, orientation, _ = encode_targets(np.array([[40.5, 40.5]]), np.array([0.5]))
+
+    def predict_crops(_: Network, crops: Float32Array) -> Float32Array:
+        out = np.zeros((len(crops), 22, 22, 3), np.float32)
+        out[..., 1] = 1  # each along its own crop: across each other
+        return out
+
+    monkeypatch.setattr(inference, "predict_heatmap", lambda network, image: (heatmap, orientation))
+    monkeypatch.setattr(inference, "forward", predict_crops)
+    found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None)
+    assert found.shape == (1, 5)
+    assert found[0, 4] > np.radians(45)
+
+
+def test_an_image_without_peaks_has_no_detections() -> None:
+    assert detect_cars(network(), np.full((64, 64), 100, np.uint8), None).shape == (0, 5)
+
+
+def test_detections_shift_with_the_image() -> None:
+    moved = np.roll(scene(), (12, 8), axis=(0, 1))
+    inner = likely(scene_detections())
+    inner = inner[((inner[:, :2] > 35) & (inner[:, :2] < 100)).all(axis=1)]
+    assert len(inner) >= 2
+    distance, difference = nearest(likely(detect_cars(network(), moved, None)), inner + np.array([8, 12, 0, 0, 0]))
+    assert distance.max() < 0.1
+    assert difference.max() < 0.02
+
+
+def test_detections_rotate_with_the_image() -> None:
+    rotated = likely(detect_cars(network(), np.ascontiguousarray(np.rot90(scene(), -1)), None))
+    expected = likely(scene_detections())
+    assert len(expected) >= 4
+    # a quarter turn clockwise: (x, y) -> (h - 1 - y, x)
+    expected = np.column_stack([len(scene()) - 1 - expected[:, 1], expected[:, 0], expected[:, 2] + np.pi / 2])
+    distance, difference = nearest(rotated, expected)
+    assert np.median(distance) < 1.0
+    assert np.median(difference) < np.radians(3)
+    assert (distance < 4).mean() > 0.85
+
+
+def test_nothing_is_detected_where_the_frame_is_not_valid() -> None:
+    valid = np.zeros(scene().shape, bool)
+    valid[:, :80] = True
+    left, expected = detect_cars(network(), scene(), valid), scene_detections()
+    assert len(left)
+    assert (left[:, 0] < 80).all()
+    expected = expected[expected[:, 0] < 70]
+    assert len(expected)
+    assert nearest(left, expected)[0].max() < 0.1
+    assert len(detect_cars(network(), scene(), np.zeros_like(valid))) == 0
+
+
+def test_scores_are_probabilities_less_the_offset() -> None:
+    found = scene_detections()
+    assert (found[:, 3] > -SCORE_OFFSET).all()
+    assert (found[:, 3] < 1 - SCORE_OFFSET).all()
+    assert ((found[:, 2] >= 0) & (found[:, 2] < np.pi)).all()
+    assert (found[:, 4] > 0).all()
+
+
+def test_a_car_truncated_by_the_frame_is_not_detected() -> None:
+    """Two cars on a road: one whole, which is detected, one cut in half by the border."""
+    image = np.full((96, 160), 90, np.uint8)
+    image[:] += np.random.default_rng(0).integers(0, 12, image.shape).astype(np.uint8)
+    for x in (0, 80):
+        image[44:52, max(x - 8, 0) : x + 8] = 225
+        image[46:50, max(x - 3, 0) : x + 3] = 60
+    detections = detect_cars(network(), image, None)
+    cars = detections[detections[:, 3] > 0]
+    assert (np.hypot(cars[:, 0] - 79.5, cars[:, 1] - 47.5) < 4).any()
+    assert not (cars[:, 0] < 3).any()
+
+
+def test_the_difference_to_the_background_is_that_around_a_position() -> None:
+    background = np.full((60, 80), 100, np.uint8)
+    image = background.copy()
+    image[20:41, 30:51] = 140
+    near, far = background_difference_at(image, background, np.array([[40.0, 30.0], [5.0, 5.0]]), 16.0)
+    assert near == pytest.approx(40, abs=0.5)
+    assert far == pytest.approx(0, abs=0.1)
+    darker = background_difference_at(background, image, np.array([[40.0, 30.0]]), 16.0)
+    assert darker[0] == pytest.approx(near)
+
+
+def test_the_bonus_is_a_ramp() -> None:
+    motion = MotionRecord(still_grey=10, moving_grey=30, lift=0.2)
+    np.testing.assert_allclose(motion_score_bonus(motion, np.array([0.0, 10, 20, 30, 90])), [0, 0, 0.1, 0.2, 0.2])
