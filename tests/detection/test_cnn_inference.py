@@ -11,14 +11,17 @@ from velfield.bench.scenes import simulated_image
 from velfield.detection.cascade.classifier import distinct
 from velfield.detection.cnn import inference
 from velfield.detection.cnn.dataset import PATCH_PX, encode_targets
+from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.inference import SCORE_OFFSET, background_difference_at, detect_cars, motion_score_bonus
 from velfield.detection.cnn.model import Network
-from velfield.detection.detector import shipped_detector
+from velfield.detection.files import shipped_detector
 from velfield.detection.orientation import axial_difference
 
 
 def network() -> Network:
-    return shipped_detector().network
+    shipped = shipped_detector()
+    assert isinstance(shipped, CnnDetector)
+    return shipped.network
 
 
 @cache
@@ -154,5 +157,5 @@ def test_the_difference_to_the_background_is_that_around_a_position() -> None:
 
 
 def test_the_bonus_is_a_ramp() -> None:
-    motion = MotionRecord(still_grey=10, moving_grey=30, lift=0.2)
+    motion = MotionRecord(bonus_ramp_start=10, bonus_ramp_end=30, max_score_bonus=0.2)
     np.testing.assert_allclose(motion_score_bonus(motion, np.array([0.0, 10, 20, 30, 90])), [0, 0, 0.1, 0.2, 0.2])

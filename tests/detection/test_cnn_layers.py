@@ -17,7 +17,6 @@ from velfield.detection.cnn.convolution import (
 )
 from velfield.detection.cnn.model import (
     CONVOLUTIONS,
-    LAYER_NAMES_V1,
     STRIDE,
     TOPOLOGY,
     Conv,
@@ -147,11 +146,6 @@ def test_channels_and_resolutions_of_the_topology_fit() -> None:
 
     assert walk(TOPOLOGY, 1, 1) == (3, STRIDE)
     assert sum(np.prod(conv.shape) + conv.channels_out for conv in CONVOLUTIONS.values()) == 125_683
-
-
-def test_every_layer_of_version_1_has_one_new_name() -> None:
-    assert list(LAYER_NAMES_V1.values()) == list(CONVOLUTIONS)
-    assert not LAYER_NAMES_V1.keys() & CONVOLUTIONS.keys()
 
 
 def test_forward_equals_the_network_written_out_with_scipy() -> None:
