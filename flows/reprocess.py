@@ -24,7 +24,7 @@ from velfield.errors import Failure, InputError
 from velfield.pipeline.graphs import rebase_graph
 from velfield.pipeline.plan import write_flight_record
 from velfield.pipeline.stage import STAGES, NewBase, stages_before
-from velfield.pipeline.stages.rebase import Rebase, measure_rebase, rebased_plan
+from velfield.pipeline.stages.rebase import Rebase, measure_rebase, plan_rebase
 from velfield.pipeline.stages.registration import lost_frames
 from velfield.pipeline.stages.report import write_report
 from velfield.run.commits import sweep_partial
@@ -134,7 +134,7 @@ def _mapped(run: Run, job: Job, found: RebaseRecord, runner: RunnerConfig, conso
     link_shared_outputs(run.layout, layout, _names(NewBase.SHARED), without=("base/",))
     link_shared_outputs(run.layout, layout, _names(NewBase.COUNTS), without=("",))  # no outputs, only the records
     sweep_partial(layout.root)
-    plan = rebased_plan(run, job, found)
+    plan = plan_rebase(run, job, found)
     write_flight_record(plan)
     with open_runner(runner) as where:
         work = Work(plan, where, console)

@@ -1,4 +1,4 @@
-"""``camera.json``: the lens, how it was found and how sure that is."""
+"""``camera.json``: the lens, how it was estimated, and its uncertainty."""
 
 from typing import Annotated, Literal
 
@@ -8,7 +8,7 @@ from schemas.model import Model
 
 
 class HarrisLensRecord(Model):
-    """Harris' one-parameter radial model, r_d = r / sqrt(1 + a r^2), r in half-diagonals; ``a = 0`` is the pin-hole."""
+    """Harris' one-parameter radial model, r_d = r / sqrt(1 + a r^2), r in half-diagonals; ``a = 0``: pinhole model."""
 
     kind: Literal["harris"] = "harris"
     a: float
@@ -44,42 +44,42 @@ LensRecord = Annotated[HarrisLensRecord | DivisionLensRecord | PolynomialLensRec
 
 
 class ModelEvidence(Model):
-    """How straight one candidate model makes the lines; lines left out of the fit are what decides."""
+    """Straightness of the lines under one candidate model; the cross-validated residual selects the model."""
 
     model: str
     parameters: tuple[float, ...]
     residual_px: float = Field(ge=0)
     """RMS distance of the edge points from their lines, raw px."""
     heldout_px: float = Field(ge=0)
-    """The same on lines left out of the fit."""
+    """The same, cross-validated: on lines held out of the fit."""
 
 
 class OverlapEvidence(Model):
-    """What control points say of the lens: pairs of frames that see the same ground at different places."""
+    """The multi-view estimate of the lens, from pairs of frames that see the same ground."""
 
     pairs: NonNegativeInt = 0
     frames: NonNegativeInt = 0
-    """Frames among these pairs."""
+    """Frames in these pairs."""
     points: NonNegativeInt = 0
-    """Matches among them."""
+    """Matched points in them."""
     lines_a: float | None = None
-    """Distortion by the straight lines, as Harris' a ..."""
+    """Distortion by the plumb line, as Harris' a ..."""
     lines_a_sd: float | None = None
-    """... and its standard deviation, kerbs that bend alike allowed for."""
+    """... and its standard deviation, inflated for curved kerbs."""
     a: float | None = None
-    """Distortion by the control points, as Harris' a ..."""
+    """Distortion by the multi-view estimate, as Harris' a ..."""
     a_sd: float | None = None
-    """... and its standard deviation; large where the camera hangs over one place."""
+    """... and its standard deviation; large if the camera hovers."""
     fit_px: float | None = None
-    """Usual miss of the matches with all fitted, raw px: large where the ground is not flat."""
+    """Residual of the multi-view fit (mean of the pairs' medians), raw px: large if the scene is not flat."""
     before_px: float | None = None
-    """Usual miss of a frame's matches after a homography with the lens of the lines, raw px ..."""
+    """Residual after homographies alone with the plumb-line lens, raw px ..."""
     after_px: float | None = None
-    """... and with the control points' lens, found without that frame."""
+    """... and cross-validated with the multi-view lens: estimated without the frame."""
     used: bool = False
     """Whether the lens was changed by it."""
     reason: str
-    """Why it was changed or not, in one line with the numbers."""
+    """Why it was changed or not, in one line with the figures."""
 
 
 class CameraRecord(Model):
@@ -89,23 +89,23 @@ class CameraRecord(Model):
     frame_width_px: PositiveInt
     frame_height_px: PositiveInt
     accepted: bool
-    """Whether the evidence bore a distortion out; where not, the lens is the pin-hole."""
+    """Whether a distortion is significant; if not, the lens is the pinhole model."""
     reason: str
-    """Why it was accepted or not, in one line with the numbers."""
+    """Why it was accepted or not, in one line with the figures."""
     residual_px: float | None = None
-    """RMS distance of the edge points from their straight lines with the lens that the lines gave, raw px."""
+    """RMS distance of the edge points from their straight lines with the plumb-line lens, raw px."""
     residual_without_px: float | None = None
-    """The same with no lens."""
+    """The same without a lens."""
     a_sd: float | None = None
-    """Standard deviation of the distortion by all that was heard of it, kerbs that bend alike allowed for."""
+    """Standard deviation of the distortion by both estimates, inflated for curved kerbs."""
     centre_sd_px: tuple[float, float] | None = None
     frames: NonNegativeInt = 0
     lines: NonNegativeInt = 0
     edge_points: NonNegativeInt = 0
     entropy_a: tuple[float, ...] = ()
-    """Distortions of the grid of starts ..."""
+    """Grid of distortions ..."""
     entropy_nats: tuple[float, ...] = ()
-    """... and the entropy of the lines' angles and distances there; least where lines are straight."""
+    """... and the entropy of the lines' angles and distances there; minimal where lines are straight."""
     candidates: tuple[ModelEvidence, ...] = ()
     overlap: OverlapEvidence | None = None
-    """What the control points say of the lens, and whether it was refined by them; none: they were not asked."""
+    """The multi-view estimate, and whether it refined the lens; None: ``lens.refine`` is ``never``."""

@@ -32,7 +32,7 @@ def registration(
     """
     import cv2
 
-    from velfield.bench.registration import CASES, bench_registration, medians
+    from velfield.bench.registration import CASES, bench_registration, summarise
 
     cv2.setNumThreads(1)  # as the runs themselves: one core each
     unknown = sorted(set(cases) - set(CASES))
@@ -46,5 +46,5 @@ def registration(
             rows = bench_registration(out, CASES[case], seed, frames=frames, stabilo=stabilo)
             measured += rows
             print("\n".join(row.text() for row in rows), flush=True)
-    print("\n".join(medians(measured)))
+    print("\n".join(summarise(measured)))
     return 0

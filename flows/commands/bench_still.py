@@ -18,11 +18,11 @@ def still(run_folder: Path, /, *, frames: int = 200, within: Path | None = None)
         A CSV `x_px,y_px`: corners around the area to look at, base pixels. Roofs and trees move on the map of a camera
         that flies by; a road does not.
     """
-    from velfield.bench.still import read_area, still_things
+    from velfield.bench.still import measure_stability, read_area
     from velfield.run.run import open_run
 
     if frames < 3:
         raise InputError(f"--frames {frames}: expected 3 or more, to see jitter")
     area = None if within is None else read_area(within)
-    print(still_things(open_run(run_folder), max_frames=frames, within=area).text())
+    print(measure_stability(open_run(run_folder), max_frames=frames, within=area).text())
     return 0

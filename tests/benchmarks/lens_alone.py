@@ -1,9 +1,9 @@
-"""What the lens of ten simulated frames leaves, after a homography, RMS over the picture: `docs/registration.md`.
+"""Error of the lens calibrated from ten simulated frames, RMS over the image up to a homography: `docs/benchmarks.md`.
 
 python -m tests.benchmarks.lens_alone [--city] [--seconds 2] [--a 0.05 0.1 0.2 0.3] [--seeds 431 432 433 434 435]
 
-A plane under a lens whose centre is off the middle, or a city with roofs, hills and rows that shake by 1.5 px; frames
-that are spread over some seconds: within 2 s they show the same lines, and over 40 s the camera strays by some metres.
+A plane under a lens with a shifted centre, or a city with roofs, hills and a rolling shutter of 1.5 px; frames spread
+over some seconds: within 2 s they show the same lines, over 40 s the camera moves by some metres.
 """
 
 import argparse
@@ -28,26 +28,29 @@ FRAMES, SIZE = 10, (960, 1280)
 
 
 def main() -> None:
-    """Simulate, calibrate, tell."""
+    """Simulate, calibrate, print."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--city", action="store_true")
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--a", type=float, nargs="+", default=[0.05, 0.1, 0.2, 0.3])
     parser.add_argument("--seeds", type=int, nargs="+", default=[431, 432, 433, 434, 435])
-    asked = parser.parse_args()
-    for a in asked.a:
-        told = [left(simulation(a, seed, asked.city, FRAMES / asked.seconds)) for seed in asked.seeds]
-        misses = [miss for miss, _ in told]
-        each = ", ".join(f"{seed} {miss:.2f}" for seed, miss in zip(asked.seeds, misses, strict=True))
+    arguments = parser.parse_args()
+    for a in arguments.a:
+        errors = [
+            calibration_error(simulation(a, seed, arguments.city, FRAMES / arguments.seconds))
+            for seed in arguments.seeds
+        ]
+        rms_px = [error for error, _ in errors]
+        each = ", ".join(f"{seed} {error:.2f}" for seed, error in zip(arguments.seeds, rms_px, strict=True))
         print(
-            f"a = {a:g}: median {np.median(misses):.3f}, worst {max(misses):.3f} px, {told[0][1]:.2f} without a lens "
+            f"a = {a:g}: median {np.median(rms_px):.3f}, worst {max(rms_px):.3f} px, {errors[0][1]:.2f} without a lens "
             f"({each})",
             flush=True,
         )
 
 
 def simulation(a: float, seed: int, city: bool, fps: float) -> SimulationConfig:
-    """The flight of a seed, its frames on time."""
+    """The flight of a seed, with exact frame times."""
     height, width = SIZE
     if city:
         flight = SimulationConfig(
@@ -58,8 +61,8 @@ def simulation(a: float, seed: int, city: bool, fps: float) -> SimulationConfig:
     return flight.model_copy(update={"times": TimesSimulation(fps=fps, late_half_share=0, late_whole_share=0)})
 
 
-def left(config: SimulationConfig) -> tuple[float, float]:
-    """RMS that the found lens leaves and that none would, px."""
+def calibration_error(config: SimulationConfig) -> tuple[float, float]:
+    """RMS error of the calibrated lens and of the pinhole model, px."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         write_flight(folder / "flight", config)

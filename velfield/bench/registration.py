@@ -1,7 +1,7 @@
-"""Registration of unseen simulated flights against the truth, beside stabilo on the same frames.
+"""Benchmark of registration on simulated flights of unseen seeds against ground truth, with stabilo as a baseline.
 
-Each case is written as a user would have it and goes through the stages themselves, lens calibration included; stabilo
-(one homography a frame) is given the same frames and the same base image, already undistorted by the true lens.
+Each flight is written to disk as a user would have it and processed by the pipeline's stages, including lens
+calibration; stabilo (one homography per frame) gets the same frames and base image, undistorted by the true lens.
 """
 
 import time
@@ -12,9 +12,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray, GreyImage
+from schemas.arrays import Float32Array, FloatArray, GreyImage
 from schemas.job import Inputs, Job
 from schemas.simulation import OtherSensorSimulation, SimulationConfig
 from velfield.errors import InputError
@@ -30,7 +29,7 @@ from velfield.synthetic.score import RegistrationScore, score_registration
 from velfield.synthetic.truth import Truth, load_truth
 from velfield.synthetic.write import frame_name
 
-Mapped = Callable[[int, FloatArray], FloatArray]
+PointMap = Callable[[int, FloatArray], FloatArray]
 
 SAME_SENSOR = OtherSensorSimulation(same_sensor=True)
 _SIFT_FEATURES = 4000
@@ -39,7 +38,7 @@ _MAX_PIXELS = 100_000_000
 
 @dataclass(frozen=True)
 class Case:
-    """One kind of flight: its configuration by seed and number of frames, and what it is called."""
+    """One kind of flight: its name, number of frames, and configuration by seed and number of frames."""
 
     name: str
     frames: int
@@ -59,20 +58,20 @@ CASES = {
         Case("long", 1000, lambda seed, n: cases.vibration_and_drift(width=640, height=480, frames=n, seed=seed)),
     )
 }
-"""The cases: plane and pin-hole; lens and rows that wobble; vibration, drift and relief on another sensor's picture;
-the same for 1000 small frames."""
+"""The cases: plane and pinhole camera; lens and rolling shutter; vibration, drift and relief with another sensor's base
+image; the same for 1000 small frames."""
 
 
 @dataclass(frozen=True)
-class Measured:
+class Measurement:
     """One method on one flight.
 
     Attributes
     ----------
-    drift_px : how far the mean error moved from the first tenth of the frames to the last, base px.
-    corner_px : greatest error of a frame's corners that lie on the base image, over all frames, base px.
-    seconds_a_frame : of the method alone, reading of pictures left out for stabilo, left in for velfield.
-    frames_registered, frames : how many it registered of how many.
+    drift_px : change of the mean error from the first tenth of the frames to the last, base px.
+    corner_px : largest error of a frame's corners, over all frames, base px.
+    seconds_a_frame : computing time; reading of images is included for velfield, not for stabilo.
+    frames_registered, frames : number of frames registered, and in total.
     """
 
     case: str
@@ -98,7 +97,7 @@ class Measured:
 
 def bench_registration(
     folder: Path, case: Case, seed: int, *, frames: int | None = None, stabilo: bool = True
-) -> list[Measured]:
+) -> list[Measurement]:
     """Simulate one flight into ``folder`` and register it by each method, or by velfield alone.
 
     Raises
@@ -110,19 +109,19 @@ def bench_registration(
     config = case.make(seed, frames or case.frames)
     write_flight(flight, config)
     truth = load_truth(flight)
-    measured = []
-    for method, run in (("velfield", _by_velfield), ("stabilo", _by_stabilo))[: 2 if stabilo else 1]:
-        to_base, registered, seconds = run(flight, config, truth)
+    measurements = []
+    for method, register in (("velfield", _run_velfield), ("stabilo", _run_stabilo))[: 2 if stabilo else 1]:
+        to_base, registered, seconds = register(flight, config, truth)
         score = score_registration(truth, to_base, registered)
         corner = _worst_corner(truth, to_base, registered)
-        measured.append(_row(case.name, method, seed, score, corner, seconds, config.frames))
-    return measured
+        measurements.append(_row(case.name, method, seed, score, corner, seconds, config.frames))
+    return measurements
 
 
 def _row(
     case: str, method: str, seed: int, score: RegistrationScore, corner_px: float, seconds: float, frames: int
-) -> Measured:
-    return Measured(
+) -> Measurement:
+    return Measurement(
         case=case,
         method=method,
         seed=seed,
@@ -137,28 +136,28 @@ def _row(
     )
 
 
-def _worst_corner(truth: Truth, to_base: Mapped, frames: Sequence[int]) -> float:
+def _worst_corner(truth: Truth, to_base: PointMap, frames: Sequence[int]) -> float:
     w, h = truth.camera.width - 1.0, truth.camera.height - 1.0
     corners = np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]])
-    misses = [np.hypot(*(to_base(frame, corners) - truth.to_base(frame, corners)).T) for frame in frames]
-    return float(np.max(misses)) if misses else float("nan")
+    errors = [np.hypot(*(to_base(frame, corners) - truth.to_base(frame, corners)).T) for frame in frames]
+    return float(np.max(errors)) if errors else float("nan")
 
 
-def medians(measured: Sequence[Measured]) -> list[str]:
-    """Of each case and method, the median and the worst over its flights, a line each."""
+def summarise(measurements: Sequence[Measurement]) -> list[str]:
+    """Median and worst over the flights of each case and method, one line each."""
     lines = []
-    for case, method in dict.fromkeys((m.case, m.method) for m in measured):
-        rows = [m for m in measured if (m.case, m.method) == (case, method)]
-        told = [f"{case:<11} {method:<9} median (worst) of {len(rows)}:"]
+    for case, method in dict.fromkeys((m.case, m.method) for m in measurements):
+        rows = [m for m in measurements if (m.case, m.method) == (case, method)]
+        texts = [f"{case:<11} {method:<9} median (worst) of {len(rows)}:"]
         for name in ("mean_px", "p95_px", "jitter_px", "drift_px", "corner_px", "seconds_a_frame"):
             values = [getattr(row, name) for row in rows]
-            told.append(f"{name} {np.median(values):.3f} ({max(values):.3f})")
-        lines.append("  ".join(told))
+            texts.append(f"{name} {np.median(values):.3f} ({max(values):.3f})")
+        lines.append("  ".join(texts))
     return lines
 
 
 def register_flight(flight: Path, out: Path) -> tuple[Plan, float]:
-    """Run the stages up to registration on a simulated flight; the plan, and registration's seconds."""
+    """Run the stages up to registration on a simulated flight; the plan, and the seconds of the registration stage."""
     job = Job(
         root=str(out),
         inputs=Inputs(
@@ -176,41 +175,41 @@ def register_flight(flight: Path, out: Path) -> tuple[Plan, float]:
     return plan, time.perf_counter() - started
 
 
-def _by_velfield(flight: Path, config: SimulationConfig, truth: Truth) -> tuple[Mapped, list[int], float]:
+def _run_velfield(flight: Path, config: SimulationConfig, truth: Truth) -> tuple[PointMap, list[int], float]:
     plan, seconds = register_flight(flight, flight / "run")
     maps = FrameTransforms.open(plan.layout, plan.config)
-    found = {
+    transforms = {
         int(source): transform
         for frame, source in enumerate(plan.indices)
         if (transform := maps.transform(frame)) is not None
     }
-    return lambda frame, xy: found[frame].to_base(xy), sorted(found), seconds
+    return lambda frame, xy: transforms[frame].to_base(xy), sorted(transforms), seconds
 
 
-def _by_stabilo(flight: Path, config: SimulationConfig, truth: Truth) -> tuple[Mapped, list[int], float]:
-    """One homography a frame by SIFT and MAGSAC; a frame that it gives up on is left out."""
-    stabilizer = _stabilizer()
-    undistort = _undistortion(truth)
-    stabilizer.set_ref_frame(_coloured(read_grey_image(flight / "base.png", _MAX_PIXELS)))
-    found: dict[int, FloatArray] = {}
+def _run_stabilo(flight: Path, config: SimulationConfig, truth: Truth) -> tuple[PointMap, list[int], float]:
+    """One homography per frame by SIFT and MAGSAC; frames it cannot register are left out."""
+    stabilizer = _make_stabilizer()
+    undistort = _undistortion_maps(truth)
+    stabilizer.set_ref_frame(_to_bgr(read_grey_image(flight / "base.png", _MAX_PIXELS)))
+    transforms: dict[int, FloatArray] = {}
     seconds = 0.0
     for frame in range(config.frames):
         grey = read_grey_image(flight / "frames" / frame_name(frame, config), _MAX_PIXELS)
-        straight = _coloured(np.asarray(cv2.remap(grey, *undistort, cv2.INTER_CUBIC), dtype=np.uint8))
+        undistorted = _to_bgr(np.asarray(cv2.remap(grey, *undistort, cv2.INTER_CUBIC), dtype=np.uint8))
         started = time.perf_counter()
-        stabilizer.stabilize(straight)
+        stabilizer.stabilize(undistorted)
         seconds += time.perf_counter() - started
         matrix = stabilizer.get_cur_trans_matrix()
         if matrix is not None:
-            found[frame] = np.asarray(matrix, dtype=np.float64)
+            transforms[frame] = np.asarray(matrix, dtype=np.float64)
 
     def to_base(frame: int, xy_raw: FloatArray) -> FloatArray:
-        return _by_homography(found[frame], truth.camera.undistort(as_points(xy_raw)))
+        return _apply_homography(transforms[frame], truth.camera.undistort(as_points(xy_raw)))
 
-    return to_base, sorted(found), seconds
+    return to_base, sorted(transforms), seconds
 
 
-def _stabilizer() -> Any:
+def _make_stabilizer() -> Any:
     try:
         from stabilo import Stabilizer
     except ImportError:
@@ -229,18 +228,18 @@ def _stabilizer() -> Any:
     )
 
 
-def _undistortion(truth: Truth) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Maps for ``cv2.remap`` from a raw frame to one that a pin-hole would have taken."""
+def _undistortion_maps(truth: Truth) -> tuple[Float32Array, Float32Array]:
+    """Maps for ``cv2.remap`` from a raw frame to that of an ideal pinhole camera."""
     h, w = truth.camera.height, truth.camera.width
     y, x = np.mgrid[0:h, 0:w].astype(np.float64)
     raw = truth.camera.distort(np.column_stack([x.ravel(), y.ravel()])).astype(np.float32).reshape(h, w, 2)
     return np.ascontiguousarray(raw[..., 0]), np.ascontiguousarray(raw[..., 1])
 
 
-def _coloured(grey: GreyImage) -> GreyImage:
+def _to_bgr(grey: GreyImage) -> GreyImage:
     return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
 
 
-def _by_homography(matrix: FloatArray, xy: FloatArray) -> FloatArray:
+def _apply_homography(matrix: FloatArray, xy: FloatArray) -> FloatArray:
     mapped = np.column_stack([xy, np.ones(len(xy))]) @ matrix.T
     return np.asarray(mapped[:, :2] / mapped[:, 2:])

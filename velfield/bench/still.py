@@ -1,11 +1,11 @@
-"""How still things that stand lie on the map of a run: the jitter of registration, measured without any truth.
+"""Stability of stationary points on the map of a run: the jitter of registration, measured without ground truth.
 
-Corners of the base image that registration itself does not use (those at least half of its patches away from its own)
-are found in every registered frame below the pixel, and carried to the map by the frame's transform. What is left of
-their motion is what a standing car would seem to do: registration's residual, and the alignment's own noise. For the
-latter's sake only sharp corners are followed, and by patches larger than registration's: by those, compressed pictures
-alone moved a road's marks by .15 px. What is higher than the ground moves on the map of a camera that flies by, as it
-must: an area tells where the ground is.
+Corners of the base image that registration does not use (half a patch away from those it uses) are located in every
+registered frame to subpixel accuracy and mapped to base pixels by the frame's transform. Their remaining motion is what
+a stationary vehicle would appear to do: the registration error plus the noise of the alignment. To reduce the latter,
+only sharp corners are tracked, with patches larger than those of registration: with the latter, compression artefacts
+alone moved road markings by 0.15 px. Points above the ground move on the map of a moving camera by parallax; an area
+restricts the measurement to the ground.
 """
 
 from dataclasses import dataclass, replace
@@ -13,9 +13,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray
+from schemas.arrays import FloatArray, GreyImage
 from velfield.errors import InputError
 from velfield.registration.alignment import (
     N_PATCHES_CROSS_SENSOR,
@@ -31,24 +30,24 @@ from velfield.sources.images import read_grey_image
 from velfield.sources.table import finite_cell, read_csv_rows
 
 _MAX_SHIFT_PX = 3.0
-_MIN_SHARE = 0.5
+_MIN_FRAME_FRACTION = 0.5
 PATCH_HALF_PX = 12
-SHARP_PX, _AT_LEAST = 0.1, 30
-"""Corners that noise would move by more are not followed; but so many at least are."""
+SHARP_PX, _MIN_CORNERS = 0.1, 30
+"""Corners of a larger standard deviation under noise are not tracked, unless fewer than this number remain."""
 _MAD_TO_SD = 1.4826
 
 
 @dataclass(frozen=True)
-class StillScore:
-    """What stands, on the map.
+class StabilityScore:
+    """Stability of stationary corners on the map.
 
     Attributes
     ----------
-    points, frames : corners followed in at least half of the registered frames; the frames.
-    sd_median_px, sd_p90_px : robust standard deviation of a corner's place an axis, its median and 90th percentile over
-        the corners, base px.
-    drift_px : how far the corners' mean place moved from the first to the last tenth of the frames, base px.
-    noise_px : what noise of three grey levels alone would move the usual corner an axis; clean pictures have less.
+    points, frames : corners tracked in at least half of the registered frames; number of frames.
+    sd_median_px, sd_p90_px : robust standard deviation of a corner's position per axis, its median and 90th percentile
+        over the corners, base px.
+    drift_px : displacement of the corners' mean position from the first to the last tenth of the frames, base px.
+    noise_px : standard deviation per axis of the typical corner due to image noise of three grey levels alone.
     """
 
     points: int
@@ -61,20 +60,19 @@ class StillScore:
     def text(self) -> str:
         """One line."""
         return (
-            f"{self.points} still corners in {self.frames} frames: standard deviation {self.sd_median_px:.3f} px "
-            f"an axis (median; 90 % below {self.sd_p90_px:.3f}; noise of 3 grey levels, as in "
-            f"compressed pictures, would move one by {self.noise_px:.3f}), "
-            f"drift from first to last tenth {self.drift_px:.3f} px"
+            f"{self.points} stationary corners in {self.frames} frames: standard deviation {self.sd_median_px:.3f} px "
+            f"per axis (median; 90 % below {self.sd_p90_px:.3f}; {self.noise_px:.3f} expected from noise of 3 grey "
+            f"levels, as in compressed video), drift from first to last tenth {self.drift_px:.3f} px"
         )
 
 
 def read_area(path: Path) -> FloatArray:
-    """Corners (n, 2) in order around an area, base px: a CSV ``x_px,y_px``.
+    """Read the corners (n, 2) of a polygon in order, base px, from a CSV ``x_px,y_px``.
 
     Raises
     ------
     InputError
-        No such file, a cell that is no number, fewer than three corners.
+        No such file, a cell that is not a number, fewer than three corners.
     """
     rows = read_csv_rows(path, required=("x_px", "y_px"), what="an area")
     corners = np.array([[finite_cell(path, line, row, name) for name in ("x_px", "y_px")] for line, row in rows])
@@ -85,88 +83,95 @@ def read_area(path: Path) -> FloatArray:
     return corners
 
 
-def still_things(run: Run, *, max_frames: int = 200, within: FloatArray | None = None) -> StillScore:
-    """Follow still corners through at most ``max_frames`` frames, spread over the run.
+def measure_stability(run: Run, *, max_frames: int = 200, within: FloatArray | None = None) -> StabilityScore:
+    """Track stationary corners through at most ``max_frames`` frames, sampled over the run.
 
-    ``within`` (n, 2): corners around the area to look at, base px; none: everywhere.
+    Parameters
+    ----------
+    run
+        A finished run.
+    max_frames
+        Largest number of frames.
+    within
+        (n, 2) polygon of the area to measure, base px; None: everywhere.
 
     Raises
     ------
     InputError
-        Fewer than three registered frames, or nothing to follow in them.
+        Fewer than three registered frames, or no corner to track.
     """
     maps = replace(run.maps, onward=())
     registered = [frame for frame, status in enumerate(run.registration_status) if status == "ok"]
-    chosen = np.unique(np.linspace(0, len(registered) - 1, min(max_frames, len(registered))).astype(int))
-    if len(chosen) < 3:
+    sampled = np.unique(np.linspace(0, len(registered) - 1, min(max_frames, len(registered))).astype(int))
+    if len(sampled) < 3:
         raise InputError(f"{run.layout.root}: {len(registered)} registered frames, 3 or more needed to see jitter")
-    templates = _sharpest(run, within)
-    places = np.full((len(chosen), len(templates), 2), np.nan)
-    for row, k in enumerate(chosen):
+    templates = _select_sharpest(run, within)
+    positions = np.full((len(sampled), len(templates), 2), np.nan)
+    for row, k in enumerate(sampled):
         transform = maps.transform(registered[k])
         assert isinstance(transform, FrameTransform), "a registered frame has a map"
-        places[row] = places_on_map(run.frames.read(registered[k]), transform, templates)
-    return _score(places, run, float(np.median(templates.sigma_px)))
+        positions[row] = track_corners(run.frames.read(registered[k]), transform, templates)
+    return _score(positions, run, float(np.median(templates.sigma_px)))
 
 
-def unused_corners(run: Run) -> tuple[Templates, NDArray[np.uint8]]:
-    """Corners that registration does not use, and the image (h, w) that frames were registered to."""
+def unused_corners(run: Run) -> tuple[Templates, GreyImage]:
+    """Corners of the registration's base image (h, w) that registration does not use, and that image."""
     layout, limit = run.layout, run.record.config.frames.max_pixels
     own = run.grid.frames_to == "own"
     grey = read_grey_image(layout.own_base_image, limit) if own else run.base_image
-    known = read_grey_image(layout.own_base_mask, limit) > 0 if own else np.ones(grey.shape, np.bool_)
-    used = [make_templates(grey, known, count=count).xy for count in (N_PATCHES_SAME_SENSOR, N_PATCHES_CROSS_SENSOR)]
-    return make_templates(grey, known, exclude=np.concatenate(used), half_patch=PATCH_HALF_PX), grey
+    valid = read_grey_image(layout.own_base_mask, limit) > 0 if own else np.ones(grey.shape, np.bool_)
+    used = [make_templates(grey, valid, count=count).xy for count in (N_PATCHES_SAME_SENSOR, N_PATCHES_CROSS_SENSOR)]
+    return make_templates(grey, valid, exclude=np.concatenate(used), half_patch=PATCH_HALF_PX), grey
 
 
-def _sharpest(run: Run, within: FloatArray | None) -> Templates:
-    """The sharpest of those corners, in an area where one is given."""
-    found, grey = unused_corners(run)
-    inside = np.ones(len(found), np.bool_)
+def _select_sharpest(run: Run, within: FloatArray | None) -> Templates:
+    """The sharpest of the unused corners, within an area if one is given."""
+    corners, grey = unused_corners(run)
+    inside = np.ones(len(corners), np.bool_)
     if within is not None:
         area = cv2.fillPoly(np.zeros(grey.shape, np.uint8), [np.rint(within).astype(np.int32)], (1,))
-        inside = area[found.xy[:, 1].astype(np.int64), found.xy[:, 0].astype(np.int64)] > 0
+        inside = area[corners.xy[:, 1].astype(np.int64), corners.xy[:, 0].astype(np.int64)] > 0
     if not inside.any():
         raise InputError(
             f"{run.layout.root}: found no corner in the area that registration does not use, expected an area on the "
-            f"base image of {grey.shape[1]}x{grey.shape[0]} px; move it there or give a larger one"
+            f"base image of {grey.shape[1]}x{grey.shape[0]} px; give another or a larger one"
         )
-    noise = np.where(inside, found.sigma_px, np.inf)
-    wanted = max(int((noise <= SHARP_PX).sum()), min(_AT_LEAST, int(inside.sum())))
-    order = np.argsort(noise, kind="stable")[:wanted]
-    return found.select(order)
+    noise = np.where(inside, corners.sigma_px, np.inf)
+    count = max(int((noise <= SHARP_PX).sum()), min(_MIN_CORNERS, int(inside.sum())))
+    order = np.argsort(noise, kind="stable")[:count]
+    return corners.select(order)
 
 
-def places_on_map(grey: NDArray[np.uint8], transform: FrameTransform, templates: Templates) -> FloatArray:
-    """Where a frame puts the corners on the map, (n, 2) base px; NaN where it does not show them."""
-    found, _ = align_patches(smooth_levels(grey)[0], transform, templates, coarse=False, max_shift_px=_MAX_SHIFT_PX)
+def track_corners(grey: GreyImage, transform: FrameTransform, templates: Templates) -> FloatArray:
+    """Positions (n, 2) of the corners by one frame, base px; NaN where they are not located."""
+    corners, _ = align_patches(smooth_levels(grey)[0], transform, templates, coarse=False, max_shift_px=_MAX_SHIFT_PX)
     number = {(float(x), float(y)): k for k, (x, y) in enumerate(templates.xy)}
-    rows = [number[(float(x), float(y))] for x, y in found.xy_base]
-    places = np.full((len(templates), 2), np.nan)
-    places[rows] = transform.to_base(found.xy_raw)
-    return places
+    rows = [number[(float(x), float(y))] for x, y in corners.xy_base]
+    positions = np.full((len(templates), 2), np.nan)
+    positions[rows] = transform.to_base(corners.xy_raw)
+    return positions
 
 
-def about_their_middles(places: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Of places (frames, n, 2), those followed in half of the frames (m of n), about their medians: (frames, m, 2).
+def centre_on_medians(positions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Residuals (frames, m, 2) of positions (frames, n, 2) about their medians, of those tracked in half of the frames.
 
-    And the robust standard deviation an axis of each, (m,).
+    Also the robust standard deviation per axis of each, (m,).
     """
-    kept = places[:, np.isfinite(places[..., 0]).mean(axis=0) >= _MIN_SHARE]
-    rest = kept - np.nanmedian(kept, axis=0)
-    return rest, _MAD_TO_SD * np.sqrt(np.mean(np.nanmedian(np.abs(rest), axis=0) ** 2, axis=1))
+    kept = positions[:, np.isfinite(positions[..., 0]).mean(axis=0) >= _MIN_FRAME_FRACTION]
+    residuals = kept - np.nanmedian(kept, axis=0)
+    return residuals, _MAD_TO_SD * np.sqrt(np.mean(np.nanmedian(np.abs(residuals), axis=0) ** 2, axis=1))
 
 
-def _score(places: FloatArray, run: Run, noise_px: float) -> StillScore:
-    """Of places (frames, corners, 2)."""
-    rest, sd = about_their_middles(places)
+def _score(positions: FloatArray, run: Run, noise_px: float) -> StabilityScore:
+    """The score of positions (frames, corners, 2)."""
+    residuals, sd = centre_on_medians(positions)
     if not len(sd):
-        raise InputError(f"{run.layout.root}: no corner of the base image is seen in half of the frames")
-    tenth = max(1, len(places) // 10)
-    drift = np.nanmedian(rest[-tenth:], axis=(0, 1)) - np.nanmedian(rest[:tenth], axis=(0, 1))
-    return StillScore(
+        raise InputError(f"{run.layout.root}: no corner of the base image could be tracked in half of the frames")
+    tenth = max(1, len(positions) // 10)
+    drift = np.nanmedian(residuals[-tenth:], axis=(0, 1)) - np.nanmedian(residuals[:tenth], axis=(0, 1))
+    return StabilityScore(
         points=len(sd),
-        frames=len(places),
+        frames=len(positions),
         noise_px=noise_px,
         sd_median_px=float(np.median(sd)),
         sd_p90_px=float(np.percentile(sd, 90)),

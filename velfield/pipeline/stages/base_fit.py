@@ -1,39 +1,39 @@
-"""How a flight lies on the picture given as ``--base``: whether its scale serves, what is told of it."""
+"""How the frames are registered to the image given as ``--base``: scale, rotation and coverage, and their limits."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import Mask
 from velfield.errors import InputError
 from velfield.registration.transforms import FrameTransform
 from velfield.sources.geo import BaseRaster
 
-LEAST_SCALE, MOST_SCALE = 0.5, 2.0
-"""Base px a frame px: the scales that the search for the place covers, and that the map is worth making at."""
-_SLACK = 1.05
-"""The scale of a tilted frame differs over it."""
-_SAME_SCALE = 0.1
-"""Scales farther from 1 than this let metres a pixel of the base picture be mistaken for the frames'."""
-_COVERED = 0.95
-_SIDE = 25
+MIN_SCALE, MAX_SCALE = 0.5, 2.0
+"""Base px per frame px: the scales that the coarse search covers and that are useful for a map."""
+_TOLERANCE = 1.05
+"""The scale varies over a tilted frame."""
+_MAX_LOG_SCALE = 0.1
+"""Beyond this logarithm of the scale, the ground sample distances of base image and frames must not be confused."""
+_MIN_COVERAGE = 0.95
+_GRID_SIDE = 25
 
 
 @dataclass(frozen=True)
 class BaseFit:
-    """How the flight lies on the given picture.
+    """Registration of the flight to the given base image.
 
     Attributes
     ----------
-    straight : whether frames are registered straight to it, not by way of the flight's own base image.
-    error_px : distance of points left out of the fit, base px.
-    points : how many of them.
-    scale, rotation_rad : base px a frame px in the middle of a frame in the midst of the flight, and the turn there,
-        from +x towards +y.
-    covered : share of what the flight shows that the picture does.
+    direct : whether frames are registered directly to it, not via the flight's own base image.
+    error_px : cross-validated error of the control points, base px.
+    points : number of control points.
+    scale, rotation_rad : base px per frame px at the centre of a frame in the middle of the flight, and the rotation
+        there, from +x towards +y.
+    covered : fraction of the area seen by the flight that the base image covers.
     """
 
-    straight: bool
+    direct: bool
     error_px: float
     points: int
     scale: float
@@ -41,52 +41,49 @@ class BaseFit:
     covered: float
 
     def note(self, given_gsd_m: float | None) -> str:
-        """Where it lies, in one line; ``given_gsd_m``: ``--gsd-m`` where it alone tells the scale of the map."""
-        turn = round(float(np.degrees(self.rotation_rad)))
-        sense = "" if turn == 0 else ", clockwise" if turn > 0 else ", anticlockwise"
-        route = "straight" if self.straight else "by way of the flight's own base image"
-        told = (
-            f"frames are registered to it {route}: a frame pixel is about {self.scale:.2f} base pixels, "
-            f"turned by about {abs(turn)} degrees{sense}"
-        )
-        if given_gsd_m is not None and abs(np.log(self.scale)) > _SAME_SCALE:
-            of_frame = f"a frame pixel is {given_gsd_m * self.scale:.3g} m"
-            told += f"; --gsd-m {given_gsd_m:g} is of the base pixels, so that {of_frame}"
-        return told
+        """The registration in one line; ``given_gsd_m``: ``--gsd-m`` if the base image has no scale of its own."""
+        degrees = round(float(np.degrees(self.rotation_rad)))
+        sense = "" if degrees == 0 else " cw" if degrees > 0 else " ccw"
+        route = "directly to the base image" if self.direct else "to the base image via the flight's own"
+        text = f"frames registered {route}: scale {self.scale:.2f}, rotation {abs(degrees)}°{sense}"
+        if given_gsd_m is not None and abs(np.log(self.scale)) > _MAX_LOG_SCALE:
+            frame_gsd = f"that of the frames is {given_gsd_m * self.scale:.3g} m"
+            text += f"; --gsd-m {given_gsd_m:g} is the ground sample distance of the base image, {frame_gsd}"
+        return text
 
     def warnings(self) -> list[str]:
-        """What is to be minded of it."""
-        if self.covered >= _COVERED:
+        """Warnings, one line each."""
+        if self.covered >= _MIN_COVERAGE:
             return []
         return [
-            f"the base picture shows {self.covered:.0%} of what the flight does: vehicles beyond it are not on the "
-            "map; give a larger picture, or none"
+            f"the base image covers {self.covered:.0%} of the area seen by the flight: vehicles outside it are not on "
+            "the map; give a larger image, or none"
         ]
 
 
 def check_scale(scale: float, given: BaseRaster, name: str) -> None:
-    """Refuse a picture of the place that is much coarser or finer than the frames.
+    """Reject a base image of much lower or higher resolution than the frames.
 
     Raises
     ------
     InputError
-        The scale is beyond 0.5 to 2.
+        The scale is outside 0.5 to 2.
     """
-    if LEAST_SCALE / _SLACK <= scale <= MOST_SCALE * _SLACK:
+    if MIN_SCALE / _TOLERANCE <= scale <= MAX_SCALE * _TOLERANCE:
         return
     height, width = given.grey.shape
     raise InputError(
-        f"--base {name}: found {scale:.2g} base pixels a frame pixel, expected {LEAST_SCALE:g} to {MOST_SCALE:g}; "
-        f"give the picture resampled to about {width / scale:.0f} x {height / scale:.0f} px"
+        f"--base {name}: found {scale:.2g} base pixels per frame pixel, expected {MIN_SCALE:g} to {MAX_SCALE:g}; "
+        f"give the image resampled to about {width / scale:.0f} x {height / scale:.0f} px"
     )
 
 
-def covered_share(to_base: FrameTransform, shown: NDArray[np.bool_] | None, given: BaseRaster) -> float:
-    """Share of a frame, or of its part ``shown`` (h, w), that lies on the given picture where that has data."""
-    x, y = np.meshgrid(np.linspace(0, to_base.width - 1, _SIDE), np.linspace(0, to_base.height - 1, _SIDE))
+def covered_fraction(to_base: FrameTransform, visible: Mask | None, given: BaseRaster) -> float:
+    """Fraction of a frame, or of its part ``visible`` (h, w), that the base image covers with valid pixels."""
+    x, y = np.meshgrid(np.linspace(0, to_base.width - 1, _GRID_SIDE), np.linspace(0, to_base.height - 1, _GRID_SIDE))
     raw = np.column_stack([x.ravel(), y.ravel()])
-    if shown is not None:
-        raw = raw[shown[raw[:, 1].astype(np.int64), raw[:, 0].astype(np.int64)]]
+    if visible is not None:
+        raw = raw[visible[raw[:, 1].astype(np.int64), raw[:, 0].astype(np.int64)]]
     base, (height, width) = to_base.to_base(raw), given.grey.shape
     with np.errstate(invalid="ignore"):
         inside = np.asarray(((base >= 0) & (base <= [width - 1, height - 1])).all(axis=1))

@@ -1,8 +1,8 @@
-"""The base image of a flight: its own, a median without traffic; and where one was given, how the own one lies on it.
+"""Stage ``base``: the base image that frames are registered to.
 
-Frames are registered to the flight's own base image, for the same camera in the same light gives a tenth of a pixel;
-unless they lie straight on the given one. Where they do not, that is checked against one frame before the own one is
-built, and registered once to the own one.
+If an image was given and sampled frames register directly to it, it is the base image. Otherwise frames are registered
+to the flight's own base image, a median mosaic free of traffic: the same camera in the same light reaches a tenth of a
+pixel. A given image is then first checked against one frame, and the own base image is registered to it once.
 """
 
 import os
@@ -13,8 +13,8 @@ from threading import Lock
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import GreyImage
 from schemas.records import GridRecord
 from velfield.camera.lens import Lens, pinhole
 from velfield.errors import Failure, InputError
@@ -22,9 +22,9 @@ from velfield.exports.cog import write_cog
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
 from velfield.pipeline.result import StageResult
-from velfield.pipeline.stages.base_fit import BaseFit, check_scale, covered_share
+from velfield.pipeline.stages.base_fit import BaseFit, check_scale, covered_fraction
 from velfield.pipeline.stages.external_detections import free_of_vehicles
-from velfield.pipeline.stages.lens import spread_usable
+from velfield.pipeline.stages.lens import select_usable_frames
 from velfield.registration.intersensor import IntersensorResult, register_intersensor
 from velfield.registration.intrasensor import BaseReference, prepare_base, register_frame
 from velfield.registration.keypoints import Keypoints, detect_keypoints
@@ -39,9 +39,9 @@ from velfield.run.stores import open_frames
 from velfield.sources.geo import BaseRaster, read_base_raster, reconcile_gsd
 from velfield.sources.images import read_grey_image
 
-_TRIED = 8
-_DIRECT_HELDOUT_PX, _DIRECT_SPREAD = 0.5, 0.8
-"""Frames tried straight on the given picture must all reach this: held-out residual, share of cells with points."""
+_N_DIRECT_TRIALS = 8
+_MAX_DIRECT_ERROR_PX, _MIN_DIRECT_COVERAGE = 0.5, 0.8
+"""Held-out residual and coverage that all sampled frames must reach to be registered directly to the given image."""
 _THREADS = min(4, os.cpu_count() or 1)
 _REFERENCE_LOCK = Lock()
 _references: dict[tuple[str, str], BaseReference] = {}
@@ -49,19 +49,19 @@ _references: dict[tuple[str, str], BaseReference] = {}
 
 @dataclass(frozen=True)
 class FrameKeypoints:
-    """Key points of one frame, raw px."""
+    """Keypoints of one frame, raw px."""
 
     frame: int
     keypoints: Keypoints
 
 
 def spread_frames(plan: Plan) -> list[int]:
-    """Frames that the own base image is made from, spread over the flight."""
-    return spread_usable(plan, plan.config.base.median_frames)
+    """Frames sampled over the flight, of which the own base image is built."""
+    return select_usable_frames(plan, plan.config.base.median_frames)
 
 
 def detect_unit_keypoints(plan: Plan, frames: Sequence[int]) -> list[FrameKeypoints]:
-    """Key points of a block of frames: the costly part of registration, and the parallel one."""
+    """Detect the keypoints of a block of frames: the expensive part of registration, which runs in parallel."""
     store, config = open_frames(plan.layout.frames), plan.config.registration
     return [
         FrameKeypoints(frame, detect_keypoints(store.read(frame), config, free_of_vehicles(plan, frame, store.shape)))
@@ -75,20 +75,20 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageR
     Raises
     ------
     InputError
-        The given base image is not of this place (with the scores), or too few frames overlap.
+        The given base image does not show this area (with the scores), or too few frames overlap.
     """
-    keypoints = {found.frame: found.keypoints for block in blocks for found in block}
-    given = _given_picture(plan)
+    keypoints = {result.frame: result.keypoints for block in blocks for result in block}
+    given = _read_given_base(plan)
     lens, store, layout = read_lens(plan.layout), open_frames(plan.layout.frames), plan.layout
     sharpness = store.column("sharpness")
     reference = max(keypoints, key=lambda frame: float(np.nan_to_num(sharpness[frame])))
     if given is not None:
-        direct = _straight_to(plan, given, keypoints, lens)
-        if direct is not None:  # to half a pixel all over the frame: no other place does that
+        direct = register_directly(plan, given, keypoints, lens)
+        if direct is not None:  # half a pixel all over the frame: no other area reaches that
             grid = _given_grid(plan, given, reference, direct)
             layout.own_to_base.unlink(missing_ok=True)
-            return _finish(plan, grid, write_given_picture(layout, given), given=given, fit=direct)
-        _check_place(plan, store.read(reference), given, lens)
+            return _finish(plan, grid, write_given_image(layout, given), given=given, fit=direct)
+        _check_area(plan, store.read(reference), given, lens)
     own = build_own_base(
         store.read,
         keypoints,
@@ -110,7 +110,7 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageR
         layout.own_to_base.unlink(missing_ok=True)
         outputs.append(layout.base_image)
     else:
-        fit, written = _onto_given(plan, own, given)
+        fit, written = _register_to_given(plan, own, given)
         grid = _given_grid(plan, given, reference, fit)
         outputs += written
     return _finish(plan, grid, outputs, frames=own.frames, given=given, fit=fit)
@@ -125,7 +125,7 @@ def _finish(
     given: BaseRaster | None = None,
     fit: BaseFit | None = None,
 ) -> StageResult:
-    """Write the grid; ``frames``: of how many the own base image was made, none where none was."""
+    """Write the grid; ``frames``: number of frames in the own base image, None if there is none."""
     layout = plan.layout
     layout.rebased.unlink(missing_ok=True)
     write_atomically(layout.grid, grid.model_dump_json(indent=1).encode())
@@ -137,21 +137,21 @@ def _finish(
     if given is None or fit is None:
         return StageResult(outputs, counts)
     counts |= {"intersensor_error_px": fit.error_px, "scale": fit.scale, "covered": fit.covered}
-    by_hand = plan.config.gsd_m if given.gsd_m is None else None
-    return StageResult(outputs, counts, [*given.notes, fit.note(by_hand)], fit.warnings())
+    given_gsd_m = plan.config.gsd_m if given.gsd_m is None else None
+    return StageResult(outputs, counts, [*given.notes, fit.note(given_gsd_m)], fit.warnings())
 
 
-def _given_picture(plan: Plan) -> BaseRaster | None:
+def _read_given_base(plan: Plan) -> BaseRaster | None:
     path = plan.job.inputs.base
     return read_base_raster(Path(path), plan.config.frames) if path else None
 
 
-def _check_place(plan: Plan, grey: NDArray[np.uint8], given: BaseRaster, lens: Lens) -> None:
-    """Refuse a picture of another place before any frame is worked on."""
-    found = register_intersensor(grey, given.grey, plan.config.base, lens=lens)
-    if isinstance(found, Failure):
-        raise InputError(f"--base {plan.job.inputs.base}: {found.reason}")
-    check_scale(found.scale, given, plan.job.inputs.base or "")
+def _check_area(plan: Plan, grey: GreyImage, given: BaseRaster, lens: Lens) -> None:
+    """Reject an image of another area before any frame is processed."""
+    result = register_intersensor(grey, given.grey, plan.config.base, lens=lens)
+    if isinstance(result, Failure):
+        raise InputError(f"--base {plan.job.inputs.base}: {result.reason}")
+    check_scale(result.scale, given, plan.job.inputs.base or "")
 
 
 def _own_grid(plan: Plan, own: OwnBase, reference: int) -> GridRecord:
@@ -167,49 +167,49 @@ def _own_grid(plan: Plan, own: OwnBase, reference: int) -> GridRecord:
     )
 
 
-def _onto_given(plan: Plan, own: OwnBase, given: BaseRaster) -> tuple[BaseFit, list[Path]]:
-    """Register the own base image to the given picture, and write what follows from it."""
+def _register_to_given(plan: Plan, own: OwnBase, given: BaseRaster) -> tuple[BaseFit, list[Path]]:
+    """Register the own base image to the given image; write the transform and the error map."""
     layout = plan.layout
-    found = register_intersensor(own.image, given.grey, plan.config.base, lens=pinhole(own.image.shape))
-    if isinstance(found, Failure):
-        raise InputError(f"--base {plan.job.inputs.base}: the flight's base image does not fit on it: {found.reason}")
-    record = polyprojective_to_record(found.transform.polyprojective)
+    result = register_intersensor(own.image, given.grey, plan.config.base, lens=pinhole(own.image.shape))
+    if isinstance(result, Failure):
+        name = plan.job.inputs.base
+        raise InputError(f"--base {name}: the flight's own base image could not be registered to it: {result.reason}")
+    record = polyprojective_to_record(result.transform.polyprojective)
     write_atomically(layout.own_to_base, record.model_dump_json(indent=1).encode())
-    write_atomically(layout.base_error_map, png_bytes(_error_picture(found)))
-    written = [layout.own_to_base, layout.base_error_map, *write_given_picture(plan.layout, given)]
+    write_atomically(layout.base_error_map, png_bytes(_draw_error_map(result)))
+    written = [layout.own_to_base, layout.base_error_map, *write_given_image(plan.layout, given)]
     fit = BaseFit(
-        straight=False,
-        error_px=found.cv_error_px,
-        points=len(found.cv_errors_px),
-        scale=found.scale,
-        rotation_rad=found.rotation_rad,
-        covered=covered_share(found.transform, own.valid, given),
+        direct=False,
+        error_px=result.cv_error_px,
+        points=len(result.cv_errors_px),
+        scale=result.scale,
+        rotation_rad=result.rotation_rad,
+        covered=covered_fraction(result.transform, own.valid, given),
     )
     return fit, written
 
 
-def _straight_to(plan: Plan, given: BaseRaster, keypoints: dict[int, Keypoints], lens: Lens) -> BaseFit | None:
-    """How frames lie straight on the given picture, by some that are spread over the flight; none where they do not.
+def register_directly(plan: Plan, given: BaseRaster, keypoints: dict[int, Keypoints], lens: Lens) -> BaseFit | None:
+    """Register sampled frames directly to the given image; None if one of them fails.
 
-    Where they do, nothing stands between a frame and the map. Where they do not (other season, other light), the
-    flight's own base image does, and one smooth map from it to the picture.
+    If all succeed, frames need no intermediate image. If not (another season, other light), they are registered to the
+    flight's own base image, and that once to the given one.
     """
     config = plan.config.registration
     reference = prepare_base(given.grey, config, mask=given.valid, frame_shape=(plan.info.height, plan.info.width))
     store = open_frames(plan.layout.frames)
     frames = sorted(keypoints)
-    tried = [
-        frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, min(_TRIED, len(frames))).round().astype(int))
-    ]
+    samples = np.unique(np.linspace(0, len(frames) - 1, min(_N_DIRECT_TRIALS, len(frames))).round().astype(int))
     fits = []
-    for frame in tried:
-        found = register_frame(store.read(frame), keypoints[frame], reference, lens, config)
-        if found.transform is None or not found.heldout_px <= _DIRECT_HELDOUT_PX or found.spread < _DIRECT_SPREAD:
+    for frame in (frames[k] for k in samples):
+        result = register_frame(store.read(frame), keypoints[frame], reference, lens, config)
+        accurate = result.heldout_px <= _MAX_DIRECT_ERROR_PX and result.spread >= _MIN_DIRECT_COVERAGE
+        if result.transform is None or not accurate:
             return None
-        scale, rotation = found.transform.scale_and_rotation()
+        scale, rotation = result.transform.scale_and_rotation()
         check_scale(scale, given, plan.job.inputs.base or "")
-        covered = covered_share(found.transform, None, given)
-        fits.append(BaseFit(True, found.heldout_px, found.count_kept, scale, rotation, covered))
+        covered = covered_fraction(result.transform, None, given)
+        fits.append(BaseFit(True, result.heldout_px, result.count_kept, scale, rotation, covered))
     return replace(
         fits[len(fits) // 2],
         error_px=float(np.mean([fit.error_px for fit in fits])),
@@ -218,8 +218,8 @@ def _straight_to(plan: Plan, given: BaseRaster, keypoints: dict[int, Keypoints],
     )
 
 
-def write_given_picture(layout: RunLayout, given: BaseRaster) -> list[Path]:
-    """The given picture as the run's base image: GeoTIFF where it has coordinates."""
+def write_given_image(layout: RunLayout, given: BaseRaster) -> list[Path]:
+    """Write the given image as the run's base image: a GeoTIFF if it is georeferenced."""
     for before in (layout.base_image, layout.base_image_tif):
         before.unlink(missing_ok=True)
     if given.crs_wkt is not None and given.affine is not None:
@@ -239,37 +239,37 @@ def _given_grid(plan: Plan, given: BaseRaster, reference: int, fit: BaseFit) -> 
         crs_wkt=given.crs_wkt,
         affine=given.affine,
         how="given",
-        frames_to="given" if fit.straight else "own",
+        frames_to="given" if fit.direct else "own",
         reference_frame=reference,
         intersensor_error_px=fit.error_px,
         intersensor_points=fit.points,
     )
 
 
-def _error_picture(found: IntersensorResult) -> NDArray[np.uint8]:
-    """The error map as grey levels, 50 a pixel of error; white where nothing is known."""
-    levels = np.where(np.isfinite(found.error_map), np.clip(found.error_map * 50, 0, 250), 255)
-    side = max(1, found.error_map_spacing_px // 4)
+def _draw_error_map(result: IntersensorResult) -> GreyImage:
+    """The error map as grey levels, 50 per pixel of error; white where there is no data."""
+    levels = np.where(np.isfinite(result.error_map), np.clip(result.error_map * 50, 0, 250), 255)
+    side = max(1, result.error_map_spacing_px // 4)
     return np.asarray(cv2.resize(levels.astype(np.uint8), None, fx=side, fy=side, interpolation=cv2.INTER_NEAREST))
 
 
 def base_reference(plan: Plan) -> BaseReference:
-    """What frames are registered to; the last one made is kept, for the units of a run all want the same."""
+    """The base image with its features; the last one is cached, because all units of a run use the same."""
     with _REFERENCE_LOCK:
-        wanted = (str(plan.layout.root), plan.keys["base"])
-        if wanted not in _references:
+        key = (str(plan.layout.root), plan.keys["base"])
+        if key not in _references:
             _references.clear()
-            _references[wanted] = _make_reference(plan)
-        return _references[wanted]
+            _references[key] = _make_reference(plan)
+        return _references[key]
 
 
 def _make_reference(plan: Plan) -> BaseReference:
     limit = plan.config.frames.max_pixels
     shape = open_frames(plan.layout.frames).shape
     if read_grid(plan.layout).frames_to == "given":
-        given = _given_picture(plan)
+        given = _read_given_base(plan)
         assert given is not None, "the grid says that a base image was given"
         return prepare_base(given.grey, plan.config.registration, mask=given.valid, frame_shape=shape)
-    with local_copy(plan.layout.own_base_image) as picture, local_copy(plan.layout.own_base_mask) as known:
-        grey, mask = read_grey_image(picture, limit), read_grey_image(known, limit) > 0
+    with local_copy(plan.layout.own_base_image) as image, local_copy(plan.layout.own_base_mask) as valid:
+        grey, mask = read_grey_image(image, limit), read_grey_image(valid, limit) > 0
     return prepare_base(grey, plan.config.registration, mask=mask, frame_shape=shape)

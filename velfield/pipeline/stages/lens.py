@@ -1,8 +1,8 @@
-"""The lens of a flight: frames spread over it, the plumb line, what control points add, ``camera.json``."""
+"""Stage ``lens``: calibration by the plumb line on frames sampled over the flight, refined by frame pairs."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import IntArray
 from schemas.camera import CameraRecord
 from velfield.camera.fusion import refine_lens
 from velfield.camera.lens import lens_from_record, pinhole
@@ -16,18 +16,16 @@ from velfield.run.stores import open_frames
 from velfield.sources.flags import UNUSABLE
 
 
-def spread_usable(plan: Plan, count: int) -> list[int]:
-    """At most ``count`` frames spread evenly over those that nothing is wrong with."""
+def select_usable_frames(plan: Plan, count: int) -> list[int]:
+    """At most ``count`` frames, evenly sampled from those without a fault."""
     flags = open_frames(plan.layout.frames).column("flags")
     usable = np.flatnonzero((flags & int(UNUSABLE)) == 0)
-    chosen: NDArray[np.int64] = np.unique(
-        np.linspace(0, max(len(usable) - 1, 0), min(count, len(usable))).round()
-    ).astype(int)
-    return [int(frame) for frame in usable[chosen]]
+    indices: IntArray = np.unique(np.linspace(0, max(len(usable) - 1, 0), min(count, len(usable))).round()).astype(int)
+    return [int(frame) for frame in usable[indices]]
 
 
 def calibrate_flight(plan: Plan) -> StageResult:
-    """Calibrate, or keep the pin-hole where that is asked for."""
+    """Calibrate the lens and write ``camera.json``; the pinhole model if ``lens.calibrate`` is ``never``."""
     store = open_frames(plan.layout.frames)
     height, width = store.shape
     config = plan.config.lens
@@ -37,14 +35,14 @@ def calibrate_flight(plan: Plan) -> StageResult:
             frame_width_px=width,
             frame_height_px=height,
             accepted=False,
-            reason="lens.calibrate is never: taken for a pin-hole",
+            reason="lens.calibrate is never: pinhole model used",
         )
     else:
-        frames = spread_usable(plan, config.frames)
-        pictures = [store.read(frame) for frame in frames]
-        record = calibrate(pictures, config).to_record()
+        frames = select_usable_frames(plan, config.frames)
+        images = [store.read(frame) for frame in frames]
+        record = calibrate(images, config).to_record()
         if config.refine == "auto":
-            record = refine_lens(record, match_frame_pairs(pictures, lens_from_record(record.lens)))
+            record = refine_lens(record, match_frame_pairs(images, lens_from_record(record.lens)))
     write_atomically(plan.layout.camera, record.model_dump_json(indent=1).encode())
     advance("lens")
     counts = {"corner_px": _corner_shift(record, width, height)}
@@ -55,14 +53,14 @@ def calibrate_flight(plan: Plan) -> StageResult:
 
 def _notes(record: CameraRecord) -> list[str]:
     if not record.accepted:
-        return [f"the lens: {record.reason}"]
+        return [f"lens: {record.reason}"]
     if record.overlap is not None and record.overlap.used:
-        return [f"the lens, refined by control points: {record.overlap.reason}"]
+        return [f"lens refined by frame pairs: {record.overlap.reason}"]
     return []
 
 
 def _corner_shift(record: CameraRecord, width: int, height: int) -> float:
-    """How far the lens moves a corner of the frame, px: what a person can picture of a distortion."""
+    """Largest displacement of a frame corner by the lens, px: an intuitive measure of the distortion."""
     corners = np.array([[0.0, 0.0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]])
-    moved = lens_from_record(record.lens).undistort_points(corners) - corners
-    return float(np.hypot(*moved.T).max())
+    displacement = lens_from_record(record.lens).undistort_points(corners) - corners
+    return float(np.hypot(*displacement.T).max())

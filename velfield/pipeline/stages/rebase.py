@@ -1,8 +1,8 @@
-"""A new base image under a finished run: what is known on the old one is mapped, frames and cars are not looked at.
+"""Transfer of a finished run to a new base image, without processing frames or detecting vehicles again.
 
-The new picture is registered to the old base image, another sensor's picture to another's. Every frame's map is then
-the old one followed by that map, detections and tracklets are mapped by it, and the field is built anew. What this adds
-to the place of everything is that registration's own error, at control points left out of its fit.
+The new image is registered to the old base image (inter-sensor). The transform of every frame is then composed with
+that registration, detections and tracklets are mapped by it, and the field is recomputed. The position error that this
+adds is the cross-validated error of that registration.
 """
 
 from dataclasses import dataclass
@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from schemas.job import Job
 from schemas.records import FlightRecord, GridRecord, InputsRecord, RebaseRecord, WorkingRecord
 from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
@@ -21,7 +21,7 @@ from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
 from velfield.pipeline.result import StageResult
 from velfield.pipeline.stage import STAGES, NewBase
-from velfield.pipeline.stages.base_image import write_given_picture
+from velfield.pipeline.stages.base_image import write_given_image
 from velfield.registration.intersensor import register_intersensor
 from velfield.registration.transforms import PolyprojectiveTransform
 from velfield.run.commits import content_key, digest_path, read_commit, write_atomically
@@ -36,53 +36,53 @@ from velfield.sources.geo import BaseRaster, read_base_raster
 
 @dataclass(frozen=True)
 class Rebase:
-    """What a unit of the new result needs besides its plan: where the old one stands, and the map between them."""
+    """What a unit of the new result needs besides its plan: the old run, and the transform from it."""
 
     old: RunLayout
     record: RebaseRecord
 
 
 def measure_rebase(run: Run, base: Path) -> RebaseRecord | Failure:
-    """Register a new base image to a run's.
+    """Register a new base image to that of a run.
 
     Raises
     ------
     InputError
-        The picture cannot be read.
+        The image cannot be read.
     """
     config = run.record.config
     given = read_base_raster(base, config.frames)
     old = run.base_image
-    found = register_intersensor(old, given.grey, config.base, lens=pinhole(old.shape))
-    if isinstance(found, Failure):
-        return found
+    result = register_intersensor(old, given.grey, config.base, lens=pinhole(old.shape))
+    if isinstance(result, Failure):
+        return result
     return RebaseRecord(
-        transform=polyprojective_to_record(found.transform.polyprojective),
-        added_error_px=found.cv_error_px,
-        added_error_95_px=float(np.percentile(found.cv_errors_px, 95)),
-        points=len(found.cv_errors_px),
-        scale=found.scale,
-        rotation_rad=found.rotation_rad,
+        transform=polyprojective_to_record(result.transform.polyprojective),
+        added_error_px=result.cv_error_px,
+        added_error_95_px=float(np.percentile(result.cv_errors_px, 95)),
+        points=len(result.cv_errors_px),
+        scale=result.scale,
+        rotation_rad=result.rotation_rad,
         old_base=run.record.keys.get("base", ""),
-        gsd_m=given.gsd_m or (run.grid.gsd_m and run.grid.gsd_m / found.scale),
+        gsd_m=given.gsd_m or (run.grid.gsd_m and run.grid.gsd_m / result.scale),
     )
 
 
-def rebased_plan(run: Run, job: Job, record: RebaseRecord) -> Plan:
-    """The plan of the new result, made from the run folder alone: its source need not be there any more."""
-    assert job.inputs.base is not None, "a new base image is what this is about"
+def plan_rebase(run: Run, job: Job, record: RebaseRecord) -> Plan:
+    """The plan of the new result, from the run folder alone: its source may be gone."""
+    assert job.inputs.base is not None, "a rebase needs a new base image"
     digest = digest_path(Path(job.inputs.base))
     inputs = run.record.inputs.model_copy(update={"base": digest})
     return Plan(
         job=job.model_copy(update={"config": job.config.model_copy(update={"gsd_m": record.gsd_m})}),
-        info=_source_of(run),
+        info=_describe_source(run),
         indices=np.arange(run.frames.count),
         inputs=inputs,
-        keys=_rebased_keys(run.record, inputs),
+        keys=_mapped_keys(run.record, inputs),
     )
 
 
-def _source_of(run: Run) -> SourceInfo:
+def _describe_source(run: Run) -> SourceInfo:
     source = run.record.inputs.source
     return SourceInfo(
         kind="video" if source.kind == "video" else "folder",
@@ -94,8 +94,8 @@ def _source_of(run: Run) -> SourceInfo:
     )
 
 
-def _rebased_keys(old: FlightRecord, inputs: InputsRecord) -> dict[str, str]:
-    """Keys of their own for what is mapped; what the new picture does not touch keeps its key."""
+def _mapped_keys(old: FlightRecord, inputs: InputsRecord) -> dict[str, str]:
+    """New keys for the mapped stages; the others keep theirs."""
     keys = dict(old.keys)
     for stage in STAGES:
         if stage.new_base in (NewBase.MAPPED, NewBase.COMPUTED):
@@ -105,17 +105,17 @@ def _rebased_keys(old: FlightRecord, inputs: InputsRecord) -> dict[str, str]:
 
 
 def rebase_image(plan: Plan, rebase: Rebase) -> StageResult:
-    """Write ``base/`` on the new picture's grid."""
+    """Write ``base/`` on the new image's grid."""
     layout, old, record = plan.layout, rebase.old, rebase.record
-    assert plan.job.inputs.base is not None, "a new base image is what this is about"
+    assert plan.job.inputs.base is not None, "a rebase needs a new base image"
     given = read_base_raster(Path(plan.job.inputs.base), plan.config.frames)
-    outputs = write_given_picture(layout, given)
-    grid = _rebased_grid(read_grid(old), given, record)
+    outputs = write_given_image(layout, given)
+    grid = _mapped_grid(read_grid(old), given, record)
     working = read_working(old)
-    moved = WorkingRecord.model_validate(
+    rescaled = WorkingRecord.model_validate(
         working.model_dump() | {"scale": working.scale / record.scale, "has_background": False}
     )
-    for path, model in ((layout.rebased, record), (layout.grid, grid), (layout.working, moved)):
+    for path, model in ((layout.rebased, record), (layout.grid, grid), (layout.working, rescaled)):
         write_atomically(path, model.model_dump_json(indent=1).encode())
         outputs.append(path)
     for name in (old.own_to_base, old.own_base_image, old.own_base_mask):
@@ -132,7 +132,7 @@ def rebase_image(plan: Plan, rebase: Rebase) -> StageResult:
     return StageResult(outputs, counts, [*given.notes, record.text()])
 
 
-def _rebased_grid(old: GridRecord, given: BaseRaster, record: RebaseRecord) -> GridRecord:
+def _mapped_grid(old: GridRecord, given: BaseRaster, record: RebaseRecord) -> GridRecord:
     height, width = given.grey.shape
     before = (old.intersensor_error_px or 0.0) * record.scale
     return GridRecord(
@@ -150,19 +150,19 @@ def _rebased_grid(old: GridRecord, given: BaseRaster, record: RebaseRecord) -> G
 
 
 def rebase_detections(plan: Plan, frames: range, rebase: Rebase) -> StageResult:
-    """Map the cars of a unit; their pictures stay."""
+    """Map the detections of a unit; their image patches are linked."""
     unit = frames.start // plan.unit_frames
     source = plan.layout.unit_file(rebase.old.detections, unit, ".parquet")
     if not source.exists():
-        told = f"frames {frames.start} to {frames.stop - 1} have no cars"
-        return StageResult([], {"frames": 0.0, "cars": 0.0}, warnings=[told])
-    table = mapped_detections(
+        warning = f"frames {frames.start} to {frames.stop - 1} have no detections"
+        return StageResult([], {"frames": 0.0, "cars": 0.0}, warnings=[warning])
+    table = map_detections(
         read_tables([source], DETECTION_COLUMNS), polyprojective_from_record(rebase.record.transform)
     )
     path = plan.layout.unit_file(plan.layout.detections, unit, ".parquet")
     write_table(path, table, DETECTION_COLUMNS)
-    pictures = plan.layout.unit_file(rebase.old.detections, unit, ".patches.npz")
-    linked = link_file(pictures, plan.layout.detections / pictures.name)
+    patches = plan.layout.unit_file(rebase.old.detections, unit, ".patches.npz")
+    linked = link_file(patches, plan.layout.detections / patches.name)
     advance("detections", len(frames))
     return StageResult([path, linked], {"frames": float(table["frame"].nunique()), "cars": float(len(table))})
 
@@ -171,7 +171,7 @@ def rebase_tracks(plan: Plan, rebase: Rebase) -> StageResult:
     """Map all tracklets, unit by unit."""
     transform, written, tracks, count = polyprojective_from_record(rebase.record.transform), [], set[int](), 0
     for source in sorted(rebase.old.tracks.glob("unit-*.parquet")):
-        table = mapped_tracklets(read_tables([source], TRACKLET_COLUMNS), transform)
+        table = map_tracklets(read_tables([source], TRACKLET_COLUMNS), transform)
         written.append(plan.layout.tracks / source.name)
         write_table(written[-1], table, TRACKLET_COLUMNS)
         tracks.update(table["passage_id"].unique().tolist())
@@ -180,33 +180,33 @@ def rebase_tracks(plan: Plan, rebase: Rebase) -> StageResult:
     return StageResult(written, {"tracklets": float(count), "tracks": float(len(tracks))})
 
 
-def mapped_detections(table: pd.DataFrame, transform: PolyprojectiveTransform) -> pd.DataFrame:
-    """Detections, in the columns of the contract, on the other picture: place, axis and area."""
+def map_detections(table: pd.DataFrame, transform: PolyprojectiveTransform) -> pd.DataFrame:
+    """Map a table of detections (`DETECTION_COLUMNS`) to the new base image: position, axis and area."""
     table = table.copy()
     xy = table[["x_px", "y_px"]].to_numpy(np.float64)
     jacobian = transform.jacobian(xy)
     axis = table["orientation_rad"].to_numpy(np.float64)
-    turned = np.einsum("nij,nj->ni", jacobian, np.column_stack([np.cos(axis), np.sin(axis)]))
+    mapped_axis = np.einsum("nij,nj->ni", jacobian, np.column_stack([np.cos(axis), np.sin(axis)]))
     table[["x_px", "y_px"]] = transform(xy)
-    table["orientation_rad"] = np.mod(np.arctan2(turned[:, 1], turned[:, 0]), np.pi)
+    table["orientation_rad"] = np.mod(np.arctan2(mapped_axis[:, 1], mapped_axis[:, 0]), np.pi)
     table["area_px"] = table["area_px"].to_numpy(np.float64) * _area_factor(jacobian)
     return table
 
 
-def mapped_tracklets(table: pd.DataFrame, transform: PolyprojectiveTransform) -> pd.DataFrame:
-    """Tracklets, in the columns of the contract, on the other picture: places, velocities and their errors."""
+def map_tracklets(table: pd.DataFrame, transform: PolyprojectiveTransform) -> pd.DataFrame:
+    """Map a table of tracklets (`TRACKLET_COLUMNS`) to the new base image: positions, velocities, their errors."""
     table = table.copy()
-    places = [table[[f"x_{k}_px", f"y_{k}_px"]].to_numpy(np.float64) for k in range(3)]
+    positions = [table[[f"x_{k}_px", f"y_{k}_px"]].to_numpy(np.float64) for k in range(3)]
     for k, link in enumerate(("01", "12")):
-        jacobian = transform.jacobian((places[k] + places[k + 1]) / 2)
+        jacobian = transform.jacobian((positions[k] + positions[k + 1]) / 2)
         names = [f"v{axis}_{link}_px_per_s" for axis in "xy"]
         table[names] = np.einsum("nij,nj->ni", jacobian, table[names].to_numpy(np.float64))
         name = f"displacement_sd_{link}_px"
         table[name] = table[name].to_numpy(np.float64) * np.sqrt(_area_factor(jacobian))
-    for k, place in enumerate(places):
-        table[[f"x_{k}_px", f"y_{k}_px"]] = transform(place)
+    for k, xy in enumerate(positions):
+        table[[f"x_{k}_px", f"y_{k}_px"]] = transform(xy)
     return table
 
 
-def _area_factor(jacobian: NDArray[np.float64]) -> NDArray[np.float64]:
+def _area_factor(jacobian: FloatArray) -> FloatArray:
     return np.asarray(np.abs(np.linalg.det(jacobian)))

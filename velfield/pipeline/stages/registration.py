@@ -1,10 +1,11 @@
-"""Every frame of a unit to the flight's own base image and to the frame before it, chained in segments."""
+"""Stage ``registration``: every frame of a unit to the base image and to the frame before it, in chains."""
 
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import Mask
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
 from velfield.pipeline.result import StageResult
@@ -25,11 +26,11 @@ from velfield.run.stores import (
 from velfield.sources.flags import UNUSABLE, describe_flags
 
 MAP_PARAMETERS = 65
-"""About how many parameters a frame's map has: its standard error is the residual times sqrt(parameters / points)."""
+"""Approximate number of parameters of a frame's map: its standard error is residual * sqrt(parameters / points)."""
 
 
 def create_registration_store(plan: Plan) -> None:
-    """Create ``registration.zarr`` unless it stands as this plan wants it."""
+    """Create ``registration.zarr`` unless there is one of this plan's key."""
     path = plan.layout.registration
     if store_key(path) == plan.keys["registration"]:
         return
@@ -51,11 +52,11 @@ def register_unit(plan: Plan, frames: range, blocks: Sequence[Sequence[FrameKeyp
     reference, lens, config = base_reference(plan), read_lens(plan.layout), plan.config.registration
     results: dict[int, FrameRegistration] = {}
     for start in range(frames.start, frames.stop, config.chain_length_frames):
-        segment = range(start, min(start + config.chain_length_frames, frames.stop))
-        usable = [frame for frame in segment if not flags[frame] & int(UNUSABLE)]
+        chain = range(start, min(start + config.chain_length_frames, frames.stop))
+        usable = [frame for frame in chain if not flags[frame] & int(UNUSABLE)]
         found = register_chain(_read(store, usable, keypoints), reference, lens, config)
         results.update(zip(usable, found, strict=True))
-        advance("registration", len(segment))
+        advance("registration", len(chain))
     return _write(plan, frames, flags, results)
 
 
@@ -97,8 +98,8 @@ def _write(plan: Plan, frames: range, flags: NDArray[np.uint16], results: dict[i
     return StageResult(store.files(frames.start), counts)
 
 
-def usable_frames(plan: Plan) -> NDArray[np.bool_]:
-    """Frames that are registered and that nothing is wrong with, (frames,)."""
+def usable_frames(plan: Plan) -> Mask:
+    """Frames (frames,) that are registered and have no fault."""
     flags = open_frames(plan.layout.frames).column("flags")
     statuses = open_registration(plan.layout.registration).statuses()
     registered = np.array([status == "ok" for status in statuses], np.bool_)
@@ -106,11 +107,11 @@ def usable_frames(plan: Plan) -> NDArray[np.bool_]:
 
 
 def lost_frames(plan: Plan) -> tuple[str, ...]:
-    """Frames in no tracklet, and why, one line each."""
+    """Frames that are not registered, with the reason, one line each."""
     times_s = open_frames(plan.layout.frames).column("time_s")
     statuses = open_registration(plan.layout.registration).statuses()
     return tuple(
-        f"frame {frame} ({times_s[frame]:.3f} s): {status or 'not worked on'}"
+        f"frame {frame} ({times_s[frame]:.3f} s): {status or 'not processed'}"
         for frame, status in enumerate(statuses)
         if status != "ok"
     )

@@ -1,4 +1,4 @@
-"""A given base image that frames lie straight on is taken, whatever the check of a single frame's patches says."""
+"""A given base image to which frames register directly, whatever the verification of a single frame says."""
 
 from pathlib import Path
 
@@ -19,11 +19,11 @@ from velfield.registration.intersensor import register_intersensor
 from velfield.run.grid import read_grid
 
 SHAPE = (360, 480)
-MIDDLE = np.array([239.5, 179.5])
+CENTRE = np.array([239.5, 179.5])
 
 
-def shaken(grey: np.ndarray) -> np.ndarray:
-    """Rows moved by 4 px, 6 cycles a frame: half a cycle is the height of the patches of the check."""
+def displace_rows(grey: np.ndarray) -> np.ndarray:
+    """Rows displaced by 4 px, 6 cycles per frame: half a cycle is the height of the verification patches."""
     y, x = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]].astype(np.float32)
     wave = (4.0 * np.sin(2 * np.pi * 6.0 * y / SHAPE[0])).astype(np.float32)
     return cv2.remap(grey, x + wave, y + 0.7 * np.roll(wave, 30, axis=0), cv2.INTER_CUBIC)
@@ -35,7 +35,7 @@ def base() -> np.ndarray:
 
 
 def plan_on(base: np.ndarray, frames: list[np.ndarray], folder: Path, gsd_m: float | None = None) -> Plan:
-    """The plan of a flight of these frames, lens and frames done."""
+    """The plan of a flight of these frames, with the stages frames and lens done."""
     (folder / "frames").mkdir()
     for number, frame in enumerate(frames):
         cv2.imwrite(str(folder / "frames" / f"{number}.png"), frame)
@@ -47,52 +47,50 @@ def plan_on(base: np.ndarray, frames: list[np.ndarray], folder: Path, gsd_m: flo
     return plan
 
 
-def seen(base: np.ndarray) -> list[np.ndarray]:
-    """Three frames that look at the middle of the base image, turned a little."""
-    views = [similarity(1.0, 4.0 + k, MIDDLE, np.array([310.0 + 5 * k, 320.0])) for k in range(3)]
-    return [photograph(base, view, pinhole(SHAPE), SHAPE, k) for k, view in enumerate(views)]
+def views(base: np.ndarray) -> list[np.ndarray]:
+    """Three frames of the middle of the base image, rotated by about 5 degrees."""
+    maps = [similarity(1.0, 4.0 + k, CENTRE, np.array([310.0 + 5 * k, 320.0])) for k in range(3)]
+    return [photograph(base, to_base, pinhole(SHAPE), SHAPE, k) for k, to_base in enumerate(maps)]
 
 
-def test_how_the_flight_lies_on_a_given_picture_is_told(base: np.ndarray, tmp_path: Path) -> None:
-    plan = plan_on(base, seen(base), tmp_path, gsd_m=0.2)
+def test_the_note_gives_scale_and_rotation(base: np.ndarray, tmp_path: Path) -> None:
+    plan = plan_on(base, views(base), tmp_path, gsd_m=0.2)
     outcome = build_base(plan, [detect_unit_keypoints(plan, range(3))])
-    assert "straight: a frame pixel is about 1.00 base pixels, turned by about 5 degrees, clockwise" in outcome.notes[0]
+    assert "frames registered directly to the base image: scale 1.00, rotation 5° cw" in outcome.notes[0]
     assert not outcome.warnings
     assert outcome.counts["covered"] == 1.0
     assert outcome.counts["intersensor_error_px"] < 0.5
 
 
-def test_another_scale_is_told_of_gsd_m(base: np.ndarray, tmp_path: Path) -> None:
+def test_another_scale_is_related_to_gsd_m(base: np.ndarray, tmp_path: Path) -> None:
     small = cv2.resize(base, None, fx=0.7, fy=0.7, interpolation=cv2.INTER_AREA)
-    plan = plan_on(small, seen(base), tmp_path, gsd_m=0.2)
+    plan = plan_on(small, views(base), tmp_path, gsd_m=0.2)
     outcome = build_base(plan, [detect_unit_keypoints(plan, range(3))])
-    assert "--gsd-m 0.2 is of the base pixels, so that a frame pixel is 0.14 m" in outcome.notes[0]
+    assert "--gsd-m 0.2 is the ground sample distance of the base image" in outcome.notes[0]
+    assert outcome.notes[0].endswith("that of the frames is 0.14 m")
     assert not outcome.warnings
 
 
-def test_a_picture_much_coarser_than_the_frames_is_refused_with_the_size_that_serves(
-    base: np.ndarray, tmp_path: Path
-) -> None:
+def test_a_base_image_of_low_resolution_is_rejected_with_the_size_needed(base: np.ndarray, tmp_path: Path) -> None:
     small = cv2.resize(base, None, fx=0.35, fy=0.35, interpolation=cv2.INTER_AREA)
-    plan = plan_on(small, seen(base), tmp_path)
+    plan = plan_on(small, views(base), tmp_path)
     with pytest.raises(
-        InputError, match=r"found 0\.35 base pixels a frame pixel, expected 0\.5 to 2; .* (639|640|641) x"
+        InputError, match=r"found 0\.35 base pixels per frame pixel, expected 0\.5 to 2; .* (639|640|641) x"
     ):
         build_base(plan, [detect_unit_keypoints(plan, range(3))])
 
 
-def test_a_picture_of_a_part_of_the_flight_warns_how_much_it_shows(base: np.ndarray, tmp_path: Path) -> None:
+def test_a_base_image_of_a_part_of_the_flight_warns_with_its_coverage(base: np.ndarray, tmp_path: Path) -> None:
     part = np.ascontiguousarray(base[:, :420])
-    plan = plan_on(part, seen(base), tmp_path)
+    plan = plan_on(part, views(base), tmp_path)
     warnings = build_base(plan, [detect_unit_keypoints(plan, range(3))]).warnings
-    # Frames are 480 px wide about column 315: from 75 on, so that 345 of 480 columns are on the picture.
-    (share,) = (int(word[:-1]) for line in warnings for word in line.split() if word.endswith("%"))
-    assert 66 <= share <= 78
+    # Frames are 480 px wide about column 315: from column 75 on, so 345 of 480 columns are covered.
+    (percent,) = (int(word[:-1]) for line in warnings for word in line.split() if word.endswith("%"))
+    assert 66 <= percent <= 78
 
 
-def test_frames_whose_rows_wobble_lie_straight_on_their_base_image(base: np.ndarray, tmp_path: Path) -> None:
-    views = [similarity(1.0, 4.0 + k, MIDDLE, np.array([310.0 + 5 * k, 320.0])) for k in range(3)]
-    frames = [shaken(photograph(base, view, pinhole(SHAPE), SHAPE, k)) for k, view in enumerate(views)]
+def test_frames_with_a_rolling_shutter_register_directly(base: np.ndarray, tmp_path: Path) -> None:
+    frames = [displace_rows(frame) for frame in views(base)]
     plan = plan_on(base, frames, tmp_path)
     build_base(plan, [detect_unit_keypoints(plan, range(3))])
     assert read_grid(plan.layout).frames_to == "given"
