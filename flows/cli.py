@@ -300,10 +300,10 @@ def _process(
     verbosity: "Verbosity" = "normal",
 ) -> int:
     from flows.launch import first_start, prepare_process
-    from flows.stopping import stop_when_told
+    from flows.stopping import stop_on_signals
     from velfield.pipeline.plan import check_inputs
 
-    stop_when_told()
+    stop_on_signals()
     check_inputs(job)  # before Prefect: its start takes seconds
     prepare_process(verbose=verbosity == "verbose")
     from flows.console import Console

@@ -12,7 +12,7 @@ from typing import Literal
 from rich.console import Console as RichConsole
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from velfield.pipeline.progress import listening
+from velfield.pipeline.progress import subscribe
 
 Verbosity = Literal["quiet", "normal", "verbose", "json"]
 
@@ -83,5 +83,5 @@ class Console:
         hidden = not self._rich.is_terminal  # in a log a bar would leave empty lines
         with Progress(*columns, console=self._rich, transient=True, refresh_per_second=5, disable=hidden) as bar:
             progress = StageProgress(total, bar, bar.add_task(label, total=total), name)
-            with listening(progress.hear):
+            with subscribe(progress.hear):
                 yield progress

@@ -12,7 +12,7 @@ from flows.reprocess import run_reprocess
 from flows.runners import RunnerConfig, read_runner
 from velfield.errors import InputError
 from velfield.pipeline.configuration import resolve_config
-from velfield.pipeline.watch import inputs_of, newest_picture, picture_named, run_folders, run_name
+from velfield.pipeline.watch import find_image, inputs_of, newest_image, run_folders, run_name
 from velfield.run.layout import RunLayout
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def reprocess_runs(runs: str, base_images: str, base: str = "", run: str = "", c
     """
     prepare_process(verbose=False)
     logger = get_run_logger()
-    picture = picture_named(Path(base_images), base) if base else newest_picture(Path(base_images))
+    picture = find_image(Path(base_images), base) if base else newest_image(Path(base_images))
     if picture is None:
         logger.info("no base image has arrived in %s", base_images)
         return []

@@ -23,7 +23,7 @@ from flows.console import say
 from flows.launch import PAGES, PAGES_OF
 from flows.stopping import as_ctrl_c, end_children, end_children_when_killed
 from velfield.errors import InputError
-from velfield.pipeline.watch import Watch
+from velfield.pipeline.watch import FolderWatcher
 
 if TYPE_CHECKING:
     from prefect.deployments.runner import RunnerDeployment
@@ -227,14 +227,14 @@ def watching(config: ServeConfig) -> Iterator[None]:
         _resource = {"prefect.resource.id": f"velfield.base-image.{path.name}"}
         emit_event(BASE_IMAGE_ARRIVED, resource=_resource, payload={"base": path.name, "run": ""})
 
-    flights = Watch(config.incoming, config.settle_s, flight, old_too=False)
-    images = Watch(config.base_images, config.settle_s, base_image, old_too=False)
+    flights = FolderWatcher(config.incoming, config.settle_s, flight, include_existing=False)
+    images = FolderWatcher(config.base_images, config.settle_s, base_image, include_existing=False)
     ended = threading.Event()
 
     def look() -> None:
         while not ended.wait(_LOOK_EVERY_S):
             for watch in (flights, images):
-                watch.look(time.monotonic())
+                watch.poll(time.monotonic())
 
     thread = threading.Thread(target=look, name="watched folders", daemon=True)
     thread.start()

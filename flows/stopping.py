@@ -34,7 +34,7 @@ _WATCH = """if True:
 """
 
 
-def stop_when_told() -> None:
+def stop_on_signals() -> None:
     """From now on SIGTERM is as Ctrl-C, and neither waits for the work under way, which the same command resumes.
 
     Call in the main thread.

@@ -21,10 +21,10 @@ from tests.small_flight import digests, job, process
 _RUN = """if True:
     import sys
     from flows.launch import limit_threads, prepare_process
-    from flows.stopping import STOPPED, leave, stop_when_told
+    from flows.stopping import STOPPED, leave, stop_on_signals
     limit_threads()
     prepare_process(verbose=False)
-    stop_when_told()
+    stop_on_signals()
     from pathlib import Path
     from tests.small_flight import job, process
     try:

@@ -9,7 +9,7 @@ from velfield.detection.cnn.fine_tuning import evaluate_network, make_record, se
 from velfield.detection.cnn.model import Network
 from velfield.detection.evaluation import Evidence, joined
 from velfield.detection.samples import LabelledImage
-from velfield.parallel import each
+from velfield.parallel import parallel_map
 
 _EXTRA_WEIGHT = 2.0
 """Sampling weight of the extra images, where that of a site is 1."""
@@ -43,7 +43,7 @@ def train_leave_one_site_out(
         network = _train(others, extra, seed + 1 + held_out, round(_FOLD_STEPS_FRACTION * steps))
         return network, joined([evaluate_network(network, sample) for sample in sites[held_out].evaluation])
 
-    (network, _), *folds = each(train_fold, [None, *range(len(sites))])
+    (network, _), *folds = parallel_map(train_fold, [None, *range(len(sites))])
     by_site = {
         site.name: evaluation for site, (_, evaluation) in zip(sites, folds, strict=True) if evaluation is not None
     }

@@ -23,7 +23,7 @@ from velfield.detection.evaluation import Evidence, joined
 from velfield.detection.orientation import with_axes
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
-from velfield.parallel import each
+from velfield.parallel import parallel_map
 from velfield.sources.labels.yolo import car_in_upright_box, length_from_upright_box
 
 ATTRIBUTION = (
@@ -135,7 +135,7 @@ def _simulate_sensor(sample: LabelledImage, gamma: float, blur_px: float, noise_
 def make_shipped_long_vehicles(data: Path, out: Path) -> str:
     """Train and write the classifier of long vehicles; returns a line about it."""
     simulate = partial(simulated_image, size=_LORRY_SCENE_SIZE)
-    scenes = each(partial(simulate, large_share=_LARGE_VEHICLE_FRACTION), LORRY_SEEDS)
+    scenes = parallel_map(partial(simulate, large_share=_LARGE_VEHICLE_FRACTION), LORRY_SEEDS)
     samples = [
         sample if k % 3 == 0 else _simulate_sensor(sample, *_SENSORS[k % 3 - 1]) for k, sample in enumerate(scenes)
     ]
@@ -145,7 +145,7 @@ def make_shipped_long_vehicles(data: Path, out: Path) -> str:
             replace(sample, cars=with_axes(sample.image, sample.cars, sample.tilts))
             for sample in [*site.evaluation, *augmented]
         ]
-    held_out = each(simulate, LORRY_SEEDS_HELD_OUT)
+    held_out = parallel_map(simulate, LORRY_SEEDS_HELD_OUT)
     record = train_long_vehicles(samples, held_out, CONFIG, ATTRIBUTION)
     out.write_text(record.model_dump_json())
     return f"long vehicles: {len(record.rounds)} rounds, threshold {record.threshold:.3f}"
@@ -153,7 +153,7 @@ def make_shipped_long_vehicles(data: Path, out: Path) -> str:
 
 def make_shipped_detector(data: Path, out: Path, steps: int = STEPS) -> list[str]:
     """Train and write the detector; returns lines with the accuracy on each held-out site."""
-    sites, simulated = read_sites(data), each(simulated_image, SIMULATED_SEEDS)
+    sites, simulated = read_sites(data), parallel_map(simulated_image, SIMULATED_SEEDS)
     detector, by_site = train_leave_one_site_out(sites, simulated, seed=SEED, steps=steps)
     CnnDetector(detector.record.model_copy(update={"attribution": ATTRIBUTION})).save(out)
     evaluations = {**by_site, "all": joined(list(by_site.values()))}

@@ -17,7 +17,7 @@ from velfield.detection.cascade.long_vehicles import LEAST_LENGTH, LONG, OFFSETS
 from velfield.detection.cascade.scenes import Poses, varied
 from velfield.detection.cascade.training import CONTRAST_FLOOR
 from velfield.detection.samples import LabelledImage
-from velfield.parallel import each
+from velfield.parallel import parallel_map
 
 ROUNDS = 800
 _MINING_ROUNDS = (80, 160)
@@ -91,7 +91,7 @@ def train_long_vehicles(
             )
             for scene in scenes
         ]
-        mined = each(partial(_mine_hard_negatives, sums=sums_of(boosted)), detections)
+        mined = parallel_map(partial(_mine_hard_negatives, sums=sums_of(boosted)), detections)
         hard = [varied(poses, rng) for poses in mined]
         negatives = np.hstack([negatives, bank.samples(zip(images, hard, strict=True))])
     boosted = _boost(bank, positives, negatives, ROUNDS, rng)

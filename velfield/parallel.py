@@ -1,4 +1,4 @@
-"""Threads for what one unit of work does to several pictures, where no graph runs it in parallel already."""
+"""Threads for the work of one unit on several images, where no graph runs it in parallel already."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -9,15 +9,15 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-def each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
-    """``function`` of every item, in their order; as many at once as this process may use processors.
+def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """Apply ``function`` to every item on a pool of threads, one a processor; results in the order of the items.
 
-    Worth it where ``function`` spends its time in kernels that let go of Python's lock.
+    Worth it where ``function`` spends its time in kernels that release the GIL.
     """
     with ThreadPoolExecutor(usable_processors()) as pool:
         return list(pool.map(function, items))
 
 
 def usable_processors() -> int:
-    """How many processors this process may use: fewer than there are, in a container or under a batch system."""
+    """Number of processors that this process may use: in a container or a batch system fewer than there are."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -26,7 +26,7 @@ def init(
     """
     from schemas.flight import FramesConfig
     from velfield.errors import InputError
-    from velfield.pipeline.config_template import found_lines, starting_config
+    from velfield.pipeline.config_template import config_template, describe_source
     from velfield.pipeline.configuration import resolve_config
     from velfield.run.commits import write_atomically
     from velfield.sources.source import probe
@@ -34,7 +34,7 @@ def init(
     if out.exists():
         raise InputError(f"{out} is there already; name another file with --out, or move it away")
     info = probe(source, frames=FramesConfig(fps=fps), timestamps=timestamps)
-    write_atomically(out, starting_config(str(source), info).encode())
-    print("\n".join(found_lines(info, resolve_config())))
+    write_atomically(out, config_template(str(source), info).encode())
+    print("\n".join(describe_source(info, resolve_config())))
     print(f"{out}: try  velfield run {source} --config {out} --gsd-m METRES_A_PIXEL --out RUN")
     return 0

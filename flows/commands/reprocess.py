@@ -45,9 +45,9 @@ def reprocess(
         Warnings only.
     """
     from flows.launch import prepare_process
-    from flows.stopping import stop_when_told
+    from flows.stopping import stop_on_signals
 
-    stop_when_told()
+    stop_on_signals()
     prepare_process(verbose=False)
     from flows.console import Console
     from flows.reprocess import run_reprocess

@@ -26,7 +26,7 @@ from flows.serve import ServeConfig, check, deployments, settings
 from schemas.summary import RunSummary
 from tests.browser import browser
 from velfield.errors import InputError
-from velfield.pipeline.watch import Watch, inputs_of, newest_picture, picture_named, run_folders, run_name
+from velfield.pipeline.watch import FolderWatcher, find_image, inputs_of, newest_image, run_folders, run_name
 
 ROOT = Path(__file__).resolve().parents[2]
 AUTH = "somebody:secret"
@@ -75,15 +75,15 @@ def test_no_analytics_and_no_other_origin() -> None:
 def test_what_arrives_is_told_once_when_it_no_longer_grows(tmp_path: Path) -> None:
     (tmp_path / "old.mp4").write_bytes(b"1")
     told: list[str] = []
-    watch = Watch(tmp_path, 5.0, lambda path: told.append(path.name), old_too=False)
+    watch = FolderWatcher(tmp_path, 5.0, lambda path: told.append(path.name), include_existing=False)
     (tmp_path / "new.mp4").write_bytes(b"1")
-    watch.look(0.0)
+    watch.poll(0.0)
     (tmp_path / "new.mp4").write_bytes(b"12")
-    watch.look(6.0)
-    watch.look(10.0)
+    watch.poll(6.0)
+    watch.poll(10.0)
     assert told == []
-    watch.look(11.0)
-    watch.look(99.0)
+    watch.poll(11.0)
+    watch.poll(99.0)
     assert told == ["new.mp4"]
 
 
@@ -106,7 +106,7 @@ def test_base_images_are_taken_from_their_folder_alone(tmp_path: Path, name: str
     (tmp_path / "secret.png").touch()
     (folder / "link.png").symlink_to(tmp_path / "secret.png")
     with pytest.raises(InputError, match="base-images"):
-        picture_named(folder, name)
+        find_image(folder, name)
 
 
 def test_runs_are_taken_from_their_folder_alone(tmp_path: Path) -> None:
@@ -116,7 +116,7 @@ def test_runs_are_taken_from_their_folder_alone(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is not in"):
         run_folders(tmp_path / "runs", "../run")
     assert run_folders(tmp_path / "runs") == []
-    assert newest_picture(tmp_path / "runs") is None
+    assert newest_image(tmp_path / "runs") is None
 
 
 # -------------------------------------------------------------------------------------------------- prefect.yaml

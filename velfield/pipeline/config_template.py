@@ -19,7 +19,7 @@ _GSD = (
 )
 
 
-def starting_config(source: str, info: SourceInfo) -> str:
+def config_template(source: str, info: SourceInfo) -> str:
     """YAML text that is the default configuration: each key stands in it, commented out, under what it means.
 
     Parameters
@@ -35,7 +35,7 @@ def starting_config(source: str, info: SourceInfo) -> str:
         "# To set one, take its `#` away: its section stands above it.",
         f"# Use it:  velfield run {source} --out RUN --config flight.yaml",
         "#",
-        *(f"# {line}" for line in found_lines(info, config)),
+        *(f"# {line}" for line in describe_source(info, config)),
         "",
         f"preset: {config.preset}  # one of: {', '.join(PRESETS)}",
         "",
@@ -47,7 +47,7 @@ def starting_config(source: str, info: SourceInfo) -> str:
     return "\n".join(lines) + "\n"
 
 
-def found_lines(info: SourceInfo, config: FlightConfig) -> list[str]:
+def describe_source(info: SourceInfo, config: FlightConfig) -> list[str]:
     """What the source is, a line each."""
     lines = [f"Found: {info.kind}, {info.frame_count} frames of {info.width} x {info.height} px."]
     if len(info.times_s) > 1:

@@ -1,6 +1,6 @@
-"""Progress of long work: kernels' callers say how far they are, whoever listens in the same process shows it.
+"""Progress within a unit: stages publish their steps, subscribers in the same process show them.
 
-On a worker of a cluster nobody listens, and saying so costs nothing; there progress is seen unit by unit.
+On a worker of a cluster there is no subscriber, and publishing costs nothing; there progress is shown unit by unit.
 """
 
 from collections.abc import Callable, Iterator
@@ -12,21 +12,21 @@ _listeners: list[Listener] = []
 
 
 def advance(stage: str, steps: int = 1) -> None:
-    """Say that ``steps`` more steps (frames, mostly) of ``stage`` are done."""
+    """Publish that ``steps`` more steps (frames, mostly) of ``stage`` are done."""
     for listener in tuple(_listeners):
         listener(stage, steps)
 
 
 @contextmanager
-def listening(listener: Listener) -> Iterator[None]:
-    """Hear of all progress made in this process within the context.
+def subscribe(listener: Listener) -> Iterator[None]:
+    """Call ``listener`` with all progress of this process within the context.
 
     Examples
     --------
-    >>> heard = []
-    >>> with listening(lambda stage, steps: heard.append((stage, steps))):
+    >>> received = []
+    >>> with listening(lambda stage, steps: received.append((stage, steps))):
     ...     advance("detections", 8)
-    >>> heard
+    >>> received
     [('detections', 8)]
     """
     _listeners.append(listener)

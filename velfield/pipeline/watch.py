@@ -1,7 +1,7 @@
-"""What arrives in watched folders: flights and base images, told to be whole when they no longer grow.
+"""Watched folders: flights and base images that arrive, complete when they no longer change.
 
-A flight is a video, a folder of pictures, or a folder that holds ``frames/`` or one video and, beside it, whatever else
-`velfield run` can be given, by name: ``base.*``, ``labels.csv`` or ``labels/``, ``timestamps.csv``, ``detector.json``,
+A flight is a video, a folder of images, or a folder that holds ``frames/`` or one video and, beside it, the optional
+inputs of `velfield run`, by name: ``base.*``, ``labels.csv`` or ``labels/``, ``timestamps.csv``, ``detector.json``,
 ``flight.yaml``. That is also what `velfield simulate` writes.
 """
 
@@ -13,7 +13,7 @@ from schemas.job import Inputs
 from velfield.errors import InputError
 
 VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".ts", ".m4v", ".mpg", ".webm"})
-PICTURES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"})
+IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"})
 
 
 def run_name(drop: Path) -> str:
@@ -32,12 +32,12 @@ def run_name(drop: Path) -> str:
 
 
 def inputs_of(drop: Path) -> tuple[Inputs, Path | None]:
-    """What `velfield run` would be given for a flight, and its configuration file.
+    """The inputs of `velfield run` for a flight, and its configuration file.
 
     Raises
     ------
     InputError
-        It is neither a video nor a folder of pictures.
+        It is neither a video nor a folder of images.
     """
     if drop.is_file():
         return Inputs(source=str(drop)), None
@@ -47,7 +47,7 @@ def inputs_of(drop: Path) -> tuple[Inputs, Path | None]:
     if source == drop:
         return Inputs(source=str(drop)), None
     beside = {
-        "base": _first(path for path in sorted(drop.glob("base.*")) if path.suffix.lower() in PICTURES),
+        "base": _first(path for path in sorted(drop.glob("base.*")) if path.suffix.lower() in IMAGES),
         "labels": _first(path for path in (drop / "labels.csv", drop / "labels") if path.exists()),
         "timestamps": _first(path for path in (drop / "timestamps.csv",) if path.exists()),
         "detector": _first(path for path in (drop / "detector.json",) if path.exists()),
@@ -86,8 +86,8 @@ def run_folders(runs: Path, name: str = "") -> list[Path]:
     return sorted(path.parent for path in runs.glob("*/flight.json") if (path.parent / "index.html").exists())
 
 
-def picture_named(folder: Path, name: str) -> Path:
-    """A picture that arrived in a folder, by its name.
+def find_image(folder: Path, name: str) -> Path:
+    """The path of an image that arrived in a folder, by its name.
 
     Raises
     ------
@@ -100,9 +100,9 @@ def picture_named(folder: Path, name: str) -> Path:
     return path
 
 
-def newest_picture(folder: Path) -> Path | None:
-    """The picture that arrived last; none where there is none."""
-    found = [path for path in folder.glob("*") if path.is_file() and path.suffix.lower() in PICTURES]
+def newest_image(folder: Path) -> Path | None:
+    """The image that arrived last; none where there is none."""
+    found = [path for path in folder.glob("*") if path.is_file() and path.suffix.lower() in IMAGES]
     return max(found, key=lambda path: (path.stat().st_mtime, path.name), default=None)
 
 
@@ -114,26 +114,28 @@ def _inside(folder: Path, name: str) -> Path:
     return path
 
 
-class Watch:
-    """Tells of each entry of a folder once, when it has not changed for a while."""
+class FolderWatcher:
+    """Calls back once for each entry of a folder, when it has not changed for a while."""
 
-    def __init__(self, folder: Path, settle_s: float, tell: Callable[[Path], None], *, old_too: bool) -> None:
-        self._folder, self._settle_s, self._tell = folder, settle_s, tell
-        self._told = set() if old_too else set(self._entries())
+    def __init__(
+        self, folder: Path, settle_s: float, callback: Callable[[Path], None], *, include_existing: bool
+    ) -> None:
+        self._folder, self._settle_s, self._callback = folder, settle_s, callback
+        self._done = set() if include_existing else set(self._entries())
         self._seen: dict[Path, tuple[tuple[int, int, int], float]] = {}
 
-    def look(self, now_s: float) -> None:
-        """Look once; ``now_s`` is any clock that goes on."""
+    def poll(self, now_s: float) -> None:
+        """Check the folder once; ``now_s`` is any monotonic clock."""
         for path in self._entries():
-            if path in self._told:
+            if path in self._done:
                 continue
             state = _state(path)
             before, since_s = self._seen.get(path, (None, now_s))
             if state != before:
                 self._seen[path] = (state, now_s)
             elif now_s - since_s >= self._settle_s:
-                self._told.add(path)
-                self._tell(path)
+                self._done.add(path)
+                self._callback(path)
 
     def _entries(self) -> list[Path]:
         return sorted(path for path in self._folder.iterdir() if not path.name.startswith("."))

@@ -24,7 +24,7 @@ from velfield.detection.evaluation import (
     stripes,
 )
 from velfield.detection.samples import LabelledImage, distance, lies_in
-from velfield.parallel import each
+from velfield.parallel import parallel_map
 
 _FOLD_SCENES = 3
 """Images that the folds are evaluated on, spread over those that there are."""
@@ -98,7 +98,7 @@ def trained(
         places = propose(scene.coarse, shape, valid, sums, contrast_floor=CONTRAST_FLOOR)
         return replace(scene, places=places[:, :3])
 
-    classifier, aligned = learn_classifier(each(looked_at, scenes), config, channels, rng)
+    classifier, aligned = learn_classifier(parallel_map(looked_at, scenes), config, channels, rng)
     if prior:
         classifier = committee_of([classifier, *[prior] * _EARLIER_SAYS])
     return Steps(proposer, classifier, aligned)
@@ -133,7 +133,7 @@ def _folds(
             for k in tried
         ]
 
-    found = each(of_fold, range(folds))
+    found = parallel_map(of_fold, range(folds))
     evidence = _joined([part for _, parts in found for part in parts])
     left = 1 - _OF_ITS_OWN * (1 - 1 / members)
     said = np.where(evidence.score > 0, left * evidence.score, evidence.score)

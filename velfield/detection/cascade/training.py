@@ -15,7 +15,7 @@ from velfield.detection.cascade.feature_image import COARSE, FINE, Grain
 from velfield.detection.cascade.feature_matrix import Bank, bank_of
 from velfield.detection.cascade.proposals import propose
 from velfield.detection.cascade.scenes import Poses, Scene, is_far, is_wrong, other_poses, varied
-from velfield.parallel import each
+from velfield.parallel import parallel_map
 
 CONTRAST_FLOOR = 12.0
 """Grey levels a px added to the mean gradient, by which sums are divided: what is flat is not blown up."""
@@ -58,7 +58,7 @@ def learn_proposer(
     most = _MINED // len(scenes)
     for _ in range(2):
         sums = sums_of(_boosted(bank, known_cars, known_others, COARSE_ROUNDS, rng))
-        mined = [varied(wrong, rng) for wrong in each(partial(_wrongly_proposed, sums=sums, most=most), scenes)]
+        mined = [varied(wrong, rng) for wrong in parallel_map(partial(_wrongly_proposed, sums=sums, most=most), scenes)]
         known_others = np.hstack([known_others, bank.samples(zip((s.coarse for s in scenes), mined, strict=True))])
     return _boosted(bank, known_cars, known_others, COARSE_ROUNDS, rng)
 
@@ -80,8 +80,8 @@ def learn_classifier(
     for rounds in _FINE_STAGES:
         known_cars = bank.samples(zip((scene.fine for scene in scenes), cars, strict=True))
         sums = sums_of(_boosted(bank, known_cars, known_others, rounds, rng))
-        scenes = tuple(each(partial(_realigned, sums=sums), scenes))
-        mined = [varied(wrong, rng) for wrong in each(partial(_wrongly_found, sums=sums, most=most), scenes)]
+        scenes = tuple(parallel_map(partial(_realigned, sums=sums), scenes))
+        mined = [varied(wrong, rng) for wrong in parallel_map(partial(_wrongly_found, sums=sums, most=most), scenes)]
         known_others = np.hstack([known_others, bank.samples(zip((s.fine for s in scenes), mined, strict=True))])
         cars = [_fine_cars(scene, _copies(scenes), rng) for scene in scenes]
     known_cars = bank.samples(zip((scene.fine for scene in scenes), cars, strict=True))

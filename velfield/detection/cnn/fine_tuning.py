@@ -30,7 +30,7 @@ from velfield.detection.evaluation import (
 )
 from velfield.detection.orientation import with_axes
 from velfield.detection.samples import LabelledImage, lies_in, within
-from velfield.parallel import each
+from velfield.parallel import parallel_map
 
 if TYPE_CHECKING:
     from velfield.detection.cnn.detector import CnnDetector
@@ -70,11 +70,13 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: "CnnDetector", confi
         The pre-trained detector is for cars of another size.
     """
     pretrained.check_car_length(config.working_car_length_px)
-    masked = each(lambda sample: _mask_unlabelled_positives(sample, pretrained.network), samples)
+    masked = parallel_map(lambda sample: _mask_unlabelled_positives(sample, pretrained.network), samples)
     count = sum(len(sample.cars) for sample in samples)
     folds = _FOLDS if count >= FOLD_MIN_CARS else 0
     tasks: list[int | None] = [None, *range(folds)]
-    (network, _), *held_out = each(lambda fold: _fine_tune_fold(masked, pretrained.network, config, fold), tasks)
+    (network, _), *held_out = parallel_map(
+        lambda fold: _fine_tune_fold(masked, pretrained.network, config, fold), tasks
+    )
     evidence = joined([part for _, parts in held_out for part in parts]) if held_out else None
     threshold, curve = select_threshold(evidence, pretrained.threshold, FOLDS_DESCRIPTION)
     if curve is not None:
@@ -91,7 +93,7 @@ def fine_tune_interpolated(
 ) -> Network:
     """Fine-tune, then interpolate between the weights before (0) and after (1): WiSE-FT (Wortsman et al. 2022)."""
     before = pretrained.network
-    masked = each(lambda sample: _mask_unlabelled_positives(sample, before), samples)
+    masked = parallel_map(lambda sample: _mask_unlabelled_positives(sample, before), samples)
     after, _ = _fine_tune_fold(masked, before, config, None)
 
     def interpolate(old: Float32Array, new: Float32Array) -> Float32Array:

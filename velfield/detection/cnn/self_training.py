@@ -21,7 +21,7 @@ from velfield.detection.evaluation import nearly_best, thinned_curve
 from velfield.detection.motion.difference import MotionFrame
 from velfield.detection.motion.evaluation import Detections, MotionState, classify_bursts
 from velfield.detection.samples import LabelledImage
-from velfield.parallel import each
+from velfield.parallel import parallel_map
 
 if TYPE_CHECKING:
     from velfield.detection.cnn.detector import CnnDetector
@@ -82,7 +82,7 @@ def self_train_from_motion(
         difference = background_difference_at(frame.image, background, cars.xy, length_px)
         return Detections(cars.xy, cars.orientation_rad, cars.score, frame.time_s), difference
 
-    detections, differences = zip(*each(detect, bursts), strict=True)
+    detections, differences = zip(*parallel_map(detect, bursts), strict=True)
     middles, states = classify_bursts(detections, car_length_px=length_px, max_interval_s=max_interval_s)
     if not middles:
         return None

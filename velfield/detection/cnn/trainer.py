@@ -31,7 +31,7 @@ from velfield.detection.cnn.model import (
     Residual,
     SpaceToDepth,
 )
-from velfield.parallel import each
+from velfield.parallel import parallel_map
 
 _STATISTICS_MOMENTUM, _MIN_VARIANCE = 0.05, 1e-5
 _PRIOR_LOGIT = -4.0
@@ -177,7 +177,7 @@ class Trainer:
         normaliser = LossNormaliser.of(batch)
         if self.is_normalised or len(batch.images) < 2:
             return self._loss_and_gradients(batch, normaliser)
-        (first, of_first), (second, of_second) = each(
+        (first, of_first), (second, of_second) = parallel_map(
             lambda half: self._loss_and_gradients(half, normaliser), batch.halves()
         )
         return first + second, {name: gradient + of_second[name] for name, gradient in of_first.items()}

@@ -22,7 +22,7 @@ from velfield.detection.evaluation import nearly_best
 from velfield.detection.motion.boxes import MAX_AXIS_OFFSET_RAD
 from velfield.detection.motion.difference import MotionFrame
 from velfield.detection.motion.links import MAX_LENGTHS_PER_S
-from velfield.parallel import each
+from velfield.parallel import parallel_map
 
 MIN_SCORE = -0.3
 """Detections below this are noise whatever the detector."""
@@ -237,7 +237,7 @@ def evaluate_detector(
         return Detections(cars.xy, cars.orientation_rad, np.asarray(cars.score, np.float64), frame.time_s)
 
     length = detector.record.working_car_length_px
-    return evaluate_by_motion(each(detect, frames), car_length_px=length, max_interval_s=max_interval_s)
+    return evaluate_by_motion(parallel_map(detect, frames), car_length_px=length, max_interval_s=max_interval_s)
 
 
 def _reachable(
