@@ -1,5 +1,5 @@
-"""What the Prefect UI shows of a run besides its graph: a summary with the two maps, a table of stages, the report's
-address, and how far a long stage is."""
+"""Artifacts in the Prefect UI: a summary with the two maps, a table of stages, a link to the report, the progress of
+long stages."""
 
 import base64
 import os
@@ -23,12 +23,12 @@ from velfield.run.layout import RunLayout
 from velfield.run.paths import is_remote
 from velfield.run.results import final_root
 
-_PICTURE_BYTES = 600_000
-"""A markdown artifact of about this size was seen to show; a larger picture is left to the report."""
+_MAX_IMAGE_BYTES = 600_000
+"""A markdown artifact of about this size is displayed; larger images are left to the report."""
 
 
 _LONG_S, _EVERY_S = 20.0, 5.0
-"""A stage that takes longer than the one has its progress shown, as often as the other."""
+"""A stage that takes longer than the first has its progress shown, updated as often as the second."""
 
 
 def publish_summary(plan: Plan, summary: RunSummary) -> None:
@@ -39,11 +39,11 @@ def publish_summary(plan: Plan, summary: RunSummary) -> None:
     lines += [f"- **{stage.name}**: {stage.text} ({stage.seconds:.1f} s)" for stage in summary.stages]
     lines += ["", f"{len(summary.frames_lost)} frames lost.", ""]
     for name in ("direction", "speed"):
-        picture = plan.layout.maps / f"{name}_preview.png"
-        if picture.exists() and picture.stat().st_size <= _PICTURE_BYTES:
-            data = base64.b64encode(picture.read_bytes()).decode()
+        image = plan.layout.maps / f"{name}_preview.png"
+        if image.exists() and image.stat().st_size <= _MAX_IMAGE_BYTES:
+            data = base64.b64encode(image.read_bytes()).decode()
             lines += [f"## {name.capitalize()}", f"![modal {name}](data:image/png;base64,{data})", ""]
-    create_markdown_artifact(key="summary", markdown="\n".join(lines), description="What was done, and the maps")
+    create_markdown_artifact(key="summary", markdown="\n".join(lines), description="Summary and maps")
     if not is_remote(plan.layout.root):
         create_link_artifact(
             key="report", link=_address(report), link_text="report", description="The run's own page: map and report"
@@ -65,7 +65,7 @@ def publish_summary(plan: Plan, summary: RunSummary) -> None:
 
 
 def _address(report: Path) -> str:
-    """The page as `velfield serve` shows it; else the file, which browsers open only when asked by hand."""
+    """Address of the page under `velfield serve`; else of the file, which browsers open only by hand."""
     served = os.environ.get(PAGES_OF)
     if served is not None and report.resolve().is_relative_to(Path(served).resolve()):
         return f"{os.environ[PAGES]}/{report.resolve().relative_to(Path(served).resolve()).as_posix()}"

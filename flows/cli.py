@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import App, Parameter
 
 from flows.launch import limit_threads
-from flows.options import Preset, Settings, frame_size, renamed_option
+from flows.options import Preset, Settings, parse_frame_size, renamed_option
 from flows.stopping import STOPPED, as_ctrl_c, leave
 from velfield.errors import IneffectiveSettingWarning, InputError, OldNameWarning
 
@@ -36,24 +36,22 @@ app = App(
     version=_version,
     version_flags=["--version"],
     help_format="plaintext",  # Markdown takes a third of the time of --help
-    suppress_keyboard_interrupt=False,  # it would end without a word, and leave children behind
+    suppress_keyboard_interrupt=False,  # it would end without a message, and leave child processes behind
 )
 
 # Each in a file of its own, imported when it runs.
-app.command("flows.commands.init:init", name="init", help="Look at a video and write a commented flight.yaml.")
-app.command("flows.commands.config:config", name="config", help="The configuration that a run was made with.")
+app.command("flows.commands.init:init", name="init", help="Probe a video and write a commented flight.yaml.")
+app.command("flows.commands.config:config", name="config", help="Print the configuration of a run.")
 app.command("flows.commands.view:view", name="view", help="Show a run's page in the browser.")
-app.command("flows.commands.annotate:annotate", name="annotate", help="Mark cars in the browser, to learn from.")
-app.command("flows.commands.train:train", name="train", help="Marked cars in, a detector file out.")
-app.command("flows.commands.export:export", name="export", help="Write a finished run in a format that others read.")
-app.command(
-    "flows.commands.lineage:lineage", name="lineage", help="What stands behind a run, or behind a pixel of its field."
-)
-app.command("flows.commands.reprocess:reprocess", name="reprocess", help="A new base image under a finished run.")
-app.command("flows.commands.serve:serve", name="serve", help="Process what arrives in a folder, with a UI.")
-app.command("flows.commands.verify:verify", name="verify", help="Is a run folder whole; and make it so.")
+app.command("flows.commands.annotate:annotate", name="annotate", help="Label cars in the browser, as training data.")
+app.command("flows.commands.train:train", name="train", help="Train a detector from labelled cars.")
+app.command("flows.commands.export:export", name="export", help="Write a finished run in another format.")
+app.command("flows.commands.lineage:lineage", name="lineage", help="Lineage of a run, or of a pixel of its field.")
+app.command("flows.commands.reprocess:reprocess", name="reprocess", help="Map a finished run onto a new base image.")
+app.command("flows.commands.serve:serve", name="serve", help="Process flights that arrive in a folder, with a UI.")
+app.command("flows.commands.verify:verify", name="verify", help="Check the integrity of a run folder, and repair it.")
 app.command("flows.commands.algebra:merge", name="merge", help="Add the fields of runs on one grid, exactly.")
-app.command("flows.commands.algebra:subtract", name="subtract", help="Take a field out of another again, exactly.")
+app.command("flows.commands.algebra:subtract", name="subtract", help="Subtract a merged field again, exactly.")
 app.command("flows.commands.algebra:compare", name="compare", help="Map what changed between two fields.")
 app.command("flows.commands.bench:bench", name="bench", help="Speed and accuracy, against a peer in the same run.")
 
@@ -96,24 +94,24 @@ def run(
     Parameters
     ----------
     source
-        Video file, or folder of pictures.
+        Video file, or folder of images.
     out
         Run folder: everything is written there.
     base
-        Picture whose pixels become the base pixels: GeoTIFF, PNG with world file, or plain.
+        Image whose pixels become the base pixels: GeoTIFF, PNG with world file, or plain.
         Default: built from the flight.
     gsd_m
-        Ground sample distance, metres a base pixel. Default: from the base picture's CRS, else all stays in px/s.
+        Ground sample distance, metres a base pixel. Default: from the base image's CRS, else speeds stay in px/s.
     labels
-        Marked cars to learn from: CSV, GeoJSON, YOLO, COCO, LabelMe, VIA. Default: learnt from motion.
+        Labelled cars to train on: CSV, GeoJSON, YOLO, COCO, LabelMe, VIA. Default: labels from motion.
     detector
-        A detector file in place of training.
+        A trained detector file, instead of training.
     detections
-        Another detector's boxes in place of ours.
+        Boxes of another detector, instead of this one's.
     timestamps
-        CSV `frame,time_s` for a folder of pictures.
+        CSV `frame,time_s` for a folder of images.
     fps
-        Frame rate of a folder of pictures that has no times.
+        Frame rate of a folder of images without timestamps.
     config
         flight.yaml with the flight's configuration.
     preset
@@ -123,9 +121,9 @@ def run(
     every
         Take every n-th frame; `auto`: the frames nearest to 0.2 s apart.
     start_s
-        Leave out what comes before, seconds from the first frame.
+        Skip frames before this time, seconds from the first frame.
     stop_s
-        Leave out what comes at or after, seconds from the first frame.
+        Skip frames from this time on, seconds from the first frame.
     intervals
         A field for each time interval too: `15min`, or `07:00-09:00,15:00-18:00`, or seconds `0-300,300-600`.
     workers
@@ -133,15 +131,15 @@ def run(
     scheduler
         Address of a Dask scheduler.
     cluster
-        File with the class of Dask clusters to use and what it is called with; see `examples/cluster-*.yaml`.
+        File with the class of Dask clusters to use and its arguments; see `examples/cluster-*.yaml`.
     plan
-        Say what would be done, and stop.
+        Print what would be computed, and stop.
     quiet
         Warnings only.
     verbose
         More detail.
     log_json
-        Lines of JSON in place of text.
+        Lines of JSON instead of text.
     """
     from schemas.job import Inputs, Job
     from velfield.pipeline.configuration import resolve_config
@@ -180,7 +178,7 @@ def simulate(
     seed: int = 0,
     quiet: Quiet = False,
 ) -> int:
-    """Simulate a flight over a city, with the truth: writes frames/, timestamps.csv, base.png, labels.csv, truth/.
+    """Simulate a flight over a city, with ground truth: writes frames/, timestamps.csv, base.png, labels.csv, truth/.
 
     Parameters
     ----------
@@ -210,7 +208,7 @@ def demo(
     seed: int = 1,
     quiet: Quiet = False,
 ) -> int:
-    """A simulated flight, the whole job by the preset `fast` with a small detector, the report.
+    """Simulate a flight and process it, with the preset `fast` and a small detector.
 
     Parameters
     ----------
@@ -237,7 +235,7 @@ def demo(
         labels=str(flight / "labels.csv"),
         timestamps=str(flight / "timestamps.csv"),
     )
-    # Four minutes from an empty clone, the kernels' first compilation and all: a hundred marked cars are soon learnt.
+    # Four minutes from an empty clone, the kernels' first compilation included: a small detector trains in seconds.
     quick = {"detection.rounds": 120, "detection.feature_pool": 800}
     config = resolve_config(preset="fast", overrides={"gsd_m": 0.23, **quick})
     with kernels_beside():
@@ -251,7 +249,7 @@ def demo(
             given = [word for name in ("timestamps", "base", "labels") for word in (f"--{name}", getattr(inputs, name))]
             chosen = [word for name, value in quick.items() for word in ("--set", f"{name}={value}")]
             words = ["velfield", "run", inputs.source, *given, "--gsd-m", "0.23", "--preset", "fast", *chosen]
-            print("by:", shlex.join([*words, "--out", str(out / "run")]))
+            print("equivalent command:", shlex.join([*words, "--out", str(out / "run")]))
     return status
 
 
@@ -271,7 +269,7 @@ def _simulate(out: Path, *, frames: int, size: str, seed: int, quiet: bool) -> N
     from schemas.simulation import SimulationConfig
     from velfield.synthetic import write_flight
 
-    width, height = frame_size(size, "as 1280x960")
+    width, height = parse_frame_size(size, "as 1280x960")
     console = Console("quiet" if quiet else "normal")
     config = SimulationConfig(frames=frames, width=width, height=height, seed=seed)
     with console.stage("simulate", "simulate", frames) as progress:
@@ -310,7 +308,7 @@ def _process(
 
     console = Console(verbosity)
     if first_start():
-        console.event("start", "Prefect lays out its data base, this once: half a minute")
+        console.event("start", "creating the Prefect database (first run only, about 30 s)")
     from flows.process_flight import run_flight
     from flows.runners import RunnerConfig
 
@@ -383,7 +381,7 @@ def main() -> None:
     except InputError as error:
         print(f"velfield: {error}", file=sys.stderr)
         status = BAD_INPUT
-    except BrokenPipeError:  # whoever read our output has seen enough
+    except BrokenPipeError:  # the reader of our output has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = DONE
     except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""What a person sees in the terminal: a bar for the stage that runs, one line for each that is done."""
+"""Terminal output: a progress bar for the running stage, one line for each that is done."""
 
 import json
 import sys
@@ -19,7 +19,7 @@ Verbosity = Literal["quiet", "normal", "verbose", "json"]
 
 @dataclass
 class StageProgress:
-    """How far one stage is. Blocks tell as they go where they run in this process; else units do."""
+    """Progress of one stage: by blocks where they run in this process, else by units."""
 
     total: int
     bar: Progress
@@ -28,25 +28,25 @@ class StageProgress:
     done: int = 0
     lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def hear(self, stage: str, steps: int) -> None:
-        """Take a step that a block of this process told of."""
+    def add_steps(self, stage: str, steps: int) -> None:
+        """Count steps that a block of this process published."""
         if stage == self.name:
             self.at_least(self.done + steps)
 
     def at_least(self, done: int) -> None:
-        """The stage is at least so far."""
+        """Set the progress to at least so many steps."""
         with self.lock:
             self.done = min(self.total, max(self.done, done))
             self.bar.update(self.task, completed=self.done)  # type: ignore[arg-type]
 
 
-def say(text: str) -> None:
-    """A line with the time of day, from a process that serves."""
+def print_with_time(text: str) -> None:
+    """Print a line with the time of day, from a process that serves."""
     print(f"{time.strftime('%H:%M:%S')}    {text}", flush=True)
 
 
 class Console:
-    """Writes to the terminal; as lines of JSON where asked to."""
+    """Writes to the terminal: text, or lines of JSON."""
 
     def __init__(self, verbosity: Verbosity = "normal") -> None:
         self.verbosity: Verbosity = verbosity
@@ -60,19 +60,19 @@ class Console:
             self._rich.print(text, markup=False, soft_wrap=True)
 
     def warn(self, text: str) -> None:
-        """A warning: shown even where all else is quiet."""
+        """A warning: shown even with ``--quiet``."""
         if self.verbosity == "json":
             self.event("warning", text)
         else:
             RichConsole(stderr=True, highlight=False).print(f"warning: {text}", markup=False, soft_wrap=True)
 
     def result(self, text: str) -> None:
-        """What the command was asked for, on standard output."""
+        """A result of the command, on standard output."""
         print(text, flush=True)
 
     @contextmanager
     def stage(self, name: str, label: str, total: int) -> Iterator[StageProgress]:
-        """A progress bar for the time of one stage."""
+        """A progress bar while one stage runs."""
         columns = (
             TextColumn("{task.description:<12}"),
             BarColumn(bar_width=30),
@@ -83,5 +83,5 @@ class Console:
         hidden = not self._rich.is_terminal  # in a log a bar would leave empty lines
         with Progress(*columns, console=self._rich, transient=True, refresh_per_second=5, disable=hidden) as bar:
             progress = StageProgress(total, bar, bar.add_task(label, total=total), name)
-            with subscribe(progress.hear):
+            with subscribe(progress.add_steps):
                 yield progress

@@ -1,11 +1,11 @@
-"""Flows as a server runs them: parameters that fit into JSON, each a few lines round the flows of the command."""
+"""Flows as a server runs them: parameters are JSON, each wraps the flow of a command."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from prefect import flow, get_run_logger
 
-from flows.console import Console, say
+from flows.console import Console, print_with_time
 from flows.launch import prepare_process
 from flows.process_flight import run_flight
 from flows.reprocess import run_reprocess
@@ -26,12 +26,12 @@ def process_dropped(source: str, runs: str, cluster: str = "") -> str:
     Parameters
     ----------
     source
-        A video, a folder of pictures, or a folder with `frames/` or a video, and beside it what `velfield run` can be
-        given: `base.*`, `labels.csv`, `timestamps.csv`, `detector.json`, `flight.yaml`.
+        A video, a folder of images, or a folder with `frames/` or a video, and beside it the optional inputs of
+        `velfield run`: `base.*`, `labels.csv`, `timestamps.csv`, `detector.json`, `flight.yaml`.
     runs
         Folder of run folders.
     cluster
-        File that says where to compute, as `velfield run --cluster`. Default: the threads of this process.
+        Cluster file, as for `velfield run --cluster`. Default: the threads of this process.
     """
     prepare_process(verbose=False)
     job = _dropped_job(Path(source), Path(runs))
@@ -39,13 +39,13 @@ def process_dropped(source: str, runs: str, cluster: str = "") -> str:
     for line in summary.frames_lost:
         get_run_logger().warning(line)
     lost = f", {len(summary.frames_lost)} frames lost" if summary.frames_lost else ""
-    say(f"{Path(source).name} is done{lost}: {summary.root}")
+    print_with_time(f"{Path(source).name} is done{lost}: {summary.root}")
     return summary.root
 
 
 @flow(name="reprocess-runs", flow_run_name="{base}", persist_result=False)
 def reprocess_runs(runs: str, base_images: str, base: str = "", run: str = "", cluster: str = "") -> list[str]:
-    """Put a new base image under one run, or under all; runs of another place stay as they are.
+    """Reprocess one run, or all, on a new base image; runs of another place are left unchanged.
 
     Parameters
     ----------
@@ -54,30 +54,30 @@ def reprocess_runs(runs: str, base_images: str, base: str = "", run: str = "", c
     base_images
         Folder that base images arrive in; no other is read.
     base
-        Name of the picture. Default: the newest.
+        Name of the image. Default: the newest.
     run
         Name of the run. Default: all.
     cluster
-        File that says where to compute. Default: the threads of this process.
+        Cluster file. Default: the threads of this process.
     """
     prepare_process(verbose=False)
     logger = get_run_logger()
-    picture = find_image(Path(base_images), base) if base else newest_image(Path(base_images))
-    if picture is None:
+    image = find_image(Path(base_images), base) if base else newest_image(Path(base_images))
+    if image is None:
         logger.info("no base image has arrived in %s", base_images)
         return []
     made, refused = [], []
     for root in run_folders(Path(runs), run):
         try:
-            folder, _ = run_reprocess(root, picture, runner=_runner(cluster), console=Console("quiet"))
+            folder, _ = run_reprocess(root, image, runner=_runner(cluster), console=Console("quiet"))
             made.append(str(folder))
         except InputError as error:
             if run:
                 raise
             refused.append(root.name)
-            logger.warning("%s stays as it is: %s", root.name, error)
-    say(f"{picture.name}: {len(made)} results made, {len(refused)} runs stay as they are")
-    logger.info("%s: %d results made, %d runs stay as they are", picture.name, len(made), len(refused))
+            logger.warning("%s is unchanged: %s", root.name, error)
+    print_with_time(f"{image.name}: {len(made)} results made, {len(refused)} runs unchanged")
+    logger.info("%s: %d results made, %d runs unchanged", image.name, len(made), len(refused))
     return made
 
 

@@ -1,6 +1,6 @@
-"""How a process of ours that uses Prefect or Dask is set up: before either is imported.
+"""Set-up of a process that uses Prefect or Dask, before either is imported.
 
-A person's own settings win: every variable is a default.
+The user's own settings win: every variable is a default.
 """
 
 import ctypes
@@ -23,13 +23,13 @@ _SETTINGS: dict[str, str] = {
     "DO_NOT_TRACK": "1",
     # Prefect's default lets any page that a browser shows talk to the server.
     "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": "http://127.0.0.1",
-    # Pickle is Prefect's default; what is kept of us there is plain.
+    # Pickle is Prefect's default; our results there are plain.
     "PREFECT_RESULTS_DEFAULT_SERIALIZER": "json",
     "DASK_DISTRIBUTED__LOGGING__DISTRIBUTED": "error",
-    # A hundred looks a second at what each worker does, for a page that nobody has open.
+    # It samples each worker a hundred times a second, for a page that nobody has open.
     "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "false",
-    # Every process of a cluster looks after itself 50 times a second, after its memory 10 times, waiting or not: on
-    # two processors that was 6 % of all they can do.
+    # Every process of a cluster checks its state 50 times a second and its memory 10 times, idle or not: on two
+    # processors that was 6 % of their time.
     "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
     "DASK_DISTRIBUTED__ADMIN__SYSTEM_MONITOR__INTERVAL": "5s",
     "DASK_DISTRIBUTED__WORKER__MEMORY__MONITOR_INTERVAL": "1s",
@@ -40,9 +40,9 @@ _MEMORY: dict[str, tuple[int, int]] = {
     "MALLOC_MMAP_THRESHOLD_": (-3, 32 << 20),
     "MALLOC_TRIM_THRESHOLD_": (-1, 256 << 20),
 }
-"""glibc's settings: environment for workers; number and bytes for `mallopt` here. Pictures of some MB come and go:
-asked of the system and given back each time, they cost a quarter of all processor time; with the 64 KiB that Dask sets
-for its workers half as much again."""
+"""glibc's settings: environment for workers; number and bytes for `mallopt` here. Images of some MB are
+allocated and freed all the time: from and to the system each time, they cost a quarter of all processor time; with the
+64 KiB that Dask sets for its workers half as much again."""
 _QUIET: dict[str, str] = {
     # Only the terminal is quiet: PREFECT_LOGGING_LEVEL would hide retries in the UI too.
     "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "CRITICAL",
@@ -50,13 +50,13 @@ _QUIET: dict[str, str] = {
 
 
 def limit_threads() -> None:
-    """Keep libraries from starting threads of their own. Call before anything imports numpy."""
+    """Keep libraries from starting threads of their own. Call before numpy is imported."""
     for name in _ONE_THREAD:
         os.environ.setdefault(name, "1")
 
 
 def prepare_process(*, verbose: bool) -> None:
-    """Set this process up to run flows. Call before anything imports prefect."""
+    """Set this process up to run flows. Call before prefect is imported."""
     for name, value in (_SETTINGS if verbose else _SETTINGS | _QUIET).items():
         os.environ.setdefault(name, value)
     _keep_memory()
@@ -76,7 +76,7 @@ def _keep_memory() -> None:
 
 
 def first_start() -> bool:
-    """Whether Prefect has yet to lay out its temporary server's data base: half a minute that a person wonders at."""
+    """Whether Prefect has yet to create the database of its temporary server, which takes half a minute."""
     from prefect.settings import get_current_settings
 
     settings = get_current_settings()
@@ -87,9 +87,9 @@ def first_start() -> bool:
 
 @contextmanager
 def first_start_beside() -> Iterator[None]:
-    """Prefect's first start, where it is to come, in a process of its own while this one does something else.
+    """Create the Prefect database, where there is none, in another process while this one does something else.
 
-    Should it fail, nothing is lost: the start itself does what is left, and says what is wrong.
+    Should it fail, nothing is lost: the start itself does what is left, and reports errors.
     """
     if not first_start():
         yield
@@ -105,10 +105,10 @@ def first_start_beside() -> Iterator[None]:
 
 @contextmanager
 def kernels_beside() -> Iterator[None]:
-    """Where numba has yet to compile the kernels: a process that does it, on a tiny job, while this one works.
+    """Compile the numba kernels, where none are cached, in another process by a tiny job while this one works.
 
-    A minute of a first run is waiting for the compiler on one processor, kernel after kernel; so the later ones are
-    there when they are wanted. Should it fail, nothing is lost.
+    A minute of a first run is waiting for the compiler on one processor, kernel after kernel; this way the later ones
+    are cached when they are needed. Should it fail, nothing is lost.
     """
     spec = find_spec("velfield")
     folders = spec.submodule_search_locations if spec else None

@@ -30,15 +30,15 @@ def renamed_option(value: str | None, old_value: str | None, *, name: str, old_n
     return old_value
 
 
-def frame_size(size: str, wanted: str, least_px: int = 0) -> tuple[int, int]:
-    """Width and height of ``--size WIDTHxHEIGHT``, px.
+def parse_frame_size(size: str, expected: str, min_px: int = 0) -> tuple[int, int]:
+    """Parse width and height of ``--size WIDTHxHEIGHT``, px.
 
     Raises
     ------
     InputError
-        It is none, or a side is below ``least_px``; ``wanted`` says what would do.
+        It is no size, or a side is below ``min_px``; ``expected`` describes a valid one.
     """
     width, times, height = size.lower().partition("x")
-    if not (times and width.isdigit() and height.isdigit() and min(int(width), int(height)) >= least_px):
-        raise InputError(f"--size {size}: expected WIDTHxHEIGHT in pixels, {wanted}")
+    if not (times and width.isdigit() and height.isdigit() and min(int(width), int(height)) >= min_px):
+        raise InputError(f"--size {size}: expected WIDTHxHEIGHT in pixels, {expected}")
     return int(width), int(height)

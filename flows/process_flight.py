@@ -1,4 +1,4 @@
-"""The whole job in the paper's order: frames, lens, base image, registration, cars, tracklets, velocity field, maps.
+"""The whole job: all stages of one flight as a Prefect flow.
 
 The stages and their order stand in ``velfield.pipeline.stage``. A task is thin glue: it asks
 ``velfield.pipeline.graphs`` for the Dask graph of its unit and computes it on the runner. What is finished is known
@@ -31,12 +31,12 @@ from velfield.run.lock import locked
 
 
 def run_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
-    """Process a flight: the flow below, with as many units under way at once as the runner is worth.
+    """Process a flight: the flow below, with as many concurrent units as the runner can use.
 
     Raises
     ------
     InputError
-        The inputs or the configuration are not usable; nothing that was committed is lost.
+        The inputs or the configuration are not usable; committed units are kept.
     """
     task_runner = ThreadPoolTaskRunner(max_workers=parallel_units(runner))
     return process_flight.with_options(task_runner=task_runner)(job, runner, console)
@@ -54,7 +54,7 @@ def process_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSumma
         check_space(plan)
         changed = changed_since(plan)
         write_flight_record(plan)
-        console.event("start", f"{job.inputs.source}: {plan.frame_count} frames to work on, {where.description}")
+        console.event("start", f"{job.inputs.source}: {plan.frame_count} frames to process, {where.description}")
         if changed:
             text = f"{', '.join(changed)} changed since the last run; dependent stages are recomputed"
             console.event("changed", f"{job.root}: {text}", changed=changed)

@@ -1,7 +1,8 @@
-"""A new base image: what depends on it is done again, and only that; the result before stays and keeps its name.
+"""A new base image under a finished run: only what depends on it is recomputed; the previous result is kept.
 
-Where the new picture registers well to the old base image, all that is known is mapped by that one map, in seconds: no
-frame is decoded, registered or searched for cars. Where it does not, or when asked to, the frames are registered again.
+Where the new image registers well to the old base image, all results are mapped by that one transform, in seconds: no
+frame is decoded, registered or searched for cars. Where it does not, or with ``--full``, the frames are registered
+again.
 """
 
 from functools import partial
@@ -23,7 +24,7 @@ from schemas.summary import RunSummary
 from velfield.errors import Failure, InputError
 from velfield.pipeline.graphs import rebase_graph
 from velfield.pipeline.plan import write_flight_record
-from velfield.pipeline.stage import STAGES, NewBase, stages_before
+from velfield.pipeline.stage import STAGE, STAGES, NewBase, stages_before
 from velfield.pipeline.stages.rebase import Rebase, measure_rebase, plan_rebase
 from velfield.pipeline.stages.registration import lost_frames
 from velfield.pipeline.stages.report import write_report
@@ -41,7 +42,7 @@ from velfield.run.results import (
 from velfield.run.run import Run, open_run
 
 MAX_ADDED_ERROR_PX = 1.0
-"""A new base image that lies on the old one worse than this, in the mean, has the frames registered again."""
+"""Above this mean registration error of the new base image to the old one the frames are registered again."""
 
 
 def run_reprocess(
@@ -59,7 +60,7 @@ def run_reprocess(
     Raises
     ------
     InputError
-        The picture is not of this place, or the run folder is not one. Nothing was changed.
+        The image is of another place, or the run folder is not one. Nothing was changed.
     """
     where = runner or RunnerConfig()
     if not base.exists():
@@ -80,7 +81,7 @@ def reprocess(
     with locked(run.layout):
         mark_crashed(f"{root} on {name}")
         if result_exists(run.layout, name, Path(base)):
-            console.event("start", f"{run.layout.results / name} is this base image's result already")
+            console.event("start", f"{run.layout.results / name} is the result on this base image already")
             return publish_result(run, name, Path(base)), None
         job = _new_job(run, name, base)
         found = None if full else _registered(run, base, max_added_error_px, console)
@@ -95,26 +96,30 @@ def reprocess(
 def _new_job(run: Run, name: str, base: str) -> Job:
     if run.layout.rebased.exists():
         raise InputError(f"{run.layout.root} is itself mapped onto a new base image; reprocess the run that it is of")
+    if set(run.record.keys) != set(STAGE):
+        raise InputError(f"{run.layout.root} was made by another version of velfield; run `velfield run` on it again")
     given = run.record.given
     if given is None:
-        raise InputError(f"{run.layout.root} does not say where its inputs are; run `velfield run` on it again")
+        raise InputError(f"{run.layout.root} has no record of its inputs; run `velfield run` on it again")
     inputs = Inputs.model_validate(given.model_dump() | {"base": base})
     return Job(root=str(staging_layout(run.layout, name).root), inputs=inputs, config=run.record.config)
 
 
 def _registered(run: Run, base: str, limit_px: float, console: Console) -> RebaseRecord | None:
-    """How the new picture lies on the old base image; none where that is not good enough, said aloud."""
+    """The registration of the new image to the old base image; none, with a warning, where it is not good enough."""
     measure = task(
         measure_rebase, name="new base image on the old one", cache_policy=NO_CACHE, persist_result=False, retries=0
     )
     found = measure(run, Path(base))
     if isinstance(found, Failure):
-        console.warn(f"the new base image does not fit on the old one, the frames are tried: {found.reason}")
+        console.warn(
+            f"the new base image does not register to the old one, so the frames are registered again: {found.reason}"
+        )
         return None
     if found.added_error_px > limit_px:
         console.warn(
-            f"the new base image lies on the old one to {found.added_error_px:.2f} px, {limit_px:.2f} px wanted: "
-            "the frames are registered again"
+            f"the new base image registers to the old one with an error of {found.added_error_px:.2f} px, more than "
+            f"{limit_px:.2f} px: the frames are registered again"
         )
         return None
     console.event("start", found.text())
@@ -122,7 +127,7 @@ def _registered(run: Run, base: str, limit_px: float, console: Console) -> Rebas
 
 
 def _again(run: Run, job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
-    """All that depends on the base image, as a run of its own that finds its frames read and its lens known."""
+    """Register the frames to the new base image: a run of its own that starts from the stages before the base image."""
     layout = RunLayout(Path(job.root))
     link_shared_outputs(run.layout, layout, stages_before("base"))
     task_runner = ThreadPoolTaskRunner(max_workers=parallel_units(runner))

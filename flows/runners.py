@@ -27,9 +27,9 @@ class RunnerConfig(Model):
     scheduler: str | None = None
     """Address of a Dask scheduler, ``tcp://host:port``."""
     cluster_class: str | None = None
-    """Where a class of Dask clusters stands, ``module.Class``: ``dask_kubernetes.operator.KubeCluster``, ..."""
+    """Import path of a class of Dask clusters, ``module.Class``: ``dask_kubernetes.operator.KubeCluster``, ..."""
     cluster_kwargs: dict[str, Any] = Field(default_factory=dict)
-    """What it is called with."""
+    """Its arguments."""
 
 
 class ClusterFile(Model):
@@ -38,16 +38,16 @@ class ClusterFile(Model):
     cluster_class: str
     cluster_kwargs: dict[str, Any] = Field(default_factory=dict)
     workers: PositiveInt = 2
-    """Workers to ask for."""
+    """Number of workers."""
 
 
 def read_runner(path: Path) -> RunnerConfig:
-    """The runner that a ``--cluster`` file asks for.
+    """The runner configuration of a ``--cluster`` file.
 
     Raises
     ------
     InputError
-        It is not there, or not such a file.
+        It does not exist, or is not such a file.
     """
     import yaml
 
@@ -56,13 +56,13 @@ def read_runner(path: Path) -> RunnerConfig:
     except FileNotFoundError:
         raise InputError(f"--cluster: {path} is not there; see examples/ for some") from None
     except (yaml.YAMLError, ValidationError) as error:
-        told = " ".join(str(error).split())
-        raise InputError(f"--cluster {path}: expected cluster_class, cluster_kwargs, workers; {told}") from None
+        details = " ".join(str(error).split())
+        raise InputError(f"--cluster {path}: expected cluster_class, cluster_kwargs, workers; {details}") from None
     return RunnerConfig(**asked.model_dump())
 
 
 class Runner(ABC):
-    """Computes Dask graphs, from several threads at once."""
+    """Computes Dask graphs; called from several threads at once."""
 
     description: str
 
@@ -79,12 +79,12 @@ class ThreadsRunner(Runner):
         self.description = f"{threads} threads of this process"
 
     def compute(self, graph: Any) -> Any:
-        # Units run side by side on Prefect's threads, so a graph of its own needs no more than a few.
+        # Units run concurrently on Prefect's threads, so a graph by itself needs no more than a few.
         return graph.compute(scheduler="threads", num_workers=self._threads)
 
 
 class ClientRunner(Runner):
-    """A Dask cluster. Graphs hold functions of ``velfield`` alone: its workers need no ``flows``."""
+    """A Dask cluster. Graphs hold functions of ``velfield`` alone, so workers need no ``flows``."""
 
     def __init__(self, client: Any) -> None:
         workers = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
@@ -97,7 +97,7 @@ class ClientRunner(Runner):
 
 @contextmanager
 def open_runner(config: RunnerConfig) -> Iterator[Runner]:
-    """A runner for the time of a flow; what it started is gone afterwards."""
+    """A runner for the duration of a flow; a cluster that it started is shut down afterwards."""
     if config == RunnerConfig():
         yield ThreadsRunner(usable_processors())
         return
@@ -111,7 +111,7 @@ def open_runner(config: RunnerConfig) -> Iterator[Runner]:
 
 @contextmanager
 def _cluster(config: RunnerConfig) -> Iterator[Any]:
-    """What a client connects to: an address, or a cluster that lives as long as the context."""
+    """The target of a client: an address, or a cluster that lives as long as the context."""
     if config.scheduler is not None:
         yield config.scheduler
         return
@@ -140,7 +140,7 @@ def _class_of(config: RunnerConfig) -> tuple[Any, dict[str, Any]]:
 
 
 def parallel_units(config: RunnerConfig) -> int:
-    """How many units are worth having under way at once, as told before the runner is opened."""
+    """Number of units to submit at once, known before the runner is opened."""
     if config.scheduler is not None:
         return 32
     return 2 * config.workers if config.workers is not None else usable_processors()

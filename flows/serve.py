@@ -1,4 +1,4 @@
-"""A Prefect server with its UI, and its deployments: flights that arrive, base images that arrive, nights.
+"""A Prefect server with its UI, and its deployments: flights that arrive, base images that arrive, a nightly run.
 
 One folder, three parts: ``incoming/`` (flights), ``base-images/`` and ``runs/``. The server is a child of this process,
 and so is every flow run: whatever ends this process in order ends them.
@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flows.console import say
+from flows.console import print_with_time
 from flows.launch import PAGES, PAGES_OF
 from flows.stopping import as_ctrl_c, end_children, end_children_when_killed
 from velfield.errors import InputError
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 FLIGHT_ARRIVED = "velfield.flight.arrived"
 BASE_IMAGE_ARRIVED = "velfield.base-image.arrived"
 NIGHTLY = "0 3 * * *"
-_LOOK_EVERY_S = 1.0
+_POLL_INTERVAL_S = 1.0
 _START_S = 180.0
 _STOP_S = 10.0
 
 
 @dataclass(frozen=True)
 class ServeConfig:
-    """What is served, and where."""
+    """Configuration of `velfield serve`."""
 
     folder: Path
     host: str = "127.0.0.1"
@@ -50,11 +50,11 @@ class ServeConfig:
     nightly: str = NIGHTLY
     """Cron expression."""
     settle_s: float = 10.0
-    """What has not changed for so long has arrived whole."""
+    """A file that has not changed for so long is complete."""
     limit: int = 1
     """Flow runs at a time."""
     cluster: str = ""
-    """File that says where to compute, as `velfield run --cluster`."""
+    """Cluster file, as for `velfield run --cluster`."""
 
     @property
     def url(self) -> str:
@@ -75,7 +75,7 @@ class ServeConfig:
 
 
 def check(config: ServeConfig) -> None:
-    """Refuse what is not safe or cannot work.
+    """Refuse a configuration that is not safe or cannot work.
 
     Raises
     ------
@@ -94,7 +94,9 @@ def check(config: ServeConfig) -> None:
         try:
             probe.bind((config.host, config.port))
         except OSError as error:
-            raise InputError(f"--port {config.port} of {config.host} cannot be had ({error}); give another") from None
+            raise InputError(
+                f"--port {config.port} of {config.host} is not available ({error}); give another"
+            ) from None
 
 
 def settings(config: ServeConfig) -> dict[str, str]:
@@ -166,7 +168,7 @@ def deployments(config: ServeConfig) -> list["RunnerDeployment"]:
 
 @contextlib.contextmanager
 def server(config: ServeConfig) -> Iterator[None]:
-    """The Prefect server, up, for the time of the context."""
+    """A running Prefect server within the context."""
     command = [sys.executable, "-m", "uvicorn", "--factory", "prefect.server.api.server:create_app"]
     command += ["--host", config.host, "--port", str(config.port), "--log-level", "warning"]
     # A session of its own: Ctrl-C reaches this process alone, which then ends the others in order.
@@ -185,7 +187,7 @@ def _wait_until_up(config: ServeConfig, process: subprocess.Popen[bytes]) -> Non
     deadline = time.monotonic() + _START_S
     while time.monotonic() < deadline:
         if process.poll() is not None:
-            raise InputError(f"the Prefect server ended at once (status {process.returncode}); see what it said above")
+            raise InputError(f"the Prefect server ended at once (status {process.returncode}); see its output above")
         with contextlib.suppress(urllib.error.URLError, OSError), urllib.request.urlopen(request, timeout=5):
             return
         time.sleep(0.2)
@@ -203,7 +205,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 @contextlib.contextmanager
 def pages(config: ServeConfig) -> Iterator[None]:
-    """The runs' own pages, at the port after the UI's, for this machine alone; the runs' artifacts link to them."""
+    """Serve the pages of the runs at the port after the UI's, to this machine only; artifacts link to them."""
     from velfield.viewer.server import files_app, serve_in_thread
 
     with serve_in_thread(files_app(config.runs), config.port + 1) as address:
@@ -214,16 +216,16 @@ def pages(config: ServeConfig) -> Iterator[None]:
 
 @contextlib.contextmanager
 def watching(config: ServeConfig) -> Iterator[None]:
-    """Look at the folders for the time of the context, and say as events what arrives."""
+    """Poll the folders within the context, and emit an event for each arrival."""
     from prefect.events import emit_event
 
     def flight(path: Path) -> None:
-        say(f"{path.name} has arrived: it is processed")
+        print_with_time(f"{path.name} has arrived: processing")
         _resource = {"prefect.resource.id": f"velfield.flight.{path.name}"}
         emit_event(FLIGHT_ARRIVED, resource=_resource, payload={"source": str(path.resolve())})
 
     def base_image(path: Path) -> None:
-        say(f"base image {path.name} has arrived: all runs are reprocessed")
+        print_with_time(f"base image {path.name} has arrived: reprocessing all runs")
         _resource = {"prefect.resource.id": f"velfield.base-image.{path.name}"}
         emit_event(BASE_IMAGE_ARRIVED, resource=_resource, payload={"base": path.name, "run": ""})
 
@@ -231,12 +233,12 @@ def watching(config: ServeConfig) -> Iterator[None]:
     images = FolderWatcher(config.base_images, config.settle_s, base_image, include_existing=False)
     ended = threading.Event()
 
-    def look() -> None:
-        while not ended.wait(_LOOK_EVERY_S):
+    def poll() -> None:
+        while not ended.wait(_POLL_INTERVAL_S):
             for watch in (flights, images):
                 watch.poll(time.monotonic())
 
-    thread = threading.Thread(target=look, name="watched folders", daemon=True)
+    thread = threading.Thread(target=poll, name="watched folders", daemon=True)
     thread.start()
     try:
         yield
@@ -246,11 +248,11 @@ def watching(config: ServeConfig) -> Iterator[None]:
 
 
 def serve_folder(config: ServeConfig) -> None:
-    """Serve until interrupted; leaves nothing running."""
+    """Serve until interrupted; ends all child processes."""
     check(config)
     for folder in (config.incoming, config.base_images, config.runs):
         folder.mkdir(parents=True, exist_ok=True)
-    # Server and flow runs import from their working folder, whatever PYTHONSAFEPATH says: let it be one of ours.
+    # Server and flow runs import from their working folder despite PYTHONSAFEPATH: it must be one of ours.
     os.chdir(config.folder)
     os.environ.update(settings(config))
     as_ctrl_c()

@@ -1,4 +1,4 @@
-"""Flow runs that were killed stay "Running" in Prefect for ever, unless somebody says otherwise."""
+"""Flow runs that were killed stay "Running" in Prefect for ever, unless they are marked as crashed."""
 
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterName, FlowRunFilterState, FlowRunFilterStateType
@@ -8,20 +8,20 @@ from prefect.states import Crashed
 
 
 def mark_crashed(name: str) -> int:
-    """Say of earlier runs of this name that still seem to run that they crashed; returns how many.
+    """Mark earlier runs of this name that Prefect believes to be running as crashed; returns how many.
 
     Call while holding the run folder's lock: then no other run on it can be alive.
     """
-    wanted = FlowRunFilter(
+    running = FlowRunFilter(
         name=FlowRunFilterName(any_=[name]),
         state=FlowRunFilterState(type=FlowRunFilterStateType(any_=[StateType.RUNNING])),
     )
     own = str(flow_run.id)
     found = 0
     with get_client(sync_client=True) as client:
-        for run in client.read_flow_runs(flow_run_filter=wanted):
+        for run in client.read_flow_runs(flow_run_filter=running):
             if str(run.id) != own:
-                state = Crashed(message="the process was killed; the next run of this folder went on from its commits")
+                state = Crashed(message="the process was killed; the next run of this folder resumed from its commits")
                 client.set_flow_run_state(run.id, state, force=True)
                 found += 1
     return found

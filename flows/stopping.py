@@ -1,4 +1,4 @@
-"""SIGTERM and Ctrl-C: either ends a run within seconds, whatever is under way. What was committed stays."""
+"""SIGTERM and Ctrl-C: either ends a run within seconds. Committed units stay."""
 
 import atexit
 import contextlib
@@ -15,15 +15,15 @@ from types import FrameType
 STOPPED = 130
 _ENDING = (signal.SIGTERM, signal.SIGINT)
 _GRACE_S = 5.0
-"""For Prefect to be told that the run ended; the frames under way, half a minute of work perhaps, are given up."""
+"""Time for Prefect to record the end of the run; units under way, half a minute of work perhaps, are abandoned."""
 _END_S = 3.0
 _resumes = threading.Event()
 _MARK = "VELFIELD_STARTED_BY"
-"""Environment: by which process, of which moment, all of its children were started."""
+"""Environment variable that marks the children of this process: its id and start time."""
 _WATCH = """if True:
     import sys
     mark = sys.argv[1]
-    sys.stdin.read()  # until the process that watches over its children is gone
+    sys.stdin.read()  # until the parent is gone
     import psutil
     for process in psutil.process_iter():
         try:
@@ -35,25 +35,25 @@ _WATCH = """if True:
 
 
 def stop_on_signals() -> None:
-    """From now on SIGTERM is as Ctrl-C, and neither waits for the work under way, which the same command resumes.
+    """Treat SIGTERM as Ctrl-C; neither waits for the work under way, which the same command resumes.
 
     Call in the main thread.
     """
     _resumes.set()
     as_ctrl_c()
-    # Prefect puts a handler of its own in the place of ours, then waits for the threads: this hears of it all the same.
-    told, tell = socket.socketpair()
-    tell.setblocking(False)
-    signal.set_wakeup_fd(tell.fileno(), warn_on_full_buffer=False)
-    threading.Thread(target=_end_late, args=(told, tell), name="end", daemon=True).start()
+    # Prefect replaces our handler by its own, then waits for the threads: the wake-up descriptor is notified anyway.
+    receiver, sender = socket.socketpair()
+    sender.setblocking(False)
+    signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+    threading.Thread(target=_end_late, args=(receiver, sender), name="end", daemon=True).start()
     end_children_when_killed()
 
 
 def end_children_when_killed() -> None:
-    """From now on what this process starts ends with it even where it is killed: Prefect's server would stay for ever.
+    """End child processes with this one even where it is killed: Prefect's server would run for ever.
 
-    Nobody can mind SIGKILL, so another process waits for the end of this one, and finds those it left by a mark in
-    their environment.
+    SIGKILL cannot be handled, so another process waits for the end of this one, and identifies its children by a mark
+    in their environment.
     """
     os.environ[_MARK] = mark = f"{os.getpid()}-{time.time_ns()}"
     watcher = subprocess.Popen(
@@ -61,7 +61,7 @@ def end_children_when_killed() -> None:
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        start_new_session=True,  # a terminal's Ctrl-C is for us, and not its end
+        start_new_session=True,  # a terminal's Ctrl-C must not end it
     )
     atexit.register(_release, watcher)
 
@@ -73,7 +73,7 @@ def _release(watcher: "subprocess.Popen[bytes]") -> None:
 
 
 def as_ctrl_c() -> None:
-    """SIGTERM is as Ctrl-C, and Ctrl-C is heard even where a shell started us in the background, with it ignored."""
+    """Treat SIGTERM as Ctrl-C, and handle Ctrl-C even where a shell started this process with it ignored."""
     for number in _ENDING:
         signal.signal(number, _stop)
 
@@ -82,25 +82,25 @@ def _stop(_number: int, _frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-def _end_late(told: socket.socket, _tell: socket.socket) -> None:
-    while told.recv(1)[0] not in _ENDING:
+def _end_late(receiver: socket.socket, _sender: socket.socket) -> None:
+    while receiver.recv(1)[0] not in _ENDING:
         pass
-    logging.disable(logging.CRITICAL)  # what fails now fails because we end: it would only alarm
+    logging.disable(logging.CRITICAL)  # errors from now on are consequences of the end
     threading.Event().wait(_GRACE_S)
     leave(STOPPED)
 
 
 def leave(status: int) -> None:
-    """Say so and end at once, with all that this process has started."""
-    shown = "\x1b[?25h" if sys.stderr.isatty() else ""  # the cursor, which a progress bar hides
-    told = "stopped; the same command resumes" if _resumes.is_set() else "stopped"
-    print(f"{shown}\nvelfield: {told}", file=sys.stderr, flush=True)
+    """Print that it stopped and end at once, with all child processes."""
+    cursor = "\x1b[?25h" if sys.stderr.isatty() else ""  # shown again: a progress bar hides it
+    message = "stopped; the same command resumes" if _resumes.is_set() else "stopped"
+    print(f"{cursor}\nvelfield: {message}", file=sys.stderr, flush=True)
     end_children(_END_S)
     os._exit(status)
 
 
 def end_children(patience_s: float) -> None:
-    """End what this process started and is still there; kill what does not end in time."""
+    """Terminate the children of this process; kill those that do not end in time."""
     import psutil
 
     children = psutil.Process().children(recursive=True)

@@ -20,7 +20,7 @@ STATIONARY_SPEED_M_PER_S = 1.15
 
 
 class FramesConfig(Model):
-    """Which frames of the source are worked on."""
+    """Which frames of the source are processed."""
 
     every: Every = "auto"
     """Take every n-th source frame; ``auto``: the frames nearest to ``target_interval_s`` apart."""

@@ -1,4 +1,4 @@
-"""``velfield merge``, ``velfield subtract``, ``velfield compare``: fields of one grid put together."""
+"""``velfield merge``, ``velfield subtract``, ``velfield compare``: algebra of fields on one grid."""
 
 from pathlib import Path
 
@@ -21,16 +21,16 @@ def merge(*run_folders: Path, out: Path) -> int:
 
 
 def subtract(whole: Path, part: Path, /, *, out: Path) -> int:
-    """Take a field that was merged into another out of it again, exactly.
+    """Subtract a field from one that it was merged into, exactly.
 
     Parameters
     ----------
     whole
         Run folder or merged folder.
     part
-        What is taken away.
+        The field to subtract.
     out
-        New folder for what is left.
+        New folder for the difference.
     """
     from velfield.run.field_algebra import subtract_fields
 
@@ -40,7 +40,7 @@ def subtract(whole: Path, part: Path, /, *, out: Path) -> int:
 
 
 def compare(before: Path, after: Path, /, *, out: Path | None = None, min_count: int = 5) -> int:
-    """Map what changed between two fields of one grid: direction, speed, volume, and whether it is chance.
+    """Map changes between two fields on one grid: direction, speed, volume, and their significance.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def compare(before: Path, after: Path, /, *, out: Path | None = None, min_count:
     out
         Folder for the figures and layers. Default: `comparison/` in the later run's folder.
     min_count
-        Passages that both fields must have at a pixel for direction and speed to be compared.
+        Vehicles that both fields need at a pixel for direction and speed to be compared.
     """
     from velfield.pipeline.compare import compare_runs
 

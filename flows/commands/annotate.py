@@ -1,4 +1,4 @@
-"""``velfield annotate``: mark cars by click and drag, to learn from."""
+"""``velfield annotate``: label cars by click and drag, as training data."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,15 +15,15 @@ def annotate(
     port: int | None = None,
     open_browser: Annotated[bool, Parameter(name="--open")] = True,
 ) -> int:
-    """Mark cars in the browser, by a drag along each; saved as labels for `velfield run --labels`.
+    """Label cars in the browser, by a drag along each; saved as labels for `velfield run --labels`.
 
     Parameters
     ----------
     place
-        A frame's picture, or a run folder: frames spread over its flight.
+        The image of a frame, or a run folder: frames spread over its flight.
     labels
-        CSV file to write; what it says of other frames stays. Default: `labels.csv` in the run folder, or beside the
-        picture.
+        CSV file to write; its labels of other frames are kept. Default: `labels.csv` in the run folder, or beside the
+        image.
     frames
         How many frames of a run to show.
     port
@@ -37,11 +37,16 @@ def annotate(
 
     file = labels or (place if place.is_dir() else place.parent) / "labels.csv"
 
-    def say(address: str) -> None:
+    def announce(address: str) -> None:
         print(f"{place}: {address}  writes {file}  (Ctrl-C ends)", flush=True)
 
     try:
-        serve(annotate_app(frames_to_annotate(place, most=frames), file), port=port, open_browser=open_browser, say=say)
+        serve(
+            annotate_app(frames_to_annotate(place, most=frames), file),
+            port=port,
+            open_browser=open_browser,
+            say=announce,
+        )
     except KeyboardInterrupt:
         print()
     return 0

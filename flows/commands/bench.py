@@ -11,7 +11,7 @@ bench.command(
 bench.command(
     "flows.commands.bench_still:still",
     name="still",
-    help="How still the things that stand lie on a run's map: registration's jitter, on your own footage.",
+    help="Stability of stationary objects on a run's map: registration jitter, on your own footage.",
 )
 bench.command(
     "flows.commands.bench_overhead:overhead",
@@ -21,7 +21,7 @@ bench.command(
 bench.command(
     "flows.commands.bench_field:field",
     name="field",
-    help="Which kernel and bins of the field foretell held-out passages best.",
+    help="Kernel and bins of the field with the best likelihood of held-out tracks.",
 )
 bench.command(
     "flows.commands.bench_detection:detection",

@@ -1,6 +1,6 @@
 """``velfield bench detection``: how fast cars are found."""
 
-from flows.options import frame_size
+from flows.options import parse_frame_size
 
 
 def detection(*, size: str = "2560x1920") -> int:
@@ -14,7 +14,7 @@ def detection(*, size: str = "2560x1920") -> int:
     from velfield.bench.detection import cascade_speed, city, learnt_there, network_speed, response_speed
     from velfield.detection.files import shipped_detector
 
-    image = city(*frame_size(size, "128 or more each, as 2560x1920", least_px=128))
+    image = city(*parse_frame_size(size, "128 or more each, as 2560x1920", min_px=128))
     for speed in response_speed(image):
         print(speed.text())
     print(cascade_speed(image, learnt_there(), "learnt from one marked frame").text())

@@ -1,4 +1,4 @@
-"""``velfield bench field``: which kernel and which bins foretell held-out passages best."""
+"""``velfield bench field``: the kernel and bins with the best likelihood of held-out tracks."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ def field(
     Parameters
     ----------
     run_folder
-        Run folder whose tracklets are taken, with metres known. Default: traffic simulated without pictures.
+        Run folder whose tracklets are used, with a known ground sample distance. Default: simulated traffic.
     seed
         City that is simulated.
     frames

@@ -1,8 +1,8 @@
-"""``velfield bench overhead``: what Prefect and Dask add to the bare functions, start-up told apart and left out.
+"""``velfield bench overhead``: the overhead of Prefect and Dask over the bare functions, start-up excluded.
 
-The peer is the same stage functions in the same order on a pool of as many processes, from a plain loop. Both are
-measured from the first unit to the last commit, in wall time, and in the processor time of all processes together:
-that is what can be told on a machine that others use as well.
+The peer runs the same stage functions in the same order on a pool of as many processes, in a plain loop. Both are
+measured from the first unit to the last commit, in wall time, and in the processor time of all processes together,
+which is meaningful on a shared machine too.
 """
 
 import shutil
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Cost:
-    """What one way took: seconds of wall and of processor, start-up left out and told apart."""
+    """Cost of one run: wall and processor time, and start-up time, which they exclude."""
 
     wall_s: float
     processor_s: float
@@ -28,16 +28,16 @@ class Cost:
 
 
 def overhead(flight: Path, /, *, work: Path, workers: int = 2) -> int:
-    """Prefect and Dask beside the bare functions, on a simulated flight.
+    """Compare Prefect and Dask with the bare functions, on a simulated flight.
 
     Parameters
     ----------
     flight
         Folder that `velfield simulate` wrote.
     work
-        Folder for the two runs; what stands there is removed.
+        Folder for the two runs; earlier ones there are removed.
     workers
-        Processes of either.
+        Processes of each.
     """
     from flows.launch import prepare_process
     from schemas.job import Inputs, Job

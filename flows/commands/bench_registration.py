@@ -13,7 +13,7 @@ def registration(
     frames: int | None = None,
     stabilo: bool = True,
 ) -> int:
-    """Register simulated flights of unseen seeds, and tell the error against their truth, median and worst.
+    """Register simulated flights of unseen seeds, and print the error against ground truth, median and worst.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""``velfield bench still``: how still the things that stand lie on a run's map."""
+"""``velfield bench still``: the stability of stationary objects on a run's map."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ from velfield.errors import InputError
 
 
 def still(run_folder: Path, /, *, frames: int = 200, within: Path | None = None) -> int:
-    """Follow corners that registration does not use through the frames of a run, and tell how they seem to move.
+    """Track corners that registration does not use through the frames of a run, and print how they seem to move.
 
     Parameters
     ----------
@@ -15,7 +15,7 @@ def still(run_folder: Path, /, *, frames: int = 200, within: Path | None = None)
     frames
         At most so many frames, spread over the run.
     within
-        A CSV `x_px,y_px`: corners around the area to look at, base pixels. Roofs and trees move on the map of a camera
+        A CSV `x_px,y_px`: corners of the area to measure, base pixels. Roofs and trees move on the map of a camera
         that flies by; a road does not.
     """
     from velfield.bench.still import measure_stability, read_area

@@ -1,4 +1,4 @@
-"""``velfield config``: the configuration that a run was made with."""
+"""``velfield config``: the configuration of a run."""
 
 from pathlib import Path
 

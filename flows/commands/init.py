@@ -1,4 +1,4 @@
-"""``velfield init``: a commented flight.yaml to begin with."""
+"""``velfield init``: a commented flight.yaml to start from."""
 
 from pathlib import Path
 
@@ -11,18 +11,18 @@ def init(
     timestamps: Path | None = None,
     fps: float | None = None,
 ) -> int:
-    """Look at a video and write a commented flight.yaml: what was found, and every parameter with its default.
+    """Probe a video and write a commented flight.yaml: its properties, and every parameter with its default.
 
     Parameters
     ----------
     source
-        Video file, or folder of pictures.
+        Video file, or folder of images.
     out
-        The file to write; one that is there is left alone.
+        The file to write; an existing one is not overwritten.
     timestamps
-        CSV `frame,time_s` for a folder of pictures.
+        CSV `frame,time_s` for a folder of images.
     fps
-        Frame rate of a folder of pictures that has no times.
+        Frame rate of a folder of images without timestamps.
     """
     from schemas.flight import FramesConfig
     from velfield.errors import InputError
@@ -32,7 +32,7 @@ def init(
     from velfield.sources.source import probe
 
     if out.exists():
-        raise InputError(f"{out} is there already; name another file with --out, or move it away")
+        raise InputError(f"{out} exists already; name another file with --out, or move it away")
     info = probe(source, frames=FramesConfig(fps=fps), timestamps=timestamps)
     write_atomically(out, config_template(str(source), info).encode())
     print("\n".join(describe_source(info, resolve_config())))

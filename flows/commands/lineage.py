@@ -1,4 +1,4 @@
-"""``velfield lineage``: what stands behind a run, or behind one pixel of its field."""
+"""``velfield lineage``: the lineage of a run, or of one pixel of its field."""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +17,7 @@ def lineage(
     pixel: str | None = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> int:
-    """Which tracklets, frames, detector and base image stand behind a pixel; of the whole run, its stages and keys.
+    """Tracklets, frames, detector and base image behind a pixel; without one, the stages of the run and their keys.
 
     Parameters
     ----------

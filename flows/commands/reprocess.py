@@ -20,23 +20,23 @@ def reprocess(
     scheduler: str | None = None,
     quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], negative=())] = False,
 ) -> int:
-    """A new base image: redo what depends on it, and only that. The result before stays, and both are named.
+    """A new base image: recompute only what depends on it. The previous result is kept beside the new one.
 
-    Where the new picture registers well to the old base image, all is mapped onto it in seconds, and the error that
-    this adds is stated; else the frames are registered again.
+    Where the new image registers well to the old base image, all results are mapped onto it in seconds, and the error
+    that this adds is printed; else the frames are registered again.
 
     Parameters
     ----------
     run_folder
         The run folder.
     base
-        The new picture, as for `velfield run`.
+        The new image, as for `velfield run`.
     out
-        Name of the new result, a folder under RUN/results. Default: the picture's name.
+        Name of the new result, a folder under RUN/results. Default: the image's name.
     full
         Register the frames again in any case.
     max_error_px
-        Map only where the new picture lies on the old one better than this, new base pixels.
+        Map only where the new image registers to the old one with a smaller error, new base pixels.
     workers
         Processes of a local cluster. Default: threads of this process.
     scheduler

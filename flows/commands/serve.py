@@ -1,4 +1,4 @@
-"""``velfield serve``: flights and base images that arrive in a folder are processed, seen in the Prefect UI."""
+"""``velfield serve``: process flights and base images that arrive in a folder, with the Prefect UI."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ def serve(
     limit: int = 1,
     cluster: Path | None = None,
 ) -> int:
-    """A Prefect server with its UI; process what arrives, reprocess when a new base image does. Ctrl-C ends all of it.
+    """Process flights that arrive, reprocess runs when a base image arrives, show both in the Prefect UI, until Ctrl-C.
 
     Drop flights into FOLDER/incoming and base images into FOLDER/base-images; the runs are in FOLDER/runs. The event
     `velfield.base-image.arrived` with `base` (and `run`) in its payload starts a reprocess too, and so does the night.
@@ -24,7 +24,7 @@ def serve(
     Parameters
     ----------
     folder
-        Folder of what arrives and what is made of it.
+        Folder of incoming files and of the runs.
     host
         Address to serve on. Another than this machine's own needs `--auth`.
     port
@@ -36,11 +36,11 @@ def serve(
     nightly
         Cron expression of the nightly reprocess.
     settle_s
-        What has not changed for so many seconds has arrived whole.
+        A file that has not changed for so many seconds is complete.
     limit
         Flow runs at a time.
     cluster
-        File that says where to compute, as for `velfield run`.
+        Cluster file, as for `velfield run`.
     """
     from flows.launch import prepare_process
 
@@ -61,5 +61,5 @@ def serve(
     try:
         serve_folder(config)
     except KeyboardInterrupt:
-        print("stopped; nothing of it is running any more")
+        print("stopped; all processes ended")
     return 0

@@ -1,4 +1,4 @@
-"""``velfield train``: marked cars in, a detector file out."""
+"""``velfield train``: train a detector from labelled cars."""
 
 import sys
 from pathlib import Path
@@ -23,12 +23,12 @@ def train(
     preset: Preset | None = None,
     settings: Settings = (),
 ) -> int:
-    """Train a detector from marked cars; `velfield run --detector` takes the file.
+    """Train a detector from labelled cars; `velfield run --detector` takes the file.
 
     Parameters
     ----------
     source
-        Video file, or folder of pictures, that the labels are of.
+        Video file, or folder of images, that the labels belong to.
     labels
         Marked cars: CSV, GeoJSON, YOLO, COCO, LabelMe, VIA. All cars of every frame that is named must be marked.
     out

@@ -1,4 +1,4 @@
-"""``velfield verify``: is a run folder whole, and if not, make it so."""
+"""``velfield verify``: the integrity of a run folder, and its repair."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -25,7 +25,7 @@ def verify(run_folder: Path, /, *, repair: Annotated[bool, Parameter(negative=()
     run_folder
         The run folder.
     repair
-        Do the damaged units again, from the same inputs.
+        Compute the damaged units again, from the same inputs.
     """
     from velfield.pipeline.verify import describe_damage, has_damage, verify_run
     from velfield.run.run import open_run
@@ -37,9 +37,9 @@ def verify(run_folder: Path, /, *, repair: Annotated[bool, Parameter(negative=()
         return WHOLE
     if not repair:
         if has_damage(damages):
-            print(f"velfield verify {run_folder} --repair  does these units again")
+            print(f"velfield verify {run_folder} --repair  computes these units again")
         else:
-            print(f"velfield run ... --out {run_folder}  goes on where it stopped, or says again why it was refused")
+            print(f"velfield run ... --out {run_folder}  resumes it, or repeats why it was refused")
         return DAMAGED
     _repair(run)
     damages = verify_run(run.layout, open_run(run_folder).record)
@@ -68,12 +68,12 @@ def _repair(run: "Run") -> None:
 
 def _inputs(record: "FlightRecord", root: Path) -> "Inputs":
     if record.given is None:
-        raise InputError(f"{root} does not say where its inputs are; run `velfield run ... --out {root}` again")
+        raise InputError(f"{root} has no record of its inputs; run `velfield run ... --out {root}` again")
     return record.given
 
 
 def _same_inputs(job: "Job", record: "FlightRecord") -> None:
-    """Nothing is taken back where the inputs changed since: then it is another run, not this one repaired."""
+    """Refuse to invalidate anything where the inputs changed since: that would be another run, not a repair."""
     from velfield.pipeline.plan import make_plan
 
     if make_plan(job).keys != record.keys:

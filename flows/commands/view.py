@@ -26,11 +26,11 @@ def view(
     """
     from velfield.viewer.server import serve, view_app
 
-    def say(address: str) -> None:
+    def announce(address: str) -> None:
         print(f"{run_folder}: {address}  (Ctrl-C ends)", flush=True)
 
     try:
-        serve(view_app(run_folder), port=port, open_browser=open_browser, say=say)
+        serve(view_app(run_folder), port=port, open_browser=open_browser, say=announce)
     except KeyboardInterrupt:
         print()
     return 0

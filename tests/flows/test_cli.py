@@ -95,7 +95,7 @@ def test_a_plan_is_shown_and_nothing_is_done(tmp_path: Path) -> None:
         Image.fromarray(np.full((96, 128), k, np.uint8)).save(tmp_path / "frames" / f"{k:03d}.png")
     told = velfield("run", str(tmp_path / "frames"), "--fps", "5", "--out", str(tmp_path / "run"), "--plan")
     assert told.returncode == 0, told.stderr
-    assert "40 of them to work on" in told.stdout
+    assert "40 of them to process" in told.stdout
     assert "GB needed" in told.stdout
     assert not (tmp_path / "run").exists()
 

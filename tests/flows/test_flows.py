@@ -233,7 +233,7 @@ def test_boxes_of_few_frames_what_is_not_used_and_why_the_maps_stay_empty_are_to
     assert any("boxes in 1 of the" in line for line in warned["detector"])
     assert any("--labels not used" in line for line in warned["detector"])
     (told,) = warned["tracks"]
-    assert "no tracklets, so the maps stay empty" in told
+    assert "no tracklets, so the maps are empty" in told
     assert "--set tracking.max_interval_s=0." in told
 
 

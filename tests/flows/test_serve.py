@@ -57,7 +57,7 @@ def test_a_port_that_is_taken_is_told() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        with pytest.raises(InputError, match="cannot be had"):
+        with pytest.raises(InputError, match="is not available"):
             check(ServeConfig(Path("x"), port=taken.getsockname()[1]))
 
 

@@ -33,7 +33,7 @@ def test_what_is_written_is_the_default_and_says_what_was_found(
     assert init(str(pictures), "--fps", "10", "--out", str(out)) == 0
     text = out.read_text()
     assert "12 frames of 64 x 48 px" in text
-    assert "6 frames are worked on" in text
+    assert "6 frames are processed" in text
     assert "12 frames of 64 x 48 px" in capsys.readouterr().out
     assert resolve_config(file=out) == resolve_config()
 
@@ -62,7 +62,7 @@ def test_one_key_is_set_by_taking_its_mark_away(pictures: Path, tmp_path: Path) 
 def test_a_file_that_is_there_is_left_alone(pictures: Path, tmp_path: Path) -> None:
     out = tmp_path / "flight.yaml"
     out.write_text("preset: fast\n")
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="exists already"):
         init(str(pictures), "--fps", "10", "--out", str(out))
     assert out.read_text() == "preset: fast\n"
 

@@ -1,4 +1,4 @@
-"""A commented ``flight.yaml`` to begin with: what was found in the source, and every key with its default."""
+"""A commented ``flight.yaml`` to start from: the properties of the source, and every key with its default."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -15,24 +15,24 @@ from velfield.sources.selection import select_frames
 _WIDTH = 116
 _GSD = (
     "Metres a base pixel: the ground sample distance. Known from the height and the camera, from a car (4.5 m long) or "
-    "a lane (3 to 3.7 m wide) in the picture, or from a --base with coordinates. Without it speeds stay in px/s."
+    "a lane (3 to 3.7 m wide) in the image, or from a --base with coordinates. Without it speeds stay in px/s."
 )
 
 
 def config_template(source: str, info: SourceInfo) -> str:
-    """YAML text that is the default configuration: each key stands in it, commented out, under what it means.
+    """The default configuration as YAML: each key is commented out, below its description.
 
     Parameters
     ----------
     source
-        What the person named; said in the heading.
+        The path as given, for the heading.
     info
-        The source, as `velfield.sources.frames.probe` found it.
+        The source, from `velfield.sources.source.probe`.
     """
     config = resolve_config()
     lines = [
         "# The configuration of a flight. Every key is optional; those below are commented out at their defaults.",
-        "# To set one, take its `#` away: its section stands above it.",
+        "# To set one, remove its `#`.",
         f"# Use it:  velfield run {source} --out RUN --config flight.yaml",
         "#",
         *(f"# {line}" for line in describe_source(info, config)),
@@ -48,7 +48,7 @@ def config_template(source: str, info: SourceInfo) -> str:
 
 
 def describe_source(info: SourceInfo, config: FlightConfig) -> list[str]:
-    """What the source is, a line each."""
+    """The properties of the source, a line each."""
     lines = [f"Found: {info.kind}, {info.frame_count} frames of {info.width} x {info.height} px."]
     if len(info.times_s) > 1:
         step = np.diff(info.times_s)
@@ -57,7 +57,7 @@ def describe_source(info: SourceInfo, config: FlightConfig) -> list[str]:
             f"(median), the longest gap is {step.max():.3f} s."
         )
         taken = select_frames(info.times_s, config.frames)
-        lines.append(f"With every: auto, {len(taken)} frames are worked on, those nearest to 0.2 s apart.")
+        lines.append(f"With every: auto, {len(taken)} frames are processed, those nearest to 0.2 s apart.")
     return [*lines, *(f"Warning: {warning}" for warning in info.warnings)]
 
 
@@ -95,7 +95,7 @@ def _value(value: Any) -> str:
 
 
 def _comment(text: str, indent: str) -> list[str]:
-    """A paragraph as lines that start with ``##``: not mistaken for a key."""
+    """A paragraph as lines that start with ``##``, unlike keys that are commented out."""
     words, lines = " ".join(text.split()).split(), [""]
     for word in words:
         longer = f"{lines[-1]} {word}".strip()

@@ -1,4 +1,4 @@
-"""The configuration from its four sources, each stronger than the one before: preset, file, ``--set``, options."""
+"""The configuration from its four sources, each overriding the ones before: preset, file, ``--set``, options."""
 
 import difflib
 import warnings
@@ -40,7 +40,7 @@ def resolve_config(
     Raises
     ------
     InputError
-        An unknown key (with what was meant, perhaps), or a value out of range.
+        An unknown key (with the nearest known one), or a value out of range.
 
     Examples
     --------
@@ -89,7 +89,7 @@ def _read(file: Path) -> Tree:
         raise InputError(
             f"{file}: found a {type(tree).__name__}; expected sections with keys, see examples/flight.yaml"
         )
-    # A section all of whose keys are commented out, as `velfield init` writes it, says nothing.
+    # A section all of whose keys are commented out, as `velfield init` writes it, is null.
     return {key: value for key, value in tree.items() if value is not None or not section_models(key)}
 
 

@@ -73,7 +73,7 @@ def check_space(plan: Plan) -> None:
 def describe_plan(plan: Plan, at_a_time: int = 2) -> str:
     """The plan as text: a line a stage, then bytes needed and free, and memory for so many units at a time."""
     lines = [f"{plan.job.inputs.source}: {plan.info.frame_count} frames of {plan.info.width} x {plan.info.height} px, "]
-    lines[0] += f"{plan.frame_count} of them to work on, {plan.unit_frames} a unit"
+    lines[0] += f"{plan.frame_count} of them to process, {plan.unit_frames} a unit"
     total = 0
     for stage, units in planned_units(plan).items():
         done = sum(committed(plan, stage, unit) is not None for unit in units)

@@ -4,18 +4,6 @@ A unit of frames becomes a graph of blocks (some eight frames each: one-frame bl
 last node that writes what must have a single writer and then the commit record. Images never travel: blocks read their
 frames from the store, and only key points, tables and patches go from node to node. Every function in a graph lives in
 ``velfield``, so that a worker needs neither ``flows`` nor Prefect.
-
-    frames         decode, write                                                   ->  commit
-    quality        blurred frames and outliers, by their neighbours                 ->  commit
-    lens           edge points of spread frames                                    ->  commit
-    base           key points of spread frames, two passes to their median         ->  commit
-    registration   key points of each block  ->  the chain over the unit's frames  ->  commit
-    detector       spread windows of three frames: labels, training                ->  commit
-    detections     cars of each block        ->  one table, its patches            ->  commit
-    tracklets      three-frame windows over the unit's frames and the halo after   ->  commit
-    tracks         the tracks of vehicles over all units                           ->  commit
-    field          the tiles of one group, from the segment table                  ->  commit
-    maps           figures, GIS layers, what the viewer reads                      ->  commit
 """
 
 import time

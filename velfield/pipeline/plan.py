@@ -36,7 +36,7 @@ class Plan:
     job: Job
     info: SourceInfo = field(repr=False)
     indices: NDArray[np.int64] = field(repr=False)
-    """Source indices of the frames worked on, (frames,)."""
+    """Source indices of the frames that are processed, (frames,)."""
     inputs: InputsRecord
     keys: dict[str, str]
     """Content key of each stage."""
@@ -120,7 +120,7 @@ def make_plan(job: Job) -> Plan:
     Raises
     ------
     InputError
-        The source cannot be read, has no times, or fewer than three frames are left to work on.
+        The source cannot be read, has no times, or fewer than three frames are left.
     """
     _check_optional_inputs(job)  # `probe` checks the source
     timestamps = Path(job.inputs.timestamps) if job.inputs.timestamps else None
@@ -128,7 +128,7 @@ def make_plan(job: Job) -> Plan:
     indices = select_frames(info.times_s, job.config.frames)
     if len(indices) < 3:
         raise InputError(
-            f"{job.inputs.source}: {len(indices)} frames to work on, 3 or more needed for a tracklet; "
+            f"{job.inputs.source}: {len(indices)} frames to process, 3 or more needed for a tracklet; "
             "widen --start-s/--stop-s or lower --every"
         )
     info = replace(info, warnings=(*info.warnings, *_gaps(info.times_s[indices], job.config.tracking.max_interval_s)))

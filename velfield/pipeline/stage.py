@@ -112,6 +112,7 @@ class Stage:
 
 
 STAGES: tuple[Stage, ...] = (
+    # Decode, measure and write each frame.
     Stage(
         name="frames",
         version=1,
@@ -125,6 +126,7 @@ STAGES: tuple[Stage, ...] = (
         cut=Cut.BY_FRAMES,
         new_base=NewBase.SHARED,
     ),
+    # Flag blurred frames and outliers by their neighbours.
     Stage(
         name="quality",
         version=1,
@@ -140,6 +142,7 @@ STAGES: tuple[Stage, ...] = (
         after=("frames",),
         new_base=NewBase.SHARED,
     ),
+    # Calibrate from edge points and control points of frames spread over the flight.
     Stage(
         name="lens",
         version=6,
@@ -157,6 +160,7 @@ STAGES: tuple[Stage, ...] = (
         config=("lens",),
         new_base=NewBase.SHARED,
     ),
+    # Key points of spread frames, two passes to their median; or the registration of a given image.
     Stage(
         name="base",
         version=4,
@@ -178,6 +182,7 @@ STAGES: tuple[Stage, ...] = (
         new_base=NewBase.MAPPED,
         remap=f"{_STAGES}.rebase:rebase_image",
     ),
+    # Key points of each block, then the chain over the unit's frames.
     Stage(
         name="registration",
         version=4,
@@ -196,6 +201,7 @@ STAGES: tuple[Stage, ...] = (
         cut=Cut.BY_FRAMES,
         new_base=NewBase.SHARED,
     ),
+    # Labels and training, from labelled frames or from what moves; or a given detector.
     Stage(
         name="detector",
         version=16,
@@ -211,6 +217,7 @@ STAGES: tuple[Stage, ...] = (
         config=("detection", "tracking.max_interval_s"),
         new_base=NewBase.SHARED,
     ),
+    # Cars of each block, then one table with their crops.
     Stage(
         name="detections",
         version=8,
@@ -224,6 +231,7 @@ STAGES: tuple[Stage, ...] = (
         new_base=NewBase.MAPPED,
         remap=f"{_STAGES}.rebase:rebase_detections",
     ),
+    # Windows of three frames that start in the unit; they reach into the unit after.
     Stage(
         name="tracklets",
         version=1,
@@ -237,6 +245,7 @@ STAGES: tuple[Stage, ...] = (
         halo=1,
         new_base=NewBase.COUNTS,
     ),
+    # Tracklets of all units that belong to one vehicle.
     Stage(
         name="tracks",
         version=3,
@@ -248,6 +257,7 @@ STAGES: tuple[Stage, ...] = (
         new_base=NewBase.MAPPED,
         remap=f"{_STAGES}.rebase:rebase_tracks",
     ),
+    # The velocity histogram of a group of tiles, from the segments that reach it.
     Stage(
         name="field",
         version=3,
@@ -261,6 +271,7 @@ STAGES: tuple[Stage, ...] = (
         config=("field",),
         cut=Cut.BY_TILES,
     ),
+    # Figures, layers for GIS, the data of the viewer.
     Stage(
         name="maps",
         version=4,

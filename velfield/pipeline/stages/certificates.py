@@ -1,4 +1,4 @@
-"""Pictures of how good the geometry is: the lens before and after, where on the frame registration errs."""
+"""Figures of geometric quality: a frame before and after undistortion, the registration error over the frame."""
 
 from pathlib import Path
 
@@ -12,11 +12,11 @@ from velfield.run.frame_transforms import read_lens
 from velfield.run.stores import open_frames, open_registration
 
 _FULL_PX = 1.0
-"""The last colour of the error map."""
+"""Maximum of the colour scale of the error map."""
 
 
 def write_certificates(plan: Plan) -> list[Path]:
-    """Write ``maps/registration.png``, and ``maps/lens.png`` where the lens is not a pin-hole; none without frames."""
+    """Write ``maps/registration.png``, and ``maps/lens.png`` where the lens has distortion."""
     layout = plan.layout
     errors = open_registration(layout.registration).column("error_px")
     seen = np.isfinite(errors).any(axis=(1, 2))

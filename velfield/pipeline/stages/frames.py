@@ -1,4 +1,4 @@
-"""Frames from the source into ``frames.zarr``, with their true times and what is wrong with them."""
+"""Frames of the source, decoded into ``frames.zarr``, with their timestamps and defects."""
 
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from velfield.sources.source import iter_frames
 
 
 def create_frame_store(plan: Plan) -> None:
-    """Create ``frames.zarr`` unless it stands as this plan wants it."""
+    """Create ``frames.zarr`` unless it exists under this plan's key."""
     path = plan.layout.frames
     if store_key(path) == plan.keys["frames"]:
         return
@@ -33,7 +33,7 @@ def create_frame_store(plan: Plan) -> None:
 
 
 def read_unit(plan: Plan, frames: range) -> StageResult:
-    """Decode a unit's frames and write them, one chunk each; what could not be read is black and flagged.
+    """Decode a unit of frames and write them, one chunk each; an unreadable frame is black and flagged.
 
     Raises
     ------

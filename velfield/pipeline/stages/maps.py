@@ -1,4 +1,4 @@
-"""The maps people look at: modal direction and speed, as figures and as layers for GIS; and what the viewer reads."""
+"""Maps of modal direction and speed, as figures and as layers for GIS; and the data of the viewer."""
 
 from pathlib import Path
 
@@ -26,8 +26,8 @@ PREVIEW_SIDE_PX = 900
 
 
 def make_maps(plan: Plan) -> StageResult:
-    """Write ``maps/``, direction and speed as PNG and as GeoTIFF, small pictures of both for the Prefect UI; and
-    what the viewer reads of the run beside the field's tiles."""
+    """Write ``maps/``: direction and speed as PNG and as GeoTIFF, previews of both for the Prefect UI; and the viewer's
+    data beside the tiles of the field."""
     grid, config, layout = read_grid(plan.layout), plan.config.field, plan.layout
     store = open_field(layout.field)
     velocity = np.stack([store.layer("modal_vx"), store.layer("modal_vy")], axis=-1).astype(np.float64)
@@ -41,9 +41,9 @@ def make_maps(plan: Plan) -> StageResult:
     }
     written = []
     for name, figure in figures.items():
-        for suffix, picture in (("", figure), ("_preview", small_picture(figure))):
+        for suffix, image in (("", figure), ("_preview", make_preview(figure))):
             path = layout.maps / f"{name}{suffix}.png"
-            write_atomically(path, png_bytes(picture))
+            write_atomically(path, png_bytes(image))
             written.append(path)
     written += _layers(plan, direction, speed)
     written += write_certificates(plan)
@@ -58,7 +58,7 @@ def _layers(plan: Plan, direction: FloatArray, speed: FloatArray) -> list[Path]:
     north = north_direction_rad(grid)
     heading = heading_deg(direction, north)
     unit, factor = ("m s-1", grid.gsd_m) if grid.gsd_m else ("px s-1", 1.0)
-    about = "heading, clockwise from north" if north is not None else "heading, clockwise from the picture's up"
+    about = "heading, clockwise from north" if north is not None else "heading, clockwise from the image's up"
     for name, values, label, units in (
         ("direction", heading, about, "degree"),
         ("speed", speed * factor, "modal speed", unit),
@@ -75,9 +75,9 @@ def _layers(plan: Plan, direction: FloatArray, speed: FloatArray) -> list[Path]:
     return [maps / "direction.tif", maps / "speed.tif"]
 
 
-def small_picture(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A picture reduced for the Prefect UI."""
-    factor = PREVIEW_SIDE_PX / max(picture.shape[:2])
+def make_preview(figure: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The figure reduced for the Prefect UI."""
+    factor = PREVIEW_SIDE_PX / max(figure.shape[:2])
     if factor >= 1:
-        return picture
-    return np.asarray(cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)
+        return figure
+    return np.asarray(cv2.resize(figure, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,6 +1,6 @@
 """Frames unlike their neighbours: blurred ones, and ones that do not belong to the flight.
 
-Both are defined by the frames around them, so they are looked for over the whole flight at once: the result is the same
+Both are defined by the frames around them, so they are detected over the whole flight at once: the result is the same
 however the flight is cut into units. Frames with another defect are neither tested nor anybody's neighbours.
 """
 

@@ -46,19 +46,19 @@ def chain_tracks(plan: Plan) -> StageResult:
 
 
 def explain_no_tracklets(plan: Plan) -> str:
-    """Why no car was followed, so that the maps stay empty, and what to do."""
-    told, near_s = "no tracklets, so the maps stay empty", plan.config.tracking.max_interval_s
+    """The reason why there are no tracklets, so that the maps are empty, and the remedy."""
+    effect, near_s = "no tracklets, so the maps are empty", plan.config.tracking.max_interval_s
     times_s = open_frames(plan.layout.frames).column("time_s")[usable_frames(plan)]
     if len(times_s) < 3:
-        return f"{told}: {len(times_s)} frames are registered well enough, 3 or more needed; see registration's notes"
+        return f"{effect}: {len(times_s)} frames are registered well enough, 3 or more needed; see registration's notes"
     gaps = np.diff(times_s)
     near = gaps <= near_s
     if (near[1:] & near[:-1]).any():
         return (
-            f"{told}: no find goes on over three frames as a car does; see in the page whether what is found is cars, "
-            "and else mark one frame and give it with --labels"
+            f"{effect}: no detection can be linked over three frames as a vehicle; check on the page whether "
+            "detections are vehicles, and if not label one frame and give it with --labels"
         )
     return (
-        f"{told}: no three registered frames come within tracking.max_interval_s = {near_s:g} s of one another (median "
-        f"{np.median(gaps):.2f} s); {widen_interval(gaps)}"
+        f"{effect}: no three registered frames are within tracking.max_interval_s = {near_s:g} s of one another "
+        f"(median {np.median(gaps):.2f} s); {widen_interval(gaps)}"
     )
