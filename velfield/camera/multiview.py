@@ -16,6 +16,9 @@ that resemble distortion and do not average out over the points:
   prior of flat ground. A hovering camera cannot separate the two, and the variance of its estimate says so.
 
 The variance combines the jackknife over frames, each left out with all its pairs, and what relief and centre may hide.
+
+`scipy.optimize.least_squares` cannot use this block structure: 20 pairs with 500 parameters take 0.1 s here; there they
+had not converged after 3 s, with sparse differences or without.
 """
 
 from collections.abc import Sequence

