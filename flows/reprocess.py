@@ -29,6 +29,7 @@ from velfield.pipeline.stages.rebase import Rebase, measure_rebase, plan_rebase
 from velfield.pipeline.stages.registration import lost_frames
 from velfield.pipeline.stages.report import write_report
 from velfield.run.commits import sweep_partial
+from velfield.run.flight_record import check_format
 from velfield.run.layout import RunLayout
 from velfield.run.lock import locked
 from velfield.run.results import (
@@ -77,6 +78,7 @@ def reprocess(
     root: str, base: str, name: str, full: bool, max_added_error_px: float, runner: RunnerConfig, console: Console
 ) -> tuple[Path, RunSummary | None]:
     """One run, a new base image, a new result beside the old one."""
+    check_format(Path(root))
     run = open_run(root)
     with locked(run.layout):
         mark_crashed(f"{root} on {name}")

@@ -149,7 +149,7 @@ class FieldConfig(Model):
     kernel_sigma_m_per_s: PositiveFloat = 0.7
     """Gaussian blob that a segment adds (the paper gives no width); best by held-out likelihood on real tracks."""
     velocity_span_s: float = Field(0.6, ge=0)
-    """A segment's velocity is averaged along its passage over this time; 0, preset ``paper``: each by itself."""
+    """A segment's velocity is averaged along its track over this time; 0, preset ``paper``: each by itself."""
     max_speed_m_per_s: PositiveFloat = 36.0
     """The histogram covers velocity components of up to this, either way."""
     lane_width_m: PositiveFloat = 3.5

@@ -8,8 +8,10 @@ from schemas.flight import FlightConfig
 from schemas.job import Inputs
 from schemas.model import Model
 
-FORMAT_VERSION = 1
-"""Version of the run folder's layout; a folder of another version is refused."""
+FORMAT_VERSION = 2
+"""Version of the run folder's layout."""
+READABLE_FORMATS = (1, FORMAT_VERSION)
+"""Versions that `velfield.open_run` reads; a run continues in a folder of the present one only."""
 
 
 class CommitRecord(Model):
@@ -22,11 +24,11 @@ class CommitRecord(Model):
     outputs: dict[str, str] = Field(default_factory=dict)
     """Path in the run folder -> BLAKE2b digest, of every file and every chunk of a store that the unit wrote."""
     counts: dict[str, float] = Field(default_factory=dict)
-    """What people ask of the unit: frames, cars, tracklets, pixels."""
+    """Counts of the unit: frames, cars, tracklets, pixels."""
     notes: tuple[str, ...] = ()
-    """What is worth telling of the unit, one line each."""
+    """Remarks on the unit, one line each."""
     warnings: tuple[str, ...] = ()
-    """What is to be minded, one line each."""
+    """Warnings, one line each."""
     seconds: float = Field(0.0, ge=0)
     code_version: str
 
@@ -79,10 +81,10 @@ class GridRecord(Model):
     crs_wkt: str | None = None
     affine: tuple[float, float, float, float, float, float] | None = None
     """Base pixel (column, row) -> CRS coordinates, GDAL's corner convention, as rasterio's ``Affine``."""
-    how: str
-    """``own``: built from the flight; ``given``: the picture given as ``--base``."""
-    frames_to: Literal["own", "given"] = "own"
-    """What frames are registered to: the flight's own base image, or straight to the given picture where it serves."""
+    base_source: Literal["flight", "given"]
+    """``flight``: the base image is built from the flight; ``given``: it is the image given as ``--base``."""
+    registered_to: Literal["flight", "given"] = "flight"
+    """What frames are registered to: the base image built from the flight, or directly the given one."""
     reference_frame: NonNegativeInt
     intersensor_error_px: float | None = None
     """Mean error at left-out points of the registration to the given picture."""
@@ -146,17 +148,17 @@ class ResultsRecord(Model):
 
 
 class WorkingRecord(Model):
-    """``base/working.json``: the grid that cars are looked for on, and what the detector was learnt from."""
+    """``base/working.json``: the detection grid, and what the detector was trained on."""
 
     scale: PositiveFloat
     """Working pixels a base pixel: a car is about ``working_car_length_px`` long on that grid."""
-    learnt_from: str
+    training_source: str
     """``labels``, ``motion``, ``file`` (a detector file), ``shipped`` or ``detections`` (another detector's boxes)."""
     has_background: bool = False
     """Whether ``base/background.npz`` holds the flight's background on the working grid."""
     labels: NonNegativeInt = 0
-    """Cars the detector was learnt from."""
-    purity: float | None = None
-    """Estimated share of labels from motion that are cars."""
-    coherence: float | None = None
-    """Share of what moves that goes along its length: about 1 for cars, less where roofs shift (parallax)."""
+    """Training labels of the detector."""
+    label_precision_estimate: float | None = None
+    """Estimated precision of the labels from motion."""
+    axial_motion_fraction: float | None = None
+    """Fraction of moving objects that move along their axis: about 1 for cars, less where roofs shift by parallax."""

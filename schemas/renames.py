@@ -89,6 +89,66 @@ def _renamed(value: Any, names: Mapping[str, str]) -> Any:
     return [_renamed(inner, names) for inner in value] if isinstance(value, list) else value
 
 
+OLD_FOLDERS: dict[str, str] = {"tracklets": "links", "tracks": "tracklets", "intervals": "slices"}
+"""Folder of a run, and stage -> its old name."""
+
+OLD_ARRAYS: dict[str, str] = {
+    "n_matches_base": "count_base",
+    "n_matches_previous": "count_previous",
+    "n_inliers": "count_kept",
+    "coverage": "spread",
+    "velocity_histogram_time_weighted": "velocity_histogram_by_time",
+    "occupancy_ms": "dwell_ms",
+    "velocity_variance_sum": "velocity_noise",
+    "mode_fraction": "mode_share",
+    "stationary_fraction": "standing_share",
+    "direction_ci90_half_width": "direction_half90",
+    "speed_p50_ci90_lower": "speed_p50_low90",
+    "speed_p50_ci90_upper": "speed_p50_high90",
+}
+"""Array of a Zarr store -> its old name."""
+
+OLD_ATTRIBUTES: dict[str, str] = {"time_interval": "slice"}
+"""Attribute of a field's store -> its old name."""
+
+OLD_WEIGHTS: dict[str, str] = {"track": "passage"}
+"""What a field is weighted by -> its old name."""
+
+OLD_FIELDS: dict[str, dict[str, str]] = {
+    "grid": {"how": "base_source", "frames_to": "registered_to"},
+    "working": {
+        "learnt_from": "training_source",
+        "purity": "label_precision_estimate",
+        "coherence": "axial_motion_fraction",
+    },
+    "report": {"few": "low_coverage_note"},
+    "precision_recall": {"chosen": "operating_point", "evidence": "description"},
+    "commit_counts": {"passages": "tracks"},
+}
+"""Record of a run folder -> its old field -> field."""
+
+OLD_FIELD_VALUES: dict[str, dict[object, object]] = {
+    "base_source": {"own": "flight"},
+    "registered_to": {"own": "flight"},
+}
+"""Field of a record -> old value -> value."""
+
+
+def upgrade_record(kind: str, record: Mapping[str, Any]) -> dict[str, Any]:
+    """A record of format 1 by the present names of its fields; ``kind`` is one of `OLD_FIELDS`.
+
+    Examples
+    --------
+    >>> upgrade_record("grid", {"how": "own", "width_px": 800})
+    {'base_source': 'flight', 'width_px': 800}
+    """
+    present = {OLD_FIELDS[kind].get(name, name): value for name, value in record.items()}
+    return {
+        name: OLD_FIELD_VALUES.get(name, {}).get(value, value) if isinstance(value, str) else value
+        for name, value in present.items()
+    }
+
+
 def upgrade_config(tree: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """A configuration of either format by the present names, and a line for each old name that was found.
 

@@ -1,4 +1,4 @@
-"""What the report shows, apart from its pictures."""
+"""What the report shows, apart from its figures."""
 
 from typing import Literal
 
@@ -29,18 +29,18 @@ class ResidualSeries(Model):
 
 
 class PrecisionRecall(Model):
-    """The detector's curve on its training evidence or on frames held out."""
+    """Precision against recall of the detector on held-out labels or frames."""
 
     recall: tuple[float, ...]
     precision: tuple[float, ...]
-    chosen: int | None = None
-    """Index of the point that the threshold stands at."""
-    evidence: str = ""
+    operating_point: int | None = None
+    """Index of the score threshold in use."""
+    description: str = ""
     """What the curve was measured on."""
 
 
 class Report(Model):
-    """A run, as its report tells it."""
+    """The contents of a run's report."""
 
     title: str
     source: str
@@ -50,34 +50,34 @@ class Report(Model):
     version: str
     facts: tuple[tuple[str, str], ...] = ()
     """Headline numbers: label and value."""
-    few: str = ""
-    """What is to be said where hardly any pixel was passed by several vehicles."""
+    low_coverage_note: str = ""
+    """A note for people where hardly any pixel was passed by several vehicles."""
     inputs: tuple[tuple[str, str], ...] = ()
     """What went in: base image, ground distance, labels, preset; label and value."""
     stages: tuple[ReportStage, ...] = ()
     residual: ResidualSeries | None = None
     detection: PrecisionRecall | None = None
     gates: dict[str, int] = Field(default_factory=dict)
-    """What tracking tried, turned down and kept, by the names of `velfield.tracking.limits.GateLog`."""
+    """What tracking tried, rejected and kept, by the names of `velfield.tracking.limits.GateLog`."""
     notes: tuple[str, ...] = ()
-    """What is worth telling of the stages."""
+    """Remarks of the stages."""
     warnings: tuple[str, ...] = ()
-    """What is to be minded."""
+    """Warnings of the stages."""
     frames_lost: tuple[str, ...] = ()
     files: tuple[tuple[str, str], ...] = ()
     """Files of the run folder worth opening: path relative to the report, and what it is."""
 
 
 class ReportFigure(Model):
-    """A picture of the report: its bytes go into the page, or the page names its file."""
+    """A figure of the report: its bytes go into the page, or the page refers to its file."""
 
     title: str
     caption: str
-    alternative: str
-    """What the picture shows, for those who do not see it."""
+    alt_text: str
+    """What the image shows, for those who do not see it."""
     mime: Literal["image/png", "image/jpeg"]
     data: bytes = Field(b"", repr=False)
     file: str | None = None
-    """Path of the picture, relative to the report, in place of its bytes."""
+    """Path of the image, relative to the report, in place of its bytes."""
     full_size: str | None = None
-    """Path of the full picture, relative to the report."""
+    """Path of the image at full size, relative to the report."""

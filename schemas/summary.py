@@ -1,4 +1,4 @@
-"""What a run says of itself at the end: a line a stage, warnings, what was lost."""
+"""Summary of a run: a line a stage, warnings, what was lost."""
 
 from pydantic import Field
 
@@ -16,9 +16,9 @@ class StageSummary(Model):
     """Units that failed in every try: done again by the next run."""
     counts: dict[str, float] = Field(default_factory=dict)
     notes: tuple[str, ...] = ()
-    """What is worth telling."""
+    """Remarks, one line each."""
     warnings: tuple[str, ...] = ()
-    """What is to be minded."""
+    """Warnings, one line each."""
     seconds: float
     """What this run spent on it."""
     seconds_before: float = 0.0

@@ -14,7 +14,7 @@ DETECTION_COLUMNS: dict[str, str] = {
 
 TRACKLET_COLUMNS: dict[str, str] = {
     "tracklet_id": "int64",  # the detection_id of its middle detection: a detection is in the middle of at most one
-    "passage_id": "int64",  # the smallest detection_id of the chain: one vehicle going by
+    "track_id": "int64",  # the smallest detection_id of the vehicle's track; -1 until tracklets are chained
     "frame_0": "int32",
     "frame_1": "int32",
     "frame_2": "int32",
@@ -41,12 +41,16 @@ TRACKLET_COLUMNS: dict[str, str] = {
     "confidence": "float32",  # [0, 1]
 }
 
+TRACK_COLUMNS: dict[str, str] = TRACKLET_COLUMNS | {"passage_id": "int64"}
+"""Tracklets with the track that they belong to. ``passage_id``, the old name of ``track_id``, is deprecated: it holds
+the same values, and the next format drops it."""
+
 LABEL_COLUMNS: dict[str, str] = {
     "frame": "str",  # a picture's file name, or a video's 0-based frame index, as text
     "x_px": "float64",  # raw pixels
     "y_px": "float64",
-    "orientation_rad": "float64",  # NaN where the label does not tell
-    "length_px": "float64",  # NaN where the label does not tell
+    "orientation_rad": "float64",  # NaN where the label does not give it
+    "length_px": "float64",  # NaN where the label does not give it
     "width_px": "float64",
-    "tilt_rad": "float64",  # |angle| to the picture's rows: of a car in an upright box, whose axis it does not tell
+    "abs_box_angle_rad": "float64",  # |angle| of the car's axis to the rows, from the sides of an upright box
 }

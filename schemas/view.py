@@ -6,8 +6,8 @@ from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 
 from schemas.model import Model
 
-LayerKind = Literal["direction", "speed", "count", "angle", "share", "time", "plain", "change"]
-"""How a layer is coloured and in what unit it is said."""
+LayerKind = Literal["direction", "speed", "count", "angle", "fraction", "time", "plain", "change"]
+"""How a layer is coloured, and in what unit it is shown."""
 
 
 class ViewLayer(Model):
@@ -15,17 +15,17 @@ class ViewLayer(Model):
 
     name: str
     title: str
-    about: str
+    description: str
     """One sentence: what the numbers mean."""
     kind: LayerKind
     arrays: tuple[str, ...] = Field(min_length=1, max_length=2)
     """Arrays of ``field.zarr``: one, or the x and y components of a velocity."""
     units: str
     """Of what is stored."""
-    top: float
-    """Where the colours end, in stored units; of a change, on either side of zero."""
-    highest: float
-    """The greatest size of a value: what is above the top gets the last colour, and the legend says so."""
+    colour_max: float
+    """Value of the last colour, in stored units; of a change, on either side of zero."""
+    data_max: float
+    """Largest magnitude in the data: values above ``colour_max`` get the last colour, and the legend notes it."""
     main: bool = False
     """Whether it stands among the first in the list."""
 
@@ -53,14 +53,14 @@ class ViewBase(Model):
 
 
 class ViewSegments(Model):
-    """``view/segments.zarr``: vehicles from one frame to the next, sorted by passage and time."""
+    """``view/segments.zarr``: vehicles from one frame to the next, sorted by track and time."""
 
     count: NonNegativeInt
-    passages: NonNegativeInt
+    tracks: NonNegativeInt
     settle_px: PositiveFloat
-    """Who crosses a line and comes back without going farther than this, has not crossed it."""
-    reach_px: PositiveFloat
-    """Who comes within this of a pixel has passed it: the half width of the band that the field counts."""
+    """A vehicle that comes back over a line before it is this far from it has not crossed it."""
+    band_radius_px: PositiveFloat
+    """A vehicle within this distance of a pixel has passed it: half the width of the path that the field counts."""
 
 
 class ViewRecord(Model):
@@ -70,7 +70,7 @@ class ViewRecord(Model):
     height_px: PositiveInt
     gsd_m: PositiveFloat | None
     north_rad: float | None
-    """Where north is in the picture, from +x towards +y (down)."""
+    """Direction of north in the base image, from +x towards +y (down)."""
     stationary_speed_px_per_s: PositiveFloat
     first_time_s: float
     last_time_s: float
@@ -81,5 +81,5 @@ class ViewRecord(Model):
     layers: tuple[ViewLayer, ...]
     arrays: dict[str, ViewArray]
     segments: ViewSegments
-    few: str = ""
-    """What is to be said where hardly any pixel was passed by several vehicles."""
+    low_coverage_note: str = ""
+    """A note for people where hardly any pixel was passed by several vehicles."""

@@ -19,7 +19,7 @@ from velfield.field.time_intervals import parse_time_intervals
 from velfield.pipeline.stages.field import accumulate_group, create_field_stores, field_groups
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run, open_run
-from velfield.run.tables import write_table
+from velfield.run.tables import write_tracks
 from velfield.synthetic.flight import Flight
 from velfield.synthetic.observed import observed_tracklets
 
@@ -50,7 +50,7 @@ def tracklets_along(paths: Sequence[FloatArray], *, interval_s: float = 0.2) -> 
     rows = []
     for number, path in enumerate(paths):
         for frame, window in enumerate(sliding_window_view(path, 3, axis=0).transpose(0, 2, 1)):
-            row: dict[str, float] = {"confidence": 1.0, "passage_id": number}
+            row: dict[str, float] = {"confidence": 1.0, "track_id": number}
             for k, (x, y) in enumerate(window):
                 row |= {
                     f"frame_{k}": frame + k,
@@ -80,8 +80,8 @@ def field_run(
     layout = RunLayout(root)
     for folder in (layout.tracks, layout.base):
         folder.mkdir(parents=True)
-    write_table(layout.tracks / "unit-00000.parquet", tracklets, TRACKLET_COLUMNS)
-    grid = GridRecord(width_px=shape[1], height_px=shape[0], gsd_m=gsd_m, how="given", reference_frame=0)
+    write_tracks(layout.tracks / "unit-00000.parquet", tracklets)
+    grid = GridRecord(width_px=shape[1], height_px=shape[0], gsd_m=gsd_m, base_source="given", reference_frame=0)
     layout.grid.write_text(grid.model_dump_json())
     cv2.imwrite(str(layout.base_image), np.full(shape, 90, np.uint8))
     flight_config = FlightConfig(gsd_m=gsd_m, field=config or FieldConfig())

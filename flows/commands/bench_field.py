@@ -12,7 +12,7 @@ def field(
     sigma: tuple[float, ...] = (0.35, 0.7, 1.4),
     width: tuple[float, ...] = (1.0, 2.0, 3.0),
 ) -> int:
-    """Learn the field from every other passage, judge it by the rest: beside one distribution and a Gaussian a pixel.
+    """Learn the field from every other track, judge it by the rest: beside one distribution and a Gaussian a pixel.
 
     Parameters
     ----------

@@ -56,8 +56,10 @@ def _repair(run: "Run") -> None:
     from flows.runners import RunnerConfig
     from schemas.job import Job
     from velfield.pipeline.verify import invalidate, verify_run
+    from velfield.run.flight_record import check_format
     from velfield.run.lock import locked
 
+    check_format(run.layout.root)
     given = _inputs(run.record, run.layout.root)
     job = Job(root=str(run.layout.root), inputs=given, config=run.record.config)
     _same_inputs(job, run.record)

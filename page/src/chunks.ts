@@ -83,7 +83,7 @@ export async function readColumn<T extends Numbers>(name: string): Promise<T> {
   const chunks = length === 0 ? 0 : Math.ceil(length / array.chunks[0]!);
   const parts = await Promise.all(Array.from({ length: chunks }, (_, k) => array.getChunk([k])));
   if (parts.length === 1) return (parts[0]!.data as T).subarray(0, length) as T;
-  const Type = name === "passage" ? Int32Array : name === "start_s" ? Float64Array : Float32Array;
+  const Type = name === "track" ? Int32Array : name === "start_s" ? Float64Array : Float32Array;
   const whole = new Type(length);
   parts.forEach((part, k) => whole.set((part.data as T).subarray(0, length - k * array.chunks[0]!), k * array.chunks[0]!));
   return whole as unknown as T;

@@ -4,7 +4,7 @@ import type { Point } from "./place";
 import type { Segments } from "./tracks";
 
 export interface Crossing {
-  passage: number;
+  track: number;
   time_s: number;
   vx: number;
   vy: number;
@@ -13,13 +13,13 @@ export interface Crossing {
   direction: 1 | -1;
 }
 
-/** Crossings of the line, by passage and time; who comes back before `settlePx` from it has not crossed it. */
+/** Crossings of the line, by track and time; who comes back before `settlePx` from it has not crossed it. */
 export function lineCrossings(segments: Segments, start: Point, end: Point, settlePx: number): Crossing[] {
   const [dx, dy] = [end.x - start.x, end.y - start.y];
   const length = Math.max(Math.hypot(dx, dy), 1e-9);
   const right = (x: number, y: number): number => (dx * (y - start.y) - dy * (x - start.x)) / length;
   const along = (x: number, y: number): number => (dx * (x - start.x) + dy * (y - start.y)) / length ** 2;
-  const { x0_px, y0_px, x1_px, y1_px, passage } = segments;
+  const { x0_px, y0_px, x1_px, y1_px, track } = segments;
   const after = (row: number): number => right(x1_px[row]!, y1_px[row]!);
 
   const found: Crossing[] = [];
@@ -36,7 +36,7 @@ export function lineCrossings(segments: Segments, start: Point, end: Point, sett
     const place = a + share * (b - a);
     if (place < 0 || place > 1) continue;
     const last = stack.at(-1);
-    if (last && passage[last.row] !== passage[row]) settle();
+    if (last && track[last.row] !== track[row]) settle();
     const out = stack.at(-1);
     if (out && after(out.row) >= 0 !== to >= 0 && excursion(after, out.row, row) < settlePx) stack.pop();
     else stack.push({ row, share });
@@ -55,7 +55,7 @@ function excursion(after: (row: number) => number, out: number, back: number): n
 function crossing(segments: Segments, row: number, share: number, after: number): Crossing {
   const [vx, vy] = [segments.vx_px_per_s[row]!, segments.vy_px_per_s[row]!];
   return {
-    passage: segments.passage[row]!,
+    track: segments.track[row]!,
     time_s: segments.start_s[row]! + share * segments.duration_s[row]!,
     vx,
     vy,

@@ -9,24 +9,24 @@ const WHEEL_PX = 132;
 
 export interface Legend {
   element: HTMLElement;
-  /** Where the colours end, in stored units. */
-  top: number;
+  /** Value of the last colour, in stored units. */
+  colourMax: number;
 }
 
 export function makeLegend(layer: Layer, run: Run, units: Units): Legend {
-  if (layer.kind === "direction") return { element: wheel(layer, run), top: layer.top };
+  if (layer.kind === "direction") return { element: wheel(layer, run), colourMax: layer.colour_max };
   const { factor, unit } = units.shown(layer);
-  const end = layer.kind === "share" ? 100 : roundUp(layer.top * factor);
-  const about = make("p", { class: "note" }, layer.about, clipped(layer, end, factor, unit));
-  return { element: make("div", {}, bar(layer, end, unit), about), top: end / factor };
+  const end = layer.kind === "fraction" ? 100 : roundUp(layer.colour_max * factor);
+  const note = make("p", { class: "note" }, layer.description, clipped(layer, end, factor, unit));
+  return { element: make("div", {}, bar(layer, end, unit), note), colourMax: end / factor };
 }
 
-/** A few values that are far above all others would flatten the colours: what is said of those that are cut off. */
+/** The note on values above the last colour: outliers would compress the scale of all others. */
 function clipped(layer: Layer, end: number, factor: number, unit: string): string {
-  const highest = layer.highest * factor;
-  if (!(highest > end * (1 + 1e-6))) return "";
-  const most = `${+highest.toPrecision(3)}${unit && ` ${unit}`}`;
-  return ` Above ${+end.toPrecision(4)} all has the last colour; the highest is ${most}.`;
+  const largest = layer.data_max * factor;
+  if (!(largest > end * (1 + 1e-6))) return "";
+  const most = `${+largest.toPrecision(3)}${unit && ` ${unit}`}`;
+  return ` Values above ${+end.toPrecision(4)} have the last colour; the maximum is ${most}.`;
 }
 
 function bar(layer: Layer, end: number, unit: string): HTMLElement {
@@ -69,7 +69,7 @@ function wheel(layer: Layer, run: Run): HTMLElement {
   const names: [string, number][] =
     north === null ? [["up", -Math.PI / 2]] : [..."NESW"].map((name, k) => [name, north + (k * Math.PI) / 2]);
   for (const [name, angle] of names) context.fillText(name, at(angle, 56), at(angle - Math.PI / 2, 56));
-  const note = north === null ? `${layer.about} North is not known: up is the picture's.` : layer.about;
+  const note = north === null ? `${layer.description} North is not known: up is that of the image.` : layer.description;
   return make("div", { class: "wheel" }, canvas, make("p", { class: "note" }, note));
 }
 

@@ -90,7 +90,7 @@ export class Overlay extends L.GridLayer {
   constructor(
     private readonly field: Field,
     private readonly shown: Layer,
-    private readonly top: number,
+    private readonly colourMax: number,
     private readonly least: number,
     opacity: number,
     private readonly failed: (error: unknown) => void,
@@ -141,7 +141,7 @@ export class Overlay extends L.GridLayer {
   private picture(data: (Numbers | null)[], side: number, level: number): ImageData {
     const step = 2 ** level;
     const picture = new ImageData(side / step, side / step);
-    const paint = painter(this.shown, this.top, this.field.run.stationary_speed_px_per_s);
+    const paint = painter(this.shown, this.colourMax, this.field.run.stationary_speed_px_per_s);
     const [a, b] = [data[0]!, data.length === 3 ? data[1]! : data[0]!];
     const count = data[data.length - 1];
     for (let j = 0, at = 0; j < side; j += step) {

@@ -16,8 +16,8 @@ export interface Mode {
 }
 
 /** The largest modes, by share; the histogram is (n, n) flat, x fastest. */
-export function findModes(h: Int32Array, n: number, passages: number): Mode[] {
-  const window = Math.max(WINDOW_BINS * Math.max(passages, 1) ** (-1 / 6), LEAST_WINDOW_BINS);
+export function findModes(h: Int32Array, n: number, tracks: number): Mode[] {
+  const window = Math.max(WINDOW_BINS * Math.max(tracks, 1) ** (-1 / 6), LEAST_WINDOW_BINS);
   const found: Mode[] = [];
   for (let y = 0; y < n; y++) {
     for (let x = 0; x < n; x++) {

@@ -18,27 +18,27 @@ export interface PixelAnswer {
   values: Record<string, number>;
 }
 
-/** What is told of a pixel, where the field holds it. `..._low90`, `_high90` and `_half90` are 90 % intervals. */
+/** What is told of a pixel, where the field holds it. `..._ci90_lower`, `_ci90_upper` and `_ci90_half_width` are 90 % intervals. */
 const WANTED = [
   "count",
   "modal_vx",
   "modal_vy",
-  "direction_half90",
+  "direction_ci90_half_width",
   "direction_se",
   "speed_p15",
-  "speed_p15_low90",
-  "speed_p15_high90",
+  "speed_p15_ci90_lower",
+  "speed_p15_ci90_upper",
   "speed_p50",
-  "speed_p50_low90",
-  "speed_p50_high90",
+  "speed_p50_ci90_lower",
+  "speed_p50_ci90_upper",
   "speed_se",
   "speed_p85",
-  "speed_p85_low90",
-  "speed_p85_high90",
-  "standing_share",
+  "speed_p85_ci90_lower",
+  "speed_p85_ci90_upper",
+  "stationary_fraction",
 ];
 /** What makes another value needless. */
-const BETTER: Record<string, string> = { direction_se: "direction_half90", speed_se: "speed_p50_low90" };
+const BETTER: Record<string, string> = { direction_se: "direction_ci90_half_width", speed_se: "speed_p50_ci90_lower" };
 
 export async function askPixel(field: Field, { x, y }: Point): Promise<PixelAnswer> {
   const names = WANTED.filter((name) => field.has(name) && !field.has(BETTER[name] ?? ""));
@@ -83,7 +83,7 @@ export function showPixel(answer: PixelAnswer, field: Field, units: Units, away:
 }
 
 function errorNote(values: Record<string, number>): string {
-  if ("direction_half90" in values) return "In grey beside a number: its 90 % interval.";
+  if ("direction_ci90_half_width" in values) return "In grey beside a number: its 90 % interval.";
   return "direction_se" in values ? "± is one standard error." : "";
 }
 
@@ -94,7 +94,7 @@ function rows({ n, values }: PixelAnswer, field: Field, units: Units): [string, 
   const heading = make("span", {}, ...(moving ? [arrow(direction), " "] : []));
   heading.append(
     told("direction", direction, moving ? units.headingDegrees(direction) : "stands"),
-    plusMinus(values.direction_half90 ?? values.direction_se, (half) => `${((half * 180) / Math.PI).toFixed(1)}°`),
+    plusMinus(values.direction_ci90_half_width ?? values.direction_se, (half) => `${((half * 180) / Math.PI).toFixed(1)}°`),
     moving ? units.headingPoint(direction) : "",
   );
   const listed: [string, Node | string][] = [
@@ -109,9 +109,9 @@ function rows({ n, values }: PixelAnswer, field: Field, units: Units): [string, 
   ] as const) {
     if (name in values) listed.push([label, speedCell(name, values[name]!, values, units)]);
   }
-  if ("standing_share" in values) {
-    const share = values.standing_share!;
-    listed.push(["Stand here", told("standing_share", share, `${Math.round(100 * share)} %`)]);
+  if ("stationary_fraction" in values) {
+    const share = values.stationary_fraction!;
+    listed.push(["Stand here", told("stationary_fraction", share, `${Math.round(100 * share)} %`)]);
   }
   return listed;
 }
@@ -119,7 +119,7 @@ function rows({ n, values }: PixelAnswer, field: Field, units: Units): [string, 
 function speedCell(name: string, speed: number, values: Record<string, number>, units: Units): HTMLElement {
   const cell = make("span", {}, told(name, speed, units.speedText(speed)));
   const shown = (pxPerS: number): string => (pxPerS * units.perPxPerS).toFixed(1);
-  const [low, high] = [values[`${name}_low90`], values[`${name}_high90`]];
+  const [low, high] = [values[`${name}_ci90_lower`], values[`${name}_ci90_upper`]];
   if (low !== undefined && high !== undefined) {
     if (Number.isFinite(low)) cell.append(make("span", { class: "error" }, ` ${shown(low)} to ${shown(high)}`));
   } else if (name === "speed_p50") cell.append(plusMinus(values.speed_se, shown));
@@ -140,7 +140,7 @@ function modeRow(mode: Mode, k: number, field: Field, units: Units): (Node | str
 }
 
 /** Who passed near the pixel, when and how fast. */
-export function showPassages(near: Near[], index: TrackIndex, units: Units): HTMLElement {
+export function showTracks(near: Near[], index: TrackIndex, units: Units): HTMLElement {
   const most = 50;
   const s = index.segments;
   const table = grid(
@@ -152,5 +152,5 @@ export function showPassages(near: Near[], index: TrackIndex, units: Units): HTM
   );
   const more = near.length > most ? [make("p", { class: "note" }, `and ${near.length - most} more`)] : [];
   const summary = make("summary", {}, `Who passed: ${near.length}`);
-  return make("details", { class: "passages", "data-count": String(near.length) }, summary, table, ...more);
+  return make("details", { class: "tracks", "data-count": String(near.length) }, summary, table, ...more);
 }

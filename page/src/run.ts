@@ -1,16 +1,16 @@
 // What view/run.json holds (schemas/view.py) and where the page's files stand.
 
-export type LayerKind = "direction" | "speed" | "count" | "angle" | "share" | "time" | "plain" | "change";
+export type LayerKind = "direction" | "speed" | "count" | "angle" | "fraction" | "time" | "plain" | "change";
 
 export interface Layer {
   name: string;
   title: string;
-  about: string;
+  description: string;
   kind: LayerKind;
   arrays: string[];
   units: string;
-  top: number;
-  highest: number;
+  colour_max: number;
+  data_max: number;
   main: boolean;
 }
 
@@ -37,12 +37,12 @@ export interface Run {
   base: { levels: number; tile: number };
   layers: Layer[];
   arrays: Record<string, StoredArray>;
-  segments: { count: number; passages: number; settle_px: number; reach_px: number };
-  /** Said where hardly any pixel was passed by several vehicles. */
-  few: string;
+  segments: { count: number; tracks: number; settle_px: number; band_radius_px: number };
+  /** A note for people where hardly any pixel was passed by several vehicles. */
+  low_coverage_note: string;
 }
 
-/** What people are told when something cannot be read. */
+/** A file or an array cannot be read: the message is for people. */
 export class Unreadable extends Error {}
 
 /** A file of the run folder, as it is now: a browser that kept an older one asks whether it changed. */

@@ -7,7 +7,7 @@ const CELL_PX = 32;
 
 export interface Segments {
   count: number;
-  passage: Int32Array;
+  track: Int32Array;
   start_s: Float64Array;
   duration_s: Float32Array;
   x0_px: Float32Array;
@@ -20,16 +20,16 @@ export interface Segments {
 
 export async function loadSegments(run: Run): Promise<Segments> {
   const reals = ["duration_s", "x0_px", "y0_px", "x1_px", "y1_px", "vx_px_per_s", "vy_px_per_s"] as const;
-  const [passage, start_s, ...columns] = await Promise.all([
-    readColumn<Int32Array>("passage"),
+  const [track, start_s, ...columns] = await Promise.all([
+    readColumn<Int32Array>("track"),
     readColumn<Float64Array>("start_s"),
     ...reals.map((name) => readColumn<Float32Array>(name)),
   ]);
   const named = Object.fromEntries(reals.map((name, k) => [name, columns[k]!])) as Record<(typeof reals)[number], Float32Array>;
-  return { count: run.segments.count, passage, start_s, ...named };
+  return { count: run.segments.count, track, start_s, ...named };
 }
 
-/** A passage near a place: its rows, and the row that comes nearest. */
+/** A track near a place: its rows, and the row that comes nearest. */
 export interface Near {
   first: number;
   last: number;
@@ -62,16 +62,16 @@ export class TrackIndex {
     else this.cells.set(key, [row]);
   }
 
-  /** Passages that come within `radius` px, in the order of time. */
+  /** Tracks that come within `radius` px, in the order of time. */
   near(x: number, y: number, radius: number): Near[] {
     const best = new Map<number, { row: number; distance: number }>();
     for (let j = cell(y - radius); j <= cell(y + radius); j++) {
       for (let i = cell(x - radius); i <= cell(x + radius); i++) {
         for (const row of this.cells.get(j * this.columns + i) ?? []) {
           const distance = this.distance(row, x, y);
-          const passage = this.segments.passage[row]!;
-          const known = best.get(passage);
-          if (distance <= radius && (!known || distance < known.distance)) best.set(passage, { row, distance });
+          const track = this.segments.track[row]!;
+          const known = best.get(track);
+          if (distance <= radius && (!known || distance < known.distance)) best.set(track, { row, distance });
         }
       }
     }
@@ -80,10 +80,10 @@ export class TrackIndex {
   }
 
   private whole(row: number): Near {
-    const { passage, count } = this.segments;
+    const { track, count } = this.segments;
     let [first, last] = [row, row];
-    while (first > 0 && passage[first - 1] === passage[row]) first--;
-    while (last < count - 1 && passage[last + 1] === passage[row]) last++;
+    while (first > 0 && track[first - 1] === track[row]) first--;
+    while (last < count - 1 && track[last + 1] === track[row]) last++;
     return { first, last, nearest: row };
   }
 
@@ -96,7 +96,7 @@ export class TrackIndex {
     return Math.hypot(x - x0 - along * dx, y - y0 - along * dy);
   }
 
-  /** The path of a passage, (x, y) by (x, y). */
+  /** The path of a track, (x, y) by (x, y). */
   path({ first, last }: Near): [number, number][] {
     const s = this.segments;
     const path: [number, number][] = [[s.x0_px[first]!, s.y0_px[first]!]];

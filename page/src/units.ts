@@ -70,7 +70,7 @@ export class Units {
     if (layer.units === "px s-1") return { factor: this.perPxPerS, unit: this.speed };
     if (layer.units === "rad") return { factor: 180 / Math.PI, unit: "degrees" };
     if (layer.units === "ms") return { factor: 1e-3, unit: "s" };
-    if (layer.kind === "share") return { factor: 100, unit: "%" };
+    if (layer.kind === "fraction") return { factor: 100, unit: "%" };
     if (layer.units === "vehicles h-1") return { factor: 1, unit: "vehicles an hour" };
     return { factor: 1, unit: layer.kind === "count" ? "vehicles" : "" };
   }

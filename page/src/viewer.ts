@@ -10,7 +10,7 @@ import { Field } from "./field";
 import { makeLegend } from "./legend";
 import { showLine } from "./line";
 import { makeMap, Overlay } from "./map";
-import { askPixel, showPassages, showPixel } from "./pixel";
+import { askPixel, showTracks, showPixel } from "./pixel";
 import { toLatLng, toPoint, type Point } from "./place";
 import { loadRun, type Layer, type Run } from "./run";
 import { readState, writeState, type State } from "./state";
@@ -64,7 +64,7 @@ class Viewer {
     find("legend").replaceChildren(legend.element);
     this.overlay?.remove();
     const { least, opacity } = this.state;
-    this.overlay = new Overlay(this.field, layer, legend.top, least, opacity / 100, (error) => this.fail(error));
+    this.overlay = new Overlay(this.field, layer, legend.colourMax, least, opacity / 100, (error) => this.fail(error));
     this.overlay.addTo(this.map);
   }
 
@@ -108,17 +108,17 @@ class Viewer {
         if (asked !== this.asked) return; // another pixel was asked since
         this.answer(showPixel(answer, this.field, this.units, away));
         find("answer").dataset.milliseconds = (performance.now() - started).toFixed(1);
-        if (answer.n) this.addPassages(place, asked);
+        if (answer.n) this.addTracks(place, asked);
       })
       .catch((error) => this.fail(error));
   }
 
-  private addPassages(place: Point, asked: number): void {
+  private addTracks(place: Point, asked: number): void {
     this.tracks()
       .then((index) => {
         if (asked !== this.asked) return;
-        const near = index.near(place.x, place.y, this.run.segments.reach_px);
-        find("answer").firstElementChild?.append(showPassages(near, index, this.units));
+        const near = index.near(place.x, place.y, this.run.segments.band_radius_px);
+        find("answer").firstElementChild?.append(showTracks(near, index, this.units));
         if (this.state.tracks) this.drawings.showTracks(near, index);
       })
       .catch((error) => this.fail(error));
@@ -244,7 +244,7 @@ class Viewer {
       unit.disabled = true;
       unit.title = "metres a pixel are not known: give --gsd-m";
     }
-    find("few").textContent = this.run.few;
+    find("coverage-note").textContent = this.run.low_coverage_note;
     find<HTMLInputElement>("opacity").value = String(this.state.opacity);
     find<HTMLInputElement>("least").value = String(this.state.least);
     find<HTMLInputElement>("tracks").checked = this.state.tracks;

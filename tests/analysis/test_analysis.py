@@ -92,7 +92,7 @@ def test_a_u_turn_is_found_and_a_roundabout_a_right_turn_and_a_straight_are_not(
         ]
     )
     found = find_u_turns(segments, stationary_speed_px_per_s=4.0, max_path_px=120)
-    assert found.passage_id.tolist() == [1]
+    assert found.track_id.tolist() == [1]
     assert np.hypot(found.x_px[0] - 120, found.y_px[0] - 100) < 12
     assert found.turn_rad[0] > math.radians(150)
 

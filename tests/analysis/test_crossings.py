@@ -33,7 +33,7 @@ BOTTOM, TOP = (50.0, 100.0), (50.0, 0.0)  # a line across a road that goes along
 def test_each_vehicle_crosses_once_in_its_direction() -> None:
     found = find_crossings(tracks(straight(3, 40, 12, 0), straight(97, 60, -6, 0)), BOTTOM, TOP, hysteresis_px=8)
     assert found["direction"].tolist() == [1, -1]  # looking up from the bottom, the first goes from left to right
-    assert found["passage"].tolist() == [0, 1]
+    assert found["track_id"].tolist() == [0, 1]
     np.testing.assert_allclose(found["speed_px_per_s"], [60, 30])
     np.testing.assert_allclose(found["time_s"], [47 / 60, 47 / 30])
     np.testing.assert_allclose(found[["x_px", "y_px"]], [[50, 40], [50, 60]])

@@ -33,7 +33,7 @@ def main(seed: int) -> None:
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
             seconds, pixels, idle_mb, peak_mb = pool.submit(_build, plan).result()
         size = sum(path.stat().st_size for path in plan.layout.field.rglob("*") if path.is_file())
-    print(f"{len(tracklets)} tracklets of {tracklets['passage_id'].nunique()} vehicles, base image {flight.base_shape}")
+    print(f"{len(tracklets)} tracklets of {tracklets['track_id'].nunique()} vehicles, base image {flight.base_shape}")
     print(f"field.zarr {size / 1e6:.1f} MB, {pixels} pixels known, built in {seconds:.1f} s")
     print(f"a worker: {idle_mb:.0f} MB before, {peak_mb:.0f} MB at most")
 
@@ -41,15 +41,14 @@ def main(seed: int) -> None:
 def _plan(root: Path, shape: tuple[int, int], tracklets: Any) -> Any:
     """A run folder whose tracklets are these."""
     from schemas.records import GridRecord
-    from schemas.tables import TRACKLET_COLUMNS
     from tests.pipeline.test_estimate import planned
     from velfield.run.commits import write_atomically
-    from velfield.run.tables import write_table
+    from velfield.run.tables import write_tracks
 
     plan = planned(FRAMES, root, WIDTH, HEIGHT)
-    grid = GridRecord(width_px=shape[1], height_px=shape[0], gsd_m=GSD_M, how="given", reference_frame=0)
+    grid = GridRecord(width_px=shape[1], height_px=shape[0], gsd_m=GSD_M, base_source="given", reference_frame=0)
     write_atomically(plan.layout.grid, grid.model_dump_json().encode())
-    write_table(plan.layout.unit_file(plan.layout.tracks, 0, ".parquet"), tracklets, TRACKLET_COLUMNS)
+    write_tracks(plan.layout.unit_file(plan.layout.tracks, 0, ".parquet"), tracklets)
     return plan
 
 

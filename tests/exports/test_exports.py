@@ -33,17 +33,17 @@ PIXELS = Georeference((200, 300), gsd_m=GSD_M)
 
 
 def tracklets_of(paths):
-    """Tracklets of vehicles at constant velocity, 5 frames a second; passage -> (x, y, vx, vy, frames)."""
+    """Tracklets of vehicles at constant velocity, 5 frames a second; track -> (x, y, vx, vy, frames)."""
     rows = []
-    for passage, (x, y, vx, vy, frames) in paths.items():
+    for track, (x, y, vx, vy, frames) in paths.items():
         for first in range(frames - 2):
             row = dict.fromkeys(TRACKLET_COLUMNS, 0.0) | {
-                "tracklet_id": passage * 100 + first + 1,
-                "passage_id": passage,
+                "tracklet_id": track * 100 + first + 1,
+                "track_id": track,
             }
             for k in range(3):
                 time_s = 10 + 0.2 * (first + k)
-                row |= {f"frame_{k}": first + k, f"detection_id_{k}": passage * 100 + first + k, f"time_{k}_s": time_s}
+                row |= {f"frame_{k}": first + k, f"detection_id_{k}": track * 100 + first + k, f"time_{k}_s": time_s}
                 row |= {f"x_{k}_px": x + vx * (time_s - 10), f"y_{k}_px": y + vy * (time_s - 10)}
             for part in ("01", "12"):
                 row |= {f"vx_{part}_px_per_s": vx, f"vy_{part}_px_per_s": vy}
@@ -56,10 +56,10 @@ def tracklets():
     return tracklets_of({1: (10.0, 100.0, 40.0, 0.0, 5), 2: (200.0, 150.0, 0.0, -30.0, 3)})
 
 
-def test_a_passage_has_each_of_its_detections_once(tracklets):
+def test_a_track_has_each_of_its_detections_once(tracklets):
     points = track_points(tracklets)
-    assert points.groupby("passage_id").size().to_dict() == {1: 5, 2: 3}
-    first = points[points["passage_id"] == 1]
+    assert points.groupby("track_id").size().to_dict() == {1: 5, 2: 3}
+    first = points[points["track_id"] == 1]
     np.testing.assert_allclose(first["x_px"], 10 + 8 * np.arange(5))
     assert first["time_s"].is_monotonic_increasing
     assert set(first["vx_px_per_s"]) == {40.0}

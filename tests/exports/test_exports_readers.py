@@ -33,7 +33,7 @@ def test_geopandas_reads_geoparquet_with_its_reference_system() -> None:
         io.BytesIO(tracklets_geoparquet(tracklets_of(PATHS), GEOREFERENCED)),
         bbox=(700_045, 3_499_900, 700_060, 3_500_000),
     )
-    assert nearby["passage_id"].tolist() == [2]
+    assert nearby["track_id"].tolist() == [2]
 
 
 @pytest.mark.parametrize("georeference", [GEOREFERENCED, PIXELS])
@@ -42,7 +42,7 @@ def test_geopandas_reads_geopackage(tmp_path: Path, georeference: Georeference) 
     path = tmp_path / "tracklets.gpkg"
     path.write_bytes(tracklets_gpkg(tracklets_of(PATHS), georeference))
     frame = geopandas.read_file(path, layer=LAYER)
-    assert frame["passage_id"].tolist() == [1, 1, 1, 2]
+    assert frame["track_id"].tolist() == [1, 1, 1, 2]
     if georeference is GEOREFERENCED:
         assert frame.crs.to_epsg() == 32636
         np.testing.assert_allclose(frame.length, LENGTHS_M, rtol=1e-6)

@@ -48,7 +48,7 @@ def tracks(seed: int, n: int = 6, size: float = 40.0) -> Segments:
     return np.array(rows, SEGMENT_DTYPE)
 
 
-def tile_of(segments: Segments, radius_px: float | None = 2.0, weight: str = "passage", size: int = 40) -> FieldTile:
+def tile_of(segments: Segments, radius_px: float | None = 2.0, weight: str = "track", size: int = 40) -> FieldTile:
     return accumulate_tile(
         segments, origin_xy=(0, 0), shape=(size, size), bins=BINS, radius_px=radius_px, weight=weight
     )
@@ -67,7 +67,7 @@ def plain_tile(segments: Segments, radius: float, weight: str, size: int) -> tup
                     continue
                 count[y, x] += 1
                 variance_sum[y, x] += dwell @ (mine["sd_px_per_s"] / BINS.width_px_per_s) ** 2 / dwell.sum()
-                fractions = {"passage": dwell / dwell.sum(), "segment": 1.0 * (dwell > 0), "time": dwell}[weight]
+                fractions = {"track": dwell / dwell.sum(), "segment": 1.0 * (dwell > 0), "time": dwell}[weight]
                 for segment, part in zip(mine, fractions, strict=True):
                     histogram[y, x] += part * _kernel(segment["vx_px_per_s"], segment["vy_px_per_s"])
     return histogram, count, variance_sum
@@ -103,7 +103,7 @@ def _kernel(vx: float, vy: float) -> np.ndarray:
     return np.outer(fractions(vy), fractions(vx))
 
 
-@pytest.mark.parametrize("weight", ["passage", "segment", "time"])
+@pytest.mark.parametrize("weight", ["track", "segment", "time"])
 def test_kernel_agrees_with_the_definition(weight: str) -> None:
     segments = tracks(seed=3, n=9, size=20.0)
     fast = tile_of(segments, weight=weight, size=20)
@@ -194,7 +194,7 @@ def tracklets(n: int) -> pd.DataFrame:
     """Tracklets of one track at 50 px/s along x, five frames a second."""
     k = np.arange(n)
     table: dict[str, object] = {name: np.zeros(n) for name in TRACKLET_COLUMNS}
-    table |= {"tracklet_id": k + 1, "passage_id": np.zeros(n, int)}
+    table |= {"tracklet_id": k + 1, "track_id": np.zeros(n, int)}
     for i in range(3):
         table |= {f"frame_{i}": k + i, f"detection_id_{i}": k + i, f"time_{i}_s": (k + i) / 5}
         table |= {f"x_{i}_px": 10.0 * (k + i), f"y_{i}_px": np.full(n, 20.0)}
@@ -247,7 +247,7 @@ def test_unaligned_displacements_have_little_weight_beside_aligned_ones() -> Non
 
 def test_averaging_stops_at_the_end_of_a_track() -> None:
     table = tracklets(6)
-    table["passage_id"] = [0, 0, 0, 1, 1, 1]
+    table["track_id"] = [0, 0, 0, 1, 1, 1]
     table.loc[3:, ["vx_01_px_per_s", "vx_12_px_per_s"]] = -50.0
     velocity = segment_table(table, FieldConfig(velocity_span_s=2.0))["vx_px_per_s"]
     assert np.abs(velocity).tolist() == pytest.approx([50.0] * 8)
@@ -258,7 +258,7 @@ def test_velocities_do_not_depend_on_other_tracks() -> None:
     parts = []
     for track in range(5):
         part = tracklets(9)
-        part["passage_id"] = track
+        part["track_id"] = track
         part[[c for c in part if c.startswith("detection_id")]] += 100 * track
         part[[c for c in part if c.startswith("v")]] += rng.normal(0, 5, (9, 4))
         parts.append(part)

@@ -57,9 +57,9 @@ def test_ten_disjoint_sets_added_equal_the_field_of_all_to_the_bit(
     tmp_path: Path, table: pd.DataFrame, shape: tuple[int, int], whole: Path
 ) -> None:
     parts = []
-    tracks = np.unique(table["passage_id"])
+    tracks = np.unique(table["track_id"])
     for k in range(10):
-        mine = table[table["passage_id"].isin(tracks[k::10])]
+        mine = table[table["track_id"].isin(tracks[k::10])]
         parts.append(field_run(tmp_path / f"part{k}", mine, shape=shape).layout.root)
     merge_fields(parts, tmp_path / "sum")
     found = everything(tmp_path / "sum")
@@ -106,9 +106,9 @@ def test_comparison_finds_a_change_and_none_in_a_random_split(
     tmp_path: Path, table: pd.DataFrame, shape: tuple[int, int], whole: Path
 ) -> None:
     """Half of the tracks against the other half: no change. All at 40 % of their speed: a change of that size."""
-    tracks = np.random.default_rng(0).permutation(np.unique(table["passage_id"]))
+    tracks = np.random.default_rng(0).permutation(np.unique(table["track_id"]))
     halves = [
-        field_run(tmp_path / name, table[table["passage_id"].isin(tracks[k::2])], shape=shape).layout.root
+        field_run(tmp_path / name, table[table["track_id"].isin(tracks[k::2])], shape=shape).layout.root
         for k, name in enumerate(("even", "odd"))
     ]
     lines = compare_runs(*halves, tmp_path / "chance", min_count=2)
@@ -200,16 +200,16 @@ def test_time_of_day_is_that_of_the_flights_day() -> None:
 def test_both_weights_are_kept_and_named(whole: Path) -> None:
     """By track every vehicle has the same weight; by time slow ones have more, so that speeds are lower."""
     run = open_run(whole)
-    by_passage, time_weighted = run.field, run.field_time_weighted
-    passing, watched = by_passage.statistics(), time_weighted.statistics()
+    by_track, time_weighted = run.field, run.field_time_weighted
+    passing, watched = by_track.statistics(), time_weighted.statistics()
     speed = np.hypot(*np.moveaxis(passing.mean_velocity_px_per_s, -1, 0))
     in_time = np.hypot(*np.moveaxis(watched.mean_velocity_px_per_s, -1, 0))
     busy = passing.n >= 3
     assert busy.sum() > 50
     assert np.mean(in_time[busy] <= speed[busy] + 0.5) > 0.95
     data = xr.open_zarr(run.layout.field, consolidated=False)
-    assert data["velocity_histogram"].attrs["weighted_by"] == "passage"
+    assert data["velocity_histogram"].attrs["weighted_by"] == "track"
     assert data["velocity_histogram_time_weighted"].attrs["weighted_by"] == "time"
-    y, x = np.unravel_index(int(by_passage.count().argmax()), by_passage.shape)
+    y, x = np.unravel_index(int(by_track.count().argmax()), by_track.shape)
     seconds = int(data["velocity_histogram_time_weighted"][y, x].sum()) / data.attrs["weight_unit"]
-    assert seconds == pytest.approx(int(data["dwell_ms"][y, x]) / 1000, rel=0.02)
+    assert seconds == pytest.approx(int(data["occupancy_ms"][y, x]) / 1000, rel=0.02)

@@ -101,7 +101,7 @@ def test_velocities_are_turned_and_scaled_and_the_ground_sample_distance_with_th
     before, after = old.tracklets()[columns].to_numpy(), new.tracklets()[columns].to_numpy()
     np.testing.assert_allclose(after, before @ NEW_FROM_OLD[:, :2].T, atol=0.5)
     assert new.grid.gsd_m == pytest.approx(0.23 / SCALE, rel=0.003)
-    pd.testing.assert_series_equal(old.tracklets()["passage_id"], new.tracklets()["passage_id"])
+    pd.testing.assert_series_equal(old.tracklets()["track_id"], new.tracklets()["track_id"])
     count = new.field.count()
     assert count.sum() == pytest.approx(old.field.count().sum() * SCALE**2, rel=0.1)
 

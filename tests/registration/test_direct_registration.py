@@ -93,5 +93,5 @@ def test_frames_with_a_rolling_shutter_register_directly(base: np.ndarray, tmp_p
     frames = [displace_rows(frame) for frame in views(base)]
     plan = plan_on(base, frames, tmp_path)
     build_base(plan, [detect_unit_keypoints(plan, range(3))])
-    assert read_grid(plan.layout).frames_to == "given"
+    assert read_grid(plan.layout).registered_to == "given"
     assert isinstance(register_intersensor(frames[1], base, plan.config.base, lens=pinhole(SHAPE)), Failure)

@@ -88,11 +88,11 @@ def test_lens_and_wobbling_rows_are_found_to_a_quarter_of_a_pixel() -> None:
 def test_certificate_tells_counts_spread_and_held_out_error() -> None:
     for result in registered("city", [0, 1]):
         assert result.status == "ok"
-        assert result.count_kept >= CONFIG.min_control_points
+        assert result.n_inliers >= CONFIG.min_control_points
         assert 0 < result.residual_px <= result.heldout_px < 0.5
-        assert result.spread > 0.9
+        assert result.coverage > 0.9
         assert result.error_map.shape == (6, 8)
-        assert len(result.control_points) == result.count_kept
+        assert len(result.control_points) == result.n_inliers
 
 
 def test_traffic_and_leaning_roofs_are_kept_out() -> None:
@@ -159,7 +159,7 @@ def test_where_the_base_image_ends_the_previous_frame_carries_on() -> None:
     truth = make_truth(flight)
     corner = np.array([[600.0, 240.0]])
     miss = [float(np.linalg.norm(r.transform.to_base(corner) - truth.to_base(1, corner))) for r in (alone, chained)]
-    assert chained.spread > alone.spread
+    assert chained.coverage > alone.coverage
     assert miss[1] < 0.3
 
 

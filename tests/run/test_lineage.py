@@ -33,7 +33,7 @@ def test_as_many_vehicles_as_the_field_counts(whole: tuple[Path, RunSummary]) ->
         *zip(xs[known], ys[known], strict=True),
         *zip(rng.integers(0, 640, 6), rng.integers(0, 480, 6), strict=True),
     ]
-    told = [len(pixel_lineage(run, int(x), int(y)).passages) for x, y in places]
+    told = [len(pixel_lineage(run, int(x), int(y)).tracks) for x, y in places]
     assert told == [int(count[y, x]) for x, y in places]
 
 
@@ -43,7 +43,7 @@ def test_the_frames_are_those_of_the_tracklets_with_their_true_times(
     run = open_run(whole[0])
     found = pixel_lineage(run, *pixel)
     tracklets = run.tracklets().set_index("tracklet_id")
-    ids = [tracklet for passage in found.passages for tracklet in passage.tracklets]
+    ids = [tracklet for track in found.tracks for tracklet in track.tracklets]
     frames = np.unique(tracklets.loc[ids, ["frame_0", "frame_1", "frame_2"]].to_numpy())
     assert [frame.frame for frame in found.frames] == frames.tolist()
     assert [frame.time_s for frame in found.frames] == run.times_s[frames].tolist()

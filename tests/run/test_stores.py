@@ -83,13 +83,13 @@ def test_registration_comes_back(tmp_path: Path) -> None:
     path = tmp_path / "r.zarr"
     create_registration(path, key="k", count=5, vector_length=3, unit_frames=2)
     statuses = ["ok", "failed:12 control points, 40 needed"]
-    columns = {"heldout_px": np.array([0.25, np.nan], np.float32), "count_kept": np.array([900, 12], np.int32)}
+    columns = {"heldout_px": np.array([0.25, np.nan], np.float32), "n_inliers": np.array([900, 12], np.int32)}
     open_registration(path, "r+").write(2, np.arange(6.0).reshape(2, 3), statuses, columns)
     store = open_registration(path)
     assert store.statuses() == ["", "", *statuses, ""]
     np.testing.assert_array_equal(store.vector(3), [3, 4, 5])
     assert np.isnan(store.vector(0)).all()
-    np.testing.assert_array_equal(store.column("count_kept"), [0, 0, 900, 12, 0])
+    np.testing.assert_array_equal(store.column("n_inliers"), [0, 0, 900, 12, 0])
 
 
 def test_the_field_opens_with_xarray_labelled(tmp_path: Path) -> None:

@@ -199,7 +199,7 @@ def tracklets_of(truth: Truth) -> pd.DataFrame:
         window = [(vehicle, frame + k) for k in range(3)]
         if all(key in cars.index for key in window):
             a, b, c = (cars.loc[key] for key in window)
-            row = {f"frame_{k}": frame + k for k in range(3)} | {"passage_id": vehicle}
+            row = {f"frame_{k}": frame + k for k in range(3)} | {"track_id": vehicle}
             for k, car in enumerate((a, b, c)):
                 row |= {f"x_{k}_px": car["x_base_px"], f"y_{k}_px": car["y_base_px"]}
             for name, p, q in (("01", a, b), ("12", b, c)):
@@ -217,7 +217,7 @@ def test_tracklets_are_right_when_they_follow_one_vehicle(truth: Truth) -> None:
     assert score.recall_moving > 0.97
     assert score.speed_error_mean_km_per_h < 0.7
     assert score.tracks_per_vehicle == 1.0
-    twice = tracklets.assign(passage_id=2 * tracklets["passage_id"] + tracklets["frame_1"] % 2)
+    twice = tracklets.assign(track_id=2 * tracklets["track_id"] + tracklets["frame_1"] % 2)
     assert score_tracklets(truth, twice).tracks_per_vehicle > 1.9
     swapped = tracklets.copy()
     swapped[["x_2_px", "y_2_px"]] = swapped[["x_2_px", "y_2_px"]].to_numpy()[::-1]
@@ -229,13 +229,13 @@ def test_a_tracklet_of_a_lorrys_load_is_on_the_vehicle_but_off_its_middle(truth:
     tracklets = tracklets_of(truth)
     cars = truth.cars.set_index(["vehicle_id", "frame"])
     long = cars["length_px"].groupby("vehicle_id").max().loc[lambda length: length > 30].index
-    lorries = tracklets[tracklets["passage_id"].isin(long)]
+    lorries = tracklets[tracklets["track_id"].isin(long)]
     assert len(lorries) > 5
 
     def shifted(ahead: float, aside: float) -> pd.DataFrame:
         moved = lorries.copy()
         for k in range(3):
-            car = cars.loc[pd.MultiIndex.from_frame(moved[["passage_id", f"frame_{k}"]])]
+            car = cars.loc[pd.MultiIndex.from_frame(moved[["track_id", f"frame_{k}"]])]
             along = ahead * car["length_px"].to_numpy()
             axis = car["orientation_rad"].to_numpy()
             moved[f"x_{k}_px"] += along * np.cos(axis) - aside * np.sin(axis)

@@ -102,7 +102,7 @@ def test_columns_and_keys() -> None:
     assert {name: str(kind) for name, kind in found.dtypes.items()} == TRACKLET_COLUMNS
     assert found["tracklet_id"].is_unique
     assert (found["tracklet_id"] == found["detection_id_1"]).all()
-    assert (found["passage_id"] == -1).all()
+    assert (found["track_id"] == -1).all()
     for k in range(3):  # a detection has one role in one tracklet only
         assert found[f"detection_id_{k}"].is_unique
 

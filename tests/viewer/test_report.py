@@ -141,16 +141,16 @@ def made_report() -> tuple[Report, list[ReportFigure]]:
         inputs=(("Base image", "built from the flight"),),
         stages=(ReportStage(name="registration", text="8 of 9 frames", seconds=1.5, lost=1),),
         residual=ResidualSeries(times_s=(0.0, 0.2, 0.4, 0.6), residual_px=(0.3, None, 0.4, 0.5), limit_px=0.45),
-        detection=PrecisionRecall(recall=(0.2, 0.9), precision=(1.0, 0.8), chosen=1, evidence="12 cars"),
+        detection=PrecisionRecall(recall=(0.2, 0.9), precision=(1.0, 0.8), operating_point=1, description="12 cars"),
         gates={"links_tried": 1200, "speed": 30, "of_another_time": 7},
-        few="Directions hold; speeds are of single vehicles.",
+        low_coverage_note="Directions hold; speeds are of single vehicles.",
         notes=("lens taken for a pin-hole",),
         warnings=("few <b>labels</b>",),
         frames_lost=("frame 1 (0.200 s): failed:12 control points, 40 needed",),
         files=(("maps/direction.tif", "GeoTIFF"), ("javascript:alert(1)", "not a link")),
     )
     data = png_bytes(np.zeros((4, 4, 3), np.uint8))
-    return report, [ReportFigure(title="Map", caption="c", alternative="a map", mime="image/png", data=data)]
+    return report, [ReportFigure(title="Map", caption="c", alt_text="a map", mime="image/png", data=data)]
 
 
 def test_page_is_whole_offline_and_scriptless() -> None:
@@ -206,7 +206,7 @@ def section(page: str, kind: str) -> str:
 def test_only_what_is_to_be_minded_is_red() -> None:
     page = render_report(*made_report())
     assert "pin-hole" in section(page, "notes")
-    assert "Directions hold" in section(page, "few")
+    assert "Directions hold" in section(page, "coverage-note")
     assert "labels" in section(page, "warnings")
     assert not re.search("pin-hole|Directions hold", section(page, "warnings"))
     assert page.index("Directions hold") < page.index("pin-hole") < page.index("<figure>")

@@ -79,7 +79,7 @@ def test_a_click_shows_what_python_says(page: Page, address: str, run: Run) -> N
     vx, vy = here.modal_velocity_px_per_s
     assert told(page, "direction") == pytest.approx(np.arctan2(vy, vx), abs=1e-5)
     assert told(page, "modal_speed") == pytest.approx(np.hypot(vx, vy), rel=1e-5)
-    assert told(page, "standing_share") == pytest.approx(here.stationary_fraction, abs=1e-6)
+    assert told(page, "stationary_fraction") == pytest.approx(here.stationary_fraction, abs=1e-6)
     for percent, speed in here.percentiles_px_per_s.items():
         assert told(page, f"speed_p{percent}") == pytest.approx(speed, rel=1e-5)
         shown = page.value(f"document.querySelector('#answer [data-name=speed_p{percent}]').textContent")
@@ -189,7 +189,7 @@ def test_the_page_colours_speeds_as_the_figure_does_and_says_what_is_cut_off(
     page.open(address)
     page.wait("document.querySelector('#layer option') !== null")
     cut_off = []
-    for layer, values in (("speed", modal), ("speed_p50_high90", store.layer("speed_p50_high90") * 0.23 * 3.6)):
+    for layer, values in (("speed", modal), ("speed_p50_ci90_upper", store.layer("speed_p50_ci90_upper") * 0.23 * 3.6)):
         page.value(f"layer.value = '{layer}'; layer.dispatchEvent(new Event('change'))")
         top = float(page.value("[...document.querySelectorAll('#legend .ticks span')].at(-1).textContent"))
         assert top == round_up(reach)
@@ -275,7 +275,7 @@ def test_every_layer_is_painted(page: Page, address: str) -> None:
     page.open(address)
     page.wait("document.querySelector('#layer option') !== null")
     names = page.value("[...document.querySelectorAll('#layer option')].map((option) => option.value)")
-    assert {"direction", "speed", "speed_p85", "count", "direction_half90"} <= set(names)
+    assert {"direction", "speed", "speed_p85", "count", "direction_ci90_half_width"} <= set(names)
     painted = """(() => [...document.querySelectorAll('canvas.leaflet-tile-loaded')].some((canvas) => {
       const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext('2d', {willReadFrequently: true});
       copy.drawImage(canvas, 0, 0);
@@ -289,9 +289,9 @@ def test_every_layer_is_painted(page: Page, address: str) -> None:
 def test_tracks_under_the_cursor(page: Page, address: str, run: Run) -> None:
     x, y = busiest(run)
     page.open(f"{address}#view={x},{y},3&tracks=1&pixel={x},{y}")
-    page.wait("document.querySelector('#answer details.passages') !== null")
-    near = int(page.value("document.querySelector('#answer details.passages').dataset.count"))
-    assert 0 < near <= run.field.at(x, y).n + 2  # passages within a pixel and a half; the field's band is wider or not
+    page.wait("document.querySelector('#answer details.tracks') !== null")
+    near = int(page.value("document.querySelector('#answer details.tracks').dataset.count"))
+    assert 0 < near <= run.field.at(x, y).n + 2  # tracks within a pixel and a half; the field's band is wider or not
 
 
 def test_hover_reads_direction_and_speed(page: Page, address: str, run: Run) -> None:
@@ -323,8 +323,8 @@ def test_a_short_clip_says_that_few_vehicles_passed_a_pixel(page: Page, address:
     known, well = int((count > 0).sum()), int((count >= 5).sum())
     assert well < known / 20, "the test needs a short clip"
     page.open(f"{address}#tab=summary")
-    page.wait("document.querySelector('#summary-panel').hidden === false && document.getElementById('few').textContent")
-    for place in ("#few", "#summary-panel .few"):
+    page.wait("!document.querySelector('#summary-panel').hidden && document.getElementById('coverage-note').innerText")
+    for place in ("#coverage-note", "#summary-panel .coverage-note"):
         text = page.value(f"document.querySelector('{place}').textContent")
         assert "Directions hold; speeds and percentiles are those of single vehicles" in text
     facts = dict(

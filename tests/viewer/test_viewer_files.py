@@ -39,7 +39,7 @@ def test_layers_follow_the_store() -> None:
     attributes = {
         "modal_vx": {"units": "px s-1"},
         "modal_vy": {"units": "px s-1"},
-        "velocity_noise": {},
+        "velocity_variance_sum": {},
         "speed_change": {"units": "px s-1", "long_name": "change of the median speed"},
         "headway": {"units": "s", "long_name": "time between vehicles"},
     }
@@ -47,18 +47,18 @@ def test_layers_follow_the_store() -> None:
     assert list(layers) == ["direction", "speed", "speed_change", "headway"]
     assert layers["speed_change"].kind == "change"
     assert layers["headway"].title == "Time between vehicles"
-    assert layers["headway"].top == pytest.approx(2.96)
+    assert layers["headway"].colour_max == pytest.approx(2.96)
 
 
 def test_an_interval_and_one_false_track_do_not_set_the_scale_of_speeds() -> None:
     speeds = np.linspace(5.0, 20.0, 400)[None]
     false_track = np.where(np.arange(400) == 7, 300.0, speeds)
-    stored = {"modal_vx": false_track, "modal_vy": 0 * speeds, "speed_p50_high90": 3 * speeds}
+    stored = {"modal_vx": false_track, "modal_vy": 0 * speeds, "speed_p50_ci90_upper": 3 * speeds}
     attributes = {name: {"units": "px s-1"} for name in stored}
     layers = {layer.name: layer for layer in view_layers(attributes, stored.__getitem__)}
-    assert layers["speed"].top == pytest.approx(20, rel=0.01)
-    assert layers["speed_p50_high90"].top == layers["speed"].top
-    assert (layers["speed"].highest, layers["speed_p50_high90"].highest) == (300, 60)
+    assert layers["speed"].colour_max == pytest.approx(20, rel=0.01)
+    assert layers["speed_p50_ci90_upper"].colour_max == layers["speed"].colour_max
+    assert (layers["speed"].data_max, layers["speed_p50_ci90_upper"].data_max) == (300, 60)
 
 
 def test_the_record_lists_what_is_stored(whole: tuple[Path, RunSummary]) -> None:
@@ -67,8 +67,8 @@ def test_the_record_lists_what_is_stored(whole: tuple[Path, RunSummary]) -> None
     run = open_run(whole[0])
     assert (record.height_px, record.width_px) == run.field.shape
     assert record.gsd_m == 0.23
-    assert run.record.config.field.lane_width_m / 4 / 0.23 == pytest.approx(record.segments.reach_px)
-    assert record.segments.passages == len(np.unique(run.segments()["track"]))
+    assert run.record.config.field.lane_width_m / 4 / 0.23 == pytest.approx(record.segments.band_radius_px)
+    assert record.segments.tracks == len(np.unique(run.segments()["track"]))
     for name, array in record.arrays.items():
         chunks = layout.root / array.store / name / "c"
         listed = set(zip(array.stored[::2], array.stored[1::2], strict=True))

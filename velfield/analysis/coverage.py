@@ -4,7 +4,7 @@ _MIN_FRACTION_5 = 0.05
 """Below this fraction of pixels with five tracks, a map of speeds is one of single vehicles."""
 
 
-def few_vehicles(pixels: int, pixels_5: int) -> str:
+def low_coverage_note(pixels: int, pixels_5: int) -> str:
     """A note on a field where few pixels have five tracks; empty for any other.
 
     Parameters
@@ -14,9 +14,9 @@ def few_vehicles(pixels: int, pixels_5: int) -> str:
 
     Examples
     --------
-    >>> few_vehicles(55251, 1105).partition(".")[0]
+    >>> low_coverage_note(55251, 1105).partition(".")[0]
     '2 % of the known pixels were passed by 5 or more vehicles'
-    >>> few_vehicles(55251, 20000), few_vehicles(0, 0)
+    >>> low_coverage_note(55251, 20000), low_coverage_note(0, 0)
     ('', '')
     """
     if pixels_5 >= _MIN_FRACTION_5 * pixels:

@@ -9,7 +9,7 @@ from schemas.arrays import FloatArray, IntArray
 from schemas.flight import PAPER_GSD_M
 from velfield.field.segments import Segments
 
-CROSSING_COLUMNS = ["passage", "time_s", "x_px", "y_px", "vx_px_per_s", "vy_px_per_s", "speed_px_per_s", "direction"]
+CROSSING_COLUMNS = ["track_id", "time_s", "x_px", "y_px", "vx_px_per_s", "vy_px_per_s", "speed_px_per_s", "direction"]
 _HYSTERESIS_M = 2.0
 
 
@@ -49,7 +49,7 @@ def find_crossings(
     found, part = segments[kept], fraction[kept]
     return pd.DataFrame(
         {
-            "passage": found["track"],
+            "track_id": found["track"],
             "time_s": found["start_s"] + part * found["duration_s"],
             "x_px": found["x0_px"] + part * (found["x1_px"] - found["x0_px"]),
             "y_px": found["y0_px"] + part * (found["y1_px"] - found["y0_px"]),

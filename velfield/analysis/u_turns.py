@@ -8,7 +8,7 @@ import pandas as pd
 from schemas.arrays import FloatArray
 from velfield.field.segments import Segments
 
-U_TURN_COLUMNS = ["passage_id", "time_s", "x_px", "y_px", "turn_rad", "path_px"]
+U_TURN_COLUMNS = ["track_id", "time_s", "x_px", "y_px", "turn_rad", "path_px"]
 
 
 def find_u_turns(

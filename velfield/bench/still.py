@@ -117,7 +117,7 @@ def measure_stability(run: Run, *, max_frames: int = 200, within: FloatArray | N
 def unused_corners(run: Run) -> tuple[Templates, GreyImage]:
     """Corners of the registration's base image (h, w) that registration does not use, and that image."""
     layout, limit = run.layout, run.record.config.frames.max_pixels
-    own = run.grid.frames_to == "own"
+    own = run.grid.registered_to == "flight"
     grey = read_grey_image(layout.own_base_image, limit) if own else run.base_image
     valid = read_grey_image(layout.own_base_mask, limit) > 0 if own else np.ones(grey.shape, np.bool_)
     used = [make_templates(grey, valid, count=count).xy for count in (N_PATCHES_SAME_SENSOR, N_PATCHES_CROSS_SENSOR)]

@@ -1,12 +1,16 @@
 """The report as one HTML file that holds all it shows, to send by mail."""
 
+import json
 from pathlib import Path
 
 from schemas.export import ExportOptions
+from schemas.records import FORMAT_VERSION
+from schemas.renames import upgrade_record
 from schemas.report import Report
 from velfield.errors import InputError
 from velfield.report.report import render_report
 from velfield.report.run_figures import report_figures
+from velfield.run.layout import RunLayout
 from velfield.run.run import Run
 
 FILE_NAME = "report.html"
@@ -14,12 +18,19 @@ FILE_NAME = "report.html"
 
 def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
     """See `velfield.exports.export.ExportModule`."""
-    record = run.layout.report_record
-    if not record.exists():
-        raise InputError(
-            f"{record} is not there: the run was not finished, or an older velfield wrote it; run it again"
-        )
-    report = Report.model_validate_json(record.read_bytes())
+    report = _read_report(run.layout)
     alone = report.model_copy(update={"files": ()})  # a mail does not carry them
     figures = [figure.model_copy(update={"full_size": None}) for figure in report_figures(run.layout.maps).values()]
     return render_report(alone, figures).encode()
+
+
+def _read_report(layout: RunLayout) -> Report:
+    path = layout.report_record
+    if not path.exists():
+        raise InputError(f"{path} is not there: the run was not finished, or an older velfield wrote it; run it again")
+    record = json.loads(path.read_bytes())
+    if layout.format_version != FORMAT_VERSION:
+        record = upgrade_record("report", record)
+        if record.get("detection"):
+            record["detection"] = upgrade_record("precision_recall", record["detection"])
+    return Report.model_validate_json(json.dumps(record))

@@ -42,7 +42,7 @@ def sumo_fcd(tracklets: pd.DataFrame, georeference: Georeference, *, vehicle_typ
     InputError
         The ground sample distance is not known.
     """
-    points = track_points(tracklets).sort_values(["time_s", "passage_id"], kind="stable")
+    points = track_points(tracklets).sort_values(["time_s", "track_id"], kind="stable")
     xy = points[["x_px", "y_px"]].to_numpy(np.float64)
     velocity = points[["vx_px_per_s", "vy_px_per_s"]].to_numpy(np.float64)
     metres = georeference.to_metres(xy)
@@ -51,7 +51,7 @@ def sumo_fcd(tracklets: pd.DataFrame, georeference: Georeference, *, vehicle_typ
     start_s = points["time_s"].min() if len(points) else 0.0
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<fcd-export>"]
     kind = quoteattr(vehicle_type)
-    numbers = points["passage_id"].to_numpy()
+    numbers = points["track_id"].to_numpy()
     for time_s, rows in points.reset_index(drop=True).groupby("time_s", sort=True).indices.items():
         lines.append(f'    <timestep time="{float(str(time_s)) - start_s:.3f}">')
         for k in rows:

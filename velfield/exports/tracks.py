@@ -4,7 +4,7 @@ import pandas as pd
 
 
 def track_points(tracklets: pd.DataFrame) -> pd.DataFrame:
-    """Detections of each passage, each once, with the velocity of the tracklet parts that meet there.
+    """Detections of each track, each once, with the velocity of the tracklet parts that meet there.
 
     Parameters
     ----------
@@ -13,20 +13,20 @@ def track_points(tracklets: pd.DataFrame) -> pd.DataFrame:
 
     Returns
     -------
-    DataFrame ``passage_id, detection_id, frame, time_s, x_px, y_px, vx_px_per_s, vy_px_per_s``, by passage and time.
+    DataFrame ``track_id, detection_id, frame, time_s, x_px, y_px, vx_px_per_s, vy_px_per_s``, by track and time.
     """
     parts = [_ends(tracklets, end, segment) for end, segment in ((0, "01"), (1, "01"), (1, "12"), (2, "12"))]
     rows = pd.concat(parts, ignore_index=True)
     velocities = ["vx_px_per_s", "vy_px_per_s"]
-    keys = ["passage_id", "detection_id"]
+    keys = ["track_id", "detection_id"]
     mean = rows.groupby(keys, sort=False)[velocities].mean()
     once = rows.drop(columns=velocities).drop_duplicates(keys).join(mean, on=keys)
-    return once.sort_values(["passage_id", "time_s", "detection_id"], ignore_index=True)
+    return once.sort_values(["track_id", "time_s", "detection_id"], ignore_index=True)
 
 
 def _ends(tracklets: pd.DataFrame, end: int, segment: str) -> pd.DataFrame:
     names = {
-        "passage_id": "passage_id",
+        "track_id": "track_id",
         f"detection_id_{end}": "detection_id",
         f"frame_{end}": "frame",
         f"time_{end}_s": "time_s",

@@ -4,7 +4,7 @@ A segment touches the pixels whose centre lies within ``radius_px`` of its path;
 time that the vehicle's centre is within that radius, i.e. the chord of the path through the disc around the pixel, in
 time. The weight that it adds there, spread over the velocity bins by a Gaussian kernel, is one of three:
 
-- ``passage`` (the default): a track adds exactly one unit at each pixel that it touches, divided among its segments in
+- ``track`` (the default): a track adds exactly one unit at each pixel that it touches, divided among its segments in
   proportion to their dwell times. So a pixel where two segments meet does not count twice, a slow vehicle weighs as
   much as a fast one (time-mean statistics), and ``histogram.sum((2, 3)) == count * UNIT`` everywhere;
 - ``time``: each segment adds its dwell time, ``UNIT`` a second (space-mean statistics: traffic at a random moment);
@@ -41,8 +41,8 @@ KERNEL_RADIUS_SIGMAS = 3.0
 """Truncation of the kernel; the 0.3 % beyond are added to its outermost bins. Four would cost two thirds more
 updates."""
 
-Weight = Literal["passage", "segment", "time"]
-_WEIGHTS: dict[Weight, int] = {"passage": 0, "segment": 1, "time": 2}
+Weight = Literal["track", "segment", "time"]
+_WEIGHTS: dict[Weight, int] = {"track": 0, "segment": 1, "time": 2}
 
 
 class FieldTile(NamedTuple):
@@ -66,7 +66,7 @@ def accumulate_tile(
     shape: tuple[int, int],
     bins: VelocityBins,
     radius_px: float | None,
-    weight: Weight = "passage",
+    weight: Weight = "track",
 ) -> FieldTile:
     """The histogram of one tile.
 

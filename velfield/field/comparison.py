@@ -112,7 +112,7 @@ def _direction(before: Layer, after: Layer, stationary_speed_px_per_s: float, en
         vx, vy = _float_layer(layer, "modal_vx"), _float_layer(layer, "modal_vy")
         moves = np.hypot(vx, vy) > stationary_speed_px_per_s
         angle.append(np.where(moves, np.arctan2(vy, vx), np.nan))
-        half.append(_float_layer(layer, "direction_half90"))
+        half.append(_float_layer(layer, "direction_ci90_half_width"))
     change = np.where(enough, np.angle(np.exp(1j * (angle[1] - angle[0]))), np.nan)
     return _change(change, _two_sided(change * _Z90 / np.hypot(half[0], half[1])))
 
@@ -123,13 +123,13 @@ def _speed(before: Layer, after: Layer, enough: Mask) -> Change:
     up = change > 0
     slower = np.where(
         up,
-        _float_layer(before, "speed_p50_high90") - _float_layer(before, "speed_p50"),
-        _float_layer(after, "speed_p50_high90") - _float_layer(after, "speed_p50"),
+        _float_layer(before, "speed_p50_ci90_upper") - _float_layer(before, "speed_p50"),
+        _float_layer(after, "speed_p50_ci90_upper") - _float_layer(after, "speed_p50"),
     )
     faster = np.where(
         up,
-        _float_layer(after, "speed_p50") - _float_layer(after, "speed_p50_low90"),
-        _float_layer(before, "speed_p50") - _float_layer(before, "speed_p50_low90"),
+        _float_layer(after, "speed_p50") - _float_layer(after, "speed_p50_ci90_lower"),
+        _float_layer(before, "speed_p50") - _float_layer(before, "speed_p50_ci90_lower"),
     )
     return _change(change, _two_sided(change * _Z90 / np.maximum(np.hypot(slower, faster), 1e-9)))
 

@@ -117,7 +117,7 @@ def _half_tracklets(tracklets: pd.DataFrame, first: int) -> Segments:
     """The segments between detections ``first`` and ``first + 1`` of every tracklet."""
     a, b = first, first + 1
     half = np.zeros(len(tracklets), SEGMENT_DTYPE)
-    track = tracklets["passage_id"].to_numpy()
+    track = tracklets["track_id"].to_numpy()
     # The ids of tracklets without a track are negative, so that none equals a track's.
     half["track"] = np.where(track >= 0, track, -2 - tracklets["tracklet_id"].to_numpy())
     half["start_s"] = tracklets[f"time_{a}_s"]

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.records import FORMAT_VERSION
 from velfield.exports.cog import write_cog
 from velfield.field.bins import stationary_speed_px_per_s
 from velfield.field.comparison import FDR_LEVEL, MIN_COUNT, Change, compare_fields
@@ -59,8 +60,9 @@ def compare_runs(before: Path, after: Path, out: Path, *, min_count: int = MIN_C
 
 
 def _show_in_the_viewer(changes: dict[str, Change], before: Path, run: Run) -> None:
-    """Leave what changed for real as layers of the later run's page, where it has one, in the units of its field."""
-    if not run.layout.view_record.exists():
+    """Leave significant changes as layers of the later run's page, where it has one of the present format, in the units
+    of its field."""
+    if run.layout.format_version != FORMAT_VERSION or not run.layout.view_record.exists():
         return
     units = {"direction": "rad", "speed": "px s-1", "volume": "vehicles h-1"}
     layers = {

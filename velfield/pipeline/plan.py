@@ -15,6 +15,7 @@ from velfield.errors import InputError
 from velfield.field.time_intervals import TimeInterval, parse_time_intervals
 from velfield.pipeline.stage import stage_keys
 from velfield.run.commits import code_version, content_key, digest_path, write_atomically
+from velfield.run.flight_record import check_format, read_flight_record
 from velfield.run.layout import RunLayout
 from velfield.sources.source import SourceInfo, check_source, probe, select_frames
 
@@ -103,6 +104,7 @@ def check_inputs(job: Job) -> None:
     InputError
         The source cannot be opened, or another input does not exist.
     """
+    check_format(Path(job.root))
     check_source(job.inputs.source)
     _check_optional_inputs(job)
 
@@ -122,6 +124,7 @@ def make_plan(job: Job) -> Plan:
     InputError
         The source cannot be read, has no times, or fewer than three frames are left.
     """
+    check_format(Path(job.root))
     _check_optional_inputs(job)  # `probe` checks the source
     timestamps = Path(job.inputs.timestamps) if job.inputs.timestamps else None
     info = probe(Path(job.inputs.source), frames=job.config.frames, timestamps=timestamps)
@@ -179,8 +182,8 @@ def changed_since(plan: Plan) -> list[str]:
     if not plan.layout.flight.exists():
         return []
     try:
-        old = FlightRecord.model_validate_json(plan.layout.flight.read_bytes())
-    except ValidationError:
+        old = read_flight_record(plan.layout.root)
+    except (InputError, ValidationError):
         return []  # that version's stages have other keys as well: everything is recomputed
     moved = old.inputs.source.model_copy(update={"path": plan.inputs.source.path})
     before = old.inputs.model_copy(update={"source": moved})

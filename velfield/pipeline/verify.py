@@ -36,7 +36,8 @@ class Damage:
 
 def verify_run(layout: RunLayout, record: FlightRecord) -> list[Damage]:
     """Read all that is committed and compare it with its digests; units that were never finished are listed too."""
-    by_stage = {stage.name: read_commits(layout, stage.name) for stage in STAGES}
+    stages = [stage.name for stage in STAGES if not record.keys or stage.name in record.keys]  # format 1 had fewer
+    by_stage = {stage: read_commits(layout, stage) for stage in stages}
     found = list(_unfinished(by_stage)) + list(_other_keys(by_stage, record))
     with ThreadPoolExecutor(_THREADS) as pool:
         checked = pool.map(lambda unit: _check(layout, unit), chain.from_iterable(by_stage.values()))

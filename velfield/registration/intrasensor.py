@@ -90,22 +90,22 @@ class FrameRegistration:
     ----------
     transform : raw to base pixels; None if it failed.
     status : ``ok`` or ``failed:<reason with counts>``.
-    count_base, count_previous : control points matched to the base image and to the previous frame.
-    count_kept : inliers of the robust fit.
+    n_matches_base, n_matches_previous : control points matched to the base image and to the previous frame.
+    n_inliers : inliers of the robust fit.
     residual_px, heldout_px : RMS residual of the inliers, fitted and cross-validated; NaN if failed.
-    spread : coverage, the fraction of the frame's cells with inliers.
+    coverage : fraction of the frame's cells with inliers.
     error_map : (6, 8) RMS cross-validated residual of the inliers per cell, base px; NaN where there are none.
     control_points : the inliers.
     """
 
     transform: FrameTransform | None
     status: str
-    count_base: int = 0
-    count_previous: int = 0
-    count_kept: int = 0
+    n_matches_base: int = 0
+    n_matches_previous: int = 0
+    n_inliers: int = 0
     residual_px: float = float("nan")
     heldout_px: float = float("nan")
-    spread: float = 0.0
+    coverage: float = 0.0
     error_map: FloatArray | None = None
     control_points: ControlPoints | None = None
 
@@ -359,7 +359,7 @@ class _FrameFitter:
         return inliers, JointFit(transform, ones, residuals, cv_residuals, refit.scale, refit.stiffness)
 
     def with_quality_metrics(
-        self, points: ControlPoints, fit: JointFit, count_base: int, count_previous: int
+        self, points: ControlPoints, fit: JointFit, n_matches_base: int, n_matches_previous: int
     ) -> FrameRegistration:
         """Add mesh, counts and cross-validated errors; a failure if those exceed the configured limits."""
         width, height = self.size
@@ -379,16 +379,16 @@ class _FrameFitter:
         inliers = is_inlier(weights)
         error_map = _cell_rms(points.xy_raw[inliers], cv_residuals[inliers], width, height)
         count, heldout_px = int(inliers.sum()), _rms(cv_residuals[inliers])
-        counts = (count_base, count_previous, count)
+        counts = (n_matches_base, n_matches_previous, count)
         if count < self.config.min_control_points:
             reason = f"{count} of {len(points)} control points are inliers, {self.config.min_control_points} needed"
             return FrameRegistration(None, f"failed:{reason}", *counts)
         if not heldout_px <= self.config.max_residual_px:
             reason = f"held-out residual {heldout_px:.2f} px, at most {self.config.max_residual_px:g} allowed"
             return FrameRegistration(None, f"failed:{reason}", *counts)
-        spread = float(np.isfinite(error_map).mean())
+        coverage = float(np.isfinite(error_map).mean())
         return FrameRegistration(
-            transform, "ok", *counts, _rms(residuals[inliers]), heldout_px, spread, error_map, points.select(inliers)
+            transform, "ok", *counts, _rms(residuals[inliers]), heldout_px, coverage, error_map, points.select(inliers)
         )
 
 

@@ -73,8 +73,8 @@ def precision_recall_plot(curve: PrecisionRecall) -> str:
             description="Precision of the car detector against its recall.",
         )
         plot.line(np.array(curve.recall, np.float64), np.array(curve.precision, np.float64))
-        if curve.chosen is not None:
-            x, y = curve.recall[curve.chosen], curve.precision[curve.chosen]
+        if curve.operating_point is not None:
+            x, y = curve.recall[curve.operating_point], curve.precision[curve.operating_point]
             plot.mark(x, y, f"chosen: precision {y:.2f}, recall {x:.2f}")
         return plot
 

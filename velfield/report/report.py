@@ -52,7 +52,9 @@ def render_sections(report: Report, figures: Sequence[ReportFigure]) -> str:
     """The report's sections and footer: what stands in a page's body below its title."""
     sections = [
         _warnings(report),
-        _section("Few vehicles at each pixel", f"<p>{escape(report.few)}</p>", "few") if report.few else "",
+        _section("Few vehicles at each pixel", f"<p>{escape(report.low_coverage_note)}</p>", "coverage-note")
+        if report.low_coverage_note
+        else "",
         _facts(report.facts),
         _section("Notes", _items(report.notes), "notes") if report.notes else "",
         *map(_figure, figures),
@@ -100,7 +102,7 @@ def _figure(figure: ReportFigure) -> str:
         source = f'src="data:{figure.mime};base64,{b64encode(figure.data).decode()}"'
     else:
         source = f'loading="lazy" src="{_path(figure.file)}"'
-    image = f'<img alt="{escape(figure.alternative)}" {source}>'
+    image = f'<img alt="{escape(figure.alt_text)}" {source}>'
     link = ""
     if figure.full_size:
         link = f' <a href="{_path(figure.full_size)}">Full size</a>'
@@ -143,8 +145,8 @@ def _detection(report: Report) -> str:
     curve = report.detection
     if curve is None or not curve.recall:
         return ""
-    evidence = f"<p>Measured on {escape(curve.evidence)}.</p>" if curve.evidence else ""
-    return _section("Detection", evidence + precision_recall_plot(curve))
+    description = f"<p>Measured on {escape(curve.description)}.</p>" if curve.description else ""
+    return _section("Detection", description + precision_recall_plot(curve))
 
 
 def _gates(gates: dict[str, int]) -> str:

@@ -38,7 +38,7 @@ _CAPTIONS = {
 def report_figures(maps: Path) -> dict[str, ReportFigure]:
     """The figures of a run's report from its folder of maps, their bytes in them, by name."""
     figures = {}
-    for name, (title, caption, alternative) in _CAPTIONS.items():
+    for name, (title, caption, alt_text) in _CAPTIONS.items():
         if not (maps / f"{name}.png").exists():
             continue  # a pin-hole has no before and after
         encoded = np.frombuffer((maps / f"{name}.png").read_bytes(), np.uint8)
@@ -46,7 +46,7 @@ def report_figures(maps: Path) -> dict[str, ReportFigure]:
         figures[name] = ReportFigure(
             title=title,
             caption=caption,
-            alternative=alternative,
+            alt_text=alt_text,
             mime="image/jpeg",
             data=jpeg_bytes(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), max_side=_PICTURE_SIDE_PX),
             full_size=f"maps/{name}.png",

@@ -15,7 +15,8 @@ from typing import IO
 
 from pydantic import BaseModel, ValidationError
 
-from schemas.records import CommitRecord
+from schemas.records import FORMAT_VERSION, CommitRecord
+from schemas.renames import upgrade_record
 from velfield.run.layout import RunLayout
 from velfield.run.paths import is_remote
 
@@ -70,7 +71,7 @@ def digest_path(path: Path) -> str:
 def content_key(
     stage: str, stage_version: int, *, parameters: Iterable[object] = (), inputs: Iterable[str | None] = ()
 ) -> str:
-    """Key of a stage: equal exactly when its inputs, its parameters and its code's version are.
+    """Key of a stage: equal exactly when its inputs, its parameters, its code's version and the format are.
 
     Examples
     --------
@@ -80,7 +81,7 @@ def content_key(
     False
     """
     plain = [p.model_dump(mode="json") if isinstance(p, BaseModel) else p for p in parameters]
-    text = json.dumps([stage, stage_version, plain, list(inputs)], sort_keys=True, allow_nan=False)
+    text = json.dumps([FORMAT_VERSION, stage, stage_version, plain, list(inputs)], sort_keys=True, allow_nan=False)
     return digest_bytes(text.encode())
 
 
@@ -110,7 +111,7 @@ def sweep_partial(root: Path) -> int:
 
 def commit_path(layout: RunLayout, stage: str, unit: str) -> Path:
     """Path of the record of one unit."""
-    return layout.commits / stage / f"{unit}.json"
+    return layout.commits / layout.stored_name(stage) / f"{unit}.json"
 
 
 def write_commit(layout: RunLayout, record: CommitRecord) -> None:
@@ -122,14 +123,18 @@ def read_commit(layout: RunLayout, stage: str, unit: str) -> CommitRecord | None
     """The record of a unit, or ``None`` where it is not finished: one that cannot be read says nothing."""
     path = commit_path(layout, stage, unit)
     try:
-        return CommitRecord.model_validate_json(path.read_bytes())
+        record = CommitRecord.model_validate_json(path.read_bytes())
     except (FileNotFoundError, ValidationError):
         return None
+    if layout.format_version == FORMAT_VERSION:
+        return record
+    return record.model_copy(update={"stage": stage, "counts": upgrade_record("commit_counts", record.counts)})
 
 
 def read_commits(layout: RunLayout, stage: str) -> list[CommitRecord]:
     """The records of all units of a stage that are finished, in the order of their names."""
-    found = (read_commit(layout, stage, path.stem) for path in sorted((layout.commits / stage).glob("*.json")))
+    folder = layout.commits / layout.stored_name(stage)
+    found = (read_commit(layout, stage, path.stem) for path in sorted(folder.glob("*.json")))
     return [record for record in found if record is not None]
 
 

@@ -4,15 +4,16 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from schemas.records import FlightRecord
+from schemas.records import FORMAT_VERSION
 from velfield.errors import InputError
 from velfield.field.accumulate import FieldTile
 from velfield.field.algebra import merge_tiles, subtract_tile
 from velfield.field.bins import VelocityBins
-from velfield.run.commits import content_key, digest_file
+from velfield.run.commits import content_key, digest_file, write_atomically
 from velfield.run.field_reader import TileReader, tile_reader
 from velfield.run.field_writer import GroupWriter, create_field_store, tile_groups
-from velfield.run.grid import read_grid
+from velfield.run.flight_record import open_layout, read_flight_record
+from velfield.run.grid import read_grid, read_working
 from velfield.run.layout import RunLayout
 from velfield.run.stores import HISTOGRAM_TIME_WEIGHTED, FieldStore, open_field, store_key
 
@@ -56,7 +57,7 @@ def subtract_fields(whole: Path, part: Path, out: Path) -> None:
         if small is None:
             return large
         if large is None:
-            raise InputError(f"{part} has passages where {whole} has none: it is no part of it")
+            raise InputError(f"{part} has tracks where {whole} has none: it is no part of it")
         return subtract_tile(large, small)
 
     stores = _open_alike([whole, part])
@@ -79,7 +80,7 @@ def check_same_grid(first: Path, other: Path) -> None:
     for name in (*_SAME, *_SAME_PLACE):
         if a.attributes.get(name) != b.attributes.get(name):
             raise InputError(_apart(first, other, name, a.attributes.get(name), b.attributes.get(name)))
-    if "velocity_noise" not in a.layer_names() or "velocity_noise" not in b.layer_names():
+    if "velocity_variance_sum" not in a.layer_names() or "velocity_variance_sum" not in b.layer_names():
         raise InputError(f"{first} or {other} was written by an older velfield: run the flight again")
     if not a.attributes.get("crs_wkt") and _base_digest(first) != _base_digest(other):
         raise InputError(
@@ -120,13 +121,16 @@ def _write(
     observed_s: float,
     made_from: Mapping[str, object],
 ) -> None:
-    layout, like = RunLayout(out), RunLayout(roots[0])
+    layout, like = RunLayout(out), open_layout(roots[0])
     if out.exists() and any(out.iterdir()):
         raise InputError(f"--out {out} is there and holds files: give a folder that is not there yet")
-    config = FlightRecord.model_validate_json(like.flight.read_bytes()).config.field
-    grid = read_grid(like)
+    record, grid = read_flight_record(roots[0]), read_grid(like)
+    config = record.config.field
     out.mkdir(parents=True, exist_ok=True)
-    shutil.copytree(like.base, layout.base)
+    shutil.copytree(like.base, layout.base, ignore=shutil.ignore_patterns(like.grid.name, like.working.name))
+    write_atomically(layout.grid, grid.model_dump_json(indent=1).encode())
+    if like.working.exists():
+        write_atomically(layout.working, read_working(like).model_dump_json(indent=1).encode())
     key = content_key("algebra", 1, parameters=list(made_from), inputs=[store_key(store.path) for store in stores])
     create_field_store(
         layout.field,
@@ -143,7 +147,8 @@ def _write(
     bins = VelocityBins.from_config(config, grid.gsd_m)
     for group in tile_groups(grid, config):
         _write_group(GroupWriter(target, group, grid=grid, config=config, bins=bins), kinds, combine)
-    shutil.copy(like.flight, layout.flight)  # last: a folder without it was not written whole
+    record = record.model_copy(update={"format_version": FORMAT_VERSION})
+    write_atomically(layout.flight, record.model_dump_json(indent=1).encode())  # last: without it nothing is whole
 
 
 def _write_group(writer: GroupWriter, kinds: Sequence[Sequence[TileReader]], combine: Combine) -> None:

@@ -7,11 +7,12 @@ from math import inf
 import numpy as np
 
 from schemas.flight import FieldConfig
-from schemas.records import FlightRecord, GridRecord
+from schemas.records import GridRecord
 from velfield.errors import InputError
 from velfield.field.accumulate import FieldTile
 from velfield.field.bins import VelocityBins, stationary_speed_px_per_s
 from velfield.field.view import Tile, VelocityField
+from velfield.run.flight_record import read_flight_record
 from velfield.run.grid import read_grid
 from velfield.run.layout import RunLayout
 from velfield.run.stores import HISTOGRAM, HISTOGRAM_TIME_WEIGHTED, FieldStore, StoreError, open_field
@@ -32,20 +33,20 @@ class IntervalField:
 
 
 def open_velocity_field(layout: RunLayout, *, time_weighted: bool = False) -> VelocityField:
-    """The field of a run folder, weighed by passage or by time.
+    """The field of a run folder, weighed by track or by time.
 
     Raises
     ------
     InputError
         The field was not built yet, or not with that weight.
     """
-    config = FlightRecord.model_validate_json(layout.flight.read_bytes()).config.field
+    config = read_flight_record(layout.root).config.field
     return field_from_store(open_field(layout.field), config, read_grid(layout), time_weighted=time_weighted)
 
 
 def open_field_intervals(layout: RunLayout) -> list[IntervalField]:
     """The fields of the time intervals of a run folder, in their order; empty where none were asked for."""
-    config = FlightRecord.model_validate_json(layout.flight.read_bytes()).config.field
+    config = read_flight_record(layout.root).config.field
     grid = read_grid(layout)
     found = []
     for path in sorted(layout.intervals.glob("*.zarr")):
@@ -64,7 +65,7 @@ def field_from_store(
     path, histogram = store.path, HISTOGRAM_TIME_WEIGHTED if time_weighted else HISTOGRAM
     if histogram not in store.histogram_names():
         raise InputError(f"{path} holds no {histogram}: run the flight again with --set field.time_weighted=true")
-    if "velocity_noise" not in store.layer_names():
+    if "velocity_variance_sum" not in store.layer_names():
         raise InputError(f"{path} was written by an older velfield and has no intervals: run the flight again")
     count = store.layer("count")
     read = tile_reader(store, histogram)
@@ -86,25 +87,25 @@ def field_from_store(
 
 def tile_reader(store: FieldStore, histogram: str = HISTOGRAM) -> TileReader:
     """Reads whole tiles: a histogram, and the layers that add up with it."""
-    sums = {name: store.layer(name) for name in ("count", "dwell_ms", "velocity_noise")}
+    sums = {name: store.layer(name) for name in ("count", "occupancy_ms", "velocity_variance_sum")}
     side = store.tile
 
     def read(row: int, column: int) -> FieldTile | None:
         place = np.s_[row * side : (row + 1) * side, column * side : (column + 1) * side]
-        count, dwell_ms, noise = (layer[place] for layer in sums.values())
+        count, occupancy_ms, noise = (layer[place] for layer in sums.values())
         if not count.any():
             return None
         if not store.has_tile(row, column, histogram):
             raise StoreError(
                 f"{store.path / histogram}: the chunk of tile ({row}, {column}) is gone; run the flight again"
             )
-        return FieldTile(store.read_tile(row, column, histogram), count, dwell_ms, noise)
+        return FieldTile(store.read_tile(row, column, histogram), count, occupancy_ms, noise)
 
     return read
 
 
 def known_tiles(count: np.ndarray, side: int) -> list[tuple[int, int]]:
-    """Tiles that hold a passage: these must be in the store."""
+    """Tiles that hold a track: these must be in the store."""
     rows, columns = np.nonzero(count)
     tiles = np.unique(np.column_stack([rows // side, columns // side]), axis=0)
     return [(int(row), int(column)) for row, column in tiles]

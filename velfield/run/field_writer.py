@@ -105,7 +105,7 @@ def create_field_store(
     Parameters
     ----------
     weighted_by
-        What a passage adds at a pixel.
+        What a track adds at a pixel.
     observed_s
         How long traffic was watched, s: what counts are compared by.
     time_weighted

@@ -1,11 +1,13 @@
 """The grid of base pixels of a run."""
 
+import json
 from functools import lru_cache
 
 import numpy as np
 
 from schemas.arrays import FloatArray
-from schemas.records import GridRecord, WorkingRecord
+from schemas.records import FORMAT_VERSION, GridRecord, WorkingRecord
+from schemas.renames import upgrade_record
 from velfield.errors import InputError
 from velfield.run.layout import RunLayout
 
@@ -20,7 +22,7 @@ def read_grid(layout: RunLayout) -> GridRecord:
     """
     if not layout.grid.exists():
         raise InputError(f"{layout.grid} is not there: run `velfield run` on this folder first")
-    return _parse(layout.grid.read_bytes())
+    return _parse_grid(layout.grid.read_bytes(), layout.format_version)
 
 
 def read_working(layout: RunLayout) -> WorkingRecord:
@@ -33,7 +35,10 @@ def read_working(layout: RunLayout) -> WorkingRecord:
     """
     if not layout.working.exists():
         raise InputError(f"{layout.working} is not there: run `velfield run` on this folder first")
-    return WorkingRecord.model_validate_json(layout.working.read_bytes())
+    data = layout.working.read_bytes()
+    if layout.format_version == FORMAT_VERSION:
+        return WorkingRecord.model_validate_json(data)
+    return WorkingRecord.model_validate(upgrade_record("working", json.loads(data)))
 
 
 def north_direction_rad(grid: GridRecord) -> float | None:
@@ -58,5 +63,7 @@ def heading_deg(direction_rad: FloatArray, north_rad: float | None) -> FloatArra
 
 
 @lru_cache(maxsize=8)
-def _parse(data: bytes) -> GridRecord:
-    return GridRecord.model_validate_json(data)
+def _parse_grid(data: bytes, format_version: int) -> GridRecord:
+    if format_version == FORMAT_VERSION:
+        return GridRecord.model_validate_json(data)
+    return GridRecord.model_validate(upgrade_record("grid", json.loads(data)))

@@ -29,10 +29,10 @@ class StageLineage:
 
 
 @dataclass(frozen=True)
-class PassageLineage:
+class TrackLineage:
     """One vehicle that went over the pixel: its tracklets there, and the frames that they were seen in."""
 
-    passage_id: int
+    track_id: int
     tracklets: tuple[int, ...]
     frames: tuple[int, ...]
 
@@ -54,7 +54,7 @@ class PixelLineage:
 
     x: int
     y: int
-    passages: tuple[PassageLineage, ...]
+    tracks: tuple[TrackLineage, ...]
     frames: tuple[FrameLineage, ...]
 
 
@@ -83,8 +83,8 @@ def pixel_lineage(run: Run, x: int, y: int) -> PixelLineage:
         raise InputError(f"pixel ({x}, {y}) is outside the base image of {width} x {height} px")
     tracklets = run.tracklets()
     touching = _touching(run, _near(tracklets, x, y, _reach(run)), x, y)
-    passages = tuple(_passages(tracklets, touching))
-    return PixelLineage(x, y, passages, _frames(run, sorted({f for passage in passages for f in passage.frames})))
+    tracks = tuple(_tracks(tracklets, touching))
+    return PixelLineage(x, y, tracks, _frames(run, sorted({f for track in tracks for f in track.frames})))
 
 
 def _reach(run: Run) -> float:
@@ -92,12 +92,12 @@ def _reach(run: Run) -> float:
 
 
 def _near(tracklets: pd.DataFrame, x: int, y: int, reach: float) -> pd.DataFrame:
-    """All tracklets of the passages that come near: a shared segment's velocity is averaged along its passage."""
+    """All tracklets of the tracks that come near: a shared segment's velocity is averaged along its track."""
     xs = tracklets[[f"x_{k}_px" for k in range(3)]].to_numpy()
     ys = tracklets[[f"y_{k}_px" for k in range(3)]].to_numpy()
     across = (xs.min(axis=1, initial=np.inf) - reach <= x) & (x <= xs.max(axis=1, initial=-np.inf) + reach)
     down = (ys.min(axis=1, initial=np.inf) - reach <= y) & (y <= ys.max(axis=1, initial=-np.inf) + reach)
-    return tracklets[tracklets["passage_id"].isin(tracklets.loc[across & down, "passage_id"])]
+    return tracklets[tracklets["track_id"].isin(tracklets.loc[across & down, "track_id"])]
 
 
 def _touching(run: Run, tracklets: pd.DataFrame, x: int, y: int) -> Segments:
@@ -116,13 +116,13 @@ def _touching(run: Run, tracklets: pd.DataFrame, x: int, y: int) -> Segments:
     return segments[np.array(touches, np.bool_)]
 
 
-def _passages(tracklets: pd.DataFrame, segments: Segments) -> Iterator[PassageLineage]:
-    for passage in np.unique(segments["track"]):
-        mine = segments[segments["track"] == passage]
+def _tracks(tracklets: pd.DataFrame, segments: Segments) -> Iterator[TrackLineage]:
+    for track in np.unique(segments["track"]):
+        mine = segments[segments["track"] == track]
         pairs = set(zip(mine["detection_0"].tolist(), mine["detection_1"].tolist(), strict=True))
-        rows = tracklets[(tracklets["passage_id"] == passage) & _has_pair(tracklets, pairs)]
+        rows = tracklets[(tracklets["track_id"] == track) & _has_pair(tracklets, pairs)]
         frames = np.unique(rows[["frame_0", "frame_1", "frame_2"]].to_numpy())
-        yield PassageLineage(int(passage), tuple(map(int, rows["tracklet_id"])), tuple(map(int, frames)))
+        yield TrackLineage(int(track), tuple(map(int, rows["tracklet_id"])), tuple(map(int, frames)))
 
 
 def _has_pair(tracklets: pd.DataFrame, pairs: set[tuple[int, int]]) -> NDArray[np.bool_]:
@@ -139,14 +139,14 @@ def _frames(run: Run, frames: list[int]) -> tuple[FrameLineage, ...]:
 def describe_detector(run: Run) -> str:
     """The detector in one line: its file's digest, and what it was learnt from."""
     working = read_working(run.layout)
-    if working.learnt_from == "detections":
+    if working.training_source == "detections":
         return f"another detector's boxes, digest {run.record.inputs.detections}"
     how = {
         "labels": f"learnt from {working.labels} marked cars (digest of the labels {run.record.inputs.labels})",
         "motion": f"learnt from {working.labels} cars that moved",
         "file": f"given as a file, digest {run.record.inputs.detector}",
         "shipped": "the shipped one",
-    }[working.learnt_from]
+    }[working.training_source]
     return f"detector.json, digest {_output(run, 'detector', 'detector.json')}, {how}"
 
 
@@ -155,7 +155,7 @@ def describe_base_image(run: Run) -> str:
     grid = run.grid
     name = (run.layout.base_image_tif if run.layout.base_image_tif.exists() else run.layout.base_image).name
     digest = _output(run, "base", f"base/{name}")
-    whence = f"given, digest {run.record.inputs.base}" if grid.how == "given" else "built from the flight"
+    whence = f"given, digest {run.record.inputs.base}" if grid.base_source == "given" else "built from the flight"
     line = f"base/{name}, digest {digest}, {grid.width_px} x {grid.height_px} px, {whence}"
     if grid.intersensor_error_px is not None:
         line += f"; the flight lies on it to {grid.intersensor_error_px:.2f} px"
@@ -182,12 +182,12 @@ def describe_lineage(run: Run) -> str:
 
 def describe_pixel(run: Run, pixel: PixelLineage) -> str:
     """A pixel's lineage, for people."""
-    vehicles, tracklets = len(pixel.passages), sum(len(p.tracklets) for p in pixel.passages)
+    vehicles, tracklets = len(pixel.tracks), sum(len(p.tracklets) for p in pixel.tracks)
     head = f"pixel ({pixel.x}, {pixel.y}): {vehicles} vehicles went by, {tracklets} tracklets in "
     lines = [f"{head}{len(pixel.frames)} frames of {run.record.inputs.source.path}"]
-    for passage in pixel.passages:
-        lines.append(f"passage {passage.passage_id}: tracklets {', '.join(map(str, passage.tracklets))}")
-        lines.append(f"  seen in frames {', '.join(map(str, passage.frames))}")
+    for track in pixel.tracks:
+        lines.append(f"track {track.track_id}: tracklets {', '.join(map(str, track.tracklets))}")
+        lines.append(f"  seen in frames {', '.join(map(str, track.frames))}")
     if pixel.frames:
         lines.append("frame  source frame  time        held-out residual")
         lines += [

@@ -9,9 +9,10 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from schemas.records import FlightRecord, RebaseRecord, ResultRecord, ResultsRecord
+from schemas.records import RebaseRecord, ResultRecord, ResultsRecord
 from velfield.errors import InputError
 from velfield.run.commits import commit_path, digest_path, read_commits, valid_commit, write_atomically
+from velfield.run.flight_record import read_flight_record
 from velfield.run.layout import RunLayout
 from velfield.run.paths import remove_tree, rename_tree
 from velfield.run.run import Run
@@ -75,7 +76,7 @@ def result_exists(layout: RunLayout, name: str, base: Path) -> bool:
     """
     if not (layout.results / name / _LAST).exists():
         return False
-    record = FlightRecord.model_validate_json((layout.results / name / _LAST).read_bytes())
+    record = read_flight_record(layout.results / name)
     if record.inputs.base != digest_path(base):
         raise InputError(f"{layout.results / name} is another base image's result; name this one with --out")
     return True

@@ -1,5 +1,6 @@
 """`open_run`: one object over a run folder, the Python side of the contract of outputs."""
 
+import warnings
 from functools import cached_property
 from pathlib import Path
 
@@ -9,45 +10,39 @@ from numpy.typing import NDArray
 
 from schemas.arrays import GreyImage, Points
 from schemas.records import FORMAT_VERSION, FlightRecord, GridRecord
-from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
+from schemas.tables import DETECTION_COLUMNS, TRACK_COLUMNS
 from velfield.analysis.crossings import find_crossings, hysteresis_px
-from velfield.errors import InputError
+from velfield.errors import OldNameWarning
 from velfield.field.segments import Segments, segment_table
 from velfield.field.view import VelocityField
 from velfield.run.analysis import RunAnalysis
 from velfield.run.base_image import read_base_image
 from velfield.run.field_reader import IntervalField, open_field_intervals, open_velocity_field
+from velfield.run.flight_record import read_flight_record
 from velfield.run.frame_transforms import FrameTransforms
 from velfield.run.grid import read_grid
 from velfield.run.layout import RunLayout
 from velfield.run.paths import to_path
 from velfield.run.stores import FrameStore, RegistrationStore, open_field, open_frames, open_registration
-from velfield.run.tables import read_tables
+from velfield.run.tables import conform, read_tables
 
 _EACH_ONCE = {"shared_segment_weight": 1}
 """The preset `paper` weighs segments that two tracklets share twice; who counts vehicles does not."""
 
 
 def open_run(root: str | Path) -> "Run":
-    """Open a run folder for reading.
+    """Open a run folder for reading. One of format 1 is read by the present names, with a warning.
 
     Raises
     ------
     InputError
-        The folder is not a run folder, or one of another format.
+        The folder is not a run folder, or one of a format that is not read.
     """
-    layout = RunLayout(to_path(root))
-    if not layout.flight.exists():
-        raise InputError(
-            f"{root} is not a run folder: it has no flight.json; make one with `velfield run ... --out {root}`"
-        )
-    record = FlightRecord.model_validate_json(layout.flight.read_bytes())
+    record = read_flight_record(to_path(root))
     if record.format_version != FORMAT_VERSION:
-        raise InputError(
-            f"{root} is a run folder of format {record.format_version}, this velfield reads {FORMAT_VERSION}; "
-            "run the flight again into a new folder"
-        )
-    return Run(layout, record)
+        message = f"{root} is a run folder of format {record.format_version}, read by the names of {FORMAT_VERSION}"
+        warnings.warn(message, OldNameWarning, stacklevel=2)
+    return Run(RunLayout(to_path(root), record.format_version), record)
 
 
 class Run:
@@ -114,11 +109,19 @@ class Run:
         return read_tables(sorted(self.layout.detections.glob("unit-*.parquet")), DETECTION_COLUMNS)
 
     def tracklets(self) -> pd.DataFrame:
-        """All tracklets, in base pixels: the columns of ``schemas.tables.TRACKLET_COLUMNS``."""
-        return read_tables(sorted(self.layout.tracks.glob("unit-*.parquet")), TRACKLET_COLUMNS)
+        """All tracklets, in base pixels: the columns of ``schemas.tables.TRACK_COLUMNS``.
+
+        ``passage_id`` is deprecated: the old name of ``track_id``, with the same values.
+        """
+        paths = sorted(self.layout.tracks.glob("unit-*.parquet"))
+        if self.layout.format_version == FORMAT_VERSION:
+            return read_tables(paths, TRACK_COLUMNS)
+        stored = {name: kind for name, kind in TRACK_COLUMNS.items() if name != "track_id"}
+        table = read_tables(paths, stored)
+        return conform(table.assign(track_id=table["passage_id"]), TRACK_COLUMNS)
 
     def segments(self) -> Segments:
-        """Vehicles from one frame to the next, each once: by passage and time (`velfield.field.segments`)."""
+        """Vehicles from one frame to the next, each once: by track and time (`velfield.field.segments`)."""
         return segment_table(self.tracklets(), self.record.config.field.model_copy(update=_EACH_ONCE))
 
     def crossings(self, start_xy: tuple[float, float], end_xy: tuple[float, float]) -> pd.DataFrame:

@@ -20,10 +20,14 @@ from numpy.typing import NDArray
 from zarr.codecs import ZstdCodec
 
 from schemas.arrays import Float32Array, IntArray
+from schemas.records import FORMAT_VERSION
+from schemas.renames import OLD_ARRAYS, OLD_ATTRIBUTES, OLD_WEIGHTS
 from velfield.errors import InputError
 from velfield.run.paths import is_remote
 
 _STATUS_BYTES = 160
+_FORMAT_KEY = "format_version"
+"""Attribute of a store that names its format; stores of format 1 have none."""
 HISTOGRAM = "velocity_histogram"
 HISTOGRAM_TIME_WEIGHTED = "velocity_histogram_time_weighted"
 HISTOGRAMS: dict[str, dict[str, str]] = {HISTOGRAM: {"long_name": "velocity histogram", "units": "1"}}
@@ -55,26 +59,46 @@ def _location(path: Path) -> dict[str, Any]:
     return {"store": path}
 
 
+def _present_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Attributes of a store of format 1 by the present names."""
+    names = {old: name for name, old in OLD_ATTRIBUTES.items()}
+    weights = {old: weight for weight, old in OLD_WEIGHTS.items()}
+    present = {names.get(name, name): value for name, value in attributes.items()}
+    if "weighted_by" in present:
+        present["weighted_by"] = weights.get(present["weighted_by"], present["weighted_by"])
+    return present
+
+
 class _Group:
-    """A group, opened, whose arrays are looked up once: on S3 each look is a request or two."""
+    """A group, opened, whose arrays are opened once: on S3 each opening is a request or two.
+
+    Arrays are named as in the present format; those of a store of format 1 are found by their old names.
+    """
 
     def __init__(self, group: zarr.Group) -> None:
         self._group = group
         self._arrays: dict[str, zarr.Array[Any]] = {}
+        self._old = _FORMAT_KEY not in group.attrs
 
     @property
     def attrs(self) -> Mapping[str, Any]:
-        return self._group.attrs
+        attributes: dict[str, Any] = dict(self._group.attrs)
+        return _present_attributes(attributes) if self._old else attributes
 
     def __getitem__(self, name: str) -> zarr.Array[Any]:
         if name not in self._arrays:
-            self._arrays[name] = cast("zarr.Array[Any]", self._group[name])
+            self._arrays[name] = cast("zarr.Array[Any]", self._group[self.stored_name(name)])
         return self._arrays[name]
+
+    def stored_name(self, name: str) -> str:
+        """The name that the store has for an array."""
+        return OLD_ARRAYS.get(name, name) if self._old else name
 
     @cached_property
     def by_axes(self) -> dict[int, list[str]]:
-        """Names of the arrays of so many axes, in one order whatever the disk lists first."""
-        self._arrays |= dict(self._group.arrays())
+        """Names of the arrays by their number of axes, sorted."""
+        present = {old: name for name, old in OLD_ARRAYS.items()} if self._old else {}
+        self._arrays |= {present.get(name, name): array for name, array in self._group.arrays()}
         names: dict[int, list[str]] = {}
         for name in sorted(self._arrays):
             names.setdefault(self._arrays[name].ndim, []).append(name)
@@ -147,7 +171,9 @@ def create_frames(
     path: Path, *, key: str, count: int, height: int, width: int, unit_frames: int, source: Mapping[str, Any]
 ) -> None:
     """Lay out ``frames.zarr``: one frame a chunk; a unit of a column a chunk. Frames are unreadable until written."""
-    group = zarr.create_group(**_location(path), overwrite=True, attributes={"source": dict(source)})
+    group = zarr.create_group(
+        **_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION, "source": dict(source)}
+    )
     chunk = min(unit_frames, max(count, 1))
     _create(group, "raw", (count, height, width), (1, height, width), "uint8", dimension_names=("frame", "y", "x"))
     for name, (dtype, fill) in FRAME_COLUMNS.items():
@@ -233,12 +259,12 @@ def open_frames(path: Path, mode: str = "r") -> FrameStore:
 # ------------------------------------------------------------------------------------------------------- registration
 
 REGISTRATION_COLUMNS: dict[str, str] = {
-    "count_base": "int32",  # matches with the base image
-    "count_previous": "int32",  # matches with the previous registered frame
-    "count_kept": "int32",  # control points that the robust fit kept
+    "n_matches_base": "int32",  # matches with the base image
+    "n_matches_previous": "int32",  # matches with the previous registered frame
+    "n_inliers": "int32",  # control points that the robust fit kept
     "residual_px": "float32",  # RMS of what was fitted
     "heldout_px": "float32",  # RMS of what was held out of the fit
-    "spread": "float32",  # share of the image's cells that hold control points
+    "coverage": "float32",  # fraction of the frame's cells that hold inliers
 }
 
 
@@ -248,7 +274,7 @@ ERROR_CELLS = (6, 8)
 
 def create_registration(path: Path, *, key: str, count: int, vector_length: int, unit_frames: int) -> None:
     """Lay out ``registration.zarr``: chunks are units, so that a unit has one writer."""
-    group = zarr.create_group(**_location(path), overwrite=True)
+    group = zarr.create_group(**_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION})
     chunk = min(unit_frames, max(count, 1))
     _create(group, "vector", (count, vector_length), (chunk, vector_length), "float64", fill_value=np.nan)
     _create(group, "status", (count, _STATUS_BYTES), (chunk, _STATUS_BYTES), "uint8", fill_value=0)
@@ -305,7 +331,7 @@ class RegistrationStore:
         """Files that hold the unit from frame ``start`` on, and the store's metadata."""
         unit = start // int(self.group["vector"].chunks[0])
         tables = [self.path / name / "c" / str(unit) / "0" for name in ("vector", "status")]
-        columns = [self.path / name / "c" / str(unit) for name in REGISTRATION_COLUMNS]
+        columns = [self.path / self.group.stored_name(name) / "c" / str(unit) for name in REGISTRATION_COLUMNS]
         errors = self.path / "error_px" / "c" / str(unit) / "0" / "0"
         return [*_metadata(self.path), *_existing([*tables, *columns, errors])]
 
@@ -342,7 +368,7 @@ def create_field(
     layers : name -> attributes
         (y, x) layers beside the histogram; ``dtype`` among the attributes says their type, float32 where absent.
     """
-    group = zarr.create_group(**_location(path), overwrite=True, attributes=dict(attributes))
+    group = zarr.create_group(**_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION, **attributes})
     n = len(velocities_px_per_s)
     grid_mapping = {"grid_mapping": "crs"} if attributes.get("crs_wkt") else {}
     for name, what in histograms.items():
@@ -429,7 +455,7 @@ class FieldStore:
 
     def has_tile(self, row: int, column: int, name: str = HISTOGRAM) -> bool:
         """Whether the tile's chunk exists."""
-        return (self.path / name / "c" / str(row) / str(column) / "0" / "0").exists()
+        return (self.path / self.group.stored_name(name) / "c" / str(row) / str(column) / "0" / "0").exists()
 
     def read_tile(self, row: int, column: int, name: str = HISTOGRAM) -> NDArray[np.int32]:
         """One tile of a histogram, (ty, tx, nvy, nvx) int32; clipped at the border.
@@ -456,8 +482,9 @@ class FieldStore:
     def files(self, tiles: Iterable[tuple[int, int]], group: tuple[int, int]) -> list[Path]:
         """Files that hold the tiles (row, column) and the layers of one group; and the store's metadata."""
         places = [Path("c", str(row), str(column), "0", "0") for row, column in tiles]
-        histogram = [self.path / name / place for name in self.histogram_names() for place in places]
-        layers = [self.path / name / "c" / str(group[0]) / str(group[1]) for name in self.layer_names()]
+        stored = self.group.stored_name
+        histogram = [self.path / stored(name) / place for name in self.histogram_names() for place in places]
+        layers = [self.path / stored(name) / "c" / str(group[0]) / str(group[1]) for name in self.layer_names()]
         axes = [self.path / name / "c" / "0" for name in self.group.by_axes.get(1, ())]
         return [*_metadata(self.path), *_existing([*histogram, *layers, *axes])]
 
@@ -476,7 +503,10 @@ class FieldStore:
 
     def stored_chunks(self, name: str) -> list[tuple[int, int]]:
         """(row, column) of the chunks of an array that are stored: one that is all fill value is not."""
-        return sorted((int(path.parent.name), int(path.name)) for path in (self.path / name / "c").glob("*/*"))
+        return sorted(
+            (int(path.parent.name), int(path.name))
+            for path in (self.path / self.group.stored_name(name) / "c").glob("*/*")
+        )
 
 
 def open_field(path: Path, mode: str = "r") -> FieldStore:
@@ -492,7 +522,7 @@ _LAYER_CHUNK_PX = 512
 
 def write_segments(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write ``view/segments.zarr`` anew: columns of one length, (segments,) each; every chunk is there to be read."""
-    group = zarr.create_group(**_location(path), overwrite=True)
+    group = zarr.create_group(**_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION})
     for name, values in columns.items():
         chunk = (min(_SEGMENTS_A_CHUNK, max(len(values), 1)),)
         column = _create(group, name, values.shape, chunk, values.dtype.name, dimension_names=("segment",))
@@ -501,7 +531,7 @@ def write_segments(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
 
 def write_extra_layers(path: Path, layers: Mapping[str, tuple[NDArray[np.floating], Mapping[str, Any]]]) -> None:
     """Write float32 (y, x) layers with their attributes, to be shown beside a field's own: `open_field` reads them."""
-    group = zarr.create_group(**_location(path), overwrite=True)
+    group = zarr.create_group(**_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION})
     for name, (values, attributes) in layers.items():
         chunk = (_LAYER_CHUNK_PX, _LAYER_CHUNK_PX)
         layer = _create(group, name, values.shape, chunk, "float32", fill_value=np.nan, dimension_names=("y", "x"))

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from schemas.tables import TRACK_COLUMNS
 from velfield.run.commits import write_atomically
 from velfield.run.paths import copy_objects, is_remote
 
@@ -43,6 +44,11 @@ def write_table(path: Path, table: pd.DataFrame, columns: Mapping[str, str]) -> 
     buffer = io.BytesIO()
     conform(table, columns).to_parquet(buffer, index=False, compression="zstd")
     write_atomically(path, buffer.getvalue())
+
+
+def write_tracks(path: Path, tracklets: pd.DataFrame) -> None:
+    """Write one part of the tracks: tracklets, whose deprecated ``passage_id`` is their ``track_id``."""
+    write_table(path, tracklets.assign(passage_id=tracklets["track_id"]), TRACK_COLUMNS)
 
 
 def link_file(source: Path, target: Path) -> Path:

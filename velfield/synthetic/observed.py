@@ -92,7 +92,7 @@ def observed_tracklets(
     columns["confidence"] = np.ones(len(start))
     columns["tracklet_id"] = columns["detection_id_1"]
     ids = np.stack([columns[f"detection_id_{k}"] for k in range(3)], axis=1).astype(np.int64)
-    columns["passage_id"] = assign_tracks(ids)
+    columns["track_id"] = assign_tracks(ids)
     return pd.DataFrame({name: columns[name].astype(kind) for name, kind in TRACKLET_COLUMNS.items()})
 
 

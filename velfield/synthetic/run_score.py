@@ -76,7 +76,7 @@ def score_run(root: str | Path, flight: str | Path, *, min_count: int = 5) -> Ru
     velocity = run.field.modal_velocity().astype(np.float64)
     velocity[np.isnan(run.field.modal_direction_rad())] = np.nan  # stationary: no direction
     some = frames[:: max(1, len(frames) // 20)]
-    to_truth = None if run.grid.how == "given" else fit_homography(truth, to_base, some)
+    to_truth = None if run.grid.base_source == "given" else fit_homography(truth, to_base, some)
     registration = score_registration(truth, to_base, frames, to_truth=to_truth)
     if to_truth is None and registration.mean_px > _ANOTHER_BASE_PX:
         raise InputError(

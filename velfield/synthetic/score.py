@@ -246,12 +246,12 @@ def score_tracklets(
         speed_bias_km_per_h=float(speed[moving].mean()) if moving.any() else 0.0,
         direction_error_mean_rad=float(direction[fast].mean()) if fast.any() else 0.0,
         tracklets=len(right),
-        tracks_per_vehicle=_tracks_per_vehicle(tracklets["passage_id"].to_numpy()[right], vehicles[1][right]),
+        tracks_per_vehicle=_tracks_per_vehicle(tracklets["track_id"].to_numpy()[right], vehicles[1][right]),
     )
 
 
-def _tracks_per_vehicle(passage: IntArray, vehicle: IntArray) -> float:
-    pairs = np.unique(np.stack([passage, vehicle], axis=1), axis=0)
+def _tracks_per_vehicle(track: IntArray, vehicle: IntArray) -> float:
+    pairs = np.unique(np.stack([track, vehicle], axis=1), axis=0)
     return len(pairs) / max(len(np.unique(vehicle)), 1)
 
 

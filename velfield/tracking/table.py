@@ -40,7 +40,7 @@ class LinkedTriples:
 def tracklet_table(
     tables: Sequence[FrameTable], windows: Sequence[LinkedTriples], limits: Limits, *, refine: bool
 ) -> tuple[pd.DataFrame, int]:
-    """The tracklets of many windows, with columns `schemas.tables.TRACKLET_COLUMNS`; ``passage_id`` is still -1.
+    """The tracklets of many windows, with columns `schemas.tables.TRACKLET_COLUMNS`; ``track_id`` is still -1.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def tracklet_table(
         column[f"sad_{link}"] = differences[:, k]
     column["confidence"] = _concatenated([w.confidence for w in windows], np.float64)
     column["tracklet_id"] = column["detection_id_1"]
-    column["passage_id"] = np.full(start.size, -1, np.int64)
+    column["track_id"] = np.full(start.size, -1, np.int64)
     frame = pd.DataFrame({name: column[name].astype(kind) for name, kind in TRACKLET_COLUMNS.items()})
     return frame, int(np.sum(displacement[:, :, 3]))
 

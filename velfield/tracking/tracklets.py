@@ -110,7 +110,7 @@ def link_windows(
     Returns
     -------
     DataFrame, GateLog
-        Columns of `schemas.tables.TRACKLET_COLUMNS` sorted by frame, ``passage_id`` still -1; and the counts by gate,
+        Columns of `schemas.tables.TRACKLET_COLUMNS` sorted by frame, ``track_id`` still -1; and the counts by gate,
         which add up over the parts of a flight.
 
     Raises

@@ -22,7 +22,7 @@ _REACH_PERCENT = 98.0
 class _Known:
     name: str
     title: str
-    about: str
+    description: str
     kind: LayerKind
     arrays: tuple[str, ...]
     main: bool = False
@@ -32,20 +32,20 @@ _KNOWN = (
     _Known(
         "direction",
         "Direction",
-        "Which way most vehicles go: the direction of the largest mode. No colour where they stand.",
+        "Direction of the largest mode, in which most vehicles go. No colour where they are stationary.",
         "direction",
         ("modal_vx", "modal_vy"),
         True,
     ),
     _Known("speed", "Speed", "Speed of the largest mode.", "speed", ("modal_vx", "modal_vy"), True),
-    _Known("speed_p85", "85th percentile speed", "85 % of vehicles go slower.", "speed", ("speed_p85",), True),
-    _Known("count", "Vehicles", "How many vehicles passed.", "count", ("count",), True),
+    _Known("speed_p85", "85th percentile speed", "85 % of vehicles are slower.", "speed", ("speed_p85",), True),
+    _Known("count", "Vehicles", "Number of vehicle tracks.", "count", ("count",), True),
     _Known(
-        "direction_half90",
+        "direction_ci90_half_width",
         "Uncertainty of direction",
-        "Half the 90 % interval of the direction.",
+        "Half the width of the 90 % confidence interval of the direction.",
         "angle",
-        ("direction_half90",),
+        ("direction_ci90_half_width",),
         True,
     ),
     _Known(
@@ -56,37 +56,39 @@ _KNOWN = (
         ("speed_se",),
         True,
     ),
-    _Known("speed_p50", "Median speed", "Half of the vehicles go slower.", "speed", ("speed_p50",)),
-    _Known("speed_p15", "15th percentile speed", "15 % of vehicles go slower.", "speed", ("speed_p15",)),
+    _Known("speed_p50", "Median speed", "Half of the vehicles are slower.", "speed", ("speed_p50",)),
+    _Known("speed_p15", "15th percentile speed", "15 % of vehicles are slower.", "speed", ("speed_p15",)),
     _Known(
         "direction_se",
         "Standard error of direction",
-        "Of the mean direction of what moves; needs two vehicles.",
+        "Of the mean direction of moving vehicles; needs two.",
         "angle",
         ("direction_se",),
     ),
     _Known("mean_direction", "Mean direction", "Direction of the mean velocity.", "direction", ("mean_vx", "mean_vy")),
     _Known(
-        "standing_share",
-        "Share that stand",
-        "Share of vehicles that stand here: stop lines, queues, parking.",
-        "share",
-        ("standing_share",),
+        "stationary_fraction",
+        "Fraction stationary",
+        "Fraction of vehicles that are stationary here: stop lines, queues, parking.",
+        "fraction",
+        ("stationary_fraction",),
     ),
-    _Known("dwell", "Time spent", "Time that vehicles spent here, all together.", "time", ("dwell_ms",)),
-    _Known("mode_share", "Share of the mode", "Share of vehicles near the largest mode.", "share", ("mode_share",)),
+    _Known("occupancy", "Occupancy", "Total time that vehicles spent here.", "time", ("occupancy_ms",)),
+    _Known("mode_fraction", "At the mode", "Fraction of vehicles at the largest mode.", "fraction", ("mode_fraction",)),
     _Known(
         "circular_variance",
-        "Spread of direction",
-        "0: all go one way; 1: no direction.",
+        "Variance of direction",
+        "Circular variance. 0: all go one way; 1: no preferred direction.",
         "plain",
         ("circular_variance",),
     ),
 )
-_LIKE_SPEED = frozenset({"speed", "speed_p85", "speed_p50", "speed_p15", "speed_p50_low90", "speed_p50_high90"})
-"""Shown on the scale of the modal speed, so that they compare, and not on that of an interval's upper end."""
+_SPEED_SCALE = frozenset(
+    {"speed", "speed_p85", "speed_p50", "speed_p15", "speed_p50_ci90_lower", "speed_p50_ci90_upper"}
+)
+"""Layers on the colour scale of the modal speed, so that they compare."""
 
-_INNER = ("velocity_noise",)
+_INNER = ("velocity_variance_sum",)
 """For the sums of fields, not for people."""
 
 Reader = Callable[[str], NDArray[Any]]
@@ -106,17 +108,17 @@ def view_layers(attributes: Mapping[str, Mapping[str, Any]], read: Reader) -> li
     taken = {*_INNER, *(name for layer in _KNOWN for name in layer.arrays)}
     known += [_unknown(name, attrs) for name, attrs in attributes.items() if name not in taken]
     sizes = {layer.name: _sizes([np.asarray(read(name)) for name in layer.arrays]) for layer in known}
-    speed_top = colour_scale_max(sizes["speed"]) if "speed" in sizes else None
+    speed_max = colour_scale_max(sizes["speed"]) if "speed" in sizes else None
     return [
         ViewLayer(
             name=layer.name,
             title=layer.title,
-            about=layer.about,
+            description=layer.description,
             kind=layer.kind,
             arrays=layer.arrays,
             units=str(attributes[layer.arrays[0]].get("units", "1")),
-            top=speed_top if speed_top and layer.name in _LIKE_SPEED else _top(sizes[layer.name]),
-            highest=float(sizes[layer.name].max(initial=0.0)),
+            colour_max=speed_max if speed_max and layer.name in _SPEED_SCALE else _colour_max(sizes[layer.name]),
+            data_max=float(sizes[layer.name].max(initial=0.0)),
             main=layer.main,
         )
         for layer in known
@@ -131,7 +133,7 @@ def _unknown(name: str, attributes: Mapping[str, Any]) -> _Known:
     title = str(attributes.get("long_name", name.replace("_", " ")))
     kind = _KINDS.get(str(attributes.get("units", "1")), "plain")
     change = "change" in name
-    about = "The later less the earlier, shown where it is hardly chance." if change else ""
+    about = "The later field minus the earlier one, where the difference is significant." if change else ""
     return _Known(name, title[:1].upper() + title[1:], about, "change" if change else kind, (name,), change)
 
 
@@ -141,7 +143,7 @@ def _sizes(arrays: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
     return np.asarray(size[np.isfinite(size)], np.float64)
 
 
-def _top(sizes: NDArray[np.float64]) -> float:
+def _colour_max(sizes: NDArray[np.float64]) -> float:
     """Where the colours end: the 98th percentile of the sizes of what is not zero."""
     sizes = sizes[sizes > 0]
     return float(np.percentile(sizes, _REACH_PERCENT)) if sizes.size else 1.0

@@ -17,7 +17,7 @@ import numpy as np
 from schemas.arrays import FloatArray
 from schemas.records import FlightRecord, GridRecord
 from schemas.view import ViewArray, ViewBase, ViewLayer, ViewRecord, ViewSegments
-from velfield.analysis.coverage import few_vehicles
+from velfield.analysis.coverage import low_coverage_note
 from velfield.analysis.crossings import hysteresis_px
 from velfield.field.bins import band_radius_px, stationary_speed_px_per_s
 from velfield.field.segments import Segments
@@ -101,11 +101,11 @@ def view_record(
         arrays={name: array for path, each in stores.items() for name, array in _arrays(path, each).items()},
         segments=ViewSegments(
             count=len(segments),
-            passages=len(np.unique(segments["track"])),
+            tracks=len(np.unique(segments["track"])),
             settle_px=hysteresis_px(grid.gsd_m),
-            reach_px=band_radius_px(flight.config.field, grid.gsd_m) or _LINE_REACH_PX,
+            band_radius_px=band_radius_px(flight.config.field, grid.gsd_m) or _LINE_REACH_PX,
         ),
-        few=few_vehicles(int((count > 0).sum()), int((count >= 5).sum())),
+        low_coverage_note=low_coverage_note(int((count > 0).sum()), int((count >= 5).sum())),
     )
 
 
@@ -128,11 +128,11 @@ def _arrays(path: str, store: FieldStore) -> dict[str, ViewArray]:
 
 
 def _columns(segments: Segments) -> dict[str, np.ndarray]:
-    """Columns for the page: passages numbered from 0, places and velocities in float32 (a thousandth of a pixel)."""
+    """Columns for the page: tracks numbered from 0, places and velocities in float32 (a thousandth of a pixel)."""
     numbers = np.unique(segments["track"], return_inverse=True)[1]
     names = ("duration_s", "x0_px", "y0_px", "x1_px", "y1_px", "vx_px_per_s", "vy_px_per_s")
     return {
-        "passage": numbers.astype(np.int32),
+        "track": numbers.astype(np.int32),
         "start_s": segments["start_s"].astype(np.float64),
         **{name: segments[name].astype(np.float32) for name in names},
     }

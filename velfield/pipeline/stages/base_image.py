@@ -162,7 +162,7 @@ def _own_grid(plan: Plan, own: OwnBase, reference: int) -> GridRecord:
         origin_x_px=own.origin_xy[0],
         origin_y_px=own.origin_xy[1],
         gsd_m=plan.config.gsd_m,
-        how="own",
+        base_source="flight",
         reference_frame=reference,
     )
 
@@ -203,13 +203,13 @@ def register_directly(plan: Plan, given: BaseRaster, keypoints: dict[int, Keypoi
     fits = []
     for frame in (frames[k] for k in samples):
         result = register_frame(store.read(frame), keypoints[frame], reference, lens, config)
-        accurate = result.heldout_px <= _MAX_DIRECT_ERROR_PX and result.spread >= _MIN_DIRECT_COVERAGE
+        accurate = result.heldout_px <= _MAX_DIRECT_ERROR_PX and result.coverage >= _MIN_DIRECT_COVERAGE
         if result.transform is None or not accurate:
             return None
         scale, rotation = result.transform.scale_and_rotation()
         check_scale(scale, given, plan.job.inputs.base or "")
         covered = covered_fraction(result.transform, None, given)
-        fits.append(BaseFit(True, result.heldout_px, result.count_kept, scale, rotation, covered))
+        fits.append(BaseFit(True, result.heldout_px, result.n_inliers, scale, rotation, covered))
     return replace(
         fits[len(fits) // 2],
         error_px=float(np.mean([fit.error_px for fit in fits])),
@@ -238,8 +238,8 @@ def _given_grid(plan: Plan, given: BaseRaster, reference: int, fit: BaseFit) -> 
         gsd_m=reconcile_gsd(given.gsd_m, plan.config.gsd_m),
         crs_wkt=given.crs_wkt,
         affine=given.affine,
-        how="given",
-        frames_to="given" if fit.direct else "own",
+        base_source="given",
+        registered_to="given" if fit.direct else "flight",
         reference_frame=reference,
         intersensor_error_px=fit.error_px,
         intersensor_points=fit.points,
@@ -266,7 +266,7 @@ def base_reference(plan: Plan) -> BaseReference:
 def _make_reference(plan: Plan) -> BaseReference:
     limit = plan.config.frames.max_pixels
     shape = open_frames(plan.layout.frames).shape
-    if read_grid(plan.layout).frames_to == "given":
+    if read_grid(plan.layout).registered_to == "given":
         given = _read_given_base(plan)
         assert given is not None, "the grid says that a base image was given"
         return prepare_base(given.grey, plan.config.registration, mask=given.valid, frame_shape=shape)

@@ -173,7 +173,7 @@ def _finish(
     plan: Plan,
     detector: Detector | None,
     scale: float,
-    learnt_from: str,
+    training_source: str,
     *,
     count: int = 0,
     motion: MotionLabels | None = None,
@@ -187,18 +187,18 @@ def _finish(
     if background is not None and detector is not None and detector.uses_background:
         write_background(layout, background)
         outputs.append(layout.background)
-    if motion is not None and learnt_from == "motion":
+    if motion is not None and training_source == "motion":
         notes.append(
             f"{motion.count} labels of {motion.vehicles} vehicles from motion: estimated precision "
             f"{motion.precision_estimate:.0%}, {motion.axial_motion_fraction:.0%} of objects move along their axis"
         )
     record = WorkingRecord(
         scale=scale,
-        learnt_from=learnt_from,
+        training_source=training_source,
         has_background=layout.background in outputs,
         labels=count,
-        purity=None if motion is None else motion.precision_estimate,
-        coherence=None if motion is None else motion.axial_motion_fraction,
+        label_precision_estimate=None if motion is None else motion.precision_estimate,
+        axial_motion_fraction=None if motion is None else motion.axial_motion_fraction,
     )
     write_atomically(layout.working, record.model_dump_json(indent=1).encode())
     advance("detector")

@@ -55,7 +55,7 @@ def free_of_vehicles(plan: Plan, frame: int, shape: tuple[int, int]) -> NDArray[
         return None
     table = given_boxes(plan)
     mine = table[table["source_index"] == plan.indices[frame]].dropna(subset=["length_px", "width_px"])
-    turns = np.degrees(mine["orientation_rad"].fillna(mine["tilt_rad"]).fillna(0.0))
+    turns = np.degrees(mine["orientation_rad"].fillna(mine["abs_box_angle_rad"]).fillna(0.0))
     boxes = np.column_stack([mine[["x_px", "y_px", "length_px", "width_px"]], turns])
     other_way = boxes[mine["orientation_rad"].isna()] * [1, 1, 1, 1, -1]  # a car in an upright box lies either way
     free = np.ones(shape, np.uint8)
@@ -71,7 +71,7 @@ def _looked_for(
     """Axes (n,) of boxes that do not tell them: the picture's, or of the two that an upright box leaves the nearer."""
     untold = np.full((len(xy), 3), np.nan)
     own = with_axes(seen.image, np.column_stack([np.nan_to_num(xy), untold]))[:, 2]
-    raw, tilt = boxes[["x_px", "y_px"]].to_numpy(np.float64), boxes["tilt_rad"].to_numpy(np.float64)
+    raw, tilt = boxes[["x_px", "y_px"]].to_numpy(np.float64), boxes["abs_box_angle_rad"].to_numpy(np.float64)
     one, other = (_turned(transform, raw, sign * tilt) for sign in (1, -1))
     nearer = np.where(axial_difference(one, own) <= axial_difference(other, own), one, other)
     return np.where(np.isfinite(nearer), nearer, own)

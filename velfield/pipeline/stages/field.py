@@ -24,7 +24,7 @@ from velfield.run.tables import read_tables
 
 _SEGMENT_COLUMNS = [
     "tracklet_id",
-    "passage_id",
+    "track_id",
     *(f"detection_id_{k}" for k in range(3)),
     *(f"time_{k}_s" for k in range(3)),
     *(f"{axis}_{k}_px" for k in range(3) for axis in "xy"),
@@ -39,8 +39,8 @@ def field_groups(plan: Plan) -> list[Group]:
 
 
 def field_weight(config: FieldConfig) -> Weight:
-    """What a passage adds at a pixel: one in all, or one a segment as in the paper."""
-    return "segment" if config.shared_segment_weight == 2 else "passage"
+    """What a track adds at a pixel: one in all, or one a segment as in the paper."""
+    return "segment" if config.shared_segment_weight == 2 else "track"
 
 
 def create_field_stores(plan: Plan) -> None:
@@ -117,14 +117,14 @@ def accumulate_into(writer: GroupWriter, segments: Segments, *, weight: Weight, 
 
 
 def _segments_near(plan: Plan, writer: GroupWriter) -> Segments:
-    """All segments of the passages that come near the group: whole ones, for a passage shares one unit at a pixel."""
+    """All segments of the tracks that come near the group: whole ones, for a track shares one unit at a pixel."""
     margin = (band_radius_px(writer.config, writer.bins.gsd_m) or 0.0) + 1
     tracklets = _tracklets_near(plan, writer.x0, writer.y0, writer.width, writer.height, margin)
     return segment_table(tracklets, writer.config) if len(tracklets) else np.empty(0, SEGMENT_DTYPE)
 
 
 def _tracklets_near(plan: Plan, x0: int, y0: int, width: int, height: int, margin: float) -> pd.DataFrame:
-    """All tracklets of the passages that come near the group: whole ones, for a passage shares one unit at a pixel."""
+    """All tracklets of the tracks that come near the group: whole ones, for a track shares one unit at a pixel."""
     paths = sorted(plan.layout.tracks.glob("unit-*.parquet"))
     table = read_tables(paths, TRACKLET_COLUMNS, only=_SEGMENT_COLUMNS)
     xs = table[[f"x_{k}_px" for k in range(3)]].to_numpy()
@@ -135,5 +135,5 @@ def _tracklets_near(plan: Plan, x0: int, y0: int, width: int, height: int, margi
         & (ys.max(axis=1, initial=-np.inf) >= y0 - margin)
         & (ys.min(axis=1, initial=np.inf) <= y0 + height + margin)
     )
-    passages = table["passage_id"].to_numpy()
-    return table[np.isin(passages, np.unique(passages[near]))]
+    tracks = table["track_id"].to_numpy()
+    return table[np.isin(tracks, np.unique(tracks[near]))]

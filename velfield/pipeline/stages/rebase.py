@@ -29,7 +29,7 @@ from velfield.run.frame_transforms import polyprojective_from_record, polyprojec
 from velfield.run.grid import read_grid, read_working
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run
-from velfield.run.tables import link_file, read_tables, write_table
+from velfield.run.tables import link_file, read_tables, write_table, write_tracks
 from velfield.sources.frames import SourceInfo
 from velfield.sources.geo import BaseRaster, read_base_raster
 
@@ -141,8 +141,8 @@ def _mapped_grid(old: GridRecord, given: BaseRaster, record: RebaseRecord) -> Gr
         gsd_m=record.gsd_m,
         crs_wkt=given.crs_wkt,
         affine=given.affine,
-        how="given",
-        frames_to=old.frames_to,
+        base_source="given",
+        registered_to=old.registered_to,
         reference_frame=old.reference_frame,
         intersensor_error_px=float(np.hypot(before, record.added_error_px)),
         intersensor_points=record.points,
@@ -173,8 +173,8 @@ def rebase_tracks(plan: Plan, rebase: Rebase) -> StageResult:
     for source in sorted(rebase.old.tracks.glob("unit-*.parquet")):
         table = map_tracklets(read_tables([source], TRACKLET_COLUMNS), transform)
         written.append(plan.layout.tracks / source.name)
-        write_table(written[-1], table, TRACKLET_COLUMNS)
-        tracks.update(table["passage_id"].unique().tolist())
+        write_tracks(written[-1], table)
+        tracks.update(table["track_id"].unique().tolist())
         count += len(table)
     advance("tracks")
     return StageResult(written, {"tracklets": float(count), "tracks": float(len(tracks))})

@@ -8,7 +8,7 @@ import numpy as np
 
 from schemas.report import PrecisionRecall, Report, ReportStage, ResidualSeries
 from schemas.summary import RunSummary, StageSummary
-from velfield.analysis.coverage import few_vehicles, percent
+from velfield.analysis.coverage import low_coverage_note, percent
 from velfield.detection.files import load_detector
 from velfield.pipeline.plan import Plan
 from velfield.report.report import render_report
@@ -19,7 +19,7 @@ from velfield.run.grid import north_direction_rad, read_grid, read_working
 from velfield.run.stores import open_frames, open_registration
 from velfield.viewer.record import write_view_record
 
-_LEARNT_FROM = {
+_TRAINING_SOURCES = {
     "labels": "marked cars",
     "motion": "what moves in the flight",
     "file": "a detector file",
@@ -66,7 +66,9 @@ def make_report(plan: Plan, summary: RunSummary) -> Report:
         created=datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
         version=code_version(),
         facts=tuple(_facts(plan, counts)),
-        few=few_vehicles(int(counts["field"].get("pixels", 0)), int(counts["field"].get("pixels_5", 0))),
+        low_coverage_note=low_coverage_note(
+            int(counts["field"].get("pixels", 0)), int(counts["field"].get("pixels_5", 0))
+        ),
         inputs=tuple(_inputs(plan)),
         stages=tuple(
             ReportStage(name=s.name, text=s.text, seconds=s.seconds + s.seconds_before, lost=len(s.lost))
@@ -104,7 +106,7 @@ def _inputs(plan: Plan) -> list[tuple[str, str]]:
     return [
         ("base image", plan.job.inputs.base or "built from the flight"),
         ("ground sample distance", gsd),
-        ("cars learnt from", _LEARNT_FROM[working.learnt_from]),
+        ("detector trained on", _TRAINING_SOURCES[working.training_source]),
         ("preset", plan.config.preset),
         ("frame size", f"{plan.info.width} x {plan.info.height} px"),
     ]
@@ -127,7 +129,10 @@ def _curve(plan: Plan) -> PrecisionRecall | None:
     if curve is None:
         return None
     return PrecisionRecall(
-        recall=curve.recall, precision=curve.precision, chosen=curve.operating_point, evidence=curve.description
+        recall=curve.recall,
+        precision=curve.precision,
+        operating_point=curve.operating_point,
+        description=curve.description,
     )
 
 

@@ -31,7 +31,7 @@ def link_unit(plan: Plan, frames: range) -> StageResult:
 def _frame_tables(plan: Plan, wanted: range, times_s: np.ndarray, usable: np.ndarray) -> list[FrameTable]:
     store = open_registration(plan.layout.registration)
     heldout = store.column("heldout_px", wanted.start, wanted.stop).astype(np.float64)
-    kept = store.column("count_kept", wanted.start, wanted.stop).astype(np.float64)
+    kept = store.column("n_inliers", wanted.start, wanted.stop).astype(np.float64)
     tables: list[FrameTable] = []
     for unit in range(wanted.start // plan.unit_frames, (wanted.stop - 1) // plan.unit_frames + 1):
         path = plan.layout.unit_file(plan.layout.detections, unit, ".parquet")

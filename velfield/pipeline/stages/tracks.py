@@ -11,7 +11,7 @@ from velfield.pipeline.result import StageResult
 from velfield.pipeline.stages.registration import usable_frames
 from velfield.run.grid import read_grid
 from velfield.run.stores import open_frames
-from velfield.run.tables import read_tables, write_table
+from velfield.run.tables import read_tables, write_tracks
 from velfield.tracking.gap_closing import END_COLUMNS, GapLimits, reconnect_tracks
 from velfield.tracking.tracks import assign_tracks
 
@@ -35,10 +35,10 @@ def chain_tracks(plan: Plan) -> StageResult:
     written, start = [], 0
     for path in sources:
         table = read_tables([path], TRACKLET_COLUMNS)
-        table["passage_id"] = tracks[start : start + len(table)]
+        table["track_id"] = tracks[start : start + len(table)]
         start += len(table)
         target = plan.layout.tracks / path.name
-        write_table(target, table, TRACKLET_COLUMNS)
+        write_tracks(target, table)
         written.append(target)
     advance("tracks")
     warnings = [] if len(tracks) else [explain_no_tracklets(plan)]

@@ -21,7 +21,7 @@ RAW_DETECTION_COLUMNS: dict[str, str] = {
     "orientation_rad": "float64",  # axial, raw image; NaN where unknown
     "length_px": "float64",  # NaN where unknown
     "width_px": "float64",
-    "tilt_rad": "float64",  # as of `schemas.tables.LABEL_COLUMNS`
+    "abs_box_angle_rad": "float64",  # as of `schemas.tables.LABEL_COLUMNS`
     "score": "float64",  # 1 where unknown
 }
 FORMATS = "a CSV `frame,x_px,y_px[,orientation_rad,length_px,width_px,score]` in raw pixels, or a YOLO folder"
@@ -80,7 +80,7 @@ def _from_yolo(path: Path, info: SourceInfo) -> pd.DataFrame:
                 box.orientation_rad,
                 box.length_px,
                 box.width_px,
-                box.tilt_rad,
+                box.abs_box_angle_rad,
                 box.score,
             )
             for box in boxes

@@ -45,20 +45,20 @@ class Box:
     orientation_rad: float
     length_px: float
     width_px: float
-    tilt_rad: float
+    abs_box_angle_rad: float
     score: float
 
 
 class CarShape(NamedTuple):
     """Orientation and size of the car in a box; NaN where unknown.
 
-    ``tilt_rad``: |angle| to the image's rows, where the box is upright and the axis therefore ambiguous.
+    ``abs_box_angle_rad``: |angle| to the image's rows, where the box is upright and the axis therefore ambiguous.
     """
 
     orientation_rad: float = math.nan
     length_px: float = math.nan
     width_px: float = math.nan
-    tilt_rad: float = math.nan
+    abs_box_angle_rad: float = math.nan
 
 
 def looks_like_yolo(path: Path) -> bool:
@@ -191,7 +191,7 @@ def car_in_upright_box(w: float, h: float) -> CarShape:
     length = length_from_upright_box(w, h)
     if max(w, h) >= _UPRIGHT_ASPECT * min(w, h):
         return CarShape(0.0 if w > h else math.pi / 2, length, CAR_ASPECT * length)
-    return CarShape(length_px=length, width_px=CAR_ASPECT * length, tilt_rad=tilt_of_upright_box(w, h))
+    return CarShape(length_px=length, width_px=CAR_ASPECT * length, abs_box_angle_rad=tilt_of_upright_box(w, h))
 
 
 def tilt_of_upright_box(w: float, h: float, *, aspect: float = CAR_ASPECT) -> float:

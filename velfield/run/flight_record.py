@@ -1,0 +1,72 @@
+"""``flight.json``: the resolved flight of a run folder, of the present format or of the one before."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from schemas.records import FORMAT_VERSION, READABLE_FORMATS, FlightRecord
+from schemas.renames import OLD_FOLDERS, upgrade_config
+from velfield.errors import InputError
+from velfield.run.layout import RunLayout
+
+
+def read_flight_record(root: Path) -> FlightRecord:
+    """The flight of a run folder by the present names; ``format_version`` is that of the folder.
+
+    Raises
+    ------
+    InputError
+        The folder is not a run folder, or one of a format that is not read.
+    """
+    layout = RunLayout(root)
+    if not layout.flight.exists():
+        raise InputError(
+            f"{root} is not a run folder: it has no flight.json; make one with `velfield run ... --out {root}`"
+        )
+    record = _parse(layout.flight)
+    version = record.get("format_version")
+    if version not in READABLE_FORMATS:
+        known = " and ".join(map(str, READABLE_FORMATS))
+        raise InputError(
+            f"{root} is a run folder of format {version}, this velfield reads formats {known}; "
+            "run the flight again into a new folder"
+        )
+    if version != FORMAT_VERSION:
+        stages = {old: stage for stage, old in OLD_FOLDERS.items()}
+        record["config"], _ = upgrade_config(record["config"])
+        record["keys"] = {stages.get(name, name): key for name, key in record.get("keys", {}).items()}
+    return FlightRecord.model_validate_json(json.dumps(record))
+
+
+def open_layout(root: Path) -> RunLayout:
+    """Paths of a run folder of any format that is read."""
+    return RunLayout(root, read_flight_record(root).format_version)
+
+
+def check_format(root: Path) -> None:
+    """Refuse to work on a run folder of another format; a folder that is none, or not there, passes.
+
+    Raises
+    ------
+    InputError
+        One line: the format found, and what to do.
+    """
+    path = RunLayout(root).flight
+    if not path.exists():
+        return
+    version = _parse(path).get("format_version")
+    if version == FORMAT_VERSION:
+        return
+    reading = "`velfield.open_run` reads it, " if version in READABLE_FORMATS else ""
+    raise InputError(
+        f"{root} is a run folder of format {version}; {reading}this velfield continues runs of format "
+        f"{FORMAT_VERSION} only: give another --out"
+    )
+
+
+def _parse(path: Path) -> dict[str, Any]:
+    try:
+        record: dict[str, Any] = json.loads(path.read_bytes())
+    except ValueError:
+        raise InputError(f"{path} is damaged: it is not JSON; run the flight again into a new folder") from None
+    return record
