@@ -261,7 +261,7 @@ def test_the_ui_shows_graph_retry_and_artifacts(
     (run,) = served.ask("/flow_runs/filter", {"flow_runs": {"name": {"any_": [str(root)]}}})
     tasks = served.ask("/task_runs/filter", {"flow_runs": {"id": {"any_": [run["id"]]}}})
     (twice,) = [task for task in tasks if task["run_count"] > 1]
-    assert twice["name"] == "links 000008-000015"
+    assert twice["name"] == "tracklets 000008-000015"
     with browser(tmp_path / "profile") as found, found.page() as page:
         page.open(f"{served.url}/runs/flow-run/{run['id']}")
         page.wait("document.body.innerText.includes('Completed')")
