@@ -56,11 +56,13 @@ def _old_record(kind: str, record: dict[str, Any]) -> dict[str, Any]:
 
 def _old_flight(record: dict[str, Any]) -> dict[str, Any]:
     config = record["config"]
+    for key, values in OLD_VALUES.items():
+        section, name = key.split(".")
+        config[section][name] = {new: old for old, new in values.items()}[config[section][name]]
     for old, key in OLD_KEYS.items():
         (section, old_name), (_, name) = old.split("."), key.split(".")
-        value = config[section].pop(name)
-        values = {new: was for was, new in OLD_VALUES.get(key, {}).items()}
-        config[section][old_name] = values.get(value, value)
+        if name in config[section]:  # not every method of detection has every key
+            config[section][old_name] = config[section].pop(name)
     for key in REMOVED_KEYS:
         section, name = key.split(".")
         config[section][name] = 8
