@@ -42,7 +42,7 @@ def annotate(
 
     try:
         serve(
-            annotate_app(frames_to_annotate(place, most=frames), file),
+            annotate_app(frames_to_annotate(place, max_frames=frames), file),
             port=port,
             open_browser=open_browser,
             say=announce,

@@ -120,5 +120,5 @@ def test_the_certificates_are_kept_and_shown(run: Run) -> None:
     assert errors.shape == (run.frames.count, 6, 8)
     assert 0 < float(np.nanmedian(errors)) < 1
     assert (run.layout.maps / "registration.png").exists()
-    assert (run.layout.maps / "lens.png").exists() == (not run.maps.lens.is_identity)
+    assert (run.layout.maps / "lens.png").exists() == (not run.frame_transforms.lens.is_identity)
     assert "How well frames lie on the map" in run.layout.report.read_text()

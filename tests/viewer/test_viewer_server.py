@@ -236,7 +236,7 @@ def test_only_the_page_it_served_may_write(tmp_path: Path) -> None:
 
 
 def test_a_run_offers_frames_spread_over_the_flight(whole: tuple[Path, RunSummary], flight: Path) -> None:
-    offered = frames_to_annotate(whole[0], most=4)
+    offered = frames_to_annotate(whole[0], max_frames=4)
     names = sorted(path.name for path in (flight / "frames").iterdir())
     assert len(offered.names) == 4
     assert (offered.names[0], offered.names[-1]) == (names[0], names[-1])
@@ -245,4 +245,4 @@ def test_a_run_offers_frames_spread_over_the_flight(whole: tuple[Path, RunSummar
 
 def test_neither_a_run_nor_an_image_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no run folder and no image"):
-        frames_to_annotate(tmp_path, most=3)
+        frames_to_annotate(tmp_path, max_frames=3)

@@ -1,4 +1,4 @@
-"""GeoJSON arrows: the modal velocity at a grid of points, for any map."""
+"""GeoJSON arrows: the modal velocity on a grid of points."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Cloud-optimised GeoTIFF: layers of the field for any GIS, with names, units, NaN and the reference system."""
+"""Cloud-optimised GeoTIFF: layers of the field for GIS, with names, units, NaN and the reference system."""
 
 import warnings
 from collections.abc import Sequence

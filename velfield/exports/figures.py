@@ -17,7 +17,7 @@ _MAX_SIDE_PX = 20_000
 
 @dataclass(frozen=True)
 class ResizedMap:
-    """Base image and layer at the figure's size, (h, w), and what the legend says at that size."""
+    """Base image and layer at the figure's size, (h, w), and the scale of its legend."""
 
     grey: GreyImage
     layer: FloatArray

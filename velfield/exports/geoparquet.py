@@ -1,4 +1,4 @@
-"""GeoParquet 1.1: tracklets as lines, with a bounding box a row, so that readers of a region skip the rest."""
+"""GeoParquet 1.1: tracklets as lines, with a bounding box a row, by which readers of a region skip the rest."""
 
 import io
 import json

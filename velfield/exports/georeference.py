@@ -1,4 +1,4 @@
-"""From base pixels to the ground: the base image's reference system, longitude and latitude, metres, headings."""
+"""Base pixels to ground coordinates: the base image's reference system, longitude and latitude, metres, headings."""
 
 from dataclasses import dataclass
 
@@ -22,9 +22,9 @@ class Georeference:
     shape
         (h, w) of the base image.
     crs_wkt, affine
-        Reference system, and (column, row) of pixel corners to its coordinates; None where there is none.
+        Reference system, and (column, row) of pixel corners to its coordinates; None without one.
     gsd_m
-        Metres a base pixel; None where it is not known.
+        Metres a base pixel; None if unknown.
     """
 
     shape: tuple[int, int]
@@ -56,7 +56,7 @@ class Georeference:
                 "run with --base GEOTIFF, or export a format in pixels"
             )
         a, b, c, d, e, f = self.affine
-        column, row = xy_px[:, 0] + 0.5, xy_px[:, 1] + 0.5  # our 0 is a pixel's centre, theirs its corner
+        column, row = xy_px[:, 0] + 0.5, xy_px[:, 1] + 0.5  # our origin is a pixel's centre, theirs its corner
         return np.column_stack([a * column + b * row + c, d * column + e * row + f])
 
     def to_lonlat(self, xy_px: Points) -> Points:
@@ -73,7 +73,7 @@ class Georeference:
         Raises
         ------
         InputError
-            The ground sample distance is not known.
+            The ground sample distance is unknown.
         """
         if self.gsd_m is None:
             raise InputError(

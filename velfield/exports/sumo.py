@@ -1,4 +1,4 @@
-"""SUMO floating car data: where each vehicle is at each time, for SUMO's own tools."""
+"""SUMO floating car data: the position of each vehicle at each time, for SUMO's tools."""
 
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -40,7 +40,7 @@ def sumo_fcd(tracklets: pd.DataFrame, georeference: Georeference, *, vehicle_typ
     Raises
     ------
     InputError
-        The ground sample distance is not known.
+        The ground sample distance is unknown.
     """
     points = track_points(tracklets).sort_values(["time_s", "track_id"], kind="stable")
     xy = points[["x_px", "y_px"]].to_numpy(np.float64)

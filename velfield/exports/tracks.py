@@ -1,4 +1,4 @@
-"""Tracklets as the tracks that other programs read: one row a vehicle and frame."""
+"""Tracks of the vehicles for other programs: one row a vehicle and frame."""
 
 import pandas as pd
 

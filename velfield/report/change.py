@@ -3,13 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.arrays import RGBImage
+from schemas.arrays import GreyImage, RGBImage
 from velfield.report.colours import change_colours
 from velfield.report.figures import MapScale, blend_over_image, round_up
 from velfield.report.panel import Legend, draw_bar_panel
 
 
-def change_figure(grey: NDArray[np.uint8], change: NDArray[np.floating], scale: MapScale, *, title: str) -> RGBImage:
+def change_figure(grey: GreyImage, change: NDArray[np.floating], scale: MapScale, *, title: str) -> RGBImage:
     """The figure of one quantity's change.
 
     Parameters
@@ -17,9 +17,9 @@ def change_figure(grey: NDArray[np.uint8], change: NDArray[np.floating], scale: 
     grey
         (h, w) base image.
     change
-        (h, w) change, in the unit that the title names. Nothing is drawn where it is NaN.
+        (h, w) change, in the unit in the title. NaN is not drawn.
     scale
-        What the legend says of the map.
+        Scale of the map, for the legend.
 
     Returns
     -------
@@ -34,6 +34,6 @@ def change_figure(grey: NDArray[np.uint8], change: NDArray[np.floating], scale: 
     known = np.isfinite(change)
     top = round_up(float(np.percentile(np.abs(change[known]), 99))) if known.any() else 10.0
     image = blend_over_image(grey, change, change_colours(change / top))
-    legend = Legend(title, "After less before, where it is more than chance. Bare grey: no change that can be told.")
+    legend = Legend(title, "After minus before, where significant. Bare grey: no significant change.")
     panel = draw_bar_panel(grey.shape, legend, top=top, gsd_m=scale.gsd_m, north_rad=scale.north_rad, changes=True)
     return np.hstack([image, panel])

@@ -1,8 +1,8 @@
-"""Two colour scales, made in OKLab, where equal steps look equal: a wheel for direction, a ramp for speed.
+"""Two colour scales in OKLab, which is perceptually uniform: a wheel for direction, a ramp for speed.
 
-The ramp rises in lightness from violet to yellow, so it reads in grey and to the colour-blind, and it starts light
-enough to stand out from a dimmed aerial image. The wheel takes of each hue the most chroma that a screen can show,
-and swings in lightness a little with it: a wheel of one lightness would be pale all round.
+The ramp increases in lightness from violet to yellow, so that it is readable in greyscale and with colour blindness,
+and starts light enough to be visible on a dimmed aerial image. The wheel has each hue at the largest chroma within the
+sRGB gamut, and varies a little in lightness: a wheel of one lightness would be pale.
 """
 
 from functools import cache
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from schemas.arrays import FloatArray, RGBImage
 
 _STEPS = 1024
-_WHEEL_TURN_DEG = 29.0  # red points along +x, as on the usual hue wheel
+_WHEEL_ROTATION_DEG = 29.0  # red points along +x, as on the usual hue wheel
 _RAMP = np.array(  # lightness, chroma, hue (degrees)
     [[0.49, 0.21, 285.0], [0.57, 0.23, 315.0], [0.65, 0.22, 365.0], [0.76, 0.16, 415.0], [0.95, 0.17, 466.0]]
 )
@@ -28,18 +28,18 @@ def direction_colours(direction_rad: NDArray[np.floating]) -> RGBImage:
     >>> bool(red[0] > 200 > red[2]), bool(cyan[0] < 120 < cyan[2])
     (True, True)
     """
-    turn = np.nan_to_num(direction_rad) / (2 * np.pi)
-    index = np.floor(turn * _STEPS + 0.5).astype(np.int64) % _STEPS
+    turns = np.nan_to_num(direction_rad) / (2 * np.pi)
+    index = np.floor(turns * _STEPS + 0.5).astype(np.int64) % _STEPS
     return np.where(np.isnan(direction_rad)[..., None], np.uint8(0), _wheel()[index])
 
 
-def ramp_colours(share: NDArray[np.floating]) -> RGBImage:
+def ramp_colours(fraction: NDArray[np.floating]) -> RGBImage:
     """(..., 3) colours of numbers in [0, 1], clipped to it. NaN is black."""
-    index = np.floor(np.nan_to_num(share).clip(0, 1) * (_STEPS - 1) + 0.5).astype(np.int64)
-    return np.where(np.isnan(share)[..., None], np.uint8(0), _ramp()[index])
+    index = np.floor(np.nan_to_num(fraction).clip(0, 1) * (_STEPS - 1) + 0.5).astype(np.int64)
+    return np.where(np.isnan(fraction)[..., None], np.uint8(0), _ramp()[index])
 
 
-def change_colours(share: NDArray[np.floating]) -> RGBImage:
+def change_colours(change: NDArray[np.floating]) -> RGBImage:
     """(..., 3) colours of changes from -1 (blue) by 0 (white) to 1 (orange). NaN is black.
 
     Examples
@@ -47,17 +47,17 @@ def change_colours(share: NDArray[np.floating]) -> RGBImage:
     >>> change_colours(np.array([-1.0, 0.0, 1.0])).tolist()
     [[58, 124, 255], [240, 240, 240], [255, 122, 26]]
     """
-    at = np.nan_to_num(share).clip(-1, 1)
+    at = np.nan_to_num(change).clip(-1, 1)
     out = np.stack([np.interp(at, (-1, 0, 1), ends) for ends in ((58, 240, 255), (124, 240, 122), (255, 240, 26))], -1)
-    return np.asarray(np.where(np.isnan(share)[..., None], 0, np.floor(out + 0.5)), np.uint8)
+    return np.asarray(np.where(np.isnan(change)[..., None], 0, np.floor(out + 0.5)), np.uint8)
 
 
 @cache
 def _wheel() -> RGBImage:
-    hue = np.radians(np.arange(_STEPS) * 360 / _STEPS + _WHEEL_TURN_DEG)
+    hue = np.radians(np.arange(_STEPS) * 360 / _STEPS + _WHEEL_ROTATION_DEG)
     lightness = 0.72 + 0.06 * np.cos(hue - np.radians(120))
     chroma = np.full(_STEPS, 0.30)
-    for _ in range(60):  # draw in, hue by hue, until the screen can show it
+    for _ in range(60):  # reduce the chroma of each hue until it is in gamut
         out_of_gamut = (np.abs(_linear_rgb(lightness, chroma, hue) - 0.5) > 0.5).any(axis=-1)
         chroma = np.where(out_of_gamut, chroma * 0.97, chroma)
     return _srgb(_linear_rgb(lightness, _smooth_round(chroma), hue))

@@ -6,33 +6,33 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.arrays import RGBImage
+from schemas.arrays import FloatArray, GreyImage, Mask, RGBImage
 from schemas.export import SpeedUnit
 from velfield.errors import InputError
 from velfield.report.colours import direction_colours, ramp_colours
 from velfield.report.panel import Legend, draw_bar_panel, draw_wheel_panel
 
 PER_M_PER_S: dict[SpeedUnit, float] = {"km/h": 3.6, "mph": 2.2369362920544, "m/s": 1.0}
-"""How many of a unit make one metre a second; px/s is not metric."""
+"""Units in one metre a second; px/s is not metric."""
 
 _DIMMED = 0.5
 """Brightness of the base image under the colours."""
 _COVER = 0.88
-"""How much of a known pixel is colour; the rest lets the image's texture through."""
+"""Opacity of the colour of a known pixel; the rest is the image's texture."""
 
 
 @dataclass(frozen=True)
 class MapScale:
-    """What the legend needs to know of the map.
+    """Scale and orientation of a map, for its legend.
 
     Attributes
     ----------
     gsd_m
         Metres a base pixel; None: speeds are shown in px/s and the scale bar in px.
     unit
-        Unit of speed for people.
+        Unit of speed in the figure.
     north_rad
-        Where north is in the image, from +x towards +y (down): -pi/2 where it is up. None: not known, and said so.
+        Direction of north in the image, from +x towards +y (down): -pi/2 where it is up. None: unknown.
     """
 
     gsd_m: float | None = None
@@ -41,18 +41,18 @@ class MapScale:
 
     @property
     def shown_unit(self) -> SpeedUnit:
-        """The unit that speeds can be shown in."""
+        """The unit that speeds are shown in."""
         return "px/s" if self.gsd_m is None else self.unit
 
-    def shown_speed(self, speed_px_per_s: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Speeds in the unit that they are shown in."""
+    def shown_speed(self, speed_px_per_s: NDArray[np.floating]) -> FloatArray:
+        """Speeds in that unit."""
         speed = np.asarray(speed_px_per_s, np.float64)
         if self.gsd_m is None or self.unit == "px/s":
             return speed
         return speed * self.gsd_m * PER_M_PER_S[self.unit]
 
 
-def direction_figure(grey: NDArray[np.uint8], direction_rad: NDArray[np.floating], scale: MapScale) -> RGBImage:
+def direction_figure(grey: GreyImage, direction_rad: NDArray[np.floating], scale: MapScale) -> RGBImage:
     """The modal direction as hue, with a colour wheel beside it.
 
     Parameters
@@ -60,14 +60,14 @@ def direction_figure(grey: NDArray[np.uint8], direction_rad: NDArray[np.floating
     grey
         (h, w) base image.
     direction_rad
-        (h, w) direction of motion, from +x towards +y (down). Nothing is drawn where it is NaN.
+        (h, w) direction of motion, from +x towards +y (down). NaN is not drawn.
     scale
-        What the legend says of the map.
+        Scale of the map, for the legend.
 
     Returns
     -------
     ndarray
-        (h, w + legend, 3) uint8 RGB; the map itself at base resolution, its pixels where they were.
+        (h, w + legend, 3) uint8 RGB; the map itself at base resolution, its pixels unmoved.
 
     Raises
     ------
@@ -75,13 +75,13 @@ def direction_figure(grey: NDArray[np.uint8], direction_rad: NDArray[np.floating
         Where the shapes differ.
     """
     _same_shape(grey, direction_rad)
-    image = _over(grey, direction_colours(direction_rad), ~np.isnan(direction_rad))
-    legend = Legend("Direction of travel", "Hue: the way most vehicles go. Bare grey: none seen, or they stand.")
+    image = _blend(grey, direction_colours(direction_rad), ~np.isnan(direction_rad))
+    legend = Legend("Direction of travel", "Hue: the direction of most vehicles. Bare grey: none, or stationary.")
     return np.hstack([image, draw_wheel_panel(grey.shape, legend, gsd_m=scale.gsd_m, north_rad=scale.north_rad)])
 
 
 def speed_figure(
-    grey: NDArray[np.uint8],
+    grey: GreyImage,
     speed_px_per_s: NDArray[np.floating],
     scale: MapScale,
     *,
@@ -93,22 +93,22 @@ def speed_figure(
     Parameters
     ----------
     speed_px_per_s
-        (h, w) speed, px/s. Nothing is drawn where it is NaN.
+        (h, w) speed, px/s. NaN is not drawn.
     top
-        Speed at the bar's end, in the shown unit; None: the round number above `colour_scale_max`, as on the page.
+        Speed at the bar's end, in the shown unit; None: `colour_scale_max` rounded up, as on the page.
     bar_gsd_m
         Metres a pixel of the figure, for the scale bar, where it is not drawn at base resolution.
     """
     _same_shape(grey, speed_px_per_s)
     shown = scale.shown_speed(speed_px_per_s)
     if top is None:
-        reach = colour_scale_max(shown)
-        top = 10.0 if reach is None else round_up(reach)
-    image = _over(grey, ramp_colours(shown / top), np.isfinite(shown))
-    note = "Colour: the speed that most vehicles have. Bare grey: none seen."
-    highest = float(np.nanmax(shown, initial=0.0))
-    if highest > top:
-        note += f" Above {top:g} all has the last colour; the highest is {highest:.3g}."
+        highest = colour_scale_max(shown)
+        top = 10.0 if highest is None else round_up(highest)
+    image = _blend(grey, ramp_colours(shown / top), np.isfinite(shown))
+    note = "Colour: the speed of most vehicles. Bare grey: no vehicles."
+    maximum = float(np.nanmax(shown, initial=0.0))
+    if maximum > top:
+        note += f" Speeds above {top:g} have the last colour; the maximum is {maximum:.3g}."
     legend = Legend(f"Speed, {scale.shown_unit}", note)
     gsd_m = scale.gsd_m if bar_gsd_m is None else bar_gsd_m
     panel = draw_bar_panel(grey.shape, legend, top=top, gsd_m=gsd_m, north_rad=scale.north_rad)
@@ -116,8 +116,8 @@ def speed_figure(
 
 
 def colour_scale_max(speed: NDArray[np.floating]) -> float | None:
-    """What 99 % of the known speeds stay below: where the colours end, then rounded up. One false fast track does not
-    flatten all others. None where none is known."""
+    """99th percentile of the known speeds, the end of the colour scale before rounding: one false fast track does not
+    compress it. None where no speed is known."""
     known = speed[np.isfinite(speed)]
     return float(np.percentile(known, 99)) if known.size else None
 
@@ -149,7 +149,7 @@ def png_bytes(rgb: RGBImage) -> bytes:
 
 
 def jpeg_bytes(rgb: RGBImage, *, quality: int = 88, max_side: int | None = None) -> bytes:
-    """An RGB image as JPEG, reduced so that no side is longer than ``max_side``: for pages that must stay small."""
+    """An RGB image as JPEG, reduced so that no side is longer than ``max_side``: for small pages."""
     if max_side is not None and max(rgb.shape[:2]) > max_side:
         factor = max_side / max(rgb.shape[:2])
         rgb = np.asarray(cv2.resize(rgb, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)
@@ -159,7 +159,7 @@ def jpeg_bytes(rgb: RGBImage, *, quality: int = 88, max_side: int | None = None)
     return bytes(data)
 
 
-def blend_over_image(grey: NDArray[np.uint8], values: NDArray[np.floating], colours: RGBImage) -> RGBImage:
+def blend_over_image(grey: GreyImage, values: NDArray[np.floating], colours: RGBImage) -> RGBImage:
     """(h, w, 3) colours over the dimmed image where the values are known.
 
     Raises
@@ -168,17 +168,17 @@ def blend_over_image(grey: NDArray[np.uint8], values: NDArray[np.floating], colo
         Where the shapes differ.
     """
     _same_shape(grey, values)
-    return _over(grey, colours, np.isfinite(values))
+    return _blend(grey, colours, np.isfinite(values))
 
 
-def _over(grey: NDArray[np.uint8], colours: RGBImage, known: NDArray[np.bool_]) -> RGBImage:
-    """Colours over the dimmed image where known, modulated a little by it so that kerbs and lanes stay visible."""
+def _blend(grey: GreyImage, colours: RGBImage, known: Mask) -> RGBImage:
+    """Blend colours over the dimmed image where known, modulated by it so that kerbs and lanes stay visible."""
     base = np.repeat((grey.astype(np.float32) * _DIMMED)[..., None], 3, axis=2)
     tinted = colours * (_COVER + (1 - _COVER) * grey[..., None].astype(np.float32) / 255)
     return np.where(known[..., None], tinted, base).astype(np.uint8)
 
 
-def _same_shape(grey: NDArray[np.uint8], values: NDArray[np.floating]) -> None:
+def _same_shape(grey: GreyImage, values: NDArray[np.floating]) -> None:
     if grey.shape != values.shape:
         raise InputError(
             f"the base image is {grey.shape} and the field {values.shape} (height, width): they must agree"

@@ -1,4 +1,4 @@
-"""The counts of tracking's gates in people's words: what was tried and kept, and apart from it what was left out."""
+"""Counts of tracking's gates as tables for the report: candidates and tracklets, and the rejected ones by gate."""
 
 from collections.abc import Mapping
 
@@ -6,9 +6,9 @@ _TOTALS = {
     "windows": "Windows of three frames",
     "links_tried": "Links tried, from a car to one in the next frame",
     "pairs_tried": "Pairs of links tried, over three frames",
-    "tracklets": "Pairs kept: tracklets",
-    "links_refined": "Links of tracklets measured again in the images",
-    "links_not_refined": "Links of tracklets left as the cars were found",
+    "tracklets": "Pairs accepted: tracklets",
+    "links_refined": "Links of tracklets refined in the images",
+    "links_not_refined": "Links of tracklets not refined",
 }
 _REJECTIONS = {
     "frames_not_registered": ("frames", "not registered to the map", None),
@@ -21,20 +21,20 @@ _REJECTIONS = {
     "not_best": ("pairs", "another with the same car is likelier", "pairs_tried"),
     "confidence": ("pairs", "likeliest, but not clearly", "pairs_tried"),
 }
-"""Gate -> what it left out, why, and of which total."""
+"""Gate -> what it rejects, why, and the total it is a fraction of."""
 
 Rows = list[tuple[str, ...]]
 
 
 def totals_table(gates: Mapping[str, int]) -> Rows:
-    """What was tried and what was kept: words and count. A count that has no words here stands under its own name."""
+    """Candidates and accepted ones: description and count. A count without a description has its own name."""
     known = [(words, f"{gates[name]:,}") for name, words in _TOTALS.items() if name in gates]
     others = [name for name in gates if name not in _TOTALS and name not in _REJECTIONS]
     return [*known, *((name.replace("_", " "), f"{gates[name]:,}") for name in others)]
 
 
 def rejection_table(gates: Mapping[str, int]) -> Rows:
-    """What was left out: of what, why, count, and share of those tried."""
+    """Rejected candidates by gate: kind, reason, count, and fraction of those tried."""
     return [
         (kind, why, f"{gates[name]:,}", _fraction(gates[name], gates.get(total or "", 0)))
         for name, (kind, why, total) in _REJECTIONS.items()

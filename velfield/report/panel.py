@@ -1,30 +1,29 @@
-"""The legend beside a map: colour wheel or bar, north, scale bar. Drawn with Pillow at the map's own height."""
+"""The legend beside a map: colour wheel or bar, north, scale bar. Drawn with Pillow at the map's height."""
 
 from dataclasses import dataclass
 from math import cos, pi, sin
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from schemas.arrays import RGBImage
+from schemas.arrays import FloatArray, RGBImage
 from velfield.report.colours import change_colours, direction_colours, ramp_colours
 
 _BACKGROUND = (18, 21, 26)
 _TEXT, _FAINT = (240, 242, 245), (168, 175, 184)
-_SMOOTH = 3  # drawn so many times larger, then reduced: smooth edges
+_SUPERSAMPLING = 3  # supersampling of the drawing, for smooth edges
 
 
 @dataclass(frozen=True)
 class Legend:
-    """Words of a legend."""
+    """Texts of a legend."""
 
     title: str
     note: str
 
 
 class _Panel:
-    """A column of things drawn from the top down, and a scale bar at its foot."""
+    """A column drawn from the top down, with a scale bar at its foot."""
 
     def __init__(self, map_shape: tuple[int, ...], legend: Legend) -> None:
         height, width = int(map_shape[0]), int(map_shape[1])
@@ -67,12 +66,12 @@ class _Panel:
     def finish(self, gsd_m: float | None, north_rad: float | None) -> RGBImage:
         self.write(self.note, 0.8, _FAINT)
         if north_rad is None:
-            self.write("North is not known: up is the image's.", 0.8, _FAINT)
+            self.write("North is unknown.", 0.8, _FAINT)
         self._scale_bar(gsd_m)
         return np.asarray(self.image).copy()
 
     def _scale_bar(self, gsd_m: float | None) -> None:
-        """A round length that fits, at the map's scale."""
+        """A bar of a round length that fits, at the map's scale."""
         per_px, unit = (1.0, "px") if gsd_m is None else (gsd_m, "m")
         length = round_down(self.inner * per_px)
         x, y, half = self.margin, self.height - self.margin, self.text_px / 4
@@ -87,7 +86,7 @@ class _Panel:
 def draw_wheel_panel(
     map_shape: tuple[int, ...], legend: Legend, *, gsd_m: float | None, north_rad: float | None
 ) -> RGBImage:
-    """(h, legend, 3) legend of directions; the wheel stands as the map does, N where north is."""
+    """(h, legend, 3) legend of directions; the wheel is oriented as the map, with N at north."""
     panel = _Panel(map_shape, legend)
     side = min(panel.inner, max(panel.height // 3, 3 * panel.text_px))
     letter = 1.3 * panel.text_px
@@ -96,16 +95,16 @@ def draw_wheel_panel(
     _paste_wheel(panel, centre, radius)
     names = {"up": -pi / 2} if north_rad is None else {n: north_rad + k * pi / 2 for k, n in enumerate("NESW")}
     for name, angle in names.items():
-        place = centre[0] + (radius + letter / 2) * cos(angle), centre[1] + (radius + letter / 2) * sin(angle)
-        panel.draw.text(place, name, font=panel.font(), fill=_TEXT, anchor="mm")
+        position = centre[0] + (radius + letter / 2) * cos(angle), centre[1] + (radius + letter / 2) * sin(angle)
+        panel.draw.text(position, name, font=panel.font(), fill=_TEXT, anchor="mm")
     panel.y += side + 0.5 * panel.text_px
     return panel.finish(gsd_m, north_rad)
 
 
 def _paste_wheel(panel: _Panel, centre: tuple[float, float], radius: float) -> None:
-    """A ring coloured by direction, arrows outward in its middle."""
+    """A ring coloured by direction, with outward arrows inside."""
     side = 2 * int(radius) + 1
-    axis = (np.arange(side * _SMOOTH) + 0.5) / _SMOOTH - side / 2
+    axis = (np.arange(side * _SUPERSAMPLING) + 0.5) / _SUPERSAMPLING - side / 2
     x, y = np.meshgrid(axis, axis)
     distance = np.hypot(x, y)
     ring = (distance <= radius) & (distance >= 0.42 * radius)
@@ -136,8 +135,8 @@ def draw_bar_panel(
     north_rad: float | None,
     changes: bool = False,
 ) -> RGBImage:
-    """(h, legend, 3) legend of a quantity from 0 to ``top``, of changes from ``-top``; an arrow to north where it is
-    known."""
+    """(h, legend, 3) legend of a quantity from 0 to ``top``, of changes from ``-top``; with an arrow to north where
+    it is known."""
     panel = _Panel(map_shape, legend)
     height = int(max(panel.height * 0.36, 3 * panel.text_px))
     width = round(1.6 * panel.text_px)
@@ -149,8 +148,8 @@ def draw_bar_panel(
     for tick in [*-ticks[:0:-1], *ticks] if changes else ticks:
         level = y + (height - 1) * (top - tick) / (top - bottom)
         panel.draw.line((x + width, level, x + width + 0.35 * panel.text_px, level), fill=_TEXT)
-        place = (x + width + 0.6 * panel.text_px, level)
-        panel.draw.text(place, f"{tick:+g}" if changes else f"{tick:g}", font=panel.font(), fill=_TEXT, anchor="lm")
+        position = (x + width + 0.6 * panel.text_px, level)
+        panel.draw.text(position, f"{tick:+g}" if changes else f"{tick:g}", font=panel.font(), fill=_TEXT, anchor="lm")
     if north_rad is not None:
         _north(panel, north_rad, (panel.width - panel.margin - 1.2 * panel.text_px, y + 1.6 * panel.text_px))
     panel.y = y + height + panel.text_px
@@ -158,13 +157,13 @@ def draw_bar_panel(
 
 
 def _north(panel: _Panel, north_rad: float, centre: tuple[float, float]) -> None:
-    reach = 1.4 * panel.text_px
-    _arrow(panel, centre, north_rad, -reach, 0.5 * reach)
-    place = (centre[0] + reach * cos(north_rad), centre[1] + reach * sin(north_rad))
-    panel.draw.text(place, "N", font=panel.font(), fill=_TEXT, anchor="mm")
+    length = 1.4 * panel.text_px
+    _arrow(panel, centre, north_rad, -length, 0.5 * length)
+    position = (centre[0] + length * cos(north_rad), centre[1] + length * sin(north_rad))
+    panel.draw.text(position, "N", font=panel.font(), fill=_TEXT, anchor="mm")
 
 
-def bar_ticks(top: float) -> NDArray[np.float64]:
+def bar_ticks(top: float) -> FloatArray:
     """Round numbers from 0 to ``top``, four to eleven of them; the last is ``top`` itself where that is round.
 
     Examples

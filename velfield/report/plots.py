@@ -1,7 +1,7 @@
-"""Small plots as inline SVG: no script, no library, sharp at any size, coloured by the page's style.
+"""Small plots as inline SVG: no script, no library, coloured by the page's style.
 
-Each is drawn twice, for a wide screen and for a narrow one; the style sheet shows one of them. An image for a wide
-screen, reduced to a narrow one, has letters that nobody can read.
+By hand, as plotting libraries write fixed colours and fonts. Each plot is drawn twice, for wide and for narrow screens,
+and the style sheet shows one of them: a plot scaled down to a narrow screen has illegible letters.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +24,7 @@ class _Size:
     width: int
     height: int
     columns: int
-    """Points that a line has at most."""
+    """Most points of a line."""
 
 
 _SIZES = (_Size("wide", 720, 280, 600), _Size("narrow", 330, 230, 300))
@@ -39,20 +39,20 @@ def residual_plot(series: ResidualSeries) -> str:
     times = np.array(series.times_s, np.float64)
     residual = np.array([np.nan if r is None else r for r in series.residual_px], np.float64)
     lost = times[np.isnan(residual)]
-    highest = float(np.nanmax(residual)) if np.isfinite(residual).any() else 1.0
+    maximum = float(np.nanmax(residual)) if np.isfinite(residual).any() else 1.0
 
     def draw(size: _Size) -> _Plot:
         plot = _Plot(
             size,
             x_range=(float(times.min(initial=0.0)), float(times.max(initial=1.0))),
-            y_top=round_up(highest * 1.1),
+            y_top=round_up(maximum * 1.1),
             x_label="time, s",
             y_label="residual, px",
             description=f"Registration residual against time; {len(lost)} frames are not registered.",
         )
         if series.limit_px is not None and series.limit_px <= plot.y_top:
             plot.rule(series.limit_px, f"limit {series.limit_px:g} px")
-        plot.line(*_thinned(times, residual, size.columns))
+        plot.line(*_decimate(times, residual, size.columns))
         for time in lost[:: max(1, len(lost) // size.columns)]:
             plot.tick(float(time))
         return plot
@@ -81,8 +81,8 @@ def precision_recall_plot(curve: PrecisionRecall) -> str:
     return _on_each_screen(draw)
 
 
-def _thinned(times: np.ndarray, values: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """At most so many points: the highest of each run of frames, so that no peak is lost."""
+def _decimate(times: np.ndarray, values: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Decimate to at most ``most`` points, the maximum of each run of frames, so that no peak is lost."""
     if len(times) <= most:
         return times, values
     step = -(-len(times) // most)
@@ -92,7 +92,7 @@ def _thinned(times: np.ndarray, values: np.ndarray, most: int) -> tuple[np.ndarr
 
 
 class _Plot:
-    """Axes from 0 upwards, and what is drawn in them."""
+    """Axes from 0 upwards, and the marks in them."""
 
     def __init__(
         self, size: _Size, *, x_range: tuple[float, float], y_top: float, x_label: str, y_label: str, description: str
@@ -114,7 +114,7 @@ class _Plot:
         self._text(4, 14, y_label, "start")
 
     def line(self, x: np.ndarray, y: np.ndarray) -> None:
-        """A line, broken where y is not finite; a lone point is a dot."""
+        """A line, broken where y is not finite; a single point is a dot."""
         good = np.isfinite(y)
         for run in np.split(np.arange(len(x)), np.flatnonzero(np.diff(good.astype(np.int8))) + 1):
             if not len(run) or not good[run[0]]:
@@ -138,7 +138,7 @@ class _Plot:
         self.parts.append(f'<line class="lost" x1="{at}" x2="{at}" y1="{self.foot - 8}" y2="{self.foot}"/>')
 
     def mark(self, x: float, y: float, label: str) -> None:
-        """A point with words beside it, on the side where there is room."""
+        """A labelled point, its label on the side with more room."""
         self.parts.append(f'<circle class="dot" cx="{self._x(x):.1f}" cy="{self._y(y):.1f}" r="5"/>')
         if x > (self.x_low + self.x_high) / 2:
             end = max(self._x(x) - 10, self.left + _LETTER_PX * len(label))
@@ -156,7 +156,7 @@ class _Plot:
 
     def _x_ticks(self) -> Sequence[float]:
         span = self.x_high - self.x_low
-        most = (self.right - self.left) / 54  # labels that stand beside one another
+        most = (self.right - self.left) / 54  # labels that fit side by side
         power = 10.0 ** np.floor(np.log10(span / most))
         step = next(s * power for s in (1, 2, 5, 10) if span / (s * power) <= most)
         first = np.ceil(self.x_low / step - 1e-9) * step

@@ -1,33 +1,33 @@
-"""Images that show how good the geometry is: the lens before and after, the registration's error over the frame."""
+"""Figures of geometric quality: a frame before and after undistortion, the registration error over the frame."""
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from schemas.arrays import FloatArray, RGBImage
+from schemas.arrays import FloatArray, GreyImage, RGBImage
 from velfield.camera.lens import Lens
 from velfield.report.colours import ramp_colours
 
 _LINES = 9
-"""Straight lines laid over the image each way."""
+"""Straight lines drawn over the image each way."""
 _LINE_RGB = (255, 176, 32)
 _SIDE_PX = 900
-"""A frame is shown this wide at most."""
+"""Largest width of a frame in a figure."""
 _COVER = 0.55
 _LEGEND_PX = 32
 
 
-def undistortion_figure(grey: NDArray[np.uint8], lens: Lens) -> RGBImage:
-    """A raw frame (h, w) and the same undistorted, side by side; lines that are straight on the ground over both."""
+def undistortion_figure(grey: GreyImage, lens: Lens) -> RGBImage:
+    """A raw frame (h, w) and the same undistorted, side by side, with a grid that is straight on the ground."""
     height, width = grey.shape
     y, x = np.mgrid[0:height, 0:width].astype(np.float64)
     raw = lens.distort_points(np.column_stack([x.ravel(), y.ravel()])).astype(np.float32).reshape(height, width, 2)
     after = cv2.remap(grey, raw[..., 0], raw[..., 1], cv2.INTER_LINEAR)
     straight = _straight_lines(width, height)
-    bent = [lens.distort_points(line) for line in straight]
+    distorted = [lens.distort_points(line) for line in straight]
     shown = [
-        _with_lines(grey, bent, "as taken"),
+        _with_lines(grey, distorted, "as taken"),
         _with_lines(np.asarray(after, dtype=np.uint8), straight, "undistorted"),
     ]
     gap = np.full((shown[0].shape[0], 8, 3), 255, np.uint8)
@@ -37,14 +37,14 @@ def undistortion_figure(grey: NDArray[np.uint8], lens: Lens) -> RGBImage:
 def _straight_lines(width: int, height: int) -> list[FloatArray]:
     along = np.linspace(-0.05, 1.05, 200)
     lines = []
-    for share in np.linspace(0.0, 1.0, _LINES):
-        level = np.full_like(along, share)
+    for fraction in np.linspace(0.0, 1.0, _LINES):
+        level = np.full_like(along, fraction)
         lines += [np.column_stack([along * (width - 1), level * (height - 1)])]
         lines += [np.column_stack([level * (width - 1), along * (height - 1)])]
     return lines
 
 
-def _with_lines(grey: NDArray[np.uint8], lines: list[FloatArray], title: str) -> RGBImage:
+def _with_lines(grey: GreyImage, lines: list[FloatArray], title: str) -> RGBImage:
     scale = min(1.0, _SIDE_PX / grey.shape[1])
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     image = Image.fromarray(np.repeat(small[..., None], 3, axis=2))
@@ -56,8 +56,8 @@ def _with_lines(grey: NDArray[np.uint8], lines: list[FloatArray], title: str) ->
     return np.asarray(image, dtype=np.uint8)
 
 
-def registration_error_figure(grey: NDArray[np.uint8], error_px: NDArray[np.floating], *, full_px: float) -> RGBImage:
-    """Registration's held-out error by cell of the frame, its figure in each cell, over a raw frame.
+def registration_error_figure(grey: GreyImage, error_px: NDArray[np.floating], *, full_px: float) -> RGBImage:
+    """Hold-out error of the registration by cell of the frame, as colour and number, over a raw frame.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def registration_error_figure(grey: NDArray[np.uint8], error_px: NDArray[np.floa
     error_px
         (rows, columns) base px; NaN where no control point lies.
     full_px
-        Error that has the last colour of the ramp.
+        Error at the end of the colour ramp.
     """
     scale = min(1.0, _SIDE_PX / grey.shape[1])
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -82,13 +82,13 @@ def registration_error_figure(grey: NDArray[np.uint8], error_px: NDArray[np.floa
     draw = ImageDraw.Draw(image)
     for i in range(rows):
         for j in range(columns):
-            told = f"{error_px[i, j]:.2f}" if np.isfinite(error_px[i, j]) else "no points"
-            _label(draw, told, (j + 0.5) * width / columns, (i + 0.5) * height / rows, anchor="mm")
+            text = f"{error_px[i, j]:.2f}" if np.isfinite(error_px[i, j]) else "no points"
+            _label(draw, text, (j + 0.5) * width / columns, (i + 0.5) * height / rows, anchor="mm")
     return np.concatenate([np.asarray(image, dtype=np.uint8), _error_legend(width, full_px)])
 
 
 def _error_legend(width: int, full_px: float) -> RGBImage:
-    """What the figures are, and the ramp from none to ``full_px``: (height, width, 3), to stand below the image."""
+    """Legend of the numbers and the ramp from 0 to ``full_px``, (height, width, 3), for below the image."""
     image = Image.new("RGB", (width, _LEGEND_PX))
     draw = ImageDraw.Draw(image)
     bar = max(1, width // 5)
@@ -97,7 +97,7 @@ def _error_legend(width: int, full_px: float) -> RGBImage:
     image.paste(Image.fromarray(ramp_colours(ramp)), (end - bar, _LEGEND_PX // 4))
     _label(draw, "0", end - bar - 6, _LEGEND_PX / 2, anchor="rm")
     _label(draw, f"{full_px:g} px", end + 6, _LEGEND_PX / 2, anchor="lm")
-    _label(draw, "error held out of the fit, RMS", 8, _LEGEND_PX / 2, anchor="lm")
+    _label(draw, "hold-out error, RMS", 8, _LEGEND_PX / 2, anchor="lm")
     return np.asarray(image, dtype=np.uint8)
 
 

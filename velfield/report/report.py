@@ -1,7 +1,7 @@
-"""The report: one HTML file that holds all it shows, opens offline, and runs no script.
+"""The report: one self-contained HTML file that opens offline and runs no script.
 
-A content security policy in the page lets nothing in from elsewhere: images are ``data:``, the one style sheet is
-admitted by its hash, everything that came from outside (names, messages) is escaped.
+The page's content security policy blocks all external content: images are ``data:``, the one style sheet is allowed by
+its hash, and all external text (names, messages) is escaped.
 """
 
 from base64 import b64encode
@@ -22,9 +22,9 @@ def render_report(report: Report, figures: Sequence[ReportFigure]) -> str:
     Parameters
     ----------
     report
-        What is told.
+        Facts, tables and curves.
     figures
-        What is shown: the maps first.
+        Images, the maps first.
     """
     style = report_style()
     digest = b64encode(sha256(style.encode()).digest()).decode()
@@ -44,12 +44,12 @@ def render_report(report: Report, figures: Sequence[ReportFigure]) -> str:
 
 
 def report_style() -> str:
-    """The style sheet of what `render_sections` gives."""
+    """The style sheet of `render_sections`."""
     return files("velfield.report").joinpath("report.css").read_text(encoding="utf-8")
 
 
 def render_sections(report: Report, figures: Sequence[ReportFigure]) -> str:
-    """The report's sections and footer: what stands in a page's body below its title."""
+    """The report's sections and footer: a page's body below its title."""
     sections = [
         _warnings(report),
         _section("Few vehicles at each pixel", f"<p>{escape(report.low_coverage_note)}</p>", "coverage-note")
@@ -63,7 +63,7 @@ def render_sections(report: Report, figures: Sequence[ReportFigure]) -> str:
         _detection(report),
         _gates(report.gates),
         _frames_lost(report.frames_lost),
-        _pairs("What went in", report.inputs),
+        _pairs("Inputs", report.inputs),
         _files(report.files),
     ]
     return (
@@ -84,10 +84,10 @@ def _items(texts: Iterable[str]) -> str:
 
 def _warnings(report: Report) -> str:
     lost = sum(stage.lost for stage in report.stages)
-    said = list(report.warnings)
+    lines = list(report.warnings)
     if report.frames_lost or lost:
-        said.insert(0, f"Not complete: {len(report.frames_lost)} frames and {lost} units lost. They are listed below.")
-    return _section("Warnings", _items(said), "warnings") if said else ""
+        lines.insert(0, f"Not complete: {len(report.frames_lost)} frames and {lost} units lost. They are listed below.")
+    return _section("Warnings", _items(lines), "warnings") if lines else ""
 
 
 def _facts(facts: Sequence[tuple[str, str]]) -> str:
@@ -137,7 +137,7 @@ def _registration(report: Report) -> str:
     text = f"{len(good)} of {len(series.times_s)} frames registered."
     if good:
         middle, late = good[len(good) // 2], good[min(int(len(good) * 0.95), len(good) - 1)]
-        text += f" Residual on control points left out of the fit: median {middle:.2f} px, 95 % below {late:.2f} px."
+        text += f" Residual on held-out control points: median {middle:.2f} px, 95 % below {late:.2f} px."
     return _section("Registration", f"<p>{escape(text)}</p>{residual_plot(series)}")
 
 
@@ -152,8 +152,8 @@ def _detection(report: Report) -> str:
 def _gates(gates: dict[str, int]) -> str:
     if not gates:
         return ""
-    kept = _table(["What was tried and kept", "Number"], totals_table(gates), numbers=1)
-    lost = _table(["Left out", "Why", "Number", "Share"], rejection_table(gates), numbers=2)
+    kept = _table(["Candidates", "Number"], totals_table(gates), numbers=1)
+    lost = _table(["Rejected", "Reason", "Number", "Fraction"], rejection_table(gates), numbers=2)
     return _section("Tracking", f'<div class="scroll narrow">{kept}</div><div class="scroll narrow">{lost}</div>')
 
 
@@ -173,7 +173,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: int) 
 def _frames_lost(frames: Sequence[str]) -> str:
     if not frames:
         return ""
-    body = f"<details><summary>{len(frames)} frames are in no tracklet</summary>{_items(frames)}</details>"
+    body = f"<details><summary>{len(frames)} frames without tracklets</summary>{_items(frames)}</details>"
     return _section("Frames lost", body)
 
 
@@ -192,5 +192,5 @@ def _files(listed: Sequence[tuple[str, str]]) -> str:
 
 
 def _path(relative: str) -> str:
-    """A path inside the run folder as a link; quoting the colon keeps it from being read as a scheme."""
+    """A path inside the run folder as a link; the colon is quoted, else it would be parsed as a scheme."""
     return "./" + quote(relative)

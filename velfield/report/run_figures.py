@@ -11,28 +11,28 @@ from velfield.report.figures import jpeg_bytes
 _PICTURE_SIDE_PX = 1600
 _CAPTIONS = {
     "direction": (
-        "Which way traffic goes",
-        "The modal direction of travel at every pixel that vehicles passed, as hue; none where they stand.",
+        "Direction of travel",
+        "The modal direction of travel at every pixel that vehicles passed, as hue; none where they are stationary.",
         "map of the modal direction over the base image",
     ),
     "speed": (
-        "How fast it goes",
+        "Speed",
         "The modal speed at every pixel that vehicles passed.",
         "map of the modal speed over the base image",
     ),
     "lens": (
         "The lens",
-        "A frame as it was taken, and as a pin-hole would have taken it. The orange grid is straight on the ground: "
-        "kerbs and roofs along it follow it in both.",
-        "a frame before and after the lens's distortion is taken out",
+        "A frame as taken, and undistorted. The orange grid is straight on the ground: kerbs and roofs along it "
+        "follow it in both.",
+        "a frame before and after undistortion",
     ),
     "registration": (
-        "How well frames lie on the map",
-        "Error of control points held out of the fit, px, by cell of the frame, all frames together.",
+        "Registration error",
+        "Hold-out error of the control points, px, by cell of the frame, over all frames.",
         "registration error by cell over a frame",
     ),
 }
-"""Image of ``maps/`` -> title, caption, and what it shows for those who do not see it."""
+"""Image of ``maps/`` -> title, caption and alternative text."""
 
 
 def report_figures(maps: Path) -> dict[str, ReportFigure]:
@@ -40,7 +40,7 @@ def report_figures(maps: Path) -> dict[str, ReportFigure]:
     figures = {}
     for name, (title, caption, alt_text) in _CAPTIONS.items():
         if not (maps / f"{name}.png").exists():
-            continue  # a pin-hole has no before and after
+            continue  # a pinhole lens has no such figure
         encoded = np.frombuffer((maps / f"{name}.png").read_bytes(), np.uint8)
         image = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
         figures[name] = ReportFigure(

@@ -1,7 +1,7 @@
-"""The pages with scripts: a run's viewer and the annotator, each one HTML file with its script and style inside.
+"""The pages with scripts, a run's viewer and the annotator: each one HTML file with its script and style inside.
 
 The scripts are built from ``page/`` in the repository (`make page`) into ``velfield/report/page/``, which the wheel
-ships. Where they are not built there is no page, and whoever asks is told so.
+includes.
 """
 
 import json
@@ -22,20 +22,20 @@ NOT_BUILT = "the viewer page is not built in this checkout, index.html is the re
 
 
 def page_is_built() -> bool:
-    """Whether the pages' scripts are there."""
+    """Whether the pages' scripts are built."""
     return files("velfield.report").joinpath("page/viewer.js").is_file()
 
 
 def licences() -> str:
-    """Licences of the packages that the scripts hold."""
+    """Licences of the packages in the scripts."""
     return _built("LICENSES.txt")
 
 
 def render_viewer(report: Report, figures: Sequence[ReportFigure]) -> str:
     """A run's page: the map, which reads the run folder's tiles, and the report as its summary.
 
-    A content security policy lets nothing in from elsewhere; ``wasm-unsafe-eval`` admits the decoder of the tiles,
-    ``data:`` among what may be connected to is where that decoder stands.
+    The content security policy blocks all external content; ``wasm-unsafe-eval`` and ``connect-src data:`` are for the
+    decoder of the tiles.
     """
     return _page(
         "viewer",
@@ -43,9 +43,9 @@ def render_viewer(report: Report, figures: Sequence[ReportFigure]) -> str:
     )
 
 
-def render_annotator(title: str, told: Mapping[str, object]) -> str:
-    """The page to mark cars on; ``told`` is what its server tells it."""
-    return _page("annotate", {"title": escape(title), "told": _json(told)})
+def render_annotator(title: str, content: Mapping[str, object]) -> str:
+    """The page for labelling cars; ``content`` is its server's data."""
+    return _page("annotate", {"title": escape(title), "told": _json(content)})
 
 
 def _page(name: str, parts: Mapping[str, str]) -> str:
@@ -57,7 +57,7 @@ def _page(name: str, parts: Mapping[str, str]) -> str:
     filled = {"policy": policy, "style": style, "colours": _json(_colours()), "script": script, **parts}
     pieces = _built(f"{name}.html").split("{{")
     html = [pieces[0]]
-    for piece in pieces[1:]:  # each part once, and nothing that a part holds is looked at
+    for piece in pieces[1:]:  # each part once; parts are not expanded in turn
         part, _, rest = piece.partition("}}")
         html += [filled[part], rest]
     return "".join(html)
@@ -72,7 +72,7 @@ def _hash(text: str) -> str:
 
 
 def _json(value: object) -> str:
-    """JSON that may stand in a script element: no end tag, no comment can be in it."""
+    """JSON that is safe in a script element: it cannot contain an end tag or a comment."""
     return json.dumps(value).replace("<", "\\u003c")
 
 

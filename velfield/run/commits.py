@@ -1,7 +1,7 @@
-"""Content keys and commit records: what is finished is known from these alone.
+"""Content keys and commit records: which units of work are finished.
 
-A unit is done when its record stands under ``commits/`` with the key that the present inputs, parameters and code give,
-and what it names is there. The record is written last, atomically; a run killed before it does the unit again.
+A unit is finished when its record is under ``commits/`` with the key of the present inputs, parameters and code, and
+the outputs it names exist. The record is written last, atomically; a run killed before that repeats the unit.
 """
 
 import hashlib
@@ -38,7 +38,7 @@ def digest_bytes(data: bytes) -> str:
 def digest_file(path: Path) -> str:
     """Digest of a file's content; of a file above 256 MiB, of its size and 64 blocks of 1 MiB spread over it.
 
-    Hashing a flight of hours whole would cost more than decoding its first minutes.
+    Hashing all of a flight of hours would take longer than decoding its first minutes.
     """
     if is_remote(path):
         data = path.read_bytes()  # one request; its size and its blocks would be more
@@ -86,7 +86,7 @@ def content_key(
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write ``data`` so that ``path`` is either as it was or whole."""
+    """Write ``data`` so that ``path`` is either unchanged or complete."""
     if is_remote(path):
         path.write_bytes(data)
         return
@@ -100,7 +100,7 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def sweep_partial(root: Path) -> int:
-    """Remove ``.partial`` files that a killed run left behind; returns how many. On S3 there are none."""
+    """Remove ``.partial`` files of a killed run; returns how many. On S3 there are none."""
     if is_remote(root):
         return 0
     found = list(root.rglob("*.partial"))
@@ -115,12 +115,12 @@ def commit_path(layout: RunLayout, stage: str, unit: str) -> Path:
 
 
 def write_commit(layout: RunLayout, record: CommitRecord) -> None:
-    """Say that a unit is finished: the last thing a unit does."""
+    """Record that a unit is finished, after its outputs are written."""
     write_atomically(commit_path(layout, record.stage, record.unit), record.model_dump_json(indent=1).encode())
 
 
 def read_commit(layout: RunLayout, stage: str, unit: str) -> CommitRecord | None:
-    """The record of a unit, or ``None`` where it is not finished: one that cannot be read says nothing."""
+    """The record of a unit; None where there is none or it cannot be read."""
     path = commit_path(layout, stage, unit)
     try:
         record = CommitRecord.model_validate_json(path.read_bytes())
@@ -132,24 +132,24 @@ def read_commit(layout: RunLayout, stage: str, unit: str) -> CommitRecord | None
 
 
 def read_commits(layout: RunLayout, stage: str) -> list[CommitRecord]:
-    """The records of all units of a stage that are finished, in the order of their names."""
+    """The records of all finished units of a stage, by name."""
     folder = layout.commits / layout.stored_name(stage)
     found = (read_commit(layout, stage, path.stem) for path in sorted(folder.glob("*.json")))
     return [record for record in found if record is not None]
 
 
 def valid_commit(layout: RunLayout, stage: str, unit: str, key: str) -> CommitRecord | None:
-    """The record of a unit where it was finished under this very key and its outputs still stand."""
+    """The record of a unit where it has this key and its outputs exist; else None."""
     record = read_commit(layout, stage, unit)
     if record is None or record.key != key:
         return None
     outputs = list(record.outputs)
     if is_remote(layout.root):
-        # A request each, for hundreds a unit: S3 loses no objects, and `velfield verify` looks at all of them.
+        # Hundreds a unit, a request each: S3 loses no objects, and `velfield verify` checks all of them.
         outputs = outputs[-1:]
     return record if all((layout.root / output).exists() for output in outputs) else None
 
 
 def digest_outputs(layout: RunLayout, paths: Iterable[Path]) -> dict[str, str]:
-    """Digests of files a unit wrote, by path in the run folder."""
+    """Digests of a unit's output files, by path in the run folder."""
     return {path.relative_to(layout.root).as_posix(): digest_file(path) for path in paths}

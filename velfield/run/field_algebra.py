@@ -1,4 +1,4 @@
-"""Fields of run folders added and subtracted, tile by tile: exact, and never more than a tile of each in memory."""
+"""Add and subtract the fields of run folders, tile by tile: exact, with one tile of each in memory."""
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +20,7 @@ from velfield.run.stores import HISTOGRAM_TIME_WEIGHTED, FieldStore, open_field,
 Combine = Callable[[Sequence[FieldTile | None]], FieldTile | None]
 
 _SAME = ("bin_width_px_per_s", "kernel_sigma_px_per_s", "band_radius_px", "velocity_span_s", "weighted_by", "gsd_m")
-_SAME_PLACE = ("crs_wkt", "geotransform")
+_SAME_GEOREFERENCE = ("crs_wkt", "geotransform")
 
 
 def merge_fields(roots: Sequence[Path], out: Path) -> None:
@@ -35,16 +35,16 @@ def merge_fields(roots: Sequence[Path], out: Path) -> None:
         raise InputError(f"merge needs two or more run folders, found {len(roots)}")
 
     def add(tiles: Sequence[FieldTile | None]) -> FieldTile | None:
-        there = [tile for tile in tiles if tile is not None]
-        return merge_tiles(there) if there else None
+        known = [tile for tile in tiles if tile is not None]
+        return merge_tiles(known) if known else None
 
-    stores = _open_alike(roots)
+    stores = _open_compatible(roots)
     observed_s = sum(float(store.attributes.get("observed_s", 0.0)) for store in stores)
     _write(roots, stores, out, add, observed_s, {"merged_from": [str(root) for root in roots]})
 
 
 def subtract_fields(whole: Path, part: Path, out: Path) -> None:
-    """What is left of the field of ``whole`` without that of ``part``, into a new folder.
+    """The field of ``whole`` less that of ``part``, into a new folder.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def subtract_fields(whole: Path, part: Path, out: Path) -> None:
         The fields are on different grids, ``part`` is no part of ``whole``, or ``out`` holds something.
     """
 
-    def take_away(tiles: Sequence[FieldTile | None]) -> FieldTile | None:
+    def subtract(tiles: Sequence[FieldTile | None]) -> FieldTile | None:
         large, small = tiles
         if small is None:
             return large
@@ -60,36 +60,36 @@ def subtract_fields(whole: Path, part: Path, out: Path) -> None:
             raise InputError(f"{part} has tracks where {whole} has none: it is no part of it")
         return subtract_tile(large, small)
 
-    stores = _open_alike([whole, part])
+    stores = _open_compatible([whole, part])
     seconds = [float(store.attributes.get("observed_s", 0.0)) for store in stores]
     made_from = {"subtracted_from": str(whole), "subtracted": str(part)}
-    _write([whole, part], stores, out, take_away, max(seconds[0] - seconds[1], 0.0), made_from)
+    _write([whole, part], stores, out, subtract, max(seconds[0] - seconds[1], 0.0), made_from)
 
 
 def check_same_grid(first: Path, other: Path) -> None:
-    """Fields can be put together only where a pixel and a bin of one are those of the other.
+    """Check that two fields have the same pixels and velocity bins.
 
     Raises
     ------
     InputError
-        One line: what differs, and what to do.
+        They differ: in what, and what to do.
     """
     a, b = (open_field(RunLayout(root).field) for root in (first, other))
     if a.shape != b.shape or a.tile != b.tile:
-        raise InputError(_apart(first, other, "size", f"{a.shape[::-1]} px", f"{b.shape[::-1]} px"))
-    for name in (*_SAME, *_SAME_PLACE):
+        raise InputError(_mismatch(first, other, "size", f"{a.shape[::-1]} px", f"{b.shape[::-1]} px"))
+    for name in (*_SAME, *_SAME_GEOREFERENCE):
         if a.attributes.get(name) != b.attributes.get(name):
-            raise InputError(_apart(first, other, name, a.attributes.get(name), b.attributes.get(name)))
+            raise InputError(_mismatch(first, other, name, a.attributes.get(name), b.attributes.get(name)))
     if "velocity_variance_sum" not in a.layer_names() or "velocity_variance_sum" not in b.layer_names():
         raise InputError(f"{first} or {other} was written by an older velfield: run the flight again")
     if not a.attributes.get("crs_wkt") and _base_digest(first) != _base_digest(other):
         raise InputError(
-            f"{first} and {other} have different base images, and no coordinates that tie their pixels together: "
+            f"{first} and {other} have different base images, and no coordinates to relate their pixels: "
             "run both with the same --base"
         )
 
 
-def _apart(first: Path, other: Path, what: str, a: object, b: object) -> str:
+def _mismatch(first: Path, other: Path, what: str, a: object, b: object) -> str:
     return (
         f"the fields of {first} and {other} are on different grids: {what} is {_short(a)} and {_short(b)}; "
         "run both with the same --base, --gsd-m and field settings"
@@ -107,7 +107,7 @@ def _base_digest(root: Path) -> str:
     return digest_file(path)
 
 
-def _open_alike(roots: Sequence[Path]) -> list[FieldStore]:
+def _open_compatible(roots: Sequence[Path]) -> list[FieldStore]:
     for other in roots[1:]:
         check_same_grid(roots[0], other)
     return [open_field(RunLayout(root).field) for root in roots]
@@ -121,16 +121,16 @@ def _write(
     observed_s: float,
     made_from: Mapping[str, object],
 ) -> None:
-    layout, like = RunLayout(out), open_layout(roots[0])
+    layout, first = RunLayout(out), open_layout(roots[0])
     if out.exists() and any(out.iterdir()):
-        raise InputError(f"--out {out} is there and holds files: give a folder that is not there yet")
-    record, grid = read_flight_record(roots[0]), read_grid(like)
+        raise InputError(f"--out {out} exists and holds files: give a new folder")
+    record, grid = read_flight_record(roots[0]), read_grid(first)
     config = record.config.field
     out.mkdir(parents=True, exist_ok=True)
-    shutil.copytree(like.base, layout.base, ignore=shutil.ignore_patterns(like.grid.name, like.working.name))
+    shutil.copytree(first.base, layout.base, ignore=shutil.ignore_patterns(first.grid.name, first.working.name))
     write_atomically(layout.grid, grid.model_dump_json(indent=1).encode())
-    if like.working.exists():
-        write_atomically(layout.working, read_working(like).model_dump_json(indent=1).encode())
+    if first.working.exists():
+        write_atomically(layout.working, read_working(first).model_dump_json(indent=1).encode())
     key = content_key("algebra", 1, parameters=list(made_from), inputs=[store_key(store.path) for store in stores])
     create_field_store(
         layout.field,

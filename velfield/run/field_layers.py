@@ -1,5 +1,5 @@
-"""The (y, x) layers beside the histogram in ``field.zarr``: made with the tiles, so that maps and viewers read no
-histogram."""
+"""The (y, x) layers beside the histogram in ``field.zarr``: computed with the tiles, so that maps and viewers need not
+read the histogram."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The velocity field of a run folder, read tile by tile; a tile that must be there and is not is an error."""
+"""Read the velocity field of a run folder tile by tile; a missing tile is an error."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from velfield.run.layout import RunLayout
 from velfield.run.stores import HISTOGRAM, HISTOGRAM_TIME_WEIGHTED, FieldStore, StoreError, open_field
 
 TileReader = Callable[[int, int], FieldTile | None]
-"""Gives the tile (row, column); None where nobody passed."""
+"""Returns the tile (row, column); None where no vehicle passed."""
 
 
 @dataclass(frozen=True)
@@ -48,20 +48,20 @@ def open_field_intervals(layout: RunLayout) -> list[IntervalField]:
     """The fields of the time intervals of a run folder, in their order; empty where none were asked for."""
     config = read_flight_record(layout.root).config.field
     grid = read_grid(layout)
-    found = []
+    fields = []
     for path in sorted(layout.intervals.glob("*.zarr")):
         store = open_field(path)
         about = store.attributes
         ends = float(about.get("start_s", -inf)), float(about.get("stop_s", inf))
         field = field_from_store(store, config, grid)
-        found.append(IntervalField(str(about["time_interval"]), *ends, float(about["observed_s"]), field))
-    return found
+        fields.append(IntervalField(str(about["time_interval"]), *ends, float(about["observed_s"]), field))
+    return fields
 
 
 def field_from_store(
     store: FieldStore, config: FieldConfig, grid: GridRecord, *, time_weighted: bool = False
 ) -> VelocityField:
-    """The field in a store that was laid out under a configuration."""
+    """The field in a store that was created under a configuration."""
     path, histogram = store.path, HISTOGRAM_TIME_WEIGHTED if time_weighted else HISTOGRAM
     if histogram not in store.histogram_names():
         raise InputError(f"{path} holds no {histogram}: run the flight again with --set field.time_weighted=true")
@@ -86,13 +86,13 @@ def field_from_store(
 
 
 def tile_reader(store: FieldStore, histogram: str = HISTOGRAM) -> TileReader:
-    """Reads whole tiles: a histogram, and the layers that add up with it."""
+    """A reader of whole tiles: a histogram, and the layers that are sums."""
     sums = {name: store.layer(name) for name in ("count", "occupancy_ms", "velocity_variance_sum")}
     side = store.tile
 
     def read(row: int, column: int) -> FieldTile | None:
-        place = np.s_[row * side : (row + 1) * side, column * side : (column + 1) * side]
-        count, occupancy_ms, noise = (layer[place] for layer in sums.values())
+        window = np.s_[row * side : (row + 1) * side, column * side : (column + 1) * side]
+        count, occupancy_ms, noise = (layer[window] for layer in sums.values())
         if not count.any():
             return None
         if not store.has_tile(row, column, histogram):

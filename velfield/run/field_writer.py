@@ -1,4 +1,4 @@
-"""Groups of tiles into ``field.zarr``: the histogram tile by tile, the layers of the whole group at once."""
+"""Write groups of tiles into ``field.zarr``: the histogram tile by tile, the layers of a group at once."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +15,7 @@ from velfield.run.field_layers import LAYERS, tile_layers
 from velfield.run.stores import HISTOGRAM, HISTOGRAM_TIME_WEIGHTED, FieldStore, create_field
 
 GROUP_TILES = 8
-"""A group is so many tiles high and wide: 512 x 512 px, a unit of work and a chunk of the layers."""
+"""Side of a group in tiles, 512 px: a unit of work and a chunk of the layers."""
 
 Group = tuple[int, int]
 """(row, column)."""
@@ -29,7 +29,7 @@ def tile_groups(grid: GridRecord, config: FieldConfig) -> list[Group]:
 
 
 class GroupWriter:
-    """Writes one group of tiles: the tiles as they come, the layers when all have."""
+    """Writes one group of tiles: each tile when it is put, the layers when the group is closed."""
 
     def __init__(
         self, store: FieldStore, group: Group, *, grid: GridRecord, config: FieldConfig, bins: VelocityBins
@@ -56,13 +56,13 @@ class GroupWriter:
         return column * self.config.tile_size_px, row * self.config.tile_size_px
 
     def tile_shape(self, row: int, column: int) -> tuple[int, int]:
-        """(height, width) of a tile: less at the map's edge."""
+        """(height, width) of a tile: smaller at the map's edge."""
         x, y = self.origin_xy(row, column)
         size = self.config.tile_size_px
         return min(size, self.y0 + self.height - y), min(size, self.x0 + self.width - x)
 
     def put(self, row: int, column: int, tile: FieldTile, time_weighted: NDArray[np.int32] | None = None) -> None:
-        """Write one tile, and its histogram weighed by time where there is one; a tile nobody passed is left out."""
+        """Write one tile, with its time-weighted histogram if any; skip a tile that no vehicle passed."""
         if not tile.count.any():
             return
         self.store.write_tile(row, column, tile.histogram)
@@ -71,9 +71,9 @@ class GroupWriter:
         self.touched.append((row, column))
         x, y = self.origin_xy(row, column)
         height, width = tile.count.shape
-        place = np.s_[y - self.y0 : y - self.y0 + height, x - self.x0 : x - self.x0 + width]
+        window = np.s_[y - self.y0 : y - self.y0 + height, x - self.x0 : x - self.x0 + width]
         for name, values in tile_layers(tile, self.bins, self.config).items():
-            self.layers[name][place] = values
+            self.layers[name][window] = values
 
     def close(self) -> None:
         """Write the layers."""
@@ -81,7 +81,7 @@ class GroupWriter:
             self.store.write_layer(name, self.y0, self.x0, values)
 
     def files(self) -> list[Path]:
-        """What was written, once closed; and what describes it."""
+        """The files written, once closed, and the store's metadata."""
         return self.store.files(self.touched, self.group)
 
 
@@ -100,14 +100,14 @@ def create_field_store(
     time_weighted: bool,
     more: Mapping[str, object] | None = None,
 ) -> None:
-    """Lay out a field's store; ``more`` goes to its attributes beside what a reader needs.
+    """Create a field's store; ``more`` are attributes beside those that a reader needs.
 
     Parameters
     ----------
     weighted_by
         What a track adds at a pixel.
     observed_s
-        How long traffic was watched, s: what counts are compared by.
+        Duration of the observation, s, for comparing counts.
     time_weighted
         Whether the histogram weighed by time is kept too.
     """

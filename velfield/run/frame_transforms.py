@@ -1,8 +1,8 @@
-"""Raw pixels of each frame <-> base pixels, from what registration and the base image left in the run folder.
+"""Raw pixels of each frame <-> base pixels: the transforms that registration stored in the run folder, composed.
 
 A frame is registered to the flight's own base image (same camera, same light: a tenth of a pixel). Where a base image
-was
-given, the own one is registered to it once, and every frame's map is the composition: images are resampled only once.
+was given, the own one is registered to it once, and each frame's transform is the composition: images are resampled
+only once.
 """
 
 from dataclasses import dataclass
@@ -14,11 +14,9 @@ from schemas.flight import FlightConfig, RegistrationConfig
 from schemas.records import PolyprojectiveRecord, RebaseRecord
 from velfield.camera.lens import Lens, lens_from_record
 from velfield.errors import InputError
-from velfield.registration.transforms import ComposedTransform, FrameTransform, PolyprojectiveTransform
+from velfield.registration.transforms import FrameMap, FrameTransform, PolyprojectiveTransform
 from velfield.run.layout import RunLayout
 from velfield.run.stores import RegistrationStore, open_frames, open_registration
-
-FrameMap = FrameTransform | ComposedTransform
 
 
 def read_lens(layout: RunLayout) -> Lens:
@@ -48,8 +46,8 @@ def polyprojective_from_record(record: PolyprojectiveRecord) -> PolyprojectiveTr
     return PolyprojectiveTransform(np.array(record.coefficients), np.array(record.source), np.array(record.target))
 
 
-def _onward(layout: RunLayout) -> tuple[PolyprojectiveTransform, ...]:
-    """What stands between the image that frames are registered to and base pixels, in order; mostly nothing."""
+def _base_transforms(layout: RunLayout) -> tuple[PolyprojectiveTransform, ...]:
+    """Transforms from the image that frames are registered to on to base pixels, in order; mostly none."""
     records = []
     if layout.own_to_base.exists():
         records.append(PolyprojectiveRecord.model_validate_json(layout.own_to_base.read_bytes()))
@@ -60,37 +58,37 @@ def _onward(layout: RunLayout) -> tuple[PolyprojectiveTransform, ...]:
 
 @dataclass(frozen=True)
 class FrameTransforms:
-    """The maps of all frames of a run, each made when it is asked for."""
+    """The transforms of all frames of a run, each read on demand."""
 
     width: int
     height: int
     lens: Lens
-    onward: tuple[PolyprojectiveTransform, ...]
-    """Maps that follow a frame's own: to a given base image, and from that to a newer one."""
+    base_transforms: tuple[PolyprojectiveTransform, ...]
+    """Applied after a frame's own: to a given base image, and from that to a newer one."""
     store: RegistrationStore
     config: RegistrationConfig
 
     @classmethod
     def open(cls, layout: RunLayout, config: FlightConfig) -> "FrameTransforms":
-        """The maps of a run folder."""
+        """The transforms of a run folder."""
         height, width = open_frames(layout.frames).shape
         return cls(
             width=width,
             height=height,
             lens=read_lens(layout),
-            onward=_onward(layout),
+            base_transforms=_base_transforms(layout),
             store=open_registration(layout.registration),
             config=config.registration,
         )
 
     def transform(self, frame: int) -> FrameMap | None:
-        """The map of one frame; none where it is not registered."""
+        """The transform of one frame; None where it is not registered."""
         vector = self.store.vector(frame)
         if not np.isfinite(vector).all():
             return None
-        found: FrameMap = FrameTransform.from_vector(
+        transform: FrameMap = FrameTransform.from_vector(
             vector, width=self.width, height=self.height, lens=self.lens, config=self.config
         )
-        for transform in self.onward:
-            found = found.then(transform)
-        return found
+        for following in self.base_transforms:
+            transform = transform.then(following)
+        return transform

@@ -18,7 +18,7 @@ def read_grid(layout: RunLayout) -> GridRecord:
     Raises
     ------
     InputError
-        The base image was not made yet.
+        There is no base image yet.
     """
     if not layout.grid.exists():
         raise InputError(f"{layout.grid} is not there: run `velfield run` on this folder first")
@@ -31,7 +31,7 @@ def read_working(layout: RunLayout) -> WorkingRecord:
     Raises
     ------
     InputError
-        The detector was not made yet.
+        There is no detector yet.
     """
     if not layout.working.exists():
         raise InputError(f"{layout.working} is not there: run `velfield run` on this folder first")
@@ -42,7 +42,7 @@ def read_working(layout: RunLayout) -> WorkingRecord:
 
 
 def north_direction_rad(grid: GridRecord) -> float | None:
-    """Where north is in the image, from +x towards +y (down); none where the base image has no place on earth."""
+    """Direction of north in the image, from +x towards +y (down); None without a georeference."""
     if grid.affine is None:
         return None
     a, b, _, d, e, _ = grid.affine

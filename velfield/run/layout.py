@@ -66,12 +66,12 @@ class RunLayout:
 
     @property
     def own_base_mask(self) -> Path:
-        """Where the own base image is known."""
+        """Valid pixels of the own base image."""
         return self.base / "own_base_mask.png"
 
     @property
     def base_error_map(self) -> Path:
-        """Left-out error of the registration to a given base image."""
+        """Cross-validated error of the registration to a given base image."""
         return self.base / "error_map.png"
 
     @property
@@ -94,7 +94,7 @@ class RunLayout:
 
     @property
     def working(self) -> Path:
-        """The grid that cars are looked for on."""
+        """The grid that cars are detected on."""
         return self.base / "working.json"
 
     @property
@@ -138,7 +138,7 @@ class RunLayout:
 
     @property
     def view(self) -> Path:
-        """What the viewer page reads beside the field's tiles."""
+        """Data of the viewer page beside the field's tiles."""
         return self.root / "view"
 
     @property
@@ -147,17 +147,17 @@ class RunLayout:
 
     @property
     def view_segments(self) -> Path:
-        """Vehicles from one frame to the next."""
+        """Segments of tracks, from one frame to the next."""
         return self.view / "segments.zarr"
 
     @property
     def view_changes(self) -> Path:
-        """Layers of the change since another run, where `velfield compare` left them."""
+        """Layers of the change since another run, written by `velfield compare`."""
         return self.view / "change.zarr"
 
     @property
     def report_record(self) -> Path:
-        """What the report tells, from which it can be written again."""
+        """The report's content, from which it is rendered."""
         return self.view / "report.json"
 
     @property

@@ -1,12 +1,12 @@
-"""What stands behind a result, told offline from the run folder alone: stages and keys, or a pixel's evidence."""
+"""Provenance of a result from the run folder alone: stages and keys, or the data behind a pixel."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from schemas.arrays import Mask
 from schemas.records import CommitRecord, RebaseRecord
 from velfield.errors import InputError
 from velfield.field.accumulate import accumulate_tile
@@ -30,7 +30,7 @@ class StageLineage:
 
 @dataclass(frozen=True)
 class TrackLineage:
-    """One vehicle that went over the pixel: its tracklets there, and the frames that they were seen in."""
+    """One vehicle that passed the pixel: its tracklets there, and their frames."""
 
     track_id: int
     tracklets: tuple[int, ...]
@@ -45,12 +45,12 @@ class FrameLineage:
     source_index: int
     time_s: float
     heldout_px: float
-    """RMS of the control points that its registration left out, base px."""
+    """RMS error of the control points held out of its registration, base px."""
 
 
 @dataclass(frozen=True)
 class PixelLineage:
-    """All that stands behind one pixel of the field."""
+    """The data behind one pixel of the field."""
 
     x: int
     y: int
@@ -59,7 +59,7 @@ class PixelLineage:
 
 
 def stage_lineage(run: Run) -> list[StageLineage]:
-    """The run's stages in the order of the work, those that are done."""
+    """The run's finished stages, in order."""
     found = []
     for stage in run.record.keys:
         records = read_commits(run.layout, stage)
@@ -82,26 +82,26 @@ def pixel_lineage(run: Run, x: int, y: int) -> PixelLineage:
     if not (0 <= x < width and 0 <= y < height):
         raise InputError(f"pixel ({x}, {y}) is outside the base image of {width} x {height} px")
     tracklets = run.tracklets()
-    touching = _touching(run, _near(tracklets, x, y, _reach(run)), x, y)
+    touching = _touching(run, _near(tracklets, x, y, _margin_px(run)), x, y)
     tracks = tuple(_tracks(tracklets, touching))
     return PixelLineage(x, y, tracks, _frames(run, sorted({f for track in tracks for f in track.frames})))
 
 
-def _reach(run: Run) -> float:
+def _margin_px(run: Run) -> float:
     return (band_radius_px(run.record.config.field, run.grid.gsd_m) or 0.0) + 1.0
 
 
-def _near(tracklets: pd.DataFrame, x: int, y: int, reach: float) -> pd.DataFrame:
+def _near(tracklets: pd.DataFrame, x: int, y: int, margin_px: float) -> pd.DataFrame:
     """All tracklets of the tracks that come near: a shared segment's velocity is averaged along its track."""
     xs = tracklets[[f"x_{k}_px" for k in range(3)]].to_numpy()
     ys = tracklets[[f"y_{k}_px" for k in range(3)]].to_numpy()
-    across = (xs.min(axis=1, initial=np.inf) - reach <= x) & (x <= xs.max(axis=1, initial=-np.inf) + reach)
-    down = (ys.min(axis=1, initial=np.inf) - reach <= y) & (y <= ys.max(axis=1, initial=-np.inf) + reach)
+    across = (xs.min(axis=1, initial=np.inf) - margin_px <= x) & (x <= xs.max(axis=1, initial=-np.inf) + margin_px)
+    down = (ys.min(axis=1, initial=np.inf) - margin_px <= y) & (y <= ys.max(axis=1, initial=-np.inf) + margin_px)
     return tracklets[tracklets["track_id"].isin(tracklets.loc[across & down, "track_id"])]
 
 
 def _touching(run: Run, tracklets: pd.DataFrame, x: int, y: int) -> Segments:
-    """Segments that the field's own kernel counts at the pixel, each asked by itself."""
+    """Segments that the field's kernel counts at the pixel, each tested by itself."""
     config, gsd_m = run.record.config.field, run.grid.gsd_m
     segments = segment_table(tracklets, config) if len(tracklets) else np.empty(0, SEGMENT_DTYPE)
     bins, radius = VelocityBins.from_config(config, gsd_m), band_radius_px(config, gsd_m)
@@ -125,7 +125,7 @@ def _tracks(tracklets: pd.DataFrame, segments: Segments) -> Iterator[TrackLineag
         yield TrackLineage(int(track), tuple(map(int, rows["tracklet_id"])), tuple(map(int, frames)))
 
 
-def _has_pair(tracklets: pd.DataFrame, pairs: set[tuple[int, int]]) -> NDArray[np.bool_]:
+def _has_pair(tracklets: pd.DataFrame, pairs: set[tuple[int, int]]) -> Mask:
     ids = tracklets[[f"detection_id_{k}" for k in range(3)]].to_numpy()
     return np.array([(a, b) in pairs or (b, c) in pairs for a, b, c in ids.tolist()], np.bool_)
 
@@ -137,13 +137,13 @@ def _frames(run: Run, frames: list[int]) -> tuple[FrameLineage, ...]:
 
 
 def describe_detector(run: Run) -> str:
-    """The detector in one line: its file's digest, and what it was learnt from."""
+    """The detector in one line: its file's digest and its training data."""
     working = read_working(run.layout)
     if working.training_source == "detections":
-        return f"another detector's boxes, digest {run.record.inputs.detections}"
+        return f"external detections, digest {run.record.inputs.detections}"
     how = {
-        "labels": f"learnt from {working.labels} marked cars (digest of the labels {run.record.inputs.labels})",
-        "motion": f"learnt from {working.labels} cars that moved",
+        "labels": f"trained on {working.labels} labelled cars (digest of the labels {run.record.inputs.labels})",
+        "motion": f"self-trained on {working.labels} moving cars",
         "file": f"given as a file, digest {run.record.inputs.detector}",
         "shipped": "the shipped one",
     }[working.training_source]
@@ -151,14 +151,14 @@ def describe_detector(run: Run) -> str:
 
 
 def describe_base_image(run: Run) -> str:
-    """The base image in one line: whence it is, and how well the flight lies on it."""
+    """The base image in one line: its source, and the error of the registration to it."""
     grid = run.grid
     name = (run.layout.base_image_tif if run.layout.base_image_tif.exists() else run.layout.base_image).name
     digest = _output(run, "base", f"base/{name}")
-    whence = f"given, digest {run.record.inputs.base}" if grid.base_source == "given" else "built from the flight"
-    line = f"base/{name}, digest {digest}, {grid.width_px} x {grid.height_px} px, {whence}"
+    source = f"given, digest {run.record.inputs.base}" if grid.base_source == "given" else "built from the flight"
+    line = f"base/{name}, digest {digest}, {grid.width_px} x {grid.height_px} px, {source}"
     if grid.intersensor_error_px is not None:
-        line += f"; the flight lies on it to {grid.intersensor_error_px:.2f} px"
+        line += f"; registered to {grid.intersensor_error_px:.2f} px"
     if run.layout.rebased.exists():
         line += f"; {RebaseRecord.model_validate_json(run.layout.rebased.read_bytes()).text()}"
     return line
@@ -170,27 +170,27 @@ def _output(run: Run, stage: str, name: str) -> str:
 
 
 def describe_lineage(run: Run) -> str:
-    """The run's chain of stages and keys, for people."""
+    """The run's stages and keys, as text."""
     source = run.record.inputs.source
     lines = [f"source        {source.path}, digest {source.digest}, {source.frame_count} frames"]
     lines += [
         f"{s.name:<14}{s.key}  units {s.units}, files {s.outputs}, velfield {', '.join(s.code_versions)}"
         for s in stage_lineage(run)
     ]
-    return "\n".join([*lines, f"base image    {describe_base_image(run)}", f"cars by       {describe_detector(run)}"])
+    return "\n".join([*lines, f"base image    {describe_base_image(run)}", f"detector      {describe_detector(run)}"])
 
 
 def describe_pixel(run: Run, pixel: PixelLineage) -> str:
-    """A pixel's lineage, for people."""
+    """A pixel's lineage, as text."""
     vehicles, tracklets = len(pixel.tracks), sum(len(p.tracklets) for p in pixel.tracks)
-    head = f"pixel ({pixel.x}, {pixel.y}): {vehicles} vehicles went by, {tracklets} tracklets in "
+    head = f"pixel ({pixel.x}, {pixel.y}): {vehicles} vehicle tracks, {tracklets} tracklets in "
     lines = [f"{head}{len(pixel.frames)} frames of {run.record.inputs.source.path}"]
     for track in pixel.tracks:
         lines.append(f"track {track.track_id}: tracklets {', '.join(map(str, track.tracklets))}")
-        lines.append(f"  seen in frames {', '.join(map(str, track.frames))}")
+        lines.append(f"  in frames {', '.join(map(str, track.frames))}")
     if pixel.frames:
-        lines.append("frame  source frame  time        held-out residual")
+        lines.append("frame  source frame  time        hold-out error")
         lines += [
             f"{f.frame:>5}  {f.source_index:>12}  {f.time_s:>8.3f} s  {f.heldout_px:.2f} px" for f in pixel.frames
         ]
-    return "\n".join([*lines, f"base image    {describe_base_image(run)}", f"cars by       {describe_detector(run)}"])
+    return "\n".join([*lines, f"base image    {describe_base_image(run)}", f"detector      {describe_detector(run)}"])

@@ -1,7 +1,7 @@
-"""The results of one flight on several base images: each a run folder of its own, sharing what did not change.
+"""The results of one flight on several base images: each a run folder, sharing the outputs that do not change.
 
-``RUN`` is the first; others stand under ``RUN/results/NAME`` and are named in ``RUN/results.json``. One in the making
-has a name that begins with a full stop, and gets its own in one step when it is whole.
+``RUN`` is the first; others are in ``RUN/results/NAME`` and listed in ``RUN/results.json``. An unfinished one is in a
+staging folder, whose name begins with a full stop, and is renamed in one step when it is complete.
 """
 
 import datetime
@@ -20,17 +20,17 @@ from velfield.run.tables import link_files
 
 FIRST = "first"
 _LAST = "flight.json"
-"""What stands in a result that has its name: where names are given file by file, it is the last of them."""
+"""The file that marks a result as complete: where a folder is renamed file by file, it is the last one."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
 def result_name(asked: str | None, base: Path) -> str:
-    """Name of a new result: the one asked for, else the base image's.
+    """Name of a new result: the requested one, else the base image's.
 
     Raises
     ------
     InputError
-        It is no plain name: results stay inside the run folder.
+        It is no plain name; results stay inside the run folder.
 
     Examples
     --------
@@ -44,12 +44,12 @@ def result_name(asked: str | None, base: Path) -> str:
 
 
 def staging_layout(layout: RunLayout, name: str) -> RunLayout:
-    """Where a result stands until it is whole."""
+    """Staging folder of an unfinished result."""
     return RunLayout(layout.results / f".{name}.unfinished")
 
 
 def final_root(root: Path) -> Path:
-    """Where a run folder stands once it is whole: elsewhere only while it is a result in the making.
+    """Folder of a result once it is complete: another one only for a staging folder.
 
     Examples
     --------
@@ -61,33 +61,33 @@ def final_root(root: Path) -> Path:
 
 
 def read_results(layout: RunLayout) -> tuple[ResultRecord, ...]:
-    """All results, the first one first; none where there is but the one."""
+    """All results, the first one first; empty where there is only one."""
     path = layout.results_index
     return ResultsRecord.model_validate_json(path.read_bytes()).results if path.exists() else ()
 
 
 def result_exists(layout: RunLayout, name: str, base: Path) -> bool:
-    """Whether this very result is there already.
+    """Whether this result exists already.
 
     Raises
     ------
     InputError
-        A result of that name stands there, of another base image.
+        There is a result of that name, of another base image.
     """
     if not (layout.results / name / _LAST).exists():
         return False
     record = read_flight_record(layout.results / name)
     if record.inputs.base != digest_path(base):
-        raise InputError(f"{layout.results / name} is another base image's result; name this one with --out")
+        raise InputError(f"{layout.results / name} is the result of another base image; name this one with --out")
     return True
 
 
 def link_shared_outputs(
     old: RunLayout, new: RunLayout, stages: Iterable[str], *, without: tuple[str, ...] = ()
 ) -> None:
-    """Give the new result what it has in common with the old: the outputs of stages, then their commit records.
+    """Link the outputs of stages from an old result into a new one, then their commit records.
 
-    Outputs whose path begins as one of ``without`` does are the new result's own, and so not in those records.
+    Outputs whose path begins with one of ``without`` are not shared, and not in the new records.
     """
     for stage in stages:
         for record in read_commits(old, stage):
@@ -100,19 +100,19 @@ def link_shared_outputs(
 
 
 def discard_result(layout: RunLayout) -> None:
-    """Remove a result that came to nothing."""
+    """Remove an unfinished result."""
     remove_tree(layout.root)
 
 
 def publish_result(run: Run, name: str, base: Path) -> Path:
-    """The new result is whole: give it its name, and write down both."""
+    """Rename a complete result to its name, and list both in ``results.json``."""
     layout = run.layout
     target = layout.results / name
-    waiting = staging_layout(layout, name).root
+    staged = staging_layout(layout, name).root
     if (target / _LAST).exists():
-        remove_tree(waiting)  # what a process that was killed while it gave the name left
+        remove_tree(staged)  # left by a process killed while renaming
     else:
-        rename_tree(waiting, target, last=_LAST)
+        rename_tree(staged, target, last=_LAST)
     others = [result for result in read_results(layout) if result.name != name] or [_first(run)]
     records = ResultsRecord(results=(*others, _result(name, target, base)))
     write_atomically(layout.results_index, records.model_dump_json(indent=1).encode())

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-from schemas.arrays import GreyImage, Points
+from schemas.arrays import FloatArray, GreyImage, Points
 from schemas.records import FORMAT_VERSION, FlightRecord, GridRecord
 from schemas.tables import DETECTION_COLUMNS, TRACK_COLUMNS
 from velfield.analysis.crossings import find_crossings, hysteresis_px
@@ -27,7 +26,7 @@ from velfield.run.stores import FrameStore, RegistrationStore, open_field, open_
 from velfield.run.tables import conform, read_tables
 
 _EACH_ONCE = {"shared_segment_weight": 1}
-"""The preset `paper` weighs segments that two tracklets share twice; who counts vehicles does not."""
+"""The preset `paper` weights segments that two tracklets share twice; counting vehicles does not."""
 
 
 def open_run(root: str | Path) -> "Run":
@@ -46,7 +45,7 @@ def open_run(root: str | Path) -> "Run":
 
 
 class Run:
-    """A run folder, read lazily: opening one reads no image and no table.
+    """A run folder, read lazily: opening one reads no images and no tables.
 
     Frames are numbered as in ``frames.zarr``; points are (x, y), pixel (0, 0) being the centre of the top-left pixel.
     """
@@ -74,12 +73,12 @@ class Run:
         return read_grid(self.layout)
 
     @cached_property
-    def maps(self) -> FrameTransforms:
+    def frame_transforms(self) -> FrameTransforms:
         """Raw pixels <-> base pixels of each frame."""
         return FrameTransforms.open(self.layout, self.record.config)
 
     @property
-    def times_s(self) -> NDArray[np.float64]:
+    def times_s(self) -> FloatArray:
         """(frames,) true times, s."""
         return self.frames.column("time_s")
 
@@ -90,22 +89,22 @@ class Run:
 
     def to_base(self, frame: int, xy_raw: Points) -> Points:
         """Raw pixels of a frame -> base pixels, (n, 2) -> (n, 2); NaN rows where the frame is not registered."""
-        return self._mapped("to_base", frame, xy_raw)
+        return self._transformed("to_base", frame, xy_raw)
 
     def to_raw(self, frame: int, xy_base: Points) -> Points:
         """Base pixels -> raw pixels of a frame, (n, 2) -> (n, 2); NaN rows where there is no such pixel."""
-        return self._mapped("to_raw", frame, xy_base)
+        return self._transformed("to_raw", frame, xy_base)
 
-    def _mapped(self, direction: str, frame: int, xy: Points) -> Points:
+    def _transformed(self, direction: str, frame: int, xy: Points) -> Points:
         points = np.asarray(xy, np.float64).reshape(-1, 2)
-        transform = self.maps.transform(frame)
+        transform = self.frame_transforms.transform(frame)
         if transform is None:
             return np.full_like(points, np.nan)
-        mapped: Points = getattr(transform, direction)(points)
-        return mapped
+        transformed: Points = getattr(transform, direction)(points)
+        return transformed
 
     def detections(self) -> pd.DataFrame:
-        """All cars found, in base pixels: the columns of ``schemas.tables.DETECTION_COLUMNS``."""
+        """All detections, in base pixels: the columns of ``schemas.tables.DETECTION_COLUMNS``."""
         return read_tables(sorted(self.layout.detections.glob("unit-*.parquet")), DETECTION_COLUMNS)
 
     def tracklets(self) -> pd.DataFrame:
@@ -135,12 +134,12 @@ class Run:
 
     @cached_property
     def field_time_weighted(self) -> VelocityField:
-        """The velocity field weighed by time: a vehicle that stays counts for as long as it does."""
+        """The velocity field weighted by time: a vehicle counts for as long as it stays."""
         return open_velocity_field(self.layout, time_weighted=True)
 
     @cached_property
     def field_intervals(self) -> dict[str, IntervalField]:
-        """Fields of time intervals by name, in their order; empty where none were asked for (``--intervals``)."""
+        """Fields of time intervals by name, in their order; empty where none were configured (``--intervals``)."""
         return {found.name: found for found in open_field_intervals(self.layout)}
 
     @cached_property

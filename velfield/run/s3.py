@@ -39,7 +39,7 @@ class S3ObjectPath(ProxyUPath):
         return len(data)
 
     def unlink(self, missing_ok: bool = False) -> None:
-        """Remove the object in one request; S3 does not say whether there was one."""
+        """Remove the object in one request; S3 does not report whether there was one."""
         self.fs.rm_file(self.path)
 
     def version(self) -> str:

@@ -1,6 +1,6 @@
 """The Zarr stores of a run folder: create, open, check. The only module that imports zarr.
 
-Three rules that were paid for (each is a fault seen in zarr or in its use):
+Three rules, each after a fault seen in zarr or in its use:
 
 - ``ZstdCodec(checksum=True)`` everywhere: the default codec returns wrong pixels for one bit in seven, silently;
 - a chunk has one writer: two writers on parts of one chunk lose each other's work, so the chunks of per-frame columns
@@ -19,7 +19,7 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import ZstdCodec
 
-from schemas.arrays import Float32Array, IntArray
+from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray
 from schemas.records import FORMAT_VERSION
 from schemas.renames import OLD_ARRAYS, OLD_ATTRIBUTES, OLD_WEIGHTS
 from velfield.errors import InputError
@@ -31,11 +31,11 @@ _FORMAT_KEY = "format_version"
 HISTOGRAM = "velocity_histogram"
 HISTOGRAM_TIME_WEIGHTED = "velocity_histogram_time_weighted"
 HISTOGRAMS: dict[str, dict[str, str]] = {HISTOGRAM: {"long_name": "velocity histogram", "units": "1"}}
-"""What a field holds at least, with its attributes."""
+"""Histogram of every field, with its attributes."""
 
 
 class StoreError(RuntimeError):
-    """A store is damaged or is not what was expected: names the store and the chunk."""
+    """A store is damaged or not as expected: names the store and the chunk."""
 
 
 def _create(
@@ -117,29 +117,29 @@ def _read(path: Path, group: _Group, name: str, selection: Any) -> NDArray[Any]:
         return np.asarray(group[name][selection])
     except Exception as error:
         raise StoreError(
-            f"{path / name}: a chunk is damaged ({error}); `velfield verify {path.parent}` says which"
+            f"{path / name}: a chunk is damaged ({error}); `velfield verify {path.parent}` finds which"
         ) from error
 
 
 def _check_column(path: Path, name: str, known: Iterable[str]) -> None:
-    """Before a name that never was is taken for a column that is damaged."""
+    """Refuse an unknown name, which would look like a damaged column."""
     if name not in known:
         raise InputError(f"{path}: found no column {name!r}; it has {', '.join(known)}")
 
 
 def _check_frame(path: Path, frame: int, count: int) -> None:
-    """Before a chunk that never was is taken for one that is gone or damaged."""
+    """Refuse an unknown frame, whose chunk would look missing or damaged."""
     if not 0 <= frame < count:
         raise InputError(f"{path}: frame {frame} is not in the run: its frames go from 0 to {count - 1}")
 
 
 def _metadata(path: Path) -> list[Path]:
-    """What describes a store and its arrays: as much part of it as its chunks."""
+    """The metadata files of a store and its arrays."""
     return [path / "zarr.json", *sorted(path.glob("*/zarr.json"))]
 
 
 def _existing(paths: Iterable[Path]) -> list[Path]:
-    """Chunks that were written: zarr leaves out those that hold nothing but the fill value."""
+    """Chunks that exist: zarr writes none that hold only the fill value."""
     return [path for path in paths if path.exists()]
 
 
@@ -147,7 +147,7 @@ def _existing(paths: Iterable[Path]) -> list[Path]:
 
 
 def store_key(path: Path) -> str | None:
-    """Content key that a store was laid out under; none where it is not there or not whole."""
+    """Content key that a store was created under; None where it does not exist or is incomplete."""
     try:
         return str(zarr.open_group(**_location(path), mode="r", zarr_format=3, use_consolidated=False).attrs["key"])
     except (FileNotFoundError, KeyError, ValueError):
@@ -170,7 +170,7 @@ THUMBNAIL_SHAPE = (16, 16)
 def create_frames(
     path: Path, *, key: str, count: int, height: int, width: int, unit_frames: int, source: Mapping[str, Any]
 ) -> None:
-    """Lay out ``frames.zarr``: one frame a chunk; a unit of a column a chunk. Frames are unreadable until written."""
+    """Create ``frames.zarr``: one frame a chunk; a unit of a column a chunk. Frames are unreadable until written."""
     group = zarr.create_group(
         **_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION, "source": dict(source)}
     )
@@ -181,7 +181,7 @@ def create_frames(
     shape, chunks = (count, *THUMBNAIL_SHAPE), (chunk, *THUMBNAIL_SHAPE)
     _create(group, "thumbnail", shape, chunks, "float32", fill_value=0, dimension_names=("frame", "row", "column"))
     _create(group, FLAGS, (count,), (max(count, 1),), "uint16", fill_value=2, dimension_names=("frame",))
-    group.attrs["key"] = key  # last: a store without it was not laid out whole
+    group.attrs["key"] = key  # last: a store without it is incomplete
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ class FrameStore:
         _, height, width = self.group["raw"].shape
         return int(height), int(width)
 
-    def read(self, frame: int) -> NDArray[np.uint8]:
+    def read(self, frame: int) -> GreyImage:
         """One grey frame, (h, w) uint8.
 
         Raises
@@ -219,8 +219,8 @@ class FrameStore:
         except Exception as error:
             raise StoreError(f"{self.path}: the chunk of frame {frame} is damaged ({error})") from error
 
-    def write(self, frame: int, grey: NDArray[np.uint8]) -> None:
-        """Write one frame: one chunk, a black frame's too, or it could not be told from one that is gone."""
+    def write(self, frame: int, grey: GreyImage) -> None:
+        """Write one frame: one chunk, also of a black frame, which else would look missing."""
         self.group["raw"].with_config({"write_empty_chunks": True})[frame] = grey
 
     def column(self, name: str) -> NDArray[Any]:
@@ -261,19 +261,19 @@ def open_frames(path: Path, mode: str = "r") -> FrameStore:
 REGISTRATION_COLUMNS: dict[str, str] = {
     "n_matches_base": "int32",  # matches with the base image
     "n_matches_previous": "int32",  # matches with the previous registered frame
-    "n_inliers": "int32",  # control points that the robust fit kept
-    "residual_px": "float32",  # RMS of what was fitted
-    "heldout_px": "float32",  # RMS of what was held out of the fit
+    "n_inliers": "int32",  # inliers of the robust fit
+    "residual_px": "float32",  # RMS of the fit's control points
+    "heldout_px": "float32",  # RMS of the control points held out of the fit
     "coverage": "float32",  # fraction of the frame's cells that hold inliers
 }
 
 
 ERROR_CELLS = (6, 8)
-"""Rows and columns of the cells of a frame that held-out errors are told by."""
+"""Rows and columns of a frame's cells, in which hold-out errors are stored."""
 
 
 def create_registration(path: Path, *, key: str, count: int, vector_length: int, unit_frames: int) -> None:
-    """Lay out ``registration.zarr``: chunks are units, so that a unit has one writer."""
+    """Create ``registration.zarr``: chunks are units, so that a unit has one writer."""
     group = zarr.create_group(**_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION})
     chunk = min(unit_frames, max(count, 1))
     _create(group, "vector", (count, vector_length), (chunk, vector_length), "float64", fill_value=np.nan)
@@ -295,7 +295,7 @@ class RegistrationStore:
     group: _Group
 
     def write(
-        self, start: int, vectors: NDArray[np.float64], statuses: Sequence[str], columns: Mapping[str, NDArray[Any]]
+        self, start: int, vectors: FloatArray, statuses: Sequence[str], columns: Mapping[str, NDArray[Any]]
     ) -> None:
         """Write a whole unit from frame ``start`` on; ``columns`` are ``REGISTRATION_COLUMNS`` and ``error_px``."""
         stop = start + len(statuses)
@@ -308,22 +308,22 @@ class RegistrationStore:
         for name, values in columns.items():
             self.group[name][start:stop] = values
 
-    def vector(self, frame: int) -> NDArray[np.float64]:
+    def vector(self, frame: int) -> FloatArray:
         """Flat parameters of one frame's transform; NaN where it is not registered."""
         _check_frame(self.path, frame, self.group["vector"].shape[0])
         return _read(self.path, self.group, "vector", frame)
 
-    def vectors(self, start: int, stop: int) -> NDArray[np.float64]:
+    def vectors(self, start: int, stop: int) -> FloatArray:
         """Flat parameters of the frames ``[start, stop)``."""
         return _read(self.path, self.group, "vector", slice(start, stop))
 
     def statuses(self, start: int = 0, stop: int | None = None) -> list[str]:
-        """``ok``, ``failed:<reason>`` or ``skipped:<reason>`` of each frame; empty where nothing was done yet."""
+        """``ok``, ``failed:<reason>`` or ``skipped:<reason>`` of each frame; empty where not processed yet."""
         rows = _read(self.path, self.group, "status", slice(start, stop))
         return [bytes(row).rstrip(b"\0").decode(errors="replace") for row in rows]
 
     def column(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
-        """One of ``REGISTRATION_COLUMNS``, (frames,); or ``error_px``, (frames, 6, 8): held-out error by cell."""
+        """One of ``REGISTRATION_COLUMNS``, (frames,); or ``error_px``, (frames, 6, 8): hold-out error by cell."""
         _check_column(self.path, name, (*REGISTRATION_COLUMNS, "error_px"))
         return _read(self.path, self.group, name, slice(start, stop))
 
@@ -352,12 +352,12 @@ def create_field(
     width: int,
     tile: int,
     group_tiles: int,
-    velocities_px_per_s: NDArray[np.float64],
+    velocities_px_per_s: FloatArray,
     attributes: Mapping[str, Any],
     histograms: Mapping[str, Mapping[str, Any]] = HISTOGRAMS,
     layers: Mapping[str, Mapping[str, Any]],
 ) -> None:
-    """Lay out ``field.zarr``: the histogram in sparse tiles, whole layers in chunks of one tile group, labelled axes.
+    """Create ``field.zarr``: the histogram in sparse tiles, whole layers in chunks of one tile group, labelled axes.
 
     Parameters
     ----------
@@ -366,12 +366,12 @@ def create_field(
     histograms : name -> attributes
         (y, x, vy, vx) histograms; `HISTOGRAM` is one of them.
     layers : name -> attributes
-        (y, x) layers beside the histogram; ``dtype`` among the attributes says their type, float32 where absent.
+        (y, x) layers beside the histogram; ``dtype`` among the attributes is their type, by default float32.
     """
     group = zarr.create_group(**_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION, **attributes})
     n = len(velocities_px_per_s)
     grid_mapping = {"grid_mapping": "crs"} if attributes.get("crs_wkt") else {}
-    for name, what in histograms.items():
+    for name, own_attributes in histograms.items():
         histogram = _create(
             group,
             name,
@@ -381,7 +381,7 @@ def create_field(
             fill_value=0,
             dimension_names=("y", "x", "vy", "vx"),
         )
-        histogram.attrs.update({**what, **grid_mapping})
+        histogram.attrs.update({**own_attributes, **grid_mapping})
     side = tile * group_tiles
     for name, attrs in layers.items():
         attrs = dict(attrs)
@@ -394,9 +394,9 @@ def create_field(
 
 
 def _write_axes(
-    group: zarr.Group, height: int, width: int, velocities: NDArray[np.float64], attributes: Mapping[str, Any]
+    group: zarr.Group, height: int, width: int, velocities: FloatArray, attributes: Mapping[str, Any]
 ) -> None:
-    axes: dict[str, tuple[NDArray[np.float64], str]] = {
+    axes: dict[str, tuple[FloatArray, str]] = {
         "y": (np.arange(height, dtype=np.float64), "px"),
         "x": (np.arange(width, dtype=np.float64), "px"),
         "vy": (velocities, "px s-1"),
@@ -440,7 +440,7 @@ class FieldStore:
         height, width = self.group[HISTOGRAM].shape[:2]
         return int(height), int(width)
 
-    def velocities(self) -> NDArray[np.float64]:
+    def velocities(self) -> FloatArray:
         """Bin centres, px/s."""
         return np.asarray(self.group["vx"][:])
 
@@ -472,7 +472,7 @@ class FieldStore:
             raise StoreError(f"{self.path}: the chunk of tile ({row}, {column}) is damaged ({error})") from error
 
     def write_layer(self, name: str, y: int, x: int, values: NDArray[Any]) -> None:
-        """Write a window of a layer: whole chunks."""
+        """Write a window of a layer, of whole chunks."""
         self.group[name][y : y + values.shape[0], x : x + values.shape[1]] = values
 
     def layer(self, name: str) -> NDArray[Any]:
@@ -481,15 +481,15 @@ class FieldStore:
 
     def files(self, tiles: Iterable[tuple[int, int]], group: tuple[int, int]) -> list[Path]:
         """Files that hold the tiles (row, column) and the layers of one group; and the store's metadata."""
-        places = [Path("c", str(row), str(column), "0", "0") for row, column in tiles]
+        chunks = [Path("c", str(row), str(column), "0", "0") for row, column in tiles]
         stored = self.group.stored_name
-        histogram = [self.path / stored(name) / place for name in self.histogram_names() for place in places]
+        histogram = [self.path / stored(name) / chunk for name in self.histogram_names() for chunk in chunks]
         layers = [self.path / stored(name) / "c" / str(group[0]) / str(group[1]) for name in self.layer_names()]
         axes = [self.path / name / "c" / "0" for name in self.group.by_axes.get(1, ())]
         return [*_metadata(self.path), *_existing([*histogram, *layers, *axes])]
 
     def layer_names(self) -> list[str]:
-        """Names of the (y, x) layers, in one order whatever the disk lists first."""
+        """Names of the (y, x) layers, sorted."""
         return self.group.by_axes.get(2, [])
 
     def layer_attributes(self, name: str) -> dict[str, Any]:
@@ -502,7 +502,7 @@ class FieldStore:
         return int(height), int(width)
 
     def stored_chunks(self, name: str) -> list[tuple[int, int]]:
-        """(row, column) of the chunks of an array that are stored: one that is all fill value is not."""
+        """(row, column) of the stored chunks of an array; those of only the fill value are not stored."""
         return sorted(
             (int(path.parent.name), int(path.name))
             for path in (self.path / self.group.stored_name(name) / "c").glob("*/*")
@@ -521,7 +521,7 @@ _LAYER_CHUNK_PX = 512
 
 
 def write_segments(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Write ``view/segments.zarr`` anew: columns of one length, (segments,) each; every chunk is there to be read."""
+    """Write ``view/segments.zarr``: columns of one length, (segments,) each; every chunk is stored."""
     group = zarr.create_group(**_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION})
     for name, values in columns.items():
         chunk = (min(_SEGMENTS_A_CHUNK, max(len(values), 1)),)
@@ -530,7 +530,7 @@ def write_segments(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
 
 
 def write_extra_layers(path: Path, layers: Mapping[str, tuple[NDArray[np.floating], Mapping[str, Any]]]) -> None:
-    """Write float32 (y, x) layers with their attributes, to be shown beside a field's own: `open_field` reads them."""
+    """Write float32 (y, x) layers with their attributes, shown beside the field's own; `open_field` reads them."""
     group = zarr.create_group(**_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION})
     for name, (values, attributes) in layers.items():
         chunk = (_LAYER_CHUNK_PX, _LAYER_CHUNK_PX)

@@ -1,4 +1,4 @@
-"""Tables of a run folder: Parquet parts of one unit each, and the patches beside them."""
+"""Tables of a run folder: Parquet parts of one unit each, and image patches of the detections."""
 
 import io
 import os
@@ -28,12 +28,12 @@ def conform(table: pd.DataFrame, columns: Mapping[str, str]) -> pd.DataFrame:
     return table[list(columns)].astype(dict(columns))
 
 
-def empty(columns: Mapping[str, str]) -> pd.DataFrame:
+def empty_table(columns: Mapping[str, str]) -> pd.DataFrame:
     """A table of no rows.
 
     Examples
     --------
-    >>> len(empty({"frame": "int32"}))
+    >>> len(empty_table({"frame": "int32"}))
     0
     """
     return pd.DataFrame({name: np.empty(0, dtype) for name, dtype in columns.items()})
@@ -82,21 +82,21 @@ def link_files(pairs: Sequence[tuple[Path, Path]]) -> None:
 def read_tables(
     paths: Sequence[Path], columns: Mapping[str, str], *, only: Sequence[str] | None = None
 ) -> pd.DataFrame:
-    """Parts put together in order; ``only`` names the columns that are wanted."""
-    wanted = {name: columns[name] for name in (only or columns)}
-    parts = [pd.read_parquet(io.BytesIO(path.read_bytes()), columns=list(wanted)) for path in paths]
+    """Parts concatenated in order; ``only`` selects columns."""
+    selected = {name: columns[name] for name in (only or columns)}
+    parts = [pd.read_parquet(io.BytesIO(path.read_bytes()), columns=list(selected)) for path in paths]
     parts = [part for part in parts if len(part)]
-    return conform(pd.concat(parts, ignore_index=True), wanted) if parts else empty(wanted)
+    return conform(pd.concat(parts, ignore_index=True), selected) if parts else empty_table(selected)
 
 
 def write_patches(path: Path, patches: Mapping[str, NDArray[Any]]) -> None:
-    """Write images of the detections, each (n, h, w) uint8, in the table's order."""
+    """Write image patches of the detections, each (n, h, w) uint8, in the table's order."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **patches)
     write_atomically(path, buffer.getvalue())
 
 
 def read_patches(path: Path) -> Patches:
-    """Images of the detections by name."""
+    """Image patches of the detections by name."""
     with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
         return {name: file[name] for name in file.files}

@@ -13,7 +13,7 @@ class FrameFlag(IntFlag):
     """
 
     SUSPECT = 1
-    """The bitstream was damaged here or since the last key frame: the image may be wrong."""
+    """The bitstream was corrupt here or since the last key frame: the image may be wrong."""
     UNREADABLE = 2
     """No image could be read; its pixels are zeros."""
     DUPLICATE = 4
@@ -23,7 +23,7 @@ class FrameFlag(IntFlag):
     BLURRED = 16
     """Far less sharp than its neighbours."""
     OUTLIER = 32
-    """Unlike its neighbours, which are like each other: it does not belong to the flight."""
+    """Correlates with neither neighbour, while those two correlate: it is not of the flight."""
 
 
 UNUSABLE = (

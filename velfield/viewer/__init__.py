@@ -1,1 +1,1 @@
-"""The viewer: what a run folder holds for its page, and the two small servers, to view and to annotate."""
+"""The viewer: the data of a run's page, and the two servers, to view and to annotate."""

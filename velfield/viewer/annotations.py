@@ -1,4 +1,4 @@
-"""Frames to mark cars on, and the labels file that the marks go to."""
+"""Frames to label, and the labels file."""
 
 import csv
 import io
@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.annotation import MarkedCar, Marks
+from schemas.arrays import GreyImage
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
 from velfield.run.commits import write_atomically
@@ -31,42 +31,42 @@ class Frames:
     Attributes
     ----------
     names
-        What labels call each.
+        Name of each in labels.
     width, height
         Size of every frame, px.
     read
-        Gives the k-th as (h, w) uint8, raw pixels.
+        Returns the k-th as (h, w) uint8, raw pixels.
     """
 
     names: tuple[str, ...]
     width: int
     height: int
-    read: Callable[[int], NDArray[np.uint8]]
+    read: Callable[[int], GreyImage]
 
 
-def frames_to_annotate(place: Path, *, most: int) -> Frames:
-    """The frames of an image, or ``most`` frames spread over a run.
+def frames_to_annotate(path: Path, *, max_frames: int) -> Frames:
+    """The one frame of an image, or at most ``max_frames`` frames spread over a run.
 
     Raises
     ------
     InputError
-        It is neither, or the run's images are gone, so that their names are not known.
+        It is neither, or the run's images, whose names are needed, no longer exist.
     """
-    if RunLayout(place).flight.exists():
-        return _frames_of_run(open_run(place), most)
-    if place.is_dir() or not place.exists():
-        raise InputError(f"{place}: found no run folder and no image, expected one of them; name a frame's file")
-    grey = read_grey_image(place, FramesConfig().max_pixels)
-    return Frames((place.name,), grey.shape[1], grey.shape[0], lambda _: grey)
+    if RunLayout(path).flight.exists():
+        return _frames_of_run(open_run(path), max_frames)
+    if path.is_dir() or not path.exists():
+        raise InputError(f"{path}: found no run folder and no image, expected one of them; name a frame's file")
+    grey = read_grey_image(path, FramesConfig().max_pixels)
+    return Frames((path.name,), grey.shape[1], grey.shape[0], lambda _: grey)
 
 
-def _frames_of_run(run: Run, most: int) -> Frames:
+def _frames_of_run(run: Run, max_frames: int) -> Frames:
     store = run.frames
     source = run.frames.column("source_index")
     good = np.flatnonzero((source >= 0) & (run.frames.column("flags") == 0))
     if not len(good):
-        raise InputError(f"{run.layout.root}: found no frame without fault, expected some to annotate; see the report")
-    chosen = good[np.unique(np.linspace(0, len(good) - 1, min(most, len(good))).round().astype(np.int64))]
+        raise InputError(f"{run.layout.root}: found no frame without defects, expected some; see the report")
+    chosen = good[np.unique(np.linspace(0, len(good) - 1, min(max_frames, len(good))).round().astype(np.int64))]
     names = _names(run)
     height, width = store.shape
     return Frames(
@@ -75,23 +75,23 @@ def _frames_of_run(run: Run, most: int) -> Frames:
 
 
 def _names(run: Run) -> Callable[[int], str]:
-    """What labels call a frame of the source: a video's index, or an image's file name."""
-    told = run.record.inputs.source
-    if told.kind == "video":
+    """Names of the source's frames in labels: a video's index, or an image's file name."""
+    source = run.record.inputs.source
+    if source.kind == "video":
         return str
     given = run.record.given
     timestamps = Path(given.timestamps) if given and given.timestamps else None
-    if not Path(told.path).is_dir():
+    if not Path(source.path).is_dir():
         raise InputError(
-            f"{run.layout.root}: its images are not at {told.path}, and labels go by their names; put them back, or "
+            f"{run.layout.root}: found no images at {source.path}, expected them for their names; put them back, or "
             "annotate a frame's file"
         )
-    names = probe(Path(told.path), frames=run.record.config.frames, timestamps=timestamps).names
+    names = probe(Path(source.path), frames=run.record.config.frames, timestamps=timestamps).names
     return lambda index: names[index]
 
 
 def read_marks(path: Path) -> Marks:
-    """The labels that stand in a CSV already; none where there is no file.
+    """The labels in a CSV; empty where there is no file.
 
     Raises
     ------
@@ -111,12 +111,12 @@ def read_marks(path: Path) -> Marks:
 
 
 def write_marks(path: Path, marks: Marks, frames: Frames) -> Marks:
-    """Put marks in the place of what the labels file said of their frames; returns all that it says now.
+    """Replace the labels of the marks' frames in the labels file; returns all its labels.
 
     Raises
     ------
     InputError
-        A mark is of a frame that was not to be annotated, or stands outside of the image.
+        A mark is of another frame, or outside the image.
     """
     _check(marks, frames)
     before = read_marks(path)
@@ -142,7 +142,7 @@ def _check(marks: Marks, frames: Frames) -> None:
 
 
 def _csv(marks: Marks) -> str:
-    """A row a car; of a frame without cars a row that names it."""
+    """One row a car; one row with the name alone for a frame without cars."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(CSV_COLUMNS)

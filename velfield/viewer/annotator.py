@@ -1,7 +1,7 @@
-"""The annotation page's server: shows frames and takes marks, for this machine alone.
+"""The annotation page's server: serves frames and receives marks, on this machine alone.
 
-It writes one file, the labels, and only for who holds the token that stands in the page it served: another page in the
-same browser cannot have it written.
+It writes one file, the labels, and only for requests with the token of the page it served, which another page in the
+same browser does not have.
 """
 
 import secrets
@@ -18,7 +18,7 @@ from velfield.viewer.server import headers_for, trusted_host_middleware
 if TYPE_CHECKING:
     from starlette.applications import Starlette
 
-_MOST_BYTES = 16 * 2**20
+_MAX_BYTES = 16 * 2**20
 
 
 def annotate_app(frames: Frames, labels: Path) -> "Starlette":
@@ -42,7 +42,7 @@ def annotate_app(frames: Frames, labels: Path) -> "Starlette":
     token = secrets.token_urlsafe(24)
 
     def page(_: Request) -> HTMLResponse:
-        html = render_annotator(f"Cars of {_named(frames)}", _told(frames, labels, token))
+        html = render_annotator(f"Cars of {_named(frames)}", _page_content(frames, labels, token))
         return HTMLResponse(html, headers=headers_for(html))
 
     def image(request: Request) -> Response:
@@ -53,11 +53,11 @@ def annotate_app(frames: Frames, labels: Path) -> "Starlette":
 
     async def save(request: Request) -> JSONResponse:
         if not secrets.compare_digest(request.headers.get("x-token", ""), token):
-            raise HTTPException(403, "the token is not this server's: load the page again")
+            raise HTTPException(403, "the token is another server's: load the page again")
         body = b""
         async for part in request.stream():
             body += part
-            if len(body) > _MOST_BYTES:
+            if len(body) > _MAX_BYTES:
                 raise HTTPException(413)
         try:
             after = write_marks(labels, Marks.model_validate_json(body), frames)
@@ -77,7 +77,7 @@ def _named(frames: Frames) -> str:
     return frames.names[0] if len(frames.names) == 1 else f"{len(frames.names)} frames"
 
 
-def _told(frames: Frames, labels: Path, token: str) -> dict[str, Any]:
+def _page_content(frames: Frames, labels: Path, token: str) -> dict[str, Any]:
     before = read_marks(labels)
     shown = set(frames.names)
     return {

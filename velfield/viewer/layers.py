@@ -1,7 +1,7 @@
-"""Which layers of a field the page shows, what they are called, and where their colours end.
+"""The layers of a field that the page shows, their titles and colour ranges.
 
-The list follows the store: a layer that is not there is not shown, one that is not known here is shown under the
-``long_name`` that the store gives it.
+The list follows the store: a layer that it does not have is not shown, one that is unknown here is shown by its
+``long_name``.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray
 from schemas.view import LayerKind, ViewLayer
 from velfield.report.figures import colour_scale_max
 
-_REACH_PERCENT = 98.0
-"""Colours end where so many per cent of the known pixels are reached: a few outliers would flatten all else."""
+_COLOUR_PERCENTILE = 98.0
+"""Percentile of the known pixels at the end of the colour scale: outliers would compress it."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ _SPEED_SCALE = frozenset(
 """Layers on the colour scale of the modal speed, so that they compare."""
 
 _INNER = ("velocity_variance_sum",)
-"""For the sums of fields, not for people."""
+"""Needed for sums of fields, not shown."""
 
 Reader = Callable[[str], NDArray[Any]]
 
@@ -102,13 +103,13 @@ def view_layers(attributes: Mapping[str, Mapping[str, Any]], read: Reader) -> li
     attributes
         Attributes of every (y, x) array of the store, by its name.
     read
-        Gives an array by its name, (y, x).
+        Returns an array by its name, (y, x).
     """
     known = [layer for layer in _KNOWN if all(name in attributes for name in layer.arrays)]
     taken = {*_INNER, *(name for layer in _KNOWN for name in layer.arrays)}
     known += [_unknown(name, attrs) for name, attrs in attributes.items() if name not in taken]
-    sizes = {layer.name: _sizes([np.asarray(read(name)) for name in layer.arrays]) for layer in known}
-    speed_max = colour_scale_max(sizes["speed"]) if "speed" in sizes else None
+    magnitudes = {layer.name: _magnitudes([np.asarray(read(name)) for name in layer.arrays]) for layer in known}
+    speed_max = colour_scale_max(magnitudes["speed"]) if "speed" in magnitudes else None
     return [
         ViewLayer(
             name=layer.name,
@@ -117,8 +118,8 @@ def view_layers(attributes: Mapping[str, Mapping[str, Any]], read: Reader) -> li
             kind=layer.kind,
             arrays=layer.arrays,
             units=str(attributes[layer.arrays[0]].get("units", "1")),
-            colour_max=speed_max if speed_max and layer.name in _SPEED_SCALE else _colour_max(sizes[layer.name]),
-            data_max=float(sizes[layer.name].max(initial=0.0)),
+            colour_max=speed_max if speed_max and layer.name in _SPEED_SCALE else _colour_max(magnitudes[layer.name]),
+            data_max=float(magnitudes[layer.name].max(initial=0.0)),
             main=layer.main,
         )
         for layer in known
@@ -129,7 +130,7 @@ _KINDS: dict[str, LayerKind] = {"px s-1": "speed", "rad": "angle", "ms": "time"}
 
 
 def _unknown(name: str, attributes: Mapping[str, Any]) -> _Known:
-    """A layer that this file does not know. One that can be below zero tells a change."""
+    """A layer that is not in `_KNOWN`."""
     title = str(attributes.get("long_name", name.replace("_", " ")))
     kind = _KINDS.get(str(attributes.get("units", "1")), "plain")
     change = "change" in name
@@ -137,13 +138,13 @@ def _unknown(name: str, attributes: Mapping[str, Any]) -> _Known:
     return _Known(name, title[:1].upper() + title[1:], about, "change" if change else kind, (name,), change)
 
 
-def _sizes(arrays: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
-    """Of the values that are known, without their sign; of velocities their speeds."""
-    size = np.hypot(*(np.asarray(array, np.float64) for array in [*arrays, 0.0][:2]))
-    return np.asarray(size[np.isfinite(size)], np.float64)
+def _magnitudes(arrays: Sequence[NDArray[Any]]) -> FloatArray:
+    """Absolute values of the known values; speeds of velocities."""
+    magnitude = np.hypot(*(np.asarray(array, np.float64) for array in [*arrays, 0.0][:2]))
+    return np.asarray(magnitude[np.isfinite(magnitude)], np.float64)
 
 
-def _colour_max(sizes: NDArray[np.float64]) -> float:
-    """Where the colours end: the 98th percentile of the sizes of what is not zero."""
-    sizes = sizes[sizes > 0]
-    return float(np.percentile(sizes, _REACH_PERCENT)) if sizes.size else 1.0
+def _colour_max(magnitudes: FloatArray) -> float:
+    """End of the colour scale: the 98th percentile of the non-zero magnitudes."""
+    positive = magnitudes[magnitudes > 0]
+    return float(np.percentile(positive, _COLOUR_PERCENTILE)) if positive.size else 1.0

@@ -1,11 +1,11 @@
-"""The base image as JPEG tiles in several sizes: a page shows a map of any size without loading it whole."""
+"""The base image as a pyramid of JPEG tiles: a page shows a map of any size without loading all of it."""
 
 from collections.abc import Iterator
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from schemas.arrays import GreyImage
 from velfield.errors import InputError
 
 TILE_PX = 512
@@ -13,7 +13,7 @@ _QUALITY = 88
 
 
 def pyramid_levels(height: int, width: int) -> int:
-    """Levels until the whole image fits a tile.
+    """Number of levels until the whole image fits into a tile.
 
     Examples
     --------
@@ -26,7 +26,7 @@ def pyramid_levels(height: int, width: int) -> int:
     return levels
 
 
-def pyramid_tiles(grey: NDArray[np.uint8]) -> Iterator[tuple[str, bytes]]:
+def pyramid_tiles(grey: GreyImage) -> Iterator[tuple[str, bytes]]:
     """Name ``<level>/<row>-<column>.jpg`` and bytes of every tile; those at the right and lower edge are smaller."""
     image = grey
     for level in range(pyramid_levels(*grey.shape)):
@@ -39,7 +39,7 @@ def pyramid_tiles(grey: NDArray[np.uint8]) -> Iterator[tuple[str, bytes]]:
                 yield f"{level}/{row}-{column}.jpg", _jpeg(image[y : y + TILE_PX, x : x + TILE_PX])
 
 
-def _jpeg(grey: NDArray[np.uint8]) -> bytes:
+def _jpeg(grey: GreyImage) -> bytes:
     good, data = cv2.imencode(".jpg", np.ascontiguousarray(grey), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     if not good:
         raise InputError(f"a tile of {grey.shape} px cannot be written as JPEG")

@@ -1,11 +1,11 @@
-"""What the viewer page reads of a run folder beside the field's own tiles: ``view/``.
+"""Data of the viewer page beside the field's own tiles: ``view/``.
 
     run.json         sizes, units, the list of layers, which chunks are stored
     base/            the base image as JPEG tiles
     segments.zarr    vehicles from one frame to the next, for the line tool and the tracks under the cursor
-    change.zarr      what changed since another run, where `velfield compare` left it
+    change.zarr      the change since another run, written by `velfield compare`
 
-Everything in it can be made again from the run folder: `write_view` does.
+`write_view` makes all of it from the run folder.
 """
 
 import json
@@ -30,12 +30,12 @@ from velfield.run.stores import HISTOGRAM, FieldStore, open_field, write_extra_l
 from velfield.viewer.layers import view_layers
 from velfield.viewer.pyramid import TILE_PX, pyramid_levels, pyramid_tiles
 
-_LINE_REACH_PX = 1.5
-"""Around a path that is a pixel wide."""
+_LINE_RADIUS_PX = 1.5
+"""Around a path that is one pixel wide."""
 
 
 def write_view(layout: RunLayout) -> None:
-    """Write ``view/`` anew.
+    """Write ``view/``.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def write_view_data(layout: RunLayout) -> list[Path]:
 
 
 def write_view_record(layout: RunLayout) -> None:
-    """Write ``view/run.json``: whenever layers were added to the field, or the run was made again."""
+    """Write ``view/run.json``: after each change of the field's layers or of the run."""
     run = open_run(layout.root)
     stores = {"field.zarr": open_field(layout.field)}
     if layout.view_changes.exists():
@@ -70,7 +70,7 @@ def write_view_record(layout: RunLayout) -> None:
 
 
 def write_change_layers(layout: RunLayout, layers: Mapping[str, tuple[FloatArray, Mapping[str, str]]]) -> None:
-    """Leave layers of change in a run's view: name -> (y, x) values, NaN where nothing changed, and attributes."""
+    """Write layers of change into a run's view: name -> (y, x) values, NaN where not significant, and attributes."""
     write_extra_layers(layout.view_changes, layers)
     write_view_record(layout)
 
@@ -103,7 +103,7 @@ def view_record(
             count=len(segments),
             tracks=len(np.unique(segments["track"])),
             settle_px=hysteresis_px(grid.gsd_m),
-            band_radius_px=band_radius_px(flight.config.field, grid.gsd_m) or _LINE_REACH_PX,
+            band_radius_px=band_radius_px(flight.config.field, grid.gsd_m) or _LINE_RADIUS_PX,
         ),
         low_coverage_note=low_coverage_note(int((count > 0).sum()), int((count >= 5).sum())),
     )
@@ -119,7 +119,7 @@ def _arrays(path: str, store: FieldStore) -> dict[str, ViewArray]:
         name: ViewArray(
             store=path,
             chunk=store.chunk_shape(name),
-            stored=tuple(index for place in store.stored_chunks(name) for index in place),
+            stored=tuple(index for chunk in store.stored_chunks(name) for index in chunk),
             units=str(store.layer_attributes(name).get("units", "1")),
             metadata=json.loads((store.path / name / "zarr.json").read_bytes()),
         )
@@ -128,7 +128,7 @@ def _arrays(path: str, store: FieldStore) -> dict[str, ViewArray]:
 
 
 def _columns(segments: Segments) -> dict[str, np.ndarray]:
-    """Columns for the page: tracks numbered from 0, places and velocities in float32 (a thousandth of a pixel)."""
+    """Columns for the page: tracks numbered from 0, positions and velocities in float32 (a thousandth of a pixel)."""
     numbers = np.unique(segments["track"], return_inverse=True)[1]
     names = ("duration_s", "x0_px", "y0_px", "x1_px", "y1_px", "vx_px_per_s", "vy_px_per_s")
     return {

@@ -1,8 +1,7 @@
-"""A run folder over HTTP, for its page: read-only, to this machine alone.
+"""A run folder over HTTP, for its page: read-only, on this machine alone.
 
-Files of the folder and no others: no listing, no link that leads out of it, nothing whose name starts with a dot, no
-method but GET and HEAD. Who asks under another name than this machine's own is turned away, so that no page elsewhere
-can have the folder read through a name of its own (DNS rebinding).
+Files of the folder and no others: no listing, no link out of it, no hidden file, no method but GET and HEAD. Requests
+to another host name than this machine's own are refused, against DNS rebinding.
 """
 
 import re
@@ -36,9 +35,9 @@ _NOTHING = "default-src 'none'; frame-ancestors 'none'"
 
 
 def page_policy(html: str) -> str:
-    """Content security policy of a page whose scripts and styles stand in it: these, by their hashes, and no others.
+    """Content security policy of a page with inline scripts and styles: these, by their hashes, and no others.
 
-    Nothing comes from another host and nothing goes to one, whatever the page itself would allow.
+    No other host is reached, whatever the page's own policy allows.
     """
     scripts = " ".join(_hashes("script", html)) or "'none'"
     styles = " ".join(_hashes("style", html)) or "'none'"
@@ -55,7 +54,7 @@ def _hashes(tag: str, html: str) -> list[str]:
 
 
 def headers_for(html: str | None) -> dict[str, str]:
-    """Headers of an answer: of a page, or of anything else (None)."""
+    """Headers of a response: of a page, or of anything else (None)."""
     return {**_HEADERS, "Content-Security-Policy": _NOTHING if html is None else page_policy(html)}
 
 
@@ -87,15 +86,15 @@ def files_app(root: Path) -> "Starlette":
 
         def file_response(self, full_path: Any, *arguments: Any, **named: Any) -> Any:
             response = super().file_response(full_path, *arguments, **named)
-            place = Path(full_path)
-            response.headers.update(headers_for(place.read_text("utf-8") if place.suffix == ".html" else None))
+            file = Path(full_path)
+            response.headers.update(headers_for(file.read_text("utf-8") if file.suffix == ".html" else None))
             return response
 
     return Starlette(routes=[Mount("/", RunFiles(directory=root, html=True))], middleware=[trusted_host_middleware()])
 
 
 def trusted_host_middleware() -> Any:
-    """Middleware that answers to this machine's own names alone."""
+    """Middleware that refuses host names other than this machine's."""
     from starlette.middleware import Middleware
     from starlette.middleware.trustedhost import TrustedHostMiddleware
 
@@ -104,13 +103,13 @@ def trusted_host_middleware() -> Any:
 
 @contextmanager
 def serve_in_thread(app: "Starlette", port: int) -> Iterator[str]:
-    """Serve in a thread for the time of the context, at this port, or any where it is taken: the address."""
+    """Serve in a thread while the context lasts, on this port, or on any if it is in use; yields the address."""
     import uvicorn
 
     try:
-        listener = _listening(port)
+        listener = _listen(port)
     except InputError:
-        listener = _listening(None)
+        listener = _listen(None)
     with listener:
         server = uvicorn.Server(uvicorn.Config(app, log_level="warning", lifespan="off", server_header=False))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, name="pages", daemon=True)
@@ -128,30 +127,30 @@ def serve(app: "Starlette", *, port: int | None, open_browser: bool, say: Callab
     Parameters
     ----------
     port
-        None: any that is free.
+        None: any free one.
     open_browser
-        Open the page in the person's browser, where there is a screen.
+        Open the page in the user's browser, where there is a screen.
     say
-        Is told the address once the server listens.
+        Called with the address once the server listens.
 
     Raises
     ------
     InputError
-        The port is taken.
+        The port is in use.
     """
     import uvicorn
 
-    with _listening(port) as listener:
+    with _listen(port) as listener:
         address = f"http://{HOST}:{listener.getsockname()[1]}/"
         say(address)
         if open_browser and _has_screen():
-            # The socket listens already: the browser waits until it is answered.
+            # The socket listens already: the browser waits for the response.
             threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
         config = uvicorn.Config(app, log_level="warning", lifespan="off", server_header=False)
         uvicorn.Server(config).run(sockets=[listener])
 
 
-def _listening(port: int | None) -> socket.socket:
+def _listen(port: int | None) -> socket.socket:
     try:
         return socket.create_server((HOST, port or 0))
     except (OSError, OverflowError) as error:

@@ -20,7 +20,7 @@ from velfield.pipeline.result import StageResult
 from velfield.pipeline.stages.external_detections import external_detections
 from velfield.pipeline.stages.rectified_frames import WorkingFrame, WorkingGrid, read_background
 from velfield.pipeline.stages.registration import usable_frames
-from velfield.run.frame_transforms import FrameMap
+from velfield.registration.transforms import FrameMap
 from velfield.run.grid import read_working
 from velfield.run.stores import open_frames
 from velfield.run.tables import write_patches, write_table

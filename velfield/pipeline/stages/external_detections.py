@@ -12,7 +12,7 @@ from velfield.detection.detector import Detections
 from velfield.detection.orientation import CAR_ASPECT, axial_difference, with_axes
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.stages.rectified_frames import WorkingFrame
-from velfield.run.frame_transforms import FrameMap
+from velfield.registration.transforms import FrameMap
 from velfield.sources.labels.detections import read_detections
 
 _AXIS_SD_RAD = 0.1
