@@ -91,7 +91,7 @@ def test_fields_on_different_grids_are_refused_in_one_line(
 
 
 def test_a_folder_that_holds_something_is_not_written_over(whole: Path) -> None:
-    with pytest.raises(InputError, match="not there yet"):
+    with pytest.raises(InputError, match="give a new folder"):
         merge_fields([whole, whole], whole)
 
 

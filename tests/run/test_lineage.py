@@ -65,7 +65,7 @@ def test_the_command_tells_it_offline(
     told = capsys.readouterr().out
     assert digest_file(root / "detector.json") in told
     assert digest_file(root / "base/base_image.png") in told
-    assert "marked cars" in told
+    assert "labelled cars" in told
     lineage(root, pixel=f"{x},{y}", as_json=True)
     assert json.loads(capsys.readouterr().out)["x"] == x
 

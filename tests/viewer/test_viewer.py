@@ -313,7 +313,7 @@ def test_the_summary_is_the_report(page: Page, address: str) -> None:
     page.open(f"{address}#tab=summary")
     page.wait("document.querySelector('#summary-panel').hidden === false")
     text = page.value("document.getElementById('summary-panel').innerText")
-    for words in ("Which way traffic goes", "Registration", "What was tried and kept", "What went in"):
+    for words in ("Direction of travel", "Registration", "Candidates", "Inputs"):
         assert words in text
     page.wait("[...document.querySelectorAll('figure img')][0].naturalWidth > 300")
 

@@ -96,7 +96,7 @@ def test_the_report_goes_by_mail(whole: tuple[Path, RunSummary], tmp_path: Path)
     assert "clockwise from the picture" in (whole[0] / "index.html").read_text()
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     assert "<script" not in page
-    assert "Which way traffic goes" in page
+    assert "Direction of travel" in page
 
 
 def test_without_a_built_page_the_report_stands_alone_and_it_is_said(
@@ -113,7 +113,7 @@ def test_without_a_built_page_the_report_stands_alone_and_it_is_said(
     assert any("make page" in line for line in said)
     page = (root / "index.html").read_text()
     assert "<script" not in page
-    assert "Which way traffic goes" in page
+    assert "Direction of travel" in page
 
 
 @NEEDS_PAGE
