@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from flows.cli import app
 from schemas.detector import METHODS
 from schemas.flight import FlightConfig
-from schemas.renames import OLD_KEYS, REMOVED_KEYS
+from schemas.renames import OLD_ARRAYS, OLD_KEYS, REMOVED_KEYS
 from schemas.summary import RunSummary
 from tests.media import drifting, write_video
 from velfield.pipeline.configuration import resolve_config
@@ -109,8 +109,8 @@ def test_decimals_have_a_leading_zero(page: Path) -> None:
     assert [line for line in prose.splitlines() if BARE_DECIMAL.search(re.sub(r"`[^`]*`", "", line))] == []
 
 
-@pytest.mark.parametrize("name", [*OLD_KEYS, *OLD_KEYS.values(), *REMOVED_KEYS])
-def test_the_changelog_lists_every_renamed_key(name: str) -> None:
+@pytest.mark.parametrize("name", [*OLD_KEYS, *OLD_KEYS.values(), *REMOVED_KEYS, *OLD_ARRAYS, *OLD_ARRAYS.values()])
+def test_the_changelog_lists_every_renamed_key_and_array(name: str) -> None:
     assert name in (ROOT / "CHANGELOG.md").read_text()
 
 
