@@ -61,8 +61,8 @@ def test_marked_cars_become_a_detector_and_a_sheet(
     assert detector.record.layers != shipped_detector().record.layers
     assert cv2.imread(str(sheet)).shape[1] == 1024
     said = capsys.readouterr().out
-    assert "14 cars, frames marked: 1" in said
-    assert "mark 16 or more" in said
+    assert "14 cars, labelled frames: 1" in said
+    assert "label 16 or more" in said
     assert "marked and found" in said
 
 

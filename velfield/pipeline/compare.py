@@ -1,4 +1,4 @@
-"""Two run folders compared: figures, layers for GIS, and a line of summary a quantity."""
+"""Comparison of two run folders: figures, layers for GIS, and a line of summary for each quantity."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ def compare_runs(before: Path, after: Path, out: Path, *, min_count: int = MIN_C
     Returns
     -------
     list of str
-        For people: of each quantity, how much of the map changed.
+        For people: for each quantity, the part of the map that changed.
 
     Raises
     ------
@@ -55,12 +55,12 @@ def compare_runs(before: Path, after: Path, out: Path, *, min_count: int = MIN_C
     _show_in_the_viewer(changes, before, runs[1])
     return [
         *(_line(name, changes[name], *shown[name]) for name in changes),
-        f"significant: at most {FDR_LEVEL:.0%} of what is shown is chance; figures and change.tif in {out}",
+        f"significant: false discovery rate {FDR_LEVEL:.0%}; figures and change.tif in {out}",
     ]
 
 
 def _show_in_the_viewer(changes: dict[str, Change], before: Path, run: Run) -> None:
-    """Leave significant changes as layers of the later run's page, where it has one of the present format, in the units
+    """Write significant changes as layers of the later run's page, where it has one of the present format, in the units
     of its field."""
     if run.layout.format_version != FORMAT_VERSION or not run.layout.view_record.exists():
         return
@@ -76,7 +76,7 @@ def _show_in_the_viewer(changes: dict[str, Change], before: Path, run: Run) -> N
 
 
 def _shown(name: str, change: Change, run: Run) -> tuple[NDArray[np.float64], str]:
-    """A change in the unit that people read."""
+    """A change in display units, and the unit."""
     gsd_m = run.grid.gsd_m
     if name == "direction":
         return np.degrees(change.change), "degrees"
@@ -99,6 +99,6 @@ def _write_layers(
     layers, names, units = [], [], []
     for name, (values, unit) in shown.items():
         layers += [values.astype(np.float32), changes[name].p_value.astype(np.float32)]
-        names += [f"{name} change", f"probability of such a {name} change by chance"]
+        names += [f"{name} change", f"p-value of the {name} change"]
         units += [unit, "1"]
     write_cog(path, layers, names=names, units=units, crs_wkt=run.grid.crs_wkt, affine=run.grid.affine)

@@ -1,4 +1,4 @@
-"""A detector from marked cars, apart from any run: what `velfield train` does."""
+"""Training of a detector on labelled cars, without a run: `velfield train`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +22,7 @@ SHIPPED = "shipped"
 
 @dataclass(frozen=True)
 class Training:
-    """A detector, and the pictures that it was learnt from, on the working grid."""
+    """A detector and its training images, on the working grid."""
 
     detector: Detector
     samples: tuple[LabelledImage, ...]
@@ -30,14 +30,14 @@ class Training:
 
 
 def train_from_labels(source: Path, labels: Path, config: FlightConfig, *, continued: str | None = None) -> Training:
-    """Train on the labelled frames of a video or picture folder.
+    """Train on the labelled frames of a video or folder of images.
 
     Parameters
     ----------
     source, labels
         As for ``velfield run``.
     config
-        ``gsd_m`` sets the working scale where it is known, else the labels' length does.
+        ``gsd_m`` sets the working scale where it is given, else the labels' length does.
     continued
         A detector file to continue, or ``shipped``: a network is fine-tuned, a cascade votes together with the new one.
 
@@ -46,12 +46,12 @@ def train_from_labels(source: Path, labels: Path, config: FlightConfig, *, conti
     InputError
         Labels that cannot be read, of unknown size, or too few.
     """
-    fps = (config.frames.fps or 1.0) if source.is_dir() else None  # pictures need no times to be learnt from
+    fps = (config.frames.fps or 1.0) if source.is_dir() else None  # training needs no timestamps
     info = probe(source, frames=config.frames.model_copy(update={"fps": fps}))
-    found = read_labels(labels, info)
-    samples = tuple(labelled_images(source, info, found, work_per_raw=_scale(config, found)))
+    table = read_labels(labels, info)
+    samples = tuple(labelled_images(source, info, table, work_per_raw=_scale(config, table)))
     detector = train_detector(samples, config.detection, base=_earlier(continued))
-    return Training(detector, samples, found)
+    return Training(detector, samples, table)
 
 
 def _scale(config: FlightConfig, labels: Labels) -> float:
@@ -71,18 +71,18 @@ def _earlier(name: str | None) -> Detector | None:
 
 
 def write_training(training: Training, out: Path, review: Path | None = None) -> list[str]:
-    """Write the detector file, and where asked for the contact sheet; lines for people."""
+    """Write the detector file and, with ``review``, the contact sheet; returns lines for people."""
     training.detector.save(out)
     record, lines = training.detector.record, [*training.labels.notes]
-    lines.append(f"{out}: {record.cars} cars, frames marked: {len(training.samples)}, threshold {record.threshold:.3f}")
+    lines.append(
+        f"{out}: {record.cars} cars, labelled frames: {len(training.samples)}, score threshold {record.threshold:.3f}"
+    )
     if record.curve is not None and record.curve.operating_point is not None:
         k = record.curve.operating_point
         precision, recall = record.curve.precision[k], record.curve.recall[k]
         lines.append(f"precision {precision:.2f} at recall {recall:.2f}: {record.curve.description}")
     else:
-        lines.append(
-            "too few cars are marked to leave some out: how good the detector is, is not known; mark 16 or more"
-        )
+        lines.append("too few labelled cars to hold some out: precision and recall are not known; label 16 or more")
     if review is not None:
         kinds = taken_for_cars(training.detector, training.samples)
         review.write_bytes(png_bytes(review_sheet(kinds)))

@@ -6,6 +6,7 @@ from typing import Any
 
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.stage import Cut, Stage, resolve
+from velfield.run.commits import read_commit
 
 WHOLE = "all"
 """Name of the one unit of a stage that is not cut."""
@@ -59,9 +60,22 @@ def group_name(group: tuple[int, int]) -> str:
 
 
 def prepare_stage(plan: Plan, stage: Stage) -> None:
-    """Create what the units of a stage write into."""
+    """Create what the units of a stage write into, and remove what units of an earlier plan left there."""
     if stage.prepare is not None:
         resolve(stage.prepare)(plan)
+    _remove_stale_units(plan, stage)
+
+
+def _remove_stale_units(plan: Plan, stage: Stage) -> None:
+    """Remove the records of units that this plan does not have, and their files: fewer frames, or other units."""
+    current = {unit.name for unit in stage_units(plan, stage)}
+    for path in (plan.layout.commits / stage.name).glob("*.json"):
+        if path.stem not in current:
+            record = read_commit(plan.layout, stage.name, path.stem)
+            path.unlink(missing_ok=True)
+            if record is not None and stage.store is None:
+                for output in record.outputs:
+                    (plan.layout.root / output).unlink(missing_ok=True)
 
 
 def stage_units(plan: Plan, stage: Stage) -> list[Unit]:

@@ -13,16 +13,19 @@ from velfield.field.statistics import direction_rad, speed_px_per_s
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
 from velfield.pipeline.result import StageResult
-from velfield.pipeline.stages.certificates import write_certificates
 from velfield.report.figures import MapScale, direction_figure, png_bytes, speed_figure
+from velfield.report.quality_figures import registration_error_figure, undistortion_figure
 from velfield.run.base_image import read_base_image
 from velfield.run.commits import write_atomically
+from velfield.run.frame_transforms import read_lens
 from velfield.run.grid import heading_deg, north_direction_rad, read_grid
 from velfield.run.paths import local_output
-from velfield.run.stores import open_field
+from velfield.run.stores import open_field, open_frames, open_registration
 from velfield.viewer.record import write_view_data
 
 PREVIEW_SIDE_PX = 900
+_FULL_PX = 1.0
+"""Maximum of the colour scale of the error map."""
 
 
 def make_maps(plan: Plan) -> StageResult:
@@ -46,7 +49,7 @@ def make_maps(plan: Plan) -> StageResult:
             write_atomically(path, png_bytes(image))
             written.append(path)
     written += _layers(plan, direction, speed)
-    written += write_certificates(plan)
+    written += _write_quality_figures(plan)
     written += write_view_data(layout)
     advance("maps")
     return StageResult(written, {"maps": float(len(figures))})
@@ -81,3 +84,25 @@ def make_preview(figure: NDArray[np.uint8]) -> NDArray[np.uint8]:
     if factor >= 1:
         return figure
     return np.asarray(cv2.resize(figure, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _write_quality_figures(plan: Plan) -> list[Path]:
+    """Write ``maps/registration.png``, and ``maps/lens.png`` where the lens has distortion."""
+    layout = plan.layout
+    errors = open_registration(layout.registration).column("error_px")
+    seen = np.isfinite(errors).any(axis=(1, 2))
+    if not seen.any():
+        return []
+    grey = open_frames(layout.frames).read(int(np.flatnonzero(seen)[0]))
+    known = np.isfinite(errors)
+    mean_square = np.sum(np.where(known, errors, 0.0) ** 2, axis=0) / np.maximum(known.sum(axis=0), 1)
+    by_cell = np.where(known.any(axis=0), np.sqrt(mean_square), np.nan)
+    pictures = {layout.maps / "registration.png": registration_error_figure(grey, by_cell, full_px=_FULL_PX)}
+    lens = read_lens(layout)
+    if not lens.is_identity:
+        pictures[layout.maps / "lens.png"] = undistortion_figure(grey, lens)
+    else:
+        (layout.maps / "lens.png").unlink(missing_ok=True)
+    for path, picture in pictures.items():
+        write_atomically(path, png_bytes(picture))
+    return list(pictures)

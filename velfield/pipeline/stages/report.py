@@ -1,4 +1,7 @@
-"""The page of a run, ``index.html``: the viewer, and as its summary the report: what was done, how well, the maps."""
+"""The page of a run, ``index.html``: the viewer, and as its summary the report: results, quality, maps.
+
+No stage of the table: it is made of the summary of all stages, by every run, and nothing depends on it.
+"""
 
 import datetime
 from collections.abc import Sequence
@@ -20,16 +23,16 @@ from velfield.run.stores import open_frames, open_registration
 from velfield.viewer.record import write_view_record
 
 _TRAINING_SOURCES = {
-    "labels": "marked cars",
-    "motion": "what moves in the flight",
-    "file": "a detector file",
-    "shipped": "the shipped detector",
-    "detections": "another detector's boxes",
+    "labels": "labelled cars",
+    "motion": "labels from motion",
+    "file": "none: a detector file",
+    "shipped": "none: the shipped detector",
+    "detections": "none: external detections",
 }
 
 
 def write_report(plan: Plan, summary: RunSummary) -> list[str]:
-    """Write ``index.html``, the viewer with the report as its summary, and what both are made from.
+    """Write ``index.html``, the viewer with the report as its summary, and the records of both.
 
     Returns
     -------
@@ -51,14 +54,14 @@ def write_report(plan: Plan, summary: RunSummary) -> list[str]:
 
 
 def _name(plan: Plan) -> str:
-    """The video's name; a folder's with the one that it lies in, for it may well be called ``frames``."""
+    """The name of the video; of a folder with its parent's, for it may well be called ``frames``."""
     source = Path(plan.job.inputs.source)
     parts = [part for part in source.parts if part != source.anchor]
     return "/".join(parts[-2:] if plan.info.kind == "folder" else parts[-1:])
 
 
 def make_report(plan: Plan, summary: RunSummary) -> Report:
-    """What the report tells."""
+    """The content of the report."""
     counts = {stage.name: stage.counts for stage in summary.stages}
     return Report(
         title=f"Velocity field of {_name(plan)}",
@@ -92,8 +95,8 @@ def _facts(plan: Plan, counts: dict[str, dict[str, float]]) -> list[tuple[str, s
     return [
         ("flight", f"{times_s[-1] - times_s[0]:.1f} s, {plan.frame_count} frames"),
         ("registered", f"{registered:.0f} of {frames:.0f} frames"),
-        ("residual", f"{counts['registration'].get('heldout_px', float('nan')):.2f} px held out"),
-        ("cars found", f"{counts['detections'].get('cars', 0):.0f}"),
+        ("hold-out registration error", f"{counts['registration'].get('heldout_px', float('nan')):.2f} px"),
+        ("detections", f"{counts['detections'].get('cars', 0):.0f}"),
         ("vehicle tracks", f"{counts['tracks'].get('tracks', 0):.0f}"),
         ("of the map, passed by vehicles", percent(pixels, grid.width_px * grid.height_px)),
         ("of that, by 5 or more", percent(field.get("pixels_5", 0), pixels)),
@@ -106,7 +109,7 @@ def _inputs(plan: Plan) -> list[tuple[str, str]]:
     return [
         ("base image", plan.job.inputs.base or "built from the flight"),
         ("ground sample distance", gsd),
-        ("detector trained on", _TRAINING_SOURCES[working.training_source]),
+        ("training data", _TRAINING_SOURCES[working.training_source]),
         ("preset", plan.config.preset),
         ("frame size", f"{plan.info.width} x {plan.info.height} px"),
     ]
@@ -142,8 +145,8 @@ def _gates(stages: Sequence[StageSummary]) -> dict[str, int]:
 
 
 def _files(plan: Plan) -> list[tuple[str, str]]:
-    layout, told = plan.layout, []
-    north = "the picture's up: north is not known" if north_direction_rad(read_grid(plan.layout)) is None else "north"
+    layout, files = plan.layout, []
+    north = "the image's up: north is not known" if north_direction_rad(read_grid(plan.layout)) is None else "north"
     for path, what in (
         (layout.maps / "direction.png", "modal direction"),
         (layout.maps / "speed.png", "modal speed"),
@@ -151,5 +154,5 @@ def _files(plan: Plan) -> list[tuple[str, str]]:
         (layout.maps / "speed.tif", "modal speed for GIS"),
     ):
         if path.exists():
-            told.append((path.relative_to(layout.root).as_posix(), what))
-    return told
+            files.append((path.relative_to(layout.root).as_posix(), what))
+    return files

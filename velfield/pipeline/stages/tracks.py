@@ -40,6 +40,8 @@ def chain_tracks(plan: Plan) -> StageResult:
         target = plan.layout.tracks / path.name
         write_tracks(target, table)
         written.append(target)
+    for stale in set(plan.layout.tracks.glob("unit-*.parquet")) - set(written):
+        stale.unlink()  # of an earlier plan with more units
     advance("tracks")
     warnings = [] if len(tracks) else [explain_no_tracklets(plan)]
     return StageResult(written, {"tracklets": len(tracks), "tracks": len(np.unique(tracks))}, warnings=warnings)
