@@ -37,7 +37,7 @@ _RUN = """if True:
 def run_with_kills(flight: Path, root: Path, kills: int, seed: int) -> int:
     """A run of the small flight, killed so many times, each time a little after a random number of commits, then left.
 
-    The last is told to end (SIGTERM) and must within seconds, the others are killed.
+    The last one gets SIGTERM and must end within seconds, the others are killed.
 
     Returns how many kills met a run that was under way.
     """
@@ -53,7 +53,7 @@ def run_with_kills(flight: Path, root: Path, kills: int, seed: int) -> int:
             if child.poll() is None and kill == kills - 1:
                 child.terminate()
                 status = child.wait(30)
-                # With 0 where it was done that moment, by the signal where it had not got so far as to mind it.
+                # With 0 where it was done that moment, by the signal where the handler was not yet installed.
                 assert status in (STOPPED, 0, -signal.SIGTERM), status
             elif child.poll() is None:
                 os.killpg(child.pid, signal.SIGKILL)
@@ -70,7 +70,7 @@ def _started(flight: Path, root: Path) -> "subprocess.Popen[bytes]":
 
 
 def main() -> None:
-    """Kill until so many kills have met a run, five a run; say whether all results are equal."""
+    """Kill until so many kills have met a run, five a run; check that all results are equal."""
     from flows.launch import prepare_process
     from schemas.simulation import SimulationConfig
     from tests.small_flight import FRAMES
@@ -80,7 +80,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=50)
     wanted, met, rounds = parser.parse_args().kills, 0, 0
     prepare_process(verbose=False)
-    folder = Path(tempfile.mkdtemp(prefix="velfield-kills-"))  # stays where a result differs: it is to be looked into
+    folder = Path(tempfile.mkdtemp(prefix="velfield-kills-"))  # kept where a result differs, for inspection
     flight = folder / "flight"
     write_flight(flight, SimulationConfig(frames=FRAMES, width=640, height=480, seed=11))
     process(job(flight, folder / "whole"))

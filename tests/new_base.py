@@ -12,7 +12,7 @@ NEW_FROM_OLD = np.array(
         [SCALE * np.sin(TURN_RAD), SCALE * np.cos(TURN_RAD), SHIFT_PX[1]],
     ]
 )
-"""Where the base image's pixels lie on the new picture: exactly known."""
+"""Base pixels -> pixels of the new image: exactly known."""
 
 
 def write_new_base(flight: Path, path: Path) -> Path:

@@ -42,12 +42,12 @@ def process(work: Job, runner: RunnerConfig | None = None) -> RunSummary:
 
 
 def digests(root: Path) -> dict[str, str]:
-    """Of all that a run leaves, apart from what tells when it was made."""
+    """Digests of all files of a run, apart from those with the time of its creation."""
     return digests_of(root, {path: path.read_bytes() for path in root.rglob("*") if path.is_file()})
 
 
 def digests_of(root: Path, files: Mapping[Path, bytes]) -> dict[str, str]:
-    """Of a run's files, wherever they were read from, apart from what tells when it was made."""
+    """Digests of a run's files, wherever they were read from, apart from those with the time of its creation."""
     layout = RunLayout(root)
     when = {layout.flight, layout.report, layout.report_record, layout.lock}
     return {

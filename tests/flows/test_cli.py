@@ -18,9 +18,9 @@ def velfield(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedPr
 
 
 def test_help_lists_the_commands() -> None:
-    told = velfield("--help")
-    assert told.returncode == 0
-    assert [name for name in ("demo", "run", "schema", "simulate") if name not in told.stdout] == []
+    text = velfield("--help")
+    assert text.returncode == 0
+    assert [name for name in ("demo", "run", "schema", "simulate") if name not in text.stdout] == []
 
 
 def test_the_version_is_that_of_the_package() -> None:
@@ -54,7 +54,7 @@ def test_an_old_option_works_for_this_release_with_a_line_that_gives_the_present
         (("simulate", "out", "--size", "big"), "WIDTHxHEIGHT"),
     ],
 )
-def test_bad_input_is_one_clear_line_and_status_1(tmp_path: Path, arguments: tuple[str, ...], told: str) -> None:
+def test_bad_input_is_one_clear_line_and_status_1(tmp_path: Path, arguments: tuple[str, ...], text: str) -> None:
     result = subprocess.run(
         [sys.executable, "-m", "flows.cli", *arguments],
         capture_output=True,
@@ -67,7 +67,7 @@ def test_bad_input_is_one_clear_line_and_status_1(tmp_path: Path, arguments: tup
     lines = result.stderr.strip().splitlines()
     assert len(lines) == 1
     assert lines[0].startswith("velfield: ")
-    assert told in lines[0]
+    assert text in lines[0]
     assert not (tmp_path / "out" / "commits").exists()
 
 
@@ -93,10 +93,10 @@ def test_a_plan_is_shown_and_nothing_is_done(tmp_path: Path) -> None:
     (tmp_path / "frames").mkdir()
     for k in range(40):
         Image.fromarray(np.full((96, 128), k, np.uint8)).save(tmp_path / "frames" / f"{k:03d}.png")
-    told = velfield("run", str(tmp_path / "frames"), "--fps", "5", "--out", str(tmp_path / "run"), "--plan")
-    assert told.returncode == 0, told.stderr
-    assert "40 of them to process" in told.stdout
-    assert "GB needed" in told.stdout
+    text = velfield("run", str(tmp_path / "frames"), "--fps", "5", "--out", str(tmp_path / "run"), "--plan")
+    assert text.returncode == 0, text.stderr
+    assert "40 of them to process" in text.stdout
+    assert "GB needed" in text.stdout
     assert not (tmp_path / "run").exists()
 
 

@@ -20,13 +20,13 @@ EXAMPLES = sorted((ROOT / "examples").glob("cluster-*.yaml"))
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_the_examples_are_read_and_say_what_stands_where(path: Path) -> None:
+def test_the_examples_are_read_and_list_what_runs_where(path: Path) -> None:
     runner = read_runner(path)
     assert runner.cluster_class is not None
     assert runner.cluster_class.split(".")[0] in path.read_text().split("pip install ")[1].replace("-", "_")
     assert runner.workers is not None
     assert runner.workers > 1
-    assert "What stands where" in path.read_text()
+    assert "What runs where" in path.read_text()
 
 
 def test_there_is_an_example_for_each_kind() -> None:
@@ -58,8 +58,8 @@ def test_workers_of_our_own_keep_memory_for_pictures() -> None:
 
     prepare_process(verbose=False)
     with open_runner(RunnerConfig(workers=1)) as runner:
-        told = runner.compute(delayed(os.environ.get)("MALLOC_TRIM_THRESHOLD_"))
-    assert int(told) == 256 << 20
+        text = runner.compute(delayed(os.environ.get)("MALLOC_TRIM_THRESHOLD_"))
+    assert int(text) == 256 << 20
 
 
 def one_that_kills_its_worker(plan: object, frames: range) -> object:

@@ -25,7 +25,7 @@ from velfield.run.layout import RunLayout
 from velfield.run.results import link_shared_outputs
 
 
-def test_it_leaves_what_the_contract_says(whole: tuple[Path, RunSummary]) -> None:
+def test_the_run_folder_is_as_the_contract_lists(whole: tuple[Path, RunSummary]) -> None:
     root, summary = whole
     assert [stage.name for stage in summary.stages] == list(STAGE)
     assert summary.complete
@@ -70,7 +70,7 @@ def test_the_python_side_of_the_contract(whole: tuple[Path, RunSummary]) -> None
     assert fast > slow
 
 
-def test_it_is_as_good_as_a_small_flight_lets_it_be(whole: tuple[Path, RunSummary], flight: Path) -> None:
+def test_accuracy_on_the_small_flight(whole: tuple[Path, RunSummary], flight: Path) -> None:
     from velfield.synthetic.run_score import score_run
 
     score = score_run(whole[0], flight, min_count=1)
@@ -94,13 +94,13 @@ def test_a_run_on_another_base_image_has_no_score(
         score_run(whole[0], flight)
 
 
-def test_a_second_run_does_nothing_again(whole: tuple[Path, RunSummary], flight: Path) -> None:
+def test_a_second_run_recomputes_nothing(whole: tuple[Path, RunSummary], flight: Path) -> None:
     root, _ = whole
     before = digests(root)
     again = process(job(flight, root))
     assert redone(again) == []
     assert digests(root) == before
-    assert all(stage.seconds_before > 0 for stage in again.stages)  # the report tells what the work took, once done
+    assert all(stage.seconds_before > 0 for stage in again.stages)  # the report lists what the work took, once done
 
 
 def test_a_changed_gate_redoes_tracking_onward(whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path) -> None:
@@ -111,10 +111,10 @@ def test_a_changed_gate_redoes_tracking_onward(whole: tuple[Path, RunSummary], f
     velocities = open_run(root).tracklets()[["vx_01_px_per_s", "vy_01_px_per_s"]]
     speeds = np.hypot(*velocities.to_numpy().T) * 0.23
     assert np.quantile(speeds, 0.99) < 10.5  # 5 m/s and what jitter adds
-    assert speeds.max() < 14  # a place may be mended by a pixel or two after the gates
+    assert speeds.max() < 14  # a position may be refined by a pixel or two after the gates
 
 
-def test_a_detector_that_looks_at_the_background_is_given_that_of_this_flight(
+def test_a_detector_that_uses_the_background_gets_that_of_this_flight(
     whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
 ) -> None:
     root, file, found = tmp_path / "copy", tmp_path / "detector.json", []
@@ -133,7 +133,7 @@ def test_workers_give_the_same_bits(whole: tuple[Path, RunSummary], flight: Path
     assert digests(tmp_path / "workers") == digests(whole[0])
 
 
-def test_a_unit_that_fails_once_is_tried_again(
+def test_a_unit_that_fails_once_is_retried(
     whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from velfield.pipeline.stages import frames as step
@@ -157,7 +157,7 @@ def test_a_unit_that_fails_once_is_tried_again(
     assert len(calls) == summary.stages[0].units + 1
 
 
-def test_a_unit_that_always_fails_is_lost_and_done_by_the_next_run(
+def test_a_unit_that_always_fails_is_lost_and_computed_by_the_next_run(
     whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from velfield.pipeline.stages import detections as step
@@ -185,15 +185,15 @@ def test_a_unit_that_always_fails_is_lost_and_done_by_the_next_run(
 def test_a_base_image_of_another_place_is_refused(flight: Path, server: None, tmp_path: Path) -> None:
     import cv2
 
-    picture = cv2.imread(str(flight / "base.png"), cv2.IMREAD_GRAYSCALE)
+    image = cv2.imread(str(flight / "base.png"), cv2.IMREAD_GRAYSCALE)
     wrong = tmp_path / "mirrored.png"
-    cv2.imwrite(str(wrong), picture[:, ::-1])
+    cv2.imwrite(str(wrong), image[:, ::-1])
     with pytest.raises(InputError, match="found a mirrored image"):
         process(job(flight, tmp_path / "run", base=str(wrong)))
     assert not (tmp_path / "run" / "commits" / "registration").exists()
 
 
-def test_commit_records_say_what_was_done(whole: tuple[Path, RunSummary]) -> None:
+def test_commit_records_hold_counts_and_digests(whole: tuple[Path, RunSummary]) -> None:
     root, _ = whole
     record = json.loads((root / "commits" / "detections" / "000008-000015.json").read_text())
     assert record["counts"]["frames"] == 8
@@ -221,9 +221,7 @@ def test_detections_of_another_detector_take_the_place_of_ours(
     assert "external detections" in next(stage.text for stage in summary.stages if stage.name == "detector")
 
 
-def test_boxes_of_few_frames_what_is_not_used_and_why_the_maps_stay_empty_are_told(
-    flight: Path, tmp_path: Path
-) -> None:
+def test_boxes_of_few_frames_unused_inputs_and_empty_maps_are_warned_of(flight: Path, tmp_path: Path) -> None:
     first = sorted(path.name for path in (flight / "frames").iterdir())[0]
     boxes = tmp_path / "boxes.csv"
     boxes.write_text(f"frame,x_px,y_px,length_px,width_px\n{first},320,240,20,9\n")
@@ -232,13 +230,13 @@ def test_boxes_of_few_frames_what_is_not_used_and_why_the_maps_stay_empty_are_to
     warned = {stage.name: stage.warnings for stage in summary.stages}
     assert any("boxes in 1 of the" in line for line in warned["detector"])
     assert any("--labels not used" in line for line in warned["detector"])
-    (told,) = warned["tracks"]
-    assert "no tracklets, so the maps are empty" in told
-    assert "--set tracking.max_interval_s=0." in told
+    (text,) = warned["tracks"]
+    assert "no tracklets, so the maps are empty" in text
+    assert "--set tracking.max_interval_s=0." in text
 
 
-def test_the_size_of_given_boxes_tells_the_working_scale(flight: Path, tmp_path: Path) -> None:
-    """Where no ground sample distance is given; boxes without a size are told of."""
+def test_the_size_of_given_boxes_sets_the_working_scale(flight: Path, tmp_path: Path) -> None:
+    """Where no ground sample distance is given; boxes without a size are warned of."""
     from velfield.synthetic import load_truth
 
     cars = load_truth(flight).cars

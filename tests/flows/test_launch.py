@@ -1,4 +1,4 @@
-"""What stands beside a first run: kernels are compiled by a process of its own, and only where they have yet to be."""
+"""A first run compiles the kernels in a process of its own, and only where none are cached."""
 
 import subprocess
 import sys

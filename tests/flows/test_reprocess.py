@@ -64,7 +64,7 @@ def apart_px(one: Run, another: Run) -> float:
     return float(np.nanmean([np.hypot(*(one.to_base(f, points) - another.to_base(f, points)).T) for f in (0, 8, 17)]))
 
 
-def test_no_frame_is_looked_at_again(mapped: tuple[Path, RunSummary]) -> None:
+def test_no_frame_is_processed_again(mapped: tuple[Path, RunSummary]) -> None:
     done = {stage.name: stage.done_before for stage in mapped[1].stages}
     units = {stage.name: stage.units for stage in mapped[1].stages}
     assert [name for name in done if done[name] == units[name]] == [
@@ -77,7 +77,7 @@ def test_no_frame_is_looked_at_again(mapped: tuple[Path, RunSummary]) -> None:
     ]
 
 
-def test_what_was_known_lies_where_it_should_to_the_stated_error(run: Path, mapped: tuple[Path, RunSummary]) -> None:
+def test_mapped_results_are_right_to_the_stated_error(run: Path, mapped: tuple[Path, RunSummary]) -> None:
     old, new = open_run(run), open_run(mapped[0])
     stated = added_error_px(mapped[0])
     assert 0 < stated < 1
@@ -121,7 +121,9 @@ def test_both_results_are_kept_and_named_and_whole(
     assert "adds" in describe_base_image(new)
 
 
-def test_the_same_again_does_nothing(run: Path, mapped: tuple[Path, RunSummary], new_base: Path) -> None:
+def test_the_same_base_image_again_recomputes_nothing(
+    run: Path, mapped: tuple[Path, RunSummary], new_base: Path
+) -> None:
     before = {path: path.stat().st_mtime_ns for path in mapped[0].rglob("*")}
     assert run_reprocess(run, new_base, console=Console("quiet")) == (mapped[0], None)
     assert {path: path.stat().st_mtime_ns for path in mapped[0].rglob("*")} == before
@@ -144,8 +146,8 @@ def test_registered_again_it_agrees_within_the_stated_error(
 
 
 def test_a_base_image_of_another_place_changes_nothing(run: Path, flight: Path, tmp_path: Path) -> None:
-    picture = cv2.imread(str(flight / "base.png"), cv2.IMREAD_GRAYSCALE)
-    cv2.imwrite(str(tmp_path / "wrong.png"), picture[:, ::-1])
+    image = cv2.imread(str(flight / "base.png"), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(tmp_path / "wrong.png"), image[:, ::-1])
     before = digests(run)
     with pytest.raises(InputError, match="found a mirrored image"):
         run_reprocess(run, tmp_path / "wrong.png", console=Console("quiet"))

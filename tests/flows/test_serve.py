@@ -53,7 +53,7 @@ def test_another_address_is_served_with_one() -> None:
         check(ServeConfig(Path("x"), auth="secret"))
 
 
-def test_a_port_that_is_taken_is_told() -> None:
+def test_a_port_that_is_taken_is_refused() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -72,19 +72,19 @@ def test_no_analytics_and_no_other_origin() -> None:
 # -------------------------------------------------------------------------------------------------- what arrives
 
 
-def test_what_arrives_is_told_once_when_it_no_longer_grows(tmp_path: Path) -> None:
+def test_an_arrival_is_reported_once_when_it_no_longer_grows(tmp_path: Path) -> None:
     (tmp_path / "old.mp4").write_bytes(b"1")
-    told: list[str] = []
-    watch = FolderWatcher(tmp_path, 5.0, lambda path: told.append(path.name), include_existing=False)
+    text: list[str] = []
+    watch = FolderWatcher(tmp_path, 5.0, lambda path: text.append(path.name), include_existing=False)
     (tmp_path / "new.mp4").write_bytes(b"1")
     watch.poll(0.0)
     (tmp_path / "new.mp4").write_bytes(b"12")
     watch.poll(6.0)
     watch.poll(10.0)
-    assert told == []
+    assert text == []
     watch.poll(11.0)
     watch.poll(99.0)
-    assert told == ["new.mp4"]
+    assert text == ["new.mp4"]
 
 
 def test_a_dropped_folder_is_read_by_its_names(tmp_path: Path) -> None:
@@ -123,11 +123,11 @@ def test_runs_are_taken_from_their_folder_alone(tmp_path: Path) -> None:
 
 
 def test_prefect_yaml_has_the_same_deployments(server: None, tmp_path: Path) -> None:
-    told = {found["name"]: found for found in yaml.safe_load((ROOT / "prefect.yaml").read_text())["deployments"]}
+    text = {found["name"]: found for found in yaml.safe_load((ROOT / "prefect.yaml").read_text())["deployments"]}
     ours = {found.name: found for found in deployments(ServeConfig(tmp_path))}
-    assert set(told) == set(ours)
+    assert set(text) == set(ours)
     for name, deployment in ours.items():
-        written = told[name]
+        written = text[name]
         path, _, function = written["entrypoint"].partition(":")
         assert deployment.entrypoint == f"{path.removesuffix('.py').replace('/', '.')}.{function}"
         assert set(written["parameters"]) == set(deployment.parameters)
@@ -205,9 +205,9 @@ def sockets_of(process: psutil.Process) -> set[str]:
 
 
 def test_from_the_event_to_the_finished_reprocess(served: Served, flight: Path) -> None:
-    picture = cv2.imread(str(flight / "base.png"), cv2.IMREAD_GRAYSCALE)
-    # Hidden names are not watched, so that only the event tells of it.
-    cv2.imwrite(str(served.folder / "base-images/.spring.png"), cv2.GaussianBlur(picture, (0, 0), 0.8))
+    image = cv2.imread(str(flight / "base.png"), cv2.IMREAD_GRAYSCALE)
+    # Hidden names are not watched, so that only the event announces it.
+    cv2.imwrite(str(served.folder / "base-images/.spring.png"), cv2.GaussianBlur(image, (0, 0), 0.8))
     wait_for(lambda: len(served.ask("/deployments/filter", {})) == 3)
     event = {
         "occurred": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),

@@ -51,6 +51,6 @@ def test_ctrl_c_is_answered(tmp_path: Path) -> None:
         while not list(tmp_path.glob("flight/frames/*")) and time.monotonic() < deadline:
             time.sleep(0.1)
         process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=60)
+        _, text = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert told.strip().splitlines()[-1] == "velfield: stopped"
+    assert text.strip().splitlines()[-1] == "velfield: stopped"

@@ -1,4 +1,4 @@
-"""`velfield init`: what it writes is read back as what it says."""
+"""`velfield init`: its file is read back as the defaults that it lists."""
 
 import re
 from pathlib import Path
@@ -14,7 +14,7 @@ from velfield.pipeline.configuration import resolve_config
 
 
 @pytest.fixture
-def pictures(tmp_path: Path) -> Path:
+def images(tmp_path: Path) -> Path:
     folder = tmp_path / "frames"
     folder.mkdir()
     for k in range(12):
@@ -27,10 +27,10 @@ def init(*words: str) -> int:
 
 
 def test_what_is_written_is_the_default_and_says_what_was_found(
-    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "flight.yaml"
-    assert init(str(pictures), "--fps", "10", "--out", str(out)) == 0
+    assert init(str(images), "--fps", "10", "--out", str(out)) == 0
     text = out.read_text()
     assert "12 frames of 64 x 48 px" in text
     assert "6 frames are processed" in text
@@ -38,35 +38,35 @@ def test_what_is_written_is_the_default_and_says_what_was_found(
     assert resolve_config(file=out) == resolve_config()
 
 
-def test_every_key_stands_in_it_and_may_be_uncommented(pictures: Path, tmp_path: Path) -> None:
+def test_it_lists_every_key_which_may_be_uncommented(images: Path, tmp_path: Path) -> None:
     out = tmp_path / "flight.yaml"
-    init(str(pictures), "--fps", "10", "--out", str(out))
+    init(str(images), "--fps", "10", "--out", str(out))
     _, body = out.read_text().split("preset:", 1)
     uncommented = re.sub(r"^# ", "", f"preset:{body}", flags=re.MULTILINE)
     out.write_text(uncommented)
     assert resolve_config(file=out) == resolve_config(overrides={"gsd_m": 0.23})
-    told = yaml.safe_load(uncommented)
+    text = yaml.safe_load(uncommented)
     defaults = resolve_config().model_dump()
-    assert {name: set(told[name]) for name in told if isinstance(told[name], dict)} == {
+    assert {name: set(text[name]) for name in text if isinstance(text[name], dict)} == {
         name: set(section) for name, section in defaults.items() if isinstance(section, dict)
     }
 
 
-def test_one_key_is_set_by_taking_its_mark_away(pictures: Path, tmp_path: Path) -> None:
+def test_a_key_is_set_by_uncommenting_it(images: Path, tmp_path: Path) -> None:
     out = tmp_path / "flight.yaml"
-    init(str(pictures), "--fps", "10", "--out", str(out))
+    init(str(images), "--fps", "10", "--out", str(out))
     out.write_text(out.read_text().replace("#   max_speed_m_per_s: 34.5", "   max_speed_m_per_s: 20", 1))
     assert resolve_config(file=out).tracking.max_speed_m_per_s == 20
 
 
-def test_a_file_that_is_there_is_left_alone(pictures: Path, tmp_path: Path) -> None:
+def test_an_existing_file_is_not_overwritten(images: Path, tmp_path: Path) -> None:
     out = tmp_path / "flight.yaml"
     out.write_text("preset: fast\n")
     with pytest.raises(InputError, match="exists already"):
-        init(str(pictures), "--fps", "10", "--out", str(out))
+        init(str(images), "--fps", "10", "--out", str(out))
     assert out.read_text() == "preset: fast\n"
 
 
-def test_a_folder_without_times_says_what_it_needs(pictures: Path, tmp_path: Path) -> None:
+def test_a_folder_without_timestamps_is_refused_with_the_remedy(images: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--fps"):
-        init(str(pictures), "--out", str(tmp_path / "flight.yaml"))
+        init(str(images), "--out", str(tmp_path / "flight.yaml"))

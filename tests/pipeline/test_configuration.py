@@ -1,4 +1,4 @@
-"""The configuration: what is stronger than what, and what a wrong key is told."""
+"""The configuration: which source overrides which, and the errors of wrong keys."""
 
 from collections.abc import Iterator, Sequence
 from itertools import permutations
@@ -14,7 +14,7 @@ from velfield.errors import IneffectiveSettingWarning, InputError, OldNameWarnin
 from velfield.pipeline.configuration import resolve_config
 
 
-def test_nothing_said_is_the_defaults() -> None:
+def test_without_settings_it_is_the_defaults() -> None:
     assert resolve_config() == FlightConfig()
 
 
@@ -53,7 +53,7 @@ def test_no_key_is_accepted_that_the_method_never_reads(model: type[DetectorConf
                 resolve_config(settings=[f"detection.{key}=1", f"detection.method={method}"])
 
 
-def test_a_key_of_another_method_is_told_where_it_is_read() -> None:
+def test_a_key_of_another_method_is_refused_with_the_method_that_reads_it() -> None:
     with pytest.raises(InputError) as caught:
         resolve_config(settings=["detection.rounds=100"])
     assert str(caught.value) == (
@@ -96,13 +96,13 @@ def test_an_option_that_was_not_given_changes_nothing() -> None:
         (["preset=worst"], "best, fast, paper"),
     ],
 )
-def test_a_wrong_setting_is_one_clear_line(settings: list[str], told: str) -> None:
-    if not told:
+def test_a_wrong_setting_is_one_clear_line(settings: list[str], text: str) -> None:
+    if not text:
         assert resolve_config(settings=settings).gsd_m == 2
         return
     with pytest.raises(InputError) as caught:
         resolve_config(settings=settings)
-    assert told in str(caught.value)
+    assert text in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -180,7 +180,7 @@ def test_a_removed_key_is_ignored_with_a_warning() -> None:
         (("field.path_width=pixel", "field.lane_width_m=3"), "lane_width_m has no effect with field.path_width=pixel"),
     ],
 )
-def test_a_setting_that_the_chosen_method_does_not_read_is_said(settings: tuple[str, ...], message: str) -> None:
+def test_a_setting_that_the_chosen_method_does_not_read_is_warned_of(settings: tuple[str, ...], message: str) -> None:
     with pytest.warns(IneffectiveSettingWarning, match=message) as caught:
         resolve_config(settings=settings)
     assert len(caught) == 1

@@ -34,10 +34,10 @@ def test_four_hours_are_fewer_than_3000_task_runs(tmp_path: Path) -> None:
     plan = planned(FOUR_HOURS, tmp_path)
     total = sum(len(units) for units in planned_units(plan).values())
     assert total < 3000
-    told = describe_plan(plan)
-    assert f"{total} task runs" in told
-    assert "memory" in told
-    assert "GB needed" in told
+    text = describe_plan(plan)
+    assert f"{total} task runs" in text
+    assert "memory" in text
+    assert "GB needed" in text
 
 
 def test_task_runs_grow_with_chunks_not_with_frames(tmp_path: Path) -> None:
@@ -46,7 +46,7 @@ def test_task_runs_grow_with_chunks_not_with_frames(tmp_path: Path) -> None:
     assert runs[300] >= 4  # and yet several workers have something to do
 
 
-def test_what_is_given_otherwise_than_before_is_known(flight: Path, tmp_path: Path) -> None:
+def test_changed_inputs_and_settings_are_known(flight: Path, tmp_path: Path) -> None:
     first = make_plan(job(flight, tmp_path / "run"))
     assert changed_since(first) == []
     write_flight_record(first)
@@ -59,13 +59,13 @@ def test_what_is_given_otherwise_than_before_is_known(flight: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize("text", ["nonsense", "6-0", "0-3,2-5"])
-def test_slices_that_cannot_be_are_told_before_any_work(flight: Path, tmp_path: Path, text: str) -> None:
+def test_impossible_time_intervals_are_refused_before_any_work(flight: Path, tmp_path: Path, text: str) -> None:
     with pytest.raises(InputError, match="time interval"):
         make_plan(job(flight, tmp_path, f"field.time_intervals={text}"))
 
 
 @pytest.mark.parametrize("option", ["base", "labels", "detector", "detections"])
-def test_what_is_not_what_it_was_given_as_is_told_before_any_work(flight: Path, tmp_path: Path, option: str) -> None:
+def test_an_input_of_the_wrong_kind_is_refused_before_any_work(flight: Path, tmp_path: Path, option: str) -> None:
     (tmp_path / "hello.txt").write_text("hello\n")
     given = job(flight, tmp_path / "run")
     given = given.model_copy(update={"inputs": given.inputs.model_copy(update={option: str(tmp_path / "hello.txt")})})
@@ -74,7 +74,7 @@ def test_what_is_not_what_it_was_given_as_is_told_before_any_work(flight: Path, 
     assert "b'" not in str(caught.value)
 
 
-def test_frames_too_far_apart_to_follow_a_car_are_told(flight: Path, tmp_path: Path) -> None:
+def test_frames_too_far_apart_to_link_are_warned_of(flight: Path, tmp_path: Path) -> None:
     assert make_plan(job(flight, tmp_path)).info.warnings == ()
     (warning,) = make_plan(job(flight, tmp_path, "frames.every=4")).info.warnings
     assert "--set tracking.max_interval_s=1.3" in warning
@@ -99,9 +99,7 @@ def test_the_estimate_of_bytes_is_of_the_order_of_what_was_measured(tmp_path: Pa
     assert 0.6 * raw < estimated_bytes(planned(frames, tmp_path)) < 1.1 * raw
 
 
-def test_a_disk_that_is_too_small_is_told_before_anything_is_done(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_is_too_small_is_refused_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from velfield.errors import InputError
     from velfield.pipeline import estimate as planning
 

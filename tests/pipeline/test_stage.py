@@ -114,7 +114,7 @@ def test_a_changed_setting_changes_the_keys_of_its_readers_and_of_what_follows(s
         ("base", ("base",)),
         ("labels", ("detector",)),
         ("detector", ("detector",)),
-        ("detections", ("base",)),  # key points are looked for beside the given boxes
+        ("detections", ("base",)),  # key points are detected beside the given boxes
     ],
 )
 def test_another_input_changes_the_keys_of_its_readers_and_of_what_follows(

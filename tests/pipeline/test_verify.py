@@ -68,20 +68,20 @@ def test_every_one_of_200_flipped_bits_is_found(copy: Path) -> None:
     assert found(copy) == dict.fromkeys(hit, "damaged")
 
 
-def test_what_is_gone_or_was_never_done_is_told(copy: Path) -> None:
+def test_missing_files_and_unfinished_units_are_listed(copy: Path) -> None:
     (copy / "frames.zarr/raw/c/5/0/0").unlink()
     commit_path(RunLayout(copy), "tracklets", "000008-000015").unlink()
     assert found(copy) == {"frames.zarr/raw/c/5/0/0": "gone", "tracklets 000008-000015": "not finished"}
 
 
-def test_a_run_that_never_came_to_its_end_is_not_called_damaged(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unfinished_run_is_not_called_damaged(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for record in (copy / "commits" / "maps").glob("*.json"):
         record.unlink()
     assert verify(copy) == 3
-    said = capsys.readouterr().out
-    assert "what is there is whole; 1 units were never finished" in said
-    assert "--repair" not in said
-    assert f"velfield run ... --out {copy}" in said
+    output = capsys.readouterr().out
+    assert "what is there is whole; 1 units were never finished" in output
+    assert "--repair" not in output
+    assert f"velfield run ... --out {copy}" in output
 
 
 def test_reading_a_damaged_chunk_raises_and_names_it(copy: Path) -> None:
@@ -95,7 +95,7 @@ def test_reading_a_damaged_chunk_raises_and_names_it(copy: Path) -> None:
         open_run(copy).registration.statuses()
 
 
-def test_only_the_damaged_units_are_done_again_and_come_out_the_same(
+def test_only_the_damaged_units_are_recomputed_with_equal_results(
     copy: Path, whole: tuple[Path, RunSummary], capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = {path: path.stat().st_mtime_ns for path in (copy / "commits").rglob("*.json")}
@@ -114,7 +114,7 @@ def test_only_the_damaged_units_are_done_again_and_come_out_the_same(
     assert again == {f"{unit}.json" for unit in units}
 
 
-def test_a_store_whose_description_is_damaged_is_made_again(copy: Path) -> None:
+def test_a_store_whose_metadata_is_damaged_is_recreated(copy: Path) -> None:
     (copy / "registration.zarr/zarr.json").write_text("{")
     run = open_run(copy)
     taken_back = invalidate(run.layout, verify_run(run.layout, run.record))

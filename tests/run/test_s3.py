@@ -52,7 +52,7 @@ def test_the_same_bits_as_on_a_disk(remote: tuple[Path, RunSummary], whole: tupl
     assert remote_digests(remote[0]) == digests(whole[0])
 
 
-def test_a_second_run_does_nothing_again(remote: tuple[Path, RunSummary], flight: Path) -> None:
+def test_a_second_run_recomputes_nothing(remote: tuple[Path, RunSummary], flight: Path) -> None:
     assert redone(process(job(flight, remote[0]))) == []
 
 
