@@ -52,13 +52,13 @@ def read_runner(path: Path) -> RunnerConfig:
     import yaml
 
     try:
-        asked = ClusterFile.model_validate(yaml.safe_load(path.read_text()))
+        file = ClusterFile.model_validate(yaml.safe_load(path.read_text()))
     except FileNotFoundError:
         raise InputError(f"--cluster: {path} is not there; see examples/ for some") from None
     except (yaml.YAMLError, ValidationError) as error:
         details = " ".join(str(error).split())
         raise InputError(f"--cluster {path}: expected cluster_class, cluster_kwargs, workers; {details}") from None
-    return RunnerConfig(**asked.model_dump())
+    return RunnerConfig(**file.model_dump())
 
 
 class Runner(ABC):
@@ -115,8 +115,8 @@ def _cluster(config: RunnerConfig) -> Iterator[Any]:
     if config.scheduler is not None:
         yield config.scheduler
         return
-    cluster_class, given = _local_cluster(config) if config.cluster_class is None else _class_of(config)
-    with cluster_class(**given) as cluster:
+    cluster_class, arguments = _local_cluster(config) if config.cluster_class is None else _class_of(config)
+    with cluster_class(**arguments) as cluster:
         if config.cluster_class is not None:
             cluster.scale(config.workers)
         yield cluster

@@ -45,7 +45,7 @@ def annotate(
             annotate_app(frames_to_annotate(place, max_frames=frames), file),
             port=port,
             open_browser=open_browser,
-            say=announce,
+            announce=announce,
         )
     except KeyboardInterrupt:
         print()

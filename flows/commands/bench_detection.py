@@ -11,12 +11,12 @@ def detection(*, size: str = "2560x1920") -> int:
     size
         Frame size, WxH in pixels.
     """
-    from velfield.bench.detection import cascade_speed, city, learnt_there, network_speed, response_speed
+    from velfield.bench.detection import cascade_speed, city, network_speed, response_speed, train_on_one_frame
     from velfield.detection.files import shipped_detector
 
     image = city(*parse_frame_size(size, "128 or more each, as 2560x1920", min_px=128))
     for speed in response_speed(image):
         print(speed.text())
-    print(cascade_speed(image, learnt_there(), "learnt from one marked frame").text())
+    print(cascade_speed(image, train_on_one_frame(), "trained on one labelled frame").text())
     print(network_speed(image, shipped_detector()).text())
     return 0

@@ -20,7 +20,7 @@ def registration(
     out
         Folder for the flights and their runs; delete it afterwards.
     cases
-        `homography`: plane, pin-hole, 2560x1440; `wobble`: lens and rows that move by 4 px, 6 cycles a frame;
+        `homography`: plane, pinhole, 2560x1440; `wobble`: lens and rows that move by 4 px, 6 cycles a frame;
         `vibration`: lens, shake at 14-29 Hz, drift, turn, tilt, relief, base image of another sensor;
         `long`: the same, 640x480, for the drift over 1000 frames.
     seeds

@@ -36,7 +36,7 @@ def train(
     gsd_m
         Ground sample distance of the frames, metres a pixel. Default: from the length of the marked cars.
     continued
-        A detector file that learns on from the marked cars. Default, and `shipped`: the one that ships.
+        A detector file to fine-tune on the labels. Default, and `shipped`: the one that ships.
     review
         PNG to write: what was taken for cars and what was not.
     config

@@ -30,7 +30,7 @@ def view(
         print(f"{run_folder}: {address}  (Ctrl-C ends)", flush=True)
 
     try:
-        serve(view_app(run_folder), port=port, open_browser=open_browser, say=announce)
+        serve(view_app(run_folder), port=port, open_browser=open_browser, announce=announce)
     except KeyboardInterrupt:
         print()
     return 0

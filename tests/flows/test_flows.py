@@ -28,6 +28,7 @@ from velfield.run.results import link_shared_outputs
 def test_the_run_folder_is_as_the_contract_lists(whole: tuple[Path, RunSummary]) -> None:
     root, summary = whole
     assert [stage.name for stage in summary.stages] == list(STAGE)
+    assert [stage.text for stage in summary.stages if "nan" in stage.text] == []
     assert summary.complete
     names = ("flight.json", "frames.zarr", "camera.json", "base/grid.json", "base/base_image.png", "registration.zarr")
     names += (

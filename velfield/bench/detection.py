@@ -152,8 +152,8 @@ def response_speed(image: NDArray[np.uint8]) -> tuple[Speed, Speed]:
     return Speed(what, "whole rows of int32", fast, rows), Speed(what, "numpy", fast, slow)
 
 
-def learnt_there() -> CascadeDetector:
-    """A detector of the usual size, learnt from the marked cars of one frame of another simulated city."""
+def train_on_one_frame() -> CascadeDetector:
+    """A detector of the usual size, trained on one labelled frame of another simulated city."""
     return CascadeDetector.train([simulated_image(_LEARNT_FROM)], CascadeConfig())
 
 

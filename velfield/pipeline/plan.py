@@ -57,9 +57,9 @@ class Plan:
     @property
     def unit_frames(self) -> int:
         """Frames a unit: depends on the flight alone, never on the number of workers."""
-        asked = self.config.work.unit_frames
-        if asked != "auto":
-            return asked
+        setting = self.config.work.unit_frames
+        if setting != "auto":
+            return setting
         return next((unit for frames, unit in _UNITS if self.frame_count <= frames), _LARGEST_UNIT)
 
     @property
@@ -70,7 +70,7 @@ class Plan:
 
     @property
     def time_intervals(self) -> list[TimeInterval]:
-        """Time intervals to accumulate a field for each, in their order; empty where none were asked for.
+        """Time intervals to accumulate a field for each, in their order; empty where none are set.
 
         Raises
         ------

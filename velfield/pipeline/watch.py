@@ -107,7 +107,7 @@ def newest_image(folder: Path) -> Path | None:
 
 
 def _inside(folder: Path, name: str) -> Path:
-    """A path in a folder by its name; also given in full, but never out of it, by ``..`` or by a link."""
+    """The path in a folder by its name or in full; never outside of it, by ``..`` or by a link."""
     path = (folder / name).resolve()
     if path.parent != folder.resolve():
         raise InputError(f"{name!r} is not in {folder}; give the name of what is there")

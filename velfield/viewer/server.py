@@ -121,7 +121,7 @@ def serve_in_thread(app: "Starlette", port: int) -> Iterator[str]:
             thread.join(_STOP_S)
 
 
-def serve(app: "Starlette", *, port: int | None, open_browser: bool, say: Callable[[str], None]) -> None:
+def serve(app: "Starlette", *, port: int | None, open_browser: bool, announce: Callable[[str], None]) -> None:
     """Serve until interrupted.
 
     Parameters
@@ -130,7 +130,7 @@ def serve(app: "Starlette", *, port: int | None, open_browser: bool, say: Callab
         None: any free one.
     open_browser
         Open the page in the user's browser, where there is a screen.
-    say
+    announce
         Called with the address once the server listens.
 
     Raises
@@ -142,7 +142,7 @@ def serve(app: "Starlette", *, port: int | None, open_browser: bool, say: Callab
 
     with _listen(port) as listener:
         address = f"http://{HOST}:{listener.getsockname()[1]}/"
-        say(address)
+        announce(address)
         if open_browser and _has_screen():
             # The socket listens already: the browser waits for the response.
             threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()

@@ -64,11 +64,11 @@ def create_field_stores(plan: Plan) -> None:
         create(path, observed_s=watched_s, time_weighted=False, more={"time_interval": part.name, **ends})
     create(
         plan.layout.field, observed_s=last_s - first_s, time_weighted=config.time_weighted
-    )  # last: its key says that all stand
+    )  # last: its key marks all as created
 
 
 def interval_stores(plan: Plan) -> list[tuple[Path, TimeInterval]]:
-    """Stores of the time intervals, in their order; empty where none were asked for."""
+    """Stores of the time intervals, in their order; empty where none are set."""
     return [(plan.layout.intervals / f"{k:03d}.zarr", part) for k, part in enumerate(plan.time_intervals)]
 
 
@@ -117,14 +117,14 @@ def accumulate_into(writer: GroupWriter, segments: Segments, *, weight: Weight, 
 
 
 def _segments_near(plan: Plan, writer: GroupWriter) -> Segments:
-    """All segments of the tracks that come near the group: whole ones, for a track shares one unit at a pixel."""
+    """All segments of the tracks that come near the group: whole tracks, for one track adds one unit at a pixel."""
     margin = (band_radius_px(writer.config, writer.bins.gsd_m) or 0.0) + 1
     tracklets = _tracklets_near(plan, writer.x0, writer.y0, writer.width, writer.height, margin)
     return segment_table(tracklets, writer.config) if len(tracklets) else np.empty(0, SEGMENT_DTYPE)
 
 
 def _tracklets_near(plan: Plan, x0: int, y0: int, width: int, height: int, margin: float) -> pd.DataFrame:
-    """All tracklets of the tracks that come near the group: whole ones, for a track shares one unit at a pixel."""
+    """All tracklets of the tracks that come near the group: whole tracks, for one track adds one unit at a pixel."""
     paths = sorted(plan.layout.tracks.glob("unit-*.parquet"))
     table = read_tables(paths, TRACKLET_COLUMNS, only=_SEGMENT_COLUMNS)
     xs = table[[f"x_{k}_px" for k in range(3)]].to_numpy()

@@ -97,12 +97,12 @@ def _write_quality_figures(plan: Plan) -> list[Path]:
     known = np.isfinite(errors)
     mean_square = np.sum(np.where(known, errors, 0.0) ** 2, axis=0) / np.maximum(known.sum(axis=0), 1)
     by_cell = np.where(known.any(axis=0), np.sqrt(mean_square), np.nan)
-    pictures = {layout.maps / "registration.png": registration_error_figure(grey, by_cell, full_px=_FULL_PX)}
+    figures = {layout.maps / "registration.png": registration_error_figure(grey, by_cell, full_px=_FULL_PX)}
     lens = read_lens(layout)
     if not lens.is_identity:
-        pictures[layout.maps / "lens.png"] = undistortion_figure(grey, lens)
+        figures[layout.maps / "lens.png"] = undistortion_figure(grey, lens)
     else:
         (layout.maps / "lens.png").unlink(missing_ok=True)
-    for path, picture in pictures.items():
-        write_atomically(path, png_bytes(picture))
-    return list(pictures)
+    for path, figure in figures.items():
+        write_atomically(path, png_bytes(figure))
+    return list(figures)

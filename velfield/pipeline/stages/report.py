@@ -36,7 +36,7 @@ def write_report(plan: Plan, summary: RunSummary) -> list[str]:
 
     Returns
     -------
-    Warnings, one line each: the viewer is not built, and the report stands alone.
+    Warnings, one line each: the viewer is not built, and the page holds the report only.
     """
     layout, report = plan.layout, make_report(plan, summary)
     write_atomically(layout.report_record, report.model_dump_json().encode())

@@ -18,8 +18,8 @@ def link_unit(plan: Plan, frames: range) -> StageResult:
     """Tracklets of all windows that start in ``frames``; reads the detections of as many frames after as they need."""
     times_s = open_frames(plan.layout.frames).column("time_s")
     usable = usable_frames(plan)
-    wanted = window_frames(list(usable), list(times_s), frames, plan.config.tracking.max_interval_s)
-    tables = _frame_tables(plan, wanted, times_s, usable)
+    window = window_frames(list(usable), list(times_s), frames, plan.config.tracking.max_interval_s)
+    tables = _frame_tables(plan, window, times_s, usable)
     tracklets, log = link_windows(tables, plan.config.tracking, gsd_m=read_grid(plan.layout).gsd_m, starts=frames)
     path = plan.layout.unit_file(plan.layout.tracklets, frames.start // plan.unit_frames, ".parquet")
     write_table(path, tracklets, TRACKLET_COLUMNS)
@@ -28,23 +28,23 @@ def link_unit(plan: Plan, frames: range) -> StageResult:
     return StageResult([path], {"frames": len(frames), "tracklets": len(tracklets), **counts})
 
 
-def _frame_tables(plan: Plan, wanted: range, times_s: np.ndarray, usable: np.ndarray) -> list[FrameTable]:
+def _frame_tables(plan: Plan, window: range, times_s: np.ndarray, usable: np.ndarray) -> list[FrameTable]:
     store = open_registration(plan.layout.registration)
-    heldout = store.column("heldout_px", wanted.start, wanted.stop).astype(np.float64)
-    kept = store.column("n_inliers", wanted.start, wanted.stop).astype(np.float64)
+    heldout = store.column("heldout_px", window.start, window.stop).astype(np.float64)
+    kept = store.column("n_inliers", window.start, window.stop).astype(np.float64)
     tables: list[FrameTable] = []
-    for unit in range(wanted.start // plan.unit_frames, (wanted.stop - 1) // plan.unit_frames + 1):
+    for unit in range(window.start // plan.unit_frames, (window.stop - 1) // plan.unit_frames + 1):
         path = plan.layout.unit_file(plan.layout.detections, unit, ".parquet")
         table = read_tables([path], DETECTION_COLUMNS)
-        pictures = read_patches(path.with_suffix(".patches.npz"))
-        first, last = unit * plan.unit_frames, min((unit + 1) * plan.unit_frames, wanted.stop)
-        for frame in range(max(first, wanted.start), last):
-            k = frame - wanted.start
+        patches = read_patches(path.with_suffix(".patches.npz"))
+        first, last = unit * plan.unit_frames, min((unit + 1) * plan.unit_frames, window.stop)
+        for frame in range(max(first, window.start), last):
+            k = frame - window.start
             residual = float(np.nan_to_num(heldout[k]))
             tables.append(
                 _frame_table(
                     table,
-                    pictures,
+                    patches,
                     frame,
                     time_s=float(times_s[frame]),
                     registered=bool(usable[frame]),
@@ -57,7 +57,7 @@ def _frame_tables(plan: Plan, wanted: range, times_s: np.ndarray, usable: np.nda
 
 def _frame_table(
     table: pd.DataFrame,
-    pictures: Patches,
+    patches: Patches,
     frame: int,
     *,
     time_s: float,
@@ -77,11 +77,11 @@ def _frame_table(
         registered=registered,
         residual_px=residual_px,
         detection_id=mine["detection_id"].to_numpy(np.int64),
-        patches=pictures["patches"][rows],
-        crops=pictures["chips"][rows],
-        x_work=pictures["place_work"][rows, 0],
-        y_work=pictures["place_work"][rows, 1],
-        working_scale=float(pictures["working_scale"]),
+        patches=patches["patches"][rows],
+        crops=patches["chips"][rows],
+        x_work=patches["place_work"][rows, 0],
+        y_work=patches["place_work"][rows, 1],
+        working_scale=float(patches["working_scale"]),
         registration_sd_px=map_sd_px,
         **column,
     )
