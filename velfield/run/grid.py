@@ -1,15 +1,17 @@
-"""The grid of base pixels of a run."""
+"""The base image of a run and the grid of its pixels."""
 
 import json
 from functools import lru_cache
 
 import numpy as np
 
-from schemas.arrays import FloatArray
+from schemas.arrays import FloatArray, GreyImage
+from schemas.flight import FramesConfig
 from schemas.records import FORMAT_VERSION, GridRecord, WorkingRecord
 from schemas.renames import upgrade_record
 from velfield.errors import InputError
 from velfield.run.layout import RunLayout
+from velfield.run.paths import local_copy
 
 
 def read_grid(layout: RunLayout) -> GridRecord:
@@ -39,6 +41,15 @@ def read_working(layout: RunLayout) -> WorkingRecord:
     if layout.format_version == FORMAT_VERSION:
         return WorkingRecord.model_validate_json(data)
     return WorkingRecord.model_validate(upgrade_record("working", json.loads(data)))
+
+
+def read_base_image(layout: RunLayout, config: FramesConfig) -> GreyImage:
+    """The base image, (y, x) grey uint8: the GeoTIFF where the run has one, else the PNG."""
+    from velfield.sources.images import read_grey_image  # opening a run loads no rasterio
+
+    path = layout.base_image_tif if layout.base_image_tif.exists() else layout.base_image
+    with local_copy(path) as local:
+        return read_grey_image(local, config.max_pixels)
 
 
 def north_direction_rad(grid: GridRecord) -> float | None:

@@ -15,11 +15,10 @@ from velfield.errors import OldNameWarning
 from velfield.field.segments import Segments, segment_table
 from velfield.field.view import VelocityField
 from velfield.run.analysis import RunAnalysis
-from velfield.run.base_image import read_base_image
 from velfield.run.field_reader import IntervalField, open_field_intervals, open_velocity_field
 from velfield.run.flight_record import read_flight_record
 from velfield.run.frame_transforms import FrameTransforms
-from velfield.run.grid import read_grid
+from velfield.run.grid import read_base_image, read_grid
 from velfield.run.layout import RunLayout
 from velfield.run.paths import to_path
 from velfield.run.stores import FrameStore, RegistrationStore, open_field, open_frames, open_registration

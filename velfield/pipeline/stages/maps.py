@@ -15,10 +15,9 @@ from velfield.pipeline.progress import advance
 from velfield.pipeline.result import StageResult
 from velfield.report.figures import MapScale, direction_figure, png_bytes, speed_figure
 from velfield.report.quality_figures import registration_error_figure, undistortion_figure
-from velfield.run.base_image import read_base_image
 from velfield.run.commits import write_atomically
 from velfield.run.frame_transforms import read_lens
-from velfield.run.grid import heading_deg, north_direction_rad, read_grid
+from velfield.run.grid import heading_deg, north_direction_rad, read_base_image, read_grid
 from velfield.run.paths import local_output
 from velfield.run.stores import open_field, open_frames, open_registration
 from velfield.viewer.record import write_view_data
