@@ -57,7 +57,7 @@ class ViewSegments(Model):
 
     count: NonNegativeInt
     tracks: NonNegativeInt
-    settle_px: PositiveFloat
+    hysteresis_px: PositiveFloat
     """A vehicle that comes back over a line before it is this far from it has not crossed it."""
     band_radius_px: PositiveFloat
     """A vehicle within this distance of a pixel has passed it: half the width of the path that the field counts."""

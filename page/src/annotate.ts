@@ -1,13 +1,13 @@
-// Marking cars: a drag along a car makes one, a click chooses one. Every change is saved at once.
+// Marking cars: a drag along a car makes one, a click selects one. Every change is saved at once.
 
 import "leaflet/dist/leaflet.css";
 import "./viewer.css";
 import L from "leaflet";
-import { corners, drawnCar, holds, USUAL_RATIO, type Car } from "./cars";
+import { corners, carFromEnds, contains, DEFAULT_RATIO, type Car } from "./cars";
 import { find } from "./dom";
-import { toLatLng, toPoint, type Point } from "./place";
+import { toLatLng, toPoint, type Point } from "./coordinates";
 
-interface Told {
+interface ServerData {
   token: string;
   labels: string;
   names: string[];
@@ -16,26 +16,26 @@ interface Told {
   marks: { frames: string[]; cars: Car[] };
 }
 
-const LEAST_DRAG = 4; // screen px: less is a click
+const MIN_DRAG_PX = 4; // screen px: a shorter drag is a click
 
 class Annotator {
   private readonly map: L.Map;
   private readonly drawn = L.layerGroup();
-  private picture: L.ImageOverlay | undefined;
+  private image: L.ImageOverlay | undefined;
   private frame = 0;
   private cars: Car[];
-  private readonly empty: Set<string>; // frames that were said to hold no car
+  private readonly empty: Set<string>; // frames marked as empty
   private readonly touched: Set<string>; // frames that are or were labelled
-  private chosen: Car | null = null;
+  private selected: Car | null = null;
   private from: L.LatLng | null = null;
-  private ratio = USUAL_RATIO;
+  private ratio = DEFAULT_RATIO;
   private saving: Promise<void> = Promise.resolve();
 
-  constructor(private readonly told: Told) {
-    this.cars = told.marks.cars;
-    this.empty = new Set(told.marks.frames.filter((name) => !this.cars.some((car) => car.frame === name)));
-    this.touched = new Set(told.marks.frames);
-    const whole = L.latLngBounds([0, 0], [-told.height, told.width]);
+  constructor(private readonly data: ServerData) {
+    this.cars = data.marks.cars;
+    this.empty = new Set(data.marks.frames.filter((name) => !this.cars.some((car) => car.frame === name)));
+    this.touched = new Set(data.marks.frames);
+    const whole = L.latLngBounds([0, 0], [-data.height, data.width]);
     this.map = L.map(find("map"), {
       crs: L.CRS.Simple,
       attributionControl: false,
@@ -50,26 +50,26 @@ class Annotator {
     });
     this.map.fitBounds(whole);
     this.drawn.addTo(this.map);
-    for (const id of ["previous", "next"]) find(id).hidden = told.names.length === 1;
+    for (const id of ["previous", "next"]) find(id).hidden = data.names.length === 1;
     this.listen();
     this.show(0);
   }
 
   private get name(): string {
-    return this.told.names[this.frame]!;
+    return this.data.names[this.frame]!;
   }
 
   // -- what is shown ---------------------------------------------------------------------------------------------------
 
   private show(frame: number): void {
-    this.frame = Math.min(Math.max(frame, 0), this.told.names.length - 1);
-    this.chosen = null;
-    this.picture?.remove();
-    const whole = L.latLngBounds([0, 0], [-this.told.height, this.told.width]);
-    this.picture = L.imageOverlay(`frame/${this.frame}.png`, whole, { className: "frame" }).addTo(this.map);
-    find("frame").textContent = `Frame ${this.frame + 1} of ${this.told.names.length}: ${this.name}`;
+    this.frame = Math.min(Math.max(frame, 0), this.data.names.length - 1);
+    this.selected = null;
+    this.image?.remove();
+    const whole = L.latLngBounds([0, 0], [-this.data.height, this.data.width]);
+    this.image = L.imageOverlay(`frame/${this.frame}.png`, whole, { className: "frame" }).addTo(this.map);
+    find("frame").textContent = `Frame ${this.frame + 1} of ${this.data.names.length}: ${this.name}`;
     find<HTMLButtonElement>("previous").disabled = this.frame === 0;
-    find<HTMLButtonElement>("next").disabled = this.frame === this.told.names.length - 1;
+    find<HTMLButtonElement>("next").disabled = this.frame === this.data.names.length - 1;
     this.draw();
   }
 
@@ -77,7 +77,7 @@ class Annotator {
     this.drawn.clearLayers();
     const here = this.cars.filter((car) => car.frame === this.name);
     for (const car of here) {
-      const colour = car === this.chosen ? "#ffd400" : "#00e5ff";
+      const colour = car === this.selected ? "#ffd400" : "#00e5ff";
       const shape = corners(car).map(({ x, y }) => toLatLng(x, y));
       this.drawn.addLayer(L.polygon(shape, { color: "#000", weight: 4, fill: false, interactive: false }));
       this.drawn.addLayer(L.polygon(shape, { color: colour, weight: 2, fillOpacity: 0.12, interactive: false }));
@@ -85,14 +85,14 @@ class Annotator {
     const none = find<HTMLButtonElement>("none");
     none.setAttribute("aria-pressed", String(this.empty.has(this.name)));
     none.disabled = here.length > 0;
-    find<HTMLButtonElement>("remove").disabled = this.chosen === null;
+    find<HTMLButtonElement>("remove").disabled = this.selected === null;
     const width = find<HTMLInputElement>("width");
-    width.disabled = this.chosen === null;
-    width.value = this.chosen?.width_px?.toFixed(1) ?? "";
-    this.tell(`${here.length} ${here.length === 1 ? "car" : "cars"} in this frame`);
+    width.disabled = this.selected === null;
+    width.value = this.selected?.width_px?.toFixed(1) ?? "";
+    this.showStatus(`${here.length} ${here.length === 1 ? "car" : "cars"} in this frame`);
   }
 
-  private tell(text: string): void {
+  private showStatus(text: string): void {
     find("saved").textContent = text;
   }
 
@@ -110,43 +110,43 @@ class Annotator {
     if (!from) return;
     const to = this.map.mouseEventToLatLng(event);
     const apart = this.map.latLngToContainerPoint(from).distanceTo(this.map.latLngToContainerPoint(to));
-    if (apart < LEAST_DRAG) this.choose(toPoint(to));
+    if (apart < MIN_DRAG_PX) this.select(toPoint(to));
     else this.add(toPoint(from), toPoint(to));
   }
 
-  private choose(place: Point): void {
-    this.chosen = this.cars.find((car) => car.frame === this.name && holds(car, place)) ?? null;
+  private select(point: Point): void {
+    this.selected = this.cars.find((car) => car.frame === this.name && contains(car, point)) ?? null;
     this.draw();
   }
 
   private add(from: Point, to: Point): void {
-    const car = drawnCar(this.name, from, to, this.ratio);
+    const car = carFromEnds(this.name, from, to, this.ratio);
     if (!this.inside(car)) return;
     this.cars.push(car);
-    this.chosen = car;
+    this.selected = car;
     this.changed();
   }
 
   private inside({ x_px: x, y_px: y }: Car): boolean {
-    return x >= -0.5 && y >= -0.5 && x <= this.told.width - 0.5 && y <= this.told.height - 0.5;
+    return x >= -0.5 && y >= -0.5 && x <= this.data.width - 0.5 && y <= this.data.height - 0.5;
   }
 
   private remove(): void {
-    this.cars = this.cars.filter((car) => car !== this.chosen);
-    this.chosen = null;
+    this.cars = this.cars.filter((car) => car !== this.selected);
+    this.selected = null;
     this.changed();
   }
 
   private widen(width: number): void {
-    const car = this.chosen;
+    const car = this.selected;
     if (!car || !(width >= 1)) return;
     car.width_px = width;
-    if (car.length_px) this.ratio = width / car.length_px; // the next car is as wide for its length
+    if (car.length_px) this.ratio = width / car.length_px; // the next car gets the same ratio
     this.changed();
   }
 
   private shift(dx: number, dy: number): void {
-    const car = this.chosen;
+    const car = this.selected;
     if (!car || !this.inside({ ...car, x_px: car.x_px + dx, y_px: car.y_px + dy })) return;
     car.x_px += dx;
     car.y_px += dy;
@@ -158,21 +158,21 @@ class Annotator {
   private changed(): void {
     if (this.cars.some((car) => car.frame === this.name)) this.empty.delete(this.name);
     this.draw();
-    this.saving = this.saving.then(() => this.save()).catch((error) => this.tell(`NOT saved: ${error.message}`));
+    this.saving = this.saving.then(() => this.save()).catch((error) => this.showStatus(`NOT saved: ${error.message}`));
   }
 
   private async save(): Promise<void> {
     const labelled = new Set([...this.empty, ...this.cars.map((car) => car.frame)]);
     labelled.forEach((name) => this.touched.add(name));
-    const frames = this.told.names.filter((name) => labelled.has(name));
-    // A frame that lost its last car, and was not said to hold none, is no longer labelled.
+    const frames = this.data.names.filter((name) => labelled.has(name));
+    // A frame that lost its last car, and is not marked as empty, is no longer labelled.
     const cleared = [...this.touched].filter((name) => !labelled.has(name));
     const body = JSON.stringify({ frames, cleared, cars: this.cars });
-    const headers = { "content-type": "application/json", "x-token": this.told.token };
+    const headers = { "content-type": "application/json", "x-token": this.data.token };
     const answer = await fetch("labels", { method: "POST", headers, body });
     if (!answer.ok) throw new Error(await answer.text());
     const { cars } = (await answer.json()) as { cars: number };
-    this.tell(`saved: ${cars} ${cars === 1 ? "car" : "cars"} in ${this.told.labels}`);
+    this.showStatus(`saved: ${cars} ${cars === 1 ? "car" : "cars"} in ${this.data.labels}`);
   }
 
   // -- controls --------------------------------------------------------------------------------------------------------
@@ -188,16 +188,16 @@ class Annotator {
     find("remove").addEventListener("click", () => this.remove());
     find("none").addEventListener("click", () => this.toggleEmpty());
     const move = find<HTMLInputElement>("move");
-    move.addEventListener("change", () => this.letMove(move.checked));
+    move.addEventListener("change", () => this.setDragging(move.checked));
     const width = find<HTMLInputElement>("width");
     width.addEventListener("change", () => this.widen(Number(width.value)));
     document.addEventListener("keydown", (event) => this.key(event));
     document.addEventListener("keyup", (event) => {
-      if (event.key === " ") this.letMove(move.checked);
+      if (event.key === " ") this.setDragging(move.checked);
     });
   }
 
-  private letMove(on: boolean): void {
+  private setDragging(on: boolean): void {
     if (on) this.map.dragging.enable();
     else this.map.dragging.disable();
   }
@@ -212,21 +212,21 @@ class Annotator {
     find("readout").textContent = `(${x.toFixed(0)}, ${y.toFixed(0)})`;
     if (!this.from) return;
     this.draw();
-    const car = drawnCar(this.name, toPoint(this.from), { x, y }, this.ratio);
+    const car = carFromEnds(this.name, toPoint(this.from), { x, y }, this.ratio);
     const shape = corners(car).map((corner) => toLatLng(corner.x, corner.y));
     this.drawn.addLayer(L.polygon(shape, { color: "#ffd400", weight: 2, dashArray: "4 4", interactive: false }));
   }
 
   private key(event: KeyboardEvent): void {
     if (event.target instanceof HTMLInputElement || event.ctrlKey || event.metaKey || event.altKey) return;
-    const act = this.actions(event.shiftKey ? 5 : 0.5)[event.key];
-    if (!act || (event.key === " " && event.target instanceof HTMLButtonElement)) return;
-    act();
+    const action = this.actions(event.shiftKey ? 5 : 0.5)[event.key];
+    if (!action || (event.key === " " && event.target instanceof HTMLButtonElement)) return;
+    action();
     event.preventDefault();
   }
 
   private actions(step: number): Record<string, () => void> {
-    const width = this.chosen?.width_px ?? 0;
+    const width = this.selected?.width_px ?? 0;
     return {
       Delete: () => this.remove(),
       Backspace: () => this.remove(),
@@ -238,9 +238,9 @@ class Annotator {
       ArrowDown: () => this.shift(0, step),
       "+": () => this.map.zoomIn(0.5),
       "-": () => this.map.zoomOut(0.5),
-      " ": () => this.letMove(true),
+      " ": () => this.setDragging(true),
     };
   }
 }
 
-new Annotator(JSON.parse(find("told").textContent!) as Told);
+new Annotator(JSON.parse(find("server-data").textContent!) as ServerData);

@@ -1,6 +1,6 @@
 // Cars as they are marked: middle, axis, length and width, in raw pixels.
 
-import type { Point } from "./place";
+import type { Point } from "./coordinates";
 
 export interface Car {
   frame: string;
@@ -11,11 +11,11 @@ export interface Car {
   width_px: number | null;
 }
 
-export const USUAL_RATIO = 0.45; // a car's width by its length, seen from above
-const UNKNOWN_PX = 12; // size shown of a car whose label tells none
+export const DEFAULT_RATIO = 0.45; // a car's width by its length, seen from above
+const UNKNOWN_PX = 12; // size shown of a car whose label gives none
 
 /** The car from one end to the other. */
-export function drawnCar(frame: string, from: Point, to: Point, ratio: number): Car {
+export function carFromEnds(frame: string, from: Point, to: Point, ratio: number): Car {
   const [dx, dy] = [to.x - from.x, to.y - from.y];
   const length = Math.hypot(dx, dy);
   return {
@@ -48,7 +48,7 @@ export function corners(car: Car): Point[] {
   ].map(([a, b]) => ({ x: car.x_px + a! * along.x + b! * across.x, y: car.y_px + a! * along.y + b! * across.y }));
 }
 
-export function holds(car: Car, { x, y }: Point): boolean {
+export function contains(car: Car, { x, y }: Point): boolean {
   const { along, across } = axes(car);
   const [dx, dy] = [x - car.x_px, y - car.y_px];
   const within = (axis: Point): boolean => Math.abs(dx * axis.x + dy * axis.y) <= axis.x ** 2 + axis.y ** 2;

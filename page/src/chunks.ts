@@ -1,4 +1,4 @@
-// Chunks of the run folder's Zarr arrays. A chunk that is not stored is known from run.json and not asked for.
+// Chunks of the run folder's Zarr arrays. A chunk that is not stored is known from run.json and never requested.
 
 import * as zarr from "zarrita";
 import { fetchFile, type StoredArray } from "./run";
@@ -8,7 +8,7 @@ zarr.registry.set("zstd", () => Zstd.load() as never);
 
 export type Numbers = Float32Array | Float64Array | Int32Array;
 
-/** An array; `metadata` where it is known already spares asking for it. */
+/** An array; known `metadata` saves a request. */
 async function openArray(path: string, metadata?: object) {
   const store = {
     async get(key: string): Promise<Uint8Array> {
@@ -21,7 +21,7 @@ async function openArray(path: string, metadata?: object) {
 
 type OpenArray = Awaited<ReturnType<typeof openArray>>;
 
-/** A (y, x, ...) array; keeps the chunks read last. */
+/** A (y, x, ...) array; caches the chunks read last. */
 export class ChunkedArray {
   readonly chunk: [number, number];
   private readonly stored: Set<string>;
@@ -31,15 +31,15 @@ export class ChunkedArray {
 
   constructor(
     readonly name: string,
-    private readonly told: StoredArray,
-    private readonly most: number,
+    private readonly record: StoredArray,
+    private readonly maxChunks: number,
   ) {
-    this.chunk = told.chunk;
+    this.chunk = record.chunk;
     this.stored = new Set();
-    for (let k = 0; k < told.stored.length; k += 2) this.stored.add(`${told.stored[k]},${told.stored[k + 1]}`);
+    for (let k = 0; k < record.stored.length; k += 2) this.stored.add(`${record.stored[k]},${record.stored[k + 1]}`);
   }
 
-  /** The numbers of a chunk, C order; null where nothing is stored: nothing was seen there. */
+  /** The numbers of a chunk, C order; null where nothing is stored: no vehicle passed there. */
   read(row: number, column: number): Promise<Numbers | null> {
     const key = `${row},${column}`;
     if (!this.stored.has(key)) return Promise.resolve(null);
@@ -51,9 +51,9 @@ export class ChunkedArray {
     }
     const promise = this.load(row, column, key);
     this.kept.set(key, promise);
-    promise.catch(() => this.kept.delete(key)); // asked for again the next time
+    promise.catch(() => this.kept.delete(key)); // requested again the next time
     for (const oldest of this.kept.keys()) {
-      if (this.kept.size <= this.most) break;
+      if (this.kept.size <= this.maxChunks) break;
       this.kept.delete(oldest);
       this.ready.delete(oldest);
     }
@@ -67,7 +67,7 @@ export class ChunkedArray {
   }
 
   private async load(row: number, column: number, key: string): Promise<Numbers> {
-    this.open ??= openArray(`${this.told.store}/${this.name}`, this.told.metadata);
+    this.open ??= openArray(`${this.record.store}/${this.name}`, this.record.metadata);
     const array = await this.open;
     const rest = array.shape.slice(2).map(() => 0);
     const data = (await array.getChunk([row, column, ...rest])).data as Numbers;

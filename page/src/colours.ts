@@ -11,9 +11,9 @@ function parse(hex: string): Scale {
   return scale;
 }
 
-const told = JSON.parse(find("colours").textContent!) as { wheel: string; ramp: string };
-const wheel = parse(told.wheel);
-const ramp = parse(told.ramp);
+const scales = JSON.parse(find("colours").textContent!) as { wheel: string; ramp: string };
+const wheel = parse(scales.wheel);
+const ramp = parse(scales.ramp);
 const COOL = [44, 123, 182];
 const WARM = [215, 48, 39];
 
@@ -30,34 +30,34 @@ export function paintDirection(target: Uint8ClampedArray, at: number, directionR
   put(target, at, wheel, ((step % steps) + steps) % steps);
 }
 
-export function paintShare(target: Uint8ClampedArray, at: number, share: number): void {
+export function paintRamp(target: Uint8ClampedArray, at: number, fraction: number): void {
   const last = ramp.length / 3 - 1;
-  put(target, at, ramp, Math.round(Math.min(Math.max(share, 0), 1) * last));
+  put(target, at, ramp, Math.round(Math.min(Math.max(fraction, 0), 1) * last));
 }
 
-/** Less is blue, more is red, the same is pale. */
-export function paintChange(target: Uint8ClampedArray, at: number, share: number): void {
-  const strength = Math.sqrt(Math.min(Math.abs(share), 1));
-  const end = share < 0 ? COOL : WARM;
+/** Decrease is blue, increase is red, no change is pale. */
+export function paintChange(target: Uint8ClampedArray, at: number, fraction: number): void {
+  const strength = Math.sqrt(Math.min(Math.abs(fraction), 1));
+  const end = fraction < 0 ? COOL : WARM;
   for (let k = 0; k < 3; k++) target[at + k] = 245 + (end[k]! - 245) * strength;
   target[at + 3] = 255;
 }
 
-/** Paints the pixel at `at` with a layer's value there; what is not known gets no paint. */
+/** Paints the pixel at `at` with a layer's value there; unknown values are not painted. */
 export type Painter = (target: Uint8ClampedArray, at: number, a: number, b: number) => void;
 
-/** How a layer's values become colours; `top` in stored units. */
-export function painter(layer: Layer, top: number, standing: number): Painter {
+/** How a layer's values become colours; `colourMax` in stored units. */
+export function painter(layer: Layer, colourMax: number, stationarySpeed: number): Painter {
   if (layer.kind === "direction") {
     return (target, at, vx, vy) => {
-      if (Math.hypot(vx, vy) > standing) paintDirection(target, at, Math.atan2(vy, vx));
+      if (Math.hypot(vx, vy) > stationarySpeed) paintDirection(target, at, Math.atan2(vy, vx));
     };
   }
-  const paint = layer.kind === "change" ? paintChange : paintShare;
+  const paint = layer.kind === "change" ? paintChange : paintRamp;
   const zeroIsNothing = layer.kind === "count" || layer.kind === "time";
   return (target, at, a, b) => {
     const value = layer.arrays.length === 2 ? Math.hypot(a, b) : a;
-    if (Number.isFinite(value) && !(zeroIsNothing && value === 0)) paint(target, at, value / top);
+    if (Number.isFinite(value) && !(zeroIsNothing && value === 0)) paint(target, at, value / colourMax);
   };
 }
 
@@ -66,7 +66,7 @@ export function gradient(change: boolean): string {
   const colour = new Uint8ClampedArray(4);
   const stops = Array.from({ length: 33 }, (_, k) => {
     if (change) paintChange(colour, 0, (k - 16) / 16);
-    else paintShare(colour, 0, k / 32);
+    else paintRamp(colour, 0, k / 32);
     return `rgb(${colour[0]} ${colour[1]} ${colour[2]})`;
   });
   return `linear-gradient(to right, ${stops.join(", ")})`;

@@ -1,10 +1,10 @@
-// What is drawn on the map beside its layers: the pixel asked, the line, tracks.
+// Drawings on the map over its layers: the selected pixel, the line, tracks.
 
 import L from "leaflet";
-import { toLatLng, toPoint, type Point } from "./place";
+import { toLatLng, toPoint, type Point } from "./coordinates";
 import type { Near, TrackIndex } from "./tracks";
 
-const MOST_TRACKS = 60;
+const MAX_TRACKS = 60;
 
 export class Drawings {
   private readonly pixel = L.layerGroup();
@@ -16,29 +16,29 @@ export class Drawings {
     for (const group of [this.tracks, this.pixel, this.line]) group.addTo(map);
   }
 
-  showPixel(place: Point | null): void {
+  showPixel(point: Point | null): void {
     this.pixel.clearLayers();
-    if (!place) return;
-    const box = L.latLngBounds(toLatLng(place.x - 0.5, place.y - 0.5), toLatLng(place.x + 0.5, place.y + 0.5));
+    if (!point) return;
+    const box = L.latLngBounds(toLatLng(point.x - 0.5, point.y - 0.5), toLatLng(point.x + 0.5, point.y + 0.5));
     this.pixel.addLayer(L.rectangle(box, { color: "#fff", weight: 2, fill: false, interactive: false }));
-    const at = toLatLng(place.x, place.y);
+    const at = toLatLng(point.x, point.y);
     this.pixel.addLayer(L.circleMarker(at, { radius: 11, color: "#000", weight: 4, fill: false, interactive: false }));
     this.pixel.addLayer(L.circleMarker(at, { radius: 11, color: "#fff", weight: 2, fill: false, interactive: false }));
   }
 
-  /** The line with its ends, which can be dragged; `moved` is told where they went. */
+  /** The line with its ends, which can be dragged; `moved` gets their new positions. */
   showLine(ends: Point[] | null, moved: (ends: [Point, Point]) => void): void {
     this.line.clearLayers();
     if (!ends?.length) return;
-    const places = ends.map(({ x, y }) => toLatLng(x, y));
+    const points = ends.map(({ x, y }) => toLatLng(x, y));
     const strokes = [
-      L.polyline(places, { color: "#000", weight: 6, opacity: 0.6, interactive: false }),
-      L.polyline(places, { color: "#fff", weight: 3, interactive: false }),
+      L.polyline(points, { color: "#000", weight: 6, opacity: 0.6, interactive: false }),
+      L.polyline(points, { color: "#fff", weight: 3, interactive: false }),
     ];
     strokes.forEach((stroke) => this.line.addLayer(stroke));
-    const handles = places.map((place, k) => {
+    const handles = points.map((point, k) => {
       const icon = L.divIcon({ className: "handle", iconSize: [22, 22] });
-      const handle = L.marker(place, { icon, draggable: ends.length === 2, keyboard: false, alt: `end ${k + 1} of the line` });
+      const handle = L.marker(point, { icon, draggable: ends.length === 2, keyboard: false, alt: `end ${k + 1} of the line` });
       return handle.addTo(this.line);
     });
     for (const handle of handles) {
@@ -50,8 +50,8 @@ export class Drawings {
   showTracks(near: Near[], index: TrackIndex | null): void {
     this.tracks.clearLayers();
     if (!index) return;
-    for (const one of near.slice(0, MOST_TRACKS)) {
-      const path = index.path(one).map(([x, y]) => toLatLng(x, y));
+    for (const track of near.slice(0, MAX_TRACKS)) {
+      const path = index.path(track).map(([x, y]) => toLatLng(x, y));
       const options = { renderer: this.canvas, interactive: false };
       this.tracks.addLayer(L.polyline(path, { ...options, color: "#000", weight: 4, opacity: 0.5 }));
       this.tracks.addLayer(L.polyline(path, { ...options, color: "#fff", weight: 1.5 }));

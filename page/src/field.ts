@@ -2,7 +2,7 @@
 
 import { ChunkedArray, type Numbers } from "./chunks";
 import { Histogram } from "./histogram";
-import type { Point } from "./place";
+import type { Point } from "./coordinates";
 import type { Run } from "./run";
 
 const HISTOGRAM = "velocity_histogram";
@@ -13,11 +13,11 @@ export class Field {
   private readonly histograms: Histogram;
 
   constructor(readonly run: Run) {
-    for (const [name, told] of Object.entries(run.arrays)) {
-      if (name !== HISTOGRAM) this.arrays.set(name, new ChunkedArray(name, told, CHUNKS_KEPT));
+    for (const [name, record] of Object.entries(run.arrays)) {
+      if (name !== HISTOGRAM) this.arrays.set(name, new ChunkedArray(name, record, CHUNKS_KEPT));
     }
-    const told = run.arrays[HISTOGRAM]!;
-    this.histograms = new Histogram(`${told.store}/${HISTOGRAM}`, told, run.bins);
+    const record = run.arrays[HISTOGRAM]!;
+    this.histograms = new Histogram(`${record.store}/${HISTOGRAM}`, record, run.bins);
   }
 
   has(name: string): boolean {
@@ -37,23 +37,23 @@ export class Field {
   /** The value at a pixel; NaN where nothing is stored. */
   async at(name: string, x: number, y: number): Promise<number> {
     const array = this.array(name);
-    const { row, column, index } = place(array, x, y);
+    const { row, column, index } = locate(array, x, y);
     return value(await array.read(row, column), index);
   }
 
   /** As `at`, of what is in memory; undefined where it is not. */
   peek(name: string, x: number, y: number): number | undefined {
     const array = this.array(name);
-    const { row, column, index } = place(array, x, y);
+    const { row, column, index } = locate(array, x, y);
     const chunk = array.peek(row, column);
     return chunk === undefined ? undefined : value(chunk, index);
   }
 
   /**
-   * The pixel that a place of the map means: the place's own where vehicles passed it, else the nearest within `reach` px
-   * that `least` passed; its own again where there is none.
+   * The pixel meant by a point of the map: its own where vehicles passed it, else the nearest within `reach` px that
+   * `minVehicles` passed; its own where there is none.
    */
-  async nearest(at: Point, reach: number, least: number): Promise<Point> {
+  async nearest(at: Point, reach: number, minVehicles: number): Promise<Point> {
     const own = { x: Math.round(at.x), y: Math.round(at.y) };
     if (reach <= 1 || (await this.at("count", own.x, own.y)) > 0) return own;
     const count = this.array("count");
@@ -66,7 +66,7 @@ export class Field {
     for (const { row, column, counts } of around) {
       const read = await counts;
       for (let k = 0; read && k < read.length; k++) {
-        if (read[k]! < least) continue;
+        if (read[k]! < minVehicles) continue;
         const [x, y] = [column * width + (k % width), row * height + Math.floor(k / width)];
         const distance = Math.hypot(x - at.x, y - at.y);
         if (distance <= best && this.inside(x, y)) [found, best] = [{ x, y }, distance];
@@ -81,13 +81,13 @@ export class Field {
   }
 }
 
-/** The chunks of so many pixels that come within `reach` of a place, along one axis of `size` pixels. */
+/** The chunks of `chunk` pixels that come within `reach` of a point, along one axis of `size` pixels. */
 function* covered(at: number, reach: number, size: number, chunk: number): Generator<number> {
   const first = Math.floor(Math.max(at - reach, 0) / chunk);
   for (let k = first; k * chunk <= Math.min(at + reach, size - 1); k++) yield k;
 }
 
-function place(array: ChunkedArray, x: number, y: number): { row: number; column: number; index: number } {
+function locate(array: ChunkedArray, x: number, y: number): { row: number; column: number; index: number } {
   const [height, width] = array.chunk;
   return {
     row: Math.floor(y / height),

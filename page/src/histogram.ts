@@ -1,31 +1,31 @@
 // The velocity histogram, (y, x, vy, vx), pixel by pixel. A tile holds tens of megabytes once decoded, most of them zeros:
-// it is kept as it is packed, and the pixel asked is cut from it as it is decoded.
+// it is kept compressed, and the requested pixel is cut from it while decoding.
 
 import { fetchFile, Unreadable, type StoredArray } from "./run";
 import { decodePart } from "./zstd";
 
-const MOST_TILES = 64;
+const MAX_TILES = 64;
 
 export class Histogram {
   private readonly stored = new Set<string>();
-  private readonly packed = new Map<string, Promise<Uint8Array>>();
+  private readonly compressed = new Map<string, Promise<Uint8Array>>();
 
   constructor(
     private readonly path: string,
-    private readonly told: StoredArray,
+    private readonly record: StoredArray,
     private readonly bins: number,
   ) {
-    for (let k = 0; k < told.stored.length; k += 2) this.stored.add(`${told.stored[k]}/${told.stored[k + 1]}`);
-    const { codecs } = told.metadata as { codecs: { name: string; configuration?: { endian?: string } }[] };
+    for (let k = 0; k < record.stored.length; k += 2) this.stored.add(`${record.stored[k]}/${record.stored[k + 1]}`);
+    const { codecs } = record.metadata as { codecs: { name: string; configuration?: { endian?: string } }[] };
     const names = codecs.map(({ name }) => name).join();
     if (names !== "bytes,zstd" || codecs[0]!.configuration?.endian !== "little") {
-      throw new Unreadable(`${path} is packed as ${names}, this page reads little-endian bytes packed by zstd`);
+      throw new Unreadable(`${path} is compressed as ${names}, this page reads little-endian bytes compressed by zstd`);
     }
   }
 
-  /** The histogram at a pixel, (vy, vx) flat; null where nothing passed. */
+  /** The histogram at a pixel, (vy, vx) flat; null where no vehicle passed. */
   async at(x: number, y: number): Promise<Int32Array | null> {
-    const [height, width] = this.told.chunk;
+    const [height, width] = this.record.chunk;
     const key = `${Math.floor(y / height)}/${Math.floor(x / width)}`;
     if (!this.stored.has(key)) return null;
     const size = 4 * this.bins ** 2;
@@ -35,12 +35,12 @@ export class Histogram {
   }
 
   private tile(key: string): Promise<Uint8Array> {
-    const known = this.packed.get(key);
+    const known = this.compressed.get(key);
     if (known) return known;
     const asked = fetchFile(`${this.path}/c/${key}/0/0`).then(async (file) => new Uint8Array(await file.arrayBuffer()));
-    this.packed.set(key, asked);
-    asked.catch(() => this.packed.delete(key)); // asked for again the next time
-    if (this.packed.size > MOST_TILES) this.packed.delete(this.packed.keys().next().value!);
+    this.compressed.set(key, asked);
+    asked.catch(() => this.compressed.delete(key)); // requested again the next time
+    if (this.compressed.size > MAX_TILES) this.compressed.delete(this.compressed.keys().next().value!);
     return asked;
   }
 }

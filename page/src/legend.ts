@@ -1,4 +1,4 @@
-// What the colours mean: a wheel of directions or a bar of numbers.
+// The legend: a wheel of directions or a bar of numbers.
 
 import { gradient, paintDirection } from "./colours";
 import { ink, make, surface } from "./dom";
@@ -25,8 +25,8 @@ export function makeLegend(layer: Layer, run: Run, units: Units): Legend {
 function clipped(layer: Layer, end: number, factor: number, unit: string): string {
   const largest = layer.data_max * factor;
   if (!(largest > end * (1 + 1e-6))) return "";
-  const most = `${+largest.toPrecision(3)}${unit && ` ${unit}`}`;
-  return ` Values above ${+end.toPrecision(4)} have the last colour; the maximum is ${most}.`;
+  const maximum = `${+largest.toPrecision(3)}${unit && ` ${unit}`}`;
+  return ` Values above ${+end.toPrecision(4)} have the last colour; the maximum is ${maximum}.`;
 }
 
 function bar(layer: Layer, end: number, unit: string): HTMLElement {
@@ -43,11 +43,11 @@ function bar(layer: Layer, end: number, unit: string): HTMLElement {
   return make("div", { class: "bar" }, strip, make("div", { class: "ticks" }, ...labels), make("p", { class: "unit" }, unit));
 }
 
-/** A ring coloured by direction; it stands as the map does. */
+/** A ring coloured by direction, oriented as the map. */
 function wheel(layer: Layer, run: Run): HTMLElement {
   const { canvas, context } = surface(WHEEL_PX, WHEEL_PX, "Colour wheel: the hue of each direction of travel");
   const scale = canvas.width / WHEEL_PX;
-  const picture = context.createImageData(canvas.width, canvas.width);
+  const image = context.createImageData(canvas.width, canvas.width);
   const centre = canvas.width / 2;
   const [inner, outer] = [26 * scale, 46 * scale];
   for (let y = 0, at = 0; y < canvas.width; y++) {
@@ -55,11 +55,11 @@ function wheel(layer: Layer, run: Run): HTMLElement {
       const [dx, dy] = [x + 0.5 - centre, y + 0.5 - centre];
       const edge = Math.min(Math.hypot(dx, dy) - inner, outer - Math.hypot(dx, dy));
       if (edge <= 0) continue;
-      paintDirection(picture.data, at, Math.atan2(dy, dx));
-      picture.data[at + 3] = 255 * Math.min(edge, 1);
+      paintDirection(image.data, at, Math.atan2(dy, dx));
+      image.data[at + 3] = 255 * Math.min(edge, 1);
     }
   }
-  context.putImageData(picture, 0, 0);
+  context.putImageData(image, 0, 0);
   drawArrows(context);
   context.fillStyle = ink("--ink");
   context.font = "600 13px system-ui, sans-serif";

@@ -1,8 +1,8 @@
-// What a line across a road says: how many crossed it, which way, how fast.
+// The answer of a line across a road: counts, directions, speeds.
 
 import type { Crossing } from "./crossings";
 import { arrow, make, pairs } from "./dom";
-import type { Point } from "./place";
+import type { Point } from "./coordinates";
 import type { Run } from "./run";
 import { percentile, roundUp, ticks, type Units } from "./units";
 
@@ -27,7 +27,7 @@ export function showLine(crossings: Crossing[], [start, end]: [Point, Point], ru
   return card;
 }
 
-/** The way across the line. */
+/** Direction across the line. */
 function across([start, end]: [Point, Point], direction: 1 | -1): number {
   return Math.atan2(direction * (end.x - start.x), -direction * (end.y - start.y));
 }
@@ -52,7 +52,7 @@ function oneWay(
   };
   const rows: [string, Node | string][] = [
     ["Vehicles", count],
-    ["Flow", `${Math.round((360 * part.length) / seconds) * 10} an hour${seconds < 300 ? " (short flight: a hint)" : ""}`],
+    ["Flow", `${Math.round((360 * part.length) / seconds) * 10} an hour${seconds < 300 ? " (short flight: uncertain)" : ""}`],
     ["15th percentile", speed(15)],
     ["Median speed", speed(50)],
     ["85th percentile", speed(85)],
@@ -66,19 +66,19 @@ function bars(speeds: number[], top: number, unit: string): HTMLElement {
   const bins = 20;
   const counts = new Array<number>(bins).fill(0);
   for (const speed of speeds) counts[Math.min(Math.floor((speed / top) * bins), bins - 1)]! += 1;
-  const most = Math.max(...counts, 1);
+  const largest = Math.max(...counts, 1);
   const step = (width - 2 * left) / bins;
   const svg = element("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", class: "bars" });
   svg.setAttribute("aria-label", `Histogram of ${speeds.length} speeds from 0 to ${top} ${unit}`);
   counts.forEach((count, k) => {
-    const tall = ((height - bottom - PLOT.top) * count) / most;
-    const at = { x: left + k * step + 0.5, y: height - bottom - tall, width: step - 1, height: tall };
+    const barHeight = ((height - bottom - PLOT.top) * count) / largest;
+    const at = { x: left + k * step + 0.5, y: height - bottom - barHeight, width: step - 1, height: barHeight };
     svg.append(element("rect", at));
   });
   svg.append(element("line", { x1: left, x2: width - left, y1: height - bottom, y2: height - bottom }));
-  const write = (x: number, y: number, words: string): void => {
+  const write = (x: number, y: number, label: string): void => {
     const text = element("text", { x, y, "text-anchor": "middle" });
-    text.textContent = words;
+    text.textContent = label;
     svg.append(text);
   };
   for (const value of ticks(top)) write(left + ((width - 2 * left) * value) / top, height - bottom + 14, `${value}`);

@@ -47,7 +47,7 @@ class ScaleBar extends L.Control {
   }
 }
 
-/** What all layers of tiles share: tiles of level k are reduced 2^k times, zoom 0 is the map's own pixels. */
+/** Common to all tile layers: tiles of level k are reduced 2^k times, zoom 0 is the map's own pixels. */
 function tiling(run: Run, tile: number): L.GridLayerOptions {
   const halvings = Math.log2(tile & -tile);
   return {
@@ -91,9 +91,9 @@ export class Overlay extends L.GridLayer {
     private readonly field: Field,
     private readonly shown: Layer,
     private readonly colourMax: number,
-    private readonly least: number,
+    private readonly minVehicles: number,
     opacity: number,
-    private readonly failed: (error: unknown) => void,
+    private readonly onError: (error: unknown) => void,
   ) {
     super({ ...tiling(field.run, field.array(shown.arrays[0]!).chunk[0]), opacity, className: "overlay" });
   }
@@ -105,7 +105,7 @@ export class Overlay extends L.GridLayer {
     this.paint(canvas, coords.x, coords.y, -coords.z).then(
       () => done(undefined, canvas),
       (error) => {
-        this.failed(error);
+        this.onError(error);
         done(error, canvas);
       },
     );
@@ -123,7 +123,7 @@ export class Overlay extends L.GridLayer {
         const [row, column] = [y * across + j, x * across + i];
         work.push(
           this.chunks(row, column).then((data) => {
-            if (data) context.putImageData(this.picture(data, canvas.width, level), i * side, j * side);
+            if (data) context.putImageData(this.tileImage(data, canvas.width, level), i * side, j * side);
           }),
         );
       }
@@ -133,32 +133,32 @@ export class Overlay extends L.GridLayer {
 
   private async chunks(row: number, column: number): Promise<(Numbers | null)[] | null> {
     const values = this.shown.arrays.map((name) => this.field.array(name).read(row, column));
-    const count = this.least > 1 ? this.field.array("count").read(row, column) : Promise.resolve(null);
+    const count = this.minVehicles > 1 ? this.field.array("count").read(row, column) : Promise.resolve(null);
     const data = await Promise.all([...values, count]);
     return data.slice(0, -1).every((chunk) => chunk !== null) ? data : null;
   }
 
-  private picture(data: (Numbers | null)[], side: number, level: number): ImageData {
+  private tileImage(data: (Numbers | null)[], side: number, level: number): ImageData {
     const step = 2 ** level;
-    const picture = new ImageData(side / step, side / step);
+    const image = new ImageData(side / step, side / step);
     const paint = painter(this.shown, this.colourMax, this.field.run.stationary_speed_px_per_s);
     const [a, b] = [data[0]!, data.length === 3 ? data[1]! : data[0]!];
     const count = data[data.length - 1];
     for (let j = 0, at = 0; j < side; j += step) {
       for (let i = 0; i < side; i += step, at += 4) {
         const index = this.known(a, count ?? null, j, i, step, side);
-        if (index >= 0) paint(picture.data, at, a[index]!, b[index]!);
+        if (index >= 0) paint(image.data, at, a[index]!, b[index]!);
       }
     }
-    return picture;
+    return image;
   }
 
-  /** The first pixel of a block that is known and that vehicles enough passed: nothing is made up between two. */
+  /** The first known pixel of a block that enough vehicles passed: no interpolation. */
   private known(values: Numbers, count: Numbers | null, y: number, x: number, step: number, side: number): number {
     for (let j = y; j < y + step; j++) {
       for (let i = x; i < x + step; i++) {
         const index = j * side + i;
-        if (Number.isFinite(values[index]!) && (this.least <= 1 || (count && count[index]! >= this.least))) {
+        if (Number.isFinite(values[index]!) && (this.minVehicles <= 1 || (count && count[index]! >= this.minVehicles))) {
           if (values[index] !== 0 || step === 1) return index;
         }
       }

@@ -1,36 +1,36 @@
 // Modes of a pixel's velocity distribution: velfield/field/modes.py in TypeScript, number for number.
 
-const WINDOW_BINS = 2.0;
-const LEAST_WINDOW_BINS = 1.0;
+const BANDWIDTH_BINS = 2.0;
+const MIN_BANDWIDTH_BINS = 1.0;
 const MAX_MODES = 4;
 const ITERATIONS = 60;
-const SETTLED_BINS = 1e-3;
+const CONVERGENCE_BINS = 1e-3;
 const SAME_MODE_BINS = 1.0;
-const MOST_PEAKS = 64;
+const MAX_PEAKS = 64;
 
-/** A mode, in bins from the first bin's centre, and the share of the weight that is nearest to it. */
+/** A mode, in bins from the first bin's centre, and the fraction of the histogram's weight that is nearest to it. */
 export interface Mode {
   x: number;
   y: number;
-  share: number;
+  weight: number;
 }
 
-/** The largest modes, by share; the histogram is (n, n) flat, x fastest. */
+/** The largest modes by weight; the histogram is (n, n) flat, x fastest. */
 export function findModes(h: Int32Array, n: number, tracks: number): Mode[] {
-  const window = Math.max(WINDOW_BINS * Math.max(tracks, 1) ** (-1 / 6), LEAST_WINDOW_BINS);
+  const bandwidth = Math.max(BANDWIDTH_BINS * Math.max(tracks, 1) ** (-1 / 6), MIN_BANDWIDTH_BINS);
   const found: Mode[] = [];
   for (let y = 0; y < n; y++) {
     for (let x = 0; x < n; x++) {
-      if (h[y * n + x]! <= 0 || found.length >= MOST_PEAKS || !isPeak(h, n, y, x)) continue;
-      const mode = climb(h, n, y, x, window);
+      if (h[y * n + x]! <= 0 || found.length >= MAX_PEAKS || !isPeak(h, n, y, x)) continue;
+      const mode = climb(h, n, y, x, bandwidth);
       if (!found.some((other) => (other.x - mode.x) ** 2 + (other.y - mode.y) ** 2 < SAME_MODE_BINS ** 2)) found.push(mode);
     }
   }
-  share(h, n, found);
-  return found.sort((a, b) => b.share - a.share).slice(0, MAX_MODES);
+  assignWeights(h, n, found);
+  return found.sort((a, b) => b.weight - a.weight).slice(0, MAX_MODES);
 }
 
-/** The histogram at a bin under the binomial 3x3 window: a peak over two bins counts as one. */
+/** The histogram at a bin smoothed by a binomial 3x3 kernel: a peak over two bins counts as one. */
 function smoothed(h: Int32Array, n: number, y: number, x: number): number {
   let total = 0;
   for (let j = Math.max(y - 1, 0); j < Math.min(y + 2, n); j++) {
@@ -54,14 +54,14 @@ function isPeak(h: Int32Array, n: number, y: number, x: number): boolean {
   return true;
 }
 
-/** Mean shift to the maximum of the windowed histogram. */
-function climb(h: Int32Array, n: number, y: number, x: number, window: number): Mode {
-  const reach = 3 * window;
+/** Mean shift to the maximum of the smoothed histogram. */
+function climb(h: Int32Array, n: number, y: number, x: number, bandwidth: number): Mode {
+  const reach = 3 * bandwidth;
   const weightX = new Float64Array(n);
   for (let k = 0; k < ITERATIONS; k++) {
     const first = Math.max(0, Math.floor(x - reach + 0.5));
     const last = Math.min(n - 1, Math.floor(x + reach + 0.5));
-    for (let i = first; i <= last; i++) weightX[i] = Math.exp((-0.5 * (i - x) ** 2) / (window * window));
+    for (let i = first; i <= last; i++) weightX[i] = Math.exp((-0.5 * (i - x) ** 2) / (bandwidth * bandwidth));
     let [total, sumY, sumX] = [0, 0, 0];
     const bottom = Math.min(n - 1, Math.floor(y + reach + 0.5));
     for (let j = Math.max(0, Math.floor(y - reach + 0.5)); j <= bottom; j++) {
@@ -72,7 +72,7 @@ function climb(h: Int32Array, n: number, y: number, x: number, window: number): 
         rowX += w * i;
       }
       if (row > 0) {
-        const weightY = Math.exp((-0.5 * (j - y) ** 2) / (window * window));
+        const weightY = Math.exp((-0.5 * (j - y) ** 2) / (bandwidth * bandwidth));
         total += weightY * row;
         sumY += weightY * row * j;
         sumX += weightY * rowX;
@@ -82,27 +82,27 @@ function climb(h: Int32Array, n: number, y: number, x: number, window: number): 
     const [stepY, stepX] = [sumY / total - y, sumX / total - x];
     y += stepY;
     x += stepX;
-    if (Math.abs(stepY) + Math.abs(stepX) < SETTLED_BINS) break;
+    if (Math.abs(stepY) + Math.abs(stepX) < CONVERGENCE_BINS) break;
   }
-  return { x, y, share: 0 };
+  return { x, y, weight: 0 };
 }
 
 /** Each bin's weight goes to the nearest mode. */
-function share(h: Int32Array, n: number, modes: Mode[]): void {
+function assignWeights(h: Int32Array, n: number, modes: Mode[]): void {
   let total = 0;
   for (let y = 0; y < n; y++) {
     for (let x = 0; x < n; x++) {
-      const weight = h[y * n + x]!;
-      if (weight <= 0) continue;
+      const here = h[y * n + x]!;
+      if (here <= 0) continue;
       let nearest = modes[0]!;
-      let least = Infinity;
+      let smallest = Infinity;
       for (const mode of modes) {
         const distance = (mode.y - y) ** 2 + (mode.x - x) ** 2;
-        if (distance < least) [least, nearest] = [distance, mode];
+        if (distance < smallest) [smallest, nearest] = [distance, mode];
       }
-      nearest.share += weight;
-      total += weight;
+      nearest.weight += here;
+      total += here;
     }
   }
-  for (const mode of modes) mode.share /= total;
+  for (const mode of modes) mode.weight /= total;
 }

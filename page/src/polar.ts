@@ -1,7 +1,6 @@
-// The velocity distribution of a pixel as a polar picture: away from the centre is faster, and the way on the picture is
-// the way on the map.
+// The velocity distribution of a pixel as a polar plot: the radius is speed, the angle the direction on the map.
 
-import { paintShare } from "./colours";
+import { paintRamp } from "./colours";
 import { ink, surface } from "./dom";
 import type { Mode } from "./modes";
 import type { Run } from "./run";
@@ -10,10 +9,10 @@ import { ticks, type Units } from "./units";
 const SIDE = 264;
 const MARGIN = 16;
 
-export function polarPicture(h: Int32Array, modes: Mode[], run: Run, units: Units): HTMLCanvasElement {
-  const { canvas, context } = surface(SIDE, SIDE, "Polar picture of the velocity distribution at this pixel");
+export function polarPlot(h: Int32Array, modes: Mode[], run: Run, units: Units): HTMLCanvasElement {
+  const { canvas, context } = surface(SIDE, SIDE, "Polar plot of the velocity distribution at this pixel");
   const centre = (run.bins - 1) / 2;
-  const reach = Math.min(usedReach(h, run.bins) + 1, centre + 0.5);
+  const reach = Math.min(occupiedReach(h, run.bins) + 1, centre + 0.5);
   const radius = SIDE / 2 - MARGIN;
   paintDistribution(context, canvas, h, run.bins, reach);
   const perBin = run.bin_width_px_per_s * units.perPxPerS;
@@ -23,18 +22,18 @@ export function polarPicture(h: Int32Array, modes: Mode[], run: Run, units: Unit
   return canvas;
 }
 
-/** How far from standing the distribution reaches, bins; at least four, so that who stands is seen to stand. */
-function usedReach(h: Int32Array, n: number): number {
-  const most = h.reduce((a, b) => Math.max(a, b), 0);
+/** Radius of the distribution about zero, bins; at least four, so that stationary vehicles are seen to be at rest. */
+function occupiedReach(h: Int32Array, n: number): number {
+  const largest = h.reduce((a, b) => Math.max(a, b), 0);
   const centre = (n - 1) / 2;
   let reach = 4;
   for (let k = 0; k < h.length; k++) {
-    if (h[k]! > 0.02 * most) reach = Math.max(reach, Math.hypot((k % n) - centre, Math.floor(k / n) - centre));
+    if (h[k]! > 0.02 * largest) reach = Math.max(reach, Math.hypot((k % n) - centre, Math.floor(k / n) - centre));
   }
   return reach;
 }
 
-/** Weight by colour and cover, between the bins bilinear, within the outer ring. */
+/** Weight as colour and opacity, bilinear between bins, within the outer ring. */
 function paintDistribution(
   context: CanvasRenderingContext2D,
   canvas: HTMLCanvasElement,
@@ -44,20 +43,20 @@ function paintDistribution(
 ): void {
   const side = canvas.width;
   const radius = (side * (SIDE / 2 - MARGIN)) / SIDE;
-  const picture = context.createImageData(side, side);
-  const most = h.reduce((a, b) => Math.max(a, b), 1);
+  const image = context.createImageData(side, side);
+  const largest = h.reduce((a, b) => Math.max(a, b), 1);
   const centre = (n - 1) / 2;
   for (let j = 0, at = 0; j < side; j++) {
     for (let i = 0; i < side; i++, at += 4) {
       const [dx, dy] = [(i + 0.5 - side / 2) / radius, (j + 0.5 - side / 2) / radius];
       if (dx * dx + dy * dy > 1) continue;
-      const weight = bilinear(h, n, centre + dx * reach, centre + dy * reach) / most;
+      const weight = bilinear(h, n, centre + dx * reach, centre + dy * reach) / largest;
       if (weight < 0.004) continue;
-      paintShare(picture.data, at, Math.sqrt(weight));
-      picture.data[at + 3] = 255 * Math.min(1, 4 * Math.sqrt(weight));
+      paintRamp(image.data, at, Math.sqrt(weight));
+      image.data[at + 3] = 255 * Math.min(1, 4 * Math.sqrt(weight));
     }
   }
-  context.putImageData(picture, 0, 0);
+  context.putImageData(image, 0, 0);
 }
 
 function bilinear(h: Int32Array, n: number, x: number, y: number): number {
@@ -91,8 +90,8 @@ function drawRings(context: CanvasRenderingContext2D, top: number, radius: numbe
   context.textBaseline = "bottom";
   const diagonal = Math.SQRT1_2 * radius;
   rings.forEach((ring, k) => {
-    const place = (ring / top) * diagonal;
-    label(context, k === rings.length - 1 ? `${ring} ${unit}` : `${ring}`, SIDE / 2 + place + 2, SIDE / 2 - place - 1);
+    const offset = (ring / top) * diagonal;
+    label(context, k === rings.length - 1 ? `${ring} ${unit}` : `${ring}`, SIDE / 2 + offset + 2, SIDE / 2 - offset - 1);
   });
 }
 
@@ -109,7 +108,7 @@ function drawNames(context: CanvasRenderingContext2D, run: Run): void {
   }
 }
 
-/** Circles in the order of their share, with their number. */
+/** Circles in the order of their weight, with their number. */
 function drawModes(context: CanvasRenderingContext2D, modes: Mode[], centre: number, scale: number): void {
   context.font = "600 12px system-ui, sans-serif";
   context.textAlign = "left";
@@ -130,7 +129,7 @@ function drawModes(context: CanvasRenderingContext2D, modes: Mode[], centre: num
   });
 }
 
-/** Text with a halo: it stands over colours. */
+/** Text with a halo: for text over colours. */
 function label(context: CanvasRenderingContext2D, text: string, x: number, y: number): void {
   context.lineWidth = 3;
   context.lineJoin = "round";

@@ -37,7 +37,7 @@ export interface Run {
   base: { levels: number; tile: number };
   layers: Layer[];
   arrays: Record<string, StoredArray>;
-  segments: { count: number; tracks: number; settle_px: number; band_radius_px: number };
+  segments: { count: number; tracks: number; hysteresis_px: number; band_radius_px: number };
   /** A note for people where hardly any pixel was passed by several vehicles. */
   low_coverage_note: string;
 }

@@ -1,4 +1,4 @@
-// Vehicles from one frame to the next (view/segments.zarr): who passed near a place.
+// Track segments (view/segments.zarr), and the tracks near a point.
 
 import { readColumn } from "./chunks";
 import type { Run } from "./run";
@@ -29,14 +29,14 @@ export async function loadSegments(run: Run): Promise<Segments> {
   return { count: run.segments.count, track, start_s, ...named };
 }
 
-/** A track near a place: its rows, and the row that comes nearest. */
+/** A track near a point: its rows, and the nearest of them. */
 export interface Near {
   first: number;
   last: number;
   nearest: number;
 }
 
-/** Rows by the cells of a grid that their middle and reach touch. */
+/** Grid index: the segments that touch each cell. */
 export class TrackIndex {
   private readonly columns: number;
   private readonly cells = new Map<number, number[]>();

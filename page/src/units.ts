@@ -1,4 +1,4 @@
-// Numbers as people say them.
+// Numbers and units for people.
 
 import type { Layer, Run } from "./run";
 
@@ -10,23 +10,23 @@ const POINTS = ["N", "NE", "E", "SE", "S", "SW", "W", "NW"];
 export class Units {
   constructor(
     private readonly run: Run,
-    public chosen: SpeedUnit,
+    public speedUnit: SpeedUnit,
   ) {}
 
   /** What speeds are shown in: pixels a second where metres are not known. */
   get speed(): string {
-    return this.run.gsd_m === null ? "px/s" : this.chosen;
+    return this.run.gsd_m === null ? "px/s" : this.speedUnit;
   }
 
   get perPxPerS(): number {
-    return this.run.gsd_m === null ? 1 : this.run.gsd_m * SPEED_UNITS[this.chosen];
+    return this.run.gsd_m === null ? 1 : this.run.gsd_m * SPEED_UNITS[this.speedUnit];
   }
 
   speedText(pxPerS: number, decimals = 1): string {
     return Number.isFinite(pxPerS) ? `${(pxPerS * this.perPxPerS).toFixed(decimals)} ${this.speed}` : "–";
   }
 
-  /** Compass heading, clockwise from north, or from the picture's up where north is not known. */
+  /** Compass heading, clockwise from north, or from the image's up where north is not known. */
   heading(directionRad: number): number {
     const degrees = ((directionRad - (this.run.north_rad ?? -Math.PI / 2)) * 180) / Math.PI;
     return ((degrees % 360) + 360) % 360;
@@ -38,17 +38,17 @@ export class Units {
     return this.headingDegrees(directionRad) + this.headingPoint(directionRad);
   }
 
-  /** "92°", where what it is counted from stands beside it. */
+  /** "92°", without the reference direction. */
   headingDegrees(directionRad: number): string {
     return `${Math.round(this.heading(directionRad)) % 360}°`;
   }
 
-  /** " E", or " from up": what stands after the degrees. */
+  /** " E", or " from up": the compass point or the reference direction, after the degrees. */
   headingPoint(directionRad: number): string {
     return this.run.north_rad === null ? " from up" : ` ${POINTS[Math.round(this.heading(directionRad) / 45) % 8]}`;
   }
 
-  /** A column of headings: its title, and what is in it. */
+  /** A column of headings: title and cell text. */
   get headingColumn(): { title: string; text: (directionRad: number) => string } {
     return this.run.north_rad === null
       ? { title: "From up", text: (direction) => this.headingDegrees(direction) }
@@ -76,7 +76,7 @@ export class Units {
   }
 }
 
-/** The least of 1, 1.2, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten that is not below: as `round_up` of the figures. */
+/** The smallest of 1, 1.2, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten that is not below: as `round_up` of the figures. */
 export function roundUp(value: number): number {
   const power = 10 ** Math.floor(Math.log10(value));
   return [1, 1.2, 1.5, 2, 3, 4, 5, 6, 8, 10].map((step) => step * power).find((step) => step >= value * (1 - 1e-9))!;

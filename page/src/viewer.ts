@@ -1,4 +1,4 @@
-// The page of a run: the map with what can be asked of it, and the summary.
+// The page of a run: the map with its queries, and the summary.
 
 import "leaflet/dist/leaflet.css";
 import "./viewer.css";
@@ -10,8 +10,8 @@ import { Field } from "./field";
 import { makeLegend } from "./legend";
 import { showLine } from "./line";
 import { makeMap, Overlay } from "./map";
-import { askPixel, showTracks, showPixel } from "./pixel";
-import { toLatLng, toPoint, type Point } from "./place";
+import { queryPixel, showTracks, showPixel } from "./pixel";
+import { toLatLng, toPoint, type Point } from "./coordinates";
 import { loadRun, type Layer, type Run } from "./run";
 import { readState, writeState, type State } from "./state";
 import { listenToTabs, showTab } from "./tabs";
@@ -19,8 +19,8 @@ import { loadSegments, TrackIndex } from "./tracks";
 import { Units } from "./units";
 
 const TRACK_REACH_PX = 6; // screen pixels around the cursor
-const POINT_REACH_PX = 8; // screen pixels: a finger or a mouse that is so near a lane means the lane
-const REST_MS = 60; // who rests on a road is about to click it: its tile is fetched already
+const POINT_REACH_PX = 8; // screen pixels: a click this near a lane selects the lane
+const REST_MS = 60; // a resting mouse is about to click: the pixel's tile is prefetched
 
 class Viewer {
   private state: State = readState(location.hash);
@@ -47,7 +47,7 @@ class Viewer {
     this.restore();
   }
 
-  // -- what is shown ---------------------------------------------------------------------------------------------------
+  // -- the view ---------------------------------------------------------------------------------------------------------
 
   private get layer(): Layer {
     return this.run.layers.find((layer) => layer.name === this.state.layer) ?? this.run.layers[0]!;
@@ -63,8 +63,8 @@ class Viewer {
     const legend = makeLegend(layer, this.run, this.units);
     find("legend").replaceChildren(legend.element);
     this.overlay?.remove();
-    const { least, opacity } = this.state;
-    this.overlay = new Overlay(this.field, layer, legend.colourMax, least, opacity / 100, (error) => this.fail(error));
+    const { minVehicles, opacity } = this.state;
+    this.overlay = new Overlay(this.field, layer, legend.colourMax, minVehicles, opacity / 100, (error) => this.fail(error));
     this.overlay.addTo(this.map);
   }
 
@@ -82,11 +82,11 @@ class Viewer {
   }
 
   private answer(...elements: HTMLElement[]): void {
-    const place = find("answer");
-    place.replaceChildren(...elements);
-    // On a small screen the answer stands below the controls: bring it into sight.
+    const panel = find("answer");
+    panel.replaceChildren(...elements);
+    // On a small screen the answer is below the controls: scroll to it.
     const side = find("side");
-    if (place.offsetTop + 120 > side.scrollTop + side.clientHeight) side.scrollTop = place.offsetTop - side.offsetTop;
+    if (panel.offsetTop + 120 > side.scrollTop + side.clientHeight) side.scrollTop = panel.offsetTop - side.offsetTop;
   }
 
   private fail(error: unknown): void {
@@ -94,30 +94,30 @@ class Viewer {
     this.answer(make("p", { class: "alarm" }, error instanceof Error ? error.message : String(error)));
   }
 
-  // -- what is asked ---------------------------------------------------------------------------------------------------
+  // -- queries ----------------------------------------------------------------------------------------------------------
 
-  /** `away`: how far from the place that was pointed at, base pixels. */
-  private ask(place: Point, away = 0, started = performance.now()): void {
-    if (!this.field.inside(place.x, place.y)) return;
-    this.set({ pixel: place, line: null });
-    this.drawings.showPixel(place);
+  /** `away`: distance from the point that was clicked, base pixels. */
+  private ask(point: Point, away = 0, started = performance.now()): void {
+    if (!this.field.inside(point.x, point.y)) return;
+    this.set({ pixel: point, line: null });
+    this.drawings.showPixel(point);
     this.drawings.showLine(null, () => undefined);
     const asked = ++this.asked;
-    askPixel(this.field, place)
+    queryPixel(this.field, point)
       .then((answer) => {
-        if (asked !== this.asked) return; // another pixel was asked since
+        if (asked !== this.asked) return; // another pixel was queried since
         this.answer(showPixel(answer, this.field, this.units, away));
         find("answer").dataset.milliseconds = (performance.now() - started).toFixed(1);
-        if (answer.n) this.addTracks(place, asked);
+        if (answer.n) this.addTracks(point, asked);
       })
       .catch((error) => this.fail(error));
   }
 
-  private addTracks(place: Point, asked: number): void {
+  private addTracks(point: Point, asked: number): void {
     this.tracks()
       .then((index) => {
         if (asked !== this.asked) return;
-        const near = index.near(place.x, place.y, this.run.segments.band_radius_px);
+        const near = index.near(point.x, point.y, this.run.segments.band_radius_px);
         find("answer").firstElementChild?.append(showTracks(near, index, this.units));
         if (this.state.tracks) this.drawings.showTracks(near, index);
       })
@@ -132,7 +132,7 @@ class Viewer {
     this.tracks()
       .then(({ segments }) => {
         if (asked !== this.asked) return;
-        const crossings = lineCrossings(segments, ends[0], ends[1], this.run.segments.settle_px);
+        const crossings = lineCrossings(segments, ends[0], ends[1], this.run.segments.hysteresis_px);
         this.answer(showLine(crossings, ends, this.run, this.units));
       })
       .catch((error) => this.fail(error));
@@ -143,35 +143,35 @@ class Viewer {
     return this.index;
   }
 
-  /** A click, a tap, or Enter at the map's centre: an end of the line being drawn, else a question. */
-  private point(place: Point): void {
+  /** A click, a tap, or Enter at the map's centre: an end of the line being drawn, else a query of the pixel. */
+  private clickAt(point: Point): void {
     if (this.drawing === null) {
-      this.askNear(place);
+      this.askNear(point);
       return;
     }
-    this.drawing.push(place);
+    this.drawing.push(point);
     this.drawings.showLine(this.drawing, () => undefined);
     if (this.drawing.length === 2) {
       const ends = this.drawing as [Point, Point];
       this.draw(false);
       this.measure(ends);
-    } else this.tell("Now the other side of the road.");
+    } else this.showHint("Now the other side of the road.");
   }
 
-  private askNear(place: Point): void {
+  private askNear(point: Point): void {
     const [asked, started] = [++this.asked, performance.now()];
-    this.meant(place)
-      .then((meant) => {
-        if (asked !== this.asked) return; // another place was pointed at since
-        const own = meant.x === Math.round(place.x) && meant.y === Math.round(place.y);
-        this.ask(meant, own ? 0 : Math.hypot(meant.x - place.x, meant.y - place.y), started);
+    this.selectPixel(point)
+      .then((pixel) => {
+        if (asked !== this.asked) return; // another point was clicked since
+        const own = pixel.x === Math.round(point.x) && pixel.y === Math.round(point.y);
+        this.ask(pixel, own ? 0 : Math.hypot(pixel.x - point.x, pixel.y - point.y), started);
       })
       .catch((error) => this.fail(error));
   }
 
-  /** The pixel that a place means: the whole map on a small screen has six pixels under each of the screen's. */
-  private meant(place: Point): Promise<Point> {
-    return this.field.nearest(place, this.reach(POINT_REACH_PX), this.state.least);
+  /** The pixel that a point selects: on a small screen the whole map has six pixels under each of the screen's. */
+  private selectPixel(point: Point): Promise<Point> {
+    return this.field.nearest(point, this.reach(POINT_REACH_PX), this.state.minVehicles);
   }
 
   /** Screen pixels as base pixels. */
@@ -183,27 +183,27 @@ class Viewer {
     this.drawing = on ? [] : null;
     find("draw-line").setAttribute("aria-pressed", String(on));
     this.map.getContainer().classList.toggle("drawing", on);
-    this.tell(on ? "Click on one side of the road, then on the other. Keyboard: Enter marks the map's centre." : "");
+    this.showHint(on ? "Click on one side of the road, then on the other. Keyboard: Enter marks the map's centre." : "");
   }
 
-  private tell(text: string): void {
+  private showHint(text: string): void {
     find("hint").textContent = text;
   }
 
   // -- the mouse over the map ------------------------------------------------------------------------------------------
 
-  private hover(place: Point): void {
-    this.hovered = place;
-    if (!this.field.inside(Math.round(place.x), Math.round(place.y))) {
+  private hover(point: Point): void {
+    this.hovered = point;
+    if (!this.field.inside(Math.round(point.x), Math.round(point.y))) {
       find("readout").textContent = "";
       return;
     }
-    const read = (meant: Point): void => (this.hovered === place ? this.read(meant, place) : undefined);
-    this.meant(place).then(read, (error) => this.fail(error));
-    if (this.state.tracks) void this.hoverTracks(place);
+    const read = (pixel: Point): void => (this.hovered === point ? this.read(pixel, point) : undefined);
+    this.selectPixel(point).then(read, (error) => this.fail(error));
+    if (this.state.tracks) void this.hoverTracks(point);
   }
 
-  /** What a click would show, in a line. */
+  /** The pixel's answer in one line. */
   private read({ x, y }: Point, hovered: Point): void {
     const readout = find("readout");
     const value = (name: string): number | undefined => this.field.peek(name, x, y);
@@ -217,11 +217,11 @@ class Viewer {
     } else if (!n) readout.textContent = `${where} no vehicle`;
     else {
       const speed = Math.hypot(vx, vy);
-      const way = speed > this.run.stationary_speed_px_per_s ? this.units.headingText(Math.atan2(vy, vx)) : "stands";
-      readout.textContent = `${where} ${way} · ${this.units.speedText(speed)} · ${n} ${n === 1 ? "vehicle" : "vehicles"}`;
+      const heading = speed > this.run.stationary_speed_px_per_s ? this.units.headingText(Math.atan2(vy, vx)) : "stationary";
+      readout.textContent = `${where} ${heading} · ${this.units.speedText(speed)} · ${n} ${n === 1 ? "vehicle" : "vehicles"}`;
     }
     clearTimeout(this.resting);
-    if (n) this.resting = window.setTimeout(() => void askPixel(this.field, { x, y }).catch(() => undefined), REST_MS);
+    if (n) this.resting = window.setTimeout(() => void queryPixel(this.field, { x, y }).catch(() => undefined), REST_MS);
   }
 
   private async hoverTracks({ x, y }: Point): Promise<void> {
@@ -246,7 +246,7 @@ class Viewer {
     }
     find("coverage-note").textContent = this.run.low_coverage_note;
     find<HTMLInputElement>("opacity").value = String(this.state.opacity);
-    find<HTMLInputElement>("least").value = String(this.state.least);
+    find<HTMLInputElement>("min-vehicles").value = String(this.state.minVehicles);
     find<HTMLInputElement>("tracks").checked = this.state.tracks;
   }
 
@@ -264,10 +264,10 @@ class Viewer {
       this.set({ opacity: Number(value) });
       this.overlay?.setOpacity(Number(value) / 100);
     });
-    on("least", "change", (element) => {
-      const least = Math.max(1, Math.round(Number(element.value)) || 1);
-      element.value = String(least);
-      this.set({ least });
+    on("min-vehicles", "change", (element) => {
+      const minVehicles = Math.max(1, Math.round(Number(element.value)) || 1);
+      element.value = String(minVehicles);
+      this.set({ minVehicles });
       this.showLayer();
     });
     on("tracks", "change", ({ checked }) => {
@@ -282,7 +282,7 @@ class Viewer {
   }
 
   private listenToMap(): void {
-    this.map.on("click", (event) => this.point(toPoint(event.latlng)));
+    this.map.on("click", (event) => this.clickAt(toPoint(event.latlng)));
     this.map.on("mousemove", (event) => this.hover(toPoint(event.latlng)));
     this.map.on("mouseout", () => this.hover({ x: -1, y: -1 }));
     this.map.on("moveend", () => {
@@ -293,8 +293,8 @@ class Viewer {
     container.addEventListener("pointerdown", () => container.classList.remove("by-keyboard"));
     container.addEventListener("keydown", (event) => {
       if (event.target !== container) return;
-      container.classList.add("by-keyboard"); // shows the centre, where Enter asks
-      if (event.key === "Enter" || event.key === " ") this.point(toPoint(this.map.getCenter()));
+      container.classList.add("by-keyboard"); // shows the centre, which Enter queries
+      if (event.key === "Enter" || event.key === " ") this.clickAt(toPoint(this.map.getCenter()));
       else if (event.key === "l") this.draw(this.drawing === null);
       else if (event.key === "Escape") this.draw(false);
       else return;
@@ -304,7 +304,7 @@ class Viewer {
 
   private changeUnit(unit: State["unit"]): void {
     this.set({ unit });
-    this.units.chosen = unit;
+    this.units.speedUnit = unit;
     this.showLayer();
     this.restore();
   }
@@ -312,9 +312,9 @@ class Viewer {
   private async copyLink(): Promise<void> {
     try {
       await navigator.clipboard.writeText(location.href);
-      this.tell("The link is in the clipboard.");
+      this.showHint("Link copied.");
     } catch {
-      this.tell("This browser keeps the clipboard closed here: copy the page's address, it holds the view.");
+      this.showHint("No access to the clipboard: copy the page's address instead.");
     }
   }
 
@@ -323,7 +323,7 @@ class Viewer {
   }
 }
 
-/** Why the map cannot be shown, in its place; the summary needs no server. */
+/** Why the map cannot be shown, in its point; the summary needs no server. */
 function explain(text: string): void {
   find("map").replaceChildren(make("p", { class: "alarm", role: "alert" }, text));
   find("side").hidden = true;

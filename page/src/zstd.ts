@@ -6,7 +6,7 @@ import { Unreadable } from "./run";
 
 const decoder = new ZSTDDecoder();
 const DAMAGED = "a chunk is damaged: its checksum is wrong";
-const MOST_EMPTY = 8; // pieces without a byte: the decoder stands still
+const MAX_EMPTY = 8; // empty pieces in a row: the decoder makes no progress
 
 /** A codec as zarrita wants it. */
 export class Zstd {
@@ -32,17 +32,17 @@ export class Zstd {
   }
 }
 
-/** Bytes [from, to) of what is packed; the whole is decoded, for its checksum, but never held. */
-export async function decodePart(packed: Uint8Array, from: number, to: number): Promise<Uint8Array> {
+/** Bytes [from, to) of compressed data; all of it is decoded, for its checksum, but never held at once. */
+export async function decodePart(compressed: Uint8Array, from: number, to: number): Promise<Uint8Array> {
   await decoder.init();
   const part = new Uint8Array(to - from);
   let [at, empty] = [0, 0];
-  for (const piece of decoder.decodeStreaming([packed])) {
+  for (const piece of decoder.decodeStreaming([compressed])) {
     const [first, last] = [Math.max(from, at), Math.min(to, at + piece.length)];
     if (first < last) part.set(piece.subarray(first - at, last - at), first - from);
     at += piece.length;
     empty = piece.length ? 0 : empty + 1;
-    if (empty > MOST_EMPTY) throw new Unreadable(DAMAGED);
+    if (empty > MAX_EMPTY) throw new Unreadable(DAMAGED);
   }
   if (at < to) throw new Unreadable(DAMAGED);
   return part;

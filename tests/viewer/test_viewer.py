@@ -1,4 +1,4 @@
-"""The page of a run in a real browser, from a plain static server: what it shows is what Python says."""
+"""The page of a run in a real browser, from a plain static server: it shows the values that Python gives."""
 
 import json
 import re
@@ -49,7 +49,7 @@ def run(whole: tuple[Path, RunSummary]) -> Run:
     return open_run(whole[0])
 
 
-def told(page: Page, name: str) -> Any:
+def shown_value(page: Page, name: str) -> Any:
     """The number behind a cell of the answer."""
     return json.loads(page.value(f"document.querySelector('#answer [data-name={name}]').dataset.value"))
 
@@ -69,25 +69,25 @@ def click_pixel(page: Page, x: float, y: float) -> None:
 ANSWERED = "document.querySelector('#answer [data-name=n]') !== null"
 
 
-def test_a_click_shows_what_python_says(page: Page, address: str, run: Run) -> None:
+def test_a_click_shows_the_values_of_python(page: Page, address: str, run: Run) -> None:
     x, y = busiest(run)
     page.open(f"{address}#view={x},{y},3")
     page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
     click_pixel(page, x, y)
     here = run.field.at(x, y)
-    assert told(page, "n") == here.n
+    assert shown_value(page, "n") == here.n
     vx, vy = here.modal_velocity_px_per_s
-    assert told(page, "direction") == pytest.approx(np.arctan2(vy, vx), abs=1e-5)
-    assert told(page, "modal_speed") == pytest.approx(np.hypot(vx, vy), rel=1e-5)
-    assert told(page, "stationary_fraction") == pytest.approx(here.stationary_fraction, abs=1e-6)
+    assert shown_value(page, "direction") == pytest.approx(np.arctan2(vy, vx), abs=1e-5)
+    assert shown_value(page, "modal_speed") == pytest.approx(np.hypot(vx, vy), rel=1e-5)
+    assert shown_value(page, "stationary_fraction") == pytest.approx(here.stationary_fraction, abs=1e-6)
     for percent, speed in here.percentiles_px_per_s.items():
-        assert told(page, f"speed_p{percent}") == pytest.approx(speed, rel=1e-5)
+        assert shown_value(page, f"speed_p{percent}") == pytest.approx(speed, rel=1e-5)
         shown = page.value(f"document.querySelector('#answer [data-name=speed_p{percent}]').textContent")
         assert shown == f"{speed * 0.23 * 3.6:.1f} km/h"
     assert page.value("document.querySelector('#answer canvas').getContext('2d') !== null")
     assert page.value("document.querySelectorAll('#answer [data-name^=mode_]').length") == len(here.modes)
     for k, mode in enumerate(here.modes):
-        np.testing.assert_allclose(told(page, f"mode_{k}"), mode, rtol=1e-4, atol=0.02)
+        np.testing.assert_allclose(shown_value(page, f"mode_{k}"), mode, rtol=1e-4, atol=0.02)
 
 
 @pytest.fixture
@@ -124,12 +124,12 @@ def test_a_tap_beside_a_lane_means_the_lane_where_a_screen_pixel_is_many(page: P
     page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
     page.click(*page.value(MIDDLE_OF_MAP))
     page.wait(ANSWERED)
-    away = told(page, "away")
+    away = shown_value(page, "away")
     pixel = [int(part) for part in page.value("new URLSearchParams(location.hash.slice(1)).get('pixel')").split(",")]
     assert page.value("document.querySelector('#answer h2').textContent") == f"Pixel ({pixel[0]}, {pixel[1]})"
     assert away == pytest.approx(np.hypot(pixel[0] - x, pixel[1] - y), abs=1.0)
     assert 2 < away <= 4
-    assert told(page, "n") == run.field.at(*pixel).n > 0
+    assert shown_value(page, "n") == run.field.at(*pixel).n > 0
     assert "m away" in page.value("document.querySelector('#answer').textContent")
 
 
@@ -138,10 +138,10 @@ def test_where_a_map_pixel_is_wider_than_a_finger_the_click_means_itself(page: P
     page.open(f"{address}#view={x},{y},3")
     page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
     click_pixel(page, x, y)
-    assert told(page, "n") == 0
+    assert shown_value(page, "n") == 0
 
 
-def test_degrees_say_what_they_are_counted_from(chromium: Browser, address: str, north_up: str, run: Run) -> None:
+def test_degrees_name_their_reference_direction(chromium: Browser, address: str, north_up: str, run: Run) -> None:
     goes = np.where(np.isfinite(run.field.modal_direction_rad()), run.field.count(), 0)
     y, x = (int(k) for k in np.unravel_index(int(goes.argmax()), goes.shape))
     vx, vy = run.field.at(x, y).modal_velocity_px_per_s
@@ -179,7 +179,7 @@ def test_the_labels_of_a_histogram_do_not_touch(page: Page, address: str, run: R
             assert right < other[0] or other[1] < left or bottom < other[2] + 2 or other[3] < top + 2
 
 
-def test_the_page_colours_speeds_as_the_figure_does_and_says_what_is_cut_off(
+def test_the_page_colours_speeds_as_the_figure_does_and_notes_what_is_cut_off(
     page: Page, address: str, whole: tuple[Path, RunSummary]
 ) -> None:
     store = open_field(RunLayout(whole[0]).field)
@@ -193,8 +193,9 @@ def test_the_page_colours_speeds_as_the_figure_does_and_says_what_is_cut_off(
         page.value(f"layer.value = '{layer}'; layer.dispatchEvent(new Event('change'))")
         top = float(page.value("[...document.querySelectorAll('#legend .ticks span')].at(-1).textContent"))
         assert top == round_up(reach)
-        said = page.value("document.getElementById('legend').textContent")
-        cut_off.append(f"Above {top:g} all has the last colour; the highest is {np.nanmax(values):.3g} km/h" in said)
+        legend = page.value("document.getElementById('legend').textContent")
+        note = f"Values above {top:g} have the last colour; the maximum is {np.nanmax(values):.3g} km/h"
+        cut_off.append(note in legend)
         assert cut_off[-1] == bool(np.nanmax(values) > top)
     assert cut_off[-1], "the test needs a layer that is cut off"
 
@@ -211,8 +212,8 @@ def test_clicks_all_over_the_map_agree_and_are_quick(
         page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
         click_pixel(page, x, y)
         here = run.field.at(x, y)
-        assert told(page, "n") == here.n
-        assert told(page, "speed_p85") == pytest.approx(here.percentiles_px_per_s[85], rel=1e-5)
+        assert shown_value(page, "n") == here.n
+        assert shown_value(page, "speed_p85") == pytest.approx(here.percentiles_px_per_s[85], rel=1e-5)
         assert page.value("document.querySelectorAll('#answer [data-name^=mode_]').length") == len(here.modes)
         taken.append(float(page.value("document.getElementById('answer').dataset.milliseconds")))
     record_property("median_click_ms", median(taken))
@@ -233,10 +234,10 @@ def test_the_line_counts_as_python_does(page: Page, address: str, run: Run) -> N
         crossed += len(crossings)
         for name, direction in (("forward", 1), ("back", -1)):
             part = crossings[crossings["direction"] == direction]
-            assert told(page, f"{name}_count") == len(part)
+            assert shown_value(page, f"{name}_count") == len(part)
             if len(part):
                 speeds = np.percentile(part["speed_px_per_s"], (15, 50, 85))
-                found = [told(page, f"{name}_p{percent}") for percent in (15, 50, 85)]
+                found = [shown_value(page, f"{name}_p{percent}") for percent in (15, 50, 85)]
                 np.testing.assert_allclose(found, speeds, rtol=1e-4)
     assert crossed > 3
 
@@ -258,12 +259,13 @@ def test_a_line_is_drawn_by_two_clicks_and_by_the_keyboard(page: Page, address: 
 
 def test_a_link_holds_the_view(page: Page, address: str, run: Run) -> None:
     x, y = busiest(run)
-    page.open(f"{address}#layer=speed_p85&unit=mph&opacity=40&least=2&view={x},{y},1&pixel={x},{y}")
+    page.open(f"{address}#layer=speed_p85&unit=mph&opacity=40&min_vehicles=2&view={x},{y},1&pixel={x},{y}")
     page.wait(ANSWERED)
     shown = {
-        name: page.value(f"document.getElementById('{name}').value") for name in ("layer", "unit", "opacity", "least")
+        name: page.value(f"document.getElementById('{name}').value")
+        for name in ("layer", "unit", "opacity", "min-vehicles")
     }
-    assert shown == {"layer": "speed_p85", "unit": "mph", "opacity": "40", "least": "2"}
+    assert shown == {"layer": "speed_p85", "unit": "mph", "opacity": "40", "min-vehicles": "2"}
     speed = run.field.at(x, y).percentiles_px_per_s[85] * 0.23 * 2.2369362920544
     assert page.value("document.querySelector('#answer [data-name=speed_p85]').textContent") == f"{speed:.1f} mph"
     page.value("document.getElementById('layer').value = 'count'; layer.dispatchEvent(new Event('change'))")
@@ -318,7 +320,7 @@ def test_the_summary_is_the_report(page: Page, address: str) -> None:
     page.wait("[...document.querySelectorAll('figure img')][0].naturalWidth > 300")
 
 
-def test_a_short_clip_says_that_few_vehicles_passed_a_pixel(page: Page, address: str, run: Run) -> None:
+def test_a_short_clip_is_marked_as_of_few_vehicles_a_pixel(page: Page, address: str, run: Run) -> None:
     count = run.field.count()
     known, well = int((count > 0).sum()), int((count >= 5).sum())
     assert well < known / 20, "the test needs a short clip"
@@ -368,7 +370,7 @@ def test_a_small_screen_shows_it_without_scrolling_sideways(
             assert small.value("map.getBoundingClientRect().height") > 300
 
 
-def test_opened_from_the_disk_it_says_what_to_do(chromium: Browser, whole: tuple[Path, RunSummary]) -> None:
+def test_opened_from_the_disk_it_names_the_command(chromium: Browser, whole: tuple[Path, RunSummary]) -> None:
     with chromium.page() as opened:
         opened.open((whole[0] / "index.html").as_uri())
         opened.wait("document.querySelector('#map .alarm') !== null")

@@ -223,7 +223,7 @@ def test_only_the_page_it_served_may_write(tmp_path: Path) -> None:
         assert client.status("/labels", "POST", {}, body) == 403
         assert client.status("/labels", "POST", {"X-Token": "guess"}, body) == 403
         assert not path.exists()
-        found = re.search(r'id="told">(.*?)</script>', client.ask("/")[1])
+        found = re.search(r'id="server-data">(.*?)</script>', client.ask("/")[1])
         assert found is not None
         token = {"X-Token": json.loads(found.group(1))["token"]}
         assert client.status("/labels", "POST", {**token, "Host": "elsewhere.example"}, body) == 400

@@ -45,7 +45,7 @@ def render_viewer(report: Report, figures: Sequence[ReportFigure]) -> str:
 
 def render_annotator(title: str, content: Mapping[str, object]) -> str:
     """The page for labelling cars; ``content`` is its server's data."""
-    return _page("annotate", {"title": escape(title), "told": _json(content)})
+    return _page("annotate", {"title": escape(title), "data": _json(content)})
 
 
 def _page(name: str, parts: Mapping[str, str]) -> str:

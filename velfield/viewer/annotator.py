@@ -42,7 +42,7 @@ def annotate_app(frames: Frames, labels: Path) -> "Starlette":
     token = secrets.token_urlsafe(24)
 
     def page(_: Request) -> HTMLResponse:
-        html = render_annotator(f"Cars of {_named(frames)}", _page_content(frames, labels, token))
+        html = render_annotator(f"Cars of {_describe(frames)}", _page_content(frames, labels, token))
         return HTMLResponse(html, headers=headers_for(html))
 
     def image(request: Request) -> Response:
@@ -73,7 +73,7 @@ def annotate_app(frames: Frames, labels: Path) -> "Starlette":
     return Starlette(routes=routes, middleware=[trusted_host_middleware()])
 
 
-def _named(frames: Frames) -> str:
+def _describe(frames: Frames) -> str:
     return frames.names[0] if len(frames.names) == 1 else f"{len(frames.names)} frames"
 
 

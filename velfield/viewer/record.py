@@ -102,7 +102,7 @@ def view_record(
         segments=ViewSegments(
             count=len(segments),
             tracks=len(np.unique(segments["track"])),
-            settle_px=hysteresis_px(grid.gsd_m),
+            hysteresis_px=hysteresis_px(grid.gsd_m),
             band_radius_px=band_radius_px(flight.config.field, grid.gsd_m) or _LINE_RADIUS_PX,
         ),
         low_coverage_note=low_coverage_note(int((count > 0).sum()), int((count >= 5).sum())),
