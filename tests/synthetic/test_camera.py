@@ -1,4 +1,4 @@
-"""The simulated camera: exact both ways, each effect by itself, and true to what is rendered."""
+"""The simulated camera: exact in both directions, each effect alone, and consistent with rendered frames."""
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from velfield.synthetic import homography_only, lens_and_wobble, lens_only, simu
 from velfield.synthetic.cases import FLAT, PINHOLE
 
 EMPTY = TrafficSimulation(flow_veh_per_h=0, warm_up_s=0)
-QUIET = OtherSensorSimulation(same_sensor=True, noise_grey=0)
+SAME_SENSOR = OtherSensorSimulation(same_sensor=True, noise_grey=0)
 
 
 def raw_points(config: SimulationConfig, n: int = 400, seed: int = 0) -> FloatArray:
@@ -27,7 +27,7 @@ def raw_points(config: SimulationConfig, n: int = 400, seed: int = 0) -> FloatAr
 
 
 @pytest.mark.parametrize("case", [homography_only, lens_only, lens_and_wobble, vibration_and_drift])
-def test_to_raw_undoes_to_base(case) -> None:  # type: ignore[no-untyped-def]
+def test_to_raw_inverts_to_base(case) -> None:  # type: ignore[no-untyped-def]
     flight = simulate(case(width=640, height=480, frames=4))
     xy = raw_points(flight.config)
     for frame in range(4):
@@ -38,7 +38,7 @@ def test_to_raw_undoes_to_base(case) -> None:  # type: ignore[no-untyped-def]
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10_000), a=st.floats(-0.3, 0.4), wobble=st.floats(0, 4), tilt=st.floats(0, 4))
-def test_to_raw_undoes_to_base_for_any_camera(seed: int, a: float, wobble: float, tilt: float) -> None:
+def test_to_raw_inverts_to_base_for_any_camera(seed: int, a: float, wobble: float, tilt: float) -> None:
     camera = CameraSimulation(lens_a=a, vibration_px=wobble, vibration_cycles=6.0, tilt_deg=tilt)
     flight = small_flight(frames=2, width=320, height=240, seed=seed, camera=camera)
     xy = raw_points(flight.config, 50, seed)
@@ -54,10 +54,10 @@ def test_without_lens_shutter_and_relief_the_map_is_a_homography() -> None:
     assert np.abs(back - base).max() < 1e-4
 
 
-def test_wobble_moves_rows_by_its_amplitude_as_often_as_it_says() -> None:
+def test_wobble_moves_rows_by_its_amplitude_and_cycles() -> None:
     camera = PINHOLE.model_copy(update={"vibration_px": 4.0, "vibration_cycles": 6.0, "readout_s": 0.1})
-    still = PINHOLE.model_copy(update={"readout_s": 0.1})
-    shaken, quiet = (small_flight(frames=2, camera=c, scene=FLAT).camera for c in (camera, still))
+    steady = PINHOLE.model_copy(update={"readout_s": 0.1})
+    shaken, quiet = (small_flight(frames=2, camera=c, scene=FLAT).camera for c in (camera, steady))
     rows = np.arange(480.0)
     shift = (shaken.row_table(1, rows) - quiet.row_table(1, rows))[:, 12]
     assert np.abs(shift).max() == pytest.approx(4.0, abs=0.01)
@@ -67,7 +67,7 @@ def test_wobble_moves_rows_by_its_amplitude_as_often_as_it_says() -> None:
     assert np.ptp(moved) == pytest.approx(8.0, abs=0.7)
 
 
-def test_shake_stays_within_its_band() -> None:
+def test_vibration_is_within_its_band() -> None:
     camera = small_flight(frames=2, camera=CameraSimulation(vibration_px=2.0)).camera
     hz = camera.shake.omega_rad_per_s / (2 * np.pi)
     assert hz.min() >= 14
@@ -75,7 +75,7 @@ def test_shake_stays_within_its_band() -> None:
     assert np.abs(camera.shake(np.linspace(0, 60, 20_000))).max() <= 2.0
 
 
-def test_relief_shifts_points_away_from_the_middle() -> None:
+def test_relief_shifts_points_away_from_the_nadir() -> None:
     flat, hilly = (
         small_flight(frames=1, camera=PINHOLE, scene=FLAT.model_copy(update={"relief_m": h})) for h in (0.0, 2.0)
     )
@@ -92,14 +92,14 @@ def test_relief_shifts_points_away_from_the_middle() -> None:
         (CameraSimulation(lens_a=0.2, vibration_px=4.0, vibration_cycles=6.0), 0.1),
         (CameraSimulation(lens_a=0.15, vibration_px=2.0), 0.1),
     ],
-    ids=["pin-hole", "lens and wobble", "lens and shake"],
+    ids=["pinhole", "lens and wobble", "lens and vibration"],
 )
-def test_features_land_where_the_truth_says(camera: CameraSimulation, limit_px: float) -> None:
+def test_rendered_features_are_where_the_truth_has_them(camera: CameraSimulation, limit_px: float) -> None:
     quiet = camera.model_copy(
         update={"noise_grey": 0.0, "vignetting": 0.0, "exposure_share": 0.0, "motion_blur_px": 0.0}
     )
     scene = SceneSimulation(building_height_m=0, tree_height_m=0, parked_share=0, sun_length=0)
-    base = QUIET.model_copy(update={"blur_px": camera.optics_blur_px})
+    base = SAME_SENSOR.model_copy(update={"blur_px": camera.optics_blur_px})
     flight = small_flight(frames=3, camera=quiet, scene=scene, base=base, traffic=EMPTY)
     frame = flight.frame(2).astype(np.float32)
     y, x = np.mgrid[0:480, 0:640]
@@ -118,14 +118,14 @@ def test_features_land_where_the_truth_says(camera: CameraSimulation, limit_px: 
     assert np.median(np.hypot(*shifts.T)) < limit_px
 
 
-def test_tall_things_lean_away_from_the_middle() -> None:
+def test_raised_points_are_displaced_away_from_the_nadir() -> None:
     flight = small_flight(frames=1, camera=PINHOLE, scene=FLAT)
     foot = flight.camera.to_base(0, np.array([[600.0, 240.0]]))
     raised = flight.camera.to_raw(0, foot, above_px=40.0)
     assert raised[0, 0] > 605
 
 
-def test_times_rise_unevenly_about_the_nominal_rate() -> None:
+def test_times_ascend_irregularly_about_the_nominal_rate() -> None:
     times = small_flight(frames=400).times_s
     step = np.diff(times)
     assert (step > 0.15).all()

@@ -1,4 +1,4 @@
-"""Rendered frames, the base image, what is written, what is read back, and the scores."""
+"""Rendered frames, the base image, written and reread flights, and scores of simulated flights."""
 
 import json
 from dataclasses import replace
@@ -43,21 +43,21 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_same_seed_same_picture_another_seed_another() -> None:
+def test_a_seed_determines_the_images() -> None:
     first, again, other = (small_flight(frames=2, width=320, height=240, seed=s) for s in (5, 5, 6))
     assert np.array_equal(first.frame(1), again.frame(1))
     assert np.array_equal(first.base_image, again.base_image)
     assert not np.array_equal(first.frame(1), other.frame(1))
 
 
-def test_frames_do_not_depend_on_the_order_they_are_asked_for() -> None:
+def test_frames_do_not_depend_on_the_order_of_rendering() -> None:
     forward, backward = small_flight(frames=3, width=320, height=240), small_flight(frames=3, width=320, height=240)
-    wanted = [forward.frame(k) for k in range(3)]
-    got = [backward.frame(k) for k in (2, 1, 0)][::-1]
-    assert all(np.array_equal(a, b) for a, b in zip(wanted, got, strict=True))
+    first = [forward.frame(k) for k in range(3)]
+    second = [backward.frame(k) for k in (2, 1, 0)][::-1]
+    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
 
 
-def test_cars_are_drawn_where_the_labels_say() -> None:
+def test_cars_are_drawn_at_their_labels() -> None:
     scene = FLAT.model_copy(update={"sun_length": 0.0})
     flight = small_flight(frames=3, camera=STEADY, scene=scene)
     empty = small_flight(
@@ -91,19 +91,19 @@ def test_the_base_image_is_of_another_sensor_and_has_no_traffic() -> None:
     y, x = np.mgrid[0:480:4, 0:640:4]
     at = flight.camera.to_base(0, np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)).astype(np.float32)
     seen = cv2.remap(base, at[:, 0].reshape(y.shape), at[:, 1].reshape(y.shape), cv2.INTER_LINEAR)
-    likeness = np.corrcoef(frame[::4, ::4].ravel(), seen.ravel())[0, 1]
-    assert 0.4 < likeness < 0.97
+    correlation = np.corrcoef(frame[::4, ::4].ravel(), seen.ravel())[0, 1]
+    assert 0.4 < correlation < 0.97
     inside = (at > 0).all() and (at < base.shape[::-1]).all()
     assert inside
 
 
-def test_buildings_hide_cars_and_trees_cast_shadows() -> None:
+def test_buildings_and_trees_change_the_image() -> None:
     bare = small_flight(frames=1, camera=STEADY, scene=FLAT)
     built = small_flight(frames=1, camera=STEADY, scene=SceneSimulation(relief_m=0))
     assert np.abs(bare.frame(0).astype(int) - built.frame(0)).mean() > 3
 
 
-def test_what_is_written_is_what_the_command_promises(written: Path) -> None:
+def test_the_written_files_are_a_users_input(written: Path) -> None:
     frames = sorted((written / "frames").glob("*.png"))
     times = pd.read_csv(written / "timestamps.csv")
     assert [f.name for f in frames] == times["frame"].tolist()
@@ -117,7 +117,7 @@ def test_what_is_written_is_what_the_command_promises(written: Path) -> None:
     assert base.shape == load_truth(written).base_shape
 
 
-def test_truth_read_back_is_the_truth(written: Path) -> None:
+def test_the_truth_read_back_is_the_one_in_memory(written: Path) -> None:
     read = load_truth(written)
     flight = small_flight(frames=6, width=320, height=240, labelled_frames=2)
     memory = make_truth(flight)
@@ -128,7 +128,7 @@ def test_truth_read_back_is_the_truth(written: Path) -> None:
     assert len(read.lanes) == len(memory.lanes)
 
 
-def test_another_flight_is_not_written_over(written: Path, tmp_path: Path) -> None:
+def test_another_flight_is_not_overwritten(written: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="another configuration"):
         write_flight(written, SimulationConfig(frames=6, width=320, height=240, seed=9))
     (tmp_path / "notes.txt").write_text("mine")
@@ -139,13 +139,13 @@ def test_another_flight_is_not_written_over(written: Path, tmp_path: Path) -> No
     assert json.loads((written / "simulation.json").read_text())["seed"] == 0
 
 
-def test_cars_of_the_truth_agree_with_its_map(truth: Truth) -> None:
+def test_cars_of_the_truth_agree_with_its_transform(truth: Truth) -> None:
     cars = truth.cars[(truth.cars["frame"] == 7) & truth.cars["visible"]]
     raw, base = cars[["x_raw_px", "y_raw_px"]].to_numpy(), cars[["x_base_px", "y_base_px"]].to_numpy()
     assert np.abs(truth.to_base(7, raw) - base).max() < 0.02
 
 
-def test_velocity_of_the_truth_is_what_its_places_say(truth: Truth) -> None:
+def test_velocities_of_the_truth_agree_with_its_positions(truth: Truth) -> None:
     steps = truth.segments()
     cars = truth.cars.set_index(["frame", "vehicle_id"])
     before = cars.loc[pd.MultiIndex.from_frame(steps[["frame", "vehicle_id"]])]
@@ -168,18 +168,18 @@ def test_a_perfect_run_scores_perfectly(truth: Truth) -> None:
     assert detections.axis_error_median_rad == 0
 
 
-def test_a_run_on_another_grid_scores_after_the_best_homography(truth: Truth) -> None:
-    turn = np.array([[0.9, -0.2, 40.0], [0.2, 0.9, -15.0], [1e-5, 0, 1.0]])
+def test_a_run_on_another_grid_is_scored_after_a_fitted_homography(truth: Truth) -> None:
+    other_grid = np.array([[0.9, -0.2, 40.0], [0.2, 0.9, -15.0], [1e-5, 0, 1.0]])
 
     def run(frame: int, xy: np.ndarray) -> np.ndarray:
-        return cv2.perspectiveTransform(truth.to_base(frame, xy)[None], turn)[0]
+        return cv2.perspectiveTransform(truth.to_base(frame, xy)[None], other_grid)[0]
 
     matrix = fit_homography(truth, run, range(12))
     assert score_registration(truth, run, range(12)).mean_px > 10
     assert score_registration(truth, run, range(12), to_truth=matrix).mean_px < 1e-3
 
 
-def test_shifts_jitter_and_drift_are_told_apart(truth: Truth) -> None:
+def test_shift_jitter_and_drift_are_separated(truth: Truth) -> None:
     shifted = score_registration(truth, lambda f, xy: truth.to_base(f, xy) + np.array([0.6, 0.8]), range(12))
     assert shifted.mean_px == pytest.approx(1.0)
     assert shifted.jitter_px < 1e-9
@@ -192,7 +192,7 @@ def test_shifts_jitter_and_drift_are_told_apart(truth: Truth) -> None:
 
 
 def tracklets_of(truth: Truth) -> pd.DataFrame:
-    """Tracklets as a perfect tracker would give them."""
+    """The tracklets of a perfect tracker."""
     cars = truth.cars[truth.cars["visible"]].set_index(["vehicle_id", "frame"])
     rows = []
     for vehicle, frame in cars.index:
@@ -210,7 +210,7 @@ def tracklets_of(truth: Truth) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def test_tracklets_are_right_when_they_follow_one_vehicle(truth: Truth) -> None:
+def test_tracklets_are_correct_if_they_follow_one_vehicle(truth: Truth) -> None:
     tracklets = tracklets_of(truth)
     score = score_tracklets(truth, tracklets)
     assert score.precision == 1.0
@@ -225,7 +225,7 @@ def test_tracklets_are_right_when_they_follow_one_vehicle(truth: Truth) -> None:
     assert score_tracklets(truth, swapped).precision_on_vehicle < 0.1
 
 
-def test_a_tracklet_of_a_lorrys_load_is_on_the_vehicle_but_off_its_middle(truth: Truth) -> None:
+def test_a_tracklet_of_a_lorrys_load_is_on_the_vehicle_but_off_its_centre(truth: Truth) -> None:
     tracklets = tracklets_of(truth)
     cars = truth.cars.set_index(["vehicle_id", "frame"])
     long = cars["length_px"].groupby("vehicle_id").max().loc[lambda length: length > 30].index
@@ -264,8 +264,8 @@ def test_a_field_along_the_lanes_scores_perfectly_and_one_across_does_not(truth:
     assert score_field(truth, shrunk, few, to_truth=np.linalg.inv(half)).fraction_within > 0.97
 
 
-def test_direction_in_a_tight_turn_is_that_of_the_lane_at_the_pixel(truth: Truth) -> None:
-    """A roundabout of 9 m: along the lane there is no error, on either side of its middle, nor before or behind."""
+def test_the_direction_in_a_tight_turn_is_that_of_the_lane_at_the_pixel(truth: Truth) -> None:
+    """A roundabout of 9 m: no error along the lane, on either side of its centre line, nor before or behind."""
     angle = np.linspace(0, 1.5 * np.pi, 60)
     path = 150 + 40 * np.column_stack([np.cos(angle), np.sin(angle)])
     turn = replace(truth, lanes=[LanePath("turn", path, 20.0)])
