@@ -7,7 +7,7 @@ from schemas.detector import CnnConfig
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.fine_tuning import evaluate_network, make_record, select_threshold, train_from_scratch
 from velfield.detection.cnn.model import Network
-from velfield.detection.evaluation import Evidence, joined
+from velfield.detection.evaluation import HeldOutScores, merge_scores
 from velfield.detection.samples import LabelledImage
 from velfield.parallel import parallel_map
 
@@ -28,7 +28,7 @@ class Site:
 
 def train_leave_one_site_out(
     sites: Sequence[Site], extra: Sequence[LabelledImage], *, seed: int, steps: int
-) -> tuple[CnnDetector, dict[str, Evidence]]:
+) -> tuple[CnnDetector, dict[str, HeldOutScores]]:
     """Train on all sites and on the ``extra`` images; choose the threshold on held-out sites.
 
     Returns
@@ -36,19 +36,19 @@ def train_leave_one_site_out(
     The detector, and the evaluation of each site by a network trained on all others and on the extra images.
     """
 
-    def train_fold(held_out: int | None) -> tuple[Network, Evidence | None]:
+    def train_fold(held_out: int | None) -> tuple[Network, HeldOutScores | None]:
         if held_out is None:
             return _train(sites, extra, seed, steps), None
         others = [site for k, site in enumerate(sites) if k != held_out]
         network = _train(others, extra, seed + 1 + held_out, round(_FOLD_STEPS_FRACTION * steps))
-        return network, joined([evaluate_network(network, sample) for sample in sites[held_out].evaluation])
+        return network, merge_scores([evaluate_network(network, sample) for sample in sites[held_out].evaluation])
 
     (network, _), *folds = parallel_map(train_fold, [None, *range(len(sites))])
     by_site = {
         site.name: evaluation for site, (_, evaluation) in zip(sites, folds, strict=True) if evaluation is not None
     }
     description = f"cars of {len(sites)} sites, each detected by a detector that was not trained on its site"
-    threshold, curve = select_threshold(joined(list(by_site.values())), 0.0, description)
+    threshold, curve = select_threshold(merge_scores(list(by_site.values())), 0.0, description)
     cars = sum(len(sample.cars) for site in sites for sample in site.evaluation) + sum(len(s.cars) for s in extra)
     return CnnDetector(make_record(network, threshold, curve, cars, CnnConfig())), by_site
 

@@ -19,8 +19,8 @@ from tools.leave_one_site_out import Site, train_leave_one_site_out
 from tools.train_long_vehicles import train_long_vehicles
 from velfield.bench.scenes import simulated_image
 from velfield.detection.cnn.detector import CnnDetector
-from velfield.detection.evaluation import Evidence, joined
-from velfield.detection.orientation import with_axes
+from velfield.detection.evaluation import HeldOutScores, merge_scores
+from velfield.detection.orientation import fill_missing_orientation
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 from velfield.parallel import parallel_map
@@ -102,7 +102,7 @@ def _scale(grey: GreyImage, boxes: FloatArray, factor: float) -> LabelledImage:
     shapes = np.array([car_in_upright_box(w, h) for w, h in sides[car]]).reshape(-1, 4)
     ignore = np.column_stack([xy, np.maximum(sides.max(axis=1) / 2, 8.0)])[~car]
     cars = np.column_stack([xy[car], shapes[:, :3]])
-    return LabelledImage(image=image, cars=cars, ignore=ignore, tilts=shapes[:, 3])
+    return LabelledImage(image=image, cars=cars, ignore=ignore, abs_box_angle_rad=shapes[:, 3])
 
 
 def read_sites(data: Path) -> list[Site]:
@@ -142,7 +142,7 @@ def make_shipped_long_vehicles(data: Path, out: Path) -> str:
     for site in read_sites(data):
         augmented = [_simulate_sensor(sample, *sensor) for sample in site.evaluation for sensor in _SENSORS]
         samples += [
-            replace(sample, cars=with_axes(sample.image, sample.cars, sample.tilts))
+            replace(sample, cars=fill_missing_orientation(sample.image, sample.cars, sample.abs_box_angle_rad))
             for sample in [*site.evaluation, *augmented]
         ]
     held_out = parallel_map(simulate, LORRY_SEEDS_HELD_OUT)
@@ -156,12 +156,12 @@ def make_shipped_detector(data: Path, out: Path, steps: int = STEPS) -> list[str
     sites, simulated = read_sites(data), parallel_map(simulated_image, SIMULATED_SEEDS)
     detector, by_site = train_leave_one_site_out(sites, simulated, seed=SEED, steps=steps)
     CnnDetector(detector.record.model_copy(update={"attribution": ATTRIBUTION})).save(out)
-    evaluations = {**by_site, "all": joined(list(by_site.values()))}
+    evaluations = {**by_site, "all": merge_scores(list(by_site.values()))}
     return [_accuracy_line(name, evaluation, detector.threshold) for name, evaluation in evaluations.items()]
 
 
-def _accuracy_line(name: str, evaluation: Evidence, threshold: float) -> str:
+def _accuracy_line(name: str, evaluation: HeldOutScores, threshold: float) -> str:
     above = evaluation.score > threshold
-    correct = int(evaluation.right[above].sum())
-    precision, recall = correct / max(int(above.sum()), 1), correct / evaluation.cars
-    return f"{name:28} {evaluation.cars:4} cars  precision {precision:.3f}  recall {recall:.3f}"
+    correct = int(evaluation.correct[above].sum())
+    precision, recall = correct / max(int(above.sum()), 1), correct / evaluation.car_count
+    return f"{name:28} {evaluation.car_count:4} cars  precision {precision:.3f}  recall {recall:.3f}"

@@ -9,12 +9,12 @@ import numpy as np
 
 from schemas.arrays import ByteArray, FloatArray
 from schemas.detector import DetectorConfig, LongVehicleRecord, Round
-from velfield.detection.boosting import BoostedSums, random_pool, sums_of
-from velfield.detection.cascade.classifier import moved
-from velfield.detection.cascade.feature_image import Picture, picture_of, scores_at
-from velfield.detection.cascade.feature_matrix import Bank, bank_of
-from velfield.detection.cascade.long_vehicles import LEAST_LENGTH, LONG, OFFSETS, LongVehicles
-from velfield.detection.cascade.scenes import Poses, varied
+from velfield.detection.boosting import BoostedStumps, draw_feature_pool
+from velfield.detection.cascade.classifier import offset_along_axis
+from velfield.detection.cascade.feature_image import FeatureImage, compute_features, score_poses
+from velfield.detection.cascade.feature_matrix import FeatureBinner, fit_feature_binner
+from velfield.detection.cascade.long_vehicles import LONG, MIN_LENGTH_RATIO, OFFSETS, LongVehicleClassifier
+from velfield.detection.cascade.scenes import Poses, augment_poses
 from velfield.detection.cascade.training import CONTRAST_FLOOR
 from velfield.detection.samples import LabelledImage
 from velfield.parallel import parallel_map
@@ -42,7 +42,7 @@ _Detections: TypeAlias = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True)
 class _Scene:
-    image: Picture
+    image: FeatureImage
     long: FloatArray
     cars: FloatArray
 
@@ -58,7 +58,7 @@ def train_long_vehicles(
     Parameters
     ----------
     samples
-        Labelled images with the orientation and length of each vehicle; vehicles of more than `LEAST_LENGTH` car
+        Labelled images with the orientation and length of each vehicle; vehicles of more than `MIN_LENGTH_RATIO` car
         lengths are positives.
     held_out
         Further ones, on which the threshold is chosen.
@@ -69,7 +69,7 @@ def train_long_vehicles(
     copies = _CAR_SAMPLES / max(1, sum(len(scene.cars) for scene in scenes))
     positive_poses = [_sample_positives(scene, rng) for scene in scenes]
     negative_poses = [_sample_negatives(scene, copies, rng) for scene in scenes]
-    pool = random_pool(
+    pool = draw_feature_pool(
         _POOL_SIZE,
         channels=3,
         sigma_xy_px=_CORNER_SIGMA_PX,
@@ -78,11 +78,11 @@ def train_long_vehicles(
         rng=rng,
     )
     poses = [*zip(images, positive_poses, strict=True), *zip(images, negative_poses, strict=True)]
-    bank = bank_of(pool, CONTRAST_FLOOR, poses, rng)
-    positives = bank.samples(zip(images, positive_poses, strict=True))
-    negatives = bank.samples(zip(images, negative_poses, strict=True))
+    binner = fit_feature_binner(pool, CONTRAST_FLOOR, poses, rng)
+    positives = binner.bins_of_images(zip(images, positive_poses, strict=True))
+    negatives = binner.bins_of_images(zip(images, negative_poses, strict=True))
     for rounds in _MINING_ROUNDS:
-        boosted = _boost(bank, positives, negatives, rounds, rng)
+        boosted = _boost(binner, positives, negatives, rounds, rng)
         detections = [
             (
                 scene,
@@ -91,10 +91,10 @@ def train_long_vehicles(
             )
             for scene in scenes
         ]
-        mined = parallel_map(partial(_mine_hard_negatives, sums=sums_of(boosted)), detections)
-        hard = [varied(poses, rng) for poses in mined]
-        negatives = np.hstack([negatives, bank.samples(zip(images, hard, strict=True))])
-    boosted = _boost(bank, positives, negatives, ROUNDS, rng)
+        mined = parallel_map(partial(_mine_hard_negatives, stumps=BoostedStumps.from_rounds(boosted)), detections)
+        hard = [augment_poses(poses, rng) for poses in mined]
+        negatives = np.hstack([negatives, binner.bins_of_images(zip(images, hard, strict=True))])
+    boosted = _boost(binner, positives, negatives, ROUNDS, rng)
     held_out_scenes = [_make_scene(sample, config.working_car_length_px) for sample in held_out]
     return LongVehicleRecord(
         working_car_length_px=config.working_car_length_px,
@@ -106,15 +106,15 @@ def train_long_vehicles(
 
 
 def _make_scene(sample: LabelledImage, car_length_px: float) -> _Scene:
-    long = sample.cars[:, 3] > LEAST_LENGTH * car_length_px
-    return _Scene(picture_of(sample.image, None, LONG), sample.cars[long, :3], sample.cars[~long, :3])
+    long = sample.cars[:, 3] > MIN_LENGTH_RATIO * car_length_px
+    return _Scene(compute_features(sample.image, None, LONG), sample.cars[long, :3], sample.cars[~long, :3])
 
 
 def _jitter(poses: FloatArray, copies: int, along: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Copies of poses (n * copies, 3), shifted along their axes, and jittered across them and in orientation."""
     poses = np.repeat(poses, copies, axis=0)
     across = rng.normal(0, _ACROSS_SD_PX, len(poses))
-    poses[:, :2] = moved(poses[:, :2], poses[:, 2], np.column_stack([along, across]))
+    poses[:, :2] = offset_along_axis(poses[:, :2], poses[:, 2], np.column_stack([along, across]))
     poses[:, 2] += rng.normal(0, _ROTATION_SD_RAD, len(poses))
     return poses
 
@@ -132,7 +132,7 @@ def _simulate_detections(poses: FloatArray, reach_px: float, rng: np.random.Gene
 
 def _sample_positives(scene: _Scene, rng: np.random.Generator) -> Poses:
     along = rng.normal(0, _CENTRE_SD_PX, _POSITIVE_COPIES * len(scene.long))
-    return varied(_jitter(scene.long, _POSITIVE_COPIES, along, rng), rng)
+    return augment_poses(_jitter(scene.long, _POSITIVE_COPIES, along, rng), rng)
 
 
 def _sample_negatives(scene: _Scene, samples_per_car: float, rng: np.random.Generator) -> Poses:
@@ -146,27 +146,27 @@ def _sample_negatives(scene: _Scene, samples_per_car: float, rng: np.random.Gene
         _jitter(scene.cars, copies, on_car, rng),
         _jitter(scene.cars, 2 * copies, off_car, rng),
     ]
-    return varied(np.concatenate(parts), rng)
+    return augment_poses(np.concatenate(parts), rng)
 
 
 def _boost(
-    bank: Bank, positives: ByteArray, negatives: ByteArray, rounds: int, rng: np.random.Generator
+    binner: FeatureBinner, positives: ByteArray, negatives: ByteArray, rounds: int, rng: np.random.Generator
 ) -> tuple[Round, ...]:
-    return bank.learnt(positives, negatives, rounds=rounds, fraction=_FRACTION, shrinkage=_SHRINKAGE, rng=rng)
+    return binner.train(positives, negatives, rounds=rounds, fraction=_FRACTION, shrinkage=_SHRINKAGE, rng=rng)
 
 
-def _mine_hard_negatives(detections: tuple[_Scene, _Detections, _Detections], sums: BoostedSums) -> FloatArray:
+def _mine_hard_negatives(detections: tuple[_Scene, _Detections, _Detections], stumps: BoostedStumps) -> FloatArray:
     """The two poses of highest score along each detection's axis, where they are not a long vehicle's centre."""
     scene, long, cars = detections
     hard = [np.empty((0, 3))]
     for (poses, vehicles), min_distance_px in ((long, _MINING_MIN_DISTANCE_PX), (cars, -1.0)):
         if not len(poses):
             continue
-        scores = scores_at(sums, scene.image, poses[:, :2], poses[:, 2], OFFSETS, contrast_floor=CONTRAST_FLOOR)
+        scores = score_poses(stumps, scene.image, poses[:, :2], poses[:, 2], OFFSETS, contrast_floor=CONTRAST_FLOOR)
         rows = np.arange(len(poses))
         for _ in range(2):
             best = scores.argmax(axis=1)
-            xy = moved(poses[:, :2], poses[:, 2], OFFSETS[best].astype(np.float64) * LONG.step)
+            xy = offset_along_axis(poses[:, :2], poses[:, 2], OFFSETS[best].astype(np.float64) * LONG.step)
             wrong = np.hypot(*(xy - vehicles[:, :2]).T) > min_distance_px
             chosen = wrong & (scores[rows, best] > _MINING_MIN_SCORE)
             hard.append(np.column_stack([xy, poses[:, 2]])[chosen])
@@ -178,7 +178,7 @@ def _mine_hard_negatives(detections: tuple[_Scene, _Detections, _Detections], su
 def _choose_threshold(boosted: tuple[Round, ...], scenes: Sequence[_Scene], rng: np.random.Generator) -> float:
     """Score that all but a small fraction of held-out cars stay below."""
     record = LongVehicleRecord(working_car_length_px=1.0, rounds=boosted, threshold=0.0, contrast_floor=CONTRAST_FLOOR)
-    classifier = LongVehicles(record, sums_of(boosted))
+    classifier = LongVehicleClassifier(record)
     highest = [np.empty(0)]
     for scene in scenes:
         poses, _ = _simulate_detections(scene.cars, _CAR_DETECTION_REACH_PX, rng)

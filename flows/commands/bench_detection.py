@@ -1,22 +1,22 @@
-"""``velfield bench detection``: how fast cars are found."""
+"""``velfield bench detection``: speed of the detectors."""
 
 from flows.options import parse_frame_size
 
 
 def detection(*, size: str = "2560x1920") -> int:
-    """Times of both steps and of the paper's dense response on one core, each beside a plain peer in the same run.
+    """Times of the CNN, the cascade and the paper's dense response on one core, each beside a plain peer.
 
     Parameters
     ----------
     size
         Frame size, WxH in pixels.
     """
-    from velfield.bench.detection import cascade_speed, city, network_speed, response_speed, train_on_one_frame
+    from velfield.bench.detection import cascade_speed, city, cnn_speed, response_speed, train_on_one_frame
     from velfield.detection.files import shipped_detector
 
     image = city(*parse_frame_size(size, "128 or more each, as 2560x1920", min_px=128))
     for speed in response_speed(image):
         print(speed.text())
     print(cascade_speed(image, train_on_one_frame(), "trained on one labelled frame").text())
-    print(network_speed(image, shipped_detector()).text())
+    print(cnn_speed(image, shipped_detector()).text())
     return 0

@@ -7,7 +7,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from schemas.flight import FieldConfig
-from velfield.bench.detection import plain_response, random_sums, row_response
+from velfield.bench.detection import plain_response, random_stumps, row_response
 from velfield.detection.paper.response import dense_response
 from velfield.field.accumulate import accumulate_tile
 from velfield.field.bins import VelocityBins
@@ -22,7 +22,7 @@ def picture() -> np.ndarray:
 @pytest.mark.parametrize("how", [dense_response, row_response, plain_response])
 def test_dense_response(benchmark: BenchmarkFixture, picture: np.ndarray, how: Callable[..., np.ndarray]) -> None:
     benchmark.group = "dense response, 20 rounds, 320 x 240"
-    assert benchmark(how, picture, random_sums(20)).shape == picture.shape
+    assert benchmark(how, picture, random_stumps(20)).shape == picture.shape
 
 
 def test_tile_of_the_field(benchmark: BenchmarkFixture) -> None:

@@ -8,7 +8,7 @@ import pytest
 from schemas.arrays import Float32Array, FloatArray, GreyImage
 from schemas.detector import MotionRecord
 from velfield.bench.scenes import simulated_image
-from velfield.detection.cascade.classifier import distinct
+from velfield.detection.cascade.classifier import nms_oriented
 from velfield.detection.cnn import inference
 from velfield.detection.cnn.dataset import PATCH_PX, encode_targets
 from velfield.detection.cnn.detector import CnnDetector
@@ -36,7 +36,7 @@ def scene_detections() -> FloatArray:
 
 def likely(found: FloatArray) -> FloatArray:
     """Likely cars, each once."""
-    found = distinct(found, 16.0)
+    found = nms_oriented(found, 16.0)
     return found[found[:, 3] > 0.1]
 
 

@@ -1,4 +1,4 @@
-"""Lorries and buses brought to their middle: in a simulated city that was not trained on, and the rules of a place."""
+"""Lorries and buses centred: in a simulated city that was not trained on, and the rules of suppression."""
 
 from functools import cache
 
@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from schemas.arrays import FloatArray
 from tools.shipped_detector import LORRY_SEEDS, LORRY_SEEDS_HELD_OUT
 from velfield.bench.scenes import simulated_image
-from velfield.detection.cascade.classifier import moved
-from velfield.detection.cascade.feature_image import Picture, picture_of
-from velfield.detection.cascade.long_vehicles import LONG, OFFSETS, LongVehicles, shipped_long_vehicles
+from velfield.detection.cascade.classifier import offset_along_axis
+from velfield.detection.cascade.feature_image import FeatureImage, compute_features
+from velfield.detection.cascade.long_vehicles import LONG, OFFSETS, LongVehicleClassifier, shipped_long_vehicles
 from velfield.detection.samples import LabelledImage
 
 SEED = 40
@@ -25,12 +25,12 @@ def city() -> LabelledImage:
 
 
 def rows(xy: FloatArray, axes: FloatArray) -> FloatArray:
-    """Finds, the best first."""
+    """Detections, the best first."""
     return np.column_stack([xy, axes, np.linspace(0.9, 0.3, len(xy)), np.full(len(xy), 0.05)])
 
 
 def alone(cars: FloatArray) -> FloatArray:
-    """Vehicles that lie well within the picture, and so far from all others that finds on them are theirs."""
+    """Vehicles well within the image, and so far from all others that detections on them are theirs."""
     gap = np.hypot(*(cars[:, None, :2] - cars[None, :, :2]).transpose(2, 0, 1)) + 1e9 * np.eye(len(cars))
     size = np.array(city().image.shape[::-1])
     within = (cars[:, :2] > 30).all(axis=1) & (cars[:, :2] < size - 30).all(axis=1)
@@ -38,79 +38,81 @@ def alone(cars: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize("off_px", [-10.0, 0.0, 10.0])
-def test_a_lorry_found_at_its_load_or_cab_is_told_at_its_middle(off_px: float) -> None:
+def test_a_lorry_detected_at_its_load_or_cab_is_centred(off_px: float) -> None:
     cars = alone(city().cars)
     lorries = cars[cars[:, 3] > 26]
     assert len(lorries) >= 6
-    xy = moved(lorries[:, :2], lorries[:, 2], np.tile([off_px, 1.0], (len(lorries), 1)))
-    told = shipped_long_vehicles().centred(
-        picture_of(city().image, None, LONG), rows(xy, lorries[:, 2]), everywhere(city())
+    xy = offset_along_axis(lorries[:, :2], lorries[:, 2], np.tile([off_px, 1.0], (len(lorries), 1)))
+    centred = shipped_long_vehicles().centre(
+        compute_features(city().image, None, LONG), rows(xy, lorries[:, 2]), everywhere(city())
     )
-    assert len(told) == len(lorries)
-    assert np.mean(np.hypot(*(told[:, :2] - lorries[:, :2]).T) < 5) >= (1.0 if off_px == 0 else 0.7)
+    assert len(centred) == len(lorries)
+    assert np.mean(np.hypot(*(centred[:, :2] - lorries[:, :2]).T) < 5) >= (1.0 if off_px == 0 else 0.7)
 
 
-def test_cars_stay_where_they_were_found() -> None:
+def test_cars_stay_where_they_were_detected() -> None:
     plain = simulated_image(SEED + 1, (960, 720))
     cars = plain.cars[plain.cars[:, 3] < 22]
     assert len(cars) >= 30
     found = rows(cars[:, :2], cars[:, 2])
-    told = shipped_long_vehicles().centred(picture_of(plain.image, None, LONG), found, everywhere(plain))
-    kept = {tuple(row) for row in told[:, :2]}
+    centred = shipped_long_vehicles().centre(compute_features(plain.image, None, LONG), found, everywhere(plain))
+    kept = {tuple(row) for row in centred[:, :2]}
     assert sum(tuple(row) not in kept for row in found[:, :2]) <= 0.02 * len(found)
 
 
-def liking(places_px: FloatArray) -> LongVehicles:
-    """A classifier that sees a middle at these places (n, 2), and nowhere else."""
+def classifier_of(centres_px: FloatArray) -> LongVehicleClassifier:
+    """A classifier that scores these positions (n, 2) as centres, and nothing else."""
     known = shipped_long_vehicles()
 
-    class Told(LongVehicles):
-        def scores(self, picture: Picture, xy: FloatArray, axes: FloatArray) -> NDArray[np.float32]:
-            there = np.stack([moved(xy, axes, np.tile(offset * 2.0, (len(xy), 1))) for offset in OFFSETS], axis=1)
-            gap = np.hypot(*(there[:, :, None] - places_px).transpose(3, 0, 1, 2)).min(axis=2)
+    class Given(LongVehicleClassifier):
+        def scores(self, features: FeatureImage, xy: FloatArray, axes: FloatArray) -> NDArray[np.float32]:
+            there = np.stack(
+                [offset_along_axis(xy, axes, np.tile(offset * 2.0, (len(xy), 1))) for offset in OFFSETS], axis=1
+            )
+            gap = np.hypot(*(there[:, :, None] - centres_px).transpose(3, 0, 1, 2)).min(axis=2)
             return np.where(gap < 1, 1.0, -1.0).astype(np.float32)
 
-    return Told(known.record, known.sums)
+    return Given(known.record)
 
 
-SEEN = np.ones((400, 400), bool)
+EVERYWHERE = np.ones((400, 400), bool)
 
 
 def everywhere(sample: LabelledImage) -> NDArray[np.bool_]:
     return np.ones(sample.image.shape, bool)
 
 
-def picture() -> Picture:
-    return picture_of(np.zeros((8, 8), np.uint8), None, LONG)
+def blank() -> FeatureImage:
+    return compute_features(np.zeros((8, 8), np.uint8), None, LONG)
 
 
-def test_two_finds_on_a_bus_are_one_and_a_car_behind_it_stays() -> None:
+def test_two_detections_on_a_bus_become_one_and_a_car_behind_it_stays() -> None:
     xy = np.array([[90.0, 50.0], [108.0, 50.0], [60.0, 50.0], [100.0, 58.0]])  # load, cab, a car behind, one beside
-    told = liking(np.array([[100.0, 50.0]])).centred(picture(), rows(xy, np.zeros(4)), SEEN)
-    assert told[:, :2].tolist() == [[100.0, 50.0], [60.0, 50.0], [100.0, 58.0]]
-    assert told[0, 3] == pytest.approx(0.9)
+    centred = classifier_of(np.array([[100.0, 50.0]])).centre(blank(), rows(xy, np.zeros(4)), EVERYWHERE)
+    assert centred[:, :2].tolist() == [[100.0, 50.0], [60.0, 50.0], [100.0, 58.0]]
+    assert centred[0, 3] == pytest.approx(0.9)
 
 
-def test_what_is_not_long_is_not_moved_and_nothing_gives_nothing() -> None:
+def test_a_car_is_not_moved_and_no_detections_give_none() -> None:
     xy = np.array([[90.0, 50.0], [100.0, 50.0]])
-    told = liking(np.array([[300.0, 300.0]])).centred(picture(), rows(xy, np.zeros(2)), SEEN)
-    assert told[:, :2].tolist() == xy.tolist()
-    assert shipped_long_vehicles().centred(picture(), np.empty((0, 5)), SEEN).shape == (0, 5)
+    centred = classifier_of(np.array([[300.0, 300.0]])).centre(blank(), rows(xy, np.zeros(2)), EVERYWHERE)
+    assert centred[:, :2].tolist() == xy.tolist()
+    assert shipped_long_vehicles().centre(blank(), np.empty((0, 5)), EVERYWHERE).shape == (0, 5)
 
 
-def test_a_middle_is_looked_for_along_the_axis_whichever_way_it_points() -> None:
+def test_centres_are_searched_along_the_axis_in_both_directions() -> None:
     axes = np.array([np.pi / 2, np.radians(210)])
-    middles = np.array([[50.0, 62.0], [300.0, 300.0]])
-    xy = moved(middles, axes, np.array([[-12.0, 0.0], [8.0, 0.0]]))
-    told = liking(middles).centred(picture(), rows(xy, axes), SEEN)
-    np.testing.assert_allclose(told[:, :2], middles, atol=1e-9)
+    centres = np.array([[50.0, 62.0], [300.0, 300.0]])
+    xy = offset_along_axis(centres, axes, np.array([[-12.0, 0.0], [8.0, 0.0]]))
+    centred = classifier_of(centres).centre(blank(), rows(xy, axes), EVERYWHERE)
+    np.testing.assert_allclose(centred[:, :2], centres, atol=1e-9)
 
 
-@pytest.mark.parametrize("middle", [(-7.0, 50.0), (50.0, 405.0), (150.0, 50.0)])
-def test_what_has_its_middle_out_of_sight_stays_where_it_was_found(middle: tuple[float, float]) -> None:
-    axis = np.array([0.0 if middle[1] == 50 else np.pi / 2])
-    seen = SEEN.copy()
-    seen[:, 150:] = False
-    xy = np.array([middle]) + (12.0 if middle[0] < 0 else -12.0) * np.array([[np.cos(axis[0]), np.sin(axis[0])]])
-    told = liking(np.array([middle])).centred(picture(), rows(xy, axis), seen)
-    np.testing.assert_array_equal(told[:, :2], xy)
+@pytest.mark.parametrize("centre", [(-7.0, 50.0), (50.0, 405.0), (150.0, 50.0)])
+def test_a_vehicle_whose_centre_is_out_of_view_stays_where_it_was_detected(centre: tuple[float, float]) -> None:
+    axis = np.array([0.0 if centre[1] == 50 else np.pi / 2])
+    valid = EVERYWHERE.copy()
+    valid[:, 150:] = False
+    xy = np.array([centre]) + (12.0 if centre[0] < 0 else -12.0) * np.array([[np.cos(axis[0]), np.sin(axis[0])]])
+    centred = classifier_of(np.array([centre])).centre(blank(), rows(xy, axis), valid)
+    np.testing.assert_array_equal(centred[:, :2], xy)

@@ -21,9 +21,9 @@ from velfield.detection.motion.difference import (
     motion_background,
 )
 from velfield.detection.motion.evaluation import (
-    Detections,
     MotionEvaluation,
     MotionState,
+    TimedDetections,
     classify_motion,
     evaluate_by_motion,
 )
@@ -294,8 +294,8 @@ def test_length_width_and_axis_of_a_rectangle() -> None:
     assert blob.extent_along(np.array([0.5]))[0] == pytest.approx(18)
 
 
-def found_at(places: NDArray[np.float64], axis: float, score: NDArray[np.float64], time_s: float) -> Detections:
-    return Detections(places, np.full(len(places), axis), score, time_s)
+def found_at(places: NDArray[np.float64], axis: float, score: NDArray[np.float64], time_s: float) -> TimedDetections:
+    return TimedDetections(places, np.full(len(places), axis), score, time_s)
 
 
 def test_what_moves_along_its_axis_is_told_from_what_stands_and_what_is_alone() -> None:

@@ -1,32 +1,167 @@
-"""The dense response is the plain one at every second pixel (the cars it finds: `test_detection`)."""
+"""The paper's detector: its dense response against plain ones, its segmentation against scikit-image."""
 
+import cv2
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import label
+from skimage.measure import regionprops
+from skimage.segmentation import watershed
 
-from velfield.bench.detection import plain_response, random_sums, row_response
-from velfield.detection.paper.response import dense_response, sampled_response
+from schemas.detector import PaperConfig
+from velfield.bench.detection import plain_response, random_stumps, row_response
+from velfield.detection.detector import train_detector
+from velfield.detection.orientation import axial_difference
+from velfield.detection.paper.response import dense_response, quantise_and_pad, response_at_even_pixels
+from velfield.detection.paper.segmentation import region_moments, segment_response
+from velfield.detection.samples import LabelledImage
+
+SEEDS = st.integers(0, 2**32 - 1)
 
 
 @settings(max_examples=25, deadline=None)
 @given(
-    st.integers(0, 2**32 - 1),
+    SEEDS,
     st.integers(65, 100),
     st.integers(65, 100),
     st.integers(1, 30),
     st.sampled_from([3, 5, 8]),
 )
-def test_at_every_second_pixel_it_is_the_plain_one(seed: int, height: int, width: int, rounds: int, bits: int) -> None:
-    """Also where sums leave 16 bits, as most of 8-bit grey do; but for the rounding of what a round says."""
+def test_at_every_second_pixel_it_is_the_plain_response(
+    seed: int, height: int, width: int, rounds: int, bits: int
+) -> None:
+    """Also where sums leave 16 bits, as most of 8-bit grey do; but for the rounding of the leaves."""
     image = np.random.default_rng(seed).integers(0, 256, (height, width), dtype=np.uint8)
-    sums = random_sums(rounds, seed=seed, max_area_px=None)
-    rounding = np.abs(np.diff(sums.leaves)).sum() / (32767 - rounds) * rounds / 2
-    ours, plain = sampled_response(image, sums, grey_bits=bits), plain_response(image, sums, bits)
+    stumps = random_stumps(rounds, seed=seed, max_area_px=None)
+    rounding = np.abs(np.diff(stumps.leaves)).sum() / (32767 - rounds) * rounds / 2
+    ours, plain = response_at_even_pixels(image, stumps, grey_bits=bits), plain_response(image, stumps, bits)
     np.testing.assert_allclose(ours, plain[::2, ::2], atol=rounding + 1e-5)
-    np.testing.assert_allclose(row_response(image, sums, bits), plain, atol=1e-4)
+    np.testing.assert_allclose(row_response(image, stumps, bits), plain, atol=1e-4)
 
 
-def test_a_picture_smaller_than_the_margin() -> None:
+def test_an_image_smaller_than_the_margin() -> None:
     image = np.full((20, 31), 90, np.uint8)
-    assert sampled_response(image, random_sums(5), grey_bits=5).shape == (10, 16)
-    assert dense_response(image, random_sums(5)).shape == image.shape
+    assert response_at_even_pixels(image, random_stumps(5), grey_bits=5).shape == (10, 16)
+    assert dense_response(image, random_stumps(5)).shape == image.shape
+
+
+def test_without_rounds_the_response_is_zero() -> None:
+    assert not dense_response(np.full((30, 40), 90, np.uint8), random_stumps(0)).any()
+
+
+@pytest.mark.parametrize("bits", [1, 5, 8])
+def test_grey_levels_are_quantised_to_their_upper_bits(bits: int) -> None:
+    image = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    padded = quantise_and_pad(image, bits)
+    assert padded.shape == (16 + 128, 16 + 128)
+    assert padded[64:-64, 64:-64].tolist() == (image // 2 ** (8 - bits)).tolist()
+
+
+def smooth_noise(seed: int, shape: tuple[int, int] = (60, 80), sigma: float = 3.0) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(0, 1, shape).astype(np.float32)
+    return np.asarray(cv2.GaussianBlur(noise, (0, 0), sigma) * 10, np.float32)
+
+
+@given(SEEDS, st.floats(-0.5, 1.0))
+@settings(max_examples=25, deadline=None)
+def test_regions_are_those_above_the_threshold_each_grown_from_one_maximum(seed: int, threshold: float) -> None:
+    response = smooth_noise(seed)
+    smooth, labels = segment_response(response, sigma_px=1.5, threshold=threshold, min_region_px=1)
+    np.testing.assert_allclose(smooth, cv2.GaussianBlur(response, (0, 0), 1.5))
+    above = smooth > threshold
+    # Every pixel above the threshold that a maximum reaches belongs to one region, no other pixel to any.
+    components, _ = label(above)
+    assert ((labels > 0) == above).all()
+    for region in range(1, int(labels.max()) + 1):
+        inside = labels == region
+        assert label(inside)[1] == 1  # connected by four neighbours
+        assert len(np.unique(components[inside])) == 1
+        y, x = np.unravel_index(np.where(inside, smooth, -np.inf).argmax(), smooth.shape)
+        window = smooth[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
+        assert smooth[y, x] == window.max() or (labels[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2] != region).any()
+
+
+@given(SEEDS)
+@settings(max_examples=15, deadline=None)
+def test_regions_grow_as_a_watershed_of_the_distance_to_the_seeds(seed: int) -> None:
+    """Each pixel of a region is at most as many steps from its own seed, within the mask, as from any other."""
+    response = smooth_noise(seed, (40, 50))
+    smooth, labels = segment_response(response, sigma_px=1.0, threshold=0.0, min_region_px=1)
+    peaks = (smooth > 0) & (smooth >= cv2.dilate(smooth, np.ones((3, 3), np.uint8)))
+    markers, _ = label(peaks, np.ones((3, 3)))
+    flooded = watershed(np.zeros_like(smooth), markers, connectivity=1, mask=smooth > 0)
+    pairs = {(int(a), int(b)) for a, b in zip(labels.ravel(), flooded.ravel(), strict=True)}
+    assert len(pairs) == len({a for a, _ in pairs}) == len({b for _, b in pairs})
+
+
+@pytest.mark.parametrize("min_region_px", [1, 30, 200, 10_000])
+def test_small_regions_are_dropped(min_region_px: int) -> None:
+    response = smooth_noise(4)
+    _, every = segment_response(response, sigma_px=1.0, threshold=0.2, min_region_px=1)
+    _, kept = segment_response(response, sigma_px=1.0, threshold=0.2, min_region_px=min_region_px)
+    sizes = np.bincount(every.ravel())
+    assert (kept == np.where(sizes[every] >= min_region_px, every, 0)).all()
+
+
+def test_moments_are_those_of_regionprops() -> None:
+    response = smooth_noise(9)
+    smooth, labels = segment_response(response, sigma_px=1.0, threshold=0.3, min_region_px=20)
+    found, regions = region_moments(labels, smooth), regionprops(labels, intensity_image=smooth)
+    assert len(found) == len(regions) > 3
+    for row, region in zip(found, regions, strict=True):
+        x, y, axis, peak, sd, area = row
+        assert (y, x) == pytest.approx(region.centroid)
+        assert area == region.area
+        assert peak == pytest.approx(float(region.intensity_max))
+        # regionprops measures the major axis from the rows' axis; ours from +x towards +y.
+        if region.axis_major_length > 1.1 * region.axis_minor_length:
+            expected = np.array([np.pi / 2 - region.orientation])
+            assert axial_difference(np.array([axis]), expected)[0] < 1e-6
+        assert 0.05 <= sd <= np.pi / 4
+
+
+def test_bars_become_regions_with_the_axis_of_their_covariance() -> None:
+    response = np.full((80, 120), -1.0, np.float32)
+    response[20:28, 10:40] = 2.0
+    response[50:74, 80:88] = 2.0
+    response[5:7, 100:102] = 2.0
+    smooth, labels = segment_response(response, sigma_px=1.0, threshold=0.0, min_region_px=10)
+    found = region_moments(labels, smooth)
+    assert len(found) == 2
+    np.testing.assert_allclose(found[:, :2], [[24.5, 23.5], [83.5, 61.5]], atol=0.5)
+    assert axial_difference(found[:, 2], np.array([0.0, np.pi / 2])).max() < 0.05
+
+
+def test_no_region_gives_no_row() -> None:
+    assert region_moments(np.zeros((10, 10), np.int32), np.zeros((10, 10), np.float32)).shape == (0, 6)
+
+
+def parking(seed: int, cars: int = 12) -> LabelledImage:
+    """Bright rectangles on a dark, noisy ground."""
+    rng = np.random.default_rng(seed)
+    image = rng.integers(40, 60, (160, 200), dtype=np.uint8)
+    table = np.full((cars, 5), np.nan)
+    for k in range(cars):
+        x, y = 30 + 45 * (k % 4), 30 + 50 * (k // 4)
+        image[y - 4 : y + 4, x - 8 : x + 8] = 200
+        table[k, :3] = x - 0.5, y - 0.5, 0.0
+    return LabelledImage(image=image, cars=table)
+
+
+def test_it_detects_rectangles_and_their_axes_and_keeps_its_settings_in_its_record() -> None:
+    config = PaperConfig(rounds=20, feature_pool=100, response_sigma_px=2.0, min_region_px=20)
+    detector = train_detector([parking(0)], config)
+    assert (detector.record.response_sigma_px, detector.record.min_region_px) == (2.0, 20)
+    sample = parking(1)
+    found = detector.detect(sample.image)
+    gap = np.hypot(*(sample.cars[:, None, :2] - found.xy[None]).transpose(2, 0, 1))
+    assert (gap.min(axis=1) < 4).all()
+    nearest = gap.argmin(axis=1)
+    assert np.median(axial_difference(found.orientation_rad[nearest], np.zeros(12))) < 0.4
+    assert (found.area_px[nearest] >= 20).all()
+
+
+def test_a_configured_threshold_is_the_detectors() -> None:
+    config = PaperConfig(rounds=5, feature_pool=40, threshold=0.75)
+    assert train_detector([parking(0)], config).threshold == 0.75

@@ -13,7 +13,7 @@ from schemas.detector import CnnConfig, MotionRecord
 from velfield.detection.cnn.inference import background_difference_at, motion_score_bonus
 from velfield.detection.cnn.self_training import fit_motion_thresholds, self_train_from_motion, stationary_threshold
 from velfield.detection.detect import detect_frame
-from velfield.detection.evaluation import matched
+from velfield.detection.evaluation import match_greedy
 from velfield.detection.files import shipped_detector
 from velfield.detection.motion.difference import MotionFrame, motion_background
 from velfield.detection.motion.evaluation import MotionState
@@ -128,7 +128,7 @@ def test_cars_that_stand_are_found_by_a_network_that_learnt_from_those_that_move
     frame, known = frames[7], cars[7]
     found = detect_frame(frame.image, frame.valid, learnt, config, background)
     order = np.argsort(-found.score)
-    right = matched(np.column_stack([found.xy, found.orientation_rad, found.score])[order], known)
+    right = match_greedy(np.column_stack([found.xy, found.orientation_rad, found.score])[order], known)
     assert right.mean() > 0.9
     differs = background_difference_at(frame.image, background, known[:, :2], 16.0)
     stands = differs < 0.3 * np.median(differs[differs > 15])

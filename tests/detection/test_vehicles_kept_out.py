@@ -1,4 +1,4 @@
-"""Key points stay off vehicles where another detector's boxes are given."""
+"""Key points are not taken on vehicles where another detector's boxes are given."""
 
 from pathlib import Path
 
@@ -46,8 +46,8 @@ def test_no_key_point_lies_on_a_given_vehicle(tmp_path: Path) -> None:
     assert on_the_vehicle(unsized) == on_the_vehicle(everywhere)
 
 
-def test_a_turned_car_in_an_upright_box_keeps_both_its_ways_free(tmp_path: Path) -> None:
-    """A YOLO box of 60 x 60 px is a car of 60 px at 45 degrees, one way or the other."""
+def test_an_upright_box_masks_both_orientations_of_the_car_in_it(tmp_path: Path) -> None:
+    """A YOLO box of 60 x 60 px is a car of 60 px at +45 or -45 degrees."""
     folder, boxes = tmp_path / "frames", tmp_path / "boxes"
     folder.mkdir()
     boxes.mkdir()

@@ -1,4 +1,4 @@
-"""How fast cars are found: each fast way beside a plain one in the same run. Ratios are to be read, not times."""
+"""Speed of the detectors, each beside a plain implementation in the same run: read the ratios, not the times."""
 
 import time
 from collections.abc import Callable
@@ -12,21 +12,21 @@ from numpy.typing import NDArray
 
 from schemas.detector import CascadeConfig
 from velfield.bench.scenes import simulated_image
-from velfield.detection.boosting import BoostedSums, random_pool
-from velfield.detection.cascade.classifier import Look, offset_grid
+from velfield.detection.boosting import BoostedStumps, draw_feature_pool
+from velfield.detection.cascade.classifier import PoseScorer, offset_grid
 from velfield.detection.cascade.detector import CascadeDetector
-from velfield.detection.cascade.feature_image import picture_of
+from velfield.detection.cascade.feature_image import compute_features
 from velfield.detection.cnn.convolution import PaddedBatchLayout, conv2d
 from velfield.detection.detect import detect_frame
 from velfield.detection.detector import Detector
-from velfield.detection.paper.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, continued, dense_response
+from velfield.detection.paper.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, dense_response, quantise_and_pad
 from velfield.synthetic import small_flight
 
-_TURNS = np.radians(np.arange(0.0, 180.0, 15.0))
+_ROTATIONS = np.radians(np.arange(0.0, 180.0, 15.0))
 _DENSE_ROUNDS = 200
 _NUMPY_ROUNDS = 10
 _TILE_PX = 8
-_LEARNT_FROM = 978
+_TRAINING_SEED = 978
 """Seed of the city; `city` shows that of seed 77."""
 
 
@@ -48,12 +48,12 @@ YOLOV8N = (
     *((16, 9, 64, 64), *_c2f(16, 192, 128, 1), (32, 9, 128, 128), *_c2f(32, 384, 256, 1)),
     *(*_head(8, 64), *_head(16, 128), *_head(32, 256)),
 )
-"""Its convolutions: px a cell of what comes out, neighbours, channels in and out."""
+"""Its convolutions: stride of the output, kernel taps, channels in and out."""
 
 
 @dataclass(frozen=True)
 class Speed:
-    """One comparison: the fast way and its peer, s for the same work."""
+    """One comparison: ours and its peer, s for the same work."""
 
     what: str
     peer: str
@@ -61,14 +61,14 @@ class Speed:
     peer_seconds: float
 
     def text(self) -> str:
-        """For people, a line."""
+        """A line for people."""
         ours, theirs = 1e3 * self.seconds, 1e3 * self.peer_seconds
         return f"{self.what}: {ours:.0f} ms; {self.peer}: {theirs:.0f} ms; {theirs / ours:.3g} times"
 
 
-def plain_response(image: NDArray[np.uint8], sums: BoostedSums, grey_bits: int = GREY_BITS) -> NDArray[np.float32]:
-    """The dense response by numpy slices, a rectangle at a time: the reference of `sampled_response`."""
-    padded = continued(image, grey_bits).astype(np.int32)
+def plain_response(image: NDArray[np.uint8], stumps: BoostedStumps, grey_bits: int = GREY_BITS) -> NDArray[np.float32]:
+    """The dense response by numpy slices, a rectangle at a time: the reference of `response_at_even_pixels`."""
+    padded = quantise_and_pad(image, grey_bits).astype(np.int32)
     integral = np.pad(padded, ((1, 0), (1, 0))).cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32)
     height, width = image.shape
     out = np.zeros(image.shape, np.float32)
@@ -76,19 +76,19 @@ def plain_response(image: NDArray[np.uint8], sums: BoostedSums, grey_bits: int =
     def corner(y: int, x: int) -> NDArray[np.int32]:
         return integral[MARGIN_PX + y : MARGIN_PX + y + height, MARGIN_PX + x : MARGIN_PX + x + width]
 
-    for f in range(len(sums)):
+    for f in range(len(stumps)):
         total = np.zeros(image.shape, np.int32)
-        for sign, x0, y0, x1, y1 in sums.rectangles[sums.starts[f] : sums.starts[f + 1]]:
+        for sign, x0, y0, x1, y1 in stumps.rectangles[stumps.starts[f] : stumps.starts[f + 1]]:
             total += sign * (corner(y1, x1) - corner(y0, x1) - corner(y1, x0) + corner(y0, x0))
-        out += np.where(total > sums.thresholds[f], sums.leaves[f, 1], sums.leaves[f, 0])
+        out += np.where(total > stumps.thresholds[f], stumps.leaves[f, 1], stumps.leaves[f, 0])
     return out
 
 
-def row_response(image: NDArray[np.uint8], sums: BoostedSums, grey_bits: int = GREY_BITS) -> NDArray[np.float32]:
-    """The same at every pixel, whole rows at a time over one integral picture of int32: the plain vectorised peer."""
-    integral = cv2.integral(continued(image, grey_bits), sdepth=cv2.CV_32S)
+def row_response(image: NDArray[np.uint8], stumps: BoostedStumps, grey_bits: int = GREY_BITS) -> NDArray[np.float32]:
+    """The same at every pixel, whole rows at a time over one integral image of int32: the plain vectorised peer."""
+    integral = cv2.integral(quantise_and_pad(image, grey_bits), sdepth=cv2.CV_32S)
     out = np.zeros(image.shape, np.float32)
-    _rows(np.ascontiguousarray(integral), sums.rectangles, sums.starts, sums.thresholds, sums.leaves, out)
+    _rows(np.ascontiguousarray(integral), stumps.rectangles, stumps.starts, stumps.thresholds, stumps.leaves, out)
     return out
 
 
@@ -97,7 +97,7 @@ def _rows(integral, rectangles, starts, thresholds, leaves, out):  # type: ignor
     height, width = out.shape
     row = np.empty(width, np.int32)
     for y in range(height):
-        said = out[y]
+        response = out[y]
         for f in range(len(thresholds)):
             row[:] = 0
             for r in range(starts[f], starts[f + 1]):
@@ -112,15 +112,15 @@ def _rows(integral, rectangles, starts, thresholds, leaves, out):  # type: ignor
                 else:
                     for x in range(width):
                         row[x] -= a[x] - b[x] - c[x] + d[x]
-            threshold, below, above = thresholds[f], leaves[f, 0], leaves[f, 1]
+            threshold, low, high = thresholds[f], leaves[f, 0], leaves[f, 1]
             for x in range(width):
-                said[x] += above if row[x] > threshold else below
+                response[x] += high if row[x] > threshold else low
 
 
-def random_sums(rounds: int, *, seed: int = 1, max_area_px: int | None = MAX_AREA_PX) -> BoostedSums:
-    """Rounds of the paper's shape, not learnt: only their cost counts."""
+def random_stumps(rounds: int, *, seed: int = 1, max_area_px: int | None = MAX_AREA_PX) -> BoostedStumps:
+    """A classifier of the paper's shape, untrained: only its cost counts."""
     rng = np.random.default_rng(seed)
-    pool = random_pool(
+    pool = draw_feature_pool(
         rounds,
         channels=1,
         sigma_xy_px=(10.0, 10.0),
@@ -130,7 +130,7 @@ def random_sums(rounds: int, *, seed: int = 1, max_area_px: int | None = MAX_ARE
         max_area_px=max_area_px,
     )
     leaves = rng.normal(0, 1, (rounds, 2)).astype(np.float32)
-    return BoostedSums(pool.table, pool.starts, pool.channels, np.zeros(rounds, np.float32), leaves)
+    return BoostedStumps(pool.table, pool.starts, pool.channels, np.zeros(rounds, np.float32), leaves)
 
 
 def city(width: int, height: int) -> NDArray[np.uint8]:
@@ -143,50 +143,52 @@ def city(width: int, height: int) -> NDArray[np.uint8]:
 def response_speed(image: NDArray[np.uint8]) -> tuple[Speed, Speed]:
     """The paper's dense response against whole rows of int32 at every pixel; and numpy, whose rounds are fewer and
     scaled up."""
-    sums, few = random_sums(_DENSE_ROUNDS), random_sums(_NUMPY_ROUNDS)
+    stumps, few = random_stumps(_DENSE_ROUNDS), random_stumps(_NUMPY_ROUNDS)
     what = f"dense response, {_DENSE_ROUNDS} rounds"
-    fast = _fastest(lambda: dense_response(image, sums), 3)
-    rows = _fastest(lambda: row_response(image, sums), 2)
-    share = len(sums.rectangles) / len(few.rectangles)
-    slow = _fastest(lambda: plain_response(image, few), 1) * share
+    fast = _fastest(lambda: dense_response(image, stumps), 3)
+    rows = _fastest(lambda: row_response(image, stumps), 2)
+    ratio = len(stumps.rectangles) / len(few.rectangles)
+    slow = _fastest(lambda: plain_response(image, few), 1) * ratio
     return Speed(what, "whole rows of int32", fast, rows), Speed(what, "numpy", fast, slow)
 
 
 def train_on_one_frame() -> CascadeDetector:
-    """A detector of the usual size, trained on one labelled frame of another simulated city."""
-    return CascadeDetector.train([simulated_image(_LEARNT_FROM)], CascadeConfig())
+    """A cascade of the usual size, trained on the cars of one frame of another simulated city."""
+    return CascadeDetector.train([simulated_image(_TRAINING_SEED)], CascadeConfig())
 
 
-def network_speed(image: NDArray[np.uint8], detector: Detector) -> Speed:
-    """The network, places that it likes looked at again, beside convolutions of YOLOv8n's sizes on such a frame."""
+def cnn_speed(image: NDArray[np.uint8], detector: Detector) -> Speed:
+    """The CNN with test-time augmentation, beside convolutions of YOLOv8n's sizes on such a frame."""
     fast = _fastest(lambda: detect_frame(image, None, detector), 2)
     peer = 0.0
     for step, taps, into, out in YOLOV8N:
         layout = PaddedBatchLayout(1, image.shape[0] // step, image.shape[1] // step)
         values, weights = np.ones((layout.rows, into), np.float32), np.ones((taps, into, out), np.float32)
         peer += _fastest(partial(conv2d, values, weights, layout), 1)
-    return Speed("the network, shipped", "convolutions of YOLOv8n's sizes", fast, peer)
+    return Speed("the shipped CNN", "convolutions of YOLOv8n's sizes", fast, peer)
 
 
 def cascade_speed(image: NDArray[np.uint8], detector: CascadeDetector, name: str, *, crop_px: int = 96) -> Speed:
-    """Both steps against the second step's classifier at every pixel and turn, of a crop, scaled up.
+    """The cascade against its classifier at every pixel and rotation of a crop, scaled up.
 
-    The surer a detector is, the fewer places it looks at twice.
+    The more confident a detector is, the fewer proposals pass its first stages.
     """
     fast = _fastest(lambda: detect_frame(image, None, detector), 2)
-    look = Look(picture_of(image), detector.sums, detector.record.contrast_floor)
+    scorer = PoseScorer(compute_features(image), detector.classifier, detector.record.contrast_floor)
     spots = np.arange(0, crop_px, _TILE_PX) + _TILE_PX / 2
     tiles = np.stack(np.meshgrid(spots, spots), axis=-1).reshape(-1, 2).astype(np.float64)
     half = offset_grid(_TILE_PX // 2, _TILE_PX // 2)
     offsets = half[(half > -_TILE_PX // 2).all(axis=1)]
-    slow = _fastest(lambda: look.scores(tiles, np.zeros(len(tiles)), np.asarray(_TURNS, np.float64), offsets), 1)
+    slow = _fastest(lambda: scorer.scores(tiles, np.zeros(len(tiles)), np.asarray(_ROTATIONS, np.float64), offsets), 1)
     slow *= image.size / crop_px**2
     rounds = len(detector.record.rounds)
-    return Speed(f"both steps, {name}, {rounds} rounds", f"dense over pixels and {len(_TURNS)} turns", fast, slow)
+    return Speed(
+        f"the cascade, {name}, {rounds} rounds", f"dense over pixels and {len(_ROTATIONS)} rotations", fast, slow
+    )
 
 
 def _fastest(work: Callable[[], object], repeats: int) -> float:
-    """The least of some runs, s of processor time; one before them compiles."""
+    """The fastest of some runs, s of processor time; one before them compiles."""
     work()
     times = []
     for _ in range(repeats):

@@ -1,4 +1,10 @@
-"""AdaBoost over stumps on random rectangle sums (paper: car detection); binned, so that a round is a histogram."""
+"""AdaBoost with decision stumps on integral-image features (Viola and Jones 2001; paper: car detection).
+
+A feature is a signed sum of random rectangles of one channel, as in integral channel features (Dollár 2009). Values are
+binned once, so that a round of boosting is a histogram for each feature. Each round searches a random subset of the
+features, and weights are trimmed (Friedman, Hastie and Tibshirani 2000). Hand-written: scikit-learn would be another
+dependency, and its AdaBoost sorts unbinned values for every stump.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,25 +13,25 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from schemas.arrays import ByteArray, Float32Array, FloatArray, IntArray
+from schemas.arrays import ByteArray, Float32Array, FloatArray, IntArray, Mask
 from schemas.detector import Round
 
 Int32s = NDArray[np.int32]
 
 N_BINS = 64
-ROUND_POOL = 700
-"""Features that a round chooses from, drawn anew each round: as good as all, at a fraction of the cost."""
+FEATURES_PER_ROUND = 700
+"""Features that a round searches, drawn at random: as accurate as all of them, at a fraction of the cost."""
 _TRIM_EVERY, _TRIMMED_WEIGHT = 10, 0.01
 
 
 @dataclass(frozen=True)
-class RectanglePool:
-    """Random features: each a channel and some positive and negative rectangles.
+class FeaturePool:
+    """Random features: for each a channel and some positive and negative rectangles.
 
     Attributes
     ----------
     table : (r, 5) int32: sign, x0, y0, x1, y1 from the centre.
-    starts : (features + 1,) int32.
+    starts : (features + 1,) int32: the rectangles of feature k are ``starts[k]:starts[k + 1]``.
     channels : (features,) int32.
     """
 
@@ -37,7 +43,7 @@ class RectanglePool:
         return len(self.channels)
 
 
-def random_pool(
+def draw_feature_pool(
     count: int,
     *,
     channels: int,
@@ -46,31 +52,31 @@ def random_pool(
     max_rectangles: int,
     rng: np.random.Generator,
     max_area_px: int | None = None,
-) -> RectanglePool:
-    """Features of 1 to ``max_rectangles`` rectangles of either sign, corners Gaussian about the centre.
+) -> FeaturePool:
+    """Draw features of 1 to ``max_rectangles`` rectangles of either sign, their corners Gaussian about the centre.
 
-    ``max_area_px``: those of one sign cover no more than this together, counted as often as they do.
+    ``max_area_px`` bounds the summed area of the rectangles of one sign.
     """
     table: list[tuple[int, int, int, int, int]] = []
     starts, chosen = [0], []
 
-    def of_sign(sign: int) -> list[tuple[int, int, int, int, int]]:
+    def draw_rectangles(sign: int) -> list[tuple[int, int, int, int, int]]:
         drawn = []
         for _ in range(int(rng.integers(1, max_rectangles + 1))):
-            x0, x1 = _interval(sigma_xy_px[0], reach_xy_px[0], rng)
-            y0, y1 = _interval(sigma_xy_px[1], reach_xy_px[1], rng)
+            x0, x1 = _draw_interval(sigma_xy_px[0], reach_xy_px[0], rng)
+            y0, y1 = _draw_interval(sigma_xy_px[1], reach_xy_px[1], rng)
             drawn.append((sign, x0, y0, x1, y1))
         fits = max_area_px is None or sum((x1 - x0) * (y1 - y0) for _, x0, y0, x1, y1 in drawn) <= max_area_px
-        return drawn if fits else of_sign(sign)
+        return drawn if fits else draw_rectangles(sign)
 
     for _ in range(count):
-        table += of_sign(1) + of_sign(-1)
+        table += draw_rectangles(1) + draw_rectangles(-1)
         starts.append(len(table))
         chosen.append(int(rng.integers(channels)))
-    return RectanglePool(np.array(table, np.int32), np.array(starts, np.int32), np.array(chosen, np.int32))
+    return FeaturePool(np.array(table, np.int32), np.array(starts, np.int32), np.array(chosen, np.int32))
 
 
-def _interval(sigma: float, reach: int, rng: np.random.Generator) -> tuple[int, int]:
+def _draw_interval(sigma: float, reach: int, rng: np.random.Generator) -> tuple[int, int]:
     while True:
         low, high = sorted(int(v) for v in np.rint(np.clip(rng.normal(0, sigma, 2), -reach, reach)))
         if high > low:
@@ -78,86 +84,92 @@ def _interval(sigma: float, reach: int, rng: np.random.Generator) -> tuple[int, 
 
 
 @dataclass(frozen=True)
-class Stumps:
-    """The rounds of a training: which feature, its threshold, what is said at or below and above it."""
+class StumpSelection:
+    """The stumps of a training: for each round the feature, its threshold, and the leaves at or below and above it.
+
+    Attributes
+    ----------
+    features, thresholds : (rounds,) int64 indices into the pool, float32.
+    leaves : (rounds, 2) float32.
+    """
 
     features: IntArray
-    thresholds: NDArray[np.float32]
-    leaves: NDArray[np.float32]
+    thresholds: Float32Array
+    leaves: Float32Array
 
 
 def boost(
     bins: ByteArray,
     edges: Float32Array,
-    is_car: NDArray[np.bool_],
+    is_car: Mask,
     *,
     rounds: int,
     car_fraction: float,
     rng: np.random.Generator,
     shrinkage: float = 1.0,
-) -> Stumps:
-    """Train.
+) -> StumpSelection:
+    """Train a boosted classifier (real AdaBoost: leaves are half the log odds of the weights).
 
     Parameters
     ----------
     bins
-        (features, samples) uint8: which bin each value falls in (`binned`).
+        (features, samples) uint8: the bin of each value (`assign_bins`).
     edges
         (features, bins - 1) float32 between the bins.
     is_car
-        (samples,) bool.
+        (samples,): positive samples.
     car_fraction
-        Weight of all cars together at the start. Paper: 15 % of the samples.
+        Summed initial weight of the positive samples. Paper: they are 15 % of the samples.
     rng
-        Chooses each round's features: the same seed, the same detector.
+        Draws the features of each round: the same seed gives the same detector.
     shrinkage
-        Share of what AdaBoost would say that a round does say. Paper: 1.
+        Factor of the leaves (learning rate). Paper: 1.
     """
-    weights = _start_weights(is_car, car_fraction)
-    smallest = 0.5 / len(is_car)
+    weights = _initial_weights(is_car, car_fraction)
+    smoothing = 0.5 / len(is_car)
     cars, others = np.flatnonzero(is_car), np.flatnonzero(~is_car)
     features, thresholds, leaves = [], [], []
     for k in range(rounds):
         if k % _TRIM_EVERY == 0:
-            active_cars, active_others = _that_matter(weights, cars), _that_matter(weights, others)
-        chosen = np.sort(rng.choice(len(bins), min(ROUND_POOL, len(bins)), replace=False))
-        feature, edge = _best_stump(bins, weights, active_cars, active_others, chosen)
+            active_cars, active_others = _trim(weights, cars), _trim(weights, others)
+        searched = np.sort(rng.choice(len(bins), min(FEATURES_PER_ROUND, len(bins)), replace=False))
+        feature, edge = _best_stump(bins, weights, active_cars, active_others, searched)
         above = bins[feature] > edge
-        said = [
+        low_high = [
             shrinkage
             * 0.5
-            * np.log((weights[part & is_car].sum() + smallest) / (weights[part & ~is_car].sum() + smallest))
-            for part in (~above, above)
+            * np.log((weights[side & is_car].sum() + smoothing) / (weights[side & ~is_car].sum() + smoothing))
+            for side in (~above, above)
         ]
-        leaf = np.where(above, said[1], said[0])
+        leaf = np.where(above, low_high[1], low_high[0])
         weights = weights * np.exp(np.where(is_car, -leaf, leaf))
         weights /= weights.sum()
         features.append(feature)
         thresholds.append(edges[feature, edge])
-        leaves.append(said)
-    return Stumps(np.array(features, np.int64), np.array(thresholds, np.float32), np.array(leaves, np.float32))
+        leaves.append(low_high)
+    return StumpSelection(np.array(features, np.int64), np.array(thresholds, np.float32), np.array(leaves, np.float32))
 
 
-def _start_weights(is_car: NDArray[np.bool_], car_fraction: float) -> FloatArray:
-    """Weights of the samples before the first round: all cars together weigh ``car_fraction``."""
+def _initial_weights(is_car: Mask, car_fraction: float) -> FloatArray:
+    """Weights of the samples before the first round; those of the cars sum to ``car_fraction``."""
     weights = np.where(is_car, car_fraction / is_car.sum(), (1 - car_fraction) / (~is_car).sum())
-    return np.asarray(weights / weights.sum())  # one but for rounding, which decides between stumps that are alike
+    return np.asarray(weights / weights.sum())  # one but for rounding, which decides between stumps of equal loss
 
 
-def _that_matter(weights: FloatArray, rows: IntArray) -> IntArray:
-    """Rows without the lightest, which together weigh next to nothing: three times fewer, the same stumps."""
+def _trim(weights: FloatArray, rows: IntArray) -> IntArray:
+    """Rows without the lightest, whose summed weight is next to nothing: three times fewer, the same stumps."""
     order = rows[np.argsort(weights[rows], kind="stable")]
     weight = np.cumsum(weights[order])
     return np.sort(order[np.searchsorted(weight, _TRIMMED_WEIGHT * weight[-1]) :])
 
 
-def bin_edges(values: Float32Array) -> Float32Array:
-    """(features, bins - 1) edges from values (features, samples): as many samples in each bin."""
+def quantile_bin_edges(values: Float32Array) -> Float32Array:
+    """(features, bins - 1) edges of values (features, samples), with equally many samples in each bin."""
     return np.asarray(np.quantile(values, np.linspace(0, 1, N_BINS + 1)[1:-1], axis=1).T, np.float32)
 
 
 @njit(cache=True, nogil=True)
-def binned(values, edges):  # type: ignore[no-untyped-def]
+def assign_bins(values, edges):  # type: ignore[no-untyped-def]
     """(features, samples) uint8 bins of values (features, samples)."""
     bins = np.empty(values.shape, np.uint8)
     for f in range(values.shape[0]):
@@ -174,13 +186,13 @@ def binned(values, edges):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _best_stump(bins, weights, cars, others, chosen):  # type: ignore[no-untyped-def]
-    """The feature, of those chosen, and bin edge of least exponential loss."""
-    best_loss, best_feature, best_edge = np.inf, chosen[0], 0
+def _best_stump(bins, weights, cars, others, searched):  # type: ignore[no-untyped-def]
+    """The feature, of those searched, and the bin edge with the lowest exponential loss."""
+    best_loss, best_feature, best_edge = np.inf, searched[0], 0
     car, other = np.zeros(256), np.zeros(256)
     car_weights, other_weights = weights[cars], weights[others]
     all_car, all_other = car_weights.sum(), other_weights.sum()
-    for f in chosen:
+    for f in searched:
         car[:] = 0
         other[:] = 0
         row = bins[f]
@@ -199,7 +211,7 @@ def _best_stump(bins, weights, cars, others, chosen):  # type: ignore[no-untyped
     return best_feature, best_edge
 
 
-def rounds_of(pool: RectanglePool, stumps: Stumps) -> tuple[Round, ...]:
+def rounds_from_stumps(pool: FeaturePool, stumps: StumpSelection) -> tuple[Round, ...]:
     """The rounds as a detector's record holds them."""
     rounds = []
     for feature, threshold, (low, high) in zip(stumps.features, stumps.thresholds, stumps.leaves, strict=True):
@@ -217,39 +229,39 @@ def rounds_of(pool: RectanglePool, stumps: Stumps) -> tuple[Round, ...]:
 
 
 @dataclass(frozen=True)
-class BoostedSums:
-    """Rounds of boosting as arrays, for the kernels.
+class BoostedStumps:
+    """A boosted classifier as arrays, for the kernels.
 
     Attributes
     ----------
     rectangles
         (r, 5) int32: sign, x0, y0, x1, y1 from the centre.
     starts
-        (rounds + 1,) int32: rectangles of round k are ``starts[k]:starts[k + 1]``.
+        (rounds + 1,) int32: the rectangles of round k are ``starts[k]:starts[k + 1]``.
     channels
         (rounds,) int32.
     thresholds, leaves
-        (rounds,) and (rounds, 2) float32: what is said at or below, and above.
+        (rounds,) and (rounds, 2) float32: what a round adds to the score at or below its threshold, and above.
     """
 
-    rectangles: NDArray[np.int32]
-    starts: NDArray[np.int32]
-    channels: NDArray[np.int32]
-    thresholds: NDArray[np.float32]
-    leaves: NDArray[np.float32]
+    rectangles: Int32s
+    starts: Int32s
+    channels: Int32s
+    thresholds: Float32Array
+    leaves: Float32Array
+
+    @classmethod
+    def from_rounds(cls, rounds: Sequence[Round]) -> "BoostedStumps":
+        """Of a detector's record."""
+        table = [(r.sign, r.x0, r.y0, r.x1, r.y1) for one in rounds for r in one.rectangles]
+        starts = np.cumsum([0, *(len(one.rectangles) for one in rounds)])
+        return cls(
+            rectangles=np.array(table, np.int32).reshape(-1, 5),
+            starts=starts.astype(np.int32),
+            channels=np.array([one.channel for one in rounds], np.int32),
+            thresholds=np.array([one.threshold for one in rounds], np.float32),
+            leaves=np.array([(one.leaf_low, one.leaf_high) for one in rounds], np.float32),
+        )
 
     def __len__(self) -> int:
         return len(self.thresholds)
-
-
-def sums_of(rounds: Sequence[Round]) -> BoostedSums:
-    """Rounds as arrays."""
-    table = [(r.sign, r.x0, r.y0, r.x1, r.y1) for one in rounds for r in one.rectangles]
-    starts = np.cumsum([0, *(len(one.rectangles) for one in rounds)])
-    return BoostedSums(
-        rectangles=np.array(table, np.int32).reshape(-1, 5),
-        starts=starts.astype(np.int32),
-        channels=np.array([one.channel for one in rounds], np.int32),
-        thresholds=np.array([one.threshold for one in rounds], np.float32),
-        leaves=np.array([(one.leaf_low, one.leaf_high) for one in rounds], np.float32),
-    )

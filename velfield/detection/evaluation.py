@@ -1,49 +1,50 @@
-"""Evaluation on cars held out of training, in spatial folds: precision and recall, and the score threshold."""
+"""Evaluation on labelled cars held out of training, in spatial folds: precision, recall, and the score threshold."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray, Mask
+from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.detector import PrecisionRecallCurve
 from velfield.detection.samples import LabelledImage
 
-FOLD_MIN_CARS = 16
-"""With fewer marked cars none are left out to choose T."""
+MIN_CARS_FOR_FOLDS = 16
+"""With fewer labelled cars none are held out to choose the score threshold."""
 MATCH_PX = 8.0
-"""A find this near to a car's middle is that car, working px: half its length."""
+"""A detection this near to a car's centre is that car, working px: half its length."""
 MIN_CURVE_SCORE = -0.25
 """Detections with a lower score are false at any precision that is of use."""
 FOLDS_DESCRIPTION = "cars in held-out stripes of the images, detected by detectors trained on the other stripes"
 _CURVE_POINTS = 400
-_KEPT_RECALL = 0.95
+_RECALL_FRACTION = 0.95
+"""Of the recall at the lowest score: the operating point where labels are incomplete, so that precision is unknown."""
 _BETA = 0.8
-"""Precision counts half as much again: the field wants few wrong tracks; but detectors tried on cars that were left out
-are worse than the one that learnt from all."""
-_AS_GOOD = 0.985
+"""Recall counts less than precision, since false tracks harm the field more than missed ones; and not by more, since
+detectors that were trained without the held-out cars are worse than the one trained on all of them."""
+_PLATEAU = 0.985
+"""Fraction of the best F measure that is nearly as good: of a few dozen cars one more or less moves the peak far."""
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """What a detector said where it was not trained.
+class HeldOutScores:
+    """Detections on images, or regions of them, that a detector was not trained on.
 
     Attributes
     ----------
-    score, right : (n,) of each find, and whether it is a marked car.
-    cars : how many cars there were to be found.
-    complete : whether what is not marked is no car.
+    score, correct : (n,) of each detection, and whether it is matched to a labelled car.
+    car_count : labelled cars there.
+    complete : whether every car is labelled, so that an unmatched detection is a false positive.
     """
 
     score: FloatArray
-    right: Mask
-    cars: int
+    correct: Mask
+    car_count: int
     complete: bool
 
 
-def stripes(sample: LabelledImage, fold: int, folds: int) -> Mask:
-    """(h, w) the two stripes across the longer side that a fold leaves out: with as many cars in each."""
+def spatial_fold(sample: LabelledImage, fold: int, folds: int) -> Mask:
+    """Region (h, w) that a fold holds out: two stripes across the longer side, each with as many cars as the others."""
     height, width = sample.image.shape
     axis, count = 0 if width >= height else 1, 2 * folds
     borders = np.quantile(sample.cars[:, axis], np.arange(1, count) / count) if len(sample.cars) else np.empty(0)
@@ -52,61 +53,69 @@ def stripes(sample: LabelledImage, fold: int, folds: int) -> Mask:
     return np.broadcast_to(inside if axis == 0 else inside[:, None], (height, width))
 
 
-def matched(found: FloatArray, cars: FloatArray) -> Mask:
-    """Whether each find, the best first, is the first on a car."""
+def match_greedy(detections: FloatArray, cars: FloatArray) -> Mask:
+    """Whether each detection (n, 2...), the best first, is a true positive: each takes the nearest car that is free."""
     taken = np.zeros(len(cars), bool)
-    right = np.zeros(len(found), bool)
-    for k in range(len(found)):
-        gap = np.hypot(cars[:, 0] - found[k, 0], cars[:, 1] - found[k, 1])
+    correct = np.zeros(len(detections), bool)
+    for k in range(len(detections)):
+        gap = np.hypot(cars[:, 0] - detections[k, 0], cars[:, 1] - detections[k, 1])
         gap[taken] = np.inf
         if len(cars) and gap.min() < MATCH_PX:
-            taken[gap.argmin()] = right[k] = True
-    return right
+            taken[gap.argmin()] = correct[k] = True
+    return correct
 
 
-def joined(parts: Sequence[Evidence]) -> Evidence:
-    """Evidence of several parts together."""
-    return Evidence(
+def merge_scores(parts: Sequence[HeldOutScores]) -> HeldOutScores:
+    """The detections of several images or folds together."""
+    return HeldOutScores(
         score=np.concatenate([part.score for part in parts]),
-        right=np.concatenate([part.right for part in parts]),
-        cars=sum(part.cars for part in parts),
+        correct=np.concatenate([part.correct for part in parts]),
+        car_count=sum(part.car_count for part in parts),
         complete=all(part.complete for part in parts),
     )
 
 
-def curve_of(evidence: Evidence, description: str) -> PrecisionRecallCurve | None:
-    """Precision and recall against the threshold; the operating point is the middle of where they are best together.
+def precision_recall_curve(scores: HeldOutScores, description: str) -> PrecisionRecallCurve | None:
+    """Precision and recall against the score threshold; the operating point is the median of the plateau of F0.8.
 
-    ``description``: which cars these are, for people.
+    Parameters
+    ----------
+    description
+        Which cars these are, for people.
+
+    Returns
+    -------
+    None where no car was detected.
     """
-    if not evidence.right.any():
+    if not scores.correct.any():
         return None
-    order = np.argsort(-evidence.score, kind="stable")
-    score, right = evidence.score[order], evidence.right[order]
-    found = np.cumsum(right)
-    precision, recall = found / np.arange(1, len(found) + 1), found / evidence.cars
-    # Of a few dozen cars one more or less moves the peak far; the middle of all that is nearly as good stays.
-    best = int(np.median(nearly_best(precision, recall, beta=_BETA)))
-    if not evidence.complete:
-        best = int(np.searchsorted(recall, _KEPT_RECALL * recall[-1]))
-    return thinned_curve(precision, recall, score, best, f"{evidence.cars} {description}")
+    order = np.argsort(-scores.score, kind="stable")
+    threshold, correct = scores.score[order], scores.correct[order]
+    true_positives = np.cumsum(correct)
+    precision = true_positives / np.arange(1, len(true_positives) + 1)
+    recall = true_positives / scores.car_count
+    best = int(np.median(f_measure_plateau(precision, recall, beta=_BETA)))
+    if not scores.complete:
+        best = int(np.searchsorted(recall, _RECALL_FRACTION * recall[-1]))
+    return to_curve_record(precision, recall, threshold, best, f"{scores.car_count} {description}")
 
 
-def thinned_curve(
-    precision: FloatArray, recall: FloatArray, threshold: FloatArray, chosen: int, description: str
+def to_curve_record(
+    precision: FloatArray, recall: FloatArray, threshold: FloatArray, operating_point: int, description: str
 ) -> PrecisionRecallCurve:
-    """For a detector file: some points of a curve (n,) by falling threshold, the chosen one among them."""
-    kept = np.unique(np.r_[np.linspace(0, len(threshold) - 1, min(_CURVE_POINTS, len(threshold))).astype(int), chosen])
+    """For a detector file: a subset of the points of a curve (n,) by falling threshold, the operating point in it."""
+    points = np.linspace(0, len(threshold) - 1, min(_CURVE_POINTS, len(threshold))).astype(int)
+    kept = np.unique(np.r_[points, operating_point])
     return PrecisionRecallCurve(
         recall=tuple(np.round(recall[kept], 4).tolist()),
         precision=tuple(np.round(precision[kept], 4).tolist()),
         threshold=tuple(np.round(threshold[kept], 4).tolist()),
-        operating_point=int(np.searchsorted(kept, chosen)),
+        operating_point=int(np.searchsorted(kept, operating_point)),
         description=description,
     )
 
 
-def nearly_best(precision: FloatArray, recall: FloatArray, *, beta: float) -> NDArray[np.int64]:
-    """Where on a curve, by falling threshold, the F measure, recall weighed ``beta`` times, is all but greatest."""
-    merit = (1 + beta**2) * precision * recall / np.maximum(beta**2 * precision + recall, 1e-9)
-    return np.flatnonzero(merit > _AS_GOOD * merit.max())
+def f_measure_plateau(precision: FloatArray, recall: FloatArray, *, beta: float) -> IntArray:
+    """Indices of a curve at which the F measure, recall weighted by ``beta``, is nearly its maximum."""
+    f_measure = (1 + beta**2) * precision * recall / np.maximum(beta**2 * precision + recall, 1e-9)
+    return np.flatnonzero(f_measure > _PLATEAU * f_measure.max())

@@ -1,17 +1,33 @@
-"""The axis of what stands at a place, from the structure tensor of the picture: three blurs and a lookup."""
+"""Orientations (axial: an axis without a front) from the image: structure tensor, outlines of labelled cars.
+
+The structure tensor gives the main direction of the gradients at every pixel. It is misled by windscreens, which lie
+across the car, and by parked neighbours. For a labelled car without an orientation the gradients across the sides and
+ends of a rectangle of its size are compared at each candidate angle instead: a template match of the outline.
+"""
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray
+from schemas.arrays import Float32Array, FloatArray, GreyImage
 
 GRADIENT_SIGMA_PX = 0.8
 WINDOW_SIGMA_PX = 3.0
+CAR_ASPECT = 0.45
+"""A usual car's width over its length."""
+_USUAL_LENGTH_PX = 16.0
+_CANDIDATES = np.radians(np.arange(0, 180, 3.0))
+_BOX_SD_RAD = 0.2
+"""Standard deviation of the angle that an upright box about a rotated car gives."""
+_OUTLINE_SIGMA_PX = 1.0
+_ALONG = np.linspace(-0.4, 0.4, 9)
+"""Sampled part of a side, in lengths from its middle: the corners are round."""
+_SIZES = (0.85, 1.0, 1.15)
+_END_WEIGHT = 0.5
+"""Bumpers are shorter than sides, and a windscreen's edge is as sharp."""
 
 
-def structure_axis(image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Axis and coherence at every pixel.
+def structure_tensor_axis(image: GreyImage) -> tuple[Float32Array, Float32Array]:
+    """Axis and coherence of the structure tensor at every pixel.
 
     Returns
     -------
@@ -20,14 +36,14 @@ def structure_axis(image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArr
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), GRADIENT_SIGMA_PX)
     gx, gy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
     xx, yy, xy = (cv2.GaussianBlur(g, (0, 0), WINDOW_SIGMA_PX) for g in (gx * gx, gy * gy, gx * gy))
-    # The gradient stands across the axis: a quarter turn from the tensor's main direction.
+    # Edges run at a right angle to the main direction of the gradients.
     axis = 0.5 * np.arctan2(2 * xy, xx - yy) + np.pi / 2
     coherence = np.sqrt((xx - yy) ** 2 + 4 * xy**2) / np.maximum(xx + yy, 1e-6)
     return np.mod(axis, np.pi).astype(np.float32), coherence.astype(np.float32)
 
 
-def at_places(values: NDArray[np.float32], xy: FloatArray) -> FloatArray:
-    """Values of a picture at the nearest pixels to (n, 2) places."""
+def sample_nearest(values: Float32Array, xy: FloatArray) -> FloatArray:
+    """Values (h, w) at the pixels nearest to positions (n, 2)."""
     x = np.clip(np.rint(xy[:, 0]), 0, values.shape[1] - 1).astype(np.int64)
     y = np.clip(np.rint(xy[:, 1]), 0, values.shape[0] - 1).astype(np.int64)
     return np.asarray(values[y, x], np.float64)
@@ -44,59 +60,49 @@ def axial_difference(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(np.abs((a - b + np.pi / 2) % np.pi - np.pi / 2))
 
 
-CAR_ASPECT = 0.45
-"""A usual car's width over its length."""
-_USUAL_LENGTH_PX = 16.0
-_TRIED = np.radians(np.arange(0, 180, 3.0))
-_SHAPE_SD_RAD = 0.2
-_SIGMA_PX = 1.0
-_ALONG = np.linspace(-0.4, 0.4, 9)
-"""Of a side so much is looked at: the corners are round."""
-_SIZES = (0.85, 1.0, 1.15)
-_ENDS = 0.5
-"""Bumpers are shorter than sides, and a windscreen's edge is as sharp."""
+def fill_missing_orientation(
+    image: GreyImage, cars: FloatArray, abs_box_angle_rad: FloatArray | None = None
+) -> FloatArray:
+    """Labelled cars with every orientation finite: the missing ones by the best outline.
 
+    On the labelled cars of songdo 0.92 of them are within 30 degrees, of KIT AIS 0.96, of simulated cities 0.76 (by the
+    structure tensor 0.60, 0.83 and 0.47), and with a box 0.95 to 1.00.
 
-def with_axes(image: NDArray[np.uint8], cars: FloatArray, tilts: FloatArray | None = None) -> FloatArray:
-    """Cars (n, 5) as x, y, axis, length, width, working px, with every axis finite.
-
-    An upright box about a turned rectangle tells the angle but for its sign: ``tilts`` (n,), NaN where there was none.
-    The outline in the picture tells the sign, and all where there is no box. (The structure tensor is misled by
-    windscreens, which lie across, and by parked neighbours: of the marked cars of songdo it has .60 within 30 degrees,
-    of KIT AIS .83, of simulated cities .47; the outline .92, .96 and .76, and with a box .95 to 1.00.)
+    Parameters
+    ----------
+    cars
+        (n, 5): x, y, orientation, length, width, working px, NaN where the label has none.
+    abs_box_angle_rad
+        (n,) |angle| to the rows from an upright box, which leaves the sign open; NaN where there is no box.
     """
     cars = cars.copy()
     unknown = np.flatnonzero(~np.isfinite(cars[:, 2]))
     if not unknown.size:
         return cars
-    evidence = _outlines(image, cars[unknown])
-    if tilts is not None:
-        upright = np.minimum(_TRIED, np.pi - _TRIED)
-        evidence -= np.nan_to_num(0.5 * ((upright - tilts[unknown, None]) / _SHAPE_SD_RAD) ** 2)
-    cars[unknown, 2] = _TRIED[evidence.argmax(axis=1)]
+    score = _outline_scores(image, cars[unknown])
+    if abs_box_angle_rad is not None:
+        candidates = np.minimum(_CANDIDATES, np.pi - _CANDIDATES)
+        score -= np.nan_to_num(0.5 * ((candidates - abs_box_angle_rad[unknown, None]) / _BOX_SD_RAD) ** 2)
+    cars[unknown, 2] = _CANDIDATES[score.argmax(axis=1)]
     return cars
 
 
-def _outlines(image: NDArray[np.uint8], cars: FloatArray) -> FloatArray:
-    """How much a car's outline is seen at each of the axes tried (n, tried), by its best one."""
-    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _SIGMA_PX)
-    slopes = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
+def _outline_scores(image: GreyImage, cars: FloatArray) -> FloatArray:
+    """Gradient across the outline at each candidate angle (n, candidates), as a fraction of the best one."""
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _OUTLINE_SIGMA_PX)
+    gradient = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
     length = np.where(np.isfinite(cars[:, 3]), cars[:, 3], _USUAL_LENGTH_PX)
     width = np.where(np.isfinite(cars[:, 4]), cars[:, 4], CAR_ASPECT * length)
-    sides = _pair_of_sides(slopes, cars[:, :2], _TRIED, length, width)
-    ends = _pair_of_sides(slopes, cars[:, :2], _TRIED + np.pi / 2, width, length)
-    seen = sides + _ENDS * ends
-    return np.asarray(seen / np.maximum(seen.max(axis=1, keepdims=True), 1e-6))
+    sides = _gradient_across_edges(gradient, cars[:, :2], _CANDIDATES, length, width)
+    ends = _gradient_across_edges(gradient, cars[:, :2], _CANDIDATES + np.pi / 2, width, length)
+    score = sides + _END_WEIGHT * ends
+    return np.asarray(score / np.maximum(score.max(axis=1, keepdims=True), 1e-6))
 
 
-def _pair_of_sides(
-    slopes: tuple[NDArray[np.float32], NDArray[np.float32]],
-    xy: FloatArray,
-    angles: FloatArray,
-    length: FloatArray,
-    gap: FloatArray,
+def _gradient_across_edges(
+    gradient: tuple[Float32Array, Float32Array], xy: FloatArray, angles: FloatArray, length: FloatArray, gap: FloatArray
 ) -> FloatArray:
-    """The slope across two parallel sides (n, angles), so long and so far apart (n,), at their best distance."""
+    """Mean gradient across two parallel edges (n, angles) of a length and a gap (n,), each at its best distance."""
     n, c, s = len(xy), np.cos(angles)[:, None], np.sin(angles)[:, None]
     along = length[:, None, None] * _ALONG
     total = np.zeros((n, len(angles)))
@@ -105,14 +111,14 @@ def _pair_of_sides(
         for size in _SIZES:
             off = (side * size * gap)[:, None, None]
             x, y = xy[:, 0, None, None] + along * c - off * s, xy[:, 1, None, None] + along * s + off * c
-            gx, gy = (_looked_up(slope, x, y) for slope in slopes)
+            gx, gy = (_sample_bilinear(component, x, y) for component in gradient)
             best = np.maximum(best, np.abs((gy * c - gx * s).mean(axis=2)))
         total += best
     return total
 
 
-def _looked_up(values: NDArray[np.float32], x: FloatArray, y: FloatArray) -> FloatArray:
+def _sample_bilinear(values: Float32Array, x: FloatArray, y: FloatArray) -> FloatArray:
     flat = (len(x), -1)
     maps = x.reshape(flat).astype(np.float32), y.reshape(flat).astype(np.float32)
-    found = cv2.remap(values, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found.reshape(x.shape), np.float64)
+    sampled = cv2.remap(values, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(sampled.reshape(x.shape), np.float64)

@@ -14,17 +14,17 @@ def _no_circles() -> FloatArray:
 
 @dataclass(frozen=True)
 class LabelledImage:
-    """A picture on the working grid and what is known to be a car in it.
+    """An image on the working grid, and the cars that are known in it.
 
     Attributes
     ----------
     image : (h, w) uint8.
-    cars : (n, 5): x, y, orientation, length, width in working px; NaN where it is not told.
-    tilts : (n,) of cars whose orientation is not told |angle| to the rows, NaN where that is not either; none: of none.
-    ignore : (k, 3): x, y, radius of what is neither car nor background.
+    cars : (n, 5): x, y, orientation, length, width in working px; NaN where the label has none.
+    ignore : (k, 3): x, y, radius of objects that are neither car nor background.
     valid : (h, w) bool, none: everywhere.
-    background : (h, w) uint8, none: not known.
-    complete : whether every car is marked, so that all else is background; else what looks like a car may be one.
+    background : (h, w) uint8 temporal median, none: not known.
+    complete : whether every car is labelled, so that all else is background.
+    abs_box_angle_rad : (n,) of cars without an orientation |angle| to the rows, from an upright box; NaN without one.
     """
 
     image: GreyImage
@@ -33,24 +33,24 @@ class LabelledImage:
     valid: Mask | None = None
     background: GreyImage | None = None
     complete: bool = True
-    tilts: FloatArray | None = None
+    abs_box_angle_rad: FloatArray | None = None
 
 
-def within(sample: LabelledImage, region: Mask) -> LabelledImage:
-    """The picture with nothing known outside a region (h, w)."""
-    valid, inside = region if sample.valid is None else region & sample.valid, lies_in(region, sample.cars)
-    tilts = None if sample.tilts is None else sample.tilts[inside]
-    return replace(sample, valid=valid, cars=sample.cars[inside], tilts=tilts)
+def restrict_to_region(sample: LabelledImage, region: Mask) -> LabelledImage:
+    """The image with nothing known outside a region (h, w)."""
+    valid, inside = region if sample.valid is None else region & sample.valid, in_region(region, sample.cars)
+    angles = None if sample.abs_box_angle_rad is None else sample.abs_box_angle_rad[inside]
+    return replace(sample, valid=valid, cars=sample.cars[inside], abs_box_angle_rad=angles)
 
 
-def lies_in(region: Mask, xy: FloatArray) -> Mask:
-    """Whether places (n, 2...) lie in a region (h, w)."""
+def in_region(region: Mask, xy: FloatArray) -> Mask:
+    """Whether positions (n, 2...) lie in a region (h, w)."""
     x, y = (np.clip(np.rint(xy[:, k]), 0, region.shape[1 - k] - 1).astype(np.int64) for k in (0, 1))
     return np.asarray(region[y, x])
 
 
-def distance(xy: FloatArray, cars: FloatArray) -> FloatArray:
-    """From places (n, 2...) to the nearest car."""
+def distance_to_nearest_car(xy: FloatArray, cars: FloatArray) -> FloatArray:
+    """From positions (n, 2...) to the nearest of the cars (m, 2...); infinite without any."""
     if not len(cars):
         return np.full(len(xy), np.inf)
     return np.asarray(KDTree(cars[:, :2]).query(xy[:, :2])[0])

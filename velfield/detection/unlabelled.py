@@ -8,7 +8,7 @@ import numpy as np
 
 from schemas.detector import DetectorConfig
 from velfield.detection.detector import Detector, train_detector
-from velfield.detection.evaluation import thinned_curve
+from velfield.detection.evaluation import to_curve_record
 from velfield.detection.motion.difference import MotionBackground, MotionFrame
 from velfield.detection.motion.evaluation import MotionEvaluation, evaluate_detector, select_bursts
 from velfield.detection.motion.labels import MotionLabels
@@ -82,7 +82,7 @@ def with_motion_threshold(detector: AnyDetector, evaluation: MotionEvaluation) -
     threshold = evaluation.operating_threshold
     if not np.isfinite(threshold):
         return detector
-    curve = thinned_curve(
+    curve = to_curve_record(
         evaluation.precision, evaluation.recall, evaluation.thresholds, evaluation.operating_index, _DESCRIPTION
     )
     return detector.with_threshold(threshold, curve)

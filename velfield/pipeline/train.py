@@ -9,7 +9,7 @@ from schemas.flight import FlightConfig
 from velfield.detection.detector import Detector, train_detector
 from velfield.detection.files import load_detector, shipped_detector
 from velfield.detection.motion.labels import working_scale
-from velfield.detection.review import review_sheet, taken_for_cars
+from velfield.detection.review import collect_tp_fn_fp_crops, contact_sheet
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 from velfield.pipeline.stages.labels import car_length_raw_px, labelled_images
@@ -84,8 +84,8 @@ def write_training(training: Training, out: Path, review: Path | None = None) ->
     else:
         lines.append("too few labelled cars to hold some out: precision and recall are not known; label 16 or more")
     if review is not None:
-        kinds = taken_for_cars(training.detector, training.samples)
-        review.write_bytes(png_bytes(review_sheet(kinds)))
+        kinds = collect_tp_fn_fp_crops(training.detector, training.samples)
+        review.write_bytes(png_bytes(contact_sheet(kinds)))
         counts = ", ".join(f"{len(chips)} {name}" for name, chips in kinds.items())
         lines.append(f"{review}: {counts}")
     return lines

@@ -1,1 +1,1 @@
-"""The boosted cascade: proposals, then a classifier on crops turned to the horizontal."""
+"""The boosted cascade (after Viola and Jones): region proposals, then a classifier of rotated crops."""

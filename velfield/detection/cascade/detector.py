@@ -9,12 +9,12 @@ import numpy as np
 
 from schemas.arrays import GreyImage, Mask
 from schemas.detector import CascadeConfig, CascadeRecord
-from velfield.detection.boosting import BoostedSums, sums_of
-from velfield.detection.cascade.classifier import Look, distinct, find_cars
-from velfield.detection.cascade.feature_image import COARSE, picture_of
+from velfield.detection.boosting import BoostedStumps
+from velfield.detection.cascade.classifier import PoseScorer, classify_proposals, nms_oriented
+from velfield.detection.cascade.feature_image import COARSE, compute_features
 from velfield.detection.cascade.fitting import train_cascade
 from velfield.detection.cascade.long_vehicles import centre_long_vehicles
-from velfield.detection.cascade.proposals import propose
+from velfield.detection.cascade.proposals import propose_regions
 from velfield.detection.cascade.training import CONTRAST_FLOOR
 from velfield.detection.detector import Detections, Detector
 from velfield.detection.orientation import CAR_ASPECT
@@ -25,20 +25,20 @@ from velfield.errors import InputError
 
 @dataclass(frozen=True)
 class CascadeDetector(Detector):
-    """Two stages, each AdaBoost over decision stumps on sums of rectangles."""
+    """Region proposals and their classification, each by AdaBoost with decision stumps on sums of rectangles."""
 
     record: CascadeRecord
     method: ClassVar[str] = "cascade"
 
     @cached_property
-    def sums(self) -> BoostedSums:
-        """Stage 2: the classifier."""
-        return sums_of(self.record.rounds)
+    def classifier(self) -> BoostedStumps:
+        """The classifier of the proposals."""
+        return BoostedStumps.from_rounds(self.record.rounds)
 
     @cached_property
-    def proposer_sums(self) -> BoostedSums:
-        """Stage 1: the proposals' classifier."""
-        return sums_of(self.record.proposer.rounds)
+    def proposer(self) -> BoostedStumps:
+        """The coarse classifier that proposes regions."""
+        return BoostedStumps.from_rounds(self.record.proposer.rounds)
 
     @property
     def uses_background(self) -> bool:
@@ -55,22 +55,22 @@ class CascadeDetector(Detector):
     ) -> Detections:
         """Detect cars: proposals, the classifier on them, non-maximum suppression, long vehicles centred."""
         record, ground = self.record, background if self.uses_background else None
-        places = propose(
-            picture_of(image, ground, COARSE),
+        proposals = propose_regions(
+            compute_features(image, ground, COARSE),
             image.shape,
             valid,
-            self.proposer_sums,
+            self.proposer,
             contrast_floor=record.contrast_floor,
             min_score=record.proposer.min_score,
         )
-        found = find_cars(
-            Look(picture_of(image, ground), self.sums, record.contrast_floor),
-            places,
+        found = classify_proposals(
+            PoseScorer(compute_features(image, ground), self.classifier, record.contrast_floor),
+            proposals,
             min_score=self.threshold if threshold is None else threshold,
             min_stage1_score=record.proposer.min_stage1_score,
         )
         length_px = record.working_car_length_px
-        cars = centre_long_vehicles(image, valid, distinct(found, length_px), length_px)
+        cars = centre_long_vehicles(image, valid, nms_oriented(found, length_px), length_px)
         return Detections.from_rows(cars, np.full(len(cars), length_px * length_px * CAR_ASPECT))
 
     @classmethod

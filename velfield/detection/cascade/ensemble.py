@@ -1,8 +1,8 @@
-"""Several classifiers as one: what detectors that learnt from parts of the marked cars say together.
+"""Ensembles: several boosted classifiers as one, whose score is the mean of theirs.
 
-Of some dozens of marked cars it is half luck what a classifier takes for a sign of one. The detectors that are learnt
-with a part of the cars left out, to choose T, err elsewhere; together they find more and err less than the one that saw
-all.
+With some dozens of labelled cars it is half luck which features a classifier selects. The classifiers of the spatial
+folds, trained to choose the score threshold, make other errors; their mean detects more cars at fewer false positives
+than the one classifier that was trained on all cars.
 """
 
 from collections.abc import Sequence
@@ -12,30 +12,31 @@ import numpy as np
 from schemas.detector import Rectangle, Round
 
 
-def committee_of(members: Sequence[Sequence[Round]]) -> tuple[Round, ...]:
+def build_ensemble(members: Sequence[Sequence[Round]]) -> tuple[Round, ...]:
     """The rounds of a classifier whose score is the mean of its members' scores.
 
-    They are woven, so that the first of them hear every member; a round that several members share, that of a detector
-    which they continue, is one.
+    The members' rounds are interleaved, so that the first ones, by which the cascade rejects candidates, come from
+    every member. A round that several members share, that of a detector which they continue, is merged into one.
 
     Parameters
     ----------
     members
-        Each one's rounds; scores are sums of these divided by the root of their number (`turned.scores_at`).
+        Rounds of each; scores are sums of them divided by the square root of their number
+        (`feature_image.score_poses`).
     """
-    found: dict[tuple[int, tuple[Rectangle, ...], float], list[tuple[float, float, Round]]] = {}
+    by_stump: dict[tuple[int, tuple[Rectangle, ...], float], list[tuple[float, float, Round]]] = {}
     for rounds in members:
         for k, one in enumerate(rounds):
-            seen = found.setdefault((one.channel, one.rectangles, one.threshold), [])
-            seen.append(((k + 0.5) / len(rounds), len(rounds) ** -0.5, one))
-    order = sorted(found.values(), key=lambda seen: float(np.mean([place for place, _, _ in seen])))
-    share = len(order) ** 0.5 / len(members)
+            copies = by_stump.setdefault((one.channel, one.rectangles, one.threshold), [])
+            copies.append(((k + 0.5) / len(rounds), len(rounds) ** -0.5, one))
+    order = sorted(by_stump.values(), key=lambda copies: float(np.mean([position for position, _, _ in copies])))
+    scale = len(order) ** 0.5 / len(members)
     return tuple(
-        seen[0][2].model_copy(
+        copies[0][2].model_copy(
             update={
-                "leaf_low": share * sum(weight * one.leaf_low for _, weight, one in seen),
-                "leaf_high": share * sum(weight * one.leaf_high for _, weight, one in seen),
+                "leaf_low": scale * sum(weight * one.leaf_low for _, weight, one in copies),
+                "leaf_high": scale * sum(weight * one.leaf_high for _, weight, one in copies),
             }
         )
-        for seen in order
+        for copies in order
     )

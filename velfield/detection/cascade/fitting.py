@@ -1,4 +1,9 @@
-"""Training of the cascade as a whole: both stages, spatial folds for the score threshold, the ensemble of the folds."""
+"""Training of the whole cascade: both classifiers, cross-validation by spatial folds for the thresholds, the ensemble.
+
+The cascades of the folds, each trained without some stripes of the images, are evaluated there: precision and recall
+give the score threshold, the scores of the true positives the thresholds at which each stage rejects. Together with the
+cascade of all stripes they then form an ensemble.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,218 +12,224 @@ import numpy as np
 
 from schemas.arrays import FloatArray, Mask
 from schemas.detector import CascadeConfig, CascadeRecord, PrecisionRecallCurve, Proposer, Round
-from velfield.detection.boosting import BoostedSums, sums_of
-from velfield.detection.cascade.classifier import FIRST_ROUNDS, Look, distinct, find_cars
-from velfield.detection.cascade.ensemble import committee_of
-from velfield.detection.cascade.proposals import propose
-from velfield.detection.cascade.scenes import Scene, is_far, part_of, scene_of
-from velfield.detection.cascade.training import CONTRAST_FLOOR, learn_classifier, learn_proposer
+from velfield.detection.boosting import BoostedStumps
+from velfield.detection.cascade.classifier import STAGE1_ROUNDS, PoseScorer, classify_proposals, nms_oriented
+from velfield.detection.cascade.ensemble import build_ensemble
+from velfield.detection.cascade.proposals import propose_regions
+from velfield.detection.cascade.scenes import TrainingScene, is_background, make_scene, restrict_scene
+from velfield.detection.cascade.training import CONTRAST_FLOOR, train_classifier, train_proposer
 from velfield.detection.evaluation import (
-    FOLD_MIN_CARS,
     FOLDS_DESCRIPTION,
     MATCH_PX,
+    MIN_CARS_FOR_FOLDS,
     MIN_CURVE_SCORE,
-    Evidence,
-    curve_of,
-    matched,
-    stripes,
+    HeldOutScores,
+    match_greedy,
+    precision_recall_curve,
+    spatial_fold,
 )
-from velfield.detection.samples import LabelledImage, distance, lies_in
+from velfield.detection.samples import LabelledImage, distance_to_nearest_car, in_region
 from velfield.parallel import parallel_map
 
-_FOLD_SCENES = 3
+_MAX_EVALUATED = 3
 """Images that the folds are evaluated on, spread over those that there are."""
-_UNTRIED_THRESHOLD = 0.15
+_DEFAULT_THRESHOLD = 0.15
 """Score threshold where too few cars are labelled to hold some out: what it came to on most sites."""
-_UNTRIED_CUT = -0.4
-_COMMITTEE_MIN_CARS = 20
-"""With fewer labelled cars the detectors of the folds know too little to be members of an ensemble."""
-_OF_ITS_OWN = 0.56
-"""Fraction of a member's score of a detection held out of its training that is its own error: the mean of an ensemble
-keeps the less of it, the more members it has. Measured on KIT AIS and simulated cities by the threshold."""
-_EARLIER_SAYS = 4
-"""Votes of an earlier detector beside the one of the new: trained on many cars, it is less sure of each."""
-_LOST, _MARGIN = 0.02, 0.1
-"""The rejection thresholds: the fraction of held-out cars that they would lose, and a margin for sites that look
-otherwise."""
+_DEFAULT_REJECTION = -0.4
+_ENSEMBLE_MIN_CARS = 20
+"""With fewer labelled cars the detectors of the folds are too weak to be members of an ensemble."""
+_OWN_ERROR_FRACTION = 0.56
+"""Fraction of a member's score on held-out images that is its own error, of which the mean of an ensemble keeps the
+less, the more members it has. Measured by the score threshold on KIT AIS and simulated cities."""
+_BASE_VOTES = 4
+"""Weight of an earlier cascade in an ensemble with the new one: trained on many cars, its scores are lower."""
+_LOST_FRACTION, _REJECTION_MARGIN = 0.02, 0.1
+"""The thresholds of the stages: fraction of held-out cars that they lose, and a margin for sites that differ."""
+_NMS_LENGTH_PX = 16.0
 _NEAR_PX = 6.0
 
 
 @dataclass(frozen=True)
-class Steps:
-    """Both stages, trained, and the scenes with the cars' axes as the classifier realigned them."""
+class CascadeClassifiers:
+    """The proposer and the classifier, trained, and the scenes with their cars realigned."""
 
     proposer: tuple[Round, ...]
     classifier: tuple[Round, ...]
-    scenes: tuple[Scene, ...]
+    scenes: tuple[TrainingScene, ...]
 
 
 @dataclass(frozen=True)
-class StageEvidence(Evidence):
-    """What a cascade scored where it was not trained, by stage.
+class StageScores(HeldOutScores):
+    """The same, with the scores that the cascade's thresholds are compared to.
 
     Attributes
     ----------
-    proposed, first : (n,) score of each detection by the proposer, and by the first rounds of the classifier.
+    proposal, stage1 : (n,) of each detection by the proposer, and by the first rounds of the classifier.
     """
 
-    proposed: FloatArray
-    first: FloatArray
+    proposal: FloatArray
+    stage1: FloatArray
 
 
 def train_cascade(
-    samples: Sequence[LabelledImage], config: CascadeConfig, earlier: CascadeRecord | None, *, has_background: bool
+    samples: Sequence[LabelledImage], config: CascadeConfig, base: CascadeRecord | None, *, has_background: bool
 ) -> CascadeRecord:
-    """Train a cascade; ``earlier`` votes together with it."""
+    """Train a cascade; with a ``base`` the ensemble of both classifiers."""
     count, channels = sum(len(sample.cars) for sample in samples), 4 if has_background else 3
-    prior = () if earlier is None else earlier.rounds
-    steps = trained([scene_of(sample, has_background) for sample in samples], config, channels, config.seed, prior)
-    evidence = None
-    if count >= FOLD_MIN_CARS:
+    votes = () if base is None else base.rounds
+    scenes = [make_scene(sample, has_background) for sample in samples]
+    cascade = train_stages(scenes, config, channels, config.seed, votes)
+    scores = None
+    if count >= MIN_CARS_FOR_FOLDS:
         complete = all(sample.complete for sample in samples)
         folds = config.folds if complete else 2  # else motion gives the score threshold
-        together = complete and not prior and count >= _COMMITTEE_MIN_CARS
-        others, evidence = _folds(steps.scenes, config, channels, prior, folds=folds, together=together)
-        if together:
-            steps = replace(steps, classifier=committee_of([steps.classifier, *(one.classifier for one in others)]))
-    record = record_of(steps, evidence, config, count)
-    return record if earlier is None else _continuing(record, earlier, config, tried=evidence is not None)
+        as_ensemble = complete and not votes and count >= _ENSEMBLE_MIN_CARS
+        others, scores = _cross_validate(cascade.scenes, config, channels, votes, folds=folds, as_ensemble=as_ensemble)
+        if as_ensemble:
+            members = [cascade.classifier, *(other.classifier for other in others)]
+            cascade = replace(cascade, classifier=build_ensemble(members))
+    record = make_record(cascade, scores, config, count)
+    return record if base is None else _with_base(record, base, config, is_validated=scores is not None)
 
 
-def trained(
-    scenes: Sequence[Scene], config: CascadeConfig, channels: int, seed: int, prior: tuple[Round, ...] = ()
-) -> Steps:
-    """Both stages, trained on scenes; ``prior``: the classifier of an earlier cascade, which votes as well."""
+def train_stages(
+    scenes: Sequence[TrainingScene], config: CascadeConfig, channels: int, seed: int, votes: tuple[Round, ...] = ()
+) -> CascadeClassifiers:
+    """Train the proposer and the classifier; ``votes``: the classifier of an earlier cascade, for an ensemble."""
     rng = np.random.default_rng(seed)
-    proposer = learn_proposer(scenes, config, channels, rng)
-    sums = sums_of(proposer)
+    proposer = train_proposer(scenes, config, channels, rng)
+    stumps = BoostedStumps.from_rounds(proposer)
 
-    def looked_at(scene: Scene) -> Scene:
+    def with_proposals(scene: TrainingScene) -> TrainingScene:
         shape, valid = scene.sample.image.shape, scene.sample.valid
-        places = propose(scene.coarse, shape, valid, sums, contrast_floor=CONTRAST_FLOOR)
-        return replace(scene, places=places[:, :3])
+        proposals = propose_regions(scene.coarse, shape, valid, stumps, contrast_floor=CONTRAST_FLOOR)
+        return replace(scene, proposals=proposals[:, :3])
 
-    classifier, aligned = learn_classifier(parallel_map(looked_at, scenes), config, channels, rng)
-    if prior:
-        classifier = committee_of([classifier, *[prior] * _EARLIER_SAYS])
-    return Steps(proposer, classifier, aligned)
+    classifier, aligned = train_classifier(parallel_map(with_proposals, scenes), config, channels, rng)
+    if votes:
+        classifier = build_ensemble([classifier, *[votes] * _BASE_VOTES])
+    return CascadeClassifiers(proposer, classifier, aligned)
 
 
-def _folds(
-    scenes: Sequence[Scene],
+def _cross_validate(
+    scenes: Sequence[TrainingScene],
     config: CascadeConfig,
     channels: int,
-    prior: tuple[Round, ...],
+    votes: tuple[Round, ...],
     *,
     folds: int,
-    together: bool,
-) -> tuple[list[Steps], StageEvidence]:
-    """Cascades each trained without the stripes of one fold, and their detections there; ``together``: as members of an
-    ensemble with the one of all stripes, each of half the rounds.
+    as_ensemble: bool,
+) -> tuple[list[CascadeClassifiers], StageScores]:
+    """The cascades of the folds, and their detections on the stripes held out.
 
-    The fewer cars are held out at once, the nearer the score threshold is to the best one of the detector of all
-    stripes: detectors of half of 47 cars gave higher scores to what is no car, and the threshold came out so high that
-    a fifth of the cars was lost.
+    As members of an ensemble they have half of the rounds each, and their scores are reduced to those of the ensemble.
+
+    The fewer cars are held out at once, the nearer the score threshold is to the best one of the cascade of all
+    stripes: those of half of 47 cars gave other objects higher scores, and the threshold came out so high that a fifth
+    of the cars was lost.
     """
-    members = folds + 1 if together else 1
-    config = config.model_copy(update={"rounds": max(config.rounds // 2, 1)}) if together else config
-    tried = np.unique(np.linspace(0, len(scenes) - 1, min(_FOLD_SCENES, len(scenes))).round().astype(int))
+    members = folds + 1 if as_ensemble else 1
+    config = config.model_copy(update={"rounds": max(config.rounds // 2, 1)}) if as_ensemble else config
+    evaluated = np.unique(np.linspace(0, len(scenes) - 1, min(_MAX_EVALUATED, len(scenes))).round().astype(int))
 
-    def of_fold(fold: int) -> tuple[Steps, list[StageEvidence]]:
-        seen = [part_of(scene, ~stripes(scene.sample, fold, folds)) for scene in scenes]
-        steps = trained(seen, config, channels, config.seed + 1 + fold, prior)
-        proposer, sums = sums_of(steps.proposer), sums_of(steps.classifier)
-        return steps, [
-            evidence_of_part(scenes[k], stripes(scenes[k].sample, fold, folds), proposer, sums, members=members)
-            for k in tried
+    def train_fold(fold: int) -> tuple[CascadeClassifiers, list[StageScores]]:
+        training = [restrict_scene(scene, ~spatial_fold(scene.sample, fold, folds)) for scene in scenes]
+        cascade = train_stages(training, config, channels, config.seed + 1 + fold, votes)
+        return cascade, [
+            evaluate_region(scenes[k], spatial_fold(scenes[k].sample, fold, folds), cascade, members=members)
+            for k in evaluated
         ]
 
-    found = parallel_map(of_fold, range(folds))
-    evidence = _joined([part for _, parts in found for part in parts])
-    left = 1 - _OF_ITS_OWN * (1 - 1 / members)
-    said = np.where(evidence.score > 0, left * evidence.score, evidence.score)
-    return [steps for steps, _ in found], replace(evidence, score=said)
+    found = parallel_map(train_fold, range(folds))
+    scores = _merge([part for _, parts in found for part in parts])
+    kept = 1 - _OWN_ERROR_FRACTION * (1 - 1 / members)
+    reduced = np.where(scores.score > 0, kept * scores.score, scores.score)
+    return [cascade for cascade, _ in found], replace(scores, score=reduced)
 
 
-def evidence_of_part(
-    scene: Scene, region: Mask, proposer: BoostedSums, sums: BoostedSums, *, members: int = 1
-) -> StageEvidence:
-    """Evaluate a cascade on a region (h, w) of a scene that it was not trained on; one of so many members."""
-    places = propose(
-        scene.coarse, scene.sample.image.shape, scene.sample.valid, proposer, contrast_floor=CONTRAST_FLOOR
-    )
-    places = places[lies_in(region, places)]
-    look = Look(scene.fine, sums, CONTRAST_FLOOR)
-    found = distinct(find_cars(look, places, min_score=MIN_CURVE_SCORE), 16.0)
-    cars = scene.cars[lies_in(region, scene.cars)]
-    counted = is_far(found, scene) | (distance(found, cars) < MATCH_PX)
-    found = found[counted]
-    first = _first_scores(look, found, max(FIRST_ROUNDS // members, 1))
-    return StageEvidence(
-        score=found[:, 3],
-        right=matched(found, cars),
-        cars=len(cars),
+def evaluate_region(
+    scene: TrainingScene, region: Mask, cascade: CascadeClassifiers, *, members: int = 1
+) -> StageScores:
+    """Detections of a cascade on a region (h, w) held out of its training; one of so many members of an ensemble."""
+    shape, valid = scene.sample.image.shape, scene.sample.valid
+    proposer = BoostedStumps.from_rounds(cascade.proposer)
+    proposals = propose_regions(scene.coarse, shape, valid, proposer, contrast_floor=CONTRAST_FLOOR)
+    proposals = proposals[in_region(region, proposals)]
+    scorer = PoseScorer(scene.fine, BoostedStumps.from_rounds(cascade.classifier), CONTRAST_FLOOR)
+    detections = nms_oriented(classify_proposals(scorer, proposals, min_score=MIN_CURVE_SCORE), _NMS_LENGTH_PX)
+    cars = scene.cars[in_region(region, scene.cars)]
+    counted = is_background(detections, scene) | (distance_to_nearest_car(detections, cars) < MATCH_PX)
+    detections = detections[counted]
+    return StageScores(
+        score=detections[:, 3],
+        correct=match_greedy(detections, cars),
+        car_count=len(cars),
         complete=scene.sample.complete,
-        proposed=_best_near(places, found),
-        first=first,
+        proposal=_best_proposal_scores(proposals, detections),
+        stage1=_stage1_scores(scorer, detections, max(STAGE1_ROUNDS // members, 1)),
     )
 
 
-def _joined(parts: Sequence[StageEvidence]) -> StageEvidence:
-    return StageEvidence(
+def _merge(parts: Sequence[StageScores]) -> StageScores:
+    return StageScores(
         score=np.concatenate([part.score for part in parts]),
-        right=np.concatenate([part.right for part in parts]),
-        cars=sum(part.cars for part in parts),
+        correct=np.concatenate([part.correct for part in parts]),
+        car_count=sum(part.car_count for part in parts),
         complete=all(part.complete for part in parts),
-        proposed=np.concatenate([part.proposed for part in parts]),
-        first=np.concatenate([part.first for part in parts]),
+        proposal=np.concatenate([part.proposal for part in parts]),
+        stage1=np.concatenate([part.stage1 for part in parts]),
     )
 
 
-def _best_near(places: FloatArray, found: FloatArray) -> FloatArray:
-    if not len(found):
+def _best_proposal_scores(proposals: FloatArray, detections: FloatArray) -> FloatArray:
+    if not len(detections):
         return np.empty(0)
-    near = np.hypot(found[:, None, 0] - places[:, 0], found[:, None, 1] - places[:, 1]) < _NEAR_PX
-    return np.asarray(np.where(near, places[:, 3], -np.inf).max(axis=1), np.float64)
+    gap = np.hypot(detections[:, None, 0] - proposals[:, 0], detections[:, None, 1] - proposals[:, 1])
+    return np.asarray(np.where(gap < _NEAR_PX, proposals[:, 3], -np.inf).max(axis=1), np.float64)
 
 
-def _first_scores(look: Look, found: FloatArray, rounds: int) -> FloatArray:
-    if not len(found):
+def _stage1_scores(scorer: PoseScorer, detections: FloatArray, rounds: int) -> FloatArray:
+    if not len(detections):
         return np.empty(0)
-    first = look.scores(found[:, :2], found[:, 2], np.zeros(1), np.zeros((1, 2), np.int64), rounds)
-    return np.asarray(first[:, 0, 0], np.float64)
+    scores = scorer.scores(detections[:, :2], detections[:, 2], np.zeros(1), np.zeros((1, 2), np.int64), rounds)
+    return np.asarray(scores[:, 0, 0], np.float64)
 
 
-def cut_of(scores: FloatArray) -> float:
-    """A score that nearly all of these exceed."""
+def rejection_threshold(scores: FloatArray) -> float:
+    """A score that nearly all of these exceed, by a margin."""
     known = scores[np.isfinite(scores)]
-    return float(np.quantile(known, _LOST) - _MARGIN) if len(known) else -1.0
+    return float(np.quantile(known, _LOST_FRACTION) - _REJECTION_MARGIN) if len(known) else -1.0
 
 
-def record_of(steps: Steps, evidence: StageEvidence | None, config: CascadeConfig, count: int) -> CascadeRecord:
-    """The detector's record; the thresholds follow from cars held out of training."""
+def make_record(
+    cascade: CascadeClassifiers, scores: StageScores | None, config: CascadeConfig, count: int
+) -> CascadeRecord:
+    """Content of the detector file; the thresholds follow from held-out scores."""
     curve: PrecisionRecallCurve | None = None
-    threshold, cuts = _UNTRIED_THRESHOLD, (_UNTRIED_CUT, _UNTRIED_CUT)
-    if evidence is not None:
-        curve = curve_of(evidence, FOLDS_DESCRIPTION)
+    threshold, min_score, min_stage1_score = _DEFAULT_THRESHOLD, _DEFAULT_REJECTION, _DEFAULT_REJECTION
+    if scores is not None:
+        curve = precision_recall_curve(scores, FOLDS_DESCRIPTION)
         if curve is not None and curve.operating_point is not None:
             threshold = curve.threshold[curve.operating_point]
-        surely = evidence.right & (evidence.score >= threshold)
-        cuts = cut_of(evidence.proposed[surely]), cut_of(evidence.first[surely])
+        detected = scores.correct & (scores.score >= threshold)
+        min_score = rejection_threshold(scores.proposal[detected])
+        min_stage1_score = rejection_threshold(scores.stage1[detected])
     return CascadeRecord(
         working_car_length_px=config.working_car_length_px,
-        rounds=steps.classifier,
+        rounds=cascade.classifier,
         threshold=float(threshold if config.threshold is None else config.threshold),
         contrast_floor=CONTRAST_FLOOR,
-        proposer=Proposer(rounds=steps.proposer, min_score=cuts[0], min_stage1_score=cuts[1]),
+        proposer=Proposer(rounds=cascade.proposer, min_score=min_score, min_stage1_score=min_stage1_score),
         curve=curve,
         cars=count,
     )
 
 
-def _continuing(record: CascadeRecord, earlier: CascadeRecord, config: CascadeConfig, *, tried: bool) -> CascadeRecord:
-    """The record with the earlier one's attribution; where nothing was held out, the mean threshold by votes."""
-    update: dict[str, object] = {"attribution": earlier.attribution}
-    if not tried and config.threshold is None:
-        update["threshold"] = (_UNTRIED_THRESHOLD + _EARLIER_SAYS * earlier.threshold) / (1 + _EARLIER_SAYS)
+def _with_base(
+    record: CascadeRecord, base: CascadeRecord, config: CascadeConfig, *, is_validated: bool
+) -> CascadeRecord:
+    """The record with the base's attribution; where no car was held out, the mean threshold by votes."""
+    update: dict[str, object] = {"attribution": base.attribution}
+    if not is_validated and config.threshold is None:
+        update["threshold"] = (_DEFAULT_THRESHOLD + _BASE_VOTES * base.threshold) / (1 + _BASE_VOTES)
     return record.model_copy(update=update)

@@ -1,7 +1,8 @@
-"""Kernels of the aligned classifier: turned patches, their integral pictures, rectangle sums over them.
+"""Kernels of the cascade: rotated patches, their integral images, rectangle sums over them.
 
-Sixteen patches go side by side, the innermost axis of every array: a rectangle's corner is then one vector load, and
-what would be a gather is not. Four times as fast a pixel, and twenty times a rectangle, as patch after patch.
+Sixteen patches are interleaved as the innermost axis of every array (structure of arrays), so that the corner of a
+rectangle is one vector load in place of a gather: four times as fast a pixel, and twenty times a rectangle, as patch
+after patch.
 """
 
 import numpy as np
@@ -15,7 +16,7 @@ GRADIENT_ZERO = 512
 
 
 @njit(cache=True, nogil=True)
-def _places(index, stride, x, y, dx, dy):  # type: ignore[no-untyped-def]
+def _pixel_indices(index, stride, x, y, dx, dy):  # type: ignore[no-untyped-def]
     half = np.float32((index.shape[0] - 1) / 2)
     for j in range(index.shape[0]):
         u = np.float32(j) - half
@@ -24,7 +25,7 @@ def _places(index, stride, x, y, dx, dy):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _split(words, c, s, grey, along, across):  # type: ignore[no-untyped-def]
+def _unpack(words, c, s, grey, along, across):  # type: ignore[no-untyped-def]
     zero, ten_bits = np.int32(GRADIENT_ZERO), np.uint32(1023)
     for j in range(words.shape[0]):
         for lane in range(LANES):
@@ -48,7 +49,7 @@ def _accumulate(values, above, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def fill_integrals(packed, difference, stride, poses, channels, out):  # type: ignore[no-untyped-def]
-    """Integral pictures of ``LANES`` turned patches, nearest pixels (measured as good as interpolated ones).
+    """Integral images of ``LANES`` rotated patches, sampled at the nearest pixel (as accurate as interpolated).
 
     ``packed`` (h * w,) uint32: grey, and the gradient in x and y. ``poses`` (8, LANES) float32: x, y of the centre plus
     a half; the step in x and y along the patch, and across it; cosine and sine of the axis. ``out`` (channels,
@@ -68,10 +69,10 @@ def fill_integrals(packed, difference, stride, poses, channels, out):  # type: i
         for lane in range(LANES):
             x[lane] = poses[0, lane] + v * poses[4, lane]
             y[lane] = poses[1, lane] + v * poses[5, lane]
-        _places(index, np.int32(stride), x, y, poses[2], poses[3])
+        _pixel_indices(index, np.int32(stride), x, y, poses[2], poses[3])
         for k in range(flat_index.size):
             flat_words[k] = packed[flat_index[k]]
-        _split(words, poses[6], poses[7], grey, ga, gb)
+        _unpack(words, poses[6], poses[7], grey, ga, gb)
         _accumulate(grey, out[0, i], out[0, i + 1])
         _accumulate(ga, out[1, i], out[1, i + 1])
         _accumulate(gb, out[2, i], out[2, i + 1])
@@ -82,7 +83,7 @@ def fill_integrals(packed, difference, stride, poses, channels, out):  # type: i
 
 
 @njit(cache=True, nogil=True)
-def _rectangles(flat, corners, signs, first, last, base, total):  # type: ignore[no-untyped-def]
+def _rectangle_sums(flat, corners, signs, first, last, base, total):  # type: ignore[no-untyped-def]
     """Signed sums of rectangles, one a lane. Indices are unsigned, which spares numba its check for negative ones."""
     lanes = np.uint64(LANES)
     for lane in range(lanes):
@@ -98,19 +99,19 @@ def _rectangles(flat, corners, signs, first, last, base, total):  # type: ignore
 
 
 @njit(cache=True, nogil=True)
-def _light(flat, window, window_area, plane, base, floor, total, mean, contrast):  # type: ignore[no-untyped-def]
-    """Mean grey of the window about a place, and its mean gradient plus ``floor``."""
+def _normalisation(flat, window, window_area, plane, base, floor, total, mean, contrast):  # type: ignore[no-untyped-def]
+    """Mean grey of the window about a position, and its mean gradient plus ``floor``."""
     ones = np.ones(1, np.int32)
-    share = np.float32(1 / window_area)
-    _rectangles(flat, window, ones, 0, 1, base, total)
+    scale = np.float32(1 / window_area)
+    _rectangle_sums(flat, window, ones, 0, 1, base, total)
     for lane in range(LANES):
-        mean[lane] = np.float32(total[lane]) * share
-    _rectangles(flat, window, ones, 0, 1, base + plane, total)
+        mean[lane] = np.float32(total[lane]) * scale
+    _rectangle_sums(flat, window, ones, 0, 1, base + plane, total)
     for lane in range(LANES):
-        contrast[lane] = np.float32(total[lane]) * share + np.float32(floor)
-    _rectangles(flat, window, ones, 0, 1, base + plane + plane, total)
+        contrast[lane] = np.float32(total[lane]) * scale + np.float32(floor)
+    _rectangle_sums(flat, window, ones, 0, 1, base + plane + plane, total)
     for lane in range(LANES):
-        contrast[lane] += np.float32(total[lane]) * share
+        contrast[lane] += np.float32(total[lane]) * scale
 
 
 @njit(cache=True, nogil=True)
@@ -131,20 +132,20 @@ def score_offsets(  # type: ignore[no-untyped-def]
     rounds,
     out,
 ):
-    """What the first ``rounds`` say, (offsets, LANES), at every offset of ``LANES`` patches."""
+    """Sums of the leaves of the first ``rounds``, (offsets, LANES), at every offset of ``LANES`` patches."""
     total = np.zeros(LANES, np.int32)
     mean, contrast = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
     for m in range(len(bases)):
-        _light(flat, window, window_area, plane, bases[m], floor, total, mean, contrast)
+        _normalisation(flat, window, window_area, plane, bases[m], floor, total, mean, contrast)
         for lane in range(LANES):
             out[m, lane] = 0
         for f in range(rounds):
-            _rectangles(flat, corners, signs, starts[f], starts[f + 1], bases[m] + planes[f], total)
+            _rectangle_sums(flat, corners, signs, starts[f], starts[f + 1], bases[m] + planes[f], total)
             threshold, area = thresholds[f], areas[f]
-            below, above = leaves[f, 0], leaves[f, 1]
+            low, high = leaves[f, 0], leaves[f, 1]
             for lane in range(LANES):
-                least = threshold * contrast[lane] + area * mean[lane]
-                out[m, lane] += above if np.float32(total[lane]) > least else below
+                split = threshold * contrast[lane] + area * mean[lane]
+                out[m, lane] += high if np.float32(total[lane]) > split else low
 
 
 @njit(cache=True, nogil=True)
@@ -152,7 +153,7 @@ def score_poses(  # type: ignore[no-untyped-def]
     packed, difference, stride, poses, floor, window, window_area, corners, signs, starts, planes, areas, thresholds,
     leaves, bases, rounds, integral, out,
 ):  # fmt: skip
-    """Scores (groups, offsets, LANES) of poses (groups, 8, LANES); ``integral`` is room to work in."""
+    """Scores (groups, offsets, LANES) of poses (groups, 8, LANES); ``integral`` is scratch memory."""
     flat = integral.reshape(-1)
     plane = np.uint64(flat.size // integral.shape[0])
     for g in range(len(poses)):
@@ -194,15 +195,15 @@ def feature_values(  # type: ignore[no-untyped-def]
     integral,
     out,
 ):
-    """Values (features, groups, LANES) float32 of every feature at every pose, light and contrast taken out."""
+    """Values (features, groups, LANES) float32 of every feature at every pose, brightness and contrast normalised."""
     flat = integral.reshape(-1)
     plane = np.uint64(flat.size // integral.shape[0])
     total = np.zeros(LANES, np.int32)
     mean, contrast = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
     for g in range(len(poses)):
         fill_integrals(packed, difference, stride, poses[g], integral.shape[0], integral)
-        _light(flat, window, window_area, plane, base, floor, total, mean, contrast)
+        _normalisation(flat, window, window_area, plane, base, floor, total, mean, contrast)
         for f in range(len(planes)):
-            _rectangles(flat, corners, signs, starts[f], starts[f + 1], base + planes[f], total)
+            _rectangle_sums(flat, corners, signs, starts[f], starts[f + 1], base + planes[f], total)
             for lane in range(LANES):
                 out[f, g, lane] = (np.float32(total[lane]) - areas[f] * mean[lane]) / contrast[lane]

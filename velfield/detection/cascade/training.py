@@ -1,179 +1,209 @@
-"""Boosting of the aligned method's two steps: what is wrongly found is learnt again, and so are the cars' axes."""
+"""Training of the cascade's two classifiers: hard-negative mining, realignment of cars labelled without orientation.
+
+Each classifier is boosted a few times. What it detects wrongly is added to the negatives before the next time
+(bootstrapping, Sung and Poggio 1998). The orientation of a car whose label has none is a latent variable: after each
+boosting it is set to the pose of the highest score.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from schemas.arrays import ByteArray, FloatArray
-from schemas.detector import CascadeConfig, Round
-from velfield.detection.boosting import BoostedSums, random_pool, sums_of
-from velfield.detection.cascade.classifier import Look, find_cars, moved, offset_grid
-from velfield.detection.cascade.feature_image import COARSE, FINE, Grain
-from velfield.detection.cascade.feature_matrix import Bank, bank_of
-from velfield.detection.cascade.proposals import propose
-from velfield.detection.cascade.scenes import Poses, Scene, is_far, is_wrong, other_poses, varied
+from schemas.arrays import ByteArray, FloatArray, Mask
+from schemas.detector import CascadeTraining, Round
+from velfield.detection.boosting import BoostedStumps, draw_feature_pool
+from velfield.detection.cascade.classifier import PoseScorer, classify_proposals, offset_along_axis, offset_grid
+from velfield.detection.cascade.feature_image import COARSE, FINE, PatchScale
+from velfield.detection.cascade.feature_matrix import FeatureBinner, fit_feature_binner
+from velfield.detection.cascade.proposals import propose_regions
+from velfield.detection.cascade.scenes import (
+    Poses,
+    TrainingScene,
+    augment_poses,
+    is_background,
+    is_false_positive,
+    sample_negatives,
+)
 from velfield.parallel import parallel_map
 
 CONTRAST_FLOOR = 12.0
-"""Grey levels a px added to the mean gradient, by which sums are divided: what is flat is not blown up."""
-COARSE_ROUNDS = 40
-_COARSE_POOL = 1500
-_COARSE_SIGMA_PX = (3.5, 2.5)
-_COARSE_BESIDE_PX, _COARSE_TURN_RAD = 2.2, 0.28
-"""Half the step between places and turns of the scan: a car that lies so must be liked all the same."""
-_FINE_STAGES = (80, 160)
-"""Rounds before each mining of what is wrongly found."""
-_BESIDE_SD_PX, _TURN_SD_RAD = 0.6, 0.06
-_SIGMA_SHARE_XY = (0.6, 0.4)
-"""Corners lie closer than the paper's: 6 px along and 4 across where the upright ones have 10, measured best."""
-_RECTANGLES = 2
-_CARS, _OTHERS, _MINED = 3000, 9000, 4000
+"""Grey levels a px added to the mean gradient that features are divided by, so that flat regions are not amplified."""
+_PROPOSER_ROUNDS = 40
+_PROPOSER_POOL = 1500
+_PROPOSER_SIGMA_PX = (3.5, 2.5)
+_PROPOSER_JITTER_PX, _PROPOSER_JITTER_RAD = 2.2, 0.28
+"""Half the step between the positions and rotations of the proposals: a car displaced so must be proposed all the
+same."""
+_MINING_ROUNDS = (80, 160)
+"""Rounds of the classifiers whose false positives are mined."""
+_JITTER_SD_PX, _JITTER_SD_RAD = 0.6, 0.06
+_SIGMA_FRACTION_XY = (0.6, 0.4)
+"""Of the configured standard deviation of the corners: 6 px along and 4 across, where the paper's upright features have
+10; measured best."""
+_MAX_RECTANGLES = 2
+_POSITIVES, _NEGATIVES, _MINED = 3000, 9000, 4000
 _CAR_FRACTION = 0.3
 _SHRINKAGE = 0.5
-"""Half of what AdaBoost would say: twice the rounds, and cars that were not seen are found better."""
-_LIKE_A_CAR = 0.25
-"""Quantile of the marked cars' scores above which an unmarked find may be a car that stands."""
-_LOOKED_AT = 6
-"""So many times the places wanted are looked at, the best of each picture: all of six of 5 Mpx took a quarter hour."""
-_WIDE = 20_000.0
-_TURN_PRIOR_RAD = np.radians(20.0)
-_TURN_PRIOR = 0.15
+"""Leaves of half AdaBoost's: twice the rounds, and held-out cars are detected better."""
+_AMBIGUOUS_QUANTILE = 0.25
+"""Of the labelled cars' scores: above it an unlabelled detection may be a stationary car."""
+_MINING_FACTOR = 6
+"""So many times the false positives wanted are scored, the best proposals of each image: all of six images of 5 Mpx
+took a quarter of an hour."""
+_MINING_PER_MEGAPIXEL = 20_000.0
+_REALIGN_ROTATIONS = np.radians(np.arange(-24.0, 25.0, 8.0))
+_REALIGN_OFFSETS = offset_grid(1, 1)
+_ROTATION_PRIOR_RAD = np.radians(20.0)
+_ROTATION_PRIOR = 0.15
 
 
-def learn_proposer(
-    scenes: Sequence[Scene], config: CascadeConfig, channels: int, rng: np.random.Generator
+def train_proposer(
+    scenes: Sequence[TrainingScene], config: CascadeTraining, channels: int, rng: np.random.Generator
 ) -> tuple[Round, ...]:
-    """The coarse classifier of step one."""
-    cars = [_coarse_cars(scene, _copies(scenes), rng) for scene in scenes]
-    others = []
+    """The coarse classifier of the region proposals."""
+    positives = [_proposer_positives(scene, _copies(scenes), rng) for scene in scenes]
+    negatives = []
     for scene in scenes:
-        poses = other_poses(scene, _OTHERS // len(scenes), rng)
-        others.append(poses.where(is_far(poses.rows, scene)))
-    bank = _bank(scenes, COARSE, cars, others, min(config.feature_pool, _COARSE_POOL), _COARSE_SIGMA_PX, channels, rng)
-    known_cars = bank.samples(zip((scene.coarse for scene in scenes), cars, strict=True))
-    known_others = bank.samples(zip((scene.coarse for scene in scenes), others, strict=True))
-    most = _MINED // len(scenes)
+        poses = sample_negatives(scene, _NEGATIVES // len(scenes), rng)
+        negatives.append(poses.where(is_background(poses.rows, scene)))
+    pool_size = min(config.feature_pool, _PROPOSER_POOL)
+    binner = _fit_binner(scenes, COARSE, positives, negatives, pool_size, _PROPOSER_SIGMA_PX, channels, rng)
+    images = [scene.coarse for scene in scenes]
+    positive_bins = binner.bins_of_images(zip(images, positives, strict=True))
+    negative_bins = binner.bins_of_images(zip(images, negatives, strict=True))
+    max_count = _MINED // len(scenes)
     for _ in range(2):
-        sums = sums_of(_boosted(bank, known_cars, known_others, COARSE_ROUNDS, rng))
-        mined = [varied(wrong, rng) for wrong in parallel_map(partial(_wrongly_proposed, sums=sums, most=most), scenes)]
-        known_others = np.hstack([known_others, bank.samples(zip((s.coarse for s in scenes), mined, strict=True))])
-    return _boosted(bank, known_cars, known_others, COARSE_ROUNDS, rng)
+        stumps = BoostedStumps.from_rounds(_boost(binner, positive_bins, negative_bins, _PROPOSER_ROUNDS, rng))
+        mine = partial(_mine_false_proposals, stumps=stumps, max_count=max_count)
+        mined = [augment_poses(false, rng) for false in parallel_map(mine, scenes)]
+        negative_bins = np.hstack([negative_bins, binner.bins_of_images(zip(images, mined, strict=True))])
+    return _boost(binner, positive_bins, negative_bins, _PROPOSER_ROUNDS, rng)
 
 
-def learn_classifier(
-    scenes: Sequence[Scene],
-    config: CascadeConfig,
-    channels: int,
-    rng: np.random.Generator,
-) -> tuple[tuple[Round, ...], tuple[Scene, ...]]:
-    """The classifier of step two, and the scenes with the cars' axes as it sees them."""
+def train_classifier(
+    scenes: Sequence[TrainingScene], config: CascadeTraining, channels: int, rng: np.random.Generator
+) -> tuple[tuple[Round, ...], tuple[TrainingScene, ...]]:
+    """The classifier of the proposals, and the scenes with their cars realigned by it."""
     scenes = tuple(scenes)
-    cars = [_fine_cars(scene, _copies(scenes), rng) for scene in scenes]
-    others = [other_poses(scene, _OTHERS // len(scenes), rng) for scene in scenes]
-    sigma = config.corner_sigma_px * _SIGMA_SHARE_XY[0], config.corner_sigma_px * _SIGMA_SHARE_XY[1]
-    bank = _bank(scenes, FINE, cars, others, config.feature_pool, sigma, channels, rng)
-    known_others = bank.samples(zip((scene.fine for scene in scenes), others, strict=True))
-    most = _MINED // len(scenes)
-    for rounds in _FINE_STAGES:
-        known_cars = bank.samples(zip((scene.fine for scene in scenes), cars, strict=True))
-        sums = sums_of(_boosted(bank, known_cars, known_others, rounds, rng))
-        scenes = tuple(parallel_map(partial(_realigned, sums=sums), scenes))
-        mined = [varied(wrong, rng) for wrong in parallel_map(partial(_wrongly_found, sums=sums, most=most), scenes)]
-        known_others = np.hstack([known_others, bank.samples(zip((s.fine for s in scenes), mined, strict=True))])
-        cars = [_fine_cars(scene, _copies(scenes), rng) for scene in scenes]
-    known_cars = bank.samples(zip((scene.fine for scene in scenes), cars, strict=True))
-    return _boosted(bank, known_cars, known_others, config.rounds, rng), scenes
+    positives = [_classifier_positives(scene, _copies(scenes), rng) for scene in scenes]
+    negatives = [sample_negatives(scene, _NEGATIVES // len(scenes), rng) for scene in scenes]
+    sigma = config.corner_sigma_px * _SIGMA_FRACTION_XY[0], config.corner_sigma_px * _SIGMA_FRACTION_XY[1]
+    binner = _fit_binner(scenes, FINE, positives, negatives, config.feature_pool, sigma, channels, rng)
+    images = [scene.fine for scene in scenes]
+    negative_bins = binner.bins_of_images(zip(images, negatives, strict=True))
+    max_count = _MINED // len(scenes)
+    for rounds in _MINING_ROUNDS:
+        positive_bins = binner.bins_of_images(zip(images, positives, strict=True))
+        stumps = BoostedStumps.from_rounds(_boost(binner, positive_bins, negative_bins, rounds, rng))
+        scenes = tuple(parallel_map(partial(realign_positives, stumps=stumps), scenes))
+        mine = partial(mine_hard_negatives, stumps=stumps, max_count=max_count)
+        mined = [augment_poses(false, rng) for false in parallel_map(mine, scenes)]
+        negative_bins = np.hstack([negative_bins, binner.bins_of_images(zip(images, mined, strict=True))])
+        positives = [_classifier_positives(scene, _copies(scenes), rng) for scene in scenes]
+    positive_bins = binner.bins_of_images(zip(images, positives, strict=True))
+    return _boost(binner, positive_bins, negative_bins, config.rounds, rng), scenes
 
 
-def _copies(scenes: Sequence[Scene]) -> int:
-    return max(4, _CARS // max(1, sum(len(scene.cars) for scene in scenes)))
+def _copies(scenes: Sequence[TrainingScene]) -> int:
+    """Augmented copies of each car."""
+    return max(4, _POSITIVES // max(1, sum(len(scene.cars) for scene in scenes)))
 
 
-def _bank(
-    scenes: Sequence[Scene],
-    grain: Grain,
-    cars: Sequence[Poses],
-    others: Sequence[Poses],
-    features: int,
+def _fit_binner(
+    scenes: Sequence[TrainingScene],
+    scale: PatchScale,
+    positives: Sequence[Poses],
+    negatives: Sequence[Poses],
+    pool_size: int,
     sigma_xy_px: tuple[float, float],
     channels: int,
     rng: np.random.Generator,
-) -> Bank:
-    pool = random_pool(
-        features,
+) -> FeatureBinner:
+    pool = draw_feature_pool(
+        pool_size,
         channels=channels,
         sigma_xy_px=sigma_xy_px,
-        reach_xy_px=grain.reach,
-        max_rectangles=_RECTANGLES,
+        reach_xy_px=scale.reach,
+        max_rectangles=_MAX_RECTANGLES,
         rng=rng,
     )
-    pictures = [scene.fine if grain is FINE else scene.coarse for scene in scenes]
-    parts = [*zip(pictures, cars, strict=True), *zip(pictures, others, strict=True)]
-    return bank_of(pool, CONTRAST_FLOOR, parts, rng)
+    images = [scene.fine if scale is FINE else scene.coarse for scene in scenes]
+    parts = [*zip(images, positives, strict=True), *zip(images, negatives, strict=True)]
+    return fit_feature_binner(pool, CONTRAST_FLOOR, parts, rng)
 
 
-def _boosted(
-    bank: Bank, cars: ByteArray, others: ByteArray, rounds: int, rng: np.random.Generator
+def _boost(
+    binner: FeatureBinner, positives: ByteArray, negatives: ByteArray, rounds: int, rng: np.random.Generator
 ) -> tuple[Round, ...]:
-    return bank.learnt(cars, others, rounds=rounds, fraction=_CAR_FRACTION, shrinkage=_SHRINKAGE, rng=rng)
+    return binner.train(positives, negatives, rounds=rounds, fraction=_CAR_FRACTION, shrinkage=_SHRINKAGE, rng=rng)
 
 
-def _fine_cars(scene: Scene, copies: int, rng: np.random.Generator) -> Poses:
-    """Cars, a little beside themselves and a little turned."""
+def _classifier_positives(scene: TrainingScene, copies: int, rng: np.random.Generator) -> Poses:
+    """Cars with a little jitter in position and axis."""
     rows = np.repeat(scene.cars, copies, axis=0)
-    noise = rng.normal(0, 1, (len(rows), 3)) * [_BESIDE_SD_PX, _BESIDE_SD_PX, _TURN_SD_RAD]
-    return varied(rows + noise, rng)
+    noise = rng.normal(0, 1, (len(rows), 3)) * [_JITTER_SD_PX, _JITTER_SD_PX, _JITTER_SD_RAD]
+    return augment_poses(rows + noise, rng)
 
 
-def _coarse_cars(scene: Scene, copies: int, rng: np.random.Generator) -> Poses:
-    """Cars as the scan meets them: up to half a step beside a place, and half a turn."""
+def _proposer_positives(scene: TrainingScene, copies: int, rng: np.random.Generator) -> Poses:
+    """Cars displaced and rotated by up to half a step of the proposals."""
     rows = np.repeat(scene.cars, copies, axis=0)
-    noise = rng.uniform(-1, 1, (len(rows), 3)) * [_COARSE_BESIDE_PX, _COARSE_BESIDE_PX, _COARSE_TURN_RAD]
-    return varied(rows + noise, rng)
+    jitter = [_PROPOSER_JITTER_PX, _PROPOSER_JITTER_PX, _PROPOSER_JITTER_RAD]
+    return augment_poses(rows + rng.uniform(-1, 1, (len(rows), 3)) * jitter, rng)
 
 
-def _wrongly_proposed(scene: Scene, sums: BoostedSums, most: int) -> FloatArray:
-    shape = scene.sample.image.shape
-    found = propose(scene.coarse, shape, scene.sample.valid, sums, contrast_floor=CONTRAST_FLOOR, per_megapixel=_WIDE)
-    return _surely_wrong(found, is_far(found, scene), scene, Look(scene.coarse, sums, CONTRAST_FLOOR))[:most]
+def _mine_false_proposals(scene: TrainingScene, stumps: BoostedStumps, max_count: int) -> FloatArray:
+    """Proposals of the highest score on the background."""
+    proposals = propose_regions(
+        scene.coarse,
+        scene.sample.image.shape,
+        scene.sample.valid,
+        stumps,
+        contrast_floor=CONTRAST_FLOOR,
+        per_megapixel=_MINING_PER_MEGAPIXEL,
+    )
+    scorer = PoseScorer(scene.coarse, stumps, CONTRAST_FLOOR)
+    return filter_ambiguous_negatives(proposals, is_background(proposals, scene), scene, scorer)[:max_count]
 
 
-def _wrongly_found(scene: Scene, sums: BoostedSums, most: int) -> FloatArray:
-    look = Look(scene.fine, sums, CONTRAST_FLOOR)
-    found = find_cars(look, scene.places[: _LOOKED_AT * most], min_score=-1.0)
-    found = found[np.argsort(-found[:, 3], kind="stable")]
-    return _surely_wrong(found, is_wrong(found, scene), scene, look)[:most]
+def mine_hard_negatives(scene: TrainingScene, stumps: BoostedStumps, max_count: int) -> FloatArray:
+    """False positives of the highest score among the best proposals."""
+    scorer = PoseScorer(scene.fine, stumps, CONTRAST_FLOOR)
+    detections = classify_proposals(scorer, scene.proposals[: _MINING_FACTOR * max_count], min_score=-1.0)
+    detections = detections[np.argsort(-detections[:, 3], kind="stable")]
+    return filter_ambiguous_negatives(detections, is_false_positive(detections, scene), scene, scorer)[:max_count]
 
 
-def _surely_wrong(found: FloatArray, wrong: NDArray[np.bool_], scene: Scene, look: Look) -> FloatArray:
-    """Of a picture not wholly marked, what is liked less than most marked cars: the rest may be cars that stand."""
+def filter_ambiguous_negatives(
+    detections: FloatArray, false: Mask, scene: TrainingScene, scorer: PoseScorer
+) -> FloatArray:
+    """The false ones; of an incompletely labelled image only those that score less than most labelled cars, since the
+    others may be stationary cars."""
     if not scene.sample.complete and len(scene.cars):
-        here = look.scores(scene.cars[:, :2], scene.cars[:, 2], np.zeros(1), np.zeros((1, 2), np.int64))
-        wrong = wrong & (found[:, 3] < np.quantile(here, _LIKE_A_CAR))
-    return np.asarray(found[wrong])
+        scores = scorer.scores(scene.cars[:, :2], scene.cars[:, 2], np.zeros(1), np.zeros((1, 2), np.int64))
+        false = false & (detections[:, 3] < np.quantile(scores, _AMBIGUOUS_QUANTILE))
+    return np.asarray(detections[false])
 
 
-_REALIGN_TURNS = np.radians(np.arange(-24.0, 25.0, 8.0))
-_REALIGN_OFFSETS = offset_grid(1, 1)
+def realign_positives(scene: TrainingScene, stumps: BoostedStumps) -> TrainingScene:
+    """Cars labelled without orientation in the pose of the highest score, with a prior on the present one.
 
-
-def _realigned(scene: Scene, sums: BoostedSums) -> Scene:
-    """Cars whose label does not tell the axis, turned to where the classifier so far likes them best.
-
-    An axis from a box's shape is some ten degrees off; what most cars agree on sets the rest right.
+    An orientation from the outline is some ten degrees off; a classifier trained on many of them corrects each.
     """
-    if scene.told.all():
+    if scene.has_orientation.all():
         return scene
-    cars, look = scene.cars[~scene.told], Look(scene.fine, sums, CONTRAST_FLOOR)
-    found = look.scores(cars[:, :2], cars[:, 2], _REALIGN_TURNS, _REALIGN_OFFSETS)
-    found = found - np.float32(_TURN_PRIOR) * (_REALIGN_TURNS / _TURN_PRIOR_RAD)[:, None].astype(np.float32) ** 2
-    best = found.reshape(len(cars), -1).argmax(axis=1)
-    turn, offset = np.unravel_index(best, found.shape[1:])
-    axes = cars[:, 2] + _REALIGN_TURNS[turn]
+    latent = ~scene.has_orientation
+    cars, scorer = scene.cars[latent], PoseScorer(scene.fine, stumps, CONTRAST_FLOOR)
+    scores = scorer.scores(cars[:, :2], cars[:, 2], _REALIGN_ROTATIONS, _REALIGN_OFFSETS)
+    deviation = (_REALIGN_ROTATIONS / _ROTATION_PRIOR_RAD)[:, None].astype(np.float32)
+    scores = scores - np.float32(_ROTATION_PRIOR) * deviation**2
+    best = scores.reshape(len(cars), -1).argmax(axis=1)
+    rotation, offset = np.unravel_index(best, scores.shape[1:])
+    axes = cars[:, 2] + _REALIGN_ROTATIONS[rotation]
+    half_way = np.asarray(0.5 * _REALIGN_OFFSETS[offset], np.float64)
     aligned = scene.cars.copy()
-    aligned[~scene.told, :2] = moved(cars[:, :2], axes, np.asarray(0.5 * _REALIGN_OFFSETS[offset], np.float64))
-    aligned[~scene.told, 2] = np.mod(axes, np.pi)
+    aligned[latent, :2] = offset_along_axis(cars[:, :2], axes, half_way)
+    aligned[latent, 2] = np.mod(axes, np.pi)
     return replace(scene, cars=aligned)

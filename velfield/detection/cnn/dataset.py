@@ -15,7 +15,7 @@ import numpy as np
 from schemas.arrays import Float32Array, FloatArray
 from velfield.detection.cnn.model import STRIDE
 from velfield.detection.cnn.trainer import Batch
-from velfield.detection.orientation import with_axes
+from velfield.detection.orientation import fill_missing_orientation
 from velfield.detection.samples import LabelledImage
 
 PATCH_PX = 96
@@ -74,7 +74,7 @@ class PatchDataset:
 
 
 def _with_orientations(sample: LabelledImage) -> LabelledImage:
-    return replace(sample, cars=with_axes(sample.image, sample.cars, sample.tilts))
+    return replace(sample, cars=fill_missing_orientation(sample.image, sample.cars, sample.abs_box_angle_rad))
 
 
 def _sample_patch(

@@ -9,7 +9,7 @@ import numpy as np
 
 from schemas.arrays import GreyImage, Mask
 from schemas.detector import CascadeConfig, CnnConfig, CnnRecord
-from velfield.detection.cascade.classifier import distinct
+from velfield.detection.cascade.classifier import nms_oriented
 from velfield.detection.cascade.detector import CascadeDetector
 from velfield.detection.cascade.long_vehicles import centre_long_vehicles
 from velfield.detection.cnn.fine_tuning import fine_tune
@@ -60,7 +60,7 @@ class CnnDetector(Detector):
             difference = background_difference_at(image, background, rows[:, :2], length_px)
             rows[:, 3] += motion_score_bonus(motion, difference)
         above = rows[rows[:, 3] > (self.threshold if threshold is None else threshold)]
-        cars = centre_long_vehicles(image, valid, distinct(above, length_px), length_px)
+        cars = centre_long_vehicles(image, valid, nms_oriented(above, length_px), length_px)
         return Detections.from_rows(cars, np.full(len(cars), length_px * length_px * CAR_ASPECT))
 
     @classmethod

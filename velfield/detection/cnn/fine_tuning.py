@@ -13,23 +13,23 @@ import numpy as np
 
 from schemas.arrays import Float32Array, Mask
 from schemas.detector import CnnConfig, CnnRecord, PrecisionRecallCurve
-from velfield.detection.cascade.classifier import distinct
+from velfield.detection.cascade.classifier import nms_oriented
 from velfield.detection.cnn.dataset import PatchDataset
 from velfield.detection.cnn.inference import detect_cars
 from velfield.detection.cnn.model import Network, network_to_record, predict_heatmap
 from velfield.detection.cnn.trainer import Trainer, train
 from velfield.detection.evaluation import (
-    FOLD_MIN_CARS,
     FOLDS_DESCRIPTION,
+    MIN_CARS_FOR_FOLDS,
     MIN_CURVE_SCORE,
-    Evidence,
-    curve_of,
-    joined,
-    matched,
-    stripes,
+    HeldOutScores,
+    match_greedy,
+    merge_scores,
+    precision_recall_curve,
+    spatial_fold,
 )
-from velfield.detection.orientation import with_axes
-from velfield.detection.samples import LabelledImage, lies_in, within
+from velfield.detection.orientation import fill_missing_orientation
+from velfield.detection.samples import LabelledImage, in_region, restrict_to_region
 from velfield.parallel import parallel_map
 
 if TYPE_CHECKING:
@@ -72,12 +72,12 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: "CnnDetector", confi
     pretrained.check_car_length(config.working_car_length_px)
     masked = parallel_map(lambda sample: _mask_unlabelled_positives(sample, pretrained.network), samples)
     count = sum(len(sample.cars) for sample in samples)
-    folds = _FOLDS if count >= FOLD_MIN_CARS else 0
+    folds = _FOLDS if count >= MIN_CARS_FOR_FOLDS else 0
     tasks: list[int | None] = [None, *range(folds)]
     (network, _), *held_out = parallel_map(
         lambda fold: _fine_tune_fold(masked, pretrained.network, config, fold), tasks
     )
-    evidence = joined([part for _, parts in held_out for part in parts]) if held_out else None
+    evidence = merge_scores([part for _, parts in held_out for part in parts]) if held_out else None
     threshold, curve = select_threshold(evidence, pretrained.threshold, FOLDS_DESCRIPTION)
     if curve is not None:
         weight = count / (count + _PRIOR_CARS)
@@ -104,10 +104,10 @@ def fine_tune_interpolated(
 
 
 def select_threshold(
-    evidence: Evidence | None, default: float, description: str
+    evidence: HeldOutScores | None, default: float, description: str
 ) -> tuple[float, PrecisionRecallCurve | None]:
     """Score threshold and precision-recall curve on held-out cars; the default where too few were held out."""
-    curve = None if evidence is None else curve_of(evidence, description)
+    curve = None if evidence is None else precision_recall_curve(evidence, description)
     if curve is None or curve.operating_point is None:
         return default, None
     return curve.threshold[curve.operating_point], curve
@@ -128,14 +128,14 @@ def make_record(
 
 def _fine_tune_fold(
     samples: Sequence[LabelledImage], pretrained: Network, config: CnnConfig, fold: int | None
-) -> tuple[Network, list[Evidence]]:
+) -> tuple[Network, list[HeldOutScores]]:
     """Fine-tune without a fold's stripes and evaluate on them; without a fold, fine-tune on everything."""
     steps, seed = config.fine_tune_steps, config.seed
     if fold is None:
         dataset = PatchDataset([samples], [1.0], seed)
         return train(Trainer.from_network(pretrained), dataset, steps=steps, learning_rate=_FINE_TUNING_RATE), []
-    held_out = [stripes(sample, fold, _FOLDS) for sample in samples]
-    training = [within(sample, ~region) for sample, region in zip(samples, held_out, strict=True)]
+    held_out = [spatial_fold(sample, fold, _FOLDS) for sample in samples]
+    training = [restrict_to_region(sample, ~region) for sample, region in zip(samples, held_out, strict=True)]
     dataset = PatchDataset([training], [1.0], seed + 1 + fold)
     network = train(Trainer.from_network(pretrained), dataset, steps=steps, learning_rate=_FINE_TUNING_RATE)
     return network, [
@@ -145,7 +145,8 @@ def _fine_tune_fold(
 
 def _mask_unlabelled_positives(sample: LabelledImage, network: Network) -> LabelledImage:
     """The sample with every orientation filled in, and without the pixels that may show an unlabelled car."""
-    sample = replace(sample, cars=with_axes(sample.image, sample.cars, sample.tilts), tilts=None)
+    cars = fill_missing_orientation(sample.image, sample.cars, sample.abs_box_angle_rad)
+    sample = replace(sample, cars=cars, abs_box_angle_rad=None)
     if sample.complete:
         return sample
     probability, _ = predict_heatmap(network, sample.image)
@@ -158,15 +159,15 @@ def _mask_unlabelled_positives(sample: LabelledImage, network: Network) -> Label
     return replace(sample, valid=known if sample.valid is None else sample.valid & known)
 
 
-def evaluate_network(network: Network, sample: LabelledImage, region: Mask | None = None) -> Evidence:
+def evaluate_network(network: Network, sample: LabelledImage, region: Mask | None = None) -> HeldOutScores:
     """Match a network's detections to the labels of an image, or of a region (h, w) of it."""
-    detections = distinct(detect_cars(network, sample.image, sample.valid), _NMS_RADIUS_PX)
+    detections = nms_oriented(detect_cars(network, sample.image, sample.valid), _NMS_RADIUS_PX)
     detections = detections[detections[:, 3] > MIN_CURVE_SCORE]
     cars = sample.cars
     if region is not None:
-        detections, cars = detections[lies_in(region, detections)], cars[lies_in(region, cars)]
-    correct = matched(detections, cars)
+        detections, cars = detections[in_region(region, detections)], cars[in_region(region, cars)]
+    correct = match_greedy(detections, cars)
     for x, y, radius in sample.ignore:
         counted = correct | (np.hypot(detections[:, 0] - x, detections[:, 1] - y) > radius)
         detections, correct = detections[counted], correct[counted]
-    return Evidence(detections[:, 3], correct, len(cars), sample.complete)
+    return HeldOutScores(detections[:, 3], correct, len(cars), sample.complete)

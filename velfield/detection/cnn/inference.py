@@ -13,10 +13,10 @@ import numpy as np
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from schemas.detector import MotionRecord
-from velfield.detection.cascade.classifier import moved
-from velfield.detection.cascade.proposals import in_sight
+from velfield.detection.cascade.classifier import offset_along_axis
+from velfield.detection.cascade.proposals import in_view
 from velfield.detection.cnn.model import STRIDE, Network, forward, predict_heatmap
-from velfield.detection.orientation import at_places
+from velfield.detection.orientation import sample_nearest
 
 SCORE_OFFSET = 0.35
 """Probability predicted where a candidate is as often a car as not: around centres the loss lets the network predict
@@ -71,7 +71,7 @@ def background_difference_at(
     The mean is weighted by a Gaussian with a standard deviation of a fifth of a car's length.
     """
     difference = cv2.absdiff(image, background).astype(np.float32)
-    return at_places(cv2.GaussianBlur(difference, (0, 0), car_length_px / 5), xy)
+    return sample_nearest(cv2.GaussianBlur(difference, (0, 0), car_length_px / 5), xy)
 
 
 def motion_score_bonus(motion: MotionRecord, difference: FloatArray) -> FloatArray:
@@ -85,7 +85,7 @@ def _is_mostly_visible(cars: FloatArray, shape: tuple[int, int], valid: Mask | N
     """Whether three quarters of a car lie in the frame: the centre of a car that is truncated more is unreliable."""
     visible = np.ones(len(cars), bool)
     for along in (-_QUARTER_CAR_PX, _QUARTER_CAR_PX):
-        visible &= in_sight(moved(cars[:, :2], cars[:, 2], np.array([[along, 0.0]])), shape, valid)
+        visible &= in_view(offset_along_axis(cars[:, :2], cars[:, 2], np.array([[along, 0.0]])), shape, valid)
     return visible
 
 

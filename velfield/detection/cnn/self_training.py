@@ -17,9 +17,9 @@ from velfield.detection.cnn.fine_tuning import fine_tune_interpolated
 from velfield.detection.cnn.inference import MIN_SCORE, background_difference_at
 from velfield.detection.cnn.model import network_to_record
 from velfield.detection.detect import detect_frame
-from velfield.detection.evaluation import nearly_best, thinned_curve
+from velfield.detection.evaluation import f_measure_plateau, to_curve_record
 from velfield.detection.motion.difference import MotionFrame
-from velfield.detection.motion.evaluation import Detections, MotionState, classify_bursts
+from velfield.detection.motion.evaluation import MotionState, TimedDetections, classify_bursts
 from velfield.detection.samples import LabelledImage
 from velfield.parallel import parallel_map
 
@@ -77,10 +77,10 @@ def self_train_from_motion(
     record = pretrained.record.model_copy(update=update)
     length_px = record.working_car_length_px
 
-    def detect(frame: MotionFrame) -> tuple[Detections, FloatArray]:
+    def detect(frame: MotionFrame) -> tuple[TimedDetections, FloatArray]:
         cars = detect_frame(frame.image, frame.valid, type(pretrained)(record), threshold=MIN_SCORE)
         difference = background_difference_at(frame.image, background, cars.xy, length_px)
-        return Detections(cars.xy, cars.orientation_rad, cars.score, frame.time_s), difference
+        return TimedDetections(cars.xy, cars.orientation_rad, cars.score, frame.time_s), difference
 
     detections, differences = zip(*parallel_map(detect, bursts), strict=True)
     middles, states = classify_bursts(detections, car_length_px=length_px, max_interval_s=max_interval_s)
@@ -125,12 +125,14 @@ def fit_motion_thresholds(
         return None
     precision = true_positives / np.arange(1, len(true_positives) + 1)
     recall = true_positives / true_positives[-1]
-    plateau = nearly_best(precision, recall, beta=1.0)
+    plateau = f_measure_plateau(precision, recall, beta=1.0)
     foreground_threshold = float(thresholds[plateau[0]] + thresholds[plateau[-1]]) / 2
     threshold = max(stationary_threshold(score[moving], score[stationary & ~foreground]), foreground_threshold)
     bonus = threshold - foreground_threshold
     nearest = int(np.abs(thresholds - foreground_threshold).argmin())
-    curve = thinned_curve(precision, recall, thresholds + threshold - foreground_threshold, nearest, _CURVE_DESCRIPTION)
+    curve = to_curve_record(
+        precision, recall, thresholds + threshold - foreground_threshold, nearest, _CURVE_DESCRIPTION
+    )
     return (
         threshold,
         MotionRecord(bonus_ramp_start=ramp_start, bonus_ramp_end=moving_grey, max_score_bonus=bonus),
@@ -154,5 +156,5 @@ def stationary_threshold(moving: FloatArray, stationary: FloatArray) -> float:
         return float(thresholds[-1])
     cars_per_moving = float((above[reliable] / count[reliable]).min())
     precision = np.minimum(cars_per_moving * count / np.maximum(above, 1), 1.0)
-    plateau = nearly_best(precision[reliable], count[reliable] / len(thresholds), beta=1.0)
+    plateau = f_measure_plateau(precision[reliable], count[reliable] / len(thresholds), beta=1.0)
     return float(np.median(thresholds[reliable][plateau]))

@@ -18,7 +18,7 @@ from schemas.arrays import FloatArray, GreyImage, IntArray
 from schemas.flight import TrackingConfig
 from velfield.detection.detect import detect_frame
 from velfield.detection.detector import Detector
-from velfield.detection.evaluation import nearly_best
+from velfield.detection.evaluation import f_measure_plateau
 from velfield.detection.motion.boxes import MAX_AXIS_OFFSET_RAD
 from velfield.detection.motion.difference import MotionFrame
 from velfield.detection.motion.links import MAX_LENGTHS_PER_S
@@ -53,7 +53,7 @@ class MotionState(IntEnum):
 
 
 @dataclass(frozen=True)
-class Detections:
+class TimedDetections:
     """Detections of a frame at a low threshold.
 
     Attributes
@@ -120,7 +120,7 @@ class MotionEvaluation:
 
 
 def classify_motion(
-    before: Detections, middle: Detections, after: Detections, *, car_length_px: float
+    before: TimedDetections, middle: TimedDetections, after: TimedDetections, *, car_length_px: float
 ) -> NDArray[np.int8]:
     """`MotionState` of each detection of the middle frame, (n,)."""
     first, second = middle.time_s - before.time_s, after.time_s - middle.time_s
@@ -146,7 +146,7 @@ def classify_motion(
 
 
 def classify_bursts(
-    frames: Sequence[Detections], *, car_length_px: float, max_interval_s: float = _MAX_INTERVAL_S
+    frames: Sequence[TimedDetections], *, car_length_px: float, max_interval_s: float = _MAX_INTERVAL_S
 ) -> tuple[list[int], list[NDArray[np.int8]]]:
     """Indices of the frames that have a neighbour in time on both sides, and the `MotionState` of their detections."""
     middles = [
@@ -174,7 +174,7 @@ def select_bursts(times_s: Sequence[float], count: int, max_interval_s: float = 
 
 
 def evaluate_by_motion(
-    frames: Sequence[Detections], *, car_length_px: float, max_interval_s: float = _MAX_INTERVAL_S
+    frames: Sequence[TimedDetections], *, car_length_px: float, max_interval_s: float = _MAX_INTERVAL_S
 ) -> MotionEvaluation:
     """Precision and recall of a detector from the motion of its detections.
 
@@ -202,7 +202,7 @@ def evaluate_by_motion(
     false_positives = np.maximum(isolated - true_positives * missed_rate, 0.0)
     precision = 1 - false_positives / (true_positives + isolated)
     recall = true_positives / true_positives[-1]
-    plateau = nearly_best(precision, recall, beta=1.0)
+    plateau = f_measure_plateau(precision, recall, beta=1.0)
     # A tracklet needs three detections in a row, and linking drops false positives: that asks for a low threshold.
     # False positives that are stationary are not in these figures: that asks for one not at the plateau's lower end.
     operating = float(thresholds[plateau[0]] + thresholds[plateau[-1]]) / 2
@@ -232,16 +232,21 @@ def evaluate_detector(
         Frames farther apart than this are not neighbours.
     """
 
-    def detect(frame: MotionFrame) -> Detections:
+    def detect(frame: MotionFrame) -> TimedDetections:
         cars = detect_frame(frame.image, frame.valid, detector, background, threshold=min_score)
-        return Detections(cars.xy, cars.orientation_rad, np.asarray(cars.score, np.float64), frame.time_s)
+        return TimedDetections(cars.xy, cars.orientation_rad, np.asarray(cars.score, np.float64), frame.time_s)
 
     length = detector.record.working_car_length_px
     return evaluate_by_motion(parallel_map(detect, frames), car_length_px=length, max_interval_s=max_interval_s)
 
 
 def _reachable(
-    before: Detections, middle: Detections, after: Detections, first_s: float, second_s: float, car_length_px: float
+    before: TimedDetections,
+    middle: TimedDetections,
+    after: TimedDetections,
+    first_s: float,
+    second_s: float,
+    car_length_px: float,
 ) -> list[tuple[IntArray, IntArray]]:
     """For each detection of the middle frame, those before and after within the distance that the speed limit
     allows."""

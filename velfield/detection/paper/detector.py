@@ -7,10 +7,10 @@ from typing import ClassVar
 
 from schemas.arrays import GreyImage, Mask
 from schemas.detector import PaperConfig, PaperRecord
-from velfield.detection.boosting import BoostedSums, sums_of
+from velfield.detection.boosting import BoostedStumps
 from velfield.detection.detector import Detections, Detector
 from velfield.detection.paper.response import dense_response
-from velfield.detection.paper.segmentation import moments, segment_response
+from velfield.detection.paper.segmentation import region_moments, segment_response
 from velfield.detection.paper.training import train_paper
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
@@ -24,9 +24,9 @@ class PaperDetector(Detector):
     method: ClassVar[str] = "paper"
 
     @cached_property
-    def sums(self) -> BoostedSums:
-        """Its rounds."""
-        return sums_of(self.record.rounds)
+    def stumps(self) -> BoostedStumps:
+        """Its classifier."""
+        return BoostedStumps.from_rounds(self.record.rounds)
 
     def detect(
         self,
@@ -37,7 +37,7 @@ class PaperDetector(Detector):
         threshold: float | None = None,
     ) -> Detections:
         """Detect cars: regions where the blurred response exceeds the threshold, their mean and covariance."""
-        response = dense_response(image, self.sums, grey_bits=self.record.grey_bits)
+        response = dense_response(image, self.stumps, grey_bits=self.record.grey_bits)
         if valid is not None:
             response[~valid] = response.min(initial=0.0)
         smooth, labels = segment_response(
@@ -46,7 +46,7 @@ class PaperDetector(Detector):
             threshold=self.threshold if threshold is None else threshold,
             min_region_px=self.record.min_region_px,
         )
-        found = moments(labels, smooth)
+        found = region_moments(labels, smooth)
         return Detections.from_rows(found[:, :5], found[:, 5])
 
     @classmethod

@@ -1,16 +1,16 @@
-"""Cars from the dense response: blur, maxima, region growing above T, mean and covariance (paper: segmentation)."""
+"""Segmentation of the dense response (paper): blur, maxima, region growing above the threshold, image moments."""
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from skimage.segmentation import watershed
 
-from schemas.arrays import FloatArray
+from schemas.arrays import Float32Array, FloatArray
 
 
 def segment_response(
-    response: NDArray[np.float32], *, sigma_px: float, threshold: float, min_region_px: int
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    response: Float32Array, *, sigma_px: float, threshold: float, min_region_px: int
+) -> tuple[Float32Array, NDArray[np.int32]]:
     """The blurred response, and the regions that grow above the threshold from its maxima with four neighbours.
 
     Returns
@@ -21,15 +21,15 @@ def segment_response(
     above = smooth > threshold
     peak = above & (smooth >= cv2.dilate(smooth, np.ones((3, 3), np.uint8)))
     _, markers = cv2.connectedComponents(peak.astype(np.uint8), connectivity=8)
-    # On a flat relief watershed floods each pixel from the seed that is fewest steps away: the paper's growing.
+    # On a constant image watershed assigns each pixel to the seed that is fewest steps away: the paper's growing.
     labels = watershed(np.zeros(smooth.shape, np.uint8), markers, connectivity=1, mask=above).astype(np.int32)
     size = np.bincount(labels.ravel())
     labels[size[labels] < min_region_px] = 0
     return smooth, labels
 
 
-def moments(labels: NDArray[np.int32], smooth: NDArray[np.float32]) -> FloatArray:
-    """Place, axis and peak of each region.
+def region_moments(labels: NDArray[np.int32], smooth: Float32Array) -> FloatArray:
+    """Mean, axis and peak of each region, from its first and second moments.
 
     Returns
     -------
@@ -46,7 +46,7 @@ def moments(labels: NDArray[np.int32], smooth: NDArray[np.float32]) -> FloatArra
     xx, yy, xy = (np.bincount(region, v, n) / area for v in (dx * dx, dy * dy, dx * dy))
     axis = np.mod(0.5 * np.arctan2(2 * xy, xx - yy), np.pi)
     elongation = np.sqrt((xx - yy) ** 2 + 4 * xy**2) / np.maximum(xx + yy, 1e-9)
-    # A round region has no axis; a car's, twice as long as wide, has it to a few degrees.
+    # A round region has no axis; that of a car, twice as long as wide, is accurate to a few degrees.
     sd = np.clip(1.0 / (np.sqrt(area) * np.maximum(elongation, 1e-3)), 0.05, np.pi / 4)
     peak = np.full(n, -np.inf)
     np.maximum.at(peak, region, smooth[y, x])

@@ -1,4 +1,4 @@
-"""Training of the paper's classifier: AdaBoost on the pixels of upright images, about the cars and away from them."""
+"""Training of the paper's classifier: AdaBoost on pixels of upright images, near car centres and away from cars."""
 
 from collections.abc import Sequence
 
@@ -7,18 +7,18 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from schemas.arrays import GreyImage, IntArray, Mask
 from schemas.detector import PaperConfig, PaperRecord
 from velfield.detection.boosting import (
-    BoostedSums,
-    RectanglePool,
-    bin_edges,
-    binned,
+    BoostedStumps,
+    FeaturePool,
+    assign_bins,
     boost,
-    random_pool,
-    rounds_of,
-    sums_of,
+    draw_feature_pool,
+    quantile_bin_edges,
+    rounds_from_stumps,
 )
-from velfield.detection.paper.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, continued, dense_response
+from velfield.detection.paper.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, dense_response, quantise_and_pad
 from velfield.detection.samples import LabelledImage
 
 _REACH_PX = 40
@@ -28,9 +28,10 @@ _EDGE_SAMPLES = 4000
 
 
 def train_paper(samples: Sequence[LabelledImage], config: PaperConfig) -> PaperRecord:
-    """Train: within ``car_radius_px`` of a centre a pixel is car, past ``background_radius_px`` of every one not."""
+    """Train: pixels within ``car_radius_px`` of a car's centre are positive, those beyond ``background_radius_px``
+    negative."""
     rng = np.random.default_rng(config.seed)
-    pool = random_pool(
+    pool = draw_feature_pool(
         config.feature_pool,
         channels=1,
         sigma_xy_px=(config.corner_sigma_px, config.corner_sigma_px),
@@ -41,16 +42,18 @@ def train_paper(samples: Sequence[LabelledImage], config: PaperConfig) -> PaperR
     )
     values, is_car = [], []
     for sample in samples:
-        places, car = _pixels(sample, config, rng, _MAX_CAR_SAMPLES // len(samples))
-        values.append(_values(sample.image, places, pool))
-        is_car.append(car)
+        xy, positive = _sample_pixels(sample, config, rng, _MAX_CAR_SAMPLES // len(samples))
+        values.append(_feature_values(sample.image, xy, pool))
+        is_car.append(positive)
     measured, cars = np.concatenate(values).T.astype(np.float32), np.concatenate(is_car)
-    edges = bin_edges(measured[:, rng.permutation(measured.shape[1])[:_EDGE_SAMPLES]])
+    edges = quantile_bin_edges(measured[:, rng.permutation(measured.shape[1])[:_EDGE_SAMPLES]])
     stumps = boost(
-        binned(measured, edges), edges, cars, rounds=config.rounds, car_fraction=config.car_fraction, rng=rng
+        assign_bins(measured, edges), edges, cars, rounds=config.rounds, car_fraction=config.car_fraction, rng=rng
     )
-    rounds = rounds_of(pool, stumps)
-    threshold = config.threshold if config.threshold is not None else _threshold(samples, sums_of(rounds), config)
+    rounds = rounds_from_stumps(pool, stumps)
+    threshold = config.threshold
+    if threshold is None:
+        threshold = _choose_threshold(samples, BoostedStumps.from_rounds(rounds), config)
     return PaperRecord(
         working_car_length_px=config.working_car_length_px,
         grey_bits=GREY_BITS,
@@ -62,12 +65,12 @@ def train_paper(samples: Sequence[LabelledImage], config: PaperConfig) -> PaperR
     )
 
 
-def _pixels(
-    sample: LabelledImage, config: PaperConfig, rng: np.random.Generator, most: int
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Pixels (n, 2) to learn from, and which are car; cars are ``car_fraction`` of them."""
+def _sample_pixels(
+    sample: LabelledImage, config: PaperConfig, rng: np.random.Generator, max_cars: int
+) -> tuple[IntArray, Mask]:
+    """Pixels (n, 2) to train on, and which are positive: ``car_fraction`` of them."""
     height, width = sample.image.shape
-    distance = _nearest(height, width, np.ascontiguousarray(sample.cars[:, :2]))
+    distance = _distance_to_nearest(height, width, np.ascontiguousarray(sample.cars[:, :2]))
     for x, y, radius in sample.ignore:
         ys, xs = np.ogrid[:height, :width]
         between = np.hypot(xs - x, ys - y) < radius
@@ -76,13 +79,13 @@ def _pixels(
         distance[~sample.valid] = config.background_radius_px
     cars = np.argwhere(distance < config.car_radius_px)
     others = np.argwhere(distance > config.background_radius_px)
-    cars = cars[rng.permutation(len(cars))[:most]]
+    cars = cars[rng.permutation(len(cars))[:max_cars]]
     others = others[rng.permutation(len(others))[: int(len(cars) * (1 - config.car_fraction) / config.car_fraction)]]
     return np.concatenate([cars, others])[:, ::-1], np.arange(len(cars) + len(others)) < len(cars)
 
 
 @njit(cache=True, nogil=True)
-def _nearest(height, width, cars):  # type: ignore[no-untyped-def]
+def _distance_to_nearest(height, width, cars):  # type: ignore[no-untyped-def]
     out = np.full((height, width), np.inf)
     for k in range(len(cars)):
         for y in range(max(0, int(cars[k, 1]) - 32), min(height, int(cars[k, 1]) + 33)):
@@ -91,12 +94,12 @@ def _nearest(height, width, cars):  # type: ignore[no-untyped-def]
     return out
 
 
-def _values(image: NDArray[np.uint8], places: NDArray[np.int64], pool: RectanglePool) -> NDArray[np.int32]:
+def _feature_values(image: GreyImage, xy: IntArray, pool: FeaturePool) -> NDArray[np.int32]:
     """Values (n, features) of all features at pixels (n, 2)."""
-    padded = continued(image, GREY_BITS).astype(np.int32)
+    padded = quantise_and_pad(image, GREY_BITS).astype(np.int32)
     integral = np.pad(padded, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
-    x, y = places[:, 0] + MARGIN_PX, places[:, 1] + MARGIN_PX
-    out = np.zeros((len(places), len(pool)), np.int32)
+    x, y = xy[:, 0] + MARGIN_PX, xy[:, 1] + MARGIN_PX
+    out = np.zeros((len(xy), len(pool)), np.int32)
     for f in range(len(pool)):
         for sign, x0, y0, x1, y1 in pool.table[pool.starts[f] : pool.starts[f + 1]]:
             area = (
@@ -109,11 +112,12 @@ def _values(image: NDArray[np.uint8], places: NDArray[np.int64], pool: Rectangle
     return out
 
 
-def _threshold(samples: Sequence[LabelledImage], sums: BoostedSums, config: PaperConfig) -> float:
-    """T that the blurred response exceeds at four of five marked cars: the paper gives none, its regions want one."""
+def _choose_threshold(samples: Sequence[LabelledImage], stumps: BoostedStumps, config: PaperConfig) -> float:
+    """Half of what the blurred response exceeds at four of five labelled cars: the paper gives no threshold, though its
+    regions need one."""
     peaks = []
     for sample in samples:
-        smooth = cv2.GaussianBlur(dense_response(sample.image, sums), (0, 0), config.response_sigma_px)
+        smooth = cv2.GaussianBlur(dense_response(sample.image, stumps), (0, 0), config.response_sigma_px)
         x, y = (np.rint(sample.cars[:, k]).astype(int) for k in (0, 1))
         inside = (x >= 0) & (y >= 0) & (x < smooth.shape[1]) & (y < smooth.shape[0])
         peaks.append(smooth[y[inside], x[inside]])

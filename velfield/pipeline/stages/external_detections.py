@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from velfield.detection.detect import FrameDetections, attach_crops
 from velfield.detection.detector import Detections
-from velfield.detection.orientation import CAR_ASPECT, axial_difference, with_axes
+from velfield.detection.orientation import CAR_ASPECT, axial_difference, fill_missing_orientation
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.stages.rectified_frames import WorkingFrame
 from velfield.registration.transforms import FrameMap
@@ -70,7 +70,7 @@ def _looked_for(
 ) -> NDArray[np.float64]:
     """Axes (n,) of boxes that do not tell them: the picture's, or of the two that an upright box leaves the nearer."""
     untold = np.full((len(xy), 3), np.nan)
-    own = with_axes(seen.image, np.column_stack([np.nan_to_num(xy), untold]))[:, 2]
+    own = fill_missing_orientation(seen.image, np.column_stack([np.nan_to_num(xy), untold]))[:, 2]
     raw, tilt = boxes[["x_px", "y_px"]].to_numpy(np.float64), boxes["abs_box_angle_rad"].to_numpy(np.float64)
     one, other = (_turned(transform, raw, sign * tilt) for sign in (1, -1))
     nearer = np.where(axial_difference(one, own) <= axial_difference(other, own), one, other)

@@ -95,7 +95,7 @@ def labelled_images(source: Path, info: SourceInfo, labels: Labels, *, work_per_
             image=scaled(frame.grey, work_per_raw),
             cars=boxes(mine, work_per_raw),
             ignore=left_out(labels.ignored[labels.ignored["frame"] == frame.name], work_per_raw),
-            tilts=mine["abs_box_angle_rad"].to_numpy(np.float64),
+            abs_box_angle_rad=mine["abs_box_angle_rad"].to_numpy(np.float64),
         )
 
 

@@ -1,0 +1,128 @@
+"""Orientations from the image, and crops rotated to them."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from velfield.detection.crops import oriented_patches, upright_chips
+from velfield.detection.orientation import (
+    axial_difference,
+    fill_missing_orientation,
+    sample_nearest,
+    structure_tensor_axis,
+)
+
+ANGLES = st.floats(-10, 10, allow_nan=False)
+
+
+def bar(angle: float, side: int = 64) -> np.ndarray:
+    """A bright bar through the middle, blurred at its edges."""
+    y, x = np.mgrid[:side, :side] - (side - 1) / 2
+    u, v = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+    inside = 1 / (1 + np.exp(2 * (np.abs(u) - 8))) / (1 + np.exp(2 * (np.abs(v) - 4)))
+    return (60 + 150 * inside).astype(np.uint8)
+
+
+def car(degrees: float, length: float = 16, width: float = 7) -> np.ndarray:
+    """A bright car with dark windscreens, in the middle of 64 x 64 px."""
+    image, angle = np.full((64, 64), 100, np.uint8), np.radians(degrees)
+    c, s = np.cos(angle), np.sin(angle)
+    screen = (length / 8, width - 1.5)
+    for along, size, grey in ((0.0, (length, width), 170), (-0.22 * length, screen, 60), (0.22 * length, screen, 60)):
+        corners = cv2.boxPoints(((32 + along * c, 32 + along * s), size, degrees))
+        cv2.fillConvexPoly(image, np.rint(corners * 16).astype(np.int32), (grey,), cv2.LINE_AA, 4)
+    return cv2.GaussianBlur(image, (0, 0), 0.8)
+
+
+@given(ANGLES, ANGLES)
+def test_axial_difference_is_a_distance_of_axes(a: float, b: float) -> None:
+    one, two = np.array([a]), np.array([b])
+    difference = axial_difference(one, two)[0]
+    assert 0 <= difference <= np.pi / 2 + 1e-12
+    assert difference == pytest.approx(axial_difference(two, one)[0], abs=1e-9)
+    assert axial_difference(one + np.pi, two)[0] == pytest.approx(difference, abs=1e-9)
+    # The angle between undirected lines, by their direction vectors.
+    assert difference == pytest.approx(np.arccos(min(abs(np.cos(a - b)), 1.0)), abs=1e-6)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 20.0, 45.0, 90.0, 130.0])
+@pytest.mark.parametrize("has_box", [False, True])
+def test_windscreens_do_not_mislead_the_outline(degrees: float, *, has_box: bool) -> None:
+    """What lies across a car is sharper than its sides, and there is as much of it."""
+    label, angle = np.array([[32.0, 32.0, np.nan, np.nan, np.nan]]), np.radians(degrees)
+    box_angle = np.array([np.arcsin(abs(np.sin(angle)))]) if has_box else None
+    filled = fill_missing_orientation(car(degrees), label, box_angle)[0, 2]
+    assert np.degrees(axial_difference(filled, angle)) < (4 if has_box else 8)
+
+
+@pytest.mark.parametrize("degrees", [10.0, 80.0, 115.0])
+@pytest.mark.parametrize(("length", "width"), [(18.0, 8.0), (24.0, 10.0)])
+def test_a_labelled_size_is_used(degrees: float, length: float, width: float) -> None:
+    label = np.array([[32.0, 32.0, np.nan, length, width]])
+    filled = fill_missing_orientation(car(degrees, length, width), label)[0, 2]
+    assert np.degrees(axial_difference(filled, np.radians(degrees))) < 8
+
+
+def test_a_box_leaves_the_sign_to_the_image() -> None:
+    """The same upright box, 30 degrees either way."""
+    label, box_angle = np.array([[32.0, 32.0, np.nan, 16.0, 7.0]]), np.array([np.radians(30)])
+    for degrees in (30.0, 150.0):
+        filled = fill_missing_orientation(car(degrees), label, box_angle)[0, 2]
+        assert np.degrees(axial_difference(filled, np.radians(degrees))) < 4
+
+
+def test_given_orientations_stay_to_the_bit() -> None:
+    labels = np.array([[32.0, 32.0, 1.234, 16.0, 7.0], [20.0, 20.0, np.nan, np.nan, np.nan]])
+    filled = fill_missing_orientation(car(30.0), labels)
+    assert filled[0].tolist() == labels[0].tolist()
+    assert np.isfinite(filled[1, 2])
+    assert np.isnan(labels[1, 2])  # the caller's array is left alone
+    assert fill_missing_orientation(car(30.0), filled)[:, 2].tolist() == filled[:, 2].tolist()
+
+
+@pytest.mark.parametrize("angle", np.linspace(0, np.pi, 7, endpoint=False))
+def test_the_structure_tensor_gives_the_axis_of_a_bar(angle: float) -> None:
+    axis, coherence = structure_tensor_axis(bar(angle))
+    assert axial_difference(np.array([float(axis[32, 32])]), np.array([angle]))[0] < np.radians(6)
+    assert 0 <= coherence.min() <= coherence.max() <= 1 + 1e-6
+
+
+def test_a_flat_image_has_no_coherence() -> None:
+    axis, coherence = structure_tensor_axis(np.full((20, 30), 77, np.uint8))
+    assert coherence.max() == 0
+    assert np.isfinite(axis).all()
+
+
+def test_nearest_sampling_clips_to_the_image() -> None:
+    values = np.arange(12, dtype=np.float32).reshape(3, 4)
+    xy = np.array([[0.4, 0.4], [2.6, 1.4], [-5.0, 9.0], [9.0, -5.0]])
+    assert sample_nearest(values, xy).tolist() == [0.0, 7.0, 8.0, 3.0]
+
+
+@pytest.mark.parametrize("angle", [0.3, 1.2, 2.5])
+def test_oriented_patches_of_rotated_bars_are_alike(angle: float) -> None:
+    upright = oriented_patches(bar(0.0), np.array([[31.5, 31.5]]), np.array([0.0]))[0].astype(int)
+    rotated = oriented_patches(bar(angle), np.array([[31.5, 31.5]]), np.array([angle]))[0].astype(int)
+    assert np.abs(upright - rotated).mean() < 4
+
+
+def test_chips_are_cropped_about_the_rounded_position() -> None:
+    image = np.arange(64 * 64, dtype=np.uint32).reshape(64, 64).astype(np.uint8)
+    chip = upright_chips(image, np.array([[30.4, 20.6]]))[0]
+    assert chip[16, 16] == image[21, 30]
+    np.testing.assert_array_equal(chip, image[5:37, 14:46])
+
+
+def test_chips_at_the_edge_repeat_the_last_pixels() -> None:
+    image = np.random.default_rng(0).integers(0, 255, (40, 50), dtype=np.uint8)
+    chip = upright_chips(image, np.array([[0.0, 0.0]]))[0]
+    np.testing.assert_array_equal(chip[16:, 16:], image[:16, :16])
+    assert (chip[:16, :16] == image[0, 0]).all()
+
+
+def test_no_positions_give_no_crops() -> None:
+    image = np.zeros((40, 50), np.uint8)
+    assert oriented_patches(image, np.empty((0, 2)), np.empty(0)).shape == (0, 16, 8)
+    assert upright_chips(image, np.empty((0, 2))).shape == (0, 32, 32)
