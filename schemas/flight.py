@@ -27,84 +27,81 @@ class FramesConfig(Model):
     target_interval_s: PositiveFloat = 0.2
     """Working interval that ``every = auto`` aims at, s. Paper: about 5 frames a second."""
     start_s: float | None = None
-    """Leave out what comes before this time, s from the first frame."""
+    """Skip frames before this time, s from the first frame."""
     stop_s: float | None = None
-    """Leave out what comes at or after this time, s from the first frame."""
+    """Skip frames at or after this time, s from the first frame."""
     fps: PositiveFloat | None = None
-    """Frame rate of a picture folder that has no times of its own; never used where the source has times."""
+    """Frame rate of a folder of images without time stamps; ignored if the source has them."""
     max_pixels: PositiveInt = 400_000_000
-    """A picture larger than this is refused before memory is taken."""
+    """A larger image is refused before memory is allocated."""
 
 
 class LensConfig(Model):
     """Radial distortion from the plumb-line constraint (paper: camera calibration)."""
 
     calibrate: Literal["auto", "always", "never"] = "auto"
-    """``auto``: calibrate, and keep the pin-hole where the evidence for a distortion is too small."""
+    """``auto``: calibrate, and keep the pinhole model where no distortion is significant."""
     refine: Literal["auto", "never"] = "auto"
-    """``auto``: the lens is refined by control points of frames that see the same ground at different places of the
-    picture, as far as their evidence bears it. Paper: by straight lines alone."""
+    """``auto``: refine the lens by a multi-view estimate, from matched points of frames that see the same ground in
+    different parts of the image, where it lowers the hold-out error. Paper: straight lines alone."""
     frames: PositiveInt = 12
-    """How many frames, spread over the flight, give edge points and control points."""
+    """Number of frames, spread over the flight, that give edge points and matches."""
     max_edge_points: PositiveInt = 40_000
-    """Edge points used, all frames together."""
+    """Maximum number of edge points of all frames together."""
     angle_bins: PositiveInt = 720
-    """Bins of the one-dimensional histogram of line angle whose entropy is least for straight lines."""
+    """Bins of the histogram of line angles, whose entropy is minimal for straight lines."""
     max_distortion: PositiveFloat = 0.6
-    """Largest |a| of Harris' model r_d = r / sqrt(1 + a r^2) that the grid of starts covers; r in half-diagonals."""
+    """Largest |a| of Harris' model r_d = r / sqrt(1 + a r^2) in the search grid; r in half-diagonals."""
 
 
 class BaseConfig(Model):
-    """Base image: inter-sensor registration to a given picture, or built from the flight itself."""
+    """Base image: inter-sensor registration to a given image, or built from the flight itself."""
 
     coarse_scale: PositiveFloat = Field(0.25, le=1)
-    """SIFT for the coarse homography runs on pictures reduced to this scale. Paper: quarter size."""
+    """Image scale of SIFT for the coarse homography. Paper: 1/4."""
     grid_spacing_px: PositiveInt = 50
     """Spacing of the points matched by normalised cross-correlation. Paper: 50."""
     patch_size_px: PositiveInt = 75
     """Side of the correlated patches. Paper: 75 x 75."""
     search_radius_px: PositiveInt = 40
-    """How far from the coarse prediction a patch is searched."""
+    """Search radius around the coarse prediction."""
     drop_fraction: PositiveFloat = Field(0.05, lt=1)
-    """Share of worst points dropped a round of case deletion. Paper: 5 %."""
+    """Fraction of the worst points removed in a round of case deletion. Paper: 5 %."""
     max_mean_error_px: PositiveFloat = 2.0
-    """Case deletion ends when the mean error is below this. Paper: 2 px; outliers are not gone by then, see
-    findings."""
+    """Case deletion ends when the mean error is below this. Paper: 2 px, at which some outliers remain."""
     min_control_points: PositiveInt = 40
-    """Fewer surviving control points than this: the picture is not of this place."""
+    """With fewer control points left, the given image does not show this area."""
     median_frames: PositiveInt = 64
-    """Frames, spread over the flight, whose median is the base image where none is given, and the background."""
+    """Frames, spread over the flight, whose median is the base image if none is given, and the background."""
 
 
 class RegistrationConfig(Model):
-    """Every frame to the base image and to the previous registered frame together (paper: intra-sensor
-    registration)."""
+    """Each frame to the base image and the previous registered frame jointly (paper: intra-sensor registration)."""
 
     model: Literal["row_spline", "polyprojective", "homography"] = "row_spline"
-    """``row_spline``: second-order polyprojective plus a spline in the row, fitted jointly and robustly (rolling
-    shutter);
-    ``polyprojective``: the paper's, by case deletion; ``homography``: eight parameters."""
+    """``row_spline``: second-order polyprojective transform and a spline in the row (rolling shutter), fitted jointly
+    by robust least squares; ``polyprojective``: the paper's, by case deletion; ``homography``: eight parameters."""
     row_spline_knots: PositiveInt = Field(48, ge=4)
-    """Knots of the row spline; it follows motion of up to about a third as many cycles a frame. How stiff it is, each
-    frame's held-out control points decide, so that more knots than needed do no harm."""
-    key_points: PositiveInt = 4000
-    """Key points kept a frame, spread by cells."""
-    key_point_scale: PositiveFloat = Field(0.5, le=1)
-    """Key points are found on frames reduced to this scale, then refined below the pixel at full size."""
+    """Knots of the row spline, which represents up to a third as many cycles a frame. Its stiffness is cross-validated
+    for each frame, so that more knots than needed do no harm."""
+    max_keypoints: PositiveInt = 4000
+    """Keypoints kept a frame, spread by cells."""
+    keypoint_scale: PositiveFloat = Field(0.5, le=1)
+    """Image scale of keypoint detection; matches are refined below the pixel at full size."""
     match_search_px: PositiveInt = 50
     """Side of the square around the predicted position in which a match is searched. Paper: 50 x 50."""
     drop_fraction: PositiveFloat = Field(0.05, lt=1)
-    """Share of worst control points dropped a round of case deletion. Paper: 5 %."""
+    """Fraction of the worst control points removed in a round of case deletion. Paper: 5 %."""
     max_mean_error_px: PositiveFloat = 0.8
-    """Case deletion ends when the mean error is below this. Paper: 2 px, at which 10 % wrong matches survive."""
+    """Case deletion ends when the mean error is below this. Paper: 2 px, at which 10 % wrong matches remain."""
     cell_size_px: PositiveInt = 120
-    """Cell of the displacement mesh, whose stiffness the evidence chooses. Paper: 200 x 200."""
+    """Cell of the displacement mesh, whose stiffness is cross-validated. Paper: 200 x 200."""
     mesh: bool = True
-    """Whether the residual displacement of each cell is measured and interpolated."""
+    """Whether the residual displacement is modelled by a mesh."""
     min_control_points: PositiveInt = 40
-    """Fewer surviving control points than this: the frame is not registered."""
+    """With fewer inliers the frame is not registered."""
     max_residual_px: PositiveFloat = 3.0
-    """A held-out RMS above this: the frame is not registered."""
+    """With a larger hold-out RMS the frame is not registered."""
     chain_length_frames: PositiveInt = 64
     """Frames registered one to the next before the chain starts again from the base image."""
 
@@ -123,18 +120,18 @@ class TrackingConfig(Model):
     max_acceleration_m_per_s2: PositiveFloat = 23.0
     """Paper: 4 px/frame^2, that is 100 px/s^2 at 5 Hz."""
     jitter_sigmas: PositiveFloat = 3.0
-    """Gates are widened by this many standard deviations of a detection's place."""
+    """Gates are widened by this many standard deviations of a detection's position."""
     jitter_px: PositiveFloat = 1.0
-    """Standard deviation of a detection's place apart from the registration's residual, base px."""
+    """Standard deviation of a detection's position, without the registration error, base px."""
     max_interval_s: PositiveFloat = 0.45
     """Consecutive frames of a window are no farther apart than this."""
     linking: Literal["joint", "pairwise"] = "joint"
     """``joint``: the two links of a three-frame window are chosen together, by appearance and motion; ``pairwise``: the
     paper's, each link the mutual best by SAD, then the gates."""
     min_confidence: float = Field(0.8, ge=0, lt=1)
-    """A tracklet less sure than this, against its rivals and chance, is dropped."""
+    """Tracklets of a lower posterior probability, against alternatives and false alarms, are dropped."""
     refine: bool = True
-    """Align the patches of a link below the pixel, and let the tracklet carry that displacement."""
+    """Refine the displacement of a link by aligning its patches below the pixel."""
     max_gap_s: float = Field(2.0, ge=0)
     """Longest gap in a vehicle's track that gap closing bridges; 0: none."""
     max_stationary_gap_s: float = Field(30.0, ge=0)
@@ -145,13 +142,13 @@ class FieldConfig(Model):
     """The velocity histogram at every pixel (paper: velocity model)."""
 
     bin_width_m_per_s: PositiveFloat = 2.0
-    """Width of a velocity bin; the peak is refined below it."""
+    """Width of a velocity bin; modes are located below it."""
     kernel_sigma_m_per_s: PositiveFloat = 0.7
-    """Gaussian blob that a segment adds (the paper gives no width); best by held-out likelihood on real tracks."""
+    """Gaussian kernel of a segment; maximises the hold-out likelihood of real tracks. The paper gives no width."""
     velocity_span_s: float = Field(0.6, ge=0)
-    """A segment's velocity is averaged along its track over this time; 0, preset ``paper``: each by itself."""
+    """A segment's velocity is averaged along its track over this time; 0, as in preset ``paper``: not averaged."""
     max_speed_m_per_s: PositiveFloat = 36.0
-    """The histogram covers velocity components of up to this, either way."""
+    """Largest velocity component that the histogram covers, in either direction."""
     lane_width_m: PositiveFloat = 3.5
     """Width of a lane, from which the width of a path follows."""
     path_width: Literal["lane", "pixel"] = "lane"
@@ -172,7 +169,7 @@ class FieldConfig(Model):
 
 
 class WorkConfig(Model):
-    """How the work is cut. Never depends on the number of workers."""
+    """Division of the work into units, which is independent of the number of workers."""
 
     block_frames: PositiveInt = 8
     """Frames a Dask block; one-frame blocks cost 10 ms each."""
@@ -180,16 +177,16 @@ class WorkConfig(Model):
     """Frames a unit, that is a Prefect task run and a commit record; ``auto``: 16 up to 256 frames, 64 up to
     4096, then 256."""
     retries: int = Field(2, ge=0)
-    """How often a unit that failed is tried again."""
+    """Retries of a unit that failed."""
 
 
 class FlightConfig(Model):
-    """All that a run can be told, apart from its inputs. ``gsd_m`` and ``preset`` concern several stages."""
+    """The configuration of a run. ``gsd_m`` and ``preset`` concern several stages."""
 
     preset: Preset = "best"
-    """Which set of defaults this configuration started from."""
+    """The set of defaults that this configuration started from."""
     gsd_m: PositiveFloat | None = None
-    """Ground sample distance of the base image, m a pixel; none: from the base image's CRS, or all stays in px/s."""
+    """Ground sample distance of the base image, m a pixel; None: from its CRS, else speeds stay in px/s."""
     frames: FramesConfig = FramesConfig()
     lens: LensConfig = LensConfig()
     base: BaseConfig = BaseConfig()
@@ -201,12 +198,12 @@ class FlightConfig(Model):
 
 
 PAPER_GSD_M = 0.23
-"""The paper's ground sample distance. Where none is known, limits in metres become the paper's in pixels by it."""
+"""The paper's ground sample distance, by which limits in metres become pixels where none is known."""
 
 PRESETS: dict[Preset, dict[str, dict[str, object]]] = {
     "best": {},
     "fast": {
-        "registration": {"key_points": 1500, "key_point_scale": 0.25},
+        "registration": {"max_keypoints": 1500, "keypoint_scale": 0.25},
         "detection": {"method": "cascade", "rounds": 300, "feature_pool": 1500, "folds": 2},
     },
     "paper": {
@@ -214,7 +211,7 @@ PRESETS: dict[Preset, dict[str, dict[str, object]]] = {
         "registration": {
             "model": "polyprojective",
             "max_mean_error_px": 2.0,
-            "key_point_scale": 1.0,
+            "keypoint_scale": 1.0,
             "cell_size_px": 200,
         },
         "detection": {"method": "paper"},
@@ -222,7 +219,7 @@ PRESETS: dict[Preset, dict[str, dict[str, object]]] = {
         "field": {"path_width": "pixel", "shared_segment_weight": 2, "velocity_span_s": 0.0},
     },
 }
-"""What each preset changes of the defaults."""
+"""Preset -> the values that differ from the defaults."""
 
 _CALIBRATED: Mapping[str, tuple[object, ...]] = {"lens.calibrate": ("auto", "always")}
 _CASE_DELETION: Mapping[str, tuple[object, ...]] = {"registration.model": ("polyprojective",)}

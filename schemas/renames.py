@@ -10,6 +10,8 @@ OLD_NAMES_UNTIL = "0.3"
 
 OLD_KEYS: dict[str, str] = {
     "detection.network_steps": "detection.fine_tune_steps",
+    "registration.key_points": "registration.max_keypoints",
+    "registration.key_point_scale": "registration.keypoint_scale",
     "registration.window_px": "registration.match_search_px",
     "registration.segment_frames": "registration.chain_length_frames",
     "tracking.slow_m_per_s": "tracking.stationary_speed_m_per_s",

@@ -17,7 +17,7 @@ SMALL = (
     "detection.feature_pool=250",
     "detection.folds=2",
     "lens.refine=never",
-    "registration.key_points=1200",
+    "registration.max_keypoints=1200",
     "work.unit_frames=8",
     "work.retries=1",
 )

@@ -29,7 +29,7 @@ def test_a_flight_with_base_image_and_labels_is_near_the_truth(server: None, tmp
     )
     settings = [
         "detection.fine_tune_steps=100",
-        "registration.key_points=1500",
+        "registration.max_keypoints=1500",
     ]
     config = resolve_config(settings=settings, overrides={"gsd_m": 0.23})
     run_flight(Job(root=str(tmp_path / "run"), inputs=inputs, config=config), RunnerConfig(), Console("quiet"))

@@ -23,7 +23,7 @@ from velfield.synthetic.flight import Flight
 from velfield.synthetic.score import fit_homography, score_registration
 from velfield.synthetic.truth import make_truth
 
-CONFIG = RegistrationConfig(key_points=2000)
+CONFIG = RegistrationConfig(max_keypoints=2000)
 SAME_SENSOR = OtherSensorSimulation(same_sensor=True)
 WOBBLE = CameraSimulation(lens_a=0.2, vibration_px=4.0, vibration_cycles=6.0)
 CUT_TOLERANCE_PX = 0.02

@@ -8,7 +8,7 @@ from velfield.registration.keypoints import Keypoints, detect_keypoints
 from velfield.registration.matching import estimate_homography_prior, match_descriptors, match_guided
 from velfield.registration.transforms import HomographyTransform
 
-CONFIG = RegistrationConfig(key_points=500)
+CONFIG = RegistrationConfig(max_keypoints=500)
 TURNED = np.array([[0.9, -0.3, 40.0], [0.3, 0.95, -20.0], [1e-5, 2e-5, 1.0]])
 
 

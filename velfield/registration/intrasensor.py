@@ -137,7 +137,7 @@ def prepare_base(
     """
     frame_area = grey.size if frame_shape is None else frame_shape[0] * frame_shape[1]
     ratio = float(np.clip(grey.size / frame_area, 1.0, _MAX_BASE_KEYPOINT_RATIO))
-    keypoints = detect_keypoints(grey, config, mask, count=round(config.key_points * ratio))
+    keypoints = detect_keypoints(grey, config, mask, count=round(config.max_keypoints * ratio))
     templates, dense_templates = make_templates(grey, mask), make_templates(grey, mask, count=N_PATCHES_CROSS_SENSOR)
     return BaseReference((grey.shape[0], grey.shape[1]), keypoints, templates, dense_templates)
 

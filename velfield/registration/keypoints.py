@@ -54,15 +54,15 @@ def detect_keypoints(
     grey
         (h, w) uint8.
     config
-        ``key_points`` and ``key_point_scale``.
+        ``max_keypoints`` and ``keypoint_scale``.
     mask
         (h, w) bool: where keypoints are allowed; None: everywhere.
     count
-        Keypoints kept, in place of ``config.key_points``.
+        Keypoints kept, in place of ``config.max_keypoints``.
     """
-    n_keypoints = config.key_points if count is None else count
+    n_keypoints = config.max_keypoints if count is None else count
     height, width = grey.shape
-    size = max(8, round(width * config.key_point_scale)), max(8, round(height * config.key_point_scale))
+    size = max(8, round(width * config.keypoint_scale)), max(8, round(height * config.keypoint_scale))
     small = grey if size == (width, height) else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     small_mask = None
     if mask is not None:

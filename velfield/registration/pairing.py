@@ -61,7 +61,7 @@ def match_frame_pairs(frames: Sequence[GreyImage], lens: Lens) -> FramePairs | N
 
 def _detect(frame: GreyImage) -> Keypoints:
     scale = min(1.0, float(np.sqrt(_MAX_IMAGE_PX / frame.size)))
-    return detect_keypoints(frame, RegistrationConfig(key_point_scale=scale), count=_N_KEYPOINTS)
+    return detect_keypoints(frame, RegistrationConfig(keypoint_scale=scale), count=_N_KEYPOINTS)
 
 
 def _find_inliers(source: FloatArray, target: FloatArray, shape: tuple[int, int]) -> tuple[Mask, float]:
