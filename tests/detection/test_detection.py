@@ -16,7 +16,7 @@ from velfield.detection.orientation import axial_difference
 from velfield.detection.paper.response import dense_response
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
-from velfield.pipeline.stages.labels import scaled
+from velfield.pipeline.stages.labels import rescale
 from velfield.synthetic import Flight, small_flight
 
 SCALE = 0.92  # 16 px a car at 0.23 m a pixel
@@ -34,7 +34,7 @@ def sample(of: Flight, frame: int) -> LabelledImage:
     labels = of.labels(frame)[["x_px", "y_px", "orientation_rad", "length_px", "width_px"]].to_numpy(copy=True)
     labels[:, :2] = (labels[:, :2] + 0.5) * SCALE - 0.5
     labels[:, 3:] *= SCALE
-    return LabelledImage(image=scaled(of.frame(frame), SCALE), cars=labels)
+    return LabelledImage(image=rescale(of.frame(frame), SCALE), cars=labels)
 
 
 @cache

@@ -14,7 +14,7 @@ from velfield.detection.cascade.scenes import make_scene
 from velfield.detection.files import load_detector, shipped_detector
 from velfield.detection.orientation import axial_difference
 from velfield.errors import InputError
-from velfield.pipeline.stages.labels import labelled_images, odd_length
+from velfield.pipeline.stages.labels import check_vehicle_length, labelled_images
 from velfield.sources.labels.labels import read_labels
 from velfield.sources.source import probe
 from velfield.synthetic import small_flight
@@ -102,8 +102,13 @@ def test_an_upright_box_about_a_rotated_car_becomes_an_oriented_label(tmp_path: 
 
 
 def test_labels_that_are_not_as_long_as_cars_are_warned_of() -> None:
-    assert odd_length(20.0, 0.23) == odd_length(float("nan"), 0.23) == odd_length(20.0, None) == []
-    (short,), (long,) = odd_length(13.0, 0.23), odd_length(13.0, 0.8)
+    assert (
+        check_vehicle_length(20.0, 0.23)
+        == check_vehicle_length(float("nan"), 0.23)
+        == check_vehicle_length(20.0, None)
+        == []
+    )
+    (short,), (long,) = check_vehicle_length(13.0, 0.23), check_vehicle_length(13.0, 0.8)
     assert "3.0 m long, expected 3.3 to 6" in short
     assert "give 0.34 if they are cars" in short
     assert "10.4 m long" in long

@@ -9,7 +9,7 @@ from schemas.job import Inputs, Job
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.plan import make_plan
 from velfield.pipeline.stages.base_image import detect_unit_keypoints
-from velfield.pipeline.stages.external_detections import free_of_vehicles
+from velfield.pipeline.stages.external_detections import vehicle_free_mask
 from velfield.pipeline.stages.frames import create_frame_store, read_unit
 
 
@@ -31,7 +31,7 @@ def test_no_key_point_lies_on_a_given_vehicle(tmp_path: Path) -> None:
     )
     create_frame_store(plan)
     read_unit(plan, range(3))
-    free = free_of_vehicles(plan, 1, (120, 160))
+    free = vehicle_free_mask(plan, 1, (120, 160))
     assert free is not None
     assert not free[46:74, 52:108].any()
     assert free[:43].all()
@@ -59,7 +59,7 @@ def test_an_upright_box_masks_both_orientations_of_the_car_in_it(tmp_path: Path)
         inputs=Inputs(source=str(folder), detections=str(boxes)),
         config=resolve_config(overrides={"frames.fps": 5}),
     )
-    free = free_of_vehicles(make_plan(job), 0, (120, 160))
+    free = vehicle_free_mask(make_plan(job), 0, (120, 160))
     assert free is not None
     ends = [(80 + dx, 60 + dy) for dx in (-18, 18) for dy in (-18, 18)]
     assert not any(free[y, x] for x, y in ends)

@@ -12,7 +12,7 @@ from velfield.detection.motion.labels import working_scale
 from velfield.detection.review import collect_tp_fn_fp_crops, contact_sheet
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
-from velfield.pipeline.stages.labels import car_length_raw_px, labelled_images
+from velfield.pipeline.stages.labels import labelled_images, median_car_length_raw_px
 from velfield.report.figures import png_bytes
 from velfield.sources.labels.labels import Labels, read_labels
 from velfield.sources.source import probe
@@ -50,7 +50,7 @@ def train_from_labels(source: Path, labels: Path, config: FlightConfig, *, conti
     info = probe(source, frames=config.frames.model_copy(update={"fps": fps}))
     table = read_labels(labels, info)
     samples = tuple(labelled_images(source, info, table, work_per_raw=_scale(config, table)))
-    detector = train_detector(samples, config.detection, base=_earlier(continued))
+    detector = train_detector(samples, config.detection, base=_base_detector(continued))
     return Training(detector, samples, table)
 
 
@@ -58,13 +58,13 @@ def _scale(config: FlightConfig, labels: Labels) -> float:
     """Working px a raw px."""
     if config.gsd_m is not None:
         return working_scale(config.detection, config.gsd_m)
-    length = car_length_raw_px(labels.cars)
+    length = median_car_length_raw_px(labels.cars)
     if not np.isfinite(length):
         raise InputError("the labels have no length_px and --gsd-m is not given, expected either; give --gsd-m")
     return config.detection.working_car_length_px / length
 
 
-def _earlier(name: str | None) -> Detector | None:
+def _base_detector(name: str | None) -> Detector | None:
     if name is None:
         return None
     return shipped_detector() if name == SHIPPED else load_detector(Path(name))

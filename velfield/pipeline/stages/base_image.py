@@ -23,7 +23,7 @@ from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
 from velfield.pipeline.result import StageResult
 from velfield.pipeline.stages.base_fit import BaseFit, check_scale, covered_fraction
-from velfield.pipeline.stages.external_detections import free_of_vehicles
+from velfield.pipeline.stages.external_detections import vehicle_free_mask
 from velfield.pipeline.stages.lens import select_usable_frames
 from velfield.registration.intersensor import IntersensorResult, register_intersensor
 from velfield.registration.intrasensor import BaseReference, prepare_base, register_frame
@@ -64,7 +64,7 @@ def detect_unit_keypoints(plan: Plan, frames: Sequence[int]) -> list[FrameKeypoi
     """Detect the keypoints of a block of frames: the expensive part of registration, which runs in parallel."""
     store, config = open_frames(plan.layout.frames), plan.config.registration
     return [
-        FrameKeypoints(frame, detect_keypoints(store.read(frame), config, free_of_vehicles(plan, frame, store.shape)))
+        FrameKeypoints(frame, detect_keypoints(store.read(frame), config, vehicle_free_mask(plan, frame, store.shape)))
         for frame in frames
     ]
 

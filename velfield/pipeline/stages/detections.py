@@ -1,4 +1,4 @@
-"""Cars of a block of frames; one table a unit, in base pixels, with their patches beside it."""
+"""Stage `detections`: cars of each frame; a table a unit, in base px, and their image patches beside it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from schemas.arrays import GreyImage, Points
 from schemas.tables import DETECTION_COLUMNS
 from velfield.detection.detect import FrameDetections, detect_frame
 from velfield.detection.detector import Detector
@@ -31,38 +31,40 @@ ID_STEP = 1 << 20
 
 @dataclass(frozen=True)
 class BlockDetections:
-    """Cars of a block of frames: the table, and beside it their pictures and places on the working grid."""
+    """Cars of a block of frames: the table, their patches, and their positions on the working grid."""
 
     table: pd.DataFrame
-    patches: NDArray[np.uint8]
-    chips: NDArray[np.uint8]
-    place_work: NDArray[np.float64]
+    patches: GreyImage
+    chips: GreyImage
+    xy_work: Points
 
 
 def detect_block(plan: Plan, frames: range) -> BlockDetections:
-    """Cars of those frames of a block that are registered and that nothing is wrong with."""
+    """Detect the cars of the registered frames of a block."""
     record = read_working(plan.layout)
     working = WorkingGrid.open(plan, record.scale)
     times_s = open_frames(plan.layout.frames).column("time_s")
     usable = usable_frames(plan)
     parts = []
     for frame in frames:
-        seen = working.frame(frame) if usable[frame] else None
-        if seen is not None:
-            found = _cars(plan, seen, working.maps.transform(frame), frame, has_background=record.has_background)
-            parts.append(_frame_part(found, seen, frame, float(times_s[frame])))
+        rectified = working.frame(frame) if usable[frame] else None
+        if rectified is not None:
+            found = _detect(plan, rectified, working.maps.transform(frame), frame, has_background=record.has_background)
+            parts.append(_tabulate(found, rectified, frame, float(times_s[frame])))
         advance("detections")
-    return _joined(parts)
+    return _concatenate(parts)
 
 
-def _cars(
-    plan: Plan, seen: WorkingFrame, transform: FrameMap | None, frame: int, *, has_background: bool
+def _detect(
+    plan: Plan, rectified: WorkingFrame, transform: FrameMap | None, frame: int, *, has_background: bool
 ) -> FrameDetections:
     if plan.job.inputs.detections and transform is not None:
-        return external_detections(plan, seen, transform, frame)
+        return external_detections(plan, rectified, transform, frame)
     detector = _detector(plan.layout.detector, plan.keys["detector"])
-    background = _background_under(plan, seen) if has_background else None
-    return detect_frame(seen.image, seen.valid, detector, background, threshold=plan.config.detection.threshold)
+    background = _background_of(plan, rectified) if has_background else None
+    return detect_frame(
+        rectified.image, rectified.valid, detector, background, threshold=plan.config.detection.threshold
+    )
 
 
 @lru_cache(maxsize=2)
@@ -71,24 +73,24 @@ def _detector(path: Path, _key: str) -> Detector:
 
 
 @lru_cache(maxsize=2)
-def _background(plan_root: Path, _key: str) -> NDArray[np.uint8]:
+def _background(plan_root: Path, _key: str) -> GreyImage:
     from velfield.run.layout import RunLayout
 
     return read_background(RunLayout(plan_root)).median
 
 
-def _background_under(plan: Plan, seen: WorkingFrame) -> NDArray[np.uint8]:
-    """The background in the frame's window, whose corner need not fall on a pixel of the whole working grid."""
+def _background_of(plan: Plan, rectified: WorkingFrame) -> GreyImage:
+    """The background in a frame's window, whose corner is not aligned with the pixels of the whole working grid."""
     whole = _background(plan.layout.root, plan.keys["detector"])
-    shift = np.array(seen.window[:2]) * seen.scale
+    shift = np.array(rectified.window[:2]) * rectified.scale
     matrix = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]]])
-    size = (seen.image.shape[1], seen.image.shape[0])
-    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpAffine(whole, matrix, size, flags=how, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+    size = (rectified.image.shape[1], rectified.image.shape[0])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(whole, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-def _frame_part(found: FrameDetections, seen: WorkingFrame, frame: int, time_s: float) -> BlockDetections:
-    xy = seen.to_base(found.xy)
+def _tabulate(found: FrameDetections, rectified: WorkingFrame, frame: int, time_s: float) -> BlockDetections:
+    xy = rectified.to_base(found.xy)
     table = pd.DataFrame(
         {
             "detection_id": frame * ID_STEP + np.arange(len(xy), dtype=np.int64),
@@ -98,14 +100,14 @@ def _frame_part(found: FrameDetections, seen: WorkingFrame, frame: int, time_s: 
             "y_px": xy[:, 1],
             "orientation_rad": found.orientation_rad,
             "orientation_sd_rad": found.orientation_sd_rad,
-            "area_px": found.area_px / seen.scale**2,
+            "area_px": found.area_px / rectified.scale**2,
             "score": found.score,
         }
     ).astype(DETECTION_COLUMNS)
     return BlockDetections(table, found.patches, found.chips, found.xy)
 
 
-def _joined(parts: Sequence[BlockDetections]) -> BlockDetections:
+def _concatenate(parts: Sequence[BlockDetections]) -> BlockDetections:
     if not parts:
         table = pd.DataFrame({name: np.empty(0, dtype) for name, dtype in DETECTION_COLUMNS.items()})
         return BlockDetections(table, np.empty((0, 16, 8), np.uint8), np.empty((0, 32, 32), np.uint8), np.empty((0, 2)))
@@ -113,21 +115,21 @@ def _joined(parts: Sequence[BlockDetections]) -> BlockDetections:
         pd.concat([part.table for part in parts], ignore_index=True),
         np.concatenate([part.patches for part in parts]),
         np.concatenate([part.chips for part in parts]),
-        np.concatenate([part.place_work for part in parts]),
+        np.concatenate([part.xy_work for part in parts]),
     )
 
 
 def write_detections(plan: Plan, frames: range, blocks: Sequence[BlockDetections]) -> StageResult:
     """Write the table of a unit, and its patches."""
-    whole = _joined([block for block in blocks if len(block.table)])
+    whole = _concatenate([block for block in blocks if len(block.table)])
     unit = frames.start // plan.unit_frames
     path = plan.layout.unit_file(plan.layout.detections, unit, ".parquet")
-    pictures = plan.layout.unit_file(plan.layout.detections, unit, ".patches.npz")
+    patches = plan.layout.unit_file(plan.layout.detections, unit, ".patches.npz")
     scale = np.array(read_working(plan.layout).scale)
     write_patches(
-        pictures,
-        {"patches": whole.patches, "chips": whole.chips, "place_work": whole.place_work, "working_scale": scale},
+        patches,
+        {"patches": whole.patches, "chips": whole.chips, "xy_work": whole.xy_work, "working_scale": scale},
     )
     write_table(path, whole.table, DETECTION_COLUMNS)
     used = int(usable_frames(plan)[frames.start : frames.stop].sum())
-    return StageResult([path, pictures], {"frames": used, "cars": len(whole.table)})
+    return StageResult([path, patches], {"frames": used, "cars": len(whole.table)})

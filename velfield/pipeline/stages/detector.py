@@ -20,13 +20,13 @@ from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.progress import advance
 from velfield.pipeline.result import StageResult
-from velfield.pipeline.stages.external_detections import given_boxes
+from velfield.pipeline.stages.external_detections import external_boxes
 from velfield.pipeline.stages.labels import (
     base_px_per_raw_px,
-    car_length_raw_px,
+    check_vehicle_length,
     labelled_images,
-    marked_cars,
-    odd_length,
+    labels_of_run,
+    median_car_length_raw_px,
 )
 from velfield.pipeline.stages.rectified_frames import WorkingGrid, write_background
 from velfield.pipeline.stages.registration import usable_frames
@@ -58,9 +58,9 @@ def _from_file(plan: Plan) -> StageResult:
 
 def _from_detections(plan: Plan) -> StageResult:
     """Take another program's boxes; their median length gives the working scale where ``--gsd-m`` does not."""
-    boxes, scale = given_boxes(plan), _scale_of_gsd(plan)
+    boxes, scale = external_boxes(plan), _scale_of_gsd(plan)
     if scale is None:
-        scale = _scale_of_length(plan, car_length_raw_px(boxes), base_px_per_raw_px(plan))
+        scale = _scale_of_length(plan, median_car_length_raw_px(boxes), base_px_per_raw_px(plan))
     outcome = _finish(plan, None, 1.0 if scale is None else scale, "detections")
     warnings = []
     if scale is None:
@@ -101,9 +101,9 @@ def _known_scale(plan: Plan) -> float:
 
 
 def _from_labels(plan: Plan) -> StageResult:
-    labels = marked_cars(plan)
+    labels = labels_of_run(plan)
     base_per_raw = base_px_per_raw_px(plan)
-    length_px = car_length_raw_px(labels.cars)
+    length_px = median_car_length_raw_px(labels.cars)
     scale = _scale_of_gsd(plan) or _scale_of_length(plan, length_px, base_per_raw)
     if scale is None:
         raise InputError(
@@ -113,7 +113,7 @@ def _from_labels(plan: Plan) -> StageResult:
     samples = list(labelled_images(source, plan.info, labels, work_per_raw=work_per_raw))
     detector = train_detector(samples, plan.config.detection)
     outcome = _finish(plan, detector, scale, "labels", count=len(labels.cars))
-    return replace(outcome, warnings=odd_length(length_px * base_per_raw, read_grid(plan.layout).gsd_m))
+    return replace(outcome, warnings=check_vehicle_length(length_px * base_per_raw, read_grid(plan.layout).gsd_m))
 
 
 def _from_motion(plan: Plan) -> StageResult:

@@ -1,8 +1,7 @@
-"""Marked cars, from raw pixels of their frame onto a picture that a detector can learn from.
+"""Labelled images to train on: raw frames, rescaled to the working grid, with their labels.
 
-A labelled frame need not be among the frames worked on, nor be registered: a car looks the same in its raw frame,
-scaled.
-So labels are learnt from raw frames, brought to the working scale by the local scale of the map raw -> base.
+A labelled frame need not be among the processed frames, nor be registered: a car looks the same in its raw frame. So
+the raw frame is rescaled by the local scale of the map raw -> base.
 """
 
 from collections.abc import Iterator
@@ -11,8 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from schemas.arrays import FloatArray, GreyImage
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
@@ -23,11 +22,11 @@ from velfield.sources.frames import SourceInfo
 from velfield.sources.labels.labels import Labels, read_labels
 from velfield.sources.source import iter_frames
 
-_SHORTEST_M, _USUAL_M, _LONGEST_M = 3.3, 4.4, 6.0
-"""Of what is marked as cars in a frame, half are shorter and half longer than something between."""
+_MIN_LENGTH_M, _USUAL_LENGTH_M, _MAX_LENGTH_M = 3.3, 4.4, 6.0
+"""Range of the median length of labelled cars, and what it usually is."""
 
 
-def marked_cars(plan: Plan) -> Labels:
+def labels_of_run(plan: Plan) -> Labels:
     """The labels of ``--labels``.
 
     Raises
@@ -37,7 +36,7 @@ def marked_cars(plan: Plan) -> Labels:
     """
     labels = read_labels(Path(str(plan.job.inputs.labels)), plan.info)
     if labels.cars.empty:
-        raise InputError(f"--labels {plan.job.inputs.labels}: no car in it; mark the cars of one frame")
+        raise InputError(f"--labels {plan.job.inputs.labels}: no car in it; label the cars of one frame")
     return labels
 
 
@@ -59,65 +58,66 @@ def base_px_per_raw_px(plan: Plan) -> float:
     return float(np.median(scales))
 
 
-def car_length_raw_px(labels: pd.DataFrame) -> float:
-    """Usual length of the marked cars, raw px; NaN where no label tells."""
+def median_car_length_raw_px(labels: pd.DataFrame) -> float:
+    """Median length of the labelled cars, raw px; NaN where no label has one."""
     longest = labels[["length_px", "width_px"]].max(axis=1).dropna()
     return float(longest.median()) if len(longest) else float("nan")
 
 
-def odd_length(length_px: float, gsd_m: float | None) -> list[str]:
-    """A warning where marked cars of that usual length, px of ``gsd_m``, are not as long as cars; else none."""
+def check_vehicle_length(length_px: float, gsd_m: float | None) -> list[str]:
+    """A warning where the median length of labelled cars, px of ``gsd_m``, is not that of cars; else none."""
     if gsd_m is None or not np.isfinite(length_px):
         return []
     length_m = length_px * gsd_m
-    if _SHORTEST_M <= length_m <= _LONGEST_M:
+    if _MIN_LENGTH_M <= length_m <= _MAX_LENGTH_M:
         return []
     return [
-        f"the marked cars are {length_m:.1f} m long, expected {_SHORTEST_M:g} to {_LONGEST_M:g}: --gsd-m is metres a "
-        f"pixel of the base image; give {gsd_m * _USUAL_M / length_m:.2g} if they are cars, or mend the labels' lengths"
+        f"the labelled cars are {length_m:.1f} m long, expected {_MIN_LENGTH_M:g} to {_MAX_LENGTH_M:g}: --gsd-m is "
+        f"metres a pixel of the base image; give {gsd_m * _USUAL_LENGTH_M / length_m:.2g} if they are cars, or correct "
+        "the labels' lengths"
     ]
 
 
 def labelled_images(source: Path, info: SourceInfo, labels: Labels, *, work_per_raw: float) -> Iterator[LabelledImage]:
-    """Every labelled frame of a source at the working scale, to learn from.
+    """Every labelled frame of a source at the working scale.
 
     Raises
     ------
     InputError
         A labelled frame cannot be read.
     """
-    place = {name: index for index, name in enumerate(info.names)}
-    for frame in iter_frames(source, info, np.array(sorted(place[name] for name in labels.frames), np.int64)):
+    index_of = {name: index for index, name in enumerate(info.names)}
+    for frame in iter_frames(source, info, np.array(sorted(index_of[name] for name in labels.frames), np.int64)):
         if frame.flags & UNUSABLE:
-            raise InputError(f"--labels: the labelled frame {frame.name} cannot be used: {frame.reason}; mark another")
-        mine = labels.cars[labels.cars["frame"] == frame.name]
+            raise InputError(f"--labels: the labelled frame {frame.name} cannot be used: {frame.reason}; label another")
+        cars = labels.cars[labels.cars["frame"] == frame.name]
         yield LabelledImage(
-            image=scaled(frame.grey, work_per_raw),
-            cars=boxes(mine, work_per_raw),
-            ignore=left_out(labels.ignored[labels.ignored["frame"] == frame.name], work_per_raw),
-            abs_box_angle_rad=mine["abs_box_angle_rad"].to_numpy(np.float64),
+            image=rescale(frame.grey, work_per_raw),
+            cars=scale_boxes(cars, work_per_raw),
+            ignore=ignore_circles(labels.ignored[labels.ignored["frame"] == frame.name], work_per_raw),
+            abs_box_angle_rad=cars["abs_box_angle_rad"].to_numpy(np.float64),
         )
 
 
-def left_out(table: pd.DataFrame, work_per_raw: float) -> NDArray[np.float64]:
+def ignore_circles(table: pd.DataFrame, work_per_raw: float) -> FloatArray:
     """Circles (k, 3) as x, y, radius, working px, about a frame's objects that are neither car nor background."""
-    around = boxes(table, work_per_raw)
+    around = scale_boxes(table, work_per_raw)
     radius = np.nanmax(np.column_stack([around[:, 3:] / 2, np.full(len(around), 8.0)]), axis=1)
     return np.column_stack([around[:, :2], radius])
 
 
-def boxes(table: pd.DataFrame, work_per_raw: float) -> NDArray[np.float64]:
+def scale_boxes(table: pd.DataFrame, work_per_raw: float) -> FloatArray:
     """A frame's boxes (n, 5) as x, y, orientation, length, width, working px."""
     columns = ["x_px", "y_px", "orientation_rad", "length_px", "width_px"]
-    found = table[columns].to_numpy(np.float64, copy=True)
-    found[:, :2] = (found[:, :2] + 0.5) * work_per_raw - 0.5
-    found[:, 3:] *= work_per_raw
-    return found
+    boxes = table[columns].to_numpy(np.float64, copy=True)
+    boxes[:, :2] = (boxes[:, :2] + 0.5) * work_per_raw - 0.5
+    boxes[:, 3:] *= work_per_raw
+    return boxes
 
 
-def scaled(grey: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
-    """A grey picture scaled about its outer corner, area-averaged where it shrinks."""
+def rescale(grey: GreyImage, factor: float) -> GreyImage:
+    """A grey image rescaled about its outer corner, by area averages where it shrinks."""
     height, width = grey.shape
     size = max(1, round(width * factor)), max(1, round(height * factor))
-    how = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
-    return np.asarray(cv2.resize(grey, size, interpolation=how), np.uint8)
+    interpolation = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(grey, size, interpolation=interpolation), np.uint8)
