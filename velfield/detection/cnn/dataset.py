@@ -1,8 +1,8 @@
 """Training patches for the network: random crops of labelled images with augmentation, and their target maps.
 
 A patch is cut by a random similarity transform (position, rotation, mirroring, scale) and then augmented
-photometrically (gamma, contrast, brightness, blur, a shadow's edge, noise), so that it looks as another sensor, or
-other light, would show it. Targets are a Gaussian heatmap of car centres and the orientation at each heatmap pixel.
+photometrically (gamma, contrast, brightness, blur, a shadow's edge, noise), to resemble images of other sensors and in
+other light. Targets are a Gaussian heatmap of car centres and the orientation at each heatmap pixel.
 """
 
 from collections.abc import Sequence

@@ -75,7 +75,7 @@ class CnnDetector(Detector):
     def train_from_motion(cls, flight: UnlabelledFlight, config: CnnConfig) -> Detector:
         """A cascade, where appearance is sufficient or few vehicles move; else the network, self-trained.
 
-        Labels from motion are hundreds: the cascade learns as much from them, and is four times as fast. Where
+        On the hundreds of labels that motion gives, the cascade is as accurate, and four times as fast. Where
         appearance is not sufficient, the pre-trained network knows more of stationary cars.
         """
         cascade = config.for_method("cascade")

@@ -24,7 +24,7 @@ from velfield.errors import InputError
 
 @dataclass(frozen=True)
 class Conv:
-    """A convolution with bias; with a ReLU after it unless told otherwise.
+    """A convolution with bias, by default with a ReLU after it.
 
     Where there is a ReLU, training from scratch normalises its input by batch; the trained normalisation is folded into
     weights and bias.

@@ -180,7 +180,7 @@ def evaluate_by_motion(
 
     Parameters
     ----------
-    frames : sequence of Detections
+    frames : sequence of TimedDetections
         In time order; bursts of three or more suffice.
     car_length_px : float
         A car's length, working px.
