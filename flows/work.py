@@ -151,7 +151,7 @@ class Work:
             if not _is_lost(future):
                 records.append(future.result())
                 continue
-            error = _error_of(future)
+            error = _failure_cause(future)
             if isinstance(error, InputError) or essential:
                 raise error
             submitted.lost.append(unit.name)
@@ -175,7 +175,7 @@ def _is_lost(future: Future) -> bool:
     return not future.state.is_completed()
 
 
-def _error_of(future: Future) -> BaseException:
+def _failure_cause(future: Future) -> BaseException:
     if not future.state.is_final():
         return RuntimeError("a unit that it reads failed")
     outcome = future.result(raise_on_failure=False)

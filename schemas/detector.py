@@ -74,7 +74,7 @@ class CascadeTraining(Model):
 class _WithMotionChannel(DetectorConfig):
     motion_channel: Literal["auto", "always", "never"] = "auto"
     """Whether a detector that is trained on labels from motion reads |frame - background|; ``auto``: where appearance
-    is not sufficient to tell cars from other objects."""
+    is not sufficient to distinguish cars."""
 
 
 class CnnConfig(_WithMotionChannel):
@@ -118,7 +118,7 @@ class PaperConfig(DetectorConfig):
     """Regions smaller than this are dropped. Paper: 10."""
 
 
-def _method_of(section: object) -> object:
+def _read_method(section: object) -> object:
     if isinstance(section, dict):
         return section.get("method", CnnConfig.model_fields["method"].default)
     return getattr(section, "method", None)
@@ -126,7 +126,7 @@ def _method_of(section: object) -> object:
 
 DetectionConfig = Annotated[
     Annotated[CnnConfig, Tag("cnn")] | Annotated[CascadeConfig, Tag("cascade")] | Annotated[PaperConfig, Tag("paper")],
-    Discriminator(_method_of),
+    Discriminator(_read_method),
 ]
 """The section of the chosen method; without ``method``, that of the network."""
 

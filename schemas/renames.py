@@ -73,7 +73,7 @@ DETECTOR_KEYS = {
 
 def upgrade_detector(record: Mapping[str, Any]) -> dict[str, Any]:
     """The content of a detector file of version 1 as version 2 has it."""
-    found = _renamed(record, DETECTOR_KEYS)
+    found = _rename_keys(record, DETECTOR_KEYS)
     found["version"] = DETECTOR_VERSION
     found["method"] = _present_value("detection.method", found.get("method"))
     if isinstance(found.get("layers"), dict):
@@ -85,10 +85,10 @@ def upgrade_detector(record: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in found.items() if name not in of_others}
 
 
-def _renamed(value: Any, names: Mapping[str, str]) -> Any:
+def _rename_keys(value: Any, names: Mapping[str, str]) -> Any:
     if isinstance(value, Mapping):
-        return {names.get(name, name): _renamed(inner, names) for name, inner in value.items()}
-    return [_renamed(inner, names) for inner in value] if isinstance(value, list) else value
+        return {names.get(name, name): _rename_keys(inner, names) for name, inner in value.items()}
+    return [_rename_keys(inner, names) for inner in value] if isinstance(value, list) else value
 
 
 OLD_FOLDERS: dict[str, str] = {"tracklets": "links", "tracks": "tracklets", "intervals": "slices"}
@@ -164,7 +164,7 @@ def upgrade_config(tree: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     >>> upgrade_config({"tracking": {"join_gap_s": 1.0}})
     ({'tracking': {'max_gap_s': 1.0}}, ['tracking.join_gap_s is now tracking.max_gap_s; the old name works until 0.3'])
     """
-    upgraded = _copied(tree)
+    upgraded = _copy_sections(tree)
     messages = []
     for key, reason in REMOVED_KEYS.items():
         if _has(upgraded, key):
@@ -213,8 +213,8 @@ def _regroup_detection(section: Any) -> list[str]:
     return messages
 
 
-def _copied(tree: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: _copied(value) if isinstance(value, Mapping) else value for name, value in tree.items()}
+def _copy_sections(tree: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: _copy_sections(value) if isinstance(value, Mapping) else value for name, value in tree.items()}
 
 
 def _present_value(key: str, value: object) -> object:

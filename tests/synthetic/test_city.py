@@ -21,7 +21,7 @@ from velfield.synthetic.city.ground import (
     add_texture,
     apply_light,
     light_map,
-    lightened,
+    lighten,
     reach_map,
 )
 from velfield.synthetic.city.relief import GRID_PX, ground_height, ground_height_at, make_relief
@@ -160,9 +160,9 @@ def test_raising_sets_polygons_and_keeps_the_higher_disc() -> None:
 
 
 def test_tones_stay_within_their_range() -> None:
-    assert lightened(ASPHALT, 1000.0)[:2] == (245, 245)
-    assert lightened(ASPHALT, -1000.0)[:2] == (8, 8)
-    assert lightened(ASPHALT, 10.0) == (ASPHALT[0] + 10, ASPHALT[1] + 10, *ASPHALT[2:])
+    assert lighten(ASPHALT, 1000.0)[:2] == (245, 245)
+    assert lighten(ASPHALT, -1000.0)[:2] == (8, 8)
+    assert lighten(ASPHALT, 10.0) == (ASPHALT[0] + 10, ASPHALT[1] + 10, *ASPHALT[2:])
 
 
 def test_texture_scales_with_its_strength_and_vegetation_is_lighter_for_the_other_sensor() -> None:

@@ -27,7 +27,7 @@ def sweep(
     InputError
         The run knows no metres.
     """
-    segments, gsd_m, shape = _simulated(seed, frames) if run_folder is None else _of_run(run_folder)
+    segments, gsd_m, shape = _simulate_segments(seed, frames) if run_folder is None else _of_run(run_folder)
     yield "log density per (m/s)^2 of a held-out track, nats"
     yield f"{'bin m/s':>8} {'kernel':>7} {'field':>8} {'map':>8} {'gaussian':>9} {'tracks':>9}"
     for width in widths:
@@ -37,7 +37,7 @@ def sweep(
             yield f"{width:8.2f} {sigma:7.2f} {r.field:8.3f} {r.whole_map:8.3f} {r.gaussian:9.3f} {r.tracks:9d}"
 
 
-def _simulated(seed: int, frames: int) -> tuple[Segments, float, tuple[int, int]]:
+def _simulate_segments(seed: int, frames: int) -> tuple[Segments, float, tuple[int, int]]:
     flight = Flight(SimulationConfig(seed=seed, frames=frames, width=_SIZE_PX[0], height=_SIZE_PX[1]))
     tracklets = observed_tracklets(
         flight.city.traffic,

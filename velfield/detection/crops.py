@@ -30,7 +30,7 @@ def oriented_patches(
     cos, sin = np.cos(orientation_rad)[:, None, None], np.sin(orientation_rad)[:, None, None]
     x = xy[:, 0, None, None] + along[:, None] * cos - across * sin
     y = xy[:, 1, None, None] + along[:, None] * sin + across * cos
-    return _sampled(image, x, y)
+    return _sample(image, x, y)
 
 
 def upright_chips(image: GreyImage, xy: FloatArray, *, side: int = 32) -> GreyImage:
@@ -41,7 +41,7 @@ def upright_chips(image: GreyImage, xy: FloatArray, *, side: int = 32) -> GreyIm
     return np.stack(chips) if chips else np.empty((0, side, side), np.uint8)
 
 
-def _sampled(image: GreyImage, x: FloatArray, y: FloatArray) -> GreyImage:
+def _sample(image: GreyImage, x: FloatArray, y: FloatArray) -> GreyImage:
     shape = x.shape
     flat_x, flat_y = (np.ascontiguousarray(c.reshape(shape[0], -1), np.float32) for c in (x, y))
     rows = []

@@ -27,7 +27,7 @@ _SAME_MODE_BINS = 1.0
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _smoothed(h: NDArray[np.int32], y: int, x: int) -> np.int64:
+def _smooth(h: NDArray[np.int32], y: int, x: int) -> np.int64:
     """The histogram at a bin smoothed by a binomial 3x3 kernel, so that a peak spread over two bins is one maximum."""
     total = np.int64(0)
     for j in range(max(y - 1, 0), min(y + 2, h.shape[0])):
@@ -81,7 +81,7 @@ def _main_mode(h: NDArray[np.int32], window: float) -> tuple[float, float]:
     for y in range(h.shape[0]):
         for x in range(h.shape[1]):
             if h[y, x] > 0:
-                value = _smoothed(h, y, x)
+                value = _smooth(h, y, x)
                 if value > best:
                     best, best_y, best_x = value, y, x
     y_mode, x_mode = _mean_shift(h, float(best_y), float(best_x), window)
@@ -90,12 +90,12 @@ def _main_mode(h: NDArray[np.int32], window: float) -> tuple[float, float]:
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _is_peak(h: NDArray[np.int32], y: int, x: int) -> bool:
-    here = _smoothed(h, y, x)
+    here = _smooth(h, y, x)
     for j in range(max(y - 1, 0), min(y + 2, h.shape[0])):
         for i in range(max(x - 1, 0), min(x + 2, h.shape[1])):
             if (j, i) == (y, x):
                 continue
-            there = _smoothed(h, j, i)
+            there = _smooth(h, j, i)
             # Of equal neighbours the first in raster order is the maximum.
             if there > here or (there == here and (j, i) < (y, x)):
                 return False

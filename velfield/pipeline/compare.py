@@ -45,7 +45,7 @@ def compare_runs(before: Path, after: Path, out: Path, *, min_count: int = MIN_C
         stationary_speed_px_per_s=stationary_speed_px_per_s(runs[0].record.config.field, runs[0].grid.gsd_m),
         min_count=min_count,
     )
-    shown = {name: _shown(name, change, runs[1]) for name, change in changes.items()}
+    shown = {name: _to_display_units(name, change, runs[1]) for name, change in changes.items()}
     scale = MapScale(gsd_m=runs[1].grid.gsd_m, north_rad=north_direction_rad(runs[1].grid))
     for name, (values, unit) in shown.items():
         real = np.where(changes[name].significant, values, np.nan)
@@ -75,7 +75,7 @@ def _show_in_the_viewer(changes: dict[str, Change], before: Path, run: Run) -> N
     write_change_layers(run.layout, layers)
 
 
-def _shown(name: str, change: Change, run: Run) -> tuple[NDArray[np.float64], str]:
+def _to_display_units(name: str, change: Change, run: Run) -> tuple[NDArray[np.float64], str]:
     """A change in display units, and the unit."""
     gsd_m = run.grid.gsd_m
     if name == "direction":

@@ -28,7 +28,7 @@ def page_is_built() -> bool:
 
 def licences() -> str:
     """Licences of the packages in the scripts."""
-    return _built("LICENSES.txt")
+    return _read_built("LICENSES.txt")
 
 
 def render_viewer(report: Report, figures: Sequence[ReportFigure]) -> str:
@@ -49,13 +49,13 @@ def render_annotator(title: str, content: Mapping[str, object]) -> str:
 
 
 def _page(name: str, parts: Mapping[str, str]) -> str:
-    style, script = report_style() + _built(f"{name}.css"), _built(f"{name}.js")
+    style, script = report_style() + _read_built(f"{name}.css"), _read_built(f"{name}.js")
     policy = (
         f"default-src 'none'; script-src '{_hash(script)}' 'wasm-unsafe-eval'; style-src '{_hash(style)}'; "
         "img-src 'self' data: blob:; connect-src 'self' data:; base-uri 'none'; form-action 'none'"
     )
     filled = {"policy": policy, "style": style, "colours": _json(_colours()), "script": script, **parts}
-    pieces = _built(f"{name}.html").split("{{")
+    pieces = _read_built(f"{name}.html").split("{{")
     html = [pieces[0]]
     for piece in pieces[1:]:  # each part once; parts are not expanded in turn
         part, _, rest = piece.partition("}}")
@@ -63,7 +63,7 @@ def _page(name: str, parts: Mapping[str, str]) -> str:
     return "".join(html)
 
 
-def _built(name: str) -> str:
+def _read_built(name: str) -> str:
     return files("velfield.report").joinpath(f"page/{name}").read_text(encoding="utf-8")
 
 

@@ -127,7 +127,7 @@ def _first(run: Run) -> ResultRecord:
         base=given.base if given else None,
         base_digest=run.record.inputs.base,
         how="run",
-        created=_time_of(run.layout.flight),
+        created=_modification_time(run.layout.flight),
     )
 
 
@@ -141,9 +141,9 @@ def _result(name: str, root: Path, base: Path) -> ResultRecord:
         base_digest=digest_path(base),
         how="mapped" if mapped else "registered again",
         added_error_px=mapped.added_error_px if mapped else None,
-        created=_time_of(RunLayout(root).flight),
+        created=_modification_time(RunLayout(root).flight),
     )
 
 
-def _time_of(path: Path) -> str:
+def _modification_time(path: Path) -> str:
     return datetime.datetime.fromtimestamp(path.stat().st_mtime).astimezone().isoformat(timespec="seconds")

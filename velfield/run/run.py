@@ -88,13 +88,13 @@ class Run:
 
     def to_base(self, frame: int, xy_raw: Points) -> Points:
         """Raw pixels of a frame -> base pixels, (n, 2) -> (n, 2); NaN rows where the frame is not registered."""
-        return self._transformed("to_base", frame, xy_raw)
+        return self._transform_points("to_base", frame, xy_raw)
 
     def to_raw(self, frame: int, xy_base: Points) -> Points:
         """Base pixels -> raw pixels of a frame, (n, 2) -> (n, 2); NaN rows where there is no such pixel."""
-        return self._transformed("to_raw", frame, xy_base)
+        return self._transform_points("to_raw", frame, xy_base)
 
-    def _transformed(self, direction: str, frame: int, xy: Points) -> Points:
+    def _transform_points(self, direction: str, frame: int, xy: Points) -> Points:
         points = np.asarray(xy, np.float64).reshape(-1, 2)
         transform = self.frame_transforms.transform(frame)
         if transform is None:

@@ -158,11 +158,11 @@ def crop_differences(before: PreparedCrops, after: PreparedCrops, first: IntArra
     (k,) float64, grey levels.
     """
     side = before.grey.shape[1]
-    out = _crop_differences(*_flattened(before), *_flattened(after), _shifts_shortest_first(side), side, first, second)
+    out = _crop_differences(*_flatten(before), *_flatten(after), _shifts_shortest_first(side), side, first, second)
     return np.asarray(out, dtype=np.float64)
 
 
-def _flattened(prepared: PreparedCrops) -> tuple[NDArray[np.generic], ...]:
+def _flatten(prepared: PreparedCrops) -> tuple[NDArray[np.generic], ...]:
     """The crops as (n, side * side)."""
     crops = (prepared.grey, prepared.low, prepared.high, prepared.car_mask)
     side = prepared.grey.shape[1]

@@ -58,10 +58,10 @@ def tracklet_table(
     DataFrame, int
         The table, and the number of its links (two a tracklet) whose displacement is from the crops.
     """
-    start = _concatenated([np.full(len(w.detections), w.start) for w in windows], np.int64)
-    indices = _concatenated([w.detections.ravel() for w in windows], np.int64).reshape(-1, 3)
-    differences = _concatenated([w.differences.ravel() for w in windows], np.float64).reshape(-1, 2)
-    column = _detections_of(tables, start, indices)
+    start = _concatenate([np.full(len(w.detections), w.start) for w in windows], np.int64)
+    indices = _concatenate([w.detections.ravel() for w in windows], np.int64).reshape(-1, 3)
+    differences = _concatenate([w.differences.ravel() for w in windows], np.float64).reshape(-1, 2)
+    column = _detection_columns(tables, start, indices)
     displacement = _displacements(tables, start, indices, limits, refine=refine)
     for k, link in ((0, "01"), (1, "12")):
         interval = column[f"time_{k + 1}_s"] - column[f"time_{k}_s"]
@@ -69,25 +69,25 @@ def tracklet_table(
         column[f"vy_{link}_px_per_s"] = displacement[:, k, 1] / interval
         column[f"displacement_sd_{link}_px"] = displacement[:, k, 2]
         column[f"sad_{link}"] = differences[:, k]
-    column["confidence"] = _concatenated([w.confidence for w in windows], np.float64)
+    column["confidence"] = _concatenate([w.confidence for w in windows], np.float64)
     column["tracklet_id"] = column["detection_id_1"]
     column["track_id"] = np.full(start.size, -1, np.int64)
     frame = pd.DataFrame({name: column[name].astype(kind) for name, kind in TRACKLET_COLUMNS.items()})
     return frame, int(np.sum(displacement[:, :, 3]))
 
 
-def _concatenated(parts: Sequence[NDArray[Any]], kind: type) -> NDArray[Any]:
+def _concatenate(parts: Sequence[NDArray[Any]], kind: type) -> NDArray[Any]:
     return np.concatenate(parts).astype(kind) if parts else np.zeros(0, kind)
 
 
-def _detections_of(tables: Sequence[FrameTable], start: IntArray, indices: IntArray) -> dict[str, NDArray[Any]]:
+def _detection_columns(tables: Sequence[FrameTable], start: IntArray, indices: IntArray) -> dict[str, NDArray[Any]]:
     """Frames, times, ids and positions of the detections of each tracklet."""
     frames = np.array([t.frame for t in tables], np.int64)
     times = np.array([t.time_s for t in tables], np.float64)
     bounds = np.cumsum([0] + [t.detection_id.size for t in tables])
-    ids = _concatenated([t.detection_id for t in tables], np.int64)
-    x = _concatenated([t.x_px for t in tables], np.float64)
-    y = _concatenated([t.y_px for t in tables], np.float64)
+    ids = _concatenate([t.detection_id for t in tables], np.int64)
+    x = _concatenate([t.x_px for t in tables], np.float64)
+    y = _concatenate([t.y_px for t in tables], np.float64)
     column: dict[str, NDArray[Any]] = {}
     for k in range(3):
         rows = bounds[start + k] + indices[:, k]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from schemas.arrays import ByteArray, FloatArray
 from schemas.simulation import SceneSimulation
 from velfield.synthetic.city import city_plan as p
-from velfield.synthetic.city.ground import GRASS, GRAVEL, OLD_ASPHALT, PAVEMENT, SOIL, Canvas, Tone, lightened
+from velfield.synthetic.city.ground import GRASS, GRAVEL, OLD_ASPHALT, PAVEMENT, SOIL, Canvas, Tone, lighten
 
 
 @dataclass
@@ -61,13 +61,11 @@ def rotated_box(x: float, y: float, length: float, width: float, angle: float) -
 def paint_fields(canvas: Canvas, rect: p.Rect, rng: np.random.Generator) -> None:
     """Large surfaces below everything else: lawns, gravel, yards, soil."""
     x0, y0, x1, y1 = rect
-    kinds: list[Tone] = [GRASS, lightened(GRASS, 16), lightened(GRASS, -14), GRAVEL, OLD_ASPHALT, SOIL, PAVEMENT]
+    kinds: list[Tone] = [GRASS, lighten(GRASS, 16), lighten(GRASS, -14), GRAVEL, OLD_ASPHALT, SOIL, PAVEMENT]
     for _ in range(int((x1 - x0) * (y1 - y0) / 500)):
         x, y = rng.uniform(x0 - 30, x1 + 30), rng.uniform(y0 - 30, y1 + 30)
         kind = kinds[int(rng.choice(len(kinds), p=[0.18, 0.18, 0.18, 0.12, 0.16, 0.08, 0.1]))]
-        canvas.polygon(
-            rotated_box(x, y, rng.uniform(8, 45), rng.uniform(8, 30), 0.0), lightened(kind, rng.normal(0, 8))
-        )
+        canvas.polygon(rotated_box(x, y, rng.uniform(8, 45), rng.uniform(8, 30), 0.0), lighten(kind, rng.normal(0, 8)))
     for _ in range(int((x1 - x0) * (y1 - y0) / 900)):
         x, y, angle = rng.uniform(x0, x1), rng.uniform(y0, y1), rng.uniform(0, np.pi)
         t = np.linspace(-1, 1, 9)
@@ -75,7 +73,7 @@ def paint_fields(canvas: Canvas, rect: p.Rect, rng: np.random.Generator) -> None
         along = np.column_stack([t * rng.uniform(8, 25), bend * t**2])
         c, s = np.cos(angle), np.sin(angle)
         path = along @ np.array([[c, s], [-s, c]]) + [x, y]
-        canvas.stroke(path, rng.uniform(0.5, 2.0), lightened(PAVEMENT, rng.normal(0, 18)))
+        canvas.stroke(path, rng.uniform(0.5, 2.0), lighten(PAVEMENT, rng.normal(0, 18)))
 
 
 def place_buildings(
@@ -92,7 +90,7 @@ def place_buildings(
         occupancy.occupy(rotated_box(x, y, length + 2, width + 2, angle))
         height = scene.building_height_m * float(rng.choice([0.25, 0.4, 0.6, 1.0], p=[0.3, 0.35, 0.25, 0.1]))
         yard = [OLD_ASPHALT, GRAVEL, PAVEMENT, GRASS][int(rng.integers(0, 4))]
-        canvas.polygon(rotated_box(x, y, length + 5, width + 5, angle), lightened(yard, rng.normal(0, 6)))
+        canvas.polygon(rotated_box(x, y, length + 5, width + 5, angle), lighten(yard, rng.normal(0, 6)))
         _building(canvas, (x, y, length, width, angle), height, rng)
 
 
@@ -113,23 +111,23 @@ def _building(
 
     if rng.uniform() < 0.4:
         shift = rng.uniform(14, 34) * rng.choice([-1, 1])
-        canvas.polygon(outline, lightened(roof, shift / 2))
-        canvas.polygon(rotated_box(*at(0, width / 4), length, width / 2, angle), lightened(roof, -shift / 2))
+        canvas.polygon(outline, lighten(roof, shift / 2))
+        canvas.polygon(rotated_box(*at(0, width / 4), length, width / 2, angle), lighten(roof, -shift / 2))
         for u in np.arange(-length / 2, length / 2, 0.9):
-            canvas.stroke(np.array([at(u, -width / 2), at(u, width / 2)]), 0.12, lightened(roof, -12))
-        canvas.stroke(np.array([at(-length / 2, 0), at(length / 2, 0)]), 0.3, lightened(roof, 26))
+            canvas.stroke(np.array([at(u, -width / 2), at(u, width / 2)]), 0.12, lighten(roof, -12))
+        canvas.stroke(np.array([at(-length / 2, 0), at(length / 2, 0)]), 0.3, lighten(roof, 26))
         return
-    canvas.polygon(outline, lightened(roof, 28))
+    canvas.polygon(outline, lighten(roof, 28))
     canvas.polygon(rotated_box(x, y, length - 0.9, width - 0.9, angle), roof)
     for _ in range(int(rng.integers(3, 12))):
         u, v = rng.uniform(-0.42, 0.42) * length, rng.uniform(-0.4, 0.4) * width
         size = rng.uniform(0.6, 3.0), rng.uniform(0.6, 2.2)
         corners = rotated_box(*at(u, v), *size, angle)
-        canvas.polygon(corners, lightened(roof, rng.choice([-55, -35, 35, 55])))
+        canvas.polygon(corners, lighten(roof, rng.choice([-55, -35, 35, 55])))
         if height > 0 and rng.uniform() < 0.5:
             canvas.raise_polygon(corners, height + rng.uniform(0.5, 1.5))
     for v in rng.uniform(-0.45, 0.45, int(rng.integers(0, 4))) * width:
-        canvas.stroke(np.array([at(-0.46 * length, v), at(0.46 * length, v)]), 0.15, lightened(roof, rng.normal(0, 18)))
+        canvas.stroke(np.array([at(-0.46 * length, v), at(0.46 * length, v)]), 0.15, lighten(roof, rng.normal(0, 18)))
 
 
 def place_trees(

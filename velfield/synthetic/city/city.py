@@ -78,7 +78,7 @@ class City:
     @cached_property
     def vehicles(self) -> Vehicles:
         """Dimensions and tones of all vehicles."""
-        parked = self._parked(self._rng(RandomStream.PARKED))
+        parked = self._park_cars(self._rng(RandomStream.PARKED))
         driving = len(self.traffic)
         rng = self._rng(RandomStream.APPEARANCE)
         still, moving = draw_dimensions(np.zeros(len(parked), bool), rng), self.traffic.dimensions
@@ -120,12 +120,12 @@ class City:
             c.base,
             shape=self.base_shape,
             sun=self.sun if same else shadow_vector(c.base.sun_azimuth_deg, c.base.sun_length),
-            parked=self._parked(rng),
+            parked=self._park_cars(rng),
             gsd_m=c.gsd_m,
             rng=rng,
         )
 
-    def _parked(self, rng: np.random.Generator) -> FloatArray:
+    def _park_cars(self, rng: np.random.Generator) -> FloatArray:
         spaces = self._painted[1]
         occupied = spaces[rng.uniform(size=len(spaces)) < self.config.scene.parked_share]
         xy = occupied[:, :2] + rng.normal(0, 0.2, (len(occupied), 2))

@@ -28,7 +28,7 @@ GRAVEL: Tone = (138, 128, 150, 90)
 SOIL: Tone = (112, 124, 130, 90)
 
 
-def lightened(tone: Tone, change: float) -> Tone:
+def lighten(tone: Tone, change: float) -> Tone:
     """A tone lighter (or darker) by ``change`` grey levels for both sensors."""
     first, second = (int(np.clip(t + change, 8, 245)) for t in tone[:2])
     return (first, second, tone[2], tone[3])
@@ -43,13 +43,13 @@ class Canvas:
         self.height_m = np.zeros((-(-size[1] // MOSAIC_SCALE), -(-size[0] // MOSAIC_SCALE)), dtype=np.float32)
         self.origin_m, self.pixel_m = np.array(origin_m), pixel_m
 
-    def _fixed(self, points_m: FloatArray, pixel_m: float) -> NDArray[np.int32]:
+    def _to_fixed_point(self, points_m: FloatArray, pixel_m: float) -> NDArray[np.int32]:
         sixteenths = (np.asarray(points_m, dtype=np.float64) - self.origin_m) / pixel_m * 16
         return np.asarray(np.rint(sixteenths), dtype=np.int32)
 
     def polygon(self, points_m: FloatArray, tone: Tone) -> None:
         """Fill a polygon (n, 2) m."""
-        cv2.fillPoly(self.paint, [self._fixed(points_m, self.pixel_m)], tone, cv2.LINE_AA, 4)
+        cv2.fillPoly(self.paint, [self._to_fixed_point(points_m, self.pixel_m)], tone, cv2.LINE_AA, 4)
 
     def rect(self, x0: float, y0: float, x1: float, y1: float, tone: Tone) -> None:
         """Fill an axis-aligned rectangle, m."""
@@ -58,7 +58,7 @@ class Canvas:
     def stroke(self, points_m: FloatArray, width_m: float, tone: Tone) -> None:
         """Draw a line of a width, m, round at its corners."""
         thickness = max(round(width_m / self.pixel_m), 1)
-        points = [self._fixed(points_m, self.pixel_m)]
+        points = [self._to_fixed_point(points_m, self.pixel_m)]
         cv2.polylines(self.paint, points, False, tone, thickness, cv2.LINE_AA, 4)
 
     def dashes(self, start: FloatArray, end: FloatArray, width_m: float, tone: Tone, on_m: float, off_m: float) -> None:
@@ -73,7 +73,7 @@ class Canvas:
 
     def circle(self, x: float, y: float, radius_m: float, tone: Tone) -> None:
         """Fill a circle, m."""
-        centre = self._fixed(np.array([x, y]), self.pixel_m).tolist()
+        centre = self._to_fixed_point(np.array([x, y]), self.pixel_m).tolist()
         cv2.circle(self.paint, centre, round(radius_m / self.pixel_m * 16), tone, -1, cv2.LINE_AA, 4)
 
     def raise_disc(self, x: float, y: float, radius_m: float, height_m: float) -> None:
@@ -90,7 +90,7 @@ class Canvas:
 
     def raise_polygon(self, points_m: FloatArray, height_m: float) -> None:
         """Set the height of a polygon (n, 2), m."""
-        mask = self._fixed(points_m, self.pixel_m * MOSAIC_SCALE)
+        mask = self._to_fixed_point(points_m, self.pixel_m * MOSAIC_SCALE)
         cv2.fillPoly(self.height_m, [mask], float(height_m), cv2.LINE_8, 4)
 
 

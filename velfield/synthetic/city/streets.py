@@ -22,7 +22,7 @@ from velfield.synthetic.city.ground import (
     OLD_ASPHALT,
     PAVEMENT,
     Canvas,
-    lightened,
+    lighten,
 )
 from velfield.synthetic.city.road_network import STEP_M
 
@@ -70,15 +70,15 @@ def _pavements(canvas: Canvas, plan: p.CityPlan) -> None:
         for sign in (-1, 1):
             canvas.rect(x0 - OVERRUN_M, y, x1 + OVERRUN_M, y + sign * (p.CURB_A + 6.0), PAVEMENT)
             for x in np.arange(x0 - 30, x1 + 30, 3.0):
-                canvas.rect(x, y, x + 0.12, y + sign * (p.CURB_A + 6.0), lightened(PAVEMENT, -16))
+                canvas.rect(x, y, x + 0.12, y + sign * (p.CURB_A + 6.0), lighten(PAVEMENT, -16))
     for x in plan.avenues_x:
         for sign in (-1, 1):
-            canvas.rect(x, y0 - OVERRUN_M, x + sign * (p.CURB_B + 8.5), y1 + OVERRUN_M, lightened(PAVEMENT, -6))
+            canvas.rect(x, y0 - OVERRUN_M, x + sign * (p.CURB_B + 8.5), y1 + OVERRUN_M, lighten(PAVEMENT, -6))
             for y in np.arange(y0 - 30, y1 + 30, 3.0):
-                canvas.rect(x, y, x + sign * (p.CURB_B + 8.5), y + 0.12, lightened(PAVEMENT, -22))
+                canvas.rect(x, y, x + sign * (p.CURB_B + 8.5), y + 0.12, lighten(PAVEMENT, -22))
     for edge in plan.road_network.edges:
         if edge.kind in ("street", "ring"):
-            canvas.stroke(edge.path, 11.0, lightened(PAVEMENT, -4))
+            canvas.stroke(edge.path, 11.0, lighten(PAVEMENT, -4))
 
 
 def _roads(canvas: Canvas, plan: p.CityPlan, rng: np.random.Generator) -> None:
@@ -91,13 +91,13 @@ def _roads(canvas: Canvas, plan: p.CityPlan, rng: np.random.Generator) -> None:
     for y in plan.avenues_y:
         canvas.rect(x0 - OVERRUN_M, y - side, x1 + OVERRUN_M, y + side, ASPHALT)
         canvas.rect(x0 - OVERRUN_M, y - median + 0.3, x1 + OVERRUN_M, y + median - 0.3, KERB)
-        canvas.rect(x0 - OVERRUN_M, y - median + 0.55, x1 + OVERRUN_M, y + median - 0.55, lightened(GRASS, 6))
+        canvas.rect(x0 - OVERRUN_M, y - median + 0.55, x1 + OVERRUN_M, y + median - 0.55, lighten(GRASS, 6))
     for edge in plan.road_network.edges:
         if edge.kind in PATH_KINDS:
             canvas.stroke(edge.path, 5.7, KERB)
     for edge in plan.road_network.edges:
         if edge.kind in PATH_KINDS:
-            canvas.stroke(edge.path, 5.2, lightened(ASPHALT, 8 if edge.kind in ("street", "ring", "aisle") else 0))
+            canvas.stroke(edge.path, 5.2, lighten(ASPHALT, 8 if edge.kind in ("street", "ring", "aisle") else 0))
     for y in plan.avenues_y:
         for sign in (-1, 1):
             canvas.rect(x0 - OVERRUN_M, y + sign * (median - 0.1), x1 + OVERRUN_M, y + sign * side, ASPHALT)
@@ -112,7 +112,7 @@ def _roads(canvas: Canvas, plan: p.CityPlan, rng: np.random.Generator) -> None:
 def _wear(canvas: Canvas, plan: p.CityPlan, rng: np.random.Generator) -> None:
     """Wear of the asphalt: oil in the middle of lanes, patches, cracks, manholes."""
     for edge in plan.road_network.edges:
-        canvas.stroke(edge.path, 1.1, lightened(ASPHALT, -9 if edge.kind in ("avenue", "box") else 0))
+        canvas.stroke(edge.path, 1.1, lighten(ASPHALT, -9 if edge.kind in ("avenue", "box") else 0))
     for edge in plan.road_network.edges:
         for _ in range(rng.poisson(edge.length_m / 9)):
             k = int(rng.integers(0, len(edge.path) - 1))
@@ -122,14 +122,14 @@ def _wear(canvas: Canvas, plan: p.CityPlan, rng: np.random.Generator) -> None:
             draw = rng.uniform()
             if draw < 0.5:
                 corners = rotated_box(x, y, rng.uniform(0.8, 7), rng.uniform(0.5, 2.8), angle)
-                canvas.polygon(corners, lightened(ASPHALT, rng.normal(0, 17)))
+                canvas.polygon(corners, lighten(ASPHALT, rng.normal(0, 17)))
             elif draw < 0.65:
-                canvas.circle(x, y, 0.38, lightened(ASPHALT, rng.choice([-40, 35])))
+                canvas.circle(x, y, 0.38, lighten(ASPHALT, rng.choice([-40, 35])))
             else:
                 wander = np.cumsum(rng.normal(0, 0.5, (7, 2)), axis=0) + np.linspace(0, rng.uniform(2, 9), 7)[
                     :, None
                 ] * (d / STEP_M)
-                canvas.stroke(wander + np.array([x, y]), 0.14, lightened(ASPHALT, -34))
+                canvas.stroke(wander + np.array([x, y]), 0.14, lighten(ASPHALT, -34))
 
 
 def _lane_lines(canvas: Canvas, plan: p.CityPlan) -> None:
@@ -141,7 +141,7 @@ def _lane_lines(canvas: Canvas, plan: p.CityPlan) -> None:
                 canvas.dashes(np.array([a, lane]), np.array([b, lane]), 0.16, MARKING, 3.0, 5.0)
                 for edge in (p.MEDIAN_M / 2 + 0.2, p.CURB_A + 1.7):
                     line = np.array([[a, y + sign * edge], [b, y + sign * edge]])
-                    canvas.stroke(line, 0.14, lightened(MARKING, -25))
+                    canvas.stroke(line, 0.14, lighten(MARKING, -25))
     for x in plan.avenues_x:
         for a, b in _between(y0 - 60, y1 + 60, plan.avenues_y, p.STOP_B + 1):
             for at in (-p.LANE_M, p.LANE_M):
@@ -186,11 +186,11 @@ def _intersection(canvas: Canvas, x: float, y: float) -> None:
             _arrow(canvas, x - sign * lane, y - sign * (p.STOP_B + 7), sign * np.pi / 2)
         for k in np.arange(-p.CURB_A - 1.3, p.CURB_A + 1.3, 1.0):
             canvas.rect(
-                x + sign * (p.STOP_A - 3.8), y + k, x + sign * (p.STOP_A - 1.0), y + k + 0.5, lightened(MARKING, -10)
+                x + sign * (p.STOP_A - 3.8), y + k, x + sign * (p.STOP_A - 1.0), y + k + 0.5, lighten(MARKING, -10)
             )
         for k in np.arange(-p.CURB_B - 1.3, p.CURB_B + 1.3, 1.0):
             canvas.rect(
-                x + k, y + sign * (p.STOP_B - 3.8), x + k + 0.5, y + sign * (p.STOP_B - 1.0), lightened(MARKING, -10)
+                x + k, y + sign * (p.STOP_B - 3.8), x + k + 0.5, y + sign * (p.STOP_B - 1.0), lighten(MARKING, -10)
             )
 
 
@@ -203,15 +203,15 @@ def _arrow(canvas: Canvas, x: float, y: float, angle: float) -> None:
 def _roundabouts(canvas: Canvas, plan: p.CityPlan, scene: SceneSimulation, rng: np.random.Generator) -> None:
     for x, y in plan.roundabouts:
         canvas.circle(x, y, p.RING_M - 2.4, KERB)
-        canvas.circle(x, y, p.RING_M - 2.7, lightened(PAVEMENT, -20))
+        canvas.circle(x, y, p.RING_M - 2.7, lighten(PAVEMENT, -20))
         canvas.circle(x, y, p.RING_M - 4.2, KERB)
-        canvas.circle(x, y, p.RING_M - 4.5, lightened(GRASS, 10))
+        canvas.circle(x, y, p.RING_M - 4.5, lighten(GRASS, 10))
         for angle in (0.0, np.pi / 2, -np.pi / 2):
             u, v = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
             base = np.array([x, y])
             island = np.array([base + 17 * u + 1.1 * v, base + 17 * u - 1.1 * v, base + 26 * u])
             canvas.polygon(island, KERB)
-            canvas.polygon(base + 19.5 * u + (island - base - 19.5 * u) * 0.72, lightened(GRASS, 0))
+            canvas.polygon(base + 19.5 * u + (island - base - 19.5 * u) * 0.72, lighten(GRASS, 0))
         for _ in range(5):
             r, t = rng.uniform(0, 6), rng.uniform(0, 2 * np.pi)
             place_tree(canvas, x + r * np.cos(t), y + r * np.sin(t), rng.uniform(0.9, 1.9), scene, rng)
@@ -227,7 +227,7 @@ def _car_parks(
         for _ in range(60):
             px, py = rng.uniform(x + 19, x + 83), rng.uniform(first - 8, first + 24)
             corners = rotated_box(px, py, rng.uniform(0.6, 6), rng.uniform(0.5, 3), 0.0)
-            canvas.polygon(corners, lightened(OLD_ASPHALT, rng.normal(0, 10)))
+            canvas.polygon(corners, lighten(OLD_ASPHALT, rng.normal(0, 10)))
         rows = ((-5.5, -np.pi / 2), (5.5, np.pi / 2), (10.5, -np.pi / 2), (21.5, np.pi / 2))
         for at, heading in rows:
             tip = first + at + 2.5 * np.sin(heading)
@@ -239,7 +239,7 @@ def _car_parks(
                     spaces.append((stall, first + at, heading))
             canvas.stroke(np.array([[x + 27.7, tip], [x + 27.7 + 2.6 * 15, tip]]), 0.12, MARKING)
         hedge = first + 8.0
-        canvas.rect(x + 36, hedge - 0.35, x + 66, hedge + 0.35, lightened(GRASS, -26))
+        canvas.rect(x + 36, hedge - 0.35, x + 66, hedge + 0.35, lighten(GRASS, -26))
         for k in range(5):
             if scene.tree_height_m > 0:
                 place_tree(canvas, x + 36 + 7 * k, hedge, rng.uniform(0.8, 1.5), scene, rng)
