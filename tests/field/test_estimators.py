@@ -101,7 +101,7 @@ def test_the_half_width_is_students_interval_and_grows_with_the_design_effect() 
 def layers(**values: float) -> dict[str, np.ndarray]:
     """Layers of one pixel."""
     base = {"modal_vx": 40.0, "modal_vy": 0.0, "count": 50.0, "speed_p50": 40.0}
-    base |= {"direction_half90": 0.05, "speed_p50_low90": 38.0, "speed_p50_high90": 42.0}
+    base |= {"direction_ci90_half_width": 0.05, "speed_p50_ci90_lower": 38.0, "speed_p50_ci90_upper": 42.0}
     return {name: np.full((1, 1), value) for name, value in (base | values).items()}
 
 
@@ -126,7 +126,7 @@ def test_a_change_of_direction_is_tested_against_both_intervals_across_pi() -> N
 
 
 def test_a_change_of_speed_is_tested_against_the_facing_ends_of_the_intervals() -> None:
-    change = compared(layers(), layers(speed_p50=50.0, speed_p50_low90=47.0, speed_p50_high90=90.0))["speed"]
+    change = compared(layers(), layers(speed_p50=50.0, speed_p50_ci90_lower=47.0, speed_p50_ci90_upper=90.0))["speed"]
     assert change.change[0, 0] == 10.0
     assert change.p_value[0, 0] == pytest.approx(2 * stats.norm.sf(10 * 1.6449 / np.hypot(2, 3)))
     assert change.significant[0, 0]

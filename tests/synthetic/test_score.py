@@ -159,7 +159,7 @@ def test_the_fitted_homography_ignores_points_without_a_transform() -> None:
 
 def tracklet(vehicle_rows: list[tuple[float, float]], track: int, speed: float = 40.0) -> dict[str, float]:
     """A tracklet in frames 0 to 2 at these positions, along x."""
-    row: dict[str, float] = {"passage_id": track}
+    row: dict[str, float] = {"track_id": track}
     for k, (x, y) in enumerate(vehicle_rows):
         row |= {f"frame_{k}": k, f"x_{k}_px": x, f"y_{k}_px": y}
     for link in ("01", "12"):

@@ -181,7 +181,7 @@ def test_without_errors_tracklets_are_the_true_trajectories() -> None:
             moved = (table[f"{axis}_{b}_px"] - table[f"{axis}_{a}_px"]).to_numpy()
             assert table[f"v{axis}_{link}_px_per_s"].to_numpy() == pytest.approx(moved / interval, abs=1e-6)
     vehicle = table["detection_id_1"].to_numpy() & (2**20 - 1)
-    assert pd.Series(table["passage_id"].to_numpy()).groupby(vehicle).nunique().max() == 1
+    assert pd.Series(table["track_id"].to_numpy()).groupby(vehicle).nunique().max() == 1
 
 
 def test_errors_have_their_standard_deviations() -> None:
@@ -220,7 +220,7 @@ def test_detections_have_their_recall(recall: float) -> None:
 def test_a_missed_detection_ends_a_track() -> None:
     full, _ = observed(NO_ERRORS)
     missed, _ = observed(replace(NO_ERRORS, recall=0.7))
-    assert missed["passage_id"].nunique() > 1.3 * full["passage_id"].nunique()
+    assert missed["track_id"].nunique() > 1.3 * full["track_id"].nunique()
     assert len(missed) == pytest.approx(0.7**3 * len(full), rel=0.15)
 
 

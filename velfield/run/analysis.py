@@ -88,7 +88,7 @@ class RunAnalysis:
             Smaller regions are dropped.
         """
         return find_stops(
-            self._float_layer("standing_share"),
+            self._float_layer("stationary_fraction"),
             self._count,
             min_fraction=min_fraction,
             max_fraction=max_fraction,
