@@ -43,11 +43,11 @@ def geotrax_table(
     gsd_m = np.nan if georeference.gsd_m is None else georeference.gsd_m
     velocity = points[["vx_px_per_s", "vy_px_per_s"]].to_numpy(np.float64)
     speed = pd.Series(np.linalg.norm(velocity, axis=1) * gsd_m)
-    same = points["passage_id"].eq(points["passage_id"].shift())
+    same = points["track_id"].eq(points["track_id"].shift())
     acceleration = (speed.diff() / points["time_s"].diff()).where(same)
     return pd.DataFrame(
         {
-            "Vehicle_ID": points["passage_id"].rank(method="dense").astype("int64"),
+            "Vehicle_ID": points["track_id"].rank(method="dense").astype("int64"),
             "Timestamp": points["time_s"],
             "Frame_Number": points["frame"],
             "Ortho_X": points["x_px"],
