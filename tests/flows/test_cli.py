@@ -45,7 +45,7 @@ def test_an_old_option_works_for_this_release_with_a_line_that_gives_the_present
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "text"),
     [
         (("run", "none.mp4", "--out", "out"), "none.mp4"),
         (("run", "http://host/video.mp4", "--out", "out"), "http"),

@@ -84,7 +84,7 @@ def test_an_option_that_was_not_given_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "text"),
     [
         (["tracking.max_sped_m_per_s=20"], "did you mean 'tracking.max_speed_m_per_s'"),
         (["tracking.max_speed_m_per_s=.nan"], "finite"),
