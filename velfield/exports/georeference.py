@@ -9,6 +9,7 @@ from rasterio.warp import transform
 from schemas.arrays import FloatArray, Points
 from schemas.records import GridRecord
 from velfield.errors import InputError
+from velfield.run.grid import heading_deg
 
 MPS_TO_KMH = 3.6
 
@@ -92,7 +93,7 @@ class Georeference:
         [0.0, 90.0, 180.0]
         """
         if not self.has_crs:
-            return np.degrees(np.arctan2(velocity_px_per_s[:, 0], -velocity_px_per_s[:, 1])) % 360
+            return heading_deg(np.arctan2(velocity_px_per_s[:, 1], velocity_px_per_s[:, 0]), None)
         speed = np.linalg.norm(velocity_px_per_s, axis=1, keepdims=True)
         step = np.divide(velocity_px_per_s, speed, out=np.zeros_like(velocity_px_per_s), where=speed > 0)
         here, there = self.to_lonlat(xy_px), self.to_lonlat(xy_px + step)
