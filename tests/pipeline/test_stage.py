@@ -14,7 +14,7 @@ from schemas.model import Model
 from schemas.records import InputsRecord, SourceRecord
 from schemas.summary import RunSummary
 from tests.small_flight import digests, job
-from velfield.pipeline.plan import make_plan
+from velfield.pipeline.plan import make_plan, write_flight_record
 from velfield.pipeline.stage import STAGE, STAGES, Cut, NewBase, Stage, resolve, stage_keys
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -165,7 +165,9 @@ class OneByOne(Executor):
 def test_the_graphs_compute_what_the_bare_functions_do(
     whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
 ) -> None:
-    compute_bare(make_plan(job(flight, tmp_path / "bare")), OneByOne())
+    plan = make_plan(job(flight, tmp_path / "bare"))
+    write_flight_record(plan)
+    compute_bare(plan, OneByOne())
     by_graphs = digests(whole[0])
     bare = digests(tmp_path / "bare")
     assert {name for name in bare if by_graphs.get(name) != bare[name]} == set()

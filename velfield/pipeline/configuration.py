@@ -124,10 +124,11 @@ def _models(annotation: object) -> list[type[BaseModel]]:
 
 
 def _ineffective(config: FlightConfig, given: Tree) -> Iterator[str]:
-    """A line for each given key that the methods chosen do not read."""
+    """A line for each key that was given another value than its default, and that the methods chosen do not read."""
+    defaults = FlightConfig()
     for key, deciding in READ_WITH.items():
         section, _, name = key.partition(".")
-        if name not in (given.get(section) or {}):
+        if name not in (given.get(section) or {}) or attrgetter(key)(config) == attrgetter(key)(defaults):
             continue
         for other, values in deciding.items():
             value = attrgetter(other)(config)
