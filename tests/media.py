@@ -1,4 +1,4 @@
-"""Videos and pictures that the tests of sources make for themselves: a textured ground that drifts below the camera."""
+"""Videos and images for the tests of sources: a textured ground that drifts below the camera."""
 
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
@@ -47,7 +47,7 @@ def write_video(
         stream.codec_context.time_base = time_base
         stream.gop_size = key_interval
         stream.options = options or ({"preset": "veryfast"} if codec == "libx264" else {})
-        stream.bit_rate = 4_000_000  # where nothing else says how good it is to be: MPEG-2 is a mush without
+        stream.bit_rate = 4_000_000  # MPEG-2 has no other setting of quality
         for number, grey in enumerate(frames):
             frame = av.VideoFrame.from_ndarray(grey, format="gray").reformat(format="yuv420p")
             frame.time_base = time_base
@@ -58,7 +58,7 @@ def write_video(
 
 
 def write_images(folder: Path, frames: Sequence[NDArray[np.uint8]], *, name: str = "f{}.png") -> list[str]:
-    """Save frames as pictures, numbered from 1; their names."""
+    """Save frames as images, numbered from 1; their names."""
     folder.mkdir(parents=True, exist_ok=True)
     names = [name.format(number) for number in range(1, len(frames) + 1)]
     for file, grey in zip(names, frames, strict=True):
@@ -73,7 +73,7 @@ def write_times(path: Path, rows: Sequence[tuple[str | int, float]]) -> Path:
 
 
 def flip_bytes(source: Path, damaged: Path, *, start: float, stop: float, count: int, seed: int) -> Path:
-    """Copy a file with `count` bytes changed between the shares `start` and `stop` of its length."""
+    """Copy a file with `count` bytes changed between the fractions `start` and `stop` of its length."""
     content = bytearray(source.read_bytes())
     rng = np.random.default_rng(seed)
     for place in rng.integers(int(start * len(content)), int(stop * len(content)), count):

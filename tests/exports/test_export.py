@@ -1,4 +1,4 @@
-"""`velfield export` on a run: figures at any size, a STAC item whose assets are where it says."""
+"""`velfield export` on a run: figures at any size, STAC assets that exist, every format on S3."""
 
 import json
 from datetime import UTC, datetime
@@ -26,21 +26,21 @@ def run(whole: tuple[Path, RunSummary]) -> Run:
 
 
 @pytest.mark.parametrize("name", ["direction", "speed"])
-def test_a_figure_has_the_width_that_was_asked_for(name: str, run: Run, tmp_path: Path) -> None:
+def test_a_figure_has_the_requested_width(name: str, run: Run, tmp_path: Path) -> None:
     shapes = {}
     for width in (None, 400, 1600):
         options = ExportOptions(width_px=width, unit="mph")
         shapes[width] = cv2.imread(str(export_run(run, name, tmp_path / f"{width}.png", options))).shape
     grid = run.grid
     for width, shape in shapes.items():
-        wanted = grid.width_px if width is None else width
-        assert shape[0] == pytest.approx(wanted * grid.height_px / grid.width_px, abs=1)
-        assert wanted < shape[1] < 1.6 * wanted + 200  # the legend beside it
+        expected = grid.width_px if width is None else width
+        assert shape[0] == pytest.approx(expected * grid.height_px / grid.width_px, abs=1)
+        assert expected < shape[1] < 1.6 * expected + 200  # the legend beside it
     with pytest.raises(InputError, match="at most"):
         export_run(run, name, tmp_path / "huge.png", ExportOptions(width_px=500_000))
 
 
-def test_a_stac_item_names_what_is_there(run: Run, tmp_path: Path) -> None:
+def test_a_stac_item_lists_files_that_exist(run: Run, tmp_path: Path) -> None:
     run = georeferenced(run)
     start = datetime(2024, 5, 1, 12, tzinfo=UTC)
     path = export_run(run, "stac", tmp_path / "deep" / "item.json", ExportOptions(start=start))
@@ -50,7 +50,7 @@ def test_a_stac_item_names_what_is_there(run: Run, tmp_path: Path) -> None:
     assert [a["href"] for a in item["assets"].values() if not (path.parent / a["href"]).exists()] == []
 
 
-def test_stac_wants_to_know_when(run: Run, tmp_path: Path) -> None:
+def test_stac_needs_the_start_of_the_flight(run: Run, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--start"):
         export_run(run, "stac", tmp_path / "item.json")
 

@@ -1,4 +1,4 @@
-"""What goes out comes back: each format is read again by a library that its users use, and says the same."""
+"""Exports read back: each format has its columns, units and coordinates."""
 
 import io
 import json
@@ -86,7 +86,7 @@ def test_without_a_reference_system_geotrax_has_pixels_and_metres(tracklets):
     assert geotrax_table(tracklets, Georeference((200, 300)))["Vehicle_Speed"].isna().all()
 
 
-def test_geoparquet_says_where_and_what_and_its_lines_are_the_tracklets(tracklets):
+def test_geoparquet_has_its_metadata_and_its_lines_are_the_tracklets(tracklets):
     table = pq.read_table(io.BytesIO(tracklets_geoparquet(tracklets, GEOREFERENCED)))
     geo = json.loads(table.schema.metadata[b"geo"])
     column = geo["columns"][geo["primary_column"]]
@@ -104,7 +104,7 @@ def test_geoparquet_says_where_and_what_and_its_lines_are_the_tracklets(tracklet
     np.testing.assert_allclose(table["heading_deg"].to_numpy(), [91, 91, 91, 1], atol=0.5)
 
 
-def test_geoparquet_without_a_reference_system_says_so(tracklets):
+def test_geoparquet_without_a_reference_system_declares_none(tracklets):
     table = pq.read_table(io.BytesIO(tracklets_geoparquet(tracklets, PIXELS)))
     assert json.loads(table.schema.metadata[b"geo"])["columns"]["geometry"]["crs"] is None
     assert pq.read_table(io.BytesIO(tracklets_geoparquet(tracklets.iloc[:0], PIXELS))).num_rows == 0
@@ -128,7 +128,7 @@ def test_sumo_fcd_is_in_metres_seconds_and_navigational_degrees(tracklets):
         sumo_fcd(tracklets, Georeference((200, 300)))
 
 
-def test_arrows_stand_on_the_busiest_pixels_and_point_the_way(tracklets):
+def test_arrows_are_at_the_pixels_of_most_vehicles_and_point_along_their_direction(tracklets):
     velocity = np.full((200, 300, 2), np.nan, np.float32)
     count = np.zeros((200, 300), np.int32)
     velocity[50, :, :], count[50] = (40.0, 0.0), 3
@@ -166,7 +166,7 @@ def test_a_stac_item_has_footprint_time_and_assets():
     ring = np.array(item["geometry"]["coordinates"][0])
     assert ring[0].tolist() == ring[-1].tolist()
     area = np.sum(ring[:-1, 0] * ring[1:, 1] - ring[1:, 0] * ring[:-1, 1])
-    assert area > 0  # counter-clockwise, as RFC 7946 wants it
+    assert area > 0  # counter-clockwise, by RFC 7946
     assert item["assets"]["direction"]["type"].startswith("image/tiff")
     with pytest.raises(InputError, match="without a time zone"):
         stac_item("f", GEOREFERENCED, {}, start=datetime(2024, 5, 1), duration_s=1)

@@ -1,4 +1,4 @@
-"""Lineage: what is told to stand behind a pixel is exactly what the field counts there."""
+"""Lineage: the tracks behind a pixel are exactly those that the field counts there."""
 
 import json
 from pathlib import Path
@@ -33,8 +33,8 @@ def test_as_many_vehicles_as_the_field_counts(whole: tuple[Path, RunSummary]) ->
         *zip(xs[known], ys[known], strict=True),
         *zip(rng.integers(0, 640, 6), rng.integers(0, 480, 6), strict=True),
     ]
-    told = [len(pixel_lineage(run, int(x), int(y)).tracks) for x, y in places]
-    assert told == [int(count[y, x]) for x, y in places]
+    found = [len(pixel_lineage(run, int(x), int(y)).tracks) for x, y in places]
+    assert found == [int(count[y, x]) for x, y in places]
 
 
 def test_the_frames_are_those_of_the_tracklets_with_their_true_times(
@@ -57,15 +57,15 @@ def test_the_chain_of_stages(whole: tuple[Path, RunSummary]) -> None:
     assert {stage.name: stage.key for stage in stages} == run.record.keys
 
 
-def test_the_command_tells_it_offline(
+def test_the_command_prints_it(
     whole: tuple[Path, RunSummary], pixel: tuple[int, int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     root, (x, y) = whole[0], pixel
     assert lineage(root) == lineage(root, str(x), y) == lineage(root, f"{x},{y}") == 0
-    told = capsys.readouterr().out
-    assert digest_file(root / "detector.json") in told
-    assert digest_file(root / "base/base_image.png") in told
-    assert "labelled cars" in told
+    printed = capsys.readouterr().out
+    assert digest_file(root / "detector.json") in printed
+    assert digest_file(root / "base/base_image.png") in printed
+    assert "labelled cars" in printed
     lineage(root, pixel=f"{x},{y}", as_json=True)
     assert json.loads(capsys.readouterr().out)["x"] == x
 

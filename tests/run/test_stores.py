@@ -1,4 +1,4 @@
-"""The stores: what is written is read, and what is damaged says so."""
+"""The stores: what is written is read, and damage is an error."""
 
 from pathlib import Path
 

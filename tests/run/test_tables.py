@@ -1,4 +1,4 @@
-"""Tables of a run folder: parts are put together with their types, second names share bytes and nothing else."""
+"""Tables of a run folder: parts are concatenated with their types; a second name of a file has its bytes."""
 
 import os
 from pathlib import Path

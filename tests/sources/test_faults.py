@@ -1,4 +1,4 @@
-"""Faults of sources: each goes on and is flagged, or stops with one line that says what was found and what to do."""
+"""Faults of sources: each is flagged and the rest is read, or refused in one line: found, expected, what to do."""
 
 import struct
 import zlib
@@ -44,7 +44,7 @@ def read_all(path, frames=ALL):
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".ts", ".avi", ".mkv"])
-def test_a_video_cut_in_half_gives_the_frames_there_are_and_says_so(tmp_path, frames, suffix):
+def test_a_video_cut_in_half_gives_the_frames_there_are_with_a_warning(tmp_path, frames, suffix):
     faststart = {"movflags": "faststart"} if suffix == ".mp4" else None
     whole = write_video(tmp_path / f"whole{suffix}", frames, container_options=faststart)
     clean = {round(frame.time_s, 3): frame for frame in read_all(whole)[1]}
@@ -115,9 +115,9 @@ def test_damage_is_flagged_alike_when_a_flight_is_read_in_pieces(tmp_path, frame
 
 def test_a_truncated_or_unreadable_image_is_flagged_and_the_rest_read(tmp_path, frames):
     names = write_images(tmp_path / "f", frames[:5], name="{}.jpg")
-    for name, share in ((names[1], 0.5), (names[2], 0.01), (names[3], 0.0)):
+    for name, fraction in ((names[1], 0.5), (names[2], 0.01), (names[3], 0.0)):
         content = (tmp_path / "f" / name).read_bytes()
-        (tmp_path / "f" / name).write_bytes(content[: int(share * len(content))])
+        (tmp_path / "f" / name).write_bytes(content[: int(fraction * len(content))])
     info, read = read_all(tmp_path / "f", FPS)
     unreadable = [bool(frame.flags & FrameFlag.UNREADABLE) for frame in read]
     assert unreadable == [False, True, True, True, False]
@@ -161,7 +161,7 @@ def test_a_flight_cut_into_units_finds_the_same_duplicates(tmp_path, frames):
     assert [frame.flags for frame in second] == [frame.flags for frame in whole[2:]] == [int(FrameFlag.DUPLICATE), 0]
 
 
-def test_permuted_times_are_sorted_and_said(tmp_path, frames):
+def test_permuted_times_are_sorted_with_a_warning(tmp_path, frames):
     names = write_images(tmp_path / "f", frames[:4])
     side = write_times(tmp_path / "t.csv", list(zip(names, [0.6, 0.0, 0.4, 0.2], strict=True)))
     info = probe(tmp_path / "f", frames=ALL, timestamps=side)
@@ -177,7 +177,7 @@ def test_equal_times_are_said_and_flagged(tmp_path, frames):
     assert [frame.flags for frame in iter_frames(tmp_path / "f", info, range(3))] == [0, 0, int(FrameFlag.DUPLICATE)]
 
 
-def test_a_folder_without_times_says_what_to_give(tmp_path, frames):
+def test_a_folder_without_times_is_refused_with_what_to_give(tmp_path, frames):
     write_images(tmp_path / "f", frames[:2])
     assert_stops(tmp_path / "f", "give --timestamps CSV .* or --fps", ALL)
 

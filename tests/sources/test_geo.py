@@ -1,4 +1,4 @@
-"""Base images: the pixel is measured on the ground, degrees are left behind, and what is no image is refused."""
+"""Base images: their ground sample distance, reprojection from degrees, refusals."""
 
 import warnings
 
@@ -108,7 +108,7 @@ def test_an_image_with_a_world_file_and_a_prj_has_its_place(tmp_path, scene):
     assert "names its reference system" in read_base_raster(tmp_path / "b.png", CONFIG).notes[0]
     (tmp_path / "b.prj").write_text(CRS.from_epsg(32636).to_wkt())
     base = read_base_raster(tmp_path / "b.png", CONFIG)
-    assert base.affine == pytest.approx((0.25, 0, 700000, 0, -0.25, 3500000))  # a world file tells the pixel's centre
+    assert base.affine == pytest.approx((0.25, 0, 700000, 0, -0.25, 3500000))  # a world file has the pixel's centre
     assert base.gsd_m == pytest.approx(0.25, rel=2e-3)
 
 

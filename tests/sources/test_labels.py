@@ -1,4 +1,4 @@
-"""Labels and other people's detections: what people wrote comes out in raw pixels; what is not labels is refused."""
+"""Labels and external detections in raw pixels; what is none is refused."""
 
 import math
 
@@ -168,4 +168,4 @@ def test_kit_ais_labels_are_read_as_they_are(footage):
     info = probe(folder, frames=FramesConfig(fps=2))
     labels = read_labels(folder, info)
     assert (len(labels.cars), len(labels.ignored), len(labels.frames)) == (1311, 27, 25)
-    assert 28 < labels.cars["length_px"].median() < 40  # its source says about 37 x 17 px
+    assert 28 < labels.cars["length_px"].median() < 40  # about 37 x 17 px by its source

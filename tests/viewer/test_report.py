@@ -23,7 +23,7 @@ GREY = np.full((480, 640), 100, np.uint8)
 
 
 def lanes() -> tuple[np.ndarray, np.ndarray]:
-    """Two opposed lanes, a place where vehicles stand, and nothing elsewhere: direction and speed."""
+    """Two opposed lanes, an area of stationary vehicles, and nothing elsewhere: direction and speed."""
     direction, speed = np.full(GREY.shape, np.nan), np.full(GREY.shape, np.nan)
     direction[200:210], speed[200:210] = 0.0, 60.0
     direction[220:230], speed[220:230] = math.pi, 30.0
@@ -87,7 +87,7 @@ def test_one_false_fast_track_does_not_set_the_colours() -> None:
     false_track[400, :5] = 400.0
     plain, cut_off = speed_figure(GREY, speed, MapScale(0.25)), speed_figure(GREY, false_track, MapScale(0.25))
     np.testing.assert_array_equal(plain[:390, :640], cut_off[:390, :640])
-    assert (plain[:, 640:] != cut_off[:, 640:]).any(), "the legend says that colours are cut off"
+    assert (plain[:, 640:] != cut_off[:, 640:]).any(), "the legend notes the end of the colour scale"
 
 
 def test_a_field_of_another_size_is_refused() -> None:
@@ -225,11 +225,11 @@ def test_what_tracking_left_out_stands_apart_from_what_it_tried() -> None:
 
 
 def test_every_gate_that_tracking_counts_has_words() -> None:
-    told = set(re.findall(r"``(\w+)``", GateLog.__doc__ or ""))
-    assert {"links_tried", "not_best", "windows"} <= told
-    counts = dict.fromkeys(sorted(told), 3)
-    assert len(totals_table(counts)) + len(rejection_table(counts)) == len(told)
-    assert not {name.replace("_", " ") for name in told} & {words for words, _ in totals_table(counts)}
+    names = set(re.findall(r"``(\w+)``", GateLog.__doc__ or ""))
+    assert {"links_tried", "not_best", "windows"} <= names
+    counts = dict.fromkeys(sorted(names), 3)
+    assert len(totals_table(counts)) + len(rejection_table(counts)) == len(names)
+    assert not {name.replace("_", " ") for name in names} & {words for words, _ in totals_table(counts)}
 
 
 def test_an_empty_report_is_a_page_too() -> None:

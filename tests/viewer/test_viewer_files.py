@@ -104,13 +104,13 @@ def test_without_a_built_page_the_report_stands_alone_and_it_is_said(
 ) -> None:
     from flows.console import Console
 
-    said: list[str] = []
-    monkeypatch.setattr(Console, "warn", lambda self, text: said.append(text))
+    warnings: list[str] = []
+    monkeypatch.setattr(Console, "warn", lambda self, text: warnings.append(text))
     monkeypatch.setattr(report_step, "page_is_built", lambda: False)
     root = tmp_path / "run"
     shutil.copytree(whole[0], root)
     process(job(flight, root))
-    assert any("make page" in line for line in said)
+    assert any("make page" in line for line in warnings)
     page = (root / "index.html").read_text()
     assert "<script" not in page
     assert "Direction of travel" in page

@@ -67,7 +67,7 @@ def served(app: Any) -> Iterator[Client]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """What looks like a run folder, with a link that leads out of it."""
+    """A folder in the form of a run folder, with a link out of it."""
     root = tmp_path / "run"
     (root / "view").mkdir(parents=True)
     (root / "index.html").write_text("<html><style>p {}</style><script>let a = 1;</script></html>")

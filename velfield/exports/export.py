@@ -31,7 +31,7 @@ class ExportModule(Protocol):
         path
             The file that will be written, for formats that refer to others by relative paths.
         options
-            What the user asked for.
+            The user's options.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""What the exported figures share: base image and layer at the width that was asked for."""
+"""What the exported figures share: base image and layer at the requested width."""
 
 from dataclasses import dataclass
 

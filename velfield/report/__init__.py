@@ -1,1 +1,1 @@
-"""Images and the report: what people look at."""
+"""Figures, the report and the pages' HTML."""

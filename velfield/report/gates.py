@@ -15,11 +15,11 @@ _REJECTIONS = {
     "gaps_too_long": ("frames", "the next one comes too late", None),
     "speed": ("links", "faster than a vehicle", "links_tried"),
     "axis": ("links", "not along the car's axis", "links_tried"),
-    "appearance": ("links", "another car looks more alike", "links_tried"),
-    "turn": ("pairs", "turn too sharply", "pairs_tried"),
+    "appearance": ("links", "another car has the more similar appearance", "links_tried"),
+    "turn": ("pairs", "change direction too fast", "pairs_tried"),
     "acceleration": ("pairs", "change speed too fast", "pairs_tried"),
-    "not_best": ("pairs", "another with the same car is likelier", "pairs_tried"),
-    "confidence": ("pairs", "likeliest, but not clearly", "pairs_tried"),
+    "not_best": ("pairs", "another pair with the same car is more likely", "pairs_tried"),
+    "confidence": ("pairs", "most likely, but ambiguous", "pairs_tried"),
 }
 """Gate -> what it rejects, why, and the total it is a fraction of."""
 

@@ -23,7 +23,7 @@ TileReader = Callable[[int, int], FieldTile | None]
 
 @dataclass(frozen=True)
 class IntervalField:
-    """The field of a time interval; the ends of ``rest``, what lies in no interval asked for, are infinite."""
+    """The field of a time interval; the ends of ``rest``, of what lies in no configured interval, are infinite."""
 
     name: str
     start_s: float
@@ -45,7 +45,7 @@ def open_velocity_field(layout: RunLayout, *, time_weighted: bool = False) -> Ve
 
 
 def open_field_intervals(layout: RunLayout) -> list[IntervalField]:
-    """The fields of the time intervals of a run folder, in their order; empty where none were asked for."""
+    """The fields of the time intervals of a run folder, in their order; empty where none were configured."""
     config = read_flight_record(layout.root).config.field
     grid = read_grid(layout)
     fields = []

@@ -24,8 +24,8 @@ _LAST = "flight.json"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
-def result_name(asked: str | None, base: Path) -> str:
-    """Name of a new result: the requested one, else the base image's.
+def result_name(given: str | None, base: Path) -> str:
+    """Name of a new result: the given one, else the base image's.
 
     Raises
     ------
@@ -37,7 +37,7 @@ def result_name(asked: str | None, base: Path) -> str:
     >>> result_name(None, Path("maps/spring 2026.tif"))
     'spring-2026'
     """
-    name = re.sub(r"[^A-Za-z0-9._-]+", "-", base.stem).strip(".-") if asked is None else asked
+    name = re.sub(r"[^A-Za-z0-9._-]+", "-", base.stem).strip(".-") if given is None else given
     if not _NAME.fullmatch(name) or name == FIRST:
         raise InputError(f"--out {name!r}: expected a name of letters, digits, '.', '_' and '-', other than {FIRST!r}")
     return name

@@ -22,7 +22,7 @@ class SourceFrame:
     name
         An image's file name, or a video's 0-based frame index, as text: its name in labels.
     time_s
-        True time, s: the container's, the CSV's, or index / fps where the user asked for that.
+        True time, s: the container's, the CSV's, or index / fps with --fps.
     grey
         (h, w) uint8, raw pixels as stored (no EXIF rotation); zeros where it is unreadable.
     flags
@@ -56,7 +56,7 @@ class SourceInfo:
     names
         (n,) name of each frame in labels: file names, or indices as text.
     warnings
-        One line each, for people: frames missing, out of order, or truncated.
+        One line each, for the user: frames missing, out of order, or truncated.
     declared_count
         Number of frames that the container declares, if it does.
     pts

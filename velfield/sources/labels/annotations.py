@@ -29,7 +29,7 @@ def is_annotation_file(path: Path) -> bool:
 
 
 def read_annotations(path: Path, info: SourceInfo) -> tuple[list[Box], list[str], list[str]]:
-    """Boxes, the frames that the labels name, notes for people.
+    """Boxes, the frames that the labels name, notes for the user.
 
     Raises
     ------

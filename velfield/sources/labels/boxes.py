@@ -35,7 +35,7 @@ class Annotation:
 def boxes_from_annotations(
     path: Path, annotations: Iterable[Annotation], images: Iterable[str], info: SourceInfo
 ) -> tuple[list[Box], list[str], list[str]]:
-    """Boxes of the annotations on this source's frames; the frames that are named; notes for people.
+    """Boxes of the annotations on this source's frames; the frames that are named; notes for the user.
 
     Raises
     ------

@@ -37,7 +37,7 @@ class Labels:
     frames
         Every frame that is named, in the source's order, also those without a car; each is fully labelled.
     notes
-        One line each, for people.
+        One line each, for the user.
     """
 
     cars: pd.DataFrame

@@ -107,7 +107,7 @@ def read_yolo(path: Path, info: SourceInfo) -> tuple[list[Box], list[str], list[
 
     Returns
     -------
-    boxes, the frames named (a file without boxes names a frame without cars), notes for people.
+    boxes, the frames named (a file without boxes names a frame without cars), notes for the user.
 
     Raises
     ------
