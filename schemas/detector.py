@@ -178,13 +178,13 @@ class PrecisionRecallCurve(Model):
 
 
 class Proposer(Model):
-    """Stage 1 of the cascade: a coarse classifier at half the resolution, dense over position and rotation."""
+    """The region proposals of a cascade: a coarse classifier at half the resolution, dense over all poses."""
 
     rounds: tuple[Round, ...] = Field(min_length=1, max_length=500)
     min_score: float
     """Proposals with a lower score are rejected."""
     min_stage1_score: float
-    """Proposals to which the first rounds of the classifier give a lower score are rejected."""
+    """Proposals with a lower score by the first rounds of the classifier, its stage 1, are rejected."""
 
 
 class LayerRecord(Model):
@@ -256,7 +256,7 @@ class CascadeRecord(BaseRecord):
     method: Literal["cascade"] = "cascade"
     proposer: Proposer
     rounds: tuple[Round, ...] = Field(min_length=1, max_length=50_000)
-    """Stage 2: the classifier of crops rotated to the car's axis."""
+    """The classifier of the proposals, on crops rotated to the car's axis."""
     contrast_floor: PositiveFloat
     """Features are divided by the mean gradient of the window plus this."""
 

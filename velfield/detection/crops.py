@@ -1,4 +1,4 @@
-"""Small pictures of the cars: turned along the axis for looks, upright for alignment."""
+"""Image patches of the cars: rotated to the axis to compare their appearance, upright to align them."""
 
 import cv2
 import numpy as np
@@ -9,12 +9,12 @@ from schemas.arrays import FloatArray, GreyImage
 def oriented_patches(
     image: GreyImage, xy: FloatArray, orientation_rad: FloatArray, *, width: int = 8, length: int = 16
 ) -> GreyImage:
-    """Patches turned so that the car's axis runs down the rows (paper: the 8 x 16 oriented patch).
+    """Patches rotated so that the car's axis runs along the columns (paper: the 8 x 16 oriented patch).
 
     Parameters
     ----------
     image
-        (h, w) uint8 working picture.
+        (h, w) uint8 on the working grid.
     xy, orientation_rad
         (n, 2) centres, working px, and (n,) axes.
 
@@ -34,7 +34,7 @@ def oriented_patches(
 
 
 def upright_chips(image: GreyImage, xy: FloatArray, *, side: int = 32) -> GreyImage:
-    """Crops centred on the rounded places, (n, side, side) uint8: pixel (side / 2, side / 2) is the rounded place."""
+    """Crops about the rounded positions, (n, side, side) uint8: pixel (side / 2, side / 2) is the rounded position."""
     padded = np.pad(image, side, mode="edge")
     corner = np.rint(xy).astype(np.int64) + side - side // 2
     chips = [padded[y : y + side, x : x + side] for x, y in corner]

@@ -44,16 +44,16 @@ def shipped_detector() -> Detector:
 
 def _parse(data: bytes, name: str) -> Detector:
     try:
-        found = json.loads(data)
-        if isinstance(found, dict) and found.get("version") == 1:
-            found = upgrade_detector(found)
+        content = json.loads(data)
+        if isinstance(content, dict) and content.get("version") == 1:
+            content = upgrade_detector(content)
             warnings.warn(
                 f"{name}: a detector file of format version 1, written now is version {DETECTOR_VERSION}; the old one "
                 f"is read until {OLD_NAMES_UNTIL}",
                 OldNameWarning,
                 stacklevel=3,
             )
-        return from_record(_RECORD.validate_python(found))
+        return from_record(_RECORD.validate_python(content))
     except (ValueError, ValidationError) as error:
         raise InputError(
             f"{name}: {_problem(error)}; expected a detector file as velfield writes it (detector.json): "

@@ -20,13 +20,13 @@ def collect_tp_fn_fp_crops(detector: Detector, samples: Sequence[LabelledImage])
     """Upright crops (n, 32, 32) uint8 of each kind, the highest scores first."""
     kinds: dict[str, list[ByteArray]] = {TRUE_POSITIVES: [], MISSED: [], FALSE_POSITIVES: []}
     for sample in samples:
-        found = detect_frame(sample.image, sample.valid, detector, sample.background)
-        order = np.argsort(-found.score, kind="stable")
-        correct = match_greedy(found.xy[order], sample.cars)
-        gap = np.hypot(*(sample.cars[:, None, :2] - found.xy[None, :, :2]).transpose(2, 0, 1))
+        detections = detect_frame(sample.image, sample.valid, detector, sample.background)
+        order = np.argsort(-detections.score, kind="stable")
+        correct = match_greedy(detections.xy[order], sample.cars)
+        gap = np.hypot(*(sample.cars[:, None, :2] - detections.xy[None, :, :2]).transpose(2, 0, 1))
         missed = gap.min(axis=1, initial=np.inf) >= MATCH_PX
-        kinds[TRUE_POSITIVES].append(found.chips[order][correct])
-        kinds[FALSE_POSITIVES].append(found.chips[order][~correct])
+        kinds[TRUE_POSITIVES].append(detections.chips[order][correct])
+        kinds[FALSE_POSITIVES].append(detections.chips[order][~correct])
         kinds[MISSED].append(upright_chips(sample.image, sample.cars[missed, :2]))
     return {name: np.concatenate(crops) for name, crops in kinds.items()}
 

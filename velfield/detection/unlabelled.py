@@ -24,7 +24,7 @@ AnyDetector = TypeVar("AnyDetector", bound=Detector)
 
 @dataclass(frozen=True)
 class UnlabelledFlight:
-    """Registered frames on the working grid, and what motion says of them.
+    """Registered frames on the working grid, with their labels from motion.
 
     Attributes
     ----------
@@ -49,11 +49,11 @@ class UnlabelledFlight:
                 image=frame.image,
                 valid=frame.valid & self.background.valid,
                 background=self.background.median,
-                cars=found.cars,
-                ignore=found.ignore,
+                cars=label.cars,
+                ignore=label.ignore,
                 complete=False,
             )
-            for frame, found in (labelled[k] for k in chosen)
+            for frame, label in (labelled[k] for k in chosen)
         ]
 
     def bursts(self) -> list[MotionFrame]:

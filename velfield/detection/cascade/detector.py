@@ -63,21 +63,21 @@ class CascadeDetector(Detector):
             contrast_floor=record.contrast_floor,
             min_score=record.proposer.min_score,
         )
-        found = classify_proposals(
+        detections = classify_proposals(
             PoseScorer(compute_features(image, ground), self.classifier, record.contrast_floor),
             proposals,
             min_score=self.threshold if threshold is None else threshold,
             min_stage1_score=record.proposer.min_stage1_score,
         )
         length_px = record.working_car_length_px
-        cars = centre_long_vehicles(image, valid, nms_oriented(found, length_px), length_px)
+        cars = centre_long_vehicles(image, valid, nms_oriented(detections, length_px), length_px)
         return Detections.from_rows(cars, np.full(len(cars), length_px * length_px * CAR_ASPECT))
 
     @classmethod
     def train(
         cls, samples: Sequence[LabelledImage], config: CascadeConfig, *, base: Detector | None = None
     ) -> "CascadeDetector":
-        """Train both stages; a base votes together with the new classifier."""
+        """Train the proposals' and the crops' classifier; with a base, the ensemble of both."""
         has_background = config.motion_channel != "never" and all(sample.background is not None for sample in samples)
         if base is not None:
             _check_base(base, config, has_background=has_background)
@@ -95,7 +95,7 @@ class CascadeDetector(Detector):
         """A cascade that reads no background, so that it detects stationary cars as well.
 
         By the difference to the background a car that waits at a light for long, and so is in the background, is not
-        detected: in a simulated city 0.79 of the cars that move at some time, 0.91 by their appearance.
+        detected: on a simulated city recall of the cars that move at some time was 0.79, by appearance 0.91.
 
         Returns
         -------

@@ -140,11 +140,11 @@ def _cross_validate(
             for k in evaluated
         ]
 
-    found = parallel_map(train_fold, range(folds))
-    scores = _merge([part for _, parts in found for part in parts])
+    trained = parallel_map(train_fold, range(folds))
+    scores = _merge([part for _, parts in trained for part in parts])
     kept = 1 - _OWN_ERROR_FRACTION * (1 - 1 / members)
     reduced = np.where(scores.score > 0, kept * scores.score, scores.score)
-    return [cascade for cascade, _ in found], replace(scores, score=reduced)
+    return [cascade for cascade, _ in trained], replace(scores, score=reduced)
 
 
 def evaluate_region(

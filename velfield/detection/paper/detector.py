@@ -46,8 +46,8 @@ class PaperDetector(Detector):
             threshold=self.threshold if threshold is None else threshold,
             min_region_px=self.record.min_region_px,
         )
-        found = region_moments(labels, smooth)
-        return Detections.from_rows(found[:, :5], found[:, 5])
+        regions = region_moments(labels, smooth)
+        return Detections.from_rows(regions[:, :5], regions[:, 5])
 
     @classmethod
     def train(

@@ -49,8 +49,10 @@ def detect_block(plan: Plan, frames: range) -> BlockDetections:
     for frame in frames:
         rectified = working.frame(frame) if usable[frame] else None
         if rectified is not None:
-            found = _detect(plan, rectified, working.maps.transform(frame), frame, has_background=record.has_background)
-            parts.append(_tabulate(found, rectified, frame, float(times_s[frame])))
+            detections = _detect(
+                plan, rectified, working.maps.transform(frame), frame, has_background=record.has_background
+            )
+            parts.append(_tabulate(detections, rectified, frame, float(times_s[frame])))
         advance("detections")
     return _concatenate(parts)
 
@@ -89,8 +91,8 @@ def _background_of(plan: Plan, rectified: WorkingFrame) -> GreyImage:
     return np.asarray(cv2.warpAffine(whole, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-def _tabulate(found: FrameDetections, rectified: WorkingFrame, frame: int, time_s: float) -> BlockDetections:
-    xy = rectified.to_base(found.xy)
+def _tabulate(detections: FrameDetections, rectified: WorkingFrame, frame: int, time_s: float) -> BlockDetections:
+    xy = rectified.to_base(detections.xy)
     table = pd.DataFrame(
         {
             "detection_id": frame * ID_STEP + np.arange(len(xy), dtype=np.int64),
@@ -98,13 +100,13 @@ def _tabulate(found: FrameDetections, rectified: WorkingFrame, frame: int, time_
             "time_s": time_s,
             "x_px": xy[:, 0],
             "y_px": xy[:, 1],
-            "orientation_rad": found.orientation_rad,
-            "orientation_sd_rad": found.orientation_sd_rad,
-            "area_px": found.area_px / rectified.scale**2,
-            "score": found.score,
+            "orientation_rad": detections.orientation_rad,
+            "orientation_sd_rad": detections.orientation_sd_rad,
+            "area_px": detections.area_px / rectified.scale**2,
+            "score": detections.score,
         }
     ).astype(DETECTION_COLUMNS)
-    return BlockDetections(table, found.patches, found.chips, found.xy)
+    return BlockDetections(table, detections.patches, detections.chips, detections.xy)
 
 
 def _concatenate(parts: Sequence[BlockDetections]) -> BlockDetections:
