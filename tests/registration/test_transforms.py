@@ -14,8 +14,10 @@ from velfield.registration.transforms import (
     FrameTransform,
     HomographyTransform,
     PolyprojectiveTransform,
+    count_row_knots,
     fit_normalisation,
     mesh_shape,
+    normalisation_matrix,
     vector_length,
 )
 
@@ -161,3 +163,80 @@ def test_composition_is_one_map_after_the_other() -> None:
     back = both.to_raw(there[good])
     found = np.isfinite(back).all(axis=1)
     assert np.abs(both.to_base(back[found]) - there[good][found]).max() < 1e-2
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(0, 10_000))
+def test_a_homography_and_its_inverse_cancel(seed: int) -> None:
+    h = HomographyTransform(homography(np.random.default_rng(seed)))
+    np.testing.assert_allclose(h.inverse(h(grid())), grid(), atol=1e-6)
+    np.testing.assert_allclose(h(h.inverse(h(grid()))), h(grid()), atol=1e-6)
+
+
+def test_a_homography_has_no_value_beyond_its_horizon() -> None:
+    h = HomographyTransform(np.array([[1.0, 0, 0], [0, 1.0, 0], [-0.01, 0, 1.0]]))  # the horizon is x = 100
+    assert np.isfinite(h(np.array([[99.0, 5.0], [101.0, 5.0]]))).all(axis=1).tolist() == [True, False]
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(0, 10_000))
+def test_composition_is_associative(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    t, p = frame_transform(rng, mesh=False), bent(rng)
+    norm = fit_normalisation(p(t.to_base(grid(inset=40))))
+    q = PolyprojectiveTransform.from_homography(np.diag([0.7, 0.7, 1.0]), norm, norm)
+    raw = grid(inset=40)
+    np.testing.assert_array_equal(t.then(p).then(q).to_base(raw), q(t.then(p).to_base(raw)))
+    assert (t.then(p).width, t.then(p).then(q).height) == (WIDTH, HEIGHT)
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(0, 10_000))
+def test_normalised_points_lie_in_the_unit_square_and_touch_it(seed: int) -> None:
+    xy = np.random.default_rng(seed).uniform(-1e4, 1e4, (20, 2))
+    cx, cy, s = fit_normalisation(xy)
+    normalised = HomographyTransform(normalisation_matrix(np.array([cx, cy, s])))(xy)
+    assert np.abs(normalised).max() == pytest.approx(1.0)
+    np.testing.assert_allclose(normalised, (xy - [cx, cy]) * s, atol=1e-9)
+
+
+def test_normalisation_ignores_points_without_a_value() -> None:
+    xy = np.array([[0.0, 0.0], [10.0, 4.0], [np.nan, 1e9], [np.inf, 3.0]])
+    np.testing.assert_allclose(fit_normalisation(xy), [5.0, 2.0, 0.2])
+    assert fit_normalisation(np.ones((3, 2)))[2] == pytest.approx(1e9)  # one point: no extent to scale
+
+
+@pytest.mark.parametrize(("scale", "degrees"), [(1.0, 0.0), (0.6, 137.0), (1.4, -80.0)])
+def test_scale_and_rotation_are_those_of_the_similarity(scale: float, degrees: float) -> None:
+    angle = np.radians(degrees)
+    c, s = scale * np.cos(angle), scale * np.sin(angle)
+    norm = fit_normalisation(grid())
+    matrix = np.array([[c, -s, 30.0], [s, c, -10.0], [0.0, 0.0, 1.0]])
+    p = PolyprojectiveTransform.from_homography(matrix, norm, norm)
+    t = FrameTransform(width=WIDTH, height=HEIGHT, lens=HarrisLens(0.2, 319.5, 239.5, 400.0), polyprojective=p)
+    found = t.scale_and_rotation()
+    assert found[0] == pytest.approx(scale, rel=1e-3)
+    assert np.degrees(found[1]) == pytest.approx(degrees, abs=0.01)
+
+
+def test_jacobian_of_the_whole_map_is_its_difference_quotient() -> None:
+    t, raw, step = frame_transform(np.random.default_rng(8)), grid(inset=30), 1e-3
+    for axis in range(2):
+        d = np.eye(2)[axis] * step
+        quotient = (t.to_base(raw + d) - t.to_base(raw - d)) / (2 * step)
+        # central differences of 0.25 px, over the kinks of the mesh and the spline's curvature
+        assert np.abs(t.jacobian(raw)[:, :, axis] - quotient).mean() < 1e-3
+
+
+def test_a_vector_of_another_configuration_is_refused() -> None:
+    t = frame_transform(np.random.default_rng(9))
+    other = RegistrationConfig(row_spline_knots=24)
+    with pytest.raises(ValueError, match=f"expected {vector_length(WIDTH, HEIGHT, other)}"):
+        t.to_vector(other)
+
+
+def test_only_the_row_spline_model_has_knots() -> None:
+    models = ("row_spline", "polyprojective", "homography")
+    knots = [count_row_knots(RegistrationConfig.model_validate({"model": model})) for model in models]
+    assert knots[0] == RegistrationConfig().row_spline_knots > 0
+    assert knots[1:] == [0, 0]
