@@ -58,7 +58,8 @@ def _old_flight(record: dict[str, Any]) -> dict[str, Any]:
     config = record["config"]
     for key, values in OLD_VALUES.items():
         section, name = key.split(".")
-        config[section][name] = {new: old for old, new in values.items()}[config[section][name]]
+        value = config[section][name]
+        config[section][name] = {new: old for old, new in values.items()}.get(value, value)
     for old, key in OLD_KEYS.items():
         (section, old_name), (_, name) = old.split("."), key.split(".")
         if name in config[section]:  # not every method of detection has every key
