@@ -68,8 +68,8 @@ def test_training_from_scratch_lowers_the_loss() -> None:
 def test_the_shipped_network_detects_cars_of_an_unseen_city() -> None:
     evaluation = evaluate_network(shipped(), city(9503))
     above = evaluation.score > shipped_detector().threshold
-    assert evaluation.right[above].mean() > 0.85
-    assert evaluation.right[above].sum() > 0.75 * evaluation.cars
+    assert evaluation.correct[above].mean() > 0.85
+    assert evaluation.correct[above].sum() > 0.75 * evaluation.car_count
 
 
 def test_fine_tuning_is_deterministic_and_keeps_the_attribution() -> None:
