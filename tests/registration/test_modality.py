@@ -80,7 +80,9 @@ def search(image: np.ndarray, base: np.ndarray) -> list[coarse.CoarseCandidate]:
 
 
 @pytest.mark.parametrize(
-    ("change", "best"), [(np.asarray, "intensity"), (invert, "inverted"), (fold_tones, "gradient")], ids=["as it is", "inverted", "folded"]
+    ("change", "best"),
+    [(np.asarray, "intensity"), (invert, "inverted"), (fold_tones, "gradient")],
+    ids=["as it is", "inverted", "folded"],
 )
 def test_the_search_ranks_the_modality_that_two_images_share_first(
     ground: np.ndarray, change: object, best: str
