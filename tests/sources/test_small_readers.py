@@ -127,7 +127,7 @@ def test_the_box_of_a_rotated_car_gives_back_its_length_and_angle(angle: float, 
     shape = car_in_upright_box(*box)
     assert shape.length_px == pytest.approx(length, rel=1e-5)
     assert shape.width_px == pytest.approx(CAR_ASPECT * length, rel=1e-5)
-    assert math.isnan(shape.orientation_rad) != math.isnan(shape.tilt_rad)
+    assert math.isnan(shape.orientation_rad) != math.isnan(shape.abs_box_angle_rad)
 
 
 @given(st.floats(0, math.pi - 0.01), st.floats(10, 50), st.floats(3, 9))
