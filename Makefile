@@ -12,6 +12,9 @@ export PYTHONDONTWRITEBYTECODE :=
 demo: page  ## simulate a flight, run the whole job, say where the report is
 	$(BIN)/velfield demo --out demo
 
+# Two processes on two cores: BLAS threads of their own make training in the tests many times slower.
+test: export OPENBLAS_NUM_THREADS := 1
+test: export OMP_NUM_THREADS := 1
 test: page  ## every check: lint, types, tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
