@@ -24,7 +24,7 @@ def subscribe(listener: Listener) -> Iterator[None]:
     Examples
     --------
     >>> received = []
-    >>> with listening(lambda stage, steps: received.append((stage, steps))):
+    >>> with subscribe(lambda stage, steps: received.append((stage, steps))):
     ...     advance("detections", 8)
     >>> received
     [('detections', 8)]
