@@ -11,7 +11,7 @@ import pytest
 from flows.runners import RunnerConfig
 from schemas.detector import MotionRecord
 from schemas.summary import RunSummary
-from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
+from schemas.tables import DETECTION_COLUMNS, TRACK_COLUMNS
 from tests.small_flight import FRAMES, digests, job, process, redone
 from velfield import open_run
 from velfield.detection.detector import from_record
@@ -50,7 +50,7 @@ def test_the_python_side_of_the_contract(whole: tuple[Path, RunSummary]) -> None
     assert list(run.registration_status) == ["ok"] * FRAMES
     assert list(run.detections().columns) == list(DETECTION_COLUMNS)
     tracklets = run.tracklets()
-    assert list(tracklets.columns) == list(TRACKLET_COLUMNS)
+    assert list(tracklets.columns) == list(TRACK_COLUMNS)
     assert len(tracklets) > 50
     raw = np.array([[100.0, 90.0], [500.0, 400.0]])
     np.testing.assert_allclose(run.to_raw(4, run.to_base(4, raw)), raw, atol=1e-2)
@@ -91,7 +91,10 @@ def test_a_run_on_another_base_image_has_no_score(
         return truth.camera.to_base(frame, xy_raw)[:, ::-1] * (1, -1) + (0, 400)
 
     monkeypatch.setattr(Truth, "to_base", turned)
-    with pytest.raises(InputError, match=r"px off those of .* its base image is another one; score a run with --base"):
+    with pytest.raises(
+        InputError,
+        match=r"positions differ from those of .* px \(mean\): its base image is another one; score a run with --base",
+    ):
         score_run(whole[0], flight)
 
 
