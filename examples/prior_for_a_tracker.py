@@ -17,8 +17,7 @@ from scipy.spatial.distance import cdist
 
 from schemas.flight import FieldConfig
 from schemas.simulation import SimulationConfig
-from velfield.field.bins import VelocityBins, band_radius_px, stationary_speed_px_per_s
-from velfield.field.segments import segment_table
+from velfield.field.segments import VelocityBins, band_radius_px, segment_table, stationary_speed_px_per_s
 from velfield.field.view import VelocityField
 from velfield.synthetic.flight import Flight
 from velfield.synthetic.observed import observed_detections, observed_tracklets

@@ -19,8 +19,7 @@ from prefect.artifacts import (
 from flows.launch import PAGES, PAGES_OF
 from schemas.summary import RunSummary
 from velfield.pipeline.plan import Plan
-from velfield.run.layout import RunLayout
-from velfield.run.paths import is_remote
+from velfield.run.layout import RunLayout, is_remote
 from velfield.run.results import final_root
 
 _MAX_IMAGE_BYTES = 600_000

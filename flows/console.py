@@ -12,7 +12,7 @@ from typing import Literal
 from rich.console import Console as RichConsole
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from velfield.pipeline.progress import subscribe
+from velfield.pipeline.result import subscribe
 
 Verbosity = Literal["quiet", "normal", "verbose", "json"]
 

@@ -58,7 +58,7 @@ class Report(Model):
     residual: ResidualSeries | None = None
     detection: PrecisionRecall | None = None
     gates: dict[str, int] = Field(default_factory=dict)
-    """What tracking tried, rejected and kept, by the names of `velfield.tracking.limits.GateLog`."""
+    """What tracking tried, rejected and kept, by the names of `velfield.tracking.gates.GateLog`."""
     notes: tuple[str, ...] = ()
     """Remarks of the stages."""
     warnings: tuple[str, ...] = ()

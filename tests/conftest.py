@@ -22,7 +22,7 @@ FOOTAGE = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 _LONGEST = (
     *("kills", "accuracy", "serve", "reprocess", "s3", "cluster", "viewer", "flows", "cli", "docs", "training"),
-    *("detection", "intersensor", "straight_to_base", "intrasensor", "motion_labels", "synthetic_flight"),
+    *("detection", "intersensor", "direct_registration", "intrasensor", "motion_labels"),
 )
 """Files that take a minute or so: begun first, or one process would sit over the last of them while the other waits."""
 

@@ -14,7 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray
-from velfield.tracking.windows import FrameTable
+from velfield.tracking.association import FrameTable
 
 OVERSAMPLING = 4
 CROP_PX = 32

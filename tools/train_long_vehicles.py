@@ -10,10 +10,15 @@ import numpy as np
 from schemas.arrays import ByteArray, FloatArray
 from schemas.detector import DetectorConfig, LongVehicleRecord, Round
 from velfield.detection.boosting import BoostedStumps, draw_feature_pool
-from velfield.detection.cascade.classifier import offset_along_axis
+from velfield.detection.cascade.classifier import (
+    LONG,
+    MIN_LENGTH_RATIO,
+    OFFSETS,
+    LongVehicleClassifier,
+    offset_along_axis,
+)
 from velfield.detection.cascade.feature_image import FeatureImage, compute_features, score_poses
 from velfield.detection.cascade.feature_matrix import FeatureBinner, fit_feature_binner
-from velfield.detection.cascade.long_vehicles import LONG, MIN_LENGTH_RATIO, OFFSETS, LongVehicleClassifier
 from velfield.detection.cascade.scenes import Poses, augment_poses
 from velfield.detection.cascade.training import CONTRAST_FLOOR
 from velfield.detection.samples import LabelledImage

@@ -7,7 +7,7 @@ import pytest
 
 from schemas.arrays import FloatArray
 from tests.field_runs import field_run, tracklets_along
-from velfield.run.grid import heading_deg
+from velfield.run.frame_transforms import heading_deg
 from velfield.run.run import Run
 
 GSD_M = 0.25

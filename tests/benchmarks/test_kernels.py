@@ -10,8 +10,7 @@ from schemas.flight import FieldConfig
 from velfield.bench.detection import plain_response, random_stumps, row_response
 from velfield.detection.paper.response import dense_response
 from velfield.field.accumulate import accumulate_tile
-from velfield.field.bins import VelocityBins
-from velfield.field.segments import SEGMENT_DTYPE
+from velfield.field.segments import SEGMENT_DTYPE, VelocityBins
 
 
 @pytest.fixture

@@ -10,17 +10,16 @@ from schemas.detector import CnnConfig
 from velfield.bench.scenes import simulated_image
 from velfield.detection.cnn.dataset import PatchDataset
 from velfield.detection.cnn.fine_tuning import evaluate_network, fine_tune
-from velfield.detection.cnn.inference import detect_cars
 from velfield.detection.cnn.model import (
     CONVOLUTIONS,
     Network,
+    detect_cars,
     network_from_record,
     network_to_record,
     predict_heatmap,
 )
 from velfield.detection.cnn.trainer import Trainer, train
-from velfield.detection.detector import from_record
-from velfield.detection.files import shipped_detector
+from velfield.detection.detector import from_record, shipped_detector
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 

@@ -9,12 +9,17 @@ from schemas.arrays import Float32Array, FloatArray, GreyImage
 from schemas.detector import MotionRecord
 from velfield.bench.scenes import simulated_image
 from velfield.detection.cascade.classifier import nms_oriented
-from velfield.detection.cnn import inference
+from velfield.detection.cnn import model
 from velfield.detection.cnn.dataset import PATCH_PX, encode_targets
 from velfield.detection.cnn.detector import CnnDetector
-from velfield.detection.cnn.inference import SCORE_OFFSET, background_difference_at, detect_cars, motion_score_bonus
-from velfield.detection.cnn.model import Network
-from velfield.detection.files import shipped_detector
+from velfield.detection.cnn.model import (
+    SCORE_OFFSET,
+    Network,
+    background_difference_at,
+    detect_cars,
+    motion_score_bonus,
+)
+from velfield.detection.detector import shipped_detector
 from velfield.detection.orientation import axial_difference
 
 
@@ -60,8 +65,8 @@ def test_positions_and_orientations_are_decoded_from_a_heatmap(monkeypatch: pyte
         out[..., 1], out[..., 2] = (f(2 * relative)[:, None, None] for f in (np.cos, np.sin))
         return out
 
-    monkeypatch.setattr(inference, "predict_heatmap", lambda network, image: (heatmap, orientation))
-    monkeypatch.setattr(inference, "forward", predict_crops)
+    monkeypatch.setattr(model, "predict_heatmap", lambda network, image: (heatmap, orientation))
+    monkeypatch.setattr(model, "forward", predict_crops)
     found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None)
     assert len(found) == 4
     distance, difference = nearest(found, np.column_stack([centres, angles]))
@@ -79,8 +84,8 @@ def test_crops_that_disagree_on_the_orientation_make_it_uncertain(monkeypatch: p
         out[..., 1] = 1  # each along its own crop: across each other
         return out
 
-    monkeypatch.setattr(inference, "predict_heatmap", lambda network, image: (heatmap, orientation))
-    monkeypatch.setattr(inference, "forward", predict_crops)
+    monkeypatch.setattr(model, "predict_heatmap", lambda network, image: (heatmap, orientation))
+    monkeypatch.setattr(model, "forward", predict_crops)
     found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None)
     assert found.shape == (1, 5)
     assert found[0, 4] > np.radians(45)

@@ -7,14 +7,7 @@ from hypothesis import strategies as st
 from scipy.signal import correlate
 
 from schemas.arrays import Float32Array, FloatArray
-from velfield.detection.cnn import convolution
-from velfield.detection.cnn.convolution import (
-    PaddedBatchLayout,
-    conv2d,
-    conv2d_backward,
-    depth_to_space,
-    space_to_depth,
-)
+from velfield.detection.cnn import model
 from velfield.detection.cnn.model import (
     CONVOLUTIONS,
     STRIDE,
@@ -22,10 +15,15 @@ from velfield.detection.cnn.model import (
     Conv,
     DepthToSpace,
     Network,
+    PaddedBatchLayout,
     Residual,
     SpaceToDepth,
+    conv2d,
+    conv2d_backward,
+    depth_to_space,
     forward,
     predict_heatmap,
+    space_to_depth,
 )
 
 SIZES = st.integers(1, 9)
@@ -96,7 +94,7 @@ def test_the_size_of_blocks_does_not_matter(monkeypatch: pytest.MonkeyPatch, row
     layout, weights = PaddedBatchLayout(2, 13, 17), normal(9, 3, 4, seed=1)
     values = layout.pack(normal(2, 13, 17, 3))
     expected = conv2d(values, weights, layout)
-    monkeypatch.setattr(convolution, "_BLOCK_ROWS", rows)
+    monkeypatch.setattr(model, "_BLOCK_ROWS", rows)
     np.testing.assert_allclose(conv2d(values, weights, layout), expected, atol=1e-5)
 
 

@@ -10,8 +10,7 @@ from schemas.detector import CascadeConfig, CascadeTraining, CnnConfig, PaperCon
 from velfield.bench.detection import row_response
 from velfield.detection.boosting import BoostedStumps
 from velfield.detection.detect import FrameDetections, detect_frame
-from velfield.detection.detector import Detector, train_detector
-from velfield.detection.files import shipped_detector
+from velfield.detection.detector import Detector, shipped_detector, train_detector
 from velfield.detection.orientation import axial_difference
 from velfield.detection.paper.response import dense_response
 from velfield.detection.samples import LabelledImage

@@ -9,9 +9,14 @@ from numpy.typing import NDArray
 from schemas.arrays import FloatArray
 from tools.shipped_detector import LORRY_SEEDS, LORRY_SEEDS_HELD_OUT
 from velfield.bench.scenes import simulated_image
-from velfield.detection.cascade.classifier import offset_along_axis
+from velfield.detection.cascade.classifier import (
+    LONG,
+    OFFSETS,
+    LongVehicleClassifier,
+    offset_along_axis,
+    shipped_long_vehicles,
+)
 from velfield.detection.cascade.feature_image import FeatureImage, compute_features
-from velfield.detection.cascade.long_vehicles import LONG, OFFSETS, LongVehicleClassifier, shipped_long_vehicles
 from velfield.detection.samples import LabelledImage
 
 SEED = 40

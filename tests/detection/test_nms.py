@@ -9,12 +9,13 @@ from velfield.detection.boosting import BoostedStumps
 from velfield.detection.cascade.classifier import (
     PoseScorer,
     classify_proposals,
+    in_view,
     nms_oriented,
     offset_along_axis,
     offset_grid,
+    propose_regions,
 )
 from velfield.detection.cascade.feature_image import COARSE, compute_features
-from velfield.detection.cascade.proposals import in_view, propose_regions
 from velfield.detection.orientation import axial_difference
 
 LENGTH = 16.0

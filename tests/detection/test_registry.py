@@ -24,8 +24,16 @@ from schemas.detector import (
 )
 from schemas.renames import DETECTOR_KEYS, DETECTOR_LAYERS, upgrade_detector
 from velfield.detection.detect import detect_frame
-from velfield.detection.detector import Detections, Detector, detector_class, from_record, register, train_detector
-from velfield.detection.files import load_detector, shipped_detector
+from velfield.detection.detector import (
+    Detections,
+    Detector,
+    detector_class,
+    from_record,
+    load_detector,
+    register,
+    shipped_detector,
+    train_detector,
+)
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError, OldNameWarning
 
@@ -233,7 +241,7 @@ def test_another_file_is_one_clear_line(content: str, problem: str, tmp_path: Pa
 
 
 def test_a_file_that_is_far_too_large_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("velfield.detection.files.MAX_BYTES", 10)
+    monkeypatch.setattr("velfield.detection.detector.MAX_BYTES", 10)
     file = tmp_path / "detector.json"
     file.write_text("x" * 11)
     with pytest.raises(InputError, match="found 11 bytes, expected 10 at most"):

@@ -13,11 +13,11 @@ from pydantic import ValidationError
 from schemas.arrays import FloatArray
 from schemas.detector import CnnConfig, MotionRecord
 from velfield.detection.cnn.fine_tuning import fine_tune_interpolated
-from velfield.detection.cnn.inference import background_difference_at, motion_score_bonus
+from velfield.detection.cnn.model import background_difference_at, motion_score_bonus
 from velfield.detection.cnn.self_training import fit_motion_thresholds, self_train_from_motion, stationary_threshold
 from velfield.detection.detect import detect_frame
+from velfield.detection.detector import shipped_detector
 from velfield.detection.evaluation import match_greedy
-from velfield.detection.files import shipped_detector
 from velfield.detection.motion.difference import MotionFrame, motion_background
 from velfield.detection.motion.evaluation import MotionState
 from velfield.detection.motion.labels import labels_from_motion

@@ -11,7 +11,7 @@ from flows.cli import app
 from flows.commands import train as train_command
 from schemas.flight import FramesConfig
 from velfield.detection.cascade.scenes import make_scene
-from velfield.detection.files import load_detector, shipped_detector
+from velfield.detection.detector import load_detector, shipped_detector
 from velfield.detection.orientation import axial_difference
 from velfield.errors import InputError
 from velfield.pipeline.stages.labels import check_vehicle_length, labelled_images

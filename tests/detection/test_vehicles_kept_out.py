@@ -8,9 +8,8 @@ import numpy as np
 from schemas.job import Inputs, Job
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.plan import make_plan
-from velfield.pipeline.stages.base_image import detect_unit_keypoints
-from velfield.pipeline.stages.external_detections import vehicle_free_mask
 from velfield.pipeline.stages.frames import create_frame_store, read_unit
+from velfield.pipeline.stages.registration import detect_unit_keypoints, vehicle_free_mask
 
 
 def test_no_key_point_lies_on_a_given_vehicle(tmp_path: Path) -> None:

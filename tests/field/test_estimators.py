@@ -15,11 +15,21 @@ from velfield.field.algebra import merge_tiles
 from velfield.field.comparison import compare_fields
 from velfield.field.gate import make_gate
 from velfield.field.heldout import heldout_log_likelihood
-from velfield.field.intervals import SPEED_CORRELATION, _half_width, _student_t95
-from velfield.field.modes import BANDWIDTH_BINS, MIN_BANDWIDTH_BINS, bandwidth_bins, velocity_modes
+from velfield.field.modes import (
+    BANDWIDTH_BINS,
+    CELLS_PER_BIN,
+    MIN_BANDWIDTH_BINS,
+    bandwidth_bins,
+    deconvolution_factor,
+    kernel_variance,
+    max_cells,
+    quantile,
+    speed_cells,
+    velocity_modes,
+)
 from velfield.field.prior import PRIOR_PSEUDOCOUNT, STATIONARY_PSEUDOCOUNT, _gaussian_at_rest, _mix_levels
 from velfield.field.segments import SEGMENT_DTYPE
-from velfield.field.speeds import CELLS_PER_BIN, deconvolution_factor, kernel_variance, max_cells, quantile, speed_cells
+from velfield.field.statistics import SPEED_CORRELATION, _half_width, _student_t95
 from velfield.field.time_intervals import assign_intervals, parse_time_intervals
 
 REACH = 18

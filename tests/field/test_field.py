@@ -13,8 +13,15 @@ from schemas.tables import TRACKLET_COLUMNS
 from velfield.errors import InputError
 from velfield.field.accumulate import KERNEL_RADIUS_SIGMAS, UNIT, VARIANCE_UNIT, FieldTile, accumulate_tile
 from velfield.field.algebra import merge_tiles, subtract_tile
-from velfield.field.bins import VelocityBins, band_radius_px, stationary_speed_px_per_s
-from velfield.field.segments import SEGMENT_DTYPE, Segments, segment_table, segments_by_tile
+from velfield.field.segments import (
+    SEGMENT_DTYPE,
+    Segments,
+    VelocityBins,
+    band_radius_px,
+    segment_table,
+    segments_by_tile,
+    stationary_speed_px_per_s,
+)
 
 BINS = VelocityBins(width_px_per_s=10.0, reach=6, kernel_sigma_px_per_s=3.5)
 

@@ -6,9 +6,15 @@ import pytest
 from schemas.flight import FieldConfig
 from schemas.simulation import SimulationConfig
 from velfield.field.accumulate import FieldTile, accumulate_tile
-from velfield.field.bins import VelocityBins, band_radius_px, stationary_speed_px_per_s
 from velfield.field.modes import modal_velocity
-from velfield.field.segments import SEGMENT_DTYPE, Segments, segment_table
+from velfield.field.segments import (
+    SEGMENT_DTYPE,
+    Segments,
+    VelocityBins,
+    band_radius_px,
+    segment_table,
+    stationary_speed_px_per_s,
+)
 from velfield.field.statistics import TileStatistics, tile_statistics
 from velfield.synthetic.flight import Flight
 from velfield.synthetic.observed import NO_ERRORS, observed_tracklets

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from velfield.errors import InputError
-from velfield.field.bins import VelocityBins
-from velfield.field.segments import SEGMENT_DTYPE, Segments
+from velfield.field.segments import SEGMENT_DTYPE, Segments, VelocityBins
 from velfield.field.view import VelocityField
 
 GSD_M = 0.25

@@ -14,8 +14,7 @@ from schemas.summary import RunSummary
 from schemas.tables import DETECTION_COLUMNS, TRACK_COLUMNS
 from tests.small_flight import FRAMES, digests, job, process, redone
 from velfield import open_run
-from velfield.detection.detector import from_record
-from velfield.detection.files import shipped_detector
+from velfield.detection.detector import from_record, shipped_detector
 from velfield.errors import InputError
 from velfield.pipeline.plan import make_plan
 from velfield.pipeline.stage import STAGE

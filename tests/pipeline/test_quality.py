@@ -16,7 +16,7 @@ from velfield.pipeline.stage import stages_before
 from velfield.run.commits import read_commit
 from velfield.run.layout import RunLayout
 from velfield.run.stores import open_frames
-from velfield.sources.flags import FrameFlag
+from velfield.sources.quality import FrameFlag
 
 BLURRED, FOREIGN = 5, 8
 """The second one is the first frame of a unit of eight."""

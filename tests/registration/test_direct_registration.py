@@ -14,9 +14,10 @@ from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import Plan, make_plan
 from velfield.pipeline.stage import stages_before
-from velfield.pipeline.stages.base_image import build_base, detect_unit_keypoints
+from velfield.pipeline.stages.base_image import build_base
+from velfield.pipeline.stages.registration import detect_unit_keypoints
 from velfield.registration.intersensor import register_intersensor
-from velfield.run.grid import read_grid
+from velfield.run.frame_transforms import read_grid
 
 SHAPE = (360, 480)
 CENTRE = np.array([239.5, 179.5])

@@ -4,8 +4,13 @@ import numpy as np
 
 from schemas.flight import RegistrationConfig
 from velfield.errors import Failure
-from velfield.registration.keypoints import Keypoints, detect_keypoints
-from velfield.registration.matching import estimate_homography_prior, match_descriptors, match_guided
+from velfield.registration.keypoints import (
+    Keypoints,
+    detect_keypoints,
+    estimate_homography_prior,
+    match_descriptors,
+    match_guided,
+)
 from velfield.registration.transforms import HomographyTransform
 
 CONFIG = RegistrationConfig(max_keypoints=500)

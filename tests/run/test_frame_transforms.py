@@ -15,11 +15,14 @@ from velfield.errors import InputError
 from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, vector_length
 from velfield.run.frame_transforms import (
     FrameTransforms,
+    heading_deg,
+    north_direction_rad,
     polyprojective_from_record,
     polyprojective_to_record,
+    read_grid,
     read_lens,
+    read_working,
 )
-from velfield.run.grid import heading_deg, north_direction_rad, read_grid, read_working
 from velfield.run.layout import RunLayout
 from velfield.run.stores import create_frames, create_registration, open_registration
 

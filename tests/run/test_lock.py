@@ -13,9 +13,8 @@ import pytest
 
 from velfield.errors import InputError
 from velfield.run import lock
-from velfield.run.layout import RunLayout
+from velfield.run.layout import RunLayout, to_path
 from velfield.run.lock import locked
-from velfield.run.paths import to_path
 
 EXPIRED = json.dumps({"pid": 1, "host": "elsewhere", "since": "2024-05-01 12:00:00", "until_s": 0.0})
 
@@ -66,7 +65,7 @@ def test_the_lock_of_a_process_that_was_killed_is_taken_over(layout: RunLayout) 
         import os
         from velfield.run.layout import RunLayout
         from velfield.run.lock import locked
-        from velfield.run.paths import to_path
+        from velfield.run.layout import to_path
         with locked(RunLayout(to_path({str(layout.root)!r}))):
             os.kill(os.getpid(), 9)
     """

@@ -23,7 +23,7 @@ from velfield.pipeline.verify import verify_run
 from velfield.run.commits import read_commits
 from velfield.run.field_algebra import merge_fields
 from velfield.run.flight_record import read_flight_record
-from velfield.run.grid import read_working
+from velfield.run.frame_transforms import read_working
 from velfield.run.lineage import pixel_lineage, stage_lineage
 from velfield.run.run import Run
 from velfield.run.stores import open_field

@@ -6,10 +6,18 @@ from pathlib import Path
 import pytest
 
 from velfield.errors import InputError
-from velfield.run import paths
+from velfield.run import layout
 from velfield.run.commits import digest_path, sweep_partial, write_atomically
-from velfield.run.layout import RunLayout
-from velfield.run.paths import copy_objects, is_remote, local_copy, local_output, remove_tree, rename_tree, to_path
+from velfield.run.layout import (
+    RunLayout,
+    copy_objects,
+    is_remote,
+    local_copy,
+    local_output,
+    remove_tree,
+    rename_tree,
+    to_path,
+)
 from velfield.run.s3 import S3ObjectPath, s3_path
 
 
@@ -59,7 +67,7 @@ def test_a_path_on_s3_travels_to_a_worker_as_it_is() -> None:
 def test_without_the_extra_a_path_on_s3_is_refused_with_what_to_install(
     missing: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(paths, "find_spec", lambda name: None if name == missing else object())
+    monkeypatch.setattr(layout, "find_spec", lambda name: None if name == missing else object())
     with pytest.raises(
         InputError, match=r"s3://bucket/run: a run folder on s3:// needs the extra; pip install '.*\[s3\]'"
     ):

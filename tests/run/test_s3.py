@@ -17,9 +17,8 @@ from tests.new_base import write_new_base
 from tests.small_flight import digests, digests_of, job, process, redone
 from velfield import open_run
 from velfield.pipeline.verify import verify_run
-from velfield.run import paths
-from velfield.run.layout import RunLayout
-from velfield.run.paths import copy_objects, rename_tree, to_path
+from velfield.run import layout
+from velfield.run.layout import RunLayout, copy_objects, rename_tree, to_path
 from velfield.run.results import link_shared_outputs
 from velfield.run.s3 import S3_OPTIONS
 
@@ -98,7 +97,7 @@ def test_a_folder_whose_naming_was_cut_short_has_no_last_file_and_is_named_again
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(paths, "copy_objects", cut_short)
+        patch.setattr(layout, "copy_objects", cut_short)
         with pytest.raises(KeyboardInterrupt):
             rename_tree(source, target, last="last")
     assert (target / "a/1").exists()

@@ -9,7 +9,7 @@ import pytest
 
 from schemas.tables import TRACKLET_COLUMNS
 from velfield.run import tables
-from velfield.run.paths import to_path
+from velfield.run.layout import to_path
 from velfield.run.tables import (
     conform,
     empty_table,

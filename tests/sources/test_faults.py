@@ -11,8 +11,14 @@ from PIL import Image
 from schemas.flight import FramesConfig
 from tests.media import drifting, flip_bytes, ground, write_images, write_times, write_video
 from velfield.errors import InputError
-from velfield.sources.flags import UNUSABLE, FrameFlag, describe_flags
-from velfield.sources.quality import flag_blurred, flag_outlier_frames, frame_quality
+from velfield.sources.quality import (
+    UNUSABLE,
+    FrameFlag,
+    describe_flags,
+    flag_blurred,
+    flag_outlier_frames,
+    frame_quality,
+)
 from velfield.sources.source import iter_frames, probe
 
 ALL = FramesConfig()

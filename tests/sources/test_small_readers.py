@@ -12,10 +12,10 @@ from PIL import Image
 
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
+from velfield.sources.frames import local_path
 from velfield.sources.images import image_size, read_grey_image
 from velfield.sources.labels.boxes import car_shape
 from velfield.sources.labels.yolo import CAR_ASPECT, car_class_numbers, car_in_upright_box, tilt_of_upright_box
-from velfield.sources.paths import local_path
 from velfield.sources.quality import flag_blurred, flag_outlier_frames, is_black
 from velfield.sources.selection import select_frames
 from velfield.sources.table import finite_cell, read_csv_rows, read_text

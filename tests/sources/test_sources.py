@@ -13,7 +13,7 @@ from PIL import Image
 from schemas.flight import FramesConfig
 from tests.media import drifting, write_images, write_times, write_video
 from velfield.errors import InputError
-from velfield.sources.flags import FrameFlag
+from velfield.sources.quality import FrameFlag
 from velfield.sources.source import iter_frames, probe, select_frames
 
 ALL = FramesConfig()

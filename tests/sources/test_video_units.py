@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from tests.media import ground
 from velfield.errors import InputError
 from velfield.sources.frames import SourceInfo
-from velfield.sources.video.block_artifacts import BlockArtifactDetector
-from velfield.sources.video.corruption import CorruptionTracker
+from velfield.sources.video.corruption import BlockArtifactDetector, CorruptionTracker
 from velfield.sources.video.decoding import _entry_points, _TimestampIndex
 from velfield.sources.video.packets import Packets, closed_key_frames, drop_timestamp_outliers
 

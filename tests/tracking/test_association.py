@@ -18,8 +18,7 @@ from velfield.tracking.association import (
     mutual_best_links,
     typical_difference,
 )
-from velfield.tracking.gates import DEFAULT_AXIS_SD_RAD, DetectionStates, gate_link_pairs, gate_links
-from velfield.tracking.limits import GateLog, Limits
+from velfield.tracking.gates import DEFAULT_AXIS_SD_RAD, DetectionStates, GateLog, Limits, gate_link_pairs, gate_links
 from velfield.tracking.tracklets import link_windows
 
 LIMITS = Limits.from_config(TrackingConfig(), None)

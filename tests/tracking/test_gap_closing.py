@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from velfield.tracking.gap_closing import END_COLUMNS, GapLimits, reconnect_tracks
+from velfield.tracking.tracks import END_COLUMNS, GapLimits, reconnect_tracks
 
 GSD_M = 0.25
 INTERVAL_S = 0.2

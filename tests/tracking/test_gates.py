@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.flight import TrackingConfig
-from velfield.tracking.gates import DetectionStates, gate_link_pairs, gate_links
-from velfield.tracking.limits import GateLog, Limits
+from velfield.tracking.gates import DetectionStates, GateLog, Limits, gate_link_pairs, gate_links
 
 PAPER = Limits.from_config(TrackingConfig(), None)
 

@@ -13,8 +13,9 @@ from schemas.flight import TrackingConfig
 from schemas.tables import TRACKLET_COLUMNS
 from tests.tracking_scenes import SCENES, Detector, Watched, car, crossing, platoon, score, two_lanes_opposed, watch
 from velfield.errors import InputError
-from velfield.tracking.limits import GateLog
-from velfield.tracking.tracklets import link_windows, window_frames
+from velfield.tracking.association import window_frames
+from velfield.tracking.gates import GateLog
+from velfield.tracking.tracklets import link_windows
 
 PAIRWISE = TrackingConfig(linking="pairwise", min_confidence=0.0, refine=False)
 ALL = range(10**6)

@@ -17,7 +17,7 @@ from velfield.report.figures import MapScale, direction_figure, jpeg_bytes, png_
 from velfield.report.gates import rejection_table, totals_table
 from velfield.report.panel import bar_ticks
 from velfield.report.report import render_report
-from velfield.tracking.limits import GateLog
+from velfield.tracking.gates import GateLog
 
 GREY = np.full((480, 640), 100, np.uint8)
 

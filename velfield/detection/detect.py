@@ -1,12 +1,60 @@
-"""Cars of one frame on the working grid, with the image patches that tracking compares."""
+"""Cars of one frame on the working grid, with the image patches that tracking compares.
+
+Image patches of the cars: rotated to the axis to compare their appearance, upright to align them.
+"""
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
-from schemas.arrays import GreyImage, IntArray, Mask
-from velfield.detection.crops import oriented_patches, upright_chips
+from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
 from velfield.detection.detector import Detections, Detector
+
+
+def oriented_patches(
+    image: GreyImage, xy: FloatArray, orientation_rad: FloatArray, *, width: int = 8, length: int = 16
+) -> GreyImage:
+    """Patches rotated so that the car's axis runs along the columns (paper: the 8 x 16 oriented patch).
+
+    Parameters
+    ----------
+    image
+        (h, w) uint8 on the working grid.
+    xy, orientation_rad
+        (n, 2) centres, working px, and (n,) axes.
+
+    Returns
+    -------
+    (n, length, width) uint8
+    """
+    count = len(xy)
+    if not count:
+        return np.empty((0, length, width), np.uint8)
+    along = np.arange(length) - (length - 1) / 2
+    across = np.arange(width) - (width - 1) / 2
+    cos, sin = np.cos(orientation_rad)[:, None, None], np.sin(orientation_rad)[:, None, None]
+    x = xy[:, 0, None, None] + along[:, None] * cos - across * sin
+    y = xy[:, 1, None, None] + along[:, None] * sin + across * cos
+    return _sample(image, x, y)
+
+
+def upright_chips(image: GreyImage, xy: FloatArray, *, side: int = 32) -> GreyImage:
+    """Crops about the rounded positions, (n, side, side) uint8: pixel (side / 2, side / 2) is the rounded position."""
+    padded = np.pad(image, side, mode="edge")
+    corner = np.rint(xy).astype(np.int64) + side - side // 2
+    chips = [padded[y : y + side, x : x + side] for x, y in corner]
+    return np.stack(chips) if chips else np.empty((0, side, side), np.uint8)
+
+
+def _sample(image: GreyImage, x: FloatArray, y: FloatArray) -> GreyImage:
+    shape = x.shape
+    flat_x, flat_y = (np.ascontiguousarray(c.reshape(shape[0], -1), np.float32) for c in (x, y))
+    rows = []
+    for start in range(0, shape[0], 16_000):  # remap takes at most 32,767 rows
+        part = slice(start, start + 16_000)
+        rows.append(cv2.remap(image, flat_x[part], flat_y[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+    return np.asarray(np.concatenate(rows).reshape(shape), np.uint8)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,8 @@ detects cars on images in base orientation, rescaled to a car's usual length (`D
 goes into a JSON file and comes back (`Detector.save`, `load_detector`). Another one is a package
 ``velfield/detection/<method>`` whose module ``detector`` names its class ``DETECTOR``, and its configuration and record
 in `schemas.detector`.
+
+Detector files: read, of this and the last format version, and the one that ships.
 """
 
 from abc import ABC, abstractmethod
@@ -21,6 +23,15 @@ from velfield.errors import InputError
 if TYPE_CHECKING:
     from velfield.detection.samples import LabelledImage
     from velfield.detection.unlabelled import UnlabelledFlight
+import json
+import warnings
+from importlib.resources import files
+
+from pydantic import TypeAdapter, ValidationError
+
+from schemas.detector import DETECTOR_VERSION, DetectorRecord
+from schemas.renames import OLD_NAMES_UNTIL, upgrade_detector
+from velfield.errors import OldNameWarning
 
 MIN_CARS = 8
 """Fewer labelled cars than this do not train a detector."""
@@ -188,3 +199,60 @@ def train_detector(
         raise InputError(f"{count} labelled cars, {MIN_CARS} needed to train a detector; label the cars of one frame")
     method = config.method if base is None else base.method
     return detector_class(method).train(samples, config.for_method(method), base=base)
+
+
+MAX_BYTES = 20_000_000
+_SHIPPED = "shipped_detector.json"
+_RECORD: TypeAdapter[DetectorRecord] = TypeAdapter(DetectorRecord)
+
+
+def load_detector(path: Path) -> Detector:
+    """Read a detector file; a warning where it is of an old format.
+
+    Raises
+    ------
+    InputError
+        No such file, too large, not a detector file, or a number out of range.
+    """
+    if not path.is_file():
+        raise InputError(
+            f"{path}: no such detector file; give one that `velfield train` wrote, or leave the option out"
+        )
+    if path.stat().st_size > MAX_BYTES:
+        raise InputError(
+            f"{path}: found {path.stat().st_size} bytes, expected {MAX_BYTES} at most; give a detector file as "
+            "`velfield train` writes it"
+        )
+    return _parse(path.read_bytes(), str(path))
+
+
+def shipped_detector() -> Detector:
+    """The pre-trained detector that comes with velfield."""
+    return _parse(files("velfield.detection").joinpath(_SHIPPED).read_bytes(), _SHIPPED)
+
+
+def _parse(data: bytes, name: str) -> Detector:
+    try:
+        content = json.loads(data)
+        if isinstance(content, dict) and content.get("version") == 1:
+            content = upgrade_detector(content)
+            warnings.warn(
+                f"{name}: a detector file of format version 1, written now is version {DETECTOR_VERSION}; the old one "
+                f"is read until {OLD_NAMES_UNTIL}",
+                OldNameWarning,
+                stacklevel=3,
+            )
+        return from_record(_RECORD.validate_python(content))
+    except (ValueError, ValidationError) as error:
+        raise InputError(
+            f"{name}: {_problem(error)}; expected a detector file as velfield writes it (detector.json): "
+            "make one with `velfield train`"
+        ) from None
+
+
+def _problem(error: ValueError) -> str:
+    if not isinstance(error, ValidationError):
+        return "this is not JSON"
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"]) or "the file"
+    return f"{where}: {first['msg'].lower()}"

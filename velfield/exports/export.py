@@ -11,7 +11,7 @@ from typing import Protocol, cast
 from schemas.export import EXPORT_FORMATS, ExportOptions
 from velfield.errors import InputError
 from velfield.run.commits import write_atomically
-from velfield.run.paths import to_path
+from velfield.run.layout import to_path
 from velfield.run.run import Run
 
 

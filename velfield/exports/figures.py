@@ -9,7 +9,7 @@ from schemas.arrays import FloatArray, GreyImage
 from schemas.export import ExportOptions
 from velfield.errors import InputError
 from velfield.report.figures import MapScale
-from velfield.run.grid import north_direction_rad
+from velfield.run.frame_transforms import north_direction_rad
 from velfield.run.run import Run
 
 _MAX_SIDE_PX = 20_000

@@ -9,7 +9,7 @@ from rasterio.warp import transform
 from schemas.arrays import FloatArray, Points
 from schemas.records import GridRecord
 from velfield.errors import InputError
-from velfield.run.grid import heading_deg
+from velfield.run.frame_transforms import heading_deg
 
 MPS_TO_KMH = 3.6
 

@@ -12,7 +12,7 @@ from rasterio.crs import CRS
 from schemas.export import ExportOptions
 from velfield.errors import InputError
 from velfield.exports.georeference import Georeference
-from velfield.run.paths import is_remote
+from velfield.run.layout import is_remote
 from velfield.run.run import Run
 
 FILE_NAME = "item.json"

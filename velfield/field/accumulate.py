@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, IntArray
 from velfield.errors import InputError
-from velfield.field.bins import VelocityBins
-from velfield.field.segments import Segments
+from velfield.field.segments import Segments, VelocityBins
 
 UNIT_BITS = 14
 UNIT = 1 << UNIT_BITS

@@ -7,7 +7,7 @@ import numpy as np
 
 from schemas.arrays import FloatArray, Mask
 from velfield.errors import InputError
-from velfield.field.bins import VelocityBins
+from velfield.field.segments import VelocityBins
 
 Densities = Callable[[FloatArray, FloatArray], FloatArray]
 """Density per (px/s)^2 at a position (2,) of velocities (n, 2)."""

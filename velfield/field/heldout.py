@@ -11,8 +11,7 @@ from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray
 from schemas.flight import FieldConfig
-from velfield.field.bins import VelocityBins, band_radius_px, stationary_speed_px_per_s
-from velfield.field.segments import Segments
+from velfield.field.segments import Segments, VelocityBins, band_radius_px, stationary_speed_px_per_s
 from velfield.field.view import VelocityField
 
 MIN_SD_M_PER_S = 0.5

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray
-from velfield.field.bins import VelocityBins
 from velfield.field.modes import velocity_modes
+from velfield.field.segments import VelocityBins
 from velfield.field.statistics import TileStatistics
 
 

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from schemas.arrays import Float32Array, FloatArray
 from velfield.errors import InputError
 from velfield.field.accumulate import accumulate_tile
-from velfield.field.bins import VelocityBins
 from velfield.field.gate import COVERAGE, VelocityGate, make_gate
 from velfield.field.modes import modal_velocity
 from velfield.field.pixel import PixelDistribution, describe_pixel
 from velfield.field.prior import densities_at_pixel, log_density_in_window
-from velfield.field.segments import Segments, segments_by_tile
+from velfield.field.segments import Segments, VelocityBins, segments_by_tile
 from velfield.field.statistics import TileStatistics, direction_rad, speed_px_per_s, tile_statistics
 
 Tile = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from velfield.detection.files import load_detector
+from velfield.detection.detector import load_detector
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import committed

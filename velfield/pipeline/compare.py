@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 
 from schemas.records import FORMAT_VERSION
 from velfield.exports.cog import write_cog
-from velfield.field.bins import stationary_speed_px_per_s
 from velfield.field.comparison import FDR_LEVEL, MIN_COUNT, Change, compare_fields
+from velfield.field.segments import stationary_speed_px_per_s
 from velfield.report.change import change_figure
 from velfield.report.figures import MapScale, png_bytes
 from velfield.run.commits import write_atomically
 from velfield.run.field_algebra import check_same_grid
-from velfield.run.grid import north_direction_rad
+from velfield.run.frame_transforms import north_direction_rad
 from velfield.run.run import Run, open_run
 from velfield.run.stores import open_field
 from velfield.viewer.record import write_change_layers

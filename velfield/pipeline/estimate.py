@@ -9,7 +9,7 @@ from velfield.pipeline.result import committed
 from velfield.pipeline.stage import STAGES, Cut, Stage
 from velfield.pipeline.units import group_name, stage_units, unit_name
 from velfield.run.field_writer import GROUP_TILES
-from velfield.run.paths import is_remote
+from velfield.run.layout import is_remote
 
 _FRAME_COMPRESSION = 0.8
 """Zstandard leaves about this much of a noisy grey frame."""

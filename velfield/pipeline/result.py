@@ -1,12 +1,48 @@
-"""The result of a unit of work, and its commit."""
+"""The result of a unit of work, and its commit.
+
+Progress within a unit: stages publish their steps, subscribers in the same process show them.
+
+On a worker of a cluster there is no subscriber, and publishing costs nothing; there progress is shown unit by unit.
+"""
 
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from schemas.records import CommitRecord
 from velfield.pipeline.plan import Plan
 from velfield.run.commits import code_version, digest_outputs, valid_commit, write_commit
+
+Listener = Callable[[str, int], None]
+
+_listeners: list[Listener] = []
+
+
+def advance(stage: str, steps: int = 1) -> None:
+    """Publish that ``steps`` more steps (frames, mostly) of ``stage`` are done."""
+    for listener in tuple(_listeners):
+        listener(stage, steps)
+
+
+@contextmanager
+def subscribe(listener: Listener) -> Iterator[None]:
+    """Call ``listener`` with all progress of this process within the context.
+
+    Examples
+    --------
+    >>> received = []
+    >>> with subscribe(lambda stage, steps: received.append((stage, steps))):
+    ...     advance("detections", 8)
+    >>> received
+    [('detections', 8)]
+    """
+    _listeners.append(listener)
+    try:
+        yield
+    finally:
+        _listeners.remove(listener)
 
 
 @dataclass(frozen=True)

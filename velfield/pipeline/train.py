@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from schemas.flight import FlightConfig
-from velfield.detection.detector import Detector, train_detector
-from velfield.detection.files import load_detector, shipped_detector
+from velfield.detection.detector import Detector, load_detector, shipped_detector, train_detector
 from velfield.detection.motion.labels import working_scale
 from velfield.detection.review import collect_tp_fn_fp_crops, contact_sheet
 from velfield.detection.samples import LabelledImage

@@ -11,8 +11,7 @@ from schemas.records import CommitRecord, FlightRecord
 from velfield.pipeline.stage import STAGE, STAGES, Cut
 from velfield.pipeline.units import WHOLE
 from velfield.run.commits import commit_path, digest_file, read_commits
-from velfield.run.layout import RunLayout
-from velfield.run.paths import remove_tree
+from velfield.run.layout import RunLayout, remove_tree
 
 _THREADS = min(4, os.cpu_count() or 1)
 NOT_FINISHED = "not finished"

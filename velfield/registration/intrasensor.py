@@ -32,8 +32,7 @@ from velfield.registration.alignment import (
 )
 from velfield.registration.fitting import fit_by_case_deletion
 from velfield.registration.joint import ControlPoints, JointFit, fit_jointly, is_inlier
-from velfield.registration.keypoints import Keypoints, detect_keypoints
-from velfield.registration.matching import estimate_homography_prior, match_guided
+from velfield.registration.keypoints import Keypoints, detect_keypoints, estimate_homography_prior, match_guided
 from velfield.registration.mesh import MESH_ITERATIONS, fit_robust_mesh
 from velfield.registration.transforms import (
     FrameTransform,

@@ -2,15 +2,23 @@
 
 Paper: registration (SIFT). Keypoints depend on one frame alone, so frames are processed in parallel. They register a
 frame to about a pixel; `alignment` refines to subpixel accuracy at full resolution.
+
+Descriptor matching: of all keypoints, for a prior homography, and guided, in a window about the predicted position.
+
+Paper: registration; guided matches are searched within 50 x 50 px of the prediction. Both use a ratio test and a
+cross-check.
 """
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 
 from schemas.arrays import ByteArray, FloatArray, GreyImage, IntArray, Mask
 from schemas.flight import RegistrationConfig
+from velfield.errors import Failure
+from velfield.registration.transforms import HomographyTransform
 
 _CELLS_ALONG_SIDE = 12
 """Cells along the frame's longer side; the strongest keypoint of every cell comes before the second of any."""
@@ -90,3 +98,134 @@ def _order_by_cell(xy: FloatArray, response: FloatArray, cell_px: float) -> IntA
     starts = np.flatnonzero(np.r_[True, np.diff(key[by_cell]) != 0])
     rank = np.arange(len(xy)) - np.repeat(starts, np.diff(np.r_[starts, len(xy)]))
     return np.asarray(by_cell[np.lexsort((-response[by_cell], rank))])
+
+
+Pairs = IntArray
+"""(m, 2) indices into the moving and the reference keypoints."""
+
+PRIOR_POINTS = 1200
+"""Keypoints of the frame that the prior is estimated from."""
+_RATIO = 0.85
+"""Ratio test: largest distance to the nearest descriptor over that to the second nearest."""
+_GUIDED_RATIO = 0.9
+_MAX_GUIDED_DISTANCE = 350
+"""Largest descriptor distance of a guided match; OpenCV's SIFT descriptors have a norm of about 512."""
+_PRIOR_THRESHOLD_PX = 6.0
+"""Inlier threshold of the prior: it models neither rolling shutter nor relief."""
+_MIN_PRIOR_MATCHES = 16
+_MAX_STRETCH = 6.0
+
+
+def match_descriptors(moving: ByteArray, reference: ByteArray) -> Pairs:
+    """Cross-checked matches of descriptors (n, 128) and (m, 128) that pass the ratio test."""
+    if len(moving) < 2 or len(reference) < 2:
+        return np.zeros((0, 2), np.int64)
+    a, b = moving.astype(np.float32), reference.astype(np.float32)
+    distance = np.square(b).sum(axis=1) - 2.0 * (a @ b.T) + np.square(a).sum(axis=1)[:, None]
+    best = distance.argmin(axis=1)
+    rows = np.arange(len(a))
+    nearest = distance[rows, best]
+    mutual = distance.argmin(axis=0)[best] == rows
+    distance[rows, best] = np.inf
+    unambiguous = nearest < _RATIO**2 * distance.min(axis=1)
+    matched = np.flatnonzero(mutual & unambiguous)
+    return np.stack([matched, best[matched]], axis=1)
+
+
+def estimate_homography_prior(
+    undistorted: FloatArray, descriptors: ByteArray, reference: Keypoints
+) -> HomographyTransform | Failure:
+    """Homography by MAGSAC from a frame's keypoints, undistorted px (n, 2), to reference keypoints, base px.
+
+    A failure gives the number of matches and inliers.
+    """
+    pairs = match_descriptors(descriptors[:PRIOR_POINTS], reference.descriptors)
+    if len(pairs) < _MIN_PRIOR_MATCHES:
+        return Failure(f"{len(pairs)} matches, {_MIN_PRIOR_MATCHES} needed")
+    source, target = undistorted[pairs[:, 0]], reference.xy[pairs[:, 1]]
+    matrix, inliers = cv2.findHomography(
+        source, target, cv2.USAC_MAGSAC, _PRIOR_THRESHOLD_PX, maxIters=4000, confidence=0.9999
+    )
+    n_inliers = 0 if inliers is None else int(inliers.sum())
+    if matrix is None or n_inliers < _MIN_PRIOR_MATCHES:
+        return Failure(f"{n_inliers} inliers of {len(pairs)} matches, {_MIN_PRIOR_MATCHES} needed")
+    prior = HomographyTransform(np.asarray(matrix / matrix[2, 2], dtype=np.float64))
+    if not _is_plausible(prior, source[inliers.ravel() > 0]):
+        return Failure(f"the homography of {n_inliers} inliers mirrors, folds or stretches the frame")
+    return prior
+
+
+def _is_plausible(prior: HomographyTransform, xy: FloatArray) -> bool:
+    """Whether the map preserves handedness, with a scale within 6-fold, at its inliers (n, 2)."""
+    step = 1.0
+    here = prior(xy)
+    along_x, along_y = prior(xy + np.array([step, 0.0])) - here, prior(xy + np.array([0.0, step])) - here
+    area = along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]
+    longest = np.maximum(np.linalg.norm(along_x, axis=1), np.linalg.norm(along_y, axis=1))
+    with np.errstate(invalid="ignore"):
+        return bool((area > _MAX_STRETCH**-2).all() and (longest < _MAX_STRETCH).all())
+
+
+def match_guided(predicted: FloatArray, descriptors: ByteArray, reference: Keypoints, *, search_px: float) -> Pairs:
+    """Cross-checked matches in a square of side ``search_px`` about the predicted positions (n, 2), base px."""
+    if not len(predicted) or not len(reference):
+        return np.zeros((0, 2), np.int64)
+    cell = search_px / 2
+    finite: Mask = np.asarray(np.isfinite(predicted).all(axis=1))
+    origin = reference.xy.min(axis=0)
+    key = np.floor((reference.xy - origin) / cell).astype(np.int64)
+    shape = key.max(axis=0) + 1
+    flat = key[:, 1] * shape[0] + key[:, 0]
+    order = np.argsort(flat, kind="stable")
+    starts = np.searchsorted(flat[order], np.arange(shape[0] * shape[1] + 1))
+    best, back = _nearest_in_window(
+        np.where(finite[:, None], predicted, -1e9),
+        descriptors,
+        reference.xy,
+        reference.descriptors,
+        order,
+        starts,
+        shape,
+        origin,
+        cell,
+        _GUIDED_RATIO**2,
+        _MAX_GUIDED_DISTANCE**2,
+    )
+    rows = np.flatnonzero(best >= 0)
+    rows = rows[back[best[rows]] == rows]
+    return np.stack([rows, best[rows]], axis=1)
+
+
+@njit(cache=True, nogil=True)
+def _nearest_in_window(predicted, moving, xy, reference, order, starts, shape, origin, cell, ratio, limit):  # type: ignore[no-untyped-def]
+    """Nearest reference index for each prediction (-1: none), and nearest prediction for each reference keypoint."""
+    best = np.full(predicted.shape[0], -1, np.int64)
+    back = np.full(xy.shape[0], -1, np.int64)
+    back_distance = np.full(xy.shape[0], 1 << 40, np.int64)
+    for i in range(predicted.shape[0]):
+        column = int(np.floor((predicted[i, 0] - origin[0]) / cell))
+        row = int(np.floor((predicted[i, 1] - origin[1]) / cell))
+        first, second, found = 1 << 40, 1 << 40, -1
+        for r in range(max(row - 1, 0), min(row + 2, shape[1])):
+            for c in range(max(column - 1, 0), min(column + 2, shape[0])):
+                for k in range(starts[r * shape[0] + c], starts[r * shape[0] + c + 1]):
+                    j = order[k]
+                    if abs(xy[j, 0] - predicted[i, 0]) > cell or abs(xy[j, 1] - predicted[i, 1]) > cell:
+                        continue
+                    distance = 0
+                    for d in range(128):
+                        difference = int(moving[i, d]) - int(reference[j, d])
+                        distance += difference * difference
+                    if distance < back_distance[j]:
+                        back_distance[j] = distance
+                        back[j] = i
+                    if distance < first:
+                        # SIFT gives one keypoint per dominant orientation: those of one position do not compete
+                        if found < 0 or abs(xy[j, 0] - xy[found, 0]) + abs(xy[j, 1] - xy[found, 1]) > 2:
+                            second = first
+                        first, found = distance, j
+                    elif distance < second and abs(xy[j, 0] - xy[found, 0]) + abs(xy[j, 1] - xy[found, 1]) > 2:
+                        second = distance
+        if found >= 0 and first < limit and first < ratio * second:
+            best[i] = found
+    return best, back

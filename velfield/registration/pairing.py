@@ -14,8 +14,7 @@ from schemas.arrays import FloatArray, GreyImage, Mask
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import HarrisLens, Lens, pinhole
 from velfield.camera.multiview import FramePairs
-from velfield.registration.keypoints import Keypoints, detect_keypoints
-from velfield.registration.matching import Pairs, match_descriptors
+from velfield.registration.keypoints import Keypoints, Pairs, detect_keypoints, match_descriptors
 
 _MAX_IMAGE_PX = 250_000
 """Images are downscaled to this size: SIFT is fast there and finds enough keypoints."""

@@ -17,10 +17,9 @@ from velfield.analysis.carriageways import find_carriageways
 from velfield.analysis.regions import Regions
 from velfield.analysis.stops import find_stops
 from velfield.analysis.u_turns import find_u_turns
-from velfield.field.bins import stationary_speed_px_per_s
-from velfield.field.segments import Segments
+from velfield.field.segments import Segments, stationary_speed_px_per_s
 from velfield.field.statistics import direction_rad
-from velfield.run.grid import heading_deg, north_direction_rad
+from velfield.run.frame_transforms import heading_deg, north_direction_rad
 
 
 @dataclass(frozen=True)

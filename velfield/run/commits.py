@@ -17,8 +17,7 @@ from pydantic import BaseModel, ValidationError
 
 from schemas.records import FORMAT_VERSION, CommitRecord
 from schemas.renames import upgrade_record
-from velfield.run.layout import RunLayout
-from velfield.run.paths import is_remote
+from velfield.run.layout import RunLayout, is_remote
 
 _WHOLE_FILE_BYTES = 256 * 2**20
 _SAMPLE_BYTES = 2**20

@@ -8,12 +8,12 @@ from schemas.records import FORMAT_VERSION
 from velfield.errors import InputError
 from velfield.field.accumulate import FieldTile
 from velfield.field.algebra import merge_tiles, subtract_tile
-from velfield.field.bins import VelocityBins
+from velfield.field.segments import VelocityBins
 from velfield.run.commits import content_key, digest_file, write_atomically
 from velfield.run.field_reader import TileReader, tile_reader
 from velfield.run.field_writer import GroupWriter, create_field_store, tile_groups
 from velfield.run.flight_record import open_layout, read_flight_record
-from velfield.run.grid import read_grid, read_working
+from velfield.run.frame_transforms import read_grid, read_working
 from velfield.run.layout import RunLayout
 from velfield.run.stores import HISTOGRAM_TIME_WEIGHTED, FieldStore, open_field, store_key
 

@@ -10,10 +10,9 @@ from schemas.arrays import Mask
 from schemas.records import CommitRecord, RebaseRecord
 from velfield.errors import InputError
 from velfield.field.accumulate import accumulate_tile
-from velfield.field.bins import VelocityBins, band_radius_px
-from velfield.field.segments import SEGMENT_DTYPE, Segments, segment_table
+from velfield.field.segments import SEGMENT_DTYPE, Segments, VelocityBins, band_radius_px, segment_table
 from velfield.run.commits import read_commits
-from velfield.run.grid import read_working
+from velfield.run.frame_transforms import read_working
 from velfield.run.run import Run
 
 

@@ -16,8 +16,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from velfield.errors import InputError
-from velfield.run.layout import RunLayout
-from velfield.run.paths import is_remote
+from velfield.run.layout import RunLayout, is_remote
 
 if TYPE_CHECKING:
     from velfield.run.s3 import S3ObjectPath

@@ -13,8 +13,7 @@ from schemas.records import RebaseRecord, ResultRecord, ResultsRecord
 from velfield.errors import InputError
 from velfield.run.commits import commit_path, digest_path, read_commits, valid_commit, write_atomically
 from velfield.run.flight_record import read_flight_record
-from velfield.run.layout import RunLayout
-from velfield.run.paths import remove_tree, rename_tree
+from velfield.run.layout import RunLayout, remove_tree, rename_tree
 from velfield.run.run import Run
 from velfield.run.tables import link_files
 

@@ -17,10 +17,8 @@ from velfield.field.view import VelocityField
 from velfield.run.analysis import RunAnalysis
 from velfield.run.field_reader import IntervalField, open_field_intervals, open_velocity_field
 from velfield.run.flight_record import read_flight_record
-from velfield.run.frame_transforms import FrameTransforms
-from velfield.run.grid import read_base_image, read_grid
-from velfield.run.layout import RunLayout
-from velfield.run.paths import to_path
+from velfield.run.frame_transforms import FrameTransforms, read_base_image, read_grid
+from velfield.run.layout import RunLayout, to_path
 from velfield.run.stores import FrameStore, RegistrationStore, open_field, open_frames, open_registration
 from velfield.run.tables import conform, read_tables
 

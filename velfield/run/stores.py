@@ -23,7 +23,7 @@ from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray
 from schemas.records import FORMAT_VERSION
 from schemas.renames import OLD_ARRAYS, OLD_ATTRIBUTES, OLD_WEIGHTS
 from velfield.errors import InputError
-from velfield.run.paths import is_remote
+from velfield.run.layout import is_remote
 
 _STATUS_BYTES = 160
 _FORMAT_KEY = "format_version"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from schemas.tables import TRACK_COLUMNS
 from velfield.run.commits import write_atomically
-from velfield.run.paths import copy_objects, is_remote
+from velfield.run.layout import copy_objects, is_remote
 
 Patches = dict[str, NDArray[Any]]
 

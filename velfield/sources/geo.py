@@ -15,8 +15,8 @@ from rasterio.warp import Resampling, reproject, transform
 from schemas.arrays import Float32Array, FloatArray, GreyImage, Mask
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
+from velfield.sources.frames import local_path
 from velfield.sources.images import check_size, read_grey_image
-from velfield.sources.paths import local_path
 
 _DRIVERS = ((b"II*\0", "GTiff"), (b"MM\0*", "GTiff"), (b"II+\0", "GTiff"), (b"MM\0+", "GTiff"))
 _PICTURE_DRIVERS = ((b"\x89PNG", "PNG"), (b"\xff\xd8\xff", "JPEG"), (b"BM", "BMP"))

@@ -9,15 +9,13 @@ import numpy as np
 from schemas.arrays import IntArray
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
-from velfield.sources.flags import FrameFlag
-from velfield.sources.folder import iter_folder, list_images, probe_folder
-from velfield.sources.frames import SourceFrame, SourceInfo
-from velfield.sources.paths import local_path
-from velfield.sources.quality import is_black, is_duplicate
+from velfield.sources.frames import SourceFrame, SourceInfo, local_path
+from velfield.sources.images import iter_folder, list_images, probe_folder
+from velfield.sources.quality import FrameFlag, is_black, is_duplicate
 from velfield.sources.selection import select_frames
-from velfield.sources.video.container import open_video, video_stream
 from velfield.sources.video.corruption import libav_log
 from velfield.sources.video.decoding import iter_video
+from velfield.sources.video.packets import open_video, video_stream
 from velfield.sources.video.probe import probe_video
 
 __all__ = ["SourceFrame", "SourceInfo", "check_source", "iter_frames", "probe", "select_frames"]

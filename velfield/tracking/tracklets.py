@@ -17,16 +17,17 @@ from velfield.errors import InputError
 from velfield.tracking.appearance import AppearanceFeatures, appearance_differences, prepare_crops
 from velfield.tracking.association import (
     MAX_COST,
+    FrameTable,
+    LinkedTriples,
     Triples,
     appearance_cost,
     best_triples,
     mutual_best_links,
+    tracklet_table,
     typical_difference,
+    window_frames,
 )
-from velfield.tracking.gates import DetectionStates, LinkPairs, Links, gate_link_pairs, gate_links
-from velfield.tracking.limits import GateLog, Limits
-from velfield.tracking.table import LinkedTriples, tracklet_table
-from velfield.tracking.windows import FrameTable, window_frames
+from velfield.tracking.gates import DetectionStates, GateLog, Limits, LinkPairs, Links, gate_link_pairs, gate_links
 
 __all__ = ["FrameTable", "link_windows", "window_frames"]
 

@@ -19,12 +19,10 @@ from schemas.records import FlightRecord, GridRecord
 from schemas.view import ViewArray, ViewBase, ViewLayer, ViewRecord, ViewSegments
 from velfield.analysis.coverage import low_coverage_note
 from velfield.analysis.crossings import hysteresis_px
-from velfield.field.bins import band_radius_px, stationary_speed_px_per_s
-from velfield.field.segments import Segments
+from velfield.field.segments import Segments, band_radius_px, stationary_speed_px_per_s
 from velfield.run.commits import write_atomically
-from velfield.run.grid import north_direction_rad
-from velfield.run.layout import RunLayout
-from velfield.run.paths import remove_tree
+from velfield.run.frame_transforms import north_direction_rad
+from velfield.run.layout import RunLayout, remove_tree
 from velfield.run.run import open_run
 from velfield.run.stores import HISTOGRAM, FieldStore, open_field, write_extra_layers, write_segments
 from velfield.viewer.layers import view_layers

@@ -10,11 +10,15 @@ import numpy as np
 from schemas.arrays import GreyImage, Mask
 from schemas.detector import CascadeConfig, CascadeRecord
 from velfield.detection.boosting import BoostedStumps
-from velfield.detection.cascade.classifier import PoseScorer, classify_proposals, nms_oriented
+from velfield.detection.cascade.classifier import (
+    PoseScorer,
+    centre_long_vehicles,
+    classify_proposals,
+    nms_oriented,
+    propose_regions,
+)
 from velfield.detection.cascade.feature_image import COARSE, compute_features
 from velfield.detection.cascade.fitting import train_cascade
-from velfield.detection.cascade.long_vehicles import centre_long_vehicles
-from velfield.detection.cascade.proposals import propose_regions
 from velfield.detection.cascade.training import CONTRAST_FLOOR
 from velfield.detection.detector import Detections, Detector
 from velfield.detection.orientation import CAR_ASPECT

@@ -8,8 +8,14 @@ import numpy as np
 from schemas.arrays import ByteArray, Float32Array
 from schemas.detector import Round
 from velfield.detection.boosting import FeaturePool, assign_bins, boost, quantile_bin_edges, rounds_from_stumps
-from velfield.detection.cascade import kernels
-from velfield.detection.cascade.feature_image import FeatureImage, RotatedPatch, pack_poses, signed_grey_areas
+from velfield.detection.cascade.feature_image import (
+    LANES,
+    FeatureImage,
+    RotatedPatch,
+    feature_values_kernel,
+    pack_poses,
+    signed_grey_areas,
+)
 from velfield.detection.cascade.scenes import Poses
 
 _BLOCK = 2048
@@ -82,8 +88,8 @@ def feature_values(image: FeatureImage, poses: Poses, pool: FeaturePool, contras
     """Values (features, poses) of all features of a pool."""
     patch = RotatedPatch.for_offsets(_NO_OFFSET, image.channels, image.scale)
     packed = pack_poses(poses.rows[:, :2], poses.rows[:, 2], image.scale, sizes=poses.sizes, mirrored=poses.mirrored)
-    out = np.empty((len(pool), len(packed), kernels.LANES), np.float32)
-    kernels.feature_values(
+    out = np.empty((len(pool), len(packed), LANES), np.float32)
+    feature_values_kernel(
         image.words,
         image.difference,
         image.stride,

@@ -13,9 +13,14 @@ import numpy as np
 from schemas.arrays import FloatArray, Mask
 from schemas.detector import CascadeConfig, CascadeRecord, PrecisionRecallCurve, Proposer, Round
 from velfield.detection.boosting import BoostedStumps
-from velfield.detection.cascade.classifier import STAGE1_ROUNDS, PoseScorer, classify_proposals, nms_oriented
+from velfield.detection.cascade.classifier import (
+    STAGE1_ROUNDS,
+    PoseScorer,
+    classify_proposals,
+    nms_oriented,
+    propose_regions,
+)
 from velfield.detection.cascade.ensemble import build_ensemble
-from velfield.detection.cascade.proposals import propose_regions
 from velfield.detection.cascade.scenes import TrainingScene, is_background, make_scene, restrict_scene
 from velfield.detection.cascade.training import CONTRAST_FLOOR, train_classifier, train_proposer
 from velfield.detection.evaluation import (

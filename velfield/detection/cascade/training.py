@@ -14,10 +14,15 @@ import numpy as np
 from schemas.arrays import ByteArray, FloatArray, Mask
 from schemas.detector import CascadeTraining, Round
 from velfield.detection.boosting import BoostedStumps, draw_feature_pool
-from velfield.detection.cascade.classifier import PoseScorer, classify_proposals, offset_along_axis, offset_grid
+from velfield.detection.cascade.classifier import (
+    PoseScorer,
+    classify_proposals,
+    offset_along_axis,
+    offset_grid,
+    propose_regions,
+)
 from velfield.detection.cascade.feature_image import COARSE, FINE, PatchScale
 from velfield.detection.cascade.feature_matrix import FeatureBinner, fit_feature_binner
-from velfield.detection.cascade.proposals import propose_regions
 from velfield.detection.cascade.scenes import (
     Poses,
     TrainingScene,

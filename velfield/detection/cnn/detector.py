@@ -9,15 +9,18 @@ import numpy as np
 
 from schemas.arrays import GreyImage, Mask
 from schemas.detector import CascadeConfig, CnnConfig, CnnRecord
-from velfield.detection.cascade.classifier import nms_oriented
+from velfield.detection.cascade.classifier import centre_long_vehicles, nms_oriented
 from velfield.detection.cascade.detector import CascadeDetector
-from velfield.detection.cascade.long_vehicles import centre_long_vehicles
 from velfield.detection.cnn.fine_tuning import fine_tune
-from velfield.detection.cnn.inference import background_difference_at, detect_cars, motion_score_bonus
-from velfield.detection.cnn.model import Network, network_from_record
+from velfield.detection.cnn.model import (
+    Network,
+    background_difference_at,
+    detect_cars,
+    motion_score_bonus,
+    network_from_record,
+)
 from velfield.detection.cnn.self_training import self_train_from_motion
-from velfield.detection.detector import Detections, Detector, train_detector
-from velfield.detection.files import shipped_detector
+from velfield.detection.detector import Detections, Detector, shipped_detector, train_detector
 from velfield.detection.orientation import CAR_ASPECT
 from velfield.detection.samples import LabelledImage
 from velfield.detection.unlabelled import UnlabelledFlight

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from schemas.arrays import FloatArray, GreyImage
 from schemas.detector import CnnConfig, MotionRecord, PrecisionRecallCurve
 from velfield.detection.cnn.fine_tuning import fine_tune_interpolated
-from velfield.detection.cnn.inference import MIN_SCORE, background_difference_at
-from velfield.detection.cnn.model import network_to_record
+from velfield.detection.cnn.model import MIN_SCORE, background_difference_at, network_to_record
 from velfield.detection.detect import detect_frame
 from velfield.detection.evaluation import f_measure_plateau, to_curve_record
 from velfield.detection.motion.difference import MotionFrame

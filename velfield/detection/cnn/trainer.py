@@ -14,13 +14,6 @@ from typing import TypeAlias
 import numpy as np
 
 from schemas.arrays import Float32Array, Mask
-from velfield.detection.cnn.convolution import (
-    PaddedBatchLayout,
-    conv2d,
-    conv2d_backward,
-    depth_to_space,
-    space_to_depth,
-)
 from velfield.detection.cnn.model import (
     CONVOLUTIONS,
     TOPOLOGY,
@@ -28,8 +21,13 @@ from velfield.detection.cnn.model import (
     DepthToSpace,
     Layer,
     Network,
+    PaddedBatchLayout,
     Residual,
     SpaceToDepth,
+    conv2d,
+    conv2d_backward,
+    depth_to_space,
+    space_to_depth,
 )
 from velfield.parallel import parallel_map
 

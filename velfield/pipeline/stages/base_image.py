@@ -7,9 +7,8 @@ pixel. A given image is then first checked against one frame, and the own base i
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from threading import Lock
 
 import cv2
 import numpy as np
@@ -20,53 +19,30 @@ from velfield.camera.lens import Lens, pinhole
 from velfield.errors import Failure, InputError
 from velfield.exports.cog import write_cog
 from velfield.pipeline.plan import Plan
-from velfield.pipeline.progress import advance
-from velfield.pipeline.result import StageResult
+from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.base_fit import BaseFit, check_scale, covered_fraction
-from velfield.pipeline.stages.external_detections import vehicle_free_mask
 from velfield.pipeline.stages.lens import select_usable_frames
+from velfield.pipeline.stages.registration import FrameKeypoints, read_given_base
 from velfield.registration.intersensor import IntersensorResult, register_intersensor
-from velfield.registration.intrasensor import BaseReference, prepare_base, register_frame
-from velfield.registration.keypoints import Keypoints, detect_keypoints
+from velfield.registration.intrasensor import prepare_base, register_frame
+from velfield.registration.keypoints import Keypoints
 from velfield.registration.own_base import OwnBase, build_own_base
 from velfield.report.figures import png_bytes
 from velfield.run.commits import write_atomically
 from velfield.run.frame_transforms import polyprojective_to_record, read_lens
-from velfield.run.grid import read_grid
-from velfield.run.layout import RunLayout
-from velfield.run.paths import local_copy, local_output
+from velfield.run.layout import RunLayout, local_output
 from velfield.run.stores import open_frames
-from velfield.sources.geo import BaseRaster, read_base_raster, reconcile_gsd
-from velfield.sources.images import read_grey_image
+from velfield.sources.geo import BaseRaster, reconcile_gsd
 
 _N_DIRECT_TRIALS = 8
 _MAX_DIRECT_ERROR_PX, _MIN_DIRECT_COVERAGE = 0.5, 0.8
 """Held-out residual and coverage that all sampled frames must reach to be registered directly to the given image."""
 _THREADS = min(4, os.cpu_count() or 1)
-_REFERENCE_LOCK = Lock()
-_references: dict[tuple[str, str], BaseReference] = {}
-
-
-@dataclass(frozen=True)
-class FrameKeypoints:
-    """Keypoints of one frame, raw px."""
-
-    frame: int
-    keypoints: Keypoints
 
 
 def spread_frames(plan: Plan) -> list[int]:
     """Frames sampled over the flight, of which the own base image is built."""
     return select_usable_frames(plan, plan.config.base.median_frames)
-
-
-def detect_unit_keypoints(plan: Plan, frames: Sequence[int]) -> list[FrameKeypoints]:
-    """Detect the keypoints of a block of frames: the expensive part of registration, which runs in parallel."""
-    store, config = open_frames(plan.layout.frames), plan.config.registration
-    return [
-        FrameKeypoints(frame, detect_keypoints(store.read(frame), config, vehicle_free_mask(plan, frame, store.shape)))
-        for frame in frames
-    ]
 
 
 def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageResult:
@@ -78,7 +54,7 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageR
         The given base image does not show this area (with the scores), or too few frames overlap.
     """
     keypoints = {result.frame: result.keypoints for block in blocks for result in block}
-    given = _read_given_base(plan)
+    given = read_given_base(plan)
     lens, store, layout = read_lens(plan.layout), open_frames(plan.layout.frames), plan.layout
     sharpness = store.column("sharpness")
     reference = max(keypoints, key=lambda frame: float(np.nan_to_num(sharpness[frame])))
@@ -139,11 +115,6 @@ def _finish(
     counts |= {"intersensor_error_px": fit.error_px, "scale": fit.scale, "covered": fit.covered}
     given_gsd_m = plan.config.gsd_m if given.gsd_m is None else None
     return StageResult(outputs, counts, [*given.notes, fit.note(given_gsd_m)], fit.warnings())
-
-
-def _read_given_base(plan: Plan) -> BaseRaster | None:
-    path = plan.job.inputs.base
-    return read_base_raster(Path(path), plan.config.frames) if path else None
 
 
 def _check_area(plan: Plan, grey: GreyImage, given: BaseRaster, lens: Lens) -> None:
@@ -251,25 +222,3 @@ def _draw_error_map(result: IntersensorResult) -> GreyImage:
     levels = np.where(np.isfinite(result.error_map), np.clip(result.error_map * 50, 0, 250), 255)
     side = max(1, result.error_map_spacing_px // 4)
     return np.asarray(cv2.resize(levels.astype(np.uint8), None, fx=side, fy=side, interpolation=cv2.INTER_NEAREST))
-
-
-def base_reference(plan: Plan) -> BaseReference:
-    """The base image with its features; the last one is cached, because all units of a run use the same."""
-    with _REFERENCE_LOCK:
-        key = (str(plan.layout.root), plan.keys["base"])
-        if key not in _references:
-            _references.clear()
-            _references[key] = _make_reference(plan)
-        return _references[key]
-
-
-def _make_reference(plan: Plan) -> BaseReference:
-    limit = plan.config.frames.max_pixels
-    shape = open_frames(plan.layout.frames).shape
-    if read_grid(plan.layout).registered_to == "given":
-        given = _read_given_base(plan)
-        assert given is not None, "the grid says that a base image was given"
-        return prepare_base(given.grey, plan.config.registration, mask=given.valid, frame_shape=shape)
-    with local_copy(plan.layout.own_base_image) as image, local_copy(plan.layout.own_base_mask) as valid:
-        grey, mask = read_grey_image(image, limit), read_grey_image(valid, limit) > 0
-    return prepare_base(grey, plan.config.registration, mask=mask, frame_shape=shape)

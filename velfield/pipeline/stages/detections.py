@@ -1,4 +1,7 @@
-"""Stage `detections`: cars of each frame; a table a unit, in base px, and their image patches beside it."""
+"""Stage `detections`: cars of each frame; a table a unit, in base px, and their image patches beside it.
+
+Detections of another program in place of ours (`--detections`): later stages do not know the difference.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,21 +12,58 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from schemas.arrays import GreyImage, Points
+from schemas.arrays import FloatArray, GreyImage, Points
 from schemas.tables import DETECTION_COLUMNS
-from velfield.detection.detect import FrameDetections, detect_frame
-from velfield.detection.detector import Detector
-from velfield.detection.files import load_detector
+from velfield.detection.detect import FrameDetections, attach_crops, detect_frame
+from velfield.detection.detector import Detections, Detector, load_detector
+from velfield.detection.orientation import CAR_ASPECT, axial_difference, fill_missing_orientation
 from velfield.pipeline.plan import Plan
-from velfield.pipeline.progress import advance
-from velfield.pipeline.result import StageResult
-from velfield.pipeline.stages.external_detections import external_detections
+from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.rectified_frames import WorkingFrame, WorkingGrid, read_background
-from velfield.pipeline.stages.registration import usable_frames
+from velfield.pipeline.stages.registration import external_boxes, usable_frames
 from velfield.registration.transforms import FrameMap
-from velfield.run.grid import read_working
+from velfield.run.frame_transforms import read_working
 from velfield.run.stores import open_frames
 from velfield.run.tables import write_patches, write_table
+
+_AXIS_SD_RAD = 0.1
+
+
+def external_detections(plan: Plan, rectified: WorkingFrame, transform: FrameMap, frame: int) -> FrameDetections:
+    """The boxes of a frame, mapped from raw to working px; orientations that they lack are estimated."""
+    table = external_boxes(plan)
+    boxes = table[table["source_index"] == plan.indices[frame]]
+    raw = boxes[["x_px", "y_px"]].to_numpy(np.float64)
+    xy = rectified.to_work(transform.to_base(raw))
+    axis = _axes_to_base(transform, raw, boxes["orientation_rad"].to_numpy(np.float64))
+    unknown = ~np.isfinite(axis)
+    axis[unknown] = _estimate_missing_axes(rectified, xy[unknown], transform, boxes[unknown])
+    length = plan.config.detection.working_car_length_px
+    area = np.full(len(xy), length * length * CAR_ASPECT)
+    score, axis_sd = boxes["score"].to_numpy(np.float64), np.full(len(xy), _AXIS_SD_RAD)
+    cars = np.column_stack([xy, np.mod(axis, np.pi), score, axis_sd])
+    finite = np.isfinite(xy).all(axis=1)
+    return attach_crops(rectified.image, Detections.from_rows(cars[finite], area[finite]))
+
+
+def _estimate_missing_axes(rectified: WorkingFrame, xy: Points, transform: FrameMap, boxes: pd.DataFrame) -> FloatArray:
+    """Axes (n,) of boxes without orientation: from the image, or the nearer of the two that an upright box allows."""
+    unlabelled = np.column_stack([np.nan_to_num(xy), np.full((len(xy), 3), np.nan)])
+    estimated = fill_missing_orientation(rectified.image, unlabelled)[:, 2]
+    raw, angle = boxes[["x_px", "y_px"]].to_numpy(np.float64), boxes["abs_box_angle_rad"].to_numpy(np.float64)
+    positive, negative = (_axes_to_base(transform, raw, sign * angle) for sign in (1, -1))
+    is_positive = axial_difference(positive, estimated) <= axial_difference(negative, estimated)
+    nearer = np.where(is_positive, positive, negative)
+    return np.where(np.isfinite(nearer), nearer, estimated)
+
+
+def _axes_to_base(transform: FrameMap, raw: Points, axis_raw: FloatArray) -> FloatArray:
+    """Axes (n,) at raw positions (n, 2), mapped to base px by a step along them; NaN stays NaN."""
+    step = np.column_stack([np.cos(axis_raw), np.sin(axis_raw)])
+    along = transform.to_base(raw + np.nan_to_num(step)) - transform.to_base(raw)
+    mapped = np.arctan2(along[:, 1], along[:, 0])
+    return np.where(np.isfinite(axis_raw), mapped, np.nan)
+
 
 ID_STEP = 1 << 20
 """Detections of a frame are numbered from ``frame * ID_STEP``: unique, and the same however the flight is cut."""

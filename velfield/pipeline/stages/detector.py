@@ -11,16 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from schemas.records import WorkingRecord
-from velfield.detection.detector import Detector, detector_class, train_detector
-from velfield.detection.files import load_detector, shipped_detector
+from velfield.detection.detector import Detector, detector_class, load_detector, shipped_detector, train_detector
 from velfield.detection.motion.difference import MotionBackground, MotionFrame, motion_background
 from velfield.detection.motion.labels import MotionLabels, choose_frames, labels_from_motion, working_scale
 from velfield.detection.unlabelled import UnlabelledFlight
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
-from velfield.pipeline.progress import advance
-from velfield.pipeline.result import StageResult
-from velfield.pipeline.stages.external_detections import external_boxes
+from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.labels import (
     base_px_per_raw_px,
     check_vehicle_length,
@@ -29,9 +26,9 @@ from velfield.pipeline.stages.labels import (
     median_car_length_raw_px,
 )
 from velfield.pipeline.stages.rectified_frames import WorkingGrid, write_background
-from velfield.pipeline.stages.registration import usable_frames
+from velfield.pipeline.stages.registration import external_boxes, usable_frames
 from velfield.run.commits import write_atomically
-from velfield.run.grid import read_grid
+from velfield.run.frame_transforms import read_grid
 from velfield.run.stores import open_frames
 
 _MIN_FRAMES_WITH_BOXES = 0.5

@@ -10,15 +10,20 @@ import pandas as pd
 from schemas.flight import FieldConfig
 from schemas.tables import TRACKLET_COLUMNS
 from velfield.field.accumulate import Weight, accumulate_tile
-from velfield.field.bins import VelocityBins, band_radius_px
-from velfield.field.segments import SEGMENT_DTYPE, Segments, segment_table, segments_by_tile
+from velfield.field.segments import (
+    SEGMENT_DTYPE,
+    Segments,
+    VelocityBins,
+    band_radius_px,
+    segment_table,
+    segments_by_tile,
+)
 from velfield.field.time_intervals import TimeInterval, assign_intervals
 from velfield.pipeline.plan import Plan
-from velfield.pipeline.progress import advance
-from velfield.pipeline.result import StageResult
+from velfield.pipeline.result import StageResult, advance
 from velfield.run.field_writer import Group, GroupWriter, create_field_store, tile_groups
-from velfield.run.grid import read_grid
-from velfield.run.paths import remove_tree
+from velfield.run.frame_transforms import read_grid
+from velfield.run.layout import remove_tree
 from velfield.run.stores import open_field, store_key
 from velfield.run.tables import read_tables
 

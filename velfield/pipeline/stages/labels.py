@@ -17,9 +17,9 @@ from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.run.frame_transforms import FrameTransforms
 from velfield.run.stores import open_registration
-from velfield.sources.flags import UNUSABLE
 from velfield.sources.frames import SourceInfo
 from velfield.sources.labels.labels import Labels, read_labels
+from velfield.sources.quality import UNUSABLE
 from velfield.sources.source import iter_frames
 
 _MIN_LENGTH_M, _USUAL_LENGTH_M, _MAX_LENGTH_M = 3.3, 4.4, 6.0

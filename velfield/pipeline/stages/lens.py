@@ -8,12 +8,11 @@ from velfield.camera.fusion import refine_lens
 from velfield.camera.lens import lens_from_record, pinhole
 from velfield.camera.plumbline import calibrate
 from velfield.pipeline.plan import Plan
-from velfield.pipeline.progress import advance
-from velfield.pipeline.result import StageResult
+from velfield.pipeline.result import StageResult, advance
 from velfield.registration.pairing import match_frame_pairs
 from velfield.run.commits import write_atomically
 from velfield.run.stores import open_frames
-from velfield.sources.flags import UNUSABLE
+from velfield.sources.quality import UNUSABLE
 
 
 def select_usable_frames(plan: Plan, count: int) -> list[int]:

@@ -8,17 +8,15 @@ from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray
 from velfield.exports.cog import write_cog
-from velfield.field.bins import stationary_speed_px_per_s
+from velfield.field.segments import stationary_speed_px_per_s
 from velfield.field.statistics import direction_rad, speed_px_per_s
 from velfield.pipeline.plan import Plan
-from velfield.pipeline.progress import advance
-from velfield.pipeline.result import StageResult
+from velfield.pipeline.result import StageResult, advance
 from velfield.report.figures import MapScale, direction_figure, png_bytes, speed_figure
 from velfield.report.quality_figures import registration_error_figure, undistortion_figure
 from velfield.run.commits import write_atomically
-from velfield.run.frame_transforms import read_lens
-from velfield.run.grid import heading_deg, north_direction_rad, read_base_image, read_grid
-from velfield.run.paths import local_output
+from velfield.run.frame_transforms import heading_deg, north_direction_rad, read_base_image, read_grid, read_lens
+from velfield.run.layout import local_output
 from velfield.run.stores import open_field, open_frames, open_registration
 from velfield.viewer.record import write_view_data
 

@@ -18,15 +18,13 @@ from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
 from velfield.camera.lens import pinhole
 from velfield.errors import Failure
 from velfield.pipeline.plan import Plan
-from velfield.pipeline.progress import advance
-from velfield.pipeline.result import StageResult
+from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stage import STAGES, NewBase
 from velfield.pipeline.stages.base_image import write_given_image
 from velfield.registration.intersensor import register_intersensor
 from velfield.registration.transforms import PolyprojectiveTransform
 from velfield.run.commits import content_key, digest_path, read_commit, write_atomically
-from velfield.run.frame_transforms import polyprojective_from_record, polyprojective_to_record
-from velfield.run.grid import read_grid, read_working
+from velfield.run.frame_transforms import polyprojective_from_record, polyprojective_to_record, read_grid, read_working
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run
 from velfield.run.tables import link_file, read_tables, write_table, write_tracks

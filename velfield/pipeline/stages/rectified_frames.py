@@ -13,8 +13,7 @@ from velfield.pipeline.plan import Plan
 from velfield.registration.transforms import FrameMap
 from velfield.registration.warp import footprint, warp_to_base
 from velfield.run.commits import write_atomically
-from velfield.run.frame_transforms import FrameTransforms
-from velfield.run.grid import read_grid
+from velfield.run.frame_transforms import FrameTransforms, read_grid
 from velfield.run.layout import RunLayout
 from velfield.run.stores import FrameStore, open_frames
 

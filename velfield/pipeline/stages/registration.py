@@ -1,19 +1,23 @@
 """Stage ``registration``: every frame of a unit to the base image and to the frame before it, in chains."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
 
+import cv2
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from schemas.arrays import Mask
 from velfield.pipeline.plan import Plan
-from velfield.pipeline.progress import advance
-from velfield.pipeline.result import StageResult
-from velfield.pipeline.stages.base_image import FrameKeypoints, base_reference
-from velfield.registration.intrasensor import FrameRegistration, register_chain
-from velfield.registration.keypoints import Keypoints
+from velfield.pipeline.result import StageResult, advance
+from velfield.registration.intrasensor import BaseReference, FrameRegistration, prepare_base, register_chain
+from velfield.registration.keypoints import Keypoints, detect_keypoints
 from velfield.registration.transforms import vector_length
-from velfield.run.frame_transforms import read_lens
+from velfield.run.frame_transforms import read_grid, read_lens
+from velfield.run.layout import local_copy
 from velfield.run.stores import (
     ERROR_CELLS,
     REGISTRATION_COLUMNS,
@@ -23,10 +27,24 @@ from velfield.run.stores import (
     open_registration,
     store_key,
 )
-from velfield.sources.flags import UNUSABLE, describe_flags
+from velfield.sources.geo import BaseRaster, read_base_raster
+from velfield.sources.images import read_grey_image
+from velfield.sources.labels.detections import read_detections
+from velfield.sources.quality import UNUSABLE, describe_flags
 
 MAP_PARAMETERS = 65
 """Approximate number of parameters of a frame's map: its standard error is residual * sqrt(parameters / points)."""
+_REFERENCE_LOCK = Lock()
+_references: dict[tuple[str, str], BaseReference] = {}
+_BOXES: dict[str, pd.DataFrame] = {}
+
+
+@dataclass(frozen=True)
+class FrameKeypoints:
+    """Keypoints of one frame, raw px."""
+
+    frame: int
+    keypoints: Keypoints
 
 
 def create_registration_store(plan: Plan) -> None:
@@ -115,3 +133,67 @@ def lost_frames(plan: Plan) -> tuple[str, ...]:
         for frame, status in enumerate(statuses)
         if status != "ok"
     )
+
+
+def detect_unit_keypoints(plan: Plan, frames: Sequence[int]) -> list[FrameKeypoints]:
+    """Detect the keypoints of a block of frames: the expensive part of registration, which runs in parallel."""
+    store, config = open_frames(plan.layout.frames), plan.config.registration
+    return [
+        FrameKeypoints(frame, detect_keypoints(store.read(frame), config, vehicle_free_mask(plan, frame, store.shape)))
+        for frame in frames
+    ]
+
+
+def external_boxes(plan: Plan) -> pd.DataFrame:
+    """The boxes of the whole flight, read once a process."""
+    key = f"{plan.job.inputs.source} {plan.inputs.detections}"
+    if key not in _BOXES:
+        _BOXES.clear()
+        _BOXES[key] = read_detections(Path(str(plan.job.inputs.detections)), plan.info)
+    return _BOXES[key]
+
+
+def vehicle_free_mask(plan: Plan, frame: int, shape: tuple[int, int]) -> Mask | None:
+    """Where a raw frame (h, w) shows no vehicle by the given boxes: key points are detected there only.
+
+    None without given boxes. Boxes without a size mask nothing; key points on these vehicles are outliers of the fit.
+    """
+    if plan.job.inputs.detections is None:
+        return None
+    table = external_boxes(plan)
+    sized = table[table["source_index"] == plan.indices[frame]].dropna(subset=["length_px", "width_px"])
+    degrees = np.degrees(sized["orientation_rad"].fillna(sized["abs_box_angle_rad"]).fillna(0.0))
+    boxes = np.column_stack([sized[["x_px", "y_px", "length_px", "width_px"]], degrees])
+    mirrored = boxes[sized["orientation_rad"].isna()] * [1, 1, 1, 1, -1]  # an upright box leaves the sign open
+    free = np.ones(shape, np.uint8)
+    for x, y, length, width, angle in np.concatenate([boxes, mirrored]):
+        corners = cv2.boxPoints(((x, y), (length, width), angle))
+        cv2.fillPoly(free, [np.rint(corners).astype(np.int32)], (0,))
+    return free.astype(np.bool_)
+
+
+def base_reference(plan: Plan) -> BaseReference:
+    """The base image with its features; the last one is cached, because all units of a run use the same."""
+    with _REFERENCE_LOCK:
+        key = (str(plan.layout.root), plan.keys["base"])
+        if key not in _references:
+            _references.clear()
+            _references[key] = _make_reference(plan)
+        return _references[key]
+
+
+def _make_reference(plan: Plan) -> BaseReference:
+    limit = plan.config.frames.max_pixels
+    shape = open_frames(plan.layout.frames).shape
+    if read_grid(plan.layout).registered_to == "given":
+        given = read_given_base(plan)
+        assert given is not None, "the grid says that a base image was given"
+        return prepare_base(given.grey, plan.config.registration, mask=given.valid, frame_shape=shape)
+    with local_copy(plan.layout.own_base_image) as image, local_copy(plan.layout.own_base_mask) as valid:
+        grey, mask = read_grey_image(image, limit), read_grey_image(valid, limit) > 0
+    return prepare_base(grey, plan.config.registration, mask=mask, frame_shape=shape)
+
+
+def read_given_base(plan: Plan) -> BaseRaster | None:
+    path = plan.job.inputs.base
+    return read_base_raster(Path(path), plan.config.frames) if path else None

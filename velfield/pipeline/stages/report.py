@@ -12,13 +12,13 @@ import numpy as np
 from schemas.report import PrecisionRecall, Report, ReportStage, ResidualSeries
 from schemas.summary import RunSummary, StageSummary
 from velfield.analysis.coverage import low_coverage_note, percent
-from velfield.detection.files import load_detector
+from velfield.detection.detector import load_detector
 from velfield.pipeline.plan import Plan
 from velfield.report.report import render_report
 from velfield.report.run_figures import report_figures
 from velfield.report.viewer_page import NOT_BUILT, licences, page_is_built, render_viewer
 from velfield.run.commits import code_version, write_atomically
-from velfield.run.grid import north_direction_rad, read_grid, read_working
+from velfield.run.frame_transforms import north_direction_rad, read_grid, read_working
 from velfield.run.stores import open_frames, open_registration
 from velfield.viewer.record import write_view_record
 

@@ -8,9 +8,8 @@ import numpy as np
 import pandas as pd
 
 from velfield.errors import InputError
-from velfield.sources.frames import SourceInfo
+from velfield.sources.frames import SourceInfo, local_path
 from velfield.sources.labels.yolo import looks_like_yolo, read_yolo
-from velfield.sources.paths import local_path
 from velfield.sources.table import finite_cell, read_csv_rows
 
 RAW_DETECTION_COLUMNS: dict[str, str] = {

@@ -9,10 +9,9 @@ import pandas as pd
 
 from schemas.tables import LABEL_COLUMNS
 from velfield.errors import InputError
-from velfield.sources.frames import SourceInfo
+from velfield.sources.frames import SourceInfo, local_path
 from velfield.sources.labels.annotations import is_annotation_file, read_annotations
 from velfield.sources.labels.yolo import Box, looks_like_yolo, read_yolo
-from velfield.sources.paths import local_path
 from velfield.sources.table import finite_cell, read_csv_rows
 
 FORMATS = (

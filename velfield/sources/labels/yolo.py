@@ -9,8 +9,8 @@ from typing import NamedTuple
 import yaml
 
 from velfield.errors import InputError
-from velfield.sources.folder import natural_key
 from velfield.sources.frames import SourceInfo
+from velfield.sources.images import natural_key
 from velfield.sources.table import read_text
 
 CAR_ASPECT = 0.45

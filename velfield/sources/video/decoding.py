@@ -13,11 +13,10 @@ import numpy as np
 
 from schemas.arrays import GreyImage, IntArray
 from velfield.errors import InputError
-from velfield.sources.flags import FrameFlag
 from velfield.sources.frames import SourceFrame, SourceInfo, unreadable_frame
-from velfield.sources.video.block_artifacts import BlockArtifactDetector
-from velfield.sources.video.container import iter_packets, open_video, video_stream
-from velfield.sources.video.corruption import CorruptionTracker, capture_errors, libav_log
+from velfield.sources.quality import FrameFlag
+from velfield.sources.video.corruption import BlockArtifactDetector, CorruptionTracker, capture_errors, libav_log
+from velfield.sources.video.packets import iter_packets, open_video, video_stream
 
 _LUMA_FIRST = {"gray", "yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "nv21"}
 _FULL_RANGE = 2  # AVCOL_RANGE_JPEG

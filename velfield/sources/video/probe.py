@@ -17,9 +17,8 @@ from velfield.errors import InputError
 from velfield.sources.frames import SourceInfo
 from velfield.sources.images import check_size
 from velfield.sources.timestamps import check_against_container, read_timestamps
-from velfield.sources.video.container import open_video, video_stream
 from velfield.sources.video.corruption import libav_log
-from velfield.sources.video.packets import closed_key_frames, demux, drop_timestamp_outliers
+from velfield.sources.video.packets import closed_key_frames, demux, drop_timestamp_outliers, open_video, video_stream
 
 
 def probe_video(path: Path, *, frames: FramesConfig, timestamps: Path | None) -> SourceInfo:
