@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from velfield.registration import kernels, mesh
-from velfield.registration.joint import assign_folds
+from velfield.registration.joint import FOLDS, assign_folds
 from velfield.registration.mesh import fit_mesh
 
 WIDTH, HEIGHT, CELL = 640, 480, 80
@@ -20,20 +20,44 @@ def ramp(xy: np.ndarray) -> np.ndarray:
     return np.stack([0.004 * xy[:, 0] - 1.0, 0.5 - 0.003 * xy[:, 1]], axis=1)
 
 
-def test_the_basis_interpolates_as_the_kernel_does() -> None:
+def test_the_weights_interpolate_as_the_kernel_does() -> None:
     xy, nodes = points(0, 300), np.random.default_rng(1).normal(size=(6, 8, 2))
-    basis = mesh._bilinear_basis(xy, 6, 8, CELL)
-    np.testing.assert_allclose(basis.sum(axis=1), 1.0)
-    assert ((basis > 0).sum(axis=1) <= 4).all()
-    np.testing.assert_allclose(basis @ nodes.reshape(-1, 2), kernels.mesh_displacement(xy, nodes, CELL), atol=1e-12)
+    of, shares = mesh.bilinear_weights(xy, 6, 8, CELL)
+    np.testing.assert_allclose(shares.sum(axis=1), 1.0)
+    found = mesh.interpolate_mesh(of, shares, nodes.reshape(1, -1, 2), np.zeros(300, np.int64))
+    np.testing.assert_allclose(found, kernels.mesh_displacement(xy, nodes, CELL), atol=1e-12)
+
+
+def dense(bands: np.ndarray) -> np.ndarray:
+    """A symmetric matrix from its lower bands."""
+    out = np.zeros((bands.shape[1],) * 2)
+    for k, band in enumerate(bands):
+        out += np.diag(band[: len(out) - k], -k) + (np.diag(band[: len(out) - k], k) if k else 0)
+    return out
 
 
 def test_the_penalty_is_the_sum_of_squared_differences_of_neighbours() -> None:
     nodes = np.random.default_rng(2).normal(size=(4, 5))
     expected = (np.diff(nodes, axis=0) ** 2).sum() + (np.diff(nodes, axis=1) ** 2).sum() + 0.05 * (nodes**2).sum()
-    matrix = mesh._smoothness_matrix(4, 5)
-    assert nodes.ravel() @ matrix @ nodes.ravel() == pytest.approx(expected)
-    np.testing.assert_array_equal(matrix, matrix.T)
+    assert nodes.ravel() @ dense(mesh.smoothness_bands(4, 5)) @ nodes.ravel() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_bands_hold_the_normal_equations_of_each_fold(seed: int) -> None:
+    """Against the plain reference: the matrix of all weights, its dense product, numpy's own solution."""
+    rng, xy = np.random.default_rng(seed), points(seed, 400)
+    weights, residuals, fold = rng.uniform(0, 2, 400), rng.normal(size=(400, 2)), assign_folds(xy)
+    of, shares = mesh.bilinear_weights(xy, 6, 8, CELL)
+    bands, right = mesh.accumulate_bands(of, shares, weights, residuals, fold, FOLDS, 48, 10)
+    basis = np.zeros((400, 48))
+    np.add.at(basis, (np.arange(400)[:, None], of), shares)
+    for k in range(FOLDS):
+        part = basis[fold == k]
+        np.testing.assert_allclose(dense(bands[k]), part.T @ (part * weights[fold == k, None]), atol=1e-12)
+        np.testing.assert_allclose(right[k], part.T @ (weights[:, None] * residuals)[fold == k], atol=1e-12)
+    matrix = bands.sum(axis=0) + mesh.smoothness_bands(6, 8)
+    expected = np.linalg.solve(dense(matrix), right.sum(axis=0))
+    np.testing.assert_allclose(mesh._solve(matrix, right.sum(axis=0)), expected, atol=1e-11)
 
 
 def test_a_smooth_displacement_is_recovered_where_there_are_points() -> None:
