@@ -1,8 +1,9 @@
 """Car detectors: for each method its section of the configuration, and its detector file.
 
 Both are tagged unions, discriminated by ``method``: a key that the chosen method never reads is refused. Another
-detector needs its two models here and a package ``velfield/detection/<method>``, nothing else. A detector file is JSON
-with a schema, never pickle; it holds numbers only, no image that the detector was trained on.
+detector needs its two models here, added to the unions ``DetectionConfig`` (with its ``Tag``) and ``DetectorRecord``,
+and a package ``velfield/detection/<method>``. A detector file is JSON with a schema, never pickle; it holds numbers
+only, no image that the detector was trained on.
 """
 
 from base64 import b64decode
@@ -244,10 +245,23 @@ class CnnRecord(BaseRecord):
     """A trained convolutional network."""
 
     method: Literal["cnn"] = "cnn"
-    layers: dict[str, LayerRecord] = Field(max_length=100)
-    """By name."""
+    onnx: str | None = Field(default=None, max_length=8_000_000)
+    """The network as an ONNX model, base64; none in a file that was of format version 1."""
+    layers: dict[str, LayerRecord] | None = Field(default=None, max_length=100)
+    """The network of a file that was of format version 1."""
     motion: MotionRecord | None = None
     """The bonus of moving objects; none: it reads no background."""
+
+    @model_validator(mode="after")
+    def _has_a_network(self) -> Self:
+        if (self.onnx is None) == (self.layers is None):
+            raise ValueError("found a record with both onnx and layers, or with neither; one holds the network")
+        if self.onnx is not None:
+            try:
+                b64decode(self.onnx, validate=True)
+            except ValueError:
+                raise ValueError("the network is not base64") from None
+        return self
 
 
 class CascadeRecord(BaseRecord):

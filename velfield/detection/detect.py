@@ -1,6 +1,7 @@
-"""Cars of one frame on the working grid, with the image patches that tracking compares.
+"""The cars of one frame: runs a detector (`detect_frame`) and attaches crops of each car for tracking (`attach_crops`).
 
-Image patches of the cars: rotated to the axis to compare their appearance, upright to align them.
+The image is on the working grid: the base image's grid, scaled so that a car is ``working_car_length_px`` long. The
+crops are patches rotated to the axis, to compare appearance, and upright chips, to align.
 """
 
 from dataclasses import dataclass

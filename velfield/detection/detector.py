@@ -2,36 +2,41 @@
 
 A detector is trained on labelled images (`Detector.train`), or on a flight without any (`Detector.train_from_motion`),
 detects cars on images in base orientation, rescaled to a car's usual length (`Detector.detect`), and is a record that
-goes into a JSON file and comes back (`Detector.save`, `load_detector`). Another one is a package
-``velfield/detection/<method>`` whose module ``detector`` names its class ``DETECTOR``, and its configuration and record
-in `schemas.detector`.
+goes into a JSON file (`Detector.save`) and comes back, from this and the last format version (`load_detector`); one
+ships (`shipped_detector`).
 
-Detector files: read, of this and the last format version, and the one that ships.
+Another one is a package ``velfield/detection/<method>`` whose module ``detector`` names its class ``DETECTOR``, and in
+`schemas.detector` its configuration and its record, added to the unions ``DetectionConfig`` (with its ``Tag``) and
+``DetectorRecord``.
 """
 
+import json
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
+from pydantic import TypeAdapter, ValidationError
+
 from schemas.arrays import FloatArray, GreyImage, Mask
-from schemas.detector import METHODS, BaseRecord, DetectorConfig, PrecisionRecallCurve
-from velfield.errors import InputError
+from schemas.detector import (
+    DETECTOR_VERSION,
+    METHODS,
+    BaseRecord,
+    DetectorConfig,
+    DetectorRecord,
+    PrecisionRecallCurve,
+)
+from schemas.renames import OLD_NAMES_UNTIL, upgrade_detector
+from velfield.errors import InputError, OldNameWarning
 
 if TYPE_CHECKING:
     from velfield.detection.samples import LabelledImage
     from velfield.detection.unlabelled import UnlabelledFlight
-import json
-import warnings
-from importlib.resources import files
-
-from pydantic import TypeAdapter, ValidationError
-
-from schemas.detector import DETECTOR_VERSION, DetectorRecord
-from schemas.renames import OLD_NAMES_UNTIL, upgrade_detector
-from velfield.errors import OldNameWarning
 
 MIN_CARS = 8
 """Fewer labelled cars than this do not train a detector."""
@@ -159,7 +164,10 @@ _CLASSES: dict[str, type[Detector]] = {}
 
 
 def register(detector: type[Detector]) -> None:
-    """Let a class be known by its method, besides those that lie in ``velfield/detection/<method>``."""
+    """Let a class be known by its method, besides those that lie in ``velfield/detection/<method>``.
+
+    This alone does not make a method configurable: ``detection.method`` takes those of the union ``DetectionConfig``.
+    """
     _CLASSES[detector.method] = detector
 
 

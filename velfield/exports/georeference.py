@@ -69,7 +69,7 @@ class Georeference:
     def to_metres(self, xy_px: Points) -> Points:
         """(n, 2) base pixels to (n, 2) metres east and north of the base image's lower left corner.
 
-        Without a reference system "north" is the image's up.
+        Without a reference system "north" is the image's top.
 
         Raises
         ------
@@ -84,7 +84,7 @@ class Georeference:
         return np.column_stack([xy_px[:, 0] + 0.5, rows - 0.5 - xy_px[:, 1]]) * self.gsd_m
 
     def heading_deg(self, xy_px: Points, velocity_px_per_s: Points) -> FloatArray:
-        """Direction of travel, degrees clockwise from north; from the image's up where there is no reference system.
+        """Direction of travel, degrees clockwise from north; from the image's top where there is no reference system.
 
         Examples
         --------

@@ -35,7 +35,7 @@ def sumo_fcd(tracklets: pd.DataFrame, georeference: Georeference, *, vehicle_typ
     Returns
     -------
     XML text. ``time`` in s from the first tracked frame, ``speed`` m/s, ``angle`` degrees clockwise from north;
-    from the image's up where the base image has no reference system.
+    from the image's top where the base image has no reference system.
 
     Raises
     ------

@@ -5,9 +5,12 @@ Paper: intra-sensor registration. For each frame, in time order:
 1. a prior homography from the base image (SIFT keypoints, ratio test, MAGSAC), which needs no other frame; if it fails,
    from the keypoints of the previous registered frame, mapped through its transform;
 2. guided matching of the keypoints in a window about the prior, to the base image and to the previous frame;
-3. the joint robust fit of polyprojective and row spline (or the paper's case deletion, or a homography);
+3. the fit, by ``model``: the joint robust fit of polyprojective and row spline (`velfield.registration.joint`, the
+   default), a homography fitted in the same way, or with ``model="polyprojective"`` the paper's, by case deletion
+   (`velfield.registration.fitting`), after which there is no step 4;
 4. subpixel alignment of patches of the base image through that map, and the fit again, twice;
-5. the displacement mesh, if cross-validation supports one.
+5. the displacement mesh, if cross-validation supports one; its cells are 120 px by default, the paper's 200
+   (``cell_size_px``).
 
 Matches to the previous frame propagate its errors and would let the chain drift: they are used only in those cells of
 the frame where the base image gives no match. Where the base image covers the frame, the result does not depend on
@@ -215,8 +218,8 @@ def register_frame(
         prior.matrix, fit_normalisation(corners), fit_normalisation(prior(corners))
     )
     fitter = _FrameFitter(grey, base, lens, config)
-    if config.model == "polyprojective":  # the paper's, to both alike
-        fitted = fitter.fit_by_case_deletion(from_base.concatenate(from_previous))
+    if config.model == "polyprojective":  # the paper matches base and previous frame alike
+        fitted = fitter.fit_with_case_deletion(from_base.concatenate(from_previous))
     else:
         fitted = fitter.fit_with_alignment(
             from_base.concatenate(_select_in_empty_cells(from_previous, from_base, width, height)), start
@@ -331,7 +334,7 @@ class _FrameFitter:
             fit = refit
         return used, fit
 
-    def fit_by_case_deletion(self, points: ControlPoints) -> tuple[ControlPoints, JointFit] | Failure:
+    def fit_with_case_deletion(self, points: ControlPoints) -> tuple[ControlPoints, JointFit] | Failure:
         """The paper's fit: polyprojective by case deletion on matched keypoints."""
         config = self.config
         source = as_points(self.lens.undistort_points(points.xy_raw))

@@ -1,8 +1,9 @@
 """Joint robust fit of polyprojective and row spline by iteratively reweighted least squares (IRLS).
 
-Case deletion drops the rows that a rolling shutter displaces before the spline can model them. Here every control
-point keeps a Geman-McClure weight of its residual, re-estimated after every Gauss-Newton step, with the scale from the
-median residual and the weight function narrowed step by step (annealing).
+The default of a frame's registration (``model="row_spline"``); the paper's fit, case deletion, is in
+`velfield.registration.fitting`. Case deletion drops the rows that a rolling shutter displaces before the spline can
+model them. Here every control point keeps a Geman-McClure weight of its residual, re-estimated after every Gauss-Newton
+step, with the scale from the median residual and the weight function narrowed step by step (annealing).
 
 The spline's smoothness penalty ("stiffness") is selected by spatial cross-validation: the normal equations are
 accumulated per fold, so the cross-validated squares of every candidate follow from small matrices alone. The same folds

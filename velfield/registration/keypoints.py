@@ -167,7 +167,13 @@ def _is_plausible(prior: HomographyTransform, xy: FloatArray) -> bool:
 
 
 def match_guided(predicted: FloatArray, descriptors: ByteArray, reference: Keypoints, *, search_px: float) -> Pairs:
-    """Cross-checked matches in a square of side ``search_px`` about the predicted positions (n, 2), base px."""
+    """Cross-checked matches about the predicted positions (n, 2), base px.
+
+    Parameters
+    ----------
+    search_px
+        Side, not radius, of the square about a predicted position in which its match is searched.
+    """
     if not len(predicted) or not len(reference):
         return np.zeros((0, 2), np.int64)
     cell = search_px / 2

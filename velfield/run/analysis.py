@@ -48,7 +48,7 @@ class RunAnalysis:
         """Connected pixels of one direction of travel: `find_carriageways`.
 
         The table has ``speed_p50_px_per_s, speed_p85_px_per_s`` and ``heading_deg``, clockwise from north (from the
-        image's up where north is unknown).
+        image's top where north is unknown).
 
         Parameters
         ----------

@@ -74,7 +74,7 @@ def north_direction_rad(grid: GridRecord) -> float | None:
 
 
 def heading_deg(direction_rad: FloatArray, north_rad: float | None) -> FloatArray:
-    """Compass heading of directions of motion in [0, 360), clockwise from north; from the image's up if None.
+    """Compass heading of directions of motion in [0, 360), clockwise from north; from the image's top if None.
 
     Examples
     --------

@@ -58,7 +58,7 @@ def _layers(plan: Plan, direction: FloatArray, speed: FloatArray) -> list[Path]:
     north = north_direction_rad(grid)
     heading = heading_deg(direction, north)
     unit, factor = ("m s-1", grid.gsd_m) if grid.gsd_m else ("px s-1", 1.0)
-    about = "heading, clockwise from north" if north is not None else "heading, clockwise from the image's up"
+    about = "heading, clockwise from north" if north is not None else "heading, clockwise from the image's top"
     for name, values, label, units in (
         ("direction", heading, about, "degree"),
         ("speed", speed * factor, "modal speed", unit),
