@@ -56,39 +56,58 @@ def test_positions_and_orientations_are_decoded_from_a_heatmap(monkeypatch: pyte
     centres = np.array([[20.3, 30.9], [60.0, 22.2], [40.7, 70.1], [75.4, 60.6]])
     angles = np.array([0.2, 1.1, 2.0, 2.9])
     heatmap, orientation, _ = encode_targets(centres, angles)
-    logit = 1.2
+    heatmap *= np.float32(0.45)  # unsure: looked at again
+    probability = 0.77
 
-    def predict_crops(_: Network, crops: Float32Array) -> Float32Array:
-        out = np.zeros((len(crops), 22, 22, 3), np.float32)
-        out[..., 0] = logit
+    def predict_crops(_: Network, crops: GreyImage) -> tuple[Float32Array, Float32Array]:
         relative = np.tile([0.0, -np.pi / 2], len(crops) // 2)  # along the axis, and across it
-        out[..., 1], out[..., 2] = (f(2 * relative)[:, None, None] for f in (np.cos, np.sin))
-        return out
+        vectors = np.stack([np.cos(2 * relative), np.sin(2 * relative)], axis=1)[..., None, None]
+        return np.full((len(crops), 24, 24), probability, np.float32), np.tile(vectors, (24, 24)).astype(np.float32)
 
-    monkeypatch.setattr(model, "predict_heatmap", lambda network, image: (heatmap, orientation))
+    monkeypatch.setattr(model, "predict_heatmap", lambda network, image: (heatmap, orientation.transpose(2, 0, 1)))
     monkeypatch.setattr(model, "forward", predict_crops)
     found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None)
     assert len(found) == 4
     distance, difference = nearest(found, np.column_stack([centres, angles]))
     assert distance.max() < 0.15
     assert difference.max() < 1e-3
-    np.testing.assert_allclose(found[:, 3], 1 / (1 + np.exp(-logit)) - SCORE_OFFSET, atol=1e-6)
+    np.testing.assert_allclose(found[:, 3], probability - SCORE_OFFSET, atol=1e-6)
     assert (found[:, 4] < 0.05).all()  # both crops agree on the orientation
 
 
 def test_crops_that_disagree_on_the_orientation_make_it_uncertain(monkeypatch: pytest.MonkeyPatch) -> None:
     heatmap, orientation, _ = encode_targets(np.array([[40.5, 40.5]]), np.array([0.5]))
 
-    def predict_crops(_: Network, crops: Float32Array) -> Float32Array:
-        out = np.zeros((len(crops), 22, 22, 3), np.float32)
-        out[..., 1] = 1  # each along its own crop: across each other
-        return out
+    heatmap *= np.float32(0.45)
 
-    monkeypatch.setattr(model, "predict_heatmap", lambda network, image: (heatmap, orientation))
+    def predict_crops(_: Network, crops: GreyImage) -> tuple[Float32Array, Float32Array]:
+        vectors = np.zeros((len(crops), 2, 24, 24), np.float32)
+        vectors[:, 0] = 1  # each along its own crop: across each other
+        return np.full((len(crops), 24, 24), 0.5, np.float32), vectors
+
+    monkeypatch.setattr(model, "predict_heatmap", lambda network, image: (heatmap, orientation.transpose(2, 0, 1)))
     monkeypatch.setattr(model, "forward", predict_crops)
     found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None)
     assert found.shape == (1, 5)
     assert found[0, 4] > np.radians(45)
+
+
+@pytest.mark.parametrize(("factor", "looks"), [(1.0, 0), (0.45, 2), (0.24, 0)])
+def test_only_unsure_candidates_are_looked_at_again(monkeypatch: pytest.MonkeyPatch, factor: float, looks: int) -> None:
+    heatmap, orientation, _ = encode_targets(np.array([[40.5, 40.5]]), np.array([0.5]))
+    heatmap *= np.float32(factor)
+    seen = []
+
+    def predict_crops(_: Network, crops: GreyImage) -> tuple[Float32Array, Float32Array]:
+        seen.append(len(crops))
+        return np.full((len(crops), 24, 24), 0.9, np.float32), np.ones((len(crops), 2, 24, 24), np.float32)
+
+    monkeypatch.setattr(model, "predict_heatmap", lambda network, image: (heatmap, orientation.transpose(2, 0, 1)))
+    monkeypatch.setattr(model, "forward", predict_crops)
+    found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None)
+    assert sum(seen) == looks
+    if not looks:
+        assert all(axial_difference(found[:, 2], np.full(len(found), 0.5)) < 0.02)
 
 
 def test_an_image_without_peaks_has_no_detections() -> None:

@@ -1,30 +1,38 @@
 """Layers of the network on packed matrices: against scipy, as adjoints, and the network written out by hand."""
 
+import pickle
+
 import numpy as np
+import onnx
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import correlate
 
-from schemas.arrays import Float32Array, FloatArray
-from velfield.detection.cnn import model
+from schemas.arrays import Float32Array, FloatArray, GreyImage
+from velfield.detection.cnn import layers
+from velfield.detection.cnn.layers import PaddedBatchLayout, conv2d, conv2d_backward, depth_to_space, space_to_depth
 from velfield.detection.cnn.model import (
-    CONVOLUTIONS,
+    HALO_PX,
     STRIDE,
+    TOPOLOGIES,
     TOPOLOGY,
     Conv,
     DepthToSpace,
     Network,
-    PaddedBatchLayout,
     Residual,
     SpaceToDepth,
-    conv2d,
-    conv2d_backward,
-    depth_to_space,
+    Topology,
+    convolutions,
     forward,
+    network_from_onnx,
+    network_to_onnx,
+    onnx_kernel,
     predict_heatmap,
-    space_to_depth,
+    weights_from_onnx,
 )
+from velfield.detection.cnn.trainer import Trainer
+from velfield.errors import InputError
 
 SIZES = st.integers(1, 9)
 CHANNELS = st.integers(1, 4)
@@ -34,14 +42,18 @@ def normal(*shape: int, seed: int = 0) -> Float32Array:
     return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
 
 
-def random_network(seed: int = 0) -> Network:
-    """Random weights that keep the size of the activations."""
-    rng = np.random.default_rng(seed)
-    scales = {name: np.sqrt(2 / (conv.shape[0] * conv.channels_in)) for name, conv in CONVOLUTIONS.items()}
-    return Network(
-        {name: rng.normal(0, scales[name], conv.shape).astype(np.float32) for name, conv in CONVOLUTIONS.items()},
-        {name: rng.normal(0, 0.1, conv.channels_out).astype(np.float32) for name, conv in CONVOLUTIONS.items()},
-    )
+def random_network(seed: int = 0, topology: Topology = TOPOLOGY) -> Network:
+    """Random weights that keep the size of the activations, exact at half precision."""
+    rng, weights, biases = np.random.default_rng(seed), {}, {}
+    for name, conv in convolutions(topology).items():
+        scale = np.sqrt(2 / (conv.shape[0] * conv.channels_in))
+        weights[name] = rng.normal(0, scale, conv.shape).astype(np.float16).astype(np.float32)
+        biases[name] = rng.normal(0, 0.1, conv.channels_out).astype(np.float16).astype(np.float32)
+    return Network(weights, biases, topology)
+
+
+def grey(seed: int, *shape: int) -> GreyImage:
+    return np.random.default_rng(seed).integers(0, 256, shape).astype(np.uint8)
 
 
 def scipy_conv(image: FloatArray, weights: FloatArray) -> FloatArray:
@@ -94,7 +106,7 @@ def test_the_size_of_blocks_does_not_matter(monkeypatch: pytest.MonkeyPatch, row
     layout, weights = PaddedBatchLayout(2, 13, 17), normal(9, 3, 4, seed=1)
     values = layout.pack(normal(2, 13, 17, 3))
     expected = conv2d(values, weights, layout)
-    monkeypatch.setattr(model, "_BLOCK_ROWS", rows)
+    monkeypatch.setattr(layers, "_BLOCK_ROWS", rows)
     np.testing.assert_allclose(conv2d(values, weights, layout), expected, atol=1e-5)
 
 
@@ -127,7 +139,8 @@ def test_depth_to_space_inverts_space_to_depth(n: int, half_h: int, half_w: int,
     np.testing.assert_array_equal(layout.interior_view(depth_to_space(deep, layout)), images)
 
 
-def test_channels_and_resolutions_of_the_topology_fit() -> None:
+@pytest.mark.parametrize("topology", TOPOLOGIES)
+def test_channels_and_resolutions_of_the_topology_fit(topology: Topology) -> None:
     def walk(layers: tuple[object, ...], channels: int, stride: float) -> tuple[int, float]:
         for layer in layers:
             if isinstance(layer, Conv):
@@ -142,8 +155,7 @@ def test_channels_and_resolutions_of_the_topology_fit() -> None:
                 assert walk(layer.layers, channels, stride) == (channels, stride)
         return channels, stride
 
-    assert walk(TOPOLOGY, 1, 1) == (3, STRIDE)
-    assert sum(np.prod(conv.shape) + conv.channels_out for conv in CONVOLUTIONS.values()) == 125_683
+    assert walk(topology, 1, 1) == (3, STRIDE)
 
 
 def test_forward_equals_the_network_written_out_with_scipy() -> None:
@@ -168,33 +180,107 @@ def test_forward_equals_the_network_written_out_with_scipy() -> None:
     for k, (row, column) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
         wide[row::2, column::2] = x[..., 32 * k : 32 * (k + 1)]
     expected = conv("head", relu(conv("dec1", relu(wide + skip))))
-    out = forward(network, image.astype(np.float32)[None])
+    out = Trainer.from_network(network).predict(image.astype(np.float32)[None])
     assert out.shape == (1, 8, 10, 3)
     np.testing.assert_allclose(out[0], expected, atol=2e-4)
 
 
+@pytest.mark.parametrize("topology", TOPOLOGIES)
+@pytest.mark.parametrize("shape", [(1, 64, 96), (3, 48, 48)])
+def test_onnxruntime_equals_the_numpy_reference(topology: Topology, shape: tuple[int, int, int]) -> None:
+    network, images = random_network(1, topology), grey(2, *shape)
+    expected = Trainer.from_network(network).predict(images.astype(np.float32) / 255)
+    probability, orientation = forward(network, images)
+    np.testing.assert_allclose(probability, 1 / (1 + np.exp(-expected[..., 0])), atol=2e-5)
+    np.testing.assert_allclose(orientation, expected[..., 1:].transpose(0, 3, 1, 2), atol=5e-4)
+
+
+@pytest.mark.parametrize("topology", TOPOLOGIES)
+def test_a_network_comes_back_from_onnx_with_the_same_weights(topology: Topology) -> None:
+    network = random_network(3, topology)
+    again = network_from_onnx(network_to_onnx(network))
+    assert again.topology == topology
+    for name in network.weights:
+        np.testing.assert_array_equal(again.weights[name], network.weights[name])
+        np.testing.assert_array_equal(again.biases[name], network.biases[name])
+
+
+@pytest.mark.parametrize(("kernel", "block"), [(1, 1), (3, 1), (1, 2), (3, 2), (1, 4)])
+def test_a_strided_kernel_is_a_convolution_of_blocks(kernel: int, block: int) -> None:
+    """Against scipy: the kernel at every ``block``-th pixel equals the layer after space-to-depth."""
+    weights, image = normal(kernel**2, block**2 * 2, 3, seed=4), normal(8, 12, 2, seed=5)
+    strided = onnx_kernel(weights, kernel, block)
+    assert strided.shape == (3, 2, kernel * block, kernel * block)
+    np.testing.assert_array_equal(weights_from_onnx(strided, kernel, block), weights)
+    pad = block * (kernel // 2)
+    padded = np.pad(image, ((pad, pad), (pad, pad), (0, 0)))
+    found = np.zeros((8 // block, 12 // block, 3))
+    for o in range(3):
+        for c in range(2):
+            found[..., o] += correlate(padded[..., c], strided[o, c], mode="valid", method="direct")[::block, ::block]
+    blocks = image.reshape(8 // block, block, 12 // block, block, 2).transpose(0, 2, 1, 3, 4)
+    expected = scipy_conv(blocks.reshape(8 // block, 12 // block, -1), weights)
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+def test_what_is_no_network_of_ours_is_refused_in_one_line() -> None:
+    for data in (b"", b"not a model", network_to_onnx(random_network())[:5000]):
+        with pytest.raises(InputError, match="train the detector again"):
+            network_from_onnx(data)
+    for change in ("shape", "external", "nan", "name"):
+        model = onnx.ModelProto.FromString(network_to_onnx(random_network()))
+        tensor = next(t for t in model.graph.initializer if t.name == "head.bias")
+        if change == "shape":
+            tensor.dims[0] = 1 << 40
+        elif change == "external":
+            tensor.data_location = onnx.TensorProto.EXTERNAL
+        elif change == "nan":
+            tensor.raw_data = np.full(len(tensor.raw_data) // 2, np.nan, np.float16).tobytes()
+        else:
+            tensor.name = "other"
+        with pytest.raises(InputError, match="train the detector again"):
+            network_from_onnx(bytes(model.SerializeToString()))
+
+
+def test_the_onnx_model_is_valid_and_of_few_operators() -> None:
+    model = onnx.ModelProto.FromString(network_to_onnx(random_network()))
+    onnx.checker.check_model(model, full_check=True)
+    known = {"Cast", "Mul", "Conv", "Relu", "Add", "DepthToSpace", "Slice", "Sigmoid"}
+    assert {node.op_type for node in model.graph.node} == known
+
+
 def test_images_of_a_batch_do_not_touch_each_other() -> None:
-    network, images = random_network(), np.random.default_rng(2).random((3, 12, 16)).astype(np.float32)
+    network, images = random_network(), grey(2, 3, 48, 64)
     batch = forward(network, images)
     for k in range(3):
-        np.testing.assert_allclose(forward(network, images[k : k + 1])[0], batch[k], atol=1e-5)
+        for of_one, of_all in zip(forward(network, images[k : k + 1]), batch, strict=True):
+            np.testing.assert_allclose(of_one[0], of_all[k], atol=1e-5)
 
 
-def test_a_pixel_reaches_no_farther_than_the_halo_of_a_tile() -> None:
-    network, image = random_network(), np.full((1, 128, 128), 0.5, np.float32)
+@pytest.mark.parametrize("topology", TOPOLOGIES)
+def test_a_pixel_reaches_no_farther_than_the_halo_of_a_tile(topology: Topology) -> None:
+    network, image = random_network(0, topology), np.full((1, 256, 256), 128, np.uint8)
     changed = image.copy()
-    changed[0, 64, 64] = 1
-    y, x = np.nonzero((forward(network, changed) != forward(network, image))[0].any(axis=2))
-    distance = np.abs(np.stack([y, x]) * STRIDE + (STRIDE - 1) / 2 - 64).max()
-    assert 20 < distance < 32
+    changed[0, 126:130, 126:130] = 255
+    differs = forward(network, changed)[1][0] != forward(network, image)[1][0]
+    y, x = np.nonzero(differs.any(axis=0))
+    distance = np.abs(np.stack([y, x]) * STRIDE + (STRIDE - 1) / 2 - 127.5).max()
+    assert 20 < distance < HALO_PX
 
 
 @pytest.mark.parametrize("shape", [(150, 90), (64, 64), (65, 3)])
 def test_tiles_do_not_show_in_the_heatmap(monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]) -> None:
-    network, image = random_network(), np.random.default_rng(3).integers(0, 255, shape).astype(np.uint8)
+    network, image = random_network(), grey(3, *shape)
     whole = predict_heatmap(network, image)
     monkeypatch.setattr("velfield.detection.cnn.model._TILE_PX", 64)
     tiled = predict_heatmap(network, image)
     assert tiled[0].shape == (-(-shape[0] // 2), -(-shape[1] // 2))
     np.testing.assert_allclose(tiled[0], whole[0], atol=1e-5)
     np.testing.assert_allclose(tiled[1], whole[1], atol=1e-4)
+
+
+def test_a_network_crosses_processes_without_its_session() -> None:
+    network, image = random_network(), grey(4, 1, 32, 32)
+    expected = forward(network, image)
+    again = pickle.loads(pickle.dumps(network))
+    np.testing.assert_array_equal(forward(again, image)[0], expected[0])

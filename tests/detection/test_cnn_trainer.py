@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.arrays import FloatArray
-from velfield.detection.cnn.model import CONVOLUTIONS, TOPOLOGY, Network, Residual, forward
+from velfield.detection.cnn.model import TOPOLOGY, Network, Residual, convolutions
 from velfield.detection.cnn.trainer import (
     MAX_GRAD_NORM,
     WEIGHT_DECAY,
@@ -137,7 +137,9 @@ def test_gradients_equal_finite_differences(normalised: bool) -> None:
 
 def test_the_forward_pass_of_training_is_that_of_inference() -> None:
     trainer, batch = trained(normalised=False), random_batch(n=1)
-    expected, _ = focal_loss_and_gradient(forward(trainer.network(), batch.images), batch, LossNormaliser.of(batch))
+    expected, _ = focal_loss_and_gradient(
+        Trainer.from_network(trainer.network()).predict(batch.images), batch, LossNormaliser.of(batch)
+    )
     assert trainer.loss_and_gradients(batch)[0] == expected
 
 
@@ -154,7 +156,7 @@ def test_fine_tuning_does_not_depend_on_how_a_batch_is_halved() -> None:
 
 def test_initial_weights_have_the_variance_of_he_and_predict_few_cars() -> None:
     trainer = Trainer.initialise(0)
-    for name, conv in CONVOLUTIONS.items():
+    for name, conv in convolutions(TOPOLOGY).items():
         weights = trainer.parameters[f"{name}.w"]
         assert weights.std() == pytest.approx(np.sqrt(2 / (conv.shape[0] * conv.channels_in)), rel=0.2), name
         assert (f"{name}.g" in trainer.parameters) == conv.relu
@@ -162,7 +164,9 @@ def test_initial_weights_have_the_variance_of_he_and_predict_few_cars() -> None:
     outer = next(layer for layer in TOPOLOGY if isinstance(layer, Residual))
     last = [block.layers[-1].name for block in outer.layers if isinstance(block, Residual)]  # type: ignore[union-attr]
     halved = [
-        name for name in CONVOLUTIONS if f"{name}.g" in trainer.parameters and trainer.parameters[f"{name}.g"][0] < 1
+        name
+        for name in convolutions(TOPOLOGY)
+        if f"{name}.g" in trainer.parameters and trainer.parameters[f"{name}.g"][0] < 1
     ]
     assert halved == last == ["res1_1", "res2_1"]
     np.testing.assert_array_equal(Trainer.initialise(0).parameters["dec1.w"], trainer.parameters["dec1.w"])

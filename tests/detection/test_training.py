@@ -57,7 +57,7 @@ def test_labels_become_a_detector_and_a_contact_sheet(
     detector = load_detector(out)
     assert detector.record.cars == 14
     assert detector.record.method == "cnn"
-    assert detector.record.layers != shipped_detector().record.layers
+    assert detector.record.onnx != shipped_detector().record.onnx
     assert cv2.imread(str(sheet)).shape[1] == 1024
     printed = capsys.readouterr().out
     assert "14 cars, labelled frames: 1, score threshold" in printed

@@ -17,6 +17,7 @@ from velfield.detection.cnn.model import (
     background_difference_at,
     detect_cars,
     motion_score_bonus,
+    network_from_layers,
     network_from_record,
 )
 from velfield.detection.cnn.self_training import self_train_from_motion
@@ -41,7 +42,8 @@ class CnnDetector(Detector):
     @cached_property
     def network(self) -> Network:
         """Its weights."""
-        return network_from_record(self.record.layers)
+        record = self.record
+        return network_from_record(record.onnx) if record.onnx is not None else network_from_layers(record.layers or {})
 
     @property
     def uses_background(self) -> bool:
@@ -58,7 +60,7 @@ class CnnDetector(Detector):
     ) -> Detections:
         """Detect cars: peaks of the heatmap, the motion bonus, non-maximum suppression, long vehicles centred."""
         length_px, motion = self.record.working_car_length_px, self.record.motion
-        rows = detect_cars(self.network, image, valid)
+        rows = detect_cars(self.network, image, valid, self.record.second_look)
         if motion is not None and background is not None:
             difference = background_difference_at(image, background, rows[:, :2], length_px)
             rows[:, 3] += motion_score_bonus(motion, difference)

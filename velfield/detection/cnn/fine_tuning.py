@@ -15,7 +15,7 @@ from schemas.arrays import Float32Array, Mask
 from schemas.detector import CnnConfig, CnnRecord, PrecisionRecallCurve
 from velfield.detection.cascade.classifier import nms_oriented
 from velfield.detection.cnn.dataset import PatchDataset
-from velfield.detection.cnn.model import Network, detect_cars, network_to_record, predict_heatmap
+from velfield.detection.cnn.model import SECOND_LOOK, Network, detect_cars, network_to_record, predict_heatmap
 from velfield.detection.cnn.trainer import Trainer, train
 from velfield.detection.evaluation import (
     FOLDS_DESCRIPTION,
@@ -99,7 +99,8 @@ def fine_tune_interpolated(
         return old + np.float32(fraction) * (new - old)
 
     weights = {name: interpolate(old, after.weights[name]) for name, old in before.weights.items()}
-    return Network(weights, {name: interpolate(old, after.biases[name]) for name, old in before.biases.items()})
+    biases = {name: interpolate(old, after.biases[name]) for name, old in before.biases.items()}
+    return Network(weights, biases, before.topology)
 
 
 def select_threshold(
@@ -118,7 +119,8 @@ def make_record(
     """Content of the detector file."""
     return CnnRecord(
         working_car_length_px=config.working_car_length_px,
-        layers=network_to_record(network),
+        onnx=network_to_record(network),
+        second_look=SECOND_LOOK,
         threshold=float(threshold),
         curve=curve,
         cars=count,

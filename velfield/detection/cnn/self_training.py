@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from schemas.arrays import FloatArray, GreyImage
 from schemas.detector import CnnConfig, MotionRecord, PrecisionRecallCurve
 from velfield.detection.cnn.fine_tuning import fine_tune_interpolated
-from velfield.detection.cnn.model import MIN_SCORE, background_difference_at, network_to_record
+from velfield.detection.cnn.model import EVERY_SECOND_LOOK, MIN_SCORE, background_difference_at, network_to_record
 from velfield.detection.detect import detect_frame
 from velfield.detection.evaluation import f_measure_plateau, to_curve_record
 from velfield.detection.motion.difference import MotionFrame
@@ -72,7 +72,13 @@ def self_train_from_motion(
     """
     longer = config.model_copy(update={"fine_tune_steps": _STEPS_FACTOR * config.fine_tune_steps})
     network = fine_tune_interpolated(samples, pretrained, longer, fraction=_FINE_TUNED_FRACTION)
-    update = {"layers": network_to_record(network), "curve": None, "motion": None}
+    update = {
+        "onnx": network_to_record(network),
+        "layers": None,
+        "second_look": EVERY_SECOND_LOOK,
+        "curve": None,
+        "motion": None,
+    }
     record = pretrained.record.model_copy(update=update)
     length_px = record.working_car_length_px
 

@@ -14,20 +14,17 @@ from typing import TypeAlias
 import numpy as np
 
 from schemas.arrays import Float32Array, Mask
+from velfield.detection.cnn.layers import PaddedBatchLayout, conv2d, conv2d_backward, depth_to_space, space_to_depth
 from velfield.detection.cnn.model import (
-    CONVOLUTIONS,
     TOPOLOGY,
     Conv,
     DepthToSpace,
     Layer,
     Network,
-    PaddedBatchLayout,
     Residual,
     SpaceToDepth,
-    conv2d,
-    conv2d_backward,
-    depth_to_space,
-    space_to_depth,
+    Topology,
+    convolutions,
 )
 from velfield.parallel import parallel_map
 
@@ -101,6 +98,7 @@ class Trainer:
     """
 
     parameters: dict[str, Float32Array]
+    topology: Topology = TOPOLOGY
     means: dict[str, Float32Array] = field(default_factory=dict)
     variances: dict[str, Float32Array] = field(default_factory=dict)
     _moments: dict[str, tuple[Float32Array, Float32Array]] = field(default_factory=dict)
@@ -110,7 +108,7 @@ class Trainer:
     def initialise(cls, seed: int) -> "Trainer":
         """Random weights (He initialisation), for training from scratch."""
         rng, parameters = np.random.default_rng(seed), {}
-        for name, conv in CONVOLUTIONS.items():
+        for name, conv in convolutions(TOPOLOGY).items():
             taps, channels_in, channels_out = conv.shape
             weights = rng.normal(0, np.sqrt(2 / (taps * channels_in)), conv.shape)
             parameters[f"{name}.w"] = weights.astype(np.float32)
@@ -125,24 +123,25 @@ class Trainer:
     @classmethod
     def from_network(cls, network: Network) -> "Trainer":
         """A trained network, for fine-tuning."""
-        parameters = {f"{name}.w": network.weights[name].copy() for name in CONVOLUTIONS}
-        return cls({**parameters, **{f"{name}.b": network.biases[name].copy() for name in CONVOLUTIONS}})
+        parameters = {f"{name}.w": weights.copy() for name, weights in network.weights.items()}
+        parameters |= {f"{name}.b": biases.copy() for name, biases in network.biases.items()}
+        return cls(parameters, network.topology)
 
     @property
     def is_normalised(self) -> bool:
         """Whether any layer is batch-normalised."""
-        return any(f"{name}.g" in self.parameters for name in CONVOLUTIONS)
+        return any(name.endswith(".g") for name in self.parameters)
 
     def network(self) -> Network:
         """The trained network, batch normalisation folded into its weights."""
         weights, biases = {}, {}
-        for name in CONVOLUTIONS:
+        for name in convolutions(self.topology):
             weight, bias = self.parameters[f"{name}.w"], self.parameters[f"{name}.b"]
             if f"{name}.g" in self.parameters:
                 gain = self.parameters[f"{name}.g"] / np.sqrt(self.variances[name] + _MIN_VARIANCE)
                 weight, bias = weight * gain, bias - self.means[name] * gain
             weights[name], biases[name] = weight.astype(np.float32), bias.astype(np.float32)
-        return Network(weights, biases)
+        return Network(weights, biases, self.topology)
 
     def train_step(self, batch: Batch, learning_rate: float) -> float:
         """One step of the optimiser, gradients clipped by their norm; returns the loss before it."""
@@ -166,6 +165,12 @@ class Trainer:
         decayed = value * (1 - learning_rate * WEIGHT_DECAY)
         self.parameters[name] = (decayed - learning_rate * step).astype(np.float32)
 
+    def predict(self, images: Float32Array) -> Float32Array:
+        """Logits and orientation vectors (n, h / 2, w / 2, 3) of images (n, h, w), grey in [0, 1]."""
+        layout = PaddedBatchLayout(*images.shape)
+        out, layout, _ = _Pass(self).forward(self.topology, layout.pack(images[..., None]), layout)
+        return np.ascontiguousarray(layout.interior_view(out))
+
     def loss_and_gradients(self, batch: Batch) -> tuple[float, dict[str, Float32Array]]:
         """Loss, and its gradient by every parameter.
 
@@ -183,7 +188,7 @@ class Trainer:
     def _loss_and_gradients(self, batch: Batch, normaliser: LossNormaliser) -> tuple[float, dict[str, Float32Array]]:
         layout = PaddedBatchLayout(*batch.images.shape)
         differentiable = _Pass(self)
-        out, layout, backward = differentiable.forward(TOPOLOGY, layout.pack(batch.images[..., None]), layout)
+        out, layout, backward = differentiable.forward(self.topology, layout.pack(batch.images[..., None]), layout)
         loss, gradient = focal_loss_and_gradient(layout.interior_view(out), batch, normaliser)
         backward(layout.pack(gradient))
         return loss, differentiable.gradients
