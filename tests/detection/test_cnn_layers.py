@@ -11,7 +11,15 @@ from scipy.signal import correlate
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage
 from velfield.detection.cnn import layers
-from velfield.detection.cnn.layers import PaddedBatchLayout, conv2d, conv2d_backward, depth_to_space, space_to_depth
+from velfield.detection.cnn.layers import (
+    PaddedBatchLayout,
+    conv2d,
+    conv2d_backward,
+    depth_to_space,
+    kernel_off_blocks,
+    kernel_on_blocks,
+    space_to_depth,
+)
 from velfield.detection.cnn.model import (
     HALO_PX,
     STRIDE,
@@ -101,6 +109,25 @@ def test_conv2d_backward_is_adjoint(h: int, w: int, channels_in: int, channels_o
     assert float((by_weights * other_weights).sum()) == pytest.approx(expected, rel=1e-3, abs=1e-2)
 
 
+@settings(max_examples=20, deadline=None)
+@given(SIZES, SIZES, CHANNELS, CHANNELS)
+def test_a_strided_kernel_on_blocks_is_adjoint_to_that_off_them(h: int, w: int, into: int, out: int) -> None:
+    layout, weights = PaddedBatchLayout(1, 2 * h, 2 * w), normal(16, into, out, seed=1)
+    assert kernel_on_blocks(weights).shape == (9, 4 * into, out)
+    np.testing.assert_array_equal(kernel_off_blocks(kernel_on_blocks(weights)), weights)
+    image = normal(2 * h, 2 * w, into, seed=2)
+    found = conv2d(space_to_depth(layout.pack(image[None]), layout), kernel_on_blocks(weights), layout.halved())
+    padded, kernel = np.pad(image, ((1, 1), (1, 1), (0, 0))), weights.reshape(4, 4, into, out)
+    for o in range(out):
+        expected = sum(
+            correlate(padded[..., c], kernel[:, :, c, o], mode="valid", method="direct")[::2, ::2] for c in range(into)
+        )
+        np.testing.assert_allclose(layout.halved().interior_view(found)[0, ..., o], expected, atol=1e-4)
+    gradient = normal(9, 4 * into, out, seed=3)
+    both = float((kernel_on_blocks(weights) * gradient).sum()), float((weights * kernel_off_blocks(gradient)).sum())
+    assert both[0] == pytest.approx(both[1], rel=1e-3, abs=1e-3)
+
+
 @pytest.mark.parametrize("rows", [1, 7, 100_000])
 def test_the_size_of_blocks_does_not_matter(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:
     layout, weights = PaddedBatchLayout(2, 13, 17), normal(9, 3, 4, seed=1)
@@ -145,7 +172,7 @@ def test_channels_and_resolutions_of_the_topology_fit(topology: Topology) -> Non
         for layer in layers:
             if isinstance(layer, Conv):
                 assert layer.channels_in == channels, layer.name
-                channels = layer.channels_out
+                channels, stride = layer.channels_out, stride * layer.stride
             elif isinstance(layer, SpaceToDepth):
                 channels, stride = 4 * channels, 2 * stride
             elif isinstance(layer, DepthToSpace):
@@ -159,7 +186,7 @@ def test_channels_and_resolutions_of_the_topology_fit(topology: Topology) -> Non
 
 
 def test_forward_equals_the_network_written_out_with_scipy() -> None:
-    network, image = random_network(), np.random.default_rng(1).random((16, 20))
+    network, image = random_network(), np.random.default_rng(1).random((16, 24))
 
     def conv(name: str, x: FloatArray) -> FloatArray:
         return scipy_conv(x, network.weights[name]) + network.biases[name]
@@ -167,21 +194,33 @@ def test_forward_equals_the_network_written_out_with_scipy() -> None:
     def relu(x: FloatArray) -> FloatArray:
         return np.maximum(x, 0)
 
+    def strided(name: str, x: FloatArray) -> FloatArray:
+        """A 4 x 4 kernel at every second pixel."""
+        weights, padded = network.weights[name], np.pad(x, ((1, 1), (1, 1), (0, 0)))
+        kernel = weights.reshape(4, 4, *weights.shape[1:])
+        out = np.zeros((x.shape[0] // 2, x.shape[1] // 2, kernel.shape[3]))
+        for o in range(kernel.shape[3]):
+            for c in range(kernel.shape[2]):
+                out[..., o] += correlate(padded[..., c], kernel[:, :, c, o], mode="valid", method="direct")[::2, ::2]
+        return out + network.biases[name]
+
     def deep(x: FloatArray) -> FloatArray:
         return np.concatenate([x[0::2, 0::2], x[0::2, 1::2], x[1::2, 0::2], x[1::2, 1::2]], axis=2)
 
-    x = deep(relu(conv("stem", image[..., None])))
-    skip = relu(conv("enc1_1", relu(conv("enc1_0", relu(conv("down1", x))))))
+    def wide(x: FloatArray) -> FloatArray:
+        channels = x.shape[2] // 4
+        out = np.empty((2 * x.shape[0], 2 * x.shape[1], channels))
+        for k, (row, column) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
+            out[row::2, column::2] = x[..., channels * k : channels * (k + 1)]
+        return out
+
+    skip = relu(conv("enc1", relu(strided("down1", relu(strided("stem", image[..., None]))))))
     x = relu(conv("down2", deep(skip)))
     x = x + relu(conv("res1_1", relu(conv("res1_0", x))))
     x = x + relu(conv("res2_1", relu(conv("res2_0", x))))
-    x = conv("up1", x)
-    wide = np.empty((8, 10, 32))
-    for k, (row, column) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
-        wide[row::2, column::2] = x[..., 32 * k : 32 * (k + 1)]
-    expected = conv("head", relu(conv("dec1", relu(wide + skip))))
+    expected = wide(conv("head", relu(conv("dec1", relu(wide(conv("up1", x)) + skip)))))
     out = Trainer.from_network(network).predict(image.astype(np.float32)[None])
-    assert out.shape == (1, 8, 10, 3)
+    assert out.shape == (1, 8, 12, 3)
     np.testing.assert_allclose(out[0], expected, atol=2e-4)
 
 

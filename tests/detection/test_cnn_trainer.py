@@ -160,7 +160,7 @@ def test_initial_weights_have_the_variance_of_he_and_predict_few_cars() -> None:
         weights = trainer.parameters[f"{name}.w"]
         assert weights.std() == pytest.approx(np.sqrt(2 / (conv.shape[0] * conv.channels_in)), rel=0.2), name
         assert (f"{name}.g" in trainer.parameters) == conv.relu
-    assert trainer.parameters["head.b"].tolist() == [-4, 0, 0]
+    assert trainer.parameters["head.b"].tolist() == [-4, 0, 0] * 4  # of the four pixels of a block
     outer = next(layer for layer in TOPOLOGY if isinstance(layer, Residual))
     last = [block.layers[-1].name for block in outer.layers if isinstance(block, Residual)]  # type: ignore[union-attr]
     halved = [

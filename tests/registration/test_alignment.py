@@ -13,7 +13,8 @@ from velfield.registration.alignment import (
     align_patches,
     extract_templates,
     make_templates,
-    smooth_levels,
+    smooth_coarse,
+    smooth_fine,
 )
 from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, fit_normalisation
 
@@ -48,7 +49,7 @@ def errors_px(
 ) -> np.ndarray:
     """Distance (n,), base px, of each aligned patch from the truth, the search starting at ``start``."""
     coarse = bool(options.get("coarse", False))
-    image = smooth_levels(frame)[1 if coarse else 0]
+    image = smooth_coarse(smooth_fine(frame)) if coarse else smooth_fine(frame)
     arguments = {"coarse": coarse, "max_shift_px": 2.5} | options
     aligned, in_frame = align_patches(image, transform(start), make_templates(base), **arguments)  # type: ignore[arg-type]
     assert len(aligned) > 0.5 * in_frame
@@ -84,7 +85,8 @@ def test_gain_offset_and_vignetting_do_not_matter(base: np.ndarray) -> None:
 def test_the_coarse_level_reaches_farther(base: np.ndarray) -> None:
     true, start = shift(0.0, 0.0), shift(3.5, -3.0)
     frame = frame_of(base, true)
-    fine, coarse = smooth_levels(frame)
+    fine = smooth_fine(frame)
+    coarse = smooth_coarse(fine)
     templates = make_templates(base)
     near, in_frame = align_patches(fine, transform(start), templates, coarse=False, max_shift_px=7.0)
     far, _ = align_patches(coarse, transform(start), templates, coarse=True, max_shift_px=7.0)
@@ -96,7 +98,7 @@ def test_the_coarse_level_reaches_farther(base: np.ndarray) -> None:
 def test_shifts_beyond_the_limit_are_rejected(base: np.ndarray) -> None:
     frame = frame_of(base, shift(0.0, 0.0))
     aligned, in_frame = align_patches(
-        smooth_levels(frame)[0], transform(shift(1.5, 0.0)), make_templates(base), coarse=False, max_shift_px=1.0
+        smooth_fine(frame), transform(shift(1.5, 0.0)), make_templates(base), coarse=False, max_shift_px=1.0
     )
     assert in_frame > 100
     moved = np.linalg.norm(transform(shift(1.5, 0.0)).to_base(aligned.xy_raw) - aligned.xy_base, axis=1)
@@ -111,9 +113,7 @@ def test_noise_moves_a_corner_as_far_as_its_sigma_predicts(base: np.ndarray) -> 
     rng, errors = np.random.default_rng(0), []
     for _ in range(8):
         noisy = np.clip(base + rng.normal(0, 3.0, base.shape), 0, 255).astype(np.uint8)
-        aligned, _ = align_patches(
-            smooth_levels(noisy)[0], transform(np.eye(3)), templates, coarse=False, max_shift_px=2.5
-        )
+        aligned, _ = align_patches(smooth_fine(noisy), transform(np.eye(3)), templates, coarse=False, max_shift_px=2.5)
         kept = {(x, y): k for k, (x, y) in enumerate(templates.xy.tolist())}
         sigma = templates.sigma_px[[kept[x, y] for x, y in aligned.xy_base.tolist()]]
         errors.append((aligned.xy_raw - aligned.xy_base) / sigma[:, None])
@@ -126,7 +126,7 @@ def test_patches_outside_the_frame_are_not_counted(base: np.ndarray) -> None:
     frame = frame_of(base, half_outside)
     templates = make_templates(base)
     aligned, in_frame = align_patches(
-        smooth_levels(frame)[0], transform(half_outside), templates, coarse=False, max_shift_px=2.5
+        smooth_fine(frame), transform(half_outside), templates, coarse=False, max_shift_px=2.5
     )
     inside = int((templates.xy[:, 0] > WIDTH / 2).sum())
     assert abs(in_frame - inside) < 0.1 * inside
@@ -136,7 +136,7 @@ def test_patches_outside_the_frame_are_not_counted(base: np.ndarray) -> None:
 def test_a_frame_without_texture_aligns_nothing(base: np.ndarray) -> None:
     flat = np.full(SHAPE, 100, np.uint8)
     aligned, in_frame = align_patches(
-        smooth_levels(flat)[0], transform(np.eye(3)), make_templates(base), coarse=False, max_shift_px=2.5
+        smooth_fine(flat), transform(np.eye(3)), make_templates(base), coarse=False, max_shift_px=2.5
     )
     assert in_frame > 100
     assert len(aligned) == 0
@@ -145,7 +145,7 @@ def test_a_frame_without_texture_aligns_nothing(base: np.ndarray) -> None:
 def test_another_image_aligns_next_to_nothing(base: np.ndarray) -> None:
     other = city(99, 360, blocks=120)[:HEIGHT, :WIDTH].copy()
     aligned, in_frame = align_patches(
-        smooth_levels(other)[0], transform(np.eye(3)), make_templates(base), coarse=False, max_shift_px=2.5
+        smooth_fine(other), transform(np.eye(3)), make_templates(base), coarse=False, max_shift_px=2.5
     )
     assert len(aligned) < 0.1 * in_frame
 
@@ -175,7 +175,8 @@ def test_excluded_positions_have_no_template_near(base: np.ndarray) -> None:
 def test_patches_hold_the_blurred_grey_levels_about_their_corner(base: np.ndarray) -> None:
     xy = np.array([[100.0, 120.0], [60.0, 70.0]])
     templates = extract_templates(base, xy, np.ones(2), half_patch=5)
-    fine, coarse = smooth_levels(base)
+    fine = smooth_fine(base)
+    coarse = smooth_coarse(fine)
     np.testing.assert_array_equal(templates.fine[0].reshape(11, 11), fine[115:126, 95:106])
     np.testing.assert_array_equal(templates.coarse[1].reshape(11, 11), coarse[60:81:2, 50:71:2])
     one = templates.select(np.array([1]))
@@ -186,8 +187,6 @@ def test_patches_hold_the_blurred_grey_levels_about_their_corner(base: np.ndarra
 def test_a_map_without_a_value_is_no_patch_in_the_frame(base: np.ndarray) -> None:
     templates = make_templates(base, count=200)
     nowhere = replace(templates, xy=np.where(np.arange(len(templates))[:, None] < 5, np.nan, templates.xy))
-    _, all_of_them = align_patches(
-        smooth_levels(base)[0], transform(np.eye(3)), templates, coarse=False, max_shift_px=2.5
-    )
-    _, fewer = align_patches(smooth_levels(base)[0], transform(np.eye(3)), nowhere, coarse=False, max_shift_px=2.5)
+    _, all_of_them = align_patches(smooth_fine(base), transform(np.eye(3)), templates, coarse=False, max_shift_px=2.5)
+    _, fewer = align_patches(smooth_fine(base), transform(np.eye(3)), nowhere, coarse=False, max_shift_px=2.5)
     assert fewer == all_of_them - 5

@@ -8,7 +8,7 @@ import pytest
 from schemas.flight import RegistrationConfig
 from schemas.simulation import CameraSimulation, OtherSensorSimulation
 from velfield.camera.lens import HarrisLens
-from velfield.registration.alignment import align_patches, make_templates, smooth_levels
+from velfield.registration.alignment import align_patches, make_templates, smooth_fine
 from velfield.registration.intrasensor import (
     BaseReference,
     FrameRegistration,
@@ -203,7 +203,7 @@ def test_patches_are_found_below_the_pixel(shift_px: float) -> None:
     off = type(transform.polyprojective)(transform.polyprojective.coefficients, transform.polyprojective.source, target)
     moved = type(transform)(width=640, height=480, lens=transform.lens, polyprojective=off)
     points, looked_for = align_patches(
-        smooth_levels(seen("still", 0)[0])[0], moved, templates, coarse=False, max_shift_px=2.5
+        smooth_fine(seen("still", 0)[0]), moved, templates, coarse=False, max_shift_px=2.5
     )
     assert len(points) > 0.7 * looked_for
     miss = make_truth(flight).to_base(0, points.xy_raw) - points.xy_base

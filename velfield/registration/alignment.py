@@ -14,7 +14,7 @@ from numba import njit
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from velfield.registration.joint import ControlPoints
-from velfield.registration.transforms import FrameTransform
+from velfield.registration.transforms import FrameTransform, invert_2x2
 
 N_PATCHES_SAME_SENSOR, N_PATCHES_CROSS_SENSOR = 3000, 6000
 """Patches of a base image of the frames' own camera, and of another sensor's: about half of those fail to align."""
@@ -32,7 +32,6 @@ _MIN_CORRELATION = 0.7
 _MIN_VISIBLE_FRACTION = 0.6
 """Fraction of a patch that must lie in the frame: patches of the first and last rows are cut in half."""
 _CONVERGED_PX = 0.01
-_DERIVATIVE_PX = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +60,8 @@ class Templates:
 
 def extract_templates(base: GreyImage, xy: FloatArray, sigma_px: FloatArray, half_patch: int = HALF_PATCH) -> Templates:
     """Cut patches out of a base image (h, w) at corners (n, 2), integers; each must lie in the image completely."""
-    fine, coarse = smooth_levels(base)
+    fine = smooth_fine(base)
+    coarse = smooth_coarse(fine)
     at = xy.astype(np.int64)
     offsets = np.arange(-half_patch, half_patch + 1)
     dy, dx = (grid.ravel() for grid in np.meshgrid(offsets, offsets, indexing="ij"))
@@ -137,11 +137,14 @@ def _find_cell_maxima(strength: FloatArray, cell: int, threshold: float) -> tupl
     return np.stack([x, y], axis=1).astype(np.float64), value[k]
 
 
-def smooth_levels(grey: GreyImage) -> tuple[Float32Array, Float32Array]:
-    """The two blur levels of an image at which patches are aligned, float32: fine and coarse."""
-    fine = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _FINE_SIGMA_PX)
-    coarse = cv2.GaussianBlur(fine, (0, 0), float(_COARSE_SPACING_PX))
-    return np.asarray(fine, dtype=np.float32), np.asarray(coarse, dtype=np.float32)
+def smooth_fine(grey: GreyImage) -> Float32Array:
+    """The fine blur level of an image at which patches are aligned, float32."""
+    return np.asarray(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _FINE_SIGMA_PX), np.float32)
+
+
+def smooth_coarse(fine: Float32Array) -> Float32Array:
+    """The coarse blur level, from the fine one."""
+    return np.asarray(cv2.GaussianBlur(fine, (0, 0), float(_COARSE_SPACING_PX)), np.float32)
 
 
 def align_patches(
@@ -157,7 +160,7 @@ def align_patches(
     Parameters
     ----------
     image
-        (h, w) float32, the raw frame at the fine or coarse level of `smooth_levels`.
+        (h, w) float32, the raw frame blurred by `smooth_fine` or, if ``coarse``, by `smooth_coarse` after it.
     transform
         The frame's map so far, accurate to about ``max_shift_px``.
     templates
@@ -172,12 +175,7 @@ def align_patches(
     Control points, and the number of patches that lie in the frame.
     """
     start = transform.to_raw(templates.xy)
-    derivative = np.empty((len(templates), 2, 2))
-    for axis in range(2):
-        step = np.zeros(2)
-        step[axis] = _DERIVATIVE_PX
-        ahead, behind = transform.to_raw(templates.xy + step), transform.to_raw(templates.xy - step)
-        derivative[:, :, axis] = (ahead - behind) / (2 * _DERIVATIVE_PX)
+    derivative = invert_2x2(transform.jacobian(start))
     spacing = _COARSE_SPACING_PX if coarse else 1
     patches = templates.coarse if coarse else templates.fine
     shift, correlation = _align_patches_kernel(
@@ -251,6 +249,89 @@ def _gauss_newton_step(patch, sample, visible, frame_mean, patch_mean, spacing):
 
 
 @njit(cache=True, nogil=True)
+def _gradients(patch, spacing, centred, gx, gy):  # type: ignore[no-untyped-def]
+    """Fill in a patch less its mean and its gradients, zero in the border; sums that every step of it needs."""
+    side = patch.shape[0]
+    mean = 0.0
+    for r in range(side):
+        for c in range(side):
+            mean += patch[r, c]
+    mean /= side * side
+    square, hxx, hxy, hyy, sum_x, sum_y, own_x, own_y = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for r in range(side):
+        for c in range(side):
+            value = patch[r, c] - mean
+            centred[r, c] = value
+            square += value * value
+            gx[r, c], gy[r, c] = 0.0, 0.0
+    for r in range(1, side - 1):
+        for c in range(1, side - 1):
+            x = (patch[r, c + 1] - patch[r, c - 1]) / (2.0 * spacing)
+            y = (patch[r + 1, c] - patch[r - 1, c]) / (2.0 * spacing)
+            gx[r, c], gy[r, c] = x, y
+            hxx += x * x
+            hxy += x * y
+            hyy += y * y
+            sum_x += x
+            sum_y += y
+            own_x += x * centred[r, c]
+            own_y += y * centred[r, c]
+    return square, hxx, hxy, hyy, sum_x, sum_y, own_x, own_y
+
+
+@njit(cache=True, nogil=True)
+def _is_inside(image, start, derivative, shift, reach):  # type: ignore[no-untyped-def]
+    """Whether a whole patch, shifted by ``shift``, lies in the frame."""
+    height, width = image.shape
+    x = start[0] + derivative[0, 0] * shift[0] + derivative[0, 1] * shift[1]
+    y = start[1] + derivative[1, 0] * shift[0] + derivative[1, 1] * shift[1]
+    dx = reach * (abs(derivative[0, 0]) + abs(derivative[0, 1]))
+    dy = reach * (abs(derivative[1, 0]) + abs(derivative[1, 1]))
+    return x - dx >= 0.0 and y - dy >= 0.0 and x + dx < width - 1.0 and y + dy < height - 1.0
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _step_inside(image, start, derivative, shift, spacing, centred, gx, gy, sums):  # type: ignore[no-untyped-def]
+    """Gauss-Newton step and correlation of a patch that lies in the frame as a whole, in one pass over its pixels.
+
+    Equal to `_sample_patch` and `_gauss_newton_step`: their sums over differences to the means are expanded.
+    """
+    side = centred.shape[0]
+    half = side // 2
+    square, hxx, hxy, hyy, sum_x, sum_y, own_x, own_y = sums
+    total, total_square, product, with_x, with_y = 0.0, 0.0, 0.0, 0.0, 0.0
+    for r in range(side):
+        oy = (r - half) * spacing + shift[1]
+        ox = shift[0] - half * spacing
+        x = start[0] + derivative[0, 0] * ox + derivative[0, 1] * oy
+        y = start[1] + derivative[1, 0] * ox + derivative[1, 1] * oy
+        for c in range(side):
+            px, py = x + derivative[0, 0] * (c * spacing), y + derivative[1, 0] * (c * spacing)
+            j, k = int(px), int(py)
+            fx, fy = np.float32(px - j), np.float32(py - k)
+            top = image[k, j] + fx * (image[k, j + 1] - image[k, j])
+            bottom = image[k + 1, j] + fx * (image[k + 1, j + 1] - image[k + 1, j])
+            value = float(top + fy * (bottom - top))
+            total += value
+            total_square += value * value
+            product += value * centred[r, c]
+            with_x += value * gx[r, c]
+            with_y += value * gy[r, c]
+    mean = total / (side * side)
+    frame_square = total_square - mean * total
+    determinant = hxx * hyy - hxy * hxy
+    if frame_square <= 1e-3 or square <= 1e-3 or determinant <= 1e-6 * (hxx + hyy) ** 2:
+        return 0.0, 0.0, -1.0
+    gain = np.sqrt(square / frame_square)
+    bx, by = gain * (with_x - mean * sum_x) - own_x, gain * (with_y - mean * sum_y) - own_y
+    return (
+        (hyy * bx - hxy * by) / determinant,
+        (hxx * by - hxy * bx) / determinant,
+        product / np.sqrt(frame_square * square),
+    )
+
+
+@njit(cache=True, nogil=True)
 def _align_patches_kernel(image, patches, start, derivative, spacing, max_shift, iterations):  # type: ignore[no-untyped-def]
     """Shift (n, 2) in base px and correlation (n,) of each patch.
 
@@ -262,19 +343,25 @@ def _align_patches_kernel(image, patches, start, derivative, spacing, max_shift,
     correlation = np.full(n, np.nan)
     sample = np.empty((side, side), np.float32)
     visible = np.empty((side, side), np.bool_)
+    centred, gx, gy = np.empty((side, side)), np.empty((side, side)), np.empty((side, side))
+    reach = (side // 2) * spacing
     for i in range(n):
         if not np.isfinite(start[i, 0] + derivative[i, 0, 0] + derivative[i, 0, 1]):
             continue
         patch = patches[i].reshape(side, side)
+        sums = _gradients(patch, spacing, centred, gx, gy)
         score, converged, in_frame = 0.0, False, True
         for _ in range(iterations):
-            count, frame_mean, patch_mean = _sample_patch(
-                image, patch, start[i], derivative[i], shift[i], spacing, sample, visible
-            )
-            in_frame = count >= _MIN_VISIBLE_FRACTION * side * side
-            if not in_frame:
-                break
-            x, y, score = _gauss_newton_step(patch, sample, visible, frame_mean, patch_mean, spacing)
+            if _is_inside(image, start[i], derivative[i], shift[i], reach):
+                x, y, score = _step_inside(image, start[i], derivative[i], shift[i], spacing, centred, gx, gy, sums)
+            else:
+                count, frame_mean, patch_mean = _sample_patch(
+                    image, patch, start[i], derivative[i], shift[i], spacing, sample, visible
+                )
+                in_frame = count >= _MIN_VISIBLE_FRACTION * side * side
+                if not in_frame:
+                    break
+                x, y, score = _gauss_newton_step(patch, sample, visible, frame_mean, patch_mean, spacing)
             length = np.sqrt(x * x + y * y)
             factor = min(1.0, 2.0 * spacing / max(length, 1e-9))
             shift[i, 0] -= x * factor

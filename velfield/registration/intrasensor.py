@@ -31,7 +31,8 @@ from velfield.registration.alignment import (
     Templates,
     align_patches,
     make_templates,
-    smooth_levels,
+    smooth_coarse,
+    smooth_fine,
 )
 from velfield.registration.fitting import fit_by_case_deletion
 from velfield.registration.joint import ControlPoints, JointFit, fit_jointly, is_inlier
@@ -312,7 +313,7 @@ class _FrameFitter:
         fit = self._fit(points, start)
         if isinstance(fit, Failure):
             return fit
-        fine, coarse = smooth_levels(self.grey)
+        fine = smooth_fine(self.grey)
         templates = self.base.templates
         aligned, in_frame = align_patches(fine, fit.transform, templates, coarse=False, max_shift_px=_FINE_SHIFT_PX)
         enough = len(aligned) >= _ENOUGH_FRACTION * in_frame
@@ -320,7 +321,7 @@ class _FrameFitter:
             templates = self.base.dense_templates
         steps = [(fine, False, _FINE_SHIFT_PX)] * 2
         if len(aligned) < _NEAR_FRACTION * in_frame:
-            steps.insert(0, (coarse, True, _COARSE_SHIFT_PX))
+            steps.insert(0, (smooth_coarse(fine), True, _COARSE_SHIFT_PX))
         used = points
         for k, (image, is_coarse, limit) in enumerate(steps):
             if k or not enough:

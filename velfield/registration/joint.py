@@ -456,13 +456,34 @@ def _cross_validate(
     stiffness: tuple[float, float],
 ) -> tuple[float, FloatArray]:
     """Cross-validated squares over all folds, and the step (FOLDS, p) without each fold."""
+    free = problem.free
+    steps = np.zeros((FOLDS, len(theta)))
+    total, steps[:, free] = _solve_without_folds(problem, _restrict(problem, equations), theta, stiffness)
+    return total, steps
+
+
+def _restrict(
+    problem: _Problem, equations: tuple[FloatArray, FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The equations of the free parameters."""
     normal, right, squares = equations
     free = problem.free
-    penalty = problem.penalty(*stiffness)[np.ix_(free, free)]
-    steps = np.zeros((FOLDS, len(theta)))
-    total, steps[:, free] = kernels.solve_without_folds(
-        np.ascontiguousarray(normal[:, free[:, None], free]), right[:, free], squares, penalty, theta[free]
-    )
+    if len(free) == right.shape[1]:
+        return equations
+    return np.ascontiguousarray(normal[:, free[:, None], free]), right[:, free], squares
+
+
+def _solve_without_folds(
+    problem: _Problem,
+    free_equations: tuple[FloatArray, FloatArray, FloatArray],
+    theta: FloatArray,
+    stiffness: tuple[float, float],
+) -> tuple[float, FloatArray]:
+    free = problem.free
+    normal, right, squares = free_equations
+    penalty = problem.penalty(*stiffness)
+    penalty = penalty if len(free) == len(penalty) else penalty[np.ix_(free, free)]
+    total, steps = kernels.solve_without_folds(normal, right, squares, penalty, theta[free])
     return (total if np.isfinite(total) else np.inf), steps
 
 
@@ -500,7 +521,8 @@ def _select_stiffest_near_best(
     candidates: list[tuple[float, float]],
 ) -> tuple[float, float]:
     """The stiffest candidate (the last: they are ordered) with about the minimum of cross-validated squares."""
-    squares = [_cross_validate(problem, equations, theta, candidate)[0] for candidate in candidates]
+    restricted = _restrict(problem, equations)
+    squares = [_solve_without_folds(problem, restricted, theta, candidate)[0] for candidate in candidates]
     return max(
         candidate for candidate, value in zip(candidates, squares, strict=True) if value <= _MAX_CV_RATIO * min(squares)
     )

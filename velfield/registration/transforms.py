@@ -131,6 +131,14 @@ def _solve_2x2(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
     return np.stack([x, y], axis=1)
 
 
+def invert_2x2(matrices: FloatArray) -> FloatArray:
+    """Inverses (n, 2, 2); not finite where a matrix is singular."""
+    a, b, c, d = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 0], matrices[:, 1, 1]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        adjugate = np.stack([np.stack([d, -b], axis=1), np.stack([-c, a], axis=1)], axis=1)
+        return np.asarray(adjugate / (a * d - b * c)[:, None, None])
+
+
 def mesh_shape(width: int, height: int, cell_size_px: int) -> tuple[int, int]:
     """Rows and columns of the displacement mesh over a frame.
 

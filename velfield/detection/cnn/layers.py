@@ -140,3 +140,36 @@ def depth_to_space(values: Float32Array, layout: PaddedBatchLayout) -> Float32Ar
     count, height, width, channels = images.shape
     blocks = images.reshape(count, height, width, 2, 2, channels // 4).transpose(0, 1, 3, 2, 4, 5)
     return layout.pack(blocks.reshape(count, 2 * height, 2 * width, channels // 4))
+
+
+_TAP, _WITHIN = (0, 1, 1, 2), (1, 0, 1, 0)
+"""Of the four rows of a strided 4 x 4 kernel: the row of blocks, and the row within the block."""
+
+
+def kernel_on_blocks(weights: Float32Array) -> Float32Array:
+    """A 4 x 4 kernel of stride 2 (16, channels in, channels out) as a 3 x 3 one on blocks: (9, 4 channels in, out).
+
+    After `space_to_depth` the strided convolution is a plain one, most of whose taps at the border are zero.
+    """
+    channels = weights.shape[1]
+    out = np.zeros((9, 4 * channels, weights.shape[2]), np.float32)
+    for tap, part, of in _strided_taps(channels):
+        out[tap, part] = weights[of]
+    return out
+
+
+def kernel_off_blocks(weights: Float32Array) -> Float32Array:
+    """Transpose of `kernel_on_blocks`: the gradient by the strided kernel from that by the one on blocks."""
+    channels = weights.shape[1] // 4
+    out = np.empty((16, channels, weights.shape[2]), np.float32)
+    for tap, part, of in _strided_taps(channels):
+        out[of] = weights[tap, part]
+    return out
+
+
+def _strided_taps(channels: int) -> Iterator[tuple[int, slice, int]]:
+    """Of each tap of the strided kernel: the tap and the channels on blocks, and its own number."""
+    for row in range(4):
+        for column in range(4):
+            part = channels * (2 * _WITHIN[row] + _WITHIN[column])
+            yield 3 * _TAP[row] + _TAP[column], slice(part, part + channels), 4 * row + column

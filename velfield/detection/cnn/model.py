@@ -1,9 +1,9 @@
 """The network that detects cars, and a frame's detections from it.
 
 A small fully convolutional encoder-decoder. From a grey image it predicts, at half the resolution, a heatmap of car
-centres and the orientation of the car at each pixel as (cos 2a, sin 2a). The encoder halves the resolution by
-space-to-depth, residual blocks follow at the lowest resolution, and the decoder returns by depth-to-space with a skip
-connection, as in a U-Net. `TOPOLOGY` is the one definition of the layers: training, the ONNX graph and the detector
+centres and the orientation of the car at each pixel as (cos 2a, sin 2a). The encoder halves the resolution three times,
+two residual blocks follow at an eighth of it, and the decoder returns by depth-to-space with a skip connection, as in a
+U-Net. `TOPOLOGY` is the one definition of the layers: training, the ONNX graph and the detector
 file derive from it.
 
 Inference is onnxruntime's, with one thread: frames are what is spread over the processors. A detector file holds the
@@ -41,15 +41,20 @@ from velfield.errors import InputError
 class Conv:
     """A convolution with bias, by default with a ReLU after it.
 
-    Where there is a ReLU, training from scratch normalises its input by batch; the trained normalisation is folded into
-    weights and bias.
+    A kernel of 1 or 3 keeps the resolution; one of 4 halves it (stride 2, one pixel of padding). Where there is a ReLU,
+    training from scratch normalises its input by batch; the trained normalisation is folded into weights and bias.
     """
 
     name: str
-    kernel: Literal[1, 3]
+    kernel: Literal[1, 3, 4]
     channels_in: int
     channels_out: int
     relu: bool = True
+
+    @property
+    def stride(self) -> int:
+        """2 of a kernel of 4, else 1."""
+        return 2 if self.kernel == 4 else 1
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -79,6 +84,26 @@ Layer: TypeAlias = Conv | SpaceToDepth | DepthToSpace | Residual
 Topology: TypeAlias = tuple[Layer, ...]
 
 TOPOLOGY: Topology = (
+    Conv("stem", 4, 1, 16),
+    Conv("down1", 4, 16, 32),
+    Conv("enc1", 3, 32, 32),
+    Residual(
+        (
+            SpaceToDepth(),
+            Conv("down2", 1, 128, 48),
+            Residual((Conv("res1_0", 3, 48, 48), Conv("res1_1", 3, 48, 48))),
+            Residual((Conv("res2_0", 3, 48, 48), Conv("res2_1", 3, 48, 48))),
+            Conv("up1", 1, 48, 128, relu=False),
+            DepthToSpace(),
+        ),
+        relu=True,
+    ),
+    Conv("dec1", 3, 32, 32),
+    Conv("head", 1, 32, 12, relu=False),
+    DepthToSpace(),
+)
+"""No layer works at full resolution: 15.9 GMAC a frame of 2560 x 1920 where `FORMER_TOPOLOGY` takes 66.6."""
+FORMER_TOPOLOGY: Topology = (
     Conv("stem", 3, 1, 16),
     SpaceToDepth(),
     Conv("down1", 1, 64, 32),
@@ -98,7 +123,8 @@ TOPOLOGY: Topology = (
     Conv("dec1", 3, 32, 32),
     Conv("head", 1, 32, 3, relu=False),
 )
-TOPOLOGIES: tuple[Topology, ...] = (TOPOLOGY,)
+"""That of the detectors of version 0.1, whose files are read."""
+TOPOLOGIES: tuple[Topology, ...] = (TOPOLOGY, FORMER_TOPOLOGY)
 """Those that a detector file may hold."""
 STRIDE = 2
 """Working px a pixel of the heatmap."""
@@ -126,6 +152,8 @@ def _alignment(layers: Topology) -> int:
     for layer in layers:
         if isinstance(layer, SpaceToDepth):
             scale *= 2
+        elif isinstance(layer, Conv):
+            scale *= layer.stride
         elif isinstance(layer, DepthToSpace):
             scale //= 2
         elif isinstance(layer, Residual):
@@ -239,8 +267,8 @@ class _GraphBuilder:
         ):
             half = self.constant(name, values.astype(np.float16))
             names.append(self.node("Cast", [half], to=TensorProto.FLOAT))
-        pad = block * (layer.kernel // 2)
-        return self.node("Conv", [value, *names], strides=[block] * 2, pads=[pad] * 4)
+        pad = 1 if layer.stride == 2 else block * (layer.kernel // 2)
+        return self.node("Conv", [value, *names], strides=[block * layer.stride] * 2, pads=[pad] * 4)
 
 
 def onnx_kernel(weights: Float32Array, kernel: int, block: int) -> Float32Array:

@@ -14,7 +14,15 @@ from typing import TypeAlias
 import numpy as np
 
 from schemas.arrays import Float32Array, Mask
-from velfield.detection.cnn.layers import PaddedBatchLayout, conv2d, conv2d_backward, depth_to_space, space_to_depth
+from velfield.detection.cnn.layers import (
+    PaddedBatchLayout,
+    conv2d,
+    conv2d_backward,
+    depth_to_space,
+    kernel_off_blocks,
+    kernel_on_blocks,
+    space_to_depth,
+)
 from velfield.detection.cnn.model import (
     TOPOLOGY,
     Conv,
@@ -117,7 +125,7 @@ class Trainer:
                 parameters[f"{name}.g"] = np.ones(channels_out, np.float32)
         for name in _last_of_residual_blocks(TOPOLOGY):
             parameters[f"{name}.g"] *= np.float32(_RESIDUAL_GAIN)
-        parameters["head.b"][0] = _PRIOR_LOGIT
+        parameters["head.b"][::3] = _PRIOR_LOGIT  # of each pixel that the head predicts
         return cls(parameters)
 
     @classmethod
@@ -245,10 +253,8 @@ class _Pass:
             return depth_to_space(values, doubled), doubled, lambda gradient: space_to_depth(gradient, doubled)
         if isinstance(layer, Residual):
             out, backward = self._residual(layer, values, layout)
-        elif f"{layer.name}.g" in self.trainer.parameters:
-            out, backward = self._normalised_conv(layer.name, values, layout)
         else:
-            out, backward = self._conv(layer.name, values, layout)
+            out, layout, backward = self._convolve(layer, values, layout)
         if not layer.relu:
             return out, layout, backward
         positive: Mask = out > 0
@@ -262,14 +268,35 @@ class _Pass:
         branch += values
         return branch, lambda gradient: gradient + backward(gradient)
 
-    def _conv(self, name: str, values: Float32Array, layout: PaddedBatchLayout) -> tuple[Float32Array, Backward]:
+    def _convolve(
+        self, layer: Conv, values: Float32Array, layout: PaddedBatchLayout
+    ) -> tuple[Float32Array, PaddedBatchLayout, Backward]:
+        convolve = self._normalised_conv if f"{layer.name}.g" in self.trainer.parameters else self._conv
+        if layer.stride == 1:
+            out, backward = convolve(layer.name, values, layout)
+            return out, layout, backward
+        halved = layout.halved()
+        out, backward = convolve(layer.name, space_to_depth(values, layout), halved)
+        return out, halved, lambda gradient: depth_to_space(backward(gradient), layout)
+
+    def _kernel(self, name: str) -> Float32Array:
+        """Weights of a layer; a strided kernel on the blocks that `space_to_depth` makes."""
         weights = self.trainer.parameters[f"{name}.w"]
+        return kernel_on_blocks(weights) if len(weights) == 16 else weights
+
+    def _keep_gradient(self, name: str, by_kernel: Float32Array) -> None:
+        strided = len(self.trainer.parameters[f"{name}.w"]) == 16
+        self.gradients[f"{name}.w"] = kernel_off_blocks(by_kernel) if strided else by_kernel
+
+    def _conv(self, name: str, values: Float32Array, layout: PaddedBatchLayout) -> tuple[Float32Array, Backward]:
+        weights = self._kernel(name)
         out = conv2d(values, weights, layout) + self.trainer.parameters[f"{name}.b"]
         layout.zero_border(out)
 
         def backward(gradient: Float32Array) -> Float32Array:
             self.gradients[f"{name}.b"] = gradient.sum(axis=0)
-            by_values, self.gradients[f"{name}.w"] = conv2d_backward(values, weights, gradient, layout)
+            by_values, by_kernel = conv2d_backward(values, weights, gradient, layout)
+            self._keep_gradient(name, by_kernel)
             return by_values
 
         return out, backward
@@ -279,7 +306,7 @@ class _Pass:
     ) -> tuple[Float32Array, Backward]:
         """Convolution and batch normalisation."""
         trainer = self.trainer
-        weights, gain = trainer.parameters[f"{name}.w"], trainer.parameters[f"{name}.g"]
+        weights, gain = self._kernel(name), trainer.parameters[f"{name}.g"]
         convolved = conv2d(values, weights, layout)
         interior = layout.interior_view(convolved)
         mean, variance = interior.mean(axis=(0, 1, 2)), interior.var(axis=(0, 1, 2))
@@ -301,7 +328,8 @@ class _Pass:
             by_convolved = gradient - (by_bias + normalised * by_gain) / np.float32(pixels)
             by_convolved *= gain * scale
             layout.zero_border(by_convolved)
-            by_values, self.gradients[f"{name}.w"] = conv2d_backward(values, weights, by_convolved, layout)
+            by_values, by_kernel = conv2d_backward(values, weights, by_convolved, layout)
+            self._keep_gradient(name, by_kernel)
             return by_values
 
         return np.asarray(out, np.float32), backward
