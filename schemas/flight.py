@@ -84,6 +84,9 @@ class RegistrationConfig(Model):
     row_spline_knots: PositiveInt = Field(48, ge=4)
     """Knots of the row spline, which represents up to a third as many cycles a frame. Its stiffness is cross-validated
     for each frame, so that more knots than needed do no harm."""
+    start: Literal["optical_flow", "keypoints"] = "optical_flow"
+    """What a frame's fit starts from: the frame before, by optical flow, with keypoints for the first of a chain and
+    wherever that fails; or the keypoints of every frame."""
     max_keypoints: PositiveInt = 4000
     """Keypoints kept a frame, spread by cells."""
     keypoint_scale: PositiveFloat = Field(0.5, le=1)
@@ -210,6 +213,7 @@ PRESETS: dict[Preset, dict[str, dict[str, object]]] = {
         "lens": {"refine": "never"},
         "registration": {
             "model": "polyprojective",
+            "start": "keypoints",
             "max_mean_error_px": 2.0,
             "keypoint_scale": 1.0,
             "cell_size_px": 200,
@@ -231,6 +235,7 @@ READ_WITH: Mapping[str, Mapping[str, tuple[object, ...]]] = {
     "lens.max_edge_points": _CALIBRATED,
     "lens.angle_bins": _CALIBRATED,
     "lens.max_distortion": _CALIBRATED,
+    "registration.start": {"registration.model": ("row_spline", "homography")},
     "registration.row_spline_knots": {"registration.model": ("row_spline",)},
     "registration.drop_fraction": _CASE_DELETION,
     "registration.max_mean_error_px": _CASE_DELETION,

@@ -1,7 +1,9 @@
 """Registration of simulated flights against the truth, and of frames that cannot be registered."""
 
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, partial
 
+import cv2
 import numpy as np
 import pytest
 
@@ -54,8 +56,14 @@ def seen(kind: str, frame: int) -> tuple[np.ndarray, Keypoints]:
     return grey, detect_keypoints(grey, CONFIG)
 
 
+def shown(kind: str, frame: int) -> tuple[np.ndarray, Callable[[], Keypoints]]:
+    """A frame as a chain reads it: keypoints only where it asks for them."""
+    grey, keypoints = seen(kind, frame)
+    return grey, lambda: keypoints
+
+
 def registered(kind: str, frames: list[int], config: RegistrationConfig = CONFIG) -> list[FrameRegistration]:
-    stream = ((frame, *seen(kind, frame)) for frame in frames)
+    stream = ((frame, *shown(kind, frame)) for frame in frames)
     return register_chain(stream, base_of(kind), lens_of(flight_of(kind)), config)
 
 
@@ -104,7 +112,7 @@ def test_patches_from_afar_do_not_pull_what_lies_near_by() -> None:
     """Another sensor's picture, of whose patches half are found: those looked for farther off are mostly wrong ones."""
     flight = small_flight(frames=4, seed=13)
     shape = flight.camera.height, flight.camera.width
-    frames = [(k, flight.frame(k), detect_keypoints(flight.frame(k), CONFIG)) for k in range(4)]
+    frames = [(k, grey, partial(detect_keypoints, grey, CONFIG)) for k, grey in enumerate(map(flight.frame, range(4)))]
     base = prepare_base(flight.base_image, CONFIG, frame_shape=shape)
     results = register_chain(frames, base, lens_of(flight), CONFIG)
     score = score_registration(make_truth(flight), lambda frame, xy: results[frame].transform.to_base(xy), range(4))
@@ -116,7 +124,7 @@ def test_patches_are_looked_for_farther_off_where_key_points_mislead() -> None:
     """All key points lie four pixels beside what they show: patches near by are few, and farther off they are right."""
     grey, keypoints = seen("still", 0)
     beside = Keypoints(keypoints.xy + np.array([3.0, -3.0]), keypoints.descriptors)
-    results = register_chain([(0, grey, beside)], base_of("still"), lens_of(flight_of("still")), CONFIG)
+    results = register_chain([(0, grey, lambda: beside)], base_of("still"), lens_of(flight_of("still")), CONFIG)
     assert errors_px("still", results)[0] < 0.1
 
 
@@ -128,14 +136,51 @@ def test_result_is_the_same_however_the_flight_is_cut() -> None:
         assert np.abs(a.transform.to_base(raw) - b.transform.to_base(raw)).max() < CUT_TOLERANCE_PX
 
 
+@pytest.mark.parametrize("kind", ["still", "wobble", "city"])
+def test_optical_flow_finds_what_keypoints_find(kind: str) -> None:
+    """Three frames of four have no keypoints detected, and are as accurate."""
+    asked = []
+
+    def ask(frame: int) -> Keypoints:
+        asked.append(frame)
+        return seen(kind, frame)[1]
+
+    stream = [(frame, seen(kind, frame)[0], partial(ask, frame)) for frame in range(4)]
+    found = register_chain(stream, base_of(kind), lens_of(flight_of(kind)), CONFIG)
+    assert asked == [0]
+    of_keypoints = registered(kind, [0, 1, 2, 3], CONFIG.model_copy(update={"start": "keypoints"}))
+    by_flow, by_keypoints = errors_px(kind, found), errors_px(kind, of_keypoints)
+    assert by_flow[0] < by_keypoints[0] + 0.01
+    assert by_flow[1] < by_keypoints[1] + 0.02
+
+
+def test_a_frame_that_flow_loses_is_registered_by_its_keypoints() -> None:
+    """The camera turns by 100 degrees between two frames: Lucas-Kanade loses its points."""
+    grey, _ = seen("still", 1)
+    turn = cv2.getRotationMatrix2D((320, 240), 100, 1.0)
+    turned = cv2.warpAffine(grey, turn, (640, 480), borderMode=cv2.BORDER_REFLECT_101)
+    asked = []
+
+    def ask() -> Keypoints:
+        asked.append(1)
+        return detect_keypoints(turned, CONFIG)
+
+    frames = [(0, *shown("still", 0)), (1, turned, ask), (2, *shown("still", 2))]
+    results = register_chain(frames, base_of("still"), lens_of(flight_of("still")), CONFIG)
+    assert asked
+    assert [r.ok for r in results] == [True, True, True]
+    first, second = (r.transform.scale_and_rotation()[1] for r in results[:2])
+    assert second - first == pytest.approx(np.radians(100), abs=0.05)
+
+
 def test_a_lost_frame_says_why_and_the_next_registers_again() -> None:
     black = np.zeros((480, 640), np.uint8)
     strange = np.random.default_rng(0).integers(0, 255, (60, 80), dtype=np.uint8).repeat(8, 0).repeat(8, 1)
     frames = [
-        (0, *seen("still", 0)),
-        (1, black, detect_keypoints(black, CONFIG)),
-        (2, strange, detect_keypoints(strange, CONFIG)),
-        (3, *seen("still", 3)),
+        (0, *shown("still", 0)),
+        (1, black, lambda: detect_keypoints(black, CONFIG)),
+        (2, strange, lambda: detect_keypoints(strange, CONFIG)),
+        (3, *shown("still", 3)),
     ]
     results = register_chain(frames, base_of("still"), lens_of(flight_of("still")), CONFIG)
     assert [r.ok for r in results] == [True, False, False, True]
@@ -154,8 +199,8 @@ def test_where_the_base_image_ends_the_previous_frame_carries_on() -> None:
     keypoints = seen("still", 0)[1]
     first = registered("still", [0])[0]
     previous = map_keypoints(keypoints, first.transform)
-    alone = register_chain([(1, *seen("still", 1))], half, lens, CONFIG)[0]
-    chained = register_chain([(1, *seen("still", 1))], half, lens, CONFIG, previous)[0]
+    alone = register_chain([(1, *shown("still", 1))], half, lens, CONFIG)[0]
+    chained = register_chain([(1, *shown("still", 1))], half, lens, CONFIG, previous)[0]
     truth = make_truth(flight)
     corner = np.array([[600.0, 240.0]])
     miss = [float(np.linalg.norm(r.transform.to_base(corner) - truth.to_base(1, corner))) for r in (alone, chained)]
@@ -172,7 +217,7 @@ def test_own_base_image_serves_as_well_as_a_given_one() -> None:
     assert own
     assert own.frames == 6
     base = prepare_base(own.image, CONFIG, mask=own.valid, frame_shape=greys[0].shape)
-    results = register_chain(((k, greys[k], keypoints[k]) for k in range(6)), base, lens, CONFIG)
+    results = register_chain(((k, greys[k], partial(keypoints.get, k)) for k in range(6)), base, lens, CONFIG)
     truth = make_truth(flight)
 
     def to_base(frame: int, xy: np.ndarray) -> np.ndarray:

@@ -27,7 +27,8 @@ OPTIONAL_INPUTS = tuple(name for name in Inputs.model_fields if name != "source"
 _UNITS = ((256, 16), (4096, 64))
 """Up to so many frames, so many a unit: a short flight is cut finely enough for several workers ..."""
 _LARGEST_UNIT = 256
-"""... and a flight of hours stays below 3,000 task runs."""
+"""... and a flight of hours stays below 3,000 task runs. These are upper limits: units are cut evenly,
+and an even number of them, so that no core of two idles over a last short one."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,11 @@ class Plan:
         setting = self.config.work.unit_frames
         if setting != "auto":
             return setting
-        return next((unit for frames, unit in _UNITS if self.frame_count <= frames), _LARGEST_UNIT)
+        largest = next((unit for frames, unit in _UNITS if self.frame_count <= frames), _LARGEST_UNIT)
+        if self.frame_count <= largest:
+            return largest
+        units = 2 * -(-self.frame_count // (2 * largest))
+        return -(-self.frame_count // units)
 
     @property
     def units(self) -> list[range]:

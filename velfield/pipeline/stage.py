@@ -115,7 +115,7 @@ STAGES: tuple[Stage, ...] = (
     # Decode, measure and write each frame.
     Stage(
         name="frames",
-        version=1,
+        version=2,
         label="frames",
         lines=(Line("{usable:.0f} of {frames:.0f} frames read"),),
         prepare=f"{_STAGES}.frames:create_frame_store",
@@ -182,16 +182,15 @@ STAGES: tuple[Stage, ...] = (
         new_base=NewBase.MAPPED,
         remap=f"{_STAGES}.rebase:rebase_image",
     ),
-    # Key points of each block, then the chain over the unit's frames.
+    # The chain over the unit's frames.
     Stage(
         name="registration",
-        version=4,
+        version=5,
         label="registration",
         lines=(
             Line("{registered:.0f} of {frames:.0f} frames registered, hold-out registration error {heldout_px:.2f} px"),
         ),
         prepare=f"{_STAGES}.registration:create_registration_store",
-        block=f"{_STAGES}.registration:detect_unit_keypoints",
         unit=f"{_STAGES}.registration:register_unit",
         store="registration.zarr",
         after=("frames", "base"),

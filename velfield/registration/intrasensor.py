@@ -1,6 +1,7 @@
 """Intra-sensor registration: every frame to the base image of the same camera, and to the frame before it.
 
-Paper: intra-sensor registration. For each frame, in time order:
+Paper: intra-sensor registration. The first frame of a chain, and every one that the
+way below loses, goes through these steps:
 
 1. a prior homography from the base image (SIFT keypoints, ratio test, MAGSAC), which needs no other frame; if it fails,
    from the keypoints of the previous registered frame, mapped through its transform;
@@ -12,14 +13,21 @@ Paper: intra-sensor registration. For each frame, in time order:
 5. the displacement mesh, if cross-validation supports one; its cells are 120 px by default, the paper's 200
    (``cell_size_px``).
 
+Every other frame starts from the one before (``start="optical_flow"``): the inliers of that frame are tracked into this
+one by pyramidal Lucas-Kanade, a fit to them takes the place of steps 1 to 3, and steps 4 and 5 follow. Nothing of the
+earlier frame's error remains, as the patches are aligned to the base image itself. Keypoints cost more than all else of
+a frame's registration. A frame that comes out worse than the one that its chain began with is registered again by its
+keypoints.
+
 Matches to the previous frame propagate its errors and would let the chain drift: they are used only in those cells of
 the frame where the base image gives no match. Where the base image covers the frame, the result does not depend on
 where the chain began.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
@@ -36,7 +44,13 @@ from velfield.registration.alignment import (
 )
 from velfield.registration.fitting import fit_by_case_deletion
 from velfield.registration.joint import ControlPoints, JointFit, fit_jointly, is_inlier
-from velfield.registration.keypoints import Keypoints, detect_keypoints, estimate_homography_prior, match_guided
+from velfield.registration.keypoints import (
+    Keypoints,
+    detect_keypoints,
+    estimate_homography_prior,
+    fit_homography,
+    match_guided,
+)
 from velfield.registration.mesh import MESH_ITERATIONS, fit_robust_mesh
 from velfield.registration.transforms import (
     FrameTransform,
@@ -64,6 +78,12 @@ _ENOUGH_FRACTION = 0.8
 at the borders."""
 _MIN_ALIGNED_FRACTION = 0.15
 """If a smaller fraction of the patches aligns, the prior was wrong: the frame is not registered."""
+_FLOW_SIGMA_PX = 0.7
+_FLOW_POINTS = 800
+_FLOW_SCALE, _FLOW_LEVELS, _FLOW_WINDOW_PX = 0.5, 4, 21
+"""Of optical flow: scale of the frames, levels of their pyramids above that, side of the window."""
+_MAX_COVERAGE_LOSS, _MAX_RESIDUAL_RATIO = 0.05, 1.5
+"""Against the first frame of the chain: a frame that is worse is registered again by its keypoints."""
 _MAX_BASE_KEYPOINT_RATIO = 3
 """Keypoints of the base image over those of a frame, at most; in proportion to its area."""
 
@@ -99,6 +119,7 @@ class FrameRegistration:
     coverage : fraction of the frame's cells with inliers.
     error_map : (6, 8) RMS cross-validated residual of the inliers per cell, base px; NaN where there are none.
     control_points : the inliers.
+    stiffness : selected for the row shift and for the roll.
     """
 
     transform: FrameTransform | None
@@ -111,6 +132,7 @@ class FrameRegistration:
     coverage: float = 0.0
     error_map: FloatArray | None = None
     control_points: ControlPoints | None = None
+    stiffness: tuple[float, float] | None = None
 
     @property
     def ok(self) -> bool:
@@ -146,7 +168,7 @@ def prepare_base(
 
 
 def register_chain(
-    frames: Iterable[tuple[int, GreyImage, Keypoints]],
+    frames: Iterable[tuple[int, GreyImage, Callable[[], Keypoints]]],
     base: BaseReference,
     lens: Lens,
     config: RegistrationConfig,
@@ -157,18 +179,93 @@ def register_chain(
     Parameters
     ----------
     frames
-        (index, grey (h, w) uint8, keypoints in raw px) of each.
+        (index, grey (h, w) uint8, function that detects its keypoints in raw px) of each.
     first_previous
         Keypoints of the frame before the first, in base px (see `map_keypoints`); None: the chain begins here.
     """
-    results = []
-    previous = first_previous
-    for _, grey, keypoints in frames:
-        result = register_frame(grey, keypoints, base, lens, config, previous)
+    results: list[FrameRegistration] = []
+    before: _ChainFrame | None = None
+    first: FrameRegistration | None = None
+    for _, grey, detect in frames:
+        by_flow = config.start == "optical_flow" and config.model != "polyprojective"
+        small = _shrink(grey) if by_flow else grey
+        result = None
+        if by_flow and before is not None and first is not None:
+            result = _register_by_flow(grey, small, before, base, lens, config)
+            result = None if result is None or _is_worse(result, first) else result
+        if result is None:
+            previous = first_previous if before is None else map_keypoints(before.detect(), before.transform)
+            result = register_frame(grey, detect(), base, lens, config, previous)
+            first = result if result.ok else first
         results.append(result)
         if result.transform is not None:
-            previous = map_keypoints(keypoints, result.transform)
+            before = _ChainFrame(result, result.transform, small, detect)
     return results
+
+
+@dataclass(frozen=True, eq=False)
+class _ChainFrame:
+    """A registered frame that the next one starts from."""
+
+    result: FrameRegistration
+    transform: FrameTransform
+    small: GreyImage
+    detect: Callable[[], Keypoints]
+
+
+def _is_worse(result: FrameRegistration, first: FrameRegistration) -> bool:
+    return (
+        result.coverage < first.coverage - _MAX_COVERAGE_LOSS
+        or not result.heldout_px <= _MAX_RESIDUAL_RATIO * first.heldout_px
+    )
+
+
+def _shrink(grey: GreyImage) -> GreyImage:
+    """The frame as optical flow sees it."""
+    return np.asarray(
+        cv2.resize(grey, None, fx=_FLOW_SCALE, fy=_FLOW_SCALE, interpolation=cv2.INTER_AREA), dtype=np.uint8
+    )
+
+
+def _register_by_flow(
+    grey: GreyImage,
+    small: GreyImage,
+    before: _ChainFrame,
+    base: BaseReference,
+    lens: Lens,
+    config: RegistrationConfig,
+) -> FrameRegistration | None:
+    """Register a frame from the inliers of the frame before; None where it fails."""
+    inliers = before.result.control_points
+    assert inliers is not None, "a registered frame has control points"
+    chosen = np.linspace(0, len(inliers) - 1, min(_FLOW_POINTS, len(inliers))).astype(np.int64)
+    start = ((inliers.xy_raw[chosen] + 0.5) * _FLOW_SCALE - 0.5).astype(np.float32)
+    window = (_FLOW_WINDOW_PX, _FLOW_WINDOW_PX)
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+        before.small, small, start[:, None], None, winSize=window, maxLevel=_FLOW_LEVELS
+    )
+    xy_raw = (moved[:, 0].astype(np.float64) + 0.5) / _FLOW_SCALE - 0.5
+    height, width = grey.shape
+    kept = (found.ravel() > 0) & (xy_raw >= 0).all(axis=1) & (xy_raw <= (width - 1, height - 1)).all(axis=1)
+    points = ControlPoints(xy_raw[kept], inliers.xy_base[chosen][kept], np.full(int(kept.sum()), _FLOW_SIGMA_PX))
+    undistorted = as_points(lens.undistort_points(points.xy_raw))
+    prior = fit_homography(undistorted, points.xy_base)
+    if isinstance(prior, Failure):
+        return None
+    fitter = _FrameFitter(grey, base, lens, config)
+    fitted = fitter.fit_with_alignment(points, _start_of(prior, lens, width, height), before.result.stiffness)
+    if isinstance(fitted, Failure):
+        return None
+    used, fit = fitted
+    result = fitter.with_quality_metrics(used, fit, len(points), 0)
+    return result if result.ok else None
+
+
+def _start_of(prior: HomographyTransform, lens: Lens, width: int, height: int) -> PolyprojectiveTransform:
+    corners = as_points(lens.undistort_points(_corners(width, height)))
+    return PolyprojectiveTransform.from_homography(
+        prior.matrix, fit_normalisation(corners), fit_normalisation(prior(corners))
+    )
 
 
 def map_keypoints(keypoints: Keypoints, transform: FrameTransform) -> Keypoints:
@@ -214,10 +311,7 @@ def register_frame(
     from_base = _match_control_points(keypoints, predicted, base.keypoints, config, _BASE_SIGMA_PX)
     from_previous = _match_control_points(keypoints, predicted, previous, config, _PREVIOUS_SIGMA_PX)
     height, width = grey.shape
-    corners = as_points(lens.undistort_points(_corners(width, height)))
-    start = PolyprojectiveTransform.from_homography(
-        prior.matrix, fit_normalisation(corners), fit_normalisation(prior(corners))
-    )
+    start = _start_of(prior, lens, width, height)
     fitter = _FrameFitter(grey, base, lens, config)
     if config.model == "polyprojective":  # the paper matches base and previous frame alike
         fitted = fitter.fit_with_case_deletion(from_base.concatenate(from_previous))
@@ -283,7 +377,11 @@ class _FrameFitter:
         return self.grey.shape[1], self.grey.shape[0]
 
     def _fit(
-        self, points: ControlPoints, start: PolyprojectiveTransform, previous_fit: JointFit | None = None
+        self,
+        points: ControlPoints,
+        start: PolyprojectiveTransform,
+        previous_fit: JointFit | None = None,
+        stiffness: tuple[float, float] | None = None,
     ) -> JointFit | Failure:
         if len(points) < self.config.min_control_points:
             return Failure(f"{len(points)} control points, {self.config.min_control_points} needed")
@@ -298,11 +396,14 @@ class _FrameFitter:
             homography=self.config.model == "homography",
             start_rows=None if previous_fit is None else previous_fit.transform.row_coefficients,
             start_scale_px=_INITIAL_SCALE_PX if previous_fit is None else _REFIT_SCALE_PX,
-            start_stiffness=None if previous_fit is None else previous_fit.stiffness,
+            start_stiffness=stiffness if previous_fit is None else previous_fit.stiffness,
         )
 
     def fit_with_alignment(
-        self, points: ControlPoints, start: PolyprojectiveTransform
+        self,
+        points: ControlPoints,
+        start: PolyprojectiveTransform,
+        stiffness: tuple[float, float] | None = None,
     ) -> tuple[ControlPoints, JointFit] | Failure:
         """Fit to matched keypoints, then twice to patches of the base image aligned through that fit.
 
@@ -310,7 +411,7 @@ class _FrameFitter:
         harm: at the border of another sensor's image, where few patches align correctly, wrong alignments from the
         larger range shifted the rows by two pixels.
         """
-        fit = self._fit(points, start)
+        fit = self._fit(points, start, stiffness=stiffness)
         if isinstance(fit, Failure):
             return fit
         fine = smooth_fine(self.grey)
@@ -391,7 +492,15 @@ class _FrameFitter:
             return FrameRegistration(None, f"failed:{reason}", *counts)
         coverage = float(np.isfinite(error_map).mean())
         return FrameRegistration(
-            transform, "ok", *counts, _rms(residuals[inliers]), heldout_px, coverage, error_map, points.select(inliers)
+            transform,
+            "ok",
+            *counts,
+            _rms(residuals[inliers]),
+            heldout_px,
+            coverage,
+            error_map,
+            points.select(inliers),
+            fit.stiffness,
         )
 
 

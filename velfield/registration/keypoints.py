@@ -140,15 +140,19 @@ def estimate_homography_prior(
     A failure gives the number of matches and inliers.
     """
     pairs = match_descriptors(descriptors[:PRIOR_POINTS], reference.descriptors)
-    if len(pairs) < _MIN_PRIOR_MATCHES:
-        return Failure(f"{len(pairs)} matches, {_MIN_PRIOR_MATCHES} needed")
-    source, target = undistorted[pairs[:, 0]], reference.xy[pairs[:, 1]]
+    return fit_homography(undistorted[pairs[:, 0]], reference.xy[pairs[:, 1]])
+
+
+def fit_homography(source: FloatArray, target: FloatArray) -> HomographyTransform | Failure:
+    """Homography by MAGSAC from points (n, 2), undistorted px, to points (n, 2), base px; up to half may be wrong."""
+    if len(source) < _MIN_PRIOR_MATCHES:
+        return Failure(f"{len(source)} matches, {_MIN_PRIOR_MATCHES} needed")
     matrix, inliers = cv2.findHomography(
         source, target, cv2.USAC_MAGSAC, _PRIOR_THRESHOLD_PX, maxIters=4000, confidence=0.9999
     )
     n_inliers = 0 if inliers is None else int(inliers.sum())
     if matrix is None or n_inliers < _MIN_PRIOR_MATCHES:
-        return Failure(f"{n_inliers} inliers of {len(pairs)} matches, {_MIN_PRIOR_MATCHES} needed")
+        return Failure(f"{n_inliers} inliers of {len(source)} matches, {_MIN_PRIOR_MATCHES} needed")
     prior = HomographyTransform(np.asarray(matrix / matrix[2, 2], dtype=np.float64))
     if not _is_plausible(prior, source[inliers.ravel() > 0]):
         return Failure(f"the homography of {n_inliers} inliers mirrors, folds or stretches the frame")

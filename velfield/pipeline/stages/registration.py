@@ -1,7 +1,8 @@
 """Stage ``registration``: every frame of a unit to the base image and to the frame before it, in chains."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 from threading import Lock
 
@@ -10,7 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from schemas.arrays import Mask
+from schemas.arrays import GreyImage, Mask
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.registration.intrasensor import BaseReference, FrameRegistration, prepare_base, register_chain
@@ -62,9 +63,8 @@ def create_registration_store(plan: Plan) -> None:
     )
 
 
-def register_unit(plan: Plan, frames: range, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageResult:
+def register_unit(plan: Plan, frames: range) -> StageResult:
     """Chain a unit's frames in chains of ``chain_length_frames``, each started from the base image."""
-    keypoints = {found.frame: found.keypoints for block in blocks for found in block}
     store = open_frames(plan.layout.frames)
     flags = store.column("flags")
     reference, lens, config = base_reference(plan), read_lens(plan.layout), plan.config.registration
@@ -72,17 +72,22 @@ def register_unit(plan: Plan, frames: range, blocks: Sequence[Sequence[FrameKeyp
     for start in range(frames.start, frames.stop, config.chain_length_frames):
         chain = range(start, min(start + config.chain_length_frames, frames.stop))
         usable = [frame for frame in chain if not flags[frame] & int(UNUSABLE)]
-        found = register_chain(_read(store, usable, keypoints), reference, lens, config)
+        found = register_chain(_read(plan, store, usable), reference, lens, config)
         results.update(zip(usable, found, strict=True))
         advance("registration", len(chain))
     return _write(plan, frames, flags, results)
 
 
 def _read(
-    store: FrameStore, frames: Sequence[int], keypoints: dict[int, Keypoints]
-) -> Iterator[tuple[int, NDArray[np.uint8], Keypoints]]:
+    plan: Plan, store: FrameStore, frames: Sequence[int]
+) -> Iterator[tuple[int, NDArray[np.uint8], Callable[[], Keypoints]]]:
     for frame in frames:
-        yield frame, store.read(frame), keypoints[frame]
+        grey = store.read(frame)
+        yield frame, grey, lru_cache(maxsize=1)(partial(_detect_keypoints, plan, frame, grey))
+
+
+def _detect_keypoints(plan: Plan, frame: int, grey: GreyImage) -> Keypoints:
+    return detect_keypoints(grey, plan.config.registration, vehicle_free_mask(plan, frame, grey.shape))
 
 
 def _write(plan: Plan, frames: range, flags: NDArray[np.uint16], results: dict[int, FrameRegistration]) -> StageResult:
@@ -136,12 +141,9 @@ def lost_frames(plan: Plan) -> tuple[str, ...]:
 
 
 def detect_unit_keypoints(plan: Plan, frames: Sequence[int]) -> list[FrameKeypoints]:
-    """Detect the keypoints of a block of frames: the expensive part of registration, which runs in parallel."""
-    store, config = open_frames(plan.layout.frames), plan.config.registration
-    return [
-        FrameKeypoints(frame, detect_keypoints(store.read(frame), config, vehicle_free_mask(plan, frame, store.shape)))
-        for frame in frames
-    ]
+    """Detect the keypoints of a block of frames."""
+    store = open_frames(plan.layout.frames)
+    return [FrameKeypoints(frame, _detect_keypoints(plan, frame, store.read(frame))) for frame in frames]
 
 
 def external_boxes(plan: Plan) -> pd.DataFrame:
