@@ -66,7 +66,7 @@ def test_positions_and_orientations_are_decoded_from_a_heatmap(monkeypatch: pyte
 
     monkeypatch.setattr(model, "predict_heatmap", lambda network, image: (heatmap, orientation.transpose(2, 0, 1)))
     monkeypatch.setattr(model, "forward", predict_crops)
-    found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None)
+    found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None, (0.25, 0.5))
     assert len(found) == 4
     distance, difference = nearest(found, np.column_stack([centres, angles]))
     assert distance.max() < 0.15
@@ -87,13 +87,15 @@ def test_crops_that_disagree_on_the_orientation_make_it_uncertain(monkeypatch: p
 
     monkeypatch.setattr(model, "predict_heatmap", lambda network, image: (heatmap, orientation.transpose(2, 0, 1)))
     monkeypatch.setattr(model, "forward", predict_crops)
-    found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None)
+    found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None, (0.25, 0.5))
     assert found.shape == (1, 5)
     assert found[0, 4] > np.radians(45)
 
 
 @pytest.mark.parametrize(("factor", "looks"), [(1.0, 0), (0.45, 2), (0.24, 0)])
-def test_only_unsure_candidates_are_looked_at_again(monkeypatch: pytest.MonkeyPatch, factor: float, looks: int) -> None:
+def test_only_candidates_of_the_chosen_probabilities_are_looked_at_again(
+    monkeypatch: pytest.MonkeyPatch, factor: float, looks: int
+) -> None:
     heatmap, orientation, _ = encode_targets(np.array([[40.5, 40.5]]), np.array([0.5]))
     heatmap *= np.float32(factor)
     seen = []
@@ -104,7 +106,7 @@ def test_only_unsure_candidates_are_looked_at_again(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(model, "predict_heatmap", lambda network, image: (heatmap, orientation.transpose(2, 0, 1)))
     monkeypatch.setattr(model, "forward", predict_crops)
-    found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None)
+    found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None, (0.25, 0.5))
     assert sum(seen) == looks
     if not looks:
         assert all(axial_difference(found[:, 2], np.full(len(found), 0.5)) < 0.02)
@@ -115,11 +117,11 @@ def test_an_image_without_peaks_has_no_detections() -> None:
 
 
 def test_detections_shift_with_the_image() -> None:
-    moved = np.roll(scene(), (12, 8), axis=(0, 1))
+    moved = np.roll(scene(), (16, 8), axis=(0, 1))
     inner = likely(scene_detections())
     inner = inner[((inner[:, :2] > 35) & (inner[:, :2] < 100)).all(axis=1)]
     assert len(inner) >= 2
-    distance, difference = nearest(likely(detect_cars(network(), moved, None)), inner + np.array([8, 12, 0, 0, 0]))
+    distance, difference = nearest(likely(detect_cars(network(), moved, None)), inner + np.array([8, 16, 0, 0, 0]))
     assert distance.max() < 0.1
     assert difference.max() < 0.02
 

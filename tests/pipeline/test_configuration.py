@@ -38,8 +38,8 @@ def test_a_method_and_its_keys_are_set_in_any_order(settings: Sequence[str], pre
 
 
 def test_a_preset_sets_keys_of_its_own_method_only() -> None:
-    assert resolve_config(preset="fast").detection == CascadeConfig(rounds=300, feature_pool=1500, folds=2)
-    assert resolve_config(preset="fast", settings=["detection.method=cnn"]).detection == CnnConfig()
+    quick = CascadeTraining(rounds=300, feature_pool=1500, folds=2)
+    assert resolve_config(preset="fast").detection == CnnConfig(fine_tune_steps=80, cascade=quick)
     fast = resolve_config(preset="fast", settings=["detection.method=cascade", "detection.rounds=200"]).detection
     assert fast == CascadeConfig(rounds=200, feature_pool=1500, folds=2)
 

@@ -71,14 +71,16 @@ def resolve_config(
 
 
 def _of_methods(preset: Mapping[str, Any], given: Mapping[str, Any]) -> Tree:
-    """A preset without the sections for whose ``method`` another one is given: its keys belong to its own method."""
+    """A preset for the methods that are given: a section's keys belong to its own method, or to one that it names."""
 
-    def is_kept(name: str) -> bool:
+    def of_method(name: str) -> Any:
         section = given.get(name)
         method = section.get("method") if isinstance(section, Mapping) else None
-        return method is None or method == preset[name].get("method", method)
+        if method is None or method == preset[name].get("method", method):
+            return preset[name]
+        return preset[name].get(method)
 
-    return {name: section for name, section in preset.items() if is_kept(name)}
+    return {name: section for name in preset if (section := of_method(name)) is not None}
 
 
 def _read(file: Path) -> Tree:
