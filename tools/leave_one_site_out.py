@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from schemas.detector import CnnConfig
+from tools.pretraining import pretrain
 from velfield.detection.cnn.detector import CnnDetector
-from velfield.detection.cnn.fine_tuning import evaluate_network, make_record, select_threshold, train_from_scratch
+from velfield.detection.cnn.fine_tuning import evaluate_network, make_record, select_threshold
 from velfield.detection.cnn.model import Network
 from velfield.detection.evaluation import HeldOutScores, merge_scores
 from velfield.detection.samples import LabelledImage
@@ -27,9 +28,11 @@ class Site:
 
 
 def train_leave_one_site_out(
-    sites: Sequence[Site], extra: Sequence[LabelledImage], *, seed: int, steps: int
+    sites: Sequence[Site], extra: Sequence[LabelledImage], *, seed: int, steps: int, teacher: Network | None = None
 ) -> tuple[CnnDetector, dict[str, HeldOutScores]]:
     """Train on all sites and on the ``extra`` images; choose the threshold on held-out sites.
+
+    A ``teacher`` was trained on all sites: the networks of the folds have none.
 
     Returns
     -------
@@ -38,7 +41,7 @@ def train_leave_one_site_out(
 
     def train_fold(held_out: int | None) -> tuple[Network, HeldOutScores | None]:
         if held_out is None:
-            return _train(sites, extra, seed, steps), None
+            return _train(sites, extra, seed, steps, teacher), None
         others = [site for k, site in enumerate(sites) if k != held_out]
         network = _train(others, extra, seed + 1 + held_out, round(_FOLD_STEPS_FRACTION * steps))
         return network, merge_scores([evaluate_network(network, sample) for sample in sites[held_out].evaluation])
@@ -53,6 +56,8 @@ def train_leave_one_site_out(
     return CnnDetector(make_record(network, threshold, curve, cars, CnnConfig())), by_site
 
 
-def _train(sites: Sequence[Site], extra: Sequence[LabelledImage], seed: int, steps: int) -> Network:
+def _train(
+    sites: Sequence[Site], extra: Sequence[LabelledImage], seed: int, steps: int, teacher: Network | None = None
+) -> Network:
     groups = [*(site.training for site in sites), extra]
-    return train_from_scratch(groups, [*(1.0 for _ in sites), _EXTRA_WEIGHT], seed, steps=steps)
+    return pretrain(groups, [*(1.0 for _ in sites), _EXTRA_WEIGHT], seed=seed, steps=steps, teacher=teacher)

@@ -1,6 +1,6 @@
 """Trains the shipped detectors again and prints their accuracy on held-out sites: ``make detector DATA=FOLDER``.
 
-Half an hour on two cores.
+Two hours on two cores; it needs PyTorch (`pip install torch`).
 """
 
 import sys

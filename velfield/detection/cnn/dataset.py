@@ -12,7 +12,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from schemas.arrays import Float32Array, FloatArray
+from schemas.arrays import Float32Array, FloatArray, Mask
 from velfield.detection.cnn.model import STRIDE
 from velfield.detection.cnn.trainer import Batch
 from velfield.detection.orientation import fill_missing_orientation
@@ -38,6 +38,12 @@ _TARGET_MARGIN_PX = 8
 _HEATMAP_PX = np.arange(PATCH_PX // STRIDE) * STRIDE + (STRIDE - 1) / 2
 """Positions of the heatmap's rows and columns in the patch, px."""
 
+_CAMOUFLAGE_PROBABILITY, _CAMOUFLAGED_FRACTION = 0.5, 0.5
+"""Of the patches, and of the cars in such a patch."""
+_CAMOUFLAGE_CONTRAST, _CAMOUFLAGE_SHIFT = (0.25, 0.9), (-0.08, 0.02)
+_CAR_HALF_PX, _ROAD_MEDIAN_PX = (10.0, 5.5), 31
+_EDGE_PROBABILITY = 0.12
+
 
 class PatchDataset:
     """Batches of random patches; each follows from its number and the seed alone.
@@ -50,9 +56,14 @@ class PatchDataset:
         Sampling weight of each group, whatever its number of images.
     seed
         Of all random numbers.
+    hard
+        Bring cars near to the tone of the road about them, and cut patches as the image's edge does: for pre-training.
     """
 
-    def __init__(self, groups: Sequence[Sequence[LabelledImage]], weights: Sequence[float], seed: int) -> None:
+    def __init__(
+        self, groups: Sequence[Sequence[LabelledImage]], weights: Sequence[float], seed: int, *, hard: bool = False
+    ) -> None:
+        self._hard = hard
         self._groups = [[_with_orientations(sample) for sample in group] for group in groups]
         self._probabilities = np.array(weights, float) / np.sum(weights)
         self._seed = seed
@@ -69,7 +80,7 @@ class PatchDataset:
         patches = []
         for _ in range(BATCH_SIZE):
             group = self._groups[rng.choice(len(self._groups), p=self._probabilities)]
-            patches.append(_sample_patch(group[rng.integers(len(group))], rng))
+            patches.append(_sample_patch(group[rng.integers(len(group))], rng, hard=self._hard))
         return Batch(*(np.stack(part) for part in zip(*patches, strict=True)))
 
 
@@ -78,7 +89,7 @@ def _with_orientations(sample: LabelledImage) -> LabelledImage:
 
 
 def _sample_patch(
-    sample: LabelledImage, rng: np.random.Generator
+    sample: LabelledImage, rng: np.random.Generator, *, hard: bool = False
 ) -> tuple[Float32Array, Float32Array, Float32Array, Float32Array, Float32Array]:
     """A patch and its targets, in the order of `Batch`."""
     matrix = _random_similarity(sample, rng)
@@ -87,7 +98,10 @@ def _sample_patch(
     patch = cv2.warpAffine(image, window_matrix, (PATCH_PX, PATCH_PX), borderMode=cv2.BORDER_REFLECT_101)
     centres = sample.cars[:, :2] @ matrix[:, :2].T + matrix[:, 2]
     direction = np.column_stack([np.cos(sample.cars[:, 2]), np.sin(sample.cars[:, 2])]) @ matrix[:, :2].T
-    heatmap, orientation, orientation_weight = encode_targets(centres, np.arctan2(direction[:, 1], direction[:, 0]))
+    angles = np.arctan2(direction[:, 1], direction[:, 0])
+    if hard:
+        patch = _camouflage_cars(patch, centres, angles, rng)
+    heatmap, orientation, orientation_weight = encode_targets(centres, angles)
     valid = np.ones(image.shape, bool) if sample.valid is None else sample.valid[rows, columns]
     valid_patch = cv2.warpAffine(valid.astype(np.uint8), window_matrix, (PATCH_PX, PATCH_PX), flags=cv2.INTER_NEAREST)
     mask = valid_patch[::STRIDE, ::STRIDE] > 0
@@ -98,7 +112,42 @@ def _sample_patch(
     for x, y, radius in circles[nearby]:
         ignored = np.hypot(_HEATMAP_PX[None, :] - x, _HEATMAP_PX[:, None] - y) < radius + STRIDE
         mask &= ~ignored | (heatmap > 0.1)
+    if hard and rng.random() < _EDGE_PROBABILITY:
+        patch = _cut_by_edge(patch, mask, rng)
     return _augment_photometry(patch, rng), heatmap, mask.astype(np.float32), orientation, orientation_weight * mask
+
+
+def _camouflage_cars(
+    patch: Float32Array, centres: FloatArray, angles: FloatArray, rng: np.random.Generator
+) -> Float32Array:
+    """Draw some cars in a tone nearer to that of the road about them, and darker: what a detector misses most."""
+    near = np.flatnonzero(((centres > -_TARGET_MARGIN_PX) & (centres < PATCH_PX + _TARGET_MARGIN_PX)).all(axis=1))
+    if not len(near) or rng.random() > _CAMOUFLAGE_PROBABILITY:
+        return patch
+    road = cv2.medianBlur((np.clip(patch, 0, 1) * 255).astype(np.uint8), _ROAD_MEDIAN_PX).astype(np.float32) / 255
+    y, x = np.mgrid[:PATCH_PX, :PATCH_PX].astype(np.float32)
+    for (cx, cy), angle in zip(centres[near], angles[near], strict=True):
+        if rng.random() > _CAMOUFLAGED_FRACTION:
+            continue
+        along = np.abs(np.cos(angle) * (x - cx) + np.sin(angle) * (y - cy)) / _CAR_HALF_PX[0]
+        across = np.abs(-np.sin(angle) * (x - cx) + np.cos(angle) * (y - cy)) / _CAR_HALF_PX[1]
+        cover = np.clip(3 - 2 * np.maximum(along, across), 0, 1).astype(np.float32)
+        contrast, darker = rng.uniform(*_CAMOUFLAGE_CONTRAST), rng.uniform(*_CAMOUFLAGE_SHIFT)
+        patch = patch * (1 - cover) + cover * (road + contrast * (patch - road) + darker)
+    return np.asarray(patch, np.float32)
+
+
+def _cut_by_edge(patch: Float32Array, mask: Mask, rng: np.random.Generator) -> Float32Array:
+    """Continue a patch beyond a vertical line by its mirror image, as inference pads a frame; what is beyond it is not
+    counted."""
+    edge = int(rng.integers(20, PATCH_PX - 20))
+    if edge > PATCH_PX // 2:
+        mask[:, (edge + 1) // STRIDE :] = False
+        cut = cv2.copyMakeBorder(patch[:, :edge], 0, 0, 0, PATCH_PX - edge, cv2.BORDER_REFLECT_101)
+    else:
+        mask[:, : edge // STRIDE] = False
+        cut = cv2.copyMakeBorder(patch[:, edge:], 0, 0, edge, 0, cv2.BORDER_REFLECT_101)
+    return np.asarray(cut, np.float32)
 
 
 def _random_similarity(sample: LabelledImage, rng: np.random.Generator) -> FloatArray:
