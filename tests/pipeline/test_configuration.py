@@ -39,7 +39,7 @@ def test_a_method_and_its_keys_are_set_in_any_order(settings: Sequence[str], pre
 
 def test_a_preset_sets_keys_of_its_own_method_only() -> None:
     quick = CascadeTraining(rounds=300, feature_pool=1500, folds=2)
-    assert resolve_config(preset="fast").detection == CnnConfig(fine_tune_steps=80, cascade=quick)
+    assert resolve_config(preset="fast").detection == CnnConfig(fine_tune_steps=120, cascade=quick)
     fast = resolve_config(preset="fast", settings=["detection.method=cascade", "detection.rounds=200"]).detection
     assert fast == CascadeConfig(rounds=200, feature_pool=1500, folds=2)
 

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from velfield.camera.lens import HarrisLens, pinhole
+from velfield.registration import warp
 from velfield.registration.background import median_background
 from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, fit_normalisation
 from velfield.registration.warp import footprint, warp_to_base
@@ -51,6 +52,26 @@ def test_every_working_pixel_holds_its_own_raw_coordinate(scale: float, window: 
         assert np.abs(error).max() < (0.6 if scale >= 1 else 1.1)
         assert abs(float(error.mean())) < 0.3
         assert not image[~mask].any()
+
+
+@pytest.mark.parametrize(("amplitude_px", "cell_px"), [(0.3, 16), (6.0, 8)])
+def test_cells_are_small_where_the_rows_wobble_fast(amplitude_px: float, cell_px: int) -> None:
+    """Four cycles over 480 rows: what bilinear interpolation leaves stays below a fifth of a pixel either way."""
+    rows = np.zeros((3, 48))
+    rows[0] = amplitude_px * np.sin(np.linspace(0, 2 * np.pi * 4, 48))
+    moved = FrameTransform(
+        width=640,
+        height=480,
+        lens=pinhole((480, 640)),
+        polyprojective=PolyprojectiveTransform.from_homography(np.eye(3), *[np.array([320.0, 240.0, 1 / 400])] * 2),
+        row_coefficients=rows,
+    )
+    step, coarse = warp._interpolable_map(moved, window=(0, 0, 640, 480), scale=1.0, shape=(480, 640))
+    assert step == cell_px
+    dense = cv2.resize(coarse.astype(np.float32), None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
+    y, x = np.mgrid[60:420:7, 60:580:7]
+    exact = moved.to_raw(np.stack([x.ravel(), y.ravel()], axis=1).astype(float)).reshape(*x.shape, 2)
+    assert np.abs(dense[step : step + 480, step : step + 640][y, x] - exact).max() < 0.2
 
 
 def test_shrinking_averages_in_place_of_skipping() -> None:

@@ -1,8 +1,8 @@
 """Rectification: a raw frame resampled once onto the base image's grid.
 
-The inverse map, output pixels to raw pixels, is exact at the centres of cells of ``step`` px and interpolated
-bilinearly between; inverting every pixel would cost fifty times as much and change the map by a few hundredths of a
-pixel.
+The inverse map, output pixels to raw pixels, is exact at the centres of cells of 16 px and interpolated bilinearly
+between, or of 8 px where the map bends by more than a twentieth of a pixel in between (fast rolling shutter). Inverting
+every pixel would cost a hundred times as much.
 """
 
 from typing import Protocol
@@ -19,6 +19,10 @@ _INVALID = -1e5
 _MIN_SHRINK = 1.35
 """At this many raw pixels per output pixel or more the raw frame is area-averaged first; below, aliasing is slight."""
 _BORDER_POINTS = 64
+_CELL_PX = 16, 8
+"""Sides of the cells that are tried, output px."""
+_CHECKS, _MAX_BEND_PX = 24, 0.05
+"""Rows and columns of places where interpolation is checked, and the error that is allowed there."""
 
 
 class RawToBase(Protocol):
@@ -39,7 +43,6 @@ def warp_to_base(
     *,
     window: Window,
     scale: float = 1.0,
-    step: int = 8,
     interpolation: int = cv2.INTER_LINEAR,
     replicate_border: bool = False,
 ) -> tuple[GreyImage, Mask]:
@@ -53,8 +56,6 @@ def warp_to_base(
         x, y, width, height of the output window, base px.
     scale
         Output px per base px. Output pixel (i, j) lies at base x = x0 + (j + 0.5) / scale - 0.5, y likewise.
-    step
-        Side of the cells at whose centres the map is exact, output px.
     interpolation
         OpenCV's flag: linear by default, cubic for base images.
     replicate_border
@@ -66,7 +67,7 @@ def warp_to_base(
     true inside the frame.
     """
     shape = round(window[3] * scale), round(window[2] * scale)
-    coarse = _coarse_map(transform, window=window, scale=scale, step=step, shape=shape)
+    step, coarse = _interpolable_map(transform, window=window, scale=scale, shape=shape)
     source, map_xy = _downscale(grey_raw, coarse, step=step)
     dense = cv2.resize(map_xy, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
     dense = dense[step : step + shape[0], step : step + shape[1]]
@@ -77,6 +78,27 @@ def warp_to_base(
     if not replicate_border:
         image[~mask] = 0
     return np.asarray(image, dtype=np.uint8), np.asarray(mask)
+
+
+def _interpolable_map(
+    transform: RawToBase, *, window: Window, scale: float, shape: tuple[int, int]
+) -> tuple[int, FloatArray]:
+    """Side of the cells, output px, and raw coordinates at their centres: large cells where interpolation is accurate.
+
+    It is least accurate in the middle between four centres: there some are compared with the exact map.
+    """
+    step = _CELL_PX[0]
+    coarse = _coarse_map(transform, window=window, scale=scale, step=step, shape=shape)
+    rows, columns = (np.unique(np.linspace(0, size - 2, _CHECKS).round().astype(np.int64)) for size in coarse.shape[:2])
+    at = np.ix_(rows, columns)
+    between = (coarse[at] + coarse[np.ix_(rows + 1, columns)] + coarse[np.ix_(rows, columns + 1)]) / 4
+    between += coarse[np.ix_(rows + 1, columns + 1)] / 4
+    x, y = (columns * step - 0.5) / scale, (rows * step - 0.5) / scale  # the corner that four cells share
+    base_x, base_y = np.meshgrid(window[0] + (x + 0.5 / scale) - 0.5, window[1] + (y + 0.5 / scale) - 0.5)
+    exact = transform.to_raw(np.stack([base_x.ravel(), base_y.ravel()], axis=1)).reshape(between.shape)
+    if not (np.abs(between - exact)[np.isfinite(exact + between)] > _MAX_BEND_PX).any():
+        return step, coarse
+    return _CELL_PX[1], _coarse_map(transform, window=window, scale=scale, step=_CELL_PX[1], shape=shape)
 
 
 def _coarse_map(transform: RawToBase, *, window: Window, scale: float, step: int, shape: tuple[int, int]) -> FloatArray:
