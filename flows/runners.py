@@ -115,7 +115,7 @@ def _cluster(config: RunnerConfig) -> Iterator[Any]:
     if config.scheduler is not None:
         yield config.scheduler
         return
-    cluster_class, arguments = _local_cluster(config) if config.cluster_class is None else _class_of(config)
+    cluster_class, arguments = _local_cluster(config) if config.cluster_class is None else _import_class(config)
     with cluster_class(**arguments) as cluster:
         if config.cluster_class is not None:
             cluster.scale(config.workers)
@@ -129,7 +129,7 @@ def _local_cluster(config: RunnerConfig) -> tuple[Any, dict[str, Any]]:
     return LocalCluster, {"n_workers": config.workers, "threads_per_worker": 1, **here}
 
 
-def _class_of(config: RunnerConfig) -> tuple[Any, dict[str, Any]]:
+def _import_class(config: RunnerConfig) -> tuple[Any, dict[str, Any]]:
     module, _, name = str(config.cluster_class).rpartition(".")
     try:
         return getattr(importlib.import_module(module), name), config.cluster_kwargs

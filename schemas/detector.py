@@ -249,7 +249,7 @@ class CnnRecord(BaseRecord):
     """The network as an ONNX model, base64; none in a file that was of format version 1."""
     layers: dict[str, LayerRecord] | None = Field(default=None, max_length=100)
     """The network of a file that was of format version 1."""
-    second_look: tuple[float, float] = (0.0, 1.0)
+    tta_range: tuple[float, float] = (0.0, 1.0)
     """Probabilities between which a candidate is scored again on rotated crops."""
     motion: MotionRecord | None = None
     """The bonus of moving objects; none: it reads no background."""

@@ -194,7 +194,7 @@ def of_version_1(record: BaseRecord) -> dict[str, object]:
     found = renamed(json.loads(record.model_dump_json(exclude={"response_sigma_px", "min_region_px"})))
     assert isinstance(found, dict)
     if isinstance(record, CnnRecord):
-        del found["onnx"], found["second_look"]
+        del found["onnx"], found["tta_range"]
         layers = layers_of(random_network(0, FORMER_TOPOLOGY))
         found["network"] = {old_layers[name]: layer.model_dump(mode="json") for name, layer in layers.items()}
     every = {"rounds": [], "network": None, "motion": None, "grey_bits": 8, "contrast_floor": None, "proposer": None}

@@ -60,7 +60,7 @@ class CnnDetector(Detector):
     ) -> Detections:
         """Detect cars: peaks of the heatmap, the motion bonus, non-maximum suppression, long vehicles centred."""
         length_px, motion = self.record.working_car_length_px, self.record.motion
-        rows = detect_cars(self.network, image, valid, self.record.second_look)
+        rows = detect_cars(self.network, image, valid, self.record.tta_range)
         if motion is not None and background is not None:
             difference = background_difference_at(image, background, rows[:, :2], length_px)
             rows[:, 3] += motion_score_bonus(motion, difference)

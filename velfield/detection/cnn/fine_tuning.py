@@ -15,7 +15,7 @@ from schemas.arrays import Float32Array, Mask
 from schemas.detector import CnnConfig, CnnRecord, PrecisionRecallCurve
 from velfield.detection.cascade.classifier import nms_oriented
 from velfield.detection.cnn.dataset import PatchDataset
-from velfield.detection.cnn.model import NO_SECOND_LOOK, Network, detect_cars, network_to_record, predict_heatmap
+from velfield.detection.cnn.model import NO_TTA, Network, detect_cars, network_to_record, predict_heatmap
 from velfield.detection.cnn.trainer import Trainer, train
 from velfield.detection.evaluation import (
     FOLDS_DESCRIPTION,
@@ -74,7 +74,7 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: "CnnDetector", confi
     folds = _FOLDS if count >= MIN_CARS_FOR_FOLDS else 0
     tasks: list[int | None] = [None, *range(folds)]
     (network, _), *held_out = parallel_map(
-        lambda fold: _fine_tune_fold(masked, pretrained.network, config, fold, pretrained.record.second_look), tasks
+        lambda fold: _fine_tune_fold(masked, pretrained.network, config, fold, pretrained.record.tta_range), tasks
     )
     evidence = merge_scores([part for _, parts in held_out for part in parts]) if held_out else None
     threshold, curve = select_threshold(evidence, pretrained.threshold, FOLDS_DESCRIPTION)
@@ -86,7 +86,7 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: "CnnDetector", confi
     record = make_record(network, threshold if config.threshold is None else config.threshold, curve, count, config)
     return type(pretrained)(
         record.model_copy(
-            update={"attribution": pretrained.record.attribution, "second_look": pretrained.record.second_look}
+            update={"attribution": pretrained.record.attribution, "tta_range": pretrained.record.tta_range}
         )
     )
 
@@ -122,7 +122,7 @@ def make_record(
 ) -> CnnRecord:
     """Content of the detector file."""
     return CnnRecord(
-        second_look=NO_SECOND_LOOK,
+        tta_range=NO_TTA,
         working_car_length_px=config.working_car_length_px,
         onnx=network_to_record(network),
         threshold=float(threshold),
@@ -136,7 +136,7 @@ def _fine_tune_fold(
     pretrained: Network,
     config: CnnConfig,
     fold: int | None,
-    second_look: tuple[float, float] = NO_SECOND_LOOK,
+    tta_range: tuple[float, float] = NO_TTA,
 ) -> tuple[Network, list[HeldOutScores]]:
     """Fine-tune without a fold's stripes and evaluate on them; without a fold, fine-tune on everything."""
     steps, seed = config.fine_tune_steps, config.seed
@@ -148,7 +148,7 @@ def _fine_tune_fold(
     dataset = PatchDataset([training], [1.0], seed + 1 + fold)
     network = train(Trainer.from_network(pretrained), dataset, steps=steps, learning_rate=_FINE_TUNING_RATE)
     return network, [
-        evaluate_network(network, sample, region, second_look) for sample, region in zip(samples, held_out, strict=True)
+        evaluate_network(network, sample, region, tta_range) for sample, region in zip(samples, held_out, strict=True)
     ]
 
 
@@ -172,10 +172,10 @@ def evaluate_network(
     network: Network,
     sample: LabelledImage,
     region: Mask | None = None,
-    second_look: tuple[float, float] = NO_SECOND_LOOK,
+    tta_range: tuple[float, float] = NO_TTA,
 ) -> HeldOutScores:
     """Match a network's detections to the labels of an image, or of a region (h, w) of it."""
-    detections = nms_oriented(detect_cars(network, sample.image, sample.valid, second_look), _NMS_RADIUS_PX)
+    detections = nms_oriented(detect_cars(network, sample.image, sample.valid, tta_range), _NMS_RADIUS_PX)
     detections = detections[detections[:, 3] > MIN_CURVE_SCORE]
     cars = sample.cars
     if region is not None:

@@ -7,7 +7,7 @@ U-Net. `TOPOLOGY` is the one definition of the layers: training, the ONNX graph 
 file derive from it.
 
 Inference is onnxruntime's, with one thread: frames are what is spread over the processors. A detector file holds the
-network as ONNX, but only the weights are read from it, and the graph is built anew from the topology: a file cannot
+network as ONNX, but only the weights are read from it, and the graph is built again from the topology: a file cannot
 bring operators of its own.
 
 Peaks of the heatmap are candidates at sub-pixel positions. Those between two probabilities that the detector file gives
@@ -436,11 +436,11 @@ _MIN_PEAK_PROBABILITY = 0.2
 MIN_SCORE = _MIN_PEAK_PROBABILITY - SCORE_OFFSET
 """Hardly any detection scores lower."""
 _QUARTER_CAR_PX = 4.0
-NO_SECOND_LOOK = 1.0, 1.0
-"""Of the shipped detector: on unseen images its first look alone scores cars as well as both (F1 0.907 and 0.900 on the
-minsk clip), at a third of the cost."""
-EVERY_SECOND_LOOK = 0.0, 1.0
-"""All candidates are scored again where the distribution of the scores counts: self-training compares that of
+NO_TTA = 1.0, 1.0
+"""No test-time augmentation (TTA), as in the shipped detector: on unseen images it scored cars no better (F1 0.900 in
+place of 0.907 on the minsk clip), at three times the cost."""
+FULL_TTA = 0.0, 1.0
+"""TTA of all candidates, where the distribution of the scores counts: self-training compares that of
 stationary cars to that of moving ones, which it was trained on. Otherwise it found 0.16 of the stationary cars on a
 simulated flight in place of 0.69."""
 _CROP_PX = 48
@@ -453,7 +453,7 @@ _CANDIDATES_PER_BATCH = 8
 
 
 def detect_cars(
-    network: Network, image: GreyImage, valid: Mask | None, second_look: tuple[float, float] = NO_SECOND_LOOK
+    network: Network, image: GreyImage, valid: Mask | None, tta_range: tuple[float, float] = NO_TTA
 ) -> FloatArray:
     """Detect cars in a frame; a car may be detected several times, see `classifier.distinct`.
 
@@ -473,7 +473,7 @@ def detect_cars(
     xy = (np.column_stack([x, y]) + _subpixel_peak_offset(smooth, y, x)) * STRIDE + (STRIDE - 1) / 2
     vector = orientation[:, y, x].T.astype(np.float64)
     score = smooth[y, x].astype(np.float64)
-    unsure = np.flatnonzero((score > second_look[0]) & (score < second_look[1]))
+    unsure = np.flatnonzero((score > tta_range[0]) & (score < tta_range[1]))
     if len(unsure):
         axis = 0.5 * np.arctan2(vector[unsure, 1], vector[unsure, 0])
         probabilities, vectors = _predict_rotated_crops(network, image, xy[unsure], axis)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from schemas.arrays import FloatArray, GreyImage
 from schemas.detector import CnnConfig, MotionRecord, PrecisionRecallCurve
 from velfield.detection.cnn.fine_tuning import fine_tune_interpolated
-from velfield.detection.cnn.model import EVERY_SECOND_LOOK, MIN_SCORE, background_difference_at, network_to_record
+from velfield.detection.cnn.model import FULL_TTA, MIN_SCORE, background_difference_at, network_to_record
 from velfield.detection.detect import detect_frame
 from velfield.detection.evaluation import f_measure_plateau, to_curve_record
 from velfield.detection.motion.difference import MotionFrame
@@ -75,7 +75,7 @@ def self_train_from_motion(
     update = {
         "onnx": network_to_record(network),
         "layers": None,
-        "second_look": EVERY_SECOND_LOOK,
+        "tta_range": FULL_TTA,
         "curve": None,
         "motion": None,
     }
