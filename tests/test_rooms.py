@@ -15,6 +15,8 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS = {"schemas": 0, "velfield": 1, "flows": 2, "tools": 3}
 SCIENCE = ("sources", "camera", "registration", "detection", "tracking", "field", "analysis")
 """Arrays in, arrays out: no run folder, no graph."""
+ONLY_IN_TOOLS = ("torch",)
+"""Libraries of developers' tools that are in no environment of ours: torch's wheel brings gigabytes of CUDA."""
 MAX_ROOMS, MAX_ARROWS, MAX_LOOSE_MODULES, MAX_FILES = 18, 55, 5, 18
 
 
@@ -56,17 +58,33 @@ def test_imports_go_down_the_floors() -> None:
     assert upward == []
 
 
+def names_of(module: str) -> set[str]:
+    """What a module offers; of a tool whose library is not in the environment, what its text defines."""
+    try:
+        return set(dir(importlib.import_module(module)))
+    except ModuleNotFoundError as error:
+        if error.name not in ONLY_IN_TOOLS or not module.startswith("tools."):
+            raise
+    tree = ast.parse((ROOT / Path(*module.split("."))).with_suffix(".py").read_text())
+    return {node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+
+
+def test_only_tools_import_what_velfield_does_not_install() -> None:
+    tools = {path.relative_to(ROOT).as_posix() for path in modules() if path.is_relative_to(ROOT / "tools")}
+    assert violations(dict.fromkeys(ONLY_IN_TOOLS, tools)) == []
+
+
 def test_every_import_within_the_house_is_there() -> None:
     """Those inside functions too, which nothing imports before a command runs."""
     missing = []
     for path in modules():
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in FLOORS:
-                module = importlib.import_module(node.module)
+                names = names_of(node.module)
                 missing += [
                     f"{path.relative_to(ROOT)}:{node.lineno}: {node.module}.{alias.name}"
                     for alias in node.names
-                    if not hasattr(module, alias.name) and find_spec(f"{node.module}.{alias.name}") is None
+                    if alias.name not in names and find_spec(f"{node.module}.{alias.name}") is None
                 ]
     assert missing == []
 

@@ -6,6 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.arrays import FloatArray, GreyImage
+from velfield.bench.scenes import simulated_image
+from velfield.detection.cnn import dataset
 from velfield.detection.cnn.dataset import BATCH_SIZE, HEATMAP_SIGMA_PX, PATCH_PX, PatchDataset, encode_targets
 from velfield.detection.cnn.model import STRIDE
 from velfield.detection.cnn.trainer import Batch
@@ -209,3 +211,38 @@ def test_unlabelled_orientations_are_filled_in_from_the_image() -> None:
     cell = expected.heatmap > 0.5
     angles = (0.5 * np.arctan2(part.orientation[cell][:, 1], part.orientation[cell][:, 0]) for part in (made, expected))
     assert np.quantile(axial_difference(*angles), 0.9) < np.radians(6)
+
+
+def test_camouflage_brings_cars_nearer_to_the_road_and_leaves_the_rest() -> None:
+    patch = np.full((PATCH_PX, PATCH_PX), 0.4, np.float32)
+    patch[44:52, 40:56] = 0.9
+    centre, angle = np.array([[47.5, 47.5]]), np.zeros(1)
+    contrasts = []
+    for seed in range(40):
+        changed = dataset._camouflage_cars(patch.copy(), centre, angle, np.random.default_rng(seed))
+        np.testing.assert_array_equal(changed[:30], patch[:30])
+        contrasts.append(float(changed[47, 48] - changed[10, 10]))
+    assert min(contrasts) < 0.25  # of 0.5
+    assert np.isclose(contrasts, 0.5).sum() > 10  # most patches and half of the cars stay as they are
+    assert max(contrasts) <= 0.52
+
+
+def test_beyond_the_edge_lies_the_mirror_image_which_is_not_counted() -> None:
+    for seed in range(8):
+        patch = np.random.default_rng(seed).random((PATCH_PX, PATCH_PX)).astype(np.float32)
+        mask = np.ones((PATCH_PX // STRIDE,) * 2, bool)
+        cut = dataset._cut_by_edge(patch, mask, np.random.default_rng(seed))
+        kept = np.flatnonzero((cut == patch).all(axis=0))
+        edge = kept[-1] if kept[0] == 0 else kept[0]
+        step = 1 if kept[0] == 0 else -1
+        np.testing.assert_array_equal(cut[:, edge + step], patch[:, edge - step])
+        counted = np.flatnonzero(mask.all(axis=0))
+        assert 0 < len(counted) < PATCH_PX // STRIDE
+        assert abs(len(counted) * STRIDE - len(kept)) <= STRIDE
+
+
+def test_hard_patches_are_an_option_of_pretraining() -> None:
+    sample = simulated_image(9504)
+    plain, hard = PatchDataset([[sample]], [1.0], 0)(0), PatchDataset([[sample]], [1.0], 0, hard=True)(0)
+    assert plain.images.shape == hard.images.shape
+    assert not np.array_equal(plain.images, hard.images)
