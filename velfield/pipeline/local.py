@@ -19,7 +19,7 @@ from velfield.pipeline.stage import STAGE, STAGES
 from velfield.pipeline.units import prepare_stage, stage_units
 
 _TINY = SimulationConfig(frames=9, width=480, height=360, seed=3)
-_QUICK = {"detection.rounds": 8, "detection.feature_pool": 40, "registration.max_keypoints": 800, "gsd_m": 0.23}
+_QUICK = {"detection.fine_tune_steps": 2, "registration.max_keypoints": 800, "gsd_m": 0.23}
 
 
 def compute_stages(plan: Plan, stages: Iterable[str] = tuple(STAGE)) -> None:
