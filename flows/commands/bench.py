@@ -4,6 +4,11 @@ from cyclopts import App
 
 bench = App(name="bench", help="Speed and accuracy, against a peer in the same run.")
 bench.command(
+    "flows.commands.bench_speed:speed",
+    name="speed",
+    help="What each stage of the whole job costs on one core, and the network against the machine's peak.",
+)
+bench.command(
     "flows.commands.bench_registration:registration",
     name="registration",
     help="Register simulated flights of unseen seeds: errors against the truth, beside stabilo.",

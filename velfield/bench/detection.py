@@ -18,6 +18,7 @@ from velfield.detection.boosting import BoostedStumps, draw_feature_pool
 from velfield.detection.cascade.classifier import PoseScorer, offset_grid
 from velfield.detection.cascade.detector import CascadeDetector
 from velfield.detection.cascade.feature_image import compute_features
+from velfield.detection.cnn.model import TOPOLOGY, DepthToSpace, Residual, SpaceToDepth, Topology
 from velfield.detection.detect import detect_frame
 from velfield.detection.detector import Detector
 from velfield.detection.paper.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, dense_response, quantise_and_pad
@@ -165,6 +166,32 @@ def cnn_speed(image: NDArray[np.uint8], detector: Detector) -> Speed:
     for step, taps, into, out in YOLOV8N:
         peer += _convolution_seconds((image.shape[0] // step, image.shape[1] // step), taps, into, out)
     return Speed("the shipped CNN", "convolutions of YOLOv8n's sizes in onnxruntime", fast, peer)
+
+
+def network_gflop(width: int, height: int) -> float:
+    """Arithmetic of the shipped network on a frame, GFLOP (two a multiplication and addition), margins aside."""
+
+    def flop(layers: Topology, scale: float) -> tuple[float, float]:
+        total = 0.0
+        for layer in layers:
+            if isinstance(layer, SpaceToDepth):
+                scale /= 2
+            elif isinstance(layer, DepthToSpace):
+                scale *= 2
+            elif isinstance(layer, Residual):
+                total += flop(layer.layers, scale)[0]
+            else:
+                scale /= layer.stride
+                total += 2.0 * np.prod(layer.shape) * scale**2
+        return float(total), scale
+
+    return flop(TOPOLOGY, 1.0)[0] * width * height / 1e9
+
+
+def matmul_gflops(size: int = 1024) -> float:
+    """What this machine does in a product of float32 matrices, GFLOP/s; one core where BLAS is held to one thread."""
+    a = np.ones((size, size), np.float32)
+    return 2.0 * size**3 / _fastest(lambda: a @ a, 7) / 1e9
 
 
 def _convolution_seconds(size: tuple[int, int], taps: int, into: int, out: int) -> float:

@@ -1,0 +1,77 @@
+"""``velfield bench speed``: what each stage of the whole job costs, on one core, and against the machine's peak."""
+
+import resource
+import tempfile
+import time
+from contextlib import nullcontext
+from pathlib import Path
+
+from flows.options import parse_frame_size
+
+PER_FRAME = ("frames", "quality", "registration", "detections", "tracklets")
+"""Stages whose cost grows with the frames; field and tracks grow with the traffic, the rest is set-up."""
+
+
+def speed(*, frames: int = 12, size: str = "2560x1920", preset: str = "fast", work: Path | None = None) -> int:
+    """Time every stage on one core, without Prefect: ms a frame and processor time; memory; the network's GFLOP/s.
+
+    Parameters
+    ----------
+    frames
+        Of the simulated flight (seed 77); its first labels train the detector.
+    size
+        Frame size, WxH in pixels.
+    preset
+        best or fast.
+    work
+        Folder for flight and run, kept; a flight that is there is used again. Default: a temporary one.
+    """
+    from flows.launch import limit_threads, prepare_process
+
+    limit_threads()
+    prepare_process(verbose=False)
+    from schemas.job import Inputs, Job
+    from schemas.simulation import SimulationConfig
+    from velfield.bench.detection import city, cnn_speed, matmul_gflops, network_gflop
+    from velfield.detection.detector import shipped_detector
+    from velfield.pipeline.configuration import resolve_config
+    from velfield.pipeline.local import compute_stages
+    from velfield.pipeline.plan import make_plan, write_flight_record
+    from velfield.pipeline.stage import STAGE
+    from velfield.synthetic import write_flight
+
+    width, height = parse_frame_size(size, "480 or more each, as 2560x1920", min_px=480)
+    with nullcontext(work) if work is not None else tempfile.TemporaryDirectory(prefix="velfield-speed-") as folder:
+        root = Path(str(folder))
+        flight = root / f"flight-{frames}-{width}x{height}"
+        if not (flight / "truth").exists():
+            write_flight(flight, SimulationConfig(frames=frames, width=width, height=height, seed=77))
+        inputs = Inputs(
+            source=str(flight / "frames"),
+            timestamps=str(flight / "timestamps.csv"),
+            base=str(flight / "base.png"),
+            labels=str(flight / "labels.csv"),
+        )
+        config = resolve_config(preset=preset, overrides={"gsd_m": 0.23})
+        plan = make_plan(Job(root=str(root / f"run-{preset}"), inputs=inputs, config=config))
+        write_flight_record(plan)
+        total = 0.0
+        print(f"{frames} frames of {width}x{height}, preset {preset}, one core")
+        for name in STAGE:
+            start, used = time.perf_counter(), time.process_time()
+            compute_stages(plan, [name])
+            wall, used = time.perf_counter() - start, time.process_time() - used
+            each = ""
+            if name in PER_FRAME:
+                total += used
+                each = f"{1000 * used / frames:8.0f} ms a frame"
+            print(f"{name:13} {wall:7.1f} s, {used:7.1f} s of processor {each}")
+    print(f"frames a second and core, set-up apart: {frames / total:.2f}")
+    print(f"peak memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.1f} GB")
+    image, peak = city(width, height), matmul_gflops()
+    network = cnn_speed(image, shipped_detector())
+    gflop = network_gflop(width, height)
+    rate = gflop / network.seconds
+    print(f"network: {gflop:.1f} GFLOP a frame, {rate:.0f} GFLOP/s of a peak of {peak:.0f} (matrix product, float32)")
+    print(network.text())
+    return 0
