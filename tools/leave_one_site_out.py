@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from schemas.detector import CnnConfig
-from tools.pretraining import pretrain
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.fine_tuning import evaluate_network, make_record, select_threshold
 from velfield.detection.cnn.model import Network
@@ -59,5 +58,7 @@ def train_leave_one_site_out(
 def _train(
     sites: Sequence[Site], extra: Sequence[LabelledImage], seed: int, steps: int, teacher: Network | None = None
 ) -> Network:
+    from tools.pretraining import pretrain  # PyTorch, which the tests that read images with these tools need not have
+
     groups = [*(site.training for site in sites), extra]
     return pretrain(groups, [*(1.0 for _ in sites), _EXTRA_WEIGHT], seed=seed, steps=steps, teacher=teacher)

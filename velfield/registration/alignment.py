@@ -290,11 +290,12 @@ def _is_inside(image, start, derivative, shift, reach):  # type: ignore[no-untyp
     return x - dx >= 0.0 and y - dy >= 0.0 and x + dx < width - 1.0 and y + dy < height - 1.0
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _step_inside(image, start, derivative, shift, spacing, centred, gx, gy, sums):  # type: ignore[no-untyped-def]
     """Gauss-Newton step and correlation of a patch that lies in the frame as a whole, in one pass over its pixels.
 
-    Equal to `_sample_patch` and `_gauss_newton_step`: their sums over differences to the means are expanded.
+    Equal to `_sample_patch` and `_gauss_newton_step`: their sums over differences to the means are expanded. Without
+    numba's fastmath: with it, code just compiled and the same code from the cache differed in the last bits.
     """
     side = centred.shape[0]
     half = side // 2
