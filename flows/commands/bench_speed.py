@@ -8,8 +8,12 @@ from pathlib import Path
 
 from flows.options import parse_frame_size
 
-PER_FRAME = ("frames", "quality", "registration", "detections", "tracklets")
-"""Stages whose cost grows with the frames; field and tracks grow with the traffic, the rest is set-up."""
+
+def stages_by_frame() -> list[str]:
+    """Stages that are cut by frames: their cost grows with these; that of others with the traffic, or never."""
+    from velfield.pipeline.stage import STAGES, Cut
+
+    return [stage.name for stage in STAGES if stage.cut is Cut.BY_FRAMES]
 
 
 def speed(*, frames: int = 12, size: str = "2560x1920", preset: str = "fast", work: Path | None = None) -> int:
@@ -55,14 +59,14 @@ def speed(*, frames: int = 12, size: str = "2560x1920", preset: str = "fast", wo
         config = resolve_config(preset=preset, overrides={"gsd_m": 0.23})
         plan = make_plan(Job(root=str(root / f"run-{preset}"), inputs=inputs, config=config))
         write_flight_record(plan)
-        total = 0.0
+        total, by_frame = 0.0, stages_by_frame()
         print(f"{frames} frames of {width}x{height}, preset {preset}, one core")
         for name in STAGE:
             start, used = time.perf_counter(), time.process_time()
             compute_stages(plan, [name])
             wall, used = time.perf_counter() - start, time.process_time() - used
             each = ""
-            if name in PER_FRAME:
+            if name in by_frame:
                 total += used
                 each = f"{1000 * used / frames:8.0f} ms a frame"
             print(f"{name:13} {wall:7.1f} s, {used:7.1f} s of processor {each}")
