@@ -229,12 +229,7 @@ def demo(
 
     prepare_process(verbose=False)
     flight = out / "flight"
-    inputs = Inputs(
-        source=str(flight / "frames"),
-        base=str(flight / "base.png"),
-        labels=str(flight / "labels.csv"),
-        timestamps=str(flight / "timestamps.csv"),
-    )
+    inputs = Inputs.from_simulated_flight(flight)
     # From an empty clone kernels compile first; the network is adapted in seconds.
     quick = {"detection.fine_tune_steps": 30}
     config = resolve_config(preset="fast", overrides={"gsd_m": 0.23, **quick})

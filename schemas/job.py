@@ -1,6 +1,8 @@
 """What a run is asked to do: its inputs, its configuration, its folder."""
 
 import os
+from pathlib import Path
+from typing import Self
 
 from schemas.flight import FlightConfig
 from schemas.model import Model
@@ -32,6 +34,12 @@ class Inputs(Model):
     """Another detector's boxes in place of ours."""
     timestamps: str | None = None
     """CSV of frame times."""
+
+    @classmethod
+    def from_simulated_flight(cls, folder: Path) -> Self:
+        """All that `velfield simulate` wrote into a folder, apart from the truth."""
+        names = {"source": "frames", "timestamps": "timestamps.csv", "base": "base.png", "labels": "labels.csv"}
+        return cls.model_validate({key: str(folder / name) for key, name in names.items()})
 
 
 class Job(Model):

@@ -44,12 +44,7 @@ def overhead(flight: Path, /, *, work: Path, workers: int = 2) -> int:
     from velfield.pipeline.configuration import resolve_config
 
     prepare_process(verbose=False)
-    inputs = Inputs(
-        source=str(flight / "frames"),
-        timestamps=str(flight / "timestamps.csv"),
-        base=str(flight / "base.png"),
-        labels=str(flight / "labels.csv"),
-    )
+    inputs = Inputs.from_simulated_flight(flight)
     config = resolve_config(overrides={"gsd_m": 0.23})
     costs = {}
     for name, way in (("bare", _bare), ("flow", _flow)):

@@ -50,12 +50,7 @@ def speed(*, frames: int = 12, size: str = "2560x1920", preset: str = "fast", wo
         flight = root / f"flight-{frames}-{width}x{height}"
         if not (flight / "truth").exists():
             write_flight(flight, SimulationConfig(frames=frames, width=width, height=height, seed=77))
-        inputs = Inputs(
-            source=str(flight / "frames"),
-            timestamps=str(flight / "timestamps.csv"),
-            base=str(flight / "base.png"),
-            labels=str(flight / "labels.csv"),
-        )
+        inputs = Inputs.from_simulated_flight(flight)
         config = resolve_config(preset=preset, overrides={"gsd_m": 0.23})
         plan = make_plan(Job(root=str(root / f"run-{preset}"), inputs=inputs, config=config))
         write_flight_record(plan)

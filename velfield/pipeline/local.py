@@ -40,12 +40,7 @@ def compile_kernels() -> None:
     with tempfile.TemporaryDirectory(prefix="velfield-kernels-") as folder:
         flight = Path(folder) / "flight"
         write_flight(flight, _TINY)
-        inputs = Inputs(
-            source=str(flight / "frames"),
-            timestamps=str(flight / "timestamps.csv"),
-            base=str(flight / "base.png"),
-            labels=str(flight / "labels.csv"),
-        )
+        inputs = Inputs.from_simulated_flight(flight)
         config = resolve_config(preset="fast", overrides=_QUICK)
         plan = make_plan(Job(root=str(Path(folder) / "run"), inputs=inputs, config=config))
         write_flight_record(plan)

@@ -133,10 +133,7 @@ def _solve_2x2(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
 
 def invert_2x2(matrices: FloatArray) -> FloatArray:
     """Inverses (n, 2, 2); not finite where a matrix is singular."""
-    a, b, c, d = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 0], matrices[:, 1, 1]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        adjugate = np.stack([np.stack([d, -b], axis=1), np.stack([-c, a], axis=1)], axis=1)
-        return np.asarray(adjugate / (a * d - b * c)[:, None, None])
+    return np.stack([_solve_2x2(matrices, np.broadcast_to(unit, (len(matrices), 2))) for unit in np.eye(2)], axis=2)
 
 
 def mesh_shape(width: int, height: int, cell_size_px: int) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Training the network from scratch, or fine-tuning a pre-trained one on labelled images; choosing its score threshold.
+"""Fine-tuning the pre-trained network on labelled images; choosing its score threshold.
 
 The threshold comes from held-out spatial folds: the network is fine-tuned once for each fold without that part of the
 images and evaluated there. With few labels it is shrunk towards the pre-trained detector's threshold.
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from velfield.detection.cnn.detector import CnnDetector
 
 _FOLDS = 2
-_FINE_TUNING_RATE, _LEARNING_RATE = 1e-3, 3e-3
+_FINE_TUNING_RATE = 1e-3
 _UNLABELLED_MIN_PROBABILITY, _LABELLED_RADIUS_PX, _UNLABELLED_MARGIN_PX = 0.12, 18, 3
 """In an incompletely labelled image a pixel of at least this probability may be an unlabelled car, except within a
 radius of a labelled one, its shadow included."""
@@ -43,15 +43,6 @@ _NMS_RADIUS_PX = 16.0
 _PRIOR_CARS = 150
 """Weight of the pre-trained detector's threshold, in labelled cars. The threshold of 47 cars alone lost a third of the
 cars of another site without a gain; in four cases of four the best threshold lay nearer to the pre-trained one."""
-
-
-def train_from_scratch(
-    groups: Sequence[Sequence[LabelledImage]], weights: Sequence[float], seed: int, *, steps: int
-) -> Network:
-    """Train a network from random weights; ``groups`` of images and their sampling ``weights`` as for
-    `PatchDataset`."""
-    dataset = PatchDataset(groups, weights, seed)
-    return train(Trainer.initialise(seed), dataset, steps=steps, learning_rate=_LEARNING_RATE)
 
 
 def fine_tune(samples: Sequence[LabelledImage], pretrained: "CnnDetector", config: CnnConfig) -> "CnnDetector":

@@ -82,10 +82,7 @@ class Residual:
 Layer: TypeAlias = Conv | SpaceToDepth | DepthToSpace | Residual
 Topology: TypeAlias = tuple[Layer, ...]
 
-TOPOLOGY: Topology = (
-    Conv("stem", 4, 1, 16),
-    Conv("down1", 4, 16, 32),
-    Conv("enc1", 3, 32, 32),
+_LOWEST_LEVEL: Topology = (
     Residual(
         (
             SpaceToDepth(),
@@ -98,6 +95,13 @@ TOPOLOGY: Topology = (
         relu=True,
     ),
     Conv("dec1", 3, 32, 32),
+)
+"""Half the resolution and back, with a skip connection; then the first convolution of the decoder."""
+TOPOLOGY: Topology = (
+    Conv("stem", 4, 1, 16),
+    Conv("down1", 4, 16, 32),
+    Conv("enc1", 3, 32, 32),
+    *_LOWEST_LEVEL,
     Conv("head", 1, 32, 12, relu=False),
     DepthToSpace(),
 )
@@ -108,18 +112,7 @@ FORMER_TOPOLOGY: Topology = (
     Conv("down1", 1, 64, 32),
     Conv("enc1_0", 3, 32, 32),
     Conv("enc1_1", 3, 32, 32),
-    Residual(
-        (
-            SpaceToDepth(),
-            Conv("down2", 1, 128, 48),
-            Residual((Conv("res1_0", 3, 48, 48), Conv("res1_1", 3, 48, 48))),
-            Residual((Conv("res2_0", 3, 48, 48), Conv("res2_1", 3, 48, 48))),
-            Conv("up1", 1, 48, 128, relu=False),
-            DepthToSpace(),
-        ),
-        relu=True,
-    ),
-    Conv("dec1", 3, 32, 32),
+    *_LOWEST_LEVEL,
     Conv("head", 1, 32, 3, relu=False),
 )
 """That of the detectors of version 0.1, whose files are read."""
@@ -129,9 +122,9 @@ STRIDE = 2
 """Working px a pixel of the heatmap."""
 _TILE_PX, HALO_PX = 2048, 64
 """Larger images are processed in tiles, each with a halo wider than the reach of the receptive field."""
+_BORDER = cv2.BORDER_REFLECT_101
 _OPSET, _IR_VERSION = 17, 9
 """Of the ONNX files: what onnxruntime has read since 1.15."""
-MAX_ONNX_BYTES = 8_000_000
 
 
 def convolutions(layers: Topology) -> dict[str, Conv]:
@@ -424,8 +417,6 @@ def predict_heatmap(network: Network, image: GreyImage) -> tuple[Float32Array, F
     size = -(-height // STRIDE), -(-width // STRIDE)
     return probability[: size[0], : size[1]], orientation[:, : size[0], : size[1]]
 
-
-_BORDER = cv2.BORDER_REFLECT_101
 
 SCORE_OFFSET = 0.35
 """Probability predicted where a candidate is as often a car as not: around centres the loss lets the network predict
