@@ -46,6 +46,9 @@ class DetectorConfig(Model):
     """Length of a usual car, which with the ground sample distance sets the working scale."""
     seed: int = Field(0, ge=0)
     """Seed of all random numbers of the training."""
+    full_frame_every: PositiveInt = 8
+    """Every n-th frame is searched whole; those after it where they differ from it, and its detections are kept
+    elsewhere. 1: every frame is searched whole."""
 
     def for_method(self, method: str) -> "DetectorConfig":
         """The section of another method: the keys that both read, and those that this section nests under its name."""
@@ -99,6 +102,8 @@ class PaperConfig(DetectorConfig):
     """How cars are detected (paper: car detection), here as the paper does."""
 
     method: Literal["paper"] = "paper"
+    full_frame_every: PositiveInt = 1
+    """As published: every frame is searched whole."""
     rounds: PositiveInt = 200
     """Rounds of AdaBoost. Paper: 200."""
     feature_pool: PositiveInt = 1000

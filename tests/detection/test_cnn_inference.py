@@ -64,7 +64,7 @@ def test_positions_and_orientations_are_decoded_from_a_heatmap(monkeypatch: pyte
         vectors = np.stack([np.cos(2 * relative), np.sin(2 * relative)], axis=1)[..., None, None]
         return np.full((len(crops), 24, 24), probability, np.float32), np.tile(vectors, (24, 24)).astype(np.float32)
 
-    monkeypatch.setattr(model, "predict_heatmap", lambda network, image: (heatmap, orientation.transpose(2, 0, 1)))
+    monkeypatch.setattr(model, "predict_heatmap", lambda network, image, **_: (heatmap, orientation.transpose(2, 0, 1)))
     monkeypatch.setattr(model, "forward", predict_crops)
     found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None, (0.25, 0.5))
     assert len(found) == 4
@@ -85,7 +85,7 @@ def test_crops_that_disagree_on_the_orientation_make_it_uncertain(monkeypatch: p
         vectors[:, 0] = 1  # each along its own crop: across each other
         return np.full((len(crops), 24, 24), 0.5, np.float32), vectors
 
-    monkeypatch.setattr(model, "predict_heatmap", lambda network, image: (heatmap, orientation.transpose(2, 0, 1)))
+    monkeypatch.setattr(model, "predict_heatmap", lambda network, image, **_: (heatmap, orientation.transpose(2, 0, 1)))
     monkeypatch.setattr(model, "forward", predict_crops)
     found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None, (0.25, 0.5))
     assert found.shape == (1, 5)
@@ -104,7 +104,7 @@ def test_only_candidates_of_the_chosen_probabilities_are_looked_at_again(
         seen.append(len(crops))
         return np.full((len(crops), 24, 24), 0.9, np.float32), np.ones((len(crops), 2, 24, 24), np.float32)
 
-    monkeypatch.setattr(model, "predict_heatmap", lambda network, image: (heatmap, orientation.transpose(2, 0, 1)))
+    monkeypatch.setattr(model, "predict_heatmap", lambda network, image, **_: (heatmap, orientation.transpose(2, 0, 1)))
     monkeypatch.setattr(model, "forward", predict_crops)
     found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None, (0.25, 0.5))
     assert sum(seen) == looks

@@ -88,6 +88,7 @@ READERS: dict[str, tuple[str, ...]] = {
     "base": ("base",),
     "registration": ("base",),  # the flight's own base image is made by registration
     "detection": ("detector",),
+    "detection.full_frame_every": ("detections",),
     "tracking": ("tracklets",),
     "tracking.max_interval_s": ("detector",),
     "tracking.max_gap_s": ("tracks",),

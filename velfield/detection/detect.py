@@ -1,16 +1,47 @@
-"""The cars of one frame: runs a detector (`detect_frame`) and attaches crops of each car for tracking (`attach_crops`).
+"""The cars of one frame, and their crops for tracking.
+
+A frame is searched whole (`detect_frame`), or only where it differs from one that was (`search_frame`). Of a city most
+stands still: roofs, trees, parked cars. Where a frame looks as the other does, within its noise, the detector would
+detect the same again; so it is run on the rest alone, and the other frame's detections are kept elsewhere. Whatever
+moves, arrives or leaves changes the image, at the edge of the frame as well; so does much else (foliage, the parallax
+of roofs), which costs time but loses nothing.
+
+The difference of two frames is averaged over about half a car, without its slow part (exposure, shadows of clouds), and
+compared by cells of 16 px. A detection is kept only while nothing within the length of a bus changed: the middle of a
+slow bus looks the same before and after.
 
 The image is on the working grid: the base image's grid, scaled so that a car is ``working_car_length_px`` long. The
-crops are patches rotated to the axis, to compare appearance, and upright chips, to align.
+crops (`attach_crops`) are patches rotated to the axis, to compare appearance, and upright chips, to align.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
+from numba import njit
 
-from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
-from velfield.detection.detector import Detections, Detector
+from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
+from velfield.detection.detector import Detections, Detector, concatenate
+
+CELL_PX = 16
+"""Side of the cells in which frames are compared, working px."""
+_BOX_PX, _SLOW_PX = 8, 96
+"""Sides of the boxes that the difference is averaged over: about half a car, and what counts as illumination."""
+_NOISE_SIGMAS, _CHANGE_LEVELS = 5.0, (3.0, 8.0)
+"""A change is a mean difference above so many standard deviations of the noise, but at least and at most so many grey
+levels: in a frame that changed everywhere the noise cannot be estimated. In a simulated city every vehicle that moved
+by 4 px changed its place by more than 10."""
+_REACH_CARS = 1.75
+"""A detection is not kept where something changed so near, in car lengths: half of a long bus."""
+_UNSURE_FRACTION = 0.1
+"""Of the detections, those of the lowest scores, which are never kept. Among them is most of what is no car, and what
+is kept makes tracklets: precision 0.984 with all kept, 0.988 with these searched again, in a simulated city."""
+_BOX_COST_PX = 8000
+"""Fixed cost of running a detector once more, as an area."""
+
+Box = tuple[int, int, int, int]
+"""Of cells: first row, first column, row and column after the last."""
 
 
 def oriented_patches(
@@ -98,3 +129,268 @@ def attach_crops(image: GreyImage, cars: Detections, order: IntArray | slice = s
         patches=oriented_patches(image, xy, axis),
         chips=upright_chips(image, xy),
     )
+
+
+@dataclass(frozen=True)
+class ComparableFrame:
+    """A frame on the working grid, as it is compared with another.
+
+    Attributes
+    ----------
+    image, valid : (h, w) uint8 and bool, where the frame covers the grid.
+    """
+
+    image: GreyImage
+    valid: Mask
+
+    @cached_property
+    def half_image(self) -> GreyImage:
+        """At half the resolution, sizes rounded up."""
+        size = -(-self.image.shape[1] // 2), -(-self.image.shape[0] // 2)
+        return np.asarray(cv2.resize(self.image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+    @cached_property
+    def half_valid(self) -> Mask:
+        """Every other pixel of every other row."""
+        return np.ascontiguousarray(self.valid[::2, ::2])
+
+
+@dataclass(frozen=True)
+class SearchedFrame:
+    """A frame and the cars found in it.
+
+    Attributes
+    ----------
+    frame : the frame.
+    detections : its cars.
+    searched : fraction of the frame's cells that the detector was run on.
+    """
+
+    frame: ComparableFrame
+    detections: Detections
+    searched: float
+
+
+def search_frame(
+    detector: Detector,
+    frame: ComparableFrame,
+    background: GreyImage | None = None,
+    *,
+    reference: SearchedFrame | None = None,
+    threshold: float | None = None,
+) -> SearchedFrame:
+    """Detect the cars of a frame: everywhere that it covers, or where it differs from a reference.
+
+    Parameters
+    ----------
+    background, threshold
+        As of `Detector.detect`.
+    reference
+        A frame that was searched whole, on the same grid; none: this one is searched whole.
+
+    Raises
+    ------
+    ValueError
+        The reference has another shape.
+    """
+    covered = _any_in_cells(frame.half_valid)
+    if reference is None:
+        cells = covered
+    else:
+        changed = covered & changed_cells(frame, reference.frame)
+        length_px = detector.record.working_car_length_px
+        cells = changed | (covered & _cells_to_repeat(changed, reference.detections, length_px))
+    boxes = split_into_boxes(cells, detector.context_px / CELL_PX, _BOX_COST_PX / CELL_PX**2)
+    searched, parts = np.zeros(cells.shape, bool), []
+    for box in boxes:
+        parts.append(_find_in_box(detector, frame, background, box, threshold))
+        searched[box[0] : box[2], box[1] : box[3]] = True
+    kept = None if reference is None else _outside(reference.detections, searched, frame.valid)
+    cars = detector.refine(frame.image, frame.valid, concatenate(parts), kept)
+    fraction = float(searched[covered].mean()) if covered.any() else 0.0
+    return SearchedFrame(frame, cars, fraction)
+
+
+def changed_cells(frame: ComparableFrame, reference: ComparableFrame) -> Mask:
+    """Where two frames on one grid differ by more than noise and illumination; where just one covers the grid as well.
+
+    Returns
+    -------
+    (rows, columns) bool, of cells of `CELL_PX`, the last of each row and column perhaps smaller.
+    """
+    if frame.image.shape != reference.image.shape:
+        raise ValueError(f"found frames of {frame.image.shape} and {reference.image.shape} px, expected one grid")
+    both = frame.half_valid & reference.half_valid
+    weight = both.astype(np.float32)
+    difference = cv2.subtract(frame.half_image, reference.half_image, dtype=cv2.CV_32F) * weight
+    difference -= _box_mean(difference, _SLOW_PX) / np.maximum(_box_mean(weight, _SLOW_PX), 1e-3)
+    change = np.abs(_box_mean(difference * weight, _BOX_PX))
+    sample = change[::4, ::4][both[::4, ::4]]
+    noise = 1.4826 * float(np.median(sample)) if sample.size else 0.0
+    lowest, highest = _CHANGE_LEVELS
+    changed = (change > min(max(_NOISE_SIGMAS * noise, lowest), highest)) & both
+    return _any_in_cells(changed | (frame.half_valid != reference.half_valid))
+
+
+def split_into_boxes(cells: Mask, margin: float, box_cost: float) -> list[Box]:
+    """Disjoint boxes that cover the marked cells, cheap to search.
+
+    Boxes are split in two, by the row or the column after which both are smallest, down to single cells; then, from
+    the smallest up, a box takes the place of its parts where it costs no more. The cost of a box is its area with a
+    margin on every side, plus a constant.
+
+    Parameters
+    ----------
+    cells
+        (rows, columns).
+    margin, box_cost
+        In cells, and in areas of a cell.
+    """
+    found = _split_kernel(np.ascontiguousarray(cells), margin, box_cost)
+    return [(int(top), int(left), int(bottom), int(right)) for top, left, bottom, right in found]
+
+
+@njit(cache=True, nogil=True)
+def _split_kernel(cells, margin, box_cost):  # type: ignore[no-untyped-def]
+    """Boxes (n, 4). Nodes of the tree are numbered so that parts come after the box that they are parts of."""
+    nodes = [_bounding_box(cells, 0, 0, cells.shape[0], cells.shape[1])]
+    parts = [(0, 0)]
+    done = 0
+    while done < len(nodes):
+        top, left, bottom, right = nodes[done]
+        by_row, row = _best_split(cells[top:bottom, left:right], margin)
+        by_column, column = _best_split(cells[top:bottom, left:right].T, margin)
+        if min(by_row, by_column) < np.inf:
+            if by_row <= by_column:
+                nodes.append(_bounding_box(cells, top, left, top + row, right))
+                nodes.append(_bounding_box(cells, top + row, left, bottom, right))
+            else:
+                nodes.append(_bounding_box(cells, top, left, bottom, left + column))
+                nodes.append(_bounding_box(cells, top, left + column, bottom, right))
+            parts[done] = (len(nodes) - 2, len(nodes) - 1)
+            parts.append((0, 0))
+            parts.append((0, 0))
+        done += 1
+    costs = np.zeros(len(nodes))
+    split = np.zeros(len(nodes), np.bool_)
+    for k in range(len(nodes) - 1, -1, -1):
+        top, left, bottom, right = nodes[k]
+        costs[k] = (bottom - top + 2 * margin) * (right - left + 2 * margin) + box_cost
+        one, other = parts[k]
+        if one > 0 and costs[one] + costs[other] < costs[k]:
+            costs[k], split[k] = costs[one] + costs[other], True
+    boxes = np.empty((len(nodes), 4), np.int64)
+    count = 0
+    taken = np.zeros(len(nodes), np.bool_)
+    taken[0] = nodes[0][2] > nodes[0][0]
+    for k in range(len(nodes)):
+        if taken[k] and split[k]:
+            taken[parts[k][0]] = taken[parts[k][1]] = True
+        elif taken[k]:
+            for side in range(4):
+                boxes[count, side] = nodes[k][side]
+            count += 1
+    return boxes[:count]
+
+
+@njit(cache=True, nogil=True)
+def _bounding_box(cells, top, left, bottom, right):  # type: ignore[no-untyped-def]
+    """Of the marked cells within a box; an empty one where there are none."""
+    first_row, first_column, last_row, last_column = bottom, right, top, left
+    for row in range(top, bottom):
+        for column in range(left, right):
+            if cells[row, column]:
+                first_row, last_row = min(first_row, row), max(last_row, row + 1)
+                first_column, last_column = min(first_column, column), max(last_column, column + 1)
+    return first_row, first_column, last_row, last_column
+
+
+@njit(cache=True, nogil=True)
+def _best_split(cells, margin):  # type: ignore[no-untyped-def]
+    """The least area of two boxes with margins, of the rows before and after one, and that row; inf for one row."""
+    height, width = cells.shape
+    if height < 2:
+        return np.inf, 0
+    area = np.zeros(height)
+    for way in range(2):
+        first, last, start = width, 0, -1
+        for step in range(height - 1):
+            row = step if way == 0 else height - 1 - step
+            for column in range(width):
+                if cells[row, column]:
+                    first, last = min(first, column), max(last, column + 1)
+                    start = row if start < 0 else start
+            end = row
+            while not cells[end].any():  # the nearest row with a mark: the first and the last have one
+                end += 1 if way == 1 else -1
+            size = abs(end - start) + 1
+            area[row + 1 if way == 0 else row] += (size + 2 * margin) * (last - first + 2 * margin)
+    best = 1
+    for row in range(2, height):
+        if area[row] < area[best]:
+            best = row
+    return area[best], best
+
+
+def _find_in_box(
+    detector: Detector, frame: ComparableFrame, background: GreyImage | None, box: Box, threshold: float | None
+) -> Detections:
+    """The candidates whose centres lie in a box, from a crop with context on every side."""
+    top, left, bottom, right = (side * CELL_PX for side in box)
+    window = top, left, min(bottom, frame.image.shape[0]), min(right, frame.image.shape[1])
+    found = detector.find(
+        _crop(frame.image, window, detector.context_px, cv2.BORDER_REFLECT_101),
+        _crop(frame.valid.view(np.uint8), window, detector.context_px, cv2.BORDER_CONSTANT) > 0,
+        None if background is None else _crop(background, window, detector.context_px, cv2.BORDER_REFLECT_101),
+        threshold=threshold,
+    ).shifted(left - detector.context_px, top - detector.context_px)
+    cell = np.floor((found.xy + 0.5) / CELL_PX)[:, ::-1]
+    return found.take(np.flatnonzero(((cell >= box[:2]) & (cell < box[2:])).all(axis=1)))
+
+
+def _crop(image: GreyImage, window: tuple[int, int, int, int], context: int, border: int) -> GreyImage:
+    """A window (top, left, bottom, right) with context on every side, beyond the image by OpenCV's border mode."""
+    top, left, bottom, right = window[0] - context, window[1] - context, window[2] + context, window[3] + context
+    outside = max(0, -top), max(0, bottom - image.shape[0]), max(0, -left), max(0, right - image.shape[1])
+    inside = image[max(0, top) : bottom, max(0, left) : right]
+    return np.asarray(cv2.copyMakeBorder(inside, *outside, border), np.uint8)
+
+
+def _outside(detections: Detections, searched: Mask, valid: Mask) -> Detections:
+    """Detections of cells that were not searched, where the frame covers them."""
+    row, column = _locate_cells(detections.xy, searched.shape)
+    x, y = (np.clip(np.rint(detections.xy[:, k]).astype(np.int64), 0, valid.shape[1 - k] - 1) for k in (0, 1))
+    return detections.take(np.flatnonzero(~searched[row, column] & valid[y, x]))
+
+
+def _cells_to_repeat(changed: Mask, detections: Detections, length_px: float) -> Mask:
+    """Cells of the detections near which something changed, and of those of the lowest scores."""
+    reach = 2 * int(np.ceil(_REACH_CARS * length_px / CELL_PX)) + 1
+    near = cv2.dilate(changed.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
+    repeat = np.zeros(changed.shape, bool)
+    row, column = _locate_cells(detections.xy, changed.shape)
+    repeat[row, column] = near[row, column]
+    unsure = np.argsort(detections.score, kind="stable")[: int(np.ceil(_UNSURE_FRACTION * len(detections)))]
+    repeat[row[unsure], column[unsure]] = True
+    return repeat
+
+
+def _locate_cells(xy: FloatArray, shape: tuple[int, ...]) -> tuple[IntArray, IntArray]:
+    """Row and column, each (n,), of the cells in which positions lie."""
+    cell = np.floor((xy + 0.5) / CELL_PX).astype(np.int64)
+    return np.clip(cell[:, 1], 0, shape[0] - 1), np.clip(cell[:, 0], 0, shape[1] - 1)
+
+
+def _any_in_cells(half: Mask) -> Mask:
+    """Whether a mask at half the resolution holds anywhere in each cell."""
+    side = CELL_PX // 2
+    rows, columns = (-(-size // side) for size in half.shape)
+    padded = np.zeros((rows * side, columns * side), bool)
+    padded[: half.shape[0], : half.shape[1]] = half
+    return np.asarray(padded.reshape(rows, side, columns, side).any(axis=(1, 3)))
+
+
+def _box_mean(values: Float32Array, side_px: int) -> Float32Array:
+    """At half the resolution."""
+    side = side_px // 2
+    return np.asarray(cv2.blur(values, (side, side), borderType=cv2.BORDER_REPLICATE), np.float32)

@@ -14,15 +14,16 @@ import json
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
+import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from schemas.arrays import FloatArray, GreyImage, Mask
+from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
 from schemas.detector import (
     DETECTOR_VERSION,
     METHODS,
@@ -66,8 +67,26 @@ class Detections:
         """Of rows (n, 5): x, y, axis, score, standard deviation of the axis; and areas (n,)."""
         return cls(rows[:, :2], rows[:, 2], rows[:, 4], area_px, rows[:, 3])
 
+    def to_rows(self) -> FloatArray:
+        """Rows (n, 6): those of `from_rows`, and the area."""
+        return np.column_stack([self.xy, self.orientation_rad, self.score, self.orientation_sd_rad, self.area_px])
+
+    def take(self, rows: IntArray) -> "Detections":
+        """Some of them, in the order given."""
+        return Detections.from_rows(self.to_rows()[rows, :5], self.area_px[rows])
+
+    def shifted(self, x: float, y: float) -> "Detections":
+        """Of a crop whose corner lies there, on the grid of the image."""
+        return replace(self, xy=self.xy + np.array([x, y]))
+
     def __len__(self) -> int:
         return len(self.score)
+
+
+def concatenate(parts: Sequence[Detections]) -> Detections:
+    """All of several parts, in their order."""
+    rows = np.concatenate([np.empty((0, 6)), *(part.to_rows() for part in parts)])
+    return Detections.from_rows(rows[:, :5], rows[:, 5])
 
 
 @dataclass(frozen=True)
@@ -76,6 +95,8 @@ class Detector(ABC):
 
     record: BaseRecord
     method: ClassVar[str]
+    context_px: ClassVar[int] = 32
+    """What it reads around a car to find it, working px on every side: the margin of a crop."""
 
     @abstractmethod
     def detect(
@@ -99,6 +120,29 @@ class Detector(ABC):
         threshold
             Score threshold in place of the detector's own.
         """
+
+    def find(
+        self,
+        image: GreyImage,
+        valid: Mask | None = None,
+        background: GreyImage | None = None,
+        *,
+        threshold: float | None = None,
+    ) -> Detections:
+        """Candidates of a crop that has `context_px` on every side: what `refine` makes the detections of."""
+        return self.detect(image, valid, background, threshold=threshold)
+
+    def refine(
+        self, image: GreyImage, valid: Mask | None, found: Detections, kept: Detections | None = None
+    ) -> Detections:
+        """Detections of a whole image from the candidates of its parts.
+
+        Parameters
+        ----------
+        kept
+            Detections that an earlier call gave, which stay unless a candidate is better.
+        """
+        return found if kept is None else concatenate([found, kept])
 
     @classmethod
     @abstractmethod

@@ -214,14 +214,21 @@ STAGES: tuple[Stage, ...] = (
         after=("registration",),
         inputs=("labels", "detector", "detections"),
         config=("detection", "tracking.max_interval_s"),
+        unread=("detection.full_frame_every",),
         new_base=NewBase.SHARED,
     ),
     # Cars of each block, then one table with their crops.
     Stage(
         name="detections",
-        version=8,
+        version=9,
         label="detections",
-        lines=(Line("{cars:.0f} cars in {frames:.0f} frames"),),
+        lines=(
+            Line(
+                "{cars:.0f} cars in {frames:.0f} frames, of which {searched:.0%} was searched",
+                lambda counts: "searched" in counts,
+            ),
+            Line("{cars:.0f} cars in {frames:.0f} frames"),
+        ),
         block=f"{_STAGES}.detections:detect_block",
         unit=f"{_STAGES}.detections:write_detections",
         after=("registration", "detector"),

@@ -6,7 +6,7 @@ from schemas.records import CommitRecord
 from schemas.summary import StageSummary
 from velfield.pipeline.stage import STAGE
 
-_MEANS = frozenset({"heldout_px", "residual_px"})
+_MEANS = frozenset({"heldout_px", "residual_px", "searched"})
 """Counts that are averaged over units, weighted by frames; all others are summed."""
 
 

@@ -30,6 +30,7 @@ from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from schemas.detector import LongVehicleRecord
 from velfield.detection.boosting import BoostedStumps
 from velfield.detection.cascade.feature_image import FeatureImage, PatchScale, compute_features, score_poses
+from velfield.detection.detector import Detections, concatenate
 from velfield.detection.orientation import CAR_ASPECT
 
 ROTATIONS = np.arange(6) * (np.pi / 6)
@@ -321,7 +322,7 @@ class LongVehicleClassifier:
         """Scores (n, offsets) of positions (n, 2), displaced by `OFFSETS` along their axes (n,), as a centre."""
         return score_poses(self.stumps, features, xy, axes, OFFSETS, contrast_floor=self.record.contrast_floor)
 
-    def centre(self, features: FeatureImage, cars: FloatArray, valid: Mask) -> FloatArray:
+    def centre(self, features: FeatureImage, cars: FloatArray, valid: Mask, settled: Mask | None = None) -> FloatArray:
         """Cars (n, 2...) as x, y, axis, the best first: long vehicles at their centre, one detection each.
 
         Parameters
@@ -330,13 +331,18 @@ class LongVehicleClassifier:
             Of the image, at the scale `LONG`.
         valid
             (h, w): where the frame covers the image; a vehicle whose centre is elsewhere stays where it was detected.
+        settled
+            (n,): cars that stay where they are.
         """
-        if not len(cars):
+        tested = np.arange(len(cars)) if settled is None else np.flatnonzero(~settled)
+        if not len(tested):
             return cars
-        scores = self.scores(features, cars[:, :2], cars[:, 2])
+        scores = self.scores(features, cars[tested, :2], cars[tested, 2])
         offsets = OFFSETS[scores.argmax(axis=1)].astype(np.float64) * features.scale.step
-        centres = offset_along_axis(cars[:, :2], cars[:, 2], offsets)
-        long = (scores.max(axis=1) > self.record.threshold) & in_view(centres, valid.shape, valid)
+        centres = cars[:, :2].copy()
+        centres[tested] = offset_along_axis(cars[tested, :2], cars[tested, 2], offsets)
+        long = np.zeros(len(cars), bool)
+        long[tested] = (scores.max(axis=1) > self.record.threshold) & in_view(centres[tested], valid.shape, valid)
         cars = np.column_stack([np.where(long[:, None], centres, cars[:, :2]), cars[:, 2:]])
         return np.asarray(cars[~self._is_covered(cars, long)])
 
@@ -362,10 +368,26 @@ def shipped_long_vehicles() -> LongVehicleClassifier:
     return LongVehicleClassifier(LongVehicleRecord.model_validate_json(data))
 
 
-def centre_long_vehicles(image: GreyImage, valid: Mask | None, cars: FloatArray, car_length_px: float) -> FloatArray:
-    """Cars (n, 2...), suppressed already, with long vehicles at their centre; unchanged for cars of another length."""
+def centre_long_vehicles(
+    image: GreyImage, valid: Mask | None, cars: FloatArray, car_length_px: float, settled: Mask | None = None
+) -> FloatArray:
+    """Cars (n, 2...), suppressed already, with long vehicles at their centre; unchanged for cars of another length.
+
+    Those that are ``settled`` (n,) stay where they are.
+    """
     long = shipped_long_vehicles()
     if car_length_px != long.record.working_car_length_px:
         return cars
     everywhere = np.ones(image.shape, bool)
-    return long.centre(compute_features(image, None, LONG), cars, everywhere if valid is None else valid)
+    return long.centre(compute_features(image, None, LONG), cars, everywhere if valid is None else valid, settled)
+
+
+def suppress_and_centre(
+    image: GreyImage, valid: Mask | None, found: Detections, kept: Detections | None, car_length_px: float
+) -> Detections:
+    """Non-maximum suppression of candidates and of detections kept from an earlier call; new long vehicles centred."""
+    parts = [found] if kept is None else [found, kept]
+    settled = np.arange(sum(map(len, parts))) >= len(found)
+    rows = nms_oriented(np.column_stack([concatenate(parts).to_rows(), settled]), car_length_px)
+    rows = centre_long_vehicles(image, valid, rows, car_length_px, rows[:, -1] > 0)
+    return Detections.from_rows(rows[:, :5], rows[:, 5])

@@ -12,10 +12,9 @@ from schemas.detector import CascadeConfig, CascadeRecord
 from velfield.detection.boosting import BoostedStumps
 from velfield.detection.cascade.classifier import (
     PoseScorer,
-    centre_long_vehicles,
     classify_proposals,
-    nms_oriented,
     propose_regions,
+    suppress_and_centre,
 )
 from velfield.detection.cascade.feature_image import COARSE, compute_features
 from velfield.detection.cascade.fitting import train_cascade
@@ -58,6 +57,18 @@ class CascadeDetector(Detector):
         threshold: float | None = None,
     ) -> Detections:
         """Detect cars: proposals, the classifier on them, non-maximum suppression, long vehicles centred."""
+        found = self.find(image, valid, background, threshold=threshold)
+        return self.refine(image, valid, found)
+
+    def find(
+        self,
+        image: GreyImage,
+        valid: Mask | None = None,
+        background: GreyImage | None = None,
+        *,
+        threshold: float | None = None,
+    ) -> Detections:
+        """Proposals that the classifier scores above the threshold."""
         record, ground = self.record, background if self.uses_background else None
         proposals = propose_regions(
             compute_features(image, ground, COARSE),
@@ -67,15 +78,20 @@ class CascadeDetector(Detector):
             contrast_floor=record.contrast_floor,
             min_score=record.proposer.min_score,
         )
-        detections = classify_proposals(
+        rows = classify_proposals(
             PoseScorer(compute_features(image, ground), self.classifier, record.contrast_floor),
             proposals,
             min_score=self.threshold if threshold is None else threshold,
             min_stage1_score=record.proposer.min_stage1_score,
         )
         length_px = record.working_car_length_px
-        cars = centre_long_vehicles(image, valid, nms_oriented(detections, length_px), length_px)
-        return Detections.from_rows(cars, np.full(len(cars), length_px * length_px * CAR_ASPECT))
+        return Detections.from_rows(rows, np.full(len(rows), length_px * length_px * CAR_ASPECT))
+
+    def refine(
+        self, image: GreyImage, valid: Mask | None, found: Detections, kept: Detections | None = None
+    ) -> Detections:
+        """Non-maximum suppression; long vehicles centred."""
+        return suppress_and_centre(image, valid, found, kept, self.record.working_car_length_px)
 
     @classmethod
     def train(

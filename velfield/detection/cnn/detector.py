@@ -9,10 +9,11 @@ import numpy as np
 
 from schemas.arrays import GreyImage, Mask
 from schemas.detector import CascadeConfig, CnnConfig, CnnRecord
-from velfield.detection.cascade.classifier import centre_long_vehicles, nms_oriented
+from velfield.detection.cascade.classifier import suppress_and_centre
 from velfield.detection.cascade.detector import CascadeDetector
 from velfield.detection.cnn.fine_tuning import fine_tune
 from velfield.detection.cnn.model import (
+    BORDER_PX,
     Network,
     background_difference_at,
     detect_cars,
@@ -38,6 +39,7 @@ class CnnDetector(Detector):
 
     record: CnnRecord
     method: ClassVar[str] = "cnn"
+    context_px: ClassVar[int] = 16
 
     @cached_property
     def network(self) -> Network:
@@ -59,14 +61,42 @@ class CnnDetector(Detector):
         threshold: float | None = None,
     ) -> Detections:
         """Detect cars: peaks of the heatmap, the motion bonus, non-maximum suppression, long vehicles centred."""
+        found = self._find(image, valid, background, threshold, border_px=BORDER_PX)
+        return self.refine(image, valid, found)
+
+    def find(
+        self,
+        image: GreyImage,
+        valid: Mask | None = None,
+        background: GreyImage | None = None,
+        *,
+        threshold: float | None = None,
+    ) -> Detections:
+        """Peaks of the heatmap above the threshold, with the motion bonus."""
+        return self._find(image, valid, background, threshold, border_px=0)
+
+    def _find(
+        self,
+        image: GreyImage,
+        valid: Mask | None,
+        background: GreyImage | None,
+        threshold: float | None,
+        *,
+        border_px: int,
+    ) -> Detections:
         length_px, motion = self.record.working_car_length_px, self.record.motion
-        rows = detect_cars(self.network, image, valid, self.record.tta_range)
+        rows = detect_cars(self.network, image, valid, self.record.tta_range, border_px=border_px)
         if motion is not None and background is not None:
             difference = background_difference_at(image, background, rows[:, :2], length_px)
             rows[:, 3] += motion_score_bonus(motion, difference)
         above = rows[rows[:, 3] > (self.threshold if threshold is None else threshold)]
-        cars = centre_long_vehicles(image, valid, nms_oriented(above, length_px), length_px)
-        return Detections.from_rows(cars, np.full(len(cars), length_px * length_px * CAR_ASPECT))
+        return Detections.from_rows(above, np.full(len(above), length_px * length_px * CAR_ASPECT))
+
+    def refine(
+        self, image: GreyImage, valid: Mask | None, found: Detections, kept: Detections | None = None
+    ) -> Detections:
+        """Non-maximum suppression; long vehicles centred."""
+        return suppress_and_centre(image, valid, found, kept, self.record.working_car_length_px)
 
     @classmethod
     def train(cls, samples: Sequence[LabelledImage], config: CnnConfig, *, base: Detector | None = None) -> Detector:

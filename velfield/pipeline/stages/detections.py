@@ -14,12 +14,12 @@ import pandas as pd
 
 from schemas.arrays import FloatArray, GreyImage, Points
 from schemas.tables import DETECTION_COLUMNS
-from velfield.detection.detect import FrameDetections, attach_crops, detect_frame
+from velfield.detection.detect import ComparableFrame, FrameDetections, SearchedFrame, attach_crops, search_frame
 from velfield.detection.detector import Detections, Detector, load_detector
 from velfield.detection.orientation import CAR_ASPECT, axial_difference, fill_missing_orientation
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
-from velfield.pipeline.stages.rectified_frames import WorkingFrame, WorkingGrid, read_background
+from velfield.pipeline.stages.rectified_frames import Window, WorkingFrame, WorkingGrid, read_background
 from velfield.pipeline.stages.registration import external_boxes, usable_frames
 from velfield.registration.transforms import FrameMap
 from velfield.run.frame_transforms import read_working
@@ -71,12 +71,16 @@ ID_STEP = 1 << 20
 
 @dataclass(frozen=True)
 class BlockDetections:
-    """Cars of a block of frames: the table, their patches, and their positions on the working grid."""
+    """Cars of a block of frames: the table, their patches, and their positions on the working grid.
+
+    ``searched`` (frames,) is the fraction of each frame that the detector was run on.
+    """
 
     table: pd.DataFrame
     patches: GreyImage
     chips: GreyImage
     xy_work: Points
+    searched: FloatArray
 
 
 def detect_block(plan: Plan, frames: range) -> BlockDetections:
@@ -85,28 +89,77 @@ def detect_block(plan: Plan, frames: range) -> BlockDetections:
     working = WorkingGrid.open(plan, record.scale)
     times_s = open_frames(plan.layout.frames).column("time_s")
     usable = usable_frames(plan)
+    search = None if plan.job.inputs.detections else _Search(plan, working, has_background=record.has_background)
     parts = []
     for frame in frames:
-        rectified = working.frame(frame) if usable[frame] else None
-        if rectified is not None:
-            detections = _detect(
-                plan, rectified, working.maps.transform(frame), frame, has_background=record.has_background
-            )
-            parts.append(_tabulate(detections, rectified, frame, float(times_s[frame])))
+        if usable[frame]:
+            part = _detect_external(plan, working, frame) if search is None else search.detect(frame)
+            if part is not None:
+                parts.append(_tabulate(*part, frame, float(times_s[frame])))
         advance("detections")
     return _concatenate(parts)
 
 
-def _detect(
-    plan: Plan, rectified: WorkingFrame, transform: FrameMap | None, frame: int, *, has_background: bool
-) -> FrameDetections:
-    if plan.job.inputs.detections and transform is not None:
-        return external_detections(plan, rectified, transform, frame)
-    detector = _detector(plan.layout.detector, plan.keys["detector"])
-    background = _background_of(plan, rectified) if has_background else None
-    return detect_frame(
-        rectified.image, rectified.valid, detector, background, threshold=plan.config.detection.threshold
-    )
+def _detect_external(plan: Plan, working: WorkingGrid, frame: int) -> "_Found | None":
+    rectified, transform = working.frame(frame), working.maps.transform(frame)
+    if rectified is None or transform is None:
+        return None
+    return external_detections(plan, rectified, transform, frame), rectified, np.nan
+
+
+_Found = tuple[FrameDetections, WorkingFrame, float]
+"""Cars of a frame, the frame, and the fraction of it that was searched."""
+
+
+class _Search:
+    """Searches frames in groups: the first that can be used whole, the others where they differ from it.
+
+    Groups are counted from the start of the flight, so that results are the same however it is cut into units.
+    """
+
+    def __init__(self, plan: Plan, working: WorkingGrid, *, has_background: bool) -> None:
+        self._plan, self._working, self._has_background = plan, working, has_background
+        self._detector = _detector(plan.layout.detector, plan.keys["detector"])
+        self._usable = usable_frames(plan)
+        self._group, self._first = range(0), -1
+        self._window: Window | None = None
+        self._reference: SearchedFrame | None = None
+
+    def detect(self, frame: int) -> _Found | None:
+        """The cars of a frame; none where it does not meet the base image."""
+        if frame not in self._group:
+            self._begin_group(frame)
+        if self._window is None:
+            return None
+        rectified = self._working.frame(frame, self._window)
+        if rectified is None:
+            return None
+        searched = self._search(rectified, None if frame == self._first else self._reference)
+        if frame == self._first:
+            self._reference = searched
+        cars = searched.detections
+        order = np.lexsort((cars.xy[:, 0], cars.xy[:, 1]))
+        return attach_crops(rectified.image, cars, order), rectified, searched.searched
+
+    def _begin_group(self, frame: int) -> None:
+        every = self._plan.config.detection.full_frame_every
+        start = frame // every * every
+        self._group = range(start, min(start + every, len(self._usable)))
+        members = [one for one in self._group if self._usable[one] and self._working.maps.transform(one) is not None]
+        self._window, self._reference = self._working.common_window(members), None
+        self._first = next((one for one in members if self._working.common_window([one]) is not None), frame)
+        if self._first < frame and self._window is not None:  # it belongs to another block
+            first = self._working.frame(self._first, self._window)
+            self._reference = None if first is None else self._search(first, None)
+
+    def _search(self, rectified: WorkingFrame, reference: SearchedFrame | None) -> SearchedFrame:
+        return search_frame(
+            self._detector,
+            ComparableFrame(rectified.image, rectified.valid),
+            _background_of(self._plan, rectified) if self._has_background else None,
+            reference=reference,
+            threshold=self._plan.config.detection.threshold,
+        )
 
 
 @lru_cache(maxsize=2)
@@ -131,7 +184,9 @@ def _background_of(plan: Plan, rectified: WorkingFrame) -> GreyImage:
     return np.asarray(cv2.warpAffine(whole, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-def _tabulate(detections: FrameDetections, rectified: WorkingFrame, frame: int, time_s: float) -> BlockDetections:
+def _tabulate(
+    detections: FrameDetections, rectified: WorkingFrame, searched: float, frame: int, time_s: float
+) -> BlockDetections:
     xy = rectified.to_base(detections.xy)
     table = pd.DataFrame(
         {
@@ -146,24 +201,26 @@ def _tabulate(detections: FrameDetections, rectified: WorkingFrame, frame: int, 
             "score": detections.score,
         }
     ).astype(DETECTION_COLUMNS)
-    return BlockDetections(table, detections.patches, detections.chips, detections.xy)
+    return BlockDetections(table, detections.patches, detections.chips, detections.xy, np.array([searched]))
 
 
 def _concatenate(parts: Sequence[BlockDetections]) -> BlockDetections:
     if not parts:
         table = pd.DataFrame({name: np.empty(0, dtype) for name, dtype in DETECTION_COLUMNS.items()})
-        return BlockDetections(table, np.empty((0, 16, 8), np.uint8), np.empty((0, 32, 32), np.uint8), np.empty((0, 2)))
+        crops = np.empty((0, 16, 8), np.uint8), np.empty((0, 32, 32), np.uint8)
+        return BlockDetections(table, *crops, np.empty((0, 2)), np.empty(0))
     return BlockDetections(
         pd.concat([part.table for part in parts], ignore_index=True),
         np.concatenate([part.patches for part in parts]),
         np.concatenate([part.chips for part in parts]),
         np.concatenate([part.xy_work for part in parts]),
+        np.concatenate([part.searched for part in parts]),
     )
 
 
 def write_detections(plan: Plan, frames: range, blocks: Sequence[BlockDetections]) -> StageResult:
     """Write the table of a unit, and its patches."""
-    whole = _concatenate([block for block in blocks if len(block.table)])
+    whole = _concatenate([block for block in blocks if len(block.searched)])
     unit = frames.start // plan.unit_frames
     path = plan.layout.unit_file(plan.layout.detections, unit, ".parquet")
     patches = plan.layout.unit_file(plan.layout.detections, unit, ".patches.npz")
@@ -174,4 +231,7 @@ def write_detections(plan: Plan, frames: range, blocks: Sequence[BlockDetections
     )
     write_table(path, whole.table, DETECTION_COLUMNS)
     used = int(usable_frames(plan)[frames.start : frames.stop].sum())
-    return StageResult([path, patches], {"frames": used, "cars": len(whole.table)})
+    counts = {"frames": float(used), "cars": float(len(whole.table))}
+    if np.isfinite(whole.searched).any():
+        counts["searched"] = float(np.nanmean(whole.searched))
+    return StageResult([path, patches], counts)

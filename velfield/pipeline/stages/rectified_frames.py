@@ -1,6 +1,7 @@
 """Frames on the working grid: the base image's, scaled so that a car is about 8 x 16 px whatever the footage."""
 
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -87,6 +88,16 @@ class WorkingGrid:
             replicate_border=True,
         )
         return WorkingFrame(image, valid, box, self.scale)
+
+    def common_window(self, frames: Sequence[int]) -> Window | None:
+        """The window of all of some frames; none where none of them is registered and meets the base image."""
+        transforms = [self.maps.transform(frame) for frame in frames]
+        boxes = [box for one in transforms if one is not None and (box := self._footprint(one)) is not None]
+        if not boxes:
+            return None
+        left, top = (min(box[k] for box in boxes) for k in (0, 1))
+        right, bottom = (max(box[k] + box[2 + k] for box in boxes) for k in (0, 1))
+        return left, top, right - left, bottom - top
 
     def _footprint(self, transform: FrameMap) -> Window | None:
         x0, y0, x1, y1 = footprint(transform, self.frames.shape)

@@ -1,0 +1,143 @@
+"""Searching a frame only where it differs from one that was searched whole."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from schemas.arrays import GreyImage, Mask, Points
+from velfield.detection.detect import (
+    CELL_PX,
+    ComparableFrame,
+    SearchedFrame,
+    changed_cells,
+    search_frame,
+    split_into_boxes,
+)
+from velfield.detection.detector import Detections, shipped_detector
+
+_SHAPE = 300, 420
+
+
+def ground(seed: int = 0) -> GreyImage:
+    """Smooth ground with noise of its own."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[: _SHAPE[0], : _SHAPE[1]]
+    return np.clip(110 + 20 * np.sin(x / 40) + 15 * np.cos(y / 30) + rng.normal(0, 2, _SHAPE), 0, 255).astype(np.uint8)
+
+
+def with_cars(image: GreyImage, xy: list[tuple[int, int]], level: int = 220) -> GreyImage:
+    """Bright cars of 16 x 8 px along x, with a dark windscreen."""
+    image = image.copy()
+    for x, y in xy:
+        image[y - 4 : y + 4, x - 8 : x + 8] = level
+        image[y - 3 : y + 3, x + 2 : x + 5] = 40
+    return image
+
+
+def frame(image: GreyImage, valid: Mask | None = None) -> ComparableFrame:
+    return ComparableFrame(image, np.ones(image.shape, bool) if valid is None else valid)
+
+
+def near(found: Points, x: float, y: float) -> bool:
+    return bool(len(found)) and bool((np.hypot(found[:, 0] - x, found[:, 1] - y) < 4).any())
+
+
+def test_noise_and_exposure_are_no_change_and_a_car_that_moved_is() -> None:
+    before = frame(with_cars(ground(1), [(100, 100), (300, 200)]))
+    after = frame(np.clip(with_cars(ground(2), [(100, 100), (312, 200)]).astype(np.int64) + 9, 0, 255).astype(np.uint8))
+    changed = changed_cells(after, before)
+    assert changed[200 // CELL_PX, 312 // CELL_PX]
+    assert changed[200 // CELL_PX, 292 // CELL_PX]
+    assert not changed[:8].any()
+    assert changed.mean() < 0.05
+
+
+def test_a_dark_car_on_asphalt_is_a_change() -> None:
+    changed = changed_cells(frame(with_cars(ground(2), [(200, 150)], level=105)), frame(ground(1)))
+    assert changed[150 // CELL_PX, 200 // CELL_PX]
+
+
+def test_a_frame_that_changed_everywhere_is_searched_everywhere() -> None:
+    rng = np.random.default_rng(5)
+    texture = np.kron(rng.integers(0, 255, (30, 42)), np.ones((10, 10))).astype(np.uint8)
+    other = np.kron(rng.integers(0, 255, (30, 42)), np.ones((10, 10))).astype(np.uint8)
+    assert changed_cells(frame(texture), frame(other)).mean() > 0.9
+
+
+def test_what_only_one_frame_covers_is_a_change() -> None:
+    valid = np.ones(_SHAPE, bool)
+    valid[:, :100] = False
+    changed = changed_cells(frame(ground(1)), frame(ground(2), valid))
+    assert changed[:, : 100 // CELL_PX].all()
+    assert not changed[:, 100 // CELL_PX + 1 :].any()
+
+
+def test_frames_of_two_grids_are_refused() -> None:
+    with pytest.raises(ValueError, match="expected one grid"):
+        changed_cells(frame(ground()), frame(ground()[:-1]))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.002, 0.02, 0.2, 1.0])
+def test_boxes_cover_the_marked_cells_once_and_cost_no_more_than_one_box(share: float) -> None:
+    cells = np.random.default_rng(3).random((40, 56)) < share
+    boxes = split_into_boxes(cells, 1.0, 16.0)
+    count = np.zeros(cells.shape, int)
+    for top, left, bottom, right in boxes:
+        count[top:bottom, left:right] += 1
+    assert count.max(initial=0) <= 1
+    assert (count[cells] == 1).all()
+    cost = sum((bottom - top + 2) * (right - left + 2) + 16 for top, left, bottom, right in boxes)
+    assert cost <= (cells.shape[0] + 2) * (cells.shape[1] + 2) + 16
+    if share == 0.002:
+        assert cost < 0.25 * cells.size
+
+
+def test_two_marks_far_apart_are_two_boxes() -> None:
+    cells = np.zeros((20, 30), bool)
+    cells[2, 3] = cells[17, 25] = True
+    assert sorted(split_into_boxes(cells, 1.0, 16.0)) == [(2, 3, 3, 4), (17, 25, 18, 26)]
+
+
+def test_detections_stay_where_nothing_changed_and_follow_what_moved() -> None:
+    detector = shipped_detector()
+    still = [(60, 60), (60, 140), (60, 220), (120, 60), (120, 140)]
+    first = search_frame(detector, frame(with_cars(ground(1), [*still, (330, 230)])))
+    assert first.searched == 1
+    assert all(near(first.detections.xy, x, y) for x, y in [*still, (330, 230)])
+    second = search_frame(detector, frame(with_cars(ground(2), [*still, (350, 230), (210, 60)])), reference=first)
+    found = second.detections.xy
+    assert second.searched < 0.3
+    assert all(near(found, x, y) for x, y in [*still, (350, 230), (210, 60)])  # the last one appeared
+    assert not near(found, 330, 230)
+    kept = {tuple(xy) for xy in found} & {tuple(xy) for xy in first.detections.xy}
+    assert len(kept) >= len(still) - 1  # the least certain one is searched for again
+
+
+def test_a_detection_is_not_kept_where_a_neighbour_changed() -> None:
+    """The middle of a bus that moved looks the same; only its ends changed."""
+    detector = shipped_detector()
+    before = search_frame(detector, frame(ground(1)))
+    detections = Detections.from_rows(np.array([[200.0, 150.0, 0.0, 0.4, 0.1]]), np.array([128.0]))
+    after = with_cars(ground(2), [(224, 150)])
+    again = search_frame(detector, frame(after), reference=replace(before, detections=detections))
+    assert not near(again.detections.xy, 200, 150)
+
+
+def test_detections_are_dropped_where_the_frame_does_not_reach() -> None:
+    detector = shipped_detector()
+    detections = Detections.from_rows(np.array([[60.0, 60.0, 0.0, 0.4, 0.1]]), np.array([128.0]))
+    reference = SearchedFrame(frame(ground(1)), detections, 1.0)
+    valid = np.ones(_SHAPE, bool)
+    valid[:, :200] = False
+    assert not near(search_frame(detector, frame(ground(2), valid), reference=reference).detections.xy, 60, 60)
+
+
+def test_a_frame_searched_whole_gives_what_the_detector_gives() -> None:
+    detector = shipped_detector()
+    image = with_cars(ground(4), [(60, 60), (330, 230), (150, 200)])
+    whole = detector.detect(image)
+    searched = search_frame(detector, frame(image)).detections
+    assert len(whole) == len(searched) >= 3
+    order, other = np.argsort(whole.xy[:, 0]), np.argsort(searched.xy[:, 0])
+    assert np.abs(whole.xy[order] - searched.xy[other]).max() < 0.1
