@@ -203,7 +203,7 @@ STAGES: tuple[Stage, ...] = (
     # Labels and training, from labelled frames or from what moves; or a given detector.
     Stage(
         name="detector",
-        version=16,
+        version=17,
         label="detector",
         lines=(
             Line("skipped: external detections", lambda counts: bool(counts) and "threshold" not in counts),

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from velfield.detection.cnn.detector import CnnDetector
 
 _FOLDS = 2
+"""Each trained for its share of the steps, so that all of them cost as much as the network itself."""
 _FINE_TUNING_RATE = 1e-3
 _UNLABELLED_MIN_PROBABILITY, _LABELLED_RADIUS_PX, _UNLABELLED_MARGIN_PX = 0.12, 18, 3
 """In an incompletely labelled image a pixel of at least this probability may be an unlabelled car, except within a
@@ -137,6 +138,7 @@ def _fine_tune_fold(
     held_out = [spatial_fold(sample, fold, _FOLDS) for sample in samples]
     training = [restrict_to_region(sample, ~region) for sample, region in zip(samples, held_out, strict=True)]
     dataset = PatchDataset([training], [1.0], seed + 1 + fold)
+    steps = -(-steps // _FOLDS)
     network = train(Trainer.from_network(pretrained), dataset, steps=steps, learning_rate=_FINE_TUNING_RATE)
     return network, [
         evaluate_network(network, sample, region, tta_range) for sample, region in zip(samples, held_out, strict=True)

@@ -92,7 +92,8 @@ class LossNormaliser:
 
 
 def _positive_weight(batch: Batch) -> Float32Array:
-    return np.asarray(batch.heatmap**4 * batch.mask, np.float32)
+    square = batch.heatmap * batch.heatmap  # a power of 4 takes ten times as long
+    return np.asarray(square * square * batch.mask, np.float32)
 
 
 @dataclass
