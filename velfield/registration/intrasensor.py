@@ -35,6 +35,7 @@ from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
 from velfield.registration.alignment import (
+    HALF_PATCH,
     N_PATCHES_CROSS_SENSOR,
     Templates,
     align_patches,
@@ -76,6 +77,11 @@ coarse one."""
 _ENOUGH_FRACTION = 0.8
 """If a smaller fraction aligns, the denser patches are used: half of those of another sensor's image align, too few
 at the borders."""
+_RETEST_FRAMES = 8
+"""In a chain, a patch that was an inlier in none of so many frames is tried in one of so many: most patches of another
+sensor's image never align, and those take the most iterations."""
+_SETTLED_PX = 0.2
+"""Where a fit to aligned patches moves 95 % of them by less than this, they are not aligned again."""
 _MIN_ALIGNED_FRACTION = 0.15
 """If a smaller fraction of the patches aligns, the prior was wrong: the frame is not registered."""
 _FLOW_SIGMA_PX = 0.7
@@ -186,12 +192,14 @@ def register_chain(
     results: list[FrameRegistration] = []
     before: _ChainFrame | None = None
     first: FrameRegistration | None = None
+    history: _PatchHistory | None = None
     for _, grey, detect in frames:
         by_flow = config.start == "optical_flow" and config.model != "polyprojective"
         small = _shrink(grey) if by_flow else grey
         result = None
         if by_flow and before is not None and first is not None:
-            result = _register_by_flow(grey, small, before, base, lens, config)
+            history = history or _PatchHistory.begin(base, before.result)
+            result = _register_by_flow(grey, small, before, base, lens, config, history.choose(before, grey.shape))
             result = None if result is None or _is_worse(result, first) else result
         if result is None:
             previous = first_previous if before is None else map_keypoints(before.detect(), before.transform)
@@ -200,6 +208,8 @@ def register_chain(
         results.append(result)
         if result.transform is not None:
             before = _ChainFrame(result, result.transform, small, detect)
+            if history is not None:
+                history.note(result)
     return results
 
 
@@ -211,6 +221,55 @@ class _ChainFrame:
     transform: FrameTransform
     small: GreyImage
     detect: Callable[[], Keypoints]
+
+
+@dataclass
+class _PatchHistory:
+    """Which patches of the base image were inliers lately in a chain of frames.
+
+    Attributes
+    ----------
+    templates : those in use.
+    frame : number of the frame in the chain.
+    last_inlier : (n,) number of the frame in which each was an inlier last.
+    """
+
+    templates: Templates
+    frame: int
+    last_inlier: IntArray
+
+    @classmethod
+    def begin(cls, base: BaseReference, first: FrameRegistration) -> "_PatchHistory":
+        """From the first registered frame: the set that its inliers are of."""
+        sets = [base.templates, base.dense_templates]
+        templates = max(sets, key=lambda one: int(_are_inliers(one, first).sum()))
+        history = cls(templates, 0, np.full(len(templates), -_RETEST_FRAMES))
+        history.note(first)
+        return history
+
+    def note(self, result: FrameRegistration) -> None:
+        """Remember the inliers of a frame."""
+        self.last_inlier[_are_inliers(self.templates, result)] = self.frame
+        self.frame += 1
+
+    def choose(self, before: _ChainFrame, shape: tuple[int, ...]) -> Templates:
+        """Inliers of the last frames, those that the frame before did not show, and some of the others in turn."""
+        recent = self.frame - self.last_inlier <= _RETEST_FRAMES
+        turn = np.arange(len(self.templates)) % _RETEST_FRAMES == self.frame % _RETEST_FRAMES
+        xy_raw = before.transform.to_raw(self.templates.xy)
+        shown = ((xy_raw >= HALF_PATCH) & (xy_raw <= np.array(shape[::-1]) - 1 - HALF_PATCH)).all(axis=1)
+        return self.templates.select(recent | turn | ~shown)
+
+
+def _are_inliers(templates: Templates, result: FrameRegistration) -> Mask:
+    """Which patches (n,) are among a frame's inliers: both are whole pixels of the base image."""
+    inliers = result.control_points
+    if inliers is None:
+        return np.zeros(len(templates), bool)
+    width = int(max(templates.xy[:, 0].max(initial=0), inliers.xy_base[:, 0].max(initial=0))) + 1
+    whole = inliers.xy_base[(inliers.xy_base == np.rint(inliers.xy_base)).all(axis=1)]
+    numbers, found = (np.asarray(xy @ (1, width), np.int64) for xy in (templates.xy, whole))
+    return np.isin(numbers, found)
 
 
 def _is_worse(result: FrameRegistration, first: FrameRegistration) -> bool:
@@ -234,8 +293,9 @@ def _register_by_flow(
     base: BaseReference,
     lens: Lens,
     config: RegistrationConfig,
+    templates: Templates,
 ) -> FrameRegistration | None:
-    """Register a frame from the inliers of the frame before; None where it fails."""
+    """Register a frame from the inliers of the frame before, by these patches; None where it fails."""
     inliers = before.result.control_points
     assert inliers is not None, "a registered frame has control points"
     chosen = np.linspace(0, len(inliers) - 1, min(_FLOW_POINTS, len(inliers))).astype(np.int64)
@@ -253,7 +313,8 @@ def _register_by_flow(
     if isinstance(prior, Failure):
         return None
     fitter = _FrameFitter(grey, base, lens, config)
-    fitted = fitter.fit_with_alignment(points, _start_of(prior, lens, width, height), before.result.stiffness)
+    start_transform = _start_of(prior, lens, width, height)
+    fitted = fitter.fit_with_alignment(points, start_transform, before.result.stiffness, templates)
     if isinstance(fitted, Failure):
         return None
     used, fit = fitted
@@ -404,8 +465,11 @@ class _FrameFitter:
         points: ControlPoints,
         start: PolyprojectiveTransform,
         stiffness: tuple[float, float] | None = None,
+        chosen: Templates | None = None,
     ) -> tuple[ControlPoints, JointFit] | Failure:
         """Fit to matched keypoints, then twice to patches of the base image aligned through that fit.
+
+        Patches that were ``chosen`` are taken as they are; else the usual set, or the denser one.
 
         If few patches align at the fine level, a coarse level with a larger search range comes first. Otherwise it does
         harm: at the border of another sensor's image, where few patches align correctly, wrong alignments from the
@@ -415,9 +479,9 @@ class _FrameFitter:
         if isinstance(fit, Failure):
             return fit
         fine = smooth_fine(self.grey)
-        templates = self.base.templates
+        templates = chosen or self.base.templates
         aligned, in_frame = align_patches(fine, fit.transform, templates, coarse=False, max_shift_px=_FINE_SHIFT_PX)
-        enough = len(aligned) >= _ENOUGH_FRACTION * in_frame
+        enough = chosen is not None or len(aligned) >= _ENOUGH_FRACTION * in_frame
         if not enough:
             templates = self.base.dense_templates
         steps = [(fine, False, _FINE_SHIFT_PX)] * 2
@@ -433,7 +497,10 @@ class _FrameFitter:
             refit = self._fit(used, fit.transform.polyprojective, fit)
             if isinstance(refit, Failure):
                 return refit
+            moved = fit.transform.to_base(aligned.xy_raw) - refit.transform.to_base(aligned.xy_raw)
             fit = refit
+            if not is_coarse and np.quantile(np.hypot(*moved.T), 0.95) < _SETTLED_PX:
+                break
         return used, fit
 
     def fit_with_case_deletion(self, points: ControlPoints) -> tuple[ControlPoints, JointFit] | Failure:
