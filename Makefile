@@ -49,9 +49,11 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 # stabilo, the peer of registration, declares torch and kornia for detectors that are not used here (gigabytes), and
-# OpenCV below 5; with --no-deps it runs on what is there. So it stands here and not in the lock.
+# OpenCV below 5; with --no-deps it runs on what is there. So it stands here and not in the lock, as does
+# trackpy, the peer of linking.
 bench: $(STAMP)  ## speed, as ratios against a peer in the same run
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps stabilo==1.4.7
+	$(BIN)/uv pip install --quiet --python $(BIN)/python trackpy
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only
 
 soak: $(STAMP)  ## fifty kills at random moments: every result equal to the bit

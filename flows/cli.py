@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import App, Parameter
 
 from flows.launch import limit_threads
-from flows.options import Preset, Settings, parse_frame_size, renamed_option
+from flows.options import Device, Preset, Settings, parse_frame_size, renamed_option
 from flows.stopping import STOPPED, as_ctrl_c, leave
 from velfield.errors import IneffectiveSettingWarning, InputError, OldNameWarning
 
@@ -84,6 +84,7 @@ def run(
     workers: int | None = None,
     scheduler: str | None = None,
     cluster: Path | None = None,
+    device: Device | None = None,
     plan: Annotated[bool, Parameter(negative=())] = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -132,6 +133,8 @@ def run(
         Address of a Dask scheduler.
     cluster
         File with the class of Dask clusters to use and its arguments; see `examples/cluster-*.yaml`.
+    device
+        Where the network is run: cpu, cuda, or auto (default): a GPU if onnxruntime can use one.
     plan
         Print what would be computed, and stop.
     quiet
@@ -151,6 +154,7 @@ def run(
         "frames.start_s": start_s,
         "frames.stop_s": stop_s,
         "field.time_intervals": renamed_option(intervals, old_intervals, name="--intervals", old_name="--slice"),
+        "work.device": device,
     }
     resolved = resolve_config(preset=preset, file=config, settings=settings, overrides=overrides)
     inputs = Inputs(

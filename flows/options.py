@@ -9,6 +9,7 @@ from schemas.renames import OLD_NAMES_UNTIL
 from velfield.errors import InputError, OldNameWarning
 
 Preset = Literal["best", "fast", "paper"]
+Device = Literal["auto", "cpu", "cuda"]
 Settings = Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False, negative=(), show_default=False)]
 """``section.key=value``, any number of times."""
 

@@ -14,6 +14,7 @@ from schemas.model import Model
 
 Every = PositiveInt | Literal["auto"]
 Preset = Literal["best", "fast", "paper"]
+Device = Literal["auto", "cpu", "cuda"]
 
 STATIONARY_SPEED_M_PER_S = 1.15
 """Below this speed a vehicle is stationary and its direction of motion is undefined. Paper: 5 px/s."""
@@ -181,6 +182,9 @@ class WorkConfig(Model):
     4096, then 256."""
     retries: int = Field(2, ge=0)
     """Retries of a unit that failed."""
+    device: Device = "auto"
+    """Where the detector's network is run: ``cpu``; ``cuda``, an NVIDIA GPU; ``auto``: a GPU that onnxruntime can use,
+    else the processor. Results differ in their last bits, and nothing is computed again for another device."""
 
 
 class FlightConfig(Model):

@@ -17,7 +17,7 @@ def stages_by_frame() -> list[str]:
 
 
 def speed(*, frames: int = 12, size: str = "2560x1920", preset: str = "fast", work: Path | None = None) -> int:
-    """Time every stage on one core, without Prefect: ms a frame and processor time; memory; the network's GFLOP/s.
+    """Time every stage on one core, without Prefect, beside other libraries: processor time, memory, GFLOP/s.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ def speed(*, frames: int = 12, size: str = "2560x1920", preset: str = "fast", wo
     size
         Frame size, WxH in pixels.
     preset
-        best or fast.
+        best, fast or paper: the paper's chain, read literally.
     work
         Folder for flight and run, kept; a flight that is there is used again. Default: a temporary one.
     """
@@ -37,7 +37,9 @@ def speed(*, frames: int = 12, size: str = "2560x1920", preset: str = "fast", wo
     from schemas.job import Inputs, Job
     from schemas.simulation import SimulationConfig
     from velfield.bench.detection import city, cnn_speed, matmul_gflops, network_gflop
+    from velfield.bench.peers import time_stabilo, time_trackpy
     from velfield.detection.detector import shipped_detector
+    from velfield.errors import InputError
     from velfield.pipeline.configuration import resolve_config
     from velfield.pipeline.local import compute_stages
     from velfield.pipeline.plan import make_plan, write_flight_record
@@ -48,25 +50,33 @@ def speed(*, frames: int = 12, size: str = "2560x1920", preset: str = "fast", wo
     with nullcontext(work) if work is not None else tempfile.TemporaryDirectory(prefix="velfield-speed-") as folder:
         root = Path(str(folder))
         flight = root / f"flight-{frames}-{width}x{height}"
+        simulation = SimulationConfig(frames=frames, width=width, height=height, seed=77)
         if not (flight / "truth").exists():
-            write_flight(flight, SimulationConfig(frames=frames, width=width, height=height, seed=77))
+            write_flight(flight, simulation)
         inputs = Inputs.from_simulated_flight(flight)
         config = resolve_config(preset=preset, overrides={"gsd_m": 0.23})
         plan = make_plan(Job(root=str(root / f"run-{preset}"), inputs=inputs, config=config))
         write_flight_record(plan)
-        total, by_frame = 0.0, stages_by_frame()
+        seconds, by_frame = {}, stages_by_frame()
         print(f"{frames} frames of {width}x{height}, preset {preset}, one core")
         for name in STAGE:
             start, used = time.perf_counter(), time.process_time()
             compute_stages(plan, [name])
             wall, used = time.perf_counter() - start, time.process_time() - used
-            each = ""
-            if name in by_frame:
-                total += used
-                each = f"{1000 * used / frames:8.0f} ms a frame"
+            seconds[name] = used
+            each = f"{1000 * used / frames:8.0f} ms a frame" if name in by_frame else ""
             print(f"{name:13} {wall:7.1f} s, {used:7.1f} s of processor {each}")
-    print(f"frames a second and core, set-up apart: {frames / total:.2f}")
-    print(f"peak memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.1f} GB")
+        print(f"frames a second and core, set-up apart: {frames / sum(seconds[name] for name in by_frame):.2f}")
+        print(f"whole job, one core: {frames / sum(seconds.values()):.2f} frames a second")
+        print(f"peak memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.1f} GB")
+        for peer in (
+            lambda: time_stabilo(flight, simulation, seconds["registration"]),
+            lambda: time_trackpy(plan, seconds["tracklets"]),
+        ):
+            try:
+                print(peer())
+            except InputError as error:
+                print(error)
     image, peak = city(width, height), matmul_gflops()
     network = cnn_speed(image, shipped_detector())
     gflop = network_gflop(width, height)

@@ -33,6 +33,11 @@ def test_every_stage_is_timed(capsys: pytest.CaptureFixture[str], monkeypatch: p
         line = next(line for line in told.splitlines() if line.startswith(f"{name} "))
         assert ("ms a frame" in line) == (name in stages_by_frame())
     assert float(re.findall(r"set-up apart: ([\d.]+)", told)[0]) > 0
+    for what, peer in (("registration", "stabilo"), ("tracklets", "trackpy")):
+        (line,) = [line for line in told.splitlines() if peer in line]
+        assert re.match(rf"{what}: [\d.]+ s of processor; {peer}.*: [\d.]+ s; [\d.e+-]+ times$", line) or (
+            "pip install" in line
+        )
     assert (
         0 < float(re.findall(r"(\d+) GFLOP/s of a peak", told)[0]) < float(re.findall(r"peak of (\d+)", told)[0]) * 1.2
     )

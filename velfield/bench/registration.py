@@ -110,7 +110,7 @@ def bench_registration(
     write_flight(flight, config)
     truth = load_truth(flight)
     measurements = []
-    for method, register in (("velfield", _run_velfield), ("stabilo", _run_stabilo))[: 2 if stabilo else 1]:
+    for method, register in (("velfield", _run_velfield), ("stabilo", register_by_stabilo))[: 2 if stabilo else 1]:
         to_base, registered, seconds = register(flight, config, truth)
         score = score_registration(truth, to_base, registered)
         corner = _worst_corner(truth, to_base, registered)
@@ -186,7 +186,7 @@ def _run_velfield(flight: Path, config: SimulationConfig, truth: Truth) -> tuple
     return lambda frame, xy: transforms[frame].to_base(xy), sorted(transforms), seconds
 
 
-def _run_stabilo(flight: Path, config: SimulationConfig, truth: Truth) -> tuple[PointMap, list[int], float]:
+def register_by_stabilo(flight: Path, config: SimulationConfig, truth: Truth) -> tuple[PointMap, list[int], float]:
     """One homography per frame by SIFT and MAGSAC; frames it cannot register are left out."""
     stabilizer = _make_stabilizer()
     undistort = _undistortion_maps(truth)

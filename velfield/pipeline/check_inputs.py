@@ -22,12 +22,12 @@ _READ: dict[str, Callable[[Path, Plan], object]] = {
 
 
 def validate_inputs(plan: Plan) -> None:
-    """Read each file that a stage has yet to read.
+    """Read each file that a stage has yet to read; see that the device is there.
 
     Raises
     ------
     InputError
-        One cannot be read or is not what its option expects; the message names the option.
+        One cannot be read or is not what its option expects, or there is no such device; the message names the option.
     """
     for option, read in _READ.items():
         path = getattr(plan.job.inputs, option)
@@ -36,6 +36,10 @@ def validate_inputs(plan: Plan) -> None:
                 read(Path(path), plan)
             except InputError as error:
                 raise InputError(f"--{option}: {error}") from None
+    if plan.config.work.device == "cuda":
+        from velfield.detection.cnn.model import check_device
+
+        check_device("cuda")
 
 
 def _is_pending(plan: Plan, option: str) -> bool:

@@ -31,6 +31,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from schemas.detector import LayerRecord, MotionRecord
+from schemas.flight import Device
 from velfield.detection.cascade.classifier import in_view, offset_along_axis
 from velfield.detection.orientation import sample_nearest
 from velfield.errors import InputError
@@ -179,14 +180,52 @@ class Network:
 
     @cached_property
     def session(self) -> ort.InferenceSession:
-        """The network in onnxruntime, on one thread: the order of its sums then never changes."""
-        options = ort.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        return ort.InferenceSession(network_to_onnx(self), options, providers=["CPUExecutionProvider"])
+        """The network in onnxruntime, on the device of `use_device`."""
+        return open_session(network_to_onnx(self), _device)
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the session, which no other process can use."""
         return {name: value for name, value in self.__dict__.items() if name != "session"}
+
+
+_CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
+_device: Device = "auto"
+
+
+def use_device(device: Device) -> None:
+    """Set where the networks of this process are run that have not been run yet."""
+    global _device
+    _device = device
+
+
+def check_device(device: Device) -> None:
+    """Raise InputError where onnxruntime cannot use a device."""
+    if device == "cuda" and _CUDA not in ort.get_available_providers():
+        raise InputError(_no_cuda(f"onnxruntime with {', '.join(ort.get_available_providers())}"))
+
+
+def open_session(model: bytes, device: Device) -> ort.InferenceSession:
+    """A model in onnxruntime: on one thread of the processor, so that the order of its sums never changes, or on a GPU.
+
+    Raises
+    ------
+    InputError
+        ``device`` is cuda, and onnxruntime cannot use it.
+    """
+    check_device(device)
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    providers: list[Any] = [_CPU]
+    if device != "cpu" and _CUDA in ort.get_available_providers():
+        providers.insert(0, (_CUDA, {"use_tf32": "0"}))  # with its shorter mantissa scores would differ visibly
+    session = ort.InferenceSession(model, options, providers=providers)
+    if device == "cuda" and _CUDA not in session.get_providers():
+        raise InputError(_no_cuda("a GPU that onnxruntime could not start"))
+    return session
+
+
+def _no_cuda(found: str) -> str:
+    return f"--device cuda: found {found}, expected CUDA; pip install velfield[cuda], or use --device cpu"
 
 
 def network_to_onnx(network: Network) -> bytes:
@@ -405,19 +444,22 @@ def predict_heatmap(
     centred at (2 x + 0.5, 2 y + 0.5) of the image.
     """
     (height, width), unit = image.shape, network.alignment
-    rows, columns = -(-height // _TILE_PX), -(-width // _TILE_PX)
-    tile_h, tile_w = unit * -(-height // (unit * rows)), unit * -(-width // (unit * columns))
-    halo = HALO_PX if rows * columns > 1 else border_px
-    excess = rows * tile_h - height, columns * tile_w - width
-    padded = cv2.copyMakeBorder(image, halo, halo + excess[0], halo, halo + excess[1], _BORDER)
-    probability = np.empty((rows * tile_h // STRIDE, columns * tile_w // STRIDE), np.float32)
+    whole = unit * -(-height // unit), unit * -(-width // unit)
+    side = [unit * -(-size // (unit * -(-size // _TILE_PX))) for size in whole]
+    end = [border_px + size - given for size, given in zip(whole, image.shape, strict=True)]
+    padded = cv2.copyMakeBorder(image, border_px, end[0], border_px, end[1], _BORDER)
+    probability = np.empty((whole[0] // STRIDE, whole[1] // STRIDE), np.float32)
     orientation = np.empty((2, *probability.shape), np.float32)
-    inner = slice(halo // STRIDE, (halo + tile_h) // STRIDE), slice(halo // STRIDE, (halo + tile_w) // STRIDE)
-    for y in range(0, rows * tile_h, tile_h):
-        for x in range(0, columns * tile_w, tile_w):
-            tile = padded[y : y + tile_h + 2 * halo, x : x + tile_w + 2 * halo]
+    for y in range(0, whole[0], side[0]):
+        for x in range(0, whole[1], side[1]):
+            # Beside other tiles the halo, at the image's edge its border: so tiles do not show.
+            top, left = max(0, y + border_px - HALO_PX), max(0, x + border_px - HALO_PX)
+            tile = padded[top : y + border_px + side[0] + HALO_PX, left : x + border_px + side[1] + HALO_PX]
             of_tile = forward(network, tile[None])
-            part = slice(y // STRIDE, (y + tile_h) // STRIDE), slice(x // STRIDE, (x + tile_w) // STRIDE)
+            rows, columns = (min(size, far - near) for size, far, near in zip(side, whole, (y, x), strict=True))
+            down, right = (y + border_px - top) // STRIDE, (x + border_px - left) // STRIDE
+            inner = slice(down, down + rows // STRIDE), slice(right, right + columns // STRIDE)
+            part = slice(y // STRIDE, (y + rows) // STRIDE), slice(x // STRIDE, (x + columns) // STRIDE)
             probability[part], orientation[:, *part] = of_tile[0][0][inner], of_tile[1][0][:, *inner]
     size = -(-height // STRIDE), -(-width // STRIDE)
     return probability[: size[0], : size[1]], orientation[:, : size[0], : size[1]]

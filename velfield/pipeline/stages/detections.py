@@ -14,6 +14,7 @@ import pandas as pd
 
 from schemas.arrays import FloatArray, GreyImage, Points
 from schemas.tables import DETECTION_COLUMNS
+from velfield.detection.cnn.model import use_device
 from velfield.detection.detect import ComparableFrame, FrameDetections, SearchedFrame, attach_crops, search_frame
 from velfield.detection.detector import Detections, Detector, load_detector
 from velfield.detection.orientation import CAR_ASPECT, axial_difference, fill_missing_orientation
@@ -119,6 +120,7 @@ class _Search:
 
     def __init__(self, plan: Plan, working: WorkingGrid, *, has_background: bool) -> None:
         self._plan, self._working, self._has_background = plan, working, has_background
+        use_device(plan.config.work.device)
         self._detector = _detector(plan.layout.detector, plan.keys["detector"])
         self._usable = usable_frames(plan)
         self._group, self._first = range(0), -1

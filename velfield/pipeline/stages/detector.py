@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from schemas.records import WorkingRecord
+from velfield.detection.cnn.model import use_device
 from velfield.detection.detector import Detector, detector_class, load_detector, shipped_detector, train_detector
 from velfield.detection.motion.difference import MotionBackground, MotionFrame, motion_background
 from velfield.detection.motion.labels import MotionLabels, choose_frames, labels_from_motion, working_scale
@@ -37,6 +38,7 @@ _MIN_FRAMES_WITH_BOXES = 0.5
 
 def make_detector(plan: Plan) -> StageResult:
     """Set the scale of the working grid, and load or train the detector."""
+    use_device(plan.config.work.device)
     if plan.job.inputs.detections:
         return _from_detections(plan)
     if plan.job.inputs.detector:
