@@ -49,11 +49,11 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 # stabilo, the peer of registration, declares torch and kornia for detectors that are not used here (gigabytes), and
-# OpenCV below 5; with --no-deps it runs on what is there. So it stands here and not in the lock, as does
-# trackpy, the peer of linking.
+# OpenCV below 5; with --no-deps it runs on what is there. So it stands here and not in the lock, as do
+# trackpy, the peer of linking, and boost-histogram and xhistogram, those of accumulation.
 bench: $(STAMP)  ## speed, as ratios against a peer in the same run
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps stabilo==1.4.7
-	$(BIN)/uv pip install --quiet --python $(BIN)/python trackpy
+	$(BIN)/uv pip install --quiet --python $(BIN)/python trackpy boost-histogram xhistogram
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only
 
 soak: $(STAMP)  ## fifty kills at random moments: every result equal to the bit

@@ -5,14 +5,14 @@ import shlex
 import sys
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from cyclopts import App, Parameter
+from cyclopts import App, CycloptsError, Parameter
 
 from flows.launch import limit_threads
 from flows.options import Device, Preset, Settings, parse_frame_size, renamed_option
 from flows.stopping import STOPPED, as_ctrl_c, leave
-from velfield.errors import IneffectiveSettingWarning, InputError, OldNameWarning
+from velfield.errors import IneffectiveSettingWarning, InputError, OldNameWarning, StoreError
 
 if TYPE_CHECKING:
     from flows.console import Console, Verbosity
@@ -43,11 +43,15 @@ app = App(
 app.command("flows.commands.init:init", name="init", help="Probe a video and write a commented flight.yaml.")
 app.command("flows.commands.config:config", name="config", help="Print the configuration of a run.")
 app.command("flows.commands.view:view", name="view", help="Show a run's page in the browser.")
+app.command("flows.commands.analyse:analyse", name="analyse", help="Lanes, turning counts, speeds, signals: a report.")
 app.command("flows.commands.annotate:annotate", name="annotate", help="Label cars in the browser, as training data.")
 app.command("flows.commands.train:train", name="train", help="Train a detector from labelled cars.")
 app.command("flows.commands.export:export", name="export", help="Write a finished run in another format.")
 app.command("flows.commands.lineage:lineage", name="lineage", help="Lineage of a run, or of a pixel of its field.")
 app.command("flows.commands.reprocess:reprocess", name="reprocess", help="Map a finished run onto a new base image.")
+app.command(
+    "flows.commands.georeference:georeference", name="georeference", help="Put a run's map on Earth by control points."
+)
 app.command("flows.commands.serve:serve", name="serve", help="Process flights that arrive in a folder, with a UI.")
 app.command("flows.commands.verify:verify", name="verify", help="Check the integrity of a run folder, and repair it.")
 app.command("flows.commands.algebra:merge", name="merge", help="Add the fields of runs on one grid, exactly.")
@@ -64,7 +68,7 @@ LogJson = Annotated[bool, Parameter(name="--log-json", negative=())]
 def run(
     source: Path,
     /,
-    *,
+    *more: Path,
     out: Path,
     base: Path | None = None,
     gsd_m: float | None = None,
@@ -72,6 +76,7 @@ def run(
     detector: Path | None = None,
     detections: Path | None = None,
     timestamps: Path | None = None,
+    telemetry: Path | None = None,
     fps: float | None = None,
     config: Path | None = None,
     preset: Preset | None = None,
@@ -96,13 +101,16 @@ def run(
     ----------
     source
         Video file, or folder of images.
+    more
+        Further clips of the same place, one after the other in time: one map, one clock by the files' own times.
     out
         Run folder: everything is written there.
     base
         Image whose pixels become the base pixels: GeoTIFF, PNG with world file, or plain.
         Default: built from the flight.
     gsd_m
-        Ground sample distance, metres a base pixel. Default: from the base image's CRS, else speeds stay in px/s.
+        Ground sample distance, metres a base pixel. Default: by the base image's CRS or the drone's metadata; else
+        speeds stay in px/s.
     labels
         Labelled cars to train on: CSV, GeoJSON, YOLO, COCO, LabelMe, VIA. Default: labels from motion.
     detector
@@ -111,6 +119,8 @@ def run(
         Boxes of another detector, instead of this one's.
     timestamps
         CSV `frame,time_s` for a folder of images.
+    telemetry
+        Subtitle file (.SRT) of a drone. Default: the one beside the video, or the subtitles and tags of the source.
     fps
         Frame rate of a folder of images without timestamps.
     config
@@ -158,12 +168,13 @@ def run(
     }
     resolved = resolve_config(preset=preset, file=config, settings=settings, overrides=overrides)
     inputs = Inputs(
-        source=str(source),
+        source=str(_clip_list(source, more, out) if more else source),
         base=_text(base),
         labels=_text(labels),
         detector=_text(detector),
         detections=_text(detections),
         timestamps=_text(timestamps),
+        telemetry=_text(telemetry),
     )
     job = Job(root=str(out), inputs=inputs, config=resolved)
     if plan:
@@ -180,6 +191,7 @@ def simulate(
     frames: int = 300,
     size: str = "1280x960",
     seed: int = 0,
+    clip: Literal["beside", "embedded"] | None = None,
     quiet: Quiet = False,
 ) -> int:
     """Simulate a flight over a city, with ground truth: writes frames/, timestamps.csv, base.png, labels.csv, truth/.
@@ -194,10 +206,16 @@ def simulate(
         Frame size, WxH in pixels.
     seed
         Another seed, another city and another flight.
+    clip
+        Write a drone's clip DJI_0001.MP4, 25 frames a second, in place of frames/, with its telemetry: in a file
+        `beside` it, or `embedded`.
     quiet
         Warnings only.
     """
-    _simulate(out, frames=frames, size=size, seed=seed, quiet=quiet)
+    _simulate(out, frames=frames, size=size, seed=seed, quiet=quiet, clip=clip)
+    if clip is not None:
+        print(f"{out}: try  velfield run {out}/DJI_0001.MP4 --out RUN")
+        return DONE
     given = f"--timestamps {out}/timestamps.csv --base {out}/base.png --labels {out}/labels.csv --gsd-m 0.23"
     print(f"{out}: try  velfield run {out}/frames {given} --out RUN")
     return DONE
@@ -263,7 +281,15 @@ def schema() -> int:
     return DONE
 
 
-def _simulate(out: Path, *, frames: int, size: str, seed: int, quiet: bool) -> None:
+def _simulate(
+    out: Path,
+    *,
+    frames: int,
+    size: str,
+    seed: int,
+    quiet: bool,
+    clip: Literal["beside", "embedded"] | None = None,
+) -> None:
     from flows.console import Console
     from schemas.simulation import SimulationConfig
     from velfield.synthetic import write_flight
@@ -271,6 +297,7 @@ def _simulate(out: Path, *, frames: int, size: str, seed: int, quiet: bool) -> N
     width, height = parse_frame_size(size, "as 1280x960")
     console = Console("quiet" if quiet else "normal")
     config = SimulationConfig(frames=frames, width=width, height=height, seed=seed)
+    config = config if clip is None else config.as_clip(clip)
     with console.stage("simulate", "simulate", frames) as progress:
         write_flight(out, config, lambda done, _total: progress.at_least(done))
     console.event("stage", f"simulated     {frames} frames of {width} x {height} px in {out}")
@@ -287,6 +314,8 @@ def _runner(workers: int | None, scheduler: str | None, cluster: Path | None) ->
 
     if sum(given is not None for given in (workers, scheduler, cluster)) > 1:
         raise InputError("found more than one of --workers, --scheduler and --cluster; give one")
+    if workers is not None and workers < 1:
+        raise InputError(f"--workers {workers}: expected a whole number from 1 on; leave it out for this process alone")
     return read_runner(cluster) if cluster else RunnerConfig(workers=workers, scheduler=scheduler)
 
 
@@ -298,11 +327,13 @@ def _process(
 ) -> int:
     from flows.launch import first_start, prepare_process
     from flows.stopping import stop_on_signals
+    from flows.temporary_server import start_server
     from velfield.pipeline.plan import check_inputs
 
     stop_on_signals()
-    check_inputs(job)  # before Prefect: its start takes seconds
     prepare_process(verbose=verbosity == "verbose")
+    server = start_server()
+    check_inputs(job)
     from flows.console import Console
 
     console = Console(verbosity)
@@ -311,7 +342,8 @@ def _process(
     from flows.process_flight import run_flight
     from flows.runners import RunnerConfig
 
-    summary = run_flight(job, runner or RunnerConfig(), console)
+    with server.in_use():
+        summary = run_flight(job, runner or RunnerConfig(), console)
     return _conclude(summary, console)
 
 
@@ -333,11 +365,28 @@ def _conclude(summary: "RunSummary", console: "Console") -> int:
 
 def _show_plan(job: "Job", runner: "RunnerConfig") -> int:
     from flows.runners import parallel_units
+    from velfield.pipeline.check_inputs import validate_inputs
     from velfield.pipeline.estimate import describe_plan
     from velfield.pipeline.plan import make_plan
 
-    print(describe_plan(make_plan(job), parallel_units(runner)))
+    plan = make_plan(job)
+    validate_inputs(plan)
+    print(describe_plan(plan, parallel_units(runner)))
     return DONE
+
+
+def _clip_list(source: Path, more: tuple[Path, ...], out: Path) -> Path:
+    """The list of several clips, written into the run folder."""
+    from velfield.run.layout import is_remote, to_path
+    from velfield.sources.clips import CLIPS_SUFFIX, write_clip_list
+
+    if is_remote(to_path(out)):
+        raise InputError(
+            f"{out}: several clips need a list on a disk; write x{CLIPS_SUFFIX}, a path a line, and run it"
+        )
+    path = out / f"source{CLIPS_SUFFIX}"
+    write_clip_list(path, (source, *more))
+    return path
 
 
 def _every(text: str | None) -> int | str | None:
@@ -370,19 +419,32 @@ def _warn_of_settings_in_one_line() -> None:
     warnings.showwarning = showwarning
 
 
+def _start() -> int:
+    from flows.commands.start import start
+
+    return start(Path.cwd())
+
+
 def main() -> None:
     """Run the command; bad input is one clear line, never a traceback."""
     limit_threads()
     as_ctrl_c()
     _warn_of_settings_in_one_line()
     try:
-        status = app(result_action="return_value")
+        options = {"result_action": "return_value", "exit_on_error": False, "print_error": False}
+        status = _start() if len(sys.argv) == 1 else app(sys.argv[1:], **options)
+    except CycloptsError as error:  # the library's own message is a box of several lines
+        print(f"velfield: {' '.join(str(error).split())} `velfield COMMAND --help` lists all", file=sys.stderr)
+        status = USAGE
     except InputError as error:
         print(f"velfield: {error}", file=sys.stderr)
         status = BAD_INPUT
     except BrokenPipeError:  # the reader of our output has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = DONE
+    except (StoreError, OSError) as error:  # a damaged run; a disk that is full, read-only or gone
+        print(f"velfield: {' '.join(str(error).split())}", file=sys.stderr)
+        status = BAD_INPUT
     except KeyboardInterrupt:
         leave(STOPPED)
     sys.exit(status)

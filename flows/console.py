@@ -10,10 +10,20 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from rich.console import Console as RichConsole
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
+from velfield.parallel import subscribe_steps
 from velfield.pipeline.result import subscribe
 
+_LINE_EVERY_S = 10.0
 Verbosity = Literal["quiet", "normal", "verbose", "json"]
 
 
@@ -21,23 +31,75 @@ Verbosity = Literal["quiet", "normal", "verbose", "json"]
 class StageProgress:
     """Progress of one stage: by blocks where they run in this process, else by units."""
 
-    total: int
     bar: Progress
-    task: int
-    name: str
+    task: TaskID
+    total: int = 0
     done: int = 0
     lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def add_steps(self, stage: str, steps: int) -> None:
-        """Count steps that a block of this process published."""
-        if stage == self.name:
-            self.at_least(self.done + steps)
+    def expect(self, total: int) -> None:
+        """Set the number of steps."""
+        self.total = total
+        self.bar.update(self.task, total=total)
+
+    def remove(self) -> None:
+        """Take the bar away, as the stage is done."""
+        self.bar.update(self.task, visible=False)
+
+    def set_progress(self, done: int, total: int) -> None:
+        """Set the progress to at least so many steps of a number that was not known before."""
+        if total != self.total:
+            self.total = total
+            self.bar.update(self.task, total=total)  # type: ignore[arg-type]
+        self.at_least(done)
 
     def at_least(self, done: int) -> None:
         """Set the progress to at least so many steps."""
         with self.lock:
             self.done = min(self.total, max(self.done, done))
-            self.bar.update(self.task, completed=self.done)  # type: ignore[arg-type]
+            self.bar.update(self.task, completed=self.done)
+
+
+@dataclass
+class StageBars:
+    """Progress bars, one a stage."""
+
+    bar: Progress
+    stages: dict[str, StageProgress] = field(default_factory=dict)
+
+    def add(self, name: str, label: str) -> StageProgress:
+        """A bar for a stage, by its name and what it is called."""
+        self.stages[name] = StageProgress(self.bar, self.bar.add_task(label, total=None))
+        return self.stages[name]
+
+    def add_steps(self, stage: str, steps: int) -> None:
+        """Count steps that a block of this process published."""
+        progress = self.stages.get(stage)
+        if progress is not None:
+            progress.at_least(progress.done + steps)
+
+
+@contextmanager
+def training_progress() -> Iterator[None]:
+    """A bar of the steps of a training; where there is no terminal, a line every ten seconds."""
+    console = RichConsole(stderr=True, highlight=False)
+    console.print("training on the labelled cars: up to some minutes", markup=False)
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=30), MofNCompleteColumn(), TimeElapsedColumn())
+    done, total, lock, printed_s = 0, 0, threading.Lock(), time.monotonic()
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("training", total=None)
+
+        def count(steps: int, announced: int) -> None:
+            nonlocal done, total, printed_s
+            with lock:
+                done, total = done + steps, total + announced
+                bar.update(task, completed=done, total=total)
+                if not console.is_terminal and time.monotonic() - printed_s > _LINE_EVERY_S:
+                    printed_s = time.monotonic()
+                    console.print(f"training: {done} of {total} steps", markup=False)
+
+        with subscribe_steps(count):
+            yield
 
 
 def print_with_time(text: str) -> None:
@@ -73,6 +135,14 @@ class Console:
     @contextmanager
     def stage(self, name: str, label: str, total: int) -> Iterator[StageProgress]:
         """A progress bar while one stage runs."""
+        with self.stages() as bars:
+            progress = bars.add(name, label)
+            progress.expect(total)
+            yield progress
+
+    @contextmanager
+    def stages(self) -> Iterator["StageBars"]:
+        """Progress bars of the stages that run."""
         columns = (
             TextColumn("{task.description:<12}"),
             BarColumn(bar_width=30),
@@ -82,6 +152,6 @@ class Console:
         )
         hidden = not self._rich.is_terminal  # in a log a bar would leave empty lines
         with Progress(*columns, console=self._rich, transient=True, refresh_per_second=5, disable=hidden) as bar:
-            progress = StageProgress(total, bar, bar.add_task(label, total=total), name)
-            with subscribe(progress.add_steps):
-                yield progress
+            bars = StageBars(bar)
+            with subscribe(bars.add_steps):
+                yield bars

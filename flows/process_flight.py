@@ -3,7 +3,8 @@
 The stages and their order stand in ``velfield.pipeline.stage``. A task is thin glue: it asks
 ``velfield.pipeline.graphs`` for the Dask graph of its unit and computes it on the runner. What is finished is known
 from the run folder's commit records, so a task whose unit has one returns at once, whatever Prefect remembers of it.
-Futures of one stage are passed to the next, which draws the lineage in the UI. The report is written last, from the
+Futures of one stage are passed to the next, which draws the lineage in the UI. On a long flight a task beside them
+makes maps of what there is so far. The report is written last, from the
 summary of all stages, by every run: it is no stage, for nothing depends on it and it takes a moment.
 """
 
@@ -14,19 +15,19 @@ from prefect.task_runners import ThreadPoolTaskRunner
 
 from flows.artifacts import publish_summary
 from flows.console import Console
-from flows.runners import RunnerConfig, open_runner, parallel_units
+from flows.previews import Previews
+from flows.runners import Runner, RunnerConfig, open_runner, parallel_units
 from flows.stale import mark_crashed
 from flows.work import Work
 from schemas.job import Job
 from schemas.summary import RunSummary
 from velfield.pipeline.check_inputs import validate_inputs
-from velfield.pipeline.estimate import check_space
-from velfield.pipeline.plan import changed_since, make_plan, write_flight_record
-from velfield.pipeline.stage import STAGES
+from velfield.pipeline.estimate import check_space, disk_full_as_input_error
+from velfield.pipeline.plan import Plan, changed_since, dropped_inputs, make_plan, write_flight_record
 from velfield.pipeline.stages.registration import lost_frames
 from velfield.pipeline.stages.report import write_report
 from velfield.run.commits import sweep_partial
-from velfield.run.layout import RunLayout
+from velfield.run.layout import RunLayout, remove_tree
 from velfield.run.lock import locked
 
 
@@ -49,22 +50,29 @@ def process_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSumma
     with locked(layout), open_runner(runner) as where:
         mark_crashed(job.root)
         sweep_partial(layout.root)
+        remove_tree(layout.preview)
         plan = make_plan(job)
         validate_inputs(plan)
         check_space(plan)
-        changed = changed_since(plan)
-        write_flight_record(plan)
-        console.event("start", f"{job.inputs.source}: {plan.frame_count} frames to process, {where.description}")
-        if changed:
-            text = f"{', '.join(changed)} changed since the last run; dependent stages are recomputed"
-            console.event("changed", f"{job.root}: {text}", changed=changed)
-        for warning in plan.info.warnings:
-            console.warn(warning)
-        work = Work(plan, where, console)
-        for stage in STAGES:
-            work.run(stage)
-        summary = RunSummary(root=job.root, stages=tuple(work.summaries), frames_lost=lost_frames(work.plan))
-        for note in write_report(work.plan, summary):
-            console.warn(note)
-        publish_summary(work.plan, summary)
-        return summary
+        with disk_full_as_input_error(plan):
+            return _run_stages(job, plan, where, parallel_units(runner), console)
+
+
+def _run_stages(job: Job, plan: Plan, runner: Runner, at_once: int, console: Console) -> RunSummary:
+    """All stages, then the report."""
+    changed, dropped = changed_since(plan), dropped_inputs(plan)
+    write_flight_record(plan)
+    console.event("start", f"{job.inputs.source}: {plan.frame_count} frames to process, {runner.description}")
+    if changed:
+        text = f"{', '.join(changed)} changed since the last run; dependent stages are recomputed"
+        console.event("changed", f"{job.root}: {text}", changed=changed)
+    for warning in (*dropped, *plan.info.warnings):
+        console.warn(warning)
+    work = Work(plan, runner, console, at_once=at_once, aside=Previews(plan, runner, console))
+    work.run()
+    remove_tree(plan.layout.preview)
+    summary = RunSummary(root=job.root, stages=tuple(work.summaries), frames_lost=lost_frames(work.plan))
+    for note in write_report(work.plan, summary):
+        console.warn(note)
+    publish_summary(work.plan, summary)
+    return summary

@@ -144,7 +144,7 @@ def _mapped(run: Run, job: Job, found: RebaseRecord, runner: RunnerConfig, conso
     plan = plan_rebase(run, job, found)
     write_flight_record(plan)
     with open_runner(runner) as where:
-        work = Work(plan, where, console)
+        work = Work(plan, where, console, at_once=parallel_units(runner))
         _run_stages(work, Rebase(run.layout, found))
     summary = RunSummary(root=job.root, stages=tuple(work.summaries), frames_lost=lost_frames(plan))
     write_report(plan, summary)
@@ -162,4 +162,4 @@ def _run_stages(work: Work, rebase: Rebase) -> None:
         if stage.new_base in (NewBase.SHARED, NewBase.COUNTS):
             work.carry_over(stage)
         else:
-            work.run(stage, graph, essential=True)
+            work.run([stage], graph, essential=True)

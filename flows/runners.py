@@ -52,10 +52,10 @@ def read_runner(path: Path) -> RunnerConfig:
     import yaml
 
     try:
-        file = ClusterFile.model_validate(yaml.safe_load(path.read_text()))
+        file = ClusterFile.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
     except FileNotFoundError:
         raise InputError(f"--cluster: {path} is not there; see examples/ for some") from None
-    except (yaml.YAMLError, ValidationError) as error:
+    except (yaml.YAMLError, ValidationError, ValueError, RecursionError) as error:
         details = " ".join(str(error).split())
         raise InputError(f"--cluster {path}: expected cluster_class, cluster_kwargs, workers; {details}") from None
     return RunnerConfig(**file.model_dump())
@@ -70,6 +70,10 @@ class Runner(ABC):
     def compute(self, graph: Any) -> Any:
         """The value of one delayed graph."""
 
+    def compute_here(self, graph: Any) -> Any:
+        """The same, on no more threads of this process than the calling one."""
+        return self.compute(graph)
+
 
 class ThreadsRunner(Runner):
     """The threads of this process."""
@@ -81,6 +85,9 @@ class ThreadsRunner(Runner):
     def compute(self, graph: Any) -> Any:
         # Units run concurrently on Prefect's threads, so a graph by itself needs no more than a few.
         return graph.compute(scheduler="threads", num_workers=self._threads)
+
+    def compute_here(self, graph: Any) -> Any:
+        return graph.compute(scheduler="synchronous")
 
 
 class ClientRunner(Runner):

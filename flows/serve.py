@@ -261,6 +261,10 @@ def serve_folder(config: ServeConfig) -> None:
         with server(config):
             from prefect import serve
 
+            from flows.stale import mark_abandoned
+
+            if killed := mark_abandoned():
+                print_with_time(f"{killed} runs of processes that were killed are marked as crashed")
             print(f"Prefect UI  {config.url}", flush=True)
             for name, path in (
                 ("flights", config.incoming),

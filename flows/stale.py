@@ -1,27 +1,54 @@
 """Flow runs that were killed stay "Running" in Prefect for ever, unless they are marked as crashed."""
 
+from collections.abc import Callable
+from pathlib import Path
+
 from prefect.client.orchestration import get_client
-from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterName, FlowRunFilterState, FlowRunFilterStateType
-from prefect.client.schemas.objects import StateType
+from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterState, FlowRunFilterStateType
+from prefect.client.schemas.objects import FlowRun, StateType
 from prefect.runtime import flow_run
 from prefect.states import Crashed
 
+from velfield.run.layout import RunLayout
+from velfield.run.lock import holder_is_gone
+
+_PAGE = 200
+_RESUMED = "the process was killed; the next run of this folder resumed from its commits"
+_ENDED = "the process was killed; the same command resumes from its commits"
+
 
 def mark_crashed(name: str) -> int:
-    """Mark earlier runs of this name that Prefect believes to be running as crashed; returns how many.
+    """Mark runs that Prefect believes to be running as crashed: earlier ones of this name, any whose process ended.
 
-    Call while holding the run folder's lock: then no other run on it can be alive.
+    Call while holding the run folder's lock: then no other run on it can be alive. Returns how many.
     """
-    running = FlowRunFilter(
-        name=FlowRunFilterName(any_=[name]),
-        state=FlowRunFilterState(type=FlowRunFilterStateType(any_=[StateType.RUNNING])),
-    )
     own = str(flow_run.id)
-    found = 0
+    return _mark(lambda run: str(run.id) != own and run.name == name, _RESUMED) + _mark(
+        lambda run: str(run.id) != own and run.name != name and _is_abandoned(run), _ENDED
+    )
+
+
+def mark_abandoned() -> int:
+    """Mark what a server finds running at its start as crashed; returns how many.
+
+    Runs of its own deployments ended with the server before; others did where their process has ended.
+    """
+    return _mark(lambda run: run.deployment_id is not None or _is_abandoned(run), _ENDED)
+
+
+def _is_abandoned(run: FlowRun) -> bool:
+    """Whether a run is named after a folder of this machine (`RUN`, or `RUN on BASE`) whose lock's holder has ended."""
+    root = Path(run.name.split(" on ")[0])
+    return root.is_absolute() and holder_is_gone(RunLayout(root))
+
+
+def _mark(is_dead: Callable[[FlowRun], bool], message: str) -> int:
+    running = FlowRunFilter(state=FlowRunFilterState(type=FlowRunFilterStateType(any_=[StateType.RUNNING])))
     with get_client(sync_client=True) as client:
-        for run in client.read_flow_runs(flow_run_filter=running):
-            if str(run.id) != own:
-                state = Crashed(message="the process was killed; the next run of this folder resumed from its commits")
-                client.set_flow_run_state(run.id, state, force=True)
-                found += 1
-    return found
+        runs: list[FlowRun] = []
+        while page := client.read_flow_runs(flow_run_filter=running, limit=_PAGE, offset=len(runs)):
+            runs += page
+        dead = [run for run in runs if is_dead(run)]
+        for run in dead:
+            client.set_flow_run_state(run.id, Crashed(message=message), force=True)
+    return len(dead)

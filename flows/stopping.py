@@ -18,12 +18,13 @@ _GRACE_S = 5.0
 """Time for Prefect to record the end of the run; units under way, half a minute of work perhaps, are abandoned."""
 _END_S = 3.0
 _resumes = threading.Event()
+_leaves = threading.Lock()
 _MARK = "VELFIELD_STARTED_BY"
 """Environment variable that marks the children of this process: its id and start time."""
 _WATCH = """if True:
     import sys
     mark = sys.argv[1]
-    sys.stdin.read()  # until the parent is gone
+    sys.stdin.read()  # until the parent is gone: killed, for one that ends by itself ends this one too
     import psutil
     for process in psutil.process_iter():
         try:
@@ -34,18 +35,26 @@ _WATCH = """if True:
 """
 
 
-def stop_on_signals() -> None:
+def stop_on_signals(*, resumes: bool = True, grace_s: float = _GRACE_S) -> None:
     """Treat SIGTERM as Ctrl-C; neither waits for the work under way, which the same command resumes.
 
     Call in the main thread.
+
+    Parameters
+    ----------
+    resumes
+        Whether the same command resumes the work: the last line then states it.
+    grace_s
+        Time to end by itself.
     """
-    _resumes.set()
+    if resumes:
+        _resumes.set()
     as_ctrl_c()
     # Prefect replaces our handler by its own, then waits for the threads: the wake-up descriptor is notified anyway.
     receiver, sender = socket.socketpair()
     sender.setblocking(False)
     signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
-    threading.Thread(target=_end_late, args=(receiver, sender), name="end", daemon=True).start()
+    threading.Thread(target=_end_late, args=(receiver, sender, grace_s), name="end", daemon=True).start()
     end_children_when_killed()
 
 
@@ -67,9 +76,8 @@ def end_children_when_killed() -> None:
 
 
 def _release(watcher: "subprocess.Popen[bytes]") -> None:
-    assert watcher.stdin is not None
-    watcher.stdin.close()
-    watcher.wait()
+    end_children(_END_S)  # whatever is left of them, and the watcher
+    watcher.communicate()
 
 
 def as_ctrl_c() -> None:
@@ -82,16 +90,17 @@ def _stop(_number: int, _frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-def _end_late(receiver: socket.socket, _sender: socket.socket) -> None:
+def _end_late(receiver: socket.socket, _sender: socket.socket, grace_s: float) -> None:
     while receiver.recv(1)[0] not in _ENDING:
         pass
     logging.disable(logging.CRITICAL)  # errors from now on are consequences of the end
-    threading.Event().wait(_GRACE_S)
+    threading.Event().wait(grace_s)
     leave(STOPPED)
 
 
 def leave(status: int) -> None:
-    """Print that it stopped and end at once, with all child processes."""
+    """Print that it stopped and end at once, with all child processes; the first thread that comes does it."""
+    _leaves.acquire()  # and keeps it
     cursor = "\x1b[?25h" if sys.stderr.isatty() else ""  # shown again: a progress bar hides it
     message = "stopped; the same command resumes" if _resumes.is_set() else "stopped"
     print(f"{cursor}\nvelfield: {message}", file=sys.stderr, flush=True)

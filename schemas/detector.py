@@ -295,7 +295,41 @@ class PaperRecord(BaseRecord):
     """Regions smaller than this are dropped."""
 
 
-DetectorRecord = Annotated[CnnRecord | CascadeRecord | PaperRecord, Field(discriminator="method")]
+OnnxLayout = Literal["boxes", "oriented_boxes", "boxes_with_objectness", "end_to_end", "end_to_end_oriented"]
+"""What a YOLO-type network gives for an image: ``boxes``, (4 + classes, n) as of YOLOv8 and later; ``oriented_boxes``,
+the same and an angle; ``boxes_with_objectness``, (n, 5 + classes) as of YOLOv5; ``end_to_end``, (n, 6) corners, score
+and class, duplicates suppressed; ``end_to_end_oriented``, (n, 7) centre, size, score, class and angle."""
+
+
+class OnnxDescription(Model):
+    """The YAML beside an ONNX model; what it leaves out is read from the model's metadata (Ultralytics)."""
+
+    layout: OnnxLayout | None = None
+    classes: tuple[str, ...] = ()
+    """Names of the classes, in their order."""
+    vehicles: tuple[int, ...] | None = None
+    """Numbers of the classes that are vehicles."""
+    image_size_px: PositiveInt | None = Field(None, ge=32, le=8192)
+    """Side of the network's input, where the model leaves it open."""
+    threshold: float | None = Field(None, ge=0, lt=1)
+    """Score threshold."""
+
+
+class OnnxRecord(BaseRecord):
+    """Another maker's network, in an ONNX file that stays where it is."""
+
+    method: Literal["onnx"] = "onnx"
+    path: str
+    """The ONNX file; workers must reach it as they reach the video."""
+    digest: str
+    layout: OnnxLayout
+    classes: tuple[str, ...] = ()
+    vehicles: tuple[int, ...] = Field(min_length=1)
+    tile_px: tuple[PositiveInt, PositiveInt]
+    """Width and height of the network's input."""
+
+
+DetectorRecord = Annotated[CnnRecord | CascadeRecord | PaperRecord | OnnxRecord, Field(discriminator="method")]
 
 RECORDS: tuple[type[BaseRecord], ...] = get_args(get_args(DetectorRecord)[0])
 
@@ -311,3 +345,14 @@ class LongVehicleRecord(Model):
     """A position with a higher score is the centre of a long vehicle."""
     contrast_floor: PositiveFloat
     attribution: tuple[str, ...] = Field(default=(), max_length=50)
+
+
+class DimensionsRecord(Model):
+    """The network that measures vehicles: fully connected layers with ReLU between them."""
+
+    widths: list[PositiveInt]
+    """Numbers of values from layer to layer, input and output included."""
+    weights_f16: list[str]
+    """Of each layer (in, out), half precision, base64."""
+    biases_f16: list[str]
+    """Of each layer (out,)."""

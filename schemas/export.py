@@ -7,8 +7,25 @@ from pydantic import Field
 
 from schemas.model import Model
 
-ExportFormat = Literal["cog", "geoparquet", "gpkg", "geotrax", "sumo", "arrows", "stac", "direction", "speed", "report"]
-"""Each is a module of `velfield.exports`, of the same name."""
+ExportFormat = Literal[
+    "cog",
+    "geoparquet",
+    "gpkg",
+    "geotrax",
+    "sumo",
+    "arrows",
+    "stac",
+    "direction",
+    "speed",
+    "report",
+    "video",
+    "poster",
+    "sumo_network",
+    "opendrive",
+    "highd",
+    "trajectories",
+]
+"""Each is a module of `velfield.exports`, of the same name; those of lanes lie in ``roads``."""
 EXPORT_FORMATS: dict[ExportFormat, str] = {
     "cog": "the field's layers as GeoTIFF",
     "geoparquet": "tracklets as lines, as Parquet",
@@ -20,6 +37,12 @@ EXPORT_FORMATS: dict[ExportFormat, str] = {
     "direction": "the map of directions as PNG",
     "speed": "the map of speeds as PNG",
     "report": "the summary as one HTML file, to send by mail",
+    "sumo_network": "SUMO's network, routes and measured edge data, as ZIP",
+    "opendrive": "the lanes as OpenDRIVE",
+    "highd": "trajectories as CSV in highD's columns",
+    "trajectories": "trajectories as Parquet",
+    "video": "the stabilised clip with vehicles, speeds and the field, as MP4",
+    "poster": "both maps on a sheet with legend, scale, north, n and date, as PDF or SVG",
 }
 """Format -> what it holds, for the command's help."""
 SpeedUnit = Literal["km/h", "mph", "m/s", "px/s"]
@@ -29,8 +52,8 @@ class ExportOptions(Model):
     """What some formats ask for."""
 
     width_px: int | None = Field(default=None, gt=0)
-    """Width of a figure's map; None: one pixel a base pixel."""
+    """Width of a figure's or a video's map; None: one pixel a base pixel, of a video at most 1920."""
     unit: SpeedUnit = "km/h"
     """Unit of speed in a figure."""
     start: datetime | None = None
-    """When the flight began, with its time zone: a STAC item needs it, and few videos record it."""
+    """When the flight began, with its time zone: a STAC item needs it and a poster shows it; few videos record it."""

@@ -5,9 +5,10 @@ takes its own section and nothing else, so that a changed number redoes only the
 """
 
 from collections.abc import Mapping
-from typing import Literal
+from math import pi
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from schemas.detector import CnnConfig, DetectionConfig
 from schemas.model import Model
@@ -35,6 +36,15 @@ class FramesConfig(Model):
     """Frame rate of a folder of images without time stamps; ignored if the source has them."""
     max_pixels: PositiveInt = 400_000_000
     """A larger image is refused before memory is allocated."""
+
+    @model_validator(mode="after")
+    def _has_time(self) -> Self:
+        if self.start_s is not None and self.stop_s is not None and self.stop_s <= self.start_s:
+            raise ValueError(
+                f"found stop_s = {self.stop_s:g}, expected it after start_s = {self.start_s:g}; both are s from "
+                "the first frame"
+            )
+        return self
 
 
 class LensConfig(Model):
@@ -115,9 +125,9 @@ class TrackingConfig(Model):
 
     max_speed_m_per_s: PositiveFloat = 34.5
     """Paper: 30 px a frame, that is 78 mph."""
-    max_turn_rad: PositiveFloat = 0.5235987755982988
+    max_turn_rad: PositiveFloat = Field(0.5235987755982988, le=pi)
     """Paper: 30 degrees between the two segments."""
-    max_axis_offset_rad: PositiveFloat = 0.5235987755982988
+    max_axis_offset_rad: PositiveFloat = Field(0.5235987755982988, le=pi / 2)
     """Paper: motion within 30 degrees of the car's axis."""
     stationary_speed_m_per_s: PositiveFloat = STATIONARY_SPEED_M_PER_S
     """Below this speed a vehicle is stationary: its direction of motion is not tested. Paper: 5 px/s."""
@@ -136,10 +146,25 @@ class TrackingConfig(Model):
     """Tracklets of a lower posterior probability, against alternatives and false alarms, are dropped."""
     refine: bool = True
     """Refine the displacement of a link by aligning its patches below the pixel."""
-    max_gap_s: float = Field(2.0, ge=0)
-    """Longest gap in a vehicle's track that gap closing bridges; 0: none."""
-    max_stationary_gap_s: float = Field(30.0, ge=0)
-    """The same for a stationary vehicle that is detected again at the same position."""
+    max_gap_s: float = Field(4.0, ge=0)
+    """Longest gap in the track of a vehicle that drives on that gap closing bridges; 0: none."""
+    max_stationary_gap_s: float = Field(60.0, ge=0)
+    """The same for a vehicle that stands, or stops and sets off again, in the gap."""
+    max_hidden_gap_s: float = Field(15.0, ge=0)
+    """The same for a vehicle that creeps under trees, say, where its lane, order and looks determine which it is."""
+
+    @model_validator(mode="after")
+    def _has_moving_vehicles(self) -> Self:
+        if self.stationary_speed_m_per_s >= self.max_speed_m_per_s:
+            raise ValueError(
+                f"stationary_speed_m_per_s {self.stationary_speed_m_per_s:g} is not below max_speed_m_per_s "
+                f"{self.max_speed_m_per_s:g}: no vehicle could move"
+            )
+        return self
+
+
+_MAX_BINS = 200
+"""Velocity bins an axis: a pixel has their square."""
 
 
 class FieldConfig(Model):
@@ -160,7 +185,7 @@ class FieldConfig(Model):
     as in the paper."""
     shared_segment_weight: Literal[1, 2] = 1
     """Weight of a segment that two tracklets share. Paper: 2."""
-    tile_size_px: PositiveInt = 64
+    tile_size_px: PositiveInt = Field(64, ge=8, le=512)
     """Side of a stored tile, base px."""
     stationary_speed_m_per_s: PositiveFloat = STATIONARY_SPEED_M_PER_S
     """Below this speed a vehicle is stationary: no direction is drawn where the modal speed is below it."""
@@ -171,16 +196,28 @@ class FieldConfig(Model):
     """Accumulate a field for each time interval too: a length (``15min``), or intervals (``0-300,300-900`` or
     ``07:00-09:00``)."""
 
+    @model_validator(mode="after")
+    def _has_bins(self) -> Self:
+        bins = 2 * self.max_speed_m_per_s / self.bin_width_m_per_s
+        if not 2 <= bins <= _MAX_BINS:
+            raise ValueError(
+                f"bin_width_m_per_s {self.bin_width_m_per_s:g} and max_speed_m_per_s {self.max_speed_m_per_s:g} make "
+                f"{bins:.0f} bins an axis, expected 2 to {_MAX_BINS}"
+            )
+        return self
+
 
 class WorkConfig(Model):
     """Division of the work into units, which is independent of the number of workers."""
 
-    block_frames: PositiveInt = 8
+    block_frames: PositiveInt = Field(8, le=4096)
     """Frames a Dask block; one-frame blocks cost 10 ms each."""
-    unit_frames: PositiveInt | Literal["auto"] = "auto"
+    unit_frames: Annotated[int, Field(ge=1, le=65536)] | Literal["auto"] = "auto"
     """Frames a unit, that is a Prefect task run and a commit record; ``auto``: 16 up to 256 frames, 64 up to
     4096, then 256."""
-    retries: int = Field(2, ge=0)
+    previews: bool = True
+    """Make maps of a long flight while it is processed: of its first frames, then of all that are through."""
+    retries: int = Field(2, ge=0, le=100)
     """Retries of a unit that failed."""
     device: Device = "auto"
     """Where the detector's network is run: ``cpu``; ``cuda``, an NVIDIA GPU; ``auto``: a GPU that onnxruntime can use,
@@ -192,7 +229,7 @@ class FlightConfig(Model):
 
     preset: Preset = "best"
     """The set of defaults that this configuration started from."""
-    gsd_m: PositiveFloat | None = None
+    gsd_m: float | None = Field(None, ge=0.001, le=5)
     """Ground sample distance of the base image, m a pixel; None: from its CRS, else speeds stay in px/s."""
     frames: FramesConfig = FramesConfig()
     lens: LensConfig = LensConfig()

@@ -34,6 +34,8 @@ class Inputs(Model):
     """Another detector's boxes in place of ours."""
     timestamps: str | None = None
     """CSV of frame times."""
+    telemetry: str | None = None
+    """Subtitle file (.SRT) that the drone wrote; None: the one beside the video, or what the source itself holds."""
 
     @classmethod
     def from_simulated_flight(cls, folder: Path) -> Self:

@@ -14,7 +14,14 @@ READABLE_FORMATS = (1, FORMAT_VERSION)
 """Versions that `velfield.open_run` reads; a run continues in a folder of the present one only."""
 
 
-class CommitRecord(Model):
+class SealedRecord(Model):
+    """A record that its file holds together with a digest of it, so that a damaged one is known."""
+
+    digest: str | None = None
+    """BLAKE2b digest of all other keys; none in records of version 0.1."""
+
+
+class CommitRecord(SealedRecord):
     """A finished unit of work: written last of all, so that what it names is whole."""
 
     stage: str
@@ -53,9 +60,10 @@ class InputsRecord(Model):
     detector: str | None = None
     detections: str | None = None
     timestamps: str | None = None
+    telemetry: str | None = None
 
 
-class FlightRecord(Model):
+class FlightRecord(SealedRecord):
     """``flight.json``: the resolved configuration, the inputs' digests, the version of the code."""
 
     format_version: PositiveInt = FORMAT_VERSION
@@ -81,6 +89,8 @@ class GridRecord(Model):
     crs_wkt: str | None = None
     affine: tuple[float, float, float, float, float, float] | None = None
     """Base pixel (column, row) -> CRS coordinates, GDAL's corner convention, as rasterio's ``Affine``."""
+    north_rad: float | None = None
+    """Direction of true north, from +x towards +y (down), where it is known without a reference system."""
     base_source: Literal["flight", "given"]
     """``flight``: the base image is built from the flight; ``given``: it is the image given as ``--base``."""
     registered_to: Literal["flight", "given"] = "flight"
@@ -99,6 +109,20 @@ class PolyprojectiveRecord(Model):
     """Normalisation of what goes in: centre x, y, and scale."""
     target: tuple[float, float, float]
     """Normalisation of what comes out."""
+
+
+class OwnToBaseRecord(PolyprojectiveRecord):
+    """``base/own_to_base.json``: the flight's own base image to the given one, polyprojective and mesh."""
+
+    mesh: tuple[tuple[tuple[float, float], ...], ...] = ()
+    """Displacement at the centres of cells of the own base image, rows of (x, y), px of the given one; none: zero."""
+    mesh_cell_px: PositiveInt = 1
+    """Side of a cell, px of the own base image."""
+    position_sd_px: tuple[tuple[float | None, ...], ...] = ()
+    """Standard deviation of the map in cells over the own base image, px of the given one; null where it has no control
+    points."""
+    own_width_px: PositiveInt = 1
+    own_height_px: PositiveInt = 1
 
 
 class RebaseRecord(Model):
@@ -141,7 +165,7 @@ class ResultRecord(Model):
     created: str
 
 
-class ResultsRecord(Model):
+class ResultsRecord(SealedRecord):
     """``results.json``: the results of one flight on several base images, the first one first."""
 
     results: tuple[ResultRecord, ...]

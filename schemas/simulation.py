@@ -3,7 +3,7 @@
 An effect whose parameter is zero is exactly off: ``relief_m=0`` gives a plane, ``lens_a=0`` a pinhole camera.
 """
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
@@ -40,10 +40,15 @@ class CameraSimulation(Model):
     """Amplitude of the rotation about its mean heading, deg."""
     tilt_deg: NonNegativeFloat = 1.5
     """Amplitude of the tilt from the vertical, deg, about either axis."""
+    mean_tilt_deg: NonNegativeFloat = Field(0.0, le=60)
+    """Mean tilt from the vertical, deg: 0 looks straight down, 45 is the oblique view of a news helicopter."""
     motion_period_s: PositiveFloat = 40.0
     """Typical period of drift, climb, rotation and tilt, s."""
     lens_a: float = Field(0.10, gt=-0.9, lt=0.9)
     """Harris' radial distortion r_d = r / sqrt(1 + a r^2), r in half-diagonals."""
+    lens_terms: Annotated[tuple[float, ...], Field(max_length=4)] = ()
+    """In place of ``lens_a`` where given: k_1, k_2, ... of r = r_d (1 + k_1 r_d^2 + k_2 r_d^4 + ...), in
+    half-diagonals. It must not fold within the frame."""
     lens_offset_x_px: float = 7.0
     """Offset of the distortion centre from the frame's centre to the right, px."""
     lens_offset_y_px: float = -5.0
@@ -102,6 +107,9 @@ class SceneSimulation(Model):
     """Height of the tallest buildings, m; 0: flat."""
     tree_height_m: NonNegativeFloat = Field(8.0, le=25)
     """Height of the tallest trees, m; 0: flat."""
+    street_tree_share: NonNegativeFloat = Field(0, le=1)
+    """Fraction of the kerbs under rows of trees whose crowns hang over the lanes; vehicles below are hidden or half
+    hidden."""
     parked_share: NonNegativeFloat = Field(0.65, le=1)
     """Fraction of parking spaces that are occupied."""
     sun_azimuth_deg: float = 215.0
@@ -133,6 +141,25 @@ class OtherSensorSimulation(Model):
     """Tones and sun of the frames, as of an own base image; other parked cars nevertheless."""
 
 
+class TelemetrySimulation(Model):
+    """The telemetry of a clip (``clip``): where the city lies, and what a drone is off by over a whole flight."""
+
+    longitude_deg: float = Field(36.25, ge=-180, le=180)
+    """Longitude of the middle of the base image, deg."""
+    latitude_deg: float = Field(50.0, ge=-80, le=84)
+    """Latitude of the middle of the base image, deg."""
+    north_deg: float = 20.0
+    """Heading of the base image's top, deg clockwise from north."""
+    height_sd_m: NonNegativeFloat = 0.8
+    """Standard deviation of the barometer's drift, m."""
+    height_sd_share: NonNegativeFloat = 0.005
+    """Standard deviation of the barometer's scale, as a fraction of the height."""
+    heading_sd_deg: NonNegativeFloat = 0.7
+    """Standard deviation of the compass, deg."""
+    position_sd_m: NonNegativeFloat = 1.5
+    """Standard deviation of the satellites' position, east and north, m."""
+
+
 class SimulationConfig(Model):
     """A simulated flight. The same configuration gives the same flight, bit by bit."""
 
@@ -152,8 +179,20 @@ class SimulationConfig(Model):
     """File format of the frames."""
     jpeg_quality: PositiveInt = Field(95, le=100)
     """Quality of JPEG frames."""
+    clip: Literal["none", "beside", "embedded"] = "none"
+    """A drone's clip, ``DJI_0001.MP4``, in place of single frames; its telemetry in ``DJI_0001.SRT`` beside it, or in
+    the clip as subtitles."""
+    telemetry: TelemetrySimulation = TelemetrySimulation()
     times: TimesSimulation = TimesSimulation()
     camera: CameraSimulation = CameraSimulation()
     traffic: TrafficSimulation = TrafficSimulation()
     scene: SceneSimulation = SceneSimulation()
     base: OtherSensorSimulation = OtherSensorSimulation()
+
+    def as_clip(self, clip: Literal["beside", "embedded"]) -> "SimulationConfig":
+        """The same flight by a drone: 25 frames a second, a gimbal, a sensor that is read out in 25 ms."""
+        regular = {"fps": 25.0, "late_half_share": 0.0, "late_whole_share": 0.0, "jitter_s": 0.0}
+        times = self.times.model_copy(update=regular)
+        drone = {"readout_s": 0.025, "vibration_px": 0.4, "tilt_deg": 0.6, "motion_blur_px": 0.2}
+        camera = self.camera.model_copy(update=drone)
+        return self.model_copy(update={"clip": clip, "times": times, "camera": camera})

@@ -41,9 +41,45 @@ TRACKLET_COLUMNS: dict[str, str] = {
     "confidence": "float32",  # [0, 1]
 }
 
-TRACK_COLUMNS: dict[str, str] = TRACKLET_COLUMNS | {"passage_id": "int64"}
-"""Tracklets with the track that they belong to. ``passage_id``, the old name of ``track_id``, is deprecated: it holds
-the same values, and the next format drops it."""
+TRACK_COLUMNS: dict[str, str] = TRACKLET_COLUMNS | {"passage_id": "int64", "recovered": "bool"}
+"""Tracklets with the track that they belong to.
+
+``recovered``: of detections that only the track confirmed. ``passage_id``, the old name of ``track_id``, is deprecated:
+it holds the same values, and the next format drops it.
+"""
+
+DIMENSION_COLUMNS: dict[str, str] = {
+    "track_id": "int64",
+    "length_px": "float32",
+    "length_sd_px": "float32",  # standard deviation
+    "width_px": "float32",
+    "width_sd_px": "float32",
+    "strips": "int32",  # number of images that they were measured on
+}
+"""Dimensions of vehicles, a row a track."""
+
+TRACK_POSITION_COLUMNS: dict[str, str] = {
+    "track_id": "int64",
+    "frame": "int32",
+    "time_s": "float64",
+    "x_px": "float64",
+    "y_px": "float64",
+    "detection_id": "int64",  # -1: interpolated
+    "source": "int8",  # index in POSITION_SOURCES
+}
+"""Where each track's vehicle was in each registered frame, a row a track and frame."""
+POSITION_SOURCES = ("tracklet", "candidate", "interpolated")
+"""Of a position: a detection in a tracklet; a detection, perhaps of a low score, that the track confirmed; or none."""
+
+JOIN_COLUMNS: dict[str, str] = {
+    "track_id": "int64",
+    "before": "int64",  # ids of the tracks that were joined, as they were before
+    "after": "int64",
+    "end_time_s": "float64",
+    "start_time_s": "float64",
+    "probability": "float32",  # that both are one vehicle's
+}
+"""Joins of tracks over a gap, a row each."""
 
 LABEL_COLUMNS: dict[str, str] = {
     "frame": "str",  # a picture's file name, or a video's 0-based frame index, as text

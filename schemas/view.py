@@ -50,6 +50,8 @@ class ViewBase(Model):
 
     levels: PositiveInt
     tile: PositiveInt
+    overlap: NonNegativeInt = 0
+    """Pixels that a tile holds of its right and lower neighbours: without them a seam shows at fractional zooms."""
 
 
 class ViewSegments(Model):
@@ -61,6 +63,24 @@ class ViewSegments(Model):
     """A vehicle that comes back over a line before it is this far from it has not crossed it."""
     band_radius_px: PositiveFloat
     """A vehicle within this distance of a pixel has passed it: half the width of the path that the field counts."""
+
+
+class ViewReplay(Model):
+    """``view/replay/<k>.bin``: positions of the vehicles, ``chunk_s`` seconds each (`velfield.viewer.replay`)."""
+
+    chunk_s: PositiveFloat
+    chunks: PositiveInt
+    step_px: PositiveFloat
+    """Unit of a stored position."""
+    states: tuple[str, ...]
+    """Names of the vehicles' states, by their number."""
+
+
+class ViewFlow(Model):
+    """``view/flow.bin``: velocities drawn from the field, cell by cell (`velfield.viewer.flow`)."""
+
+    cell_px: PositiveInt
+    draws: PositiveInt
 
 
 class ViewRecord(Model):
@@ -81,5 +101,7 @@ class ViewRecord(Model):
     layers: tuple[ViewLayer, ...]
     arrays: dict[str, ViewArray]
     segments: ViewSegments
+    replay: ViewReplay
+    flow: ViewFlow
     low_coverage_note: str = ""
     """A note for people where hardly any pixel was passed by several vehicles."""

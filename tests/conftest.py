@@ -2,10 +2,6 @@
 
 import fcntl
 import os
-import re
-import subprocess
-import sys
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +11,7 @@ import pytest
 from flows.launch import prepare_process
 from schemas.simulation import SimulationConfig
 from schemas.summary import RunSummary
+from tests.s3_server import s3_server
 from tests.small_flight import FRAMES, digests, job, process
 
 FOOTAGE = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -93,25 +90,7 @@ def whole(flight: Path, server: None, tmp_path_factory: pytest.TempPathFactory) 
 
 @pytest.fixture(scope="session")
 def s3() -> Iterator[None]:
-    """A local S3 server with the bucket `flights`, its address in the environment as any other's would be.
-
-    In a process of its own: in one with its clients, all would wait for the interpreter most of the time. Once a
-    session: s3fs keeps a connection by the arguments it was opened with, and the address is none of them.
-    """
-    command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", "0"]
-    with (
-        pytest.MonkeyPatch.context() as patch,
-        subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as started,
-    ):
-        assert started.stderr is not None
-        address = next(found[0] for line in started.stderr if (found := re.findall(r"http://127\.0\.0\.1:\d+", line)))
-        threading.Thread(target=started.stderr.read, daemon=True).start()  # or its log would fill the pipe
-        patch.setenv("AWS_ENDPOINT_URL", address)
-        patch.setenv("AWS_ACCESS_KEY_ID", "testing")
-        patch.setenv("AWS_SECRET_ACCESS_KEY", "testing")
-        patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-        import boto3
-
-        boto3.client("s3").create_bucket(Bucket="flights")
+    """A local S3 server, once a session: s3fs keeps a connection by the arguments it was opened with, and the address
+    is none of them."""
+    with s3_server():
         yield
-        started.terminate()

@@ -16,7 +16,7 @@ from schemas.records import FlightRecord, GridRecord, InputsRecord, SourceRecord
 from schemas.simulation import SimulationConfig
 from schemas.tables import TRACKLET_COLUMNS
 from velfield.field.time_intervals import parse_time_intervals
-from velfield.pipeline.stages.field import accumulate_group, create_field_stores, field_groups
+from velfield.pipeline.stages.field import accumulate_block, create_field_stores, field_blocks
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run, open_run
 from velfield.run.tables import write_tracks
@@ -98,6 +98,6 @@ def field_run(
         time_intervals=[] if asked is None else parse_time_intervals(asked, 0.0, seconds),
     )
     create_field_stores(plan)  # type: ignore[arg-type]  # all of a plan that the field reads
-    for group in field_groups(plan):  # type: ignore[arg-type]
-        accumulate_group(plan, group)  # type: ignore[arg-type]
+    for group in field_blocks(plan):  # type: ignore[arg-type]
+        accumulate_block(plan, group)  # type: ignore[arg-type]
     return open_run(root)

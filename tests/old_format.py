@@ -36,13 +36,16 @@ def to_format_1(run: Path, out: Path) -> Path:
         pd.read_parquet(path).drop(columns="track_id").to_parquet(path, index=False)
     for store in out.rglob("*.zarr"):
         _old_store(store)
+    shutil.rmtree(out / "commits/page", ignore_errors=True)  # records of a later version, like the digest of each
     for path in (out / "commits").glob("*/*.json"):
         _edit_json(path, lambda record: _old_commit(out, record))
     return out
 
 
 def _edit_json(path: Path, change: Any) -> None:
-    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+    record = change(json.loads(path.read_text()))
+    record.pop("digest", None)
+    path.write_text(json.dumps(record))
 
 
 def _old_record(kind: str, record: dict[str, Any]) -> dict[str, Any]:

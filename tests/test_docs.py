@@ -3,6 +3,7 @@
 The words VIDEO, RUN, ... of the pages are replaced by what the test has.
 """
 
+import json
 import re
 import shlex
 import shutil
@@ -25,7 +26,7 @@ DOCS = sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [ROOT / "README.md", *DOCS]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 BARE_DECIMAL = re.compile(r"(?<![\w.)\]*/])\.\d")
-QUICK = {"schema", "config", "export", "init", "lineage", "verify"}
+QUICK = {"analyse", "schema", "config", "export", "init", "lineage", "verify"}
 """Commands that are run; the others take minutes, or wait for a person: their lines must parse."""
 
 
@@ -53,6 +54,8 @@ def folder(whole: tuple[Path, RunSummary], tmp_path: Path, monkeypatch: pytest.M
     """A working folder with the files that the pages name."""
     shutil.copytree(whole[0], tmp_path / "RUN")  # the commands write into it
     write_video(tmp_path / "VIDEO.mp4", list(drifting(30)))
+    rows = [f"{k},{k + t / 5},{10 * t / 5},{50}" for k in range(6) for t in range(60)]
+    (tmp_path / "tracks.csv").write_text("\n".join(["track_id,time_s,x_m,y_m", *rows]))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -79,6 +82,17 @@ def test_a_snippet_of_the_pages(page: str, text: str, folder: Path) -> None:
     names: dict[str, object] = {"xy": [[100.0, 100.0]], "v": [[10.0, 0.0]]}
     exec(compile(text, page, "exec"), names)
     assert names.keys() - {"xy", "v", "__builtins__"}, "the snippet defines nothing, not even an import"
+
+
+def test_the_notebook_runs(folder: Path) -> None:
+    """On a run that is there: its cell that makes one is skipped, as for a user who runs it twice."""
+    notebook = json.loads((ROOT / "examples" / "video_to_map.ipynb").read_text(encoding="utf-8"))
+    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert all(cell.get("outputs") == [] for cell in notebook["cells"] if cell["cell_type"] == "code")
+    names: dict[str, object] = {}
+    for number, text in enumerate(cells):
+        exec(compile(text, f"cell {number}", "exec"), names)
+    assert (folder / "RUN" / "exports" / "field.tif").exists()
 
 
 @pytest.mark.parametrize(("page", "text"), blocks("yaml"))

@@ -1,10 +1,15 @@
 """What pyproject promises: the extras that pages and messages name, and a lock that holds them all."""
 
+import json
 import re
 import tomllib
+from importlib.metadata import distribution
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -31,5 +36,92 @@ def test_the_lock_holds_each_extra(extra: str) -> None:
     assert [name for name in names if not re.search(rf"^{re.escape(name)}(\[.*\])?==", LOCK, re.M)] == []
 
 
+def test_each_dependency_has_bounds_and_a_reason() -> None:
+    text = (ROOT / "pyproject.toml").read_text()
+    lines = text.split("\ndependencies = [\n", 1)[1].split("\n]", 1)[0].splitlines()
+    assert len(lines) == len(PROJECT["dependencies"])
+    assert [line for line in lines if not re.search(r'>=[\d.]+,<[\d.]+", +# \S', line)] == []
+
+
+def test_the_lock_is_within_the_bounds() -> None:
+    pins = re.findall(r"^([\w.-]+)==([\w.]+)", LOCK, re.M)  # some twice, by the version of Python
+    asked = {one.name.lower(): one for one in map(Requirement, PROJECT["dependencies"])}
+    assert [pin for pin in pins if pin[0] in asked and not asked[pin[0]].specifier.contains(pin[1])] == []
+    assert set(asked) <= {name for name, _ in pins}
+
+
+def test_the_licences_of_what_ships_are_listed() -> None:
+    """Of the page's packages, with their versions, and of the data that the detectors were trained on."""
+    listed = (ROOT / "THIRD-PARTY-LICENSES.md").read_text()
+    assert "THIRD-PARTY-LICENSES.md" in PROJECT["license-files"]
+    packages = json.loads((ROOT / "page/package.json").read_text())["dependencies"]
+    assert [name for name, version in packages.items() if f"{name} {version}" not in listed] == []
+    record = json.loads((ROOT / "velfield/detection/shipped_detector.json").read_bytes())
+    data = [re.split(r" \(|,| simulated", text)[0] for text in record["attribution"]]
+    assert [name for name in data if name.lower() not in listed.lower()] == []
+
+
 def test_the_lock_names_no_registry() -> None:
     assert re.findall(r"^.*(?:--index-url|--find-links|--extra-index-url|://).*$", LOCK, re.M) == []
+
+
+# What conda-forge calls by another name, or splits.
+CONDA_NAMES = {"opencv-python-headless": {"opencv"}, "dask": {"dask-core", "distributed"}}
+
+
+def requirement(line: str) -> tuple[str, str]:
+    """Name and bounds of a requirement, without extras and spaces."""
+    name, bounds = re.fullmatch(r"([\w.-]+)(?:\[[^]]*\])?\s*(.*)", line).groups()  # type: ignore[union-attr]
+    return name, bounds.replace(" ", "")
+
+
+def test_the_conda_recipe_has_the_requirements_of_the_wheel() -> None:
+    text = (ROOT / "conda" / "meta.yaml").read_text()
+    recipe = yaml.safe_load(re.sub(r"\{%.*?%\}", "", text).replace("{{", "").replace("}}", ""))
+    found = dict(requirement(line) for line in recipe["requirements"]["run"])
+    assert found.pop("python") == PROJECT["requires-python"]
+    expected = {}
+    for name, bounds in map(requirement, PROJECT["dependencies"]):
+        expected |= dict.fromkeys(CONDA_NAMES.get(name, {name}), bounds)
+    assert found == expected
+    assert recipe["build"]["entry_points"] == [f"velfield = {PROJECT['scripts']['velfield']}"]
+    assert f'version = "{PROJECT["version"]}"' in text
+
+
+def compose() -> dict[str, Any]:
+    loaded: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text())
+    return loaded
+
+
+def test_the_services_that_the_scale_page_lists_are_those_of_compose() -> None:
+    page = (ROOT / "docs" / "scale.md").read_text()
+    listed = set(re.findall(r"^\| `(\w+)` \|", page.partition("## Containers")[2], re.M))
+    assert listed == set(compose()["services"])
+
+
+def test_services_wait_for_services_that_are_there_and_have_a_check() -> None:
+    services = compose()["services"]
+    for name, service in services.items():
+        waits = service.get("depends_on", {})
+        for other, condition in waits.items() if isinstance(waits, dict) else ((one, {}) for one in waits):
+            assert other in services, name
+            if condition.get("condition") == "service_healthy":
+                assert "healthcheck" in services[other], f"{name} waits for {other}"
+        for port in service.get("ports", []):
+            assert port.startswith("127.0.0.1:"), f"{name} is open to others"
+
+
+def test_commands_of_the_containers_are_commands_that_the_image_has() -> None:
+    scripts = {script.name for script in distribution("prefect").entry_points if script.group == "console_scripts"}
+    scripts |= {script.name for script in distribution("dask").entry_points if script.group == "console_scripts"}
+    docker = (ROOT / "Dockerfile").read_text()
+    assert {"prefect", "dask"} <= scripts
+    for service in compose()["services"].values():
+        if service.get("image") == "velfield" and "entrypoint" in service:
+            assert service["entrypoint"][0] in scripts
+    assert 'ENTRYPOINT ["velfield"]' in docker
+    copied = {word for line in docker.splitlines() if line.startswith("COPY") for word in line.split()[1:-1]}
+    missing = [name for name in copied if not name.startswith(("-", "/")) and not (ROOT / name).exists()]
+    assert missing == []
+    for package in ("flows", "velfield", "schemas"):
+        assert package in copied or f"/source/{package}" in copied

@@ -1,10 +1,29 @@
-"""What goes wrong, in two kinds: the user's input, and a frame or chunk that cannot be done; and two warnings."""
+"""What goes wrong: bad input, a damaged run, a full disk, a frame or chunk that cannot be done; and two warnings."""
 
+import errno
 from dataclasses import dataclass
+
+_LONGEST = 1200
+"""Characters of a message: what was found may itself be a megabyte on one line."""
 
 
 class InputError(Exception):
-    """Bad input or configuration. The message is one line: what was found, what was expected, what to do."""
+    """Bad input or configuration. The message is one line: what was found, what was expected, what to do.
+
+    Examples
+    --------
+    >>> print(InputError("a name\\nof two lines; give another"))
+    a name of two lines; give another
+    """
+
+    def __init__(self, message: str) -> None:
+        line = " ".join(message.splitlines()) if "\n" in message or "\r" in message else message
+        half = _LONGEST // 2
+        super().__init__(line if len(line) <= _LONGEST else f"{line[:half]} [...] {line[-half:]}")
+
+
+class StoreError(RuntimeError):
+    """A store or a file of a run is damaged or not as expected: names it, and the chunk."""
 
 
 class OldNameWarning(FutureWarning):
@@ -13,6 +32,20 @@ class OldNameWarning(FutureWarning):
 
 class IneffectiveSettingWarning(UserWarning):
     """A setting that the chosen method does not read. The message says which setting chose the method."""
+
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+def is_disk_full(error: BaseException) -> bool:
+    """Whether an error says that there is no room to write: nothing is gained by trying again at once.
+
+    Examples
+    --------
+    >>> is_disk_full(OSError(28, "No space left on device")), is_disk_full(OSError(5, "Input/output error"))
+    (True, False)
+    """
+    return isinstance(error, OSError) and error.errno in _FULL
 
 
 @dataclass(frozen=True)

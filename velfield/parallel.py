@@ -1,8 +1,12 @@
-"""Threads for the work of one unit on several images, where no graph runs it in parallel already."""
+"""Threads for the work of one unit on several images, where no graph runs it in parallel already.
+
+The steps of long work that nothing else counts: those of a training, whatever the method, for a progress bar.
+"""
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -16,6 +20,34 @@ def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """
     with ThreadPoolExecutor(usable_processors()) as pool:
         return list(pool.map(function, items))
+
+
+_step_listeners: list[Callable[[int, int], None]] = []
+
+
+def count_steps(done: int, announced: int = 0) -> None:
+    """Publish that so many more steps are done, and that so many more will follow."""
+    for listener in tuple(_step_listeners):
+        listener(done, announced)
+
+
+@contextmanager
+def subscribe_steps(listener: Callable[[int, int], None]) -> Iterator[None]:
+    """Call ``listener`` with the steps of this process within the context, from any thread.
+
+    Examples
+    --------
+    >>> received = []
+    >>> with subscribe_steps(lambda done, announced: received.append((done, announced))):
+    ...     count_steps(0, announced=8)
+    >>> received
+    [(0, 8)]
+    """
+    _step_listeners.append(listener)
+    try:
+        yield
+    finally:
+        _step_listeners.remove(listener)
 
 
 def usable_processors() -> int:

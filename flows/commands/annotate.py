@@ -31,22 +31,11 @@ def annotate(
     open_browser
         Open the browser, where there is a screen.
     """
+    from flows.commands.view import serve_until_interrupted
     from velfield.viewer.annotations import frames_to_annotate
     from velfield.viewer.annotator import annotate_app
-    from velfield.viewer.server import serve
 
     file = labels or (place if place.is_dir() else place.parent) / "labels.csv"
-
-    def announce(address: str) -> None:
-        print(f"{place}: {address}  writes {file}  (Ctrl-C ends)", flush=True)
-
-    try:
-        serve(
-            annotate_app(frames_to_annotate(place, max_frames=frames), file),
-            port=port,
-            open_browser=open_browser,
-            announce=announce,
-        )
-    except KeyboardInterrupt:
-        print()
+    app = annotate_app(frames_to_annotate(place, max_frames=frames), file)
+    serve_until_interrupted(app, port=port, open_browser=open_browser, place=place, purpose=f"writes {file}")
     return 0

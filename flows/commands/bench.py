@@ -4,32 +4,32 @@ from cyclopts import App
 
 bench = App(name="bench", help="Speed and accuracy, against a peer in the same run.")
 bench.command(
-    "flows.commands.bench_speed:speed",
+    "flows.commands.benchmarks.speed:speed",
     name="speed",
     help="What each stage of the whole job costs on one core, and the network against the machine's peak.",
 )
 bench.command(
-    "flows.commands.bench_registration:registration",
+    "flows.commands.benchmarks.registration:registration",
     name="registration",
     help="Register simulated flights of unseen seeds: errors against the truth, beside stabilo.",
 )
 bench.command(
-    "flows.commands.bench_still:still",
+    "flows.commands.benchmarks.still:still",
     name="still",
     help="Stability of stationary objects on a run's map: registration jitter, on your own footage.",
 )
 bench.command(
-    "flows.commands.bench_overhead:overhead",
+    "flows.commands.benchmarks.overhead:overhead",
     name="overhead",
     help="What Prefect and Dask add to the bare functions, start-up left out.",
 )
 bench.command(
-    "flows.commands.bench_field:field",
+    "flows.commands.benchmarks.field:field",
     name="field",
     help="Kernel and bins of the field with the best likelihood of held-out tracks.",
 )
 bench.command(
-    "flows.commands.bench_detection:detection",
+    "flows.commands.benchmarks.detection:detection",
     name="detection",
     help="How fast cars are found, beside plain peers in the same run.",
 )

@@ -32,17 +32,21 @@ def export(
     out
         File to write. Default: in the run folder's `exports/`.
     width
-        Width of a figure's map, px. Default: a pixel a base pixel.
+        Width of a figure's or a video's map, px. Default: a pixel a base pixel, of a video 1920 at most.
     unit
         Unit of speed in a figure.
     start
-        When the flight began, as 2024-05-01T12:00:00Z; for `stac`.
+        When the flight began, as 2024-05-01T12:00:00Z; for `stac` and `poster`.
     """
+    from flows.console import Console
     from velfield.exports.export import export_run
     from velfield.run.run import open_run
 
     options = ExportOptions(width_px=width, unit=unit, start=_parse_time(start))
-    print(export_run(open_run(run_folder), format_name, out, options))
+    run, console = open_run(run_folder), Console("normal")
+    with console.stage("export", format_name, 1) as bar:
+        written = export_run(run, format_name, out, options, bar.set_progress)
+    print(written)
     return 0
 
 

@@ -1,12 +1,12 @@
 """``velfield train``: train a detector from labelled cars."""
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
 from flows.options import Preset, Settings
+from flows.stopping import stop_on_signals
 from velfield.errors import InputError
 
 
@@ -53,7 +53,10 @@ def train(
     for file in (out, review):
         if file is not None and not file.parent.is_dir():
             raise InputError(f"{file}: found no folder {file.parent}, expected one to write to; make it")
-    print("learning from the marked cars: up to some minutes", file=sys.stderr, flush=True)
-    training = train_from_labels(source, labels, resolved, continued=continued)
+    from flows.console import training_progress
+
+    stop_on_signals(resumes=False, grace_s=0.0)
+    with training_progress():
+        training = train_from_labels(source, labels, resolved, continued=continued)
     print("\n".join(write_training(training, out, review)))
     return 0

@@ -1,9 +1,12 @@
 """``velfield view``: a run's page in the browser."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
+
+if TYPE_CHECKING:
+    from starlette.applications import Starlette
 
 
 def view(
@@ -24,13 +27,22 @@ def view(
     open_browser
         Open the browser, where there is a screen.
     """
-    from velfield.viewer.server import serve, view_app
+    from velfield.viewer.server import view_app
+
+    serve_until_interrupted(view_app(run_folder), port=port, open_browser=open_browser, place=run_folder)
+    return 0
+
+
+def serve_until_interrupted(
+    app: "Starlette", *, port: int | None, open_browser: bool, place: Path, purpose: str = ""
+) -> None:
+    """Serve a page until Ctrl-C; prints the address, what is served and what for."""
+    from velfield.viewer.server import serve
 
     def announce(address: str) -> None:
-        print(f"{run_folder}: {address}  (Ctrl-C ends)", flush=True)
+        print("  ".join(part for part in (f"{place}: {address}", purpose, "(Ctrl-C ends)") if part), flush=True)
 
     try:
-        serve(view_app(run_folder), port=port, open_browser=open_browser, announce=announce)
+        serve(app, port=port, open_browser=open_browser, announce=announce)
     except KeyboardInterrupt:
         print()
-    return 0

@@ -6,13 +6,11 @@ import L from "leaflet";
 import { corners, carFromEnds, contains, DEFAULT_RATIO, type Car } from "./cars";
 import { find } from "./dom";
 import { toLatLng, toPoint, type Point } from "./coordinates";
+import { imageMap, inside, post, served, showImage, type Served } from "./editor";
 
-interface ServerData {
-  token: string;
+interface ServerData extends Served {
   labels: string;
   names: string[];
-  width: number;
-  height: number;
   marks: { frames: string[]; cars: Car[] };
 }
 
@@ -35,20 +33,7 @@ class Annotator {
     this.cars = data.marks.cars;
     this.empty = new Set(data.marks.frames.filter((name) => !this.cars.some((car) => car.frame === name)));
     this.touched = new Set(data.marks.frames);
-    const whole = L.latLngBounds([0, 0], [-data.height, data.width]);
-    this.map = L.map(find("map"), {
-      crs: L.CRS.Simple,
-      attributionControl: false,
-      boxZoom: false,
-      doubleClickZoom: false,
-      dragging: false,
-      keyboard: false,
-      maxBounds: whole.pad(0.5),
-      maxZoom: 6,
-      minZoom: -6,
-      zoomSnap: 0.25,
-    });
-    this.map.fitBounds(whole);
+    this.map = imageMap(data, { dragging: false, keyboard: false });
     this.drawn.addTo(this.map);
     for (const id of ["previous", "next"]) find(id).hidden = data.names.length === 1;
     this.listen();
@@ -65,8 +50,7 @@ class Annotator {
     this.frame = Math.min(Math.max(frame, 0), this.data.names.length - 1);
     this.selected = null;
     this.image?.remove();
-    const whole = L.latLngBounds([0, 0], [-this.data.height, this.data.width]);
-    this.image = L.imageOverlay(`frame/${this.frame}.png`, whole, { className: "frame" }).addTo(this.map);
+    this.image = showImage(this.map, this.data, this.frame);
     find("frame").textContent = `Frame ${this.frame + 1} of ${this.data.names.length}: ${this.name}`;
     find<HTMLButtonElement>("previous").disabled = this.frame === 0;
     find<HTMLButtonElement>("next").disabled = this.frame === this.data.names.length - 1;
@@ -128,7 +112,7 @@ class Annotator {
   }
 
   private inside({ x_px: x, y_px: y }: Car): boolean {
-    return x >= -0.5 && y >= -0.5 && x <= this.data.width - 0.5 && y <= this.data.height - 0.5;
+    return inside(this.data, { x, y });
   }
 
   private remove(): void {
@@ -167,11 +151,7 @@ class Annotator {
     const frames = this.data.names.filter((name) => labelled.has(name));
     // A frame that lost its last car, and is not marked as empty, is no longer labelled.
     const cleared = [...this.touched].filter((name) => !labelled.has(name));
-    const body = JSON.stringify({ frames, cleared, cars: this.cars });
-    const headers = { "content-type": "application/json", "x-token": this.data.token };
-    const answer = await fetch("labels", { method: "POST", headers, body });
-    if (!answer.ok) throw new Error(await answer.text());
-    const { cars } = (await answer.json()) as { cars: number };
+    const { cars } = await post<{ cars: number }>(this.data, "labels", { frames, cleared, cars: this.cars });
     this.showStatus(`saved: ${cars} ${cars === 1 ? "car" : "cars"} in ${this.data.labels}`);
   }
 
@@ -208,11 +188,9 @@ class Annotator {
   }
 
   private hover(event: PointerEvent): void {
-    const { x, y } = toPoint(this.map.mouseEventToLatLng(event));
-    find("readout").textContent = `(${x.toFixed(0)}, ${y.toFixed(0)})`;
     if (!this.from) return;
     this.draw();
-    const car = carFromEnds(this.name, toPoint(this.from), { x, y }, this.ratio);
+    const car = carFromEnds(this.name, toPoint(this.from), toPoint(this.map.mouseEventToLatLng(event)), this.ratio);
     const shape = corners(car).map((corner) => toLatLng(corner.x, corner.y));
     this.drawn.addLayer(L.polygon(shape, { color: "#ffd400", weight: 2, dashArray: "4 4", interactive: false }));
   }
@@ -243,4 +221,4 @@ class Annotator {
   }
 }
 
-new Annotator(JSON.parse(find("server-data").textContent!) as ServerData);
+new Annotator(served<ServerData>());

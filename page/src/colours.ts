@@ -35,6 +35,12 @@ export function paintRamp(target: Uint8ClampedArray, at: number, fraction: numbe
   put(target, at, ramp, Math.round(Math.min(Math.max(fraction, 0), 1) * last));
 }
 
+/** CSS colour of a fraction of the ramp. */
+export function rampColour(fraction: number): string {
+  const step = 3 * Math.round(Math.min(Math.max(fraction, 0), 1) * (ramp.length / 3 - 1));
+  return `rgb(${ramp[step]} ${ramp[step + 1]} ${ramp[step + 2]})`;
+}
+
 /** Decrease is blue, increase is red, no change is pale. */
 export function paintChange(target: Uint8ClampedArray, at: number, fraction: number): void {
   const strength = Math.sqrt(Math.min(Math.abs(fraction), 1));

@@ -1,6 +1,7 @@
 // Drawings on the map over its layers: the selected pixel, the line, tracks.
 
 import L from "leaflet";
+import type { Geometry } from "./analysis";
 import { toLatLng, toPoint, type Point } from "./coordinates";
 import type { Near, TrackIndex } from "./tracks";
 
@@ -10,10 +11,11 @@ export class Drawings {
   private readonly pixel = L.layerGroup();
   private readonly line = L.layerGroup();
   private readonly tracks = L.layerGroup();
+  private readonly places = L.layerGroup();
   private readonly canvas = L.canvas({ padding: 0.2 });
 
-  constructor(map: L.Map) {
-    for (const group of [this.tracks, this.pixel, this.line]) group.addTo(map);
+  constructor(private readonly map: L.Map) {
+    for (const group of [this.places, this.tracks, this.pixel, this.line]) group.addTo(map);
   }
 
   showPixel(point: Point | null): void {
@@ -45,6 +47,25 @@ export class Drawings {
       handle.on("drag", () => strokes.forEach((stroke) => stroke.setLatLngs(handles.map((h) => h.getLatLng()))));
       handle.on("dragend", () => moved(handles.map((h) => toPoint(h.getLatLng())) as [Point, Point]));
     }
+  }
+
+  /** The places of a table's rows, the chosen one in white; the map moves to it. */
+  showGeometries(all: Geometry[], chosen: Geometry | null): void {
+    this.places.clearLayers();
+    for (const geometry of all) this.addGeometry(geometry, "#5ee0ff", 2);
+    if (!chosen) return;
+    this.addGeometry(chosen, "#000", 9);
+    this.addGeometry(chosen, "#fff", 5);
+    const box = L.latLngBounds(chosen.xy_px.map(([x, y]) => toLatLng(x, y)));
+    if (!this.map.getBounds().contains(box)) this.map.fitBounds(box, { maxZoom: this.map.getZoom(), animate: false });
+  }
+
+  private addGeometry({ type, xy_px }: Geometry, color: string, weight: number): void {
+    const points = xy_px.map(([x, y]) => toLatLng(x, y));
+    const options = { renderer: this.canvas, interactive: false, color, weight };
+    if (type === "Point") this.places.addLayer(L.circleMarker(points[0]!, { ...options, radius: 5 }));
+    else if (type === "Polygon") this.places.addLayer(L.polygon(points, { ...options, fillOpacity: 0.08 }));
+    else this.places.addLayer(L.polyline(points, options));
   }
 
   showTracks(near: Near[], index: TrackIndex | null): void {

@@ -7,6 +7,8 @@ import type { Field } from "./field";
 import type { Layer, Run } from "./run";
 import { roundDown } from "./units";
 
+const DIMMING = 0.32;
+
 export function makeMap(element: HTMLElement, run: Run): L.Map {
   const whole = L.latLngBounds([0, 0], [-run.height_px, run.width_px]);
   const map = L.map(element, {
@@ -67,20 +69,25 @@ class BaseTiles extends L.GridLayer {
   }
 
   protected createTile(coords: L.Coords, done: L.DoneCallback): HTMLElement {
-    const { width_px, height_px, base } = this.run;
-    const level = -coords.z;
-    const image = document.createElement("img");
-    image.alt = "";
-    // Those at the edge are smaller than a tile.
-    const width = Math.min(Math.ceil(width_px / 2 ** level) - coords.x * base.tile, base.tile);
-    const height = Math.min(Math.ceil(height_px / 2 ** level) - coords.y * base.tile, base.tile);
-    image.style.width = `${(100 * width) / base.tile}%`;
-    image.style.height = `${(100 * height) / base.tile}%`;
+    const { base } = this.run;
+    const image = new Image();
+    const canvas = document.createElement("canvas");
     const tile = document.createElement("div");
-    tile.append(image);
-    image.onload = () => done(undefined, tile);
+    tile.append(canvas);
+    image.onload = () => {
+      // Its own size: those at the edge are smaller, the others hold the first pixels of their neighbours, against seams.
+      [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
+      canvas.style.width = `${(100 * canvas.width) / base.tile}%`;
+      canvas.style.height = `${(100 * canvas.height) / base.tile}%`;
+      const context = canvas.getContext("2d", { alpha: false })!;
+      context.drawImage(image, 0, 0);
+      // Dimmed here, once: a filter in the style sheet is computed again for each frame of an animation.
+      context.fillStyle = `rgb(0 0 0 / ${DIMMING})`;
+      context.fillRect(0, 0, canvas.width, canvas.height);
+      done(undefined, tile);
+    };
     image.onerror = () => done(new Error(`${image.src} cannot be read`), tile);
-    image.src = `view/base/${level}/${coords.y}-${coords.x}.jpg`;
+    image.src = `view/base/${-coords.z}/${coords.y}-${coords.x}.jpg`;
     return tile;
   }
 }
@@ -101,29 +108,34 @@ export class Overlay extends L.GridLayer {
   protected createTile(coords: L.Coords, done: L.DoneCallback): HTMLElement {
     const side = this.field.array(this.shown.arrays[0]!).chunk[0];
     const canvas = document.createElement("canvas");
-    canvas.width = canvas.height = side;
+    canvas.width = canvas.height = side + 1; // with the first pixels of the next tiles: else a seam shows
+    const tile = document.createElement("div");
+    tile.append(canvas);
+    canvas.style.width = canvas.style.height = `${(100 * (side + 1)) / side}%`;
     this.paint(canvas, coords.x, coords.y, -coords.z).then(
-      () => done(undefined, canvas),
+      () => done(undefined, tile),
       (error) => {
         this.onError(error);
-        done(error, canvas);
+        done(error, tile);
       },
     );
-    return canvas;
+    return tile;
   }
 
   /** A tile of level k covers 2^k x 2^k chunks. */
   private async paint(canvas: HTMLCanvasElement, x: number, y: number, level: number): Promise<void> {
     const context = canvas.getContext("2d")!;
-    const side = canvas.width >> level;
+    const chunk = canvas.width - 1;
+    const side = chunk >> level;
     const across = 2 ** level;
     const work: Promise<void>[] = [];
-    for (let j = 0; j < across; j++) {
-      for (let i = 0; i < across; i++) {
+    for (let j = 0; j <= across; j++) {
+      for (let i = 0; i <= across; i++) {
         const [row, column] = [y * across + j, x * across + i];
+        const size: [number, number] = [i < across ? side : 1, j < across ? side : 1];
         work.push(
           this.chunks(row, column).then((data) => {
-            if (data) context.putImageData(this.tileImage(data, canvas.width, level), i * side, j * side);
+            if (data) context.putImageData(this.tileImage(data, chunk, level, size), i * side, j * side);
           }),
         );
       }
@@ -138,15 +150,16 @@ export class Overlay extends L.GridLayer {
     return data.slice(0, -1).every((chunk) => chunk !== null) ? data : null;
   }
 
-  private tileImage(data: (Numbers | null)[], side: number, level: number): ImageData {
+  /** The first `width` and `height` pixels of a chunk, reduced 2^level times. */
+  private tileImage(data: (Numbers | null)[], side: number, level: number, [width, height]: [number, number]): ImageData {
     const step = 2 ** level;
-    const image = new ImageData(side / step, side / step);
+    const image = new ImageData(width, height);
     const paint = painter(this.shown, this.colourMax, this.field.run.stationary_speed_px_per_s);
     const [a, b] = [data[0]!, data.length === 3 ? data[1]! : data[0]!];
     const count = data[data.length - 1];
-    for (let j = 0, at = 0; j < side; j += step) {
-      for (let i = 0; i < side; i += step, at += 4) {
-        const index = this.known(a, count ?? null, j, i, step, side);
+    for (let j = 0, at = 0; j < height; j++) {
+      for (let i = 0; i < width; i++, at += 4) {
+        const index = this.known(a, count ?? null, j * step, i * step, step, side);
         if (index >= 0) paint(image.data, at, a[index]!, b[index]!);
       }
     }

@@ -73,7 +73,7 @@ export function showPixel(answer: PixelAnswer, field: Field, units: Units, away:
     make("p", { class: "note" }, "Angle: direction on the map; radius: speed. Circles mark the modes."),
     make("h3", {}, answer.modes.length > 1 ? "Modes" : "Mode"),
     grid(
-      ["", units.headingColumn.title, "Speed", "Fraction"],
+      ["No.", units.headingColumn.title, "Speed", "Fraction"],
       answer.modes.map((mode, k) => modeRow(mode, k, field, units)),
     ),
   );

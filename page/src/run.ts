@@ -34,10 +34,12 @@ export interface Run {
   last_time_s: number;
   bin_width_px_per_s: number;
   bins: number;
-  base: { levels: number; tile: number };
+  base: { levels: number; tile: number; overlap: number };
   layers: Layer[];
   arrays: Record<string, StoredArray>;
   segments: { count: number; tracks: number; hysteresis_px: number; band_radius_px: number };
+  replay: { chunk_s: number; chunks: number; step_px: number; states: string[] };
+  flow: { cell_px: number; draws: number };
   /** A note for people where hardly any pixel was passed by several vehicles. */
   low_coverage_note: string;
 }

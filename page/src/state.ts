@@ -4,7 +4,7 @@ import type { Point } from "./coordinates";
 import { SPEED_UNITS, type SpeedUnit } from "./units";
 
 export interface State {
-  tab: "map" | "summary";
+  tab: "map" | "analysis" | "summary";
   layer: string;
   unit: SpeedUnit;
   /** Of the layer, per cent. */
@@ -12,6 +12,9 @@ export interface State {
   /** Pixels of fewer vehicles are not painted. */
   minVehicles: number;
   tracks: boolean;
+  flow: boolean;
+  /** Time of the replay, s; null: no replay. */
+  replay: number | null;
   pixel: Point | null;
   line: [Point, Point] | null;
   /** Centre and zoom; null: the whole map. */
@@ -25,10 +28,14 @@ export const START: State = {
   opacity: 80,
   minVehicles: 1,
   tracks: false,
+  flow: false,
+  replay: null,
   pixel: null,
   line: null,
   view: null,
 };
+
+const TABS: State["tab"][] = ["map", "analysis", "summary"];
 
 function numbers(text: string | null, count: number): number[] | null {
   const found = (text ?? "").split(",").map(Number);
@@ -47,12 +54,14 @@ export function readState(hash: string): State {
   const line = numbers(parameters.get("line"), 4);
   const view = numbers(parameters.get("view"), 3);
   return {
-    tab: parameters.get("tab") === "summary" ? "summary" : "map",
+    tab: TABS.find((name) => name === parameters.get("tab")) ?? "map",
     layer: parameters.get("layer") ?? START.layer,
     unit: unit && unit in SPEED_UNITS ? unit : START.unit,
     opacity: within("opacity", 0, 100, START.opacity),
     minVehicles: Math.round(within("min_vehicles", 1, 1e6, START.minVehicles)),
     tracks: parameters.get("tracks") === "1",
+    flow: parameters.get("flow") === "1",
+    replay: numbers(parameters.get("replay"), 1)?.[0] ?? null,
     pixel: pixel && { x: Math.round(pixel[0]!), y: Math.round(pixel[1]!) },
     line: line && [
       { x: line[0]!, y: line[1]! },
@@ -70,6 +79,8 @@ export function writeState(state: State): string {
   }
   if (state.minVehicles !== START.minVehicles) parameters.set("min_vehicles", String(state.minVehicles));
   if (state.tracks) parameters.set("tracks", "1");
+  if (state.flow) parameters.set("flow", "1");
+  if (state.replay !== null) parameters.set("replay", state.replay.toFixed(1));
   if (state.pixel) parameters.set("pixel", `${state.pixel.x},${state.pixel.y}`);
   if (state.line) parameters.set("line", state.line.flatMap(({ x, y }) => [x.toFixed(1), y.toFixed(1)]).join(","));
   if (state.view) parameters.set("view", [state.view.x.toFixed(1), state.view.y.toFixed(1), state.view.zoom].join(","));

@@ -1,8 +1,8 @@
-// Two tabs, as screen readers and keyboards know them.
+// Tabs, as screen readers and keyboards know them.
 
 import { find } from "./dom";
 
-const NAMES = ["map", "summary"] as const;
+const NAMES = ["map", "analysis", "summary"] as const;
 export type Tab = (typeof NAMES)[number];
 
 export function showTab(tab: Tab): void {
@@ -10,8 +10,11 @@ export function showTab(tab: Tab): void {
     const button = find(`tab-${name}`);
     button.setAttribute("aria-selected", String(name === tab));
     button.tabIndex = name === tab ? 0 : -1;
-    find(`${name}-panel`).hidden = name !== tab;
   }
+  find("map-panel").hidden = tab === "summary"; // both tabs of the map have it
+  find("side").hidden = tab !== "map";
+  find("analysis").hidden = tab !== "analysis";
+  find("summary-panel").hidden = tab !== "summary";
   document.body.dataset.tab = tab;
 }
 
@@ -21,7 +24,8 @@ export function listenToTabs(chosen: (tab: Tab) => void): void {
     button.addEventListener("click", () => chosen(name));
     button.addEventListener("keydown", (event) => {
       if (!["ArrowLeft", "ArrowRight"].includes(event.key)) return;
-      const other = name === "map" ? "summary" : "map";
+      const step = event.key === "ArrowRight" ? 1 : NAMES.length - 1;
+      const other = NAMES[(NAMES.indexOf(name) + step) % NAMES.length]!;
       chosen(other);
       find(`tab-${other}`).focus();
     });

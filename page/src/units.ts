@@ -22,6 +22,14 @@ export class Units {
     return this.run.gsd_m === null ? 1 : this.run.gsd_m * SPEED_UNITS[this.speedUnit];
   }
 
+  fromMetresPerSecond(speed: number): number {
+    return this.run.gsd_m === null ? speed : speed * SPEED_UNITS[this.speedUnit];
+  }
+
+  get stationarySpeed(): number {
+    return this.run.stationary_speed_px_per_s;
+  }
+
   speedText(pxPerS: number, decimals = 1): string {
     return Number.isFinite(pxPerS) ? `${(pxPerS * this.perPxPerS).toFixed(decimals)} ${this.speed}` : "–";
   }

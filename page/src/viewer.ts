@@ -3,15 +3,20 @@
 import "leaflet/dist/leaflet.css";
 import "./viewer.css";
 import type L from "leaflet";
+import { Animation, reducedMotion } from "./animation";
+import { AnalysisPanel } from "./analysis";
 import { lineCrossings } from "./crossings";
 import { find, make } from "./dom";
 import { Drawings } from "./drawings";
 import { Field } from "./field";
+import { Flow } from "./flow";
 import { makeLegend } from "./legend";
 import { showLine } from "./line";
 import { makeMap, Overlay } from "./map";
 import { queryPixel, showTracks, showPixel } from "./pixel";
 import { toLatLng, toPoint, type Point } from "./coordinates";
+import { Player, showVehicle } from "./player";
+import { Replay } from "./replay";
 import { loadRun, type Layer, type Run } from "./run";
 import { readState, writeState, type State } from "./state";
 import { listenToTabs, showTab } from "./tabs";
@@ -20,6 +25,7 @@ import { Units } from "./units";
 
 const TRACK_REACH_PX = 6; // screen pixels around the cursor
 const POINT_REACH_PX = 8; // screen pixels: a click this near a lane selects the lane
+const VEHICLE_REACH_PX = 14; // screen pixels: a click this near a vehicle of the replay selects it
 const REST_MS = 60; // a resting mouse is about to click: the pixel's tile is prefetched
 
 class Viewer {
@@ -28,11 +34,17 @@ class Viewer {
   private readonly units: Units;
   private readonly map: L.Map;
   private readonly drawings: Drawings;
+  private readonly animation: Animation;
+  private readonly flow: Flow;
+  private readonly replay: Replay;
+  private readonly player: Player;
+  private readonly analysis: AnalysisPanel;
   private overlay: Overlay | undefined;
   private index: Promise<TrackIndex> | undefined;
   private drawing: Point[] | null = null; // ends of a line that is being drawn
   private asked = 0;
   private resting = 0;
+  private answered = 0; // when the answer of a vehicle was shown
   private hovered: Point | null = null;
 
   constructor(private readonly run: Run) {
@@ -40,11 +52,18 @@ class Viewer {
     this.units = new Units(run, this.state.unit);
     this.map = makeMap(find("map"), run);
     this.drawings = new Drawings(this.map);
+    this.animation = new Animation(this.map);
+    this.flow = new Flow(run);
+    this.replay = new Replay(run, this.speedMax(), (ended) => this.replayed(ended), (error) => this.fail(error));
+    this.player = new Player(this.replay, () => this.animation.request(), () => this.keepTime());
+    this.analysis = new AnalysisPanel(this.units, (all, chosen) => this.drawings.showGeometries(all, chosen));
     this.fillControls();
     this.applyView();
     this.listen();
     this.showLayer();
     this.restore();
+    if (this.state.replay !== null) this.showReplay(this.state.replay);
+    if (this.state.flow) this.showFlow(true);
   }
 
   // -- the view ---------------------------------------------------------------------------------------------------------
@@ -146,7 +165,7 @@ class Viewer {
   /** A click, a tap, or Enter at the map's centre: an end of the line being drawn, else a query of the pixel. */
   private clickAt(point: Point): void {
     if (this.drawing === null) {
-      this.askNear(point);
+      if (!this.selectVehicle(point)) this.askNear(point);
       return;
     }
     this.drawing.push(point);
@@ -156,6 +175,85 @@ class Viewer {
       this.draw(false);
       this.measure(ends);
     } else this.showHint("Now the other side of the road.");
+  }
+
+  // -- what moves ------------------------------------------------------------------------------------------------------
+
+  private speedMax(): number {
+    const layer = this.run.layers.find(({ name }) => name === "speed") ?? this.run.layers[0]!;
+    return makeLegend(layer, this.run, this.units).colourMax;
+  }
+
+  /** Show the vehicles at a time, or no longer (null). */
+  private showReplay(time_s: number | null): void {
+    find("replay").setAttribute("aria-pressed", String(time_s !== null));
+    this.replay.selected = null;
+    if (time_s !== null) this.replay.time_s = Math.min(Math.max(time_s, 0), this.replay.duration_s);
+    this.player.show(time_s !== null);
+    if (time_s === null) this.animation.remove(this.replay);
+    else this.animation.add(this.replay);
+    this.set({ replay: time_s });
+    this.noteMoving();
+  }
+
+  private replayed(ended: boolean): void {
+    this.player.update();
+    this.showSelected();
+    if (ended) this.keepTime();
+  }
+
+  private keepTime(): void {
+    if (this.state.replay === null) return;
+    this.set({ replay: this.replay.time_s });
+    this.showSelected();
+  }
+
+  /** The answer of the selected vehicle, at most ten times a second while it moves. */
+  private showSelected(): void {
+    if (this.replay.selected === null) return;
+    const now = performance.now();
+    if (this.replay.playing && now - this.answered < 100) return;
+    this.answered = now;
+    const seen = this.replay.now().find(({ vehicle }) => vehicle === this.replay.selected);
+    if (seen) this.answer(showVehicle(seen, this.units));
+  }
+
+  private selectVehicle(point: Point): boolean {
+    const seen = this.state.replay === null ? null : this.replay.near(point, this.reach(VEHICLE_REACH_PX));
+    this.replay.selected = seen?.vehicle ?? null;
+    this.animation.request();
+    if (!seen) return false;
+    this.asked++;
+    this.set({ pixel: null, line: null });
+    this.drawings.showPixel(null);
+    this.drawings.showLine(null, () => undefined);
+    this.answered = 0;
+    this.showSelected();
+    return true;
+  }
+
+  private showFlow(on: boolean): void {
+    const still = on && reducedMotion();
+    if (still) this.showHint("The flow animation is off: this system asks for reduced motion.");
+    const flows = on && !still;
+    find("flow").setAttribute("aria-pressed", String(flows));
+    this.set({ flow: flows });
+    this.noteMoving();
+    if (!flows) this.animation.remove(this.flow);
+    else this.flow.load().then(() => this.state.flow && this.animation.add(this.flow), (error) => this.fail(error));
+  }
+
+  private noteMoving(): void {
+    const notes: string[] = [];
+    if (this.state.replay !== null) {
+      notes.push("Replay: colour is speed, as in the layer Speed; grey is parked; pale is not detected. Click a vehicle.");
+    }
+    if (this.state.flow) {
+      const pace = this.flow.pace(this.animation.view().scale);
+      notes.push(`Flow: each particle draws its velocity from the distribution where it is; ${pace.toFixed(1)} times real speed.`);
+    }
+    find("moving-note").textContent = notes.join(" ");
+    find("moving-note").hidden = !notes.length;
   }
 
   private askNear(point: Point): void {
@@ -274,6 +372,8 @@ class Viewer {
       this.set({ tracks: checked });
       if (!checked) this.drawings.showTracks([], null);
     });
+    on("replay", "click", () => this.showReplay(this.state.replay === null ? this.replay.time_s : null));
+    on("flow", "click", () => this.showFlow(!this.state.flow));
     on("draw-line", "click", () => this.draw(this.drawing === null));
     on("whole", "click", () => this.map.fitBounds([[0, 0], [-this.run.height_px, this.run.width_px]]));
     on("copy-link", "click", () => void this.copyLink());
@@ -288,6 +388,7 @@ class Viewer {
     this.map.on("moveend", () => {
       const { x, y } = toPoint(this.map.getCenter());
       this.set({ view: { x, y, zoom: this.map.getZoom() } });
+      this.noteMoving();
     });
     const container = this.map.getContainer();
     container.addEventListener("pointerdown", () => container.classList.remove("by-keyboard"));
@@ -297,6 +398,9 @@ class Viewer {
       if (event.key === "Enter" || event.key === " ") this.clickAt(toPoint(this.map.getCenter()));
       else if (event.key === "l") this.draw(this.drawing === null);
       else if (event.key === "Escape") this.draw(false);
+      else if (event.key === "r") this.showReplay(this.state.replay === null ? this.replay.time_s : null);
+      else if (event.key === "p" && this.state.replay !== null) this.player.toggle();
+      else if (event.key === "f") this.showFlow(!this.state.flow);
       else return;
       event.preventDefault();
     });
@@ -318,8 +422,17 @@ class Viewer {
     }
   }
 
-  resize(): void {
+  /** What a tab shows of the map. */
+  showTab(tab: State["tab"]): void {
+    this.state = { ...this.state, tab };
     this.map.invalidateSize();
+    if (tab === "analysis") this.analysis.show().catch((error) => this.failAnalysis(error));
+    else this.drawings.showGeometries([], null);
+  }
+
+  private failAnalysis(error: unknown): void {
+    console.error(error);
+    find("analysis-content").replaceChildren(make("p", { class: "alarm" }, error instanceof Error ? error.message : String(error)));
   }
 }
 
@@ -336,7 +449,7 @@ async function start(): Promise<void> {
     showTab(chosen);
     const state = { ...readState(location.hash), tab: chosen };
     history.replaceState(null, "", `#${writeState(state)}`);
-    if (chosen === "map") viewer?.resize();
+    viewer?.showTab(chosen);
   });
   if (location.protocol === "file:") {
     showTab("summary");
@@ -351,6 +464,7 @@ async function start(): Promise<void> {
     explain(`The map cannot be shown: ${error instanceof Error ? error.message : String(error)}`);
   }
   showTab(tab);
+  viewer?.showTab(tab);
 }
 
 void start();

@@ -37,10 +37,9 @@ def _stages(root: Path, frames: int, unit: Any) -> int:
     from velfield.pipeline.stage import STAGES, Cut
 
     plan = planned(frames, root, unit_frames=unit)
-    work = Work(plan, ThreadsRunner(2), Console("quiet"))
+    work = Work(plan, ThreadsRunner(2), Console("quiet"), at_once=4)
     by_frames = [replace(stage, prepare=None) for stage in STAGES if stage.cut is Cut.BY_FRAMES]
-    for stage in by_frames:
-        work.run(stage, lambda plan, stage, part: delayed(_commit, pure=False)(plan, stage.name, part))
+    work.run(by_frames, lambda plan, stage, part: delayed(_commit, pure=False)(plan, stage.name, part))
     return len(by_frames) * len(plan.units)
 
 

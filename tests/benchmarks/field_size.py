@@ -54,12 +54,12 @@ def _plan(root: Path, shape: tuple[int, int], tracklets: Any) -> Any:
 
 def _build(plan: Any) -> tuple[float, int, float, float]:
     """Seconds, pixels known, and MB of memory before and at most, in a process of its own."""
-    from velfield.pipeline.stages.field import accumulate_group, create_field_stores, field_groups
+    from velfield.pipeline.stages.field import accumulate_block, create_field_stores, field_blocks
 
     idle_mb = _most_mb()
     started = time.monotonic()
     create_field_stores(plan)
-    pixels = sum(int(accumulate_group(plan, group).counts["pixels"]) for group in field_groups(plan))
+    pixels = sum(int(accumulate_block(plan, group).counts["pixels"]) for group in field_blocks(plan))
     return time.monotonic() - started, pixels, idle_mb, _most_mb()
 
 

@@ -36,7 +36,7 @@ def main() -> None:
     images = sorted(path for path in arguments.folder.glob("*.png") if path.with_suffix(".txt").exists())
     parked = _parked(run, [read_boxes(image)[1] for image in images])
     corners = _corners_on(run, parked)
-    maps = replace(run.frame_transforms, base_transforms=())
+    maps = replace(run.frame_transforms, base_maps=())
     frames = [k for k, status in enumerate(run.registration_status) if status == "ok"]
     positions = np.stack([track_corners(run.frames.read(k), maps.transform(k), corners) for k in frames])
     residuals, sd = centre_on_medians(positions)

@@ -16,9 +16,8 @@ from velfield import open_run
 
 _VISITS, _CLICKS = 5, 12
 _REACH_X, _REACH_Y = 300, 250
-_STANDS = (
-    "document.querySelector('#map img')?.complete && document.querySelector('canvas.leaflet-tile-loaded') !== null"
-)
+_TILES = [f"document.querySelector('.{layer} .leaflet-tile-loaded') !== null" for layer in ("base", "overlay")]
+_STANDS = " && ".join(_TILES)
 
 
 def main(root: Path) -> None:

@@ -7,14 +7,14 @@ import pytest
 
 from schemas.arrays import GreyImage, Mask, Points
 from velfield.detection.detect import (
-    CELL_PX,
-    ComparableFrame,
     SearchedFrame,
     changed_cells,
+    oriented_strips,
     search_frame,
     split_into_boxes,
 )
 from velfield.detection.detector import Detections, shipped_detector
+from velfield.detection.frame import CELL_PX, ComparableFrame, half_resolution
 
 _SHAPE = 300, 420
 
@@ -141,3 +141,27 @@ def test_a_frame_searched_whole_gives_what_the_detector_gives() -> None:
     assert len(whole) == len(searched) >= 3
     order, other = np.argsort(whole.xy[:, 0]), np.argsort(searched.xy[:, 0])
     assert np.abs(whole.xy[order] - searched.xy[other]).max() < 0.1
+
+
+def test_weak_candidates_lie_below_the_threshold_and_on_no_car_and_leave_the_cars_as_they_are() -> None:
+    image = with_cars(with_cars(ground(4), [(60, 60), (330, 230)]), [(150, 200), (250, 80)], level=126)  # two are faint
+    at = shipped_detector().threshold
+    low = search_frame(shipped_detector(), frame(image), threshold=at - 0.1).detections
+    pick = float(np.sort(low.score)[len(low) // 2])  # a threshold with candidates on either side
+    searched = search_frame(shipped_detector(), frame(image), threshold=pick)
+    margin = shipped_detector().weak_margin
+    assert len(searched.weak)
+    assert ((searched.weak.score <= pick) & (searched.weak.score > pick - margin)).all()
+    apart = np.hypot(*(searched.weak.xy[:, None] - searched.detections.xy[None]).transpose(2, 0, 1))
+    assert apart.min() > 4
+    again = search_frame(shipped_detector(), frame(image), reference=replace(searched), threshold=pick)
+    assert len(again.weak) == len(searched.weak)  # of what stayed as it was they are kept as well
+
+
+def test_strips_show_a_bus_whole_along_its_axis() -> None:
+    image = np.full(_SHAPE, 90, np.uint8)
+    image[80:180, 196:204] = 200  # 100 px long, upright, 8 px wide
+    strip = oriented_strips(half_resolution(image), np.array([[199.5, 129.5]]), np.array([np.pi / 2]))[0]
+    assert strip.shape == (32, 10)
+    assert (strip[:, 4:6] == 200).all()  # all 64 px of it
+    assert (strip[:, [0, 1, 8, 9]] == 90).all()

@@ -3,6 +3,7 @@
 from functools import cache
 from typing import Any, ClassVar
 
+import cv2
 import numpy as np
 import pytest
 
@@ -21,6 +22,7 @@ from velfield.detection.cnn.model import (
     detect_cars,
     motion_score_bonus,
 )
+from velfield.detection.cnn.peaks import SMOOTHING_SIGMA, find_peaks
 from velfield.detection.detector import shipped_detector
 from velfield.detection.orientation import axial_difference
 from velfield.errors import InputError
@@ -233,3 +235,42 @@ def test_without_a_gpu_cuda_is_refused_and_auto_is_the_processor(monkeypatch: py
     model.check_device("auto")
     session = model.open_session(model.network_to_onnx(network()), "auto")
     assert session.get_providers() == ["CPUExecutionProvider"]
+
+
+def test_peaks_are_those_of_the_plain_form() -> None:
+    rng = np.random.default_rng(2)
+    probability = cv2.GaussianBlur(rng.random((60, 80), np.float32), (0, 0), 1.5) * 1.4
+    orientation = rng.normal(size=(2, 60, 80)).astype(np.float32)
+    valid = rng.random((120, 160)) < 0.8
+    found = find_peaks(probability, orientation, valid, stride=2, min_probability=0.5)
+    smooth = cv2.GaussianBlur(probability, (0, 0), SMOOTHING_SIGMA)
+    peak = (smooth >= cv2.dilate(smooth, np.ones((3, 3), np.uint8))) & (smooth > 0.5) & valid[::2, ::2]
+    y, x = np.nonzero(peak)
+    assert len(found) == len(x) > 20
+    np.testing.assert_array_equal(found[:, 4], smooth[y, x])
+    np.testing.assert_array_equal(found[:, 2:4], orientation[:, y, x].T)
+    assert np.abs(found[:, :2] - (2 * np.column_stack([x, y]) + 0.5)).max() <= 1
+    inner = (x > 0) & (x < 79) & (y > 0) & (y < 59)
+    log = np.log(smooth.astype(np.float64))
+    y, x = y[inner], x[inner]
+    offset = (log[y, x + 1] - log[y, x - 1]) / (2 * (2 * log[y, x] - log[y, x - 1] - log[y, x + 1]))
+    np.testing.assert_allclose(found[inner, 0], 2 * (x + np.clip(offset, -0.5, 0.5)) + 0.5, atol=1e-4)
+
+
+def test_the_number_of_threads_changes_nothing_that_matters() -> None:
+    """A session has one thread, so that the order of its sums never changes; with more, scores differ by rounding."""
+    import onnxruntime as ort
+
+    from velfield.detection.cnn.model import network_to_onnx, open_session
+    from velfield.detection.detector import shipped_detector
+
+    model = network_to_onnx(shipped_detector().network)  # type: ignore[attr-defined]
+    session = open_session(model, "cpu")
+    assert session.get_session_options().intra_op_num_threads == 1
+    image = np.random.default_rng(3).integers(0, 255, (1, 1, 64, 96), dtype=np.uint8)
+    (expected,) = session.run(["probability"], {"image": image})
+    for threads in (2, 8):
+        options = ort.SessionOptions()
+        options.intra_op_num_threads = threads
+        other = ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+        np.testing.assert_allclose(other.run(["probability"], {"image": image})[0], expected, atol=1e-6)

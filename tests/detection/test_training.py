@@ -5,16 +5,18 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 
 from flows.cli import app
 from flows.commands import train as train_command
 from schemas.flight import FramesConfig
+from schemas.tables import LABEL_COLUMNS
 from velfield.detection.cascade.scenes import make_scene
 from velfield.detection.detector import load_detector, shipped_detector
 from velfield.detection.orientation import axial_difference
 from velfield.errors import InputError
-from velfield.pipeline.stages.labels import check_vehicle_length, labelled_images
+from velfield.pipeline.stages.labels import check_label_scale, check_vehicle_length, labelled_images
 from velfield.sources.labels.labels import read_labels
 from velfield.sources.source import probe
 from velfield.synthetic import small_flight
@@ -112,6 +114,20 @@ def test_labels_that_are_not_as_long_as_cars_are_warned_of() -> None:
     assert "3.0 m long, expected 3.3 to 6" in short
     assert "give 0.34 if they are cars" in short
     assert "10.4 m long" in long
+
+
+@pytest.mark.parametrize(("factor", "n_warnings"), [(1.0, 0), (1.2, 1), (1 / 1.2, 1)])
+def test_a_wrong_gsd_is_reported_by_the_labelled_cars(factor: float, n_warnings: int) -> None:
+    rng = np.random.default_rng(4)
+    cars = pd.DataFrame(
+        {name: pd.Series(np.nan, index=range(60), dtype=kind) for name, kind in LABEL_COLUMNS.items() if kind != "str"}
+    )
+    cars["length_px"] = rng.normal(4.4, 0.35, 60) / 0.23 / 1.1
+    cars["width_px"] = 8.0
+    cars["orientation_rad"] = 0.3
+    lines = check_label_scale(cars, 1.1, 0.23 * factor)
+    assert len(lines) == n_warnings
+    assert all("by --gsd-m is used, but it is" in line for line in lines)
 
 
 def test_a_folder_that_is_missing_is_an_error_before_anything_is_trained(tmp_path: Path) -> None:

@@ -59,7 +59,8 @@ def test_each_format_is_described_and_a_module() -> None:
     assert set(get_args(ExportFormat)) == set(EXPORT_FORMATS)
     names = [export_module(name).FILE_NAME for name in EXPORT_FORMATS]
     assert len(set(names)) == len(names)
-    assert [name for name in EXPORT_FORMATS if not callable(export_module(name).encode)] == []
+    modules = {name: export_module(name) for name in EXPORT_FORMATS}
+    assert [name for name, one in modules.items() if not (hasattr(one, "encode") or hasattr(one, "write"))] == []
 
 
 @pytest.mark.parametrize("name", ["shapefile", "export", "georeference"])
@@ -86,6 +87,10 @@ def remote_root(s3: None, whole: tuple[Path, RunSummary]) -> str:
 def test_each_format_is_the_same_from_and_to_s3(name: str, run: Run, remote_root: str, tmp_path: Path) -> None:
     options = ExportOptions(width_px=300, start=datetime(2024, 5, 1, 12, tzinfo=UTC))
     remote = georeferenced(open_run(remote_root))
+    if name in ("sumo_network", "opendrive") and not len(run.analysis.lanes()):
+        with pytest.raises(InputError, match="found no lanes"):  # in so short a flight; tests/exports/test_roads.py
+            export_run(remote, name, options=options)
+        return
     path = export_run(remote, name, options=options)
     assert str(path) == f"{remote_root}/exports/{export_module(name).FILE_NAME}"
     local = export_run(georeferenced(run), name, tmp_path / "whole" / "exports" / path.name, options)

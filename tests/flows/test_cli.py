@@ -155,7 +155,8 @@ def test_the_wheel_runs_from_a_folder_with_decoys(wheel_folder: Path, tmp_path: 
 def test_the_wheel_ships_what_it_reads_at_run_time(wheel_folder: Path) -> None:
     wanted = ("velfield/report/report.css", "velfield/py.typed", "schemas/py.typed", "flows/cli.py")
     wanted += tuple(
-        f"velfield/report/page/{name}" for name in ("viewer.js", "viewer.html", "annotate.js", "LICENSES.txt")
+        f"velfield/report/page/{name}"
+        for name in ("viewer.js", "viewer.html", "annotate.js", "georeference.js", "LICENSES.txt")
     )
     assert [name for name in wanted if not (wheel_folder / name).exists()] == []
 

@@ -31,14 +31,15 @@ def test_what_a_process_started_ends_with_it(kill: bool) -> None:
     ) as process:
         assert process.stdout is not None
         child = psutil.Process(int(process.stdout.readline()))
-        bystander = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-        if kill:
-            process.send_signal(signal.SIGKILL)
-        _, alive = psutil.wait_procs([child], timeout=20)
-        assert alive == []
-        assert bystander.poll() is None
-        bystander.kill()
-        bystander.wait()
+        with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as bystander:
+            try:
+                if kill:
+                    process.send_signal(signal.SIGKILL)
+                _, alive = psutil.wait_procs([child], timeout=20)
+                assert alive == []
+                assert bystander.poll() is None
+            finally:
+                bystander.kill()
 
 
 def test_ctrl_c_is_answered(tmp_path: Path) -> None:

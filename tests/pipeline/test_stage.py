@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from flows.commands.bench_overhead import compute_bare
 from schemas.flight import FlightConfig
 from schemas.model import Model
 from schemas.records import InputsRecord, SourceRecord
 from schemas.summary import RunSummary
 from tests.small_flight import digests, job
+from velfield.bench.workers import compute_bare
 from velfield.pipeline.plan import make_plan, write_flight_record
 from velfield.pipeline.stage import STAGE, STAGES, Cut, NewBase, Stage, resolve, stage_keys
 
@@ -93,6 +93,7 @@ READERS: dict[str, tuple[str, ...]] = {
     "tracking.max_interval_s": ("detector",),
     "tracking.max_gap_s": ("tracks",),
     "tracking.max_stationary_gap_s": ("tracks",),
+    "tracking.max_hidden_gap_s": ("tracks",),
     "field": ("field",),
     "work": (),
     "work.unit_frames": ("frames",),

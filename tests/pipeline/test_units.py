@@ -5,22 +5,30 @@ from pathlib import Path
 
 import pytest
 
-from schemas.summary import RunSummary
-from tests.small_flight import digests, job, process
+from tests.faults.failing_store import TINY, run_again, tiny_job
+from tests.small_flight import digests
 from velfield import open_run
 from velfield.pipeline.stage import STAGE
 from velfield.pipeline.verify import verify_run
+from velfield.synthetic import write_flight
 
 
-@pytest.mark.parametrize("setting", ["frames.stop_s=1.7", "work.unit_frames=9"])
-def test_a_run_into_a_folder_of_another_plan_is_as_into_a_new_one(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, setting: str
-) -> None:
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("units")
+    write_flight(folder / "flight", TINY)
+    run_again(tiny_job(folder / "flight", folder / "whole"))
+    return folder
+
+
+@pytest.mark.parametrize("setting", ["frames.stop_s=0.9", "work.unit_frames=4"])
+def test_a_run_into_a_folder_of_another_plan_is_as_into_a_new_one(flight: Path, tmp_path: Path, setting: str) -> None:
     used, new = tmp_path / "used", tmp_path / "new"
-    shutil.copytree(whole[0], used)
+    shutil.copytree(flight / "whole", used)
     for root in (used, new):
-        process(job(flight, root, setting))
+        run_again(tiny_job(flight / "flight", root, setting))
     run = open_run(used)
+    assert run.frames.count == (6 if "unit" in setting else 4)
     assert run.detections()["frame"].max() < run.frames.count
     assert run.tracklets()["frame_2"].max() < run.frames.count
     assert verify_run(run.layout, run.record) == []

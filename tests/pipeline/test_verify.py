@@ -8,15 +8,16 @@ import pytest
 
 from flows.commands.verify import verify
 from schemas.summary import RunSummary
+from tests.faults.flipped_bits import flip_bits
 from tests.small_flight import digests
 from velfield import open_run
+from velfield.errors import InputError, StoreError
 from velfield.pipeline.stage import STAGE
 from velfield.pipeline.verify import invalidate, verify_run
-from velfield.run.commits import commit_path, read_commits
+from velfield.run.commits import commit_path, read_commit, read_commits
 from velfield.run.layout import RunLayout
-from velfield.run.stores import StoreError
 
-FLIPS = 200
+FLIPS, SEED = 200, 25
 
 
 @pytest.fixture
@@ -60,12 +61,40 @@ def test_every_file_of_the_stores_and_tables_is_in_a_record(copy: Path) -> None:
 
 
 def test_every_one_of_200_flipped_bits_is_found(copy: Path) -> None:
-    rng = np.random.default_rng(0)
-    files = committed_files(copy)
-    hit = {files[k] for k in rng.choice(len(files), min(FLIPS, len(files)), replace=False)}
-    for name in sorted(hit):
-        flip_a_bit(copy / name, rng)
-    assert found(copy) == dict.fromkeys(hit, "damaged")
+    """In any file of the run but the lock: stores, tables, images, records, the page."""
+    flips = flip_bits(copy, FLIPS, SEED)
+    assert [flip.text() for flip in flips if not flip.is_found] == [], f"seed {SEED}"
+    assert sum(flip.path.startswith("commits/") for flip in flips) > 5
+    assert sum(flip.path.startswith("field.zarr/") for flip in flips) > 5
+
+
+def test_a_damaged_commit_record_counts_for_nothing(copy: Path) -> None:
+    """One digit of a count: the unit is computed again rather than taken."""
+    path = commit_path(RunLayout(copy), "detections", "000008-000015")
+    path.write_text(path.read_text().replace('"cars": ', '"cars": 1'))
+    assert found(copy) == {"commits/detections/000008-000015.json": "damaged"}
+    assert read_commit(RunLayout(copy), "detections", "000008-000015") is None
+
+
+def test_a_damaged_flight_record_is_refused_with_what_to_do(copy: Path) -> None:
+    path = copy / "flight.json"
+    path.write_text(path.read_text().replace('"max_keypoints": 1200', '"max_keypoints": 1201'))
+    with pytest.raises(InputError, match=r"flight\.json is damaged .*same `velfield run` command writes it again"):
+        open_run(copy)
+
+
+def test_a_damaged_page_is_found(copy: Path) -> None:
+    flip_a_bit(copy / "view/run.json", np.random.default_rng(SEED))
+    assert found(copy) == {"view/run.json": "damaged"}
+
+
+def test_reading_a_damaged_table_raises_and_names_it(copy: Path) -> None:
+    path = next((copy / "detections").glob("*.parquet"))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 4
+    path.write_bytes(data)
+    with pytest.raises(StoreError, match=f"{path.name} is damaged"):
+        open_run(copy).detections()
 
 
 def test_missing_files_and_unfinished_units_are_listed(copy: Path) -> None:
@@ -111,7 +140,7 @@ def test_only_the_damaged_units_are_recomputed_with_equal_results(
         path.relative_to(copy / "commits").as_posix() for path in before if path.stat().st_mtime_ns != before[path]
     }
     units = ("frames/000000-000007", "frames/000016-000017", "registration/000008-000015", "tracks/all")
-    assert again == {f"{unit}.json" for unit in units}
+    assert again == {f"{unit}.json" for unit in (*units, "page/all")}  # every run writes the page again
 
 
 def test_a_store_whose_metadata_is_damaged_is_recreated(copy: Path) -> None:

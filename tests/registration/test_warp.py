@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from velfield.camera.lens import HarrisLens, pinhole
+from velfield.detection.frame import ComparableFrame
 from velfield.registration import warp
 from velfield.registration.background import median_background
 from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, fit_normalisation
-from velfield.registration.warp import footprint, warp_to_base
+from velfield.registration.warp import CELL_PX, Rectification, footprint, warp_to_base
 
 WIDTH, HEIGHT = 240, 180
 
@@ -18,6 +19,19 @@ def moved(matrix: np.ndarray, *, a: float = 0.0) -> FrameTransform:
     lens = HarrisLens(a, 119.5, 89.5, 150.0) if a else pinhole((HEIGHT, WIDTH))
     p = PolyprojectiveTransform.from_homography(matrix, fit_normalisation(corners), fit_normalisation(corners))
     return FrameTransform(width=WIDTH, height=HEIGHT, lens=lens, polyprojective=p)
+
+
+def wobbling(amplitude_px: float) -> FrameTransform:
+    """Of a frame of 640x480 whose rows move in x, in four cycles."""
+    rows = np.zeros((3, 48))
+    rows[0] = amplitude_px * np.sin(np.linspace(0, 2 * np.pi * 4, 48))
+    return FrameTransform(
+        width=640,
+        height=480,
+        lens=pinhole((480, 640)),
+        polyprojective=PolyprojectiveTransform.from_homography(np.eye(3), *[np.array([320.0, 240.0, 1 / 400])] * 2),
+        row_coefficients=rows,
+    )
 
 
 def coordinate_picture(axis: int) -> np.ndarray:
@@ -57,15 +71,7 @@ def test_every_working_pixel_holds_its_own_raw_coordinate(scale: float, window: 
 @pytest.mark.parametrize(("amplitude_px", "cell_px"), [(0.3, 16), (6.0, 8)])
 def test_cells_are_small_where_the_rows_wobble_fast(amplitude_px: float, cell_px: int) -> None:
     """Four cycles over 480 rows: what bilinear interpolation leaves stays below a fifth of a pixel either way."""
-    rows = np.zeros((3, 48))
-    rows[0] = amplitude_px * np.sin(np.linspace(0, 2 * np.pi * 4, 48))
-    moved = FrameTransform(
-        width=640,
-        height=480,
-        lens=pinhole((480, 640)),
-        polyprojective=PolyprojectiveTransform.from_homography(np.eye(3), *[np.array([320.0, 240.0, 1 / 400])] * 2),
-        row_coefficients=rows,
-    )
+    moved = wobbling(amplitude_px)
     step, coarse = warp._interpolable_map(moved, window=(0, 0, 640, 480), scale=1.0, shape=(480, 640))
     assert step == cell_px
     dense = cv2.resize(coarse.astype(np.float32), None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
@@ -133,3 +139,32 @@ def test_background_is_the_median_of_those_that_see() -> None:
 def test_background_of_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="0 images"):
         median_background([], [])
+
+
+@pytest.mark.parametrize(("scale", "amplitude_px"), [(1.0, 0.3), (0.9, 6.0), (0.4, 0.3)])
+def test_resampled_by_cells_a_frame_is_as_when_resampled_whole(scale: float, amplitude_px: float) -> None:
+    frame = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 255, (480, 640), dtype=np.uint8), (0, 0), 2)
+    transform, window = wobbling(amplitude_px), (-20, -30, 700, 500)
+    whole, mask = warp_to_base(
+        frame, transform, window=window, scale=scale, interpolation=cv2.INTER_CUBIC, replicate_border=True
+    )
+    by_cells = Rectification(frame, transform, window=window, scale=scale)
+    cells = np.random.default_rng(4).random([-(-size // CELL_PX) for size in whole.shape]) < 0.5
+    by_cells.resample(cells)
+    asked = np.kron(cells, np.ones((CELL_PX, CELL_PX), bool))[: whole.shape[0], : whole.shape[1]]
+    assert not by_cells.image[~asked].any()
+    by_cells.resample(~cells)
+    assert cv2.absdiff(by_cells.image, whole).max() <= 4
+    assert np.abs(by_cells.image.astype(int) - whole).mean() < 0.2
+    assert (by_cells.valid != mask).mean() < 1e-3
+    half = ComparableFrame(whole, mask)
+    assert by_cells.half_image.shape == half.half_image.shape
+    assert np.abs(by_cells.half_image.astype(int) - half.half_image).mean() < 2
+    assert (by_cells.half_valid != half.half_valid).mean() < 0.01
+
+
+def test_a_map_inverted_on_a_grid_is_the_inverse() -> None:
+    transform = wobbling(6.0)
+    base = np.stack(np.meshgrid(np.arange(-40.0, 680, 16), np.arange(-40.0, 520, 16)), axis=2)
+    exact = transform.to_raw(base.reshape(-1, 2)).reshape(base.shape)
+    assert np.nanmax(np.abs(warp.invert_on_grid(transform, base) - exact)) < 0.005

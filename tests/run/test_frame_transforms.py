@@ -12,9 +12,17 @@ from schemas.flight import FlightConfig
 from schemas.records import GridRecord, RebaseRecord
 from velfield.camera.lens import HarrisLens
 from velfield.errors import InputError
-from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, vector_length
+from velfield.registration.base_mesh import BaseMesh
+from velfield.registration.mesh import CELLS, Support
+from velfield.registration.transforms import (
+    FrameTransform,
+    MeshedTransform,
+    PolyprojectiveTransform,
+    vector_length,
+)
 from velfield.run.frame_transforms import (
     FrameTransforms,
+    base_mesh_to_record,
     heading_deg,
     north_direction_rad,
     polyprojective_from_record,
@@ -104,6 +112,28 @@ def test_base_images_given_later_are_applied_after_a_frames_own(layout: RunLayou
     xy = points()
     np.testing.assert_allclose(composed.to_base(xy), to_newer(to_given(own.to_base(xy))), atol=1e-9)
     np.testing.assert_allclose(composed.to_raw(composed.to_base(xy)), xy, atol=1e-6)
+
+
+def test_the_map_to_a_given_image_has_a_mesh_and_a_standard_deviation_that_both_come_back(layout: RunLayout) -> None:
+    mesh = np.random.default_rng(0).uniform(-1, 1, (3, 4, 2))
+    sd_px = np.full(CELLS, 0.3, np.float32)
+    sd_px[:, 16:] = np.nan  # the given image does not show the right half
+    to_given = MeshedTransform(similarity(2.0, 0.0, (0, 0)), mesh, 100)
+    record = base_mesh_to_record(BaseMesh(to_given, 0.2, 99, Support(sd_px, WIDTH, HEIGHT)))
+    layout.own_to_base.write_text(record.model_dump_json())
+    store = open_registration(layout.registration, "r+")
+    own_sd = np.full((3, *CELLS), 0.2, np.float32)
+    store.write(0, store.vectors(0, 3), store.statuses(), {"position_sd_px": own_sd})
+    frames = FrameTransforms.open(layout, CONFIG)
+    transform, xy = frames.transform(0), np.array([[40.0, 60.0], [300.0, 60.0]])
+    assert transform is not None
+    own = frame_transform(similarity(1.1, 0.1, (5, 7))).to_base(xy)
+    np.testing.assert_allclose(transform.to_base(xy), to_given(own), atol=1e-9)
+    np.testing.assert_allclose(transform.to_raw(transform.to_base(xy)), xy, atol=2e-3)
+    known, unknown = frames.position_sd_px(0, xy)
+    assert known == pytest.approx(np.hypot(2 * 0.2, 0.3), rel=0.02)
+    assert np.isnan(unknown)
+    assert np.isnan(frames.position_sd_px(1, xy)).all()
 
 
 def test_a_record_of_a_transform_gives_it_back_to_the_bit() -> None:

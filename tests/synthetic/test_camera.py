@@ -14,7 +14,16 @@ from schemas.simulation import (
     SimulationConfig,
     TrafficSimulation,
 )
-from velfield.synthetic import homography_only, lens_and_wobble, lens_only, simulate, small_flight, vibration_and_drift
+from velfield.errors import InputError
+from velfield.synthetic import (
+    homography_only,
+    lens_and_wobble,
+    lens_only,
+    simulate,
+    small_flight,
+    two_term_lens,
+    vibration_and_drift,
+)
 from velfield.synthetic.cases import FLAT, PINHOLE
 
 EMPTY = TrafficSimulation(flow_veh_per_h=0, warm_up_s=0)
@@ -26,7 +35,7 @@ def raw_points(config: SimulationConfig, n: int = 400, seed: int = 0) -> FloatAr
     return rng.uniform([0, 0], [config.width - 1, config.height - 1], (n, 2))
 
 
-@pytest.mark.parametrize("case", [homography_only, lens_only, lens_and_wobble, vibration_and_drift])
+@pytest.mark.parametrize("case", [homography_only, lens_only, lens_and_wobble, vibration_and_drift, two_term_lens])
 def test_to_raw_inverts_to_base(case) -> None:  # type: ignore[no-untyped-def]
     flight = simulate(case(width=640, height=480, frames=4))
     xy = raw_points(flight.config)
@@ -134,3 +143,9 @@ def test_times_ascend_irregularly_about_the_nominal_rate() -> None:
     assert 0.05 < late.mean() < 0.2
     assert np.abs(step[late] - 0.3).min() < 0.02
     assert np.abs(step[late] - 0.4).min() < 0.02
+
+
+def test_a_lens_that_folds_within_the_frame_is_refused() -> None:
+    config = small_flight().config.model_copy(update={"camera": CameraSimulation(lens_terms=(-0.5,))})
+    with pytest.raises(InputError, match="found a lens that folds"):
+        simulate(config)

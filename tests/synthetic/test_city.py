@@ -1,5 +1,6 @@
 """Blocks, streets, ground and relief: what is painted where, heights, light and shadows."""
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -109,6 +110,27 @@ def test_a_tree_is_highest_at_its_centre_and_within_its_radius() -> None:
     height = painted.height_m[y, x]
     assert 0.8 * 8.0 * 0.9 < height.max() <= 8.0
     assert height[distance < 1].mean() > height[distance > 3].mean()
+
+
+def test_street_trees_hide_parts_of_lanes_and_change_nothing_else() -> None:
+    rect = (-120.0, -60.0, 40.0, 100.0)
+    plan = make_city_plan(rect, np.random.default_rng(1), turn_share=0.1, cycle_s=60)
+    heights, paints = [], []
+    for share in (0.0, 0.4):
+        painted = Canvas((640, 640), origin_m=(-120.0, -60.0), pixel_m=0.25)
+        paint_city(painted, plan, SceneSimulation(street_tree_share=share), np.random.default_rng(2))
+        heights.append(painted.height_m)
+        paints.append(painted.paint)
+    lanes = np.concatenate([edge.path for edge in plan.road_network.edges if edge.kind == "avenue"])
+    cells = np.rint((lanes - [-120.0, -60.0]) / 0.5).astype(int)
+    cells = cells[((cells >= 0) & (cells < 320)).all(axis=1)]
+    hidden = [float((height[cells[:, 1], cells[:, 0]] > 2).mean()) for height in heights]
+    assert hidden[0] < 0.01
+    assert 0.03 < hidden[1] < 0.4
+    assert (heights[1] >= heights[0]).all()
+    changed = (paints[0] != paints[1]).any(axis=2)[::2, ::2]
+    raised = cv2.dilate((heights[1] > 0).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    assert not (changed & ~raised).any()
 
 
 def test_roads_and_parking_spaces_are_free_of_buildings_and_apart_from_lanes() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from velfield.tracking.tracks import END_COLUMNS, GapLimits, reconnect_tracks
+from velfield.tracking.joins import END_COLUMNS, GapLimits, reconnect_tracks
 
 GSD_M = 0.25
 INTERVAL_S = 0.2
@@ -18,6 +18,7 @@ def seen(start_s: float, frames: int, x_m: float, speed: float, acceleration: fl
     x = x_m + speed * (t - start_s) + acceleration * (t - start_s) ** 2 / 2
     v = np.diff(x) / INTERVAL_S
     columns = {"time_0_s": t[:-2], "x_0_px": x[:-2] / GSD_M, "y_0_px": lane_m / GSD_M, "vx_01_px_per_s": v[:-1] / GSD_M}
+    columns |= {"frame_0": np.round(t[:-2] / INTERVAL_S), "frame_2": np.round(t[2:] / INTERVAL_S)}
     columns |= {"time_2_s": t[2:], "x_2_px": x[2:] / GSD_M, "y_2_px": lane_m / GSD_M, "vx_12_px_per_s": v[1:] / GSD_M}
     return pd.DataFrame({**columns, "vy_01_px_per_s": 0.0, "vy_12_px_per_s": 0.0})[END_COLUMNS]
 
@@ -48,10 +49,49 @@ def test_a_stationary_vehicle_is_reconnected_however_long_the_gap() -> None:
     assert reconnected([stationary, again], stationary_gap_s=30.0) == [0, 0]
     assert reconnected([stationary, again]) == [0, 1]
     assert reconnected([stationary, again], stationary_gap_s=10.0) == [0, 1]
-    assert reconnected([stationary, seen(20.0, 6, 1.5, 0.0)], stationary_gap_s=30.0) == [0, 1]
+    assert reconnected([stationary, seen(20.0, 6, 1.4, 0.0)], stationary_gap_s=30.0) == [0, 0]  # another end of it
+    assert reconnected([stationary, seen(20.0, 6, 2.1, 0.0)], stationary_gap_s=30.0) == [0, 1]
     rolling = seen(20.0, 6, 0.5, 3.0)  # the next vehicle at its position, and one that passes through it
     assert reconnected([stationary, rolling], stationary_gap_s=30.0) == [0, 1]
     assert reconnected([seen(0.0, 6, -2.0, 3.0), again], stationary_gap_s=30.0) == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("speed_before", "speed_after", "displacement_m", "same"),
+    [
+        (0.2, 2.0, 1.2, True),  # sets off
+        (4.0, 0.1, 4.5, True),  # comes to rest
+        (4.0, 3.0, 6.0, True),  # both
+        (4.0, 3.0, 15.0, False),  # it would have driven on
+        (4.0, 3.0, 1.0, False),  # no vehicle brakes and accelerates so fast
+        (4.0, 3.0, -6.0, False),
+        (9.0, 9.0, 40.0, False),  # how far that takes is too uncertain
+    ],
+)
+def test_a_vehicle_that_stops_in_the_gap_gets_as_far_as_its_speeds_say(
+    speed_before: float, speed_after: float, displacement_m: float, same: bool
+) -> None:
+    before = seen(0.0, 6, 0.0, speed_before)
+    after = seen(20.0, 6, 5 * INTERVAL_S * speed_before + displacement_m, speed_after)
+    assert reconnected([before, after], stationary_gap_s=30.0) == ([0, 0] if same else [0, 1])
+    assert reconnected([before, after], stationary_gap_s=10.0) == [0, 1]
+    aside = seen(20.0, 6, 5 * INTERVAL_S * speed_before + displacement_m, speed_after, lane_m=3.0)
+    assert reconnected([before, aside], stationary_gap_s=30.0) == [0, 1]
+
+
+def test_a_queue_lost_as_a_whole_sets_off_in_its_order() -> None:
+    """Six vehicles 6.5 m apart, at rest, are seen again at speeds of their own: the first has gone farthest."""
+    x_m, speeds = -6.5 * np.arange(6), np.array([5.0, 4.5, 4.0, 3.0, 2.0, 1.2])
+    before = [seen(0.0, 6, x, 0.0) for x in x_m]
+    after = [seen(25.0, 4, x + v**2 / 4, v) for x, v in zip(x_m, speeds, strict=True)]
+    assert reconnected([*before, *after], stationary_gap_s=60.0) == [*range(6), *range(6)]
+
+
+def test_joins_are_chosen_together() -> None:
+    """The nearest pair of all would leave two others apart that are a vehicle's as well."""
+    ends = [seen(0.0, 6, 0.0, 10.0), seen(0.0, 6, 1.6, 10.0)]
+    starts = [seen(2.0, 6, 20.0 + 1.2, 10.0), seen(2.0, 6, 20.0 + 2.7, 10.0)]
+    assert reconnected([*ends, *starts]) == [0, 1, 0, 1]
 
 
 def test_three_parts_are_one_track_in_any_order() -> None:

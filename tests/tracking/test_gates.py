@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.flight import TrackingConfig
-from velfield.tracking.gates import DetectionStates, GateLog, Limits, gate_link_pairs, gate_links
+from velfield.tracking.gates import DetectionStates, GateLog, Limits, gate_link_pairs, gate_links, triples_pass
 
 PAPER = Limits.from_config(TrackingConfig(), None)
 
@@ -99,3 +99,13 @@ def test_gate_logs_add(entries: list[tuple[str, int]], cut: int) -> None:
         parts[2].add(gate, count)
         parts[i >= cut].add(gate, count)
     assert dict(parts[0] + parts[1]) == dict(parts[2])
+
+
+def test_triples_that_are_chosen_otherwise_pass_the_gates_one_by_one() -> None:
+    """A steady car, one too fast, one that stops dead, and the steady one's detections in another's company."""
+    first = states([(0, 0), (0, 50), (0, 100), (0, 0)], 0.0, sd_px=0.1)
+    second = states([(20, 0), (40, 50), (25, 100), (20, 0)], 0.2, sd_px=0.1)
+    third = states([(40, 0), (80, 50), (25, 100), (40, 50)], 0.4, sd_px=0.1)
+    assert triples_pass((first, second, third), PAPER).tolist() == [True, False, False, False]
+    order = np.array([3, 0])
+    assert triples_pass((first.take(order), second.take(order), third.take(order)), PAPER).tolist() == [False, True]

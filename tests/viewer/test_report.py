@@ -245,3 +245,26 @@ def test_a_long_flight_keeps_its_peaks() -> None:
     assert len(page) < 60_000
     heights = [float(p.split(",")[1]) for p in re.findall(r'class="line" points="([^"]*)"', page)[0].split()]
     assert min(heights) < max(heights) - 100
+
+
+DICHROMATS = {  # Machado, Oliveira and Fernandes 2009, severity 1, linear RGB
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "tritanopia": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+    "none": np.eye(3).tolist(),
+}
+
+
+@pytest.mark.parametrize("sight", list(DICHROMATS))
+def test_directions_are_told_apart_with_any_sight(sight: str) -> None:
+    from skimage.color import deltaE_ciede2000, rgb2lab
+
+    n = 72
+    encoded = direction_colours(np.arange(n) * 2 * np.pi / n) / 255
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    seen = (linear @ np.array(DICHROMATS[sight]).T).clip(0, 1)
+    lab = rgb2lab(np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055))
+    apart = min(deltaE_ciede2000(lab, np.roll(lab, k, axis=0)).min() for k in range(n // 8, n // 2 + 1))
+    opposite = deltaE_ciede2000(lab, np.roll(lab, n // 2, axis=0)).min()
+    assert apart > 12  # a difference of 5 is plain side by side
+    assert opposite > 35

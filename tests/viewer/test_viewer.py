@@ -72,7 +72,7 @@ ANSWERED = "document.querySelector('#answer [data-name=n]') !== null"
 def test_a_click_shows_the_values_of_python(page: Page, address: str, run: Run) -> None:
     x, y = busiest(run)
     page.open(f"{address}#view={x},{y},3")
-    page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
+    page.wait("document.querySelector('.overlay .leaflet-tile-loaded') !== null")
     click_pixel(page, x, y)
     here = run.field.at(x, y)
     assert shown_value(page, "n") == here.n
@@ -121,7 +121,7 @@ def beside(run: Run, away: int) -> tuple[int, int]:
 def test_a_tap_beside_a_lane_means_the_lane_where_a_screen_pixel_is_many(page: Page, address: str, run: Run) -> None:
     x, y = beside(run, 3)
     page.open(f"{address}#view={x},{y},1")
-    page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
+    page.wait("document.querySelector('.overlay .leaflet-tile-loaded') !== null")
     page.click(*page.value(MIDDLE_OF_MAP))
     page.wait(ANSWERED)
     away = shown_value(page, "away")
@@ -136,7 +136,7 @@ def test_a_tap_beside_a_lane_means_the_lane_where_a_screen_pixel_is_many(page: P
 def test_where_a_map_pixel_is_wider_than_a_finger_the_click_means_itself(page: Page, address: str, run: Run) -> None:
     x, y = beside(run, 1)
     page.open(f"{address}#view={x},{y},3")
-    page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
+    page.wait("document.querySelector('.overlay .leaflet-tile-loaded') !== null")
     click_pixel(page, x, y)
     assert shown_value(page, "n") == 0
 
@@ -209,7 +209,7 @@ def test_clicks_all_over_the_map_agree_and_are_quick(
     for y, x in places.tolist():
         page.open("about:blank")
         page.open(f"{address}#view={x},{y},2")
-        page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
+        page.wait("document.querySelector('.overlay .leaflet-tile-loaded') !== null")
         click_pixel(page, x, y)
         here = run.field.at(x, y)
         assert shown_value(page, "n") == here.n
@@ -278,7 +278,7 @@ def test_every_layer_is_painted(page: Page, address: str) -> None:
     page.wait("document.querySelector('#layer option') !== null")
     names = page.value("[...document.querySelectorAll('#layer option')].map((option) => option.value)")
     assert {"direction", "speed", "speed_p85", "count", "direction_ci90_half_width"} <= set(names)
-    painted = """(() => [...document.querySelectorAll('canvas.leaflet-tile-loaded')].some((canvas) => {
+    painted = """(() => [...document.querySelectorAll('.overlay .leaflet-tile-loaded canvas')].some((canvas) => {
       const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext('2d', {willReadFrequently: true});
       copy.drawImage(canvas, 0, 0);
       return copy.getImageData(0, 0, canvas.width, canvas.height).data.some((value) => value > 0);
@@ -299,7 +299,7 @@ def test_tracks_under_the_cursor(page: Page, address: str, run: Run) -> None:
 def test_hover_reads_direction_and_speed(page: Page, address: str, run: Run) -> None:
     x, y = busiest(run)
     page.open(f"{address}#view={x},{y},3")
-    page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
+    page.wait("document.querySelector('.overlay .leaflet-tile-loaded') !== null")
     box = page.value(
         "(({left, top, width, height}) => [left + width / 2, top + height / 2])(map.getBoundingClientRect())"
     )

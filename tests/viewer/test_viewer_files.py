@@ -18,7 +18,7 @@ from velfield.pipeline.compare import compare_runs
 from velfield.pipeline.stages import report as report_step
 from velfield.run.layout import RunLayout
 from velfield.viewer.layers import view_layers
-from velfield.viewer.pyramid import TILE_PX, pyramid_levels, pyramid_tiles
+from velfield.viewer.pyramid import OVERLAP_PX, TILE_PX, pyramid_levels, pyramid_tiles
 
 
 def test_tiles_make_up_the_image_at_every_level() -> None:
@@ -28,10 +28,12 @@ def test_tiles_make_up_the_image_at_every_level() -> None:
         name: cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) for name, data in pyramid_tiles(grey)
     }
     assert pyramid_levels(*grey.shape) == 3
-    whole = np.vstack([np.hstack([tiles[f"0/{row}-{column}.jpg"] for column in range(3)]) for row in range(2)])
+    own = {name: tile[:TILE_PX, :TILE_PX] for name, tile in tiles.items()}
+    whole = np.vstack([np.hstack([own[f"0/{row}-{column}.jpg"] for column in range(3)]) for row in range(2)])
     assert np.abs(whole.astype(int) - grey).max() < 12
     assert tiles["2/0-0.jpg"].shape == (225, 325)
-    assert max(max(tile.shape) for tile in tiles.values()) <= TILE_PX
+    assert max(max(tile.shape) for tile in tiles.values()) <= TILE_PX + OVERLAP_PX
+    assert np.abs(tiles["0/0-0.jpg"][:, TILE_PX].astype(int) - grey[: TILE_PX + 1, TILE_PX]).max() < 12
 
 
 def test_layers_follow_the_store() -> None:

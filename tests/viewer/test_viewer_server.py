@@ -132,7 +132,7 @@ def command(*arguments: str) -> Iterator[str]:
 def test_view_serves_the_page(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
     with command("view", str(whole[0])) as address, browser(tmp_path / "profile") as chromium, chromium.page() as page:
         page.open(address)
-        page.wait("document.querySelector('canvas.leaflet-tile-loaded') !== null")
+        page.wait("document.querySelector('.overlay .leaflet-tile-loaded') !== null")
         assert page.complaints == []
         assert [r for r in page.requests if not r.startswith((address, "data:", "blob:"))] == []
 

@@ -55,6 +55,7 @@ CASES = {
         Case("homography", 8, lambda seed, n: _same_sensor(cases.homography_only(frames=n, seed=seed))),
         Case("wobble", 12, lambda seed, n: _same_sensor(cases.lens_and_wobble(frames=n, seed=seed))),
         Case("vibration", 60, lambda seed, n: cases.vibration_and_drift(frames=n, seed=seed)),
+        Case("two_term_lens", 10, lambda seed, n: cases.two_term_lens(frames=n, seed=seed)),
         Case("long", 1000, lambda seed, n: cases.vibration_and_drift(width=640, height=480, frames=n, seed=seed)),
     )
 }
@@ -69,7 +70,8 @@ class Measurement:
     Attributes
     ----------
     drift_px : change of the mean error from the first tenth of the frames to the last, base px.
-    corner_px : largest error of a frame's corners, over all frames, base px.
+    corner_px : largest error of a frame's corners, over all frames, base px; of those that were answered.
+    answered : fraction of the frame for which there is a position.
     seconds_a_frame : computing time; reading of images is included for velfield, not for stabilo.
     frames_registered, frames : number of frames registered, and in total.
     """
@@ -82,6 +84,7 @@ class Measurement:
     jitter_px: float
     drift_px: float
     corner_px: float
+    answered: float
     seconds_a_frame: float
     frames_registered: int
     frames: int
@@ -91,6 +94,7 @@ class Measurement:
         return (
             f"{self.case:<11} {self.method:<9} seed {self.seed:<6} mean {self.mean_px:7.3f}  p95 {self.p95_px:7.3f}  "
             f"jitter {self.jitter_px:6.3f}  drift {self.drift_px:6.3f}  worst corner {self.corner_px:7.2f} px  "
+            f"answered {self.answered:.4f}  "
             f"{self.seconds_a_frame:5.2f} s a frame  {self.frames_registered}/{self.frames} frames"
         )
 
@@ -130,6 +134,7 @@ def _row(
         jitter_px=score.jitter_px,
         drift_px=score.drift_px,
         corner_px=corner_px,
+        answered=score.answered,
         seconds_a_frame=seconds / frames,
         frames_registered=score.frames,
         frames=frames,
@@ -140,7 +145,7 @@ def _worst_corner(truth: Truth, to_base: PointMap, frames: Sequence[int]) -> flo
     w, h = truth.camera.width - 1.0, truth.camera.height - 1.0
     corners = np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]])
     errors = [np.hypot(*(to_base(frame, corners) - truth.to_base(frame, corners)).T) for frame in frames]
-    return float(np.max(errors)) if errors else float("nan")
+    return float(np.nanmax(errors)) if errors and np.isfinite(errors).any() else float("nan")
 
 
 def summarise(measurements: Sequence[Measurement]) -> list[str]:
@@ -149,7 +154,7 @@ def summarise(measurements: Sequence[Measurement]) -> list[str]:
     for case, method in dict.fromkeys((m.case, m.method) for m in measurements):
         rows = [m for m in measurements if (m.case, m.method) == (case, method)]
         texts = [f"{case:<11} {method:<9} median (worst) of {len(rows)}:"]
-        for name in ("mean_px", "p95_px", "jitter_px", "drift_px", "corner_px", "seconds_a_frame"):
+        for name in ("mean_px", "p95_px", "jitter_px", "drift_px", "corner_px", "answered", "seconds_a_frame"):
             values = [getattr(row, name) for row in rows]
             texts.append(f"{name} {np.median(values):.3f} ({max(values):.3f})")
         lines.append("  ".join(texts))
@@ -183,7 +188,13 @@ def _run_velfield(flight: Path, config: SimulationConfig, truth: Truth) -> tuple
         for frame, source in enumerate(plan.indices)
         if (transform := maps.transform(frame)) is not None
     }
-    return lambda frame, xy: transforms[frame].to_base(xy), sorted(transforms), seconds
+    number = {int(source): frame for frame, source in enumerate(plan.indices)}
+
+    def to_base(frame: int, xy_raw: FloatArray) -> FloatArray:
+        supported = np.isfinite(maps.position_sd_px(number[frame], xy_raw))
+        return np.where(supported[:, None], transforms[frame].to_base(xy_raw), np.nan)
+
+    return to_base, sorted(transforms), seconds
 
 
 def register_by_stabilo(flight: Path, config: SimulationConfig, truth: Truth) -> tuple[PointMap, list[int], float]:

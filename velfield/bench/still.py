@@ -100,7 +100,7 @@ def measure_stability(run: Run, *, max_frames: int = 200, within: FloatArray | N
     InputError
         Fewer than three registered frames, or no corner to track.
     """
-    maps = replace(run.frame_transforms, base_transforms=())
+    maps = replace(run.frame_transforms, base_maps=())
     registered = [frame for frame, status in enumerate(run.registration_status) if status == "ok"]
     sampled = np.unique(np.linspace(0, len(registered) - 1, min(max_frames, len(registered))).astype(int))
     if len(sampled) < 3:

@@ -44,6 +44,12 @@ class Lens(Protocol):
         ...
 
 
+def _squares(offsets: FloatArray) -> FloatArray:
+    """Squared lengths (..., 1) of vectors (..., 2): numpy's sum over so short an axis takes five times as long."""
+    x, y = offsets[..., :1], offsets[..., 1:]
+    return np.asarray(x * x + y * y)
+
+
 @dataclass(frozen=True)
 class HarrisLens:
     """Harris' model, r_d = r / sqrt(1 + a r^2), with its closed inverse r = r_d / sqrt(1 - a r_d^2).
@@ -76,7 +82,7 @@ class HarrisLens:
 
     def _offsets(self, xy: Points) -> tuple[Points, Points]:
         offsets = np.asarray(xy, dtype=np.float64) - (self.centre_x_px, self.centre_y_px)
-        return offsets, np.sum(offsets * offsets, axis=-1, keepdims=True) / self.half_diagonal_px**2
+        return offsets, _squares(offsets) / self.half_diagonal_px**2
 
     def undistort_points(self, xy_raw: Points) -> Points:
         """Raw pixels (n, 2) to undistorted pixels (n, 2); NaN rows at and beyond r_d = 1 / sqrt(a)."""
@@ -142,7 +148,7 @@ class DivisionLens:
 
     def _offsets(self, xy: Points) -> tuple[Points, Points]:
         offsets = (np.asarray(xy, dtype=np.float64) - (self.centre_x_px, self.centre_y_px)) / self.half_diagonal_px
-        return offsets, np.sum(offsets * offsets, axis=-1, keepdims=True)
+        return offsets, _squares(offsets)
 
     def _to_pixels(self, offsets: Points) -> Points:
         return np.asarray(offsets * self.half_diagonal_px + (self.centre_x_px, self.centre_y_px))
@@ -223,7 +229,7 @@ class PolynomialLens:
 
     def _offsets(self, xy: Points) -> tuple[Points, Points]:
         offsets = (np.asarray(xy, dtype=np.float64) - (self.centre_x_px, self.centre_y_px)) / self.half_diagonal_px
-        return offsets, np.sum(offsets * offsets, axis=-1, keepdims=True)
+        return offsets, _squares(offsets)
 
     def _to_pixels(self, offsets: Points) -> Points:
         return np.asarray(offsets * self.half_diagonal_px + (self.centre_x_px, self.centre_y_px))

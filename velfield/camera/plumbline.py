@@ -13,7 +13,7 @@
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize
@@ -59,6 +59,7 @@ _ARC_FRACTION, _LINE_FRACTION = 0.012, 0.04  # of the diagonal: the shortest arc
 _FOLDS = 4
 _MIN_CHANGE_PX = 0.05
 _ALLOWED_SIGMAS = 2.0
+_COMPARED_RADIUS = 0.8  # half-diagonals: within it lie most lines
 _MAX_CENTRE_OFFSET = 0.1  # half-diagonals from the middle: beyond it the descent has diverged
 
 
@@ -328,14 +329,13 @@ def _decide(
     ``bounded``: whether the entropy has its minimum inside the searched range. If it falls to the end of the range, as
     at a crossroads of curved kerbs, the evidence must be strong.
     """
-    family = data.family("harris", 1)
+    compared = harris if best.family.terms == 1 else best
     unmerged = LineSet(data.arcs.xy, data.arcs.tangents, data.arcs.arc, data.arcs.frame)
     by_pinhole = data.lines(data.pinhole, 2.0)
-    fits = [harris, fit_lens(unmerged, family, harris.parameters)]
+    fits = [compared, fit_lens(unmerged, compared.family, compared.parameters)]
     if by_pinhole.count >= MIN_LINES:
-        fits.append(fit_lens(by_pinhole, family, np.zeros(3)))
-    estimates = np.array([fit.parameters[0] for fit in fits])
-    deviations = np.array([float(np.sqrt(fit.covariance[0, 0])) for fit in fits])
+        fits.append(fit_lens(by_pinhole, compared.family, np.zeros(compared.parameters.size)))
+    estimates, deviations = (np.array(values) for values in zip(*(harris_amount(fit) for fit in fits), strict=True))
     # Lines merged as straight under the pinhole model are biased against a lens if at all.
     straightened, changed = _straightened_fraction(by_pinhole, data.pinhole, best.lens)
     a, sd = float(estimates[0]), float(deviations[0])
@@ -360,6 +360,27 @@ def _decide(
     if straightened < MIN_STRAIGHTENED_FRACTION * changed:
         return False, f"{evidence}: {MIN_STRAIGHTENED_FRACTION:.0%} needed, pinhole model kept"
     return True, f"{evidence}: {best.family.name} accepted"
+
+
+def harris_amount(fit: PlumbLineFit) -> tuple[float, float]:
+    """Distortion as Harris' a, and its standard deviation.
+
+    Of a lens of several terms it is the a of the Harris lens that displaces as much at `_COMPARED_RADIUS`: where one
+    term cannot describe the lens, its value depends on where the lines happen to lie.
+    """
+    if fit.family.name == "harris":
+        return float(fit.parameters[0]), float(np.sqrt(fit.covariance[0, 0]))
+
+    def amount(parameters: FloatArray) -> float:
+        unit = replace(fit.family, middle=(0.0, 0.0), half_diagonal_px=1.0).lens(np.append(parameters[:-2], (0.0, 0.0)))
+        radius = float(unit.undistort_points(np.array([[_COMPARED_RADIUS, 0.0]]))[0, 0])
+        return (1.0 - (_COMPARED_RADIUS / radius) ** 2) / _COMPARED_RADIUS**2
+
+    value = amount(fit.parameters)
+    steps = 1e-5 * np.eye(fit.parameters.size)[: fit.family.terms]
+    slope = np.array([(amount(fit.parameters + step) - value) / 1e-5 for step in steps])
+    terms = slice(0, fit.family.terms)
+    return value, float(np.sqrt(slope @ fit.covariance[terms, terms] @ slope))
 
 
 def _straightened_fraction(lines: LineSet, by_pinhole: RadialLens, lens: RadialLens) -> tuple[int, int]:

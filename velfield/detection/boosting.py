@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from schemas.arrays import ByteArray, Float32Array, FloatArray, IntArray, Mask
 from schemas.detector import Round
+from velfield.parallel import count_steps
 
 Int32s = NDArray[np.int32]
 
@@ -129,7 +130,9 @@ def boost(
     smoothing = 0.5 / len(is_car)
     cars, others = np.flatnonzero(is_car), np.flatnonzero(~is_car)
     features, thresholds, leaves = [], [], []
+    count_steps(0, announced=rounds)
     for k in range(rounds):
+        count_steps(1)
         if k % _TRIM_EVERY == 0:
             active_cars, active_others = _trim(weights, cars), _trim(weights, others)
         searched = np.sort(rng.choice(len(bins), min(FEATURES_PER_ROUND, len(bins)), replace=False))

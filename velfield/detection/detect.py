@@ -11,21 +11,24 @@ compared by cells of 16 px. A detection is kept only while nothing within the le
 slow bus looks the same before and after.
 
 The image is on the working grid: the base image's grid, scaled so that a car is ``working_car_length_px`` long. The
-crops (`attach_crops`) are patches rotated to the axis, to compare appearance, and upright chips, to align.
+crops (`attach_crops`) are patches rotated to the axis, to compare appearance, upright chips, to align, and strips at
+half the resolution along the axis, to measure vehicles up to the length of a bus.
+
+Candidates of a lower score than a detection's are kept apart (`SearchedFrame.weak`): where a track shows that a vehicle
+must be, they are enough evidence of it, as in the second association of ByteTrack (Zhang and others 2022).
 """
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field, fields
 
 import cv2
 import numpy as np
 from numba import njit
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
+from velfield.detection.cascade.classifier import confirm_long_vehicles, nms_oriented
 from velfield.detection.detector import Detections, Detector, concatenate
+from velfield.detection.frame import CELL_PX, SearchableFrame, half_resolution
 
-CELL_PX = 16
-"""Side of the cells in which frames are compared, working px."""
 _BOX_PX, _SLOW_PX = 8, 96
 """Sides of the boxes that the difference is averaged over: about half a car, and what counts as illumination."""
 _NOISE_SIGMAS, _CHANGE_LEVELS = 5.0, (3.0, 8.0)
@@ -73,10 +76,33 @@ def oriented_patches(
 
 def upright_chips(image: GreyImage, xy: FloatArray, *, side: int = 32) -> GreyImage:
     """Crops about the rounded positions, (n, side, side) uint8: pixel (side / 2, side / 2) is the rounded position."""
-    padded = np.pad(image, side, mode="edge")
-    corner = np.rint(xy).astype(np.int64) + side - side // 2
-    chips = [padded[y : y + side, x : x + side] for x, y in corner]
-    return np.stack(chips) if chips else np.empty((0, side, side), np.uint8)
+    return np.asarray(_chips_kernel(image, np.rint(xy).astype(np.int64) - side // 2, side))
+
+
+@njit(cache=True, nogil=True)
+def _chips_kernel(image, corners, side):  # type: ignore[no-untyped-def]
+    """Crops with these corners (n, 2); beyond the image its edge goes on."""
+    height, width = image.shape
+    out = np.empty((len(corners), side, side), np.uint8)
+    for n in range(len(corners)):
+        for i in range(side):
+            y = min(max(corners[n, 1] + i, 0), height - 1)
+            for j in range(side):
+                out[n, i, j] = image[y, min(max(corners[n, 0] + j, 0), width - 1)]
+    return out
+
+
+def oriented_strips(
+    half_image: GreyImage, xy: FloatArray, orientation_rad: FloatArray, *, length: int = 32, width: int = 10
+) -> GreyImage:
+    """Patches of twice a bus's length at half the resolution, the axis along the columns: (n, length, width) uint8.
+
+    Parameters
+    ----------
+    half_image
+        The image on the working grid at half its resolution, as of `ComparableFrame.half_image`.
+    """
+    return oriented_patches(half_image, (xy - 0.5) / 2, orientation_rad, width=width, length=length)
 
 
 def _sample(image: GreyImage, x: FloatArray, y: FloatArray) -> GreyImage:
@@ -97,10 +123,16 @@ class FrameDetections(Detections):
     ----------
     patches : (n, 16, 8) uint8, rotated to the axis.
     chips : (n, 32, 32) uint8, upright about the rounded position.
+    strips : (n, 32, 10) uint8, rotated to the axis, at half the resolution.
     """
 
     patches: GreyImage
     chips: GreyImage
+    strips: GreyImage
+
+    def select(self, mask: Mask) -> "FrameDetections":
+        """The cars of a mask (n,)."""
+        return FrameDetections(**{one.name: getattr(self, one.name)[mask] for one in fields(self)})
 
 
 def detect_frame(
@@ -117,8 +149,11 @@ def detect_frame(
     return attach_crops(image, cars, order)
 
 
-def attach_crops(image: GreyImage, cars: Detections, order: IntArray | slice = slice(None)) -> FrameDetections:
-    """Detections in an order, with their patches."""
+def attach_crops(
+    image: GreyImage, cars: Detections, order: IntArray | slice = slice(None), *, half_image: GreyImage | None = None
+) -> FrameDetections:
+    """Detections in an order, with their patches; the image at half its resolution is made where it is not given."""
+    half = half_resolution(image) if half_image is None else half_image
     xy, axis = np.ascontiguousarray(cars.xy[order]), np.ascontiguousarray(cars.orientation_rad[order])
     return FrameDetections(
         xy=xy,
@@ -128,31 +163,8 @@ def attach_crops(image: GreyImage, cars: Detections, order: IntArray | slice = s
         score=cars.score[order],
         patches=oriented_patches(image, xy, axis),
         chips=upright_chips(image, xy),
+        strips=oriented_strips(half, xy, axis),
     )
-
-
-@dataclass(frozen=True)
-class ComparableFrame:
-    """A frame on the working grid, as it is compared with another.
-
-    Attributes
-    ----------
-    image, valid : (h, w) uint8 and bool, where the frame covers the grid.
-    """
-
-    image: GreyImage
-    valid: Mask
-
-    @cached_property
-    def half_image(self) -> GreyImage:
-        """At half the resolution, sizes rounded up."""
-        size = -(-self.image.shape[1] // 2), -(-self.image.shape[0] // 2)
-        return np.asarray(cv2.resize(self.image, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-    @cached_property
-    def half_valid(self) -> Mask:
-        """Every other pixel of every other row."""
-        return np.ascontiguousarray(self.valid[::2, ::2])
 
 
 @dataclass(frozen=True)
@@ -164,27 +176,29 @@ class SearchedFrame:
     frame : the frame.
     detections : its cars.
     searched : fraction of the frame's cells that the detector was run on.
+    weak : candidates of a lower score that no car covers; long vehicles among them are in ``detections``.
     """
 
-    frame: ComparableFrame
+    frame: SearchableFrame
     detections: Detections
     searched: float
+    weak: Detections = field(default_factory=lambda: concatenate([]))
 
 
 def search_frame(
     detector: Detector,
-    frame: ComparableFrame,
+    frame: SearchableFrame,
     background: GreyImage | None = None,
     *,
     reference: SearchedFrame | None = None,
     threshold: float | None = None,
 ) -> SearchedFrame:
-    """Detect the cars of a frame: everywhere that it covers, or where it differs from a reference.
+    """Detect the cars of a frame and weak candidates: everywhere that it covers, or where it differs from a reference.
 
     Parameters
     ----------
     background, threshold
-        As of `Detector.detect`.
+        As of `Detector.detect`; `Detector.weak_margin` below the threshold begin the weak candidates.
     reference
         A frame that was searched whole, on the same grid; none: this one is searched whole.
 
@@ -193,6 +207,8 @@ def search_frame(
     ValueError
         The reference has another shape.
     """
+    own = detector.threshold if threshold is None else threshold
+    weak_above = own - detector.weak_margin
     covered = _any_in_cells(frame.half_valid)
     if reference is None:
         cells = covered
@@ -201,17 +217,51 @@ def search_frame(
         length_px = detector.record.working_car_length_px
         cells = changed | (covered & _cells_to_repeat(changed, reference.detections, length_px))
     boxes = split_into_boxes(cells, detector.context_px / CELL_PX, _BOX_COST_PX / CELL_PX**2)
-    searched, parts = np.zeros(cells.shape, bool), []
-    for box in boxes:
-        parts.append(_find_in_box(detector, frame, background, box, threshold))
-        searched[box[0] : box[2], box[1] : box[3]] = True
-    kept = None if reference is None else _outside(reference.detections, searched, frame.valid)
-    cars = detector.refine(frame.image, frame.valid, concatenate(parts), kept)
+    searched = np.zeros(cells.shape, bool)
+    for top, left, bottom, right in boxes:
+        searched[top:bottom, left:right] = True
+    frame.resample(_grow(searched, -(-detector.context_px // CELL_PX)))
+    found = concatenate([_find_in_box(detector, frame, background, box, weak_above) for box in boxes])
+    above = found.score > own if detector.weak_margin else np.ones(len(found), bool)
+    kept = None if reference is None else _outside(reference.detections, searched, frame.half_valid)
+    cars = detector.refine(frame, found.take(np.flatnonzero(above)), kept)
+    weak = found.take(np.flatnonzero(~above))
+    if reference is not None:
+        weak = concatenate([weak, _outside(reference.weak, searched, frame.half_valid)])
+    length_px = detector.record.working_car_length_px
+    weak = suppress_weak(weak, cars, length_px)
+    long = confirm_long_vehicles(frame, weak, cars, length_px)
+    if len(long):
+        cars = concatenate([cars, long])
+        weak = suppress_weak(weak, long, length_px)
+    frame.resample(_cells_of_crops(np.concatenate([cars.xy, weak.xy]), cells.shape))
     fraction = float(searched[covered].mean()) if covered.any() else 0.0
-    return SearchedFrame(frame, cars, fraction)
+    return SearchedFrame(frame, cars, fraction, weak)
 
 
-def changed_cells(frame: ComparableFrame, reference: ComparableFrame) -> Mask:
+def suppress_weak(weak: Detections, cars: Detections, car_length_px: float) -> Detections:
+    """Weak candidates that neither a car nor a better one of them covers."""
+    if not len(weak):
+        return weak
+    number = np.arange(len(weak) + len(cars))[:, None]
+    kept = nms_oriented(np.column_stack([concatenate([weak, cars]).to_rows(), number]), car_length_px)[:, -1]
+    return weak.take(np.sort(kept[kept < len(weak)]).astype(np.int64))
+
+
+def _grow(cells: Mask, reach: int) -> Mask:
+    """Cells and those so many rows and columns from one."""
+    side = 2 * reach + 1
+    return np.asarray(cv2.dilate(cells.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
+
+
+def _cells_of_crops(xy: FloatArray, shape: tuple[int, ...]) -> Mask:
+    """Cells (rows, columns) that the crops about positions reach into: a crop is two cells wide."""
+    cells = np.zeros(shape, bool)
+    cells[_locate_cells(xy, shape)] = True
+    return _grow(cells, 1)
+
+
+def changed_cells(frame: SearchableFrame, reference: SearchableFrame) -> Mask:
     """Where two frames on one grid differ by more than noise and illumination; where just one covers the grid as well.
 
     Returns
@@ -333,19 +383,23 @@ def _best_split(cells, margin):  # type: ignore[no-untyped-def]
 
 
 def _find_in_box(
-    detector: Detector, frame: ComparableFrame, background: GreyImage | None, box: Box, threshold: float | None
+    detector: Detector, frame: SearchableFrame, background: GreyImage | None, box: Box, threshold: float | None
 ) -> Detections:
     """The candidates whose centres lie in a box, from a crop with context on every side."""
     top, left, bottom, right = (side * CELL_PX for side in box)
+    context = detector.context_px
     window = top, left, min(bottom, frame.image.shape[0]), min(right, frame.image.shape[1])
     found = detector.find(
-        _crop(frame.image, window, detector.context_px, cv2.BORDER_REFLECT_101),
-        _crop(frame.valid.view(np.uint8), window, detector.context_px, cv2.BORDER_CONSTANT) > 0,
-        None if background is None else _crop(background, window, detector.context_px, cv2.BORDER_REFLECT_101),
+        _crop(frame.image, window, context, cv2.BORDER_REFLECT_101),
+        _crop(frame.valid.view(np.uint8), window, context, cv2.BORDER_CONSTANT).view(np.bool_),
+        None if background is None else _crop(background, window, context, cv2.BORDER_REFLECT_101),
         threshold=threshold,
-    ).shifted(left - detector.context_px, top - detector.context_px)
-    cell = np.floor((found.xy + 0.5) / CELL_PX)[:, ::-1]
-    return found.take(np.flatnonzero(((cell >= box[:2]) & (cell < box[2:])).all(axis=1)))
+    )
+    if not len(found):
+        return found
+    x, y = found.xy[:, 0] + (left - context + 0.5), found.xy[:, 1] + (top - context + 0.5)
+    inside = (y >= top) & (y < bottom) & (x >= left) & (x < right)
+    return found.take(np.flatnonzero(inside)).shifted(left - context, top - context)
 
 
 def _crop(image: GreyImage, window: tuple[int, int, int, int], context: int, border: int) -> GreyImage:
@@ -353,14 +407,17 @@ def _crop(image: GreyImage, window: tuple[int, int, int, int], context: int, bor
     top, left, bottom, right = window[0] - context, window[1] - context, window[2] + context, window[3] + context
     outside = max(0, -top), max(0, bottom - image.shape[0]), max(0, -left), max(0, right - image.shape[1])
     inside = image[max(0, top) : bottom, max(0, left) : right]
+    if not any(outside):
+        return inside
     return np.asarray(cv2.copyMakeBorder(inside, *outside, border), np.uint8)
 
 
-def _outside(detections: Detections, searched: Mask, valid: Mask) -> Detections:
+def _outside(detections: Detections, searched: Mask, half_valid: Mask) -> Detections:
     """Detections of cells that were not searched, where the frame covers them."""
     row, column = _locate_cells(detections.xy, searched.shape)
-    x, y = (np.clip(np.rint(detections.xy[:, k]).astype(np.int64), 0, valid.shape[1 - k] - 1) for k in (0, 1))
-    return detections.take(np.flatnonzero(~searched[row, column] & valid[y, x]))
+    half = np.floor((detections.xy + 0.5) / 2).astype(np.int64)
+    x, y = (np.clip(half[:, k], 0, half_valid.shape[1 - k] - 1) for k in (0, 1))
+    return detections.take(np.flatnonzero(~searched[row, column] & half_valid[y, x]))
 
 
 def _cells_to_repeat(changed: Mask, detections: Detections, length_px: float) -> Mask:

@@ -27,15 +27,19 @@ from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
 from schemas.detector import (
     DETECTOR_VERSION,
     METHODS,
+    RECORDS,
     BaseRecord,
     DetectorConfig,
     DetectorRecord,
     PrecisionRecallCurve,
 )
 from schemas.renames import OLD_NAMES_UNTIL, upgrade_detector
+from velfield.detection.frame import SearchableFrame
 from velfield.errors import InputError, OldNameWarning
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from velfield.detection.samples import LabelledImage
     from velfield.detection.unlabelled import UnlabelledFlight
 
@@ -95,6 +99,8 @@ class Detector(ABC):
 
     record: BaseRecord
     method: ClassVar[str]
+    reads_raw_frames: ClassVar[bool] = False
+    """Whether it is run on raw frames (`detect_raw`), at their own resolution, and not on the working grid."""
     context_px: ClassVar[int] = 32
     """What it reads around a car to find it, working px on every side: the margin of a crop."""
 
@@ -132,10 +138,17 @@ class Detector(ABC):
         """Candidates of a crop that has `context_px` on every side: what `refine` makes the detections of."""
         return self.detect(image, valid, background, threshold=threshold)
 
-    def refine(
-        self, image: GreyImage, valid: Mask | None, found: Detections, kept: Detections | None = None
-    ) -> Detections:
-        """Detections of a whole image from the candidates of its parts.
+    def detect_raw(self, grey: GreyImage, *, threshold: float | None = None) -> "pd.DataFrame":
+        """Boxes of cars in a raw frame, of a detector that `reads_raw_frames`.
+
+        Returns
+        -------
+        The columns of `velfield.sources.labels.detections.RAW_DETECTION_COLUMNS` from ``x_px`` on.
+        """
+        raise NotImplementedError
+
+    def refine(self, frame: SearchableFrame, found: Detections, kept: Detections | None = None) -> Detections:
+        """Detections of a whole frame from the candidates of its parts.
 
         Parameters
         ----------
@@ -182,6 +195,11 @@ class Detector(ABC):
         """Precision and recall on cars held out of training."""
         return self.record.curve
 
+    @property
+    def weak_margin(self) -> float:
+        """How far below the threshold a candidate's score may be that a track can confirm; 0: there are none."""
+        return 0.0
+
     def with_threshold(self, threshold: float, curve: PrecisionRecallCurve | None) -> Self:
         """The detector with another score threshold, and the curve that it was chosen on."""
         return type(self)(self.record.model_copy(update={"threshold": threshold, "curve": curve}))
@@ -201,7 +219,7 @@ class Detector(ABC):
 
     def save(self, path: Path) -> None:
         """Write a detector file."""
-        path.write_text(self.to_json())
+        path.write_text(self.to_json(), encoding="utf-8")
 
 
 _CLASSES: dict[str, type[Detector]] = {}
@@ -218,7 +236,7 @@ def register(detector: type[Detector]) -> None:
 def detector_class(method: str) -> type[Detector]:
     """The class of a method, imported when it is first asked for: some take a second."""
     if method not in _CLASSES:
-        if method not in {model.model_fields["method"].default for model in METHODS}:
+        if method not in {model.model_fields["method"].default for model in (*METHODS, *RECORDS)}:
             raise InputError(f"found no detector {method!r}; expected one that is registered")
         register(import_module(f"velfield.detection.{method}.detector").DETECTOR)
     return _CLASSES[method]
@@ -258,8 +276,12 @@ _SHIPPED = "shipped_detector.json"
 _RECORD: TypeAdapter[DetectorRecord] = TypeAdapter(DetectorRecord)
 
 
+ONNX_SUFFIX = ".onnx"
+"""Of another maker's network: see `velfield.detection.onnx`."""
+
+
 def load_detector(path: Path) -> Detector:
-    """Read a detector file; a warning where it is of an old format.
+    """Read a detector file, or another maker's ONNX model; a warning where it is of an old format.
 
     Raises
     ------
@@ -270,6 +292,10 @@ def load_detector(path: Path) -> Detector:
         raise InputError(
             f"{path}: no such detector file; give one that `velfield train` wrote, or leave the option out"
         )
+    if path.suffix.lower() == ONNX_SUFFIX:
+        from velfield.detection.onnx.detector import OnnxDetector
+
+        return OnnxDetector.from_file(path)
     if path.stat().st_size > MAX_BYTES:
         raise InputError(
             f"{path}: found {path.stat().st_size} bytes, expected {MAX_BYTES} at most; give a detector file as "

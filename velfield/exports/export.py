@@ -1,18 +1,24 @@
 """A run in the formats of other programs: `velfield export`.
 
-A format is a module of this package, of the format's name, with what `ExportModule` lists. A new one is that module and
-its line in `schemas.export`.
+A format is a module of this package, of the format's name, with what `ExportModule` lists; one whose files do not fit
+into memory has ``write(run, path, options, progress)`` in place of ``encode``. A new one is that module and its line in
+`schemas.export`.
 """
 
+import tempfile
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import Protocol, cast
+from typing import Any, Protocol, cast
 
 from schemas.export import EXPORT_FORMATS, ExportOptions
 from velfield.errors import InputError
 from velfield.run.commits import write_atomically
-from velfield.run.layout import to_path
+from velfield.run.layout import is_remote, to_path
 from velfield.run.run import Run
+
+_OF_ROADS = ("sumo_network", "opendrive", "highd", "trajectories")
+"""Formats whose modules lie in the package ``roads``."""
 
 
 class ExportModule(Protocol):
@@ -40,6 +46,10 @@ class ExportModule(Protocol):
         """
 
 
+Progress = Callable[[int, int], None]
+"""Called with the steps done and their number."""
+
+
 def export_module(format_name: str) -> ExportModule:
     """The module of a format.
 
@@ -50,10 +60,17 @@ def export_module(format_name: str) -> ExportModule:
     """
     if format_name not in EXPORT_FORMATS:
         raise InputError(f"--format {format_name}: not known; expected one of {', '.join(EXPORT_FORMATS)}")
-    return cast(ExportModule, import_module(f"velfield.exports.{format_name}"))
+    package = "velfield.exports.roads" if format_name in _OF_ROADS else "velfield.exports"
+    return cast(ExportModule, import_module(f"{package}.{format_name}"))
 
 
-def export_run(run: Run, format_name: str, out: Path | None = None, options: ExportOptions | None = None) -> Path:
+def export_run(
+    run: Run,
+    format_name: str,
+    out: Path | None = None,
+    options: ExportOptions | None = None,
+    progress: Progress = lambda done, total: None,
+) -> Path:
     """Write one export, whole or not at all; returns its path, by default in the run folder's ``exports/``.
 
     Raises
@@ -63,5 +80,21 @@ def export_run(run: Run, format_name: str, out: Path | None = None, options: Exp
     """
     module = export_module(format_name)
     path = run.layout.root / "exports" / module.FILE_NAME if out is None else to_path(out)
-    write_atomically(path, module.encode(run, path, options or ExportOptions()))
+    write = getattr(module, "write", None)
+    if write is None:
+        write_atomically(path, module.encode(run, path, options or ExportOptions()))
+    else:
+        _write_stream(write, run, path, options or ExportOptions(), progress)
     return path
+
+
+def _write_stream(write: Any, run: Run, path: Path, options: ExportOptions, progress: Progress) -> None:
+    """Write a file that is too large for memory: beside its place, which it takes when it is whole."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=None if is_remote(path) else path.parent) as folder:
+        partial = Path(folder) / path.name
+        write(run, partial, options, progress)
+        if is_remote(path):
+            path.write_bytes(partial.read_bytes())
+        else:
+            partial.replace(path)

@@ -66,6 +66,7 @@ def accumulate_tile(
     bins: VelocityBins,
     radius_px: float | None,
     weight: Weight = "track",
+    zeros: NDArray[np.int32] | None = None,
 ) -> FieldTile:
     """The histogram of one tile.
 
@@ -81,13 +82,15 @@ def accumulate_tile(
         Half the width of a segment's band, px; None: lines of one pixel, as in the paper.
     weight
         What a track adds at a pixel; see the head of this file.
+    zeros
+        (height, width, nvy, nvx) of zeros that becomes the histogram; None: allocated.
 
     Raises
     ------
     InputError
         A pixel's weight does not fit 32 bits.
     """
-    histogram = np.zeros((*shape, bins.n, bins.n), np.int32)
+    histogram = np.zeros((*shape, bins.n, bins.n), np.int32) if zeros is None else zeros
     count, occupancy_ms, variance_sum = np.zeros((3, *shape), np.int32)
     weight_sum = np.zeros(shape, np.int64)
     path = np.column_stack([segments[name] for name in ("x0_px", "y0_px", "x1_px", "y1_px")]).astype(np.float64)

@@ -3,21 +3,34 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from schemas.arrays import GreyImage
+from velfield.camera.lens import pinhole
 from velfield.detection.detector import load_detector
-from velfield.errors import InputError
+from velfield.errors import Failure, InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import committed
 from velfield.pipeline.stage import STAGES, Cut
+from velfield.pipeline.stages.labels import rescale
 from velfield.pipeline.units import WHOLE
+from velfield.registration.intersensor import MIRRORED, register_intersensor
 from velfield.sources.geo import read_base_raster
 from velfield.sources.labels.detections import read_detections
 from velfield.sources.labels.labels import read_labels
+from velfield.sources.quality import UNUSABLE
+from velfield.sources.source import iter_frames
+from velfield.sources.telemetry.read import read_srt
+
+_CHECKED_SIDE_PX = 960
+_TRIED_FRAMES = 5
+_LONG_PX = 50_000_000
+"""Pixels of all frames above which decoding them takes longer than the check of the base image."""
 
 _READ: dict[str, Callable[[Path, Plan], object]] = {
     "base": lambda path, plan: read_base_raster(path, plan.config.frames),
     "labels": lambda path, plan: read_labels(path, plan.info),
     "detector": lambda path, plan: load_detector(path),
     "detections": lambda path, plan: read_detections(path, plan.info),
+    "telemetry": lambda path, plan: read_srt(path),
 }
 
 
@@ -36,10 +49,55 @@ def validate_inputs(plan: Plan) -> None:
                 read(Path(path), plan)
             except InputError as error:
                 raise InputError(f"--{option}: {error}") from None
+    if plan.job.inputs.base and _is_pending(plan, "base") and _takes_long(plan):
+        check_base_area(plan)
     if plan.config.work.device == "cuda":
         from velfield.detection.cnn.model import check_device
 
         check_device("cuda")
+
+
+def check_base_area(plan: Plan) -> None:
+    """Refuse a base image of another area by one frame of the flight's middle, before the others are decoded.
+
+    The lens is not known yet. So the middle of the frame, where a lens distorts little, is tried as well as all of it,
+    both reduced, and only an image to which neither registers is refused; the base stage decides on the others.
+
+    Raises
+    ------
+    InputError
+        Neither registers: with the scores.
+    """
+    grey = _middle_frame(plan)
+    if grey is None:
+        return
+    base = read_base_raster(Path(plan.job.inputs.base or ""), plan.config.frames).grey
+    height, width = grey.shape
+    middle = grey[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    for image in (grey, middle):
+        factor = min(1.0, _CHECKED_SIDE_PX / max(image.shape))
+        small = rescale(image, factor)
+        found = register_intersensor(small, rescale(base, factor), plan.config.base, lens=pinhole(small.shape))
+        if not isinstance(found, Failure):
+            return
+        reason = found.reason
+        if MIRRORED in reason:
+            break
+    raise InputError(f"--base {plan.job.inputs.base}: {reason}")
+
+
+def _middle_frame(plan: Plan) -> GreyImage | None:
+    """A usable frame near the middle of the flight; None where the first few there are not."""
+    middle = plan.indices[plan.frame_count // 2 :][:_TRIED_FRAMES]
+    for frame in iter_frames(Path(plan.job.inputs.source), plan.info, middle):
+        if not frame.flags & UNUSABLE:
+            return frame.grey
+    return None
+
+
+def _takes_long(plan: Plan) -> bool:
+    """Whether the base stage, which checks the image too, is far off."""
+    return plan.frame_count * plan.info.width * plan.info.height > _LONG_PX
 
 
 def _is_pending(plan: Plan, option: str) -> bool:

@@ -3,9 +3,11 @@
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from schemas.records import FORMAT_VERSION
+from velfield.analysis.changes import find_changes
 from velfield.exports.cog import write_cog
 from velfield.field.comparison import FDR_LEVEL, MIN_COUNT, Change, compare_fields
 from velfield.field.segments import stationary_speed_px_per_s
@@ -55,7 +57,36 @@ def compare_runs(before: Path, after: Path, out: Path, *, min_count: int = MIN_C
     _show_in_the_viewer(changes, before, runs[1])
     return [
         *(_line(name, changes[name], *shown[name]) for name in changes),
-        f"significant: false discovery rate {FDR_LEVEL:.0%}; figures and change.tif in {out}",
+        *_traffic_lines(runs[0], runs[1], out),
+        f"significant: false discovery rate {FDR_LEVEL:.0%}; figures, change.tif and traffic_change.csv in {out}",
+    ]
+
+
+def _traffic_lines(before: Run, after: Run, out: Path) -> list[str]:
+    """Write what differs in shares, flows, travel times, cycles and free-flow speeds; a line on each that does."""
+    changes = find_changes(before.analysis.traffic, after.analysis.traffic)
+    rows = [
+        {
+            "what": c.what,
+            "unit": c.unit,
+            "before": c.before.value,
+            "before_low": c.before.low,
+            "before_high": c.before.high,
+            "before_n": c.before.n,
+            "after": c.after.value,
+            "after_low": c.after.low,
+            "after_high": c.after.high,
+            "after_n": c.after.n,
+            "p_value": c.p_value,
+            "significant": c.significant,
+        }
+        for c in changes
+    ]
+    write_atomically(out / "traffic_change.csv", pd.DataFrame(rows).to_csv(index=False).encode())
+    real = [c for c in changes if c.significant]
+    lines = [f"traffic    {len(real)} of {len(changes)} quantities of junctions and roads changed"]
+    return lines + [
+        f"           {c.what}: {c.before.value:.3g} to {c.after.value:.3g} {c.unit}".rstrip() for c in real[:20]
     ]
 
 

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ValidationError
 from schemas.flight import PRESETS, READ_WITH, FlightConfig, Preset
 from schemas.renames import upgrade_config
 from velfield.errors import IneffectiveSettingWarning, InputError, OldNameWarning
+from velfield.sources.table import read_text
 
 Tree = dict[str, Any]
 
@@ -86,7 +87,7 @@ def _of_methods(preset: Mapping[str, Any], given: Mapping[str, Any]) -> Tree:
 def _read(file: Path) -> Tree:
     if not file.exists():
         raise InputError(f"--config: {file} is not there; give a YAML file, see examples/flight.yaml")
-    tree = _yaml(file.read_text(), str(file)) or {}
+    tree = _yaml(read_text(file, "configuration"), str(file)) or {}
     if not isinstance(tree, dict):
         raise InputError(
             f"{file}: found a {type(tree).__name__}; expected sections with keys, see examples/flight.yaml"
@@ -141,6 +142,9 @@ def _ineffective(config: FlightConfig, given: Tree) -> Iterator[str]:
 def _yaml(text: str, what: str) -> Any:
     try:
         return yaml.safe_load(text)
+    except (RecursionError, ValueError) as error:  # sections within sections without end; a date that is none
+        problem = "sections lie too deep in each other" if isinstance(error, RecursionError) else str(error)
+        raise InputError(f"{what}: this is not YAML that can be read ({problem}); see examples/flight.yaml") from None
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = "" if mark is None or "\n" not in text.strip() else f"line {mark.line + 1}: "

@@ -1,14 +1,16 @@
 """The estimate of a run before it starts: units, task runs, bytes, memory, what is finished already."""
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from velfield.errors import InputError
+from velfield.errors import InputError, is_disk_full
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import committed
 from velfield.pipeline.stage import STAGES, Cut, Stage
 from velfield.pipeline.units import group_name, stage_units, unit_name
-from velfield.run.field_writer import GROUP_TILES
+from velfield.run.field_writer import FIELD_BLOCK, GROUP_TILES
 from velfield.run.layout import is_remote
 
 _FRAME_COMPRESSION = 0.8
@@ -32,7 +34,7 @@ def planned_units(plan: Plan) -> dict[str, list[str]]:
 def _unit_names(plan: Plan, stage: Stage) -> list[str]:
     if stage.cut is not Cut.BY_TILES:
         return [unit.name for unit in stage_units(plan, stage)]
-    side = plan.config.field.tile_size_px * GROUP_TILES
+    side = plan.config.field.tile_size_px * GROUP_TILES * FIELD_BLOCK
     rows, columns = -(-plan.info.height // side), -(-plan.info.width // side)
     return [group_name((row, column)) for row in range(rows) for column in range(columns)]
 
@@ -60,14 +62,35 @@ def check_space(plan: Plan) -> None:
     """
     if is_remote(plan.layout.root):
         return
-    names = [unit_name(frames) for frames in plan.units]
-    undone = sum(committed(plan, "frames", name) is None for name in names)
-    needed, free = int(estimated_bytes(plan) * undone / len(names)), _free_bytes(plan.layout.root)
+    needed, free = _bytes_left(plan), _free_bytes(plan.layout.root)
     if needed > free:
         raise InputError(
             f"{plan.layout.root}: about {needed / 1e9:.2f} GB needed, {free / 1e9:.2f} GB free; "
             "make room, give --out on another disk, or fewer frames with --every or --stop-s"
         )
+
+
+def _bytes_left(plan: Plan) -> int:
+    """Bytes that the units which are not finished will take."""
+    names = [unit_name(frames) for frames in plan.units]
+    undone = sum(committed(plan, "frames", name) is None for name in names)
+    return int(estimated_bytes(plan) * undone / len(names))
+
+
+@contextmanager
+def disk_full_as_input_error(plan: Plan) -> Iterator[None]:
+    """Turn "no space left", wherever it is met, into one line with the path, the bytes needed and those free."""
+    try:
+        yield
+    except OSError as error:
+        if not is_disk_full(error):
+            raise
+        root = plan.layout.root
+        where = "" if error.filename is None else f" at {error.filename}"
+        raise InputError(
+            f"{root}: the disk is full{where} ({error.strerror}): about {_bytes_left(plan) / 1e9:.2f} GB more needed"
+            f"{_free(root)}; make room, and the same command resumes: what is finished is kept"
+        ) from None
 
 
 def describe_plan(plan: Plan, at_a_time: int = 2) -> str:

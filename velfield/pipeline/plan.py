@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from schemas.flight import FlightConfig
 from schemas.job import Inputs, Job
@@ -14,10 +13,12 @@ from schemas.records import FlightRecord, InputsRecord, SourceRecord
 from velfield.errors import InputError
 from velfield.field.time_intervals import TimeInterval, parse_time_intervals
 from velfield.pipeline.stage import stage_keys
-from velfield.run.commits import code_version, content_key, digest_path, write_atomically
+from velfield.run.commits import code_version, content_key, digest_bytes, digest_path, sealed_json, write_atomically
 from velfield.run.flight_record import check_format, read_flight_record
 from velfield.run.layout import RunLayout
+from velfield.sources.clips import clip_files
 from velfield.sources.source import SourceInfo, check_source, probe, select_frames
+from velfield.sources.telemetry.find import find_beside
 
 _MANY_GAPS = 0.3
 """Fraction of frames without a near one before them from which a warning is given."""
@@ -65,7 +66,11 @@ class Plan:
         if self.frame_count <= largest:
             return largest
         units = 2 * -(-self.frame_count // (2 * largest))
-        return -(-self.frame_count // units)
+        even = -(-self.frame_count // units)
+        # Of whole blocks where that leaves no short one: a block that is cut searches one frame more as a whole.
+        blocks = -(-even // self.config.work.block_frames) * self.config.work.block_frames
+        last = self.frame_count - (units - 1) * blocks
+        return blocks if blocks <= largest and 2 * last > blocks else even
 
     @property
     def units(self) -> list[range]:
@@ -130,6 +135,7 @@ def make_plan(job: Job) -> Plan:
         The source cannot be read, has no times, or fewer than three frames are left.
     """
     check_format(Path(job.root))
+    job = _with_telemetry(job)
     _check_optional_inputs(job)  # `probe` checks the source
     timestamps = Path(job.inputs.timestamps) if job.inputs.timestamps else None
     info = probe(Path(job.inputs.source), frames=job.config.frames, timestamps=timestamps)
@@ -144,6 +150,14 @@ def make_plan(job: Job) -> Plan:
     plan = Plan(job=job.anywhere(), info=info, indices=indices, inputs=inputs, keys=stage_keys(job.config, inputs))
     _ = plan.time_intervals  # refuses impossible intervals now, not where the field is built
     return plan
+
+
+def _with_telemetry(job: Job) -> Job:
+    """The job with the subtitle file beside its video, where none is given."""
+    beside = find_beside(Path(job.inputs.source)) if job.inputs.telemetry is None else None
+    if beside is None:
+        return job
+    return job.model_copy(update={"inputs": job.inputs.model_copy(update={"telemetry": str(beside)})})
 
 
 def _gaps(times_s: NDArray[np.float64], max_interval_s: float) -> list[str]:
@@ -171,15 +185,40 @@ def _digest_inputs(job: Job, info: SourceInfo) -> InputsRecord:
     for name in OPTIONAL_INPUTS:
         path = getattr(job.inputs, name)
         digests[name] = digest_path(Path(path)) if path else None
+        described = Path(path).with_suffix(".yaml") if name == "detector" and path else None
+        if described is not None and described != Path(path) and described.is_file():  # beside an ONNX model
+            digests[name] = f"{digests[name]} {digest_path(described)}"
     source = SourceRecord(
         path=job.inputs.source,
         kind=info.kind,
-        digest=digest_path(Path(job.inputs.source)),
+        digest=_digest_source(Path(job.inputs.source), info),
         width=info.width,
         height=info.height,
         frame_count=info.frame_count,
     )
     return InputsRecord(source=source, **digests)
+
+
+def _digest_source(path: Path, info: SourceInfo) -> str:
+    """Digest of a source; of several clips, of theirs: where they lie does not matter."""
+    if not info.parts:
+        return digest_path(path)
+    return digest_bytes(" ".join(map(digest_path, clip_files(path))).encode())
+
+
+def dropped_inputs(plan: Plan) -> list[str]:
+    """A line for each optional input that the last run in this folder was given and this one is not."""
+    try:
+        before = read_flight_record(plan.layout.root).given if plan.layout.flight.exists() else None
+    except InputError:
+        return []
+    instead = {"base": "the base image is built from the flight", "labels": "cars are not labelled"}
+    return [
+        f"--{name} {path} was given to the run before in {plan.layout.root} and is not given now"
+        f"{': ' + instead[name] if name in instead else ''}; give it again to keep those results"
+        for name in OPTIONAL_INPUTS
+        if before is not None and (path := getattr(before, name)) and not getattr(plan.job.inputs, name)
+    ]
 
 
 def changed_since(plan: Plan) -> list[str]:
@@ -188,7 +227,7 @@ def changed_since(plan: Plan) -> list[str]:
         return []
     try:
         old = read_flight_record(plan.layout.root)
-    except (InputError, ValidationError):
+    except InputError:
         return []  # that version's stages have other keys as well: everything is recomputed
     moved = old.inputs.source.model_copy(update={"path": plan.inputs.source.path})
     before = old.inputs.model_copy(update={"source": moved})
@@ -201,4 +240,4 @@ def write_flight_record(plan: Plan) -> None:
     record = FlightRecord(
         code_version=code_version(), config=plan.config, inputs=plan.inputs, given=plan.job.inputs, keys=plan.keys
     )
-    write_atomically(plan.layout.flight, record.model_dump_json(indent=1).encode())
+    write_atomically(plan.layout.flight, sealed_json(record))

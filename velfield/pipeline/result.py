@@ -5,6 +5,9 @@ Progress within a unit: stages publish their steps, subscribers in the same proc
 On a worker of a cluster there is no subscriber, and publishing costs nothing; there progress is shown unit by unit.
 """
 
+import ctypes
+import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,12 +21,25 @@ from velfield.run.commits import code_version, digest_outputs, valid_commit, wri
 Listener = Callable[[str, int], None]
 
 _listeners: list[Listener] = []
+_muted = threading.local()
 
 
 def advance(stage: str, steps: int = 1) -> None:
     """Publish that ``steps`` more steps (frames, mostly) of ``stage`` are done."""
+    if getattr(_muted, "on", False):
+        return
     for listener in tuple(_listeners):
         listener(stage, steps)
+
+
+@contextmanager
+def without_progress() -> Iterator[None]:
+    """Publish no progress from this thread within the context: it works on something else than the run's stages."""
+    _muted.on = True
+    try:
+        yield
+    finally:
+        _muted.on = False
 
 
 @contextmanager
@@ -72,7 +88,16 @@ def commit(plan: Plan, stage: str, unit: str, result: StageResult, *, started: f
         code_version=code_version(),
     )
     write_commit(plan.layout, record)
+    _return_free_memory()
     return record
+
+
+def _return_free_memory() -> None:
+    """Return memory that the unit freed to the system, where the C library is glibc, which would keep most of it: the
+    next unit is of another stage or size, and what each one leaves would add up to more than any of them takes."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim is not None:
+        trim(0)
 
 
 def committed(plan: Plan, stage: str, unit: str) -> CommitRecord | None:

@@ -68,6 +68,8 @@ class Stage:
     prepare : function ``(plan) -> None`` that creates the stage's store before its units fill it.
     store : the store's path in the run folder.
     after : stages that it reads.
+    follows : of those, the ones of which a unit reads the same frames' units alone (and the halo): it need not wait
+        for the others.
     inputs : of the inputs (`schemas.records.InputsRecord`), those that it reads.
     config : of the configuration (`schemas.flight.FlightConfig`), the sections and keys that it reads.
     unread : keys of those sections that it does not read.
@@ -86,6 +88,7 @@ class Stage:
     prepare: str | None = None
     store: str | None = None
     after: tuple[str, ...] = ()
+    follows: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
     config: tuple[str, ...] = ()
     unread: tuple[str, ...] = ()
@@ -115,7 +118,7 @@ STAGES: tuple[Stage, ...] = (
     # Decode, measure and write each frame.
     Stage(
         name="frames",
-        version=2,
+        version=3,
         label="frames",
         lines=(Line("{usable:.0f} of {frames:.0f} frames read"),),
         prepare=f"{_STAGES}.frames:create_frame_store",
@@ -129,7 +132,7 @@ STAGES: tuple[Stage, ...] = (
     # Flag blurred frames and outliers by their neighbours.
     Stage(
         name="quality",
-        version=1,
+        version=2,
         label="frame quality",
         lines=(
             Line("every frame is usable", lambda counts: not counts.get("flagged")),
@@ -145,7 +148,7 @@ STAGES: tuple[Stage, ...] = (
     # Calibrate from edge points and control points of frames spread over the flight.
     Stage(
         name="lens",
-        version=6,
+        version=7,
         label="lens",
         lines=(
             Line("no significant distortion; pinhole model used", lambda counts: not counts.get("corner_px")),
@@ -163,7 +166,7 @@ STAGES: tuple[Stage, ...] = (
     # Key points of spread frames, two passes to their median; or the registration of a given image.
     Stage(
         name="base",
-        version=4,
+        version=6,
         label="base image",
         lines=(
             Line(
@@ -174,7 +177,7 @@ STAGES: tuple[Stage, ...] = (
             Line("base image {width:.0f} x {height:.0f} px from {frames:.0f} frames"),
         ),
         block=f"{_STAGES}.registration:detect_unit_keypoints",
-        block_frames=f"{_STAGES}.base_image:spread_frames",
+        block_frames=f"{_STAGES}.base_image:keypoint_frames",
         unit=f"{_STAGES}.base_image:build_base",
         after=("frames", "lens"),
         inputs=("base", "detections"),
@@ -185,7 +188,7 @@ STAGES: tuple[Stage, ...] = (
     # The chain over the unit's frames.
     Stage(
         name="registration",
-        version=6,
+        version=8,
         label="registration",
         lines=(
             Line("{registered:.0f} of {frames:.0f} frames registered, hold-out registration error {heldout_px:.2f} px"),
@@ -200,6 +203,25 @@ STAGES: tuple[Stage, ...] = (
         cut=Cut.BY_FRAMES,
         new_base=NewBase.SHARED,
     ),
+    # Scale, north and place of the base image: by its own reference system, --gsd-m, control points and telemetry.
+    Stage(
+        name="georeference",
+        version=1,
+        label="georeference",
+        lines=(
+            Line("{gsd_m:.4g} m a pixel by control points", lambda counts: bool(counts.get("by_control_points"))),
+            Line("{gsd_m:.4g} m a pixel by the base image", lambda counts: bool(counts.get("by_base"))),
+            Line("{gsd_m:.4g} m a pixel as given", lambda counts: bool(counts.get("by_given"))),
+            Line("{gsd_m:.4g} m a pixel by the drone's metadata", lambda counts: bool(counts.get("by_metadata"))),
+            Line("no source knows the scale: speeds in px/s, unless --gsd-m is given"),
+        ),
+        unit=f"{_STAGES}.georeference:georeference_run",
+        after=("frames", "base", "registration"),
+        inputs=("telemetry",),
+        config=("gsd_m",),
+        new_base=NewBase.MAPPED,
+        remap=f"{_STAGES}.rebase:rebase_georeference",
+    ),
     # Labels and training, from labelled frames or from what moves; or a given detector.
     Stage(
         name="detector",
@@ -211,7 +233,7 @@ STAGES: tuple[Stage, ...] = (
             Line("{labels:.0f} training labels, score threshold {threshold:.3f}"),
         ),
         unit=f"{_STAGES}.detector:make_detector",
-        after=("registration",),
+        after=("registration", "georeference"),
         inputs=("labels", "detector", "detections"),
         config=("detection", "tracking.max_interval_s"),
         unread=("detection.full_frame_every",),
@@ -220,7 +242,7 @@ STAGES: tuple[Stage, ...] = (
     # Cars of each block, then one table with their crops.
     Stage(
         name="detections",
-        version=9,
+        version=12,
         label="detections",
         lines=(
             Line(
@@ -245,8 +267,9 @@ STAGES: tuple[Stage, ...] = (
         lines=(Line("{tracklets:.0f} tracklets over three frames"),),
         unit=f"{_STAGES}.tracklets:link_unit",
         after=("detections",),
+        follows=("detections",),
         config=("tracking",),
-        unread=("tracking.max_gap_s", "tracking.max_stationary_gap_s"),
+        unread=("tracking.max_gap_s", "tracking.max_stationary_gap_s", "tracking.max_hidden_gap_s"),
         cut=Cut.BY_FRAMES,
         halo=1,
         new_base=NewBase.COUNTS,
@@ -254,24 +277,30 @@ STAGES: tuple[Stage, ...] = (
     # Tracklets of all units that belong to one vehicle.
     Stage(
         name="tracks",
-        version=3,
+        version=6,
         label="tracks",
-        lines=(Line("{tracks:.0f} vehicle tracks from {tracklets:.0f} tracklets"),),
-        unit=f"{_STAGES}.tracklets:chain_tracks",
+        lines=(
+            Line(
+                "{tracks:.0f} vehicle tracks from {tracklets:.0f} tracklets, {recovered:.0f} of them recovered",
+                lambda counts: bool(counts.get("recovered")),
+            ),
+            Line("{tracks:.0f} vehicle tracks from {tracklets:.0f} tracklets"),
+        ),
+        unit=f"{_STAGES}.tracks:chain_tracks",
         after=("tracklets",),
-        config=("tracking.max_gap_s", "tracking.max_stationary_gap_s"),
+        config=("tracking.max_gap_s", "tracking.max_stationary_gap_s", "tracking.max_hidden_gap_s"),
         new_base=NewBase.MAPPED,
         remap=f"{_STAGES}.rebase:rebase_tracks",
     ),
-    # The velocity histogram of a group of tiles, from the segments that reach it.
+    # The velocity histogram of a block of tiles, from the segments that reach it.
     Stage(
         name="field",
         version=3,
         label="field",
         lines=(Line("vehicles passed {pixels:.0f} pixels, 5 or more vehicles {pixels_5:.0f} of them"),),
         prepare=f"{_STAGES}.field:create_field_stores",
-        tiles=f"{_STAGES}.field:field_groups",
-        unit=f"{_STAGES}.field:accumulate_group",
+        tiles=f"{_STAGES}.field:field_blocks",
+        unit=f"{_STAGES}.field:accumulate_block",
         store="field.zarr",
         after=("tracks",),
         config=("field",),
@@ -280,7 +309,7 @@ STAGES: tuple[Stage, ...] = (
     # Figures, layers for GIS, the data of the viewer.
     Stage(
         name="maps",
-        version=4,
+        version=5,
         label="maps",
         lines=(Line("{maps:.0f} maps"),),
         unit=f"{_STAGES}.maps:make_maps",
@@ -303,6 +332,26 @@ def stages_before(name: str) -> list[str]:
     """
     names = list(STAGE)
     return names[: names.index(name)]
+
+
+def stages_awaited(name: str) -> list[str]:
+    """Names of the stages that are done, or lost units, before any unit of a stage is computed, in the order of the
+    work: its key depends on what they lost.
+
+    Examples
+    --------
+    >>> "detections" in stages_awaited("tracklets"), "detections" in stages_awaited("tracks")
+    (False, True)
+    """
+    found: set[str] = set()
+    for before in STAGE[name].after:
+        found |= set(stages_awaited(before) if before in STAGE[name].follows else [before, *_all_read(before)])
+    return [one for one in STAGE if one in found]
+
+
+def _all_read(name: str) -> set[str]:
+    """Names of the stages that a stage reads, and those that they read."""
+    return {one for before in STAGE[name].after for one in {before} | _all_read(before)}
 
 
 def resolve(function: str) -> Callable[..., Any]:

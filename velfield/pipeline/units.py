@@ -49,7 +49,7 @@ def unit_name(frames: range) -> str:
 
 
 def group_name(group: tuple[int, int]) -> str:
-    """Name of a group of tiles, (row, column).
+    """Name of a unit of tiles, (row, column).
 
     Examples
     --------

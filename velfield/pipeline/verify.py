@@ -8,10 +8,12 @@ from itertools import chain
 from pathlib import Path
 
 from schemas.records import CommitRecord, FlightRecord
+from velfield.errors import InputError
 from velfield.pipeline.stage import STAGE, STAGES, Cut
 from velfield.pipeline.units import WHOLE
-from velfield.run.commits import commit_path, digest_file, read_commits
+from velfield.run.commits import PAGE, commit_path, digest_file, read_commit, read_commits
 from velfield.run.layout import RunLayout, remove_tree
+from velfield.run.results import read_results
 
 _THREADS = min(4, os.cpu_count() or 1)
 NOT_FINISHED = "not finished"
@@ -37,11 +39,30 @@ def verify_run(layout: RunLayout, record: FlightRecord) -> list[Damage]:
     """Read all that is committed and compare it with its digests; units that were never finished are listed too."""
     stages = [stage.name for stage in STAGES if not record.keys or stage.name in record.keys]  # format 1 had fewer
     by_stage = {stage: read_commits(layout, stage) for stage in stages}
-    found = list(_unfinished(by_stage)) + list(_other_keys(by_stage, record))
+    pages = read_commits(layout, PAGE)  # of no earlier version
+    found = [damage for stage in (*stages, PAGE) for damage in _damaged_records(layout, stage)]
+    damaged = {(damage.stage, damage.unit) for damage in found}
+    found += [damage for damage in _unfinished(by_stage) if (damage.stage, damage.unit) not in damaged]
+    found += _other_keys(by_stage, record)
     with ThreadPoolExecutor(_THREADS) as pool:
-        checked = pool.map(lambda unit: _check(layout, unit), chain.from_iterable(by_stage.values()))
+        checked = pool.map(lambda unit: _check(layout, unit), [*chain.from_iterable(by_stage.values()), *pages])
         found += chain.from_iterable(checked)
-    return found
+    return found + _damaged_index(layout)
+
+
+def _damaged_records(layout: RunLayout, stage: str) -> Iterator[Damage]:
+    """Commit records that are there and cannot be read."""
+    for path in sorted((layout.commits / layout.stored_name(stage)).glob("*.json")):
+        if read_commit(layout, stage, path.stem) is None:
+            yield Damage(stage, path.stem, path.relative_to(layout.root).as_posix(), "damaged")
+
+
+def _damaged_index(layout: RunLayout) -> list[Damage]:
+    try:
+        read_results(layout)
+    except InputError:
+        return [Damage("results", layout.results_index.stem, layout.results_index.name, "damaged")]
+    return []
 
 
 def _check(layout: RunLayout, record: CommitRecord) -> list[Damage]:
@@ -81,8 +102,11 @@ def invalidate(layout: RunLayout, damages: Iterable[Damage]) -> list[str]:
 
     A store whose metadata is damaged cannot be opened: it is removed, with the records of all of its units.
     """
-    units = {(damage.stage, damage.unit) for damage in damages}
-    for stage in {damage.stage for damage in damages if (damage.path or "").endswith("zarr.json")}:
+    damages = list(damages)
+    units = {(damage.stage, damage.unit) for damage in damages if damage.stage in (*STAGE, PAGE)}
+    if any((layout.root / (damage.path or "")).is_relative_to(layout.view_changes) for damage in damages):
+        remove_tree(layout.view_changes)  # `velfield compare` writes it again
+    for stage in {damage.stage for damage in damages if (damage.path or "").endswith("zarr.json")} & set(STAGE):
         units |= {(stage, record.unit) for record in read_commits(layout, stage)}
         remove_tree(layout.root / str(STAGE[stage].store))
     for stage, unit in units:

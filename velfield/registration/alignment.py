@@ -308,10 +308,11 @@ def _step_inside(image, start, derivative, shift, spacing, centred, gx, gy, sums
         y = start[1] + derivative[1, 0] * ox + derivative[1, 1] * oy
         for c in range(side):
             px, py = x + derivative[0, 0] * (c * spacing), y + derivative[1, 0] * (c * spacing)
-            j, k = int(px), int(py)
-            fx, fy = np.float32(px - j), np.float32(py - k)
-            top = image[k, j] + fx * (image[k, j + 1] - image[k, j])
-            bottom = image[k + 1, j] + fx * (image[k + 1, j + 1] - image[k + 1, j])
+            fx, fy = np.float32(px - int(px)), np.float32(py - int(py))
+            j, k = np.uint64(int(px)), np.uint64(int(py))  # unsigned: numba checks no index for its sign
+            after, below = j + np.uint64(1), k + np.uint64(1)
+            top = image[k, j] + fx * (image[k, after] - image[k, j])
+            bottom = image[below, j] + fx * (image[below, after] - image[below, j])
             value = float(top + fy * (bottom - top))
             total += value
             total_square += value * value

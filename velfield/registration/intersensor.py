@@ -30,6 +30,7 @@ from velfield.registration.fitting import Model
 from velfield.registration.modality import GRADIENT, MODALITIES, Modality
 from velfield.registration.transforms import FrameTransform
 
+MIRRORED = "found a mirrored image"
 _CERTAIN_FRACTION = 0.5
 """With a smaller fraction of consistent patches, the flipped base image must not match too."""
 MIN_CONSISTENT_FRACTION = 0.25
@@ -152,7 +153,7 @@ def _explain_failure(pair: ImagePair, scores: list[str]) -> str:
     """What was found, what to do, and the scores."""
     flipped = estimate_sift_homography(pair.image, pair.base, pair.lens, scale=pair.config.coarse_scale, mirrored=True)
     if flipped.matrix is not None:
-        return f"found a mirrored image ({flipped.inliers} of {flipped.matches} SIFT matches are inliers); flip it"
+        return f"{MIRRORED} ({flipped.inliers} of {flipped.matches} SIFT matches are inliers); flip it"
     needed = (
         f"{pair.config.min_control_points} control points and {MIN_CONSISTENT_FRACTION:.0%} of verification patches "
         "needed"

@@ -30,7 +30,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
+from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
@@ -52,7 +52,7 @@ from velfield.registration.keypoints import (
     fit_homography,
     match_guided,
 )
-from velfield.registration.mesh import MESH_ITERATIONS, fit_robust_mesh
+from velfield.registration.mesh import MESH_ITERATIONS, fit_robust_mesh, measure_support
 from velfield.registration.transforms import (
     FrameTransform,
     HomographyTransform,
@@ -124,6 +124,7 @@ class FrameRegistration:
     residual_px, heldout_px : RMS residual of the inliers, fitted and cross-validated; NaN if failed.
     coverage : fraction of the frame's cells with inliers.
     error_map : (6, 8) RMS cross-validated residual of the inliers per cell, base px; NaN where there are none.
+    position_sd_px : (24, 32) standard deviation of the map by cell, base px; NaN where no control points support it.
     control_points : the inliers.
     stiffness : selected for the row shift and for the roll.
     """
@@ -137,6 +138,7 @@ class FrameRegistration:
     heldout_px: float = float("nan")
     coverage: float = 0.0
     error_map: FloatArray | None = None
+    position_sd_px: Float32Array | None = None
     control_points: ControlPoints | None = None
     stiffness: tuple[float, float] | None = None
 
@@ -558,6 +560,7 @@ class _FrameFitter:
             reason = f"held-out residual {heldout_px:.2f} px, at most {self.config.max_residual_px:g} allowed"
             return FrameRegistration(None, f"failed:{reason}", *counts)
         coverage = float(np.isfinite(error_map).mean())
+        support = measure_support(points.xy_raw[inliers], cv_residuals[inliers], width=width, height=height)
         return FrameRegistration(
             transform,
             "ok",
@@ -566,6 +569,7 @@ class _FrameFitter:
             heldout_px,
             coverage,
             error_map,
+            support.sd_px,
             points.select(inliers),
             fit.stiffness,
         )

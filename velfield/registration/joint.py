@@ -361,6 +361,11 @@ def is_inlier(weights: FloatArray) -> Mask:
     return np.asarray(weights >= _INLIER_WEIGHT)
 
 
+def robust_scale(residuals: FloatArray, sigma: FloatArray) -> float:
+    """Robust standard deviation per coordinate of residuals (n, 2) over sigma (n,), by their median."""
+    return max(float(np.median(np.linalg.norm(residuals, axis=1) / sigma)) / 1.1774, _MIN_SIGMA_PX)
+
+
 def robust_weights(residuals: FloatArray, sigma: FloatArray, scale: float) -> FloatArray:
     """Robust weights (n,) of residuals (n, 2), as at the end of the joint fit.
 

@@ -14,6 +14,7 @@ from schemas.arrays import FloatArray, GreyImage, Mask
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import HarrisLens, Lens, pinhole
 from velfield.camera.multiview import FramePairs
+from velfield.parallel import parallel_map
 from velfield.registration.keypoints import Keypoints, Pairs, detect_keypoints, match_descriptors
 
 _MAX_IMAGE_PX = 250_000
@@ -39,7 +40,7 @@ def match_frame_pairs(frames: Sequence[GreyImage], lens: Lens) -> FramePairs | N
         The lens estimated so far; inliers are matches near a homography of the points it undistorts.
     """
     shape = (frames[0].shape[0], frames[0].shape[1])
-    keypoints = [_detect(frame) for frame in frames]
+    keypoints = parallel_map(_detect, frames)
     undistorted = [lens.undistort_points(detected.xy) for detected in keypoints]
 
     def match(i: int, j: int, count: int) -> tuple[Pairs, float]:

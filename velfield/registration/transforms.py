@@ -229,19 +229,31 @@ class FrameTransform:
         NaN rows where there is no inverse, or where it lies outside the frame by more than a tenth of its size and
         more than 64 px.
         """
-        target = as_points(xy_base)
-        raw = as_points(self.lens.distort_points(self.polyprojective.inverse(target)))
+        target, raw = as_points(xy_base), self.to_raw_roughly(xy_base)
         todo = np.flatnonzero(np.isfinite(raw).all(axis=1))
+        error = np.full(len(raw), np.nan)
         for _ in range(_INVERSE_STEPS):
-            residual = target[todo] - self.to_base(raw[todo])
-            size = np.abs(residual).max(axis=1, initial=0.0)
-            todo, residual = todo[size > _INVERSE_TOLERANCE_PX], residual[size > _INVERSE_TOLERANCE_PX]
+            mapped = self.to_base(raw[todo])
+            residual = target[todo] - mapped
+            error[todo] = np.maximum(np.abs(residual[:, 0]), np.abs(residual[:, 1]))
+            far = error[todo] > _INVERSE_TOLERANCE_PX
+            todo, residual, mapped = todo[far], residual[far], mapped[far]
             if not todo.size:
                 break
-            raw[todo] += _solve_2x2(self.jacobian(raw[todo]), residual)
-        failed = ~(np.abs(target - self.to_base(raw)).max(axis=1, initial=0.0) < 1e-3)
-        raw[failed | self._far_outside(raw)] = np.nan
+            raw[todo] += _solve_2x2(self._slopes(raw[todo], mapped), residual)
+        if todo.size:
+            error[todo] = np.abs(target[todo] - self.to_base(raw[todo])).max(axis=1)
+        raw[~(error < 1e-3) | self._far_outside(raw)] = np.nan
         return raw
+
+    def to_raw_roughly(self, xy_base: FloatArray) -> FloatArray:
+        """The inverse without row motion and mesh, so wrong by these; NaN rows where there is none."""
+        return as_points(self.lens.distort_points(self.polyprojective.inverse(as_points(xy_base))))
+
+    def _slopes(self, raw: FloatArray, mapped: FloatArray) -> FloatArray:
+        """Jacobian by differences from what is mapped already: half as many points to map as `jacobian`."""
+        steps = [self.to_base(raw + _DIFFERENCE_PX * unit) - mapped for unit in np.eye(2)]
+        return np.stack(steps, axis=2) / _DIFFERENCE_PX
 
     def _far_outside(self, raw: FloatArray) -> Mask:
         margin = max(_OUTSIDE_PX, _OUTSIDE_FRACTION * max(self.width, self.height))
@@ -265,7 +277,7 @@ class FrameTransform:
         cosine, sine = jacobian[0, 0] + jacobian[1, 1], jacobian[1, 0] - jacobian[0, 1]
         return float(0.5 * np.hypot(cosine, sine)), float(np.arctan2(sine, cosine))
 
-    def then(self, transform: PolyprojectiveTransform) -> "ComposedTransform":
+    def then(self, transform: "PlaneTransform") -> "ComposedTransform":
         """This map followed by another: from the flight's own base image to a given one."""
         return ComposedTransform(self, transform)
 
@@ -308,11 +320,58 @@ class FrameTransform:
 
 
 @dataclass(frozen=True, eq=False)
+class MeshedTransform:
+    """A polyprojective plus a displacement mesh, from one base image to another.
+
+    Parameters
+    ----------
+    polyprojective
+        Px of the one image to px of the other.
+    mesh
+        (my, mx, 2) displacement at the cell centres of the first image, px of the second.
+    cell_size_px
+        Side of a cell, px of the first image.
+    """
+
+    polyprojective: PolyprojectiveTransform
+    mesh: FloatArray
+    cell_size_px: int
+
+    def __call__(self, xy: FloatArray) -> FloatArray:
+        """Map points (n, 2)."""
+        points = as_points(xy)
+        return np.asarray(self.polyprojective(points) + kernels.mesh_displacement(points, self.mesh, self.cell_size_px))
+
+    def jacobian(self, xy: FloatArray) -> FloatArray:
+        """Jacobian (n, 2, 2) at points (n, 2)."""
+        points, columns = as_points(xy), []
+        for step in np.eye(2):
+            columns.append((self(points + step) - self(points - step)) / 2.0)
+        return np.stack(columns, axis=2)
+
+    def inverse(self, xy: FloatArray) -> FloatArray:
+        """Map points (n, 2) back; the mesh bends by far less than a pixel a pixel, so that a few steps settle."""
+        target = as_points(xy)
+        guess = self.polyprojective.inverse(target)
+        for _ in range(_INVERSE_STEPS):
+            residual = target - self(guess)
+            if np.nanmax(np.abs(residual), initial=0.0) < _INVERSE_TOLERANCE_PX:
+                break
+            guess = guess + _solve_2x2(self.polyprojective.jacobian(guess), residual)
+        guess[~(np.abs(target - self(guess)).max(axis=1, initial=0.0) < 1e-3)] = np.nan
+        return guess
+
+
+PlaneTransform = PolyprojectiveTransform | MeshedTransform
+"""From one base image to another."""
+
+
+@dataclass(frozen=True, eq=False)
 class ComposedTransform:
-    """A frame's map followed by a polyprojective transform of the base plane."""
+    """A frame's map followed by a transform of the base plane."""
 
     first: "FrameTransform | ComposedTransform"
-    second: PolyprojectiveTransform
+    second: PlaneTransform
 
     @property
     def width(self) -> int:
@@ -332,7 +391,7 @@ class ComposedTransform:
         """Base pixels (n, 2) to raw pixels (n, 2); NaN rows where there is no inverse."""
         return self.first.to_raw(self.second.inverse(xy_base))
 
-    def then(self, transform: PolyprojectiveTransform) -> "ComposedTransform":
+    def then(self, transform: PlaneTransform) -> "ComposedTransform":
         """This map followed by another: from one base image to the next."""
         return ComposedTransform(self, transform)
 

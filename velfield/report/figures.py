@@ -173,9 +173,9 @@ def blend_over_image(grey: GreyImage, values: NDArray[np.floating], colours: RGB
 
 def _blend(grey: GreyImage, colours: RGBImage, known: Mask) -> RGBImage:
     """Blend colours over the dimmed image where known, modulated by it so that kerbs and lanes stay visible."""
-    base = np.repeat((grey.astype(np.float32) * _DIMMED)[..., None], 3, axis=2)
-    tinted = colours * (_COVER + (1 - _COVER) * grey[..., None].astype(np.float32) / 255)
-    return np.where(known[..., None], tinted, base).astype(np.uint8)
+    image = np.repeat((grey.astype(np.float32) * _DIMMED).astype(np.uint8)[..., None], 3, axis=2)
+    image[known] = colours[known] * (_COVER + (1 - _COVER) * grey[known][:, None].astype(np.float32) / 255)
+    return image
 
 
 def _same_shape(grey: GreyImage, values: NDArray[np.floating]) -> None:

@@ -15,14 +15,17 @@ _LINE_RGB = (255, 176, 32)
 _SIDE_PX = 900
 """Largest width of a frame in a figure."""
 _COVER = 0.55
+_BAND_ROWS = 128
 _LEGEND_PX = 32
 
 
 def undistortion_figure(grey: GreyImage, lens: Lens) -> RGBImage:
     """A raw frame (h, w) and the same undistorted, side by side, with a grid that is straight on the ground."""
     height, width = grey.shape
-    y, x = np.mgrid[0:height, 0:width].astype(np.float64)
-    raw = lens.distort_points(np.column_stack([x.ravel(), y.ravel()])).astype(np.float32).reshape(height, width, 2)
+    raw = np.empty((height, width, 2), np.float32)
+    for top in range(0, height, _BAND_ROWS):  # all points at once would take half a gigabyte
+        y, x = np.mgrid[top : min(top + _BAND_ROWS, height), 0:width].astype(np.float64)
+        raw[top : top + len(y)] = lens.distort_points(np.column_stack([x.ravel(), y.ravel()])).reshape(*y.shape, 2)
     after = cv2.remap(grey, raw[..., 0], raw[..., 1], cv2.INTER_LINEAR)
     straight = _straight_lines(width, height)
     distorted = [lens.distort_points(line) for line in straight]

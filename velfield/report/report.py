@@ -39,7 +39,7 @@ def render_report(report: Report, figures: Sequence[ReportFigure]) -> str:
         '<meta name="referrer" content="no-referrer">\n<link rel="icon" href="data:,">\n'
         f"<title>{escape(report.title)}</title>\n<style>{style}</style>\n</head>\n<body>\n"
         f"<header><h1>{escape(report.title)}</h1><p>{escape(report.source)}</p></header>\n"
-        f"{render_sections(report, figures)}\n</body>\n</html>\n"
+        f"<main>\n{render_sections(report, figures)}\n</main>\n</body>\n</html>\n"
     )
 
 
@@ -67,15 +67,20 @@ def render_sections(report: Report, figures: Sequence[ReportFigure]) -> str:
         _files(report.files),
     ]
     return (
-        "<main>\n"
+        '<div class="sections">\n'
         + "\n".join(section for section in sections if section)
-        + f"\n</main>\n<footer>velfield {escape(report.version)}, {escape(report.created)}</footer>"
+        + f"\n</div>\n<footer>velfield {escape(report.version)}, {escape(report.created)}</footer>"
     )
 
 
 def _section(title: str, body: str, kind: str = "") -> str:
     attribute = f' class="{kind}"' if kind else ""
     return f"<section{attribute}><h2>{escape(title)}</h2>{body}</section>"
+
+
+def _scrolled(name: str, table: str, kind: str = " narrow") -> str:
+    """A table that scrolls sideways where the screen is narrow, by keyboard too."""
+    return f'<div class="scroll{kind}" tabindex="0" role="group" aria-label="{escape(name)}">{table}</div>'
 
 
 def _items(texts: Iterable[str]) -> str:
@@ -121,7 +126,7 @@ def _stages(stages: Sequence[ReportStage]) -> str:
     total = sum(stage.seconds for stage in stages)
     head = _head("Stage", "Result", number="Seconds of work")
     foot = f'<tfoot><tr><th scope="row">all</th><td></td><td class="number">{total:.1f}</td></tr></tfoot>'
-    return _section("Stages", f'<div class="scroll"><table>{head}<tbody>{rows}</tbody>{foot}</table></div>')
+    return _section("Stages", _scrolled("Stages", f"<table>{head}<tbody>{rows}</tbody>{foot}</table>", ""))
 
 
 def _head(*names: str, number: str) -> str:
@@ -154,7 +159,7 @@ def _gates(gates: dict[str, int]) -> str:
         return ""
     kept = _table(["Candidates", "Number"], totals_table(gates), numbers=1)
     lost = _table(["Rejected", "Reason", "Number", "Fraction"], rejection_table(gates), numbers=2)
-    return _section("Tracking", f'<div class="scroll narrow">{kept}</div><div class="scroll narrow">{lost}</div>')
+    return _section("Tracking", _scrolled("Candidates", kept) + _scrolled("Rejected", lost))
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: int) -> str:
@@ -181,7 +186,7 @@ def _pairs(title: str, pairs: Sequence[tuple[str, str]]) -> str:
     if not pairs:
         return ""
     rows = "".join(f'<tr><th scope="row">{escape(a)}</th><td>{escape(b)}</td></tr>' for a, b in pairs)
-    return _section(title, f'<div class="scroll narrow"><table><tbody>{rows}</tbody></table></div>')
+    return _section(title, _scrolled(title, f"<table><tbody>{rows}</tbody></table>"))
 
 
 def _files(listed: Sequence[tuple[str, str]]) -> str:

@@ -1,4 +1,4 @@
-"""The pages with scripts, a run's viewer and the annotator: each one HTML file with its script and style inside.
+"""The pages with scripts, a run's viewer and those that write: each one HTML file with its script and style inside.
 
 The scripts are built from ``page/`` in the repository (`make page`) into ``velfield/report/page/``, which the wheel
 includes.
@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from html import escape
 from importlib.resources import files
+from typing import Literal
 
 import numpy as np
 
@@ -43,9 +44,9 @@ def render_viewer(report: Report, figures: Sequence[ReportFigure]) -> str:
     )
 
 
-def render_annotator(title: str, content: Mapping[str, object]) -> str:
-    """The page for labelling cars; ``content`` is its server's data."""
-    return _page("annotate", {"title": escape(title), "data": _json(content)})
+def render_editor(name: Literal["annotate", "georeference"], title: str, content: Mapping[str, object]) -> str:
+    """The page for labelling cars, or for marking control points; ``content`` is its server's data."""
+    return _page(name, {"title": escape(title), "data": _json(content)})
 
 
 def _page(name: str, parts: Mapping[str, str]) -> str:

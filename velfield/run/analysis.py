@@ -14,8 +14,12 @@ from schemas.flight import PAPER_GSD_M, FieldConfig
 from schemas.records import GridRecord
 from velfield.analysis.bottlenecks import find_bottlenecks
 from velfield.analysis.carriageways import find_carriageways
+from velfield.analysis.lanes.find import MIN_TRACKS, find_lanes
+from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.regions import Regions
 from velfield.analysis.stops import find_stops
+from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.analysis.trajectories import Trajectories, from_tracklets, moving
 from velfield.analysis.u_turns import find_u_turns
 from velfield.field.segments import Segments, stationary_speed_px_per_s
 from velfield.field.statistics import direction_rad
@@ -35,14 +39,37 @@ class RunAnalysis:
         Returns a (y, x) layer of ``field.zarr`` by its name.
     segments
         Returns the segment table of the run.
+    tracklets
+        Returns the tracklets of the run, with their tracks.
     grid, config
         Base pixels and configuration of the field.
     """
 
     layer: Callable[[str], NDArray[np.generic]]
     segments: Callable[[], Segments]
+    tracklets: Callable[[], pd.DataFrame]
     grid: GridRecord
     config: FieldConfig
+
+    @cached_property
+    def trajectories(self) -> Trajectories:
+        """Tracks of vehicles that move, in metres."""
+        return moving(from_tracklets(self.tracklets(), self.gsd_m))
+
+    @cached_property
+    def traffic(self) -> TrafficAnalysis:
+        """Answers about lanes, movements, speeds, signals, flow and conflicts: what `velfield analyse` writes."""
+        return TrafficAnalysis(self.trajectories)
+
+    def lanes(self, *, min_tracks: int = MIN_TRACKS) -> LaneGraph:
+        """Lanes, their connections and junctions: `find_lanes`.
+
+        Parameters
+        ----------
+        min_tracks
+            Fewest tracks of a lane and of a connection.
+        """
+        return self.traffic.lanes if min_tracks == MIN_TRACKS else find_lanes(self.trajectories, min_tracks=min_tracks)
 
     def carriageways(self, *, min_count: int = 3, min_area_m2: float = 10.0) -> Regions:
         """Connected pixels of one direction of travel: `find_carriageways`.
@@ -115,7 +142,7 @@ class RunAnalysis:
             self._float_layer("speed_p50"),
             self._direction_rad,
             self._count,
-            distance_px=distance_m / self._gsd_m,
+            distance_px=distance_m / self.gsd_m,
             max_ratio=max_ratio,
             min_count=min_count,
             min_area_px=self._area_px(min_area_m2),
@@ -134,7 +161,7 @@ class RunAnalysis:
         return find_u_turns(
             self.segments(),
             stationary_speed_px_per_s=stationary_speed_px_per_s(self.config, self.grid.gsd_m),
-            max_path_px=max_path_m / self._gsd_m,
+            max_path_px=max_path_m / self.gsd_m,
             min_turn_rad=radians(min_turn_deg),
         )
 
@@ -149,11 +176,12 @@ class RunAnalysis:
         return np.asarray(self.layer("count"), np.int32)
 
     @property
-    def _gsd_m(self) -> float:
+    def gsd_m(self) -> float:
+        """Metres a base pixel; the paper's where it is unknown."""
         return self.grid.gsd_m or PAPER_GSD_M
 
     def _area_px(self, area_m2: float) -> int:
-        return max(1, round(area_m2 / self._gsd_m**2))
+        return max(1, round(area_m2 / self.gsd_m**2))
 
     def _float_layer(self, name: str) -> FloatArray:
         return np.asarray(self.layer(name), np.float64)

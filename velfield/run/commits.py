@@ -11,17 +11,21 @@ import os
 from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from pydantic import BaseModel, ValidationError
 
-from schemas.records import FORMAT_VERSION, CommitRecord
+from schemas.records import FORMAT_VERSION, CommitRecord, SealedRecord
 from schemas.renames import upgrade_record
 from velfield.run.layout import RunLayout, is_remote
 
 _WHOLE_FILE_BYTES = 256 * 2**20
 _SAMPLE_BYTES = 2**20
 _SAMPLES = 64
+_DIGEST = "digest"
+"""Key of a record of which the digest of all others is the value."""
+PAGE, PAGE_UNIT = "page", "all"
+"""Name of the commit record of the page, which is no stage."""
 
 
 def code_version() -> str:
@@ -98,6 +102,40 @@ def write_atomically(path: Path, data: bytes) -> None:
     partial.replace(path)
 
 
+def sealed_json(record: SealedRecord) -> bytes:
+    """A record as JSON with a digest of its own content, by which `read_sealed` knows a damaged one."""
+    content = json.loads(record.model_dump_json())
+    content[_DIGEST] = _digest_content(content)
+    return json.dumps(content, indent=1).encode()
+
+
+def read_sealed(data: bytes) -> dict[str, Any]:
+    """The content of a record as `sealed_json` wrote it; of one without a digest, which earlier versions wrote, as is.
+
+    Raises
+    ------
+    ValueError
+        It is not JSON, not an object, or not what was written.
+
+    Examples
+    --------
+    >>> read_sealed(b'{"stage": "lens"}')
+    {'stage': 'lens'}
+    """
+    content = json.loads(data)
+    if not isinstance(content, dict):
+        raise ValueError("not an object")
+    found = content.pop(_DIGEST, None)
+    if found is not None and found != _digest_content(content):
+        raise ValueError("it is not what was written")
+    return content
+
+
+def _digest_content(content: dict[str, Any]) -> str:
+    kept = {key: value for key, value in content.items() if key != _DIGEST}
+    return digest_bytes(json.dumps(kept, sort_keys=True).encode())
+
+
 def sweep_partial(root: Path) -> int:
     """Remove ``.partial`` files of a killed run; returns how many. On S3 there are none."""
     if is_remote(root):
@@ -115,15 +153,25 @@ def commit_path(layout: RunLayout, stage: str, unit: str) -> Path:
 
 def write_commit(layout: RunLayout, record: CommitRecord) -> None:
     """Record that a unit is finished, after its outputs are written."""
-    write_atomically(commit_path(layout, record.stage, record.unit), record.model_dump_json(indent=1).encode())
+    write_atomically(commit_path(layout, record.stage, record.unit), sealed_json(record))
+
+
+def record_page(layout: RunLayout) -> None:
+    """Record the files of the page and of its report, so that `velfield verify` knows them; written by every run."""
+    view = [path for path in layout.view.glob("*") if path.suffix in (".json", ".jpg", ".txt")]
+    if layout.view_changes.exists():
+        view += [path for path in layout.view_changes.rglob("*") if path.is_file()]
+    outputs = digest_outputs(layout, sorted([layout.report, *view]))
+    record = CommitRecord(stage=PAGE, unit=PAGE_UNIT, key="", outputs=outputs, code_version=code_version())
+    write_commit(layout, record)
 
 
 def read_commit(layout: RunLayout, stage: str, unit: str) -> CommitRecord | None:
-    """The record of a unit; None where there is none or it cannot be read."""
+    """The record of a unit; None where there is none or it is damaged."""
     path = commit_path(layout, stage, unit)
     try:
-        record = CommitRecord.model_validate_json(path.read_bytes())
-    except (FileNotFoundError, ValidationError):
+        record = CommitRecord.model_validate_json(json.dumps(read_sealed(path.read_bytes())))
+    except (FileNotFoundError, ValidationError, ValueError):
         return None
     if layout.format_version == FORMAT_VERSION:
         return record

@@ -155,5 +155,5 @@ def _write_group(writer: GroupWriter, kinds: Sequence[Sequence[TileReader]], com
     for row, column in writer.tiles():
         tile, *timed = (combine([read(row, column) for read in readers]) for readers in kinds)
         if tile is not None:
-            writer.put(row, column, tile, timed[0].histogram if timed and timed[0] else None)
+            writer.put(row, column, tile, timed[0] if timed else None)
     writer.close()

@@ -8,14 +8,14 @@ import numpy as np
 
 from schemas.flight import FieldConfig
 from schemas.records import GridRecord
-from velfield.errors import InputError
+from velfield.errors import InputError, StoreError
 from velfield.field.accumulate import FieldTile
 from velfield.field.segments import VelocityBins, stationary_speed_px_per_s
 from velfield.field.view import Tile, VelocityField
 from velfield.run.flight_record import read_flight_record
 from velfield.run.frame_transforms import read_grid
 from velfield.run.layout import RunLayout
-from velfield.run.stores import HISTOGRAM, HISTOGRAM_TIME_WEIGHTED, FieldStore, StoreError, open_field
+from velfield.run.stores import HISTOGRAM, HISTOGRAM_TIME_WEIGHTED, FieldStore, open_field
 
 TileReader = Callable[[int, int], FieldTile | None]
 """Returns the tile (row, column); None where no vehicle passed."""

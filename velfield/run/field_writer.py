@@ -4,7 +4,9 @@ The (y, x) layers beside the histogram in ``field.zarr``: computed with the tile
 read the histogram.
 """
 
+from collections import deque
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -80,10 +82,17 @@ def tile_layers(tile: FieldTile, bins: VelocityBins, config: FieldConfig) -> dic
 
 
 GROUP_TILES = 8
-"""Side of a group in tiles, 512 px: a unit of work and a chunk of the layers."""
+"""Side of a group in tiles, 512 px: a chunk of the layers."""
+FIELD_BLOCK = 2
+"""Side of a unit of work in groups: each reads the tables of tracks once, and costs a task of its own."""
 
 Group = tuple[int, int]
 """(row, column)."""
+
+_WRITES_AT_ONCE = 2
+"""Histograms of a group that are compressed and written while the next one is computed, 22 MB each, nearly all zeros:
+a quarter of the time went into clearing new ones, so those that were written are used again."""
+_writers = ThreadPoolExecutor(2 * _WRITES_AT_ONCE, thread_name_prefix="tiles")
 
 
 def tile_groups(grid: GridRecord, config: FieldConfig) -> list[Group]:
@@ -104,6 +113,8 @@ class GroupWriter:
         self.y0, self.x0 = group[0] * self.side, group[1] * self.side
         self.height, self.width = min(self.side, grid.height_px - self.y0), min(self.side, grid.width_px - self.x0)
         self.touched: list[tuple[int, int]] = []
+        self._writes: deque[Future[NDArray[np.int32]]] = deque()
+        self._zeros: list[NDArray[np.int32]] = []
         self.layers: dict[str, NDArray[Any]] = {
             name: np.full((self.height, self.width), _fill(attrs), attrs.get("dtype", "float32"))
             for name, attrs in LAYERS.items()
@@ -126,22 +137,47 @@ class GroupWriter:
         size = self.config.tile_size_px
         return min(size, self.y0 + self.height - y), min(size, self.x0 + self.width - x)
 
-    def put(self, row: int, column: int, tile: FieldTile, time_weighted: NDArray[np.int32] | None = None) -> None:
-        """Write one tile, with its time-weighted histogram if any; skip a tile that no vehicle passed."""
+    def zeros(self, row: int, column: int) -> NDArray[np.int32]:
+        """A histogram of zeros for a tile, (ty, tx, nvy, nvx), which `put` takes back once it is written."""
+        shape = (*self.tile_shape(row, column), self.bins.n, self.bins.n)
+        for k, histogram in enumerate(self._zeros):
+            if histogram.shape == shape:
+                return self._zeros.pop(k)
+        return np.zeros(shape, np.int32)
+
+    def put(self, row: int, column: int, tile: FieldTile, time_weighted: FieldTile | None = None) -> None:
+        """Write one tile, with the histogram weighted by time if any; skip a tile that no vehicle passed.
+
+        The histograms belong to the writer from now on.
+        """
+        histograms = [(HISTOGRAM, tile)] + ([] if time_weighted is None else [(HISTOGRAM_TIME_WEIGHTED, time_weighted)])
         if not tile.count.any():
+            self._zeros += [one.histogram for _, one in histograms]
             return
-        self.store.write_tile(row, column, tile.histogram)
-        if time_weighted is not None:
-            self.store.write_tile(row, column, time_weighted, HISTOGRAM_TIME_WEIGHTED)
         self.touched.append((row, column))
         x, y = self.origin_xy(row, column)
         height, width = tile.count.shape
         window = np.s_[y - self.y0 : y - self.y0 + height, x - self.x0 : x - self.x0 + width]
         for name, values in tile_layers(tile, self.bins, self.config).items():
             self.layers[name][window] = values
+        for name, one in histograms:
+            if len(self._writes) == _WRITES_AT_ONCE:
+                self._zeros.append(self._writes.popleft().result())
+            self._writes.append(_writers.submit(self._write, row, column, one, name))
+
+    def _write(self, row: int, column: int, tile: FieldTile, name: str) -> NDArray[np.int32]:
+        """Write a histogram, then fill it with zeros."""
+        passed = tile.count > 0
+        if tile.histogram[passed].any():  # weights of milliseconds may all be zero
+            self.store.write_tile(row, column, tile.histogram, name)
+            tile.histogram[passed] = 0
+        return tile.histogram
 
     def close(self) -> None:
-        """Write the layers."""
+        """Wait for the tiles, and write the layers."""
+        while self._writes:
+            self._writes.popleft().result()
+        self._zeros.clear()
         for name, values in self.layers.items():
             self.store.write_layer(name, self.y0, self.x0, values)
 

@@ -4,9 +4,12 @@ import json
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from schemas.records import FORMAT_VERSION, READABLE_FORMATS, FlightRecord
 from schemas.renames import OLD_FOLDERS, upgrade_config
 from velfield.errors import InputError
+from velfield.run.commits import read_sealed
 from velfield.run.layout import RunLayout
 
 
@@ -35,7 +38,14 @@ def read_flight_record(root: Path) -> FlightRecord:
         stages = {old: stage for stage, old in OLD_FOLDERS.items()}
         record["config"], _ = upgrade_config(record["config"])
         record["keys"] = {stages.get(name, name): key for name, key in record.get("keys", {}).items()}
-    return FlightRecord.model_validate_json(json.dumps(record))
+    try:
+        return FlightRecord.model_validate_json(json.dumps(record))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(
+            f"{layout.flight}: found {'.'.join(map(str, first['loc']))} that is not of this version of velfield "
+            f"({first['msg'].lower()}); run the flight again with the same command"
+        ) from None
 
 
 def open_layout(root: Path) -> RunLayout:
@@ -44,7 +54,8 @@ def open_layout(root: Path) -> RunLayout:
 
 
 def check_format(root: Path) -> None:
-    """Refuse to work on a run folder of another format; a folder that is none, or not there, passes.
+    """Refuse to work on a run folder of another format; a folder that is none, or not there, passes, and so does one
+    whose record is damaged: it is written again, and what is finished is known by content keys.
 
     Raises
     ------
@@ -54,7 +65,10 @@ def check_format(root: Path) -> None:
     path = RunLayout(root).flight
     if not path.exists():
         return
-    version = _parse(path).get("format_version")
+    try:
+        version = _parse(path).get("format_version")
+    except InputError:
+        return
     if version == FORMAT_VERSION:
         return
     reading = "`velfield.open_run` reads it, " if version in READABLE_FORMATS else ""
@@ -66,7 +80,9 @@ def check_format(root: Path) -> None:
 
 def _parse(path: Path) -> dict[str, Any]:
     try:
-        record: dict[str, Any] = json.loads(path.read_bytes())
-    except ValueError:
-        raise InputError(f"{path} is damaged: it is not JSON; run the flight again into a new folder") from None
-    return record
+        return read_sealed(path.read_bytes())
+    except ValueError as error:
+        raise InputError(
+            f"{path} is damaged ({' '.join(str(error).split())}), expected the record that `velfield run` wrote; the "
+            "same `velfield run` command writes it again and keeps what is finished"
+        ) from None

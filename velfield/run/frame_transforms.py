@@ -8,25 +8,42 @@ The base image of a run and the grid of its pixels.
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
 
 from schemas.arrays import FloatArray, GreyImage
-from schemas.camera import CameraRecord
+from schemas.camera import CameraRecord, PolynomialLensRecord
 from schemas.flight import FlightConfig, FramesConfig, RegistrationConfig
-from schemas.records import FORMAT_VERSION, GridRecord, PolyprojectiveRecord, RebaseRecord, WorkingRecord
+from schemas.georeference import GeoreferenceRecord
+from schemas.records import (
+    FORMAT_VERSION,
+    GridRecord,
+    OwnToBaseRecord,
+    PolyprojectiveRecord,
+    RebaseRecord,
+    WorkingRecord,
+)
 from schemas.renames import upgrade_record
 from velfield.camera.lens import Lens, lens_from_record
 from velfield.errors import InputError
-from velfield.registration.transforms import FrameMap, FrameTransform, PolyprojectiveTransform
+from velfield.registration.base_mesh import BaseMesh
+from velfield.registration.mesh import Support, sample_cells
+from velfield.registration.transforms import (
+    FrameMap,
+    FrameTransform,
+    MeshedTransform,
+    PlaneTransform,
+    PolyprojectiveTransform,
+    as_points,
+)
 from velfield.run.layout import RunLayout, local_copy
 from velfield.run.stores import RegistrationStore, open_frames, open_registration
 
 
 def read_grid(layout: RunLayout) -> GridRecord:
-    """``base/grid.json``.
+    """The grid of base pixels: ``base/grid.json``, with scale, north and place by ``base/georeference.json``.
 
     Raises
     ------
@@ -35,7 +52,41 @@ def read_grid(layout: RunLayout) -> GridRecord:
     """
     if not layout.grid.exists():
         raise InputError(f"{layout.grid} is not there: run `velfield run` on this folder first")
+    grid = _parse_grid(layout.grid.read_bytes(), layout.format_version)
+    record = read_georeference(layout)
+    return grid if record is None else _apply_georeference(grid, record)
+
+
+def read_own_grid(layout: RunLayout) -> GridRecord:
+    """``base/grid.json`` alone: what the base image itself and ``--gsd-m`` give."""
     return _parse_grid(layout.grid.read_bytes(), layout.format_version)
+
+
+def read_georeference(layout: RunLayout) -> GeoreferenceRecord | None:
+    """``base/georeference.json``; None before its stage, and in runs that had none."""
+    if not layout.georeference.exists():
+        return None
+    return _parse_georeference(layout.georeference.read_bytes())
+
+
+@lru_cache(maxsize=8)
+def _parse_georeference(data: bytes) -> GeoreferenceRecord:
+    return GeoreferenceRecord.model_validate_json(data)
+
+
+@lru_cache(maxsize=8)
+def _apply_georeference(grid: GridRecord, record: GeoreferenceRecord) -> GridRecord:
+    return grid.model_copy(update=georeference_update(record))
+
+
+def georeference_update(record: GeoreferenceRecord) -> dict[str, object]:
+    """The fields of a `GridRecord` that a georeference sets."""
+    update: dict[str, object] = {"north_rad": record.north_rad}
+    if record.scale.used is not None:
+        update["gsd_m"] = record.scale.used.gsd_m
+    if record.crs_wkt is not None:
+        update |= {"crs_wkt": record.crs_wkt, "affine": record.affine}
+    return update
 
 
 def read_working(layout: RunLayout) -> WorkingRecord:
@@ -64,9 +115,9 @@ def read_base_image(layout: RunLayout, config: FramesConfig) -> GreyImage:
 
 
 def north_direction_rad(grid: GridRecord) -> float | None:
-    """Direction of north in the image, from +x towards +y (down); None without a georeference."""
+    """Direction of north in the image, from +x towards +y (down); None where it is not known."""
     if grid.affine is None:
-        return None
+        return grid.north_rad
     a, b, _, d, e, _ = grid.affine
     # One step north in the CRS, as a step of pixels: the inverse of [[a, b], [d, e]] times (0, 1).
     determinant = a * e - b * d
@@ -92,7 +143,7 @@ def _parse_grid(data: bytes, format_version: int) -> GridRecord:
 
 
 def read_lens(layout: RunLayout) -> Lens:
-    """The lens of ``camera.json``.
+    """The lens of ``camera.json``, or that by the given base image.
 
     Raises
     ------
@@ -101,6 +152,8 @@ def read_lens(layout: RunLayout) -> Lens:
     """
     if not layout.camera.exists():
         raise InputError(f"{layout.camera} is not there: run `velfield run` on this folder first")
+    if layout.map_lens.exists():
+        return lens_from_record(PolynomialLensRecord.model_validate_json(layout.map_lens.read_bytes()))
     return lens_from_record(CameraRecord.model_validate_json(layout.camera.read_bytes()).lens)
 
 
@@ -118,14 +171,57 @@ def polyprojective_from_record(record: PolyprojectiveRecord) -> PolyprojectiveTr
     return PolyprojectiveTransform(np.array(record.coefficients), np.array(record.source), np.array(record.target))
 
 
-def _base_transforms(layout: RunLayout) -> tuple[PolyprojectiveTransform, ...]:
-    """Transforms from the image that frames are registered to on to base pixels, in order; mostly none."""
-    records = []
+def base_mesh_to_record(mesh: BaseMesh) -> OwnToBaseRecord:
+    """The map from the own base image to the given one as a record for JSON."""
+    transform, support = mesh.transform, mesh.support
+    return OwnToBaseRecord(
+        **polyprojective_to_record(transform.polyprojective).model_dump(),
+        mesh=tuple(tuple((float(x), float(y)) for x, y in row) for row in transform.mesh),
+        mesh_cell_px=transform.cell_size_px,
+        position_sd_px=tuple(
+            tuple(float(sd) if np.isfinite(sd) else None for sd in row) for row in np.round(support.sd_px, 4)
+        ),
+        own_width_px=support.width,
+        own_height_px=support.height,
+    )
+
+
+@dataclass(frozen=True)
+class BaseMap:
+    """A map from one base image to the next, and its accuracy.
+
+    ``sd_px`` is one figure, of the whole image, where it is not known by cell.
+    """
+
+    transform: PlaneTransform
+    support: Support | None = None
+    sd_px: float = 0.0
+
+    def position_sd_px(self, xy: FloatArray) -> FloatArray:
+        """Standard deviation (n,) of the mapped position of points (n, 2), px of the next image; NaN beyond support."""
+        return np.full(len(xy), self.sd_px) if self.support is None else self.support.at(xy)
+
+
+def _own_to_base(record: OwnToBaseRecord) -> BaseMap:
+    polyprojective = polyprojective_from_record(record)
+    if not record.mesh:
+        return BaseMap(polyprojective)
+    sd_px = np.array([[np.nan if sd is None else sd for sd in row] for row in record.position_sd_px], np.float32)
+    return BaseMap(
+        MeshedTransform(polyprojective, np.array(record.mesh), record.mesh_cell_px),
+        Support(sd_px, record.own_width_px, record.own_height_px),
+    )
+
+
+def _base_maps(layout: RunLayout) -> tuple[BaseMap, ...]:
+    """Maps from the image that frames are registered to on to base pixels, in order; mostly none."""
+    maps = []
     if layout.own_to_base.exists():
-        records.append(PolyprojectiveRecord.model_validate_json(layout.own_to_base.read_bytes()))
+        maps.append(_own_to_base(OwnToBaseRecord.model_validate_json(layout.own_to_base.read_bytes())))
     if layout.rebased.exists():
-        records.append(RebaseRecord.model_validate_json(layout.rebased.read_bytes()).transform)
-    return tuple(polyprojective_from_record(record) for record in records)
+        record = RebaseRecord.model_validate_json(layout.rebased.read_bytes())
+        maps.append(BaseMap(polyprojective_from_record(record.transform), sd_px=record.added_error_px))
+    return tuple(maps)
 
 
 @dataclass(frozen=True)
@@ -135,10 +231,12 @@ class FrameTransforms:
     width: int
     height: int
     lens: Lens
-    base_transforms: tuple[PolyprojectiveTransform, ...]
+    base_maps: tuple[BaseMap, ...]
     """Applied after a frame's own: to a given base image, and from that to a newer one."""
     store: RegistrationStore
     config: RegistrationConfig
+    _vectors: dict[int, FloatArray] = field(default_factory=dict, repr=False, compare=False)
+    """The parameters of one unit of frames, by its number: those read last."""
 
     @classmethod
     def open(cls, layout: RunLayout, config: FlightConfig) -> "FrameTransforms":
@@ -148,19 +246,50 @@ class FrameTransforms:
             width=width,
             height=height,
             lens=read_lens(layout),
-            base_transforms=_base_transforms(layout),
+            base_maps=_base_maps(layout),
             store=open_registration(layout.registration),
             config=config.registration,
         )
 
     def transform(self, frame: int) -> FrameMap | None:
         """The transform of one frame; None where it is not registered."""
-        vector = self.store.vector(frame)
+        vector = self._vector(frame)
         if not np.isfinite(vector).all():
             return None
         transform: FrameMap = FrameTransform.from_vector(
             vector, width=self.width, height=self.height, lens=self.lens, config=self.config
         )
-        for following in self.base_transforms:
-            transform = transform.then(following)
+        for following in self.base_maps:
+            transform = transform.then(following.transform)
         return transform
+
+    def position_sd_px(self, frame: int, xy_raw: FloatArray) -> FloatArray:
+        """Standard deviation (n,) of the base position of raw pixels (n, 2), base px.
+
+        NaN where the frame is not registered, or no control points support its map: there it is an extrapolation.
+        """
+        points = as_points(xy_raw)
+        vector = self._vector(frame)
+        if not np.isfinite(vector).all():
+            return np.full(len(points), np.nan)
+        sd_px = sample_cells(self.store.position_sd_px(frame), points, self.width, self.height)
+        if not self.base_maps:
+            return sd_px
+        xy = FrameTransform.from_vector(
+            vector, width=self.width, height=self.height, lens=self.lens, config=self.config
+        ).to_base(points)
+        for following in self.base_maps:
+            scale = np.sqrt(np.abs(np.linalg.det(following.transform.jacobian(xy))))
+            sd_px = np.hypot(sd_px * scale, following.position_sd_px(xy))
+            xy = following.transform(xy)
+        return sd_px
+
+    def _vector(self, frame: int) -> FloatArray:
+        unit, at = divmod(frame, self.store.unit_frames)
+        vectors = self._vectors.get(unit)
+        if vectors is None:
+            start = unit * self.store.unit_frames
+            vectors = self.store.vectors(start, start + self.store.unit_frames)
+            self._vectors.clear()
+            self._vectors[unit] = vectors
+        return vectors[at] if at < len(vectors) else self.store.vector(frame)  # which refuses an unknown frame

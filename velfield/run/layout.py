@@ -142,6 +142,11 @@ class RunLayout:
         return self.root / "camera.json"
 
     @property
+    def map_lens(self) -> Path:
+        """The lens by matches with the given base image, where they decide for another than ``camera.json``."""
+        return self.base / "lens.json"
+
+    @property
     def base(self) -> Path:
         return self.root / "base"
 
@@ -183,6 +188,16 @@ class RunLayout:
         return self.base / "grid.json"
 
     @property
+    def georeference(self) -> Path:
+        """Scale, north and place of the base image, and where each is from."""
+        return self.base / "georeference.json"
+
+    @property
+    def control_points(self) -> Path:
+        """Ground control points, where `velfield georeference` was given some."""
+        return self.base / "control_points.json"
+
+    @property
     def background(self) -> Path:
         return self.base / "background.npz"
 
@@ -202,6 +217,26 @@ class RunLayout:
     @property
     def detections(self) -> Path:
         return self.root / "detections"
+
+    @property
+    def weak_detections(self) -> Path:
+        """Candidates of a lower score than a detection's, which tracks can confirm."""
+        return self.detections / "weak"
+
+    @property
+    def dimensions(self) -> Path:
+        """Dimensions of the vehicles, a row a track."""
+        return self.tracks / "dimensions.parquet"
+
+    @property
+    def track_positions(self) -> Path:
+        """Where each track's vehicle was in each frame, by unit."""
+        return self.tracks / "positions"
+
+    @property
+    def joins(self) -> Path:
+        """Joins of tracks over a gap, with their probabilities."""
+        return self.tracks / "joins.parquet"
 
     @property
     def tracklets(self) -> Path:
@@ -255,6 +290,11 @@ class RunLayout:
         return self.view / "report.json"
 
     @property
+    def analysis(self) -> Path:
+        """Results of `velfield analyse`."""
+        return self.root / "analysis"
+
+    @property
     def results(self) -> Path:
         """Results on other base images, a run folder each, by name."""
         return self.root / "results"
@@ -267,6 +307,11 @@ class RunLayout:
     @property
     def commits(self) -> Path:
         return self.root / "commits"
+
+    @property
+    def preview(self) -> Path:
+        """Run folder of a map made before the run is through, while it is being made (`velfield.pipeline.preview`)."""
+        return self.root / ".preview"
 
     @property
     def lock(self) -> Path:

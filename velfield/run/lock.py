@@ -4,7 +4,6 @@ The lease is an object that is never removed. Every change of it is one conditio
 "only if its content still is what I read", so that of several processes that find it expired one gets it.
 """
 
-import fcntl
 import json
 import os
 import socket
@@ -15,7 +14,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
+import psutil
+
 from velfield.errors import InputError
+from velfield.run.file_lock import try_lock
 from velfield.run.layout import RunLayout, is_remote
 
 if TYPE_CHECKING:
@@ -41,11 +43,9 @@ def locked(layout: RunLayout) -> Iterator[None]:
         return
     layout.root.mkdir(parents=True, exist_ok=True)
     with layout.lock.open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        if not try_lock(file):
             file.seek(0)
-            raise InputError(_refusal(str(layout.root), file.read())) from None
+            raise InputError(_refusal(str(layout.root), file.read()))
         file.truncate(0)
         file.write(_record())
         file.flush()
@@ -136,6 +136,15 @@ def _leased(path: "S3ObjectPath", name: str) -> Iterator[None]:
         )
 
 
+def holder_is_gone(layout: RunLayout) -> bool:
+    """Whether the process that last held the lock was one of this machine and has ended, perhaps killed."""
+    try:
+        record = json.loads(layout.lock.read_text(encoding="utf-8"))
+        return bool(record["host"] == socket.gethostname()) and not _is_running(int(record["pid"]))
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
 def _is_expired(text: str) -> bool:
     """Whether the writer of the record is gone: it was not renewed in time, or its process on this machine ended."""
     try:
@@ -147,13 +156,7 @@ def _is_expired(text: str) -> bool:
 
 
 def _is_running(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
+    return bool(psutil.pid_exists(pid))  # on Windows os.kill(pid, 0) is Ctrl-C
 
 
 def _refusal(name: str, text: str) -> str:

@@ -11,7 +11,15 @@ from pathlib import Path
 
 from schemas.records import RebaseRecord, ResultRecord, ResultsRecord
 from velfield.errors import InputError
-from velfield.run.commits import commit_path, digest_path, read_commits, valid_commit, write_atomically
+from velfield.run.commits import (
+    digest_path,
+    read_commits,
+    read_sealed,
+    sealed_json,
+    valid_commit,
+    write_atomically,
+    write_commit,
+)
 from velfield.run.flight_record import read_flight_record
 from velfield.run.layout import RunLayout, remove_tree, rename_tree
 from velfield.run.run import Run
@@ -62,7 +70,14 @@ def final_root(root: Path) -> Path:
 def read_results(layout: RunLayout) -> tuple[ResultRecord, ...]:
     """All results, the first one first; empty where there is only one."""
     path = layout.results_index
-    return ResultsRecord.model_validate_json(path.read_bytes()).results if path.exists() else ()
+    if not path.exists():
+        return ()
+    try:
+        return ResultsRecord.model_validate(read_sealed(path.read_bytes())).results
+    except ValueError:
+        raise InputError(
+            f"{path} is damaged, expected the list of results; remove it, and `velfield reprocess` writes it again"
+        ) from None
 
 
 def result_exists(layout: RunLayout, name: str, base: Path) -> bool:
@@ -95,7 +110,7 @@ def link_shared_outputs(
             outputs = {name: digest for name, digest in record.outputs.items() if not name.startswith(without)}
             link_files([(old.root / name, new.root / name) for name in outputs])
             kept = record.model_copy(update={"outputs": outputs})
-            write_atomically(commit_path(new, stage, record.unit), kept.model_dump_json(indent=1).encode())
+            write_commit(new, kept)
 
 
 def discard_result(layout: RunLayout) -> None:
@@ -114,7 +129,7 @@ def publish_result(run: Run, name: str, base: Path) -> Path:
         rename_tree(staged, target, last=_LAST)
     others = [result for result in read_results(layout) if result.name != name] or [_first(run)]
     records = ResultsRecord(results=(*others, _result(name, target, base)))
-    write_atomically(layout.results_index, records.model_dump_json(indent=1).encode())
+    write_atomically(layout.results_index, sealed_json(records))
     return target
 
 

@@ -6,21 +6,32 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray, GreyImage, Points
+from schemas.arrays import FloatArray, GreyImage, Mask, Points
 from schemas.records import FORMAT_VERSION, FlightRecord, GridRecord
-from schemas.tables import DETECTION_COLUMNS, TRACK_COLUMNS
+from schemas.tables import (
+    DETECTION_COLUMNS,
+    DIMENSION_COLUMNS,
+    JOIN_COLUMNS,
+    POSITION_SOURCES,
+    TRACK_COLUMNS,
+    TRACK_POSITION_COLUMNS,
+)
 from velfield.analysis.crossings import find_crossings, hysteresis_px
+from velfield.analysis.vehicle_classes import add_dimensions
+from velfield.analysis.vehicles import find_vehicles
 from velfield.errors import OldNameWarning
 from velfield.field.segments import Segments, segment_table
 from velfield.field.view import VelocityField
+from velfield.registration.warp import warp_to_base
 from velfield.run.analysis import RunAnalysis
 from velfield.run.field_reader import IntervalField, open_field_intervals, open_velocity_field
 from velfield.run.flight_record import read_flight_record
 from velfield.run.frame_transforms import FrameTransforms, read_base_image, read_grid
 from velfield.run.layout import RunLayout, to_path
 from velfield.run.stores import FrameStore, RegistrationStore, open_field, open_frames, open_registration
-from velfield.run.tables import conform, read_tables
+from velfield.run.tables import conform, read_tables, read_track_tables
 
 _EACH_ONCE = {"shared_segment_weight": 1}
 """The preset `paper` weights segments that two tracklets share twice; counting vehicles does not."""
@@ -74,6 +85,15 @@ class Run:
         """Raw pixels <-> base pixels of each frame."""
         return FrameTransforms.open(self.layout, self.record.config)
 
+    def rectified_frame(self, frame: int, *, scale: float = 1.0) -> tuple[GreyImage, Mask] | None:
+        """A frame on the grid of the base image, ``scale`` px a base pixel: image (h, w) uint8 and where the frame
+        covers it; None where it is not registered."""
+        transform = self.frame_transforms.transform(frame)
+        if transform is None:
+            return None
+        window = (0, 0, self.grid.width_px, self.grid.height_px)
+        return warp_to_base(self.frames.read(frame), transform, window=window, scale=scale)
+
     @property
     def times_s(self) -> FloatArray:
         """(frames,) true times, s."""
@@ -85,12 +105,29 @@ class Run:
         return self.registration.statuses()
 
     def to_base(self, frame: int, xy_raw: Points) -> Points:
-        """Raw pixels of a frame -> base pixels, (n, 2) -> (n, 2); NaN rows where the frame is not registered."""
-        return self._transform_points("to_base", frame, xy_raw)
+        """Raw pixels of a frame -> base pixels, (n, 2) -> (n, 2).
+
+        NaN rows where the frame is not registered, or no control points support the map (`position_sd_px`).
+        """
+        xy = self._transform_points("to_base", frame, xy_raw)
+        xy[np.isnan(self.position_sd_px(frame, xy_raw))] = np.nan
+        return xy
 
     def to_raw(self, frame: int, xy_base: Points) -> Points:
-        """Base pixels -> raw pixels of a frame, (n, 2) -> (n, 2); NaN rows where there is no such pixel."""
-        return self._transform_points("to_raw", frame, xy_base)
+        """Base pixels -> raw pixels of a frame, (n, 2) -> (n, 2).
+
+        NaN rows where there is no such pixel, or no control points support the map (`position_sd_px`).
+        """
+        xy = self._transform_points("to_raw", frame, xy_base)
+        xy[np.isnan(self.position_sd_px(frame, xy))] = np.nan
+        return xy
+
+    def position_sd_px(self, frame: int, xy_raw: Points) -> FloatArray:
+        """Standard deviation of the base position of a frame's raw pixels, (n, 2) -> (n,) base px.
+
+        NaN where the frame is not registered, and where no control points support its map: nothing is detected there.
+        """
+        return self.frame_transforms.position_sd_px(frame, np.asarray(xy_raw, np.float64).reshape(-1, 2))
 
     def _transform_points(self, direction: str, frame: int, xy: Points) -> Points:
         points = np.asarray(xy, np.float64).reshape(-1, 2)
@@ -111,10 +148,36 @@ class Run:
         """
         paths = sorted(self.layout.tracks.glob("unit-*.parquet"))
         if self.layout.format_version == FORMAT_VERSION:
-            return read_tables(paths, TRACK_COLUMNS)
+            return read_track_tables(paths, TRACK_COLUMNS)
         stored = {name: kind for name, kind in TRACK_COLUMNS.items() if name != "track_id"}
-        table = read_tables(paths, stored)
+        table = read_track_tables(paths, stored)
         return conform(table.assign(track_id=table["passage_id"]), TRACK_COLUMNS)
+
+    def vehicles(self) -> pd.DataFrame:
+        """One row a track: when and where, its length, width and class, and whether it moves, waits in a lane or is
+        parked: `find_vehicles`, `add_dimensions`.
+
+        Of a run by an earlier release, which measured no vehicles, dimensions are NaN.
+        """
+        gsd_m, path = self.grid.gsd_m, self.layout.dimensions
+        measured = read_tables([path] if path.exists() else [], DIMENSION_COLUMNS)
+        return add_dimensions(find_vehicles(self.tracklets(), self.detections(), gsd_m=gsd_m), measured, gsd_m)
+
+    def track_positions(self) -> pd.DataFrame:
+        """Where each track's vehicle was in each registered frame: ``schemas.tables.TRACK_POSITION_COLUMNS``.
+
+        ``source`` distinguishes what is seen from what is inferred, by name (``POSITION_SOURCES``). Empty of a run by
+        an earlier release.
+        """
+        table = read_tables(sorted(self.layout.track_positions.glob("unit-*.parquet")), TRACK_POSITION_COLUMNS)
+        return table.assign(source=pd.Categorical.from_codes(table["source"], pd.Index(POSITION_SOURCES)))
+
+    def joins(self) -> pd.DataFrame:
+        """Joins of tracks over gaps, each with the probability that it is right: ``schemas.tables.JOIN_COLUMNS``.
+
+        Empty of a run by an earlier release.
+        """
+        return read_tables([self.layout.joins] if self.layout.joins.exists() else [], JOIN_COLUMNS)
 
     def segments(self) -> Segments:
         """Vehicles from one frame to the next, each once: by track and time (`velfield.field.segments`)."""
@@ -141,8 +204,12 @@ class Run:
 
     @cached_property
     def analysis(self) -> RunAnalysis:
-        """Carriageways, stops, bottlenecks and U-turns: ``run.analysis.stops().table``."""
-        return RunAnalysis(open_field(self.layout.field).layer, self.segments, self.grid, self.record.config.field)
+        """Lanes, carriageways, stops, bottlenecks and U-turns: ``run.analysis.stops().table``."""
+
+        def layer(name: str) -> NDArray[np.generic]:
+            return open_field(self.layout.field).layer(name)
+
+        return RunAnalysis(layer, self.segments, self.tracklets, self.grid, self.record.config.field)
 
     @cached_property
     def base_image(self) -> GreyImage:

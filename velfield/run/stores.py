@@ -22,7 +22,7 @@ from zarr.codecs import ZstdCodec
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray
 from schemas.records import FORMAT_VERSION
 from schemas.renames import OLD_ARRAYS, OLD_ATTRIBUTES, OLD_WEIGHTS
-from velfield.errors import InputError
+from velfield.errors import InputError, StoreError
 from velfield.run.layout import is_remote
 
 _STATUS_BYTES = 160
@@ -32,10 +32,6 @@ HISTOGRAM = "velocity_histogram"
 HISTOGRAM_TIME_WEIGHTED = "velocity_histogram_time_weighted"
 HISTOGRAMS: dict[str, dict[str, str]] = {HISTOGRAM: {"long_name": "velocity histogram", "units": "1"}}
 """Histogram of every field, with its attributes."""
-
-
-class StoreError(RuntimeError):
-    """A store is damaged or not as expected: names the store and the chunk."""
 
 
 def _create(
@@ -272,6 +268,11 @@ ERROR_CELLS = (6, 8)
 """Rows and columns of a frame's cells, in which hold-out errors are stored."""
 
 
+POSITION_SD_CELLS = (24, 32)
+"""Rows and columns of a frame's cells, in which the standard deviation of its map is stored."""
+_CELL_ARRAYS = ("error_px", "position_sd_px")
+
+
 def create_registration(path: Path, *, key: str, count: int, vector_length: int, unit_frames: int) -> None:
     """Create ``registration.zarr``: chunks are units, so that a unit has one writer."""
     group = zarr.create_group(**_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION})
@@ -282,8 +283,9 @@ def create_registration(path: Path, *, key: str, count: int, vector_length: int,
         fill = np.nan if dtype.startswith("float") else 0
         _create(group, name, (count,), (chunk,), dtype, fill_value=fill, dimension_names=("frame",))
     axes = ("frame", "row", "column")
-    shape, chunks = (count, *ERROR_CELLS), (chunk, *ERROR_CELLS)
-    _create(group, "error_px", shape, chunks, "float32", fill_value=np.nan, dimension_names=axes)
+    for name, cells in zip(_CELL_ARRAYS, (ERROR_CELLS, POSITION_SD_CELLS), strict=True):
+        shape, chunks = (count, *cells), (chunk, *cells)
+        _create(group, name, shape, chunks, "float32", fill_value=np.nan, dimension_names=axes)
     group.attrs["key"] = key
 
 
@@ -297,7 +299,7 @@ class RegistrationStore:
     def write(
         self, start: int, vectors: FloatArray, statuses: Sequence[str], columns: Mapping[str, NDArray[Any]]
     ) -> None:
-        """Write a whole unit from frame ``start`` on; ``columns`` are ``REGISTRATION_COLUMNS`` and ``error_px``."""
+        """Write a whole unit from frame ``start`` on; ``columns`` are ``REGISTRATION_COLUMNS`` and those by cell."""
         stop = start + len(statuses)
         text = np.zeros((len(statuses), _STATUS_BYTES), np.uint8)
         for row, status in zip(text, statuses, strict=True):
@@ -307,6 +309,11 @@ class RegistrationStore:
         self.group["status"][start:stop] = text
         for name, values in columns.items():
             self.group[name][start:stop] = values
+
+    @property
+    def unit_frames(self) -> int:
+        """Frames of a chunk."""
+        return int(self.group["vector"].chunks[0])
 
     def vector(self, frame: int) -> FloatArray:
         """Flat parameters of one frame's transform; NaN where it is not registered."""
@@ -324,16 +331,24 @@ class RegistrationStore:
 
     def column(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
         """One of ``REGISTRATION_COLUMNS``, (frames,); or ``error_px``, (frames, 6, 8): hold-out error by cell."""
-        _check_column(self.path, name, (*REGISTRATION_COLUMNS, "error_px"))
+        _check_column(self.path, name, (*REGISTRATION_COLUMNS, *_CELL_ARRAYS))
         return _read(self.path, self.group, name, slice(start, stop))
+
+    def position_sd_px(self, frame: int) -> Float32Array:
+        """Standard deviation of one frame's map by cell, (rows, columns); NaN where it has no control points.
+
+        Of a run that stored none it is the hold-out error in coarser cells, which is larger.
+        """
+        name = "position_sd_px" if "position_sd_px" in self.group.by_axes.get(3, ()) else "error_px"
+        return _read(self.path, self.group, name, frame)
 
     def files(self, start: int) -> list[Path]:
         """Files that hold the unit from frame ``start`` on, and the store's metadata."""
         unit = start // int(self.group["vector"].chunks[0])
         tables = [self.path / name / "c" / str(unit) / "0" for name in ("vector", "status")]
         columns = [self.path / self.group.stored_name(name) / "c" / str(unit) for name in REGISTRATION_COLUMNS]
-        errors = self.path / "error_px" / "c" / str(unit) / "0" / "0"
-        return [*_metadata(self.path), *_existing([*tables, *columns, errors])]
+        cells = [self.path / name / "c" / str(unit) / "0" / "0" for name in _CELL_ARRAYS]
+        return [*_metadata(self.path), *_existing([*tables, *columns, *cells])]
 
 
 def open_registration(path: Path, mode: str = "r") -> RegistrationStore:
@@ -451,7 +466,8 @@ class FieldStore:
     def write_tile(self, row: int, column: int, histogram: NDArray[np.int32], name: str = HISTOGRAM) -> None:
         """Write one tile of a histogram, (ty, tx, nvy, nvx): one chunk."""
         y, x, side = row * self.tile, column * self.tile, self.tile
-        self.group[name][y : y + side, x : x + side] = histogram
+        # Written whatever it holds: to look whether all of it is zero takes a quarter of the time.
+        self.group[name].with_config({"write_empty_chunks": True})[y : y + side, x : x + side] = histogram
 
     def has_tile(self, row: int, column: int, name: str = HISTOGRAM) -> bool:
         """Whether the tile's chunk exists."""

@@ -116,6 +116,8 @@ class SourceInfo:
         Frame rate behind the times, where the user gave one and the source had none.
     max_pixels
         Limit on the size of an image, refused before memory is taken.
+    parts
+        Of several clips (`velfield.sources.clips`), in order of time: path, facts, and start in s from the first one's.
     """
 
     kind: SourceKind
@@ -131,6 +133,7 @@ class SourceInfo:
     entries: Mask = field(default_factory=lambda: np.zeros(0, np.bool_))
     fps: float | None = None
     max_pixels: int = 400_000_000
+    parts: tuple[tuple[str, "SourceInfo", float], ...] = ()
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -109,6 +109,18 @@ def ground_sample_distance_m(crs: CRS, affine: Affine, shape: tuple[int, int], *
     return float(np.sqrt(across * down))
 
 
+def utm_crs(longitude: float, latitude: float) -> CRS:
+    """The reference system of the UTM zone of a place.
+
+    Examples
+    --------
+    >>> utm_crs(36.2, 50.0).to_epsg()
+    32637
+    """
+    zone = min(int((longitude + 180) // 6) + 1, 60)
+    return CRS.from_epsg((32600 if latitude >= 0 else 32700) + zone)
+
+
 def reconcile_gsd(from_crs_m: float | None, given_m: float | None) -> float | None:
     """The ground sample distance, m a pixel: the reference system's, else the one given, else None.
 
@@ -272,8 +284,8 @@ def _to_utm(path: Path, raster: _Raster, max_pixels: int) -> _Raster:
             f"{path.name}: found its centre at {longitude:g}, {latitude:g} degrees, expected it between 80 south and "
             "84 north; fix its georeference"
         )
-    zone = min(int((longitude + 180) // 6) + 1, 60)
-    crs = CRS.from_epsg((32600 if latitude >= 0 else 32700) + zone)
+    crs = utm_crs(longitude, latitude)
+    zone = crs.to_epsg() % 100
     affine, width, height = _utm_grid(raster, crs)
     check_size(path, width, height, max_pixels)
     shape = (height, width)

@@ -136,6 +136,75 @@ def flag_blurred(sharpness: FloatArray, *, fraction: float = 0.5, window: int = 
     return np.asarray(sharpness < fraction * usual, np.bool_)
 
 
+DARK_LEVEL = 30.0
+"""Mean grey level below which a flight is reported as dark; daylight footage lies between 80 and 150."""
+FAINT_SD, FAINT_SHARPNESS = 6.0, 2.5
+"""Contrast of the thumbnails and sharpness below which, both, a flight is reported to be in fog."""
+MAX_CUT_CORRELATION = 0.3
+"""Correlation of the thumbnails before and after, below which the picture changes wholly."""
+_CUT_FRAMES = 5
+
+
+def find_cuts(thumbnails: Float32Array) -> list[int]:
+    """Frames from which on the picture is another one: uncorrelated to those before for some frames on either side.
+
+    Parameters
+    ----------
+    thumbnails
+        (n, 16, 16) as `frame_quality` gives them.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> here, there = rng.normal(size=(2, 16, 16)).astype(np.float32)
+    >>> find_cuts(np.stack([here] * 6 + [there] * 6))
+    [6]
+    """
+    flat = np.asarray(thumbnails, np.float64).reshape(len(thumbnails), -1)
+    cuts: list[int] = []
+    for k in range(2, len(flat) - 1):
+        if _correlation(flat[k - 1], flat[k]) >= MAX_CUT_CORRELATION:
+            continue
+        before, after = flat[max(0, k - _CUT_FRAMES) : k], flat[k : k + _CUT_FRAMES]
+        across = max(_correlation(one, other) for one in before for other in after)
+        within = min(_correlation(part[0], part[-1]) for part in (before, after))
+        if across < MAX_CUT_CORRELATION <= within:
+            cuts.append(k)
+    return cuts
+
+
+def _correlation(one: FloatArray, other: FloatArray) -> float:
+    norm = float(np.linalg.norm(one) * np.linalg.norm(other))
+    return float(one @ other) / norm if norm > 0 else 0.0
+
+
+def describe_light(brightness: FloatArray, contrast: FloatArray, sharpness: FloatArray) -> list[str]:
+    """What the light of a flight makes uncertain, one line each; columns (n,) of its usable frames.
+
+    Examples
+    --------
+    >>> describe_light(np.full(3, 12.0), np.full(3, 20.0), np.full(3, 9.0))
+    ['the flight is dark (mean grey level 12, 30 or more expected): vehicles without contrast to the road are missed']
+    >>> describe_light(np.full(3, 110.0), np.full(3, 30.0), np.full(3, 12.0))
+    []
+    """
+    if not brightness.size:
+        return []
+    found = []
+    level = float(np.nanmedian(brightness))
+    if level < DARK_LEVEL:
+        found.append(
+            f"the flight is dark (mean grey level {level:.0f}, {DARK_LEVEL:.0f} or more expected): vehicles without "
+            "contrast to the road are missed"
+        )
+    elif float(np.nanmedian(contrast)) < FAINT_SD and float(np.nanmedian(sharpness)) < FAINT_SHARPNESS:
+        found.append(
+            f"the flight has little contrast (sharpness {float(np.nanmedian(sharpness)):.1f} grey levels, "
+            f"{FAINT_SHARPNESS:g} or more expected), as in fog: registration and detection are less certain"
+        )
+    return found
+
+
 def flag_outlier_frames(thumbnails: Float32Array, *, max_step: float = 0.3, min_across: float = 0.7) -> Mask:
     """Frames that correlate neither with the frame before nor with the frame after, while those two do with each other.
 

@@ -9,6 +9,7 @@ import numpy as np
 from schemas.arrays import IntArray
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
+from velfield.sources.clips import CLIPS_SUFFIX, iter_clips, probe_clips, read_clip_list
 from velfield.sources.frames import SourceFrame, SourceInfo, local_path
 from velfield.sources.images import iter_folder, list_images, probe_folder
 from velfield.sources.quality import FrameFlag, is_black, is_duplicate
@@ -45,6 +46,8 @@ def probe(path: Path | str, *, frames: FramesConfig, timestamps: Path | None = N
             raise InputError("found both --timestamps and --fps, expected one of them; leave --fps out")
     if source.is_dir():
         return probe_folder(source, frames=frames, timestamps=timestamps)
+    if source.suffix == CLIPS_SUFFIX:
+        return probe_clips(source, frames=frames, timestamps=timestamps)
     return probe_video(source, frames=frames, timestamps=timestamps)
 
 
@@ -60,8 +63,9 @@ def check_source(path: Path | str) -> None:
     if source.is_dir():
         list_images(source)
         return
-    with libav_log(), open_video(source) as container:
-        video_stream(container, source)
+    for clip in read_clip_list(source) if source.suffix == CLIPS_SUFFIX else [source]:
+        with libav_log(), open_video(clip) as container:
+            video_stream(container, clip)
 
 
 def iter_frames(
@@ -96,7 +100,7 @@ def iter_frames(
     read = requested if after is None else np.r_[np.int64(after), requested]
     reader = iter_video if info.kind == "video" else iter_folder
     previous: SourceFrame | None = None
-    for frame in reader(source, info, read):
+    for frame in iter_clips(info, read) if info.parts else reader(source, info, read):
         checked = _with_content_flags(frame, previous)
         if not checked.flags & FrameFlag.UNREADABLE:
             previous = checked

@@ -6,7 +6,14 @@
 (240, 320)
 """
 
-from velfield.synthetic.cases import homography_only, lens_and_wobble, lens_only, small_flight, vibration_and_drift
+from velfield.synthetic.cases import (
+    homography_only,
+    lens_and_wobble,
+    lens_only,
+    small_flight,
+    two_term_lens,
+    vibration_and_drift,
+)
 from velfield.synthetic.flight import Flight, simulate
 from velfield.synthetic.score import fit_homography, score_detections, score_field, score_registration, score_tracklets
 from velfield.synthetic.truth import Truth, load_truth, make_truth
@@ -27,6 +34,7 @@ __all__ = [
     "score_tracklets",
     "simulate",
     "small_flight",
+    "two_term_lens",
     "vibration_and_drift",
     "write_flight",
 ]

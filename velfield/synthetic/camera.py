@@ -9,17 +9,21 @@ pixel's row determines its exposure time, and thereby its pose and its vibration
 No step is approximated, so these transforms are the ground truth of registration.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
 
 from schemas.arrays import FloatArray
 from schemas.simulation import CameraSimulation, SimulationConfig
+from velfield.errors import InputError
 from velfield.synthetic.city.relief import Relief, ground_height, ground_height_at
 
 ROW_FIELDS = 14
 """Columns of a row table: rotation camera -> base (9, row-major), camera position (3), shake (2)."""
+
+_BISECTIONS = 50
 
 MAX_FIXED_POINT_ITERATIONS = 60
 """Iterations of the search for the row that images a point; each at least halves the error, see ``to_raw``."""
@@ -71,6 +75,8 @@ class Camera:
     width, height : frame size, px.
     focal_px : focal length, px.
     lens_a, lens_x_px, lens_y_px : Harris' distortion and its centre; radius in half-diagonals.
+    mean_tilt_rad : mean tilt from the vertical, about x.
+    lens_terms : (terms,) coefficients of the polynomial model in place of ``lens_a``; none: Harris' model.
     position_px : (3,) mean position of the camera, base px; z negative (above the ground).
     heading_rad : mean rotation about the vertical, from +x towards +y.
     motion : waves of x, y, z (base px), rotation about z, tilt about x, tilt about y (rad).
@@ -93,6 +99,8 @@ class Camera:
     readout_s: float
     times_s: FloatArray
     relief: Relief
+    mean_tilt_rad: float = 0.0
+    lens_terms: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def half_diagonal_px(self) -> float:
@@ -108,18 +116,27 @@ class Camera:
         time_s = self.row_time_s(frame, rows)
         dx, dy, dz, yaw, tilt_x, tilt_y = self.motion(time_s)
         table = np.empty((len(rows), ROW_FIELDS))
-        table[:, :9] = _rotation(self.heading_rad + yaw, tilt_x, tilt_y).reshape(-1, 9)
+        table[:, :9] = _rotation(self.heading_rad + yaw, tilt_x + self.mean_tilt_rad, tilt_y).reshape(-1, 9)
         table[:, 9:12] = self.position_px + np.stack([dx, dy, dz], axis=1)
         table[:, 12:14] = self.shake(time_s).T
         return table
 
     def undistort(self, xy: FloatArray) -> FloatArray:
         """Raw pixels (n, 2) -> undistorted pixels (n, 2); NaN where the lens model has none."""
+        if len(self.lens_terms):
+            return _polynomial(xy, (self.lens_x_px, self.lens_y_px), self.lens_terms, self.half_diagonal_px)
         return _radial(xy, (self.lens_x_px, self.lens_y_px), -self.lens_a, self.half_diagonal_px)
 
     def distort(self, xy: FloatArray) -> FloatArray:
         """Undistorted pixels (n, 2) -> raw pixels (n, 2); NaN where the lens model has none."""
+        if len(self.lens_terms):
+            return _inverse_polynomial(xy, (self.lens_x_px, self.lens_y_px), self.lens_terms, self.half_diagonal_px)
         return _radial(xy, (self.lens_x_px, self.lens_y_px), self.lens_a, self.half_diagonal_px)
+
+    @property
+    def lens_array(self) -> FloatArray:
+        """The lens for the renderer: Harris' a, the centre, the half-diagonal, then the terms of the polynomial."""
+        return np.array([self.lens_a, self.lens_x_px, self.lens_y_px, self.half_diagonal_px, *self.lens_terms])
 
     def to_base(self, frame: int, xy_raw: FloatArray) -> FloatArray:
         """Raw pixels (n, 2) of a frame -> the ground that they show, base pixels (n, 2)."""
@@ -167,6 +184,7 @@ def make_camera(config: SimulationConfig, times_s: FloatArray, relief: Relief, r
     """The camera of a configuration, its mean position above base pixel (0, 0)."""
     c = config.camera
     focal = c.focal_widths * config.width
+    _check_lens(config)
     height_px = focal / c.scale
     drift = c.drift_m / config.gsd_m
     amplitudes = np.array(
@@ -186,13 +204,71 @@ def make_camera(config: SimulationConfig, times_s: FloatArray, relief: Relief, r
         lens_a=c.lens_a,
         lens_x_px=(config.width - 1) / 2 + c.lens_offset_x_px,
         lens_y_px=(config.height - 1) / 2 + c.lens_offset_y_px,
-        position_px=np.array([0.0, 0.0, -height_px]),
+        position_px=_position(c, height_px),
         heading_rad=float(np.radians(c.heading_deg)),
         motion=motion_waves(amplitudes, period_s=c.motion_period_s, rng=rng),
         shake=shake_waves(c, rng),
         readout_s=c.readout_s,
         times_s=times_s,
         relief=relief,
+        mean_tilt_rad=float(np.radians(c.mean_tilt_deg)),
+        lens_terms=np.array(c.lens_terms, dtype=np.float64),
+    )
+
+
+def fold_radius(terms: Sequence[float] | FloatArray) -> float:
+    """Raw radius, half-diagonals, beyond which a polynomial lens no longer maps outwards; infinity within two of them.
+
+    Independent of `velfield.camera`, as all of the truth: it judges that.
+    """
+    radius = np.linspace(0.0, 2.0, 2001)
+    growing = np.diff(radius * _radial_scale(radius**2, terms)) > 0
+    return float("inf") if growing.all() else float(radius[np.argmin(growing)])
+
+
+def _radial_scale(radius2: FloatArray, terms: Sequence[float] | FloatArray) -> FloatArray:
+    """1 + k_1 r^2 + k_2 r^4 + ..."""
+    return 1.0 + sum((k * radius2 ** (n + 1) for n, k in enumerate(terms)), start=np.zeros_like(radius2))
+
+
+def _polynomial(xy: FloatArray, centre: tuple[float, float], terms: FloatArray, unit: float) -> FloatArray:
+    offset = np.asarray(xy, dtype=np.float64) - centre
+    return np.asarray(offset * _radial_scale((offset**2).sum(axis=1) / unit**2, terms)[:, None] + centre)
+
+
+def _inverse_polynomial(xy: FloatArray, centre: tuple[float, float], terms: FloatArray, unit: float) -> FloatArray:
+    """By bisection up to the radius where the model folds, or twice the half-diagonal; NaN beyond."""
+    offset = np.asarray(xy, dtype=np.float64) - centre
+    radius = np.hypot(*offset.T) / unit
+    last = min(fold_radius(terms), 2.0)
+    low, high = np.zeros_like(radius), np.full_like(radius, last)
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        outside = middle * _radial_scale(middle**2, terms) > radius
+        low, high = np.where(outside, low, middle), np.where(outside, middle, high)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        scale = np.where(radius > 0, low / radius, 1.0)
+    beyond = ~(radius < last * float(_radial_scale(np.array([last**2]), terms)[0]))
+    return np.asarray(np.where(beyond[:, None], np.nan, offset * scale[:, None]) + centre)
+
+
+def _check_lens(config: SimulationConfig) -> None:
+    """Refuse a polynomial that folds within the frame: no raw pixel may be beyond."""
+    c = config.camera
+    reach = 1.0 + np.hypot(c.lens_offset_x_px, c.lens_offset_y_px) / (0.5 * np.hypot(config.width, config.height))
+    folds = fold_radius(c.lens_terms)
+    if folds <= reach:
+        raise InputError(
+            f"camera.lens_terms {list(c.lens_terms)}: found a lens that folds at {folds:.2f} half-diagonals from its "
+            f"centre, expected one that reaches the corners at {reach:.2f}; take smaller terms"
+        )
+
+
+def _position(c: CameraSimulation, height_px: float) -> FloatArray:
+    """Where the camera is: its axis meets the ground at base pixel (0, 0)."""
+    axis = _rotation(np.radians([c.heading_deg]), np.radians([c.mean_tilt_deg]), np.zeros(1))[0] @ (0.0, 0.0, 1.0)
+    return (
+        np.append(-height_px * axis[:2] / axis[2], -height_px) if c.mean_tilt_deg else np.array([0.0, 0.0, -height_px])
     )
 
 

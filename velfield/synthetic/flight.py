@@ -53,7 +53,7 @@ class Flight:
             base_shape=self.base_shape,
             origin_m=origin_m,
             duration_s=float(self.times_s[-1]) + config.camera.readout_s + 1.0,
-            lean=float(half / self.camera.focal_px + np.radians(2 * config.camera.tilt_deg)),
+            lean=_largest_slope(config, half / self.camera.focal_px),
         )
 
     @property
@@ -163,9 +163,10 @@ class Flight:
             *self._undistorted, table, camera.pinhole, relief.grid, relief.frame,
             scene.mosaic, scene.height, scene.reach, scene.origin, scene.height_step_px, out, occluder,
         )  # fmt: skip
-        lens = np.array([camera.lens_a, camera.lens_x_px, camera.lens_y_px, camera.half_diagonal_px])
         sprites = self._vehicle_sprites(index)
-        draw_vehicles(out, occluder, sprites, table=table, pinhole=camera.pinhole, lens=lens, sun=self.city.sun)
+        draw_vehicles(
+            out, occluder, sprites, table=table, pinhole=camera.pinhole, lens=camera.lens_array, sun=self.city.sun
+        )
         out *= self._light * np.float32(1 + c.exposure_share * float(np.clip(rng.standard_normal(), -2, 2)))
         kernel = _motion_kernel(c.motion_blur_px * rng.uniform(), rng.uniform(0, np.pi))
         if kernel is not None:
@@ -233,6 +234,14 @@ class Flight:
 def simulate(config: SimulationConfig) -> Flight:
     """The flight of a configuration; its parts are computed at the first access."""
     return Flight(config)
+
+
+def _largest_slope(config: SimulationConfig, half: float) -> float:
+    """Largest slope of a ray, px sideways a px of height; ``half``: that of the frame's corner seen straight down."""
+    slope = half + np.radians(2 * config.camera.tilt_deg)
+    if not config.camera.mean_tilt_deg:
+        return float(slope)
+    return float(np.tan(min(np.arctan(slope) + np.radians(config.camera.mean_tilt_deg), np.radians(80.0))))
 
 
 def _position_camera(c: SimulationConfig, times_s: FloatArray) -> tuple[Camera, tuple[int, int], FloatArray]:

@@ -21,6 +21,7 @@ class RandomStream(IntEnum):
     PARKED = 8
     OTHER_SENSOR = 9
     FRAME = 10
+    TELEMETRY = 11
 
 
 def random_generator(seed: int, stream: RandomStream, *number: int) -> np.random.Generator:

@@ -132,7 +132,7 @@ def _first_hit(x, y, sx, sy, highest, height, origin, step):  # type: ignore[no-
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _draw_vehicles(out, occluder, pose, shape, tones, box, table, pinhole, lens, sun, layers):  # type: ignore[no-untyped-def]
-    """Draw vehicles and their shadows over ``out`` (h, w) float32; ``lens`` = a, centre x, centre y, half-diagonal.
+    """Draw vehicles and their shadows over ``out`` (h, w) float32; ``lens``: `Camera.lens_array`.
 
     The transform from the image to a vehicle's axes is linear within a pixel to a good approximation: three rays a
     pixel give all samples.
@@ -172,7 +172,14 @@ def _ray(u, v, pose, table, pinhole, lens):  # type: ignore[no-untyped-def]
     """The ray of a raw position in a vehicle's axes: its intersection with the ground along and across, and its
     slopes."""
     ox, oy = u - lens[1], v - lens[2]
-    scale = 1.0 / np.sqrt(1.0 - lens[0] * (ox * ox + oy * oy) / (lens[3] * lens[3]))
+    radius2 = (ox * ox + oy * oy) / (lens[3] * lens[3])
+    scale = 0.0
+    if len(lens) > 4:
+        for i in range(len(lens) - 1, 3, -1):
+            scale = (scale + lens[i]) * radius2
+        scale += 1.0
+    else:
+        scale = 1.0 / np.sqrt(1.0 - lens[0] * radius2)
     row = min(max(v, 0.0), table.shape[0] - 1.001)
     k = int(row)
     t = row - k

@@ -1,6 +1,7 @@
 """Scores of a run of a simulated flight against its ground truth, as `velfield demo` prints them."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from velfield.synthetic.score import (
     score_registration,
     score_tracklets,
 )
+from velfield.synthetic.track_score import TrackScore, score_run_tracks, track_positions
 from velfield.synthetic.truth import load_truth
 
 _ANOTHER_BASE_PX = 30.0  # no registered frame is that far off its own base image
@@ -25,11 +27,18 @@ _ANOTHER_BASE_PX = 30.0  # no registered frame is that far off its own base imag
 
 @dataclass(frozen=True)
 class RunScore:
-    """All four scores of a run."""
+    """All scores of a run.
+
+    ``traffic_precision`` is the tracklets' precision without those of parked tracks; ``traffic`` scores the tracks that
+    are not parked against the vehicles that move at some time.
+    """
 
     registration: RegistrationScore
     detection: DetectionScore
     tracking: TrackletScore
+    tracks: TrackScore
+    traffic_precision: float
+    traffic: TrackScore
     field: FieldScore
 
     def text(self) -> str:
@@ -43,14 +52,23 @@ class RunScore:
                 f"  detections    precision {d.precision:.3f}, recall {d.recall:.3f}, "
                 f"recall of moving cars {d.recall_moving:.3f}, "
                 f"axis error {np.degrees(d.axis_error_median_rad):.1f} degrees (median)",
-                f"  tracklets     precision {t.precision:.3f} ({t.precision_on_vehicle:.3f} anywhere on a vehicle), "
+                f"  tracklets     precision {t.precision:.3f} ({t.precision_on_vehicle:.3f} anywhere on a vehicle; "
+                f"{self.traffic_precision:.3f} without what is parked), "
                 f"recall of moving cars {t.recall_moving:.3f}, "
-                f"speed error {t.speed_error_mean_km_per_h:.2f} km/h (mean), "
-                f"{t.tracks_per_vehicle:.2f} tracks a vehicle",
+                f"speed error {t.speed_error_mean_km_per_h:.2f} km/h (mean)",
+                f"  tracks        {_identity_text(self.tracks)}",
+                f"  traffic's     {_identity_text(self.traffic)}",
                 f"  field         modal direction within 10 degrees at {f.fraction_within:.1%} of "
                 f"{f.pixels} pixels with 5 or more vehicles; none at {f.undirected} where most are stationary",
             )
         )
+
+
+def _identity_text(score: TrackScore) -> str:
+    return (
+        f"{score.tracks_per_vehicle:.2f} a vehicle, IDF1 {score.idf1:.3f}, MOTA {score.mota:.3f}, "
+        f"{score.switches} identity switches"
+    )
 
 
 def score_run(root: str | Path, flight: str | Path, *, min_count: int = 5) -> RunScore:
@@ -83,10 +101,21 @@ def score_run(root: str | Path, flight: str | Path, *, min_count: int = 5) -> Ru
             f"{run.layout.root}: positions differ from those of {flight} by {registration.mean_px:.0f} px (mean): its "
             f"base image is another one; score a run with --base {Path(flight) / 'base.png'}, or with none"
         )
+    score_identity = partial(
+        score_run_tracks, truth, frame_of={frame: frame_of[frame] for frame in registered}, to_truth=to_truth
+    )
+    tracklets, vehicles, positions = run.tracklets(), run.vehicles(), run.track_positions()
+    if positions.empty:  # of an earlier release
+        positions = track_positions(tracklets)
+    in_traffic = vehicles.loc[vehicles["state"] != "parked", "track_id"]
+    traffic = tracklets[tracklets["track_id"].isin(in_traffic)]
     return RunScore(
         registration=registration,
         detection=score_detections(truth, run.detections(), frame_of=frame_of, to_truth=to_truth),
-        tracking=score_tracklets(truth, run.tracklets(), frame_of=frame_of, to_truth=to_truth),
+        tracking=score_tracklets(truth, tracklets, frame_of=frame_of, to_truth=to_truth),
+        tracks=score_identity(tracks=positions),
+        traffic_precision=score_tracklets(truth, traffic, frame_of=frame_of, to_truth=to_truth).precision,
+        traffic=score_identity(tracks=positions[positions["track_id"].isin(in_traffic)], moving_only=True),
         field=score_field(
             truth,
             velocity,

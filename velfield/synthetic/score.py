@@ -33,6 +33,7 @@ class RegistrationScore:
 
     ``jitter_px``: root mean square of the error about its mean over the frames at each position.
     ``drift_px``: change of the mean error from the first tenth of the frames to the last.
+    ``answered``: fraction of the points within the base image for which the run gives a position.
     """
 
     mean_px: float
@@ -43,6 +44,7 @@ class RegistrationScore:
     worst_frame_px: float
     frame_mean_px: FloatArray
     frames: int
+    answered: float
 
 
 @dataclass(frozen=True)
@@ -125,11 +127,13 @@ def score_registration(
     Points outside the base image by the truth are not evaluated, nor those where the run gives NaN.
     """
     grid = sample_grid(truth)
-    positions, errors, numbers = [], [], []
+    positions, errors, numbers, asked = [], [], [], 0
     for frame in frames:
         true = truth.to_base(frame, grid)
         error = apply_homography(to_truth, to_base(frame, grid)) - true
-        inside = (true >= 0).all(axis=1) & (true < truth.base_shape[::-1]).all(axis=1) & np.isfinite(error).all(axis=1)
+        inside = (true >= 0).all(axis=1) & (true < truth.base_shape[::-1]).all(axis=1)
+        asked += int(inside.sum())
+        inside &= np.isfinite(error).all(axis=1)
         positions.append(true[inside])
         errors.append(error[inside])
         numbers.append(np.full(int(inside.sum()), frame))
@@ -146,6 +150,7 @@ def score_registration(
         worst_frame_px=float(by_frame.max()),
         frame_mean_px=np.asarray(by_frame, dtype=np.float64),
         frames=len(by_frame),
+        answered=len(size) / asked,
     )
 
 
@@ -174,7 +179,7 @@ def score_detections(
     """Score detections (columns frame, x_px, y_px, orientation_rad; base px). ``frame_of``: run's frame -> flight's."""
     matches, n_detections, n_cars, n_moving = [], 0, 0, 0
     for frame, found in detections.groupby("frame"):
-        cars = _cars(truth, _flight_frame(frame, frame_of))
+        cars = cars_near_frame(truth, flight_frame(frame, frame_of))
         xy = apply_homography(to_truth, found[["x_px", "y_px"]].to_numpy(dtype=np.float64))
         pairs = _match(xy, cars[["x_base_px", "y_base_px"]].to_numpy(), match_px)
         evaluated = cars["evaluated"].to_numpy()
@@ -216,7 +221,7 @@ def score_tracklets(
     match_px: float = MATCH_PX,
 ) -> TrackletScore:
     """Score tracklets: correct if all three detections are nearest to one vehicle, within ``match_px`` of it."""
-    frames = [np.array([_flight_frame(f, frame_of) for f in tracklets[f"frame_{k}"]], dtype=np.int64) for k in range(3)]
+    frames = [np.array([flight_frame(f, frame_of) for f in tracklets[f"frame_{k}"]], dtype=np.int64) for k in range(3)]
     positions = [
         apply_homography(to_truth, tracklets[[f"x_{k}_px", f"y_{k}_px"]].to_numpy(np.float64)) for k in range(3)
     ]
@@ -298,12 +303,12 @@ def _direction_errors(truth: Truth, position: FloatArray, angle: FloatArray) -> 
     return errors
 
 
-def _flight_frame(frame: object, frame_of: Mapping[int, int] | None) -> int:
+def flight_frame(frame: object, frame_of: Mapping[int, int] | None) -> int:
     number = int(frame)  # type: ignore[call-overload]
     return number if frame_of is None else frame_of[number]
 
 
-def _cars(truth: Truth, frame: int) -> pd.DataFrame:
+def cars_near_frame(truth: Truth, frame: int) -> pd.DataFrame:
     """Cars within or near a frame, and whether they are ``evaluated``: visible, and not near its border."""
     cars = truth.cars[truth.cars["frame"] == frame]
     size = [truth.camera.width - 1, truth.camera.height - 1]
@@ -376,7 +381,7 @@ def _true_triples(truth: Truth, windows: list[tuple[int, int, int]]) -> set[tupl
     for window in set(windows):
         for frame in window:
             if frame not in evaluated:
-                cars = _cars(truth, frame)
+                cars = cars_near_frame(truth, frame)
                 evaluated[frame] = set(cars.loc[cars["evaluated"], "vehicle_id"].tolist())
                 moving[frame] = set(cars.loc[cars["evaluated"] & cars["moving"], "vehicle_id"].tolist())
         both = evaluated[window[0]] & evaluated[window[2]] & moving[window[1]]

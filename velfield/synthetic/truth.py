@@ -121,12 +121,12 @@ def save_truth(truth: Truth, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     truth.cars.to_parquet(folder / "cars.parquet", index=False)
     record = {"gsd_m": truth.gsd_m, "base_shape": list(truth.base_shape), "camera": _camera_record(truth.camera)}
-    (folder / "camera.json").write_text(json.dumps(record))
+    (folder / "camera.json").write_text(json.dumps(record), encoding="utf-8")
     lanes = [
         {"kind": lane.kind, "limit_px_per_s": lane.limit_px_per_s, "path_px": np.round(lane.path_px, 3).tolist()}
         for lane in truth.lanes
     ]
-    (folder / "lanes.json").write_text(json.dumps(lanes))
+    (folder / "lanes.json").write_text(json.dumps(lanes), encoding="utf-8")
 
 
 def load_truth(folder: Path) -> Truth:
@@ -140,10 +140,10 @@ def load_truth(folder: Path) -> Truth:
     inner = folder / "truth" if (folder / "truth").is_dir() else folder
     if not (inner / "camera.json").is_file():
         raise InputError(f"{folder} holds no truth/camera.json; make a flight with `velfield simulate {folder}`")
-    record = json.loads((inner / "camera.json").read_text())
+    record = json.loads((inner / "camera.json").read_text(encoding="utf-8"))
     lanes = [
         LanePath(lane["kind"], np.array(lane["path_px"]), lane["limit_px_per_s"])
-        for lane in json.loads((inner / "lanes.json").read_text())
+        for lane in json.loads((inner / "lanes.json").read_text(encoding="utf-8"))
     ]
     camera = _camera_from(record["camera"])
     height, width = record["base_shape"]
@@ -165,8 +165,8 @@ def _camera_from(record: dict[str, Any]) -> Camera:
     values = {_RENAMED.get(name, name): value for name, value in record.items()}
     for name, kind in (("motion", Waves), ("shake", Waves), ("relief", Relief)):
         values[name] = kind(**{key: np.array(array) for key, array in record[name].items()})
-    for name in ("position_px", "times_s"):
-        values[name] = np.array(values[name])
+    for name in ("position_px", "times_s", "lens_terms"):
+        values[name] = np.array(values.get(name, ()), dtype=np.float64)
     return Camera(**values)
 
 

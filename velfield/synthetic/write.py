@@ -1,7 +1,6 @@
 """Writing of a simulated flight as a user's input (frames, times, base image, labels), with the ground truth."""
 
-import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -12,9 +11,11 @@ from numpy.typing import NDArray
 
 from schemas.simulation import SimulationConfig
 from velfield.errors import InputError
+from velfield.synthetic.clip import open_clip, simulate_telemetry
 from velfield.synthetic.flight import Flight, simulate
 from velfield.synthetic.truth import make_truth, save_truth
 
+_RENDERED_AHEAD = 8
 WRITERS = 2
 """Threads that render and write; numba, OpenCV and NumPy release the interpreter lock."""
 
@@ -22,7 +23,7 @@ WRITERS = 2
 def write_flight(
     out: Path, config: SimulationConfig, progress: Callable[[int, int], None] | None = None, *, threads: int = WRITERS
 ) -> Flight:
-    """Write ``frames/``, ``timestamps.csv``, ``base.png``, ``labels.csv`` and ``truth/`` into ``out``.
+    """Write ``frames/`` or a clip, ``timestamps.csv``, ``base.png``, ``labels.csv`` and ``truth/`` into ``out``.
 
     Parameters
     ----------
@@ -46,18 +47,10 @@ def write_flight(
     if labels:
         pd.concat(labels)[columns].round(3).to_csv(out / "labels.csv", index=False)
     save_truth(make_truth(flight), out / "truth")
-    options = (
-        [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality]
-        if config.picture_format == "jpg"
-        else [cv2.IMWRITE_PNG_COMPRESSION, 1]
-    )
-
-    def one(k: int) -> None:
-        _write_image(out / "frames" / names[k], flight.frame(k), options)
-
+    write = _write_frames if config.clip == "none" else _write_clip
     with ThreadPoolExecutor(threads) as pool:
         try:
-            for done, _ in enumerate(pool.map(one, range(config.frames)), start=1):
+            for done, _ in enumerate(write(out, flight, names, pool), start=1):
                 if progress is not None:
                     progress(done, config.frames)
         except BaseException:  # Ctrl-C above all: cancel the frames that have not begun
@@ -66,8 +59,33 @@ def write_flight(
     return flight
 
 
+def _write_frames(out: Path, flight: Flight, names: list[str], pool: ThreadPoolExecutor) -> Iterator[None]:
+    config = flight.config
+    options = (
+        [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality]
+        if config.picture_format == "jpg"
+        else [cv2.IMWRITE_PNG_COMPRESSION, 1]
+    )
+    yield from pool.map(
+        lambda k: _write_image(out / "frames" / names[k], flight.frame(k), options), range(config.frames)
+    )
+
+
+def _write_clip(out: Path, flight: Flight, _names: list[str], pool: ThreadPoolExecutor) -> Iterator[None]:
+    config = flight.config
+    subtitles = simulate_telemetry(config, flight.camera, flight.base_shape)
+    with open_clip(out, config, flight.times_s, subtitles) as clip:
+        for first in range(0, config.frames, _RENDERED_AHEAD):  # encoding is in order: only a few frames wait for it
+            part = range(first, min(first + _RENDERED_AHEAD, config.frames))
+            for frame, grey in zip(part, pool.map(flight.frame, part), strict=True):
+                clip.write(frame, grey)
+                yield
+
+
 def frame_name(index: int, config: SimulationConfig) -> str:
-    """File name of a frame; sorts naturally and alphabetically."""
+    """File name of a frame; sorts naturally and alphabetically. Of a clip, its index."""
+    if config.clip != "none":
+        return str(index)
     return f"{index:05d}.{config.picture_format}"
 
 
@@ -82,10 +100,10 @@ def _claim(out: Path, config: SimulationConfig) -> None:
     if out.exists() and any(out.iterdir()):
         if not record.is_file():
             raise InputError(f"{out} holds other files; name an empty or new folder for the simulated flight")
-        if json.loads(record.read_text()) != config.model_dump(mode="json"):
+        if SimulationConfig.model_validate_json(record.read_text(encoding="utf-8")) != config:
             raise InputError(f"{out} holds a flight of another configuration (simulation.json); name a new folder")
-    (out / "frames").mkdir(parents=True, exist_ok=True)
-    record.write_text(config.model_dump_json(indent=1))
+    (out if config.clip != "none" else out / "frames").mkdir(parents=True, exist_ok=True)
+    record.write_text(config.model_dump_json(indent=1), encoding="utf-8")
 
 
 def _write_image(path: Path, image: NDArray[np.uint8], options: list[int]) -> None:

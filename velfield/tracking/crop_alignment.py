@@ -17,6 +17,7 @@ robust weights 0.17-0.19. A link that does not align keeps the displacement of t
 deviation.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,8 @@ CAR_WIDTH_PX = 6.0
 """Rectangle that lies on a car, working px, of the paper's 16 x 8."""
 TAPER_PX = 2.0
 """Width over which the weights fall to zero outside the rectangle, working px."""
+_CAR_REACH_PX = math.ceil(math.hypot(CAR_LENGTH_PX / 2 + TAPER_PX, CAR_WIDTH_PX / 2 + TAPER_PX))
+"""No pixel farther from the centre than this has weight."""
 BLUR_SIGMA_PX = 0.5
 """Standard deviation of the blur of both crops before alignment, working px."""
 MAX_SHIFT_PX = 6
@@ -142,19 +145,23 @@ def align_crops(
 @njit(cache=True, nogil=True)
 def _blur(crop, taps):  # type: ignore[no-untyped-def]
     """Separable blur, edge values repeated."""
-    side = crop.shape[0]
-    radius = taps.size // 2
-    rows = np.zeros((side, side))
-    out = np.zeros((side, side))
+    side, radius = crop.shape[0], taps.size // 2
+    line = np.empty(side + 2 * radius)
+    rows, out = np.zeros((side + 2 * radius, side)), np.zeros((side, side))
     for y in range(side):
-        for x in range(side):
-            for k in range(taps.size):
-                rows[y, x] += taps[k] * crop[y, min(max(x + k - radius, 0), side - 1)]
+        for x in range(side + 2 * radius):
+            line[x] = crop[y, min(max(x - radius, 0), side - 1)]
+        for k in range(np.uint64(taps.size)):
+            tap = taps[k]
+            for x in range(np.uint64(side)):
+                rows[y + radius, x] += tap * line[x + k]
+    for y in range(radius):
+        rows[y], rows[side + radius + y] = rows[radius], rows[side + radius - 1]
     for y in range(side):
         for k in range(taps.size):
-            row = min(max(y + k - radius, 0), side - 1)
+            tap = taps[k]
             for x in range(side):
-                out[y, x] += taps[k] * rows[row, x]
+                out[y, x] += tap * rows[y + k, x]
     return out
 
 
@@ -184,8 +191,9 @@ def _car_pixels(weight):  # type: ignore[no-untyped-def]
     rows = np.empty(side * side, np.int64)
     columns = np.empty(side * side, np.int64)
     n = 0
-    for y in range(1, side - 1):
-        for x in range(1, side - 1):
+    first, last = max(1, side // 2 - _CAR_REACH_PX), min(side - 1, side // 2 + _CAR_REACH_PX + 1)
+    for y in range(first, last):
+        for x in range(first, last):
             if weight[y, x] > 0:
                 rows[n], columns[n] = y, x
                 n += 1
@@ -195,21 +203,39 @@ def _car_pixels(weight):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _integer_shift(template, image, weight, image_weight, rows, columns):  # type: ignore[no-untyped-def]
     """Integer shift of minimum mean absolute difference over the pixels on the car in both."""
-    side = template.shape[0]
     best, best_x, best_y = np.inf, 0, 0
-    min_weight = 0.125 * np.sum(weight)
+    min_weight, most = 0.125 * np.sum(weight), 0.0
+    for i in range(0, rows.size, 2):
+        most += weight[rows[i], columns[i]]
+    # Whatever is farther off than no shift is given up half-way: it cannot be the least.
+    total, weights = _absolute_differences(template, image, weight, image_weight, rows, columns, 0, 0, np.inf)
+    limit = most * total / weights if weights > min_weight else np.inf
     for dy in range(-MAX_SHIFT_PX, MAX_SHIFT_PX + 1):
         for dx in range(-MAX_SHIFT_PX, MAX_SHIFT_PX + 1):
-            total, weights = 0.0, 0.0
-            for i in range(0, rows.size, 2):  # half of the pixels suffices here; the alignment takes all
-                y, x = rows[i] + dy, columns[i] + dx
-                if 0 <= y < side and 0 <= x < side:
-                    w = min(weight[rows[i], columns[i]], image_weight[y, x])
-                    total += w * abs(image[y, x] - template[rows[i], columns[i]])
-                    weights += w
+            total, weights = _absolute_differences(
+                template, image, weight, image_weight, rows, columns, dx, dy, min(limit, most * best) + 1e-6
+            )
             if weights > min_weight and total < best * weights:
                 best, best_x, best_y = total / weights, dx, dy
     return best_x, best_y
+
+
+@njit(cache=True, nogil=True)
+def _absolute_differences(template, image, weight, image_weight, rows, columns, dx, dy, limit):  # type: ignore[no-untyped-def]
+    """Weighted sum of absolute differences at a shift, and the sum of the weights, over half of the pixels, which
+    suffices here; infinite as soon as it exceeds a limit."""
+    side = template.shape[0]
+    total, weights = 0.0, 0.0
+    for i in range(0, rows.size, 2):
+        y, x = rows[i] + dy, columns[i] + dx
+        if 0 <= y < side and 0 <= x < side:
+            here_y, here_x, there_y, there_x = np.uint64(rows[i]), np.uint64(columns[i]), np.uint64(y), np.uint64(x)
+            w = min(weight[here_y, here_x], image_weight[there_y, there_x])
+            total += w * abs(image[there_y, there_x] - template[here_y, here_x])
+            weights += w
+            if total > limit:
+                return np.inf, weights
+    return total, weights
 
 
 @njit(cache=True, nogil=True)
@@ -232,36 +258,79 @@ def _differences(template, image, weight, image_weight, rows, columns, u, v, nea
     cx, cy = _cubic(u - ix), _cubic(v - iy)
     n = 0
     for i in range(rows.size):
-        y, x = rows[i], columns[i]
-        row, column = y + iy - 1, x + ix - 1
+        row, column = rows[i] + iy - 1, columns[i] + ix - 1
         if row < 0 or column < 0 or row + 3 >= side or column + 3 >= side:
             continue
-        near_y, near_x = min(max(y + near[1], 0), side - 1), min(max(x + near[0], 0), side - 1)
-        w = min(weight[y, x], image_weight[near_y, near_x])
+        near_y, near_x = min(max(rows[i] + near[1], 0), side - 1), min(max(columns[i] + near[0], 0), side - 1)
+        # Unsigned, which spares numba its check for negative indices.
+        y, x, one = np.uint64(rows[i]), np.uint64(columns[i]), np.uint64(1)
+        w = min(weight[y, x], image_weight[np.uint64(near_y), np.uint64(near_x)])
         if w <= 0:
             continue
-        value = 0.0
+        value, first = 0.0, np.uint64(column)
         for k in range(4):
+            line = np.uint64(row + k)
             value += cy[k] * (
-                cx[0] * image[row + k, column]
-                + cx[1] * image[row + k, column + 1]
-                + cx[2] * image[row + k, column + 2]
-                + cx[3] * image[row + k, column + 3]
+                cx[0] * image[line, first]
+                + cx[1] * image[line, first + one]
+                + cx[2] * image[line, first + one + one]
+                + cx[3] * image[line, first + one + one + one]
             )
         out[n, 0] = value - template[y, x]
-        out[n, 1] = 0.5 * (template[y, x + 1] - template[y, x - 1])
-        out[n, 2] = 0.5 * (template[y + 1, x] - template[y - 1, x])
+        out[n, 1] = 0.5 * (template[y, x + one] - template[y, x - one])
+        out[n, 2] = 0.5 * (template[y + one, x] - template[y - one, x])
         out[n, 3] = w
         n += 1
     return n
 
 
 @njit(cache=True, nogil=True)
+def _median(values):  # type: ignore[no-untyped-def]
+    """Median by Hoare's selection, as numpy's but without its copies; the order of the values changes."""
+    half = values.size // 2
+    _select(values, half)
+    upper = values[half]
+    if values.size % 2:
+        return upper
+    lower = values[0]
+    for i in range(1, half):
+        lower = max(lower, values[i])
+    return (lower + upper) * 0.5
+
+
+@njit(cache=True, nogil=True)
+def _select(values, k):  # type: ignore[no-untyped-def]
+    """Reorder so that the k-th smallest value stands at its place, none greater before and none smaller after it."""
+    low, high = 0, values.size - 1
+    while low < high:
+        pivot = values[(low + high) // 2]
+        i, j = low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if k <= j:
+            high = j
+        elif k >= i:
+            low = i
+        else:
+            return
+
+
+@njit(cache=True, nogil=True)
 def _step(samples):  # type: ignore[no-untyped-def]
     """One robust Gauss-Newton step with the brightness offset eliminated: (step x, step y, variance); NaN where it is
     underdetermined."""
-    middle = np.median(samples[:, 0])
-    spread = 1.4826 * np.median(np.abs(samples[:, 0] - middle)) + 1.0
+    scratch = samples[:, 0].copy()
+    middle = _median(scratch)
+    for i in range(samples.shape[0]):
+        scratch[i] = abs(samples[i, 0] - middle)
+    spread = 1.4826 * _median(scratch) + 1.0
     s = sx = sy = sd = xx = xy = yy = xd = yd = dd = 0.0
     for i in range(samples.shape[0]):
         d, gx, gy = samples[i, 0] - middle, samples[i, 1], samples[i, 2]

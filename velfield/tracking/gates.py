@@ -11,12 +11,12 @@ Limits of the gates in base pixels and seconds, and the counts of candidates tha
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numba import njit
 
-from schemas.arrays import FloatArray, IntArray
+from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.flight import PAPER_GSD_M, TrackingConfig
 
 
@@ -134,6 +134,11 @@ class DetectionStates:
     axis_sd_rad: FloatArray
     sd_px: float
     time_s: float
+
+    def take(self, rows: IntArray) -> "DetectionStates":
+        """Those of some detections, in this order; one may come more than once."""
+        columns = {name: getattr(self, name)[rows] for name in ("x_px", "y_px", "axis_rad", "axis_sd_rad")}
+        return replace(self, **columns)
 
 
 @dataclass(frozen=True)
@@ -320,6 +325,16 @@ def gate_link_pairs(
         ),
     )
     return LinkPairs(link_01, link_12, cost, (int(rejected[0]), int(rejected[1]), int(rejected[2])))
+
+
+def triples_pass(states: tuple[DetectionStates, DetectionStates, DetectionStates], limits: Limits) -> Mask:
+    """(n,) whether each of n chosen triples, row i of all three states, passes every gate of a tracklet."""
+    before, after = gate_links(states[0], states[1], limits), gate_links(states[1], states[2], limits)
+    pairs = gate_link_pairs(states, before, after, limits)
+    first, middle = before.first[pairs.link_01], before.second[pairs.link_01]
+    passes = np.zeros(states[0].x_px.size, np.bool_)
+    passes[first[(first == middle) & (middle == after.second[pairs.link_12])]] = True
+    return passes
 
 
 TYPICAL_ACCELERATION_FRACTION = 0.1

@@ -1,1 +1,1 @@
-"""The viewer: the data of a run's page, and the two servers, to view and to annotate."""
+"""The viewer: the data of a run's page, and the servers, to view, to annotate and to georeference."""

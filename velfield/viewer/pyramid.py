@@ -9,6 +9,8 @@ from schemas.arrays import GreyImage
 from velfield.errors import InputError
 
 TILE_PX = 512
+OVERLAP_PX = 1
+"""Of a tile over its right and lower neighbours: edges at fractions of a screen pixel would show as seams."""
 _QUALITY = 88
 
 
@@ -36,7 +38,10 @@ def pyramid_tiles(grey: GreyImage) -> Iterator[tuple[str, bytes]]:
         for row in range(-(-image.shape[0] // TILE_PX)):
             for column in range(-(-image.shape[1] // TILE_PX)):
                 y, x = row * TILE_PX, column * TILE_PX
-                yield f"{level}/{row}-{column}.jpg", _jpeg(image[y : y + TILE_PX, x : x + TILE_PX])
+                yield (
+                    f"{level}/{row}-{column}.jpg",
+                    _jpeg(image[y : y + TILE_PX + OVERLAP_PX, x : x + TILE_PX + OVERLAP_PX]),
+                )
 
 
 def _jpeg(grey: GreyImage) -> bytes:

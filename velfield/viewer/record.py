@@ -3,6 +3,8 @@
     run.json         sizes, units, the list of layers, which chunks are stored
     base/            the base image as JPEG tiles
     segments.zarr    vehicles from one frame to the next, for the line tool and the tracks under the cursor
+    replay/          positions of the vehicles, ten seconds a file, for the replay
+    flow.bin         velocities drawn from the field, for the flow animation
     change.zarr      the change since another run, written by `velfield compare`
 
 `write_view` makes all of it from the run folder.
@@ -16,17 +18,20 @@ import numpy as np
 
 from schemas.arrays import FloatArray
 from schemas.records import FlightRecord, GridRecord
-from schemas.view import ViewArray, ViewBase, ViewLayer, ViewRecord, ViewSegments
+from schemas.view import ViewArray, ViewBase, ViewFlow, ViewLayer, ViewRecord, ViewReplay, ViewSegments
 from velfield.analysis.coverage import low_coverage_note
 from velfield.analysis.crossings import hysteresis_px
+from velfield.analysis.vehicles import STATES
 from velfield.field.segments import Segments, band_radius_px, stationary_speed_px_per_s
-from velfield.run.commits import write_atomically
+from velfield.run.commits import record_page, write_atomically
 from velfield.run.frame_transforms import north_direction_rad
 from velfield.run.layout import RunLayout, remove_tree
-from velfield.run.run import open_run
+from velfield.run.run import Run, open_run
 from velfield.run.stores import HISTOGRAM, FieldStore, open_field, write_extra_layers, write_segments
+from velfield.viewer.flow import DRAWS, cell_side, flow_bytes
 from velfield.viewer.layers import view_layers
-from velfield.viewer.pyramid import TILE_PX, pyramid_levels, pyramid_tiles
+from velfield.viewer.pyramid import OVERLAP_PX, TILE_PX, pyramid_levels, pyramid_tiles
+from velfield.viewer.replay import CHUNK_S, chunk_count, position_step, replay_chunks, vehicle_paths
 
 _LINE_RADIUS_PX = 1.5
 """Around a path that is one pixel wide."""
@@ -53,8 +58,39 @@ def write_view_data(layout: RunLayout) -> list[Path]:
         path = layout.view / "base" / name
         write_atomically(path, data)
         written.append(path)
-    write_segments(layout.view_segments, _columns(run.segments()))
-    return written + sorted(path for path in layout.view_segments.rglob("*") if path.is_file())
+    segments = run.segments()
+    write_segments(layout.view_segments, _columns(segments))
+    written += sorted(path for path in layout.view_segments.rglob("*") if path.is_file())
+    return written + _write_animations(run, segments)
+
+
+def _write_animations(run: Run, segments: Segments) -> list[Path]:
+    """Write what the page animates: the tracks, and draws from the field."""
+    grid, view = run.grid, run.layout.view
+    vehicles = run.vehicles()
+    first_s, last_s = _span(run.times_s)
+    chunks = replay_chunks(
+        vehicle_paths(segments, (vehicles["state"] == "parked").to_numpy()),
+        vehicles,
+        first_time_s=first_s,
+        duration_s=last_s - first_s,
+        step_px=position_step(grid.width_px, grid.height_px),
+    )
+    remove_tree(view / "replay")  # of an earlier, longer run
+    files = {view / "replay" / f"{k}.bin": content for k, content in enumerate(chunks)}
+    slow = stationary_speed_px_per_s(run.record.config.field, grid.gsd_m)
+    files[view / "flow.bin"] = flow_bytes(
+        open_field(run.layout.field), gsd_m=grid.gsd_m, stationary_speed_px_per_s=slow
+    )
+    for path, content in files.items():
+        write_atomically(path, content)
+    return list(files)
+
+
+def _span(times_s: FloatArray) -> tuple[float, float]:
+    """First and last known time; zeros where none is."""
+    known_s = times_s[np.isfinite(times_s)]
+    return (float(known_s[0]), float(known_s[-1])) if len(known_s) else (0.0, 0.0)
 
 
 def write_view_record(layout: RunLayout) -> None:
@@ -71,6 +107,7 @@ def write_change_layers(layout: RunLayout, layers: Mapping[str, tuple[FloatArray
     """Write layers of change into a run's view: name -> (y, x) values, NaN where not significant, and attributes."""
     write_extra_layers(layout.view_changes, layers)
     write_view_record(layout)
+    record_page(layout)
 
 
 def view_record(
@@ -83,18 +120,18 @@ def view_record(
     """``view/run.json`` of a run with these stores of layers, by their paths; the field is the first."""
     store = next(iter(stores.values()))
     count = store.layer("count")
-    known_s = times_s[np.isfinite(times_s)]
+    first_s, last_s = _span(times_s)
     return ViewRecord(
         width_px=grid.width_px,
         height_px=grid.height_px,
         gsd_m=grid.gsd_m,
         north_rad=north_direction_rad(grid),
         stationary_speed_px_per_s=stationary_speed_px_per_s(flight.config.field, grid.gsd_m),
-        first_time_s=float(known_s[0]) if len(known_s) else 0.0,
-        last_time_s=float(known_s[-1]) if len(known_s) else 0.0,
+        first_time_s=first_s,
+        last_time_s=last_s,
         bin_width_px_per_s=float(store.attributes["bin_width_px_per_s"]),
         bins=len(store.velocities()),
-        base=ViewBase(levels=pyramid_levels(grid.height_px, grid.width_px), tile=TILE_PX),
+        base=ViewBase(levels=pyramid_levels(grid.height_px, grid.width_px), tile=TILE_PX, overlap=OVERLAP_PX),
         layers=tuple(layer for each in stores.values() for layer in _layers(each)),
         arrays={name: array for path, each in stores.items() for name, array in _arrays(path, each).items()},
         segments=ViewSegments(
@@ -103,6 +140,13 @@ def view_record(
             hysteresis_px=hysteresis_px(grid.gsd_m),
             band_radius_px=band_radius_px(flight.config.field, grid.gsd_m) or _LINE_RADIUS_PX,
         ),
+        replay=ViewReplay(
+            chunk_s=CHUNK_S,
+            chunks=chunk_count(last_s - first_s),
+            step_px=position_step(grid.width_px, grid.height_px),
+            states=STATES,
+        ),
+        flow=ViewFlow(cell_px=cell_side(store.shape, grid.gsd_m), draws=DRAWS),
         low_coverage_note=low_coverage_note(int((count > 0).sum()), int((count >= 5).sum())),
     )
 

@@ -20,10 +20,14 @@ from velfield.detection.cascade.feature_image import COARSE, compute_features
 from velfield.detection.cascade.fitting import train_cascade
 from velfield.detection.cascade.training import CONTRAST_FLOOR
 from velfield.detection.detector import Detections, Detector
+from velfield.detection.frame import SearchableFrame, whole_frame
 from velfield.detection.orientation import CAR_ASPECT
 from velfield.detection.samples import LabelledImage
 from velfield.detection.unlabelled import UnlabelledFlight, with_motion_threshold
 from velfield.errors import InputError
+
+_WEAK_MARGIN = 0.5
+"""Of the difference between a typical car's score and the threshold."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,12 @@ class CascadeDetector(Detector):
         """Whether any round reads the channel |frame - background|."""
         return any(one.channel == 3 for one in self.record.rounds)
 
+    @property
+    def weak_margin(self) -> float:
+        """A part of what lies between the threshold and a typical car's score."""
+        above = _median_car_score(self) - self.threshold
+        return _WEAK_MARGIN * max(above, 0.0) if np.isfinite(above) else 0.0
+
     def detect(
         self,
         image: GreyImage,
@@ -58,7 +68,7 @@ class CascadeDetector(Detector):
     ) -> Detections:
         """Detect cars: proposals, the classifier on them, non-maximum suppression, long vehicles centred."""
         found = self.find(image, valid, background, threshold=threshold)
-        return self.refine(image, valid, found)
+        return self.refine(whole_frame(image, valid), found)
 
     def find(
         self,
@@ -87,11 +97,9 @@ class CascadeDetector(Detector):
         length_px = record.working_car_length_px
         return Detections.from_rows(rows, np.full(len(rows), length_px * length_px * CAR_ASPECT))
 
-    def refine(
-        self, image: GreyImage, valid: Mask | None, found: Detections, kept: Detections | None = None
-    ) -> Detections:
+    def refine(self, frame: SearchableFrame, found: Detections, kept: Detections | None = None) -> Detections:
         """Non-maximum suppression; long vehicles centred."""
-        return suppress_and_centre(image, valid, found, kept, self.record.working_car_length_px)
+        return suppress_and_centre(frame, found, kept, self.record.working_car_length_px)
 
     @classmethod
     def train(

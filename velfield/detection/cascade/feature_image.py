@@ -274,25 +274,44 @@ class FeatureImage:
 
 def compute_features(image: GreyImage, background: GreyImage | None = None, scale: PatchScale = FINE) -> FeatureImage:
     """Channels of an image (h, w) and, where there is one, of its difference to the background."""
-    grey, window = _smooth(image, scale), np.ones((3, 3), np.uint8)
-    zero = GRADIENT_ZERO
-    gx, gy = (np.asarray(cv2.Sobel(grey, cv2.CV_16S, 1 - k, k) // 2 + zero, np.uint32) for k in (0, 1))
-    words = grey | gx << np.uint32(8) | gy << np.uint32(18)
+    return features_of_reduced(_reduce(image, scale), None if background is None else _reduce(background, scale), scale)
+
+
+def features_of_reduced(image: GreyImage, background: GreyImage | None, scale: PatchScale) -> FeatureImage:
+    """The same of images that have the scale's resolution already."""
+    grey, window = _smooth(image), np.ones((3, 3), np.uint8)
+    gx, gy = (cv2.Sobel(grey, cv2.CV_16S, 1 - k, k) for k in (0, 1))
+    words = _pack_words(grey, gx, gy)
     difference = np.zeros(1, np.uint8)
     if background is not None:
-        ground = _smooth(background, scale)
+        ground = _smooth(background)
         # Outside the range within a pixel, not |grey - background|: half a pixel of jitter lights up every roof's edge.
         low, high = cv2.erode(ground, window), cv2.dilate(ground, window)
         difference = np.maximum(cv2.subtract(grey, high), cv2.subtract(low, grey))
     return FeatureImage(scale, words.ravel(), difference.ravel(), grey.shape[1], 3 if background is None else 4)
 
 
-def _smooth(image: GreyImage, scale: PatchScale) -> GreyImage:
+@njit(cache=True, nogil=True)
+def _pack_words(grey, gx, gy):  # type: ignore[no-untyped-def]
+    """Grey, and half of each gradient above its zero, in one word a pixel."""
+    words = np.empty(grey.shape, np.uint32)
+    for y in range(grey.shape[0]):
+        for x in range(grey.shape[1]):
+            along, across = np.uint32((gx[y, x] >> 1) + GRADIENT_ZERO), np.uint32((gy[y, x] >> 1) + GRADIENT_ZERO)
+            words[y, x] = np.uint32(grey[y, x]) | along << np.uint32(8) | across << np.uint32(18)
+    return words
+
+
+def _reduce(image: GreyImage, scale: PatchScale) -> GreyImage:
     height, width = image.shape
-    if scale.step > 1:
-        image = np.pad(image, ((0, -height % scale.step), (0, -width % scale.step)), mode="edge")
-        size = image.shape[1] // scale.step, image.shape[0] // scale.step
-        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    if scale.step == 1:
+        return image
+    image = np.pad(image, ((0, -height % scale.step), (0, -width % scale.step)), mode="edge")
+    size = image.shape[1] // scale.step, image.shape[0] // scale.step
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _smooth(image: GreyImage) -> GreyImage:
     padded = cv2.copyMakeBorder(image, PAD_PX, PAD_PX, PAD_PX, PAD_PX, cv2.BORDER_REPLICATE)
     return np.asarray(cv2.GaussianBlur(padded, (0, 0), SMOOTHING_SIGMA_PX), np.uint8)
 

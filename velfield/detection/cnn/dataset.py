@@ -189,10 +189,8 @@ def encode_targets(centres: FloatArray, orientation_rad: FloatArray) -> tuple[Fl
     """
     size = len(_HEATMAP_PX)
     heatmap, orientation = np.zeros((size, size), np.float32), np.zeros((size, size, 2), np.float32)
-    for (x, y), angle in zip(centres, orientation_rad, strict=True):
-        low, high = -_TARGET_MARGIN_PX, PATCH_PX + _TARGET_MARGIN_PX
-        if not (low < x < high and low < y < high):
-            continue
+    near = ((centres > -_TARGET_MARGIN_PX) & (centres < PATCH_PX + _TARGET_MARGIN_PX)).all(axis=1)
+    for (x, y), angle in zip(centres[near], orientation_rad[near], strict=True):
         squared_distance = (_HEATMAP_PX[None, :] - x) ** 2 + (_HEATMAP_PX[:, None] - y) ** 2
         gaussian = np.exp(-squared_distance / (2 * HEATMAP_SIGMA_PX**2)).astype(np.float32)
         nearest = gaussian > heatmap

@@ -23,12 +23,15 @@ from velfield.detection.cnn.model import (
 )
 from velfield.detection.cnn.self_training import self_train_from_motion
 from velfield.detection.detector import Detections, Detector, shipped_detector, train_detector
+from velfield.detection.frame import SearchableFrame, whole_frame
 from velfield.detection.orientation import CAR_ASPECT
 from velfield.detection.samples import LabelledImage
 from velfield.detection.unlabelled import UnlabelledFlight
 
 _FRAMES = 12
 """Frames that the self-training samples."""
+_WEAK_MARGIN = 0.2
+"""Below the threshold: in a simulated city a fifth more candidates, among them most cars that are not detected."""
 _MIN_VEHICLES = 20
 """With fewer moving vehicles the network would overfit to these."""
 
@@ -52,6 +55,11 @@ class CnnDetector(Detector):
         """Whether a detection that differs from the background has a bonus on its score."""
         return self.record.motion is not None
 
+    @property
+    def weak_margin(self) -> float:
+        """In terms of probability."""
+        return _WEAK_MARGIN
+
     def detect(
         self,
         image: GreyImage,
@@ -62,7 +70,7 @@ class CnnDetector(Detector):
     ) -> Detections:
         """Detect cars: peaks of the heatmap, the motion bonus, non-maximum suppression, long vehicles centred."""
         found = self._find(image, valid, background, threshold, border_px=BORDER_PX)
-        return self.refine(image, valid, found)
+        return self.refine(whole_frame(image, valid), found)
 
     def find(
         self,
@@ -89,14 +97,12 @@ class CnnDetector(Detector):
         if motion is not None and background is not None:
             difference = background_difference_at(image, background, rows[:, :2], length_px)
             rows[:, 3] += motion_score_bonus(motion, difference)
-        above = rows[rows[:, 3] > (self.threshold if threshold is None else threshold)]
+        above = rows[rows[:, 3] > (self.threshold if threshold is None else threshold)] if len(rows) else rows
         return Detections.from_rows(above, np.full(len(above), length_px * length_px * CAR_ASPECT))
 
-    def refine(
-        self, image: GreyImage, valid: Mask | None, found: Detections, kept: Detections | None = None
-    ) -> Detections:
+    def refine(self, frame: SearchableFrame, found: Detections, kept: Detections | None = None) -> Detections:
         """Non-maximum suppression; long vehicles centred."""
-        return suppress_and_centre(image, valid, found, kept, self.record.working_car_length_px)
+        return suppress_and_centre(frame, found, kept, self.record.working_car_length_px)
 
     @classmethod
     def train(cls, samples: Sequence[LabelledImage], config: CnnConfig, *, base: Detector | None = None) -> Detector:

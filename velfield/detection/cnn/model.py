@@ -29,10 +29,10 @@ import onnx
 import onnxruntime as ort
 from onnx import TensorProto, helper, numpy_helper
 
-from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
+from schemas.arrays import Float32Array, FloatArray, GreyImage, Mask
 from schemas.detector import LayerRecord, MotionRecord
 from schemas.flight import Device
-from velfield.detection.cascade.classifier import in_view, offset_along_axis
+from velfield.detection.cnn.peaks import SMOOTHING_SIGMA, are_mostly_visible, find_peaks
 from velfield.detection.orientation import sample_nearest
 from velfield.errors import InputError
 
@@ -196,6 +196,11 @@ def use_device(device: Device) -> None:
     """Set where the networks of this process are run that have not been run yet."""
     global _device
     _device = device
+
+
+def current_device() -> Device:
+    """What `use_device` set."""
+    return _device
 
 
 def check_device(device: Device) -> None:
@@ -447,7 +452,10 @@ def predict_heatmap(
     whole = unit * -(-height // unit), unit * -(-width // unit)
     side = [unit * -(-size // (unit * -(-size // _TILE_PX))) for size in whole]
     end = [border_px + size - given for size, given in zip(whole, image.shape, strict=True)]
-    padded = cv2.copyMakeBorder(image, border_px, end[0], border_px, end[1], _BORDER)
+    padded = cv2.copyMakeBorder(image, border_px, end[0], border_px, end[1], _BORDER) if any(end) else image
+    if len(range(0, whole[0], side[0])) == len(range(0, whole[1], side[1])) == 1 and not border_px:
+        of_image = forward(network, padded[None])
+        return of_image[0][0][: -(-height // STRIDE), : -(-width // STRIDE)], of_image[1][0]
     probability = np.empty((whole[0] // STRIDE, whole[1] // STRIDE), np.float32)
     orientation = np.empty((2, *probability.shape), np.float32)
     for y in range(0, whole[0], side[0]):
@@ -468,12 +476,9 @@ def predict_heatmap(
 SCORE_OFFSET = 0.35
 """Probability predicted where a candidate is as often a car as not: around centres the loss lets the network predict
 less than it should. Scores are probabilities less this."""
-_SMOOTHING_SIGMA = 0.8
-"""Of the heatmap, in its pixels."""
 _MIN_PEAK_PROBABILITY = 0.2
 MIN_SCORE = _MIN_PEAK_PROBABILITY - SCORE_OFFSET
 """Hardly any detection scores lower."""
-_QUARTER_CAR_PX = 4.0
 NO_TTA = 1.0, 1.0
 """No test-time augmentation (TTA), as in the shipped detector: on unseen images it scored cars no better (F1 0.900 in
 place of 0.907 on the minsk clip), at three times the cost."""
@@ -506,16 +511,10 @@ def detect_cars(
     of the orientation, rad.
     """
     probability, orientation = predict_heatmap(network, image, border_px=border_px)
-    smooth = cv2.GaussianBlur(probability, (0, 0), _SMOOTHING_SIGMA)
-    peak = (smooth >= cv2.dilate(smooth, np.ones((3, 3), np.uint8))) & (smooth > _MIN_PEAK_PROBABILITY)
-    if valid is not None:
-        peak &= valid[::STRIDE, ::STRIDE]
-    y, x = np.nonzero(peak)
-    if not len(x):
+    peaks = find_peaks(probability, orientation, valid, stride=STRIDE, min_probability=_MIN_PEAK_PROBABILITY)
+    if not len(peaks):
         return np.empty((0, 5))
-    xy = (np.column_stack([x, y]) + _subpixel_peak_offset(smooth, y, x)) * STRIDE + (STRIDE - 1) / 2
-    vector = orientation[:, y, x].T.astype(np.float64)
-    score = smooth[y, x].astype(np.float64)
+    xy, vector, score = peaks[:, :2], peaks[:, 2:4].copy(), peaks[:, 4].copy()
     unsure = np.flatnonzero((score > tta_range[0]) & (score < tta_range[1]))
     if len(unsure):
         axis = 0.5 * np.arctan2(vector[unsure, 1], vector[unsure, 0])
@@ -526,7 +525,7 @@ def detect_cars(
     resultant = np.clip(np.hypot(vector[:, 0], vector[:, 1]), 1e-3, 1 - 1e-3)
     axis = np.mod(0.5 * np.arctan2(vector[:, 1], vector[:, 0]), np.pi)
     detections = np.column_stack([xy, axis, score - SCORE_OFFSET, 0.5 * np.sqrt(-2 * np.log(resultant))])
-    return detections[_is_mostly_visible(detections, image.shape, valid)]
+    return detections[are_mostly_visible(detections, image.shape, valid)]
 
 
 def background_difference_at(
@@ -545,24 +544,6 @@ def motion_score_bonus(motion: MotionRecord, difference: FloatArray) -> FloatArr
     ramp = motion.bonus_ramp_end - motion.bonus_ramp_start
     fraction = (difference - motion.bonus_ramp_start) / ramp
     return motion.max_score_bonus * np.clip(fraction, 0.0, 1.0)
-
-
-def _is_mostly_visible(cars: FloatArray, shape: tuple[int, int], valid: Mask | None) -> Mask:
-    """Whether three quarters of a car lie in the frame: the centre of a car that is truncated more is unreliable."""
-    visible = np.ones(len(cars), bool)
-    for along in (-_QUARTER_CAR_PX, _QUARTER_CAR_PX):
-        visible &= in_view(offset_along_axis(cars[:, :2], cars[:, 2], np.array([[along, 0.0]])), shape, valid)
-    return visible
-
-
-def _subpixel_peak_offset(values: Float32Array, y: IntArray, x: IntArray) -> FloatArray:
-    """Offset (n, 2), right and down, of the peak of a parabola through the logarithms of a pixel and its neighbours."""
-    log = np.log(np.maximum(np.pad(values, 1, mode="edge"), 1e-6)).astype(np.float64)
-    centre, offset = log[y + 1, x + 1], []
-    for down, right in ((0, 1), (1, 0)):
-        before, after = log[y + 1 - down, x + 1 - right], log[y + 1 + down, x + 1 + right]
-        offset.append(np.clip((after - before) / (2 * np.maximum(2 * centre - before - after, 1e-6)), -0.5, 0.5))
-    return np.column_stack(offset)
 
 
 def _predict_rotated_crops(
@@ -591,7 +572,7 @@ def _predict_rotated_crops(
 def _read_centre(heatmaps: Float32Array, vectors: Float32Array, rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Highest smoothed probability within a pixel of the crops' centre, and the orientation vector at the centre."""
     window = heatmaps[:, _CENTRE - 3 : _CENTRE + 4, _CENTRE - 3 : _CENTRE + 4].astype(np.float64)
-    kernel = cv2.getGaussianKernel(5, _SMOOTHING_SIGMA)[:, 0]
+    kernel = cv2.getGaussianKernel(5, SMOOTHING_SIGMA)[:, 0]
     rows = sum(kernel[k] * window[:, k : k + 3] for k in range(5))
     smooth = sum(kernel[k] * rows[:, :, k : k + 3] for k in range(5))
     probability = np.asarray(smooth).max(axis=(1, 2)).reshape(rotations.shape)

@@ -34,7 +34,7 @@ from velfield.detection.cnn.model import (
     Topology,
     convolutions,
 )
-from velfield.parallel import parallel_map
+from velfield.parallel import count_steps, parallel_map
 
 _STATISTICS_MOMENTUM, _MIN_VARIANCE = 0.05, 1e-5
 _PRIOR_LOGIT = -4.0
@@ -387,7 +387,9 @@ def train(
     on_step
         Called with each step's number and loss.
     """
+    count_steps(0, announced=steps)
     for step in range(steps):
+        count_steps(1)
         loss = trainer.train_step(batches(step), learning_rate * lr_schedule(step / max(steps, 1)))
         if on_step is not None:
             on_step(step, loss)

@@ -16,20 +16,23 @@ import numpy as np
 from schemas.arrays import GreyImage
 from schemas.records import GridRecord
 from velfield.camera.lens import Lens, pinhole
+from velfield.camera.map_fit import fit_lens_to_map
 from velfield.errors import Failure, InputError
 from velfield.exports.cog import write_cog
+from velfield.parallel import parallel_map
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.base_fit import BaseFit, check_scale, covered_fraction
 from velfield.pipeline.stages.lens import select_usable_frames
-from velfield.pipeline.stages.registration import FrameKeypoints, read_given_base
+from velfield.pipeline.stages.registration import FrameKeypoints, detect_unit_keypoints, read_given_base
+from velfield.registration.base_mesh import fit_base_mesh
 from velfield.registration.intersensor import IntersensorResult, register_intersensor
-from velfield.registration.intrasensor import prepare_base, register_frame
+from velfield.registration.intrasensor import FrameRegistration, prepare_base, register_frame
 from velfield.registration.keypoints import Keypoints
 from velfield.registration.own_base import OwnBase, build_own_base
 from velfield.report.figures import png_bytes
 from velfield.run.commits import write_atomically
-from velfield.run.frame_transforms import polyprojective_to_record, read_lens
+from velfield.run.frame_transforms import base_mesh_to_record, read_lens
 from velfield.run.layout import RunLayout, local_output
 from velfield.run.stores import open_frames
 from velfield.sources.geo import BaseRaster, reconcile_gsd
@@ -37,12 +40,26 @@ from velfield.sources.geo import BaseRaster, reconcile_gsd
 _N_DIRECT_TRIALS = 8
 _MAX_DIRECT_ERROR_PX, _MIN_DIRECT_COVERAGE = 0.5, 0.8
 """Held-out residual and coverage that all sampled frames must reach to be registered directly to the given image."""
+_LENS_ROUNDS = 4
+_MIN_LENS_CHANGE_PX = 0.7
+"""RMS change over the frame that is worth it: the mesh follows less, and a rolling shutter passes for less."""
 _THREADS = min(4, os.cpu_count() or 1)
 
 
-def spread_frames(plan: Plan) -> list[int]:
+def keypoint_frames(plan: Plan) -> list[int]:
+    """Frames whose keypoints are detected before: none where an image is given, which may need those of a few only."""
+    return _spread_frames(plan) if plan.job.inputs.base is None else []
+
+
+def _spread_frames(plan: Plan) -> list[int]:
     """Frames sampled over the flight, of which the own base image is built."""
     return select_usable_frames(plan, plan.config.base.median_frames)
+
+
+def _trial_frames(spread: list[int]) -> list[int]:
+    """Of the spread frames, those that are registered directly to a given image first."""
+    count = min(_N_DIRECT_TRIALS, len(spread))
+    return [spread[k] for k in np.unique(np.linspace(0, len(spread) - 1, count).round().astype(int))]
 
 
 def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageResult:
@@ -55,16 +72,22 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageR
     """
     keypoints = {result.frame: result.keypoints for block in blocks for result in block}
     given = read_given_base(plan)
+    plan.layout.map_lens.unlink(missing_ok=True)
     lens, store, layout = read_lens(plan.layout), open_frames(plan.layout.frames), plan.layout
     sharpness = store.column("sharpness")
-    reference = max(keypoints, key=lambda frame: float(np.nan_to_num(sharpness[frame])))
+    lens_notes: list[str] = []
+    spread = _spread_frames(plan)
+    reference = max(spread, key=lambda frame: float(np.nan_to_num(sharpness[frame])))
     if given is not None:
+        keypoints |= _detect_keypoints(plan, _missing(_trial_frames(spread), keypoints))
         direct = register_directly(plan, given, keypoints, lens)
         if direct is not None:  # half a pixel all over the frame: no other area reaches that
             grid = _given_grid(plan, given, reference, direct)
             layout.own_to_base.unlink(missing_ok=True)
             return _finish(plan, grid, write_given_image(layout, given), given=given, fit=direct)
-        _check_area(plan, store.read(reference), given, lens)
+        lens, lens_notes = _check_area(plan, store.read(reference), given, lens)
+        keypoints |= _detect_keypoints(plan, _missing(spread, keypoints))
+        keypoints = dict(sorted(keypoints.items()))
     own = build_own_base(
         store.read,
         keypoints,
@@ -77,7 +100,7 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageR
         raise InputError(f"no base image can be built from the flight: {own.reason}; give one with --base")
     write_atomically(layout.own_base_image, png_bytes(own.image))
     write_atomically(layout.own_base_mask, png_bytes(own.valid.astype(np.uint8) * 255))
-    outputs = [layout.own_base_image, layout.own_base_mask]
+    outputs = [layout.own_base_image, layout.own_base_mask, *([layout.map_lens] if layout.map_lens.exists() else [])]
     fit = None
     if given is None:
         grid = _own_grid(plan, own, reference)
@@ -89,7 +112,17 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageR
         fit, written = _register_to_given(plan, own, given)
         grid = _given_grid(plan, given, reference, fit)
         outputs += written
-    return _finish(plan, grid, outputs, frames=own.frames, given=given, fit=fit)
+    finished = _finish(plan, grid, outputs, frames=own.frames, given=given, fit=fit)
+    return replace(finished, notes=[*finished.notes, *lens_notes])
+
+
+def _missing(frames: list[int], keypoints: dict[int, Keypoints]) -> list[int]:
+    return [frame for frame in frames if frame not in keypoints]
+
+
+def _detect_keypoints(plan: Plan, frames: list[int]) -> dict[int, Keypoints]:
+    blocks = parallel_map(lambda frame: detect_unit_keypoints(plan, [frame]), frames)
+    return {result.frame: result.keypoints for block in blocks for result in block}
 
 
 def _finish(
@@ -104,6 +137,7 @@ def _finish(
     """Write the grid; ``frames``: number of frames in the own base image, None if there is none."""
     layout = plan.layout
     layout.rebased.unlink(missing_ok=True)
+    layout.georeference.unlink(missing_ok=True)  # its stage follows
     write_atomically(layout.grid, grid.model_dump_json(indent=1).encode())
     outputs.append(layout.grid)
     advance("base")
@@ -117,12 +151,42 @@ def _finish(
     return StageResult(outputs, counts, [*given.notes, fit.note(given_gsd_m)], fit.warnings())
 
 
-def _check_area(plan: Plan, grey: GreyImage, given: BaseRaster, lens: Lens) -> None:
-    """Reject an image of another area before any frame is processed."""
+def _check_area(plan: Plan, grey: GreyImage, given: BaseRaster, lens: Lens) -> tuple[Lens, list[str]]:
+    """Reject an image of another area before any frame is processed; else the lens, and notes on it."""
     result = register_intersensor(grey, given.grey, plan.config.base, lens=lens)
     if isinstance(result, Failure):
         raise InputError(f"--base {plan.job.inputs.base}: {result.reason}")
     check_scale(result.scale, given, plan.job.inputs.base or "")
+    if plan.config.lens.calibrate == "never":
+        return lens, []
+    return _refine_by_map(plan, grey, given, lens, result)
+
+
+def _refine_by_map(
+    plan: Plan, grey: GreyImage, given: BaseRaster, lens: Lens, result: IntersensorResult
+) -> tuple[Lens, list[str]]:
+    """The lens by matches of one frame with the given image, where they decide for another; matched again through it.
+
+    A lens that is off in the corners finds no matches there: each round reaches farther out.
+    """
+    best, points, last = lens, len(result.cv_errors_px), None
+    for _ in range(_LENS_ROUNDS):
+        fit = fit_lens_to_map(result.source_raw, result.target, best, grey.shape)
+        if fit is None or fit.change_px < _MIN_LENS_CHANGE_PX or not (fit.is_better or last is not None):
+            break
+        again = register_intersensor(grey, given.grey, plan.config.base, lens=fit.lens)
+        if isinstance(again, Failure):
+            break
+        if len(again.cv_errors_px) < points and again.cv_error_px > result.cv_error_px:
+            break
+        best, points, last, result = fit.lens, len(again.cv_errors_px), fit, again
+    if last is None:
+        return lens, []
+    write_atomically(plan.layout.map_lens, last.lens.to_record().model_dump_json(indent=1).encode())
+    first, second = last.lens.coefficients
+    return last.lens, [
+        f"lens by the base image: k = {first:.3f}, {second:.3f} from {last.matches} matches, {points} through it"
+    ]
 
 
 def _own_grid(plan: Plan, own: OwnBase, reference: int) -> GridRecord:
@@ -145,14 +209,14 @@ def _register_to_given(plan: Plan, own: OwnBase, given: BaseRaster) -> tuple[Bas
     if isinstance(result, Failure):
         name = plan.job.inputs.base
         raise InputError(f"--base {name}: the flight's own base image could not be registered to it: {result.reason}")
-    record = polyprojective_to_record(result.transform.polyprojective)
-    write_atomically(layout.own_to_base, record.model_dump_json(indent=1).encode())
+    mesh = fit_base_mesh(own.image, own.valid, given.grey, result.transform.polyprojective, plan.config.base)
+    write_atomically(layout.own_to_base, base_mesh_to_record(mesh).model_dump_json(indent=1).encode())
     write_atomically(layout.base_error_map, png_bytes(_draw_error_map(result)))
     written = [layout.own_to_base, layout.base_error_map, *write_given_image(plan.layout, given)]
     fit = BaseFit(
         direct=False,
-        error_px=result.cv_error_px,
-        points=len(result.cv_errors_px),
+        error_px=mesh.heldout_px,
+        points=mesh.points,
         scale=result.scale,
         rotation_rad=result.rotation_rad,
         covered=covered_fraction(result.transform, own.valid, given),
@@ -169,13 +233,17 @@ def register_directly(plan: Plan, given: BaseRaster, keypoints: dict[int, Keypoi
     config = plan.config.registration
     reference = prepare_base(given.grey, config, mask=given.valid, frame_shape=(plan.info.height, plan.info.width))
     store = open_frames(plan.layout.frames)
-    frames = sorted(keypoints)
-    samples = np.unique(np.linspace(0, len(frames) - 1, min(_N_DIRECT_TRIALS, len(frames))).round().astype(int))
+
+    def register(frame: int) -> FrameRegistration:
+        return register_frame(store.read(frame), keypoints[frame], reference, lens, config)
+
+    first, *others = _trial_frames(sorted(keypoints))
+    results = [register(first)]
+    if _is_accurate(results[0]):
+        results += parallel_map(register, others)
     fits = []
-    for frame in (frames[k] for k in samples):
-        result = register_frame(store.read(frame), keypoints[frame], reference, lens, config)
-        accurate = result.heldout_px <= _MAX_DIRECT_ERROR_PX and result.coverage >= _MIN_DIRECT_COVERAGE
-        if result.transform is None or not accurate:
+    for result in results:
+        if result.transform is None or not _is_accurate(result):
             return None
         scale, rotation = result.transform.scale_and_rotation()
         check_scale(scale, given, plan.job.inputs.base or "")
@@ -187,6 +255,10 @@ def register_directly(plan: Plan, given: BaseRaster, keypoints: dict[int, Keypoi
         points=int(np.mean([fit.points for fit in fits])),
         covered=float(np.mean([fit.covered for fit in fits])),
     )
+
+
+def _is_accurate(result: FrameRegistration) -> bool:
+    return result.heldout_px <= _MAX_DIRECT_ERROR_PX and result.coverage >= _MIN_DIRECT_COVERAGE
 
 
 def write_given_image(layout: RunLayout, given: BaseRaster) -> list[Path]:

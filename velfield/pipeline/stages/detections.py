@@ -3,7 +3,7 @@
 Detections of another program in place of ours (`--detections`): later stages do not know the difference.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from schemas.arrays import FloatArray, GreyImage, Points
+from schemas.arrays import FloatArray, GreyImage, Mask, Points
 from schemas.tables import DETECTION_COLUMNS
 from velfield.detection.cnn.model import use_device
-from velfield.detection.detect import ComparableFrame, FrameDetections, SearchedFrame, attach_crops, search_frame
-from velfield.detection.detector import Detections, Detector, load_detector
+from velfield.detection.detect import FrameDetections, SearchedFrame, attach_crops, search_frame
+from velfield.detection.detector import Detections, Detector, concatenate, load_detector
 from velfield.detection.orientation import CAR_ASPECT, axial_difference, fill_missing_orientation
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
@@ -30,10 +30,10 @@ from velfield.run.tables import write_patches, write_table
 _AXIS_SD_RAD = 0.1
 
 
-def external_detections(plan: Plan, rectified: WorkingFrame, transform: FrameMap, frame: int) -> FrameDetections:
+def external_detections(
+    plan: Plan, rectified: WorkingFrame, transform: FrameMap, boxes: pd.DataFrame
+) -> FrameDetections:
     """The boxes of a frame, mapped from raw to working px; orientations that they lack are estimated."""
-    table = external_boxes(plan)
-    boxes = table[table["source_index"] == plan.indices[frame]]
     raw = boxes[["x_px", "y_px"]].to_numpy(np.float64)
     xy = rectified.to_work(transform.to_base(raw))
     axis = _axes_to_base(transform, raw, boxes["orientation_rad"].to_numpy(np.float64))
@@ -74,14 +74,24 @@ ID_STEP = 1 << 20
 class BlockDetections:
     """Cars of a block of frames: the table, their patches, and their positions on the working grid.
 
-    ``searched`` (frames,) is the fraction of each frame that the detector was run on.
+    ``searched`` (frames,) is the fraction of each frame that the detector was run on. Of each frame the cars come
+    first, then the ``weak`` (n,) candidates.
     """
 
     table: pd.DataFrame
     patches: GreyImage
     chips: GreyImage
+    strips: GreyImage
     xy_work: Points
+    weak: Mask
     searched: FloatArray
+
+    def take(self, rows: Mask) -> "BlockDetections":
+        """Some of them."""
+        crops = self.patches[rows], self.chips[rows], self.strips[rows]
+        return BlockDetections(
+            self.table[rows].reset_index(drop=True), *crops, self.xy_work[rows], self.weak[rows], self.searched
+        )
 
 
 def detect_block(plan: Plan, frames: range) -> BlockDetections:
@@ -90,26 +100,56 @@ def detect_block(plan: Plan, frames: range) -> BlockDetections:
     working = WorkingGrid.open(plan, record.scale)
     times_s = open_frames(plan.layout.frames).column("time_s")
     usable = usable_frames(plan)
-    search = None if plan.job.inputs.detections else _Search(plan, working, has_background=record.has_background)
+    search = _searcher(plan, working, has_background=record.has_background)
     parts = []
     for frame in frames:
         if usable[frame]:
-            part = _detect_external(plan, working, frame) if search is None else search.detect(frame)
+            part = search(frame)
             if part is not None:
-                parts.append(_tabulate(*part, frame, float(times_s[frame])))
+                found, cars, rectified, searched = part
+                kept = _supported(working, rectified, frame, found.xy)
+                found, cars = found.select(kept), int(kept[:cars].sum())
+                parts.append(_tabulate(found, cars, rectified, searched, frame, float(times_s[frame])))
         advance("detections")
     return _concatenate(parts)
 
 
-def _detect_external(plan: Plan, working: WorkingGrid, frame: int) -> "_Found | None":
+def _supported(working: WorkingGrid, rectified: WorkingFrame, frame: int, xy_work: Points) -> Mask:
+    """Which positions (n, 2) on the working grid lie where control points support the frame's map."""
+    transform = working.maps.transform(frame)
+    assert transform is not None, "a frame that was searched is registered"
+    raw = transform.to_raw(rectified.to_base(xy_work))
+    return np.asarray(np.isfinite(working.maps.position_sd_px(frame, raw)))
+
+
+def _searcher(plan: Plan, working: WorkingGrid, *, has_background: bool) -> "Callable[[int], _Found | None]":
+    """What gives the cars of a frame: given boxes, a detector of raw frames, or one of the working grid."""
+    if plan.job.inputs.detections:
+        table = external_boxes(plan)
+        return lambda frame: _from_boxes(plan, working, frame, table[table["source_index"] == plan.indices[frame]])
+    use_device(plan.config.work.device)
+    detector = _detector(plan.layout.detector, plan.keys["detector"])
+    if not detector.reads_raw_frames:
+        return _Search(plan, working, detector, has_background=has_background).detect
+    store, threshold = open_frames(plan.layout.frames), plan.config.detection.threshold
+
+    def search(frame: int) -> "_Found | None":
+        found = _from_boxes(plan, working, frame, detector.detect_raw(store.read(frame), threshold=threshold))
+        return found and (*found[:3], 1.0)
+
+    return search
+
+
+def _from_boxes(plan: Plan, working: WorkingGrid, frame: int, boxes: pd.DataFrame) -> "_Found | None":
     rectified, transform = working.frame(frame), working.maps.transform(frame)
     if rectified is None or transform is None:
         return None
-    return external_detections(plan, rectified, transform, frame), rectified, np.nan
+    cars = external_detections(plan, rectified, transform, boxes)
+    return cars, len(cars), rectified, np.nan
 
 
-_Found = tuple[FrameDetections, WorkingFrame, float]
-"""Cars of a frame, the frame, and the fraction of it that was searched."""
+_Found = tuple[FrameDetections, int, WorkingFrame, float]
+"""Cars of a frame and, after so many, weak candidates; the frame; and the fraction of it that was searched."""
 
 
 class _Search:
@@ -118,10 +158,9 @@ class _Search:
     Groups are counted from the start of the flight, so that results are the same however it is cut into units.
     """
 
-    def __init__(self, plan: Plan, working: WorkingGrid, *, has_background: bool) -> None:
+    def __init__(self, plan: Plan, working: WorkingGrid, detector: Detector, *, has_background: bool) -> None:
         self._plan, self._working, self._has_background = plan, working, has_background
-        use_device(plan.config.work.device)
-        self._detector = _detector(plan.layout.detector, plan.keys["detector"])
+        self._detector = detector
         self._usable = usable_frames(plan)
         self._group, self._first = range(0), -1
         self._window: Window | None = None
@@ -133,15 +172,17 @@ class _Search:
             self._begin_group(frame)
         if self._window is None:
             return None
-        rectified = self._working.frame(frame, self._window)
-        if rectified is None:
+        result = self._search(frame, None if frame == self._first else self._reference)
+        if result is None:
             return None
-        searched = self._search(rectified, None if frame == self._first else self._reference)
+        searched, rectified = result
         if frame == self._first:
             self._reference = searched
         cars = searched.detections
-        order = np.lexsort((cars.xy[:, 0], cars.xy[:, 1]))
-        return attach_crops(rectified.image, cars, order), rectified, searched.searched
+        found = concatenate([cars, searched.weak])
+        order = np.lexsort((found.xy[:, 0], found.xy[:, 1], np.arange(len(found)) >= len(cars)))
+        crops = attach_crops(rectified.image, found, order, half_image=searched.frame.half_image)
+        return crops, len(cars), rectified, searched.searched
 
     def _begin_group(self, frame: int) -> None:
         every = self._plan.config.detection.full_frame_every
@@ -151,17 +192,23 @@ class _Search:
         self._window, self._reference = self._working.common_window(members), None
         self._first = next((one for one in members if self._working.common_window([one]) is not None), frame)
         if self._first < frame and self._window is not None:  # it belongs to another block
-            first = self._working.frame(self._first, self._window)
-            self._reference = None if first is None else self._search(first, None)
+            first = self._search(self._first, None)
+            self._reference = None if first is None else first[0]
 
-    def _search(self, rectified: WorkingFrame, reference: SearchedFrame | None) -> SearchedFrame:
-        return search_frame(
+    def _search(self, frame: int, reference: SearchedFrame | None) -> tuple[SearchedFrame, WorkingFrame] | None:
+        assert self._window is not None, "its frames meet the base image"
+        image = self._working.rectification(frame, self._window)
+        if image is None:
+            return None
+        rectified = WorkingFrame(image.image, image.valid, self._window, self._working.scale)
+        searched = search_frame(
             self._detector,
-            ComparableFrame(rectified.image, rectified.valid),
+            image,
             _background_of(self._plan, rectified) if self._has_background else None,
             reference=reference,
             threshold=self._plan.config.detection.threshold,
         )
+        return searched, rectified
 
 
 @lru_cache(maxsize=2)
@@ -187,7 +234,7 @@ def _background_of(plan: Plan, rectified: WorkingFrame) -> GreyImage:
 
 
 def _tabulate(
-    detections: FrameDetections, rectified: WorkingFrame, searched: float, frame: int, time_s: float
+    detections: FrameDetections, cars: int, rectified: WorkingFrame, searched: float, frame: int, time_s: float
 ) -> BlockDetections:
     xy = rectified.to_base(detections.xy)
     table = pd.DataFrame(
@@ -203,37 +250,44 @@ def _tabulate(
             "score": detections.score,
         }
     ).astype(DETECTION_COLUMNS)
-    return BlockDetections(table, detections.patches, detections.chips, detections.xy, np.array([searched]))
+    crops = detections.patches, detections.chips, detections.strips
+    return BlockDetections(table, *crops, detections.xy, np.arange(len(xy)) >= cars, np.array([searched]))
 
 
 def _concatenate(parts: Sequence[BlockDetections]) -> BlockDetections:
     if not parts:
         table = pd.DataFrame({name: np.empty(0, dtype) for name, dtype in DETECTION_COLUMNS.items()})
-        crops = np.empty((0, 16, 8), np.uint8), np.empty((0, 32, 32), np.uint8)
-        return BlockDetections(table, *crops, np.empty((0, 2)), np.empty(0))
+        patches, chips, strips = (np.empty((0, *size), np.uint8) for size in ((16, 8), (32, 32), (32, 10)))
+        return BlockDetections(table, patches, chips, strips, np.empty((0, 2)), np.empty(0, bool), np.empty(0))
     return BlockDetections(
         pd.concat([part.table for part in parts], ignore_index=True),
         np.concatenate([part.patches for part in parts]),
         np.concatenate([part.chips for part in parts]),
+        np.concatenate([part.strips for part in parts]),
         np.concatenate([part.xy_work for part in parts]),
+        np.concatenate([part.weak for part in parts]),
         np.concatenate([part.searched for part in parts]),
     )
 
 
 def write_detections(plan: Plan, frames: range, blocks: Sequence[BlockDetections]) -> StageResult:
-    """Write the table of a unit, and its patches."""
+    """Write the table of a unit, that of its weak candidates, and the patches of both."""
     whole = _concatenate([block for block in blocks if len(block.searched)])
     unit = frames.start // plan.unit_frames
-    path = plan.layout.unit_file(plan.layout.detections, unit, ".parquet")
-    patches = plan.layout.unit_file(plan.layout.detections, unit, ".patches.npz")
-    scale = np.array(read_working(plan.layout).scale)
-    write_patches(
-        patches,
-        {"patches": whole.patches, "chips": whole.chips, "xy_work": whole.xy_work, "working_scale": scale},
-    )
-    write_table(path, whole.table, DETECTION_COLUMNS)
+    scale = read_working(plan.layout).scale
+    written = []
+    for folder, part in ((plan.layout.detections, ~whole.weak), (plan.layout.weak_detections, whole.weak)):
+        written += _write_part(plan.layout.unit_file(folder, unit, ".parquet"), whole.take(part), scale)
     used = int(usable_frames(plan)[frames.start : frames.stop].sum())
-    counts = {"frames": float(used), "cars": float(len(whole.table))}
+    counts = {"frames": float(used), "cars": float(np.sum(~whole.weak)), "weak": float(np.sum(whole.weak))}
     if np.isfinite(whole.searched).any():
         counts["searched"] = float(np.nanmean(whole.searched))
-    return StageResult([path, patches], counts)
+    return StageResult(written, counts)
+
+
+def _write_part(path: Path, part: BlockDetections, scale: float) -> list[Path]:
+    patches = path.with_suffix(".patches.npz")
+    arrays = {"patches": part.patches, "chips": part.chips, "strips": part.strips}
+    write_patches(patches, {**arrays, "xy_work": part.xy_work, "working_scale": np.array(scale)})
+    write_table(path, part.table, DETECTION_COLUMNS)
+    return [path, patches]

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from schemas.records import WorkingRecord
 from velfield.detection.cnn.model import use_device
@@ -21,7 +22,7 @@ from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.labels import (
     base_px_per_raw_px,
-    check_vehicle_length,
+    check_label_scale,
     labelled_images,
     labels_of_run,
     median_car_length_raw_px,
@@ -32,6 +33,7 @@ from velfield.run.commits import write_atomically
 from velfield.run.frame_transforms import read_grid
 from velfield.run.stores import open_frames
 
+_FRAMES_TO_MEASURE = 4
 _MIN_FRAMES_WITH_BOXES = 0.5
 """Fraction of the frames in which another program's boxes are expected."""
 
@@ -50,9 +52,28 @@ def make_detector(plan: Plan) -> StageResult:
 
 def _from_file(plan: Plan) -> StageResult:
     """Load a detector file; one that uses the difference to the background gets that of this flight."""
-    detector, scale = load_detector(Path(plan.job.inputs.detector or "")), _known_scale(plan)
+    detector = load_detector(Path(plan.job.inputs.detector or ""))
+    scale = _scale_of_boxes(plan, detector) if detector.reads_raw_frames else _known_scale(plan)
     background = motion_background(_motion_frames(plan, scale)) if detector.uses_background else None
     return _finish(plan, detector, scale, "file", background=background)
+
+
+def _scale_of_boxes(plan: Plan, detector: Detector) -> float:
+    """By the ground sample distance, else by the boxes of some frames where they have a length."""
+    known = _scale_of_gsd(plan)
+    if known is not None:
+        return known
+    store, usable = open_frames(plan.layout.frames), np.flatnonzero(usable_frames(plan))
+    chosen = usable[np.unique(np.linspace(0, max(len(usable) - 1, 0), _FRAMES_TO_MEASURE).astype(int))]
+    threshold = plan.config.detection.threshold
+    boxes = pd.concat([detector.detect_raw(store.read(int(frame)), threshold=threshold) for frame in chosen])
+    scale = _scale_of_length(plan, float(boxes["length_px"].median()), base_px_per_raw_px(plan))
+    if scale is None:
+        raise InputError(
+            f"found {len(boxes)} boxes without a length in {len(chosen)} frames, and no scale of the map: the size of "
+            "a car is not known; give --gsd-m"
+        )
+    return scale
 
 
 def _from_detections(plan: Plan) -> StageResult:
@@ -112,7 +133,7 @@ def _from_labels(plan: Plan) -> StageResult:
     samples = list(labelled_images(source, plan.info, labels, work_per_raw=work_per_raw))
     detector = train_detector(samples, plan.config.detection)
     outcome = _finish(plan, detector, scale, "labels", count=len(labels.cars))
-    return replace(outcome, warnings=check_vehicle_length(length_px * base_per_raw, read_grid(plan.layout).gsd_m))
+    return replace(outcome, warnings=check_label_scale(labels.cars, base_per_raw, read_grid(plan.layout).gsd_m))
 
 
 def _from_motion(plan: Plan) -> StageResult:
@@ -136,7 +157,8 @@ def _from_motion(plan: Plan) -> StageResult:
     flight = UnlabelledFlight(frames, labels, background, max_interval_s)
     config = plan.config.detection
     detector = detector_class(config.method).train_from_motion(flight, config)
-    return _finish(plan, detector, scale, "motion", count=labels.count, motion=labels, background=background)
+    outcome = _finish(plan, detector, scale, "motion", count=labels.count, motion=labels, background=background)
+    return replace(outcome, warnings=[*outcome.warnings, *labels.warnings])
 
 
 def _without_labels(plan: Plan, scale: float | None, labels: MotionLabels) -> StageResult:

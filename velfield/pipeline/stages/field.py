@@ -1,5 +1,6 @@
 """The velocity histogram, a group of tiles at a time: each tile from the segments that reach it, written once."""
 
+from collections.abc import Sequence
 from functools import partial
 from math import isfinite
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from schemas.arrays import IntArray
 from schemas.flight import FieldConfig
 from schemas.tables import TRACKLET_COLUMNS
 from velfield.field.accumulate import Weight, accumulate_tile
@@ -21,12 +23,13 @@ from velfield.field.segments import (
 from velfield.field.time_intervals import TimeInterval, assign_intervals
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
-from velfield.run.field_writer import Group, GroupWriter, create_field_store, tile_groups
+from velfield.run.field_writer import FIELD_BLOCK, Group, GroupWriter, create_field_store, tile_groups
 from velfield.run.frame_transforms import read_grid
 from velfield.run.layout import remove_tree
 from velfield.run.stores import open_field, store_key
 from velfield.run.tables import read_tables
 
+_PLACE_COLUMNS = ["track_id", *(f"{axis}_{k}_px" for k in range(3) for axis in "xy")]
 _SEGMENT_COLUMNS = [
     "tracklet_id",
     "track_id",
@@ -38,9 +41,15 @@ _SEGMENT_COLUMNS = [
 ]
 
 
-def field_groups(plan: Plan) -> list[Group]:
-    """All groups of tiles of the base image, (row, column)."""
-    return tile_groups(read_grid(plan.layout), plan.config.field)
+def field_blocks(plan: Plan) -> list[Group]:
+    """All units of the base image: blocks of two by two groups of tiles, (row, column) of each."""
+    groups = tile_groups(read_grid(plan.layout), plan.config.field)
+    return sorted({(row // FIELD_BLOCK, column // FIELD_BLOCK) for row, column in groups})
+
+
+def _list_groups(plan: Plan, block: Group) -> list[Group]:
+    groups = tile_groups(read_grid(plan.layout), plan.config.field)
+    return [group for group in groups if (group[0] // FIELD_BLOCK, group[1] // FIELD_BLOCK) == block]
 
 
 def field_weight(config: FieldConfig) -> Weight:
@@ -77,26 +86,34 @@ def interval_stores(plan: Plan) -> list[tuple[Path, TimeInterval]]:
     return [(plan.layout.intervals / f"{k:03d}.zarr", part) for k, part in enumerate(plan.time_intervals)]
 
 
-def accumulate_group(plan: Plan, group: Group) -> StageResult:
-    """Fill one group of tiles, of the field and of its time intervals."""
+def accumulate_block(plan: Plan, block: Group) -> StageResult:
+    """Fill one block of groups of tiles, of the field and of its time intervals."""
     grid, config = read_grid(plan.layout), plan.config.field
-    bins = VelocityBins.from_config(config, grid.gsd_m)
-    writer = GroupWriter(open_field(plan.layout.field, "r+"), group, grid=grid, config=config, bins=bins)
-    segments = _segments_near(plan, writer)
-    weight = field_weight(config)
-    accumulate_into(writer, segments, weight=weight, time_weighted=config.time_weighted)
-    files = writer.files()
-    stores = interval_stores(plan)
-    number = assign_intervals(segments, [part for _, part in stores]) if stores else None
-    for k, (path, _) in enumerate(stores):
-        part = GroupWriter(open_field(path, "r+"), group, grid=grid, config=config, bins=bins)
-        accumulate_into(part, segments[number == k], weight=weight, time_weighted=False)
-        files += part.files()
+    bins, weight = VelocityBins.from_config(config, grid.gsd_m), field_weight(config)
+    make = partial(GroupWriter, grid=grid, config=config, bins=bins)
+    store = open_field(plan.layout.field, "r+")
+    writers = [make(store, group) for group in _list_groups(plan, block)]
+    segments = _segments_near(plan, writers)
+    for writer in writers:
+        accumulate_into(writer, segments, weight=weight, time_weighted=config.time_weighted)
+    parts = interval_stores(plan)
+    number = assign_intervals(segments, [part for _, part in parts]) if parts else None
+    interval_writers = []
+    for k, (path, _) in enumerate(parts):
+        store = open_field(path, "r+")
+        for group in _list_groups(plan, block):
+            interval_writers.append(make(store, group))
+            accumulate_into(interval_writers[-1], segments[number == k], weight=weight, time_weighted=False)
     advance("field")
-    count = writer.layers["count"]
+    files = [file for writer in (*writers, *interval_writers) for file in writer.files()]
+    counts = [writer.layers["count"] for writer in writers]
     return StageResult(
-        files,
-        {"pixels": float((count > 0).sum()), "pixels_5": float((count >= 5).sum()), "tiles": len(writer.touched)},
+        list(dict.fromkeys(files)),
+        {
+            "pixels": float(sum((count > 0).sum() for count in counts)),
+            "pixels_5": float(sum((count >= 5).sum() for count in counts)),
+            "tiles": float(sum(len(writer.touched) for writer in writers)),
+        },
     )
 
 
@@ -116,29 +133,43 @@ def accumulate_into(writer: GroupWriter, segments: Segments, *, weight: Weight, 
             bins=writer.bins,
             radius_px=radius,
         )
-        timed = accumulate(weight="time").histogram if time_weighted else None
-        writer.put(row, column, accumulate(weight=weight), timed)
+        timed = accumulate(weight="time", zeros=writer.zeros(row, column)) if time_weighted else None
+        writer.put(row, column, accumulate(weight=weight, zeros=writer.zeros(row, column)), timed)
     writer.close()
 
 
-def _segments_near(plan: Plan, writer: GroupWriter) -> Segments:
-    """All segments of the tracks that come near the group: whole tracks, for one track adds one unit at a pixel."""
-    margin = (band_radius_px(writer.config, writer.bins.gsd_m) or 0.0) + 1
-    tracklets = _tracklets_near(plan, writer.x0, writer.y0, writer.width, writer.height, margin)
-    return segment_table(tracklets, writer.config) if len(tracklets) else np.empty(0, SEGMENT_DTYPE)
-
-
-def _tracklets_near(plan: Plan, x0: int, y0: int, width: int, height: int, margin: float) -> pd.DataFrame:
-    """All tracklets of the tracks that come near the group: whole tracks, for one track adds one unit at a pixel."""
-    paths = sorted(plan.layout.tracks.glob("unit-*.parquet"))
-    table = read_tables(paths, TRACKLET_COLUMNS, only=_SEGMENT_COLUMNS)
-    xs = table[[f"x_{k}_px" for k in range(3)]].to_numpy()
-    ys = table[[f"y_{k}_px" for k in range(3)]].to_numpy()
-    near = (
-        (xs.max(axis=1, initial=-np.inf) >= x0 - margin)
-        & (xs.min(axis=1, initial=np.inf) <= x0 + width + margin)
-        & (ys.max(axis=1, initial=-np.inf) >= y0 - margin)
-        & (ys.min(axis=1, initial=np.inf) <= y0 + height + margin)
+def _segments_near(plan: Plan, writers: Sequence[GroupWriter]) -> Segments:
+    """All segments of the tracks that come near groups: whole tracks, for one track adds one unit at a pixel."""
+    config, gsd_m = plan.config.field, writers[0].bins.gsd_m
+    margin = (band_radius_px(config, gsd_m) or 0.0) + 1
+    low = min(writer.x0 for writer in writers) - margin, min(writer.y0 for writer in writers) - margin
+    high = (
+        max(writer.x0 + writer.width for writer in writers) + margin,
+        max(writer.y0 + writer.height for writer in writers) + margin,
     )
-    tracks = table["track_id"].to_numpy()
-    return table[np.isin(tracks, np.unique(tracks[near]))]
+    tracklets = _tracklets_near(plan, low, high)
+    return segment_table(tracklets, config) if len(tracklets) else np.empty(0, SEGMENT_DTYPE)
+
+
+def _tracklets_near(plan: Plan, low_xy: tuple[float, float], high_xy: tuple[float, float]) -> pd.DataFrame:
+    """All tracklets of the tracks that come into a rectangle, table by table: of a long flight all at once would take
+    gigabytes."""
+    paths = sorted(plan.layout.tracks.glob("unit-*.parquet"))
+    read = partial(read_tables, columns=TRACKLET_COLUMNS)
+    if not paths:
+        return read([], only=_SEGMENT_COLUMNS)
+    near = np.unique(np.concatenate([_tracks_in(read([path], only=_PLACE_COLUMNS), low_xy, high_xy) for path in paths]))
+    parts = []
+    for path in paths:
+        table = read([path], only=_SEGMENT_COLUMNS)
+        parts.append(table[np.isin(table["track_id"].to_numpy(), near)])
+    return pd.concat(parts, ignore_index=True)
+
+
+def _tracks_in(table: pd.DataFrame, low_xy: tuple[float, float], high_xy: tuple[float, float]) -> IntArray:
+    """Tracks of the tracklets whose bounding box meets the rectangle."""
+    inside = np.ones(len(table), bool)
+    for axis, low, high in zip("xy", low_xy, high_xy, strict=True):
+        positions = table[[f"{axis}_{k}_px" for k in range(3)]].to_numpy()
+        inside &= (positions.max(axis=1, initial=-np.inf) >= low) & (positions.min(axis=1, initial=np.inf) <= high)
+    return np.unique(table["track_id"].to_numpy(np.int64)[inside])

@@ -17,9 +17,18 @@ from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.run.stores import THUMBNAIL_SHAPE, FrameStore, create_frames, open_frames, store_key
-from velfield.sources.quality import UNUSABLE, FrameFlag, flag_blurred, flag_outlier_frames, frame_quality
+from velfield.sources.quality import (
+    UNUSABLE,
+    FrameFlag,
+    describe_light,
+    find_cuts,
+    flag_blurred,
+    flag_outlier_frames,
+    frame_quality,
+)
 from velfield.sources.source import iter_frames
 
+_OVERLAP = 5
 _CHUNK = 4096
 """Thumbnails in memory at a time."""
 
@@ -36,10 +45,32 @@ def flag_frames(plan: Plan) -> StageResult:
     times_s = store.column("time_s")
     warnings = [f"frame {k} ({times_s[k]:.3f} s) is blurred: it is left out" for k in blurred]
     warnings += [f"frame {k} ({times_s[k]:.3f} s) is unlike the frames around it: it is left out" for k in outliers]
+    warnings += _describe_footage(store, np.flatnonzero((flags & int(UNUSABLE)) == 0))
     usable = int(np.sum((flags & int(UNUSABLE)) == 0))
     advance("quality")
     counts = {"usable": usable, "flagged": len(flags) - usable, "blurred": len(blurred), "outliers": len(outliers)}
     return StageResult([store.write_flags(flags)], {name: float(count) for name, count in counts.items()}, [], warnings)
+
+
+def _describe_footage(store: FrameStore, usable: IntArray) -> list[str]:
+    """Cuts, and what the light makes uncertain, one line each."""
+    times_s, contrast, found = store.column("time_s"), [], []
+    for start in range(0, len(usable), _CHUNK):
+        frames = usable[max(start - _OVERLAP, 0) : start + _CHUNK]
+        thumbnails = store.thumbnails(int(frames[0]), int(frames[-1]) + 1)[frames - frames[0]]
+        contrast.append(thumbnails.reshape(len(frames), -1).std(axis=1))
+        for k in find_cuts(thumbnails):
+            found.append(
+                f"the picture changes wholly at frame {frames[k]} ({times_s[frames[k]]:.3f} s), as at a cut to another "
+                "place: frames that the base image does not show are not registered; run each place by itself, with "
+                "--start-s and --stop-s"
+            )
+    light = describe_light(
+        store.column("brightness")[usable],
+        np.concatenate(contrast) if contrast else np.empty(0),
+        store.column("sharpness")[usable],
+    )
+    return list(dict.fromkeys(found)) + light
 
 
 def _find_outliers(store: FrameStore, tested: IntArray) -> IntArray:

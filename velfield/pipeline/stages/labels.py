@@ -12,6 +12,8 @@ import numpy as np
 import pandas as pd
 
 from schemas.arrays import FloatArray, GreyImage
+from schemas.scale import ScaleEstimate
+from velfield.analysis.vehicle_scale import estimate_vehicle_scale
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
@@ -20,10 +22,13 @@ from velfield.run.stores import open_registration
 from velfield.sources.frames import SourceInfo
 from velfield.sources.labels.labels import Labels, read_labels
 from velfield.sources.quality import UNUSABLE
+from velfield.sources.scale import choose_scale
 from velfield.sources.source import iter_frames
 
 _MIN_LENGTH_M, _USUAL_LENGTH_M, _MAX_LENGTH_M = 3.3, 4.4, 6.0
 """Range of the median length of labelled cars, and what it usually is."""
+_LABEL_SD = 0.03
+"""Relative error that all lengths drawn by one person may have in common."""
 
 
 def labels_of_run(plan: Plan) -> Labels:
@@ -76,6 +81,20 @@ def check_vehicle_length(length_px: float, gsd_m: float | None) -> list[str]:
         f"metres a pixel of the base image; give {gsd_m * _USUAL_LENGTH_M / length_m:.2g} if they are cars, or correct "
         "the labels' lengths"
     ]
+
+
+def check_label_scale(cars: pd.DataFrame, base_per_raw: float, gsd_m: float | None) -> list[str]:
+    """A warning where the lengths of labelled cars (`LABEL_COLUMNS`) contradict the ground sample distance; else none.
+
+    Sides of upright boxes are no lengths; by them, or by too few for an interval, only an impossible one is reported.
+    """
+    oriented = cars[cars["abs_box_angle_rad"].isna() & cars["orientation_rad"].notna()]
+    lengths_px = oriented[["length_px", "width_px"]].max(axis=1).to_numpy(np.float64) * base_per_raw
+    found = estimate_vehicle_scale(lengths_px, measurement_sd=_LABEL_SD)
+    if gsd_m is None or found is None:
+        return check_vehicle_length(median_car_length_raw_px(cars) * base_per_raw, gsd_m)
+    given = ScaleEstimate(gsd_m=gsd_m, low_m=gsd_m, high_m=gsd_m, source="given")
+    return list(choose_scale([given, found]).disagreements)
 
 
 def labelled_images(source: Path, info: SourceInfo, labels: Labels, *, work_per_raw: float) -> Iterator[LabelledImage]:

@@ -2,17 +2,21 @@
 
 import numpy as np
 
-from schemas.arrays import IntArray
-from schemas.camera import CameraRecord
+from schemas.arrays import GreyImage, IntArray
+from schemas.camera import CameraRecord, TiltEvidence
 from velfield.camera.fusion import refine_lens
 from velfield.camera.lens import lens_from_record, pinhole
 from velfield.camera.plumbline import calibrate
+from velfield.camera.tilt import tilt_of_frames
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.registration.pairing import match_frame_pairs
 from velfield.run.commits import write_atomically
 from velfield.run.stores import open_frames
 from velfield.sources.quality import UNUSABLE
+
+_TILT_FRAMES = 3
+"""One shows it; the others look from other sides."""
 
 
 def select_usable_frames(plan: Plan, count: int) -> list[int]:
@@ -42,12 +46,38 @@ def calibrate_flight(plan: Plan) -> StageResult:
         record = calibrate(images, config).to_record()
         if config.refine == "auto":
             record = refine_lens(record, match_frame_pairs(images, lens_from_record(record.lens)))
+        record = record.model_copy(update={"tilt": _tilt(images[:_TILT_FRAMES], record)})
     write_atomically(plan.layout.camera, record.model_dump_json(indent=1).encode())
     advance("lens")
     counts = {"corner_px": _corner_shift(record, width, height)}
     if record.residual_px is not None:
         counts["residual_px"] = record.residual_px
-    return StageResult([plan.layout.camera], counts, _notes(record))
+    return StageResult([plan.layout.camera], counts, _notes(record), _warnings(plan, record))
+
+
+def _tilt(images: list[GreyImage], record: CameraRecord) -> TiltEvidence | None:
+    found = tilt_of_frames(images, lens_from_record(record.lens)) if images else None
+    if found is None:
+        return None
+    x, y = found.convergence
+    return TiltEvidence(
+        convergence_x=x, convergence_y=y, gain_nats=found.gain_nats, tilt_deg=found.degrees, oblique=found.is_oblique
+    )
+
+
+def _warnings(plan: Plan, record: CameraRecord) -> list[str]:
+    if record.tilt is None or not record.tilt.oblique:
+        return []
+    remedy = (
+        "its parts that are too far from the base image's scale are lost"
+        if plan.job.inputs.base
+        else "without --base the map keeps that perspective: scale, speeds and directions differ over it; give an "
+        "orthophoto with --base, or fly looking straight down"
+    )
+    return [
+        f"the camera looks at the ground obliquely, {record.tilt.tilt_deg:.0f} degrees from the vertical by the "
+        f"directions of {record.frames or 'its'} frames' lines, 0 to 20 expected: {remedy}"
+    ]
 
 
 def _notes(record: CameraRecord) -> list[str]:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray
+from schemas.arrays import FloatArray, Mask
 from velfield.exports.cog import write_cog
 from velfield.field.segments import stationary_speed_px_per_s
 from velfield.field.statistics import direction_rad, speed_px_per_s
@@ -29,50 +29,70 @@ def make_maps(plan: Plan) -> StageResult:
     """Write ``maps/``: direction and speed as PNG and as GeoTIFF, previews of both for the Prefect UI; and the viewer's
     data beside the tiles of the field."""
     grid, config, layout = read_grid(plan.layout), plan.config.field, plan.layout
-    store = open_field(layout.field)
-    velocity = np.stack([store.layer("modal_vx"), store.layer("modal_vy")], axis=-1).astype(np.float64)
-    direction = direction_rad(velocity, stationary_speed_px_per_s=stationary_speed_px_per_s(config, grid.gsd_m))
-    speed = speed_px_per_s(velocity)
-    grey = read_base_image(layout, plan.config.frames)
+    slow = stationary_speed_px_per_s(config, grid.gsd_m)
     scale = MapScale(gsd_m=grid.gsd_m, north_rad=north_direction_rad(grid))
-    figures = {
-        "direction": direction_figure(grey, direction, scale),
-        "speed": speed_figure(grey, speed, scale),
-    }
-    written = []
-    for name, figure in figures.items():
-        for suffix, image in (("", figure), ("_preview", make_preview(figure))):
-            path = layout.maps / f"{name}{suffix}.png"
-            write_atomically(path, png_bytes(image))
-            written.append(path)
-    written += _layers(plan, direction, speed)
-    written += _write_quality_figures(plan)
-    written += write_view_data(layout)
+    # One map after the other, each of the few pixels that vehicles passed: whole layers of float64 fill the memory.
+    written = [
+        *_write_direction(plan, scale, slow),
+        *_write_speed(plan, scale),
+        *_write_quality_figures(plan),
+        *write_view_data(layout),
+    ]
     advance("maps")
-    return StageResult(written, {"maps": float(len(figures))})
+    return StageResult(written, {"maps": 2.0})
 
 
-def _layers(plan: Plan, direction: FloatArray, speed: FloatArray) -> list[Path]:
-    """Direction as heading and speed as GeoTIFF, each value with its unit."""
-    grid, maps = read_grid(plan.layout), plan.layout.maps
-    north = north_direction_rad(grid)
-    heading = heading_deg(direction, north)
-    unit, factor = ("m s-1", grid.gsd_m) if grid.gsd_m else ("px s-1", 1.0)
+def _modal_velocity(plan: Plan) -> tuple[Mask, FloatArray]:
+    """Where a velocity is known, (y, x), and the velocities there, (n, 2) px/s."""
+    store = open_field(plan.layout.field)
+    layers = store.layer("modal_vx"), store.layer("modal_vy")
+    known = np.isfinite(layers[0]) & np.isfinite(layers[1])
+    return known, np.stack([layer[known] for layer in layers], axis=-1).astype(np.float64)
+
+
+def _write_direction(plan: Plan, scale: MapScale, slow_px_per_s: float) -> list[Path]:
+    """Figure and GeoTIFF of the direction, which as a layer is the heading, degrees."""
+    known, velocity = _modal_velocity(plan)
+    direction = direction_rad(velocity, stationary_speed_px_per_s=slow_px_per_s)
+    figure = direction_figure(read_base_image(plan.layout, plan.config.frames), _spread(known, direction), scale)
+    north = scale.north_rad
     about = "heading, clockwise from north" if north is not None else "heading, clockwise from the image's top"
-    for name, values, label, units in (
-        ("direction", heading, about, "degree"),
-        ("speed", speed * factor, "modal speed", unit),
-    ):
-        with local_output(maps / f"{name}.tif") as here:
-            write_cog(
-                here,
-                [values.astype(np.float32)],
-                names=[label],
-                units=[units],
-                crs_wkt=grid.crs_wkt,
-                affine=grid.affine,
-            )
-    return [maps / "direction.tif", maps / "speed.tif"]
+    layer = _spread(known, heading_deg(direction, north).astype(np.float32))
+    return [*_write_figure(plan, "direction", figure), _write_layer(plan, "direction", layer, about, "degree")]
+
+
+def _write_speed(plan: Plan, scale: MapScale) -> list[Path]:
+    """Figure and GeoTIFF of the speed."""
+    known, velocity = _modal_velocity(plan)
+    speed = speed_px_per_s(velocity)
+    figure = speed_figure(read_base_image(plan.layout, plan.config.frames), _spread(known, speed), scale)
+    unit, factor = ("m s-1", scale.gsd_m) if scale.gsd_m else ("px s-1", 1.0)
+    layer = _spread(known, (speed * factor).astype(np.float32))
+    return [*_write_figure(plan, "speed", figure), _write_layer(plan, "speed", layer, "modal speed", unit)]
+
+
+def _spread(known: Mask, values: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Values (n,) of the known pixels as a layer (y, x) of their type, NaN elsewhere."""
+    layer = np.full(known.shape, np.nan, values.dtype)
+    layer[known] = values
+    return layer
+
+
+def _write_figure(plan: Plan, name: str, figure: NDArray[np.uint8]) -> list[Path]:
+    """A figure, and its preview."""
+    written = []
+    for suffix, image in (("", figure), ("_preview", make_preview(figure))):
+        path = plan.layout.maps / f"{name}{suffix}.png"
+        write_atomically(path, png_bytes(image))
+        written.append(path)
+    return written
+
+
+def _write_layer(plan: Plan, name: str, values: NDArray[np.floating], label: str, unit: str) -> Path:
+    grid, path = read_grid(plan.layout), plan.layout.maps / f"{name}.tif"
+    with local_output(path) as here:
+        write_cog(here, [values], names=[label], units=[unit], crs_wkt=grid.crs_wkt, affine=grid.affine)
+    return path
 
 
 def make_preview(figure: NDArray[np.uint8]) -> NDArray[np.uint8]:

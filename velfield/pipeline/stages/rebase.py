@@ -12,24 +12,41 @@ import numpy as np
 import pandas as pd
 
 from schemas.arrays import FloatArray
+from schemas.georeference import GeoreferenceRecord
 from schemas.job import Job
 from schemas.records import FlightRecord, GridRecord, InputsRecord, RebaseRecord, WorkingRecord
-from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
+from schemas.scale import ScaleEstimate
+from schemas.tables import DETECTION_COLUMNS, DIMENSION_COLUMNS, TRACK_POSITION_COLUMNS, TRACKLET_COLUMNS
 from velfield.camera.lens import pinhole
 from velfield.errors import Failure
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stage import STAGES, NewBase
 from velfield.pipeline.stages.base_image import write_given_image
+from velfield.pipeline.stages.georeference import (
+    describe,
+    georeference_counts,
+    georeference_warnings,
+    scale_by_grid,
+    write_georeference,
+)
 from velfield.registration.intersensor import register_intersensor
 from velfield.registration.transforms import PolyprojectiveTransform
 from velfield.run.commits import content_key, digest_path, read_commit, write_atomically
-from velfield.run.frame_transforms import polyprojective_from_record, polyprojective_to_record, read_grid, read_working
+from velfield.run.frame_transforms import (
+    polyprojective_from_record,
+    polyprojective_to_record,
+    read_georeference,
+    read_grid,
+    read_own_grid,
+    read_working,
+)
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run
-from velfield.run.tables import link_file, read_tables, write_table, write_tracks
+from velfield.run.tables import link_file, read_tables, read_track_tables, write_table, write_tracks
 from velfield.sources.frames import SourceInfo
 from velfield.sources.geo import BaseRaster, read_base_raster
+from velfield.sources.scale import choose_scale
 
 
 @dataclass(frozen=True)
@@ -116,7 +133,7 @@ def rebase_image(plan: Plan, rebase: Rebase) -> StageResult:
     for path, model in ((layout.rebased, record), (layout.grid, grid), (layout.working, rescaled)):
         write_atomically(path, model.model_dump_json(indent=1).encode())
         outputs.append(path)
-    for name in (old.own_to_base, old.own_base_image, old.own_base_mask):
+    for name in (old.own_to_base, old.own_base_image, old.own_base_mask, old.map_lens):
         if name.exists():
             outputs.append(link_file(name, layout.base / name.name))
     advance("base")
@@ -147,33 +164,70 @@ def _mapped_grid(old: GridRecord, given: BaseRaster, record: RebaseRecord) -> Gr
     )
 
 
+def rebase_georeference(plan: Plan, rebase: Rebase) -> StageResult:
+    """Write ``base/georeference.json`` of the new base image: its own reference system, else scale and north mapped."""
+    old, record = read_georeference(rebase.old), rebase.record
+    grid, update = read_own_grid(plan.layout), {}
+    estimates = scale_by_grid(grid)
+    if old is not None and grid.crs_wkt is None:
+        every = [old.scale.used, *old.scale.others] if old.scale.used is not None else []
+        estimates += [_rescale(estimate, record.scale) for estimate in every if estimate is not None]
+        if old.north_rad is not None:
+            update = {"north_rad": old.north_rad + record.rotation_rad, "north_sd_deg": old.north_sd_deg}
+    new = GeoreferenceRecord(scale=choose_scale(estimates), telemetry=old.telemetry if old else "", **update)
+    outputs = write_georeference(plan.layout, new, plan.config.frames)
+    advance("georeference")
+    return StageResult(outputs, georeference_counts(new), describe(new), georeference_warnings(new))
+
+
+def _rescale(estimate: ScaleEstimate, scale: float) -> ScaleEstimate:
+    lengths = {name: getattr(estimate, name) / scale for name in ("gsd_m", "low_m", "high_m")}
+    return estimate.model_copy(update=lengths)
+
+
 def rebase_detections(plan: Plan, frames: range, rebase: Rebase) -> StageResult:
-    """Map the detections of a unit; their image patches are linked."""
-    unit = frames.start // plan.unit_frames
-    source = plan.layout.unit_file(rebase.old.detections, unit, ".parquet")
-    if not source.exists():
+    """Map the detections of a unit, and its weak candidates; their image patches are linked."""
+    unit, layout, old = frames.start // plan.unit_frames, plan.layout, rebase.old
+    if not layout.unit_file(old.detections, unit, ".parquet").exists():
         warning = f"frames {frames.start} to {frames.stop - 1} have no detections"
         return StageResult([], {"frames": 0.0, "cars": 0.0}, warnings=[warning])
-    table = map_detections(
-        read_tables([source], DETECTION_COLUMNS), polyprojective_from_record(rebase.record.transform)
-    )
-    path = plan.layout.unit_file(plan.layout.detections, unit, ".parquet")
-    write_table(path, table, DETECTION_COLUMNS)
-    patches = plan.layout.unit_file(rebase.old.detections, unit, ".patches.npz")
-    linked = link_file(patches, plan.layout.detections / patches.name)
+    transform = polyprojective_from_record(rebase.record.transform)
+    written, counts = [], {"frames": 0.0, "cars": 0.0}
+    for source, target in ((old.detections, layout.detections), (old.weak_detections, layout.weak_detections)):
+        path = layout.unit_file(source, unit, ".parquet")
+        if path.exists():  # of a run by an earlier release there are no weak candidates
+            table = map_detections(read_tables([path], DETECTION_COLUMNS), transform)
+            write_table(target / path.name, table, DETECTION_COLUMNS)
+            patches = path.with_suffix(".patches.npz")
+            written += [target / path.name, link_file(patches, target / patches.name)]
+            if source == old.detections:
+                counts = {"frames": float(table["frame"].nunique()), "cars": float(len(table))}
     advance("detections", len(frames))
-    return StageResult([path, linked], {"frames": float(table["frame"].nunique()), "cars": float(len(table))})
+    return StageResult(written, counts)
 
 
 def rebase_tracks(plan: Plan, rebase: Rebase) -> StageResult:
     """Map all tracklets, unit by unit."""
     transform, written, tracks, count = polyprojective_from_record(rebase.record.transform), [], set[int](), 0
     for source in sorted(rebase.old.tracks.glob("unit-*.parquet")):
-        table = map_tracklets(read_tables([source], TRACKLET_COLUMNS), transform)
+        table = map_tracklets(read_track_tables([source], TRACKLET_COLUMNS | {"recovered": "bool"}), transform)
         written.append(plan.layout.tracks / source.name)
         write_tracks(written[-1], table)
         tracks.update(table["track_id"].unique().tolist())
         count += len(table)
+    for source in sorted(rebase.old.track_positions.glob("unit-*.parquet")):
+        table = read_tables([source], TRACK_POSITION_COLUMNS)
+        table[["x_px", "y_px"]] = transform(table[["x_px", "y_px"]].to_numpy(np.float64))
+        written.append(plan.layout.track_positions / source.name)
+        write_table(written[-1], table, TRACK_POSITION_COLUMNS)
+    if rebase.old.dimensions.exists():
+        table = read_tables([rebase.old.dimensions], DIMENSION_COLUMNS)
+        sizes = ["length_px", "length_sd_px", "width_px", "width_sd_px"]
+        table[sizes] = table[sizes] * rebase.record.scale
+        written.append(plan.layout.dimensions)
+        write_table(written[-1], table, DIMENSION_COLUMNS)
+    if rebase.old.joins.exists():
+        written.append(link_file(rebase.old.joins, plan.layout.joins))
     advance("tracks")
     return StageResult(written, {"tracklets": float(count), "tracks": float(len(tracks))})
 

@@ -12,7 +12,7 @@ from schemas.records import GridRecord
 from velfield.detection.motion.difference import MotionBackground
 from velfield.pipeline.plan import Plan
 from velfield.registration.transforms import FrameMap
-from velfield.registration.warp import footprint, warp_to_base
+from velfield.registration.warp import Rectification, footprint, warp_to_base
 from velfield.run.commits import write_atomically
 from velfield.run.frame_transforms import FrameTransforms, read_grid
 from velfield.run.layout import RunLayout
@@ -88,6 +88,13 @@ class WorkingGrid:
             replicate_border=True,
         )
         return WorkingFrame(image, valid, box, self.scale)
+
+    def rectification(self, frame: int, window: Window) -> Rectification | None:
+        """One frame on a window, resampled where it is asked for; none where it is not registered."""
+        transform = self.maps.transform(frame)
+        if transform is None:
+            return None
+        return Rectification(self.frames.read(frame), transform, window=window, scale=self.scale)
 
     def common_window(self, frames: Sequence[int]) -> Window | None:
         """The window of all of some frames; none where none of them is registered and meets the base image."""

@@ -21,6 +21,7 @@ from velfield.run.frame_transforms import read_grid, read_lens
 from velfield.run.layout import local_copy
 from velfield.run.stores import (
     ERROR_CELLS,
+    POSITION_SD_CELLS,
     REGISTRATION_COLUMNS,
     FrameStore,
     create_registration,
@@ -35,6 +36,8 @@ from velfield.sources.quality import UNUSABLE, describe_flags
 
 MAP_PARAMETERS = 65
 """Approximate number of parameters of a frame's map: its standard error is residual * sqrt(parameters / points)."""
+MAX_SCALE_CHANGE = 1.15
+"""Change of a frame's scale that is reported; a drone that holds its height changes by 2 %."""
 _REFERENCE_LOCK = Lock()
 _references: dict[tuple[str, str], BaseReference] = {}
 _BOXES: dict[str, pd.DataFrame] = {}
@@ -99,6 +102,7 @@ def _write(plan: Plan, frames: range, flags: NDArray[np.uint16], results: dict[i
         for name, dtype in REGISTRATION_COLUMNS.items()
     }
     errors = np.full((len(frames), *ERROR_CELLS), np.nan, np.float32)
+    position_sd = np.full((len(frames), *POSITION_SD_CELLS), np.nan, np.float32)
     statuses = []
     for k, frame in enumerate(frames):
         result = results.get(frame)
@@ -112,13 +116,36 @@ def _write(plan: Plan, frames: range, flags: NDArray[np.uint16], results: dict[i
             columns[name][k] = getattr(result, name)
         if result.error_map is not None:
             errors[k] = result.error_map
+        if result.position_sd_px is not None:
+            position_sd[k] = result.position_sd_px
     store = open_registration(plan.layout.registration, "r+")
-    store.write(frames.start, vectors, statuses, {**columns, "error_px": errors})
+    store.write(frames.start, vectors, statuses, {**columns, "error_px": errors, "position_sd_px": position_sd})
     registered = statuses.count("ok")
     counts = {"frames": float(len(frames)), "registered": float(registered)}
     if registered:
         counts["heldout_px"] = float(np.nanmean(columns["heldout_px"]))
-    return StageResult(store.files(frames.start), counts)
+    return StageResult(store.files(frames.start), counts, warnings=_scale_warnings(plan, frames, results))
+
+
+def _scale_warnings(plan: Plan, frames: range, results: dict[int, FrameRegistration]) -> list[str]:
+    """Whether the camera zoomed, or climbed by much, within a unit: the lens was calibrated at one focal length."""
+    scales = {
+        frame: result.transform.scale_and_rotation()[0]
+        for frame, result in results.items()
+        if result.transform is not None
+    }
+    if not scales:
+        return []
+    values = list(scales.values())
+    usual = float(np.median(values)) if read_grid(plan.layout).registered_to == "given" else 1.0
+    odd = [frame for frame, scale in scales.items() if abs(np.log(scale / usual)) > np.log(MAX_SCALE_CHANGE)]
+    if not odd:
+        return []
+    most = max(odd, key=lambda frame: abs(np.log(scales[frame] / usual)))
+    return [
+        f"frames {odd[0]} to {odd[-1]} show the ground at up to {usual / scales[most]:.2f} times the usual scale: the "
+        "camera zoomed or changed its height, and the lens, calibrated for the whole flight, may not fit there"
+    ]
 
 
 def usable_frames(plan: Plan) -> Mask:

@@ -17,8 +17,9 @@ from velfield.pipeline.plan import Plan
 from velfield.report.report import render_report
 from velfield.report.run_figures import report_figures
 from velfield.report.viewer_page import NOT_BUILT, licences, page_is_built, render_viewer
-from velfield.run.commits import code_version, write_atomically
+from velfield.run.commits import code_version, record_page, write_atomically
 from velfield.run.frame_transforms import north_direction_rad, read_grid, read_working
+from velfield.run.layout import RunLayout
 from velfield.run.stores import open_frames, open_registration
 from velfield.viewer.record import write_view_record
 
@@ -31,14 +32,28 @@ _TRAINING_SOURCES = {
 }
 
 
-def write_report(plan: Plan, summary: RunSummary) -> list[str]:
+def write_report(plan: Plan, summary: RunSummary, *, preview_of: str | None = None) -> list[str]:
     """Write ``index.html``, the viewer with the report as its summary, and the records of both.
+
+    Parameters
+    ----------
+    preview_of
+        The frames that the field is of, while the run goes on.
 
     Returns
     -------
     Warnings, one line each: the viewer is not built, and the page holds the report only.
     """
-    layout, report = plan.layout, make_report(plan, summary)
+    report = make_report(plan, summary)
+    if preview_of is not None:
+        note = f"Preview of {preview_of}, while the run goes on: load the page again for more."
+        report = report.model_copy(update={"title": f"{report.title}: {preview_of}", "notes": (note, *report.notes)})
+    warnings = _write_page(plan.layout, report)
+    record_page(plan.layout)
+    return warnings
+
+
+def _write_page(layout: RunLayout, report: Report) -> list[str]:
     write_atomically(layout.report_record, report.model_dump_json().encode())
     write_view_record(layout)
     figures = report_figures(layout.maps)

@@ -1,7 +1,4 @@
-"""Tracklets of a unit of frames, exact across its border.
-
-The tracks of vehicles: tracklets of the whole flight that share detections, chained.
-"""
+"""Tracklets of a unit of frames, exact across its border."""
 
 from pathlib import Path
 
@@ -14,10 +11,9 @@ from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.registration import MAP_PARAMETERS, usable_frames
 from velfield.run.frame_transforms import read_grid
 from velfield.run.stores import open_frames, open_registration
-from velfield.run.tables import Patches, read_patches, read_tables, write_table, write_tracks
+from velfield.run.tables import Patches, read_patches, read_tables, write_table
 from velfield.tracking.association import FrameTable, window_frames
 from velfield.tracking.tracklets import link_windows
-from velfield.tracking.tracks import END_COLUMNS, GapLimits, assign_tracks, reconnect_tracks
 
 
 def tracklet_files(plan: Plan) -> list[Path]:
@@ -25,30 +21,6 @@ def tracklet_files(plan: Plan) -> list[Path]:
     layout = plan.layout
     paths = [layout.unit_file(layout.tracklets, unit, ".parquet") for unit in range(len(plan.units))]
     return [path for path in paths if path.exists()]
-
-
-def chain_tracks(plan: Plan) -> StageResult:
-    """Give every tracklet the track that it belongs to: reads a few columns of all units, writes unit by unit."""
-    ids = [f"detection_id_{k}" for k in range(3)]
-    sources = tracklet_files(plan)
-    tracklets = read_tables(sources, TRACKLET_COLUMNS, only=[*ids, *END_COLUMNS])
-    tracks = assign_tracks(tracklets[ids].to_numpy(np.int64))
-    config = plan.config.tracking
-    gaps = GapLimits(config.max_gap_s, config.max_stationary_gap_s, config.stationary_speed_m_per_s)
-    tracks = reconnect_tracks(tracklets, tracks, gaps, gsd_m=read_grid(plan.layout).gsd_m)
-    written, start = [], 0
-    for path in sources:
-        table = read_tables([path], TRACKLET_COLUMNS)
-        table["track_id"] = tracks[start : start + len(table)]
-        start += len(table)
-        target = plan.layout.tracks / path.name
-        write_tracks(target, table)
-        written.append(target)
-    for stale in set(plan.layout.tracks.glob("unit-*.parquet")) - set(written):
-        stale.unlink()  # of an earlier plan with more units
-    advance("tracks")
-    warnings = [] if len(tracks) else [explain_no_tracklets(plan)]
-    return StageResult(written, {"tracklets": len(tracks), "tracks": len(np.unique(tracks))}, warnings=warnings)
 
 
 def explain_no_tracklets(plan: Plan) -> str:
@@ -75,7 +47,7 @@ def link_unit(plan: Plan, frames: range) -> StageResult:
     times_s = open_frames(plan.layout.frames).column("time_s")
     usable = usable_frames(plan)
     window = window_frames(list(usable), list(times_s), frames, plan.config.tracking.max_interval_s)
-    tables = _frame_tables(plan, window, times_s, usable)
+    tables = frame_tables(plan, window, times_s, usable)
     tracklets, log = link_windows(tables, plan.config.tracking, gsd_m=read_grid(plan.layout).gsd_m, starts=frames)
     path = plan.layout.unit_file(plan.layout.tracklets, frames.start // plan.unit_frames, ".parquet")
     write_table(path, tracklets, TRACKLET_COLUMNS)
@@ -84,15 +56,16 @@ def link_unit(plan: Plan, frames: range) -> StageResult:
     return StageResult([path], {"frames": len(frames), "tracklets": len(tracklets), **counts})
 
 
-def _frame_tables(plan: Plan, window: range, times_s: np.ndarray, usable: np.ndarray) -> list[FrameTable]:
+def frame_tables(
+    plan: Plan, window: range, times_s: np.ndarray, usable: np.ndarray, *, weak: bool = False
+) -> list[FrameTable]:
+    """Detections of a range of frames, with the weak candidates after them where asked for."""
     store = open_registration(plan.layout.registration)
     heldout = store.column("heldout_px", window.start, window.stop).astype(np.float64)
     kept = store.column("n_inliers", window.start, window.stop).astype(np.float64)
     tables: list[FrameTable] = []
     for unit in range(window.start // plan.unit_frames, (window.stop - 1) // plan.unit_frames + 1):
-        path = plan.layout.unit_file(plan.layout.detections, unit, ".parquet")
-        table = read_tables([path], DETECTION_COLUMNS)
-        patches = read_patches(path.with_suffix(".patches.npz"))
+        table, patches = _read_unit(plan, unit, weak=weak)
         first, last = unit * plan.unit_frames, min((unit + 1) * plan.unit_frames, window.stop)
         for frame in range(max(first, window.start), last):
             k = frame - window.start
@@ -109,6 +82,17 @@ def _frame_tables(plan: Plan, window: range, times_s: np.ndarray, usable: np.nda
                 )
             )
     return tables
+
+
+def _read_unit(plan: Plan, unit: int, *, weak: bool) -> tuple[pd.DataFrame, Patches]:
+    """Detections of a unit and their patches; weak candidates after them, by frame in the order of their ids."""
+    layout = plan.layout
+    folders = (layout.detections, layout.weak_detections) if weak else (layout.detections,)
+    paths = [layout.unit_file(folder, unit, ".parquet") for folder in folders]
+    table = read_tables(paths, DETECTION_COLUMNS)
+    parts = [read_patches(path.with_suffix(".patches.npz")) for path in paths]
+    arrays = {name: np.concatenate([part[name] for part in parts]) for name in ("patches", "chips", "xy_work")}
+    return table, {**arrays, "working_scale": parts[0]["working_scale"]}
 
 
 def _frame_table(

@@ -37,6 +37,7 @@ def probe_video(path: Path, *, frames: FramesConfig, timestamps: Path | None) ->
         time_base = stream.time_base
         warnings = _stream_warnings(stream)
         packets = demux(container, stream, path)
+    warnings += _picture_warnings(path, frames.max_pixels)
     if packets.pts.size == 0:
         raise InputError(
             f"{path.name}: found no frames in the video stream, expected at least one; the file is damaged or truncated"
@@ -120,6 +121,41 @@ def _stream_warnings(stream: Any) -> tuple[str, ...]:
     if aspect is not None and aspect not in (0, 1):
         return (f"pixels are {aspect} as wide as high: coordinates are pixels as stored",)
     return ()
+
+
+_HDR = {16: "PQ", 18: "HLG"}
+"""Transfer functions (ITU-T H.273) of high dynamic range."""
+
+
+def _picture_warnings(path: Path, max_pixels: int) -> tuple[str, ...]:
+    """Properties of the recording, by its first frame, that would make a wrong map, or a poor one."""
+    found: list[str] = []
+    with libav_log(), ExitStack() as stack:
+        container = stack.enter_context(open_video(path))
+        stream = video_stream(container, path)
+        stream.codec_context.options = {"max_pixels": str(max_pixels)}
+        try:
+            picture = next(iter(container.decode(stream)), None)
+        except (av.error.FFmpegError, ValueError):
+            return ()  # a damaged start is told where frames are read
+        if picture is None:
+            return ()
+        if picture.interlaced_frame:
+            found.append(
+                "the video is interlaced: every other row is half a frame later, so that what moves is a comb; "
+                "deinterlace it first (`ffmpeg -i IN -vf bwdif OUT`)"
+            )
+        if int(picture.color_trc) in _HDR:
+            found.append(
+                f"the video is of high dynamic range ({_HDR[int(picture.color_trc)]}): its grey levels are used as "
+                "stored, which are flatter than the detector was trained on; convert it to BT.709 first"
+            )
+        if picture.rotation % 360:
+            found.append(
+                f"the file asks for its pictures to be turned by {picture.rotation % 360} degrees for display: they "
+                "are used as stored, and so are the coordinates of labels and detections"
+            )
+    return tuple(found)
 
 
 def _truncation_warning(times_s: FloatArray, declared: int | None, declared_s: float | None) -> tuple[str, ...]:

@@ -152,6 +152,55 @@ def place_trees(
             place_tree(canvas, x, y, radius, scene, rng)
 
 
+_ROW_M, _TREE_GAP_M, _NO_TREE_M = (25.0, 60.0), (7.0, 11.0), 12.0
+"""Lengths of rows of street trees and of the gaps between their stems; how far they keep from an intersection."""
+
+
+def place_street_trees(canvas: Canvas, plan: p.CityPlan, scene: SceneSimulation, rng: np.random.Generator) -> None:
+    """Rows of trees along the kerbs of avenues and streets, their crowns over the lanes."""
+    if not scene.street_tree_share:
+        return
+    x0, y0, x1, y1 = plan.rect
+    for y in plan.avenues_y:
+        for sign in (-1, 1):
+            for x in _stems((x0, x1), plan.avenues_x, p.STOP_A, scene.street_tree_share, rng):
+                _place_street_tree(canvas, (x, y + sign * (p.CURB_A + rng.uniform(3.0, 4.5))), scene, rng)
+    for x in plan.avenues_x:
+        for sign in (-1, 1):
+            for y in _stems((y0, y1), plan.avenues_y, p.STOP_B, scene.street_tree_share, rng):
+                _place_street_tree(canvas, (x + sign * (p.CURB_B + rng.uniform(3.5, 5.0)), y), scene, rng)
+    for left, top, right, bottom in plan.streets:
+        vertical = right - left < bottom - top
+        along = (top, bottom) if vertical else (left, right)
+        middle = (left + right) / 2 if vertical else (top + bottom) / 2
+        for sign in (-1, 1):
+            for at in _stems(along, [], 0.0, scene.street_tree_share, rng):
+                off = middle + sign * rng.uniform(4.5, 6.0)
+                _place_street_tree(canvas, (off, at) if vertical else (at, off), scene, rng)
+
+
+def _stems(
+    span: tuple[float, float], crossings: list[float], stop_m: float, share: float, rng: np.random.Generator
+) -> list[float]:
+    """Where along a kerb trees stand: rows that take a share of it, none near a crossing."""
+    found, at = [], span[0] - rng.uniform(0, _ROW_M[1])
+    while at < span[1]:
+        row = rng.uniform(*_ROW_M)
+        end = at + row
+        while at < end:
+            if all(abs(at - crossing) > stop_m + _NO_TREE_M for crossing in crossings):
+                found.append(float(at))
+            at += rng.uniform(*_TREE_GAP_M)
+        at += row * (1 - share) / share * rng.uniform(0.6, 1.4)
+    return found
+
+
+def _place_street_tree(
+    canvas: Canvas, at: tuple[float, float], scene: SceneSimulation, rng: np.random.Generator
+) -> None:
+    place_tree(canvas, *at, float(rng.uniform(4.0, 6.0)), scene, rng)
+
+
 def place_tree(
     canvas: Canvas, x: float, y: float, radius: float, scene: SceneSimulation, rng: np.random.Generator
 ) -> None:

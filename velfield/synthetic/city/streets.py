@@ -10,6 +10,7 @@ from velfield.synthetic.city.blocks import (
     box,
     paint_fields,
     place_buildings,
+    place_street_trees,
     place_tree,
     place_trees,
     rotated_box,
@@ -45,6 +46,7 @@ def paint_city(canvas: Canvas, plan: p.CityPlan, scene: SceneSimulation, rng: np
     _roundabouts(canvas, plan, scene, rng)
     place_buildings(canvas, plan.rect, occupancy, scene, rng)
     place_trees(canvas, plan, occupancy, scene, rng)
+    place_street_trees(canvas, plan, scene, rng)  # last, so that without them all else is as it was
     return np.array(spaces, dtype=np.float64).reshape(-1, 3)
 
 

@@ -22,11 +22,12 @@ def registration(
     cases
         `homography`: plane, pinhole, 2560x1440; `wobble`: lens and rows that move by 4 px, 6 cycles a frame;
         `vibration`: lens, shake at 14-29 Hz, drift, turn, tilt, relief, base image of another sensor;
+        `two_term_lens`: a lens of two terms whose centre is up to 20 px off, 2560x1920, base image of another sensor;
         `long`: the same, 640x480, for the drift over 1000 frames.
     seeds
         One flight each.
     frames
-        Frames a flight. Default: 8, 12, 60 and 1000.
+        Frames a flight. Default: 8, 12, 60, 10 and 1000.
     stabilo
         Register by stabilo too; without, velfield alone is measured, and stabilo need not be installed.
     """

@@ -7,15 +7,13 @@ which is meaningful on a shared machine too.
 
 import shutil
 import time
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from schemas.job import Job
-    from velfield.pipeline.plan import Plan
-    from velfield.pipeline.units import Unit
 
 
 @dataclass(frozen=True)
@@ -88,6 +86,7 @@ def _flow(job: "Job", workers: int) -> Cost:
 def _bare(job: "Job", workers: int) -> Cost:
     import multiprocessing
 
+    from velfield.bench.workers import compute_bare
     from velfield.pipeline.plan import make_plan, write_flight_record
 
     begun = time.monotonic()
@@ -98,30 +97,3 @@ def _bare(job: "Job", workers: int) -> Cost:
         start, used_before = time.monotonic(), _processor_s()
         compute_bare(plan, pool)
         return Cost(time.monotonic() - start, _processor_s() - used_before, start - begun)
-
-
-def compute_bare(plan: "Plan", pool: Executor) -> None:
-    """All stages, one after another, each on the pool: blocks of all units at once, then what joins a unit's."""
-    from velfield.pipeline.stage import STAGES, resolve
-    from velfield.pipeline.units import prepare_stage, stage_units, unit_blocks
-
-    for stage in STAGES:
-        prepare_stage(plan, stage)
-        under_way = []
-        for unit in stage_units(plan, stage):
-            frames = unit_blocks(plan, stage, unit) if stage.block else []
-            under_way.append((unit, [pool.submit(resolve(str(stage.block)), plan, part) for part in frames]))
-        ends = []
-        for unit, blocks in under_way:
-            results = [[block.result() for block in blocks]] if stage.block else []
-            ends.append(pool.submit(_one, plan, stage.name, unit, *results))
-        for end in ends:
-            end.result()
-
-
-def _one(plan: "Plan", stage: str, unit: "Unit", *blocks: Any) -> None:
-    from velfield.pipeline.result import commit
-    from velfield.pipeline.stage import STAGE, resolve
-
-    started = time.time()
-    commit(plan, stage, unit.name, resolve(STAGE[stage].unit)(plan, *unit.part, *blocks), started=started)

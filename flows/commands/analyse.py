@@ -1,0 +1,47 @@
+"""``velfield analyse``: what a traffic engineer asks of a run, or of another program's tracks."""
+
+from pathlib import Path
+from typing import Literal
+
+
+def analyse(
+    run_folder: Path | None = None,
+    /,
+    *,
+    tracks: Path | None = None,
+    out: Path | None = None,
+    gsd_m: float | None = None,
+    fps: float | None = None,
+    unit: Literal["m", "px"] | None = None,
+) -> int:
+    """Lanes, turning counts, speeds, signals, flow, conflicts: write `analysis/` with a report.
+
+    Parameters
+    ----------
+    run_folder
+        The run folder.
+    tracks
+        Tracks of another program instead: CSV or Parquet (geo-trax, highD and others), or SUMO's FCD.
+    out
+        Folder for the answers from `--tracks`.
+    gsd_m
+        Metres a pixel of `--tracks`, where they are in pixels.
+    fps
+        Frames a second of `--tracks`, where they have no times.
+    unit
+        Of columns named x and y in `--tracks`.
+    """
+    from velfield.errors import InputError
+    from velfield.pipeline.analysis.analyse import analyse_run, analyse_tracks
+
+    if (run_folder is None) == (tracks is None):
+        raise InputError("expected a run folder or --tracks FILE; give one of them")
+    if tracks is None:
+        lines = analyse_run(Path(run_folder or "."))
+    elif out is None:
+        raise InputError(f"found --tracks {tracks} and no folder for the answers; give --out")
+    else:
+        lines = analyse_tracks(tracks, out, gsd_m=gsd_m, fps=fps, unit=unit)
+    for line in lines:
+        print(line, flush=True)
+    return 0

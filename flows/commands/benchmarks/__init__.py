@@ -1,0 +1,1 @@
+"""The commands of `velfield bench`, one a module."""

@@ -1,0 +1,96 @@
+"""``velfield georeference``: put a finished run's map on Earth by ground control points, of a file or of a page."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from schemas.georeference import ControlPoint, ControlPointsRecord
+
+if TYPE_CHECKING:
+    from starlette.applications import Starlette
+
+Model = Literal["similarity", "affine"]
+
+
+def georeference(
+    run_folder: Path,
+    /,
+    *,
+    points: Path | None = None,
+    epsg: int | None = None,
+    model: Model | None = None,
+    check: Annotated[bool, Parameter(negative=())] = False,
+    port: int | None = None,
+    open_browser: Annotated[bool, Parameter(name="--open")] = True,
+) -> int:
+    """Put a finished run's map on Earth by three or more ground control points; no frame is registered again.
+
+    Maps, exports and the page have coordinates, metres and north by the points from then on. Without --points the
+    points are clicked in the browser.
+
+    Parameters
+    ----------
+    run_folder
+        The run folder.
+    points
+        CSV `x_px,y_px,longitude,latitude`, or `x_px,y_px,x,y` with --epsg; `name` is optional. Pixels of the map, as
+        the page shows them. Default: a page in the browser, to click them.
+    epsg
+        Reference system of `x,y`, as 32633.
+    model
+        How the map is fitted. Default: a similarity, or with six points or more an affine transform where that is
+        closer at points left out.
+    check
+        Print residuals of --points, and change nothing.
+    port
+        Port of the page. Default: any that is free.
+    open_browser
+        Open the browser, where there is a screen.
+    """
+    from velfield.errors import InputError
+    from velfield.pipeline.georeference import fit_run_points
+    from velfield.pipeline.georeference import georeference as georeference_run
+    from velfield.run.run import open_run
+    from velfield.sources.control_points import read_control_points, residual_table
+
+    if points is None:
+        from flows.commands.view import serve_until_interrupted
+
+        if check:
+            raise InputError("found --check without --points, expected both; the page shows residuals by itself")
+        app = page_app(run_folder, epsg, model)
+        serve_until_interrupted(app, port=port, open_browser=open_browser, place=run_folder, purpose="control points")
+        return 0
+    read, code = read_control_points(points, epsg)
+    if check:
+        print(residual_table(fit_run_points(open_run(run_folder), read, code, model)))
+        return 0
+    done = georeference_run(run_folder, read, code, model)
+    print(residual_table(done.points))
+    for line in done.all_notes():
+        print(f"note: {line}")
+    print(f"map     {run_folder / 'maps'}")
+    return 0
+
+
+def page_app(run_folder: Path, epsg: int | None, model: Model | None) -> "Starlette":
+    """The server of the page for a run."""
+    from velfield.pipeline.georeference import fit_run_points, open_finished_run
+    from velfield.pipeline.georeference import georeference as georeference_run
+    from velfield.pipeline.stages.georeference import saved_control_points
+    from velfield.viewer.georeferencer import georeference_app, marked_points
+
+    run = open_finished_run(run_folder)
+
+    def fit(points: Sequence[ControlPoint], code: int) -> ControlPointsRecord:
+        return fit_run_points(run, points, code, model)
+
+    def save(points: Sequence[ControlPoint], code: int) -> tuple[ControlPointsRecord, Sequence[str]]:
+        done = georeference_run(run_folder, points, code, model)
+        return done.points, done.all_notes()
+
+    before = marked_points(saved_control_points(run.layout)[0], epsg)
+    title = f"Control points of {run_folder.name or run_folder}"
+    return georeference_app(run.base_image, before, title=title, fit=fit, save=save)

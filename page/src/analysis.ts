@@ -1,0 +1,154 @@
+// The tab Analysis: the tables of analysis/analysis.json (schemas/analysis.py), their rows over the map.
+
+import { find, grid, make } from "./dom";
+import { Unreadable } from "./run";
+import type { Units } from "./units";
+
+const MAX_ROWS = 200; // shown of a table
+
+export interface Geometry {
+  type: "Point" | "LineString" | "Polygon";
+  xy_px: [number, number][];
+}
+
+interface Estimate {
+  value: number | null;
+  low: number | null;
+  high: number | null;
+  n: number;
+}
+
+type Cell = Estimate | boolean | number | string | null;
+
+interface Row {
+  cells: Record<string, Cell>;
+  geometry: Geometry | null;
+}
+
+interface Table {
+  name: string;
+  section: string;
+  title: string;
+  note: string;
+  columns: { name: string; title: string; unit: string }[];
+  rows: Row[];
+}
+
+interface Analysis {
+  duration_s: number;
+  tracks: number;
+  level: number;
+  gsd_known: boolean;
+  tables: Table[];
+}
+
+async function loadAnalysis(): Promise<Analysis | null> {
+  const response = await fetch("analysis/analysis.json", { cache: "no-cache" });
+  if (response.status === 404) return null;
+  if (!response.ok) throw new Unreadable(`analysis/analysis.json cannot be read (${response.status})`);
+  return response.json();
+}
+
+export class AnalysisPanel {
+  private loaded: Promise<Analysis | null> | undefined;
+  private table = 0;
+
+  constructor(
+    private readonly units: Units,
+    /** Show these on the map, one of them chosen. */
+    private readonly draw: (all: Geometry[], chosen: Geometry | null) => void,
+  ) {}
+
+  /** Fill the panel; read the file the first time. */
+  async show(): Promise<void> {
+    const started = performance.now();
+    this.loaded ??= loadAnalysis();
+    const analysis = await this.loaded.catch((error: unknown) => {
+      this.loaded = undefined; // asked again the next time
+      throw error;
+    });
+    if (!analysis || !analysis.tables.length) {
+      const text = "This run has not been analysed. For lanes, movements and speeds with intervals: velfield analyse RUN, then load this page again.";
+      find("analysis-content").replaceChildren(make("p", { class: "note" }, text));
+      return;
+    }
+    this.render(analysis);
+    find("analysis-content").dataset.milliseconds = (performance.now() - started).toFixed(1);
+  }
+
+  private render(analysis: Analysis): void {
+    const table = analysis.tables[this.table]!;
+    const choice = make("select", { id: "table" });
+    for (const section of new Set(analysis.tables.map((each) => each.section))) {
+      const group = make("optgroup", { label: section });
+      analysis.tables.forEach((each, k) => {
+        if (each.section === section) group.append(make("option", { value: String(k) }, `${each.title} (${each.rows.length})`));
+      });
+      choice.append(group);
+    }
+    choice.value = String(this.table);
+    choice.addEventListener("change", () => {
+      this.table = Number(choice.value);
+      const started = performance.now();
+      this.render(analysis);
+      find("analysis-content").dataset.milliseconds = (performance.now() - started).toFixed(1);
+      find("table").focus();
+    });
+    const metres = analysis.gsd_known ? "" : " Metres a pixel are not known: lengths are by 0.23 m.";
+    const about = `${analysis.tracks} tracks of moving vehicles in ${analysis.duration_s.toFixed(0)} s. In grey: ${Math.round(100 * analysis.level)} % interval, n.${metres}`;
+    const note = make("p", { class: "note" }, table.note);
+    const content: HTMLElement[] = [make("p", { class: "note" }, about), make("label", {}, "Table ", choice), note];
+    content.push(table.rows.length ? this.rows(table) : make("p", {}, "Nothing of this kind was found."));
+    if (table.rows.length > MAX_ROWS) content.push(make("p", { class: "note" }, `and ${table.rows.length - MAX_ROWS} more, in analysis/analysis.json`));
+    find("analysis-content").replaceChildren(...content);
+    this.draw(geometries(table), null);
+  }
+
+  private rows(table: Table): HTMLElement {
+    const shown = table.rows.slice(0, MAX_ROWS);
+    const placed = shown.some(({ geometry }) => geometry);
+    const titles = table.columns.map(({ title, unit }) => `${title}${this.shownUnit(unit) && `, ${this.shownUnit(unit)}`}`);
+    const element = grid(
+      [...(placed ? ["Map"] : []), ...titles],
+      shown.map((row, k) => [
+        ...(placed ? [this.button(table, row, k)] : []),
+        ...table.columns.map(({ name, unit }) => this.cell(row.cells[name] ?? null, unit)),
+      ]),
+    );
+    const label = `Table ${table.title}`;
+    return make("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": label }, element);
+  }
+
+  private button(table: Table, row: Row, k: number): HTMLElement | string {
+    const { geometry } = row;
+    if (!geometry) return "";
+    const button = make("button", { type: "button", "aria-label": `Show row ${k + 1} on the map`, class: "place" }, "●");
+    button.addEventListener("click", () => this.draw(geometries(table), geometry));
+    return button;
+  }
+
+  /** Speeds are stored in m/s and shown in the chosen unit. */
+  private shownUnit(unit: string): string {
+    return unit === "m/s" ? this.units.speed : unit;
+  }
+
+  private cell(cell: Cell, unit: string): Node | string {
+    const text = (value: number): string => {
+      const shown = unit === "m/s" ? this.units.fromMetresPerSecond(value) : value;
+      return Number.isInteger(shown) ? String(shown) : Math.abs(shown) < 1 ? shown.toFixed(2) : shown.toFixed(1);
+    };
+    if (cell === null) return "–";
+    if (typeof cell === "boolean") return cell ? "yes" : "no";
+    if (typeof cell === "string") return cell;
+    if (typeof cell === "number") return text(cell);
+    if (cell.value === null) return "–";
+    const span = make("span", {}, text(cell.value));
+    const interval = cell.low !== null && cell.high !== null ? `${text(cell.low)} to ${text(cell.high)}, ` : "";
+    span.append(make("span", { class: "error" }, ` ${interval}n = ${cell.n}`));
+    return span;
+  }
+}
+
+function geometries(table: Table): Geometry[] {
+  return table.rows.flatMap(({ geometry }) => (geometry ? [geometry] : []));
+}

@@ -1,0 +1,135 @@
+"""Results of `velfield analyse`, in ``RUN/analysis/``: ``analysis.json``, ``lanes.json``. Points are (x, y), px."""
+
+from typing import Literal
+
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+
+from schemas.model import Model
+
+ANALYSIS_VERSION = 1
+"""Version of these files."""
+
+Point = tuple[float, float]
+
+
+class EstimateRecord(Model):
+    """A number with its 90 % interval; all None where there is too little data for one."""
+
+    value: float | None = None
+    low: float | None = None
+    high: float | None = None
+    n: NonNegativeInt = 0
+    """Vehicles, cycles or events that it rests on."""
+
+
+class GeometryRecord(Model):
+    """Where a row of a table is on the map."""
+
+    type: Literal["Point", "LineString", "Polygon"]
+    xy_px: tuple[Point, ...]
+
+
+Cell = EstimateRecord | bool | int | float | str | None
+"""A value of a table; None: not known."""
+
+
+class AnalysisColumn(Model):
+    """A column of a table."""
+
+    name: str
+    """Key of its cells."""
+    title: str
+    unit: str = ""
+
+
+class AnalysisRow(Model):
+    """A row of a table."""
+
+    cells: dict[str, Cell]
+    geometry: GeometryRecord | None = None
+
+
+class AnalysisTable(Model):
+    """A question and its answer."""
+
+    name: str
+    """Unique: ``lanes``, ``turning_counts``, ..."""
+    section: str
+    """Groups tables: Lanes, Movements, Speed, Signals, Flow, Conflicts, Unusual."""
+    title: str
+    note: str = ""
+    """How it was found, what is left out, which tables of which manual were used."""
+    columns: tuple[AnalysisColumn, ...]
+    rows: tuple[AnalysisRow, ...]
+
+
+class AnalysisRecord(Model):
+    """``analysis.json``: all tables."""
+
+    version: PositiveInt = ANALYSIS_VERSION
+    code_version: str
+    gsd_m: PositiveFloat
+    gsd_known: bool
+    """False: lengths are by the paper's ground sample distance."""
+    duration_s: NonNegativeFloat
+    tracks: NonNegativeInt
+    """Tracks of moving vehicles that were analysed."""
+    level: float = Field(0.9, gt=0, lt=1)
+    """Probability that an interval is to have."""
+    tables: tuple[AnalysisTable, ...]
+
+
+class LaneRecord(Model):
+    """A lane: its centre line runs in the direction of travel."""
+
+    lane: NonNegativeInt
+    xy_px: tuple[Point, ...]
+    length_m: NonNegativeFloat
+    width_m: PositiveFloat
+    width_source: Literal["neighbour", "spread"]
+    """``neighbour``: distance to the lane beside it; ``spread``: of the paths across it, and a car's width."""
+    tracks: NonNegativeInt
+    left: NonNegativeInt | None = None
+    """Neighbouring lane of the same direction."""
+    right: NonNegativeInt | None = None
+    predecessors: tuple[NonNegativeInt, ...] = ()
+    successors: tuple[NonNegativeInt, ...] = ()
+    limit_m_per_s: PositiveFloat | None = None
+    """Speed limit inferred from vehicles in free flow."""
+
+
+class ConnectionRecord(Model):
+    """From the end of a lane to the start of another."""
+
+    start: NonNegativeInt
+    end: NonNegativeInt
+    tracks: NonNegativeInt
+    share: float = Field(ge=0, le=1)
+    """Of the tracks that leave the lane ``start``."""
+    turn: Literal["straight", "left", "right", "u-turn"]
+
+
+class JunctionRecord(Model):
+    """Where lanes cross, merge or diverge."""
+
+    junction: NonNegativeInt
+    kind: Literal["intersection", "roundabout", "merge", "diverge"]
+    x_px: float
+    y_px: float
+    hull_px: tuple[Point, ...]
+    """Corners of the convex area in which the lanes meet."""
+    lanes_in: tuple[NonNegativeInt, ...]
+    lanes_out: tuple[NonNegativeInt, ...]
+    lanes_inside: tuple[NonNegativeInt, ...]
+    signalised: bool | None = None
+    """Whether its traffic stops in a cycle; None: too little data, or lanes only merge or diverge here."""
+
+
+class LanesRecord(Model):
+    """``lanes.json``: the lane graph."""
+
+    version: PositiveInt = ANALYSIS_VERSION
+    gsd_m: PositiveFloat
+    lanes: tuple[LaneRecord, ...]
+    connections: tuple[ConnectionRecord, ...]
+    junctions: tuple[JunctionRecord, ...]

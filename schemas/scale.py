@@ -1,0 +1,62 @@
+"""The ground sample distance by each of its sources, with an interval, and which one a run uses."""
+
+from typing import Literal, Self
+
+from pydantic import PositiveFloat, model_validator
+
+from schemas.model import Model
+
+ScaleSource = Literal["control_points", "base", "given", "metadata", "vehicles"]
+"""``control_points``: of `velfield georeference`; ``base``: the reference system of the image given as ``--base``;
+``given``: ``--gsd-m``; ``metadata``: the camera's height and focal length; ``vehicles``: the lengths of cars."""
+
+
+class ScaleEstimate(Model):
+    """The ground sample distance by one source.
+
+    Examples
+    --------
+    >>> estimate = ScaleEstimate(gsd_m=0.05, low_m=0.048, high_m=0.052, source="metadata")
+    >>> estimate.text()
+    '0.05 m a pixel (90 % interval 0.048 to 0.052) by the metadata'
+    """
+
+    gsd_m: PositiveFloat
+    """Ground sample distance, m a base pixel."""
+    low_m: PositiveFloat
+    """Lower end of the 90 % interval, m a base pixel."""
+    high_m: PositiveFloat
+    """Upper end of the 90 % interval, m a base pixel."""
+    source: ScaleSource
+    note: str = ""
+    """What it rests on, one line."""
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if not self.low_m <= self.gsd_m <= self.high_m:
+            raise ValueError(f"gsd_m {self.gsd_m:g} is not between low_m {self.low_m:g} and high_m {self.high_m:g}")
+        return self
+
+    def text(self) -> str:
+        """The estimate in one line."""
+        interval = f"90 % interval {self.low_m:.3g} to {self.high_m:.3g}"
+        return f"{self.gsd_m:.4g} m a pixel ({interval}) by {_NAMES[self.source]}"
+
+
+_NAMES: dict[ScaleSource, str] = {
+    "control_points": "the control points",
+    "base": "the base image",
+    "given": "--gsd-m",
+    "metadata": "the metadata",
+    "vehicles": "the lengths of vehicles",
+}
+
+
+class ScaleChoice(Model):
+    """Which estimate a run uses, and what the others say."""
+
+    used: ScaleEstimate | None = None
+    """None: no source knows the scale, and speeds stay in px/s."""
+    others: tuple[ScaleEstimate, ...] = ()
+    disagreements: tuple[str, ...] = ()
+    """One line for each of the others whose interval does not meet that of the one that is used."""

@@ -1,0 +1,98 @@
+"""Lanes of constructed tracks: an avenue of two lanes, a side street that leaves and one that joins it, a circle."""
+
+import numpy as np
+import pytest
+
+from schemas.arrays import FloatArray
+from tests.field_runs import tracklets_along
+from velfield.analysis.lanes.find import find_lanes, project
+from velfield.analysis.lanes.junctions import buffered_hull, inside_hull
+from velfield.analysis.lanes.model import LaneGraph
+from velfield.analysis.trajectories import from_tracklets
+
+GSD_M = 0.25
+
+
+def arc(centre: tuple[float, float], radius: float, start_deg: float, end_deg: float) -> FloatArray:
+    angle = np.radians(np.linspace(start_deg, end_deg, 60))
+    return np.array(centre) + radius * np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def driven(corners: FloatArray, *, speed_m_per_s: float = 10.0) -> FloatArray:
+    """Positions (n, 2), px, every 0.2 s along a path in metres."""
+    along = np.concatenate([[0.0], np.hypot(*np.diff(corners, axis=0).T).cumsum()])
+    s = np.arange(0.0, along[-1], speed_m_per_s / 5)
+    return np.column_stack([np.interp(s, along, corners[:, k]) for k in (0, 1)]) / GSD_M
+
+
+def graph_of(paths: list[FloatArray], *, sd_m: float = 0.2) -> LaneGraph:
+    rng = np.random.default_rng(5)
+    noisy = [path + rng.normal(0, sd_m / GSD_M, (1, 2)) + rng.normal(0, 0.05 / GSD_M, path.shape) for path in paths]
+    return find_lanes(from_tracklets(tracklets_along(noisy), GSD_M))
+
+
+AVENUE = np.array([[0.0, 50.0], [150.0, 50.0]])
+BESIDE = AVENUE - np.array([0.0, 3.5])
+OPPOSITE = AVENUE[::-1] + np.array([0.0, 3.5])
+LEAVES = np.concatenate([[[0.0, 46.5], [60.0, 46.5]], arc((60.0, 36.5), 10.0, 90, 0), [[70.0, 0.0]]])
+
+
+@pytest.fixture(scope="module")
+def avenue() -> LaneGraph:
+    paths = [AVENUE] * 8 + [BESIDE] * 8 + [OPPOSITE] * 8 + [LEAVES] * 5
+    return graph_of([driven(path) for path in paths])
+
+
+def test_centre_lines_are_where_vehicles_drive(avenue: LaneGraph) -> None:
+    errors = [
+        np.abs(project(lane.xy_m, truth)[1]).max()
+        for truth in (AVENUE, BESIDE, OPPOSITE)
+        for lane in avenue
+        if abs(np.median(lane.xy_m[:, 1]) - truth[0, 1]) < 1 and lane.length_m > 20
+    ]
+    assert len(errors) == 4  # the lane that the street leaves is two lanes
+    assert max(errors) < 0.35
+
+
+def test_the_graph_has_the_turn_and_nothing_else(avenue: LaneGraph) -> None:
+    assert len(avenue) == 5
+    assert sorted(c.turn for c in avenue.connections) == ["left", "straight"]
+    left = next(c for c in avenue.connections if c.turn == "left")
+    assert left.tracks == 5
+    assert left.share == pytest.approx(5 / 13)
+    assert len(avenue.entries) == 3
+    assert len(avenue.exits) == 4
+
+
+def test_lanes_of_one_direction_are_neighbours(avenue: LaneGraph) -> None:
+    lane = max((lane for lane in avenue if lane.width_source == "neighbour"), key=lambda lane: lane.length_m)
+    assert lane.width_m == pytest.approx(3.5, abs=0.35)
+    back = max((lane for lane in avenue if abs(np.median(lane.xy_m[:, 1]) - 53.5) < 1), key=lambda lane: lane.length_m)
+    assert (back.left, back.right) == (None, None)
+    assert back.direction_rad == pytest.approx(np.pi, abs=0.1) or abs(np.median(back.direction_rad)) > 3.0
+
+
+def test_a_circle_is_a_roundabout() -> None:
+    ring = [np.concatenate([[[0.0, 60.0]], arc((40.0, 40.0), 13.0, 130, -70), [[80.0, 20.0]]])]
+    other = [np.concatenate([[[80.0, 16.0]], arc((40.0, 40.0), 13.0, -40, -250), [[0.0, 64.0]]])]
+    graph = graph_of([driven(path, speed_m_per_s=6.0) for path in ring * 8 + other * 8], sd_m=0.1)
+    assert "roundabout" in [junction.kind for junction in graph.junctions]
+
+
+def test_two_tracks_make_no_lane() -> None:
+    assert len(graph_of([driven(AVENUE)] * 2)) == 0
+    assert len(graph_of([driven(AVENUE)] * 3)) == 1
+
+
+def test_no_tracks_no_lanes() -> None:
+    none = tracklets_along([driven(AVENUE)]).iloc[:0]
+    assert len(find_lanes(from_tracklets(none, GSD_M))) == 0
+
+
+def test_a_hull_holds_its_points() -> None:
+    rng = np.random.default_rng(0)
+    xy = rng.normal(0, 5, (20, 2))
+    hull = buffered_hull(xy, 1.0)
+    assert inside_hull(xy, hull).all()
+    assert inside_hull(xy, hull[::-1]).all()
+    assert not inside_hull(xy + 100, hull).any()

@@ -1,0 +1,179 @@
+"""Answers about constructed traffic: a signal of known cycle, turning counts, free flow, a U-turn, a wrong way."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from schemas.arrays import FloatArray
+from velfield.analysis.changes import find_changes
+from velfield.analysis.flow.conflicts import find_conflicts
+from velfield.analysis.flow.volume import flow_slices
+from velfield.analysis.intervals import estimate_quantile, estimate_rate, estimate_share
+from velfield.analysis.movements.movements import furness
+from velfield.analysis.signals.cycles import find_signal, queues
+from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.analysis.trajectories import Trajectories, make_trajectories, moving
+
+STEP_S, CYCLE_S, SPEED = 0.2, 40.0, 12.0
+Track = tuple[FloatArray, FloatArray]
+"""Times (n,) and positions (n, 2) m."""
+
+
+def drive(path: FloatArray, start_s: float, *, stop_at_m: float | None = None, go_s: float = 0.0) -> Track:
+    """Along a path at 12 m/s; a stop at a place until a time, with comfortable braking and starting."""
+    along = np.concatenate([[0.0], np.hypot(*np.diff(path, axis=0).T).cumsum()])
+    s, v, t, out = 0.0, SPEED, start_s, []
+    while s < along[-1]:
+        out.append((t, s))
+        held = stop_at_m is not None and t < go_s and s <= stop_at_m + 1.0
+        limit = np.sqrt(2 * 2.5 * max((stop_at_m or 0.0) - s, 0.0)) if held else SPEED
+        v = max(min(v + 2.0 * STEP_S, limit, SPEED), 0.0)
+        v = 0.0 if held and v < 0.4 else v
+        s, t = s + v * STEP_S, t + STEP_S
+    times, s_at = np.array(out).T
+    return times, np.column_stack([np.interp(s_at, along, path[:, k]) for k in (0, 1)])
+
+
+def gather(tracks: list[Track], *, sd_m: float = 0.03) -> Trajectories:
+    rng = np.random.default_rng(3)
+    owner = np.repeat(np.arange(len(tracks)), [len(times) for times, _ in tracks])
+    time = np.concatenate([times for times, _ in tracks])
+    xy = np.concatenate([xy for _, xy in tracks]) + rng.normal(0, sd_m, (len(time), 2))
+    return moving(make_trajectories(owner, np.round(time / STEP_S).astype(np.int64), time, xy, gsd_m=0.2))
+
+
+def corner(x: float, y: float, to_y: float) -> FloatArray:
+    angle = np.linspace(-np.pi / 2, 0, 20)
+    arc = np.array([x, y + 10.0]) + 10.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.concatenate([[[0.0, y]], arc, [[x + 10.0, to_y]]])
+
+
+EAST = np.array([[0.0, 100.0], [260.0, 100.0]])
+SOUTH = np.array([[150.0, 0.0], [150.0, 220.0]])
+RIGHT = corner(140.0, 100.0, 220.0)
+
+
+def crossroads() -> list[Track]:
+    """Twelve cycles: to the east green from 0 to 18 s of each, to the south from 20 to 38 s."""
+    out = []
+    for cycle in range(12):
+        begin = cycle * CYCLE_S
+        for k in range(4):  # a queue before each green, 7 m apart, 2 s apart
+            path = RIGHT if k == 2 else EAST
+            out.append(drive(path, begin - 24 + 3 * k, stop_at_m=128.0 - 7 * k, go_s=begin + 1.8 * k + 1.8))
+            out.append(drive(SOUTH, begin - 4 + 3 * k, stop_at_m=78.0 - 7 * k, go_s=begin + 20 + 1.8 * k + 1.8))
+        out.append(drive(EAST, begin + 1.0 + cycle % 3))
+    return out
+
+
+@pytest.fixture(scope="module")
+def analysis() -> TrafficAnalysis:
+    return TrafficAnalysis(gather(crossroads()))
+
+
+def test_turning_counts_and_shares(analysis: TrafficAnalysis) -> None:
+    found = {
+        (m.arm_in, m.arm_out): m for j in analysis.movements for m in j.movements if j.junction.kind == "intersection"
+    }
+    assert found["W", "E"].seen == 48
+    assert found["W", "S"].seen == 12
+    assert found["W", "S"].turn == "right"
+    assert found["N", "S"].seen == 48
+    share = found["W", "S"].share
+    assert share is not None
+    assert share.value == pytest.approx(0.2)
+    assert share.low < 0.2 < share.high
+    delay = found["N", "S"].delay_s
+    assert delay is not None
+    assert delay.value > 0
+
+
+def test_the_cycle_green_and_queues(analysis: TrafficAnalysis) -> None:
+    junction = next(j for j in analysis.lanes.junctions if j.kind == "intersection")
+    signal = analysis.signals[junction.number]
+    assert signal.signalised
+    assert signal.cycle_s is not None
+    assert signal.cycle_s.value == pytest.approx(CYCLE_S, abs=0.3)
+    assert signal.cycle_s.low < CYCLE_S < signal.cycle_s.high
+    greens = sorted((s.green_phase_s.value + 5) % CYCLE_S - 5 for s in signal.streams)
+    assert greens == pytest.approx([0.0, 20.0], abs=1.0)
+    for stream in signal.streams:
+        found = [queue.vehicles for queue in queues(stream.stream, stream.green_s[1:-1])]
+        assert np.median(found) == 4
+        assert stream.stream.stop_line_m is not None
+
+
+def test_without_a_cycle_there_is_no_signal(analysis: TrafficAnalysis) -> None:
+    streams = next(s for s in analysis.streams.values() if any(len(x.head_time_s) for x in s))
+    rng = np.random.default_rng(0)
+    scattered = [replace(s, head_time_s=np.sort(rng.uniform(0, 480, len(s.head_time_s)))) for s in streams]
+    assert find_signal(0, scattered, 0.0, 480.0).signalised is False
+    few = [replace(s, head_time_s=s.head_time_s[:2], cross_time_s=s.cross_time_s[:3]) for s in streams]
+    assert find_signal(0, few, 0.0, 480.0).signalised is None
+
+
+def test_free_flow_and_edie(analysis: TrafficAnalysis) -> None:
+    known = [road.speed_m_per_s for road in analysis.free_flow if road.speed_m_per_s]
+    assert known
+    assert known[0].value == pytest.approx(SPEED, abs=0.4)
+    lane = max(analysis.lanes, key=lambda lane: lane.tracks)
+    slices = flow_slices(analysis.lane_traffic, lane.number, *analysis.window_s)
+    driven = (slices.flow_veh_per_h / 3600).mean() * (analysis.window_s[1] - analysis.window_s[0])
+    assert driven == pytest.approx(lane.tracks, rel=0.1)
+    used = slices.density_veh_per_km > 0
+    product = slices.density_veh_per_km[used] * slices.speed_m_per_s[used] * 3.6
+    assert product == pytest.approx(slices.flow_veh_per_h[used])
+
+
+def test_a_u_turn_a_wrong_way_and_a_conflict() -> None:
+    half = np.linspace(np.pi / 2, -np.pi / 2, 20)
+    back = np.array([[0.0, 86.0]])
+    turn = np.array([140.0, 93.0]) + 7.0 * np.column_stack([np.cos(half), np.sin(half)])
+    u_turn = drive(np.concatenate([[[0.0, 100.0]], turn, back]), 5.0)
+    tracks = [drive(EAST, 4.0 * k) for k in range(12)] + [drive(EAST[::-1], 20.0), u_turn]
+    tracks += [drive(SOUTH, 4.0 * k + 5.7) for k in range(12)]
+    analysis = TrafficAnalysis(gather(tracks))
+    assert [r.left for r in analysis.reversals] == [True]
+    assert "wrong way" in {u.kind for u in analysis.unusual}
+    assert {u.track for u in analysis.unusual if u.kind == "wrong way"} == {12}
+    crossing = [c for c in find_conflicts(analysis.trajectories, analysis.lane_traffic) if c.kind == "crossing"]
+    # at (150, 100): east at 4 k + 12.5 s, south at 4 k + 14.03 s; each holds the place for 6.3 m at 12 m/s
+    assert len(crossing) >= 12
+    first = min(crossing, key=lambda c: c.value_s)
+    assert first.value_s == pytest.approx(14.03 - 12.5 - 6.3 / 12, abs=0.1)
+    assert 0.5 < first.probability <= 1.0
+
+
+def test_a_changed_cycle_and_nothing_else_is_a_change(analysis: TrafficAnalysis) -> None:
+    assert [c.what for c in find_changes(analysis, analysis) if c.significant] == []
+    slow = [(times * 1.25, xy) for times, xy in crossroads()]
+    changes = {c.what.split(",")[0]: c for c in find_changes(analysis, TrafficAnalysis(gather(slow)))}
+    assert changes["cycle"].significant
+    assert changes["cycle"].change == pytest.approx(0.25 * CYCLE_S, abs=1.0)
+    assert not changes["share from W to S"].significant
+
+
+def test_furness_keeps_the_sums() -> None:
+    seen = np.array([[0.0, 30.0, 10.0], [20.0, 0.0, 0.0], [0.0, 5.0, 0.0]])
+    added = furness(seen, np.array([8.0, 4.0, 0.0]), np.zeros(3))
+    assert added.sum(axis=1) == pytest.approx([8.0, 4.0, 0.0])
+    assert (added[seen == 0] == 0).all()
+    assert furness(seen, np.zeros(3), np.ones(3)).sum() == 0
+
+
+@pytest.mark.parametrize("q", [0.15, 0.5, 0.85])
+def test_intervals_of_quantiles_cover(q: float) -> None:
+    rng = np.random.default_rng(1)
+    hits = [
+        e.low <= np.log(1 / (1 - q)) <= e.high
+        for _ in range(400)
+        if (e := estimate_quantile(rng.exponential(1, 40), q))
+    ]
+    assert 0.86 < np.mean(hits) < 0.95
+
+
+def test_too_little_data_gives_none() -> None:
+    assert estimate_quantile(np.arange(10.0), 0.15) is None
+    assert estimate_share(2, 4) is None
+    assert estimate_rate(np.array([1, 2]), 1.0) is None

@@ -1,0 +1,317 @@
+"""Accuracy of `velfield analyse` on simulated traffic without images: ``python -m tests.benchmarks.analysis``.
+
+Tracks are true trajectories with the errors of tracking (`velfield.synthetic.observed_tracks`). Long-run shares and
+flows are the means of the other seeds: their cities are one plan.
+"""
+
+import argparse
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.spatial import cKDTree
+
+from schemas.arrays import FloatArray, IntArray
+from schemas.simulation import SimulationConfig
+from velfield.analysis.flow.conflicts import MAX_PET_S, find_conflicts
+from velfield.analysis.flow.passings import LaneTraffic
+from velfield.analysis.intervals import Estimate
+from velfield.analysis.lanes.find import find_lanes
+from velfield.analysis.movements.movements import find_passes
+from velfield.analysis.signals.cycles import JunctionSignal, queues
+from velfield.analysis.signals.queues import Stops, find_stops, observe_stream
+from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.analysis.trajectories import PathSamples, Trajectories, make_trajectories, moving
+from velfield.synthetic.city.city_plan import AISLE_SPEED, STOP_A, STOP_B
+from velfield.synthetic.flight import Flight
+from velfield.synthetic.lane_score import DirectedGraph, score_lanes
+from velfield.synthetic.observed import NO_ERRORS, observed_detections
+from velfield.synthetic.observed_tracks import observed_tracks
+from velfield.synthetic.traffic.traffic import STEP_S
+
+GSD_M, CYCLE_S = 0.23, 60.0
+AVENUE_KM_PER_H, STREET_KM_PER_H = 50.0, 34.2
+
+
+@dataclass(frozen=True)
+class Case:
+    """A simulated flight: what a tracker reports, and the truth."""
+
+    flight: Flight
+    tracks: pd.DataFrame
+    true: pd.DataFrame
+    lengths_m: FloatArray
+
+
+@dataclass(frozen=True)
+class Results:
+    """Values by measure; estimates by quantity and name; hits of intervals by quantity."""
+
+    values: defaultdict[str, list[float]]
+    estimates: list[tuple[str, str, Estimate]]
+    true: dict[tuple[str, str], float]
+
+
+def simulate(seed: int, minutes: float) -> Case:
+    """Simulate one flight."""
+    flight = Flight(SimulationConfig(seed=seed, frames=round(300 * minutes), gsd_m=GSD_M))
+    traffic, times, city = flight.city.traffic, flight.times_s, flight.city
+    rng = np.random.default_rng(seed)
+    tracks = observed_tracks(traffic, times, city.to_px, shape=flight.base_shape, gsd_m=GSD_M, rng=rng)
+    true = observed_detections(traffic, times, city.to_px, shape=flight.base_shape, rng=rng, errors=NO_ERRORS)
+    return Case(flight, tracks, true, traffic.dimensions.length_m)
+
+
+def trajectories(table: pd.DataFrame, owner: str) -> Trajectories:
+    """Trajectories of a table of positions."""
+    known = "dx_px" in table
+    return moving(
+        make_trajectories(
+            table[owner].to_numpy(np.int64),
+            table["frame"].to_numpy(np.int64),
+            table["time_s"].to_numpy(np.float64),
+            table[["x_px", "y_px"]].to_numpy(np.float64) * GSD_M,
+            gsd_m=GSD_M,
+            displacement_m=table[["dx_px", "dy_px"]].to_numpy(np.float64) * GSD_M if known else None,
+        )
+    )
+
+
+def measure(case: Case) -> Results:
+    """Everything about one flight."""
+    results = Results(defaultdict(list), [], {})
+    found = TrafficAnalysis(trajectories(case.tracks, "track_id"))
+    true = TrafficAnalysis(trajectories(case.true, "vehicle_id"))
+    _lanes(case, found, results)
+    _movements(found, true, results)
+    _speeds(found, true, results)
+    _signals(case, found, true, results)
+    _u_turns(case, found, results)
+    _conflicts(case, found, true, results)
+    return results
+
+
+def _lanes(case: Case, found: TrafficAnalysis, results: Results) -> None:
+    graph = DirectedGraph([lane.xy_m for lane in found.lanes], found.lanes.successors)
+    score = score_lanes(graph, driven_plan(case))
+    results.values["lanes: topology F1"].append(score.f1)
+    results.values["lanes: centre line, median m"].append(score.centre_median_m)
+
+
+def driven_plan(case: Case, *, min_vehicles: int = 3) -> DirectedGraph:
+    """The plan's edges that so many vehicles drove during the flight, within the image."""
+    network, city = case.flight.city.plan.road_network, case.flight.city
+    height, width = case.flight.base_shape
+    vehicles = np.zeros(len(network.edges), np.int64)
+    middles = cKDTree([edge.path[len(edge.path) // 2] for edge in network.edges])
+    times = case.true.groupby("vehicle_id")["time_s"].agg(["min", "max"])
+    traffic = city.traffic
+    for vehicle, begin, end in times.itertuples():
+        points, along = traffic.path(vehicle)
+        rows = slice(int(traffic.first[vehicle]), int(traffic.first[vehicle + 1]))
+        at = STEP_S * (traffic.start_step[vehicle] + np.arange(rows.stop - rows.start))
+        driven = np.interp([begin, end], at, traffic.distance_m[rows])
+        seen = points[(along >= driven[0]) & (along <= driven[1])]
+        near, edge = middles.query(seen, distance_upper_bound=0.3)
+        vehicles[np.unique(edge[np.isfinite(near)])] += 1
+    number: dict[int, int] = {}
+    paths: list[FloatArray] = []
+    for k in np.flatnonzero(vehicles >= min_vehicles):
+        path = city.to_px(network.edges[k].path)
+        inside = ((path >= 0) & (path <= [width, height])).all(axis=1)
+        if inside.sum() >= 2:
+            number[int(k)] = len(paths)
+            paths.append(path[inside] * GSD_M)
+    out = network.out_edges()
+    return DirectedGraph(paths, [[number[j] for j in out[network.edges[k].end] if j in number] for k in number])
+
+
+def _movements(found: TrafficAnalysis, true: TrafficAnalysis, results: Results) -> None:
+    for junction in found.movements:
+        arms = junction.gates.arms
+        passes = find_passes(true.samples, junction.junction, junction.gates)
+        arm = np.array([gate.arm for gate in junction.gates.gates] + [-1], np.int64)
+        arm_in, arm_out = arm[passes.gate_in], arm[passes.gate_out]
+        names = [a.name for a in arms]
+        for m in junction.movements:
+            i, j = names.index(m.arm_in), names.index(m.arm_out)
+            n, whole = int(((arm_in == i) & (arm_out == j)).sum()), int(((arm_in == i) & (arm_out >= 0)).sum())
+            total = m.seen + m.inferred
+            results.values["movements: GEH"].append(float(np.sqrt(2 * (total - n) ** 2 / max(total + n, 1))))
+            if n >= 20 and m.share:
+                results.values["movements: share, points"].append(100 * abs(m.share.value - n / whole))
+            centre = np.round(junction.junction.centre_m / 15).astype(int)
+            name = f"{junction.junction.kind} {centre[0]} {centre[1]} {m.arm_in} {m.arm_out}"
+            if m.share and m.share.value < 0.995:
+                results.estimates.append(("share", name, m.share))
+                results.true["share", name] = n / max(whole, 1)
+            if m.flow_veh_per_h:
+                results.estimates.append(("flow", name, m.flow_veh_per_h))
+                results.true["flow", name] = n / max(np.ptp(true.window_s), 1.0) * 3600
+
+
+def _speeds(found: TrafficAnalysis, true: TrafficAnalysis, results: Results) -> None:
+    for road in found.free_flow:
+        if road.speed_m_per_s:
+            speed = road.speed_m_per_s.in_units(3.6)
+            truth = min((AVENUE_KM_PER_H, STREET_KM_PER_H, 20.2, 15.1), key=lambda v: abs(v - speed.value))
+            results.values["limit: error, km/h"].append(abs(speed.value - truth))
+            results.estimates.append(("limit", f"{truth}", speed))
+            results.true["limit", f"{truth}"] = truth
+    known = {(_place(true, r.junction), _entry(true, r.lane)): r for r in true.reductions}
+    for r in found.reductions:
+        other = known.get((_place(found, r.junction), _entry(found, r.lane)))
+        circle = found.lanes.junctions[r.junction].kind == "roundabout"
+        if circle and other and r.reduction_m_per_s and other.reduction_m_per_s:
+            change = r.reduction_m_per_s.value - other.reduction_m_per_s.value
+            results.values["circle: reduction, km/h"].append(3.6 * abs(change))
+
+
+def _place(analysis: TrafficAnalysis, junction: int) -> tuple[int, int]:
+    x, y = np.round(analysis.lanes.junctions[junction].centre_m / 25).astype(int)
+    return int(x), int(y)
+
+
+def _entry(analysis: TrafficAnalysis, lane: int) -> int:
+    return int(np.round(analysis.lanes.lanes[lane].direction_rad.mean() / (np.pi / 2))) % 4
+
+
+def _signals(case: Case, found: TrafficAnalysis, true: TrafficAnalysis, results: Results) -> None:
+    samples, stops = true.samples, find_stops(true.trajectories)
+    for junction in found.lanes.junctions:
+        signal = found.signals.get(junction.number)
+        if signal is None:
+            continue
+        if junction.kind != "intersection":
+            results.values["signals: found where there is none"].append(float(signal.signalised is True))
+            continue
+        results.values["signals: found"].append(float(signal.signalised is True))
+        if signal.cycle_s:
+            results.values["signals: cycle, s"].append(abs(signal.cycle_s.value - CYCLE_S))
+            results.estimates.append(("cycle", "60", signal.cycle_s))
+            results.true["cycle", "60"] = CYCLE_S
+            _streams(case, signal, samples, stops, results)
+
+
+def _streams(case: Case, signal: JunctionSignal, samples: PathSamples, stops: Stops, results: Results) -> None:
+    origin, warm_up = case.flight.city._origin_m, case.flight.config.traffic.warm_up_s
+    plan = case.flight.city.plan
+    for stream in signal.streams:
+        path = stream.stream.approach.path_m
+        step = path[-1] - path[0]
+        axis = int(abs(step[1]) > abs(step[0]))
+        line = stream.stream.stop_line_m
+        centres = np.array([[x, y] for x in plan.avenues_x for y in plan.avenues_y]) - origin
+        number = int(np.argmin(np.hypot(*(centres - path[-20]).T)))
+        onset = -plan.road_network.signal_offsets_s[number] - warm_up + axis * CYCLE_S / 2
+        error = (stream.green_phase_s.value - onset + CYCLE_S / 2) % CYCLE_S - CYCLE_S / 2
+        results.values["signals: green onset, s"].append(abs(error))
+        value = stream.green_phase_s
+        shifted = Estimate(error, error - (value.value - value.low), error + value.high - value.value, value.n)
+        results.estimates.append(("green", "0", shifted))
+        results.true["green", "0"] = 0.0
+        if line is not None:
+            at = path[0] + step / np.hypot(*step) * line
+            distance = abs(float((at - centres[number])[axis]))
+            results.values["signals: stop line, m"].append(abs(distance - (STOP_B if axis else STOP_A)))
+        truth = observe_stream(stream.stream.approach, samples, stops)
+        pairs = zip(queues(stream.stream, stream.green_s), queues(truth, stream.green_s), strict=False)
+        results.values["signals: queue, vehicles"] += [abs(a.vehicles - b.vehicles) for a, b in pairs]
+
+
+def _u_turns(case: Case, found: TrafficAnalysis, results: Results) -> None:
+    """U-turns of the plan: turns that reverse, between two avenues' lanes; a vehicle is counted at their middle."""
+    city = case.flight.city
+    xy, vehicle = case.true[["x_px", "y_px"]].to_numpy(np.float64), case.true["vehicle_id"].to_numpy(np.int64)
+    tree, true = cKDTree(xy), set()
+    for edge in city.plan.road_network.edges:
+        first, last = np.diff(edge.path[:2], axis=0)[0], np.diff(edge.path[-2:], axis=0)[0]
+        turn = abs(float(np.angle(np.exp(1j * (np.arctan2(*last[::-1]) - np.arctan2(*first[::-1]))))))
+        if edge.kind == "turn" and turn > 2.6 and edge.speed_m_per_s != AISLE_SPEED:
+            middle = city.to_px(edge.path[len(edge.path) // 2][None])[0]
+            true |= set(vehicle[tree.query_ball_point(middle, 2.5 / GSD_M)].tolist())
+    owner = case.tracks.drop_duplicates("track_id").set_index("track_id")["vehicle_id"]
+    reversed_ = [int(owner[found.trajectories.track_id[r.track]]) for r in found.reversals]
+    results.values["u-turns: true"].append(len(true))
+    results.values["u-turns: found"].append(len(true & set(reversed_)))
+    results.values["u-turns: false"].append(sum(v not in true for v in reversed_))
+
+
+def _conflicts(case: Case, found: TrafficAnalysis, true: TrafficAnalysis, results: Results) -> None:
+    owner = case.tracks.drop_duplicates("track_id").set_index("track_id")["vehicle_id"]
+    ids = owner.reindex(found.trajectories.track_id).to_numpy(np.int64)
+    lengths = case.lengths_m[true.trajectories.track_id]
+    traffic = LaneTraffic(find_lanes(true.trajectories))
+    truth = _pairs(find_conflicts(true.trajectories, traffic, lengths_m=lengths), true.trajectories.track_id)
+    seen = _pairs(found.conflicts, ids)
+    for pair, value in seen.items():
+        if pair in truth:
+            results.values["conflicts: PET error, s"].append(abs(value - truth[pair]))
+    # a value near the limit may be on either side of it
+    results.values["conflicts: true"].append(sum(v < MAX_PET_S - 0.3 for v in truth.values()))
+    results.values["conflicts: of these found"].append(
+        sum(v < MAX_PET_S - 0.3 and pair in seen for pair, v in truth.items())
+    )
+    results.values["conflicts: found"].append(sum(v < MAX_PET_S - 0.3 for v in seen.values()))
+    results.values["conflicts: of these true"].append(
+        sum(v < MAX_PET_S - 0.3 and pair in truth for pair, v in seen.items())
+    )
+
+
+def _pairs(conflicts: list, ids: IntArray) -> dict[tuple[int, int], float]:
+    return {(int(ids[c.first]), int(ids[c.second])): c.value_s for c in conflicts if c.kind != "following"}
+
+
+def coverage(all_results: list[Results]) -> dict[str, tuple[int, int]]:
+    """For each quantity how many intervals hold the truth, and of how many; for what differs from flight to flight the
+    truth is the mean of the other seeds."""
+    out: dict[str, tuple[int, int]] = {}
+    for k, results in enumerate(all_results):
+        for kind, name, estimate in results.estimates:
+            if kind in ("share", "flow"):
+                others = [r.true[kind, name] for j, r in enumerate(all_results) if j != k and (kind, name) in r.true]
+                if len(others) < len(all_results) // 2:
+                    continue
+                truth = float(np.mean(others))
+            else:
+                truth = results.true[kind, name]
+            hits, n = out.get(kind, (0, 0))
+            out[kind] = (hits + (estimate.low <= truth <= estimate.high), n + 1)
+    return out
+
+
+def lines(all_results: list[Results]) -> Iterator[str]:
+    """The table, for people."""
+    names = sorted({name for results in all_results for name in results.values})
+    for name in names:
+        values = np.array([v for results in all_results for v in results.values[name]], np.float64)
+        yield (
+            f"{name:38} n {len(values):5d}  sum {values.sum():9.1f}  median {np.median(values):7.3f}  "
+            f"p90 {np.quantile(values, 0.9):7.3f}  p95 {np.quantile(values, 0.95):7.3f}  max {values.max():7.3f}"
+        )
+    share = np.array([v for r in all_results for v in r.values["movements: share, points"]])
+    yield f"shares within 3 points: {np.mean(share <= 3):.3f} of {len(share)}"
+    covered = coverage(all_results)
+    for kind, (hits, n) in covered.items():
+        yield f"90 % intervals, {kind:8} {hits / n:.3f} of {n}"
+    hits, n = (sum(pair[k] for pair in covered.values()) for k in (0, 1))
+    yield f"90 % intervals, pooled   {hits / max(n, 1):.3f} of {n}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(913, 923)))
+    parser.add_argument("--minutes", type=float, default=6.0)
+    arguments = parser.parse_args()
+    made = []
+    for seed in arguments.seeds:
+        made.append(measure(simulate(seed, arguments.minutes)))
+        print(f"seed {seed}: {', '.join(f'{k} {np.mean(v):.2f}' for k, v in made[-1].values.items())}", flush=True)
+    for line in lines(made):
+        print(line)
+
+
+if __name__ == "__main__":
+    main()

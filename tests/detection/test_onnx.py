@@ -1,0 +1,175 @@
+"""Another maker's network in the place of our detector: a tiny YOLO, made here, of every layout."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from schemas.detector import OnnxLayout
+from schemas.job import Job
+from schemas.summary import RunSummary
+from velfield import open_run
+from velfield.detection.detector import Detector, load_detector
+from velfield.detection.onnx.boxes import Boxes, suppress
+from velfield.detection.onnx.detector import OnnxDetector
+from velfield.errors import InputError
+from velfield.pipeline.georeference import plan_of_finished
+from velfield.pipeline.plan import Plan
+from velfield.pipeline.stages.detections import detect_block
+from velfield.pipeline.stages.detector import make_detector
+
+TILE = 128
+LENGTH, WIDTH, ANGLE = 16.0, 8.0, 0.5
+NAMES = ("tree", "car", "bus")
+LAYOUTS: tuple[OnnxLayout, ...] = (
+    "boxes",
+    "oriented_boxes",
+    "boxes_with_objectness",
+    "end_to_end",
+    "end_to_end_oriented",
+)
+
+
+def tiny_yolo(path: Path, layout: OnnxLayout, *, metadata: bool = True, names: tuple[str, ...] = NAMES) -> Path:
+    """A network that takes each bright cell of 8 x 8 px for a car of 16 x 8 px about it."""
+    side = TILE // 8
+    y, x = np.mgrid[:side, :side].reshape(2, -1) * 8 + 4.0
+    n, rows = len(x), layout.startswith(("end", "boxes_with"))
+    box = np.stack([x, y, np.full(n, LENGTH), np.full(n, WIDTH)])
+    if layout == "end_to_end":
+        box = np.stack([x - LENGTH / 2, y - WIDTH / 2, x + LENGTH / 2, y + WIDTH / 2])
+    low, one, angle = np.full((1, n), 0.05), np.ones((1, n)), np.full((1, n), ANGLE)
+    after = {
+        "boxes": [box, low, "score", low],
+        "oriented_boxes": [box, low, "score", low, angle],
+        "boxes_with_objectness": [box, one, low, "score", low],
+        "end_to_end": [box, "score", one],
+        "end_to_end_oriented": [box, "score", one, angle],
+    }[layout]
+    constants = {f"c{k}": part[None].astype(np.float32) for k, part in enumerate(after) if not isinstance(part, str)}
+    parts = [part if isinstance(part, str) else f"c{k}" for k, part in enumerate(after)]
+    nodes = [
+        helper.make_node("AveragePool", ["images"], ["pooled"], kernel_shape=[8, 8], strides=[8, 8]),
+        helper.make_node("ReduceMean", ["pooled"], ["grey"], axes=[1], keepdims=1),
+        helper.make_node("Reshape", ["grey", "shape"], ["score"]),
+        helper.make_node("Concat", parts, ["columns"], axis=1),
+        helper.make_node("Transpose" if rows else "Identity", ["columns"], ["output0"]),
+    ]
+    if rows:
+        nodes[-1].attribute.append(helper.make_attribute("perm", [0, 2, 1]))
+    weights = [numpy_helper.from_array(np.array([1, 1, n]), "shape")]
+    weights += [numpy_helper.from_array(value, name) for name, value in constants.items()]
+    channels = sum(1 if isinstance(part, str) else len(part) for part in after)
+    graph = helper.make_graph(
+        nodes,
+        "tiny",
+        [helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, TILE, TILE])],
+        [helper.make_tensor_value_info("output0", TensorProto.FLOAT, [1, n, channels] if rows else [1, channels, n])],
+        weights,
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    if metadata:
+        helper.set_model_props(
+            model,
+            {
+                "task": "obb" if "oriented" in layout else "detect",
+                "names": str(dict(enumerate(names))),
+                "imgsz": f"[{TILE}, {TILE}]",
+            },
+        )
+    onnx.save(model, str(path))
+    return path
+
+
+@pytest.fixture
+def image() -> tuple[np.ndarray, np.ndarray]:
+    """An image larger than a tile, with bright cells, and their centres in our pixels."""
+    grey = np.full((224, 320), 20, np.uint8)  # tiles begin at 0, 96, 192 and 0, 96: on the cells' grid
+    corners = np.array([[8, 16], [120, 40], [112, 104], [232, 160], [304, 80]])  # the second is cut by a tile's edge
+    for x, y in corners:
+        grey[y : y + 8, x : x + 8] = 240
+    return grey, corners + 3.5
+
+
+def sorted_rows(xy: Any) -> list[list[float]]:
+    return sorted(np.round(np.asarray(xy, float), 3).tolist())
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_boxes_of_every_layout_are_found_across_tiles(
+    layout: OnnxLayout, image: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    detector = load_detector(tiny_yolo(tmp_path / "m.onnx", layout))
+    assert detector.record.method == "onnx"
+    assert detector.record.layout == layout
+    assert detector.record.vehicles == (1, 2)
+    table = detector.detect_raw(image[0], threshold=0.9)
+    assert sorted_rows(table[["x_px", "y_px"]]) == sorted_rows(image[1])
+    if "oriented" in layout:
+        assert table["orientation_rad"].tolist() == pytest.approx([ANGLE] * len(table), abs=1e-5)
+        assert table["length_px"].tolist() == pytest.approx([LENGTH] * len(table))
+    else:
+        assert table["abs_box_angle_rad"].tolist() == pytest.approx([np.arctan2(WIDTH, LENGTH)] * len(table))
+    assert detector.detect_raw(image[0], threshold=0.96).empty
+    assert len(detector.detect(image[0], threshold=0.9)) == len(image[1])
+
+
+def test_a_model_without_metadata_is_described_by_a_yaml(image: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    path = tiny_yolo(tmp_path / "m.onnx", "boxes", metadata=False)
+    with pytest.raises(InputError, match="found no metadata"):
+        load_detector(path)
+    (tmp_path / "m.yaml").write_text("layout: boxes\nclasses: [tree, thing, other]\nvehicles: [1]\nthreshold: 0.9\n")
+    detector = load_detector(path)
+    assert len(detector.detect_raw(image[0])) == len(image[1])
+    (tmp_path / "m.yaml").write_text("layout: squares\n")
+    with pytest.raises(InputError, match=r"m\.yaml: layout"):
+        load_detector(path)
+
+
+def test_models_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected one that is a vehicle"):
+        load_detector(tiny_yolo(tmp_path / "m.onnx", "boxes", names=("tree", "bird", "cat")))
+    (tmp_path / "n.onnx").write_bytes(b"no model")
+    with pytest.raises(InputError, match="no ONNX model"):
+        load_detector(tmp_path / "n.onnx")
+    detector = load_detector(tiny_yolo(tmp_path / "o.onnx", "boxes"))
+    again = type(detector)(detector.record)
+    tiny_yolo(tmp_path / "o.onnx", "oriented_boxes")
+    with pytest.raises(InputError, match="another model"):
+        again.detect_raw(np.zeros((64, 64), np.uint8))
+    with pytest.raises(InputError, match="expected one of velfield's"):
+        OnnxDetector.train([], None)
+
+
+def test_of_two_boxes_of_one_vehicle_the_better_is_kept() -> None:
+    size = np.array([[16.0, 8.0]] * 3)
+    xy = np.array([[20.0, 20.0], [21.0, 20.0], [60.0, 20.0]])
+    for angle in (0.0, 0.7):
+        kept = suppress(Boxes(xy, size, np.full(3, angle), np.array([0.5, 0.9, 0.4])), 0.1)
+        assert kept.score.tolist() == [0.9, 0.4]
+
+
+def test_a_run_detects_with_it_on_raw_frames(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
+    root = tmp_path / "run"
+    shutil.copytree(whole[0], root)
+    path = tiny_yolo(tmp_path / "m.onnx", "oriented_boxes")
+    made = plan_of_finished(open_run(root))
+    inputs = made.job.inputs.model_copy(update={"labels": None, "detector": str(path)})
+    config = made.config.model_copy(update={"detection": made.config.detection.model_copy(update={"threshold": 0.75})})
+    plan = Plan(Job(root=str(root), inputs=inputs, config=config), made.info, made.indices, made.inputs, made.keys)
+    counts = make_detector(plan).counts
+    assert counts["threshold"] == 0.25
+    run, frame = open_run(root), 3
+    block = detect_block(plan, range(frame, frame + 1))
+    detector: Detector = load_detector(path)
+    raw = detector.detect_raw(run.frames.read(frame), threshold=0.75)
+    assert len(raw) > 3
+    expected = run.to_base(frame, raw[["x_px", "y_px"]].to_numpy())
+    assert sorted_rows(block.table[["x_px", "y_px"]].round(1)) == sorted_rows(
+        expected[np.isfinite(expected[:, 0])].round(1)
+    )
+    assert block.searched.tolist() == [1.0]

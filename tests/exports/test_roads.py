@@ -1,0 +1,149 @@
+"""Lanes and trajectories for other programs, each read back by its own: SUMO, OpenDRIVE's reader, pandas."""
+
+import os
+import shutil
+import subprocess
+import xml.etree.ElementTree as ET
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.analysis.test_lanes import AVENUE, BESIDE, GSD_M, LEAVES, OPPOSITE, driven
+from tests.exports.test_exports import UTM
+from tests.field_runs import field_run, tracklets_along
+from velfield.exports.export import export_run
+from velfield.exports.roads.network import RoadNetwork, road_network
+from velfield.run.run import Run
+
+SHAPE = (400, 640)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """An avenue of two lanes, one that comes the other way, and a street that leaves."""
+    rng = np.random.default_rng(5)
+    paths = [driven(path) for path in [AVENUE] * 8 + [BESIDE] * 8 + [OPPOSITE] * 8 + [LEAVES] * 5]
+    noisy = [path + rng.normal(0, 0.2 / GSD_M, (1, 2)) + rng.normal(0, 0.05 / GSD_M, path.shape) for path in paths]
+    return field_run(tmp_path_factory.mktemp("roads") / "run", tracklets_along(noisy), shape=SHAPE, gsd_m=GSD_M)
+
+
+@pytest.fixture(scope="module")
+def network(run: Run) -> RoadNetwork:
+    return road_network(run)
+
+
+def sumo_tool(name: str) -> str:
+    """Path of a program of SUMO's; skips the test where it is not installed."""
+    home = os.environ.get("SUMO_HOME")
+    found = shutil.which(name) or shutil.which(name, path=str(Path(home) / "bin") if home else None)
+    if found is None:
+        pytest.skip(f"{name} is not installed (pip install eclipse-sumo)")
+    return found
+
+
+def test_trips_follow_connections(network: RoadNetwork) -> None:
+    assert len(network.trips) == 29
+    for trip in network.trips:
+        assert set(zip(trip.lanes[:-1], trip.lanes[1:], strict=True)) <= set(network.connections)
+    turning = [trip for trip in network.trips if len(trip.lanes) == 2]
+    assert len(turning) == 13  # along the lane that the street leaves: 8 straight on, 5 into it
+    speeds = [lane.speed_m_per_s for lane in network.lanes]
+    assert speeds == pytest.approx([10.0] * len(speeds), abs=0.5)
+    assert all(lane.xy_m[:, 1].min() >= 0 and lane.xy_m[:, 1].max() <= SHAPE[0] * GSD_M for lane in network.lanes)
+
+
+def test_the_network_is_whole(run: Run, network: RoadNetwork, tmp_path: Path) -> None:
+    unpack(run, tmp_path)
+    edges = {edge.get("id"): edge for edge in ET.parse(tmp_path / "velfield.edg.xml").getroot()}
+    nodes = {node.get("id") for node in ET.parse(tmp_path / "velfield.nod.xml").getroot()}
+    assert len(edges) == len(network.lanes)
+    assert all({edge.get("from"), edge.get("to")} <= nodes for edge in edges.values())
+    for connection in ET.parse(tmp_path / "velfield.con.xml").getroot():
+        assert edges[connection.get("from")].get("to") == edges[connection.get("to")].get("from")
+    measured = ET.parse(tmp_path / "velfield.edgedata.xml").getroot().find("interval")
+    assert measured is not None
+    assert {edge.get("id") for edge in measured} == set(edges)
+
+
+def unpack(run: Run, folder: Path) -> None:
+    with zipfile.ZipFile(export_run(run, "sumo_network", folder / "x.zip")) as archive:
+        archive.extractall(folder)
+
+
+def test_sumo_builds_the_network_and_drives_all_vehicles(run: Run, network: RoadNetwork, tmp_path: Path) -> None:
+    netconvert, sumo = sumo_tool("netconvert"), sumo_tool("sumo")
+    unpack(run, tmp_path)
+    subprocess.run([netconvert, "-c", "velfield.netccfg"], cwd=tmp_path, check=True, capture_output=True, timeout=120)
+    options = ["--tripinfo-output", "trips.xml", "--no-step-log", "--random", "false"]
+    done = subprocess.run(
+        [sumo, "-c", "velfield.sumocfg", *options],
+        cwd=tmp_path,
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert "Error" not in done.stderr
+    trips = ET.parse(tmp_path / "trips.xml").getroot()
+    assert {trip.get("id") for trip in trips} == {str(trip.track_id) for trip in network.trips}
+
+
+def test_sumolib_reads_the_built_network(run: Run, network: RoadNetwork, tmp_path: Path) -> None:
+    sumolib = pytest.importorskip("sumolib")
+    netconvert = sumo_tool("netconvert")
+    unpack(run, tmp_path)
+    subprocess.run([netconvert, "-c", "velfield.netccfg"], cwd=tmp_path, check=True, capture_output=True, timeout=120)
+    net = sumolib.net.readNet(str(tmp_path / "velfield.net.xml"))
+    assert {edge.getID() for edge in net.getEdges()} == {f"lane{lane.number}" for lane in network.lanes}
+
+
+def test_opendrive_has_a_road_a_lane_and_its_connections(run: Run, network: RoadNetwork, tmp_path: Path) -> None:
+    root = ET.parse(export_run(run, "opendrive", tmp_path / "x.xodr")).getroot()
+    roads = {road.get("id"): road for road in root.findall("road")}
+    assert len(roads) == len(network.lanes) + len(network.connections)
+    for lane in network.lanes:
+        geometry = roads[str(lane.number)].findall("planView/geometry")
+        total = sum(float(one.get("length", "nan")) for one in geometry)
+        assert total == pytest.approx(float(roads[str(lane.number)].get("length", "nan")), abs=1e-3)
+        first = np.array([float(geometry[0].get(name, "nan")) for name in "xy"])
+        assert np.linalg.norm(first - lane.xy_m[0]) < lane.width_m / 2 + 1.1
+    links = [(one.get("incomingRoad"), one.get("connectingRoad")) for one in root.findall("junction/connection")]
+    assert sorted(int(start or -1) for start, _ in links) == sorted(start for start, _ in network.connections)
+    assert all(road in roads for _, road in links)
+
+
+def test_netconvert_reads_opendrive(run: Run, network: RoadNetwork, tmp_path: Path) -> None:
+    netconvert = sumo_tool("netconvert")
+    path = export_run(run, "opendrive", tmp_path / "x.xodr")
+    command = [netconvert, "--opendrive-files", str(path), "-o", str(tmp_path / "x.net.xml")]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    edges = ET.parse(tmp_path / "x.net.xml").getroot().findall("edge")
+    own = [edge for edge in edges if edge.get("function") != "internal"]
+    assert len(own) == len(network.lanes)
+
+
+def test_tables_of_trajectories(run: Run, tmp_path: Path) -> None:
+    table = pd.read_parquet(export_run(run, "trajectories", tmp_path / "x.parquet"))
+    assert table["track_id"].nunique() == 29
+    assert table["speed_m_per_s"].median() == pytest.approx(10.0, abs=0.3)
+    assert set(table["lane"]) == {-1, *range(5)} or set(table["lane"]) == set(range(5))
+    highd = pd.read_csv(export_run(run, "highd", tmp_path / "x.csv"))
+    assert list(highd)[:8] == ["frame", "id", "x", "y", "width", "height", "xVelocity", "yVelocity"]
+    assert np.allclose(highd["x"] + highd["width"] / 2, table["x_m"], atol=2e-3)
+    assert highd["width"].max() <= np.hypot(4.5, 1.8) + 1e-3
+    eastwards = highd[highd["yVelocity"].abs() < 0.2]
+    assert np.allclose(eastwards["height"], 1.8, atol=0.2)
+
+
+def test_a_table_with_a_reference_system_has_coordinates(run: Run) -> None:
+    from velfield.exports.roads.table import trajectory_table
+
+    affine = (GSD_M, 0.0, 700_000.0, 0.0, -GSD_M, 3_500_000.0)
+    placed = Run(run.layout, run.record)
+    placed.__dict__["grid"] = run.grid.model_copy(update={"crs_wkt": UTM.to_wkt(), "affine": affine})
+    table = trajectory_table(placed)
+    assert table["latitude_deg"].between(31, 32).all()
+    assert table["longitude_deg"].between(35, 36).all()

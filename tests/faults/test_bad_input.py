@@ -1,0 +1,80 @@
+"""Bad input is refused in one line: a sample of what `tests.faults.bad_input` tries, and structures made at random."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.faults import bad_input
+from tests.faults.bad_input import Kind, kinds, problem_of_case, try_cases
+from velfield.errors import StoreError
+
+SEED, CASES = 2026, 150
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=12), inner, max_size=4),
+    max_leaves=12,
+)
+KEYS = st.sampled_from(
+    ["frames", "lens", "gsd_m", "detection", "tracking", "field", "work", "preset", "every", "method"]
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("bad")
+
+
+@pytest.fixture(scope="module")
+def by_name(folder: Path) -> dict[str, Kind]:
+    return {kind.name: kind for kind in kinds(folder)}
+
+
+def test_mutated_files_of_every_kind_are_read_or_refused(tmp_path: Path) -> None:
+    tried, problems = try_cases(tmp_path, CASES, SEED)
+    assert problems == []
+    assert len(tried) > 15
+
+
+@settings(max_examples=40, deadline=None)
+@given(content=st.dictionaries(KEYS, JSON, max_size=4))
+def test_any_structure_as_configuration(content: object, by_name: dict[str, Kind], folder: Path) -> None:
+    assert problem_of_case(by_name["configuration"], yaml.safe_dump(content).encode(), folder) == ""
+
+
+@pytest.mark.parametrize("name", ["labels (JSON)", "detector", "flight record"])
+@settings(max_examples=25, deadline=None)
+@given(content=JSON)
+def test_any_json(name: str, content: object, by_name: dict[str, Kind], folder: Path) -> None:
+    assert problem_of_case(by_name[name], json.dumps(content).encode(), folder) == ""
+
+
+def test_an_onnx_model_brings_no_files_shapes_or_operators_of_its_own(by_name: dict[str, Kind], folder: Path) -> None:
+    """Its weights in another file, of a huge shape, with an operator of its own: read or refused, and nothing run."""
+    kind = by_name["detector"]
+    assert [problem_of_case(kind, data, folder) for data in kind.good] == [""] * 4
+
+
+def test_the_check_finds_what_it_is_for(folder: Path) -> None:
+    """A traceback, a message of many lines, a file that was written, a hang."""
+
+    def fail(_path: Path) -> None:
+        raise ValueError("a traceback")
+
+    def speak(_path: Path) -> None:
+        raise StoreError("one line\nand another")
+
+    def write(path: Path) -> None:
+        (path.parent / "left behind").touch()
+
+    def hang(_path: Path) -> None:
+        while True:
+            pass
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bad_input, "LIMIT_S", 0.2)
+        found = [problem_of_case(Kind("x", (b"",), "x", read), b"", folder) for read in (fail, speak, write, hang)]
+    assert [text.split()[0] for text in found] == ["ValueError:", "a", "wrote", "TooLong:"]

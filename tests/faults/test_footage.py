@@ -1,0 +1,183 @@
+"""Footage that is not what it should be is told with its reason, and what is right is not."""
+
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from schemas.arrays import GreyImage
+from schemas.flight import FramesConfig
+from schemas.job import Inputs, Job
+from schemas.simulation import CameraSimulation
+from tests.media import drifting, ground, write_images, write_video
+from velfield.camera.lens import pinhole
+from velfield.camera.tilt import tilt_of_frames
+from velfield.pipeline.configuration import resolve_config
+from velfield.pipeline.local import compute_stages
+from velfield.pipeline.plan import make_plan, write_flight_record
+from velfield.pipeline.stage import stages_before
+from velfield.pipeline.stages.frames import flag_frames
+from velfield.pipeline.stages.lens import calibrate_flight
+from velfield.pipeline.stages.registration import register_unit
+from velfield.run.stores import open_registration
+from velfield.sources.images import read_grey_image
+from velfield.sources.source import probe
+from velfield.synthetic import small_flight
+
+WARNED = FramesConfig()
+REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+
+def quality_warnings(folder: Path, frames: Sequence[GreyImage], *settings: str) -> list[str]:
+    return flag_frames(planned(folder, frames, "quality", *settings)).warnings
+
+
+def planned(folder: Path, frames: Sequence[GreyImage], stage: str, *settings: str):  # type: ignore[no-untyped-def]
+    """The plan of a flight of these images, computed up to a stage."""
+    write_images(folder / "frames", frames)
+    config = resolve_config(settings=["frames.fps=5", "frames.every=1", "registration.max_keypoints=800", *settings])
+    plan = make_plan(Job(root=str(folder / "run"), inputs=Inputs(source=str(folder / "frames")), config=config))
+    write_flight_record(plan)
+    compute_stages(plan, stages_before(stage))
+    return plan
+
+
+# ---------------------------------------------------------------------------------------------------------- the video
+
+
+def encoded(path: Path, **settings: object) -> Path:
+    """A video of 6 frames with a property of its codec or its pictures set."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(str(settings.get("codec", "libx264")), rate=25)
+        stream.width, stream.height, stream.pix_fmt = 160, 128, "yuv420p"
+        for name in ("color_trc", "flags"):
+            if name in settings:
+                setattr(stream.codec_context, name, settings[name])
+        stream.options = dict(settings.get("options", {}))  # type: ignore[call-overload]
+        if "rotation" in settings:
+            stream.set_display_rotation(settings["rotation"])
+        for number, grey in enumerate(drifting(6, 160, 128)):
+            frame = av.VideoFrame.from_ndarray(grey, format="gray").reformat(format="yuv420p")
+            frame.pts, frame.time_base = number, Fraction(1, 25)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+def test_an_interlaced_video_is_reported(tmp_path: Path) -> None:
+    path = encoded(tmp_path / "i.mp4", options={"x264-params": "tff=1"})
+    (line,) = probe(path, frames=WARNED).warnings
+    assert line.startswith("the video is interlaced")
+
+
+def test_a_video_of_high_dynamic_range_is_reported(tmp_path: Path) -> None:
+    path = encoded(tmp_path / "h.mp4", options={"x264-params": "transfer=arib-std-b67"})
+    (line,) = probe(path, frames=WARNED).warnings
+    assert "high dynamic range (HLG)" in line
+
+
+def test_rotation_metadata_is_reported_and_pixels_stay_as_stored(tmp_path: Path) -> None:
+    info = probe(encoded(tmp_path / "r.mp4", rotation=90), frames=WARNED)
+    (line,) = info.warnings
+    assert "turned by" in line
+    assert (info.width, info.height) == (160, 128)
+
+
+def test_a_usual_video_and_one_of_variable_rate_cause_no_warning(tmp_path: Path) -> None:
+    assert probe(encoded(tmp_path / "p.mp4"), frames=WARNED).warnings == ()
+    times = [0, 1, 2, 5, 6, 9]
+    info = probe(write_video(tmp_path / "v.mp4", list(drifting(6)), times=times), frames=WARNED)
+    assert info.warnings == ()
+    np.testing.assert_allclose(np.diff(info.times_s), np.diff(times) / 25)
+
+
+# ---------------------------------------------------------------------------------------------------------- the light
+
+
+def test_night_is_reported(tmp_path: Path) -> None:
+    frames = [np.clip(8 + 0.08 * frame, 0, 255).astype(np.uint8) for frame in drifting(5)]
+    (line,) = quality_warnings(tmp_path, frames)
+    assert "the flight is dark" in line
+
+
+def test_fog_is_reported(tmp_path: Path) -> None:
+    frames = [np.clip(150 + 0.1 * cv2.GaussianBlur(f, (0, 0), 3), 0, 255).astype(np.uint8) for f in drifting(5)]
+    assert any("as in fog" in line for line in quality_warnings(tmp_path, frames))
+
+
+def test_a_cut_to_another_place_is_reported(tmp_path: Path) -> None:
+    frames = [*drifting(8, seed=1), *drifting(8, seed=5)]
+    (line,) = quality_warnings(tmp_path, frames)
+    assert "the picture changes wholly at frame 8 (1.600 s)" in line
+
+
+def test_a_static_camera_and_a_drifting_one_cause_no_warning(tmp_path: Path) -> None:
+    rng, scene = np.random.default_rng(0), ground(160, 120)
+    still = [np.clip(scene + rng.normal(0, 2, scene.shape), 0, 255).astype(np.uint8) for _ in range(8)]
+    assert quality_warnings(tmp_path / "still", still) == []
+    assert quality_warnings(tmp_path / "drifting", list(drifting(8))) == []
+
+
+# ------------------------------------------------------------------------------------------ zoom, obliqueness
+
+
+def test_a_zoom_in_mid_flight_is_reported(tmp_path: Path) -> None:
+    scene = ground(640, 480, seed=3)
+    frames = []
+    for k, zoom in enumerate([1.0] * 5 + [1.4] * 2):
+        matrix = np.array([[zoom, 0, 160 - 320 * zoom + k], [0, zoom, 120 - 240 * zoom]])
+        frames.append(cv2.warpAffine(scene, matrix, (320, 240), flags=cv2.INTER_AREA, borderMode=cv2.BORDER_REFLECT))
+    plan = planned(tmp_path, frames, "registration", "lens.calibrate=never")
+    compute_stages(plan, ("registration",))
+    assert open_registration(plan.layout.registration).statuses()[5:] == ["ok", "ok"]
+    (line,) = register_unit(plan, range(7)).warnings
+    assert "frames 5 to 6 show the ground at up to 1.4" in line
+
+
+def oblique(tilt_deg: float, seed: int = 21) -> GreyImage:
+    camera = CameraSimulation(mean_tilt_deg=tilt_deg)
+    return small_flight(frames=1, width=800, height=600, seed=seed, camera=camera).frame(0)
+
+
+@pytest.fixture(scope="module")
+def from_above() -> GreyImage:
+    return oblique(0.0)
+
+
+def test_an_oblique_view_is_reported(tmp_path: Path) -> None:
+    frame = oblique(40.0)
+    found = tilt_of_frames([frame], pinhole(frame.shape))
+    assert found is not None
+    assert found.is_oblique
+    assert found.degrees == pytest.approx(40, abs=6)
+    plan = planned(tmp_path, [frame, np.roll(frame, 2, axis=1), np.roll(frame, 4, axis=1)], "lens", "lens.refine=never")
+    (line,) = calibrate_flight(plan).warnings
+    assert "the camera looks at the ground obliquely" in line
+    assert "--base" in line
+
+
+def test_a_view_from_above_is_not(from_above: GreyImage) -> None:
+    found = tilt_of_frames([from_above], pinhole(from_above.shape))
+    assert found is not None
+    assert not found.is_oblique
+    assert found.degrees < 10
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the real footage is not here")
+@pytest.mark.parametrize("name", ["songdo/00003.jpg", "songdo/00972.jpg", "songdo/03936.jpg"])
+def test_real_views_from_above_are_not(name: str) -> None:
+    frame = read_grey_image(REAL / name, 10**9)
+    found = tilt_of_frames([frame], pinhole(frame.shape))
+    assert found is None or not found.is_oblique
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the real footage is not here")
+def test_a_real_oblique_view_is() -> None:
+    frame = read_grey_image(REAL / "minsk" / "DJI_0762-00003.jpg", 10**9)
+    found = tilt_of_frames([frame], pinhole(frame.shape))
+    assert found is not None
+    assert found.is_oblique

@@ -1,0 +1,118 @@
+"""Servers: on which addresses they listen, what they refuse, and that runs of killed processes are not "Running"."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from base64 import b64encode
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from flows.runners import RunnerConfig, open_runner
+from tests.viewer.test_viewer_server import served
+from velfield.report.figures import png_bytes
+from velfield.report.viewer_page import page_is_built
+from velfield.viewer.annotations import frames_to_annotate
+from velfield.viewer.annotator import annotate_app
+from velfield.viewer.server import files_app, serve_in_thread
+
+
+def listening(*processes: psutil.Process) -> set[tuple[int, str, int]]:
+    """Process, address and port of each listening socket."""
+    return {
+        (process.pid, found.laddr.ip, found.laddr.port)
+        for process in processes
+        for found in process.net_connections(kind="tcp")
+        if found.status == psutil.CONN_LISTEN
+    }
+
+
+def test_pages_of_runs_are_served_to_this_machine_alone(tmp_path: Path) -> None:
+    before = listening(psutil.Process())
+    with serve_in_thread(files_app(tmp_path), 0) as address:
+        opened = listening(psutil.Process()) - before
+    assert {(ip, port) for _, ip, port in opened} == {("127.0.0.1", int(address.rpartition(":")[2]))}
+
+
+def test_a_local_cluster_listens_on_this_machine_alone() -> None:
+    """Scheduler, workers, their nannies and the dashboard."""
+    before = listening(psutil.Process())
+    with open_runner(RunnerConfig(workers=1)):
+        own = psutil.Process()
+        opened = listening(own, *own.children(recursive=True)) - before
+    assert len(opened) >= 3
+    assert {ip for _, ip, _ in opened} == {"127.0.0.1"}
+
+
+def test_the_temporary_server_of_prefect_is_for_this_machine_alone() -> None:
+    """By the address that it is started with: to start one takes ten seconds, which other tests do."""
+    from flows import temporary_server
+
+    assert temporary_server._HOST == "127.0.0.1"
+    with socket.create_server((temporary_server._HOST, 0)) as probe:
+        assert probe.getsockname()[0] == "127.0.0.1"
+
+
+@pytest.mark.skipif(not page_is_built(), reason="the page is not built: `make page`")
+def test_annotate_serves_its_frames_and_nothing_else(tmp_path: Path) -> None:
+    image = tmp_path / "frames" / "a.png"
+    image.parent.mkdir()
+    image.write_bytes(png_bytes(np.zeros((32, 48), np.uint8)))
+    with served(annotate_app(frames_to_annotate(image, max_frames=1), tmp_path / "labels.csv")) as client:
+        for path in ("/frame/1.png", "/frame/-1.png", "/frame/", "/labels.csv", "/../labels.csv", "/%2e%2e/x", "/.git"):
+            assert client.status(path) in (404, 405), path
+        for method in ("POST", "PUT", "DELETE"):
+            assert client.status("/frame/0.png", method) == 405, method
+        assert client.status("/", headers={"Host": "elsewhere.example"}) == 400
+        for path in ("/", "/frame/0.png"):
+            headers = client.ask(path)[2]
+            assert headers["content-security-policy"].startswith("default-src 'none'"), path
+            assert headers["x-content-type-options"] == "nosniff", path
+    assert not (tmp_path / "labels.csv").exists()
+
+
+def test_with_an_auth_string_prefects_api_asks_for_it(server: None) -> None:
+    from prefect.server.api.server import create_api_app
+    from prefect.settings import PREFECT_SERVER_API_AUTH_STRING, temporary_settings
+
+    def header(words: str) -> dict[str, str]:
+        return {"Authorization": f"Basic {b64encode(words.encode()).decode()}"}
+
+    with temporary_settings({PREFECT_SERVER_API_AUTH_STRING: "somebody:secret"}):
+        app = create_api_app(ignore_cache=True)
+    with served(app) as client:
+        for path in ("/admin/version", "/flow_runs/count", "/deployments/filter", "/variables/name/system-health"):
+            assert client.status(path) == 401, path
+        assert client.status("/admin/version", headers=header("somebody:wrong")) == 401
+        assert client.status("/admin/version", headers=header("somebody:secret")) == 200
+
+
+def test_runs_whose_process_was_killed_are_crashed_and_others_are_not(server: None, tmp_path: Path) -> None:
+    from prefect import flow
+    from prefect.client.orchestration import get_client
+    from prefect.states import Running
+
+    from flows.stale import mark_abandoned, mark_crashed
+
+    @flow
+    def nothing() -> None:
+        pass
+
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        ended.wait()
+    pids = {"killed": ended.pid, "alive": os.getpid(), "resumed": os.getpid()}
+    with get_client(sync_client=True) as client:
+        runs = {}
+        for name, pid in pids.items():
+            (tmp_path / name).mkdir()
+            (tmp_path / name / ".lock").write_text(json.dumps({"pid": pid, "host": socket.gethostname()}))
+            runs[name] = client.create_flow_run(nothing, name=str(tmp_path / name), state=Running())
+        assert mark_crashed(str(tmp_path / "resumed")) == 2
+        states = {name: client.read_flow_run(run.id).state_name for name, run in runs.items()}
+        assert states == {"killed": "Crashed", "alive": "Running", "resumed": "Crashed"}
+        assert mark_abandoned() == 0
+        client.delete_flow_run(runs["alive"].id)

@@ -1,0 +1,103 @@
+"""Maps before a flight is through: they come, they grow, and the result is to the bit what it is without them."""
+
+import re
+import shutil
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows.console import Console
+from flows.process_flight import run_flight
+from flows.runners import RunnerConfig
+from schemas.summary import RunSummary
+from tests.small_flight import FRAMES, digests, job
+from velfield.run.layout import RunLayout
+from velfield.run.results import link_shared_outputs
+from velfield.run.stores import open_field
+
+
+class Recording(Console):
+    """Notes the page's title and the count of vehicles when a preview is announced."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__("quiet")
+        self.root = root
+        self.seen: list[tuple[int, str, int]] = []
+        self.warnings: list[str] = []
+        self._more = threading.Condition()
+
+    def previews_are_there(self, count: int) -> bool:
+        with self._more:
+            return self._more.wait_for(lambda: len(self.seen) >= count, timeout=120)
+
+    def event(self, kind: str, text: str, **values: Any) -> None:
+        if kind == "preview":
+            (title,) = re.findall(r"<title>(.*?)</title>", (self.root / "index.html").read_text())
+            vehicles = int(open_field(self.root / "field.zarr").layer("count").sum())
+            assert (self.root / "maps/direction.png").stat().st_size > 1000
+            with self._more:
+                self.seen.append((values["frames"], title, vehicles))
+                self._more.notify_all()
+
+    def warn(self, text: str) -> None:
+        self.warnings.append(text)
+
+
+@pytest.fixture
+def _always(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("LONG_MPX", "WORTH_S", "TIMES_ITS_COST"):
+        monkeypatch.setattr(f"flows.previews.{name}", 0.0)
+    monkeypatch.setattr("flows.previews.SHARE", 1.0)
+
+
+@pytest.mark.usefixtures("_always")
+def test_previews_come_and_grow_and_leave_no_trace(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from velfield.pipeline.stages import detections as step
+
+    root = tmp_path / "run"
+    link_shared_outputs(RunLayout(whole[0]), RunLayout(root), ("frames", "lens", "base", "registration", "detector"))
+    for name in ("frames.zarr", "registration.zarr"):
+        shutil.rmtree(root / name)
+        shutil.copytree(whole[0] / name, root / name)
+    console = Recording(root)
+    true = step.detect_block
+
+    def waiting(plan: Any, frames: range) -> object:
+        """The second unit of this run comes after the first preview, the third one after the second."""
+        if plan.frame_count == FRAMES:
+            assert console.previews_are_there(frames.start // 8)
+        return true(plan, frames)
+
+    monkeypatch.setattr(step, "detect_block", waiting)
+    run_flight(job(flight, root), RunnerConfig(), console)
+    assert console.warnings == []
+    # Of the first frames, by the detector that ships; then of the first unit, whose windows reach into the second.
+    assert [found for found, _, _ in console.seen] == [16, 8]
+    for found, title, vehicles in console.seen:
+        assert f"{found} of {FRAMES} frames" in title or f"the first {found} of" in title
+        assert vehicles > 0
+    assert console.seen[-1][2] < open_field(root / "field.zarr").layer("count").sum()
+    assert not RunLayout(root).preview.exists()
+    assert digests(root) == digests(whole[0])
+
+
+@pytest.mark.usefixtures("_always")
+def test_a_preview_that_fails_fails_alone(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_arguments: Any) -> int:
+        raise OSError("no space left")
+
+    monkeypatch.setattr("flows.previews.preview_first_frames", broken)
+    root = tmp_path / "run"
+    shutil.copytree(whole[0], root)
+    (root / "index.html").unlink()
+    console = Recording(root)
+    assert run_flight(job(flight, root), RunnerConfig(), console).complete
+    assert console.warnings == ["no preview of the field: no space left"]
+    assert console.seen == []
+    assert digests(root) == digests(whole[0])

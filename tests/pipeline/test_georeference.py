@@ -1,0 +1,128 @@
+"""A finished run is put on Earth by control points, or by a drone's telemetry, without its frames."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+from flows.cli import app
+from schemas.georeference import ControlPoint
+from schemas.job import Inputs
+from schemas.scale import ScaleEstimate
+from schemas.simulation import SimulationConfig
+from schemas.summary import RunSummary
+from velfield import open_run
+from velfield.errors import InputError
+from velfield.exports.export import export_run
+from velfield.exports.georeference import Georeference
+from velfield.pipeline.georeference import georeference
+from velfield.pipeline.plan import Plan
+from velfield.pipeline.stages.georeference import georeference_run
+from velfield.pipeline.verify import verify_run
+from velfield.run.frame_transforms import north_direction_rad, read_georeference
+from velfield.run.lineage import pixel_lineage
+from velfield.run.run import Run
+from velfield.synthetic.clip import simulate_telemetry, srt_text
+from velfield.synthetic.flight import Flight
+
+LON, LAT = 13.4, 52.5
+
+
+@pytest.fixture(scope="module")
+def copied(whole: tuple[Path, RunSummary], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("georeference") / "run"
+    shutil.copytree(whole[0], root)
+    return root
+
+
+def points(run: Run, gsd_m: float, count: int = 4) -> list[ControlPoint]:
+    """Control points of a map whose top is north."""
+    w, h = run.grid.width_px, run.grid.height_px
+    pixels = np.array([[20, 20], [w - 20, 30], [w - 30, h - 20], [30, h - 30], [w / 2, h / 2], [w / 3, h / 4]])[:count]
+    east, north = 111_320 * np.cos(np.radians(LAT)), 111_262.0
+    return [ControlPoint(x_px=x, y_px=y, x=LON + x * gsd_m / east, y=LAT - y * gsd_m / north) for x, y in pixels]
+
+
+def test_control_points_move_maps_exports_and_lineage(copied: Path, tmp_path: Path) -> None:
+    run = open_run(copied)
+    frames = {path: path.stat().st_mtime_ns for path in run.layout.registration.rglob("*") if path.is_file()}
+    count, speed = run.field.count(), run.field.modal_speed_px_per_s()
+    y, x = np.unravel_index(count.argmax(), count.shape)
+    tracks = [track.track_id for track in pixel_lineage(run, int(x), int(y)).tracks]
+    assert run.grid.crs_wkt is None
+
+    rows = ["x_px,y_px,longitude,latitude", *(f"{p.x_px},{p.y_px},{p.x},{p.y}" for p in points(run, 0.25))]
+    (tmp_path / "points.csv").write_text("\n".join(rows))
+    assert (
+        app(["georeference", str(copied), "--points", str(tmp_path / "points.csv")], result_action="return_value") == 0
+    )
+
+    run = open_run(copied)
+    assert run.grid.gsd_m == pytest.approx(0.25, rel=2e-3)
+    lonlat = Georeference.from_grid(run.grid).to_lonlat(np.array([[20.0, 20.0]]))[0]
+    assert lonlat == pytest.approx(
+        [points(run, 0.25)[0].x, points(run, 0.25)[0].y], abs=3e-6
+    )  # the points are made on a sphere
+    with rasterio.open(run.layout.maps / "speed.tif") as dataset:
+        assert tuple(dataset.transform)[:6] == run.grid.affine
+    with rasterio.open(run.layout.base_image_tif) as dataset:
+        assert dataset.crs.to_epsg() == 32633
+    with rasterio.open(export_run(run, "cog", tmp_path / "field.tif")) as dataset:
+        assert dataset.crs.to_epsg() == 32633
+    after = run.field.modal_speed_px_per_s()
+    known = np.isfinite(after) & (speed > 5)
+    assert np.median(after[known] / speed[known]) == pytest.approx(1.0, abs=0.1)  # vehicles go as fast, in pixels
+    assert set(tracks) & {track.track_id for track in pixel_lineage(run, int(x), int(y)).tracks}
+    assert {path: path.stat().st_mtime_ns for path in frames} == frames
+    assert verify_run(run.layout, run.record) == []
+    record = read_georeference(run.layout)
+    assert record is not None
+    assert [estimate.source for estimate in record.scale.others] == ["given"]
+    assert any("--gsd-m" in line for line in record.scale.disagreements)  # 0.23 was given
+
+
+def test_points_that_cannot_be_used_change_nothing(copied: Path) -> None:
+    before = {path: path.read_bytes() for path in copied.rglob("*.json")}
+    with pytest.raises(InputError, match="found 2 control points"):
+        georeference(copied, points(open_run(copied), 0.25, 2))
+    assert {path: path.read_bytes() for path in copied.rglob("*.json")} == before
+
+
+def test_a_drones_telemetry_gives_scale_north_and_place(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
+) -> None:
+    """The base image of this run is the simulation's own, of 0.23 m a pixel, its top at a known heading."""
+    shutil.copytree(whole[0], tmp_path / "run")
+    config = SimulationConfig.model_validate_json((flight / "simulation.json").read_text())
+    simulated = Flight(config)
+    subtitles = simulate_telemetry(config, simulated.camera, simulated.base_shape)
+    (tmp_path / "x.SRT").write_text(srt_text(subtitles, simulated.times_s))
+    run = open_run(tmp_path / "run")
+    plan = made_plan(run, Inputs(source=str(flight / "frames"), telemetry=str(tmp_path / "x.SRT")))
+    done = georeference_run(plan)
+    grid, record = open_run(tmp_path / "run").grid, read_georeference(run.layout)
+    assert record is not None
+    assert record.scale.used is not None
+    assert record.scale.used.source == "metadata"
+    assert grid.gsd_m == pytest.approx(0.23, rel=0.03)
+    off = np.angle(np.exp(1j * ((north_direction_rad(grid) or 0.0) - np.radians(-90 - config.telemetry.north_deg))))
+    assert abs(np.degrees(off)) < 2.0 + 2.0  # and the zone's own north, off by up to 2 degrees
+    assert run.layout.base_image_tif in done.outputs
+
+    given = plan.job.model_copy(update={"config": plan.config.model_copy(update={"gsd_m": 0.23 * 1.2})})
+    done = georeference_run(Plan(given, plan.info, plan.indices, plan.inputs, plan.keys))
+    assert any("by the metadata" in line for line in done.warnings)
+    chosen = read_georeference(run.layout)
+    assert chosen is not None
+    assert isinstance(chosen.scale.used, ScaleEstimate)
+    assert chosen.scale.used.source == "given"
+
+
+def made_plan(run: Run, inputs: Inputs) -> Plan:
+    from velfield.pipeline.georeference import plan_of_finished
+
+    plan = plan_of_finished(run)
+    job = plan.job.model_copy(update={"inputs": inputs, "config": plan.config.model_copy(update={"gsd_m": None})})
+    return Plan(job, plan.info, plan.indices, plan.inputs, plan.keys)

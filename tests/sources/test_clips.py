@@ -1,0 +1,96 @@
+"""Several clips of one place are one source: one clock, gaps noted, frames of all."""
+
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from schemas.flight import FramesConfig
+from tests.media import drifting
+from velfield.errors import Failure, InputError
+from velfield.sources.clips import clip_files, read_clips_telemetry, write_clip_list
+from velfield.sources.source import check_source, iter_frames, probe, select_frames
+
+FRAMES = FramesConfig()
+
+
+def clip(path: Path, start: str | None, *, frames: int = 10, width: int = 160, seed: int = 0) -> Path:
+    """A clip of 25 frames a second with a creation time."""
+    with av.open(str(path), "w") as container:
+        if start is not None:
+            container.metadata["creation_time"] = start
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = width, 120, "yuv420p"
+        stream.codec_context.time_base = Fraction(1, 25)
+        for number, grey in enumerate(drifting(frames, width=width, seed=seed)):
+            frame = av.VideoFrame.from_ndarray(grey, format="gray").reformat(format="yuv420p")
+            frame.time_base, frame.pts = Fraction(1, 25), number
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+def joined(folder: Path, *clips: Path) -> Path:
+    write_clip_list(folder / "x.clips", clips)
+    return folder / "x.clips"
+
+
+def test_clips_are_joined_by_their_creation_times(tmp_path: Path) -> None:
+    late = clip(tmp_path / "a.mp4", "2026-05-04T10:20:00Z", seed=1)
+    early = clip(tmp_path / "b.mp4", "2026-05-04T10:00:00Z", frames=15)
+    path = joined(tmp_path, late, early)
+    check_source(path)
+    info = probe(path, frames=FRAMES)
+    assert info.frame_count == 25
+    assert info.times_s[:15] == pytest.approx(np.arange(15) / 25)
+    assert info.times_s[15:] == pytest.approx(1200 + np.arange(10) / 25)
+    assert info.names[0] == "b.mp4:0"
+    assert info.names[15] == "a.mp4:0"
+    assert any("a gap of 1199.4 s before a.mp4" in warning for warning in info.warnings)
+    indices = select_frames(info.times_s, FRAMES)
+    found = list(iter_frames(path, info, indices))
+    assert [frame.source_index for frame in found] == indices.tolist()
+    assert [frame.time_s for frame in found] == pytest.approx(info.times_s[indices])
+    alone = probe(late, frames=FRAMES)
+    (first,) = iter_frames(late, alone, [0])
+    assert np.array_equal(next(iter(iter_frames(path, info, [15]))).grey, first.grey)
+
+
+def test_the_drones_subtitles_win_over_creation_times(tmp_path: Path) -> None:
+    clips = [clip(tmp_path / f"{name}.mp4", "2026-05-04T10:00:00Z") for name in "ab"]
+    for path, moment in zip(clips, ("12:00:00.000", "12:00:05.500"), strict=True):
+        cue = f"1\n00:00:00,000 --> 00:00:00,400\n2026-05-04 {moment}\n[rel_alt: 80.0 abs_alt: 90.0]\n"
+        path.with_suffix(".SRT").write_text(cue)
+    info = probe(joined(tmp_path, *clips), frames=FRAMES)
+    assert info.times_s[10] == pytest.approx(5.5)
+    telemetry = read_clips_telemetry(info)
+    assert not isinstance(telemetry, Failure)
+    assert telemetry.time_s == pytest.approx([0.0, 5.5])
+    assert telemetry.height_m.tolist() == [80.0, 80.0]
+    assert len(clip_files(tmp_path / "x.clips")) == 4
+
+
+def test_clips_without_times_follow_each_other_and_a_note_says_so(tmp_path: Path) -> None:
+    clips = [clip(tmp_path / f"{name}.mp4", None) for name in "ab"]
+    info = probe(joined(tmp_path, *clips), frames=FRAMES)
+    assert info.times_s[10] == pytest.approx(60.36)
+    assert any("do not all have a creation time" in warning for warning in info.warnings)
+    assert isinstance(read_clips_telemetry(info), Failure)
+    assert replace(info, parts=()).frame_count == 20
+
+
+def test_clips_that_cannot_be_one_source_are_refused(tmp_path: Path) -> None:
+    one = clip(tmp_path / "a.mp4", "2026-05-04T10:00:00Z")
+    overlapping = clip(tmp_path / "b.mp4", "2026-05-04T10:00:00.2Z")
+    with pytest.raises(InputError, match="velfield merge"):
+        probe(joined(tmp_path, one, overlapping), frames=FRAMES)
+    other = clip(tmp_path / "c.mp4", "2026-05-04T11:00:00Z", width=192)
+    with pytest.raises(InputError, match="found frames of 192x120, expected 160x120"):
+        probe(joined(tmp_path, one, other), frames=FRAMES)
+    with pytest.raises(InputError, match="twice"):
+        joined(tmp_path, one, one)
+    with pytest.raises(InputError, match="folder"):
+        joined(tmp_path, one, tmp_path)

@@ -1,0 +1,290 @@
+"""What the page animates: the replay's files and the draws of the flow, read back; both in a real browser."""
+
+import base64
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+
+from schemas.analysis import AnalysisColumn, AnalysisRecord, AnalysisRow, AnalysisTable, EstimateRecord, GeometryRecord
+from schemas.summary import RunSummary
+from schemas.view import ViewRecord
+from tests.browser import MIDDLE_OF_MAP, NEEDS_PAGE, Browser, browser, served
+from velfield import open_run
+from velfield.field.segments import SEGMENT_DTYPE, stationary_speed_px_per_s
+from velfield.run.layout import RunLayout
+from velfield.run.run import Run
+from velfield.run.stores import open_field
+from velfield.viewer.flow import DRAWS, draw_bins
+from velfield.viewer.replay import CHUNK_S, chunk_count, replay_chunks, vehicle_paths
+
+PAINTED = """(() => {
+  const canvas = document.querySelector('canvas.animation');
+  const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext('2d', {willReadFrequently: true});
+  copy.drawImage(canvas, 0, 0);
+  const data = copy.getImageData(0, 0, canvas.width, canvas.height).data;
+  const found = [];
+  for (let k = 0; k < data.length; k += 4) if (data[k] > 200 && data[k + 3] > 200) found.push(k / 4);
+  return {width: canvas.width, found};
+})()"""
+
+
+@pytest.fixture(scope="module")
+def run(whole: tuple[Path, RunSummary]) -> Run:
+    return open_run(whole[0])
+
+
+@pytest.fixture(scope="module")
+def record(whole: tuple[Path, RunSummary]) -> ViewRecord:
+    return ViewRecord.model_validate_json(RunLayout(whole[0]).view_record.read_bytes())
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with browser(tmp_path_factory.mktemp("chromium")) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def address(whole: tuple[Path, RunSummary]) -> Iterator[str]:
+    with served(whole[0]) as there:
+        yield there
+
+
+def decode(data: bytes, step_px: float) -> dict[int, dict[str, np.ndarray]]:
+    """Vehicle -> its times, positions and gaps, by the format's description alone."""
+    n, m = np.frombuffer(data, "<u4", 2)
+    vehicle, first = np.frombuffer(data, "<u4", 2 * n, 8).reshape(2, n)
+    at = 8 + 8 * n
+    time_s = np.frombuffer(data, "<f4", m, at)
+    x, y = np.frombuffer(data, "<u2", 2 * m, at + 4 * m).reshape(2, m) * step_px - 0.5
+    state, axis = np.frombuffer(data, np.uint8, 2 * n, at + 8 * m).reshape(2, n)
+    gap = np.frombuffer(data, np.uint8, m, at + 8 * m + 2 * n)
+    assert len(data) == at + 9 * m + 2 * n
+    parts = np.split(np.arange(m), first[1:])[:n]
+    return {
+        int(name): {"t": time_s[rows], "x": x[rows], "y": y[rows], "gap": gap[rows], "state": state[k], "axis": axis[k]}
+        for k, (name, rows) in enumerate(zip(vehicle, parts, strict=True))
+    }
+
+
+def made_segments(rows: list[tuple[int, float, float, float, float]]) -> np.ndarray:
+    """Segments of half a second along x: (track, start, x0, x1, y)."""
+    made = np.zeros(len(rows), SEGMENT_DTYPE)
+    for k, (track, start, x0, x1, y) in enumerate(rows):
+        made[k] = (track, start, 0.5, x0, y, x1, y, 2 * (x1 - x0), 0, 0, 0, 0)
+    return made
+
+
+def test_a_long_flight_is_cut_by_time_and_each_part_holds_all_of_its_time() -> None:
+    rows = [(7, 100 + 0.5 * k, 4.0 * k, 4.0 * (k + 1), 20.0) for k in range(60)]  # 30 s, from 100 s on
+    rows += [(9, 102.0, 50.0, 52.0, 5.0), (9, 118.0, 80.0, 83.0, 5.0)]  # unseen for 15.5 s
+    segments = made_segments(rows)
+    vehicles = pd.DataFrame({"state": ["moving", "moving"], "orientation_rad": [0.0, np.nan]})
+    paths = vehicle_paths(segments, np.zeros(2, bool))
+    chunks = list(replay_chunks(paths, vehicles, first_time_s=100.0, duration_s=30.0, step_px=0.01))
+    assert len(chunks) == chunk_count(30.0) == 4
+    for k, chunk in enumerate(chunks[:3]):
+        there = decode(chunk, 0.01)
+        assert (there[0]["t"][0], there[0]["t"][-1]) == pytest.approx((10 * k, 10 * k + 10), abs=0.51)
+        np.testing.assert_allclose(there[0]["x"], 8 * there[0]["t"], atol=0.01)
+        if k < 2:
+            middle = there[1]
+            assert (middle["t"][0] <= CHUNK_S * k) or k == 0
+            assert middle["gap"].tolist().count(1) == 1
+            assert np.interp(10.25, middle["t"], middle["x"]) == pytest.approx(66, abs=0.1)
+    assert max(map(len, chunks)) < 300  # of 60 positions a vehicle, 21 in each
+
+
+def test_what_is_parked_stands_still() -> None:
+    jitter = np.random.default_rng(4).normal(0, 0.4, 41)
+    rows = [(3, 0.5 * k, 100 + jitter[k], 100 + jitter[k + 1], 30.0) for k in range(40)]
+    paths = vehicle_paths(made_segments(rows), np.ones(1, bool))
+    assert paths.time_s.tolist() == [0.0, 20.0]
+    assert np.ptp(paths.x_px) == 0
+    assert paths.x_px[0] == pytest.approx(100, abs=0.3)
+
+
+def test_no_vehicles_make_files_too() -> None:
+    paths = vehicle_paths(np.zeros(0, SEGMENT_DTYPE), np.zeros(0, bool))
+    vehicles = pd.DataFrame({"state": [], "orientation_rad": np.zeros(0)})
+    (chunk,) = replay_chunks(paths, vehicles, first_time_s=0.0, duration_s=3.0, step_px=1.0)
+    assert decode(chunk, 1.0) == {}
+
+
+def test_draws_follow_the_weights_within_one_draw() -> None:
+    weights = np.random.default_rng(8).integers(0, 50, (30, 1369)) ** 3
+    weights[:, np.random.default_rng(9).permutation(1369)[:1350]] = 0
+    drawn = np.stack([np.bincount(row, minlength=1369) for row in draw_bins(weights)])
+    expected = weights / weights.sum(axis=1, keepdims=True) * DRAWS
+    assert np.abs(drawn - expected).max() <= 1
+    assert drawn[weights == 0].sum() == 0
+
+
+def test_the_flow_holds_the_distribution_of_the_field(run: Run, record: ViewRecord) -> None:
+    data = (run.layout.view / "flow.bin").read_bytes()
+    n = len(data) // (5 + 2 * DRAWS)
+    cells = np.frombuffer(data, "<u4", n)
+    bins = np.frombuffer(data, "<u2", n * DRAWS, 5 * n).reshape(n, DRAWS)
+    side, width = record.flow.cell_px, run.field.shape[1]
+    moving = run.field.modal_speed_px_per_s() > stationary_speed_px_per_s(run.record.config.field, run.grid.gsd_m)
+    y, x = np.nonzero(moving)
+    assert set(((y // side) * -(-width // side) + x // side).tolist()) <= set(cells.tolist())
+    differences, store = [], open_field(run.layout.field)
+    for k in range(0, n, max(1, n // 40)):
+        row, column = divmod(int(cells[k]), -(-width // side))
+        y0, x0 = row * side, column * side
+        tile = store.read_tile(y0 // store.tile, x0 // store.tile)
+        y0, x0 = y0 % store.tile, x0 % store.tile
+        total = tile[y0 : y0 + side, x0 : x0 + side].sum(axis=(0, 1), dtype=float).ravel()
+        drawn = np.bincount(bins[k], minlength=len(total)) / DRAWS
+        differences.append(np.abs(drawn - total / total.sum()).max())
+    assert np.median(differences) <= 1 / DRAWS + 1e-9
+
+
+def vehicle_at(run: Run, time_s: float) -> tuple[float, float, float]:
+    """Position and speed over a second of the vehicle that is fastest at a time, px and px/s."""
+    segments = run.segments()
+    best = (0.0, 0.0, 0.0)
+    for track in np.unique(segments["track"]):
+        mine = segments[segments["track"] == track]
+        t = np.append(mine["start_s"], mine["start_s"][-1] + mine["duration_s"][-1])
+        if not t[0] + 0.5 < time_s < t[-1] - 0.5:
+            continue
+        xy = np.column_stack([np.append(mine[f"{c}0_px"], mine[f"{c}1_px"][-1]) for c in "xy"])
+        place = [np.array([np.interp(time_s + s, t, xy[:, k]) for k in (0, 1)]) for s in (-0.5, 0.0, 0.5)]
+        speed = float(np.hypot(*(place[2] - place[0])))
+        if speed > best[2]:
+            best = (float(place[1][0]), float(place[1][1]), speed)
+    assert best[2] > 0, "the test needs a vehicle that is seen for a second"
+    return best
+
+
+@NEEDS_PAGE
+def test_a_click_on_a_vehicle_of_the_replay_tells_its_speed(chromium: Browser, address: str, run: Run) -> None:
+    middle = float(np.nanmedian(run.times_s))
+    x, y, speed = vehicle_at(run, middle)
+    since = round(middle - float(run.times_s[0]), 1)
+    x, y, speed = vehicle_at(run, since + float(run.times_s[0]))
+    with chromium.page() as page:
+        page.open(f"{address}#replay={since}&view={x},{y},2")
+        page.wait(f"({PAINTED}).found.length > 0")
+        page.click(*page.value(MIDDLE_OF_MAP))
+        page.wait("document.querySelector('#answer [data-name=vehicle_speed]') !== null")
+        shown = json.loads(page.value("document.querySelector('#answer [data-name=vehicle_speed]').dataset.value"))
+        assert shown == pytest.approx(speed, rel=0.02)
+        page.value("document.getElementById('play').click()")
+        page.wait(f"Number(document.getElementById('time').value) > {since}")
+        page.value("document.getElementById('play').click()")
+        page.wait(f"Number(new URLSearchParams(location.hash.slice(1)).get('replay')) > {since}")
+        page.value("time.value = time.max; time.dispatchEvent(new Event('input'))")
+        page.value("document.getElementById('map').focus()")
+        page.key("p", 80)
+        page.wait("document.getElementById('play').getAttribute('aria-label') === 'Pause'")  # from the start again
+        assert page.value("Number(document.getElementById('time').value) < Number(time.max)")
+        page.key("r", 82)
+        page.wait("document.getElementById('player').hidden")
+        assert page.complaints == []
+
+
+@NEEDS_PAGE
+def test_particles_move_on_the_roads(chromium: Browser, address: str, run: Run) -> None:
+    height, width = run.field.shape
+    near = cv2.dilate((run.field.count() > 0).astype(np.uint8), np.ones((41, 41), np.uint8))
+    with chromium.page() as page:
+        page.open(f"{address}#flow=1&view={width / 2},{height / 2},0")
+        page.wait(f"({PAINTED}).found.length > 200")
+        first = page.value(PAINTED)
+        page.wait("Number(document.querySelector('canvas.animation').dataset.framesPerSecond) > 0")
+        second = page.value(PAINTED)
+        w, h = page.value("(({width, height}) => [width, height])(map.getBoundingClientRect())")
+        assert page.complaints == []
+    assert set(first["found"]) != set(second["found"])
+    y, x = np.divmod(np.array(second["found"]), second["width"])
+    x, y = (x - w / 2 + width / 2).astype(int), (y - h / 2 + height / 2).astype(int)
+    inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    assert near[y[inside], x[inside]].mean() > 0.98
+
+
+@NEEDS_PAGE
+def test_where_less_motion_is_asked_for_nothing_flows(chromium: Browser, address: str) -> None:
+    with chromium.page() as page:
+        page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-reduced-motion", "value": "reduce"}])
+        page.open(f"{address}#flow=1")
+        page.wait("document.getElementById('hint').textContent.includes('reduced motion')")
+        assert page.value("document.getElementById('flow').getAttribute('aria-pressed')") == "false"
+        assert page.value(PAINTED)["found"] == []
+
+
+@NEEDS_PAGE
+@pytest.mark.parametrize(("ratio", "zoom"), [(1, -0.25), (1.25, 0), (1.5, 0.25)])
+def test_no_seam_shows_between_tiles(
+    chromium: Browser, whole: tuple[Path, RunSummary], tmp_path: Path, ratio: float, zoom: float
+) -> None:
+    for path in whole[0].iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    (tmp_path / "view").unlink()
+    (tmp_path / "view").mkdir()
+    for path in (whole[0] / "view").iterdir():
+        if path.name != "base":
+            (tmp_path / "view" / path.name).symlink_to(path)
+    for path in (whole[0] / "view" / "base").rglob("*.jpg"):
+        even = tmp_path / "view" / "base" / path.relative_to(whole[0] / "view" / "base")
+        even.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(even), np.full_like(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), 220))
+    with served(tmp_path) as there, chromium.page(width=700, height=500) as page:
+        page.call("Emulation.setDeviceMetricsOverride", width=700, height=500, deviceScaleFactor=ratio, mobile=False)
+        page.open(f"{there}#opacity=0&view=500.3,300.7,{zoom}")
+        page.wait(
+            "[...document.querySelectorAll('.base .leaflet-tile')].every((t) => t.matches('.leaflet-tile-loaded'))"
+        )
+        page.wait("document.querySelectorAll('.base .leaflet-tile-loaded').length >= 2")
+        page.wait("getComputedStyle([...document.querySelectorAll('.base .leaflet-tile')].at(-1)).opacity === '1'")
+        box = page.value("(({left, top, width, height}) => [left, top, width, height])(map.getBoundingClientRect())")
+        png = base64.b64decode(page.call("Page.captureScreenshot", format="png")["data"])
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
+    x, y = (box[0] + box[2] / 2) * ratio, (box[1] + box[3] / 2) * ratio
+    reach = int(60 * ratio)
+    around = image[int(y) - reach : int(y) + reach, int(x) - reach : int(x) + reach]
+    assert np.ptp(around) <= 1
+
+
+def made_analysis() -> AnalysisRecord:
+    """Two lanes with a speed each, one of them known."""
+    speed = EstimateRecord(value=10.0, low=9.0, high=11.5, n=14)
+    rows = (
+        AnalysisRow(
+            cells={"lane": 0, "speed": speed}, geometry=GeometryRecord(type="LineString", xy_px=((9, 9), (90, 9)))
+        ),
+        AnalysisRow(cells={"lane": 1, "speed": EstimateRecord(n=1)}),
+    )
+    columns = (
+        AnalysisColumn(name="lane", title="Lane"),
+        AnalysisColumn(name="speed", title="Median speed", unit="m/s"),
+    )
+    table = AnalysisTable(name="speeds", section="Speed", title="Speeds", note="A note.", columns=columns, rows=rows)
+    return AnalysisRecord(code_version="0", gsd_m=0.23, gsd_known=True, duration_s=8, tracks=15, tables=(table,))
+
+
+@NEEDS_PAGE
+def test_the_tab_of_the_analysis_shows_tables_with_n_and_intervals(
+    chromium: Browser, whole: tuple[Path, RunSummary], tmp_path: Path
+) -> None:
+    for path in whole[0].iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    (tmp_path / "analysis").mkdir()
+    (tmp_path / "analysis" / "analysis.json").write_text(made_analysis().model_dump_json())
+    with served(tmp_path) as there, chromium.page() as page:
+        page.open(f"{there}#tab=analysis")
+        page.wait("document.querySelector('#analysis tbody') !== null")
+        cells = page.value("[...document.querySelectorAll('#analysis tbody td')].map((cell) => cell.textContent)")
+        assert cells == ["●", "0", "36 32.4 to 41.4, n = 14", "", "1", "–"]
+        titles = page.value("[...document.querySelectorAll('#analysis thead th')].map((cell) => cell.textContent)")
+        assert titles == ["Map", "Lane", "Median speed, km/h"]
+        page.value("document.querySelector('#analysis .place').click()")
+        assert page.value("document.getElementById('side').hidden")
+        assert page.complaints == []

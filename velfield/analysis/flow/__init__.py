@@ -1,0 +1,1 @@
+"""Flow and speed on lanes: profiles, free flow, volume and density, headways, conflicts."""

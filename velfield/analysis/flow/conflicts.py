@@ -1,0 +1,200 @@
+"""Conflicts: post-encroachment time where paths cross or merge, time to collision behind a leader; with the probability
+that each lies below a threshold, given the errors of positions."""
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+from scipy import stats
+
+from schemas.arrays import FloatArray, IntArray
+from velfield.analysis.flow.passings import LaneTraffic, Passings
+from velfield.analysis.lanes.find import project
+from velfield.analysis.lanes.junctions import Crossing, find_crossings
+from velfield.analysis.lanes.model import LaneGraph
+from velfield.analysis.trajectories import Trajectories
+
+ConflictKind = Literal["crossing", "merging", "following"]
+MAX_PET_S, MAX_TTC_S = 3.0, 3.0
+LENGTH_M, WIDTH_M = 4.5, 1.8
+POSITION_SD_M, SPEED_SD_M_PER_S = 0.35, 0.3
+"""Of a vehicle's bumper along its path: of its position, and of a length that is not known; and of its speed."""
+_MIN_SPEED_M_PER_S = 1.0
+_JOINED_M = 4.0
+"""A lane that joins another is on it so far after its own end."""
+
+
+@dataclass(frozen=True)
+class Conflict:
+    """Two vehicles that were near in time: ``first`` and ``second`` by number of their tracks.
+
+    Attributes
+    ----------
+    value_s, sd_s
+        Post-encroachment time (crossing, merging), or least time to collision (following), and its standard deviation.
+    probability
+        That it is below ``threshold_s``.
+    """
+
+    kind: ConflictKind
+    first: int
+    second: int
+    time_s: float
+    xy_m: FloatArray
+    value_s: float
+    sd_s: float
+    threshold_s: float
+    probability: float
+
+
+def find_conflicts(
+    trajectories: Trajectories,
+    traffic: LaneTraffic,
+    *,
+    pet_s: float = 1.5,
+    ttc_s: float = 1.5,
+    lengths_m: FloatArray | None = None,
+) -> list[Conflict]:
+    """All pairs with a post-encroachment time or time to collision below 3 s, by time.
+
+    Parameters
+    ----------
+    pet_s, ttc_s
+        Thresholds of the probability.
+    lengths_m
+        (tracks,) lengths of the vehicles; None: a car's.
+    """
+    lengths = np.full(len(trajectories), LENGTH_M) if lengths_m is None else lengths_m
+    found = [
+        conflict
+        for crossing in find_crossings(traffic.graph.lanes)
+        for conflict in _post_encroachments(crossing, traffic, lengths, pet_s)
+    ]
+    found += _merges(traffic, lengths, pet_s)
+    found += time_to_collision(trajectories, traffic.graph, lengths, ttc_s)
+    return sorted(_closest(found), key=lambda c: c.time_s)
+
+
+def _closest(found: list[Conflict]) -> list[Conflict]:
+    """One conflict a pair and kind: the closest."""
+    best: dict[tuple[str, int, int], Conflict] = {}
+    for conflict in found:
+        key = (conflict.kind, conflict.first, conflict.second)
+        if key not in best or conflict.value_s < best[key].value_s:
+            best[key] = conflict
+    return list(best.values())
+
+
+def _post_encroachments(
+    crossing: Crossing, traffic: LaneTraffic, lengths: FloatArray, threshold_s: float
+) -> list[Conflict]:
+    """Pairs that cross one after the other, by different lanes."""
+    a = traffic.passings(crossing.lane, crossing.along_m)
+    b = traffic.passings(crossing.other, crossing.other_along_m)
+    half_m = WIDTH_M / 2 / max(abs(np.sin(crossing.angle_rad)), 0.3)
+    return _pairs("crossing", a, b, crossing.xy_m, lengths, half_m, threshold_s)
+
+
+def _merges(traffic: LaneTraffic, lengths: FloatArray, threshold_s: float) -> list[Conflict]:
+    """Pairs that come from different lanes onto one."""
+    graph, out = traffic.graph, []
+    for lane in graph:
+        sources = graph.predecessors[lane.number]
+        if len(sources) < 2:
+            continue
+        # where the last of the lanes has joined: the first joins at the start of this one
+        ends = np.array([graph.lanes[k].xy_m[-1] for k in sources])
+        place = min(float(project(ends, lane.xy_m)[0].max()) + _JOINED_M, 0.9 * lane.length_m)
+        at = traffic.passings(lane.number, place)
+        for x, y in combinations(sources, 2):
+            came = [np.isin(at.track, np.unique(traffic.samples(k).track)) for k in (x, y)]
+            only = came[0] ^ came[1]
+            parts = [Passings(at.track[c & only], at.time_s[c & only], at.speed_m_per_s[c & only]) for c in came]
+            out += _pairs("merging", parts[0], parts[1], lane.at(place), lengths, 0.0, threshold_s)
+    return out
+
+
+def _pairs(
+    kind: ConflictKind,
+    a: Passings,
+    b: Passings,
+    xy_m: FloatArray,
+    lengths: FloatArray,
+    half_m: float,
+    threshold_s: float,
+) -> list[Conflict]:
+    """Consecutive passings of different streams, nearer than ``MAX_PET_S``."""
+    time = np.r_[a.time_s, b.time_s]
+    order = np.argsort(time, kind="stable")
+    track, time = np.r_[a.track, b.track][order], time[order]
+    speed = np.maximum(np.r_[a.speed_m_per_s, b.speed_m_per_s][order], _MIN_SPEED_M_PER_S)
+    stream = np.r_[np.zeros(len(a)), np.ones(len(b))][order]
+    k = np.flatnonzero((np.diff(stream) != 0) & (np.diff(time) < MAX_PET_S + 3.0) & (np.diff(track) != 0))
+    reach = lengths[track] / 2 + half_m
+    value = (time[k + 1] - reach[k + 1] / speed[k + 1]) - (time[k] + reach[k] / speed[k])
+    sd = POSITION_SD_M * np.hypot(1 / speed[k], 1 / speed[k + 1])
+    probability = stats.norm.cdf((threshold_s - value) / sd)
+    return [
+        Conflict(
+            kind, int(track[i]), int(track[i + 1]), float(time[i + 1]), xy_m, float(v), float(s), threshold_s, float(p)
+        )
+        for i, v, s, p in zip(k, value, sd, probability, strict=True)
+        if v < MAX_PET_S
+    ]
+
+
+def time_to_collision(
+    trajectories: Trajectories, graph: LaneGraph, lengths: FloatArray, threshold_s: float
+) -> list[Conflict]:
+    """Least time to collision of each follower and its leader on a lane, where it is below ``MAX_TTC_S``."""
+    lane, along = positions_on_lanes(trajectories, graph)
+    rows = np.flatnonzero(lane >= 0)
+    order = rows[np.lexsort((along[rows], trajectories.frame[rows], lane[rows]))]
+    a, b = order[:-1], order[1:]  # b leads a
+    same = (lane[a] == lane[b]) & (trajectories.frame[a] == trajectories.frame[b])
+    a, b = a[same], b[same]
+    owner, speed = trajectories.owner, trajectories.speed_m_per_s
+    gap = along[b] - along[a] - (lengths[owner[a]] + lengths[owner[b]]) / 2
+    closing = speed[a] - speed[b]
+    near = (closing > 0.5) & (gap > -1.0) & (gap < MAX_TTC_S * closing) & (owner[a] != owner[b])
+    a, b, gap, closing = a[near], b[near], np.maximum(gap[near], 0.05), closing[near]
+    value = gap / closing
+    sd = value * np.hypot(np.sqrt(2) * POSITION_SD_M / gap, np.sqrt(2) * SPEED_SD_M_PER_S / closing)
+    # the probability on the closing speed's side: gap < threshold * closing
+    spread = np.hypot(np.sqrt(2) * POSITION_SD_M, threshold_s * np.sqrt(2) * SPEED_SD_M_PER_S)
+    probability = stats.norm.cdf((threshold_s * closing - gap) / spread)
+    pair = owner[a] * np.int64(len(trajectories)) + owner[b]
+    best = np.lexsort((value, pair))
+    _, first = np.unique(pair[best], return_index=True)
+    return [
+        Conflict(
+            "following",
+            int(owner[b[i]]),
+            int(owner[a[i]]),
+            float(trajectories.time_s[a[i]]),
+            trajectories.xy_m[a[i]],
+            float(value[i]),
+            float(sd[i]),
+            threshold_s,
+            float(probability[i]),
+        )
+        for i in best[first]
+    ]
+
+
+def positions_on_lanes(trajectories: Trajectories, graph: LaneGraph) -> tuple[IntArray, FloatArray]:
+    """Lane of each position (m,), -1: none, and distance along it, m."""
+    samples = graph.samples
+    if not len(samples) or not len(trajectories):
+        return np.full(len(trajectories.time_s), -1), np.zeros(len(trajectories.time_s))
+    begin = float(trajectories.time_s.min())
+    span = trajectories.duration_s + 10.0
+    key = samples.track * span + (samples.time_s - begin)
+    owner = trajectories.owner
+    query = owner * span + (trajectories.time_s - begin)
+    k = np.clip(np.searchsorted(key, query) - 1, 0, len(key) - 2)
+    good = (samples.track[k] == owner) & (samples.track[k + 1] == owner) & (samples.lane[k] == samples.lane[k + 1])
+    f = np.clip((query - key[k]) / np.maximum(key[k + 1] - key[k], 1e-9), 0.0, 1.0)
+    along = samples.along_m[k] + f * (samples.along_m[k + 1] - samples.along_m[k])
+    return np.where(good, samples.lane[k], -1), along

@@ -1,0 +1,220 @@
+"""Speeds along lanes: profiles, free flow and the limit that it shows, and what a feature takes from it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.arrays import FloatArray, IntArray
+from velfield.analysis.flow.passings import LaneTraffic
+from velfield.analysis.intervals import Estimate, estimate_median, estimate_quantile
+from velfield.analysis.lanes.model import Junction, LaneGraph, LaneSamples
+
+STATION_M = 10.0
+"""Length of a profile's stations."""
+_FREE_HEADWAY_S = 4.0
+"""A vehicle whose leader is further ahead follows nobody."""
+_STEADY_M, _STEADY = 30.0, 0.03
+"""A vehicle that goes freely changes its speed by no more than this fraction over so long a distance."""
+_MIN_FREE = 8
+SIGN_KM_PER_H = 10.0
+"""Speed limits are multiples of it."""
+_AWAY_M = 50.0
+_RECOVERED = 0.95
+
+
+@dataclass(frozen=True)
+class Station:
+    """Speeds at a station of a lane, m/s: quantiles over vehicles."""
+
+    lane: int
+    along_m: float
+    xy_m: FloatArray
+    vehicles: int
+    p15: Estimate | None
+    p50: Estimate | None
+    p85: Estimate | None
+
+
+def speed_profile(traffic: LaneTraffic, lane: int, *, station_m: float = STATION_M) -> list[Station]:
+    """Speeds of the vehicles at each station of a lane, every vehicle once."""
+    samples = traffic.samples(lane)
+    length = traffic.graph.lanes[lane].length_m
+    count = max(round(length / station_m), 1)
+    station = np.clip((samples.along_m / length * count).astype(np.int64), 0, count - 1)
+    out = []
+    for k, speeds in enumerate(_speeds_by_station(samples, station, count)):
+        at = (k + 0.5) * length / count
+        quantiles = [estimate_quantile(speeds, q) for q in (0.15, 0.5, 0.85)]
+        out.append(Station(lane, at, traffic.graph.lanes[lane].at(at), len(speeds), *quantiles))
+    return out
+
+
+def _speeds_by_station(samples: LaneSamples, station: IntArray, count: int) -> list[FloatArray]:
+    """Mean speed of each track at each station."""
+    key = station * (int(samples.track.max(initial=0)) + 1) + samples.track
+    keys, inverse = np.unique(key, return_inverse=True)
+    mean = np.bincount(inverse, samples.speed_m_per_s) / np.bincount(inverse) if len(key) else np.empty(0)
+    owner = keys // (int(samples.track.max(initial=0)) + 1)
+    first = np.searchsorted(owner, np.arange(count + 1))
+    return [mean[first[k] : first[k + 1]] for k in range(count)]
+
+
+@dataclass(frozen=True)
+class FreeFlow:
+    """Free flow on a road: lanes beside each other and one after the other.
+
+    Attributes
+    ----------
+    lanes
+        Of the road.
+    speed_m_per_s
+        Median speed of the vehicles that follow nobody and keep their speed; None: too few of them.
+    limit_km_per_h
+        The multiple of ten nearest to it.
+    p85_m_per_s
+        Which 85 of 100 such vehicles do not exceed.
+    """
+
+    lanes: tuple[int, ...]
+    speed_m_per_s: Estimate | None
+    limit_km_per_h: float | None
+    p85_m_per_s: Estimate | None
+
+
+def free_flow(traffic: LaneTraffic) -> list[FreeFlow]:
+    """Free flow of every road of a lane graph."""
+    speeds = [_free_speeds(traffic, lane.number) for lane in traffic.graph]
+    out = []
+    for lanes in roads(traffic.graph):
+        tracks = np.concatenate([speeds[lane][0] for lane in lanes])
+        values = np.concatenate([speeds[lane][1] for lane in lanes])
+        # a vehicle once: its fastest steady stretch, as it goes slowly for other reasons too
+        order = np.lexsort((-values, tracks))
+        _, first = np.unique(tracks[order], return_index=True)
+        best = values[order][first]
+        median = estimate_median(best, min_n=_MIN_FREE)
+        limit = None if median is None else round(median.value * 3.6 / SIGN_KM_PER_H) * SIGN_KM_PER_H
+        p85 = estimate_quantile(best, 0.85, min_n=_MIN_FREE)
+        out.append(FreeFlow(tuple(lanes), median, limit, p85))
+    return out
+
+
+def _free_speeds(traffic: LaneTraffic, lane: int) -> tuple[IntArray, FloatArray]:
+    """Tracks and their speeds where they go steadily and follow nobody."""
+    samples = traffic.samples(lane)
+    length = traffic.graph.lanes[lane].length_m
+    window = min(_STEADY_M, 0.6 * length)
+    tracks, speeds = [np.empty(0, np.int64)], [np.empty(0)]
+    steps = int(window)
+    if steps < 5 or len(samples) <= steps:
+        return tracks[0], speeds[0]
+    v = samples.speed_m_per_s
+    low = np.lib.stride_tricks.sliding_window_view(v, steps).min(axis=1)
+    high = np.lib.stride_tricks.sliding_window_view(v, steps).max(axis=1)
+    one = samples.track[: len(low)] == samples.track[steps - 1 :]
+    steady = one & (high - low < 2 * _STEADY * (high + low) / 2) & (low > 2.0)
+    for at in np.arange(0.5 * window, length, 10.0):
+        passing = traffic_passings(samples, at)
+        # whoever leads a platoon is slow: only a vehicle that nobody follows either goes as it likes
+        free = (passing[1] > _FREE_HEADWAY_S) & (np.r_[passing[1][1:], np.inf] > _FREE_HEADWAY_S)
+        begin = np.flatnonzero(steady & (samples.along_m[: len(low)] <= at - window / 2 + 1.0))
+        begin = begin[samples.along_m[begin] > at - window / 2 - 1.5]
+        owner = samples.track[begin]
+        keep = np.isin(owner, passing[0][free])
+        tracks.append(owner[keep])
+        speeds.append((low[begin][keep] + high[begin][keep]) / 2)
+    return np.concatenate(tracks), np.concatenate(speeds)
+
+
+def traffic_passings(samples: LaneSamples, at_m: float) -> tuple[IntArray, FloatArray]:
+    """Tracks at a place and their headways, s; the first has none and counts as free."""
+    from velfield.analysis.flow.passings import find_passings
+
+    found = find_passings(samples, at_m)
+    return found.track, np.nan_to_num(found.headway_s, nan=np.inf)
+
+
+def roads(graph: LaneGraph) -> list[list[int]]:
+    """Lanes by road: beside each other in one direction, or straight on from each other, outside roundabouts."""
+    label = np.arange(len(graph))
+    ring = {k for junction in graph.junctions if junction.kind == "roundabout" for k in junction.lanes_inside}
+    pairs = [(c.start, c.end) for c in graph.connections if c.turn == "straight" and c.share > 0.5]
+    pairs = [(a, b) for a, b in pairs if graph.predecessors[b][0] == a]
+    pairs += [(lane.number, other) for lane in graph for other in (lane.left, lane.right) if other is not None]
+    for a, b in pairs:
+        if (a in ring) == (b in ring):
+            label[label == label[a]] = label[b]
+    return [np.flatnonzero(label == k).tolist() for k in np.unique(label)]
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """How a junction slows the vehicles that reach it by a lane and pass it without stopping.
+
+    Attributes
+    ----------
+    before_m_per_s, lowest_m_per_s, after_m_per_s
+        Medians: 50 m before its area, the lowest on the way, 50 m after its area.
+    reduction_m_per_s
+        Before less lowest, of the same vehicles.
+    recovery_m
+        Distance from the lowest speed to where 95 % of the speed before, or of that after if it is lower, is reached.
+    """
+
+    junction: int
+    lane: int
+    before_m_per_s: Estimate | None
+    lowest_m_per_s: Estimate | None
+    after_m_per_s: Estimate | None
+    reduction_m_per_s: Estimate | None
+    recovery_m: Estimate | None
+
+
+def speed_reduction(
+    samples: "PathArrays", junction: Junction, lane: int, tracks: IntArray, entry_s: FloatArray
+) -> Reduction:
+    """Speeds of tracks that enter a junction at given times, from 50 m before it to 100 m after it."""
+    before, lowest, after, recovery = [], [], [], []
+    for track, time in zip(tracks.tolist(), entry_s.tolist(), strict=True):
+        rows = samples.rows(track)
+        speed, when = samples.speed_m_per_s[rows], samples.time_s[rows]
+        k = int(np.searchsorted(when, time))
+        begin = k - int(_AWAY_M)
+        if begin < 0 or k >= len(speed) or np.diff(when[begin:k]).max(initial=0.0) > 1.5:
+            continue  # too short, or it stopped
+        ahead = speed[k : k + 45]
+        low = int(np.argmin(ahead)) if len(ahead) else 0
+        if len(ahead) < 15 or ahead[low] < 1.0:
+            continue
+        start = float(np.median(speed[begin : begin + 10]))
+        end = speed[k + low : k + low + 120]
+        before.append(start)
+        lowest.append(float(ahead[low]))
+        late = float(np.median(end[70:90])) if len(end) > 80 else np.nan
+        after.append(late)
+        aim = _RECOVERED * min(start, late) if np.isfinite(late) else np.nan
+        hits = np.flatnonzero(end >= aim)
+        recovery.append(float(hits[0]) if len(hits) and np.isfinite(aim) else np.nan)
+    b, w, a, r = (np.array(values, np.float64) for values in (before, lowest, after, recovery))
+    return Reduction(
+        junction.number,
+        lane,
+        estimate_median(b),
+        estimate_median(w),
+        estimate_median(a),
+        estimate_median(b - w),
+        estimate_median(r),
+    )
+
+
+@dataclass(frozen=True)
+class PathArrays:
+    """Path samples by track: ``first`` (tracks + 1,) rows."""
+
+    first: IntArray
+    time_s: FloatArray
+    speed_m_per_s: FloatArray
+
+    def rows(self, track: int) -> slice:
+        """Rows of a track."""
+        return slice(int(self.first[track]), int(self.first[track + 1]))

@@ -1,0 +1,120 @@
+"""Volume, density and space-mean speed of lanes by Edie's definitions; headways; levels of service."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.arrays import FloatArray
+from velfield.analysis.flow.passings import LaneTraffic
+from velfield.analysis.intervals import Estimate, estimate_mean, estimate_median, estimate_rate
+
+_VEHICLE_M = 4.5
+_FOLLOW_S = 3.0
+"""A vehicle with a shorter headway follows the one before."""
+LOS_SIGNAL_S = (10.0, 20.0, 35.0, 55.0, 80.0)
+"""Control delay, s, up to which levels A to E reach at signals: Highway Capacity Manual, 6th edition, Exhibit 19-8."""
+LOS_YIELD_S = (10.0, 15.0, 25.0, 35.0, 50.0)
+"""The same without signals: Exhibits 20-2 (stop control) and 22-8 (roundabouts)."""
+
+
+@dataclass(frozen=True)
+class LaneFlow:
+    """Traffic of a lane.
+
+    Attributes
+    ----------
+    flow_veh_per_h
+        At the middle of the lane.
+    density_veh_per_km, space_mean_speed_m_per_s
+        Time spent on the lane over its length and the time; distance driven over time spent (Edie).
+    headway_s, gap_s
+        Mean headway; median time gap of those that follow, rear bumper to front bumper of a car of 4.5 m.
+    """
+
+    lane: int
+    flow_veh_per_h: Estimate | None
+    density_veh_per_km: Estimate | None
+    space_mean_speed_m_per_s: Estimate | None
+    headway_s: Estimate | None
+    gap_s: Estimate | None
+
+
+@dataclass(frozen=True)
+class FlowSlices:
+    """Edie's flow (veh/h), density (veh/km) and speed (m/s; NaN without traffic) of a lane by slice of time: points of
+    its fundamental diagram."""
+
+    start_s: FloatArray
+    flow_veh_per_h: FloatArray
+    density_veh_per_km: FloatArray
+    speed_m_per_s: FloatArray
+
+
+def lane_flow(traffic: LaneTraffic, lane: int, begin_s: float, end_s: float, *, slice_s: float = 60.0) -> LaneFlow:
+    """Traffic of one lane from ``begin_s`` to ``end_s``."""
+    slices = flow_slices(traffic, lane, begin_s, end_s, slice_s=slice_s)
+    passing = traffic.passings(lane, traffic.graph.lanes[lane].length_m / 2)
+    inside = (passing.time_s >= begin_s) & (passing.time_s <= end_s)
+    number = max(round((end_s - begin_s) / slice_s), 1)
+    counts = np.histogram(passing.time_s[inside], number, (begin_s, max(end_s, begin_s + 1e-9)))[0]
+    headway = passing.headway_s
+    follows = headway < _FOLLOW_S
+    gap = headway[follows] - _VEHICLE_M / np.maximum(passing.speed_m_per_s[follows], 1.0)
+    enough = len(passing) >= 5
+    return LaneFlow(
+        lane,
+        estimate_rate(counts, (end_s - begin_s) / 3600),
+        estimate_mean(slices.density_veh_per_km) if enough else None,
+        _ratio(slices) if enough else None,
+        estimate_mean(headway),
+        estimate_median(gap[gap > 0]),
+    )
+
+
+def flow_slices(traffic: LaneTraffic, lane: int, begin_s: float, end_s: float, *, slice_s: float = 60.0) -> FlowSlices:
+    """Edie's quantities of one lane by slice of time."""
+    samples, length = traffic.samples(lane), traffic.graph.lanes[lane].length_m
+    number = max(int((end_s - begin_s) / slice_s), 1)
+    width = (end_s - begin_s) / number if end_s > begin_s else 1.0
+    one = samples.track[1:] == samples.track[:-1]
+    step = np.where(one, samples.along_m[1:] - samples.along_m[:-1], 0.0)
+    wait = np.where(one, samples.time_s[1:] - samples.time_s[:-1], 0.0)
+    ok = one & (step >= 0) & (step < 20.0) & (wait > 0)
+    driven, spent = np.zeros(number), np.zeros(number)
+    # a long wait between two samples spreads over slices
+    for part in range(8):
+        at = samples.time_s[:-1][ok] + wait[ok] * (part + 0.5) / 8
+        k = np.floor((at - begin_s) / width).astype(np.int64)
+        inside = (k >= 0) & (k < number)
+        driven += np.bincount(k[inside], step[ok][inside] / 8, number)
+        spent += np.bincount(k[inside], wait[ok][inside] / 8, number)
+    area = length * width
+    speed = np.divide(driven, spent, out=np.full(number, np.nan), where=spent > 0)
+    start = np.asarray(begin_s + width * np.arange(number), np.float64)
+    flow, density = np.asarray(driven / area * 3600, np.float64), np.asarray(spent / area * 1000, np.float64)
+    return FlowSlices(start, flow, density, np.asarray(speed, np.float64))
+
+
+def _ratio(slices: FlowSlices) -> Estimate | None:
+    """Space-mean speed of all slices together, by the ratio estimator."""
+    flow, density = slices.flow_veh_per_h / 3.6, slices.density_veh_per_km  # veh/s * 1000, veh/km
+    used = density > 0
+    n = int(used.sum())
+    if n < 5:
+        return None
+    ratio = float(flow.sum() / density.sum())
+    residual = (flow - ratio * density)[used]
+    half = 1.645 * float(residual.std(ddof=1)) / np.sqrt(n) / float(density[used].mean())
+    return Estimate(ratio, max(ratio - half, 0.0), ratio + half, n)
+
+
+def level_of_service(delay_s: float, *, signalised: bool) -> str:
+    """Level of service A to F by the control delay.
+
+    Examples
+    --------
+    >>> level_of_service(12.0, signalised=True), level_of_service(51.0, signalised=False)
+    ('B', 'F')
+    """
+    limits = LOS_SIGNAL_S if signalised else LOS_YIELD_S
+    return "ABCDEF"[int(np.searchsorted(limits, delay_s))]

@@ -1,0 +1,116 @@
+"""Estimates with their 90 % intervals; None where there is too little data for one.
+
+An interval says where the quantity lies in the long run of such traffic, not only in the flight.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from schemas.arrays import FloatArray, IntArray
+
+LEVEL = 0.9
+MIN_VEHICLES = 5
+"""Fewer vehicles give no estimate."""
+MIN_QUANTILE_TAIL = 2
+"""A quantile needs so many values on either side of it in expectation."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number, its 90 % interval and the number of vehicles (or cycles, or events) that it rests on."""
+
+    value: float
+    low: float
+    high: float
+    n: int
+
+    def in_units(self, factor: float) -> "Estimate":
+        """In another unit."""
+        return Estimate(self.value * factor, self.low * factor, self.high * factor, self.n)
+
+
+def estimate_mean(values: NDArray[np.floating], *, min_n: int = MIN_VEHICLES) -> Estimate | None:
+    """Mean of independent values by Student's t.
+
+    Examples
+    --------
+    >>> estimate_mean(np.array([1.0, 2.0]))
+    >>> estimate_mean(np.array([1.0, 2.0, 3.0, 4.0, 5.0])).value
+    3.0
+    """
+    known = values[np.isfinite(values)]
+    if len(known) < min_n:
+        return None
+    mean = float(known.mean())
+    half = float(stats.t.ppf((1 + LEVEL) / 2, len(known) - 1) * known.std(ddof=1) / np.sqrt(len(known)))
+    return Estimate(mean, mean - half, mean + half, len(known))
+
+
+def estimate_median(values: NDArray[np.floating], *, min_n: int = MIN_VEHICLES) -> Estimate | None:
+    """Median of independent values, the interval by order statistics."""
+    return estimate_quantile(values, 0.5, min_n=min_n)
+
+
+def estimate_quantile(values: NDArray[np.floating], q: float, *, min_n: int = MIN_VEHICLES) -> Estimate | None:
+    """A quantile of independent values; the interval lies between order statistics, interpolated to the level."""
+    known = np.sort(values[np.isfinite(values)])
+    n = len(known)
+    if n < min_n or min(q, 1 - q) * n < MIN_QUANTILE_TAIL:
+        return None
+    # The level of the sample quantile is a beta variable (Hutson 1999): interpolated order statistics.
+    low, high = (float(_fractional_order(known, q, alpha)) for alpha in ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
+    return Estimate(float(np.quantile(known, q)), low, high, n)
+
+
+def _fractional_order(ordered: FloatArray, q: float, alpha: float) -> float:
+    """The order statistic, interpolated, that lies above the quantile ``q`` with probability ``alpha``."""
+    n = len(ordered)
+    ranks = np.arange(1, n + 1)
+    above = 1 - stats.beta.cdf(q, ranks, n - ranks + 1)  # probability that the statistic of a rank lies above
+    return float(np.interp(alpha, above, ordered))
+
+
+def estimate_share(successes: float, n: int, *, min_n: int = MIN_VEHICLES) -> Estimate | None:
+    """A fraction of independent vehicles, by the interval of Jeffreys."""
+    if n < min_n:
+        return None
+    a, b = successes + 0.5, n - successes + 0.5
+    low = 0.0 if successes <= 0 else float(stats.beta.ppf((1 - LEVEL) / 2, a, b))
+    high = 1.0 if successes >= n else float(stats.beta.ppf((1 + LEVEL) / 2, a, b))
+    return Estimate(successes / n, low, high, n)
+
+
+def estimate_rate(
+    counts: IntArray | FloatArray, exposure: float, *, min_n: int = MIN_VEHICLES, dispersion: float | None = None
+) -> Estimate | None:
+    """Events per unit of exposure from counts of equal slices of it; slices show how much more, or less, than Poisson
+    the events vary.
+
+    Parameters
+    ----------
+    counts
+        (k,) events in k slices of equal length.
+    exposure
+        Of all slices together, h.
+    dispersion
+        Variance over mean, where it is known from elsewhere.
+    """
+    total = float(np.sum(counts))
+    if total < min_n or exposure <= 0:
+        return None
+    factor = _dispersion(np.asarray(counts, np.float64)) if dispersion is None else dispersion
+    shape = (total + 0.5) / factor
+    low, high = (float(stats.gamma.ppf(p, shape) * factor) for p in ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
+    return Estimate(total / exposure, low / exposure, high / exposure, round(total))
+
+
+def _dispersion(counts: FloatArray) -> float:
+    """Variance over mean of the counts of slices, drawn towards 1 where there are few."""
+    k = len(counts)
+    if k < 2 or counts.mean() <= 0:
+        return 1.0
+    ratio = counts.var(ddof=1) / counts.mean()
+    return float(np.clip((ratio * (k - 1) + 4.0) / (k - 1 + 4.0), 0.1, 10.0))

@@ -1,0 +1,1 @@
+"""Movements: who enters a junction, or the image, where, and leaves it where; U-turns."""

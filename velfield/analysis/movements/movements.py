@@ -1,0 +1,224 @@
+"""Movements through a junction: counted where both ends are seen, inferred where a track is cut.
+
+A track that enters and leaves within sight is a movement that is seen. One that enters and is lost, or is found within
+and leaves, is half of one. Such halves are joined as the entries and exits require: the seen movements are scaled until
+their rows add up to the entries that were lost, and their columns to the exits of unknown origin (Furness' method).
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.arrays import FloatArray, IntArray
+from velfield.analysis.intervals import Estimate, estimate_mean, estimate_rate, estimate_share
+from velfield.analysis.lanes.junctions import inside_hull
+from velfield.analysis.lanes.model import Junction, LaneGraph, Turn
+from velfield.analysis.movements.gates import Gates, find_gates
+from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
+
+_UPSTREAM_M = 60
+"""A travel time begins so far before the junction where the track does."""
+_FURNESS_STEPS = 60
+_MIN_PASSES = 3
+_STOP_S, _STOP_M_PER_S = 2.0, 1.0
+
+
+@dataclass(frozen=True)
+class Passes:
+    """Tracks in a junction, one row a pass: gates by number, -1 where the track was not seen to enter (or leave).
+
+    ``entry_s``, ``exit_s`` and ``upstream_s`` (``_UPSTREAM_M`` before the entry) are times, NaN where unknown.
+    """
+
+    track: IntArray
+    gate_in: IntArray
+    gate_out: IntArray
+    entry_s: FloatArray
+    exit_s: FloatArray
+    upstream_s: FloatArray
+
+
+@dataclass(frozen=True)
+class Movement:
+    """From one arm of a junction to another.
+
+    Attributes
+    ----------
+    seen, inferred
+        Vehicles seen from entry to exit, and those inferred from tracks that are cut.
+    share
+        Of the vehicles that enter by the arm.
+    flow_veh_per_h
+        Vehicles an hour.
+    travel_time_s, delay_s
+        From 60 m before the junction to its exit, and what that is longer than for vehicles that pass freely.
+    """
+
+    junction: int
+    arm_in: str
+    arm_out: str
+    turn: Turn
+    seen: int
+    inferred: float
+    share: Estimate | None
+    flow_veh_per_h: Estimate | None
+    travel_time_s: Estimate | None
+    delay_s: Estimate | None
+    line_m: FloatArray
+
+
+@dataclass(frozen=True)
+class JunctionMovements:
+    """All movements of a junction."""
+
+    junction: Junction
+    gates: Gates
+    passes: Passes
+    movements: tuple[Movement, ...]
+
+    @property
+    def volume(self) -> float:
+        """Vehicles that passed."""
+        return float(sum(m.seen + m.inferred for m in self.movements))
+
+
+def find_movements(
+    trajectories: Trajectories, graph: LaneGraph, *, slice_s: float = 120.0, window_s: tuple[float, float] | None = None
+) -> tuple[JunctionMovements, ...]:
+    """Movements through every junction of a lane graph.
+
+    Parameters
+    ----------
+    slice_s
+        Counts of slices so long show how much the flow varies.
+    window_s
+        Only vehicles that enter (or, unseen there, leave) from the first time up to the second.
+    """
+    samples = sample_paths(trajectories)
+    begin, end = window_s or (
+        (float(trajectories.time_s.min()), float(trajectories.time_s.max())) if len(trajectories) else (0.0, 0.0)
+    )
+    out = []
+    for junction in graph.junctions:
+        gates = find_gates(graph, junction)
+        passes = _within(find_passes(samples, junction, gates), begin, end)
+        out.append(
+            JunctionMovements(junction, gates, passes, tuple(_count(junction, gates, passes, begin, end, slice_s)))
+        )
+    return tuple(out)
+
+
+def find_passes(samples: PathSamples, junction: Junction, gates: Gates) -> Passes:
+    """Tracks in the area of a junction."""
+    low, high = junction.hull_m.min(axis=0), junction.hull_m.max(axis=0)
+    near = np.flatnonzero(((samples.xy_m >= low) & (samples.xy_m <= high)).all(axis=1))
+    inside = near[inside_hull(samples.xy_m[near], junction.hull_m)]
+    if not len(inside):
+        none, number = np.empty(0), np.empty(0, np.int64)
+        return Passes(number, number, number, none, none, none)
+    breaks = np.flatnonzero((np.diff(inside) > 1) | (np.diff(samples.track[inside]) != 0)) + 1
+    first, last = inside[np.r_[0, breaks]], inside[np.r_[breaks - 1, len(inside) - 1]]
+    enters = (first > 0) & (samples.track[np.maximum(first - 1, 0)] == samples.track[first])
+    after = np.minimum(last + 1, len(samples) - 1)
+    leaves = (last + 1 < len(samples)) & (samples.track[after] == samples.track[last])
+    gate_in = np.where(enters, gates.nearest(samples.xy_m[first], samples.direction_rad[first], inwards=True), -1)
+    gate_out = np.where(leaves, gates.nearest(samples.xy_m[last], samples.direction_rad[last], inwards=False), -1)
+    up = np.maximum(first - _UPSTREAM_M, 0)
+    reaches = enters & (samples.track[up] == samples.track[first])
+    return Passes(
+        samples.track[first],
+        gate_in,
+        gate_out,
+        np.where(enters, samples.time_s[first], np.nan),
+        np.where(leaves, samples.time_s[last], np.nan),
+        np.where(reaches, samples.time_s[up], np.nan),
+    )
+
+
+def _within(passes: Passes, begin_s: float, end_s: float) -> Passes:
+    time = np.where(np.isfinite(passes.entry_s), passes.entry_s, passes.exit_s)
+    keep = (time >= begin_s) & (time <= end_s)
+    return Passes(*(getattr(passes, name)[keep] for name in Passes.__dataclass_fields__))
+
+
+def _count(
+    junction: Junction, gates: Gates, passes: Passes, begin_s: float, end_s: float, slice_s: float
+) -> Iterator[Movement]:
+    arm = np.array([gate.arm for gate in gates.gates] + [-1], np.int64)
+    arm_in, arm_out = arm[passes.gate_in], arm[passes.gate_out]
+    n = len(gates.arms)
+    seen = np.zeros((n, n))
+    both = (arm_in >= 0) & (arm_out >= 0)
+    np.add.at(seen, (arm_in[both], arm_out[both]), 1)
+    lost = np.bincount(arm_in[(arm_in >= 0) & (arm_out < 0)], minlength=n).astype(np.float64)
+    found = np.bincount(arm_out[(arm_out >= 0) & (arm_in < 0)], minlength=n).astype(np.float64)
+    inferred = furness(seen, lost, found)
+    slices = max(round((end_s - begin_s) / slice_s), 1)
+    hours = max(end_s - begin_s, 1e-9) / 3600
+    for i, j in zip(*np.nonzero(seen >= _MIN_PASSES), strict=True):
+        rows = both & (arm_in == i) & (arm_out == j)
+        total = seen[i, j] + inferred[i, j]
+        entering = seen[i].sum() + inferred[i].sum()
+        slice_of = np.clip(((passes.entry_s[rows] - begin_s) / slice_s).astype(int), 0, slices - 1)
+        counts = np.bincount(slice_of, minlength=slices) * total / max(seen[i, j], 1)
+        travel, delay = _delay(passes, rows)
+        effective = round(float(seen[i].sum()))
+        share = estimate_share(total / entering * effective, effective)
+        yield Movement(
+            junction.number,
+            gates.arms[i].name,
+            gates.arms[j].name,
+            _turn(gates, passes, rows),
+            int(seen[i, j]),
+            float(inferred[i, j]),
+            share,
+            estimate_rate(counts, hours),
+            travel,
+            delay,
+            np.array([gates.arms[i].xy_m, junction.centre_m, gates.arms[j].xy_m]),
+        )
+
+
+def furness(seen: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArray:
+    """The matrix (n, n) with these sums of rows and columns that is nearest to the seen movements in its ratios.
+
+    Movements that were never seen stay zero. Where rows and columns add up to different totals, the rows count.
+    """
+    out = seen.copy()
+    if rows.sum() == 0 or seen.sum() == 0:
+        return np.zeros_like(seen)
+    known = rows * (seen.sum(axis=1) > 0)
+    target = columns * (seen.sum(axis=0) > 0)
+    target = target * (known.sum() / target.sum()) if target.sum() > 0 else seen.sum(axis=0) * known.sum() / seen.sum()
+    # Where few exits are of unknown origin their shares are noise: the seen ones' are mixed in.
+    prior = seen.sum(axis=0) * known.sum() / seen.sum()
+    weight = columns.sum() / (columns.sum() + 10.0)
+    target = weight * target + (1 - weight) * prior
+    for _ in range(_FURNESS_STEPS):
+        out *= (target / np.maximum(out.sum(axis=0), 1e-12))[None, :]
+        out *= (known / np.maximum(out.sum(axis=1), 1e-12))[:, None]
+    return np.asarray(out)
+
+
+def _delay(passes: Passes, rows: FloatArray) -> tuple[Estimate | None, Estimate | None]:
+    """Travel time of a movement, and its delay against the quarter of vehicles that are the fastest."""
+    time = (passes.exit_s - passes.upstream_s)[rows]
+    time = time[np.isfinite(time)]
+    travel = estimate_mean(time)
+    if travel is None or travel.n < 10:
+        return travel, None
+    free = float(np.quantile(time, 0.1))
+    return travel, Estimate(travel.value - free, max(travel.low - free, 0.0), travel.high - free, travel.n)
+
+
+def _turn(gates: Gates, passes: Passes, rows: FloatArray) -> Turn:
+    """The turn that most vehicles of a movement make, by the directions of its gates."""
+    direction = np.array([gate.direction_rad for gate in gates.gates])
+    change = direction[passes.gate_out[rows]] - direction[passes.gate_in[rows]]
+    angle = float(np.angle(np.exp(1j * change).mean()))
+    if abs(angle) > np.radians(150):
+        return "u-turn"
+    if abs(angle) < np.radians(40):
+        return "straight"
+    return "right" if angle > 0 else "left"

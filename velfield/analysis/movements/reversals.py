@@ -1,0 +1,59 @@
+"""U-turns: tracks that reverse their direction within a short path, on a road where others go on."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.arrays import FloatArray
+from velfield.analysis.lanes.junctions import inside_hull
+from velfield.analysis.lanes.model import LaneGraph
+from velfield.analysis.trajectories import PathSamples
+
+_PATH_M = 36
+"""A U-turn is no longer; half round a circle of 13 m radius is."""
+_MIN_TURN_RAD = np.radians(150)
+_ROAD_M_PER_S = 5.5
+"""Who comes more slowly, over 60 m before, turns in a car park."""
+_APPROACH_M = 80
+
+
+@dataclass(frozen=True)
+class Reversal:
+    """A U-turn: number of the track, middle of the turn and its time; ``left`` or to the right."""
+
+    track: int
+    time_s: float
+    xy_m: FloatArray
+    left: bool
+
+
+def find_reversals(samples: PathSamples, graph: LaneGraph) -> list[Reversal]:
+    """U-turns, by time; those within roundabouts are none."""
+    n = len(samples)
+    if n <= _PATH_M:
+        return []
+    step = np.angle(np.exp(1j * np.diff(samples.direction_rad)))
+    step[np.diff(samples.track) != 0] = 0.0
+    course = np.concatenate([[0.0], np.cumsum(step)])
+    turn = course[_PATH_M:] - course[:-_PATH_M]
+    turn[samples.track[_PATH_M:] != samples.track[:-_PATH_M]] = 0.0
+    rows = np.flatnonzero(np.abs(turn) >= _MIN_TURN_RAD)
+    rings = [junction.hull_m for junction in graph.junctions if junction.kind == "roundabout"]
+    out = []
+    for group in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
+        if not len(group):
+            continue
+        best = int(group[np.argmax(np.abs(turn[group]))])
+        middle = best + _PATH_M // 2
+        inside_ring = any(inside_hull(samples.xy_m[[middle]], hull)[0] for hull in rings)
+        if not inside_ring and _comes_by_road(samples, best):
+            track = int(samples.track[middle])
+            out.append(Reversal(track, float(samples.time_s[middle]), samples.xy_m[middle], bool(turn[best] < 0)))
+    return sorted(out, key=lambda row: row.time_s)
+
+
+def _comes_by_road(samples: PathSamples, row: int) -> bool:
+    """Whether the track was as fast as on a road before, or after, the turn."""
+    low, high = max(row - _APPROACH_M, 0), min(row + _PATH_M + _APPROACH_M, len(samples))
+    own = samples.track[low:high] == samples.track[row]
+    return bool(np.quantile(samples.speed_m_per_s[low:high][own], 0.9) > _ROAD_M_PER_S)

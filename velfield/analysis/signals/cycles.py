@@ -1,0 +1,278 @@
+"""Cycles: whether the starts of queues recur, and when each stream has green."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from schemas.arrays import FloatArray, IntArray
+from velfield.analysis.intervals import Estimate, estimate_mean, estimate_share
+from velfield.analysis.signals.queues import Stream
+
+MIN_CYCLE_S, MAX_CYCLE_S = 24.0, 200.0
+MIN_STARTS = 4
+"""A stream with fewer starts of queues says nothing of a signal."""
+_MAX_P_VALUE = 0.005
+"""Probability by chance above which starts do not recur."""
+_MIN_CONCENTRATION = 0.85
+"""Mean resultant length of the starts' phases under a signal; one that traffic actuates has less."""
+_START_DELAY_S, _START_DELAY_SD_S = 1.8, 0.6
+"""From green to the moment at which the first vehicle has visibly moved off: its driver's reaction, and a junction that
+is still to clear. It differs from junction to junction by so much."""
+_TOGETHER_S = 4.0
+_VEHICLE_M, _SPACING_M = 4.5, 6.4
+"""Length of a car, and from front to front in a queue."""
+_START_UP_VEHICLES = 4
+"""The first vehicles of a queue lose time at the start (HCM)."""
+
+
+@dataclass(frozen=True)
+class StreamSignal:
+    """The signal of one stream.
+
+    Attributes
+    ----------
+    green_phase_s, red_phase_s
+        Onsets of green and of red after the start of a cycle, s.
+    green_s
+        Onsets of green in the flight, one a cycle.
+    start_up_lost_s, saturation_veh_per_h
+        Time that a queue's first four vehicles lose, and flow of those behind them.
+    """
+
+    stream: Stream
+    green_phase_s: Estimate
+    red_phase_s: Estimate | None
+    green_s: FloatArray
+    start_up_lost_s: Estimate | None
+    saturation_veh_per_h: Estimate | None
+
+
+@dataclass(frozen=True)
+class JunctionSignal:
+    """Whether a junction has a signal, and its cycle.
+
+    Attributes
+    ----------
+    signalised
+        None: too little data.
+    reason
+        Why there is none, or why it is not known.
+    phases
+        Lanes whose green begins together, in the order of the cycle.
+    """
+
+    junction: int
+    signalised: bool | None
+    reason: str
+    cycle_s: Estimate | None
+    streams: tuple[StreamSignal, ...]
+    phases: tuple[tuple[int, ...], ...]
+
+
+def find_signal(junction: int, streams: Sequence[Stream], begin_s: float, end_s: float) -> JunctionSignal:
+    """The signal of a junction from its streams, seen from ``begin_s`` to ``end_s``."""
+    used = [stream for stream in streams if len(stream.head_time_s) >= MIN_STARTS]
+    events = [_queue_heads(stream) for stream in used]
+    events = [times for times in events if len(times) >= MIN_STARTS]
+    n = sum(len(times) for times in events)
+    if n < 2 * MIN_STARTS or not events:
+        reason = f"too little data: {n} starts of queues, {2 * MIN_STARTS} needed"
+        crossed = sum(len(s.cross_time_s) for s in streams)
+        if crossed >= 60 and n <= 0.02 * crossed:
+            return JunctionSignal(
+                junction, False, f"no signal: {n} of {crossed} vehicles stopped at a line", None, (), ()
+            )
+        return JunctionSignal(junction, None, reason, None, (), ())
+    longest = min(MAX_CYCLE_S, (end_s - begin_s) / 3)
+    found = _find_cycle(events, longest) if longest > MIN_CYCLE_S else None
+    if found is None:
+        reason = f"too little data: {end_s - begin_s:.0f} s, three cycles needed"
+        return JunctionSignal(junction, None, reason, None, (), ())
+    cycle, concentration, p_value = found
+    if p_value > _MAX_P_VALUE or concentration < _MIN_CONCENTRATION:
+        reason = f"no fixed cycle: {n} starts of queues, concentration {concentration:.2f}"
+        return JunctionSignal(junction, False, reason, None, (), ())
+    estimate = _cycle_interval(events, cycle)
+    signals = [_stream_signal(stream, estimate.value, begin_s, end_s) for stream in used]
+    kept = [signal for signal in signals if signal is not None]
+    return JunctionSignal(junction, True, "", estimate, tuple(kept), _phases(kept, estimate.value))
+
+
+def _queue_heads(stream: Stream) -> FloatArray:
+    """Starts at the stop line, the first of each queue: a second start within 8 s is of the same green."""
+    time = np.sort(stream.head_time_s)
+    return time[np.r_[True, np.diff(time) > 8.0]] if len(time) else time
+
+
+def _find_cycle(events: Sequence[FloatArray], longest_s: float) -> tuple[float, float, float] | None:
+    """The period at which the starts of each stream recur: s, concentration, and probability by chance."""
+    n = sum(len(times) for times in events)
+    span = max(float(np.ptp(times)) for times in events)
+    if span < 2 * MIN_CYCLE_S:
+        return None
+    frequency = np.arange(1 / longest_s, 1 / MIN_CYCLE_S, 0.1 / span)
+    power = np.zeros(len(frequency))
+    for times in events:
+        power += np.abs(np.exp(2j * np.pi * frequency[:, None] * times).sum(axis=1))
+    power /= n
+    # Starts that recur every P recur every P / 2 too: the longest period nearly as good as the best is the cycle.
+    peak = np.flatnonzero((power >= np.r_[0, power[:-1]]) & (power >= np.r_[power[1:], 0]))
+    good = peak[power[peak] > power.max() - 0.06]
+    best = good[0]
+    fine = np.linspace(frequency[max(best - 1, 0)], frequency[min(best + 1, len(frequency) - 1)], 201)
+    sharp = sum(np.abs(np.exp(2j * np.pi * fine[:, None] * times).sum(axis=1)) for times in events) / n
+    k = int(np.argmax(sharp))
+    concentration = float(sharp[k])
+    excess = max(n * concentration - 1.0 * len(events), 0.0) ** 2 / n
+    return float(1 / fine[k]), concentration, float(min(len(frequency) / 5 * np.exp(-excess), 1.0))
+
+
+def _cycle_interval(events: Sequence[FloatArray], cycle_s: float) -> Estimate:
+    """The cycle by least squares on the number of each start's cycle, each stream with its own phase."""
+    numbers, times, free = [], [], 0
+    for start in events:
+        phase = np.angle(np.exp(2j * np.pi * start / cycle_s).mean()) / (2 * np.pi) * cycle_s
+        k = np.round((start - phase) / cycle_s)
+        good = np.abs(start - phase - k * cycle_s) < 8.0
+        if good.sum() < 2:
+            continue
+        numbers.append(k[good] - k[good].mean())
+        times.append(start[good] - start[good].mean())
+        free += 1
+    k, t = np.concatenate(numbers), np.concatenate(times)
+    n = len(k)
+    slope = float((k * t).sum() / (k**2).sum())
+    residual = float(np.sqrt(((t - slope * k) ** 2).sum() / max(n - free - 1, 1)))
+    half = float(stats.t.ppf(0.95, max(n - free - 1, 1)) * max(residual, 0.1) / np.sqrt((k**2).sum()))
+    return Estimate(slope, slope - half, slope + half, n)
+
+
+def _stream_signal(stream: Stream, cycle_s: float, begin_s: float, end_s: float) -> StreamSignal | None:
+    starts = _queue_heads(stream)
+    if len(starts) < MIN_STARTS:
+        return None
+    phase = float(np.angle(np.exp(2j * np.pi * starts / cycle_s).mean()) / (2 * np.pi) * cycle_s)
+    residual = (starts - phase + cycle_s / 2) % cycle_s - cycle_s / 2
+    # Some heads are slow, or wait for the junction to clear: green is where the prompt ones start.
+    middle = float(np.median(residual))
+    prompt = residual[np.abs(residual - middle) < 3.0]
+    onset = estimate_mean(prompt, min_n=3)
+    if onset is None:
+        return None
+    half = float(np.hypot((onset.high - onset.low) / 2, 1.645 * _START_DELAY_SD_S))
+    value = (phase + onset.value - _START_DELAY_S) % cycle_s
+    green = Estimate(value, value - half, value + half, onset.n)
+    k = np.arange(np.ceil((begin_s - value) / cycle_s), np.floor((end_s - value) / cycle_s) + 1)
+    lost, saturation = _discharge(stream, value + k * cycle_s)
+    return StreamSignal(stream, green, _red_onset(stream, value, cycle_s), value + k * cycle_s, lost, saturation)
+
+
+def _red_onset(stream: Stream, green_s: float, cycle_s: float) -> Estimate | None:
+    """Onset of red: after the latest crossings of the stop line, before the earliest stops at it."""
+    crossed = (stream.cross_time_s - green_s) % cycle_s
+    if len(crossed) < 20:
+        return None
+    bins = max(round(cycle_s / 1.0), 8)
+    counts = np.bincount(np.minimum((crossed / cycle_s * bins).astype(np.int64), bins - 1), minlength=bins)
+    # the longest time of the cycle that hardly anyone crosses is the red
+    quiet = np.tile(counts <= 0.15 * counts.mean(), 2)
+    edge = np.diff(np.r_[False, quiet, False].astype(np.int8))
+    start, end = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1)
+    if not len(start) or (end - start).max() < 6:
+        return None
+    k = int(np.argmax(end - start))
+    value = float(start[k] % bins) * cycle_s / bins
+    value = (value + green_s) % cycle_s
+    sd = 1.0 + 2.0 / np.sqrt(len(crossed) / 20)
+    return Estimate(value, value - sd - 1.5, value + sd, len(crossed))
+
+
+def _discharge(stream: Stream, green_s: FloatArray) -> tuple[Estimate | None, Estimate | None]:
+    """Start-up lost time, s, and saturation flow, vehicles an hour, from the headways of queues that discharge."""
+    headways: dict[int, list[float]] = {}
+    for onset in green_s:
+        queue = _queue_at(stream, float(onset) + 1.0)
+        time = stream.cross_time_s[(stream.cross_time_s > onset) & (stream.cross_time_s < onset + 60)]
+        track = stream.cross_track[(stream.cross_time_s > onset) & (stream.cross_time_s < onset + 60)]
+        stood = np.isin(track, queue)
+        before = onset
+        for position, (t, queued) in enumerate(zip(time, stood, strict=True)):
+            if not queued:
+                break
+            headways.setdefault(position, []).append(float(t - before))
+            before = t
+    later = [h for p, values in headways.items() if p >= _START_UP_VEHICLES for h in values]
+    saturated = estimate_mean(np.array(later), min_n=8)
+    if saturated is None:
+        return None, None
+    saturation = Estimate(3600 / saturated.value, 3600 / saturated.high, 3600 / max(saturated.low, 0.5), saturated.n)
+    first = [np.array(headways.get(p, [])) for p in range(_START_UP_VEHICLES)]
+    means = [estimate_mean(values, min_n=3) for values in first]
+    if any(mean is None for mean in means):
+        return None, saturation
+    known = [mean for mean in means if mean is not None]
+    value = sum(mean.value - saturated.value for mean in known)
+    half = float(np.sqrt(sum(((m.high - m.low) / 2) ** 2 for m in known)))
+    return Estimate(value, value - half, value + half, min(m.n for m in known)), saturation
+
+
+def _queue_at(stream: Stream, time_s: float) -> IntArray:
+    """Tracks that stand at a time, or have just left a stop at it."""
+    end = np.where(np.isfinite(stream.stop_end_s), stream.stop_end_s, stream.stop_start_s)
+    return np.unique(stream.stop_track[(stream.stop_start_s < time_s) & (end + 25 > time_s) & (end > time_s - 5)])
+
+
+def _phases(signals: Sequence[StreamSignal], cycle_s: float) -> tuple[tuple[int, ...], ...]:
+    """Lanes whose green begins within a few seconds, in order round the cycle."""
+    groups: list[tuple[float, list[int]]] = []
+    for signal in sorted(signals, key=lambda s: s.green_phase_s.value):
+        value = signal.green_phase_s.value
+        for at, lanes in groups:
+            if abs((value - at + cycle_s / 2) % cycle_s - cycle_s / 2) < _TOGETHER_S:
+                lanes.append(signal.stream.approach.lane)
+                break
+        else:
+            groups.append((value, [signal.stream.approach.lane]))
+    return tuple(tuple(lanes) for _, lanes in groups)
+
+
+def stopping_share(stream: Stream) -> Estimate | None:
+    """Share of the vehicles that cross which stopped before."""
+    return estimate_share(float(np.isin(stream.cross_track, stream.stop_track).sum()), len(stream.cross_track))
+
+
+@dataclass(frozen=True)
+class Queue:
+    """The queue of a stream at an onset of green, or at its longest: vehicles that stand, and its length from the stop
+    line to the last one's rear, m."""
+
+    time_s: float
+    vehicles: int
+    length_m: float
+
+
+def queues(stream: Stream, times_s: FloatArray) -> list[Queue]:
+    """Queues that stand at the stop line at given times (as the onsets of green).
+
+    A place for one or two vehicles between others that stand is taken as theirs: a tree hides them.
+    """
+    if stream.stop_line_m is None:
+        return []
+    end = np.where(np.isfinite(stream.stop_end_s), stream.stop_end_s, stream.stop_start_s + 3.0)
+    out = []
+    for time in times_s:
+        stands = (stream.stop_start_s <= time) & (end >= time)
+        front = np.sort(stream.stop_along_m[stands] + _VEHICLE_M / 2)[::-1]
+        front = front[front < stream.stop_line_m + 4.0]
+        count, at = 0, stream.stop_line_m + _SPACING_M
+        for position in front:
+            if at - position > 3.4 * _SPACING_M:
+                break
+            count, at = (
+                count + max(round((at - position) / _SPACING_M), 0 if count == 0 else int(at - position > 2.0)),
+                position,
+            )
+        out.append(Queue(float(time), count, float(stream.stop_line_m - at + _VEHICLE_M) if count else 0.0))
+    return out

@@ -1,0 +1,225 @@
+"""Stops and queues on the lanes that lead to a junction."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.arrays import FloatArray, IntArray, Mask
+from velfield.analysis.lanes.model import Junction, LaneGraph
+from velfield.analysis.trajectories import PathSamples, Trajectories
+
+STOP_M_PER_S, GO_M_PER_S = 0.7, 1.4
+"""A vehicle has stopped below the one, and goes again above the other."""
+MIN_STOP_S = 1.5
+REACH_M = 120.0
+"""Stops so far before a stop line belong to its queue."""
+_QUEUE_GAP_M = 13.0
+"""Vehicles of a queue are nearer to each other, centre to centre, or to the stop line."""
+_VEHICLE_M = 4.5
+_CROSSES_S = 8.0
+"""From its start to its crossing of the line, a vehicle at the head of a queue needs no longer."""
+
+
+@dataclass(frozen=True)
+class Stops:
+    """Stops of vehicles, one row each: ``track``, ``start_s`` and ``end_s`` (when it goes again; NaN: its track ends
+    before), ``xy_m`` (n, 2)."""
+
+    track: IntArray
+    start_s: FloatArray
+    end_s: FloatArray
+    xy_m: FloatArray
+
+
+def find_stops(trajectories: Trajectories) -> Stops:
+    """All stops of at least ``MIN_STOP_S``."""
+    speed, owner = trajectories.speed_m_per_s, trajectories.owner
+    slow = _hysteresis(speed, owner)
+    edge = np.diff(np.r_[False, slow, False].astype(np.int8))
+    first, last = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1) - 1
+    # a run of slow positions may reach from one track into the next
+    inside = np.flatnonzero(slow[:-1] & slow[1:] & (owner[:-1] != owner[1:]))
+    first, last = np.sort(np.r_[first, inside + 1]), np.sort(np.r_[last, inside])
+    after = np.minimum(last + 1, len(owner) - 1)
+    goes = (owner[after] == owner[last]) & (after > last)
+    time = trajectories.time_s
+    # between the last slow position and the first that is not, by the acceleration of a start
+    start = time[last] + np.where(goes, (time[after] - time[last]) * 0.5, 0.0)
+    end = np.where(goes, start, np.nan)
+    long = (np.where(goes, start, time[last]) - time[first]) >= MIN_STOP_S
+    return Stops(owner[first[long]], time[first[long]], end[long], trajectories.xy_m[last[long]])
+
+
+def _hysteresis(speed: FloatArray, owner: IntArray) -> Mask:
+    """Whether each position is of a stop: it begins below the lower speed and lasts to the upper one."""
+    low, high = speed < STOP_M_PER_S, speed >= GO_M_PER_S
+    new = np.r_[True, owner[1:] != owner[:-1]]
+    decided = np.flatnonzero(low | high | new)
+    return np.asarray(np.repeat(low[decided], np.diff(np.r_[decided, len(speed)])))
+
+
+@dataclass(frozen=True)
+class Approach:
+    """The lanes of one direction that lead into a junction, one stream each.
+
+    Attributes
+    ----------
+    lane
+        Number of the lane that crosses the junction's border.
+    path_m
+        (n, 2) course upstream of the border and through it, 1 m apart; ``border_m`` is the border's distance along it.
+    """
+
+    junction: int
+    lane: int
+    path_m: FloatArray
+    border_m: float
+
+
+def find_approaches(graph: LaneGraph, junction: Junction) -> list[Approach]:
+    """The lanes into a junction, each with what leads to it (its strongest predecessors) and what it leads to."""
+    from velfield.analysis.lanes.junctions import inside_hull
+
+    out = []
+    for number in junction.lanes_in:
+        lane = graph.lanes[number]
+        inside = inside_hull(lane.xy_m, junction.hull_m)
+        k = int(np.flatnonzero(~inside[:-1] & inside[1:])[0])
+        upstream = [lane.xy_m[: k + 1]]
+        length, at, seen = lane.along_m[k], number, {number}
+        while length < REACH_M and graph.predecessors[at] and graph.predecessors[at][0] not in seen:
+            at = graph.predecessors[at][0]
+            seen.add(at)
+            upstream.insert(0, graph.lanes[at].xy_m[:-1])
+            length += graph.lanes[at].length_m
+        downstream = [lane.xy_m[k + 1 :]]
+        length, at = lane.length_m - lane.along_m[k], number
+        while length < 40.0 and graph.successors[at] and graph.successors[at][0] not in seen:
+            at = graph.successors[at][0]
+            seen.add(at)
+            downstream.append(graph.lanes[at].xy_m[1:])
+            length += graph.lanes[at].length_m
+        before = _space_evenly(np.concatenate(upstream))
+        after = _space_evenly(np.concatenate([before[-1:], *downstream]))
+        border = float(len(before) - 1)
+        path = np.concatenate([before, after[1:]])
+        start = max(len(before) - 1 - int(REACH_M), 0)
+        out.append(Approach(junction.number, number, path[start : len(before) + 40], border - start))
+    return out
+
+
+def _space_evenly(line: FloatArray) -> FloatArray:
+    """Points of a line 1 m apart."""
+    along = np.concatenate([[0.0], np.hypot(*np.diff(line, axis=0).T).cumsum()])
+    s = np.arange(0.0, along[-1] + 1e-9, 1.0)
+    return np.column_stack([np.interp(s, along, line[:, k]) for k in (0, 1)])
+
+
+@dataclass(frozen=True)
+class Stream:
+    """What happens on an approach.
+
+    Attributes
+    ----------
+    stop_line_m
+        Where the first of the queues stand, front bumper, along the approach's path; None: nobody stops.
+    head_time_s, head_track
+        Starts of vehicles that stood at the stop line.
+    stop_track, stop_start_s, stop_end_s, stop_along_m
+        Stops on the approach.
+    cross_time_s, cross_track, cross_speed_m_per_s
+        When tracks cross the stop line (the border without one), and how fast; in time order.
+    """
+
+    approach: Approach
+    stop_line_m: float | None
+    head_time_s: FloatArray
+    head_track: IntArray
+    stop_track: IntArray
+    stop_start_s: FloatArray
+    stop_end_s: FloatArray
+    stop_along_m: FloatArray
+    cross_time_s: FloatArray
+    cross_track: IntArray
+    cross_speed_m_per_s: FloatArray
+
+
+def observe_stream(approach: Approach, samples: PathSamples, stops: Stops) -> Stream:
+    """Stops and crossings on an approach."""
+    along, across = _along(approach.path_m, stops.xy_m)
+    here = np.flatnonzero((across < 1.6) & (along > 1.0) & (along < len(approach.path_m) - 2))
+    along = along[here]
+    known = here[np.isfinite(stops.end_s[here])]
+    line = _stop_line(along[np.isfinite(stops.end_s[here])], approach.border_m)
+    at = approach.border_m if line is None else min(line, len(approach.path_m) - 4.0)
+    cross = _crossings(approach.path_m, at, samples)
+    heads = np.empty(0, np.int64)
+    if line is not None:
+        front = _along(approach.path_m, stops.xy_m[known])[0] + _VEHICLE_M / 2
+        heads = known[np.abs(front - line) < 3.0]
+        heads = heads[_goes_on(stops.track[heads], stops.end_s[heads], cross[1], cross[0])]
+        heads = heads[np.argsort(stops.end_s[heads])]
+    return Stream(
+        approach,
+        line,
+        stops.end_s[heads],
+        stops.track[heads],
+        stops.track[here],
+        stops.start_s[here],
+        stops.end_s[here],
+        along,
+        *cross,
+    )
+
+
+def _goes_on(track: IntArray, end_s: FloatArray, crossed: IntArray, cross_s: FloatArray) -> Mask:
+    """Whether the vehicle of each stop crosses the line soon after it."""
+    time = {int(k): float(t) for k, t in zip(crossed, cross_s, strict=True)}
+    when = np.array([time.get(int(k), np.nan) for k in track])
+    return np.asarray((when - end_s > -1.0) & (when - end_s < _CROSSES_S))
+
+
+def _along(path_m: FloatArray, xy_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distance along a path of points 1 m apart, and from it."""
+    from scipy.spatial import cKDTree
+
+    distance, k = cKDTree(path_m).query(xy_m)
+    k = np.clip(k, 0, len(path_m) - 2)
+    u = path_m[k + 1] - path_m[k]
+    d = xy_m - path_m[k]
+    s = (d * u).sum(axis=1) / np.maximum((u**2).sum(axis=1), 1e-9)
+    across = np.abs(u[:, 0] * d[:, 1] - u[:, 1] * d[:, 0]) / np.maximum(np.hypot(*u.T), 1e-9)
+    return k + s, np.where(distance < 5.0, across, np.inf)
+
+
+def _stop_line(along_m: FloatArray, border_m: float) -> float | None:
+    """Where the foremost of many stops are, front bumpers: the last peak of their density near the border."""
+    front = along_m + _VEHICLE_M / 2
+    front = front[np.abs(front - border_m) < 25.0]
+    if len(front) < 4:
+        return None
+    grid = np.arange(front.min() - 1, front.max() + 1, 0.25)
+    density = np.exp(-0.5 * ((grid[:, None] - front) / 0.8) ** 2).sum(axis=1)
+    peak = (density[1:-1] >= density[:-2]) & (density[1:-1] > density[2:])
+    rows = np.flatnonzero(peak) + 1
+    strong = rows[density[rows] > 0.4 * density[rows].max()]
+    return float(grid[strong[-1]]) if len(strong) else None
+
+
+def _crossings(path_m: FloatArray, at_m: float, samples: PathSamples) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Time, track and speed of the samples' crossings of a path's point ``at_m`` along it, in time order."""
+    k = int(np.clip(at_m, 0, len(path_m) - 2))
+    u = path_m[k + 1] - path_m[k]
+    u = u / max(float(np.hypot(*u)), 1e-9)
+    origin = path_m[k] + (at_m - k) * u
+    near = np.flatnonzero((np.abs(samples.xy_m - origin) < 4.0).all(axis=1))
+    d = samples.xy_m[near] - origin
+    s, across = d @ u, np.abs(u[0] * d[:, 1] - u[1] * d[:, 0])
+    pair = (np.diff(near) == 1) & (np.diff(samples.track[near]) == 0) & (s[:-1] < 0) & (s[1:] >= 0)
+    rows = np.flatnonzero(pair & (across[:-1] < 1.7))
+    a, b = near[rows], near[rows + 1]
+    f = -s[rows] / np.maximum(s[rows + 1] - s[rows], 1e-9)
+    # a vehicle that waits at the line moves at the end of the time between two samples
+    time = samples.time_s[b] - (1 - f) * np.minimum(samples.time_s[b] - samples.time_s[a], 1.5)
+    order = np.argsort(time, kind="stable")
+    return time[order], samples.track[a][order], samples.speed_m_per_s[b][order]

@@ -1,0 +1,141 @@
+"""`TrafficAnalysis`: every question about the tracks of one flight, each answer computed once."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from velfield.analysis.flow.conflicts import Conflict, find_conflicts
+from velfield.analysis.flow.passings import LaneTraffic
+from velfield.analysis.flow.speeds import (
+    FreeFlow,
+    PathArrays,
+    Reduction,
+    Station,
+    free_flow,
+    speed_profile,
+    speed_reduction,
+)
+from velfield.analysis.flow.volume import LaneFlow, lane_flow
+from velfield.analysis.lanes.find import find_lanes
+from velfield.analysis.lanes.model import LaneGraph
+from velfield.analysis.movements.movements import JunctionMovements, find_movements
+from velfield.analysis.movements.reversals import Reversal, find_reversals
+from velfield.analysis.signals.cycles import JunctionSignal, find_signal
+from velfield.analysis.signals.queues import Stream, find_approaches, find_stops, observe_stream
+from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
+from velfield.analysis.unusual import DoubtfulPlace, Unusual, find_doubtful_places, find_unusual
+
+
+@dataclass(frozen=True)
+class TrafficAnalysis:
+    """Answers from trajectories of vehicles that move; lengths in metres, times in seconds.
+
+    Examples
+    --------
+    >>> from velfield.analysis.trajectories import make_trajectories
+    >>> none = np.empty(0)
+    >>> tracks = make_trajectories(none.astype(int), none.astype(int), none, none.reshape(0, 2), gsd_m=0.2)
+    >>> TrafficAnalysis(tracks).signals
+    {}
+    """
+
+    trajectories: Trajectories
+
+    @cached_property
+    def samples(self) -> PathSamples:
+        """Points along the tracks, 1 m apart."""
+        return sample_paths(self.trajectories)
+
+    @property
+    def window_s(self) -> tuple[float, float]:
+        """First and last time of all tracks."""
+        time = self.trajectories.time_s
+        return (float(time.min()), float(time.max())) if len(time) else (0.0, 0.0)
+
+    @cached_property
+    def lanes(self) -> LaneGraph:
+        """The lane graph."""
+        return find_lanes(self.trajectories)
+
+    @cached_property
+    def lane_traffic(self) -> LaneTraffic:
+        """The samples by lane."""
+        return LaneTraffic(self.lanes)
+
+    @cached_property
+    def movements(self) -> tuple[JunctionMovements, ...]:
+        """Movements through each junction."""
+        return find_movements(self.trajectories, self.lanes)
+
+    @cached_property
+    def reversals(self) -> list[Reversal]:
+        """U-turns."""
+        return find_reversals(self.samples, self.lanes)
+
+    @cached_property
+    def streams(self) -> dict[int, list[Stream]]:
+        """Stops and crossings of the approaches of each junction, by its number."""
+        stops = find_stops(self.trajectories) if len(self.trajectories) else None
+        return {
+            junction.number: [observe_stream(a, self.samples, stops) for a in find_approaches(self.lanes, junction)]
+            for junction in self.lanes.junctions
+            if stops is not None
+        }
+
+    @cached_property
+    def signals(self) -> dict[int, JunctionSignal]:
+        """The signal of each junction at which lanes cross, or of a roundabout, by its number.
+
+        Where lanes only merge, vehicles stop in the rhythm of the signals around.
+        """
+        return {
+            number: find_signal(number, streams, *self.window_s)
+            for number, streams in self.streams.items()
+            if self.lanes.junctions[number].kind in ("intersection", "roundabout")
+        }
+
+    def profile(self, lane: int) -> list[Station]:
+        """Speeds along a lane."""
+        return speed_profile(self.lane_traffic, lane)
+
+    @cached_property
+    def free_flow(self) -> list[FreeFlow]:
+        """Free flow of each road."""
+        return free_flow(self.lane_traffic)
+
+    @cached_property
+    def reductions(self) -> list[Reduction]:
+        """How each junction slows the vehicles of each lane into it that do not stop."""
+        first = np.searchsorted(self.samples.track, np.arange(len(self.trajectories) + 1))
+        arrays = PathArrays(first, self.samples.time_s, self.samples.speed_m_per_s)
+        out = []
+        for found in self.movements:
+            lane = np.array([gate.lane for gate in found.gates.gates] + [-1])[found.passes.gate_in]
+            for number in np.unique(lane[lane >= 0]):
+                rows = lane == number
+                passes = found.passes
+                out.append(
+                    speed_reduction(arrays, found.junction, int(number), passes.track[rows], passes.entry_s[rows])
+                )
+        return out
+
+    @cached_property
+    def flows(self) -> list[LaneFlow]:
+        """Traffic of each lane."""
+        return [lane_flow(self.lane_traffic, lane.number, *self.window_s) for lane in self.lanes]
+
+    @cached_property
+    def conflicts(self) -> list[Conflict]:
+        """Pairs of vehicles near in time."""
+        return find_conflicts(self.trajectories, self.lane_traffic) if len(self.lanes) else []
+
+    @cached_property
+    def unusual(self) -> list[Unusual]:
+        """Unusual tracks."""
+        return find_unusual(self.trajectories, self.lanes, self.movements)
+
+    @cached_property
+    def doubtful_places(self) -> list[DoubtfulPlace]:
+        """Where tracks are unlikely to be vehicles."""
+        return find_doubtful_places(self.trajectories)

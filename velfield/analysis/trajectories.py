@@ -1,0 +1,335 @@
+"""Trajectories: the tracks of a flight as flat arrays in metres, smoothed, and resampled along their paths."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numba import njit
+
+from schemas.arrays import FloatArray, IntArray, Mask
+
+_SMOOTHING_S = 1.0
+"""Half the window in which the errors of positions are averaged along the measured displacements."""
+_VELOCITY_S = 0.3
+"""Half the window of a velocity: an acceleration is about constant for so long."""
+_DIRECTION_M = 2.0
+"""A direction of travel is that of the path from so far behind to so far ahead."""
+_BRIDGE_S, _BRIDGE_M = 1.0, 0.9
+"""Displacements that were not measured, over no longer than this, are those of the velocity beside them, unless the
+positions differ from that by more than this."""
+_ALIGNED_SD_PX = 0.5
+"""A displacement with a larger standard deviation is that of two detections, whose crops did not align."""
+_MIN_STEP_M = 0.3
+"""Jitter of a stationary vehicle is below it: its path does not grow by it."""
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """Tracks as flat arrays: track k has the rows ``first[k]:first[k + 1]``, in time order.
+
+    Attributes
+    ----------
+    track_id
+        (n,) ids of the tracks.
+    first
+        (n + 1,) rows.
+    frame, time_s
+        (m,) frame and time of each position.
+    xy_m, velocity_m_per_s
+        (m, 2) position, and velocity.
+    gsd_m
+        Metres a base pixel.
+    """
+
+    track_id: IntArray
+    first: IntArray
+    frame: IntArray
+    time_s: FloatArray
+    xy_m: FloatArray
+    velocity_m_per_s: FloatArray
+    gsd_m: float
+
+    def __len__(self) -> int:
+        return len(self.track_id)
+
+    def __iter__(self) -> Iterator[slice]:
+        for a, b in zip(self.first[:-1], self.first[1:], strict=True):
+            yield slice(int(a), int(b))
+
+    @property
+    def owner(self) -> IntArray:
+        """(m,) number of the track of each position."""
+        return np.repeat(np.arange(len(self)), np.diff(self.first))
+
+    @property
+    def speed_m_per_s(self) -> FloatArray:
+        """(m,) speed."""
+        return np.asarray(np.hypot(self.velocity_m_per_s[:, 0], self.velocity_m_per_s[:, 1]))
+
+    @property
+    def duration_s(self) -> float:
+        """From the first position of all tracks to the last, s."""
+        return float(np.ptp(self.time_s)) if len(self.time_s) else 0.0
+
+    def select(self, keep: Mask) -> "Trajectories":
+        """The tracks (n,) that are kept."""
+        rows = np.repeat(keep, np.diff(self.first))
+        first = np.concatenate([[0], np.cumsum(np.diff(self.first)[keep])]).astype(np.int64)
+        return Trajectories(
+            self.track_id[keep],
+            first,
+            self.frame[rows],
+            self.time_s[rows],
+            self.xy_m[rows],
+            self.velocity_m_per_s[rows],
+            self.gsd_m,
+        )
+
+
+def moving(trajectories: Trajectories, *, min_extent_m: float = 6.0) -> Trajectories:
+    """The tracks that reach so far: of vehicles that move."""
+    if not len(trajectories):
+        return trajectories
+    low, high = (
+        reduce.reduceat(trajectories.xy_m, trajectories.first[:-1], axis=0) for reduce in (np.minimum, np.maximum)
+    )
+    return trajectories.select(np.hypot(*(high - low).T) >= min_extent_m)
+
+
+def make_trajectories(
+    track: IntArray,
+    frame: IntArray,
+    time_s: FloatArray,
+    xy_m: FloatArray,
+    *,
+    gsd_m: float,
+    displacement_m: FloatArray | None = None,
+) -> Trajectories:
+    """Trajectories of positions (m,) in any order; those of a track at one time are taken once.
+
+    Parameters
+    ----------
+    track, frame, time_s, xy_m
+        (m,) track and frame, (m,) time and (m, 2) position of each.
+    gsd_m
+        Metres a base pixel.
+    displacement_m
+        (m, 2) measured displacement to the track's next position, NaN where there is none; more accurate than the
+        difference of the positions.
+    """
+    order = np.lexsort((time_s, track))
+    track, frame, time_s, xy_m = track[order], frame[order], time_s[order], xy_m[order]
+    displaced = None if displacement_m is None else displacement_m[order]
+    new = np.ones(len(track), bool)
+    new[1:] = (np.diff(track) != 0) | (np.diff(time_s) > 0)
+    track, frame, time_s, xy_m = track[new], frame[new], time_s[new], xy_m[new]
+    starts = np.flatnonzero(np.r_[True, np.diff(track) != 0]) if len(track) else np.empty(0, np.int64)
+    first = np.r_[starts, len(track)].astype(np.int64)
+    step = np.zeros_like(xy_m)
+    step[:-1] = np.diff(xy_m, axis=0)
+    if displaced is not None:
+        known = np.isfinite(displaced[new]).all(axis=1)
+        step[known] = displaced[new][known]
+        _bridge(first, time_s, step, known, _BRIDGE_S, _BRIDGE_M)
+    xy, velocity = _smooth(first, time_s, xy_m, step, _SMOOTHING_S, _VELOCITY_S)
+    return Trajectories(track[starts], first, frame, time_s, xy, velocity, gsd_m)
+
+
+def from_tracklets(tracklets: pd.DataFrame, gsd_m: float) -> Trajectories:
+    """Trajectories of a table of tracklets (`schemas.tables.TRACKLET_COLUMNS`); tracklets of no track are left out."""
+    table = tracklets[tracklets["track_id"] >= 0]
+    parts: dict[str, list[FloatArray]] = {name: [] for name in ("track", "frame", "time", "id", "x", "y", "dx", "dy")}
+    for k, link in ((1, "12"), (0, "01"), (2, None)):
+        parts["track"].append(table["track_id"].to_numpy())
+        parts["frame"].append(table[f"frame_{k}"].to_numpy())
+        parts["time"].append(table[f"time_{k}_s"].to_numpy(np.float64))
+        parts["id"].append(table[f"detection_id_{k}"].to_numpy())
+        for axis in "xy":
+            parts[axis].append(table[f"{axis}_{k}_px"].to_numpy(np.float64))
+            if link is None:
+                parts[f"d{axis}"].append(np.full(len(table), np.nan))
+            else:
+                duration = table[f"time_{k + 1}_s"].to_numpy() - table[f"time_{k}_s"].to_numpy()
+                aligned = table[f"displacement_sd_{link}_px"].to_numpy() <= _ALIGNED_SD_PX
+                moved = table[f"v{axis}_{link}_px_per_s"].to_numpy(np.float64) * duration
+                parts[f"d{axis}"].append(np.where(aligned, moved, np.nan))
+    whole = {name: np.concatenate(values) for name, values in parts.items()}
+    _, once = np.unique(whole["id"], return_index=True)  # the first: as a middle detection it has a displacement
+    whole = {name: values[once] for name, values in whole.items()}
+    return make_trajectories(
+        whole["track"].astype(np.int64),
+        whole["frame"].astype(np.int64),
+        whole["time"],
+        np.column_stack([whole["x"], whole["y"]]) * gsd_m,
+        gsd_m=gsd_m,
+        displacement_m=np.column_stack([whole["dx"], whole["dy"]]) * gsd_m,
+    )
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _smooth(
+    first: IntArray, time_s: FloatArray, xy: FloatArray, step: FloatArray, reach_s: float, velocity_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """Positions: the measured displacements, plus the mean of the positions' differences from them within ``reach_s``;
+    velocities: displacements over the time within ``velocity_s``."""
+    out = xy.copy()
+    velocity = np.zeros_like(xy)
+    for k in range(len(first) - 1):
+        a, b = first[k], first[k + 1]
+        driven = np.zeros((b - a + 1, 2))
+        for i in range(a, b - 1):
+            driven[i - a + 1] = driven[i - a] + step[i]
+        low = high = a
+        for i in range(a, b):
+            reach = min(reach_s, max(time_s[i] - time_s[a], 0.0) + 0.25, max(time_s[b - 1] - time_s[i], 0.0) + 0.25)
+            low = i
+            while low > a and time_s[i] - time_s[low - 1] <= reach:
+                low -= 1
+            high = i
+            while high < b - 1 and time_s[high + 1] - time_s[i] <= reach:
+                high += 1
+            sx = sy = 0.0
+            for j in range(low, high + 1):
+                sx += xy[j, 0] - driven[j - a, 0]
+                sy += xy[j, 1] - driven[j - a, 1]
+            n = high - low + 1
+            out[i, 0] = driven[i - a, 0] + sx / n
+            out[i, 1] = driven[i - a, 1] + sy / n
+            low, high = max(i - 1, a), min(i + 1, b - 1)
+            while low > a and time_s[i] - time_s[low - 1] <= velocity_s:
+                low -= 1
+            while high < b - 1 and time_s[high + 1] - time_s[i] <= velocity_s:
+                high += 1
+            if high > low:
+                velocity[i] = (driven[high - a] - driven[low - a]) / (time_s[high] - time_s[low])
+    return out, velocity
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _bridge(first: IntArray, time_s: FloatArray, step: FloatArray, known: Mask, longest_s: float, reach: float) -> None:
+    """Give displacements that were not measured, in place, the mean velocity of the measured ones beside them, where
+    the positions do not contradict it."""
+    for k in range(len(first) - 1):
+        a, b = first[k], first[k + 1] - 1
+        for i in range(a, b):
+            if known[i]:
+                continue
+            low, high = i - 1, i + 1
+            while low >= a and not known[low]:
+                low -= 1
+            while high < b and not known[high]:
+                high += 1
+            if low < a or high >= b or time_s[high] - time_s[low + 1] > longest_s:
+                continue
+            dt = time_s[i + 1] - time_s[i]
+            before, after = time_s[low + 1] - time_s[low], time_s[high + 1] - time_s[high]
+            x = 0.5 * dt * (step[low, 0] / before + step[high, 0] / after)
+            y = 0.5 * dt * (step[low, 1] / before + step[high, 1] / after)
+            if np.hypot(x - step[i, 0], y - step[i, 1]) < reach:
+                step[i, 0], step[i, 1] = x, y
+
+
+@dataclass(frozen=True)
+class PathSamples:
+    """Points at equal distances along the paths of tracks.
+
+    Attributes
+    ----------
+    track
+        (k,) number of the track, in its order along the path.
+    xy_m
+        (k, 2) position.
+    direction_rad
+        (k,) direction of travel.
+    time_s, speed_m_per_s
+        (k,) when the vehicle was there, and how fast.
+    """
+
+    track: IntArray
+    xy_m: FloatArray
+    direction_rad: FloatArray
+    time_s: FloatArray
+    speed_m_per_s: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.track)
+
+
+def sample_paths(trajectories: Trajectories, spacing_m: float = 1.0) -> PathSamples:
+    """Points every ``spacing_m`` along each track; a stationary vehicle gives none."""
+    out = _resample(
+        trajectories.first,
+        trajectories.time_s,
+        trajectories.xy_m,
+        trajectories.speed_m_per_s,
+        spacing_m,
+        _DIRECTION_M,
+        _MIN_STEP_M,
+    )
+    return PathSamples(out[:, 0].astype(np.int64), out[:, 1:3].copy(), out[:, 3].copy(), out[:, 4].copy(), out[:, 5])
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _resample(
+    first: IntArray,
+    time_s: FloatArray,
+    xy: FloatArray,
+    speed: FloatArray,
+    spacing: float,
+    reach: float,
+    min_step: float,
+) -> FloatArray:
+    """Rows (track, x, y, direction, time, speed), ``spacing`` apart along the path of each track."""
+    capacity = 1024
+    out = np.empty((capacity, 6))
+    n = 0
+    for k in range(len(first) - 1):
+        a, b = first[k], first[k + 1]
+        # the path's vertices: positions at least ``min_step`` from the vertex before
+        vertex = np.empty(b - a, np.int64)
+        along = np.zeros(b - a)
+        count = 0
+        for i in range(a, b):
+            if count == 0:
+                vertex[0], count = i, 1
+                continue
+            j = vertex[count - 1]
+            d = np.hypot(xy[i, 0] - xy[j, 0], xy[i, 1] - xy[j, 1])
+            if d >= min_step:
+                vertex[count], along[count] = i, along[count - 1] + d
+                count += 1
+        length = along[count - 1] if count else 0.0
+        steps = int(length / spacing) + 1 if length >= 2 * spacing else 0
+        while n + steps > capacity:
+            capacity *= 2
+            wider = np.empty((capacity, 6))
+            wider[:n] = out[:n]
+            out = wider
+        begin = 0.5 * (length - (steps - 1) * spacing)
+        at = behind = ahead = 0
+        for q in range(steps):
+            s = begin + q * spacing
+            x, y, at = _vertex_at(xy, vertex, along, count, s, at)
+            x0, y0, behind = _vertex_at(xy, vertex, along, count, max(s - reach, 0.0), behind)
+            x1, y1, ahead = _vertex_at(xy, vertex, along, count, min(s + reach, length), ahead)
+            i, j = vertex[at], vertex[min(at + 1, count - 1)]
+            f = (s - along[at]) / max(along[min(at + 1, count - 1)] - along[at], 1e-9)
+            out[n, 0], out[n, 1], out[n, 2] = k, x, y
+            out[n, 3] = np.arctan2(y1 - y0, x1 - x0)
+            out[n, 4] = time_s[i] + f * (time_s[j] - time_s[i])
+            out[n, 5] = speed[i] + f * (speed[j] - speed[i])
+            n += 1
+    return out[:n]
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _vertex_at(
+    xy: FloatArray, vertex: IntArray, along: FloatArray, count: int, s: float, at: int
+) -> tuple[float, float, int]:
+    """Position at distance ``s`` along the vertices, and the vertex before it, looked for from ``at`` on."""
+    while at < count - 2 and along[at + 1] < s:
+        at += 1
+    i, j = vertex[at], vertex[at + 1]
+    f = (s - along[at]) / max(along[at + 1] - along[at], 1e-9)
+    return xy[i, 0] + f * (xy[j, 0] - xy[i, 0]), xy[i, 1] + f * (xy[j, 1] - xy[i, 1]), at

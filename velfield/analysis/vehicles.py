@@ -1,0 +1,163 @@
+"""Vehicles: one row a track, and whether it is part of the traffic.
+
+A detector finds parked cars as well as those that drive, and things on roofs that stand as still as they do. The image
+does not distinguish a parked car in a yard from a vent; but the traffic distinguishes both from a car that waits: where
+vehicles drive along its axis, ahead of it, behind it or over its place at another time, it stands in a lane.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from schemas.arrays import FloatArray, IntArray, Mask
+from schemas.flight import PAPER_GSD_M, STATIONARY_SPEED_M_PER_S
+
+STATES = ("moving", "stopped", "parked")
+"""``moving``: at some time; ``stopped``: never, but in a lane that others drive; ``parked``: never, and in none, or no
+vehicle at all."""
+_MOVED_M = 2.0
+"""A displacement of half a car's length is no error of its position."""
+_MOVED_SIGMAS = 4.0
+"""A shorter one counts where it is so many standard deviations, at more than a stationary vehicle's speed."""
+_ENDS = 3
+"""Positions averaged at each end of a track, where it has twice as many; of a shorter one fewer."""
+_CELL_M, _SECTOR_RAD = 0.5, np.pi / 12
+"""Sides of the cells and sectors of axial direction in which driven lanes are noted."""
+_REACH_M, _HALF_WIDTH_M = 8.0, 1.0
+"""A lane is looked for so far ahead and behind, and to either side: parked cars stand 2 m and more beside it."""
+_DRIVEN_FRACTION = 0.4
+"""Of that length, what others drove where a vehicle stands in a lane."""
+
+
+def find_vehicles(tracklets: pd.DataFrame, detections: pd.DataFrame, *, gsd_m: float | None) -> pd.DataFrame:
+    """One row a track.
+
+    Parameters
+    ----------
+    tracklets
+        ``schemas.tables.TRACK_COLUMNS``.
+    detections
+        ``schemas.tables.DETECTION_COLUMNS``: ``detection_id`` and ``orientation_rad`` are read.
+    gsd_m
+        Metres a base pixel; None: the paper's.
+
+    Returns
+    -------
+    DataFrame
+        ``track_id, first_frame, last_frame, first_time_s, last_time_s, detections`` (their number), ``x_px, y_px``
+        (median position), ``orientation_rad`` (axial, NaN where unknown), ``displacement_m`` (from the first positions
+        to the last), ``state`` (of `STATES`); by ``track_id``.
+    """
+    metres = PAPER_GSD_M if gsd_m is None else gsd_m
+    positions = _track_positions(tracklets, detections)
+    groups = positions.groupby("track_id", sort=True)
+    table = groups.agg(
+        first_frame=("frame", "first"),
+        last_frame=("frame", "last"),
+        first_time_s=("time_s", "first"),
+        last_time_s=("time_s", "last"),
+        detections=("frame", "size"),
+        x_px=("x_px", "median"),
+        y_px=("y_px", "median"),
+        cos=("cos", "mean"),
+        sin=("sin", "mean"),
+    ).reset_index()
+    between = (_mean_of_ends(positions, last=True) - _mean_of_ends(positions, last=False)).to_numpy(np.float64)
+    displacement_m = np.hypot(between[:, 1], between[:, 2]) * metres
+    sd_m = _position_sd_px(tracklets, table["track_id"].to_numpy()) * metres
+    speed = displacement_m / np.maximum(between[:, 0], 1e-9)
+    surely = (displacement_m > _MOVED_SIGMAS * sd_m) & (speed > STATIONARY_SPEED_M_PER_S)
+    moving = (displacement_m > _MOVED_M) | surely
+    axis = np.mod(np.arctan2(table["sin"].to_numpy(np.float64), table["cos"].to_numpy(np.float64)) / 2, np.pi)
+    driven = _DrivenLanes.of(tracklets[np.isin(tracklets["track_id"], table["track_id"][moving])], metres)
+    lane = driven.along(table.loc[~moving, ["x_px", "y_px"]].to_numpy(np.float64) * metres, axis[~moving])
+    state = np.full(len(table), STATES[0], object)
+    state[~moving] = np.where(lane >= _DRIVEN_FRACTION, STATES[1], STATES[2])
+    return table.drop(columns=["cos", "sin"]).assign(
+        orientation_rad=axis, displacement_m=displacement_m, state=pd.Categorical(state, STATES)
+    )
+
+
+def _track_positions(tracklets: pd.DataFrame, detections: pd.DataFrame) -> pd.DataFrame:
+    """Every detection of every track once, in time order; ``cos`` and ``sin`` are of twice the axial orientation."""
+    names = ("frame_{}", "time_{}_s", "detection_id_{}", "x_{}_px", "y_{}_px")
+    parts = [
+        tracklets[["track_id", *(name.format(k) for name in names)]].set_axis(
+            ["track_id", "frame", "time_s", "detection_id", "x_px", "y_px"], axis=1
+        )
+        for k in range(3)
+    ]
+    positions = pd.concat(parts, ignore_index=True).drop_duplicates("detection_id").sort_values("frame", kind="stable")
+    doubled = 2 * detections.set_index("detection_id")["orientation_rad"].reindex(positions["detection_id"]).to_numpy()
+    return positions.assign(cos=np.cos(doubled), sin=np.sin(doubled))
+
+
+def _mean_of_ends(positions: pd.DataFrame, *, last: bool) -> pd.DataFrame:
+    """Mean ``time_s, x_px, y_px`` of the first or last positions of each track, by ``track_id``."""
+    groups = positions.groupby("track_id")
+    rank, size = groups.cumcount(ascending=not last), groups["frame"].transform("size")
+    ends = positions[rank < np.clip(size // 2, 1, _ENDS)]
+    return pd.DataFrame(ends.groupby("track_id")[["time_s", "x_px", "y_px"]].mean())
+
+
+def _position_sd_px(tracklets: pd.DataFrame, ids: IntArray) -> FloatArray:
+    """Standard deviation of a displacement within each track: the median of its links'."""
+    links = tracklets[["displacement_sd_01_px", "displacement_sd_12_px"]].mean(axis=1)
+    return links.groupby(tracklets["track_id"]).median().reindex(ids).to_numpy(np.float64)
+
+
+@dataclass(frozen=True)
+class _DrivenLanes:
+    """Where vehicles drove, and along which axis: sorted keys of cells and sectors."""
+
+    keys: IntArray
+
+    @classmethod
+    def of(cls, tracklets: pd.DataFrame, metres: float) -> "_DrivenLanes":
+        """Of the tracklets of moving vehicles: their paths in steps of a cell."""
+        keys = [np.empty(0, np.int64)]
+        for k in (0, 1):
+            start, end = (tracklets[[f"x_{j}_px", f"y_{j}_px"]].to_numpy(np.float64) * metres for j in (k, k + 1))
+            length = np.hypot(*(end - start).T)
+            steps = np.ceil(length / _CELL_M).astype(np.int64)
+            row = np.repeat(np.arange(len(start)), steps)
+            step = np.arange(len(row)) - np.repeat(np.cumsum(steps) - steps, steps)
+            fraction = ((step + 0.5) / np.maximum(steps[row], 1))[:, None]
+            axis = np.arctan2(*(end - start).T[::-1])
+            keys.append(np.unique(_key(start[row] + fraction * (end - start)[row], _sector(axis[row]))))
+        return cls(np.unique(np.concatenate(keys)))
+
+    def along(self, xy_m: FloatArray, axis_rad: FloatArray) -> FloatArray:
+        """Fraction (n,) of the line through each position along its axis that others drove, in its direction."""
+        ahead = np.arange(-_REACH_M, _REACH_M + _CELL_M / 2, _CELL_M)
+        aside = np.arange(-_HALF_WIDTH_M, _HALF_WIDTH_M + _CELL_M / 2, _CELL_M)
+        driven = np.zeros((len(xy_m), len(ahead)), bool)
+        known = np.nan_to_num(axis_rad)
+        direction = np.column_stack([np.cos(known), np.sin(known)])
+        normal = direction[:, ::-1] * [-1.0, 1.0]
+        for offset in aside:
+            places = xy_m[:, None] + ahead[:, None] * direction[:, None] + offset * normal[:, None]
+            for turn in (-1, 0, 1):
+                sector = np.mod(_sector(known) + turn, _SECTORS)
+                driven |= self._holds(_key(places, sector[:, None]))
+        return np.where(np.isfinite(axis_rad), driven.mean(axis=1), 0.0)
+
+    def _holds(self, keys: IntArray) -> Mask:
+        if not len(self.keys):
+            return np.zeros(keys.shape, bool)
+        where = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
+        return np.asarray(self.keys[where] == keys)
+
+
+_SECTORS = round(np.pi / _SECTOR_RAD)
+
+
+def _sector(axis_rad: FloatArray) -> IntArray:
+    return np.asarray(np.mod(np.round(axis_rad / _SECTOR_RAD), _SECTORS), np.int64)
+
+
+def _key(xy_m: FloatArray, sector: IntArray) -> IntArray:
+    """One number for a cell and a sector; cells of a flight lie within a million of zero."""
+    cell = np.floor(xy_m / _CELL_M).astype(np.int64) + (1 << 20)
+    return np.asarray((cell[..., 1] << 21 | cell[..., 0]) * _SECTORS + sector, np.int64)

@@ -1,0 +1,79 @@
+"""A frame on the working grid as a search for cars reads it: whole at half the resolution, elsewhere by cells."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from schemas.arrays import GreyImage, Mask
+
+CELL_PX = 16
+"""Side of the cells in which frames are compared and searched, working px."""
+
+
+class SearchableFrame(Protocol):
+    """What is read of a frame that is searched: `ComparableFrame`, or `velfield.registration.warp.Rectification`."""
+
+    @property
+    def image(self) -> GreyImage:
+        """(h, w) uint8; any value in cells that were not asked for by `resample`."""
+        ...
+
+    @property
+    def valid(self) -> Mask:
+        """(h, w): where the frame covers the grid; likewise."""
+        ...
+
+    @property
+    def half_image(self) -> GreyImage:
+        """The whole frame at half the resolution, sizes rounded up."""
+        ...
+
+    @property
+    def half_valid(self) -> Mask:
+        """Where the frame covers it."""
+        ...
+
+    def resample(self, cells: Mask) -> None:
+        """Fill `image` and `valid` in the cells (rows, columns) of `CELL_PX` px of a mask."""
+        ...
+
+
+def half_resolution(image: GreyImage) -> GreyImage:
+    """The image at half its resolution, sizes rounded up."""
+    even = cv2.copyMakeBorder(image, 0, image.shape[0] % 2, 0, image.shape[1] % 2, cv2.BORDER_REPLICATE)
+    size = even.shape[1] // 2, even.shape[0] // 2
+    return np.asarray(cv2.resize(even, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+@dataclass(frozen=True)
+class ComparableFrame:
+    """A frame that is there whole.
+
+    Attributes
+    ----------
+    image, valid : (h, w) uint8 and bool, where the frame covers the grid.
+    """
+
+    image: GreyImage
+    valid: Mask
+
+    @cached_property
+    def half_image(self) -> GreyImage:
+        """At half the resolution, sizes rounded up."""
+        return half_resolution(self.image)
+
+    @cached_property
+    def half_valid(self) -> Mask:
+        """Every other pixel of every other row."""
+        return np.ascontiguousarray(self.valid[::2, ::2])
+
+    def resample(self, cells: Mask) -> None:
+        """Nothing: all of it is there."""
+
+
+def whole_frame(image: GreyImage, valid: Mask | None) -> ComparableFrame:
+    """An image (h, w) as a frame; ``valid`` none: it covers all of it."""
+    return ComparableFrame(image, np.ones(image.shape, bool) if valid is None else valid)

@@ -1,0 +1,135 @@
+"""What an ONNX detector takes and gives: from Ultralytics' metadata, or a small YAML beside the model."""
+
+import ast
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import onnx
+import yaml
+from pydantic import ValidationError
+
+from schemas.detector import OnnxDescription, OnnxLayout, OnnxRecord
+from velfield.errors import InputError
+
+MAX_BYTES = 1 << 30
+_VEHICLES = (
+    *("car", "van", "truck", "lorry", "bus", "taxi", "pickup", "vehicle", "suv", "minibus", "coach", "automobile"),
+    *("small vehicle", "large vehicle", "small car", "light vehicle", "heavy vehicle", "motor vehicle", "freight car"),
+)
+_THRESHOLD, _DEFAULT_SIDE_PX = 0.25, 640
+_ASK = "describe it in a YAML of its name beside it (docs/detection.md)"
+
+
+def describe_model(path: Path, car_length_px: float = 16.0) -> OnnxRecord:
+    """The record of a model file.
+
+    Parameters
+    ----------
+    path
+        The ``.onnx`` file; a ``.yaml`` of its name beside it wins over its metadata.
+    car_length_px
+        Length of a car on the working grid, px.
+
+    Raises
+    ------
+    InputError
+        Not an ONNX model, not one image in and one array of boxes out, or no class that is a vehicle.
+    """
+    if path.stat().st_size > MAX_BYTES:
+        raise InputError(f"{path.name}: found {path.stat().st_size >> 20} MiB, expected 1 GiB at most")
+    try:
+        model = onnx.load(str(path), load_external_data=False)
+        inputs = [one for one in model.graph.input if one.name not in {each.name for each in model.graph.initializer}]
+        image, boxes = inputs[0], model.graph.output[0]
+    except Exception as error:  # protobuf's own, and whatever a damaged graph lacks
+        raise InputError(
+            f"{path.name}: this is no ONNX model ({type(error).__name__}), expected one; export it"
+        ) from None
+    given = _read_yaml(path.with_suffix(".yaml"))
+    metadata = {one.key: one.value for one in model.metadata_props}
+    names = given.classes or _class_names(metadata.get("names", ""))
+    layout = given.layout or _layout(path, metadata, _sizes(boxes), names)
+    return OnnxRecord(
+        working_car_length_px=car_length_px,
+        threshold=_THRESHOLD if given.threshold is None else given.threshold,
+        path=str(path.resolve()),
+        digest=hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest(),
+        layout=layout,
+        classes=names,
+        vehicles=given.vehicles if given.vehicles is not None else _vehicles(path, names),
+        tile_px=_tile(path, given, metadata, _sizes(image)),
+    )
+
+
+def _read_yaml(path: Path) -> OnnxDescription:
+    if not path.is_file():
+        return OnnxDescription()
+    try:
+        return OnnxDescription.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")) or {})
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "the file"
+        keys = ", ".join(OnnxDescription.model_fields)
+        raise InputError(f"{path.name}: {where}: {first['msg'].lower()}; expected the keys {keys}") from None
+    except (yaml.YAMLError, UnicodeDecodeError):
+        raise InputError(f"{path.name}: this is not YAML, expected a description of the model; fix it") from None
+
+
+def _class_names(text: str) -> tuple[str, ...]:
+    """Ultralytics writes a dictionary, {0: 'car', ...}."""
+    try:
+        names = ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        return ()
+    if isinstance(names, dict):
+        names = [names[key] for key in sorted(names)]
+    return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
+
+
+def _sizes(value: Any) -> tuple[int | None, ...]:
+    return tuple(one.dim_value or None for one in value.type.tensor_type.shape.dim)
+
+
+def _layout(path: Path, metadata: dict[str, str], sizes: tuple[int | None, ...], names: tuple[str, ...]) -> OnnxLayout:
+    """By the task that Ultralytics names, and the size of the output: (1, channels, boxes) or (1, boxes, columns)."""
+    task = metadata.get("task", "detect" if names else "")
+    if task not in ("detect", "obb") or len(sizes) != 3:
+        found = f"the task {task!r}" if task else "no metadata"
+        raise InputError(f"{path.name}: found {found} and an output of {sizes}, expected a detector's; {_ASK}")
+    oriented = task == "obb"
+    if sizes[2] == 6 + oriented and sizes[1] != 4 + len(names) + oriented:
+        return "end_to_end_oriented" if oriented else "end_to_end"
+    if sizes[1] == 4 + len(names) + oriented:
+        return "oriented_boxes" if oriented else "boxes"
+    if sizes[2] == 5 + len(names) and not oriented:
+        return "boxes_with_objectness"
+    raise InputError(f"{path.name}: found an output of {sizes} for {len(names)} classes, expected boxes; {_ASK}")
+
+
+def _vehicles(path: Path, names: tuple[str, ...]) -> tuple[int, ...]:
+    plain = [name.lower().replace("-", " ").replace("_", " ").strip() for name in names]
+    found = tuple(index for index, name in enumerate(plain) if name in _VEHICLES)
+    if not found:
+        raise InputError(
+            f"{path.name}: found the classes {', '.join(names)[:120] or 'unnamed'}, expected one that is a vehicle; "
+            "list their numbers as `vehicles: [...]` in a YAML of its name beside it"
+        )
+    return found
+
+
+def _tile(
+    path: Path, given: OnnxDescription, metadata: dict[str, str], sizes: tuple[int | None, ...]
+) -> tuple[int, int]:
+    """Width and height of the network's input, px."""
+    if len(sizes) != 4:
+        raise InputError(f"{path.name}: found an input of {len(sizes)} dimensions, expected an image (1, 3, h, w)")
+    if sizes[2] and sizes[3]:
+        return sizes[3], sizes[2]
+    side = given.image_size_px
+    if side is None:
+        try:
+            side = max(ast.literal_eval(metadata.get("imgsz", "0")))
+        except (ValueError, SyntaxError, TypeError):
+            side = _DEFAULT_SIDE_PX
+    return side, side

@@ -1,0 +1,1 @@
+"""Lanes and the vehicles on them for other programs: SUMO, OpenDRIVE, tables of trajectories."""

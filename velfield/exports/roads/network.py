@@ -1,0 +1,118 @@
+"""The lane graph of a run and the trips on it, in metres with y upwards: what the formats of roads are written from."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from schemas.arrays import FloatArray
+from velfield.errors import InputError
+from velfield.exports.georeference import Georeference
+from velfield.run.run import Run
+
+
+@dataclass(frozen=True)
+class RoadLane:
+    """A lane.
+
+    Attributes
+    ----------
+    number : of the lane.
+    xy_m : (n, 2) centre line in the direction of travel, x to the right of the map, y upwards.
+    width_m : of the lane.
+    speed_m_per_s : mean of the vehicles on it, time-mean.
+    high_speed_m_per_s : their 85th percentile.
+    vehicles : number of tracks on it.
+    """
+
+    number: int
+    xy_m: FloatArray
+    width_m: float
+    speed_m_per_s: float
+    high_speed_m_per_s: float
+    vehicles: int
+
+
+@dataclass(frozen=True)
+class Trip:
+    """A vehicle that drove along connected lanes, from a time in s since the first track's."""
+
+    track_id: int
+    depart_s: float
+    lanes: tuple[int, ...]
+    speed_m_per_s: float
+
+
+@dataclass(frozen=True)
+class RoadNetwork:
+    """Lanes, connections (from, to), trips in order of time, and the time that all tracks cover, s."""
+
+    lanes: tuple[RoadLane, ...]
+    connections: tuple[tuple[int, int], ...]
+    trips: tuple[Trip, ...]
+    duration_s: float
+
+
+def road_network(run: Run) -> RoadNetwork:
+    """The network of a run.
+
+    Raises
+    ------
+    InputError
+        The ground sample distance is not known, or no lanes were found.
+    """
+    if run.grid.gsd_m is None:
+        raise InputError("found a run without a ground sample distance, expected one for roads; run with --gsd-m")
+    graph, trajectories = run.analysis.lanes(), run.analysis.trajectories
+    if not len(graph):
+        raise InputError("found no lanes in the tracks of this run, expected some: a longer flight has more traffic")
+    samples, georeference = graph.samples, Georeference.from_grid(run.grid)
+    lanes = []
+    for lane in graph:
+        speeds = samples.speed_m_per_s[samples.lane == lane.number]
+        speeds = speeds if len(speeds) else np.array([13.9])
+        lanes.append(
+            RoadLane(
+                number=lane.number,
+                xy_m=georeference.to_metres(lane.xy_m / run.grid.gsd_m),
+                width_m=float(np.clip(lane.width_m, 2.0, 6.0)),
+                speed_m_per_s=float(speeds.mean()),
+                high_speed_m_per_s=float(max(np.percentile(speeds, 85), 1.0)),
+                vehicles=lane.tracks,
+            )
+        )
+    connections = tuple((one.start, one.end) for one in graph.connections)
+    first_s = float(trajectories.time_s.min()) if len(trajectories.time_s) else 0.0
+    trips = _trips(samples.track, samples.lane, samples.time_s - first_s, samples.speed_m_per_s, set(connections))
+    named = tuple(Trip(int(trajectories.track_id[trip.track_id]), *_rest(trip)) for trip in trips)
+    return RoadNetwork(tuple(lanes), connections, named, trajectories.duration_s)
+
+
+def _rest(trip: Trip) -> tuple[float, tuple[int, ...], float]:
+    return trip.depart_s, trip.lanes, trip.speed_m_per_s
+
+
+def _trips(
+    track: FloatArray | np.ndarray,
+    lane: np.ndarray,
+    time_s: FloatArray,
+    speed: FloatArray,
+    connections: set[tuple[int, int]],
+) -> list[Trip]:
+    """The longest connected sequence of lanes of each track, by the number of its samples."""
+    trips = []
+    for number in np.unique(track):
+        rows = np.flatnonzero(track == number)
+        rows = rows[np.argsort(time_s[rows], kind="stable")]
+        starts = np.flatnonzero(np.r_[True, np.diff(lane[rows]) != 0])
+        visited = [int(one) for one in lane[rows[starts]]]
+        cuts = [
+            0,
+            *(k for k in range(1, len(visited)) if (visited[k - 1], visited[k]) not in connections),
+            len(visited),
+        ]
+        ends = [*starts.tolist(), len(rows)]
+        first, last = max(pairwise(cuts), key=lambda part: ends[part[1]] - ends[part[0]])
+        row = rows[starts[first]]
+        trips.append(Trip(int(number), float(time_s[row]), tuple(visited[first:last]), float(speed[row])))
+    return sorted(trips, key=lambda trip: (trip.depart_s, trip.track_id))

@@ -1,0 +1,136 @@
+"""SUMO's network and traffic: nodes, edges and connections for netconvert, routes, measured edge data, in one archive.
+
+    unzip sumo-network.zip && netconvert -c velfield.netccfg && sumo -c velfield.sumocfg
+
+Each lane is an edge with one lane, of the shape that vehicles drove.
+"""
+
+import io
+import zipfile
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from schemas.arrays import FloatArray
+from schemas.export import ExportOptions
+from velfield.exports.roads.network import RoadNetwork, road_network
+from velfield.run.run import Run
+
+FILE_NAME = "sumo-network.zip"
+_HEAD = '<?xml version="1.0" encoding="UTF-8"?>'
+_NETCONVERT = f"""{_HEAD}
+<configuration>
+    <input>
+        <node-files value="velfield.nod.xml"/>
+        <edge-files value="velfield.edg.xml"/>
+        <connection-files value="velfield.con.xml"/>
+    </input>
+    <output><output-file value="velfield.net.xml"/></output>
+    <processing><no-turnarounds value="true"/></processing>
+</configuration>
+"""
+_SUMO = """{head}
+<configuration>
+    <input>
+        <net-file value="velfield.net.xml"/>
+        <route-files value="velfield.rou.xml"/>
+    </input>
+    <time><begin value="0"/><end value="{end:.0f}"/></time>
+    <processing><time-to-teleport value="120"/></processing>
+</configuration>
+"""
+_END_LATER_S = 300.0
+"""Simulated vehicles need longer than the measured ones where they wait for each other."""
+
+
+def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
+    """See `velfield.exports.export.ExportModule`."""
+    return sumo_archive(road_network(run))
+
+
+def sumo_archive(network: RoadNetwork) -> bytes:
+    """All files of a network as a ZIP archive."""
+    files = {
+        "velfield.nod.xml": _nodes_xml(network),
+        "velfield.edg.xml": _edges_xml(network),
+        "velfield.con.xml": _connections_xml(network),
+        "velfield.rou.xml": _routes_xml(network),
+        "velfield.edgedata.xml": _edge_data_xml(network),
+        "velfield.netccfg": _NETCONVERT,
+        "velfield.sumocfg": _SUMO.format(head=_HEAD, end=network.duration_s + _END_LATER_S),
+    }
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, text in files.items():
+            archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), text, zipfile.ZIP_DEFLATED)
+    return out.getvalue()
+
+
+def lane_nodes(network: RoadNetwork) -> dict[tuple[int, str], int]:
+    """The node of each lane's ``start`` and ``end``: ends that are connected share one."""
+    parent = {(lane.number, end): (lane.number, end) for lane in network.lanes for end in ("start", "end")}
+
+    def root(one: tuple[int, str]) -> tuple[int, str]:
+        while parent[one] != one:
+            one = parent[one]
+        return one
+
+    for before, after in network.connections:
+        parent[root((after, "start"))] = root((before, "end"))
+    numbers = {one: k for k, one in enumerate(sorted({root(one) for one in parent}))}
+    return {one: numbers[root(one)] for one in parent}
+
+
+def _nodes_xml(network: RoadNetwork) -> str:
+    places: dict[int, list[FloatArray]] = {}
+    nodes = lane_nodes(network)
+    for lane in network.lanes:
+        places.setdefault(nodes[lane.number, "start"], []).append(lane.xy_m[0])
+        places.setdefault(nodes[lane.number, "end"], []).append(lane.xy_m[-1])
+    rows = [(number, np.mean(xy, axis=0)) for number, xy in sorted(places.items())]
+    return _document("nodes", [f'<node id="n{k}" x="{x:.2f}" y="{y:.2f}" type="priority"/>' for k, (x, y) in rows])
+
+
+def _edges_xml(network: RoadNetwork) -> str:
+    nodes, rows = lane_nodes(network), []
+    for lane in network.lanes:
+        shape = " ".join(f"{x:.2f},{y:.2f}" for x, y in lane.xy_m)
+        ends = nodes[lane.number, "start"], nodes[lane.number, "end"]
+        rows.append(
+            f'<edge id="lane{lane.number}" from="n{ends[0]}" to="n{ends[1]}" numLanes="1" width="{lane.width_m:.2f}" '
+            f'speed="{lane.high_speed_m_per_s:.2f}" spreadType="center" shape={quoteattr(shape)}/>'
+        )
+    return _document("edges", rows)
+
+
+def _connections_xml(network: RoadNetwork) -> str:
+    rows = [
+        f'<connection from="lane{start}" to="lane{end}" fromLane="0" toLane="0"/>' for start, end in network.connections
+    ]
+    return _document("connections", rows)
+
+
+def _routes_xml(network: RoadNetwork) -> str:
+    rows = ['<vType id="car" vClass="passenger"/>']
+    for trip in network.trips:
+        edges = " ".join(f"lane{number}" for number in trip.lanes)
+        rows.append(
+            f'<vehicle id="{trip.track_id}" type="car" depart="{trip.depart_s:.2f}" departSpeed="max">'
+            f'<route edges="{edges}"/></vehicle>'
+        )
+    return _document("routes", rows)
+
+
+def _edge_data_xml(network: RoadNetwork) -> str:
+    """What was measured on each lane, as SUMO writes what it simulated: to compare and to calibrate."""
+    rows = [f'<interval begin="0.00" end="{max(network.duration_s, 0.01):.2f}" id="velfield">']
+    rows += [
+        f'    <edge id="lane{lane.number}" speed="{lane.speed_m_per_s:.2f}" entered="{lane.vehicles}"/>'
+        for lane in network.lanes
+    ]
+    return _document("meandata", [*rows, "</interval>"])
+
+
+def _document(root: str, rows: list[str]) -> str:
+    return "\n".join([_HEAD, f"<{root}>", *(f"    {row}" for row in rows), f"</{root}>", ""])

@@ -1,0 +1,59 @@
+"""Trajectories as a table in metres: one row a vehicle and frame, smoothed, with the lane that it is on."""
+
+import numpy as np
+import pandas as pd
+
+from velfield.errors import InputError
+from velfield.exports.georeference import Georeference
+from velfield.run.run import Run
+
+
+def trajectory_table(run: Run) -> pd.DataFrame:
+    """Trajectories of the vehicles that move.
+
+    Returns
+    -------
+    DataFrame ``track_id, frame, time_s, x_m, y_m, vx_m_per_s, vy_m_per_s, ax_m_per_s2, ay_m_per_s2, speed_m_per_s,
+    heading_deg, lane`` and, with a reference system, ``longitude_deg, latitude_deg``; x to the right of the map and y
+    down, from its upper left corner; ``lane`` -1 where none was found; by track and time.
+
+    Raises
+    ------
+    InputError
+        The ground sample distance is not known.
+    """
+    if run.grid.gsd_m is None:
+        raise InputError("found a run without a ground sample distance, expected one for metres; run with --gsd-m")
+    paths, samples = run.analysis.trajectories, run.analysis.lanes().samples
+    owner = paths.owner
+    acceleration = np.zeros_like(paths.velocity_m_per_s)
+    lane = np.full(len(owner), -1, np.int64)
+    for number, rows in enumerate(paths):
+        if rows.stop - rows.start > 1:
+            acceleration[rows] = np.gradient(paths.velocity_m_per_s[rows], paths.time_s[rows], axis=0)
+        mine = np.flatnonzero(samples.track == number)
+        if len(mine):
+            mine = mine[np.argsort(samples.time_s[mine], kind="stable")]
+            after = np.searchsorted(samples.time_s[mine], paths.time_s[rows]).clip(0, len(mine) - 1)
+            lane[rows] = samples.lane[mine[after]]
+    xy_px, velocity = paths.xy_m / run.grid.gsd_m, paths.velocity_m_per_s
+    georeference = Georeference.from_grid(run.grid)
+    table = pd.DataFrame(
+        {
+            "track_id": paths.track_id[owner],
+            "frame": paths.frame,
+            "time_s": paths.time_s,
+            "x_m": paths.xy_m[:, 0],
+            "y_m": paths.xy_m[:, 1],
+            "vx_m_per_s": velocity[:, 0],
+            "vy_m_per_s": velocity[:, 1],
+            "ax_m_per_s2": acceleration[:, 0],
+            "ay_m_per_s2": acceleration[:, 1],
+            "speed_m_per_s": paths.speed_m_per_s,
+            "heading_deg": georeference.heading_deg(xy_px, velocity),
+            "lane": lane,
+        }
+    )
+    if georeference.has_crs:
+        table[["longitude_deg", "latitude_deg"]] = georeference.to_lonlat(xy_px)
+    return table

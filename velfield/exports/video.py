@@ -1,0 +1,260 @@
+"""The stabilised clip as H.264: each frame rectified onto the base image, under the field, tracks, vehicles and speeds.
+
+Written frame by frame at the frames' true times: memory does not grow with the flight.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from schemas.arrays import FloatArray, GreyImage, IntArray, Mask, RGBImage
+from schemas.export import ExportOptions
+from velfield.errors import InputError
+from velfield.exports.figures import resized_map
+from velfield.field.segments import Segments, stationary_speed_px_per_s
+from velfield.report.colours import ramp_colours
+from velfield.report.figures import MapScale, colour_scale_max, round_up
+from velfield.report.panel import Legend, draw_bar_panel
+from velfield.run.run import Run
+
+FILE_NAME = "video.mp4"
+Progress = Callable[[int, int], None]
+
+_DEFAULT_WIDTH_PX = 1920
+_MAX_SIDE_PX = 8192
+"""Of H.264 as players read it."""
+_TICKS = 90_000
+_DIMMED, _OUTSIDE, _FIELD = 0.75, 0.4, 0.4
+"""Brightness of the frame, and of the base image where the frame does not reach; opacity of the field."""
+_TRAIL_S, _SPEED_S = 3.0, 0.5
+"""Length of the tracks drawn, and half the time over which the speed shown is."""
+_LENGTH_M, _WIDTH_M, _UNKNOWN_LENGTH_PX = 4.5, 1.9, 20.0
+_MIN_BOX_PX, _MIN_LABELLED_PX = 6.0, 8.0
+_PARKED = np.array([154, 160, 168])
+_SHIFT = 4
+"""Binary digits of a pixel's fraction in OpenCV's drawing."""
+
+
+def write(run: Run, path: Path, options: ExportOptions, progress: Progress) -> None:
+    """Write the video to a local file.
+
+    Raises
+    ------
+    InputError
+        It would be too large, or no frame is registered.
+    """
+    import av  # loaded by this format alone
+
+    scene = _Scene.of(run, options)
+    frames = [k for k, status in enumerate(run.registration_status) if status == "ok"]
+    if not frames:
+        raise InputError(f"{run.layout.root}: found no registered frame, expected some for a video")
+    times_s = run.times_s
+    seconds = float(times_s[frames[-1]] - times_s[frames[0]])
+    rate = Fraction((len(frames) - 1) / seconds if seconds > 0 else 5.0).limit_denominator(1000)
+    with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
+        stream = container.add_stream("libx264", rate=rate, options={"crf": "21", "preset": "veryfast"})
+        stream.height, stream.width = (side - side % 2 for side in scene.shape)
+        stream.pix_fmt, stream.time_base = "yuv420p", Fraction(1, _TICKS)
+        stream.codec_context.time_base = stream.time_base
+        for done, (frame, image) in enumerate(_images(run, scene, frames), 1):
+            picture = av.VideoFrame.from_ndarray(image[: stream.height, : stream.width], format="rgb24")
+            picture.pts = round((times_s[frame] - times_s[frames[0]]) * _TICKS)
+            picture.time_base = stream.time_base
+            container.mux(stream.encode(picture))
+            progress(done, len(frames))
+        container.mux(stream.encode())
+
+
+def _images(run: Run, scene: "_Scene", frames: list[int]) -> Iterator[tuple[int, RGBImage]]:
+    for frame in frames:
+        rectified = run.rectified_frame(frame, scale=scene.scale)
+        if rectified is not None:
+            yield frame, scene.draw(*rectified, float(run.times_s[frame]))
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What is the same in all images of the video, at its size.
+
+    Attributes
+    ----------
+    scale
+        Video pixels a base pixel.
+    base
+        (h, w) base image.
+    field, known
+        (h, w, 3) colours of the modal speed, and (h, w) where vehicles move.
+    panel
+        (h, legend, 3) legend.
+    top_px_per_s
+        Speed of the last colour.
+    legend_scale
+        For speeds as text.
+    """
+
+    scale: float
+    base: GreyImage
+    field: RGBImage
+    known: Mask
+    panel: RGBImage
+    top_px_per_s: float
+    legend_scale: MapScale
+    tracks: "_Tracks"
+
+    @classmethod
+    def of(cls, run: Run, options: ExportOptions) -> "_Scene":
+        width = options.width_px or min(run.grid.width_px, _DEFAULT_WIDTH_PX)
+        slow = stationary_speed_px_per_s(run.record.config.field, run.grid.gsd_m)
+        speed = run.field.modal_speed_px_per_s()
+        shown = resized_map(
+            run,
+            np.where(speed >= slow, speed, np.nan),
+            options.model_copy(update={"width_px": width}),
+        )
+        if max(shown.grey.shape) > _MAX_SIDE_PX:
+            raise InputError(
+                f"--width {width}: found a video of {shown.grey.shape[1]} x {shown.grey.shape[0]} px, expected at most "
+                f"{_MAX_SIDE_PX}; give less"
+            )
+        scale = MapScale(gsd_m=run.grid.gsd_m, unit=options.unit, north_rad=shown.scale.north_rad)
+        top = round_up(colour_scale_max(scale.shown_speed(speed)) or 10.0)
+        note = "Boxes: vehicles, at their speed; grey: parked. Lanes, paler: the speed of most vehicles."
+        legend = Legend(f"Speed, {scale.shown_unit}", note)
+        panel = draw_bar_panel(
+            shown.grey.shape, legend, top=top, gsd_m=shown.scale.gsd_m, north_rad=shown.scale.north_rad
+        )
+        per_px_per_s = float(scale.shown_speed(np.ones(1))[0])
+        return cls(
+            scale=width / run.grid.width_px,
+            base=shown.grey,
+            field=ramp_colours(scale.shown_speed(shown.layer) / top),
+            known=np.isfinite(shown.layer),
+            panel=panel,
+            top_px_per_s=top / per_px_per_s,
+            legend_scale=scale,
+            tracks=_Tracks.of(run, slow),
+        )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width) of an image."""
+        return self.base.shape[0], self.base.shape[1] + self.panel.shape[1]
+
+    def draw(self, grey: GreyImage, inside: Mask, time_s: float) -> RGBImage:
+        """An image of the video, (h, w + legend, 3)."""
+        dimmed = np.where(inside, grey * _DIMMED, self.base * _OUTSIDE).astype(np.uint8)
+        image = np.ascontiguousarray(np.repeat(dimmed[..., None], 3, axis=2))
+        tinted = cv2.addWeighted(image, 1 - _FIELD, self.field, _FIELD, 0)
+        np.copyto(image, tinted, where=self.known[..., None])
+        self._draw_trails(image, time_s)
+        self._draw_vehicles(image, time_s)
+        self._write(image, f"{int(time_s // 60)}:{time_s % 60:04.1f}", (12, image.shape[0] - 14), 0.9)
+        return np.hstack([image, self.panel])
+
+    def _draw_trails(self, image: RGBImage, time_s: float) -> None:
+        rows = self.tracks.between(time_s - _TRAIL_S, time_s)
+        rows = rows[~self.tracks.parked[rows]]
+        ends = self._place(self.tracks.ends_px[rows].reshape(-1, 2)).reshape(-1, 2, 2)
+        colours = ramp_colours(self.tracks.speed[rows] / self.top_px_per_s).tolist()
+        for line, colour in zip(ends, colours, strict=True):
+            cv2.line(image, line[0].tolist(), line[1].tolist(), colour, 1, cv2.LINE_AA, _SHIFT)
+
+    def _draw_vehicles(self, image: RGBImage, time_s: float) -> None:
+        rows = self.tracks.at(time_s)
+        fraction = ((time_s - self.tracks.start_s[rows]) / self.tracks.duration_s[rows])[:, None]
+        ends = self.tracks.ends_px[rows]
+        centre = ends[:, 0] + fraction * (ends[:, 1] - ends[:, 0])
+        gsd_m = self.legend_scale.gsd_m
+        length = max(self.scale * (_UNKNOWN_LENGTH_PX if gsd_m is None else _LENGTH_M / gsd_m), _MIN_BOX_PX)
+        boxes = _boxes(centre, self.tracks.axis_rad[rows], length / self.scale)
+        corners = self._place(boxes.reshape(-1, 2)).reshape(-1, 4, 2)
+        parked, speed = self.tracks.parked[rows], self.tracks.speed[rows]
+        colours = np.where(parked[:, None], _PARKED, ramp_colours(speed / self.top_px_per_s))
+        for box, colour in zip(corners, colours.tolist(), strict=True):
+            cv2.fillConvexPoly(image, box, colour, cv2.LINE_AA, _SHIFT)
+            cv2.polylines(image, [box], True, (0, 0, 0), 1, cv2.LINE_AA, _SHIFT)
+        if length < _MIN_LABELLED_PX:
+            return
+        shown = self.legend_scale.shown_speed(speed)
+        for place, value, still in zip(self._place(centre) >> _SHIFT, shown, parked, strict=True):
+            if not still:
+                self._write(image, f"{value:.0f}", (int(place[0] + 0.6 * length), int(place[1] - 0.3 * length)), 0.4)
+
+    def _place(self, xy_px: FloatArray) -> IntArray:
+        """Base pixels as OpenCV's fixed-point pixels of the video."""
+        fixed: IntArray = np.rint(((xy_px + 0.5) * self.scale - 0.5) * 2**_SHIFT).astype(np.int32)
+        return fixed
+
+    @staticmethod
+    def _write(image: RGBImage, text: str, at: tuple[int, int], size: float) -> None:
+        for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+            cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, thickness, cv2.LINE_AA)
+
+
+def _boxes(centre: FloatArray, axis_rad: FloatArray, length_px: float) -> FloatArray:
+    """(n, 4, 2) corners of vehicles."""
+    along = np.stack([np.cos(axis_rad), np.sin(axis_rad)], axis=1) * length_px / 2
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1) * (_WIDTH_M / _LENGTH_M)
+    return centre[:, None] + np.stack([along + across, along - across, -along - across, -along + across], axis=1)
+
+
+@dataclass(frozen=True)
+class _Tracks:
+    """Segments of all tracks by the time of their start, (n,) each; ends (n, 2, 2)."""
+
+    start_s: FloatArray
+    duration_s: FloatArray
+    ends_px: FloatArray
+    speed: FloatArray
+    axis_rad: FloatArray
+    parked: Mask
+
+    @classmethod
+    def of(cls, run: Run, stationary_px_per_s: float) -> "_Tracks":
+        segments, vehicles = run.segments(), run.vehicles().set_index("track_id")
+        velocity = _smoothed_velocity(segments)
+        speed = np.hypot(velocity[:, 0], velocity[:, 1])
+        mine = vehicles.loc[segments["track"]]
+        axis = np.nan_to_num(mine["orientation_rad"].to_numpy(np.float64))
+        heading = np.arctan2(velocity[:, 1], velocity[:, 0])
+        order = np.argsort(segments["start_s"], kind="stable")
+        ends = np.stack([np.stack([segments[f"{c}{k}_px"] for c in "xy"], axis=1) for k in (0, 1)], axis=1)
+        return cls(
+            start_s=segments["start_s"][order],
+            duration_s=segments["duration_s"][order],
+            ends_px=ends[order],
+            speed=speed[order],
+            axis_rad=np.where(speed > stationary_px_per_s, heading, axis)[order],
+            parked=(mine["state"] == "parked").to_numpy()[order],
+        )
+
+    def between(self, first_s: float, last_s: float) -> IntArray:
+        """Segments that begin in a stretch of time, before its end."""
+        return np.arange(*np.searchsorted(self.start_s, [first_s, last_s]))
+
+    def at(self, time_s: float) -> IntArray:
+        """The segments that last at a time; of a vehicle at a frame between two of its segments, the earlier one."""
+        longest = float(self.duration_s.max(initial=0.0))
+        rows = self.between(time_s - longest - 1e-6, time_s - 1e-6)
+        return rows[self.start_s[rows] + self.duration_s[rows] >= time_s - 1e-6]
+
+
+def _smoothed_velocity(segments: Segments) -> FloatArray:
+    """(n, 2) velocity of each segment's vehicle over a second around it, px/s."""
+    smooth = np.empty((len(segments), 2))
+    bounds = np.flatnonzero(np.diff(segments["track"], prepend=-1, append=-1))
+    for first, last in pairwise(bounds):
+        mine = segments[first:last]
+        t = np.append(mine["start_s"], mine["start_s"][-1] + mine["duration_s"][-1])
+        middle = mine["start_s"] + mine["duration_s"] / 2
+        before, after = np.maximum(middle - _SPEED_S, t[0]), np.minimum(middle + _SPEED_S, t[-1])
+        for k, axis in enumerate("xy"):
+            place = np.append(mine[f"{axis}0_px"], mine[f"{axis}1_px"][-1])
+            smooth[first:last, k] = (np.interp(after, t, place) - np.interp(before, t, place)) / (after - before)
+    return smooth

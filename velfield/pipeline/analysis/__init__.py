@@ -1,0 +1,1 @@
+"""`velfield analyse`: the analyses of a run as tables, JSON, GeoJSON, a report and a workbook."""

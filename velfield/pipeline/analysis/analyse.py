@@ -1,0 +1,142 @@
+"""`analyse_run`, `analyse_tracks`: answers from the tracks of a run, or of another program, written into a folder."""
+
+import base64
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from schemas.analysis import AnalysisRecord, LanesRecord
+from schemas.arrays import GreyImage
+from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.analysis.trajectories import make_trajectories, moving
+from velfield.errors import InputError
+from velfield.exports.georeference import Georeference
+from velfield.pipeline.analysis.lanes_record import lanes_geojson, lanes_record
+from velfield.pipeline.analysis.page import report_html
+from velfield.pipeline.analysis.tables import all_tables
+from velfield.pipeline.analysis.workbook import EXTRA, can_write_workbook, workbook_bytes
+from velfield.run.commits import code_version, write_atomically
+from velfield.run.layout import to_path
+from velfield.run.run import open_run
+from velfield.sources.trajectories import read_tracks
+
+_MAX_PICTURE_PX = 1600
+_TRACKS_GSD_M = 0.1
+"""Base pixels of tracks given in metres."""
+
+
+def analyse_run(run_folder: Path) -> Iterator[str]:
+    """Analyse the tracks of a run and write ``analysis/`` into its folder; a line for people on each question.
+
+    Raises
+    ------
+    InputError
+        The folder is not a run folder.
+    """
+    run = open_run(run_folder)
+    yield from write_analysis(
+        run.analysis.traffic,
+        run.layout.analysis,
+        Georeference.from_grid(run.grid),
+        gsd_known=run.grid.gsd_m is not None,
+        picture=run.base_image,
+    )
+
+
+def analyse_tracks(
+    path: Path, out: Path, *, gsd_m: float | None, fps: float | None, unit: Literal["m", "px"] | None
+) -> Iterator[str]:
+    """Analyse the tracks of another program and write the answers into ``out``.
+
+    Raises
+    ------
+    InputError
+        The file holds no tracks, or pixels without a ground sample distance.
+    """
+    table = read_tracks(path, fps=fps, unit=unit)
+    if "x_m" in table:
+        gsd = gsd_m or _TRACKS_GSD_M
+        xy_m = table[["x_m", "y_m"]].to_numpy(np.float64)
+        xy_m = xy_m - xy_m.min(axis=0)
+    else:
+        if gsd_m is None:
+            raise InputError(f"{path}: found positions in pixels, expected their size; give --gsd-m, metres a pixel")
+        gsd = gsd_m
+        xy_m = table[["x_px", "y_px"]].to_numpy(np.float64) * gsd
+    ids, frames = table["track_id"].to_numpy(np.int64), table["frame"].to_numpy(np.int64)
+    tracks = moving(make_trajectories(ids, frames, table["time_s"].to_numpy(np.float64), xy_m, gsd_m=gsd))
+    if not len(tracks):
+        raise InputError(
+            f"{path}: found no track that moves 6 m or more, expected tracks of vehicles; check unit and --gsd-m"
+        )
+    width, height = np.ceil(xy_m.max(axis=0) / gsd).astype(int) + 1
+    georeference = Georeference((int(height), int(width)), gsd_m=gsd)
+    yield from write_analysis(TrafficAnalysis(tracks), to_path(out), georeference, gsd_known=True, picture=None)
+
+
+def write_analysis(
+    analysis: TrafficAnalysis, out: Path, georeference: Georeference, *, gsd_known: bool, picture: GreyImage | None
+) -> Iterator[str]:
+    """Write lanes, tables, report and workbook; a line on each."""
+    gsd_m = analysis.trajectories.gsd_m
+    lanes = _with_answers(lanes_record(analysis.lanes, gsd_m), analysis)
+    write_atomically(out / "lanes.json", lanes.model_dump_json().encode())
+    write_atomically(out / "lanes.geojson", lanes_geojson(lanes, georeference).encode())
+    yield _lanes_line(analysis, out)
+    record = AnalysisRecord(
+        code_version=code_version(),
+        gsd_m=gsd_m,
+        gsd_known=gsd_known,
+        duration_s=round(analysis.trajectories.duration_s, 3),
+        tracks=len(analysis.trajectories),
+        tables=tuple(all_tables(analysis)),
+    )
+    write_atomically(out / "analysis.json", record.model_dump_json().encode())
+    for table in record.tables:
+        yield f"{table.section.lower():11} {table.title.lower()}: {len(table.rows)}"
+    html = report_html(record, lanes, georeference.shape, _data_url(picture))
+    write_atomically(out / "report.html", html.encode())
+    yield f"report      {out / 'report.html'}"
+    if can_write_workbook():
+        write_atomically(out / "analysis.xlsx", workbook_bytes(record))
+        yield f"workbook    {out / 'analysis.xlsx'}"
+    else:
+        yield f"workbook    not written: pip install '{EXTRA}'"
+
+
+def _lanes_line(analysis: TrafficAnalysis, out: Path) -> str:
+    graph = analysis.lanes
+    length = sum(lane.length_m for lane in graph) / 1000
+    return (
+        f"lanes       {len(graph)} lanes of {length:.2f} km, {len(graph.connections)} connections, "
+        f"{len(graph.junctions)} junctions: {out / 'lanes.geojson'}"
+    )
+
+
+def _with_answers(lanes: LanesRecord, analysis: TrafficAnalysis) -> LanesRecord:
+    """With the limits of lanes, and whether junctions have a signal."""
+    roads = [road for road in analysis.free_flow if road.limit_km_per_h]
+    limits = {lane: (road.limit_km_per_h or 0.0) / 3.6 for road in roads for lane in road.lanes}
+    return lanes.model_copy(
+        update={
+            "lanes": tuple(lane.model_copy(update={"limit_m_per_s": limits.get(lane.lane)}) for lane in lanes.lanes),
+            "junctions": tuple(
+                junction.model_copy(update={"signalised": analysis.signals[junction.junction].signalised})
+                if junction.junction in analysis.signals
+                else junction
+                for junction in lanes.junctions
+            ),
+        }
+    )
+
+
+def _data_url(picture: GreyImage | None) -> str | None:
+    if picture is None:
+        return None
+    scale = min(1.0, _MAX_PICTURE_PX / max(picture.shape))
+    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else picture
+    done, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 70])
+    return f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode()}" if done else None

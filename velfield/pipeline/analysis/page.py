@@ -1,0 +1,95 @@
+"""The report: one HTML file, with the map of lanes and every table."""
+
+from html import escape
+
+from schemas.analysis import AnalysisRecord, AnalysisTable, Cell, EstimateRecord, LanesRecord
+
+MAX_ROWS = 400
+"""Rows of a table that are shown; the workbook and the JSON have all."""
+_STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2em auto; max-width: 75em; padding: 0 1em; color: #1b1f24 }
+table { border-collapse: collapse; margin: .6em 0 2em; font-size: 13px; font-variant-numeric: tabular-nums }
+th, td { border-bottom: 1px solid #d5d9de; padding: .25em .7em; text-align: right; vertical-align: top }
+th { text-align: left; border-bottom: 2px solid #8a929b; white-space: normal }
+td.text { text-align: left } .ci { color: #667079; white-space: nowrap } .none { color: #98a1aa }
+svg { width: 100%; height: auto; background: #f3f4f6; border: 1px solid #d5d9de }
+p.note { color: #4b545d; max-width: 60em }
+nav a { margin-right: 1.2em }
+"""
+_COLOURS = ("#2563eb", "#d97706", "#059669", "#dc2626", "#7c3aed", "#0891b2", "#be185d", "#4d7c0f")
+
+
+def report_html(record: AnalysisRecord, lanes: LanesRecord, shape: tuple[int, int], background: str | None) -> str:
+    """The report.
+
+    Parameters
+    ----------
+    record, lanes
+        The answers.
+    shape
+        (height, width) of the base image.
+    background
+        The base image as a data URL, or None.
+    """
+    links = "".join(f'<a href="#{table.name}">{escape(table.title)}</a>' for table in record.tables)
+    head = (
+        f"{record.tracks} tracks of moving vehicles in {record.duration_s / 60:.1f} minutes. Grey: the 90 % interval "
+        "and, in brackets, the number of vehicles (cycles, events) that it rests on."
+    )
+    scale = (
+        "" if record.gsd_known else " The ground sample distance is not known: lengths and speeds are by the paper's."
+    )
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Traffic analysis</title><style>{_STYLE}</style>'
+        f"<h1>Traffic analysis</h1><p>{escape(head + scale)}</p><nav>{links}</nav>"
+        f"{_map(lanes, shape, background)}{''.join(_section(table) for table in record.tables)}</html>"
+    )
+
+
+def _map(lanes: LanesRecord, shape: tuple[int, int], background: str | None) -> str:
+    height, width = shape
+    unit = max(width, height) / 900
+    parts = [f'<image href="{background}" width="{width}" height="{height}" opacity="0.55"/>'] if background else []
+    for lane in lanes.lanes:
+        points = " ".join(f"{x},{y}" for x, y in lane.xy_px)
+        colour = _COLOURS[lane.lane % len(_COLOURS)]
+        parts.append(
+            f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="{1.6 * unit:.2f}" '
+            f'marker-end="url(#a)"><title>lane {lane.lane}: {lane.tracks} tracks</title></polyline>'
+        )
+        x, y = lane.xy_px[len(lane.xy_px) // 2]
+        parts.append(f'<text x="{x}" y="{y}" font-size="{9 * unit:.1f}" fill="{colour}">{lane.lane}</text>')
+    for junction in lanes.junctions:
+        points = " ".join(f"{x},{y}" for x, y in junction.hull_px)
+        parts.append(
+            f'<polygon points="{points}" fill="#0003" stroke="#000" stroke-width="{0.6 * unit:.2f}"/>'
+            f'<text x="{junction.x_px}" y="{junction.y_px}" font-size="{14 * unit:.1f}" text-anchor="middle">'
+            f"J{junction.junction}</text>"
+        )
+    arrow = (
+        '<defs><marker id="a" viewBox="0 0 6 6" refX="5" refY="3" markerWidth="5" markerHeight="5" orient="auto">'
+        '<path d="M0 0L6 3L0 6z"/></marker></defs>'
+    )
+    return f'<svg viewBox="0 0 {width} {height}">{arrow}{"".join(parts)}</svg>'
+
+
+def _section(table: AnalysisTable) -> str:
+    heads = "".join(f"<th>{escape(c.title)}{f', {escape(c.unit)}' if c.unit else ''}</th>" for c in table.columns)
+    rows = "".join(
+        f"<tr>{''.join(_cell(row.cells.get(c.name)) for c in table.columns)}</tr>" for row in table.rows[:MAX_ROWS]
+    )
+    more = f"<p>{len(table.rows) - MAX_ROWS} more rows in analysis.json.</p>" if len(table.rows) > MAX_ROWS else ""
+    body = f"<table><tr>{heads}</tr>{rows}</table>{more}" if table.rows else "<p>None found.</p>"
+    return f'<h2 id="{table.name}">{escape(table.title)}</h2><p class="note">{escape(table.note)}</p>{body}'
+
+
+def _cell(cell: Cell) -> str:
+    if isinstance(cell, EstimateRecord):
+        if cell.value is None:
+            return '<td class="none">too little data</td>'
+        return f'<td>{cell.value:g} <span class="ci">{cell.low:g} to {cell.high:g} ({cell.n})</span></td>'
+    if cell is None:
+        return '<td class="none"></td>'
+    if isinstance(cell, str):
+        return f'<td class="text">{escape(cell)}</td>'
+    return f"<td>{cell}</td>" if isinstance(cell, int) else f"<td>{cell:g}</td>"

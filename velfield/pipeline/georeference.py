@@ -1,0 +1,181 @@
+"""Georeference a finished run by ground control points: its map moves, no frame is registered again.
+
+The map's place, scale and north are those of the points from then on. Maps, exports, the page and the report follow;
+the field is accumulated again where the scale changed, as its bins are in metres a second. Tracklets stay as they are:
+their limits were those of the scale before.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from schemas.georeference import ControlPoint, ControlPointsRecord, GeoreferenceRecord
+from schemas.job import Job
+from schemas.summary import RunSummary
+from velfield.errors import InputError
+from velfield.pipeline.local import compute_stages
+from velfield.pipeline.plan import Plan
+from velfield.pipeline.result import StageResult, commit
+from velfield.pipeline.stage import STAGE, STAGES
+from velfield.pipeline.stages.georeference import (
+    base_digest,
+    describe,
+    georeference_counts,
+    georeference_warnings,
+    scale_of_points,
+    with_control_points,
+    write_georeference,
+)
+from velfield.pipeline.stages.registration import lost_frames
+from velfield.pipeline.stages.report import write_report
+from velfield.pipeline.summary import summarise_stage
+from velfield.pipeline.units import WHOLE
+from velfield.run.commits import read_commits, write_atomically
+from velfield.run.flight_record import check_format
+from velfield.run.frame_transforms import read_georeference
+from velfield.run.layout import remove_tree, to_path
+from velfield.run.lock import locked
+from velfield.run.run import Run, open_run
+from velfield.sources.control_points import Model, fit_control_points
+from velfield.sources.frames import SourceInfo
+from velfield.sources.scale import choose_scale
+
+_SAME_SCALE = 1e-4
+_OTHER_LIMITS = 0.1
+"""Where the scale changes by more than this fraction, it matters that the limits of tracking were those before."""
+
+
+@dataclass(frozen=True)
+class Georeferenced:
+    """What `georeference` did.
+
+    Attributes
+    ----------
+    points : the control points and the fit.
+    record : scale, north and place of the map from now on.
+    notes : one line each, for the user.
+    """
+
+    points: ControlPointsRecord
+    record: GeoreferenceRecord
+    notes: tuple[str, ...] = ()
+
+    def all_notes(self) -> tuple[str, ...]:
+        """What sources disagree on, what contradicts what, and the notes."""
+        return (*self.record.scale.disagreements, *self.record.remarks, *self.notes)
+
+
+def fit_run_points(
+    run: Run, points: Sequence[ControlPoint], epsg: int, model: Model | None = None
+) -> ControlPointsRecord:
+    """Fit a run's map to control points, and write nothing: what `georeference` would use.
+
+    Raises
+    ------
+    InputError
+        Too few points, on one line, outside the map, of no reference system, or the map would be distorted.
+    """
+    shape = (run.grid.height_px, run.grid.width_px)
+    return fit_control_points(points, epsg, shape=shape, base_digest=base_digest(run.layout), model=model)
+
+
+def georeference(
+    root: str | Path, points: Sequence[ControlPoint], epsg: int = 4326, model: Model | None = None
+) -> Georeferenced:
+    """Georeference a finished run by control points, and bring all that shows coordinates up to date.
+
+    Parameters
+    ----------
+    root
+        The run folder.
+    points
+        Three or more.
+    epsg
+        Code of their coordinates; 4326: longitude and latitude.
+    model
+        None: a similarity, or with six points or more an affine transform where that is closer at points left out.
+
+    Raises
+    ------
+    InputError
+        Not a finished run, another process works on it, or the points cannot be used; nothing was changed.
+    """
+    run = open_finished_run(root)
+    fitted = fit_run_points(run, points, epsg, model)
+    with locked(run.layout):
+        before_m, plan = run.grid.gsd_m, plan_of_finished(run)
+        write_atomically(run.layout.control_points, fitted.model_dump_json(indent=1).encode())
+        record = _record(read_georeference(run.layout) or GeoreferenceRecord(), fitted)
+        outputs = write_georeference(run.layout, record, plan.config.frames)
+        done = StageResult(outputs, georeference_counts(record), describe(record), georeference_warnings(record))
+        commit(plan, "georeference", WHOLE, done, started=time.time())
+        changed = 1.0 if before_m is None else abs(fitted.gsd_m / before_m - 1)
+        if changed > _SAME_SCALE:
+            remove_tree(run.layout.field)
+            compute_stages(plan, ("field",))
+        compute_stages(plan, ("maps",))
+        write_report(plan, _summary(plan))
+    return Georeferenced(fitted, record, tuple(_notes(before_m, fitted, changed)))
+
+
+def open_finished_run(root: str | Path) -> Run:
+    """A run that can be georeferenced.
+
+    Raises
+    ------
+    InputError
+        It is not finished, or another version's.
+    """
+    folder = to_path(root)
+    check_format(folder)
+    run = open_run(folder)
+    if set(run.record.keys) != set(STAGE):
+        raise InputError(f"{root} was made by another version of velfield; run `velfield run` on it again")
+    if not run.layout.report.exists():
+        raise InputError(f"{root} is not finished; run `velfield run` on it again")
+    return run
+
+
+def plan_of_finished(run: Run) -> Plan:
+    """The plan of a finished run, from its folder alone: its source may be gone."""
+    source, given = run.record.inputs.source, run.record.given
+    if given is None:
+        raise InputError(f"{run.layout.root} has no record of its inputs; run `velfield run` on it again")
+    info = SourceInfo(
+        kind="video" if source.kind == "video" else "folder",
+        width=source.width,
+        height=source.height,
+        frame_count=source.frame_count,
+        times_s=run.times_s,
+        names=(),
+    )
+    job = Job(root=str(run.layout.root), inputs=given, config=run.record.config)
+    return Plan(job, info, np.arange(run.frames.count), run.record.inputs, run.record.keys)
+
+
+def _record(before: GeoreferenceRecord, points: ControlPointsRecord) -> GeoreferenceRecord:
+    every = [before.scale.used, *before.scale.others]
+    kept = [estimate for estimate in every if estimate is not None and estimate.source != "control_points"]
+    scale = choose_scale([scale_of_points(points), *kept])
+    return with_control_points(before.model_copy(update={"scale": scale, "remarks": ()}), points)
+
+
+def _summary(plan: Plan) -> RunSummary:
+    stages = []
+    for stage in STAGES:
+        records = read_commits(plan.layout, stage.name)
+        stages.append(summarise_stage(stage.name, records, units=len(records), before=records, lost=(), seconds=0.0))
+    return RunSummary(root=plan.job.root, stages=tuple(stages), frames_lost=lost_frames(plan))
+
+
+def _notes(before_m: float | None, points: ControlPointsRecord, changed: float) -> list[str]:
+    if before_m is None or changed > _OTHER_LIMITS:
+        before = "not known" if before_m is None else f"{before_m:.4g} m a pixel"
+        return [
+            f"the scale was {before} when vehicles were tracked; to track them with {points.gsd_m:.4g} m, run the "
+            f"flight again with --gsd-m {points.gsd_m:.4g}"
+        ]
+    return []

@@ -1,0 +1,144 @@
+"""Maps before the flight is through: of its first frames, and then of the units that are finished so far.
+
+A preview is a run folder of its own inside the run's, `RunLayout.preview`, made by the stages of any run; its field,
+maps and page then take the place of those in the run folder. The first one is of a few frames alone, with the detector
+that ships unless one is given: lens and base image of the flight need frames of all of it. The later ones share all
+that is finished, and add the tracks, the field and the maps of what is there. They have keys of their own, as if the
+other units were lost: nothing of a preview is taken for the result, which is to the bit what it is without them.
+"""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from schemas.job import Job
+from schemas.records import InputsRecord
+from schemas.summary import RunSummary
+from velfield.detection.detector import shipped_detector
+from velfield.pipeline.graphs import unit_graph
+from velfield.pipeline.plan import Plan, write_flight_record
+from velfield.pipeline.result import without_progress
+from velfield.pipeline.stage import STAGES, Stage, stage_keys, stages_before
+from velfield.pipeline.stages.registration import lost_frames
+from velfield.pipeline.stages.report import write_report
+from velfield.pipeline.summary import summarise_stage
+from velfield.pipeline.units import prepare_stage, stage_units
+from velfield.run.commits import commit_path, read_commits, valid_commit, write_atomically
+from velfield.run.layout import RunLayout, remove_tree
+from velfield.run.results import link_shared_outputs
+
+FIRST_FRAMES = 16
+"""Frames of the first preview: three seconds."""
+_BEFORE = stages_before("tracks")
+FIELD_STAGES = tuple(stage.name for stage in STAGES if stage.name not in _BEFORE)
+"""What is computed of the units that are finished: tracks, field and maps."""
+Compute = Callable[[Any], Any]
+"""Gives the value of a Dask graph."""
+Publishing = AbstractContextManager[object]
+"""Entered to replace the field and the page of the run; raises where the run's own are being made."""
+
+
+def preview_first_frames(plan: Plan, compute: Compute, publishing: Publishing) -> int:
+    """Make and publish the preview of a flight's first frames; returns their number.
+
+    Raises
+    ------
+    InputError
+        As in any run: they show too little to register them, or to size a car.
+    """
+    remove_tree(plan.layout.preview)
+    first = _first_plan(plan)
+    _make(first, STAGES, compute)
+    _write_page(plan, first, f"the first {first.frame_count} of {plan.frame_count} frames")
+    with publishing:
+        _publish(plan.layout, first.layout, with_tracks=False)
+    return first.frame_count
+
+
+def preview_finished_units(plan: Plan, compute: Compute, publishing: Publishing) -> int:
+    """Make and publish the preview of the units whose tracklets are finished; returns the number of their frames."""
+    remove_tree(plan.layout.preview)
+    units = {unit.name: len(unit.frames) for unit in stage_units(plan, _stage("tracklets"))}
+    found = {name: valid_commit(plan.layout, "tracklets", name, plan.keys["tracklets"]) for name in units}
+    finished = [name for name, record in found.items() if record is not None]
+    so_far = _with_root(plan).with_lost_units([f"tracklets {name}" for name in units if name not in finished])
+    link_shared_outputs(plan.layout, so_far.layout, _BEFORE)
+    _make(so_far, [_stage(name) for name in FIELD_STAGES], compute)
+    frames = sum(units[name] for name in finished)
+    _write_page(plan, so_far, f"{frames} of {plan.frame_count} frames")
+    with publishing:
+        _publish(plan.layout, so_far.layout, with_tracks=True)
+    return frames
+
+
+def _stage(name: str) -> Stage:
+    return next(stage for stage in STAGES if stage.name == name)
+
+
+def _with_root(plan: Plan, **inputs: str | None) -> Plan:
+    """The plan in the preview's folder, its field without time intervals and weights of time, which no map needs."""
+    field = plan.config.field.model_copy(update={"time_weighted": False, "time_intervals": None})
+    config = plan.config.model_copy(update={"field": field})
+    given = plan.job.inputs.model_copy(update=inputs)
+    return replace(plan, job=Job(root=str(plan.layout.preview), inputs=given, config=config))
+
+
+def _first_plan(plan: Plan) -> Plan:
+    """The plan of the first frames: without fine-tuning where a car's size is known, as it takes long."""
+    layout = plan.layout
+    inputs: dict[str, str | None] = {}
+    record = plan.inputs
+    if plan.config.gsd_m is not None and not (plan.job.inputs.detector or plan.job.inputs.detections):
+        detector = layout.preview / "shipped_detector.json"
+        write_atomically(detector, shipped_detector().to_json().encode())
+        inputs = {"detector": str(detector), "labels": None}
+        record = InputsRecord.model_validate(record.model_dump() | {"detector": "shipped", "labels": None})
+    first = replace(_with_root(plan, **inputs), indices=plan.indices[:FIRST_FRAMES], inputs=record)
+    return replace(first, keys=stage_keys(first.config, record)).with_lost_units(["all other frames"])
+
+
+def _make(plan: Plan, stages: tuple[Stage, ...] | list[Stage], compute: Compute) -> None:
+    write_flight_record(plan)
+    with without_progress():
+        for stage in stages:
+            prepare_stage(plan, stage)
+            for unit in stage_units(plan, stage):
+                compute(unit_graph(plan, stage, unit))
+
+
+def _write_page(plan: Plan, preview: Plan, what: str) -> None:
+    records = {stage.name: read_commits(preview.layout, stage.name) for stage in STAGES}
+    summary = RunSummary(
+        root=plan.job.root,
+        stages=tuple(
+            summarise_stage(
+                name, found, units=len(found), before=(), lost=(), seconds=sum(one.seconds for one in found)
+            )
+            for name, found in records.items()
+        ),
+        frames_lost=lost_frames(preview),
+    )
+    write_report(preview, summary, preview_of=what)
+
+
+def _publish(layout: RunLayout, new: RunLayout, *, with_tracks: bool) -> None:
+    """Let a preview's field, maps and page take the place of the run folder's."""
+    for name in FIELD_STAGES:  # no record may vouch for what is replaced
+        for path in commit_path(layout, name, "all").parent.glob("*.json"):
+            path.unlink()
+    tracks = [(new.tracks, layout.tracks)] if with_tracks else []
+    for source, target in (*tracks, (new.field, layout.field), (new.view, layout.view), (new.maps, layout.maps)):
+        _replace_tree(source, target)
+    new.report.replace(layout.report)
+    remove_tree(new.root)
+
+
+def _replace_tree(source: Path, target: Path) -> None:
+    """Give a folder the place of another one; who reads it meets the one or the other, or for a moment none."""
+    old = source.with_name(f"{source.name}.old")
+    if target.exists():
+        target.rename(old)
+    source.rename(target)
+    remove_tree(old)

@@ -1,0 +1,302 @@
+"""Tracks of the whole flight: tracklets that share detections, chained, gaps closed; and the vehicles' dimensions."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from schemas.arrays import ByteArray, Float32Array, FloatArray, IntArray, Mask
+from schemas.flight import PAPER_GSD_M
+from schemas.tables import DETECTION_COLUMNS, DIMENSION_COLUMNS, JOIN_COLUMNS, TRACK_POSITION_COLUMNS, TRACKLET_COLUMNS
+from velfield.pipeline.plan import Plan
+from velfield.pipeline.result import StageResult, advance
+from velfield.pipeline.stages.registration import usable_frames
+from velfield.pipeline.stages.tracklets import explain_no_tracklets, frame_tables, tracklet_files
+from velfield.run.frame_transforms import FrameTransforms, read_grid
+from velfield.run.layout import RunLayout
+from velfield.run.stores import open_frames
+from velfield.run.tables import empty_table, read_patches, read_tables, write_table, write_tracks
+from velfield.tracking.association import LinkedTriples, tracklet_table, window_frames
+from velfield.tracking.dimensions import STRIP_SHAPE, direction_of_axes, looks, measure, sample_tracks
+from velfield.tracking.gates import Limits, triples_pass
+from velfield.tracking.joins import END_COLUMNS, EndContext, GapLimits, TrackEnds, find_ends
+from velfield.tracking.recovery import Candidates, Recovered, interpolate_gap, recover_tracks
+from velfield.tracking.tracks import assign_tracks
+
+_MIDDLE = ["frame_1", "time_1_s", "x_1_px", "y_1_px"]
+_IDS = [f"detection_id_{k}" for k in range(3)]
+_BORDER_M, _BORDER_S = 5.0, 0.6
+"""A vehicle that would be outside the frame after so many metres and seconds has left it."""
+_MISSED_S = 1.0
+"""A track that misses frames for so long goes on linearly meanwhile."""
+_CONFIDENCE = 0.95
+"""Of a tracklet that only its track confirms: as many were right in simulated flights, or more."""
+_HIDDEN_S = 1.5
+"""A track that ends so shortly before the last frame, or begins so shortly after the first, did not vanish."""
+
+
+def chain_tracks(plan: Plan) -> StageResult:
+    """Give every tracklet the track that it belongs to: reads a few columns of all units, writes unit by unit."""
+    sources, layout = tracklet_files(plan), plan.layout
+    tracklets = read_tables(
+        sources, TRACKLET_COLUMNS, only=[*_IDS, "frame_1", "time_1_s", "x_1_px", "y_1_px", *END_COLUMNS]
+    )
+    ids, chain = np.unique(assign_tracks(tracklets[_IDS].to_numpy(np.int64)), return_inverse=True)
+    strips = sum_strips(layout, tracklets.assign(track_id=ids[chain]), len(plan.units))
+    gsd_m = read_grid(layout).gsd_m or PAPER_GSD_M
+    starts, ends = find_ends(tracklets, chain, len(ids), gsd_m)
+    candidates = read_candidates(plan, tracklets, gsd_m)
+    context = find_context(plan, ends, starts, strips)
+    found = recover_tracks(ids, ends, starts, _gap_limits(plan), context, candidates)
+    tracklets = tracklets.assign(track_id=found.tracks[chain])
+    flight = _Frames(open_frames(layout.frames).column("time_s"), usable_frames(plan))
+    positions = all_positions(tracklets, found, candidates, gsd_m, flight)
+    written, start, recovered = [], 0, 0
+    for unit, frames in enumerate(plan.units):
+        path = layout.unit_file(layout.tracklets, unit, ".parquet")
+        if path.exists():
+            table = read_tables([path], TRACKLET_COLUMNS).assign(recovered=False)
+            table["track_id"] = tracklets["track_id"].to_numpy()[start : start + len(table)]
+            start += len(table)
+            more = recovered_tracklets(plan, frames, positions, flight)
+            recovered += len(more)
+            table = pd.concat([table, more.assign(recovered=True)], ignore_index=True)
+            table = table.sort_values(["frame_0", "tracklet_id"], kind="stable", ignore_index=True)
+            written.append(layout.tracks / path.name)
+            write_tracks(written[-1], table)
+        here = positions[(positions["frame"] >= frames.start) & (positions["frame"] < frames.stop)]
+        written.append(layout.unit_file(layout.track_positions, unit, ".parquet"))
+        write_table(written[-1], here, TRACK_POSITION_COLUMNS)
+    for folder in (layout.tracks, layout.track_positions):
+        for stale in set(folder.glob("unit-*.parquet")) - set(written):
+            stale.unlink()  # of an earlier plan with more units
+    for path, table, columns in (
+        (layout.dimensions, measure_tracks(strips, found.tracks), DIMENSION_COLUMNS),
+        (layout.joins, found.joins, JOIN_COLUMNS),
+    ):
+        write_table(path, table, columns)
+        written.append(path)
+    advance("tracks")
+    warnings = [] if len(tracklets) else [explain_no_tracklets(plan)]
+    counts = {
+        "tracklets": float(len(tracklets) + recovered),
+        "recovered": float(recovered),
+        "tracks": float(tracklets["track_id"].nunique()),
+    }
+    return StageResult(written, counts, warnings=warnings)
+
+
+def read_candidates(plan: Plan, tracklets: pd.DataFrame, metres: float) -> Candidates:
+    """Detections in no tracklet, and weak candidates, of the whole flight."""
+    layout = plan.layout
+    names = ["detection_id", "frame", "time_s", "x_px", "y_px", "orientation_rad"]
+    used = np.unique(tracklets[_IDS].to_numpy(np.int64))
+    parts = []
+    for unit in range(len(plan.units)):
+        for folder in (layout.detections, layout.weak_detections):
+            path = layout.unit_file(folder, unit, ".parquet")
+            if path.exists():
+                table = read_tables([path], DETECTION_COLUMNS, only=names)
+                parts.append(table[~np.isin(table["detection_id"], used)])
+    table = pd.concat(parts) if parts else empty_table({name: DETECTION_COLUMNS[name] for name in names})
+    table = table.sort_values(["frame", "detection_id"], ignore_index=True)
+    return Candidates(
+        detection_id=table["detection_id"].to_numpy(np.int64),
+        frame=table["frame"].to_numpy(np.int64),
+        time_s=table["time_s"].to_numpy(np.float64),
+        position_m=table[["x_px", "y_px"]].to_numpy(np.float64) * metres,
+        axis_rad=table["orientation_rad"].to_numpy(np.float64),
+    )
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """Times (frames,) and which are usable."""
+
+    times_s: FloatArray
+    usable: Mask
+
+
+def all_positions(
+    tracklets: pd.DataFrame, found: Recovered, candidates: Candidates, metres: float, frames: _Frames
+) -> pd.DataFrame:
+    """Positions of every track (`TRACK_POSITION_COLUMNS`) by frame and track: seen, confirmed and interpolated."""
+    parts = [
+        tracklets[["track_id", f"frame_{k}", f"time_{k}_s", f"x_{k}_px", f"y_{k}_px", f"detection_id_{k}"]].set_axis(
+            ["track_id", "frame", "time_s", "x_px", "y_px", "detection_id"], axis=1
+        )
+        for k in range(3)
+    ]
+    seen = pd.concat(parts, ignore_index=True).drop_duplicates("detection_id").assign(source=0)
+    xy = candidates.position_m[found.candidate] / metres
+    confirmed = pd.DataFrame(
+        {
+            "track_id": found.track_id,
+            "frame": candidates.frame[found.candidate],
+            "time_s": candidates.time_s[found.candidate],
+            "x_px": xy[:, 0],
+            "y_px": xy[:, 1],
+            "detection_id": candidates.detection_id[found.candidate],
+            "source": 1,
+        }
+    )
+    known = pd.concat([seen, confirmed], ignore_index=True)
+    numbers, times_s = np.flatnonzero(frames.usable), frames.times_s
+    inferred = [_between_frames(known, numbers, times_s)]
+    for gap in found.gaps:
+        inside = numbers[(times_s[numbers] > gap.time_s[0]) & (times_s[numbers] < gap.time_s[1])]
+        x, y = interpolate_gap(gap, candidates, times_s[inside]).T / metres
+        columns = {"track_id": gap.track_id, "frame": inside, "time_s": times_s[inside], "x_px": x, "y_px": y}
+        inferred.append(pd.DataFrame(columns))
+    between = pd.concat(inferred, ignore_index=True).assign(detection_id=-1, source=2)
+    table = pd.concat([known, between], ignore_index=True)
+    table = table.sort_values(["frame", "track_id", "source"], kind="stable", ignore_index=True)
+    return table.drop_duplicates(["frame", "track_id"], ignore_index=True)
+
+
+def _between_frames(known: pd.DataFrame, frames: IntArray, times_s: FloatArray) -> pd.DataFrame:
+    """Frames that a track misses for a moment, linearly in time."""
+    table = known.sort_values(["track_id", "frame"], ignore_index=True)
+    rank = np.searchsorted(frames, table["frame"].to_numpy())
+    same = np.diff(table["track_id"].to_numpy()) == 0
+    missed = np.where(same & (np.diff(table["time_s"].to_numpy()) <= _MISSED_S), np.maximum(np.diff(rank) - 1, 0), 0)
+    row = np.repeat(np.arange(len(missed)), missed)
+    step = np.arange(len(row)) - np.repeat(np.cumsum(missed) - missed, missed) + 1
+    frame = frames[rank[row] + step] if len(row) else np.empty(0, np.int64)
+    before, after = table.iloc[row].reset_index(drop=True), table.iloc[row + 1].reset_index(drop=True)
+    part = (times_s[frame] - before["time_s"]) / (after["time_s"] - before["time_s"])
+    xy = {name: before[name] + part * (after[name] - before[name]) for name in ("x_px", "y_px")}
+    return pd.DataFrame({"track_id": before["track_id"], "frame": frame, "time_s": times_s[frame], **xy})
+
+
+def recovered_tracklets(plan: Plan, frames: range, positions: pd.DataFrame, flight: "_Frames") -> pd.DataFrame:
+    """Tracklets that start in a unit and hold a detection that only the track confirmed (`TRACKLET_COLUMNS`)."""
+    times_s, usable = flight.times_s, flight.usable
+    config = plan.config.tracking
+    window = window_frames(list(usable), list(times_s), frames, config.max_interval_s)
+    known = positions[positions["source"] < 2]
+    known = known[(known["frame"] >= window.start) & (known["frame"] < window.stop)]
+    known = known.sort_values(["track_id", "frame"], ignore_index=True)
+    rank = np.cumsum(usable)[known["frame"].to_numpy()]
+    near = (np.diff(known["track_id"].to_numpy()) == 0) & (np.diff(rank) == 1)
+    near &= np.diff(known["time_s"].to_numpy()) <= config.max_interval_s
+    confirmed = known["source"].to_numpy() == 1
+    first = np.flatnonzero(near[:-1] & near[1:]) if len(near) > 1 else np.empty(0, np.int64)
+    first = first[(confirmed[first] | confirmed[first + 1] | confirmed[first + 2])]
+    first = first[known["frame"].to_numpy()[first] < frames.stop]
+    if not len(first):
+        return empty_table(TRACKLET_COLUMNS)
+    tables = [one for one in frame_tables(plan, window, times_s, usable, weak=True) if one.registered]
+    index = {one.frame: k for k, one in enumerate(tables)}
+    start = np.array([index[frame] for frame in known["frame"].to_numpy()[first]])
+    ids = np.stack([known["detection_id"].to_numpy()[first + k] for k in range(3)], axis=1)
+    limits = Limits.from_config(config, read_grid(plan.layout).gsd_m)
+    windows = []
+    for at in np.unique(start).tolist():
+        rows = np.flatnonzero(start == at)
+        places = np.stack([np.searchsorted(tables[at + k].detection_id, ids[rows, k]) for k in range(3)], axis=1)
+        first_of, middle, last = (tables[at + k].states(limits).take(places[:, k]) for k in range(3))
+        places = places[triples_pass((first_of, middle, last), limits)]
+        nothing = np.full((len(places), 2), np.nan)
+        windows.append(LinkedTriples(at, places, nothing, np.full(len(places), _CONFIDENCE)))
+    made, _ = tracklet_table(tables, windows, limits, refine=config.refine)
+    track = pd.Series(known["track_id"].to_numpy()[first], index=ids[:, 1])
+    return made.assign(track_id=track.reindex(made["tracklet_id"]).to_numpy())
+
+
+def _gap_limits(plan: Plan) -> GapLimits:
+    c = plan.config.tracking
+    return GapLimits(c.max_gap_s, c.max_stationary_gap_s, c.max_hidden_gap_s, c.stationary_speed_m_per_s)
+
+
+@dataclass(frozen=True)
+class StripSums:
+    """Sums of the strips of each chain of tracklets, and their numbers: spread over it, at its start, at its end.
+
+    ``total`` (3, chains, 32, 10), ``count`` (3, chains); ``ids`` (chains,); ``scale``, working px a base px.
+    """
+
+    ids: IntArray
+    total: Float32Array
+    count: IntArray
+    scale: float
+
+    def mean(self, which: int) -> FloatArray:
+        """(chains, 32, 10); NaN where there are none."""
+        count = np.where(self.count[which], self.count[which], np.nan)[:, None, None]
+        return np.asarray(self.total[which] / count)
+
+
+def sum_strips(layout: RunLayout, tracklets: pd.DataFrame, units: int) -> StripSums:
+    """Read the strips that stand for each chain, unit by unit, as all together take much space."""
+    ids, chosen = sample_tracks(tracklets)
+    total, count = np.zeros((3, len(ids), *STRIP_SHAPE), np.float32), np.zeros((3, len(ids)), np.int64)
+    scale = 1.0
+    for unit in range(units):
+        path = layout.unit_file(layout.detections, unit, ".parquet")
+        if path.exists():
+            table = read_tables([path], DETECTION_COLUMNS, only=["detection_id", "orientation_rad"])
+            patches = read_patches(path.with_suffix(".patches.npz"))
+            scale = float(patches["working_scale"])
+            here = chosen[chosen["detection_id"].isin(table["detection_id"])]
+            strips = _along_headings(here, table, patches["strips"])
+            for which, name in enumerate(("spread", "start", "end")):
+                rows = np.flatnonzero(here[name])
+                np.add.at(total[which], here["track"].to_numpy()[rows], strips[rows])  # whole numbers: sums are exact
+                np.add.at(count[which], here["track"].to_numpy()[rows], 1)
+    return StripSums(ids, total, count, scale)
+
+
+def _along_headings(chosen: pd.DataFrame, table: pd.DataFrame, strips: ByteArray) -> Float32Array:
+    """The strips of chosen detections, turned along their vehicles' headings."""
+    rows = pd.Index(table["detection_id"]).get_indexer(chosen["detection_id"])
+    axis = table["orientation_rad"].to_numpy(np.float64)[rows]
+    backward = direction_of_axes(axis, chosen["heading_rad"].to_numpy())
+    found = np.asarray(strips[rows], np.float32)
+    found[backward] = found[backward, ::-1, ::-1]
+    return found
+
+
+def measure_tracks(strips: StripSums, tracks: IntArray) -> pd.DataFrame:
+    """Dimensions by track (`DIMENSION_COLUMNS`), from the strips of all chains of each; ``tracks`` (chains,)."""
+    ids, track = np.unique(tracks, return_inverse=True)
+    total, count = np.zeros((len(ids), *STRIP_SHAPE)), np.zeros(len(ids), np.int64)
+    np.add.at(total, track, strips.total[0])
+    np.add.at(count, track, strips.count[0])
+    seen = np.flatnonzero(count)
+    found = measure(total[seen] / count[seen, None, None])
+    columns = {
+        name: getattr(found, name.removesuffix("_px")) / strips.scale
+        for name in ("length_px", "length_sd_px", "width_px", "width_sd_px")
+    }
+    return pd.DataFrame({"track_id": ids[seen], **columns, "strips": count[seen]})
+
+
+def find_context(plan: Plan, ends: TrackEnds, starts: TrackEnds, strips: StripSums) -> EndContext:
+    """Where chains vanish and appear, and how they look there."""
+    metres = read_grid(plan.layout).gsd_m or PAPER_GSD_M
+    maps = FrameTransforms.open(plan.layout, plan.config)
+    times_s = open_frames(plan.layout.frames).column("time_s")[usable_frames(plan)]
+    first_s, last_s = (times_s[0], times_s[-1]) if len(times_s) else (0.0, 0.0)
+    return EndContext(
+        _stays_inside(maps, ends, 1, metres) & (last_s - ends.time_s > _HIDDEN_S),
+        _stays_inside(maps, starts, -1, metres) & (starts.time_s - first_s > _HIDDEN_S),
+        looks(strips.mean(2)),
+        looks(strips.mean(1)),
+    )
+
+
+def _stays_inside(maps: FrameTransforms, ends: TrackEnds, sign: int, metres: float) -> Mask:
+    """Whether vehicles stay inside the frame where they go, or come from, and a little to any side."""
+    velocity = sign * ends.velocity_m_per_s
+    direction = velocity / np.maximum(ends.speed_m_per_s, 1e-9)[:, None]
+    sides = [0.5 * _BORDER_M * np.array(side) for side in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
+    ahead = ends.position_m + velocity * _BORDER_S + direction * _BORDER_M
+    places = [place / metres for place in (ahead, *(ends.position_m + side for side in sides))]
+    inside = np.zeros(len(ends.frame), bool)
+    for frame in np.unique(ends.frame):
+        rows, transform = np.flatnonzero(ends.frame == frame), maps.transform(int(frame))
+        if transform is not None:
+            raw = np.stack([transform.to_raw(place[rows]) for place in places])
+            inside[rows] = ((raw >= 0) & (raw <= [maps.width - 1, maps.height - 1])).all(axis=(0, 2))
+    return inside

@@ -1,0 +1,135 @@
+"""Find and read the telemetry of a source: subtitles in the video or beside it, tags of the images."""
+
+import re
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from velfield.errors import Failure, InputError
+from velfield.sources.frames import SourceInfo, local_path
+from velfield.sources.images import list_images
+from velfield.sources.telemetry.image_tags import read_image_telemetry
+from velfield.sources.telemetry.srt import parse_srt, telemetry_from_cues
+from velfield.sources.telemetry.telemetry import Telemetry
+from velfield.sources.video.corruption import libav_log
+from velfield.sources.video.packets import iter_packets, open_video
+
+MAX_IMAGES = 200
+"""Of a folder, so many images' tags are read, evenly spread: a header each."""
+_MAX_BYTES = 256 * 2**20
+_NOT_READ = {
+    "klv": "MISB KLV",
+    "smpte_klv": "MISB KLV",
+    "djmd": "DJI's binary telemetry (djmd)",
+    "gpmd": "GoPro's telemetry (gpmd)",
+}
+"""Streams of data that hold telemetry, which no kept and light library reads."""
+_ISO6709 = re.compile(r"([-+]\d+(?:\.\d+)?)([-+]\d+(?:\.\d+)?)([-+]\d+(?:\.\d+)?)?")
+
+
+def read_telemetry(source: Path, info: SourceInfo, given: Path | None = None) -> Telemetry | Failure:
+    """The telemetry of a source, from the file given, else from the source itself.
+
+    Parameters
+    ----------
+    source, info
+        The video or folder of images, and its facts.
+    given
+        A subtitle file.
+
+    Raises
+    ------
+    InputError
+        The file given cannot be read or holds no telemetry.
+    """
+    if given is not None:
+        return read_srt(given)
+    if info.kind == "folder":
+        return _from_images(source, info)
+    return _from_video(source)
+
+
+def read_srt(path: Path) -> Telemetry:
+    """The telemetry in a subtitle file.
+
+    Raises
+    ------
+    InputError
+        It cannot be read or holds no telemetry.
+    """
+    file = local_path(path, "telemetry")
+    if file.stat().st_size > _MAX_BYTES:
+        raise InputError(f"{file.name}: found {file.stat().st_size >> 20} MiB, expected a subtitle file; check it")
+    found = parse_srt(file.read_text(encoding="utf-8", errors="replace"), file.name)
+    if isinstance(found, Failure):
+        raise InputError(f"{found.reason}; leave it out, or give the drone's own .SRT")
+    return found
+
+
+def _from_images(folder: Path, info: SourceInfo) -> Telemetry | Failure:
+    names = info.names or list_images(folder)
+    step = -(-len(names) // MAX_IMAGES)
+    records = []
+    for index in range(0, len(names), step):
+        try:
+            tags = read_image_telemetry(folder / names[index])
+        except InputError:
+            continue  # the frame itself is reported where it is decoded
+        if set(tags) - {"clock_s", "focal_35mm"}:
+            records.append((float(info.times_s[index] - info.times_s[0]), tags))
+    if not records:
+        return Failure("the images have no position, height or attitude in EXIF or XMP")
+    return Telemetry.from_records("the images' EXIF and XMP", records)
+
+
+def _from_video(path: Path) -> Telemetry | Failure:
+    with libav_log(), ExitStack() as stack:
+        container = stack.enter_context(open_video(path))
+        unread = [what for stream in container.streams if (what := _unread_format(stream))]
+        texts = [stream for stream in container.streams.subtitles if _is_text(stream)]
+        found: Telemetry | Failure = Failure("the video has no subtitles, and there is no .SRT beside it")
+        if texts:
+            found = telemetry_from_cues(_embedded_cues(container, texts[0]), f"the subtitles of {path.name}")
+        place = _place(container)
+    if isinstance(found, Telemetry):
+        return found
+    if unread:
+        found = Failure(f"{found.reason}; its {unread[0]} is not read: write an .SRT from it, or give --gsd-m")
+    if place is None:
+        return found
+    return Telemetry.from_records(f"the header of {path.name}", [(0.0, place)], [found.reason])
+
+
+def _is_text(stream: Any) -> bool:
+    return stream.codec_context is not None and stream.codec_context.name in ("mov_text", "subrip", "srt", "text")
+
+
+def _unread_format(stream: Any) -> str | None:
+    tag = str(stream.metadata.get("handler_name", "")).lower()
+    codec = stream.codec_context.name if stream.codec_context is not None else ""
+    four = getattr(stream.codec_context, "codec_tag", "") if stream.codec_context is not None else ""
+    for key, name in _NOT_READ.items():
+        if key in (codec, str(four).lower()) or key in tag:
+            return name
+    return None
+
+
+def _embedded_cues(container: Any, stream: Any) -> Iterator[tuple[float, str]]:
+    for packet, _ in iter_packets(container, stream):
+        if packet.pts is None or packet.size == 0:
+            continue
+        data = bytes(packet)
+        if stream.codec_context.name == "mov_text":  # two bytes of length, the text, boxes of style
+            data = data[2 : 2 + int.from_bytes(data[:2], "big")]
+        yield float(packet.pts * packet.time_base), data.decode("utf-8", "replace")
+
+
+def _place(container: Any) -> dict[str, float] | None:
+    """Longitude and latitude in the container's header (ISO 6709)."""
+    names = ("com.apple.quicktime.location.ISO6709", "location", "location-eng")
+    text = next((container.metadata[name] for name in names if name in container.metadata), "")
+    match = _ISO6709.match(text)
+    if match is None or float(match[1]) == float(match[2]) == 0.0:
+        return None
+    return {"latitude_deg": float(match[1]), "longitude_deg": float(match[2])}

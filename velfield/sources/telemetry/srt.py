@@ -1,0 +1,142 @@
+"""Telemetry that drones write as subtitles, a cue a frame or a second: DJI's formats since 2016, and Autel's.
+
+DJI, since 2018   [iso : 100] ... [focal_len: 24.00] [latitude: 52.5] [longitude: 13.4] [rel_alt: 100.2 abs_alt: 134.1]
+                  [gb_yaw: -12.3 gb_pitch: -90.0 gb_roll: 0.0]
+Phantom 4, Mavic  HOME(13.4,52.5) 2017.08.05 14:11:51 / GPS(13.4,52.5,16) BAROMETER:91.2
+Mavic Mini, P4R   F/2.8, SS 206.14, ISO 150, GPS (13.4, 52.5, 15), D 48.6m, H 4.6m, G_PRY (-90.0°, 0.0°, 43.7°)
+Autel             HOME(E: 13.4, N: 52.5) / GPS(E: 13.4, N: 52.5, 100.1m) / G.PRY (-90.0°, 0.0°, -3.7°)
+"""
+
+import re
+from collections.abc import Iterator
+from datetime import UTC, datetime
+
+from velfield.errors import Failure
+from velfield.sources.telemetry.telemetry import Telemetry
+
+_NUMBER = r"\s*([-+]?\d+(?:\.\d+)?)"
+_CUE = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
+_TAG = re.compile(r"<[^>]*>")
+_PAIR = re.compile(rf"([A-Za-z_]+)\s*:{_NUMBER}")
+_GPS = re.compile(rf"GPS\s*\({_NUMBER}\s*,{_NUMBER}")
+_GPS_SIGNED = re.compile(
+    rf"GPS\s*\(\s*([EW])\s*:{_NUMBER}\s*,\s*([NS])\s*:{_NUMBER}\s*(?:,{_NUMBER}\s*m)?", re.IGNORECASE
+)
+_HEIGHT = re.compile(rf"(?:^|[\s,])H{_NUMBER}\s*m\b")
+_ATTITUDE = re.compile(rf"G[._]PRY\s*\({_NUMBER}°?\s*,{_NUMBER}°?\s*,{_NUMBER}")
+_CLOCK = re.compile(r"(\d{4})[-.](\d\d)[-.](\d\d)\s+(\d\d):(\d\d):(\d\d)(?:[.,:](\d{3}))?")
+_PAIRS = {
+    "latitude": "latitude_deg",
+    "longitude": "longitude_deg",
+    "longtitude": "longitude_deg",  # as DJI wrote it for years
+    "rel_alt": "height_m",
+    "barometer": "height_m",
+    "abs_alt": "altitude_m",
+    "altitude": "altitude_m",
+    "gb_yaw": "yaw_deg",
+    "gb_pitch": "pitch_deg",
+    "gb_roll": "roll_deg",
+    "focal_len": "focal_35mm",
+    "dzoom_ratio": "zoom",
+}
+_MIN_FOCAL_35MM = 15.0
+"""A smaller number is the lens's own focal length, which means nothing without the sensor's size."""
+_MAX_ZOOM = 100.0
+
+
+def parse_srt(text: str, origin: str) -> Telemetry | Failure:
+    """Telemetry of a subtitle file.
+
+    Parameters
+    ----------
+    text
+        Its content: cues ``H:MM:SS,mmm --> H:MM:SS,mmm`` and their lines.
+    origin
+        Where it is from, for messages.
+    """
+    return telemetry_from_cues(_cues(text), origin)
+
+
+def telemetry_from_cues(cues: Iterator[tuple[float, str]], origin: str) -> Telemetry | Failure:
+    """Telemetry of subtitles, each with its time in s from the first frame; a failure where they hold none."""
+    records = [(start_s, found) for start_s, text in cues if (found := parse_cue(text))]
+    telemetry = Telemetry.from_records(origin, records)
+    if not set(telemetry.known_quantities()) - {"clock_s", "zoom", "focal_35mm"}:
+        return Failure(
+            f"{origin}: found no position, height or attitude in the subtitles, expected a drone's telemetry"
+        )
+    return telemetry
+
+
+def parse_cue(text: str) -> dict[str, float]:
+    """The quantities in one subtitle, by their names in `Telemetry`.
+
+    Examples
+    --------
+    >>> parse_cue("[focal_len: 240] [latitude: 52.5] [longtitude: 13.4] [rel_alt: 100.5 abs_alt: 134.1]")
+    {'latitude_deg': 52.5, 'longitude_deg': 13.4, 'height_m': 100.5, 'altitude_m': 134.1, 'focal_35mm': 24.0}
+    >>> parse_cue("HOME(13.1,52.1) 2017.08.05 14:11:51 GPS(13.4,52.5,16) BAROMETER:91.2")["height_m"]
+    91.2
+    """
+    plain = _TAG.sub(" ", text)
+    pairs = [(_PAIRS[name.lower()], float(number)) for name, number in _PAIR.findall(plain) if name.lower() in _PAIRS]
+    found = dict(pairs)
+    if "focal_35mm" in found:
+        found |= _focal(found.pop("focal_35mm"))
+    if found.get("zoom", 0.0) > _MAX_ZOOM:
+        found["zoom"] /= 10_000  # 10000 is 1.0
+    found |= _position(plain) | _attitude(plain) | _clock(plain)
+    if found.get("latitude_deg") == found.get("longitude_deg") == 0.0:
+        del found["latitude_deg"], found["longitude_deg"]  # no satellites yet
+    return found
+
+
+def _focal(value: float) -> dict[str, float]:
+    """The 35 mm equivalent; 240 is 24.0 in the formats up to 2021."""
+    value = value / 10 if value >= 150 and value == int(value) else value
+    return {"focal_35mm": value} if value >= _MIN_FOCAL_35MM else {}
+
+
+def _position(text: str) -> dict[str, float]:
+    found = {}
+    if match := _GPS_SIGNED.search(text):
+        east, longitude, north, latitude, altitude = match.groups()
+        found["longitude_deg"] = _with_sign(longitude, east in "Ww")
+        found["latitude_deg"] = _with_sign(latitude, north in "Ss")
+        found |= {"height_m": float(altitude)} if altitude else {}
+    elif match := _GPS.search(text):
+        found["longitude_deg"], found["latitude_deg"] = map(float, match.groups())
+    if match := _HEIGHT.search(text):
+        found["height_m"] = float(match[1])
+    return found
+
+
+def _with_sign(number: str, negative: bool) -> float:
+    return -abs(float(number)) if negative else float(number)
+
+
+def _attitude(text: str) -> dict[str, float]:
+    match = _ATTITUDE.search(text)
+    return dict(zip(("pitch_deg", "roll_deg", "yaw_deg"), map(float, match.groups()), strict=True)) if match else {}
+
+
+def _clock(text: str) -> dict[str, float]:
+    match = _CLOCK.search(text)
+    if match is None:
+        return {}
+    year, month, day, hour, minute, second, milliseconds = (int(part or 0) for part in match.groups())
+    try:
+        moment = datetime(year, month, day, hour, minute, second, milliseconds * 1000, tzinfo=UTC)
+        return {"clock_s": moment.timestamp()}
+    except ValueError:
+        return {}
+
+
+def _cues(text: str) -> Iterator[tuple[float, str]]:
+    """Start in s and text of each cue."""
+    matches = list(_CUE.finditer(text))
+    ends = [match.start() for match in matches[1:]] + [len(text)]
+    for match, end in zip(matches, ends, strict=True):
+        hours, minutes, seconds = (int(part) for part in match.groups()[:3])
+        fraction = int(match[4]) / 10 ** len(match[4])
+        yield 3600 * hours + 60 * minutes + seconds + fraction, text[match.end() : end]

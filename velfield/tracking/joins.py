@@ -1,0 +1,373 @@
+"""Gap closing: tracks that a missed detection interrupted are joined.
+
+A detector misses a car now and then, and its track ends there; without gap closing a flight counts each vehicle about
+four times, and those in a queue more often. Both sides of a gap give a position and a velocity. Under a constant
+acceleration between them the displacement is the mean of the two velocities times the gap, whatever the acceleration,
+so the start of the later track is predicted to better than a metre for gaps of a second or two. A stationary vehicle is
+predicted where it was, however long the gap. Traffic that creeps under trees is hidden for longer than either holds;
+but it keeps to its lane and its order, and it cannot vanish.
+
+All joins are chosen at once: a one-to-one assignment of ends to starts of the least total cost, where an end or a start
+that is left alone in the middle of the frames costs more than one at their border. What the total would cost more
+without a join is the evidence for it, and gives its probability.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from schemas.arrays import FloatArray, IntArray, Mask
+from schemas.flight import PAPER_GSD_M, STATIONARY_SPEED_M_PER_S
+from velfield.tracking.dimensions import looks_difference
+from velfield.tracking.tracks import component_minimum
+
+_SLACK_M = 2.0
+"""Tolerance of the prediction for a gap of no length: detections are not always at the same point of a car."""
+_ACCELERATION_CHANGE_M_PER_S2 = 4.0
+"""Change of acceleration within a gap, as from hard braking to none. Over dt it displaces a vehicle by dt^2 / 8 times
+this."""
+_MAX_OFFSET_M = 2.2
+"""Upper bound of the tolerance: half a car, so that a queue's next vehicle is not taken for it."""
+_CAR_AND_GAP_M, _HEADWAY_S, _HEADWAY_FRACTION = 6.0, 0.8, 0.35
+"""At speed the bound is this fraction of the distance to the next vehicle, which follows no closer than so."""
+
+_GAP_PENALTY_PER_S = 0.25
+"""A gap longer by a second costs as much as an offset larger by a quarter of the tolerance."""
+_STATIONARY_OFFSET_M = 1.6
+"""Tolerance for a vehicle that is stationary on both sides of the gap; another one would arrive moving."""
+_TYPICAL_ACCELERATION_M_PER_S2, _MAX_ACCELERATION_M_PER_S2, _STOP_SLACK_M = 2.0, 4.0, 0.5
+_MAX_STOP_SPEED_M_PER_S, _MAX_STOP_OFFSET_M = 5.0, 4.0
+"""Of a vehicle that stops in the gap: beyond these speeds the distance that it takes is too uncertain."""
+_STOP_COST = 0.5
+_ALONE_COST = 1.0
+"""Cost of a track's end, or start, that continues in none; a pair costs at most twice as much."""
+_VANISHED_COST = 0.8
+"""Of one in the middle of the frames and of the flight so much more: no vehicle vanishes there."""
+_HIDDEN_COST, _HIDDEN_GAP_PENALTY_PER_S, _MIN_HIDDEN_S = 0.8, 0.04, 0.5
+_PACE_SD_M_PER_S, _PACE_SD_FRACTION, _FASTER_M_PER_S = 1.0, 0.35, 2.5
+"""Of a hidden vehicle: how far its mean speed is from the mean of those before and after, and how far above both it may
+be."""
+_LANE_OFFSET_M, _LANE_OFFSET_FRACTION, _MAX_BEND_RAD = 1.8, 0.05, np.radians(50)
+"""How far aside a hidden vehicle may appear, and how much its direction may differ from the way that it took."""
+_USUAL_LOOKS_DIFFERENCE = 0.35
+"""Of a vehicle to itself, in standard deviations of its strip."""
+_LOOKS_WEIGHT, _MAX_LOOKS_COST = 0.6, 0.8
+"""Cost of looks that differ by twice as much as one vehicle's usually do, and the highest."""
+_CERTAINTY_OFFSET, _CERTAINTY_SLOPE = 0.0, 3.0
+"""Log odds that a join is right, from what the total would cost more without it."""
+_MIN_PROBABILITY = 0.75
+"""A join of a lower probability is not made."""
+_MAX_EXACT = 60
+"""Joins of a group of candidates up to which that is computed for each by another assignment; beyond, from the cost of
+the best other partners, which is a lower bound."""
+
+
+@dataclass(frozen=True)
+class TrackEnds:
+    """One end of each track: frame (n,), time (n,) s, position (n, 2) m, velocity (n, 2) m/s."""
+
+    frame: IntArray
+    time_s: FloatArray
+    position_m: FloatArray
+    velocity_m_per_s: FloatArray
+
+    @property
+    def speed_m_per_s(self) -> FloatArray:
+        return np.asarray(np.hypot(self.velocity_m_per_s[:, 0], self.velocity_m_per_s[:, 1]))
+
+
+@dataclass(frozen=True)
+class GapLimits:
+    """Longest gaps that are closed, s: of a vehicle that drives on, of one that stands, and of one that is hidden.
+
+    A vehicle slower than ``stationary_speed_m_per_s`` on both sides is stationary.
+    """
+
+    moving_s: float
+    stationary_s: float = 0.0
+    hidden_s: float = 0.0
+    stationary_speed_m_per_s: float = STATIONARY_SPEED_M_PER_S
+
+
+END_COLUMNS = [
+    *("frame_0", "time_0_s", "x_0_px", "y_0_px", "vx_01_px_per_s", "vy_01_px_per_s"),
+    *("frame_2", "time_2_s", "x_2_px", "y_2_px", "vx_12_px_per_s", "vy_12_px_per_s"),
+]
+"""Columns of tracklets that `reconnect_tracks` reads."""
+
+
+@dataclass(frozen=True)
+class EndContext:
+    """What is known of the ends and the starts of tracks beside their motion; tracks in the order of their ids.
+
+    Attributes
+    ----------
+    end_vanishes, start_vanishes
+        (tracks,) whether the end, or the start, lies in the middle of the frames and of the flight.
+    end_looks, start_looks
+        (tracks, 16, 6) mean looks before the end and after the start (`velfield.tracking.dimensions.looks`); NaN where
+        unknown.
+    """
+
+    end_vanishes: Mask
+    start_vanishes: Mask
+    end_looks: FloatArray
+    start_looks: FloatArray
+
+
+@dataclass(frozen=True)
+class ClosedGaps:
+    """Tracks after gap closing.
+
+    Attributes
+    ----------
+    tracks
+        (tracks,) int64 the track that each is part of: the smallest of the ids of those that were joined.
+    joins
+        A row a join, in time order: ``track_id``, ``before`` and ``after`` (ids of the tracks that it joins),
+        ``end_time_s``, ``start_time_s``, ``probability`` that it is right.
+    """
+
+    tracks: IntArray
+    joins: pd.DataFrame
+
+
+def reconnect_tracks(tracklets: pd.DataFrame, tracks: IntArray, gaps: GapLimits, *, gsd_m: float | None) -> IntArray:
+    """(n,) the track of each tracklet after `close_gaps`, from motion alone.
+
+    Parameters
+    ----------
+    tracklets
+        `END_COLUMNS`.
+    tracks
+        (n,) track of each tracklet, by `velfield.tracking.tracks.assign_tracks`.
+    gaps
+        The longest gaps; 0 leaves the tracks as they are.
+    gsd_m
+        Metres a base pixel; None: the paper's.
+    """
+    ids, track = np.unique(tracks, return_inverse=True)
+    starts, ends = find_ends(tracklets, track, len(ids), gsd_m)
+    return close_gaps(ids, ends, starts, gaps).tracks[track]
+
+
+def close_gaps(
+    ids: IntArray,
+    ends: TrackEnds,
+    starts: TrackEnds,
+    gaps: GapLimits,
+    context: EndContext | None = None,
+    *,
+    open_end: Mask | None = None,
+    open_start: Mask | None = None,
+) -> ClosedGaps:
+    """Join tracks that continue each other over a gap.
+
+    Parameters
+    ----------
+    ids
+        (tracks,) ascending.
+    ends, starts
+        Of each track.
+    gaps
+        The longest gaps.
+    context
+        None: from motion alone.
+    open_end, open_start
+        (tracks,) whether each end, or start, may be joined; None: all.
+    """
+    pairs, cost = _candidates(ends, starts, gaps)
+    if open_end is not None and open_start is not None:
+        may = open_end[pairs[:, 0]] & open_start[pairs[:, 1]]
+        pairs, cost = pairs[may], cost[may]
+    alone = np.full((2, len(ids)), _ALONE_COST)
+    if context is not None:
+        alone += _VANISHED_COST * np.stack([context.end_vanishes, context.start_vanishes])
+        cost = cost + _cost_of_looks(context.end_looks[pairs[:, 0]], context.start_looks[pairs[:, 1]])
+    joined, margin = _assign(pairs, alone[0, pairs[:, 0]] + alone[1, pairs[:, 1]] - cost)
+    probability = 1 / (1 + np.exp(-_CERTAINTY_OFFSET - _CERTAINTY_SLOPE * margin))
+    if context is not None:
+        sure = probability >= _MIN_PROBABILITY
+        joined, probability = joined[sure], probability[sure]
+    tracks = component_minimum(ids, joined)
+    joins = pd.DataFrame(
+        {
+            "track_id": tracks[joined[:, 0]],
+            "before": ids[joined[:, 0]],
+            "after": ids[joined[:, 1]],
+            "end_time_s": ends.time_s[joined[:, 0]],
+            "start_time_s": starts.time_s[joined[:, 1]],
+            "probability": probability,
+        }
+    )
+    return ClosedGaps(tracks, joins.sort_values(["end_time_s", "before"], ignore_index=True))
+
+
+def find_ends(tracklets: pd.DataFrame, track: IntArray, count: int, gsd_m: float | None) -> tuple[TrackEnds, TrackEnds]:
+    """Starts and ends of tracks, from `END_COLUMNS`; ``track`` (n,) is the index of each tracklet's, of ``count``."""
+    metres = PAPER_GSD_M if gsd_m is None else gsd_m
+    first, last = end_rows(tracklets, track, count)
+    return _ends(tracklets.iloc[first], "0", "01", metres), _ends(tracklets.iloc[last], "2", "12", metres)
+
+
+def end_rows(tracklets: pd.DataFrame, track: IntArray, count: int) -> tuple[IntArray, IntArray]:
+    """(count,) the first and the last tracklet of each track, whose index ``track`` (n,) gives."""
+    order = np.lexsort((tracklets["time_0_s"].to_numpy(), track))
+    first = order[np.searchsorted(track[order], np.arange(count))]
+    order = np.lexsort((tracklets["time_2_s"].to_numpy(), track))
+    return first, order[np.searchsorted(track[order], np.arange(count), side="right") - 1]
+
+
+def _cost_of_looks(before: FloatArray, after: FloatArray) -> FloatArray:
+    """A difference larger than usual costs, a smaller one gains."""
+    difference = looks_difference(before, after)
+    known = np.isfinite(difference)
+    if not known.any():
+        return np.zeros(len(difference))
+    excess = np.nan_to_num(difference) / _USUAL_LOOKS_DIFFERENCE - 1
+    return np.where(known, np.clip(_LOOKS_WEIGHT * excess, -_MAX_LOOKS_COST / 2, _MAX_LOOKS_COST), 0.0)
+
+
+def _ends(rows: pd.DataFrame, detection: str, link: str, metres: float) -> TrackEnds:
+    return TrackEnds(
+        rows[f"frame_{detection}"].to_numpy(np.int64),
+        rows[f"time_{detection}_s"].to_numpy(np.float64),
+        rows[[f"x_{detection}_px", f"y_{detection}_px"]].to_numpy(np.float64) * metres,
+        rows[[f"vx_{link}_px_per_s", f"vy_{link}_px_per_s"]].to_numpy(np.float64) * metres,
+    )
+
+
+def _candidates(ends: TrackEnds, starts: TrackEnds, gaps: GapLimits) -> tuple[IntArray, FloatArray]:
+    """(m, 2) ends and starts that may be one vehicle's, and the cost (m,) of joining each: 0 as predicted, 1 at the
+    tolerance, and a longer gap more."""
+    order = np.argsort(starts.time_s, kind="stable")
+    times = starts.time_s[order]
+    longest = max(gaps.moving_s, gaps.stationary_s, gaps.hidden_s)
+    low = np.searchsorted(times, ends.time_s, side="right")
+    high = np.searchsorted(times, ends.time_s + longest, side="right")
+    found = []
+    for end in np.flatnonzero(high > low).tolist():
+        start = order[low[end] : high[end]]
+        ways = (_cost_in_motion, _cost_of_stop, _cost_when_hidden)
+        cost = np.min([way(ends, starts, end, start, gaps) for way in ways], axis=0)
+        near = np.flatnonzero(np.isfinite(cost))
+        found.append(np.stack([cost[near], np.full(len(near), end), start[near]], axis=1))
+    table = np.concatenate(found) if found else np.empty((0, 3))
+    pairs = table[:, 1:].astype(np.int64)
+    rank = np.lexsort((pairs[:, 1], pairs[:, 0], table[:, 0]))
+    return pairs[rank], table[rank, 0]
+
+
+def _cost_in_motion(ends: TrackEnds, starts: TrackEnds, end: int, start: IntArray, gaps: GapLimits) -> FloatArray:
+    """Of gaps in which a vehicle drives on, its acceleration nearly constant; inf beyond the tolerance."""
+    gap = starts.time_s[start] - ends.time_s[end]
+    displacement = starts.position_m[start] - ends.position_m[end]
+    mean = (ends.velocity_m_per_s[end] + starts.velocity_m_per_s[start]) / 2
+    speed = np.hypot(*mean.T)
+    offset = np.hypot(*(displacement - mean * gap[:, None]).T)
+    nearest = np.maximum(_MAX_OFFSET_M, _HEADWAY_FRACTION * (_CAR_AND_GAP_M + _HEADWAY_S * speed))
+    relative = offset / np.minimum(_SLACK_M + _ACCELERATION_CHANGE_M_PER_S2 * gap**2 / 8, nearest)
+    return np.where((relative <= 1) & (gap <= gaps.moving_s), relative + _GAP_PENALTY_PER_S * gap, np.inf)
+
+
+def _cost_of_stop(ends: TrackEnds, starts: TrackEnds, end: int, start: IntArray, gaps: GapLimits) -> FloatArray:
+    """Of gaps in which a vehicle stops and sets off again, or stands throughout; inf beyond the tolerance.
+
+    It brakes from one velocity to rest and accelerates to the other along one line: how far that takes it follows from
+    the speeds, whatever the gap.
+    """
+    gap = starts.time_s[start] - ends.time_s[end]
+    displacement = starts.position_m[start] - ends.position_m[end]
+    before, after = ends.speed_m_per_s[end], starts.speed_m_per_s[start]
+    stands = (before < gaps.stationary_speed_m_per_s) & (after < gaps.stationary_speed_m_per_s)
+    standing = np.hypot(*displacement.T) / _STATIONARY_OFFSET_M
+    heading = ends.velocity_m_per_s[end] + starts.velocity_m_per_s[start]
+    heading = heading / np.maximum(np.hypot(*heading.T), 1e-9)[:, None]
+    expected = (before**2 + after**2) / (2 * _TYPICAL_ACCELERATION_M_PER_S2)
+    along = np.sum(displacement * heading, axis=1)
+    across = heading[:, 0] * displacement[:, 1] - heading[:, 1] * displacement[:, 0]
+    stopping = np.hypot(
+        (along - expected) / np.minimum(_SLACK_M + 0.5 * expected, _MAX_STOP_OFFSET_M), across / _SLACK_M
+    )
+    possible = (gap >= (before + after) / _MAX_ACCELERATION_M_PER_S2) & (
+        np.maximum(before, after) <= _MAX_STOP_SPEED_M_PER_S
+    )
+    possible &= along >= (before**2 + after**2) / (2 * _MAX_ACCELERATION_M_PER_S2) - _STOP_SLACK_M
+    relative = np.where(stands, standing, np.where(possible, stopping, np.inf))
+    return np.where((relative <= 1) & (gap <= gaps.stationary_s), relative + _STOP_COST, np.inf)
+
+
+def _cost_when_hidden(ends: TrackEnds, starts: TrackEnds, end: int, start: IntArray, gaps: GapLimits) -> FloatArray:
+    """Of gaps in which a vehicle keeps to its way at an unknown, moderate pace; inf where it cannot be.
+
+    A vehicle that is at rest on one side goes the way that the other side gives.
+    """
+    gap = starts.time_s[start] - ends.time_s[end]
+    displacement = starts.position_m[start] - ends.position_m[end]
+    distance = np.hypot(*displacement.T)
+    before, after = ends.speed_m_per_s[end], starts.speed_m_per_s[start]
+    heading = ends.velocity_m_per_s[end] + starts.velocity_m_per_s[start]
+    heading = heading / np.maximum(np.hypot(*heading.T), 1e-9)[:, None]
+    along = np.sum(displacement * heading, axis=1)
+    across = np.abs(heading[:, 0] * displacement[:, 1] - heading[:, 1] * displacement[:, 0])
+    bend = np.zeros(len(start))
+    for velocity, speed in ((ends.velocity_m_per_s[end], before), (starts.velocity_m_per_s[start], after)):
+        cos = np.sum(displacement * velocity, axis=1) / np.maximum(distance * speed, 1e-9)
+        directed = (speed > gaps.stationary_speed_m_per_s) & (distance > _CAR_AND_GAP_M / 2)
+        bend = np.where(directed, np.maximum(bend, np.arccos(np.clip(cos, -1, 1))), bend)
+    mean, pace = (before + after) / 2, along / np.maximum(gap, 1e-9)
+    relative = np.hypot(
+        (pace - mean) / (_PACE_SD_M_PER_S + _PACE_SD_FRACTION * mean) / 1.5,
+        across / (_LANE_OFFSET_M + _LANE_OFFSET_FRACTION * distance),
+    )
+    possible = (gap >= _MIN_HIDDEN_S) & (gap <= gaps.hidden_s) & (bend <= _MAX_BEND_RAD) & (relative <= 1.2)
+    possible &= (along > 0) & (pace <= np.maximum(before, after) + _FASTER_M_PER_S)
+    return np.where(possible, _HIDDEN_COST + relative + _HIDDEN_GAP_PENALTY_PER_S * gap, np.inf)
+
+
+def _assign(pairs: IntArray, gain: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Of candidate pairs (m, 2), each end with at most one start and the reverse, those of the greatest total gain.
+
+    Returns
+    -------
+    (k, 2) pairs, and (k,) by how much the total would be less without each.
+    """
+    pairs, gain = pairs[gain > 0], gain[gain > 0]
+    if not len(pairs):
+        return pairs, gain
+    ends, start_base = pairs[:, 0], int(pairs.max()) + 1
+    graph = coo_array((np.ones(len(pairs), np.int8), (ends, start_base + pairs[:, 1])), shape=(2 * start_base,) * 2)
+    _, label = connected_components(graph, directed=False)
+    group = label[ends]
+    order = np.argsort(group, kind="stable")
+    chosen, margins = [], []
+    for rows in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
+        end, row = np.unique(pairs[rows, 0], return_inverse=True)
+        start, column = np.unique(pairs[rows, 1], return_inverse=True)
+        table = np.zeros((len(end), len(start)))
+        table[row, column] = gain[rows]
+        best = np.stack(linear_sum_assignment(-table), axis=1)
+        best = best[table[best[:, 0], best[:, 1]] > 0]
+        chosen.append(np.column_stack([end[best[:, 0]], start[best[:, 1]]]))
+        margins.append(_margins(table, best))
+    return np.concatenate(chosen), np.concatenate(margins)
+
+
+def _margins(table: FloatArray, best: IntArray) -> FloatArray:
+    """By how much the total gain falls without each of the best pairs."""
+    own = table[best[:, 0], best[:, 1]]
+    if len(best) > _MAX_EXACT:
+        without = table.copy()
+        without[best[:, 0], best[:, 1]] = 0
+        return np.asarray(np.maximum(own - without[best[:, 0]].max(axis=1) - without[:, best[:, 1]].max(axis=0), 0))
+    total, margins = float(own.sum()), []
+    for row, column in best:
+        without = table.copy()
+        without[row, column] = 0
+        rows, columns = linear_sum_assignment(-without)
+        margins.append(total - float(without[rows, columns].sum()))
+    return np.array(margins)

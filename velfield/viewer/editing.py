@@ -1,0 +1,99 @@
+"""Servers of the pages that write: one page, the images it shows, and its requests, on this machine alone.
+
+They write only for requests with the token of the page they served, which another page in the same browser does not
+have, and one request at a time.
+"""
+
+import secrets
+import threading
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from schemas.arrays import GreyImage
+from velfield.errors import InputError
+from velfield.report.figures import png_bytes
+from velfield.report.viewer_page import page_is_built
+from velfield.viewer.server import headers_for, trusted_host_middleware
+
+if TYPE_CHECKING:
+    from starlette.applications import Starlette
+    from starlette.requests import Request
+    from starlette.routing import Route
+
+_MAX_BYTES = 16 * 2**20
+
+
+def editing_app(
+    page: Callable[[str], str],
+    images: Callable[[int], GreyImage | None],
+    requests: Mapping[str, Callable[[bytes], dict[str, Any]]],
+) -> "Starlette":
+    """The server of a page that writes.
+
+    Parameters
+    ----------
+    page
+        Returns the page's HTML, with this token in it.
+    images
+        Returns the k-th image that the page shows, (h, w) uint8; None where there is none.
+    requests
+        Path -> what answers a POST to it, by a JSON object. `InputError` and pydantic's errors become status 422.
+
+    Raises
+    ------
+    InputError
+        The page is not built.
+    """
+    from starlette.applications import Starlette
+    from starlette.exceptions import HTTPException
+    from starlette.responses import HTMLResponse, Response
+    from starlette.routing import Route
+
+    if not page_is_built():
+        raise InputError("the page is not built in this checkout: `make page`, then try again")
+    token = secrets.token_urlsafe(24)
+    alone = threading.Lock()
+
+    def show(_: "Request") -> HTMLResponse:
+        html = page(token)
+        return HTMLResponse(html, headers=headers_for(html))
+
+    def image(request: "Request") -> Response:
+        grey = images(request.path_params["number"])
+        if grey is None:
+            raise HTTPException(404)
+        return Response(png_bytes(grey), media_type="image/png", headers=headers_for(None))
+
+    routes = [Route("/", show), Route("/frame/{number:int}.png", image)]
+    routes += [_post_route(path, token, alone, answer) for path, answer in requests.items()]
+    return Starlette(routes=routes, middleware=[trusted_host_middleware()])
+
+
+def _post_route(path: str, token: str, alone: threading.Lock, answer: Callable[[bytes], dict[str, Any]]) -> "Route":
+    """POST to ``path``, for who has the token; answered in a thread, as it may take long."""
+    from pydantic import ValidationError
+    from starlette.concurrency import run_in_threadpool
+    from starlette.exceptions import HTTPException
+    from starlette.requests import Request
+    from starlette.responses import JSONResponse
+    from starlette.routing import Route
+
+    def answer_alone(body: bytes) -> dict[str, Any]:
+        with alone:
+            return answer(body)
+
+    async def post(request: Request) -> JSONResponse:
+        if not secrets.compare_digest(request.headers.get("x-token", "").encode(), token.encode()):
+            raise HTTPException(403, "the token is another server's: load the page again")
+        body = b""
+        async for part in request.stream():
+            body += part
+            if len(body) > _MAX_BYTES:
+                raise HTTPException(413)
+        try:
+            content = await run_in_threadpool(answer_alone, body)
+        except (ValidationError, InputError) as error:
+            raise HTTPException(422, str(InputError(str(error)))) from error
+        return JSONResponse(content, headers=headers_for(None))
+
+    return Route(path, post, methods=["POST"])

@@ -1,0 +1,96 @@
+"""Velocities drawn from the field for the page's animation: ``view/flow.bin``.
+
+Little-endian; n cells of `cell_side` px that vehicles passed, in raster order:
+
+    uint32    cell (n), row * columns + column
+    uint8     vehicles (n), the most at a pixel of the cell, 255 or more as 255
+    uint16    bin (n, 16), vy * bins + vx
+
+The 16 bins are a systematic sample of the sum of the histograms in the cell: a bin of weight w is among them
+floor(16 w) or ceil(16 w) times, so that one of them at random is a draw from the distribution, every mode of it.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.arrays import IntArray, Mask
+from schemas.flight import PAPER_GSD_M
+from velfield.run.stores import HISTOGRAM, FieldStore
+
+DRAWS = 16
+_SIDE_M = 0.8
+_MIN_MOVING_FRACTION = 0.1
+_MAX_CELLS = 2**22
+"""Of the whole grid, as the page has it in memory."""
+
+
+def cell_side(shape: tuple[int, int], gsd_m: float | None) -> int:
+    """Side of a cell, px: a power of two of 0.8 m or more, a quarter of a lane.
+
+    Examples
+    --------
+    >>> cell_side((2417, 3051), 0.23), cell_side((1000, 1000), 1.5)
+    (4, 1)
+    """
+    side = 1
+    while side * (gsd_m or PAPER_GSD_M) < _SIDE_M or shape[0] * shape[1] / side**2 > _MAX_CELLS:
+        side *= 2
+    return side
+
+
+def flow_bytes(store: FieldStore, *, gsd_m: float | None, stationary_speed_px_per_s: float) -> bytes:
+    """The file's content; of pixels that some vehicles drive over: nothing flows over what is parked."""
+    side = cell_side(store.shape, gsd_m)
+    count = np.where(_flowing(store, stationary_speed_px_per_s), store.layer("count"), 0)
+    columns, across = -(-store.shape[1] // side), store.tile // side
+    found = []
+    for row, column in store.stored_chunks(HISTOGRAM):
+        window = np.s_[row * store.tile : (row + 1) * store.tile, column * store.tile : (column + 1) * store.tile]
+        if not count[window].any():
+            continue
+        cells, vehicles, bins = _draw_tile(store.read_tile(row, column), count[window], side, across)
+        down, right = np.divmod(cells, across)
+        found.append(((row * across + down) * columns + column * across + right, vehicles, bins))
+    if not found:
+        return b""
+    cells, vehicles, bins = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    order = np.argsort(cells)
+    return (
+        cells[order].astype("<u4").tobytes()
+        + vehicles[order].clip(0, 255).astype(np.uint8).tobytes()
+        + bins[order].astype("<u2").tobytes()
+    )
+
+
+def _flowing(store: FieldStore, stationary_speed_px_per_s: float) -> Mask:
+    """Where the mode moves, or more than a tenth of the vehicles."""
+    moving = np.hypot(store.layer("modal_vx"), store.layer("modal_vy")) > stationary_speed_px_per_s
+    if "stationary_fraction" in store.layer_names():
+        moving |= store.layer("stationary_fraction") < 1 - _MIN_MOVING_FRACTION
+    return np.asarray(moving)
+
+
+def _draw_tile(
+    histogram: NDArray[np.int32], count: IntArray, side: int, across: int
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Cells of a tile, row * across + column, the vehicles of each, and its bins (n, DRAWS)."""
+    y, x = np.nonzero(count)
+    of_pixel = (y // side) * across + x // side
+    order = np.argsort(of_pixel, kind="stable")
+    cell, first = np.unique(of_pixel[order], return_index=True)
+    y, x = y[order], x[order]
+    total = np.add.reduceat(histogram[y, x].reshape(len(y), -1), first, axis=0, dtype=np.int64)
+    return cell, np.maximum.reduceat(count[y, x], first), draw_bins(total)
+
+
+def draw_bins(weights: IntArray) -> IntArray:
+    """(n, DRAWS) systematic sample of bins with these weights (n, bins), each row with some.
+
+    Examples
+    --------
+    >>> np.bincount(draw_bins(np.array([[3, 0, 1]]))[0]).tolist()
+    [12, 0, 4]
+    """
+    cumulative = np.cumsum(weights, axis=1)
+    at = (np.arange(DRAWS) + 0.5) / DRAWS * cumulative[:, -1:]
+    return np.stack([np.searchsorted(row, where, side="right") for row, where in zip(cumulative, at, strict=True)])
