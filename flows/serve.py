@@ -23,7 +23,7 @@ from flows.console import print_with_time
 from flows.launch import PAGES, PAGES_OF
 from flows.stopping import as_ctrl_c, end_children, end_children_when_killed
 from velfield.errors import InputError
-from velfield.pipeline.watch import FolderWatcher
+from velfield.pipeline.watch import FolderWatcher, is_flight
 
 if TYPE_CHECKING:
     from prefect.deployments.runner import RunnerDeployment
@@ -220,6 +220,9 @@ def watching(config: ServeConfig) -> Iterator[None]:
     from prefect.events import emit_event
 
     def flight(path: Path) -> None:
+        if not is_flight(path):  # subtitles, thumbnails and proxies that a drone writes beside a video
+            print_with_time(f"{path.name} has arrived: neither a video nor a folder, not processed")
+            return
         print_with_time(f"{path.name} has arrived: processing")
         _resource = {"prefect.resource.id": f"velfield.flight.{path.name}"}
         emit_event(FLIGHT_ARRIVED, resource=_resource, payload={"source": str(path.resolve())})

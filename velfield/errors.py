@@ -1,7 +1,9 @@
 """What goes wrong: bad input, a damaged run, a full disk, a frame or chunk that cannot be done; and two warnings."""
 
 import errno
+import json
 from dataclasses import dataclass
+from typing import Any
 
 _LONGEST = 1200
 """Characters of a message: what was found may itself be a megabyte on one line."""
@@ -46,6 +48,25 @@ def is_disk_full(error: BaseException) -> bool:
     (True, False)
     """
     return isinstance(error, OSError) and error.errno in _FULL
+
+
+def parse_json(data: str | bytes) -> Any:
+    """What JSON says, of a file that anyone may have written.
+
+    Raises
+    ------
+    ValueError
+        It is not JSON, or arrays and objects lie too deep in each other.
+
+    Examples
+    --------
+    >>> parse_json('{"a": 1}')
+    {'a': 1}
+    """
+    try:
+        return json.loads(data)
+    except RecursionError:
+        raise ValueError("arrays and objects lie too deep in each other") from None
 
 
 @dataclass(frozen=True)

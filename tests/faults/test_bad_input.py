@@ -52,6 +52,13 @@ def test_any_json(name: str, content: object, by_name: dict[str, Kind], folder: 
     assert problem_of_case(by_name[name], json.dumps(content).encode(), folder) == ""
 
 
+@pytest.mark.parametrize("name", ["configuration", "labels (JSON)", "detector", "flight record", "cluster"])
+@pytest.mark.parametrize("whole", [True, False])
+def test_arrays_without_end_are_refused(name: str, whole: bool, by_name: dict[str, Kind], folder: Path) -> None:
+    data = b"[" * 100_000 + (b"]" * 100_000 if whole else b"")
+    assert problem_of_case(by_name[name], data, folder) == ""
+
+
 def test_an_onnx_model_brings_no_files_shapes_or_operators_of_its_own(by_name: dict[str, Kind], folder: Path) -> None:
     """Its weights in another file, of a huge shape, with an operator of its own: read or refused, and nothing run."""
     kind = by_name["detector"]

@@ -22,7 +22,7 @@ import psutil
 import pytest
 import yaml
 
-from flows.serve import ServeConfig, check, deployments, settings
+from flows.serve import ServeConfig, check, deployments, settings, watching
 from schemas.summary import RunSummary
 from tests.browser import browser
 from velfield.errors import InputError
@@ -85,6 +85,27 @@ def test_an_arrival_is_reported_once_when_it_no_longer_grows(tmp_path: Path) -> 
     watch.poll(11.0)
     watch.poll(99.0)
     assert text == ["new.mp4"]
+
+
+def test_what_a_drone_writes_beside_a_video_is_no_flight(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = ServeConfig(tmp_path, settle_s=0.0)
+    for folder in (config.incoming, config.base_images):
+        folder.mkdir(parents=True)
+    emitted: list[str] = []
+    monkeypatch.setattr("prefect.events.emit_event", lambda _name, *, payload, **_: emitted.append(payload["source"]))
+    monkeypatch.setattr("flows.serve._POLL_INTERVAL_S", 0.01)
+    with watching(config):
+        for name in ("DJI_0001.SRT", "DJI_0001.LRF", "DJI_0001.MP4"):
+            (config.incoming / name).write_bytes(b"1")
+        until = time.monotonic() + 20
+        text = ""
+        while text.count("arrived") < 3 and time.monotonic() < until:
+            time.sleep(0.01)
+            text += capsys.readouterr().out
+    assert [Path(source).name for source in emitted] == ["DJI_0001.MP4"]
+    assert "DJI_0001.SRT has arrived: neither a video nor a folder, not processed" in text
 
 
 def test_a_dropped_folder_is_read_by_its_names(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ Another one is a package ``velfield/detection/<method>`` whose module ``detector
 ``DetectorRecord``.
 """
 
-import json
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -35,7 +34,7 @@ from schemas.detector import (
 )
 from schemas.renames import OLD_NAMES_UNTIL, upgrade_detector
 from velfield.detection.frame import SearchableFrame
-from velfield.errors import InputError, OldNameWarning
+from velfield.errors import InputError, OldNameWarning, parse_json
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -311,7 +310,7 @@ def shipped_detector() -> Detector:
 
 def _parse(data: bytes, name: str) -> Detector:
     try:
-        content = json.loads(data)
+        content = parse_json(data)
         if isinstance(content, dict) and content.get("version") == 1:
             content = upgrade_detector(content)
             warnings.warn(

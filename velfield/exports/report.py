@@ -7,7 +7,7 @@ from schemas.export import ExportOptions
 from schemas.records import FORMAT_VERSION
 from schemas.renames import upgrade_record
 from schemas.report import Report
-from velfield.errors import InputError
+from velfield.errors import InputError, parse_json
 from velfield.report.report import render_report
 from velfield.report.run_figures import report_figures
 from velfield.run.layout import RunLayout
@@ -28,7 +28,7 @@ def _read_report(layout: RunLayout) -> Report:
     path = layout.report_record
     if not path.exists():
         raise InputError(f"{path} is not there: the run was not finished, or an older velfield wrote it; run it again")
-    record = json.loads(path.read_bytes())
+    record = parse_json(path.read_bytes())
     if layout.format_version != FORMAT_VERSION:
         record = upgrade_record("report", record)
         if record.get("detection"):

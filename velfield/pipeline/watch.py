@@ -31,6 +31,17 @@ def run_name(drop: Path) -> str:
     return name
 
 
+def is_flight(drop: Path) -> bool:
+    """Whether what arrived is processed: a folder, or a file that is a video by its suffix.
+
+    Examples
+    --------
+    >>> is_flight(Path("incoming/DJI_0001.MP4")), is_flight(Path("incoming/DJI_0001.SRT"))
+    (True, False)
+    """
+    return drop.is_dir() or drop.suffix.lower() in VIDEOS
+
+
 def inputs_of(drop: Path) -> tuple[Inputs, Path | None]:
     """The inputs of `velfield run` for a flight, and its configuration file.
 

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ValidationError
 
 from schemas.records import FORMAT_VERSION, CommitRecord, SealedRecord
 from schemas.renames import upgrade_record
+from velfield.errors import parse_json
 from velfield.run.layout import RunLayout, is_remote
 
 _WHOLE_FILE_BYTES = 256 * 2**20
@@ -122,7 +123,7 @@ def read_sealed(data: bytes) -> dict[str, Any]:
     >>> read_sealed(b'{"stage": "lens"}')
     {'stage': 'lens'}
     """
-    content = json.loads(data)
+    content = parse_json(data)
     if not isinstance(content, dict):
         raise ValueError("not an object")
     found = content.pop(_DIGEST, None)

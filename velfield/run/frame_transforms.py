@@ -7,7 +7,6 @@ only once.
 The base image of a run and the grid of its pixels.
 """
 
-import json
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -27,7 +26,7 @@ from schemas.records import (
 )
 from schemas.renames import upgrade_record
 from velfield.camera.lens import Lens, lens_from_record
-from velfield.errors import InputError
+from velfield.errors import InputError, parse_json
 from velfield.registration.base_mesh import BaseMesh
 from velfield.registration.mesh import Support, sample_cells
 from velfield.registration.transforms import (
@@ -102,7 +101,7 @@ def read_working(layout: RunLayout) -> WorkingRecord:
     data = layout.working.read_bytes()
     if layout.format_version == FORMAT_VERSION:
         return WorkingRecord.model_validate_json(data)
-    return WorkingRecord.model_validate(upgrade_record("working", json.loads(data)))
+    return WorkingRecord.model_validate(upgrade_record("working", parse_json(data)))
 
 
 def read_base_image(layout: RunLayout, config: FramesConfig) -> GreyImage:
@@ -139,7 +138,7 @@ def heading_deg(direction_rad: FloatArray, north_rad: float | None) -> FloatArra
 def _parse_grid(data: bytes, format_version: int) -> GridRecord:
     if format_version == FORMAT_VERSION:
         return GridRecord.model_validate_json(data)
-    return GridRecord.model_validate(upgrade_record("grid", json.loads(data)))
+    return GridRecord.model_validate(upgrade_record("grid", parse_json(data)))
 
 
 def read_lens(layout: RunLayout) -> Lens:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import psutil
 
-from velfield.errors import InputError
+from velfield.errors import InputError, parse_json
 from velfield.run.file_lock import try_lock
 from velfield.run.layout import RunLayout, is_remote
 
@@ -139,7 +139,7 @@ def _leased(path: "S3ObjectPath", name: str) -> Iterator[None]:
 def holder_is_gone(layout: RunLayout) -> bool:
     """Whether the process that last held the lock was one of this machine and has ended, perhaps killed."""
     try:
-        record = json.loads(layout.lock.read_text(encoding="utf-8"))
+        record = parse_json(layout.lock.read_text(encoding="utf-8"))
         return bool(record["host"] == socket.gethostname()) and not _is_running(int(record["pid"]))
     except (OSError, ValueError, KeyError, TypeError):
         return False
@@ -148,7 +148,7 @@ def holder_is_gone(layout: RunLayout) -> bool:
 def _is_expired(text: str) -> bool:
     """Whether the writer of the record is gone: it was not renewed in time, or its process on this machine ended."""
     try:
-        record = json.loads(text)
+        record = parse_json(text)
         gone = record["host"] == socket.gethostname() and not _is_running(int(record["pid"]))
         return gone or time.time() > float(record["until_s"])
     except (ValueError, KeyError):
@@ -161,7 +161,7 @@ def _is_running(pid: int) -> bool:
 
 def _refusal(name: str, text: str) -> str:
     try:
-        record = json.loads(text)
+        record = parse_json(text)
         holder = f"pid {record['pid']} on {record['host']} since {record['since']}"
     except (ValueError, KeyError):
         holder = "another process"

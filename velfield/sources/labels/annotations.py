@@ -4,12 +4,11 @@ All but GeoJSON have the origin at the first pixel's corner; ours is its centre,
 """
 
 import csv
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from velfield.errors import InputError
+from velfield.errors import InputError, parse_json
 from velfield.sources.frames import SourceInfo
 from velfield.sources.labels.boxes import Annotation, Point, boxes_from_annotations
 from velfield.sources.labels.yolo import Box
@@ -47,8 +46,8 @@ def read_annotations(path: Path, info: SourceInfo) -> tuple[list[Box], list[str]
 
 def _parse(path: Path) -> Parsed:
     try:
-        content = json.loads(read_text(path, "labels"))
-    except (json.JSONDecodeError, RecursionError) as error:
+        content = parse_json(read_text(path, "labels"))
+    except ValueError as error:
         raise InputError(f"{path.name}: found no JSON ({str(error)[:60]}), expected labels; save it again") from None
     reader = _find_reader(content)
     if reader is None:
@@ -143,9 +142,9 @@ def _via_csv(path: Path) -> Parsed:
     try:
         for row in csv.DictReader(read_text(path, "VIA labels").splitlines()):
             images.append(row["filename"])
-            shape = json.loads(row["region_shape_attributes"] or "{}")
+            shape = parse_json(row["region_shape_attributes"] or "{}")
             if shape:
-                name = _via_name(json.loads(row.get("region_attributes") or "{}"))
+                name = _via_name(parse_json(row.get("region_attributes") or "{}"))
                 annotations.append(Annotation(row["filename"], name, _via_points(shape)))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
