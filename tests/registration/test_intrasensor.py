@@ -1,6 +1,7 @@
 """Registration of simulated flights against the truth, and of frames that cannot be registered."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache, partial
 
 import cv2
@@ -10,16 +11,18 @@ import pytest
 from schemas.flight import RegistrationConfig
 from schemas.simulation import CameraSimulation, OtherSensorSimulation
 from velfield.camera.lens import HarrisLens
-from velfield.registration.alignment import align_patches, make_templates, smooth_fine
+from velfield.registration.alignment import Templates, align_patches, make_templates, smooth_fine
 from velfield.registration.intrasensor import (
     BaseReference,
     FrameRegistration,
     _ChainFrame,
+    _FrameFitter,
     _PatchHistory,
     map_keypoints,
     prepare_base,
     register_chain,
 )
+from velfield.registration.joint import ControlPoints, JointFit
 from velfield.registration.keypoints import Keypoints, detect_keypoints
 from velfield.registration.own_base import build_own_base
 from velfield.synthetic.cases import FLAT, PINHOLE, small_flight
@@ -128,6 +131,36 @@ def test_patches_are_looked_for_farther_off_where_key_points_mislead() -> None:
     beside = Keypoints(keypoints.xy + np.array([3.0, -3.0]), keypoints.descriptors)
     results = register_chain([(0, grey, lambda: beside)], base_of("still"), lens_of(flight_of("still")), CONFIG)
     assert errors_px("still", results)[0] < 0.1
+
+
+def test_rows_pulled_off_by_few_matches_are_fitted_again_from_their_neighbours() -> None:
+    """A spline pulled off by 4 px over an eighth of the rows, where the right patches are out of reach."""
+    fitter, (_, fit), templates, fine = fitted("city")
+    rows = fit.transform.row_coefficients.copy()
+    rows[1, 18:24] -= 4.0
+    pulled_rows = replace(fit.transform, row_coefficients=rows)
+    aligned, _ = align_patches(fine, pulled_rows, templates, coarse=False, max_shift_px=2.5)
+    pulled = fitter._fit(aligned, pulled_rows.polyprojective, replace(fit, transform=pulled_rows))
+    grid = np.column_stack([np.full(60, 300.0), np.linspace(160, 270, 60)])
+    good = fit.transform.to_base(grid)
+    assert np.abs(pulled.transform.to_base(grid) - good).max() > 1.2
+    _, refitted = fitter._bridge_weak_rows(aligned, pulled, templates, fine)
+    assert np.abs(refitted.transform.to_base(grid) - good).max() < 0.1
+
+
+@pytest.mark.parametrize("kind", ["still", "city", "wobble"])
+def test_a_right_fit_stays_as_it_is(kind: str) -> None:
+    fitter, (points, fit), templates, fine = fitted(kind)
+    assert fitter._bridge_weak_rows(points, fit, templates, fine)[1] is fit
+
+
+def fitted(kind: str) -> tuple[_FrameFitter, tuple[ControlPoints, JointFit], Templates, np.ndarray]:
+    """The fit of the first frame with what it was made of."""
+    (grey, _), base, lens = seen(kind, 0), base_of(kind), lens_of(flight_of(kind))
+    result = registered(kind, [0])[0]
+    fitter, points = _FrameFitter(grey, base, lens, CONFIG), result.control_points
+    fit = fitter._fit(points, result.transform.polyprojective)
+    return fitter, (points, fit), base.templates, smooth_fine(grey)
 
 
 def test_result_is_the_same_however_the_flight_is_cut() -> None:

@@ -148,7 +148,7 @@ STAGES: tuple[Stage, ...] = (
     # Calibrate from edge points and control points of frames spread over the flight.
     Stage(
         name="lens",
-        version=7,
+        version=8,
         label="lens",
         lines=(
             Line("no significant distortion; pinhole model used", lambda counts: not counts.get("corner_px")),
@@ -166,7 +166,7 @@ STAGES: tuple[Stage, ...] = (
     # Key points of spread frames, two passes to their median; or the registration of a given image.
     Stage(
         name="base",
-        version=6,
+        version=7,
         label="base image",
         lines=(
             Line(
@@ -188,7 +188,7 @@ STAGES: tuple[Stage, ...] = (
     # The chain over the unit's frames.
     Stage(
         name="registration",
-        version=8,
+        version=9,
         label="registration",
         lines=(
             Line("{registered:.0f} of {frames:.0f} frames registered, hold-out registration error {heldout_px:.2f} px"),

@@ -82,6 +82,9 @@ _RETEST_FRAMES = 8
 sensor's image never align, and those take the most iterations."""
 _SETTLED_PX = 0.2
 """Where a fit to aligned patches moves 95 % of them by less than this, they are not aligned again."""
+_WEAK_FRACTION, _MIN_TRIED = 0.5, 20
+"""A band of rows is fitted again from its neighbours if a smaller part of its patches are inliers than in the typical
+band, of as many patches at least."""
 _MIN_ALIGNED_FRACTION = 0.15
 """If a smaller fraction of the patches aligns, the prior was wrong: the frame is not registered."""
 _FLOW_SIGMA_PX = 0.7
@@ -503,7 +506,52 @@ class _FrameFitter:
             fit = refit
             if not is_coarse and np.quantile(np.hypot(*moved.T), 0.95) < _SETTLED_PX:
                 break
-        return used, fit
+        return self._bridge_weak_rows(used, fit, templates, fine) if chosen is None else (used, fit)
+
+    def _bridge_weak_rows(
+        self, used: ControlPoints, fit: JointFit, templates: Templates, fine: Float32Array
+    ) -> tuple[ControlPoints, JointFit]:
+        """The fit, or one through other alignments where rows have few inliers, if more patches agree with that.
+
+        The spline may bend to a band of rows of which the roofs match and little else: aligned from there, the ground
+        is out of reach, and some roofs confirm the bend. So the band's rows are interpolated from its neighbours, and
+        the patches are aligned again from there.
+        """
+        knots = count_row_knots(self.config)
+        weak = self._weak_rows(used, fit, templates, knots) if knots else np.zeros(0, bool)
+        if not weak.any() or weak.all():
+            return used, fit
+        rows = fit.transform.row_coefficients.copy()
+        for part in rows:
+            part[weak] = np.interp(np.flatnonzero(weak), np.flatnonzero(~weak), part[~weak])
+        bridged = replace(fit, transform=replace(fit.transform, row_coefficients=rows))
+        aligned, _ = align_patches(fine, bridged.transform, templates, coarse=False, max_shift_px=_FINE_SHIFT_PX)
+        again = aligned.concatenate(_select_in_empty_cells(used, aligned, *self.size))
+        refit = self._fit(again, bridged.transform.polyprojective, bridged)
+        if isinstance(refit, Failure):
+            return used, fit
+        before, after = (
+            int(weak[self._row_band(points.xy_raw[one.inliers], knots)].sum())
+            for points, one in ((used, fit), (again, refit))
+        )
+        return (again, refit) if after > before else (used, fit)
+
+    def _weak_rows(self, used: ControlPoints, fit: JointFit, templates: Templates, knots: int) -> Mask:
+        """Bands of rows (knots,) where far fewer patches are inliers than in the typical band, and their neighbours."""
+        width, height = self.size
+        xy_raw = fit.transform.to_raw(templates.xy)
+        shown = ((xy_raw >= 0) & (xy_raw <= (width - 1, height - 1))).all(axis=1)
+        bands = [self._row_band(xy, knots) for xy in (xy_raw[shown], used.xy_raw[fit.inliers])]
+        tried, inliers = (np.convolve(np.bincount(band, minlength=knots), np.ones(3), "same") for band in bands)
+        enough = tried >= _MIN_TRIED
+        fraction = inliers / np.maximum(tried, 1.0)
+        typical = float(np.median(fraction[enough])) if enough.any() else 0.0
+        weak = enough & (fraction < _WEAK_FRACTION * typical)
+        return np.asarray(np.convolve(weak, np.ones(3), "same") > 0)
+
+    def _row_band(self, xy_raw: FloatArray, knots: int) -> IntArray:
+        """Band of rows (n,) of raw points, as many bands as knots."""
+        return np.clip((xy_raw[:, 1] + 0.5) / self.size[1] * knots, 0, knots - 1).astype(np.int64)
 
     def fit_with_case_deletion(self, points: ControlPoints) -> tuple[ControlPoints, JointFit] | Failure:
         """The paper's fit: polyprojective by case deletion on matched keypoints."""
