@@ -13,8 +13,9 @@ from velfield.detection.detect import (
     search_frame,
     split_into_boxes,
 )
-from velfield.detection.detector import Detections, shipped_detector
+from velfield.detection.detector import Detections, concatenate, shipped_detector
 from velfield.detection.frame import CELL_PX, ComparableFrame, half_resolution
+from velfield.detection.mosaic import find_in_boxes, pack_boxes
 
 _SHAPE = 300, 420
 
@@ -71,6 +72,35 @@ def test_what_only_one_frame_covers_is_a_change() -> None:
     changed = changed_cells(frame(ground(1)), frame(ground(2), valid))
     assert changed[:, : 100 // CELL_PX].all()
     assert not changed[:, 100 // CELL_PX + 1 :].any()
+
+
+def test_an_edge_that_is_registered_a_fraction_of_a_pixel_off_is_no_change_and_a_car_beside_it_is() -> None:
+    bright = ground(1).astype(np.float64)
+    bright[:, 200:] += 90
+    shifted = ground(2).astype(np.float64)
+    shifted[:, 200:] += 90
+    shifted[:, 199] += 90 * 0.25  # a quarter of a pixel to the left
+    before, after = (np.clip(image, 0, 255).astype(np.uint8) for image in (bright, shifted))
+    assert not changed_cells(frame(after), frame(before)).any()
+    changed = changed_cells(frame(with_cars(after, [(208, 150)], level=60)), frame(before))
+    assert changed[150 // CELL_PX, 208 // CELL_PX]
+
+
+def test_what_is_found_in_a_mosaic_of_boxes_is_what_is_found_in_each_box() -> None:
+    image = with_cars(ground(3), [(30, 40), (100, 100), (300, 200), (215, 250), (410, 290)])
+    searched = frame(image)
+    boxes = [(0, 0, 5, 4), (5, 5, 9, 8), (11, 16, 14, 21), (14, 11, 19, 16), (17, 24, 19, 27)]
+    detector = shipped_detector()
+    mosaics = pack_boxes(boxes, detector.context_px)
+    assert sorted(number for one in mosaics for number in one.numbers) == [0, 1, 2, 3, 4]
+    taken = np.zeros(mosaics[0].shape, np.int64)
+    for row, column, height, width in mosaics[0].crops:
+        taken[row : row + height, column : column + width] += 1
+    assert taken.max() == 1, "crops do not overlap"
+    together = find_in_boxes(detector, searched, None, boxes, 0.0)
+    alone = [find_in_boxes(detector, searched, None, [box], 0.0) for box in boxes]
+    assert [len(one) for one in alone] == [1, 1, 1, 1, 1]
+    np.testing.assert_allclose(together.to_rows(), concatenate(alone).to_rows(), rtol=0, atol=1e-4)
 
 
 def test_frames_of_two_grids_are_refused() -> None:

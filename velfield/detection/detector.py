@@ -46,6 +46,10 @@ MIN_CARS = 8
 """Fewer labelled cars than this do not train a detector."""
 
 
+Crop = tuple[int, int, int, int]
+"""Of an image: first row, first column, height and width, px."""
+
+
 @dataclass(frozen=True)
 class Detections:
     """Cars of an image, in no order.
@@ -136,6 +140,21 @@ class Detector(ABC):
     ) -> Detections:
         """Candidates of a crop that has `context_px` on every side: what `refine` makes the detections of."""
         return self.detect(image, valid, background, threshold=threshold)
+
+    def find_in_crops(
+        self,
+        image: GreyImage,
+        valid: Mask | None,
+        background: GreyImage | None,
+        crops: Sequence[Crop],
+        *,
+        threshold: float | None = None,
+    ) -> Detections:
+        """Candidates of an image of crops side by side, each of which has `context_px` on every side.
+
+        A detector whose candidates depend on more than that takes each crop by itself.
+        """
+        return self.find(image, valid, background, threshold=threshold)
 
     def detect_raw(self, grey: GreyImage, *, threshold: float | None = None) -> "pd.DataFrame":
         """Boxes of cars in a raw frame, of a detector that `reads_raw_frames`.

@@ -48,7 +48,7 @@ def half_resolution(image: GreyImage) -> GreyImage:
     return np.asarray(cv2.resize(even, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ComparableFrame:
     """A frame that is there whole.
 

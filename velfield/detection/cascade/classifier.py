@@ -21,6 +21,7 @@ few lorries to train it.
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.resources import files
+from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
@@ -406,6 +407,17 @@ def shipped_long_vehicles() -> LongVehicleClassifier:
     return LongVehicleClassifier(LongVehicleRecord.model_validate_json(data))
 
 
+_features: WeakKeyDictionary[SearchableFrame, FeatureImage] = WeakKeyDictionary()
+
+
+def _long_features(frame: SearchableFrame) -> FeatureImage:
+    """Features of a frame at the scale `LONG`, made once: they are asked for twice."""
+    found = _features.get(frame)
+    if found is None:
+        found = _features[frame] = features_of_reduced(frame.half_image, None, LONG)
+    return found
+
+
 def centre_long_vehicles(
     frame: SearchableFrame, cars: FloatArray, car_length_px: float, settled: Mask | None = None
 ) -> FloatArray:
@@ -416,7 +428,7 @@ def centre_long_vehicles(
     long = shipped_long_vehicles()
     if car_length_px != long.record.working_car_length_px or (settled is not None and settled.all()):
         return cars
-    return long.centre(features_of_reduced(frame.half_image, None, LONG), cars, frame.half_valid, settled)
+    return long.centre(_long_features(frame), cars, frame.half_valid, settled)
 
 
 def confirm_long_vehicles(
@@ -430,7 +442,7 @@ def confirm_long_vehicles(
     long = shipped_long_vehicles()
     if car_length_px != long.record.working_car_length_px or not len(weak):
         return weak.take(np.empty(0, np.int64))
-    rows = long.confirm(features_of_reduced(frame.half_image, None, LONG), weak.to_rows(), frame.half_valid)
+    rows = long.confirm(_long_features(frame), weak.to_rows(), frame.half_valid)
     found = Detections.from_rows(rows[:, :5], rows[:, 5])
     on_car = np.zeros(len(found), bool)
     for k in range(len(found)):

@@ -33,6 +33,7 @@ from schemas.arrays import Float32Array, FloatArray, GreyImage, Mask
 from schemas.detector import LayerRecord, MotionRecord
 from schemas.flight import Device
 from velfield.detection.cnn.peaks import SMOOTHING_SIGMA, are_mostly_visible, find_peaks
+from velfield.detection.detector import Crop
 from velfield.detection.orientation import sample_nearest
 from velfield.errors import InputError
 
@@ -126,6 +127,8 @@ _TILE_PX, HALO_PX = 2048, 64
 BORDER_PX = 16
 """An image is continued so far by reflection, for cars at its edge: F1 0.837 in place of 0.833 on the minsk clip, cars
 that the edge cuts included; with 64 px 0.836."""
+_BATCH_PX = 500_000
+"""Of the crops that the network is run on at once: more no longer stays in the processor's cache."""
 _BORDER = cv2.BORDER_REFLECT_101
 _OPSET, _IR_VERSION = 17, 9
 """Of the ONNX files: what onnxruntime has read since 1.15."""
@@ -473,6 +476,41 @@ def predict_heatmap(
     return probability[: size[0], : size[1]], orientation[:, : size[0], : size[1]]
 
 
+def predict_crops(network: Network, image: GreyImage, crops: Sequence[Crop]) -> tuple[Float32Array, Float32Array]:
+    """The same of crops of an image, each predicted as if it were alone; those of one size in one call.
+
+    Parameters
+    ----------
+    image
+        (h, w) uint8, even.
+    crops
+        Disjoint, at multiples of `Network.alignment` and of such sizes.
+
+    Returns
+    -------
+    As of `predict_heatmap`; zero where no crop is.
+    """
+    probability = np.zeros((image.shape[0] // STRIDE, image.shape[1] // STRIDE), np.float32)
+    orientation = np.zeros((2, *probability.shape), np.float32)
+    by_size: dict[tuple[int, int], list[Crop]] = {}
+    for crop in crops:
+        by_size.setdefault(crop[2:], []).append(crop)
+    for (height, width), alike in by_size.items():
+        at_once = max(1, _BATCH_PX // (height * width))
+        for start in range(0, len(alike), at_once):
+            batch = alike[start : start + at_once]
+            pixels = np.stack([image[y : y + height, x : x + width] for y, x, _, _ in batch])
+            if len(batch) == 1:
+                heatmap, vector = predict_heatmap(network, pixels[0], border_px=0)
+                heatmaps, vectors = heatmap[None], vector[None]
+            else:
+                heatmaps, vectors = forward(network, pixels)
+            for k, (y, x, _, _) in enumerate(batch):
+                part = slice(y // STRIDE, (y + height) // STRIDE), slice(x // STRIDE, (x + width) // STRIDE)
+                probability[part], orientation[:, *part] = heatmaps[k], vectors[k]
+    return probability, orientation
+
+
 SCORE_OFFSET = 0.35
 """Probability predicted where a candidate is as often a car as not: around centres the loss lets the network predict
 less than it should. Scores are probabilities less this."""
@@ -502,15 +540,19 @@ def detect_cars(
     tta_range: tuple[float, float] = NO_TTA,
     *,
     border_px: int = BORDER_PX,
+    crops: Sequence[Crop] | None = None,
 ) -> FloatArray:
-    """Detect cars in a frame; a car may be detected several times, see `classifier.distinct`.
+    """Detect cars in a frame, or in an image of crops; a car may be detected several times, see `nms_oriented`.
 
     Returns
     -------
     (n, 5): x, y in working px, orientation (axial, [0, pi)), score (probability - `SCORE_OFFSET`), standard deviation
     of the orientation, rad.
     """
-    probability, orientation = predict_heatmap(network, image, border_px=border_px)
+    if crops is None:
+        probability, orientation = predict_heatmap(network, image, border_px=border_px)
+    else:
+        probability, orientation = predict_crops(network, image, crops)
     peaks = find_peaks(probability, orientation, valid, stride=STRIDE, min_probability=_MIN_PEAK_PROBABILITY)
     if not len(peaks):
         return np.empty((0, 5))
