@@ -13,7 +13,9 @@ give every control point its cross-validated residual, to first order: the frame
 0.104 in place of 0.101 px) and takes 1.3 in place of 0.1 s per fit, of which a frame needs three or four.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 
@@ -38,8 +40,9 @@ their weight. The second is for a refit."""
 _BENDING_SD = 0.05
 """Prior standard deviation of the second-order terms, in half-frames: far above what a lens leaves, it matters only
 where there are no control points."""
-_SELECT_STIFFNESS_AFTER = (1, 3)
-"""Steps after which the stiffness is selected again: fast row motion appears only once the slow one is fitted."""
+_SELECT_STIFFNESS_AFTER, _WARM_SELECT_AFTER = (1, 3), (3,)
+"""Steps after which the stiffness is selected again: fast row motion appears only once the slow one is fitted. The
+second is for a fit that starts from the stiffness of an earlier one."""
 _FINAL_STEPS = 2
 _INITIAL_STIFFNESS = (10.0, 1e4)
 """Stiffness of row shift and roll before the first selection."""
@@ -384,13 +387,14 @@ def _irls_annealed(
 ) -> tuple[FloatArray, FloatArray, float, tuple[float, float]]:
     """IRLS with a weight function that narrows from step to step: parameters, weights, scale and stiffness."""
     stiffness = start_stiffness or _INITIAL_STIFFNESS
-    widths = _ANNEALING if start_stiffness is None else _WARM_ANNEALING
+    cold = start_stiffness is None
+    widths = _ANNEALING if cold else _WARM_ANNEALING
     limit = start_scale_px / float(np.median(problem.sigma))
     weights, scale = _weights_and_scale(problem.residuals(theta), problem.sigma, widths[0], limit)
     for iteration, width in enumerate(widths):
         theta = _take_step(problem, theta, weights, scale, stiffness)
         weights, scale = _weights_and_scale(problem.residuals(theta), problem.sigma, width, limit)
-        if iteration in _SELECT_STIFFNESS_AFTER:
+        if iteration in (_SELECT_STIFFNESS_AFTER if cold else _WARM_SELECT_AFTER):
             stiffness = _select_stiffness(problem, theta, weights, scale, start_stiffness)
     for _ in range(_FINAL_STEPS):
         theta = _take_step(problem, theta, weights, scale, stiffness)
@@ -507,8 +511,14 @@ def _select_stiffness(
     shifts = _neighbours(_SHIFT_STIFFNESSES, None if earlier is None else earlier[0])
     rolls = _neighbours(_ROLL_STIFFNESSES, None if earlier is None else earlier[1])
     roll = _ROLL_STIFFNESSES[-1] if earlier is None else earlier[1]
-    shift, _ = _select_stiffest_near_best(problem, equations, theta, [(s, roll) for s in shifts])
-    return _select_stiffest_near_best(problem, equations, theta, [(shift, s) for s in rolls])
+    restricted = _restrict(problem, equations)
+
+    @cache
+    def squares(candidate: tuple[float, float]) -> float:
+        return _solve_without_folds(problem, restricted, theta, candidate)[0]
+
+    shift, _ = _select_stiffest_near_best([(s, roll) for s in shifts], squares)
+    return _select_stiffest_near_best([(shift, s) for s in rolls], squares)
 
 
 def _neighbours(candidates: tuple[float, ...], value: float | None) -> tuple[float, ...]:
@@ -520,14 +530,8 @@ def _neighbours(candidates: tuple[float, ...], value: float | None) -> tuple[flo
 
 
 def _select_stiffest_near_best(
-    problem: _Problem,
-    equations: tuple[FloatArray, FloatArray, FloatArray],
-    theta: FloatArray,
-    candidates: list[tuple[float, float]],
+    candidates: list[tuple[float, float]], squares: Callable[[tuple[float, float]], float]
 ) -> tuple[float, float]:
     """The stiffest candidate (the last: they are ordered) with about the minimum of cross-validated squares."""
-    restricted = _restrict(problem, equations)
-    squares = [_solve_without_folds(problem, restricted, theta, candidate)[0] for candidate in candidates]
-    return max(
-        candidate for candidate, value in zip(candidates, squares, strict=True) if value <= _MAX_CV_RATIO * min(squares)
-    )
+    limit = _MAX_CV_RATIO * min(map(squares, candidates))
+    return max(candidate for candidate in candidates if squares(candidate) <= limit)

@@ -274,26 +274,32 @@ def solve_cholesky(matrix, right):  # type: ignore[no-untyped-def]
 
     LAPACK is not used: its threads, several per worker thread of the pipeline, busy-wait on systems this small.
     """
-    p, m = right.shape
-    low = np.zeros((p, p))
-    for i in range(p):
-        for j in range(i):
-            low[i, j] = (matrix[i, j] - _dot(low[i], low[j], j)) / low[j, j]
-        rest = matrix[i, i] - _dot(low[i], low[i], i)
-        if not rest > 0.0:
-            return np.full((p, m), np.nan)
-        low[i, i] = np.sqrt(rest)
+    p, m = np.uint64(right.shape[0]), np.uint64(right.shape[1])  # unsigned: numba checks no index for its sign
+    one = np.uint64(1)
+    upper = matrix.copy()  # row by row from the diagonal on, so that the inner loops run along rows
+    for j in range(p):
+        if not upper[j, j] > 0.0:
+            return np.full(right.shape, np.nan)
+        inverse = 1.0 / np.sqrt(upper[j, j])
+        for k in range(j, p):
+            upper[j, k] *= inverse
+        for i in range(j + one, p):
+            factor = upper[j, i]
+            if factor != 0.0:  # a spline's knots far apart have nothing in common
+                for k in range(i, p):
+                    upper[i, k] -= factor * upper[j, k]
     out = right.copy()
     for c in range(m):
         for i in range(p):
-            total = out[i, c]
-            for k in range(i):
-                total -= low[i, k] * out[k, c]
-            out[i, c] = total / low[i, i]
-        for i in range(p - 1, -1, -1):
-            out[i, c] /= low[i, i]
-            for k in range(i):
-                out[k, c] -= low[i, k] * out[i, c]
+            out[i, c] /= upper[i, i]
+            for k in range(i + one, p):
+                out[k, c] -= upper[i, k] * out[i, c]
+        for j in range(p):
+            last = p - one - j
+            total = out[last, c]
+            for k in range(last + one, p):
+                total -= upper[last, k] * out[k, c]
+            out[last, c] = total / upper[last, last]
     return out
 
 
