@@ -182,6 +182,9 @@ class WorkingRecord(Model):
     """Whether ``base/background.npz`` holds the flight's background on the working grid."""
     labels: NonNegativeInt = 0
     """Training labels of the detector."""
+    vehicle_gsd_m: PositiveFloat | None = None
+    """Metres a base pixel by the median length of labels, boxes or moving objects, where nothing else gives the scale:
+    good enough for the limits of tracking."""
     label_precision_estimate: float | None = None
     """Estimated precision of the labels from motion."""
     axial_motion_fraction: float | None = None

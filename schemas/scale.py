@@ -38,9 +38,11 @@ class ScaleEstimate(Model):
         return self
 
     def text(self) -> str:
-        """The estimate in one line."""
-        interval = f"90 % interval {self.low_m:.3g} to {self.high_m:.3g}"
-        return f"{self.gsd_m:.4g} m a pixel ({interval}) by {_NAMES[self.source]}"
+        """The estimate in one line, with its interval where it has one."""
+        by = f"by {_NAMES[self.source]}"
+        if self.low_m == self.high_m:
+            return f"{self.gsd_m:.4g} m a pixel {by}"
+        return f"{self.gsd_m:.3g} m a pixel (90 % interval {self.low_m:.3g} to {self.high_m:.3g}) {by}"
 
 
 _NAMES: dict[ScaleSource, str] = {

@@ -92,6 +92,8 @@ class TrafficSimulation(Model):
     """Fraction of drivers who turn where they can."""
     large_share: NonNegativeFloat = Field(0.05, le=1)
     """Fraction of lorries and buses."""
+    car_length_m: PositiveFloat = Field(4.35, ge=3.5, le=5.5)
+    """Median length of cars, m: places and decades differ."""
     warm_up_s: NonNegativeFloat = 90.0
     """Simulated time before the first frame, s."""
 

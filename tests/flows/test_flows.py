@@ -110,11 +110,27 @@ def test_a_changed_gate_redoes_tracking_onward(whole: tuple[Path, RunSummary], f
     root = tmp_path / "copy"
     shutil.copytree(whole[0], root)
     changed = process(job(flight, root, "tracking.max_speed_m_per_s=5"))
-    assert redone(changed) == ["tracklets", "tracks", "field", "maps"]
+    assert redone(changed) == ["tracklets", "tracks", "scale", "field", "maps"]
     velocities = open_run(root).tracklets()[["vx_01_px_per_s", "vy_01_px_per_s"]]
     speeds = np.hypot(*velocities.to_numpy().T) * 0.23
     assert np.quantile(speeds, 0.99) < 10.5  # 5 m/s and what jitter adds
     assert speeds.max() < 14  # a position may be refined by a pixel or two after the gates
+
+
+def test_a_ground_sample_distance_given_later_keeps_what_does_not_depend_on_it(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
+) -> None:
+    root = tmp_path / "copy"
+    shutil.copytree(whole[0], root)
+    given = job(flight, root)
+    changed = process(given.model_copy(update={"config": given.config.model_copy(update={"gsd_m": 0.25})}))
+    assert redone(changed) == following_names("georeference")
+    assert open_run(root).grid.gsd_m == 0.25
+
+
+def following_names(first: str) -> list[str]:
+    names = list(STAGE)
+    return names[names.index(first) :]
 
 
 def test_a_detector_that_uses_the_background_gets_that_of_this_flight(

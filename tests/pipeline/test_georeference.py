@@ -20,8 +20,14 @@ from velfield.exports.georeference import Georeference
 from velfield.pipeline.georeference import georeference
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.stages.georeference import georeference_run
+from velfield.pipeline.stages.scale import scale_run
 from velfield.pipeline.verify import verify_run
-from velfield.run.frame_transforms import north_direction_rad, read_georeference
+from velfield.run.frame_transforms import (
+    north_direction_rad,
+    read_first_georeference,
+    read_georeference,
+    read_tracking_gsd,
+)
 from velfield.run.lineage import pixel_lineage
 from velfield.run.run import Run
 from velfield.synthetic.clip import simulate_telemetry, srt_text
@@ -79,7 +85,7 @@ def test_control_points_move_maps_exports_and_lineage(copied: Path, tmp_path: Pa
     assert verify_run(run.layout, run.record) == []
     record = read_georeference(run.layout)
     assert record is not None
-    assert [estimate.source for estimate in record.scale.others] == ["given"]
+    assert [estimate.source for estimate in record.scale.others] == ["given", "vehicles"]
     assert any("--gsd-m" in line for line in record.scale.disagreements)  # 0.23 was given
 
 
@@ -118,6 +124,34 @@ def test_a_drones_telemetry_gives_scale_north_and_place(
     assert chosen is not None
     assert isinstance(chosen.scale.used, ScaleEstimate)
     assert chosen.scale.used.source == "given"
+
+
+def test_the_lengths_of_vehicles_give_the_scale_and_contradict_a_wrong_one(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
+) -> None:
+    """The flight's base image has 0.23 m a pixel."""
+    shutil.copytree(whole[0], tmp_path / "run")
+    run = open_run(tmp_path / "run")
+    alone = made_plan(run, Inputs(source=str(flight / "frames")))
+    warnings = {}
+    for gsd_m in (None, 0.23, 0.23 * 1.2, 0.23 / 1.2):
+        job = alone.job.model_copy(update={"config": alone.config.model_copy(update={"gsd_m": gsd_m})})
+        plan = Plan(job, alone.info, alone.indices, alone.inputs, alone.keys)
+        georeference_run(plan)
+        assert read_georeference(run.layout) == read_first_georeference(run.layout)
+        warnings[gsd_m] = scale_run(plan).warnings
+        record = read_georeference(run.layout)
+        assert record is not None
+        assert record.scale.used is not None
+        assert record.scale.used.source == ("vehicles" if gsd_m is None else "given")
+        if gsd_m is None:
+            assert record.scale.used.gsd_m == pytest.approx(0.23, rel=0.06)
+            assert record.scale.used.low_m < 0.23 < record.scale.used.high_m
+            assert open_run(tmp_path / "run").grid.gsd_m == record.scale.used.gsd_m
+            assert read_tracking_gsd(run.layout) is None  # its detector was trained with --gsd-m
+    assert not warnings[None]
+    assert not warnings[0.23]
+    assert all("by the lengths of vehicles" in warnings[wrong][0] for wrong in (0.23 * 1.2, 0.23 / 1.2))
 
 
 def made_plan(run: Run, inputs: Inputs) -> Plan:

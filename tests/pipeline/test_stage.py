@@ -82,7 +82,7 @@ def changed_stages(setting: str) -> set[str]:
 
 READERS: dict[str, tuple[str, ...]] = {
     "preset": (),
-    "gsd_m": ("base",),
+    "gsd_m": ("georeference",),
     "frames": ("frames",),
     "lens": ("lens",),
     "base": ("base",),

@@ -13,9 +13,11 @@ from velfield.errors import Failure, InputError
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import Plan, make_plan
-from velfield.pipeline.stage import stages_before
+from velfield.pipeline.stage import STAGE, stages_before
 from velfield.pipeline.stages.base_image import build_base
-from velfield.pipeline.stages.registration import detect_unit_keypoints
+from velfield.pipeline.stages.georeference import georeference_run
+from velfield.pipeline.stages.registration import detect_unit_keypoints, register_unit
+from velfield.pipeline.units import prepare_stage
 from velfield.registration.intersensor import register_intersensor
 from velfield.run.frame_transforms import read_grid
 
@@ -67,9 +69,13 @@ def test_another_scale_is_related_to_gsd_m(base: np.ndarray, tmp_path: Path) -> 
     small = cv2.resize(base, None, fx=0.7, fy=0.7, interpolation=cv2.INTER_AREA)
     plan = plan_on(small, views(base), tmp_path, gsd_m=0.2)
     outcome = build_base(plan, [detect_unit_keypoints(plan, range(3))])
-    assert "--gsd-m 0.2 is the ground sample distance of the base image" in outcome.notes[0]
-    assert outcome.notes[0].endswith("that of the frames is 0.14 m")
     assert not outcome.warnings
+    prepare_stage(plan, STAGE["registration"])
+    register_unit(plan, range(3))
+    notes = [line for line in georeference_run(plan).notes if line.startswith("--gsd-m 0.2 is")]
+    assert notes == [
+        "--gsd-m 0.2 is the ground sample distance of the base image, that of the frames is 0.14 m",
+    ]
 
 
 def test_a_base_image_of_low_resolution_is_rejected_with_the_size_needed(base: np.ndarray, tmp_path: Path) -> None:

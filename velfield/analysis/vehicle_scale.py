@@ -20,6 +20,9 @@ MIN_VEHICLES = 20
 _CLASSES = ((0.84, np.log(CAR_LENGTH_M), 0.075), (0.08, np.log(5.5), 0.09), (0.06, np.log(9.5), 0.25))
 """Fraction, mean and standard deviation of the logarithm of the length, m: cars; vans; lorries and buses."""
 _OUTLIERS = 0.02
+TRACK_LENGTH_BIAS, TRACK_LENGTH_SD = 1.02, 0.015
+"""Of the lengths that are measured on tracks, over the true ones: their median over simulated flights, and how much the
+median of a flight scatters about it (seeds 901 to 905)."""
 _STEP = 0.004
 _Z = 1.645  # of a 90 % interval
 
@@ -63,6 +66,12 @@ def estimate_vehicle_scale(
         source="vehicles",
         note=f"{int(good.sum())} vehicles, of which the usual car is {CAR_LENGTH_M:g} m long",
     )
+
+
+def estimate_track_scale(length_px: FloatArray, length_sd_px: FloatArray) -> ScaleEstimate | None:
+    """`estimate_vehicle_scale` by the lengths of tracks (`velfield.tracking.dimensions`), without their bias."""
+    length = np.asarray(length_px, np.float64) / TRACK_LENGTH_BIAS
+    return estimate_vehicle_scale(length, length_sd_px, measurement_sd=TRACK_LENGTH_SD)
 
 
 def _log_likelihood(log_m: FloatArray, variance: FloatArray) -> float:

@@ -35,8 +35,8 @@ from velfield.pipeline.summary import summarise_stage
 from velfield.pipeline.units import WHOLE
 from velfield.run.commits import read_commits, write_atomically
 from velfield.run.flight_record import check_format
-from velfield.run.frame_transforms import read_georeference
-from velfield.run.layout import remove_tree, to_path
+from velfield.run.frame_transforms import read_first_georeference, read_georeference
+from velfield.run.layout import RunLayout, remove_tree, to_path
 from velfield.run.lock import locked
 from velfield.run.run import Run, open_run
 from velfield.sources.control_points import Model, fit_control_points
@@ -108,17 +108,24 @@ def georeference(
     with locked(run.layout):
         before_m, plan = run.grid.gsd_m, plan_of_finished(run)
         write_atomically(run.layout.control_points, fitted.model_dump_json(indent=1).encode())
+        first = _record(read_first_georeference(run.layout) or GeoreferenceRecord(), fitted)
         record = _record(read_georeference(run.layout) or GeoreferenceRecord(), fitted)
-        outputs = write_georeference(run.layout, record, plan.config.frames)
-        done = StageResult(outputs, georeference_counts(record), describe(record), georeference_warnings(record))
-        commit(plan, "georeference", WHOLE, done, started=time.time())
+        for stage, path, written in (
+            ("georeference", run.layout.georeference, first),
+            ("scale", run.layout.scale, record),
+        ):
+            outputs = write_georeference(run.layout, path, written, plan.config.frames)
+            counts = georeference_counts(written) | _vehicle_counts(run.layout, stage)
+            done = StageResult(outputs, counts, describe(written), georeference_warnings(written))
+            commit(plan, stage, WHOLE, done, started=time.time())
         changed = 1.0 if before_m is None else abs(fitted.gsd_m / before_m - 1)
         if changed > _SAME_SCALE:
             remove_tree(run.layout.field)
             compute_stages(plan, ("field",))
         compute_stages(plan, ("maps",))
         write_report(plan, _summary(plan))
-    return Georeferenced(fitted, record, tuple(_notes(before_m, fitted, changed)))
+        notes = [*_notes(before_m, fitted, changed), *_list_outdated(run.layout)]
+    return Georeferenced(fitted, record, tuple(notes))
 
 
 def open_finished_run(root: str | Path) -> Run:
@@ -154,6 +161,24 @@ def plan_of_finished(run: Run) -> Plan:
     )
     job = Job(root=str(run.layout.root), inputs=given, config=run.record.config)
     return Plan(job, info, np.arange(run.frames.count), run.record.inputs, run.record.keys)
+
+
+def _vehicle_counts(layout: RunLayout, stage: str) -> dict[str, float]:
+    """What the vehicles gave, as the stage counted it when it was computed."""
+    return {
+        key: value
+        for record in read_commits(layout, stage)
+        for key, value in record.counts.items()
+        if key in ("vehicles", "vehicle_gsd_m")
+    }
+
+
+def _list_outdated(layout: RunLayout) -> list[str]:
+    """What was made of the run with the place and scale before, and is not made again here."""
+    if not layout.analysis.exists():
+        return []
+    again = f"`velfield analyse {layout.root}`"
+    return [f"the analysis is of the place and scale before, as are files exported so far: run {again}, export again"]
 
 
 def _record(before: GeoreferenceRecord, points: ControlPointsRecord) -> GeoreferenceRecord:

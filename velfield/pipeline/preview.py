@@ -131,6 +131,9 @@ def _publish(layout: RunLayout, new: RunLayout, *, with_tracks: bool) -> None:
     tracks = [(new.tracks, layout.tracks)] if with_tracks else []
     for source, target in (*tracks, (new.field, layout.field), (new.view, layout.view), (new.maps, layout.maps)):
         _replace_tree(source, target)
+    if new.scale.exists():
+        layout.base.mkdir(exist_ok=True)
+        new.scale.replace(layout.scale)  # that of the field and the page
     new.report.replace(layout.report)
     remove_tree(new.root)
 

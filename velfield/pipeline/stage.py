@@ -181,7 +181,7 @@ STAGES: tuple[Stage, ...] = (
         unit=f"{_STAGES}.base_image:build_base",
         after=("frames", "lens"),
         inputs=("base", "detections"),
-        config=("base", "registration", "gsd_m"),
+        config=("base", "registration"),
         new_base=NewBase.MAPPED,
         remap=f"{_STAGES}.rebase:rebase_image",
     ),
@@ -206,14 +206,14 @@ STAGES: tuple[Stage, ...] = (
     # Scale, north and place of the base image: by its own reference system, --gsd-m, control points and telemetry.
     Stage(
         name="georeference",
-        version=1,
+        version=2,
         label="georeference",
         lines=(
             Line("{gsd_m:.4g} m a pixel by control points", lambda counts: bool(counts.get("by_control_points"))),
             Line("{gsd_m:.4g} m a pixel by the base image", lambda counts: bool(counts.get("by_base"))),
             Line("{gsd_m:.4g} m a pixel as given", lambda counts: bool(counts.get("by_given"))),
             Line("{gsd_m:.4g} m a pixel by the drone's metadata", lambda counts: bool(counts.get("by_metadata"))),
-            Line("no source knows the scale: speeds in px/s, unless --gsd-m is given"),
+            Line("the scale is not known yet: it will be estimated by the lengths of vehicles"),
         ),
         unit=f"{_STAGES}.georeference:georeference_run",
         after=("frames", "base", "registration"),
@@ -225,7 +225,7 @@ STAGES: tuple[Stage, ...] = (
     # Labels and training, from labelled frames or from what moves; or a given detector.
     Stage(
         name="detector",
-        version=17,
+        version=18,
         label="detector",
         lines=(
             Line("skipped: external detections", lambda counts: bool(counts) and "threshold" not in counts),
@@ -262,7 +262,7 @@ STAGES: tuple[Stage, ...] = (
     # Windows of three frames that start in the unit; they reach into the unit after.
     Stage(
         name="tracklets",
-        version=1,
+        version=2,
         label="tracklets",
         lines=(Line("{tracklets:.0f} tracklets over three frames"),),
         unit=f"{_STAGES}.tracklets:link_unit",
@@ -292,6 +292,30 @@ STAGES: tuple[Stage, ...] = (
         new_base=NewBase.MAPPED,
         remap=f"{_STAGES}.rebase:rebase_tracks",
     ),
+    # Scale, north and place again, with the lengths of the vehicles.
+    Stage(
+        name="scale",
+        version=1,
+        label="scale",
+        lines=(
+            Line(
+                "{gsd_m:.3g} m a pixel by the lengths of {vehicles:.0f} vehicles",
+                lambda counts: "by_vehicles" in counts,
+            ),
+            Line(
+                "{gsd_m:.4g} m a pixel; by the lengths of {vehicles:.0f} vehicles {vehicle_gsd_m:.3g}",
+                lambda counts: "gsd_m" in counts and "vehicle_gsd_m" in counts,
+            ),
+            Line("{gsd_m:.4g} m a pixel; too few vehicles to check it", lambda counts: "gsd_m" in counts),
+            Line("{vehicles:.0f} vehicles are too few to know the scale: speeds in px/s; give --gsd-m"),
+        ),
+        unit=f"{_STAGES}.scale:scale_run",
+        after=("georeference", "tracks"),
+        inputs=("telemetry",),
+        config=("gsd_m",),
+        new_base=NewBase.MAPPED,
+        remap=f"{_STAGES}.rebase:rebase_scale",
+    ),
     # The velocity histogram of a block of tiles, from the segments that reach it.
     Stage(
         name="field",
@@ -302,7 +326,7 @@ STAGES: tuple[Stage, ...] = (
         tiles=f"{_STAGES}.field:field_blocks",
         unit=f"{_STAGES}.field:accumulate_block",
         store="field.zarr",
-        after=("tracks",),
+        after=("tracks", "scale"),
         config=("field",),
         cut=Cut.BY_TILES,
     ),

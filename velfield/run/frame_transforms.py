@@ -42,7 +42,7 @@ from velfield.run.stores import RegistrationStore, open_frames, open_registratio
 
 
 def read_grid(layout: RunLayout) -> GridRecord:
-    """The grid of base pixels: ``base/grid.json``, with scale, north and place by ``base/georeference.json``.
+    """The grid of base pixels: ``base/grid.json``, with scale, north and place by `read_georeference`.
 
     Raises
     ------
@@ -56,13 +56,37 @@ def read_grid(layout: RunLayout) -> GridRecord:
     return grid if record is None else _apply_georeference(grid, record)
 
 
+def read_first_grid(layout: RunLayout) -> GridRecord:
+    """The grid of base pixels as it is known before vehicles are tracked: for the stages up to the tracks.
+
+    Their results may not depend on `read_grid`, whose scale may rest on them.
+    """
+    grid = read_own_grid(layout)
+    record = read_first_georeference(layout)
+    return grid if record is None else _apply_georeference(grid, record)
+
+
+def read_tracking_gsd(layout: RunLayout) -> float | None:
+    """Metres a base pixel for the limits of tracking: of `read_first_grid`, else by the size of the cars that the
+    detector was trained on; None where neither is known."""
+    gsd_m = read_first_grid(layout).gsd_m
+    return read_working(layout).vehicle_gsd_m if gsd_m is None and layout.working.exists() else gsd_m
+
+
 def read_own_grid(layout: RunLayout) -> GridRecord:
-    """``base/grid.json`` alone: what the base image itself and ``--gsd-m`` give."""
+    """``base/grid.json`` alone: what the base image itself gives."""
     return _parse_grid(layout.grid.read_bytes(), layout.format_version)
 
 
 def read_georeference(layout: RunLayout) -> GeoreferenceRecord | None:
-    """``base/georeference.json``; None before its stage, and in runs that had none."""
+    """``base/scale.json``; before its stage, and in runs that had none, `read_first_georeference`."""
+    if not layout.scale.exists():
+        return read_first_georeference(layout)
+    return _parse_georeference(layout.scale.read_bytes())
+
+
+def read_first_georeference(layout: RunLayout) -> GeoreferenceRecord | None:
+    """``base/georeference.json``, without the lengths of vehicles; None before its stage, and in runs that had none."""
     if not layout.georeference.exists():
         return None
     return _parse_georeference(layout.georeference.read_bytes())

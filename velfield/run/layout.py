@@ -193,6 +193,11 @@ class RunLayout:
         return self.base / "georeference.json"
 
     @property
+    def scale(self) -> Path:
+        """`georeference` once more, when the lengths of vehicles are known: it takes its place."""
+        return self.base / "scale.json"
+
+    @property
     def control_points(self) -> Path:
         """Ground control points, where `velfield georeference` was given some."""
         return self.base / "control_points.json"

@@ -44,7 +44,5 @@ def _interval(estimate: ScaleEstimate) -> tuple[float, float]:
 
 
 def _disagreement(used: ScaleEstimate, other: ScaleEstimate) -> str:
-    text = used.text()
-    text = text if used.low_m < used.high_m else f"{used.gsd_m:.4g} m a pixel by {text.split(' by ', 1)[1]}"
     times = f"{other.gsd_m / used.gsd_m:.3g}"
-    return f"{text} is used, but it is {other.text()}: speeds would be {times} times as high"
+    return f"{used.text()} is used, but it is {other.text()}: speeds would be {times} times as high"

@@ -13,8 +13,6 @@ MIN_SCALE, MAX_SCALE = 0.5, 2.0
 """Base px per frame px: the scales that the coarse search covers and that are useful for a map."""
 _TOLERANCE = 1.05
 """The scale varies over a tilted frame."""
-_MAX_LOG_SCALE = 0.1
-"""Beyond this logarithm of the scale, the ground sample distances of base image and frames must not be confused."""
 _MIN_COVERAGE = 0.95
 _GRID_SIDE = 25
 
@@ -40,16 +38,12 @@ class BaseFit:
     rotation_rad: float
     covered: float
 
-    def note(self, given_gsd_m: float | None) -> str:
-        """The registration in one line; ``given_gsd_m``: ``--gsd-m`` if the base image has no scale of its own."""
+    def note(self) -> str:
+        """The registration in one line."""
         degrees = round(float(np.degrees(self.rotation_rad)))
         sense = "" if degrees == 0 else " cw" if degrees > 0 else " ccw"
         route = "directly to the base image" if self.direct else "to the base image via the flight's own"
-        text = f"frames registered {route}: scale {self.scale:.2f}, rotation {abs(degrees)}°{sense}"
-        if given_gsd_m is not None and abs(np.log(self.scale)) > _MAX_LOG_SCALE:
-            frame_gsd = f"that of the frames is {given_gsd_m * self.scale:.3g} m"
-            text += f"; --gsd-m {given_gsd_m:g} is the ground sample distance of the base image, {frame_gsd}"
-        return text
+        return f"frames registered {route}: scale {self.scale:.2f}, rotation {abs(degrees)}°{sense}"
 
     def warnings(self) -> list[str]:
         """Warnings, one line each."""

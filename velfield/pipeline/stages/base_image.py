@@ -72,6 +72,8 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageR
     """
     keypoints = {result.frame: result.keypoints for block in blocks for result in block}
     given = read_given_base(plan)
+    if given is not None:
+        reconcile_gsd(given.gsd_m, plan.config.gsd_m)  # the stage `georeference` does it again, after much work
     plan.layout.map_lens.unlink(missing_ok=True)
     lens, store, layout = read_lens(plan.layout), open_frames(plan.layout.frames), plan.layout
     sharpness = store.column("sharpness")
@@ -137,7 +139,8 @@ def _finish(
     """Write the grid; ``frames``: number of frames in the own base image, None if there is none."""
     layout = plan.layout
     layout.rebased.unlink(missing_ok=True)
-    layout.georeference.unlink(missing_ok=True)  # its stage follows
+    for later in (layout.georeference, layout.scale):  # of stages that follow
+        later.unlink(missing_ok=True)
     write_atomically(layout.grid, grid.model_dump_json(indent=1).encode())
     outputs.append(layout.grid)
     advance("base")
@@ -147,8 +150,7 @@ def _finish(
     if given is None or fit is None:
         return StageResult(outputs, counts)
     counts |= {"intersensor_error_px": fit.error_px, "scale": fit.scale, "covered": fit.covered}
-    given_gsd_m = plan.config.gsd_m if given.gsd_m is None else None
-    return StageResult(outputs, counts, [*given.notes, fit.note(given_gsd_m)], fit.warnings())
+    return StageResult(outputs, counts, [*given.notes, fit.note()], fit.warnings())
 
 
 def _check_area(plan: Plan, grey: GreyImage, given: BaseRaster, lens: Lens) -> tuple[Lens, list[str]]:
@@ -196,7 +198,6 @@ def _own_grid(plan: Plan, own: OwnBase, reference: int) -> GridRecord:
         height_px=height,
         origin_x_px=own.origin_xy[0],
         origin_y_px=own.origin_xy[1],
-        gsd_m=plan.config.gsd_m,
         base_source="flight",
         reference_frame=reference,
     )
@@ -278,7 +279,7 @@ def _given_grid(plan: Plan, given: BaseRaster, reference: int, fit: BaseFit) -> 
     return GridRecord(
         width_px=width,
         height_px=height,
-        gsd_m=reconcile_gsd(given.gsd_m, plan.config.gsd_m),
+        gsd_m=given.gsd_m,
         crs_wkt=given.crs_wkt,
         affine=given.affine,
         base_source="given",

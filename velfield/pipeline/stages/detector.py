@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from schemas.records import WorkingRecord
+from velfield.analysis.vehicle_scale import CAR_LENGTH_M
 from velfield.detection.cnn.model import use_device
 from velfield.detection.detector import Detector, detector_class, load_detector, shipped_detector, train_detector
 from velfield.detection.motion.difference import MotionBackground, MotionFrame, motion_background
@@ -30,7 +31,7 @@ from velfield.pipeline.stages.labels import (
 from velfield.pipeline.stages.rectified_frames import WorkingGrid, write_background
 from velfield.pipeline.stages.registration import external_boxes, usable_frames
 from velfield.run.commits import write_atomically
-from velfield.run.frame_transforms import read_grid
+from velfield.run.frame_transforms import read_first_grid
 from velfield.run.stores import open_frames
 
 _FRAMES_TO_MEASURE = 4
@@ -81,7 +82,7 @@ def _from_detections(plan: Plan) -> StageResult:
     boxes, scale = external_boxes(plan), _scale_of_gsd(plan)
     if scale is None:
         scale = _scale_of_length(plan, median_car_length_raw_px(boxes), base_px_per_raw_px(plan))
-    outcome = _finish(plan, None, 1.0 if scale is None else scale, "detections")
+    outcome = _finish(plan, None, scale, "detections")
     warnings = []
     if scale is None:
         assumed_px = plan.config.detection.working_car_length_px
@@ -109,7 +110,7 @@ def _scale_of_length(plan: Plan, length_raw_px: float, base_per_raw: float) -> f
 
 
 def _scale_of_gsd(plan: Plan) -> float | None:
-    gsd_m = read_grid(plan.layout).gsd_m
+    gsd_m = read_first_grid(plan.layout).gsd_m
     return None if gsd_m is None else working_scale(plan.config.detection, gsd_m)
 
 
@@ -133,7 +134,7 @@ def _from_labels(plan: Plan) -> StageResult:
     samples = list(labelled_images(source, plan.info, labels, work_per_raw=work_per_raw))
     detector = train_detector(samples, plan.config.detection)
     outcome = _finish(plan, detector, scale, "labels", count=len(labels.cars))
-    return replace(outcome, warnings=check_label_scale(labels.cars, base_per_raw, read_grid(plan.layout).gsd_m))
+    return replace(outcome, warnings=check_label_scale(labels.cars, base_per_raw, read_first_grid(plan.layout).gsd_m))
 
 
 def _from_motion(plan: Plan) -> StageResult:
@@ -193,14 +194,17 @@ def _motion_frames(plan: Plan, scale: float) -> list[MotionFrame]:
 def _finish(
     plan: Plan,
     detector: Detector | None,
-    scale: float,
+    scale: float | None,
     training_source: str,
     *,
     count: int = 0,
     motion: MotionLabels | None = None,
     background: MotionBackground | None = None,
 ) -> StageResult:
-    """Write the detector, the working grid, and the background where the detector uses it."""
+    """Write the detector, the working grid, and the background where the detector uses it.
+
+    ``scale``: working px a base px; None: the size of a car is not known, and working px are base px.
+    """
     layout, outputs, notes = plan.layout, [plan.layout.working], []
     if detector is not None:
         write_atomically(layout.detector, detector.to_json().encode())
@@ -213,8 +217,11 @@ def _finish(
             f"{motion.count} labels of {motion.vehicles} vehicles from motion: estimated precision "
             f"{motion.precision_estimate:.0%}, {motion.axial_motion_fraction:.0%} of objects move along their axis"
         )
+    by_vehicles = None if _scale_of_gsd(plan) is not None else scale
+    car_px = plan.config.detection.working_car_length_px
     record = WorkingRecord(
-        scale=scale,
+        scale=scale or 1.0,
+        vehicle_gsd_m=None if by_vehicles is None else CAR_LENGTH_M * by_vehicles / car_px,
         training_source=training_source,
         has_background=layout.background in outputs,
         labels=count,
@@ -223,7 +230,7 @@ def _finish(
     )
     write_atomically(layout.working, record.model_dump_json(indent=1).encode())
     advance("detector")
-    counts = {"labels": float(count), "working_scale": scale}
+    counts = {"labels": float(count), "working_scale": record.scale}
     if detector is not None:
         counts["threshold"] = detector.threshold
     return StageResult(outputs, counts, notes)

@@ -1,8 +1,9 @@
 """Stage ``georeference``: scale, north and place of the base image, by every source that knows them.
 
 The base image's reference system, ``--gsd-m``, ground control points and the camera's telemetry are compared; the
-record says which one is used, what the others give, and where they disagree. `read_grid` puts the record over the grid,
-so that everything after this stage, and every export, has metres and coordinates.
+record says which one is used, what the others give, and where they disagree. The stage ``scale`` does it again with the
+lengths of the vehicles, once they are tracked. `read_grid` puts the record over the grid, so that everything after
+these stages, and every export, has metres and coordinates.
 """
 
 from pathlib import Path
@@ -17,6 +18,7 @@ from velfield.errors import Failure
 from velfield.exports.cog import write_cog
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
+from velfield.pipeline.stages.labels import base_px_per_raw_px
 from velfield.registration.transforms import FrameMap
 from velfield.run.commits import digest_bytes, write_atomically
 from velfield.run.frame_transforms import (
@@ -29,6 +31,7 @@ from velfield.run.frame_transforms import (
 from velfield.run.layout import RunLayout, local_output
 from velfield.run.stores import open_frames, open_registration
 from velfield.sources.clips import read_clips_telemetry
+from velfield.sources.geo import reconcile_gsd
 from velfield.sources.scale import choose_scale
 from velfield.sources.telemetry.placement import (
     FramePoses,
@@ -47,13 +50,41 @@ _Z90 = 1.645
 _MIN_NORTH_DEG = 5.0
 """Smaller differences between the base image's north and the compass are not remarked on."""
 _MIN_POSITION_M = 15.0
+_MAX_LOG_SCALE = 0.1
+"""Beyond this logarithm of the scale, the ground sample distances of base image and frames must not be confused."""
 
 
 def georeference_run(plan: Plan) -> StageResult:
-    """Write ``base/georeference.json``; and the base image as GeoTIFF where its place became known here."""
+    """Write ``base/georeference.json``; and the base image as GeoTIFF where its place became known here.
+
+    Raises
+    ------
+    InputError
+        ``--gsd-m`` contradicts the base image's own reference system.
+    """
     layout, grid = plan.layout, read_own_grid(plan.layout)
-    estimates = [*scale_by_grid(grid), *_given_scale(plan.config.gsd_m)]
-    points, remarks = saved_control_points(layout)
+    layout.scale.unlink(missing_ok=True)  # its stage follows
+    record, notes = compare_sources(plan, grid)
+    outputs = write_georeference(layout, layout.georeference, record, plan.config.frames)
+    advance("georeference")
+    notes = [*describe(record), *notes, *_gsd_of_frames(plan, grid)]
+    return StageResult(outputs, georeference_counts(record), notes, georeference_warnings(record))
+
+
+def compare_sources(
+    plan: Plan, grid: GridRecord, measured: ScaleEstimate | None = None
+) -> tuple[GeoreferenceRecord, list[str]]:
+    """What all sources give, and notes on what they do not give; ``measured``: the scale by the lengths of vehicles.
+
+    Raises
+    ------
+    InputError
+        ``--gsd-m`` contradicts the base image's own reference system.
+    """
+    if grid.crs_wkt is not None:
+        reconcile_gsd(grid.gsd_m, plan.config.gsd_m)
+    points, remarks = saved_control_points(plan.layout)
+    estimates = [*scale_by_grid(grid), *_given_scale(plan.config.gsd_m), *([] if measured is None else [measured])]
     estimates += [] if points is None else [scale_of_points(points)]
     poses = _frame_poses(plan)
     scale = poses if isinstance(poses, Failure) else estimate_scale(poses)
@@ -66,10 +97,19 @@ def georeference_run(plan: Plan) -> StageResult:
     if isinstance(poses, FramePoses):
         record, more = _with_telemetry(record, poses, grid)
         notes += more
-    record = record.model_copy(update={"remarks": (*record.remarks, *remarks)})
-    outputs = write_georeference(layout, record, plan.config.frames)
-    advance("georeference")
-    return StageResult(outputs, georeference_counts(record), [*describe(record), *notes], georeference_warnings(record))
+    return record.model_copy(update={"remarks": (*record.remarks, *remarks)}), notes
+
+
+def _gsd_of_frames(plan: Plan, grid: GridRecord) -> list[str]:
+    """A note where ``--gsd-m`` is of a given base image whose pixels are not as large as the frames'."""
+    given_m = plan.config.gsd_m
+    if given_m is None or grid.base_source == "flight" or grid.crs_wkt is not None:
+        return []
+    scale = base_px_per_raw_px(plan)
+    if abs(np.log(scale)) <= _MAX_LOG_SCALE:
+        return []
+    frame_gsd = f"that of the frames is {given_m * scale:.3g} m"
+    return [f"--gsd-m {given_m:g} is the ground sample distance of the base image, {frame_gsd}"]
 
 
 def scale_by_grid(grid: GridRecord) -> list[ScaleEstimate]:
@@ -209,9 +249,9 @@ def _contradictions(grid: GridRecord, poses: FramePoses, north: North) -> list[s
     return found
 
 
-def write_georeference(layout: RunLayout, record: GeoreferenceRecord, frames: FramesConfig) -> list[Path]:
+def write_georeference(layout: RunLayout, path: Path, record: GeoreferenceRecord, frames: FramesConfig) -> list[Path]:
     """Write the record, and the base image as GeoTIFF where it was built from the flight and its place is known."""
-    outputs = [layout.georeference]
+    outputs = [path]
     grid = read_own_grid(layout)
     if grid.crs_wkt is None and layout.base_image.exists():
         layout.base_image_tif.unlink(missing_ok=True)
@@ -220,7 +260,7 @@ def write_georeference(layout: RunLayout, record: GeoreferenceRecord, frames: Fr
             with local_output(layout.base_image_tif) as here:
                 write_cog(here, [grey], names=["grey"], units=["1"], crs_wkt=record.crs_wkt, affine=record.affine)
             outputs.append(layout.base_image_tif)
-    write_atomically(layout.georeference, record.model_dump_json(indent=1).encode())
+    write_atomically(path, record.model_dump_json(indent=1).encode())
     return outputs
 
 

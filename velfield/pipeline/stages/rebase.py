@@ -175,9 +175,17 @@ def rebase_georeference(plan: Plan, rebase: Rebase) -> StageResult:
         if old.north_rad is not None:
             update = {"north_rad": old.north_rad + record.rotation_rad, "north_sd_deg": old.north_sd_deg}
     new = GeoreferenceRecord(scale=choose_scale(estimates), telemetry=old.telemetry if old else "", **update)
-    outputs = write_georeference(plan.layout, new, plan.config.frames)
+    outputs = write_georeference(plan.layout, plan.layout.georeference, new, plan.config.frames)
     advance("georeference")
     return StageResult(outputs, georeference_counts(new), describe(new), georeference_warnings(new))
+
+
+def rebase_scale(plan: Plan, rebase: Rebase) -> StageResult:
+    """Write nothing: the georeference that was mapped holds the scale by the vehicles already."""
+    del rebase
+    record = read_georeference(plan.layout) or GeoreferenceRecord()
+    advance("scale")
+    return StageResult([], georeference_counts(record))
 
 
 def _rescale(estimate: ScaleEstimate, scale: float) -> ScaleEstimate:

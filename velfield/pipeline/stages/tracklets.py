@@ -9,7 +9,7 @@ from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
 from velfield.pipeline.plan import Plan, widen_interval
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.registration import MAP_PARAMETERS, usable_frames
-from velfield.run.frame_transforms import read_grid
+from velfield.run.frame_transforms import read_tracking_gsd
 from velfield.run.stores import open_frames, open_registration
 from velfield.run.tables import Patches, read_patches, read_tables, write_table
 from velfield.tracking.association import FrameTable, window_frames
@@ -48,7 +48,7 @@ def link_unit(plan: Plan, frames: range) -> StageResult:
     usable = usable_frames(plan)
     window = window_frames(list(usable), list(times_s), frames, plan.config.tracking.max_interval_s)
     tables = frame_tables(plan, window, times_s, usable)
-    tracklets, log = link_windows(tables, plan.config.tracking, gsd_m=read_grid(plan.layout).gsd_m, starts=frames)
+    tracklets, log = link_windows(tables, plan.config.tracking, gsd_m=read_tracking_gsd(plan.layout), starts=frames)
     path = plan.layout.unit_file(plan.layout.tracklets, frames.start // plan.unit_frames, ".parquet")
     write_table(path, tracklets, TRACKLET_COLUMNS)
     advance("tracklets", len(frames))

@@ -12,7 +12,7 @@ from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.registration import usable_frames
 from velfield.pipeline.stages.tracklets import explain_no_tracklets, frame_tables, tracklet_files
-from velfield.run.frame_transforms import FrameTransforms, read_grid
+from velfield.run.frame_transforms import FrameTransforms, read_tracking_gsd
 from velfield.run.layout import RunLayout
 from velfield.run.stores import open_frames
 from velfield.run.tables import empty_table, read_patches, read_tables, write_table, write_tracks
@@ -43,7 +43,7 @@ def chain_tracks(plan: Plan) -> StageResult:
     )
     ids, chain = np.unique(assign_tracks(tracklets[_IDS].to_numpy(np.int64)), return_inverse=True)
     strips = sum_strips(layout, tracklets.assign(track_id=ids[chain]), len(plan.units))
-    gsd_m = read_grid(layout).gsd_m or PAPER_GSD_M
+    gsd_m = read_tracking_gsd(layout) or PAPER_GSD_M
     starts, ends = find_ends(tracklets, chain, len(ids), gsd_m)
     candidates = read_candidates(plan, tracklets, gsd_m)
     context = find_context(plan, ends, starts, strips)
@@ -190,7 +190,7 @@ def recovered_tracklets(plan: Plan, frames: range, positions: pd.DataFrame, flig
     index = {one.frame: k for k, one in enumerate(tables)}
     start = np.array([index[frame] for frame in known["frame"].to_numpy()[first]])
     ids = np.stack([known["detection_id"].to_numpy()[first + k] for k in range(3)], axis=1)
-    limits = Limits.from_config(config, read_grid(plan.layout).gsd_m)
+    limits = Limits.from_config(config, read_tracking_gsd(plan.layout))
     windows = []
     for at in np.unique(start).tolist():
         rows = np.flatnonzero(start == at)
@@ -274,7 +274,7 @@ def measure_tracks(strips: StripSums, tracks: IntArray) -> pd.DataFrame:
 
 def find_context(plan: Plan, ends: TrackEnds, starts: TrackEnds, strips: StripSums) -> EndContext:
     """Where chains vanish and appear, and how they look there."""
-    metres = read_grid(plan.layout).gsd_m or PAPER_GSD_M
+    metres = read_tracking_gsd(plan.layout) or PAPER_GSD_M
     maps = FrameTransforms.open(plan.layout, plan.config)
     times_s = open_frames(plan.layout.frames).column("time_s")[usable_frames(plan)]
     first_s, last_s = (times_s[0], times_s[-1]) if len(times_s) else (0.0, 0.0)

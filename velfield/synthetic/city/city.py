@@ -81,7 +81,10 @@ class City:
         parked = self._park_cars(self._rng(RandomStream.PARKED))
         driving = len(self.traffic)
         rng = self._rng(RandomStream.APPEARANCE)
-        still, moving = draw_dimensions(np.zeros(len(parked), bool), rng), self.traffic.dimensions
+        still, moving = (
+            draw_dimensions(np.zeros(len(parked), bool), rng, self.config.traffic.car_length_m),
+            self.traffic.dimensions,
+        )
         dimensions = VehicleDimensions(
             np.concatenate([moving.length_m, still.length_m]),
             np.concatenate([moving.width_m, still.width_m]),

@@ -16,6 +16,8 @@ from schemas.simulation import TrafficSimulation
 from velfield.synthetic.city.road_network import RoadNetwork, clear_until_m
 from velfield.synthetic.traffic.driving import CarStates, RoadArrays, advance, try_enter
 
+_CAR_LENGTH_M = 4.35
+"""Median of the lengths as they are drawn, before they are scaled to a place's."""
 STEP_S = 0.1
 MAX_LEGS = 60
 
@@ -181,16 +183,18 @@ def _draw_route_dimensions(
     """Dimensions of vehicles; large ones only on routes without tight turns."""
     slow = np.array([min(road_network.edges[e].speed_m_per_s for e in route) < 8 for route in routes], dtype=bool)
     large = (rng.uniform(size=n) < config.large_share) & ~slow
-    return draw_dimensions(large, rng)
+    return draw_dimensions(large, rng, config.car_length_m)
 
 
-def draw_dimensions(large: NDArray[np.bool_], rng: np.random.Generator) -> VehicleDimensions:
+def draw_dimensions(
+    large: NDArray[np.bool_], rng: np.random.Generator, car_length_m: float = _CAR_LENGTH_M
+) -> VehicleDimensions:
     """Dimensions of vehicles (n,): cars and vans; lorries and buses where ``large``."""
     n = len(large)
     pick = rng.uniform(size=n)
     bus = large & (pick < 0.4)
     van = ~large & (pick < 0.12)
-    length = np.clip(rng.normal(4.35, 0.35, n), 3.5, 5.2)
+    length = np.clip(rng.normal(_CAR_LENGTH_M, 0.35, n), 3.5, 5.2) * (car_length_m / _CAR_LENGTH_M)
     width = np.clip(1.2 + 0.135 * length + rng.normal(0, 0.04, n), 1.6, 2.0)
     height = rng.uniform(1.4, 1.7, n)
     length = np.where(van, rng.uniform(4.8, 5.8, n), length)
