@@ -1,6 +1,8 @@
 """Footage that is not what it should be is told with its reason, and what is right is not."""
 
+import re
 from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
 from fractions import Fraction
 from pathlib import Path
 
@@ -8,11 +10,12 @@ import av
 import cv2
 import numpy as np
 import pytest
+from PIL import ExifTags, Image
 
 from schemas.arrays import GreyImage
 from schemas.flight import FramesConfig
 from schemas.job import Inputs, Job
-from schemas.simulation import CameraSimulation
+from schemas.simulation import CameraSimulation, TimesSimulation
 from tests.media import drifting, ground, write_images, write_video
 from velfield.camera.lens import pinhole
 from velfield.camera.tilt import tilt_of_frames
@@ -26,6 +29,7 @@ from velfield.pipeline.stages.registration import register_unit
 from velfield.run.stores import open_registration
 from velfield.sources.images import read_grey_image
 from velfield.sources.source import probe
+from velfield.sources.video.corruption import BlockArtifactDetector
 from velfield.synthetic import small_flight
 
 WARNED = FramesConfig()
@@ -115,6 +119,41 @@ def test_a_cut_to_another_place_is_reported(tmp_path: Path) -> None:
     assert "the picture changes wholly at frame 8 (1.600 s)" in line
 
 
+@pytest.mark.parametrize("seed", [21, 22])
+def test_a_small_clip_of_a_vibrating_camera_has_no_block_artefacts(seed: int) -> None:
+    """At 25 frames a second rows move by 2 px against each other: 6 of 40 sound frames were flagged."""
+    flight = small_flight(frames=24, width=640, height=480, seed=seed, times=TimesSimulation(fps=25.0))
+    detector = BlockArtifactDetector()
+    assert not any(detector.feed(flight.frame(k)) for k in range(24))
+
+
+# ----------------------------------------------------------------------------------------------------------- the rate
+
+
+def photographed(folder: Path, seconds: float, count: int = 5) -> Path:
+    """Images with the times that a camera writes, to whole seconds."""
+    folder.mkdir()
+    for k, grey in enumerate(drifting(count, 160, 120)):
+        exif = Image.Exif()
+        taken = datetime(2026, 5, 4, 8, 30, tzinfo=UTC) + timedelta(seconds=seconds * k)
+        exif.get_ifd(ExifTags.IFD.Exif)[0x9003] = taken.strftime("%Y:%m:%d %H:%M:%S")
+        Image.fromarray(grey).save(folder / f"{k}.jpg", exif=exif)
+    return folder
+
+
+def test_a_rate_that_contradicts_the_images_own_times_is_reported(tmp_path: Path) -> None:
+    (line,) = probe(photographed(tmp_path / "f", 2.0), frames=FramesConfig(fps=5)).warnings
+    assert "5 images would take 0.8 s at that rate, and took 8.0 s" in line
+    assert "speeds would be 10 times the true ones; give --fps 0.5" in line
+
+
+def test_a_rate_that_agrees_and_images_without_times_cause_no_warning(tmp_path: Path) -> None:
+    assert probe(photographed(tmp_path / "f", 2.0), frames=FramesConfig(fps=0.5)).warnings == ()
+    assert probe(photographed(tmp_path / "burst", 0.2), frames=FramesConfig(fps=5)).warnings == ()
+    write_images(tmp_path / "plain", list(drifting(5, 160, 120)))
+    assert probe(tmp_path / "plain", frames=FramesConfig(fps=5)).warnings == ()
+
+
 def test_a_static_camera_and_a_drifting_one_cause_no_warning(tmp_path: Path) -> None:
     rng, scene = np.random.default_rng(0), ground(160, 120)
     still = [np.clip(scene + rng.normal(0, 2, scene.shape), 0, 255).astype(np.uint8) for _ in range(8)]
@@ -136,6 +175,27 @@ def test_a_zoom_in_mid_flight_is_reported(tmp_path: Path) -> None:
     assert open_registration(plan.layout.registration).statuses()[5:] == ["ok", "ok"]
     (line,) = register_unit(plan, range(7)).warnings
     assert "frames 5 to 6 show the ground at up to 1.4" in line
+
+
+def test_a_turn_towards_the_horizon_in_mid_flight_is_reported(tmp_path: Path) -> None:
+    """The last two of seven frames look 30 degrees away from the vertical, at the same place."""
+    scene, focal, middle = ground(900, 700, seed=3), 400.0, np.array([160.0, 120.0])
+    frames = []
+    for k, tilt_deg in enumerate([0.0, 2.0, 0.0, 3.0, 1.0, 28.0, 30.0]):
+        tilt = np.radians(tilt_deg)
+        down = np.array([[1, 0, 450 + k], [0, 1, 350], [0, 0, 1.0]]) @ np.diag([1, 1, 1 / focal])
+        turn = np.array([[1, 0, 0], [0, np.cos(tilt), np.sin(tilt)], [0, -np.sin(tilt), np.cos(tilt)]])
+        to_middle = np.array([[1, 0, 0], [0, 1, -focal * np.tan(tilt)], [0, 0, 1.0]])
+        to_ground = to_middle @ down @ turn @ np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, focal]])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        frames.append(cv2.warpPerspective(scene, to_ground, (320, 240), flags=flags, borderMode=cv2.BORDER_REFLECT))
+    plan = planned(tmp_path, frames, "registration", "lens.calibrate=never")
+    compute_stages(plan, ("registration",))
+    assert open_registration(plan.layout.registration).statuses() == ["ok"] * 7
+    (line,) = [line for line in register_unit(plan, range(7)).warnings if "degrees" in line]
+    found = re.search(r"at up to (\d+) degrees from the base image's view", line)
+    assert found is not None
+    assert 22 <= int(found[1]) <= 33
 
 
 def oblique(tilt_deg: float, seed: int = 21) -> GreyImage:

@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from schemas.camera import CameraRecord
 from schemas.job import Inputs, Job
-from tests.scenes import city, photograph, similarity
-from velfield.camera.lens import pinhole
+from tests.scenes import city, frame_grid, photograph, rms_after_homography, similarity
+from velfield.camera.lens import HarrisLens, PolynomialLens, pinhole
 from velfield.errors import Failure, InputError
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.local import compute_stages
@@ -19,7 +20,7 @@ from velfield.pipeline.stages.georeference import georeference_run
 from velfield.pipeline.stages.registration import detect_unit_keypoints, register_unit
 from velfield.pipeline.units import prepare_stage
 from velfield.registration.intersensor import register_intersensor
-from velfield.run.frame_transforms import read_grid
+from velfield.run.frame_transforms import read_grid, read_lens
 
 SHAPE = (360, 480)
 CENTRE = np.array([239.5, 179.5])
@@ -37,14 +38,16 @@ def base() -> np.ndarray:
     return city(3, 640)
 
 
-def plan_on(base: np.ndarray, frames: list[np.ndarray], folder: Path, gsd_m: float | None = None) -> Plan:
+def plan_on(
+    base: np.ndarray, frames: list[np.ndarray], folder: Path, gsd_m: float | None = None, calibrate: str = "never"
+) -> Plan:
     """The plan of a flight of these frames, with the stages frames and lens done."""
     (folder / "frames").mkdir()
     for number, frame in enumerate(frames):
         cv2.imwrite(str(folder / "frames" / f"{number}.png"), frame)
     cv2.imwrite(str(folder / "base.png"), base)
     inputs = Inputs(source=str(folder / "frames"), base=str(folder / "base.png"))
-    config = resolve_config(overrides={"frames.fps": 5, "lens.calibrate": "never", "gsd_m": gsd_m})
+    config = resolve_config(overrides={"frames.fps": 5, "lens.calibrate": calibrate, "gsd_m": gsd_m})
     plan = make_plan(Job(root=str(folder / "run"), inputs=inputs, config=config))
     compute_stages(plan, stages_before("base"))
     return plan
@@ -102,3 +105,30 @@ def test_frames_with_a_rolling_shutter_register_directly(base: np.ndarray, tmp_p
     build_base(plan, [detect_unit_keypoints(plan, range(3))])
     assert read_grid(plan.layout).registered_to == "given"
     assert isinstance(register_intersensor(frames[1], base, plan.config.base, lens=pinhole(SHAPE)), Failure)
+
+
+def test_the_frames_matches_with_the_given_image_correct_the_lens(tmp_path: Path) -> None:
+    """A lens of two terms of which the plumb lines gave one: off by a pixel in the corners."""
+    shape, middle = (480, 640), np.array([319.5, 239.5])
+    ground, true = city(5, 900, blocks=300), PolynomialLens((0.02, 0.05), 322.0, 236.0, 400.0)
+    poses = [similarity(1.0, 2.0 * k, middle, np.array([450.0 + 4 * k, 450.0])) for k in range(4)]
+    frames = [photograph(ground, pose, true, shape, k) for k, pose in enumerate(poses)]
+    plan = plan_on(ground, frames, tmp_path, calibrate="auto")
+    taken = HarrisLens(0.13, 319.5, 239.5, 400.0)
+    record = CameraRecord.model_validate_json(plan.layout.camera.read_bytes())
+    plan.layout.camera.write_text(record.model_copy(update={"lens": taken.to_record()}).model_dump_json())
+    outcome = build_base(plan, [detect_unit_keypoints(plan, range(4))])
+    assert any(note.startswith("lens by the base image: k = ") for note in outcome.notes), outcome.notes
+    assert plan.layout.map_lens in outcome.outputs
+    points = frame_grid(shape)
+    before = rms_after_homography(taken.undistort_points(points), true.undistort_points(points))
+    after = rms_after_homography(read_lens(plan.layout).undistort_points(points), true.undistort_points(points))
+    assert before > 0.5
+    assert after < 0.25
+
+
+def test_a_lens_that_is_right_stays(base: np.ndarray, tmp_path: Path) -> None:
+    plan = plan_on(base, views(base), tmp_path, calibrate="auto")
+    outcome = build_base(plan, [detect_unit_keypoints(plan, range(3))])
+    assert not any("lens" in note for note in outcome.notes)
+    assert not plan.layout.map_lens.exists()

@@ -5,6 +5,7 @@ lens. Against a map every match shows the distortion itself, so that it decides 
 terms, its centre and a homography are fitted to the matches robustly.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -85,6 +86,13 @@ def fit_lens_to_map(xy_raw: FloatArray, xy_map: FloatArray, lens: Lens, shape: t
     refit, _ = cv2.findHomography(old[valid], new[valid], 0)
     change = np.hypot(*(_apply(np.asarray(refit), old[valid]) - new[valid]).T)
     return MapFit(fitted, float(np.sqrt(np.mean(change**2))), residual_before, after_px, len(xy_raw))
+
+
+def mean_lens(lenses: Sequence[PolynomialLens]) -> PolynomialLens:
+    """The lens of the mean coefficients and centre of lenses of one size and number of terms."""
+    x, y = np.mean([(lens.centre_x_px, lens.centre_y_px) for lens in lenses], axis=0)
+    coefficients = tuple(float(k) for k in np.mean([lens.coefficients for lens in lenses], axis=0))
+    return PolynomialLens(coefficients, float(x), float(y), lenses[0].half_diagonal_px)
 
 
 def _homography(lens: Lens, xy_raw: FloatArray, xy_map: FloatArray) -> tuple[FloatArray, float]:

@@ -32,7 +32,7 @@ _DIRECTIONS = 16
 _MIN_DEPTH = 0.15
 _MAX_POINTS = 20_000
 _ARC_FRACTION, _MAX_CURVATURE = 0.012, 4.0  # of the diagonal; over the diagonal
-_FOCAL_HALF_DIAGONALS = 2.0
+FOCAL_HALF_DIAGONALS = 2.0
 """Focal length of a usual drone camera, half-diagonals: 1.25 widths of a frame of 4 : 3."""
 
 
@@ -52,7 +52,7 @@ class Tilt:
     @property
     def degrees(self) -> float:
         """Angle between the camera's axis and the vertical, for a usual focal length."""
-        return float(np.degrees(np.arctan(_FOCAL_HALF_DIAGONALS * np.hypot(*self.convergence))))
+        return float(np.degrees(np.arctan(FOCAL_HALF_DIAGONALS * np.hypot(*self.convergence))))
 
     @property
     def is_oblique(self) -> bool:
@@ -128,7 +128,7 @@ def _stretch(direction: FloatArray, convergence: FloatArray) -> FloatArray:
     if size < 1e-9:
         return direction
     along = convergence / size
-    cosine = np.cos(np.arctan(_FOCAL_HALF_DIAGONALS * size))
+    cosine = np.cos(np.arctan(FOCAL_HALF_DIAGONALS * size))
     return np.asarray(direction + (1.0 / cosine - 1.0) * (direction @ along)[:, None] * along)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from schemas.arrays import IntArray
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
+from velfield.sources.capture_times import describe_rate
 from velfield.sources.clips import CLIPS_SUFFIX, iter_clips, probe_clips, read_clip_list
 from velfield.sources.frames import SourceFrame, SourceInfo, local_path
 from velfield.sources.images import iter_folder, list_images, probe_folder
@@ -45,7 +46,10 @@ def probe(path: Path | str, *, frames: FramesConfig, timestamps: Path | None = N
         if frames.fps is not None:
             raise InputError("found both --timestamps and --fps, expected one of them; leave --fps out")
     if source.is_dir():
-        return probe_folder(source, frames=frames, timestamps=timestamps)
+        info = probe_folder(source, frames=frames, timestamps=timestamps)
+        if frames.fps is None:
+            return info
+        return replace(info, warnings=info.warnings + describe_rate(source, info.names, frames.fps))
     if source.suffix == CLIPS_SUFFIX:
         return probe_clips(source, frames=frames, timestamps=timestamps)
     return probe_video(source, frames=frames, timestamps=timestamps)

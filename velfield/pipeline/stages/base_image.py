@@ -23,11 +23,11 @@ from velfield.parallel import parallel_map
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.base_fit import BaseFit, check_scale, covered_fraction
+from velfield.pipeline.stages.direct import register_directly, trial_frames
 from velfield.pipeline.stages.lens import select_usable_frames
 from velfield.pipeline.stages.registration import FrameKeypoints, detect_unit_keypoints, read_given_base
 from velfield.registration.base_mesh import fit_base_mesh
 from velfield.registration.intersensor import IntersensorResult, register_intersensor
-from velfield.registration.intrasensor import FrameRegistration, prepare_base, register_frame
 from velfield.registration.keypoints import Keypoints
 from velfield.registration.own_base import OwnBase, build_own_base
 from velfield.report.figures import png_bytes
@@ -37,9 +37,6 @@ from velfield.run.layout import RunLayout, local_output
 from velfield.run.stores import open_frames
 from velfield.sources.geo import BaseRaster, reconcile_gsd
 
-_N_DIRECT_TRIALS = 8
-_MAX_DIRECT_ERROR_PX, _MIN_DIRECT_COVERAGE = 0.5, 0.8
-"""Held-out residual and coverage that all sampled frames must reach to be registered directly to the given image."""
 _LENS_ROUNDS = 4
 _MIN_LENS_CHANGE_PX = 0.7
 """RMS change over the frame that is worth it: the mesh follows less, and a rolling shutter passes for less."""
@@ -54,12 +51,6 @@ def keypoint_frames(plan: Plan) -> list[int]:
 def _spread_frames(plan: Plan) -> list[int]:
     """Frames sampled over the flight, of which the own base image is built."""
     return select_usable_frames(plan, plan.config.base.median_frames)
-
-
-def _trial_frames(spread: list[int]) -> list[int]:
-    """Of the spread frames, those that are registered directly to a given image first."""
-    count = min(_N_DIRECT_TRIALS, len(spread))
-    return [spread[k] for k in np.unique(np.linspace(0, len(spread) - 1, count).round().astype(int))]
 
 
 def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageResult:
@@ -81,12 +72,14 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageR
     spread = _spread_frames(plan)
     reference = max(spread, key=lambda frame: float(np.nan_to_num(sharpness[frame])))
     if given is not None:
-        keypoints |= _detect_keypoints(plan, _missing(_trial_frames(spread), keypoints))
+        keypoints |= _detect_keypoints(plan, _missing(trial_frames(spread), keypoints))
         direct = register_directly(plan, given, keypoints, lens)
         if direct is not None:  # half a pixel all over the frame: no other area reaches that
-            grid = _given_grid(plan, given, reference, direct)
+            grid = _given_grid(plan, given, reference, direct.fit)
             layout.own_to_base.unlink(missing_ok=True)
-            return _finish(plan, grid, write_given_image(layout, given), given=given, fit=direct)
+            outputs = [*write_given_image(layout, given), *_written_lens(layout)]
+            finished = _finish(plan, grid, outputs, given=given, fit=direct.fit)
+            return replace(finished, notes=[*finished.notes, *direct.notes])
         lens, lens_notes = _check_area(plan, store.read(reference), given, lens)
         keypoints |= _detect_keypoints(plan, _missing(spread, keypoints))
         keypoints = dict(sorted(keypoints.items()))
@@ -102,7 +95,7 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageR
         raise InputError(f"no base image can be built from the flight: {own.reason}; give one with --base")
     write_atomically(layout.own_base_image, png_bytes(own.image))
     write_atomically(layout.own_base_mask, png_bytes(own.valid.astype(np.uint8) * 255))
-    outputs = [layout.own_base_image, layout.own_base_mask, *([layout.map_lens] if layout.map_lens.exists() else [])]
+    outputs = [layout.own_base_image, layout.own_base_mask, *_written_lens(layout)]
     fit = None
     if given is None:
         grid = _own_grid(plan, own, reference)
@@ -116,6 +109,10 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageR
         outputs += written
     finished = _finish(plan, grid, outputs, frames=own.frames, given=given, fit=fit)
     return replace(finished, notes=[*finished.notes, *lens_notes])
+
+
+def _written_lens(layout: RunLayout) -> list[Path]:
+    return [layout.map_lens] if layout.map_lens.exists() else []
 
 
 def _missing(frames: list[int], keypoints: dict[int, Keypoints]) -> list[int]:
@@ -223,43 +220,6 @@ def _register_to_given(plan: Plan, own: OwnBase, given: BaseRaster) -> tuple[Bas
         covered=covered_fraction(result.transform, own.valid, given),
     )
     return fit, written
-
-
-def register_directly(plan: Plan, given: BaseRaster, keypoints: dict[int, Keypoints], lens: Lens) -> BaseFit | None:
-    """Register sampled frames directly to the given image; None if one of them fails.
-
-    If all succeed, frames need no intermediate image. If not (another season, other light), they are registered to the
-    flight's own base image, and that once to the given one.
-    """
-    config = plan.config.registration
-    reference = prepare_base(given.grey, config, mask=given.valid, frame_shape=(plan.info.height, plan.info.width))
-    store = open_frames(plan.layout.frames)
-
-    def register(frame: int) -> FrameRegistration:
-        return register_frame(store.read(frame), keypoints[frame], reference, lens, config)
-
-    first, *others = _trial_frames(sorted(keypoints))
-    results = [register(first)]
-    if _is_accurate(results[0]):
-        results += parallel_map(register, others)
-    fits = []
-    for result in results:
-        if result.transform is None or not _is_accurate(result):
-            return None
-        scale, rotation = result.transform.scale_and_rotation()
-        check_scale(scale, given, plan.job.inputs.base or "")
-        covered = covered_fraction(result.transform, None, given)
-        fits.append(BaseFit(True, result.heldout_px, result.n_inliers, scale, rotation, covered))
-    return replace(
-        fits[len(fits) // 2],
-        error_px=float(np.mean([fit.error_px for fit in fits])),
-        points=int(np.mean([fit.points for fit in fits])),
-        covered=float(np.mean([fit.covered for fit in fits])),
-    )
-
-
-def _is_accurate(result: FrameRegistration) -> bool:
-    return result.heldout_px <= _MAX_DIRECT_ERROR_PX and result.coverage >= _MIN_DIRECT_COVERAGE
 
 
 def write_given_image(layout: RunLayout, given: BaseRaster) -> list[Path]:

@@ -11,12 +11,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from schemas.arrays import GreyImage, Mask
+from schemas.arrays import FloatArray, GreyImage, Mask
+from velfield.camera.tilt import FOCAL_HALF_DIAGONALS, MIN_CONVERGENCE
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.registration.intrasensor import BaseReference, FrameRegistration, prepare_base, register_chain
 from velfield.registration.keypoints import Keypoints, detect_keypoints
-from velfield.registration.transforms import vector_length
+from velfield.registration.transforms import FrameTransform, vector_length
 from velfield.run.frame_transforms import read_grid, read_lens
 from velfield.run.layout import local_copy
 from velfield.run.stores import (
@@ -124,28 +125,64 @@ def _write(plan: Plan, frames: range, flags: NDArray[np.uint16], results: dict[i
     counts = {"frames": float(len(frames)), "registered": float(registered)}
     if registered:
         counts["heldout_px"] = float(np.nanmean(columns["heldout_px"]))
-    return StageResult(store.files(frames.start), counts, warnings=_scale_warnings(plan, frames, results))
+    return StageResult(store.files(frames.start), counts, warnings=_view_warnings(plan, results))
 
 
-def _scale_warnings(plan: Plan, frames: range, results: dict[int, FrameRegistration]) -> list[str]:
-    """Whether the camera zoomed, or climbed by much, within a unit: the lens was calibrated at one focal length."""
-    scales = {
-        frame: result.transform.scale_and_rotation()[0]
-        for frame, result in results.items()
-        if result.transform is not None
-    }
-    if not scales:
+def _view_warnings(plan: Plan, results: dict[int, FrameRegistration]) -> list[str]:
+    """Whether within a unit the camera zoomed, climbed by much, or turned towards the horizon."""
+    transforms = {frame: result.transform for frame, result in results.items() if result.transform is not None}
+    if not transforms:
         return []
-    values = list(scales.values())
-    usual = float(np.median(values)) if read_grid(plan.layout).registered_to == "given" else 1.0
-    odd = [frame for frame, scale in scales.items() if abs(np.log(scale / usual)) > np.log(MAX_SCALE_CHANGE)]
-    if not odd:
+    scales = np.array([transform.scale_and_rotation()[0] for transform in transforms.values()])
+    convergences = np.array([ground_convergence(transform) for transform in transforms.values()])
+    usual, straight = 1.0, np.zeros(2)  # the flight's own base image is as the camera looked
+    if read_grid(plan.layout).registered_to == "given":
+        usual, straight = float(np.median(scales)), np.median(convergences, axis=0)
+    frames = list(transforms)
+    return [*_scale_warnings(frames, scales / usual), *_turn_warnings(frames, convergences - straight)]
+
+
+def _scale_warnings(frames: list[int], scales: FloatArray) -> list[str]:
+    """Frames (n,) by their scale (n,) relative to the usual one: the lens was calibrated at one focal length."""
+    odd = np.flatnonzero(np.abs(np.log(scales)) > np.log(MAX_SCALE_CHANGE))
+    if not len(odd):
         return []
-    most = max(odd, key=lambda frame: abs(np.log(scales[frame] / usual)))
+    most = odd[np.argmax(np.abs(np.log(scales[odd])))]
     return [
-        f"frames {odd[0]} to {odd[-1]} show the ground at up to {usual / scales[most]:.2f} times the usual scale: the "
-        "camera zoomed or changed its height, and the lens, calibrated for the whole flight, may not fit there"
+        f"frames {frames[odd[0]]} to {frames[odd[-1]]} show the ground at up to {1 / scales[most]:.2f} times the usual "
+        "scale: the camera zoomed or changed its height, and the lens, calibrated for the whole flight, may not fit "
+        "there"
     ]
+
+
+def _turn_warnings(frames: list[int], convergences: FloatArray) -> list[str]:
+    """Frames (n,) by the convergence (n, 2) of the ground in them, relative to the usual one."""
+    size = np.hypot(*convergences.T)
+    odd = np.flatnonzero(size > MIN_CONVERGENCE)
+    if not len(odd):
+        return []
+    degrees = float(np.degrees(np.arctan(FOCAL_HALF_DIAGONALS * size.max())))
+    return [
+        f"frames {frames[odd[0]]} to {frames[odd[-1]]} look at the ground at up to {degrees:.0f} degrees from the "
+        "base image's view, 20 at most expected: the camera turned to or from the horizon in mid-flight; leave the "
+        "part that looks far away out, with --start-s and --stop-s"
+    ]
+
+
+def ground_convergence(transform: FrameTransform) -> FloatArray:
+    """Convergence (2,) of a frame's view of the base image, 1 / half-diagonal: its horizon is at convergence @ x = -1.
+
+    Under a homography the area that a pixel covers grows as the third power of a linear function's inverse.
+    """
+    width, height = transform.width, transform.height
+    x, y = np.meshgrid(np.linspace(0.1, 0.9, 9) * (width - 1), np.linspace(0.1, 0.9, 7) * (height - 1))
+    raw = np.column_stack([x.ravel(), y.ravel()])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        linear = 1.0 / np.cbrt(np.abs(np.linalg.det(transform.jacobian(raw))))
+    good = np.isfinite(linear)
+    offset = (raw - transform.centre) / (0.5 * np.hypot(width, height))
+    level, *slope = np.linalg.lstsq(np.column_stack([np.ones(len(raw)), offset])[good], linear[good], rcond=None)[0]
+    return np.asarray(np.array(slope) / level, np.float64)
 
 
 def usable_frames(plan: Plan) -> Mask:

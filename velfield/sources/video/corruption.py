@@ -26,7 +26,8 @@ BLOCK_PX = 16
 _WORK_WIDTH = 480
 _MIN_DIFFERENCE = 8.0
 """Grey levels: a block is new where its mean lies this far outside the range of its surroundings a frame ago."""
-_MIN_BLOCKS = 3
+_REACH_PX = 3
+_MIN_BLOCKS = 8
 _TYPICAL_FACTOR = 3.0
 _HISTORY_FRAMES = 15
 _MIN_HISTORY_FRAMES = 3
@@ -37,9 +38,9 @@ _DEFAULT_COUNT = 10.0
 class BlockArtifactDetector:
     """Fed with every frame in order of presentation, detects those with many new blocks.
 
-    A block is new where it lies outside the range of the frame before within one pixel (at a width of some 480 px),
-    after global translation and change of brightness are compensated. Traffic and parallax make some new blocks in
-    every frame, so the threshold is a multiple of the typical number.
+    A block is new where it lies outside the range of the frame before within three pixels, after global translation and
+    change of brightness are compensated: a camera that vibrates moves its rows by as much. Traffic and parallax make
+    some new blocks in every frame, so the threshold is a multiple of the typical number.
     """
 
     def __init__(self) -> None:
@@ -56,12 +57,12 @@ class BlockArtifactDetector:
         if previous is None or previous.shape != small.shape:
             self._counts.clear()
             return False
-        count = self._new_blocks(previous, small, max(BLOCK_PX // factor, 1))
+        count = self._new_blocks(previous, small, max(BLOCK_PX // factor, 1), -(-_REACH_PX // factor))
         typical = float(np.median(self._counts)) if len(self._counts) >= _MIN_HISTORY_FRAMES else _DEFAULT_COUNT
         self._counts.append(count)
         return count > _MIN_BLOCKS + _TYPICAL_FACTOR * typical
 
-    def _new_blocks(self, previous: Float32Array, current: Float32Array, block: int) -> int:
+    def _new_blocks(self, previous: Float32Array, current: Float32Array, block: int, reach: int) -> int:
         if self._window is None or self._window.shape != current.shape:
             self._window = cv2.createHanningWindow(current.shape[::-1], cv2.CV_32F)
         # With its window argument OpenCV 5 writes into its arguments.
@@ -69,7 +70,7 @@ class BlockArtifactDetector:
         shift = np.array([[1, 0, dx], [0, 1, dy]])
         moved = cv2.warpAffine(previous, shift, current.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
         moved += np.float32(np.median(current[::4, ::4] - moved[::4, ::4]))
-        kernel = np.ones((3, 3), np.uint8)
+        kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
         outside = np.maximum(current - cv2.dilate(moved, kernel), cv2.erode(moved, kernel) - current)
         rows, columns = current.shape[0] // block, current.shape[1] // block
         if not rows or not columns:

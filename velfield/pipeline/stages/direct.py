@@ -1,0 +1,133 @@
+"""Direct registration of sampled frames to the image given as ``--base``, and the lens that follows from it.
+
+If all succeed, frames need no intermediate image. If not (another season, other light), they are registered to the
+flight's own base image, and that once to the given one.
+
+Their control points, hundreds a frame, show the lens better than straight lines do: it is fitted to them again, and the
+frames registered through it, which reaches farther into the corners.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from velfield.camera.lens import Lens
+from velfield.camera.map_fit import MapFit, fit_lens_to_map, mean_lens
+from velfield.parallel import parallel_map
+from velfield.pipeline.plan import Plan
+from velfield.pipeline.stages.base_fit import BaseFit, check_scale, covered_fraction
+from velfield.registration.intrasensor import BaseReference, FrameRegistration, prepare_base, register_frame
+from velfield.registration.keypoints import Keypoints
+from velfield.run.commits import write_atomically
+from velfield.run.stores import open_frames
+from velfield.sources.geo import BaseRaster
+
+_N_TRIALS = 8
+_MAX_ERROR_PX, _MIN_COVERAGE = 0.5, 0.8
+"""Held-out residual and coverage that all sampled frames must reach to be registered directly to the given image."""
+_LENS_ROUNDS = 3
+_MIN_LENS_CHANGE_PX = 0.3
+"""RMS change of the lens over the frame that is worth registering the frames again."""
+
+
+@dataclass(frozen=True)
+class DirectRegistration:
+    """How sampled frames register directly: in sum, the lens they were registered through, and notes on it."""
+
+    fit: BaseFit
+    lens: Lens
+    notes: list[str]
+
+
+def trial_frames(spread: list[int]) -> list[int]:
+    """Of the spread frames, those that are registered directly to a given image first."""
+    count = min(_N_TRIALS, len(spread))
+    return [spread[k] for k in np.unique(np.linspace(0, len(spread) - 1, count).round().astype(int))]
+
+
+def register_directly(
+    plan: Plan, given: BaseRaster, keypoints: dict[int, Keypoints], lens: Lens
+) -> DirectRegistration | None:
+    """Register sampled frames directly to the given image; None if one of them fails.
+
+    Where their control points decide for another lens, it is written to ``base/lens.json``.
+    """
+    config = plan.config.registration
+    shape = (plan.info.height, plan.info.width)
+    reference = prepare_base(given.grey, config, mask=given.valid, frame_shape=shape)
+    frames = trial_frames(sorted(keypoints))
+    results = _register(plan, reference, keypoints, frames, lens)
+    if results is None:
+        return None
+    notes: list[str] = []
+    if plan.config.lens.calibrate != "never":
+        for _ in range(_LENS_ROUNDS):
+            fit = _fit_lens(results, lens, shape)
+            again = None if fit is None else _register(plan, reference, keypoints, frames, fit.lens)
+            if fit is None or again is None or _error_px(again) >= _error_px(results):
+                break
+            first, second = fit.lens.coefficients
+            matches = sum(result.n_inliers for result in again)
+            notes = [f"lens by the base image: k = {first:.3f}, {second:.3f} from {matches} control points"]
+            write_atomically(plan.layout.map_lens, fit.lens.to_record().model_dump_json(indent=1).encode())
+            lens, results = fit.lens, again
+    return DirectRegistration(_summarise(plan, given, results), lens, notes)
+
+
+def _register(
+    plan: Plan, reference: BaseReference, keypoints: dict[int, Keypoints], frames: list[int], lens: Lens
+) -> list[FrameRegistration] | None:
+    """The frames' registrations; None if one of them is not accurate."""
+    store = open_frames(plan.layout.frames)
+
+    def register(frame: int) -> FrameRegistration:
+        return register_frame(store.read(frame), keypoints[frame], reference, lens, plan.config.registration)
+
+    results = [register(frames[0])]
+    if _is_accurate(results[0]):
+        results += parallel_map(register, frames[1:])
+    return results if all(_is_accurate(result) for result in results) else None
+
+
+def _is_accurate(result: FrameRegistration) -> bool:
+    return result.ok and result.heldout_px <= _MAX_ERROR_PX and result.coverage >= _MIN_COVERAGE
+
+
+def _error_px(results: Sequence[FrameRegistration]) -> float:
+    return float(np.mean([result.heldout_px for result in results]))
+
+
+def _fit_lens(results: Sequence[FrameRegistration], lens: Lens, shape: tuple[int, int]) -> MapFit | None:
+    """The mean of the lenses that each frame's control points give; None where most decide for none.
+
+    Row motion is removed first. Of several frames it leaves a mean lens that no one frame's rolling shutter bends.
+    """
+    fits = []
+    for result in results:
+        assert result.transform is not None, "accurate frames have a transform"
+        assert result.control_points is not None, "accurate frames have control points"
+        xy_raw = lens.distort_points(result.transform.remove_row_motion(result.control_points.xy_raw))
+        valid = np.isfinite(xy_raw).all(axis=1)
+        fit = fit_lens_to_map(xy_raw[valid], result.control_points.xy_base[valid], lens, shape)
+        if fit is not None:
+            fits.append(fit)
+    if 2 * sum(fit.is_better and fit.change_px >= _MIN_LENS_CHANGE_PX for fit in fits) <= len(results):
+        return None
+    return replace(fits[0], lens=mean_lens([fit.lens for fit in fits]))
+
+
+def _summarise(plan: Plan, given: BaseRaster, results: Sequence[FrameRegistration]) -> BaseFit:
+    fits = []
+    for result in results:
+        assert result.transform is not None, "accurate frames have a transform"
+        scale, rotation = result.transform.scale_and_rotation()
+        check_scale(scale, given, plan.job.inputs.base or "")
+        covered = covered_fraction(result.transform, None, given)
+        fits.append(BaseFit(True, result.heldout_px, result.n_inliers, scale, rotation, covered))
+    return replace(
+        fits[len(fits) // 2],
+        error_px=float(np.mean([fit.error_px for fit in fits])),
+        points=int(np.mean([fit.points for fit in fits])),
+        covered=float(np.mean([fit.covered for fit in fits])),
+    )

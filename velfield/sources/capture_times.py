@@ -1,0 +1,43 @@
+"""A frame rate that the user gives, against the times that the camera wrote in the images (EXIF)."""
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+from PIL import ExifTags
+
+from velfield.errors import InputError
+from velfield.sources.images import read_image_tags
+
+_TAKEN, _FRACTION = 0x9003, 0x9291  # DateTimeOriginal, SubSecTimeOriginal
+_MAX_DISAGREEMENT = 0.1
+"""Relative to the duration, beside the clock's resolution at both ends."""
+
+
+def describe_rate(folder: Path, names: Sequence[str], fps: float) -> tuple[str, ...]:
+    """A warning where images in order of time took another time than their number over the rate; else none."""
+    ends = [_capture_time(folder / name) for name in (names[0], names[-1])]
+    if ends[0] is None or ends[1] is None:
+        return ()
+    taken_s, resolution_s = ends[1][0] - ends[0][0], ends[0][1] + ends[1][1]
+    expected_s = (len(names) - 1) / fps
+    if taken_s <= 0 or abs(taken_s - expected_s) <= resolution_s + _MAX_DISAGREEMENT * taken_s:
+        return ()
+    rate = (len(names) - 1) / taken_s
+    return (
+        f"--fps {fps:g}: {len(names)} images would take {expected_s:.1f} s at that rate, and took {taken_s:.1f} s by "
+        f"the times that the camera wrote in them: speeds would be {fps / rate:.2g} times the true ones; give --fps "
+        f"{rate:.3g}, or --timestamps",
+    )
+
+
+def _capture_time(path: Path) -> tuple[float, float] | None:
+    """Time of exposure by EXIF, s, and its resolution; None where it is not there."""
+    try:
+        tags = read_image_tags(path)[0].get_ifd(ExifTags.IFD.Exif)
+        taken = datetime.strptime(str(tags[_TAKEN]).strip("\0 "), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
+    except (InputError, KeyError, ValueError):
+        return None
+    digits = str(tags.get(_FRACTION, "")).strip("\0 ")
+    fraction = float(f"0.{digits}") if digits.isdecimal() else 0.0
+    return taken.timestamp() + fraction, 10.0 ** -len(digits) if digits.isdecimal() else 1.0
