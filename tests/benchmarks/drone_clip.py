@@ -25,7 +25,7 @@ from velfield.analysis.vehicle_scale import CAR_LENGTH_M
 from velfield.pipeline.georeference import plan_of_finished
 from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import Plan
-from velfield.run.frame_transforms import north_direction_rad, read_georeference
+from velfield.run.frame_transforms import read_georeference
 from velfield.run.run import Run
 from velfield.synthetic.clip import CLIP_NAME, SUBTITLE_NAME
 from velfield.synthetic.score import apply_homography, fit_homography
@@ -37,8 +37,8 @@ from velfield.synthetic.write import write_flight
 class TrueGrid:
     """The true scale and north of a run's base pixels, at the middle of the base image.
 
-    ``to_truth`` (3, 3): base pixels -> those of the simulation; ``gsd_m`` of the base image; ``north_rad`` as
-    `velfield.run.frame_transforms.north_direction_rad`.
+    ``to_truth`` (3, 3): base pixels -> those of the simulation; ``gsd_m`` of the base image; ``north_rad``: direction
+    of true north, from +x towards +y.
     """
 
     to_truth: np.ndarray
@@ -139,7 +139,7 @@ def measure(
         run, record = run_clip(alone / CLIP_NAME, folder / "run")
     metadata = scale_by(record, "metadata")
     assert metadata is not None, record.telemetry
-    north_rad = north_direction_rad(run.grid)
+    north_rad = record.north_rad  # true north; that of the grid's reference system is up to 3 degrees off it
     assert north_rad is not None
     return found | {
         "metadata": metadata.gsd_m / true.gsd_m - 1,

@@ -5,18 +5,21 @@ or training on the given labels (`--labels`), or self-training on vehicles that 
 shipped pre-trained detector is used.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from schemas.arrays import FloatArray
 from schemas.records import WorkingRecord
 from velfield.analysis.vehicle_scale import CAR_LENGTH_M
 from velfield.detection.cnn.model import use_device
 from velfield.detection.detector import Detector, detector_class, load_detector, shipped_detector, train_detector
 from velfield.detection.motion.difference import MotionBackground, MotionFrame, motion_background
 from velfield.detection.motion.labels import MotionLabels, choose_frames, labels_from_motion, working_scale
+from velfield.detection.scale_search import STEP, View, find_scale
 from velfield.detection.unlabelled import UnlabelledFlight
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
@@ -33,8 +36,13 @@ from velfield.pipeline.stages.registration import external_boxes, usable_frames
 from velfield.run.commits import write_atomically
 from velfield.run.frame_transforms import read_first_grid
 from velfield.run.stores import open_frames
+from velfield.tracking.dimensions import measure
 
 _FRAMES_TO_MEASURE = 4
+_FRAMES_TO_SEARCH = 3
+_GSD_RANGE_M = 0.02, 0.6
+"""Metres a base pixel at which cars are looked for where nothing gives their size."""
+_MAX_SEARCH_PX = 4e7
 _MIN_FRAMES_WITH_BOXES = 0.5
 """Fraction of the frames in which another program's boxes are expected."""
 
@@ -167,11 +175,37 @@ def _without_labels(plan: Plan, scale: float | None, labels: MotionLabels) -> St
 
     It needs a car's size.
     """
-    reason = "; ".join(labels.warnings)
-    if scale is None:
+    reason, detector = "; ".join(labels.warnings), shipped_detector()
+    found = _search_scale(plan, detector) if scale is None else scale
+    if found is None:
         raise InputError(f"{reason}; or give --gsd-m, so that the shipped detector can be used")
-    outcome = _finish(plan, shipped_detector(), scale, "shipped", motion=labels)
-    return StageResult(outcome.outputs, outcome.counts, outcome.notes, [f"{reason}. The shipped detector is used"])
+    outcome = _finish(plan, detector, found, "shipped", motion=labels, car_length_m=plan.config.detection.car_length_m)
+    used = "The shipped detector is used" + ("" if scale else ", at the scale at which it finds cars of their size")
+    return StageResult(outcome.outputs, outcome.counts, outcome.notes, [f"{reason}. {used}"])
+
+
+def _search_scale(plan: Plan, detector: Detector) -> float | None:
+    """Working px a base px, by the detector that ships; None where it finds cars at no scale, or at several."""
+    usable = np.flatnonzero(usable_frames(plan))
+    chosen = usable[np.unique(np.linspace(0, len(usable) - 1, _FRAMES_TO_SEARCH).astype(int))]
+    grid = read_first_grid(plan.layout)
+    gsd_m = _GSD_RANGE_M[0] * STEP ** np.arange(np.log(_GSD_RANGE_M[1] / _GSD_RANGE_M[0]) / np.log(STEP))
+    scales = np.array([working_scale(plan.config.detection, float(one)) for one in gsd_m])
+    scales = scales[scales**2 * grid.width_px * grid.height_px < _MAX_SEARCH_PX]
+
+    def views(scale: float) -> Iterator[View]:
+        working = WorkingGrid.open(plan, scale)
+        for frame in chosen:
+            rectified = working.frame(int(frame), working.whole)
+            if rectified is not None:
+                yield rectified.image, rectified.valid
+        advance("detector", 0)
+
+    def measure_px(strips: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        size = measure(strips)
+        return size.length, size.length_sd, size.width
+
+    return find_scale(views, detector, scales, measure_px)
 
 
 def _motion_frames(plan: Plan, scale: float) -> list[MotionFrame]:
@@ -200,10 +234,12 @@ def _finish(
     count: int = 0,
     motion: MotionLabels | None = None,
     background: MotionBackground | None = None,
+    car_length_m: float = CAR_LENGTH_M,
 ) -> StageResult:
     """Write the detector, the working grid, and the background where the detector uses it.
 
-    ``scale``: working px a base px; None: the size of a car is not known, and working px are base px.
+    ``scale``: working px a base px; None: the size of a car is not known, and working px are base px. ``car_length_m``:
+    length of the cars that it makes `working_car_length_px` long.
     """
     layout, outputs, notes = plan.layout, [plan.layout.working], []
     if detector is not None:
@@ -221,7 +257,7 @@ def _finish(
     car_px = plan.config.detection.working_car_length_px
     record = WorkingRecord(
         scale=scale or 1.0,
-        vehicle_gsd_m=None if by_vehicles is None else CAR_LENGTH_M * by_vehicles / car_px,
+        vehicle_gsd_m=None if by_vehicles is None else car_length_m * by_vehicles / car_px,
         training_source=training_source,
         has_background=layout.background in outputs,
         labels=count,
