@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
+from flows.commands.start import own_command
 from flows.launch import limit_threads
 from flows.options import Device, Preset, Settings, parse_frame_size, renamed_option
 from flows.stopping import STOPPED, as_ctrl_c, leave
@@ -351,7 +352,7 @@ def _conclude(summary: "RunSummary", console: "Console") -> int:
     root = Path(summary.root)
     console.result(f"maps    {root / 'maps'}")
     console.result(f"report  {root / 'index.html'}")
-    console.result(f"page    velfield view {shlex.quote(str(root))}")
+    console.result(f"page    {own_command()} view {shlex.quote(str(root))}")
     if summary.complete:
         return DONE
     for line in summary.frames_lost[:10]:

@@ -8,6 +8,8 @@ makes maps of what there is so far. The report is written last, from the
 summary of all stages, by every run: it is no stage, for nothing depends on it and it takes a moment.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from prefect import flow
@@ -21,13 +23,14 @@ from flows.stale import mark_crashed
 from flows.work import Work
 from schemas.job import Job
 from schemas.summary import RunSummary
+from velfield.errors import InputError
 from velfield.pipeline.check_inputs import validate_inputs
 from velfield.pipeline.estimate import check_space, disk_full_as_input_error
 from velfield.pipeline.plan import Plan, changed_since, dropped_inputs, make_plan, write_flight_record
 from velfield.pipeline.stages.registration import lost_frames
 from velfield.pipeline.stages.report import write_report
 from velfield.run.commits import sweep_partial
-from velfield.run.layout import RunLayout, remove_tree
+from velfield.run.layout import RunLayout, is_remote, remove_tree
 from velfield.run.lock import locked
 
 
@@ -47,7 +50,7 @@ def run_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
 def process_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
     """Aerial video in, velocity field out."""
     layout = RunLayout(Path(job.root))
-    with locked(layout), open_runner(runner) as where:
+    with locked(layout), _leave_no_trace(layout), open_runner(runner) as where:
         mark_crashed(job.root)
         sweep_partial(layout.root)
         remove_tree(layout.preview)
@@ -56,6 +59,19 @@ def process_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSumma
         check_space(plan)
         with disk_full_as_input_error(plan):
             return _run_stages(job, plan, where, parallel_units(runner), console)
+
+
+@contextmanager
+def _leave_no_trace(layout: RunLayout) -> Iterator[None]:
+    """Remove the folder again, with nothing but the lock in it, where the inputs are refused."""
+    try:
+        yield
+    except InputError:
+        if not is_remote(layout.root) and [path.name for path in layout.root.iterdir()] == [layout.lock.name]:
+            with suppress(OSError):  # where an open file cannot be removed
+                layout.lock.unlink()
+                layout.root.rmdir()
+        raise
 
 
 def _run_stages(job: Job, plan: Plan, runner: Runner, at_once: int, console: Console) -> RunSummary:

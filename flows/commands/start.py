@@ -1,12 +1,22 @@
 """``velfield`` alone: what to do next, by what lies in the working folder."""
 
 import shlex
+import shutil
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".ts", ".m4v")
 _IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 _MAX_ENTRIES, _SHOWN = 2000, 3
+
+
+def own_command() -> str:
+    """How to call this program from the same shell: by its name only where the shell finds it."""
+    if shutil.which("velfield") is not None:
+        return "velfield"
+    program = Path(sys.argv[0])
+    return shlex.quote(str(program)) if program.stem == "velfield" else f"{shlex.quote(sys.executable)} -m flows.cli"
 
 
 def start(folder: Path) -> int:
@@ -52,7 +62,7 @@ def _of_videos(videos: list[Path], runs: set[str], entries: list[Path]) -> Itera
     new = [video for video in videos if f"{video.stem}-run" not in runs]
     for video in new[:_SHOWN]:
         known = video.stem in subtitles
-        scale = "its .SRT may give scale and north" if known else "add --gsd-m METRES unless its metadata has the scale"
+        scale = "its .SRT may give scale and north" if known else "add --gsd-m METRES if you know it"
         yield f"{video.name} is a video, {scale}:"
         yield f"  velfield run {shlex.quote(video.name)} --out {shlex.quote(video.stem + '-run')}"
         yield f"  velfield init {shlex.quote(video.name)}   # writes flight.yaml with every parameter, to change some\n"

@@ -201,6 +201,13 @@ def test_a_unit_that_always_fails_is_lost_and_computed_by_the_next_run(
     assert digests(root) == digests(whole[0])
 
 
+def test_refused_labels_leave_no_folder(flight: Path, server: None, tmp_path: Path) -> None:
+    (tmp_path / "labels.csv").write_text("no,such,columns\n1,2,3\n")
+    with pytest.raises(InputError, match="--labels"):
+        process(job(flight, tmp_path / "run", labels=str(tmp_path / "labels.csv")))
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_base_image_of_another_place_is_refused(flight: Path, server: None, tmp_path: Path) -> None:
     import cv2
 

@@ -6,7 +6,10 @@ from pathlib import Path
 import pytest
 
 from flows.cli import app, main
-from flows.commands.start import next_steps
+from flows.commands.start import next_steps, own_command
+from velfield import open_run
+from velfield.errors import InputError
+from velfield.viewer.server import view_app
 
 
 def printed(folder: Path) -> str:
@@ -50,3 +53,23 @@ def test_the_command_alone_exits_well(
         main()
     assert ended.value.code == 0
     assert "velfield demo" in capsys.readouterr().out
+
+
+def test_a_folder_that_holds_a_run_leads_to_it(tmp_path: Path) -> None:
+    (tmp_path / "demo" / "run").mkdir(parents=True)
+    (tmp_path / "demo" / "run" / "flight.json").touch()
+    for read in (open_run, view_app):
+        with pytest.raises(InputError, match=r"it holds a run: give .*demo.run$"):
+            read(tmp_path / "demo")
+    with pytest.raises(InputError, match="make one with"):
+        open_run(tmp_path / "none")
+
+
+def test_the_program_is_called_as_the_shell_finds_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("shutil.which", lambda name: f"/usr/bin/{name}")
+    assert own_command() == "velfield"
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    monkeypatch.setattr("sys.argv", [".venv/bin/velfield", "run"])
+    assert own_command() == ".venv/bin/velfield"
+    monkeypatch.setattr("sys.argv", ["flows/cli.py", "run"])
+    assert own_command().endswith(" -m flows.cli")

@@ -35,6 +35,7 @@ _TRAIL_S, _SPEED_S = 3.0, 0.5
 """Length of the tracks drawn, and half the time over which the speed shown is."""
 _LENGTH_M, _WIDTH_M, _UNKNOWN_LENGTH_PX = 4.5, 1.9, 20.0
 _MIN_BOX_PX, _MIN_LABELLED_PX = 6.0, 8.0
+_LABEL_SIZE = 0.4
 _PARKED = np.array([154, 160, 168])
 _SHIFT = 4
 """Binary digits of a pixel's fraction in OpenCV's drawing."""
@@ -182,9 +183,17 @@ class _Scene:
         if length < _MIN_LABELLED_PX:
             return
         shown = self.legend_scale.shown_speed(speed)
-        for place, value, still in zip(self._place(centre) >> _SHIFT, shown, parked, strict=True):
+        heading = (ends[:, 1] - ends[:, 0]) / np.maximum(np.hypot(*(ends[:, 1] - ends[:, 0]).T), 1e-9)[:, None]
+        for place, value, along, still in zip(self._place(centre) / 2**_SHIFT, shown, heading, parked, strict=True):
             if not still:
-                self._write(image, f"{value:.0f}", (int(place[0] + 0.6 * length), int(place[1] - 0.3 * length)), 0.4)
+                self._write_behind(image, f"{value:.0f}", place, along, length)
+
+    def _write_behind(self, image: RGBImage, text: str, place: FloatArray, along: FloatArray, length: float) -> None:
+        """A speed behind its vehicle, in its own lane: beside it would be the next one's."""
+        (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, _LABEL_SIZE, 1)
+        reach = 0.5 * (length + abs(along[0]) * width + abs(along[1]) * height) + 2
+        x, y = place - reach * along
+        self._write(image, text, (round(x - width / 2), round(y + height / 2)), _LABEL_SIZE)
 
     def _place(self, xy_px: FloatArray) -> IntArray:
         """Base pixels as OpenCV's fixed-point pixels of the video."""

@@ -10,7 +10,18 @@ from schemas.records import FORMAT_VERSION, READABLE_FORMATS, FlightRecord
 from schemas.renames import OLD_FOLDERS, upgrade_config
 from velfield.errors import InputError
 from velfield.run.commits import read_sealed
-from velfield.run.layout import RunLayout
+from velfield.run.layout import RunLayout, is_remote
+
+_MAX_ENTRIES = 1000
+
+
+def suggest_run(root: Path) -> str:
+    """What to do with a folder that is no run: the runs that lie in it, else how to make one."""
+    folders = sorted(root.iterdir())[:_MAX_ENTRIES] if not is_remote(root) and root.is_dir() else []
+    runs = [str(folder) for folder in folders if RunLayout(folder).flight.exists()]
+    if runs:
+        return f"it holds {'a run' if len(runs) == 1 else 'runs'}: give {' or '.join(runs[:3])}"
+    return f"make one with `velfield run ... --out {root}`"
 
 
 def read_flight_record(root: Path) -> FlightRecord:
@@ -23,9 +34,7 @@ def read_flight_record(root: Path) -> FlightRecord:
     """
     layout = RunLayout(root)
     if not layout.flight.exists():
-        raise InputError(
-            f"{root} is not a run folder: it has no flight.json; make one with `velfield run ... --out {root}`"
-        )
+        raise InputError(f"{root} is not a run folder: it has no flight.json; {suggest_run(root)}")
     record = _parse(layout.flight)
     version = record.get("format_version")
     if version not in READABLE_FORMATS:

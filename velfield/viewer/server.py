@@ -18,6 +18,7 @@ from sys import platform
 from typing import TYPE_CHECKING, Any
 
 from velfield.errors import InputError
+from velfield.run.flight_record import suggest_run
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
@@ -67,7 +68,7 @@ def view_app(root: Path) -> "Starlette":
         There is no page in the folder.
     """
     if not (root / "index.html").is_file():
-        raise InputError(f"{root} holds no index.html: make it with `velfield run ... --out {root}`")
+        raise InputError(f"{root} holds no index.html: {suggest_run(root)}")
     return files_app(root)
 
 
