@@ -9,9 +9,10 @@ from schemas.arrays import FloatArray
 from velfield.analysis.changes import find_changes
 from velfield.analysis.flow.conflicts import find_conflicts
 from velfield.analysis.flow.volume import flow_slices
-from velfield.analysis.intervals import estimate_quantile, estimate_rate, estimate_share
+from velfield.analysis.intervals import estimate_censored_quantile, estimate_quantile, estimate_rate, estimate_share
 from velfield.analysis.movements.movements import furness
 from velfield.analysis.signals.cycles import find_signal, queues
+from velfield.analysis.signals.phases import START_DELAY_S, fit_phases
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import Trajectories, make_trajectories, moving
 
@@ -177,3 +178,41 @@ def test_too_little_data_gives_none() -> None:
     assert estimate_quantile(np.arange(10.0), 0.15) is None
     assert estimate_share(2, 4) is None
     assert estimate_rate(np.array([1, 2]), 1.0) is None
+
+
+def test_lower_bounds_do_not_draw_a_median_down() -> None:
+    rng = np.random.default_rng(3)
+    hits, errors, naive = [], [], []
+    for _ in range(200):
+        wish, ahead = rng.normal(50, 5, 120), rng.normal(50, 6, 120)
+        free = ahead > wish
+        found = estimate_censored_quantile(np.minimum(wish, ahead), free, 0.5)
+        assert found is not None
+        hits.append(found.low <= 50 <= found.high)
+        errors.append(found.value - 50)
+        naive.append(np.median(wish[free]) - 50)
+    assert 0.84 < np.mean(hits) < 0.96
+    assert abs(np.mean(errors)) < 0.3
+    assert np.mean(naive) < -2
+
+
+def test_a_quantile_above_all_observed_values_is_not_known() -> None:
+    values = np.arange(40.0)
+    assert estimate_censored_quantile(values, values < 10, 0.5) is None
+    assert estimate_censored_quantile(values, values < 3, 0.05) is None
+
+
+def test_lanes_of_a_phase_that_start_late_together_are_one_observation() -> None:
+    rng = np.random.default_rng(4)
+    covered, green = [], []
+    for _ in range(200):
+        starts = []
+        for onset in (12.0, 42.0):
+            late = onset + START_DELAY_S + 60.0 * np.arange(8) + np.abs(rng.normal(0, 0.8, 8))
+            starts += [late + rng.normal(0, 0.1, 8) for _ in range(4)]
+        cycle, phases = fit_phases(starts, 60.05)
+        assert [len(phase.streams) for phase in phases] == [4, 4]
+        covered.append(cycle.low <= 60.0 <= cycle.high)
+        green.append(phases[0].green_s.low < 12.0 < phases[0].green_s.high)
+    assert 0.85 < np.mean(covered) < 0.96
+    assert np.mean(green) > 0.9

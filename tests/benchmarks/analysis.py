@@ -8,6 +8,7 @@ import argparse
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -24,7 +25,7 @@ from velfield.analysis.signals.cycles import JunctionSignal, queues
 from velfield.analysis.signals.queues import Stops, find_stops, observe_stream
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import PathSamples, Trajectories, make_trajectories, moving
-from velfield.synthetic.city.city_plan import AISLE_SPEED, STOP_A, STOP_B
+from velfield.synthetic.city.city_plan import STOP_A, STOP_B
 from velfield.synthetic.flight import Flight
 from velfield.synthetic.lane_score import DirectedGraph, score_lanes
 from velfield.synthetic.observed import NO_ERRORS, observed_detections
@@ -142,14 +143,28 @@ def _movements(found: TrafficAnalysis, true: TrafficAnalysis, results: Results) 
             results.values["movements: GEH"].append(float(np.sqrt(2 * (total - n) ** 2 / max(total + n, 1))))
             if n >= 20 and m.share:
                 results.values["movements: share, points"].append(100 * abs(m.share.value - n / whole))
-            centre = np.round(junction.junction.centre_m / 15).astype(int)
-            name = f"{junction.junction.kind} {centre[0]} {centre[1]} {m.arm_in} {m.arm_out}"
+            name = _name(junction.junction.kind, m.arm_in, m.arm_out, junction.junction.centre_m)
             if m.share and m.share.value < 0.995:
                 results.estimates.append(("share", name, m.share))
-                results.true["share", name] = n / max(whole, 1)
             if m.flow_veh_per_h:
                 results.estimates.append(("flow", name, m.flow_veh_per_h))
-                results.true["flow", name] = n / max(np.ptp(true.window_s), 1.0) * 3600
+        for i, j in product(range(len(arms)), repeat=2):  # of movements that are too few for an estimate as well
+            n, whole = int(((arm_in == i) & (arm_out == j)).sum()), int(((arm_in == i) & (arm_out >= 0)).sum())
+            name = _name(junction.junction.kind, names[i], names[j], junction.junction.centre_m)
+            results.true["flow", name] = n / max(np.ptp(true.window_s), 1.0) * 3600
+            if whole:
+                results.true["share", name] = n / whole
+
+
+def _name(kind: str, arm_in: str, arm_out: str, centre_m: FloatArray) -> str:
+    return f"{kind} {arm_in} {arm_out} {centre_m[0]:.1f} {centre_m[1]:.1f}"
+
+
+def _same(name: str, other: str) -> bool:
+    """Whether two names are of one movement: of junctions whose centres are within 20 m."""
+    *what, x, y = name.split()
+    *others, u, v = other.split()
+    return what == others and float(np.hypot(float(x) - float(u), float(y) - float(v))) < 20
 
 
 def _speeds(found: TrafficAnalysis, true: TrafficAnalysis, results: Results) -> None:
@@ -197,7 +212,7 @@ def _signals(case: Case, found: TrafficAnalysis, true: TrafficAnalysis, results:
 
 def _streams(case: Case, signal: JunctionSignal, samples: PathSamples, stops: Stops, results: Results) -> None:
     origin, warm_up = case.flight.city._origin_m, case.flight.config.traffic.warm_up_s
-    plan = case.flight.city.plan
+    plan, all_red = case.flight.city.plan, case.flight.config.traffic.all_red_s
     for stream in signal.streams:
         path = stream.stream.approach.path_m
         step = path[-1] - path[0]
@@ -212,6 +227,13 @@ def _streams(case: Case, signal: JunctionSignal, samples: PathSamples, stops: St
         shifted = Estimate(error, error - (value.value - value.low), error + value.high - value.value, value.n)
         results.estimates.append(("green", "0", shifted))
         results.true["green", "0"] = 0.0
+        if stream.red_phase_s:
+            red = stream.red_phase_s
+            red_error = (red.value - onset - CYCLE_S / 2 + all_red + CYCLE_S / 2) % CYCLE_S - CYCLE_S / 2
+            results.values["signals: red onset, s"].append(abs(red_error))
+            around = Estimate(red_error, red_error - red.value + red.low, red_error + red.high - red.value, red.n)
+            results.estimates.append(("red", "0", around))
+            results.true["red", "0"] = 0.0
         if line is not None:
             at = path[0] + step / np.hypot(*step) * line
             distance = abs(float((at - centres[number])[axis]))
@@ -222,21 +244,37 @@ def _streams(case: Case, signal: JunctionSignal, samples: PathSamples, stops: St
 
 
 def _u_turns(case: Case, found: TrafficAnalysis, results: Results) -> None:
-    """U-turns of the plan: turns that reverse, between two avenues' lanes; a vehicle is counted at their middle."""
-    city = case.flight.city
-    xy, vehicle = case.true[["x_px", "y_px"]].to_numpy(np.float64), case.true["vehicle_id"].to_numpy(np.int64)
-    tree, true = cKDTree(xy), set()
-    for edge in city.plan.road_network.edges:
-        first, last = np.diff(edge.path[:2], axis=0)[0], np.diff(edge.path[-2:], axis=0)[0]
-        turn = abs(float(np.angle(np.exp(1j * (np.arctan2(*last[::-1]) - np.arctan2(*first[::-1]))))))
-        if edge.kind == "turn" and turn > 2.6 and edge.speed_m_per_s != AISLE_SPEED:
-            middle = city.to_px(edge.path[len(edge.path) // 2][None])[0]
-            true |= set(vehicle[tree.query_ball_point(middle, 2.5 / GSD_M)].tolist())
+    """U-turns between an avenue's lanes, of vehicles that were seen before the turn and after it."""
+    true = true_u_turns(case)
     owner = case.tracks.drop_duplicates("track_id").set_index("track_id")["vehicle_id"]
     reversed_ = [int(owner[found.trajectories.track_id[r.track]]) for r in found.reversals]
     results.values["u-turns: true"].append(len(true))
     results.values["u-turns: found"].append(len(true & set(reversed_)))
-    results.values["u-turns: false"].append(sum(v not in true for v in reversed_))
+    begun = true_u_turns(case, seen_m=0.0)
+    results.values["u-turns: false"].append(sum(v not in begun for v in reversed_))
+
+
+def true_u_turns(case: Case, *, seen_m: float = 20.0) -> set[int]:
+    """Vehicles that reverse on a turn onto an avenue, seen so far before and after its middle."""
+    city, net = case.flight.city, case.flight.city.plan.road_network
+    into, out = net.in_edges(), net.out_edges()
+    xy, vehicle = case.true[["x_px", "y_px"]].to_numpy(np.float64), case.true["vehicle_id"].to_numpy(np.int64)
+    tree, true = cKDTree(xy), set()
+    rows = case.true.sort_values(["vehicle_id", "frame"], kind="stable").groupby("vehicle_id").groups
+    for edge in net.edges:
+        first, last = np.diff(edge.path[:2], axis=0)[0], np.diff(edge.path[-2:], axis=0)[0]
+        turn = abs(float(np.angle(np.exp(1j * (np.arctan2(*last[::-1]) - np.arctan2(*first[::-1]))))))
+        in_car_park = any(net.edges[k].kind == "aisle" for k in into[edge.start] + out[edge.end])
+        if edge.kind != "turn" or turn < 2.6 or in_car_park:
+            continue
+        middle = city.to_px(edge.path[len(edge.path) // 2][None])[0]
+        for v in np.unique(vehicle[tree.query_ball_point(middle, 2.5 / GSD_M)]).tolist():
+            own = xy[rows[v]]
+            along = np.r_[0.0, np.hypot(*np.diff(own, axis=0).T).cumsum()] * GSD_M
+            at = along[np.argmin(np.hypot(*(own - middle).T))]
+            if min(at, along[-1] - at) >= seen_m:
+                true.add(v)
+    return true
 
 
 def _conflicts(case: Case, found: TrafficAnalysis, true: TrafficAnalysis, results: Results) -> None:
@@ -271,8 +309,14 @@ def coverage(all_results: list[Results]) -> dict[str, tuple[int, int]]:
     for k, results in enumerate(all_results):
         for kind, name, estimate in results.estimates:
             if kind in ("share", "flow"):
-                others = [r.true[kind, name] for j, r in enumerate(all_results) if j != k and (kind, name) in r.true]
-                if len(others) < len(all_results) // 2:
+                others = [
+                    value
+                    for j, r in enumerate(all_results)
+                    if j != k
+                    for (what, other), value in r.true.items()
+                    if what == kind and _same(name, other)
+                ]
+                if len(others) < 0.7 * (len(all_results) - 1):
                     continue
                 truth = float(np.mean(others))
             else:

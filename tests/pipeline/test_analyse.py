@@ -1,5 +1,6 @@
 """`velfield analyse`: what it writes from another program's tracks, and what it says of bad ones."""
 
+import re
 import zipfile
 from pathlib import Path
 
@@ -9,13 +10,18 @@ import pytest
 
 from flows.commands.analyse import analyse
 from schemas.analysis import AnalysisRecord, LanesRecord
+from schemas.records import CommitRecord
 from tests.analysis.test_traffic_analysis import crossroads
+from tests.field_runs import field_run, tracklets_along
 from velfield.errors import InputError
 from velfield.pipeline.analysis.workbook import can_write_workbook
+from velfield.run.commits import sealed_json, write_atomically, write_commit
+from velfield.run.flight_record import read_flight_record
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight minutes at a crossroads with a signal."""
     root = tmp_path_factory.mktemp("analyse")
     tracks = crossroads()
     owner = np.repeat(np.arange(len(tracks)), [len(times) for times, _ in tracks])
@@ -68,3 +74,35 @@ def test_bad_input_is_one_line(tmp_path: Path) -> None:
         analyse(tracks=pixels, out=tmp_path / "out")
     with pytest.raises(InputError, match="no track that moves"):
         analyse(tracks=pixels, out=tmp_path / "out", gsd_m=0.1)
+
+
+def test_the_answers_are_printed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    analyse(tracks=folder.parent / "tracks.csv", out=folder.parent / "again")
+    text = capsys.readouterr().out
+    assert re.search(r"signal +junction \d: cycle 40 s \(\d", text)
+    assert re.search(r"W to E: \d+, [\d.]+ % \([\d.]+ to [\d.]+, n \d+\) of the entry", text)
+    assert re.search(r"u-turns +none in \d.* min, so fewer than \d", text)
+
+
+def test_a_short_clip_is_said_to_be_short(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [(k, 0.2 * t, 10.0 * 0.2 * t, 5.0 + k) for k in range(4) for t in range(30)]
+    pd.DataFrame(rows, columns=["track_id", "time_s", "x_m", "y_m"]).to_csv(tmp_path / "t.csv", index=False)
+    analyse(tracks=tmp_path / "t.csv", out=tmp_path / "out")
+    assert "4 moving vehicles in 6 s are too few" in capsys.readouterr().out
+    tables = AnalysisRecord.model_validate_json((tmp_path / "out" / "analysis.json").read_text()).tables
+    assert next(t for t in tables if t.name == "signals").note.startswith("Too little data: 4 moving vehicles in 6 s.")
+
+
+def test_tracks_older_than_the_settings_are_said_to_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(0)
+    paths = [np.column_stack([np.arange(0, 390, 6.0), 50 + rng.normal(0, 0.1, 65)]) for _ in range(8)]
+    run = field_run(tmp_path / "run", tracklets_along(paths), shape=(100, 400), gsd_m=0.25)
+    with pytest.raises(InputError, match="tracks are not computed"):
+        analyse(tmp_path / "run")
+    record = CommitRecord(stage="tracks", unit="all", key="old", code_version="1")
+    write_commit(run.layout, record)
+    flight = read_flight_record(run.layout.root)
+    for key, stale in (("old", False), ("new", True)):
+        write_atomically(run.layout.flight, sealed_json(flight.model_copy(update={"keys": {"tracks": key}})))
+        assert analyse(tmp_path / "run") == 0
+        assert ("older than its settings" in capsys.readouterr().out) is stale

@@ -65,6 +65,57 @@ def estimate_quantile(values: NDArray[np.floating], q: float, *, min_n: int = MI
     return Estimate(float(np.quantile(known, q)), low, high, n)
 
 
+def estimate_censored_quantile(
+    values: NDArray[np.floating], observed: NDArray[np.bool_], q: float, *, min_n: int = MIN_VEHICLES
+) -> Estimate | None:
+    """A quantile of independent values of which some are known only to be larger than what was measured.
+
+    The product-limit estimator (Kaplan and Meier); the interval inverts its own at each value, by Greenwood's variance
+    of log(-log S). Without such values it is `estimate_quantile`.
+
+    Parameters
+    ----------
+    values
+        (n,) values, or lower bounds.
+    observed
+        (n,) False where the value is a lower bound.
+    min_n
+        Fewest observed values.
+
+    Examples
+    --------
+    >>> values, observed = np.arange(1.0, 12.0), np.arange(11) != 2
+    >>> estimate_censored_quantile(values, observed, 0.5).value
+    7.0
+    """
+    if observed.all():
+        return estimate_quantile(values, q, min_n=min_n)
+    n = int(observed.sum())
+    if n < min_n or min(q, 1 - q) * n < MIN_QUANTILE_TAIL:
+        return None
+    order = np.lexsort((~observed, values))
+    ordered, event = values[order], observed[order].astype(np.float64)
+    at_risk = len(ordered) - np.arange(len(ordered))
+    last = int(np.flatnonzero(event)[-1])
+    ordered, event, at_risk = ordered[: last + 1], event[: last + 1], at_risk[: last + 1]
+    survival = np.cumprod(1 - event / at_risk)
+    variance = np.cumsum(event / np.maximum(at_risk * (at_risk - event), 0.5))
+    known = np.flatnonzero((survival > 0) & (survival < 1))
+    if not len(known):
+        return None
+    z = float(stats.norm.ppf((1 + LEVEL) / 2)) * np.sqrt(variance[known]) / np.abs(np.log(survival[known]))
+    curves = (survival[known] ** np.exp(z), survival[known], survival[known] ** np.exp(-z))
+    low, value, high = (_first_below(curve, ordered[known], 1 - q) for curve in curves)
+    if low is None or value is None:
+        return None  # too many lower bounds: the quantile lies above all that was observed
+    return Estimate(value, low, float(ordered[-1]) if high is None else high, n)
+
+
+def _first_below(curve: FloatArray, values: FloatArray, level: float) -> float | None:
+    rows = np.flatnonzero(curve <= level)
+    return float(values[rows[0]]) if len(rows) else None
+
+
 def _fractional_order(ordered: FloatArray, q: float, alpha: float) -> float:
     """The order statistic, interpolated, that lies above the quantile ``q`` with probability ``alpha``."""
     n = len(ordered)

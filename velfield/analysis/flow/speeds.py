@@ -4,15 +4,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.arrays import FloatArray, IntArray
+from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.analysis.flow.passings import LaneTraffic
-from velfield.analysis.intervals import Estimate, estimate_median, estimate_quantile
+from velfield.analysis.intervals import Estimate, estimate_censored_quantile, estimate_median, estimate_quantile
 from velfield.analysis.lanes.model import Junction, LaneGraph, LaneSamples
 
 STATION_M = 10.0
 """Length of a profile's stations."""
 _FREE_HEADWAY_S = 4.0
 """A vehicle whose leader is further ahead follows nobody."""
+_FOLLOWS_HEADWAY_S = 3.0
+"""One whose leader is nearer goes no faster than it would like."""
 _STEADY_M, _STEADY = 30.0, 0.03
 """A vehicle that goes freely changes its speed by no more than this fraction over so long a distance."""
 _MIN_FREE = 8
@@ -68,11 +70,12 @@ class FreeFlow:
     lanes
         Of the road.
     speed_m_per_s
-        Median speed of the vehicles that follow nobody and keep their speed; None: too few of them.
+        Median speed at which drivers go where nobody is ahead; None: too few of them are seen to. Those who follow
+        count as faster than they go (Botma's estimator of free speeds).
     limit_km_per_h
         The multiple of ten nearest to it.
     p85_m_per_s
-        Which 85 of 100 such vehicles do not exceed.
+        Which 85 of 100 drivers do not exceed.
     """
 
     lanes: tuple[int, ...]
@@ -83,47 +86,49 @@ class FreeFlow:
 
 def free_flow(traffic: LaneTraffic) -> list[FreeFlow]:
     """Free flow of every road of a lane graph."""
-    speeds = [_free_speeds(traffic, lane.number) for lane in traffic.graph]
+    speeds = [_steady_speeds(traffic, lane.number) for lane in traffic.graph]
     out = []
     for lanes in roads(traffic.graph):
-        tracks = np.concatenate([speeds[lane][0] for lane in lanes])
-        values = np.concatenate([speeds[lane][1] for lane in lanes])
+        tracks, values, free = (np.concatenate([speeds[lane][k] for lane in lanes]) for k in range(3))
         # a vehicle once: its fastest steady stretch, as it goes slowly for other reasons too
         order = np.lexsort((-values, tracks))
         _, first = np.unique(tracks[order], return_index=True)
-        best = values[order][first]
-        median = estimate_median(best, min_n=_MIN_FREE)
+        best, is_free = values[order][first], free[order][first]
+        median = estimate_censored_quantile(best, is_free, 0.5, min_n=_MIN_FREE)
         limit = None if median is None else round(median.value * 3.6 / SIGN_KM_PER_H) * SIGN_KM_PER_H
-        p85 = estimate_quantile(best, 0.85, min_n=_MIN_FREE)
+        p85 = estimate_censored_quantile(best, is_free, 0.85, min_n=_MIN_FREE)
         out.append(FreeFlow(tuple(lanes), median, limit, p85))
     return out
 
 
-def _free_speeds(traffic: LaneTraffic, lane: int) -> tuple[IntArray, FloatArray]:
-    """Tracks and their speeds where they go steadily and follow nobody."""
+def _steady_speeds(traffic: LaneTraffic, lane: int) -> tuple[IntArray, FloatArray, Mask]:
+    """Tracks, their speeds where they go steadily, and whether they follow nobody there; what is neither free nor
+    certain to follow is left out."""
     samples = traffic.samples(lane)
     length = traffic.graph.lanes[lane].length_m
     window = min(_STEADY_M, 0.6 * length)
-    tracks, speeds = [np.empty(0, np.int64)], [np.empty(0)]
+    tracks, speeds, free = [np.empty(0, np.int64)], [np.empty(0)], [np.empty(0, bool)]
     steps = int(window)
     if steps < 5 or len(samples) <= steps:
-        return tracks[0], speeds[0]
-    v = samples.speed_m_per_s
-    low = np.lib.stride_tricks.sliding_window_view(v, steps).min(axis=1)
-    high = np.lib.stride_tricks.sliding_window_view(v, steps).max(axis=1)
+        return tracks[0], speeds[0], free[0]
+    windows = np.lib.stride_tricks.sliding_window_view(samples.speed_m_per_s, steps)
+    low, high = windows.min(axis=1), windows.max(axis=1)
+    mean = (low + high) / 2
     one = samples.track[: len(low)] == samples.track[steps - 1 :]
-    steady = one & (high - low < 2 * _STEADY * (high + low) / 2) & (low > 2.0)
+    steady = one & (high - low < 2 * _STEADY * mean) & (low > 2.0)
     for at in np.arange(0.5 * window, length, 10.0):
-        passing = traffic_passings(samples, at)
-        # whoever leads a platoon is slow: only a vehicle that nobody follows either goes as it likes
-        free = (passing[1] > _FREE_HEADWAY_S) & (np.r_[passing[1][1:], np.inf] > _FREE_HEADWAY_S)
+        passed, headway = traffic_passings(samples, at)
         begin = np.flatnonzero(steady & (samples.along_m[: len(low)] <= at - window / 2 + 1.0))
         begin = begin[samples.along_m[begin] > at - window / 2 - 1.5]
-        owner = samples.track[begin]
-        keep = np.isin(owner, passing[0][free])
-        tracks.append(owner[keep])
-        speeds.append((low[begin][keep] + high[begin][keep]) / 2)
-    return np.concatenate(tracks), np.concatenate(speeds)
+        order = np.argsort(passed, kind="stable")
+        k = np.clip(np.searchsorted(passed[order], samples.track[begin]), 0, max(len(passed) - 1, 0))
+        known = passed[order][k] == samples.track[begin] if len(passed) else np.zeros(len(begin), bool)
+        begin, ahead_s = begin[known], headway[order][k[known]] if len(passed) else np.empty(0)
+        keep = (ahead_s > _FREE_HEADWAY_S) | (ahead_s < _FOLLOWS_HEADWAY_S)
+        tracks.append(samples.track[begin][keep])
+        speeds.append(mean[begin][keep])
+        free.append(ahead_s[keep] > _FREE_HEADWAY_S)
+    return np.concatenate(tracks), np.concatenate(speeds), np.concatenate(free)
 
 
 def traffic_passings(samples: LaneSamples, at_m: float) -> tuple[IntArray, FloatArray]:

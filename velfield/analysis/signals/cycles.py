@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.intervals import Estimate, estimate_mean, estimate_share
+from velfield.analysis.signals.phases import fit_phases
 from velfield.analysis.signals.queues import Stream
 
 MIN_CYCLE_S, MAX_CYCLE_S = 24.0, 200.0
@@ -17,10 +17,6 @@ _MAX_P_VALUE = 0.005
 """Probability by chance above which starts do not recur."""
 _MIN_CONCENTRATION = 0.85
 """Mean resultant length of the starts' phases under a signal; one that traffic actuates has less."""
-_START_DELAY_S, _START_DELAY_SD_S = 1.8, 0.6
-"""From green to the moment at which the first vehicle has visibly moved off: its driver's reaction, and a junction that
-is still to clear. It differs from junction to junction by so much."""
-_TOGETHER_S = 4.0
 _VEHICLE_M, _SPACING_M = 4.5, 6.4
 """Length of a car, and from front to front in a queue."""
 _START_UP_VEHICLES = 4
@@ -74,8 +70,8 @@ class JunctionSignal:
 def find_signal(junction: int, streams: Sequence[Stream], begin_s: float, end_s: float) -> JunctionSignal:
     """The signal of a junction from its streams, seen from ``begin_s`` to ``end_s``."""
     used = [stream for stream in streams if len(stream.head_time_s) >= MIN_STARTS]
+    used = [stream for stream in used if len(_queue_heads(stream)) >= MIN_STARTS]
     events = [_queue_heads(stream) for stream in used]
-    events = [times for times in events if len(times) >= MIN_STARTS]
     n = sum(len(times) for times in events)
     if n < 2 * MIN_STARTS or not events:
         reason = f"too little data: {n} starts of queues, {2 * MIN_STARTS} needed"
@@ -94,10 +90,14 @@ def find_signal(junction: int, streams: Sequence[Stream], begin_s: float, end_s:
     if p_value > _MAX_P_VALUE or concentration < _MIN_CONCENTRATION:
         reason = f"no fixed cycle: {n} starts of queues, concentration {concentration:.2f}"
         return JunctionSignal(junction, False, reason, None, (), ())
-    estimate = _cycle_interval(events, cycle)
-    signals = [_stream_signal(stream, estimate.value, begin_s, end_s) for stream in used]
-    kept = [signal for signal in signals if signal is not None]
-    return JunctionSignal(junction, True, "", estimate, tuple(kept), _phases(kept, estimate.value))
+    estimate, phases = fit_phases(events, cycle)
+    signals = [
+        _stream_signal(used[k], phase.green_s, estimate.value, begin_s, end_s)
+        for phase in phases
+        for k in phase.streams
+    ]
+    lanes = tuple(tuple(sorted(used[k].approach.lane for k in phase.streams)) for phase in phases)
+    return JunctionSignal(junction, True, "", estimate, tuple(signals), lanes)
 
 
 def _queue_heads(stream: Stream) -> FloatArray:
@@ -129,41 +129,8 @@ def _find_cycle(events: Sequence[FloatArray], longest_s: float) -> tuple[float, 
     return float(1 / fine[k]), concentration, float(min(len(frequency) / 5 * np.exp(-excess), 1.0))
 
 
-def _cycle_interval(events: Sequence[FloatArray], cycle_s: float) -> Estimate:
-    """The cycle by least squares on the number of each start's cycle, each stream with its own phase."""
-    numbers, times, free = [], [], 0
-    for start in events:
-        phase = np.angle(np.exp(2j * np.pi * start / cycle_s).mean()) / (2 * np.pi) * cycle_s
-        k = np.round((start - phase) / cycle_s)
-        good = np.abs(start - phase - k * cycle_s) < 8.0
-        if good.sum() < 2:
-            continue
-        numbers.append(k[good] - k[good].mean())
-        times.append(start[good] - start[good].mean())
-        free += 1
-    k, t = np.concatenate(numbers), np.concatenate(times)
-    n = len(k)
-    slope = float((k * t).sum() / (k**2).sum())
-    residual = float(np.sqrt(((t - slope * k) ** 2).sum() / max(n - free - 1, 1)))
-    half = float(stats.t.ppf(0.95, max(n - free - 1, 1)) * max(residual, 0.1) / np.sqrt((k**2).sum()))
-    return Estimate(slope, slope - half, slope + half, n)
-
-
-def _stream_signal(stream: Stream, cycle_s: float, begin_s: float, end_s: float) -> StreamSignal | None:
-    starts = _queue_heads(stream)
-    if len(starts) < MIN_STARTS:
-        return None
-    phase = float(np.angle(np.exp(2j * np.pi * starts / cycle_s).mean()) / (2 * np.pi) * cycle_s)
-    residual = (starts - phase + cycle_s / 2) % cycle_s - cycle_s / 2
-    # Some heads are slow, or wait for the junction to clear: green is where the prompt ones start.
-    middle = float(np.median(residual))
-    prompt = residual[np.abs(residual - middle) < 3.0]
-    onset = estimate_mean(prompt, min_n=3)
-    if onset is None:
-        return None
-    half = float(np.hypot((onset.high - onset.low) / 2, 1.645 * _START_DELAY_SD_S))
-    value = (phase + onset.value - _START_DELAY_S) % cycle_s
-    green = Estimate(value, value - half, value + half, onset.n)
+def _stream_signal(stream: Stream, green: Estimate, cycle_s: float, begin_s: float, end_s: float) -> StreamSignal:
+    value = green.value
     k = np.arange(np.ceil((begin_s - value) / cycle_s), np.floor((end_s - value) / cycle_s) + 1)
     lost, saturation = _discharge(stream, value + k * cycle_s)
     return StreamSignal(stream, green, _red_onset(stream, value, cycle_s), value + k * cycle_s, lost, saturation)
@@ -222,20 +189,6 @@ def _queue_at(stream: Stream, time_s: float) -> IntArray:
     """Tracks that stand at a time, or have just left a stop at it."""
     end = np.where(np.isfinite(stream.stop_end_s), stream.stop_end_s, stream.stop_start_s)
     return np.unique(stream.stop_track[(stream.stop_start_s < time_s) & (end + 25 > time_s) & (end > time_s - 5)])
-
-
-def _phases(signals: Sequence[StreamSignal], cycle_s: float) -> tuple[tuple[int, ...], ...]:
-    """Lanes whose green begins within a few seconds, in order round the cycle."""
-    groups: list[tuple[float, list[int]]] = []
-    for signal in sorted(signals, key=lambda s: s.green_phase_s.value):
-        value = signal.green_phase_s.value
-        for at, lanes in groups:
-            if abs((value - at + cycle_s / 2) % cycle_s - cycle_s / 2) < _TOGETHER_S:
-                lanes.append(signal.stream.approach.lane)
-                break
-        else:
-            groups.append((value, [signal.stream.approach.lane]))
-    return tuple(tuple(lanes) for _, lanes in groups)
 
 
 def stopping_share(stream: Stream) -> Estimate | None:

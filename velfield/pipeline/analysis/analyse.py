@@ -14,15 +14,19 @@ from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import make_trajectories, moving
 from velfield.errors import InputError
 from velfield.exports.georeference import Georeference
+from velfield.pipeline.analysis.answers import answers, explain_empty
 from velfield.pipeline.analysis.lanes_record import lanes_geojson, lanes_record
 from velfield.pipeline.analysis.page import report_html
 from velfield.pipeline.analysis.tables import all_tables
 from velfield.pipeline.analysis.workbook import EXTRA, can_write_workbook, workbook_bytes
-from velfield.run.commits import code_version, write_atomically
-from velfield.run.layout import to_path
+from velfield.run.commits import code_version, read_commits, write_atomically
+from velfield.run.flight_record import read_flight_record
+from velfield.run.layout import RunLayout, to_path
 from velfield.run.run import open_run
 from velfield.sources.trajectories import read_tracks
 
+TRACKS = "tracks"
+"""The stage whose results are analysed."""
 _MAX_PICTURE_PX = 1600
 _TRACKS_GSD_M = 0.1
 """Base pixels of tracks given in metres."""
@@ -34,9 +38,10 @@ def analyse_run(run_folder: Path) -> Iterator[str]:
     Raises
     ------
     InputError
-        The folder is not a run folder.
+        The folder is not a run folder, or its tracks are not computed.
     """
     run = open_run(run_folder)
+    yield from _stale_lines(run.layout)
     yield from write_analysis(
         run.analysis.traffic,
         run.layout.analysis,
@@ -44,6 +49,22 @@ def analyse_run(run_folder: Path) -> Iterator[str]:
         gsd_known=run.grid.gsd_m is not None,
         picture=run.base_image,
     )
+
+
+def _stale_lines(layout: RunLayout) -> Iterator[str]:
+    """A line where the tracks are of other settings, or inputs, than the run's latest."""
+    record, commits = read_flight_record(layout.root), read_commits(layout, TRACKS)
+    if not commits:
+        raise InputError(
+            f"{layout.root}: found a run whose tracks are not computed, expected a finished one; "
+            "run `velfield run` with this folder to the end"
+        )
+    key = record.keys.get(TRACKS)
+    if key is not None and any(commit.key != key for commit in commits):
+        yield (
+            f"warning     the tracks in {layout.root} are older than its settings, or units were lost before them: "
+            "these answers are of the earlier tracks; run `velfield run` with this folder to the end"
+        )
 
 
 def analyse_tracks(
@@ -85,18 +106,16 @@ def write_analysis(
     lanes = _with_answers(lanes_record(analysis.lanes, gsd_m), analysis)
     write_atomically(out / "lanes.json", lanes.model_dump_json().encode())
     write_atomically(out / "lanes.geojson", lanes_geojson(lanes, georeference).encode())
-    yield _lanes_line(analysis, out)
     record = AnalysisRecord(
         code_version=code_version(),
         gsd_m=gsd_m,
         gsd_known=gsd_known,
         duration_s=round(analysis.trajectories.duration_s, 3),
         tracks=len(analysis.trajectories),
-        tables=tuple(all_tables(analysis)),
+        tables=tuple(explain_empty(table, analysis) for table in all_tables(analysis)),
     )
     write_atomically(out / "analysis.json", record.model_dump_json().encode())
-    for table in record.tables:
-        yield f"{table.section.lower():11} {table.title.lower()}: {len(table.rows)}"
+    yield from answers(analysis)
     html = report_html(record, lanes, georeference.shape, _data_url(picture))
     write_atomically(out / "report.html", html.encode())
     yield f"report      {out / 'report.html'}"
@@ -105,15 +124,6 @@ def write_analysis(
         yield f"workbook    {out / 'analysis.xlsx'}"
     else:
         yield f"workbook    not written: pip install '{EXTRA}'"
-
-
-def _lanes_line(analysis: TrafficAnalysis, out: Path) -> str:
-    graph = analysis.lanes
-    length = sum(lane.length_m for lane in graph) / 1000
-    return (
-        f"lanes       {len(graph)} lanes of {length:.2f} km, {len(graph.connections)} connections, "
-        f"{len(graph.junctions)} junctions: {out / 'lanes.geojson'}"
-    )
 
 
 def _with_answers(lanes: LanesRecord, analysis: TrafficAnalysis) -> LanesRecord:

@@ -79,7 +79,7 @@ def _section(table: AnalysisTable) -> str:
         f"<tr>{''.join(_cell(row.cells.get(c.name)) for c in table.columns)}</tr>" for row in table.rows[:MAX_ROWS]
     )
     more = f"<p>{len(table.rows) - MAX_ROWS} more rows in analysis.json.</p>" if len(table.rows) > MAX_ROWS else ""
-    body = f"<table><tr>{heads}</tr>{rows}</table>{more}" if table.rows else "<p>None found.</p>"
+    body = f"<table><tr>{heads}</tr>{rows}</table>{more}" if table.rows else ""
     return f'<h2 id="{table.name}">{escape(table.title)}</h2><p class="note">{escape(table.note)}</p>{body}'
 
 

@@ -176,8 +176,8 @@ def limit_table(analysis: TrafficAnalysis) -> AnalysisTable:
         for road in analysis.free_flow
     )
     note = (
-        "Median speed of vehicles that keep their speed over 30 m, 4 s and more behind the one before and ahead of the "
-        "one behind; the limit is the multiple of 10 km/h nearest to it."
+        "Median speed of vehicles that keep their speed over 30 m, 4 s and more behind the one before; speeds of those "
+        "that follow within 3 s are lower bounds. The limit is the multiple of 10 km/h nearest to it."
     )
     return _table("free_flow", "Speed", "Free flow and speed limit", note, columns, rows)
 
@@ -276,7 +276,7 @@ def stream_table(analysis: TrafficAnalysis) -> AnalysisTable:
             }
             at = path[int(np.clip(stream.stream.stop_line_m or 0, 0, len(path) - 1))]
             rows.append(_row(cells, _point(at, analysis)))
-    note = "Second 0 of the cycle is the first frame of the flight. A vehicle is taken to start 1.8 s after its green."
+    note = "Second 0 of the cycle is the first frame of the flight. A vehicle is taken to start 2.0 s after its green."
     return _table("streams", "Signals", "Streams at signals", note, columns, rows)
 
 
