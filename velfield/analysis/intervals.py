@@ -94,7 +94,7 @@ def estimate_censored_quantile(
     if n < min_n or min(q, 1 - q) * n < MIN_QUANTILE_TAIL:
         return None
     order = np.lexsort((~observed, values))
-    ordered, event = values[order], observed[order].astype(np.float64)
+    ordered, event = values[order].astype(np.float64), observed[order].astype(np.float64)
     at_risk = len(ordered) - np.arange(len(ordered))
     last = int(np.flatnonzero(event)[-1])
     ordered, event, at_risk = ordered[: last + 1], event[: last + 1], at_risk[: last + 1]
@@ -105,7 +105,7 @@ def estimate_censored_quantile(
         return None
     z = float(stats.norm.ppf((1 + LEVEL) / 2)) * np.sqrt(variance[known]) / np.abs(np.log(survival[known]))
     curves = (survival[known] ** np.exp(z), survival[known], survival[known] ** np.exp(-z))
-    low, value, high = (_first_below(curve, ordered[known], 1 - q) for curve in curves)
+    low, value, high = (_first_below(np.asarray(curve), ordered[known], 1 - q) for curve in curves)
     if low is None or value is None:
         return None  # too many lower bounds: the quantile lies above all that was observed
     return Estimate(value, low, float(ordered[-1]) if high is None else high, n)

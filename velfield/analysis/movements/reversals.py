@@ -13,8 +13,8 @@ _PATH_M = 36
 """A U-turn is no longer; half round a circle of 13 m radius is."""
 _MIN_TURN_RAD = np.radians(150)
 _ROAD_M_PER_S = 5.5
-"""Who comes more slowly, over 60 m before, turns in a car park."""
-_APPROACH_M = 80
+"""Who is slower all the way from 40 m before a turn to 40 m after it turns in a car park."""
+_APPROACH_M = 40
 
 
 @dataclass(frozen=True)
