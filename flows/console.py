@@ -24,6 +24,8 @@ from velfield.parallel import subscribe_steps
 from velfield.pipeline.result import subscribe
 
 _LINE_EVERY_S = 10.0
+_TRAINS = "detector"
+"""The stage that counts steps of a training."""
 Verbosity = Literal["quiet", "normal", "verbose", "json"]
 
 
@@ -71,6 +73,12 @@ class StageBars:
         """A bar for a stage, by its name and what it is called."""
         self.stages[name] = StageProgress(self.bar, self.bar.add_task(label, total=None))
         return self.stages[name]
+
+    def add_training_steps(self, done: int, announced: int) -> None:
+        """Count steps of the training of a detector, whose number is announced as it goes on."""
+        progress = self.stages.get(_TRAINS)
+        if progress is not None:
+            progress.set_progress(progress.done + done, progress.total + announced)
 
     def add_steps(self, stage: str, steps: int) -> None:
         """Count steps that a block of this process published."""
@@ -153,5 +161,5 @@ class Console:
         hidden = not self._rich.is_terminal  # in a log a bar would leave empty lines
         with Progress(*columns, console=self._rich, transient=True, refresh_per_second=5, disable=hidden) as bar:
             bars = StageBars(bar)
-            with subscribe(bars.add_steps):
+            with subscribe(bars.add_steps), subscribe_steps(bars.add_training_steps):
                 yield bars

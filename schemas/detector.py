@@ -12,6 +12,7 @@ from typing import Annotated, Literal, Self, get_args
 from pydantic import (
     Discriminator,
     Field,
+    FiniteFloat,
     NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
@@ -87,6 +88,8 @@ class CnnConfig(_WithMotionChannel):
     method: Literal["cnn"] = "cnn"
     fine_tune_steps: PositiveInt = 250
     """Optimiser steps of the fine-tuning on labelled cars."""
+    precision: Literal["int8", "float32"] = "int8"
+    """Numbers that the network is run with on a processor; a GPU always takes ``float32``."""
     cascade: CascadeTraining = CascadeTraining()
     """The cascade that takes the network's place: where labels come from motion and appearance is sufficient, or few
     vehicles move, and where cars are not as long as those that the pre-trained network knows."""
@@ -258,6 +261,8 @@ class CnnRecord(BaseRecord):
     """Probabilities between which a candidate is scored again on rotated crops."""
     motion: MotionRecord | None = None
     """The bonus of moving objects; none: it reads no background."""
+    activation_ranges: dict[str, tuple[FiniteFloat, FiniteFloat]] | None = Field(default=None, max_length=100)
+    """Least and largest value of the network's activations, on images of the flight; none: it is run in float32."""
 
     @model_validator(mode="after")
     def _has_a_network(self) -> Self:

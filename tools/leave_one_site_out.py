@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from schemas.detector import CnnConfig
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.fine_tuning import evaluate_network, make_record, select_threshold
-from velfield.detection.cnn.model import Network
+from velfield.detection.cnn.network import Network
 from velfield.detection.evaluation import HeldOutScores, merge_scores
 from velfield.detection.samples import LabelledImage
 from velfield.parallel import parallel_map

@@ -14,7 +14,16 @@ from torch import Tensor, nn
 
 from schemas.arrays import Float32Array
 from velfield.detection.cnn.dataset import PatchDataset
-from velfield.detection.cnn.model import TOPOLOGY, Conv, DepthToSpace, Layer, Network, Residual, SpaceToDepth, Topology
+from velfield.detection.cnn.network import (
+    TOPOLOGY,
+    Conv,
+    DepthToSpace,
+    Layer,
+    Network,
+    Residual,
+    SpaceToDepth,
+    Topology,
+)
 from velfield.detection.cnn.trainer import ADAM_BETAS, MAX_GRAD_NORM, WEIGHT_DECAY, Batch, lr_schedule
 from velfield.detection.samples import LabelledImage
 

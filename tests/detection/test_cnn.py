@@ -12,15 +12,14 @@ from tests.detection.test_cnn_layers import random_network
 from velfield.bench.scenes import simulated_image
 from velfield.detection.cnn.dataset import PatchDataset
 from velfield.detection.cnn.fine_tuning import evaluate_network, fine_tune
-from velfield.detection.cnn.model import (
+from velfield.detection.cnn.model import detect_cars, predict_heatmap
+from velfield.detection.cnn.network import (
     FORMER_TOPOLOGY,
     Network,
     convolutions,
-    detect_cars,
     network_from_layers,
     network_from_record,
     network_to_record,
-    predict_heatmap,
 )
 from velfield.detection.cnn.trainer import Trainer, train
 from velfield.detection.detector import from_record, shipped_detector

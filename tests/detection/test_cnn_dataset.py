@@ -9,7 +9,7 @@ from schemas.arrays import FloatArray, GreyImage
 from velfield.bench.scenes import simulated_image
 from velfield.detection.cnn import dataset
 from velfield.detection.cnn.dataset import BATCH_SIZE, HEATMAP_SIGMA_PX, PATCH_PX, PatchDataset, encode_targets
-from velfield.detection.cnn.model import STRIDE
+from velfield.detection.cnn.network import STRIDE
 from velfield.detection.cnn.trainer import Batch
 from velfield.detection.orientation import axial_difference
 from velfield.detection.samples import LabelledImage

@@ -13,15 +13,11 @@ from schemas.flight import Device
 from velfield.bench.scenes import simulated_image
 from velfield.detection.cascade.classifier import nms_oriented
 from velfield.detection.cnn import model
+from velfield.detection.cnn import network as networks
 from velfield.detection.cnn.dataset import PATCH_PX, encode_targets
 from velfield.detection.cnn.detector import CnnDetector
-from velfield.detection.cnn.model import (
-    SCORE_OFFSET,
-    Network,
-    background_difference_at,
-    detect_cars,
-    motion_score_bonus,
-)
+from velfield.detection.cnn.model import SCORE_OFFSET, background_difference_at, detect_cars, motion_score_bonus
+from velfield.detection.cnn.network import Network
 from velfield.detection.cnn.peaks import SMOOTHING_SIGMA, find_peaks
 from velfield.detection.detector import shipped_detector
 from velfield.detection.orientation import axial_difference
@@ -209,14 +205,14 @@ class _Session:
 def gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     """An onnxruntime that offers CUDA."""
     offered = ["CUDAExecutionProvider", "CPUExecutionProvider"]
-    monkeypatch.setattr(model.ort, "get_available_providers", lambda: offered)
-    monkeypatch.setattr(model.ort, "InferenceSession", _Session)
+    monkeypatch.setattr(networks.ort, "get_available_providers", lambda: offered)
+    monkeypatch.setattr(networks.ort, "InferenceSession", _Session)
     monkeypatch.setattr(_Session, "started", offered)
 
 
 @pytest.mark.parametrize(("device", "first"), [("auto", "CUDA"), ("cuda", "CUDA"), ("cpu", "CPU")])
 def test_a_gpu_runs_the_network_where_there_is_one_and_it_may(gpu: None, device: Device, first: str) -> None:
-    model.open_session(b"", device)
+    networks.open_session(b"", device)
     names = [one if isinstance(one, str) else one[0] for one in _Session.asked]
     assert names[0] == f"{first}ExecutionProvider"
     assert names[-1] == "CPUExecutionProvider"
@@ -225,15 +221,15 @@ def test_a_gpu_runs_the_network_where_there_is_one_and_it_may(gpu: None, device:
 def test_a_gpu_that_does_not_start_is_no_silent_fallback(gpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_Session, "started", ["CPUExecutionProvider"])
     with pytest.raises(InputError, match=r"--device cuda: found a GPU that .* could not start, expected CUDA"):
-        model.open_session(b"", "cuda")
+        networks.open_session(b"", "cuda")
 
 
 def test_without_a_gpu_cuda_is_refused_and_auto_is_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(model.ort, "get_available_providers", lambda: ["CPUExecutionProvider"])
+    monkeypatch.setattr(networks.ort, "get_available_providers", lambda: ["CPUExecutionProvider"])
     with pytest.raises(InputError, match=r"--device cuda: found onnxruntime with CPU.*pip install velfield\[cuda\]"):
-        model.check_device("cuda")
-    model.check_device("auto")
-    session = model.open_session(model.network_to_onnx(network()), "auto")
+        networks.check_device("cuda")
+    networks.check_device("auto")
+    session = networks.open_session(networks.network_to_onnx(network()), "auto")
     assert session.get_providers() == ["CPUExecutionProvider"]
 
 
@@ -261,7 +257,7 @@ def test_the_number_of_threads_changes_nothing_that_matters() -> None:
     """A session has one thread, so that the order of its sums never changes; with more, scores differ by rounding."""
     import onnxruntime as ort
 
-    from velfield.detection.cnn.model import network_to_onnx, open_session
+    from velfield.detection.cnn.network import network_to_onnx, open_session
     from velfield.detection.detector import shipped_detector
 
     model = network_to_onnx(shipped_detector().network)  # type: ignore[attr-defined]

@@ -20,8 +20,8 @@ from velfield.detection.cnn.layers import (
     kernel_on_blocks,
     space_to_depth,
 )
-from velfield.detection.cnn.model import (
-    HALO_PX,
+from velfield.detection.cnn.model import HALO_PX, forward, predict_heatmap
+from velfield.detection.cnn.network import (
     STRIDE,
     TOPOLOGIES,
     TOPOLOGY,
@@ -32,11 +32,9 @@ from velfield.detection.cnn.model import (
     SpaceToDepth,
     Topology,
     convolutions,
-    forward,
     network_from_onnx,
     network_to_onnx,
     onnx_kernel,
-    predict_heatmap,
     weights_from_onnx,
 )
 from velfield.detection.cnn.trainer import Trainer

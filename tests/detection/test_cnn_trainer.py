@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.arrays import FloatArray
-from velfield.detection.cnn.model import TOPOLOGY, Network, Residual, convolutions
+from velfield.detection.cnn.network import TOPOLOGY, Network, Residual, convolutions
 from velfield.detection.cnn.trainer import (
     MAX_GRAD_NORM,
     WEIGHT_DECAY,

@@ -5,7 +5,7 @@ import pytest
 
 from velfield.bench.scenes import simulated_image
 from velfield.detection.cnn.dataset import PatchDataset
-from velfield.detection.cnn.model import TOPOLOGIES, Topology
+from velfield.detection.cnn.network import TOPOLOGIES, Topology
 from velfield.detection.cnn.trainer import LossNormaliser, Trainer, focal_loss_and_gradient
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: `pip install torch`")

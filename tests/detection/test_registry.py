@@ -26,7 +26,7 @@ from schemas.renames import DETECTOR_KEYS, DETECTOR_LAYERS, upgrade_detector
 from tests.detection.test_cnn import layers_of
 from tests.detection.test_cnn_layers import random_network
 from velfield.detection.cnn.detector import CnnDetector
-from velfield.detection.cnn.model import FORMER_TOPOLOGY
+from velfield.detection.cnn.network import FORMER_TOPOLOGY
 from velfield.detection.detect import detect_frame
 from velfield.detection.detector import (
     Detections,

@@ -168,7 +168,7 @@ def _onnx_files() -> tuple[bytes, ...]:
     import onnx
     from onnx import TensorProto, helper
 
-    from velfield.detection.cnn.model import network_to_onnx
+    from velfield.detection.cnn.network import network_to_onnx
     from velfield.detection.detector import shipped_detector
 
     good = network_to_onnx(shipped_detector().network)  # type: ignore[attr-defined]

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from flows import cli
-from flows.console import training_progress
+from flows.console import Console, training_progress
 from tests.small_flight import job
 from velfield.errors import InputError
 from velfield.parallel import count_steps
@@ -197,6 +197,17 @@ def test_a_training_shows_its_steps(monkeypatch: pytest.MonkeyPatch, capsys: pyt
         count_steps(0, announced=8)
         count_steps(1)
     assert capsys.readouterr().err.splitlines()[-1] == "training: 1 of 8 steps"
+
+
+def test_a_run_counts_the_steps_of_its_detector() -> None:
+    with Console("quiet").stages() as bars:
+        progress = bars.add("detector", "detector")
+        progress.expect(1)
+        count_steps(0, announced=8)
+        count_steps(3)
+        assert (progress.done, progress.total) == (3, 9)
+    count_steps(1)
+    assert progress.done == 3
 
 
 def test_every_training_counts_its_steps() -> None:

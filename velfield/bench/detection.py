@@ -18,7 +18,7 @@ from velfield.detection.boosting import BoostedStumps, draw_feature_pool
 from velfield.detection.cascade.classifier import PoseScorer, offset_grid
 from velfield.detection.cascade.detector import CascadeDetector
 from velfield.detection.cascade.feature_image import compute_features
-from velfield.detection.cnn.model import TOPOLOGY, DepthToSpace, Residual, SpaceToDepth, Topology
+from velfield.detection.cnn.network import TOPOLOGY, DepthToSpace, Residual, SpaceToDepth, Topology
 from velfield.detection.detect import detect_frame
 from velfield.detection.detector import Detector
 from velfield.detection.paper.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, dense_response, quantise_and_pad

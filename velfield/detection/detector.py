@@ -231,6 +231,16 @@ class Detector(ABC):
                 "set detection.working_car_length_px"
             )
 
+    def for_flight(self, images: Sequence[GreyImage], config: Any) -> "Detector":
+        """The detector, adjusted to images (h, w) of the flight on the working grid, where it can be; ``config`` is the
+        section of its method, or of another."""
+        return self
+
+    @property
+    def limitations(self) -> list[str]:
+        """What this machine cannot do of what the detector is set to do, one line each."""
+        return []
+
     def to_json(self) -> str:
         """The content of its file."""
         return self.record.model_dump_json()

@@ -52,7 +52,7 @@ def validate_inputs(plan: Plan) -> None:
     if plan.job.inputs.base and _is_pending(plan, "base") and _takes_long(plan):
         check_base_area(plan)
     if plan.config.work.device == "cuda":
-        from velfield.detection.cnn.model import check_device
+        from velfield.detection.cnn.network import check_device
 
         check_device("cuda")
 

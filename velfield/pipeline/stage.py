@@ -242,7 +242,7 @@ STAGES: tuple[Stage, ...] = (
     # Cars of each block, then one table with their crops.
     Stage(
         name="detections",
-        version=13,
+        version=14,
         label="detections",
         lines=(
             Line(

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from schemas.arrays import Float32Array, FloatArray, Mask
-from velfield.detection.cnn.model import STRIDE
+from velfield.detection.cnn.network import STRIDE
 from velfield.detection.cnn.trainer import Batch
 from velfield.detection.orientation import fill_missing_orientation
 from velfield.detection.samples import LabelledImage

@@ -1,28 +1,29 @@
 """The convolutional network as a detector: pre-trained, fine-tuned on labelled cars, or self-trained on moving ones."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 
 from schemas.arrays import GreyImage, Mask
-from schemas.detector import CascadeConfig, CnnConfig, CnnRecord
+from schemas.detector import CascadeConfig, CnnConfig, CnnRecord, DetectorConfig
 from velfield.detection.cascade.classifier import suppress_and_centre
 from velfield.detection.cascade.detector import CascadeDetector
 from velfield.detection.cnn.fine_tuning import fine_tune
-from velfield.detection.cnn.model import (
-    BORDER_PX,
+from velfield.detection.cnn.model import BORDER_PX, NO_TTA, background_difference_at, detect_cars, motion_score_bonus
+from velfield.detection.cnn.network import (
+    INEXACT,
     Network,
-    background_difference_at,
-    detect_cars,
-    motion_score_bonus,
+    current_device,
     network_from_layers,
     network_from_record,
+    uses_cuda,
 )
+from velfield.detection.cnn.quantization import calibrate, is_exact
 from velfield.detection.cnn.self_training import self_train_from_motion
-from velfield.detection.detector import Crop, Detections, Detector, shipped_detector, train_detector
+from velfield.detection.detector import Crop, Detections, Detector, concatenate, shipped_detector, train_detector
 from velfield.detection.frame import SearchableFrame, whole_frame
 from velfield.detection.orientation import CAR_ASPECT
 from velfield.detection.samples import LabelledImage
@@ -48,7 +49,21 @@ class CnnDetector(Detector):
     def network(self) -> Network:
         """Its weights."""
         record = self.record
-        return network_from_record(record.onnx) if record.onnx is not None else network_from_layers(record.layers or {})
+        if record.onnx is None:
+            return network_from_layers(record.layers or {})
+        return replace(network_from_record(record.onnx), ranges=record.activation_ranges)
+
+    def for_flight(self, images: Sequence[GreyImage], config: DetectorConfig) -> "CnnDetector":
+        """With the ranges of the activations on these images, so that it can be run in 8 bits."""
+        wanted = isinstance(config, CnnConfig) and config.precision == "int8" and self.record.onnx is not None
+        ranges = calibrate(replace(self.network, ranges=None), images) if wanted else None
+        return CnnDetector(self.record.model_copy(update={"activation_ranges": ranges}))
+
+    @property
+    def limitations(self) -> list[str]:
+        """A processor without exact sums of products of 8 bits."""
+        wanted = self.record.activation_ranges is not None and not uses_cuda(current_device())
+        return [INEXACT] if wanted and not is_exact() else []
 
     @property
     def uses_background(self) -> bool:
@@ -92,8 +107,19 @@ class CnnDetector(Detector):
         *,
         threshold: float | None = None,
     ) -> Detections:
-        """As of `find`, the network run on each crop by itself: it sees farther than the context, though little."""
-        return self._find(image, valid, background, threshold, crops=crops)
+        """As of `find`, the network run on each crop by itself: it sees farther than the context, though little.
+
+        So do the rotated crops of test-time augmentation, and by more.
+        """
+        if self.record.tta_range == NO_TTA:
+            return self._find(image, valid, background, threshold, crops=crops)
+        found = []
+        for row, column, height, width in crops:
+            part = np.s_[row : row + height, column : column + width]
+            covered = None if valid is None else valid[part]
+            ground = None if background is None else background[part]
+            found.append(self._find(image[part], covered, ground, threshold).shifted(column, row))
+        return concatenate(found)
 
     def _find(
         self,

@@ -15,7 +15,8 @@ from schemas.arrays import Float32Array, Mask
 from schemas.detector import CnnConfig, CnnRecord, PrecisionRecallCurve
 from velfield.detection.cascade.classifier import nms_oriented
 from velfield.detection.cnn.dataset import PatchDataset
-from velfield.detection.cnn.model import NO_TTA, Network, detect_cars, network_to_record, predict_heatmap
+from velfield.detection.cnn.model import NO_TTA, detect_cars, predict_heatmap
+from velfield.detection.cnn.network import Network, network_to_record
 from velfield.detection.cnn.trainer import Trainer, train
 from velfield.detection.evaluation import (
     FOLDS_DESCRIPTION,

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from schemas.arrays import FloatArray, GreyImage
 from schemas.detector import CnnConfig, MotionRecord, PrecisionRecallCurve
 from velfield.detection.cnn.fine_tuning import fine_tune_interpolated
-from velfield.detection.cnn.model import FULL_TTA, MIN_SCORE, background_difference_at, network_to_record
+from velfield.detection.cnn.model import FULL_TTA, MIN_SCORE, background_difference_at
+from velfield.detection.cnn.network import network_to_record
 from velfield.detection.detect import detect_frame
 from velfield.detection.evaluation import f_measure_plateau, to_curve_record
 from velfield.detection.motion.difference import MotionFrame
 from velfield.detection.motion.evaluation import MotionState, TimedDetections, classify_bursts
 from velfield.detection.samples import LabelledImage
-from velfield.parallel import parallel_map
+from velfield.parallel import count_steps, parallel_map
 
 if TYPE_CHECKING:
     from velfield.detection.cnn.detector import CnnDetector
@@ -78,6 +79,7 @@ def self_train_from_motion(
         "tta_range": FULL_TTA,
         "curve": None,
         "motion": None,
+        "activation_ranges": None,
     }
     record = pretrained.record.model_copy(update=update)
     length_px = record.working_car_length_px
@@ -85,8 +87,10 @@ def self_train_from_motion(
     def detect(frame: MotionFrame) -> tuple[TimedDetections, FloatArray]:
         cars = detect_frame(frame.image, frame.valid, type(pretrained)(record), threshold=MIN_SCORE)
         difference = background_difference_at(frame.image, background, cars.xy, length_px)
+        count_steps(1)
         return TimedDetections(cars.xy, cars.orientation_rad, cars.score, frame.time_s), difference
 
+    count_steps(0, announced=len(bursts))
     detections, differences = zip(*parallel_map(detect, bursts), strict=True)
     middles, states = classify_bursts(detections, car_length_px=length_px, max_interval_s=max_interval_s)
     if not middles:

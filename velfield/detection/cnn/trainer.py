@@ -23,7 +23,7 @@ from velfield.detection.cnn.layers import (
     kernel_on_blocks,
     space_to_depth,
 )
-from velfield.detection.cnn.model import (
+from velfield.detection.cnn.network import (
     TOPOLOGY,
     Conv,
     DepthToSpace,

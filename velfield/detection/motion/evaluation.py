@@ -22,7 +22,7 @@ from velfield.detection.evaluation import f_measure_plateau
 from velfield.detection.motion.boxes import MAX_AXIS_OFFSET_RAD
 from velfield.detection.motion.difference import MotionFrame
 from velfield.detection.motion.links import MAX_LENGTHS_PER_S
-from velfield.parallel import parallel_map
+from velfield.parallel import count_steps, parallel_map
 
 MIN_SCORE = -0.3
 """Detections below this are noise whatever the detector."""
@@ -234,9 +234,11 @@ def evaluate_detector(
 
     def detect(frame: MotionFrame) -> TimedDetections:
         cars = detect_frame(frame.image, frame.valid, detector, background, threshold=min_score)
+        count_steps(1)
         return TimedDetections(cars.xy, cars.orientation_rad, np.asarray(cars.score, np.float64), frame.time_s)
 
     length = detector.record.working_car_length_px
+    count_steps(0, announced=len(frames))
     return evaluate_by_motion(parallel_map(detect, frames), car_length_px=length, max_interval_s=max_interval_s)
 
 

@@ -17,7 +17,7 @@ import pandas as pd
 
 from schemas.arrays import GreyImage, Mask
 from schemas.detector import OnnxRecord
-from velfield.detection.cnn.model import current_device, open_session
+from velfield.detection.cnn.network import current_device, open_session
 from velfield.detection.detector import Detections, Detector
 from velfield.detection.onnx.boxes import Boxes, cut_tile, decode, suppress, tile_corners, whole_in_tile
 from velfield.detection.onnx.description import describe_model

@@ -14,7 +14,7 @@ import pandas as pd
 
 from schemas.arrays import FloatArray, GreyImage, Mask, Points
 from schemas.tables import DETECTION_COLUMNS
-from velfield.detection.cnn.model import use_device
+from velfield.detection.cnn.network import use_device
 from velfield.detection.detect import FrameDetections, SearchedFrame, attach_crops, search_frame
 from velfield.detection.detector import Detections, Detector, concatenate, load_detector
 from velfield.detection.orientation import CAR_ASPECT, axial_difference, fill_missing_orientation

@@ -12,16 +12,17 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from schemas.arrays import FloatArray
+from schemas.arrays import FloatArray, GreyImage
 from schemas.records import WorkingRecord
 from velfield.analysis.vehicle_scale import CAR_LENGTH_M
-from velfield.detection.cnn.model import use_device
+from velfield.detection.cnn.network import use_device
 from velfield.detection.detector import Detector, detector_class, load_detector, shipped_detector, train_detector
 from velfield.detection.motion.difference import MotionBackground, MotionFrame, motion_background
 from velfield.detection.motion.labels import MotionLabels, choose_frames, labels_from_motion, working_scale
 from velfield.detection.scale_search import STEP, View, find_scale
 from velfield.detection.unlabelled import UnlabelledFlight
 from velfield.errors import InputError
+from velfield.parallel import count_steps
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.labels import (
@@ -43,6 +44,7 @@ _FRAMES_TO_SEARCH = 3
 _GSD_RANGE_M = 0.02, 0.6
 """Metres a base pixel at which cars are looked for where nothing gives their size."""
 _MAX_SEARCH_PX = 4e7
+_FRAMES_TO_CALIBRATE = 3
 _MIN_FRAMES_WITH_BOXES = 0.5
 """Fraction of the frames in which another program's boxes are expected."""
 
@@ -91,7 +93,7 @@ def _from_detections(plan: Plan) -> StageResult:
     if scale is None:
         scale = _scale_of_length(plan, median_car_length_raw_px(boxes), base_px_per_raw_px(plan))
     outcome = _finish(plan, None, scale, "detections")
-    warnings = []
+    warnings: list[str] = []
     if scale is None:
         assumed_px = plan.config.detection.working_car_length_px
         warnings.append(
@@ -142,7 +144,8 @@ def _from_labels(plan: Plan) -> StageResult:
     samples = list(labelled_images(source, plan.info, labels, work_per_raw=work_per_raw))
     detector = train_detector(samples, plan.config.detection)
     outcome = _finish(plan, detector, scale, "labels", count=len(labels.cars))
-    return replace(outcome, warnings=check_label_scale(labels.cars, base_per_raw, read_first_grid(plan.layout).gsd_m))
+    found = check_label_scale(labels.cars, base_per_raw, read_first_grid(plan.layout).gsd_m)
+    return replace(outcome, warnings=[*outcome.warnings, *found])
 
 
 def _from_motion(plan: Plan) -> StageResult:
@@ -181,7 +184,7 @@ def _without_labels(plan: Plan, scale: float | None, labels: MotionLabels) -> St
         raise InputError(f"{reason}; or give --gsd-m, so that the shipped detector can be used")
     outcome = _finish(plan, detector, found, "shipped", motion=labels, car_length_m=plan.config.detection.car_length_m)
     used = "The shipped detector is used" + ("" if scale else ", at the scale at which it finds cars of their size")
-    return StageResult(outcome.outputs, outcome.counts, outcome.notes, [f"{reason}. {used}"])
+    return replace(outcome, warnings=[*outcome.warnings, f"{reason}. {used}"])
 
 
 def _search_scale(plan: Plan, detector: Detector) -> float | None:
@@ -217,11 +220,12 @@ def _motion_frames(plan: Plan, scale: float) -> list[MotionFrame]:
     chosen = [int(frame) for frame in usable[choose_frames(times_s[usable])]]
     working = WorkingGrid.open(plan, scale)
     frames = []
+    count_steps(0, announced=len(chosen))
     for frame in chosen:
         rectified = working.frame(frame, working.whole)
         if rectified is not None:
             frames.append(MotionFrame(rectified.image, rectified.valid, float(times_s[frame])))
-        advance("detector", 0)
+        count_steps(1)
     return frames
 
 
@@ -242,7 +246,13 @@ def _finish(
     length of the cars that it makes `working_car_length_px` long.
     """
     layout, outputs, notes = plan.layout, [plan.layout.working], []
+    warnings: list[str] = []
     if detector is not None:
+        if not detector.reads_raw_frames:
+            detector = detector.for_flight(
+                _images_to_calibrate(plan, 1.0 if scale is None else scale), plan.config.detection
+            )
+            warnings += detector.limitations
         write_atomically(layout.detector, detector.to_json().encode())
         outputs.append(layout.detector)
     if background is not None and detector is not None and detector.uses_background:
@@ -269,4 +279,12 @@ def _finish(
     counts = {"labels": float(count), "working_scale": record.scale}
     if detector is not None:
         counts["threshold"] = detector.threshold
-    return StageResult(outputs, counts, notes)
+    return StageResult(outputs, counts, notes, warnings)
+
+
+def _images_to_calibrate(plan: Plan, scale: float) -> list[GreyImage]:
+    """Some frames on the working grid, spread over the flight."""
+    working, usable = WorkingGrid.open(plan, scale), np.flatnonzero(usable_frames(plan))
+    chosen = usable[np.unique(np.linspace(0, max(len(usable) - 1, 0), _FRAMES_TO_CALIBRATE).astype(int))]
+    frames = (working.frame(int(frame)) for frame in chosen)
+    return [frame.image for frame in frames if frame is not None]

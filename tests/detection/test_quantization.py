@@ -1,0 +1,111 @@
+"""The network in integers of 8 bits."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from schemas.arrays import GreyImage
+from schemas.detector import CnnConfig
+from velfield.detection.cnn import network as networks
+from velfield.detection.cnn import quantization
+from velfield.detection.cnn.detector import CnnDetector
+from velfield.detection.cnn.model import forward
+from velfield.detection.cnn.network import FORMER_TOPOLOGY, TOPOLOGY, Network, Topology, convolutions
+from velfield.detection.cnn.quantization import calibrate, is_exact, quantized_to_onnx
+from velfield.detection.detector import load_detector, shipped_detector
+
+
+def cars(seed: int = 0, shape: tuple[int, int] = (208, 304)) -> GreyImage:
+    """Cars of 16 x 8 px on noise, some brighter and some darker than the ground."""
+    rng = np.random.default_rng(seed)
+    image = rng.normal(110, 6, shape)
+    for y, x in np.stack([rng.integers(12, size - 12, 30) for size in shape], axis=1):
+        image[y - 4 : y + 4, x - 8 : x + 8] = rng.choice([40, 70, 190, 230])
+        image[y - 3 : y + 3, x + 2 : x + 5] = 30
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def shipped() -> CnnDetector:
+    detector = shipped_detector()
+    assert isinstance(detector, CnnDetector)
+    return detector
+
+
+@pytest.fixture
+def exact() -> None:
+    if not is_exact():
+        pytest.skip("this processor saturates sums of products of 8 bits")
+
+
+@pytest.mark.usefixtures("exact")
+def test_eight_bits_give_nearly_the_heatmap_of_floating_point() -> None:
+    network, image = shipped().network, cars()[None]
+    eight = replace(network, ranges=calibrate(network, [cars(1), cars(2)]))
+    (wanted, axes), (found, found_axes) = forward(network, image), forward(eight, image)
+    at = wanted > 0.2
+    assert at.sum() > 100
+    assert not np.array_equal(wanted, found)
+    assert np.sqrt(np.mean((wanted - found)[at] ** 2)) < 0.03
+    assert np.median(np.abs(axes - found_axes)[0, :, at[0]]) < 0.05
+
+
+@pytest.mark.usefixtures("exact")
+@pytest.mark.parametrize("topology", [TOPOLOGY, FORMER_TOPOLOGY])
+def test_a_network_of_random_weights_is_near_to_floating_point(topology: Topology) -> None:
+    rng = np.random.default_rng(3)
+    layers = convolutions(topology)
+    weights = {
+        name: (rng.normal(size=layer.shape) / np.sqrt(layer.shape[0] * layer.shape[1])).astype(np.float32)
+        for name, layer in layers.items()
+    }
+    biases = {name: rng.normal(0, 0.1, layer.channels_out).astype(np.float32) for name, layer in layers.items()}
+    network = Network(weights, biases, topology)
+    eight = replace(network, ranges=calibrate(network, [cars(1)], crops=16))
+    (wanted, _), (found, _) = forward(network, cars()[None]), forward(eight, cars()[None])
+    assert np.abs(wanted - found).max() < 0.1 * np.ptp(wanted) + 0.01
+
+
+@pytest.mark.usefixtures("exact")
+def test_a_crop_gives_the_same_alone_and_among_others() -> None:
+    network = shipped().network
+    eight = replace(network, ranges=calibrate(network, [cars(1)], crops=16))
+    images = np.stack([cars(k, (96, 96)) for k in range(5)])
+    together, _ = forward(eight, images)
+    np.testing.assert_array_equal(together, np.concatenate([forward(eight, one[None])[0] for one in images]))
+
+
+def test_ranges_are_of_the_flight_and_the_setting_and_come_back_from_the_file(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    detector = shipped()
+    eight = detector.for_flight([cars(1)], CnnConfig())
+    again = detector.for_flight([cars(1)], CnnConfig())
+    assert eight.record.activation_ranges == again.record.activation_ranges
+    assert eight.record.activation_ranges != detector.for_flight([cars(2)], CnnConfig()).record.activation_ranges
+    eight.save(tmp_path / "detector.json")
+    loaded = load_detector(tmp_path / "detector.json")
+    assert isinstance(loaded, CnnDetector)
+    assert loaded.network.ranges == eight.record.activation_ranges
+    assert eight.for_flight([cars(1)], CnnConfig(precision="float32")).network.ranges is None
+
+
+def test_small_images_are_calibrated_on_smaller_crops_and_smaller_ones_refused() -> None:
+    network = shipped().network
+    assert calibrate(network, [cars(1, (60, 90))], crops=4)
+    with pytest.raises(ValueError, match="expected 96 or more"):
+        calibrate(network, [np.zeros((4, 90), np.uint8)], crops=4)
+
+
+def test_a_processor_that_saturates_takes_floating_point_and_says_so(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.setattr(quantization, "is_exact", lambda: False)
+    monkeypatch.setattr("velfield.detection.cnn.detector.is_exact", lambda: False)
+    detector = shipped().for_flight([cars(1)], CnnConfig())
+    assert detector.limitations == [networks.INEXACT]
+    with pytest.warns(RuntimeWarning, match="VNNI"):
+        found, _ = forward(detector.network, cars()[None])
+    np.testing.assert_array_equal(found, forward(shipped().network, cars()[None])[0])
+
+
+def test_the_model_holds_bytes() -> None:
+    network = shipped().network
+    model = quantized_to_onnx(network, calibrate(network, [cars(1)], crops=4))
+    assert len(model) < len(networks.network_to_onnx(network))
