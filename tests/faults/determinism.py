@@ -3,7 +3,8 @@
 python -m tests.faults.determinism FOLDER [--threads 1 2 8] [--processes 2 8]
 
 The flight is made in FOLDER where it is not there; each run leaves its digests in FOLDER/NAME.json and is compared with
-all that are there, also of another Python: of what differs, by how much.
+all that are there, also of another Python: of what differs, by how much. Exit status 1 where that is more than
+`TOLERANCE`.
 """
 
 import argparse
@@ -11,14 +12,17 @@ import io
 import json
 import platform
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import zarr
 
 from flows.runners import RunnerConfig, ThreadsRunner, open_runner
+from schemas.arrays import FloatArray
 from tests.faults.failing_store import TINY, tiny_job
 from tests.small_flight import digests
 from velfield.pipeline.graphs import unit_graph
@@ -39,19 +43,56 @@ def run_by(compute: Callable[[Any], Any], flight: Path, root: Path) -> dict[str,
     return digests(root)
 
 
-def largest_difference(one: Path, other: Path) -> str:
-    """By how much two tables differ, or two JSON files; of other files only that they do."""
-    if one.suffix == ".parquet" and other.exists():
+TOLERANCE = 1e-6
+"""Of every number (px, s, px/s) between versions of numpy and scipy; between runs of the same ones nothing differs."""
+
+
+def largest_difference(one: Path, other: Path) -> float:
+    """The largest difference of two files' numbers: tables, JSON, and the array that a chunk belongs to.
+
+    Infinite where they differ in anything else: texts, counts of rows, shapes, bytes that are none of these.
+    """
+    if not (one.exists() and other.exists()):
+        return np.inf
+    if one.suffix == ".parquet":
         first, second = (pd.read_parquet(io.BytesIO(path.read_bytes())) for path in (one, other))
-        if len(first) != len(second):
-            return f"{len(first)} and {len(second)} rows"
-        numbers = first.select_dtypes("number").columns
-        gaps = np.abs(first[numbers].to_numpy(float) - second[numbers].to_numpy(float))
-        return f"by {np.nanmax(gaps, initial=0.0):.2g}"
-    return "in bytes"
+        return _frames(first, second)
+    if one.suffix == ".json" and one.name != "zarr.json":
+        return _values(*(json.loads(path.read_bytes()) for path in (one, other)))
+    arrays = [_array_of(path) for path in (one, other)]
+    return np.inf if any(array is None for array in arrays) else _numbers(*arrays)  # type: ignore[arg-type]
 
 
-def main() -> None:
+def _array_of(chunk: Path) -> FloatArray | None:
+    folder = next((folder for folder in chunk.parents if (folder / "zarr.json").exists()), None)
+    array = None if folder is None else zarr.open(folder, mode="r")
+    return array[...].astype(float) if isinstance(array, zarr.Array) else None
+
+
+def _frames(first: pd.DataFrame, second: pd.DataFrame) -> float:
+    numbers = list(first.select_dtypes("number").columns)
+    if len(first) != len(second) or not first.drop(columns=numbers).equals(second.drop(columns=numbers)):
+        return np.inf
+    return _numbers(first[numbers].to_numpy(float), second[numbers].to_numpy(float))
+
+
+def _values(first: object, second: object) -> float:
+    if isinstance(first, dict) and isinstance(second, dict) and first.keys() == second.keys():
+        return max((_values(first[key], second[key]) for key in first), default=0.0)
+    if isinstance(first, list) and isinstance(second, list) and len(first) == len(second):
+        return max((_values(*pair) for pair in zip(first, second, strict=True)), default=0.0)
+    if isinstance(first, float) and isinstance(second, float):
+        return abs(first - second)
+    return 0.0 if first == second else np.inf
+
+
+def _numbers(first: FloatArray, second: FloatArray) -> float:
+    if first.shape != second.shape or not np.array_equal(np.isnan(first), np.isnan(second)):
+        return np.inf
+    return float(np.nanmax(np.abs(first - second), initial=0.0))
+
+
+def main() -> int:
     """All runs; prints what differs between them."""
     from flows.launch import limit_threads, prepare_process
 
@@ -78,18 +119,24 @@ def main() -> None:
             found[name] = run_by(runner.compute, flight, given.folder / name)
     for name, made in found.items():
         (given.folder / f"{name}.json").write_text(json.dumps(made, indent=1))
-    _compare(given.folder, python)
+    return 0 if _compare(given.folder, python) else 1
 
 
-def _compare(folder: Path, python: str) -> None:
+def _compare(folder: Path, python: str) -> bool:
+    """Print what differs from the first run, and by how much; whether all of it is within the tolerance."""
     runs = {path.stem: json.loads(path.read_text()) for path in sorted(folder.glob("python-*.json"))}
     first, *others = runs
     print(f"Python {python}; all are compared with {first}: {len(runs[first])} files")
+    largest = 0.0
     for name in others:
-        differ = [file for file in runs[first] if runs[first][file] != runs[name].get(file)]
-        tables = [f"{file} {largest_difference(folder / first / file, folder / name / file)}" for file in differ]
-        print(f"{name}: {len(differ)} files differ" + "".join(f"\n  {line}" for line in tables))
+        differ = [
+            file for file in runs[first].keys() | runs[name].keys() if runs[first].get(file) != runs[name].get(file)
+        ]
+        gaps = {file: largest_difference(folder / first / file, folder / name / file) for file in sorted(differ)}
+        print(f"{name}: {len(gaps)} files differ" + "".join(f"\n  {file} by {gap:.2g}" for file, gap in gaps.items()))
+        largest = max(largest, *gaps.values(), 0.0)
+    return largest <= TOLERANCE
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
