@@ -50,7 +50,7 @@ def run_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
 def process_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
     """Aerial video in, velocity field out."""
     layout = RunLayout(Path(job.root))
-    with locked(layout), _leave_no_trace(layout), open_runner(runner) as where:
+    with locked(layout), _leave_no_trace(layout), open_runner(runner, console.warn) as where:
         mark_crashed(job.root)
         sweep_partial(layout.root)
         remove_tree(layout.preview)

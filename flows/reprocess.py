@@ -143,7 +143,7 @@ def _mapped(run: Run, job: Job, found: RebaseRecord, runner: RunnerConfig, conso
     sweep_partial(layout.root)
     plan = plan_rebase(run, job, found)
     write_flight_record(plan)
-    with open_runner(runner) as where:
+    with open_runner(runner, console.warn) as where:
         work = Work(plan, where, console, at_once=parallel_units(runner))
         _run_stages(work, Rebase(run.layout, found))
     summary = RunSummary(root=job.root, stages=tuple(work.summaries), frames_lost=lost_frames(plan))

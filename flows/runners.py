@@ -6,8 +6,11 @@ either.
 """
 
 import importlib
+import threading
+import time
+import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,6 +20,9 @@ from pydantic import Field, PositiveInt, ValidationError
 from schemas.model import Model
 from velfield.errors import InputError
 from velfield.parallel import usable_processors
+
+_WAIT_S = 10.0
+_NO_WORKERS_S = 60.0
 
 
 class RunnerConfig(Model):
@@ -93,18 +99,45 @@ class ThreadsRunner(Runner):
 class ClientRunner(Runner):
     """A Dask cluster. Graphs hold functions of ``velfield`` alone, so workers need no ``flows``."""
 
-    def __init__(self, client: Any) -> None:
-        workers = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
-        self._client = client
-        self.description = f"Dask at {client.scheduler.address}, {workers} workers"
+    def __init__(self, client: Any, warn: Callable[[str], None]) -> None:
+        workers = len(client.scheduler_info(n_workers=-1)["workers"])
+        self._client, self._warn = client, warn
+        self._address = str(client.scheduler.address)
+        self._lock, self._without_since_s = threading.Lock(), float("inf")
+        self.description = f"Dask at {self._address}, {workers} worker{'' if workers == 1 else 's'}"
 
     def compute(self, graph: Any) -> Any:
-        return self._client.compute(graph).result()
+        future = self._client.compute(graph)
+        while True:
+            try:
+                return future.result(timeout=_WAIT_S)
+            except TimeoutError:
+                if future.done():  # the graph's own
+                    raise
+                self._look_for_workers()
+
+    def _look_for_workers(self) -> None:
+        """Say, once a minute, that there is nothing that could compute: Dask waits for workers without a word."""
+        workers = len(self._client.scheduler_info(n_workers=-1)["workers"])
+        with self._lock:
+            now_s = time.monotonic()
+            self._without_since_s = float("inf") if workers else min(self._without_since_s, now_s)
+            waited_s = now_s - self._without_since_s
+            if waited_s < _NO_WORKERS_S:
+                return
+            self._without_since_s = now_s
+        self._warn(
+            f"found no workers at {self._address} for {waited_s:.0f} s, expected one at least; start some "
+            f"(`dask worker {self._address}`): the run waits for them, and if you stop it the same command resumes"
+        )
 
 
 @contextmanager
-def open_runner(config: RunnerConfig) -> Iterator[Runner]:
-    """A runner for the duration of a flow; a cluster that it started is shut down afterwards."""
+def open_runner(config: RunnerConfig, warn: Callable[[str], None] = warnings.warn) -> Iterator[Runner]:
+    """A runner for the duration of a flow; a cluster that it started is shut down afterwards.
+
+    ``warn`` is called, once a minute at most, while a cluster has no workers.
+    """
     if config == RunnerConfig():
         yield ThreadsRunner(usable_processors())
         return
@@ -113,7 +146,7 @@ def open_runner(config: RunnerConfig) -> Iterator[Runner]:
     with _cluster(config) as cluster, Client(cluster, timeout="60s", set_as_default=False) as client:
         if config.cluster_class is not None:
             client.wait_for_workers(1)
-        yield ClientRunner(client)
+        yield ClientRunner(client, warn)
 
 
 @contextmanager

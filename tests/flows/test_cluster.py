@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+from dask import delayed
+from distributed import LocalCluster
 
 from flows.runners import ClusterFile, RunnerConfig, open_runner, read_runner
 from schemas.summary import RunSummary
@@ -102,3 +104,29 @@ def test_workers_elsewhere_without_flows_give_the_same(
     with foreign_cluster(tmp_path) as address:
         process(job(flight, Path("run")), RunnerConfig(scheduler=address))
     assert digests(tmp_path / "run") == digests(whole[0])
+
+
+def test_a_cluster_without_workers_is_said_and_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As after a restart of the scheduler, whose workers ended with it: Dask itself waits without a word."""
+    monkeypatch.setattr("flows.runners._WAIT_S", 0.05)
+    monkeypatch.setattr("flows.runners._NO_WORKERS_S", 0.2)
+    warned: list[str] = []
+    with LocalCluster(n_workers=0, processes=False, dashboard_address=None) as cluster:
+
+        def warn(text: str) -> None:
+            if not warned:
+                cluster.scale(1)
+            warned.append(text)
+
+        with open_runner(RunnerConfig(scheduler=cluster.scheduler_address), warn) as runner:
+            assert runner.description.endswith("0 workers")
+            assert runner.compute(delayed(sum)([1, 2])) == 3
+            with pytest.raises(TimeoutError, match="its own"):  # not that of the waiting
+                runner.compute(delayed(_out_of_time)())
+    assert warned
+    assert "found no workers at" in warned[0]
+    assert "expected one at least" in warned[0]
+
+
+def _out_of_time() -> None:
+    raise TimeoutError("its own")
