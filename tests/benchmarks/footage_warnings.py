@@ -149,7 +149,7 @@ def kinds_of(warnings: Sequence[str]) -> set[str]:
 def main() -> None:
     """Make each flight, run it, count its warnings."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(651, 661)))
+    parser.add_argument("--seeds", type=int, nargs="*", default=list(range(651, 661)))
     parser.add_argument("--cases", nargs="+", default=list(CASES))
     parser.add_argument("--real", type=Path, default=None)
     given = parser.parse_args()

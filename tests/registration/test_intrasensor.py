@@ -144,7 +144,8 @@ def test_rows_pulled_off_by_few_matches_are_fitted_again_from_their_neighbours()
     grid = np.column_stack([np.full(60, 300.0), np.linspace(160, 270, 60)])
     good = fit.transform.to_base(grid)
     assert np.abs(pulled.transform.to_base(grid) - good).max() > 1.2
-    _, refitted = fitter._bridge_weak_rows(aligned, pulled, templates, fine)
+    _, refitted, bridged = fitter._bridge_weak_rows(aligned, pulled, templates, fine)
+    assert bridged
     assert np.abs(refitted.transform.to_base(grid) - good).max() < 0.1
 
 

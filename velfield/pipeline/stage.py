@@ -132,7 +132,7 @@ STAGES: tuple[Stage, ...] = (
     # Flag blurred frames and outliers by their neighbours.
     Stage(
         name="quality",
-        version=2,
+        version=3,
         label="frame quality",
         lines=(
             Line("every frame is usable", lambda counts: not counts.get("flagged")),
@@ -188,7 +188,7 @@ STAGES: tuple[Stage, ...] = (
     # The chain over the unit's frames.
     Stage(
         name="registration",
-        version=9,
+        version=10,
         label="registration",
         lines=(
             Line("{registered:.0f} of {frames:.0f} frames registered, hold-out registration error {heldout_px:.2f} px"),

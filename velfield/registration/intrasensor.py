@@ -85,6 +85,7 @@ _SETTLED_PX = 0.2
 _WEAK_FRACTION, _MIN_TRIED = 0.5, 20
 """A band of rows is fitted again from its neighbours if a smaller part of its patches are inliers than in the typical
 band, of as many patches at least."""
+_MAX_BRIDGES = 3
 _MIN_ALIGNED_FRACTION = 0.15
 """If a smaller fraction of the patches aligns, the prior was wrong: the frame is not registered."""
 _FLOW_SIGMA_PX = 0.7
@@ -506,12 +507,17 @@ class _FrameFitter:
             fit = refit
             if not is_coarse and np.quantile(np.hypot(*moved.T), 0.95) < _SETTLED_PX:
                 break
-        return self._bridge_weak_rows(used, fit, templates, fine) if chosen is None else (used, fit)
+        if chosen is None:
+            for _ in range(_MAX_BRIDGES):
+                used, fit, bridged = self._bridge_weak_rows(used, fit, templates, fine)
+                if not bridged:
+                    break
+        return used, fit
 
     def _bridge_weak_rows(
         self, used: ControlPoints, fit: JointFit, templates: Templates, fine: Float32Array
-    ) -> tuple[ControlPoints, JointFit]:
-        """The fit, or one through other alignments where rows have few inliers, if more patches agree with that.
+    ) -> tuple[ControlPoints, JointFit, bool]:
+        """The fit, or one through other alignments where rows have few inliers, if more patches agree; and whether.
 
         The spline may bend to a band of rows of which the roofs match and little else: aligned from there, the ground
         is out of reach, and some roofs confirm the bend. So the band's rows are interpolated from its neighbours, and
@@ -520,7 +526,7 @@ class _FrameFitter:
         knots = count_row_knots(self.config)
         weak = self._weak_rows(used, fit, templates, knots) if knots else np.zeros(0, bool)
         if not weak.any() or weak.all():
-            return used, fit
+            return used, fit, False
         rows = fit.transform.row_coefficients.copy()
         for part in rows:
             part[weak] = np.interp(np.flatnonzero(weak), np.flatnonzero(~weak), part[~weak])
@@ -529,12 +535,12 @@ class _FrameFitter:
         again = aligned.concatenate(_select_in_empty_cells(used, aligned, *self.size))
         refit = self._fit(again, bridged.transform.polyprojective, bridged)
         if isinstance(refit, Failure):
-            return used, fit
+            return used, fit, False
         before, after = (
             int(weak[self._row_band(points.xy_raw[one.inliers], knots)].sum())
             for points, one in ((used, fit), (again, refit))
         )
-        return (again, refit) if after > before else (used, fit)
+        return (again, refit, True) if after > before else (used, fit, False)
 
     def _weak_rows(self, used: ControlPoints, fit: JointFit, templates: Templates, knots: int) -> Mask:
         """Bands of rows (knots,) where far fewer patches are inliers than in the typical band, and their neighbours."""

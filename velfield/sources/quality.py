@@ -140,8 +140,9 @@ DARK_LEVEL = 30.0
 """Mean grey level below which a flight is reported as dark; daylight footage lies between 80 and 150."""
 FAINT_SD, FAINT_SHARPNESS = 6.0, 2.5
 """Contrast of the thumbnails and sharpness below which, both, a flight is reported to be in fog."""
-MAX_CUT_CORRELATION = 0.3
-"""Correlation of the thumbnails before and after, below which the picture changes wholly."""
+MAX_CUT_CORRELATION, MIN_SCENE_CORRELATION = 0.5, 0.7
+"""Correlation of the thumbnails across a cut at most, and within the scenes before and after it at least. Two places
+share up to 0.4, by their layout and a lens's vignetting; the frames of a flight 0.9 and more."""
 _CUT_FRAMES = 5
 
 
@@ -168,7 +169,7 @@ def find_cuts(thumbnails: Float32Array) -> list[int]:
         before, after = flat[max(0, k - _CUT_FRAMES) : k], flat[k : k + _CUT_FRAMES]
         across = max(_correlation(one, other) for one in before for other in after)
         within = min(_correlation(part[0], part[-1]) for part in (before, after))
-        if across < MAX_CUT_CORRELATION <= within:
+        if across < MAX_CUT_CORRELATION and within >= MIN_SCENE_CORRELATION:
             cuts.append(k)
     return cuts
 
@@ -205,7 +206,9 @@ def describe_light(brightness: FloatArray, contrast: FloatArray, sharpness: Floa
     return found
 
 
-def flag_outlier_frames(thumbnails: Float32Array, *, max_step: float = 0.3, min_across: float = 0.7) -> Mask:
+def flag_outlier_frames(
+    thumbnails: Float32Array, *, max_step: float = MAX_CUT_CORRELATION, min_across: float = MIN_SCENE_CORRELATION
+) -> Mask:
     """Frames that correlate neither with the frame before nor with the frame after, while those two do with each other.
 
     Parameters
