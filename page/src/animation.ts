@@ -17,6 +17,9 @@ export interface Painter {
 }
 
 const MAX_CANVAS_PX = 6e6; // a larger screen gets a coarser canvas
+const MIN_CANVAS_PX = 1.2e6; // as coarse as a slow machine's may become
+const [SLOW_PER_S, COARSER] = [50, 0.75]; // fewer frames a second make the canvas coarser
+const BREAK_MS = 250; // a longer pause is no slow frame: the tab was hidden
 
 export const reducedMotion = (): boolean => window.matchMedia("(prefers-reduced-motion: reduce)").matches;
 
@@ -28,12 +31,16 @@ export class Animation {
   private zooming = false;
   private empty = true;
   private times: number[] = [];
+  private fineness = 1;
 
   constructor(private readonly map: L.Map) {
     this.canvas.className = "animation";
     this.canvas.setAttribute("aria-hidden", "true");
     map.getContainer().append(this.canvas);
-    map.on("resize", () => this.resize());
+    map.on("resize", () => {
+      this.fineness = 1;
+      this.resize();
+    });
     map.on("move", () => this.request());
     map.on("zoomstart", () => this.setZooming(true));
     map.on("zoomend", () => this.setZooming(false));
@@ -57,6 +64,12 @@ export class Animation {
     requestAnimationFrame((now) => this.paint(now));
   }
 
+  /** Show or hide the canvas; nothing is painted on a hidden one. */
+  show(shown: boolean): void {
+    this.canvas.hidden = !shown;
+    this.request();
+  }
+
   view(): View {
     const { x, y } = this.map.latLngToContainerPoint([0, 0]);
     const { x: width, y: height } = this.map.getSize();
@@ -71,7 +84,9 @@ export class Animation {
 
   private resize(): void {
     const { x, y } = this.map.getSize();
-    const ratio = Math.min(window.devicePixelRatio || 1, Math.sqrt(MAX_CANVAS_PX / Math.max(x * y, 1)));
+    const limit = (pixels: number): number => Math.sqrt(pixels / Math.max(x * y, 1));
+    const finest = Math.min(window.devicePixelRatio || 1, limit(MAX_CANVAS_PX));
+    const ratio = Math.max(finest * this.fineness, Math.min(finest, limit(MIN_CANVAS_PX)));
     this.canvas.width = Math.max(1, Math.round(x * ratio));
     this.canvas.height = Math.max(1, Math.round(y * ratio));
     this.canvas.style.width = `${x}px`;
@@ -81,7 +96,7 @@ export class Animation {
 
   private paint(now: number): void {
     this.requested = false;
-    if (this.zooming) return;
+    if (this.zooming || this.canvas.hidden) return;
     const view = this.view();
     if (!this.painters.length && this.empty) return;
     this.context.setTransform(1, 0, 0, 1, 0, 0);
@@ -97,9 +112,22 @@ export class Animation {
 
   /** Frames a second over the last sixty frames, for measurements. */
   private count(now: number): void {
+    if (now - this.times[this.times.length - 1]! > BREAK_MS) this.times = [];
     this.times.push(now);
     if (this.times.length > 61) this.times.shift();
     const [first, n] = [this.times[0]!, this.times.length];
-    if (n > 10) this.canvas.dataset.framesPerSecond = ((1000 * (n - 1)) / (now - first)).toFixed(1);
+    if (n <= 10) return;
+    const perSecond = (1000 * (n - 1)) / (now - first);
+    this.canvas.dataset.framesPerSecond = perSecond.toFixed(1);
+    if (n > 30 && perSecond < SLOW_PER_S) this.coarsen();
+  }
+
+  /** Fewer pixels to paint, where this machine is slow (most often one without a graphics card). */
+  private coarsen(): void {
+    const before = this.canvas.width;
+    this.fineness *= COARSER;
+    this.resize();
+    if (this.canvas.width < before) this.times = [];
+    else this.fineness /= COARSER; // as coarse as it may be
   }
 }

@@ -426,6 +426,9 @@ class Viewer {
   showTab(tab: State["tab"]): void {
     this.state = { ...this.state, tab };
     this.map.invalidateSize();
+    const moving = tab === "map"; // the analysis has the map to itself
+    this.animation.show(moving);
+    this.player.show(moving && this.state.replay !== null);
     if (tab === "analysis") this.analysis.show().catch((error) => this.failAnalysis(error));
     else this.drawings.showGeometries([], null);
   }

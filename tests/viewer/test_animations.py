@@ -192,6 +192,42 @@ def test_a_click_on_a_vehicle_of_the_replay_tells_its_speed(chromium: Browser, a
 
 
 @NEEDS_PAGE
+def test_the_analysis_tab_shows_no_replay(chromium: Browser, address: str, run: Run) -> None:
+    since = round(float(np.nanmedian(run.times_s) - run.times_s[0]), 1)
+    with chromium.page() as page:
+        page.open(f"{address}#replay={since}")
+        page.wait(f"({PAINTED}).found.length > 0")
+        page.value("document.getElementById('play').click()")
+        page.value("document.getElementById('tab-analysis').click()")
+        page.wait("document.querySelector('canvas.animation').hidden && document.getElementById('player').hidden")
+        assert page.value("getComputedStyle(document.querySelector('canvas.animation')).display") == "none"
+        page.value("document.getElementById('tab-map').click()")
+        page.wait("!document.getElementById('player').hidden")
+        page.wait(f"({PAINTED}).found.length > 0")
+        assert page.value("document.getElementById('play').getAttribute('aria-label')") == "Play"
+        assert all("analysis.json" in line for line in page.complaints)  # this run has none
+
+
+@NEEDS_PAGE
+def test_a_slow_machine_paints_on_a_coarser_canvas(chromium: Browser, address: str) -> None:
+    with chromium.page(width=2560, height=1920) as page:
+        page.open(f"{address}#flow=1")
+        page.wait("document.querySelector('canvas.animation') !== null")
+        width = page.value("document.querySelector('canvas.animation').width")
+        # Frames of 40 ms, whatever this machine can do.
+        page.value(
+            "(() => { const ask = requestAnimationFrame; let last = 0;"
+            " window.requestAnimationFrame = (paint) => setTimeout(() => paint((last += 40)), 1); })()"
+        )
+        page.wait(f"document.querySelector('canvas.animation').width < {0.7 * width}")
+        shown = page.value("document.querySelector('canvas.animation').getBoundingClientRect().width")
+        smallest = page.value("(({width, height}) => width * height)(document.querySelector('canvas.animation'))")
+        assert shown == pytest.approx(width, abs=1)
+        assert smallest > 1.0e6
+        assert page.complaints == []
+
+
+@NEEDS_PAGE
 def test_particles_move_on_the_roads(chromium: Browser, address: str, run: Run) -> None:
     height, width = run.field.shape
     near = cv2.dilate((run.field.count() > 0).astype(np.uint8), np.ones((41, 41), np.uint8))
