@@ -50,7 +50,7 @@ def test_every_stage_is_timed(capsys: pytest.CaptureFixture[str], monkeypatch: p
             "pip install" in line
         )
     rate, peak = re.findall(r"(\d+) GFLOP/s of a peak of (\d+)", told)[0]
-    assert 0 < float(rate) < 3 * float(peak)  # another program may have slowed the measure of the peak
+    assert 0 < float(rate) < 1.2 * float(peak)
 
 
 def test_the_literal_chain_puts_a_response_in_the_place_of_the_presets() -> None:

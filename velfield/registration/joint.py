@@ -40,9 +40,9 @@ their weight. The second is for a refit."""
 _BENDING_SD = 0.05
 """Prior standard deviation of the second-order terms, in half-frames: far above what a lens leaves, it matters only
 where there are no control points."""
-_SELECT_STIFFNESS_AFTER, _WARM_SELECT_AFTER = (1, 3), (3,)
-"""Steps after which the stiffness is selected again: fast row motion appears only once the slow one is fitted. The
-second is for a fit that starts from the stiffness of an earlier one."""
+_SELECT_STIFFNESS_AFTER = (1, 3)
+"""Steps after which the stiffness is selected again: fast row motion appears only once the slow one is fitted. Once in
+a fit that starts from an earlier one would save 5 ms a frame, and cost 0.02 px of the 95th percentile."""
 _FINAL_STEPS = 2
 _INITIAL_STIFFNESS = (10.0, 1e4)
 """Stiffness of row shift and roll before the first selection."""
@@ -387,14 +387,13 @@ def _irls_annealed(
 ) -> tuple[FloatArray, FloatArray, float, tuple[float, float]]:
     """IRLS with a weight function that narrows from step to step: parameters, weights, scale and stiffness."""
     stiffness = start_stiffness or _INITIAL_STIFFNESS
-    cold = start_stiffness is None
-    widths = _ANNEALING if cold else _WARM_ANNEALING
+    widths = _ANNEALING if start_stiffness is None else _WARM_ANNEALING
     limit = start_scale_px / float(np.median(problem.sigma))
     weights, scale = _weights_and_scale(problem.residuals(theta), problem.sigma, widths[0], limit)
     for iteration, width in enumerate(widths):
         theta = _take_step(problem, theta, weights, scale, stiffness)
         weights, scale = _weights_and_scale(problem.residuals(theta), problem.sigma, width, limit)
-        if iteration in (_SELECT_STIFFNESS_AFTER if cold else _WARM_SELECT_AFTER):
+        if iteration in _SELECT_STIFFNESS_AFTER:
             stiffness = _select_stiffness(problem, theta, weights, scale, start_stiffness)
     for _ in range(_FINAL_STEPS):
         theta = _take_step(problem, theta, weights, scale, stiffness)
