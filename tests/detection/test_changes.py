@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from schemas.arrays import GreyImage, Mask, Points
+from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.detect import (
     SearchedFrame,
     changed_cells,
@@ -101,6 +102,24 @@ def test_what_is_found_in_a_mosaic_of_boxes_is_what_is_found_in_each_box() -> No
     alone = [find_in_boxes(detector, searched, None, [box], 0.0) for box in boxes]
     assert [len(one) for one in alone] == [1, 1, 1, 1, 1]
     np.testing.assert_allclose(together.to_rows(), concatenate(alone).to_rows(), rtol=0, atol=1e-4)
+
+
+def test_a_detector_of_another_kind_searches_each_box_by_itself() -> None:
+    seen = []
+
+    class Recording(CnnDetector):
+        def find(self, image, valid=None, background=None, *, threshold=None):  # type: ignore[no-untyped-def]
+            assert valid.shape == background.shape == image.shape
+            seen.append(image.shape)
+            return super().find(image, valid, background, threshold=threshold)
+
+    shipped = shipped_detector()
+    detector = Recording(shipped.record.model_copy(update={"tta_range": (0.3, 0.6)}))
+    image = with_cars(ground(3), [(30, 40), (100, 100), (300, 200)])
+    boxes = [(0, 0, 5, 4), (5, 5, 9, 8), (11, 16, 14, 21)]
+    found = find_in_boxes(detector, frame(image), image, boxes, 0.0)
+    assert sorted(seen) == [(80, 112), (96, 80), (112, 96)]
+    assert all(near(found.xy, x, y) for x, y in [(30, 40), (100, 100), (300, 200)])
 
 
 def test_frames_of_two_grids_are_refused() -> None:

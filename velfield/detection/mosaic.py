@@ -1,8 +1,8 @@
 """The boxes of a frame that are searched, cut out with context on every side and packed side by side into few images.
 
 Boxes come by the hundred, and most are small: a detector that is called once for each spends a third of its time on the
-calls. So crops lie on shelves as tall as their tallest one, and are searched together. A detector that would see beyond
-the context takes each crop by itself (`Detector.find_in_crops`); candidates in the context are dropped.
+calls. So crops lie on shelves as tall as their tallest one, and are searched together where that changes nothing (by
+the network), or else one after another (`Detector.find_in_crops`); candidates in the context are dropped.
 """
 
 from collections.abc import Sequence

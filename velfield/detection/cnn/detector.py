@@ -23,7 +23,7 @@ from velfield.detection.cnn.network import (
 )
 from velfield.detection.cnn.quantization import calibrate, is_exact
 from velfield.detection.cnn.self_training import self_train_from_motion
-from velfield.detection.detector import Crop, Detections, Detector, concatenate, shipped_detector, train_detector
+from velfield.detection.detector import Crop, Detections, Detector, shipped_detector, train_detector
 from velfield.detection.frame import SearchableFrame, whole_frame
 from velfield.detection.orientation import CAR_ASPECT
 from velfield.detection.samples import LabelledImage
@@ -44,6 +44,7 @@ class CnnDetector(Detector):
     record: CnnRecord
     method: ClassVar[str] = "cnn"
     context_px: ClassVar[int] = 16
+    box_cost_px: ClassVar[int] = 1200
 
     @cached_property
     def network(self) -> Network:
@@ -107,19 +108,13 @@ class CnnDetector(Detector):
         *,
         threshold: float | None = None,
     ) -> Detections:
-        """As of `find`, the network run on each crop by itself: it sees farther than the context, though little.
+        """The network run on each crop by itself, those of one size at once; its heatmaps are searched together.
 
-        So do the rotated crops of test-time augmentation, and by more.
+        The rotated crops of test-time augmentation see farther than the context.
         """
-        if self.record.tta_range == NO_TTA:
-            return self._find(image, valid, background, threshold, crops=crops)
-        found = []
-        for row, column, height, width in crops:
-            part = np.s_[row : row + height, column : column + width]
-            covered = None if valid is None else valid[part]
-            ground = None if background is None else background[part]
-            found.append(self._find(image[part], covered, ground, threshold).shifted(column, row))
-        return concatenate(found)
+        if self.record.tta_range != NO_TTA:
+            return super().find_in_crops(image, valid, background, crops, threshold=threshold)
+        return self._find(image, valid, background, threshold, crops=crops)
 
     def _find(
         self,
