@@ -127,6 +127,24 @@ def test_the_frames_matches_with_the_given_image_correct_the_lens(tmp_path: Path
     assert after < 0.25
 
 
+def test_a_lens_far_off_in_the_corners_is_corrected_before_the_given_image_is_judged(tmp_path: Path) -> None:
+    """Such an image was refused as one of another area: nothing agreed outside the middle."""
+    shape, middle = (480, 640), np.array([319.5, 239.5])
+    ground, true = city(5, 900, blocks=300), PolynomialLens((0.0636, 0.1198), 319.0, 235.0, 400.0)
+    poses = [similarity(1.0, 2.0 * k, middle, np.array([450.0 + 4 * k, 450.0])) for k in range(4)]
+    frames = [photograph(ground, pose, true, shape, k) for k, pose in enumerate(poses)]
+    plan = plan_on(ground, frames, tmp_path, calibrate="auto")
+    taken = HarrisLens(0.346, 322.5, 248.0, 400.0)
+    record = CameraRecord.model_validate_json(plan.layout.camera.read_bytes())
+    plan.layout.camera.write_text(record.model_copy(update={"lens": taken.to_record()}).model_dump_json())
+    build_base(plan, [detect_unit_keypoints(plan, range(4))])
+    points = frame_grid(shape)
+    before = rms_after_homography(taken.undistort_points(points), true.undistort_points(points))
+    after = rms_after_homography(read_lens(plan.layout).undistort_points(points), true.undistort_points(points))
+    assert before > 1.5
+    assert after < 0.3
+
+
 def test_a_lens_that_is_right_stays(base: np.ndarray, tmp_path: Path) -> None:
     plan = plan_on(base, views(base), tmp_path, calibrate="auto")
     outcome = build_base(plan, [detect_unit_keypoints(plan, range(3))])

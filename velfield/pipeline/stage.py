@@ -166,7 +166,7 @@ STAGES: tuple[Stage, ...] = (
     # Key points of spread frames, two passes to their median; or the registration of a given image.
     Stage(
         name="base",
-        version=7,
+        version=8,
         label="base image",
         lines=(
             Line(

@@ -74,13 +74,14 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageR
     if given is not None:
         keypoints |= _detect_keypoints(plan, _missing(trial_frames(spread), keypoints))
         direct = register_directly(plan, given, keypoints, lens)
-        if direct is not None:  # half a pixel all over the frame: no other area reaches that
+        if direct.fit is not None:  # half a pixel all over the frame: no other area reaches that
             grid = _given_grid(plan, given, reference, direct.fit)
             layout.own_to_base.unlink(missing_ok=True)
             outputs = [*write_given_image(layout, given), *_written_lens(layout)]
             finished = _finish(plan, grid, outputs, given=given, fit=direct.fit)
             return replace(finished, notes=[*finished.notes, *direct.notes])
-        lens, lens_notes = _check_area(plan, store.read(reference), given, lens)
+        lens, lens_notes = _check_area(plan, store.read(reference), given, direct.lens)
+        lens_notes = lens_notes or direct.notes
         keypoints |= _detect_keypoints(plan, _missing(spread, keypoints))
         keypoints = dict(sorted(keypoints.items()))
     own = build_own_base(

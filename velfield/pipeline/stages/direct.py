@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from velfield.camera.lens import Lens
+from velfield.camera.lens import Lens, PolynomialLens
 from velfield.camera.map_fit import MapFit, fit_lens_to_map, mean_lens
 from velfield.parallel import parallel_map
 from velfield.pipeline.plan import Plan
@@ -33,9 +33,9 @@ _MIN_LENS_CHANGE_PX = 0.3
 
 @dataclass(frozen=True)
 class DirectRegistration:
-    """How sampled frames register directly: in sum, the lens they were registered through, and notes on it."""
+    """How sampled frames register directly (None: one of them does not), the lens by their matches, notes on it."""
 
-    fit: BaseFit
+    fit: BaseFit | None
     lens: Lens
     notes: list[str]
 
@@ -46,10 +46,8 @@ def trial_frames(spread: list[int]) -> list[int]:
     return [spread[k] for k in np.unique(np.linspace(0, len(spread) - 1, count).round().astype(int))]
 
 
-def register_directly(
-    plan: Plan, given: BaseRaster, keypoints: dict[int, Keypoints], lens: Lens
-) -> DirectRegistration | None:
-    """Register sampled frames directly to the given image; None if one of them fails.
+def register_directly(plan: Plan, given: BaseRaster, keypoints: dict[int, Keypoints], lens: Lens) -> DirectRegistration:
+    """Register sampled frames directly to the given image.
 
     Where their control points decide for another lens, it is written to ``base/lens.json``.
     """
@@ -57,22 +55,51 @@ def register_directly(
     shape = (plan.info.height, plan.info.width)
     reference = prepare_base(given.grey, config, mask=given.valid, frame_shape=shape)
     frames = trial_frames(sorted(keypoints))
+    refines = plan.config.lens.calibrate != "never"
+    notes: list[str] = []
+    if refines:
+        lens, notes = _refine_by_one(plan, reference, keypoints, frames[0], lens)
     results = _register(plan, reference, keypoints, frames, lens)
     if results is None:
-        return None
-    notes: list[str] = []
-    if plan.config.lens.calibrate != "never":
+        return DirectRegistration(None, lens, notes)
+    if refines:
         for _ in range(_LENS_ROUNDS):
             fit = _fit_lens(results, lens, shape)
             again = None if fit is None else _register(plan, reference, keypoints, frames, fit.lens)
             if fit is None or again is None or _error_px(again) >= _error_px(results):
                 break
-            first, second = fit.lens.coefficients
-            matches = sum(result.n_inliers for result in again)
-            notes = [f"lens by the base image: k = {first:.3f}, {second:.3f} from {matches} control points"]
-            write_atomically(plan.layout.map_lens, fit.lens.to_record().model_dump_json(indent=1).encode())
+            notes = _accept(plan, fit.lens, again)
             lens, results = fit.lens, again
     return DirectRegistration(_summarise(plan, given, results), lens, notes)
+
+
+def _refine_by_one(
+    plan: Plan, reference: BaseReference, keypoints: dict[int, Keypoints], frame: int, lens: Lens
+) -> tuple[Lens, list[str]]:
+    """The lens, or a better one where a frame registers not well through it; each reaches farther out.
+
+    Through a lens that is far off in the corners the patches that verify a given image agree in its middle alone, and
+    it would be refused as one of another area.
+    """
+    grey, notes = open_frames(plan.layout.frames).read(frame), list[str]()
+    result = register_frame(grey, keypoints[frame], reference, lens, plan.config.registration)
+    for _ in range(_LENS_ROUNDS):
+        fit = _fit_lens([result], lens, grey.shape) if result.ok and not _is_accurate(result) else None
+        if fit is None:
+            break
+        again = register_frame(grey, keypoints[frame], reference, fit.lens, plan.config.registration)
+        if not again.ok or again.heldout_px >= result.heldout_px:
+            break
+        lens, result, notes = fit.lens, again, _accept(plan, fit.lens, [again])
+    return lens, notes
+
+
+def _accept(plan: Plan, lens: PolynomialLens, results: Sequence[FrameRegistration]) -> list[str]:
+    """Write the lens to ``base/lens.json``; a note on it."""
+    write_atomically(plan.layout.map_lens, lens.to_record().model_dump_json(indent=1).encode())
+    first, second = lens.coefficients
+    matches = sum(result.n_inliers for result in results)
+    return [f"lens by the base image: k = {first:.3f}, {second:.3f} from {matches} control points"]
 
 
 def _register(
@@ -98,7 +125,7 @@ def _error_px(results: Sequence[FrameRegistration]) -> float:
     return float(np.mean([result.heldout_px for result in results]))
 
 
-def _fit_lens(results: Sequence[FrameRegistration], lens: Lens, shape: tuple[int, int]) -> MapFit | None:
+def _fit_lens(results: Sequence[FrameRegistration], lens: Lens, shape: tuple[int, ...]) -> MapFit | None:
     """The mean of the lenses that each frame's control points give; None where most decide for none.
 
     Row motion is removed first. Of several frames it leaves a mean lens that no one frame's rolling shutter bends.
@@ -109,7 +136,7 @@ def _fit_lens(results: Sequence[FrameRegistration], lens: Lens, shape: tuple[int
         assert result.control_points is not None, "accurate frames have control points"
         xy_raw = lens.distort_points(result.transform.remove_row_motion(result.control_points.xy_raw))
         valid = np.isfinite(xy_raw).all(axis=1)
-        fit = fit_lens_to_map(xy_raw[valid], result.control_points.xy_base[valid], lens, shape)
+        fit = fit_lens_to_map(xy_raw[valid], result.control_points.xy_base[valid], lens, (shape[0], shape[1]))
         if fit is not None:
             fits.append(fit)
     if 2 * sum(fit.is_better and fit.change_px >= _MIN_LENS_CHANGE_PX for fit in fits) <= len(results):
