@@ -128,10 +128,14 @@ def find_doubtful_places(trajectories: Trajectories) -> list[DoubtfulPlace]:
     low, high = (reduce.reduceat(trajectories.xy_m, first, axis=0) for reduce in (np.minimum, np.maximum))
     short = np.hypot(*(high - low).T) < _SHORT_M
     cell = np.floor(trajectories.xy_m / _CELL_M).astype(np.int64)
-    visits = np.unique(np.column_stack([cell, trajectories.owner]), axis=0)
-    cells, inverse = np.unique(visits[:, :2], axis=0, return_inverse=True)
-    inverse = inverse.ravel()
-    total = np.bincount(inverse, minlength=len(cells))
-    brief = np.bincount(inverse, short[visits[:, 2]], len(cells))
+    corner = cell.min(axis=0)
+    columns = int(np.ptp(cell[:, 0])) + 1
+    number = (cell[:, 1] - corner[1]) * columns + cell[:, 0] - corner[0]
+    # one integer a visit sorts several times as fast as rows of three
+    visits = np.unique(number * len(trajectories) + trajectories.owner)
+    numbers, inverse = np.unique(visits // len(trajectories), return_inverse=True)
+    total = np.bincount(inverse, minlength=len(numbers))
+    brief = np.bincount(inverse, short[visits % len(trajectories)], len(numbers))
     rows = np.flatnonzero((brief >= _MIN_SHORT) & (brief > 0.7 * total))
+    cells = np.column_stack([numbers % columns, numbers // columns]) + corner
     return [DoubtfulPlace((cells[k] + 0.5) * _CELL_M, int(brief[k]), int(total[k])) for k in rows]
