@@ -16,9 +16,15 @@ from velfield.detection.cnn import model
 from velfield.detection.cnn import network as networks
 from velfield.detection.cnn.dataset import PATCH_PX, encode_targets
 from velfield.detection.cnn.detector import CnnDetector
-from velfield.detection.cnn.model import SCORE_OFFSET, background_difference_at, detect_cars, motion_score_bonus
+from velfield.detection.cnn.model import (
+    SCORE_OFFSET,
+    SMOOTHING_SIGMA,
+    background_difference_at,
+    detect_cars,
+    find_peaks,
+    motion_score_bonus,
+)
 from velfield.detection.cnn.network import Network
-from velfield.detection.cnn.peaks import SMOOTHING_SIGMA, find_peaks
 from velfield.detection.detector import shipped_detector
 from velfield.detection.orientation import axial_difference
 from velfield.errors import InputError

@@ -129,9 +129,8 @@ def link_detections(path: Path) -> int:
     """Tracklets and tracks of detections that no detector would give."""
     from schemas.flight import TrackingConfig
     from velfield.tracking.association import FrameTable
-    from velfield.tracking.joins import GapLimits, reconnect_tracks
+    from velfield.tracking.joins import GapLimits, assign_tracks, reconnect_tracks
     from velfield.tracking.tracklets import link_windows
-    from velfield.tracking.tracks import assign_tracks
 
     rng = np.random.default_rng(int.from_bytes(path.read_bytes()[:8].ljust(8), "little"))
     extreme = np.array([0.0, -1e9, 1e9, 1e-300, 5.0, 5.0])

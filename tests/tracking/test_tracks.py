@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from velfield.tracking.tracks import assign_tracks
+from velfield.tracking.joins import assign_tracks
 
 
 def test_a_track_is_named_after_its_first_detection() -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from schemas.arrays import FloatArray, IntArray
 from schemas.tables import TRACKLET_COLUMNS
 from velfield.synthetic.traffic.traffic import STEP_S, Traffic
-from velfield.tracking.tracks import assign_tracks
+from velfield.tracking.joins import assign_tracks
 
 _MAX_INTERVAL_S = 0.45
 

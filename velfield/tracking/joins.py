@@ -23,7 +23,6 @@ from scipy.sparse.csgraph import connected_components
 from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.flight import PAPER_GSD_M, STATIONARY_SPEED_M_PER_S
 from velfield.tracking.dimensions import looks_difference
-from velfield.tracking.tracks import component_minimum
 
 _SLACK_M = 2.0
 """Tolerance of the prediction for a gap of no length: detections are not always at the same point of a car."""
@@ -371,3 +370,38 @@ def _margins(table: FloatArray, best: IntArray) -> FloatArray:
         rows, columns = linear_sum_assignment(-without)
         margins.append(total - float(without[rows, columns].sum()))
     return np.array(margins)
+
+
+def assign_tracks(detection_ids: IntArray) -> IntArray:
+    """The track of each tracklet: the smallest detection id of its connected component.
+
+    Parameters
+    ----------
+    detection_ids
+        (n, 3) ids of each tracklet's detections. Tracklets that share a detection belong to one track.
+
+    Returns
+    -------
+    (n,) int64
+
+    Examples
+    --------
+    >>> assign_tracks(np.array([[1, 12, 23], [12, 23, 34], [2, 13, 24]])).tolist()
+    [1, 1, 2]
+    """
+    if not detection_ids.size:
+        return np.zeros(0, np.int64)
+    ids, flat = np.unique(detection_ids, return_inverse=True)
+    node = flat.reshape(detection_ids.shape)
+    edges = np.concatenate([node[:, :2], node[:, 1:]])
+    return component_minimum(ids, edges)[node[:, 0]]
+
+
+def component_minimum(ids: IntArray, edges: IntArray) -> IntArray:
+    """The smallest of ids (n,) in each one's connected component; edges (m, 2) are pairs of their indices."""
+    count = len(ids)
+    graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    _, label = connected_components(graph, directed=False)
+    smallest = np.full(count, np.iinfo(np.int64).max)
+    np.minimum.at(smallest, label, ids)
+    return np.asarray(smallest[label], dtype=np.int64)

@@ -13,8 +13,7 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, IntArray, Mask
-from velfield.tracking.joins import EndContext, GapLimits, TrackEnds, close_gaps
-from velfield.tracking.tracks import component_minimum
+from velfield.tracking.joins import EndContext, GapLimits, TrackEnds, close_gaps, component_minimum
 
 _MAX_MISSED_S = 0.75
 """An end is not extended any more when so long nothing was found."""

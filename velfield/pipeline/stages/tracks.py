@@ -19,9 +19,8 @@ from velfield.run.tables import empty_table, read_patches, read_tables, write_ta
 from velfield.tracking.association import LinkedTriples, tracklet_table, window_frames
 from velfield.tracking.dimensions import STRIP_SHAPE, direction_of_axes, looks, measure, sample_tracks
 from velfield.tracking.gates import Limits, triples_pass
-from velfield.tracking.joins import END_COLUMNS, EndContext, GapLimits, TrackEnds, find_ends
+from velfield.tracking.joins import END_COLUMNS, EndContext, GapLimits, TrackEnds, assign_tracks, find_ends
 from velfield.tracking.recovery import Candidates, Recovered, interpolate_gap, recover_tracks
-from velfield.tracking.tracks import assign_tracks
 
 _MIDDLE = ["frame_1", "time_1_s", "x_1_px", "y_1_px"]
 _IDS = [f"detection_id_{k}" for k in range(3)]
