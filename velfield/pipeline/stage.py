@@ -242,7 +242,7 @@ STAGES: tuple[Stage, ...] = (
     # Cars of each block, then one table with their crops.
     Stage(
         name="detections",
-        version=14,
+        version=15,
         label="detections",
         lines=(
             Line(
