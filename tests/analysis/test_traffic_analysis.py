@@ -146,6 +146,30 @@ def test_a_u_turn_a_wrong_way_and_a_conflict() -> None:
     assert 0.5 < first.probability <= 1.0
 
 
+def approach(start_s: float, gap_m: float, follower: float, leader: float, final_gap_m: float) -> list[Track]:
+    """A leader to the east, and a follower that closes up on it until a gap from bumper to bumper is left."""
+    times = np.arange(start_s, start_s + 250.0 / max(leader, 1.0), STEP_S)
+    front = leader * (times - start_s)
+    rear = front - 4.5 - np.maximum(gap_m - (follower - leader) * (times - start_s), final_gap_m)
+    return [
+        (times[x < 250], np.column_stack([x, np.full(len(x), 100.0)])[x < 250]) for x in (front + 10.0, rear + 10.0)
+    ]
+
+
+def test_a_fast_approach_is_a_conflict_and_a_queue_and_a_double_are_none() -> None:
+    free = [drive(EAST, 8.0 * k) for k in range(12)]
+    near = approach(120.0, 30.0, 12.0, 6.0, 3.0)  # 3 m at 6 m/s: 0.5 s
+    creeping = approach(200.0, 12.0, 2.5, 1.5, 1.0)  # below 3 m/s: closing up in a queue
+    double = approach(420.0, -2.5, 8.0, 8.0, -2.5)  # 2 m from centre to centre
+    analysis = TrafficAnalysis(gather([*free, *near, *creeping, *double]))
+    found = find_conflicts(analysis.trajectories, analysis.lane_traffic)
+    following = [(c.first, c.second) for c in found if c.kind == "following"]
+    assert following == [(12, 13)]
+    conflict = next(c for c in found if c.kind == "following")
+    assert conflict.value_s == pytest.approx(3.0 / 6.0 + 0.4, abs=0.15)  # what it is below for 0.4 s
+    assert conflict.probability > 0.9
+
+
 def test_a_changed_cycle_and_nothing_else_is_a_change(analysis: TrafficAnalysis) -> None:
     assert [c.what for c in find_changes(analysis, analysis) if c.significant] == []
     slow = [(times * 1.25, xy) for times, xy in crossroads()]

@@ -2,7 +2,7 @@
 that each lies below a threshold, given the errors of positions."""
 
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import Literal
 
 import numpy as np
@@ -21,6 +21,9 @@ LENGTH_M, WIDTH_M = 4.5, 1.8
 POSITION_SD_M, SPEED_SD_M_PER_S = 0.35, 0.3
 """Of a vehicle's bumper along its path: of its position, and of a length that is not known; and of its speed."""
 _MIN_SPEED_M_PER_S = 1.0
+_MIN_FOLLOWER_M_PER_S = 3.0
+_OVERLAP_M = 1.0
+_PERSISTENCE_S = 0.4
 _JOINED_M = 4.0
 """A lane that joins another is on it so far after its own end."""
 
@@ -147,7 +150,12 @@ def _pairs(
 def time_to_collision(
     trajectories: Trajectories, graph: LaneGraph, lengths: FloatArray, threshold_s: float
 ) -> list[Conflict]:
-    """Least time to collision of each follower and its leader on a lane, where it is below ``MAX_TTC_S``."""
+    """Least time to collision of each follower and its leader on a lane, where it is below ``MAX_TTC_S``.
+
+    Followers slower than 3 m/s are left out: closing up in a queue is no conflict. So are pairs that overlap at some
+    time: two tracks of one vehicle, or vehicles side by side on a wide lane. A pair's value is the least that holds
+    for `_PERSISTENCE_S`, not that of one noisy frame.
+    """
     lane, along = positions_on_lanes(trajectories, graph)
     rows = np.flatnonzero(lane >= 0)
     order = rows[np.lexsort((along[rows], trajectories.frame[rows], lane[rows]))]
@@ -157,14 +165,18 @@ def time_to_collision(
     owner, speed = trajectories.owner, trajectories.speed_m_per_s
     gap = along[b] - along[a] - (lengths[owner[a]] + lengths[owner[b]]) / 2
     closing = speed[a] - speed[b]
-    near = (closing > 0.5) & (gap > -1.0) & (gap < MAX_TTC_S * closing) & (owner[a] != owner[b])
-    a, b, gap, closing = a[near], b[near], np.maximum(gap[near], 0.05), closing[near]
-    value = gap / closing
+    pair = owner[a] * np.int64(len(trajectories)) + owner[b]
+    overlap = np.isin(pair, pair[gap < -_OVERLAP_M])
+    near = (closing > 0.5) & (gap < MAX_TTC_S * closing) & (owner[a] != owner[b])
+    near &= ~overlap & (speed[a] > _MIN_FOLLOWER_M_PER_S)
+    a, b, gap, closing, pair = a[near], b[near], np.maximum(gap[near], 0.05), closing[near], pair[near]
+    value = _persistent(pair, trajectories.time_s[a], gap / closing)
+    lasts = np.isfinite(value)
+    a, b, gap, closing, pair, value = a[lasts], b[lasts], gap[lasts], closing[lasts], pair[lasts], value[lasts]
     sd = value * np.hypot(np.sqrt(2) * POSITION_SD_M / gap, np.sqrt(2) * SPEED_SD_M_PER_S / closing)
     # the probability on the closing speed's side: gap < threshold * closing
     spread = np.hypot(np.sqrt(2) * POSITION_SD_M, threshold_s * np.sqrt(2) * SPEED_SD_M_PER_S)
     probability = stats.norm.cdf((threshold_s * closing - gap) / spread)
-    pair = owner[a] * np.int64(len(trajectories)) + owner[b]
     best = np.lexsort((value, pair))
     _, first = np.unique(pair[best], return_index=True)
     return [
@@ -181,6 +193,21 @@ def time_to_collision(
         )
         for i in best[first]
     ]
+
+
+def _persistent(pair: IntArray, time_s: FloatArray, value_s: FloatArray) -> FloatArray:
+    """The largest value (n,) of each pair within `_PERSISTENCE_S` from each time on; infinite where it is shorter."""
+    out = np.full(len(value_s), np.inf)
+    order = np.lexsort((time_s, pair))
+    pair, time_s, value_s = pair[order], time_s[order], value_s[order]
+    starts = np.r_[0, np.flatnonzero(np.diff(pair)) + 1, len(pair)]
+    for begin, end in pairwise(starts):
+        time = time_s[begin:end]
+        last = np.searchsorted(time, time + _PERSISTENCE_S - 1e-9)
+        for k in np.flatnonzero(last < len(time)):
+            if np.diff(time[k : last[k] + 1]).max(initial=0.0) <= _PERSISTENCE_S:
+                out[order[begin + k]] = value_s[begin + k : begin + last[k] + 1].max()
+    return out
 
 
 def positions_on_lanes(trajectories: Trajectories, graph: LaneGraph) -> tuple[IntArray, FloatArray]:
