@@ -9,6 +9,8 @@ from numba import njit
 
 from schemas.arrays import FloatArray, IntArray, Mask
 
+VEHICLE_LENGTH_M, VEHICLE_WIDTH_M = 4.5, 1.8
+"""Of a vehicle that was not measured."""
 _SMOOTHING_S = 1.0
 """Half the window in which the errors of positions are averaged along the measured displacements."""
 _VELOCITY_S = 0.3

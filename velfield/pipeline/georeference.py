@@ -29,6 +29,7 @@ from velfield.pipeline.stages.georeference import (
     with_control_points,
     write_georeference,
 )
+from velfield.pipeline.stages.rebase import describe_source
 from velfield.pipeline.stages.registration import lost_frames
 from velfield.pipeline.stages.report import write_report
 from velfield.pipeline.summary import summarise_stage
@@ -40,7 +41,6 @@ from velfield.run.layout import RunLayout, remove_tree, to_path
 from velfield.run.lock import locked
 from velfield.run.run import Run, open_run
 from velfield.sources.control_points import Model, fit_control_points
-from velfield.sources.frames import SourceInfo
 from velfield.sources.scale import choose_scale
 
 _SAME_SCALE = 1e-4
@@ -148,19 +148,11 @@ def open_finished_run(root: str | Path) -> Run:
 
 def plan_of_finished(run: Run) -> Plan:
     """The plan of a finished run, from its folder alone: its source may be gone."""
-    source, given = run.record.inputs.source, run.record.given
+    given = run.record.given
     if given is None:
         raise InputError(f"{run.layout.root} has no record of its inputs; run `velfield run` on it again")
-    info = SourceInfo(
-        kind="video" if source.kind == "video" else "folder",
-        width=source.width,
-        height=source.height,
-        frame_count=source.frame_count,
-        times_s=run.times_s,
-        names=(),
-    )
     job = Job(root=str(run.layout.root), inputs=given, config=run.record.config)
-    return Plan(job, info, np.arange(run.frames.count), run.record.inputs, run.record.keys)
+    return Plan(job, describe_source(run), np.arange(run.frames.count), run.record.inputs, run.record.keys)
 
 
 def _vehicle_counts(layout: RunLayout, stage: str) -> dict[str, float]:

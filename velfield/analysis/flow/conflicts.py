@@ -13,11 +13,10 @@ from velfield.analysis.flow.passings import LaneTraffic, Passings
 from velfield.analysis.lanes.find import project
 from velfield.analysis.lanes.junctions import Crossing, find_crossings
 from velfield.analysis.lanes.model import LaneGraph
-from velfield.analysis.trajectories import Trajectories
+from velfield.analysis.trajectories import VEHICLE_LENGTH_M, VEHICLE_WIDTH_M, Trajectories
 
 ConflictKind = Literal["crossing", "merging", "following"]
 MAX_PET_S, MAX_TTC_S = 3.0, 3.0
-LENGTH_M, WIDTH_M = 4.5, 1.8
 POSITION_SD_M, SPEED_SD_M_PER_S = 0.35, 0.3
 """Of a vehicle's bumper along its path: of its position, and of a length that is not known; and of its speed."""
 _MIN_SPEED_M_PER_S = 1.0
@@ -68,7 +67,7 @@ def find_conflicts(
     lengths_m
         (tracks,) lengths of the vehicles; None: a car's.
     """
-    lengths = np.full(len(trajectories), LENGTH_M) if lengths_m is None else lengths_m
+    lengths = np.full(len(trajectories), VEHICLE_LENGTH_M) if lengths_m is None else lengths_m
     found = [
         conflict
         for crossing in find_crossings(traffic.graph.lanes)
@@ -95,7 +94,7 @@ def _post_encroachments(
     """Pairs that cross one after the other, by different lanes."""
     a = traffic.passings(crossing.lane, crossing.along_m)
     b = traffic.passings(crossing.other, crossing.other_along_m)
-    half_m = WIDTH_M / 2 / max(abs(np.sin(crossing.angle_rad)), 0.3)
+    half_m = VEHICLE_WIDTH_M / 2 / max(abs(np.sin(crossing.angle_rad)), 0.3)
     return _pairs("crossing", a, b, crossing.xy_m, lengths, half_m, threshold_s)
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.arrays import FloatArray, IntArray, Mask
-from velfield.analysis.flow.passings import LaneTraffic
+from velfield.analysis.flow.passings import LaneTraffic, find_passings
 from velfield.analysis.intervals import Estimate, estimate_censored_quantile, estimate_median, estimate_quantile
 from velfield.analysis.lanes.model import Junction, LaneGraph, LaneSamples
 
@@ -133,8 +133,6 @@ def _steady_speeds(traffic: LaneTraffic, lane: int) -> tuple[IntArray, FloatArra
 
 def traffic_passings(samples: LaneSamples, at_m: float) -> tuple[IntArray, FloatArray]:
     """Tracks at a place and their headways, s; the first has none and counts as free."""
-    from velfield.analysis.flow.passings import find_passings
-
     found = find_passings(samples, at_m)
     return found.track, np.nan_to_num(found.headway_s, nan=np.inf)
 

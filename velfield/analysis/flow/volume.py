@@ -7,8 +7,8 @@ import numpy as np
 from schemas.arrays import FloatArray
 from velfield.analysis.flow.passings import LaneTraffic
 from velfield.analysis.intervals import Estimate, estimate_mean, estimate_median, estimate_rate
+from velfield.analysis.trajectories import VEHICLE_LENGTH_M
 
-_VEHICLE_M = 4.5
 _FOLLOW_S = 3.0
 """A vehicle with a shorter headway follows the one before."""
 LOS_SIGNAL_S = (10.0, 20.0, 35.0, 55.0, 80.0)
@@ -59,7 +59,7 @@ def lane_flow(traffic: LaneTraffic, lane: int, begin_s: float, end_s: float, *, 
     counts = np.histogram(passing.time_s[inside], number, (begin_s, max(end_s, begin_s + 1e-9)))[0]
     headway = passing.headway_s
     follows = headway < _FOLLOW_S
-    gap = headway[follows] - _VEHICLE_M / np.maximum(passing.speed_m_per_s[follows], 1.0)
+    gap = headway[follows] - VEHICLE_LENGTH_M / np.maximum(passing.speed_m_per_s[follows], 1.0)
     enough = len(passing) >= 5
     return LaneFlow(
         lane,

@@ -8,13 +8,12 @@ from velfield.analysis.lanes.graph import Chains, count_links, make_chains
 from velfield.analysis.lanes.junctions import find_junctions
 from velfield.analysis.lanes.model import Connection, Lane, LaneGraph, LaneSamples, Turn, WidthSource
 from velfield.analysis.lanes.ridges import Nodes, bin_keys, bin_samples, find_nodes
-from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
+from velfield.analysis.trajectories import VEHICLE_WIDTH_M, PathSamples, Trajectories, sample_paths
 
 MIN_TRACKS = 3
 """A lane, or a connection, that fewer tracks drove is not one: an error of tracking or of a driver."""
 _LANE_MIN_M, _LANE_MAX_M = 2.2, 5.0
 """Distances between neighbouring lanes of one carriageway."""
-_CAR_WIDTH_M = 1.8
 _MARGIN_M = 0.6
 """To either side of a car, where a lane's width is taken from the spread of paths."""
 _TURN_RAD, _U_TURN_RAD = np.radians(40), np.radians(150)
@@ -167,7 +166,7 @@ def _lanes(lines: list[FloatArray], on_lanes: LaneSamples) -> tuple[Lane, ...]:
         else:
             offsets = on_lanes.offset_m[order[borders[k] : borders[k + 1]]]
             spread = float(np.subtract(*np.quantile(offsets, [0.95, 0.05]))) if len(offsets) else 0.0
-            width = float(np.clip(spread + _CAR_WIDTH_M + 2 * _MARGIN_M, 2.5, 5.5))
+            width = float(np.clip(spread + VEHICLE_WIDTH_M + 2 * _MARGIN_M, 2.5, 5.5))
         out.append(Lane(k, line, int(tracks[k]), width, source, left[0] if left else None, right[0] if right else None))
     return tuple(out)
 

@@ -9,6 +9,7 @@ from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.intervals import Estimate, estimate_mean, estimate_share
 from velfield.analysis.signals.phases import fit_phases
 from velfield.analysis.signals.queues import Stream
+from velfield.analysis.trajectories import VEHICLE_LENGTH_M
 
 MIN_CYCLE_S, MAX_CYCLE_S = 24.0, 200.0
 MIN_STARTS = 4
@@ -17,8 +18,8 @@ _MAX_P_VALUE = 0.005
 """Probability by chance above which starts do not recur."""
 _MIN_CONCENTRATION = 0.85
 """Mean resultant length of the starts' phases under a signal; one that traffic actuates has less."""
-_VEHICLE_M, _SPACING_M = 4.5, 6.4
-"""Length of a car, and from front to front in a queue."""
+_SPACING_M = 6.4
+"""From front to front in a queue."""
 _START_UP_VEHICLES = 4
 """The first vehicles of a queue lose time at the start (HCM)."""
 
@@ -217,7 +218,7 @@ def queues(stream: Stream, times_s: FloatArray) -> list[Queue]:
     out = []
     for time in times_s:
         stands = (stream.stop_start_s <= time) & (end >= time)
-        front = np.sort(stream.stop_along_m[stands] + _VEHICLE_M / 2)[::-1]
+        front = np.sort(stream.stop_along_m[stands] + VEHICLE_LENGTH_M / 2)[::-1]
         front = front[front < stream.stop_line_m + 4.0]
         count, at = 0, stream.stop_line_m + _SPACING_M
         for position in front:
@@ -227,5 +228,5 @@ def queues(stream: Stream, times_s: FloatArray) -> list[Queue]:
                 count + max(round((at - position) / _SPACING_M), 0 if count == 0 else int(at - position > 2.0)),
                 position,
             )
-        out.append(Queue(float(time), count, float(stream.stop_line_m - at + _VEHICLE_M) if count else 0.0))
+        out.append(Queue(float(time), count, float(stream.stop_line_m - at + VEHICLE_LENGTH_M) if count else 0.0))
     return out

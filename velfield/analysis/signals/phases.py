@@ -62,7 +62,7 @@ def _group(phases_s: Sequence[float], cycle_s: float) -> list[list[int]]:
     groups: list[tuple[float, list[int]]] = []
     for k in np.argsort(phases_s).tolist():
         for at, members in groups:
-            if abs(_wrap(phases_s[k] - at, cycle_s)) < _TOGETHER_S:
+            if abs(_wrap(np.array(phases_s[k] - at), cycle_s)) < _TOGETHER_S:
                 members.append(k)
                 break
         else:
@@ -70,7 +70,7 @@ def _group(phases_s: Sequence[float], cycle_s: float) -> list[list[int]]:
     return [members for _, members in groups]
 
 
-def _wrap(value: float, cycle_s: float) -> float:
+def _wrap(value: FloatArray, cycle_s: float) -> FloatArray:
     return (value + cycle_s / 2) % cycle_s - cycle_s / 2
 
 
@@ -82,7 +82,7 @@ def _one_a_cycle(
     for k, members in enumerate(groups):
         every = np.concatenate([starts_s[m] for m in members])
         phase = _circular_mean(every, cycle_s)
-        residual = (every - phase + cycle_s / 2) % cycle_s - cycle_s / 2
+        residual = _wrap(every - phase, cycle_s)
         every = every[np.abs(residual - np.median(residual)) < _PROMPT_S]
         cycles = np.round((every - phase) / cycle_s).astype(np.int64)
         for cycle in np.unique(cycles):

@@ -6,7 +6,7 @@ import numpy as np
 
 from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.analysis.lanes.model import Junction, LaneGraph
-from velfield.analysis.trajectories import PathSamples, Trajectories
+from velfield.analysis.trajectories import VEHICLE_LENGTH_M, PathSamples, Trajectories
 
 STOP_M_PER_S, GO_M_PER_S = 0.7, 1.4
 """A vehicle has stopped below the one, and goes again above the other."""
@@ -15,7 +15,6 @@ REACH_M = 120.0
 """Stops so far before a stop line belong to its queue."""
 _QUEUE_GAP_M = 13.0
 """Vehicles of a queue are nearer to each other, centre to centre, or to the stop line."""
-_VEHICLE_M = 4.5
 _CROSSES_S = 8.0
 """From its start to its crossing of the line, a vehicle at the head of a queue needs no longer."""
 
@@ -155,7 +154,7 @@ def observe_stream(approach: Approach, samples: PathSamples, stops: Stops) -> St
     cross = _crossings(approach.path_m, at, samples)
     heads = np.empty(0, np.int64)
     if line is not None:
-        front = _along(approach.path_m, stops.xy_m[known])[0] + _VEHICLE_M / 2
+        front = _along(approach.path_m, stops.xy_m[known])[0] + VEHICLE_LENGTH_M / 2
         heads = known[np.abs(front - line) < 3.0]
         heads = heads[_goes_on(stops.track[heads], stops.end_s[heads], cross[1], cross[0])]
         heads = heads[np.argsort(stops.end_s[heads])]
@@ -194,7 +193,7 @@ def _along(path_m: FloatArray, xy_m: FloatArray) -> tuple[FloatArray, FloatArray
 
 def _stop_line(along_m: FloatArray, border_m: float) -> float | None:
     """Where the foremost of many stops are, front bumpers: the last peak of their density near the border."""
-    front = along_m + _VEHICLE_M / 2
+    front = along_m + VEHICLE_LENGTH_M / 2
     front = front[np.abs(front - border_m) < 25.0]
     if len(front) < 4:
         return None

@@ -9,6 +9,7 @@ from schemas.arrays import FloatArray
 from velfield.analysis.flow.volume import level_of_service
 from velfield.analysis.intervals import Estimate
 from velfield.analysis.signals.cycles import queues, stopping_share
+from velfield.analysis.signals.phases import START_DELAY_S
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.pipeline.analysis.lanes_record import points_px
 
@@ -276,7 +277,10 @@ def stream_table(analysis: TrafficAnalysis) -> AnalysisTable:
             }
             at = path[int(np.clip(stream.stream.stop_line_m or 0, 0, len(path) - 1))]
             rows.append(_row(cells, _point(at, analysis)))
-    note = "Second 0 of the cycle is the first frame of the flight. A vehicle is taken to start 2.0 s after its green."
+    note = (
+        "Second 0 of the cycle is the first frame of the flight. A vehicle is taken to start "
+        f"{START_DELAY_S:.1f} s after its green."
+    )
     return _table("streams", "Signals", "Streams at signals", note, columns, rows)
 
 

@@ -23,7 +23,7 @@ from velfield.parallel import parallel_map
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.base_fit import BaseFit, check_scale, covered_fraction
-from velfield.pipeline.stages.direct import register_directly, trial_frames
+from velfield.pipeline.stages.direct import accept_lens, register_directly, trial_frames
 from velfield.pipeline.stages.lens import select_usable_frames
 from velfield.pipeline.stages.registration import FrameKeypoints, detect_unit_keypoints, read_given_base
 from velfield.registration.base_mesh import fit_base_mesh
@@ -182,11 +182,7 @@ def _refine_by_map(
         best, points, last, result = fit.lens, len(again.cv_errors_px), fit, again
     if last is None:
         return lens, []
-    write_atomically(plan.layout.map_lens, last.lens.to_record().model_dump_json(indent=1).encode())
-    first, second = last.lens.coefficients
-    return last.lens, [
-        f"lens by the base image: k = {first:.3f}, {second:.3f} from {last.matches} matches, {points} through it"
-    ]
+    return last.lens, accept_lens(plan, last.lens, f"{last.matches} matches, {points} through it")
 
 
 def _own_grid(plan: Plan, own: OwnBase, reference: int) -> GridRecord:

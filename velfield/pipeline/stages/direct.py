@@ -7,7 +7,7 @@ Their control points, hundreds a frame, show the lens better than straight lines
 frames registered through it, which reaches farther into the corners.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from velfield.camera.map_fit import MapFit, fit_lens_to_map, mean_lens
 from velfield.parallel import parallel_map
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.stages.base_fit import BaseFit, check_scale, covered_fraction
-from velfield.registration.intrasensor import BaseReference, FrameRegistration, prepare_base, register_frame
+from velfield.registration.intrasensor import FrameRegistration, prepare_base, register_frame
 from velfield.registration.keypoints import Keypoints
 from velfield.run.commits import write_atomically
 from velfield.run.stores import open_frames
@@ -29,6 +29,9 @@ _MAX_ERROR_PX, _MIN_COVERAGE = 0.5, 0.8
 _LENS_ROUNDS = 3
 _MIN_LENS_CHANGE_PX = 0.3
 """RMS change of the lens over the frame that is worth registering the frames again."""
+
+Register = Callable[[int, Lens], FrameRegistration]
+"""Registers a frame through a lens."""
 
 
 @dataclass(frozen=True)
@@ -51,69 +54,75 @@ def register_directly(plan: Plan, given: BaseRaster, keypoints: dict[int, Keypoi
 
     Where their control points decide for another lens, it is written to ``base/lens.json``.
     """
-    config = plan.config.registration
+    config, store = plan.config.registration, open_frames(plan.layout.frames)
     shape = (plan.info.height, plan.info.width)
     reference = prepare_base(given.grey, config, mask=given.valid, frame_shape=shape)
     frames = trial_frames(sorted(keypoints))
+
+    def register(frame: int, lens: Lens) -> FrameRegistration:
+        return register_frame(store.read(frame), keypoints[frame], reference, lens, config)
+
     refines = plan.config.lens.calibrate != "never"
-    notes: list[str] = []
+    first, notes = register(frames[0], lens), list[str]()
     if refines:
-        lens, notes = _refine_by_one(plan, reference, keypoints, frames[0], lens)
-    results = _register(plan, reference, keypoints, frames, lens)
+        lens, first, notes = _refine_by_one(plan, register, frames[0], lens, first)
+    results = _register_others(register, frames, lens, first)
     if results is None:
         return DirectRegistration(None, lens, notes)
     if refines:
         for _ in range(_LENS_ROUNDS):
             fit = _fit_lens(results, lens, shape)
-            again = None if fit is None else _register(plan, reference, keypoints, frames, fit.lens)
-            if fit is None or again is None or _error_px(again) >= _error_px(results):
+            if fit is None:
                 break
-            notes = _accept(plan, fit.lens, again)
+            again = _register_others(register, frames, fit.lens, register(frames[0], fit.lens))
+            if again is None or _error_px(again) >= _error_px(results):
+                break
+            notes = accept_lens(plan, fit.lens, _evidence(again))
             lens, results = fit.lens, again
     return DirectRegistration(_summarise(plan, given, results), lens, notes)
 
 
 def _refine_by_one(
-    plan: Plan, reference: BaseReference, keypoints: dict[int, Keypoints], frame: int, lens: Lens
-) -> tuple[Lens, list[str]]:
-    """The lens, or a better one where a frame registers not well through it; each reaches farther out.
+    plan: Plan, register: Register, frame: int, lens: Lens, result: FrameRegistration
+) -> tuple[Lens, FrameRegistration, list[str]]:
+    """The lens, or a better one where a frame registers not well through it, each reaching farther out; the frame's
+    registration through it, and notes.
 
     Through a lens that is far off in the corners the patches that verify a given image agree in its middle alone, and
     it would be refused as one of another area.
     """
-    grey, notes = open_frames(plan.layout.frames).read(frame), list[str]()
-    result = register_frame(grey, keypoints[frame], reference, lens, plan.config.registration)
+    notes: list[str] = []
     for _ in range(_LENS_ROUNDS):
-        fit = _fit_lens([result], lens, grey.shape) if result.ok and not _is_accurate(result) else None
+        if not result.ok or _is_accurate(result):
+            break
+        fit = _fit_lens([result], lens, (plan.info.height, plan.info.width))
         if fit is None:
             break
-        again = register_frame(grey, keypoints[frame], reference, fit.lens, plan.config.registration)
+        again = register(frame, fit.lens)
         if not again.ok or again.heldout_px >= result.heldout_px:
             break
-        lens, result, notes = fit.lens, again, _accept(plan, fit.lens, [again])
-    return lens, notes
+        lens, result, notes = fit.lens, again, accept_lens(plan, fit.lens, _evidence([again]))
+    return lens, result, notes
 
 
-def _accept(plan: Plan, lens: PolynomialLens, results: Sequence[FrameRegistration]) -> list[str]:
-    """Write the lens to ``base/lens.json``; a note on it."""
+def accept_lens(plan: Plan, lens: PolynomialLens, evidence: str) -> list[str]:
+    """Write a lens that matches with the given image decide for to ``base/lens.json``; a note on it."""
     write_atomically(plan.layout.map_lens, lens.to_record().model_dump_json(indent=1).encode())
     first, second = lens.coefficients
-    matches = sum(result.n_inliers for result in results)
-    return [f"lens by the base image: k = {first:.3f}, {second:.3f} from {matches} control points"]
+    return [f"lens by the base image: k = {first:.3f}, {second:.3f} from {evidence}"]
 
 
-def _register(
-    plan: Plan, reference: BaseReference, keypoints: dict[int, Keypoints], frames: list[int], lens: Lens
+def _evidence(results: Sequence[FrameRegistration]) -> str:
+    return f"{sum(result.n_inliers for result in results)} control points"
+
+
+def _register_others(
+    register: Register, frames: list[int], lens: Lens, first: FrameRegistration
 ) -> list[FrameRegistration] | None:
-    """The frames' registrations; None if one of them is not accurate."""
-    store = open_frames(plan.layout.frames)
-
-    def register(frame: int) -> FrameRegistration:
-        return register_frame(store.read(frame), keypoints[frame], reference, lens, plan.config.registration)
-
-    results = [register(frames[0])]
-    if _is_accurate(results[0]):
-        results += parallel_map(register, frames[1:])
+    """The frames' registrations, after that of the first; None if one of them is not accurate."""
+    if not _is_accurate(first):
+        return None
+    results = [first, *parallel_map(lambda frame: register(frame, lens), frames[1:])]
     return results if all(_is_accurate(result) for result in results) else None
 
 

@@ -90,14 +90,15 @@ def plan_rebase(run: Run, job: Job, record: RebaseRecord) -> Plan:
     inputs = run.record.inputs.model_copy(update={"base": digest})
     return Plan(
         job=job.model_copy(update={"config": job.config.model_copy(update={"gsd_m": record.gsd_m})}),
-        info=_describe_source(run),
+        info=describe_source(run),
         indices=np.arange(run.frames.count),
         inputs=inputs,
         keys=_mapped_keys(run.record, inputs),
     )
 
 
-def _describe_source(run: Run) -> SourceInfo:
+def describe_source(run: Run) -> SourceInfo:
+    """The source of a finished run, by its record alone."""
     source = run.record.inputs.source
     return SourceInfo(
         kind="video" if source.kind == "video" else "folder",

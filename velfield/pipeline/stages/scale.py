@@ -10,7 +10,7 @@ import numpy as np
 from schemas.georeference import GeoreferenceRecord
 from schemas.scale import ScaleEstimate
 from schemas.tables import DIMENSION_COLUMNS
-from velfield.analysis.vehicle_scale import MIN_VEHICLES, estimate_track_scale
+from velfield.analysis.vehicle_scale import estimate_track_scale
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.georeference import (
@@ -45,7 +45,7 @@ def scale_run(plan: Plan) -> StageResult:
 
 
 def scale_of_tracks(layout: RunLayout) -> tuple[ScaleEstimate | None, int]:
-    """The scale by the measured lengths of a run's vehicles, None of fewer than `MIN_VEHICLES`; and their number."""
+    """The scale by the measured lengths of a run's vehicles, None of too few; and their number."""
     if not layout.dimensions.exists():
         return None, 0
     lengths = read_tables([layout.dimensions], DIMENSION_COLUMNS, only=["length_px", "length_sd_px"])
@@ -62,6 +62,3 @@ def _other_limits(plan: Plan, record: GeoreferenceRecord) -> list[str]:
         f"vehicles were tracked with limits for {tracked:.3g} m a pixel, as {used.gsd_m:.3g} was not known yet; run "
         f"the flight again with --gsd-m {used.gsd_m:.3g}"
     ]
-
-
-__all__ = ["MIN_VEHICLES", "scale_of_tracks", "scale_run"]
