@@ -31,6 +31,8 @@ PAINTED = """(() => {
   for (let k = 0; k < data.length; k += 4) if (data[k] > 200 && data[k + 3] > 200) found.push(k / 4);
   return {width: canvas.width, found};
 })()"""
+# The page makes the canvas a moment after it is loaded.
+PAINTED_PX = f"document.querySelector('canvas.animation') !== null && ({PAINTED}).found.length"
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +174,7 @@ def test_a_click_on_a_vehicle_of_the_replay_tells_its_speed(chromium: Browser, a
     x, y, speed = vehicle_at(run, since + float(run.times_s[0]))
     with chromium.page() as page:
         page.open(f"{address}#replay={since}&view={x},{y},2")
-        page.wait(f"({PAINTED}).found.length > 0")
+        page.wait(f"{PAINTED_PX} > 0")
         page.click(*page.value(MIDDLE_OF_MAP))
         page.wait("document.querySelector('#answer [data-name=vehicle_speed]') !== null")
         shown = json.loads(page.value("document.querySelector('#answer [data-name=vehicle_speed]').dataset.value"))
@@ -196,14 +198,14 @@ def test_the_analysis_tab_shows_no_replay(chromium: Browser, address: str, run: 
     since = round(float(np.nanmedian(run.times_s) - run.times_s[0]), 1)
     with chromium.page() as page:
         page.open(f"{address}#replay={since}")
-        page.wait(f"({PAINTED}).found.length > 0")
+        page.wait(f"{PAINTED_PX} > 0")
         page.value("document.getElementById('play').click()")
         page.value("document.getElementById('tab-analysis').click()")
         page.wait("document.querySelector('canvas.animation').hidden && document.getElementById('player').hidden")
         assert page.value("getComputedStyle(document.querySelector('canvas.animation')).display") == "none"
         page.value("document.getElementById('tab-map').click()")
         page.wait("!document.getElementById('player').hidden")
-        page.wait(f"({PAINTED}).found.length > 0")
+        page.wait(f"{PAINTED_PX} > 0")
         assert page.value("document.getElementById('play').getAttribute('aria-label')") == "Play"
         assert all("analysis.json" in line for line in page.complaints)  # this run has none
 
@@ -233,7 +235,7 @@ def test_particles_move_on_the_roads(chromium: Browser, address: str, run: Run) 
     near = cv2.dilate((run.field.count() > 0).astype(np.uint8), np.ones((41, 41), np.uint8))
     with chromium.page() as page:
         page.open(f"{address}#flow=1&view={width / 2},{height / 2},0")
-        page.wait(f"({PAINTED}).found.length > 200")
+        page.wait(f"{PAINTED_PX} > 200")
         first = page.value(PAINTED)
         page.wait("Number(document.querySelector('canvas.animation').dataset.framesPerSecond) > 0")
         second = page.value(PAINTED)
