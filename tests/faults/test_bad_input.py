@@ -1,6 +1,7 @@
 """Bad input is refused in one line: a sample of what `tests.faults.bad_input` tries, and structures made at random."""
 
 import json
+import time
 from pathlib import Path
 
 import pytest
@@ -81,7 +82,12 @@ def test_the_check_finds_what_it_is_for(folder: Path) -> None:
         while True:
             pass
 
+    def wait(_path: Path) -> None:
+        time.sleep(30)
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bad_input, "LIMIT_S", 0.2)
-        found = [problem_of_case(Kind("x", (b"",), "x", read), b"", folder) for read in (fail, speak, write, hang)]
-    assert [text.split()[0] for text in found] == ["ValueError:", "a", "wrote", "TooLong:"]
+        patch.setattr(bad_input, "WAIT_S", 5)
+        readers = (fail, speak, write, hang, wait)
+        found = [problem_of_case(Kind("x", (b"",), "x", read), b"", folder) for read in readers]
+    assert [text.split()[0] for text in found] == ["ValueError:", "a", "wrote", "TooLong:", "TooLong:"]
