@@ -23,11 +23,11 @@ _RUN = """if True:
     from flows.launch import limit_threads, prepare_process
     from flows.stopping import STOPPED, leave, stop_on_signals
     limit_threads()
-    prepare_process(verbose=False)
-    stop_on_signals()
-    from pathlib import Path
-    from tests.small_flight import job, process
     try:
+        prepare_process(verbose=False)
+        stop_on_signals()
+        from pathlib import Path
+        from tests.small_flight import job, process
         process(job(Path(sys.argv[1]), Path(sys.argv[2])))
     except KeyboardInterrupt:
         leave(STOPPED)

@@ -143,6 +143,18 @@ def test_only_the_damaged_units_are_recomputed_with_equal_results(
     assert again == {f"{unit}.json" for unit in (*units, "page/all")}  # every run writes the page again
 
 
+def test_what_no_unit_writes_and_what_an_earlier_stage_reads_are_repaired(
+    copy: Path, whole: tuple[Path, RunSummary]
+) -> None:
+    """Coordinates, which are written with their store; the scale of the last run, which registration reads."""
+    rng = np.random.default_rng(2)
+    for name in ("field.zarr/y/c/0", "field.zarr/vx_m_per_s/c/0", "commits/registration/000000-000007.json"):
+        flip_a_bit(copy / name, rng)
+    (copy / "base/scale.json").write_text("{")
+    assert verify(copy, repair=True) == 0
+    assert digests(copy) == digests(whole[0])
+
+
 def test_a_store_whose_metadata_is_damaged_is_recreated(copy: Path) -> None:
     (copy / "registration.zarr/zarr.json").write_text("{")
     run = open_run(copy)

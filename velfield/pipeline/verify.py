@@ -14,6 +14,7 @@ from velfield.pipeline.units import WHOLE
 from velfield.run.commits import PAGE, commit_path, digest_file, read_commit, read_commits
 from velfield.run.layout import RunLayout, remove_tree
 from velfield.run.results import read_results
+from velfield.run.stores import is_of_creation
 
 _THREADS = min(4, os.cpu_count() or 1)
 NOT_FINISHED = "not finished"
@@ -100,15 +101,20 @@ def _other_keys(by_stage: dict[str, list[CommitRecord]], flight: FlightRecord) -
 def invalidate(layout: RunLayout, damages: Iterable[Damage]) -> list[str]:
     """Remove the records of damaged units, so that the next run computes them again; returns ``stage unit`` names.
 
-    A store whose metadata is damaged cannot be opened: it is removed, with the records of all of its units.
+    A store whose metadata or coordinates are damaged is removed, with the records of all of its units: no unit writes
+    those again. So are damaged files outside the stores, which a stage before theirs may read where they exist.
     """
     damages = list(damages)
     units = {(damage.stage, damage.unit) for damage in damages if damage.stage in (*STAGE, PAGE)}
     if any((layout.root / (damage.path or "")).is_relative_to(layout.view_changes) for damage in damages):
         remove_tree(layout.view_changes)  # `velfield compare` writes it again
-    for stage in {damage.stage for damage in damages if (damage.path or "").endswith("zarr.json")} & set(STAGE):
+    of_creation = {damage.stage for damage in damages if damage.path and is_of_creation(damage.path)}
+    for stage in of_creation & {name for name, stage in STAGE.items() if stage.store}:
         units |= {(stage, record.unit) for record in read_commits(layout, stage)}
         remove_tree(layout.root / str(STAGE[stage].store))
+    for damage in damages:
+        if damage.path and damage.stage in (*STAGE, PAGE) and ".zarr/" not in damage.path:
+            (layout.root / damage.path).unlink(missing_ok=True)
     for stage, unit in units:
         commit_path(layout, stage, unit).unlink(missing_ok=True)
     return sorted(f"{stage} {unit}" for stage, unit in units)

@@ -408,6 +408,19 @@ def create_field(
     group.attrs["key"] = key
 
 
+_AXES, _METRIC = ("y", "x", "vy", "vx"), "_m_per_s"
+
+
+def is_of_creation(name: str) -> bool:
+    """Whether a file of a store, by its path in the run folder, is written when the store is created, and by no unit.
+
+    That is the metadata, and the coordinates along the axes of the field.
+    """
+    return name.endswith("zarr.json") or Path(name).parts[1:2] in {
+        (f"{axis}{unit}",) for axis in _AXES for unit in ("", _METRIC)
+    }
+
+
 def _write_axes(
     group: zarr.Group, height: int, width: int, velocities: FloatArray, attributes: Mapping[str, Any]
 ) -> None:
@@ -425,7 +438,7 @@ def _write_axes(
     if gsd_m:
         for name in ("vy", "vx"):
             metric = _create(
-                group, f"{name}_m_per_s", velocities.shape, velocities.shape, "float64", dimension_names=(name,)
+                group, f"{name}{_METRIC}", velocities.shape, velocities.shape, "float64", dimension_names=(name,)
             )
             metric[:] = velocities * float(gsd_m)
             metric.attrs["units"] = "m s-1"
