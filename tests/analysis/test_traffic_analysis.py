@@ -146,6 +146,23 @@ def test_a_u_turn_a_wrong_way_and_a_conflict() -> None:
     assert 0.5 < first.probability <= 1.0
 
 
+def test_a_vehicle_that_touches_the_end_of_another_lane_merges_by_its_own() -> None:
+    angle = np.linspace(np.pi, np.pi / 2, 20)
+    arc = np.array([160.0, 90.0]) + 10.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    join = np.concatenate([[[150.0, 0.0]], arc, [[260.0, 100.0]]])
+    early = np.array(
+        [[150.0, 0.0], [150.0, 92.0], [151.0, 98.0], [153.0, 100.0], [260.0, 100.0]]
+    )  # 7 m before the others
+    tracks = [drive(EAST, 4.0 * k) for k in range(12)]
+    tracks += [drive(early if k == 5 else join, 4.0 * k + 6.5) for k in range(11)]
+    analysis = TrafficAnalysis(gather(tracks))
+    merging = {(c.first, c.second): c.value_s for c in analysis.conflicts if c.kind == "merging"}
+    assert (5, 17) in merging
+    assert (17, 6) in merging
+    # at (165, 100): east at 4 k + 13.75 s, the others, 110.7 m from their start, at 4 k + 15.73 s
+    assert merging[4, 16] == pytest.approx(6.5 + 110.7 / 12 - 13.75 - 4.5 / 12, abs=0.1)
+
+
 def approach(start_s: float, gap_m: float, follower: float, leader: float, final_gap_m: float) -> list[Track]:
     """A leader to the east, and a follower that closes up on it until a gap from bumper to bumper is left."""
     times = np.arange(start_s, start_s + 250.0 / max(leader, 1.0), STEP_S)

@@ -2,7 +2,7 @@
 that each lies below a threshold, given the errors of positions."""
 
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -25,6 +25,8 @@ _OVERLAP_M = 1.0
 _PERSISTENCE_S = 0.4
 _JOINED_M = 4.0
 """A lane that joins another is on it so far after its own end."""
+_CAME_M = 3
+"""A track came by a lane on which it drove so far."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,9 @@ def _post_encroachments(
     a = traffic.passings(crossing.lane, crossing.along_m)
     b = traffic.passings(crossing.other, crossing.other_along_m)
     half_m = VEHICLE_WIDTH_M / 2 / max(abs(np.sin(crossing.angle_rad)), 0.3)
-    return _pairs("crossing", a, b, crossing.xy_m, lengths, half_m, threshold_s)
+    both = Passings(np.r_[a.track, b.track], np.r_[a.time_s, b.time_s], np.r_[a.speed_m_per_s, b.speed_m_per_s])
+    stream = np.repeat([0, 1], [len(a), len(b)])
+    return _pairs("crossing", both, stream, crossing.xy_m, lengths, half_m, threshold_s)
 
 
 def _merges(traffic: LaneTraffic, lengths: FloatArray, threshold_s: float) -> list[Conflict]:
@@ -109,29 +113,35 @@ def _merges(traffic: LaneTraffic, lengths: FloatArray, threshold_s: float) -> li
         ends = np.array([graph.lanes[k].xy_m[-1] for k in sources])
         place = min(float(project(ends, lane.xy_m)[0].max()) + _JOINED_M, 0.9 * lane.length_m)
         at = traffic.passings(lane.number, place)
-        for x, y in combinations(sources, 2):
-            came = [np.isin(at.track, np.unique(traffic.samples(k).track)) for k in (x, y)]
-            only = came[0] ^ came[1]
-            parts = [Passings(at.track[c & only], at.time_s[c & only], at.speed_m_per_s[c & only]) for c in came]
-            out += _pairs("merging", parts[0], parts[1], lane.at(place), lengths, 0.0, threshold_s)
+        source = _sources(at.track, [traffic.samples(k).track for k in sources])
+        known = source >= 0
+        at = Passings(at.track[known], at.time_s[known], at.speed_m_per_s[known])
+        out += _pairs("merging", at, source[known], lane.at(place), lengths, 0.0, threshold_s)
     return out
+
+
+def _sources(track: IntArray, samples: list[IntArray]) -> IntArray:
+    """Which lane each track (n,) came by, -1: none: the one that it drove longest, as it touches the ends of others
+    where they join. ``samples``: the track of each sample on each lane."""
+    if not len(track):
+        return np.empty(0, np.int64)
+    driven = np.array([np.bincount(of, minlength=int(track.max()) + 1)[track] for of in samples])
+    return np.where(driven.max(axis=0) >= _CAME_M, driven.argmax(axis=0), -1)
 
 
 def _pairs(
     kind: ConflictKind,
-    a: Passings,
-    b: Passings,
+    at: Passings,
+    stream: IntArray,
     xy_m: FloatArray,
     lengths: FloatArray,
     half_m: float,
     threshold_s: float,
 ) -> list[Conflict]:
-    """Consecutive passings of different streams, nearer than ``MAX_PET_S``."""
-    time = np.r_[a.time_s, b.time_s]
-    order = np.argsort(time, kind="stable")
-    track, time = np.r_[a.track, b.track][order], time[order]
-    speed = np.maximum(np.r_[a.speed_m_per_s, b.speed_m_per_s][order], _MIN_SPEED_M_PER_S)
-    stream = np.r_[np.zeros(len(a)), np.ones(len(b))][order]
+    """Consecutive passings of different streams (n,), nearer than ``MAX_PET_S``."""
+    order = np.argsort(at.time_s, kind="stable")
+    track, time, stream = at.track[order], at.time_s[order], stream[order]
+    speed = np.maximum(at.speed_m_per_s[order], _MIN_SPEED_M_PER_S)
     k = np.flatnonzero((np.diff(stream) != 0) & (np.diff(time) < MAX_PET_S + 3.0) & (np.diff(track) != 0))
     reach = lengths[track] / 2 + half_m
     value = (time[k + 1] - reach[k + 1] / speed[k + 1]) - (time[k] + reach[k] / speed[k])
