@@ -90,6 +90,30 @@ def test_turning_counts_and_shares(analysis: TrafficAnalysis) -> None:
     assert delay.value > 0
 
 
+def test_a_tree_that_cuts_one_movement_leaves_shares_and_counts_as_they_are() -> None:
+    cut: list[Track] = []
+    for k, (times, xy) in enumerate(crossroads()):
+        hidden = np.hypot(*(xy - [158.0, 100.0]).T) < 6.0  # over the way out to the east
+        if hidden.any() and k % 3:
+            first, last = np.flatnonzero(hidden)[[0, -1]]
+            cut += [(times[:first], xy[:first]), (times[last + 1 :], xy[last + 1 :])]
+        else:
+            cut.append((times, xy))
+    found = TrafficAnalysis(gather([track for track in cut if len(track[0]) > 3]))
+    joined = found.cut_tracks
+    assert np.bincount(joined.vehicle).max() == 2
+    assert len(np.unique(joined.vehicle)) == len(crossroads())
+    movements = {
+        (m.arm_in, m.arm_out): m for j in found.movements for m in j.movements if j.junction.kind == "intersection"
+    }
+    straight, right = movements["W", "E"], movements["W", "S"]
+    assert straight.seen < 25
+    assert straight.seen + straight.inferred == pytest.approx(48)
+    assert right.seen == 12
+    assert right.share is not None
+    assert right.share.value == pytest.approx(0.2)
+
+
 def test_the_cycle_green_and_queues(analysis: TrafficAnalysis) -> None:
     junction = next(j for j in analysis.lanes.junctions if j.kind == "intersection")
     signal = analysis.signals[junction.number]

@@ -19,6 +19,7 @@ from velfield.analysis.flow.speeds import (
 from velfield.analysis.flow.volume import LaneFlow, lane_flow
 from velfield.analysis.lanes.find import find_lanes
 from velfield.analysis.lanes.model import LaneGraph
+from velfield.analysis.movements.cut_tracks import CutTracks, join_cut_tracks
 from velfield.analysis.movements.movements import JunctionMovements, find_movements
 from velfield.analysis.movements.reversals import Reversal, find_reversals
 from velfield.analysis.signals.cycles import JunctionSignal, find_signal
@@ -66,7 +67,12 @@ class TrafficAnalysis:
     @cached_property
     def movements(self) -> tuple[JunctionMovements, ...]:
         """Movements through each junction."""
-        return find_movements(self.trajectories, self.lanes)
+        return find_movements(self.trajectories, self.lanes, cut_tracks=self.cut_tracks)
+
+    @cached_property
+    def cut_tracks(self) -> CutTracks:
+        """The tracks joined into vehicles."""
+        return join_cut_tracks(self.trajectories)
 
     @cached_property
     def reversals(self) -> list[Reversal]:
@@ -128,7 +134,9 @@ class TrafficAnalysis:
     @cached_property
     def conflicts(self) -> list[Conflict]:
         """Pairs of vehicles near in time."""
-        return find_conflicts(self.trajectories, self.lane_traffic) if len(self.lanes) else []
+        if not len(self.lanes):
+            return []
+        return find_conflicts(self.trajectories, self.lane_traffic, vehicle=self.cut_tracks.vehicle)
 
     @cached_property
     def unusual(self) -> list[Unusual]:

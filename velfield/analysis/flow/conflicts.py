@@ -26,7 +26,7 @@ _PERSISTENCE_S = 0.4
 _JOINED_M = 4.0
 """A lane that joins another is on it so far after its own end."""
 _CAME_M = 3
-"""A track came by a lane on which it drove so far."""
+"""A vehicle came by a lane on which it drove so far."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,7 @@ def find_conflicts(
     pet_s: float = 1.5,
     ttc_s: float = 1.5,
     lengths_m: FloatArray | None = None,
+    vehicle: IntArray | None = None,
 ) -> list[Conflict]:
     """All pairs with a post-encroachment time or time to collision below 3 s, by time.
 
@@ -68,14 +69,17 @@ def find_conflicts(
         Thresholds of the probability.
     lengths_m
         (tracks,) lengths of the vehicles; None: a car's.
+    vehicle
+        (tracks,) number of each track's vehicle, where tracks are cut; None: each track is one.
     """
+    vehicles = np.arange(len(trajectories)) if vehicle is None else vehicle
     lengths = np.full(len(trajectories), VEHICLE_LENGTH_M) if lengths_m is None else lengths_m
     found = [
         conflict
         for crossing in find_crossings(traffic.graph.lanes)
         for conflict in _post_encroachments(crossing, traffic, lengths, pet_s)
     ]
-    found += _merges(traffic, lengths, pet_s)
+    found += _merges(traffic, lengths, vehicles, pet_s)
     found += time_to_collision(trajectories, traffic.graph, lengths, ttc_s)
     return sorted(_closest(found), key=lambda c: c.time_s)
 
@@ -102,7 +106,7 @@ def _post_encroachments(
     return _pairs("crossing", both, stream, crossing.xy_m, lengths, half_m, threshold_s)
 
 
-def _merges(traffic: LaneTraffic, lengths: FloatArray, threshold_s: float) -> list[Conflict]:
+def _merges(traffic: LaneTraffic, lengths: FloatArray, vehicle: IntArray, threshold_s: float) -> list[Conflict]:
     """Pairs that come from different lanes onto one."""
     graph, out = traffic.graph, []
     for lane in graph:
@@ -113,19 +117,19 @@ def _merges(traffic: LaneTraffic, lengths: FloatArray, threshold_s: float) -> li
         ends = np.array([graph.lanes[k].xy_m[-1] for k in sources])
         place = min(float(project(ends, lane.xy_m)[0].max()) + _JOINED_M, 0.9 * lane.length_m)
         at = traffic.passings(lane.number, place)
-        source = _sources(at.track, [traffic.samples(k).track for k in sources])
+        source = _sources(vehicle[at.track], [vehicle[traffic.samples(k).track] for k in sources])
         known = source >= 0
         at = Passings(at.track[known], at.time_s[known], at.speed_m_per_s[known])
         out += _pairs("merging", at, source[known], lane.at(place), lengths, 0.0, threshold_s)
     return out
 
 
-def _sources(track: IntArray, samples: list[IntArray]) -> IntArray:
-    """Which lane each track (n,) came by, -1: none: the one that it drove longest, as it touches the ends of others
-    where they join. ``samples``: the track of each sample on each lane."""
-    if not len(track):
+def _sources(vehicle: IntArray, samples: list[IntArray]) -> IntArray:
+    """Which lane each vehicle (n,) came by, -1: none: the one that it drove longest, as it touches the ends of others
+    where they join. ``samples``: the vehicle of each sample on each lane."""
+    if not len(vehicle):
         return np.empty(0, np.int64)
-    driven = np.array([np.bincount(of, minlength=int(track.max()) + 1)[track] for of in samples])
+    driven = np.array([np.bincount(of, minlength=int(vehicle.max()) + 1)[vehicle] for of in samples])
     return np.where(driven.max(axis=0) >= _CAME_M, driven.argmax(axis=0), -1)
 
 

@@ -3,25 +3,36 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
-from schemas.arrays import FloatArray, IntArray, Mask
+from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.flow.passings import LaneTraffic, find_passings
-from velfield.analysis.intervals import Estimate, estimate_censored_quantile, estimate_median, estimate_quantile
+from velfield.analysis.intervals import (
+    LEVEL,
+    Estimate,
+    estimate_censored_quantile,
+    estimate_median,
+    estimate_quantile,
+)
 from velfield.analysis.lanes.model import Junction, LaneGraph, LaneSamples
 
 STATION_M = 10.0
 """Length of a profile's stations."""
 _FREE_HEADWAY_S = 4.0
 """A vehicle whose leader is further ahead follows nobody."""
-_FOLLOWS_HEADWAY_S = 3.0
-"""One whose leader is nearer goes no faster than it would like."""
+_FOLLOWS_HEADWAY_S = (2.0, 3.0)
+"""One whose leader is nearer goes no faster than it would like: from which headway on is not known better than this."""
 _STEADY_M, _STEADY = 30.0, 0.03
 """A vehicle that goes freely changes its speed by no more than this fraction over so long a distance."""
+_STEADY_SD = 0.002
+"""By which the median of such speeds may differ from what drivers would like: standard deviation, as a fraction."""
 _MIN_FREE = 8
 SIGN_KM_PER_H = 10.0
 """Speed limits are multiples of it."""
 _AWAY_M = 50.0
 _RECOVERED = 0.95
+_FREELY = 0.25
+"""At least this fraction of the vehicles that do not stop has nobody to give way to."""
 
 
 @dataclass(frozen=True)
@@ -89,28 +100,44 @@ def free_flow(traffic: LaneTraffic) -> list[FreeFlow]:
     speeds = [_steady_speeds(traffic, lane.number) for lane in traffic.graph]
     out = []
     for lanes in roads(traffic.graph):
-        tracks, values, free = (np.concatenate([speeds[lane][k] for lane in lanes]) for k in range(3))
-        # a vehicle once: its fastest steady stretch, as it goes slowly for other reasons too
-        order = np.lexsort((-values, tracks))
-        _, first = np.unique(tracks[order], return_index=True)
-        best, is_free = values[order][first], free[order][first]
-        median = estimate_censored_quantile(best, is_free, 0.5, min_n=_MIN_FREE)
+        tracks, values, headway = (np.concatenate([speeds[lane][k] for lane in lanes]) for k in range(3))
+        median, p85 = (_free_quantile(tracks, values, headway, q) for q in (0.5, 0.85))
         limit = None if median is None else round(median.value * 3.6 / SIGN_KM_PER_H) * SIGN_KM_PER_H
-        p85 = estimate_censored_quantile(best, is_free, 0.85, min_n=_MIN_FREE)
         out.append(FreeFlow(tuple(lanes), median, limit, p85))
     return out
 
 
-def _steady_speeds(traffic: LaneTraffic, lane: int) -> tuple[IntArray, FloatArray, Mask]:
-    """Tracks, their speeds where they go steadily, and whether they follow nobody there; what is neither free nor
-    certain to follow is left out."""
+def _free_quantile(tracks: IntArray, speeds: FloatArray, headway_s: FloatArray, q: float) -> Estimate | None:
+    """A quantile of free speeds: the mean for both headways from which on a vehicle may follow, and the interval that
+    holds both of theirs."""
+    found = []
+    for follows_s in _FOLLOWS_HEADWAY_S:
+        free = headway_s > _FREE_HEADWAY_S
+        used = np.flatnonzero(free | (headway_s < follows_s))
+        # a vehicle once: its fastest steady stretch, as it goes slowly for other reasons too
+        order = used[np.lexsort((-speeds[used], tracks[used]))]
+        _, first = np.unique(tracks[order], return_index=True)
+        best = order[first]
+        found.append(estimate_censored_quantile(speeds[best], free[best], q, min_n=_MIN_FREE))
+    known = [estimate for estimate in found if estimate is not None]
+    if not known:
+        return None
+    value = float(np.mean([estimate.value for estimate in known]))
+    systematic = float(stats.norm.ppf((1 + LEVEL) / 2)) * _STEADY_SD * value
+    below, above = value - min(e.low for e in known), max(e.high for e in known) - value
+    low, high = value - float(np.hypot(below, systematic)), value + float(np.hypot(above, systematic))
+    return Estimate(value, low, high, min(estimate.n for estimate in known))
+
+
+def _steady_speeds(traffic: LaneTraffic, lane: int) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Tracks, their speeds where they go steadily, and their headways there, s."""
     samples = traffic.samples(lane)
     length = traffic.graph.lanes[lane].length_m
     window = min(_STEADY_M, 0.6 * length)
-    tracks, speeds, free = [np.empty(0, np.int64)], [np.empty(0)], [np.empty(0, bool)]
+    tracks, speeds, headways = [np.empty(0, np.int64)], [np.empty(0)], [np.empty(0)]
     steps = int(window)
     if steps < 5 or len(samples) <= steps:
-        return tracks[0], speeds[0], free[0]
+        return tracks[0], speeds[0], headways[0]
     windows = np.lib.stride_tricks.sliding_window_view(samples.speed_m_per_s, steps)
     low, high = windows.min(axis=1), windows.max(axis=1)
     mean = (low + high) / 2
@@ -123,12 +150,11 @@ def _steady_speeds(traffic: LaneTraffic, lane: int) -> tuple[IntArray, FloatArra
         order = np.argsort(passed, kind="stable")
         k = np.clip(np.searchsorted(passed[order], samples.track[begin]), 0, max(len(passed) - 1, 0))
         known = passed[order][k] == samples.track[begin] if len(passed) else np.zeros(len(begin), bool)
-        begin, ahead_s = begin[known], headway[order][k[known]] if len(passed) else np.empty(0)
-        keep = (ahead_s > _FREE_HEADWAY_S) | (ahead_s < _FOLLOWS_HEADWAY_S)
-        tracks.append(samples.track[begin][keep])
-        speeds.append(mean[begin][keep])
-        free.append(ahead_s[keep] > _FREE_HEADWAY_S)
-    return np.concatenate(tracks), np.concatenate(speeds), np.concatenate(free)
+        begin = begin[known]
+        tracks.append(samples.track[begin])
+        speeds.append(mean[begin])
+        headways.append(headway[order][k[known]] if len(passed) else np.empty(0))
+    return np.concatenate(tracks), np.concatenate(speeds), np.concatenate(headways)
 
 
 def traffic_passings(samples: LaneSamples, at_m: float) -> tuple[IntArray, FloatArray]:
@@ -156,10 +182,11 @@ class Reduction:
 
     Attributes
     ----------
-    before_m_per_s, lowest_m_per_s, after_m_per_s
-        Medians: 50 m before its area, the lowest on the way, 50 m after its area.
-    reduction_m_per_s
-        Before less lowest, of the same vehicles.
+    before_m_per_s, after_m_per_s
+        Medians: 50 m before its area, 50 m after its area.
+    lowest_m_per_s, reduction_m_per_s
+        The lowest on the way, and the speed before less it, of the vehicles that nothing but the junction slows: the
+        upper quartile of the lowest speeds, the lower one of the reductions, as those who give way go slower.
     recovery_m
         Distance from the lowest speed to where 95 % of the speed before, or of that after if it is lower, is reached.
     """
@@ -203,9 +230,9 @@ def speed_reduction(
         junction.number,
         lane,
         estimate_median(b),
-        estimate_median(w),
+        estimate_quantile(w, 1 - _FREELY),
         estimate_median(a),
-        estimate_median(b - w),
+        estimate_quantile(b - w, _FREELY),
         estimate_median(r),
     )
 

@@ -1,19 +1,22 @@
 """Movements through a junction: counted where both ends are seen, inferred where a track is cut.
 
-A track that enters and leaves within sight is a movement that is seen. One that enters and is lost, or is found within
-and leaves, is half of one. Such halves are joined as the entries and exits require: the seen movements are scaled until
-their rows add up to the entries that were lost, and their columns to the exits of unknown origin (Furness' method).
+A track that enters and leaves within sight is a movement that is seen. Tracks of one vehicle that is lost and found
+again where it must have gone (`cut_tracks`) are a movement that is inferred. What remains is half of one: it enters and
+is lost, or is found within and leaves. Such halves are joined as the entries and exits require: the known movements are
+scaled until their rows add up to the entries that were lost, and their columns to the exits of unknown origin (Furness'
+method).
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from schemas.arrays import FloatArray, IntArray
+from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.analysis.intervals import Estimate, estimate_mean, estimate_rate, estimate_share
 from velfield.analysis.lanes.junctions import inside_hull
 from velfield.analysis.lanes.model import Junction, LaneGraph, Turn
+from velfield.analysis.movements.cut_tracks import CutTracks, join_cut_tracks
 from velfield.analysis.movements.gates import Gates, find_gates
 from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
 
@@ -28,7 +31,8 @@ _STOP_S, _STOP_M_PER_S = 2.0, 1.0
 class Passes:
     """Tracks in a junction, one row a pass: gates by number, -1 where the track was not seen to enter (or leave).
 
-    ``entry_s``, ``exit_s`` and ``upstream_s`` (``_UPSTREAM_M`` before the entry) are times, NaN where unknown.
+    ``entry_s``, ``exit_s`` and ``upstream_s`` (``_UPSTREAM_M`` before the entry) are times, NaN where unknown;
+    ``joined``: of two tracks or more of one vehicle, of which ``track`` is the one that enters (or leaves).
     """
 
     track: IntArray
@@ -37,6 +41,7 @@ class Passes:
     entry_s: FloatArray
     exit_s: FloatArray
     upstream_s: FloatArray
+    joined: Mask
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,7 @@ class Movement:
     Attributes
     ----------
     seen, inferred
-        Vehicles seen from entry to exit, and those inferred from tracks that are cut.
+        Vehicles seen from entry to exit by one track, and those inferred from tracks that are cut.
     share
         Of the vehicles that enter by the arm.
     flow_veh_per_h
@@ -84,7 +89,12 @@ class JunctionMovements:
 
 
 def find_movements(
-    trajectories: Trajectories, graph: LaneGraph, *, slice_s: float = 120.0, window_s: tuple[float, float] | None = None
+    trajectories: Trajectories,
+    graph: LaneGraph,
+    *,
+    slice_s: float = 120.0,
+    window_s: tuple[float, float] | None = None,
+    cut_tracks: CutTracks | None = None,
 ) -> tuple[JunctionMovements, ...]:
     """Movements through every junction of a lane graph.
 
@@ -94,15 +104,18 @@ def find_movements(
         Counts of slices so long show how much the flow varies.
     window_s
         Only vehicles that enter (or, unseen there, leave) from the first time up to the second.
+    cut_tracks
+        Those of the trajectories, where they are known already.
     """
-    samples = sample_paths(trajectories)
+    cut = join_cut_tracks(trajectories) if cut_tracks is None else cut_tracks
+    samples = sample_paths(cut.trajectories)
     begin, end = window_s or (
         (float(trajectories.time_s.min()), float(trajectories.time_s.max())) if len(trajectories) else (0.0, 0.0)
     )
     out = []
     for junction in graph.junctions:
         gates = find_gates(graph, junction)
-        passes = _within(find_passes(samples, junction, gates), begin, end)
+        passes = _within(_by_track(find_passes(samples, junction, gates), cut), begin, end)
         out.append(
             JunctionMovements(junction, gates, passes, tuple(_count(junction, gates, passes, begin, end, slice_s)))
         )
@@ -116,7 +129,7 @@ def find_passes(samples: PathSamples, junction: Junction, gates: Gates) -> Passe
     inside = near[inside_hull(samples.xy_m[near], junction.hull_m)]
     if not len(inside):
         none, number = np.empty(0), np.empty(0, np.int64)
-        return Passes(number, number, number, none, none, none)
+        return Passes(number, number, number, none, none, none, np.empty(0, bool))
     breaks = np.flatnonzero((np.diff(inside) > 1) | (np.diff(samples.track[inside]) != 0)) + 1
     first, last = inside[np.r_[0, breaks]], inside[np.r_[breaks - 1, len(inside) - 1]]
     enters = (first > 0) & (samples.track[np.maximum(first - 1, 0)] == samples.track[first])
@@ -133,7 +146,23 @@ def find_passes(samples: PathSamples, junction: Junction, gates: Gates) -> Passe
         np.where(enters, samples.time_s[first], np.nan),
         np.where(leaves, samples.time_s[last], np.nan),
         np.where(reaches, samples.time_s[up], np.nan),
+        np.zeros(len(first), bool),
     )
+
+
+def _by_track(passes: Passes, cut: CutTracks) -> Passes:
+    """Passes of vehicles as those of their tracks; joined where a gap lies on the way."""
+    if not len(passes.track):
+        return passes
+    known = np.where(np.isfinite(passes.entry_s), passes.entry_s, passes.exit_s)
+    used = np.isfinite(known)
+    entry = np.where(np.isfinite(passes.entry_s), passes.entry_s, passes.exit_s)
+    leave = np.where(np.isfinite(passes.exit_s), passes.exit_s, passes.entry_s)
+    track, joined = np.full(len(used), -1), np.zeros(len(used), bool)
+    track[used] = cut.track_at(passes.track[used], known[used])
+    joined[used] = cut.has_gap(passes.track[used], entry[used], leave[used])
+    made = replace(passes, track=track, joined=joined)
+    return Passes(*(getattr(made, name)[used] for name in Passes.__dataclass_fields__))
 
 
 def _within(passes: Passes, begin_s: float, end_s: float) -> Passes:
@@ -148,22 +177,24 @@ def _count(
     arm = np.array([gate.arm for gate in gates.gates] + [-1], np.int64)
     arm_in, arm_out = arm[passes.gate_in], arm[passes.gate_out]
     n = len(gates.arms)
-    seen = np.zeros((n, n))
+    seen, joined = np.zeros((n, n)), np.zeros((n, n))
     both = (arm_in >= 0) & (arm_out >= 0)
-    np.add.at(seen, (arm_in[both], arm_out[both]), 1)
+    for counts, rows in ((seen, both & ~passes.joined), (joined, both & passes.joined)):
+        np.add.at(counts, (arm_in[rows], arm_out[rows]), 1)
     lost = np.bincount(arm_in[(arm_in >= 0) & (arm_out < 0)], minlength=n).astype(np.float64)
     found = np.bincount(arm_out[(arm_out >= 0) & (arm_in < 0)], minlength=n).astype(np.float64)
-    inferred = furness(seen, lost, found)
+    known = seen + joined
+    inferred = joined + furness(known, lost, found)
     slices = max(round((end_s - begin_s) / slice_s), 1)
     hours = max(end_s - begin_s, 1e-9) / 3600
-    for i, j in zip(*np.nonzero(seen >= _MIN_PASSES), strict=True):
+    for i, j in zip(*np.nonzero(known >= _MIN_PASSES), strict=True):
         rows = both & (arm_in == i) & (arm_out == j)
         total = seen[i, j] + inferred[i, j]
         entering = seen[i].sum() + inferred[i].sum()
         slice_of = np.clip(((passes.entry_s[rows] - begin_s) / slice_s).astype(int), 0, slices - 1)
-        counts = np.bincount(slice_of, minlength=slices) * total / max(seen[i, j], 1)
+        counts = np.bincount(slice_of, minlength=slices) * total / max(known[i, j], 1)
         travel, delay = _delay(passes, rows)
-        effective = round(float(seen[i].sum()))
+        effective = round(float(known[i].sum()))
         share = estimate_share(total / entering * effective, effective)
         yield Movement(
             junction.number,

@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from schemas.arrays import FloatArray, IntArray
-from velfield.analysis.intervals import Estimate, estimate_mean, estimate_share
+from velfield.analysis.intervals import LEVEL, Estimate, estimate_mean, estimate_share
 from velfield.analysis.signals.phases import fit_phases
 from velfield.analysis.signals.queues import Stream
 from velfield.analysis.trajectories import VEHICLE_LENGTH_M
@@ -22,6 +23,10 @@ _SPACING_M = 6.4
 """From front to front in a queue."""
 _START_UP_VEHICLES = 4
 """The first vehicles of a queue lose time at the start (HCM)."""
+_MIN_CROSSINGS, _LAST_CROSSINGS = 20, 5
+"""An onset of red rests on so many crossings of the line at least, and on the last so many of a cycle."""
+_RED_SD_S = 0.5
+"""By which the end of crossings differs from the onset of red from junction to junction: standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -138,9 +143,10 @@ def _stream_signal(stream: Stream, green: Estimate, cycle_s: float, begin_s: flo
 
 
 def _red_onset(stream: Stream, green_s: float, cycle_s: float) -> Estimate | None:
-    """Onset of red: after the latest crossings of the stop line, before the earliest stops at it."""
-    crossed = (stream.cross_time_s - green_s) % cycle_s
-    if len(crossed) < 20:
+    """Onset of red: when the crossings of the stop line end, those of vehicles too near to stop at yellow included."""
+    crossed = np.sort((stream.cross_time_s - green_s) % cycle_s)
+    n = len(crossed)
+    if n < _MIN_CROSSINGS:
         return None
     bins = max(round(cycle_s / 1.0), 8)
     counts = np.bincount(np.minimum((crossed / cycle_s * bins).astype(np.int64), bins - 1), minlength=bins)
@@ -150,11 +156,18 @@ def _red_onset(stream: Stream, green_s: float, cycle_s: float) -> Estimate | Non
     start, end = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1)
     if not len(start) or (end - start).max() < 6:
         return None
-    k = int(np.argmax(end - start))
-    value = float(start[k] % bins) * cycle_s / bins
-    value = (value + green_s) % cycle_s
-    sd = 1.0 + 2.0 / np.sqrt(len(crossed) / 20)
-    return Estimate(value, value - sd - 1.5, value + sd, len(crossed))
+    quiet_s = float(start[np.argmax(end - start)] % bins) * cycle_s / bins
+    # Crossings thin out no further towards their end: it lies about their spacing after the last of them.
+    before = np.sort((crossed - quiet_s) % cycle_s)[-_LAST_CROSSINGS - 1 :] - cycle_s
+    spacing = float(before[-1] - before[0]) / _LAST_CROSSINGS
+    value = quiet_s + float(before[-1]) + spacing
+    # the spacing is exponential; drivers' decisions at yellow differ from junction to junction
+    early, late = (spacing * float(stats.expon.ppf(p)) for p in ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
+    systematic = float(stats.norm.ppf((1 + LEVEL) / 2)) * _RED_SD_S
+    low = value - float(np.hypot(spacing - early, systematic))
+    high = value + float(np.hypot(late - spacing, systematic))
+    shift = green_s - cycle_s * np.floor((value + green_s) / cycle_s)
+    return Estimate(value + shift, low + shift, high + shift, n)
 
 
 def _discharge(stream: Stream, green_s: FloatArray) -> tuple[Estimate | None, Estimate | None]:

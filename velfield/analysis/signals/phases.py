@@ -13,7 +13,7 @@ from scipy import stats
 from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.intervals import Estimate
 
-START_DELAY_S, START_DELAY_SD_S = 2.0, 0.6
+START_DELAY_S, START_DELAY_SD_S = 2.0, 0.5
 """From green to the moment at which the first vehicle has visibly moved off, where nothing is in its way: its driver's
 reaction, and the time to reach walking speed. It differs from junction to junction by so much."""
 _TOGETHER_S = 4.0
