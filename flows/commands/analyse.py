@@ -13,6 +13,7 @@ def analyse(
     gsd_m: float | None = None,
     fps: float | None = None,
     unit: Literal["m", "px"] | None = None,
+    slice_s: float = 300.0,
 ) -> int:
     """Lanes, turning counts, speeds, signals, flow, conflicts: write `analysis/` with a report.
 
@@ -30,6 +31,8 @@ def analyse(
         Frames a second of `--tracks`, where they have no times.
     unit
         Of columns named x and y in `--tracks`.
+    slice_s
+        Counts by time are of slices so long, where the flight is longer than two.
     """
     from velfield.errors import InputError
     from velfield.pipeline.analysis.analyse import analyse_run, analyse_tracks
@@ -37,11 +40,11 @@ def analyse(
     if (run_folder is None) == (tracks is None):
         raise InputError("expected a run folder or --tracks FILE; give one of them")
     if tracks is None:
-        lines = analyse_run(Path(run_folder or "."))
+        lines = analyse_run(Path(run_folder or "."), slice_s=slice_s)
     elif out is None:
         raise InputError(f"found --tracks {tracks} and no folder for the answers; give --out")
     else:
-        lines = analyse_tracks(tracks, out, gsd_m=gsd_m, fps=fps, unit=unit)
+        lines = analyse_tracks(tracks, out, gsd_m=gsd_m, fps=fps, unit=unit, slice_s=slice_s)
     for line in lines:
         print(line, flush=True)
     return 0

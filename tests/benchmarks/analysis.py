@@ -21,6 +21,7 @@ from velfield.analysis.flow.speeds import Reduction
 from velfield.analysis.intervals import Estimate
 from velfield.analysis.lanes.find import find_lanes
 from velfield.analysis.movements.movements import JunctionMovements, find_passes
+from velfield.analysis.movements.scene import trace_trips
 from velfield.analysis.signals.cycles import JunctionSignal, queues
 from velfield.analysis.signals.queues import Stops, find_stops, observe_stream
 from velfield.analysis.traffic_analysis import TrafficAnalysis
@@ -127,6 +128,7 @@ def measure(case: Case, long_run: LongRun) -> Results:
     true = TrafficAnalysis(trajectories(case.true, "vehicle_id"))
     _lanes(case, found, results)
     _movements(found, true, long_run.seen_in(case), long_run, results)
+    _scene(found, true, results)
     _speeds(found, true, results)
     _signals(case, found, true, results)
     _u_turns(case, found, results)
@@ -196,6 +198,31 @@ def _true_counts(junction: JunctionMovements, samples: PathSamples) -> IntArray:
     n = len(junction.gates.arms)
     whole = (i >= 0) & (j >= 0)
     return np.bincount(i[whole] * n + j[whole], minlength=n * n).reshape(n, n)
+
+
+def _scene(found: TrafficAnalysis, true: TrafficAnalysis, results: Results) -> None:
+    """Origins and destinations, against true trajectories at the same gates."""
+    if found.scene is None or true.scene is None:
+        results.values["scene: arms"].append(0.0)
+        return
+    at = np.array([arm.xy_m for arm in true.scene.arms])
+    near = [np.hypot(*(at - arm.xy_m).T).min() < 20 for arm in found.scene.arms]
+    results.values["scene: arms"].append(len(at))
+    results.values["scene: of these found"].append(sum(near))
+    results.values["scene: arms, false"].append(len(near) - sum(near))
+    gates, arms = found.scene.gates, found.scene.arms
+    truth = trace_trips(true.trajectories, true.samples, true.lanes, gates, arms, true.window_s)
+    entered = len(found.scene.trips.track), len(truth.trips.track)
+    results.values["scene: vehicles entered, error in %"].append(100 * abs(entered[0] / entered[1] - 1))
+    counts, known = ({(r.origin.number, r.destination.number): r for r in s.relations} for s in (found.scene, truth))
+    for pair in counts.keys() | known.keys():
+        a, b = (c[pair].vehicles if pair in c else 0.0 for c in (counts, known))
+        results.values["scene: GEH"].append(float(np.sqrt(2 * (a - b) ** 2 / max(a + b, 1))))
+        results.values["scene: vehicles inferred of cut tracks"].append(counts[pair].cut if pair in counts else 0.0)
+        results.values["scene: vehicles"].append(a)
+        entering = [sum(r.vehicles for (i, _), r in c.items() if i == pair[0]) for c in (counts, known)]
+        if b >= 20:
+            results.values["scene: share, points"].append(100 * abs(a / entering[0] - b / entering[1]))
 
 
 def _speeds(found: TrafficAnalysis, true: TrafficAnalysis, results: Results) -> None:

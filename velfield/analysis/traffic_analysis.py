@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
+from schemas.arrays import FloatArray
 from velfield.analysis.flow.conflicts import Conflict, find_conflicts
 from velfield.analysis.flow.passings import LaneTraffic
 from velfield.analysis.flow.speeds import (
@@ -22,6 +23,14 @@ from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.movements.cut_tracks import CutTracks, join_cut_tracks
 from velfield.analysis.movements.movements import JunctionMovements, find_movements
 from velfield.analysis.movements.reversals import Reversal, find_reversals
+from velfield.analysis.movements.scene import OriginDestination, find_origins_destinations
+from velfield.analysis.movements.time_slices import (
+    SLICE_S,
+    SliceCount,
+    movements_by_slice,
+    origins_by_slice,
+    slice_edges,
+)
 from velfield.analysis.signals.cycles import JunctionSignal, find_signal
 from velfield.analysis.signals.queues import Stream, find_approaches, find_stops, observe_stream
 from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
@@ -31,6 +40,11 @@ from velfield.analysis.unusual import DoubtfulPlace, Unusual, find_doubtful_plac
 @dataclass(frozen=True)
 class TrafficAnalysis:
     """Answers from trajectories of vehicles that move; lengths in metres, times in seconds.
+
+    Attributes
+    ----------
+    slice_s
+        Counts by time are of slices so long.
 
     Examples
     --------
@@ -42,6 +56,7 @@ class TrafficAnalysis:
     """
 
     trajectories: Trajectories
+    slice_s: float = SLICE_S
 
     @cached_property
     def samples(self) -> PathSamples:
@@ -73,6 +88,26 @@ class TrafficAnalysis:
     def cut_tracks(self) -> CutTracks:
         """The tracks joined into vehicles."""
         return join_cut_tracks(self.trajectories)
+
+    @cached_property
+    def scene(self) -> OriginDestination | None:
+        """Origins and destinations of the whole scene; None where no road enters it and leaves it."""
+        return find_origins_destinations(self.trajectories, self.samples, self.lanes)
+
+    @cached_property
+    def slice_edges_s(self) -> FloatArray:
+        """Borders of the slices of time; none where the flight is no longer than two of them."""
+        return slice_edges(*self.window_s, self.slice_s)
+
+    @cached_property
+    def counts_by_time(self) -> list[SliceCount]:
+        """Movements through each junction by slice of time."""
+        return movements_by_slice(self.movements, self.slice_edges_s)
+
+    @cached_property
+    def scene_by_time(self) -> list[SliceCount]:
+        """Vehicles from origins to destinations by slice of time."""
+        return origins_by_slice(self.scene, self.slice_edges_s)
 
     @cached_property
     def reversals(self) -> list[Reversal]:

@@ -12,7 +12,8 @@ _ARM_M = 17.0
 """Gates of one arm are nearer to each other: a median may lie between them."""
 _ARM_RAD = np.radians(35)
 """Axes of one arm's gates differ by less."""
-_COMPASS = ("E", "SE", "S", "SW", "W", "NW", "N", "NE")
+COMPASS = ("E", "SE", "S", "SW", "W", "NW", "N", "NE")
+"""Sides of the image by direction, every 45° from the right, clockwise."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ def find_gates(graph: LaneGraph, junction: Junction) -> Gates:
             middle = (lane.xy_m[k] + lane.xy_m[k + 1]) / 2
             step = lane.xy_m[k + 1] - lane.xy_m[k]
             found.append((lane.number, bool(inside[k + 1]), middle, float(np.arctan2(step[1], step[0]))))
-    arms = _group(found)
+    arms = group_gates(found)
     numbers = sorted(set(arms.tolist()))
     middles = [
         np.mean([f[2] for f, arm in zip(found, arms, strict=True) if arm == number], axis=0) for number in numbers
@@ -84,8 +85,14 @@ def _outward(gates: list[tuple[int, bool, FloatArray, float]]) -> float:
     return float(np.angle(sum(np.exp(1j * (direction + np.pi * inwards)) for _, inwards, _, direction in gates)))
 
 
-def _group(found: list[tuple[int, bool, FloatArray, float]]) -> IntArray:
-    """Number of each gate's arm: gates near each other, of one axis, are of one arm."""
+def group_gates(found: list[tuple[int, bool, FloatArray, float]]) -> IntArray:
+    """Number of each gate's arm: gates near each other, of one axis, are of one arm.
+
+    Parameters
+    ----------
+    found
+        Of each gate its lane, whether it leads inwards, its position, m, and its direction, rad.
+    """
     n = len(found)
     label = np.arange(n)
     for i in range(n):
@@ -100,6 +107,6 @@ def _group(found: list[tuple[int, bool, FloatArray, float]]) -> IntArray:
 def _names(outward_rad: list[float]) -> list[str]:
     names: list[str] = []
     for angle in outward_rad:
-        name = _COMPASS[int(np.round(angle / (np.pi / 4))) % 8]
+        name = COMPASS[int(np.round(angle / (np.pi / 4))) % 8]
         names.append(name if name not in names else f"{name}{sum(other.startswith(name) for other in names) + 1}")
     return names

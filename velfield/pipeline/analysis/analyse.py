@@ -2,6 +2,7 @@
 
 import base64
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from schemas.analysis import AnalysisRecord, LanesRecord
 from schemas.arrays import GreyImage
+from velfield.analysis.movements.time_slices import SLICE_S
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import make_trajectories, moving
 from velfield.errors import InputError
@@ -32,7 +34,7 @@ _TRACKS_GSD_M = 0.1
 """Base pixels of tracks given in metres."""
 
 
-def analyse_run(run_folder: Path) -> Iterator[str]:
+def analyse_run(run_folder: Path, *, slice_s: float = SLICE_S) -> Iterator[str]:
     """Analyse the tracks of a run and write ``analysis/`` into its folder; a line for people on each question.
 
     Raises
@@ -40,10 +42,11 @@ def analyse_run(run_folder: Path) -> Iterator[str]:
     InputError
         The folder is not a run folder, or its tracks are not computed.
     """
+    _check_slice(slice_s)
     run = open_run(run_folder)
     yield from _stale_lines(run.layout)
     yield from write_analysis(
-        run.analysis.traffic,
+        replace(run.analysis.traffic, slice_s=slice_s),
         run.layout.analysis,
         Georeference.from_grid(run.grid),
         gsd_known=run.grid.gsd_m is not None,
@@ -68,7 +71,13 @@ def _stale_lines(layout: RunLayout) -> Iterator[str]:
 
 
 def analyse_tracks(
-    path: Path, out: Path, *, gsd_m: float | None, fps: float | None, unit: Literal["m", "px"] | None
+    path: Path,
+    out: Path,
+    *,
+    gsd_m: float | None,
+    fps: float | None,
+    unit: Literal["m", "px"] | None,
+    slice_s: float = SLICE_S,
 ) -> Iterator[str]:
     """Analyse the tracks of another program and write the answers into ``out``.
 
@@ -77,6 +86,7 @@ def analyse_tracks(
     InputError
         The file holds no tracks, or pixels without a ground sample distance.
     """
+    _check_slice(slice_s)
     table = read_tracks(path, fps=fps, unit=unit)
     if "x_m" in table:
         gsd = gsd_m or _TRACKS_GSD_M
@@ -95,7 +105,14 @@ def analyse_tracks(
         )
     width, height = np.ceil(xy_m.max(axis=0) / gsd).astype(int) + 1
     georeference = Georeference((int(height), int(width)), gsd_m=gsd)
-    yield from write_analysis(TrafficAnalysis(tracks), to_path(out), georeference, gsd_known=True, picture=None)
+    yield from write_analysis(
+        TrafficAnalysis(tracks, slice_s), to_path(out), georeference, gsd_known=True, picture=None
+    )
+
+
+def _check_slice(slice_s: float) -> None:
+    if not slice_s > 0:
+        raise InputError(f"found --slice-s {slice_s:g}, expected a length in seconds; counts are by slices so long")
 
 
 def write_analysis(

@@ -9,7 +9,7 @@ from velfield.analysis.signals.cycles import JunctionSignal, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 
 MAX_LINES = 12
-"""Lines on movements, and on lanes, that are printed: those with the most vehicles."""
+"""Lines on movements, on origins and destinations, and on lanes, that are printed: those with the most vehicles."""
 _SHORT_S, _FEW_TRACKS = 60.0, 30
 """In a shorter clip with fewer vehicles nothing is expected to be found."""
 _NONE_PROBABILITY = 0.1
@@ -28,6 +28,7 @@ def answers(analysis: TrafficAnalysis) -> Iterator[str]:
     if seconds < _SHORT_S or tracks < _FEW_TRACKS:
         yield _line("", too_short(analysis))
     yield from _movement_lines(analysis)
+    yield from _scene_lines(analysis)
     yield from _speed_lines(analysis)
     for number, signal in analysis.signals.items():
         yield from _signal_lines(number, signal)
@@ -76,6 +77,15 @@ def _movement_lines(analysis: TrafficAnalysis) -> Iterator[str]:
         )
     if len(found) > MAX_LINES:
         yield _line("", f"and {len(found) - MAX_LINES} movements more")
+
+
+def _scene_lines(analysis: TrafficAnalysis) -> Iterator[str]:
+    relations = analysis.scene.relations if analysis.scene else ()
+    for r in relations[:MAX_LINES]:
+        share = f", {_text(r.share, '%', 100)} of the entry" if r.share else ""
+        yield _line("scene", f"{r.origin.name} to {r.destination.name}: {r.vehicles:.0f}, seen whole {r.seen}{share}")
+    if len(relations) > MAX_LINES:
+        yield _line("", f"and {len(relations) - MAX_LINES} pairs more")
 
 
 def _speed_lines(analysis: TrafficAnalysis) -> Iterator[str]:

@@ -1,21 +1,24 @@
 """Answers as tables (`schemas.analysis.AnalysisTable`), which the page, the report and the workbook show."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
-from schemas.analysis import AnalysisColumn, AnalysisRow, AnalysisTable, Cell, EstimateRecord, GeometryRecord
-from schemas.arrays import FloatArray
+from schemas.analysis import AnalysisTable, Cell
 from velfield.analysis.flow.volume import level_of_service
-from velfield.analysis.intervals import Estimate
 from velfield.analysis.signals.cycles import queues, stopping_share
 from velfield.analysis.signals.phases import START_DELAY_S
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.pipeline.analysis.lanes_record import points_px
-
-KM_PER_H = 3.6
-Columns = dict[str, tuple[str, str]]
-"""Name -> title and unit."""
+from velfield.pipeline.analysis.cells import (
+    KM_PER_H,
+    Columns,
+    estimate_cell,
+    line_geometry,
+    make_row,
+    make_table,
+    point_geometry,
+)
+from velfield.pipeline.analysis.scene_tables import scene_tables, time_tables
 
 
 def all_tables(analysis: TrafficAnalysis) -> Iterator[AnalysisTable]:
@@ -24,6 +27,8 @@ def all_tables(analysis: TrafficAnalysis) -> Iterator[AnalysisTable]:
         lane_table(analysis),
         profile_table(analysis),
         movement_table(analysis),
+        *scene_tables(analysis),
+        *time_tables(analysis),
         reversal_table(analysis),
         limit_table(analysis),
         reduction_table(analysis),
@@ -48,7 +53,7 @@ def lane_table(analysis: TrafficAnalysis) -> AnalysisTable:
         "successors": ("Leads to lanes", ""),
     }
     rows = (
-        _row(
+        make_row(
             {
                 "lane": lane.number,
                 "tracks": lane.tracks,
@@ -57,12 +62,12 @@ def lane_table(analysis: TrafficAnalysis) -> AnalysisTable:
                 "width_source": lane.width_source,
                 "successors": " ".join(map(str, graph.successors[lane.number])),
             },
-            _line(lane.xy_m, analysis),
+            line_geometry(lane.xy_m, analysis),
         )
         for lane in graph
     )
     note = "Lanes that fewer than three tracks drove are not found."
-    return _table("lanes", "Lanes", "Lanes", note, columns, rows)
+    return make_table("lanes", "Lanes", "Lanes", note, columns, rows)
 
 
 def profile_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -74,22 +79,22 @@ def profile_table(analysis: TrafficAnalysis) -> AnalysisTable:
         **{f"p{q}": (f"Speed p{q}", "km/h") for q in (15, 50, 85)},
     }
     rows = (
-        _row(
+        make_row(
             {
                 "lane": station.lane,
                 "along": round(station.along_m, 1),
                 "vehicles": station.vehicles,
-                "p15": _cell(station.p15, KM_PER_H),
-                "p50": _cell(station.p50, KM_PER_H),
-                "p85": _cell(station.p85, KM_PER_H),
+                "p15": estimate_cell(station.p15, KM_PER_H),
+                "p50": estimate_cell(station.p50, KM_PER_H),
+                "p85": estimate_cell(station.p85, KM_PER_H),
             },
-            _point(station.xy_m, analysis),
+            point_geometry(station.xy_m, analysis),
         )
         for lane in analysis.lanes
         for station in analysis.profile(lane.number)
     )
     note = "Every vehicle once at each station of 10 m."
-    return _table("speed_profile", "Speed", "Speed along lanes", note, columns, rows)
+    return make_table("speed_profile", "Speed", "Speed along lanes", note, columns, rows)
 
 
 def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -122,36 +127,36 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
                 "turn": m.turn,
                 "seen": m.seen,
                 "inferred": round(m.inferred, 1),
-                "share": _cell(m.share, 100.0),
-                "flow": _cell(m.flow_veh_per_h),
-                "travel_time": _cell(m.travel_time_s),
-                "delay": _cell(m.delay_s),
+                "share": estimate_cell(m.share, 100.0),
+                "flow": estimate_cell(m.flow_veh_per_h),
+                "travel_time": estimate_cell(m.travel_time_s),
+                "delay": estimate_cell(m.delay_s),
                 "los": los,
             }
-            rows.append(_row(cells, _line(m.line_m, analysis)))
+            rows.append(make_row(cells, line_geometry(m.line_m, analysis)))
     note = (
         "Arms are named by the side of the image. Inferred: a track is cut, and its other end follows from what enters "
         "and leaves (Furness). Delay is against the fastest tenth of the movement. Levels of service: Highway Capacity "
         "Manual, 6th edition, Exhibit 19-8 at signals, 20-2 and 22-8 elsewhere."
     )
-    return _table("movements", "Movements", "Turning counts", note, columns, rows)
+    return make_table("movements", "Movements", "Turning counts", note, columns, rows)
 
 
 def reversal_table(analysis: TrafficAnalysis) -> AnalysisTable:
     """U-turns."""
     columns: Columns = {"track": ("Track", ""), "time": ("Time", "s"), "side": ("To the", "")}
     rows = (
-        _row(
+        make_row(
             {
                 "track": int(analysis.trajectories.track_id[found.track]),
                 "time": round(found.time_s, 1),
                 "side": "left" if found.left else "right",
             },
-            _point(found.xy_m, analysis),
+            point_geometry(found.xy_m, analysis),
         )
         for found in analysis.reversals
     )
-    return _table(
+    return make_table(
         "u_turns", "Movements", "U-turns", "Reversals within 36 m, outside circles and car parks.", columns, rows
     )
 
@@ -165,14 +170,14 @@ def limit_table(analysis: TrafficAnalysis) -> AnalysisTable:
         "p85": ("Free-flow speed p85", "km/h"),
     }
     rows = (
-        _row(
+        make_row(
             {
                 "lanes": " ".join(map(str, road.lanes)),
                 "limit": road.limit_km_per_h,
-                "free_speed": _cell(road.speed_m_per_s, KM_PER_H),
-                "p85": _cell(road.p85_m_per_s, KM_PER_H),
+                "free_speed": estimate_cell(road.speed_m_per_s, KM_PER_H),
+                "p85": estimate_cell(road.p85_m_per_s, KM_PER_H),
             },
-            _line(analysis.lanes.lanes[road.lanes[0]].xy_m, analysis),
+            line_geometry(analysis.lanes.lanes[road.lanes[0]].xy_m, analysis),
         )
         for road in analysis.free_flow
     )
@@ -180,7 +185,7 @@ def limit_table(analysis: TrafficAnalysis) -> AnalysisTable:
         "Median speed of vehicles that keep their speed over 30 m, 4 s and more behind the one before; speeds of those "
         "that follow within 3 s are lower bounds. The limit is the multiple of 10 km/h nearest to it."
     )
-    return _table("free_flow", "Speed", "Free flow and speed limit", note, columns, rows)
+    return make_table("free_flow", "Speed", "Free flow and speed limit", note, columns, rows)
 
 
 def reduction_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -195,22 +200,22 @@ def reduction_table(analysis: TrafficAnalysis) -> AnalysisTable:
         "recovery": ("Recovers over", "m"),
     }
     rows = (
-        _row(
+        make_row(
             {
                 "junction": r.junction,
                 "lane": r.lane,
-                "before": _cell(r.before_m_per_s, KM_PER_H),
-                "lowest": _cell(r.lowest_m_per_s, KM_PER_H),
-                "reduction": _cell(r.reduction_m_per_s, KM_PER_H),
-                "after": _cell(r.after_m_per_s, KM_PER_H),
-                "recovery": _cell(r.recovery_m),
+                "before": estimate_cell(r.before_m_per_s, KM_PER_H),
+                "lowest": estimate_cell(r.lowest_m_per_s, KM_PER_H),
+                "reduction": estimate_cell(r.reduction_m_per_s, KM_PER_H),
+                "after": estimate_cell(r.after_m_per_s, KM_PER_H),
+                "recovery": estimate_cell(r.recovery_m),
             },
-            _point(analysis.lanes.junctions[r.junction].centre_m, analysis),
+            point_geometry(analysis.lanes.junctions[r.junction].centre_m, analysis),
         )
         for r in analysis.reductions
     )
     note = "Of vehicles that do not stop."
-    return _table("speed_reduction", "Speed", "Speed reduction at junctions", note, columns, rows)
+    return make_table("speed_reduction", "Speed", "Speed reduction at junctions", note, columns, rows)
 
 
 def signal_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -233,14 +238,14 @@ def signal_table(analysis: TrafficAnalysis) -> AnalysisTable:
             "junction": number,
             "kind": junction.kind,
             "signal": names[signal.signalised] + reason,
-            "cycle": _cell(signal.cycle_s),
+            "cycle": estimate_cell(signal.cycle_s),
             "phases": " | ".join(" ".join(map(str, lanes)) for lanes in signal.phases),
         }
-        rows.append(_row(cells, _point(junction.centre_m, analysis)))
+        rows.append(make_row(cells, point_geometry(junction.centre_m, analysis)))
     note = (
         "From the starts of vehicles at stop lines. A signal that traffic actuates has no fixed cycle and is not found."
     )
-    return _table("signals", "Signals", "Signals", note, columns, rows)
+    return make_table("signals", "Signals", "Signals", note, columns, rows)
 
 
 def stream_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -266,22 +271,22 @@ def stream_table(analysis: TrafficAnalysis) -> AnalysisTable:
             cells: dict[str, Cell] = {
                 "junction": number,
                 "lane": stream.stream.approach.lane,
-                "green": _cell(stream.green_phase_s),
-                "red": _cell(stream.red_phase_s),
-                "lost": _cell(stream.start_up_lost_s),
-                "saturation": _cell(stream.saturation_veh_per_h),
+                "green": estimate_cell(stream.green_phase_s),
+                "red": estimate_cell(stream.red_phase_s),
+                "lost": estimate_cell(stream.start_up_lost_s),
+                "saturation": estimate_cell(stream.saturation_veh_per_h),
                 "queue": round(float(vehicles.mean()), 1) if len(vehicles) else None,
                 "queue_max": int(vehicles.max()) if len(vehicles) else None,
                 "queue_max_m": round(max(queue.length_m for queue in found), 1) if found else None,
-                "stops": _cell(stopping_share(stream.stream), 100.0),
+                "stops": estimate_cell(stopping_share(stream.stream), 100.0),
             }
             at = path[int(np.clip(stream.stream.stop_line_m or 0, 0, len(path) - 1))]
-            rows.append(_row(cells, _point(at, analysis)))
+            rows.append(make_row(cells, point_geometry(at, analysis)))
     note = (
         "Second 0 of the cycle is the first frame of the flight. A vehicle is taken to start "
         f"{START_DELAY_S:.1f} s after its green."
     )
-    return _table("streams", "Signals", "Streams at signals", note, columns, rows)
+    return make_table("streams", "Signals", "Streams at signals", note, columns, rows)
 
 
 def flow_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -295,21 +300,21 @@ def flow_table(analysis: TrafficAnalysis) -> AnalysisTable:
         "gap": ("Gap of those that follow", "s"),
     }
     rows = (
-        _row(
+        make_row(
             {
                 "lane": flow.lane,
-                "flow": _cell(flow.flow_veh_per_h),
-                "density": _cell(flow.density_veh_per_km),
-                "speed": _cell(flow.space_mean_speed_m_per_s, KM_PER_H),
-                "headway": _cell(flow.headway_s),
-                "gap": _cell(flow.gap_s),
+                "flow": estimate_cell(flow.flow_veh_per_h),
+                "density": estimate_cell(flow.density_veh_per_km),
+                "speed": estimate_cell(flow.space_mean_speed_m_per_s, KM_PER_H),
+                "headway": estimate_cell(flow.headway_s),
+                "gap": estimate_cell(flow.gap_s),
             },
-            _line(analysis.lanes.lanes[flow.lane].xy_m, analysis),
+            line_geometry(analysis.lanes.lanes[flow.lane].xy_m, analysis),
         )
         for flow in analysis.flows
     )
     note = "Density and speed by Edie's definitions over the lane; flow and headways at its middle."
-    return _table("flow", "Flow", "Flow by lane", note, columns, rows)
+    return make_table("flow", "Flow", "Flow by lane", note, columns, rows)
 
 
 def conflict_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -325,7 +330,7 @@ def conflict_table(analysis: TrafficAnalysis) -> AnalysisTable:
     }
     ids = analysis.trajectories.track_id
     rows = (
-        _row(
+        make_row(
             {
                 "kind": c.kind,
                 "first": int(ids[c.first]),
@@ -335,13 +340,13 @@ def conflict_table(analysis: TrafficAnalysis) -> AnalysisTable:
                 "sd": round(c.sd_s, 2),
                 "probability": round(100 * c.probability, 1),
             },
-            _point(c.xy_m, analysis),
+            point_geometry(c.xy_m, analysis),
         )
         for c in sorted(analysis.conflicts, key=lambda c: -c.probability)
         if c.probability >= 0.05
     )
     note = "Following: least time to collision behind a leader. Crossing and merging: post-encroachment time."
-    return _table("conflicts", "Conflicts", "Conflicts", note, columns, rows)
+    return make_table("conflicts", "Conflicts", "Conflicts", note, columns, rows)
 
 
 def unusual_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -354,13 +359,13 @@ def unusual_table(analysis: TrafficAnalysis) -> AnalysisTable:
         "detail": ("What", ""),
     }
     rows = (
-        _row(
+        make_row(
             {"kind": u.kind, "track": u.track, "frame": u.frame, "time": round(u.time_s, 1), "detail": u.detail},
-            _point(u.xy_m, analysis),
+            point_geometry(u.xy_m, analysis),
         )
         for u in analysis.unusual
     )
-    return _table(
+    return make_table(
         "unusual", "Unusual", "Unusual tracks", "Look at them: an error of tracking is one too.", columns, rows
     )
 
@@ -369,35 +374,8 @@ def doubtful_table(analysis: TrafficAnalysis) -> AnalysisTable:
     """Doubtful places."""
     columns: Columns = {"short_tracks": ("Short tracks", ""), "tracks": ("Tracks", "")}
     rows = (
-        _row({"short_tracks": place.short_tracks, "tracks": place.tracks}, _point(place.xy_m, analysis))
+        make_row({"short_tracks": place.short_tracks, "tracks": place.tracks}, point_geometry(place.xy_m, analysis))
         for place in analysis.doubtful_places
     )
     note = "Squares of 12 m in which most tracks are shorter than 15 m, as false ones in dense car parks are."
-    return _table("doubtful", "Unusual", "Places where false motion is likely", note, columns, rows)
-
-
-def _table(
-    name: str, section: str, title: str, note: str, columns: Columns, rows: Iterable[AnalysisRow]
-) -> AnalysisTable:
-    made = tuple(AnalysisColumn(name=key, title=text, unit=unit) for key, (text, unit) in columns.items())
-    return AnalysisTable(name=name, section=section, title=title, note=note, columns=made, rows=tuple(rows))
-
-
-def _row(cells: dict[str, Cell], geometry: GeometryRecord) -> AnalysisRow:
-    return AnalysisRow(cells=cells, geometry=geometry)
-
-
-def _cell(estimate: Estimate | None, factor: float = 1.0) -> EstimateRecord:
-    if estimate is None:
-        return EstimateRecord()
-    scaled = estimate.in_units(factor)
-    value, low, high = (float(f"{number:.4g}") for number in (scaled.value, scaled.low, scaled.high))
-    return EstimateRecord(value=value, low=low, high=high, n=estimate.n)
-
-
-def _point(xy_m: FloatArray, analysis: TrafficAnalysis) -> GeometryRecord:
-    return GeometryRecord(type="Point", xy_px=points_px(np.atleast_2d(xy_m), analysis.trajectories.gsd_m))
-
-
-def _line(xy_m: FloatArray, analysis: TrafficAnalysis) -> GeometryRecord:
-    return GeometryRecord(type="LineString", xy_px=points_px(xy_m, analysis.trajectories.gsd_m))
+    return make_table("doubtful", "Unusual", "Places where false motion is likely", note, columns, rows)

@@ -1,0 +1,339 @@
+"""Origins and destinations of the whole scene: where vehicles enter the picture, and where they leave it.
+
+A lane that follows no other, and on which most tracks begin, is an entry; one that leads to no other, and on which most
+tracks end, an exit. Where an exit faces an entry, something hides the road between them (a tree, a bridge): neither is
+one. A vehicle whose track is cut inside the picture is lost on a lane; where those seen whole went from there shows
+where it went.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from schemas.arrays import FloatArray, IntArray, Mask
+from velfield.analysis.intervals import Estimate, estimate_mean, estimate_rate, estimate_share
+from velfield.analysis.lanes.junctions import buffered_hull
+from velfield.analysis.lanes.model import LaneGraph
+from velfield.analysis.movements.gates import COMPASS, Arm, Gate, group_gates
+from velfield.analysis.trajectories import PathSamples, Trajectories
+
+_INWARDS_M, _OUTWARDS_M, _ASIDE_M = 20.0, 15.0, 2.5
+"""A track that begins so far behind an entry, or ahead of it, and so far beside its lane, was seen to enter there."""
+_TURN_RAD = np.radians(35)
+_MIN_FRACTION = 0.5
+"""Of the tracks on the first 20 m of an entry so many begin there."""
+_HIDDEN_M = 40.0
+"""A place that is hidden from above is no longer."""
+_INSIDE_M = 25.0
+"""A gate farther from the scene's border is within it: a yard, or a garage."""
+_CUT_BY_TIME_S = 1.0
+"""A track that begins so soon after the first frame, or ends so soon before the last one, is cut by time."""
+_MIN_WHOLE = 3
+"""Fewer whole tracks do not show where those that are cut went."""
+_DISPERSION_SLICE_S = 120.0
+
+
+@dataclass(frozen=True)
+class Trips:
+    """Vehicles that entered the scene while it was filmed, one row each.
+
+    Attributes
+    ----------
+    track, origin
+        Numbers of the track and of the arm.
+    entry_s, exit_s
+        When the track begins at the entry, and ends at the exit; NaN: it ends elsewhere.
+    destination
+        (n, arms) probability of each destination: 1 where the vehicle was seen to leave.
+    seen
+        From entry to exit.
+    remains
+        Not seen to leave, but still in the picture at the end; of the others that were not, the track is cut.
+    """
+
+    track: IntArray
+    origin: IntArray
+    entry_s: FloatArray
+    exit_s: FloatArray
+    destination: FloatArray
+    seen: Mask
+    remains: Mask
+
+
+@dataclass(frozen=True)
+class Relation:
+    """Vehicles from one arm of the scene to another.
+
+    Attributes
+    ----------
+    seen, cut, remaining
+        Vehicles seen from entry to exit; inferred of those whose track is cut, and of those still in the picture at
+        the end.
+    share
+        Of the vehicles that enter by the arm.
+    travel_time_s
+        Of the vehicles seen.
+    """
+
+    origin: Arm
+    destination: Arm
+    seen: int
+    cut: float
+    remaining: float
+    share: Estimate | None
+    flow_veh_per_h: Estimate | None
+    travel_time_s: Estimate | None
+
+    @property
+    def vehicles(self) -> float:
+        """Seen and inferred."""
+        return self.seen + self.cut + self.remaining
+
+
+@dataclass(frozen=True)
+class OriginDestination:
+    """Origins and destinations of a scene.
+
+    Attributes
+    ----------
+    arms, gates
+        Where roads leave the scene, and their lanes.
+    trips
+        Vehicles that entered while it was filmed.
+    before, unknown
+        Tracks of vehicles that were there in the first frame, and those that began inside later: cut ones, mostly.
+    window_s
+        First and last time.
+    """
+
+    arms: tuple[Arm, ...]
+    gates: tuple[Gate, ...]
+    trips: Trips
+    before: int
+    unknown: int
+    window_s: tuple[float, float]
+
+    @cached_property
+    def relations(self) -> tuple[Relation, ...]:
+        """All pairs of arms between which a vehicle drove, the most driven first."""
+        trips = self.trips
+        begin, end = self.window_s
+        slices = max(round((end - begin) / _DISPERSION_SLICE_S), 1)
+        slice_of = np.clip(((trips.entry_s - begin) / max(end - begin, 1e-9) * slices).astype(np.int64), 0, slices - 1)
+        out = []
+        for i, j in product(range(len(self.arms)), repeat=2):
+            rows = trips.origin == i
+            weight = np.where(rows, trips.destination[:, j], 0.0)
+            if weight.sum() < 0.5:
+                continue
+            whole = rows & trips.seen
+            seen = whole & (trips.destination[:, j] == 1.0)
+            n, entering = int(whole.sum()), float(trips.destination[rows].sum())
+            counts = np.bincount(slice_of, weight, slices)
+            out.append(
+                Relation(
+                    self.arms[i],
+                    self.arms[j],
+                    int(seen.sum()),
+                    float(weight[~trips.seen & ~trips.remains].sum()),
+                    float(weight[trips.remains].sum()),
+                    estimate_share(weight.sum() / entering * n, n),
+                    estimate_rate(counts, (end - begin) / 3600),
+                    estimate_mean((trips.exit_s - trips.entry_s)[seen]),
+                )
+            )
+        return tuple(sorted(out, key=lambda relation: -relation.vehicles))
+
+
+def find_origins_destinations(
+    trajectories: Trajectories, samples: PathSamples, graph: LaneGraph
+) -> OriginDestination | None:
+    """Origins and destinations of a flight; None where no road enters the scene and leaves it.
+
+    Parameters
+    ----------
+    trajectories, samples
+        Tracks of moving vehicles, and points along them.
+    graph
+        Their lanes.
+    """
+    if not len(graph) or not len(samples):
+        return None
+    window = float(trajectories.time_s.min()), float(trajectories.time_s.max())
+    gates, arms = find_scene_gates(trajectories, samples, graph, window)
+    if not any(gate.inwards for gate in gates) or all(gate.inwards for gate in gates):
+        return None
+    return trace_trips(trajectories, samples, graph, gates, arms, window)
+
+
+def find_scene_gates(
+    trajectories: Trajectories, samples: PathSamples, graph: LaneGraph, window_s: tuple[float, float]
+) -> tuple[tuple[Gate, ...], tuple[Arm, ...]]:
+    """Entries and exits of the scene, and the arms that they are of."""
+    ends = [(lane, True) for lane in graph.entries] + [(lane, False) for lane in graph.exits]
+    found = []
+    for lane, inwards in ends:
+        line = graph.lanes[lane]
+        k = 0 if inwards else -1
+        found.append((lane, inwards, line.xy_m[k], float(line.direction_rad[k])))
+    facing = {k for i, a in enumerate(found) for j, b in enumerate(found) if _faces(a, b) for k in (i, j)}
+    found = [end for k, end in enumerate(found) if k not in facing]
+    used = [end for end in found if _mostly_ends(end, trajectories, samples, window_s)]
+    if not used:
+        return (), ()
+    label = group_gates(used)
+    middle = {int(k): np.mean([g[2] for g, of in zip(used, label, strict=True) if of == k], axis=0) for k in label}
+    outward = {
+        int(k): float(
+            np.angle(sum(np.exp(1j * (g[3] + np.pi * g[1])) for g, of in zip(used, label, strict=True) if of == k))
+        )
+        for k in label
+    }
+    inside = {k for k in middle if _from_border_m(middle[k], graph) > _INSIDE_M}
+    names = dict(_name_arms(middle, outward, inside))
+    order = sorted(
+        names, key=lambda k: (names[k].startswith("inside"), (outward[k] + np.pi / 2) % (2 * np.pi), names[k])
+    )
+    rank = {k: i for i, k in enumerate(order)}
+    gates = tuple(Gate(*end, arm=rank[int(of)]) for end, of in zip(used, label, strict=True))
+    return gates, tuple(Arm(i, names[k], middle[k]) for i, k in enumerate(order))
+
+
+End = tuple[int, bool, FloatArray, float]
+
+
+def _faces(a: End, b: End) -> bool:
+    """Whether the road goes on from an exit to an entry ahead of it."""
+    if a[1] or not b[1]:
+        return False
+    d = b[2] - a[2]
+    c, s = np.cos(a[3]), np.sin(a[3])
+    ahead, aside = d[0] * c + d[1] * s, abs(d[1] * c - d[0] * s)
+    turn = abs(float(np.angle(np.exp(1j * (b[3] - a[3])))))
+    return bool(-3.0 < ahead < _HIDDEN_M and aside < 2.0 + 0.2 * max(ahead, 0.0) and turn < _TURN_RAD)
+
+
+def _mostly_ends(end: End, trajectories: Trajectories, samples: PathSamples, window_s: tuple[float, float]) -> bool:
+    """Whether most tracks at a lane's start begin there (at its end: end there), but those that time cuts."""
+    _, inwards, xy, direction = end
+    here = np.unique(samples.track[_at_gate(samples.xy_m, samples.direction_rad, xy, direction, inwards=inwards)])
+    rows = _terminal(samples, len(trajectories), first=inwards)[here]
+    time = samples.time_s[rows]
+    by_time = (time < window_s[0] + _CUT_BY_TIME_S) if inwards else (time > window_s[1] - _CUT_BY_TIME_S)
+    ends = _at_gate(samples.xy_m[rows], samples.direction_rad[rows], xy, direction, inwards=inwards)
+    known = ends | ~by_time
+    return bool(ends.sum() >= _MIN_WHOLE and ends.sum() >= _MIN_FRACTION * known.sum())
+
+
+def _terminal(samples: PathSamples, n: int, *, first: bool) -> IntArray:
+    """Row of the first (or last) sample of each of n tracks; of one without any, another's."""
+    if first:
+        return np.minimum(np.searchsorted(samples.track, np.arange(n)), len(samples) - 1)
+    return np.maximum(np.searchsorted(samples.track, np.arange(n), side="right") - 1, 0)
+
+
+def _at_gate(
+    xy_m: FloatArray, direction_rad: FloatArray, gate_m: FloatArray, gate_rad: float, *, inwards: bool
+) -> Mask:
+    """Whether positions (n, 2) with directions (n,) are at a gate."""
+    d = xy_m - gate_m
+    c, s = np.cos(gate_rad), np.sin(gate_rad)
+    ahead, aside = d[:, 0] * c + d[:, 1] * s, np.abs(d[:, 1] * c - d[:, 0] * s)
+    low, high = (-_OUTWARDS_M, _INWARDS_M) if inwards else (-_INWARDS_M, _OUTWARDS_M)
+    turn = np.abs(np.angle(np.exp(1j * (direction_rad - gate_rad))))
+    return np.asarray((ahead > low) & (ahead < high) & (aside < _ASIDE_M) & (turn < _TURN_RAD))
+
+
+def _from_border_m(xy_m: FloatArray, graph: LaneGraph) -> float:
+    """Distance from the convex hull of all lanes' border, inwards, m."""
+    hull = ConvexHull(buffered_hull(np.concatenate([lane.xy_m for lane in graph]), 1.0))
+    return float(-(hull.equations[:, :2] @ xy_m + hull.equations[:, 2]).max())
+
+
+def _name_arms(middle: dict[int, FloatArray], outward: dict[int, float], inside: set[int]) -> Iterator[tuple[int, str]]:
+    """Names by the side of the image that each arm leads to; several of one side from the top, or from the left."""
+    side = {k: "inside" if k in inside else COMPASS[int(np.round(a / (np.pi / 4))) % 8] for k, a in outward.items()}
+    for name in sorted(set(side.values())):
+        across = (1, 0) if name in ("E", "W", "inside") else (0, 1)
+        members = sorted((k for k in side if side[k] == name), key=lambda k: tuple(middle[k][list(across)]))
+        for number, k in enumerate(members, 1):
+            yield k, name if len(members) == 1 else f"{name}{number}"
+
+
+def trace_trips(
+    trajectories: Trajectories,
+    samples: PathSamples,
+    graph: LaneGraph,
+    gates: tuple[Gate, ...],
+    arms: tuple[Arm, ...],
+    window_s: tuple[float, float],
+) -> OriginDestination:
+    """Which arms tracks enter by and leave by, and where those went that are cut."""
+    n = len(trajectories)
+    origin, entry = _arms_of(samples, n, gates, first=True)
+    destination, leaves = _arms_of(samples, n, gates, first=False)
+    begins, ends = trajectories.time_s[trajectories.first[:-1]], trajectories.time_s[trajectories.first[1:] - 1]
+    before = begins < window_s[0] + _CUT_BY_TIME_S
+    entered = (origin >= 0) & ~before
+    whole = (origin >= 0) & (destination >= 0)
+    probability = np.zeros((n, len(arms)))
+    probability[destination >= 0, destination[destination >= 0]] = 1.0
+    _infer(probability, origin, destination, whole, np.flatnonzero(entered & (destination < 0)), graph)
+    remains = (destination < 0) & (ends > window_s[1] - _CUT_BY_TIME_S)
+    rows = np.flatnonzero(entered)
+    trips = Trips(
+        rows,
+        origin[rows],
+        entry[rows],
+        np.where(destination >= 0, leaves, np.nan)[rows],
+        probability[rows],
+        destination[rows] >= 0,
+        remains[rows],
+    )
+    unknown = int(((origin < 0) & ~before).sum())
+    return OriginDestination(arms, gates, trips, int(before.sum()), unknown, window_s)
+
+
+def _arms_of(samples: PathSamples, n: int, gates: tuple[Gate, ...], *, first: bool) -> tuple[IntArray, FloatArray]:
+    """Arm (n,) at which each track begins (or ends), -1: none, and when."""
+    rows = _terminal(samples, n, first=first)
+    exists = samples.track[rows] == np.arange(n)
+    xy, direction = samples.xy_m[rows], samples.direction_rad[rows]
+    arm, nearest = np.full(n, -1), np.full(n, np.inf)
+    for gate in gates:
+        if gate.inwards is first:
+            here = exists & _at_gate(xy, direction, gate.xy_m, gate.direction_rad, inwards=first)
+            distance = np.where(here, np.hypot(*(xy - gate.xy_m).T), np.inf)
+            arm = np.where(distance < nearest, gate.arm, arm)
+            nearest = np.minimum(distance, nearest)
+    return arm, samples.time_s[rows]
+
+
+def _infer(
+    probability: FloatArray, origin: IntArray, destination: IntArray, whole: Mask, cut: IntArray, graph: LaneGraph
+) -> None:
+    """Destinations of the tracks that are ``cut``, in place: as of the whole ones from their origin that drove on the
+    lane on which they are lost; without three of these, of all that drove on it; else of all of their origin."""
+    visits = np.unique(np.column_stack([graph.samples.lane, graph.samples.track]), axis=0)
+    borders = np.searchsorted(visits[:, 0], np.arange(len(graph) + 1))
+    row = np.searchsorted(graph.samples.track, cut, side="right") - 1
+    on_lane = (row >= 0) & (graph.samples.track[np.maximum(row, 0)] == cut)
+    known: dict[tuple[int, int], FloatArray] = {}
+    for track, k, placed in zip(cut, row, on_lane, strict=True):
+        lane = int(graph.samples.lane[k]) if placed else -1
+        key = (lane, int(origin[track]))
+        if key not in known:
+            others = visits[borders[lane] : borders[lane + 1], 1] if placed else np.empty(0, np.int64)
+            choices = (
+                others[whole[others] & (origin[others] == key[1])],
+                others[destination[others] >= 0],
+                np.flatnonzero(whole & (origin == key[1])),
+            )
+            used = next((c for c in choices if len(c) >= _MIN_WHOLE), choices[2])
+            counts = np.bincount(destination[used], minlength=probability.shape[1]).astype(np.float64)
+            known[key] = counts / max(counts.sum(), 1.0)
+        probability[track] = known[key]
