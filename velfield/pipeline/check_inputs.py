@@ -1,6 +1,7 @@
 """Optional inputs are read before any work: a bad file is reported at once, not an hour later."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from schemas.arrays import GreyImage
@@ -12,7 +13,7 @@ from velfield.pipeline.result import committed
 from velfield.pipeline.stage import STAGES, Cut
 from velfield.pipeline.stages.labels import rescale
 from velfield.pipeline.units import WHOLE
-from velfield.registration.intersensor import MIRRORED, register_intersensor
+from velfield.registration.intersensor import MIRRORED, IntersensorResult, register_intersensor
 from velfield.sources.geo import read_base_raster
 from velfield.sources.labels.detections import read_detections
 from velfield.sources.labels.labels import read_labels
@@ -74,16 +75,21 @@ def check_base_area(plan: Plan) -> None:
     base = read_base_raster(Path(plan.job.inputs.base or ""), plan.config.frames).grey
     height, width = grey.shape
     middle = grey[height // 4 : height - height // 4, width // 4 : width - width // 4]
-    for image in (grey, middle):
-        factor = min(1.0, _CHECKED_SIDE_PX / max(image.shape))
-        small = rescale(image, factor)
-        found = register_intersensor(small, rescale(base, factor), plan.config.base, lens=pinhole(small.shape))
-        if not isinstance(found, Failure):
-            return
-        reason = found.reason
-        if MIRRORED in reason:
-            break
+    with ThreadPoolExecutor(2) as pool:
+        tries = [pool.submit(_register_reduced, plan, image, base) for image in (grey, middle)]
+        found = [one.result() for one in tries]
+    reasons = [one.reason for one in found if isinstance(one, Failure)]
+    if len(reasons) < len(found):
+        return
+    reason = next((reason for reason in reasons if MIRRORED in reason), reasons[-1])
     raise InputError(f"--base {plan.job.inputs.base}: {reason}")
+
+
+def _register_reduced(plan: Plan, image: GreyImage, base: GreyImage) -> IntersensorResult | Failure:
+    """Register an image that no lens is known of, reduced as far as it shows the area."""
+    factor = min(1.0, _CHECKED_SIDE_PX / max(image.shape))
+    small = rescale(image, factor)
+    return register_intersensor(small, rescale(base, factor), plan.config.base, lens=pinhole(small.shape))
 
 
 def _middle_frame(plan: Plan) -> GreyImage | None:

@@ -35,6 +35,8 @@ class CoarseCandidate:
     method: str
     modality: Modality
     score: float
+    is_blind: bool = False
+    """Whether it is the best of all rotations and scales, and nothing else speaks for it."""
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from velfield.registration.transforms import FrameTransform
 
 MIRRORED = "found a mirrored image"
 _CERTAIN_FRACTION = 0.5
-"""With a smaller fraction of consistent patches, the flipped base image must not match too."""
+"""With a smaller fraction of consistent patches, the flipped base image must not match too; a search does not count."""
 MIN_CONSISTENT_FRACTION = 0.25
 """Smallest fraction of verification patches consistent with the map; wrong or flipped areas have 0.03 to 0.15."""
 MIN_CONSISTENT_PATCHES = 12
@@ -137,6 +137,8 @@ def register_intersensor(
         count, verification = int(fit.inliers.sum()), verify(pair, fit, candidate.modality)
         scores.append(f"{candidate.method}: {count} control points, {verification.text}")
         if count >= config.min_control_points and verification.is_verified:
+            if candidate.is_blind and not verification.is_certain:
+                continue  # a town of equal blocks matches another place of its own kind, with up to 0.43 of the patches
             if not verification.is_certain and _matches_flipped(pair):
                 break  # straight roads match their own mirror image well enough to pass the verification
             return _to_result(pair, fit, candidate, tuple(scores))
@@ -156,7 +158,7 @@ def _explain_failure(pair: ImagePair, scores: list[str]) -> str:
         return f"{MIRRORED} ({flipped.inliers} of {flipped.matches} SIFT matches are inliers); flip it"
     needed = (
         f"{pair.config.min_control_points} control points and {MIN_CONSISTENT_FRACTION:.0%} of verification patches "
-        "needed"
+        f"needed, by search {_CERTAIN_FRACTION:.0%}"
     )
     return (
         "not an image of this flight's area; give one of the area, seen from above, at 0.5 to 2 times the frames' "
@@ -206,7 +208,7 @@ def _search_candidates(
         for fine in finer:
             if fine.modality == rough.modality:
                 described = f"{method} ({fine.modality.name}), correlation {fine.score:.2f}"
-                yield CoarseCandidate(fine.matrix, described, fine.modality, fine.score)
+                yield CoarseCandidate(fine.matrix, described, fine.modality, fine.score, is_blind=initial is None)
 
 
 @dataclass(frozen=True)
