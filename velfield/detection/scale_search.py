@@ -1,4 +1,4 @@
-"""The size of a car by the detector that ships, where too little moves to measure it.
+"""The size of a car by the detector that ships: where too little moves to measure it, and to check what moves.
 
 The network was trained on cars of one length in pixels. At the right scale of the image its scores are highest, and
 what it finds has a car's length and width; at others the network finds parts of things that look like cars, of any
@@ -26,6 +26,9 @@ _MIN_AGREEMENT = 0.04
 0.03 to 0.05 at wrong ones."""
 _MIN_RATIO = 1.3
 """The best scale must surpass all that are not beside it by this factor."""
+_MAX_MOTION_RATIO = 1.5
+"""Between a car's length by what moves and by what looks like a car, which is right to some 15 %; roofs, or parts of
+vehicles, that are taken for cars are several times as long or short."""
 
 View = tuple[GreyImage, Mask]
 Measure = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
@@ -63,6 +66,29 @@ def find_scale(
         return None
     beside = slice(max(best - 1, 0), best + 2)
     return float(np.exp(np.average(np.log(scales[beside]), weights=agreement[beside] ** 2)))
+
+
+def contradict_motion(by_motion: float, by_appearance: float | None, car_length_px: float) -> list[str]:
+    """Compare the scale by what moves with that by what looks like a car.
+
+    Parameters
+    ----------
+    by_motion, by_appearance
+        Working px a base px; None where no scale was found.
+    car_length_px
+        Of a car on the working grid.
+
+    Returns
+    -------
+    A warning where they differ by more than a factor of 1.5, so that the scale by appearance is to be used; else none.
+    """
+    if by_appearance is None or abs(np.log(by_motion / by_appearance)) <= np.log(_MAX_MOTION_RATIO):
+        return []
+    moving_px, car_px = car_length_px / by_motion, car_length_px / by_appearance
+    return [
+        f"what moves is {moving_px:.0f} px long, what looks like a car {car_px:.0f} px (expected to be the same within "
+        f"a factor of {_MAX_MOTION_RATIO:g}): cars are taken to be {car_px:.0f} px long; give --gsd-m"
+    ]
 
 
 def _judge(view: View, detector: Detector, measure: Measure) -> tuple[FloatArray, Mask]:

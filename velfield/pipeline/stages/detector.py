@@ -5,7 +5,7 @@ or training on the given labels (`--labels`), or self-training on vehicles that 
 shipped pre-trained detector is used.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from velfield.detection.cnn.network import use_device
 from velfield.detection.detector import Detector, detector_class, load_detector, shipped_detector, train_detector
 from velfield.detection.motion.difference import MotionBackground, MotionFrame, motion_background
 from velfield.detection.motion.labels import MotionLabels, choose_frames, labels_from_motion, working_scale
-from velfield.detection.scale_search import STEP, View, find_scale
+from velfield.detection.scale_search import STEP, View, contradict_motion, find_scale
 from velfield.detection.unlabelled import UnlabelledFlight
 from velfield.errors import InputError
 from velfield.parallel import count_steps
@@ -149,7 +149,10 @@ def _from_labels(plan: Plan) -> StageResult:
 
 
 def _from_motion(plan: Plan) -> StageResult:
-    """Train on vehicles that move; without ``--gsd-m`` a car's length is estimated from them first."""
+    """Train on vehicles that move; without ``--gsd-m`` a car's length is estimated from them first.
+
+    What the shipped detector takes for cars must be of that length: from an aeroplane roofs move too, by parallax.
+    """
     known = _scale_of_gsd(plan)
     scale = known or 1.0
     frames = _motion_frames(plan, scale)
@@ -159,32 +162,52 @@ def _from_motion(plan: Plan) -> StageResult:
     labels = labels_from_motion(
         frames, background, car_length_px=length_px if known else None, max_interval_s=max_interval_s
     )
+    by_appearance, contradicted = None, []
     if known is None and labels.usable:
         scale = working_scale(plan.config.detection, None, labels, labels_scale=scale)
+        by_appearance = _search_scale(plan, shipped_detector())
+        contradicted = contradict_motion(scale, by_appearance, length_px)
+        if by_appearance is not None and contradicted:
+            scale = by_appearance
         frames = _motion_frames(plan, scale)
         background = motion_background(frames)
         labels = labels_from_motion(frames, background, car_length_px=length_px, max_interval_s=max_interval_s)
     if not labels.usable:
-        return _without_labels(plan, known, labels)
+        return _without_labels(plan, known, labels, by_appearance, contradicted)
     flight = UnlabelledFlight(frames, labels, background, max_interval_s)
     config = plan.config.detection
     detector = detector_class(config.method).train_from_motion(flight, config)
-    outcome = _finish(plan, detector, scale, "motion", count=labels.count, motion=labels, background=background)
-    return replace(outcome, warnings=[*outcome.warnings, *labels.warnings])
+    outcome = _finish(
+        plan,
+        detector,
+        scale,
+        "motion",
+        count=labels.count,
+        motion=labels,
+        background=background,
+        car_length_m=config.car_length_m if contradicted else CAR_LENGTH_M,
+    )
+    return replace(outcome, warnings=[*outcome.warnings, *contradicted, *labels.warnings])
 
 
-def _without_labels(plan: Plan, scale: float | None, labels: MotionLabels) -> StageResult:
+def _without_labels(
+    plan: Plan,
+    scale: float | None,
+    labels: MotionLabels,
+    by_appearance: float | None = None,
+    contradicted: Sequence[str] = (),
+) -> StageResult:
     """Neither given labels nor enough vehicles that move: use the shipped detector, with a warning.
 
-    It needs a car's size.
+    It needs a car's size: ``scale``, else ``by_appearance``, else it is looked for. ``contradicted``: warnings so far.
     """
     reason, detector = "; ".join(labels.warnings), shipped_detector()
-    found = _search_scale(plan, detector) if scale is None else scale
+    found = scale or by_appearance or _search_scale(plan, detector)
     if found is None:
         raise InputError(f"{reason}; or give --gsd-m, so that the shipped detector can be used")
     outcome = _finish(plan, detector, found, "shipped", motion=labels, car_length_m=plan.config.detection.car_length_m)
     used = "The shipped detector is used" + ("" if scale else ", at the scale at which it finds cars of their size")
-    return replace(outcome, warnings=[*outcome.warnings, f"{reason}. {used}"])
+    return replace(outcome, warnings=[*outcome.warnings, *contradicted, f"{reason}. {used}"])
 
 
 def _search_scale(plan: Plan, detector: Detector) -> float | None:
