@@ -75,6 +75,15 @@ class MarkedPoints(Model):
     """Of x, y; not read with longitude and latitude."""
 
 
+class MarkedPlace(Model):
+    """A place that was clicked on the user's own map; coordinates are asked for as the page's points have them."""
+
+    longitude: float = Field(ge=-180, le=180)
+    latitude: float = Field(ge=-90, le=90)
+    order: Literal["longitude_latitude", "latitude_longitude", "x_y"]
+    epsg: int | None = Field(None, gt=0, lt=2**31)
+
+
 class GeoreferenceRecord(Model):
     """What is known of scale, north and place."""
 

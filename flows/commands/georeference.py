@@ -11,6 +11,8 @@ from schemas.georeference import ControlPoint, ControlPointsRecord
 if TYPE_CHECKING:
     from starlette.applications import Starlette
 
+    from velfield.run.run import Run
+
 Model = Literal["similarity", "affine"]
 
 
@@ -21,6 +23,7 @@ def georeference(
     points: Path | None = None,
     epsg: int | None = None,
     model: Model | None = None,
+    map_: Annotated[str | None, Parameter(name="--map")] = None,
     check: Annotated[bool, Parameter(negative=())] = False,
     port: int | None = None,
     open_browser: Annotated[bool, Parameter(name="--open")] = True,
@@ -42,6 +45,9 @@ def georeference(
     model
         How the map is fitted. Default: a similarity, or with six points or more an affine transform where that is
         closer at points left out.
+    map_
+        A map of your own, shown beside the run's in the page to click coordinates on: GeoTIFF, MBTiles of images, or
+        the address of a tile server as https://HOST/{z}/{x}/{y}.png. Nothing is loaded from elsewhere.
     check
         Print residuals of --points, and change nothing.
     port
@@ -60,9 +66,11 @@ def georeference(
 
         if check:
             raise InputError("found --check without --points, expected both; the page shows residuals by itself")
-        app = page_app(run_folder, epsg, model)
+        app = page_app(run_folder, epsg, model, map_)
         serve_until_interrupted(app, port=port, open_browser=open_browser, place=run_folder, purpose="control points")
         return 0
+    if map_ is not None:
+        raise InputError("found --map with --points, expected one of them; the map is for clicking points in the page")
     read, code = read_control_points(points, epsg)
     if check:
         print(residual_table(fit_run_points(open_run(run_folder), read, code, model)))
@@ -75,11 +83,12 @@ def georeference(
     return 0
 
 
-def page_app(run_folder: Path, epsg: int | None, model: Model | None) -> "Starlette":
-    """The server of the page for a run."""
+def page_app(run_folder: Path, epsg: int | None, model: Model | None, given_map: str | None = None) -> "Starlette":
+    """The server of the page for a run, with a map to click on where one is given."""
     from velfield.pipeline.georeference import fit_run_points, open_finished_run
     from velfield.pipeline.georeference import georeference as georeference_run
     from velfield.pipeline.stages.georeference import saved_control_points
+    from velfield.sources.reference_map import open_map
     from velfield.viewer.georeferencer import georeference_app, marked_points
 
     run = open_finished_run(run_folder)
@@ -93,4 +102,19 @@ def page_app(run_folder: Path, epsg: int | None, model: Model | None) -> "Starle
 
     before = marked_points(saved_control_points(run.layout)[0], epsg)
     title = f"Control points of {run_folder.name or run_folder}"
-    return georeference_app(run.base_image, before, title=title, fit=fit, save=save)
+    reference = None if given_map is None else open_map(given_map)
+    start = None if reference is None else _find_centre(run)
+    return georeference_app(run.base_image, before, title=title, fit=fit, save=save, reference=reference, start=start)
+
+
+def _find_centre(run: "Run") -> tuple[float, float] | None:
+    """Longitude and latitude of the middle of the run's map, where it has coordinates already."""
+    import numpy as np
+
+    from velfield.exports.georeference import Georeference
+
+    place = Georeference.from_grid(run.grid)
+    if not place.has_crs:
+        return None
+    ((longitude, latitude),) = place.to_lonlat(np.array([[run.grid.width_px / 2, run.grid.height_px / 2]]))
+    return float(longitude), float(latitude)

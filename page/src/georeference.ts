@@ -5,6 +5,7 @@ import "./viewer.css";
 import L from "leaflet";
 import { toPoint, type Point } from "./coordinates";
 import { find, make } from "./dom";
+import { ReferencePane, type Place, type ReferenceMap } from "./reference";
 import { clamp, imageMap, inside, placed, post, served, showImage, type Served } from "./editor";
 
 interface MarkedPoint {
@@ -45,8 +46,12 @@ class Georeferencer {
   private readonly save = find<HTMLButtonElement>("save");
   private timer = 0;
   private asked = 0; // answers to earlier questions are not shown
+  private selected: Row | null = null;
+  private places: (Place | null)[] = [];
+  private readonly reference: ReferencePane | null;
 
-  constructor(private readonly data: Served & { before: MarkedPoints }) {
+  constructor(private readonly data: Served & { before: MarkedPoints; map: ReferenceMap | null }) {
+    this.reference = data.map && new ReferencePane(data.map, this.choose, this.replace);
     this.map = imageMap(data);
     showImage(this.map, data, 0);
     this.order.value = data.before.order;
@@ -104,6 +109,7 @@ class Georeferencer {
     row.marker.remove();
     row.element.remove();
     this.rows = this.rows.filter((other) => other !== row);
+    if (this.selected === row) this.selected = null;
     this.number();
     this.changed();
     (this.rows.at(-1)?.coordinates ?? this.map.getContainer()).focus();
@@ -115,6 +121,8 @@ class Georeferencer {
   }
 
   private select(row: Row): void {
+    this.selected = row;
+    this.reference?.show(this.places, this.rows.indexOf(row));
     for (const other of this.rows) {
       other.marker.getElement()!.classList.toggle("selected", other === row);
       other.element.classList.toggle("selected", other === row);
@@ -134,6 +142,47 @@ class Georeferencer {
     });
   }
 
+  // -- the user's own map ----------------------------------------------------------------------------------------------
+
+  /** A place was clicked: it is the selected point's, else that of the first without coordinates. */
+  private readonly choose = (place: Place): void => {
+    const row = this.selected ?? this.rows.find(({ coordinates }) => coordinates.value.trim() === "");
+    if (row) void this.place(row, place);
+    else this.complain("Click the point in the run's picture first, then the same place on the map");
+  };
+
+  private readonly replace = (number: number, place: Place): void => {
+    const row = this.rows[number];
+    if (row) void this.place(row, place);
+  };
+
+  private async place(row: Row, [longitude, latitude]: Place): Promise<void> {
+    const { order, epsg } = this.content([]);
+    try {
+      const asked = { longitude, latitude, order, epsg };
+      row.coordinates.value = (await post<{ coordinates: string }>(this.data, "coordinates", asked)).coordinates;
+      this.select(row);
+      this.changed();
+    } catch (error) {
+      this.complain((error as Error).message);
+    }
+  }
+
+  /** Markers on it where the coordinates are, typed or clicked. */
+  private async showPlaces(): Promise<void> {
+    if (!this.reference) return;
+    const { rows } = this;
+    const found = await post<{ places: (Place | null)[] }>(this.data, "places", this.content(rows));
+    if (rows !== this.rows || found.places.length !== rows.length) return; // changed meanwhile
+    this.places = found.places;
+    this.reference.show(this.places, this.selected ? rows.indexOf(this.selected) : -1);
+  }
+
+  private complain(problem: string): void {
+    find("problem").textContent = problem;
+    find("problem").hidden = problem === "";
+  }
+
   // -- the fit ---------------------------------------------------------------------------------------------------------
 
   private changed(): void {
@@ -145,7 +194,10 @@ class Georeferencer {
     find("saved").textContent = "Not saved";
     find("notes").replaceChildren();
     window.clearTimeout(this.timer);
-    this.timer = window.setTimeout(() => void this.fit(), PAUSE_MS);
+    this.timer = window.setTimeout(() => {
+      void this.fit();
+      this.showPlaces().catch((error: Error) => this.complain(error.message));
+    }, PAUSE_MS);
   }
 
   /** Of the points that have coordinates. */
@@ -177,8 +229,7 @@ class Georeferencer {
     }
     find("fit").textContent = fit?.text ?? "";
     find("scale").textContent = fit?.scale ?? "";
-    find("problem").textContent = problem;
-    find("problem").hidden = problem === "";
+    this.complain(problem);
   }
 
   private async saveAll(): Promise<void> {

@@ -6,20 +6,26 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
+import cv2
 import numpy as np
 import pytest
+from rasterio.transform import Affine
+from rasterio.warp import transform
 
 from flows.cli import app
 from schemas.georeference import ControlPoint, ControlPointsRecord, MarkedPoint, MarkedPoints
 from schemas.summary import RunSummary
 from tests.browser import NEEDS_PAGE, Page, browser
+from tests.sources.test_reference_map import squares, write_geotiff
 from tests.viewer.test_accessibility import AXE, FINDINGS
 from tests.viewer.test_viewer_server import Client, command, served
 from velfield import open_run
 from velfield.errors import InputError
 from velfield.pipeline.georeference import fit_run_points
 from velfield.sources.control_points import fit_control_points
+from velfield.sources.reference_map import ReferenceMap, TileServer, open_map
 from velfield.viewer.georeferencer import georeference_app, marked_points, read_marked_points
 
 PIXELS = ((60, 50), (580, 70), (560, 430), (80, 400))
@@ -50,7 +56,11 @@ def files(root: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in root.rglob("*") if path.is_file()}
 
 
-def made_app(saves: list[Sequence[ControlPoint]], before: MarkedPoints | None = None) -> Any:
+def made_app(
+    saves: list[Sequence[ControlPoint]],
+    before: MarkedPoints | None = None,
+    reference: ReferenceMap | TileServer | None = None,
+) -> Any:
     """The page of an image of noise, without a run."""
 
     def fit(points: Sequence[ControlPoint], epsg: int) -> ControlPointsRecord:
@@ -62,7 +72,8 @@ def made_app(saves: list[Sequence[ControlPoint]], before: MarkedPoints | None = 
         return record, ["the scale was not known when vehicles were tracked"]
 
     image = np.random.default_rng(1).integers(60, 180, (480, 640), dtype=np.uint8)
-    return georeference_app(image, before or marked_points(None, None), title="Control points", fit=fit, save=save)
+    begin = before or marked_points(None, None)
+    return georeference_app(image, begin, title="Control points", fit=fit, save=save, reference=reference)
 
 
 @NEEDS_PAGE
@@ -169,6 +180,77 @@ def test_check_needs_a_file_of_points(tmp_path: Path) -> None:
         app(["georeference", str(tmp_path), "--check"], result_action="return_value")
 
 
+def test_a_map_is_for_the_page(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--map with --points"):
+        app(["georeference", str(tmp_path), "--points", "p.csv", "--map", "m.tif"], result_action="return_value")
+
+
+def own_map(folder: Path) -> ReferenceMap:
+    """A map in UTM of the place that the control points are in, 240 m wide."""
+    (east,), (north,) = transform("EPSG:4326", "EPSG:32633", [LON], [LAT])
+    grid = Affine(0.4, 0, east - 40, 0, -0.4, north + 40)
+    return ReferenceMap(write_geotiff(folder / "own.tif", squares(3), transform=grid, photometric="RGB"))
+
+
+@NEEDS_PAGE
+def test_the_users_map_is_served_by_tiles_and_nothing_else_is(tmp_path: Path) -> None:
+    reference = own_map(tmp_path)
+    zoom = reference.native_zoom
+    column = int((LON + 180) / 360 * 2**zoom)
+    row = int((1 - np.arcsinh(np.tan(np.radians(LAT))) / np.pi) / 2 * 2**zoom)
+    with served(made_app([], reference=reference)) as client:
+        with urlopen(f"http://127.0.0.1:{client.port}/map/{zoom}/{column}/{row}.png") as answer:
+            tile = cv2.imdecode(np.frombuffer(answer.read(), np.uint8), cv2.IMREAD_UNCHANGED)
+            assert answer.headers["content-type"] == "image/png"
+            assert answer.headers["cross-origin-resource-policy"] == "same-origin"
+        np.testing.assert_array_equal(cv2.cvtColor(tile, cv2.COLOR_BGRA2RGBA), reference.tile(zoom, column, row))
+        for path in ("/map/0/1/0.png", "/map/99999999/0/0.png", "/map/2/0/4.png", "/map/-1/0/0.png", "/map/"):
+            assert client.status(path) == 404, path
+        for path in ("/map/../own.tif", "/map/own.tif", "/own.tif", f"/map/{zoom}/{column}/../../own.tif"):
+            assert client.status(path) == 404, path
+        assert client.status(f"/map/{zoom}/{column}/{row}.png", "POST", token_of(client)) == 405
+        assert client.status(f"/map/{zoom}/{column}/{row}.png", "GET", {"Host": "elsewhere.example"}) == 400
+        for path in ("/places", "/coordinates"):
+            assert client.status(path, "POST", {}, "{}") == 403
+            assert client.status(path, "POST", token_of(client), "{}") == 422
+        assert "http" not in client.ask("/")[2]["content-security-policy"]
+    with served(made_app([])) as client:  # without a map there are no such routes
+        for path in ("/map/0/0/0.png", "/places", "/coordinates"):
+            assert client.status(path, "POST", token_of(client), "{}") == 404
+
+
+@NEEDS_PAGE
+def test_a_tile_server_alone_may_be_asked_for_images() -> None:
+    server = open_map("https://tiles.example:8443/{z}/{x}/{y}.png?key=1")
+    with served(made_app([], reference=server)) as client:
+        _, html, headers = client.ask("/")
+        for policy in (headers["content-security-policy"], html):
+            assert "img-src 'self' data: blob: https://tiles.example:8443;" in policy
+            assert "connect-src 'self' data:;" in policy
+        assert client.status("/map/0/0/0.png") == 404
+
+
+@NEEDS_PAGE
+def test_places_on_the_map_become_coordinates_and_back(tmp_path: Path) -> None:
+    with served(made_app([], reference=own_map(tmp_path))) as client:
+        token = token_of(client)
+        for order, epsg, text in (
+            ("longitude_latitude", None, "13.40000000, 52.50000000"),
+            ("latitude_longitude", None, "52.50000000, 13.40000000"),
+            ("x_y", 32633, "391390.731, 5817855.241"),
+        ):
+            asked = json.dumps({"longitude": LON, "latitude": LAT, "order": order, "epsg": epsg})
+            status, answer, _ = client.ask("/coordinates", "POST", token, asked)
+            assert (status, json.loads(answer)) == (200, {"coordinates": text})
+            status, answer, _ = client.ask("/places", "POST", token, body(text, "nowhere", "", order=order, epsg=epsg))
+            first, *others = json.loads(answer)["places"]
+            assert first == pytest.approx((LON, LAT), abs=1e-8)
+            assert others == [None, None]
+        asked = json.dumps({"longitude": LON, "latitude": LAT, "order": "x_y"})
+        status, answer, _ = client.ask("/coordinates", "POST", token, asked)
+        assert (status, answer) == (422, "found no EPSG code for x, y, expected one as 32633; fill it in")
+
+
 def screen(page: Page) -> list[tuple[float, float]]:
     """Where the control points' pixels are on the screen."""
     left, top, width = page.value(
@@ -240,3 +322,63 @@ def test_points_are_clicked_typed_moved_removed_and_saved(tmp_path: Path) -> Non
     pixels = [[point.x_px, point.y_px] for point in points]
     np.testing.assert_allclose(pixels, [PIXELS[0], PIXELS[1], PIXELS[3]], atol=1.0)
     assert (points[2].x, points[2].y) == tuple(map(float, GOOD[3].split(",")))
+
+
+PLACE_ON_MAP = """((longitude, latitude) => {{
+  const tile = [...document.querySelectorAll('#reference img.leaflet-tile')].find((one) => one.complete);
+  const [zoom, column, row] = tile.src.match(/(\\d+)\\/(\\d+)\\/(\\d+)\\.png/).slice(1).map(Number);
+  const {{left, top, width}} = tile.getBoundingClientRect();
+  const x = (longitude + 180) / 360 * 2 ** zoom;
+  const y = (1 - Math.asinh(Math.tan(latitude * Math.PI / 180)) / Math.PI) / 2 * 2 ** zoom;
+  return [left + (x - column) * width, top + (y - row) * width].map(Math.round);
+}})({place})"""
+"""Nearest screen pixel of a place, by the address and position of a tile, not by what the page believes."""
+
+
+@NEEDS_PAGE
+def test_points_are_clicked_on_a_map_of_the_users_own(tmp_path: Path) -> None:
+    saves: list[Sequence[ControlPoint]] = []
+    with (
+        served(made_app(saves, reference=own_map(tmp_path))) as client,
+        browser(tmp_path / "profile") as chromium,
+        chromium.page(width=1400, height=900) as page,
+    ):
+        page.open(f"http://127.0.0.1:{client.port}/")
+        page.wait("document.querySelector('img.frame')?.naturalWidth === 640")
+        page.wait(
+            "document.querySelectorAll('#reference .leaflet-tile-loaded').length > 0 && "
+            "!document.querySelector('#reference .leaflet-tile:not(.leaflet-tile-loaded)')"
+        )
+        page.click(*page.value(PLACE_ON_MAP.format(place=GOOD[0])))  # without a point in the picture
+        page.wait("document.getElementById('problem').textContent.startsWith('Click the point in the run')")
+        for k, place in enumerate(screen(page)[:3]):
+            page.click(*place)
+            page.click(*page.value(PLACE_ON_MAP.format(place=GOOD[k])))
+            page.wait(f"document.querySelectorAll('#points input')[{k}].value !== ''")
+            page.wait(f"document.querySelectorAll('#reference .point').length === {k + 1}")
+        page.wait("document.getElementById('fit').textContent.startsWith('3 control points, similarity')")
+        assert np.array(cells(page), float).max() < 1.5  # clicks within a screen pixel of either, 0.4 m at most
+        typed = page.value("[...document.querySelectorAll('#points input')].map((one) => one.value)")
+        for text, good in zip(typed, GOOD, strict=False):
+            off = np.subtract(*(np.array(one.split(","), float) for one in (text, good)))
+            assert np.abs(off * [67_800, 111_262]).max() < 0.73  # a screen pixel, where the whole map is shown
+        page.value("document.querySelectorAll('#points input')[2].select()")
+        type_text(page, GOOD[3])  # typed coordinates are shown on the map too
+        x, y = page.value(PLACE_ON_MAP.format(place=GOOD[3]))
+        marker = "document.querySelector('#reference .point[data-number=\"3\"]').getBoundingClientRect()"
+        page.wait(f"(({{x, y, width}}) => Math.hypot(x + width / 2 - {x}, y + width / 2 - {y}) < 1.5)({marker})")
+        if AXE.exists():
+            page.value(f"{AXE.read_text()};0")
+            assert page.value(FINDINGS)["violations"] == []
+        assert [line for line in page.complaints if "422" not in line] == []
+        assert all(address.startswith((f"http://127.0.0.1:{client.port}/", "data:")) for address in page.requests)
+        for width, height in ((1400, 900), (390, 800)):
+            page.call(
+                "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
+            )
+            sizes = page.value(
+                "['map', 'reference', 'side'].map((name) => document.getElementById(name).getBoundingClientRect())"
+                ".map(({width, height}) => [width, height])"
+            )
+            assert np.min(sizes) > 180, sizes
+            page.screenshot(tmp_path / f"{width}.png")

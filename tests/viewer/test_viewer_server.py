@@ -60,9 +60,11 @@ def served(app: Any) -> Iterator[Client]:
         server = uvicorn.Server(uvicorn.Config(app, lifespan="off", log_level="warning"))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
-        yield Client(listener.getsockname()[1])
-        server.should_exit = True
-        thread.join(20)
+        try:
+            yield Client(listener.getsockname()[1])
+        finally:  # a failing test ends too
+            server.should_exit = True
+            thread.join(20)
 
 
 @pytest.fixture

@@ -140,8 +140,11 @@ def round_up(value: float) -> float:
 
 
 def png_bytes(rgb: RGBImage) -> bytes:
-    """An RGB or grey image as PNG."""
-    order = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR) if rgb.ndim == 3 else rgb
+    """An RGB, RGBA or grey image as PNG."""
+    if rgb.ndim == 2:
+        order = rgb
+    else:
+        order = cv2.cvtColor(rgb, cv2.COLOR_RGBA2BGRA if rgb.shape[2] == 4 else cv2.COLOR_RGB2BGR)
     done, data = cv2.imencode(".png", order)
     if not done:
         raise ValueError(f"no PNG can be made of an array of shape {rgb.shape} and type {rgb.dtype}")

@@ -44,16 +44,22 @@ def render_viewer(report: Report, figures: Sequence[ReportFigure]) -> str:
     )
 
 
-def render_editor(name: Literal["annotate", "georeference"], title: str, content: Mapping[str, object]) -> str:
-    """The page for labelling cars, or for marking control points; ``content`` is its server's data."""
-    return _page(name, {"title": escape(title), "data": _json(content)})
+def render_editor(
+    name: Literal["annotate", "georeference"], title: str, content: Mapping[str, object], *, image_origin: str = ""
+) -> str:
+    """The page for labelling cars, or for marking control points.
+
+    ``content`` is its server's data, ``image_origin`` the one other server that it may load images from.
+    """
+    return _page(name, {"title": escape(title), "data": _json(content)}, image_origin)
 
 
-def _page(name: str, parts: Mapping[str, str]) -> str:
+def _page(name: str, parts: Mapping[str, str], image_origin: str = "") -> str:
     style, script = report_style() + _read_built(f"{name}.css"), _read_built(f"{name}.js")
     policy = (
         f"default-src 'none'; script-src '{_hash(script)}' 'wasm-unsafe-eval'; style-src '{_hash(style)}'; "
-        "img-src 'self' data: blob:; connect-src 'self' data:; base-uri 'none'; form-action 'none'"
+        f"img-src 'self' data: blob:{image_origin and ' ' + image_origin}; connect-src 'self' data:; base-uri 'none'; "
+        "form-action 'none'"
     )
     filled = {"policy": policy, "style": style, "colours": _json(_colours()), "script": script, **parts}
     pieces = _read_built(f"{name}.html").split("{{")

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from schemas.arrays import GreyImage
+from schemas.arrays import GreyImage, RGBImage
 from velfield.errors import InputError
 from velfield.report.figures import png_bytes
 from velfield.report.viewer_page import page_is_built
@@ -27,6 +27,9 @@ def editing_app(
     page: Callable[[str], str],
     images: Callable[[int], GreyImage | None],
     requests: Mapping[str, Callable[[bytes], dict[str, Any]]],
+    *,
+    tiles: Callable[[int, int, int], RGBImage | None] | None = None,
+    image_origin: str = "",
 ) -> "Starlette":
     """The server of a page that writes.
 
@@ -38,6 +41,10 @@ def editing_app(
         Returns the k-th image that the page shows, (h, w) uint8; None where there is none.
     requests
         Path -> what answers a POST to it, by a JSON object. `InputError` and pydantic's errors become status 422.
+    tiles
+        Returns the tile of zoom, column and row of a map, as an image; None where there is no such tile.
+    image_origin
+        The one other server that the page may load images from.
 
     Raises
     ------
@@ -56,7 +63,7 @@ def editing_app(
 
     def show(_: "Request") -> HTMLResponse:
         html = page(token)
-        return HTMLResponse(html, headers=headers_for(html))
+        return HTMLResponse(html, headers=headers_for(html, image_origin))
 
     def image(request: "Request") -> Response:
         grey = images(request.path_params["number"])
@@ -65,8 +72,30 @@ def editing_app(
         return Response(png_bytes(grey), media_type="image/png", headers=headers_for(None))
 
     routes = [Route("/", show), Route("/frame/{number:int}.png", image)]
+    if tiles is not None:
+        routes.append(_tile_route(tiles))
     routes += [_post_route(path, token, alone, answer) for path, answer in requests.items()]
     return Starlette(routes=routes, middleware=[trusted_host_middleware()])
+
+
+def _tile_route(tiles: Callable[[int, int, int], RGBImage | None]) -> "Route":
+    """GET of a map's tiles; Starlette answers them in threads."""
+    from starlette.exceptions import HTTPException
+    from starlette.requests import Request
+    from starlette.responses import Response
+    from starlette.routing import Route
+
+    def tile(request: Request) -> Response:
+        zoom, column, row = (request.path_params[name] for name in ("zoom", "column", "row"))
+        try:
+            image = tiles(zoom, column, row)
+        except InputError as error:
+            raise HTTPException(422, str(error)) from error
+        if image is None:
+            raise HTTPException(404)
+        return Response(png_bytes(image), media_type="image/png", headers=headers_for(None))
+
+    return Route("/map/{zoom:int}/{column:int}/{row:int}.png", tile)
 
 
 def _post_route(path: str, token: str, alone: threading.Lock, answer: Callable[[bytes], dict[str, Any]]) -> "Route":

@@ -8,10 +8,11 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from schemas.arrays import GreyImage
-from schemas.georeference import ControlPoint, ControlPointsRecord, MarkedPoint, MarkedPoints
+from schemas.georeference import ControlPoint, ControlPointsRecord, MarkedPlace, MarkedPoint, MarkedPoints
 from velfield.errors import InputError
 from velfield.report.viewer_page import render_editor
 from velfield.sources.control_points import WGS84, scale_text
+from velfield.sources.reference_map import ReferenceMap, TileServer, to_coordinates, to_degrees
 from velfield.viewer.editing import editing_app
 
 if TYPE_CHECKING:
@@ -24,7 +25,16 @@ Fit = Callable[[Sequence[ControlPoint], int], ControlPointsRecord]
 Save = Callable[[Sequence[ControlPoint], int], tuple[ControlPointsRecord, Sequence[str]]]
 
 
-def georeference_app(base_image: GreyImage, before: MarkedPoints, *, title: str, fit: Fit, save: Save) -> "Starlette":
+def georeference_app(
+    base_image: GreyImage,
+    before: MarkedPoints,
+    *,
+    title: str,
+    fit: Fit,
+    save: Save,
+    reference: ReferenceMap | TileServer | None = None,
+    start: tuple[float, float] | None = None,
+) -> "Starlette":
     """The server of the page on which a user marks control points.
 
     Parameters
@@ -37,6 +47,10 @@ def georeference_app(base_image: GreyImage, before: MarkedPoints, *, title: str,
         Fits the map to points and the EPSG code of their coordinates, and writes nothing.
     save
         The same, and georeferences the run; returns notes for the user too.
+    reference
+        A map of the user's own, shown beside it to click coordinates on.
+    start
+        Longitude and latitude that it begins with, where it has no extent; None: not known.
 
     Raises
     ------
@@ -44,10 +58,12 @@ def georeference_app(base_image: GreyImage, before: MarkedPoints, *, title: str,
         The page is not built.
     """
     height, width = base_image.shape
+    origin = reference.origin if isinstance(reference, TileServer) else ""
 
     def page(token: str) -> str:
         content = {"token": token, "width": width, "height": height, "before": before.model_dump(mode="json")}
-        return render_editor("georeference", title, content)
+        content["map"] = _describe_map(reference, start)
+        return render_editor("georeference", title, content, image_origin=origin)
 
     def image(number: int) -> GreyImage | None:
         return base_image if number == 0 else None
@@ -59,7 +75,66 @@ def georeference_app(base_image: GreyImage, before: MarkedPoints, *, title: str,
         record, notes = save(*read_marked_points(MarkedPoints.model_validate_json(body)))
         return {**_describe(record), "notes": list(notes)}
 
-    return editing_app(page, image, {"/fit": answer_fit, "/save": answer_save})
+    def answer_places(body: bytes) -> dict[str, Any]:
+        return {"places": find_places(MarkedPoints.model_validate_json(body))}
+
+    def answer_coordinates(body: bytes) -> dict[str, Any]:
+        return {"coordinates": write_coordinates(MarkedPlace.model_validate_json(body))}
+
+    requests = {"/fit": answer_fit, "/save": answer_save}
+    if reference is not None:
+        requests |= {"/places": answer_places, "/coordinates": answer_coordinates}
+    tiles = reference.tile if isinstance(reference, ReferenceMap) else None
+    return editing_app(page, image, requests, tiles=tiles, image_origin=origin)
+
+
+def _describe_map(
+    reference: ReferenceMap | TileServer | None, start: tuple[float, float] | None
+) -> dict[str, Any] | None:
+    """The user's map, for the page."""
+    if reference is None:
+        return None
+    if isinstance(reference, TileServer):
+        return {"name": reference.origin, "url": reference.template, "remote": True, "bounds": None, "start": start}
+    name, zoom = reference.name, reference.native_zoom
+    return {"name": name, "url": "map/{z}/{x}/{y}.png", "remote": False, "bounds": reference.bounds, "zoom": zoom}
+
+
+def find_places(marked: MarkedPoints) -> list[tuple[float, float] | None]:
+    """Longitude and latitude of each point, None where its coordinates are none (yet)."""
+    return [_find_place(marked.model_copy(update={"points": (point,)})) for point in marked.points]
+
+
+def _find_place(marked: MarkedPoints) -> tuple[float, float] | None:
+    try:
+        ((point,), epsg) = read_marked_points(marked)
+        longitude, latitude = to_degrees(point.x, point.y, epsg)
+    except InputError:
+        return None
+    return (longitude, latitude) if abs(longitude) <= 180 and abs(latitude) <= 90 else None
+
+
+def write_coordinates(place: MarkedPlace) -> str:
+    """A place's coordinates as the page's user would type them: degrees to 1 mm, others to 1 mm.
+
+    Raises
+    ------
+    InputError
+        The reference system is not given, or does not cover the place.
+
+    Examples
+    --------
+    >>> write_coordinates(MarkedPlace(longitude=13.4, latitude=52.5, order="latitude_longitude"))
+    '52.50000000, 13.40000000'
+    """
+    if place.order == "longitude_latitude":
+        return f"{place.longitude:.8f}, {place.latitude:.8f}"
+    if place.order == "latitude_longitude":
+        return f"{place.latitude:.8f}, {place.longitude:.8f}"
+    if place.epsg is None:
+        raise InputError("found no EPSG code for x, y, expected one as 32633; fill it in")
+    x, y = to_coordinates(place.longitude, place.latitude, place.epsg)
+    return f"{x:.8f}, {y:.8f}" if abs(x) <= 360 and abs(y) <= 360 else f"{x:.3f}, {y:.3f}"
 
 
 def _describe(record: ControlPointsRecord) -> dict[str, Any]:

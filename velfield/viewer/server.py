@@ -35,17 +35,17 @@ _HEADERS = {
 _NOTHING = "default-src 'none'; frame-ancestors 'none'"
 
 
-def page_policy(html: str) -> str:
+def page_policy(html: str, image_origin: str = "") -> str:
     """Content security policy of a page with inline scripts and styles: these, by their hashes, and no others.
 
-    No other host is reached, whatever the page's own policy allows.
+    No other host is reached, whatever the page's own policy allows, but for images of ``image_origin``.
     """
     scripts = " ".join(_hashes("script", html)) or "'none'"
     styles = " ".join(_hashes("style", html)) or "'none'"
     return (
         f"default-src 'none'; script-src {scripts} 'wasm-unsafe-eval'; style-src {styles}; "
-        "img-src 'self' data: blob:; connect-src 'self' data:; base-uri 'none'; form-action 'none'; "
-        "frame-ancestors 'none'"
+        f"img-src 'self' data: blob:{image_origin and ' ' + image_origin}; connect-src 'self' data:; base-uri 'none'; "
+        "form-action 'none'; frame-ancestors 'none'"
     ).replace("'none' 'wasm-unsafe-eval'", "'none'")
 
 
@@ -54,9 +54,9 @@ def _hashes(tag: str, html: str) -> list[str]:
     return [f"'sha256-{b64encode(sha256(text.encode()).digest()).decode()}'" for text in texts]
 
 
-def headers_for(html: str | None) -> dict[str, str]:
-    """Headers of a response: of a page, or of anything else (None)."""
-    return {**_HEADERS, "Content-Security-Policy": _NOTHING if html is None else page_policy(html)}
+def headers_for(html: str | None, image_origin: str = "") -> dict[str, str]:
+    """Headers of a response: of a page, which may show images of ``image_origin``, or of anything else (None)."""
+    return {**_HEADERS, "Content-Security-Policy": _NOTHING if html is None else page_policy(html, image_origin)}
 
 
 def view_app(root: Path) -> "Starlette":
