@@ -18,7 +18,7 @@ from velfield.errors import IneffectiveSettingWarning, InputError, OldNameWarnin
 if TYPE_CHECKING:
     from flows.console import Console, Verbosity
     from flows.runners import RunnerConfig
-    from schemas.job import Job
+    from schemas.job import Inputs, Job
     from schemas.summary import RunSummary
 
 DONE, BAD_INPUT, USAGE, INCOMPLETE = 0, 1, 2, 3
@@ -67,10 +67,12 @@ LogJson = Annotated[bool, Parameter(name="--log-json", negative=())]
 
 @app.command
 def run(
-    source: Path,
+    source: Path | None = None,
     /,
     *more: Path,
     out: Path,
+    tracks: Path | None = None,
+    unit: Literal["m", "px"] | None = None,
     base: Path | None = None,
     gsd_m: float | None = None,
     labels: Path | None = None,
@@ -106,6 +108,11 @@ def run(
         Further clips of the same place, one after the other in time: one map, one clock by the files' own times.
     out
         Run folder: everything is written there.
+    tracks
+        Tracks of another program instead of a video: CSV or Parquet (geo-trax, highD and others), or SUMO's FCD. Field,
+        maps and analysis are made of them.
+    unit
+        Of columns named x and y in `--tracks`.
     base
         Image whose pixels become the base pixels: GeoTIFF, PNG with world file, or plain.
         Default: built from the flight.
@@ -123,7 +130,7 @@ def run(
     telemetry
         Subtitle file (.SRT) of a drone. Default: the one beside the video, or the subtitles and tags of the source.
     fps
-        Frame rate of a folder of images without timestamps.
+        Frame rate of a folder of images without timestamps, or of `--tracks` that have no times.
     config
         flight.yaml with the flight's configuration.
     preset
@@ -166,8 +173,18 @@ def run(
         "frames.stop_s": stop_s,
         "field.time_intervals": renamed_option(intervals, old_intervals, name="--intervals", old_name="--slice"),
         "work.device": device,
+        "position_unit": unit,
     }
     resolved = resolve_config(preset=preset, file=config, settings=settings, overrides=overrides)
+    if tracks is not None or source is None:
+        frames_only = {
+            "VIDEO": source, "--labels": labels, "--detector": detector, "--detections": detections,
+            "--timestamps": timestamps, "--telemetry": telemetry, "--device": device,
+        }  # fmt: skip
+        inputs = _tracks_inputs(tracks, base, [name for name, value in frames_only.items() if value is not None])
+        job = Job(root=str(out), inputs=inputs, config=resolved)
+        where = _runner(workers, scheduler, cluster)
+        return _process_tracks(job, where, _verbosity(quiet, verbose, log_json), plan_only=plan)
     inputs = Inputs(
         source=str(_clip_list(source, more, out) if more else source),
         base=_text(base),
@@ -310,6 +327,17 @@ def _score(run_folder: Path, flight: Path) -> None:
     print(score_run(run_folder, flight).text())
 
 
+def _tracks_inputs(tracks: Path | None, base: Path | None, frames_only: list[str]) -> "Inputs":
+    """Inputs of a run of given tracks; ``frames_only``: options that were given and need frames."""
+    from schemas.job import Inputs
+
+    if tracks is None:
+        raise InputError("found neither a video nor --tracks; give a video, a folder of images, or --tracks FILE")
+    if frames_only:
+        raise InputError(f"found --tracks and {', '.join(frames_only)}, expected tracks alone, which have no frames")
+    return Inputs(source=str(tracks), base=_text(base))
+
+
 def _runner(workers: int | None, scheduler: str | None, cluster: Path | None) -> "RunnerConfig":
     from flows.runners import RunnerConfig, read_runner
 
@@ -345,6 +373,31 @@ def _process(
 
     with server.in_use():
         summary = run_flight(job, runner or RunnerConfig(), console)
+    return _conclude(summary, console)
+
+
+def _process_tracks(job: "Job", runner: "RunnerConfig", verbosity: "Verbosity", *, plan_only: bool) -> int:
+    from velfield.pipeline.given_tracks.plan import describe_tracks
+
+    if plan_only:
+        print(describe_tracks(job))
+        return DONE
+    from flows.launch import prepare_process
+    from flows.stopping import stop_on_signals
+    from flows.temporary_server import start_server
+
+    stop_on_signals()
+    prepare_process(verbose=verbosity == "verbose")
+    server = start_server()
+    from flows.console import Console
+    from flows.process_tracks import run_tracks
+    from velfield.pipeline.analysis.analyse import analyse_run
+
+    console = Console(verbosity)
+    with server.in_use():
+        summary = run_tracks(job, runner, console)
+    for line in analyse_run(Path(job.root)):
+        console.result(line)
     return _conclude(summary, console)
 
 

@@ -22,6 +22,7 @@ from schemas.job import Inputs, Job, absolute
 from schemas.records import RebaseRecord
 from schemas.summary import RunSummary
 from velfield.errors import Failure, InputError
+from velfield.pipeline.given_tracks.plan import TRACKS
 from velfield.pipeline.graphs import rebase_graph
 from velfield.pipeline.plan import write_flight_record
 from velfield.pipeline.stage import STAGE, STAGES, NewBase, stages_before
@@ -98,6 +99,10 @@ def reprocess(
 def _new_job(run: Run, name: str, base: str) -> Job:
     if run.layout.rebased.exists():
         raise InputError(f"{run.layout.root} is itself mapped onto a new base image; reprocess the run that it is of")
+    if run.record.inputs.source.kind == TRACKS:
+        raise InputError(
+            f"{run.layout.root} is of tracks, without frames; run `velfield run --tracks` with the new --base"
+        )
     if set(run.record.keys) != set(STAGE):
         raise InputError(f"{run.layout.root} was made by another version of velfield; run `velfield run` on it again")
     given = run.record.given

@@ -83,6 +83,7 @@ def changed_stages(setting: str) -> set[str]:
 READERS: dict[str, tuple[str, ...]] = {
     "preset": (),
     "gsd_m": ("georeference",),
+    "position_unit": (),  # part of the digest of given tracks
     "frames": ("frames",),
     "lens": ("lens",),
     "base": ("base",),

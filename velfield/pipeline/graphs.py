@@ -49,5 +49,13 @@ def rebase_graph(plan: Plan, stage: Stage, unit: Unit, rebase: "Rebase") -> Grap
     return _committed(constant, stage, unit, _node(resolve(stage.remap), constant, *unit.part, _constant(rebase)))
 
 
+def tracks_graph(plan: Plan, stage: Stage, unit: Unit) -> Graph:
+    """A unit of a run of given tracks, which has no frames."""
+    if stage.from_tracks is None:
+        return unit_graph(plan, stage, unit)
+    constant = _constant(plan)
+    return _committed(constant, stage, unit, _node(resolve(stage.from_tracks), constant, *unit.part))
+
+
 def _committed(plan: Any, stage: Stage, unit: Unit, result: Any) -> Graph:
     return _node(commit, plan, stage.name, unit.name, result, started=time.time())

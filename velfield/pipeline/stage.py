@@ -75,6 +75,8 @@ class Stage:
     unread : keys of those sections that it does not read.
     cut, halo : how it is cut; a unit of frames also reads so many units after its own.
     new_base, remap : what `velfield reprocess` makes of it; ``remap`` is ``(plan, *part, rebase) -> StageResult``.
+    from_tracks : function ``(plan) -> StageResult`` in place of ``unit``, where tracks are given and no frames: it
+        writes what the stages before would have.
     """
 
     name: str
@@ -96,6 +98,7 @@ class Stage:
     halo: int = 0
     new_base: NewBase = NewBase.COMPUTED
     remap: str | None = None
+    from_tracks: str | None = None
 
     @property
     def essential(self) -> bool:
@@ -291,6 +294,7 @@ STAGES: tuple[Stage, ...] = (
         config=("tracking.max_gap_s", "tracking.max_stationary_gap_s", "tracking.max_hidden_gap_s"),
         new_base=NewBase.MAPPED,
         remap=f"{_STAGES}.rebase:rebase_tracks",
+        from_tracks="velfield.pipeline.given_tracks.write:write_given_tracks",
     ),
     # Scale, north and place again, with the lengths of the vehicles.
     Stage(

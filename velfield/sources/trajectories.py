@@ -27,8 +27,12 @@ _NAMES: dict[str, tuple[str, ...]] = {
     "y": ("y", "vehicle_y", "y_center"),
     "width": ("width",),
     "height": ("height",),
+    "length_m": ("length_m", "vehicle_length_m", "vehicle_length"),
+    "width_m": ("width_m", "vehicle_width_m", "vehicle_width"),
 }
 Unit = Literal["m", "px"]
+_SIZES_M = (0.3, 40.0)
+"""A length or width beyond these is not one in metres: it is left out."""
 
 
 def read_tracks(path: Path, *, fps: float | None = None, unit: Unit | None = None) -> pd.DataFrame:
@@ -46,7 +50,9 @@ def read_tracks(path: Path, *, fps: float | None = None, unit: Unit | None = Non
     Returns
     -------
     DataFrame
-        ``track_id`` (int), ``frame`` (int), ``time_s`` from 0 on, ``x_m, y_m`` or ``x_px, y_px``; by track and time.
+        ``track_id`` (int) and ``source_id``, its name in the file, ``frame`` (int), ``time_s`` from 0 on, ``x_m, y_m``
+        or ``x_px, y_px``; ``length_m, width_m`` of the vehicle where the file has them (NaN: not known); by track and
+        time.
 
     Raises
     ------
@@ -63,6 +69,10 @@ def read_tracks(path: Path, *, fps: float | None = None, unit: Unit | None = Non
     out = pd.DataFrame({"track": _need(table, found["track"], "a column of the track", path)})
     out["time_s"], out["frame"] = _times(table, found, fps, path)
     _positions(table, found, unit, out, path)
+    for name in ("length_m", "width_m"):
+        if found[name] is not None:  # empty where it was not measured
+            values = pd.to_numeric(table[found[name]], errors="coerce")
+            out[name] = values.where((values > _SIZES_M[0]) & (values < _SIZES_M[1]))
     return _finish(out, path)
 
 
@@ -168,6 +178,6 @@ def _finish(table: pd.DataFrame, path: Path) -> pd.DataFrame:
     if not len(table):
         raise InputError(f"{path}: no tracks in it; expected a row for each track and time")
     codes, _ = pd.factorize(table["track"], sort=False)
-    table = table.assign(track_id=codes).drop(columns="track")
+    table = table.assign(track_id=codes, source_id=table["track"].astype(str)).drop(columns="track")
     table["time_s"] -= table["time_s"].min()
     return table.sort_values(["track_id", "time_s"], kind="stable", ignore_index=True)

@@ -274,8 +274,8 @@ def trace_trips(
 ) -> OriginDestination:
     """Which arms tracks enter by and leave by, and where those went that are cut."""
     n = len(trajectories)
-    origin, entry = _arms_of(samples, n, gates, first=True)
-    destination, leaves = _arms_of(samples, n, gates, first=False)
+    origin, entry = _terminal_arms(samples, n, gates, first=True)
+    destination, leaves = _terminal_arms(samples, n, gates, first=False)
     begins, ends = trajectories.time_s[trajectories.first[:-1]], trajectories.time_s[trajectories.first[1:] - 1]
     before = begins < window_s[0] + _CUT_BY_TIME_S
     entered = (origin >= 0) & ~before
@@ -298,7 +298,9 @@ def trace_trips(
     return OriginDestination(arms, gates, trips, int(before.sum()), unknown, window_s)
 
 
-def _arms_of(samples: PathSamples, n: int, gates: tuple[Gate, ...], *, first: bool) -> tuple[IntArray, FloatArray]:
+def _terminal_arms(
+    samples: PathSamples, n: int, gates: tuple[Gate, ...], *, first: bool
+) -> tuple[IntArray, FloatArray]:
     """Arm (n,) at which each track begins (or ends), -1: none, and when."""
     rows = _terminal(samples, n, first=first)
     exists = samples.track[rows] == np.arange(n)

@@ -14,6 +14,7 @@ from schemas.summary import RunSummary, StageSummary
 from velfield.analysis.coverage import low_coverage_note, percent
 from velfield.detection.detector import load_detector
 from velfield.pipeline.plan import Plan
+from velfield.pipeline.stage import STAGES
 from velfield.report.report import render_report
 from velfield.report.run_figures import report_figures
 from velfield.report.viewer_page import NOT_BUILT, licences, page_is_built, render_viewer
@@ -29,6 +30,7 @@ _TRAINING_SOURCES = {
     "file": "none: a detector file",
     "shipped": "none: the shipped detector",
     "detections": "none: external detections",
+    "tracks": "none: tracks were given",
 }
 
 
@@ -77,7 +79,9 @@ def _name(plan: Plan) -> str:
 
 def make_report(plan: Plan, summary: RunSummary) -> Report:
     """The content of the report."""
-    counts = {stage.name: stage.counts for stage in summary.stages}
+    counts: dict[str, dict[str, float]] = {stage.name: {} for stage in STAGES} | {
+        stage.name: stage.counts for stage in summary.stages
+    }
     return Report(
         title=f"Velocity field of {_name(plan)}",
         source=plan.job.inputs.source,
@@ -106,15 +110,20 @@ def _facts(plan: Plan, counts: dict[str, dict[str, float]]) -> list[tuple[str, s
     times_s = plan.info.times_s[plan.indices]
     grid, field = read_grid(plan.layout), counts["field"]
     pixels = field.get("pixels", 0)
+    covered = [
+        ("vehicle tracks", f"{counts['tracks'].get('tracks', 0):.0f}"),
+        ("of the map, passed by vehicles", percent(pixels, grid.width_px * grid.height_px)),
+        ("of that, by 5 or more", percent(field.get("pixels_5", 0), pixels)),
+    ]
+    if not counts["registration"]:
+        return [("tracks given", f"{times_s[-1] - times_s[0]:.1f} s, {plan.frame_count} times"), *covered]
     frames, registered = counts["registration"].get("frames", 0), counts["registration"].get("registered", 0)
     return [
         ("flight", f"{times_s[-1] - times_s[0]:.1f} s, {plan.frame_count} frames"),
         ("registered", f"{registered:.0f} of {frames:.0f} frames"),
         ("hold-out registration error", f"{counts['registration'].get('heldout_px', float('nan')):.2f} px"),
         ("detections", f"{counts['detections'].get('cars', 0):.0f}"),
-        ("vehicle tracks", f"{counts['tracks'].get('tracks', 0):.0f}"),
-        ("of the map, passed by vehicles", percent(pixels, grid.width_px * grid.height_px)),
-        ("of that, by 5 or more", percent(field.get("pixels_5", 0), pixels)),
+        *covered,
     ]
 
 
@@ -122,7 +131,11 @@ def _inputs(plan: Plan) -> list[tuple[str, str]]:
     grid, working = read_grid(plan.layout), read_working(plan.layout)
     gsd = f"{grid.gsd_m:.4g} m a pixel" if grid.gsd_m else "not known: speeds in px/s"
     return [
-        ("base image", plan.job.inputs.base or "built from the flight"),
+        (
+            "base image",
+            plan.job.inputs.base
+            or ("built from the flight" if plan.inputs.source.kind != "tracks" else "the tracks, drawn"),
+        ),
         ("ground sample distance", gsd),
         ("training data", _TRAINING_SOURCES[working.training_source]),
         ("preset", plan.config.preset),
@@ -155,7 +168,7 @@ def _curve(plan: Plan) -> PrecisionRecall | None:
 
 
 def _gates(stages: Sequence[StageSummary]) -> dict[str, int]:
-    counts = next(stage.counts for stage in stages if stage.name == "tracklets")
+    counts = next((stage.counts for stage in stages if stage.name == "tracklets"), {})
     return {name.removeprefix("gate_"): int(count) for name, count in counts.items() if name.startswith("gate_")}
 
 

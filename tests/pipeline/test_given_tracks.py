@@ -1,0 +1,189 @@
+"""`velfield run --tracks`: tracks of a simulated flight in each format give the same field and answers as the truth."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from flows.cli import run as run_command
+from schemas.flight import FlightConfig
+from schemas.job import Inputs, Job
+from schemas.simulation import SimulationConfig
+from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.errors import InputError
+from velfield.pipeline.given_tracks.plan import list_track_stages, plan_tracks
+from velfield.pipeline.given_tracks.write import at_frames, read_given_tracks
+from velfield.pipeline.result import commit
+from velfield.pipeline.stage import resolve
+from velfield.pipeline.units import prepare_stage, stage_units
+from velfield.run.run import Run, open_run
+from velfield.synthetic.flight import Flight
+from velfield.synthetic.observed import NO_ERRORS, observed_detections
+
+GSD_M = 0.23
+
+
+@cache
+def truth() -> pd.DataFrame:
+    """True positions of simulated traffic in a minute, a row a vehicle and frame, in metres."""
+    flight = Flight(SimulationConfig(seed=971, frames=300, width=480, height=360, gsd_m=GSD_M))
+    city, rng = flight.city, np.random.default_rng(0)
+    table = observed_detections(
+        city.traffic, flight.times_s, city.to_px, shape=flight.base_shape, rng=rng, errors=NO_ERRORS
+    )
+    length_m = city.traffic.dimensions.length_m[table["vehicle_id"].to_numpy(np.int64)]
+    xy = table[["x_px", "y_px"]] * GSD_M
+    table = table.assign(x_m=xy["x_px"], y_m=xy["y_px"], length_m=length_m)
+    return table.sort_values(["vehicle_id", "frame"], kind="stable", ignore_index=True)
+
+
+def write(form: str, path: Path) -> tuple[Path, dict[str, float | str]]:
+    """The truth as a file, and what the format needs to be said beside it."""
+    t = truth()
+    plain = t[["vehicle_id", "frame", "time_s"]]
+    match form:
+        case "metres":
+            table = plain.assign(x_m=t["x_m"], y_m=t["y_m"], length_m=t["length_m"]).rename(
+                columns={"vehicle_id": "id"}
+            )
+        case "pixels":
+            table, said = plain.assign(x_px=t["x_px"], y_px=t["y_px"]), {"gsd_m": GSD_M}
+            table.to_csv(path.with_suffix(".csv"), index=False)
+            return path.with_suffix(".csv"), said
+        case "geotrax":
+            table = pd.DataFrame({"Vehicle_ID": t["vehicle_id"], "Timestamp": t["time_s"], "Frame_Number": t["frame"]})
+            table = table.assign(Ortho_X=t["x_m"], Ortho_Y=t["y_m"], Vehicle_Length=t["length_m"])
+        case "highd":
+            table = pd.DataFrame({"frame": t["frame"] + 1, "id": t["vehicle_id"], "time": t["time_s"]})
+            table = table.assign(
+                x=t["x_m"] - 2.0, y=t["y_m"] - 1.0, width=4.0, height=2.0, xVelocity=0.0, yVelocity=0.0
+            )
+        case _:
+            steps = "".join(
+                f'<timestep time="{time:.4f}">'
+                + "".join(
+                    f'<vehicle id="car.{v}" x="{x:.6f}" y="{-y:.6f}"/>'
+                    for v, x, y in zip(part["vehicle_id"], part["x_m"], part["y_m"], strict=True)
+                )
+                + "</timestep>"
+                for time, part in t.groupby("time_s")
+            )
+            path.with_suffix(".xml").write_text(f"<fcd-export>{steps}</fcd-export>")
+            return path.with_suffix(".xml"), {}
+    table.to_csv(path.with_suffix(".csv"), index=False)
+    return path.with_suffix(".csv"), {}
+
+
+def process(path: Path, out: Path, **settings: float | str) -> Run:
+    """The stages of the run, one after the other, without Prefect."""
+    config = FlightConfig.model_validate(settings)
+    plan = plan_tracks(Job(root=str(out), inputs=Inputs(source=str(path)), config=config))
+    from velfield.pipeline.plan import write_flight_record
+
+    write_flight_record(plan)
+    for stage in list_track_stages():
+        prepare_stage(plan, stage)
+        for unit in stage_units(plan, stage):
+            result = resolve(stage.from_tracks or stage.unit)(plan, *unit.part)
+            commit(plan, stage.name, unit.name, result, started=0.0)
+    return open_run(out)
+
+
+def answers(analysis: TrafficAnalysis) -> list[float]:
+    scene = analysis.scene
+    flows = [flow.flow_veh_per_h.value for flow in analysis.flows if flow.flow_veh_per_h]
+    counts = sorted(r.vehicles for r in scene.relations) if scene else []
+    return [len(analysis.lanes), *sorted(lane.length_m for lane in analysis.lanes), *sorted(flows), *counts]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    root = tmp_path_factory.mktemp("tracks")
+    path, said = write("metres", root / "t")
+    return process(path, root / "run", gsd_m=GSD_M, **said)
+
+
+def test_the_field_has_the_true_speeds(run: Run) -> None:
+    t = truth()
+    same = t["vehicle_id"].diff(-1) == 0
+    v = -t[["x_m", "y_m"]].diff(-1)[same].to_numpy() / -t["time_s"].diff(-1)[same].to_numpy()[:, None]
+    at = t[["x_m", "y_m"]][same].to_numpy()
+    corner = t[["x_m", "y_m"]].to_numpy().min(axis=0) - 10.0
+    modal = run.field.modal_velocity() * GSD_M
+    xy = np.round((at - corner) / GSD_M).astype(int)
+    found = modal[xy[:, 1], xy[:, 0]]
+    moving = np.hypot(*v.T) > 3.0
+    assert np.isfinite(found[moving]).all()
+    turn = np.angle(np.exp(1j * (np.arctan2(found[:, 1], found[:, 0]) - np.arctan2(v[:, 1], v[:, 0]))))[moving]
+    assert np.quantile(np.abs(np.degrees(turn)), 0.9) < 20
+    assert np.median(np.hypot(*found[moving].T) / np.hypot(*v[moving].T)) == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_run_has_its_vehicles_and_times(run: Run) -> None:
+    t = truth()
+    assert run.times_s[-1] == pytest.approx(t["time_s"].max() - t["time_s"].min(), abs=0.21)
+    vehicles = run.vehicles()
+    seen = t.groupby("vehicle_id")["frame"].size()
+    assert len(vehicles) == (seen >= 3).sum()
+    names = pd.read_csv(run.layout.tracks / "source_ids.csv").set_index("track_id")["source_id"]
+    lengths = t.drop_duplicates("vehicle_id").set_index("vehicle_id")["length_m"]
+    assert vehicles["length_m"].to_numpy() == pytest.approx(
+        lengths.reindex(names.reindex(vehicles["track_id"])).to_numpy(), abs=1e-3
+    )
+
+
+@pytest.mark.parametrize("form", ["pixels", "geotrax", "highd", "fcd"])
+def test_each_format_gives_the_same_answers(form: str, run: Run, tmp_path: Path) -> None:
+    path, said = write(form, tmp_path / "t")
+    other = process(path, tmp_path / "run", **({"gsd_m": GSD_M} | said))
+    expected = answers(run.analysis.traffic)
+    assert expected[0] > 3
+    assert answers(other.analysis.traffic) == pytest.approx(expected, rel=0.02, abs=0.6)
+    known, all_known = (np.isfinite(r.field.modal_velocity()).all(axis=2).sum() for r in (other, run))
+    # pixels end at their image's border, metres have a margin in which lanes are as wide as elsewhere
+    assert known == pytest.approx(all_known, rel=0.06 if form == "pixels" else 0.02)
+
+
+def test_positions_are_interpolated_over_short_gaps_alone() -> None:
+    table = pd.DataFrame({"track_id": [0, 0, 0, 0], "time_s": [0.0, 0.3, 0.6, 5.0]}).assign(y_px=0.0)
+    table["x_px"] = 10 * table["time_s"]
+    found = at_frames(table, np.arange(0, 5.1, 0.2))
+    assert found["time_s"].tolist() == pytest.approx([0.0, 0.2, 0.4, 0.6, 5.0])
+    assert found["x_px"].tolist() == pytest.approx([0.0, 2.0, 4.0, 6.0, 50.0])
+
+
+@pytest.mark.parametrize(
+    ("text", "settings", "message"),
+    [
+        ("id,time,x_px,y_px\n1,0,1,1\n1,1,9,9\n1,2,9,9\n", {}, "--gsd-m"),
+        ("id,time,x_m,y_m\n1,0,1,1\n1,1,9e7,9\n1,2,9e7,9\n", {}, "too large a map"),
+        ("id,time,x_m,y_m\n1,0,1,1\n1,1,9,9\n", {}, "expected 3 or more"),
+        ("id,time,x_px,y_px\n1,0,-9,1\n1,1,9,9\n1,2,9,9\n", {"gsd_m": 0.2}, "none below 0"),
+    ],
+)
+def test_bad_tracks_are_one_line(text: str, settings: dict[str, float], message: str, tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text(text)
+    job = Job(root=str(tmp_path / "run"), inputs=Inputs(source=str(path)), config=FlightConfig.model_validate(settings))
+    with pytest.raises(InputError, match=message) as error:
+        plan_tracks(job)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_pixels_of_another_image_are_refused(tmp_path: Path) -> None:
+    import cv2
+
+    (tmp_path / "t.csv").write_text("id,time,x_px,y_px\n1,0,900,900\n1,1,901,900\n1,2,902,900\n")
+    cv2.imwrite(str(tmp_path / "base.png"), np.zeros((50, 60), np.uint8))
+    with pytest.raises(InputError, match="0% of the positions within --base of 60 x 50 px"):
+        read_given_tracks(tmp_path / "t.csv", FlightConfig(gsd_m=0.2), base=tmp_path / "base.png")
+
+
+def test_options_of_frames_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="neither a video nor --tracks"):
+        run_command(out=tmp_path / "run")
+    with pytest.raises(InputError, match="--tracks and VIDEO, --labels"):
+        run_command(tmp_path / "a.mp4", out=tmp_path / "run", tracks=tmp_path / "t.csv", labels=tmp_path / "l.csv")

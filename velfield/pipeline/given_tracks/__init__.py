@@ -1,0 +1,1 @@
+"""`velfield run --tracks`: tracks of another program in place of frames."""

@@ -1,0 +1,75 @@
+"""The plan of a run of given tracks (`velfield run --tracks`): stages that read frames are left out."""
+
+from pathlib import Path
+
+import numpy as np
+
+from schemas.job import Job
+from schemas.records import InputsRecord, SourceRecord
+from velfield.errors import InputError
+from velfield.pipeline.given_tracks.write import read_given_tracks
+from velfield.pipeline.plan import Plan
+from velfield.pipeline.stage import STAGES, Stage, stage_keys
+from velfield.run.commits import digest_path
+from velfield.sources.source import SourceInfo
+
+TRACKS = "tracks"
+"""Kind of the source of such a run."""
+
+
+def list_track_stages() -> list[Stage]:
+    """The stages of such a run: those that given tracks have a function for, and those after."""
+    first = next(k for k, stage in enumerate(STAGES) if stage.from_tracks)
+    return [stage for stage in STAGES[first:] if stage.from_tracks or stage.name != "scale"]
+
+
+def describe_tracks(job: Job) -> str:
+    """What would be made of the tracks, in one line.
+
+    Raises
+    ------
+    InputError
+        As `plan_tracks`.
+    """
+    plan = plan_tracks(job)
+    span = float(plan.info.times_s[-1] - plan.info.times_s[0])
+    return (
+        f"{job.inputs.source}: tracks over {span:.1f} s at {plan.frame_count} times, on a map of {plan.info.width} x "
+        f"{plan.info.height} px of {plan.config.gsd_m:g} m: {', '.join(stage.name for stage in list_track_stages())}"
+    )
+
+
+def plan_tracks(job: Job) -> Plan:
+    """Read the tracks and resolve the run.
+
+    Raises
+    ------
+    InputError
+        The file holds no tracks that can be laid on a map, or fewer than three frames.
+    """
+    job, path = job.anywhere(), Path(job.inputs.source)
+    base = Path(job.inputs.base) if job.inputs.base else None
+    given = read_given_tracks(path, job.config, base=base)
+    times_s = given.times_s
+    if len(times_s) < 3:
+        raise InputError(f"{path}: found {len(times_s)} times, expected 3 or more for a velocity; give longer tracks")
+    height, width = given.shape
+    source = SourceRecord(
+        path=str(path),
+        kind=TRACKS,
+        digest=f"{digest_path(path)} {job.config.position_unit or ''}".strip(),
+        width=width,
+        height=height,
+        frame_count=len(times_s),
+    )
+    inputs = InputsRecord(source=source, base=digest_path(base) if base else None)
+    info = SourceInfo("folder", width, height, len(times_s), times_s, ())
+    plan = Plan(
+        job=job.model_copy(update={"config": job.config.model_copy(update={"gsd_m": given.gsd_m})}),
+        info=info,
+        indices=np.arange(len(times_s)),
+        inputs=inputs,
+        keys=stage_keys(job.config, inputs),
+    )
+    _ = plan.time_intervals  # refuses impossible intervals now
+    return plan
