@@ -119,7 +119,10 @@ class TrafficAnalysis:
         """Stops and crossings of the approaches of each junction, by its number."""
         stops = find_stops(self.trajectories) if len(self.trajectories) else None
         return {
-            junction.number: [observe_stream(a, self.samples, stops) for a in find_approaches(self.lanes, junction)]
+            junction.number: [
+                observe_stream(a, self.samples, stops, self.trajectories.length_m)
+                for a in find_approaches(self.lanes, junction)
+            ]
             for junction in self.lanes.junctions
             if stops is not None
         }
@@ -164,7 +167,8 @@ class TrafficAnalysis:
     @cached_property
     def flows(self) -> list[LaneFlow]:
         """Traffic of each lane."""
-        return [lane_flow(self.lane_traffic, lane.number, *self.window_s) for lane in self.lanes]
+        lengths = self.trajectories.length_m
+        return [lane_flow(self.lane_traffic, lane.number, *self.window_s, lengths_m=lengths) for lane in self.lanes]
 
     @cached_property
     def conflicts(self) -> list[Conflict]:

@@ -1,7 +1,7 @@
 """Trajectories: the tracks of a flight as flat arrays in metres, smoothed, and resampled along their paths."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -11,6 +11,8 @@ from schemas.arrays import FloatArray, IntArray, Mask
 
 VEHICLE_LENGTH_M, VEHICLE_WIDTH_M = 4.5, 1.8
 """Of a vehicle that was not measured."""
+_LENGTH_SD_M = 0.5
+"""A length that is known worse says less than that most vehicles are cars."""
 _SMOOTHING_S = 1.0
 """Half the window in which the errors of positions are averaged along the measured displacements."""
 _VELOCITY_S = 0.3
@@ -42,6 +44,8 @@ class Trajectories:
         (m, 2) position, and velocity.
     gsd_m
         Metres a base pixel.
+    measured_length_m
+        (n,) lengths of the vehicles, NaN where one was not measured; None: none was.
     """
 
     track_id: IntArray
@@ -51,6 +55,7 @@ class Trajectories:
     xy_m: FloatArray
     velocity_m_per_s: FloatArray
     gsd_m: float
+    measured_length_m: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.track_id)
@@ -70,6 +75,19 @@ class Trajectories:
         return np.asarray(np.hypot(self.velocity_m_per_s[:, 0], self.velocity_m_per_s[:, 1]))
 
     @property
+    def length_m(self) -> FloatArray:
+        """(n,) lengths of the vehicles; `VEHICLE_LENGTH_M` of those that were not measured."""
+        if self.measured_length_m is None:
+            return np.full(len(self), VEHICLE_LENGTH_M)
+        return np.where(np.isfinite(self.measured_length_m), self.measured_length_m, VEHICLE_LENGTH_M)
+
+    def with_lengths(self, dimensions: pd.DataFrame) -> "Trajectories":
+        """With the lengths of ``dimensions`` (`schemas.tables.DIMENSION_COLUMNS`) that are known to half a metre."""
+        known = dimensions.set_index("track_id")[["length_px", "length_sd_px"]].reindex(self.track_id) * self.gsd_m
+        length, sd = known["length_px"].to_numpy(np.float64), known["length_sd_px"].to_numpy(np.float64)
+        return replace(self, measured_length_m=np.where(sd <= _LENGTH_SD_M, length, np.nan))
+
+    @property
     def duration_s(self) -> float:
         """From the first position of all tracks to the last, s."""
         return float(np.ptp(self.time_s)) if len(self.time_s) else 0.0
@@ -86,6 +104,7 @@ class Trajectories:
             self.xy_m[rows],
             self.velocity_m_per_s[rows],
             self.gsd_m,
+            None if self.measured_length_m is None else self.measured_length_m[keep],
         )
 
 

@@ -43,6 +43,8 @@ class RunAnalysis:
         Returns the tracklets of the run, with their tracks.
     grid, config
         Base pixels and configuration of the field.
+    dimensions
+        Returns the dimensions of the vehicles (`schemas.tables.DIMENSION_COLUMNS`); None: they were not measured.
     """
 
     layer: Callable[[str], NDArray[np.generic]]
@@ -50,11 +52,13 @@ class RunAnalysis:
     tracklets: Callable[[], pd.DataFrame]
     grid: GridRecord
     config: FieldConfig
+    dimensions: Callable[[], pd.DataFrame] | None = None
 
     @cached_property
     def trajectories(self) -> Trajectories:
         """Tracks of vehicles that move, in metres."""
-        return moving(from_tracklets(self.tracklets(), self.gsd_m))
+        trajectories = moving(from_tracklets(self.tracklets(), self.gsd_m))
+        return trajectories if self.dimensions is None else trajectories.with_lengths(self.dimensions())
 
     @cached_property
     def traffic(self) -> TrafficAnalysis:

@@ -159,9 +159,13 @@ class Run:
 
         Of a run by an earlier release, which measured no vehicles, dimensions are NaN.
         """
-        gsd_m, path = self.grid.gsd_m, self.layout.dimensions
-        measured = read_tables([path] if path.exists() else [], DIMENSION_COLUMNS)
-        return add_dimensions(find_vehicles(self.tracklets(), self.detections(), gsd_m=gsd_m), measured, gsd_m)
+        gsd_m = self.grid.gsd_m
+        vehicles = find_vehicles(self.tracklets(), self.detections(), gsd_m=gsd_m)
+        return add_dimensions(vehicles, self._dimensions(), gsd_m)
+
+    def _dimensions(self) -> pd.DataFrame:
+        path = self.layout.dimensions
+        return read_tables([path] if path.exists() else [], DIMENSION_COLUMNS)
 
     def track_positions(self) -> pd.DataFrame:
         """Where each track's vehicle was in each registered frame: ``schemas.tables.TRACK_POSITION_COLUMNS``.
@@ -209,7 +213,7 @@ class Run:
         def layer(name: str) -> NDArray[np.generic]:
             return open_field(self.layout.field).layer(name)
 
-        return RunAnalysis(layer, self.segments, self.tracklets, self.grid, self.record.config.field)
+        return RunAnalysis(layer, self.segments, self.tracklets, self.grid, self.record.config.field, self._dimensions)
 
     @cached_property
     def base_image(self) -> GreyImage:

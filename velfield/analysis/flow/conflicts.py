@@ -13,7 +13,7 @@ from velfield.analysis.flow.passings import LaneTraffic, Passings
 from velfield.analysis.lanes.find import project
 from velfield.analysis.lanes.junctions import Crossing, find_crossings
 from velfield.analysis.lanes.model import LaneGraph
-from velfield.analysis.trajectories import VEHICLE_LENGTH_M, VEHICLE_WIDTH_M, Trajectories
+from velfield.analysis.trajectories import VEHICLE_WIDTH_M, Trajectories
 
 ConflictKind = Literal["crossing", "merging", "following"]
 MAX_PET_S, MAX_TTC_S = 3.0, 3.0
@@ -68,12 +68,12 @@ def find_conflicts(
     pet_s, ttc_s
         Thresholds of the probability.
     lengths_m
-        (tracks,) lengths of the vehicles; None: a car's.
+        (tracks,) lengths of the vehicles; None: as measured, a car's where they were not.
     vehicle
         (tracks,) number of each track's vehicle, where tracks are cut; None: each track is one.
     """
     vehicles = np.arange(len(trajectories)) if vehicle is None else vehicle
-    lengths = np.full(len(trajectories), VEHICLE_LENGTH_M) if lengths_m is None else lengths_m
+    lengths = trajectories.length_m if lengths_m is None else lengths_m
     found = [
         conflict
         for crossing in find_crossings(traffic.graph.lanes)

@@ -28,7 +28,7 @@ class LaneFlow:
     density_veh_per_km, space_mean_speed_m_per_s
         Time spent on the lane over its length and the time; distance driven over time spent (Edie).
     headway_s, gap_s
-        Mean headway; median time gap of those that follow, rear bumper to front bumper of a car of 4.5 m.
+        Mean headway; median time gap of those that follow, rear bumper to front bumper.
     """
 
     lane: int
@@ -50,8 +50,22 @@ class FlowSlices:
     speed_m_per_s: FloatArray
 
 
-def lane_flow(traffic: LaneTraffic, lane: int, begin_s: float, end_s: float, *, slice_s: float = 60.0) -> LaneFlow:
-    """Traffic of one lane from ``begin_s`` to ``end_s``."""
+def lane_flow(
+    traffic: LaneTraffic,
+    lane: int,
+    begin_s: float,
+    end_s: float,
+    *,
+    slice_s: float = 60.0,
+    lengths_m: FloatArray | None = None,
+) -> LaneFlow:
+    """Traffic of one lane from ``begin_s`` to ``end_s``.
+
+    Parameters
+    ----------
+    lengths_m
+        (tracks,) lengths of the vehicles; None: a car's.
+    """
     slices = flow_slices(traffic, lane, begin_s, end_s, slice_s=slice_s)
     passing = traffic.passings(lane, traffic.graph.lanes[lane].length_m / 2)
     inside = (passing.time_s >= begin_s) & (passing.time_s <= end_s)
@@ -59,7 +73,9 @@ def lane_flow(traffic: LaneTraffic, lane: int, begin_s: float, end_s: float, *, 
     counts = np.histogram(passing.time_s[inside], number, (begin_s, max(end_s, begin_s + 1e-9)))[0]
     headway = passing.headway_s
     follows = headway < _FOLLOW_S
-    gap = headway[follows] - VEHICLE_LENGTH_M / np.maximum(passing.speed_m_per_s[follows], 1.0)
+    length = np.full(len(passing), VEHICLE_LENGTH_M) if lengths_m is None else lengths_m[passing.track]
+    between = (length + np.r_[length[:1], length[:-1]]) / 2  # the leader's rear half, the follower's front half
+    gap = headway[follows] - between[follows] / np.maximum(passing.speed_m_per_s[follows], 1.0)
     enough = len(passing) >= 5
     return LaneFlow(
         lane,

@@ -231,15 +231,19 @@ def queues(stream: Stream, times_s: FloatArray) -> list[Queue]:
     out = []
     for time in times_s:
         stands = (stream.stop_start_s <= time) & (end >= time)
-        front = np.sort(stream.stop_along_m[stands] + VEHICLE_LENGTH_M / 2)[::-1]
-        front = front[front < stream.stop_line_m + 4.0]
+        length = stream.vehicle_length_m[stands]
+        front = stream.stop_along_m[stands] + length / 2
+        order = np.argsort(-front, kind="stable")
+        order = order[front[order] < stream.stop_line_m + 4.0]
+        last_m = VEHICLE_LENGTH_M
         count, at = 0, stream.stop_line_m + _SPACING_M
-        for position in front:
+        for position, last in zip(front[order], length[order], strict=True):
             if at - position > 3.4 * _SPACING_M:
                 break
             count, at = (
                 count + max(round((at - position) / _SPACING_M), 0 if count == 0 else int(at - position > 2.0)),
                 position,
             )
-        out.append(Queue(float(time), count, float(stream.stop_line_m - at + VEHICLE_LENGTH_M) if count else 0.0))
+            last_m = float(last)
+        out.append(Queue(float(time), count, float(stream.stop_line_m - at + last_m) if count else 0.0))
     return out

@@ -124,8 +124,8 @@ class Stream:
         Where the first of the queues stand, front bumper, along the approach's path; None: nobody stops.
     head_time_s, head_track
         Starts of vehicles that stood at the stop line.
-    stop_track, stop_start_s, stop_end_s, stop_along_m
-        Stops on the approach.
+    stop_track, stop_start_s, stop_end_s, stop_along_m, stop_length_m
+        Stops on the approach, and the lengths of their vehicles.
     cross_time_s, cross_track, cross_speed_m_per_s
         When tracks cross the stop line (the border without one), and how fast; in time order.
     """
@@ -141,20 +141,32 @@ class Stream:
     cross_time_s: FloatArray
     cross_track: IntArray
     cross_speed_m_per_s: FloatArray
+    stop_length_m: FloatArray | None = None
+
+    @property
+    def vehicle_length_m(self) -> FloatArray:
+        """(n,) length of the vehicle of each stop; a car's where none was measured."""
+        if self.stop_length_m is None:
+            return np.full(len(self.stop_track), VEHICLE_LENGTH_M)
+        return self.stop_length_m
 
 
-def observe_stream(approach: Approach, samples: PathSamples, stops: Stops) -> Stream:
-    """Stops and crossings on an approach."""
+def observe_stream(
+    approach: Approach, samples: PathSamples, stops: Stops, lengths_m: FloatArray | None = None
+) -> Stream:
+    """Stops and crossings on an approach; ``lengths_m`` (tracks,) of the vehicles, None: a car's."""
     along, across = _along(approach.path_m, stops.xy_m)
     here = np.flatnonzero((across < 1.6) & (along > 1.0) & (along < len(approach.path_m) - 2))
     along = along[here]
     known = here[np.isfinite(stops.end_s[here])]
-    line = _stop_line(along[np.isfinite(stops.end_s[here])], approach.border_m)
+    half = (np.full(len(stops.track), VEHICLE_LENGTH_M) if lengths_m is None else lengths_m[stops.track]) / 2
+    goes = np.isfinite(stops.end_s[here])
+    line = _stop_line(along[goes] + half[here][goes], approach.border_m)
     at = approach.border_m if line is None else min(line, len(approach.path_m) - 4.0)
     cross = _crossings(approach.path_m, at, samples)
     heads = np.empty(0, np.int64)
     if line is not None:
-        front = _along(approach.path_m, stops.xy_m[known])[0] + VEHICLE_LENGTH_M / 2
+        front = _along(approach.path_m, stops.xy_m[known])[0] + half[known]
         heads = known[np.abs(front - line) < 3.0]
         heads = heads[_goes_on(stops.track[heads], stops.end_s[heads], cross[1], cross[0])]
         heads = heads[np.argsort(stops.end_s[heads])]
@@ -168,6 +180,7 @@ def observe_stream(approach: Approach, samples: PathSamples, stops: Stops) -> St
         stops.end_s[here],
         along,
         *cross,
+        2 * half[here],
     )
 
 
@@ -191,10 +204,9 @@ def _along(path_m: FloatArray, xy_m: FloatArray) -> tuple[FloatArray, FloatArray
     return k + s, np.where(distance < 5.0, across, np.inf)
 
 
-def _stop_line(along_m: FloatArray, border_m: float) -> float | None:
+def _stop_line(front_m: FloatArray, border_m: float) -> float | None:
     """Where the foremost of many stops are, front bumpers: the last peak of their density near the border."""
-    front = along_m + VEHICLE_LENGTH_M / 2
-    front = front[np.abs(front - border_m) < 25.0]
+    front = front_m[np.abs(front_m - border_m) < 25.0]
     if len(front) < 4:
         return None
     grid = np.arange(front.min() - 1, front.max() + 1, 0.25)

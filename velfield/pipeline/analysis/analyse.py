@@ -98,7 +98,10 @@ def analyse_tracks(
         gsd = gsd_m
         xy_m = table[["x_px", "y_px"]].to_numpy(np.float64) * gsd
     ids, frames = table["track_id"].to_numpy(np.int64), table["frame"].to_numpy(np.int64)
-    tracks = moving(make_trajectories(ids, frames, table["time_s"].to_numpy(np.float64), xy_m, gsd_m=gsd))
+    made = make_trajectories(ids, frames, table["time_s"].to_numpy(np.float64), xy_m, gsd_m=gsd)
+    if "length_m" in table:
+        made = replace(made, measured_length_m=table.groupby("track_id")["length_m"].median().to_numpy(np.float64))
+    tracks = moving(made)
     if not len(tracks):
         raise InputError(
             f"{path}: found no track that moves 6 m or more, expected tracks of vehicles; check unit and --gsd-m"
