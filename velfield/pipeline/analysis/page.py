@@ -80,7 +80,41 @@ def _section(table: AnalysisTable) -> str:
     )
     more = f"<p>{len(table.rows) - MAX_ROWS} more rows in analysis.json.</p>" if len(table.rows) > MAX_ROWS else ""
     body = f"<table><tr>{heads}</tr>{rows}</table>{more}" if table.rows else ""
-    return f'<h2 id="{table.name}">{escape(table.title)}</h2><p class="note">{escape(table.note)}</p>{body}'
+    picture = diagram_svg(table) if table.name == "fundamental_diagram" and table.rows else ""
+    return f'<h2 id="{table.name}">{escape(table.title)}</h2><p class="note">{escape(table.note)}</p>{picture}{body}'
+
+
+def diagram_svg(table: AnalysisTable) -> str:
+    """Flow against density, a point a slice; the colours are those of the lanes on the map."""
+    names = ("lane", "density", "flow", "begin")
+    known = [(int(lane), x, y, t) for lane, x, y, t in ([_number(row.cells[n]) for n in names] for row in table.rows)]
+    far, high = max(x for _, x, _, _ in known), max(y for _, _, y, _ in known)
+    width, height, left = 640, 360, 60
+    at = [
+        (lane, left + x / far * (width - left - 20), height - 40 - y / high * (height - 60), t)
+        for lane, x, y, t in known
+    ]
+    dots = "".join(
+        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{_COLOURS[lane % len(_COLOURS)]}">'
+        f"<title>lane {lane}, from {t:g} s</title></circle>"
+        for lane, x, y, t in at
+    )
+    axes = f'<path d="M{left} 20V{height - 40}H{width - 20}" fill="none" stroke="#8a929b"/>'
+    labels = "".join(
+        f'<text x="{x}" y="{y}" font-size="12" text-anchor="{anchor}">{text}</text>'
+        for x, y, anchor, text in (
+            (left - 6, 26, "end", f"{high:.0f}"),
+            (left - 6, height - 38, "end", "0"),
+            (width - 20, height - 22, "end", f"{far:.0f}"),
+            (width / 2, height - 8, "middle", "density, veh/km"),
+            (left + 6, 16, "start", "flow, veh/h"),
+        )
+    )
+    return f'<svg viewBox="0 0 {width} {height}" style="max-width: 45em">{axes}{labels}{dots}</svg>'
+
+
+def _number(cell: Cell) -> float:
+    return float(cell) if isinstance(cell, int | float) else 0.0
 
 
 def _cell(cell: Cell) -> str:

@@ -18,6 +18,7 @@ from velfield.pipeline.analysis.cells import (
     make_table,
     point_geometry,
 )
+from velfield.pipeline.analysis.flow_tables import diagram_table, growth_table, offset_table
 from velfield.pipeline.analysis.scene_tables import scene_tables, time_tables
 
 
@@ -34,7 +35,10 @@ def all_tables(analysis: TrafficAnalysis) -> Iterator[AnalysisTable]:
         reduction_table(analysis),
         signal_table(analysis),
         stream_table(analysis),
+        growth_table(analysis),
+        offset_table(analysis),
         flow_table(analysis),
+        diagram_table(analysis),
         conflict_table(analysis),
         unusual_table(analysis),
         doubtful_table(analysis),
