@@ -381,4 +381,7 @@ def test_points_are_clicked_on_a_map_of_the_users_own(tmp_path: Path) -> None:
                 ".map(({width, height}) => [width, height])"
             )
             assert np.min(sizes) > 180, sizes
+            assert page.value(
+                "document.getElementById('side').scrollWidth <= document.getElementById('side').clientWidth"
+            )
             page.screenshot(tmp_path / f"{width}.png")
