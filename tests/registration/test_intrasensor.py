@@ -11,6 +11,8 @@ import pytest
 from schemas.flight import RegistrationConfig
 from schemas.simulation import CameraSimulation, OtherSensorSimulation
 from velfield.camera.lens import HarrisLens
+from velfield.errors import Failure
+from velfield.registration import intrasensor
 from velfield.registration.alignment import Templates, align_patches, make_templates, smooth_fine
 from velfield.registration.intrasensor import (
     BaseReference,
@@ -226,6 +228,17 @@ def test_a_lost_frame_says_why_and_the_next_registers_again() -> None:
         assert lost.status.startswith("failed:no prior, neither from the base image (")
         assert "16 needed" in lost.status
         assert np.isnan(lost.heldout_px)
+
+
+def test_a_fit_that_shows_no_patch_of_the_base_image_is_a_failure_with_the_count(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As for strange images, whose keypoints match by chance."""
+    fitter, (points, fit), _, _ = fitted("still")
+    monkeypatch.setattr(intrasensor, "align_patches", lambda *_a, **_k: (points.select(np.zeros(len(points), bool)), 0))
+    found = fitter.fit_with_alignment(points, fit.transform.polyprojective)
+    assert isinstance(found, Failure)
+    assert found.reason == "0 of 0 patches of the base image align"
 
 
 def test_where_the_base_image_ends_the_previous_frame_carries_on() -> None:

@@ -1,12 +1,20 @@
 """Gap closing: a track that was interrupted goes on as itself, and no other vehicle's does in its place."""
 
+import tracemalloc
 from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from velfield.tracking.joins import END_COLUMNS, GapLimits, reconnect_tracks
+from velfield.tracking.joins import (
+    END_COLUMNS,
+    GapLimits,
+    _assign,
+    _assign_sparse,
+    _assign_table,
+    reconnect_tracks,
+)
 
 GSD_M = 0.25
 INTERVAL_S = 0.2
@@ -126,3 +134,31 @@ def test_an_end_is_reconnected_once() -> None:
 def test_no_tracklets() -> None:
     empty = seen(0.0, 2, 0.0, 1.0)
     assert reconnect_tracks(empty, np.zeros(0, np.int64), GapLimits(2.0), gsd_m=None).size == 0
+
+
+@pytest.mark.parametrize(("tracks", "pairs"), [(3, 6), (150, 900), (500, 4000)])
+def test_sparse_assignment_is_that_of_a_table(tracks: int, pairs: int) -> None:
+    rng = np.random.default_rng(tracks)
+    ends, starts = np.unique(rng.integers(0, tracks, (pairs, 2)), axis=0).T
+    row, column = (np.unique(one, return_inverse=True)[1] for one in (ends, starts))
+    gain = rng.uniform(0.01, 4, len(row))
+    by_table, by_pairs = _assign_table(row, column, gain), _assign_sparse(row, column, gain)
+    np.testing.assert_array_equal(by_pairs[0], by_table[0])
+    if len(by_table[0]) > 60:  # the margins of fewer are exact, which others bound from below
+        np.testing.assert_allclose(by_pairs[1], by_table[1], atol=1e-12)
+    assert (by_pairs[1] <= by_table[1] + 1e-12).all()
+
+
+def test_memory_grows_with_the_pairs_and_not_with_their_square() -> None:
+    """A chain of 20,000 tracks that all hang together: a table of them would take 3.2 GB."""
+    tracks = 20_000
+    pairs = np.concatenate(
+        [np.column_stack([np.arange(tracks - 1 - k), np.arange(tracks - 1 - k) + 1 + k]) for k in (0, 1)]
+    )
+    tracemalloc.start()
+    joined, _ = _assign(pairs, np.repeat([2.0, 1.0], [tracks - 1, tracks - 2]))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(joined) == tracks - 1
+    assert (joined[:, 1] == joined[:, 0] + 1).all()
+    assert peak < 100e6

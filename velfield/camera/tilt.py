@@ -19,9 +19,11 @@ from velfield.camera.lens import Lens
 MIN_GAIN_NATS = 0.1
 """Smallest decrease of the entropy for which a tilt is reported: from above it reaches 0.02, at 45 degrees 0.15 and
 more."""
-MIN_CONVERGENCE = 0.2
-"""Smallest convergence of which a tilt is reported, 1 / half-diagonal: 22 degrees, where the far side of the image has
-half the scale of the near one."""
+MIN_CONVERGENCE = 0.33
+"""Smallest convergence of which a tilt is reported, 1 / half-diagonal: 33 degrees, where the far side of the image has
+half the scale of the near one. Crossings of streets at other than right angles give up to 28 degrees from above."""
+MIN_TURN = 0.2
+"""As much against a base image, whose lines need not be guessed at: 22 degrees."""
 MIN_ARCS = 150
 """On fewer, as of a crossing of curved kerbs, the entropy may fall to the end of the range."""
 _ANGLE_BINS = 90

@@ -497,7 +497,7 @@ class _FrameFitter:
         for k, (image, is_coarse, limit) in enumerate(steps):
             if k or not enough:
                 aligned, in_frame = align_patches(image, fit.transform, templates, coarse=is_coarse, max_shift_px=limit)
-            if len(aligned) < _MIN_ALIGNED_FRACTION * in_frame:
+            if not len(aligned) or len(aligned) < _MIN_ALIGNED_FRACTION * in_frame:
                 return Failure(f"{len(aligned)} of {in_frame} patches of the base image align")
             used = aligned.concatenate(_select_in_empty_cells(points, aligned, *self.size))
             refit = self._fit(used, fit.transform.polyprojective, fit)

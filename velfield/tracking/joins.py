@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, min_weight_full_bipartite_matching
 
 from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.flight import PAPER_GSD_M, STATIONARY_SPEED_M_PER_S
@@ -60,6 +60,9 @@ _CERTAINTY_OFFSET, _CERTAINTY_SLOPE = 0.0, 3.0
 """Log odds that a join is right, from what the total would cost more without it."""
 _MIN_PROBABILITY = 0.75
 """A join of a lower probability is not made."""
+_MAX_TABLE = 250_000
+"""Ends times starts of a group up to which they are assigned by a table of all."""
+_PAIRS_AT_ONCE, _LOOKS_AT_ONCE = 100_000, 20_000
 _MAX_EXACT = 60
 """Joins of a group of candidates up to which that is computed for each by another assignment; beyond, from the cost of
 the best other partners, which is a lower bound."""
@@ -186,7 +189,9 @@ def close_gaps(
     alone = np.full((2, len(ids)), _ALONE_COST)
     if context is not None:
         alone += _VANISHED_COST * np.stack([context.end_vanishes, context.start_vanishes])
-        cost = cost + _cost_of_looks(context.end_looks[pairs[:, 0]], context.start_looks[pairs[:, 1]])
+        blocks = np.split(pairs, range(_LOOKS_AT_ONCE, len(pairs), _LOOKS_AT_ONCE))  # 1.5 kB a pair
+        looks = [_cost_of_looks(context.end_looks[one[:, 0]], context.start_looks[one[:, 1]]) for one in blocks]
+        cost = cost + np.concatenate(looks)
     joined, margin = _assign(pairs, alone[0, pairs[:, 0]] + alone[1, pairs[:, 1]] - cost)
     probability = 1 / (1 + np.exp(-_CERTAINTY_OFFSET - _CERTAINTY_SLOPE * margin))
     if context is not None:
@@ -248,20 +253,23 @@ def _candidates(ends: TrackEnds, starts: TrackEnds, gaps: GapLimits) -> tuple[In
     longest = max(gaps.moving_s, gaps.stationary_s, gaps.hidden_s)
     low = np.searchsorted(times, ends.time_s, side="right")
     high = np.searchsorted(times, ends.time_s + longest, side="right")
+    count = np.maximum(high - low, 0)
     found = []
-    for end in np.flatnonzero(high > low).tolist():
-        start = order[low[end] : high[end]]
+    for block in np.split(np.arange(len(count)), np.flatnonzero(np.diff(np.cumsum(count) // _PAIRS_AT_ONCE)) + 1):
+        end = np.repeat(block, count[block])
+        within = np.arange(len(end)) - np.repeat(np.cumsum(count[block]) - count[block], count[block])
+        start = order[low[end] + within]
         ways = (_cost_in_motion, _cost_of_stop, _cost_when_hidden)
         cost = np.min([way(ends, starts, end, start, gaps) for way in ways], axis=0)
         near = np.flatnonzero(np.isfinite(cost))
-        found.append(np.stack([cost[near], np.full(len(near), end), start[near]], axis=1))
+        found.append(np.stack([cost[near], end[near], start[near]], axis=1))
     table = np.concatenate(found) if found else np.empty((0, 3))
     pairs = table[:, 1:].astype(np.int64)
     rank = np.lexsort((pairs[:, 1], pairs[:, 0], table[:, 0]))
     return pairs[rank], table[rank, 0]
 
 
-def _cost_in_motion(ends: TrackEnds, starts: TrackEnds, end: int, start: IntArray, gaps: GapLimits) -> FloatArray:
+def _cost_in_motion(ends: TrackEnds, starts: TrackEnds, end: IntArray, start: IntArray, gaps: GapLimits) -> FloatArray:
     """Of gaps in which a vehicle drives on, its acceleration nearly constant; inf beyond the tolerance."""
     gap = starts.time_s[start] - ends.time_s[end]
     displacement = starts.position_m[start] - ends.position_m[end]
@@ -273,7 +281,7 @@ def _cost_in_motion(ends: TrackEnds, starts: TrackEnds, end: int, start: IntArra
     return np.where((relative <= 1) & (gap <= gaps.moving_s), relative + _GAP_PENALTY_PER_S * gap, np.inf)
 
 
-def _cost_of_stop(ends: TrackEnds, starts: TrackEnds, end: int, start: IntArray, gaps: GapLimits) -> FloatArray:
+def _cost_of_stop(ends: TrackEnds, starts: TrackEnds, end: IntArray, start: IntArray, gaps: GapLimits) -> FloatArray:
     """Of gaps in which a vehicle stops and sets off again, or stands throughout; inf beyond the tolerance.
 
     It brakes from one velocity to rest and accelerates to the other along one line: how far that takes it follows from
@@ -300,7 +308,9 @@ def _cost_of_stop(ends: TrackEnds, starts: TrackEnds, end: int, start: IntArray,
     return np.where((relative <= 1) & (gap <= gaps.stationary_s), relative + _STOP_COST, np.inf)
 
 
-def _cost_when_hidden(ends: TrackEnds, starts: TrackEnds, end: int, start: IntArray, gaps: GapLimits) -> FloatArray:
+def _cost_when_hidden(
+    ends: TrackEnds, starts: TrackEnds, end: IntArray, start: IntArray, gaps: GapLimits
+) -> FloatArray:
     """Of gaps in which a vehicle keeps to its way at an unknown, moderate pace; inf where it cannot be.
 
     A vehicle that is at rest on one side goes the way that the other side gives.
@@ -347,13 +357,40 @@ def _assign(pairs: IntArray, gain: FloatArray) -> tuple[IntArray, FloatArray]:
     for rows in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
         end, row = np.unique(pairs[rows, 0], return_inverse=True)
         start, column = np.unique(pairs[rows, 1], return_inverse=True)
-        table = np.zeros((len(end), len(start)))
-        table[row, column] = gain[rows]
-        best = np.stack(linear_sum_assignment(-table), axis=1)
-        best = best[table[best[:, 0], best[:, 1]] > 0]
+        solve = _assign_table if len(end) * len(start) <= _MAX_TABLE else _assign_sparse
+        best, margin = solve(row, column, gain[rows])
         chosen.append(np.column_stack([end[best[:, 0]], start[best[:, 1]]]))
-        margins.append(_margins(table, best))
+        margins.append(margin)
     return np.concatenate(chosen), np.concatenate(margins)
+
+
+def _assign_table(row: IntArray, column: IntArray, gain: FloatArray) -> tuple[IntArray, FloatArray]:
+    """The best pairs (k, 2) of rows and columns, by a table of all, and their margins."""
+    table = np.zeros((int(row.max()) + 1, int(column.max()) + 1))
+    table[row, column] = gain
+    best = np.stack(linear_sum_assignment(-table), axis=1)
+    best = best[table[best[:, 0], best[:, 1]] > 0]
+    return best, _margins(table, best)
+
+
+def _assign_sparse(row: IntArray, column: IntArray, gain: FloatArray) -> tuple[IntArray, FloatArray]:
+    """As `_assign_table`, in memory that grows with the pairs: those of a long flight may hang together throughout.
+
+    Every row has a column of its own beside the others, for which it gains nothing. The margins are, as those of larger
+    tables, against the next best of the row and of the column.
+    """
+    rows, columns = int(row.max()) + 1, int(column.max()) + 1
+    own = np.arange(rows)
+    weight = 1 + gain.max() - np.concatenate([gain, np.zeros(rows)])  # a sparse zero would be no edge
+    nodes = (np.concatenate([row, own]), np.concatenate([column, columns + own]))
+    matched = min_weight_full_bipartite_matching(coo_array((weight, nodes), shape=(rows, columns + rows)).tocsr())[1]
+    is_best = matched[row] == column
+    best_of_row, best_of_column = np.zeros(rows), np.zeros(columns)
+    np.maximum.at(best_of_row, row[~is_best], gain[~is_best])
+    np.maximum.at(best_of_column, column[~is_best], gain[~is_best])
+    order = np.flatnonzero(is_best)[np.argsort(row[is_best])]
+    margin = gain[order] - best_of_row[row[order]] - best_of_column[column[order]]
+    return np.column_stack([row[order], column[order]]), np.maximum(margin, 0)
 
 
 def _margins(table: FloatArray, best: IntArray) -> FloatArray:

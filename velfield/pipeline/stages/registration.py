@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, GreyImage, Mask
-from velfield.camera.tilt import FOCAL_HALF_DIAGONALS, MIN_CONVERGENCE
+from velfield.camera.tilt import FOCAL_HALF_DIAGONALS, MIN_TURN
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.registration.intrasensor import BaseReference, FrameRegistration, prepare_base, register_chain
@@ -158,7 +158,7 @@ def _scale_warnings(frames: list[int], scales: FloatArray) -> list[str]:
 def _turn_warnings(frames: list[int], convergences: FloatArray) -> list[str]:
     """Frames (n,) by the convergence (n, 2) of the ground in them, relative to the usual one."""
     size = np.hypot(*convergences.T)
-    odd = np.flatnonzero(size > MIN_CONVERGENCE)
+    odd = np.flatnonzero(size > MIN_TURN)
     if not len(odd):
         return []
     degrees = float(np.degrees(np.arctan(FOCAL_HALF_DIAGONALS * size.max())))

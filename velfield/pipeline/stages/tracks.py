@@ -96,7 +96,9 @@ def read_candidates(plan: Plan, tracklets: pd.DataFrame, metres: float) -> Candi
             path = layout.unit_file(folder, unit, ".parquet")
             if path.exists():
                 table = read_tables([path], DETECTION_COLUMNS, only=names)
-                parts.append(table[~np.isin(table["detection_id"], used)])
+                ids = table["detection_id"].to_numpy(np.int64)
+                at = np.minimum(np.searchsorted(used, ids), max(len(used) - 1, 0))
+                parts.append(table[used[at] != ids] if len(used) else table)
     table = pd.concat(parts) if parts else empty_table({name: DETECTION_COLUMNS[name] for name in names})
     table = table.sort_values(["frame", "detection_id"], ignore_index=True)
     return Candidates(
