@@ -7,9 +7,11 @@ import pytest
 
 from schemas.arrays import FloatArray
 from velfield.analysis.changes import find_changes
-from velfield.analysis.flow.conflicts import find_conflicts
+from velfield.analysis.flow.conflicts import find_conflicts, persistent
+from velfield.analysis.flow.speeds import slowing
 from velfield.analysis.flow.volume import flow_slices
 from velfield.analysis.intervals import estimate_censored_quantile, estimate_quantile, estimate_rate, estimate_share
+from velfield.analysis.lanes.graph import count_once
 from velfield.analysis.movements.movements import furness
 from velfield.analysis.signals.cycles import find_signal, queues
 from velfield.analysis.signals.phases import START_DELAY_S, fit_phases
@@ -281,3 +283,27 @@ def test_lanes_of_a_phase_that_start_late_together_are_one_observation() -> None
         green.append(phases[0].green_s.low < 12.0 < phases[0].green_s.high)
     assert 0.85 < np.mean(covered) < 0.96
     assert np.mean(green) > 0.9
+
+
+def test_kernels_equal_their_plain_functions(analysis: TrafficAnalysis) -> None:
+    rng = np.random.default_rng(7)
+    owner = np.sort(rng.integers(0, 30, 400))
+    number = rng.integers(0, 12, 400)
+    pairs = np.unique(np.column_stack([owner, number]), axis=0)
+    assert count_once(owner, number, 13).tolist() == np.bincount(pairs[:, 1], minlength=13).tolist()
+    samples = analysis.samples
+    first = np.searchsorted(samples.track, np.arange(len(analysis.trajectories) + 1))
+    passes = next(j.passes for j in analysis.movements if j.junction.kind == "intersection")
+    rows = passes.gate_in >= 0
+    arguments = (first, samples.time_s, samples.speed_m_per_s, passes.track[rows], passes.entry_s[rows])
+    assert len(slowing(*arguments)) > 10
+    np.testing.assert_array_equal(slowing(*arguments), slowing.py_func(*arguments))
+
+
+def test_a_time_to_collision_counts_where_it_lasts() -> None:
+    pair = np.array([4, 4, 4, 4, 4, 9, 9, 9])
+    time_s = np.array([0.0, 0.2, 0.4, 0.6, 2.0, 0.0, 0.2, 0.3])
+    value_s = np.array([1.0, 3.0, 2.0, 1.0, 0.5, 1.0, 1.0, 1.0])
+    expected = [3.0, 3.0] + 6 * [np.inf]  # within 0.4 s: rows 0 to 2, 1 to 3; then a gap, or the end
+    order = np.random.default_rng(1).permutation(8)
+    assert persistent(pair[order], time_s[order], value_s[order]).tolist() == np.array(expected)[order].tolist()

@@ -35,6 +35,7 @@ from velfield.analysis.signals.cycles import JunctionSignal, find_signal
 from velfield.analysis.signals.queues import Stream, find_approaches, find_stops, observe_stream
 from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
 from velfield.analysis.unusual import DoubtfulPlace, Unusual, find_doubtful_places, find_unusual
+from velfield.parallel import parallel_map
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,17 @@ class TrafficAnalysis:
         """Points along the tracks, 1 m apart."""
         return sample_paths(self.trajectories)
 
+    def answer_all(self) -> None:
+        """Compute the answers that take long on all processors: each is there when it is asked for."""
+        shared = self.lane_traffic, self.cut_tracks  # what several of them read
+        if len(shared[0].graph):
+            shared[0].samples(0)
+        groups = (
+            ("conflicts",), ("free_flow",), ("movements", "reductions", "unusual"), ("streams", "signals"), ("flows",),
+            ("reversals", "doubtful_places"),
+        )  # fmt: skip
+        parallel_map(lambda names: [getattr(self, name) for name in names], groups)
+
     @property
     def window_s(self) -> tuple[float, float]:
         """First and last time of all tracks."""
@@ -72,7 +84,7 @@ class TrafficAnalysis:
     @cached_property
     def lanes(self) -> LaneGraph:
         """The lane graph."""
-        return find_lanes(self.trajectories)
+        return find_lanes(self.trajectories, samples=self.samples)
 
     @cached_property
     def lane_traffic(self) -> LaneTraffic:
@@ -180,7 +192,7 @@ class TrafficAnalysis:
     @cached_property
     def unusual(self) -> list[Unusual]:
         """Unusual tracks."""
-        return find_unusual(self.trajectories, self.lanes, self.movements)
+        return find_unusual(self.trajectories, self.lanes, self.movements, samples=self.samples)
 
     @cached_property
     def doubtful_places(self) -> list[DoubtfulPlace]:

@@ -139,19 +139,18 @@ def make_trajectories(
         (m, 2) measured displacement to the track's next position, NaN where there is none; more accurate than the
         difference of the positions.
     """
-    order = np.lexsort((time_s, track))
-    track, frame, time_s, xy_m = track[order], frame[order], time_s[order], xy_m[order]
-    displaced = None if displacement_m is None else displacement_m[order]
-    new = np.ones(len(track), bool)
-    new[1:] = (np.diff(track) != 0) | (np.diff(time_s) > 0)
-    track, frame, time_s, xy_m = track[new], frame[new], time_s[new], xy_m[new]
+    if (np.diff(track) < 0).any() or ((np.diff(track) == 0) & (np.diff(time_s) <= 0)).any():
+        order = np.lexsort((time_s, track))
+        order = order[np.r_[True, (np.diff(track[order]) != 0) | (np.diff(time_s[order]) > 0)]]
+        track, frame, time_s, xy_m = track[order], frame[order], time_s[order], xy_m[order]
+        displacement_m = None if displacement_m is None else displacement_m[order]
     starts = np.flatnonzero(np.r_[True, np.diff(track) != 0]) if len(track) else np.empty(0, np.int64)
     first = np.r_[starts, len(track)].astype(np.int64)
     step = np.zeros_like(xy_m)
     step[:-1] = np.diff(xy_m, axis=0)
-    if displaced is not None:
-        known = np.isfinite(displaced[new]).all(axis=1)
-        step[known] = displaced[new][known]
+    if displacement_m is not None:
+        known = np.isfinite(displacement_m[:, 0]) & np.isfinite(displacement_m[:, 1])
+        step = np.where(known[:, None], displacement_m, step)
         _bridge(first, time_s, step, known, _BRIDGE_S, _BRIDGE_M)
     xy, velocity = _smooth(first, time_s, xy_m, step, _SMOOTHING_S, _VELOCITY_S)
     return Trajectories(track[starts], first, frame, time_s, xy, velocity, gsd_m)
@@ -275,6 +274,13 @@ class PathSamples:
 
     def __len__(self) -> int:
         return len(self.track)
+
+
+def within(xy_m: FloatArray, low_m: FloatArray, high_m: FloatArray) -> IntArray:
+    """Rows of the positions (n, 2) in a box with its corners at ``low_m`` and ``high_m`` (2,)."""
+    rows = np.flatnonzero((xy_m[:, 0] >= low_m[0]) & (xy_m[:, 0] <= high_m[0]))  # few: the second test is of these
+    y = xy_m[rows, 1]
+    return np.asarray(rows[(y >= low_m[1]) & (y <= high_m[1])])
 
 
 def sample_paths(trajectories: Trajectories, spacing_m: float = 1.0) -> PathSamples:

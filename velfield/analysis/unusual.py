@@ -12,7 +12,7 @@ from schemas.arrays import FloatArray
 from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.lanes.ridges import bin_keys, bin_samples
 from velfield.analysis.movements.movements import JunctionMovements
-from velfield.analysis.trajectories import Trajectories, sample_paths
+from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
 
 UnusualKind = Literal["wrong way", "rare turn"]
 _BESIDE_M = 1.6
@@ -45,19 +45,25 @@ class DoubtfulPlace:
     tracks: int
 
 
-def find_unusual(trajectories: Trajectories, graph: LaneGraph, movements: Sequence[JunctionMovements]) -> list[Unusual]:
-    """Unusual tracks, by time."""
-    found = [*_wrong_way(trajectories, graph), *_rare_turns(trajectories, movements)]
+def find_unusual(
+    trajectories: Trajectories,
+    graph: LaneGraph,
+    movements: Sequence[JunctionMovements],
+    *,
+    samples: PathSamples | None = None,
+) -> list[Unusual]:
+    """Unusual tracks, by time; ``samples``: `sample_paths` of the tracks, where they are known already."""
+    samples = sample_paths(trajectories) if samples is None else samples
+    found = [*_wrong_way(trajectories, samples, graph), *_rare_turns(trajectories, movements)]
     return sorted(found, key=lambda row: row.time_s)
 
 
-def _wrong_way(trajectories: Trajectories, graph: LaneGraph) -> list[Unusual]:
+def _wrong_way(trajectories: Trajectories, samples: PathSamples, graph: LaneGraph) -> list[Unusual]:
     """Tracks that drive along a lane against its direction, where no lane of theirs is."""
     if not len(graph):
         return []
-    samples = sample_paths(trajectories)
     keys = bin_keys(samples.xy_m, samples.direction_rad)
-    bins = bin_samples(samples, keys)
+    bins, bin_of = bin_samples(samples, keys)
     points = np.concatenate([lane.xy_m for lane in graph])
     heading = np.concatenate([lane.direction_rad for lane in graph])
     tracks = np.concatenate([np.full(len(lane.xy_m), lane.tracks) for lane in graph])
@@ -70,7 +76,7 @@ def _wrong_way(trajectories: Trajectories, graph: LaneGraph) -> list[Unusual]:
             across = np.abs(d[:, 1] * np.cos(heading[found]) - d[:, 0] * np.sin(heading[found]))
             against = (turn > np.radians(145)) & (across < _BESIDE_M) & (tracks[found] >= 8)
             wrong[k] = against.any() and not (turn < np.radians(70)).any()
-    rows = np.flatnonzero(wrong[np.searchsorted(bins.key, keys)])
+    rows = np.flatnonzero(wrong[bin_of])
     out = []
     for track in np.unique(samples.track[rows]):
         own = rows[samples.track[rows] == track]

@@ -2,7 +2,6 @@
 that each lies below a threshold, given the errors of positions."""
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -171,9 +170,11 @@ def time_to_collision(
     """
     lane, along = positions_on_lanes(trajectories, graph)
     rows = np.flatnonzero(lane >= 0)
-    order = rows[np.lexsort((along[rows], trajectories.frame[rows], lane[rows]))]
+    moment = lane[rows] * (np.int64(trajectories.frame.max(initial=0)) + 1) + trajectories.frame[rows]
+    order = rows[np.lexsort((along[rows], moment))]
     a, b = order[:-1], order[1:]  # b leads a
-    same = (lane[a] == lane[b]) & (trajectories.frame[a] == trajectories.frame[b])
+    moment = np.sort(moment)
+    same = moment[:-1] == moment[1:]
     a, b = a[same], b[same]
     owner, speed = trajectories.owner, trajectories.speed_m_per_s
     gap = along[b] - along[a] - (lengths[owner[a]] + lengths[owner[b]]) / 2
@@ -183,7 +184,7 @@ def time_to_collision(
     near = (closing > 0.5) & (gap < MAX_TTC_S * closing) & (owner[a] != owner[b])
     near &= ~overlap & (speed[a] > _MIN_FOLLOWER_M_PER_S)
     a, b, gap, closing, pair = a[near], b[near], np.maximum(gap[near], 0.05), closing[near], pair[near]
-    value = _persistent(pair, trajectories.time_s[a], gap / closing)
+    value = persistent(pair, trajectories.time_s[a], gap / closing)
     lasts = np.isfinite(value)
     a, b, gap, closing, pair, value = a[lasts], b[lasts], gap[lasts], closing[lasts], pair[lasts], value[lasts]
     sd = value * np.hypot(np.sqrt(2) * POSITION_SD_M / gap, np.sqrt(2) * SPEED_SD_M_PER_S / closing)
@@ -208,18 +209,29 @@ def time_to_collision(
     ]
 
 
-def _persistent(pair: IntArray, time_s: FloatArray, value_s: FloatArray) -> FloatArray:
-    """The largest value (n,) of each pair within `_PERSISTENCE_S` from each time on; infinite where it is shorter."""
-    out = np.full(len(value_s), np.inf)
+def persistent(pair: IntArray, time_s: FloatArray, value_s: FloatArray) -> FloatArray:
+    """The largest value (n,) of each pair within `_PERSISTENCE_S` from each time on; infinite where it is shorter, or
+    has a gap as long."""
+    n = len(value_s)
+    out = np.full(n, np.inf)
+    if not n:
+        return out
     order = np.lexsort((time_s, pair))
-    pair, time_s, value_s = pair[order], time_s[order], value_s[order]
-    starts = np.r_[0, np.flatnonzero(np.diff(pair)) + 1, len(pair)]
-    for begin, end in pairwise(starts):
-        time = time_s[begin:end]
-        last = np.searchsorted(time, time + _PERSISTENCE_S - 1e-9)
-        for k in np.flatnonzero(last < len(time)):
-            if np.diff(time[k : last[k] + 1]).max(initial=0.0) <= _PERSISTENCE_S:
-                out[order[begin + k]] = value_s[begin + k : begin + last[k] + 1].max()
+    time, largest = time_s[order], value_s[order].copy()
+    end = np.flatnonzero(np.r_[np.diff(pair[order]) != 0, True])
+    end = np.repeat(end, np.diff(np.r_[-1, end]))  # last row of each row's pair
+    value, lasts, unbroken = value_s[order], np.zeros(n, bool), np.ones(n, bool)
+    rows, ahead = np.arange(n), 0
+    while len(rows):  # rows whose time is not up yet, one further row of their pair at each step
+        ahead += 1
+        rows = rows[rows + ahead <= end[rows]]
+        step = time[rows + ahead] - time[rows + ahead - 1]
+        unbroken[rows] &= step <= _PERSISTENCE_S
+        largest[rows] = np.maximum(largest[rows], value[rows + ahead])
+        done = time[rows + ahead] >= time[rows] + _PERSISTENCE_S - 1e-9
+        lasts[rows[done]] = True
+        rows = rows[~done]
+    out[order[lasts & unbroken]] = largest[lasts & unbroken]
     return out
 
 

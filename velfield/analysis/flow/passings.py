@@ -37,17 +37,18 @@ class LaneTraffic:
     graph: LaneGraph
 
     @cached_property
-    def _order(self) -> IntArray:
-        return np.argsort(self.graph.samples.lane, kind="stable")
+    def _by_lane(self) -> LaneSamples:
+        order = np.argsort(self.graph.samples.lane, kind="stable")
+        return LaneSamples(*(getattr(self.graph.samples, name)[order] for name in LaneSamples.__dataclass_fields__))
 
     @cached_property
     def _first(self) -> IntArray:
-        return np.searchsorted(self.graph.samples.lane[self._order], np.arange(len(self.graph) + 1))
+        return np.searchsorted(self._by_lane.lane, np.arange(len(self.graph) + 1))
 
     def samples(self, lane: int) -> LaneSamples:
         """Those on one lane, by track and along it."""
-        rows = self._order[self._first[lane] : self._first[lane + 1]]
-        return LaneSamples(*(getattr(self.graph.samples, name)[rows] for name in LaneSamples.__dataclass_fields__))
+        rows = slice(int(self._first[lane]), int(self._first[lane + 1]))
+        return LaneSamples(*(getattr(self._by_lane, name)[rows] for name in LaneSamples.__dataclass_fields__))
 
     def passings(self, lane: int, along_m: float) -> Passings:
         """Tracks that pass a distance along a lane."""

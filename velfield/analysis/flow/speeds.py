@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy import stats
 
 from schemas.arrays import FloatArray, IntArray
@@ -29,7 +30,11 @@ _STEADY_SD = 0.002
 _MIN_FREE = 8
 SIGN_KM_PER_H = 10.0
 """Speed limits are multiples of it."""
-_AWAY_M = 50.0
+_AWAY_M, _WAY_M, _MIN_WAY_M = 50, 45, 15
+"""A speed before a junction is that so far from its area; the lowest is sought so far into it, of tracks seen at least
+so far."""
+_WAITS_S, _STANDS_M_PER_S = 1.5, 1.0
+"""A vehicle that needs longer for a metre, or is slower, has stopped."""
 _RECOVERED = 0.95
 _FREELY = 0.25
 """At least this fraction of the vehicles that do not stop has nobody to give way to."""
@@ -204,28 +209,7 @@ def speed_reduction(
     samples: "PathArrays", junction: Junction, lane: int, tracks: IntArray, entry_s: FloatArray
 ) -> Reduction:
     """Speeds of tracks that enter a junction at given times, from 50 m before it to 100 m after it."""
-    before, lowest, after, recovery = [], [], [], []
-    for track, time in zip(tracks.tolist(), entry_s.tolist(), strict=True):
-        rows = samples.rows(track)
-        speed, when = samples.speed_m_per_s[rows], samples.time_s[rows]
-        k = int(np.searchsorted(when, time))
-        begin = k - int(_AWAY_M)
-        if begin < 0 or k >= len(speed) or np.diff(when[begin:k]).max(initial=0.0) > 1.5:
-            continue  # too short, or it stopped
-        ahead = speed[k : k + 45]
-        low = int(np.argmin(ahead)) if len(ahead) else 0
-        if len(ahead) < 15 or ahead[low] < 1.0:
-            continue
-        start = float(np.median(speed[begin : begin + 10]))
-        end = speed[k + low : k + low + 120]
-        before.append(start)
-        lowest.append(float(ahead[low]))
-        late = float(np.median(end[70:90])) if len(end) > 80 else np.nan
-        after.append(late)
-        aim = _RECOVERED * min(start, late) if np.isfinite(late) else np.nan
-        hits = np.flatnonzero(end >= aim)
-        recovery.append(float(hits[0]) if len(hits) and np.isfinite(aim) else np.nan)
-    b, w, a, r = (np.array(values, np.float64) for values in (before, lowest, after, recovery))
+    b, w, a, r = slowing(samples.first, samples.time_s, samples.speed_m_per_s, tracks, entry_s).T
     return Reduction(
         junction.number,
         lane,
@@ -237,6 +221,39 @@ def speed_reduction(
     )
 
 
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def slowing(
+    first: IntArray, time_s: FloatArray, speed: FloatArray, tracks: IntArray, entry_s: FloatArray
+) -> FloatArray:
+    """Rows (before, lowest, after, recovery): speeds of the tracks that enter a junction and do not stop, m/s, and the
+    distance over which they recover, m."""
+    out = np.empty((len(tracks), 4))
+    n = 0
+    for i in range(len(tracks)):
+        a, end = first[tracks[i]], first[tracks[i] + 1]
+        k = a + np.searchsorted(time_s[a:end], entry_s[i])
+        begin = k - _AWAY_M
+        if begin < a or min(k + _WAY_M, end) - k < _MIN_WAY_M:
+            continue
+        if np.max(np.diff(time_s[begin:k])) > _WAITS_S:
+            continue
+        low = k + np.argmin(speed[k : min(k + _WAY_M, end)])
+        if speed[low] < _STANDS_M_PER_S:
+            continue
+        start = np.median(speed[begin : begin + 10])
+        after = np.median(speed[low + 70 : min(low + 90, end)]) if end - low > 80 else np.nan
+        recovery = np.nan
+        if not np.isnan(after):
+            aim = _RECOVERED * min(start, after)
+            for q in range(low, min(low + 120, end)):
+                if speed[q] >= aim:
+                    recovery = q - low
+                    break
+        out[n, 0], out[n, 1], out[n, 2], out[n, 3] = start, speed[low], after, recovery
+        n += 1
+    return out[:n]
+
+
 @dataclass(frozen=True)
 class PathArrays:
     """Path samples by track: ``first`` (tracks + 1,) rows."""
@@ -244,7 +261,3 @@ class PathArrays:
     first: IntArray
     time_s: FloatArray
     speed_m_per_s: FloatArray
-
-    def rows(self, track: int) -> slice:
-        """Rows of a track."""
-        return slice(int(self.first[track]), int(self.first[track + 1]))

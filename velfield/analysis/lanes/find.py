@@ -9,6 +9,7 @@ from velfield.analysis.lanes.junctions import find_junctions
 from velfield.analysis.lanes.model import Connection, Lane, LaneGraph, LaneSamples, Turn, WidthSource
 from velfield.analysis.lanes.ridges import Nodes, bin_keys, bin_samples, find_nodes
 from velfield.analysis.trajectories import VEHICLE_WIDTH_M, PathSamples, Trajectories, sample_paths
+from velfield.parallel import parallel_map
 
 MIN_TRACKS = 3
 """A lane, or a connection, that fewer tracks drove is not one: an error of tracking or of a driver."""
@@ -23,7 +24,9 @@ _MIN_LENGTH_M = 8.0
 """A track shorter than this drives on no lane."""
 
 
-def find_lanes(trajectories: Trajectories, *, min_tracks: int = MIN_TRACKS) -> LaneGraph:
+def find_lanes(
+    trajectories: Trajectories, *, min_tracks: int = MIN_TRACKS, samples: PathSamples | None = None
+) -> LaneGraph:
     """The lane graph of the tracks.
 
     Parameters
@@ -32,14 +35,16 @@ def find_lanes(trajectories: Trajectories, *, min_tracks: int = MIN_TRACKS) -> L
         Tracks of moving vehicles.
     min_tracks
         Fewest tracks of a lane and of a connection.
+    samples
+        `sample_paths` of the tracks, where they are known already.
     """
-    samples = _long_enough(sample_paths(trajectories))
+    samples = _long_enough(sample_paths(trajectories) if samples is None else samples)
     if not len(samples):
         return LaneGraph((), (), (), _no_samples())
     keys = bin_keys(samples.xy_m, samples.direction_rad)
-    bins = bin_samples(samples, keys)
+    bins, bin_of = bin_samples(samples, keys)
     nodes = find_nodes(bins, min_weight=float(min_tracks))
-    node = nodes.of_bin[np.searchsorted(bins.key, keys)]
+    node = nodes.of_bin[bin_of]
     chains = make_chains(nodes, count_links(samples.track, node, nodes), min_tracks=min_tracks)
     chains = _drop_rare(chains, samples.track, node, len(nodes), min_tracks)
     if not chains.nodes:
@@ -56,6 +61,8 @@ def _long_enough(samples: PathSamples) -> PathSamples:
         return samples
     count = np.bincount(samples.track)
     keep = count[samples.track] >= _MIN_LENGTH_M
+    if keep.all():
+        return samples
     return PathSamples(*(getattr(samples, name)[keep] for name in PathSamples.__dataclass_fields__))
 
 
@@ -67,9 +74,7 @@ def _no_samples() -> LaneSamples:
 def _drop_rare(chains: Chains, track: IntArray, node: IntArray, n: int, min_tracks: int) -> Chains:
     """Without the lanes of a single node or of too few tracks, which nothing connects."""
     lane_of = _lane_of_node(chains.nodes, n)
-    lane = np.where(node >= 0, lane_of[node], -1)
-    pairs = np.unique(np.column_stack([track, lane])[lane >= 0], axis=0)
-    tracks = np.bincount(pairs[:, 1], minlength=len(chains.nodes))
+    tracks = _tracks_on(track, np.where(node >= 0, lane_of[node], -1), len(chains.nodes))
     linked = {i for a, b, _ in chains.links for i in (a, b)}
     keep = [k for k, c in enumerate(chains.nodes) if tracks[k] >= min_tracks and (len(c) > 2 or k in linked)]
     number = {k: i for i, k in enumerate(keep)}
@@ -78,6 +83,13 @@ def _drop_rare(chains: Chains, track: IntArray, node: IntArray, n: int, min_trac
         for pairs in (chains.links, chains.changes)
     )
     return Chains([chains.nodes[k] for k in keep], links, changes)
+
+
+def _tracks_on(track: IntArray, lane: IntArray, n: int) -> IntArray:
+    """Number of tracks on each of n lanes, from samples along the tracks; lane -1: none."""
+    # a track is on a lane for many samples: first those at which it comes there, then each once
+    comes = np.flatnonzero((lane >= 0) & np.r_[True, (np.diff(lane) != 0) | (np.diff(track) != 0)])
+    return np.bincount(np.unique(track[comes] * np.int64(n) + lane[comes]) % n, minlength=n)
 
 
 def _lane_of_node(chains: list[IntArray], n: int) -> IntArray:
@@ -123,9 +135,11 @@ def _place(samples: PathSamples, node: IntArray, chains: Chains, n: int, lines: 
     along, offset = np.zeros(len(lane)), np.zeros(len(lane))
     order = np.argsort(lane, kind="stable")
     borders = np.searchsorted(lane[order], np.arange(len(lines) + 1))
-    for k, line in enumerate(lines):
-        rows = order[borders[k] : borders[k + 1]]
-        along[rows], offset[rows] = project(xy[rows], line)
+    rows = np.split(order, borders[1:-1])
+    for of_lane, placed in zip(
+        rows, parallel_map(lambda k: project(xy[rows[k]], lines[k]), range(len(lines))), strict=True
+    ):
+        along[of_lane], offset[of_lane] = placed
     return LaneSamples(samples.track[keep], lane, along, offset, samples.time_s[keep], samples.speed_m_per_s[keep])
 
 
@@ -151,8 +165,7 @@ def project(xy_m: FloatArray, line_m: FloatArray) -> tuple[FloatArray, FloatArra
 
 
 def _lanes(lines: list[FloatArray], on_lanes: LaneSamples) -> tuple[Lane, ...]:
-    pairs = np.unique(np.column_stack([on_lanes.track, on_lanes.lane]), axis=0)
-    tracks = np.bincount(pairs[:, 1], minlength=len(lines))
+    tracks = _tracks_on(on_lanes.track, on_lanes.lane, len(lines))
     gaps = _neighbours(lines)
     order = np.argsort(on_lanes.lane, kind="stable")
     borders = np.searchsorted(on_lanes.lane[order], np.arange(len(lines) + 1))

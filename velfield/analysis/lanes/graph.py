@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
+from numba import njit
 
 from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.analysis.lanes.ridges import NODE_SPACING_M, Nodes
@@ -58,9 +60,21 @@ def count_links(track: IntArray, node: IntArray, nodes: Nodes) -> Links:
     step = nodes.xy_m[b] - nodes.xy_m[a]
     ahead = np.cos(nodes.direction_rad[a]) * step[:, 0] + np.sin(nodes.direction_rad[a]) * step[:, 1]
     ok = (np.hypot(step[:, 0], step[:, 1]) < _MAX_STEP_M) & (ahead > 0)
-    once = np.unique(np.column_stack([owner[ok], a[ok], b[ok]]), axis=0)
-    pairs, count = np.unique(once[:, 1] * np.int64(len(nodes)) + once[:, 2], return_counts=True)
+    # by hashing: there are few pairs of nodes
+    number, pairs = pd.factorize(a[ok] * np.int64(len(nodes)) + b[ok], sort=True)
+    pairs, count = np.asarray(pairs, np.int64), count_once(owner[ok], number, len(pairs))
     return Links(pairs // len(nodes), pairs % len(nodes), count)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def count_once(owner: IntArray, number: IntArray, n: int) -> IntArray:
+    """How many owners have each of n numbers, an owner's rows being together."""
+    count, last = np.zeros(n, np.int64), np.full(n, -1, np.int64)
+    for k in range(len(owner)):
+        if last[number[k]] != owner[k]:
+            last[number[k]] = owner[k]
+            count[number[k]] += 1
+    return count
 
 
 def make_chains(nodes: Nodes, links: Links, *, min_tracks: int) -> Chains:

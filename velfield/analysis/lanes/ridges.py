@@ -8,6 +8,7 @@ neighbours (mean shift) until it lies on the ridge; then nodes are chosen along 
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from numba import njit
 from scipy.spatial import cKDTree
 
@@ -57,9 +58,9 @@ def bin_keys(xy_m: FloatArray, direction_rad: FloatArray) -> IntArray:
     return np.asarray((cell[:, 1] << 21 | cell[:, 0]) * SECTORS + sector, np.int64)
 
 
-def bin_samples(samples: PathSamples, keys: IntArray) -> Bins:
-    """The occupied bins of all samples."""
-    key, inverse = np.unique(keys, return_inverse=True)
+def bin_samples(samples: PathSamples, keys: IntArray) -> tuple[Bins, IntArray]:
+    """The occupied bins of all samples, and the number (n,) of each sample's bin."""
+    inverse, key = pd.factorize(keys, sort=True)  # by hashing: samples are many times as many as bins
     sums = [
         np.bincount(inverse, values, len(key))
         for values in (
@@ -71,12 +72,13 @@ def bin_samples(samples: PathSamples, keys: IntArray) -> Bins:
         )
     ]
     weight = sums[0]
-    return Bins(
-        key,
+    bins = Bins(
+        np.asarray(key, np.int64),
         np.column_stack([sums[1], sums[2]]) / weight[:, None],
         np.arctan2(sums[4], sums[3]),
         np.asarray(weight, np.float64),
     )
+    return bins, np.asarray(inverse, np.int64)
 
 
 def find_nodes(bins: Bins, *, min_weight: float) -> Nodes:

@@ -18,7 +18,7 @@ from velfield.analysis.lanes.junctions import inside_hull
 from velfield.analysis.lanes.model import Junction, LaneGraph, Turn
 from velfield.analysis.movements.cut_tracks import CutTracks, join_cut_tracks
 from velfield.analysis.movements.gates import Gates, find_gates
-from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
+from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths, within
 
 _UPSTREAM_M = 60
 """A travel time begins so far before the junction where the track does."""
@@ -125,7 +125,7 @@ def find_movements(
 def find_passes(samples: PathSamples, junction: Junction, gates: Gates) -> Passes:
     """Tracks in the area of a junction."""
     low, high = junction.hull_m.min(axis=0), junction.hull_m.max(axis=0)
-    near = np.flatnonzero(((samples.xy_m >= low) & (samples.xy_m <= high)).all(axis=1))
+    near = within(samples.xy_m, low, high)
     inside = near[inside_hull(samples.xy_m[near], junction.hull_m)]
     if not len(inside):
         none, number = np.empty(0), np.empty(0, np.int64)

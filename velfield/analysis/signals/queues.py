@@ -6,7 +6,7 @@ import numpy as np
 
 from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.analysis.lanes.model import Junction, LaneGraph
-from velfield.analysis.trajectories import VEHICLE_LENGTH_M, PathSamples, Trajectories
+from velfield.analysis.trajectories import VEHICLE_LENGTH_M, PathSamples, Trajectories, within
 
 STOP_M_PER_S, GO_M_PER_S = 0.7, 1.4
 """A vehicle has stopped below the one, and goes again above the other."""
@@ -223,7 +223,7 @@ def _crossings(path_m: FloatArray, at_m: float, samples: PathSamples) -> tuple[F
     u = path_m[k + 1] - path_m[k]
     u = u / max(float(np.hypot(*u)), 1e-9)
     origin = path_m[k] + (at_m - k) * u
-    near = np.flatnonzero((np.abs(samples.xy_m - origin) < 4.0).all(axis=1))
+    near = within(samples.xy_m, origin - 4.0, origin + 4.0)
     d = samples.xy_m[near] - origin
     s, across = d @ u, np.abs(u[0] * d[:, 1] - u[1] * d[:, 0])
     pair = (np.diff(near) == 1) & (np.diff(samples.track[near]) == 0) & (s[:-1] < 0) & (s[1:] >= 0)

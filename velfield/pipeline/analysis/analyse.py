@@ -122,6 +122,7 @@ def write_analysis(
     analysis: TrafficAnalysis, out: Path, georeference: Georeference, *, gsd_known: bool, picture: GreyImage | None
 ) -> Iterator[str]:
     """Write lanes, tables, report and workbook; a line on each."""
+    analysis.answer_all()
     gsd_m = analysis.trajectories.gsd_m
     lanes = _with_answers(lanes_record(analysis.lanes, gsd_m), analysis)
     write_atomically(out / "lanes.json", lanes.model_dump_json().encode())
