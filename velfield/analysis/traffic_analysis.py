@@ -1,5 +1,6 @@
 """`TrafficAnalysis`: every question about the tracks of one flight, each answer computed once."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -35,7 +36,10 @@ from velfield.analysis.signals.cycles import JunctionSignal, find_signal
 from velfield.analysis.signals.queues import Stream, find_approaches, find_stops, observe_stream
 from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
 from velfield.analysis.unusual import DoubtfulPlace, Unusual, find_doubtful_places, find_unusual
-from velfield.parallel import parallel_map
+
+
+_THREADS = 2
+"""Each needs memory of its own: of 100,000 tracks some GiB."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +69,7 @@ class TrafficAnalysis:
         return sample_paths(self.trajectories)
 
     def answer_all(self) -> None:
-        """Compute the answers that take long on all processors: each is there when it is asked for."""
+        """Compute the answers that take long beside each other: each is there when it is asked for."""
         shared = self.lane_traffic, self.cut_tracks  # what several of them read
         if len(shared[0].graph):
             shared[0].samples(0)
@@ -73,7 +77,8 @@ class TrafficAnalysis:
             ("conflicts",), ("free_flow",), ("movements", "reductions", "unusual"), ("streams", "signals"), ("flows",),
             ("reversals", "doubtful_places"),
         )  # fmt: skip
-        parallel_map(lambda names: [getattr(self, name) for name in names], groups)
+        with ThreadPoolExecutor(_THREADS) as pool:
+            list(pool.map(lambda names: [getattr(self, name) for name in names], groups))
 
     @property
     def window_s(self) -> tuple[float, float]:

@@ -1,5 +1,7 @@
 """`find_lanes`: the lane graph of a flight's tracks."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -9,7 +11,6 @@ from velfield.analysis.lanes.junctions import find_junctions
 from velfield.analysis.lanes.model import Connection, Lane, LaneGraph, LaneSamples, Turn, WidthSource
 from velfield.analysis.lanes.ridges import Nodes, bin_keys, bin_samples, find_nodes
 from velfield.analysis.trajectories import VEHICLE_WIDTH_M, PathSamples, Trajectories, sample_paths
-from velfield.parallel import parallel_map
 
 MIN_TRACKS = 3
 """A lane, or a connection, that fewer tracks drove is not one: an error of tracking or of a driver."""
@@ -22,6 +23,7 @@ _LOOK_M = 12.0
 """A turn is the change of direction from so far before a connection to so far after it."""
 _MIN_LENGTH_M = 8.0
 """A track shorter than this drives on no lane."""
+_THREADS = 2
 
 
 def find_lanes(
@@ -136,10 +138,10 @@ def _place(samples: PathSamples, node: IntArray, chains: Chains, n: int, lines: 
     order = np.argsort(lane, kind="stable")
     borders = np.searchsorted(lane[order], np.arange(len(lines) + 1))
     rows = np.split(order, borders[1:-1])
-    for of_lane, placed in zip(
-        rows, parallel_map(lambda k: project(xy[rows[k]], lines[k]), range(len(lines))), strict=True
-    ):
-        along[of_lane], offset[of_lane] = placed
+    with ThreadPoolExecutor(_THREADS) as pool:
+        placed = pool.map(lambda k: project(xy[rows[k]], lines[k]), range(len(lines)))
+        for of_lane, (s, miss) in zip(rows, placed, strict=True):
+            along[of_lane], offset[of_lane] = s, miss
     return LaneSamples(samples.track[keep], lane, along, offset, samples.time_s[keep], samples.speed_m_per_s[keep])
 
 
