@@ -37,7 +37,6 @@ from velfield.analysis.signals.queues import Stream, find_approaches, find_stops
 from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
 from velfield.analysis.unusual import DoubtfulPlace, Unusual, find_doubtful_places, find_unusual
 
-
 _THREADS = 2
 """Each needs memory of its own: of 100,000 tracks some GiB."""
 
