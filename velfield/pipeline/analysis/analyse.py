@@ -1,7 +1,7 @@
 """`analyse_run`, `analyse_tracks`: answers from the tracks of a run, or of another program, written into a folder."""
 
 import base64
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -9,7 +9,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from schemas.analysis import AnalysisRecord, LanesRecord
+from schemas.analysis import AnalysisColumn, AnalysisRecord, AnalysisTable, LanesRecord
 from schemas.arrays import GreyImage
 from velfield.analysis.movements.time_slices import SLICE_S
 from velfield.analysis.traffic_analysis import TrafficAnalysis
@@ -17,14 +17,15 @@ from velfield.analysis.trajectories import make_trajectories, moving
 from velfield.errors import InputError
 from velfield.exports.georeference import Georeference
 from velfield.pipeline.analysis.answers import answers, explain_empty
+from velfield.pipeline.analysis.clips import Frames, unusual_clips
 from velfield.pipeline.analysis.lanes_record import lanes_geojson, lanes_record
 from velfield.pipeline.analysis.page import report_html
 from velfield.pipeline.analysis.tables import all_tables
 from velfield.pipeline.analysis.workbook import EXTRA, can_write_workbook, workbook_bytes
 from velfield.run.commits import code_version, read_commits, write_atomically
 from velfield.run.flight_record import read_flight_record
-from velfield.run.layout import RunLayout, to_path
-from velfield.run.run import open_run
+from velfield.run.layout import RunLayout, remove_tree, to_path
+from velfield.run.run import Run, open_run
 from velfield.sources.trajectories import read_tracks
 
 TRACKS = "tracks"
@@ -51,7 +52,15 @@ def analyse_run(run_folder: Path, *, slice_s: float = SLICE_S) -> Iterator[str]:
         Georeference.from_grid(run.grid),
         gsd_known=run.grid.gsd_m is not None,
         picture=run.base_image,
+        frames=_frames(run),
     )
+
+
+def _frames(run: Run) -> Frames | None:
+    """The frames of a run; None of one that was made of tracks."""
+    if run.record.inputs.source.kind == "tracks" or not run.layout.frames.exists():
+        return None
+    return Frames(run.times_s, run.frames.read, run.frame_transforms.transform)
 
 
 def _stale_lines(layout: RunLayout) -> Iterator[str]:
@@ -119,25 +128,35 @@ def _check_slice(slice_s: float) -> None:
 
 
 def write_analysis(
-    analysis: TrafficAnalysis, out: Path, georeference: Georeference, *, gsd_known: bool, picture: GreyImage | None
+    analysis: TrafficAnalysis,
+    out: Path,
+    georeference: Georeference,
+    *,
+    gsd_known: bool,
+    picture: GreyImage | None,
+    frames: Frames | None = None,
 ) -> Iterator[str]:
-    """Write lanes, tables, report and workbook; a line on each."""
+    """Write lanes, tables, report and workbook, and strips of pictures of unusual tracks; a line on each."""
     analysis.answer_all()
     gsd_m = analysis.trajectories.gsd_m
     lanes = _with_answers(lanes_record(analysis.lanes, gsd_m), analysis)
     write_atomically(out / "lanes.json", lanes.model_dump_json().encode())
     write_atomically(out / "lanes.geojson", lanes_geojson(lanes, georeference).encode())
+    clips = dict(unusual_clips(analysis, frames)) if frames else {}
+    remove_tree(out / "clips")  # of an earlier analysis
+    for number, data in clips.items():
+        write_atomically(out / clip_name(number), data)
     record = AnalysisRecord(
         code_version=code_version(),
         gsd_m=gsd_m,
         gsd_known=gsd_known,
         duration_s=round(analysis.trajectories.duration_s, 3),
         tracks=len(analysis.trajectories),
-        tables=tuple(explain_empty(table, analysis) for table in all_tables(analysis)),
+        tables=tuple(_with_clips(explain_empty(table, analysis), clips) for table in all_tables(analysis)),
     )
     write_atomically(out / "analysis.json", record.model_dump_json().encode())
     yield from answers(analysis)
-    html = report_html(record, lanes, georeference.shape, _data_url(picture))
+    html = report_html(record, lanes, georeference.shape, _data_url(picture), clips)
     write_atomically(out / "report.html", html.encode())
     yield f"report      {out / 'report.html'}"
     if can_write_workbook():
@@ -145,6 +164,29 @@ def write_analysis(
         yield f"workbook    {out / 'analysis.xlsx'}"
     else:
         yield f"workbook    not written: pip install '{EXTRA}'"
+
+
+def clip_name(number: int) -> str:
+    """File of an unusual track's strip, in ``analysis/``.
+
+    Examples
+    --------
+    >>> clip_name(3)
+    'clips/unusual-003.jpg'
+    """
+    return f"clips/unusual-{number:03d}.jpg"
+
+
+def _with_clips(table: AnalysisTable, clips: Mapping[int, bytes]) -> AnalysisTable:
+    """The table of unusual tracks with the files of their strips; others as they are."""
+    if table.name != "unusual" or not clips:
+        return table
+    rows = tuple(
+        row.model_copy(update={"cells": {**row.cells, "clip": clip_name(k) if k in clips else None}})
+        for k, row in enumerate(table.rows)
+    )
+    column = AnalysisColumn(name="clip", title="Pictures")
+    return table.model_copy(update={"rows": rows, "columns": (*table.columns, column)})
 
 
 def _with_answers(lanes: LanesRecord, analysis: TrafficAnalysis) -> LanesRecord:

@@ -1,5 +1,7 @@
 """The report: one HTML file, with the map of lanes and every table."""
 
+from base64 import b64encode
+from collections.abc import Mapping
 from html import escape
 
 from schemas.analysis import AnalysisRecord, AnalysisTable, Cell, EstimateRecord, LanesRecord
@@ -15,11 +17,18 @@ td.text { text-align: left } .ci { color: #667079; white-space: nowrap } .none {
 svg { width: 100%; height: auto; background: #f3f4f6; border: 1px solid #d5d9de }
 p.note { color: #4b545d; max-width: 60em }
 nav a { margin-right: 1.2em }
+figure { margin: 0 0 1em } figure img { max-width: 100% }
 """
 _COLOURS = ("#2563eb", "#d97706", "#059669", "#dc2626", "#7c3aed", "#0891b2", "#be185d", "#4d7c0f")
 
 
-def report_html(record: AnalysisRecord, lanes: LanesRecord, shape: tuple[int, int], background: str | None) -> str:
+def report_html(
+    record: AnalysisRecord,
+    lanes: LanesRecord,
+    shape: tuple[int, int],
+    background: str | None,
+    clips: Mapping[int, bytes] | None = None,
+) -> str:
     """The report.
 
     Parameters
@@ -30,6 +39,8 @@ def report_html(record: AnalysisRecord, lanes: LanesRecord, shape: tuple[int, in
         (height, width) of the base image.
     background
         The base image as a data URL, or None.
+    clips
+        JPEG strips of unusual tracks, by their row.
     """
     links = "".join(f'<a href="#{table.name}">{escape(table.title)}</a>' for table in record.tables)
     head = (
@@ -39,10 +50,11 @@ def report_html(record: AnalysisRecord, lanes: LanesRecord, shape: tuple[int, in
     scale = (
         "" if record.gsd_known else " The ground sample distance is not known: lengths and speeds are by the paper's."
     )
+    sections = "".join(_section(table) + _clips(table, clips or {}) for table in record.tables)
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Traffic analysis</title><style>{_STYLE}</style>'
         f"<h1>Traffic analysis</h1><p>{escape(head + scale)}</p><nav>{links}</nav>"
-        f"{_map(lanes, shape, background)}{''.join(_section(table) for table in record.tables)}</html>"
+        f"{_map(lanes, shape, background)}{sections}</html>"
     )
 
 
@@ -82,6 +94,19 @@ def _section(table: AnalysisTable) -> str:
     body = f"<table><tr>{heads}</tr>{rows}</table>{more}" if table.rows else ""
     picture = diagram_svg(table) if table.name == "fundamental_diagram" and table.rows else ""
     return f'<h2 id="{table.name}">{escape(table.title)}</h2><p class="note">{escape(table.note)}</p>{picture}{body}'
+
+
+def _clips(table: AnalysisTable, clips: Mapping[int, bytes]) -> str:
+    """The strips below the table of unusual tracks: 2 s before to 2 s after, the vehicle in a ring."""
+    if table.name != "unusual":
+        return ""
+    out = []
+    for number, data in sorted(clips.items()):
+        cells = table.rows[number].cells
+        text = escape(f"{cells['kind']}, track {cells['track']}, frame {cells['frame']}, {cells['time']} s; 1 s apart")
+        url = f"data:image/jpeg;base64,{b64encode(data).decode()}"
+        out.append(f'<figure><img src="{url}" alt="{text}"><figcaption>{text}</figcaption></figure>')
+    return "".join(out)
 
 
 def diagram_svg(table: AnalysisTable) -> str:
