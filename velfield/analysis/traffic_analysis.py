@@ -21,6 +21,7 @@ from velfield.analysis.flow.speeds import (
 from velfield.analysis.flow.volume import LaneFlow, lane_flow
 from velfield.analysis.lanes.find import find_lanes
 from velfield.analysis.lanes.model import LaneGraph
+from velfield.analysis.movements.car_parks import CarPark, find_car_parks
 from velfield.analysis.movements.cut_tracks import CutTracks, join_cut_tracks
 from velfield.analysis.movements.movements import JunctionMovements, find_movements
 from velfield.analysis.movements.reversals import Reversal, find_reversals
@@ -49,6 +50,8 @@ class TrafficAnalysis:
     ----------
     slice_s
         Counts by time are of slices so long.
+    parked_m
+        (n, 2) positions of parked vehicles; None: not known.
 
     Examples
     --------
@@ -61,6 +64,7 @@ class TrafficAnalysis:
 
     trajectories: Trajectories
     slice_s: float = SLICE_S
+    parked_m: FloatArray | None = None
 
     @cached_property
     def samples(self) -> PathSamples:
@@ -109,6 +113,13 @@ class TrafficAnalysis:
     def scene(self) -> OriginDestination | None:
         """Origins and destinations of the whole scene; None where no road enters it and leaves it."""
         return find_origins_destinations(self.trajectories, self.samples, self.lanes)
+
+    @cached_property
+    def car_parks(self) -> list[CarPark]:
+        """Areas with parked vehicles, and the traffic through them; none where parked vehicles are not known."""
+        if self.parked_m is None or not len(self.samples):
+            return []
+        return find_car_parks(self.parked_m, self.samples, self.trajectories.duration_s)
 
     @cached_property
     def slice_edges_s(self) -> FloatArray:

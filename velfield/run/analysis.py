@@ -45,6 +45,8 @@ class RunAnalysis:
         Base pixels and configuration of the field.
     dimensions
         Returns the dimensions of the vehicles (`schemas.tables.DIMENSION_COLUMNS`); None: they were not measured.
+    vehicles
+        Returns the vehicles (`velfield.run.run.Run.vehicles`), of which some are parked; None: not known.
     """
 
     layer: Callable[[str], NDArray[np.generic]]
@@ -53,6 +55,7 @@ class RunAnalysis:
     grid: GridRecord
     config: FieldConfig
     dimensions: Callable[[], pd.DataFrame] | None = None
+    vehicles: Callable[[], pd.DataFrame] | None = None
 
     @cached_property
     def trajectories(self) -> Trajectories:
@@ -63,7 +66,11 @@ class RunAnalysis:
     @cached_property
     def traffic(self) -> TrafficAnalysis:
         """Answers about lanes, movements, speeds, signals, flow and conflicts: what `velfield analyse` writes."""
-        return TrafficAnalysis(self.trajectories)
+        if self.vehicles is None:
+            return TrafficAnalysis(self.trajectories)
+        known = self.vehicles()
+        parked = known.loc[(known["state"] == "parked").to_numpy(), ["x_px", "y_px"]].to_numpy(np.float64)
+        return TrafficAnalysis(self.trajectories, parked_m=parked * self.gsd_m)
 
     def lanes(self, *, min_tracks: int = MIN_TRACKS) -> LaneGraph:
         """Lanes, their connections and junctions: `find_lanes`.

@@ -213,7 +213,9 @@ class Run:
         def layer(name: str) -> NDArray[np.generic]:
             return open_field(self.layout.field).layer(name)
 
-        return RunAnalysis(layer, self.segments, self.tracklets, self.grid, self.record.config.field, self._dimensions)
+        return RunAnalysis(
+            layer, self.segments, self.tracklets, self.grid, self.record.config.field, self._dimensions, self.vehicles
+        )
 
     @cached_property
     def base_image(self) -> GreyImage:

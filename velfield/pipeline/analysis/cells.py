@@ -45,3 +45,8 @@ def point_geometry(xy_m: FloatArray, analysis: TrafficAnalysis) -> GeometryRecor
 def line_geometry(xy_m: FloatArray, analysis: TrafficAnalysis) -> GeometryRecord:
     """A line (n, 2) m."""
     return GeometryRecord(type="LineString", xy_px=points_px(xy_m, analysis.trajectories.gsd_m))
+
+
+def polygon_geometry(corners_m: FloatArray, analysis: TrafficAnalysis) -> GeometryRecord:
+    """An area of corners (n, 2) m."""
+    return GeometryRecord(type="Polygon", xy_px=points_px(corners_m, analysis.trajectories.gsd_m))

@@ -15,6 +15,7 @@ from velfield.pipeline.analysis.cells import (
     make_row,
     make_table,
     point_geometry,
+    polygon_geometry,
 )
 
 
@@ -22,6 +23,7 @@ def scene_tables(analysis: TrafficAnalysis) -> Iterator[AnalysisTable]:
     """The matrix of origins and destinations, and what is known of each pair."""
     yield matrix_table(analysis)
     yield relation_table(analysis)
+    yield car_park_table(analysis)
 
 
 def matrix_table(analysis: TrafficAnalysis) -> AnalysisTable:
@@ -91,6 +93,36 @@ def _relation_cells(r: Relation) -> dict[str, Cell]:
 
 def _between(r: Relation) -> np.ndarray:
     return np.array([r.origin.xy_m, r.destination.xy_m])
+
+
+def car_park_table(analysis: TrafficAnalysis) -> AnalysisTable:
+    """Through traffic of car parks."""
+    columns: Columns = {
+        "parked": ("Parked vehicles", ""),
+        "entered": ("Vehicles that drive in", ""),
+        "through": ("Of these, through without a stop", ""),
+        "share": ("Share", "%"),
+        "flow": ("Flow", "veh/h"),
+        "time": ("Time inside", "s"),
+    }
+    rows = (
+        make_row(
+            {
+                "parked": park.parked,
+                "entered": park.entered,
+                "through": park.through,
+                "share": estimate_cell(park.through_share, 100.0),
+                "flow": estimate_cell(park.through_veh_per_h),
+                "time": estimate_cell(park.time_s),
+            },
+            polygon_geometry(park.hull_m, analysis),
+        )
+        for park in analysis.car_parks
+    )
+    note = "Areas of six parked vehicles or more, 10 m wide or more, and who drives 15 m or more in them."
+    if analysis.parked_m is None:
+        note = "Parked vehicles are not known of these tracks."
+    return make_table("car_parks", "Movements", "Through traffic of car parks", note, columns, rows)
 
 
 def time_tables(analysis: TrafficAnalysis) -> Iterator[AnalysisTable]:
