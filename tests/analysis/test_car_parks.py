@@ -24,8 +24,9 @@ def traffic() -> list[Track]:
     return out + [drive(before, 350.0 + 5 * k) for k in range(2)]
 
 
-def analyse(parked: FloatArray) -> TrafficAnalysis:
-    return TrafficAnalysis(gather(traffic()), parked_m=parked)
+def analyse(parked: FloatArray, axis_rad: float = np.pi / 2) -> TrafficAnalysis:
+    known = np.column_stack([parked, np.full(len(parked), axis_rad)])
+    return TrafficAnalysis(gather(traffic()), parked=known)
 
 
 def test_who_drives_through_is_counted() -> None:
@@ -47,7 +48,12 @@ def test_who_drives_through_is_counted() -> None:
 def test_a_row_along_a_kerb_and_few_vehicles_are_no_car_park() -> None:
     assert analyse(ROWS[:20]).car_parks == []
     assert analyse(ROWS[[0, 1, 2, 20, 21]]).car_parks == []
-    assert find_car_parks(np.empty((0, 2)), analyse(ROWS).samples, 60.0) == []
+    assert find_car_parks(np.empty((0, 2)), np.empty(0), analyse(ROWS).samples, 60.0) == []
+
+
+def test_kerbs_on_both_sides_of_a_street_are_no_car_park() -> None:
+    assert analyse(ROWS, axis_rad=0.0).car_parks == []
+    assert len(analyse(ROWS, axis_rad=float("nan")).car_parks) == 1  # not known to be at a kerb
 
 
 def test_unknown_parking_is_reported_as_such() -> None:

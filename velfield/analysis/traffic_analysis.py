@@ -50,8 +50,8 @@ class TrafficAnalysis:
     ----------
     slice_s
         Counts by time are of slices so long.
-    parked_m
-        (n, 2) positions of parked vehicles; None: not known.
+    parked
+        (n, 3) position, m, and axial orientation, rad, of parked vehicles; None: not known.
 
     Examples
     --------
@@ -64,7 +64,7 @@ class TrafficAnalysis:
 
     trajectories: Trajectories
     slice_s: float = SLICE_S
-    parked_m: FloatArray | None = None
+    parked: FloatArray | None = None
 
     @cached_property
     def samples(self) -> PathSamples:
@@ -117,9 +117,9 @@ class TrafficAnalysis:
     @cached_property
     def car_parks(self) -> list[CarPark]:
         """Areas with parked vehicles, and the traffic through them; none where parked vehicles are not known."""
-        if self.parked_m is None or not len(self.samples):
+        if self.parked is None or not len(self.samples):
             return []
-        return find_car_parks(self.parked_m, self.samples, self.trajectories.duration_s)
+        return find_car_parks(self.parked[:, :2], self.parked[:, 2], self.samples, self.trajectories.duration_s)
 
     @cached_property
     def slice_edges_s(self) -> FloatArray:

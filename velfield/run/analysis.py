@@ -69,8 +69,9 @@ class RunAnalysis:
         if self.vehicles is None:
             return TrafficAnalysis(self.trajectories)
         known = self.vehicles()
-        parked = known.loc[(known["state"] == "parked").to_numpy(), ["x_px", "y_px"]].to_numpy(np.float64)
-        return TrafficAnalysis(self.trajectories, parked_m=parked * self.gsd_m)
+        parked = known.loc[(known["state"] == "parked").to_numpy(), ["x_px", "y_px", "orientation_rad"]]
+        scale = [self.gsd_m, self.gsd_m, 1.0]
+        return TrafficAnalysis(self.trajectories, parked=parked.to_numpy(np.float64) * scale)
 
     def lanes(self, *, min_tracks: int = MIN_TRACKS) -> LaneGraph:
         """Lanes, their connections and junctions: `find_lanes`.

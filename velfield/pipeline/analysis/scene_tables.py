@@ -119,8 +119,10 @@ def car_park_table(analysis: TrafficAnalysis) -> AnalysisTable:
         )
         for park in analysis.car_parks
     )
-    note = "Areas of six parked vehicles or more, 10 m wide or more, and who drives 15 m or more in them."
-    if analysis.parked_m is None:
+    note = (
+        "Areas of six parked vehicles or more, 10 m wide or more, kerbs left out, and who drives 15 m or more in them."
+    )
+    if analysis.parked is None:
         note = "Parked vehicles are not known of these tracks."
     return make_table("car_parks", "Movements", "Through traffic of car parks", note, columns, rows)
 
