@@ -18,6 +18,7 @@ from velfield.pipeline.given_tracks.write import at_frames, read_given_tracks
 from velfield.pipeline.result import commit
 from velfield.pipeline.stage import resolve
 from velfield.pipeline.units import prepare_stage, stage_units
+from velfield.pipeline.verify import verify_run
 from velfield.run.run import Run, open_run
 from velfield.synthetic.flight import Flight
 from velfield.synthetic.observed import NO_ERRORS, observed_detections
@@ -119,6 +120,10 @@ def test_the_field_has_the_true_speeds(run: Run) -> None:
     turn = np.angle(np.exp(1j * (np.arctan2(found[:, 1], found[:, 0]) - np.arctan2(v[:, 1], v[:, 0]))))[moving]
     assert np.quantile(np.abs(np.degrees(turn)), 0.9) < 20
     assert np.median(np.hypot(*found[moving].T) / np.hypot(*v[moving].T)) == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_run_is_whole(run: Run) -> None:
+    assert verify_run(run.layout, run.record) == []
 
 
 def test_the_run_has_its_vehicles_and_times(run: Run) -> None:

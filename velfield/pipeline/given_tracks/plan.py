@@ -64,12 +64,13 @@ def plan_tracks(job: Job) -> Plan:
     )
     inputs = InputsRecord(source=source, base=digest_path(base) if base else None)
     info = SourceInfo("folder", width, height, len(times_s), times_s, ())
+    keys = stage_keys(job.config, inputs)
     plan = Plan(
         job=job.model_copy(update={"config": job.config.model_copy(update={"gsd_m": given.gsd_m})}),
         info=info,
         indices=np.arange(len(times_s)),
         inputs=inputs,
-        keys=stage_keys(job.config, inputs),
+        keys={stage.name: keys[stage.name] for stage in list_track_stages()},  # of the others `verify` asks nothing
     )
     _ = plan.time_intervals  # refuses impossible intervals now
     return plan

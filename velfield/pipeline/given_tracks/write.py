@@ -4,7 +4,7 @@ Tracks are interpolated at common times, some 0.2 s apart, where a track has a p
 positions in a row are a tracklet, as in a run of a video.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -245,8 +245,9 @@ def make_tracklets(positions: pd.DataFrame, longest_s: float, gsd_m: float) -> p
 
 def _write_stores(plan: Plan) -> list[Path]:
     """Stores of frames and registration with times and no images: `velfield.open_run` reads times from them."""
-    create_frame_store(plan)
-    create_registration_store(plan)
+    stores = replace(plan, keys=plan.keys | dict.fromkeys(("frames", "registration"), plan.keys["tracks"]))
+    create_frame_store(stores)
+    create_registration_store(stores)
     store, written = open_frames(plan.layout.frames, "r+"), []
     for frames in plan.units:
         times_s = plan.info.times_s[frames.start : frames.stop]
