@@ -309,7 +309,7 @@ def to_coordinates(longitude: float, latitude: float, epsg: int) -> tuple[float,
     InputError
         There is no such system, or it does not cover the place.
     """
-    return _transformed(_DEGREES, _crs(epsg), longitude, latitude, epsg)
+    return _transform_points(_DEGREES, _crs(epsg), longitude, latitude, epsg)
 
 
 def to_degrees(x: float, y: float, epsg: int) -> tuple[float, float]:
@@ -320,10 +320,10 @@ def to_degrees(x: float, y: float, epsg: int) -> tuple[float, float]:
     InputError
         There is no such system, or they are outside of its area.
     """
-    return _transformed(_crs(epsg), _DEGREES, x, y, epsg)
+    return _transform_points(_crs(epsg), _DEGREES, x, y, epsg)
 
 
-def _transformed(source: CRS, to: CRS, x: float, y: float, epsg: int) -> tuple[float, float]:
+def _transform_points(source: CRS, to: CRS, x: float, y: float, epsg: int) -> tuple[float, float]:
     try:
         (x_to,), (y_to,) = transform(source, to, [x], [y])
     except CPLE_BaseError:
