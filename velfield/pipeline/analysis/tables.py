@@ -82,6 +82,8 @@ def profile_table(analysis: TrafficAnalysis) -> AnalysisTable:
         "vehicles": ("Vehicles", ""),
         **{f"p{q}": (f"Speed p{q}", "km/h") for q in (15, 50, 85)},
     }
+    profiles = {lane.number: analysis.profile(lane.number) for lane in analysis.lanes}
+    known = [lane for lane, stations in profiles.items() if any(station.p50 is not None for station in stations)]
     rows = (
         make_row(
             {
@@ -94,10 +96,13 @@ def profile_table(analysis: TrafficAnalysis) -> AnalysisTable:
             },
             point_geometry(station.xy_m, analysis),
         )
-        for lane in analysis.lanes
-        for station in analysis.profile(lane.number)
+        for lane in known
+        for station in profiles[lane]
     )
     note = "Every vehicle once at each station of 10 m."
+    if len(known) < len(profiles):
+        others = ", ".join(str(lane) for lane in profiles if lane not in known)
+        note += f" Of too few vehicles for any, and left out: lanes {others}."
     return make_table("speed_profile", "Speed", "Speed along lanes", note, columns, rows)
 
 
@@ -218,7 +223,7 @@ def reduction_table(analysis: TrafficAnalysis) -> AnalysisTable:
         )
         for r in analysis.reductions
     )
-    note = "Of vehicles that do not stop."
+    note = "Of vehicles that neither stop nor give way."
     return make_table("speed_reduction", "Speed", "Speed reduction at junctions", note, columns, rows)
 
 
