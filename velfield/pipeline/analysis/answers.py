@@ -22,8 +22,9 @@ def answers(analysis: TrafficAnalysis) -> Iterator[str]:
     length = sum(lane.length_m for lane in analysis.lanes) / 1000
     yield _line(
         "lanes",
-        f"{len(analysis.lanes)} lanes of {length:.2f} km, {len(analysis.lanes.junctions)} junctions, from "
-        f"{tracks} moving vehicles in {_duration(seconds)}",
+        f"{_count(len(analysis.lanes), 'lane')} of {length:.2f} km, "
+        f"{_count(len(analysis.lanes.junctions), 'junction')}, from "
+        f"{_count(tracks, 'moving vehicle')} in {_duration(seconds)}",
     )
     if seconds < _SHORT_S or tracks < _FEW_TRACKS:
         yield _line("", too_short(analysis))
@@ -47,7 +48,7 @@ def too_short(analysis: TrafficAnalysis) -> str:
     """What a short clip with few vehicles allows to say."""
     tracks, seconds = len(analysis.trajectories), analysis.trajectories.duration_s
     return (
-        f"{tracks} moving vehicles in {_duration(seconds)} are too few for most "
+        f"{_count(tracks, 'moving vehicle')} in {_duration(seconds)} {'is' if tracks == 1 else 'are'} too few for most "
         "questions: a movement needs 5, free flow 8 that go freely, a signal three cycles"
     )
 
@@ -60,7 +61,7 @@ def explain_empty(table: AnalysisTable, analysis: TrafficAnalysis) -> AnalysisTa
     if table.name in _EVENTS:
         reason = f"{_events(0, seconds).capitalize()}."
     elif seconds < _SHORT_S or tracks < _FEW_TRACKS:
-        reason = f"Too little data: {tracks} moving vehicles in {_duration(seconds)}."
+        reason = f"Too little data: {_count(tracks, 'moving vehicle')} in {_duration(seconds)}."
     else:
         reason = "None found."
     return table.model_copy(update={"note": f"{reason} {table.note}".strip()})
@@ -103,13 +104,19 @@ def _signal_lines(number: int, signal: JunctionSignal) -> Iterator[str]:
     if not signal.signalised or signal.cycle_s is None:
         yield _line("signal", f"junction {number}: {signal.reason}")
         return
-    yield _line("signal", f"junction {number}: cycle {_text(signal.cycle_s, 's')}, {len(signal.phases)} phases")
+    yield _line(
+        "signal", f"junction {number}: cycle {_text(signal.cycle_s, 's')}, {_count(len(signal.phases), 'phase')}"
+    )
     for lanes in signal.phases:
         streams = [s for s in signal.streams if s.stream.approach.lane in lanes]
         longest = max((q for s in streams for q in queues(s.stream, s.green_s)), key=lambda q: q.length_m, default=None)
-        queue = f", longest queue {longest.vehicles} vehicles, {longest.length_m:.0f} m" if longest else ""
+        queue = f", longest queue {_count(longest.vehicles, 'vehicle')}, {longest.length_m:.0f} m" if longest else ""
         green = _text(streams[0].green_phase_s, "s of the cycle")
         yield _line("", f"lanes {' '.join(map(str, lanes))}: green at {green}{queue}")
+
+
+def _count(n: int, noun: str) -> str:
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 def _events(n: int, seconds: float) -> str:
