@@ -7,7 +7,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import App, CycloptsError, MissingArgumentError, Parameter
 
 from flows.commands.start import own_command
 from flows.launch import limit_threads
@@ -117,12 +117,12 @@ def run(
         Image whose pixels become the base pixels: GeoTIFF, PNG with world file, or plain.
         Default: built from the flight.
     gsd_m
-        Ground sample distance, metres a base pixel. Default: by the base image's CRS or the drone's metadata; else
-        speeds stay in px/s.
+        Ground sample distance, metres a base pixel. Default: by the base image's CRS, the drone's metadata or the
+        lengths of the vehicles.
     labels
         Labelled cars to train on: CSV, GeoJSON, YOLO, COCO, LabelMe, VIA. Default: labels from motion.
     detector
-        A trained detector file, instead of training.
+        A trained detector file, or a YOLO-type ONNX model, instead of training.
     detections
         Boxes of another detector, instead of this one's.
     timestamps
@@ -487,6 +487,11 @@ def main() -> None:
     try:
         options = {"result_action": "return_value", "exit_on_error": False, "print_error": False}
         status = _start() if len(sys.argv) == 1 else app(sys.argv[1:], **options)
+    except MissingArgumentError as error:
+        chain, missing = " ".join(error.command_chain or ()), error.keyword
+        name = f"value for {missing}" if missing else getattr(error.argument, "name", "")
+        print(f"velfield: {chain}: found no {name}, which is needed; see `velfield {chain} --help`", file=sys.stderr)
+        status = USAGE
     except CycloptsError as error:  # the library's own message is a box of several lines
         print(f"velfield: {' '.join(str(error).split())} `velfield COMMAND --help` lists all", file=sys.stderr)
         status = USAGE
@@ -501,6 +506,11 @@ def main() -> None:
         status = BAD_INPUT
     except KeyboardInterrupt:
         leave(STOPPED)
+    except Exception as error:
+        if type(error).__module__.split(".")[0] not in ("botocore", "aiobotocore"):
+            raise
+        print(f"velfield: S3: {' '.join(str(error).split())}", file=sys.stderr)  # no such server, no credentials
+        status = BAD_INPUT
     sys.exit(status)
 
 

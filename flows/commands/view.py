@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from velfield.errors import InputError
+
 if TYPE_CHECKING:
     from starlette.applications import Starlette
 
@@ -28,6 +30,12 @@ def view(
         Open the browser, where there is a screen.
     """
     from velfield.viewer.server import view_app
+
+    if run_folder.parts[:1] == ("s3:",):
+        address = "s3://" + "/".join(run_folder.parts[1:])
+        raise InputError(
+            f"{address}: found a run on S3, expected a folder of this machine; copy it first, as by `aws s3 sync`"
+        )
 
     serve_until_interrupted(view_app(run_folder), port=port, open_browser=open_browser, place=run_folder)
     return 0

@@ -43,12 +43,14 @@ def command(
     ("arguments", "status", "text"),
     [
         (("train", "frames"), 2, "--labels"),
-        (("run",), 2, "SOURCE"),
+        (("run",), 2, "run: found no --out"),
+        (("simulate", "x", "--clip"), 2, "simulate: found no value for --clip"),
         (("fly",), 2, 'Unknown command "fly"'),
         (("run", "a", "--out", "b", "--workers", "many"), 2, "--workers"),
         (("run", "a", "--out", "b", "--workers", "0"), 1, "--workers 0: expected a whole number from 1 on"),
         (("run", "a", "--out", "b", "--gsd-m", "23"), 1, "gsd_m = 23"),
         (("verify", "/dev/null"), 1, "/dev/null"),
+        (("view", "s3://runs/flight"), 1, "s3://runs/flight: found a run on S3"),
     ],
 )
 def test_a_command_that_cannot_be_is_one_line(
@@ -76,6 +78,17 @@ def test_a_disk_that_refuses_is_one_line(
     monkeypatch.setattr(cli, "app", refuse)
     status, lines = command(monkeypatch, capsys, "schema")
     assert (status, lines) == (1, [f"velfield: {error}"])
+
+
+def test_an_object_store_that_does_not_answer_is_one_line() -> None:
+    """In a process of its own: the library keeps its connections by their options, and not by the environment."""
+    nowhere = {"AWS_ENDPOINT_URL": "http://127.0.0.1:9", "AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b"}
+    command = [sys.executable, "-m", "flows.cli", "verify", "s3://runs/flight"]
+    environment = {**os.environ, **nowhere, "AWS_MAX_ATTEMPTS": "1"}
+    ended = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    lines = ended.stderr.splitlines()
+    assert (ended.returncode, len(lines)) == (1, 1), lines
+    assert lines[0].startswith("velfield: S3: Could not connect")
 
 
 @pytest.mark.parametrize("option", ["base", "labels"])

@@ -24,7 +24,7 @@ def answers(analysis: TrafficAnalysis) -> Iterator[str]:
         "lanes",
         f"{_count(len(analysis.lanes), 'lane')} of {length:.2f} km, "
         f"{_count(len(analysis.lanes.junctions), 'junction')}, from "
-        f"{_count(tracks, 'moving vehicle')} in {_duration(seconds)}",
+        f"{_count(tracks, 'moving vehicle')} in {duration_text(seconds)}",
     )
     if seconds < _SHORT_S or tracks < _FEW_TRACKS:
         yield _line("", too_short(analysis))
@@ -47,8 +47,9 @@ def answers(analysis: TrafficAnalysis) -> Iterator[str]:
 def too_short(analysis: TrafficAnalysis) -> str:
     """What a short clip with few vehicles allows to say."""
     tracks, seconds = len(analysis.trajectories), analysis.trajectories.duration_s
+    verb = "is" if tracks == 1 else "are"
     return (
-        f"{_count(tracks, 'moving vehicle')} in {_duration(seconds)} {'is' if tracks == 1 else 'are'} too few for most "
+        f"{_count(tracks, 'moving vehicle')} in {duration_text(seconds)} {verb} too few for most "
         "questions: a movement needs 5, free flow 8 that go freely, a signal three cycles"
     )
 
@@ -61,7 +62,7 @@ def explain_empty(table: AnalysisTable, analysis: TrafficAnalysis) -> AnalysisTa
     if table.name in _EVENTS:
         reason = f"{_events(0, seconds).capitalize()}."
     elif seconds < _SHORT_S or tracks < _FEW_TRACKS:
-        reason = f"Too little data: {_count(tracks, 'moving vehicle')} in {_duration(seconds)}."
+        reason = f"Too little data: {_count(tracks, 'moving vehicle')} in {duration_text(seconds)}."
     else:
         reason = "None found."
     return table.model_copy(update={"note": f"{reason} {table.note}".strip()})
@@ -125,10 +126,11 @@ def _events(n: int, seconds: float) -> str:
         return str(n)
     hourly = -math.log(_NONE_PROBABILITY) / seconds * 3600
     rate = f"{hourly:.2g}" if hourly < 10 else f"{hourly:.0f}"
-    return f"none in {_duration(seconds)}, so fewer than {rate} an hour with 90 % probability"
+    return f"none in {duration_text(seconds)}, so fewer than {rate} an hour with 90 % probability"
 
 
-def _duration(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
+    """A duration in seconds or minutes, for people."""
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.1f} min"
 
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from html import escape
 
 from schemas.analysis import AnalysisRecord, AnalysisTable, Cell, EstimateRecord, LanesRecord
+from velfield.pipeline.analysis.answers import duration_text
 
 MAX_ROWS = 400
 """Rows of a table that are shown; the workbook and the JSON have all."""
@@ -44,7 +45,7 @@ def report_html(
     """
     links = "".join(f'<a href="#{table.name}">{escape(table.title)}</a>' for table in record.tables)
     head = (
-        f"{record.tracks} tracks of moving vehicles in {record.duration_s / 60:.1f} minutes. Grey: the 90 % interval "
+        f"{record.tracks} tracks of moving vehicles in {duration_text(record.duration_s)}. Grey: the 90 % interval "
         "and, in brackets, the number of vehicles (cycles, events) that it rests on."
     )
     scale = (
