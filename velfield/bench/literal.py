@@ -22,6 +22,8 @@ from velfield.pipeline.stage import STAGE, stages_before
 from velfield.run.stores import open_frames
 
 FRAMES = 4
+_SETTINGS = {"gsd_m": 0.23, "registration.max_residual_px": 12.0}
+"""A polyprojective model alone leaves more of a rolling shutter than a run would accept; here its cost counts."""
 _FEW_ROUNDS = 10
 
 
@@ -75,13 +77,11 @@ def time_literal_chain(flight: Path, root: Path, stages: Iterable[str], frames: 
 
 def _paper_plan(flight: Path, root: Path, frames: int) -> Plan:
     inputs = Inputs.from_simulated_flight(flight)
-    config = resolve_config(preset="paper", overrides={"gsd_m": 0.23})
+    config = resolve_config(preset="paper", overrides=_SETTINGS)
     whole = make_plan(Job(root=str(root), inputs=inputs, config=config))
     if frames < whole.frame_count:
         before_s, next_s = whole.info.times_s[whole.indices[frames - 1 : frames + 1]] - whole.info.times_s[0]
-        config = resolve_config(
-            preset="paper", overrides={"gsd_m": 0.23, "frames.stop_s": float(before_s + next_s) / 2}
-        )
+        config = resolve_config(preset="paper", overrides=_SETTINGS | {"frames.stop_s": float(before_s + next_s) / 2})
     plan = make_plan(Job(root=str(root), inputs=inputs, config=config))
     write_flight_record(plan)
     return plan
