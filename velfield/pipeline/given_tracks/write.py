@@ -18,6 +18,7 @@ from schemas.tables import DETECTION_COLUMNS, DIMENSION_COLUMNS, JOIN_COLUMNS, T
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
+from velfield.pipeline.stage import STAGE, stages_before
 from velfield.pipeline.stages.base_image import write_given_image
 from velfield.pipeline.stages.frames import create_frame_store
 from velfield.pipeline.stages.registration import create_registration_store
@@ -245,7 +246,8 @@ def make_tracklets(positions: pd.DataFrame, longest_s: float, gsd_m: float) -> p
 
 def _write_stores(plan: Plan) -> list[Path]:
     """Stores of frames and registration with times and no images: `velfield.open_run` reads times from them."""
-    stores = replace(plan, keys=plan.keys | dict.fromkeys(("frames", "registration"), plan.keys["tracks"]))
+    of_images = [name for name in stages_before("tracks") if STAGE[name].store]
+    stores = replace(plan, keys=plan.keys | dict.fromkeys(of_images, plan.keys["tracks"]))
     create_frame_store(stores)
     create_registration_store(stores)
     store, written = open_frames(plan.layout.frames, "r+"), []

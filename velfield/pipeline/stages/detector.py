@@ -49,6 +49,13 @@ _MIN_FRAMES_WITH_BOXES = 0.5
 """Fraction of the frames in which another program's boxes are expected."""
 
 
+_TRAINED = {
+    "labels": "trained on labelled cars",
+    "motion": "trained on what moves: it finds fewer cars that stand; label one frame (--labels) where queues matter",
+    "shipped": "as it ships",
+}
+
+
 def make_detector(plan: Plan) -> StageResult:
     """Set the scale of the working grid, and load or train the detector."""
     use_device(plan.config.work.device)
@@ -278,6 +285,8 @@ def _finish(
             warnings += detector.limitations
         write_atomically(layout.detector, detector.to_json().encode())
         outputs.append(layout.detector)
+        given = Path(plan.job.inputs.detector or "").name
+        notes.append(f"detector: {detector.method}, {_TRAINED.get(training_source, f'of the file {given}')}")
     if background is not None and detector is not None and detector.uses_background:
         write_background(layout, background)
         outputs.append(layout.background)
