@@ -4,6 +4,9 @@ import os
 import shlex
 import sys
 import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -354,26 +357,37 @@ def _process(
     runner: "RunnerConfig | None" = None,
     verbosity: "Verbosity" = "normal",
 ) -> int:
+    from velfield.pipeline.plan import check_inputs
+
+    with _prefect_console(verbosity, "flows.process_flight", lambda: check_inputs(job)) as console:
+        from flows.process_flight import run_flight
+        from flows.runners import RunnerConfig
+
+        summary = run_flight(job, runner or RunnerConfig(), console)
+    return _conclude(summary, console)
+
+
+@contextmanager
+def _prefect_console(
+    verbosity: "Verbosity", flow: str, check: Callable[[], object] = lambda: None
+) -> Iterator["Console"]:
+    """A console, with Prefect's server in use; ``check``, and the import of the flow, pass while the server starts."""
     from flows.launch import first_start, prepare_process
     from flows.stopping import stop_on_signals
     from flows.temporary_server import start_server
-    from velfield.pipeline.plan import check_inputs
 
     stop_on_signals()
     prepare_process(verbose=verbosity == "verbose")
     server = start_server()
-    check_inputs(job)
+    check()
     from flows.console import Console
 
     console = Console(verbosity)
     if first_start():
         console.event("start", "creating the Prefect database (first run only, about 30 s)")
-    from flows.process_flight import run_flight
-    from flows.runners import RunnerConfig
-
+    import_module(flow)
     with server.in_use():
-        summary = run_flight(job, runner or RunnerConfig(), console)
-    return _conclude(summary, console)
+        yield console
 
 
 def _process_tracks(job: "Job", runner: "RunnerConfig", verbosity: "Verbosity", *, plan_only: bool) -> int:
@@ -382,19 +396,11 @@ def _process_tracks(job: "Job", runner: "RunnerConfig", verbosity: "Verbosity", 
     if plan_only:
         print(describe_tracks(job))
         return DONE
-    from flows.launch import prepare_process
-    from flows.stopping import stop_on_signals
-    from flows.temporary_server import start_server
-
-    stop_on_signals()
-    prepare_process(verbose=verbosity == "verbose")
-    server = start_server()
-    from flows.console import Console
-    from flows.process_tracks import run_tracks
     from velfield.pipeline.analysis.analyse import analyse_run
 
-    console = Console(verbosity)
-    with server.in_use():
+    with _prefect_console(verbosity, "flows.process_tracks") as console:
+        from flows.process_tracks import run_tracks
+
         summary = run_tracks(job, runner, console)
     for line in analyse_run(Path(job.root)):
         console.result(line)

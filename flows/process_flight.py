@@ -76,19 +76,30 @@ def _leave_no_trace(layout: RunLayout) -> Iterator[None]:
 
 def _run_stages(job: Job, plan: Plan, runner: Runner, at_once: int, console: Console) -> RunSummary:
     """All stages, then the report."""
-    changed, dropped = changed_since(plan), dropped_inputs(plan)
-    write_flight_record(plan)
-    console.event("start", f"{job.inputs.source}: {plan.frame_count} frames to process, {runner.description}")
-    if changed:
-        text = f"{', '.join(changed)} changed since the last run; dependent stages are recomputed"
-        console.event("changed", f"{job.root}: {text}", changed=changed)
+    dropped = dropped_inputs(plan)
+    record_start(plan, f"{plan.frame_count} frames to process, {runner.description}", console)
     for warning in (*dropped, *plan.info.warnings):
         console.warn(warning)
     work = Work(plan, runner, console, at_once=at_once, aside=Previews(plan, runner, console))
     work.run()
     remove_tree(plan.layout.preview)
     summary = RunSummary(root=job.root, stages=tuple(work.summaries), frames_lost=lost_frames(work.plan))
-    for note in write_report(work.plan, summary):
-        console.warn(note)
-    publish_summary(work.plan, summary)
+    publish_report(work.plan, summary, console)
     return summary
+
+
+def record_start(plan: Plan, what: str, console: Console) -> None:
+    """Write the flight record; say what is processed, and what changed since the last run."""
+    changed = changed_since(plan)
+    write_flight_record(plan)
+    console.event("start", f"{plan.job.inputs.source}: {what}")
+    if changed:
+        text = f"{', '.join(changed)} changed since the last run; dependent stages are recomputed"
+        console.event("changed", f"{plan.job.root}: {text}", changed=changed)
+
+
+def publish_report(plan: Plan, summary: RunSummary, console: Console) -> None:
+    """Write the page and the report, and show the summary in Prefect's UI."""
+    for note in write_report(plan, summary):
+        console.warn(note)
+    publish_summary(plan, summary)

@@ -5,8 +5,8 @@ from pathlib import Path
 from prefect import flow
 from prefect.task_runners import ThreadPoolTaskRunner
 
-from flows.artifacts import publish_summary
 from flows.console import Console
+from flows.process_flight import publish_report, record_start
 from flows.runners import RunnerConfig, open_runner, parallel_units
 from flows.stale import mark_crashed
 from flows.work import Work
@@ -14,8 +14,6 @@ from schemas.job import Job
 from schemas.summary import RunSummary
 from velfield.pipeline.given_tracks.plan import list_track_stages, plan_tracks
 from velfield.pipeline.graphs import tracks_graph
-from velfield.pipeline.plan import changed_since, write_flight_record
-from velfield.pipeline.stages.report import write_report
 from velfield.run.commits import sweep_partial
 from velfield.run.flight_record import check_format
 from velfield.run.layout import RunLayout
@@ -43,16 +41,9 @@ def process_tracks(job: Job, runner: RunnerConfig, console: Console) -> RunSumma
     with locked(layout), open_runner(runner, console.warn) as where:
         mark_crashed(job.root)
         sweep_partial(layout.root)
-        changed = changed_since(plan)
-        write_flight_record(plan)
-        console.event("start", f"{job.inputs.source}: tracks over {plan.frame_count} times, {where.description}")
-        if changed:
-            text = f"{', '.join(changed)} changed since the last run; dependent stages are recomputed"
-            console.event("changed", f"{job.root}: {text}", changed=changed)
+        record_start(plan, f"tracks over {plan.frame_count} times, {where.description}", console)
         work = Work(plan, where, console, at_once=parallel_units(runner))
         work.run(list_track_stages(), tracks_graph, essential=True)
         summary = RunSummary(root=job.root, stages=tuple(work.summaries))
-        for note in write_report(work.plan, summary):
-            console.warn(note)
-        publish_summary(work.plan, summary)
+        publish_report(work.plan, summary, console)
     return summary
