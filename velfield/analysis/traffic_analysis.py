@@ -37,6 +37,7 @@ from velfield.analysis.signals.cycles import JunctionSignal, find_signal
 from velfield.analysis.signals.queues import Stream, find_approaches, find_stops, observe_stream
 from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
 from velfield.analysis.unusual import DoubtfulPlace, Unusual, find_doubtful_places, find_unusual
+from velfield.analysis.vehicle_classes import VehicleClasses
 
 _THREADS = 2
 """Each needs memory of its own: of 100,000 tracks some GiB."""
@@ -52,6 +53,8 @@ class TrafficAnalysis:
         Counts by time are of slices so long.
     parked
         (n, 3) position, m, and axial orientation, rad, of parked vehicles; None: not known.
+    classes
+        Of the vehicles of the trajectories; None: not known.
 
     Examples
     --------
@@ -65,6 +68,7 @@ class TrafficAnalysis:
     trajectories: Trajectories
     slice_s: float = SLICE_S
     parked: FloatArray | None = None
+    classes: VehicleClasses | None = None
 
     @cached_property
     def samples(self) -> PathSamples:

@@ -21,6 +21,7 @@ from velfield.analysis.stops import find_stops
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import Trajectories, from_tracklets, moving
 from velfield.analysis.u_turns import find_u_turns
+from velfield.analysis.vehicle_classes import VehicleClasses, find_classes
 from velfield.field.segments import Segments, stationary_speed_px_per_s
 from velfield.field.statistics import direction_rad
 from velfield.run.frame_transforms import heading_deg, north_direction_rad
@@ -67,11 +68,20 @@ class RunAnalysis:
     def traffic(self) -> TrafficAnalysis:
         """Answers about lanes, movements, speeds, signals, flow and conflicts: what `velfield analyse` writes."""
         if self.vehicles is None:
-            return TrafficAnalysis(self.trajectories)
+            return TrafficAnalysis(self.trajectories, classes=self._classes)
         known = self.vehicles()
         parked = known.loc[(known["state"] == "parked").to_numpy(), ["x_px", "y_px", "orientation_rad"]]
         scale = [self.gsd_m, self.gsd_m, 1.0]
-        return TrafficAnalysis(self.trajectories, parked=parked.to_numpy(np.float64) * scale)
+        return TrafficAnalysis(self.trajectories, parked=parked.to_numpy(np.float64) * scale, classes=self._classes)
+
+    @property
+    def _classes(self) -> VehicleClasses | None:
+        """Classes of the vehicles that move; None where nothing gives their dimensions in metres."""
+        if self.dimensions is None or self.grid.gsd_m is None:
+            return None
+        table = self.dimensions().set_index("track_id").reindex(self.trajectories.track_id) * self.grid.gsd_m
+        size, sd = (table[[f"length{k}_px", f"width{k}_px"]].to_numpy(np.float64) for k in ("", "_sd"))
+        return find_classes(size, sd)
 
     def lanes(self, *, min_tracks: int = MIN_TRACKS) -> LaneGraph:
         """Lanes, their connections and junctions: `find_lanes`.

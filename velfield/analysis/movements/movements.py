@@ -87,6 +87,13 @@ class JunctionMovements:
         """Vehicles that passed."""
         return float(sum(m.seen + m.inferred for m in self.movements))
 
+    def tracks(self, movement: Movement) -> IntArray:
+        """Numbers of the tracks of a movement's vehicles whose both ends are known: those that enter."""
+        name = np.array([self.gates.arms[gate.arm].name for gate in self.gates.gates] + [""])
+        passes = self.passes
+        rows = (name[passes.gate_in] == movement.arm_in) & (name[passes.gate_out] == movement.arm_out)
+        return np.asarray(passes.track[rows])
+
 
 def find_movements(
     trajectories: Trajectories,

@@ -7,6 +7,7 @@ from schemas.analysis import AnalysisTable
 from velfield.analysis.intervals import Estimate
 from velfield.analysis.signals.cycles import JunctionSignal, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.analysis.vehicle_classes import COUNTED_CLASSES
 
 MAX_LINES = 12
 """Lines on movements, on origins and destinations, and on lanes, that are printed: those with the most vehicles."""
@@ -28,6 +29,7 @@ def answers(analysis: TrafficAnalysis) -> Iterator[str]:
     )
     if seconds < _SHORT_S or tracks < _FEW_TRACKS:
         yield _line("", too_short(analysis))
+    yield from _class_lines(analysis)
     yield from _movement_lines(analysis)
     yield from _scene_lines(analysis)
     yield from _speed_lines(analysis)
@@ -66,6 +68,17 @@ def explain_empty(table: AnalysisTable, analysis: TrafficAnalysis) -> AnalysisTa
     else:
         reason = "None found."
     return table.model_copy(update={"note": f"{reason} {table.note}".strip()})
+
+
+def _class_lines(analysis: TrafficAnalysis) -> Iterator[str]:
+    if analysis.classes is None or not len(analysis.classes.measured):
+        return
+    shares = analysis.classes.estimate_shares(analysis.classes.measured)
+    known = [(name, share) for name, share in zip(COUNTED_CLASSES, shares, strict=True) if share is not None]
+    rest = ", ".join(f"{name} {100 * s.value:.3g} % ({100 * s.low:.3g} to {100 * s.high:.3g})" for name, s in known)
+    yield _line(
+        "classes", f"of {_count(len(analysis.classes.measured), 'measured vehicle')}: {rest or 'too little data'}"
+    )
 
 
 def _movement_lines(analysis: TrafficAnalysis) -> Iterator[str]:

@@ -18,6 +18,7 @@ from velfield.pipeline.analysis.cells import (
     make_table,
     point_geometry,
 )
+from velfield.pipeline.analysis.class_tables import class_table, heavy_cell
 from velfield.pipeline.analysis.flow_tables import diagram_table, growth_table, offset_table
 from velfield.pipeline.analysis.scene_tables import scene_tables, time_tables
 
@@ -30,6 +31,7 @@ def all_tables(analysis: TrafficAnalysis) -> Iterator[AnalysisTable]:
         movement_table(analysis),
         *scene_tables(analysis),
         *time_tables(analysis),
+        class_table(analysis),
         reversal_table(analysis),
         limit_table(analysis),
         reduction_table(analysis),
@@ -118,6 +120,7 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
         "inferred": ("Vehicles inferred", ""),
         "share": ("Share of the entry", "%"),
         "flow": ("Flow", "veh/h"),
+        "heavy": ("Lorries and buses", "%"),
         "travel_time": ("Travel time", "s"),
         "delay": ("Delay", "s"),
         "los": ("Level of service", ""),
@@ -138,6 +141,7 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
                 "inferred": round(m.inferred, 1),
                 "share": estimate_cell(m.share, 100.0),
                 "flow": estimate_cell(m.flow_veh_per_h),
+                "heavy": heavy_cell(analysis, found.tracks(m)),
                 "travel_time": estimate_cell(m.travel_time_s),
                 "delay": estimate_cell(m.delay_s),
                 "los": los,
