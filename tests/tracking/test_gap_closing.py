@@ -95,6 +95,20 @@ def test_a_queue_lost_as_a_whole_sets_off_in_its_order() -> None:
     assert reconnected([*before, *after], stationary_gap_s=60.0) == [*range(6), *range(6)]
 
 
+@pytest.mark.parametrize("frames", [3, 8])
+def test_a_velocity_that_the_positions_contradict_is_not_believed(frames: int) -> None:
+    """The last crop of a vehicle that drives under a tree aligned with the tree."""
+    again_s = INTERVAL_S * (frames - 1) + 1.6
+    before, after = seen(0.0, frames, 0.0, 9.0), seen(again_s, 6, 9.0 * again_s, 9.0)
+    assert reconnected([before, after]) == [0, 0]
+    before.loc[before.index[-1], "vx_12_px_per_s"] = 0.2
+    assert reconnected([before, after]) == [0, 0]
+    stands = seen(again_s, 6, 9.0 * (again_s - 1.6) + 0.5, 0.0)  # another one, where it was seen last
+    assert reconnected([before, stands], stationary_gap_s=30.0) == [0, 1]
+    after.loc[after.index[0], "vx_01_px_per_s"] = -3.0
+    assert reconnected([before, after]) == [0, 0]
+
+
 def test_joins_are_chosen_together() -> None:
     """The nearest pair of all would leave two others apart that are a vehicle's as well."""
     ends = [seen(0.0, 6, 0.0, 10.0), seen(0.0, 6, 1.6, 10.0)]

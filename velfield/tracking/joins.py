@@ -60,6 +60,9 @@ _CERTAINTY_OFFSET, _CERTAINTY_SLOPE = 0.0, 3.0
 """Log odds that a join is right, from what the total would cost more without it."""
 _MIN_PROBABILITY = 0.75
 """A join of a lower probability is not made."""
+_VELOCITY_SLACK_M_PER_S = 1.5
+"""By how much a velocity at an end may differ from the median of what is known around it: an acceleration within a
+link's time."""
 _MAX_TABLE = 250_000
 """Ends times starts of a group up to which they are assigned by a table of all."""
 _PAIRS_AT_ONCE, _LOOKS_AT_ONCE = 100_000, 20_000
@@ -212,10 +215,48 @@ def close_gaps(
 
 
 def find_ends(tracklets: pd.DataFrame, track: IntArray, count: int, gsd_m: float | None) -> tuple[TrackEnds, TrackEnds]:
-    """Starts and ends of tracks, from `END_COLUMNS`; ``track`` (n,) is the index of each tracklet's, of ``count``."""
+    """Starts and ends of tracks, from `END_COLUMNS`; ``track`` (n,) is the index of each tracklet's, of ``count``.
+
+    A velocity is that of the last link, unless the links and positions before contradict it: half under a tree a crop
+    aligns with the leaves.
+    """
     metres = PAPER_GSD_M if gsd_m is None else gsd_m
     first, last = end_rows(tracklets, track, count)
-    return _ends(tracklets.iloc[first], "0", "01", metres), _ends(tracklets.iloc[last], "2", "12", metres)
+    starts = _ends(tracklets, track, first, ("0", "01", "12"), metres)
+    return starts, _ends(tracklets, track, last, ("2", "12", "01"), metres)
+
+
+def _ends(
+    tracklets: pd.DataFrame, track: IntArray, rows: IntArray, names: tuple[str, str, str], metres: float
+) -> TrackEnds:
+    """The ends at the outer tracklet (count,) of each track: ``names`` of its outer detection, outer and inner link."""
+    detection, outer, inner = names
+    order = np.lexsort((tracklets[f"time_{detection}_s"].to_numpy(), track))
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    beside = order[np.clip(rank[rows] + (1 if detection == "0" else -1), 0, max(len(order) - 1, 0))]
+    ends, before = tracklets.iloc[rows], tracklets.iloc[beside]
+    alone = ((track[beside] != track[rows]) | (beside == rows))[:, None]
+    last = _velocity(ends, outer)
+    known = [last, _velocity(ends, inner), _velocity(ends, None)]
+    known += [np.where(alone, np.nan, _velocity(before, link)) for link in (inner, None)]
+    usual = np.nanmedian(np.stack(known), axis=0)
+    contradicted = np.hypot(*(last - usual).T) * metres > _VELOCITY_SLACK_M_PER_S
+    return TrackEnds(
+        ends[f"frame_{detection}"].to_numpy(np.int64),
+        ends[f"time_{detection}_s"].to_numpy(np.float64),
+        ends[[f"x_{detection}_px", f"y_{detection}_px"]].to_numpy(np.float64) * metres,
+        np.where(contradicted[:, None], usual, last) * metres,
+    )
+
+
+def _velocity(rows: pd.DataFrame, link: str | None) -> FloatArray:
+    """(n, 2) px/s of a link of tracklets; None: by their first and last positions."""
+    if link is not None:
+        return rows[[f"vx_{link}_px_per_s", f"vy_{link}_px_per_s"]].to_numpy(np.float64)
+    duration = (rows["time_2_s"] - rows["time_0_s"]).to_numpy(np.float64)
+    moved = [(rows[f"{axis}_2_px"] - rows[f"{axis}_0_px"]).to_numpy(np.float64) for axis in "xy"]
+    return np.asarray(np.column_stack(moved) / duration[:, None])
 
 
 def end_rows(tracklets: pd.DataFrame, track: IntArray, count: int) -> tuple[IntArray, IntArray]:
@@ -234,15 +275,6 @@ def _cost_of_looks(before: FloatArray, after: FloatArray) -> FloatArray:
         return np.zeros(len(difference))
     excess = np.nan_to_num(difference) / _USUAL_LOOKS_DIFFERENCE - 1
     return np.where(known, np.clip(_LOOKS_WEIGHT * excess, -_MAX_LOOKS_COST / 2, _MAX_LOOKS_COST), 0.0)
-
-
-def _ends(rows: pd.DataFrame, detection: str, link: str, metres: float) -> TrackEnds:
-    return TrackEnds(
-        rows[f"frame_{detection}"].to_numpy(np.int64),
-        rows[f"time_{detection}_s"].to_numpy(np.float64),
-        rows[[f"x_{detection}_px", f"y_{detection}_px"]].to_numpy(np.float64) * metres,
-        rows[[f"vx_{link}_px_per_s", f"vy_{link}_px_per_s"]].to_numpy(np.float64) * metres,
-    )
 
 
 def _candidates(ends: TrackEnds, starts: TrackEnds, gaps: GapLimits) -> tuple[IntArray, FloatArray]:
