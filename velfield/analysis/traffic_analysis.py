@@ -116,7 +116,7 @@ class TrafficAnalysis:
     @cached_property
     def scene(self) -> OriginDestination | None:
         """Origins and destinations of the whole scene; None where no road enters it and leaves it."""
-        return find_origins_destinations(self.trajectories, self.samples, self.lanes)
+        return find_origins_destinations(self.trajectories, self.samples, self.lanes, self.cut_tracks)
 
     @cached_property
     def car_parks(self) -> list[CarPark]:

@@ -58,7 +58,7 @@ _LOOKS_WEIGHT, _MAX_LOOKS_COST = 0.6, 0.8
 """Cost of looks that differ by twice as much as one vehicle's usually do, and the highest."""
 _CERTAINTY_OFFSET, _CERTAINTY_SLOPE = 0.0, 3.0
 """Log odds that a join is right, from what the total would cost more without it."""
-_MIN_PROBABILITY = 0.75
+_MIN_PROBABILITY = 0.8
 """A join of a lower probability is not made."""
 _VELOCITY_SLACK_M_PER_S = 1.5
 """By how much a velocity at an end may differ from the median of what is known around it: an acceleration within a
@@ -66,9 +66,9 @@ link's time."""
 _MAX_TABLE = 250_000
 """Ends times starts of a group up to which they are assigned by a table of all."""
 _PAIRS_AT_ONCE, _LOOKS_AT_ONCE = 100_000, 20_000
-_MAX_EXACT = 60
-"""Joins of a group of candidates up to which that is computed for each by another assignment; beyond, from the cost of
-the best other partners, which is a lower bound."""
+_NEIGHBOURHOOD, _SURE_MARGIN = 80, 1.5
+"""Ends and starts around a join among which another assignment without it is looked for; not where the best other
+partners of both sides show already that the total would cost so much more."""
 
 
 @dataclass(frozen=True)
@@ -402,43 +402,83 @@ def _assign_table(row: IntArray, column: IntArray, gain: FloatArray) -> tuple[In
     table[row, column] = gain
     best = np.stack(linear_sum_assignment(-table), axis=1)
     best = best[table[best[:, 0], best[:, 1]] > 0]
-    return best, _margins(table, best)
+    return best, _margins(row, column, gain, best)
 
 
 def _assign_sparse(row: IntArray, column: IntArray, gain: FloatArray) -> tuple[IntArray, FloatArray]:
     """As `_assign_table`, in memory that grows with the pairs: those of a long flight may hang together throughout.
 
-    Every row has a column of its own beside the others, for which it gains nothing. The margins are, as those of larger
-    tables, against the next best of the row and of the column.
+    Every row has a column of its own beside the others, for which it gains nothing.
     """
     rows, columns = int(row.max()) + 1, int(column.max()) + 1
     own = np.arange(rows)
     weight = 1 + gain.max() - np.concatenate([gain, np.zeros(rows)])  # a sparse zero would be no edge
     nodes = (np.concatenate([row, own]), np.concatenate([column, columns + own]))
     matched = min_weight_full_bipartite_matching(coo_array((weight, nodes), shape=(rows, columns + rows)).tocsr())[1]
-    is_best = matched[row] == column
+    order = np.flatnonzero(matched[row] == column)
+    order = order[np.argsort(row[order])]
+    best = np.column_stack([row[order], column[order]])
+    return best, _margins(row, column, gain, best)
+
+
+def _margins(row: IntArray, column: IntArray, gain: FloatArray, best: IntArray) -> FloatArray:
+    """By how much the total gain falls without each of the best pairs (k, 2), the others around it assigned anew."""
+    rows, columns = int(row.max()) + 1, int(column.max()) + 1
+    order = np.argsort(row, kind="stable")
+    gains = np.split(gain[order], np.searchsorted(row[order], np.arange(1, rows)))
+    beside = (_lists(row, column, rows), _lists(column, row, columns))
+    partner = (np.full(rows, -1), np.full(columns, -1))
+    partner[0][best[:, 0]], partner[1][best[:, 1]] = best[:, 1], best[:, 0]
+    is_best = partner[0][row] == column
     best_of_row, best_of_column = np.zeros(rows), np.zeros(columns)
     np.maximum.at(best_of_row, row[~is_best], gain[~is_best])
     np.maximum.at(best_of_column, column[~is_best], gain[~is_best])
-    order = np.flatnonzero(is_best)[np.argsort(row[is_best])]
-    margin = gain[order] - best_of_row[row[order]] - best_of_column[column[order]]
-    return np.column_stack([row[order], column[order]]), np.maximum(margin, 0)
+    own = np.zeros(rows)
+    own[row[is_best]] = gain[is_best]
+    bound = own[best[:, 0]] - best_of_row[best[:, 0]] - best_of_column[best[:, 1]]
+    margins = np.maximum(bound, 0.0)
+    for number in np.flatnonzero(bound < _SURE_MARGIN):
+        end, start = best[number].tolist()
+        ends, starts = _neighbourhood(end, start, beside, partner)
+        at = {column: k for k, column in enumerate(starts)}
+        near, whole = np.zeros((len(ends), len(starts))), 0.0
+        for k, i in enumerate(ends):
+            for j, value in zip(beside[0][i], gains[i].tolist(), strict=True):
+                if j in at:
+                    near[k, at[j]] = value
+                    whole += value if j == partner[0][i] else 0.0
+        near[0, 0] = 0  # the pair itself: it is the first of the neighbourhood
+        other = linear_sum_assignment(-near)
+        margins[number] = max(whole - float(near[other].sum()), 0.0)
+    return margins
 
 
-def _margins(table: FloatArray, best: IntArray) -> FloatArray:
-    """By how much the total gain falls without each of the best pairs."""
-    own = table[best[:, 0], best[:, 1]]
-    if len(best) > _MAX_EXACT:
-        without = table.copy()
-        without[best[:, 0], best[:, 1]] = 0
-        return np.asarray(np.maximum(own - without[best[:, 0]].max(axis=1) - without[:, best[:, 1]].max(axis=0), 0))
-    total, margins = float(own.sum()), []
-    for row, column in best:
-        without = table.copy()
-        without[row, column] = 0
-        rows, columns = linear_sum_assignment(-without)
-        margins.append(total - float(without[rows, columns].sum()))
-    return np.array(margins)
+def _lists(of: IntArray, values: IntArray, count: int) -> list[list[int]]:
+    """The values of each of ``count`` numbers."""
+    order = np.argsort(of, kind="stable")
+    parts = np.split(values[order], np.searchsorted(of[order], np.arange(1, count)))
+    return [part.tolist() for part in parts]
+
+
+def _neighbourhood(
+    end: int, start: int, beside: tuple[list[list[int]], list[list[int]]], partner: tuple[IntArray, IntArray]
+) -> tuple[list[int], list[int]]:
+    """Ends and starts around a pair, the nearest by candidates first, each with its partner."""
+    found: tuple[dict[int, None], dict[int, None]] = ({end: None}, {start: None})
+    front = [(0, end), (1, start)]
+    while front and len(found[0]) + len(found[1]) < _NEIGHBOURHOOD:
+        following = []
+        for side, one in front:
+            for other in beside[side][one]:
+                if other not in found[1 - side]:
+                    found[1 - side][other] = None
+                    following.append((1 - side, other))
+                    back = int(partner[1 - side][other])
+                    if back >= 0 and back not in found[side]:
+                        found[side][back] = None
+                        following.append((side, back))
+        front = following
+    return list(found[0]), list(found[1])
 
 
 def assign_tracks(detection_ids: IntArray) -> IntArray:

@@ -2,8 +2,9 @@
 
 A lane that follows no other, and on which most tracks begin, is an entry; one that leads to no other, and on which most
 tracks end, an exit. Where an exit faces an entry, something hides the road between them (a tree, a bridge): neither is
-one. A vehicle whose track is cut inside the picture is lost on a lane; where those seen whole went from there shows
-where it went.
+one. Tracks of a vehicle that is lost and found again where it must have gone are one (`cut_tracks`). Of the others a
+track that is cut inside the picture is lost on a lane; where those of known destination went from there shows where it
+went.
 """
 
 from collections.abc import Iterator
@@ -18,8 +19,9 @@ from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.analysis.intervals import Estimate, estimate_mean, estimate_rate, estimate_share
 from velfield.analysis.lanes.junctions import buffered_hull
 from velfield.analysis.lanes.model import LaneGraph
+from velfield.analysis.movements.cut_tracks import CutTracks
 from velfield.analysis.movements.gates import COMPASS, Arm, Gate, group_gates
-from velfield.analysis.trajectories import PathSamples, Trajectories
+from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
 
 _INWARDS_M, _OUTWARDS_M, _ASIDE_M = 20.0, 15.0, 2.5
 """A track that begins so far behind an entry, or ahead of it, and so far beside its lane, was seen to enter there."""
@@ -33,7 +35,7 @@ _INSIDE_M = 25.0
 _CUT_BY_TIME_S = 1.0
 """A track that begins so soon after the first frame, or ends so soon before the last one, is cut by time."""
 _MIN_WHOLE = 3
-"""Fewer whole tracks do not show where those that are cut went."""
+"""Fewer vehicles of known destination do not show where those that are cut went."""
 _DISPERSION_SLICE_S = 120.0
 
 
@@ -44,15 +46,15 @@ class Trips:
     Attributes
     ----------
     track, origin
-        Numbers of the track and of the arm.
+        Numbers of the track that enters, and of the arm.
     entry_s, exit_s
-        When the track begins at the entry, and ends at the exit; NaN: it ends elsewhere.
+        When the vehicle's track begins at the entry, and ends at the exit; NaN: it ends elsewhere.
     destination
         (n, arms) probability of each destination: 1 where the vehicle was seen to leave.
     seen
-        From entry to exit.
+        From entry to exit, by one track.
     remains
-        Not seen to leave, but still in the picture at the end; of the others that were not, the track is cut.
+        Not seen to leave, but still in the picture at the end; of the others that are not ``seen``, the track is cut.
     """
 
     track: IntArray
@@ -71,8 +73,8 @@ class Relation:
     Attributes
     ----------
     seen, cut, remaining
-        Vehicles seen from entry to exit; inferred of those whose track is cut, and of those still in the picture at
-        the end.
+        Vehicles seen from entry to exit; those whose track is cut, joined or inferred; and inferred of those still in
+        the picture at the end.
     share
         Of the vehicles that enter by the arm.
     travel_time_s
@@ -130,9 +132,9 @@ class OriginDestination:
             weight = np.where(rows, trips.destination[:, j], 0.0)
             if weight.sum() < 0.5:
                 continue
-            whole = rows & trips.seen
-            seen = whole & (trips.destination[:, j] == 1.0)
-            n, entering = int(whole.sum()), float(trips.destination[rows].sum())
+            known = rows & np.isfinite(trips.exit_s)
+            seen = trips.seen & rows & (trips.destination[:, j] == 1.0)
+            n, entering = int(known.sum()), float(trips.destination[rows].sum())
             counts = np.bincount(slice_of, weight, slices)
             out.append(
                 Relation(
@@ -150,7 +152,7 @@ class OriginDestination:
 
 
 def find_origins_destinations(
-    trajectories: Trajectories, samples: PathSamples, graph: LaneGraph
+    trajectories: Trajectories, samples: PathSamples, graph: LaneGraph, cut_tracks: CutTracks
 ) -> OriginDestination | None:
     """Origins and destinations of a flight; None where no road enters the scene and leaves it.
 
@@ -160,6 +162,8 @@ def find_origins_destinations(
         Tracks of moving vehicles, and points along them.
     graph
         Their lanes.
+    cut_tracks
+        The tracks joined into vehicles.
     """
     if not len(graph) or not len(samples):
         return None
@@ -167,7 +171,7 @@ def find_origins_destinations(
     gates, arms = find_scene_gates(trajectories, samples, graph, window)
     if not any(gate.inwards for gate in gates) or all(gate.inwards for gate in gates):
         return None
-    return trace_trips(trajectories, samples, graph, gates, arms, window)
+    return trace_trips(cut_tracks, graph, gates, arms, window)
 
 
 def find_scene_gates(
@@ -265,33 +269,29 @@ def _name_arms(middle: dict[int, FloatArray], outward: dict[int, float], inside:
 
 
 def trace_trips(
-    trajectories: Trajectories,
-    samples: PathSamples,
-    graph: LaneGraph,
-    gates: tuple[Gate, ...],
-    arms: tuple[Arm, ...],
-    window_s: tuple[float, float],
+    vehicles: CutTracks, graph: LaneGraph, gates: tuple[Gate, ...], arms: tuple[Arm, ...], window_s: tuple[float, float]
 ) -> OriginDestination:
-    """Which arms tracks enter by and leave by, and where those went that are cut."""
+    """Which arms vehicles enter by and leave by, and where those went whose tracks are cut."""
+    trajectories, samples = vehicles.trajectories, sample_paths(vehicles.trajectories)
     n = len(trajectories)
     origin, entry = _terminal_arms(samples, n, gates, first=True)
     destination, leaves = _terminal_arms(samples, n, gates, first=False)
     begins, ends = trajectories.time_s[trajectories.first[:-1]], trajectories.time_s[trajectories.first[1:] - 1]
     before = begins < window_s[0] + _CUT_BY_TIME_S
     entered = (origin >= 0) & ~before
-    whole = (origin >= 0) & (destination >= 0)
+    known = (origin >= 0) & (destination >= 0)
     probability = np.zeros((n, len(arms)))
     probability[destination >= 0, destination[destination >= 0]] = 1.0
-    _infer(probability, origin, destination, whole, np.flatnonzero(entered & (destination < 0)), graph)
+    _infer(probability, origin, destination, known, np.flatnonzero(entered & (destination < 0)), graph, vehicles)
     remains = (destination < 0) & (ends > window_s[1] - _CUT_BY_TIME_S)
     rows = np.flatnonzero(entered)
     trips = Trips(
-        rows,
+        vehicles.track[vehicles.first[rows]],
         origin[rows],
         entry[rows],
         np.where(destination >= 0, leaves, np.nan)[rows],
         probability[rows],
-        destination[rows] >= 0,
+        (destination[rows] >= 0) & (np.diff(vehicles.first)[rows] == 1),
         remains[rows],
     )
     unknown = int(((origin < 0) & ~before).sum())
@@ -316,26 +316,33 @@ def _terminal_arms(
 
 
 def _infer(
-    probability: FloatArray, origin: IntArray, destination: IntArray, whole: Mask, cut: IntArray, graph: LaneGraph
+    probability: FloatArray,
+    origin: IntArray,
+    destination: IntArray,
+    known: Mask,
+    cut: IntArray,
+    graph: LaneGraph,
+    vehicles: CutTracks,
 ) -> None:
-    """Destinations of the tracks that are ``cut``, in place: as of the whole ones from their origin that drove on the
+    """Destinations of the vehicles that are ``cut``, in place: as of the known ones from their origin that drove on the
     lane on which they are lost; without three of these, of all that drove on it; else of all of their origin."""
-    visits = np.unique(np.column_stack([graph.samples.lane, graph.samples.track]), axis=0)
+    visits = np.unique(np.column_stack([graph.samples.lane, vehicles.vehicle[graph.samples.track]]), axis=0)
     borders = np.searchsorted(visits[:, 0], np.arange(len(graph) + 1))
-    row = np.searchsorted(graph.samples.track, cut, side="right") - 1
-    on_lane = (row >= 0) & (graph.samples.track[np.maximum(row, 0)] == cut)
-    known: dict[tuple[int, int], FloatArray] = {}
-    for track, k, placed in zip(cut, row, on_lane, strict=True):
+    last = vehicles.track[vehicles.first[cut + 1] - 1]
+    row = np.searchsorted(graph.samples.track, last, side="right") - 1
+    on_lane = (row >= 0) & (graph.samples.track[np.maximum(row, 0)] == last)
+    shares: dict[tuple[int, int], FloatArray] = {}
+    for vehicle, k, placed in zip(cut, row, on_lane, strict=True):
         lane = int(graph.samples.lane[k]) if placed else -1
-        key = (lane, int(origin[track]))
-        if key not in known:
+        key = (lane, int(origin[vehicle]))
+        if key not in shares:
             others = visits[borders[lane] : borders[lane + 1], 1] if placed else np.empty(0, np.int64)
             choices = (
-                others[whole[others] & (origin[others] == key[1])],
+                others[known[others] & (origin[others] == key[1])],
                 others[destination[others] >= 0],
-                np.flatnonzero(whole & (origin == key[1])),
+                np.flatnonzero(known & (origin == key[1])),
             )
             used = next((c for c in choices if len(c) >= _MIN_WHOLE), choices[2])
             counts = np.bincount(destination[used], minlength=probability.shape[1]).astype(np.float64)
-            known[key] = counts / max(counts.sum(), 1.0)
-        probability[track] = known[key]
+            shares[key] = counts / max(counts.sum(), 1.0)
+        probability[vehicle] = shares[key]

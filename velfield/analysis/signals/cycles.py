@@ -23,9 +23,14 @@ _SPACING_M = 6.4
 """From front to front in a queue."""
 _START_UP_VEHICLES = 4
 """The first vehicles of a queue lose time at the start (HCM)."""
-_MIN_CROSSINGS, _LAST_CROSSINGS = 20, 5
-"""An onset of red rests on so many crossings of the line at least, and on the last so many of a cycle."""
-_RED_SD_S = 0.5
+_MIN_CROSSINGS = 20
+"""An onset of red rests on so many crossings of the line at least."""
+_RATE_S, _MIN_RATE_CROSSINGS = 8.0, 3
+"""The rate of crossings, of all cycles together, is that of so long before their end; of fewer crossings it is unknown,
+and taken for theirs."""
+_THINNING_S = 1.2
+"""Crossings thin out over the last so long: drivers' speeds differ, and so does how late they can still not stop."""
+_RED_SD_S = 0.2
 """By which the end of crossings differs from the onset of red from junction to junction: standard deviation."""
 
 
@@ -157,17 +162,26 @@ def _red_onset(stream: Stream, green_s: float, cycle_s: float) -> Estimate | Non
     if not len(start) or (end - start).max() < 6:
         return None
     quiet_s = float(start[np.argmax(end - start)] % bins) * cycle_s / bins
-    # Crossings thin out no further towards their end: it lies about their spacing after the last of them.
-    before = np.sort((crossed - quiet_s) % cycle_s)[-_LAST_CROSSINGS - 1 :] - cycle_s
-    spacing = float(before[-1] - before[0]) / _LAST_CROSSINGS
-    value = quiet_s + float(before[-1]) + spacing
-    # the spacing is exponential; drivers' decisions at yellow differ from junction to junction
-    early, late = (spacing * float(stats.expon.ppf(p)) for p in ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
+    # How far it lies behind the last crossing: the rate of crossings falls to nothing over the last of the time.
+    before = np.sort((crossed - quiet_s) % cycle_s) - cycle_s
+    last = float(before[-1])
+    crossings = int(np.sum((before > last - _RATE_S) & (before <= last - 1)))
+    rate = max(crossings, _MIN_RATE_CROSSINGS) / (_RATE_S - 1)
+    early, middle, late = (_last_crossing_gap(p, rate) for p in ((1 - LEVEL) / 2, 0.5, (1 + LEVEL) / 2))
+    value = quiet_s + last + middle
     systematic = float(stats.norm.ppf((1 + LEVEL) / 2)) * _RED_SD_S
-    low = value - float(np.hypot(spacing - early, systematic))
-    high = value + float(np.hypot(late - spacing, systematic))
+    low = value - float(np.hypot(middle - early, systematic))
+    high = value + float(np.hypot(late - middle, systematic))
     shift = green_s - cycle_s * np.floor((value + green_s) / cycle_s)
     return Estimate(value + shift, low + shift, high + shift, n)
+
+
+def _last_crossing_gap(probability: float, rate: float) -> float:
+    """Time from the last crossing to the end of crossings that is exceeded with 1 - ``probability``, s: ``rate``
+    crossings a second of the cycle, which falls linearly to none over the last `_THINNING_S`."""
+    expected = -float(np.log1p(-probability))  # crossings in that time
+    within = float(np.sqrt(2 * _THINNING_S * expected / rate))
+    return within if within < _THINNING_S else expected / rate + _THINNING_S / 2
 
 
 def _discharge(stream: Stream, green_s: FloatArray) -> tuple[Estimate | None, Estimate | None]:

@@ -13,8 +13,10 @@ STOP_M_PER_S, GO_M_PER_S = 0.7, 1.4
 MIN_STOP_S = 1.5
 REACH_M = 120.0
 """Stops so far before a stop line belong to its queue."""
-_QUEUE_GAP_M = 13.0
-"""Vehicles of a queue are nearer to each other, centre to centre, or to the stop line."""
+_HIDDEN_MOVE_M = 1.0
+"""A vehicle that is seen again so much farther on did not stand where it is seen."""
+_SETS_OFF_M_PER_S2 = 2.0
+"""Acceleration of a vehicle that sets off."""
 _CROSSES_S = 8.0
 """From its start to its crossing of the line, a vehicle at the head of a queue needs no longer."""
 
@@ -46,7 +48,35 @@ def find_stops(trajectories: Trajectories) -> Stops:
     start = time[last] + np.where(goes, (time[after] - time[last]) * 0.5, 0.0)
     end = np.where(goes, start, np.nan)
     long = (np.where(goes, start, time[last]) - time[first]) >= MIN_STOP_S
-    return Stops(owner[first[long]], time[first[long]], end[long], trajectories.xy_m[last[long]])
+    xy = trajectories.xy_m[last]
+    _stop_under_trees(trajectories, slow, first, last, xy, end)
+    return Stops(owner[first[long]], time[first[long]], end[long], xy[long])
+
+
+def _stop_under_trees(
+    trajectories: Trajectories, slow: Mask, first: IntArray, last: IntArray, xy_m: FloatArray, end_s: FloatArray
+) -> None:
+    """Place stops (n,) that nothing was seen of, in place: ``slow`` from row ``first`` to ``last``, at ``xy_m``, until
+    ``end_s``.
+
+    A vehicle brakes to a tree, and appears behind it setting off. Where between it stood follows from both speeds, as
+    acceleration and braking are about equal: their distances are as their squares.
+    """
+    time, owner, speed = trajectories.time_s, trajectories.owner, trajectories.speed_m_per_s
+    moved = np.diff(trajectories.xy_m, axis=0)
+    far = (np.diff(time) >= MIN_STOP_S) & (np.hypot(*moved.T) >= _HIDDEN_MOVE_M)
+    rows = np.flatnonzero(slow[:-1] & slow[1:] & (owner[:-1] == owner[1:]) & far)
+    # the speeds beside the gap are means over it
+    before, after = np.maximum(rows - 1, 0), np.minimum(rows + 2, len(owner) - 1)
+    v0 = np.where(owner[before] == owner[rows], speed[before], 0.0)
+    v1 = np.where(owner[after] == owner[rows], speed[after], 0.0)
+    share = v0**2 / np.maximum(v0**2 + v1**2, 1e-9)
+    stop = np.searchsorted(first, rows, side="right") - 1
+    xy_m[stop] = trajectories.xy_m[rows] + share[:, None] * moved[rows]
+    sets_off = np.isfinite(end_s[stop]) & (rows + 1 == last[stop])
+    distance = (1 - share) * np.hypot(*moved[rows].T)
+    begin = time[rows + 1] - 2 * distance / np.maximum(v1, GO_M_PER_S)
+    end_s[stop[sets_off]] = np.maximum(begin, time[rows] + 0.5)[sets_off]
 
 
 def _hysteresis(speed: FloatArray, owner: IntArray) -> Mask:
@@ -163,7 +193,10 @@ def observe_stream(
     goes = np.isfinite(stops.end_s[here])
     line = _stop_line(along[goes] + half[here][goes], approach.border_m)
     at = approach.border_m if line is None else min(line, len(approach.path_m) - 4.0)
-    cross = _crossings(approach.path_m, at, samples)
+    time, track, speed = _crossings(approach.path_m, at, samples)
+    time = _after_stops(time, track, at, stops.track[known], stops.start_s[known], stops.end_s[known], along[goes])
+    order = np.argsort(time, kind="stable")
+    cross = time[order], track[order], speed[order]
     heads = np.empty(0, np.int64)
     if line is not None:
         front = _along(approach.path_m, stops.xy_m[known])[0] + half[known]
@@ -182,6 +215,28 @@ def observe_stream(
         *cross,
         2 * half[here],
     )
+
+
+def _after_stops(
+    time_s: FloatArray,
+    track: IntArray,
+    at_m: float,
+    stop_track: IntArray,
+    start_s: FloatArray,
+    end_s: FloatArray,
+    along_m: FloatArray,
+) -> FloatArray:
+    """Times (n,) of crossings of ``at_m``: of those within a stop (m,) of their track, under a tree, after its end."""
+    if not len(stop_track) or not len(track):
+        return time_s
+    order = np.lexsort((start_s, stop_track))
+    begin = float(min(start_s.min(), time_s.min()))
+    span = float(max(start_s.max(), time_s.max())) - begin + 1.0
+    key = stop_track[order] * span + start_s[order] - begin
+    row = order[np.maximum(np.searchsorted(key, track * span + time_s - begin, side="right") - 1, 0)]
+    stands = (stop_track[row] == track) & (start_s[row] <= time_s) & (time_s < end_s[row])
+    reaches = end_s[row] + np.sqrt(2 * np.maximum(at_m - along_m[row], 0.0) / _SETS_OFF_M_PER_S2)
+    return np.asarray(np.where(stands, reaches, time_s))
 
 
 def _goes_on(track: IntArray, end_s: FloatArray, crossed: IntArray, cross_s: FloatArray) -> Mask:

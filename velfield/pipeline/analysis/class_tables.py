@@ -64,7 +64,7 @@ def _groups(analysis: TrafficAnalysis) -> Iterator[_Group]:
     if scene is not None:
         for r in scene.relations:
             trips = scene.trips
-            rows = (trips.origin == r.origin.number) & (trips.destination[:, r.destination.number] == 1.0) & trips.seen
+            rows = (trips.origin == r.origin.number) & (trips.destination[:, r.destination.number] == 1.0)
             geometry = line_geometry(np.array([r.origin.xy_m, r.destination.xy_m]), analysis)
             name = f"{r.origin.name} to {r.destination.name}"
             yield _Group("origin to destination", name, r.vehicles, trips.track[rows], geometry)

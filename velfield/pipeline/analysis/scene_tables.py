@@ -63,7 +63,7 @@ def relation_table(analysis: TrafficAnalysis) -> AnalysisTable:
         "from": ("From", ""),
         "to": ("To", ""),
         "seen": ("Vehicles seen whole", ""),
-        "cut": ("Inferred of cut tracks", ""),
+        "cut": ("Of cut tracks, joined or inferred", ""),
         "remaining": ("Inferred of those still there at the end", ""),
         "share": ("Share of the entry", "%"),
         "flow": ("Flow", "veh/h"),
@@ -73,7 +73,7 @@ def relation_table(analysis: TrafficAnalysis) -> AnalysisTable:
     rows = (make_row(_relation_cells(r), line_geometry(_between(r), analysis)) for r in relations)
     note = (
         "Arms are named by the side of the image that they lead to; “inside” is a yard or a garage. A vehicle whose "
-        "track is cut is taken to go where those seen whole went that drove where it was lost."
+        "track is cut, and not found again, is taken to go where the others went that drove where it was lost."
     )
     return make_table("origin_destination", "Movements", "From origin to destination", note, columns, rows)
 
