@@ -422,7 +422,7 @@ def _assign_sparse(row: IntArray, column: IntArray, gain: FloatArray) -> tuple[I
 
 
 def _margins(row: IntArray, column: IntArray, gain: FloatArray, best: IntArray) -> FloatArray:
-    """By how much the total gain falls without each of the best pairs (k, 2), the others around it assigned anew."""
+    """By how much the total gain falls without each of the best pairs (k, 2), the others around it assigned again."""
     rows, columns = int(row.max()) + 1, int(column.max()) + 1
     order = np.argsort(row, kind="stable")
     gains = np.split(gain[order], np.searchsorted(row[order], np.arange(1, rows)))
