@@ -52,13 +52,15 @@ _PACE_SD_M_PER_S, _PACE_SD_FRACTION, _FASTER_M_PER_S = 1.0, 0.35, 2.5
 be."""
 _LANE_OFFSET_M, _LANE_OFFSET_FRACTION, _MAX_BEND_RAD = 1.8, 0.05, np.radians(50)
 """How far aside a hidden vehicle may appear, and how much its direction may differ from the way that it took."""
-_USUAL_LOOKS_DIFFERENCE = 0.35
-"""Of a vehicle to itself, in standard deviations of its strip."""
-_LOOKS_WEIGHT, _MAX_LOOKS_COST = 0.6, 0.8
-"""Cost of looks that differ by twice as much as one vehicle's usually do, and the highest."""
+_UNDECIDED_LOOKS_DIFFERENCE = 0.68
+"""Of looks, in standard deviations of a strip, that one vehicle has as often on both sides as two have: the median is
+0.43 for one, 1.08 for two, the logarithm normal with a standard deviation of 0.5 for both (simulated flights)."""
+_LOOKS_WEIGHT, _MIN_LOOKS_COST, _MAX_LOOKS_COST = 1.23, -0.3, 1.3
+"""Cost of looks by the logarithm of their difference over that, which is a log likelihood ratio in units of cost; and
+its limits."""
 _CERTAINTY_OFFSET, _CERTAINTY_SLOPE = 0.0, 3.0
 """Log odds that a join is right, from what the total would cost more without it."""
-_MIN_PROBABILITY = 0.8
+_MIN_PROBABILITY = 0.9
 """A join of a lower probability is not made."""
 _VELOCITY_SLACK_M_PER_S = 1.5
 """By how much a velocity at an end may differ from the median of what is known around it: an acceleration within a
@@ -268,13 +270,10 @@ def end_rows(tracklets: pd.DataFrame, track: IntArray, count: int) -> tuple[IntA
 
 
 def _cost_of_looks(before: FloatArray, after: FloatArray) -> FloatArray:
-    """A difference larger than usual costs, a smaller one gains."""
+    """A difference larger than of one vehicle costs, a smaller one gains; nothing where looks are unknown."""
     difference = looks_difference(before, after)
-    known = np.isfinite(difference)
-    if not known.any():
-        return np.zeros(len(difference))
-    excess = np.nan_to_num(difference) / _USUAL_LOOKS_DIFFERENCE - 1
-    return np.where(known, np.clip(_LOOKS_WEIGHT * excess, -_MAX_LOOKS_COST / 2, _MAX_LOOKS_COST), 0.0)
+    ratio = np.log(np.maximum(difference, 1e-3) / _UNDECIDED_LOOKS_DIFFERENCE)
+    return np.nan_to_num(np.clip(_LOOKS_WEIGHT * ratio, _MIN_LOOKS_COST, _MAX_LOOKS_COST))
 
 
 def _candidates(ends: TrackEnds, starts: TrackEnds, gaps: GapLimits) -> tuple[IntArray, FloatArray]:
