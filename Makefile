@@ -7,7 +7,7 @@ export UV_LINK_MODE := copy
 # Where this is set, every process of ours compiles all that it imports anew: 12 s each for Prefect.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test page docs lint types check format env lock bench detector soak clean
+.PHONY: demo test page docs lint types check format env lock bench audit detector soak clean
 
 demo: page  ## simulate a flight, run the whole job, say where the report is
 	$(BIN)/velfield demo --out demo
@@ -55,6 +55,10 @@ bench: $(STAMP)  ## speed, as ratios against a peer in the same run
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps stabilo==1.4.7
 	$(BIN)/uv pip install --quiet --python $(BIN)/python trackpy boost-histogram xhistogram
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only
+
+# Of the lock, in an environment of the tool's own. Strict: a package that the service does not know fails the audit.
+audit: $(STAMP)  ## known vulnerabilities of the pinned packages, by pip-audit, which asks PyPI or OSV
+	$(BIN)/uv tool run --quiet pip-audit --requirement requirements.lock --require-hashes --disable-pip --strict --progress-spinner off
 
 soak: $(STAMP)  ## fifty kills at random moments: every result equal to the bit
 	$(BIN)/python -m tests.kills --kills 50

@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import rasterio
 
@@ -13,6 +14,7 @@ from schemas.job import Inputs
 from schemas.scale import ScaleEstimate
 from schemas.simulation import SimulationConfig
 from schemas.summary import RunSummary
+from schemas.tables import TRACK_COLUMNS
 from velfield import open_run
 from velfield.errors import InputError
 from velfield.exports.export import export_run
@@ -30,6 +32,7 @@ from velfield.run.frame_transforms import (
 )
 from velfield.run.lineage import pixel_lineage
 from velfield.run.run import Run
+from velfield.run.tables import write_tracks
 from velfield.synthetic.clip import simulate_telemetry, srt_text
 from velfield.synthetic.flight import Flight
 
@@ -152,6 +155,53 @@ def test_the_lengths_of_vehicles_give_the_scale_and_contradict_a_wrong_one(
     assert not warnings[None]
     assert not warnings[0.23]
     assert all("by the lengths of vehicles" in warnings[wrong][0] for wrong in (0.23 * 1.2, 0.23 / 1.2))
+
+
+def stopping_street(gsd_m: float, fps: float) -> pd.DataFrame:
+    """Tracklets of 12 vehicles that set off, one after another, with 1.7 m/s2 up to 12 m/s (`TRACK_COLUMNS`)."""
+    rows = []
+    for track in range(12):
+        times_s = np.arange(40) / 5.0
+        since = np.clip(times_s - 0.1 * track, 0, None)
+        x_px = np.where(since < 12 / 1.7, 0.85 * since**2, 12 * since - 72 / 1.7) / gsd_m
+        for k in range(38):
+            row: dict[str, float] = dict.fromkeys(TRACK_COLUMNS, 0) | {"track_id": track}
+            for j in range(3):
+                row |= {f"frame_{j}": k + j, f"detection_id_{j}": 1000 * track + k + j}
+                row |= {f"time_{j}_s": (k + j) / fps, f"x_{j}_px": x_px[k + j], f"y_{j}_px": 20.0 * track}
+            for j in range(2):
+                row[f"vx_{j}{j + 1}_px_per_s"] = (x_px[k + j + 1] - x_px[k + j]) * fps
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def test_a_frame_rate_that_vehicles_contradict_is_reported(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
+) -> None:
+    """Vehicles that set off in the images do so with four times the usual acceleration at twice the rate."""
+    shutil.copytree(whole[0], tmp_path / "run")
+    run = open_run(tmp_path / "run")
+    made = made_plan(run, Inputs(source=str(flight / "frames")))
+    for path in run.layout.tracks.glob("unit-*.parquet"):
+        path.unlink()
+    results = {}
+    for fps in (5.0, 10.0, 2.5):
+        frames = made.config.frames.model_copy(update={"fps": fps})
+        job = made.job.model_copy(update={"config": made.config.model_copy(update={"frames": frames, "gsd_m": 0.23})})
+        plan = Plan(job, made.info, made.indices, made.inputs, made.keys)
+        georeference_run(plan)
+        write_tracks(run.layout.unit_file(run.layout.tracks, 0, ".parquet"), stopping_street(0.23, fps))
+        results[fps] = scale_run(plan)
+    assert not any("--fps" in line for line in [*results[5.0].warnings, *results[5.0].notes])
+    (fast,) = [line for line in results[10.0].warnings if "--fps 10" in line]
+    assert "about 2" in fast
+    assert "give --fps 5 " in fast
+    (slow,) = [line for line in results[2.5].warnings if "--fps 2.5" in line]
+    assert "about 0.5" in slow
+    write_tracks(
+        run.layout.unit_file(run.layout.tracks, 0, ".parquet"), stopping_street(0.23, 5.0).query("track_id < 4")
+    )
+    assert any("4 vehicles set off or stop, 10 are needed" in line for line in scale_run(plan).notes)
 
 
 def made_plan(run: Run, inputs: Inputs) -> Plan:

@@ -17,7 +17,7 @@ from velfield.sources.frames import local_path
 from velfield.sources.images import image_size, read_grey_image
 from velfield.sources.labels.boxes import car_shape
 from velfield.sources.labels.yolo import CAR_ASPECT, car_class_numbers, car_in_upright_box, tilt_of_upright_box
-from velfield.sources.quality import flag_blurred, flag_outlier_frames, is_black
+from velfield.sources.quality import find_cuts, flag_blurred, flag_outlier_frames, is_black
 from velfield.sources.selection import select_frames
 from velfield.sources.table import finite_cell, read_csv_rows, read_text
 from velfield.sources.timestamps import check_against_container
@@ -175,6 +175,16 @@ def test_a_cut_to_another_scene_is_no_outlier() -> None:
     ]
     assert not flag_outlier_frames(np.stack([first, first, second, second])).any()
     assert not flag_outlier_frames(np.stack([first, second])).any()
+
+
+def test_places_that_share_only_their_layout_are_two_places() -> None:
+    """A lens's vignetting and a town in the middle of the picture make thumbnails of any two places alike."""
+    rng = np.random.default_rng(0)
+    x, y = np.meshgrid(*2 * [np.linspace(-1, 1, 16)])
+    here, there = (4.0 * np.exp(-(x**2) - y**2) + rng.normal(size=(2, 16, 16))).astype(np.float32)
+    assert np.corrcoef(here.ravel(), there.ravel())[0, 1] > 0.5
+    assert find_cuts(np.stack([here] * 6 + [there] * 6)) == [6]
+    assert np.flatnonzero(flag_outlier_frames(np.stack([here] * 4 + [there] + [here] * 4))).tolist() == [4]
 
 
 def test_a_dark_frame_and_fog_are_black() -> None:

@@ -1,4 +1,5 @@
-"""Stage ``scale``: the scale once more, with the lengths of the vehicles that were tracked.
+"""Stage ``scale``: the scale once more, with the lengths of the vehicles that were tracked; the times, with how they
+set off and stop.
 
 Stages before this one work with what `velfield.pipeline.stages.georeference` found, or, where nothing gives the scale,
 with the size of the cars that the detector was trained on. Here the measured lengths of all vehicles give an estimate
@@ -9,7 +10,9 @@ import numpy as np
 
 from schemas.georeference import GeoreferenceRecord
 from schemas.scale import ScaleEstimate
-from schemas.tables import DIMENSION_COLUMNS
+from schemas.tables import DIMENSION_COLUMNS, TRACK_COLUMNS
+from velfield.analysis.speed_changes import MIN_VEHICLES, PLAUSIBLE_M_PER_S2, check_times
+from velfield.analysis.trajectories import from_tracklets, moving
 from velfield.analysis.vehicle_scale import estimate_track_scale
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
@@ -22,10 +25,12 @@ from velfield.pipeline.stages.georeference import (
 )
 from velfield.run.frame_transforms import read_first_georeference, read_own_grid, read_tracking_gsd
 from velfield.run.layout import RunLayout
-from velfield.run.tables import read_tables
+from velfield.run.tables import read_tables, read_track_tables
 
 _OTHER_LIMITS = 0.25
 """Where the limits of tracking were for a scale that differs by more than this fraction, vehicles may be missed."""
+_CHECKED_BYTES = 20_000_000
+"""Of the tracks' files, by which the times are checked: minutes of dense traffic."""
 
 
 def scale_run(plan: Plan) -> StageResult:
@@ -41,7 +46,10 @@ def scale_run(plan: Plan) -> StageResult:
     known = [*describe(before), *georeference_warnings(before)]
     notes = [line for line in describe(record) if line not in known]
     warnings = [line for line in georeference_warnings(record) if line not in known]
-    return StageResult(outputs, counts, notes, [*warnings, *_other_limits(plan, record)])
+    more_notes, more_warnings = _check_times(plan, record)
+    return StageResult(
+        outputs, counts, [*notes, *more_notes], [*warnings, *_other_limits(plan, record), *more_warnings]
+    )
 
 
 def scale_of_tracks(layout: RunLayout) -> tuple[ScaleEstimate | None, int]:
@@ -61,4 +69,33 @@ def _other_limits(plan: Plan, record: GeoreferenceRecord) -> list[str]:
     return [
         f"vehicles were tracked with limits for {tracked:.3g} m a pixel, as {used.gsd_m:.3g} was not known yet; run "
         f"the flight again with --gsd-m {used.gsd_m:.3g}"
+    ]
+
+
+def _check_times(plan: Plan, record: GeoreferenceRecord) -> tuple[list[str], list[str]]:
+    """Notes and warnings about the times of the frames, by the accelerations of vehicles."""
+    fps, used = plan.config.frames.fps, record.scale.used
+    if used is None:
+        return [], []
+    paths, size = [], 0
+    for path in sorted(plan.layout.tracks.glob("unit-*.parquet")):
+        paths.append(path)
+        size += path.stat().st_size
+        if size > _CHECKED_BYTES:
+            break
+    check = check_times(moving(from_tracklets(read_track_tables(paths, TRACK_COLUMNS), used.gsd_m)))
+    given = f"--fps {fps:g}" if fps else "--timestamps" if plan.job.inputs.timestamps else None
+    if not check.known:
+        short = f"{check.vehicles} vehicles set off or stop, {MIN_VEHICLES} are needed to check them"
+        return ([f"the times are those of {given}: {short}"] if given else []), []
+    if check.plausible:
+        return [], []
+    advice = (
+        f"give --fps {fps / check.factor:.2g} if that is the true rate" if fps else "give true times by --timestamps"
+    )
+    return [], [
+        f"vehicles set off and stop with {check.median_m_per_s2:.2g} m/s2 (median of {check.vehicles}), where "
+        f"{PLAUSIBLE_M_PER_S2[0]:g} to {PLAUSIBLE_M_PER_S2[1]:g} is expected: by "
+        f"{given or 'the times of the video'} all speeds "
+        f"are about {check.factor:.2g} times the true ones, unless the scale is wrong; {advice}"
     ]
