@@ -8,7 +8,7 @@ from cyclopts import Parameter
 from velfield.errors import InputError
 
 if TYPE_CHECKING:
-    from schemas.job import Inputs, Job
+    from schemas.job import Inputs
     from schemas.records import FlightRecord
     from velfield.run.run import Run
 
@@ -53,8 +53,11 @@ def _repair(run: "Run") -> None:
     prepare_process(verbose=False)
     from flows.console import Console
     from flows.process_flight import run_flight
+    from flows.process_tracks import run_tracks
     from flows.runners import RunnerConfig
     from schemas.job import Job
+    from velfield.pipeline.given_tracks.plan import TRACKS, plan_tracks
+    from velfield.pipeline.plan import make_plan
     from velfield.pipeline.verify import invalidate, verify_run
     from velfield.run.flight_record import check_format
     from velfield.run.lock import locked
@@ -62,23 +65,19 @@ def _repair(run: "Run") -> None:
     check_format(run.layout.root)
     given = _inputs(run.record, run.layout.root)
     job = Job(root=str(run.layout.root), inputs=given, config=run.record.config)
-    _same_inputs(job, run.record)
+    of_tracks = run.record.inputs.source.kind == TRACKS
+    plan = (plan_tracks if of_tracks else make_plan)(job)
+    # Where the inputs changed since, it would be another run and not a repair.
+    if plan.keys != run.record.keys:
+        raise InputError(
+            f"{job.root}: its inputs or the code changed since it was made; run `velfield run` on it again"
+        )
     with locked(run.layout):
         invalidate(run.layout, verify_run(run.layout, run.record))
-    run_flight(job, RunnerConfig(), Console("normal"))
+    (run_tracks if of_tracks else run_flight)(job, RunnerConfig(), Console("normal"))
 
 
 def _inputs(record: "FlightRecord", root: Path) -> "Inputs":
     if record.given is None:
         raise InputError(f"{root} has no record of its inputs; run `velfield run ... --out {root}` again")
     return record.given
-
-
-def _same_inputs(job: "Job", record: "FlightRecord") -> None:
-    """Refuse to invalidate anything where the inputs changed since: that would be another run, not a repair."""
-    from velfield.pipeline.plan import make_plan
-
-    if make_plan(job).keys != record.keys:
-        raise InputError(
-            f"{job.root}: its inputs or the code changed since it was made; run `velfield run` on it again"
-        )

@@ -8,9 +8,11 @@ import pandas as pd
 import pytest
 
 from flows.cli import run as run_command
+from flows.commands.verify import DAMAGED, WHOLE, verify
 from schemas.flight import FlightConfig
 from schemas.job import Inputs, Job
 from schemas.simulation import SimulationConfig
+from tests.small_flight import digests
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import InputError
 from velfield.pipeline.given_tracks.plan import list_track_stages, plan_tracks
@@ -137,6 +139,33 @@ def test_the_run_has_its_vehicles_and_times(run: Run) -> None:
     assert vehicles["length_m"].to_numpy() == pytest.approx(
         lengths.reindex(names.reindex(vehicles["track_id"])).to_numpy(), abs=1e-3
     )
+
+
+def test_the_flow_writes_the_same_bits_and_repairs_what_was_damaged(run: Run, server: None, tmp_path: Path) -> None:
+    from flows.console import Console
+    from flows.process_tracks import run_tracks
+    from flows.runners import RunnerConfig
+
+    path, said = write("metres", tmp_path / "t")
+    root, config = tmp_path / "run", FlightConfig.model_validate({"gsd_m": GSD_M} | said)
+    job = Job(root=str(root), inputs=Inputs(source=str(path)), config=config)
+    assert run_tracks(job, RunnerConfig(), Console("quiet")).complete
+    before, staged = digests(root), digests(run.layout.root)
+    del staged["frames.zarr/zarr.json"]  # it has the path of the source
+    assert {name: value for name, value in before.items() if name in staged} == staged
+    for file in (next((root / "field.zarr").rglob("c/*/*")), next((root / "tracks").glob("unit-*.parquet"))):
+        file = next(p for p in file.rglob("*") if p.is_file()) if file.is_dir() else file
+        data = bytearray(file.read_bytes())
+        data[len(data) // 2] ^= 1
+        file.write_bytes(data)
+    assert verify(root) == DAMAGED
+    assert digests(root) != before
+    assert verify(root, repair=True) == WHOLE
+    assert digests(root) == before
+    path.write_text(path.read_text() + "9999,0,0.0,1.0,1.0,4.5\n")
+    (root / "tracks" / "source_ids.csv").unlink()
+    with pytest.raises(InputError, match="its inputs or the code changed"):
+        verify(root, repair=True)
 
 
 @pytest.mark.parametrize("form", ["pixels", "geotrax", "highd", "fcd"])
