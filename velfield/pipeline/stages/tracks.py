@@ -20,7 +20,7 @@ from velfield.tracking.association import LinkedTriples, tracklet_table, window_
 from velfield.tracking.dimensions import STRIP_SHAPE, direction_of_axes, looks, measure, sample_tracks
 from velfield.tracking.gates import Limits, triples_pass
 from velfield.tracking.joins import END_COLUMNS, EndContext, GapLimits, TrackEnds, assign_tracks, find_ends
-from velfield.tracking.recovery import Candidates, Recovered, interpolate_gap, recover_tracks
+from velfield.tracking.recovery import Candidates, Recovered, find_doubles, interpolate_gap, recover_tracks
 
 _MIDDLE = ["frame_1", "time_1_s", "x_1_px", "y_1_px"]
 _IDS = [f"detection_id_{k}" for k in range(3)]
@@ -50,6 +50,8 @@ def chain_tracks(plan: Plan) -> StageResult:
     tracklets = tracklets.assign(track_id=found.tracks[chain])
     flight = _Frames(open_frames(layout.frames).column("time_s"), usable_frames(plan))
     positions = all_positions(tracklets, found, candidates, gsd_m, flight)
+    doubles = find_doubles(positions[positions["source"] < 2], mean_grey(strips, found.tracks), gsd_m)
+    positions = _without(positions, doubles)
     written, start, recovered = [], 0, 0
     for unit, frames in enumerate(plan.units):
         path = layout.unit_file(layout.tracklets, unit, ".parquet")
@@ -57,6 +59,7 @@ def chain_tracks(plan: Plan) -> StageResult:
             table = read_tables([path], TRACKLET_COLUMNS).assign(recovered=False)
             table["track_id"] = tracklets["track_id"].to_numpy()[start : start + len(table)]
             start += len(table)
+            table = _without(table, doubles)
             more = recovered_tracklets(plan, frames, positions, flight)
             recovered += len(more)
             table = pd.concat([table, more.assign(recovered=True)], ignore_index=True)
@@ -73,16 +76,21 @@ def chain_tracks(plan: Plan) -> StageResult:
         (layout.dimensions, measure_tracks(strips, found.tracks), DIMENSION_COLUMNS),
         (layout.joins, found.joins, JOIN_COLUMNS),
     ):
-        write_table(path, table, columns)
+        write_table(path, _without(table, doubles), columns)
         written.append(path)
     advance("tracks")
     warnings = [] if len(tracklets) else [explain_no_tracklets(plan)]
+    kept = _without(tracklets, doubles)
     counts = {
-        "tracklets": float(len(tracklets) + recovered),
+        "tracklets": float(len(kept) + recovered),
         "recovered": float(recovered),
-        "tracks": float(tracklets["track_id"].nunique()),
+        "tracks": float(kept["track_id"].nunique()),
     }
     return StageResult(written, counts, warnings=warnings)
+
+
+def _without(table: pd.DataFrame, doubles: IntArray) -> pd.DataFrame:
+    return table[~table["track_id"].isin(doubles)].reset_index(drop=True)
 
 
 def read_candidates(plan: Plan, tracklets: pd.DataFrame, metres: float) -> Candidates:
@@ -271,6 +279,15 @@ def measure_tracks(strips: StripSums, tracks: IntArray) -> pd.DataFrame:
         for name in ("length_px", "length_sd_px", "width_px", "width_sd_px")
     }
     return pd.DataFrame({"track_id": ids[seen], **columns, "strips": count[seen]})
+
+
+def mean_grey(strips: StripSums, tracks: IntArray) -> pd.Series:
+    """Mean grey level of the vehicle by track, from the middle of the strips of all chains of each; ``tracks``
+    (chains,)."""
+    along, across = STRIP_SHAPE[0] // 2, STRIP_SHAPE[1] // 2
+    middle = strips.total[0][:, along - 2 : along + 2, across - 1 : across + 1].mean(axis=(1, 2))
+    sums = pd.DataFrame({"grey": middle, "count": strips.count[0]}).groupby(tracks).sum()
+    return sums["grey"] / sums["count"].replace(0, np.nan)
 
 
 def find_context(plan: Plan, ends: TrackEnds, starts: TrackEnds, strips: StripSums) -> EndContext:
