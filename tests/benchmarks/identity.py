@@ -12,9 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from schemas.simulation import SceneSimulation, SimulationConfig, TrafficSimulation
+from velfield.analysis.vehicle_classes import HEAVY
+from velfield.run.run import open_run
 from velfield.synthetic import write_flight
 from velfield.synthetic.run_score import RunScore, score_run
+from velfield.synthetic.truth import load_truth
 
+HEAVY_M = 6.5
+"""Longer than any car or van of the simulator, shorter than any lorry."""
 FRAMES, WIDTH, HEIGHT, GSD_M = 130, 960, 720, 0.23
 
 
@@ -50,6 +55,26 @@ def line(score: RunScore) -> str:
     )
 
 
+def heavy_vehicles(flight: Path, out: Path) -> str:
+    """Lorries and buses among the vehicles that move: true, and by `velfield.analysis.vehicle_classes`."""
+    analysis = open_run(out).analysis.traffic
+    cars = load_truth(flight).cars
+    seen = (
+        cars[cars["visible"]]
+        .groupby("vehicle_id")
+        .agg(frames=("frame", "size"), moving=("moving", "any"), length_px=("length_px", "first"))
+    )
+    seen = seen[(seen["frames"] >= 5) & seen["moving"]]
+    true = int((seen["length_px"] * GSD_M > HEAVY_M).sum())
+    share = analysis.classes.estimate_shares(analysis.classes.measured)[HEAVY] if analysis.classes else None
+    found = (
+        "too little data"
+        if share is None
+        else f"{100 * share.value:.1f} % ({100 * share.low:.1f} to {100 * share.high:.1f})"
+    )
+    return f"lorries and buses: {true} of {len(seen)}, {100 * true / len(seen):.1f} %; found {found}"
+
+
 def main() -> None:
     """Simulate, run, score."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -63,6 +88,7 @@ def main() -> None:
         simulate(flight, seed)
         scores.append(run(flight, asked.work / f"run-{seed}", asked.settings))
         print(f"seed {seed}: {line(scores[-1])}", flush=True)
+        print(f"  {heavy_vehicles(flight, asked.work / f'run-{seed}')}", flush=True)
     mean = [
         float(np.mean([getattr(score.traffic, name) for score in scores]))
         for name in ("tracks_per_vehicle", "idf1", "mota", "switches", "mixed_tracks")
