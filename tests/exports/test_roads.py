@@ -11,12 +11,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from schemas.tables import DIMENSION_COLUMNS
 from tests.analysis.test_lanes import AVENUE, BESIDE, GSD_M, LEAVES, OPPOSITE, driven
 from tests.exports.test_exports import UTM
 from tests.field_runs import field_run, tracklets_along
 from velfield.exports.export import export_run
 from velfield.exports.roads.network import RoadNetwork, road_network
-from velfield.run.run import Run
+from velfield.run.run import Run, open_run
+from velfield.run.tables import write_table
 
 SHAPE = (400, 640)
 
@@ -137,6 +139,26 @@ def test_tables_of_trajectories(run: Run, tmp_path: Path) -> None:
     assert highd["width"].max() <= np.hypot(4.5, 1.8) + 1e-3
     eastwards = highd[highd["yVelocity"].abs() < 0.2]
     assert np.allclose(eastwards["height"], 1.8, atol=0.2)
+
+
+def test_a_measured_vehicle_has_its_own_box_and_class(run: Run, tmp_path: Path) -> None:
+    lorry, *others = run.analysis.trajectories.track_id.tolist()
+    sizes = {"length_px": 11.0, "length_sd_px": 0.3, "width_px": 2.5, "width_sd_px": 0.1}
+    row = {"track_id": lorry, **{name: size / GSD_M for name, size in sizes.items()}, "strips": 16}
+    write_table(run.layout.dimensions, pd.DataFrame([row]), DIMENSION_COLUMNS)
+    measured = open_run(run.layout.root)
+    try:
+        table = pd.read_parquet(export_run(measured, "trajectories", tmp_path / "x.parquet"))
+        highd = pd.read_csv(export_run(measured, "highd", tmp_path / "x.csv"))
+    finally:
+        run.layout.dimensions.unlink()
+    own = table[table["track_id"] == lorry]
+    assert own["length_m"].to_numpy() == pytest.approx(11.0, abs=1e-3)
+    assert set(own["vehicle_class"]) == {"lorry or bus"}
+    assert own["class_probability"].min() > 0.9
+    assert table.loc[table["track_id"].isin(others), ["length_m", "vehicle_class"]].isna().all(axis=None)
+    long = np.hypot(highd["width"], highd["height"]) > 9
+    assert long.tolist() == (table["track_id"] == lorry).tolist()
 
 
 def test_a_table_with_a_reference_system_has_coordinates(run: Run) -> None:

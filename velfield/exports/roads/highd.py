@@ -1,7 +1,8 @@
 """Trajectories as a CSV with the columns of the highD data set's ``tracks.csv``, for programs that read that.
 
 As in highD x points right and y down, in metres, and (x, y) is the upper left corner of the vehicle's upright box, of
-``width`` along x and ``height`` along y. The box is that of a usual car in the direction of travel.
+``width`` along x and ``height`` along y. The box is the vehicle in the direction of travel, that of a usual car where
+its dimensions were not measured.
 """
 
 from pathlib import Path
@@ -26,7 +27,8 @@ def highd_csv(table: pd.DataFrame) -> str:
     """The table of `trajectory_table` in highD's columns, and the time, s, as the last one."""
     angle = np.arctan2(table["vy_m_per_s"], table["vx_m_per_s"])
     c, s = np.abs(np.cos(angle)), np.abs(np.sin(angle))
-    width, height = _LENGTH_M * c + _WIDTH_M * s, _LENGTH_M * s + _WIDTH_M * c
+    along, across = table["length_m"].fillna(_LENGTH_M), table["width_m"].fillna(_WIDTH_M)
+    width, height = along * c + across * s, along * s + across * c
     numbers = pd.factorize(table["track_id"], sort=True)[0] + 1
     columns = {
         "frame": table["frame"],

@@ -7,6 +7,8 @@ from velfield.errors import InputError
 from velfield.exports.georeference import Georeference
 from velfield.run.run import Run
 
+_OF_VEHICLES = ["length_m", "width_m", "vehicle_class", "class_probability"]
+
 
 def trajectory_table(run: Run) -> pd.DataFrame:
     """Trajectories of the vehicles that move.
@@ -14,8 +16,9 @@ def trajectory_table(run: Run) -> pd.DataFrame:
     Returns
     -------
     DataFrame ``track_id, frame, time_s, x_m, y_m, vx_m_per_s, vy_m_per_s, ax_m_per_s2, ay_m_per_s2, speed_m_per_s,
-    heading_deg, lane`` and, with a reference system, ``longitude_deg, latitude_deg``; x to the right of the map and y
-    down, from its upper left corner; ``lane`` -1 where none was found; by track and time.
+    heading_deg, lane, length_m, width_m, vehicle_class, class_probability`` and, with a reference system,
+    ``longitude_deg, latitude_deg``; x to the right of the map and y down, from its upper left corner; ``lane`` -1 where
+    none was found, dimensions NaN and classes missing of a vehicle that was not measured; by track and time.
 
     Raises
     ------
@@ -54,6 +57,8 @@ def trajectory_table(run: Run) -> pd.DataFrame:
             "lane": lane,
         }
     )
+    vehicles = run.vehicles().set_index("track_id").reindex(paths.track_id)[_OF_VEHICLES]
+    table[_OF_VEHICLES] = vehicles.iloc[owner].reset_index(drop=True)
     if georeference.has_crs:
         table[["longitude_deg", "latitude_deg"]] = georeference.to_lonlat(xy_px)
     return table
