@@ -1,5 +1,6 @@
 """Another maker's network in the place of our detector: a tiny YOLO, made here, of every layout."""
 
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -125,9 +126,42 @@ def test_a_model_without_metadata_is_described_by_a_yaml(image: tuple[np.ndarray
     (tmp_path / "m.yaml").write_text("layout: boxes\nclasses: [tree, thing, other]\nvehicles: [1]\nthreshold: 0.9\n")
     detector = load_detector(path)
     assert len(detector.detect_raw(image[0])) == len(image[1])
-    (tmp_path / "m.yaml").write_text("layout: squares\n")
-    with pytest.raises(InputError, match=r"m\.yaml: layout"):
+    (tmp_path / "m.yaml").write_text("layout: squares\nclases: [car]\nvehicles: [car]\nthreshold: 2\n")
+    with pytest.raises(InputError, match=r"m\.yaml: layout: .*; vehicles\.0: .*; threshold: .*; clases: .*expected"):
         load_detector(path)
+
+
+def test_the_yaml_of_the_documentation_describes_a_model(image: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs" / "detection.md").read_text()
+    text = re.search(r"^# model\.yaml\n.*?(?=^```)", page, re.MULTILINE | re.DOTALL)
+    assert text is not None
+    path = tiny_yolo(tmp_path / "model.onnx", "boxes", metadata=False)
+    path.with_suffix(".yaml").write_text(text[0])
+    detector = load_detector(path)
+    assert [detector.record.classes[k] for k in detector.record.vehicles] == ["car", "bus"]
+    assert len(detector.detect_raw(image[0], threshold=0.9)) == len(image[1])
+
+
+@pytest.mark.parametrize(("dtype", "highest"), [("float32", 1.0), ("float16", 1.0), ("uint8", 255.0)])
+def test_a_model_gets_the_input_range_of_the_documentation(dtype: str, highest: float, tmp_path: Path) -> None:
+    """A model whose output is its input: white is 1 of floats, 255 of bytes; all three channels are equal."""
+    kind = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
+    graph = helper.make_graph(
+        [helper.make_node("Identity", ["images"], ["output0"])],
+        "same",
+        [helper.make_tensor_value_info("images", kind, [1, 3, TILE, TILE])],
+        [helper.make_tensor_value_info("output0", kind, [1, 3, TILE, TILE])],
+    )
+    path = tmp_path / "same.onnx"
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), str(path))
+    path.with_suffix(".yaml").write_text("layout: boxes\nclasses: [car]\nvehicles: [0]\n")
+    detector = load_detector(path)
+    assert isinstance(detector, OnnxDetector)
+    grey = np.zeros((TILE, TILE), np.uint8)
+    grey[:, 5:] = 255
+    seen = detector._run(grey)
+    assert (seen.dtype, seen.min(), seen.max()) == (np.dtype(dtype), 0.0, highest)
+    assert (seen == seen[0]).all()
 
 
 def test_models_that_cannot_be_used_are_refused(tmp_path: Path) -> None:

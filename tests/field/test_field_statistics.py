@@ -1,5 +1,8 @@
 """Statistics of a pixel, the whole map, and the prior."""
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -22,9 +25,9 @@ def drive(velocities: np.ndarray, y0: float = 50.0) -> Segments:
     return out
 
 
-def field(segments: Segments, shape: tuple[int, int] = (100, 160)) -> VelocityField:
+def field(segments: Segments, shape: tuple[int, int] = (100, 160), bins: VelocityBins = BINS) -> VelocityField:
     return VelocityField.from_segments(
-        segments, shape=shape, tile_size=64, bins=BINS, radius_px=3.5, stationary_speed_px_per_s=1.15 / GSD_M
+        segments, shape=shape, tile_size=64, bins=bins, radius_px=3.5, stationary_speed_px_per_s=1.15 / GSD_M
     )
 
 
@@ -59,6 +62,25 @@ def test_percentiles_are_those_of_the_speeds() -> None:
         assert value * GSD_M == pytest.approx(np.percentile(speeds, percent), abs=0.35)
     median_se = 1.2533 * 2.5 / np.sqrt(400)
     assert found.speed_se_px_per_s * GSD_M == pytest.approx(median_se, rel=0.35)
+
+
+def test_speeds_in_km_per_h_need_the_scale() -> None:
+    """The ground sample distance times 3.6, and one clear error at each of them where it is not known."""
+    segments = drive(polar(np.array([9.0, 10.0, 11.0]), np.full(3, 40.0)))
+    known = field(segments)
+    found = known.at(80, 50)
+    assert found.modal_speed_km_per_h == pytest.approx(36, abs=2)
+    assert found.percentiles_km_per_h[50] == pytest.approx(36, abs=1.5)
+    low, high = found.median_speed_interval_km_per_h
+    assert low < found.percentiles_km_per_h[50] < high
+    assert np.arctan2(*found.modal_velocity_km_per_h[::-1]) == pytest.approx(np.radians(40), abs=0.05)
+    assert known.modal_speed_km_per_h()[50, 80] == pytest.approx(found.modal_speed_km_per_h, rel=1e-5)
+    unknown = field(segments, bins=replace(BINS, gsd_m=None))
+    names = ("modal_speed", "modal_velocity", "percentiles", "median_speed_interval")
+    asked = [partial(getattr, unknown.at(80, 50), f"{name}_km_per_h") for name in names]
+    for ask in (*asked, unknown.modal_speed_km_per_h):
+        with pytest.raises(InputError, match=r"without a ground sample distance.*--gsd-m.*px/s"):
+            ask()
 
 
 def test_two_directions_are_two_modes_with_their_weights() -> None:

@@ -74,3 +74,13 @@ def test_the_command_prints_it(
 def test_a_pixel_that_is_none_is_refused(whole: tuple[Path, RunSummary], wrong: str) -> None:
     with pytest.raises(InputError, match=r"pixel"):
         lineage(whole[0], pixel=wrong)
+
+
+def test_a_run_converts_to_metres_where_its_scale_is_known(whole: tuple[Path, RunSummary]) -> None:
+    run = open_run(whole[0])
+    assert run.gsd_m == run.grid.gsd_m
+    np.testing.assert_allclose(run.to_metres([[0, 0], [412, 300]]), [[0, 0], [412 * run.gsd_m, 300 * run.gsd_m]])
+    vars(run)["grid"] = run.grid.model_copy(update={"gsd_m": None})
+    for ask in (lambda: run.gsd_m, lambda: run.to_metres([[1, 2]])):
+        with pytest.raises(InputError, match=r"without a ground sample distance.*--gsd-m"):
+            ask()

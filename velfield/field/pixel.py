@@ -56,6 +56,28 @@ class PixelDistribution:
     direction_interval_rad: tuple[float, float]
     median_speed_interval_px_per_s: tuple[float, float]
 
+    @property
+    def modal_velocity_km_per_h(self) -> FloatArray:
+        """(2,) as (vx, vy) km/h, NaN where empty. This and the other speeds in km/h raise InputError where the ground
+        sample distance is not known."""
+        return self.modal_velocity_px_per_s * self.bins.km_per_h_per_px_per_s
+
+    @property
+    def modal_speed_km_per_h(self) -> float:
+        """Speed of the highest mode, km/h, NaN where empty."""
+        return float(np.hypot(*self.modal_velocity_km_per_h))
+
+    @property
+    def percentiles_km_per_h(self) -> dict[int, float]:
+        """Speed by percentage: 15, 50, 85; km/h."""
+        return {share: speed * self.bins.km_per_h_per_px_per_s for share, speed in self.percentiles_px_per_s.items()}
+
+    @property
+    def median_speed_interval_km_per_h(self) -> tuple[float, float]:
+        """90 % interval of the median speed: lower and upper end, km/h."""
+        low, high = self.median_speed_interval_px_per_s
+        return low * self.bins.km_per_h_per_px_per_s, high * self.bins.km_per_h_per_px_per_s
+
 
 def describe_pixel(
     x: int,

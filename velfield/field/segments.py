@@ -15,6 +15,27 @@ from schemas.flight import PAPER_GSD_M, FieldConfig
 from velfield.errors import InputError
 
 
+def require_gsd_m(gsd_m: float | None) -> float:
+    """The ground sample distance, for whoever asks for metres.
+
+    Raises
+    ------
+    InputError
+        It is not known.
+
+    Examples
+    --------
+    >>> require_gsd_m(0.23)
+    0.23
+    """
+    if gsd_m is None:
+        raise InputError(
+            "found a run without a ground sample distance, expected one for metres and km/h; run it again with "
+            "--gsd-m, put it on Earth (`velfield georeference RUN`), or take px and px/s"
+        )
+    return gsd_m
+
+
 @dataclass(frozen=True)
 class VelocityBins:
     """Square bins of velocity, the same on both axes, one of them centred on zero velocity.
@@ -58,6 +79,17 @@ class VelocityBins:
             kernel_sigma_px_per_s=config.kernel_sigma_m_per_s / metres,
             gsd_m=gsd_m,
         )
+
+    @property
+    def km_per_h_per_px_per_s(self) -> float:
+        """A speed of 1 px/s, km/h.
+
+        Raises
+        ------
+        InputError
+            The ground sample distance is not known.
+        """
+        return 3.6 * require_gsd_m(self.gsd_m)
 
     @property
     def n(self) -> int:

@@ -137,6 +137,16 @@ class VelocityField:
         """(y, x) speed of the highest mode, px/s; NaN where no vehicle passed."""
         return speed_px_per_s(self.modal_velocity().astype(np.float64))
 
+    def modal_speed_km_per_h(self) -> FloatArray:
+        """(y, x) speed of the highest mode, km/h; NaN where no vehicle passed.
+
+        Raises
+        ------
+        InputError
+            The ground sample distance is not known.
+        """
+        return self.modal_speed_px_per_s() * self.bins.km_per_h_per_px_per_s
+
     def count(self) -> NDArray[np.int32]:
         """(y, x) number of tracks; 0 where no vehicle passed."""
         if self._layers is not None:

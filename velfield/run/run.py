@@ -22,7 +22,7 @@ from velfield.analysis.crossings import find_crossings, hysteresis_px
 from velfield.analysis.vehicle_classes import add_dimensions
 from velfield.analysis.vehicles import find_vehicles
 from velfield.errors import OldNameWarning
-from velfield.field.segments import Segments, segment_table
+from velfield.field.segments import Segments, require_gsd_m, segment_table
 from velfield.field.view import VelocityField
 from velfield.registration.warp import warp_to_base
 from velfield.run.analysis import RunAnalysis
@@ -121,6 +121,27 @@ class Run:
         xy = self._transform_points("to_raw", frame, xy_base)
         xy[np.isnan(self.position_sd_px(frame, xy))] = np.nan
         return xy
+
+    @property
+    def gsd_m(self) -> float:
+        """The ground sample distance, metres a base pixel.
+
+        Raises
+        ------
+        InputError
+            It is not known: then so are no metres and no km/h of this run.
+        """
+        return require_gsd_m(self.grid.gsd_m)
+
+    def to_metres(self, xy_base: Points) -> Points:
+        """Base pixels -> metres to the right of and below the top-left pixel's centre, (n, 2) -> (n, 2).
+
+        Raises
+        ------
+        InputError
+            The ground sample distance is not known.
+        """
+        return np.asarray(xy_base, np.float64).reshape(-1, 2) * self.gsd_m
 
     def position_sd_px(self, frame: int, xy_raw: Points) -> FloatArray:
         """Standard deviation of the base position of a frame's raw pixels, (n, 2) -> (n,) base px.

@@ -68,12 +68,15 @@ def _read_yaml(path: Path) -> OnnxDescription:
     try:
         return OnnxDescription.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")) or {})
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "the file"
+        faults = "; ".join(_fault(one["loc"], one["msg"]) for one in error.errors())
         keys = ", ".join(OnnxDescription.model_fields)
-        raise InputError(f"{path.name}: {where}: {first['msg'].lower()}; expected the keys {keys}") from None
+        raise InputError(f"{path.name}: {faults}; expected the keys {keys}; fix them") from None
     except (yaml.YAMLError, UnicodeDecodeError):
         raise InputError(f"{path.name}: this is not YAML, expected a description of the model; fix it") from None
+
+
+def _fault(place: tuple[int | str, ...], problem: str) -> str:
+    return f"{'.'.join(map(str, place)) or 'the file'}: {problem[:1].lower()}{problem[1:]}"
 
 
 def _class_names(text: str) -> tuple[str, ...]:

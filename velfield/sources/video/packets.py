@@ -21,13 +21,15 @@ from velfield.sources.video.corruption import capture_errors
 _FORMATS = "mov,mp4,avi,matroska,webm,mpegts,mpeg,h264,hevc,m4v,mpegvideo,flv,mxf,asf,ogg,nut,ivf,av1,obu,dv,gif"
 _OPTIONS = {"protocol_whitelist": "file", "format_whitelist": _FORMATS}
 _MAX_ERRORS = 100
+_METADATA = {"metadata_errors": "replace"} if int(av.__version__.partition(".")[0]) < 19 else {}
+"""A container's texts need not be UTF-8. PyAV 19 never raises at them, and has no such argument."""
 
 
 def open_video(path: Path) -> Any:
     """Open for reading; only local files, only demuxers that read this one file."""
     try:
         with capture_errors():
-            return av.open(str(path), mode="r", options=_OPTIONS, metadata_errors="replace")
+            return av.open(str(path), mode="r", options=_OPTIONS, **_METADATA)
     except (av.error.FFmpegError, OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or str(error)
         raise InputError(
