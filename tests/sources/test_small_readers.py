@@ -4,6 +4,7 @@ import itertools
 import math
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -17,7 +18,16 @@ from velfield.sources.frames import local_path
 from velfield.sources.images import image_size, read_grey_image
 from velfield.sources.labels.boxes import car_shape
 from velfield.sources.labels.yolo import CAR_ASPECT, car_class_numbers, car_in_upright_box, tilt_of_upright_box
-from velfield.sources.quality import find_cuts, flag_blurred, flag_outlier_frames, is_black
+from velfield.sources.quality import (
+    BLACK_LEVEL,
+    FLAT_SD,
+    find_cuts,
+    flag_blurred,
+    flag_outlier_frames,
+    frame_quality,
+    is_black,
+    is_duplicate,
+)
 from velfield.sources.selection import select_frames
 from velfield.sources.table import finite_cell, read_csv_rows, read_text
 from velfield.sources.timestamps import check_against_container
@@ -152,6 +162,35 @@ def test_cars_are_known_by_their_names_and_lorries_are_none() -> None:
     assert car_class_numbers(enumerate(names), Path("classes.txt")) == {1, 3, 7}
     with pytest.raises(InputError, match="found the classes bus, tram, expected one of cars"):
         car_class_numbers([(0, "bus"), (1, "tram")], Path("classes.txt"))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 6), (7, 2), (33, 40)])
+def test_sharpness_is_the_standard_deviation_of_opencv_s_laplacian(shape: tuple[int, int]) -> None:
+    for grey in (np.random.default_rng(shape).integers(0, 256, shape).astype(np.uint8), np.full(shape, 90, np.uint8)):
+        _, expected = cv2.meanStdDev(cv2.Laplacian(grey, cv2.CV_16S))
+        assert math.isclose(frame_quality(grey).sharpness, float(expected[0, 0]), abs_tol=1e-9)
+
+
+def test_black_frames_are_those_of_numpy_s_percentile_and_deviation() -> None:
+    rng, answers = np.random.default_rng(5), []
+    for _ in range(300):
+        grey = rng.normal(rng.uniform(0, 25), rng.uniform(0.3, 6), rng.integers(1, 60, 2)).clip(0, 255).astype(np.uint8)
+        sample = grey[::4, ::4]
+        expected = bool(np.percentile(sample, 99) < BLACK_LEVEL or sample.std() < FLAT_SD)
+        assert is_black(grey) == expected
+        answers.append(expected)
+    assert 60 < sum(answers) < 240  # both answers are met
+
+
+@pytest.mark.parametrize(("row", "column"), [(0, 0), (63, 5), (64, 7), (129, 9)])
+def test_one_pixel_of_any_row_tells_two_frames_apart(row: int, column: int) -> None:
+    grey = np.full((130, 10), 90, np.uint8)
+    other = grey.copy()
+    other[row, column] += 1
+    assert is_duplicate(grey, other)
+    other[row, column] += 1
+    assert not is_duplicate(grey, other)
+    assert not is_duplicate(grey, grey[:-1])
 
 
 def test_blur_is_relative_to_the_neighbours_and_needs_three_frames() -> None:
