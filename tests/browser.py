@@ -16,6 +16,7 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
@@ -77,7 +78,7 @@ def browser(profile: Path) -> Iterator["Browser"]:
         stderr=subprocess.DEVNULL,
     )
     try:
-        yield Browser(_port(profile, process))
+        yield Browser(_port(profile, process), psutil.Process(process.pid))
     finally:
         process.terminate()
         process.wait(_PATIENCE_S)
@@ -96,8 +97,9 @@ def _port(profile: Path, process: "subprocess.Popen[bytes]") -> int:
 class Browser:
     """A running Chromium."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, process: psutil.Process) -> None:
         self.port = port
+        self.process = process
 
     @contextmanager
     def page(self, *, width: int = 1280, height: int = 860) -> Iterator["Page"]:

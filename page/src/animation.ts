@@ -1,6 +1,7 @@
 // A canvas over the map that follows it, and the loop that paints moving things on it.
 
 import type L from "leaflet";
+import { Backdrop } from "./backdrop";
 
 /** Base pixels to CSS pixels of the map: x * scale + left. */
 export interface View {
@@ -12,9 +13,39 @@ export interface View {
 }
 
 export interface Painter {
-  /** Paint at a time (ms); true: something moves, paint again. */
-  paint(context: CanvasRenderingContext2D, view: View, now: number): boolean;
+  /** Paint at a time (ms), and mark where; true: something moves, paint again. */
+  paint(context: CanvasRenderingContext2D, view: View, now: number, painted: Blocks): boolean;
 }
+
+const BLOCK_PX = 64;
+
+/** Which blocks of the canvas were painted: to clear those alone takes a third of the time of clearing all of it. */
+export class Blocks {
+  private readonly marked = new Set<number>();
+
+  /** Mark the blocks within `reach` of a point, CSS px. */
+  mark(x: number, y: number, reach: number): void {
+    const [right, bottom] = [Math.floor((x + reach) / BLOCK_PX), Math.floor((y + reach) / BLOCK_PX)];
+    for (let j = Math.floor((y - reach) / BLOCK_PX); j <= bottom; j++) {
+      for (let i = Math.floor((x - reach) / BLOCK_PX); i <= right; i++) {
+        if (i >= 0 && j >= 0 && i < ROW_BLOCKS) this.marked.add(j * ROW_BLOCKS + i);
+      }
+    }
+  }
+
+  /** Clear them, on a canvas of `ratio` pixels a CSS pixel: whole pixels, as a part of one is not cleared whole. */
+  clear(context: CanvasRenderingContext2D, ratio: number): void {
+    context.setTransform(1, 0, 0, 1, 0, 0);
+    const edge = (k: number): number => Math.floor(k * BLOCK_PX * ratio);
+    for (const block of this.marked) {
+      const [i, j] = [block % ROW_BLOCKS, Math.floor(block / ROW_BLOCKS)];
+      context.clearRect(edge(i), edge(j), edge(i + 1) - edge(i), edge(j + 1) - edge(j));
+    }
+    this.marked.clear();
+  }
+}
+
+const ROW_BLOCKS = 1 << 10;
 
 const MAX_CANVAS_PX = 6e6; // a larger screen gets a coarser canvas
 const MIN_CANVAS_PX = 1.2e6; // as coarse as a slow machine's may become
@@ -26,6 +57,8 @@ export const reducedMotion = (): boolean => window.matchMedia("(prefers-reduced-
 export class Animation {
   private readonly canvas = document.createElement("canvas");
   private readonly context = this.canvas.getContext("2d")!;
+  private readonly backdrop: Backdrop;
+  private readonly painted = new Blocks();
   private readonly painters: Painter[] = [];
   private requested = false;
   private zooming = false;
@@ -37,6 +70,7 @@ export class Animation {
     this.canvas.className = "animation";
     this.canvas.setAttribute("aria-hidden", "true");
     map.getContainer().append(this.canvas);
+    this.backdrop = new Backdrop(map);
     map.on("resize", () => {
       this.fineness = 1;
       this.resize();
@@ -67,6 +101,7 @@ export class Animation {
   /** Show or hide the canvas; nothing is painted on a hidden one. */
   show(shown: boolean): void {
     this.canvas.hidden = !shown;
+    if (!shown) this.backdrop.hide();
     this.request();
   }
 
@@ -99,15 +134,19 @@ export class Animation {
     if (this.zooming || this.canvas.hidden) return;
     const view = this.view();
     if (!this.painters.length && this.empty) return;
-    this.context.setTransform(1, 0, 0, 1, 0, 0);
-    this.context.clearRect(0, 0, this.canvas.width, this.canvas.height);
-    this.empty = !this.painters.length;
     const ratio = this.canvas.width / Math.max(view.width, 1);
+    this.painted.clear(this.context, ratio);
     this.context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    const moves = this.painters.map((painter) => painter.paint(this.context, view, now));
+    this.empty = !this.painters.length;
+    const moves = this.painters.map((painter) => painter.paint(this.context, view, now, this.painted));
     this.count(now);
-    if (moves.includes(true)) this.request();
-    else this.times = [];
+    if (moves.includes(true)) {
+      this.backdrop.follow();
+      this.request();
+    } else {
+      this.backdrop.hide();
+      this.times = [];
+    }
   }
 
   /** Frames a second over the last sixty frames, for measurements. */

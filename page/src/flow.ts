@@ -1,6 +1,6 @@
 // Particles that move through the field. Each draws its velocity from the distribution where it is (view/flow.bin).
 
-import type { Painter, View } from "./animation";
+import type { Blocks, Painter, View } from "./animation";
 import { fetchFile, type Run } from "./run";
 
 const MAX_PARTICLES = 2500;
@@ -9,6 +9,7 @@ const LIFE_S = [2, 5] as const;
 const REDRAW_S = 0.25; // a vehicle keeps its speed for so long
 const TURN_S = 0.15; // time in which a particle takes on a new velocity
 const TAIL_S = 0.3;
+const LINE_PX = 3.4;
 const SCREEN_PX_PER_S = 45; // of a vehicle at 60 px/s in the map, at least
 const STILL_BINS = 1.5; // the kernel blurs the velocities of a stationary vehicle over the bins around zero
 const MIN_ALONG = 0.5; // cosine: a particle draws among the velocities that go its way
@@ -71,7 +72,7 @@ export class Flow implements Painter {
     return Math.max(1, SCREEN_PX_PER_S / 60 / scale);
   }
 
-  paint(context: CanvasRenderingContext2D, view: View, now: number): boolean {
+  paint(context: CanvasRenderingContext2D, view: View, now: number, painted: Blocks): boolean {
     if (!this.cells) return false;
     const dt = Math.min((now - this.last) / 1000, 0.1);
     this.last = now;
@@ -79,7 +80,7 @@ export class Flow implements Painter {
     const pace = this.pace(view.scale);
     for (const particle of this.particles) this.move(particle, dt, pace);
     this.particles = this.particles.filter(({ left_s }) => left_s > 0);
-    this.draw(context, view);
+    this.draw(context, view, painted);
     return true;
   }
 
@@ -190,16 +191,18 @@ export class Flow implements Painter {
   }
 
   /** Dark below, light above: seen on any colour. */
-  private draw(context: CanvasRenderingContext2D, { scale, left, top }: View): void {
+  private draw(context: CanvasRenderingContext2D, { scale, left, top }: View, painted: Blocks): void {
     const path = new Path2D();
     for (const p of this.particles) {
       const [x, y] = [p.x * scale + left, p.y * scale + top];
-      path.moveTo(p.tailX * scale + left, p.tailY * scale + top);
+      const [tailX, tailY] = [p.tailX * scale + left, p.tailY * scale + top];
+      painted.mark((x + tailX) / 2, (y + tailY) / 2, Math.hypot(x - tailX, y - tailY) / 2 + LINE_PX);
+      path.moveTo(tailX, tailY);
       path.lineTo(x + 0.01, y);
     }
     context.lineCap = "square"; // round ends take half as long again to paint in software
     for (const [width, colour] of [
-      [3.4, "rgb(0 0 0 / .5)"],
+      [LINE_PX, "rgb(0 0 0 / .5)"],
       [1.7, "#fff"],
     ] as const) {
       context.lineWidth = width;

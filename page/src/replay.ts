@@ -1,6 +1,6 @@
 // The replay: vehicles where they were at a time, from view/replay/<k>.bin (velfield/viewer/replay.py).
 
-import type { Painter, View } from "./animation";
+import type { Blocks, Painter, View } from "./animation";
 import { rampColour } from "./colours";
 import type { Point } from "./coordinates";
 import { fetchFile, type Run } from "./run";
@@ -11,6 +11,7 @@ const WIDTH_M = 1.9;
 const UNKNOWN_LENGTH_PX = 20; // of a vehicle in the map, where metres are not known
 const MIN_SCREEN_PX = 9; // length drawn, at least
 const TRAIL_S = 3;
+const LINE_PX = 3; // the widest
 const SPEED_S = 0.5; // the speed shown is of so long before and after
 const PARKED = "parked";
 
@@ -90,12 +91,12 @@ export class Replay implements Painter {
     this.last = performance.now();
   }
 
-  paint(context: CanvasRenderingContext2D, view: View, now: number): boolean {
+  paint(context: CanvasRenderingContext2D, view: View, now: number, painted: Blocks): boolean {
     const chunk = this.chunk(this.time_s);
     if (this.playing && chunk) this.advance(now);
     this.last = now;
     if (!chunk) return true; // on its way
-    this.draw(context, view, this.at(chunk));
+    this.draw(context, view, this.at(chunk), painted);
     return this.playing;
   }
 
@@ -179,13 +180,14 @@ export class Replay implements Painter {
     return [between(x), between(y)];
   }
 
-  private draw(context: CanvasRenderingContext2D, view: View, vehicles: Seen[]): void {
+  private draw(context: CanvasRenderingContext2D, view: View, vehicles: Seen[], painted: Blocks): void {
     const { scale, left, top, width, height } = view;
     const length = Math.max(MIN_SCREEN_PX, scale * (this.run.gsd_m === null ? UNKNOWN_LENGTH_PX : LENGTH_M / this.run.gsd_m));
     const wide = (length * WIDTH_M) / LENGTH_M;
     for (const seen of vehicles) {
       const [x, y] = [(seen.x + 0.5) * scale + left, (seen.y + 0.5) * scale + top];
       if (x < -length || y < -length || x > width + length || y > height + length) continue;
+      painted.mark(x, y, length / 2 + LINE_PX);
       const speed = Math.hypot(seen.vx, seen.vy);
       const moves = speed > this.run.stationary_speed_px_per_s;
       context.save();
@@ -202,18 +204,22 @@ export class Replay implements Painter {
       context.globalAlpha = 1;
     }
     const chosen = vehicles.find(({ vehicle }) => vehicle === this.selected);
-    if (chosen) this.drawTrail(context, view, chosen);
+    if (chosen) this.drawTrail(context, view, chosen, painted);
   }
 
-  private drawTrail(context: CanvasRenderingContext2D, { scale, left, top }: View, seen: Seen): void {
+  private drawTrail(context: CanvasRenderingContext2D, { scale, left, top }: View, seen: Seen, painted: Blocks): void {
     const chunk = this.chunk(this.time_s);
     const v = chunk ? chunk.vehicle.indexOf(seen.vehicle) : -1;
     if (!chunk || v < 0) return;
+    let [x, y] = [(seen.x + 0.5) * scale + left, (seen.y + 0.5) * scale + top];
     context.beginPath();
-    context.moveTo((seen.x + 0.5) * scale + left, (seen.y + 0.5) * scale + top);
+    context.moveTo(x, y);
     for (let k = before(chunk, v, this.time_s); k >= chunk.first[v]! && chunk.time[k]! > this.time_s - TRAIL_S; k--) {
       const step = this.run.replay.step_px * scale;
-      context.lineTo(chunk.x[k]! * step + left, chunk.y[k]! * step + top);
+      const [fromX, fromY] = [chunk.x[k]! * step + left, chunk.y[k]! * step + top];
+      painted.mark((x + fromX) / 2, (y + fromY) / 2, Math.hypot(x - fromX, y - fromY) / 2 + LINE_PX);
+      [x, y] = [fromX, fromY];
+      context.lineTo(x, y);
     }
     context.lineWidth = 2;
     context.strokeStyle = "#fff";

@@ -13,7 +13,7 @@ import pytest
 from schemas.analysis import AnalysisColumn, AnalysisRecord, AnalysisRow, AnalysisTable, EstimateRecord, GeometryRecord
 from schemas.summary import RunSummary
 from schemas.view import ViewRecord
-from tests.browser import MIDDLE_OF_MAP, NEEDS_PAGE, Browser, browser, served
+from tests.browser import MIDDLE_OF_MAP, NEEDS_PAGE, Browser, Page, browser, served
 from velfield import open_run
 from velfield.field.segments import SEGMENT_DTYPE, stationary_speed_px_per_s
 from velfield.run.layout import RunLayout
@@ -246,6 +246,56 @@ def test_particles_move_on_the_roads(chromium: Browser, address: str, run: Run) 
     x, y = (x - w / 2 + width / 2).astype(int), (y - h / 2 + height / 2).astype(int)
     inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
     assert near[y[inside], x[inside]].mean() > 0.98
+
+
+def screen(page: Page) -> np.ndarray:
+    """The page as it is seen, without the particles."""
+    page.value("document.querySelector('canvas.animation').style.opacity = 0")
+    png = base64.b64decode(page.call("Page.captureScreenshot", format="png")["data"])
+    return cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR).astype(int)
+
+
+@NEEDS_PAGE
+@pytest.mark.parametrize("zoom", [0, -0.75])
+def test_while_particles_move_one_image_stands_for_the_tiles_and_shows_the_same(
+    chromium: Browser, address: str, zoom: float
+) -> None:
+    backdrop, pane = "document.querySelector('canvas.backdrop')", "document.querySelector('.leaflet-tile-pane')"
+    with chromium.page() as page:
+        page.open(f"{address}#flow=1&opacity=60&view=300,200,{zoom}")
+        page.wait(f"{backdrop} !== null && !{backdrop}.hidden")
+        assert page.value(f"getComputedStyle({pane}).visibility") == "hidden"
+        left, top = page.value(MIDDLE_OF_MAP)
+        x, y = slice(int(left) - 300, int(left) + 300), slice(int(top) - 200, int(top) + 200)
+        flattened = screen(page)[y, x]
+        page.value("document.getElementById('map').focus()")
+        page.key("f", 70)
+        page.wait(f"{backdrop}.hidden")
+        tiles = screen(page)[y, x]
+        assert np.ptp(tiles) > 100
+        assert np.abs(flattened - tiles).mean() < 0.5
+        assert np.quantile(np.abs(flattened - tiles), 0.99) <= (2 if zoom == 0 else 12)
+        assert page.complaints == []
+
+
+@NEEDS_PAGE
+def test_tiles_are_shown_while_the_map_is_moved_and_then_the_image_of_the_new_view(
+    chromium: Browser, address: str
+) -> None:
+    backdrop = "document.querySelector('canvas.backdrop')"
+    with chromium.page() as page:
+        page.open(f"{address}#flow=1")
+        page.wait(f"{backdrop} !== null && !{backdrop}.hidden")
+        before = screen(page)
+        left, top = page.value(MIDDLE_OF_MAP)
+        page.mouse("mouseMoved", left, top)
+        page.mouse("mousePressed", left, top, 1)
+        for step in range(1, 9):
+            page.mouse("mouseMoved", left + 8 * step, top, 1)
+        assert page.value(f"{backdrop}.hidden")
+        page.mouse("mouseReleased", left + 64, top)
+        page.wait(f"!{backdrop}.hidden")
+        assert np.abs(screen(page) - before).mean() > 1
 
 
 @NEEDS_PAGE
