@@ -12,6 +12,7 @@ from velfield.registration.alignment import (
     HALF_PATCH,
     align_patches,
     extract_templates,
+    make_template_sets,
     make_templates,
     smooth_coarse,
     smooth_fine,
@@ -162,6 +163,30 @@ def test_templates_lie_on_corners_one_a_cell_and_keep_to_the_mask(base: np.ndarr
     mask = np.zeros(SHAPE, bool)
     mask[:, : WIDTH // 2] = True
     assert make_templates(base, mask).xy[:, 0].max() < WIDTH // 2 - HALF_PATCH
+
+
+def test_a_template_is_the_strongest_corner_of_its_cell(base: np.ndarray) -> None:
+    reach, side = 2 * HALF_PATCH + 2, 2 * HALF_PATCH + 1
+    gradient = cv2.cornerMinEigenVal(cv2.GaussianBlur(base, (0, 0), 0.8), side, ksize=3)
+    inside = np.zeros_like(gradient)
+    inside[reach:-reach, reach:-reach] = gradient[reach:-reach, reach:-reach]
+    coarsely, finely = make_template_sets(base, counts=(48, 300))
+    assert len(finely) > len(coarsely) > 20
+    for found, cell in ((coarsely, 40), (finely, 16)):
+        corners = found.xy.astype(int)
+        for x, y in corners:
+            left, top = x // cell * cell, y // cell * cell
+            assert inside[y, x] == inside[top : top + cell, left : left + cell].max()
+        assert len(np.unique(corners // cell, axis=0)) == len(corners)
+
+
+def test_sets_of_templates_are_those_made_one_by_one(base: np.ndarray) -> None:
+    mask = np.ones(SHAPE, bool)
+    mask[:60] = False
+    for found, count in zip(make_template_sets(base, mask, counts=(100, 500)), (100, 500), strict=True):
+        alone = make_templates(base, mask, count=count)
+        for name in ("xy", "sigma_px", "fine", "coarse"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
 
 
 def test_excluded_positions_have_no_template_near(base: np.ndarray) -> None:

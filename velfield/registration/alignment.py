@@ -6,11 +6,13 @@ by inverse compositional Gauss-Newton steps with free gain and offset of the gre
 exposure and vignetting.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from velfield.registration.joint import ControlPoints
@@ -61,7 +63,12 @@ class Templates:
 def extract_templates(base: GreyImage, xy: FloatArray, sigma_px: FloatArray, half_patch: int = HALF_PATCH) -> Templates:
     """Cut patches out of a base image (h, w) at corners (n, 2), integers; each must lie in the image completely."""
     fine = smooth_fine(base)
-    coarse = smooth_coarse(fine)
+    return _cut_patches(fine, smooth_coarse(fine), xy, sigma_px, half_patch)
+
+
+def _cut_patches(
+    fine: Float32Array, coarse: Float32Array, xy: FloatArray, sigma_px: FloatArray, half_patch: int
+) -> Templates:
     at = xy.astype(np.int64)
     offsets = np.arange(-half_patch, half_patch + 1)
     dy, dx = (grid.ravel() for grid in np.meshgrid(offsets, offsets, indexing="ij"))
@@ -96,45 +103,65 @@ def make_templates(
     half_patch
         px from a corner to its patch's edge. Larger patches are less sensitive to noise, but span more relief.
     """
+    return make_template_sets(base, mask, counts=(count,), exclude=exclude, half_patch=half_patch)[0]
+
+
+def make_template_sets(
+    base: GreyImage,
+    mask: Mask | None = None,
+    *,
+    counts: Sequence[int],
+    exclude: FloatArray | None = None,
+    half_patch: int = HALF_PATCH,
+) -> list[Templates]:
+    """`make_templates` for several numbers of cells; what they have in common is computed once."""
     height, width = base.shape
     side = 2 * half_patch + 1
     gradient = cv2.cornerMinEigenVal(cv2.GaussianBlur(base, (0, 0), _FINE_SIGMA_PX), side, ksize=3)
-    # OpenCV gives the mean over the block of gradients in (grey / 255) per pixel, Sobel's factor of 4 divided out
-    eigenvalue = np.maximum(np.asarray(gradient, dtype=np.float64), 0.0) * 255.0**2 * side**2
     reach = half_patch * _COARSE_SPACING_PX + 2
     usable = np.zeros(base.shape, np.uint8)
     usable[reach : height - reach, reach : width - reach] = 1
     if mask is not None:
         usable &= cv2.erode(mask.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8), borderValue=0)
-    eigenvalue *= usable
     if exclude is not None:
-        eigenvalue *= _mask_away_from(exclude, base.shape)
-    cell = float(np.clip(np.sqrt(base.size / count), *_CELL_PX))
-    xy, strength = _find_cell_maxima(eigenvalue, max(1, round(cell)), (_NOISE_GREY / _MAX_SIGMA_PX) ** 2)
-    sigma = np.sqrt(_MIN_SIGMA_PX**2 + _NOISE_GREY**2 / np.maximum(strength, 1e-9))
-    return extract_templates(base, xy, sigma, half_patch)
+        usable &= _mask_away_from(exclude, base.shape)
+    gradient *= usable
+    fine = smooth_fine(base)
+    coarse = smooth_coarse(fine)
+    sets = []
+    for count in counts:
+        cell = max(1, round(float(np.clip(np.sqrt(base.size / count), *_CELL_PX))))
+        xy, mean = _find_cell_maxima(gradient, cell)
+        # OpenCV gives the mean over the block of gradients in (grey / 255) per pixel, Sobel's factor of 4 divided out
+        strength = mean.astype(np.float64) * 255.0**2 * side**2
+        strong = strength > (_NOISE_GREY / _MAX_SIGMA_PX) ** 2
+        sigma = np.sqrt(_MIN_SIGMA_PX**2 + _NOISE_GREY**2 / strength[strong])
+        sets.append(_cut_patches(fine, coarse, xy[strong].astype(np.float64), sigma, half_patch))
+    return sets
 
 
-def _mask_away_from(xy: FloatArray, shape: tuple[int, ...]) -> Mask:
+def _mask_away_from(xy: FloatArray, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     free = np.ones(shape, np.uint8)
     at = np.rint(xy).astype(np.int64)
     free[at[:, 1], at[:, 0]] = 0
-    return np.asarray(cv2.distanceTransform(free, cv2.DIST_C, 3) > HALF_PATCH)
+    return np.asarray(cv2.distanceTransform(free, cv2.DIST_C, 3) > HALF_PATCH, np.uint8)
 
 
-def _find_cell_maxima(strength: FloatArray, cell: int, threshold: float) -> tuple[FloatArray, FloatArray]:
-    """Position (n, 2) and value (n,) of each cell's maximum above ``threshold``."""
+@njit(cache=True, nogil=True)
+def _find_cell_maxima(strength, cell):  # type: ignore[no-untyped-def]
+    """Position (n, 2) and value (n,) of each cell's first maximum, in rows of cells."""
     height, width = strength.shape
-    rows, columns = -(-height // cell), -(-width // cell)
-    padded = np.zeros((rows * cell, columns * cell))
-    padded[:height, :width] = strength
-    cells = padded.reshape(rows, cell, columns, cell).transpose(0, 2, 1, 3).reshape(rows * columns, cell * cell)
-    best = cells.argmax(axis=1)
-    value = cells[np.arange(len(cells)), best]
-    k = np.flatnonzero(value > threshold)
-    y = (k // columns) * cell + best[k] // cell
-    x = (k % columns) * cell + best[k] % cell
-    return np.stack([x, y], axis=1).astype(np.float64), value[k]
+    columns = -(-width // cell)
+    count = -(-height // cell) * columns
+    xy, best = np.zeros((count, 2), np.int64), np.zeros(count, np.float32)
+    for y in range(height):
+        for column in range(columns):
+            k = (y // cell) * columns + column
+            for x in range(column * cell, min((column + 1) * cell, width)):
+                if strength[y, x] > best[k]:
+                    best[k] = strength[y, x]
+                    xy[k, 0], xy[k, 1] = x, y
+    return xy, best
 
 
 def smooth_fine(grey: GreyImage) -> Float32Array:

@@ -37,9 +37,10 @@ from velfield.errors import Failure
 from velfield.registration.alignment import (
     HALF_PATCH,
     N_PATCHES_CROSS_SENSOR,
+    N_PATCHES_SAME_SENSOR,
     Templates,
     align_patches,
-    make_templates,
+    make_template_sets,
     smooth_coarse,
     smooth_fine,
 )
@@ -175,7 +176,7 @@ def prepare_base(
     frame_area = grey.size if frame_shape is None else frame_shape[0] * frame_shape[1]
     ratio = float(np.clip(grey.size / frame_area, 1.0, _MAX_BASE_KEYPOINT_RATIO))
     keypoints = detect_keypoints(grey, config, mask, count=round(config.max_keypoints * ratio))
-    templates, dense_templates = make_templates(grey, mask), make_templates(grey, mask, count=N_PATCHES_CROSS_SENSOR)
+    templates, dense_templates = make_template_sets(grey, mask, counts=(N_PATCHES_SAME_SENSOR, N_PATCHES_CROSS_SENSOR))
     return BaseReference((grey.shape[0], grey.shape[1]), keypoints, templates, dense_templates)
 
 
