@@ -1,5 +1,6 @@
 """``base/georeference.json``: scale, north and place of the base image, where each is from, and how sure."""
 
+from datetime import UTC, datetime
 from typing import Literal
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
@@ -84,12 +85,29 @@ class MarkedPlace(Model):
     epsg: int | None = Field(None, gt=0, lt=2**31)
 
 
+class FlightStart(Model):
+    """When the first frame was taken, by a clock that the camera wrote."""
+
+    clock_s: float
+    """s since 1970, as if the clock were set to UTC."""
+    source: str
+    """Where it was read, for people."""
+    is_utc: bool
+    """Whether the clock is UTC by its format; a camera's own clock mostly shows local time."""
+
+    @property
+    def time(self) -> datetime:
+        """The clock as if it were set to UTC."""
+        return datetime.fromtimestamp(self.clock_s, UTC)
+
+
 class GeoreferenceRecord(Model):
     """What is known of scale, north and place."""
 
     scale: ScaleChoice = ScaleChoice()
     telemetry: str = ""
     """Where the camera's telemetry was read, or why there is none."""
+    start: FlightStart | None = None
     north_rad: float | None = None
     """Direction of true north in the base image, from +x towards +y (down)."""
     north_sd_deg: NonNegativeFloat | None = None

@@ -1,6 +1,7 @@
 """`velfield export` on a run: figures at any size, STAC assets that exist, every format on S3."""
 
 import json
+import re
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import get_args
@@ -12,6 +13,7 @@ import pytest
 import s3fs
 
 from schemas.export import EXPORT_FORMATS, ExportFormat, ExportOptions
+from schemas.georeference import FlightStart
 from schemas.summary import RunSummary
 from tests.exports.test_exports import UTM
 from velfield.errors import InputError
@@ -53,6 +55,25 @@ def test_a_stac_item_lists_files_that_exist(run: Run, tmp_path: Path) -> None:
 def test_stac_needs_the_start_of_the_flight(run: Run, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--start"):
         export_run(run, "stac", tmp_path / "item.json")
+
+
+@pytest.mark.parametrize(
+    ("is_utc", "shown", "stated"), [(True, "UTC", "x.mp4$"), (False, "by the camera", "taken as UTC$")]
+)
+def test_the_date_that_the_camera_wrote_is_used(
+    is_utc: bool, shown: str, stated: str, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded = FlightStart(clock_s=datetime(2024, 5, 1, 12, tzinfo=UTC).timestamp(), source="x.mp4", is_utc=is_utc)
+    monkeypatch.setattr(Run, "start", recorded)
+    item = json.loads(export_run(georeferenced(run), "stac", tmp_path / "item.json").read_text())["properties"]
+    assert item["start_datetime"] == "2024-05-01T12:00:00Z"
+    assert re.search(stated, item["velfield:start_source"])
+    poster = export_run(run, "poster", tmp_path / "sheet.svg", ExportOptions(width_px=200)).read_text()
+    assert f"2024-05-01 12:00 {shown}" in poster
+    given = ExportOptions(start=datetime(2025, 6, 1, tzinfo=UTC))
+    item = json.loads(export_run(georeferenced(run), "stac", tmp_path / "item.json", given).read_text())["properties"]
+    assert item["start_datetime"] == "2025-06-01T00:00:00Z"
+    assert "velfield:start_source" not in item
 
 
 def test_each_format_is_described_and_a_module() -> None:

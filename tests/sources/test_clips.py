@@ -1,16 +1,19 @@
 """Several clips of one place are one source: one clock, gaps noted, frames of all."""
 
 from dataclasses import replace
+from datetime import UTC, datetime
 from fractions import Fraction
 from pathlib import Path
 
 import av
 import numpy as np
 import pytest
+from PIL import Image
 
 from schemas.flight import FramesConfig
 from tests.media import drifting
 from velfield.errors import Failure, InputError
+from velfield.sources.capture_times import read_flight_start
 from velfield.sources.clips import clip_files, read_clips_telemetry, write_clip_list
 from velfield.sources.source import check_source, iter_frames, probe, select_frames
 
@@ -94,3 +97,33 @@ def test_clips_that_cannot_be_one_source_are_refused(tmp_path: Path) -> None:
         joined(tmp_path, one, one)
     with pytest.raises(InputError, match="folder"):
         joined(tmp_path, one, tmp_path)
+
+
+def test_a_flight_starts_by_subtitles_else_by_the_header(tmp_path: Path) -> None:
+    path = clip(tmp_path / "a.mp4", "2026-05-04T10:00:00Z")
+    info = probe(path, frames=FRAMES)
+    start = read_flight_start(path, info)
+    assert start is not None
+    assert (start.time, start.is_utc) == (datetime(2026, 5, 4, 10, tzinfo=UTC), True)
+    cue = "1\n00:00:02,000 --> 00:00:02,400\n2026-05-04 12:00:05.500\n[rel_alt: 80.0 abs_alt: 90.0]\n"
+    (tmp_path / "a.SRT").write_text(cue)
+    start = read_flight_start(path, info)
+    assert start is not None
+    assert (start.time, start.is_utc) == (datetime(2026, 5, 4, 12, 0, 3, 500_000, tzinfo=UTC), False)
+    assert start.source == "subtitles of a.mp4"
+    (tmp_path / "b.SRT").write_text(cue.replace("05-04", "05-06"))
+    given = read_flight_start(path, info, tmp_path / "b.SRT")
+    assert given is not None
+    assert given.time.day == 6
+    bare = clip(tmp_path / "c.mp4", None)
+    assert read_flight_start(bare, probe(bare, frames=FRAMES)) is None
+
+
+def test_a_flight_of_images_starts_by_the_first_ones_exif(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update({0x9003: "2024:05:01 12:00:00"})
+    for name in ("000.jpg", "001.jpg"):
+        Image.new("L", (64, 48), 90).save(tmp_path / name, exif=exif)
+    start = read_flight_start(tmp_path, probe(tmp_path, frames=FramesConfig(fps=5)))
+    assert start is not None
+    assert (start.time, start.source, start.is_utc) == (datetime(2024, 5, 1, 12, tzinfo=UTC), "EXIF of 000.jpg", False)

@@ -88,12 +88,22 @@ def _facts(run: Run, options: ExportOptions) -> list[str]:
     states = run.vehicles()["state"]
     count = run.field.count()
     known = int((count > 0).sum())
-    facts = [f"{options.start:%Y-%m-%d %H:%M %Z}" if options.start else "date not recorded (give --start)"]
+    facts = [_date(run, options)]
     facts += [f"{seconds:.0f} s of video", f"n = {int((states != 'parked').sum())} vehicles in traffic"]
     facts += [f"{int((states == 'parked').sum())} parked or stationary throughout"]
     if known:
         facts += [f"median of {float(np.median(count[count > 0])):.0f} vehicles at a coloured pixel"]
     return facts
+
+
+def _date(run: Run, options: ExportOptions) -> str:
+    """By ``--start``, else by what the camera wrote."""
+    if options.start is not None:
+        return f"{options.start:%Y-%m-%d %H:%M %Z}"
+    if run.start is None:
+        return "date not recorded (give --start)"
+    clock = "UTC" if run.start.is_utc else "by the camera's clock"
+    return f"{run.start.time:%Y-%m-%d %H:%M} {clock}"
 
 
 def _draw_wheel(sheet: Sheet, at: Point, north_rad: float | None) -> None:

@@ -32,17 +32,22 @@ _KINDS: dict[str, tuple[str, list[str]]] = {
 
 def encode(run: Run, path: Path, options: ExportOptions) -> bytes:
     """See `velfield.exports.export.ExportModule`."""
-    if options.start is None:
+    layout, times_s, recorded = run.layout, run.times_s, run.start
+    start = options.start or (recorded.time if recorded is not None else None)
+    if start is None:
         raise InputError("--format stac: found no start, expected the flight's; give --start 2024-05-01T12:00:00Z")
-    layout, times_s = run.layout, run.times_s
+    properties: dict[str, object] = {"velfield:version": run.record.code_version, "velfield:frames": run.frames.count}
+    if options.start is None and recorded is not None:
+        zone = "" if recorded.is_utc else "; the camera's clock, whose time zone is not known, taken as UTC"
+        properties["velfield:start_source"] = f"{recorded.source}{zone}"
     files = [file for file in (*sorted(layout.maps.glob("*.tif")), layout.field, layout.report) if file.exists()]
     item = stac_item(
         layout.root.resolve().name,
         Georeference.from_grid(run.grid),
         {file.stem: _href(file, path.parent) for file in files},
-        start=options.start,
+        start=start,
         duration_s=float(times_s[-1] - times_s[0]),
-        properties={"velfield:version": run.record.code_version, "velfield:frames": run.frames.count},
+        properties=properties,
     )
     return json.dumps(item, indent=1).encode()
 

@@ -9,6 +9,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, GreyImage, Mask, Points
+from schemas.georeference import FlightStart
 from schemas.records import FORMAT_VERSION, FlightRecord, GridRecord
 from schemas.tables import (
     DETECTION_COLUMNS,
@@ -28,7 +29,7 @@ from velfield.registration.warp import warp_to_base
 from velfield.run.analysis import RunAnalysis
 from velfield.run.field_reader import IntervalField, open_field_intervals, open_velocity_field
 from velfield.run.flight_record import read_flight_record
-from velfield.run.frame_transforms import FrameTransforms, read_base_image, read_grid
+from velfield.run.frame_transforms import FrameTransforms, read_base_image, read_georeference, read_grid
 from velfield.run.layout import RunLayout, to_path
 from velfield.run.stores import FrameStore, RegistrationStore, open_field, open_frames, open_registration
 from velfield.run.tables import conform, read_tables, read_track_tables
@@ -121,6 +122,12 @@ class Run:
         xy = self._transform_points("to_raw", frame, xy_base)
         xy[np.isnan(self.position_sd_px(frame, xy))] = np.nan
         return xy
+
+    @property
+    def start(self) -> FlightStart | None:
+        """When the first frame was taken, by subtitles, EXIF or the container's header; None where none has it."""
+        record = read_georeference(self.layout)
+        return None if record is None else record.start
 
     @property
     def gsd_m(self) -> float:

@@ -1,4 +1,4 @@
-"""A frame rate that the user gives, against the times that the camera wrote in the images (EXIF)."""
+"""Times that the camera wrote: when a flight began, and a frame rate that the user gives against those of images."""
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -6,8 +6,12 @@ from pathlib import Path
 
 from PIL import ExifTags
 
+from schemas.georeference import FlightStart
 from velfield.errors import InputError
+from velfield.sources.clips import clock_of, creation_clock, subtitle_clock
+from velfield.sources.frames import SourceInfo
 from velfield.sources.images import read_image_tags
+from velfield.sources.telemetry.read import read_srt
 
 _TAKEN, _FRACTION = 0x9003, 0x9291  # DateTimeOriginal, SubSecTimeOriginal
 _MAX_DISAGREEMENT = 0.1
@@ -29,6 +33,28 @@ def describe_rate(folder: Path, names: Sequence[str], fps: float) -> tuple[str, 
         f"the times that the camera wrote in them: speeds would be {fps / rate:.2g} times the true ones; give --fps "
         f"{rate:.3g}, or --timestamps",
     )
+
+
+def read_flight_start(source: Path, info: SourceInfo, telemetry: Path | None = None) -> FlightStart | None:
+    """When a source's first frame was taken; None where nothing in it says so.
+
+    Parameters
+    ----------
+    source, info
+        The video, list of clips or folder of images, and its facts.
+    telemetry
+        A subtitle file given; its cues count from the first frame.
+    """
+    if info.kind == "folder":
+        taken = _capture_time(source / info.names[0]) if info.names else None
+        return None if taken is None else FlightStart(clock_s=taken[0], source=f"EXIF of {info.names[0]}", is_utc=False)
+    clip = Path(info.parts[0][0]) if info.parts else source
+    part = info.parts[0][1] if info.parts else info
+    clock_s = subtitle_clock(clip, part) if telemetry is None else clock_of(read_srt(telemetry))
+    if clock_s is not None:
+        return FlightStart(clock_s=clock_s, source=f"subtitles of {(telemetry or clip).name}", is_utc=False)
+    created_s = creation_clock(clip, part)
+    return None if created_s is None else FlightStart(clock_s=created_s, source=f"header of {clip.name}", is_utc=True)
 
 
 def _capture_time(path: Path) -> tuple[float, float] | None:

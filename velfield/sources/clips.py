@@ -127,7 +127,7 @@ def _join(parts: tuple[tuple[str, SourceInfo, float], ...], notes: tuple[str, ..
 
 def _starts(clips: Sequence[Path], infos: Sequence[SourceInfo]) -> tuple[FloatArray, tuple[str, ...]]:
     """When each clip began, s on one clock, and a note where that is not known."""
-    for clock in (_subtitle_clock, _creation_clock):
+    for clock in (subtitle_clock, creation_clock):
         found = [clock(clip, info) for clip, info in zip(clips, infos, strict=True)]
         if all(start is not None for start in found):
             return np.array(found, np.float64), ()
@@ -139,16 +139,21 @@ def _starts(clips: Sequence[Path], infos: Sequence[SourceInfo]) -> tuple[FloatAr
     return np.concatenate([[0.0], np.cumsum(lasts)[:-1]]), (note,)
 
 
-def _subtitle_clock(clip: Path, info: SourceInfo) -> float | None:
+def subtitle_clock(clip: Path, info: SourceInfo) -> float | None:
+    """The camera's clock at a video's first frame by its subtitles, s since 1970 as if it were set to UTC."""
     beside = find_beside(clip)
     telemetry = read_srt(beside) if beside is not None else read_telemetry(clip, info)
-    if isinstance(telemetry, Failure):
-        return None
+    return None if isinstance(telemetry, Failure) else clock_of(telemetry)
+
+
+def clock_of(telemetry: Telemetry) -> float | None:
+    """The camera's clock at the source's first frame, s since 1970; None where no record has it."""
     known = np.flatnonzero(np.isfinite(telemetry.clock_s))
     return float(telemetry.clock_s[known[0]] - telemetry.time_s[known[0]]) if len(known) else None
 
 
-def _creation_clock(clip: Path, _info: SourceInfo) -> float | None:
+def creation_clock(clip: Path, _info: SourceInfo) -> float | None:
+    """When a video began by its container's header, s since 1970; None where it is not there."""
     with libav_log(), open_video(clip) as container:
         text = container.metadata.get("creation_time", "")
     try:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from schemas.flight import FramesConfig
-from schemas.georeference import ControlPointsRecord, GeoreferenceRecord
+from schemas.georeference import ControlPointsRecord, FlightStart, GeoreferenceRecord
 from schemas.records import GridRecord
 from schemas.scale import ScaleEstimate
 from velfield.errors import Failure
@@ -30,6 +30,7 @@ from velfield.run.frame_transforms import (
 )
 from velfield.run.layout import RunLayout, local_output
 from velfield.run.stores import open_frames, open_registration
+from velfield.sources.capture_times import read_flight_start
 from velfield.sources.clips import read_clips_telemetry
 from velfield.sources.geo import reconcile_gsd
 from velfield.sources.scale import choose_scale
@@ -90,7 +91,7 @@ def compare_sources(
     scale = poses if isinstance(poses, Failure) else estimate_scale(poses)
     estimates += [scale] if isinstance(scale, ScaleEstimate) else []
     described = poses.reason if isinstance(poses, Failure) else poses.telemetry.origin
-    record = GeoreferenceRecord(scale=choose_scale(estimates), telemetry=described)
+    record = GeoreferenceRecord(scale=choose_scale(estimates), telemetry=described, start=_start(plan))
     notes = [] if isinstance(poses, Failure) else _missing(scale, poses)
     if points is not None:
         record = with_control_points(record, points)
@@ -166,6 +167,15 @@ def with_control_points(record: GeoreferenceRecord, points: ControlPointsRecord)
             "position_sd_m": points.left_out_rms_m if points.left_out_rms_m is not None else points.rms_m,
         }
     )
+
+
+def _start(plan: Plan) -> FlightStart | None:
+    """When the run's first frame was taken."""
+    given, times_s = plan.job.inputs.telemetry, open_frames(plan.layout.frames).column("time_s")
+    start = read_flight_start(Path(plan.job.inputs.source), plan.info, Path(given) if given else None)
+    if start is None or not len(times_s):
+        return None
+    return start.model_copy(update={"clock_s": start.clock_s + float(times_s[0] - plan.info.times_s[0])})
 
 
 def _frame_poses(plan: Plan) -> FramePoses | Failure:

@@ -175,7 +175,8 @@ def rebase_georeference(plan: Plan, rebase: Rebase) -> StageResult:
         estimates += [_rescale(estimate, record.scale) for estimate in every if estimate is not None]
         if old.north_rad is not None:
             update = {"north_rad": old.north_rad + record.rotation_rad, "north_sd_deg": old.north_sd_deg}
-    new = GeoreferenceRecord(scale=choose_scale(estimates), telemetry=old.telemetry if old else "", **update)
+    kept = {"telemetry": old.telemetry, "start": old.start} if old else {}
+    new = GeoreferenceRecord(scale=choose_scale(estimates), **kept, **update)
     outputs = write_georeference(plan.layout, plan.layout.georeference, new, plan.config.frames)
     advance("georeference")
     return StageResult(outputs, georeference_counts(new), describe(new), georeference_warnings(new))
