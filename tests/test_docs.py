@@ -7,7 +7,9 @@ import json
 import re
 import shlex
 import shutil
-from inspect import Parameter, signature
+from dataclasses import fields, is_dataclass
+from functools import cached_property
+from inspect import Parameter, getdoc, signature
 from pathlib import Path
 
 import pytest
@@ -21,7 +23,11 @@ from schemas.flight import FlightConfig
 from schemas.renames import OLD_ARRAYS, OLD_KEYS, REMOVED_KEYS
 from schemas.summary import RunSummary
 from tests.media import drifting, write_video
+from velfield.field.pixel import PixelDistribution
+from velfield.field.view import VelocityField
 from velfield.pipeline.configuration import resolve_config
+from velfield.run.analysis import RunAnalysis
+from velfield.run.run import Run
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
@@ -135,6 +141,46 @@ def test_every_option_of_serve_is_on_its_page() -> None:
     listed = set(re.findall(r"^\| `--([\w-]+)", page, re.MULTILINE))
     keywords = [name for name, one in signature(serve).parameters.items() if one.kind is Parameter.KEYWORD_ONLY]
     assert listed == {name.replace("_", "-") for name in keywords}
+
+
+REFERENCE: tuple[tuple[str, type], ...] = (
+    ("run", Run),
+    ("run.field", VelocityField),
+    ("run.field.at(x, y)", PixelDistribution),
+    ("run.analysis", RunAnalysis),
+)
+"""How a user gets at each public object, and its class."""
+
+
+def summary_line(documented: object) -> str:
+    """The first sentence of a docstring, on one line."""
+    text = " ".join((getdoc(documented) or "").partition("\n\n")[0].split())
+    return re.split(r"(?<=\.) ", text, maxsplit=1)[0].rstrip(".").replace("``", "`").replace("|", "\\|")
+
+
+def reference_rows() -> list[str]:
+    """A row for each public method, property and documented attribute of what `velfield.open_run` leads to."""
+    rows = []
+    for path, owner in REFERENCE:
+        if is_dataclass(owner):
+            rows.append(f"| `{path}` | with {', '.join(f'`{one.name}`' for one in fields(owner))} |")
+        for name, member in vars(owner).items():
+            plain = member.__func__ if isinstance(member, classmethod) else member
+            if name.startswith("_") or isinstance(member, classmethod) or not getdoc(plain):
+                continue
+            if callable(plain):
+                names = ", ".join(list(signature(plain).parameters)[1:])
+                rows.append(f"| `{path}.{name}({names})` | {summary_line(plain)} |")
+            elif isinstance(plain, property | cached_property):
+                rows.append(f"| `{path}.{name}` | {summary_line(plain)} |")
+    return rows
+
+
+def test_the_reference_lists_the_interface_as_it_is() -> None:
+    """Neither a public name that is missing or changed, nor one that is gone."""
+    page = (ROOT / "docs" / "reference.md").read_text()
+    listed = [line for line in page.splitlines() if line.startswith("| `run")]
+    assert listed == reference_rows()
 
 
 def configuration_keys() -> set[str]:

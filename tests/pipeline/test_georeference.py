@@ -107,7 +107,8 @@ def test_a_drones_telemetry_gives_scale_north_and_place(
     config = SimulationConfig.model_validate_json((flight / "simulation.json").read_text())
     simulated = Flight(config)
     subtitles = simulate_telemetry(config, simulated.camera, simulated.base_shape)
-    (tmp_path / "x.SRT").write_text(srt_text(subtitles, simulated.times_s))
+    text = srt_text((f"2026-05-04 12:00:00 {one}" for one in subtitles), simulated.times_s)
+    (tmp_path / "x.SRT").write_text(text)
     run = open_run(tmp_path / "run")
     plan = made_plan(run, Inputs(source=str(flight / "frames"), telemetry=str(tmp_path / "x.SRT")))
     done = georeference_run(plan)
@@ -115,6 +116,9 @@ def test_a_drones_telemetry_gives_scale_north_and_place(
     assert record is not None
     assert record.scale.used is not None
     assert record.scale.used.source == "metadata"
+    assert record.start is not None
+    assert open_run(tmp_path / "run").start == record.start
+    assert f"{record.start.time:%Y-%m-%d}" == "2026-05-04"
     assert grid.gsd_m == pytest.approx(0.23, rel=0.03)
     off = np.angle(np.exp(1j * ((north_direction_rad(grid) or 0.0) - np.radians(-90 - config.telemetry.north_deg))))
     assert abs(np.degrees(off)) < 2.0 + 2.0  # and the zone's own north, off by up to 2 degrees

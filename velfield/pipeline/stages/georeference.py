@@ -42,7 +42,7 @@ from velfield.sources.telemetry.placement import (
     estimate_place,
     estimate_scale,
 )
-from velfield.sources.telemetry.read import read_telemetry
+from velfield.sources.telemetry.read import NOT_READ, read_telemetry
 from velfield.sources.telemetry.telemetry import Telemetry
 
 _MAX_FRAMES = 200
@@ -294,7 +294,7 @@ def describe(record: GeoreferenceRecord) -> list[str]:
     if record.place_source is not None and record.position_sd_m is not None:
         by = {"control_points": "control points", "metadata": "the metadata", "base": "the base image"}
         lines.append(f"place: by {by[record.place_source]}, to about {record.position_sd_m:.1f} m")
-    return lines
+    return [*lines, f"metadata: {record.telemetry}"] if NOT_READ in record.telemetry else lines
 
 
 def georeference_warnings(record: GeoreferenceRecord) -> list[str]:

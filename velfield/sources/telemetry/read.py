@@ -18,6 +18,8 @@ from velfield.sources.video.packets import iter_packets, open_video
 MAX_IMAGES = 200
 """Of a folder, so many images' tags are read, evenly spread: a header each."""
 _MAX_BYTES = 256 * 2**20
+NOT_READ = "is not read"
+"""In a failure: the source holds telemetry all the same, in a format of `_NOT_READ`."""
 _NOT_READ = {
     "klv": "MISB KLV",
     "smpte_klv": "MISB KLV",
@@ -95,7 +97,7 @@ def _from_video(path: Path) -> Telemetry | Failure:
     if isinstance(found, Telemetry):
         return found
     if unread:
-        found = Failure(f"{found.reason}; its {unread[0]} is not read: write an .SRT from it, or give --gsd-m")
+        found = Failure(f"{found.reason}; its {unread[0]} {NOT_READ}: write an .SRT from it, or give --gsd-m")
     if place is None:
         return found
     return Telemetry.from_records(f"the header of {path.name}", [(0.0, place)], [found.reason])
@@ -107,7 +109,7 @@ def _is_text(stream: Any) -> bool:
 
 def _unread_format(stream: Any) -> str | None:
     tag = str(stream.metadata.get("handler_name", "")).lower()
-    codec = stream.codec_context.name if stream.codec_context is not None else ""
+    codec = stream.codec_context.name if stream.codec_context is not None else getattr(stream, "name", None) or ""
     four = getattr(stream.codec_context, "codec_tag", "") if stream.codec_context is not None else ""
     for key, name in _NOT_READ.items():
         if key in (codec, str(four).lower()) or key in tag:
