@@ -88,7 +88,10 @@ def test_a_short_clip_is_said_to_be_short(tmp_path: Path, capsys: pytest.Capture
     rows = [(k, 0.2 * t, 10.0 * 0.2 * t, 5.0 + k) for k in range(4) for t in range(30)]
     pd.DataFrame(rows, columns=["track_id", "time_s", "x_m", "y_m"]).to_csv(tmp_path / "t.csv", index=False)
     analyse(tracks=tmp_path / "t.csv", out=tmp_path / "out")
-    assert "4 moving vehicles in 6 s are too few" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "4 moving vehicles in 6 s are too few" in text
+    assert re.search(r"u-turns +none in 6 s, too short to say how rare they are", text)
+    assert "an hour" not in text
     tables = AnalysisRecord.model_validate_json((tmp_path / "out" / "analysis.json").read_text()).tables
     assert next(t for t in tables if t.name == "signals").note.startswith("Too little data: 4 moving vehicles in 6 s.")
 

@@ -21,10 +21,11 @@ from velfield.exports.export import export_run
 from velfield.exports.georeference import Georeference
 from velfield.pipeline.georeference import georeference
 from velfield.pipeline.plan import Plan
-from velfield.pipeline.stages.georeference import georeference_run
+from velfield.pipeline.stages.georeference import compass_text, georeference_run
 from velfield.pipeline.stages.scale import scale_run
 from velfield.pipeline.verify import verify_run
 from velfield.run.frame_transforms import (
+    heading_deg,
     north_direction_rad,
     read_first_georeference,
     read_georeference,
@@ -120,6 +121,8 @@ def test_a_drones_telemetry_gives_scale_north_and_place(
     assert open_run(tmp_path / "run").start == record.start
     assert f"{record.start.time:%Y-%m-%d}" == "2026-05-04"
     assert grid.gsd_m == pytest.approx(0.23, rel=0.03)
+    up = float(heading_deg(np.array([-np.pi / 2]), record.north_rad)[0])
+    assert any(line.startswith(f"north: the map's top is {compass_text(up)}, standard") for line in done.notes)
     off = np.angle(np.exp(1j * ((north_direction_rad(grid) or 0.0) - np.radians(-90 - config.telemetry.north_deg))))
     assert abs(np.degrees(off)) < 2.0 + 2.0  # and the zone's own north, off by up to 2 degrees
     assert run.layout.base_image_tif in done.outputs

@@ -8,7 +8,7 @@ from PIL import ExifTags
 
 from schemas.georeference import FlightStart
 from velfield.errors import InputError
-from velfield.sources.clips import clock_of, creation_clock, subtitle_clock
+from velfield.sources.clips import creation_clock, first_clock, subtitle_clock
 from velfield.sources.frames import SourceInfo
 from velfield.sources.images import read_image_tags
 from velfield.sources.telemetry.read import read_srt
@@ -45,14 +45,15 @@ def read_flight_start(source: Path, info: SourceInfo, telemetry: Path | None = N
     telemetry
         A subtitle file given; its cues count from the first frame.
     """
+    if telemetry is not None and (clock_s := first_clock(read_srt(telemetry))) is not None:
+        return FlightStart(clock_s=clock_s, source=f"subtitles of {telemetry.name}", is_utc=False)
     if info.kind == "folder":
         taken = _capture_time(source / info.names[0]) if info.names else None
         return None if taken is None else FlightStart(clock_s=taken[0], source=f"EXIF of {info.names[0]}", is_utc=False)
     clip = Path(info.parts[0][0]) if info.parts else source
     part = info.parts[0][1] if info.parts else info
-    clock_s = subtitle_clock(clip, part) if telemetry is None else clock_of(read_srt(telemetry))
-    if clock_s is not None:
-        return FlightStart(clock_s=clock_s, source=f"subtitles of {(telemetry or clip).name}", is_utc=False)
+    if telemetry is None and (clock_s := subtitle_clock(clip, part)) is not None:
+        return FlightStart(clock_s=clock_s, source=f"subtitles of {clip.name}", is_utc=False)
     created_s = creation_clock(clip, part)
     return None if created_s is None else FlightStart(clock_s=created_s, source=f"header of {clip.name}", is_utc=True)
 

@@ -143,10 +143,10 @@ def subtitle_clock(clip: Path, info: SourceInfo) -> float | None:
     """The camera's clock at a video's first frame by its subtitles, s since 1970 as if it were set to UTC."""
     beside = find_beside(clip)
     telemetry = read_srt(beside) if beside is not None else read_telemetry(clip, info)
-    return None if isinstance(telemetry, Failure) else clock_of(telemetry)
+    return None if isinstance(telemetry, Failure) else first_clock(telemetry)
 
 
-def clock_of(telemetry: Telemetry) -> float | None:
+def first_clock(telemetry: Telemetry) -> float | None:
     """The camera's clock at the source's first frame, s since 1970; None where no record has it."""
     known = np.flatnonzero(np.isfinite(telemetry.clock_s))
     return float(telemetry.clock_s[known[0]] - telemetry.time_s[known[0]]) if len(known) else None

@@ -12,7 +12,7 @@ from velfield.analysis.vehicle_classes import COUNTED_CLASSES
 MAX_LINES = 12
 """Lines on movements, on origins and destinations, and on lanes, that are printed: those with the most vehicles."""
 _SHORT_S, _FEW_TRACKS = 60.0, 30
-"""In a shorter clip with fewer vehicles nothing is expected to be found."""
+"""In a shorter clip with fewer vehicles nothing is expected to be found; what it did not show may still be frequent."""
 _NONE_PROBABILITY = 0.1
 _EVENTS = ("u_turns", "conflicts", "unusual")
 
@@ -137,6 +137,8 @@ def _events(n: int, seconds: float) -> str:
     """A number of events, and of none how rare they are at least."""
     if n or seconds <= 0:
         return str(n)
+    if seconds < _SHORT_S:
+        return f"none in {duration_text(seconds)}, too short to say how rare they are"
     hourly = -math.log(_NONE_PROBABILITY) / seconds * 3600
     rate = f"{hourly:.2g}" if hourly < 10 else f"{hourly:.0f}"
     return f"none in {duration_text(seconds)}, so fewer than {rate} an hour with 90 % probability"

@@ -48,6 +48,7 @@ from velfield.sources.telemetry.telemetry import Telemetry
 _MAX_FRAMES = 200
 _CRS_SD = 0.005
 _Z90 = 1.645
+_POINTS = ["N", "NNE", "NE", "ENE", "E", "ESE", "SE", "SSE", "S", "SSW", "SW", "WSW", "W", "WNW", "NW", "NNW"]
 _MIN_NORTH_DEG = 5.0
 """Smaller differences between the base image's north and the compass are not remarked on."""
 _MIN_POSITION_M = 15.0
@@ -281,16 +282,26 @@ def georeference_counts(record: GeoreferenceRecord) -> dict[str, float]:
     return counts if used is None else {**counts, "gsd_m": used.gsd_m, f"by_{used.source}": 1.0}
 
 
+def compass_text(bearing_deg: float) -> str:
+    """A bearing, degrees clockwise from north, for people.
+
+    Examples
+    --------
+    >>> compass_text(-26.0), compass_text(359.96)
+    ('334.0° (NNW)', '0.0° (N)')
+    """
+    bearing_deg = round(bearing_deg, 1) % 360
+    return f"{bearing_deg:.1f}° ({_POINTS[round(bearing_deg / 22.5) % 16]})"
+
+
 def describe(record: GeoreferenceRecord) -> list[str]:
     """What is used, and what the other sources give, one line each."""
     used = record.scale.used
     lines = [] if used is None else [f"scale: {used.text()}{f' ({used.note})' if used.note else ''}"]
     lines += [f"scale, not used: {other.text()}" for other in record.scale.others]
     if record.north_rad is not None and record.north_sd_deg is not None:
-        up_deg = (90 + np.degrees(record.north_rad) + 180) % 360 - 180
-        lines.append(
-            f"north: {up_deg:+.1f}° from the map's top, clockwise, standard deviation {record.north_sd_deg:.1f}°"
-        )
+        top = compass_text(float(-90 - np.degrees(record.north_rad)))
+        lines.append(f"north: the map's top is {top}, standard deviation {record.north_sd_deg:.1f}°")
     if record.place_source is not None and record.position_sd_m is not None:
         by = {"control_points": "control points", "metadata": "the metadata", "base": "the base image"}
         lines.append(f"place: by {by[record.place_source]}, to about {record.position_sd_m:.1f} m")
