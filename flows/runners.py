@@ -57,8 +57,10 @@ def read_runner(path: Path) -> RunnerConfig:
     """
     import yaml
 
+    from schemas.model import load_yaml
+
     try:
-        file = ClusterFile.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+        file = ClusterFile.model_validate(load_yaml(path.read_text(encoding="utf-8")))
     except FileNotFoundError:
         raise InputError(f"--cluster: {path} is not there; see examples/ for some") from None
     except (yaml.YAMLError, ValidationError, ValueError, RecursionError) as error:

@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -177,6 +178,66 @@ def test_models_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
         again.detect_raw(np.zeros((64, 64), np.uint8))
     with pytest.raises(InputError, match="expected one of velfield's"):
         OnnxDetector.train([], None)
+
+
+def changed(path: Path, change: Callable[[onnx.ModelProto], object]) -> Path:
+    """A tiny model with something wrong in it."""
+    model = onnx.load(str(tiny_yolo(path, "boxes")))
+    change(model)
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+def with_external_data(model: onnx.ModelProto) -> None:
+    weight = next(one for one in model.graph.initializer if one.name == "c0")
+    weight.data_location = onnx.TensorProto.EXTERNAL
+    weight.external_data.add(key="location", value="secrets.bin")
+    weight.ClearField("raw_data")
+
+
+def with_two_inputs(model: onnx.ModelProto) -> None:
+    model.graph.input.append(helper.make_tensor_value_info("more", TensorProto.FLOAT, [1]))
+    model.graph.node.append(helper.make_node("Identity", ["more"], ["unused"]))
+
+
+def with_side(side: int) -> Callable[[onnx.ModelProto], None]:
+    def change(model: onnx.ModelProto) -> None:
+        for k in (2, 3):
+            model.graph.input[0].type.tensor_type.shape.dim[k].dim_value = side
+
+    return change
+
+
+def with_open_side(model: onnx.ModelProto) -> None:
+    for k in (2, 3):
+        model.graph.input[0].type.tensor_type.shape.dim[k].dim_param = "side"
+    next(one for one in model.metadata_props if one.key == "imgsz").value = "[900000, 900000]"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (with_external_data, "found weights in other files .*secrets.bin"),
+        (with_two_inputs, "found 2 inputs, expected one"),
+        (with_side(8), "found an input of 8 x 8 px, expected 32 to 8192"),
+        (with_side(200_000), "found an input of 200000 x 200000 px"),
+        (with_open_side, "found an input of 900000 x 900000 px"),
+    ],
+)
+def test_a_model_reads_no_other_file_and_takes_one_image_of_a_sound_size(
+    change: Callable[[onnx.ModelProto], object], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # onnxruntime looks for external data here
+    (tmp_path / "secrets.bin").write_bytes(bytes(1 << 20))
+    with pytest.raises(InputError, match=message):
+        load_detector(changed(tmp_path / "m.onnx", change))
+
+
+def test_a_model_that_fails_on_an_image_is_one_line(tmp_path: Path) -> None:
+    detector = load_detector(changed(tmp_path / "m.onnx", with_side(2 * TILE)))  # its boxes are for half of that
+    with pytest.raises(InputError, match=r"m\.onnx: onnxruntime cannot run this model on a tile of") as error:
+        detector.detect_raw(np.zeros((TILE, TILE), np.uint8))
+    assert "\n" not in str(error.value)
 
 
 def test_of_two_boxes_of_one_vehicle_the_better_is_kept() -> None:

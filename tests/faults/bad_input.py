@@ -8,6 +8,7 @@ message of one line. Anything else counts as a failure: another exception, more 
 """
 
 import argparse
+import io
 import json
 import os
 import re
@@ -198,6 +199,8 @@ def kinds(folder: Path) -> list[Kind]:
     from velfield.sources.labels.detections import read_detections
     from velfield.sources.labels.labels import read_labels
     from velfield.sources.source import probe
+    from velfield.sources.telemetry.read import read_srt
+    from velfield.sources.trajectories import read_tracks
 
     frames = list(drifting(FRAMES, WIDTH, HEIGHT))
     names = write_images(folder / "frames", frames)
@@ -255,7 +258,27 @@ def kinds(folder: Path) -> list[Kind]:
         Kind("flight record", (flight,), "flight.json", run_folder),
         Kind("table of a run", (table.read_bytes(),), "unit.parquet", lambda path: read_tables([path], columns)),
         Kind("tracks", (b"any seed",), "seed.bin", link_detections),
+        Kind("tracks (CSV)", (TRACKS, IMAGE_TRACKS), "tracks.csv", lambda path: read_tracks(path, fps=5.0), 2),
+        Kind("tracks (Parquet)", (_parquet_tracks(),), "tracks.parquet", read_tracks),
+        Kind("tracks (FCD)", (FCD,), "tracks.xml", read_tracks),
+        Kind("subtitles", (SUBTITLES,), "x.srt", read_srt, 2),
     ]
+
+
+TRACKS = b"track_id,time_s,x_m,y_m\n" + b"".join(b"%d,%.1f,%d,3\n" % (k % 3, 0.2 * k, k) for k in range(12))
+IMAGE_TRACKS = b"id;frame;x_px;y_px\n" + b"".join(b"7;%d;%d;3.5\n" % (k, k) for k in range(12))
+FCD = b'<fcd-export><timestep time="0.0"><vehicle id="a" x="1" y="2"/></timestep></fcd-export>'
+SUBTITLES = b"".join(
+    b"%d\n00:00:0%d,000 --> 00:00:0%d,500\n[focal_len: 24.00] [latitude: 52.5] [longitude: 13.4] "
+    b"[rel_alt: 100.2 abs_alt: 134.1] [gb_yaw: -12.3 gb_pitch: -90.0 gb_roll: 0.0]\n\n" % (k, k, k)
+    for k in range(1, 6)
+)
+
+
+def _parquet_tracks() -> bytes:
+    out = io.BytesIO()
+    pd.read_csv(io.BytesIO(TRACKS)).to_parquet(out)
+    return out.getvalue()
 
 
 def _annotation_files(names: list[str]) -> tuple[bytes, ...]:

@@ -79,6 +79,9 @@ def test_subtitles_that_are_no_telemetry_are_none(tmp_path: Path) -> None:
     (tmp_path / "x.srt").write_text(plain)
     with pytest.raises(InputError, match="expected a drone's telemetry"):
         read_srt(tmp_path / "x.srt")
+    (tmp_path / "x.srt").write_text("no cue at all")
+    with pytest.raises(InputError, match="expected a drone's telemetry"):
+        read_srt(tmp_path / "x.srt")
     (tmp_path / "x.mp4").touch()
     assert find_beside(tmp_path / "x.mp4") is None
     (tmp_path / "x.SRT").write_text(f"1\n00:00:01,000 --> 00:00:02,000\n{FORMATS['Mavic Mini'][0]}\n")

@@ -57,3 +57,16 @@ def test_fcd_of_sumo_has_y_to_the_north(tmp_path: Path) -> None:
 def test_bad_files(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         read_tracks(written(tmp_path / "t.csv", text))
+
+
+def test_files_that_are_no_tables_are_one_line(tmp_path: Path) -> None:
+    damaged = tmp_path / "t.parquet"
+    damaged.write_bytes(b"PAR1 and no more")
+    with pytest.raises(InputError, match="no Parquet file that can be read") as error:
+        read_tracks(damaged)
+    assert "\n" not in str(error.value)
+    endless = written(tmp_path / "t.csv", "track_id,frame,x_px,y_px\n1,1,2,3\n1,inf,2,3\n")
+    with pytest.raises(InputError, match="found inf in column frame, row 3, expected a number"):
+        read_tracks(endless, fps=5.0)
+    with pytest.raises(InputError, match="expected"):
+        read_tracks(written(tmp_path / "e.csv", "\x00\n"))

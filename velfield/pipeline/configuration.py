@@ -11,6 +11,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from schemas.flight import PRESETS, READ_WITH, FlightConfig, Preset
+from schemas.model import load_yaml
 from schemas.renames import upgrade_config
 from velfield.errors import IneffectiveSettingWarning, InputError, OldNameWarning
 from velfield.sources.table import read_text
@@ -141,7 +142,7 @@ def _ineffective(config: FlightConfig, given: Tree) -> Iterator[str]:
 
 def _yaml(text: str, what: str) -> Any:
     try:
-        return yaml.safe_load(text)
+        return load_yaml(text)
     except (RecursionError, ValueError) as error:  # sections within sections without end; a date that is none
         problem = "sections lie too deep in each other" if isinstance(error, RecursionError) else str(error)
         raise InputError(f"{what}: this is not YAML that can be read ({problem}); see examples/flight.yaml") from None

@@ -4,6 +4,7 @@ All become one table: ``track_id, frame, time_s``, and ``x_m, y_m`` or ``x_px, y
 that an axis that points north is turned.
 """
 
+import csv
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Literal
@@ -63,7 +64,7 @@ def read_tracks(path: Path, *, fps: float | None = None, unit: Unit | None = Non
         raise InputError(f"{path}: not found; give a CSV, a Parquet file or SUMO's FCD with tracks")
     if path.suffix == ".xml":
         return _finish(_read_fcd(path), path)
-    table = pd.read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
+    table = _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
     columns = {_normal(name): str(name) for name in table.columns}
     found = {key: next((columns[n] for n in names if n in columns), None) for key, names in _NAMES.items()}
     out = pd.DataFrame({"track": _need(table, found["track"], "a column of the track", path)})
@@ -80,10 +81,18 @@ def _normal(name: object) -> str:
     return str(name).strip().lower().replace(" ", "_").replace("(m)", "m").replace("(px)", "px").strip("#")
 
 
+def _read_parquet(path: Path) -> pd.DataFrame:
+    try:
+        return pd.read_parquet(path)
+    except Exception as error:  # pyarrow's own kinds, some of which are OSError
+        what = " ".join(str(error).split())[:160]
+        raise InputError(f"{path}: this is no Parquet file that can be read ({what}); write it again") from None
+
+
 def _read_csv(path: Path) -> pd.DataFrame:
     try:
         return pd.read_csv(path, sep=None, engine="python", skipinitialspace=True)
-    except (ValueError, pd.errors.ParserError) as error:
+    except (ValueError, pd.errors.ParserError, csv.Error) as error:
         raise InputError(f"{path}: no table of tracks ({error}); expected a CSV with a header") from None
 
 
@@ -98,12 +107,11 @@ def _need(table: pd.DataFrame, name: str | None, what: str, path: Path) -> pd.Se
 
 def _numbers(series: pd.Series, path: Path) -> pd.Series:
     values = pd.to_numeric(series, errors="coerce")
-    bad = values.isna()
+    bad = ~np.isfinite(values.to_numpy(np.float64, na_value=np.nan))
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
-        raise InputError(
-            f"{path}: found {series.iloc[row]!r} in column {series.name}, row {row + 2}, expected a number"
-        )
+        found = series.iloc[[row]].tolist()[0]
+        raise InputError(f"{path}: found {found!r} in column {series.name}, row {row + 2}, expected a number")
     return values
 
 

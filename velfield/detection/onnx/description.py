@@ -2,6 +2,7 @@
 
 import ast
 import hashlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import yaml
 from pydantic import ValidationError
 
 from schemas.detector import OnnxDescription, OnnxLayout, OnnxRecord
+from schemas.model import load_yaml
 from velfield.errors import InputError
 
 MAX_BYTES = 1 << 30
@@ -17,7 +19,7 @@ _VEHICLES = (
     *("car", "van", "truck", "lorry", "bus", "taxi", "pickup", "vehicle", "suv", "minibus", "coach", "automobile"),
     *("small vehicle", "large vehicle", "small car", "light vehicle", "heavy vehicle", "motor vehicle", "freight car"),
 )
-_THRESHOLD, _DEFAULT_SIDE_PX = 0.25, 640
+_THRESHOLD, _DEFAULT_SIDE_PX, _MIN_SIDE_PX, _MAX_SIDE_PX = 0.25, 640, 32, 8192
 _ASK = "describe it in a YAML of its name beside it (docs/detection.md)"
 
 
@@ -42,10 +44,18 @@ def describe_model(path: Path, car_length_px: float = 16.0) -> OnnxRecord:
         model = onnx.load(str(path), load_external_data=False)
         inputs = [one for one in model.graph.input if one.name not in {each.name for each in model.graph.initializer}]
         image, boxes = inputs[0], model.graph.output[0]
+        files = sorted({entry.value for one in _tensors(model.graph) for entry in one.external_data})
     except Exception as error:  # protobuf's own, and whatever a damaged graph lacks
         raise InputError(
             f"{path.name}: this is no ONNX model ({type(error).__name__}), expected one; export it"
         ) from None
+    if files:
+        raise InputError(
+            f"{path.name}: found weights in other files ({', '.join(files)[:160]}), expected all in the model; "
+            "export it without external data"
+        )
+    if len(inputs) > 1:
+        raise InputError(f"{path.name}: found {len(inputs)} inputs, expected one, the image; export it again")
     given = _read_yaml(path.with_suffix(".yaml"))
     metadata = {one.key: one.value for one in model.metadata_props}
     names = given.classes or _class_names(metadata.get("names", ""))
@@ -62,11 +72,23 @@ def describe_model(path: Path, car_length_px: float = 16.0) -> OnnxRecord:
     )
 
 
+def _tensors(graph: onnx.GraphProto) -> Iterator[onnx.TensorProto]:
+    """All constant tensors of a graph and of the graphs within it."""
+    yield from graph.initializer
+    for sparse in graph.sparse_initializer:
+        yield from (sparse.values, sparse.indices)
+    for attribute in (one for node in graph.node for one in node.attribute):
+        yield from (attribute.t, *attribute.tensors)
+        for inner in (attribute.g, *attribute.graphs):
+            if inner.node or inner.initializer:
+                yield from _tensors(inner)
+
+
 def _read_yaml(path: Path) -> OnnxDescription:
     if not path.is_file():
         return OnnxDescription()
     try:
-        return OnnxDescription.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")) or {})
+        return OnnxDescription.model_validate(load_yaml(path.read_text(encoding="utf-8")) or {})
     except ValidationError as error:
         faults = "; ".join(_fault(one["loc"], one["msg"]) for one in error.errors())
         keys = ", ".join(OnnxDescription.model_fields)
@@ -127,12 +149,20 @@ def _tile(
     """Width and height of the network's input, px."""
     if len(sizes) != 4:
         raise InputError(f"{path.name}: found an input of {len(sizes)} dimensions, expected an image (1, 3, h, w)")
-    if sizes[2] and sizes[3]:
-        return sizes[3], sizes[2]
-    side = given.image_size_px
-    if side is None:
-        try:
-            side = max(ast.literal_eval(metadata.get("imgsz", "0")))
-        except (ValueError, SyntaxError, TypeError):
-            side = _DEFAULT_SIDE_PX
-    return side, side
+    width, height = sizes[3], sizes[2]
+    if not width or not height:
+        width = height = given.image_size_px or _side(metadata)
+    if not _MIN_SIDE_PX <= min(width, height) <= max(width, height) <= _MAX_SIDE_PX:
+        raise InputError(
+            f"{path.name}: found an input of {width} x {height} px, expected {_MIN_SIDE_PX} to {_MAX_SIDE_PX} a side; "
+            "export it for tiles of that size"
+        )
+    return width, height
+
+
+def _side(metadata: dict[str, str]) -> int:
+    """By Ultralytics' metadata, where it is there."""
+    try:
+        return int(max(ast.literal_eval(metadata.get("imgsz", "0"))))
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
+        return _DEFAULT_SIDE_PX

@@ -89,7 +89,14 @@ class OnnxDetector(Detector):
         channels = image.shape[1] if isinstance(image.shape[1], int) else 3
         values = tile if kind is np.uint8 else tile.astype(kind) / kind(255)
         batch = np.ascontiguousarray(np.broadcast_to(values, (1, channels, *tile.shape)))
-        output: np.ndarray = self.session.run(None, {image.name: batch})[0][0]
+        try:
+            output: np.ndarray = self.session.run(None, {image.name: batch})[0][0]
+        except Exception as error:  # onnxruntime's own kinds have no common base
+            first = str(error).splitlines()[0][:160]
+            raise InputError(
+                f"{Path(self.record.path).name}: onnxruntime cannot run this model on a tile of {tile.shape[1]} x "
+                f"{tile.shape[0]} px ({first}); export it again"
+            ) from None
         return output
 
     def detect_raw(self, grey: GreyImage, *, threshold: float | None = None) -> pd.DataFrame:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import yaml
 
+from schemas.model import load_yaml
 from velfield.errors import InputError
 from velfield.sources.frames import SourceInfo
 from velfield.sources.images import natural_key
@@ -263,7 +264,7 @@ def _car_classes(path: Path) -> set[int]:
 
 def _yaml_names(path: Path) -> list[tuple[int, str]]:
     try:
-        content = yaml.safe_load(read_text(path, "class names"))
+        content = load_yaml(read_text(path, "class names"))
         names = content["names"]
         pairs = names.items() if isinstance(names, dict) else enumerate(names)
         return [(int(number), str(name)) for number, name in pairs]

@@ -10,6 +10,7 @@ Autel             HOME(E: 13.4, N: 52.5) / GPS(E: 13.4, N: 52.5, 100.1m) / G.PRY
 import re
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from itertools import zip_longest
 
 from velfield.errors import Failure
 from velfield.sources.telemetry.telemetry import Telemetry
@@ -135,8 +136,8 @@ def _clock(text: str) -> dict[str, float]:
 def _cues(text: str) -> Iterator[tuple[float, str]]:
     """Start in s and text of each cue."""
     matches = list(_CUE.finditer(text))
-    ends = [match.start() for match in matches[1:]] + [len(text)]
-    for match, end in zip(matches, ends, strict=True):
+    for match, following in zip_longest(matches, matches[1:]):
+        end = following.start() if following else len(text)
         hours, minutes, seconds = (int(part) for part in match.groups()[:3])
         fraction = int(match[4]) / 10 ** len(match[4])
         yield 3600 * hours + 60 * minutes + seconds + fraction, text[match.end() : end]
