@@ -111,7 +111,7 @@ def test_a_cluster_without_workers_is_said_and_waited_for(monkeypatch: pytest.Mo
     monkeypatch.setattr("flows.runners._WAIT_S", 0.05)
     monkeypatch.setattr("flows.runners._NO_WORKERS_S", 0.2)
     warned: list[str] = []
-    with LocalCluster(n_workers=0, processes=False, dashboard_address=None) as cluster:
+    with LocalCluster(n_workers=0, processes=False, dashboard_address="127.0.0.1:0") as cluster:
 
         def warn(text: str) -> None:
             if not warned:

@@ -127,8 +127,7 @@ def test_a_drones_telemetry_gives_scale_north_and_place(
     assert abs(np.degrees(off)) < 2.0 + 2.0  # and the zone's own north, off by up to 2 degrees
     assert run.layout.base_image_tif in done.outputs
 
-    given = plan.job.model_copy(update={"config": plan.config.model_copy(update={"gsd_m": 0.23 * 1.2})})
-    done = georeference_run(Plan(given, plan.info, plan.indices, plan.inputs, plan.keys))
+    done = georeference_run(with_config(plan, gsd_m=0.23 * 1.2))
     assert any("by the metadata" in line for line in done.warnings)
     chosen = read_georeference(run.layout)
     assert chosen is not None
@@ -145,8 +144,7 @@ def test_the_lengths_of_vehicles_give_the_scale_and_contradict_a_wrong_one(
     alone = made_plan(run, Inputs(source=str(flight / "frames")))
     warnings = {}
     for gsd_m in (None, 0.23, 0.23 * 1.2, 0.23 / 1.2):
-        job = alone.job.model_copy(update={"config": alone.config.model_copy(update={"gsd_m": gsd_m})})
-        plan = Plan(job, alone.info, alone.indices, alone.inputs, alone.keys)
+        plan = with_config(alone, gsd_m=gsd_m)
         georeference_run(plan)
         assert read_georeference(run.layout) == read_first_georeference(run.layout)
         warnings[gsd_m] = scale_run(plan).warnings
@@ -193,9 +191,7 @@ def test_a_frame_rate_that_vehicles_contradict_is_reported(
         path.unlink()
     results = {}
     for fps in (5.0, 10.0, 2.5):
-        frames = made.config.frames.model_copy(update={"fps": fps})
-        job = made.job.model_copy(update={"config": made.config.model_copy(update={"frames": frames, "gsd_m": 0.23})})
-        plan = Plan(job, made.info, made.indices, made.inputs, made.keys)
+        plan = with_config(made, frames=made.config.frames.model_copy(update={"fps": fps}), gsd_m=0.23)
         georeference_run(plan)
         write_tracks(run.layout.unit_file(run.layout.tracks, 0, ".parquet"), stopping_street(0.23, fps))
         results[fps] = scale_run(plan)
@@ -216,4 +212,10 @@ def made_plan(run: Run, inputs: Inputs) -> Plan:
 
     plan = plan_of_finished(run)
     job = plan.job.model_copy(update={"inputs": inputs, "config": plan.config.model_copy(update={"gsd_m": None})})
+    return Plan(job, plan.info, plan.indices, plan.inputs, plan.keys)
+
+
+def with_config(plan: Plan, **changes: object) -> Plan:
+    """The same plan with other values in its configuration."""
+    job = plan.job.model_copy(update={"config": plan.config.model_copy(update=changes)})
     return Plan(job, plan.info, plan.indices, plan.inputs, plan.keys)

@@ -59,8 +59,7 @@ class OnnxDetector(Detector):
         except InputError:
             raise
         except Exception as error:  # onnxruntime's own kinds have no common base
-            first = str(error).splitlines()[0][:160]
-            raise InputError(f"{path.name}: onnxruntime cannot run this model ({first}); export it again") from None
+            raise self._refusal(error) from None
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the session, which no other process can use."""
@@ -91,13 +90,14 @@ class OnnxDetector(Detector):
         batch = np.ascontiguousarray(np.broadcast_to(values, (1, channels, *tile.shape)))
         try:
             output: np.ndarray = self.session.run(None, {image.name: batch})[0][0]
-        except Exception as error:  # onnxruntime's own kinds have no common base
-            first = str(error).splitlines()[0][:160]
-            raise InputError(
-                f"{Path(self.record.path).name}: onnxruntime cannot run this model on a tile of {tile.shape[1]} x "
-                f"{tile.shape[0]} px ({first}); export it again"
-            ) from None
+        except Exception as error:  # as above
+            raise self._refusal(error, f" on a tile of {tile.shape[1]} x {tile.shape[0]} px") from None
         return output
+
+    def _refusal(self, error: Exception, where: str = "") -> InputError:
+        first = str(error).splitlines()[0][:160]
+        name = Path(self.record.path).name
+        return InputError(f"{name}: onnxruntime cannot run this model{where} ({first}); export it again")
 
     def detect_raw(self, grey: GreyImage, *, threshold: float | None = None) -> pd.DataFrame:
         """Boxes in a raw frame: see `Detector.detect_raw`."""
