@@ -36,7 +36,8 @@ def publish_summary(plan: Plan, summary: RunSummary) -> None:
     shown = f"velfield view {shlex.quote(str(report.parent))}"
     lines = [f"# {plan.job.inputs.source}", "", f"The map and the report, in a browser: `{shown}`", ""]
     lines += [f"- **{stage.name}**: {stage.text} ({stage.seconds:.1f} s)" for stage in summary.stages]
-    lines += ["", f"{len(summary.frames_lost)} frames lost.", ""]
+    lost = [*summary.footage_lost, *(line for stage in summary.stages for line in stage.failures)]
+    lines += ["", f"{len(summary.frames_lost)} frames lost.", "", *(f"- {line}" for line in lost), ""]
     for name in ("direction", "speed"):
         image = plan.layout.maps / f"{name}_preview.png"
         if image.exists() and image.stat().st_size <= _MAX_IMAGE_BYTES:

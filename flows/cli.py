@@ -414,11 +414,13 @@ def _conclude(summary: "RunSummary", console: "Console") -> int:
     console.result(f"page    {own_command()} view {shlex.quote(str(root))}")
     if summary.complete:
         return DONE
-    for line in summary.frames_lost[:10]:
+    for line in (*summary.footage_lost, *summary.frames_lost[:10]):
         console.warn(line)
     lost_units = sum(len(stage.lost) for stage in summary.stages)
+    absent = ", a part of the recording is not there" if summary.footage_lost else ""
     console.warn(
-        f"done, but not complete: {len(summary.frames_lost)} frames and {lost_units} units lost; the report lists them"
+        f"{summary.root}: done, but not complete: {len(summary.frames_lost)} frames and {lost_units} units lost"
+        f"{absent}; the report lists them"
     )
     return INCOMPLETE
 

@@ -27,8 +27,8 @@ from velfield.errors import InputError
 from velfield.pipeline.check_inputs import validate_inputs
 from velfield.pipeline.estimate import check_space, disk_full_as_input_error
 from velfield.pipeline.plan import Plan, changed_since, dropped_inputs, make_plan, write_flight_record
-from velfield.pipeline.stages.registration import lost_frames
 from velfield.pipeline.stages.report import write_report
+from velfield.pipeline.summary import summarise_run
 from velfield.run.commits import sweep_partial
 from velfield.run.layout import RunLayout, is_remote, remove_tree
 from velfield.run.lock import locked
@@ -83,7 +83,7 @@ def _run_stages(job: Job, plan: Plan, runner: Runner, at_once: int, console: Con
     work = Work(plan, runner, console, at_once=at_once, aside=Previews(plan, runner, console))
     work.run()
     remove_tree(plan.layout.preview)
-    summary = RunSummary(root=job.root, stages=tuple(work.summaries), frames_lost=lost_frames(work.plan))
+    summary = summarise_run(work.plan, work.summaries)
     publish_report(work.plan, summary, console)
     return summary
 

@@ -27,8 +27,8 @@ from velfield.pipeline.graphs import rebase_graph
 from velfield.pipeline.plan import write_flight_record
 from velfield.pipeline.stage import STAGE, STAGES, NewBase, stages_before
 from velfield.pipeline.stages.rebase import Rebase, measure_rebase, plan_rebase
-from velfield.pipeline.stages.registration import lost_frames
 from velfield.pipeline.stages.report import write_report
+from velfield.pipeline.summary import summarise_run
 from velfield.run.commits import sweep_partial
 from velfield.run.flight_record import check_format
 from velfield.run.layout import RunLayout
@@ -151,7 +151,7 @@ def _mapped(run: Run, job: Job, found: RebaseRecord, runner: RunnerConfig, conso
     with open_runner(runner, console.warn) as where:
         work = Work(plan, where, console, at_once=parallel_units(runner))
         _run_stages(work, Rebase(run.layout, found))
-    summary = RunSummary(root=job.root, stages=tuple(work.summaries), frames_lost=lost_frames(plan))
+    summary = summarise_run(plan, work.summaries)
     write_report(plan, summary)
     publish_summary(plan, summary)
     return summary

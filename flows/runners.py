@@ -69,6 +69,10 @@ def read_runner(path: Path) -> RunnerConfig:
     return RunnerConfig(**file.model_dump())
 
 
+class WorkersKilledError(RuntimeError):
+    """Every worker that computed a graph was killed meanwhile, as often as the cluster tries."""
+
+
 class Runner(ABC):
     """Computes Dask graphs; called from several threads at once."""
 
@@ -109,10 +113,17 @@ class ClientRunner(Runner):
         self.description = f"Dask at {self._address}, {workers} worker{'' if workers == 1 else 's'}"
 
     def compute(self, graph: Any) -> Any:
+        from distributed.scheduler import KilledWorker
+
         future = self._client.compute(graph)
         while True:
             try:
                 return future.result(timeout=_WAIT_S)
+            except KilledWorker as error:
+                raise WorkersKilledError(
+                    f"{error.allowed_failures + 1} workers of {self._address} ended while they computed it, the last "
+                    f"at {error.last_worker.address}: their memory limit is too small for it, or something kills them"
+                ) from None
             except TimeoutError:
                 if future.done():  # the graph's own
                     raise

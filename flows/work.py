@@ -17,7 +17,7 @@ from prefect.futures import PrefectFuture
 
 from flows.artifacts import LongStage
 from flows.console import Console, StageProgress
-from flows.runners import Runner
+from flows.runners import Runner, WorkersKilledError
 from schemas.records import CommitRecord
 from schemas.summary import StageSummary
 from velfield.errors import InputError, is_disk_full
@@ -50,8 +50,8 @@ class UnderWay:
     futures: dict[int, Future] = field(default_factory=dict)
     """By the number of the unit: those submitted."""
     ended: set[int] = field(default_factory=set)
-    lost: list[str] = field(default_factory=list)
-    """Names of the units that failed."""
+    lost: dict[str, str] = field(default_factory=dict)
+    """Why units failed, by their names."""
     before: list[CommitRecord] = field(default_factory=list)
     """Records of the units that an earlier run finished."""
 
@@ -201,7 +201,7 @@ class Work:
     def carry_over(self, stage: Stage) -> None:
         """Summarise a stage whose units an earlier result finished, and that this one takes as they are."""
         records = read_commits(self.plan.layout, stage.name)
-        summary = summarise_stage(stage.name, records, units=len(records), before=records, lost=(), seconds=0.0)
+        summary = summarise_stage(stage.name, records, units=len(records), before=records, seconds=0.0)
         self.summaries.append(summary)
 
     def _submit(self, under_way: UnderWay, k: int, graph: GraphOf) -> None:
@@ -244,18 +244,27 @@ class Work:
             error = _failure_cause(future)
             if isinstance(error, InputError) or is_disk_full(error) or under_way.essential:
                 raise error
-            under_way.lost.append(unit.name)
-            self.console.warn(f"unit {unit.name} of {under_way.stage.label} failed: {error}; re-run to retry")
+            reason = " ".join(str(error).split()) or type(error).__name__
+            under_way.lost[unit.name] = f"{self._describe(under_way, unit)} failed: {reason}; re-run to retry"
+            self.console.warn(under_way.lost[unit.name])
         steps = sum(under_way.units[j].steps for j in under_way.ended)
         under_way.progress.at_least(steps)
         under_way.artifact.update(steps)
         if under_way.done:
             self._finish(under_way)
 
+    def _describe(self, under_way: UnderWay, unit: Unit) -> str:
+        """A unit for people: with its run, and the times of its frames."""
+        text = f"{self.plan.job.root}: {under_way.stage.label}"
+        if not unit.frames:
+            return f"{text}, unit {unit.name}," if unit.name != WHOLE else text
+        times_s = self.plan.info.times_s[self.plan.indices[[unit.frames[0], unit.frames[-1]]]]
+        return f"{text} of frames {unit.frames[0]} to {unit.frames[-1]} ({times_s[0]:.3f} to {times_s[1]:.3f} s)"
+
     def _finish(self, under_way: UnderWay) -> None:
         under_way.progress.remove()
         futures = [under_way.futures[k] for k in range(len(under_way.units))]
-        lost = under_way.lost = sorted(under_way.lost)
+        lost = under_way.lost = dict(sorted(under_way.lost.items()))
         # Units that failed change the keys of all that is made without them.
         self.plan = self.plan.with_lost_units([f"{under_way.stage.name} {unit}" for unit in lost])
         summary = summarise_stage(
@@ -295,12 +304,17 @@ def _without_outputs(record: CommitRecord) -> CommitRecord:
     return record.model_copy(update={"outputs": {}})
 
 
-def _worth_retrying(_task: Any, _run: Any, state: Any) -> bool:
-    """Bad input stays bad, and a full disk full: only what may pass, such as a killed worker, is tried again."""
+def _worth_retrying(_task: Any, run: Any, state: Any) -> bool:
+    """Bad input stays bad, and a full disk full: only what may pass, such as a killed worker, is tried again.
+
+    What killed all workers that tried it is given to a fresh one once: more would kill those of other units too.
+    """
     try:
         state.result()
     except InputError:
         return False
+    except WorkersKilledError:
+        return bool(run.run_count <= 1)
     except Exception as error:
         return not is_disk_full(error)
     return False

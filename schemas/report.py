@@ -64,6 +64,8 @@ class Report(Model):
     warnings: tuple[str, ...] = ()
     """Warnings of the stages."""
     frames_lost: tuple[str, ...] = ()
+    footage_lost: tuple[str, ...] = ()
+    """What of the recording is not there, one line each; also among the warnings."""
     files: tuple[tuple[str, str], ...] = ()
     """Files of the run folder worth opening: path relative to the report, and what it is."""
 

@@ -14,6 +14,8 @@ class StageSummary(Model):
     """Units that an earlier run had finished."""
     lost: tuple[str, ...] = ()
     """Units that failed in every try: done again by the next run."""
+    failures: tuple[str, ...] = ()
+    """Why they failed, one line each."""
     counts: dict[str, float] = Field(default_factory=dict)
     notes: tuple[str, ...] = ()
     """Remarks, one line each."""
@@ -34,8 +36,10 @@ class RunSummary(Model):
     stages: tuple[StageSummary, ...]
     frames_lost: tuple[str, ...] = ()
     """Frames that are in no tracklet though the source has them, and why: ``frame 12 (2.412 s): failed:...``."""
+    footage_lost: tuple[str, ...] = ()
+    """What of the recording the source does not have: ``clip.mp4: 31 frames read of 60 declared: ...``."""
 
     @property
     def complete(self) -> bool:
         """Whether nothing was lost."""
-        return not self.frames_lost and not any(stage.lost for stage in self.stages)
+        return not self.frames_lost and not self.footage_lost and not any(stage.lost for stage in self.stages)

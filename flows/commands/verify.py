@@ -56,9 +56,12 @@ def _repair(run: "Run") -> None:
     from flows.process_tracks import run_tracks
     from flows.runners import RunnerConfig
     from schemas.job import Job
+    from velfield.analysis.movements.time_slices import SLICE_S
+    from velfield.pipeline.analysis.analyse import analyse_run
     from velfield.pipeline.given_tracks.plan import TRACKS, plan_tracks
     from velfield.pipeline.plan import make_plan
     from velfield.pipeline.verify import invalidate, verify_run
+    from velfield.run.commits import ANALYSIS, read_commit
     from velfield.run.flight_record import check_format
     from velfield.run.lock import locked
 
@@ -72,9 +75,15 @@ def _repair(run: "Run") -> None:
         raise InputError(
             f"{job.root}: its inputs or the code changed since it was made; run `velfield run` on it again"
         )
+    analysis = read_commit(run.layout, ANALYSIS, "all")
     with locked(run.layout):
-        invalidate(run.layout, verify_run(run.layout, run.record))
+        damages = verify_run(run.layout, run.record)
+        invalidate(run.layout, damages)
     (run_tracks if of_tracks else run_flight)(job, RunnerConfig(), Console("normal"))
+    if any(damage.stage == ANALYSIS for damage in damages):
+        slice_s = SLICE_S if analysis is None else analysis.counts["slice_s"]
+        for line in analyse_run(run.layout.root, slice_s=slice_s):
+            print(line)
 
 
 def _inputs(record: "FlightRecord", root: Path) -> "Inputs":

@@ -66,7 +66,7 @@ def run_again(job: Job, *, until: str = PAGE) -> Plan:
             committed(plan, stage.name, unit.name) or unit_graph(plan, stage, unit).compute(scheduler="synchronous")
             for unit in units
         ]
-        summaries.append(summarise_stage(stage.name, records, units=len(units), before=records, lost=(), seconds=0.0))
+        summaries.append(summarise_stage(stage.name, records, units=len(units), before=records, seconds=0.0))
         if stage.name == until:
             return plan
     write_report(plan, RunSummary(root=job.root, stages=tuple(summaries), frames_lost=()))

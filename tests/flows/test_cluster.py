@@ -2,8 +2,10 @@
 
 import os
 import shutil
+import time
 from pathlib import Path
 
+import dask
 import pytest
 import yaml
 from dask import delayed
@@ -92,6 +94,45 @@ def test_a_worker_killed_in_mid_chunk_on_a_cluster_by_class(
     assert (root / "killed").exists()
     (root / "killed").unlink()
     assert summary.complete
+    assert digests(root) == digests(whole[0])
+
+
+def one_that_needs_too_much_memory(plan: object, frames: range) -> object:
+    """In place of the step: frame 8 takes more than the limit of its worker, wherever it is computed."""
+    from velfield.pipeline.stages.detections import detect_block
+
+    if 8 in frames:
+        with (Path(plan.job.root) / "attempts").open("a") as file:  # type: ignore[attr-defined]
+            file.write(f"{os.getpid()}\n")
+        taken = []
+        for _ in range(600):  # the worker's nanny looks a few times a second
+            taken.append(b"\1" * (20 << 20))
+            time.sleep(0.02)
+    return detect_block(plan, frames)  # type: ignore[arg-type]
+
+
+def test_a_unit_over_the_memory_limit_is_tried_once_more_and_then_left_out_with_the_reason(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = tmp_path / "run"
+    shutil.copytree(whole[0], root)
+    for stage in ("detections", "tracklets", "tracks", "field", "maps"):
+        shutil.rmtree(root / "commits" / stage)
+    here = {"n_workers": 0, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0", "memory_limit": "1200MB"}
+    runner = RunnerConfig(cluster_class="distributed.LocalCluster", workers=2, cluster_kwargs=here)
+    monkeypatch.setattr("velfield.pipeline.stages.detections.detect_block", one_that_needs_too_much_memory)
+    with dask.config.set({"distributed.scheduler.allowed-failures": 1}):
+        summary = process(job(flight, root), runner)
+    # Dask tries it on another worker; then it is tried once more, likewise.
+    assert len(set((root / "attempts").read_text().split())) == 4
+    assert not summary.complete
+    (why,) = next(stage.failures for stage in summary.stages if stage.name == "detections")
+    assert "detections of frames 8 to 15 (" in why
+    assert "failed: 2 workers of tcp://" in why
+    assert "their memory limit is too small" in why
+    monkeypatch.undo()
+    (root / "attempts").unlink()
+    assert process(job(flight, root)).complete
     assert digests(root) == digests(whole[0])
 
 

@@ -8,6 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from flows.cli import _conclude
+from flows.console import Console
 from flows.runners import RunnerConfig
 from schemas.detector import MotionRecord
 from schemas.summary import RunSummary
@@ -20,6 +22,9 @@ from velfield.pipeline.plan import make_plan
 from velfield.pipeline.stage import STAGE
 from velfield.pipeline.stages.detections import detect_block
 from velfield.pipeline.stages.detector import make_detector
+from velfield.pipeline.stages.report import make_report
+from velfield.pipeline.summary import summarise_run
+from velfield.report.report import render_report
 from velfield.run.layout import RunLayout
 from velfield.run.results import link_shared_outputs
 
@@ -195,10 +200,40 @@ def test_a_unit_that_always_fails_is_lost_and_computed_by_the_next_run(
     lost = {stage.name: stage.lost for stage in summary.stages if stage.lost}
     assert lost["detections"] == ("000008-000015",)
     assert not summary.complete
+    (why,) = next(stage.failures for stage in summary.stages if stage.name == "detections")
+    assert why.startswith(f"{root}: detections of frames 8 to 15 (")
+    assert why.endswith(" s) failed: this chunk kills its worker; re-run to retry")
+    assert why in json.loads(RunLayout(root).report_record.read_text())["warnings"]
     monkeypatch.setattr(step, "detect_block", true)
     again = process(job(flight, root))
     assert again.complete
     assert digests(root) == digests(whole[0])
+
+
+@pytest.mark.parametrize("fault", ["a frame more", "a time twice", "a frame without time"])
+def test_footage_that_is_not_all_there_ends_with_status_3(
+    fault: str,
+    whole: tuple[Path, RunSummary],
+    flight: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    lines = (flight / "timestamps.csv").read_text().splitlines()
+    if fault == "a frame more":
+        lines.append("999999.png,1000.0")
+    elif fault == "a time twice":
+        lines[5] = f"{lines[5].split(',')[0]},{lines[4].split(',')[1]}"
+    else:
+        del lines[5]
+    (tmp_path / "timestamps.csv").write_text("\n".join(lines))
+    plan = make_plan(job(flight, whole[0], timestamps=str(tmp_path / "timestamps.csv")))
+    summary = summarise_run(plan, whole[1].stages)
+    assert whole[1].complete
+    assert not summary.complete
+    assert len(summary.footage_lost) == 1
+    assert _conclude(summary, Console()) == 3
+    assert summary.footage_lost[0] in capsys.readouterr().err
+    assert "Not complete" in render_report(make_report(plan, summary), [])
 
 
 def test_refused_labels_leave_no_folder(flight: Path, server: None, tmp_path: Path) -> None:

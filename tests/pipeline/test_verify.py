@@ -12,6 +12,7 @@ from tests.faults.flipped_bits import flip_bits
 from tests.small_flight import digests
 from velfield import open_run
 from velfield.errors import InputError, StoreError
+from velfield.pipeline.analysis.analyse import analyse_run
 from velfield.pipeline.stage import STAGE
 from velfield.pipeline.verify import invalidate, verify_run
 from velfield.run.commits import commit_path, read_commit, read_commits
@@ -61,7 +62,8 @@ def test_every_file_of_the_stores_and_tables_is_in_a_record(copy: Path) -> None:
 
 
 def test_every_one_of_200_flipped_bits_is_found(copy: Path) -> None:
-    """In any file of the run but the lock: stores, tables, images, records, the page."""
+    """In any file of the run but the lock: stores, tables, images, records, the page, the analysis."""
+    list(analyse_run(copy))
     flips = flip_bits(copy, FLIPS, SEED)
     assert [flip.text() for flip in flips if not flip.is_found] == [], f"seed {SEED}"
     assert sum(flip.path.startswith("commits/") for flip in flips) > 5
@@ -86,6 +88,25 @@ def test_a_damaged_flight_record_is_refused_with_what_to_do(copy: Path) -> None:
 def test_a_damaged_page_is_found(copy: Path) -> None:
     flip_a_bit(copy / "view/run.json", np.random.default_rng(SEED))
     assert found(copy) == {"view/run.json": "damaged"}
+
+
+def test_a_damaged_analysis_is_found_and_made_again_as_it_was(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    list(analyse_run(copy, slice_s=2.0))
+    before, rng = digests(copy), np.random.default_rng(SEED)
+    flip_a_bit(copy / "analysis/lanes.json", rng)
+    flip_a_bit(copy / "analysis/report.html", rng)
+    (copy / "analysis/lanes.geojson").unlink()
+    assert found(copy) == {
+        "analysis/lanes.geojson": "gone",
+        "analysis/lanes.json": "damaged",
+        "analysis/report.html": "damaged",
+    }
+    assert verify(copy, repair=True) == 0
+    assert capsys.readouterr().out.strip().endswith(f"{copy}: whole")
+    after = digests(copy)
+    different = {name for name in before if before[name] != after[name]}
+    assert different <= {"analysis/analysis.xlsx"}  # it has its time in it
+    assert after.keys() == before.keys()
 
 
 def test_reading_a_damaged_table_raises_and_names_it(copy: Path) -> None:

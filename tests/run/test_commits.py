@@ -8,7 +8,15 @@ from schemas.flight import FlightConfig, TrackingConfig
 from schemas.records import CommitRecord, InputsRecord, SourceRecord
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.stage import STAGE, stage_keys
-from velfield.run.commits import content_key, digest_file, sweep_partial, valid_commit, write_atomically, write_commit
+from velfield.run.commits import (
+    content_key,
+    digest_file,
+    digest_input,
+    sweep_partial,
+    valid_commit,
+    write_atomically,
+    write_commit,
+)
 from velfield.run.layout import RunLayout
 
 INPUTS = InputsRecord(source=SourceRecord(path="a", kind="video", digest="d", width=10, height=10, frame_count=3))
@@ -72,11 +80,17 @@ def test_a_file_of_any_size_has_a_digest_of_its_content(tmp_path: Path, monkeypa
     monkeypatch.setattr("velfield.run.commits._WHOLE_FILE_BYTES", 1000)
     monkeypatch.setattr("velfield.run.commits._SAMPLE_BYTES", 16)
     file.write_bytes(bytes(4096))
-    digest = digest_file(file)
+    digest, sampled = digest_file(file), digest_input(file)
+    assert sampled != digest
     file.write_bytes(bytes(4095) + b"x")
     assert digest_file(file) != digest
+    assert digest_input(file) != sampled
     file.write_bytes(bytes(4097))
     assert digest_file(file) != digest
+    assert digest_input(file) != sampled
+    for changed in (20, 1000, 2222):  # an output is read whole, however large
+        file.write_bytes(bytes(changed) + b"x" + bytes(4095 - changed))
+        assert digest_file(file) != digest
 
 
 def test_partial_files_are_swept(tmp_path: Path) -> None:

@@ -60,6 +60,34 @@ def test_two_runs_on_one_folder(layout: RunLayout) -> None:
         pass
 
 
+@pytest.mark.parametrize("name", ["lock", "commits", "frames.zarr", "view/report.json", "tables/deep/er"])
+@pytest.mark.parametrize("exists", [True, False])
+def test_a_link_out_of_the_run_folder_is_refused_and_not_written_through(
+    tmp_path: Path, name: str, exists: bool
+) -> None:
+    root, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+    link = root / (RunLayout(root).lock.name if name == "lock" else name)
+    link.parent.mkdir(parents=True)
+    if exists and link.suffix:
+        elsewhere.write_text("of somebody")
+    elif exists:
+        elsewhere.mkdir()
+    link.symlink_to(elsewhere)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(InputError, match=r"found a symbolic link to .*elsewhere, expected that all of a run folder"):
+        locked(RunLayout(root)).__enter__()
+    assert sorted(tmp_path.rglob("*")) == before
+    assert not elsewhere.is_file() or elsewhere.read_text() == "of somebody"
+
+
+def test_links_within_the_run_folder_and_one_to_it_are_followed(tmp_path: Path) -> None:
+    (tmp_path / "disk" / "a").mkdir(parents=True)
+    (tmp_path / "disk" / "b").symlink_to("a")
+    (tmp_path / "run").symlink_to(tmp_path / "disk")
+    with locked(RunLayout(tmp_path / "run")):
+        assert RunLayout(tmp_path / "disk").lock.exists()
+
+
 def test_the_lock_of_a_process_that_was_killed_is_taken_over(layout: RunLayout) -> None:
     code = f"""if True:
         import os

@@ -30,9 +30,8 @@ from velfield.pipeline.stages.georeference import (
     write_georeference,
 )
 from velfield.pipeline.stages.rebase import describe_source
-from velfield.pipeline.stages.registration import lost_frames
 from velfield.pipeline.stages.report import write_report
-from velfield.pipeline.summary import summarise_stage
+from velfield.pipeline.summary import summarise_run, summarise_stage
 from velfield.pipeline.units import WHOLE
 from velfield.run.commits import read_commits, write_atomically
 from velfield.run.flight_record import check_format
@@ -184,8 +183,8 @@ def _summary(plan: Plan) -> RunSummary:
     stages = []
     for stage in STAGES:
         records = read_commits(plan.layout, stage.name)
-        stages.append(summarise_stage(stage.name, records, units=len(records), before=records, lost=(), seconds=0.0))
-    return RunSummary(root=plan.job.root, stages=tuple(stages), frames_lost=lost_frames(plan))
+        stages.append(summarise_stage(stage.name, records, units=len(records), before=records, seconds=0.0))
+    return summarise_run(plan, stages)
 
 
 def _notes(before_m: float | None, points: ControlPointsRecord, changed: float) -> list[str]:

@@ -113,9 +113,7 @@ def _write_page(plan: Plan, preview: Plan, what: str) -> None:
     summary = RunSummary(
         root=plan.job.root,
         stages=tuple(
-            summarise_stage(
-                name, found, units=len(found), before=(), lost=(), seconds=sum(one.seconds for one in found)
-            )
+            summarise_stage(name, found, units=len(found), before=(), seconds=sum(one.seconds for one in found))
             for name, found in records.items()
         ),
         frames_lost=lost_frames(preview),

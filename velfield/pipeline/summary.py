@@ -1,10 +1,13 @@
-"""The summary of a stage: its units added up, and one line for people."""
+"""Summaries: of a stage, its units added up and one line for people; of a run, what it lost besides."""
 
 from collections.abc import Mapping, Sequence
 
 from schemas.records import CommitRecord
-from schemas.summary import StageSummary
+from schemas.summary import RunSummary, StageSummary
+from velfield.pipeline.plan import Plan
 from velfield.pipeline.stage import STAGE
+from velfield.pipeline.stages.registration import lost_frames
+from velfield.sources.frames import FootageLoss
 
 _MEANS = frozenset({"heldout_px", "residual_px", "searched"})
 """Counts that are averaged over units, weighted by frames; all others are summed."""
@@ -16,10 +19,11 @@ def summarise_stage(
     *,
     units: int,
     before: Sequence[CommitRecord],
-    lost: Sequence[str],
+    lost: Mapping[str, str] | None = None,
     seconds: float,
 ) -> StageSummary:
-    """Add up a stage's units; ``before``: those that an earlier run finished."""
+    """Add up a stage's units; ``before``: those that an earlier run finished; ``lost``: why others failed, by name."""
+    lost = lost or {}
     counts = _total([record.counts for record in records])
     line = next(line.text for line in STAGE[name].lines if line.when(counts))
     text = line.format_map({key: counts.get(key, float("nan")) for key in _keys(line)})
@@ -32,6 +36,7 @@ def summarise_stage(
         units=units,
         done_before=len(before),
         lost=tuple(lost),
+        failures=tuple(lost.values()),
         counts=counts,
         notes=tuple(note for record in records for note in record.notes),
         warnings=tuple(warning for record in records for warning in record.warnings),
@@ -39,6 +44,12 @@ def summarise_stage(
         seconds_before=sum(record.seconds for record in before),
         text=text,
     )
+
+
+def summarise_run(plan: Plan, stages: Sequence[StageSummary]) -> RunSummary:
+    """The summary of a run of frames: its stages, and the frames that are not there or in no tracklet."""
+    absent = tuple(f"{plan.job.inputs.source}: {line}" for line in plan.info.warnings if isinstance(line, FootageLoss))
+    return RunSummary(root=plan.job.root, stages=tuple(stages), frames_lost=lost_frames(plan), footage_lost=absent)
 
 
 def _keys(line: str) -> list[str]:

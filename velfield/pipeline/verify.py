@@ -11,13 +11,15 @@ from schemas.records import CommitRecord, FlightRecord
 from velfield.errors import InputError
 from velfield.pipeline.stage import STAGE, STAGES, Cut
 from velfield.pipeline.units import WHOLE
-from velfield.run.commits import PAGE, commit_path, digest_file, read_commit, read_commits
+from velfield.run.commits import ANALYSIS, PAGE, commit_path, digest_file, digest_input, read_commit, read_commits
 from velfield.run.layout import RunLayout, remove_tree
 from velfield.run.results import read_results
 from velfield.run.stores import is_of_creation
 
 _THREADS = min(4, os.cpu_count() or 1)
 NOT_FINISHED = "not finished"
+_BESIDES = (PAGE, ANALYSIS)
+"""What has commit records and is no stage."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +42,13 @@ def verify_run(layout: RunLayout, record: FlightRecord) -> list[Damage]:
     """Read all that is committed and compare it with its digests; units that were never finished are listed too."""
     stages = [stage.name for stage in STAGES if not record.keys or stage.name in record.keys]  # format 1 had fewer
     by_stage = {stage: read_commits(layout, stage) for stage in stages}
-    pages = read_commits(layout, PAGE)  # of no earlier version
-    found = [damage for stage in (*stages, PAGE) for damage in _damaged_records(layout, stage)]
+    besides = [record for name in _BESIDES for record in read_commits(layout, name)]  # of no earlier version
+    found = [damage for stage in (*stages, *_BESIDES) for damage in _damaged_records(layout, stage)]
     damaged = {(damage.stage, damage.unit) for damage in found}
     found += [damage for damage in _unfinished(by_stage) if (damage.stage, damage.unit) not in damaged]
     found += _other_keys(by_stage, record)
     with ThreadPoolExecutor(_THREADS) as pool:
-        checked = pool.map(lambda unit: _check(layout, unit), [*chain.from_iterable(by_stage.values()), *pages])
+        checked = pool.map(lambda unit: _check(layout, unit), [*chain.from_iterable(by_stage.values()), *besides])
         found += chain.from_iterable(checked)
     return found + _damaged_index(layout)
 
@@ -70,7 +72,8 @@ def _check(layout: RunLayout, record: CommitRecord) -> list[Damage]:
     found = []
     for name, digest in record.outputs.items():
         try:
-            whole = digest_file(layout.root / name) == digest
+            path = layout.root / name
+            whole = digest in (digest_file(path), digest_input(path))  # the latter of large files by earlier versions
         except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
             found.append(Damage(record.stage, record.unit, name, "gone"))
         else:
@@ -105,7 +108,7 @@ def invalidate(layout: RunLayout, damages: Iterable[Damage]) -> list[str]:
     those again. So are damaged files outside the stores, which a stage before theirs may read where they exist.
     """
     damages = list(damages)
-    units = {(damage.stage, damage.unit) for damage in damages if damage.stage in (*STAGE, PAGE)}
+    units = {(damage.stage, damage.unit) for damage in damages if damage.stage in (*STAGE, *_BESIDES)}
     if any((layout.root / (damage.path or "")).is_relative_to(layout.view_changes) for damage in damages):
         remove_tree(layout.view_changes)  # `velfield compare` writes it again
     of_creation = {damage.stage for damage in damages if damage.path and is_of_creation(damage.path)}
@@ -113,7 +116,7 @@ def invalidate(layout: RunLayout, damages: Iterable[Damage]) -> list[str]:
         units |= {(stage, record.unit) for record in read_commits(layout, stage)}
         remove_tree(layout.root / str(STAGE[stage].store))
     for damage in damages:
-        if damage.path and damage.stage in (*STAGE, PAGE) and ".zarr/" not in damage.path:
+        if damage.path and damage.stage in (*STAGE, *_BESIDES) and ".zarr/" not in damage.path:
             (layout.root / damage.path).unlink(missing_ok=True)
     for stage, unit in units:
         commit_path(layout, stage, unit).unlink(missing_ok=True)

@@ -92,6 +92,8 @@ def _warnings(report: Report) -> str:
     lines = list(report.warnings)
     if report.frames_lost or lost:
         lines.insert(0, f"Not complete: {len(report.frames_lost)} frames and {lost} units lost. They are listed below.")
+    elif report.footage_lost:
+        lines.insert(0, "Not complete: a part of the recording is not there, as listed below.")
     return _section("Warnings", _items(lines), "warnings") if lines else ""
 
 

@@ -8,6 +8,7 @@ import hashlib
 import io
 import json
 import os
+import sys
 from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
@@ -25,8 +26,8 @@ _SAMPLE_BYTES = 2**20
 _SAMPLES = 64
 _DIGEST = "digest"
 """Key of a record of which the digest of all others is the value."""
-PAGE, PAGE_UNIT = "page", "all"
-"""Name of the commit record of the page, which is no stage."""
+PAGE, ANALYSIS, _WHOLE = "page", "analysis", "all"
+"""Names of the commit records of the page and of the analysis, which are no stages, and of their one unit."""
 
 
 def code_version() -> str:
@@ -40,21 +41,30 @@ def digest_bytes(data: bytes) -> str:
 
 
 def digest_file(path: Path) -> str:
+    """Digest of a file's content."""
+    return _digest(path, whole_bytes=sys.maxsize)
+
+
+def digest_input(path: Path) -> str:
     """Digest of a file's content; of a file above 256 MiB, of its size and 64 blocks of 1 MiB spread over it.
 
     Hashing all of a flight of hours would take longer than decoding its first minutes.
     """
+    return _digest(path, whole_bytes=_WHOLE_FILE_BYTES)
+
+
+def _digest(path: Path, *, whole_bytes: int) -> str:
     if is_remote(path):
         data = path.read_bytes()  # one request; its size and its blocks would be more
-        return _digest_stream(io.BytesIO(data), len(data))
+        return _digest_stream(io.BytesIO(data), len(data), whole_bytes)
     size = path.stat().st_size
     with path.open("rb") as file:
-        return _digest_stream(file, size)
+        return _digest_stream(file, size, whole_bytes)
 
 
-def _digest_stream(file: IO[bytes], size: int) -> str:
+def _digest_stream(file: IO[bytes], size: int, whole_bytes: int) -> str:
     digest = hashlib.blake2b(str(size).encode(), digest_size=16)
-    if size <= _WHOLE_FILE_BYTES:
+    if size <= whole_bytes:
         while block := file.read(_SAMPLE_BYTES):
             digest.update(block)
     else:
@@ -65,11 +75,11 @@ def _digest_stream(file: IO[bytes], size: int) -> str:
 
 
 def digest_path(path: Path) -> str:
-    """Digest of a file, or of a folder's files by name and content."""
+    """Digest of an input, a file, or of a folder's files by name and content."""
     if path.is_dir():
         files = sorted(p for p in path.rglob("*") if p.is_file())
-        return digest_bytes("".join(f"{p.relative_to(path)}\0{digest_file(p)}\n" for p in files).encode())
-    return digest_file(path)
+        return digest_bytes("".join(f"{p.relative_to(path)}\0{digest_input(p)}\n" for p in files).encode())
+    return digest_input(path)
 
 
 def content_key(
@@ -162,8 +172,18 @@ def record_page(layout: RunLayout) -> None:
     view = [path for path in layout.view.glob("*") if path.suffix in (".json", ".jpg", ".txt")]
     if layout.view_changes.exists():
         view += [path for path in layout.view_changes.rglob("*") if path.is_file()]
-    outputs = digest_outputs(layout, sorted([layout.report, *view]))
-    record = CommitRecord(stage=PAGE, unit=PAGE_UNIT, key="", outputs=outputs, code_version=code_version())
+    _record_files(layout, PAGE, [layout.report, *view])
+
+
+def record_analysis(layout: RunLayout, *, slice_s: float) -> None:
+    """Record the files of the analysis, and with which slices of time it was made, likewise."""
+    files = [path for path in layout.analysis.rglob("*") if path.is_file()]
+    _record_files(layout, ANALYSIS, files, slice_s=slice_s)
+
+
+def _record_files(layout: RunLayout, name: str, files: Iterable[Path], **counts: float) -> None:
+    outputs = digest_outputs(layout, sorted(files))
+    record = CommitRecord(stage=name, unit=_WHOLE, key="", outputs=outputs, counts=counts, code_version=code_version())
     write_commit(layout, record)
 
 

@@ -12,6 +12,7 @@ import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import psutil
@@ -34,14 +35,15 @@ def locked(layout: RunLayout) -> Iterator[None]:
     Raises
     ------
     InputError
-        Another process holds it: with its pid, host and since when. Or, on S3, this process stood still for longer
-        than the lease, and another took the lock over meanwhile.
+        Another process holds it: with its pid, host and since when. A symbolic link leads out of the folder. Or, on
+        S3, this process stood still for longer than the lease, and another took the lock over meanwhile.
     """
     if is_remote(layout.lock):
         with _leased(layout.lock, str(layout.root)):
             yield
         return
     layout.root.mkdir(parents=True, exist_ok=True)
+    _refuse_links(layout.root)
     with layout.lock.open("a+") as file:
         if not try_lock(file):
             file.seek(0)
@@ -50,6 +52,27 @@ def locked(layout: RunLayout) -> Iterator[None]:
         file.write(_record())
         file.flush()
         yield
+
+
+def _refuse_links(root: Path) -> None:
+    """Refuse a run folder in which a symbolic link leads out of it: what is written stays inside.
+
+    The folder itself may be reached by a link.
+    """
+    inside = root.resolve()
+    folders = [str(root)]
+    while folders:
+        with os.scandir(folders.pop()) as entries:
+            for entry in entries:
+                if entry.is_symlink():
+                    target = Path(entry.path).resolve()
+                    if not target.is_relative_to(inside):
+                        raise InputError(
+                            f"{entry.path}: found a symbolic link to {target}, expected that all of a run folder lies "
+                            "in it; remove the link, and move or link the run folder as a whole"
+                        )
+                elif entry.is_dir():
+                    folders.append(entry.path)
 
 
 def _record(lease_s: float = 0.0, lease: str = "") -> str:

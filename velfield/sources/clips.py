@@ -107,7 +107,7 @@ def _join(parts: tuple[tuple[str, SourceInfo, float], ...], notes: tuple[str, ..
             )
         if times and times_s[0] - end_s > _NOTED_GAP_S:
             warnings.append(f"a gap of {times_s[0] - end_s:.1f} s before {name}: no tracklet reaches over it")
-        warnings += [f"{name}: {warning}" for warning in info.warnings]
+        warnings += [type(warning)(f"{name}: {warning}") for warning in info.warnings]
         names += [f"{name}:{index}" for index in info.names]
         times.append(times_s)
         end_s = float(times_s[-1])

@@ -85,6 +85,12 @@ class SourceFrame:
     reason: str = ""
 
 
+class FootageLoss(str):
+    """A warning that part of the recording is not there: a run of it ends as not complete."""
+
+    __slots__ = ()
+
+
 @dataclass(frozen=True)
 class SourceInfo:
     """What is known of a video or an image folder before any frame is decoded.
@@ -102,7 +108,7 @@ class SourceInfo:
     names
         (n,) name of each frame in labels: file names, or indices as text.
     warnings
-        One line each, for the user: frames missing, out of order, or truncated.
+        One line each, for the user: frames missing, out of order, or truncated; what is lost is a `FootageLoss`.
     declared_count
         Number of frames that the container declares, if it does.
     pts

@@ -14,7 +14,7 @@ from PIL import BmpImagePlugin, Image, JpegImagePlugin, PngImagePlugin, TiffImag
 from schemas.arrays import FloatArray, GreyImage, IntArray
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
-from velfield.sources.frames import SourceFrame, SourceInfo, local_path, unreadable_frame
+from velfield.sources.frames import FootageLoss, SourceFrame, SourceInfo, local_path, unreadable_frame
 from velfield.sources.quality import FrameFlag
 from velfield.sources.timestamps import read_timestamps
 
@@ -289,9 +289,13 @@ def _unmatched_notes(
     absent = sorted(set(side) - set(kept), key=natural_key)
     notes: tuple[str, ...] = ()
     if untimed:
-        notes += (f"{len(untimed)} of {len(names)} images have no time and are dropped ({_shorten(untimed)})",)
+        notes += (
+            FootageLoss(f"{len(untimed)} of {len(names)} images have no time and are dropped ({_shorten(untimed)})"),
+        )
     if absent:
-        notes += (f"{len(absent)} frames of {timestamps.name} are not in {path.name} ({_shorten(absent)})",)
+        notes += (
+            FootageLoss(f"{len(absent)} frames of {timestamps.name} are not in {path.name} ({_shorten(absent)})"),
+        )
     return notes
 
 
@@ -305,7 +309,7 @@ def _sorted_by_time(
     if backwards:
         notes += (f"times run backwards {backwards} times in the order of names: frames are taken in order of time",)
     if equal:
-        notes += (f"{equal} frames have the time of the frame before and are dropped",)
+        notes += (FootageLoss(f"{equal} frames have the time of the frame before and are dropped"),)
     return tuple(names[i] for i in order), times_s, notes
 
 

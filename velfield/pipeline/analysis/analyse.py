@@ -22,9 +22,10 @@ from velfield.pipeline.analysis.lanes_record import lanes_geojson, lanes_record
 from velfield.pipeline.analysis.page import report_html
 from velfield.pipeline.analysis.tables import all_tables
 from velfield.pipeline.analysis.workbook import EXTRA, can_write_workbook, workbook_bytes
-from velfield.run.commits import code_version, read_commits, write_atomically
+from velfield.run.commits import code_version, read_commits, record_analysis, write_atomically
 from velfield.run.flight_record import read_flight_record
 from velfield.run.layout import RunLayout, remove_tree, to_path
+from velfield.run.lock import locked
 from velfield.run.run import Run, open_run
 from velfield.sources.trajectories import read_tracks
 
@@ -41,19 +42,21 @@ def analyse_run(run_folder: Path, *, slice_s: float = SLICE_S) -> Iterator[str]:
     Raises
     ------
     InputError
-        The folder is not a run folder, or its tracks are not computed.
+        The folder is not a run folder, its tracks are not computed, or another process writes into it.
     """
     _check_slice(slice_s)
     run = open_run(run_folder)
-    yield from _stale_lines(run.layout)
-    yield from write_analysis(
-        replace(run.analysis.traffic, slice_s=slice_s),
-        run.layout.analysis,
-        Georeference.from_grid(run.grid),
-        gsd_known=run.grid.gsd_m is not None,
-        picture=run.base_image,
-        frames=_frames(run),
-    )
+    with locked(run.layout):
+        yield from _stale_lines(run.layout)
+        yield from write_analysis(
+            replace(run.analysis.traffic, slice_s=slice_s),
+            run.layout.analysis,
+            Georeference.from_grid(run.grid),
+            gsd_known=run.grid.gsd_m is not None,
+            picture=run.base_image,
+            frames=_frames(run),
+        )
+        record_analysis(run.layout, slice_s=slice_s)
 
 
 def _frames(run: Run) -> Frames | None:

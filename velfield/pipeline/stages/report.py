@@ -100,8 +100,12 @@ def make_report(plan: Plan, summary: RunSummary) -> Report:
         detection=_curve(plan),
         gates=_gates(summary.stages),
         notes=tuple(note for stage in summary.stages for note in stage.notes),
-        warnings=(*plan.info.warnings, *(warning for stage in summary.stages for warning in stage.warnings)),
+        warnings=(
+            *plan.info.warnings,
+            *(line for stage in summary.stages for line in (*stage.failures, *stage.warnings)),
+        ),
         frames_lost=summary.frames_lost,
+        footage_lost=summary.footage_lost,
         files=tuple(_files(plan)),
     )
 

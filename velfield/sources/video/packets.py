@@ -15,6 +15,7 @@ import numpy as np
 
 from schemas.arrays import IntArray, Mask
 from velfield.errors import InputError
+from velfield.sources.frames import FootageLoss
 from velfield.sources.video.corruption import capture_errors
 
 # Demuxers that read this one file: playlists (HLS, ffconcat, SDP, image patterns) could name other files or hosts.
@@ -135,7 +136,9 @@ def drop_timestamp_outliers(
     outlier = np.abs(pts - np.median(windows, axis=1)) > max_deviation
     notes: tuple[str, ...] = ()
     if outlier.any():
-        notes = (f"{np.count_nonzero(outlier)} frames have times far from their neighbours' (corrupt): dropped",)
+        notes = (
+            FootageLoss(f"{np.count_nonzero(outlier)} frames have times far from their neighbours' (corrupt): dropped"),
+        )
         packets = Packets(pts[~outlier], packets.key[~outlier], packets.stamps, packets.notes)
     back = np.maximum.accumulate(packets.pts) - packets.pts
     if back.size and back.max() > max_deviation:

@@ -14,7 +14,7 @@ import numpy as np
 from schemas.arrays import FloatArray
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
-from velfield.sources.frames import SourceInfo
+from velfield.sources.frames import FootageLoss, SourceInfo
 from velfield.sources.images import check_size
 from velfield.sources.timestamps import check_against_container, read_timestamps
 from velfield.sources.video.corruption import libav_log
@@ -78,7 +78,7 @@ def _times(
         notes: tuple[str, ...] = ("--fps is not used: the video has times of its own",) if frames.fps else ()
         equal = int(np.count_nonzero(np.diff(container_s) == 0))
         if equal:
-            notes += (f"{equal} frames have the time of the frame before and are dropped",)
+            notes += (FootageLoss(f"{equal} frames have the time of the frame before and are dropped"),)
         return container_s, notes
     if frames.fps is None:
         raise InputError(
@@ -161,10 +161,10 @@ def _picture_warnings(path: Path, max_pixels: int) -> tuple[str, ...]:
 def _truncation_warning(times_s: FloatArray, declared: int | None, declared_s: float | None) -> tuple[str, ...]:
     """Warn where the container declares more frames or time than the file holds."""
     if declared is not None and times_s.size < declared:
-        return (f"{times_s.size} frames read of {declared} declared: the file is truncated",)
+        return (FootageLoss(f"{times_s.size} frames read of {declared} declared: the file is truncated"),)
     if declared is None and declared_s is not None and times_s.size > 1:
         step = float(np.median(np.diff(times_s)))
         lasts = float(times_s[-1] - times_s[0]) + step
         if lasts < declared_s - max(2 * step, 0.02 * declared_s):
-            return (f"{lasts:.1f} s read of {declared_s:.1f} s declared: the file is truncated",)
+            return (FootageLoss(f"{lasts:.1f} s read of {declared_s:.1f} s declared: the file is truncated"),)
     return ()
