@@ -54,6 +54,9 @@ def answer(columns: dict[str, np.ndarray]) -> TrafficAnalysis:
                 analysis.profile(lane.number)
         elif name == "all other answers":
             analysis.answer_all()
+            slices = analysis.counts_by_time, analysis.scene_by_time
+            relations = () if analysis.scene is None else analysis.scene.relations
+            print(f"{len(slices[0])} and {len(slices[1])} counts by time, {len(relations)} origins and destinations")
         else:
             getattr(analysis, name)
         steps[name] = (time.perf_counter() - wall, time.process_time() - cpu)

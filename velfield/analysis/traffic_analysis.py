@@ -81,8 +81,8 @@ class TrafficAnalysis:
         if len(shared[0].graph):
             shared[0].samples(0)
         groups = (
-            ("conflicts",), ("free_flow",), ("movements", "reductions", "unusual"), ("streams", "signals"), ("flows",),
-            ("reversals", "doubtful_places"),
+            ("movements", "reductions", "unusual", "scene"), ("conflicts",), ("free_flow",), ("streams", "signals"),
+            ("flows",), ("reversals", "doubtful_places"), ("car_parks",),
         )  # fmt: skip
         with ThreadPoolExecutor(_THREADS) as pool:
             list(pool.map(lambda names: [getattr(self, name) for name in names], groups))

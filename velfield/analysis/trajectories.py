@@ -1,6 +1,7 @@
 """Trajectories: the tracks of a flight as flat arrays in metres, smoothed, and resampled along their paths."""
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +25,7 @@ _BRIDGE_S, _BRIDGE_M = 1.0, 0.9
 positions differ from that by more than this."""
 _ALIGNED_SD_PX = 0.5
 """A displacement with a larger standard deviation is that of two detections, whose crops did not align."""
+_THREADS = 2
 _MIN_STEP_M = 0.3
 """Jitter of a stationary vehicle is below it: its path does not grow by it."""
 
@@ -94,6 +96,8 @@ class Trajectories:
 
     def select(self, keep: Mask) -> "Trajectories":
         """The tracks (n,) that are kept."""
+        if keep.all():
+            return self
         rows = np.repeat(keep, np.diff(self.first))
         first = np.concatenate([[0], np.cumsum(np.diff(self.first)[keep])]).astype(np.int64)
         return Trajectories(
@@ -139,18 +143,19 @@ def make_trajectories(
         (m, 2) measured displacement to the track's next position, NaN where there is none; more accurate than the
         difference of the positions.
     """
-    if (np.diff(track) < 0).any() or ((np.diff(track) == 0) & (np.diff(time_s) <= 0)).any():
+    same = track[1:] == track[:-1]
+    if (track[1:] < track[:-1]).any() or (same & (time_s[1:] <= time_s[:-1])).any():
         order = np.lexsort((time_s, track))
         order = order[np.r_[True, (np.diff(track[order]) != 0) | (np.diff(time_s[order]) > 0)]]
         track, frame, time_s, xy_m = track[order], frame[order], time_s[order], xy_m[order]
         displacement_m = None if displacement_m is None else displacement_m[order]
-    starts = np.flatnonzero(np.r_[True, np.diff(track) != 0]) if len(track) else np.empty(0, np.int64)
+    starts = np.flatnonzero(np.r_[True, track[1:] != track[:-1]]) if len(track) else np.empty(0, np.int64)
     first = np.r_[starts, len(track)].astype(np.int64)
     step = np.zeros_like(xy_m)
-    step[:-1] = np.diff(xy_m, axis=0)
+    np.subtract(xy_m[1:], xy_m[:-1], out=step[:-1])
     if displacement_m is not None:
         known = np.isfinite(displacement_m[:, 0]) & np.isfinite(displacement_m[:, 1])
-        step = np.where(known[:, None], displacement_m, step)
+        np.copyto(step, displacement_m, where=known[:, None])
         _bridge(first, time_s, step, known, _BRIDGE_S, _BRIDGE_M)
     xy, velocity = _smooth(first, time_s, xy_m, step, _SMOOTHING_S, _VELOCITY_S)
     return Trajectories(track[starts], first, frame, time_s, xy, velocity, gsd_m)
@@ -283,71 +288,106 @@ def within(xy_m: FloatArray, low_m: FloatArray, high_m: FloatArray) -> IntArray:
     return np.asarray(rows[(y >= low_m[1]) & (y <= high_m[1])])
 
 
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def group_rows(group: IntArray, n: int) -> tuple[IntArray, IntArray]:
+    """Rows in the order of their group (rows,), and the borders (n + 1,) of the n groups among them: a counting sort,
+    in the time of a few copies."""
+    border = np.zeros(n + 1, np.int64)
+    for k in group:
+        border[k + 1] += 1
+    border = np.cumsum(border)
+    order, at = np.empty(len(group), np.int64), border.copy()
+    for i in range(len(group)):
+        order[at[group[i]]] = i
+        at[group[i]] += 1
+    return order, border
+
+
 def sample_paths(trajectories: Trajectories, spacing_m: float = 1.0) -> PathSamples:
     """Points every ``spacing_m`` along each track; a stationary vehicle gives none."""
-    out = _resample(
-        trajectories.first,
-        trajectories.time_s,
-        trajectories.xy_m,
-        trajectories.speed_m_per_s,
-        spacing_m,
-        _DIRECTION_M,
-        _MIN_STEP_M,
-    )
-    return PathSamples(out[:, 0].astype(np.int64), out[:, 1:3].copy(), out[:, 3].copy(), out[:, 4].copy(), out[:, 5])
+    first, xy, speed = trajectories.first, trajectories.xy_m, trajectories.speed_m_per_s
+    border = np.r_[0, np.cumsum(_count_samples(first, xy, spacing_m, _MIN_STEP_M))].astype(np.int64)
+    n = int(border[-1])
+    out = PathSamples(np.empty(n, np.int64), np.empty((n, 2)), np.empty(n), np.empty(n), np.empty(n))
+
+    def fill(tracks: IntArray) -> None:
+        columns = out.track, out.xy_m, out.direction_rad, out.time_s, out.speed_m_per_s
+        _resample(tracks, first, trajectories.time_s, xy, speed, border, spacing_m, _DIRECTION_M, _MIN_STEP_M, *columns)
+
+    with ThreadPoolExecutor(_THREADS) as pool:
+        list(pool.map(fill, np.array_split(np.arange(len(trajectories)), _THREADS)))
+    return out
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _find_vertices(
+    xy: FloatArray, a: int, b: int, min_step: float, vertex: IntArray, along: FloatArray
+) -> tuple[int, float]:
+    """How many vertices the path of the rows ``a`` to ``b`` has, its length; written: their rows, and how far along.
+
+    Vertices are positions at least ``min_step`` from the vertex before.
+    """
+    count = 0
+    for i in range(a, b):
+        if count == 0:
+            vertex[0], along[0], count = i, 0.0, 1
+            continue
+        j = vertex[count - 1]
+        d = np.hypot(xy[i, 0] - xy[j, 0], xy[i, 1] - xy[j, 1])
+        if d >= min_step:
+            vertex[count], along[count] = i, along[count - 1] + d
+            count += 1
+    return count, along[count - 1] if count else 0.0
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _count_samples(first: IntArray, xy: FloatArray, spacing: float, min_step: float) -> IntArray:
+    """Points ``spacing`` apart along each track (tracks,)."""
+    steps = np.zeros(len(first) - 1, np.int64)
+    most = np.max(np.diff(first)) if len(steps) else 0
+    vertex, along = np.empty(most, np.int64), np.empty(most)
+    for k in range(len(steps)):
+        _, length = _find_vertices(xy, first[k], first[k + 1], min_step, vertex, along)
+        steps[k] = int(length / spacing) + 1 if length >= 2 * spacing else 0
+    return steps
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _resample(
+    tracks: IntArray,
     first: IntArray,
     time_s: FloatArray,
     xy: FloatArray,
     speed: FloatArray,
+    border: IntArray,
     spacing: float,
     reach: float,
     min_step: float,
-) -> FloatArray:
-    """Rows (track, x, y, direction, time, speed), ``spacing`` apart along the path of each track."""
-    capacity = 1024
-    out = np.empty((capacity, 6))
-    n = 0
-    for k in range(len(first) - 1):
+    out_track: IntArray,
+    out_xy: FloatArray,
+    out_direction: FloatArray,
+    out_time: FloatArray,
+    out_speed: FloatArray,
+) -> None:
+    """Fill the rows ``border[k]:border[k + 1]`` of the outputs with points ``spacing`` apart along track k."""
+    for k in tracks:
         a, b = first[k], first[k + 1]
-        # the path's vertices: positions at least ``min_step`` from the vertex before
-        vertex = np.empty(b - a, np.int64)
-        along = np.zeros(b - a)
-        count = 0
-        for i in range(a, b):
-            if count == 0:
-                vertex[0], count = i, 1
-                continue
-            j = vertex[count - 1]
-            d = np.hypot(xy[i, 0] - xy[j, 0], xy[i, 1] - xy[j, 1])
-            if d >= min_step:
-                vertex[count], along[count] = i, along[count - 1] + d
-                count += 1
-        length = along[count - 1] if count else 0.0
-        steps = int(length / spacing) + 1 if length >= 2 * spacing else 0
-        while n + steps > capacity:
-            capacity *= 2
-            wider = np.empty((capacity, 6))
-            wider[:n] = out[:n]
-            out = wider
+        vertex, along = np.empty(b - a, np.int64), np.empty(b - a)
+        count, length = _find_vertices(xy, a, b, min_step, vertex, along)
+        steps = border[k + 1] - border[k]
         begin = 0.5 * (length - (steps - 1) * spacing)
         at = behind = ahead = 0
         for q in range(steps):
-            s = begin + q * spacing
+            n, s = border[k] + q, begin + q * spacing
             x, y, at = _vertex_at(xy, vertex, along, count, s, at)
             x0, y0, behind = _vertex_at(xy, vertex, along, count, max(s - reach, 0.0), behind)
             x1, y1, ahead = _vertex_at(xy, vertex, along, count, min(s + reach, length), ahead)
             i, j = vertex[at], vertex[min(at + 1, count - 1)]
             f = (s - along[at]) / max(along[min(at + 1, count - 1)] - along[at], 1e-9)
-            out[n, 0], out[n, 1], out[n, 2] = k, x, y
-            out[n, 3] = np.arctan2(y1 - y0, x1 - x0)
-            out[n, 4] = time_s[i] + f * (time_s[j] - time_s[i])
-            out[n, 5] = speed[i] + f * (speed[j] - speed[i])
-            n += 1
-    return out[:n]
+            out_track[n], out_xy[n, 0], out_xy[n, 1] = k, x, y
+            out_direction[n] = np.arctan2(y1 - y0, x1 - x0)
+            out_time[n] = time_s[i] + f * (time_s[j] - time_s[i])
+            out_speed[n] = speed[i] + f * (speed[j] - speed[i])
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

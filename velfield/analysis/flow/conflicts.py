@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numba import njit
 from scipy import stats
 
 from schemas.arrays import FloatArray, IntArray
@@ -12,7 +13,7 @@ from velfield.analysis.flow.passings import LaneTraffic, Passings
 from velfield.analysis.lanes.find import project
 from velfield.analysis.lanes.junctions import Crossing, find_crossings
 from velfield.analysis.lanes.model import LaneGraph
-from velfield.analysis.trajectories import VEHICLE_WIDTH_M, Trajectories
+from velfield.analysis.trajectories import VEHICLE_WIDTH_M, Trajectories, group_rows
 
 ConflictKind = Literal["crossing", "merging", "following"]
 MAX_PET_S, MAX_TTC_S = 3.0, 3.0
@@ -170,20 +171,17 @@ def time_to_collision(
     """
     lane, along = positions_on_lanes(trajectories, graph)
     rows = np.flatnonzero(lane >= 0)
-    moment = lane[rows] * (np.int64(trajectories.frame.max(initial=0)) + 1) + trajectories.frame[rows]
-    order = rows[np.lexsort((along[rows], moment))]
-    a, b = order[:-1], order[1:]  # b leads a
-    moment = np.sort(moment)
-    same = moment[:-1] == moment[1:]
-    a, b = a[same], b[same]
+    rows = rows[group_rows(trajectories.frame[rows], int(trajectories.frame.max(initial=0)) + 1)[0]]
+    rows = rows[group_rows(lane[rows], len(graph))[0]]
+    _sort_along(rows, lane, trajectories.frame, along)
     owner, speed = trajectories.owner, trajectories.speed_m_per_s
-    gap = along[b] - along[a] - (lengths[owner[a]] + lengths[owner[b]]) / 2
+    near, overlaps = _followers(rows, lane, trajectories.frame, along, owner, speed, lengths)
+    a, b = rows[near], rows[near + 1]  # b leads a
+    pair, overlapping = (owner[rows[k]] * np.int64(len(trajectories)) + owner[rows[k + 1]] for k in (near, overlaps))
+    apart = ~np.isin(pair, overlapping)
+    a, b, pair = a[apart], b[apart], pair[apart]
+    gap = np.maximum(along[b] - along[a] - (lengths[owner[a]] + lengths[owner[b]]) / 2, 0.05)
     closing = speed[a] - speed[b]
-    pair = owner[a] * np.int64(len(trajectories)) + owner[b]
-    overlap = np.isin(pair, pair[gap < -_OVERLAP_M])
-    near = (closing > 0.5) & (gap < MAX_TTC_S * closing) & (owner[a] != owner[b])
-    near &= ~overlap & (speed[a] > _MIN_FOLLOWER_M_PER_S)
-    a, b, gap, closing, pair = a[near], b[near], np.maximum(gap[near], 0.05), closing[near], pair[near]
     value = persistent(pair, trajectories.time_s[a], gap / closing)
     lasts = np.isfinite(value)
     a, b, gap, closing, pair, value = a[lasts], b[lasts], gap[lasts], closing[lasts], pair[lasts], value[lasts]
@@ -207,6 +205,51 @@ def time_to_collision(
         )
         for i in best[first]
     ]
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _sort_along(rows: IntArray, lane: IntArray, frame: IntArray, along: FloatArray) -> None:
+    """Bring rows, in place, of one frame and lane, which are together and few, into their order along the lane."""
+    for i in range(1, len(rows)):
+        row, k = rows[i], i
+        while (
+            k > 0
+            and lane[rows[k - 1]] == lane[row]
+            and frame[rows[k - 1]] == frame[row]
+            and along[rows[k - 1]] > along[row]
+        ):
+            rows[k] = rows[k - 1]
+            k -= 1
+        rows[k] = row
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _followers(
+    rows: IntArray,
+    lane: IntArray,
+    frame: IntArray,
+    along: FloatArray,
+    owner: IntArray,
+    speed: FloatArray,
+    lengths: FloatArray,
+) -> tuple[IntArray, IntArray]:
+    """Numbers k at which ``rows[k]`` closes in on its leader ``rows[k + 1]``, and at which the two overlap."""
+    near, overlaps = np.empty(len(rows), np.int64), np.empty(len(rows), np.int64)
+    n = m = 0
+    for k in range(len(rows) - 1):
+        a, b = rows[k], rows[k + 1]
+        if lane[a] != lane[b] or frame[a] != frame[b]:
+            continue
+        gap = along[b] - along[a] - (lengths[owner[a]] + lengths[owner[b]]) / 2
+        closing = speed[a] - speed[b]
+        if gap < -_OVERLAP_M:
+            overlaps[m] = k
+            m += 1
+        moves = closing > 0.5 and speed[a] > _MIN_FOLLOWER_M_PER_S
+        if moves and gap < MAX_TTC_S * closing and owner[a] != owner[b]:
+            near[n] = k
+            n += 1
+    return near[:n].copy(), overlaps[:m].copy()
 
 
 def persistent(pair: IntArray, time_s: FloatArray, value_s: FloatArray) -> FloatArray:
@@ -240,13 +283,34 @@ def positions_on_lanes(trajectories: Trajectories, graph: LaneGraph) -> tuple[In
     samples = graph.samples
     if not len(samples) or not len(trajectories):
         return np.full(len(trajectories.time_s), -1), np.zeros(len(trajectories.time_s))
-    begin = float(trajectories.time_s.min())
-    span = trajectories.duration_s + 10.0
-    key = samples.track * span + (samples.time_s - begin)
-    owner = trajectories.owner
-    query = owner * span + (trajectories.time_s - begin)
-    k = np.clip(np.searchsorted(key, query) - 1, 0, len(key) - 2)
-    good = (samples.track[k] == owner) & (samples.track[k + 1] == owner) & (samples.lane[k] == samples.lane[k + 1])
-    f = np.clip((query - key[k]) / np.maximum(key[k + 1] - key[k], 1e-9), 0.0, 1.0)
-    along = samples.along_m[k] + f * (samples.along_m[k + 1] - samples.along_m[k])
-    return np.where(good, samples.lane[k], -1), along
+    lane, along = _between(
+        trajectories.first, trajectories.time_s, samples.track, samples.lane, samples.along_m, samples.time_s
+    )
+    return lane, along
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _between(
+    first: IntArray,
+    time_s: FloatArray,
+    sample_track: IntArray,
+    sample_lane: IntArray,
+    sample_along: FloatArray,
+    sample_time: FloatArray,
+) -> tuple[IntArray, FloatArray]:
+    """Lane and distance of each position, between the two samples of its track around its time."""
+    lane, along = np.full(len(time_s), -1, np.int64), np.zeros(len(time_s))
+    k, last = 0, len(sample_track) - 1
+    for track in range(len(first) - 1):
+        for i in range(first[track], first[track + 1]):
+            t = time_s[i]
+            # the first sample of this track, or of a later one, that is not before the position
+            while k <= last and (sample_track[k] < track or (sample_track[k] == track and sample_time[k] < t)):
+                k += 1
+            at = min(max(k - 1, 0), last - 1)
+            if sample_track[at] == track and sample_track[at + 1] == track and sample_lane[at] == sample_lane[at + 1]:
+                lasts = max(sample_time[at + 1] - sample_time[at], 1e-9)
+                f = min(max((t - sample_time[at]) / lasts, 0.0), 1.0)
+                lane[i] = sample_lane[at]
+                along[i] = sample_along[at] + f * (sample_along[at + 1] - sample_along[at])
+    return lane, along

@@ -8,6 +8,7 @@ import numpy as np
 
 from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.lanes.model import LaneGraph, LaneSamples
+from velfield.analysis.trajectories import group_rows
 
 _GOES_S = 1.5
 """A vehicle that needs longer from one sample to the next, 1 m on, has waited."""
@@ -37,18 +38,17 @@ class LaneTraffic:
     graph: LaneGraph
 
     @cached_property
-    def _by_lane(self) -> LaneSamples:
-        order = np.argsort(self.graph.samples.lane, kind="stable")
-        return LaneSamples(*(getattr(self.graph.samples, name)[order] for name in LaneSamples.__dataclass_fields__))
-
-    @cached_property
-    def _first(self) -> IntArray:
-        return np.searchsorted(self._by_lane.lane, np.arange(len(self.graph) + 1))
+    def _by_lane(self) -> tuple[LaneSamples, IntArray]:
+        """The samples in the order of their lanes, and the lanes' borders among them."""
+        order, first = group_rows(self.graph.samples.lane, len(self.graph))
+        columns = (getattr(self.graph.samples, name)[order] for name in LaneSamples.__dataclass_fields__)
+        return LaneSamples(*columns), first
 
     def samples(self, lane: int) -> LaneSamples:
         """Those on one lane, by track and along it."""
-        rows = slice(int(self._first[lane]), int(self._first[lane + 1]))
-        return LaneSamples(*(getattr(self._by_lane, name)[rows] for name in LaneSamples.__dataclass_fields__))
+        samples, first = self._by_lane
+        rows = slice(int(first[lane]), int(first[lane + 1]))
+        return LaneSamples(*(getattr(samples, name)[rows] for name in LaneSamples.__dataclass_fields__))
 
     def passings(self, lane: int, along_m: float) -> Passings:
         """Tracks that pass a distance along a lane."""

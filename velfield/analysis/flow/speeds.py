@@ -143,8 +143,7 @@ def _steady_speeds(traffic: LaneTraffic, lane: int) -> tuple[IntArray, FloatArra
     steps = int(window)
     if steps < 5 or len(samples) <= steps:
         return tracks[0], speeds[0], headways[0]
-    windows = np.lib.stride_tricks.sliding_window_view(samples.speed_m_per_s, steps)
-    low, high = windows.min(axis=1), windows.max(axis=1)
+    low, high = (_of_windows(samples.speed_m_per_s, steps, of) for of in (np.minimum, np.maximum))
     mean = (low + high) / 2
     one = samples.track[: len(low)] == samples.track[steps - 1 :]
     steady = one & (high - low < 2 * _STEADY * mean) & (low > 2.0)
@@ -160,6 +159,16 @@ def _steady_speeds(traffic: LaneTraffic, lane: int) -> tuple[IntArray, FloatArra
         speeds.append(mean[begin])
         headways.append(headway[order][k[known]] if len(passed) else np.empty(0))
     return np.concatenate(tracks), np.concatenate(speeds), np.concatenate(headways)
+
+
+def _of_windows(values: FloatArray, steps: int, of: np.ufunc) -> FloatArray:
+    """The least (or greatest: ``of``) of each ``steps`` consecutive values (n,): of windows twice as long each time."""
+    out, width = values, 1
+    while width < steps:
+        further = min(width, steps - width)
+        out = of(out[: len(out) - further], out[further:])
+        width += further
+    return out
 
 
 def traffic_passings(samples: LaneSamples, at_m: float) -> tuple[IntArray, FloatArray]:

@@ -3,6 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+from numba import njit
 from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, IntArray
@@ -10,7 +11,7 @@ from velfield.analysis.lanes.graph import Chains, count_links, make_chains
 from velfield.analysis.lanes.junctions import find_junctions
 from velfield.analysis.lanes.model import Connection, Lane, LaneGraph, LaneSamples, Turn, WidthSource
 from velfield.analysis.lanes.ridges import Nodes, bin_keys, bin_samples, find_nodes
-from velfield.analysis.trajectories import VEHICLE_WIDTH_M, PathSamples, Trajectories, sample_paths
+from velfield.analysis.trajectories import VEHICLE_WIDTH_M, PathSamples, Trajectories, group_rows, sample_paths
 
 MIN_TRACKS = 3
 """A lane, or a connection, that fewer tracks drove is not one: an error of tracking or of a driver."""
@@ -134,43 +135,70 @@ def _place(samples: PathSamples, node: IntArray, chains: Chains, n: int, lines: 
     lane = np.where(node >= 0, _lane_of_node(chains.nodes, n)[node], -1)
     keep = lane >= 0
     lane, xy = lane[keep], samples.xy_m[keep]
-    along, offset = np.zeros(len(lane)), np.zeros(len(lane))
-    order = np.argsort(lane, kind="stable")
-    borders = np.searchsorted(lane[order], np.arange(len(lines) + 1))
-    rows = np.split(order, borders[1:-1])
+    along, offset = np.empty(len(lane)), np.empty(len(lane))
+    points, border = np.concatenate(lines), np.r_[0, np.cumsum([len(line) for line in lines])].astype(np.int64)
+
+    def fill(rows: slice) -> None:
+        _project(xy[rows], lane[rows], points, border, along[rows], offset[rows])
+
+    half = len(lane) // 2
     with ThreadPoolExecutor(_THREADS) as pool:
-        placed = pool.map(lambda k: project(xy[rows[k]], lines[k]), range(len(lines)))
-        for of_lane, (s, miss) in zip(rows, placed, strict=True):
-            along[of_lane], offset[of_lane] = s, miss
+        list(pool.map(fill, (slice(half), slice(half, None))))
     return LaneSamples(samples.track[keep], lane, along, offset, samples.time_s[keep], samples.speed_m_per_s[keep])
 
 
 def project(xy_m: FloatArray, line_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Distance (n,) along a line of points (k, 2), and to its right, of positions (n, 2)."""
-    step = np.diff(line_m, axis=0)
-    length = np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)
-    begin = np.concatenate([[0.0], np.cumsum(length)[:-1]])
-    middles = (line_m[1:] + line_m[:-1]) / 2
-    _, near = cKDTree(middles).query(xy_m, k=min(2, len(middles)))
-    near = np.asarray(near).reshape(len(xy_m), -1)
-    best_along, best_offset = np.zeros(len(xy_m)), np.full(len(xy_m), np.inf)
-    for i in near.T:
-        d = xy_m - line_m[i]
-        u = step[i] / length[i][:, None]
-        s = np.clip((d * u).sum(axis=1), 0.0, length[i])
-        across = u[:, 0] * d[:, 1] - u[:, 1] * d[:, 0]
-        miss = np.hypot(*(d - s[:, None] * u).T)
-        closer = miss < np.abs(best_offset) - 1e-9
-        best_along = np.where(closer, begin[i] + s, best_along)
-        best_offset = np.where(closer, np.copysign(miss, across), best_offset)
-    return best_along, best_offset
+    along, offset = np.empty(len(xy_m)), np.empty(len(xy_m))
+    border = np.array([0, len(line_m)], np.int64)
+    _project(xy_m, np.zeros(len(xy_m), np.int64), line_m, border, along, offset)
+    return along, offset
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _project(
+    xy: FloatArray, line: IntArray, points: FloatArray, border: IntArray, out_along: FloatArray, out_offset: FloatArray
+) -> None:
+    """Positions onto the nearer of the two pieces whose middles are nearest, of the line of each.
+
+    Line k has the points ``border[k]:border[k + 1]``, some hundred: trying them all takes less time than a tree.
+    """
+    begin = np.zeros(len(points))
+    for k in range(len(border) - 1):
+        for j in range(border[k] + 1, border[k + 1]):
+            length = np.hypot(points[j, 0] - points[j - 1, 0], points[j, 1] - points[j - 1, 1])
+            begin[j] = begin[j - 1] + max(length, 1e-9)
+    for i in range(len(xy)):
+        x, y = xy[i, 0], xy[i, 1]
+        near = second = -1
+        least = less = np.inf
+        for j in range(border[line[i]], border[line[i] + 1] - 1):
+            dx, dy = x - (points[j + 1, 0] + points[j, 0]) / 2, y - (points[j + 1, 1] + points[j, 1]) / 2
+            d = dx * dx + dy * dy
+            if d < least:
+                near, second, least, less = j, near, d, least
+            elif d < less:
+                second, less = j, d
+        best = np.inf
+        out_along[i], out_offset[i] = 0.0, np.inf
+        for j in (near, second):
+            if j < 0:
+                continue
+            ux, uy = points[j + 1, 0] - points[j, 0], points[j + 1, 1] - points[j, 1]
+            length = max(np.hypot(ux, uy), 1e-9)
+            ux, uy = ux / length, uy / length
+            dx, dy = x - points[j, 0], y - points[j, 1]
+            s = min(max(dx * ux + dy * uy, 0.0), length)
+            miss = np.hypot(dx - s * ux, dy - s * uy)
+            if miss < best - 1e-9:
+                best = miss
+                out_along[i], out_offset[i] = begin[j] + s, np.copysign(miss, ux * dy - uy * dx)
 
 
 def _lanes(lines: list[FloatArray], on_lanes: LaneSamples) -> tuple[Lane, ...]:
     tracks = _tracks_on(on_lanes.track, on_lanes.lane, len(lines))
     gaps = _neighbours(lines)
-    order = np.argsort(on_lanes.lane, kind="stable")
-    borders = np.searchsorted(on_lanes.lane[order], np.arange(len(lines) + 1))
+    order, borders = group_rows(on_lanes.lane, len(lines))
     out = []
     for k, line in enumerate(lines):
         left, right = gaps.get((k, -1)), gaps.get((k, 1))

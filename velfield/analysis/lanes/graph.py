@@ -53,10 +53,8 @@ class Chains:
 
 def count_links(track: IntArray, node: IntArray, nodes: Nodes) -> Links:
     """Links of consecutive samples' nodes; samples are in order along each track, ``node`` -1: none."""
-    known = node >= 0
-    track, node = track[known], node[known]
-    moves = np.flatnonzero((np.diff(track) == 0) & (np.diff(node) != 0))
-    a, b, owner = node[moves], node[moves + 1], track[moves]
+    first, second = _moves(track, node)
+    a, b, owner = node[first], node[second], track[first]
     step = nodes.xy_m[b] - nodes.xy_m[a]
     ahead = np.cos(nodes.direction_rad[a]) * step[:, 0] + np.sin(nodes.direction_rad[a]) * step[:, 1]
     ok = (np.hypot(step[:, 0], step[:, 1]) < _MAX_STEP_M) & (ahead > 0)
@@ -64,6 +62,21 @@ def count_links(track: IntArray, node: IntArray, nodes: Nodes) -> Links:
     number, pairs = pd.factorize(a[ok] * np.int64(len(nodes)) + b[ok], sort=True)
     pairs, count = np.asarray(pairs, np.int64), count_once(owner[ok], number, len(pairs))
     return Links(pairs // len(nodes), pairs % len(nodes), count)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _moves(track: IntArray, node: IntArray) -> tuple[IntArray, IntArray]:
+    """Rows at which a track leaves a node, and at which it is at the next; those without a node are passed over."""
+    first, second = np.empty(len(track), np.int64), np.empty(len(track), np.int64)
+    n, last = 0, -1
+    for i in range(len(track)):
+        if node[i] < 0:
+            continue
+        if last >= 0 and track[i] == track[last] and node[i] != node[last]:
+            first[n], second[n] = last, i
+            n += 1
+        last = i
+    return first[:n], second[:n]
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

@@ -51,11 +51,16 @@ class Nodes:
         return len(self.xy_m)
 
 
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def bin_keys(xy_m: FloatArray, direction_rad: FloatArray) -> IntArray:
     """One number (n,) for the bin of each sample; positions lie within 500 km of the origin."""
-    cell = np.floor(xy_m / BIN_M).astype(np.int64) + (1 << 20)
-    sector = np.mod(np.round(direction_rad / (2 * np.pi / SECTORS)).astype(np.int64), SECTORS)
-    return np.asarray((cell[:, 1] << 21 | cell[:, 0]) * SECTORS + sector, np.int64)
+    out = np.empty(len(xy_m), np.int64)
+    for i in range(len(xy_m)):
+        x = np.int64(np.floor(xy_m[i, 0] / BIN_M)) + (1 << 20)
+        y = np.int64(np.floor(xy_m[i, 1] / BIN_M)) + (1 << 20)
+        sector = np.int64(np.rint(direction_rad[i] / (2 * np.pi / SECTORS))) % SECTORS
+        out[i] = (y << 21 | x) * SECTORS + sector
+    return out
 
 
 def bin_samples(samples: PathSamples, keys: IntArray) -> tuple[Bins, IntArray]:

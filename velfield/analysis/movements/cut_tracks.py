@@ -1,11 +1,12 @@
 """Tracks that are one vehicle's: cut by a tree or a miss of the detector, and found again where it must have gone."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from schemas.arrays import FloatArray, IntArray, Mask
-from velfield.analysis.trajectories import Trajectories
+from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
 
 _MAX_GAP_S = 5.0
 _ENDS_S = 0.6
@@ -41,6 +42,11 @@ class CutTracks:
     track: IntArray
     start_s: FloatArray
     gap_start_s: FloatArray
+
+    @cached_property
+    def samples(self) -> PathSamples:
+        """Points along the vehicles' paths, 1 m apart."""
+        return sample_paths(self.trajectories)
 
     def track_at(self, vehicle: IntArray, time_s: FloatArray) -> IntArray:
         """Number of the track (n,) of vehicles at times, in a gap of the one before it."""

@@ -18,7 +18,7 @@ from velfield.analysis.lanes.junctions import inside_hull
 from velfield.analysis.lanes.model import Junction, LaneGraph, Turn
 from velfield.analysis.movements.cut_tracks import CutTracks, join_cut_tracks
 from velfield.analysis.movements.gates import Gates, find_gates
-from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths, within
+from velfield.analysis.trajectories import PathSamples, Trajectories, within
 
 _UPSTREAM_M = 60
 """A travel time begins so far before the junction where the track does."""
@@ -115,7 +115,7 @@ def find_movements(
         Those of the trajectories, where they are known already.
     """
     cut = join_cut_tracks(trajectories) if cut_tracks is None else cut_tracks
-    samples = sample_paths(cut.trajectories)
+    samples = cut.samples
     begin, end = window_s or (
         (float(trajectories.time_s.min()), float(trajectories.time_s.max())) if len(trajectories) else (0.0, 0.0)
     )

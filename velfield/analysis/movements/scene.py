@@ -21,10 +21,11 @@ from velfield.analysis.lanes.junctions import buffered_hull
 from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.movements.cut_tracks import CutTracks
 from velfield.analysis.movements.gates import COMPASS, Arm, Gate, group_gates
-from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
+from velfield.analysis.trajectories import PathSamples, Trajectories, within
 
 _INWARDS_M, _OUTWARDS_M, _ASIDE_M = 20.0, 15.0, 2.5
 """A track that begins so far behind an entry, or ahead of it, and so far beside its lane, was seen to enter there."""
+_REACH_M = float(np.hypot(max(_INWARDS_M, _OUTWARDS_M), _ASIDE_M))
 _TURN_RAD = np.radians(35)
 _MIN_FRACTION = 0.5
 """Of the tracks on the first 20 m of an entry so many begin there."""
@@ -224,7 +225,9 @@ def _faces(a: End, b: End) -> bool:
 def _mostly_ends(end: End, trajectories: Trajectories, samples: PathSamples, window_s: tuple[float, float]) -> bool:
     """Whether most tracks at a lane's start begin there (at its end: end there), but those that time cuts."""
     _, inwards, xy, direction = end
-    here = np.unique(samples.track[_at_gate(samples.xy_m, samples.direction_rad, xy, direction, inwards=inwards)])
+    near = within(samples.xy_m, xy - _REACH_M, xy + _REACH_M)
+    here = _at_gate(samples.xy_m[near], samples.direction_rad[near], xy, direction, inwards=inwards)
+    here = np.unique(samples.track[near[here]])
     rows = _terminal(samples, len(trajectories), first=inwards)[here]
     time = samples.time_s[rows]
     by_time = (time < window_s[0] + _CUT_BY_TIME_S) if inwards else (time > window_s[1] - _CUT_BY_TIME_S)
@@ -272,7 +275,7 @@ def trace_trips(
     vehicles: CutTracks, graph: LaneGraph, gates: tuple[Gate, ...], arms: tuple[Arm, ...], window_s: tuple[float, float]
 ) -> OriginDestination:
     """Which arms vehicles enter by and leave by, and where those went whose tracks are cut."""
-    trajectories, samples = vehicles.trajectories, sample_paths(vehicles.trajectories)
+    trajectories, samples = vehicles.trajectories, vehicles.samples
     n = len(trajectories)
     origin, entry = _terminal_arms(samples, n, gates, first=True)
     destination, leaves = _terminal_arms(samples, n, gates, first=False)
@@ -326,8 +329,10 @@ def _infer(
 ) -> None:
     """Destinations of the vehicles that are ``cut``, in place: as of the known ones from their origin that drove on the
     lane on which they are lost; without three of these, of all that drove on it; else of all of their origin."""
-    visits = np.unique(np.column_stack([graph.samples.lane, vehicles.vehicle[graph.samples.track]]), axis=0)
-    borders = np.searchsorted(visits[:, 0], np.arange(len(graph) + 1))
+    lane_of, vehicle_of, count = graph.samples.lane, vehicles.vehicle[graph.samples.track], len(vehicles.trajectories)
+    comes = np.flatnonzero(np.r_[True, (lane_of[1:] != lane_of[:-1]) | (vehicle_of[1:] != vehicle_of[:-1])])
+    visits = np.unique(lane_of[comes] * np.int64(count) + vehicle_of[comes])
+    borders = np.searchsorted(visits, np.arange(len(graph) + 1) * np.int64(count))
     last = vehicles.track[vehicles.first[cut + 1] - 1]
     row = np.searchsorted(graph.samples.track, last, side="right") - 1
     on_lane = (row >= 0) & (graph.samples.track[np.maximum(row, 0)] == last)
@@ -336,7 +341,7 @@ def _infer(
         lane = int(graph.samples.lane[k]) if placed else -1
         key = (lane, int(origin[vehicle]))
         if key not in shares:
-            others = visits[borders[lane] : borders[lane + 1], 1] if placed else np.empty(0, np.int64)
+            others = visits[borders[lane] : borders[lane + 1]] % count if placed else np.empty(0, np.int64)
             choices = (
                 others[known[others] & (origin[others] == key[1])],
                 others[destination[others] >= 0],
