@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.analysis.test_traffic_analysis import CYCLE_S, crossroads, gather
+from velfield.analysis.lanes.model import LaneSamples
 from velfield.analysis.signals.coordination import find_offsets, queue_growth
 from velfield.analysis.signals.cycles import JunctionSignal
 from velfield.analysis.traffic_analysis import TrafficAnalysis
@@ -86,3 +87,13 @@ def test_points_of_the_diagram_obey_its_equation(analysis: TrafficAnalysis) -> N
     picture = diagram_svg(table)
     assert picture.count("<circle") == len(table.rows)
     assert len(growth_table(analysis).rows) == len(queue_growth(signal_of_crossroads(analysis)))
+
+
+def test_a_lane_on_which_no_vehicle_has_two_samples_has_no_point(analysis: TrafficAnalysis) -> None:
+    samples = analysis.lanes.samples
+    _, once = np.unique(samples.lane * len(analysis.trajectories) + samples.track, return_index=True)
+    single = LaneSamples(*(getattr(samples, name)[once] for name in LaneSamples.__dataclass_fields__))
+    assert diagram_table(analysis).rows
+    short = TrafficAnalysis(analysis.trajectories)
+    vars(short)["lanes"] = replace(analysis.lanes, samples=single)
+    assert diagram_table(short).rows == ()

@@ -39,9 +39,10 @@ def diagram_table(analysis: TrafficAnalysis) -> AnalysisTable:
         samples = analysis.lane_traffic.samples(lane.number)
         width = (end - begin) / len(found.start_s) if end > begin else 1.0
         number = np.clip(((samples.time_s - begin) / width).astype(np.int64), 0, len(found.start_s) - 1)
-        pairs = np.unique(np.column_stack([number, samples.track]), axis=0)
-        vehicles = np.bincount(pairs[:, 0], minlength=len(found.start_s))
-        for k in np.flatnonzero(vehicles >= _MIN_VEHICLES).tolist():
+        tracks = int(samples.track.max(initial=0)) + 1
+        vehicles = np.bincount(np.unique(number * tracks + samples.track) // tracks, minlength=len(found.start_s))
+        # on a lane of a metre or two vehicles have one sample each, and no speed
+        for k in np.flatnonzero((vehicles >= _MIN_VEHICLES) & np.isfinite(found.speed_m_per_s)).tolist():
             cells: dict[str, Cell] = {
                 "lane": lane.number,
                 "begin": round(float(found.start_s[k]), 1),
