@@ -44,9 +44,11 @@ _MAX_STOP_SPEED_M_PER_S, _MAX_STOP_OFFSET_M = 5.0, 4.0
 _STOP_COST = 0.5
 _ALONE_COST = 1.0
 """Cost of a track's end, or start, that continues in none; a pair costs at most twice as much."""
-_VANISHED_COST = 0.8
-"""Of one in the middle of the frames and of the flight so much more: no vehicle vanishes there."""
-_HIDDEN_COST, _HIDDEN_GAP_PENALTY_PER_S, _MIN_HIDDEN_S = 0.8, 0.04, 0.5
+_VANISHED_COST = 0.6
+"""Of one in the middle of the frames and of the flight so much more: few vehicles vanish there, under trees."""
+_HIDDEN_COST, _MIN_HIDDEN_S = 0.2, 0.5
+_FOUND_WITHIN_M = 1.0
+"""Of a hidden vehicle: where it may come out is not known better than this, however short the gap."""
 _PACE_SD_M_PER_S, _PACE_SD_FRACTION, _FASTER_M_PER_S = 1.0, 0.35, 2.5
 """Of a hidden vehicle: how far its mean speed is from the mean of those before and after, and how far above both it may
 be."""
@@ -360,13 +362,15 @@ def _cost_when_hidden(
         directed = (speed > gaps.stationary_speed_m_per_s) & (distance > _CAR_AND_GAP_M / 2)
         bend = np.where(directed, np.maximum(bend, np.arccos(np.clip(cos, -1, 1))), bend)
     mean, pace = (before + after) / 2, along / np.maximum(gap, 1e-9)
-    relative = np.hypot(
-        (pace - mean) / (_PACE_SD_M_PER_S + _PACE_SD_FRACTION * mean) / 1.5,
-        across / (_LANE_OFFSET_M + _LANE_OFFSET_FRACTION * distance),
-    )
+    pace_sd = _PACE_SD_M_PER_S + _PACE_SD_FRACTION * mean
+    aside = _LANE_OFFSET_M + _LANE_OFFSET_FRACTION * distance
+    relative = np.hypot((pace - mean) / pace_sd / 1.5, across / aside)
+    # the larger the area in which the vehicle may come out, the less one that comes out at a place speaks for it: the
+    # normalisation of a density, whose logarithm over the slope of the certainty is a cost
+    area = np.hypot(_FOUND_WITHIN_M, pace_sd * gap) * aside / _LANE_OFFSET_M
     possible = (gap >= _MIN_HIDDEN_S) & (gap <= gaps.hidden_s) & (bend <= _MAX_BEND_RAD) & (relative <= 1.2)
     possible &= (along > 0) & (pace <= np.maximum(before, after) + _FASTER_M_PER_S)
-    return np.where(possible, _HIDDEN_COST + relative + _HIDDEN_GAP_PENALTY_PER_S * gap, np.inf)
+    return np.where(possible, _HIDDEN_COST + relative + np.log(area) / _CERTAINTY_SLOPE, np.inf)
 
 
 def _assign(pairs: IntArray, gain: FloatArray) -> tuple[IntArray, FloatArray]:
