@@ -81,6 +81,7 @@ def reprocess(
     """One run, a new base image, a new result beside the old one."""
     check_format(Path(root))
     run = open_run(root)
+    run.require_frames()
     with locked(run.layout):
         mark_crashed(f"{root} on {name}")
         if result_exists(run.layout, name, Path(base)):

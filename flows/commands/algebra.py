@@ -6,6 +6,8 @@ from pathlib import Path
 def merge(*run_folders: Path, out: Path) -> int:
     """Add the fields of two or more run folders on one grid, exactly.
 
+    A vehicle that two of them saw at the same time counts twice; how many did is printed, where the runs have clocks.
+
     Parameters
     ----------
     run_folders
@@ -13,9 +15,10 @@ def merge(*run_folders: Path, out: Path) -> int:
     out
         New folder for the sum.
     """
-    from velfield.run.field_algebra import merge_fields
+    from velfield.pipeline.merge import merge_runs
 
-    merge_fields(run_folders, out)
+    for line in merge_runs(run_folders, out):
+        print(line)
     print(out / "field.zarr")
     return 0
 

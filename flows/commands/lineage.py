@@ -37,6 +37,7 @@ def lineage(
 
     where = _pixel(x, y, pixel)
     run = open_run(run_folder)
+    run.require_frames()
     if where is None:
         print(_json(stage_lineage(run)) if as_json else describe_lineage(run))
     else:

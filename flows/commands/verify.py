@@ -31,6 +31,7 @@ def verify(run_folder: Path, /, *, repair: Annotated[bool, Parameter(negative=()
     from velfield.run.run import open_run
 
     run = open_run(run_folder)
+    run.require_frames()
     damages = verify_run(run.layout, run.record)
     print(describe_damage(run_folder, damages))
     if not damages:

@@ -18,6 +18,7 @@ FILE_NAME = "report.html"
 
 def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
     """See `velfield.exports.export.ExportModule`."""
+    run.require_frames()
     report = _read_report(run.layout)
     alone = report.model_copy(update={"files": ()})  # a mail does not carry them
     figures = [figure.model_copy(update={"full_size": None}) for figure in report_figures(run.layout.maps).values()]

@@ -58,12 +58,17 @@ def compare_runs(before: Path, after: Path, out: Path, *, min_count: int = MIN_C
     return [
         *(_line(name, changes[name], *shown[name]) for name in changes),
         *_traffic_lines(runs[0], runs[1], out),
-        f"significant: false discovery rate {FDR_LEVEL:.0%}; figures, change.tif and traffic_change.csv in {out}",
+        f"significant: false discovery rate {FDR_LEVEL:.0%}; figures and tables in {out}",
     ]
 
 
 def _traffic_lines(before: Run, after: Run, out: Path) -> list[str]:
-    """Write what differs in shares, flows, travel times, cycles and free-flow speeds; a line on each that does."""
+    """Write what differs in shares, flows, travel times, cycles and free-flow speeds; a line on each that does.
+
+    Of a merged or subtracted field there are no tracks to ask.
+    """
+    if before.made_from or after.made_from:
+        return []
     changes = find_changes(before.analysis.traffic, after.analysis.traffic)
     rows = [
         {

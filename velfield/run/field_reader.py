@@ -44,6 +44,17 @@ def open_velocity_field(layout: RunLayout, *, time_weighted: bool = False) -> Ve
     return field_from_store(open_field(layout.field), config, read_grid(layout), time_weighted=time_weighted)
 
 
+def source_runs(layout: RunLayout) -> tuple[str, ...]:
+    """The runs of whose fields this folder's was made by `velfield.run.field_algebra`; empty of a run of its own."""
+    if not layout.field.exists():
+        return ()
+    about = open_field(layout.field).attributes
+    return (
+        *about.get("merged_from", ()),
+        *(about[name] for name in ("subtracted_from", "subtracted") if name in about),
+    )
+
+
 def open_field_intervals(layout: RunLayout) -> list[IntervalField]:
     """The fields of the time intervals of a run folder, in their order; empty where none were configured."""
     config = read_flight_record(layout.root).config.field

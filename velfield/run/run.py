@@ -22,12 +22,12 @@ from schemas.tables import (
 from velfield.analysis.crossings import find_crossings, hysteresis_px
 from velfield.analysis.vehicle_classes import add_dimensions
 from velfield.analysis.vehicles import find_vehicles
-from velfield.errors import OldNameWarning
+from velfield.errors import InputError, OldNameWarning
 from velfield.field.segments import Segments, require_gsd_m, segment_table
 from velfield.field.view import VelocityField
 from velfield.registration.warp import warp_to_base
 from velfield.run.analysis import RunAnalysis
-from velfield.run.field_reader import IntervalField, open_field_intervals, open_velocity_field
+from velfield.run.field_reader import IntervalField, open_field_intervals, open_velocity_field, source_runs
 from velfield.run.flight_record import read_flight_record
 from velfield.run.frame_transforms import FrameTransforms, read_base_image, read_georeference, read_grid
 from velfield.run.layout import RunLayout, to_path
@@ -64,16 +64,38 @@ class Run:
         self.record = record
 
     def __repr__(self) -> str:
-        return f"Run({str(self.layout.root)!r}, {self.frames.count} frames)"
+        content = f"field of {', '.join(self.made_from)}" if self.made_from else f"{self.frames.count} frames"
+        return f"Run({str(self.layout.root)!r}, {content})"
+
+    @cached_property
+    def made_from(self) -> tuple[str, ...]:
+        """The runs of whose fields `velfield merge` or `subtract` made this folder; empty of a run with frames."""
+        return source_runs(self.layout)
+
+    def require_frames(self) -> None:
+        """Refuse a folder that `velfield merge` or `subtract` made: it has a field and a base image, nothing else.
+
+        Raises
+        ------
+        InputError
+            It is one; the message names the runs to ask.
+        """
+        if self.made_from:
+            raise InputError(
+                f"{self.layout.root}: found a field made of those of {' and '.join(self.made_from)}, without frames "
+                "and tracks, expected a run of its own; give one of these"
+            )
 
     @cached_property
     def frames(self) -> FrameStore:
         """The frames: ``run.frames.read(frame)`` is (h, w) uint8."""
+        self.require_frames()
         return open_frames(self.layout.frames)
 
     @cached_property
     def registration(self) -> RegistrationStore:
         """Per-frame results of registration."""
+        self.require_frames()
         return open_registration(self.layout.registration)
 
     @cached_property
@@ -167,6 +189,7 @@ class Run:
 
     def detections(self) -> pd.DataFrame:
         """All detections, in base pixels: the columns of ``schemas.tables.DETECTION_COLUMNS``."""
+        self.require_frames()
         return read_tables(sorted(self.layout.detections.glob("unit-*.parquet")), DETECTION_COLUMNS)
 
     def tracklets(self) -> pd.DataFrame:
@@ -174,6 +197,7 @@ class Run:
 
         ``passage_id`` is deprecated: the old name of ``track_id``, with the same values.
         """
+        self.require_frames()
         paths = sorted(self.layout.tracks.glob("unit-*.parquet"))
         if self.layout.format_version == FORMAT_VERSION:
             return read_track_tables(paths, TRACK_COLUMNS)
@@ -201,6 +225,7 @@ class Run:
         ``source`` distinguishes what is seen from what is inferred, by name (``POSITION_SOURCES``). Empty of a run by
         an earlier release.
         """
+        self.require_frames()
         table = read_tables(sorted(self.layout.track_positions.glob("unit-*.parquet")), TRACK_POSITION_COLUMNS)
         return table.assign(source=pd.Categorical.from_codes(table["source"], pd.Index(POSITION_SOURCES)))
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from velfield.errors import InputError
 from velfield.run.flight_record import suggest_run
+from velfield.run.layout import RunLayout
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
@@ -68,6 +69,10 @@ def view_app(root: Path) -> "Starlette":
         There is no page in the folder.
     """
     if not (root / "index.html").is_file():
+        if RunLayout(root).flight.is_file():
+            from velfield.run.run import open_run
+
+            open_run(root).require_frames()
         raise InputError(f"{root} holds no index.html: {suggest_run(root)}")
     return files_app(root)
 

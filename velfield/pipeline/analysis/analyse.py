@@ -46,6 +46,7 @@ def analyse_run(run_folder: Path, *, slice_s: float = SLICE_S) -> Iterator[str]:
     """
     _check_slice(slice_s)
     run = open_run(run_folder)
+    run.require_frames()
     with locked(run.layout):
         yield from _stale_lines(run.layout)
         yield from write_analysis(
