@@ -1,6 +1,6 @@
 """The same bits: a small flight by threads and processes, 1, 2 and 8 at a time, and under several versions of Python.
 
-python -m tests.faults.determinism FOLDER [--threads 1 2 8] [--processes 2 8]
+python -m tests.faults.determinism FOLDER [--threads 1 2 8] [--processes 2 8] [--set detection.method=cnn ...]
 
 The flight is made in FOLDER where it is not there; each run leaves its digests in FOLDER/NAME.json and is compared with
 all that are there, also of another Python: of what differs, by how much. Exit status 1 where that is more than
@@ -13,7 +13,7 @@ import json
 import platform
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +31,10 @@ from velfield.pipeline.stage import STAGES
 from velfield.pipeline.units import prepare_stage, stage_units
 
 
-def run_by(compute: Callable[[Any], Any], flight: Path, root: Path) -> dict[str, str]:
+def run_by(compute: Callable[[Any], Any], flight: Path, root: Path, settings: Sequence[str] = ()) -> dict[str, str]:
     """Digests of the files of a run whose graphs are computed by a runner."""
     shutil.rmtree(root, ignore_errors=True)
-    plan = make_plan(tiny_job(flight, root))
+    plan = make_plan(tiny_job(flight, root, *settings))
     write_flight_record(plan)
     for stage in STAGES:
         prepare_stage(plan, stage)
@@ -100,6 +100,7 @@ def main() -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--threads", type=int, nargs="*", default=[1, 2, 8])
     parser.add_argument("--processes", type=int, nargs="*", default=[2, 8])
+    parser.add_argument("--set", dest="settings", nargs="*", default=[])
     given = parser.parse_args()
     limit_threads()
     prepare_process(verbose=False)
@@ -112,11 +113,11 @@ def main() -> int:
     found: dict[str, dict[str, str]] = {}
     for threads in given.threads:
         name = f"python-{platform.python_version()}-threads-{threads}"
-        found[name] = run_by(ThreadsRunner(threads).compute, flight, given.folder / name)
+        found[name] = run_by(ThreadsRunner(threads).compute, flight, given.folder / name, given.settings)
     for processes in given.processes:
         name = f"python-{platform.python_version()}-processes-{processes}"
         with open_runner(RunnerConfig(workers=processes)) as runner:
-            found[name] = run_by(runner.compute, flight, given.folder / name)
+            found[name] = run_by(runner.compute, flight, given.folder / name, given.settings)
     for name, made in found.items():
         (given.folder / f"{name}.json").write_text(json.dumps(made, indent=1))
     return 0 if _compare(given.folder, python) else 1

@@ -48,8 +48,10 @@ _SETTINGS = (
 
 
 def tiny_job(flight: Path, root: Path | str, *settings: str) -> Job:
-    """A job on `TINY`: some seconds."""
-    config = resolve_config(settings=[*_SETTINGS, *settings], overrides={"gsd_m": 0.23})
+    """A job on `TINY`: some seconds. Another detector is taken with its own settings."""
+    another = any(setting.startswith("detection.method=") for setting in settings)
+    usual = [setting for setting in _SETTINGS if not (another and setting.startswith("detection."))]
+    config = resolve_config(settings=[*usual, *settings], overrides={"gsd_m": 0.23})
     return Job(root=str(root), inputs=Inputs.from_simulated_flight(flight), config=config)
 
 

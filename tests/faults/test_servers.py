@@ -2,10 +2,14 @@
 
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
+import time
 from base64 import b64encode
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +17,7 @@ import psutil
 import pytest
 
 from flows.runners import RunnerConfig, open_runner
+from schemas.summary import RunSummary
 from tests.viewer.test_viewer_server import served
 from velfield.report.figures import png_bytes
 from velfield.report.viewer_page import page_is_built
@@ -36,6 +41,53 @@ def test_pages_of_runs_are_served_to_this_machine_alone(tmp_path: Path) -> None:
     with serve_in_thread(files_app(tmp_path), 0) as address:
         opened = listening(psutil.Process()) - before
     assert {(ip, port) for _, ip, port in opened} == {("127.0.0.1", int(address.rpartition(":")[2]))}
+
+
+@contextmanager
+def velfield_process(*arguments: str) -> Iterator[psutil.Process]:
+    """A command of velfield's in a process of its own, ended afterwards."""
+    command = [sys.executable, "-m", "flows.cli", *arguments]
+    checkout = {"PYTHONPATH": str(Path(__file__).parents[2])}
+    with subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ | checkout
+    ) as process:
+        try:
+            yield psutil.Process(process.pid)
+        finally:
+            process.terminate()
+            process.wait(60)
+
+
+def sockets_seen(process: psutil.Process, *, until: Callable[[], bool], fewest: int = 1) -> set[str]:
+    """Addresses on which a process and all that it starts listened, looked at until there are some and all is done."""
+    seen: set[tuple[int, str, int]] = set()
+    deadline = time.monotonic() + 90
+    while (len(seen) < fewest or not until()) and time.monotonic() < deadline:
+        with suppress(psutil.NoSuchProcess):
+            seen |= listening(process, *process.children(recursive=True))
+        time.sleep(0.2)
+    assert len(seen) >= fewest
+    assert until()
+    return {address for _, address, _ in seen}
+
+
+def test_a_run_listens_on_this_machine_alone(flight: Path, tmp_path: Path) -> None:
+    """As a process: Prefect's temporary server, scheduler, workers and dashboard of `--workers`."""
+    registered = tmp_path / "run" / "commits" / "base"
+    given = [str(flight / "frames"), "--timestamps", str(flight / "timestamps.csv"), "--out", str(tmp_path / "run")]
+    settings = ["--preset", "fast", "--gsd-m", "0.23", "--base", str(flight / "base.png"), "--workers", "1"]
+    with velfield_process("run", *given, *settings) as process:
+        assert sockets_seen(process, until=registered.exists, fewest=4) == {"127.0.0.1"}
+
+
+@pytest.mark.skipif(not page_is_built(), reason="the page is not built: `make page`")
+@pytest.mark.parametrize("command", ["view", "annotate", "georeference"])
+def test_each_page_as_a_process_listens_on_this_machine_alone(
+    command: str, whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(whole[0], tmp_path / "run")
+    with velfield_process(command, str(tmp_path / "run"), "--no-open") as process:
+        assert sockets_seen(process, until=lambda: True) == {"127.0.0.1"}
 
 
 def test_a_local_cluster_listens_on_this_machine_alone() -> None:
