@@ -12,6 +12,7 @@ from flows.commands.verify import DAMAGED, WHOLE, verify
 from schemas.flight import FlightConfig
 from schemas.job import Inputs, Job
 from schemas.simulation import SimulationConfig
+from tests.analysis.test_traffic_analysis import crossroads, gather
 from tests.small_flight import digests
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import InputError
@@ -21,6 +22,8 @@ from velfield.pipeline.result import commit
 from velfield.pipeline.stage import resolve
 from velfield.pipeline.units import prepare_stage, stage_units
 from velfield.pipeline.verify import verify_run
+from velfield.run.commits import read_commits
+from velfield.run.layout import RunLayout
 from velfield.run.run import Run, open_run
 from velfield.synthetic.flight import Flight
 from velfield.synthetic.observed import NO_ERRORS, observed_detections
@@ -178,6 +181,18 @@ def test_each_format_gives_the_same_answers(form: str, run: Run, tmp_path: Path)
     known, all_known = (np.isfinite(r.field.modal_velocity()).all(axis=2).sum() for r in (other, run))
     # pixels end at their image's border, metres have a margin in which lanes are as wide as elsewhere
     assert known == pytest.approx(all_known, rel=0.06 if form == "pixels" else 0.02)
+
+
+def test_positions_with_errors_are_smoothed_to_the_same_lanes(tmp_path: Path) -> None:
+    """As of another program's detections: as they are, the paths of a lane cross, and five lanes become 26."""
+    exact = gather(crossroads())
+    position = exact.xy_m + np.random.default_rng(8).normal(0, 0.4, exact.xy_m.shape)
+    table = pd.DataFrame({"id": exact.owner, "time_s": exact.time_s, "x_m": position[:, 0], "y_m": position[:, 1]})
+    table.to_csv(tmp_path / "t.csv", index=False)
+    found = process(tmp_path / "t.csv", tmp_path / "run").analysis.traffic
+    assert len(found.lanes) == len(TrafficAnalysis(exact).lanes) == 5
+    notes = [note for of in read_commits(RunLayout(tmp_path / "run"), "tracks") for note in of.notes]
+    assert any("errors of 0.40 m: smoothed to 0.1" in note for note in notes)
 
 
 def test_positions_are_interpolated_over_short_gaps_alone() -> None:
