@@ -131,7 +131,7 @@ def run(
     timestamps
         CSV `frame,time_s` for a folder of images.
     telemetry
-        Subtitle file (.SRT) of a drone. Default: the one beside the video, or the subtitles and tags of the source.
+        Subtitles (.SRT) or MISB KLV (.klv) of a drone. Default: those beside the video, or in it, or the images' tags.
     fps
         Frame rate of a folder of images without timestamps, or of `--tracks` that have no times.
     config

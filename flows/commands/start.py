@@ -58,11 +58,11 @@ def _of_runs(runs: list[Path]) -> Iterator[str]:
 
 
 def _of_videos(videos: list[Path], runs: set[str], entries: list[Path]) -> Iterator[str]:
-    subtitles = {entry.stem for entry in entries if entry.suffix.lower() == ".srt"}
+    subtitles = {entry.stem for entry in entries if entry.suffix.lower() in (".srt", ".klv")}
     new = [video for video in videos if f"{video.stem}-run" not in runs]
     for video in new[:_SHOWN]:
         known = video.stem in subtitles
-        scale = "its .SRT may give scale and north" if known else "add --gsd-m METRES if you know it"
+        scale = "the telemetry beside it may give scale and north" if known else "add --gsd-m METRES if you know it"
         yield f"{video.name} is a video, {scale}:"
         yield f"  velfield run {shlex.quote(video.name)} --out {shlex.quote(video.stem + '-run')}"
         yield f"  velfield init {shlex.quote(video.name)}   # writes flight.yaml with every parameter, to change some\n"

@@ -31,6 +31,7 @@ import yaml
 
 from schemas.flight import FlightConfig, FramesConfig
 from tests.media import drifting, write_images, write_times, write_video
+from tests.misb import encode_set, with_checksum
 from velfield.errors import InputError, StoreError
 
 LIMIT_S, WAIT_S = 10, 60
@@ -199,7 +200,7 @@ def kinds(folder: Path) -> list[Kind]:
     from velfield.sources.labels.detections import read_detections
     from velfield.sources.labels.labels import read_labels
     from velfield.sources.source import probe
-    from velfield.sources.telemetry.read import read_srt
+    from velfield.sources.telemetry.read import read_telemetry_file
     from velfield.sources.trajectories import read_tracks
 
     frames = list(drifting(FRAMES, WIDTH, HEIGHT))
@@ -261,7 +262,9 @@ def kinds(folder: Path) -> list[Kind]:
         Kind("tracks (CSV)", (TRACKS, IMAGE_TRACKS), "tracks.csv", lambda path: read_tracks(path, fps=5.0), 2),
         Kind("tracks (Parquet)", (_parquet_tracks(),), "tracks.parquet", read_tracks),
         Kind("tracks (FCD)", (FCD,), "tracks.xml", read_tracks),
-        Kind("subtitles", (SUBTITLES,), "x.srt", read_srt, 2),
+        Kind("subtitles", (SUBTITLES,), "x.srt", read_telemetry_file, 2),
+        Kind("KLV", (b"".join(KLV),), "x.klv", read_telemetry_file, 2),
+        Kind("KLV, a set with its checksum", tuple(packet[:-2] for packet in KLV), "x.klv", read_klv_summed, 2),
     ]
 
 
@@ -273,6 +276,20 @@ SUBTITLES = b"".join(
     b"[rel_alt: 100.2 abs_alt: 134.1] [gb_yaw: -12.3 gb_pitch: -90.0 gb_roll: 0.0]\n\n" % (k, k, k)
     for k in range(1, 6)
 )
+
+KLV = tuple(
+    encode_set(
+        {2: 1.7e9 + k, 5: 30, 6: 1, 7: 1, 13: 52, 14: 13, 15: 500, 16: 40, 18: 0, 19: -90, 20: 0, 21: 400, 25: 90}
+    )
+    for k in range(3)
+)
+
+
+def read_klv_summed(path: Path) -> object:
+    """One set of KLV, given the checksum that its bytes have: what is wrong in it reaches the reader of values."""
+    from velfield.sources.telemetry.klv import parse_klv
+
+    return parse_klv(with_checksum(path.read_bytes()), path.name)
 
 
 def _parquet_tracks() -> bytes:

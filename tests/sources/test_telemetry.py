@@ -1,9 +1,7 @@
 """What drones write: subtitles of every format, tags of images, and scale, north and place by them."""
 
-from fractions import Fraction
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 from PIL import Image
@@ -11,11 +9,9 @@ from rasterio.crs import CRS
 from rasterio.warp import transform
 
 from schemas.flight import FramesConfig
-from schemas.georeference import GeoreferenceRecord
 from schemas.simulation import SimulationConfig
 from tests.media import drifting, write_video
 from velfield.errors import Failure, InputError
-from velfield.pipeline.stages.georeference import describe
 from velfield.sources.source import probe
 from velfield.sources.telemetry.find import find_beside
 from velfield.sources.telemetry.placement import (
@@ -25,7 +21,7 @@ from velfield.sources.telemetry.placement import (
     estimate_scale,
     metres_per_degree,
 )
-from velfield.sources.telemetry.read import read_srt, read_telemetry
+from velfield.sources.telemetry.read import read_telemetry, read_telemetry_file
 from velfield.sources.telemetry.srt import parse_cue, parse_srt
 from velfield.sources.telemetry.telemetry import Telemetry
 from velfield.synthetic.clip import simulate_telemetry, srt_text
@@ -78,10 +74,10 @@ def test_subtitles_that_are_no_telemetry_are_none(tmp_path: Path) -> None:
     assert isinstance(parse_srt(plain, "x.srt"), Failure)
     (tmp_path / "x.srt").write_text(plain)
     with pytest.raises(InputError, match="expected a drone's telemetry"):
-        read_srt(tmp_path / "x.srt")
+        read_telemetry_file(tmp_path / "x.srt")
     (tmp_path / "x.srt").write_text("no cue at all")
     with pytest.raises(InputError, match="expected a drone's telemetry"):
-        read_srt(tmp_path / "x.srt")
+        read_telemetry_file(tmp_path / "x.srt")
     (tmp_path / "x.mp4").touch()
     assert find_beside(tmp_path / "x.mp4") is None
     (tmp_path / "x.SRT").write_text(f"1\n00:00:01,000 --> 00:00:02,000\n{FORMATS['Mavic Mini'][0]}\n")
@@ -190,24 +186,3 @@ def test_a_camera_that_looks_at_the_horizon_has_no_scale() -> None:
     found = estimate_scale(flat)
     assert isinstance(found, Failure)
     assert "tilted by 60°" in found.reason
-
-
-def test_a_clip_with_a_klv_stream_says_so(tmp_path: Path) -> None:
-    """An MPEG-TS as a drone with MISB metadata writes it: the stream has no codec that PyAV opens."""
-    path = tmp_path / "x.ts"
-    with av.open(str(path), "w") as container:
-        video, data = container.add_stream("libx264", rate=25), container.add_data_stream("klv")
-        video.width, video.height, video.pix_fmt = 160, 120, "yuv420p"
-        for number, grey in enumerate(drifting(10, width=160)):
-            frame = av.VideoFrame.from_ndarray(grey, format="gray").reformat(format="yuv420p")
-            frame.time_base, frame.pts = Fraction(1, 25), number
-            container.mux(video.encode(frame))
-            packet = av.Packet(bytes.fromhex("060e2b34020b01010e0103010100000005410102030400"))
-            packet.stream, packet.time_base, packet.pts, packet.dts = data, Fraction(1, 25), number, number
-            container.mux(packet)
-        container.mux(video.encode())
-    found = read_telemetry(path, probe(path, frames=FramesConfig()))
-    assert isinstance(found, Failure)
-    assert "its MISB KLV is not read: write an .SRT from it, or give --gsd-m" in found.reason
-    assert describe(GeoreferenceRecord(telemetry=found.reason)) == [f"metadata: {found.reason}"]
-    assert describe(GeoreferenceRecord(telemetry="x.ts has no subtitles")) == []

@@ -19,7 +19,7 @@ from velfield.sources.labels.detections import read_detections
 from velfield.sources.labels.labels import read_labels
 from velfield.sources.quality import UNUSABLE
 from velfield.sources.source import iter_frames
-from velfield.sources.telemetry.read import read_srt
+from velfield.sources.telemetry.read import read_telemetry_file
 
 _CHECKED_SIDE_PX = 960
 _TRIED_FRAMES = 5
@@ -31,7 +31,7 @@ _READ: dict[str, Callable[[Path, Plan], object]] = {
     "labels": lambda path, plan: read_labels(path, plan.info),
     "detector": lambda path, plan: load_detector(path),
     "detections": lambda path, plan: read_detections(path, plan.info),
-    "telemetry": lambda path, plan: read_srt(path),
+    "telemetry": lambda path, plan: read_telemetry_file(path),
 }
 
 

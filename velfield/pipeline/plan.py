@@ -153,7 +153,7 @@ def make_plan(job: Job) -> Plan:
 
 
 def _with_telemetry(job: Job) -> Job:
-    """The job with the subtitle file beside its video, where none is given."""
+    """The job with the telemetry beside its video, where none is given."""
     beside = find_beside(Path(job.inputs.source)) if job.inputs.telemetry is None else None
     if beside is None:
         return job

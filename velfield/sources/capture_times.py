@@ -7,11 +7,13 @@ from pathlib import Path
 from PIL import ExifTags
 
 from schemas.georeference import FlightStart
-from velfield.errors import InputError
-from velfield.sources.clips import creation_clock, first_clock, subtitle_clock
+from velfield.errors import Failure, InputError
+from velfield.sources.clips import creation_clock, first_clock
 from velfield.sources.frames import SourceInfo
 from velfield.sources.images import read_image_tags
-from velfield.sources.telemetry.read import read_srt
+from velfield.sources.telemetry.find import find_beside
+from velfield.sources.telemetry.read import read_telemetry, read_telemetry_file
+from velfield.sources.telemetry.telemetry import Telemetry
 
 _TAKEN, _FRACTION = 0x9003, 0x9291  # DateTimeOriginal, SubSecTimeOriginal
 _MAX_DISAGREEMENT = 0.1
@@ -43,19 +45,27 @@ def read_flight_start(source: Path, info: SourceInfo, telemetry: Path | None = N
     source, info
         The video, list of clips or folder of images, and its facts.
     telemetry
-        A subtitle file given; its cues count from the first frame.
+        A file of telemetry given; its times count from the first frame.
     """
-    if telemetry is not None and (clock_s := first_clock(read_srt(telemetry))) is not None:
-        return FlightStart(clock_s=clock_s, source=f"subtitles of {telemetry.name}", is_utc=False)
+    if telemetry is not None and (start := _start(read_telemetry_file(telemetry), telemetry)) is not None:
+        return start
     if info.kind == "folder":
         taken = _capture_time(source / info.names[0]) if info.names else None
         return None if taken is None else FlightStart(clock_s=taken[0], source=f"EXIF of {info.names[0]}", is_utc=False)
     clip = Path(info.parts[0][0]) if info.parts else source
     part = info.parts[0][1] if info.parts else info
-    if telemetry is None and (clock_s := subtitle_clock(clip, part)) is not None:
-        return FlightStart(clock_s=clock_s, source=f"subtitles of {clip.name}", is_utc=False)
+    if telemetry is None and (start := _start(read_telemetry(clip, part, find_beside(clip)), clip)) is not None:
+        return start
     created_s = creation_clock(clip, part)
     return None if created_s is None else FlightStart(clock_s=created_s, source=f"header of {clip.name}", is_utc=True)
+
+
+def _start(telemetry: Telemetry | Failure, path: Path) -> FlightStart | None:
+    clock_s = None if isinstance(telemetry, Failure) else first_clock(telemetry)
+    if isinstance(telemetry, Failure) or clock_s is None:
+        return None
+    kind = "MISB KLV" if telemetry.is_utc else "subtitles"
+    return FlightStart(clock_s=clock_s, source=f"{kind} of {path.name}", is_utc=telemetry.is_utc)
 
 
 def _capture_time(path: Path) -> tuple[float, float] | None:

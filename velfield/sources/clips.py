@@ -1,7 +1,7 @@
 """Several clips of one place as one source: one clock from the files' own times, gaps between them as they were.
 
 Their list is a text file, a path a line, with the suffix ``.clips``; `velfield run A.mp4 B.mp4` writes it. A clip's
-start is by the drone's subtitles where all clips have some, else by the containers' creation times; without either they
+start is by the drone's telemetry where all clips have some, else by the containers' creation times; without either they
 follow each other in the order given.
 """
 
@@ -18,7 +18,7 @@ from velfield.errors import Failure, InputError
 from velfield.sources.frames import SourceFrame, SourceInfo, local_path
 from velfield.sources.images import natural_key
 from velfield.sources.telemetry.find import find_beside
-from velfield.sources.telemetry.read import read_srt, read_telemetry
+from velfield.sources.telemetry.read import read_telemetry
 from velfield.sources.telemetry.telemetry import QUANTITIES, Telemetry
 from velfield.sources.video.corruption import libav_log
 from velfield.sources.video.decoding import iter_video
@@ -127,7 +127,7 @@ def _join(parts: tuple[tuple[str, SourceInfo, float], ...], notes: tuple[str, ..
 
 def _starts(clips: Sequence[Path], infos: Sequence[SourceInfo]) -> tuple[FloatArray, tuple[str, ...]]:
     """When each clip began, s on one clock, and a note where that is not known."""
-    for clock in (subtitle_clock, creation_clock):
+    for clock in (telemetry_clock, creation_clock):
         found = [clock(clip, info) for clip, info in zip(clips, infos, strict=True)]
         if all(start is not None for start in found):
             return np.array(found, np.float64), ()
@@ -139,10 +139,9 @@ def _starts(clips: Sequence[Path], infos: Sequence[SourceInfo]) -> tuple[FloatAr
     return np.concatenate([[0.0], np.cumsum(lasts)[:-1]]), (note,)
 
 
-def subtitle_clock(clip: Path, info: SourceInfo) -> float | None:
-    """The camera's clock at a video's first frame by its subtitles, s since 1970 as if it were set to UTC."""
-    beside = find_beside(clip)
-    telemetry = read_srt(beside) if beside is not None else read_telemetry(clip, info)
+def telemetry_clock(clip: Path, info: SourceInfo) -> float | None:
+    """The camera's clock at a video's first frame by its telemetry, s since 1970 as if it were set to UTC."""
+    telemetry = read_telemetry(clip, info, find_beside(clip))
     return None if isinstance(telemetry, Failure) else first_clock(telemetry)
 
 
@@ -178,13 +177,13 @@ def iter_clips(info: SourceInfo, indices: IntArray) -> Iterator[SourceFrame]:
 
 def read_clips_telemetry(info: SourceInfo) -> Telemetry | Failure:
     """The telemetry of all clips on their one clock; a failure where none of them has any."""
-    records, origins, failure = [], [], Failure("no clip has telemetry")
+    records, read, failure = [], list[Telemetry](), Failure("no clip has telemetry")
     for path, part, start_s in info.parts:
         found = read_telemetry(Path(path), part, find_beside(Path(path)))
         if isinstance(found, Failure):
             failure = found
             continue
-        origins.append(found.origin)
+        read.append(found)
         columns = {name: getattr(found, name) for name in QUANTITIES}
         records += [
             (float(found.time_s[k] + start_s), {name: float(values[k]) for name, values in columns.items()})
@@ -192,5 +191,8 @@ def read_clips_telemetry(info: SourceInfo) -> Telemetry | Failure:
         ]
     if not records:
         return failure
-    more = f" and {len(origins) - 1} more" if len(origins) > 1 else ""
-    return Telemetry.from_records(f"{sorted(origins, key=natural_key)[0]}{more}", records)
+    more = f" and {len(read) - 1} more" if len(read) > 1 else ""
+    origin = sorted((telemetry.origin for telemetry in read), key=natural_key)[0]
+    notes = [note for telemetry in read for note in telemetry.notes]
+    height, is_utc = read[0].height, all(telemetry.is_utc for telemetry in read)
+    return Telemetry.from_records(f"{origin}{more}", records, notes, height=height, is_utc=is_utc)

@@ -1,26 +1,30 @@
-"""Find the subtitle file that a drone wrote beside a video."""
+"""Find the file of telemetry that a drone wrote beside a video."""
 
 import re
 from pathlib import Path
 
 from velfield.errors import Failure
+from velfield.sources.telemetry.klv import KLV_KEY, KLV_SUFFIX
 from velfield.sources.telemetry.srt import parse_srt
 
-_HEAD_CHARACTERS = 100_000
+_HEAD_BYTES = 100_000
 
 
 def find_beside(source: Path) -> Path | None:
-    """The subtitle file beside a video, of its name up to the suffix; None where there is none that holds telemetry."""
+    """The subtitles or KLV beside a video, of its name up to the suffix; None where there are none with telemetry."""
     if not source.is_file():
         return None
     name = re.sub(r"([*?\[])", r"[\1]", source.stem)
-    beside = sorted(path for path in source.parent.glob(f"{name}.*") if path.suffix.lower() == ".srt")
+    beside = sorted(path for path in source.parent.glob(f"{name}.*") if path.suffix.lower() in (".srt", KLV_SUFFIX))
     return next((path for path in beside if _holds_telemetry(path)), None)
 
 
 def _holds_telemetry(path: Path) -> bool:
     try:
-        with path.open(encoding="utf-8", errors="replace") as file:
-            return not isinstance(parse_srt(file.read(_HEAD_CHARACTERS), path.name), Failure)
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
     except OSError:
         return False
+    if path.suffix.lower() == KLV_SUFFIX:
+        return KLV_KEY in head
+    return not isinstance(parse_srt(head.decode("utf-8", "replace"), path.name), Failure)

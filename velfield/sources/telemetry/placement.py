@@ -25,9 +25,9 @@ _PHOTO_ASPECT = 1.55
 _CROPPED_DIAGONAL = 1.25
 """Diagonal of a 4:3 sensor over its width; of a 3:2 sensor it is 1.2."""
 _CROP_SD = 0.02
-_FOCAL_SD, _CALIBRATED_FOCAL_SD = 0.007, 0.003
-_HEIGHT_SD, _HEIGHT_SD_M = 0.007, 1.2
-"""Of the barometer: a fraction of the height, and drift with the ground's height against the place of take-off, m."""
+_FOCAL_SD, _CALIBRATED_FOCAL_SD, _ANGLE_OF_VIEW_SD = 0.007, 0.003, 0.01
+_HEIGHT_SD = 0.007
+"""A fraction of the height, beside what its source is off by in metres."""
 _TILT_SD_DEG, _UNKNOWN_TILT_SD_DEG = 1.0, 4.0
 MAX_TILT_DEG = 25.0
 """Tilted further, a frame has no one scale."""
@@ -78,18 +78,24 @@ class FramePoses:
 
     @property
     def focal_px(self) -> FloatArray:
-        """Focal length, px of the raw frame, (n,); the maker's calibration before the equivalent one."""
+        """Focal length, px of the raw frame, (n,); the maker's calibration before angles of view and the equivalent."""
         whole = self.width <= _PHOTO_ASPECT * self.height
         diagonal = np.hypot(self.width, self.height) if whole else _CROPPED_DIAGONAL * self.width
         equivalent = self.telemetry.focal_35mm / _DIAGONAL_35MM * diagonal
         focal = np.where(np.isfinite(self.telemetry.focal_px), self.telemetry.focal_px, equivalent)
-        return focal * np.where(np.isfinite(self.telemetry.zoom), np.maximum(self.telemetry.zoom, 1.0), 1.0)
+        zoomed = focal * np.where(np.isfinite(self.telemetry.zoom), np.maximum(self.telemetry.zoom, 1.0), 1.0)
+        by_width = self.width / 2 / np.tan(np.radians(self.telemetry.hfov_deg / 2))
+        by_height = self.height / 2 / np.tan(np.radians(self.telemetry.vfov_deg / 2))
+        by_view = np.where(np.isfinite(by_width), by_width, by_height)
+        return np.where(np.isfinite(zoomed), zoomed, by_view)
 
     @property
     def focal_sd(self) -> float:
         """Standard deviation of the focal length, as a fraction of it."""
         if np.isfinite(self.telemetry.focal_px).any():
             return _CALIBRATED_FOCAL_SD
+        if not np.isfinite(self.telemetry.focal_35mm).any():
+            return _ANGLE_OF_VIEW_SD
         rounding = 0.29 / float(np.nanmedian(self.telemetry.focal_35mm))
         crop = 0.0 if self.width <= _PHOTO_ASPECT * self.height else _CROP_SD
         return float(np.sqrt(_FOCAL_SD**2 + rounding**2 + crop**2))
@@ -113,14 +119,14 @@ def estimate_scale(poses: FramePoses) -> ScaleEstimate | Failure:
     spread = float(np.std(np.log(gsd_m[usable]))) / np.sqrt(min(int(usable.sum()), 10))
     lean_deg = float(np.hypot(np.median(tilt[usable]), _TILT_SD_DEG if poses.knows_tilt else _UNKNOWN_TILT_SD_DEG))
     lean = 1.5 * np.radians(lean_deg) * np.radians(_TILT_SD_DEG if poses.knows_tilt else _UNKNOWN_TILT_SD_DEG)
-    errors = (_HEIGHT_SD, _HEIGHT_SD_M / above_m, poses.focal_sd, spread, lean)
+    errors = (_HEIGHT_SD, poses.telemetry.height.sd_m / above_m, poses.focal_sd, spread, lean)
     factor = float(np.exp(_Z90 * np.linalg.norm(errors)))
     return ScaleEstimate(
         gsd_m=middle_m,
         low_m=middle_m / factor,
         high_m=middle_m * factor,
         source="metadata",
-        note=f"{poses.telemetry.origin}: {above_m:.1f} m above the place of take-off, "
+        note=f"{poses.telemetry.origin}: {above_m:.1f} m {poses.telemetry.height.above}, "
         f"focal length {float(np.nanmedian(focal_px)):.0f} px",
     )
 

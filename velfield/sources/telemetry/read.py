@@ -1,7 +1,7 @@
-"""Find and read the telemetry of a source: subtitles in the video or beside it, tags of the images."""
+"""Read the telemetry of a source: subtitles or MISB KLV in the video or beside it, tags of the images."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -10,19 +10,19 @@ from velfield.errors import Failure, InputError
 from velfield.sources.frames import SourceInfo, local_path
 from velfield.sources.images import list_images
 from velfield.sources.telemetry.image_tags import read_image_telemetry
+from velfield.sources.telemetry.klv import KLV_KEY, KLV_SUFFIX, NEEDS_KLV, parse_klv
 from velfield.sources.telemetry.srt import parse_srt, telemetry_from_cues
 from velfield.sources.telemetry.telemetry import Telemetry
 from velfield.sources.video.corruption import libav_log
-from velfield.sources.video.packets import iter_packets, open_video
+from velfield.sources.video.packets import iter_packets, open_video, video_stream
 
 MAX_IMAGES = 200
 """Of a folder, so many images' tags are read, evenly spread: a header each."""
-_MAX_BYTES = 256 * 2**20
+_MAX_BYTES, _HEAD_BYTES = 256 * 2**20, 2**16
 NOT_READ = "is not read"
 """In a failure: the source holds telemetry all the same, in a format of `_NOT_READ`."""
+_KLV_NAMES = ("klv", "smpte_klv")
 _NOT_READ = {
-    "klv": "MISB KLV",
-    "smpte_klv": "MISB KLV",
     "djmd": "DJI's binary telemetry (djmd)",
     "gpmd": "GoPro's telemetry (gpmd)",
 }
@@ -38,7 +38,7 @@ def read_telemetry(source: Path, info: SourceInfo, given: Path | None = None) ->
     source, info
         The video or folder of images, and its facts.
     given
-        A subtitle file.
+        A file of subtitles or of MISB KLV.
 
     Raises
     ------
@@ -46,14 +46,14 @@ def read_telemetry(source: Path, info: SourceInfo, given: Path | None = None) ->
         The file given cannot be read or holds no telemetry.
     """
     if given is not None:
-        return read_srt(given)
+        return read_telemetry_file(given)
     if info.kind == "folder":
         return _from_images(source, info)
     return _from_video(source)
 
 
-def read_srt(path: Path) -> Telemetry:
-    """The telemetry in a subtitle file.
+def read_telemetry_file(path: Path) -> Telemetry:
+    """The telemetry in a file of subtitles or, by its suffix ``.klv`` or its key, of MISB KLV.
 
     Raises
     ------
@@ -62,10 +62,14 @@ def read_srt(path: Path) -> Telemetry:
     """
     file = local_path(path, "telemetry")
     if file.stat().st_size > _MAX_BYTES:
-        raise InputError(f"{file.name}: found {file.stat().st_size >> 20} MiB, expected a subtitle file; check it")
-    found = parse_srt(file.read_text(encoding="utf-8", errors="replace"), file.name)
+        raise InputError(f"{file.name}: found {file.stat().st_size >> 20} MiB, expected telemetry; check it")
+    data = file.read_bytes()
+    if file.suffix.lower() == KLV_SUFFIX or KLV_KEY in data[:_HEAD_BYTES]:
+        found = parse_klv(data, file.name)
+    else:
+        found = parse_srt(data.decode("utf-8", "replace"), file.name)
     if isinstance(found, Failure):
-        raise InputError(f"{found.reason}; leave it out, or give the drone's own .SRT")
+        raise InputError(f"{found.reason}; leave it out, or give the drone's own .SRT or .klv")
     return found
 
 
@@ -90,9 +94,12 @@ def _from_video(path: Path) -> Telemetry | Failure:
         container = stack.enter_context(open_video(path))
         unread = [what for stream in container.streams if (what := _unread_format(stream))]
         texts = [stream for stream in container.streams.subtitles if _is_text(stream)]
+        klv = [stream for stream in container.streams.data if _has_format(stream, _KLV_NAMES)]
         found: Telemetry | Failure = Failure("the video has no subtitles, and there is no .SRT beside it")
         if texts:
             found = telemetry_from_cues(_embedded_cues(container, texts[0]), f"the subtitles of {path.name}")
+        elif klv:
+            found = _from_klv(container, klv[0], path)
         place = _place(container)
     if isinstance(found, Telemetry):
         return found
@@ -108,13 +115,32 @@ def _is_text(stream: Any) -> bool:
 
 
 def _unread_format(stream: Any) -> str | None:
+    return next((name for key, name in _NOT_READ.items() if _has_format(stream, (key,))), None)
+
+
+def _has_format(stream: Any, keys: Sequence[str]) -> bool:
+    """Whether the codec, its tag or the handler of a stream has one of these names."""
     tag = str(stream.metadata.get("handler_name", "")).lower()
     codec = stream.codec_context.name if stream.codec_context is not None else getattr(stream, "name", None) or ""
     four = getattr(stream.codec_context, "codec_tag", "") if stream.codec_context is not None else ""
-    for key, name in _NOT_READ.items():
-        if key in (codec, str(four).lower()) or key in tag:
-            return name
-    return None
+    return any(key in (codec, str(four).lower()) or key in tag for key in keys)
+
+
+def _from_klv(container: Any, stream: Any, path: Path) -> Telemetry | Failure:
+    """By the time stamps of the stream's packets: a set may begin in one and end in the next."""
+    parts, times_s, size = [], dict[int, float](), 0
+    for packet, _ in iter_packets(container, stream):
+        stamp = packet.pts if packet.pts is not None else packet.dts
+        if packet.size and stamp is not None and size < _MAX_BYTES:
+            parts.append(bytes(packet))
+            times_s[size] = float(stamp * packet.time_base)
+            size += packet.size
+    video, origin = video_stream(container, path), f"the MISB KLV of {path.name}"
+    first_s = float((video.start_time or 0) * video.time_base)  # an MPEG-TS does not begin at 0
+    try:
+        return parse_klv(b"".join(parts), origin, {at: time_s - first_s for at, time_s in times_s.items()})
+    except InputError:
+        return Failure(f"{origin} {NOT_READ}: it {NEEDS_KLV}, or give --gsd-m")
 
 
 def _embedded_cues(container: Any, stream: Any) -> Iterator[tuple[float, str]]:

@@ -19,11 +19,27 @@ QUANTITIES = (
     "roll_deg",
     "focal_35mm",
     "focal_px",
+    "hfov_deg",
+    "vfov_deg",
     "zoom",
     "clock_s",
 )
 """What a record may hold; `Telemetry` says what each is."""
 _ANGLES = ("yaw_deg", "roll_deg")
+
+
+@dataclass(frozen=True)
+class HeightSource:
+    """What heights are above, for people, and their standard deviation, m."""
+
+    above: str
+    sd_m: float
+
+
+ABOVE_TAKE_OFF = HeightSource("above the place of take-off", 1.2)
+"""By barometer: it drifts, and the ground is elsewhere not as high as at the place of take-off."""
+ABOVE_GROUND = HeightSource("above the ground", 5.0)
+"""By satellites, less the elevation of a terrain model at the middle of the picture, or by a range."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +55,7 @@ class Telemetry:
     latitude_deg, longitude_deg
         Of the camera, WGS 84.
     height_m
-        Above the place of take-off, by barometer.
+        As ``height`` says.
     altitude_m
         Above the sea or the ellipsoid: not comparable with the ground, whose altitude is not known.
     yaw_deg
@@ -50,12 +66,18 @@ class Telemetry:
         Focal length that gives the same diagonal angle of view on 36 mm x 24 mm, mm, before digital zoom.
     focal_px
         Focal length, px of the picture; by the maker's calibration.
+    hfov_deg, vfov_deg
+        Angle of view of the picture's width and of its height, at the zoom that there was.
     zoom
         Digital zoom.
     clock_s
-        The camera's clock, s since 1970 as if it were set to UTC; it mostly shows local time.
+        The camera's clock, s since 1970 as if it were set to UTC; it shows local time unless ``is_utc``.
     notes
         One line each: what could not be read.
+    height
+        What ``height_m`` is above.
+    is_utc
+        Whether the clock shows UTC.
     """
 
     origin: str
@@ -69,24 +91,35 @@ class Telemetry:
     roll_deg: FloatArray
     focal_35mm: FloatArray
     focal_px: FloatArray
+    hfov_deg: FloatArray
+    vfov_deg: FloatArray
     zoom: FloatArray
     clock_s: FloatArray
     notes: tuple[str, ...] = ()
+    height: HeightSource = ABOVE_TAKE_OFF
+    is_utc: bool = False
 
     @classmethod
     def from_records(
-        cls, origin: str, records: Sequence[tuple[float, Mapping[str, float]]], notes: Sequence[str] = ()
+        cls,
+        origin: str,
+        records: Sequence[tuple[float, Mapping[str, float]]],
+        notes: Sequence[str] = (),
+        *,
+        height: HeightSource = ABOVE_TAKE_OFF,
+        is_utc: bool = False,
     ) -> "Telemetry":
         """From (time in s, quantities) pairs, in any order."""
         ordered = sorted(records, key=lambda record: record[0])
         columns = {name: np.array([one.get(name, np.nan) for _, one in ordered], np.float64) for name in QUANTITIES}
-        return cls(origin, np.array([time_s for time_s, _ in ordered], np.float64), notes=tuple(notes), **columns)
+        times_s = np.array([time_s for time_s, _ in ordered], np.float64)
+        return cls(origin, times_s, notes=tuple(notes), height=height, is_utc=is_utc, **columns)
 
     def at(self, times_s: FloatArray) -> "Telemetry":
         """The telemetry at other times (m,), s from the source's first frame, interpolated between records."""
         at_s = np.asarray(times_s, np.float64)
         columns = {name: self._interpolate(name, at_s) for name in QUANTITIES}
-        return Telemetry(self.origin, at_s, notes=self.notes, **columns)
+        return Telemetry(self.origin, at_s, notes=self.notes, height=self.height, is_utc=self.is_utc, **columns)
 
     def _interpolate(self, name: str, times_s: FloatArray) -> FloatArray:
         values = getattr(self, name)
