@@ -1,4 +1,5 @@
-"""How soon a run's page stands, and answers: five first views with nothing cached, and twelve clicks of each visit.
+"""How soon a run's page stands, and answers: five first views with nothing cached, twelve clicks of each visit, and
+each table of the analysis, where the run has one.
 
 python -m tests.benchmarks.viewer RUN
 """
@@ -33,6 +34,10 @@ def main(root: Path) -> None:
         print(f"click: median {median([*first, *later]):.0f} ms of {len(first) + len(later)}")
         late = np.quantile(later, 0.9)
         print(f"  first of a visit {median(first):.0f} ms; later ones {median(later):.0f} ms, their p90 {late:.0f} ms")
+        if (root / "analysis" / "analysis.json").is_file():
+            opened, tables = _tables(running, address)
+            print(f"analysis: opened {median(opened):.0f} ms, worst {max(opened):.0f} ms")
+            print(f"  a table {median(tables.values()):.0f} ms; worst {max(tables.values()):.0f} ms of {len(tables)}")
 
 
 def _first_view(running: Browser, address: str) -> float:
@@ -65,6 +70,28 @@ def _clicks(running: Browser, address: str, root: Path) -> tuple[list[float], li
             first.append(taken[0])
             later += taken[1:]
     return first, later
+
+
+def _tables(running: Browser, address: str) -> tuple[list[float], dict[str, float]]:
+    """Milliseconds until the analysis is shown, of each visit; and of each of its tables, by title, the slowest."""
+    opened: list[float] = []
+    tables: dict[str, float] = {}
+    taken = "document.getElementById('analysis-content').dataset.milliseconds"
+    with running.page() as page:
+        for _ in range(_VISITS):
+            page.open("about:blank")
+            page.open(f"{address}#tab=analysis")
+            page.wait(f"{taken} !== undefined")
+            opened.append(float(page.value(taken)))
+            titles = page.value("[...document.querySelectorAll('#table option')].map((each) => each.textContent)")
+            for k, title in enumerate(titles):
+                page.value(
+                    f"delete {taken}; choice = document.getElementById('table'); "
+                    f"choice.value = '{k}'; choice.dispatchEvent(new Event('change'))"
+                )
+                page.wait(f"{taken} !== undefined")
+                tables[title] = max(tables.get(title, 0.0), float(page.value(taken)))
+    return opened, tables
 
 
 if __name__ == "__main__":
