@@ -20,6 +20,7 @@ from velfield.run.stores import THUMBNAIL_SHAPE, FrameStore, create_frames, open
 from velfield.sources.quality import (
     UNUSABLE,
     FrameFlag,
+    describe_flags,
     describe_light,
     find_cuts,
     flag_blurred,
@@ -32,9 +33,18 @@ _OVERLAP = 5
 _CHUNK = 4096
 """Thumbnails in memory at a time."""
 
+_FEWEST_USABLE = 3
+"""Frames of a tracklet."""
+
 
 def flag_frames(plan: Plan) -> StageResult:
-    """Write the column ``flags`` of ``frames.zarr``: defects from decoding, and frames unlike their neighbours."""
+    """Write the column ``flags`` of ``frames.zarr``: defects from decoding, and frames unlike their neighbours.
+
+    Raises
+    ------
+    InputError
+        Fewer than three frames are without a fault.
+    """
     store = open_frames(plan.layout.frames, "r+")
     flags = store.column("decoding_flags")
     tested = np.flatnonzero((flags & int(UNUSABLE)) == 0)
@@ -47,6 +57,14 @@ def flag_frames(plan: Plan) -> StageResult:
     warnings += [f"frame {k} ({times_s[k]:.3f} s) is unlike the frames around it: it is left out" for k in outliers]
     warnings += _describe_footage(store, np.flatnonzero((flags & int(UNUSABLE)) == 0))
     usable = int(np.sum((flags & int(UNUSABLE)) == 0))
+    if usable < _FEWEST_USABLE:
+        kinds = {flag: int(np.sum((flags & int(flag)) > 0)) for flag in UNUSABLE}
+        listed = ", ".join(f"{count} {describe_flags(int(flag))}" for flag, count in kinds.items() if count)
+        raise InputError(
+            f"{plan.job.inputs.source}: found {usable} frames without a fault of {len(flags)} "
+            f"({listed}), expected {_FEWEST_USABLE} or more; "
+            "copy the recording from the camera again, or give another part of it with --start-s and --stop-s"
+        )
     advance("quality")
     counts = {"usable": usable, "flagged": len(flags) - usable, "blurred": len(blurred), "outliers": len(outliers)}
     return StageResult([store.write_flags(flags)], {name: float(count) for name, count in counts.items()}, [], warnings)
