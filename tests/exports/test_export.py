@@ -53,8 +53,16 @@ def test_a_stac_item_lists_files_that_exist(run: Run, tmp_path: Path) -> None:
 
 
 def test_stac_needs_the_start_of_the_flight(run: Run, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--start"):
+    with pytest.raises(InputError, match=r"found no start, expected .*; give --start"):
+        export_run(georeferenced(run), "stac", tmp_path / "item.json")
+
+
+def test_stac_names_all_that_is_missing_at_once(run: Run, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no start and no place on Earth, .* --start .* and .* `velfield geor"):
         export_run(run, "stac", tmp_path / "item.json")
+    start = ExportOptions(start=datetime(2024, 5, 1, tzinfo=UTC))
+    with pytest.raises(InputError, match=r"found no place on Earth, .*; put the map there"):
+        export_run(run, "stac", tmp_path / "item.json", start)
 
 
 @pytest.mark.parametrize(

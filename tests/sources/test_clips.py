@@ -9,6 +9,7 @@ import av
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from schemas.flight import FramesConfig
 from tests.media import drifting
@@ -127,3 +128,43 @@ def test_a_flight_of_images_starts_by_the_first_ones_exif(tmp_path: Path) -> Non
     start = read_flight_start(tmp_path, probe(tmp_path, frames=FramesConfig(fps=5)))
     assert start is not None
     assert (start.time, start.source, start.is_utc) == (datetime(2024, 5, 1, 12, tzinfo=UTC), "EXIF of 000.jpg", False)
+
+
+def png_chunks(path: Path) -> list[bytes]:
+    data, chunks, at = path.read_bytes(), [], 8
+    while at < len(data):
+        size = 12 + int.from_bytes(data[at : at + 4])
+        chunks.append(data[at : at + size])
+        at += size
+    return chunks
+
+
+@pytest.mark.parametrize("tags", ["EXIF", "EXIF behind the pixels", "XMP", "XMP behind the pixels"])
+def test_a_flight_of_pngs_starts_by_their_tags(tags: str, tmp_path: Path) -> None:
+    """ExifTool writes them behind the pixels, other programs before."""
+    exif, info = Image.Exif(), PngInfo()
+    if tags.startswith("EXIF"):
+        exif[0x010F] = "maker"
+        exif.get_ifd(0x8769).update({0x9003: "2024:05:01 12:00:00", 0x9291: "25"})
+    else:
+        info.add_itxt("XML:com.adobe.xmp", '<rdf:Description exif:DateTimeOriginal="2024-05-01T12:00:00.25+02:00"/>')
+    for name in ("000.png", "001.png"):
+        Image.new("L", (64, 48), 90).save(tmp_path / name, exif=exif, pnginfo=info)
+        if "behind" in tags:
+            chunks = sorted(png_chunks(tmp_path / name), key=lambda chunk: chunk[4:8] in (b"eXIf", b"iTXt", b"IEND"))
+            ordered = sorted(chunks, key=lambda chunk: chunk[4:8] == b"IEND")
+            assert [chunk[4:8] for chunk in ordered][1] == b"IDAT"
+            (tmp_path / name).write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(ordered))
+    start = read_flight_start(tmp_path, probe(tmp_path, frames=FramesConfig(fps=5)))
+    assert start is not None
+    assert start.time == datetime(2024, 5, 1, 12, 0, 0, 250_000, tzinfo=UTC)
+    assert start.source == f"{tags[:4].strip()} of 000.png"
+
+
+def test_a_png_whose_tags_are_damaged_has_no_start(tmp_path: Path) -> None:
+    for name in ("000.png", "001.png"):
+        Image.new("L", (64, 48), 90).save(tmp_path / name)
+        *chunks, end = png_chunks(tmp_path / name)
+        chunks += [(3).to_bytes(4) + b"eXIf" + b"MM\0" + bytes(4), (2**31).to_bytes(4) + b"iTXt" + b"XML"]
+        (tmp_path / name).write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks) + end)
+    assert read_flight_start(tmp_path, probe(tmp_path, frames=FramesConfig(fps=5))) is None

@@ -14,6 +14,7 @@ from tests.media import drifting, write_video
 from velfield.errors import Failure, InputError
 from velfield.sources.source import probe
 from velfield.sources.telemetry.find import find_beside
+from velfield.sources.telemetry.image_tags import parse_xmp
 from velfield.sources.telemetry.placement import (
     FramePoses,
     estimate_north,
@@ -139,6 +140,66 @@ def test_tags_of_images_are_read(tmp_path: Path) -> None:
     assert found.height_m == pytest.approx([80.2] * 3)
     assert found.focal_35mm == pytest.approx([24.0] * 3)
     assert found.yaw_deg == pytest.approx([30.5] * 3)
+
+
+XMP = {
+    # As developer.parrot.com lists them for ANAFI Ai: elements, a height as a fraction, Pix4D's angles beside its own.
+    "Parrot": (
+        '<rdf:Description rdf:about="" xmlns:drone-parrot="http://www.parrot.com/drone-parrot/1.0/" '
+        'xmlns:Camera="http://pix4d.com/camera/1.0"><Camera:Roll>-0.041258</Camera:Roll>'
+        "<Camera:Pitch>3.011101</Camera:Pitch><Camera:Yaw>146.781036</Camera:Yaw>"
+        "<Camera:AboveGroundAltitude>11485529/262144</Camera:AboveGroundAltitude>"
+        "<drone-parrot:CameraRollDegree>0.0</drone-parrot:CameraRollDegree>"
+        "<drone-parrot:CameraPitchDegree>-86.988888</drone-parrot:CameraPitchDegree>"
+        "<drone-parrot:CameraYawDegree>146.848038</drone-parrot:CameraYawDegree></rdf:Description>",
+        {"height_m": 11485529 / 262144, "pitch_deg": -86.988888, "yaw_deg": 146.848038, "roll_deg": 0.0},
+    ),
+    # Skydio 2 and X2: attributes of a structure, beside the same structure of the vehicle and in other axes.
+    "Skydio X2": (
+        '<rdf:Description drone-skydio:Latitude="52.5" drone-skydio:Longitude="13.4" '
+        'drone-skydio:AbsoluteAltitude="1034.441910" drone-skydio:RelativeAltitude="61.5" '
+        'drone-skydio:CalibratedFocalLengthX="2376.5625" drone-skydio:CalibratedFocalLengthY="2376.5625">'
+        '<drone-skydio:VehicleOrientationNED drone-skydio:Roll="1.0" drone-skydio:Pitch="2.0" drone-skydio:Yaw="3.0"/>'
+        '<drone-skydio:CameraOrientationFLU drone-skydio:Roll="4.0" drone-skydio:Pitch="87" drone-skydio:Yaw="6.0"/>'
+        '<drone-skydio:CameraOrientationNED drone-skydio:Roll="0.0" drone-skydio:Pitch="-87.468572" '
+        'drone-skydio:Yaw="127.444323"/></rdf:Description>',
+        HERE
+        | {"height_m": 61.5, "focal_px": 2376.5625}
+        | {"pitch_deg": -87.468572, "yaw_deg": 127.444323, "roll_deg": 0.0},
+    ),
+    "Skydio X10": (
+        "<drone-skydio:Latitude>52.5</drone-skydio:Latitude><drone-skydio:Longitude>13.4</drone-skydio:Longitude>"
+        '<drone-skydio:CameraOrientationFLU rdf:parseType="Resource"><drone-skydio:Yaw>9</drone-skydio:Yaw>'
+        "</drone-skydio:CameraOrientationFLU>"
+        '<drone-skydio:CameraOrientationNED rdf:parseType="Resource"><drone-skydio:Roll>0.0</drone-skydio:Roll>'
+        "<drone-skydio:Pitch>-80.5</drone-skydio:Pitch><drone-skydio:Yaw>-12.5</drone-skydio:Yaw>"
+        "</drone-skydio:CameraOrientationNED>",
+        HERE | {"pitch_deg": -80.5, "yaw_deg": -12.5, "roll_deg": 0.0},
+    ),
+    "Autel of old": (
+        '<rdf:Description Camera:Yaw="30" Camera:Pitch="2.5" Camera:Roll="0"/>',
+        {"pitch_deg": -87.5, "yaw_deg": 30.0, "roll_deg": 0.0},
+    ),
+    # Straight down yaw and roll turn about one axis: 100 and 50 are as 150 and 0, and DJI's roll of 180 turns about.
+    "straight down": (
+        ' drone-parrot:CameraYawDegree="100" drone-parrot:CameraPitchDegree="-90" drone-parrot:CameraRollDegree="50"',
+        {"pitch_deg": -90.0, "yaw_deg": 150.0},
+    ),
+    "DJI upside down": (
+        'drone-dji:GimbalYawDegree="+30.0" drone-dji:GimbalPitchDegree="-90.00" drone-dji:GimbalRollDegree="+180.00"',
+        {"pitch_deg": -90.0, "yaw_deg": -150.0, "roll_deg": 0.0},
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "expected"), XMP.values(), ids=list(XMP))
+def test_xmp_of_every_maker_is_read(text: str, expected: dict[str, float]) -> None:
+    found = parse_xmp(text)
+    assert {name: found.get(name) for name in expected} == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_fraction_over_zero_is_not_known() -> None:
+    assert "height_m" not in parse_xmp("<Camera:AboveGroundAltitude>5/0</Camera:AboveGroundAltitude>")
 
 
 def simulated_poses(seed: int) -> tuple[SimulationConfig, FramePoses]:

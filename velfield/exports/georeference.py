@@ -54,7 +54,7 @@ class Georeference:
         if self.crs_wkt is None or self.affine is None:
             raise InputError(
                 "found a run whose base image has no reference system, expected one for this format; "
-                "run with --base GEOTIFF, or export a format in pixels"
+                "run `velfield georeference RUN`, or with --base GEOTIFF, or export a format in pixels"
             )
         a, b, c, d, e, f = self.affine
         column, row = xy_px[:, 0] + 0.5, xy_px[:, 1] + 0.5  # our origin is a pixel's centre, theirs its corner

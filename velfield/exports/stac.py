@@ -34,8 +34,15 @@ def encode(run: Run, path: Path, options: ExportOptions) -> bytes:
     """See `velfield.exports.export.ExportModule`."""
     layout, times_s, recorded = run.layout, run.times_s, run.start
     start = options.start or (recorded.time if recorded is not None else None)
-    if start is None:
-        raise InputError("--format stac: found no start, expected the flight's; give --start 2024-05-01T12:00:00Z")
+    georeference = Georeference.from_grid(run.grid)
+    missing = {
+        "start": None if start else "give --start 2024-05-01T12:00:00Z",
+        "place on Earth": None if georeference.has_crs else "put the map there by `velfield georeference RUN`",
+    }
+    remedies = {what: remedy for what, remedy in missing.items() if remedy}
+    if start is None or remedies:
+        lacking, remedy = " and no ".join(remedies), " and ".join(remedies.values())
+        raise InputError(f"--format stac: found no {lacking}, expected the flight's; {remedy}")
     properties: dict[str, object] = {"velfield:version": run.record.code_version, "velfield:frames": run.frames.count}
     if options.start is None and recorded is not None:
         zone = "" if recorded.is_utc else "; the camera's clock, whose time zone is not known, taken as UTC"
@@ -43,7 +50,7 @@ def encode(run: Run, path: Path, options: ExportOptions) -> bytes:
     files = [file for file in (*sorted(layout.maps.glob("*.tif")), layout.field, layout.report) if file.exists()]
     item = stac_item(
         layout.root.resolve().name,
-        Georeference.from_grid(run.grid),
+        georeference,
         {file.stem: _href(file, path.parent) for file in files},
         start=start,
         duration_s=float(times_s[-1] - times_s[0]),

@@ -1,8 +1,10 @@
 """Times that the camera wrote: when a flight began, and a frame rate that the user gives against those of images."""
 
+import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 from PIL import ExifTags
 
@@ -16,6 +18,10 @@ from velfield.sources.telemetry.read import read_telemetry, read_telemetry_file
 from velfield.sources.telemetry.telemetry import Telemetry
 
 _TAKEN, _FRACTION = 0x9003, 0x9291  # DateTimeOriginal, SubSecTimeOriginal
+_XMP_TIME = re.compile(
+    rb"""(?:exif:DateTimeOriginal|xmp:CreateDate)\s*(?:=\s*["']|>)\s*(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d)(?:\.(\d+))?"""
+)
+"""Its zone is left out: the clock counts as EXIF's does, as the camera shows it."""
 _MAX_DISAGREEMENT = 0.1
 """Relative to the duration, beside the clock's resolution at both ends."""
 
@@ -25,7 +31,7 @@ def describe_rate(folder: Path, names: Sequence[str], fps: float) -> tuple[str, 
     ends = [_capture_time(folder / name) for name in (names[0], names[-1])]
     if ends[0] is None or ends[1] is None:
         return ()
-    taken_s, resolution_s = ends[1][0] - ends[0][0], ends[0][1] + ends[1][1]
+    taken_s, resolution_s = ends[1].clock_s - ends[0].clock_s, ends[0].resolution_s + ends[1].resolution_s
     expected_s = (len(names) - 1) / fps
     if taken_s <= 0 or abs(taken_s - expected_s) <= resolution_s + _MAX_DISAGREEMENT * taken_s:
         return ()
@@ -51,7 +57,9 @@ def read_flight_start(source: Path, info: SourceInfo, telemetry: Path | None = N
         return start
     if info.kind == "folder":
         taken = _capture_time(source / info.names[0]) if info.names else None
-        return None if taken is None else FlightStart(clock_s=taken[0], source=f"EXIF of {info.names[0]}", is_utc=False)
+        if taken is None:
+            return None
+        return FlightStart(clock_s=taken.clock_s, source=f"{taken.kind} of {info.names[0]}", is_utc=False)
     clip = Path(info.parts[0][0]) if info.parts else source
     part = info.parts[0][1] if info.parts else info
     if telemetry is None and (start := _start(read_telemetry(clip, part, find_beside(clip)), clip)) is not None:
@@ -68,13 +76,29 @@ def _start(telemetry: Telemetry | Failure, path: Path) -> FlightStart | None:
     return FlightStart(clock_s=clock_s, source=f"{kind} of {path.name}", is_utc=telemetry.is_utc)
 
 
-def _capture_time(path: Path) -> tuple[float, float] | None:
-    """Time of exposure by EXIF, s, and its resolution; None where it is not there."""
+class _CaptureTime(NamedTuple):
+    """Time of exposure, its resolution, and which tags it is by."""
+
+    clock_s: float
+    resolution_s: float
+    kind: str
+
+
+def _capture_time(path: Path) -> _CaptureTime | None:
+    """By EXIF, else XMP; None where neither has it."""
     try:
-        tags = read_image_tags(path)[0].get_ifd(ExifTags.IFD.Exif)
-        taken = datetime.strptime(str(tags[_TAKEN]).strip("\0 "), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
-    except (InputError, KeyError, ValueError):
+        exif, xmp = read_image_tags(path)
+    except InputError:
         return None
-    digits = str(tags.get(_FRACTION, "")).strip("\0 ")
+    tags = exif.get_ifd(ExifTags.IFD.Exif)
+    text, digits = str(tags.get(_TAKEN, "")).strip("\0 "), str(tags.get(_FRACTION, "")).strip("\0 ")
+    written = _XMP_TIME.search(xmp)
+    kind = "EXIF" if text or not written else "XMP"
+    if not text and written:
+        text, digits = (part.decode() for part in written.groups(default=b""))
+    try:
+        taken = datetime.strptime(text.replace("-", ":").replace("T", " "), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
+    except ValueError:
+        return None
     fraction = float(f"0.{digits}") if digits.isdecimal() else 0.0
-    return taken.timestamp() + fraction, 10.0 ** -len(digits) if digits.isdecimal() else 1.0
+    return _CaptureTime(taken.timestamp() + fraction, 10.0 ** -len(digits) if digits.isdecimal() else 1.0, kind)

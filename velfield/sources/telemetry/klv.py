@@ -12,8 +12,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from schemas.arrays import FloatArray
 from velfield.errors import Failure, InputError
+from velfield.sources.telemetry.attitude import camera_angles, rotation_to_ned
 from velfield.sources.telemetry.telemetry import ABOVE_GROUND, Telemetry
 
 KLV_KEY = bytes.fromhex("060e2b34020b01010e01030101000000")
@@ -119,24 +119,9 @@ _POSITION = {_LATITUDE: "latitude_deg", _LONGITUDE: "longitude_deg"}
 
 
 def _attitude(tags: Mapping[int, float]) -> dict[str, float]:
-    """Yaw, pitch and roll of the camera as a gimbal that looks down reports them; of sensors without an axis of roll
-    that angle is 0."""
+    """The camera's angles; of sensors without an axis of roll that angle is 0."""
     pitch, roll = tags.get(_PITCH, tags.get(_FULL_PITCH)), tags.get(_ROLL, tags.get(_FULL_ROLL))
     if pitch is None or roll is None or not {_HEADING, _AZIMUTH, _ELEVATION} <= set(tags):
         return {}
-    platform = _rotation(tags[_HEADING], pitch, roll)
-    axis, right, down = (platform @ _rotation(tags[_AZIMUTH], tags[_ELEVATION], tags.get(_SENSOR_ROLL, 0.0))).T
-    return {
-        "yaw_deg": float(np.degrees(np.arctan2(right[1], right[0])) - 90.0),
-        "pitch_deg": float(np.degrees(np.arctan2(down[2], axis[2])) - 90.0),
-        "roll_deg": float(np.degrees(np.arctan2(right[2], axis[2]))),
-    }
-
-
-def _rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> FloatArray:
-    """The matrix (3, 3) from forward, right, down of a body to north, east, down: roll, then pitch, then yaw."""
-    y, p, r = np.radians([yaw_deg, pitch_deg, roll_deg])
-    about_down = np.array([[np.cos(y), -np.sin(y), 0], [np.sin(y), np.cos(y), 0], [0, 0, 1]])
-    about_right = np.array([[np.cos(p), 0, np.sin(p)], [0, 1, 0], [-np.sin(p), 0, np.cos(p)]])
-    about_forward = np.array([[1, 0, 0], [0, np.cos(r), -np.sin(r)], [0, np.sin(r), np.cos(r)]])
-    return np.asarray(about_down @ about_right @ about_forward)
+    platform = rotation_to_ned(tags[_HEADING], pitch, roll)
+    return camera_angles(platform @ rotation_to_ned(tags[_AZIMUTH], tags[_ELEVATION], tags.get(_SENSOR_ROLL, 0.0)))
