@@ -74,6 +74,8 @@ class ViewReplay(Model):
     """Unit of a stored position."""
     states: tuple[str, ...]
     """Names of the vehicles' states, by their number."""
+    classes: tuple[str, ...] = ()
+    """Names of the vehicles' classes, by their number less one."""
 
 
 class ViewFlow(Model):

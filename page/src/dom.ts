@@ -38,6 +38,19 @@ export function grid(head: string[], rows: Child[][]): HTMLTableElement {
   );
 }
 
+/** Keys pressed on a map that has the focus; its middle, where they act, is marked as long as no pointer is used. */
+export function listenToKeys(container: HTMLElement, acts: Record<string, () => void>): void {
+  container.addEventListener("pointerdown", () => container.classList.remove("by-keyboard"));
+  container.addEventListener("keydown", (event) => {
+    if (event.target !== container) return;
+    container.classList.add("by-keyboard");
+    const act = acts[event.key];
+    if (act === undefined) return;
+    act();
+    event.preventDefault();
+  });
+}
+
 export interface Surface {
   canvas: HTMLCanvasElement;
   context: CanvasRenderingContext2D;

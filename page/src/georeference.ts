@@ -4,7 +4,7 @@ import "leaflet/dist/leaflet.css";
 import "./viewer.css";
 import L from "leaflet";
 import { toPoint, type Point } from "./coordinates";
-import { find, make } from "./dom";
+import { find, listenToKeys, make } from "./dom";
 import { ReferencePane, type Place, type ReferenceMap } from "./reference";
 import { clamp, imageMap, inside, placed, post, served, showImage, type Served } from "./editor";
 
@@ -259,15 +259,7 @@ class Georeferencer {
     this.order.addEventListener("change", () => this.changed());
     this.epsg.addEventListener("input", () => this.changed());
     this.save.addEventListener("click", () => void this.saveAll());
-    const container = this.map.getContainer();
-    container.addEventListener("pointerdown", () => container.classList.remove("by-keyboard"));
-    container.addEventListener("keydown", (event) => {
-      if (event.target !== container) return;
-      container.classList.add("by-keyboard"); // shows the middle
-      if (event.key !== "Enter") return;
-      this.mark(toPoint(this.map.getCenter()));
-      event.preventDefault();
-    });
+    listenToKeys(this.map.getContainer(), { Enter: () => this.mark(toPoint(this.map.getCenter())) });
   }
 
   private mark(at: Point): void {

@@ -72,6 +72,16 @@ const STATES: Record<string, string> = {
   parked: "parked, or no vehicle",
 };
 
+/** Class and length; nothing where the vehicle was not measured. */
+function classText({ measured }: Seen): [string, string][] {
+  if (measured === null) return [];
+  const { kind, percent, length_m } = measured;
+  return [
+    ["Class", `${kind} (${percent} %)`],
+    ["Length", `${length_m.toFixed(1)} m`],
+  ];
+}
+
 /** The answer of a vehicle at the present time of the replay. */
 export function showVehicle(seen: Seen, units: Units): HTMLElement {
   const speed = Math.hypot(seen.vx, seen.vy);
@@ -86,7 +96,8 @@ export function showVehicle(seen: Seen, units: Units): HTMLElement {
     pairs([
       ["Speed now", value],
       ["Direction", heading],
-      ["Kind", STATES[seen.state] ?? seen.state],
+      ...classText(seen),
+      ["State", STATES[seen.state] ?? seen.state],
       ["Pixel", `(${Math.round(seen.x)}, ${Math.round(seen.y)})`],
     ]),
     make("p", { class: "note" }, seen.gap ? "Not detected at this moment: the position is interpolated." : "Speed over one second."),

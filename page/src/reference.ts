@@ -1,7 +1,7 @@
 // A map of the user's own beside the run's picture: web map tiles, of a file through our server or of a tile server.
 
 import L from "leaflet";
-import { find } from "./dom";
+import { find, listenToKeys } from "./dom";
 
 /** Longitude and latitude, degrees. */
 export type Place = [number, number];
@@ -97,15 +97,7 @@ export class ReferencePane {
 
   private listen(): void {
     this.map.on("click", (event) => this.choose(toPlace(event.latlng)));
-    const container = this.map.getContainer();
-    container.addEventListener("pointerdown", () => container.classList.remove("by-keyboard"));
-    container.addEventListener("keydown", (event) => {
-      if (event.target !== container) return;
-      container.classList.add("by-keyboard"); // shows the middle
-      if (event.key !== "Enter") return;
-      this.choose(toPlace(this.map.getCenter()));
-      event.preventDefault();
-    });
+    listenToKeys(this.map.getContainer(), { Enter: () => this.choose(toPlace(this.map.getCenter())) });
   }
 }
 

@@ -26,6 +26,11 @@ interface Chunk {
   state: Uint8Array;
   axis: Uint8Array;
   gap: Uint8Array;
+  /** Number of the class from 1, 0 where it was not measured. */
+  kind: Uint8Array;
+  percent: Uint8Array;
+  /** Tenths of a metre, 0 where it is not known. */
+  length: Uint8Array;
 }
 
 /** A vehicle at a time. */
@@ -39,6 +44,7 @@ export interface Seen {
   /** Nothing was seen of it: the position is interpolated. */
   gap: boolean;
   axis: number;
+  measured: { kind: string; percent: number; length_m: number } | null;
 }
 
 function parse(data: ArrayBuffer): Chunk {
@@ -49,6 +55,8 @@ function parse(data: ArrayBuffer): Chunk {
     at += length * size;
     return taken;
   };
+  // Files of an earlier release end before.
+  const takeMeasured = (): Uint8Array => (at < data.byteLength ? take(Uint8Array, n, 1) : new Uint8Array(n));
   const vehicle = take(Uint32Array, n, 4);
   const first = new Uint32Array(n + 1);
   first.set(take(Uint32Array, n, 4));
@@ -62,6 +70,9 @@ function parse(data: ArrayBuffer): Chunk {
     state: take(Uint8Array, n, 1),
     axis: take(Uint8Array, n, 1),
     gap: take(Uint8Array, m, 1),
+    kind: takeMeasured(),
+    percent: takeMeasured(),
+    length: takeMeasured(),
   };
 }
 
@@ -169,7 +180,13 @@ export class Replay implements Painter {
     const span = Math.max(to - from, 1e-6);
     const state = this.run.replay.states[chunk.state[v]!]!;
     const axis = ((chunk.axis[v]! + 0.5) * Math.PI) / 256;
-    return { vehicle: chunk.vehicle[v]!, x, y, vx: (x1 - x0) / span, vy: (y1 - y0) / span, state, gap: chunk.gap[k] === 1, axis };
+    const [vx, vy] = [(x1 - x0) / span, (y1 - y0) / span];
+    return { vehicle: chunk.vehicle[v]!, x, y, vx, vy, state, gap: chunk.gap[k] === 1, axis, measured: this.measured(chunk, v) };
+  }
+
+  private measured({ kind, percent, length }: Chunk, v: number): Seen["measured"] {
+    const name = this.run.replay.classes[kind[v]! - 1];
+    return name === undefined ? null : { kind: name, percent: percent[v]!, length_m: length[v]! / 10 };
   }
 
   /** Where it is at a time, from position k to the next. */
@@ -182,9 +199,10 @@ export class Replay implements Painter {
 
   private draw(context: CanvasRenderingContext2D, view: View, vehicles: Seen[], painted: Blocks): void {
     const { scale, left, top, width, height } = view;
-    const length = Math.max(MIN_SCREEN_PX, scale * (this.run.gsd_m === null ? UNKNOWN_LENGTH_PX : LENGTH_M / this.run.gsd_m));
-    const wide = (length * WIDTH_M) / LENGTH_M;
+    const ofCar = Math.max(MIN_SCREEN_PX, scale * (this.run.gsd_m === null ? UNKNOWN_LENGTH_PX : LENGTH_M / this.run.gsd_m));
+    const wide = (ofCar * WIDTH_M) / LENGTH_M;
     for (const seen of vehicles) {
+      const length = seen.measured === null ? ofCar : (ofCar * Math.max(seen.measured.length_m, 2 * WIDTH_M)) / LENGTH_M;
       const [x, y] = [(seen.x + 0.5) * scale + left, (seen.y + 0.5) * scale + top];
       if (x < -length || y < -length || x > width + length || y > height + length) continue;
       painted.mark(x, y, length / 2 + LINE_PX);

@@ -38,7 +38,7 @@ export interface Run {
   layers: Layer[];
   arrays: Record<string, StoredArray>;
   segments: { count: number; tracks: number; hysteresis_px: number; band_radius_px: number };
-  replay: { chunk_s: number; chunks: number; step_px: number; states: string[] };
+  replay: { chunk_s: number; chunks: number; step_px: number; states: string[]; classes: string[] };
   flow: { cell_px: number; draws: number };
   /** A note for people where hardly any pixel was passed by several vehicles. */
   low_coverage_note: string;

@@ -6,7 +6,7 @@ import type L from "leaflet";
 import { Animation, reducedMotion } from "./animation";
 import { AnalysisPanel } from "./analysis";
 import { lineCrossings } from "./crossings";
-import { find, make } from "./dom";
+import { find, listenToKeys, make } from "./dom";
 import { Drawings } from "./drawings";
 import { Field } from "./field";
 import { Flow } from "./flow";
@@ -390,19 +390,15 @@ class Viewer {
       this.set({ view: { x, y, zoom: this.map.getZoom() } });
       this.noteMoving();
     });
-    const container = this.map.getContainer();
-    container.addEventListener("pointerdown", () => container.classList.remove("by-keyboard"));
-    container.addEventListener("keydown", (event) => {
-      if (event.target !== container) return;
-      container.classList.add("by-keyboard"); // shows the centre, which Enter queries
-      if (event.key === "Enter" || event.key === " ") this.clickAt(toPoint(this.map.getCenter()));
-      else if (event.key === "l") this.draw(this.drawing === null);
-      else if (event.key === "Escape") this.draw(false);
-      else if (event.key === "r") this.showReplay(this.state.replay === null ? this.replay.time_s : null);
-      else if (event.key === "p" && this.state.replay !== null) this.player.toggle();
-      else if (event.key === "f") this.showFlow(!this.state.flow);
-      else return;
-      event.preventDefault();
+    const query = (): void => this.clickAt(toPoint(this.map.getCenter()));
+    listenToKeys(this.map.getContainer(), {
+      Enter: query,
+      " ": query,
+      l: () => this.draw(this.drawing === null),
+      Escape: () => this.draw(false),
+      r: () => this.showReplay(this.state.replay === null ? this.replay.time_s : null),
+      p: () => this.state.replay !== null && this.player.toggle(),
+      f: () => this.showFlow(!this.state.flow),
     });
   }
 

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from schemas.summary import RunSummary
 from schemas.view import ViewRecord
 from tests.browser import MIDDLE_OF_MAP, NEEDS_PAGE, Browser, Page, browser, served
 from velfield import open_run
+from velfield.analysis.vehicle_classes import CLASS_NAMES
 from velfield.field.segments import SEGMENT_DTYPE, stationary_speed_px_per_s
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run
@@ -66,10 +68,12 @@ def decode(data: bytes, step_px: float) -> dict[int, dict[str, np.ndarray]]:
     x, y = np.frombuffer(data, "<u2", 2 * m, at + 4 * m).reshape(2, m) * step_px - 0.5
     state, axis = np.frombuffer(data, np.uint8, 2 * n, at + 8 * m).reshape(2, n)
     gap = np.frombuffer(data, np.uint8, m, at + 8 * m + 2 * n)
-    assert len(data) == at + 9 * m + 2 * n
+    kind, percent, length = np.frombuffer(data, np.uint8, 3 * n, at + 9 * m + 2 * n).reshape(3, n)
+    assert len(data) == at + 9 * m + 5 * n
     parts = np.split(np.arange(m), first[1:])[:n]
     return {
         int(name): {"t": time_s[rows], "x": x[rows], "y": y[rows], "gap": gap[rows], "state": state[k], "axis": axis[k]}
+        | {"class": kind[k], "percent": percent[k], "length": length[k]}
         for k, (name, rows) in enumerate(zip(vehicle, parts, strict=True))
     }
 
@@ -86,7 +90,9 @@ def test_a_long_flight_is_cut_by_time_and_each_part_holds_all_of_its_time() -> N
     rows = [(7, 100 + 0.5 * k, 4.0 * k, 4.0 * (k + 1), 20.0) for k in range(60)]  # 30 s, from 100 s on
     rows += [(9, 102.0, 50.0, 52.0, 5.0), (9, 118.0, 80.0, 83.0, 5.0)]  # unseen for 15.5 s
     segments = made_segments(rows)
-    vehicles = pd.DataFrame({"state": ["moving", "moving"], "orientation_rad": [0.0, np.nan]})
+    vehicles = pd.DataFrame({"state": ["moving", "moving"], "orientation_rad": [0.0, np.nan]}).assign(
+        vehicle_class=["lorry or bus", None], class_probability=[0.934, np.nan], length_m=[11.26, np.nan]
+    )
     paths = vehicle_paths(segments, np.zeros(2, bool))
     chunks = list(replay_chunks(paths, vehicles, first_time_s=100.0, duration_s=30.0, step_px=0.01))
     assert len(chunks) == chunk_count(30.0) == 4
@@ -94,6 +100,9 @@ def test_a_long_flight_is_cut_by_time_and_each_part_holds_all_of_its_time() -> N
         there = decode(chunk, 0.01)
         assert (there[0]["t"][0], there[0]["t"][-1]) == pytest.approx((10 * k, 10 * k + 10), abs=0.51)
         np.testing.assert_allclose(there[0]["x"], 8 * there[0]["t"], atol=0.01)
+        assert CLASS_NAMES[there[0]["class"] - 1] == "lorry or bus"
+        assert (there[0]["percent"], there[0]["length"]) == (93, 113)
+        assert there.get(1, {"class": 0})["class"] == 0
         if k < 2:
             middle = there[1]
             assert (middle["t"][0] <= CHUNK_S * k) or k == 0
@@ -113,7 +122,8 @@ def test_what_is_parked_stands_still() -> None:
 
 def test_no_vehicles_make_files_too() -> None:
     paths = vehicle_paths(np.zeros(0, SEGMENT_DTYPE), np.zeros(0, bool))
-    vehicles = pd.DataFrame({"state": [], "orientation_rad": np.zeros(0)})
+    numbers = ("orientation_rad", "class_probability", "length_m")
+    vehicles = pd.DataFrame({"state": [], "vehicle_class": []} | {name: np.zeros(0) for name in numbers})
     (chunk,) = replay_chunks(paths, vehicles, first_time_s=0.0, duration_s=3.0, step_px=1.0)
     assert decode(chunk, 1.0) == {}
 
@@ -179,6 +189,11 @@ def test_a_click_on_a_vehicle_of_the_replay_tells_its_speed(chromium: Browser, a
         page.wait("document.querySelector('#answer [data-name=vehicle_speed]') !== null")
         shown = json.loads(page.value("document.querySelector('#answer [data-name=vehicle_speed]').dataset.value"))
         assert shown == pytest.approx(speed, rel=0.02)
+        answer = page.value("document.getElementById('answer').innerText")
+        vehicle = run.vehicles().iloc[int(re.search(r"Vehicle (\d+)", answer)[1])]  # type: ignore[index]
+        assert vehicle["vehicle_class"] in CLASS_NAMES, "the test needs a vehicle that was measured"
+        assert re.search(rf"Class\s+{vehicle['vehicle_class']} \({100 * vehicle['class_probability']:.0f} %\)", answer)
+        assert re.search(rf"Length\s+{vehicle['length_m']:.1f} m", answer)
         page.value("document.getElementById('play').click()")
         page.wait(f"Number(document.getElementById('time').value) > {since}")
         page.value("document.getElementById('play').click()")

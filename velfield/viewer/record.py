@@ -21,6 +21,7 @@ from schemas.records import FlightRecord, GridRecord
 from schemas.view import ViewArray, ViewBase, ViewFlow, ViewLayer, ViewRecord, ViewReplay, ViewSegments
 from velfield.analysis.coverage import low_coverage_note
 from velfield.analysis.crossings import hysteresis_px
+from velfield.analysis.vehicle_classes import CLASS_NAMES
 from velfield.analysis.vehicles import STATES
 from velfield.field.segments import Segments, band_radius_px, stationary_speed_px_per_s
 from velfield.run.commits import record_page, write_atomically
@@ -145,6 +146,7 @@ def view_record(
             chunks=chunk_count(last_s - first_s),
             step_px=position_step(grid.width_px, grid.height_px),
             states=STATES,
+            classes=CLASS_NAMES,
         ),
         flow=ViewFlow(cell_px=cell_side(store.shape, grid.gsd_m), draws=DRAWS),
         low_coverage_note=low_coverage_note(int((count > 0).sum()), int((count >= 5).sum())),

@@ -9,6 +9,8 @@ Little-endian; n vehicles, m positions, one vehicle's after another's, in the or
     uint16    x (m), y (m), `position_step` px each, from the corner of the map
     uint8     state (n), of `STATES`; axis (n), axial orientation, 256ths of half a turn
     uint8     gap (m): 1 where nothing was seen of the vehicle until its next position
+    uint8     class (n), of `CLASS_NAMES` from 1, 0 where it was not measured; its probability (n), per cent
+    uint8     length (n), tenths of a metre, 0 where it is not known
 
 A position before a chunk's start and one after its end belong to it too, so that each chunk shows all its time.
 """
@@ -20,6 +22,7 @@ import numpy as np
 import pandas as pd
 
 from schemas.arrays import FloatArray, IntArray, Mask
+from velfield.analysis.vehicle_classes import CLASS_NAMES
 from velfield.analysis.vehicles import STATES
 from velfield.field.segments import Segments
 
@@ -109,7 +112,7 @@ def replay_chunks(
     Parameters
     ----------
     vehicles
-        `find_vehicles`, a row a track.
+        `find_vehicles` and `add_dimensions`, a row a track.
     """
     time_s = paths.time_s - first_time_s
     begins = np.flatnonzero(paths.vehicle[1:] == paths.vehicle[:-1])  # positions with another after them
@@ -123,7 +126,15 @@ def replay_chunks(
     bounds = np.searchsorted(chunk[order], np.arange(count + 1))
     state = pd.Categorical(vehicles["state"], STATES).codes.astype(np.uint8)
     axis = np.nan_to_num(vehicles["orientation_rad"].to_numpy(np.float64))
-    looks = np.column_stack([state, np.floor(axis / np.pi * 256).clip(0, 255).astype(np.uint8)])
+    classes = pd.Categorical(vehicles["vehicle_class"], CLASS_NAMES).codes + 1
+    measured = [classes, 100 * vehicles["class_probability"], 10 * vehicles["length_m"]]
+    looks = np.column_stack(
+        [
+            state,
+            np.floor(axis / np.pi * 256).clip(0, 255).astype(np.uint8),
+            *(np.rint(np.nan_to_num(np.asarray(of, np.float64))).clip(0, 255).astype(np.uint8) for of in measured),
+        ]
+    )
     for k in range(count):
         mine = begin[order[bounds[k] : bounds[k + 1]]]
         rows = np.union1d(mine, mine + 1)
@@ -142,5 +153,6 @@ def _encode(paths: Paths, time_s: FloatArray, looks: IntArray, step_px: float) -
         looks[vehicle, 0],
         looks[vehicle, 1],
         paths.gap.astype(np.uint8),
+        *looks[vehicle, 2:].T,
     ]
     return b"".join(part.tobytes() for part in parts)
