@@ -52,6 +52,7 @@ export class Drawings {
   /** The places of a table's rows, the chosen one in white; the map moves to it. */
   showGeometries(all: Geometry[], chosen: Geometry | null): void {
     this.places.clearLayers();
+    for (const geometry of all) this.addGeometry(geometry, "#000", 4);
     for (const geometry of all) this.addGeometry(geometry, "#5ee0ff", 2);
     if (!chosen) return;
     this.addGeometry(chosen, "#000", 9);

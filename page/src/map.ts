@@ -8,6 +8,7 @@ import type { Layer, Run } from "./run";
 import { roundDown } from "./units";
 
 const DIMMING = 0.32;
+const CASING_ALPHA = 254; // what is painted has 255
 
 export function makeMap(element: HTMLElement, run: Run): L.Map {
   const whole = L.latLngBounds([0, 0], [-run.height_px, run.width_px]);
@@ -92,6 +93,21 @@ class BaseTiles extends L.GridLayer {
   }
 }
 
+/** A dark edge around what is painted: against it the colours are read on light and dark images alike. */
+function addCasing(context: CanvasRenderingContext2D, side: number): void {
+  const image = context.getImageData(0, 0, side, side);
+  const { data } = image;
+  const isPainted = (x: number, y: number): boolean =>
+    x >= 0 && y >= 0 && x < side && y < side && data[4 * (y * side + x) + 3] === 255;
+  for (let y = 0, at = 3; y < side; y++) {
+    for (let x = 0; x < side; x++, at += 4) {
+      if (data[at] !== 0) continue;
+      if (isPainted(x - 1, y) || isPainted(x + 1, y) || isPainted(x, y - 1) || isPainted(x, y + 1)) data[at] = CASING_ALPHA;
+    }
+  }
+  context.putImageData(image, 0, 0);
+}
+
 /** A layer of the field, painted from its chunks. */
 export class Overlay extends L.GridLayer {
   constructor(
@@ -141,6 +157,7 @@ export class Overlay extends L.GridLayer {
       }
     }
     await Promise.all(work);
+    addCasing(context, canvas.width);
   }
 
   private async chunks(row: number, column: number): Promise<(Numbers | null)[] | null> {

@@ -25,7 +25,7 @@ export const START: State = {
   tab: "map",
   layer: "direction",
   unit: "km/h",
-  opacity: 80,
+  opacity: 100,
   minVehicles: 1,
   tracks: false,
   flow: false,

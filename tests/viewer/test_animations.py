@@ -18,6 +18,7 @@ from tests.browser import MIDDLE_OF_MAP, NEEDS_PAGE, Browser, Page, browser, ser
 from velfield import open_run
 from velfield.analysis.vehicle_classes import CLASS_NAMES
 from velfield.field.segments import SEGMENT_DTYPE, stationary_speed_px_per_s
+from velfield.report.colours import direction_colours, ramp_colours
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run
 from velfield.run.stores import open_field
@@ -391,3 +392,40 @@ def test_the_tab_of_the_analysis_shows_tables_with_n_and_intervals(
         page.value("document.querySelector('#analysis .place').click()")
         assert page.value("document.getElementById('side').hidden")
         assert page.complaints == []
+
+
+BARE_EDGES = """[...document.querySelectorAll('.overlay canvas')].reduce(([painted, bare], canvas) => {
+  const { width, height } = canvas;
+  const { data } = canvas.getContext('2d').getImageData(0, 0, width, height);
+  const alpha = (x, y) => data[4 * (y * width + x) + 3];
+  for (let y = 1; y < height - 1; y++)
+    for (let x = 1; x < width - 1; x++) {
+      if (alpha(x, y) !== 255) continue;
+      painted++;
+      bare += [[x - 1, y], [x + 1, y], [x, y - 1], [x, y + 1]].filter(([i, j]) => alpha(i, j) === 0).length;
+    }
+  return [painted, bare];
+}, [0, 0])"""
+
+
+@NEEDS_PAGE
+@pytest.mark.parametrize("layer", ["direction", "speed"])
+def test_the_colours_of_a_layer_stand_in_a_dark_edge(chromium: Browser, address: str, layer: str) -> None:
+    """So that they are read on light images as well as on dark ones."""
+    with chromium.page() as page:
+        page.open(f"{address}#layer={layer}")
+        page.wait(f"{BARE_EDGES}[0] > 200")
+        assert page.value(BARE_EDGES)[1] == 0
+
+
+def luminance(rgb: np.ndarray) -> np.ndarray:
+    """Relative luminance as the Web Content Accessibility Guidelines define it."""
+    share = np.asarray(rgb, float) / 255
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return np.asarray(linear @ np.array([0.2126, 0.7152, 0.0722]))
+
+
+def test_every_colour_has_the_contrast_of_graphics_to_its_dark_edge() -> None:
+    scales = direction_colours(np.linspace(0, 2 * np.pi, 720)), ramp_colours(np.linspace(0, 1, 720))
+    for scale in scales:
+        assert ((luminance(scale) + 0.05) / 0.05).min() >= 3.0  # of graphics, by success criterion 1.4.11
