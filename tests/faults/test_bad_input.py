@@ -53,6 +53,30 @@ def test_any_json(name: str, content: object, by_name: dict[str, Kind], folder: 
     assert problem_of_case(by_name[name], json.dumps(content).encode(), folder) == ""
 
 
+HEADERS = {
+    "time stamps": ["frame", "time_s", "timestamp", "name"],
+    "labels (CSV)": ["frame", "x_px", "y_px", "length_px", "width_px", "angle_deg", "orientation_rad"],
+    "tracks (CSV)": ["track_id", "id", "frame", "time_s", "x_m", "y_m", "x_px", "y_px", "length_m", "width_m"],
+}
+CELL = (
+    st.integers(-(10**20), 10**20).map(str)
+    | st.floats().map(str)
+    | st.sampled_from(["", "f1.png", "0", "1", "NaN", "1e400", "-0", '"', "1,2", "\t", "\x00", "#"])
+    | st.text(max_size=6)
+)
+
+
+@pytest.mark.parametrize("name", list(HEADERS))
+@settings(max_examples=40, deadline=None)
+@given(data=st.data())
+def test_any_table(name: str, data: st.DataObject, by_name: dict[str, Kind], folder: Path) -> None:
+    """Its columns, some of them twice or missing, and rows of any length with any text."""
+    header = data.draw(st.lists(st.sampled_from(HEADERS[name]), min_size=1, max_size=6))
+    rows = data.draw(st.lists(st.lists(CELL, max_size=len(header) + 1), max_size=5))
+    text = "\n".join(",".join(row) for row in [header, *rows])
+    assert problem_of_case(by_name[name], text.encode("utf-8", "surrogatepass"), folder) == ""
+
+
 @pytest.mark.parametrize("name", ["configuration", "labels (JSON)", "detector", "flight record", "cluster"])
 @pytest.mark.parametrize("whole", [True, False])
 def test_arrays_without_end_are_refused(name: str, whole: bool, by_name: dict[str, Kind], folder: Path) -> None:

@@ -177,11 +177,11 @@ def test_a_zoom_in_mid_flight_is_reported(tmp_path: Path) -> None:
     assert "frames 5 to 6 show the ground at up to 1.4" in line
 
 
-def test_a_turn_towards_the_horizon_in_mid_flight_is_reported(tmp_path: Path) -> None:
-    """The last two of seven frames look 30 degrees away from the vertical, at the same place."""
+def turned(tilts_deg: Sequence[float]) -> list[GreyImage]:
+    """Frames of one place that look so many degrees away from the vertical."""
     scene, focal, middle = ground(900, 700, seed=3), 400.0, np.array([160.0, 120.0])
     frames = []
-    for k, tilt_deg in enumerate([0.0, 2.0, 0.0, 3.0, 1.0, 28.0, 30.0]):
+    for k, tilt_deg in enumerate(tilts_deg):
         tilt = np.radians(tilt_deg)
         down = np.array([[1, 0, 450 + k], [0, 1, 350], [0, 0, 1.0]]) @ np.diag([1, 1, 1 / focal])
         turn = np.array([[1, 0, 0], [0, np.cos(tilt), np.sin(tilt)], [0, -np.sin(tilt), np.cos(tilt)]])
@@ -189,13 +189,29 @@ def test_a_turn_towards_the_horizon_in_mid_flight_is_reported(tmp_path: Path) ->
         to_ground = to_middle @ down @ turn @ np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, focal]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         frames.append(cv2.warpPerspective(scene, to_ground, (320, 240), flags=flags, borderMode=cv2.BORDER_REFLECT))
-    plan = planned(tmp_path, frames, "registration", "lens.calibrate=never")
+    return frames
+
+
+def test_a_turn_towards_the_horizon_in_mid_flight_is_reported(tmp_path: Path) -> None:
+    """The last two of seven frames look 30 degrees away from the vertical, at the same place."""
+    plan = planned(tmp_path, turned([0, 2, 0, 3, 1, 28, 30]), "registration", "lens.calibrate=never")
     compute_stages(plan, ("registration",))
     assert open_registration(plan.layout.registration).statuses() == ["ok"] * 7
     (line,) = [line for line in register_unit(plan, range(7)).warnings if "degrees" in line]
     found = re.search(r"at up to (\d+) degrees from the base image's view", line)
     assert found is not None
     assert 22 <= int(found[1]) <= 33
+
+
+@pytest.mark.parametrize("tilts_deg", [(20, 40, 60, 60), (60, 60)])
+def test_frames_of_a_turn_by_60_degrees_are_lost_with_the_reason(tmp_path: Path, tilts_deg: tuple[float, ...]) -> None:
+    """The sharpest frame is one of them; the base image is of those that most frames overlap with."""
+    plan = planned(tmp_path, turned([0, 2, 0, 3, 1, *tilts_deg]), "registration", "lens.calibrate=never")
+    compute_stages(plan, ("registration",))
+    statuses = open_registration(plan.layout.registration).statuses()
+    print(statuses, register_unit(plan, range(5 + len(tilts_deg))).warnings)
+    assert statuses[:5] == ["ok"] * 5
+    assert all(status.startswith("failed:") for status in statuses[-2:])
 
 
 def oblique(tilt_deg: float, seed: int = 21) -> GreyImage:

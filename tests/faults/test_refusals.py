@@ -1,13 +1,13 @@
 """Refusals are one line, and come before any work: options, settings without sense, a base image of another place."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,16 +15,19 @@ import pytest
 
 from flows import cli
 from flows.console import Console, training_progress
+from schemas.simulation import SimulationConfig
 from tests.small_flight import job
 from velfield.errors import InputError
 from velfield.parallel import count_steps
 from velfield.pipeline import check_inputs
 from velfield.pipeline.configuration import resolve_config
+from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import dropped_inputs, make_plan, write_flight_record
-from velfield.pipeline.result import StageResult
-from velfield.pipeline.stages import detector as detector_stage
+from velfield.pipeline.stage import stages_before
+from velfield.synthetic.flight import Flight
 
 ROOT = Path(__file__).resolve().parents[2]
+_ELSEWHERE = "not an image of this flight's area; give one of the area"
 
 
 def command(
@@ -123,24 +126,53 @@ def test_settings_without_sense_are_refused(settings: list[str], text: str) -> N
     assert "\n" not in str(caught.value)
 
 
+@pytest.fixture(scope="module")
+def bases(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The flight's base image mirrored and turned; one of another town, a corner of it, as the middle of each has the
+    same crossing; noise."""
+    base = cv2.imread(str(flight / "base.png"), cv2.IMREAD_GRAYSCALE)
+    images = {
+        "mirrored": base[:, ::-1],
+        "turned": base[::-1, ::-1],
+        "town": Flight(SimulationConfig(seed=5, frames=1, width=1600, height=1200)).base_image[:600, :760],
+        "noise": np.random.default_rng(5).integers(0, 256, base.shape).astype(np.uint8),
+    }
+    folder = tmp_path_factory.mktemp("bases")
+    for name, image in images.items():
+        cv2.imwrite(str(folder / f"{name}.png"), image)
+    return {name: folder / f"{name}.png" for name in images}
+
+
 def test_a_wrong_base_image_is_refused_before_a_frame_is_stored(
-    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    flight: Path, bases: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of flights that take long: a short one's base stage comes soon enough."""
-    base = cv2.imread(str(flight / "base.png"), cv2.IMREAD_GRAYSCALE)
-    cv2.imwrite(str(tmp_path / "mirrored.png"), base[:, ::-1])
-    cv2.imwrite(str(tmp_path / "turned.png"), base[::-1, ::-1])
     checked: list[object] = []
+    plans = {name: make_plan(job(flight, tmp_path / "run", base=str(path))) for name, path in bases.items()}
     monkeypatch.setattr(check_inputs, "_LONG_PX", 1)
     check_inputs.check_base_area(make_plan(job(flight, tmp_path / "run")))
-    check_inputs.check_base_area(make_plan(job(flight, tmp_path / "run", base=str(tmp_path / "turned.png"))))
-    wrong = make_plan(job(flight, tmp_path / "run", base=str(tmp_path / "mirrored.png")))
-    with pytest.raises(InputError, match=r"--base .*mirrored\.png: found a mirrored image"):
-        check_inputs.validate_inputs(wrong)
+    check_inputs.check_base_area(plans["turned"])
+    for name, found in {"mirrored": "found a mirrored image", "town": _ELSEWHERE, "noise": _ELSEWHERE}.items():
+        with pytest.raises(InputError, match=rf"--base .*{name}\.png: {found}") as caught:
+            check_inputs.validate_inputs(plans[name])
+        assert "\n" not in str(caught.value)
     monkeypatch.setattr(check_inputs, "check_base_area", checked.append)
     monkeypatch.setattr(check_inputs, "_LONG_PX", 10**9)
-    check_inputs.validate_inputs(wrong)
+    check_inputs.validate_inputs(plans["mirrored"])
     assert checked == []
+
+
+@pytest.mark.parametrize("name", ["town", "noise"])
+def test_a_wrong_base_image_of_a_short_flight_is_refused_before_a_frame_is_registered(
+    name: str, flight: Path, bases: dict[str, Path], tmp_path: Path
+) -> None:
+    """Its frames are stored by then, which takes less time than the check."""
+    plan = make_plan(job(flight, tmp_path / "run", base=str(bases[name])))
+    write_flight_record(plan)
+    with pytest.raises(InputError, match=rf"--base .*{name}\.png: {_ELSEWHERE}") as caught:
+        compute_stages(plan, stages_before("registration"))
+    assert "\n" not in str(caught.value)
+    assert not plan.layout.registration.exists()
 
 
 def test_an_input_that_is_no_longer_given_is_said(flight: Path, tmp_path: Path) -> None:
@@ -154,54 +186,33 @@ def test_an_input_that_is_no_longer_given_is_said(flight: Path, tmp_path: Path) 
     assert "the base image is built from the flight" in line
 
 
-def test_few_vehicles_that_move_are_warned_of(monkeypatch: pytest.MonkeyPatch) -> None:
-    few = SimpleNamespace(usable=True, count=30, warnings=("trained on only 9 moving vehicles",))
-    method = SimpleNamespace(train_from_motion=lambda *_: None)
-    stubs = {
-        "_scale_of_gsd": 1.0,
-        "_motion_frames": [],
-        "motion_background": None,
-        "labels_from_motion": few,
-        "detector_class": method,
-        "UnlabelledFlight": None,
-        "_finish": StageResult(),
-    }
-    for name, value in stubs.items():
-        monkeypatch.setattr(detector_stage, name, lambda *_, value=value, **__: value)
-    plan = SimpleNamespace(config=resolve_config())
-    assert detector_stage._from_motion(plan).warnings == list(few.warnings)  # type: ignore[arg-type]
-
-
-_TRAINS = """if True:
-    import time
-    from flows.stopping import STOPPED, leave, stop_on_signals
-    from velfield.parallel import parallel_map
-    stop_on_signals(resumes=False, grace_s=0.0)
-    try:
-        print("trains", flush=True)  # within the try: the signal may come at once
-        parallel_map(lambda _: time.sleep(60), range(2))
-    except KeyboardInterrupt:
-        leave(STOPPED)
-"""
-
-
-def test_a_training_hears_sigterm_at_once() -> None:
-    """Its threads are under way, and are not waited for."""
+def test_a_training_shows_its_progress_and_hears_sigterm_at_once(flight: Path, tmp_path: Path) -> None:
+    """`velfield train` as a process: its threads are under way, and are not waited for."""
+    command = [
+        sys.executable,
+        "-m",
+        "flows.cli",
+        "train",
+        str(flight / "frames"),
+        "--labels",
+        str(flight / "labels.csv"),
+    ]
     with subprocess.Popen(
-        [sys.executable, "-c", _TRAINS],
-        stdout=subprocess.PIPE,
+        [*command, "--gsd-m", "0.23", "--out", str(tmp_path / "detector.json")],
+        stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     ) as process:
-        assert process.stdout is not None
-        process.stdout.readline()
+        assert process.stderr is not None
+        assert any(re.fullmatch(r"training: [1-9]\d* of \d+ steps", line.strip()) for line in process.stderr)
         started = time.monotonic()
         process.send_signal(signal.SIGTERM)
         _, text = process.communicate(timeout=60)
     assert process.returncode == 130
     assert time.monotonic() - started < 20
-    assert text.strip() == "velfield: stopped"
+    assert text.splitlines()[-1] == "velfield: stopped"
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_training_shows_its_steps(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

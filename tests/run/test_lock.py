@@ -52,7 +52,9 @@ def answer_of_another_process(root: Path) -> str:
 
 def test_two_runs_on_one_folder(layout: RunLayout) -> None:
     with locked(layout):
-        assert f"locked by pid {os.getpid()} on" in answer_of_another_process(layout.root)
+        owner = record(layout)
+        told = answer_of_another_process(layout.root)
+        assert f"locked by pid {os.getpid()} on {owner['host']} since {owner['since']}" in told
         with pytest.raises(InputError, match=f"locked by pid {os.getpid()}"), locked(layout):
             pass
     assert answer_of_another_process(layout.root) == "got it"

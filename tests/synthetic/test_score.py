@@ -145,6 +145,13 @@ def test_points_without_a_transform_or_outside_the_base_image_are_not_scored() -
     assert shifted.mean_px == pytest.approx(0.0, abs=1e-9)
 
 
+def test_a_frame_that_is_not_registered_answers_nothing() -> None:
+    made = truth([car(0, 0, 50, 50)])
+    score = score_registration(made, lambda _, xy: xy, [0, 1, 3], asked=range(4))
+    assert (score.answered, score.frames, score.mean_px) == (0.75, 3, pytest.approx(0.0, abs=1e-9))
+    assert score_registration(made, lambda _, xy: xy, [0, 1, 3]).answered == 1.0
+
+
 def test_the_fitted_homography_ignores_points_without_a_transform() -> None:
     made = truth([car(0, 0, 50, 50)])
     matrix = np.array([[1.1, 0.05, 4.0], [-0.04, 0.95, -7.0], [1e-4, 0.0, 1.0]])

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from schemas.flight import TrackingConfig
@@ -156,12 +156,17 @@ def test_a_dropped_frame_breaks_by_time_not_by_index() -> None:
     assert log["gaps_too_long"] == 1
 
 
-def test_an_interval_of_zero_never_divides() -> None:
+@settings(max_examples=30, deadline=None)
+@given(steps=st.lists(st.sampled_from([0.0, 0.1, 0.2, 0.3]), min_size=2, max_size=5))
+@example(steps=[0.2, 0.0, 0.2])
+def test_an_interval_of_zero_never_divides(steps: list[float]) -> None:
     rng = np.random.default_rng(1)
-    seen = watch([car(rng, (60.0, 60.0), (50.0, 0.0))], [0.0, 0.2, 0.2, 0.4], rng=rng)
-    found, log = link_windows(seen.tables, TrackingConfig(), gsd_m=None, starts=ALL)
-    assert found.empty
-    assert log["gaps_too_long"] == 1
+    seen = watch([car(rng, (60.0, 60.0), (50.0, 0.0))], np.cumsum([0.0, *steps]), rng=rng)
+    with np.errstate(divide="raise", invalid="raise"):
+        found, _ = link_windows(seen.tables, TrackingConfig(), gsd_m=None, starts=ALL)
+    assert np.isfinite(found[[f"v{axis}_{link}_px_per_s" for axis in "xy" for link in ("01", "12")]].to_numpy()).all()
+    windows = [k for k in range(len(steps) - 1) if steps[k] > 0 and steps[k + 1] > 0]
+    assert set(found["frame_0"]) <= set(windows)
 
 
 def test_frames_out_of_time_order_are_refused() -> None:

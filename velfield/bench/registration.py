@@ -71,7 +71,7 @@ class Measurement:
     ----------
     drift_px : change of the mean error from the first tenth of the frames to the last, base px.
     corner_px : largest error of a frame's corners, over all frames, base px; of those that were answered.
-    answered : fraction of the frame for which there is a position.
+    answered : fraction of all frames for which there is a position; a frame that is not registered has none.
     seconds_a_frame : computing time; reading of images is included for velfield, not for stabilo.
     frames_registered, frames : number of frames registered, and in total.
     """
@@ -116,7 +116,7 @@ def bench_registration(
     measurements = []
     for method, register in (("velfield", _run_velfield), ("stabilo", register_by_stabilo))[: 2 if stabilo else 1]:
         to_base, registered, seconds = register(flight, config, truth)
-        score = score_registration(truth, to_base, registered)
+        score = score_registration(truth, to_base, registered, asked=range(config.frames))
         corner = _worst_corner(truth, to_base, registered)
         measurements.append(_row(case.name, method, seed, score, corner, seconds, config.frames))
     return measurements
@@ -156,7 +156,8 @@ def summarise(measurements: Sequence[Measurement]) -> list[str]:
         texts = [f"{case:<11} {method:<9} median (worst) of {len(rows)}:"]
         for name in ("mean_px", "p95_px", "jitter_px", "drift_px", "corner_px", "answered", "seconds_a_frame"):
             values = [getattr(row, name) for row in rows]
-            texts.append(f"{name} {np.median(values):.3f} ({max(values):.3f})")
+            worst = min(values) if name == "answered" else max(values)
+            texts.append(f"{name} {np.median(values):.3f} ({worst:.3f})")
         lines.append("  ".join(texts))
     return lines
 

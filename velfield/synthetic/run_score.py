@@ -95,7 +95,9 @@ def score_run(root: str | Path, flight: str | Path, *, min_count: int = 5) -> Ru
     velocity[np.isnan(run.field.modal_direction_rad())] = np.nan  # stationary: no direction
     some = frames[:: max(1, len(frames) // 20)]
     to_truth = None if run.grid.base_source == "given" else fit_homography(truth, to_base, some)
-    registration = score_registration(truth, to_base, frames, to_truth=to_truth)
+    registration = score_registration(
+        truth, to_base, frames, asked=[int(index) for index in source_index], to_truth=to_truth
+    )
     if to_truth is None and registration.mean_px > _ANOTHER_BASE_PX:
         raise InputError(
             f"{run.layout.root}: positions differ from those of {flight} by {registration.mean_px:.0f} px (mean): its "

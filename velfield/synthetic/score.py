@@ -4,7 +4,7 @@ Without a given base image a run's base pixels are those of another image: ``fit
 truth's, and each score takes it as ``to_truth``.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -33,7 +33,8 @@ class RegistrationScore:
 
     ``jitter_px``: root mean square of the error about its mean over the frames at each position.
     ``drift_px``: change of the mean error from the first tenth of the frames to the last.
-    ``answered``: fraction of the points within the base image for which the run gives a position.
+    ``answered``: fraction of the points within the base image, of all frames of the flight, for which the run gives a
+    position: a frame that is not registered answers nothing.
     """
 
     mean_px: float
@@ -120,19 +121,26 @@ def apply_homography(matrix: FloatArray | None, xy: FloatArray) -> FloatArray:
 
 
 def score_registration(
-    truth: Truth, to_base: ToBase, frames: list[int] | range, *, to_truth: FloatArray | None = None
+    truth: Truth,
+    to_base: ToBase,
+    frames: Sequence[int],
+    *,
+    asked: Sequence[int] | None = None,
+    to_truth: FloatArray | None = None,
 ) -> RegistrationScore:
-    """Score a run's raw-to-base transform over its registered ``frames``.
+    """Score a run's raw-to-base transform over its registered ``frames``, of those ``asked`` for (None: no others).
 
     Points outside the base image by the truth are not evaluated, nor those where the run gives NaN.
     """
     grid = sample_grid(truth)
-    positions, errors, numbers, asked = [], [], [], 0
-    for frame in frames:
+    positions, errors, numbers, points = [], [], [], 0
+    for frame in frames if asked is None else asked:
         true = truth.to_base(frame, grid)
-        error = apply_homography(to_truth, to_base(frame, grid)) - true
         inside = (true >= 0).all(axis=1) & (true < truth.base_shape[::-1]).all(axis=1)
-        asked += int(inside.sum())
+        points += int(inside.sum())
+        if frame not in frames:
+            continue
+        error = apply_homography(to_truth, to_base(frame, grid)) - true
         inside &= np.isfinite(error).all(axis=1)
         positions.append(true[inside])
         errors.append(error[inside])
@@ -150,7 +158,7 @@ def score_registration(
         worst_frame_px=float(by_frame.max()),
         frame_mean_px=np.asarray(by_frame, dtype=np.float64),
         frames=len(by_frame),
-        answered=len(size) / asked,
+        answered=len(size) / points,
     )
 
 

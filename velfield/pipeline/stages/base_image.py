@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from schemas.arrays import GreyImage
+from schemas.arrays import FloatArray, GreyImage
 from schemas.records import GridRecord
 from velfield.camera.lens import Lens, pinhole
 from velfield.camera.map_fit import fit_lens_to_map
@@ -41,6 +41,9 @@ _LENS_ROUNDS = 4
 _MIN_LENS_CHANGE_PX = 0.7
 """RMS change over the frame that is worth it: the mesh follows less, and a rolling shutter passes for less."""
 _THREADS = min(4, os.cpu_count() or 1)
+_MOST_REFERENCES, _REFERENCES_APART, _OVERLAPPING = 3, 0.2, 0.5
+"""Frames that are tried as the reference, how far apart they are as a fraction of the flight, and the fraction of
+frames that overlap with one after which no other is tried."""
 
 
 def keypoint_frames(plan: Plan) -> list[int]:
@@ -84,14 +87,7 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageR
         lens_notes = lens_notes or direct.notes
         keypoints |= _detect_keypoints(plan, _missing(spread, keypoints))
         keypoints = dict(sorted(keypoints.items()))
-    own = build_own_base(
-        store.read,
-        keypoints,
-        reference=reference,
-        lens=lens,
-        config=plan.config.registration,
-        threads=_THREADS,
-    )
+    own, reference = _build_own_base(plan, keypoints, lens, _reference_frames(spread, sharpness))
     if isinstance(own, Failure):
         raise InputError(f"no base image can be built from the flight: {own.reason}; give one with --base")
     write_atomically(layout.own_base_image, png_bytes(own.image))
@@ -110,6 +106,40 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageR
         outputs += written
     finished = _finish(plan, grid, outputs, frames=own.frames, given=given, fit=fit)
     return replace(finished, notes=[*finished.notes, *lens_notes])
+
+
+def _reference_frames(spread: list[int], sharpness: FloatArray) -> list[int]:
+    """Frames that may define the grid: the sharpest, and the sharpest of those far from it in the flight."""
+    chosen: list[int] = []
+    left = sorted(spread, key=lambda frame: -float(np.nan_to_num(sharpness[frame])))
+    while left and len(chosen) < _MOST_REFERENCES:
+        chosen.append(left[0])
+        far = _REFERENCES_APART * (spread[-1] - spread[0])
+        left = [frame for frame in left if min(abs(frame - one) for one in chosen) > far]
+    return chosen
+
+
+def _build_own_base(
+    plan: Plan, keypoints: dict[int, Keypoints], lens: Lens, references: list[int]
+) -> tuple[OwnBase | Failure, int]:
+    """The own base image on the grid of the first frame with which most others overlap, and that frame.
+
+    The sharpest frame may be one of few that look elsewhere or obliquely: then another one is tried.
+    """
+    store, tried = open_frames(plan.layout.frames), []
+    for reference in references:
+        own = build_own_base(
+            store.read,
+            keypoints,
+            reference=reference,
+            lens=lens,
+            config=plan.config.registration,
+            threads=_THREADS,
+        )
+        tried.append((own, reference))
+        if not isinstance(own, Failure) and own.frames > _OVERLAPPING * len(keypoints):
+            break
+    return max(tried, key=lambda pair: 0 if isinstance(pair[0], Failure) else pair[0].frames)
 
 
 def _written_lens(layout: RunLayout) -> list[Path]:
