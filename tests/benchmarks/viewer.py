@@ -16,6 +16,8 @@ from tests.browser import MIDDLE_OF_MAP, Browser, browser, served
 from velfield import open_run
 
 _VISITS, _CLICKS = 5, 12
+_REST_S = 0.3
+"""A person's pointer comes to a place so long before the click."""
 _REACH_X, _REACH_Y = 300, 250
 _TILES = [f"document.querySelector('.{layer} .leaflet-tile-loaded') !== null" for layer in ("base", "overlay")]
 _STANDS = " && ".join(_TILES)
@@ -30,10 +32,13 @@ def main(root: Path) -> None:
     ):
         views = [_first_view(running, address) for _ in range(_VISITS)]
         print(f"first view: {', '.join(f'{view:.2f}' for view in views)} s; median {median(views):.2f} s")
-        first, later = _clicks(running, address, root)
-        print(f"click: median {median([*first, *later]):.0f} ms of {len(first) + len(later)}")
-        late = np.quantile(later, 0.9)
-        print(f"  first of a visit {median(first):.0f} ms; later ones {median(later):.0f} ms, their p90 {late:.0f} ms")
+        for rest_s in (0.0, _REST_S):
+            first, later = _clicks(running, address, root, rest_s)
+            print(f"click {rest_s:g} s after the pointer came: median {median([*first, *later]):.0f} ms of ", end="")
+            late = np.quantile(later, 0.9)
+            print(
+                f"{len(first) + len(later)}; first of a visit {median(first):.0f} ms; p90 of later ones {late:.0f} ms"
+            )
         if (root / "analysis" / "analysis.json").is_file():
             opened, tables = _tables(running, address)
             print(f"analysis: opened {median(opened):.0f} ms, worst {max(opened):.0f} ms")
@@ -49,7 +54,7 @@ def _first_view(running: Browser, address: str) -> float:
         return time.perf_counter() - start
 
 
-def _clicks(running: Browser, address: str, root: Path) -> tuple[list[float], list[float]]:
+def _clicks(running: Browser, address: str, root: Path, rest_s: float) -> tuple[list[float], list[float]]:
     """Milliseconds from the click to the numbers: of the first click of a visit, and of those after it."""
     known = np.argwhere(open_run(root).field.count() > 0)
     rng = np.random.default_rng(0)
@@ -64,6 +69,8 @@ def _clicks(running: Browser, address: str, root: Path) -> tuple[list[float], li
             taken = []
             for there_y, there_x in rng.choice(near, _CLICKS).tolist():
                 page.value("delete document.getElementById('answer').dataset.milliseconds")
+                page.mouse("mouseMoved", left + there_x - x, top + there_y - y)
+                time.sleep(rest_s)
                 page.click(left + there_x - x, top + there_y - y)
                 page.wait("document.getElementById('answer').dataset.milliseconds !== undefined")
                 taken.append(float(page.value("document.getElementById('answer').dataset.milliseconds")))

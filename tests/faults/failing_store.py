@@ -158,6 +158,12 @@ def failing_disk(root: Path, fault: Fault) -> Iterator[None]:
         Path.open, Path.replace, os.fsync = true_open, true_replace, true_sync  # type: ignore[method-assign]
 
 
+_S3_WRITES = {
+    *("put_object", "copy_object", "delete_object", "delete_objects"),
+    *("create_multipart_upload", "upload_part", "upload_part_copy", "complete_multipart_upload"),
+}
+
+
 @contextmanager
 def failing_s3(root: Path, fault: Fault) -> Iterator[None]:
     """Let every writing of an object below ``root`` meet the fault."""
@@ -167,16 +173,19 @@ def failing_s3(root: Path, fault: Fault) -> Iterator[None]:
     true = s3fs.S3FileSystem._call_s3
 
     async def call(self: Any, method: str, *arguments: Any, **named: Any) -> Any:
-        path = f"{named.get('Bucket')}/{named.get('Key')}"
-        if method == "put_object" and path.startswith(below) and not path.endswith(".lock"):
-            halves: list[bytes] = []
-            body = bytes(named["Body"])
-            try:
-                fault.meet(path, lambda: halves.append(body[: len(body) // 2]))
-            except OSError:
-                for half in halves:
-                    await true(self, method, *arguments, **(named | {"Body": half}))
-                raise
+        names = [named.get("Key"), *(one["Key"] for one in named.get("Delete", {}).get("Objects", []))]
+        path = f"{named.get('Bucket')}/{next((name for name in names if name), None)}"
+        if method not in _S3_WRITES or not path.startswith(below) or path.endswith(".lock"):
+            return await true(self, method, *arguments, **named)
+        torn: list[dict[str, Any]] = []
+        body = bytes(named.get("Body", b""))
+        try:
+            # half of an object; of a call that has no body all is done, and only its answer is lost
+            fault.meet(f"{path} ({method})", lambda: torn.append({"Body": body[: len(body) // 2]} if body else {}))
+        except OSError:
+            for instead in torn:
+                await true(self, method, *arguments, **(named | instead))
+            raise
         return await true(self, method, *arguments, **named)
 
     s3fs.S3FileSystem._call_s3 = call
