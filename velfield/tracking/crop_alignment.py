@@ -51,6 +51,15 @@ REWEIGHTING_ITERATIONS = 4
 CONVERGENCE_PX = 0.01
 """A step shorter than this ends the iterations."""
 
+_SHIFTS = np.array(
+    sorted(
+        ((x, y) for y in range(-MAX_SHIFT_PX, MAX_SHIFT_PX + 1) for x in range(-MAX_SHIFT_PX, MAX_SHIFT_PX + 1)),
+        key=lambda shift: (shift[0] ** 2 + shift[1] ** 2, shift[1], shift[0]),
+    )
+)
+_SPREAD, _PIECE = 5, 16
+"""Pixels of the search come in so many passes over the car; after each piece of so many it may be given up."""
+
 
 @dataclass(frozen=True)
 class UprightCrops:
@@ -202,40 +211,41 @@ def _car_pixels(weight):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _integer_shift(template, image, weight, image_weight, rows, columns):  # type: ignore[no-untyped-def]
-    """Integer shift of minimum mean absolute difference over the pixels on the car in both."""
-    best, best_x, best_y = np.inf, 0, 0
-    min_weight, most = 0.125 * np.sum(weight), 0.0
-    for i in range(0, rows.size, 2):
-        most += weight[rows[i], columns[i]]
-    # Whatever is farther off than no shift is given up half-way: it cannot be the least.
-    total, weights = _absolute_differences(template, image, weight, image_weight, rows, columns, 0, 0, np.inf)
-    limit = most * total / weights if weights > min_weight else np.inf
-    for dy in range(-MAX_SHIFT_PX, MAX_SHIFT_PX + 1):
-        for dx in range(-MAX_SHIFT_PX, MAX_SHIFT_PX + 1):
-            total, weights = _absolute_differences(
-                template, image, weight, image_weight, rows, columns, dx, dy, min(limit, most * best) + 1e-6
-            )
-            if weights > min_weight and total < best * weights:
-                best, best_x, best_y = total / weights, dx, dy
-    return best_x, best_y
-
-
-@njit(cache=True, nogil=True)
-def _absolute_differences(template, image, weight, image_weight, rows, columns, dx, dy, limit):  # type: ignore[no-untyped-def]
-    """Weighted sum of absolute differences at a shift, and the sum of the weights, over half of the pixels, which
-    suffices here; infinite as soon as it exceeds a limit."""
-    side = template.shape[0]
-    total, weights = 0.0, 0.0
-    for i in range(0, rows.size, 2):
-        y, x = rows[i] + dy, columns[i] + dx
-        if 0 <= y < side and 0 <= x < side:
-            here_y, here_x, there_y, there_x = np.uint64(rows[i]), np.uint64(columns[i]), np.uint64(y), np.uint64(x)
-            w = min(weight[here_y, here_x], image_weight[there_y, there_x])
-            total += w * abs(image[there_y, there_x] - template[here_y, here_x])
-            weights += w
+    """Integer shift of minimum mean absolute difference over the pixels on the car in both; over half of the pixels,
+    which suffices here."""
+    side, margin = template.shape[0], MAX_SHIFT_PX
+    width = side + 2 * margin
+    # beyond the crop's border nothing has weight
+    grey, grey_weight = np.zeros((width, width)), np.zeros((width, width))
+    grey[margin : margin + side, margin : margin + side] = image
+    grey_weight[margin : margin + side, margin : margin + side] = image_weight
+    grey_flat, weight_flat = grey.ravel(), grey_weight.ravel()
+    count = (rows.size + 1) // 2
+    here, value, own = np.empty(count, np.int64), np.empty(count), np.empty(count)
+    n, most = 0, 0.0
+    for begin in range(0, 2 * _SPREAD, 2):  # some from all over the car first
+        for i in range(begin, rows.size, 2 * _SPREAD):
+            here[n] = (rows[i] + margin) * width + columns[i] + margin
+            value[n], own[n] = template[rows[i], columns[i]], weight[rows[i], columns[i]]
+            most += own[n]
+            n += 1
+    best, best_x, best_y, min_weight = np.inf, 0, 0, 0.125 * np.sum(weight)
+    # Shortest first, as the least is among those: whatever is farther off than the best so far is soon given up.
+    for k in range(_SHIFTS.shape[0]):
+        dx, dy = _SHIFTS[k]
+        shift, limit = dy * width + dx, most * best + 1e-6
+        total, weights = 0.0, 0.0
+        for begin in range(0, count, _PIECE):
+            for i in range(begin, min(begin + _PIECE, count)):
+                there = np.uint64(here[i] + shift)
+                w = min(own[i], weight_flat[there])
+                total += w * abs(grey_flat[there] - value[i])
+                weights += w
             if total > limit:
-                return np.inf, weights
-    return total, weights
+                break
+        if total <= limit and weights > min_weight and total < best * weights:
+            best, best_x, best_y = total / weights, dx, dy
+    return best_x, best_y
 
 
 @njit(cache=True, nogil=True)
