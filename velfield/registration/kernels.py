@@ -208,8 +208,12 @@ def normal_equations(  # type: ignore[no-untyped-def]
             vx, vy = gx[k] * weight[i], gy[k] * weight[i]
             right[f, index[k]] += vx * ex + vy * ey
             row = normal[f, index[k]]
-            for j in range(k + 1):
-                row[index[j]] += vx * gx[j] + vy * gy[j]
+            for j in range(np.uint64(min(k + 1, 17))):  # the first 17 lie side by side, then each four
+                row[j] += vx * gx[j] + vy * gy[j]
+            for begin in range(17, k + 1, 4):
+                part, px_of, py_of = row[index[begin] :], gx[begin:], gy[begin:]
+                for j in range(np.uint64(min(k + 1 - begin, 4))):
+                    part[j] += vx * px_of[j] + vy * py_of[j]
     for f in range(folds):
         for k in range(p):
             for j in range(k):
@@ -268,6 +272,9 @@ def _dot(a, b, count):  # type: ignore[no-untyped-def]
     return total
 
 
+_ROWS = np.uint64(4)
+
+
 @njit(cache=True, nogil=True)
 def solve_cholesky(matrix, right):  # type: ignore[no-untyped-def]
     """Solution (p, m) of a positive definite system by Cholesky factorisation; NaN if it is not positive definite.
@@ -277,17 +284,25 @@ def solve_cholesky(matrix, right):  # type: ignore[no-untyped-def]
     p, m = np.uint64(right.shape[0]), np.uint64(right.shape[1])  # unsigned: numba checks no index for its sign
     one = np.uint64(1)
     upper = matrix.copy()  # row by row from the diagonal on, so that the inner loops run along rows
-    for j in range(p):
-        if not upper[j, j] > 0.0:
-            return np.full(right.shape, np.nan)
-        inverse = 1.0 / np.sqrt(upper[j, j])
-        for k in range(j, p):
-            upper[j, k] *= inverse
-        for i in range(j + one, p):
-            factor = upper[j, i]
-            if factor != 0.0:  # a spline's knots far apart have nothing in common
+    for first in range(np.uint64(0), p, _ROWS):
+        end = min(first + _ROWS, p)
+        for j in range(first, end):
+            if not upper[j, j] > 0.0:
+                return np.full(right.shape, np.nan)
+            inverse = 1.0 / np.sqrt(upper[j, j])
+            for k in range(j, p):
+                upper[j, k] *= inverse
+            for i in range(j + one, end):
+                factor = upper[j, i]
                 for k in range(i, p):
                     upper[i, k] -= factor * upper[j, k]
+        if end == first + _ROWS:  # four rows at once: the rest of the matrix is read and written a quarter as often
+            a, b, c, d = upper[first], upper[first + one], upper[first + one + one], upper[end - one]
+            for i in range(end, p):
+                fa, fb, fc, fd = a[i], b[i], c[i], d[i]
+                row = upper[i]
+                for k in range(i, p):
+                    row[k] = row[k] - fa * a[k] - fb * b[k] - fc * c[k] - fd * d[k]
     out = right.copy()
     for c in range(m):
         for i in range(p):
