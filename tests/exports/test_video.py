@@ -1,5 +1,6 @@
 """`velfield export --format video`, read back by PyAV."""
 
+import itertools
 from pathlib import Path
 
 import av
@@ -11,6 +12,7 @@ from schemas.export import ExportOptions
 from schemas.summary import RunSummary
 from velfield import open_run
 from velfield.errors import InputError
+from velfield.exports import video
 from velfield.exports.export import export_run
 
 WIDTH = 640
@@ -56,6 +58,23 @@ def test_a_vehicle_is_drawn_where_its_track_is(clip: Path, whole: tuple[Path, Ru
     scale = WIDTH / run.grid.width_px
     at = [(int((y + 0.5) * scale), int((x + 0.5) * scale)) for x, y in zip(fast["x0_px"], fast["y0_px"], strict=True)]
     assert np.mean([saturation[place] > 100 for place in at]) > 0.8
+
+
+def test_speeds_do_not_cover_one_another(whole: tuple[Path, RunSummary], monkeypatch: pytest.MonkeyPatch) -> None:
+    run = open_run(whole[0])
+    scene = video._Scene.of(run, ExportOptions(width_px=900))
+    written: list[tuple[str, tuple[int, int], float]] = []
+    monkeypatch.setattr(video._Scene, "_write", staticmethod(lambda image, *what: written.append(what)))
+    scene.draw(scene.base, np.ones(scene.base.shape, bool), float(np.nanmedian(run.times_s)))
+    labels = [(text, at) for text, at, _ in written if ":" not in text]
+    assert len(labels) >= 5, "the test needs vehicles that drive"
+    assert all(int(text) >= 1 for text, _ in labels)
+    boxes = []
+    for text, (x, y) in labels:
+        (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, video._LABEL_SIZE, 1)
+        boxes.append((x, y - height, x + width, y))
+    for (x0, y0, x1, y1), (u0, v0, u1, v1) in itertools.combinations(boxes, 2):
+        assert x1 <= u0 or u1 <= x0 or y1 <= v0 or v1 <= y0
 
 
 def test_a_video_that_no_player_reads_is_refused(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:

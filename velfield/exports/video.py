@@ -184,16 +184,26 @@ class _Scene:
             return
         shown = self.legend_scale.shown_speed(speed)
         heading = (ends[:, 1] - ends[:, 0]) / np.maximum(np.hypot(*(ends[:, 1] - ends[:, 0]).T), 1e-9)[:, None]
-        for place, value, along, still in zip(self._place(centre) / 2**_SHIFT, shown, heading, parked, strict=True):
-            if not still:
-                self._write_behind(image, f"{value:.0f}", place, along, length)
+        places = self._place(centre) / 2**_SHIFT
+        told = np.flatnonzero(~parked & (shown >= 0.5))  # colour tells who waits: a queue would be full of zeros
+        self._write_speeds(image, shown[told], places[told], heading[told], length)
 
-    def _write_behind(self, image: RGBImage, text: str, place: FloatArray, along: FloatArray, length: float) -> None:
-        """A speed behind its vehicle, in its own lane: beside it would be the next one's."""
-        (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, _LABEL_SIZE, 1)
-        reach = 0.5 * (length + abs(along[0]) * width + abs(along[1]) * height) + 2
-        x, y = place - reach * along
-        self._write(image, text, (round(x - width / 2), round(y + height / 2)), _LABEL_SIZE)
+    def _write_speeds(
+        self, image: RGBImage, shown: FloatArray, places: FloatArray, heading: FloatArray, length: float
+    ) -> None:
+        """Speeds behind their vehicles, in their own lanes, beside them they would be the next one's; the fastest
+        first, and none over another."""
+        taken = np.zeros((0, 4))
+        for k in np.argsort(-shown, kind="stable"):
+            text = f"{shown[k]:.0f}"
+            (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, _LABEL_SIZE, 1)
+            reach = 0.5 * (length + abs(heading[k, 0]) * width + abs(heading[k, 1]) * height) + 2
+            x, y = places[k] - reach * heading[k]
+            box = np.array([x - width / 2, y - height / 2, x + width / 2, y + height / 2])
+            if ((taken[:, :2] < box[2:] + 1) & (box[:2] - 1 < taken[:, 2:])).all(axis=1).any():
+                continue
+            taken = np.vstack([taken, box])
+            self._write(image, text, (round(box[0]), round(box[3])), _LABEL_SIZE)
 
     def _place(self, xy_px: FloatArray) -> IntArray:
         """Base pixels as OpenCV's fixed-point pixels of the video."""
