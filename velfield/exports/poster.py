@@ -111,11 +111,9 @@ def _draw_wheel(sheet: Sheet, at: Point, north_rad: float | None) -> None:
     centre, outer, inner = (at[0] + _LEGEND / 2, at[1] + 25), 12.0, 5.0
     step = 2 * pi / _WEDGES
     colours = direction_colours(np.arange(_WEDGES) * step).tolist()
-    for k, colour in enumerate(colours):
-        angles = (
-            (k - 0.5) * step,
-            (min(k + 1.5, _WEDGES - 0.5)) * step,
-        )  # a little over the next: no line between them
+    for k, colour in enumerate([*colours, colours[0]]):
+        # Each reaches over the next, the last over the first, which is drawn again: no line between them.
+        angles = (k - 0.5) * step, (k + (1.5 if k < _WEDGES else 0.5)) * step
         ring = [(outer, angles[0]), (outer, angles[1]), (inner, angles[1]), (inner, angles[0])]
         sheet.area([(centre[0] + r * cos(a), centre[1] + r * sin(a)) for r, a in ring], tuple(colour))
     names = {"up": -pi / 2} if north_rad is None else {n: north_rad + k * pi / 2 for k, n in enumerate("NESW")}

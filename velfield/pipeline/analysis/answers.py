@@ -38,12 +38,12 @@ def answers(analysis: TrafficAnalysis) -> Iterator[str]:
     yield _line("u-turns", _events(len(analysis.reversals), seconds))
     likely = [c for c in analysis.conflicts if c.probability >= 0.5]
     kinds = ", ".join(f"{sum(c.kind == k for c in likely)} {k}" for k in sorted({c.kind for c in likely}))
-    rest = f", more likely than not below 1.5 s: {kinds}" if likely else " more likely than not below 1.5 s"
-    yield _line("conflicts", _events(len(likely), seconds) + rest)
+    found = f"{len(likely)}: {kinds}" if likely else _events(0, seconds)
+    yield _line("conflicts", f"below 1.5 s, more likely than not: {found}")
     yield _line("unusual", _events(len(analysis.unusual), seconds))
-    for found in analysis.unusual[:3]:
-        track = int(analysis.trajectories.track_id[found.track])
-        yield _line("", f"{found.kind} at {found.time_s:.1f} s (frame {found.frame}, track {track}): {found.detail}")
+    for event in analysis.unusual[:3]:
+        track = int(analysis.trajectories.track_id[event.track])
+        yield _line("", f"{event.kind} at {event.time_s:.1f} s (frame {event.frame}, track {track}): {event.detail}")
 
 
 def too_short(analysis: TrafficAnalysis) -> str:
@@ -75,7 +75,7 @@ def _class_lines(analysis: TrafficAnalysis) -> Iterator[str]:
         return
     shares = analysis.classes.estimate_shares(analysis.classes.measured)
     known = [(name, share) for name, share in zip(COUNTED_CLASSES, shares, strict=True) if share is not None]
-    rest = ", ".join(f"{name} {100 * s.value:.3g} % ({100 * s.low:.3g} to {100 * s.high:.3g})" for name, s in known)
+    rest = ", ".join(f"{name} {100 * s.value:.1f} % ({100 * s.low:.1f} to {100 * s.high:.1f})" for name, s in known)
     yield _line(
         "classes", f"of {_count(len(analysis.classes.measured), 'measured vehicle')}: {rest or 'too little data'}"
     )
