@@ -67,7 +67,7 @@ export class Player {
 }
 
 const STATES: Record<string, string> = {
-  moving: "moves",
+  moving: "in traffic",
   stopped: "stopped in a lane all the time that it was seen",
   parked: "parked, or no vehicle",
 };
@@ -77,7 +77,7 @@ function classText({ measured }: Seen): [string, string][] {
   if (measured === null) return [];
   const { kind, percent, length_m } = measured;
   return [
-    ["Class", `${kind} (${percent} %)`],
+    ["Class", `${kind} (${percent < 100 ? percent : "> 99"} %)`],
     ["Length", `${length_m.toFixed(1)} m`],
   ];
 }
