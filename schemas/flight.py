@@ -232,7 +232,7 @@ class FlightConfig(Model):
     gsd_m: float | None = Field(None, ge=0.001, le=5)
     position_unit: Literal["m", "px"] | None = None
     """Of columns named x and y in the tracks of `velfield run --tracks`."""
-    """Ground sample distance of the base image, m a pixel; None: from its CRS, else speeds stay in px/s."""
+    """Ground sample distance of the base image, m a pixel; None: from its CRS, the metadata or the vehicles."""
     frames: FramesConfig = FramesConfig()
     lens: LensConfig = LensConfig()
     base: BaseConfig = BaseConfig()

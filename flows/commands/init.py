@@ -1,5 +1,6 @@
 """``velfield init``: a commented flight.yaml to start from."""
 
+import shlex
 from pathlib import Path
 
 
@@ -24,9 +25,10 @@ def init(
     fps
         Frame rate of a folder of images without timestamps.
     """
+    from flows.commands.start import own_command
     from schemas.flight import FramesConfig
     from velfield.errors import InputError
-    from velfield.pipeline.config_template import config_template, describe_source
+    from velfield.pipeline.config_template import config_template, describe_source, describe_telemetry
     from velfield.pipeline.configuration import resolve_config
     from velfield.run.commits import write_atomically
     from velfield.sources.source import probe
@@ -35,6 +37,8 @@ def init(
         raise InputError(f"{out} exists already; name another file with --out, or move it away")
     info = probe(source, frames=FramesConfig(fps=fps), timestamps=timestamps)
     write_atomically(out, config_template(str(source), info).encode())
-    print("\n".join(describe_source(info, resolve_config())))
-    print(f"{out}: try  velfield run {source} --config {out} --gsd-m METRES_A_PIXEL --out RUN")
+    print("\n".join([*describe_source(info, resolve_config()), describe_telemetry(source, info)]))
+    times = ["--timestamps", str(timestamps)] if timestamps else ["--fps", f"{fps:g}"] if fps else []
+    words = shlex.join(["run", str(source), *times, "--config", str(out), "--out", "RUN"])
+    print(f"{out}: try  {own_command()} {words}")
     return 0

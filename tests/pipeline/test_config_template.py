@@ -1,6 +1,7 @@
 """`velfield init`: its file is read back as the defaults that it lists."""
 
 import re
+import shlex
 from pathlib import Path
 
 import cv2
@@ -9,6 +10,7 @@ import pytest
 import yaml
 
 from flows.cli import app
+from tests.media import drifting, write_video
 from velfield.errors import InputError
 from velfield.pipeline.configuration import resolve_config
 
@@ -36,6 +38,27 @@ def test_what_is_written_is_the_default_and_says_what_was_found(
     assert "6 frames are processed" in text
     assert "12 frames of 64 x 48 px" in capsys.readouterr().out
     assert resolve_config(file=out) == resolve_config()
+
+
+def test_the_command_that_it_prints_is_whole(images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "my flight.yaml"
+    init(str(images), "--fps", "10", "--out", str(out))
+    words = shlex.split(capsys.readouterr().out.splitlines()[-1].partition(" try ")[2])
+    run = words[words.index("run") :]
+    assert app([*run[:-1], str(tmp_path / "RUN"), "--plan"], result_action="return_value") == 0
+
+
+def test_it_says_what_the_source_knows_of_scale_and_north(
+    images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    init(str(images), "--fps", "10", "--out", str(tmp_path / "flight.yaml"))
+    assert "Telemetry: none (the images have no position" in capsys.readouterr().out
+    write_video(tmp_path / "x.mp4", list(drifting(5)))
+    (tmp_path / "x.SRT").write_text(
+        "1\n00:00:00,000 --> 00:00:01,000\n[focal_len: 24.00] [rel_alt: 100.2 abs_alt: 134.1] [gb_yaw: 3.0]\n"
+    )
+    init(str(tmp_path / "x.mp4"), "--out", str(tmp_path / "x.yaml"))
+    assert "Telemetry: x.SRT: height, heading, focal length." in capsys.readouterr().out
 
 
 def test_it_lists_every_key_which_may_be_uncommented(images: Path, tmp_path: Path) -> None:

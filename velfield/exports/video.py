@@ -185,8 +185,8 @@ class _Scene:
         shown = self.legend_scale.shown_speed(speed)
         heading = (ends[:, 1] - ends[:, 0]) / np.maximum(np.hypot(*(ends[:, 1] - ends[:, 0]).T), 1e-9)[:, None]
         places = self._place(centre) / 2**_SHIFT
-        told = np.flatnonzero(~parked & (shown >= 0.5))  # colour tells who waits: a queue would be full of zeros
-        self._write_speeds(image, shown[told], places[told], heading[told], length)
+        moving = np.flatnonzero(~parked & (shown >= 0.5))  # colour shows who waits: a queue would be full of zeros
+        self._write_speeds(image, shown[moving], places[moving], heading[moving], length)
 
     def _write_speeds(
         self, image: RGBImage, shown: FloatArray, places: FloatArray, heading: FloatArray, length: float

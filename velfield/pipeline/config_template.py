@@ -1,6 +1,7 @@
 """A commented ``flight.yaml`` to start from: the properties of the source, and every key with its default."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,14 +9,18 @@ import yaml
 from pydantic import BaseModel
 
 from schemas.flight import PRESETS, FlightConfig
+from velfield.errors import Failure
 from velfield.pipeline.configuration import resolve_config, section_models
 from velfield.sources.frames import SourceInfo
 from velfield.sources.selection import select_frames
+from velfield.sources.telemetry.find import find_beside
+from velfield.sources.telemetry.read import read_telemetry
 
 _WIDTH = 116
 _GSD = (
     "Metres a base pixel: the ground sample distance. Known from the height and the camera, from a car (4.5 m long) or "
-    "a lane (3 to 3.7 m wide) in the image, or from a --base with coordinates. Without it speeds stay in px/s."
+    "a lane (3 to 3.7 m wide) in the image, or from a --base with coordinates. Without it the drone's metadata or the "
+    "lengths of the vehicles give it."
 )
 
 
@@ -45,6 +50,33 @@ def config_template(source: str, info: SourceInfo) -> str:
     for name, section in _sections(config):
         lines += ["", *_comment(type(section).__doc__ or "", ""), f"{name}:", *_keys(section), *_of_other_methods(name)]
     return "\n".join(lines) + "\n"
+
+
+_QUANTITY_NAMES = {
+    "height_m": "height",
+    "latitude_deg": "position",
+    "yaw_deg": "heading",
+    "pitch_deg": "tilt",
+    "focal_px": "focal length",
+    "focal_35mm": "focal length",
+    "hfov_deg": "angle of view",
+    "clock_s": "time of day",
+}
+
+
+def describe_telemetry(source: Path, info: SourceInfo) -> str:
+    """What gives scale and north of the source, in a line.
+
+    Raises
+    ------
+    InputError
+        There is a file of telemetry beside it that cannot be read.
+    """
+    found = read_telemetry(source, info, find_beside(source))
+    if isinstance(found, Failure):
+        return f"Telemetry: none ({found.reason}); the lengths of the vehicles give the scale, or gsd_m."
+    known = dict.fromkeys(_QUANTITY_NAMES[name] for name in found.known_quantities() if name in _QUANTITY_NAMES)
+    return f"Telemetry: {found.origin}: {', '.join(known)}."
 
 
 def describe_source(info: SourceInfo, config: FlightConfig) -> list[str]:
