@@ -194,6 +194,7 @@ class Georeferencer {
     find("saved").textContent = "Not saved";
     find("notes").replaceChildren();
     window.clearTimeout(this.timer);
+    if (!this.rows.length && !this.asked) return; // nothing was fitted yet that would have to be cleared
     this.timer = window.setTimeout(() => {
       void this.fit();
       this.showPlaces().catch((error: Error) => this.complain(error.message));
