@@ -46,7 +46,7 @@ def parse_klv(data: bytes, origin: str, times_s: Mapping[int, float] | None = No
         klv-parser is not installed.
     """
     if find_spec("klv_parser") is None:
-        raise InputError(f"{origin}: found MISB KLV, which {NEEDS_KLV}")
+        raise InputError(f"{origin}: found MISB KLV, which {NEEDS_KLV}, or move it elsewhere")
     packets = list(_local_sets(data))
     valid = [(offset, value) for offset, value in packets if value is not None]
     read = [(offset, _read_tags(value)) for offset, value in valid[:: -(-len(valid) // MAX_SETS) or 1]]
