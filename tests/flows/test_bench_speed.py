@@ -4,15 +4,18 @@ import re
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from flows.commands.benchmarks.speed import speed, stages_by_frame
-from schemas.flight import PRESETS
-from tests.benchmarks.long_flight import repeat_frames
+from schemas.flight import PRESETS, FramesConfig
+from tests.benchmarks.long_flight import encode_frames, repeat_frames
 from velfield.bench.detection import network_gflop
 from velfield.bench.literal import LiteralChain
 from velfield.bench.measured_run import run_measured
 from velfield.pipeline.stage import STAGE
+from velfield.sources.source import iter_frames, probe
 
 
 def test_the_networks_arithmetic_is_that_of_its_layers() -> None:
@@ -83,9 +86,24 @@ def test_a_long_flight_of_few_frames_never_jumps(tmp_path: Path) -> None:
     for k in range(4):
         (flight / f"frames/{k:05d}.png").write_bytes(bytes([k]))
     (flight / "labels.csv").write_text("frame,x_px\n00000.png,1\n00003.png,2\n")
-    long = repeat_frames(flight, tmp_path / "long", 9)
+    long = tmp_path / "long"
+    assert repeat_frames(flight, long, 9)[0] == str(long / "frames")
     shown = [path.read_bytes()[0] for path in sorted((long / "frames").iterdir())]
     assert shown == [0, 1, 2, 3, 2, 1, 0, 1, 2]
     assert (long / "labels.csv").read_text() == "frame,x_px\n00000.png,1\n"
     times = (long / "timestamps.csv").read_text().splitlines()
     assert [line.split(",")[0] for line in times[1:]] == [path.name for path in sorted((long / "frames").iterdir())]
+
+
+def test_a_long_flight_as_a_video_has_the_same_frames(tmp_path: Path) -> None:
+    flight = tmp_path / "flight"
+    (flight / "frames").mkdir(parents=True)
+    for k in range(4):
+        cv2.imwrite(str(flight / f"frames/{k:05d}.png"), np.full((64, 96), 40 * (k + 1), np.uint8))
+    (flight / "labels.csv").write_text("frame,x_px\n00000.png,1\n00003.png,2\n")
+    video, labels = encode_frames(flight, tmp_path / "long", 9)
+    info = probe(Path(video), frames=FramesConfig(every=1))
+    assert np.diff(info.times_s) == pytest.approx(0.2)
+    means = [frame.grey.mean() for frame in iter_frames(Path(video), info, range(info.frame_count))]
+    assert means == pytest.approx([40, 80, 120, 160, 120, 80, 40, 80, 120], abs=3)
+    assert Path(labels.removeprefix("--labels=")).read_text() == "frame,x_px\n0,1\n"

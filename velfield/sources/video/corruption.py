@@ -30,9 +30,9 @@ _REACH_PX = 3
 _MIN_BLOCKS = 8
 _TYPICAL_FACTOR = 3.0
 _HISTORY_FRAMES = 15
-_MIN_HISTORY_FRAMES = 3
-_DEFAULT_COUNT = 10.0
-"""New blocks a frame, the most seen in sound videos: assumed typical until there is a history."""
+_MIN_HISTORY_FRAMES = 5
+"""Before there are so many none is judged: a busy city at 5 frames a second has 50 new blocks a frame, a quiet road at
+25 none."""
 
 
 class BlockArtifactDetector:
@@ -43,24 +43,38 @@ class BlockArtifactDetector:
     some new blocks in every frame, so the threshold is a multiple of the typical number.
     """
 
+    LONGEST_AGO = _MIN_HISTORY_FRAMES - 1
+    """Of the frames that `feed` returns."""
+
     def __init__(self) -> None:
         self._previous: Float32Array | None = None
         self._counts: deque[int] = deque(maxlen=_HISTORY_FRAMES)
         self._window: Float32Array | None = None
 
-    def feed(self, grey: GreyImage) -> bool:
-        """Whether this frame, (h, w) uint8, has block artefacts."""
+    def feed(self, grey: GreyImage) -> tuple[int, ...]:
+        """The frames found to have block artefacts, by how many frames ago they were fed: 0 is this one, (h, w) uint8.
+
+        The first frames are judged together, once there are enough to know what is typical.
+        """
         factor = 1 << max(round(np.log2(grey.shape[1] / _WORK_WIDTH)), 0)
         size = (max(grey.shape[1] // factor, 1), max(grey.shape[0] // factor, 1))
         small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
         previous, self._previous = self._previous, small
         if previous is None or previous.shape != small.shape:
             self._counts.clear()
-            return False
+            return ()
         count = self._new_blocks(previous, small, max(BLOCK_PX // factor, 1), -(-_REACH_PX // factor))
-        typical = float(np.median(self._counts)) if len(self._counts) >= _MIN_HISTORY_FRAMES else _DEFAULT_COUNT
+        if len(self._counts) >= _MIN_HISTORY_FRAMES:
+            found = (0,) if count > self._limit() else ()
+            self._counts.append(count)
+            return found
         self._counts.append(count)
-        return count > _MIN_BLOCKS + _TYPICAL_FACTOR * typical
+        if len(self._counts) < _MIN_HISTORY_FRAMES:
+            return ()
+        return tuple(ago for ago, one in enumerate(reversed(self._counts)) if one > self._limit())
+
+    def _limit(self) -> float:
+        return _MIN_BLOCKS + _TYPICAL_FACTOR * float(np.median(self._counts))
 
     def _new_blocks(self, previous: Float32Array, current: Float32Array, block: int, reach: int) -> int:
         if self._window is None or self._window.shape != current.shape:

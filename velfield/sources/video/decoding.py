@@ -83,6 +83,7 @@ def _decode(path: Path, info: SourceInfo, entry: int, corruption: CorruptionTrac
             with capture_errors():
                 container.seek(int(info.pts[entry]), stream=stream, backward=True, any_frame=False)
         timestamp_index, artifacts = _TimestampIndex(info), BlockArtifactDetector()
+        recent: deque[int] = deque(maxlen=BlockArtifactDetector.LONGEST_AGO + 1)
         for packet, demux_errors in iter_packets(container, stream):
             corruption.feed(packet, timestamp_index.of_packet(packet))
             out = _decode_packet(stream, packet, demux_errors, corruption)
@@ -96,8 +97,9 @@ def _decode(path: Path, info: SourceInfo, entry: int, corruption: CorruptionTrac
                 if frame.is_corrupt:
                     corruption.mark_frame(index)
                 grey = _grey(frame)
-                if artifacts.feed(grey):
-                    corruption.mark_artifacts(index)
+                recent.append(index)
+                for ago in artifacts.feed(grey):
+                    corruption.mark_artifacts(recent[-1 - ago])
                 yield index, grey, corruption.is_suspect(index)
 
 
