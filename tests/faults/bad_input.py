@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import yaml
+from PIL import Image
 
 from schemas.flight import FlightConfig, FramesConfig
 from tests.media import drifting, write_images, write_times, write_video
@@ -200,6 +201,7 @@ def kinds(folder: Path) -> list[Kind]:
     from velfield.sources.labels.detections import read_detections
     from velfield.sources.labels.labels import read_labels
     from velfield.sources.source import probe
+    from velfield.sources.telemetry.image_tags import read_image_telemetry
     from velfield.sources.telemetry.read import read_telemetry_file
     from velfield.sources.trajectories import read_tracks
 
@@ -262,6 +264,8 @@ def kinds(folder: Path) -> list[Kind]:
         Kind("tracks (CSV)", (TRACKS, IMAGE_TRACKS), "tracks.csv", lambda path: read_tracks(path, fps=5.0), 2),
         Kind("tracks (Parquet)", (_parquet_tracks(),), "tracks.parquet", read_tracks),
         Kind("tracks (FCD)", (FCD,), "tracks.xml", read_tracks),
+        Kind("tags (JPEG)", (_tagged("JPEG"),), "x.jpg", read_image_telemetry),
+        Kind("tags (PNG)", (_tagged("PNG"), _tagged("PNG", late=True)), "x.png", read_image_telemetry),
         Kind("subtitles", (SUBTITLES,), "x.srt", read_telemetry_file, 2),
         Kind("KLV", (b"".join(KLV),), "x.klv", read_telemetry_file, 2),
         Kind("KLV, a set with its checksum", tuple(packet[:-2] for packet in KLV), "x.klv", read_klv_summed, 2),
@@ -290,6 +294,22 @@ def read_klv_summed(path: Path) -> object:
     from velfield.sources.telemetry.klv import parse_klv
 
     return parse_klv(with_checksum(path.read_bytes()), path.name)
+
+
+def _tagged(kind: str, *, late: bool = False) -> bytes:
+    """An image with EXIF and XMP; `late`: a PNG's EXIF behind its pixels."""
+    exif, out = Image.Exif(), io.BytesIO()
+    exif[0x010F] = "maker"
+    exif.get_ifd(0x8825).update({1: "N", 2: (52.0, 30.0, 0.0), 3: "W", 4: (13.0, 24.0, 0.0)})
+    exif.get_ifd(0x8769).update({0xA405: 24, 0x9003: "2024:05:01 12:00:00"})
+    xmp = {"xmp": b'<x drone-dji:RelativeAltitude="+80.2" Camera:Pitch="1/2"/>'} if kind == "JPEG" else {}
+    Image.new("L", (16, 12), 90).save(out, kind, exif=exif, **xmp)
+    data = out.getvalue()
+    if not late:
+        return data
+    start = data.index(b"eXIf") - 4
+    stop = start + 12 + int.from_bytes(data[start : start + 4])
+    return data[:start] + data[stop:-12] + data[start:stop] + data[-12:]
 
 
 def _parquet_tracks() -> bytes:
