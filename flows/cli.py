@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 
-from cyclopts import App, CycloptsError, MissingArgumentError, Parameter
+from cyclopts import App, Argument, CycloptsError, MissingArgumentError, Parameter
 
 from flows.commands.start import own_command
 from flows.launch import limit_threads
@@ -487,6 +487,12 @@ def _start() -> int:
     return start(Path.cwd())
 
 
+def _choices(argument: Argument | None) -> str:
+    """What an option may be, where that is one of some words."""
+    words = get_args(argument.hint) if argument is not None and get_origin(argument.hint) is Literal else ()
+    return f" (one of {', '.join(words)})" if words else ""
+
+
 def main() -> None:
     """Run the command; bad input is one clear line, never a traceback."""
     limit_threads()
@@ -498,7 +504,11 @@ def main() -> None:
     except MissingArgumentError as error:
         chain, missing = " ".join(error.command_chain or ()), error.keyword
         name = f"value for {missing}" if missing else getattr(error.argument, "name", "")
-        print(f"velfield: {chain}: found no {name}, which is needed; see `velfield {chain} --help`", file=sys.stderr)
+        choices = "" if missing else _choices(error.argument)
+        print(
+            f"velfield: {chain}: found no {name}, which is needed{choices}; see `velfield {chain} --help`",
+            file=sys.stderr,
+        )
         status = USAGE
     except CycloptsError as error:  # the library's own message is a box of several lines
         print(f"velfield: {' '.join(str(error).split())} `velfield COMMAND --help` lists all", file=sys.stderr)

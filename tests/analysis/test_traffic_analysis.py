@@ -16,7 +16,7 @@ from velfield.analysis.movements.movements import furness
 from velfield.analysis.signals.cycles import find_signal, queues
 from velfield.analysis.signals.phases import START_DELAY_S, fit_phases
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.analysis.trajectories import Trajectories, make_trajectories, moving
+from velfield.analysis.trajectories import Trajectories, group_rows, make_trajectories, moving
 
 STEP_S, CYCLE_S, SPEED = 0.2, 40.0, 12.0
 Track = tuple[FloatArray, FloatArray]
@@ -298,6 +298,27 @@ def test_kernels_equal_their_plain_functions(analysis: TrafficAnalysis) -> None:
     arguments = (first, samples.time_s, samples.speed_m_per_s, passes.track[rows], passes.entry_s[rows])
     assert len(slowing(*arguments)) > 10
     np.testing.assert_array_equal(slowing(*arguments), slowing.py_func(*arguments))
+
+
+def test_rows_are_grouped_in_order_and_no_other_group_is_taken() -> None:
+    group = np.array([2, 0, 2, 1, 0])
+    order, border = group_rows(group, 4)
+    assert order.tolist() == [1, 4, 3, 0, 2]
+    assert border.tolist() == [0, 2, 3, 5, 5]
+    for wrong in (-1, 4):
+        with pytest.raises(ValueError, match="not one of those"):
+            group_rows(np.array([0, wrong]), 4)
+
+
+def test_conflicts_do_not_depend_on_where_frames_are_counted_from(analysis: TrafficAnalysis) -> None:
+    """The frames of these tracks begin below 0, which wrote beyond an array."""
+    trajectories = analysis.trajectories
+    assert trajectories.frame.min() < 0
+    later = replace(trajectories, frame=trajectories.frame - trajectories.frame.min())
+    shown = [
+        [(c.kind, c.first, c.second, c.value_s) for c in one.conflicts] for one in (TrafficAnalysis(later), analysis)
+    ]
+    assert shown[0] == shown[1]
 
 
 def test_a_time_to_collision_counts_where_it_lasts() -> None:

@@ -81,3 +81,15 @@ def test_a_video_that_no_player_reads_is_refused(whole: tuple[Path, RunSummary],
     with pytest.raises(InputError, match=r"--width 9000: found a video of 9000 x \d+ px"):
         export_run(open_run(whole[0]), "video", tmp_path / "clip.mp4", ExportOptions(width_px=9000))
     assert not list(tmp_path.iterdir())
+
+
+def test_vehicles_are_drawn_as_long_as_they_were_measured(whole: tuple[Path, RunSummary]) -> None:
+    run = open_run(whole[0])
+    lengths_m = run.vehicles().set_index("track_id")["length_m"].dropna()
+    tracks = video._Tracks.of(run, 5.0)
+    drawn_m = np.unique(np.round(tracks.cars_long * video._LENGTH_M, 3))
+    known_m = set(np.round(np.maximum(lengths_m, 2 * video._WIDTH_M), 3)) | {video._LENGTH_M}
+    assert len(drawn_m) > 3
+    assert all(np.min(np.abs(np.array(sorted(known_m)) - one)) < 2e-3 for one in drawn_m)
+    boxes = video._boxes(np.zeros((2, 2)), np.array([0.0, np.pi / 2]), np.array([20.0, 50.0]), 8.0)
+    assert np.ptp(boxes, axis=1) == pytest.approx(np.array([[20.0, 8.0], [8.0, 50.0]]))

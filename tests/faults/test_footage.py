@@ -203,15 +203,13 @@ def test_a_turn_towards_the_horizon_in_mid_flight_is_reported(tmp_path: Path) ->
     assert 22 <= int(found[1]) <= 33
 
 
-@pytest.mark.parametrize("tilts_deg", [(20, 40, 60, 60), (60, 60)])
-def test_frames_of_a_turn_by_60_degrees_are_lost_with_the_reason(tmp_path: Path, tilts_deg: tuple[float, ...]) -> None:
+def test_frames_of_a_turn_by_60_degrees_are_lost_with_the_reason(tmp_path: Path) -> None:
     """The sharpest frame is one of them; the base image is of those that most frames overlap with."""
-    plan = planned(tmp_path, turned([0, 2, 0, 3, 1, *tilts_deg]), "registration", "lens.calibrate=never")
+    plan = planned(tmp_path, turned([0, 2, 0, 3, 1, 60, 60]), "registration", "lens.calibrate=never")
     compute_stages(plan, ("registration",))
     statuses = open_registration(plan.layout.registration).statuses()
-    print(statuses, register_unit(plan, range(5 + len(tilts_deg))).warnings)
     assert statuses[:5] == ["ok"] * 5
-    assert all(status.startswith("failed:") for status in statuses[-2:])
+    assert all(status.startswith("failed:") for status in statuses[5:])
 
 
 def oblique(tilt_deg: float, seed: int = 21) -> GreyImage:

@@ -15,7 +15,7 @@ from velfield.run.stores import open_registration
 from velfield.synthetic import write_flight
 
 STILL = CameraSimulation(drift_m=0, climb_share=0, turn_deg=0, tilt_deg=0, vibration_px=0)
-FRAMES = 12
+FRAMES = 10
 
 
 @pytest.fixture(scope="module")
@@ -23,9 +23,9 @@ def layout(tmp_path_factory: pytest.TempPathFactory) -> RunLayout:
     """A run without labels: its detector is trained on the few vehicles that move."""
     folder = tmp_path_factory.mktemp("mast")
     quiet = TrafficSimulation(flow_veh_per_h=500)
-    config = SimulationConfig(frames=FRAMES, width=640, height=480, seed=11, camera=STILL, traffic=quiet)
+    config = SimulationConfig(frames=FRAMES, width=560, height=420, seed=11, camera=STILL, traffic=quiet)
     write_flight(folder / "flight", config)
-    work = job(folder / "flight", folder / "run", "detection.rounds=20", "detection.feature_pool=120")
+    work = job(folder / "flight", folder / "run", "detection.rounds=10", "detection.feature_pool=60")
     plan = make_plan(work.model_copy(update={"inputs": work.inputs.model_copy(update={"labels": None})}))
     write_flight_record(plan)
     compute_stages(plan, stages_before("maps"))

@@ -47,6 +47,7 @@ def command(
     [
         (("train", "frames"), 2, "--labels"),
         (("run",), 2, "run: found no --out"),
+        (("export", "x"), 2, "export: found no --format, which is needed (one of cog, geoparquet, "),
         (("simulate", "x", "--clip"), 2, "simulate: found no value for --clip"),
         (("fly",), 2, 'Unknown command "fly"'),
         (("run", "a", "--out", "b", "--workers", "many"), 2, "--workers"),
@@ -162,14 +163,13 @@ def test_a_wrong_base_image_is_refused_before_a_frame_is_stored(
     assert checked == []
 
 
-@pytest.mark.parametrize("name", ["town", "noise"])
 def test_a_wrong_base_image_of_a_short_flight_is_refused_before_a_frame_is_registered(
-    name: str, flight: Path, bases: dict[str, Path], tmp_path: Path
+    flight: Path, bases: dict[str, Path], tmp_path: Path
 ) -> None:
     """Its frames are stored by then, which takes less time than the check."""
-    plan = make_plan(job(flight, tmp_path / "run", base=str(bases[name])))
+    plan = make_plan(job(flight, tmp_path / "run", base=str(bases["town"])))
     write_flight_record(plan)
-    with pytest.raises(InputError, match=rf"--base .*{name}\.png: {_ELSEWHERE}") as caught:
+    with pytest.raises(InputError, match=rf"--base .*town\.png: {_ELSEWHERE}") as caught:
         compute_stages(plan, stages_before("registration"))
     assert "\n" not in str(caught.value)
     assert not plan.layout.registration.exists()

@@ -83,6 +83,18 @@ def test_a_video_cut_within_the_run_yields_its_lost_frames_as_unreadable(tmp_pat
     assert "frame 55 at" in read[-1].reason
 
 
+def test_an_avi_that_repeats_images_is_no_truncated_one(tmp_path, frames):
+    """A frame that came late leaves chunks without an image before it."""
+    uneven = [0, 5, 10, 15, 25, 30, 45, 50]
+    whole = write_video(tmp_path / "a.avi", frames[:8], codec="mpeg4", times=uneven)
+    info, read = read_all(whole)
+    assert info.warnings == ()
+    assert info.times_s.tolist() == pytest.approx([k / 25 for k in uneven])
+    assert [frame.flags for frame in read] == [0] * 8
+    (tmp_path / "b.avi").write_bytes(whole.read_bytes()[: int(0.6 * whole.stat().st_size)])
+    assert any("the file is truncated" in warning for warning in probe(tmp_path / "b.avi", frames=ALL).warnings)
+
+
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("suffix", "codec"), [(".mp4", "libx264"), (".ts", "libx264"), (".avi", "mpeg4")])
 def test_no_wrong_frame_of_a_damaged_stretch_goes_unflagged(tmp_path, frames, suffix, codec, seed):

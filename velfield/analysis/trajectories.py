@@ -291,9 +291,17 @@ def within(xy_m: FloatArray, low_m: FloatArray, high_m: FloatArray) -> IntArray:
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def group_rows(group: IntArray, n: int) -> tuple[IntArray, IntArray]:
     """Rows in the order of their group (rows,), and the borders (n + 1,) of the n groups among them: a counting sort,
-    in the time of a few copies."""
+    in the time of a few copies.
+
+    Raises
+    ------
+    ValueError
+        A group is not one of 0 to n - 1.
+    """
     border = np.zeros(n + 1, np.int64)
     for k in group:
+        if k < 0 or k >= n:
+            raise ValueError("a group is not one of those that are counted")
         border[k + 1] += 1
     border = np.cumsum(border)
     order, at = np.empty(len(group), np.int64), border.copy()

@@ -172,24 +172,25 @@ class _Scene:
         ends = self.tracks.ends_px[rows]
         centre = ends[:, 0] + fraction * (ends[:, 1] - ends[:, 0])
         gsd_m = self.legend_scale.gsd_m
-        length = max(self.scale * (_UNKNOWN_LENGTH_PX if gsd_m is None else _LENGTH_M / gsd_m), _MIN_BOX_PX)
-        boxes = _boxes(centre, self.tracks.axis_rad[rows], length / self.scale)
+        car = max(self.scale * (_UNKNOWN_LENGTH_PX if gsd_m is None else _LENGTH_M / gsd_m), _MIN_BOX_PX)
+        length = car * self.tracks.cars_long[rows]
+        boxes = _boxes(centre, self.tracks.axis_rad[rows], length / self.scale, car / self.scale * _WIDTH_M / _LENGTH_M)
         corners = self._place(boxes.reshape(-1, 2)).reshape(-1, 4, 2)
         parked, speed = self.tracks.parked[rows], self.tracks.speed[rows]
         colours = np.where(parked[:, None], _PARKED, ramp_colours(speed / self.top_px_per_s))
         for box, colour in zip(corners, colours.tolist(), strict=True):
             cv2.fillConvexPoly(image, box, colour, cv2.LINE_AA, _SHIFT)
             cv2.polylines(image, [box], True, (0, 0, 0), 1, cv2.LINE_AA, _SHIFT)
-        if length < _MIN_LABELLED_PX:
+        if car < _MIN_LABELLED_PX:
             return
         shown = self.legend_scale.shown_speed(speed)
         heading = (ends[:, 1] - ends[:, 0]) / np.maximum(np.hypot(*(ends[:, 1] - ends[:, 0]).T), 1e-9)[:, None]
         places = self._place(centre) / 2**_SHIFT
         moving = np.flatnonzero(~parked & (shown >= 0.5))  # colour shows who waits: a queue would be full of zeros
-        self._write_speeds(image, shown[moving], places[moving], heading[moving], length)
+        self._write_speeds(image, shown[moving], places[moving], heading[moving], length[moving])
 
     def _write_speeds(
-        self, image: RGBImage, shown: FloatArray, places: FloatArray, heading: FloatArray, length: float
+        self, image: RGBImage, shown: FloatArray, places: FloatArray, heading: FloatArray, length: FloatArray
     ) -> None:
         """Speeds behind their vehicles, in their own lanes, beside them they would be the next one's; the fastest
         first, and none over another."""
@@ -197,7 +198,7 @@ class _Scene:
         for k in np.argsort(-shown, kind="stable"):
             text = f"{shown[k]:.0f}"
             (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, _LABEL_SIZE, 1)
-            reach = 0.5 * (length + abs(heading[k, 0]) * width + abs(heading[k, 1]) * height) + 2
+            reach = 0.5 * (length[k] + abs(heading[k, 0]) * width + abs(heading[k, 1]) * height) + 2
             x, y = places[k] - reach * heading[k]
             box = np.array([x - width / 2, y - height / 2, x + width / 2, y + height / 2])
             if ((taken[:, :2] < box[2:] + 1) & (box[:2] - 1 < taken[:, 2:])).all(axis=1).any():
@@ -216,22 +217,24 @@ class _Scene:
             cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, thickness, cv2.LINE_AA)
 
 
-def _boxes(centre: FloatArray, axis_rad: FloatArray, length_px: float) -> FloatArray:
+def _boxes(centre: FloatArray, axis_rad: FloatArray, length_px: FloatArray, width_px: float) -> FloatArray:
     """(n, 4, 2) corners of vehicles."""
-    along = np.stack([np.cos(axis_rad), np.sin(axis_rad)], axis=1) * length_px / 2
-    across = np.stack([-along[:, 1], along[:, 0]], axis=1) * (_WIDTH_M / _LENGTH_M)
+    axis = np.stack([np.cos(axis_rad), np.sin(axis_rad)], axis=1)
+    along, across = axis * length_px[:, None] / 2, np.stack([-axis[:, 1], axis[:, 0]], axis=1) * width_px / 2
     return centre[:, None] + np.stack([along + across, along - across, -along - across, -along + across], axis=1)
 
 
 @dataclass(frozen=True)
 class _Tracks:
-    """Segments of all tracks by the time of their start, (n,) each; ends (n, 2, 2)."""
+    """Segments of all tracks by the time of their start, (n,) each; ends (n, 2, 2); ``cars_long``: the length of the
+    vehicle over a car's, 1 where it was not measured."""
 
     start_s: FloatArray
     duration_s: FloatArray
     ends_px: FloatArray
     speed: FloatArray
     axis_rad: FloatArray
+    cars_long: FloatArray
     parked: Mask
 
     @classmethod
@@ -250,6 +253,7 @@ class _Tracks:
             ends_px=ends[order],
             speed=speed[order],
             axis_rad=np.where(speed > stationary_px_per_s, heading, axis)[order],
+            cars_long=np.nan_to_num(np.maximum(mine["length_m"], 2 * _WIDTH_M) / _LENGTH_M, nan=1.0)[order],
             parked=(mine["state"] == "parked").to_numpy()[order],
         )
 

@@ -171,7 +171,8 @@ def time_to_collision(
     """
     lane, along = positions_on_lanes(trajectories, graph)
     rows = np.flatnonzero(lane >= 0)
-    rows = rows[group_rows(trajectories.frame[rows], int(trajectories.frame.max(initial=0)) + 1)[0]]
+    frame = trajectories.frame[rows] - trajectories.frame.min(initial=0)
+    rows = rows[group_rows(frame, int(frame.max(initial=0)) + 1)[0]]
     rows = rows[group_rows(lane[rows], len(graph))[0]]
     _sort_along(rows, lane, trajectories.frame, along)
     owner, speed = trajectories.owner, trajectories.speed_m_per_s

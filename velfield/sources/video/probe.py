@@ -11,7 +11,7 @@ from typing import Any
 import av
 import numpy as np
 
-from schemas.arrays import FloatArray
+from schemas.arrays import FloatArray, IntArray
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
 from velfield.sources.frames import FootageLoss, SourceInfo
@@ -35,6 +35,7 @@ def probe_video(path: Path, *, frames: FramesConfig, timestamps: Path | None) ->
         declared = int(stream.frames) or None
         declared_s = _declared_seconds(container, stream)
         time_base = stream.time_base
+        repeats = container.format.name == "avi"
         warnings = _stream_warnings(stream)
         packets = demux(container, stream, path)
     warnings += _picture_warnings(path, frames.max_pixels)
@@ -50,6 +51,8 @@ def probe_video(path: Path, *, frames: FramesConfig, timestamps: Path | None) ->
         container_s = packets.pts[order] * time_base.numerator / time_base.denominator
     times_s, time_notes = _times(path, container_s, packets.pts.size, frames, timestamps)
     warnings += packets.notes + dropped + time_notes
+    if repeats and packets.stamps != "none" and _counts_as_declared(packets.pts[order], declared):
+        declared = times_s.size
     warnings += _truncation_warning(times_s, declared, declared_s if container_s is not None else None)
     return SourceInfo(
         kind="video",
@@ -156,6 +159,15 @@ def _picture_warnings(path: Path, max_pixels: int) -> tuple[str, ...]:
                 "are used as stored, and so are the coordinates of labels and detections"
             )
     return tuple(found)
+
+
+def _counts_as_declared(pts: IntArray, declared: int | None) -> bool:
+    """Whether an AVI's frames, of which its time stamps are the numbers, reach to the last that is declared.
+
+    A chunk without an image repeats the one before, and counts.
+    """
+    steps = np.diff(pts)
+    return declared is not None and int(pts[-1] - pts[0]) + int(steps.max(initial=1)) >= declared
 
 
 def _truncation_warning(times_s: FloatArray, declared: int | None, declared_s: float | None) -> tuple[str, ...]:
