@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 from scipy.optimize import linear_sum_assignment
 
+from velfield.tracking.join_costs import GapLimits
 from velfield.tracking.joins import (
     END_COLUMNS,
-    GapLimits,
     _assign,
     _assign_sparse,
     _assign_table,

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from schemas.arrays import FloatArray, IntArray
-from velfield.tracking.joins import EndContext, GapLimits, TrackEnds
+from velfield.tracking.join_costs import GapLimits, TrackEnds
+from velfield.tracking.joins import EndContext
 from velfield.tracking.recovery import Candidates, Gap, extend_tracks, fill_gap, interpolate_gap, recover_tracks
 
 DT = 0.2
@@ -34,7 +35,7 @@ def candidates(frames: IntArray, xy: FloatArray, axis: float = 0.0) -> Candidate
 
 def context(n: int, *, vanish: bool) -> EndContext:
     unknown = np.full((n, 16, 6), np.nan)
-    return EndContext(np.full(n, vanish), np.full(n, vanish), unknown, unknown)
+    return EndContext(np.full(n, vanish), np.full(n, vanish), unknown, unknown, np.full(n, np.nan))
 
 
 @pytest.mark.parametrize("forward", [True, False])

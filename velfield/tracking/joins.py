@@ -21,47 +21,22 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, min_weight_full_bipartite_matching
 
 from schemas.arrays import FloatArray, IntArray, Mask
-from schemas.flight import PAPER_GSD_M, STATIONARY_SPEED_M_PER_S
+from schemas.flight import PAPER_GSD_M
 from velfield.tracking.dimensions import looks_difference
+from velfield.tracking.join_costs import CERTAINTY_SLOPE, GapLimits, TrackEnds, find_candidates
 
-_SLACK_M = 2.0
-"""Tolerance of the prediction for a gap of no length: detections are not always at the same point of a car."""
-_ACCELERATION_CHANGE_M_PER_S2 = 4.0
-"""Change of acceleration within a gap, as from hard braking to none. Over dt it displaces a vehicle by dt^2 / 8 times
-this."""
-_MAX_OFFSET_M = 2.2
-"""Upper bound of the tolerance: half a car, so that a queue's next vehicle is not taken for it."""
-_CAR_AND_GAP_M, _HEADWAY_S, _HEADWAY_FRACTION = 6.0, 0.8, 0.35
-"""At speed the bound is this fraction of the distance to the next vehicle, which follows no closer than so."""
-
-_GAP_PENALTY_PER_S = 0.25
-"""A gap longer by a second costs as much as an offset larger by a quarter of the tolerance."""
-_STATIONARY_OFFSET_M = 1.6
-"""Tolerance for a vehicle that is stationary on both sides of the gap; another one would arrive moving."""
-_TYPICAL_ACCELERATION_M_PER_S2, _MAX_ACCELERATION_M_PER_S2, _STOP_SLACK_M = 2.0, 4.0, 0.5
-_MAX_STOP_SPEED_M_PER_S, _MAX_STOP_OFFSET_M = 5.0, 4.0
-"""Of a vehicle that stops in the gap: beyond these speeds the distance that it takes is too uncertain."""
-_STOP_COST = 0.5
 _ALONE_COST = 1.0
 """Cost of a track's end, or start, that continues in none; a pair costs at most twice as much."""
 _VANISHED_COST = 0.6
 """Of one in the middle of the frames and of the flight so much more: few vehicles vanish there, under trees."""
-_HIDDEN_COST, _MIN_HIDDEN_S = 0.2, 0.5
-_FOUND_WITHIN_M = 1.0
-"""Of a hidden vehicle: where it may come out is not known better than this, however short the gap."""
-_PACE_SD_M_PER_S, _PACE_SD_FRACTION, _FASTER_M_PER_S = 1.0, 0.35, 2.5
-"""Of a hidden vehicle: how far its mean speed is from the mean of those before and after, and how far above both it may
-be."""
-_LANE_OFFSET_M, _LANE_OFFSET_FRACTION, _MAX_BEND_RAD = 1.8, 0.05, np.radians(50)
-"""How far aside a hidden vehicle may appear, and how much its direction may differ from the way that it took."""
+_STAYS_M, _DOUBTFUL_S, _DOUBTFUL_COST = 1.6, 1.0, 0.8
+"""Of a track that stays so shortly in one place amid the frames: two of five are of no vehicle (simulated flights)."""
 _UNDECIDED_LOOKS_DIFFERENCE = 0.68
 """Of looks, in standard deviations of a strip, that one vehicle has as often on both sides as two have: the median is
 0.43 for one, 1.08 for two, the logarithm normal with a standard deviation of 0.5 for both (simulated flights)."""
 _LOOKS_WEIGHT, _MIN_LOOKS_COST, _MAX_LOOKS_COST = 1.23, -0.3, 1.3
 """Cost of looks by the logarithm of their difference over that, which is a log likelihood ratio in units of cost; and
 its limits."""
-_CERTAINTY_OFFSET, _CERTAINTY_SLOPE = 0.0, 3.0
-"""Log odds that a join is right, from what the total would cost more without it."""
 _MIN_PROBABILITY = 0.9
 """A join of a lower probability is not made."""
 _VELOCITY_SLACK_M_PER_S = 1.5
@@ -69,37 +44,10 @@ _VELOCITY_SLACK_M_PER_S = 1.5
 link's time."""
 _MAX_TABLE = 250_000
 """Ends times starts of a group up to which they are assigned by a table of all."""
-_PAIRS_AT_ONCE, _LOOKS_AT_ONCE = 100_000, 20_000
+_LOOKS_AT_ONCE = 20_000
 _NEIGHBOURHOOD, _SURE_MARGIN = 80, 1.5
 """Ends and starts around a join among which another assignment without it is looked for; not where the best other
 partners of both sides show already that the total would cost so much more."""
-
-
-@dataclass(frozen=True)
-class TrackEnds:
-    """One end of each track: frame (n,), time (n,) s, position (n, 2) m, velocity (n, 2) m/s."""
-
-    frame: IntArray
-    time_s: FloatArray
-    position_m: FloatArray
-    velocity_m_per_s: FloatArray
-
-    @property
-    def speed_m_per_s(self) -> FloatArray:
-        return np.asarray(np.hypot(self.velocity_m_per_s[:, 0], self.velocity_m_per_s[:, 1]))
-
-
-@dataclass(frozen=True)
-class GapLimits:
-    """Longest gaps that are closed, s: of a vehicle that drives on, of one that stands, and of one that is hidden.
-
-    A vehicle slower than ``stationary_speed_m_per_s`` on both sides is stationary.
-    """
-
-    moving_s: float
-    stationary_s: float = 0.0
-    hidden_s: float = 0.0
-    stationary_speed_m_per_s: float = STATIONARY_SPEED_M_PER_S
 
 
 END_COLUMNS = [
@@ -120,12 +68,15 @@ class EndContext:
     end_looks, start_looks
         (tracks, 16, 6) mean looks before the end and after the start (`velfield.tracking.dimensions.looks`); NaN where
         unknown.
+    length_m
+        (tracks,) length of each vehicle that is certain to be exceeded by few; NaN where unknown.
     """
 
     end_vanishes: Mask
     start_vanishes: Mask
     end_looks: FloatArray
     start_looks: FloatArray
+    length_m: FloatArray
 
 
 @dataclass(frozen=True)
@@ -189,18 +140,17 @@ def close_gaps(
     open_end, open_start
         (tracks,) whether each end, or start, may be joined; None: all.
     """
-    pairs, cost = _candidates(ends, starts, gaps)
+    pairs, cost = find_candidates(ends, starts, gaps, None if context is None else context.length_m)
     if open_end is not None and open_start is not None:
         may = open_end[pairs[:, 0]] & open_start[pairs[:, 1]]
         pairs, cost = pairs[may], cost[may]
-    alone = np.full((2, len(ids)), _ALONE_COST)
+    alone = _cost_alone(pairs, ends, starts, context)
     if context is not None:
-        alone += _VANISHED_COST * np.stack([context.end_vanishes, context.start_vanishes])
         blocks = np.split(pairs, range(_LOOKS_AT_ONCE, len(pairs), _LOOKS_AT_ONCE))  # 1.5 kB a pair
         looks = [_cost_of_looks(context.end_looks[one[:, 0]], context.start_looks[one[:, 1]]) for one in blocks]
         cost = cost + np.concatenate(looks)
-    joined, margin = _assign(pairs, alone[0, pairs[:, 0]] + alone[1, pairs[:, 1]] - cost)
-    probability = 1 / (1 + np.exp(-_CERTAINTY_OFFSET - _CERTAINTY_SLOPE * margin))
+    joined, margin = _assign(pairs, alone.sum(axis=0) - cost)
+    probability = 1 / (1 + np.exp(-CERTAINTY_SLOPE * margin))
     if context is not None:
         sure = probability >= _MIN_PROBABILITY
         joined, probability = joined[sure], probability[sure]
@@ -216,6 +166,20 @@ def close_gaps(
         }
     )
     return ClosedGaps(tracks, joins.sort_values(["end_time_s", "before"], ignore_index=True))
+
+
+def _cost_alone(pairs: IntArray, ends: TrackEnds, starts: TrackEnds, context: EndContext | None) -> FloatArray:
+    """(2, m) what it costs to leave the end and the start of each candidate pair alone."""
+    if context is None:
+        return np.full((2, len(pairs)), _ALONE_COST)
+    alone = _ALONE_COST + _VANISHED_COST * np.stack(
+        [context.end_vanishes[pairs[:, 0]], context.start_vanishes[pairs[:, 1]]]
+    )
+    doubtful = np.hypot(*(ends.position_m - starts.position_m).T) <= _STAYS_M
+    doubtful &= (ends.time_s - starts.time_s <= _DOUBTFUL_S) & context.end_vanishes & context.start_vanishes
+    sides = doubtful[pairs.T]
+    # two of them in one place are one thing, whatever it is
+    return np.where(sides & (sides[0] ^ sides[1]), _DOUBTFUL_COST, alone)
 
 
 def find_ends(tracklets: pd.DataFrame, track: IntArray, count: int, gsd_m: float | None) -> tuple[TrackEnds, TrackEnds]:
@@ -276,101 +240,6 @@ def _cost_of_looks(before: FloatArray, after: FloatArray) -> FloatArray:
     difference = looks_difference(before, after)
     ratio = np.log(np.maximum(difference, 1e-3) / _UNDECIDED_LOOKS_DIFFERENCE)
     return np.nan_to_num(np.clip(_LOOKS_WEIGHT * ratio, _MIN_LOOKS_COST, _MAX_LOOKS_COST))
-
-
-def _candidates(ends: TrackEnds, starts: TrackEnds, gaps: GapLimits) -> tuple[IntArray, FloatArray]:
-    """(m, 2) ends and starts that may be one vehicle's, and the cost (m,) of joining each: 0 as predicted, 1 at the
-    tolerance, and a longer gap more."""
-    order = np.argsort(starts.time_s, kind="stable")
-    times = starts.time_s[order]
-    longest = max(gaps.moving_s, gaps.stationary_s, gaps.hidden_s)
-    low = np.searchsorted(times, ends.time_s, side="right")
-    high = np.searchsorted(times, ends.time_s + longest, side="right")
-    count = np.maximum(high - low, 0)
-    found = []
-    for block in np.split(np.arange(len(count)), np.flatnonzero(np.diff(np.cumsum(count) // _PAIRS_AT_ONCE)) + 1):
-        end = np.repeat(block, count[block])
-        within = np.arange(len(end)) - np.repeat(np.cumsum(count[block]) - count[block], count[block])
-        start = order[low[end] + within]
-        ways = (_cost_in_motion, _cost_of_stop, _cost_when_hidden)
-        cost = np.min([way(ends, starts, end, start, gaps) for way in ways], axis=0)
-        near = np.flatnonzero(np.isfinite(cost))
-        found.append(np.stack([cost[near], end[near], start[near]], axis=1))
-    table = np.concatenate(found) if found else np.empty((0, 3))
-    pairs = table[:, 1:].astype(np.int64)
-    rank = np.lexsort((pairs[:, 1], pairs[:, 0], table[:, 0]))
-    return pairs[rank], table[rank, 0]
-
-
-def _cost_in_motion(ends: TrackEnds, starts: TrackEnds, end: IntArray, start: IntArray, gaps: GapLimits) -> FloatArray:
-    """Of gaps in which a vehicle drives on, its acceleration nearly constant; inf beyond the tolerance."""
-    gap = starts.time_s[start] - ends.time_s[end]
-    displacement = starts.position_m[start] - ends.position_m[end]
-    mean = (ends.velocity_m_per_s[end] + starts.velocity_m_per_s[start]) / 2
-    speed = np.hypot(*mean.T)
-    offset = np.hypot(*(displacement - mean * gap[:, None]).T)
-    nearest = np.maximum(_MAX_OFFSET_M, _HEADWAY_FRACTION * (_CAR_AND_GAP_M + _HEADWAY_S * speed))
-    relative = offset / np.minimum(_SLACK_M + _ACCELERATION_CHANGE_M_PER_S2 * gap**2 / 8, nearest)
-    return np.where((relative <= 1) & (gap <= gaps.moving_s), relative + _GAP_PENALTY_PER_S * gap, np.inf)
-
-
-def _cost_of_stop(ends: TrackEnds, starts: TrackEnds, end: IntArray, start: IntArray, gaps: GapLimits) -> FloatArray:
-    """Of gaps in which a vehicle stops and sets off again, or stands throughout; inf beyond the tolerance.
-
-    It brakes from one velocity to rest and accelerates to the other along one line: how far that takes it follows from
-    the speeds, whatever the gap.
-    """
-    gap = starts.time_s[start] - ends.time_s[end]
-    displacement = starts.position_m[start] - ends.position_m[end]
-    before, after = ends.speed_m_per_s[end], starts.speed_m_per_s[start]
-    stands = (before < gaps.stationary_speed_m_per_s) & (after < gaps.stationary_speed_m_per_s)
-    standing = np.hypot(*displacement.T) / _STATIONARY_OFFSET_M
-    heading = ends.velocity_m_per_s[end] + starts.velocity_m_per_s[start]
-    heading = heading / np.maximum(np.hypot(*heading.T), 1e-9)[:, None]
-    expected = (before**2 + after**2) / (2 * _TYPICAL_ACCELERATION_M_PER_S2)
-    along = np.sum(displacement * heading, axis=1)
-    across = heading[:, 0] * displacement[:, 1] - heading[:, 1] * displacement[:, 0]
-    stopping = np.hypot(
-        (along - expected) / np.minimum(_SLACK_M + 0.5 * expected, _MAX_STOP_OFFSET_M), across / _SLACK_M
-    )
-    possible = (gap >= (before + after) / _MAX_ACCELERATION_M_PER_S2) & (
-        np.maximum(before, after) <= _MAX_STOP_SPEED_M_PER_S
-    )
-    possible &= along >= (before**2 + after**2) / (2 * _MAX_ACCELERATION_M_PER_S2) - _STOP_SLACK_M
-    relative = np.where(stands, standing, np.where(possible, stopping, np.inf))
-    return np.where((relative <= 1) & (gap <= gaps.stationary_s), relative + _STOP_COST, np.inf)
-
-
-def _cost_when_hidden(
-    ends: TrackEnds, starts: TrackEnds, end: IntArray, start: IntArray, gaps: GapLimits
-) -> FloatArray:
-    """Of gaps in which a vehicle keeps to its way at an unknown, moderate pace; inf where it cannot be.
-
-    A vehicle that is at rest on one side goes the way that the other side gives.
-    """
-    gap = starts.time_s[start] - ends.time_s[end]
-    displacement = starts.position_m[start] - ends.position_m[end]
-    distance = np.hypot(*displacement.T)
-    before, after = ends.speed_m_per_s[end], starts.speed_m_per_s[start]
-    heading = ends.velocity_m_per_s[end] + starts.velocity_m_per_s[start]
-    heading = heading / np.maximum(np.hypot(*heading.T), 1e-9)[:, None]
-    along = np.sum(displacement * heading, axis=1)
-    across = np.abs(heading[:, 0] * displacement[:, 1] - heading[:, 1] * displacement[:, 0])
-    bend = np.zeros(len(start))
-    for velocity, speed in ((ends.velocity_m_per_s[end], before), (starts.velocity_m_per_s[start], after)):
-        cos = np.sum(displacement * velocity, axis=1) / np.maximum(distance * speed, 1e-9)
-        directed = (speed > gaps.stationary_speed_m_per_s) & (distance > _CAR_AND_GAP_M / 2)
-        bend = np.where(directed, np.maximum(bend, np.arccos(np.clip(cos, -1, 1))), bend)
-    mean, pace = (before + after) / 2, along / np.maximum(gap, 1e-9)
-    pace_sd = _PACE_SD_M_PER_S + _PACE_SD_FRACTION * mean
-    aside = _LANE_OFFSET_M + _LANE_OFFSET_FRACTION * distance
-    relative = np.hypot((pace - mean) / pace_sd / 1.5, across / aside)
-    # the larger the area in which the vehicle may come out, the less one that comes out at a place speaks for it: the
-    # normalisation of a density, whose logarithm over the slope of the certainty is a cost
-    area = np.hypot(_FOUND_WITHIN_M, pace_sd * gap) * aside / _LANE_OFFSET_M
-    possible = (gap >= _MIN_HIDDEN_S) & (gap <= gaps.hidden_s) & (bend <= _MAX_BEND_RAD) & (relative <= 1.2)
-    possible &= (along > 0) & (pace <= np.maximum(before, after) + _FASTER_M_PER_S)
-    return np.where(possible, _HIDDEN_COST + relative + np.log(area) / _CERTAINTY_SLOPE, np.inf)
 
 
 def _assign(pairs: IntArray, gain: FloatArray) -> tuple[IntArray, FloatArray]:

@@ -17,7 +17,8 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, IntArray, Mask
-from velfield.tracking.joins import EndContext, GapLimits, TrackEnds, close_gaps, component_minimum
+from velfield.tracking.join_costs import GapLimits, TrackEnds
+from velfield.tracking.joins import EndContext, close_gaps, component_minimum
 
 _MAX_MISSED_S = 0.75
 """An end is not extended any more when so long nothing was found."""

@@ -19,7 +19,8 @@ from velfield.run.tables import empty_table, read_patches, read_tables, write_ta
 from velfield.tracking.association import LinkedTriples, tracklet_table, window_frames
 from velfield.tracking.dimensions import STRIP_SHAPE, direction_of_axes, looks, measure, sample_tracks
 from velfield.tracking.gates import Limits, triples_pass
-from velfield.tracking.joins import END_COLUMNS, EndContext, GapLimits, TrackEnds, assign_tracks, find_ends
+from velfield.tracking.join_costs import GapLimits, TrackEnds
+from velfield.tracking.joins import END_COLUMNS, EndContext, assign_tracks, find_ends
 from velfield.tracking.recovery import Candidates, Recovered, find_doubles, interpolate_gap, recover_tracks
 
 _MIDDLE = ["frame_1", "time_1_s", "x_1_px", "y_1_px"]
@@ -301,7 +302,15 @@ def find_context(plan: Plan, ends: TrackEnds, starts: TrackEnds, strips: StripSu
         _stays_inside(maps, starts, -1, metres) & (starts.time_s - first_s > _HIDDEN_S),
         looks(strips.mean(2)),
         looks(strips.mean(1)),
+        _certain_length(strips) * metres,
     )
+
+
+def _certain_length(strips: StripSums) -> FloatArray:
+    """(chains,) px: the mean less a standard deviation; NaN where unknown."""
+    found = measure_tracks(strips, strips.ids).set_index("track_id")
+    length = (found["length_px"] - found["length_sd_px"]).reindex(strips.ids)
+    return np.asarray(length, dtype=np.float64)
 
 
 def _stays_inside(maps: FrameTransforms, ends: TrackEnds, sign: int, metres: float) -> Mask:
