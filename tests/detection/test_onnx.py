@@ -148,21 +148,100 @@ def test_a_model_gets_the_input_range_of_the_documentation(dtype: str, highest: 
     """A model whose output is its input: white is 1 of floats, 255 of bytes; all three channels are equal."""
     kind = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
     graph = helper.make_graph(
-        [helper.make_node("Identity", ["images"], ["output0"])],
+        [helper.make_node("Reshape", ["images", "shape"], ["output0"])],
         "same",
         [helper.make_tensor_value_info("images", kind, [1, 3, TILE, TILE])],
-        [helper.make_tensor_value_info("output0", kind, [1, 3, TILE, TILE])],
+        [helper.make_tensor_value_info("output0", kind, [1, TILE * TILE // 2, 6])],
+        [numpy_helper.from_array(np.array([1, -1, 6]), "shape")],
     )
     path = tmp_path / "same.onnx"
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), str(path))
-    path.with_suffix(".yaml").write_text("layout: boxes\nclasses: [car]\nvehicles: [0]\n")
+    path.with_suffix(".yaml").write_text("layout: end_to_end\nclasses: [car]\nvehicles: [0]\n")
     detector = load_detector(path)
     assert isinstance(detector, OnnxDetector)
     grey = np.zeros((TILE, TILE), np.uint8)
     grey[:, 5:] = 255
-    seen = detector._run(grey)
+    seen = detector._run(grey).reshape(3, TILE, TILE)
     assert (seen.dtype, seen.min(), seen.max()) == (np.dtype(dtype), 0.0, highest)
     assert (seen == seen[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("layout: end_to_end\nclasses: [tree, car, bus]\nvehicles: [1]\n", r"\(1, n, 6\) of the layout end_to_end;"),
+        (
+            "layout: oriented_boxes\nclasses: [tree, car, bus]\nvehicles: [1]\n",
+            r"\(1, 5 \+ 3 classes, n\) of the layout",
+        ),
+        (
+            "layout: boxes\nclasses: [tree, car]\nvehicles: [1]\n",
+            r"found an output of \(1, 7, 256\), expected \(1, 4 \+ 2 ",
+        ),
+        ("layout: boxes\nvehicles: [3]\n", r"expected \(1, 8 or more, n\)"),
+        (
+            "layout: boxes\nclasses: [tree, car, bus]\nvehicles: [1, 3]\n",
+            r"m\.yaml: found vehicles: 3, .* 0 to 2 \(tree, car",
+        ),
+        ("layout: boxes\nvehicles: [-1]\n", "found vehicles: -1, expected numbers from 0 on"),
+        ("layout: boxes\nclasses: [tree, car, bus]\nvehicles: []\n", "found vehicles: none, expected numbers"),
+        ("layout: boxes\nclasses: [tree, car, bus]\nvehicles: [car]\n", r"found 'car', expected the number of a class"),
+        ("layuot: boxes\n", "layuot: no such key, did you mean 'layout'"),
+        ("layout: boxes\nclasses: [tree, car\nvehicles: [1]\n", "not YAML at line 3, expected"),
+    ],
+)
+def test_a_description_that_does_not_fit_its_model_is_refused(text: str, message: str, tmp_path: Path) -> None:
+    """The columns of another layout would be read without an error."""
+    path = tiny_yolo(tmp_path / "m.onnx", "boxes", metadata=False)
+    path.with_suffix(".yaml").write_text(text)
+    with pytest.raises(InputError, match=message) as error:
+        load_detector(path)
+    assert "\n" not in str(error.value)
+
+
+def with_open_output(model: onnx.ModelProto) -> None:
+    for k in (1, 2):
+        model.graph.output[0].type.tensor_type.shape.dim[k].dim_param = f"size{k}"
+    model.metadata_props.clear()
+
+
+def with_fractions(model: onnx.ModelProto) -> None:
+    box = next(one for one in model.graph.initializer if one.name == "c0")
+    box.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(box) / np.float32(TILE), "c0"))
+
+
+def test_an_output_that_shows_only_at_an_image_is_refused(image: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    path = changed(tmp_path / "m.onnx", with_open_output)
+    path.with_suffix(".yaml").write_text("layout: boxes\nclasses: [tree, car]\nvehicles: [1]\n")
+    detector = load_detector(path)
+    with pytest.raises(InputError, match=r"found an output of \(1, 7, 256\), expected \(1, 4 \+ 2 classes, n\)"):
+        detector.detect_raw(image[0])
+
+
+def test_boxes_in_fractions_of_the_input_are_refused(image: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    detector = load_detector(changed(tmp_path / "m.onnx", with_fractions))
+    assert detector.detect_raw(np.zeros_like(image[0]), threshold=0.5).empty
+    with pytest.raises(InputError, match="as fractions of its sides would lie, expected pixels; multiply"):
+        detector.detect_raw(image[0], threshold=0.5)
+
+
+def with_unused_weight(model: onnx.ModelProto) -> None:
+    model.graph.initializer.append(numpy_helper.from_array(np.zeros(1, np.float32), "nobody's"))
+
+
+def test_onnxruntime_prints_nothing_of_how_a_graph_was_exported(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    load_detector(changed(tmp_path / "m.onnx", with_unused_weight))
+    assert capfd.readouterr().err == ""
+
+
+def test_models_in_other_formats_and_folders_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "best.pt").write_bytes(b"PK")
+    with pytest.raises(InputError, match=r"found a model as \.pt, expected \.onnx .*; export it as ONNX"):
+        load_detector(tmp_path / "best.pt")
+    with pytest.raises(InputError, match="found a folder, expected a file"):
+        load_detector(tmp_path)
 
 
 def test_models_that_cannot_be_used_are_refused(tmp_path: Path) -> None:

@@ -315,6 +315,19 @@ _RECORD: TypeAdapter[DetectorRecord] = TypeAdapter(DetectorRecord)
 
 ONNX_SUFFIX = ".onnx"
 """Of another maker's network: see `velfield.detection.onnx`."""
+_OTHER_FORMATS = (
+    ".pt",
+    ".pth",
+    ".torchscript",
+    ".engine",
+    ".tflite",
+    ".pb",
+    ".h5",
+    ".keras",
+    ".mlmodel",
+    ".safetensors",
+)
+"""Those that the trainers of such networks write, and that are not read."""
 
 
 def load_detector(path: Path) -> Detector:
@@ -327,12 +340,18 @@ def load_detector(path: Path) -> Detector:
     """
     if not path.is_file():
         raise InputError(
-            f"{path}: no such detector file; give one that `velfield train` wrote, or leave the option out"
+            f"{path}: found {'a folder' if path.is_dir() else 'no such detector file'}, expected a file: one that "
+            "`velfield train` wrote, or an ONNX model; give its path, or leave the option out"
         )
     if path.suffix.lower() == ONNX_SUFFIX:
         from velfield.detection.onnx.detector import OnnxDetector
 
         return OnnxDetector.from_file(path)
+    if path.suffix.lower() in _OTHER_FORMATS:
+        raise InputError(
+            f"{path}: found a model as {path.suffix}, expected .onnx (or a detector.json); export it as ONNX "
+            "(docs/detection.md#another-detector)"
+        )
     if path.stat().st_size > MAX_BYTES:
         raise InputError(
             f"{path}: found {path.stat().st_size} bytes, expected {MAX_BYTES} at most; give a detector file as "

@@ -185,6 +185,8 @@ class Network:
 
 
 _CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
+_ERRORS = 3
+"""Of onnxruntime's levels of severity: its warnings are of how a graph was exported, many lines in each process."""
 _device: Device = "auto"
 
 
@@ -227,6 +229,7 @@ def open_session(model: bytes, device: Device) -> ort.InferenceSession:
     check_device(device)
     options = ort.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = _ERRORS
     providers: list[Any] = [_CPU]
     if uses_cuda(device):
         providers.insert(0, (_CUDA, {"use_tf32": "0"}))  # with its shorter mantissa scores would differ visibly

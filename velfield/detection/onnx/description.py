@@ -3,12 +3,14 @@
 import ast
 import hashlib
 from collections.abc import Iterator
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import onnx
 import yaml
 from pydantic import ValidationError
+from pydantic_core import ErrorDetails
 
 from schemas.detector import OnnxDescription, OnnxLayout, OnnxRecord
 from schemas.model import load_yaml
@@ -20,6 +22,14 @@ _VEHICLES = (
     *("small vehicle", "large vehicle", "small car", "light vehicle", "heavy vehicle", "motor vehicle", "freight car"),
 )
 _THRESHOLD, _DEFAULT_SIDE_PX, _MIN_SIDE_PX, _MAX_SIDE_PX = 0.25, 640, 32, 8192
+_COLUMNS: dict[OnnxLayout, int] = {
+    "boxes": 4,
+    "oriented_boxes": 5,
+    "boxes_with_objectness": 5,
+    "end_to_end": 6,
+    "end_to_end_oriented": 7,
+}
+"""Of a box, those of its classes' scores aside."""
 _ASK = "describe it in a YAML of its name beside it (docs/detection.md)"
 
 
@@ -60,6 +70,8 @@ def describe_model(path: Path, car_length_px: float = 16.0) -> OnnxRecord:
     metadata = {one.key: one.value for one in model.metadata_props}
     names = given.classes or _class_names(metadata.get("names", ""))
     layout = given.layout or _layout(path, metadata, _sizes(boxes), names)
+    vehicles = _vehicles(path, names) if given.vehicles is None else _given_vehicles(path, given.vehicles, names)
+    check_output(path.name, _sizes(boxes), layout, names, vehicles)
     return OnnxRecord(
         working_car_length_px=car_length_px,
         threshold=_THRESHOLD if given.threshold is None else given.threshold,
@@ -67,9 +79,47 @@ def describe_model(path: Path, car_length_px: float = 16.0) -> OnnxRecord:
         digest=hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest(),
         layout=layout,
         classes=names,
-        vehicles=given.vehicles if given.vehicles is not None else _vehicles(path, names),
+        vehicles=vehicles,
         tile_px=_tile(path, given, metadata, _sizes(image)),
     )
+
+
+def check_output(
+    name: str, sizes: tuple[int | None, ...], layout: OnnxLayout, classes: tuple[str, ...], vehicles: tuple[int, ...]
+) -> None:
+    """Refuse an output that is not of a layout: its columns would be read as others, without an error.
+
+    Parameters
+    ----------
+    name
+        Of the model, for the message.
+    sizes
+        Of the output, (1, ...); None where the model leaves one open.
+    layout, classes, vehicles
+        As in `OnnxRecord`.
+
+    Raises
+    ------
+    InputError
+        Another number of dimensions, or of rows or columns.
+    """
+    extra = _COLUMNS[layout]
+    axis = 1 if layout in ("boxes", "oriented_boxes") else 2
+    if layout.startswith("end_to_end"):
+        least, most, expected = extra, extra, str(extra)
+    elif classes:
+        least = most = extra + len(classes)
+        expected = f"{extra} + {len(classes)} classes"
+    else:  # they may be left out, where the numbers of the vehicles are given
+        least, most = extra + max(vehicles) + 1, None
+        expected = f"{least} or more"
+    size = sizes[axis] if len(sizes) == 3 else 0
+    if size is not None and (size < least or (most is not None and size > most)):
+        wanted = f"(1, {expected}, n)" if axis == 1 else f"(1, n, {expected})"
+        raise InputError(
+            f"{name}: found an output of {sizes}, expected {wanted} of the layout {layout}; give its layout and all "
+            "of its classes in a YAML of its name beside it (docs/detection.md)"
+        )
 
 
 def _tensors(graph: onnx.GraphProto) -> Iterator[onnx.TensorProto]:
@@ -90,15 +140,23 @@ def _read_yaml(path: Path) -> OnnxDescription:
     try:
         return OnnxDescription.model_validate(load_yaml(path.read_text(encoding="utf-8")) or {})
     except ValidationError as error:
-        faults = "; ".join(_fault(one["loc"], one["msg"]) for one in error.errors())
+        faults = "; ".join(_fault(one) for one in error.errors())
         keys = ", ".join(OnnxDescription.model_fields)
         raise InputError(f"{path.name}: {faults}; expected the keys {keys}; fix them") from None
-    except (yaml.YAMLError, UnicodeDecodeError):
-        raise InputError(f"{path.name}: this is not YAML, expected a description of the model; fix it") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        mark = getattr(error, "problem_mark", None)
+        place = "" if mark is None else f" at line {mark.line + 1}"
+        raise InputError(f"{path.name}: this is not YAML{place}, expected a description of the model; fix it") from None
 
 
-def _fault(place: tuple[int | str, ...], problem: str) -> str:
-    return f"{'.'.join(map(str, place)) or 'the file'}: {problem[:1].lower()}{problem[1:]}"
+def _fault(error: ErrorDetails) -> str:
+    place, problem = ".".join(map(str, error["loc"])) or "the file", error["msg"]
+    if error["type"] == "extra_forbidden":
+        close = get_close_matches(place, list(OnnxDescription.model_fields), n=1, cutoff=0.5)
+        return f"{place}: no such key" + (f", did you mean {close[0]!r}?" if close else "")
+    if error["loc"][:1] == ("vehicles",) and error["type"].startswith("int"):
+        return f"{place}: found {str(error['input'])[:40]!r}, expected the number of a class, the first is 0"
+    return f"{place}: {problem[:1].lower()}{problem[1:]}"
 
 
 def _class_names(text: str) -> tuple[str, ...]:
@@ -141,6 +199,19 @@ def _vehicles(path: Path, names: tuple[str, ...]) -> tuple[int, ...]:
             "list their numbers as `vehicles: [...]` in a YAML of its name beside it"
         )
     return found
+
+
+def _given_vehicles(path: Path, vehicles: tuple[int, ...], names: tuple[str, ...]) -> tuple[int, ...]:
+    """Those of the YAML, where they are numbers of classes: others would match no box, without an error."""
+    highest = len(names) - 1 if names else None
+    wrong = [one for one in vehicles if one < 0 or (highest is not None and one > highest)]
+    if wrong or not vehicles:
+        found = ", ".join(map(str, wrong)) if wrong else "none"
+        expected = "numbers from 0 on" if highest is None else f"numbers from 0 to {highest} ({', '.join(names)[:120]})"
+        raise InputError(
+            f"{path.with_suffix('.yaml').name}: found vehicles: {found}, expected {expected}; correct them"
+        )
+    return vehicles
 
 
 def _tile(

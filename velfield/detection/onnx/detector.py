@@ -20,12 +20,14 @@ from schemas.detector import OnnxRecord
 from velfield.detection.cnn.network import current_device, open_session
 from velfield.detection.detector import Detections, Detector
 from velfield.detection.onnx.boxes import Boxes, cut_tile, decode, suppress, tile_corners, whole_in_tile
-from velfield.detection.onnx.description import describe_model
+from velfield.detection.onnx.description import check_output, describe_model
 from velfield.detection.orientation import fill_missing_orientation
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 
 _AXIS_SD_RAD = 0.1
+_FRACTION = 1.5
+"""Boxes in fractions of the input end below this, those beyond its edge too; in pixels no vehicle is as small."""
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 
 
@@ -74,6 +76,7 @@ class OnnxDetector(Detector):
             found = decode(
                 self._run(cut_tile(grey, corner, tile_px)), self.record.layout, self.record.vehicles, min_score
             )
+            self._check_unit(found)
             whole = found.take(whole_in_tile(found, corner, tile_px, shape))
             parts.append(Boxes(whole.xy + np.array(corner), whole.size, whole.angle_rad, whole.score))
         joined = suppress(Boxes.join(parts), min_score)
@@ -89,10 +92,23 @@ class OnnxDetector(Detector):
         values = tile if kind is np.uint8 else tile.astype(kind) / kind(255)
         batch = np.ascontiguousarray(np.broadcast_to(values, (1, channels, *tile.shape)))
         try:
-            output: np.ndarray = self.session.run(None, {image.name: batch})[0][0]
+            output: np.ndarray = self.session.run(None, {image.name: batch})[0]
         except Exception as error:  # as above
             raise self._refusal(error, f" on a tile of {tile.shape[1]} x {tile.shape[0]} px") from None
-        return output
+        record = self.record  # sizes that the model leaves open are known only now
+        check_output(Path(record.path).name, output.shape, record.layout, record.classes, record.vehicles)
+        first: np.ndarray = output[0]
+        return first
+
+    def _check_unit(self, found: Boxes) -> None:
+        """Refuse boxes in fractions of the input: each would lie in a tile's first corner."""
+        size = found.size.max(initial=0.0)  # 0 of rows that only fill an output up
+        if 0 < size <= _FRACTION and np.abs(found.xy).max() <= _FRACTION:
+            name = Path(self.record.path).name
+            raise InputError(
+                f"{name}: found boxes within {_FRACTION:g} px of the input's corner, as fractions of its sides would "
+                "lie, expected pixels; multiply them by its width and height in the graph"
+            )
 
     def _refusal(self, error: Exception, where: str = "") -> InputError:
         first = str(error).splitlines()[0][:160]

@@ -85,6 +85,12 @@ def _scale_of_boxes(plan: Plan, detector: Detector) -> float:
     chosen = usable[np.unique(np.linspace(0, max(len(usable) - 1, 0), _FRAMES_TO_MEASURE).astype(int))]
     threshold = plan.config.detection.threshold
     boxes = pd.concat([detector.detect_raw(store.read(int(frame)), threshold=threshold) for frame in chosen])
+    if boxes.empty:
+        raise InputError(
+            f"the detector found no vehicle in {len(chosen)} frames, expected some, as the scale of the map comes from "
+            "their size; check its classes, its threshold and the values that its input takes "
+            "(docs/detection.md#another-detector), or give --gsd-m"
+        )
     scale = _scale_of_length(plan, float(boxes["length_px"].median()), base_px_per_raw_px(plan))
     if scale is None:
         raise InputError(

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 
 from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
+from velfield.detection.detector import ONNX_SUFFIX
 from velfield.pipeline.plan import Plan, widen_interval
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.registration import MAP_PARAMETERS, usable_frames
@@ -32,9 +33,15 @@ def explain_no_tracklets(plan: Plan) -> str:
     gaps = np.diff(times_s)
     near = gaps <= near_s
     if (near[1:] & near[:-1]).any():
+        inputs = plan.job.inputs
+        remedy = "label one frame and give it with --labels"
+        if (inputs.detector or "").lower().endswith(ONNX_SUFFIX):
+            remedy = "check the model's classes, threshold and input values (docs/detection.md#another-detector)"
+        elif inputs.detections:
+            remedy = "check the pixels and frames of --detections"
         return (
             f"{effect}: no detection can be linked over three frames as a vehicle; check on the page whether "
-            "detections are vehicles, and if not label one frame and give it with --labels"
+            f"detections are vehicles, and if not {remedy}"
         )
     return (
         f"{effect}: no three registered frames are within tracking.max_interval_s = {near_s:g} s of one another "
