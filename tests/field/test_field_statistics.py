@@ -8,7 +8,7 @@ import pytest
 
 from velfield.errors import InputError
 from velfield.field.segments import SEGMENT_DTYPE, Segments, VelocityBins
-from velfield.field.view import VelocityField
+from velfield.field.view import Tile, VelocityField
 
 GSD_M = 0.25
 BINS = VelocityBins(width_px_per_s=2 / GSD_M, reach=18, kernel_sigma_px_per_s=0.7 / GSD_M, gsd_m=GSD_M)
@@ -129,6 +129,42 @@ def test_whole_map_statistics_are_those_of_its_pixels() -> None:
 def test_a_pixel_that_is_not_on_the_map_is_refused() -> None:
     with pytest.raises(InputError, match="not on the map"):
         field(drive(np.array([[48.0, 0.0]]))).at(160, 0)
+
+
+@pytest.mark.parametrize(("x", "y"), [(np.array([3, 4]), np.array([3, 4])), (float("nan"), 3), (3, float("inf"))])
+def test_what_is_not_one_pixel_is_refused(x: float, y: float) -> None:
+    with pytest.raises(InputError, match=r"one finite pixel.*found.*log_density"):
+        field(drive(np.array([[48.0, 0.0]]))).at(x, y)
+
+
+def test_one_position_with_many_velocities_says_what_to_do() -> None:
+    with pytest.raises(InputError, match=r"\(1, 2\) and \(3, 2\); repeat a position"):
+        field(drive(np.array([[48.0, 0.0]]))).log_density(np.zeros((1, 2)), np.zeros((3, 2)))
+
+
+def test_a_density_reads_the_tiles_about_its_places_once() -> None:
+    """A place inside a tile needs that tile alone; places all over the map need each tile once a row of tiles."""
+    size, rows, columns, read = 16, 6, 9, []
+    bins = replace(BINS, reach=2)
+
+    def tile(ty: int, tx: int) -> Tile:
+        read.append((ty, tx))
+        histogram = np.random.default_rng([ty, tx]).integers(0, 9, (size, size, bins.n, bins.n), np.int32)
+        return histogram, np.full((size, size), 3, np.int32), np.zeros((size, size), np.int32)
+
+    every = [(ty, tx) for ty in range(rows) for tx in range(columns)]
+    map_ = VelocityField(
+        tile, tiles=every, shape=(rows * size, columns * size), tile_size=size, bins=bins, stationary_speed_px_per_s=1.0
+    )
+    places = np.array([[x, y] for y in range(0, rows * size, 5) for x in range(0, columns * size, 5)], float)
+    v = np.broadcast_to([9.0, 2.0], places.shape)
+    single = np.concatenate([map_.log_density(place, v[:1]) for place in places])
+    read.clear()
+    map_.log_density(np.array([[1.5 * size, 1.5 * size]]), v[:1])
+    assert read == [(1, 1)]
+    read.clear()
+    np.testing.assert_array_equal(map_.log_density(places, v), single)
+    assert len(read) <= 3 * len(every)  # those above and below a row of tiles with it; every window anew: 9
 
 
 def test_queries_on_an_empty_map() -> None:

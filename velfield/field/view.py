@@ -30,7 +30,9 @@ LayerSource = Callable[[str], NDArray[Any]]
 
 T = TypeVar("T")
 _Window = tuple[slice, slice]
-_CACHED_TILES = 6
+_CACHED_TILES = 12
+"""The nine that places in one tile can need, and the three more of the tile beside it: with fewer, places all over the
+map read each tile several times."""
 _MAP_SAMPLE_TILES = 64
 _NEIGHBOURHOOD_M = 1.5
 _NEIGHBOURHOOD_PX = 6
@@ -179,8 +181,13 @@ class VelocityField:
         Raises
         ------
         InputError
-            The pixel is not on the map.
+            The pixel is not on the map, or not one pixel.
         """
+        if np.ndim(x) or np.ndim(y) or not np.isfinite([x, y]).all():
+            raise InputError(
+                f"at needs one finite pixel x, y, found {x} and {y}; call it for each pixel, or take `statistics` or "
+                "`log_density` of many"
+            )
         column, row = round(x), round(y)
         if not (0 <= column < self.shape[1] and 0 <= row < self.shape[0]):
             raise InputError(
@@ -221,7 +228,8 @@ class VelocityField:
         xy, v = np.atleast_2d(np.asarray(xy, np.float64)), np.atleast_2d(np.asarray(v, np.float64))
         if xy.shape != v.shape or xy.shape[1] != 2:
             raise InputError(
-                f"log_density needs positions and velocities of one shape (n, 2), found {xy.shape} and {v.shape}"
+                f"log_density needs positions and velocities of one shape (n, 2), found {xy.shape} and {v.shape}; "
+                "repeat a position for each of its velocities (numpy.broadcast_to)"
             )
         out = np.full(len(xy), np.nan)
         good = np.flatnonzero(np.isfinite(xy).all(axis=1) & np.isfinite(v).all(axis=1))
@@ -229,14 +237,17 @@ class VelocityField:
         pixels = np.floor(xy[good].clip(-limit, limit) + 0.5).astype(np.int64)
         tiles = pixels[:, ::-1] // self.tile_size
         radius = self._neighbourhood_px()
-        for ty, tx in np.unique(tiles, axis=0):
-            here = np.flatnonzero((tiles == (ty, tx)).all(axis=1))
-            histogram, count, origin = self._window(int(ty), int(tx), radius)
+        for tile in np.unique(tiles, axis=0):
+            here = np.flatnonzero((tiles == tile).all(axis=1))
+            # no more of the tile than is asked for: a tracker asks for few places, and a tile of the store is megabytes
+            x0, y0 = pixels[here].min(axis=0) - radius
+            width, height = np.ptp(pixels[here], axis=0) + 1 + 2 * radius
+            histogram, count = self._cut(int(x0), int(y0), int(width), int(height))
             out[good[here]] = log_density_in_window(
                 histogram,
                 count,
                 self._map_distribution(),
-                pixels[here] - origin,
+                pixels[here] - np.array([x0, y0], np.int64),
                 self.bins.to_bins(v[good[here]]),
                 radius,
                 self.bins.blur_bins2,
@@ -321,12 +332,6 @@ class VelocityField:
                     total += tile[0].sum(axis=(0, 1), dtype=np.int64)
             self._map_weights = total / max(total.sum(), 1)
         return self._map_weights
-
-    def _window(self, ty: int, tx: int, margin: int) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
-        """A tile with a margin: histogram, count, and the pixel (x, y) of its first corner."""
-        x0, y0 = tx * self.tile_size - margin, ty * self.tile_size - margin
-        extent = self.tile_size + 2 * margin
-        return *self._cut(x0, y0, extent, extent), np.array([x0, y0], np.int64)
 
     def _cut(self, x0: int, y0: int, width: int, height: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Histogram and count of a window of the map; zero where it is outside the map."""
