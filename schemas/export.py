@@ -40,7 +40,7 @@ EXPORT_FORMATS: dict[ExportFormat, str] = {
     "sumo_network": "SUMO's network, routes and measured edge data, as ZIP",
     "opendrive": "the lanes as OpenDRIVE",
     "highd": "trajectories as CSV in highD's columns",
-    "trajectories": "trajectories as Parquet",
+    "trajectories": "trajectories as Parquet, or as CSV with `--out FILE.csv`",
     "video": "the stabilised clip with vehicles, speeds and the field, as MP4",
     "poster": "both maps on a sheet with legend, scale, north, n and date, as PDF or SVG",
 }

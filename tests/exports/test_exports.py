@@ -79,6 +79,14 @@ def test_geotrax_csv_has_its_columns_and_units(tracklets):
     assert (x, y) == pytest.approx((700_000 + 10.5 * GSD_M, 3_500_000 - 100.5 * GSD_M), abs=0.02)
 
 
+def test_geotrax_csv_has_the_measured_dimensions(tracklets):
+    vehicles = pd.DataFrame({"track_id": [2, 1], "length_m": [np.nan, 4.518], "width_m": [np.nan, 1.8]})
+    table = pd.read_csv(io.StringIO(geotrax_csv(tracklets, GEOREFERENCED, vehicles)))
+    dimensions = table.groupby("Vehicle_ID")[["Vehicle_Length", "Vehicle_Width"]].first()
+    assert dimensions.loc[1].tolist() == [4.52, 1.8]
+    assert dimensions.loc[2].isna().all()
+
+
 def test_without_a_reference_system_geotrax_has_pixels_and_metres(tracklets):
     table = geotrax_table(tracklets, PIXELS)
     assert table["Latitude"].isna().all()

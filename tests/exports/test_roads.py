@@ -130,6 +130,9 @@ def test_netconvert_reads_opendrive(run: Run, network: RoadNetwork, tmp_path: Pa
 
 def test_tables_of_trajectories(run: Run, tmp_path: Path) -> None:
     table = pd.read_parquet(export_run(run, "trajectories", tmp_path / "x.parquet"))
+    as_text = pd.read_csv(export_run(run, "trajectories", tmp_path / "x.csv"))
+    assert as_text.columns.tolist() == table.columns.tolist()
+    np.testing.assert_allclose(as_text[["time_s", "x_m", "y_m"]], table[["time_s", "x_m", "y_m"]])
     assert table["track_id"].nunique() == 29
     assert table["speed_m_per_s"].median() == pytest.approx(10.0, abs=0.3)
     assert set(table["lane"]) == {-1, *range(5)} or set(table["lane"]) == set(range(5))

@@ -16,18 +16,18 @@ FILE_NAME = "tracks.csv"
 
 def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
     """See `velfield.exports.export.ExportModule`."""
-    return geotrax_csv(run.tracklets(), Georeference.from_grid(run.grid)).encode()
+    return geotrax_csv(run.tracklets(), Georeference.from_grid(run.grid), run.vehicles()).encode()
 
 
 def geotrax_table(
-    tracklets: pd.DataFrame, georeference: Georeference, *, vehicle_length_m: float | None = None
+    tracklets: pd.DataFrame, georeference: Georeference, vehicles: pd.DataFrame | None = None
 ) -> pd.DataFrame:
     """Tracks in the columns of geo-trax's CSV, unknown ones left empty.
 
     Parameters
     ----------
-    vehicle_length_m
-        Given where one is known; geo-trax measures each vehicle, we do not.
+    vehicles
+        With ``track_id, length_m, width_m``, NaN of a vehicle that was not measured; None: of none is known.
 
     Returns
     -------
@@ -45,6 +45,11 @@ def geotrax_table(
     speed = pd.Series(np.linalg.norm(velocity, axis=1) * gsd_m)
     same = points["track_id"].eq(points["track_id"].shift())
     acceleration = (speed.diff() / points["time_s"].diff()).where(same)
+    if vehicles is None:
+        dimensions = np.full((len(points), 2), np.nan)
+    else:
+        measured = vehicles.set_index("track_id")[["length_m", "width_m"]]
+        dimensions = measured.reindex(points["track_id"]).to_numpy(np.float64)
     return pd.DataFrame(
         {
             "Vehicle_ID": points["track_id"].rank(method="dense").astype("int64"),
@@ -56,8 +61,8 @@ def geotrax_table(
             "Local_Y": local[:, 1],
             "Latitude": lonlat[:, 1],
             "Longitude": lonlat[:, 0],
-            "Vehicle_Length": empty if vehicle_length_m is None else np.full(len(points), vehicle_length_m),
-            "Vehicle_Width": empty,
+            "Vehicle_Length": dimensions[:, 0],
+            "Vehicle_Width": dimensions[:, 1],
             "Vehicle_Class": 0,
             "Vehicle_Speed": speed * MPS_TO_KMH,
             "Vehicle_Acceleration": acceleration,
@@ -68,10 +73,11 @@ def geotrax_table(
     )
 
 
-def geotrax_csv(tracklets: pd.DataFrame, georeference: Georeference) -> str:
+def geotrax_csv(tracklets: pd.DataFrame, georeference: Georeference, vehicles: pd.DataFrame | None = None) -> str:
     """`geotrax_table` as text, decimals as geo-trax has them."""
-    table = geotrax_table(tracklets, georeference)
+    table = geotrax_table(tracklets, georeference, vehicles)
     decimals = {"Timestamp": 3, "Ortho_X": 1, "Ortho_Y": 1, "Local_X": 2, "Local_Y": 2, "Latitude": 7, "Longitude": 7}
+    decimals |= {"Vehicle_Length": 2, "Vehicle_Width": 2}
     table = table.round({**decimals, "Vehicle_Speed": 1, "Vehicle_Acceleration": 2})
     return str(table.to_csv(index=False, lineterminator="\n"))
 

@@ -1,4 +1,7 @@
-"""Trajectories as Parquet: the columns of `velfield.exports.roads.table.trajectory_table`."""
+"""Trajectories as Parquet, or as CSV where the file is named so.
+
+The columns are those of `velfield.exports.roads.table.trajectory_table`.
+"""
 
 import io
 from pathlib import Path
@@ -10,8 +13,11 @@ from velfield.run.run import Run
 FILE_NAME = "trajectories.parquet"
 
 
-def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
+def encode(run: Run, path: Path, _options: ExportOptions) -> bytes:
     """See `velfield.exports.export.ExportModule`."""
+    table = trajectory_table(run)
+    if path.suffix.lower() == ".csv":
+        return str(table.to_csv(index=False, lineterminator="\n")).encode()
     out = io.BytesIO()
-    trajectory_table(run).to_parquet(out, index=False)
+    table.to_parquet(out, index=False)
     return out.getvalue()
