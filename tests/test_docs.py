@@ -11,6 +11,7 @@ from dataclasses import fields, is_dataclass
 from functools import cached_property
 from inspect import Parameter, getdoc, signature
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -169,11 +170,18 @@ def reference_rows() -> list[str]:
             if name.startswith("_") or isinstance(member, classmethod) or not getdoc(plain):
                 continue
             if callable(plain):
-                names = ", ".join(list(signature(plain).parameters)[1:])
-                rows.append(f"| `{path}.{name}({names})` | {summary_line(plain)} |")
+                rows.append(f"| `{path}.{name}({parameter_names(plain)})` | {summary_line(plain)} |")
             elif isinstance(plain, property | cached_property):
                 rows.append(f"| `{path}.{name}` | {summary_line(plain)} |")
     return rows
+
+
+def parameter_names(function: Any) -> str:
+    """Those of a method, a star before those that must be named."""
+    found = list(signature(function).parameters.values())[1:]
+    by_name = [one.name for one in found if one.kind is Parameter.KEYWORD_ONLY]
+    others = [one.name for one in found if one.kind is not Parameter.KEYWORD_ONLY]
+    return ", ".join([*others, "*", *by_name] if by_name else others)
 
 
 def test_the_reference_lists_the_interface_as_it_is() -> None:
