@@ -287,6 +287,11 @@ def with_side(side: int) -> Callable[[onnx.ModelProto], None]:
     return change
 
 
+def with_channels_last(model: onnx.ModelProto) -> None:
+    for k, size in enumerate((1, TILE, TILE, 3)):
+        model.graph.input[0].type.tensor_type.shape.dim[k].dim_value = size
+
+
 def with_open_side(model: onnx.ModelProto) -> None:
     for k in (2, 3):
         model.graph.input[0].type.tensor_type.shape.dim[k].dim_param = "side"
@@ -298,6 +303,7 @@ def with_open_side(model: onnx.ModelProto) -> None:
     [
         (with_external_data, "found weights in other files .*secrets.bin"),
         (with_two_inputs, "found 2 inputs, expected one"),
+        (with_channels_last, r"found an input of \(1, 128, 128, 3\), .*; export it with channels first"),
         (with_side(8), "found an input of 8 x 8 px, expected 32 to 8192"),
         (with_side(200_000), "found an input of 200000 x 200000 px"),
         (with_open_side, "found an input of 900000 x 900000 px"),

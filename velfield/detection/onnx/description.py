@@ -220,6 +220,10 @@ def _tile(
     """Width and height of the network's input, px."""
     if len(sizes) != 4:
         raise InputError(f"{path.name}: found an input of {len(sizes)} dimensions, expected an image (1, 3, h, w)")
+    if sizes[3] in (1, 3) and sizes[1] not in (1, 3):
+        raise InputError(
+            f"{path.name}: found an input of {sizes}, expected an image (1, 3, h, w); export it with channels first"
+        )
     width, height = sizes[3], sizes[2]
     if not width or not height:
         width = height = given.image_size_px or _side(metadata)
