@@ -342,12 +342,14 @@ def _tracks_inputs(tracks: Path | None, base: Path | None, frames_only: list[str
 
 
 def _runner(workers: int | None, scheduler: str | None, cluster: Path | None) -> "RunnerConfig":
-    from flows.runners import RunnerConfig, read_runner
+    from flows.runners import RunnerConfig, check_scheduler, read_runner
 
     if sum(given is not None for given in (workers, scheduler, cluster)) > 1:
         raise InputError("found more than one of --workers, --scheduler and --cluster; give one")
     if workers is not None and workers < 1:
         raise InputError(f"--workers {workers}: expected a whole number from 1 on; leave it out for this process alone")
+    if scheduler is not None:
+        check_scheduler(scheduler)  # before Prefect's server starts, which takes longer
     return read_runner(cluster) if cluster else RunnerConfig(workers=workers, scheduler=scheduler)
 
 

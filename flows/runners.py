@@ -5,7 +5,10 @@ a laptop; the same tasks submitting their graphs to a cluster survive a killed w
 either.
 """
 
+import asyncio
 import importlib
+import importlib.util
+import platform
 import threading
 import time
 import warnings
@@ -23,6 +26,9 @@ from velfield.parallel import usable_processors
 
 _WAIT_S = 10.0
 _NO_WORKERS_S = 60.0
+_ANSWER_S = 20.0
+_COMPARED = ("velfield", "python", "dask", "distributed", "numpy", "pandas")
+"""Packages whose versions a worker should have in common with this process."""
 
 
 class RunnerConfig(Model):
@@ -141,7 +147,8 @@ class ClientRunner(Runner):
             self._without_since_s = now_s
         self._warn(
             f"found no workers at {self._address} for {waited_s:.0f} s, expected one at least; start some "
-            f"(`dask worker {self._address}`): the run waits for them, and if you stop it the same command resumes"
+            f"(`dask worker {self._address}`; one that ends at once has the reason in its log, as where velfield is "
+            "not installed): the run waits for them, and if you stop it the same command resumes"
         )
 
 
@@ -154,12 +161,91 @@ def open_runner(config: RunnerConfig, warn: Callable[[str], None] = warnings.war
     if config == RunnerConfig():
         yield ThreadsRunner(usable_processors())
         return
-    from dask.distributed import Client
+    from distributed import Client
+    from distributed.versions import VersionMismatchWarning
 
-    with _cluster(config) as cluster, Client(cluster, timeout="60s", set_as_default=False) as client:
-        if config.cluster_class is not None:
-            client.wait_for_workers(1)
-        yield ClientRunner(client, warn)
+    if config.scheduler is not None:
+        check_scheduler(config.scheduler)
+    with _cluster(config) as cluster:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", VersionMismatchWarning)  # a table of several lines: `_check_workers`
+            client = Client(cluster, timeout="60s", set_as_default=False)
+        with client:
+            if config.cluster_class is not None:
+                _wait_for_worker(client, warn)
+            _check_workers(client, warn)
+            yield ClientRunner(client, warn)
+
+
+def check_scheduler(address: str) -> None:
+    """Refuse an address at which no Dask scheduler answers: a client would wait at another service for ever.
+
+    Raises
+    ------
+    InputError
+        The address is not one, nothing answers there, or it is no scheduler.
+    """
+    from distributed import rpc
+    from distributed.security import Security
+
+    expected = "expected a Dask scheduler, as tcp://HOST:8786 (`dask scheduler` prints its address; the dashboard's"
+
+    async def ask() -> str:
+        async with rpc(address, connection_args=Security().get_connection_args("client")) as service:
+            return str((await service.identity())["type"])
+
+    try:
+        found = asyncio.run(asyncio.wait_for(ask(), _ANSWER_S))
+    except TimeoutError:
+        found = f"no answer within {_ANSWER_S:.0f} s"
+    except Exception as error:  # of the address, of the name's look-up, of what another service answers
+        found = " ".join(str(error).split()) or type(error).__name__
+    if found != "Scheduler":
+        raise InputError(f"--scheduler {address}: found {found}; {expected} is another); give that of one that runs")
+
+
+def _wait_for_worker(client: Any, warn: Callable[[str], None]) -> None:
+    """Until a cluster that was asked for workers has one: a queue may take hours over it."""
+    while True:
+        try:
+            client.wait_for_workers(1, timeout=_NO_WORKERS_S)
+            return
+        except TimeoutError:
+            warn(
+                f"found no workers at {client.scheduler.address} after {_NO_WORKERS_S:.0f} s, expected one at least: "
+                "the run waits for them; see whether the cluster's queue holds their jobs, and their log"
+            )
+
+
+def _check_workers(client: Any, warn: Callable[[str], None]) -> None:
+    """Refuse workers that could not compute: one without velfield ends when it is sent work, then the next one.
+
+    Only by functions of the standard library: all others would end such a worker too.
+    """
+    found = client.run(importlib.util.find_spec, "velfield", on_error="return")
+    without = sorted(address for address, spec in found.items() if spec is None or isinstance(spec, Exception))
+    if without:
+        raise InputError(
+            f"found no velfield on {_some(without)} of the cluster's {len(found)} workers, expected it on all; "
+            "install the wheel in the environment from which `dask worker` is started, or stop those workers"
+        )
+    versions = client.get_versions(packages=["velfield"])
+    here = {name: versions["client"]["packages"][name] for name in _COMPARED}
+    others: dict[tuple[str, str], list[str]] = {}
+    for address, told in versions["workers"].items():
+        for name in _COMPARED:
+            if told["packages"][name] != here[name]:
+                others.setdefault((name, str(told["packages"][name])), []).append(address)
+    for (name, other), addresses in sorted(others.items()):
+        told_here = platform.python_version() if name == "python" else here[name]
+        text = f"found {name} {other} on {_some(addresses)} of the cluster's workers, expected {told_here} as here"
+        if name == "velfield":
+            raise InputError(f"{text}; install the same wheel there")
+        warn(f"{text}: the last bits of the results may differ, or work fail; install the same versions there")
+
+
+def _some(addresses: list[str]) -> str:
+    return f"{len(addresses)} ({', '.join(addresses[:3])}{', ...' if len(addresses) > 3 else ''})"
 
 
 @contextmanager

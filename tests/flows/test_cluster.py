@@ -2,17 +2,23 @@
 
 import os
 import shutil
+import socket
+import subprocess
+import sys
 import time
+import warnings
 from pathlib import Path
 
 import dask
 import pytest
 import yaml
 from dask import delayed
-from distributed import LocalCluster
+from distributed import Client, LocalCluster
+from distributed.versions import VersionMismatchWarning, get_versions
 
-from flows.runners import ClusterFile, RunnerConfig, open_runner, read_runner
+from flows.runners import ClusterFile, RunnerConfig, _wait_for_worker, check_scheduler, open_runner, read_runner
 from schemas.summary import RunSummary
+from tests.faults.test_refusals import command
 from tests.foreign_cluster import foreign_cluster
 from tests.small_flight import digests, job, process
 from velfield.errors import InputError
@@ -167,6 +173,103 @@ def test_a_cluster_without_workers_is_said_and_waited_for(monkeypatch: pytest.Mo
     assert warned
     assert "found no workers at" in warned[0]
     assert "expected one at least" in warned[0]
+
+
+@pytest.mark.parametrize(
+    ("address", "text"),
+    [
+        ("tcp://127.0.0.1:{silent}", "found no answer within 1 s"),  # as the port of the dashboard, or of anything else
+        ("tcp://127.0.0.1:{refused}", "found no answer within 1 s"),
+        ("http://127.0.0.1:8787", "found unknown address scheme 'http'"),
+        ("host", "found missing port number"),
+    ],
+)
+def test_an_address_without_a_scheduler_is_refused_in_one_line(
+    address: str, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("flows.runners._ANSWER_S", 1.0)
+    with socket.socket() as silent, socket.socket() as refused:
+        for port in (silent, refused):
+            port.bind(("127.0.0.1", 0))
+        silent.listen()
+        at = address.format(silent=silent.getsockname()[1], refused=refused.getsockname()[1])
+        status, lines = command(
+            monkeypatch, capsys, "run", str(tmp_path), "--fps", "5", "--out", str(tmp_path / "run"), "--scheduler", at
+        )
+    assert (status, len(lines)) == (1, 1), lines
+    assert text in lines[0]
+    assert "expected a Dask scheduler, as tcp://HOST:8786" in lines[0]
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_worker_is_no_scheduler() -> None:
+    with (
+        LocalCluster(n_workers=1, processes=False, dashboard_address="127.0.0.1:0", protocol="tcp") as cluster,
+        pytest.raises(InputError, match="found Worker; expected a Dask scheduler"),
+    ):
+        check_scheduler(next(iter(cluster.workers.values())).address)
+
+
+_HIDDEN = "import sys; sys.modules['velfield'] = None; from distributed.cli.dask_worker import main; main()"
+
+
+def test_workers_without_velfield_are_refused_and_live_on() -> None:
+    """What is of velfield would end each of them, one after the other, without a word to the run."""
+    with LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0") as cluster:
+        address = cluster.scheduler_address
+        options = ["--no-nanny", "--nthreads", "1", "--no-dashboard", "--host", "127.0.0.1"]
+        worker = subprocess.Popen([sys.executable, "-c", _HIDDEN, address, *options], stderr=subprocess.DEVNULL)
+        try:
+            with Client(address, set_as_default=False) as client:
+                client.wait_for_workers(1, timeout=60)
+            with (
+                pytest.raises(InputError, match=r"found no velfield on 1 \(tcp://.*\) of the cluster's 1 workers"),
+                open_runner(RunnerConfig(scheduler=address)),
+            ):
+                pass
+            assert worker.poll() is None
+        finally:
+            worker.kill()
+            worker.wait()
+
+
+@pytest.mark.parametrize("name", ["velfield", "numpy", "python"])
+def test_workers_of_other_versions(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another velfield is refused, others are warned of in one line each, and Dask's table is not printed."""
+    here = get_versions(packages=["velfield"])
+
+    def told(self: Client, check: bool = False, packages: object = ()) -> dict[str, object]:
+        return {"client": here, "workers": {"tcp://a:1": {"packages": {**here["packages"], name: "0.1.2"}}}}
+
+    monkeypatch.setattr(Client, "get_versions", told)
+    said: list[str] = []
+    with LocalCluster(n_workers=1, processes=False, dashboard_address="127.0.0.1:0") as cluster:
+        where = RunnerConfig(scheduler=cluster.scheduler_address)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", VersionMismatchWarning)
+            if name == "velfield":
+                with pytest.raises(InputError, match=r"found velfield 0\.1\.2 on 1 \(tcp://a:1\)"), open_runner(where):
+                    pass
+                return
+            with open_runner(where, said.append):
+                pass
+    assert len(said) == 1
+    assert said[0].startswith(f"found {name} 0.1.2 on 1 (tcp://a:1) of the cluster's workers, expected ")
+
+
+def test_a_cluster_whose_queue_gives_no_worker_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flows.runners._NO_WORKERS_S", 0.2)
+    said: list[str] = []
+    with LocalCluster(n_workers=0, processes=False, dashboard_address="127.0.0.1:0") as cluster:
+
+        def warn(text: str) -> None:
+            said.append(text)
+            cluster.scale(1)
+
+        with Client(cluster, set_as_default=False) as client:
+            _wait_for_worker(client, warn)
+    assert said
+    assert "expected one at least" in said[0]
 
 
 def _out_of_time() -> None:
