@@ -34,8 +34,12 @@ def process_dropped(source: str, runs: str, cluster: str = "") -> str:
         Cluster file, as for `velfield run --cluster`. Default: the threads of this process.
     """
     prepare_process(verbose=False)
-    job = _dropped_job(Path(source), Path(runs))
-    summary = run_flight(job, _runner(cluster), Console("quiet"))
+    try:
+        job = _dropped_job(Path(source), Path(runs))
+        summary = run_flight(job, _runner(cluster), Console("quiet"))
+    except Exception as error:  # in the terminal too: else nothing there follows "has arrived"
+        print_with_time(f"{Path(source).name} failed: {' '.join(str(error).split()) or type(error).__name__}")
+        raise
     for line in summary.frames_lost:
         get_run_logger().warning(line)
     lost = f", {len(summary.frames_lost)} frames lost" if summary.frames_lost else ""

@@ -58,8 +58,9 @@ class ServeConfig:
 
     @property
     def url(self) -> str:
-        """The UI's address."""
-        return f"http://{self.host}:{self.port}"
+        """The UI's address, from this machine."""
+        here = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)
+        return f"http://{f'[{here}]' if ':' in here else here}:{self.port}"
 
     @property
     def incoming(self) -> Path:
@@ -89,7 +90,7 @@ def check(config: ServeConfig) -> None:
         )
     if config.auth is not None and not all(config.auth.partition(":")):
         raise InputError("--auth: expected USER:PASSWORD")
-    with socket.socket() as probe:
+    with socket.socket(socket.AF_INET6 if ":" in config.host else socket.AF_INET) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((config.host, config.port))
@@ -103,7 +104,8 @@ def settings(config: ServeConfig) -> dict[str, str]:
     """Prefect's settings for the server, the deployments and their flow runs."""
     given = {
         "PREFECT_API_URL": f"{config.url}/api",
-        "PREFECT_UI_API_URL": f"{config.url}/api",
+        # Relative: the same under every name and address by which a browser reaches this server.
+        "PREFECT_UI_API_URL": "/api",
         "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
         "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": config.url,
         "PREFECT_RUNNER_POLL_FREQUENCY": "2",
@@ -268,7 +270,8 @@ def serve_folder(config: ServeConfig) -> None:
 
             if killed := mark_abandoned():
                 print_with_time(f"{killed} runs of processes that were killed are marked as crashed")
-            print(f"Prefect UI  {config.url}", flush=True)
+            everywhere = f", port {config.port} of all its addresses" if config.host in ("0.0.0.0", "::") else ""
+            print(f"Prefect UI  {config.url}{everywhere}", flush=True)
             for name, path in (
                 ("flights", config.incoming),
                 ("base images", config.base_images),

@@ -12,6 +12,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from base64 import b64encode
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ import psutil
 import pytest
 import yaml
 
+from flows.deployed import process_dropped
 from flows.serve import ServeConfig, check, deployments, settings, watching
 from schemas.summary import RunSummary
 from tests.browser import browser
@@ -67,6 +69,65 @@ def test_no_analytics_and_no_other_origin() -> None:
     assert given["PREFECT_SERVER_CORS_ALLOWED_ORIGINS"] == "http://127.0.0.1:4321"
     assert given["PREFECT_API_DATABASE_CONNECTION_URL"].startswith("postgresql")
     assert given["PREFECT_SERVER_API_AUTH_STRING"] == AUTH
+
+
+@pytest.mark.parametrize(
+    ("host", "url"),
+    [("0.0.0.0", "http://127.0.0.1:4321"), ("::", "http://[::1]:4321"), ("10.0.0.1", "http://10.0.0.1:4321")],
+)
+def test_the_ui_asks_the_address_by_which_the_browser_reached_it(host: str, url: str) -> None:
+    """A browser elsewhere cannot ask 0.0.0.0, nor 127.0.0.1; this machine asks itself."""
+    given = settings(ServeConfig(Path("x"), host=host, port=4321, auth=AUTH))
+    assert given["PREFECT_UI_API_URL"] == "/api"
+    assert given["PREFECT_API_URL"] == f"{url}/api"
+
+
+def test_a_flight_that_fails_says_so_in_the_terminal(
+    server: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Else "has arrived" is the last word about it there."""
+    with pytest.raises(InputError, match="is not there"):
+        process_dropped(str(tmp_path / "street.mp4"), str(tmp_path / "runs"))
+    assert f"street.mp4 failed: {tmp_path / 'street.mp4'} is not there" in capsys.readouterr().out
+
+
+def test_all_addresses_with_a_password(tmp_path: Path) -> None:
+    """A real server: without the password nothing but its health, and the UI works under other names of the machine."""
+    port = free_port()
+    ours = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
+    environment = {**ours, "PREFECT_HOME": str(tmp_path / "home"), "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "flows.cli", "serve", str(tmp_path), "--host", "0.0.0.0", "--port", str(port)]
+    with subprocess.Popen([*command, "--auth", AUTH], env=environment, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            told = process.stdout.readline().strip()
+            assert told == f"Prefect UI  http://127.0.0.1:{port}, port {port} of all its addresses"
+            url = f"http://localhost:{port}"
+            for password, status in ((None, 401), ("somebody:else", 401), (AUTH, 200)):
+                request = urllib.request.Request(
+                    f"{url}/api/deployments/filter", b"{}", {"Content-Type": "application/json"}
+                )
+                if password is not None:
+                    request.add_header("Authorization", f"Basic {b64encode(password.encode()).decode()}")
+                assert _status(request) == status
+            with browser(tmp_path / "profile") as found, found.page() as page:
+                page.open(url)
+                page.wait("document.querySelector('input') !== null")  # for the password
+                asked = [request for request in page.requests if "/api/" in request]
+                assert asked
+                assert [request for request in asked if not request.startswith(url)] == []
+                assert "Can't connect" not in page.value("document.body.innerText")
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.wait(60)
+
+
+def _status(request: urllib.request.Request) -> int:
+    try:
+        with urllib.request.urlopen(request, timeout=30) as answer:
+            return int(answer.status)
+    except urllib.error.HTTPError as error:
+        return error.code
 
 
 # -------------------------------------------------------------------------------------------------- what arrives
