@@ -410,10 +410,15 @@ def _process_tracks(job: "Job", runner: "RunnerConfig", verbosity: "Verbosity", 
 
 
 def _conclude(summary: "RunSummary", console: "Console") -> int:
-    root = Path(summary.root)
+    from velfield.run.layout import is_remote, to_path
+
+    root = to_path(summary.root)
     console.result(f"maps    {root / 'maps'}")
     console.result(f"report  {root / 'index.html'}")
-    console.result(f"page    {own_command()} view {shlex.quote(str(root))}")
+    if is_remote(root):  # `velfield view` shows a folder of this machine
+        console.result(f"page    aws s3 sync {shlex.quote(str(root))} RUN && {own_command()} view RUN")
+    else:
+        console.result(f"page    {own_command()} view {shlex.quote(str(root))}")
     if summary.complete:
         return DONE
     for line in (*summary.footage_lost, *summary.frames_lost[:10]):

@@ -19,7 +19,7 @@ from flows.artifacts import publish_summary
 from flows.console import Console
 from flows.previews import Previews
 from flows.runners import Runner, RunnerConfig, open_runner, parallel_units
-from flows.stale import mark_crashed
+from flows.stale import mark_crashed, run_name_of
 from flows.work import Work
 from schemas.job import Job
 from schemas.summary import RunSummary
@@ -43,7 +43,8 @@ def run_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
         The inputs or the configuration are not usable; committed units are kept.
     """
     task_runner = ThreadPoolTaskRunner(max_workers=parallel_units(runner))
-    return process_flight.with_options(task_runner=task_runner)(job, runner, console)
+    named = process_flight.with_options(task_runner=task_runner, flow_run_name=run_name_of(job))
+    return named(job, runner, console)
 
 
 @flow(name="process-flight", flow_run_name="{job.root}", persist_result=False, validate_parameters=False)
@@ -51,7 +52,7 @@ def process_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSumma
     """Aerial video in, velocity field out."""
     layout = RunLayout(Path(job.root))
     with locked(layout), _leave_no_trace(layout), open_runner(runner, console.warn) as where:
-        mark_crashed(job.root)
+        mark_crashed(run_name_of(job)())
         sweep_partial(layout.root)
         remove_tree(layout.preview)
         plan = make_plan(job)
@@ -95,7 +96,7 @@ def record_start(plan: Plan, what: str, console: Console) -> None:
     console.event("start", f"{plan.job.inputs.source}: {what}")
     if changed:
         text = f"{', '.join(changed)} changed since the last run; dependent stages are recomputed"
-        console.event("changed", f"{plan.job.root}: {text}", changed=changed)
+        console.event("changed", f"{plan.layout.root}: {text}", changed=changed)
 
 
 def publish_report(plan: Plan, summary: RunSummary, console: Console) -> None:

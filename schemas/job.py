@@ -15,7 +15,11 @@ def absolute(path: str) -> str:
     --------
     >>> absolute("s3://bucket/run")
     's3://bucket/run'
+    >>> absolute("s3:/bucket/run")  # as `pathlib.Path` writes it
+    's3://bucket/run'
     """
+    if path.startswith("s3:/"):
+        return "s3://" + path.removeprefix("s3:").lstrip("/")
     return path if ":/" in path else os.path.abspath(path)
 
 

@@ -17,8 +17,11 @@ import psutil
 import pytest
 
 from flows.runners import RunnerConfig, open_runner
+from flows.stale import run_name_of
 from schemas.summary import RunSummary
+from tests.small_flight import job, process
 from tests.viewer.test_viewer_server import served
+from velfield.errors import InputError
 from velfield.report.figures import png_bytes
 from velfield.report.viewer_page import page_is_built
 from velfield.viewer.annotations import frames_to_annotate
@@ -141,6 +144,22 @@ def test_with_an_auth_string_prefects_api_asks_for_it(server: None) -> None:
             assert client.status(path) == 401, path
         assert client.status("/admin/version", headers=header("somebody:wrong")) == 401
         assert client.status("/admin/version", headers=header("somebody:secret")) == 200
+
+
+def test_a_run_is_named_by_its_folder_from_the_root_on(
+    flight: Path, server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `--out RUN` gives it, one that was killed was never marked, and one of another place's `RUN` was."""
+    from prefect.client.orchestration import get_client
+    from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterName
+
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="nowhere"):
+        process(job(flight, Path("RUN {x}"), timestamps="nowhere"))
+    named = FlowRunFilter(name=FlowRunFilterName(any_=[str(tmp_path / "RUN {x}")]))
+    with get_client(sync_client=True) as client:
+        assert len(client.read_flow_runs(flow_run_filter=named)) == 1
+    assert run_name_of(job(flight, Path("s3://runs/flight")))() == "s3://runs/flight"  # `Path` drops a slash
 
 
 def test_runs_whose_process_was_killed_are_crashed_and_others_are_not(server: None, tmp_path: Path) -> None:
