@@ -19,7 +19,7 @@ from flows.artifacts import publish_summary
 from flows.console import Console
 from flows.previews import Previews
 from flows.runners import Runner, RunnerConfig, open_runner, parallel_units
-from flows.stale import mark_crashed, run_name_of
+from flows.stale import mark_crashed, name_run
 from flows.work import Work
 from schemas.job import Job
 from schemas.summary import RunSummary
@@ -43,7 +43,7 @@ def run_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
         The inputs or the configuration are not usable; committed units are kept.
     """
     task_runner = ThreadPoolTaskRunner(max_workers=parallel_units(runner))
-    named = process_flight.with_options(task_runner=task_runner, flow_run_name=run_name_of(job))
+    named = process_flight.with_options(task_runner=task_runner, flow_run_name=name_run(job))
     return named(job, runner, console)
 
 
@@ -52,7 +52,7 @@ def process_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSumma
     """Aerial video in, velocity field out."""
     layout = RunLayout(Path(job.root))
     with locked(layout), _leave_no_trace(layout), open_runner(runner, console.warn) as where:
-        mark_crashed(run_name_of(job)())
+        mark_crashed(name_run(job)())
         sweep_partial(layout.root)
         remove_tree(layout.preview)
         plan = make_plan(job)

@@ -8,7 +8,7 @@ from prefect.task_runners import ThreadPoolTaskRunner
 from flows.console import Console
 from flows.process_flight import publish_report, record_start
 from flows.runners import RunnerConfig, open_runner, parallel_units
-from flows.stale import mark_crashed, run_name_of
+from flows.stale import mark_crashed, name_run
 from flows.work import Work
 from schemas.job import Job
 from schemas.summary import RunSummary
@@ -29,7 +29,7 @@ def run_tracks(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
         The tracks or the configuration are not usable.
     """
     task_runner = ThreadPoolTaskRunner(max_workers=parallel_units(runner))
-    named = process_tracks.with_options(task_runner=task_runner, flow_run_name=run_name_of(job))
+    named = process_tracks.with_options(task_runner=task_runner, flow_run_name=name_run(job))
     return named(job, runner, console)
 
 
@@ -40,7 +40,7 @@ def process_tracks(job: Job, runner: RunnerConfig, console: Console) -> RunSumma
     plan = plan_tracks(job)  # refuses bad tracks before the folder is there
     layout = RunLayout(Path(job.root))
     with locked(layout), open_runner(runner, console.warn) as where:
-        mark_crashed(run_name_of(job)())
+        mark_crashed(name_run(job)())
         sweep_partial(layout.root)
         record_start(plan, f"tracks over {plan.frame_count} times, {where.description}", console)
         work = Work(plan, where, console, at_once=parallel_units(runner))

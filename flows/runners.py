@@ -226,7 +226,7 @@ def _check_workers(client: Any, warn: Callable[[str], None]) -> None:
     without = sorted(address for address, spec in found.items() if spec is None or isinstance(spec, Exception))
     if without:
         raise InputError(
-            f"found no velfield on {_describe_workers(without)} of the cluster's {len(found)} workers, expected it on all; "
+            f"found no velfield on {_list_some(without)} of the cluster's {len(found)} workers, expected it on all; "
             "install the wheel in the environment from which `dask worker` is started, or stop those workers"
         )
     versions = client.get_versions(packages=["velfield"])
@@ -238,13 +238,13 @@ def _check_workers(client: Any, warn: Callable[[str], None]) -> None:
                 others.setdefault((name, str(worker["packages"][name])), []).append(address)
     for (name, other), addresses in sorted(others.items()):
         version_here = platform.python_version() if name == "python" else here[name]
-        text = f"found {name} {other} on {_describe_workers(addresses)} of the cluster's workers, expected {version_here} as here"
+        text = f"found {name} {other} on {_list_some(addresses)} of its workers, expected {version_here} as here"
         if name == "velfield":
             raise InputError(f"{text}; install the same wheel there")
         warn(f"{text}: the last bits of the results may differ, or work fail; install the same versions there")
 
 
-def _describe_workers(addresses: list[str]) -> str:
+def _list_some(addresses: list[str]) -> str:
     return f"{len(addresses)} ({', '.join(addresses[:3])}{', ...' if len(addresses) > 3 else ''})"
 
 

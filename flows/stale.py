@@ -19,11 +19,11 @@ _RESUMED = "the process was killed; the next run of this folder resumed from its
 _ENDED = "the process was killed; the same command resumes from its commits"
 
 
-def run_name_of(job: Job) -> Callable[[], str]:
+def name_run(job: Job) -> Callable[[], str]:
     """The name in Prefect of a run of a job: its folder, from the root on.
 
     By a folder as it is given, two runs on a folder `RUN` of two places would be one, and one that was killed could
-    not be told from one that lives.
+    not be distinguished from one that lives.
     """
     return partial(absolute, job.root)  # a function: Prefect takes braces in a text for fields
 

@@ -17,7 +17,7 @@ import psutil
 import pytest
 
 from flows.runners import RunnerConfig, open_runner
-from flows.stale import run_name_of
+from flows.stale import name_run
 from schemas.summary import RunSummary
 from tests.small_flight import job, process
 from tests.viewer.test_viewer_server import served
@@ -159,7 +159,7 @@ def test_a_run_is_named_by_its_folder_from_the_root_on(
     named = FlowRunFilter(name=FlowRunFilterName(any_=[str(tmp_path / "RUN {x}")]))
     with get_client(sync_client=True) as client:
         assert len(client.read_flow_runs(flow_run_filter=named)) == 1
-    assert run_name_of(job(flight, Path("s3://runs/flight")))() == "s3://runs/flight"  # `Path` drops a slash
+    assert name_run(job(flight, Path("s3://runs/flight")))() == "s3://runs/flight"  # `Path` drops a slash
 
 
 def test_runs_whose_process_was_killed_are_crashed_and_others_are_not(server: None, tmp_path: Path) -> None:

@@ -254,7 +254,7 @@ def test_workers_of_other_versions(name: str, monkeypatch: pytest.MonkeyPatch) -
             with open_runner(where, said.append):
                 pass
     assert len(said) == 1
-    assert said[0].startswith(f"found {name} 0.1.2 on 1 (tcp://a:1) of the cluster's workers, expected ")
+    assert said[0].startswith(f"found {name} 0.1.2 on 1 (tcp://a:1) of its workers, expected ")
 
 
 def test_a_cluster_whose_queue_gives_no_worker_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
