@@ -80,7 +80,8 @@ def _clicks(running: Browser, address: str, root: Path, rest_s: float) -> tuple[
 
 
 def _tables(running: Browser, address: str) -> tuple[list[float], dict[str, float]]:
-    """Milliseconds from a click on its tab until the analysis is shown, of each visit; and of each of its tables, by title, the slowest."""
+    """Milliseconds from the click on its tab until the analysis is shown, of each visit; and of each of its tables, by
+    title, the slowest."""
     opened: list[float] = []
     tables: dict[str, float] = {}
     taken = "document.getElementById('analysis-content').dataset.milliseconds"
