@@ -280,7 +280,7 @@ STAGES: tuple[Stage, ...] = (
     # Tracklets of all units that belong to one vehicle.
     Stage(
         name="tracks",
-        version=8,
+        version=9,
         label="tracks",
         lines=(
             Line(

@@ -4,10 +4,6 @@ A vehicle in shade, or half under a tree, is often detected at a score below the
 of three frames in a row. Where a track predicts a vehicle, such a candidate is enough evidence (ByteTrack, Zhang and
 others 2022). Ends and starts of tracks are extended from frame to frame; a gap between two parts of one track is filled
 where candidates lie on the way between them.
-
-A vehicle's shadow, or the cab and the load of a lorry, may each have a track. Two vehicles that drive in one lane keep
-a distance of more than a vehicle's length; two tracks that keep a shorter one, and the same one, while they move are
-one vehicle's, and one of them is a double.
 """
 
 from dataclasses import dataclass, field, replace
@@ -30,18 +26,6 @@ _POSITION_GAIN, _VELOCITY_GAIN = 0.7, 0.2
 """Of a candidate against the prediction: a detection's position is accurate to a pixel only."""
 _FILL_M, _FILL_M_PER_S, _MAX_FILL_M = 0.8, 0.5, 1.6
 """How far a candidate may lie from the way across a gap, at once and growing with the time to what is known."""
-_SPACING_M, _SPACING_S, _MAX_SPACING_M = 5.0, 0.25, 8.0
-"""From centre to centre, and more with speed: two cars that queue bumper to bumper are 6 m apart, and driving ones keep
-a gap of half a second and more."""
-_MAX_ASIDE_M = 1.8
-"""Across the direction of travel: a vehicle in the next lane is 3 m and more away."""
-_ABREAST_M = 2.6
-"""Two vehicles are not nearer to each other, side by side either."""
-_MAX_SPREAD_M = 0.8
-"""Standard deviation of the spacing: of detections' positions, not of driving."""
-_MIN_SPEED_M_PER_S, _MIN_EXTENT_M = 2.5, 8.0
-_MIN_FRAMES, _MIN_SHARE = 4, 0.6
-"""Frames that both have, and their share of those of the shorter one."""
 
 
 @dataclass(frozen=True)
@@ -271,83 +255,3 @@ def fill_gap(gap: Gap, candidates: Candidates, free: Mask) -> IntArray:
     best = order[np.unique(candidates.frame[rows[order]], return_index=True)[1]]
     free[rows[best]] = False
     return np.asarray(rows[best])
-
-
-def find_doubles(positions: pd.DataFrame, grey: pd.Series, metres: float) -> IntArray:
-    """Ids of the tracks that are doubles of another, which is brighter: a shadow is darker than what casts it.
-
-    Parameters
-    ----------
-    positions
-        ``track_id, frame, time_s, x_px, y_px`` of what was seen of each track.
-    grey
-        Mean grey level of each track's vehicle, by ``track_id``; of tracks that it lacks nothing is known.
-    metres
-        A base pixel, m.
-
-    Examples
-    --------
-    >>> t = np.arange(8) * 0.2
-    >>> car = pd.DataFrame({"track_id": 1, "frame": range(8), "time_s": t, "x_px": 50 * t, "y_px": 0.0})
-    >>> shadow = car[1:].assign(track_id=2, x_px=50 * t[1:] + 14)
-    >>> find_doubles(pd.concat([car, shadow]), pd.Series({1: 140.0, 2: 40.0}), 0.25).tolist()
-    [2]
-    """
-    if not len(positions):
-        return np.empty(0, np.int64)
-    table = positions.sort_values(["track_id", "frame"], ignore_index=True)
-    xy = table.groupby("track_id")[["x_px", "y_px"]]
-    extent = np.hypot(*(xy.max() - xy.min()).to_numpy().T) * metres
-    moves = extent[np.unique(table["track_id"], return_inverse=True)[1]] >= _MIN_EXTENT_M
-    table = table[moves].reset_index(drop=True)
-    pairs = _near_pairs(table, metres)
-    if not len(pairs):
-        return np.empty(0, np.int64)
-    count = table["track_id"].value_counts()
-    doubles: set[int] = set()
-    for _, rows in pairs.groupby(["one", "other"]):
-        if len(rows) >= _MIN_FRAMES and _in_lockstep(rows):
-            both = [int(rows[name].iloc[0]) for name in ("one", "other")]
-            darker, brighter = sorted(both, key=lambda track: (grey.get(track, np.inf), -track))
-            if len(rows) >= _MIN_SHARE * min(count[darker], count[brighter]) and brighter not in doubles:
-                doubles.add(darker)
-    return np.array(sorted(doubles), np.int64)
-
-
-def _near_pairs(table: pd.DataFrame, metres: float) -> pd.DataFrame:
-    """Pairs of tracks that are near in a frame: ``one, other, time_s``, position ``x, y`` of one and offset ``dx, dy``
-    of the other, m; by track and time."""
-    xy, track = table[["x_px", "y_px"]].to_numpy(np.float64) * metres, table["track_id"].to_numpy(np.int64)
-    found: list[IntArray] = [np.empty((0, 2), np.int64)]
-    frame = table["frame"].to_numpy(np.int64)
-    order = np.argsort(frame, kind="stable")
-    for rows in np.split(order, np.flatnonzero(np.diff(frame[order])) + 1):
-        near = cKDTree(xy[rows]).query_pairs(_MAX_SPACING_M + _MAX_SPREAD_M, output_type="ndarray")
-        found.append(rows[near])
-    pair = np.concatenate(found)
-    pair = np.where((track[pair[:, 0]] > track[pair[:, 1]])[:, None], pair[:, ::-1], pair)
-    offset = xy[pair[:, 1]] - xy[pair[:, 0]]
-    columns = {"one": track[pair[:, 0]], "other": track[pair[:, 1]], "time_s": table["time_s"].to_numpy()[pair[:, 0]]}
-    places = {"x": xy[pair[:, 0], 0], "y": xy[pair[:, 0], 1], "dx": offset[:, 0], "dy": offset[:, 1]}
-    return pd.DataFrame({**columns, **places}).sort_values(["one", "other", "time_s"], ignore_index=True)
-
-
-def _in_lockstep(rows: pd.DataFrame) -> bool:
-    """Whether the pair keeps its spacing, in the world as a shadow does, or along the vehicle as a load does."""
-    time, offset = rows["time_s"].to_numpy(), rows[["dx", "dy"]].to_numpy()
-    velocity = np.gradient(rows[["x", "y"]].to_numpy(), time, axis=0)
-    speed = np.hypot(*velocity.T)
-    if np.median(speed) < _MIN_SPEED_M_PER_S:
-        return False
-    heading = velocity / np.maximum(speed, 1e-9)[:, None]
-    along = (offset * heading).sum(axis=1)
-    across = heading[:, 0] * offset[:, 1] - heading[:, 1] * offset[:, 0]
-    spacing = min(_SPACING_M + _SPACING_S * float(np.median(speed)), _MAX_SPACING_M)
-    distance = float(np.hypot(*np.median(offset, axis=0)))
-    near = distance <= _ABREAST_M or (distance <= spacing and abs(np.median(across)) <= _MAX_ASIDE_M)
-    spread = min(_spread(offset), _spread(np.column_stack([along, across])))
-    return bool(near and spread <= _MAX_SPREAD_M)
-
-
-def _spread(offset: FloatArray) -> float:
-    return float(np.sqrt(offset.var(axis=0).sum()))

@@ -1,6 +1,6 @@
 """Tracks of the whole flight: tracklets that share detections, chained, gaps closed; and the vehicles' dimensions."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -18,10 +18,11 @@ from velfield.run.stores import open_frames
 from velfield.run.tables import empty_table, read_patches, read_tables, write_table, write_tracks
 from velfield.tracking.association import LinkedTriples, tracklet_table, window_frames
 from velfield.tracking.dimensions import STRIP_SHAPE, direction_of_axes, looks, measure, sample_tracks
+from velfield.tracking.doubles import find_doubles, find_split_tracks
 from velfield.tracking.gates import Limits, triples_pass
 from velfield.tracking.join_costs import GapLimits, TrackEnds
 from velfield.tracking.joins import END_COLUMNS, EndContext, assign_tracks, find_ends
-from velfield.tracking.recovery import Candidates, Recovered, find_doubles, interpolate_gap, recover_tracks
+from velfield.tracking.recovery import Candidates, Recovered, interpolate_gap, recover_tracks
 
 _MIDDLE = ["frame_1", "time_1_s", "x_1_px", "y_1_px"]
 _IDS = [f"detection_id_{k}" for k in range(3)]
@@ -51,7 +52,10 @@ def chain_tracks(plan: Plan) -> StageResult:
     tracklets = tracklets.assign(track_id=found.tracks[chain])
     flight = _Frames(open_frames(layout.frames).column("time_s"), usable_frames(plan))
     positions = all_positions(tracklets, found, candidates, gsd_m, flight)
-    doubles = find_doubles(positions[positions["source"] < 2], mean_grey(strips, found.tracks), gsd_m)
+    whole = find_split_tracks(positions, gsd_m)
+    positions, tracklets = _join_parts(positions, whole), _join_parts(tracklets, whole)
+    found = replace(found, tracks=_whole_of(found.tracks, whole), joins=_join_parts(found.joins, whole))
+    doubles = find_doubles(positions, mean_grey(strips, found.tracks), gsd_m)
     positions = _without(positions, doubles)
     written, start, recovered = [], 0, 0
     for unit, frames in enumerate(plan.units):
@@ -88,6 +92,23 @@ def chain_tracks(plan: Plan) -> StageResult:
         "tracks": float(kept["track_id"].nunique()),
     }
     return StageResult(written, counts, warnings=warnings)
+
+
+def _whole_of(track_id: IntArray, whole: pd.Series) -> IntArray:
+    """The ids of tracks, those of parts by the whole's."""
+    named = pd.Series(track_id)
+    return named.map(whole).fillna(named).to_numpy(np.int64)
+
+
+def _join_parts(table: pd.DataFrame, whole: pd.Series) -> pd.DataFrame:
+    """A table with parts of tracks as one; of its positions in one frame, the one that is surest."""
+    if whole.empty:
+        return table
+    table = table.assign(track_id=_whole_of(table["track_id"].to_numpy(np.int64), whole))
+    if "source" not in table:
+        return table
+    table = table.sort_values(["frame", "track_id", "source"], kind="stable", ignore_index=True)
+    return table.drop_duplicates(["frame", "track_id"], ignore_index=True)
 
 
 def _without(table: pd.DataFrame, doubles: IntArray) -> pd.DataFrame:
