@@ -36,6 +36,13 @@ def test_a_shadow_to_the_side_is_nearer_than_the_next_lane() -> None:
     assert doubles(track(1, 12.0), track(2, 12.0, 0.5, 2.2)) == [2]
 
 
+def test_the_shadow_of_a_van_in_a_low_sun_is_further_to_the_side_and_black() -> None:
+    van, shadow = track(1, 12.0), track(2, 12.0, 0.3, 3.0)
+    assert doubles(van, shadow, grey={1: 240.0, 2: 30.0}) == [2]
+    assert doubles(van, shadow, grey={1: 240.0, 2: 90.0}) == []
+    assert doubles(van, track(2, 12.0, 0.3, 3.5), grey={1: 240.0, 2: 30.0}) == []
+
+
 def test_a_shadow_keeps_its_place_in_the_world_round_a_bend() -> None:
     angle = np.linspace(0, np.pi / 2, 15)
     car = track(1, 0.0).assign(x_px=80 * np.sin(angle), y_px=80 * (1 - np.cos(angle)))

@@ -18,8 +18,9 @@ _SPACING_M, _SPACING_S, _MAX_SPACING_M = 5.0, 0.25, 8.0
 a gap of half a second and more."""
 _MAX_ASIDE_M = 1.8
 """Across the direction of travel: a vehicle in the next lane is 3 m and more away."""
-_ABREAST_M = 2.6
-"""Two vehicles are not nearer to each other, side by side either."""
+_ABREAST_M, _BLACK_ABREAST_M, _BLACK = 2.6, 3.2, 0.3
+"""Two vehicles are not nearer to each other, side by side either; nor is one, for long, to one that has so small a part
+of its grey level, as the shadow of a van in a low sun has."""
 _MAX_SPREAD_M = 0.8
 """Standard deviation of the spacing: of detections' positions, not of driving."""
 _MIN_SPEED_M_PER_S, _MIN_EXTENT_M = 2.5, 8.0
@@ -64,11 +65,13 @@ def find_doubles(positions: pd.DataFrame, grey: pd.Series, metres: float) -> Int
     doubles: set[int] = set()
     part, _, both_seen = _count_seen(pairs)
     for rows in (pairs[part[k] : part[k + 1]] for k in np.flatnonzero(both_seen >= _MIN_FRAMES)):
-        if _in_lockstep(rows[rows["seen"] == 2]):
-            both = [int(rows[name].iloc[0]) for name in ("one", "other")]
-            darker, brighter = sorted(both, key=lambda track: (grey.get(track, np.inf), -track))
-            if len(rows) >= _MIN_SHARE * min(count[darker], count[brighter]) and brighter not in doubles:
-                doubles.add(darker)
+        both = [int(rows[name].iloc[0]) for name in ("one", "other")]
+        darker, brighter = sorted(both, key=lambda track: (grey.get(track, np.inf), -track))
+        black = grey.get(darker, np.nan) <= _BLACK * grey.get(brighter, np.nan)
+        long_enough = len(rows) >= _MIN_SHARE * min(count[darker], count[brighter])
+        abreast_m = _BLACK_ABREAST_M if black else _ABREAST_M
+        if long_enough and brighter not in doubles and _in_lockstep(rows[rows["seen"] == 2], abreast_m):
+            doubles.add(darker)
     return np.array(sorted(doubles), np.int64)
 
 
@@ -172,8 +175,11 @@ def _near_pairs(table: pd.DataFrame, metres: float) -> pd.DataFrame:
     return pairs.sort_values(["one", "other", "time_s"], ignore_index=True)
 
 
-def _in_lockstep(rows: pd.DataFrame) -> bool:
-    """Whether the pair keeps its spacing, in the world as a shadow does, or along the vehicle as a load does."""
+def _in_lockstep(rows: pd.DataFrame, abreast_m: float) -> bool:
+    """Whether the pair keeps its spacing, in the world as a shadow does, or along the vehicle as a load does.
+
+    To any side up to ``abreast_m``.
+    """
     time, offset = rows["time_s"].to_numpy(), rows[["dx", "dy"]].to_numpy()
     velocity = np.gradient(rows[["x", "y"]].to_numpy(), time, axis=0)
     speed = np.hypot(*velocity.T)
@@ -184,7 +190,7 @@ def _in_lockstep(rows: pd.DataFrame) -> bool:
     across = heading[:, 0] * offset[:, 1] - heading[:, 1] * offset[:, 0]
     spacing = min(_SPACING_M + _SPACING_S * float(np.median(speed)), _MAX_SPACING_M)
     distance = float(np.hypot(*np.median(offset, axis=0)))
-    near = distance <= _ABREAST_M or (distance <= spacing and abs(np.median(across)) <= _MAX_ASIDE_M)
+    near = distance <= abreast_m or (distance <= spacing and abs(np.median(across)) <= _MAX_ASIDE_M)
     spread = min(_spread(offset), _spread(np.column_stack([along, across])))
     return bool(near and spread <= _MAX_SPREAD_M)
 
