@@ -54,7 +54,7 @@ def chain_tracks(plan: Plan) -> StageResult:
     positions = all_positions(tracklets, found, candidates, gsd_m, flight)
     whole = find_split_tracks(positions, gsd_m)
     positions, tracklets = _join_parts(positions, whole), _join_parts(tracklets, whole)
-    found = replace(found, tracks=_whole_of(found.tracks, whole), joins=_join_parts(found.joins, whole))
+    found = replace(found, tracks=_rename_parts(found.tracks, whole), joins=_join_parts(found.joins, whole))
     doubles = find_doubles(positions, mean_grey(strips, found.tracks), gsd_m)
     positions = _without(positions, doubles)
     written, start, recovered = [], 0, 0
@@ -94,7 +94,7 @@ def chain_tracks(plan: Plan) -> StageResult:
     return StageResult(written, counts, warnings=warnings)
 
 
-def _whole_of(track_id: IntArray, whole: pd.Series) -> IntArray:
+def _rename_parts(track_id: IntArray, whole: pd.Series) -> IntArray:
     """The ids of tracks, those of parts by the whole's."""
     named = pd.Series(track_id)
     return named.map(whole).fillna(named).to_numpy(np.int64)
@@ -104,7 +104,7 @@ def _join_parts(table: pd.DataFrame, whole: pd.Series) -> pd.DataFrame:
     """A table with parts of tracks as one; of its positions in one frame, the one that is surest."""
     if whole.empty:
         return table
-    table = table.assign(track_id=_whole_of(table["track_id"].to_numpy(np.int64), whole))
+    table = table.assign(track_id=_rename_parts(table["track_id"].to_numpy(np.int64), whole))
     if "source" not in table:
         return table
     table = table.sort_values(["frame", "track_id", "source"], kind="stable", ignore_index=True)
