@@ -500,6 +500,15 @@ def _choices(argument: Argument | None) -> str:
     return f" (one of {', '.join(words)})" if words else ""
 
 
+def _explain_s3(error: Exception) -> str:
+    if type(error).__name__ == "NoCredentialsError":
+        return (
+            "found no credentials, expected AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, a profile (AWS_PROFILE) or "
+            "this machine's role; set them"
+        )
+    return " ".join(str(error).split())  # no such server, an address that is none
+
+
 def main() -> None:
     """Run the command; bad input is one clear line, never a traceback."""
     limit_threads()
@@ -534,7 +543,7 @@ def main() -> None:
     except Exception as error:
         if type(error).__module__.split(".")[0] not in ("botocore", "aiobotocore"):
             raise
-        print(f"velfield: S3: {' '.join(str(error).split())}", file=sys.stderr)  # no such server, no credentials
+        print(f"velfield: S3: {_explain_s3(error)}", file=sys.stderr)
         status = BAD_INPUT
     sys.exit(status)
 

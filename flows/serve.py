@@ -107,6 +107,8 @@ def settings(config: ServeConfig) -> dict[str, str]:
         # Relative: the same under every name and address by which a browser reaches this server.
         "PREFECT_UI_API_URL": "/api",
         "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+        # Its second UI asks amplitude.com when it is opened, whatever the setting above says (Prefect 3.8).
+        "PREFECT_SERVER_UI_V2_ENABLED": "false",
         "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": config.url,
         "PREFECT_RUNNER_POLL_FREQUENCY": "2",
         "PREFECT_CLIENT_CSRF_SUPPORT_ENABLED": "true",

@@ -11,10 +11,11 @@ from prefect.runtime import flow_run
 from prefect.states import Crashed
 
 from schemas.job import Job, absolute
-from velfield.run.layout import RunLayout
+from velfield.run.layout import RunLayout, to_path
 from velfield.run.lock import holder_is_gone
 
 _PAGE = 200
+_S3 = "s3:/"
 _RESUMED = "the process was killed; the next run of this folder resumed from its commits"
 _ENDED = "the process was killed; the same command resumes from its commits"
 
@@ -33,9 +34,9 @@ def mark_crashed(name: str) -> int:
 
     Call while holding the run folder's lock: then no other run on it can be alive. Returns how many.
     """
-    own = str(flow_run.id)
+    own, remote = str(flow_run.id), name.startswith(_S3)
     return _mark(lambda run: str(run.id) != own and run.name == name, _RESUMED) + _mark(
-        lambda run: str(run.id) != own and run.name != name and _is_abandoned(run), _ENDED
+        lambda run: str(run.id) != own and run.name != name and _is_abandoned(run, remote=remote), _ENDED
     )
 
 
@@ -44,13 +45,18 @@ def mark_abandoned() -> int:
 
     Runs of its own deployments ended with the server before; others did where their process has ended.
     """
-    return _mark(lambda run: run.deployment_id is not None or _is_abandoned(run), _ENDED)
+    return _mark(lambda run: run.deployment_id is not None or _is_abandoned(run, remote=False), _ENDED)
 
 
-def _is_abandoned(run: FlowRun) -> bool:
-    """Whether a run is named after a folder of this machine (`RUN`, or `RUN on BASE`) whose lock's holder has ended."""
-    root = Path(run.name.split(" on ")[0])
-    return root.is_absolute() and holder_is_gone(RunLayout(root))
+def _is_abandoned(run: FlowRun, *, remote: bool) -> bool:
+    """Whether a run is named after a folder (`RUN`, or `RUN on BASE`) whose lock's holder has ended.
+
+    S3 is asked only by who works on it (``remote``): another process has no credentials for it, or waits in vain.
+    """
+    name = run.name.split(" on ")[0]
+    if name.startswith(_S3):
+        return remote and holder_is_gone(RunLayout(to_path(name)))
+    return Path(name).is_absolute() and holder_is_gone(RunLayout(Path(name)))
 
 
 def _mark(is_dead: Callable[[FlowRun], bool], message: str) -> int:

@@ -95,6 +95,17 @@ def test_an_object_store_that_does_not_answer_is_one_line() -> None:
     assert lines[0].startswith("velfield: S3: Could not connect")
 
 
+def test_no_credentials_for_an_object_store_are_one_line(tmp_path: Path) -> None:
+    ours = {name: value for name, value in os.environ.items() if not name.startswith("AWS_")}
+    nobody = {"AWS_ENDPOINT_URL": "http://127.0.0.1:9", "AWS_EC2_METADATA_DISABLED": "true", "HOME": str(tmp_path)}
+    command = [sys.executable, "-m", "flows.cli", "verify", "s3://runs/flight"]
+    given = {"cwd": ROOT, "env": {**ours, **nobody}, "capture_output": True, "text": True}
+    ended = subprocess.run(command, timeout=120, check=False, **given)
+    lines = ended.stderr.splitlines()
+    assert (ended.returncode, len(lines)) == (1, 1), lines
+    assert lines[0].startswith("velfield: S3: found no credentials, expected AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_")
+
+
 @pytest.mark.parametrize("option", ["base", "labels"])
 def test_a_plan_reads_the_inputs_too(
     option: str, flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -24,6 +24,7 @@ from tests.viewer.test_viewer_server import served
 from velfield.errors import InputError
 from velfield.report.figures import png_bytes
 from velfield.report.viewer_page import page_is_built
+from velfield.run.layout import RunLayout, to_path
 from velfield.viewer.annotations import frames_to_annotate
 from velfield.viewer.annotator import annotate_app
 from velfield.viewer.server import files_app, serve_in_thread
@@ -160,6 +161,31 @@ def test_a_run_is_named_by_its_folder_from_the_root_on(
     with get_client(sync_client=True) as client:
         assert len(client.read_flow_runs(flow_run_filter=named)) == 1
     assert name_run(job(flight, Path("s3://runs/flight")))() == "s3://runs/flight"  # `Path` drops a slash
+
+
+def test_a_run_on_s3_whose_lease_expired_is_crashed_once_another_works_there(server: None, s3: None) -> None:
+    from prefect import flow
+    from prefect.client.orchestration import get_client
+    from prefect.states import Running
+
+    from flows.stale import mark_abandoned, mark_crashed
+
+    @flow
+    def nothing() -> None:
+        pass
+
+    owner = {"pid": 1, "host": "another.machine"}
+    with get_client(sync_client=True) as client:
+        runs = {}
+        for name, until_s in (("killed", time.time() - 5), ("alive", time.time() + 60)):
+            root = to_path(f"s3://flights/servers/{name}")
+            RunLayout(root).lock.write_bytes(json.dumps(owner | {"until_s": until_s}).encode())
+            runs[name] = client.create_flow_run(nothing, name=str(root), state=Running())
+        assert mark_abandoned() == 0  # a server on this machine does not ask S3
+        assert mark_crashed("s3://flights/servers/another") == 1
+        states = {name: client.read_flow_run(run.id).state_name for name, run in runs.items()}
+        assert states == {"killed": "Crashed", "alive": "Running"}
+        client.delete_flow_run(runs["alive"].id)
 
 
 def test_runs_whose_process_was_killed_are_crashed_and_others_are_not(server: None, tmp_path: Path) -> None:

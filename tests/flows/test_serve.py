@@ -117,6 +117,8 @@ def test_all_addresses_with_a_password(tmp_path: Path) -> None:
                 assert asked
                 assert [request for request in asked if not request.startswith(url)] == []
                 assert "Can't connect" not in page.value("document.body.innerText")
+                others = [one for one in page.requests if not one.startswith((url, "data:", "blob:"))]
+                assert others == []  # no other host is told that somebody looks
         finally:
             process.send_signal(signal.SIGINT)
             process.wait(60)

@@ -14,7 +14,7 @@ import pytest
 from velfield.errors import InputError
 from velfield.run import lock
 from velfield.run.layout import RunLayout, to_path
-from velfield.run.lock import locked
+from velfield.run.lock import holder_is_gone, locked
 
 EXPIRED = json.dumps({"pid": 1, "host": "elsewhere", "since": "2024-05-01 12:00:00", "until_s": 0.0})
 
@@ -154,6 +154,15 @@ def test_a_lease_is_renewed_while_it_is_held_and_expires_when_it_is_given_back(
         time.sleep(0.5)
         assert record(lease)["until_s"] > first["until_s"]  # type: ignore[operator]
     assert record(lease)["until_s"] <= time.time()  # type: ignore[operator]
+
+
+def test_the_holder_of_a_lease_is_gone_when_it_expired(lease: RunLayout) -> None:
+    assert not holder_is_gone(lease)  # nobody ever held it
+    with locked(lease):
+        assert not holder_is_gone(lease)
+    assert holder_is_gone(lease)
+    lease.lock.write_bytes(EXPIRED.encode())
+    assert holder_is_gone(lease)
 
 
 def test_a_lease_that_was_taken_over_is_not_taken_back(lease: RunLayout) -> None:

@@ -16,6 +16,8 @@ from tests.foreign_cluster import foreign_cluster
 from tests.new_base import write_new_base
 from tests.small_flight import digests, digests_of, job, process, redone
 from velfield import open_run
+from velfield.errors import InputError
+from velfield.pipeline.plan import make_plan
 from velfield.pipeline.verify import verify_run
 from velfield.run import layout
 from velfield.run.layout import RunLayout, copy_objects, rename_tree, to_path
@@ -49,6 +51,12 @@ def remote_digests(root: Path) -> dict[str, str]:
 def test_the_same_bits_as_on_a_disk(remote: tuple[Path, RunSummary], whole: tuple[Path, RunSummary]) -> None:
     assert remote[1].complete
     assert remote_digests(remote[0]) == digests(whole[0])
+
+
+def test_a_bucket_that_is_not_there_is_refused_before_anything_starts(s3: None, flight: Path) -> None:
+    work = job(flight, to_path("s3://nowhere/runs/whole"))
+    with pytest.raises(InputError, match=r"^s3://nowhere/runs/whole/flight.json: found no bucket nowhere, expected it"):
+        make_plan(work)
 
 
 def test_a_second_run_recomputes_nothing(remote: tuple[Path, RunSummary], flight: Path) -> None:

@@ -10,7 +10,7 @@ from schemas.records import FORMAT_VERSION, READABLE_FORMATS, FlightRecord
 from schemas.renames import OLD_FOLDERS, upgrade_config
 from velfield.errors import InputError
 from velfield.run.commits import read_sealed
-from velfield.run.layout import RunLayout, is_remote
+from velfield.run.layout import RunLayout, check_store, is_remote
 
 _MAX_ENTRIES = 1000
 
@@ -69,9 +69,10 @@ def check_format(root: Path) -> None:
     Raises
     ------
     InputError
-        One line: the format found, and what to do.
+        One line: the format found, or the bucket that is not there, and what to do.
     """
     path = RunLayout(root).flight
+    check_store(path)
     if not path.exists():
         return
     try:

@@ -46,6 +46,26 @@ def is_remote(path: object) -> "TypeGuard[S3ObjectPath]":
     return not isinstance(path, Path)
 
 
+def check_store(path: Path) -> None:
+    """Refuse a path in a bucket that is not there, before anything is read or written; on a disk all paths pass.
+
+    Raises
+    ------
+    InputError
+        There is no such bucket.
+    """
+    if not is_remote(path):
+        return
+    bucket, _, prefix = path.path.partition("/")
+    try:
+        path.fs.call_s3("list_objects_v2", Bucket=bucket, Prefix=prefix, MaxKeys=1)
+    except FileNotFoundError:
+        raise InputError(
+            f"{path}: found no bucket {bucket}, expected it to be there; make it (`aws s3 mb s3://{bucket}`) or "
+            "correct the address"
+        ) from None
+
+
 def remove_tree(path: Path) -> None:
     """Remove a folder and all in it, if it exists."""
     if not is_remote(path):

@@ -160,9 +160,13 @@ def _leased(path: "S3ObjectPath", name: str) -> Iterator[None]:
 
 
 def holder_is_gone(layout: RunLayout) -> bool:
-    """Whether the process that last held the lock was one of this machine and has ended, perhaps killed."""
+    """Whether the process that last held the lock has ended, perhaps killed: one of this machine; on S3 any whose lease
+    has expired."""
     try:
-        record = parse_json(layout.lock.read_text(encoding="utf-8"))
+        text = layout.lock.read_text(encoding="utf-8")
+        if is_remote(layout.lock):
+            return _is_expired(text)
+        record = parse_json(text)
         return bool(record["host"] == socket.gethostname()) and not _is_running(int(record["pid"]))
     except (OSError, ValueError, KeyError, TypeError):
         return False
