@@ -4,9 +4,10 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 from rich.console import Console as RichConsole
@@ -23,7 +24,7 @@ from rich.progress import (
 from velfield.parallel import subscribe_steps
 from velfield.pipeline.result import subscribe
 
-_LINE_EVERY_S = 10.0
+_LINE_EVERY_S, _LOG_EVERY_S = 10.0, 30.0
 _TRAINS = "detector"
 """The stage that counts steps of a training."""
 Verbosity = Literal["quiet", "normal", "verbose", "json"]
@@ -35,6 +36,8 @@ class StageProgress:
 
     bar: Progress
     task: TaskID
+    log: Callable[[int, int], None]
+    """Told of the steps that are done and of their number; writes a line now and then where no bar is seen."""
     total: int = 0
     done: int = 0
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -60,6 +63,7 @@ class StageProgress:
         with self.lock:
             self.done = min(self.total, max(self.done, done))
             self.bar.update(self.task, completed=self.done)
+        self.log(self.done, self.total)
 
 
 @dataclass
@@ -67,11 +71,20 @@ class StageBars:
     """Progress bars, one a stage."""
 
     bar: Progress
+    log: Callable[[str], None] | None = None
+    """Writes a line, where no bar is seen."""
     stages: dict[str, StageProgress] = field(default_factory=dict)
+    logged_s: float = field(default_factory=time.monotonic)
 
     def add(self, name: str, label: str) -> StageProgress:
         """A bar for a stage, by its name and what it is called."""
-        self.stages[name] = StageProgress(self.bar, self.bar.add_task(label, total=None))
+
+        def log(done: int, total: int) -> None:
+            if self.log is not None and done < total and time.monotonic() - self.logged_s >= _LOG_EVERY_S:
+                self.logged_s = time.monotonic()
+                self.log(f"{label}: {done} of {total} steps")
+
+        self.stages[name] = StageProgress(self.bar, self.bar.add_task(label, total=None), log)
         return self.stages[name]
 
     def add_training_steps(self, done: int, announced: int) -> None:
@@ -160,6 +173,6 @@ class Console:
         )
         hidden = not self._rich.is_terminal  # in a log a bar would leave empty lines
         with Progress(*columns, console=self._rich, transient=True, refresh_per_second=5, disable=hidden) as bar:
-            bars = StageBars(bar)
+            bars = StageBars(bar, partial(self.event, "progress") if hidden else None)
             with subscribe(bars.add_steps), subscribe_steps(bars.add_training_steps):
                 yield bars
