@@ -37,7 +37,7 @@ class StageProgress:
     bar: Progress
     task: TaskID
     log: Callable[[int, int], None]
-    """Told of the steps that are done and of their number; writes a line now and then where no bar is seen."""
+    """Called with the steps that are done and their number: a line now and then where no bar is seen."""
     total: int = 0
     done: int = 0
     lock: threading.Lock = field(default_factory=threading.Lock)

@@ -18,11 +18,17 @@ from velfield.run.stores import open_frames
 from velfield.run.tables import empty_table, read_patches, read_tables, write_table, write_tracks
 from velfield.tracking.association import LinkedTriples, tracklet_table, window_frames
 from velfield.tracking.dimensions import STRIP_SHAPE, direction_of_axes, looks, measure, sample_tracks
-from velfield.tracking.doubles import find_doubles, find_split_tracks
 from velfield.tracking.gates import Limits, triples_pass
 from velfield.tracking.join_costs import GapLimits, TrackEnds
 from velfield.tracking.joins import END_COLUMNS, EndContext, assign_tracks, find_ends
-from velfield.tracking.recovery import Candidates, Recovered, interpolate_gap, recover_tracks
+from velfield.tracking.recovery import (
+    Candidates,
+    Recovered,
+    find_doubles,
+    find_split_tracks,
+    interpolate_gap,
+    recover_tracks,
+)
 
 _MIDDLE = ["frame_1", "time_1_s", "x_1_px", "y_1_px"]
 _IDS = [f"detection_id_{k}" for k in range(3)]
