@@ -23,6 +23,7 @@ from velfield.pipeline.georeference import plan_of_finished
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.stages.detections import detect_block
 from velfield.pipeline.stages.detector import make_detector
+from velfield.pipeline.stages.tracklets import explain_no_tracklets
 
 TILE = 128
 LENGTH, WIDTH, ANGLE = 16.0, 8.0, 0.5
@@ -353,3 +354,21 @@ def test_a_run_detects_with_it_on_raw_frames(whole: tuple[Path, RunSummary], tmp
         expected[np.isfinite(expected[:, 0])].round(1)
     )
     assert block.searched.tolist() == [1.0]
+
+
+def test_a_model_that_finds_nothing_is_told_what_to_check(
+    whole: tuple[Path, RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tiny_yolo(tmp_path / "m.onnx", "oriented_boxes")
+    made = plan_of_finished(open_run(whole[0]))
+    inputs = made.job.inputs.model_copy(update={"labels": None, "detector": str(path)})
+    config = made.config.model_copy(
+        update={"detection": made.config.detection.model_copy(update={"threshold": 0.99999})}
+    )
+    plan = Plan(Job(root=str(whole[0]), inputs=inputs, config=config), made.info, made.indices, made.inputs, made.keys)
+    monkeypatch.setattr("velfield.pipeline.stages.detector._scale_of_gsd", lambda _: None)
+    with pytest.raises(InputError, match=r"^the detector found no vehicle in \d+ frames, expected some, as the scale "):
+        make_detector(plan)
+    assert explain_no_tracklets(plan).endswith(
+        "and if not check the model's classes, threshold and input values (docs/detection.md#another-detector)"
+    )
