@@ -30,13 +30,21 @@ _DRIVEN_FRACTION = 0.4
 """Of that length, what others drove where a vehicle stands in a lane."""
 
 
+VEHICLE_COLUMNS = (
+    *("track_id", "displacement_sd_01_px", "displacement_sd_12_px"),
+    *(f"{name}_{k}{unit}" for k in range(3) for name, unit in (("time", "_s"), ("x", "_px"), ("y", "_px"))),
+    *(f"{name}_{k}" for k in range(3) for name in ("frame", "detection_id")),
+)
+"""Columns of tracklets that `find_vehicles` reads."""
+
+
 def find_vehicles(tracklets: pd.DataFrame, detections: pd.DataFrame, *, gsd_m: float | None) -> pd.DataFrame:
     """One row a track.
 
     Parameters
     ----------
     tracklets
-        ``schemas.tables.TRACK_COLUMNS``.
+        `VEHICLE_COLUMNS`.
     detections
         ``schemas.tables.DETECTION_COLUMNS``: ``detection_id`` and ``orientation_rad`` are read.
     gsd_m

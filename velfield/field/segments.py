@@ -171,6 +171,15 @@ _MIN_DISPLACEMENT_SD_PX = 0.15
 Segments = NDArray[np.void]
 """(n,) structured array of `SEGMENT_DTYPE`."""
 
+SEGMENT_COLUMNS = (
+    *("track_id", "tracklet_id"),
+    *(f"{name}_{k}{unit}" for k in range(3) for name, unit in (("time", "_s"), ("x", "_px"), ("y", "_px"))),
+    *(f"detection_id_{k}" for k in range(3)),
+    *(f"v{axis}_{link}_px_per_s" for link in ("01", "12") for axis in "xy"),
+    *(f"displacement_sd_{link}_px" for link in ("01", "12")),
+)
+"""Columns of tracklets that `segment_table` reads."""
+
 
 def segment_table(tracklets: pd.DataFrame, config: FieldConfig) -> Segments:
     """The segments of a table of tracklets, two a tracklet, sorted by track and time.
@@ -184,26 +193,28 @@ def segment_table(tracklets: pd.DataFrame, config: FieldConfig) -> Segments:
     InputError
         A position, a velocity or a time is not finite, or an interval is not positive.
     """
-    halves = [_half_tracklets(tracklets, first) for first in (0, 1)]
-    segments = np.concatenate(halves)
-    _check(segments)
-    order = np.lexsort((segments["detection_1"], segments["detection_0"], segments["start_s"], segments["track"]))
-    segments = segments[order]
-    if config.shared_segment_weight == 1:
-        segments = _average_velocities(segments[_first_of_duplicates(segments)], config.velocity_span_s)
+    both: Segments = np.zeros(2 * len(tracklets), SEGMENT_DTYPE)  # filled in place: of a long flight each copy is much
+    for first, half in enumerate(np.split(both, 2)):
+        _fill_with_half(half, tracklets, first)
+    _check(both)
+    order = np.lexsort((both["detection_1"], both["detection_0"], both["start_s"], both["track"]))
+    if config.shared_segment_weight != 1:
+        return both[order]
+    segments = both[order[_first_of_duplicates(both, order)]]
+    _average_velocities(segments, config.velocity_span_s)
     return segments
 
 
-def _average_velocities(segments: Segments, span_s: float) -> Segments:
-    """Moving average of the velocities, weighted by duration over variance, over the consecutive segments whose
-    midpoints are within half a span.
+def _average_velocities(segments: Segments, span_s: float) -> None:
+    """Replace the velocities by their moving average over the consecutive segments whose midpoints are within half a
+    span, weighted by duration over variance.
 
     The error of a detection's position enters two neighbouring segments with opposite signs, so that it mostly cancels
     in their mean; for half a second or so a vehicle's acceleration is about constant, and a symmetric mean is
     unbiased. Segments whose crops did not align, with errors of a pixel or more, have little weight.
     """
     if not len(segments):
-        return segments
+        return
     broken = segments["track"][1:] != segments["track"][:-1]
     broken |= segments["detection_0"][1:] != segments["detection_1"][:-1]
     run = np.concatenate([[0], np.cumsum(broken)])
@@ -212,16 +223,14 @@ def _average_velocities(segments: Segments, span_s: float) -> Segments:
     # Symmetric; at a run's end one neighbour on the one side, as more would shift the mean in time.
     reach = np.maximum(np.minimum(before, after), 1)
     before, after = np.minimum(before, reach), np.minimum(after, reach)
-    out = segments.copy()
     sd_px = segments["sd_px_per_s"] * segments["duration_s"]
     weight = segments["duration_s"] / (sd_px**2 + _MIN_DISPLACEMENT_SD_PX**2)
     total = _window_sum(weight, before, after)
     for name in ("vx_px_per_s", "vy_px_per_s"):
-        out[name] = _window_sum(segments[name] * weight, before, after) / total
+        segments[name] = _window_sum(segments[name] * weight, before, after) / total
     # Errors of displacements are assumed independent. Those of positions cancel in part, so that for segments whose
     # crops did not align this is slightly too large.
-    out["sd_px_per_s"] = np.sqrt(_window_sum((segments["sd_px_per_s"] * weight) ** 2, before, after)) / total
-    return out
+    segments["sd_px_per_s"] = np.sqrt(_window_sum((segments["sd_px_per_s"] * weight) ** 2, before, after)) / total
 
 
 def _window_sum(values: FloatArray, before: IntArray, after: IntArray) -> FloatArray:
@@ -248,10 +257,9 @@ def _neighbours(run: IntArray, middle: FloatArray, reach_s: float) -> IntArray:
     return count
 
 
-def _half_tracklets(tracklets: pd.DataFrame, first: int) -> Segments:
-    """The segments between detections ``first`` and ``first + 1`` of every tracklet."""
+def _fill_with_half(half: Segments, tracklets: pd.DataFrame, first: int) -> None:
+    """Fill in the segments between detections ``first`` and ``first + 1`` of every tracklet."""
     a, b = first, first + 1
-    half = np.zeros(len(tracklets), SEGMENT_DTYPE)
     track = tracklets["track_id"].to_numpy()
     # The ids of tracklets without a track are negative, so that none equals a track's.
     half["track"] = np.where(track >= 0, track, -2 - tracklets["tracklet_id"].to_numpy())
@@ -263,7 +271,6 @@ def _half_tracklets(tracklets: pd.DataFrame, first: int) -> Segments:
     half["vy_px_per_s"] = tracklets[f"vy_{a}{b}_px_per_s"]
     half["sd_px_per_s"] = tracklets[f"displacement_sd_{a}{b}_px"] / half["duration_s"]
     half["detection_0"], half["detection_1"] = tracklets[f"detection_id_{a}"], tracklets[f"detection_id_{b}"]
-    return half
 
 
 def _check(segments: Segments) -> None:
@@ -279,11 +286,12 @@ def _check(segments: Segments) -> None:
         )
 
 
-def _first_of_duplicates(segments: Segments) -> Mask:
-    """Mask of the rows that do not repeat the row before (sorted: rows of equal track and detections are adjacent)."""
+def _first_of_duplicates(segments: Segments, order: IntArray) -> Mask:
+    """Mask of the rows, in an order, that do not repeat the row before; rows of equal track and detections are adjacent
+    in it."""
     keep = np.ones(len(segments), bool)
-    same = [segments[name][1:] == segments[name][:-1] for name in ("track", "detection_0", "detection_1")]
-    keep[1:] = ~np.logical_and.reduce(same)
+    columns = (segments[name][order] for name in ("track", "detection_0", "detection_1"))
+    keep[1:] = ~np.logical_and.reduce([column[1:] == column[:-1] for column in columns])
     return keep
 
 

@@ -1,6 +1,7 @@
 """`open_run`: one object over a run folder, the Python side of the contract of outputs."""
 
 import warnings
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -21,9 +22,9 @@ from schemas.tables import (
 )
 from velfield.analysis.crossings import find_crossings, hysteresis_px
 from velfield.analysis.vehicle_classes import add_dimensions
-from velfield.analysis.vehicles import find_vehicles
+from velfield.analysis.vehicles import VEHICLE_COLUMNS, find_vehicles
 from velfield.errors import InputError, OldNameWarning
-from velfield.field.segments import Segments, require_gsd_m, segment_table
+from velfield.field.segments import SEGMENT_COLUMNS, Segments, require_gsd_m, segment_table
 from velfield.field.view import VelocityField
 from velfield.registration.warp import warp_to_base
 from velfield.run.analysis import RunAnalysis
@@ -205,6 +206,13 @@ class Run:
         table = read_track_tables(paths, stored)
         return conform(table.assign(track_id=table["passage_id"]), TRACK_COLUMNS)
 
+    def _tracklet_columns(self, names: Sequence[str]) -> pd.DataFrame:
+        """Some columns of all tracklets: all of them are much, of a long flight."""
+        self.require_frames()
+        if self.layout.format_version != FORMAT_VERSION:
+            return self.tracklets()[list(names)]
+        return read_tables(sorted(self.layout.tracks.glob("unit-*.parquet")), TRACK_COLUMNS, only=list(names))
+
     def vehicles(self) -> pd.DataFrame:
         """One row a track: when and where, its length, width and class, and whether it moves, waits in a lane or is
         parked: `find_vehicles`, `add_dimensions`.
@@ -212,7 +220,7 @@ class Run:
         Of a run by an earlier release, which measured no vehicles, dimensions are NaN.
         """
         gsd_m = self.grid.gsd_m
-        vehicles = find_vehicles(self.tracklets(), self.detections(), gsd_m=gsd_m)
+        vehicles = find_vehicles(self._tracklet_columns(VEHICLE_COLUMNS), self.detections(), gsd_m=gsd_m)
         return add_dimensions(vehicles, self._dimensions(), gsd_m)
 
     def _dimensions(self) -> pd.DataFrame:
@@ -238,7 +246,8 @@ class Run:
 
     def segments(self) -> Segments:
         """Vehicles from one frame to the next, each once: by track and time (`velfield.field.segments`)."""
-        return segment_table(self.tracklets(), self.record.config.field.model_copy(update=_EACH_ONCE))
+        tracklets = self._tracklet_columns(SEGMENT_COLUMNS)
+        return segment_table(tracklets, self.record.config.field.model_copy(update=_EACH_ONCE))
 
     def crossings(self, start_xy: tuple[float, float], end_xy: tuple[float, float]) -> pd.DataFrame:
         """Crossings of the line between two base pixels by vehicles: `find_crossings`."""
