@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray
 from velfield.tracking.association import FrameTable
+from velfield.tracking.join_costs import TrackEnds
 
 OVERSAMPLING = 4
 CROP_PX = 32
@@ -305,3 +306,9 @@ SCENES: dict[str, Callable[[np.random.Generator], list[Car]]] = {
     "platoon": platoon,
     "crossing": crossing,
 }
+
+
+def together(*ends: TrackEnds) -> TrackEnds:
+    """The ends of several tracks in one table."""
+    names = ("frame", "time_s", "position_m", "velocity_m_per_s")
+    return TrackEnds(*(np.concatenate([getattr(one, name) for one in ends]) for name in names))

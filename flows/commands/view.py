@@ -32,9 +32,11 @@ def view(
     from velfield.viewer.server import view_app
 
     if run_folder.parts[:1] == ("s3:",):
-        address = "s3://" + "/".join(run_folder.parts[1:])
+        from schemas.job import absolute
+
         raise InputError(
-            f"{address}: found a run on S3, expected a folder of this machine; copy it first, as by `aws s3 sync`"
+            f"{absolute(str(run_folder))}: found a run on S3, expected a folder of this machine; copy it first, as by "
+            "`aws s3 sync`"
         )
 
     serve_until_interrupted(view_app(run_folder), port=port, open_browser=open_browser, place=run_folder)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from schemas.arrays import FloatArray
+from tests.tracking_scenes import together
 from velfield.tracking.join_costs import GapLimits, TrackEnds, find_candidates
 from velfield.tracking.joins import EndContext, close_gaps
 
@@ -14,11 +15,6 @@ def side(time_s: float, x: float, y: float, speed: float, heading_deg: float) ->
     heading = np.radians(heading_deg)
     velocity = speed * np.array([[np.cos(heading), np.sin(heading)]])
     return TrackEnds(np.array([round(5 * time_s)]), np.array([time_s]), np.array([[x, y]], dtype=float), velocity)
-
-
-def together(*sides: TrackEnds) -> TrackEnds:
-    names = ("frame", "time_s", "position_m", "velocity_m_per_s")
-    return TrackEnds(*(np.concatenate([getattr(one, name) for one in sides]) for name in names))
 
 
 def may_join(end: TrackEnds, start: TrackEnds, length_m: float = np.nan) -> bool:

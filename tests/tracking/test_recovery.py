@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from schemas.arrays import FloatArray, IntArray
+from tests.tracking_scenes import together
 from velfield.tracking.join_costs import GapLimits, TrackEnds
 from velfield.tracking.joins import EndContext
 from velfield.tracking.recovery import Candidates, Gap, extend_tracks, fill_gap, interpolate_gap, recover_tracks
@@ -16,15 +17,6 @@ LIMITS = GapLimits(4.0, 60.0, 15.0)
 
 def end(frame: int, x: float, speed: float, y: float = 0.0) -> TrackEnds:
     return TrackEnds(np.array([frame]), np.array([frame * DT]), np.array([[x, y]]), np.array([[speed, 0.0]]))
-
-
-def together(*ends: TrackEnds) -> TrackEnds:
-    return TrackEnds(
-        *(
-            np.concatenate([getattr(one, name) for one in ends])
-            for name in ("frame", "time_s", "position_m", "velocity_m_per_s")
-        )
-    )
 
 
 def candidates(frames: IntArray, xy: FloatArray, axis: float = 0.0) -> Candidates:

@@ -8,6 +8,8 @@ from typing import Any
 
 from upath.extensions import ProxyUPath
 
+from schemas.job import absolute
+
 S3_OPTIONS: dict[str, Any] = {
     "use_listings_cache": False,  # other processes write what this one lists
     "max_concurrency": 1,  # more would ask for an object's size before each reading; ours are small
@@ -67,7 +69,7 @@ class S3ObjectPath(ProxyUPath):
 
 def s3_path(path: str) -> S3ObjectPath:
     """The path of ``s3://bucket/key``; ``s3:/bucket/key``, which `pathlib.Path` makes of it, is the same."""
-    return S3ObjectPath("s3://" + path.removeprefix("s3:").lstrip("/"), **S3_OPTIONS)
+    return S3ObjectPath(absolute(path), **S3_OPTIONS)
 
 
 def _status(error: OSError) -> int | None:

@@ -27,7 +27,7 @@ _LONG_M, _LONG_FRACTION, _ASIDE_M = 4.8, 0.9, 1.2
 along its way; and no more than this where its way is unknown, as the next lane is 3 m away."""
 _GAP_PENALTY_PER_S = 0.25
 """A gap longer by a second costs as much as an offset larger by a quarter of the tolerance."""
-_STATIONARY_OFFSET_M = 1.6
+STATIONARY_OFFSET_M = 1.6
 """Tolerance for a vehicle that is stationary on both sides of the gap; another one would arrive moving."""
 _TYPICAL_ACCELERATION_M_PER_S2, _MAX_ACCELERATION_M_PER_S2, _STOP_SLACK_M = 2.0, 4.0, 0.5
 _MAX_STOP_SPEED_M_PER_S, _MAX_STOP_OFFSET_M = 5.0, 4.0
@@ -163,7 +163,7 @@ def _cost_of_stop(gaps: _Gaps, limits: GapLimits) -> FloatArray:
     """
     before, after = gaps.speeds()
     stands = (before < limits.stationary_speed_m_per_s) & (after < limits.stationary_speed_m_per_s)
-    standing = np.hypot(*gaps.displacement.T) / (_STATIONARY_OFFSET_M + np.minimum(gaps.slack, _ASIDE_M))
+    standing = np.hypot(*gaps.displacement.T) / (STATIONARY_OFFSET_M + np.minimum(gaps.slack, _ASIDE_M))
     expected = (before**2 + after**2) / (2 * _TYPICAL_ACCELERATION_M_PER_S2)
     along, across = _components(gaps.displacement, gaps.before + gaps.after)
     tolerance = np.minimum(_SLACK_M + 0.5 * expected, _MAX_STOP_OFFSET_M) + gaps.slack

@@ -23,13 +23,13 @@ from scipy.sparse.csgraph import connected_components, min_weight_full_bipartite
 from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.flight import PAPER_GSD_M
 from velfield.tracking.dimensions import looks_difference
-from velfield.tracking.join_costs import CERTAINTY_SLOPE, GapLimits, TrackEnds, find_candidates
+from velfield.tracking.join_costs import CERTAINTY_SLOPE, STATIONARY_OFFSET_M, GapLimits, TrackEnds, find_candidates
 
 _ALONE_COST = 1.0
 """Cost of a track's end, or start, that continues in none; a pair costs at most twice as much."""
 _VANISHED_COST = 0.6
 """Of one in the middle of the frames and of the flight so much more: few vehicles vanish there, under trees."""
-_STAYS_M, _DOUBTFUL_S, _DOUBTFUL_COST = 1.6, 1.0, 0.8
+_DOUBTFUL_S, _DOUBTFUL_COST = 1.0, 0.8
 """Of a track that stays so shortly in one place amid the frames: two of five are of no vehicle (simulated flights)."""
 _UNDECIDED_LOOKS_DIFFERENCE = 0.68
 """Of looks, in standard deviations of a strip, that one vehicle has as often on both sides as two have: the median is
@@ -69,7 +69,8 @@ class EndContext:
         (tracks, 16, 6) mean looks before the end and after the start (`velfield.tracking.dimensions.looks`); NaN where
         unknown.
     length_m
-        (tracks,) length of each vehicle that is certain to be exceeded by few; NaN where unknown.
+        (tracks,) what each vehicle is longer than, but for one in six: its length less a standard deviation; NaN where
+        unknown.
     """
 
     end_vanishes: Mask
@@ -175,7 +176,7 @@ def _cost_alone(pairs: IntArray, ends: TrackEnds, starts: TrackEnds, context: En
     alone = _ALONE_COST + _VANISHED_COST * np.stack(
         [context.end_vanishes[pairs[:, 0]], context.start_vanishes[pairs[:, 1]]]
     )
-    doubtful = np.hypot(*(ends.position_m - starts.position_m).T) <= _STAYS_M
+    doubtful = np.hypot(*(ends.position_m - starts.position_m).T) <= STATIONARY_OFFSET_M
     doubtful &= (ends.time_s - starts.time_s <= _DOUBTFUL_S) & context.end_vanishes & context.start_vanishes
     sides = doubtful[pairs.T]
     # two of them in one place are one thing, whatever it is

@@ -391,9 +391,7 @@ def _inferred_s(table: pd.DataFrame) -> FloatArray:
 
 def _in_one_place(rows: pd.DataFrame) -> FloatArray:
     """Whether a pair is nearer in each row than two vehicles are, along the way and across it."""
-    time, offset = rows["time_s"].to_numpy(), rows[["dx", "dy"]].to_numpy()
-    velocity = np.gradient(rows[["x", "y"]].to_numpy(), time, axis=0)
-    heading = velocity / np.maximum(np.hypot(*velocity.T), 1e-9)[:, None]
+    offset, heading, _ = _driven(rows)
     along = (offset * heading).sum(axis=1)
     across = np.hypot(*(offset - along[:, None] * heading).T)
     return np.asarray((np.abs(along) <= _PARTS_M) & (across <= _MAX_ASIDE_M))
@@ -427,12 +425,9 @@ def _in_lockstep(rows: pd.DataFrame, abreast_m: float) -> bool:
 
     To any side up to ``abreast_m``.
     """
-    time, offset = rows["time_s"].to_numpy(), rows[["dx", "dy"]].to_numpy()
-    velocity = np.gradient(rows[["x", "y"]].to_numpy(), time, axis=0)
-    speed = np.hypot(*velocity.T)
+    offset, heading, speed = _driven(rows)
     if np.median(speed) < _MIN_SPEED_M_PER_S:
         return False
-    heading = velocity / np.maximum(speed, 1e-9)[:, None]
     along = (offset * heading).sum(axis=1)
     across = heading[:, 0] * offset[:, 1] - heading[:, 1] * offset[:, 0]
     spacing = min(_SPACING_M + _SPACING_S * float(np.median(speed)), _MAX_SPACING_M)
@@ -440,6 +435,14 @@ def _in_lockstep(rows: pd.DataFrame, abreast_m: float) -> bool:
     near = distance <= abreast_m or (distance <= spacing and abs(np.median(across)) <= _MAX_ASIDE_M)
     spread = min(_spread(offset), _spread(np.column_stack([along, across])))
     return bool(near and spread <= _MAX_SPREAD_M)
+
+
+def _driven(rows: pd.DataFrame) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of a pair of tracks (rows of `_near_pairs`): offsets (n, 2) m, and the first one's headings (n, 2), unit vectors,
+    and speeds (n,) m/s."""
+    velocity = np.gradient(rows[["x", "y"]].to_numpy(), rows["time_s"].to_numpy(), axis=0)
+    speed = np.hypot(*velocity.T)
+    return rows[["dx", "dy"]].to_numpy(), velocity / np.maximum(speed, 1e-9)[:, None], speed
 
 
 def _spread(offset: FloatArray) -> float:

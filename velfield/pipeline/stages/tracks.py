@@ -59,8 +59,9 @@ def chain_tracks(plan: Plan) -> StageResult:
     flight = _Frames(open_frames(layout.frames).column("time_s"), usable_frames(plan))
     positions = all_positions(tracklets, found, candidates, gsd_m, flight)
     whole = find_split_tracks(positions, gsd_m)
-    positions, tracklets = _join_parts(positions, whole), _join_parts(tracklets, whole)
-    found = replace(found, tracks=_rename_parts(found.tracks, whole), joins=_join_parts(found.joins, whole))
+    if len(whole):
+        positions, tracklets = _keep_surest(_join_parts(positions, whole)), _join_parts(tracklets, whole)
+        found = replace(found, tracks=_rename_parts(found.tracks, whole), joins=_join_parts(found.joins, whole))
     doubles = find_doubles(positions, mean_grey(strips, found.tracks), gsd_m)
     positions = _without(positions, doubles)
     written, start, recovered = [], 0, 0
@@ -107,14 +108,8 @@ def _rename_parts(track_id: IntArray, whole: pd.Series) -> IntArray:
 
 
 def _join_parts(table: pd.DataFrame, whole: pd.Series) -> pd.DataFrame:
-    """A table with parts of tracks as one; of its positions in one frame, the one that is surest."""
-    if whole.empty:
-        return table
-    table = table.assign(track_id=_rename_parts(table["track_id"].to_numpy(np.int64), whole))
-    if "source" not in table:
-        return table
-    table = table.sort_values(["frame", "track_id", "source"], kind="stable", ignore_index=True)
-    return table.drop_duplicates(["frame", "track_id"], ignore_index=True)
+    """A table with parts of tracks under the id of the whole."""
+    return table.assign(track_id=_rename_parts(table["track_id"].to_numpy(np.int64), whole))
 
 
 def _without(table: pd.DataFrame, doubles: IntArray) -> pd.DataFrame:
@@ -186,8 +181,12 @@ def all_positions(
         columns = {"track_id": gap.track_id, "frame": inside, "time_s": times_s[inside], "x_px": x, "y_px": y}
         inferred.append(pd.DataFrame(columns))
     between = pd.concat(inferred, ignore_index=True).assign(detection_id=-1, source=2)
-    table = pd.concat([known, between], ignore_index=True)
-    table = table.sort_values(["frame", "track_id", "source"], kind="stable", ignore_index=True)
+    return _keep_surest(pd.concat([known, between], ignore_index=True))
+
+
+def _keep_surest(positions: pd.DataFrame) -> pd.DataFrame:
+    """Of a track's positions in one frame, the one that is surest; by frame and track."""
+    table = positions.sort_values(["frame", "track_id", "source"], kind="stable", ignore_index=True)
     return table.drop_duplicates(["frame", "track_id"], ignore_index=True)
 
 
