@@ -6,20 +6,24 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from flows.console import Console
 from flows.runners import Runner
-from flows.work import UnderWay
+from flows.work import UnderWay, is_long
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
-from velfield.pipeline.preview import FIELD_STAGES, preview_finished_units, preview_first_frames
+from velfield.pipeline.preview import (
+    FIELD_STAGES,
+    make_first_preview,
+    preview_finished_units,
+    publish_first_preview,
+)
 from velfield.pipeline.result import committed
 from velfield.pipeline.units import WHOLE
 from velfield.run.layout import is_remote
 
-LONG_MPX = 1200.0
-"""Frames times megapixels of a flight that has a preview of its first frames: two minutes of two processors."""
 WORTH_S = 30.0
 """A preview of the finished units is made where so much time is left at least ..."""
 TIMES_ITS_COST = 3.0
@@ -43,13 +47,12 @@ class Previews:
     console: Console
 
     def __post_init__(self) -> None:
-        self._megapixels = self.plan.info.width * self.plan.info.height / 1e6
         # On S3 folders are not renamed in one step.
         self._off = not self.plan.config.work.previews or is_remote(self.plan.layout.root)
         self._publishing = threading.Lock()
         self._first_tried = False
         self._units_shown = 0
-        self._cost_s = COST_S_A_MPX * self._megapixels
+        self._cost_s = COST_S_A_MPX * self.plan.info.width * self.plan.info.height / 1e6
         self._next_s = -math.inf
 
     def next_task(self, stages: Sequence[UnderWay]) -> Callable[[], None] | None:
@@ -58,13 +61,13 @@ class Previews:
             return None
         if not self._first_tried:
             self._first_tried = True
-            if self.plan.frame_count * self._megapixels >= LONG_MPX and not self.plan.layout.report.exists():
-                return lambda: self._make(preview_first_frames, self.plan)
+            if is_long(self.plan) and not self.plan.layout.report.exists():
+                return lambda: self._make(self._show_first_frames)
         linked = next((stage for stage in stages if stage.stage.name == "tracklets"), None)
         if linked is None or not self._is_worth_it(linked):
             return None
         self._units_shown = len(linked.ended)
-        return lambda: self._make(preview_finished_units, linked.plan)
+        return lambda: self._make(partial(self._show_finished_units, linked.plan))
 
     def _is_worth_it(self, linked: UnderWay) -> bool:
         """Whether units came since the last preview, most of the work is still to come, and little time went into
@@ -75,10 +78,18 @@ class Previews:
         left_s = (now_s - linked.started_s) / done * (units - done)
         return left_s >= max(WORTH_S, TIMES_ITS_COST * self._cost_s) and not committed(linked.plan, "tracks", WHOLE)
 
-    def _make(self, preview: Callable[..., int], plan: Plan) -> None:
+    def _show_first_frames(self) -> int:
+        frames = self.runner.call(make_first_preview, self.plan)
+        publish_first_preview(self.plan, self._while_wanted())
+        return frames
+
+    def _show_finished_units(self, plan: Plan) -> int:
+        return preview_finished_units(plan, self._compute, self._while_wanted())
+
+    def _make(self, preview: Callable[[], int]) -> None:
         start_s = time.monotonic()
         try:
-            frames = preview(plan, self._compute, self._while_wanted())
+            frames = preview()
         except _OverError:
             return
         end_s = time.monotonic()

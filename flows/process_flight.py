@@ -85,7 +85,7 @@ def _run_stages(job: Job, plan: Plan, runner: Runner, at_once: int, console: Con
     work.run()
     remove_tree(plan.layout.preview)
     summary = summarise_run(work.plan, work.summaries)
-    publish_report(work.plan, summary, console)
+    publish_report(work.plan, summary, runner, console)
     return summary
 
 
@@ -99,8 +99,8 @@ def record_start(plan: Plan, what: str, console: Console) -> None:
         console.event("changed", f"{plan.layout.root}: {text}", changed=changed)
 
 
-def publish_report(plan: Plan, summary: RunSummary, console: Console) -> None:
+def publish_report(plan: Plan, summary: RunSummary, runner: Runner, console: Console) -> None:
     """Write the page and the report, and show the summary in Prefect's UI."""
-    for note in write_report(plan, summary):
+    for note in runner.call(write_report, plan, summary):  # it reads whole tables
         console.warn(note)
     publish_summary(plan, summary)

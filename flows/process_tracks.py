@@ -46,5 +46,5 @@ def process_tracks(job: Job, runner: RunnerConfig, console: Console) -> RunSumma
         work = Work(plan, where, console, at_once=parallel_units(runner))
         work.run(list_track_stages(), tracks_graph, essential=True)
         summary = RunSummary(root=job.root, stages=tuple(work.summaries))
-        publish_report(work.plan, summary, console)
+        publish_report(work.plan, summary, where, console)
     return summary

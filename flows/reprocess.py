@@ -12,9 +12,8 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 from prefect.task_runners import ThreadPoolTaskRunner
 
-from flows.artifacts import publish_summary
 from flows.console import Console
-from flows.process_flight import process_flight
+from flows.process_flight import process_flight, publish_report
 from flows.runners import RunnerConfig, open_runner, parallel_units
 from flows.stale import mark_crashed
 from flows.work import Work
@@ -27,7 +26,6 @@ from velfield.pipeline.graphs import rebase_graph
 from velfield.pipeline.plan import write_flight_record
 from velfield.pipeline.stage import STAGE, STAGES, NewBase, stages_before
 from velfield.pipeline.stages.rebase import Rebase, measure_rebase, plan_rebase
-from velfield.pipeline.stages.report import write_report
 from velfield.pipeline.summary import summarise_run
 from velfield.run.commits import sweep_partial
 from velfield.run.flight_record import check_format
@@ -152,9 +150,8 @@ def _mapped(run: Run, job: Job, found: RebaseRecord, runner: RunnerConfig, conso
     with open_runner(runner, console.warn) as where:
         work = Work(plan, where, console, at_once=parallel_units(runner))
         _run_stages(work, Rebase(run.layout, found))
-    summary = summarise_run(plan, work.summaries)
-    write_report(plan, summary)
-    publish_summary(plan, summary)
+        summary = summarise_run(plan, work.summaries)
+        publish_report(plan, summary, where, console)
     return summary
 
 

@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import Field, PositiveInt, ValidationError
 
@@ -24,9 +24,12 @@ from schemas.model import Model
 from velfield.errors import InputError
 from velfield.parallel import usable_processors
 
+T = TypeVar("T")
+
 _WAIT_S = 10.0
 _NO_WORKERS_S = 60.0
 _ANSWER_S = 20.0
+_RESTART_S = 60.0
 _COMPARED = ("velfield", "python", "dask", "distributed", "numpy", "pandas")
 """Packages whose versions a worker should have in common with this process."""
 
@@ -92,6 +95,14 @@ class Runner(ABC):
         """The same, on no more threads of this process than the calling one."""
         return self.compute(graph)
 
+    @abstractmethod
+    def call(self, function: Callable[..., T], *arguments: Any) -> T:
+        """The value of one function, called by the calling thread, or by one worker as soon as one is free."""
+
+    @abstractmethod
+    def renew(self) -> None:
+        """Start processes that hold memory of earlier work anew, where they are ours. Call it while nothing runs."""
+
 
 class ThreadsRunner(Runner):
     """The threads of this process."""
@@ -107,11 +118,18 @@ class ThreadsRunner(Runner):
     def compute_here(self, graph: Any) -> Any:
         return graph.compute(scheduler="synchronous")
 
+    def call(self, function: Callable[..., T], *arguments: Any) -> T:
+        return function(*arguments)
+
+    def renew(self) -> None:
+        pass  # its threads are of this process
+
 
 class ClientRunner(Runner):
     """A Dask cluster. Graphs hold functions of ``velfield`` alone, so workers need no ``flows``."""
 
-    def __init__(self, client: Any, warn: Callable[[str], None]) -> None:
+    def __init__(self, client: Any, warn: Callable[[str], None], *, own_workers: bool = False) -> None:
+        self._own_workers = own_workers
         workers = len(client.scheduler_info(n_workers=-1)["workers"])
         self._client, self._warn = client, warn
         self._address = str(client.scheduler.address)
@@ -119,9 +137,22 @@ class ClientRunner(Runner):
         self.description = f"Dask at {self._address}, {workers} worker{'' if workers == 1 else 's'}"
 
     def compute(self, graph: Any) -> Any:
+        return self._wait(self._client.compute(graph))
+
+    def call(self, function: Callable[..., T], *arguments: Any) -> T:
+        # Before the units that wait for a worker.
+        found: T = self._wait(self._client.submit(function, *arguments, pure=False, priority=1))
+        return found
+
+    def renew(self) -> None:
+        # Libraries, kernels and models of the stages before take a gigabyte, which no call gives back.
+        if self._own_workers:
+            workers = self._client.scheduler_info(n_workers=-1)["workers"]
+            self._client.restart_workers(list(workers), timeout=_RESTART_S, raise_for_error=False)
+
+    def _wait(self, future: Any) -> Any:
         from distributed.scheduler import KilledWorker
 
-        future = self._client.compute(graph)
         while True:
             try:
                 return future.result(timeout=_WAIT_S)
@@ -174,7 +205,8 @@ def open_runner(config: RunnerConfig, warn: Callable[[str], None] = warnings.war
             if config.cluster_class is not None:
                 _wait_for_worker(client, warn)
             _check_workers(client, warn)
-            yield ClientRunner(client, warn)
+            own = config.scheduler is None and config.cluster_class is None
+            yield ClientRunner(client, warn, own_workers=own)
 
 
 def check_scheduler(address: str) -> None:

@@ -32,8 +32,15 @@ from velfield.run.commits import read_commits
 Future = PrefectFuture[Any]
 GraphOf = Callable[[Plan, Stage, Unit], Any]
 """The Dask graph of a unit."""
+LONG_MPX = 1200.0
+"""Frames times megapixels of a long flight: two minutes of two processors."""
 _QUEUED = 1
 """Units submitted beyond those that run, so that a thread that is done finds the next one."""
+
+
+def is_long(plan: Plan) -> bool:
+    """Whether a flight takes so long that previews, and seconds that save memory, are worth it."""
+    return plan.frame_count * plan.info.width * plan.info.height / 1e6 >= LONG_MPX
 
 
 @dataclass
@@ -120,6 +127,8 @@ class Work:
         with self.console.stages() as bars:
             while todo or running or aside is not None:
                 for stage in [stage for stage in todo if self._can_start(stage, todo)]:
+                    if not running and aside is None:
+                        self._renew_before(stage)
                     self._start(stage, bars.add(stage.name, stage.label), essential)
                     todo.remove(stage)
                 if aside is None:
@@ -141,6 +150,11 @@ class Work:
                     for _ in range(running):  # what is under way writes into the run folder
                         self._ends.get()
                     raise
+
+    def _renew_before(self, stage: Stage) -> None:
+        """Where a flight is long, let a stage whose memory grows with it start without what earlier work left."""
+        if stage.grows and is_long(self.plan) and committed(self.plan, stage.name, WHOLE) is None:
+            self.runner.renew()
 
     def _can_start(self, stage: Stage, todo: Sequence[Stage]) -> bool:
         """Whether all that it reads is done; of a stage that it follows, whether that has started."""

@@ -10,7 +10,7 @@ import pytest
 
 from flows.cli import _conclude
 from flows.console import Console
-from flows.runners import RunnerConfig
+from flows.runners import ClientRunner, RunnerConfig
 from schemas.detector import MotionRecord
 from schemas.summary import RunSummary
 from schemas.tables import DETECTION_COLUMNS, TRACK_COLUMNS
@@ -19,7 +19,7 @@ from velfield import open_run
 from velfield.detection.detector import from_record, shipped_detector
 from velfield.errors import InputError
 from velfield.pipeline.plan import make_plan
-from velfield.pipeline.stage import STAGE
+from velfield.pipeline.stage import STAGE, STAGES
 from velfield.pipeline.stages.detections import detect_block
 from velfield.pipeline.stages.detector import make_detector
 from velfield.pipeline.stages.report import make_report
@@ -152,8 +152,16 @@ def test_a_detector_that_uses_the_background_gets_that_of_this_flight(
     assert found[1] > found[0] + 5
 
 
-def test_workers_give_the_same_bits(whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path) -> None:
+def test_workers_give_the_same_bits(
+    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of a long flight, which are started anew on the way; previews apart, whose test is another."""
+    monkeypatch.setattr("flows.work.LONG_MPX", 0.0)
+    monkeypatch.setattr("flows.process_flight.Previews", lambda *_: None)
+    renewed, true = [], ClientRunner.renew
+    monkeypatch.setattr(ClientRunner, "renew", lambda self: renewed.append(true(self)))
     process(job(flight, tmp_path / "workers"), RunnerConfig(workers=2))
+    assert len(renewed) == sum(stage.grows for stage in STAGES) > 0
     assert digests(tmp_path / "workers") == digests(whole[0])
 
 

@@ -3,6 +3,7 @@
 import re
 import shutil
 import threading
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,11 @@ import pytest
 
 from flows.console import Console
 from flows.process_flight import run_flight
-from flows.runners import RunnerConfig
+from flows.runners import RunnerConfig, open_runner
 from schemas.summary import RunSummary
 from tests.small_flight import FRAMES, digests, job
+from velfield.pipeline.plan import make_plan
+from velfield.pipeline.preview import make_first_preview, publish_first_preview
 from velfield.run.layout import RunLayout
 from velfield.run.results import link_shared_outputs
 from velfield.run.stores import open_field
@@ -47,7 +50,8 @@ class Recording(Console):
 
 @pytest.fixture
 def _always(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("LONG_MPX", "WORTH_S", "TIMES_ITS_COST"):
+    monkeypatch.setattr("flows.work.LONG_MPX", 0.0)
+    for name in ("WORTH_S", "TIMES_ITS_COST"):
         monkeypatch.setattr(f"flows.previews.{name}", 0.0)
     monkeypatch.setattr("flows.previews.SHARE", 1.0)
 
@@ -85,6 +89,19 @@ def test_previews_come_and_grow_and_leave_no_trace(
     assert digests(root) == digests(whole[0])
 
 
+def test_a_worker_makes_the_first_preview_by_itself(flight: Path, tmp_path: Path) -> None:
+    plan = make_plan(job(flight, tmp_path / "run"))
+    with open_runner(RunnerConfig(workers=1)) as runner:
+        assert runner.call(make_first_preview, plan) == 16
+    preview = RunLayout(plan.layout.preview)
+    assert preview.field.is_dir()
+    assert not plan.layout.report.exists()
+    publish_first_preview(plan, nullcontext())
+    assert "the first 16 of" in plan.layout.report.read_text()
+    assert plan.layout.field.is_dir()
+    assert not preview.root.exists()
+
+
 @pytest.mark.usefixtures("_always")
 def test_a_preview_that_fails_fails_alone(
     whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -92,7 +109,7 @@ def test_a_preview_that_fails_fails_alone(
     def broken(*_arguments: Any) -> int:
         raise OSError("no space left")
 
-    monkeypatch.setattr("flows.previews.preview_first_frames", broken)
+    monkeypatch.setattr("flows.previews.make_first_preview", broken)
     root = tmp_path / "run"
     shutil.copytree(whole[0], root)
     (root / "index.html").unlink()

@@ -40,8 +40,10 @@ Publishing = AbstractContextManager[object]
 """Entered to replace the field and the page of the run; raises where the run's own are being made."""
 
 
-def preview_first_frames(plan: Plan, compute: Compute, publishing: Publishing) -> int:
-    """Make and publish the preview of a flight's first frames; returns their number.
+def make_first_preview(plan: Plan) -> int:
+    """Make the preview of a flight's first frames, by one thread; returns their number.
+
+    One piece of work on one worker: stage by stage it would wait for a free one as often, and for seconds each time.
 
     Raises
     ------
@@ -50,11 +52,15 @@ def preview_first_frames(plan: Plan, compute: Compute, publishing: Publishing) -
     """
     remove_tree(plan.layout.preview)
     first = _first_plan(plan)
-    _make(first, STAGES, compute)
+    _make(first, STAGES, lambda graph: graph.compute(scheduler="synchronous"))
     _write_page(plan, first, f"the first {first.frame_count} of {plan.frame_count} frames")
-    with publishing:
-        _publish(plan.layout, first.layout, with_tracks=False)
     return first.frame_count
+
+
+def publish_first_preview(plan: Plan, publishing: Publishing) -> None:
+    """Publish the preview of the first frames."""
+    with publishing:
+        _publish(plan.layout, RunLayout(plan.layout.preview), with_tracks=False)
 
 
 def preview_finished_units(plan: Plan, compute: Compute, publishing: Publishing) -> int:

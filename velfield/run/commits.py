@@ -10,6 +10,7 @@ import json
 import os
 import sys
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
 from typing import IO, Any
@@ -78,7 +79,10 @@ def digest_path(path: Path) -> str:
     """Digest of an input, a file, or of a folder's files by name and content."""
     if path.is_dir():
         files = sorted(p for p in path.rglob("*") if p.is_file())
-        return digest_bytes("".join(f"{p.relative_to(path)}\0{digest_input(p)}\n" for p in files).encode())
+        with ThreadPoolExecutor() as pool:  # hashing releases the GIL
+            digests = list(pool.map(digest_input, files))
+        lines = [f"{p.relative_to(path)}\0{digest}\n" for p, digest in zip(files, digests, strict=True)]
+        return digest_bytes("".join(lines).encode())
     return digest_input(path)
 
 
