@@ -103,10 +103,10 @@ def test_a_disk_that_is_too_small_is_refused_before_any_work(tmp_path: Path, mon
     from velfield.errors import InputError
     from velfield.pipeline import estimate as planning
 
-    monkeypatch.setattr(planning, "_free_bytes", lambda root: 300_000_000_000)
+    monkeypatch.setattr(planning, "_free_bytes", lambda root: 400_000_000_000)
     planning.check_space(planned(FOUR_HOURS, tmp_path))
     monkeypatch.setattr(planning, "_free_bytes", lambda root: 100_000_000_000)
-    with pytest.raises(InputError, match=r"about 29\d.\d\d GB needed, 100.00 GB free"):
+    with pytest.raises(InputError, match=r"about 36\d.\d\d GB needed, 100.00 GB free"):
         planning.check_space(planned(FOUR_HOURS, tmp_path))
 
 

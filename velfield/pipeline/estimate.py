@@ -13,8 +13,6 @@ from velfield.pipeline.units import group_name, stage_units, unit_name
 from velfield.run.field_writer import FIELD_BLOCK, GROUP_TILES
 from velfield.run.layout import is_remote
 
-_FRAME_COMPRESSION = 0.8
-"""Zstandard leaves about this much of a noisy grey frame."""
 _BYTES_A_DETECTION_FRAME = 150_000
 _BYTES_A_TILE = 200_000
 _TOUCHED = 0.1
@@ -42,7 +40,7 @@ def _unit_names(plan: Plan, stage: Stage) -> list[str]:
 def estimated_bytes(plan: Plan) -> int:
     """Bytes that the run folder will take."""
     pixels = plan.info.width * plan.info.height
-    frames = plan.frame_count * (pixels * _FRAME_COMPRESSION + _BYTES_A_DETECTION_FRAME)
+    frames = plan.frame_count * (pixels + _BYTES_A_DETECTION_FRAME)
     tiles = pixels / plan.config.field.tile_size_px**2 * _TOUCHED * _BYTES_A_TILE
     return int(frames + tiles + 8 * pixels)
 

@@ -2,7 +2,7 @@
 
 Three rules, each after a fault seen in zarr or in its use:
 
-- ``ZstdCodec(checksum=True)`` everywhere: the default codec returns wrong pixels for one bit in seven, silently;
+- every chunk has a checksum: the default codec returns wrong pixels for one bit in seven, silently;
 - a chunk has one writer: two writers on parts of one chunk lose each other's work, so the chunks of per-frame columns
   are exactly the units of work;
 - a missing chunk reads as the fill value: whoever reads asks the commit records which chunks must exist.
@@ -17,7 +17,7 @@ from typing import Any, cast
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from zarr.codecs import ZstdCodec
+from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray
 from schemas.records import FORMAT_VERSION
@@ -37,13 +37,13 @@ HISTOGRAMS: dict[str, dict[str, str]] = {HISTOGRAM: {"long_name": "velocity hist
 def _create(
     group: zarr.Group, name: str, shape: Sequence[int], chunks: Sequence[int], dtype: str, **kw: Any
 ) -> zarr.Array[Any]:
-    level = kw.pop("level", 1)
+    compressors = kw.pop("compressors", ZstdCodec(level=1, checksum=True))
     return group.create_array(
         name,
         shape=tuple(shape),
         chunks=tuple(chunks),
         dtype=dtype,
-        compressors=ZstdCodec(level=level, checksum=True),
+        compressors=compressors,
         **kw,
     )
 
@@ -171,7 +171,9 @@ def create_frames(
         **_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION, "source": dict(source)}
     )
     chunk = min(unit_frames, max(count, 1))
-    _create(group, "raw", (count, height, width), (1, height, width), "uint8", dimension_names=("frame", "y", "x"))
+    # Zstandard takes off a tenth of a frame, for 13 ms a frame of 5 Mpx to write and 4 ms to read, three times over.
+    how = {"dimension_names": ("frame", "y", "x"), "compressors": Crc32cCodec()}
+    _create(group, "raw", (count, height, width), (1, height, width), "uint8", **how)
     for name, (dtype, fill) in FRAME_COLUMNS.items():
         _create(group, name, (count,), (chunk,), dtype, fill_value=fill, dimension_names=("frame",))
     shape, chunks = (count, *THUMBNAIL_SHAPE), (chunk, *THUMBNAIL_SHAPE)
