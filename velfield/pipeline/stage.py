@@ -282,7 +282,7 @@ STAGES: tuple[Stage, ...] = (
     # Tracklets of all units that belong to one vehicle.
     Stage(
         name="tracks",
-        version=9,
+        version=10,
         label="tracks",
         lines=(
             Line(

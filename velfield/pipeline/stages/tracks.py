@@ -1,5 +1,6 @@
 """Tracks of the whole flight: tracklets that share detections, chained, gaps closed; and the vehicles' dimensions."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from schemas.flight import PAPER_GSD_M
 from schemas.tables import DETECTION_COLUMNS, DIMENSION_COLUMNS, JOIN_COLUMNS, TRACK_POSITION_COLUMNS, TRACKLET_COLUMNS
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
+from velfield.pipeline.stages.rectified_frames import FrameLook
 from velfield.pipeline.stages.registration import usable_frames
 from velfield.pipeline.stages.tracklets import explain_no_tracklets, frame_tables, tracklet_files
 from velfield.run.frame_transforms import FrameTransforms, read_tracking_gsd
@@ -17,7 +19,17 @@ from velfield.run.layout import RunLayout
 from velfield.run.stores import open_frames
 from velfield.run.tables import empty_table, read_patches, read_tables, write_table, write_tracks
 from velfield.tracking.association import LinkedTriples, tracklet_table, window_frames
-from velfield.tracking.dimensions import STRIP_SHAPE, direction_of_axes, looks, measure, sample_tracks
+from velfield.tracking.casters import HALF_WINDOW_M, MIN_DRIVEN_M, Caster, find_casters, keeps_direction
+from velfield.tracking.dimensions import (
+    STRIP_SHAPE,
+    direction_of_axes,
+    looks,
+    may_be_shadows,
+    measure,
+    sample_tracks,
+    shade_moments,
+    shadow_direction,
+)
 from velfield.tracking.gates import Limits, triples_pass
 from velfield.tracking.join_costs import GapLimits, TrackEnds
 from velfield.tracking.joins import END_COLUMNS, EndContext, assign_tracks, find_ends
@@ -64,6 +76,11 @@ def chain_tracks(plan: Plan) -> StageResult:
         found = replace(found, tracks=_rename_parts(found.tracks, whole), joins=_join_parts(found.joins, whole))
     doubles = find_doubles(positions, mean_grey(strips, found.tracks), gsd_m)
     positions = _without(positions, doubles)
+    casters = find_shadows(plan, images_of_tracks(strips, found.tracks), positions, gsd_m)
+    bent = [one for one in casters if not keeps_direction(positions[positions["track_id"] == one], gsd_m)]
+    left_out = np.union1d(doubles, np.array(bent, np.int64))  # where a bent track's caster is follows from no offset
+    offsets_px = {track: casters[track].offset_m / gsd_m for track in casters if track not in bent}
+    positions = _move_tracks(_without(positions, left_out), offsets_px, [("x_px", "y_px")])
     written, start, recovered = [], 0, 0
     for unit, frames in enumerate(plan.units):
         path = layout.unit_file(layout.tracklets, unit, ".parquet")
@@ -71,11 +88,12 @@ def chain_tracks(plan: Plan) -> StageResult:
             table = read_tables([path], TRACKLET_COLUMNS).assign(recovered=False)
             table["track_id"] = tracklets["track_id"].to_numpy()[start : start + len(table)]
             start += len(table)
-            table = _without(table, doubles)
+            table = _without(table, left_out)
             more = recovered_tracklets(plan, frames, positions, flight)
             recovered += len(more)
             table = pd.concat([table, more.assign(recovered=True)], ignore_index=True)
             table = table.sort_values(["frame_0", "tracklet_id"], kind="stable", ignore_index=True)
+            table = _move_tracks(table, offsets_px, [(f"x_{k}_px", f"y_{k}_px") for k in range(3)])
             written.append(layout.tracks / path.name)
             write_tracks(written[-1], table)
         here = positions[(positions["frame"] >= frames.start) & (positions["frame"] < frames.stop)]
@@ -84,21 +102,51 @@ def chain_tracks(plan: Plan) -> StageResult:
     for folder in (layout.tracks, layout.track_positions):
         for stale in set(folder.glob("unit-*.parquet")) - set(written):
             stale.unlink()  # of an earlier plan with more units
+    measured = _without(measure_tracks(strips, found.tracks), np.array(list(offsets_px), np.int64))  # of shadows
     for path, table, columns in (
-        (layout.dimensions, measure_tracks(strips, found.tracks), DIMENSION_COLUMNS),
+        (layout.dimensions, measured, DIMENSION_COLUMNS),
         (layout.joins, found.joins, JOIN_COLUMNS),
     ):
-        write_table(path, _without(table, doubles), columns)
+        write_table(path, _without(table, left_out), columns)
         written.append(path)
     advance("tracks")
     warnings = [] if len(tracklets) else [explain_no_tracklets(plan)]
-    kept = _without(tracklets, doubles)
+    kept = _without(tracklets, left_out)
     counts = {
         "tracklets": float(len(kept) + recovered),
         "recovered": float(recovered),
         "tracks": float(kept["track_id"].nunique()),
+        "moved_from_shadows": float(len(offsets_px)),
     }
     return StageResult(written, counts, warnings=warnings)
+
+
+def find_shadows(plan: Plan, images: "TrackImages", positions: pd.DataFrame, metres: float) -> dict[int, Caster]:
+    """The tracks of shadows, and the vehicles that cast them; ``metres`` a base px.
+
+    Frames are read only where a track may be of a shadow: it is black, something bright is beside it, and the shadows
+    of the flight's other vehicles agree on a direction.
+    """
+    xy = positions.groupby("track_id")[["x_px", "y_px"]]
+    extent = pd.Series(np.hypot(*(xy.max() - xy.min()).to_numpy().T) * metres, index=xy.size().index)
+    moving = extent.reindex(images.ids).to_numpy() >= MIN_DRIVEN_M
+    suspects = images.ids[moving & may_be_shadows(images.strips)]
+    direction = shadow_direction(images.shade[moving], images.count[moving], images.strips[moving])
+    if direction is None or not len(suspects):
+        return {}
+    look = FrameLook.open(plan, images.scale, metres, HALF_WINDOW_M)
+    return find_casters(positions, suspects, direction, look, metres / look.scale, metres)
+
+
+def _move_tracks(
+    table: pd.DataFrame, offsets_px: Mapping[int, FloatArray], columns: list[tuple[str, str]]
+) -> pd.DataFrame:
+    """A table with ``track_id`` where some tracks are moved by offsets (2,) px; ``columns``, pairs of x and y."""
+    for track, offset in offsets_px.items():
+        rows = table["track_id"] == track
+        for names in columns:
+            table = table.assign(**{name: table[name] + rows * offset[axis] for axis, name in enumerate(names)})
+    return table
 
 
 def _rename_parts(track_id: IntArray, whole: pd.Series) -> IntArray:
@@ -249,12 +297,14 @@ def _gap_limits(plan: Plan) -> GapLimits:
 class StripSums:
     """Sums of the strips of each chain of tracklets, and their numbers: spread over it, at its start, at its end.
 
-    ``total`` (3, chains, 32, 10), ``count`` (3, chains); ``ids`` (chains,); ``scale``, working px a base px.
+    ``total`` (3, chains, 32, 10), ``count`` (3, chains); ``ids`` (chains,); ``scale``, working px a base px. ``shade``
+    (chains, 3), sums of `velfield.tracking.dimensions.shade_moments` over the detections that are spread over it.
     """
 
     ids: IntArray
     total: Float32Array
     count: IntArray
+    shade: FloatArray
     scale: float
 
     def mean(self, which: int) -> FloatArray:
@@ -267,7 +317,7 @@ def sum_strips(layout: RunLayout, tracklets: pd.DataFrame, units: int) -> StripS
     """Read the strips that stand for each chain, unit by unit, as all together take much space."""
     ids, chosen = sample_tracks(tracklets)
     total, count = np.zeros((3, len(ids), *STRIP_SHAPE), np.float32), np.zeros((3, len(ids)), np.int64)
-    scale = 1.0
+    shade, scale = np.zeros((len(ids), 3)), 1.0
     for unit in range(units):
         path = layout.unit_file(layout.detections, unit, ".parquet")
         if path.exists():
@@ -280,7 +330,10 @@ def sum_strips(layout: RunLayout, tracklets: pd.DataFrame, units: int) -> StripS
                 rows = np.flatnonzero(here[name])
                 np.add.at(total[which], here["track"].to_numpy()[rows], strips[rows])  # whole numbers: sums are exact
                 np.add.at(count[which], here["track"].to_numpy()[rows], 1)
-    return StripSums(ids, total, count, scale)
+            spread = here[here["spread"]]
+            at = pd.Index(table["detection_id"]).get_indexer(spread["detection_id"])
+            np.add.at(shade, spread["track"].to_numpy(), shade_moments(patches["chips"][at]))
+    return StripSums(ids, total, count, shade, scale)
 
 
 def _along_headings(chosen: pd.DataFrame, table: pd.DataFrame, strips: ByteArray) -> Float32Array:
@@ -293,19 +346,40 @@ def _along_headings(chosen: pd.DataFrame, table: pd.DataFrame, strips: ByteArray
     return found
 
 
+@dataclass(frozen=True)
+class TrackImages:
+    """What is known of tracks without reading frames.
+
+    ``ids`` (tracks,); ``strips`` (tracks, 32, 10), the means of ``count`` (tracks,) strips; ``shade`` (tracks, 3), sums
+    of `velfield.tracking.dimensions.shade_moments` over as many chips; ``scale``, working px a base px.
+    """
+
+    ids: IntArray
+    strips: FloatArray
+    count: IntArray
+    shade: FloatArray
+    scale: float
+
+
+def images_of_tracks(strips: StripSums, tracks: IntArray) -> TrackImages:
+    """Mean strips and shade by track, of all chains of each; ``tracks`` (chains,)."""
+    ids, track = np.unique(tracks, return_inverse=True)
+    total, count, shade = np.zeros((len(ids), *STRIP_SHAPE)), np.zeros(len(ids), np.int64), np.zeros((len(ids), 3))
+    for target, source in ((total, strips.total[0]), (count, strips.count[0]), (shade, strips.shade)):
+        np.add.at(target, track, source)
+    seen = np.flatnonzero(count)
+    return TrackImages(ids[seen], total[seen] / count[seen, None, None], count[seen], shade[seen], strips.scale)
+
+
 def measure_tracks(strips: StripSums, tracks: IntArray) -> pd.DataFrame:
     """Dimensions by track (`DIMENSION_COLUMNS`), from the strips of all chains of each; ``tracks`` (chains,)."""
-    ids, track = np.unique(tracks, return_inverse=True)
-    total, count = np.zeros((len(ids), *STRIP_SHAPE)), np.zeros(len(ids), np.int64)
-    np.add.at(total, track, strips.total[0])
-    np.add.at(count, track, strips.count[0])
-    seen = np.flatnonzero(count)
-    found = measure(total[seen] / count[seen, None, None])
+    images = images_of_tracks(strips, tracks)
+    found = measure(images.strips)
     columns = {
         name: getattr(found, name.removesuffix("_px")) / strips.scale
         for name in ("length_px", "length_sd_px", "width_px", "width_sd_px")
     }
-    return pd.DataFrame({"track_id": ids[seen], **columns, "strips": count[seen]})
+    return pd.DataFrame({"track_id": images.ids, **columns, "strips": images.count})
 
 
 def mean_grey(strips: StripSums, tracks: IntArray) -> pd.Series:
