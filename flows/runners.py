@@ -100,8 +100,8 @@ class Runner(ABC):
         """The value of one function, called by the calling thread, or by one worker as soon as one is free."""
 
     @abstractmethod
-    def renew(self) -> None:
-        """Start processes that hold memory of earlier work anew, where they are ours. Call it while nothing runs."""
+    def restart_workers(self) -> None:
+        """Restart processes that hold memory of earlier work, where they are ours. Call it while nothing runs."""
 
 
 class ThreadsRunner(Runner):
@@ -121,7 +121,7 @@ class ThreadsRunner(Runner):
     def call(self, function: Callable[..., T], *arguments: Any) -> T:
         return function(*arguments)
 
-    def renew(self) -> None:
+    def restart_workers(self) -> None:
         pass  # its threads are of this process
 
 
@@ -144,7 +144,7 @@ class ClientRunner(Runner):
         found: T = self._wait(self._client.submit(function, *arguments, pure=False, priority=1))
         return found
 
-    def renew(self) -> None:
+    def restart_workers(self) -> None:
         # Libraries, kernels and models of the stages before take a gigabyte, which no call gives back.
         if self._own_workers:
             workers = self._client.scheduler_info(n_workers=-1)["workers"]

@@ -128,7 +128,7 @@ class Work:
             while todo or running or aside is not None:
                 for stage in [stage for stage in todo if self._can_start(stage, todo)]:
                     if not running and aside is None:
-                        self._renew_before(stage)
+                        self._restart_before(stage)
                     self._start(stage, bars.add(stage.name, stage.label), essential)
                     todo.remove(stage)
                 if aside is None:
@@ -151,10 +151,10 @@ class Work:
                         self._ends.get()
                     raise
 
-    def _renew_before(self, stage: Stage) -> None:
+    def _restart_before(self, stage: Stage) -> None:
         """Where a flight is long, let a stage whose memory grows with it start without what earlier work left."""
         if stage.grows and is_long(self.plan) and committed(self.plan, stage.name, WHOLE) is None:
-            self.runner.renew()
+            self.runner.restart_workers()
 
     def _can_start(self, stage: Stage, todo: Sequence[Stage]) -> bool:
         """Whether all that it reads is done; of a stage that it follows, whether that has started."""

@@ -72,18 +72,18 @@ def test_workers_of_our_own_keep_memory_for_pictures() -> None:
     assert int(text) == 256 << 20
 
 
-def test_workers_of_our_own_are_started_anew_and_others_are_left_alone() -> None:
+def test_workers_of_our_own_are_restarted_and_others_are_left_alone() -> None:
     with open_runner(RunnerConfig(workers=1)) as runner:
         before = runner.call(os.getpid)
         assert runner.call(os.getpid) == before
-        runner.renew()
+        runner.restart_workers()
         assert runner.call(os.getpid) not in (before, os.getpid())
     with (
         LocalCluster(n_workers=1, dashboard_address="127.0.0.1:0", host="127.0.0.1") as cluster,
         open_runner(RunnerConfig(scheduler=cluster.scheduler_address)) as runner,
     ):
         before = runner.call(os.getpid)
-        runner.renew()
+        runner.restart_workers()
         assert runner.call(os.getpid) == before
 
 

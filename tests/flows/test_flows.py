@@ -155,13 +155,13 @@ def test_a_detector_that_uses_the_background_gets_that_of_this_flight(
 def test_workers_give_the_same_bits(
     whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Those of a long flight, which are started anew on the way; previews apart, whose test is another."""
+    """Those of a long flight, which are restarted on the way; previews apart, whose test is another."""
     monkeypatch.setattr("flows.work.LONG_MPX", 0.0)
     monkeypatch.setattr("flows.process_flight.Previews", lambda *_: None)
-    renewed, true = [], ClientRunner.renew
-    monkeypatch.setattr(ClientRunner, "renew", lambda self: renewed.append(true(self)))
+    restarted, true = [], ClientRunner.restart_workers
+    monkeypatch.setattr(ClientRunner, "restart_workers", lambda self: restarted.append(true(self)))
     process(job(flight, tmp_path / "workers"), RunnerConfig(workers=2))
-    assert len(renewed) == sum(stage.grows for stage in STAGES) > 0
+    assert len(restarted) == sum(stage.grows for stage in STAGES) > 0
     assert digests(tmp_path / "workers") == digests(whole[0])
 
 
