@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 from schemas.arrays import FloatArray, GreyImage
 from schemas.camera import CameraRecord, ModelEvidence
 from schemas.flight import LensConfig
-from velfield.camera.edges import Arcs, detect_arcs, pool_arcs
+from velfield.camera.edges import Apply, Arcs, detect_arcs_of_frames, pool_arcs
 from velfield.camera.entropy import hough_entropy
 from velfield.camera.lens import HarrisLens, pinhole
 from velfield.camera.lines import LineSet, line_residuals, line_rms, merge_collinear_arcs
@@ -145,7 +145,9 @@ class _EdgeData:
         )
 
 
-def calibrate(frames: Sequence[GreyImage], config: LensConfig, seed: int = 0) -> CalibrationResult:
+def calibrate(
+    frames: Sequence[GreyImage], config: LensConfig, seed: int = 0, *, apply: Apply = map
+) -> CalibrationResult:
     """Estimate the lens from frames of one camera.
 
     Parameters
@@ -156,6 +158,8 @@ def calibrate(frames: Sequence[GreyImage], config: LensConfig, seed: int = 0) ->
         The lens section of the flight's configuration.
     seed
         Seed of the cross-validation folds and of the vanishing points.
+    apply
+        Applies a function to every frame.
 
     Returns
     -------
@@ -170,7 +174,7 @@ def calibrate(frames: Sequence[GreyImage], config: LensConfig, seed: int = 0) ->
     shape = _common_shape(frames)
     if config.calibrate == "never":
         return CalibrationResult(pinhole(shape), False, "calibration is switched off", shape)
-    data = _EdgeData(shape, _detect_and_pool(frames, shape, config), config.angle_bins)
+    data = _EdgeData(shape, _detect_and_pool(frames, shape, config, apply), config.angle_bins)
     count = data.arcs.length_px.size
     if count < MIN_LINES:
         reason = f"{count} straight edges in {len(frames)} frames, {MIN_LINES} needed"
@@ -223,17 +227,14 @@ def _common_shape(frames: Sequence[GreyImage]) -> tuple[int, int]:
     return height, width
 
 
-def _detect_and_pool(frames: Sequence[GreyImage], shape: tuple[int, int], config: LensConfig) -> Arcs:
+def _detect_and_pool(frames: Sequence[GreyImage], shape: tuple[int, int], config: LensConfig, apply: Apply) -> Arcs:
     half_diagonal = pinhole(shape).half_diagonal_px
-    parts = [
-        detect_arcs(
-            frame,
-            frame=number,
-            min_length_px=max(24.0, _ARC_FRACTION * 2.0 * half_diagonal),
-            max_curvature_per_px=2.0 / half_diagonal,
-        )
-        for number, frame in enumerate(frames)
-    ]
+    parts = detect_arcs_of_frames(
+        frames,
+        min_length_px=max(24.0, _ARC_FRACTION * 2.0 * half_diagonal),
+        max_curvature_per_px=2.0 / half_diagonal,
+        apply=apply,
+    )
     return pool_arcs(parts, max_points=config.max_edge_points)
 
 
