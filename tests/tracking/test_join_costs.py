@@ -87,3 +87,29 @@ def test_two_of_them_in_one_place_are_one() -> None:
     unknown, all_of = np.full((2, 16, 6), np.nan), np.ones(2, bool)
     context = EndContext(all_of, all_of, unknown, unknown, np.full(2, np.nan))
     assert len(close_gaps(np.arange(2), ends, starts, LIMITS, context).joins) == 1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_join_is_lost_where_only_near_starts_are_weighed(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Starts where each vehicle would be by its speed, at its greatest pace, or after a stop, and far from there."""
+    rng = np.random.default_rng(seed)
+    count = 700
+
+    def ends_at(time_s: FloatArray, position_m: FloatArray, speed: FloatArray, heading: FloatArray) -> TrackEnds:
+        velocity = speed[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
+        return TrackEnds(np.round(5 * time_s).astype(np.int64), time_s, position_m, velocity)
+
+    speed, heading = rng.choice([0.0, 1.0, 4.0, 9.0, 16.0, 35.0], count), rng.uniform(-np.pi, np.pi, count)
+    end = ends_at(rng.uniform(0, 30, count), rng.uniform(0, 400, (count, 2)), speed, heading)
+    gap_s, pace = rng.choice([0.3, 2.0, 4.0, 10.0, 15.0], count), speed + rng.choice([-2.0, 0.0, 2.4, 3.0], count)
+    turned = heading + rng.normal(0, 0.5, count)
+    way = (pace * gap_s + rng.choice([0.0, 2.0, 12.0, 18.0], count))[:, None]
+    place = end.position_m + way * np.column_stack([np.cos(turned), np.sin(turned)]) + rng.normal(0, 2, (count, 2))
+    start = ends_at(end.time_s + gap_s, place, np.abs(speed + rng.normal(0, 1, count)), turned)
+    length_m = rng.choice([np.nan, 4.0, 18.0], count)
+    near = find_candidates(end, start, LIMITS, length_m)
+    monkeypatch.setattr("velfield.tracking.join_costs._REACH_M", np.inf)
+    whole = find_candidates(end, start, LIMITS, length_m)
+    assert len(whole[0]) > 300
+    np.testing.assert_array_equal(near[0], whole[0])
+    np.testing.assert_array_equal(near[1], whole[1])

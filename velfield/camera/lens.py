@@ -8,6 +8,7 @@ Other packages use the protocol `Lens` and do not depend on the model.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -186,6 +187,17 @@ class DivisionLens:
         )
 
 
+@lru_cache(maxsize=64)
+def _fold_radius(coefficients: tuple[float, ...]) -> float:
+    """Of a polynomial; kept, as points are undistorted in tens of thousands of calls."""
+    scale = np.array((1.0, *coefficients))
+    growth = scale * (1.0 + 2.0 * np.arange(len(scale)))
+    # The root of a vanishing last term is at infinity and would spoil the accuracy of the others.
+    roots = np.polynomial.polynomial.polyroots(np.polynomial.polynomial.polytrim(growth, tol=1e-9))
+    real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+    return float(np.sqrt(real.min())) if real.size else float("inf")
+
+
 @dataclass(frozen=True)
 class PolynomialLens:
     """Polynomial model, r = r_d (1 + k_1 r_d^2 + k_2 r_d^4 + ...), for lenses that one parameter cannot describe.
@@ -220,12 +232,7 @@ class PolynomialLens:
 
     def fold_radius(self) -> float:
         """Raw radius, in half-diagonals, at which the undistorted radius stops growing; infinity if never."""
-        scale = self._polynomial()
-        growth = scale * (1.0 + 2.0 * np.arange(len(scale)))
-        # The root of a vanishing last term is at infinity and would spoil the accuracy of the others.
-        roots = np.polynomial.polynomial.polyroots(np.polynomial.polynomial.polytrim(growth, tol=1e-9))
-        real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
-        return float(np.sqrt(real.min())) if real.size else float("inf")
+        return _fold_radius(self.coefficients)
 
     def _offsets(self, xy: Points) -> tuple[Points, Points]:
         offsets = (np.asarray(xy, dtype=np.float64) - (self.centre_x_px, self.centre_y_px)) / self.half_diagonal_px

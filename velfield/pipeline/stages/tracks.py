@@ -419,11 +419,11 @@ def _stays_inside(maps: FrameTransforms, ends: TrackEnds, sign: int, metres: flo
     direction = velocity / np.maximum(ends.speed_m_per_s, 1e-9)[:, None]
     sides = [0.5 * _BORDER_M * np.array(side) for side in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
     ahead = ends.position_m + velocity * _BORDER_S + direction * _BORDER_M
-    places = [place / metres for place in (ahead, *(ends.position_m + side for side in sides))]
+    places = np.stack([ahead, *(ends.position_m + side for side in sides)]) / metres
     inside = np.zeros(len(ends.frame), bool)
     for frame in np.unique(ends.frame):
         rows, transform = np.flatnonzero(ends.frame == frame), maps.transform(int(frame))
         if transform is not None:
-            raw = np.stack([transform.to_raw(place[rows]) for place in places])
+            raw = transform.to_raw(places[:, rows].reshape(-1, 2)).reshape(len(places), len(rows), 2)
             inside[rows] = ((raw >= 0) & (raw <= [maps.width - 1, maps.height - 1])).all(axis=(0, 2))
     return inside
