@@ -560,6 +560,12 @@ def write_segments(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
         column.with_config({"write_empty_chunks": True})[:] = values
 
 
+def read_segment_tracks(path: Path) -> IntArray:
+    """Column ``track`` of ``view/segments.zarr``, (segments,)."""
+    group = zarr.open_group(**_location(path), mode="r")
+    return np.asarray(cast("zarr.Array[Any]", group["track"])[:], np.int64)
+
+
 def write_extra_layers(path: Path, layers: Mapping[str, tuple[NDArray[np.floating], Mapping[str, Any]]]) -> None:
     """Write float32 (y, x) layers with their attributes, shown beside the field's own; `open_field` reads them."""
     group = zarr.create_group(**_location(path), overwrite=True, attributes={_FORMAT_KEY: FORMAT_VERSION})

@@ -139,9 +139,11 @@ def _unknown(name: str, attributes: Mapping[str, Any]) -> _Known:
 
 
 def _magnitudes(arrays: Sequence[NDArray[Any]]) -> FloatArray:
-    """Absolute values of the known values; speeds of velocities."""
-    magnitude = np.hypot(*(np.asarray(array, np.float64) for array in [*arrays, 0.0][:2]))
-    return np.asarray(magnitude[np.isfinite(magnitude)], np.float64)
+    """Absolute values of the known values, of counts those above zero; speeds of velocities."""
+    known = np.isfinite(arrays[0]) if arrays[0].dtype.kind == "f" else arrays[0] != 0  # a count is 0 nearly everywhere
+    for array in arrays[1:]:
+        known &= np.isfinite(array)
+    return np.asarray(np.hypot(*([array[known].astype(np.float64) for array in arrays] + [0.0])[:2]), np.float64)
 
 
 def _colour_max(magnitudes: FloatArray) -> float:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.arrays import FloatArray
+from schemas.arrays import FloatArray, IntArray
 from schemas.records import FlightRecord, GridRecord
 from schemas.view import ViewArray, ViewBase, ViewFlow, ViewLayer, ViewRecord, ViewReplay, ViewSegments
 from velfield.analysis.coverage import low_coverage_note
@@ -28,7 +28,14 @@ from velfield.run.commits import record_page, write_atomically
 from velfield.run.frame_transforms import north_direction_rad
 from velfield.run.layout import RunLayout, remove_tree
 from velfield.run.run import Run, open_run
-from velfield.run.stores import HISTOGRAM, FieldStore, open_field, write_extra_layers, write_segments
+from velfield.run.stores import (
+    HISTOGRAM,
+    FieldStore,
+    open_field,
+    read_segment_tracks,
+    write_extra_layers,
+    write_segments,
+)
 from velfield.viewer.flow import DRAWS, cell_side, flow_bytes
 from velfield.viewer.layers import view_layers
 from velfield.viewer.pyramid import OVERLAP_PX, TILE_PX, pyramid_levels, pyramid_tiles
@@ -95,12 +102,12 @@ def _span(times_s: FloatArray) -> tuple[float, float]:
 
 
 def write_view_record(layout: RunLayout) -> None:
-    """Write ``view/run.json``: after each change of the field's layers or of the run."""
+    """Write ``view/run.json``: after `write_view_data`, and after each change of the field's layers."""
     run = open_run(layout.root)
     stores = {"field.zarr": open_field(layout.field)}
     if layout.view_changes.exists():
         stores["view/change.zarr"] = open_field(layout.view_changes)
-    record = view_record(run.record, run.grid, stores, run.segments(), run.times_s)
+    record = view_record(run.record, run.grid, stores, read_segment_tracks(layout.view_segments), run.times_s)
     write_atomically(layout.view_record, record.model_dump_json().encode())
 
 
@@ -115,10 +122,11 @@ def view_record(
     flight: FlightRecord,
     grid: GridRecord,
     stores: Mapping[str, FieldStore],
-    segments: Segments,
+    segment_tracks: IntArray,
     times_s: np.ndarray,
 ) -> ViewRecord:
-    """``view/run.json`` of a run with these stores of layers, by their paths; the field is the first."""
+    """``view/run.json`` of a run with these stores of layers, by their paths, of which the field is the first; and with
+    these tracks (segments,) of its segments."""
     store = next(iter(stores.values()))
     count = store.layer("count")
     first_s, last_s = _span(times_s)
@@ -136,8 +144,8 @@ def view_record(
         layers=tuple(layer for each in stores.values() for layer in _layers(each)),
         arrays={name: array for path, each in stores.items() for name, array in _arrays(path, each).items()},
         segments=ViewSegments(
-            count=len(segments),
-            tracks=len(np.unique(segments["track"])),
+            count=len(segment_tracks),
+            tracks=len(np.unique(segment_tracks)),
             hysteresis_px=hysteresis_px(grid.gsd_m),
             band_radius_px=band_radius_px(flight.config.field, grid.gsd_m) or _LINE_RADIUS_PX,
         ),
