@@ -267,7 +267,7 @@ STAGES: tuple[Stage, ...] = (
     # Windows of three frames that start in the unit; they reach into the unit after.
     Stage(
         name="tracklets",
-        version=2,
+        version=3,
         label="tracklets",
         lines=(Line("{tracklets:.0f} tracklets over three frames"),),
         unit=f"{_STAGES}.tracklets:link_unit",

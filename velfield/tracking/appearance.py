@@ -6,6 +6,7 @@ in both orientations; and a detection's position is accurate to about a pixel, s
 shifts. The smallest difference is taken.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,9 @@ MAX_CROP_SHIFT_PX = 3
 CAR_LENGTH_PX = 16.0
 CAR_WIDTH_PX = 8.0
 """Rectangle of a crop that is compared, about its centre along the car's axis, working px."""
+
+_REACH = math.ceil(math.hypot(CAR_LENGTH_PX / 2, CAR_WIDTH_PX / 2))
+"""No pixel farther from the centre than this lies on the car, working px."""
 
 
 @dataclass(frozen=True)
@@ -182,16 +186,19 @@ def _prepare(crops, axes):  # type: ignore[no-untyped-def]
     n, side = crops.shape[0], crops.shape[1]
     low, high = crops.copy(), crops.copy()
     mask = np.zeros(crops.shape, np.uint8)
+    one = np.uint64(1)
     for k in range(n):
         cos, sin = np.cos(axes[k]), np.sin(axes[k])
         for y in range(1, side - 1):
-            for x in range(1, side - 1):
-                here = np.int32(crops[k, y, x])
-                minimum = maximum = 2 * here
-                for other in (crops[k, y - 1, x], crops[k, y + 1, x], crops[k, y, x - 1], crops[k, y, x + 1]):
-                    between = here + np.int32(other)
-                    minimum, maximum = min(minimum, between), max(maximum, between)
-                low[k, y, x], high[k, y, x] = minimum // 2, (maximum + 1) // 2
+            above, line, under = crops[k, y - 1], crops[k, y], crops[k, y + 1]
+            low_line, high_line = low[k, y], high[k, y]
+            for x in range(one, np.uint64(side - 1)):  # as unsigned, which makes vectors of it
+                here, up, down = np.int32(line[x]), np.int32(above[x]), np.int32(under[x])
+                left, right = np.int32(line[x - one]), np.int32(line[x + one])
+                low_line[x] = (here + min(here, up, down, left, right)) >> 1
+                high_line[x] = (here + max(here, up, down, left, right) + 1) >> 1
+        for y in range(max(1, side // 2 - _REACH), min(side - 1, side // 2 + _REACH + 1)):
+            for x in range(max(1, side // 2 - _REACH), min(side - 1, side // 2 + _REACH + 1)):
                 dx, dy = x - side // 2, y - side // 2
                 if np.isnan(axes[k]):
                     mask[k, y, x] = np.hypot(dx, dy) <= CAR_WIDTH_PX

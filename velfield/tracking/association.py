@@ -213,26 +213,36 @@ def _displacements(
     keys = np.concatenate([np.stack([start + k, indices[:, k], indices[:, k + 1]], axis=1) for k in (0, 1)])
     links, where = np.unique(keys, axis=0, return_inverse=True)  # a link that two tracklets share is aligned once
     displacement = np.zeros((len(links), 4))
-    for i in np.unique(links[:, 0]):
+    crops: dict[
+        int, UprightCrops | None
+    ] = {}  # of the two frames of a link: what is prepared of them is kept for the next
+    for i in map(int, np.unique(links[:, 0])):
         rows = links[:, 0] == i
-        pair = (tables[int(i)], tables[int(i) + 1])
-        displacement[rows] = _frame_displacements(*pair, links[rows, 1], links[rows, 2], limits, refine=refine)
+        crops = {k: crops[k] if k in crops else tables[k].upright_crops() if refine else None for k in (i, i + 1)}
+        displacement[rows] = _frame_displacements(
+            tables[i], tables[i + 1], crops[i], crops[i + 1], links[rows, 1], links[rows, 2], limits
+        )
     return np.moveaxis(displacement[where.ravel()].reshape(2, -1, 4), 0, 1)
 
 
 def _frame_displacements(
-    before: FrameTable, after: FrameTable, first: IntArray, second: IntArray, limits: Limits, *, refine: bool
+    before: FrameTable,
+    after: FrameTable,
+    crops_before: UprightCrops | None,
+    crops_after: UprightCrops | None,
+    first: IntArray,
+    second: IntArray,
+    limits: Limits,
 ) -> FloatArray:
-    """(k, 4) of the links between two frames: from the crops where they align, otherwise from the detections'
-    positions."""
+    """(k, 4) of the links between two frames: from the crops where there are and they align, otherwise from the
+    detections' positions."""
     noise = float(np.hypot(limits.position_sd_px(before.residual_px), limits.position_sd_px(after.residual_px)))
     x = after.x_px[second] - before.x_px[first]
     y = after.y_px[second] - before.y_px[first]
     unrefined = np.stack([x, y, np.full(x.size, noise), np.zeros(x.size)], axis=1)
-    crops = (before.upright_crops(), after.upright_crops())
-    if not refine or crops[0] is None or crops[1] is None:
+    if crops_before is None or crops_after is None:
         return unrefined
-    aligned = refine_links(crops[0], crops[1], first, second)
+    aligned = refine_links(crops_before, crops_after, first, second)
     # Crops that align far from the detections' displacement match something else: a road marking, a neighbour.
     near = np.hypot(aligned.x_px - x, aligned.y_px - y) <= limits.jitter_sigmas * noise
     sd = np.sqrt(aligned.sd_px**2 + before.registration_sd_px**2 + after.registration_sd_px**2)

@@ -19,25 +19,27 @@ deviation.
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from schemas.arrays import ByteArray, FloatArray, IntArray
+from schemas.arrays import ByteArray, Float32Array, FloatArray, IntArray
 
 CAR_LENGTH_PX = 14.0
 CAR_WIDTH_PX = 6.0
 """Rectangle that lies on a car, working px, of the paper's 16 x 8."""
 TAPER_PX = 2.0
 """Width over which the weights fall to zero outside the rectangle, working px."""
-_CAR_REACH_PX = math.ceil(math.hypot(CAR_LENGTH_PX / 2 + TAPER_PX, CAR_WIDTH_PX / 2 + TAPER_PX))
-"""No pixel farther from the centre than this has weight."""
 BLUR_SIGMA_PX = 0.5
 """Standard deviation of the blur of both crops before alignment, working px."""
 MAX_SHIFT_PX = 6
 """Largest shift searched, working px: about three standard deviations of the jitter of two positions."""
-MAX_DISAGREEMENT_PX = 0.75
-"""Largest difference of the forward and backward shifts, working px."""
+MAX_DISAGREEMENT_PX = 0.35
+"""Largest difference of the forward shift and the backward one that starts from it, working px: two cars that do not
+belong together pass as rarely as with 0.75 where both start from the whole-pixel shift, one and the same more often."""
 MIN_SD_PX = 0.03
 """Lower bound of a shift's standard deviation, working px: the error on crops without noise."""
 MIN_PIXELS = 20
@@ -45,7 +47,7 @@ MIN_PIXELS = 20
 TUKEY_C = 4.685
 """Constant of Tukey's biweight: differences beyond this many standard deviations have no weight."""
 MAX_ITERATIONS = 15
-"""Gauss-Newton iterations; four to six are typical."""
+"""Gauss-Newton iterations; two or three are typical."""
 REWEIGHTING_ITERATIONS = 4
 """Iterations in which the weights follow the shift; fixed afterwards, or they could alternate without convergence."""
 CONVERGENCE_PX = 0.01
@@ -57,8 +59,22 @@ _SHIFTS = np.array(
         key=lambda shift: (shift[0] ** 2 + shift[1] ** 2, shift[1], shift[0]),
     )
 )
+_INNER_SQUARE, _NEAR_SQUARE = 5, 10
+"""Squares of lengths: where the best of the shifts up to the second is no longer than the first, those around it are
+known to be worse, and none farther away is tried. Positions jitter by a pixel: of two minima the near one is right."""
 _SPREAD, _PIECE = 5, 16
 """Pixels of the search come in so many passes over the car; after each piece of so many it may be given up."""
+_REACH = math.ceil(math.hypot(CAR_LENGTH_PX / 2 + TAPER_PX, CAR_WIDTH_PX / 2 + TAPER_PX))
+"""No pixel farther from the centre than this has weight, working px."""
+_ROWS, _COLUMNS = 2 * _REACH + 1, 2 * (_REACH + 1)
+"""The box about the centre that holds the car however it lies; its columns fill whole vectors of the processor."""
+_MIDDLE = _REACH + 1 + MAX_SHIFT_PX + 2
+_SIDE = 2 * _MIDDLE
+"""Index of the centre, and side, of the images that hold the box at every shift, with the samples to interpolate."""
+_LEFT = _MIDDLE - _REACH - 1
+"""First column of the box in these."""
+_MEDIAN_STEPS = 13
+"""Halvings of the range of grey levels for a median: to a sixteenth of one. It decides weights only."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +98,40 @@ class UprightCrops:
     centre_y_px: FloatArray
     axis_rad: FloatArray
     scale: float
+
+    @cached_property
+    def prepared(self) -> "AlignableCrops":
+        """What every alignment of these crops needs, computed once: a crop is aligned to two frames."""
+        return prepare_crops(self.pixels, self.axis_rad)
+
+
+@dataclass(frozen=True)
+class AlignableCrops:
+    """Crops prepared for alignment, n of them: all that does not depend on the other crop.
+
+    Attributes
+    ----------
+    grey, weight
+        (n, 40, 40) float32, blurred grey levels and weights about the centre at (20, 20); 0 beyond the crop.
+    slope_x, slope_y
+        (n, 23, 24) float32, gradients of the grey levels over the box that holds the car.
+    pixels
+        (n, 276) int32, flat index into ``grey`` of every second pixel on the car, some from all over it first.
+    counts
+        (n, 3) int64: number of ``pixels``; first row of the box in which a pixel has weight, and the row after the
+        last.
+    """
+
+    grey: Float32Array
+    weight: Float32Array
+    slope_x: Float32Array
+    slope_y: Float32Array
+    pixels: NDArray[np.int32]
+    counts: IntArray
+
+    def fields(self) -> tuple[NDArray[Any], ...]:
+        """The arrays, in this order."""
+        return self.grey, self.weight, self.slope_x, self.slope_y, self.pixels, self.counts
 
 
 @dataclass(frozen=True)
@@ -111,7 +161,7 @@ def refine_links(before: UprightCrops, after: UprightCrops, first: IntArray, sec
     if before.scale != after.scale:
         # One detector, one working scale: another would change a car's size between the crops.
         raise ValueError(f"working scales {before.scale} and {after.scale} differ between linked frames")
-    shift = align_crops(before.pixels, after.pixels, before.axis_rad, after.axis_rad, first, second)
+    shift = align_prepared(before.prepared, after.prepared, first, second)
     return Displacements(
         after.centre_x_px[second] - before.centre_x_px[first] + shift[:, 0] / before.scale,
         after.centre_y_px[second] - before.centre_y_px[first] + shift[:, 1] / before.scale,
@@ -144,102 +194,118 @@ def align_crops(
         Shift of the car from the earlier to the later crop in x and y, and its standard deviation along either axis,
         working px; NaN where the crops do not align.
     """
+    return align_prepared(prepare_crops(before, axis_before), prepare_crops(after, axis_after), first, second)
+
+
+def prepare_crops(crops: ByteArray, axis_rad: FloatArray) -> AlignableCrops:
+    """Prepare crops (n, side, side), uint8, of cars of axes (n,) for alignment; NaN: the weights are a disc."""
     radius = int(np.ceil(3 * BLUR_SIGMA_PX))
     taps = np.exp(-0.5 * (np.arange(-radius, radius + 1) / BLUR_SIGMA_PX) ** 2)
-    return np.asarray(
-        _align_all(before, after, axis_before, axis_after, first, second, taps / taps.sum()), dtype=np.float64
-    )
+    return AlignableCrops(*_prepare(crops, axis_rad, (taps / taps.sum()).astype(np.float32)))
+
+
+def align_prepared(before: AlignableCrops, after: AlignableCrops, first: IntArray, second: IntArray) -> FloatArray:
+    """`align_crops` of prepared crops."""
+    return np.asarray(_align_all(before.fields(), after.fields(), first, second, _SHIFTS), dtype=np.float64)
 
 
 @njit(cache=True, nogil=True)
-def _blur(crop, taps):  # type: ignore[no-untyped-def]
-    """Separable blur, edge values repeated."""
+def _blur(crop, taps, rows, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` (side, side) with the separably blurred crop, edge values repeated; ``rows`` is scratch."""
     side, radius = crop.shape[0], taps.size // 2
-    line = np.empty(side + 2 * radius)
-    rows, out = np.zeros((side + 2 * radius, side)), np.zeros((side, side))
+    line = np.empty(side + 2 * radius, np.float32)
     for y in range(side):
         for x in range(side + 2 * radius):
             line[x] = crop[y, min(max(x - radius, 0), side - 1)]
-        for k in range(np.uint64(taps.size)):
-            tap = taps[k]
+        into = rows[y + radius]
+        into[:] = 0.0
+        for k in range(taps.size):
+            tap, part = taps[k], line[k : k + side]
             for x in range(np.uint64(side)):
-                rows[y + radius, x] += tap * line[x + k]
+                into[x] += tap * part[x]
     for y in range(radius):
         rows[y], rows[side + radius + y] = rows[radius], rows[side + radius - 1]
     for y in range(side):
+        into = out[y]
+        into[:] = 0.0
         for k in range(taps.size):
-            tap = taps[k]
-            for x in range(side):
-                out[y, x] += tap * rows[y + k, x]
-    return out
+            tap, part = taps[k], rows[y + k]
+            for x in range(np.uint64(side)):
+                into[x] += tap * part[x]
 
 
 @njit(cache=True, nogil=True)
-def _weights(side, axis):  # type: ignore[no-untyped-def]
+def _weight(dx, dy, axis, cos, sin):  # type: ignore[no-untyped-def]
     """One on the car, tapering to zero around it; a disc where the axis is unknown."""
-    out = np.zeros((side, side))
-    cos, sin = np.cos(axis), np.sin(axis)
-    centre = side // 2
-    for y in range(side):
-        for x in range(side):
-            dx, dy = x - centre, y - centre
-            if np.isnan(axis):
-                beyond = np.hypot(dx, dy) - CAR_WIDTH_PX
-            else:
-                beyond = max(
-                    abs(dx * cos + dy * sin) - 0.5 * CAR_LENGTH_PX, abs(dy * cos - dx * sin) - 0.5 * CAR_WIDTH_PX
-                )
-            out[y, x] = min(max(1.0 - beyond / TAPER_PX, 0.0), 1.0)
-    return out
+    if np.isnan(axis):
+        beyond = np.hypot(dx, dy) - CAR_WIDTH_PX
+    else:
+        beyond = max(abs(dx * cos + dy * sin) - 0.5 * CAR_LENGTH_PX, abs(dy * cos - dx * sin) - 0.5 * CAR_WIDTH_PX)
+    return min(max(1.0 - beyond / TAPER_PX, 0.0), 1.0)
 
 
 @njit(cache=True, nogil=True)
-def _car_pixels(weight):  # type: ignore[no-untyped-def]
-    """Rows and columns of the pixels of positive weight that have all neighbours."""
-    side = weight.shape[0]
-    rows = np.empty(side * side, np.int64)
-    columns = np.empty(side * side, np.int64)
-    n = 0
-    first, last = max(1, side // 2 - _CAR_REACH_PX), min(side - 1, side // 2 + _CAR_REACH_PX + 1)
-    for y in range(first, last):
-        for x in range(first, last):
-            if weight[y, x] > 0:
-                rows[n], columns[n] = y, x
-                n += 1
-    return rows[:n], columns[:n]
+def _prepare(crops, axes, taps):  # type: ignore[no-untyped-def]
+    """The fields of `AlignableCrops`."""
+    n, side, radius = crops.shape[0], crops.shape[1], taps.size // 2
+    grey, weight = np.zeros((n, _SIDE, _SIDE), np.float32), np.zeros((n, _SIDE, _SIDE), np.float32)
+    slope_x, slope_y = np.zeros((n, _ROWS, _COLUMNS), np.float32), np.zeros((n, _ROWS, _COLUMNS), np.float32)
+    pixels, counts = np.zeros((n, _ROWS * _COLUMNS // 2), np.int32), np.zeros((n, 3), np.int64)
+    rows, blurred = np.empty((side + 2 * radius, side), np.float32), np.empty((side, side), np.float32)
+    on_car = np.empty(_ROWS * _COLUMNS, np.int32)
+    offset = _MIDDLE - side // 2  # of the crop in the images
+    low, high = max(0, -offset), min(side, _SIDE - offset)
+    inner_low, inner_high = max(1, side // 2 - _REACH), min(side - 1, side // 2 + _REACH + 1)
+    for i in range(n):
+        _blur(crops[i], taps, rows, blurred)
+        grey[i, low + offset : high + offset, low + offset : high + offset] = blurred[low:high, low:high]
+        cos, sin = np.cos(axes[i]), np.sin(axes[i])
+        found, first, last = 0, _ROWS, 0
+        for y in range(inner_low, inner_high):  # pixels that have all neighbours
+            for x in range(inner_low, inner_high):
+                here = _weight(x - side // 2, y - side // 2, axes[i], cos, sin)
+                if here > 0:
+                    weight[i, y + offset, x + offset] = here
+                    row, column = y + offset - _MIDDLE + _REACH, x + offset - _MIDDLE + _REACH + 1
+                    slope_x[i, row, column] = np.float32(0.5) * (blurred[y, x + 1] - blurred[y, x - 1])
+                    slope_y[i, row, column] = np.float32(0.5) * (blurred[y + 1, x] - blurred[y - 1, x])
+                    on_car[found] = (y + offset) * _SIDE + x + offset
+                    found, first, last = found + 1, min(first, row), row + 1
+        kept = 0
+        for begin in range(0, 2 * _SPREAD, 2):  # some from all over the car first
+            for k in range(begin, found, 2 * _SPREAD):
+                pixels[i, kept] = on_car[k]
+                kept += 1
+        counts[i, 0], counts[i, 1], counts[i, 2] = kept, min(first, last), last
+    return grey, weight, slope_x, slope_y, pixels, counts
 
 
 @njit(cache=True, nogil=True)
-def _integer_shift(template, image, weight, image_weight, rows, columns):  # type: ignore[no-untyped-def]
+def _integer_shift(template, own_weight, pixels, image, image_weight, shifts):  # type: ignore[no-untyped-def]
     """Integer shift of minimum mean absolute difference over the pixels on the car in both; over half of the pixels,
     which suffices here."""
-    side, margin = template.shape[0], MAX_SHIFT_PX
-    width = side + 2 * margin
-    # beyond the crop's border nothing has weight
-    grey, grey_weight = np.zeros((width, width)), np.zeros((width, width))
-    grey[margin : margin + side, margin : margin + side] = image
-    grey_weight[margin : margin + side, margin : margin + side] = image_weight
-    grey_flat, weight_flat = grey.ravel(), grey_weight.ravel()
-    count = (rows.size + 1) // 2
-    here, value, own = np.empty(count, np.int64), np.empty(count), np.empty(count)
-    n, most = 0, 0.0
-    for begin in range(0, 2 * _SPREAD, 2):  # some from all over the car first
-        for i in range(begin, rows.size, 2 * _SPREAD):
-            here[n] = (rows[i] + margin) * width + columns[i] + margin
-            value[n], own[n] = template[rows[i], columns[i]], weight[rows[i], columns[i]]
-            most += own[n]
-            n += 1
-    best, best_x, best_y, min_weight = np.inf, 0, 0, 0.125 * np.sum(weight)
-    # Shortest first, as the least is among those: whatever is farther off than the best so far is soon given up.
-    for k in range(_SHIFTS.shape[0]):
-        dx, dy = _SHIFTS[k]
-        shift, limit = dy * width + dx, most * best + 1e-6
-        total, weights = 0.0, 0.0
+    value_at, weight_at = template.ravel(), own_weight.ravel()
+    grey, weight = image.ravel(), image_weight.ravel()
+    count = pixels.size
+    here, value, own = np.empty(count, np.int64), np.empty(count, np.float32), np.empty(count, np.float32)
+    most = np.float32(0.0)
+    for i in range(count):
+        here[i] = pixels[i]
+        value[i], own[i] = value_at[here[i]], weight_at[here[i]]
+        most += own[i]
+    best, best_x, best_y, min_weight = np.float32(np.inf), 0, 0, np.float32(0.25) * most
+    # Shortest first, as the least is among those: whatever is worse than the best so far is soon given up.
+    for k in range(shifts.shape[0]):
+        dx, dy = shifts[k, 0], shifts[k, 1]
+        if dx * dx + dy * dy > _NEAR_SQUARE and best_x * best_x + best_y * best_y <= _INNER_SQUARE:
+            break
+        shift, limit = dy * _SIDE + dx, most * best + np.float32(1e-3)
+        total, weights = np.float32(0.0), np.float32(0.0)
         for begin in range(0, count, _PIECE):
             for i in range(begin, min(begin + _PIECE, count)):
-                there = np.uint64(here[i] + shift)
-                w = min(own[i], weight_flat[there])
-                total += w * abs(grey_flat[there] - value[i])
+                there = np.uint64(here[i] + shift)  # unsigned: numba checks no index for its sign
+                w = min(own[i], weight[there])
+                total += w * abs(grey[there] - value[i])
                 weights += w
             if total > limit:
                 break
@@ -249,115 +315,114 @@ def _integer_shift(template, image, weight, image_weight, rows, columns):  # typ
 
 
 @njit(cache=True, nogil=True)
-def _cubic(t):  # type: ignore[no-untyped-def]
-    """Weights of Catmull-Rom interpolation at t in [0, 1) between the second and the third of four samples."""
+def _cubic(fraction):  # type: ignore[no-untyped-def]
+    """Weights of Catmull-Rom interpolation at a fraction in [0, 1) between the second and the third of four samples."""
+    t = fraction
     return (
-        ((-0.5 * t + 1.0) * t - 0.5) * t,
-        (1.5 * t - 2.5) * t * t + 1.0,
-        ((-1.5 * t + 2.0) * t + 0.5) * t,
-        (0.5 * t - 0.5) * t * t,
+        np.float32(((-0.5 * t + 1.0) * t - 0.5) * t),
+        np.float32((1.5 * t - 2.5) * t * t + 1.0),
+        np.float32(((-1.5 * t + 2.0) * t + 0.5) * t),
+        np.float32((0.5 * t - 0.5) * t * t),
     )
 
 
 @njit(cache=True, nogil=True)
-def _differences(template, image, weight, image_weight, rows, columns, u, v, near, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` with (difference, gradient x, gradient y, weight) of the pixels on the car in both at this shift;
-    returns their number."""
-    side = template.shape[0]
+def _differences(grey, own, image, image_weight, top, u, v, near, lines, difference, weight):  # type: ignore[no-untyped-def]
+    """Fill in the differences of image and template (rows, columns) at this shift, and the weights of those pixels on
+    the car in both; returns their number. A pixel without weight has a difference of a million grey levels.
+
+    The shift is the same for all pixels, so that the interpolation is separable; loops over whole rows of the box,
+    which compilers turn into vector instructions, cost less than those over the car's pixels alone.
+    """
     ix, iy = int(np.floor(u)), int(np.floor(v))
-    cx, cy = _cubic(u - ix), _cubic(v - iy)
+    a, b, c, d = _cubic(u - ix)
+    rows, one, columns = difference.shape[0], np.uint64(1), np.uint64(_COLUMNS)
+    for y in range(rows + 3):
+        line, into = image[top + y + iy - 1, _LEFT + ix - 1 : _LEFT + ix + _COLUMNS + 2], lines[y]
+        for x in range(columns):
+            into[x] = a * line[x] + b * line[x + one] + c * line[x + one + one] + d * line[x + one + one + one]
+    a, b, c, d = _cubic(v - iy)
     n = 0
-    for i in range(rows.size):
-        row, column = rows[i] + iy - 1, columns[i] + ix - 1
-        if row < 0 or column < 0 or row + 3 >= side or column + 3 >= side:
-            continue
-        near_y, near_x = min(max(rows[i] + near[1], 0), side - 1), min(max(columns[i] + near[0], 0), side - 1)
-        # Unsigned, which spares numba its check for negative indices.
-        y, x, one = np.uint64(rows[i]), np.uint64(columns[i]), np.uint64(1)
-        w = min(weight[y, x], image_weight[np.uint64(near_y), np.uint64(near_x)])
-        if w <= 0:
-            continue
-        value, first = 0.0, np.uint64(column)
-        for k in range(4):
-            line = np.uint64(row + k)
-            value += cy[k] * (
-                cx[0] * image[line, first]
-                + cx[1] * image[line, first + one]
-                + cx[2] * image[line, first + one + one]
-                + cx[3] * image[line, first + one + one + one]
-            )
-        out[n, 0] = value - template[y, x]
-        out[n, 1] = 0.5 * (template[y, x + one] - template[y, x - one])
-        out[n, 2] = 0.5 * (template[y + one, x] - template[y - one, x])
-        out[n, 3] = w
-        n += 1
+    for y in range(rows):
+        p, q, r, s = lines[y], lines[y + 1], lines[y + 2], lines[y + 3]
+        values, here = grey[top + y, _LEFT : _LEFT + _COLUMNS], own[top + y, _LEFT : _LEFT + _COLUMNS]
+        there = image_weight[top + y + near[1], _LEFT + near[0] : _LEFT + near[0] + _COLUMNS]
+        out, kept = difference[y], weight[y]
+        for x in range(columns):
+            w = min(here[x], there[x])
+            kept[x] = w
+            out[x] = a * p[x] + b * q[x] + c * r[x] + d * s[x] - values[x] if w > 0 else np.float32(1e6)
+            n += w > 0
     return n
 
 
 @njit(cache=True, nogil=True)
-def _median(values):  # type: ignore[no-untyped-def]
-    """Median by Hoare's selection, as numpy's but without its copies; the order of the values changes."""
-    half = values.size // 2
-    _select(values, half)
-    upper = values[half]
-    if values.size % 2:
-        return upper
-    lower = values[0]
-    for i in range(1, half):
-        lower = max(lower, values[i])
-    return (lower + upper) * 0.5
-
-
-@njit(cache=True, nogil=True)
-def _select(values, k):  # type: ignore[no-untyped-def]
-    """Reorder so that the k-th smallest value stands at its place, none greater before and none smaller after it."""
-    low, high = 0, values.size - 1
-    while low < high:
-        pivot = values[(low + high) // 2]
-        i, j = low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while values[j] > pivot:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if k <= j:
-            high = j
-        elif k >= i:
-            low = i
+def _median(values, middle, count):  # type: ignore[no-untyped-def]
+    """Median of ``count`` grey levels, to a sixteenth of one, or where ``middle`` is given that of the distances from
+    it; by halving the range, as counting takes vector instructions. Values above 256 do not count."""
+    low, high = np.float32(-256.0), np.float32(256.0)
+    flat, half = values.ravel(), (count + 1) // 2
+    distances = not np.isnan(middle)
+    if distances:
+        low = np.float32(0.0)
+    for _ in range(_MEDIAN_STEPS):
+        limit, below = np.float32(0.5) * (low + high), 0
+        if distances:
+            for i in range(np.uint64(flat.size)):
+                below += abs(flat[i] - middle) < limit
         else:
-            return
+            for i in range(np.uint64(flat.size)):
+                below += flat[i] < limit
+        if below < half:
+            low = limit
+        else:
+            high = limit
+    return np.float32(0.5) * (low + high)
 
 
 @njit(cache=True, nogil=True)
-def _step(samples):  # type: ignore[no-untyped-def]
+def _step(difference, weight, slope_x, slope_y, first, count, sums):  # type: ignore[no-untyped-def]
     """One robust Gauss-Newton step with the brightness offset eliminated: (step x, step y, variance); NaN where it is
-    underdetermined."""
-    scratch = samples[:, 0].copy()
-    middle = _median(scratch)
-    for i in range(samples.shape[0]):
-        scratch[i] = abs(samples[i, 0] - middle)
-    spread = 1.4826 * _median(scratch) + 1.0
-    s = sx = sy = sd = xx = xy = yy = xd = yd = dd = 0.0
-    for i in range(samples.shape[0]):
-        d, gx, gy = samples[i, 0] - middle, samples[i, 1], samples[i, 2]
-        e = d / (TUKEY_C * spread)
-        if abs(e) >= 1:
-            continue
-        w = samples[i, 3] * (1 - e * e) ** 2
-        s += w
-        sx += w * gx
-        sy += w * gy
-        sd += w * d
-        xx += w * gx * gx
-        xy += w * gx * gy
-        yy += w * gy * gy
-        xd += w * gx * d
-        yd += w * gy * d
-        dd += w * d * d
+    underdetermined. Overwrites ``difference``, ``weight`` and the scratch ``sums`` (10, columns)."""
+    middle = _median(difference, np.float32(np.nan), count)
+    spread = np.float32(1.4826) * _median(difference, middle, count) + np.float32(1.0)
+    scale = np.float32(1.0) / (np.float32(TUKEY_C) * spread)
+    sums[:], columns = 0.0, np.uint64(_COLUMNS)
+    for y in range(difference.shape[0]):
+        d, w, gx, gy = difference[y], weight[y], slope_x[first + y], slope_y[first + y]
+        for x in range(columns):
+            d[x] -= middle
+            root = max(np.float32(1.0) - (d[x] * scale) * (d[x] * scale), np.float32(0.0))
+            w[x] *= root * root
+        # A sum for each column leaves no order of additions to the compiler; of ten arrays at once it makes no vectors.
+        a0, a1, a2, a3, a4 = sums[0], sums[1], sums[2], sums[3], sums[4]
+        for x in range(columns):
+            a0[x] += w[x]
+            a1[x] += w[x] * gx[x]
+            a2[x] += w[x] * gy[x]
+            a3[x] += w[x] * d[x]
+            a4[x] += w[x] * d[x] * d[x]
+        a5, a6, a7, a8, a9 = sums[5], sums[6], sums[7], sums[8], sums[9]
+        for x in range(columns):
+            a5[x] += w[x] * gx[x] * gx[x]
+            a6[x] += w[x] * gx[x] * gy[x]
+            a7[x] += w[x] * gy[x] * gy[x]
+            a8[x] += w[x] * gx[x] * d[x]
+            a9[x] += w[x] * gy[x] * d[x]
+    s = sx = sy = sd = dd = xx = xy = yy = xd = yd = 0.0
+    for x in range(columns):
+        s += sums[0, x]
+        sx += sums[1, x]
+        sy += sums[2, x]
+        sd += sums[3, x]
+        dd += sums[4, x]
+        xx += sums[5, x]
+        xy += sums[6, x]
+        yy += sums[7, x]
+        xd += sums[8, x]
+        yd += sums[9, x]
+    if s <= 0.0:
+        return np.nan, np.nan, np.nan
     xx, xy, yy = xx - sx * sx / s, xy - sx * sy / s, yy - sy * sy / s
     xd, yd = xd - sx * sd / s, yd - sy * sd / s
     determinant = xx * yy - xy * xy
@@ -368,18 +433,23 @@ def _step(samples):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _lucas_kanade(template, image, weight, image_weight, rows, columns, u, v):  # type: ignore[no-untyped-def]
+def _lucas_kanade(template, image, u, v):  # type: ignore[no-untyped-def]
     """Shift of the template in the image, and its variance; NaN where it leaves the search range or does not
-    converge."""
-    samples = np.empty((rows.size, 4))
+    converge. Each crop is (grey, weight, slopes in x and in y, counts), as in `AlignableCrops`."""
+    grey, own_weight, slope_x, slope_y, counts = template
+    first, last = counts[1], counts[2]
+    rows, top = last - first, _MIDDLE - _REACH + first
+    lines = np.empty((rows + 3, _COLUMNS), np.float32)
+    difference, weight = np.empty((rows, _COLUMNS), np.float32), np.empty((rows, _COLUMNS), np.float32)
+    sums = np.empty((10, _COLUMNS), np.float32)
     near = (0, 0)
     for count in range(MAX_ITERATIONS):
         if count < REWEIGHTING_ITERATIONS:
             near = (int(np.rint(u)), int(np.rint(v)))
-        n = _differences(template, image, weight, image_weight, rows, columns, u, v, near, samples)
+        n = _differences(grey, own_weight, image[0], image[1], top, u, v, near, lines, difference, weight)
         if n < MIN_PIXELS:
             break
-        du, dv, variance = _step(samples[:n])
+        du, dv, variance = _step(difference, weight, slope_x, slope_y, first, n, sums)
         if np.isnan(du):
             break
         length = np.hypot(du, dv)
@@ -393,19 +463,27 @@ def _lucas_kanade(template, image, weight, image_weight, rows, columns, u, v):  
 
 
 @njit(cache=True, nogil=True)
-def _align_all(before, after, axis_before, axis_after, first, second, taps):  # type: ignore[no-untyped-def]
+def _align_all(before, after, first, second, shifts):  # type: ignore[no-untyped-def]
+    """`align_prepared`; ``before`` and ``after`` are the fields of `AlignableCrops`."""
+    grey_a, weight_a, slope_x_a, slope_y_a, pixels_a, counts_a = before
+    grey_b, weight_b, slope_x_b, slope_y_b, _, counts_b = after
     out = np.full((first.size, 3), np.nan)
-    side = before.shape[1]
     # Neighbouring residuals of a blurred image are correlated: the variance grows by the blur's footprint.
     correlated_pixels = 4 * np.pi * BLUR_SIGMA_PX**2
     for k in range(first.size):
-        a, b = _blur(before[first[k]], taps), _blur(after[second[k]], taps)
-        weight_a, weight_b = _weights(side, axis_before[first[k]]), _weights(side, axis_after[second[k]])
-        rows_a, columns_a = _car_pixels(weight_a)
-        rows_b, columns_b = _car_pixels(weight_b)
-        x, y = _integer_shift(a, b, weight_a, weight_b, rows_a, columns_a)
-        fx, fy, forward = _lucas_kanade(a, b, weight_a, weight_b, rows_a, columns_a, float(x), float(y))
-        bx, by, backward = _lucas_kanade(b, a, weight_b, weight_a, rows_b, columns_b, float(-x), float(-y))
+        i, j = first[k], second[k]
+        here = (grey_a[i], weight_a[i], slope_x_a[i], slope_y_a[i], counts_a[i])
+        there = (grey_b[j], weight_b[j], slope_x_b[j], slope_y_b[j], counts_b[j])
+        x, y = _integer_shift(here[0], here[1], pixels_a[i, : counts_a[i, 0]], there[0], there[1], shifts)
+        # Each way from where the other ended: half of the iterations of two that start from the whole-pixel shift.
+        fx, fy, forward = _lucas_kanade(here, there, float(x), float(y))
+        if np.isnan(fx):
+            bx, by, backward = _lucas_kanade(there, here, -float(x), -float(y))
+            if np.isnan(bx):
+                continue
+            fx, fy, forward = _lucas_kanade(here, there, -bx, -by)
+        else:
+            bx, by, backward = _lucas_kanade(there, here, -fx, -fy)
         disagreement = np.hypot(fx + bx, fy + by)
         if not disagreement <= MAX_DISAGREEMENT_PX:  # NaN too
             continue
