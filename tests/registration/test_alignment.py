@@ -8,6 +8,7 @@ import pytest
 
 from tests.scenes import city
 from velfield.camera.lens import pinhole
+from velfield.registration import alignment
 from velfield.registration.alignment import (
     HALF_PATCH,
     align_patches,
@@ -81,6 +82,24 @@ def test_gain_offset_and_vignetting_do_not_matter(base: np.ndarray) -> None:
     start = shift(2.4, 0.7)
     plain, changed = (np.median(errors_px(base, image.astype(np.uint8), true, start)) for image in (frame, vignetted))
     assert changed < plain + 0.02
+
+
+def test_a_step_within_the_frame_is_the_plain_one(base: np.ndarray) -> None:
+    """The pass over whole rows of floats against the one pixel by pixel, which patches at the border take."""
+    templates, image = make_templates(base), smooth_fine(base)
+    derivative, shift = np.array([[0.98, -0.12], [0.11, 1.03]]), np.array([0.4, -0.7])
+    side, columns = 2 * HALF_PATCH + 1, 2 * HALF_PATCH + 2
+    for start, patch in zip(templates.xy[5:25] + 0.3, templates.fine[5:25].reshape(-1, side, side), strict=True):
+        centred, gx, gy, sample = np.zeros((4, side, columns), np.float32)
+        sums = np.zeros((7, columns), np.float32)
+        of_patch = alignment._gradients(patch, 1, centred, gx, gy, sums)
+        found = alignment._step_inside(image, start, derivative, shift, 1, centred, gx, gy, of_patch, sample, sums)
+        plain, visible = np.empty((side, side), np.float32), np.empty((side, side), np.bool_)
+        count, *means = alignment._sample_patch(image, patch, start, derivative, shift, 1, plain, visible)
+        assert count == side * side
+        np.testing.assert_allclose(found, alignment._gauss_newton_step(patch, plain, visible, *means, 1), atol=1e-4)
+        gradient = np.gradient(patch, axis=1)[1:-1, 1:-1]
+        np.testing.assert_allclose(gx[1:-1, 1 : side - 1], gradient, atol=1e-4)
 
 
 def test_the_coarse_level_reaches_farther(base: np.ndarray) -> None:

@@ -85,6 +85,39 @@ def normal_equations(problem: dict[str, np.ndarray]) -> tuple[np.ndarray, np.nda
     return kernels.normal_equations(*arguments, FOLDS, KNOTS, problem["coefficients"], NORMS, CENTRE)
 
 
+def test_evaluation_in_one_is_that_of_the_kernels_one_by_one(problem: dict[str, np.ndarray]) -> None:
+    p = problem
+    corrected, found = kernels.evaluate(
+        p["undistorted"], p["first"], p["basis"], p["observed"], p["theta"], KNOTS, NORMS, CENTRE
+    )
+    np.testing.assert_allclose(corrected, p["corrected"], atol=1e-9)
+    np.testing.assert_allclose(found, residuals(p["theta"], p["undistorted"], p["rows"], p["observed"]), atol=1e-9)
+    still, _ = kernels.evaluate(p["undistorted"], p["first"], p["basis"], p["observed"], p["theta"], 0, NORMS, CENTRE)
+    np.testing.assert_array_equal(still, p["undistorted"])
+
+
+def test_evaluation_has_no_value_beyond_the_pole(problem: dict[str, np.ndarray]) -> None:
+    p, theta = problem, problem["theta"].copy()
+    theta[12:17] = [-2.0, 0.0, 0.0, 0.0, 0.0]
+    _, found = kernels.evaluate(p["undistorted"], p["first"], p["basis"], p["observed"], theta, KNOTS, NORMS, CENTRE)
+    beyond = (problem["corrected"][:, 0] - SOURCE[0]) * SOURCE[2] >= 0.5
+    assert beyond.any()
+    np.testing.assert_array_equal(np.isnan(found).all(axis=1), beyond)
+
+
+def test_the_inverse_of_the_rational_function_undoes_it() -> None:
+    rng = np.random.default_rng(3)
+    c, xy = coefficients(rng), points(rng, 200)
+    there = kernels.rational(xy, c, SOURCE, TARGET)
+    back = kernels.rational_inverse(there, xy + rng.normal(0, 20, xy.shape), c, SOURCE, TARGET, 1e-6)
+    np.testing.assert_allclose(back, xy, atol=1e-5)
+    there[:2], nowhere = np.nan, np.full((1, 2), 1e9)
+    back = kernels.rational_inverse(
+        np.concatenate([there, nowhere]), np.concatenate([xy, nowhere]), c, SOURCE, TARGET, 1e-6
+    )
+    assert np.isnan(back[[0, 1, -1]]).all()
+
+
 def test_normal_equations_are_those_of_the_dense_jacobian(problem: dict[str, np.ndarray]) -> None:
     normal, right, squares = normal_equations(problem)
     j = jacobian(problem)

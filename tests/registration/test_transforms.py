@@ -108,6 +108,20 @@ def test_to_raw_undoes_to_base_below_a_thousandth_of_a_pixel(seed: int) -> None:
     assert np.abs(t.to_base(back) - t.to_base(raw)).max() < 1e-3
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_to_raw_in_frame_starts_a_search_where_to_raw_ends(seed: int) -> None:
+    transform, raw = frame_transform(np.random.default_rng(seed)), grid()
+    base = transform.to_base(raw)
+    found, slopes = transform.to_raw_in_frame(base)
+    assert np.hypot(*(found - transform.to_raw(base)).T).max() < 0.05
+    np.testing.assert_allclose(
+        slopes @ transform.jacobian(raw), np.broadcast_to(np.eye(2), (len(raw), 2, 2)), atol=0.02
+    )
+    assert np.hypot(*(transform.to_raw_nearby(base) - transform.to_raw_roughly(base)).T).max() < 0.05
+    far = transform.to_base(np.array([[-300.0, 100.0]]))
+    assert all(np.isnan(part).all() for part in transform.to_raw_in_frame(far))
+
+
 def test_to_raw_is_nan_far_outside_the_frame() -> None:
     t = frame_transform(np.random.default_rng(3))
     far = t.to_base(np.array([[320.0, 240.0]])) + np.array([1e5, 1e5])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from velfield.registration.joint import ControlPoints
-from velfield.registration.transforms import FrameTransform, invert_2x2
+from velfield.registration.transforms import FrameTransform
 
 N_PATCHES_SAME_SENSOR, N_PATCHES_CROSS_SENSOR = 3000, 6000
 """Patches of a base image of the frames' own camera, and of another sensor's: about half of those fail to align."""
@@ -24,6 +24,7 @@ _CELL_PX = (10.0, 40.0)
 HALF_PATCH = 7
 _FINE_SIGMA_PX = 0.8
 """Gaussian blur of both images: bilinear sampling of the raw frame is accurate enough after it."""
+_FINE_TAPS = 7
 _COARSE_SPACING_PX = 2
 _NOISE_GREY = 3.0
 _MAX_SIGMA_PX = 0.35
@@ -33,7 +34,11 @@ _MAX_ITERATIONS = 12
 _MIN_CORRELATION = 0.7
 _MIN_VISIBLE_FRACTION = 0.6
 """Fraction of a patch that must lie in the frame: patches of the first and last rows are cut in half."""
-_CONVERGED_PX = 0.01
+_CONVERGED_PX = 0.02
+_FRACTION_BITS = 24
+"""Of positions at which the frame is sampled: as many as a float32 holds."""
+_LANES = 8
+"""Values of float32 in a vector of the processor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +171,8 @@ def _find_cell_maxima(strength, cell):  # type: ignore[no-untyped-def]
 
 def smooth_fine(grey: GreyImage) -> Float32Array:
     """The fine blur level of an image at which patches are aligned, float32."""
-    return np.asarray(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _FINE_SIGMA_PX), np.float32)
+    taps = cv2.getGaussianKernel(_FINE_TAPS, _FINE_SIGMA_PX)
+    return np.asarray(cv2.sepFilter2D(grey, cv2.CV_32F, taps, taps), np.float32)
 
 
 def smooth_coarse(fine: Float32Array) -> Float32Array:
@@ -201,8 +207,7 @@ def align_patches(
     -------
     Control points, and the number of patches that lie in the frame.
     """
-    start = transform.to_raw(templates.xy)
-    derivative = invert_2x2(transform.jacobian(start))
+    start, derivative = transform.to_raw_in_frame(templates.xy)
     spacing = _COARSE_SPACING_PX if coarse else 1
     patches = templates.coarse if coarse else templates.fine
     shift, correlation = _align_patches_kernel(
@@ -276,34 +281,51 @@ def _gauss_newton_step(patch, sample, visible, frame_mean, patch_mean, spacing):
 
 
 @njit(cache=True, nogil=True)
-def _gradients(patch, spacing, centred, gx, gy):  # type: ignore[no-untyped-def]
-    """Fill in a patch less its mean and its gradients, zero in the border; sums that every step of it needs."""
-    side = patch.shape[0]
-    mean = 0.0
+def _gradients(patch, spacing, centred, gx, gy, sums):  # type: ignore[no-untyped-def]
+    """Fill in a patch less its mean and its gradients, zero in the border and beyond; sums that every step needs.
+
+    ``centred``, ``gx``, ``gy`` (side, columns) and the scratch ``sums`` (7, columns) have whole vectors of columns. A
+    sum for each column leaves no order of additions to the compiler.
+    """
+    side, inner = patch.shape[0], np.uint64(patch.shape[0] - 1)
+    gx[0], gy[0], gx[side - 1], gy[side - 1], sums[:] = 0.0, 0.0, 0.0, 0.0, 0.0
+    a0, a1, a2, a3, a4, a5, a6 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6]
+    total = 0.0
     for r in range(side):
-        for c in range(side):
-            mean += patch[r, c]
-    mean /= side * side
-    square, hxx, hxy, hyy, sum_x, sum_y, own_x, own_y = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        line = patch[r]
+        for c in range(np.uint64(side)):
+            a6[c] += line[c]
+    for c in range(side):
+        total += a6[c]
+    mean, factor, one = np.float32(total / (side * side)), np.float32(0.5 / spacing), np.uint64(1)
     for r in range(side):
-        for c in range(side):
-            value = patch[r, c] - mean
-            centred[r, c] = value
-            square += value * value
-            gx[r, c], gy[r, c] = 0.0, 0.0
+        line, out = patch[r], centred[r]
+        for c in range(np.uint64(side)):
+            out[c] = line[c] - mean
     for r in range(1, side - 1):
-        for c in range(1, side - 1):
-            x = (patch[r, c + 1] - patch[r, c - 1]) / (2.0 * spacing)
-            y = (patch[r + 1, c] - patch[r - 1, c]) / (2.0 * spacing)
-            gx[r, c], gy[r, c] = x, y
-            hxx += x * x
-            hxy += x * y
-            hyy += y * y
-            sum_x += x
-            sum_y += y
-            own_x += x * centred[r, c]
-            own_y += y * centred[r, c]
-    return square, hxx, hxy, hyy, sum_x, sum_y, own_x, own_y
+        line, above, below, along, across = patch[r], patch[r - 1], patch[r + 1], gx[r], gy[r]
+        for c in range(one, inner):
+            along[c] = factor * (line[c + one] - line[c - one])
+            across[c] = factor * (below[c] - above[c])
+    for r in range(side):
+        value, along, across = centred[r], gx[r], gy[r]
+        for c in range(np.uint64(side)):
+            a0[c] += value[c] * value[c]
+            a1[c] += along[c] * along[c]
+            a2[c] += along[c] * across[c]
+        for c in range(np.uint64(side)):
+            a3[c] += across[c] * across[c]
+            a4[c] += along[c] * value[c]
+            a5[c] += across[c] * value[c]
+    square, hxx, hxy, hyy, own_x, own_y = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for c in range(side):
+        square += a0[c]
+        hxx += a1[c]
+        hxy += a2[c]
+        hyy += a3[c]
+        own_x += a4[c]
+        own_y += a5[c]
+    return square, hxx, hxy, hyy, own_x, own_y
 
 
 @njit(cache=True, nogil=True)
@@ -318,41 +340,64 @@ def _is_inside(image, start, derivative, shift, reach):  # type: ignore[no-untyp
 
 
 @njit(cache=True, nogil=True)
-def _step_inside(image, start, derivative, shift, spacing, centred, gx, gy, sums):  # type: ignore[no-untyped-def]
-    """Gauss-Newton step and correlation of a patch that lies in the frame as a whole, in one pass over its pixels.
+def _step_inside(image, start, derivative, shift, spacing, centred, gx, gy, of_patch, sample, sums):  # type: ignore[no-untyped-def]
+    """Gauss-Newton step and correlation of a patch that lies in the frame as a whole.
 
-    Equal to `_sample_patch` and `_gauss_newton_step`: their sums over differences to the means are expanded. Without
-    numba's fastmath: with it, code just compiled and the same code from the cache differed in the last bits.
+    Equal to `_sample_patch` and `_gauss_newton_step` but for the rounding of float32. The frame is sampled at positions
+    in whole multiples of 2^-24 px, of which integers alone give pixel and fraction: twice as fast as converting floats.
+    The scratch ``sample`` (side, columns) and ``sums`` (7, columns) have whole vectors of columns. Without numba's
+    fastmath: with it, code just compiled and the same code from the cache differed in the last bits.
     """
     side = centred.shape[0]
     half = side // 2
-    square, hxx, hxy, hyy, sum_x, sum_y, own_x, own_y = sums
-    total, total_square, product, with_x, with_y = 0.0, 0.0, 0.0, 0.0, 0.0
+    square, hxx, hxy, hyy, own_x, own_y = of_patch
+    flat, width = image.ravel(), image.shape[1]
+    one, under = np.uint64(1), np.uint64(width)
+    unit, part = float(1 << _FRACTION_BITS), np.float32(1.0 / (1 << _FRACTION_BITS))
+    fraction = (1 << _FRACTION_BITS) - 1
+    ox, oy = shift[0] - half * spacing, shift[1] - half * spacing
+    left = start[0] + derivative[0, 0] * ox + derivative[0, 1] * oy
+    top = start[1] + derivative[1, 0] * ox + derivative[1, 1] * oy
+    step_x, step_y = int(derivative[0, 0] * spacing * unit), int(derivative[1, 0] * spacing * unit)
+    sums[:] = 0.0
+    a0, a1, a2, a3, a4 = sums[0], sums[1], sums[2], sums[3], sums[4]
     for r in range(side):
-        oy = (r - half) * spacing + shift[1]
-        ox = shift[0] - half * spacing
-        x = start[0] + derivative[0, 0] * ox + derivative[0, 1] * oy
-        y = start[1] + derivative[1, 0] * ox + derivative[1, 1] * oy
-        for c in range(side):
-            px, py = x + derivative[0, 0] * (c * spacing), y + derivative[1, 0] * (c * spacing)
-            fx, fy = np.float32(px - int(px)), np.float32(py - int(py))
-            j, k = np.uint64(int(px)), np.uint64(int(py))  # unsigned: numba checks no index for its sign
-            after, below = j + np.uint64(1), k + np.uint64(1)
-            top = image[k, j] + fx * (image[k, after] - image[k, j])
-            bottom = image[below, j] + fx * (image[below, after] - image[below, j])
-            value = float(top + fy * (bottom - top))
-            total += value
-            total_square += value * value
-            product += value * centred[r, c]
-            with_x += value * gx[r, c]
-            with_y += value * gy[r, c]
-    mean = total / (side * side)
-    frame_square = total_square - mean * total
+        x = int((left + derivative[0, 1] * (r * spacing)) * unit)
+        y = int((top + derivative[1, 1] * (r * spacing)) * unit)
+        out = sample[r]
+        for c in range(np.uint64(side)):
+            at = np.uint64((y >> _FRACTION_BITS) * width + (x >> _FRACTION_BITS))
+            fx, fy = np.float32(x & fraction) * part, np.float32(y & fraction) * part
+            upper = flat[at] + fx * (flat[at + one] - flat[at])
+            lower = flat[at + under] + fx * (flat[at + under + one] - flat[at + under])
+            out[c] = upper + fy * (lower - upper)
+            x += step_x
+            y += step_y
+        for c in range(np.uint64(side)):
+            a4[c] += out[c]
+    total = 0.0
+    for c in range(side):
+        total += a4[c]
+    mean = np.float32(total / (side * side))
+    for r in range(side):
+        out, value, along, across = sample[r], centred[r], gx[r], gy[r]
+        for c in range(np.uint64(side)):
+            e = out[c] - mean
+            a0[c] += e * e
+            a1[c] += e * value[c]
+            a2[c] += e * along[c]
+            a3[c] += e * across[c]
+    frame_square, product, with_x, with_y = 0.0, 0.0, 0.0, 0.0
+    for c in range(side):
+        frame_square += a0[c]
+        product += a1[c]
+        with_x += a2[c]
+        with_y += a3[c]
     determinant = hxx * hyy - hxy * hxy
     if frame_square <= 1e-3 or square <= 1e-3 or determinant <= 1e-6 * (hxx + hyy) ** 2:
         return 0.0, 0.0, -1.0
     gain = np.sqrt(square / frame_square)
-    bx, by = gain * (with_x - mean * sum_x) - own_x, gain * (with_y - mean * sum_y) - own_y
+    bx, by = gain * with_x - own_x, gain * with_y - own_y
     return (
         (hyy * bx - hxy * by) / determinant,
         (hxx * by - hxy * bx) / determinant,
@@ -370,19 +415,26 @@ def _align_patches_kernel(image, patches, start, derivative, spacing, max_shift,
     side = int(np.sqrt(patches.shape[1]) + 0.5)
     shift = np.zeros((n, 2))
     correlation = np.full(n, np.nan)
-    sample = np.empty((side, side), np.float32)
     visible = np.empty((side, side), np.bool_)
-    centred, gx, gy = np.empty((side, side)), np.empty((side, side)), np.empty((side, side))
+    columns = (side + _LANES - 1) // _LANES * _LANES
+    sample, centred = np.zeros((side, columns), np.float32), np.zeros((side, columns), np.float32)
+    gx, gy = np.zeros((side, columns), np.float32), np.zeros((side, columns), np.float32)
+    sums = np.zeros((7, columns), np.float32)
     reach = (side // 2) * spacing
+    height, width = image.shape
     for i in range(n):
         if not np.isfinite(start[i, 0] + derivative[i, 0, 0] + derivative[i, 0, 1]):
             continue
+        if not (0.0 <= start[i, 0] < width and 0.0 <= start[i, 1] < height):
+            continue  # less than half of it is visible
         patch = patches[i].reshape(side, side)
-        sums = _gradients(patch, spacing, centred, gx, gy)
+        of_patch = _gradients(patch, spacing, centred, gx, gy, sums)
         score, converged, in_frame = 0.0, False, True
         for _ in range(iterations):
             if _is_inside(image, start[i], derivative[i], shift[i], reach):
-                x, y, score = _step_inside(image, start[i], derivative[i], shift[i], spacing, centred, gx, gy, sums)
+                x, y, score = _step_inside(
+                    image, start[i], derivative[i], shift[i], spacing, centred, gx, gy, of_patch, sample, sums
+                )
             else:
                 count, frame_mean, patch_mean = _sample_patch(
                     image, patch, start[i], derivative[i], shift[i], spacing, sample, visible

@@ -81,18 +81,23 @@ at the borders."""
 _RETEST_FRAMES = 8
 """In a chain, a patch that was an inlier in none of so many frames is tried in one of so many: most patches of another
 sensor's image never align, and those take the most iterations."""
-_SETTLED_PX = 0.2
-"""Where a fit to aligned patches moves 95 % of them by less than this, they are not aligned again."""
+_SETTLED_PX, _SETTLED_IN_CHAIN_PX = 0.2, 0.5
+"""Where a fit to aligned patches moves 95 % of them by less than this, they are not aligned again: an alignment does
+not depend on where it starts, but from keypoints whole bands of rows may start out of its reach."""
 _WEAK_FRACTION, _MIN_TRIED = 0.5, 20
 """A band of rows is fitted again from its neighbours if a smaller part of its patches are inliers than in the typical
 band, of as many patches at least."""
+_SHOWN_PX = 2 * HALF_PATCH
+"""A patch that is as far from the frame's border has been seen."""
 _MAX_BRIDGES = 3
 _MIN_ALIGNED_FRACTION = 0.15
 """If a smaller fraction of the patches aligns, the prior was wrong: the frame is not registered."""
 _FLOW_SIGMA_PX = 0.7
-_FLOW_POINTS = 800
+_FLOW_POINTS = 500
 _FLOW_SCALE, _FLOW_LEVELS, _FLOW_WINDOW_PX = 0.5, 4, 21
 """Of optical flow: scale of the frames, levels of their pyramids above that, side of the window."""
+_FLOW_ENDS = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 10, 0.03)
+"""A point is followed for so many iterations, or until it moves by less than so many px of the scaled frame."""
 _MAX_COVERAGE_LOSS, _MAX_RESIDUAL_RATIO = 0.05, 1.5
 """Against the first frame of the chain: a frame that is worse is registered again by its keypoints."""
 _MAX_BASE_KEYPOINT_RATIO = 3
@@ -263,8 +268,8 @@ class _PatchHistory:
         """Inliers of the last frames, those that the frame before did not show, and some of the others in turn."""
         recent = self.frame - self.last_inlier <= _RETEST_FRAMES
         turn = np.arange(len(self.templates)) % _RETEST_FRAMES == self.frame % _RETEST_FRAMES
-        xy_raw = before.transform.to_raw(self.templates.xy)
-        shown = ((xy_raw >= HALF_PATCH) & (xy_raw <= np.array(shape[::-1]) - 1 - HALF_PATCH)).all(axis=1)
+        xy_raw = before.transform.to_raw_nearby(self.templates.xy)  # row motion and mesh are a few pixels
+        shown = ((xy_raw >= _SHOWN_PX) & (xy_raw <= np.array(shape[::-1]) - 1 - _SHOWN_PX)).all(axis=1)
         return self.templates.select(recent | turn | ~shown)
 
 
@@ -309,7 +314,7 @@ def _register_by_flow(
     start = ((inliers.xy_raw[chosen] + 0.5) * _FLOW_SCALE - 0.5).astype(np.float32)
     window = (_FLOW_WINDOW_PX, _FLOW_WINDOW_PX)
     moved, found, _ = cv2.calcOpticalFlowPyrLK(
-        before.small, small, start[:, None], None, winSize=window, maxLevel=_FLOW_LEVELS
+        before.small, small, start[:, None], None, winSize=window, maxLevel=_FLOW_LEVELS, criteria=_FLOW_ENDS
     )
     xy_raw = (moved[:, 0].astype(np.float64) + 0.5) / _FLOW_SCALE - 0.5
     height, width = grey.shape
@@ -450,6 +455,8 @@ class _FrameFitter:
         start: PolyprojectiveTransform,
         previous_fit: JointFit | None = None,
         stiffness: tuple[float, float] | None = None,
+        *,
+        rough: bool = False,
     ) -> JointFit | Failure:
         if len(points) < self.config.min_control_points:
             return Failure(f"{len(points)} control points, {self.config.min_control_points} needed")
@@ -465,6 +472,7 @@ class _FrameFitter:
             start_rows=None if previous_fit is None else previous_fit.transform.row_coefficients,
             start_scale_px=_INITIAL_SCALE_PX if previous_fit is None else _REFIT_SCALE_PX,
             start_stiffness=stiffness if previous_fit is None else previous_fit.stiffness,
+            rough=rough,
         )
 
     def fit_with_alignment(
@@ -482,7 +490,7 @@ class _FrameFitter:
         harm: at the border of another sensor's image, where few patches align correctly, wrong alignments from the
         larger range shifted the rows by two pixels.
         """
-        fit = self._fit(points, start, stiffness=stiffness)
+        fit = self._fit(points, start, stiffness=stiffness, rough=True)
         if isinstance(fit, Failure):
             return fit
         fine = smooth_fine(self.grey)
@@ -494,7 +502,7 @@ class _FrameFitter:
         steps = [(fine, False, _FINE_SHIFT_PX)] * 2
         if len(aligned) < _NEAR_FRACTION * in_frame:
             steps.insert(0, (smooth_coarse(fine), True, _COARSE_SHIFT_PX))
-        used = points
+        used, settled_px = points, _SETTLED_PX if chosen is None else _SETTLED_IN_CHAIN_PX
         for k, (image, is_coarse, limit) in enumerate(steps):
             if k or not enough:
                 aligned, in_frame = align_patches(image, fit.transform, templates, coarse=is_coarse, max_shift_px=limit)
@@ -506,7 +514,7 @@ class _FrameFitter:
                 return refit
             moved = fit.transform.to_base(aligned.xy_raw) - refit.transform.to_base(aligned.xy_raw)
             fit = refit
-            if not is_coarse and np.quantile(np.hypot(*moved.T), 0.95) < _SETTLED_PX:
+            if not is_coarse and np.quantile(np.hypot(*moved.T), 0.95) < settled_px:
                 break
         if chosen is None:
             for _ in range(_MAX_BRIDGES):

@@ -35,8 +35,9 @@ FOLD_CELL_PX = 48
 """Control points of one cell of this side share a fold: errors of neighbours are correlated."""
 _ANNEALING = (8.0, 6.0, 4.0, 3.0, 2.5, 2.5, 2.5)
 _WARM_ANNEALING = (5.0, 3.5, 2.5, 2.5)
+_ROUGH_ANNEALING = (5.0, 3.5, 2.5)
 """Width of the weight function in robust standard deviations, step by step: wide first, so that displaced rows keep
-their weight. The second is for a refit."""
+their weight. The second is for a refit, the third for a fit that another starts from."""
 _BENDING_SD = 0.05
 """Prior standard deviation of the second-order terms, in half-frames: far above what a lens leaves, it matters only
 where there are no control points."""
@@ -140,7 +141,6 @@ class _Problem:
     """The constants of one fit."""
 
     undistorted: FloatArray
-    rows: FloatArray
     xy_base: FloatArray
     sigma: FloatArray
     first: IntArray
@@ -151,8 +151,10 @@ class _Problem:
     norms: FloatArray
     centre: FloatArray
     height: int
+    inner: Mask
     roughness: FloatArray = field(repr=False)
     gauge: FloatArray = field(repr=False)
+    penalties: dict[tuple[float, float], FloatArray] = field(default_factory=dict, repr=False)
 
     def coefficients(self, theta: FloatArray) -> FloatArray:
         return np.stack([theta[:6], theta[6:12], np.concatenate([[1.0], theta[12:17]])])
@@ -162,17 +164,20 @@ class _Problem:
         rows[2] /= self.norms[3]
         return rows
 
-    def corrected(self, theta: FloatArray) -> FloatArray:
-        rows = self.row_coefficients(theta)
-        return np.asarray(kernels.remove_row_motion(self.undistorted, self.rows, rows, self.height, self.centre))
-
-    def residuals(self, theta: FloatArray) -> FloatArray:
-        source, target = self.norms[:3], self.norms[4:]
-        mapped = kernels.rational(self.corrected(theta), self.coefficients(theta), source, target)
-        return np.asarray(self.xy_base - mapped)
+    def evaluate(self, theta: FloatArray) -> "_State":
+        """The map by these parameters, at all control points."""
+        corrected, residuals = kernels.evaluate(
+            self.undistorted, self.first, self.basis, self.xy_base, theta, self.knots, self.norms, self.centre
+        )
+        return _State(theta, corrected, residuals)
 
     def penalty(self, stiffness: float, roll_stiffness: float) -> FloatArray:
         """Quadratic form (p, p) of all priors: second differences, ridge, gauge and second-order terms."""
+        if (stiffness, roll_stiffness) not in self.penalties:
+            self.penalties[stiffness, roll_stiffness] = self._make_penalty(stiffness, roll_stiffness)
+        return self.penalties[stiffness, roll_stiffness]
+
+    def _make_penalty(self, stiffness: float, roll_stiffness: float) -> FloatArray:
         matrix = np.zeros((17 + 3 * self.knots, 17 + 3 * self.knots))
         k = self.knots
         for part, weight in enumerate((stiffness, stiffness, roll_stiffness)):
@@ -182,29 +187,42 @@ class _Problem:
         matrix[bending, bending] = 1.0 / _BENDING_SD**2
         return matrix
 
-    def equations(self, theta: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def equations(
+        self, state: "_State", weight: FloatArray, fold: IntArray, folds: int
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         return kernels.normal_equations(  # type: ignore[no-any-return]
             self.undistorted,
-            self.corrected(theta),
+            state.corrected,
             self.first,
             self.basis,
             self.xy_base,
             weight,
-            self.fold,
-            FOLDS,
+            fold,
+            folds,
             self.knots,
-            self.coefficients(theta),
+            self.coefficients(state.theta),
             self.norms,
             self.centre,
         )
 
     def step(self, normal: FloatArray, right: FloatArray, penalty: FloatArray, theta: FloatArray) -> FloatArray:
         """Gauss-Newton step (p,) of the penalised squares; zero for fixed parameters."""
-        matrix = (normal + penalty)[np.ix_(self.free, self.free)]
-        gradient = (right - np.einsum("ij,j", penalty, theta))[self.free]
+        matrix, gradient = normal + penalty, right - np.einsum("ij,j", penalty, theta)
+        if len(self.free) == len(theta):
+            return np.asarray(kernels.solve_cholesky(matrix, gradient[:, None])[:, 0])
+        matrix, gradient = matrix[np.ix_(self.free, self.free)], gradient[self.free]
         out = np.zeros(len(theta))
         out[self.free] = kernels.solve_cholesky(matrix, gradient[:, None])[:, 0]
         return out
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """The map by parameters ``theta`` (p,): points (n, 2) without row motion, undistorted px; residuals (n, 2)."""
+
+    theta: FloatArray
+    corrected: FloatArray
+    residuals: FloatArray
 
 
 def fit_jointly(
@@ -219,6 +237,7 @@ def fit_jointly(
     start_rows: FloatArray | None = None,
     start_scale_px: float = 3.0,
     start_stiffness: tuple[float, float] | None = None,
+    rough: bool = False,
 ) -> JointFit | Failure:
     """Fit polyprojective (or homography) and row spline jointly to control points, by annealed IRLS.
 
@@ -238,6 +257,8 @@ def fit_jointly(
         Upper limit of the robust scale: residuals up to some eight times this have weight at first.
     start_stiffness
         Stiffness of an earlier fit of the same frame: fewer steps and candidates are needed.
+    rough
+        Fit in a few steps, with that stiffness and without cross-validation: to start another fit from.
 
     Returns
     -------
@@ -246,9 +267,10 @@ def fit_jointly(
     problem = _build_problem(
         points, start=start, lens=lens, width=width, height=height, knots=knots, homography=homography
     )
-    theta = _initial_parameters(problem, start, start_rows)
-    theta, weights, scale, stiffness = _irls_annealed(problem, theta, start_scale_px, start_stiffness)
-    return _to_result(problem, theta, weights, scale, stiffness, lens=lens, width=width)
+    state = problem.evaluate(_initial_parameters(problem, start, start_rows))
+    rough = rough and start_stiffness is not None
+    state, weights, scale, stiffness = _irls_annealed(problem, state, start_scale_px, start_stiffness, rough=rough)
+    return _to_result(problem, state, weights, scale, stiffness, lens=lens, width=width, rough=rough)
 
 
 def _build_problem(
@@ -268,14 +290,12 @@ def _build_problem(
         first, basis = kernels.spline_basis(rows, height, knots)
     else:
         knots, first, basis = 0, np.zeros(len(raw), np.int64), np.zeros((len(raw), 4))
-    difference = np.diff(np.eye(knots), n=2, axis=0) if knots else np.zeros((0, 0))
     free = np.array([0, 1, 2, 6, 7, 8, 12, 13]) if homography else np.arange(17)
     corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=np.float64)
     source = fit_normalisation(as_points(lens.undistort_points(corners)))
     target = fit_normalisation(as_points(points.xy_base))
     return _Problem(
         undistorted=undistorted,
-        rows=rows,
         xy_base=as_points(points.xy_base),
         sigma=np.asarray(points.sigma_px, dtype=np.float64),
         first=first,
@@ -286,11 +306,20 @@ def _build_problem(
         norms=np.concatenate([source, [0.5 * np.hypot(width, height)], target]),
         centre=np.array([(width - 1) / 2, (height - 1) / 2]),
         height=height,
-        roughness=difference.T @ difference,
+        inner=np.asarray(np.abs(rows / (height - 1) - 0.5) < 0.5 - _END_FRACTION),
+        roughness=_roughness(knots),
         gauge=_gauge_projections(knots, homography=homography),
     )
 
 
+@cache
+def _roughness(knots: int) -> FloatArray:
+    """Quadratic form (knots, knots) of the squared second differences."""
+    difference = np.diff(np.eye(knots), n=2, axis=0) if knots else np.zeros((0, 0))
+    return np.asarray(difference.T @ difference)
+
+
+@cache
 def _gauge_projections(knots: int, *, homography: bool) -> FloatArray:
     """Projections (3, knots, knots) of shift x, shift y and roll onto the low powers of the row that the model has."""
     powers = (2, 2, 1) if homography else (3, 3, 2)
@@ -383,44 +412,70 @@ def robust_weights(residuals: FloatArray, sigma: FloatArray, scale: float) -> Fl
 
 
 def _irls_annealed(
-    problem: _Problem, theta: FloatArray, start_scale_px: float, start_stiffness: tuple[float, float] | None
-) -> tuple[FloatArray, FloatArray, float, tuple[float, float]]:
-    """IRLS with a weight function that narrows from step to step: parameters, weights, scale and stiffness."""
+    problem: _Problem,
+    state: _State,
+    start_scale_px: float,
+    start_stiffness: tuple[float, float] | None,
+    *,
+    rough: bool,
+) -> tuple[_State, FloatArray, float, tuple[float, float]]:
+    """IRLS with a weight function that narrows from step to step: the map, weights, scale and stiffness."""
     stiffness = start_stiffness or _INITIAL_STIFFNESS
-    widths = _ANNEALING if start_stiffness is None else _WARM_ANNEALING
+    widths: tuple[float, ...] = _ANNEALING if start_stiffness is None else _WARM_ANNEALING
+    widths = _ROUGH_ANNEALING if rough else widths + (widths[-1],) * _FINAL_STEPS
     limit = start_scale_px / float(np.median(problem.sigma))
-    weights, scale = _weights_and_scale(problem.residuals(theta), problem.sigma, widths[0], limit)
+    weights, scale = _weights_and_scale(state.residuals, problem.sigma, widths[0], limit)
+    no_folds, equations, settled = np.zeros_like(problem.fold), None, rough
     for iteration, width in enumerate(widths):
-        theta = _take_step(problem, theta, weights, scale, stiffness)
-        weights, scale = _weights_and_scale(problem.residuals(theta), problem.sigma, width, limit)
-        if iteration in _SELECT_STIFFNESS_AFTER:
-            stiffness = _select_stiffness(problem, theta, weights, scale, start_stiffness)
-    for _ in range(_FINAL_STEPS):
-        theta = _take_step(problem, theta, weights, scale, stiffness)
-        weights, scale = _weights_and_scale(problem.residuals(theta), problem.sigma, widths[-1], limit)
-    return theta, weights, scale, stiffness
+        if equations is None:
+            equations = problem.equations(state, _inverse_variance(problem, weights, scale), no_folds, 1)
+        state = _take_step(problem, state, equations, weights, stiffness)
+        weights, scale = _weights_and_scale(state.residuals, problem.sigma, width, limit)
+        equations = None
+        if iteration in _SELECT_STIFFNESS_AFTER and problem.knots and not settled:
+            # the rows at the ends take part in the next step only: a fold of their own
+            equations = problem.equations(
+                state,
+                _inverse_variance(problem, weights, scale),
+                np.where(problem.inner, problem.fold, FOLDS),
+                FOLDS + 1,
+            )
+            of_inner = tuple(part[:FOLDS] for part in equations)
+            selected = _select_stiffness(problem, of_inner, state.theta, start_stiffness)
+            settled = start_stiffness is not None and selected == stiffness
+            stiffness = selected
+    return state, weights, scale, stiffness if problem.knots else (1.0, 1.0)
 
 
 def _to_result(
     problem: _Problem,
-    theta: FloatArray,
+    state: _State,
     weights: FloatArray,
     scale: float,
     stiffness: tuple[float, float],
     *,
     lens: Lens,
     width: int,
+    rough: bool,
 ) -> JointFit | Failure:
     """The result, with cross-validated residuals to first order: one Gauss-Newton step without each fold."""
-    _, steps = _cross_validate(
-        problem, problem.equations(theta, _inverse_variance(problem, weights, scale)), theta, stiffness
-    )
-    residuals = problem.residuals(theta)
+    theta, residuals = state.theta, state.residuals
     if not np.isfinite(theta).all() or float(weights.sum()) < len(problem.free) / 4:
         return Failure(f"the fit to {len(weights)} control points did not converge")
+    transform = FrameTransform(
+        width=width,
+        height=problem.height,
+        lens=lens,
+        polyprojective=PolyprojectiveTransform(problem.coefficients(theta), problem.norms[:3], problem.norms[4:]),
+        row_coefficients=problem.row_coefficients(theta),
+    )
+    if rough:
+        return JointFit(transform, weights, residuals, residuals, scale, stiffness)
+    equations = problem.equations(state, _inverse_variance(problem, weights, scale), problem.fold, FOLDS)
+    _, steps = _cross_validate(problem, equations, theta, stiffness)
     change = kernels.predict_change(
         problem.undistorted,
-        problem.corrected(theta),
+        state.corrected,
         problem.first,
         problem.basis,
         steps,
@@ -430,13 +485,6 @@ def _to_result(
         problem.norms,
         problem.centre,
     )
-    transform = FrameTransform(
-        width=width,
-        height=problem.height,
-        lens=lens,
-        polyprojective=PolyprojectiveTransform(problem.coefficients(theta), problem.norms[:3], problem.norms[4:]),
-        row_coefficients=problem.row_coefficients(theta),
-    )
     return JointFit(transform, weights, residuals, residuals - change, scale, stiffness)
 
 
@@ -445,16 +493,21 @@ def _inverse_variance(problem: _Problem, weights: FloatArray, scale: float) -> F
 
 
 def _take_step(
-    problem: _Problem, theta: FloatArray, weights: FloatArray, scale: float, stiffness: tuple[float, float]
-) -> FloatArray:
+    problem: _Problem,
+    state: _State,
+    equations: tuple[FloatArray, FloatArray, FloatArray],
+    weights: FloatArray,
+    stiffness: tuple[float, float],
+) -> _State:
     """One Gauss-Newton step, halved until every control point of positive weight stays in the map's domain."""
-    normal, right, _ = problem.equations(theta, _inverse_variance(problem, weights, scale))
-    step = problem.step(normal.sum(axis=0), right.sum(axis=0), problem.penalty(*stiffness), theta)
+    normal, right = (part[0] if len(part) == 1 else part.sum(axis=0) for part in equations[:2])
+    step = problem.step(normal, right, problem.penalty(*stiffness), state.theta)
     for _ in range(_HALVINGS):
-        if np.isfinite(problem.residuals(theta + step)[weights > 0]).all():
-            return theta + step
+        stepped = problem.evaluate(state.theta + step)
+        if np.isfinite(stepped.residuals[weights > 0]).all():
+            return stepped
         step = 0.5 * step
-    return theta
+    return state
 
 
 def _cross_validate(
@@ -497,20 +550,16 @@ def _solve_without_folds(
 
 def _select_stiffness(
     problem: _Problem,
+    equations: tuple[FloatArray, ...],
     theta: FloatArray,
-    weights: FloatArray,
-    scale: float,
     earlier: tuple[float, float] | None,
 ) -> tuple[float, float]:
     """Select the stiffness of the row shift, then of the roll, by cross-validation; near ``earlier`` if given."""
-    if problem.knots == 0:
-        return (1.0, 1.0)
-    inner = np.abs(problem.rows / (problem.height - 1) - 0.5) < 0.5 - _END_FRACTION
-    equations = problem.equations(theta, _inverse_variance(problem, np.where(inner, weights, 0.0), scale))
     shifts = _neighbours(_SHIFT_STIFFNESSES, None if earlier is None else earlier[0])
     rolls = _neighbours(_ROLL_STIFFNESSES, None if earlier is None else earlier[1])
     roll = _ROLL_STIFFNESSES[-1] if earlier is None else earlier[1]
-    restricted = _restrict(problem, equations)
+    normal, right, squares_by_fold = equations
+    restricted = _restrict(problem, (normal, right, squares_by_fold))
 
     @cache
     def squares(candidate: tuple[float, float]) -> float:

@@ -13,6 +13,8 @@ import math
 import numpy as np
 from numba import njit
 
+_INVERSE_STEPS = 25
+
 
 @njit(cache=True, nogil=True)
 def rational(points, coefficients, source, target):  # type: ignore[no-untyped-def]
@@ -67,6 +69,40 @@ def rational_jacobian(points, coefficients, source, target):  # type: ignore[no-
         for row in range(2):
             out[i, row, 0] = (dx[row] - value[row] / w * dx[2]) / w * scale
             out[i, row, 1] = (dy[row] - value[row] / w * dy[2]) / w * scale
+    return out
+
+
+@njit(cache=True, nogil=True)
+def rational_inverse(points, guess, coefficients, source, target, tolerance):  # type: ignore[no-untyped-def]
+    """Inverse of `rational` at points (n, 2) by Newton's method from ``guess`` (n, 2), each point until its residual is
+    below ``tolerance``; NaN where that fails. Arguments as in `rational`."""
+    out = np.full((points.shape[0], 2), np.nan)
+    scale = source[2] / target[2]
+    c = coefficients
+    for i in range(points.shape[0]):
+        u, v = guess[i, 0], guess[i, 1]
+        for _ in range(_INVERSE_STEPS):
+            x, y = (u - source[0]) * source[2], (v - source[1]) * source[2]
+            xx, xy, yy = x * x, x * y, y * y
+            w = c[2, 0] + c[2, 1] * x + c[2, 2] * y + c[2, 3] * xx + c[2, 4] * xy + c[2, 5] * yy
+            if not w > 1e-9:
+                break
+            p = (c[0, 0] + c[0, 1] * x + c[0, 2] * y + c[0, 3] * xx + c[0, 4] * xy + c[0, 5] * yy) / w
+            q = (c[1, 0] + c[1, 1] * x + c[1, 2] * y + c[1, 3] * xx + c[1, 4] * xy + c[1, 5] * yy) / w
+            ex, ey = points[i, 0] - (p / target[2] + target[0]), points[i, 1] - (q / target[2] + target[1])
+            if abs(ex) < tolerance and abs(ey) < tolerance:
+                out[i, 0], out[i, 1] = u, v
+                break
+            wx, wy = c[2, 1] + 2 * c[2, 3] * x + c[2, 4] * y, c[2, 2] + c[2, 4] * x + 2 * c[2, 5] * y
+            jxx = (c[0, 1] + 2 * c[0, 3] * x + c[0, 4] * y - p * wx) / w * scale
+            jxy = (c[0, 2] + c[0, 4] * x + 2 * c[0, 5] * y - p * wy) / w * scale
+            jyx = (c[1, 1] + 2 * c[1, 3] * x + c[1, 4] * y - q * wx) / w * scale
+            jyy = (c[1, 2] + c[1, 4] * x + 2 * c[1, 5] * y - q * wy) / w * scale
+            determinant = jxx * jyy - jxy * jyx
+            if determinant == 0.0:
+                break
+            u += (jyy * ex - jxy * ey) / determinant
+            v += (jxx * ey - jyx * ex) / determinant
     return out
 
 
@@ -129,6 +165,38 @@ def mesh_displacement(points, mesh, cell):  # type: ignore[no-untyped-def]
             bottom = mesh[k1, j, c] + fx * (mesh[k1, j1, c] - mesh[k1, j, c])
             out[i, c] = top + fy * (bottom - top)
     return out
+
+
+@njit(cache=True, nogil=True)
+def evaluate(undistorted, first, basis, observed, theta, knots, norms, centre):  # type: ignore[no-untyped-def]
+    """Points (n, 2) without row motion and their residuals (n, 2) by the parameters ``theta``, as `remove_row_motion`
+    and `rational` in one; arguments as in `normal_equations`. NaN where the denominator is not positive."""
+    corrected, residuals = np.empty((undistorted.shape[0], 2)), np.empty((undistorted.shape[0], 2))
+    shift_x, shift_y, roll = 17, 17 + knots, 17 + 2 * knots
+    for i in range(undistorted.shape[0]):
+        u, v = undistorted[i, 0], undistorted[i, 1]
+        if knots > 0:
+            dx, dy, turn = 0.0, 0.0, 0.0
+            for k in range(4):
+                column, b = first[i] + k, basis[i, k]
+                dx += b * theta[shift_x + column]
+                dy += b * theta[shift_y + column]
+                turn += b * theta[roll + column]
+            turn /= norms[3]
+            dx, dy = dx - turn * (v - centre[1]), dy + turn * (u - centre[0])
+            u, v = u + dx, v + dy
+        corrected[i, 0], corrected[i, 1] = u, v
+        x, y = (u - norms[0]) * norms[2], (v - norms[1]) * norms[2]
+        xx, xy, yy = x * x, x * y, y * y
+        w = 1.0 + theta[12] * x + theta[13] * y + theta[14] * xx + theta[15] * xy + theta[16] * yy
+        if w > 1e-9:
+            p = theta[0] + theta[1] * x + theta[2] * y + theta[3] * xx + theta[4] * xy + theta[5] * yy
+            q = theta[6] + theta[7] * x + theta[8] * y + theta[9] * xx + theta[10] * xy + theta[11] * yy
+            residuals[i, 0] = observed[i, 0] - (p / w / norms[6] + norms[4])
+            residuals[i, 1] = observed[i, 1] - (q / w / norms[6] + norms[5])
+        else:
+            residuals[i, 0], residuals[i, 1] = np.nan, np.nan
+    return corrected, residuals
 
 
 @njit(cache=True, nogil=True)

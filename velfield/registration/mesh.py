@@ -18,6 +18,7 @@ The standard deviation of a cell is that of the mean of the hold-out residuals a
 the distance to the nearest control points. Its two constants were set on simulated flights of seeds 1 to 3.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,11 +64,12 @@ _GROWTH = 3.0
 
 @dataclass(frozen=True, eq=False)
 class MeshFit:
-    """Mesh (my, mx, 2), base px, or None; ``residuals`` and ``cv_residuals`` (n, 2) after it."""
+    """Mesh (my, mx, 2), base px, or None; ``residuals`` and ``cv_residuals`` (n, 2) after it; selected stiffness."""
 
     mesh: FloatArray | None
     residuals: FloatArray
     cv_residuals: FloatArray
+    stiffness: float = float("nan")
 
 
 def fit_robust_mesh(
@@ -85,6 +87,7 @@ def fit_robust_mesh(
     model it. Relative to the mesh of the previous iteration they are inliers; those on roofs among them are not.
     """
     mesh_fit, weights = MeshFit(None, fit.residuals, fit.cv_residuals), fit.weights
+    stiffnesses = _STIFFNESSES
     for iteration in range(iterations):
         if iteration:
             weights = robust_weights(mesh_fit.residuals, points.sigma_px, fit.scale)
@@ -97,9 +100,13 @@ def fit_robust_mesh(
             width=width,
             height=height,
             cell_size_px=cell_size_px,
+            stiffnesses=stiffnesses,
         )
         if mesh_fit.mesh is None:
             return mesh_fit, fit.weights
+        # the second fit's weights are the first that count relief as inliers; those of the third hardly differ
+        at = stiffnesses.index(mesh_fit.stiffness)
+        stiffnesses = stiffnesses[max(at - 1, 0) : at + 2] if iteration == 0 else (mesh_fit.stiffness,)
     return mesh_fit, weights
 
 
@@ -113,6 +120,7 @@ def fit_mesh(
     height: int,
     cell_size_px: int,
     fold: IntArray | None = None,
+    stiffnesses: Sequence[float] = _STIFFNESSES,
 ) -> MeshFit:
     """Fit a mesh to residuals by penalised least squares; cross-validation selects the penalty, or no mesh.
 
@@ -128,6 +136,8 @@ def fit_mesh(
         Raw frame, px.
     fold
         (n,) fold of each control point; None: by cells of 48 px.
+    stiffnesses
+        Candidate weights of the penalty.
     """
     my, mx = mesh_shape(width, height, cell_size_px)
     if len(xy_raw) < _MIN_POINTS_PER_CELL * my * mx or my * mx < 4:
@@ -140,7 +150,7 @@ def fit_mesh(
     smoothness = smoothness_bands(my, mx)
     squares_without = float((weights[:, None] * cv_residuals**2).sum())
     best, best_squares, best_cv = None, squares_without * (1 - _MIN_GAIN), cv_residuals
-    for stiffness in _STIFFNESSES:
+    for stiffness in stiffnesses:
         meshes = np.stack(
             [_solve(normal_all - normal[f] + stiffness * smoothness, right_all - right[f]) for f in range(FOLDS)]
         )
@@ -152,7 +162,7 @@ def fit_mesh(
         return MeshFit(None, residuals, cv_residuals)
     mesh = _solve(normal_all + best * smoothness, right_all)
     left = residuals - interpolate_mesh(nodes, shares, mesh[None], np.zeros_like(fold))
-    return MeshFit(np.ascontiguousarray(mesh.reshape(my, mx, 2)), left, best_cv)
+    return MeshFit(np.ascontiguousarray(mesh.reshape(my, mx, 2)), left, best_cv, best)
 
 
 def _solve(bands: FloatArray, right: FloatArray) -> FloatArray:
