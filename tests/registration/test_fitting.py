@@ -37,7 +37,7 @@ def control_points(
     return ControlPoints(raw, base, np.full(count, 0.5))
 
 
-def fit(points: ControlPoints, *, knots: int = 48, **options: bool):
+def fit(points: ControlPoints, *, knots: int = 48, **options: object):
     corners = np.array([[0.0, 0.0], [WIDTH - 1, HEIGHT - 1]])
     start = PolyprojectiveTransform.from_homography(
         MATRIX, fit_normalisation(corners), fit_normalisation(points.xy_base)
@@ -101,6 +101,17 @@ def test_wobbling_rows_are_followed_among_a_third_of_wrong_matches(cycles: float
     )
     found = fit(points)
     assert mean_error(found.transform, amplitude_px=4.0, cycles=cycles) < limit_px
+
+
+def test_a_rough_fit_keeps_its_stiffness_and_is_near_enough_to_start_another() -> None:
+    motion = {"amplitude_px": 3.0, "cycles": 3.0}
+    points = control_points(np.random.default_rng(12), count=500, noise_px=0.2, wrong=0.05, **motion)
+    whole = fit(points)
+    rough = fit(points, start_stiffness=whole.stiffness, rough=True)
+    assert rough.stiffness == whole.stiffness
+    assert mean_error(rough.transform, **motion) < mean_error(whole.transform, **motion) + 0.05
+    assert rough.cv_residuals is rough.residuals
+    assert fit(points, rough=True).stiffness == whole.stiffness  # without a stiffness to keep it is a whole fit
 
 
 def test_case_deletion_cannot_follow_wobbling_rows() -> None:
