@@ -91,8 +91,8 @@ class CnnConfig(_WithMotionChannel):
     precision: Literal["int8", "float32"] = "int8"
     """Numbers that the network is run with on a processor; a GPU always takes ``float32``."""
     cascade: CascadeTraining = CascadeTraining()
-    """The cascade that takes the network's place: where labels come from motion and appearance is sufficient, or few
-    vehicles move, and where cars are not as long as those that the pre-trained network knows."""
+    """The cascade that takes the network's place: where labels come from motion and few vehicles move, and where cars
+    are not as long as those that the pre-trained network knows."""
 
 
 class CascadeConfig(CascadeTraining, _WithMotionChannel):
