@@ -36,6 +36,7 @@ from velfield.detection.motion.triplets import (
     link_triplet,
 )
 from velfield.errors import InputError
+from velfield.parallel import parallel_map
 
 __all__ = [
     "FrameLabels",
@@ -161,7 +162,7 @@ def labels_from_motion(
     length = estimate_car_length(differences, times, max_interval_s) if car_length_px is None else car_length_px
     if not np.isfinite(length):
         return _no_labels(len(frames))
-    blobs = [differences.blobs(k, length) for k in range(len(frames))]
+    blobs = parallel_map(lambda k: differences.blobs(k, length), range(len(frames)))
     middles = interior_frames(times, max_interval_s)
     triplets = [link_triplet(blobs, times, (k - 1, k, k + 1), length) for k in middles]
     shadow = fit_shadow_vector(np.concatenate([np.empty((0, 5)), *(triplet.shadows for triplet in triplets)]))

@@ -22,7 +22,7 @@ from velfield.detection.motion.labels import MotionLabels, choose_frames, labels
 from velfield.detection.scale_search import STEP, View, contradict_motion, find_scale
 from velfield.detection.unlabelled import UnlabelledFlight
 from velfield.errors import InputError
-from velfield.parallel import count_steps
+from velfield.parallel import count_steps, parallel_map
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.labels import (
@@ -255,14 +255,14 @@ def _motion_frames(plan: Plan, scale: float) -> list[MotionFrame]:
         raise InputError(f"{len(usable)} frames are registered, 3 or more needed; see the reasons above")
     chosen = [int(frame) for frame in usable[choose_frames(times_s[usable])]]
     working = WorkingGrid.open(plan, scale)
-    frames = []
     count_steps(0, announced=len(chosen))
-    for frame in chosen:
+
+    def rectify(frame: int) -> MotionFrame | None:
         rectified = working.frame(frame, working.whole)
-        if rectified is not None:
-            frames.append(MotionFrame(rectified.image, rectified.valid, float(times_s[frame])))
         count_steps(1)
-    return frames
+        return MotionFrame(rectified.image, rectified.valid, float(times_s[frame])) if rectified is not None else None
+
+    return [frame for frame in parallel_map(rectify, chosen) if frame is not None]
 
 
 def _finish(
