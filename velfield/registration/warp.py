@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
+from velfield.registration.resampling.cells import CELL_PX, extend_border, resample_cells
 
 Window = tuple[int, int, int, int]
 """x, y, width, height in base px."""
@@ -31,14 +32,6 @@ _CHECKS, _MAX_BEND_PX = 24, 0.05
 _SPARSE, _CORRECTIONS, _MAX_ERROR_PX = 4, 8, 2e-3
 """Nodes whose inverse is computed from nothing: every fourth. At the others it starts from their interpolation, and is
 corrected until it is this accurate, base px, at most so many times; nodes that are not by then start from nothing."""
-CELL_PX = 16
-"""Side of the cells in which `Rectification` resamples, output px."""
-_CELLS_AT_ONCE = 2000
-"""OpenCV's remap takes at most 32,767 columns."""
-_FRACTION_BITS = 5
-"""Of the fixed-point maps of OpenCV's remap: 1/32 px, to which it rounds maps of floats as well."""
-_MARGIN_PX = 1024
-"""Of the fixed-point maps about the frame: what lies farther outside is taken as if it were that far."""
 
 
 class RawToBase(Protocol):
@@ -135,26 +128,18 @@ def invert_on_grid(transform: RawToBase, base: FloatArray) -> FloatArray:
     rows, columns = (_sparse_nodes(size) for size in base.shape[:2])
     sparse_base = base[np.ix_(rows, columns)]
     sparse = transform.to_raw(sparse_base.reshape(-1, 2)).reshape(sparse_base.shape)
-    guess, slope_x, slope_y = _interpolate_grid(sparse, rows, columns)
     pitch_x, pitch_y = base[0, 1, 0] - base[0, 0, 0], base[1, 0, 1] - base[0, 0, 1]
+    raw, slopes, near, lost = _starts(sparse, *_neighbours(rows), *_neighbours(columns), pitch_x, pitch_y)
     target = base.reshape(-1, 2)
-    raw, slope_x, slope_y = guess.reshape(-1, 2), slope_x.reshape(-1, 2) / pitch_x, slope_y.reshape(-1, 2) / pitch_y
-    near = np.flatnonzero(np.isfinite(raw + slope_x + slope_y).all(axis=1))
-    outside, _, _ = _interpolate_grid(np.isnan(sparse).astype(np.float64), rows, columns)
-    lost = outside.reshape(-1, 2)[:, 0] < 1  # where no node around has an inverse, none between them is in the frame
     for _ in range(_CORRECTIONS):
-        error = target[near] - transform.to_base(raw[near])
-        with np.errstate(invalid="ignore"):
-            inaccurate = ~(np.maximum(np.abs(error[:, 0]), np.abs(error[:, 1])) < _MAX_ERROR_PX)
-        raw[near] += slope_x[near] * error[:, :1] + slope_y[near] * error[:, 1:]
-        lost[near[~inaccurate]] = False
-        near = near[inaccurate]
+        mapped = transform.to_base(raw[near])
+        near = near[_correct(raw, slopes, near, target, mapped, lost)]
         if not near.size:
             break
     at = np.flatnonzero(lost)
     if at.size:
         raw[at] = transform.to_raw(target[at])
-    return raw.reshape(base.shape)
+    return np.asarray(raw.reshape(base.shape))
 
 
 def _sparse_nodes(count: int) -> IntArray:
@@ -162,25 +147,67 @@ def _sparse_nodes(count: int) -> IntArray:
     return np.unique(np.r_[np.arange(0, count, _SPARSE), count - 1])
 
 
-def _interpolate_grid(
-    values: FloatArray, rows: IntArray, columns: IntArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Values (r, c, 2) at some rows and columns of a grid, interpolated at all of it; and the slopes, a node."""
+def _neighbours(nodes: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
+    """For all places up to the last of some nodes: number of the node before, distance from it and to the next."""
+    at = np.arange(nodes[-1] + 1)
+    if len(nodes) == 1:
+        return np.zeros(1, np.int64), np.zeros(1), np.ones(1)
+    before = np.clip(np.searchsorted(nodes, at, side="right") - 1, 0, len(nodes) - 2)
+    return before, (at - nodes[before]).astype(np.float64), (nodes[before + 1] - nodes[before]).astype(np.float64)
 
-    def along(values: FloatArray, nodes: IntArray) -> tuple[FloatArray, FloatArray]:
-        if len(nodes) == 1:
-            return values, np.zeros_like(values)
-        at = np.arange(nodes[-1] + 1)
-        left = np.clip(np.searchsorted(nodes, at, side="right") - 1, 0, len(nodes) - 2)
-        width = (nodes[left + 1] - nodes[left]).astype(np.float64)
-        slope = (values[left + 1] - values[left]) / width[:, None, None]
-        return values[left] + slope * (at - nodes[left])[:, None, None], slope
 
-    by_row, slope_y = along(values, rows)
-    both, slope_x = along(by_row.transpose(1, 0, 2), columns)
-    slope_y, _ = along(slope_y.transpose(1, 0, 2), columns)
-    whole, slope_x, slope_y = (np.ascontiguousarray(part.transpose(1, 0, 2)) for part in (both, slope_x, slope_y))
-    return whole, slope_x, slope_y
+@njit(cache=True, nogil=True)
+def _starts(sparse, above, down, height, before, across, width, pitch_x, pitch_y):  # type: ignore[no-untyped-def]
+    """Where the correction starts: nodes interpolated between the sparse ones (r, c, 2).
+
+    Returns the nodes (n, 2), slopes in x and y (n, 2, 2), the numbers of nodes that can be corrected, and which may
+    have an inverse (n,): where no node around has one, none between them is in the frame.
+    """
+    rows, columns = len(above), len(before)
+    raw, slopes = np.empty((rows * columns, 2)), np.empty((rows * columns, 2, 2))
+    near, count = np.empty(rows * columns, np.int64), 0
+    lost = np.empty(rows * columns, np.bool_)
+    last_row, last_column = sparse.shape[0] - 1, sparse.shape[1] - 1
+    for i in range(rows):
+        k = above[i]
+        below = min(k + 1, last_row)
+        for j in range(columns):
+            m = before[j]
+            after, n = min(m + 1, last_column), i * columns + j
+            finite = True
+            for c in range(2):
+                slope_before = (sparse[below, m, c] - sparse[k, m, c]) / height[i]
+                slope_after = (sparse[below, after, c] - sparse[k, after, c]) / height[i]
+                value_before = sparse[k, m, c] + slope_before * down[i]
+                value_after = sparse[k, after, c] + slope_after * down[i]
+                slope_x = (value_after - value_before) / width[j]
+                slope_y = slope_before + (slope_after - slope_before) / width[j] * across[j]
+                raw[n, c] = value_before + slope_x * across[j]
+                slopes[n, 0, c], slopes[n, 1, c] = slope_x / pitch_x, slope_y / pitch_y
+                finite &= np.isfinite(raw[n, c] + slopes[n, 0, c] + slopes[n, 1, c])
+            if finite:
+                near[count] = n
+                count += 1
+            lost[n] = False
+            for row, in_row in ((k, down[i] < height[i]), (below, down[i] > 0)):
+                for column, in_column in ((m, across[j] < width[j]), (after, across[j] > 0)):
+                    lost[n] |= in_row and in_column and not np.isnan(sparse[row, column, 0])
+    return raw, slopes, near[:count], lost
+
+
+@njit(cache=True, nogil=True)
+def _correct(raw, slopes, near, target, mapped, lost):  # type: ignore[no-untyped-def]
+    """Correct nodes by what they are mapped to; which of them (n,) were not accurate. Those that were are not lost."""
+    inaccurate = np.empty(len(near), np.bool_)
+    for n in range(len(near)):
+        at = near[n]
+        error_x, error_y = target[at, 0] - mapped[n, 0], target[at, 1] - mapped[n, 1]
+        inaccurate[n] = not (abs(error_x) < _MAX_ERROR_PX and abs(error_y) < _MAX_ERROR_PX)
+        for c in range(2):
+            raw[at, c] += slopes[at, 0, c] * error_x + slopes[at, 1, c] * error_y
+        if not inaccurate[n]:
+            lost[at] = False
+    return inaccurate
 
 
 def _downscale(
@@ -224,7 +251,8 @@ class Rectification:
 
     @cached_property
     def _source(self) -> tuple[GreyImage, Float32Array]:
-        return _downscale(self._raw, self._coarse, step=self._step)
+        source, coarse = _downscale(self._raw, self._coarse, step=self._step)
+        return extend_border(source), coarse
 
     @property
     def half_image(self) -> GreyImage:
@@ -243,85 +271,14 @@ class Rectification:
         cells = np.ones([-(-size // (2 * CELL_PX)) for size in self.shape], bool)
         size = -(-self.shape[0] // 2), -(-self.shape[1] // 2)
         image, valid = np.empty(size, np.uint8), np.empty(size, bool)
-        _resample(source, coarse, step, cells, image, valid)
+        resample_cells(extend_border(source), coarse, step, np.argwhere(cells), image, valid)
         return image, valid
 
     def resample(self, cells: Mask) -> None:
         """Fill the cells (rows, columns) of a mask in `image` and `valid`, where they are not filled yet."""
         source, coarse = self._source
-        _resample(source, coarse, self._step, cells & ~self._done, self.image, self.valid)
+        resample_cells(source, coarse, self._step, np.argwhere(cells & ~self._done), self.image, self.valid)
         self._done |= cells
-
-
-def _resample(source: GreyImage, coarse: Float32Array, step: int, cells: Mask, image: GreyImage, valid: Mask) -> None:
-    """Fill cells of an image and of its mask."""
-    chosen = np.argwhere(cells)
-    for start in range(0, len(chosen), _CELLS_AT_ONCE):
-        part = chosen[start : start + _CELLS_AT_ONCE]
-        whole, fraction, inside = _fixed_point_map(coarse, step, part, source.shape[0], source.shape[1])
-        pixels = cv2.remap(source, whole, fraction, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        _place_cells(pixels, inside, part, image, valid)
-
-
-@njit(cache=True, nogil=True)
-def _fixed_point_map(coarse, step, cells, height, width):  # type: ignore[no-untyped-def]
-    """The map of some cells, side by side, in whole pixels and in fractions of them; and whether it is inside.
-
-    ``coarse`` (my, mx, 2) is the map at centres of cells of ``step`` px, with one more cell on each side.
-    """
-    whole = np.empty((CELL_PX, len(cells) * CELL_PX, 2), np.int16)
-    fraction = np.empty((CELL_PX, len(cells) * CELL_PX), np.uint16)
-    inside = np.empty((CELL_PX, len(cells) * CELL_PX), np.bool_)
-    unit, mask = np.float32(1 << _FRACTION_BITS), np.int32((1 << _FRACTION_BITS) - 1)
-    # In units of the fraction, from a margin of so many pixels: all positive, so that truncation rounds down.
-    margin = np.float32(_MARGIN_PX)
-    last_x, last_y = np.float32(width + 2 * _MARGIN_PX) * unit, np.float32(height + 2 * _MARGIN_PX) * unit
-    half, zero = np.float32(0.5), np.float32(0)
-    first = (margin - half) * unit
-    end_x, end_y = first + np.float32(width) * unit, first + np.float32(height) * unit
-    nodes = CELL_PX // step + 2
-    across = np.empty(CELL_PX, np.float32)
-    run_ends = np.empty(nodes - 1, np.int64)  # runs of pixels between the same two centres: alike in all cells
-    for j in range(CELL_PX):
-        at = (j + 0.5) / step + 0.5
-        across[j] = at - int(at)
-        run_ends[int(at)] = j + 1
-    x, y = np.empty(nodes, np.float32), np.empty(nodes, np.float32)
-    for n in range(len(cells)):
-        k0, m0 = cells[n, 0] * CELL_PX // step, cells[n, 1] * CELL_PX // step
-        for i in range(CELL_PX):
-            down, k = across[i], k0 + int((i + 0.5) / step + 0.5)
-            for m in range(nodes):
-                above, below = (
-                    coarse[k, min(m0 + m, coarse.shape[1] - 1)],
-                    coarse[k + 1, min(m0 + m, coarse.shape[1] - 1)],
-                )
-                x[m] = (above[0] + down * (below[0] - above[0]) + margin) * unit
-                y[m] = (above[1] + down * (below[1] - above[1]) + margin) * unit
-            for m in range(nodes - 1):
-                dx, dy = x[m + 1] - x[m], y[m + 1] - y[m]
-                start = np.uint64(run_ends[m - 1] if m else 0)
-                for q in range(start, np.uint64(run_ends[m])):
-                    at_cell = np.uint64(n * CELL_PX) + q
-                    px, py = x[m] + across[q] * dx, y[m] + across[q] * dy
-                    inside[i, at_cell] = (px >= first) & (px <= end_x) & (py >= first) & (py <= end_y)
-                    fine_x = np.int32(min(max(px + half, zero), last_x))
-                    fine_y = np.int32(min(max(py + half, zero), last_y))
-                    whole[i, at_cell, 0] = (fine_x >> _FRACTION_BITS) - _MARGIN_PX
-                    whole[i, at_cell, 1] = (fine_y >> _FRACTION_BITS) - _MARGIN_PX
-                    fraction[i, at_cell] = ((fine_y & mask) << _FRACTION_BITS) + (fine_x & mask)
-    return whole, fraction, inside
-
-
-@njit(cache=True, nogil=True)
-def _place_cells(pixels, inside, cells, image, valid):  # type: ignore[no-untyped-def]
-    """Copy cells, side by side, to their places in an image and its mask; what lies beyond these is dropped."""
-    for n in range(len(cells)):
-        top, left = cells[n, 0] * CELL_PX, cells[n, 1] * CELL_PX
-        for i in range(min(CELL_PX, image.shape[0] - top)):
-            for j in range(min(CELL_PX, image.shape[1] - left)):
-                image[top + i, left + j] = pixels[i, n * CELL_PX + j]
-                valid[top + i, left + j] = inside[i, n * CELL_PX + j]
 
 
 def _raw_px_per_output_px(coarse: FloatArray, step: int) -> float:

@@ -1,0 +1,1 @@
+"""Images resampled in numba, where OpenCV takes a pass for every step."""
