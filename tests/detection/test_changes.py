@@ -2,14 +2,15 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from schemas.arrays import GreyImage, Mask, Points
+from velfield.detection.changes import box_mean_slope, changed_cells
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.detect import (
     SearchedFrame,
-    changed_cells,
     oriented_strips,
     search_frame,
     split_into_boxes,
@@ -53,6 +54,34 @@ def test_noise_and_exposure_are_no_change_and_a_car_that_moved_is() -> None:
     assert changed[200 // CELL_PX, 292 // CELL_PX]
     assert not changed[:8].any()
     assert changed.mean() < 0.05
+
+
+@pytest.mark.parametrize("shape", [(300, 420), (287, 401)])
+def test_changed_cells_are_those_by_whole_images(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(5)
+    images = [cv2.GaussianBlur(rng.integers(0, 256, shape).astype(np.uint8), (0, 0), 2) for _ in range(2)]
+    images[1][:150] = images[0][:150] + rng.integers(0, 3, (150, shape[1])).astype(np.uint8)
+    masks = [np.ones(shape, bool) for _ in range(2)]
+    masks[0][:, :40], masks[1][-50:] = False, False
+    one, other = (frame(image, mask) for image, mask in zip(images, masks, strict=True))
+    both = one.half_valid & other.half_valid
+    difference = (one.half_image.astype(np.int16) - other.half_image) * both
+    change = cv2.boxFilter(difference, cv2.CV_32F, (4, 4), borderType=cv2.BORDER_REPLICATE)
+    end = [-size % 8 for size in both.shape]
+    slow = []
+    for values in (difference, both):
+        whole = np.pad(values.astype(np.float64), [(0, size) for size in end])
+        mean = whole.reshape(whole.shape[0] // 8, 8, -1, 8).mean(axis=(1, 3))
+        slow.append(cv2.blur(mean.astype(np.float32), (6, 6), borderType=cv2.BORDER_REPLICATE))
+    about = np.kron(slow[0] / np.maximum(slow[1], 1e-3), np.ones((8, 8), np.float32))[: both.shape[0], : both.shape[1]]
+    sample = np.s_[4::8, 4::8]
+    noise = 1.4826 * np.median(np.abs(change - about)[sample][both[sample]])
+    limit = np.float32(np.clip(5 * noise, 3, 8)) + np.float32(0.15) * box_mean_slope(other)
+    marked = (both & (np.abs(change - about) > limit)) | (one.half_valid != other.half_valid)
+    padded = np.pad(marked, [(0, size) for size in end])
+    cells = padded.reshape(padded.shape[0] // 8, 8, -1, 8).any(axis=(1, 3))
+    assert 0.2 < cells.mean() < 0.9
+    np.testing.assert_array_equal(changed_cells(one, other), cells)
 
 
 def test_a_dark_car_on_asphalt_is_a_change() -> None:

@@ -6,9 +6,8 @@ detect the same again; so it is run on the rest alone, and the other frame's det
 moves, arrives or leaves changes the image, at the edge of the frame as well; so does much else (foliage, the parallax
 of roofs), which costs time but loses nothing.
 
-The difference of two frames is averaged over about half a car, without its slow part (exposure, shadows of clouds), and
-compared by cells of 16 px. A detection is kept only while nothing within the length of a bus changed: the middle of a
-slow bus looks the same before and after.
+Frames are compared by cells of 16 px (`velfield.detection.changes`). A detection is kept only while nothing within the
+length of a bus changed: the middle of a slow bus looks the same before and after.
 
 The image is on the working grid: the base image's grid, scaled so that a car is ``working_car_length_px`` long. The
 crops (`attach_crops`) are patches rotated to the axis, to compare appearance, upright chips, to align, and strips at
@@ -24,25 +23,14 @@ from functools import cached_property
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from velfield.detection.cascade.classifier import confirm_long_vehicles, nms_oriented
+from velfield.detection.changes import any_in_cells, box_mean_slope, changed_cells
 from velfield.detection.detector import Detections, Detector, concatenate
 from velfield.detection.frame import CELL_PX, SearchableFrame, half_resolution
 from velfield.detection.mosaic import Box, find_in_boxes
 
-_BOX_PX, _SLOW_PX = 8, 96
-"""Sides of the boxes that the difference is averaged over: about half a car, and what counts as illumination."""
-_NOISE_SIGMAS, _CHANGE_LEVELS = 5.0, (3.0, 8.0)
-"""A change is a mean difference above so many standard deviations of the noise, but at least and at most so many grey
-levels: in a frame that changed everywhere the noise cannot be estimated. In a simulated city every vehicle that moved
-by 4 px changed its place by more than 10."""
-_SHIFT_PX = 0.3
-"""Between two frames the map is wrong by about as much, working px, by rolling shutter and by the noise of its fit. At
-every edge of a city that makes a change: without the allowance up to three quarters of a shaken frame were searched."""
-_SAMPLE_PX = CELL_PX // 2
-"""Distance of the pixels, at half the resolution, that noise is estimated from: one a cell."""
 _REACH_CARS = 1.75
 """A detection is not kept where something changed so near, in car lengths: half of a long bus."""
 _UNSURE_FRACTION = 0.1
@@ -217,7 +205,7 @@ def search_frame(
     """
     own = detector.threshold if threshold is None else threshold
     weak_above = own - detector.weak_margin
-    covered = _any_in_cells(frame.half_valid)
+    covered = any_in_cells(frame.half_valid)
     if reference is None:
         cells = covered
     else:
@@ -267,76 +255,6 @@ def _cells_of_crops(xy: FloatArray, shape: tuple[int, ...]) -> Mask:
     cells = np.zeros(shape, bool)
     cells[_locate_cells(xy, shape)] = True
     return _grow(cells, 1)
-
-
-def changed_cells(frame: SearchableFrame, reference: SearchableFrame, slope: Float32Array | None = None) -> Mask:
-    """Where two frames on one grid differ by more than noise, illumination and the error of their registration; where
-    just one covers the grid as well.
-
-    Parameters
-    ----------
-    slope
-        `box_mean_slope` of the reference, where it is known already.
-
-    Returns
-    -------
-    (rows, columns) bool, of cells of `CELL_PX`, the last of each row and column perhaps smaller.
-    """
-    if frame.image.shape != reference.image.shape:
-        raise ValueError(f"found frames of {frame.image.shape} and {reference.image.shape} px, expected one grid")
-    slope = box_mean_slope(reference) if slope is None else slope
-    both = frame.half_valid & reference.half_valid
-    difference = cv2.subtract(frame.half_image, reference.half_image, dtype=cv2.CV_16S) * both
-    side = _BOX_PX // 2
-    change = cv2.boxFilter(difference, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REPLICATE)
-    slow = _slow_part(difference, both)
-    sample = (slice(_SAMPLE_PX // 2, None, _SAMPLE_PX),) * 2
-    at = change[sample]
-    at = np.abs(at - slow[: at.shape[0], : at.shape[1]])[both[sample]]
-    noise = 1.4826 * float(np.median(at)) if at.size else 0.0
-    lowest, highest = _CHANGE_LEVELS
-    limit = np.float32(min(max(_NOISE_SIGMAS * noise, lowest), highest))
-    changed = _changed_kernel(change, slow, slope, both, limit, np.float32(_SHIFT_PX / 2))
-    return np.asarray(changed | _any_in_cells(frame.half_valid != reference.half_valid))
-
-
-def box_mean_slope(frame: SearchableFrame) -> Float32Array:
-    """Steepness of a frame's mean over boxes of `_BOX_PX`, grey levels a pixel of half the resolution."""
-    side = _BOX_PX // 2
-    mean = cv2.boxFilter(frame.half_image, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REPLICATE)
-    along, across = (cv2.Sobel(mean, cv2.CV_32F, 1 - k, k, scale=1 / 8) for k in (0, 1))
-    return np.asarray(cv2.magnitude(along, across), np.float32)
-
-
-def _slow_part(difference: NDArray[np.int16], both: Mask) -> Float32Array:
-    """Mean difference about each cell, over `_SLOW_PX`, where both frames cover the grid."""
-    side, reach = CELL_PX // 2, _SLOW_PX // CELL_PX
-    rows, columns = (-(-size // side) for size in both.shape)
-    parts = []
-    for values in (difference.astype(np.float32), both.astype(np.float32)):
-        end = (rows * side - both.shape[0], columns * side - both.shape[1])
-        whole = cv2.copyMakeBorder(values, 0, end[0], 0, end[1], cv2.BORDER_CONSTANT) if any(end) else values
-        mean = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
-        parts.append(cv2.blur(mean, (reach, reach), borderType=cv2.BORDER_REPLICATE))
-    return np.asarray(parts[0] / np.maximum(parts[1], 1e-3), np.float32)
-
-
-@njit(cache=True, nogil=True)
-def _changed_kernel(change, slow, slope, both, limit, shift):  # type: ignore[no-untyped-def]
-    """Cells that hold a pixel whose change exceeds the limit and what a shift by so many px would make."""
-    side = CELL_PX // 2
-    out = np.zeros(slow.shape, np.bool_)
-    height, width = both.shape
-    for row in range(slow.shape[0]):
-        for column in range(slow.shape[1]):
-            for y in range(row * side, min((row + 1) * side, height)):
-                for x in range(column * side, min((column + 1) * side, width)):
-                    if both[y, x] and abs(change[y, x] - slow[row, column]) > limit + shift * slope[y, x]:
-                        out[row, column] = True
-                        break
-                if out[row, column]:
-                    break
-    return out
 
 
 def split_into_boxes(cells: Mask, margin: float, box_cost: float) -> list[Box]:
@@ -463,12 +381,3 @@ def _locate_cells(xy: FloatArray, shape: tuple[int, ...]) -> tuple[IntArray, Int
     """Row and column, each (n,), of the cells in which positions lie."""
     cell = np.floor((xy + 0.5) / CELL_PX).astype(np.int64)
     return np.clip(cell[:, 1], 0, shape[0] - 1), np.clip(cell[:, 0], 0, shape[1] - 1)
-
-
-def _any_in_cells(half: Mask) -> Mask:
-    """Whether a mask at half the resolution holds anywhere in each cell."""
-    side = CELL_PX // 2
-    rows, columns = (-(-size // side) for size in half.shape)
-    padded = np.zeros((rows * side, columns * side), bool)
-    padded[: half.shape[0], : half.shape[1]] = half
-    return np.asarray(padded.reshape(rows, side, columns, side).any(axis=(1, 3)))
