@@ -278,20 +278,26 @@ def split_into_boxes(cells: Mask, margin: float, box_cost: float) -> list[Box]:
 @njit(cache=True, nogil=True)
 def _split_kernel(cells, margin, box_cost):  # type: ignore[no-untyped-def]
     """Boxes (n, 4). Nodes of the tree are numbered so that parts come after the box that they are parts of."""
-    nodes = [_bounding_box(cells, 0, 0, cells.shape[0], cells.shape[1])]
+    height, width = cells.shape
+    of_rows, of_columns = np.empty((height + 1, 2), np.int64), np.empty((width + 1, 2), np.int64)
+    of_rows[height], of_columns[width] = 0, 0
+    _find_extents(cells, (0, 0, height, width), of_rows, of_columns)
+    nodes = [_bounds(of_rows, 0, height)]
     parts = [(0, 0)]
     done = 0
     while done < len(nodes):
         top, left, bottom, right = nodes[done]
-        by_row, row = _best_split(cells[top:bottom, left:right], margin)
-        by_column, column = _best_split(cells[top:bottom, left:right].T, margin)
+        _find_extents(cells, nodes[done], of_rows, of_columns)
+        by_row, row = _best_split(of_rows, top, bottom, margin)
+        by_column, column = _best_split(of_columns, left, right, margin)
         if min(by_row, by_column) < np.inf:
             if by_row <= by_column:
-                nodes.append(_bounding_box(cells, top, left, top + row, right))
-                nodes.append(_bounding_box(cells, top + row, left, bottom, right))
+                nodes.append(_bounds(of_rows, top, row))
+                nodes.append(_bounds(of_rows, row, bottom))
             else:
-                nodes.append(_bounding_box(cells, top, left, bottom, left + column))
-                nodes.append(_bounding_box(cells, top, left + column, bottom, right))
+                for begin, end in ((left, column), (column, right)):
+                    first_column, first_row, last_column, last_row = _bounds(of_columns, begin, end)
+                    nodes.append((first_row, first_column, last_row, last_column))
             parts[done] = (len(nodes) - 2, len(nodes) - 1)
             parts.append((0, 0))
             parts.append((0, 0))
@@ -319,42 +325,55 @@ def _split_kernel(cells, margin, box_cost):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _bounding_box(cells, top, left, bottom, right):  # type: ignore[no-untyped-def]
-    """Of the marked cells within a box; an empty one where there are none."""
-    first_row, first_column, last_row, last_column = bottom, right, top, left
+def _find_extents(cells, box, of_rows, of_columns):  # type: ignore[no-untyped-def]
+    """First marked cell of each row and column of a box, and that after the last; the last is 0 where none is."""
+    top, left, bottom, right = box
+    of_rows[top:bottom, 0], of_rows[top:bottom, 1] = right, 0
+    of_columns[left:right, 0], of_columns[left:right, 1] = bottom, 0
     for row in range(top, bottom):
         for column in range(left, right):
             if cells[row, column]:
-                first_row, last_row = min(first_row, row), max(last_row, row + 1)
-                first_column, last_column = min(first_column, column), max(last_column, column + 1)
-    return first_row, first_column, last_row, last_column
+                of_rows[row, 0], of_rows[row, 1] = min(of_rows[row, 0], column), column + 1
+                of_columns[column, 0], of_columns[column, 1] = min(of_columns[column, 0], row), row + 1
 
 
 @njit(cache=True, nogil=True)
-def _best_split(cells, margin):  # type: ignore[no-untyped-def]
-    """The least area of two boxes with margins, of the rows before and after one, and that row; inf for one row."""
-    height, width = cells.shape
-    if height < 2:
-        return np.inf, 0
-    area = np.zeros(height)
+def _bounds(extents, begin, end):  # type: ignore[no-untyped-def]
+    """Of the marked cells in some rows (or columns): the first row, the first column, and those after the last."""
+    while begin < end and extents[begin, 1] == 0:
+        begin += 1
+    while end > begin and extents[end - 1, 1] == 0:
+        end -= 1
+    first, last = extents[begin, 0], extents[begin, 1]
+    for line in range(begin + 1, end):
+        if extents[line, 1] > 0:
+            first, last = min(first, extents[line, 0]), max(last, extents[line, 1])
+    return begin, first, end, last
+
+
+@njit(cache=True, nogil=True)
+def _best_split(extents, begin, end, margin):  # type: ignore[no-untyped-def]
+    """The least area of two boxes with margins, of the rows (or columns) of a box before and after one, and that row;
+    inf for one row. The first and the last have a mark."""
+    count = end - begin
+    if count < 2:
+        return np.inf, begin
+    area = np.zeros(count)
     for way in range(2):
-        first, last, start = width, 0, -1
-        for step in range(height - 1):
-            row = step if way == 0 else height - 1 - step
-            for column in range(width):
-                if cells[row, column]:
-                    first, last = min(first, column), max(last, column + 1)
-                    start = row if start < 0 else start
-            end = row
-            while not cells[end].any():  # the nearest row with a mark: the first and the last have one
-                end += 1 if way == 1 else -1
-            size = abs(end - start) + 1
-            area[row + 1 if way == 0 else row] += (size + 2 * margin) * (last - first + 2 * margin)
+        edge = 0 if way == 0 else count - 1
+        first, last, nearest = extents[begin + edge, 0], extents[begin + edge, 1], edge
+        for step in range(count - 1):
+            line = step if way == 0 else count - 1 - step
+            if extents[begin + line, 1] > 0:
+                first, last = min(first, extents[begin + line, 0]), max(last, extents[begin + line, 1])
+                nearest = line
+            size = abs(nearest - edge) + 1
+            area[line + 1 if way == 0 else line] += (size + 2 * margin) * (last - first + 2 * margin)
     best = 1
-    for row in range(2, height):
-        if area[row] < area[best]:
-            best = row
-    return area[best], best
+    for line in range(2, count):
+        if area[line] < area[best]:
+            best = line
+    return area[best], begin + best
 
 
 def _outside(detections: Detections, searched: Mask, half_valid: Mask) -> Detections:

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from velfield.detection.boosting import BoostedStumps
+from velfield.detection.cascade.rounds import LANES, normalise, score_offsets, signed_corners, sum_rectangles
 
-LANES = 16
 CHANNELS = 4
 """Grey, |gradient along|, |gradient across|, |frame - background|."""
 GRADIENT_ZERO = 512
@@ -97,72 +97,6 @@ def fill_integrals(packed, difference, stride, poses, channels, out):  # type: i
 
 
 @njit(cache=True, nogil=True)
-def _rectangle_sums(flat, corners, signs, first, last, base, total):  # type: ignore[no-untyped-def]
-    """Signed sums of rectangles, one a lane. Indices are unsigned, which spares numba its check for negative ones."""
-    lanes = np.uint64(LANES)
-    for lane in range(lanes):
-        total[lane] = 0
-    for r in range(first, last):
-        p, q, s, t = base + corners[r, 0], base + corners[r, 1], base + corners[r, 2], base + corners[r, 3]
-        if signs[r] > 0:
-            for lane in range(lanes):
-                total[lane] += flat[p + lane] - flat[q + lane] - flat[s + lane] + flat[t + lane]
-        else:
-            for lane in range(lanes):
-                total[lane] -= flat[p + lane] - flat[q + lane] - flat[s + lane] + flat[t + lane]
-
-
-@njit(cache=True, nogil=True)
-def _normalisation(flat, window, window_area, plane, base, floor, total, mean, contrast):  # type: ignore[no-untyped-def]
-    """Mean grey of the window about a position, and its mean gradient plus ``floor``."""
-    ones = np.ones(1, np.int32)
-    scale = np.float32(1 / window_area)
-    _rectangle_sums(flat, window, ones, 0, 1, base, total)
-    for lane in range(LANES):
-        mean[lane] = np.float32(total[lane]) * scale
-    _rectangle_sums(flat, window, ones, 0, 1, base + plane, total)
-    for lane in range(LANES):
-        contrast[lane] = np.float32(total[lane]) * scale + np.float32(floor)
-    _rectangle_sums(flat, window, ones, 0, 1, base + plane + plane, total)
-    for lane in range(LANES):
-        contrast[lane] += np.float32(total[lane]) * scale
-
-
-@njit(cache=True, nogil=True)
-def score_offsets(  # type: ignore[no-untyped-def]
-    flat,
-    window,
-    window_area,
-    plane,
-    floor,
-    corners,
-    signs,
-    starts,
-    planes,
-    areas,
-    thresholds,
-    leaves,
-    bases,
-    rounds,
-    out,
-):
-    """Sums of the leaves of the first ``rounds``, (offsets, LANES), at every offset of ``LANES`` patches."""
-    total = np.zeros(LANES, np.int32)
-    mean, contrast = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
-    for m in range(len(bases)):
-        _normalisation(flat, window, window_area, plane, bases[m], floor, total, mean, contrast)
-        for lane in range(LANES):
-            out[m, lane] = 0
-        for f in range(rounds):
-            _rectangle_sums(flat, corners, signs, starts[f], starts[f + 1], bases[m] + planes[f], total)
-            threshold, area = thresholds[f], areas[f]
-            low, high = leaves[f, 0], leaves[f, 1]
-            for lane in range(LANES):
-                split = threshold * contrast[lane] + area * mean[lane]
-                out[m, lane] += high if np.float32(total[lane]) > split else low
-
-
-@njit(cache=True, nogil=True)
 def score_poses_kernel(  # type: ignore[no-untyped-def]
     packed, difference, stride, poses, floor, window, window_area, corners, signs, starts, planes, areas, thresholds,
     leaves, bases, rounds, integral, out,
@@ -170,25 +104,13 @@ def score_poses_kernel(  # type: ignore[no-untyped-def]
     """Scores (groups, offsets, LANES) of poses (groups, 8, LANES); ``integral`` is scratch memory."""
     flat = integral.reshape(-1)
     plane = np.uint64(flat.size // integral.shape[0])
+    signed = signed_corners(corners, signs)
     for g in range(len(poses)):
         fill_integrals(packed, difference, stride, poses[g], integral.shape[0], integral)
         score_offsets(
-            flat,
-            window,
-            window_area,
-            plane,
-            floor,
-            corners,
-            signs,
-            starts,
-            planes,
-            areas,
-            thresholds,
-            leaves,
-            bases,
-            rounds,
+            flat, window, window_area, plane, floor, signed, starts, planes, areas, thresholds, leaves, bases, rounds,
             out[g],
-        )
+        )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
@@ -212,13 +134,14 @@ def feature_values_kernel(  # type: ignore[no-untyped-def]
     """Values (features, groups, LANES) float32 of every feature at every pose, brightness and contrast normalised."""
     flat = integral.reshape(-1)
     plane = np.uint64(flat.size // integral.shape[0])
+    signed = signed_corners(corners, signs)
     total = np.zeros(LANES, np.int32)
     mean, contrast = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
     for g in range(len(poses)):
         fill_integrals(packed, difference, stride, poses[g], integral.shape[0], integral)
-        _normalisation(flat, window, window_area, plane, base, floor, total, mean, contrast)
+        normalise(flat, window, window_area, plane, base, floor, total, mean, contrast)
         for f in range(len(planes)):
-            _rectangle_sums(flat, corners, signs, starts[f], starts[f + 1], base + planes[f], total)
+            sum_rectangles(flat, signed, starts[f], starts[f + 1], base + planes[f], total)
             for lane in range(LANES):
                 out[f, g, lane] = (np.float32(total[lane]) - areas[f] * mean[lane]) / contrast[lane]
 

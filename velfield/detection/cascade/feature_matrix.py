@@ -9,13 +9,13 @@ from schemas.arrays import ByteArray, Float32Array
 from schemas.detector import Round
 from velfield.detection.boosting import FeaturePool, assign_bins, boost, quantile_bin_edges, rounds_from_stumps
 from velfield.detection.cascade.feature_image import (
-    LANES,
     FeatureImage,
     RotatedPatch,
     feature_values_kernel,
     pack_poses,
     signed_grey_areas,
 )
+from velfield.detection.cascade.rounds import LANES
 from velfield.detection.cascade.scenes import Poses
 
 _BLOCK = 2048
