@@ -11,7 +11,15 @@ from velfield.detection.cnn import network as networks
 from velfield.detection.cnn import quantization
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.model import forward
-from velfield.detection.cnn.network import FORMER_TOPOLOGY, TOPOLOGY, Network, Topology, convolutions
+from velfield.detection.cnn.network import (
+    FORMER_TOPOLOGY,
+    TOPOLOGY,
+    Conv,
+    GraphBuilder,
+    Network,
+    Topology,
+    convolutions,
+)
 from velfield.detection.cnn.quantization import calibrate, is_exact, quantized_to_onnx
 from velfield.detection.detector import load_detector, shipped_detector
 
@@ -48,6 +56,33 @@ def test_eight_bits_give_nearly_the_heatmap_of_floating_point() -> None:
     assert not np.array_equal(wanted, found)
     assert np.sqrt(np.mean((wanted - found)[at] ** 2)) < 0.03
     assert np.median(np.abs(axes - found_axes)[0, :, at[0]]) < 0.05
+
+
+class PlainGraph(quantization._QuantizedGraph):
+    """Every layer by onnxruntime's own operator, the first one in bytes as well."""
+
+    def depth_to_space(self, value: str) -> str:
+        return GraphBuilder.depth_to_space(self, value)
+
+    def conv(self, layer: Conv, value: str, block: int) -> str:
+        if value != "image":
+            return super().conv(layer, value, block)
+        scale = self._scale["image"]
+        grey = self._dequantize("image", self._constants("image", scale, 0), scale)
+        return super().conv(layer, grey, block)
+
+
+@pytest.mark.usefixtures("exact")
+def test_the_first_layer_in_whole_floats_and_blocks_by_rows_change_nothing() -> None:
+    network = replace(shipped().network, ranges=calibrate(shipped().network, [cars(1), cars(2)]))
+    assert network.ranges is not None
+    plain = PlainGraph(network, network.ranges)
+    session = networks.open_session(plain.finish(plain.layers(network.topology, "image")), "cpu")
+    images = np.stack([cars(3), cars(4)])
+    expected = session.run(None, {"image": images[:, None]})
+    found = forward(network, images)
+    np.testing.assert_array_equal(found[0], expected[0][:, 0])
+    np.testing.assert_array_equal(found[1], expected[1])
 
 
 @pytest.mark.usefixtures("exact")

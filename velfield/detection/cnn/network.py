@@ -312,7 +312,7 @@ class GraphBuilder:
                 value = self.conv(layer, value, block)
             elif isinstance(layer, DepthToSpace):
                 assert block == 1, "blocks are moved into the channels of a convolution only"
-                value = self.node("DepthToSpace", [value], blocksize=2, mode="DCR")
+                value = self.depth_to_space(value)
             else:
                 value = self.node("Add", [self.layers(layer.layers, value, f"{name}."), value])
             block = 1
@@ -329,6 +329,10 @@ class GraphBuilder:
             assert isinstance(layer, DepthToSpace), "only the heatmap is unpacked after the head"
             value = self.node("DepthToSpace", [value], blocksize=2, mode="DCR")
         return value
+
+    def depth_to_space(self, value: str) -> str:
+        """Channels (y, x, c) moved into blocks of 2 x 2 pixels."""
+        return self.node("DepthToSpace", [value], blocksize=2, mode="DCR")
 
     def activation(self, value: str, name: str) -> str:
         """What the layers read in place of a value before the head; ``name`` is its place in the topology."""
