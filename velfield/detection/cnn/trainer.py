@@ -13,16 +13,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from schemas.arrays import Float32Array, Mask
-from velfield.detection.cnn.layers import (
-    PaddedBatchLayout,
-    conv2d,
-    conv2d_backward,
-    depth_to_space,
-    kernel_off_blocks,
-    kernel_on_blocks,
-    space_to_depth,
-)
+from schemas.arrays import Float32Array
+from velfield.detection.cnn.layers import conv2d, conv2d_backward, depth_to_space, relu_backward, space_to_depth
 from velfield.detection.cnn.network import (
     TOPOLOGY,
     Conv,
@@ -176,9 +168,7 @@ class Trainer:
 
     def predict(self, images: Float32Array) -> Float32Array:
         """Logits and orientation vectors (n, h / 2, w / 2, 3) of images (n, h, w), grey in [0, 1]."""
-        layout = PaddedBatchLayout(*images.shape)
-        out, layout, _ = _Pass(self).forward(self.topology, layout.pack(images[..., None]), layout)
-        return np.ascontiguousarray(layout.interior_view(out))
+        return _Pass(self).forward(self.topology, images[..., None])[0]
 
     def loss_and_gradients(self, batch: Batch) -> tuple[float, dict[str, Float32Array]]:
         """Loss, and its gradient by every parameter.
@@ -195,11 +185,10 @@ class Trainer:
         return first + second, {name: gradient + of_second[name] for name, gradient in of_first.items()}
 
     def _loss_and_gradients(self, batch: Batch, normaliser: LossNormaliser) -> tuple[float, dict[str, Float32Array]]:
-        layout = PaddedBatchLayout(*batch.images.shape)
         differentiable = _Pass(self)
-        out, layout, backward = differentiable.forward(self.topology, layout.pack(batch.images[..., None]), layout)
-        loss, gradient = focal_loss_and_gradient(layout.interior_view(out), batch, normaliser)
-        backward(layout.pack(gradient))
+        out, backward = differentiable.forward(self.topology, batch.images[..., None])
+        loss, gradient = focal_loss_and_gradient(out, batch, normaliser)
+        backward(gradient)
         return loss, differentiable.gradients
 
 
@@ -227,13 +216,11 @@ class _Pass:
         self.trainer = trainer
         self.gradients: dict[str, Float32Array] = {}
 
-    def forward(
-        self, layers: Sequence[Layer], values: Float32Array, layout: PaddedBatchLayout
-    ) -> tuple[Float32Array, PaddedBatchLayout, Backward]:
-        """Output of a sequence of layers, its layout, and the backward pass."""
+    def forward(self, layers: Sequence[Layer], values: Float32Array) -> tuple[Float32Array, Backward]:
+        """Output (n, h, w, channels) of a sequence of layers, and the backward pass."""
         steps: list[Backward] = []
         for layer in layers:
-            values, layout, step = self._layer(layer, values, layout)
+            values, step = self._layer(layer, values)
             steps.append(step)
 
         def backward(gradient: Float32Array) -> Float32Array:
@@ -242,75 +229,63 @@ class _Pass:
                 gradient = steps.pop()(gradient)
             return gradient
 
-        return values, layout, backward
+        return values, backward
 
-    def _layer(
-        self, layer: Layer, values: Float32Array, layout: PaddedBatchLayout
-    ) -> tuple[Float32Array, PaddedBatchLayout, Backward]:
+    def _layer(self, layer: Layer, values: Float32Array) -> tuple[Float32Array, Backward]:
         if isinstance(layer, SpaceToDepth):
-            return space_to_depth(values, layout), layout.halved(), lambda gradient: depth_to_space(gradient, layout)
+            return space_to_depth(values), depth_to_space
         if isinstance(layer, DepthToSpace):
-            doubled = layout.doubled()
-            return depth_to_space(values, doubled), doubled, lambda gradient: space_to_depth(gradient, doubled)
+            return depth_to_space(values), space_to_depth
         if isinstance(layer, Residual):
-            out, backward = self._residual(layer, values, layout)
-        else:
-            out, layout, backward = self._convolve(layer, values, layout)
-        if not layer.relu:
-            return out, layout, backward
-        positive: Mask = out > 0
-        np.maximum(out, 0, out=out)
-        return out, layout, lambda gradient: backward(np.asarray(gradient * positive, np.float32))
+            return self._residual(layer, values)
+        if f"{layer.name}.g" in self.trainer.parameters:
+            return self._normalised_conv(layer, values)
+        return self._conv(layer, values)
 
-    def _residual(
-        self, block: Residual, values: Float32Array, layout: PaddedBatchLayout
-    ) -> tuple[Float32Array, Backward]:
-        branch, _, backward = self.forward(block.layers, values, layout)
-        branch += values
-        return branch, lambda gradient: gradient + backward(gradient)
-
-    def _convolve(
-        self, layer: Conv, values: Float32Array, layout: PaddedBatchLayout
-    ) -> tuple[Float32Array, PaddedBatchLayout, Backward]:
-        convolve = self._normalised_conv if f"{layer.name}.g" in self.trainer.parameters else self._conv
-        if layer.stride == 1:
-            out, backward = convolve(layer.name, values, layout)
-            return out, layout, backward
-        halved = layout.halved()
-        out, backward = convolve(layer.name, space_to_depth(values, layout), halved)
-        return out, halved, lambda gradient: depth_to_space(backward(gradient), layout)
-
-    def _kernel(self, name: str) -> Float32Array:
-        """Weights of a layer; a strided kernel on the blocks that `space_to_depth` makes."""
-        weights = self.trainer.parameters[f"{name}.w"]
-        return kernel_on_blocks(weights) if len(weights) == 16 else weights
-
-    def _keep_gradient(self, name: str, by_kernel: Float32Array) -> None:
-        strided = len(self.trainer.parameters[f"{name}.w"]) == 16
-        self.gradients[f"{name}.w"] = kernel_off_blocks(by_kernel) if strided else by_kernel
-
-    def _conv(self, name: str, values: Float32Array, layout: PaddedBatchLayout) -> tuple[Float32Array, Backward]:
-        weights = self._kernel(name)
-        out = conv2d(values, weights, layout) + self.trainer.parameters[f"{name}.b"]
-        layout.zero_border(out)
+    def _residual(self, block: Residual, values: Float32Array) -> tuple[Float32Array, Backward]:
+        branch, backward_branch = self.forward(block.layers, values)
+        out = branch + values
+        if block.relu:
+            np.maximum(out, 0, out=out)
 
         def backward(gradient: Float32Array) -> Float32Array:
-            self.gradients[f"{name}.b"] = gradient.sum(axis=0)
-            by_values, by_kernel = conv2d_backward(values, weights, gradient, layout)
-            self._keep_gradient(name, by_kernel)
+            if block.relu:
+                gradient, _ = relu_backward(gradient, out)
+            by_values = backward_branch(gradient)
+            by_values += gradient
             return by_values
 
         return out, backward
 
-    def _normalised_conv(
-        self, name: str, values: Float32Array, layout: PaddedBatchLayout
-    ) -> tuple[Float32Array, Backward]:
-        """Convolution and batch normalisation."""
-        trainer = self.trainer
-        weights, gain = self._kernel(name), trainer.parameters[f"{name}.g"]
-        convolved = conv2d(values, weights, layout)
-        interior = layout.interior_view(convolved)
-        mean, variance = interior.mean(axis=(0, 1, 2)), interior.var(axis=(0, 1, 2))
+    def _conv(self, layer: Conv, values: Float32Array) -> tuple[Float32Array, Backward]:
+        name = layer.name
+        out = conv2d(
+            values, self.trainer.parameters[f"{name}.w"], self.trainer.parameters[f"{name}.b"], relu=layer.relu
+        )
+
+        def backward(gradient: Float32Array) -> Float32Array:
+            if layer.relu:
+                gradient, by_bias = relu_backward(gradient, out)
+            else:
+                by_bias = gradient.sum(axis=(0, 1, 2))
+            self.gradients[f"{name}.b"] = by_bias
+            return self._convolve_backward(layer, values, gradient)
+
+        return out, backward
+
+    def _convolve_backward(self, layer: Conv, values: Float32Array, gradient: Float32Array) -> Float32Array:
+        """Keep the gradient by the weights; the gradient by the input, which nobody needs of the image itself."""
+        weights, is_first = self.trainer.parameters[f"{layer.name}.w"], layer is self.trainer.topology[0]
+        by_values, by_weights = conv2d_backward(values, weights, gradient, by_images=not is_first)
+        self.gradients[f"{layer.name}.w"] = by_weights
+        return gradient if by_values is None else by_values
+
+    def _normalised_conv(self, layer: Conv, values: Float32Array) -> tuple[Float32Array, Backward]:
+        """Convolution, batch normalisation and ReLU."""
+        trainer, name = self.trainer, layer.name
+        weights, gain = trainer.parameters[f"{name}.w"], trainer.parameters[f"{name}.g"]
+        convolved = conv2d(values, weights)
+        mean, variance = convolved.mean(axis=(0, 1, 2)), convolved.var(axis=(0, 1, 2))
         for running, current in ((trainer.means, mean), (trainer.variances, variance)):
             old = running.get(name)
             running[name] = (
@@ -318,22 +293,18 @@ class _Pass:
             )
         scale = 1 / np.sqrt(variance + _MIN_VARIANCE)
         normalised = (convolved - mean) * scale
-        layout.zero_border(normalised)
-        out = normalised * gain + trainer.parameters[f"{name}.b"]
-        layout.zero_border(out)
-        pixels = layout.count * layout.height * layout.width
+        out = np.asarray(np.maximum(normalised * gain + trainer.parameters[f"{name}.b"], 0), np.float32)
+        pixels = out.size // out.shape[-1]
 
         def backward(gradient: Float32Array) -> Float32Array:
-            by_bias, by_gain = gradient.sum(axis=0), (gradient * normalised).sum(axis=0)
+            gradient, by_bias = relu_backward(gradient, out)
+            by_gain = (gradient * normalised).sum(axis=(0, 1, 2))
             self.gradients[f"{name}.b"], self.gradients[f"{name}.g"] = by_bias, by_gain
             by_convolved = gradient - (by_bias + normalised * by_gain) / np.float32(pixels)
             by_convolved *= gain * scale
-            layout.zero_border(by_convolved)
-            by_values, by_kernel = conv2d_backward(values, weights, by_convolved, layout)
-            self._keep_gradient(name, by_kernel)
-            return by_values
+            return self._convolve_backward(layer, values, by_convolved)
 
-        return np.asarray(out, np.float32), backward
+        return out, backward
 
 
 def focal_loss_and_gradient(out: Float32Array, batch: Batch, normaliser: LossNormaliser) -> tuple[float, Float32Array]:
