@@ -8,6 +8,7 @@ other light. Targets are a Gaussian heatmap of car centres and the orientation a
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from math import cos, sin
 
 import cv2
 import numpy as np
@@ -25,8 +26,8 @@ HEATMAP_SIGMA_PX = 2.2
 _CENTRED_FRACTION, _CENTRING_SD_PX = 0.7, 19.0
 """Fraction of the patches that are centred near a labelled car, and standard deviation of that position."""
 _LOG_SCALE_RANGE = 0.2
-_WINDOW_PATCHES = 2
-"""Half side of the source window, in patch sides: covers all that a patch can show."""
+_WINDOW_MARGIN_PX = 2
+"""Of the source window, for interpolation."""
 _LOG_GAMMA_RANGE, _CONTRAST_RANGE, _BRIGHTNESS_RANGE = 0.7, (0.5, 1.4), 0.15
 _MEAN_GREY = 0.45
 """Contrast is changed about this grey."""
@@ -35,6 +36,8 @@ _SHADOW_PROBABILITY, _SHADOW_DEPTH, _SHADOW_EDGE_SIGMA_PX = 0.25, (0.2, 0.6), (0
 _MAX_NOISE_SD = 0.03
 _TARGET_MARGIN_PX = 8
 """Cars beyond the border of a patch by no more than this still show in its targets."""
+_HEATMAP_REACH = 8
+"""Pixels of the heatmap: farther from a car's centre its Gaussian is below 1e-11, and zero is taken."""
 _HEATMAP_PX = np.arange(PATCH_PX // STRIDE) * STRIDE + (STRIDE - 1) / 2
 """Positions of the heatmap's rows and columns in the patch, px."""
 
@@ -93,18 +96,19 @@ def _sample_patch(
 ) -> tuple[Float32Array, Float32Array, Float32Array, Float32Array, Float32Array]:
     """A patch and its targets, in the order of `Batch`."""
     matrix = _random_similarity(sample, rng)
-    rows, columns, window_matrix = _source_window(matrix)
-    image = sample.image[rows, columns].astype(np.float32) / 255
+    rows, columns, window_matrix = _source_window(matrix, sample.image.shape)
+    image = sample.image[rows, columns].astype(np.float32)
     patch = cv2.warpAffine(image, window_matrix, (PATCH_PX, PATCH_PX), borderMode=cv2.BORDER_REFLECT_101)
+    patch *= np.float32(1 / 255)
     centres = sample.cars[:, :2] @ matrix[:, :2].T + matrix[:, 2]
     direction = np.column_stack([np.cos(sample.cars[:, 2]), np.sin(sample.cars[:, 2])]) @ matrix[:, :2].T
     angles = np.arctan2(direction[:, 1], direction[:, 0])
     if hard:
         patch = _camouflage_cars(patch, centres, angles, rng)
     heatmap, orientation, orientation_weight = encode_targets(centres, angles)
-    valid = np.ones(image.shape, bool) if sample.valid is None else sample.valid[rows, columns]
-    valid_patch = cv2.warpAffine(valid.astype(np.uint8), window_matrix, (PATCH_PX, PATCH_PX), flags=cv2.INTER_NEAREST)
-    mask = valid_patch[::STRIDE, ::STRIDE] > 0
+    valid = np.ones(image.shape, np.uint8) if sample.valid is None else sample.valid[rows, columns].astype(np.uint8)
+    on_heatmap = window_matrix / STRIDE  # every second pixel of the patch
+    mask = cv2.warpAffine(valid, on_heatmap, (len(_HEATMAP_PX), len(_HEATMAP_PX)), flags=cv2.INTER_NEAREST) > 0
     scale = float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
     circles = np.column_stack([sample.ignore[:, :2] @ matrix[:, :2].T + matrix[:, 2], scale * sample.ignore[:, 2]])
     reach = circles[:, 2:] + STRIDE
@@ -163,14 +167,20 @@ def _random_similarity(sample: LabelledImage, rng: np.random.Generator) -> Float
     return np.column_stack([linear, np.full(2, PATCH_PX / 2) - linear @ centre])
 
 
-def _source_window(matrix: FloatArray) -> tuple[slice, slice, FloatArray]:
-    """Rows and columns of the image that a patch can show, reflection at the border included, and the matrix from
-    that window to the patch."""
-    centre = np.linalg.solve(matrix[:, :2], np.full(2, PATCH_PX / 2) - matrix[:, 2])
-    first = np.maximum(centre - _WINDOW_PATCHES * PATCH_PX, 0).astype(int)
-    last = np.maximum(centre + _WINDOW_PATCHES * PATCH_PX, 1).astype(int)
+def _source_window(matrix: FloatArray, shape: tuple[int, ...]) -> tuple[slice, slice, FloatArray]:
+    """Rows and columns of an image (h, w) that a patch shows, reflection at the border included, and the matrix from
+    that window to the patch.
+    """
+    to_image = np.linalg.inv(matrix[:, :2])
+    centre = to_image @ (np.full(2, PATCH_PX / 2) - matrix[:, 2])
+    reach = np.abs(to_image).sum(axis=1) * PATCH_PX / 2 + _WINDOW_MARGIN_PX
+    last_px = np.array(shape[::-1]) - 1
+    low, high = centre - reach, centre + reach
+    # What lies beyond the first or the last pixel shows what is as far from it inside.
+    first = np.clip(np.minimum(low, 2 * last_px - high), 0, last_px).astype(int)
+    last = np.clip(np.maximum(high, -low), 0, last_px).astype(int)
     shifted = np.column_stack([matrix[:, :2], matrix[:, 2] + matrix[:, :2] @ first])
-    return slice(first[1], last[1]), slice(first[0], last[0]), shifted
+    return slice(first[1], last[1] + 1), slice(first[0], last[0] + 1), shifted
 
 
 def encode_targets(centres: FloatArray, orientation_rad: FloatArray) -> tuple[Float32Array, Float32Array, Float32Array]:
@@ -190,31 +200,35 @@ def encode_targets(centres: FloatArray, orientation_rad: FloatArray) -> tuple[Fl
     size = len(_HEATMAP_PX)
     heatmap, orientation = np.zeros((size, size), np.float32), np.zeros((size, size, 2), np.float32)
     near = ((centres > -_TARGET_MARGIN_PX) & (centres < PATCH_PX + _TARGET_MARGIN_PX)).all(axis=1)
-    for (x, y), angle in zip(centres[near], orientation_rad[near], strict=True):
-        squared_distance = (_HEATMAP_PX[None, :] - x) ** 2 + (_HEATMAP_PX[:, None] - y) ** 2
-        gaussian = np.exp(-squared_distance / (2 * HEATMAP_SIGMA_PX**2)).astype(np.float32)
-        nearest = gaussian > heatmap
-        heatmap[nearest] = gaussian[nearest]
-        orientation[nearest] = np.cos(2 * angle), np.sin(2 * angle)
+    squared_distance = (_HEATMAP_PX - centres[near, :2, None]) ** 2
+    profiles = np.exp(-squared_distance / (2 * HEATMAP_SIGMA_PX**2)).astype(np.float32)
+    cells = np.rint((centres[near] - _HEATMAP_PX[0]) / STRIDE).astype(int)
+    for (along_x, along_y), (x, y), angle in zip(profiles, cells, orientation_rad[near], strict=True):
+        rows, columns = (slice(max(0, at - _HEATMAP_REACH), max(0, at + _HEATMAP_REACH + 1)) for at in (y, x))
+        gaussian, part = along_y[rows, None] * along_x[columns], heatmap[rows, columns]
+        nearest = gaussian > part
+        part[nearest] = gaussian[nearest]
+        orientation[rows, columns][nearest] = cos(2 * angle), sin(2 * angle)
     return heatmap, orientation, np.square(heatmap)
 
 
 def _augment_photometry(patch: Float32Array, rng: np.random.Generator) -> Float32Array:
     """Photometric augmentation: gamma, contrast, brightness, blur, shadow, noise; grey stays in [0, 1]."""
-    grey = np.clip(patch, 0, 1) ** np.exp(rng.uniform(-_LOG_GAMMA_RANGE, _LOG_GAMMA_RANGE))
+    grey = cv2.pow(np.clip(patch, 0, 1), float(np.exp(rng.uniform(-_LOG_GAMMA_RANGE, _LOG_GAMMA_RANGE))))
     contrast, brightness = rng.uniform(*_CONTRAST_RANGE), rng.uniform(-_BRIGHTNESS_RANGE, _BRIGHTNESS_RANGE)
-    grey = (grey - _MEAN_GREY) * contrast + _MEAN_GREY + brightness
+    grey *= np.float32(contrast)
+    grey += np.float32(_MEAN_GREY * (1 - contrast) + brightness)
     if rng.random() < _BLUR_PROBABILITY:
         grey = cv2.GaussianBlur(grey, (0, 0), rng.uniform(*_BLUR_SIGMA_PX))
     if rng.random() < _SHADOW_PROBABILITY:
-        grey = grey * (1 - rng.uniform(*_SHADOW_DEPTH) * _random_shadow(rng))
-    grey = grey + rng.normal(0, rng.uniform(0, _MAX_NOISE_SD), grey.shape)
-    return np.asarray(np.clip(grey, 0, 1), np.float32)
+        grey *= 1 - np.float32(rng.uniform(*_SHADOW_DEPTH)) * _random_shadow(rng)
+    grey += rng.normal(0, rng.uniform(0, _MAX_NOISE_SD), grey.shape).astype(np.float32)
+    return np.asarray(np.clip(grey, 0, 1, out=grey), np.float32)
 
 
-def _random_shadow(rng: np.random.Generator) -> FloatArray:
+def _random_shadow(rng: np.random.Generator) -> Float32Array:
     """Mask of a shadow with a straight, blurred edge across the patch, 0 to 1."""
     angle, offset = rng.uniform(0, 2 * np.pi), rng.uniform(-PATCH_PX / 3, PATCH_PX / 3)
     position = np.arange(PATCH_PX) - PATCH_PX / 2
     shadow = position[None, :] * np.cos(angle) + position[:, None] * np.sin(angle) > offset
-    return np.asarray(cv2.GaussianBlur(shadow.astype(np.float64), (0, 0), rng.uniform(*_SHADOW_EDGE_SIGMA_PX)))
+    return np.asarray(cv2.GaussianBlur(shadow.astype(np.float32), (0, 0), rng.uniform(*_SHADOW_EDGE_SIGMA_PX)))

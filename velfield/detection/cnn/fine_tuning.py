@@ -30,7 +30,7 @@ from velfield.detection.evaluation import (
 )
 from velfield.detection.orientation import fill_missing_orientation
 from velfield.detection.samples import LabelledImage, in_region, restrict_to_region
-from velfield.parallel import parallel_map
+from velfield.parallel import parallel_map, usable_processors
 
 if TYPE_CHECKING:
     from velfield.detection.cnn.detector import CnnDetector
@@ -66,8 +66,12 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: "CnnDetector", confi
     count = sum(len(sample.cars) for sample in samples)
     folds = _FOLDS if count >= MIN_CARS_FOR_FOLDS else 0
     tasks: list[int | None] = [None, *range(folds)]
+    spare = usable_processors() > len(tasks) - 1  # the folds together take as long as the network itself
     (network, _), *held_out = parallel_map(
-        lambda fold: _fine_tune_fold(masked, pretrained.network, config, fold, pretrained.record.tta_range), tasks
+        lambda fold: _fine_tune_fold(
+            masked, pretrained.network, config, fold, pretrained.record.tta_range, halves_at_once=spare
+        ),
+        tasks,
     )
     evidence = merge_scores([part for _, parts in held_out for part in parts]) if held_out else None
     threshold, curve = select_threshold(evidence, pretrained.threshold, FOLDS_DESCRIPTION)
@@ -130,17 +134,20 @@ def _fine_tune_fold(
     config: CnnConfig,
     fold: int | None,
     tta_range: tuple[float, float] = NO_TTA,
+    *,
+    halves_at_once: bool = True,
 ) -> tuple[Network, list[HeldOutScores]]:
     """Fine-tune without a fold's stripes and evaluate on them; without a fold, fine-tune on everything."""
     steps, seed = config.fine_tune_steps, config.seed
+    trainer = Trainer.from_network(pretrained, halves_at_once=halves_at_once)
     if fold is None:
         dataset = PatchDataset([samples], [1.0], seed)
-        return train(Trainer.from_network(pretrained), dataset, steps=steps, learning_rate=_FINE_TUNING_RATE), []
+        return train(trainer, dataset, steps=steps, learning_rate=_FINE_TUNING_RATE), []
     held_out = [spatial_fold(sample, fold, _FOLDS) for sample in samples]
     training = [restrict_to_region(sample, ~region) for sample, region in zip(samples, held_out, strict=True)]
     dataset = PatchDataset([training], [1.0], seed + 1 + fold)
     steps = -(-steps // _FOLDS)
-    network = train(Trainer.from_network(pretrained), dataset, steps=steps, learning_rate=_FINE_TUNING_RATE)
+    network = train(trainer, dataset, steps=steps, learning_rate=_FINE_TUNING_RATE)
     return network, [
         evaluate_network(network, sample, region, tta_range) for sample, region in zip(samples, held_out, strict=True)
     ]

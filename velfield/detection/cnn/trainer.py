@@ -96,12 +96,14 @@ class Trainer:
     ----------
     parameters : by name: ``LAYER.w``, ``LAYER.b`` and, of a batch-normalised layer, ``LAYER.g``, its gain.
     means, variances : running batch statistics of the normalised layers, by layer.
+    halves_at_once : whether the two halves of a batch are computed on two processors; the result is the same.
     """
 
     parameters: dict[str, Float32Array]
     topology: Topology = TOPOLOGY
     means: dict[str, Float32Array] = field(default_factory=dict)
     variances: dict[str, Float32Array] = field(default_factory=dict)
+    halves_at_once: bool = True
     _moments: dict[str, tuple[Float32Array, Float32Array]] = field(default_factory=dict)
     _steps: int = 0
 
@@ -122,11 +124,11 @@ class Trainer:
         return cls(parameters)
 
     @classmethod
-    def from_network(cls, network: Network) -> "Trainer":
+    def from_network(cls, network: Network, *, halves_at_once: bool = True) -> "Trainer":
         """A trained network, for fine-tuning."""
         parameters = {f"{name}.w": weights.copy() for name, weights in network.weights.items()}
         parameters |= {f"{name}.b": biases.copy() for name, biases in network.biases.items()}
-        return cls(parameters, network.topology)
+        return cls(parameters, network.topology, halves_at_once=halves_at_once)
 
     @property
     def is_normalised(self) -> bool:
@@ -173,13 +175,14 @@ class Trainer:
     def loss_and_gradients(self, batch: Batch) -> tuple[float, dict[str, Float32Array]]:
         """Loss, and its gradient by every parameter.
 
-        Without batch normalisation both halves of the batch are computed in parallel: their gradients add up to those
+        Without batch normalisation both halves of the batch are computed by themselves: their gradients add up to those
         of the whole, whatever the number of processors.
         """
         normaliser = LossNormaliser.of(batch)
         if self.is_normalised or len(batch.images) < 2:
             return self._loss_and_gradients(batch, normaliser)
-        (first, of_first), (second, of_second) = parallel_map(
+        apply = parallel_map if self.halves_at_once else map
+        (first, of_first), (second, of_second) = apply(
             lambda half: self._loss_and_gradients(half, normaliser), batch.halves()
         )
         return first + second, {name: gradient + of_second[name] for name, gradient in of_first.items()}
