@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from schemas.arrays import GreyImage, Mask, Points
-from velfield.detection.changes import box_mean_slope, changed_cells
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.detect import (
     SearchedFrame,
+    box_mean_slope,
+    changed_cells,
     oriented_strips,
     search_frame,
     split_into_boxes,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from schemas.arrays import Float32Array, GreyImage, Mask
-from velfield.registration.resampling.cells import CELL_PX, extend_border, resample_cells
+from velfield.registration.warp import CELL_PX, extend_border, resample_cells
 
 _UNIT = np.float32(32)
 

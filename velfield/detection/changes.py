@@ -1,83 +1,18 @@
-"""Where two frames differ: by more than noise, illumination and the error of their registration.
+"""Kernels that find where two frames differ, all at half the resolution, by cells of `CELL_PX`."""
 
-The difference is averaged over about half a car, without its slow part (exposure, shadows of clouds), and compared by
-cells of `CELL_PX`, all at half the resolution.
-"""
-
-import cv2
 import numpy as np
 from numba import njit
 
-from schemas.arrays import Float32Array, Mask
-from velfield.detection.frame import CELL_PX, SearchableFrame
+from velfield.detection.frame import CELL_PX
 
-_BOX_PX, _SLOW_PX = 8, 96
-"""Sides of the boxes that the difference is averaged over: about half a car, and what counts as illumination."""
-_BOX_AREA = (_BOX_PX // 2) ** 2
+BOX_PX = 8
+"""Side of the boxes that the difference is averaged over: about half a car."""
+BOX_AREA = (BOX_PX // 2) ** 2
 """In pixels at half the resolution."""
-_NOISE_SIGMAS, _CHANGE_LEVELS = 5.0, (3.0, 8.0)
-"""A change is a mean difference above so many standard deviations of the noise, but at least and at most so many grey
-levels: in a frame that changed everywhere the noise cannot be estimated. In a simulated city every vehicle that moved
-by 4 px changed its place by more than 10."""
-_SHIFT_PX = 0.3
-"""Between two frames the map is wrong by about as much, working px, by rolling shutter and by the noise of its fit. At
-every edge of a city that makes a change: without the allowance up to three quarters of a shaken frame were searched."""
-_SAMPLE_PX = CELL_PX // 2
-"""Distance of the pixels, at half the resolution, that noise is estimated from: one a cell."""
-
-
-def changed_cells(frame: SearchableFrame, reference: SearchableFrame, slope: Float32Array | None = None) -> Mask:
-    """Where two frames on one grid differ by more than noise, illumination and the error of their registration; where
-    just one covers the grid as well.
-
-    Parameters
-    ----------
-    slope
-        `box_mean_slope` of the reference, where it is known already.
-
-    Returns
-    -------
-    (rows, columns) bool, of cells of `CELL_PX`, the last of each row and column perhaps smaller.
-    """
-    if frame.image.shape != reference.image.shape:
-        raise ValueError(f"found frames of {frame.image.shape} and {reference.image.shape} px, expected one grid")
-    slope = box_mean_slope(reference) if slope is None else slope
-    side = CELL_PX // 2
-    rows, columns = (-(-size // side) for size in frame.half_valid.shape)
-    sums, counts = np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.float32)
-    one_only = np.zeros((rows, columns), bool)
-    images, masks = (frame.half_image, reference.half_image), (frame.half_valid, reference.half_valid)
-    difference = _difference_kernel(*images, *masks, sums, counts, one_only)
-    boxes = _box_sums_kernel(difference)
-    share = np.float32(1 / side**2)
-    slow = _slow_part(sums * share, counts * share)
-    sample = (slice(_SAMPLE_PX // 2, None, _SAMPLE_PX),) * 2
-    at = boxes[sample] * np.float32(1 / _BOX_AREA)
-    at = np.abs(at - slow[: at.shape[0], : at.shape[1]])[masks[0][sample] & masks[1][sample]]
-    noise = 1.4826 * float(np.median(at)) if at.size else 0.0
-    lowest, highest = _CHANGE_LEVELS
-    limit = np.float32(min(max(_NOISE_SIGMAS * noise, lowest), highest))
-    changed = _changed_kernel(boxes, slow, slope, *masks, limit, np.float32(_SHIFT_PX / 2))
-    return np.asarray(changed | one_only)
-
-
-def box_mean_slope(frame: SearchableFrame) -> Float32Array:
-    """Steepness of a frame's mean over boxes of `_BOX_PX`, grey levels a pixel of half the resolution."""
-    side = _BOX_PX // 2
-    mean = cv2.boxFilter(frame.half_image, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REPLICATE)
-    along, across = (cv2.Sobel(mean, cv2.CV_32F, 1 - k, k, scale=1 / 8) for k in (0, 1))
-    return np.asarray(cv2.magnitude(along, across), np.float32)
-
-
-def _slow_part(difference: Float32Array, covered: Float32Array) -> Float32Array:
-    """Mean difference about each cell, over `_SLOW_PX`, where both frames cover the grid, from the means of cells."""
-    reach = _SLOW_PX // CELL_PX
-    parts = [cv2.blur(mean, (reach, reach), borderType=cv2.BORDER_REPLICATE) for mean in (difference, covered)]
-    return np.asarray(parts[0] / np.maximum(parts[1], 1e-3), np.float32)
 
 
 @njit(cache=True, nogil=True)
-def _difference_kernel(image, other, valid, other_valid, sums, counts, one_only):  # type: ignore[no-untyped-def]
+def difference_kernel(image, other, valid, other_valid, sums, counts, one_only):  # type: ignore[no-untyped-def]
     """Difference of two images (h, w) where both are valid, else 0; of each cell its sum, the number of such pixels,
     and whether there are some where just one is valid."""
     side = np.uint64(CELL_PX // 2)
@@ -101,8 +36,8 @@ def _difference_kernel(image, other, valid, other_valid, sums, counts, one_only)
 
 
 @njit(cache=True, nogil=True)
-def _box_sums_kernel(difference):  # type: ignore[no-untyped-def]
-    """Sums over boxes of `_BOX_PX` at half the resolution, from two pixels before each; beyond the edge it goes on."""
+def box_sums_kernel(difference):  # type: ignore[no-untyped-def]
+    """Sums over boxes of `BOX_PX` at half the resolution, from two pixels before each; beyond the edge it goes on."""
     height, width = difference.shape
     out = np.empty((height, width), np.int16)
     padded = np.empty(width + 3, np.int16)
@@ -118,9 +53,9 @@ def _box_sums_kernel(difference):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _changed_kernel(boxes, slow, slope, valid, other_valid, limit, shift):  # type: ignore[no-untyped-def]
+def changed_kernel(boxes, slow, slope, valid, other_valid, limit, shift):  # type: ignore[no-untyped-def]
     """Cells that hold a pixel whose change exceeds the limit and what a shift by so many px would make."""
-    side, scale = np.uint64(CELL_PX // 2), np.float32(1 / _BOX_AREA)
+    side, scale = np.uint64(CELL_PX // 2), np.float32(1 / BOX_AREA)
     out = np.zeros(slow.shape, np.bool_)
     height, width = np.uint64(valid.shape[0]), np.uint64(valid.shape[1])
     for y in range(height):
@@ -135,10 +70,14 @@ def _changed_kernel(boxes, slow, slope, valid, other_valid, limit, shift):  # ty
     return out
 
 
-def any_in_cells(half: Mask) -> Mask:
-    """Whether a mask at half the resolution holds anywhere in each cell."""
-    side = CELL_PX // 2
-    rows, columns = (-(-size // side) for size in half.shape)
-    padded = np.zeros((rows * side, columns * side), bool)
-    padded[: half.shape[0], : half.shape[1]] = half
-    return np.asarray(padded.reshape(rows, side, columns, side).any(axis=(1, 3)))
+@njit(cache=True, nogil=True)
+def any_kernel(half, out):  # type: ignore[no-untyped-def]
+    """Mark the cells (rows, columns) in which a mask at half the resolution holds anywhere."""
+    side = np.uint64(CELL_PX // 2)
+    width = np.uint64(half.shape[1])
+    for y in range(np.uint64(half.shape[0])):
+        for column in range(np.uint64(out.shape[1])):
+            number = np.int32(0)
+            for x in range(column * side, min((column + np.uint64(1)) * side, width)):
+                number = np.int32(number + half[y, x])
+            out[y // side, column] |= number > 0

@@ -6,8 +6,9 @@ detect the same again; so it is run on the rest alone, and the other frame's det
 moves, arrives or leaves changes the image, at the edge of the frame as well; so does much else (foliage, the parallax
 of roofs), which costs time but loses nothing.
 
-Frames are compared by cells of 16 px (`velfield.detection.changes`). A detection is kept only while nothing within the
-length of a bus changed: the middle of a slow bus looks the same before and after.
+The difference of two frames is averaged over about half a car, without its slow part (exposure, shadows of clouds), and
+compared by cells of 16 px. A detection is kept only while nothing within the length of a bus changed: the middle of a
+slow bus looks the same before and after.
 
 The image is on the working grid: the base image's grid, scaled so that a car is ``working_car_length_px`` long. The
 crops (`attach_crops`) are patches rotated to the axis, to compare appearance, upright chips, to align, and strips at
@@ -26,11 +27,29 @@ from numba import njit
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from velfield.detection.cascade.classifier import confirm_long_vehicles, nms_oriented
-from velfield.detection.changes import any_in_cells, box_mean_slope, changed_cells
+from velfield.detection.changes import (
+    BOX_AREA,
+    BOX_PX,
+    any_kernel,
+    box_sums_kernel,
+    changed_kernel,
+    difference_kernel,
+)
 from velfield.detection.detector import Detections, Detector, concatenate
 from velfield.detection.frame import CELL_PX, SearchableFrame, half_resolution
 from velfield.detection.mosaic import Box, find_in_boxes
 
+_SLOW_PX = 96
+"""Side of the boxes over which a difference counts as illumination."""
+_NOISE_SIGMAS, _CHANGE_LEVELS = 5.0, (3.0, 8.0)
+"""A change is a mean difference above so many standard deviations of the noise, but at least and at most so many grey
+levels: in a frame that changed everywhere the noise cannot be estimated. In a simulated city every vehicle that moved
+by 4 px changed its place by more than 10."""
+_SHIFT_PX = 0.3
+"""Between two frames the map is wrong by about as much, working px, by rolling shutter and by the noise of its fit. At
+every edge of a city that makes a change: without the allowance up to three quarters of a shaken frame were searched."""
+_SAMPLE_PX = CELL_PX // 2
+"""Distance of the pixels, at half the resolution, that noise is estimated from: one a cell."""
 _REACH_CARS = 1.75
 """A detection is not kept where something changed so near, in car lengths: half of a long bus."""
 _UNSURE_FRACTION = 0.1
@@ -205,7 +224,7 @@ def search_frame(
     """
     own = detector.threshold if threshold is None else threshold
     weak_above = own - detector.weak_margin
-    covered = any_in_cells(frame.half_valid)
+    covered = _any_in_cells(frame.half_valid)
     if reference is None:
         cells = covered
     else:
@@ -255,6 +274,56 @@ def _cells_of_crops(xy: FloatArray, shape: tuple[int, ...]) -> Mask:
     cells = np.zeros(shape, bool)
     cells[_locate_cells(xy, shape)] = True
     return _grow(cells, 1)
+
+
+def changed_cells(frame: SearchableFrame, reference: SearchableFrame, slope: Float32Array | None = None) -> Mask:
+    """Where two frames on one grid differ by more than noise, illumination and the error of their registration; where
+    just one covers the grid as well.
+
+    Parameters
+    ----------
+    slope
+        `box_mean_slope` of the reference, where it is known already.
+
+    Returns
+    -------
+    (rows, columns) bool, of cells of `CELL_PX`, the last of each row and column perhaps smaller.
+    """
+    if frame.image.shape != reference.image.shape:
+        raise ValueError(f"found frames of {frame.image.shape} and {reference.image.shape} px, expected one grid")
+    slope = box_mean_slope(reference) if slope is None else slope
+    side = CELL_PX // 2
+    rows, columns = (-(-size // side) for size in frame.half_valid.shape)
+    sums, counts = np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.float32)
+    one_only = np.zeros((rows, columns), bool)
+    images, masks = (frame.half_image, reference.half_image), (frame.half_valid, reference.half_valid)
+    difference = difference_kernel(*images, *masks, sums, counts, one_only)
+    boxes = box_sums_kernel(difference)
+    share = np.float32(1 / side**2)
+    slow = _slow_part(sums * share, counts * share)
+    sample = (slice(_SAMPLE_PX // 2, None, _SAMPLE_PX),) * 2
+    at = boxes[sample] * np.float32(1 / BOX_AREA)
+    at = np.abs(at - slow[: at.shape[0], : at.shape[1]])[masks[0][sample] & masks[1][sample]]
+    noise = 1.4826 * float(np.median(at)) if at.size else 0.0
+    lowest, highest = _CHANGE_LEVELS
+    limit = np.float32(min(max(_NOISE_SIGMAS * noise, lowest), highest))
+    changed = changed_kernel(boxes, slow, slope, *masks, limit, np.float32(_SHIFT_PX / 2))
+    return np.asarray(changed | one_only)
+
+
+def box_mean_slope(frame: SearchableFrame) -> Float32Array:
+    """Steepness of a frame's mean over boxes of `BOX_PX`, grey levels a pixel of half the resolution."""
+    side = BOX_PX // 2
+    mean = cv2.boxFilter(frame.half_image, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REPLICATE)
+    along, across = (cv2.Sobel(mean, cv2.CV_32F, 1 - k, k, scale=1 / 8) for k in (0, 1))
+    return np.asarray(cv2.magnitude(along, across), np.float32)
+
+
+def _slow_part(difference: Float32Array, covered: Float32Array) -> Float32Array:
+    """Mean difference about each cell, over `_SLOW_PX`, where both frames cover the grid, from the means of cells."""
+    reach = _SLOW_PX // CELL_PX
+    parts = [cv2.blur(mean, (reach, reach), borderType=cv2.BORDER_REPLICATE) for mean in (difference, covered)]
+    return np.asarray(parts[0] / np.maximum(parts[1], 1e-3), np.float32)
 
 
 def split_into_boxes(cells: Mask, margin: float, box_cost: float) -> list[Box]:
@@ -400,3 +469,10 @@ def _locate_cells(xy: FloatArray, shape: tuple[int, ...]) -> tuple[IntArray, Int
     """Row and column, each (n,), of the cells in which positions lie."""
     cell = np.floor((xy + 0.5) / CELL_PX).astype(np.int64)
     return np.clip(cell[:, 1], 0, shape[0] - 1), np.clip(cell[:, 0], 0, shape[1] - 1)
+
+
+def _any_in_cells(half: Mask) -> Mask:
+    """Whether a mask at half the resolution holds anywhere in each cell."""
+    out = np.zeros([-(-size // (CELL_PX // 2)) for size in half.shape], bool)
+    any_kernel(half, out)
+    return out

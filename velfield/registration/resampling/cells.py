@@ -2,64 +2,25 @@
 
 The result is that of OpenCV's remap, to the bit on processors with fused multiplication and addition: positions rounded
 to 1/32 px, the same weights, the same order of sums. OpenCV takes 8 ns a pixel, and 4 more to make the map and to place
-the pixels; here it is 4 ns in all, for the products of four pixels are four vectors.
+the pixels; here it is 5 ns in all, for the products of four pixels are four vectors.
 """
 
-from functools import cache
 from typing import Any
 
-import cv2
 import numpy as np
 from llvmlite import ir
 from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from schemas.arrays import Float32Array, GreyImage, IntArray, Mask
-
 CELL_PX = 16
 """Side of a cell, output px."""
-_FRACTION_BITS = 5
+FRACTION_BITS = 5
 """Of positions: 1/32 px, to which OpenCV's remap rounds them as well."""
 _MARGIN_PX = 1024
 """About the frame: what lies farther outside is taken as if it were that far."""
-_PAD_PX = 3
+PAD_PX = 3
 """Of the source: pixels farther outside are those of its border."""
-_SHARPNESS = -0.75
-"""Of the cubic, as in OpenCV."""
-
-
-def extend_border(source: GreyImage) -> GreyImage:
-    """A source with `_PAD_PX` more on every side."""
-    extended = cv2.copyMakeBorder(source, _PAD_PX, _PAD_PX, _PAD_PX, _PAD_PX, cv2.BORDER_REPLICATE)
-    return np.asarray(extended, np.uint8)
-
-
-def resample_cells(
-    extended: GreyImage, coarse: Float32Array, step: int, cells: IntArray, image: GreyImage, valid: Mask
-) -> None:
-    """Fill cells of an image (h, w) and of its mask, which is true inside the frame; outside its border goes on.
-
-    Parameters
-    ----------
-    extended
-        The source by `extend_border`.
-    coarse
-        (my, mx, 2) position in the source itself at centres of cells of ``step`` px, with one more cell on each side.
-    cells
-        (n, 2) row and column of cells of `CELL_PX`.
-    """
-    _resample_kernel(extended, coarse, step, cells, _cubic_weights(), image, valid)
-
-
-@cache
-def _cubic_weights() -> Float32Array:
-    """Weights (128,) of four pixels in a row, from the second of which a position lies 0, 1/32, 2/32... px."""
-    x, a = np.arange(1 << _FRACTION_BITS) / (1 << _FRACTION_BITS), _SHARPNESS
-    first = ((a * (x + 1) - 5 * a) * (x + 1) + 8 * a) * (x + 1) - 4 * a
-    second = ((a + 2) * x - (a + 3)) * x * x + 1
-    third = ((a + 2) * (1 - x) - (a + 3)) * (1 - x) * (1 - x) + 1
-    return np.stack([first, second, third, 1 - first - second - third], axis=1).astype(np.float32).ravel()
 
 
 @intrinsic
@@ -145,20 +106,20 @@ def _interpolate_four(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _resample_kernel(extended, coarse, step, cells, weights, image, valid):  # type: ignore[no-untyped-def]
-    """As `resample_cells`.
+def resample_kernel(extended, coarse, step, cells, weights, image, valid):  # type: ignore[no-untyped-def]
+    """As `velfield.registration.warp.resample_cells`, with the weights of the cubic by fraction of a pixel.
 
     Positions are in units of the fraction, from a margin of so many pixels: all positive, so that truncation rounds
     down.
     """
-    height, width = extended.shape[0] - 2 * _PAD_PX, extended.shape[1] - 2 * _PAD_PX
-    unit, mask = np.float32(1 << _FRACTION_BITS), np.int32((1 << _FRACTION_BITS) - 1)
+    height, width = extended.shape[0] - 2 * PAD_PX, extended.shape[1] - 2 * PAD_PX
+    unit, mask = np.float32(1 << FRACTION_BITS), np.int32((1 << FRACTION_BITS) - 1)
     margin, half, zero = np.float32(_MARGIN_PX), np.float32(0.5), np.float32(0)
     last_x, last_y = np.float32(width + 2 * _MARGIN_PX) * unit, np.float32(height + 2 * _MARGIN_PX) * unit
     start = (margin - half) * unit
     end_x, end_y = start + np.float32(width) * unit, start + np.float32(height) * unit
     # Of the first of four pixels, in the extended source: beyond, all four are the border's.
-    shift, most_x, most_y = np.int32(_PAD_PX - _MARGIN_PX - 1), np.int32(width + 2), np.int32(height + 2)
+    shift, most_x, most_y = np.int32(PAD_PX - _MARGIN_PX - 1), np.int32(width + 2), np.int32(height + 2)
     nodes = CELL_PX // step + 2
     across, runs = np.empty(CELL_PX, np.float32), np.empty(CELL_PX, np.int64)
     run_ends = np.empty(nodes - 1, np.uint64)  # runs of pixels between the same two centres: alike in all cells
@@ -194,8 +155,8 @@ def _resample_kernel(extended, coarse, step, cells, weights, image, valid):  # t
                     fine_y[q] = np.int32(min(max(py + half, zero), last_y))
                 begin = run_ends[m]
             for q in range(side):
-                u = min(max(np.int32((fine_x[q] >> _FRACTION_BITS) + shift), np.int32(0)), most_x)
-                v = min(max(np.int32((fine_y[q] >> _FRACTION_BITS) + shift), np.int32(0)), most_y)
+                u = min(max(np.int32((fine_x[q] >> FRACTION_BITS) + shift), np.int32(0)), most_x)
+                v = min(max(np.int32((fine_y[q] >> FRACTION_BITS) + shift), np.int32(0)), most_y)
                 first[q] = np.int32(np.int32(v * stride) + u)
                 wx[q], wy[q] = np.int32((fine_x[q] & mask) * 4), np.int32((fine_y[q] & mask) * 4)
             place = np.uint64((top + i) * image.shape[1] + left)
