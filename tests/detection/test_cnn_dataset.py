@@ -1,5 +1,6 @@
 """Training patches: target maps, masks, and augmentation under which labels move with the image."""
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,7 +9,15 @@ from hypothesis import strategies as st
 from schemas.arrays import FloatArray, GreyImage
 from velfield.bench.scenes import simulated_image
 from velfield.detection.cnn import dataset
-from velfield.detection.cnn.dataset import BATCH_SIZE, HEATMAP_SIGMA_PX, PATCH_PX, PatchDataset, encode_targets
+from velfield.detection.cnn.dataset import (
+    BATCH_SIZE,
+    HEATMAP_SIGMA_PX,
+    PATCH_PX,
+    PatchDataset,
+    _random_similarity,
+    _source_window,
+    encode_targets,
+)
 from velfield.detection.cnn.network import STRIDE
 from velfield.detection.cnn.trainer import Batch
 from velfield.detection.orientation import axial_difference
@@ -172,6 +181,21 @@ def test_images_smaller_than_a_patch_are_mirrored_at_their_borders() -> None:
     assert (made.images.std(axis=(1, 2)) > 0).all()
     assert made.mask.mean() < 0.5  # beyond the image nothing is known
     assert (made.mask.sum(axis=(1, 2)) > 0).all()
+
+
+@pytest.mark.parametrize("shape", [(400, 500), (150, 220), (70, 90)])
+def test_a_window_of_the_image_shows_what_the_whole_image_does(shape: tuple[int, int]) -> None:
+    """At its borders too, where patches see the mirror image."""
+    rng = np.random.default_rng(7)
+    sample = LabelledImage(rng.integers(0, 256, shape).astype(np.uint8), np.empty((0, 5)))
+    for _ in range(100):
+        matrix = _random_similarity(sample, rng)
+        rows, columns, of_window = _source_window(matrix, shape)
+        found, expected = (
+            cv2.warpAffine(image.astype(np.float32), to_patch, (PATCH_PX, PATCH_PX), borderMode=cv2.BORDER_REFLECT_101)
+            for image, to_patch in ((sample.image[rows, columns], of_window), (sample.image, matrix))
+        )
+        np.testing.assert_allclose(found, expected, atol=0.05)
 
 
 def test_photometry_varies_from_patch_to_patch() -> None:

@@ -123,6 +123,14 @@ def test_ranges_are_of_the_flight_and_the_setting_and_come_back_from_the_file(tm
     assert eight.for_flight([cars(1)], CnnConfig(precision="float32")).network.ranges is None
 
 
+@pytest.mark.parametrize("size", [1, 15, 700, 50_000, 400_001])
+@pytest.mark.parametrize("cut", [False, True])
+def test_the_tails_are_those_of_all_values(size: int, cut: bool) -> None:
+    values = np.random.default_rng(size).normal(size=size).astype(np.float32)
+    values = np.maximum(values, 0) if cut else values
+    np.testing.assert_allclose(quantization._tails(values), np.percentile(values, (0.01, 99.99)), rtol=1e-5)
+
+
 def test_small_images_are_calibrated_on_smaller_crops_and_smaller_ones_refused() -> None:
     network = shipped().network
     assert calibrate(network, [cars(1, (60, 90))], crops=4)

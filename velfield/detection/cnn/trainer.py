@@ -4,7 +4,7 @@ From scratch, each convolution followed by a ReLU is batch-normalised, and the r
 weights and bias at the end; fine-tuning starts from a folded network and normalises nothing.
 
 The training loop is our own on numpy: jax measured no faster (478 against 443 ms a step from scratch, 309 against 351
-ms fine-tuning) and adds 380 MB of wheels, and the wheel of torch brings CUDA.
+ms fine-tuning, before this loop took 0.55 of its time) and adds 380 MB of wheels, and the wheel of torch brings CUDA.
 """
 
 from collections.abc import Callable, Sequence
