@@ -230,7 +230,7 @@ STAGES: tuple[Stage, ...] = (
     # Labels and training, from labelled frames or from what moves; or a given detector.
     Stage(
         name="detector",
-        version=21,
+        version=22,
         label="detector",
         lines=(
             Line("skipped: external detections", lambda counts: bool(counts) and "threshold" not in counts),
