@@ -146,25 +146,33 @@ class ClientRunner(Runner):
 
     def restart_workers(self) -> None:
         # Libraries, kernels and models of the stages before take a gigabyte, which no call gives back.
-        if self._own_workers:
-            workers = self._client.scheduler_info(n_workers=-1)["workers"]
-            self._client.restart_workers(list(workers), timeout=_RESTART_S, raise_for_error=False)
+        if not self._own_workers:
+            return
+        end_s = time.monotonic() + _WAIT_S
+        while self._client.run_on_scheduler(_count_tasks) and time.monotonic() < end_s:
+            time.sleep(0.05)  # what is released is forgotten a moment later; until then it would be computed again
+        workers = self._client.scheduler_info(n_workers=-1)["workers"]
+        self._client.restart_workers(list(workers), timeout=_RESTART_S, raise_for_error=False)
 
     def _wait(self, future: Any) -> Any:
         from distributed.scheduler import KilledWorker
 
-        while True:
-            try:
-                return future.result(timeout=_WAIT_S)
-            except KilledWorker as error:
-                raise WorkersKilledError(
-                    f"{error.allowed_failures + 1} workers of {self._address} ended while they computed it, the last "
-                    f"at {error.last_worker.address}: their memory limit is too small for it, or something kills them"
-                ) from None
-            except TimeoutError:
-                if future.done():  # the graph's own
-                    raise
-                self._look_for_workers()
+        try:
+            while True:
+                try:
+                    return future.result(timeout=_WAIT_S)
+                except KilledWorker as error:
+                    raise WorkersKilledError(
+                        f"{error.allowed_failures + 1} workers of {self._address} ended while they computed it, the "
+                        f"last at {error.last_worker.address}: their memory limit is too small for it, or something "
+                        "kills them"
+                    ) from None
+                except TimeoutError:
+                    if future.done():  # the graph's own
+                        raise
+                    self._look_for_workers()
+        finally:
+            future.release()  # else the scheduler computes it again where the worker that holds it ends
 
     def _look_for_workers(self) -> None:
         """Say, once a minute, that there is nothing that could compute: Dask waits for workers without a word."""
@@ -181,6 +189,10 @@ class ClientRunner(Runner):
             f"(`dask worker {self._address}`; one that ends at once has the reason in its log, as where velfield is "
             "not installed): the run waits for them, and if you stop it the same command resumes"
         )
+
+
+def _count_tasks(dask_scheduler: Any) -> int:
+    return len(dask_scheduler.tasks)
 
 
 @contextmanager

@@ -87,6 +87,25 @@ def test_workers_of_our_own_are_restarted_and_others_are_left_alone() -> None:
         assert runner.call(os.getpid) == before
 
 
+def note_slowly(path: Path) -> None:
+    time.sleep(0.5)
+    with path.open("a") as file:
+        file.write("computed\n")
+
+
+def test_what_was_computed_is_not_again_where_workers_are_restarted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Dask computes what a client still holds again, where the worker that has its result ends."""
+    monkeypatch.setattr("flows.runners._WAIT_S", 0.1)
+    with open_runner(RunnerConfig(workers=1)) as runner:
+        note = runner.compute(delayed(note_slowly)(tmp_path / "notes"))
+        assert note is None
+        runner.restart_workers()
+        runner.call(time.sleep, 1.5)
+    assert (tmp_path / "notes").read_text() == "computed\n"
+
+
 def one_that_kills_its_worker(plan: object, frames: range) -> object:
     """In place of the step: the first worker that gets frame 8 dies of it."""
     from velfield.pipeline.stages.detections import detect_block
