@@ -167,8 +167,7 @@ class CnnDetector(Detector):
                 return trained
         cascade = config.for_method("cascade")
         assert isinstance(cascade, CascadeConfig)
-        by_appearance = CascadeDetector.train_by_appearance(flight, cascade)
-        return by_appearance or flight.calibrate(flight.train(cascade), cascade)
+        return CascadeDetector.train_from_motion(flight, cascade)
 
 
 def _pretrained(config: CnnConfig) -> CnnDetector | None:

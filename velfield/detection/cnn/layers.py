@@ -156,14 +156,21 @@ def _neighbourhoods(images: Float32Array, weights: Float32Array) -> Iterator[tup
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _first_value(shape: tuple[int, int, int, int], stride: int, pixel: int) -> int:
+    """Where the neighbourhood of an output pixel begins in padded images of a shape, by the number of the value."""
+    _, height, width, channels = shape
+    line, x = divmod(pixel, (width - 2) // stride)
+    image, y = divmod(line, (height - 2) // stride)
+    return ((image * height + y * stride) * width + x * stride) * channels
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _gather(padded: Float32Array, columns: Float32Array, side: int, stride: int, first: int) -> None:
     """Fill rows with the neighbourhoods (side x side x channels) of successive output pixels from the first."""
-    _, height, width, channels = padded.shape
+    width, channels = padded.shape[2:]
     flat, length = padded.reshape(-1), side * channels
     for row in range(columns.shape[0]):
-        line, x = divmod(first + row, (width - 2) // stride)
-        image, y = divmod(line, (height - 2) // stride)
-        start = ((image * height + y * stride) * width + x * stride) * channels
+        start = _first_value(padded.shape, stride, first + row)
         neighbourhood = columns[row]
         for tap in range(side):
             # The taps of a row are adjacent in memory, in the image as in the neighbourhood.
@@ -176,12 +183,10 @@ def _gather(padded: Float32Array, columns: Float32Array, side: int, stride: int,
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _scatter(columns: Float32Array, padded: Float32Array, side: int, stride: int, first: int) -> None:
     """Add rows to the neighbourhoods that `_gather` reads: its adjoint."""
-    _, height, width, channels = padded.shape
+    width, channels = padded.shape[2:]
     flat, length = padded.reshape(-1), side * channels
     for row in range(columns.shape[0]):
-        line, x = divmod(first + row, (width - 2) // stride)
-        image, y = divmod(line, (height - 2) // stride)
-        start = ((image * height + y * stride) * width + x * stride) * channels
+        start = _first_value(padded.shape, stride, first + row)
         neighbourhood = columns[row]
         for tap in range(side):
             target = flat[start + tap * width * channels : start + tap * width * channels + length]

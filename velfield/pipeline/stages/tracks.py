@@ -76,7 +76,8 @@ def chain_tracks(plan: Plan) -> StageResult:
         found = replace(found, tracks=_rename_parts(found.tracks, whole), joins=_join_parts(found.joins, whole))
     doubles = find_doubles(positions, mean_grey(strips, found.tracks), gsd_m)
     positions = _without(positions, doubles)
-    casters = find_shadows(plan, images_of_tracks(strips, found.tracks), positions, gsd_m)
+    images = images_of_tracks(strips, found.tracks)
+    casters = find_shadows(plan, images, positions, gsd_m)
     bent = [one for one in casters if not keeps_direction(positions[positions["track_id"] == one], gsd_m)]
     left_out = np.union1d(doubles, np.array(bent, np.int64))  # where a bent track's caster is follows from no offset
     offsets_px = {track: casters[track].offset_m / gsd_m for track in casters if track not in bent}
@@ -102,7 +103,7 @@ def chain_tracks(plan: Plan) -> StageResult:
     for folder in (layout.tracks, layout.track_positions):
         for stale in set(folder.glob("unit-*.parquet")) - set(written):
             stale.unlink()  # of an earlier plan with more units
-    measured = _without(measure_tracks(strips, found.tracks), np.array(list(offsets_px), np.int64))  # of shadows
+    measured = _without(measure_tracks(images), np.array(list(offsets_px), np.int64))  # of shadows
     for path, table, columns in (
         (layout.dimensions, measured, DIMENSION_COLUMNS),
         (layout.joins, found.joins, JOIN_COLUMNS),
@@ -371,12 +372,11 @@ def images_of_tracks(strips: StripSums, tracks: IntArray) -> TrackImages:
     return TrackImages(ids[seen], total[seen] / count[seen, None, None], count[seen], shade[seen], strips.scale)
 
 
-def measure_tracks(strips: StripSums, tracks: IntArray) -> pd.DataFrame:
-    """Dimensions by track (`DIMENSION_COLUMNS`), from the strips of all chains of each; ``tracks`` (chains,)."""
-    images = images_of_tracks(strips, tracks)
+def measure_tracks(images: TrackImages) -> pd.DataFrame:
+    """Dimensions by track (`DIMENSION_COLUMNS`)."""
     found = measure(images.strips)
     columns = {
-        name: getattr(found, name.removesuffix("_px")) / strips.scale
+        name: getattr(found, name.removesuffix("_px")) / images.scale
         for name in ("length_px", "length_sd_px", "width_px", "width_sd_px")
     }
     return pd.DataFrame({"track_id": images.ids, **columns, "strips": images.count})
@@ -408,7 +408,7 @@ def find_context(plan: Plan, ends: TrackEnds, starts: TrackEnds, strips: StripSu
 
 def _certain_length(strips: StripSums) -> FloatArray:
     """(chains,) px: the mean less a standard deviation; NaN where unknown."""
-    found = measure_tracks(strips, strips.ids).set_index("track_id")
+    found = measure_tracks(images_of_tracks(strips, strips.ids)).set_index("track_id")
     length = (found["length_px"] - found["length_sd_px"]).reindex(strips.ids)
     return np.asarray(length, dtype=np.float64)
 
