@@ -152,8 +152,11 @@ class Work:
                     raise
 
     def _restart_before(self, stage: Stage) -> None:
-        """Where a flight is long, let a stage whose memory grows with it start without what earlier work left."""
-        if stage.grows and is_long(self.plan) and committed(self.plan, stage.name, WHOLE) is None:
+        """Where a flight is long, let a stage that takes much memory start without what earlier work left."""
+        if not (stage.new_workers and is_long(self.plan)):
+            return
+        units = stage_units(self.plan, stage)
+        if any(committed(self.plan, stage.name, unit.name) is None for unit in units):
             self.runner.restart_workers()
 
     def _can_start(self, stage: Stage, todo: Sequence[Stage]) -> bool:

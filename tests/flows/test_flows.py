@@ -161,7 +161,7 @@ def test_workers_give_the_same_bits(
     restarted, true = [], ClientRunner.restart_workers
     monkeypatch.setattr(ClientRunner, "restart_workers", lambda self: restarted.append(true(self)))
     process(job(flight, tmp_path / "workers"), RunnerConfig(workers=2))
-    assert len(restarted) == sum(stage.grows for stage in STAGES) > 0
+    assert len(restarted) == sum(stage.new_workers for stage in STAGES) > 0
     assert digests(tmp_path / "workers") == digests(whole[0])
 
 

@@ -74,7 +74,8 @@ class Stage:
     config : of the configuration (`schemas.flight.FlightConfig`), the sections and keys that it reads.
     unread : keys of those sections that it does not read.
     cut, halo : how it is cut; a unit of frames also reads so many units after its own.
-    grows : its memory grows with the flight, whose tables it reads as a whole.
+    new_workers : in a long flight its workers start without what earlier stages left in theirs: its memory grows with
+        the flight, whose tables it reads as a whole, or is the most that any takes.
     new_base, remap : what `velfield reprocess` makes of it; ``remap`` is ``(plan, *part, rebase) -> StageResult``.
     from_tracks : function ``(plan) -> StageResult`` in place of ``unit``, where tracks are given and no frames: it
         writes what the stages before would have.
@@ -97,7 +98,7 @@ class Stage:
     unread: tuple[str, ...] = ()
     cut: Cut = Cut.WHOLE
     halo: int = 0
-    grows: bool = False
+    new_workers: bool = False
     new_base: NewBase = NewBase.COMPUTED
     remap: str | None = None
     from_tracks: str | None = None
@@ -261,6 +262,7 @@ STAGES: tuple[Stage, ...] = (
         after=("registration", "detector"),
         config=("detection",),
         cut=Cut.BY_FRAMES,
+        new_workers=True,
         new_base=NewBase.MAPPED,
         remap=f"{_STAGES}.rebase:rebase_detections",
     ),
@@ -294,7 +296,7 @@ STAGES: tuple[Stage, ...] = (
         unit=f"{_STAGES}.tracks:chain_tracks",
         after=("tracklets",),
         config=("tracking.max_gap_s", "tracking.max_stationary_gap_s", "tracking.max_hidden_gap_s"),
-        grows=True,
+        new_workers=True,
         new_base=NewBase.MAPPED,
         remap=f"{_STAGES}.rebase:rebase_tracks",
         from_tracks="velfield.pipeline.given_tracks.write:write_given_tracks",
@@ -345,7 +347,7 @@ STAGES: tuple[Stage, ...] = (
         lines=(Line("{maps:.0f} maps"),),
         unit=f"{_STAGES}.maps:make_maps",
         after=("field",),
-        grows=True,
+        new_workers=True,
     ),
 )
 """The stages in the order of the work."""
