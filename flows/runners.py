@@ -23,6 +23,7 @@ from pydantic import Field, PositiveInt, ValidationError
 from schemas.model import Model
 from velfield.errors import InputError
 from velfield.parallel import usable_processors
+from velfield.pipeline.stage import load_stages
 
 T = TypeVar("T")
 
@@ -218,7 +219,16 @@ def open_runner(config: RunnerConfig, warn: Callable[[str], None] = warnings.war
                 _wait_for_worker(client, warn)
             _check_workers(client, warn)
             own = config.scheduler is None and config.cluster_class is None
+            if own:
+                _load_stages(client)
             yield ClientRunner(client, warn, own_workers=own)
+
+
+def _load_stages(client: Any) -> None:
+    """Let each worker import what it will need, while the run is planned; without waiting for it."""
+    for address in client.scheduler_info(n_workers=-1)["workers"]:
+        loaded = client.submit(load_stages, workers=[address], pure=False)
+        loaded.add_done_callback(lambda future: future.release())
 
 
 def check_scheduler(address: str) -> None:

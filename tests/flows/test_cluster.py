@@ -22,6 +22,7 @@ from tests.faults.test_refusals import command
 from tests.foreign_cluster import foreign_cluster
 from tests.small_flight import digests, job, process
 from velfield.errors import InputError
+from velfield.pipeline.stage import STAGES
 from velfield.run.layout import RunLayout
 from velfield.run.results import link_shared_outputs
 
@@ -70,6 +71,16 @@ def test_workers_of_our_own_keep_memory_for_pictures() -> None:
     with open_runner(RunnerConfig(workers=1)) as runner:
         text = runner.compute(delayed(os.environ.get)("MALLOC_TRIM_THRESHOLD_"))
     assert int(text) == 256 << 20
+
+
+def stages_not_loaded() -> list[str]:
+    modules = {path.partition(":")[0] for stage in STAGES for path in (stage.unit, stage.block) if path is not None}
+    return sorted(modules - set(sys.modules))
+
+
+def test_workers_of_our_own_import_what_the_stages_need_before_their_first_task() -> None:
+    with open_runner(RunnerConfig(workers=1)) as runner:
+        assert runner.compute(delayed(stages_not_loaded)()) == []
 
 
 def test_workers_of_our_own_are_restarted_and_others_are_left_alone() -> None:

@@ -123,7 +123,7 @@ def test_the_map_to_a_given_image_has_a_mesh_and_a_standard_deviation_that_both_
     layout.own_to_base.write_text(record.model_dump_json())
     store = open_registration(layout.registration, "r+")
     own_sd = np.full((3, *CELLS), 0.2, np.float32)
-    store.write(0, store.vectors(0, 3), store.statuses(), {"position_sd_px": own_sd})
+    store.write(0, store.column("vector", 0, 3), store.statuses(), {"position_sd_px": own_sd})
     frames = FrameTransforms.open(layout, CONFIG)
     transform, xy = frames.transform(0), np.array([[40.0, 60.0], [300.0, 60.0]])
     assert transform is not None

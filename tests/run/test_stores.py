@@ -87,8 +87,8 @@ def test_registration_comes_back(tmp_path: Path) -> None:
     open_registration(path, "r+").write(2, np.arange(6.0).reshape(2, 3), statuses, columns)
     store = open_registration(path)
     assert store.statuses() == ["", "", *statuses, ""]
-    np.testing.assert_array_equal(store.vector(3), [3, 4, 5])
-    assert np.isnan(store.vector(0)).all()
+    np.testing.assert_array_equal(store.column("vector")[3], [3, 4, 5])
+    assert np.isnan(store.column("vector")[0]).all()
     np.testing.assert_array_equal(store.column("n_inliers"), [0, 0, 900, 12, 0])
 
 

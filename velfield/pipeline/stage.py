@@ -394,6 +394,14 @@ def resolve(function: str) -> Callable[..., Any]:
     return found
 
 
+def load_stages() -> None:
+    """Import what the stages need: a second of a worker's time, which has nothing to do while a run is planned."""
+    for stage in STAGES:
+        for path in (stage.unit, stage.block):
+            if path is not None:
+                resolve(path)
+
+
 def stage_keys(config: FlightConfig, inputs: InputsRecord) -> dict[str, str]:
     """Each stage's content key: of the stages, the inputs and the settings that it reads, and of its version."""
     keys: dict[str, str] = {}

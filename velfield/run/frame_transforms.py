@@ -9,8 +9,10 @@ The base image of a run and the grid of its pixels.
 
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, GreyImage
 from schemas.camera import CameraRecord, PolynomialLensRecord
@@ -258,8 +260,8 @@ class FrameTransforms:
     """Applied after a frame's own: to a given base image, and from that to a newer one."""
     store: RegistrationStore
     config: RegistrationConfig
-    _vectors: dict[int, FloatArray] = field(default_factory=dict, repr=False, compare=False)
-    """The parameters of one unit of frames, by its number: those read last."""
+    _units: dict[str, tuple[int, NDArray[Any]]] = field(default_factory=dict, repr=False, compare=False)
+    """By column, number of a unit of frames and its values: those read last."""
 
     @classmethod
     def open(cls, layout: RunLayout, config: FlightConfig) -> "FrameTransforms":
@@ -295,7 +297,7 @@ class FrameTransforms:
         vector = self._vector(frame)
         if not np.isfinite(vector).all():
             return np.full(len(points), np.nan)
-        sd_px = sample_cells(self.store.position_sd_px(frame), points, self.width, self.height)
+        sd_px = sample_cells(self._of_frame("position_sd_px", frame), points, self.width, self.height)
         if not self.base_maps:
             return sd_px
         xy = FrameTransform.from_vector(
@@ -308,11 +310,13 @@ class FrameTransforms:
         return sd_px
 
     def _vector(self, frame: int) -> FloatArray:
-        unit, at = divmod(frame, self.store.unit_frames)
-        vectors = self._vectors.get(unit)
-        if vectors is None:
+        return self._of_frame("vector", frame)
+
+    def _of_frame(self, name: str, frame: int) -> NDArray[Any]:
+        """A frame's values of a column, of which a unit is read at once."""
+        unit, at = divmod(self.store.check_frame(frame), self.store.unit_frames)
+        known = self._units.get(name)
+        if known is None or known[0] != unit:
             start = unit * self.store.unit_frames
-            vectors = self.store.vectors(start, start + self.store.unit_frames)
-            self._vectors.clear()
-            self._vectors[unit] = vectors
-        return vectors[at] if at < len(vectors) else self.store.vector(frame)  # which refuses an unknown frame
+            known = self._units[name] = unit, self.store.column(name, start, start + self.store.unit_frames)
+        return np.asarray(known[1][at])

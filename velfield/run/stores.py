@@ -324,14 +324,10 @@ class RegistrationStore:
         """Frames of a chunk."""
         return int(self.group["vector"].chunks[0])
 
-    def vector(self, frame: int) -> FloatArray:
-        """Flat parameters of one frame's transform; NaN where it is not registered."""
+    def check_frame(self, frame: int) -> int:
+        """The frame itself; InputError where there is none of this number."""
         _check_frame(self.path, frame, self.group["vector"].shape[0])
-        return _read(self.path, self.group, "vector", frame)
-
-    def vectors(self, start: int, stop: int) -> FloatArray:
-        """Flat parameters of the frames ``[start, stop)``."""
-        return _read(self.path, self.group, "vector", slice(start, stop))
+        return frame
 
     def statuses(self, start: int = 0, stop: int | None = None) -> list[str]:
         """``ok``, ``failed:<reason>`` or ``skipped:<reason>`` of each frame; empty where not processed yet."""
@@ -339,17 +335,17 @@ class RegistrationStore:
         return [bytes(row).rstrip(b"\0").decode(errors="replace") for row in rows]
 
     def column(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
-        """One of ``REGISTRATION_COLUMNS``, (frames,); or ``error_px``, (frames, 6, 8): hold-out error by cell."""
-        _check_column(self.path, name, (*REGISTRATION_COLUMNS, *_CELL_ARRAYS))
-        return _read(self.path, self.group, name, slice(start, stop))
+        """A column of the frames ``[start, stop)``.
 
-    def position_sd_px(self, frame: int) -> Float32Array:
-        """Standard deviation of one frame's map by cell, (rows, columns); NaN where it has no control points.
-
-        Of a run that stored none it is the hold-out error in coarser cells, which is larger.
+        One of ``REGISTRATION_COLUMNS``, (frames,); ``vector``, (frames, n): parameters of the transforms, NaN where a
+        frame is not registered; ``error_px``, (frames, 6, 8): hold-out error by cell; ``position_sd_px``, (frames,
+        rows, columns): standard deviation of the maps by cell, NaN where there are no control points. Of a run that
+        stored none the last is the hold-out error in coarser cells, which is larger.
         """
-        name = "position_sd_px" if "position_sd_px" in self.group.by_axes.get(3, ()) else "error_px"
-        return _read(self.path, self.group, name, frame)
+        _check_column(self.path, name, (*REGISTRATION_COLUMNS, "vector", *_CELL_ARRAYS))
+        if name == "position_sd_px" and name not in self.group.by_axes.get(3, ()):
+            name = "error_px"
+        return _read(self.path, self.group, name, slice(start, stop))
 
     def files(self, start: int) -> list[Path]:
         """Files that hold the unit from frame ``start`` on, and the store's metadata."""

@@ -119,7 +119,7 @@ def predict_crops(network: Network, image: GreyImage, crops: Sequence[Crop]) -> 
         for start in range(0, len(alike), at_once):
             batch = alike[start : start + at_once]
             pixels = np.stack([image[y : y + height, x : x + width] for y, x, _, _ in batch])
-            if len(batch) == 1:
+            if max(height, width) > _TILE_PX:
                 heatmap, vector = predict_heatmap(network, pixels[0], border_px=0)
                 heatmaps, vectors = heatmap[None], vector[None]
             else:

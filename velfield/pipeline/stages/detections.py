@@ -4,7 +4,7 @@ Detections of another program in place of ours (`--detections`): later stages do
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -103,22 +103,18 @@ def detect_block(plan: Plan, frames: range) -> BlockDetections:
     search = _searcher(plan, working, has_background=record.has_background)
     parts = []
     for frame in frames:
-        if usable[frame]:
-            part = search(frame)
-            if part is not None:
-                found, cars, rectified, searched = part
-                kept = _supported(working, rectified, frame, found.xy)
-                found, cars = found.select(kept), int(kept[:cars].sum())
-                parts.append(_tabulate(found, cars, rectified, searched, frame, float(times_s[frame])))
+        found = search(frame) if usable[frame] else None
+        if found is not None:
+            parts.append(_FrameCars(frame, float(times_s[frame]), found.keep(_supported(working, found, frame))))
         advance("detections")
-    return _concatenate(parts)
+    return _tabulate(parts)
 
 
-def _supported(working: WorkingGrid, rectified: WorkingFrame, frame: int, xy_work: Points) -> Mask:
-    """Which positions (n, 2) on the working grid lie where control points support the frame's map."""
+def _supported(working: WorkingGrid, found: "_Found", frame: int) -> Mask:
+    """Which of the cars and candidates (n,) lie where control points support the frame's map."""
     transform = working.maps.transform(frame)
     assert transform is not None, "a frame that was searched is registered"
-    raw = transform.to_raw(rectified.to_base(xy_work))
+    raw = transform.to_raw(found.rectified.to_base(found.detections.xy))
     return np.asarray(np.isfinite(working.maps.position_sd_px(frame, raw)))
 
 
@@ -135,7 +131,7 @@ def _searcher(plan: Plan, working: WorkingGrid, *, has_background: bool) -> "Cal
 
     def search(frame: int) -> "_Found | None":
         found = _from_boxes(plan, working, frame, detector.detect_raw(store.read(frame), threshold=threshold))
-        return found and (*found[:3], 1.0)
+        return found and replace(found, searched=1.0)
 
     return search
 
@@ -145,11 +141,37 @@ def _from_boxes(plan: Plan, working: WorkingGrid, frame: int, boxes: pd.DataFram
     if rectified is None or transform is None:
         return None
     cars = external_detections(plan, rectified, transform, boxes)
-    return cars, len(cars), rectified, np.nan
+    return _Found(cars, len(cars), rectified, np.nan)
 
 
-_Found = tuple[FrameDetections, int, WorkingFrame, float]
-"""Cars of a frame and, after so many, weak candidates; the frame; and the fraction of it that was searched."""
+@dataclass(frozen=True)
+class _Found:
+    """What was found in a frame.
+
+    Attributes
+    ----------
+    detections : cars and, after so many (``cars``), weak candidates.
+    rectified : the frame.
+    searched : the fraction of it that was searched.
+    """
+
+    detections: FrameDetections
+    cars: int
+    rectified: WorkingFrame
+    searched: float
+
+    def keep(self, rows: Mask) -> "_Found":
+        """Some of the cars and candidates."""
+        return replace(self, detections=self.detections.select(rows), cars=int(rows[: self.cars].sum()))
+
+
+@dataclass(frozen=True)
+class _FrameCars:
+    """What was found in a frame, by its number and time."""
+
+    frame: int
+    time_s: float
+    found: _Found
 
 
 class _Search:
@@ -182,7 +204,7 @@ class _Search:
         found = concatenate([cars, searched.weak])
         order = np.lexsort((found.xy[:, 0], found.xy[:, 1], np.arange(len(found)) >= len(cars)))
         crops = attach_crops(rectified.image, found, order, half_image=searched.frame.half_image)
-        return crops, len(cars), rectified, searched.searched
+        return _Found(crops, len(cars), rectified, searched.searched)
 
     def _begin_group(self, frame: int) -> None:
         every = self._plan.config.detection.full_frame_every
@@ -233,25 +255,37 @@ def _background_of(plan: Plan, rectified: WorkingFrame) -> GreyImage:
     return np.asarray(cv2.warpAffine(whole, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-def _tabulate(
-    detections: FrameDetections, cars: int, rectified: WorkingFrame, searched: float, frame: int, time_s: float
-) -> BlockDetections:
-    xy = rectified.to_base(detections.xy)
-    table = pd.DataFrame(
-        {
-            "detection_id": frame * ID_STEP + np.arange(len(xy), dtype=np.int64),
-            "frame": frame,
-            "time_s": time_s,
-            "x_px": xy[:, 0],
-            "y_px": xy[:, 1],
-            "orientation_rad": detections.orientation_rad,
-            "orientation_sd_rad": detections.orientation_sd_rad,
-            "area_px": detections.area_px / rectified.scale**2,
-            "score": detections.score,
-        }
-    ).astype(DETECTION_COLUMNS)
-    crops = detections.patches, detections.chips, detections.strips
-    return BlockDetections(table, *crops, detections.xy, np.arange(len(xy)) >= cars, np.array([searched]))
+def _tabulate(parts: Sequence[_FrameCars]) -> BlockDetections:
+    """Frames as one table: a table a frame, then joined, cost 4 ms a frame."""
+    if not parts:
+        return _concatenate([])
+    all_found = [part.found for part in parts]
+    detections = [one.detections for one in all_found]
+    counts = np.array([len(one) for one in detections])
+    number = np.concatenate([np.arange(count) for count in counts])
+    frame = np.repeat([part.frame for part in parts], counts)
+    scale = np.repeat([one.rectified.scale for one in all_found], counts)
+    xy = np.concatenate([one.rectified.to_base(one.detections.xy) for one in all_found])
+    columns = {
+        "detection_id": frame * ID_STEP + number,
+        "frame": frame,
+        "time_s": np.repeat([part.time_s for part in parts], counts),
+        "x_px": xy[:, 0],
+        "y_px": xy[:, 1],
+        "orientation_rad": np.concatenate([one.orientation_rad for one in detections]),
+        "orientation_sd_rad": np.concatenate([one.orientation_sd_rad for one in detections]),
+        "area_px": np.concatenate([one.area_px for one in detections]) / scale**2,
+        "score": np.concatenate([one.score for one in detections]),
+    }
+    return BlockDetections(
+        pd.DataFrame(columns).astype(DETECTION_COLUMNS),
+        np.concatenate([one.patches for one in detections]),
+        np.concatenate([one.chips for one in detections]),
+        np.concatenate([one.strips for one in detections]),
+        np.concatenate([one.xy for one in detections]),
+        number >= np.repeat([one.cars for one in all_found], counts),
+        np.array([one.searched for one in all_found]),
+    )
 
 
 def _concatenate(parts: Sequence[BlockDetections]) -> BlockDetections:
