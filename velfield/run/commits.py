@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
@@ -63,11 +63,10 @@ def _digest(path: Path, *, whole_bytes: int) -> str:
         return _digest_stream(file, size, whole_bytes)
 
 
-def _digest_stream(file: IO[bytes], size: int, whole_bytes: int) -> str:
+def _digest_stream(file: io.BufferedReader | io.BytesIO, size: int, whole_bytes: int) -> str:
     digest = hashlib.blake2b(str(size).encode(), digest_size=16)
     if size <= whole_bytes:
-        while block := file.read(_SAMPLE_BYTES):
-            digest.update(block)
+        hashlib.file_digest(file, lambda: digest)  # in one buffer: a new one a block costs an eighth more
     else:
         for k in range(_SAMPLES):
             file.seek((size - _SAMPLE_BYTES) * k // (_SAMPLES - 1))
