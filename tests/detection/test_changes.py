@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from schemas.arrays import GreyImage, Mask, Points
+from velfield.detection.changes import CELL_PX
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.detect import (
     SearchedFrame,
@@ -17,8 +18,8 @@ from velfield.detection.detect import (
     split_into_boxes,
 )
 from velfield.detection.detector import Detections, concatenate, shipped_detector
-from velfield.detection.frame import CELL_PX, ComparableFrame, half_resolution
-from velfield.detection.mosaic import find_in_boxes, pack_boxes
+from velfield.detection.frame import ComparableFrame, half_resolution
+from velfield.detection.mosaic import Box, find_in_boxes, pack_boxes
 
 _SHAPE = 300, 420
 
@@ -47,6 +48,14 @@ def near(found: Points, x: float, y: float) -> bool:
     return bool(len(found)) and bool((np.hypot(found[:, 0] - x, found[:, 1] - y) < 4).any())
 
 
+def boxes_of_px(*boxes: Box) -> list[Box]:
+    """Boxes of cells that cover boxes of px."""
+    return [
+        (top // CELL_PX, left // CELL_PX, -(-bottom // CELL_PX), -(-right // CELL_PX))
+        for top, left, bottom, right in boxes
+    ]
+
+
 def test_noise_and_exposure_are_no_change_and_a_car_that_moved_is() -> None:
     before = frame(with_cars(ground(1), [(100, 100), (300, 200)]))
     after = frame(np.clip(with_cars(ground(2), [(100, 100), (312, 200)]).astype(np.int64) + 9, 0, 255).astype(np.uint8))
@@ -68,19 +77,21 @@ def test_changed_cells_are_those_by_whole_images(shape: tuple[int, int]) -> None
     both = one.half_valid & other.half_valid
     difference = (one.half_image.astype(np.int16) - other.half_image) * both
     change = cv2.boxFilter(difference, cv2.CV_32F, (4, 4), borderType=cv2.BORDER_REPLICATE)
-    end = [-size % 8 for size in both.shape]
+    side = CELL_PX // 2
+    end = [-size % side for size in both.shape]
     slow = []
     for values in (difference, both):
         whole = np.pad(values.astype(np.float64), [(0, size) for size in end])
-        mean = whole.reshape(whole.shape[0] // 8, 8, -1, 8).mean(axis=(1, 3))
-        slow.append(cv2.blur(mean.astype(np.float32), (6, 6), borderType=cv2.BORDER_REPLICATE))
-    about = np.kron(slow[0] / np.maximum(slow[1], 1e-3), np.ones((8, 8), np.float32))[: both.shape[0], : both.shape[1]]
+        mean = whole.reshape(whole.shape[0] // side, side, -1, side).mean(axis=(1, 3))
+        slow.append(cv2.blur(mean.astype(np.float32), (48 // side,) * 2, borderType=cv2.BORDER_REPLICATE))
+    about = np.kron(slow[0] / np.maximum(slow[1], 1e-3), np.ones((side, side), np.float32))
+    about = about[: both.shape[0], : both.shape[1]]
     sample = np.s_[4::8, 4::8]
     noise = 1.4826 * np.median(np.abs(change - about)[sample][both[sample]])
     limit = np.float32(np.clip(5 * noise, 3, 8)) + np.float32(0.15) * box_mean_slope(other)
     marked = (both & (np.abs(change - about) > limit)) | (one.half_valid != other.half_valid)
     padded = np.pad(marked, [(0, size) for size in end])
-    cells = padded.reshape(padded.shape[0] // 8, 8, -1, 8).any(axis=(1, 3))
+    cells = padded.reshape(padded.shape[0] // side, side, -1, side).any(axis=(1, 3))
     assert 0.2 < cells.mean() < 0.9
     np.testing.assert_array_equal(changed_cells(one, other), cells)
 
@@ -120,7 +131,9 @@ def test_an_edge_that_is_registered_a_fraction_of_a_pixel_off_is_no_change_and_a
 def test_what_is_found_in_a_mosaic_of_boxes_is_what_is_found_in_each_box() -> None:
     image = with_cars(ground(3), [(30, 40), (100, 100), (300, 200), (215, 250), (410, 290)])
     searched = frame(image)
-    boxes = [(0, 0, 5, 4), (5, 5, 9, 8), (11, 16, 14, 21), (14, 11, 19, 16), (17, 24, 19, 27)]
+    boxes = boxes_of_px(
+        (0, 0, 80, 64), (80, 80, 144, 128), (176, 256, 224, 336), (224, 176, 300, 256), (272, 384, 300, 420)
+    )
     detector = shipped_detector()
     mosaics = pack_boxes(boxes, detector.context_px)
     assert sorted(number for one in mosaics for number in one.numbers) == [0, 1, 2, 3, 4]
@@ -146,7 +159,7 @@ def test_a_detector_of_another_kind_searches_each_box_by_itself() -> None:
     shipped = shipped_detector()
     detector = Recording(shipped.record.model_copy(update={"tta_range": (0.3, 0.6)}))
     image = with_cars(ground(3), [(30, 40), (100, 100), (300, 200)])
-    boxes = [(0, 0, 5, 4), (5, 5, 9, 8), (11, 16, 14, 21)]
+    boxes = boxes_of_px((0, 0, 80, 64), (80, 80, 144, 128), (176, 256, 224, 336))
     found = find_in_boxes(detector, frame(image), image, boxes, 0.0)
     assert sorted(seen) == [(80, 112), (96, 80), (112, 96)]
     assert all(near(found.xy, x, y) for x, y in [(30, 40), (100, 100), (300, 200)])
@@ -170,6 +183,38 @@ def test_boxes_cover_the_marked_cells_once_and_cost_no_more_than_one_box(share: 
     assert cost <= (cells.shape[0] + 2) * (cells.shape[1] + 2) + 16
     if share == 0.002:
         assert cost < 0.25 * cells.size
+
+
+def split_by_trying_all(cells: Mask, box: Box, margin: float, box_cost: float) -> tuple[float, list[Box]]:
+    """Cost and boxes: as the docstring of `split_into_boxes` says, with parts down to single cells everywhere."""
+    rows, columns = np.nonzero(cells[box[0] : box[2], box[1] : box[3]])
+    top, left = box[0] + int(rows.min()), box[1] + int(columns.min())
+    bottom, right = box[0] + int(rows.max()) + 1, box[1] + int(columns.max()) + 1
+
+    def area(part: Box) -> float:
+        rows, columns = np.nonzero(cells[part[0] : part[2], part[1] : part[3]])
+        return float((np.ptp(rows) + 1 + 2 * margin) * (np.ptp(columns) + 1 + 2 * margin))
+
+    one = (bottom - top + 2 * margin) * (right - left + 2 * margin) + box_cost, [(top, left, bottom, right)]
+    halves = [((top, left, k, right), (k, left, bottom, right)) for k in range(top + 1, bottom)]
+    halves += [((top, left, bottom, k), (top, k, bottom, right)) for k in range(left + 1, right)]
+    if not halves:
+        return one
+    parts = min(halves, key=lambda pair: sum(map(area, pair)))
+    costs, boxes = zip(*(split_by_trying_all(cells, part, margin, box_cost) for part in parts), strict=True)
+    return (sum(costs), [*boxes[0], *boxes[1]]) if sum(costs) < one[0] else one
+
+
+@pytest.mark.parametrize("share", [0.02, 0.1, 0.3, 0.7, 0.97, 1.0])
+@pytest.mark.parametrize("margin", [1.0, 2.0])
+def test_boxes_are_those_of_trying_all_parts(share: float, margin: float) -> None:
+    for seed in range(4):
+        cells = np.random.default_rng(seed).random((13, 17)) < share
+        cells[4, 5] = True
+        cost, boxes = split_by_trying_all(cells, (0, 0, *cells.shape), margin, 18.75)
+        found = split_into_boxes(cells, margin, 18.75)
+        assert sum((b - t + 2 * margin) * (r - e + 2 * margin) + 18.75 for t, e, b, r in found) == cost
+        assert sorted(found) == sorted(boxes)
 
 
 def test_two_marks_far_apart_are_two_boxes() -> None:

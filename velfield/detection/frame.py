@@ -9,9 +9,6 @@ import numpy as np
 
 from schemas.arrays import GreyImage, Mask
 
-CELL_PX = 16
-"""Side of the cells in which frames are compared and searched, working px."""
-
 
 class SearchableFrame(Protocol):
     """What is read of a frame that is searched: `ComparableFrame`, or `velfield.registration.warp.Rectification`."""
@@ -36,8 +33,8 @@ class SearchableFrame(Protocol):
         """Where the frame covers it."""
         ...
 
-    def resample(self, cells: Mask) -> None:
-        """Fill `image` and `valid` in the cells (rows, columns) of `CELL_PX` px of a mask."""
+    def resample(self, cells: Mask, side_px: int) -> None:
+        """Fill `image` and `valid` in the cells (rows, columns) of a mask, of so many px."""
         ...
 
 
@@ -70,7 +67,7 @@ class ComparableFrame:
         """Every other pixel of every other row."""
         return np.ascontiguousarray(self.valid[::2, ::2])
 
-    def resample(self, cells: Mask) -> None:
+    def resample(self, cells: Mask, side_px: int) -> None:
         """Nothing: all of it is there."""
 
 

@@ -12,8 +12,9 @@ import cv2
 import numpy as np
 
 from schemas.arrays import GreyImage, IntArray
+from velfield.detection.changes import CELL_PX
 from velfield.detection.detector import Crop, Detections, Detector, concatenate
-from velfield.detection.frame import CELL_PX, SearchableFrame
+from velfield.detection.frame import SearchableFrame
 
 Box = tuple[int, int, int, int]
 """Of cells: first row, first column, row and column after the last."""

@@ -248,7 +248,7 @@ STAGES: tuple[Stage, ...] = (
     # Cars of each block, then one table with their crops.
     Stage(
         name="detections",
-        version=15,
+        version=16,
         label="detections",
         lines=(
             Line(

@@ -276,11 +276,27 @@ class Rectification:
         resample_cells(extend_border(source), coarse, step, np.argwhere(cells), image, valid)
         return image, valid
 
-    def resample(self, cells: Mask) -> None:
-        """Fill the cells (rows, columns) of a mask in `image` and `valid`, where they are not filled yet."""
+    def resample(self, cells: Mask, side_px: int = CELL_PX) -> None:
+        """Fill `image` and `valid` in the cells of `CELL_PX` in which those of a mask lie, unless filled before.
+
+        Parameters
+        ----------
+        cells
+            (rows, columns) of cells of ``side_px``, of which a whole number makes `CELL_PX`.
+        """
+        if side_px != CELL_PX:
+            cells = _join_cells(cells, CELL_PX // side_px, self._done.shape)
         source, coarse = self._source
         resample_cells(source, coarse, self._step, np.argwhere(cells & ~self._done), self.image, self.valid)
         self._done |= cells
+
+
+def _join_cells(cells: Mask, count: int, shape: tuple[int, ...]) -> Mask:
+    """Cells (rows, columns) so many times as large, of a shape: those in which any of the given ones is marked."""
+    rows, columns = shape
+    padded = np.zeros((count * rows, count * columns), bool)
+    padded[: cells.shape[0], : cells.shape[1]] = cells
+    return np.asarray(padded.reshape(rows, count, columns, count).any(axis=(1, 3)))
 
 
 def extend_border(source: GreyImage) -> GreyImage:
