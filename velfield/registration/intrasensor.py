@@ -94,7 +94,7 @@ _MIN_ALIGNED_FRACTION = 0.15
 """If a smaller fraction of the patches aligns, the prior was wrong: the frame is not registered."""
 _FLOW_SIGMA_PX = 0.7
 _FLOW_POINTS = 500
-_FLOW_SCALE, _FLOW_LEVELS, _FLOW_WINDOW_PX = 0.5, 4, 21
+_FLOW_SCALE, _FLOW_LEVELS, _FLOW_WINDOW_PX = 0.25, 3, 21
 """Of optical flow: scale of the frames, levels of their pyramids above that, side of the window."""
 _FLOW_ENDS = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 10, 0.03)
 """A point is followed for so many iterations, or until it moves by less than so many px of the scaled frame."""
