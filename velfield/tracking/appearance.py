@@ -167,7 +167,7 @@ def prepare_crops(crops: ByteArray, axis_rad: FloatArray) -> PreparedCrops:
         raise ValueError(f"crops of {crops.shape[1:]} px, expected {2 * _HALF_SIDE} x {2 * _HALF_SIDE}")
     spare = np.zeros(len(crops) * _PART * 16 + 2 * _CHUNK, np.uint8)
     parts = spare[_CHUNK:-_CHUNK].reshape(len(crops), 4, 4, _PART)
-    return PreparedCrops(parts, spare, _prepare(crops, axis_rad, parts))
+    return PreparedCrops(parts, spare, _prepare(np.ascontiguousarray(crops), axis_rad, parts))
 
 
 def crop_differences(before: PreparedCrops, after: PreparedCrops, first: IntArray, second: IntArray) -> FloatArray:
@@ -208,12 +208,29 @@ _HALF_SIDE, _PART = 16, 256
 _SHIFTS = _shifts_shortest_first()
 
 
+@intrinsic
+def _split_row(_context, row, at, out, to):  # type: ignore[no-untyped-def]
+    """Store the even ones of 32 bytes from ``row[at]`` on from ``out[to]`` on, the odd ones a part farther."""
+
+    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, build, signature, arguments, 2 * _HALF_SIDE)
+        row, at, out, to = v.arguments
+        half, line = Vectors(context, build, signature, arguments, _HALF_SIDE), v.load(row, at)
+        for odd in range(2):
+            order = half.constant(WORD, np.arange(odd, 2 * _HALF_SIDE, 2))
+            half.store(build.shuffle_vector(line, line, order), out, to, odd * _PART)
+        return context.get_dummy_value()
+
+    return types.void(row, at, out, to), generate
+
+
 @njit(cache=True, nogil=True)
 def _prepare(crops, axes, parts):  # type: ignore[no-untyped-def]
     """Fill in the ``parts`` of `PreparedCrops`; returns its ``rows``."""
     n, side = crops.shape[0], crops.shape[1]
     low, high = np.empty((side, side), np.uint8), np.empty((side, side), np.uint8)
-    rows, one = np.empty((n, 2), np.int64), np.uint64(1)
+    rows, one, on_car = np.empty((n, 2), np.int64), np.uint64(1), np.empty(side, np.uint8)
+    grey, lowest, highest, out = crops.reshape(-1), low.reshape(-1), high.reshape(-1), parts.reshape(-1)
     for k in range(n):
         cos, sin = np.cos(axes[k]), np.sin(axes[k])
         low[:], high[:] = crops[k], crops[k]
@@ -225,27 +242,27 @@ def _prepare(crops, axes, parts):  # type: ignore[no-untyped-def]
                 left, right = np.int32(line[x - one]), np.int32(line[x + one])
                 low_line[x] = (here + min(here, up, down, left, right)) >> 1
                 high_line[x] = (here + max(here, up, down, left, right) + 1) >> 1
-        for y in range(side):
-            q, r = 2 * (y % 2), y // 2 * _HALF_SIDE
-            for odd in range(2):
-                grey_of, low_of, high_of = parts[k, 0, q + odd], parts[k, 1, q + odd], parts[k, 2, q + odd]
-                for half in range(np.uint64(_HALF_SIDE)):
-                    at, to = np.uint64(r) + half, np.uint64(2) * half + np.uint64(odd)
-                    grey_of[at], low_of[at], high_of[at] = crops[k, y, to], low[y, to], high[y, to]
         rows[k, 0], rows[k, 1] = _HALF_SIDE, 0
-        for y in range(max(1, side // 2 - _REACH), min(side - 1, side // 2 + _REACH + 1)):
-            for x in range(max(1, side // 2 - _REACH), min(side - 1, side // 2 + _REACH + 1)):
-                dx, dy = x - side // 2, y - side // 2
-                if np.isnan(axes[k]):
-                    on_car = np.hypot(dx, dy) <= CAR_WIDTH_PX
-                else:
+        for y in range(side):
+            q, r, dy = 2 * (y % 2), y // 2 * _HALF_SIDE, y - side // 2
+            on_car[:] = 0
+            if abs(dy) <= _REACH:
+                for x in range(np.uint64(2 * _HALF_SIDE)):
+                    dx = np.int32(x) - np.int32(_HALF_SIDE)
                     along, across = abs(dx * cos + dy * sin), abs(dy * cos - dx * sin)
-                    on_car = along <= 0.5 * CAR_LENGTH_PX and across <= 0.5 * CAR_WIDTH_PX
-                if on_car:
-                    row = y // 2
-                    parts[k, 3, 2 * (y % 2) + x % 2, row * _HALF_SIDE + x // 2] = 255
-                    if y % 2:
-                        rows[k, 0], rows[k, 1] = min(rows[k, 0], row), max(rows[k, 1], row + 1)
+                    is_on = (along <= 0.5 * CAR_LENGTH_PX) & (across <= 0.5 * CAR_WIDTH_PX)
+                    on_car[x] = 255 if is_on else 0
+                if np.isnan(axes[k]):
+                    for x in range(side):
+                        on_car[x] = 255 if np.hypot(x - _HALF_SIDE, dy) <= CAR_WIDTH_PX else 0
+                if y % 2 and on_car.any():
+                    rows[k, 0], rows[k, 1] = min(rows[k, 0], y // 2), y // 2 + 1
+            to, size = np.uint64(((k * 4) * 4 + q) * _PART + r), np.uint64(4 * _PART)
+            at = np.uint64(y * side)
+            _split_row(grey, np.uint64(k * side * side) + at, out, to)
+            _split_row(lowest, at, out, to + size)
+            _split_row(highest, at, out, to + size + size)
+            _split_row(on_car, np.uint64(0), out, to + size + size + size)
     return rows
 
 
