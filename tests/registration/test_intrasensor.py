@@ -137,33 +137,33 @@ def test_patches_are_looked_for_farther_off_where_key_points_mislead() -> None:
 
 def test_rows_pulled_off_by_few_matches_are_fitted_again_from_their_neighbours() -> None:
     """A spline pulled off by 4 px over an eighth of the rows, where the right patches are out of reach."""
-    fitter, (_, fit), templates, fine = fitted("city")
+    fitter, (_, fit), templates = fitted("city")
     rows = fit.transform.row_coefficients.copy()
     rows[1, 18:24] -= 4.0
     pulled_rows = replace(fit.transform, row_coefficients=rows)
-    aligned, _ = align_patches(fine, pulled_rows, templates, coarse=False, max_shift_px=2.5)
+    aligned, _ = align_patches(fitter.grey, pulled_rows, templates, coarse=False, max_shift_px=2.5)
     pulled = fitter._fit(aligned, pulled_rows.polyprojective, replace(fit, transform=pulled_rows))
     grid = np.column_stack([np.full(60, 300.0), np.linspace(160, 270, 60)])
     good = fit.transform.to_base(grid)
     assert np.abs(pulled.transform.to_base(grid) - good).max() > 1.2
-    _, refitted, bridged = fitter._bridge_weak_rows(aligned, pulled, templates, fine)
+    _, refitted, bridged = fitter._bridge_weak_rows(aligned, pulled, templates)
     assert bridged
     assert np.abs(refitted.transform.to_base(grid) - good).max() < 0.1
 
 
 @pytest.mark.parametrize("kind", ["still", "city", "wobble"])
 def test_a_right_fit_stays_as_it_is(kind: str) -> None:
-    fitter, (points, fit), templates, fine = fitted(kind)
-    assert fitter._bridge_weak_rows(points, fit, templates, fine)[1] is fit
+    fitter, (points, fit), templates = fitted(kind)
+    assert fitter._bridge_weak_rows(points, fit, templates)[1] is fit
 
 
-def fitted(kind: str) -> tuple[_FrameFitter, tuple[ControlPoints, JointFit], Templates, np.ndarray]:
+def fitted(kind: str) -> tuple[_FrameFitter, tuple[ControlPoints, JointFit], Templates]:
     """The fit of the first frame with what it was made of."""
     (grey, _), base, lens = seen(kind, 0), base_of(kind), lens_of(flight_of(kind))
     result = registered(kind, [0])[0]
     fitter, points = _FrameFitter(grey, base, lens, CONFIG), result.control_points
     fit = fitter._fit(points, result.transform.polyprojective)
-    return fitter, (points, fit), base.templates, smooth_fine(grey)
+    return fitter, (points, fit), base.templates
 
 
 def test_result_is_the_same_however_the_flight_is_cut() -> None:
@@ -234,7 +234,7 @@ def test_a_fit_that_shows_no_patch_of_the_base_image_is_a_failure_with_the_count
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """As for strange images, whose keypoints match by chance."""
-    fitter, (points, fit), _, _ = fitted("still")
+    fitter, (points, fit), _ = fitted("still")
     monkeypatch.setattr(intrasensor, "align_patches", lambda *_a, **_k: (points.select(np.zeros(len(points), bool)), 0))
     found = fitter.fit_with_alignment(points, fit.transform.polyprojective)
     assert isinstance(found, Failure)

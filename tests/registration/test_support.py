@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from schemas.arrays import FloatArray
-from velfield.registration.mesh import CELLS, measure_support, reach
+from velfield.registration.mesh import CELLS, measure_support, nearest_points, reach
 
 WIDTH, HEIGHT = 1280, 960
 
@@ -63,3 +64,15 @@ def test_a_hole_amid_control_points_is_bridged_and_one_at_the_border_is_not() ->
     assert np.isfinite(amid)
     assert amid > 2 * beside
     assert np.isnan(border)
+
+
+@pytest.mark.parametrize(("n", "count"), [(3, 3), (40, 24), (1500, 24), (1500, 1)])
+def test_the_nearest_points_are_those_of_a_tree(n: int, count: int) -> None:
+    """Points in one corner too, and centres far from all of them."""
+    rng = np.random.default_rng(n)
+    xy = rng.uniform(0, 1, (n, 2)) * (600, 300) + (200, 100)
+    centres = rng.uniform(-500, 2000, (200, 2))
+    distances, nearest = nearest_points(xy, centres, count, 40.0)
+    expected = KDTree(xy).query(centres, k=[*range(1, count + 1)])
+    np.testing.assert_allclose(distances, expected[0], rtol=1e-14)
+    np.testing.assert_array_equal(nearest, expected[1])

@@ -1,6 +1,7 @@
 """Appearance differences: kernels equal their definitions; an axis is known up to 180 degrees."""
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from velfield.tracking.appearance import (
@@ -77,6 +78,26 @@ def test_crop_differences_equal_their_definition() -> None:
     prepared = prepare_crops(CROPS, AXES)
     got = crop_differences(prepared, prepared, FIRST, SECOND)
     assert np.allclose(got, [plain_crop_difference(i, j) for i, j in zip(FIRST, SECOND, strict=True)])
+
+
+def test_crops_of_another_size_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"crops of \(30, 32\) px, expected 32 x 32"):
+        prepare_crops(CROPS[:, 1:31], AXES)
+
+
+def test_patches_of_any_size_are_compared() -> None:
+    """Chunks of pixels reach beyond small patches and divide large ones."""
+    for length, width in ((6, 5), (20, 12)):
+        one, other = RNG.integers(0, 256, (2, 1, length, width), np.uint8)
+        inner = one[0, 1:-1, 1:-1].astype(int)
+        plain = min(
+            np.abs(inner - r[1 + dy : length - 1 + dy, 1 + dx : width - 1 + dx].astype(int)).mean()
+            for r in (other[0], other[0, ::-1, ::-1])
+            for dy in (-1, 0, 1)
+            for dx in (-1, 0, 1)
+        )
+        first = np.zeros(1, np.int64)
+        assert np.allclose(patch_differences(one, other, first, first, max_shift_px=1), plain)
 
 
 def test_the_difference_to_an_unknown_appearance_is_unknown() -> None:

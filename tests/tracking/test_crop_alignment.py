@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from schemas.arrays import ByteArray, FloatArray
 from tests.tracking_scenes import CROP_PX, Car, Detector, appearance, car, crops_of, draw, road, watch
+from velfield.tracking import crop_alignment
 from velfield.tracking.crop_alignment import (
     BLUR_SIGMA_PX,
     CAR_LENGTH_PX,
@@ -210,3 +211,17 @@ def test_crops_of_different_cars_do_not_align() -> None:
     zero = np.zeros(1, np.int64)
     found = align_crops(one, other, np.zeros(1), np.zeros(1), zero, zero)
     assert np.isnan(found).all() or found[0, 2] > 0.1
+
+
+@pytest.mark.parametrize("spread", [3.0, 60.0])
+@pytest.mark.parametrize("offset", [0.0, -30.0])
+def test_the_median_is_that_of_the_values_that_count(spread: float, offset: float) -> None:
+    """Near zero, where fewer steps lead to it, and far away; to a sixteenth of a grey level."""
+    rng = np.random.default_rng(3)
+    values = np.clip(rng.normal(offset, spread, 384), -255, 255).astype(np.float32)
+    values[rng.permutation(384)[:181]] = 1e6
+    counted = values[values < 256]
+    middle = crop_alignment._median(values, np.float32(np.nan), len(counted))
+    assert middle == pytest.approx(np.median(counted), abs=1 / 16)
+    distance = crop_alignment._median(values, np.float32(middle), len(counted))
+    assert distance == pytest.approx(np.median(np.abs(counted - middle)), abs=1 / 16)

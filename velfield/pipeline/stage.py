@@ -172,7 +172,7 @@ STAGES: tuple[Stage, ...] = (
     # Key points of spread frames, two passes to their median; or the registration of a given image.
     Stage(
         name="base",
-        version=9,
+        version=10,
         label="base image",
         lines=(
             Line(
@@ -194,7 +194,7 @@ STAGES: tuple[Stage, ...] = (
     # The chain over the unit's frames.
     Stage(
         name="registration",
-        version=11,
+        version=12,
         label="registration",
         lines=(
             Line("{registered:.0f} of {frames:.0f} frames registered, hold-out registration error {heldout_px:.2f} px"),

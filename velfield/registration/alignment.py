@@ -8,10 +8,14 @@ exposure and vignetting.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
@@ -35,10 +39,12 @@ _MIN_CORRELATION = 0.7
 _MIN_VISIBLE_FRACTION = 0.6
 """Fraction of a patch that must lie in the frame: patches of the first and last rows are cut in half."""
 _CONVERGED_PX = 0.02
-_FRACTION_BITS = 24
-"""Of positions at which the frame is sampled: as many as a float32 holds."""
-_LANES = 8
-"""Values of float32 in a vector of the processor."""
+_GREY_STEPS = 256
+"""Of one grey level of the blurred frame, which is sampled from 16 bits: far below its noise."""
+_LANES, _BLOCK = 8, 16
+"""Values of float32 in a vector of the processor; values of one pass of a loop over a patch: two vectors."""
+_MAX_REACH_PX = 256.0
+"""A patch that spreads over more of the frame than this to any side is magnified beyond sense, and does not align."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,20 +55,22 @@ class Templates:
     ----------
     xy : (n, 2) base px, integers.
     sigma_px : (n,) standard deviation of the position under image noise.
-    fine, coarse : (n, side * side) float32 grey levels about the corner, sampled at every and every second pixel.
+    fine, coarse : (m, side * side) float32 grey levels about corners, sampled at every and every second pixel.
+    rows : (n,) of each in ``fine`` and ``coarse``: a selection shares these.
     """
 
     xy: FloatArray
     sigma_px: FloatArray
     fine: Float32Array
     coarse: Float32Array
+    rows: IntArray
 
     def __len__(self) -> int:
         return len(self.xy)
 
     def select(self, selection: Mask | IntArray) -> "Templates":
         """The templates of a mask (n,) or of indices."""
-        return Templates(self.xy[selection], self.sigma_px[selection], self.fine[selection], self.coarse[selection])
+        return Templates(self.xy[selection], self.sigma_px[selection], self.fine, self.coarse, self.rows[selection])
 
 
 def extract_templates(base: GreyImage, xy: FloatArray, sigma_px: FloatArray, half_patch: int = HALF_PATCH) -> Templates:
@@ -82,6 +90,7 @@ def _cut_patches(
         sigma_px=sigma_px,
         fine=fine[at[:, 1:] + dy, at[:, :1] + dx],
         coarse=coarse[at[:, 1:] + _COARSE_SPACING_PX * dy, at[:, :1] + _COARSE_SPACING_PX * dx],
+        rows=np.arange(len(xy)),
     )
 
 
@@ -181,7 +190,7 @@ def smooth_coarse(fine: Float32Array) -> Float32Array:
 
 
 def align_patches(
-    image: Float32Array,
+    image: GreyImage | Float32Array,
     transform: FrameTransform,
     templates: Templates,
     *,
@@ -193,7 +202,8 @@ def align_patches(
     Parameters
     ----------
     image
-        (h, w) float32, the raw frame blurred by `smooth_fine` or, if ``coarse``, by `smooth_coarse` after it.
+        (h, w) uint8, the raw frame, which is blurred as by `smooth_fine` about each patch; or float32, the raw frame
+        blurred by `smooth_fine` or, if ``coarse``, by `smooth_coarse` after it.
     transform
         The frame's map so far, accurate to about ``max_shift_px``.
     templates
@@ -210,8 +220,17 @@ def align_patches(
     start, derivative = transform.to_raw_in_frame(templates.xy)
     spacing = _COARSE_SPACING_PX if coarse else 1
     patches = templates.coarse if coarse else templates.fine
+    taps = cv2.getGaussianKernel(_FINE_TAPS, _FINE_SIGMA_PX, cv2.CV_32F).ravel()[_FINE_TAPS // 2 :]
     shift, correlation = _align_patches_kernel(
-        image, patches, start, derivative, spacing, max_shift_px, _MAX_ITERATIONS
+        np.ascontiguousarray(image),
+        taps if image.dtype == np.uint8 else taps[:0],
+        patches,
+        templates.rows,
+        start,
+        derivative,
+        spacing,
+        max_shift_px,
+        _MAX_ITERATIONS,
     )
     in_frame = np.isfinite(correlation)
     good = in_frame & (np.nan_to_num(correlation) > _MIN_CORRELATION)
@@ -222,11 +241,231 @@ def align_patches(
 
 
 @njit(cache=True, nogil=True)
-def _sample_patch(image, patch, start, derivative, shift, spacing, sample, visible):  # type: ignore[no-untyped-def]
-    """Sample the frame under a patch shifted by ``shift``; the number of pixels in the frame, their mean in both."""
+def _reflect(at, size):  # type: ignore[no-untyped-def]
+    """Index within an axis of this size of a position beyond its ends, as OpenCV's default border: 2 1 0 1 2."""
+    at = abs(at)
+    at = 2 * (size - 1) - at if at >= size else at
+    return min(max(at, 0), size - 1)
+
+
+class _Vectors:
+    """Builds instructions on vectors of ``lanes`` values, where numba alone makes loops over single ones: it does not
+    know that the arrays do not overlap. No sum is reordered and no product fused, so that all processors agree."""
+
+    def __init__(self, context: Any, build: Any, signature: Any, arguments: Any, lanes: int) -> None:
+        self.build, self.lanes = build, lanes
+        self.arguments = [
+            cgutils.create_struct_proxy(kind)(context, build, value).data if isinstance(kind, types.Array) else value
+            for kind, value in zip(signature.args, arguments, strict=True)
+        ]
+
+    def kind(self, element: Any) -> Any:
+        return ir.VectorType(element, self.lanes)
+
+    def constant(self, element: Any, values: Any) -> Any:
+        return ir.Constant(self.kind(element), list(np.broadcast_to(values, self.lanes).tolist()))
+
+    def spread(self, value: Any) -> Any:
+        """The same value in every lane."""
+        first = self.build.insert_element(ir.Constant(self.kind(value.type), ir.Undefined), value, _WORD(0))
+        return self.build.shuffle_vector(first, first, self.constant(_WORD, 0))
+
+    def place(self, start: Any, *offsets: Any) -> Any:
+        """Pointer to the vector at the sum of these offsets, numbers or 64-bit values."""
+        for offset in offsets:
+            start = self.build.gep(start, [_LONG(offset) if isinstance(offset, int) else offset])
+        return self.build.bitcast(start, self.kind(start.type.pointee).as_pointer())
+
+    def load(self, start: Any, *offsets: Any) -> Any:
+        loaded = self.build.load(self.place(start, *offsets))
+        loaded.align = 1
+        return loaded
+
+    def store(self, value: Any, start: Any, *offsets: Any) -> None:
+        self.build.store(value, self.place(start, *offsets)).align = 1
+
+    def add(self, value: Any, start: Any, *offsets: Any) -> None:
+        """Add to what is stored there."""
+        self.store(self.build.fadd(self.load(start, *offsets), value), start, *offsets)
+
+
+_WORD, _LONG, _REAL = ir.IntType(32), ir.IntType(64), ir.FloatType()
+
+
+def _blurred(vectors: _Vectors, factors: list[Any], values: list[Any]) -> Any:
+    """Sum of seven vectors by the centre's and the following three of seven symmetric factors."""
+    build, total = vectors.build, vectors.build.fmul(factors[0], values[3])
+    for k in (1, 2, 3):
+        total = build.fadd(total, build.fmul(factors[k], build.fadd(values[3 - k], values[3 + k])))
+    return total
+
+
+@intrinsic
+def _blur_across(_context, source, first, taps, out, place):  # type: ignore[no-untyped-def]
+    """Blur 8 pixels along a row of bytes, ``source[first]`` the third before the first of them."""
+
+    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
+        v = _Vectors(context, build, signature, arguments, _LANES)
+        source, first, taps, out, place = v.arguments
+        factors = [v.spread(build.load(build.gep(taps, [_LONG(k)]))) for k in range(4)]
+        values = [build.uitofp(v.load(source, first, k), v.kind(_REAL)) for k in range(7)]
+        v.store(_blurred(v, factors, values), out, place)
+        return context.get_dummy_value()
+
+    return types.void(source, first, taps, out, place), generate
+
+
+@intrinsic
+def _blur_down(_context, source, first, stride, taps, out, place):  # type: ignore[no-untyped-def]
+    """Blur 8 pixels down rows ``stride`` values apart, ``source[first]`` three rows above; in steps of grey levels."""
+
+    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
+        v = _Vectors(context, build, signature, arguments, _LANES)
+        source, first, stride, taps, out, place = v.arguments
+        factors = [v.spread(build.load(build.gep(taps, [_LONG(k)]))) for k in range(4)]
+        values = [v.load(source, first, build.mul(stride, _LONG(k))) for k in range(7)]
+        steps = build.fmul(_blurred(v, factors, values), v.constant(_REAL, float(_GREY_STEPS)))
+        v.store(build.fptosi(build.fadd(steps, v.constant(_REAL, 0.5)), v.kind(_WORD)), out, place)
+        return context.get_dummy_value()
+
+    return types.void(source, first, stride, taps, out, place), generate
+
+
+@intrinsic
+def _pack_four(_context, levels, first, stride, out, place):  # type: ignore[no-untyped-def]
+    """Pack 8 pixels of an int32 image, from ``levels[first]`` on, each with those right of and below it and between."""
+
+    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
+        v = _Vectors(context, build, signature, arguments, _LANES)
+        levels, first, stride, out, place = v.arguments
+        shift, far = v.constant(_WORD, 16), v.constant(_LONG, 32)
+        upper = build.or_(v.load(levels, first), build.shl(v.load(levels, first, 1), shift))
+        lower = build.or_(v.load(levels, first, stride), build.shl(v.load(levels, first, stride, 1), shift))
+        upper, lower = (build.zext(pair, v.kind(_LONG)) for pair in (upper, lower))
+        v.store(build.or_(upper, build.shl(lower, far)), out, place)
+        return context.get_dummy_value()
+
+    return types.void(levels, first, stride, out, place), generate
+
+
+@intrinsic
+def _add_samples(_context, window, stride, last, x, y, step_x, step_y, templates, first, count, near, sums):  # type: ignore[no-untyped-def]
+    """Interpolate 16 pixels of a packed window from (x, y) on, and add what a Gauss-Newton step needs to ``sums``.
+
+    ``templates`` holds, ``count`` values apart, where the patch is, its grey levels less their mean, and its gradients;
+    ``sums`` (5 x 16) those of the samples less ``near``, their squares, and their products with the last three.
+    """
+
+    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
+        v = _Vectors(context, build, signature, arguments, _BLOCK)
+        window, stride, last, x, y, step_x, step_y, templates, first, count, near, sums = v.arguments
+        lanes = v.constant(_REAL, np.arange(_BLOCK, dtype=float))
+        fractions, pixels = [], []
+        for start, step in ((x, step_x), (y, step_y)):
+            position = build.fadd(v.spread(start), build.fmul(lanes, v.spread(step)))
+            pixels.append(build.fptosi(position, v.kind(_WORD)))
+            fractions.append(build.fsub(position, build.sitofp(pixels[-1], v.kind(_REAL))))
+        at = build.add(build.mul(pixels[1], v.spread(stride)), pixels[0])
+        for limit, order in ((v.constant(_WORD, 0), ">"), (v.spread(last), "<")):  # lanes beyond the patch
+            at = build.select(build.icmp_signed(order, at, limit), at, limit)
+        four = ir.Constant(v.kind(_LONG), ir.Undefined)
+        for k in range(_BLOCK):
+            number = build.zext(build.extract_element(at, _WORD(k)), _LONG)
+            four = build.insert_element(four, build.load(build.gep(window, [number])), _WORD(k))
+        low, shift = v.constant(_WORD, 0xFFFF), v.constant(_WORD, 16)
+        rows = []
+        for pair in (four, build.lshr(four, v.constant(_LONG, 32))):
+            word = build.trunc(pair, v.kind(_WORD))
+            left, right = build.and_(word, low), build.lshr(word, shift)
+            left, right = (build.sitofp(value, v.kind(_REAL)) for value in (left, right))
+            rows.append(build.fadd(left, build.fmul(fractions[0], build.fsub(right, left))))
+        value = build.fadd(rows[0], build.fmul(fractions[1], build.fsub(rows[1], rows[0])))
+        value = build.fsub(build.fmul(value, v.constant(_REAL, 1.0 / _GREY_STEPS)), v.spread(near))
+        value = build.fmul(value, v.load(templates, first))
+        v.add(value, sums)
+        v.add(build.fmul(value, value), sums, _BLOCK)
+        for k in (1, 2, 3):
+            v.add(build.fmul(value, v.load(templates, first, build.mul(count, _LONG(k)))), sums, (k + 1) * _BLOCK)
+        return context.get_dummy_value()
+
+    arguments = (window, stride, last, x, y, step_x, step_y, templates, first, count, near, sums)
+    return types.void(*arguments), generate
+
+
+@intrinsic
+def _add_gradients(_context, padded, row, mean, factor, templates, inner, first, count, sums):  # type: ignore[no-untyped-def]
+    """Fill in 16 values of a patch less its mean and of its gradients in ``templates``, as `_add_samples` takes them.
+
+    ``padded`` holds the patch in rows of ``row`` values after one row of zeros, ``inner`` is one within its border.
+    ``sums`` (8 x 16) are those of the squares, the products of gradients (xx, xy, yy), of gradients and grey levels
+    (x, y), and of the gradients (x, y).
+    """
+
+    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
+        v = _Vectors(context, build, signature, arguments, _BLOCK)
+        padded, row, mean, factor, templates, inner, first, count, sums = v.arguments
+        value = build.fsub(v.load(padded, first, row), v.spread(mean))
+        value = build.fmul(value, v.load(templates, first))
+        scale = build.fmul(v.spread(factor), v.load(inner, first))
+        x = build.fmul(scale, build.fsub(v.load(padded, first, row, 1), v.load(padded, first, row, -1)))
+        y = build.fmul(scale, build.fsub(v.load(padded, first, row, row), v.load(padded, first)))
+        for k, part in enumerate((value, x, y)):
+            v.store(part, templates, first, build.mul(count, _LONG(k + 1)))
+        products = ((value, value), (x, x), (x, y), (y, y), (x, value), (y, value))
+        for k, part in enumerate([*(build.fmul(one, other) for one, other in products), x, y]):
+            v.add(part, sums, k * _BLOCK)
+        return context.get_dummy_value()
+
+    return types.void(padded, row, mean, factor, templates, inner, first, count, sums), generate
+
+
+@njit(cache=True, nogil=True)
+def _fill_window(image, taps, x0, y0, rows, columns, line, across, levels, window):  # type: ignore[no-untyped-def]
+    """Fill in ``window`` (rows * columns) from pixel (x0, y0) of a frame on: each pixel of the blurred frame with those
+    right of, below, and right below it, 16 bits each, one number to load where an interpolation needs four.
+
+    A frame of bytes is blurred as by `smooth_fine`; one of float32, where there are no ``taps``, is taken as it is.
+    The scratch is ``line`` (columns + 6) uint8, ``across`` ((rows + 6) * columns) float32 and ``levels`` ((rows + 1) *
+    columns) int32, with whole vectors of columns. Returns the grey level in the middle.
+    """
+    height, width = image.shape
+    stride, eight = np.uint64(columns), np.uint64(_LANES)
+    if taps.size:
+        left = x0 - 3
+        inside = left >= 0 and left + columns + 6 <= width
+        flat = image.ravel()
+        for r in range(rows + 6):
+            begin = _reflect(y0 - 3 + r, height) * width
+            if inside:
+                first = np.uint64(begin + left)
+                for c in range(np.uint64(0), stride, eight):
+                    _blur_across(flat, first + c, taps, across, np.uint64(r) * stride + c)
+            else:
+                for k in range(columns + 6):
+                    line[k] = flat[begin + _reflect(left + k, width)]
+                for c in range(np.uint64(0), stride, eight):
+                    _blur_across(line, c, taps, across, np.uint64(r) * stride + c)
+        for at in range(np.uint64(0), np.uint64(rows) * stride, eight):
+            _blur_down(across, at, stride, taps, levels, at)
+    else:
+        for r in range(rows):
+            for c in range(columns):
+                grey = image[_reflect(y0 + r, height), _reflect(x0 + c, width)]
+                levels[r * columns + c] = np.int32(grey * np.float32(_GREY_STEPS) + np.float32(0.5))
+    for at in range(np.uint64(0), np.uint64(rows - 1) * stride, eight):
+        _pack_four(levels, at, stride, window, at)
+    return levels[(rows // 2) * columns + columns // 2] / _GREY_STEPS
+
+
+@njit(cache=True, nogil=True)
+def _sample_patch(window, columns, x0, y0, shape, patch, start, derivative, shift, spacing, sample, visible):  # type: ignore[no-untyped-def]
+    """Sample the frame under a patch shifted by ``shift``; the number of pixels in the frame, their mean in both.
+
+    ``window`` holds the frame of this shape from pixel (x0, y0) on, ``columns`` a row, as `_pack_window` makes it.
+    """
     side = patch.shape[0]
     half = side // 2
-    height, width = image.shape
+    height, width = shape
     count, frame_mean, patch_mean = 0, 0.0, 0.0
     for r in range(side):
         for c in range(side):
@@ -237,9 +476,11 @@ def _sample_patch(image, patch, start, derivative, shift, spacing, sample, visib
             if visible[r, c]:
                 j, k = int(x), int(y)
                 fx, fy = x - j, y - k
-                top = image[k, j] + fx * (image[k, j + 1] - image[k, j])
-                bottom = image[k + 1, j] + fx * (image[k + 1, j + 1] - image[k + 1, j])
-                sample[r, c] = top + fy * (bottom - top)
+                four = window[(k - y0) * columns + j - x0]
+                a, b, below = four & 0xFFFF, (four >> 16) & 0xFFFF, (four >> 32) & 0xFFFF
+                top = a + fx * (b - a)
+                bottom = below + fx * (((four >> 48) & 0xFFFF) - below)
+                sample[r, c] = (top + fy * (bottom - top)) / _GREY_STEPS
                 frame_mean += sample[r, c]
                 patch_mean += patch[r, c]
                 count += 1
@@ -281,51 +522,29 @@ def _gauss_newton_step(patch, sample, visible, frame_mean, patch_mean, spacing):
 
 
 @njit(cache=True, nogil=True)
-def _gradients(patch, spacing, centred, gx, gy, sums):  # type: ignore[no-untyped-def]
+def _prepare_patch(patch, spacing, row, padded, templates, inner, sums):  # type: ignore[no-untyped-def]
     """Fill in a patch less its mean and its gradients, zero in the border and beyond; sums that every step needs.
 
-    ``centred``, ``gx``, ``gy`` (side, columns) and the scratch ``sums`` (7, columns) have whole vectors of columns. A
-    sum for each column leaves no order of additions to the compiler.
+    ``templates`` (4 * n) starts with ones in the patch, zeros beyond, in rows of ``row`` values, whole vectors. The
+    scratch is ``padded``, n values and a row of zeros before and after these, and ``sums`` (8 * 16).
     """
-    side, inner = patch.shape[0], np.uint64(patch.shape[0] - 1)
-    gx[0], gy[0], gx[side - 1], gy[side - 1], sums[:] = 0.0, 0.0, 0.0, 0.0, 0.0
-    a0, a1, a2, a3, a4, a5, a6 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6]
-    total = 0.0
+    side, total = patch.shape[0], 0.0
+    n = np.uint64(side * row)
     for r in range(side):
-        line = patch[r]
+        line, begin = patch[r], np.uint64((r + 1) * row)
         for c in range(np.uint64(side)):
-            a6[c] += line[c]
-    for c in range(side):
-        total += a6[c]
-    mean, factor, one = np.float32(total / (side * side)), np.float32(0.5 / spacing), np.uint64(1)
-    for r in range(side):
-        line, out = patch[r], centred[r]
+            padded[begin + c] = line[c]
         for c in range(np.uint64(side)):
-            out[c] = line[c] - mean
-    for r in range(1, side - 1):
-        line, above, below, along, across = patch[r], patch[r - 1], patch[r + 1], gx[r], gy[r]
-        for c in range(one, inner):
-            along[c] = factor * (line[c + one] - line[c - one])
-            across[c] = factor * (below[c] - above[c])
-    for r in range(side):
-        value, along, across = centred[r], gx[r], gy[r]
-        for c in range(np.uint64(side)):
-            a0[c] += value[c] * value[c]
-            a1[c] += along[c] * along[c]
-            a2[c] += along[c] * across[c]
-        for c in range(np.uint64(side)):
-            a3[c] += across[c] * across[c]
-            a4[c] += along[c] * value[c]
-            a5[c] += across[c] * value[c]
-    square, hxx, hxy, hyy, own_x, own_y = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for c in range(side):
-        square += a0[c]
-        hxx += a1[c]
-        hxy += a2[c]
-        hyy += a3[c]
-        own_x += a4[c]
-        own_y += a5[c]
-    return square, hxx, hxy, hyy, own_x, own_y
+            total += line[c]
+    mean, factor = np.float32(total / (side * side)), np.float32(0.5 / spacing)
+    sums[:] = 0.0
+    for k in range(np.uint64(0), n, np.uint64(_BLOCK)):
+        _add_gradients(padded, np.uint64(row), mean, factor, templates, inner, k, n, sums)
+    out = np.zeros(8)
+    for p in range(8):
+        for k in range(_BLOCK):
+            out[p] += sums[p * _BLOCK + k]
+    return out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7]
 
 
 @njit(cache=True, nogil=True)
@@ -340,104 +559,129 @@ def _is_inside(image, start, derivative, shift, reach):  # type: ignore[no-untyp
 
 
 @njit(cache=True, nogil=True)
-def _step_inside(image, start, derivative, shift, spacing, centred, gx, gy, of_patch, sample, sums):  # type: ignore[no-untyped-def]
-    """Gauss-Newton step and correlation of a patch that lies in the frame as a whole.
+def _step_inside(window, columns, start, derivative, shift, spacing, side, templates, of_patch, near, sums):  # type: ignore[no-untyped-def]
+    """Gauss-Newton step of a patch that lies in the frame as a whole, its correlation, and the frame's mean under it.
 
-    Equal to `_sample_patch` and `_gauss_newton_step` but for the rounding of float32. The frame is sampled at positions
-    in whole multiples of 2^-24 px, of which integers alone give pixel and fraction: twice as fast as converting floats.
-    The scratch ``sample`` (side, columns) and ``sums`` (7, columns) have whole vectors of columns. Without numba's
-    fastmath: with it, code just compiled and the same code from the cache differed in the last bits.
+    Equal to `_sample_patch` and `_gauss_newton_step` but for the rounding of float32. ``start`` is in px of the window
+    that `_fill_window` makes, ``templates`` and ``of_patch`` are from `_prepare_patch`; ``near`` is about the mean,
+    which keeps the sums small.
     """
-    side = centred.shape[0]
-    half = side // 2
-    square, hxx, hxy, hyy, own_x, own_y = of_patch
-    flat, width = image.ravel(), image.shape[1]
-    one, under = np.uint64(1), np.uint64(width)
-    unit, part = float(1 << _FRACTION_BITS), np.float32(1.0 / (1 << _FRACTION_BITS))
-    fraction = (1 << _FRACTION_BITS) - 1
+    square, hxx, hxy, hyy, own_x, own_y, sum_x, sum_y = of_patch
+    n, half = np.uint64(templates.size // 4), side // 2
+    row, stride, last = templates.size // 4 // side, np.int32(columns), np.int32(window.size - 1)
     ox, oy = shift[0] - half * spacing, shift[1] - half * spacing
     left = start[0] + derivative[0, 0] * ox + derivative[0, 1] * oy
     top = start[1] + derivative[1, 0] * ox + derivative[1, 1] * oy
-    step_x, step_y = int(derivative[0, 0] * spacing * unit), int(derivative[1, 0] * spacing * unit)
+    step_x, step_y = np.float32(derivative[0, 0] * spacing), np.float32(derivative[1, 0] * spacing)
+    offset = np.float32(near)
     sums[:] = 0.0
-    a0, a1, a2, a3, a4 = sums[0], sums[1], sums[2], sums[3], sums[4]
     for r in range(side):
-        x = int((left + derivative[0, 1] * (r * spacing)) * unit)
-        y = int((top + derivative[1, 1] * (r * spacing)) * unit)
-        out = sample[r]
-        for c in range(np.uint64(side)):
-            at = np.uint64((y >> _FRACTION_BITS) * width + (x >> _FRACTION_BITS))
-            fx, fy = np.float32(x & fraction) * part, np.float32(y & fraction) * part
-            upper = flat[at] + fx * (flat[at + one] - flat[at])
-            lower = flat[at + under] + fx * (flat[at + under + one] - flat[at + under])
-            out[c] = upper + fy * (lower - upper)
-            x += step_x
-            y += step_y
-        for c in range(np.uint64(side)):
-            a4[c] += out[c]
-    total = 0.0
-    for c in range(side):
-        total += a4[c]
-    mean = np.float32(total / (side * side))
-    for r in range(side):
-        out, value, along, across = sample[r], centred[r], gx[r], gy[r]
-        for c in range(np.uint64(side)):
-            e = out[c] - mean
-            a0[c] += e * e
-            a1[c] += e * value[c]
-            a2[c] += e * along[c]
-            a3[c] += e * across[c]
-    frame_square, product, with_x, with_y = 0.0, 0.0, 0.0, 0.0
-    for c in range(side):
-        frame_square += a0[c]
-        product += a1[c]
-        with_x += a2[c]
-        with_y += a3[c]
+        for c in range(0, row, _BLOCK):
+            x = np.float32(left + derivative[0, 1] * (r * spacing) + derivative[0, 0] * (c * spacing))
+            y = np.float32(top + derivative[1, 1] * (r * spacing) + derivative[1, 0] * (c * spacing))
+            first = np.uint64(r * row + c)
+            _add_samples(window, stride, last, x, y, step_x, step_y, templates, first, n, offset, sums)
+    total, frame_square, product, with_x, with_y = 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(_BLOCK):
+        total += sums[k]
+        frame_square += sums[k + _BLOCK]
+        product += sums[k + 2 * _BLOCK]
+        with_x += sums[k + 3 * _BLOCK]
+        with_y += sums[k + 4 * _BLOCK]
+    mean = total / (side * side)
+    frame_square -= total * mean
+    with_x, with_y = with_x - mean * sum_x, with_y - mean * sum_y
     determinant = hxx * hyy - hxy * hxy
     if frame_square <= 1e-3 or square <= 1e-3 or determinant <= 1e-6 * (hxx + hyy) ** 2:
-        return 0.0, 0.0, -1.0
+        return 0.0, 0.0, -1.0, near
     gain = np.sqrt(square / frame_square)
     bx, by = gain * with_x - own_x, gain * with_y - own_y
     return (
         (hyy * bx - hxy * by) / determinant,
         (hxx * by - hxy * bx) / determinant,
         product / np.sqrt(frame_square * square),
+        near + mean,
     )
 
 
 @njit(cache=True, nogil=True)
-def _align_patches_kernel(image, patches, start, derivative, spacing, max_shift, iterations):  # type: ignore[no-untyped-def]
-    """Shift (n, 2) in base px and correlation (n,) of each patch.
+def _reach_in_frame(derivative, reach, max_shift):  # type: ignore[no-untyped-def]
+    """How far from its start a patch is sampled in a frame, px along x and y, and a pixel more."""
+    x = reach * (abs(derivative[0, 0]) + abs(derivative[0, 1])) + max_shift * np.hypot(
+        derivative[0, 0], derivative[0, 1]
+    )
+    y = reach * (abs(derivative[1, 0]) + abs(derivative[1, 1])) + max_shift * np.hypot(
+        derivative[1, 0], derivative[1, 1]
+    )
+    return x + 1.0, y + 1.0
 
+
+@njit(cache=True, nogil=True)
+def _align_patches_kernel(image, taps, patches, chosen, start, derivative, spacing, max_shift, iterations):  # type: ignore[no-untyped-def]
+    """Shift (n, 2) in base px and correlation (n,) of each of the ``chosen`` (n,) patches.
+
+    The frame is blurred about each patch alone, where ``taps`` are given, in a window that the processor's caches hold.
     The correlation is NaN where the patch is not in the frame, 0 where the iteration did not converge.
     """
-    n = patches.shape[0]
+    n = chosen.size
     side = int(np.sqrt(patches.shape[1]) + 0.5)
     shift = np.zeros((n, 2))
     correlation = np.full(n, np.nan)
-    visible = np.empty((side, side), np.bool_)
-    columns = (side + _LANES - 1) // _LANES * _LANES
-    sample, centred = np.zeros((side, columns), np.float32), np.zeros((side, columns), np.float32)
-    gx, gy = np.zeros((side, columns), np.float32), np.zeros((side, columns), np.float32)
-    sums = np.zeros((7, columns), np.float32)
-    reach = (side // 2) * spacing
     height, width = image.shape
+    reach = (side // 2) * spacing
+    half_x, half_y = 0, 0
+    usable = np.zeros(n, np.bool_)
     for i in range(n):
         if not np.isfinite(start[i, 0] + derivative[i, 0, 0] + derivative[i, 0, 1]):
             continue
         if not (0.0 <= start[i, 0] < width and 0.0 <= start[i, 1] < height):
             continue  # less than half of it is visible
-        patch = patches[i].reshape(side, side)
-        of_patch = _gradients(patch, spacing, centred, gx, gy, sums)
+        x, y = _reach_in_frame(derivative[i], reach, max_shift)
+        if max(x, y) > _MAX_REACH_PX:
+            correlation[i] = 0.0
+            continue
+        usable[i] = True
+        half_x, half_y = max(half_x, int(np.ceil(x))), max(half_y, int(np.ceil(y)))
+    rows, columns = 2 * half_y + 2, (2 * half_x + 2 + _LANES - 1) // _LANES * _LANES
+    line, across = np.zeros(columns + 6, np.uint8), np.zeros((rows + 6) * columns, np.float32)
+    levels, window = np.zeros((rows + 1) * columns, np.int32), np.zeros(rows * columns, np.int64)
+    row = (side + _BLOCK - 1) // _BLOCK * _BLOCK
+    padded, templates = np.zeros((side + 2) * row, np.float32), np.zeros(4 * side * row, np.float32)
+    inner, sums = np.zeros(side * row, np.float32), np.zeros(8 * _BLOCK, np.float32)
+    for r in range(side):
+        templates[r * row : r * row + side] = 1.0
+        if 0 < r < side - 1:
+            inner[r * row + 1 : r * row + side - 1] = 1.0
+    sample, visible = np.empty((side, side), np.float32), np.empty((side, side), np.bool_)
+    in_window = np.empty(2)
+    for i in range(n):
+        if not usable[i]:
+            continue
+        patch = patches[chosen[i]].reshape(side, side)
+        of_patch = _prepare_patch(patch, spacing, row, padded, templates, inner, sums)
+        x0, y0 = int(np.floor(start[i, 0])) - half_x, int(np.floor(start[i, 1])) - half_y
+        near = _fill_window(image, taps, x0, y0, rows, columns, line, across, levels, window)
+        in_window[0], in_window[1] = start[i, 0] - x0, start[i, 1] - y0
         score, converged, in_frame = 0.0, False, True
         for _ in range(iterations):
             if _is_inside(image, start[i], derivative[i], shift[i], reach):
-                x, y, score = _step_inside(
-                    image, start[i], derivative[i], shift[i], spacing, centred, gx, gy, of_patch, sample, sums
+                x, y, score, near = _step_inside(
+                    window, columns, in_window, derivative[i], shift[i], spacing, side, templates, of_patch, near, sums
                 )
             else:
                 count, frame_mean, patch_mean = _sample_patch(
-                    image, patch, start[i], derivative[i], shift[i], spacing, sample, visible
+                    window,
+                    columns,
+                    x0,
+                    y0,
+                    image.shape,
+                    patch,
+                    start[i],
+                    derivative[i],
+                    shift[i],
+                    spacing,
+                    sample,
+                    visible,
                 )
                 in_frame = count >= _MIN_VISIBLE_FRACTION * side * side
                 if not in_frame:

@@ -94,7 +94,7 @@ _MIN_ALIGNED_FRACTION = 0.15
 """If a smaller fraction of the patches aligns, the prior was wrong: the frame is not registered."""
 _FLOW_SIGMA_PX = 0.7
 _FLOW_POINTS = 500
-_FLOW_SCALE, _FLOW_LEVELS, _FLOW_WINDOW_PX = 0.5, 4, 21
+_FLOW_SCALE, _FLOW_LEVELS, _FLOW_WINDOW_PX = 0.25, 3, 21
 """Of optical flow: scale of the frames, levels of their pyramids above that, side of the window."""
 _FLOW_ENDS = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 10, 0.03)
 """A point is followed for so many iterations, or until it moves by less than so many px of the scaled frame."""
@@ -493,15 +493,16 @@ class _FrameFitter:
         fit = self._fit(points, start, stiffness=stiffness, rough=True)
         if isinstance(fit, Failure):
             return fit
-        fine = smooth_fine(self.grey)
         templates = chosen or self.base.templates
-        aligned, in_frame = align_patches(fine, fit.transform, templates, coarse=False, max_shift_px=_FINE_SHIFT_PX)
+        aligned, in_frame = align_patches(
+            self.grey, fit.transform, templates, coarse=False, max_shift_px=_FINE_SHIFT_PX
+        )
         enough = chosen is not None or len(aligned) >= _ENOUGH_FRACTION * in_frame
         if not enough:
             templates = self.base.dense_templates
-        steps = [(fine, False, _FINE_SHIFT_PX)] * 2
+        steps: list[tuple[GreyImage | Float32Array, bool, float]] = [(self.grey, False, _FINE_SHIFT_PX)] * 2
         if len(aligned) < _NEAR_FRACTION * in_frame:
-            steps.insert(0, (smooth_coarse(fine), True, _COARSE_SHIFT_PX))
+            steps.insert(0, (smooth_coarse(smooth_fine(self.grey)), True, _COARSE_SHIFT_PX))
         used, settled_px = points, _SETTLED_PX if chosen is None else _SETTLED_IN_CHAIN_PX
         for k, (image, is_coarse, limit) in enumerate(steps):
             if k or not enough:
@@ -518,13 +519,13 @@ class _FrameFitter:
                 break
         if chosen is None:
             for _ in range(_MAX_BRIDGES):
-                used, fit, bridged = self._bridge_weak_rows(used, fit, templates, fine)
+                used, fit, bridged = self._bridge_weak_rows(used, fit, templates)
                 if not bridged:
                     break
         return used, fit
 
     def _bridge_weak_rows(
-        self, used: ControlPoints, fit: JointFit, templates: Templates, fine: Float32Array
+        self, used: ControlPoints, fit: JointFit, templates: Templates
     ) -> tuple[ControlPoints, JointFit, bool]:
         """The fit, or one through other alignments where rows have few inliers, if more patches agree; and whether.
 
@@ -540,7 +541,7 @@ class _FrameFitter:
         for part in rows:
             part[weak] = np.interp(np.flatnonzero(weak), np.flatnonzero(~weak), part[~weak])
         bridged = replace(fit, transform=replace(fit.transform, row_coefficients=rows))
-        aligned, _ = align_patches(fine, bridged.transform, templates, coarse=False, max_shift_px=_FINE_SHIFT_PX)
+        aligned, _ = align_patches(self.grey, bridged.transform, templates, coarse=False, max_shift_px=_FINE_SHIFT_PX)
         again = aligned.concatenate(_select_in_empty_cells(used, aligned, *self.size))
         refit = self._fit(again, bridged.transform.polyprojective, bridged)
         if isinstance(refit, Failure):

@@ -8,12 +8,14 @@ shifts. The smallest difference is taken.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
+from numba import njit, types
+from numba.extending import intrinsic
 
-from schemas.arrays import ByteArray, FloatArray, IntArray, Mask
+from schemas.arrays import ByteArray, FloatArray, IntArray
+from velfield.tracking.crop_alignment import BYTE, WORD, Vectors
 
 MAX_PATCH_SHIFT_PX = 2
 """Patches are compared at shifts of up to this, working px, either way and either axis."""
@@ -73,39 +75,56 @@ def patch_differences(
     return np.asarray(_differences(before, after, first, second, max_shift_px), dtype=np.float64)
 
 
+_CHUNK = 64
+"""Pixels that are compared at a time."""
+
+
+@intrinsic
+def _absolute_sum(_context, before, at, after, to, counted):  # type: ignore[no-untyped-def]
+    """Sum of the absolute differences of 64 pixels from ``before[at]`` and ``after[to]`` on, where ``counted[at]`` has
+    all bits."""
+
+    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, build, signature, arguments, _CHUNK)
+        before, at, after, to, counted = v.arguments
+        one, other = v.load(before, at), v.load(after, to)
+        difference = build.sub(v.call("umax", one, other), v.call("umin", one, other))
+        difference = build.and_(difference, v.load(counted, at))
+        return v.call("vector.reduce.add", build.zext(difference, v.kind(WORD)), returns=WORD)
+
+    return types.int32(before, at, after, to, counted), generate
+
+
 @njit(cache=True, nogil=True)
 def _differences(before, after, first, second, shift):  # type: ignore[no-untyped-def]
+    """Patches by columns, so that a shift is an offset in whole chunks; the rest of a chunk is not counted."""
     length, width = before.shape[1], before.shape[2]
+    size = length * width
+    p, inner = np.zeros(size + _CHUNK, np.uint8), np.zeros(size + _CHUNK, np.uint8)
+    q, rotated = np.zeros(3 * size + _CHUNK, np.uint8), np.zeros(3 * size + _CHUNK, np.uint8)
+    for x in range(shift, width - shift):
+        inner[x * length + shift : (x + 1) * length - shift] = 255
+    begin, end = shift * length, (width - shift) * length
     counted = (length - 2 * shift) * (width - 2 * shift)
     out = np.empty(first.size, np.float64)
-    rotated = np.empty((length, width), np.uint8)
     for pair in range(first.size):
-        p = before[first[pair]]
-        q = after[second[pair]]
-        for y in range(length):
-            for x in range(width):
-                rotated[y, x] = q[length - 1 - y, width - 1 - x]
-        best = _min_absolute_sum(p, q, shift, counted * 256)
-        out[pair] = _min_absolute_sum(p, rotated, shift, best) / counted
+        one, other = before[first[pair]], after[second[pair]]
+        for x in range(width):
+            for y in range(length):
+                p[x * length + y] = one[y, x]
+                q[size + x * length + y] = other[y, x]
+                rotated[2 * size - 1 - x * length - y] = other[y, x]
+        best = counted * 256
+        for moved in (q, rotated):
+            for dx in range(-shift, shift + 1):
+                for dy in range(-shift, shift + 1):
+                    total = 0
+                    for at in range(begin, end, _CHUNK):
+                        to = np.uint64(size + at + dx * length + dy)
+                        total += _absolute_sum(p, np.uint64(at), moved, to, inner)
+                    best = min(best, total)
+        out[pair] = best / counted
     return out
-
-
-@njit(cache=True, nogil=True)
-def _min_absolute_sum(p, q, shift, best):  # type: ignore[no-untyped-def]
-    """Smallest sum of absolute differences over the shifts; a shift ends at the row where it exceeds ``best``."""
-    length, width = p.shape
-    for dy in range(-shift, shift + 1):
-        for dx in range(-shift, shift + 1):
-            total = np.int64(0)
-            for y in range(shift, length - shift):
-                row = np.int64(0)  # the difference of two uint8 would wrap
-                for x in range(shift, width - shift):
-                    row += abs(np.int64(p[y, x]) - np.int64(q[y + dy, x + dx]))
-                total += row
-                if total >= best:
-                    break
-            best = min(best, total)
-    return best
 
 
 @dataclass(frozen=True)
@@ -114,18 +133,19 @@ class PreparedCrops:
 
     Attributes
     ----------
-    grey
-        (n, side, side) uint8.
-    low, high
-        (n, side, side) uint8, minimum and maximum within half a pixel (by interpolation) of each pixel.
-    car_mask
-        (n, side, side) bool, pixels that lie on the car.
+    parts
+        (n, 4, 4, 256) uint8: grey levels, minimum and maximum within half a pixel (by interpolation) of each pixel, and
+        255 on the car; of each, the pixels of even rows and columns, of even rows and odd columns, and so on, 16 x 16
+        in the middle of the crop. At a shift, every second pixel of one crop meets neighbours of one part of the other.
+    spare
+        (n * 4096 + 128,) uint8, the same with 64 bytes before and after: those at its border are read, but not counted.
+    rows
+        (n, 2) int64, first of the 16 odd rows with a pixel on the car, and the one after the last.
     """
 
-    grey: ByteArray
-    low: ByteArray
-    high: ByteArray
-    car_mask: Mask
+    parts: ByteArray
+    spare: ByteArray
+    rows: IntArray
 
 
 def prepare_crops(crops: ByteArray, axis_rad: FloatArray) -> PreparedCrops:
@@ -134,12 +154,20 @@ def prepare_crops(crops: ByteArray, axis_rad: FloatArray) -> PreparedCrops:
     Parameters
     ----------
     crops
-        (n, side, side) uint8, upright, centred on the cars.
+        (n, 32, 32) uint8, upright, centred on the cars.
     axis_rad
         (n,) axes; NaN: the mask is a disc.
+
+    Raises
+    ------
+    ValueError
+        The crops have another size.
     """
-    low, high, car_mask = _prepare(crops, axis_rad)
-    return PreparedCrops(crops, low, high, car_mask.astype(np.bool_))
+    if crops.shape[1:] != (2 * _HALF_SIDE, 2 * _HALF_SIDE):
+        raise ValueError(f"crops of {crops.shape[1:]} px, expected {2 * _HALF_SIDE} x {2 * _HALF_SIDE}")
+    spare = np.zeros(len(crops) * _PART * 16 + 2 * _CHUNK, np.uint8)
+    parts = spare[_CHUNK:-_CHUNK].reshape(len(crops), 4, 4, _PART)
+    return PreparedCrops(parts, spare, _prepare(np.ascontiguousarray(crops), axis_rad, parts))
 
 
 def crop_differences(before: PreparedCrops, after: PreparedCrops, first: IntArray, second: IntArray) -> FloatArray:
@@ -161,87 +189,130 @@ def crop_differences(before: PreparedCrops, after: PreparedCrops, first: IntArra
     -------
     (k,) float64, grey levels.
     """
-    side = before.grey.shape[1]
-    out = _crop_differences(*_flatten(before), *_flatten(after), _shifts_shortest_first(side), side, first, second)
-    return np.asarray(out, dtype=np.float64)
+    return np.asarray(
+        _crop_differences(before.spare, before.rows, after.spare, _SHIFTS, first, second), dtype=np.float64
+    )
 
 
-def _flatten(prepared: PreparedCrops) -> tuple[NDArray[np.generic], ...]:
-    """The crops as (n, side * side)."""
-    crops = (prepared.grey, prepared.low, prepared.high, prepared.car_mask)
-    side = prepared.grey.shape[1]
-    return tuple(crop.reshape(len(crop), side * side) for crop in crops)
-
-
-def _shifts_shortest_first(side: int) -> IntArray:
-    """Flat offsets of all shifts, the shortest first."""
+def _shifts_shortest_first() -> IntArray:
+    """Where in the parts of the other crop a shift (y, x) leads the odd rows and columns of the one, shortest first."""
     steps = np.arange(-MAX_CROP_SHIFT_PX, MAX_CROP_SHIFT_PX + 1)
     dy, dx = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
     order = np.argsort(dy**2 + dx**2, kind="stable")
-    return np.asarray((dy * side + dx)[order], dtype=np.int64)
+    y, x = 1 + dy[order], 1 + dx[order]
+    return np.asarray((2 * (y % 2) + x % 2) * _PART + (y // 2) * _HALF_SIDE + x // 2, dtype=np.int64)
+
+
+_HALF_SIDE, _PART = 16, 256
+"""Side and size of a part of a crop."""
+_SHIFTS = _shifts_shortest_first()
+
+
+@intrinsic
+def _split_row(_context, row, at, out, to):  # type: ignore[no-untyped-def]
+    """Store the even ones of 32 bytes from ``row[at]`` on from ``out[to]`` on, the odd ones a part farther."""
+
+    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, build, signature, arguments, 2 * _HALF_SIDE)
+        row, at, out, to = v.arguments
+        half, line = Vectors(context, build, signature, arguments, _HALF_SIDE), v.load(row, at)
+        for odd in range(2):
+            order = half.constant(WORD, np.arange(odd, 2 * _HALF_SIDE, 2))
+            half.store(build.shuffle_vector(line, line, order), out, to, odd * _PART)
+        return context.get_dummy_value()
+
+    return types.void(row, at, out, to), generate
 
 
 @njit(cache=True, nogil=True)
-def _prepare(crops, axes):  # type: ignore[no-untyped-def]
+def _prepare(crops, axes, parts):  # type: ignore[no-untyped-def]
+    """Fill in the ``parts`` of `PreparedCrops`; returns its ``rows``."""
     n, side = crops.shape[0], crops.shape[1]
-    low, high = crops.copy(), crops.copy()
-    mask = np.zeros(crops.shape, np.uint8)
-    one = np.uint64(1)
+    low, high = np.empty((side, side), np.uint8), np.empty((side, side), np.uint8)
+    rows, one, on_car = np.empty((n, 2), np.int64), np.uint64(1), np.empty(side, np.uint8)
+    grey, lowest, highest, out = crops.reshape(-1), low.reshape(-1), high.reshape(-1), parts.reshape(-1)
     for k in range(n):
         cos, sin = np.cos(axes[k]), np.sin(axes[k])
+        low[:], high[:] = crops[k], crops[k]
         for y in range(1, side - 1):
             above, line, under = crops[k, y - 1], crops[k, y], crops[k, y + 1]
-            low_line, high_line = low[k, y], high[k, y]
+            low_line, high_line = low[y], high[y]
             for x in range(one, np.uint64(side - 1)):  # as unsigned, which makes vectors of it
                 here, up, down = np.int32(line[x]), np.int32(above[x]), np.int32(under[x])
                 left, right = np.int32(line[x - one]), np.int32(line[x + one])
                 low_line[x] = (here + min(here, up, down, left, right)) >> 1
                 high_line[x] = (here + max(here, up, down, left, right) + 1) >> 1
-        for y in range(max(1, side // 2 - _REACH), min(side - 1, side // 2 + _REACH + 1)):
-            for x in range(max(1, side // 2 - _REACH), min(side - 1, side // 2 + _REACH + 1)):
-                dx, dy = x - side // 2, y - side // 2
-                if np.isnan(axes[k]):
-                    mask[k, y, x] = np.hypot(dx, dy) <= CAR_WIDTH_PX
-                else:
+        rows[k, 0], rows[k, 1] = _HALF_SIDE, 0
+        for y in range(side):
+            q, r, dy = 2 * (y % 2), y // 2 * _HALF_SIDE, y - side // 2
+            on_car[:] = 0
+            if abs(dy) <= _REACH:
+                for x in range(np.uint64(2 * _HALF_SIDE)):
+                    dx = np.int32(x) - np.int32(_HALF_SIDE)
                     along, across = abs(dx * cos + dy * sin), abs(dy * cos - dx * sin)
-                    mask[k, y, x] = along <= 0.5 * CAR_LENGTH_PX and across <= 0.5 * CAR_WIDTH_PX
-    return low, high, mask
+                    is_on = (along <= 0.5 * CAR_LENGTH_PX) & (across <= 0.5 * CAR_WIDTH_PX)
+                    on_car[x] = 255 if is_on else 0
+                if np.isnan(axes[k]):
+                    for x in range(side):
+                        on_car[x] = 255 if np.hypot(x - _HALF_SIDE, dy) <= CAR_WIDTH_PX else 0
+                if y % 2 and on_car.any():
+                    rows[k, 0], rows[k, 1] = min(rows[k, 0], y // 2), y // 2 + 1
+            to, size = np.uint64(((k * 4) * 4 + q) * _PART + r), np.uint64(4 * _PART)
+            at = np.uint64(y * side)
+            _split_row(grey, np.uint64(k * side * side) + at, out, to)
+            _split_row(lowest, at, out, to + size)
+            _split_row(highest, at, out, to + size + size)
+            _split_row(on_car, np.uint64(0), out, to + size + size + size)
+    return rows
+
+
+@intrinsic
+def _compare_chunk(_context, before, at, after, to):  # type: ignore[no-untyped-def]
+    """Sum of the differences of 64 pixels on both cars, and their number times 65536.
+
+    ``before[at]`` and ``after[to]`` are grey levels, with the other parts of `PreparedCrops` at their distances.
+    """
+
+    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, build, signature, arguments, _CHUNK)
+        before, at, after, to = v.arguments
+        grey, low, high, mine = (v.load(before, at, 4 * _PART * k) for k in range(4))
+        other, other_low, other_high, its = (v.load(after, to, 4 * _PART * k) for k in range(4))
+        pairs = ((grey, other_high), (other_low, grey), (other, high), (low, other))
+        outside = [v.call("usub.sat", one, limit) for one, limit in pairs]
+        most = v.call("umax", v.call("umax", *outside[:2]), v.call("umax", *outside[2:]))
+        both = build.and_(mine, its)
+        most = build.zext(build.and_(most, both), v.kind(WORD))
+        number = build.zext(build.and_(both, v.constant(BYTE, 1)), v.kind(WORD))
+        total, count = (v.call("vector.reduce.add", values, returns=WORD) for values in (most, number))
+        return build.add(total, build.shl(count, WORD(16)))
+
+    return types.int32(before, at, after, to), generate
 
 
 @njit(cache=True, nogil=True)
-def _outside(value, low, high):  # type: ignore[no-untyped-def]
-    """How far a value lies outside a range of bytes."""
-    return max(value - np.int64(high), np.int64(low) - value, np.int64(0))
+def _crop_differences(before, rows, after, shifts, first, second):  # type: ignore[no-untyped-def]
+    """`crop_differences` of crops with 64 bytes about them; ``shifts`` are those of `_shifts_shortest_first`.
 
-
-@njit(cache=True, nogil=True)
-def _crop_differences(p, p_low, p_high, p_mask, q, q_low, q_high, q_mask, shifts, side, first, second):  # type: ignore[no-untyped-def]
-    """Crops are (n, side * side); ``shifts`` are flat offsets, the shortest first, so that most sums end early."""
+    Every second pixel in x and y is as accurate as all of them, in a quarter of the time.
+    """
     out = np.empty(first.size, np.float64)
-    pixels = np.empty(side * side, np.int64)
+    size = np.uint64(16 * _PART)
     for pair in range(first.size):
         i, j = first[pair], second[pair]
+        own, other = np.uint64(i) * size + np.uint64(_CHUNK), np.uint64(j) * size + np.uint64(_CHUNK)
+        begin, end = np.uint64(rows[i, 0] * _HALF_SIDE), np.uint64(max(rows[i]) * _HALF_SIDE)
         n = 0
-        # Every second pixel in x and y is as accurate as all of them, in a quarter of the time.
-        for y in range(MAX_CROP_SHIFT_PX, side - MAX_CROP_SHIFT_PX, 2):
-            for x in range(MAX_CROP_SHIFT_PX, side - MAX_CROP_SHIFT_PX, 2):
-                if p_mask[i, y * side + x]:
-                    pixels[n] = y * side + x
-                    n += 1
+        for at in range(begin, end, np.uint64(_CHUNK)):
+            n += _compare_chunk(before, own + at + np.uint64(3 * _PART), before, own + at + np.uint64(3 * _PART)) >> 16
         best = 255.0
         for shift in shifts:
-            total, counted = np.int64(0), 0
-            limit = best * n
-            for k in range(n):
-                at, to = np.uint64(pixels[k]), np.uint64(pixels[k] + shift)  # unsigned: numba omits the wraparound test
-                if not q_mask[j, to]:
-                    continue
-                here = _outside(np.int64(p[i, at]), q_low[j, to], q_high[j, to])
-                there = _outside(np.int64(q[j, to]), p_low[i, at], p_high[i, at])
-                total += max(here, there)
-                counted += 1
-                if total > limit:
-                    break
+            both = np.int32(0)
+            for at in range(begin, end, np.uint64(_CHUNK)):
+                both += _compare_chunk(
+                    before, own + at + np.uint64(3 * _PART), after, np.uint64(np.int64(other + at) + shift)
+                )
+            total, counted = both & 65535, both >> 16
             if 2 * counted >= n and counted and total < best * counted:
                 best = total / counted
         out[pair] = best

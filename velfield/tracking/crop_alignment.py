@@ -18,15 +18,23 @@ deviation.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from schemas.arrays import ByteArray, Float32Array, FloatArray, IntArray
+
+BYTE, SHORT, WORD, LONG = (ir.IntType(bits) for bits in (8, 16, 32, 64))
+REAL, DOUBLE = ir.FloatType(), ir.DoubleType()
+"""Types of values in the vectors of `Vectors`."""
 
 CAR_LENGTH_PX = 14.0
 CAR_WIDTH_PX = 6.0
@@ -73,8 +81,14 @@ _SIDE = 2 * _MIDDLE
 """Index of the centre, and side, of the images that hold the box at every shift, with the samples to interpolate."""
 _LEFT = _MIDDLE - _REACH - 1
 """First column of the box in these."""
+_LANES, _RUN = 8, 32
+"""Columns that are summed at a time, and values that are counted at a time."""
+_BEYOND = 1e6
+"""Difference of a pixel without weight, grey levels."""
 _MEDIAN_STEPS = 13
 """Halvings of the range of grey levels for a median: to a sixteenth of one. It decides weights only."""
+_NEAR_MEDIAN, _NEAR_STEPS = np.float32(8.0), 8
+"""Most medians lie within this of zero, in a range that so many halvings lead to from the whole one."""
 
 
 @dataclass(frozen=True)
@@ -111,12 +125,13 @@ class AlignableCrops:
 
     Attributes
     ----------
-    grey, weight
-        (n, 40, 40) float32, blurred grey levels and weights about the centre at (20, 20); 0 beyond the crop.
-    slope_x, slope_y
-        (n, 23, 24) float32, gradients of the grey levels over the box that holds the car.
+    grey
+        (n, side, side) float32, blurred grey levels.
+    weight
+        (n, 23, 24) float32, over the box that holds the car, with the crop's centre at (11, 12).
     pixels
-        (n, 276) int32, flat index into ``grey`` of every second pixel on the car, some from all over it first.
+        (n, 276) int16, flat index into a 40 x 40 image about the centre, at (20, 20), of every second pixel on the car,
+        some from all over it first.
     counts
         (n, 3) int64: number of ``pixels``; first row of the box in which a pixel has weight, and the row after the
         last.
@@ -124,14 +139,12 @@ class AlignableCrops:
 
     grey: Float32Array
     weight: Float32Array
-    slope_x: Float32Array
-    slope_y: Float32Array
-    pixels: NDArray[np.int32]
+    pixels: NDArray[np.int16]
     counts: IntArray
 
     def fields(self) -> tuple[NDArray[Any], ...]:
         """The arrays, in this order."""
-        return self.grey, self.weight, self.slope_x, self.slope_y, self.pixels, self.counts
+        return self.grey, self.weight, self.pixels, self.counts
 
 
 @dataclass(frozen=True)
@@ -235,49 +248,80 @@ def _blur(crop, taps, rows, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _weight(dx, dy, axis, cos, sin):  # type: ignore[no-untyped-def]
-    """One on the car, tapering to zero around it; a disc where the axis is unknown."""
-    if np.isnan(axis):
-        beyond = np.hypot(dx, dy) - CAR_WIDTH_PX
-    else:
-        beyond = max(abs(dx * cos + dy * sin) - 0.5 * CAR_LENGTH_PX, abs(dy * cos - dx * sin) - 0.5 * CAR_WIDTH_PX)
-    return min(max(1.0 - beyond / TAPER_PX, 0.0), 1.0)
+def _fill_weights(axis, out):  # type: ignore[no-untyped-def]
+    """Weights over the box: one on the car, tapering to zero around it; a disc where the axis is unknown."""
+    cos, sin, unknown = np.cos(axis), np.sin(axis), np.isnan(axis)
+    for row in range(_ROWS):
+        dy, line = row - _REACH, out[row]
+        if unknown:
+            for column in range(_COLUMNS):
+                beyond = np.hypot(column - _REACH - 1, dy) - CAR_WIDTH_PX
+                line[column] = min(max(1.0 - beyond / TAPER_PX, 0.0), 1.0)
+        else:
+            for column in range(np.uint64(_COLUMNS)):
+                dx = np.int32(column) - np.int32(_REACH + 1)
+                along, across = abs(dx * cos + dy * sin), abs(dy * cos - dx * sin)
+                beyond = max(along - 0.5 * CAR_LENGTH_PX, across - 0.5 * CAR_WIDTH_PX)
+                line[column] = min(max(1.0 - beyond / TAPER_PX, 0.0), 1.0)
 
 
 @njit(cache=True, nogil=True)
 def _prepare(crops, axes, taps):  # type: ignore[no-untyped-def]
     """The fields of `AlignableCrops`."""
     n, side, radius = crops.shape[0], crops.shape[1], taps.size // 2
-    grey, weight = np.zeros((n, _SIDE, _SIDE), np.float32), np.zeros((n, _SIDE, _SIDE), np.float32)
-    slope_x, slope_y = np.zeros((n, _ROWS, _COLUMNS), np.float32), np.zeros((n, _ROWS, _COLUMNS), np.float32)
-    pixels, counts = np.zeros((n, _ROWS * _COLUMNS // 2), np.int32), np.zeros((n, 3), np.int64)
-    rows, blurred = np.empty((side + 2 * radius, side), np.float32), np.empty((side, side), np.float32)
-    on_car = np.empty(_ROWS * _COLUMNS, np.int32)
-    offset = _MIDDLE - side // 2  # of the crop in the images
-    low, high = max(0, -offset), min(side, _SIDE - offset)
-    inner_low, inner_high = max(1, side // 2 - _REACH), min(side - 1, side // 2 + _REACH + 1)
+    grey, weight = np.empty((n, side, side), np.float32), np.empty((n, _ROWS, _COLUMNS), np.float32)
+    pixels, counts = np.empty((n, _ROWS * _COLUMNS // 2), np.int16), np.zeros((n, 3), np.int64)
+    rows = np.empty((side + 2 * radius, side), np.float32)
+    on_car = np.empty(_ROWS * _COLUMNS, np.int16)
+    # Pixels that have all neighbours, and lie no farther away on one side than on the other.
+    low, high = max(0, _REACH + 1 - side // 2), min(_ROWS, side - 1 - side // 2 + _REACH)
     for i in range(n):
-        _blur(crops[i], taps, rows, blurred)
-        grey[i, low + offset : high + offset, low + offset : high + offset] = blurred[low:high, low:high]
-        cos, sin = np.cos(axes[i]), np.sin(axes[i])
+        _blur(crops[i], taps, rows, grey[i])
+        _fill_weights(axes[i], weight[i])
+        weight[i, :low], weight[i, high:], weight[i, :, : low + 1], weight[i, :, high + 1 :] = 0.0, 0.0, 0.0, 0.0
         found, first, last = 0, _ROWS, 0
-        for y in range(inner_low, inner_high):  # pixels that have all neighbours
-            for x in range(inner_low, inner_high):
-                here = _weight(x - side // 2, y - side // 2, axes[i], cos, sin)
-                if here > 0:
-                    weight[i, y + offset, x + offset] = here
-                    row, column = y + offset - _MIDDLE + _REACH, x + offset - _MIDDLE + _REACH + 1
-                    slope_x[i, row, column] = np.float32(0.5) * (blurred[y, x + 1] - blurred[y, x - 1])
-                    slope_y[i, row, column] = np.float32(0.5) * (blurred[y + 1, x] - blurred[y - 1, x])
-                    on_car[found] = (y + offset) * _SIDE + x + offset
-                    found, first, last = found + 1, min(first, row), row + 1
+        for row in range(low, high):
+            line, at = weight[i, row], (row + _MIDDLE - _REACH) * _SIDE + _LEFT
+            before = found
+            for column in range(np.uint64(_COLUMNS)):
+                on_car[np.uint64(found)] = at + np.int64(column)
+                found += line[column] > 0
+            if found > before:
+                first, last = min(first, row), row + 1
         kept = 0
         for begin in range(0, 2 * _SPREAD, 2):  # some from all over the car first
             for k in range(begin, found, 2 * _SPREAD):
                 pixels[i, kept] = on_car[k]
                 kept += 1
         counts[i, 0], counts[i, 1], counts[i, 2] = kept, min(first, last), last
-    return grey, weight, slope_x, slope_y, pixels, counts
+    return grey, weight, pixels, counts
+
+
+@njit(cache=True, nogil=True)
+def _unfold(blurred, weight, unfolded):  # type: ignore[no-untyped-def]
+    """Fill in a crop's images about its centre, (40, 40) each: grey levels and weights, 0 beyond the crop and the box;
+    and over the box the slopes of the grey levels in x and in y, those without weight too."""
+    grey, weights, slope_x, slope_y = unfolded
+    side = blurred.shape[0]
+    offset = _MIDDLE - side // 2  # of the crop in the images
+    low, high = max(0, -offset), min(side, _SIDE - offset)
+    for y in range(low, high):
+        line, into = blurred[y, low:high], grey[y + offset, low + offset : high + offset]
+        for x in range(np.uint64(high - low)):
+            into[x] = line[x]
+    half, two = np.float32(0.5), np.uint64(2)
+    for row in range(_ROWS):
+        y = _MIDDLE - _REACH + row
+        line, into = weight[row], weights[y, _LEFT : _LEFT + _COLUMNS]
+        for x in range(np.uint64(_COLUMNS)):
+            into[x] = line[x]
+        near, along = grey[y, _LEFT - 1 : _LEFT + _COLUMNS + 1], slope_x[row]
+        for x in range(np.uint64(_COLUMNS)):
+            along[x] = half * (near[x + two] - near[x])
+        above, below = grey[y - 1, _LEFT : _LEFT + _COLUMNS], grey[y + 1, _LEFT : _LEFT + _COLUMNS]
+        across = slope_y[row]
+        for x in range(np.uint64(_COLUMNS)):
+            across[x] = half * (below[x] - above[x])
 
 
 @njit(cache=True, nogil=True)
@@ -329,7 +373,7 @@ def _cubic(fraction):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _differences(grey, own, image, image_weight, top, u, v, near, lines, difference, weight):  # type: ignore[no-untyped-def]
     """Fill in the differences of image and template (rows, columns) at this shift, and the weights of those pixels on
-    the car in both; returns their number. A pixel without weight has a difference of a million grey levels.
+    the car in both; returns their number. A pixel without weight has the difference `_BEYOND`.
 
     The shift is the same for all pixels, so that the interpolation is separable; loops over whole rows of the box,
     which compilers turn into vector instructions, cost less than those over the car's pixels alone.
@@ -351,28 +395,124 @@ def _differences(grey, own, image, image_weight, top, u, v, near, lines, differe
         for x in range(columns):
             w = min(here[x], there[x])
             kept[x] = w
-            out[x] = a * p[x] + b * q[x] + c * r[x] + d * s[x] - values[x] if w > 0 else np.float32(1e6)
+            out[x] = a * p[x] + b * q[x] + c * r[x] + d * s[x] - values[x] if w > 0 else np.float32(_BEYOND)
             n += w > 0
     return n
+
+
+class Vectors:
+    """Builds instructions on vectors of ``lanes`` values within a numba intrinsic.
+
+    Numba does not know that arrays do not overlap, and makes loops over single values where several are written. No sum
+    is reordered and no product fused, so that all processors agree to the bit.
+    """
+
+    def __init__(self, context: Any, build: Any, signature: Any, arguments: Any, lanes: int) -> None:
+        self.build, self.lanes = build, lanes
+        self.arguments = [
+            cgutils.create_struct_proxy(kind)(context, build, value).data if isinstance(kind, types.Array) else value
+            for kind, value in zip(signature.args, arguments, strict=True)
+        ]
+        """Of the intrinsic: pointers to the first value of arrays, all else as it is."""
+
+    def kind(self, element: Any) -> Any:
+        """The type of a vector of such elements."""
+        return ir.VectorType(element, self.lanes)
+
+    def constant(self, element: Any, values: Any) -> Any:
+        """A vector of one number, or of as many as there are lanes."""
+        return ir.Constant(self.kind(element), list(np.broadcast_to(values, self.lanes).tolist()))
+
+    def spread(self, value: Any) -> Any:
+        """The same value in every lane."""
+        first = self.build.insert_element(ir.Constant(self.kind(value.type), ir.Undefined), value, WORD(0))
+        return self.build.shuffle_vector(first, first, self.constant(WORD, 0))
+
+    def place(self, start: Any, *offsets: Any) -> Any:
+        """Pointer to the vector at the sum of these offsets, numbers or 64-bit values."""
+        for offset in offsets:
+            start = self.build.gep(start, [LONG(offset) if isinstance(offset, int) else offset])
+        return self.build.bitcast(start, self.kind(start.type.pointee).as_pointer())
+
+    def load(self, start: Any, *offsets: Any) -> Any:
+        """The vector at the sum of these offsets; it need not be aligned."""
+        loaded = self.build.load(self.place(start, *offsets))
+        loaded.align = 1
+        return loaded
+
+    def store(self, value: Any, start: Any, *offsets: Any) -> None:
+        """Store a vector at the sum of these offsets."""
+        self.build.store(value, self.place(start, *offsets)).align = 1
+
+    def add(self, value: Any, start: Any, *offsets: Any) -> None:
+        """Add a vector of reals to what is stored there."""
+        self.store(self.build.fadd(self.load(start, *offsets), value), start, *offsets)
+
+    def call(self, name: str, *values: Any, returns: Any = None) -> Any:
+        """An instruction ``llvm.<name>`` on vectors of one type, which it returns unless another type is given."""
+        kind = values[-1].type
+        short = {BYTE: "i8", SHORT: "i16", WORD: "i32", LONG: "i64", REAL: "f32", DOUBLE: "f64"}[kind.element]
+        declared = ir.FunctionType(returns or kind, [value.type for value in values])
+        full = f"llvm.{name}.v{self.lanes}{short}"
+        return self.build.call(cgutils.get_or_insert_function(self.build.module, declared, full), values)
+
+
+def _count(v: Vectors, values: Any, count: Any, holds: Callable[[Any], Any]) -> Any:
+    """Number of the first ``count`` values, a multiple of 32, for which a condition on vectors holds."""
+    build, total = v.build, cgutils.alloca_once_value(v.build, v.constant(WORD, 0))
+    with cgutils.for_range_slice(build, LONG(0), count, LONG(_RUN)) as (at, _):
+        one = build.zext(holds(v.load(values, at)), v.kind(WORD))
+        build.store(build.add(build.load(total), one), total)
+    return v.call("vector.reduce.add", build.load(total), returns=WORD)
+
+
+@intrinsic
+def _count_below(_context, values, count, limit):  # type: ignore[no-untyped-def]
+    """Number of the first ``count`` values that lie below ``limit``."""
+
+    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, build, signature, arguments, _RUN)
+        values, count, limit = v.arguments
+        limits = v.spread(limit)
+        return _count(v, values, count, lambda value: build.fcmp_ordered("<", value, limits))
+
+    return types.int32(values, count, limit), generate
+
+
+@intrinsic
+def _count_near(_context, values, count, middle, limit):  # type: ignore[no-untyped-def]
+    """Number of the first ``count`` values that lie closer than ``limit`` to ``middle``."""
+
+    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, build, signature, arguments, _RUN)
+        values, count, middle, limit = v.arguments
+        middles, limits = v.spread(middle), v.spread(limit)
+
+        def is_near(value: Any) -> Any:
+            return build.fcmp_ordered("<", v.call("fabs", build.fsub(value, middles)), limits)
+
+        return _count(v, values, count, is_near)
+
+    return types.int32(values, count, middle, limit), generate
 
 
 @njit(cache=True, nogil=True)
 def _median(values, middle, count):  # type: ignore[no-untyped-def]
     """Median of ``count`` grey levels, to a sixteenth of one, or where ``middle`` is given that of the distances from
-    it; by halving the range, as counting takes vector instructions. Values above 256 do not count."""
-    low, high = np.float32(-256.0), np.float32(256.0)
-    flat, half = values.ravel(), (count + 1) // 2
+    it; by halving the range, as counting takes vector instructions. Values above 256 do not count: so many of them
+    follow that ``values`` are whole vectors."""
+    low, high, steps = np.float32(-256.0), np.float32(256.0), _MEDIAN_STEPS
+    half, size = (count + 1) // 2, np.uint64(values.size)
     distances = not np.isnan(middle)
     if distances:
         low = np.float32(0.0)
-    for _ in range(_MEDIAN_STEPS):
-        limit, below = np.float32(0.5) * (low + high), 0
-        if distances:
-            for i in range(np.uint64(flat.size)):
-                below += abs(flat[i] - middle) < limit
-        else:
-            for i in range(np.uint64(flat.size)):
-                below += flat[i] < limit
+        if _count_near(values, size, middle, _NEAR_MEDIAN) >= half:
+            high, steps = _NEAR_MEDIAN, _NEAR_STEPS
+    elif _count_below(values, size, -_NEAR_MEDIAN) < half <= _count_below(values, size, _NEAR_MEDIAN):
+        low, high, steps = -_NEAR_MEDIAN, _NEAR_MEDIAN, _NEAR_STEPS
+    for _ in range(steps):
+        limit = np.float32(0.5) * (low + high)
+        below = _count_near(values, size, middle, limit) if distances else _count_below(values, size, limit)
         if below < half:
             low = limit
         else:
@@ -380,37 +520,57 @@ def _median(values, middle, count):  # type: ignore[no-untyped-def]
     return np.float32(0.5) * (low + high)
 
 
+@intrinsic
+def _sum_columns(_context, difference, weight, slope_x, slope_y, rows, middle, scale, sums):  # type: ignore[no-untyped-def]
+    """Sums for each column of what a step needs, ``sums`` (10, columns): of the weights, and by these of the slopes in
+    x and in y, the differences, their squares, the squares and products of slopes, xx, xy and yy, and the products of
+    either slope and the differences. These are less ``middle``, and their weights include Tukey's biweight.
+
+    A sum for each column leaves no order of additions to the compiler.
+    """
+
+    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, build, signature, arguments, _LANES)
+        difference, weight, slope_x, slope_y, rows, middle, scale, sums = v.arguments
+        middle, scale, zero, one = v.spread(middle), v.spread(scale), v.constant(REAL, 0.0), v.constant(REAL, 1.0)
+        totals = [cgutils.alloca_once(build, v.kind(REAL)) for _ in range(10)]
+        for first in range(0, _COLUMNS, _LANES):
+            for total in totals:
+                build.store(zero, total)
+            with cgutils.for_range_slice(build, LONG(first), build.mul(rows, LONG(_COLUMNS)), LONG(_COLUMNS)) as (
+                at,
+                _,
+            ):
+                d, x, y = build.fsub(v.load(difference, at), middle), v.load(slope_x, at), v.load(slope_y, at)
+                root = build.fsub(one, build.fmul(build.fmul(d, scale), build.fmul(d, scale)))
+                root = build.select(build.fcmp_ordered(">", root, zero), root, zero)
+                w = build.fmul(v.load(weight, at), build.fmul(root, root))
+                wx, wy, wd = (build.fmul(w, part) for part in (x, y, d))
+                products = ((wd, d), (wx, x), (wx, y), (wy, y), (wx, d), (wy, d))
+                parts = [w, wx, wy, wd, *(build.fmul(left, right) for left, right in products)]
+                for total, part in zip(totals, parts, strict=True):
+                    build.store(build.fadd(build.load(total), part), total)
+            for k, total in enumerate(totals):
+                v.store(build.load(total), sums, k * _COLUMNS + first)
+        return context.get_dummy_value()
+
+    return types.void(difference, weight, slope_x, slope_y, rows, middle, scale, sums), generate
+
+
 @njit(cache=True, nogil=True)
-def _step(difference, weight, slope_x, slope_y, first, count, sums):  # type: ignore[no-untyped-def]
+def _step(difference, weight, slope_x, slope_y, count, sums):  # type: ignore[no-untyped-def]
     """One robust Gauss-Newton step with the brightness offset eliminated: (step x, step y, variance); NaN where it is
-    underdetermined. Overwrites ``difference``, ``weight`` and the scratch ``sums`` (10, columns)."""
+    underdetermined.
+
+    ``difference`` is flat, as `_median` takes it, ``weight`` and the slopes are (rows, columns); ``sums`` (10, columns)
+    is scratch.
+    """
     middle = _median(difference, np.float32(np.nan), count)
     spread = np.float32(1.4826) * _median(difference, middle, count) + np.float32(1.0)
     scale = np.float32(1.0) / (np.float32(TUKEY_C) * spread)
-    sums[:], columns = 0.0, np.uint64(_COLUMNS)
-    for y in range(difference.shape[0]):
-        d, w, gx, gy = difference[y], weight[y], slope_x[first + y], slope_y[first + y]
-        for x in range(columns):
-            d[x] -= middle
-            root = max(np.float32(1.0) - (d[x] * scale) * (d[x] * scale), np.float32(0.0))
-            w[x] *= root * root
-        # A sum for each column leaves no order of additions to the compiler; of ten arrays at once it makes no vectors.
-        a0, a1, a2, a3, a4 = sums[0], sums[1], sums[2], sums[3], sums[4]
-        for x in range(columns):
-            a0[x] += w[x]
-            a1[x] += w[x] * gx[x]
-            a2[x] += w[x] * gy[x]
-            a3[x] += w[x] * d[x]
-            a4[x] += w[x] * d[x] * d[x]
-        a5, a6, a7, a8, a9 = sums[5], sums[6], sums[7], sums[8], sums[9]
-        for x in range(columns):
-            a5[x] += w[x] * gx[x] * gx[x]
-            a6[x] += w[x] * gx[x] * gy[x]
-            a7[x] += w[x] * gy[x] * gy[x]
-            a8[x] += w[x] * gx[x] * d[x]
-            a9[x] += w[x] * gy[x] * d[x]
+    _sum_columns(difference, weight, slope_x, slope_y, np.uint64(weight.shape[0]), middle, scale, sums)
     s = sx = sy = sd = dd = xx = xy = yy = xd = yd = 0.0
-    for x in range(columns):
+    for x in range(np.uint64(_COLUMNS)):
         s += sums[0, x]
         sx += sums[1, x]
         sy += sums[2, x]
@@ -433,15 +593,18 @@ def _step(difference, weight, slope_x, slope_y, first, count, sums):  # type: ig
 
 
 @njit(cache=True, nogil=True)
-def _lucas_kanade(template, image, u, v):  # type: ignore[no-untyped-def]
+def _lucas_kanade(template, image, u, v, scratch):  # type: ignore[no-untyped-def]
     """Shift of the template in the image, and its variance; NaN where it leaves the search range or does not
-    converge. Each crop is (grey, weight, slopes in x and in y, counts), as in `AlignableCrops`."""
+    converge. Each crop is (grey, weight, slopes in x and in y, counts), as in `AlignableCrops`; the scratch is that of
+    `_align_all`."""
     grey, own_weight, slope_x, slope_y, counts = template
     first, last = counts[1], counts[2]
     rows, top = last - first, _MIDDLE - _REACH + first
-    lines = np.empty((rows + 3, _COLUMNS), np.float32)
-    difference, weight = np.empty((rows, _COLUMNS), np.float32), np.empty((rows, _COLUMNS), np.float32)
-    sums = np.empty((10, _COLUMNS), np.float32)
+    lines, values, weights, sums = scratch
+    used, whole = rows * _COLUMNS, (rows * _COLUMNS + _RUN - 1) // _RUN * _RUN
+    values[used:whole] = np.float32(_BEYOND)
+    flat, difference, weight = values[:whole], values[:used].reshape(rows, _COLUMNS), weights[:rows]
+    along, across = slope_x[first:last], slope_y[first:last]
     near = (0, 0)
     for count in range(MAX_ITERATIONS):
         if count < REWEIGHTING_ITERATIONS:
@@ -449,7 +612,7 @@ def _lucas_kanade(template, image, u, v):  # type: ignore[no-untyped-def]
         n = _differences(grey, own_weight, image[0], image[1], top, u, v, near, lines, difference, weight)
         if n < MIN_PIXELS:
             break
-        du, dv, variance = _step(difference, weight, slope_x, slope_y, first, n, sums)
+        du, dv, variance = _step(flat, weight, along, across, n, sums)
         if np.isnan(du):
             break
         length = np.hypot(du, dv)
@@ -463,27 +626,42 @@ def _lucas_kanade(template, image, u, v):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def _images():  # type: ignore[no-untyped-def]
+    """What `_unfold` fills in."""
+    return (
+        np.zeros((_SIDE, _SIDE), np.float32),
+        np.zeros((_SIDE, _SIDE), np.float32),
+        np.empty((_ROWS, _COLUMNS), np.float32),
+        np.empty((_ROWS, _COLUMNS), np.float32),
+    )
+
+
+@njit(cache=True, nogil=True)
 def _align_all(before, after, first, second, shifts):  # type: ignore[no-untyped-def]
     """`align_prepared`; ``before`` and ``after`` are the fields of `AlignableCrops`."""
-    grey_a, weight_a, slope_x_a, slope_y_a, pixels_a, counts_a = before
-    grey_b, weight_b, slope_x_b, slope_y_b, _, counts_b = after
+    grey_a, weight_a, pixels_a, counts_a = before
+    grey_b, weight_b, _, counts_b = after
     out = np.full((first.size, 3), np.nan)
     # Neighbouring residuals of a blurred image are correlated: the variance grows by the blur's footprint.
     correlated_pixels = 4 * np.pi * BLUR_SIGMA_PX**2
+    lines, values = np.empty((_ROWS + 3, _COLUMNS), np.float32), np.empty(_ROWS * _COLUMNS + _RUN, np.float32)
+    scratch = (lines, values, np.empty((_ROWS, _COLUMNS), np.float32), np.empty((10, _COLUMNS), np.float32))
+    of_a, of_b = _images(), _images()
     for k in range(first.size):
         i, j = first[k], second[k]
-        here = (grey_a[i], weight_a[i], slope_x_a[i], slope_y_a[i], counts_a[i])
-        there = (grey_b[j], weight_b[j], slope_x_b[j], slope_y_b[j], counts_b[j])
+        _unfold(grey_a[i], weight_a[i], of_a)
+        _unfold(grey_b[j], weight_b[j], of_b)
+        here, there = (*of_a, counts_a[i]), (*of_b, counts_b[j])
         x, y = _integer_shift(here[0], here[1], pixels_a[i, : counts_a[i, 0]], there[0], there[1], shifts)
         # Each way from where the other ended: half of the iterations of two that start from the whole-pixel shift.
-        fx, fy, forward = _lucas_kanade(here, there, float(x), float(y))
+        fx, fy, forward = _lucas_kanade(here, there, float(x), float(y), scratch)
         if np.isnan(fx):
-            bx, by, backward = _lucas_kanade(there, here, -float(x), -float(y))
+            bx, by, backward = _lucas_kanade(there, here, -float(x), -float(y), scratch)
             if np.isnan(bx):
                 continue
-            fx, fy, forward = _lucas_kanade(here, there, -bx, -by)
+            fx, fy, forward = _lucas_kanade(here, there, -bx, -by, scratch)
         else:
-            bx, by, backward = _lucas_kanade(there, here, -fx, -fy)
+            bx, by, backward = _lucas_kanade(there, here, -fx, -fy, scratch)
         disagreement = np.hypot(fx + bx, fy + by)
         if not disagreement <= MAX_DISAGREEMENT_PX:  # NaN too
             continue
