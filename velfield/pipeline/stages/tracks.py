@@ -52,6 +52,8 @@ from velfield.tracking.recovery import (
     recover_tracks,
 )
 
+_Columns = dict[str, np.ndarray]
+"""Of positions, (n,) each, by their names."""
 _MIDDLE = ["frame_1", "time_1_s", "x_1_px", "y_1_px"]
 _IDS = [f"detection_id_{k}" for k in range(3)]
 _BORDER_M, _BORDER_S = 5.0, 0.6
@@ -69,9 +71,7 @@ _AT_ONCE = 4
 def chain_tracks(plan: Plan) -> StageResult:
     """Give every tracklet the track that it belongs to: reads a few columns of all units, writes unit by unit."""
     sources, layout = tracklet_files(plan), plan.layout
-    tracklets = read_tables(
-        sources, TRACKLET_COLUMNS, only=[*_IDS, "frame_1", "time_1_s", "x_1_px", "y_1_px", *END_COLUMNS]
-    )
+    tracklets = read_tables(sources, TRACKLET_COLUMNS, only=[*_IDS, *_MIDDLE, *END_COLUMNS])
     ids, chain = np.unique(assign_tracks(tracklets[_IDS].to_numpy(np.int64)), return_inverse=True)
     strips = sum_strips(layout, tracklets.assign(track_id=ids[chain]), len(plan.units))
     gsd_m = read_tracking_gsd(layout) or PAPER_GSD_M
@@ -209,38 +209,72 @@ def all_positions(
     """Positions of every track (`TRACK_POSITION_COLUMNS`) by frame and track: seen, confirmed and interpolated."""
     ids = np.concatenate([tracklets[name].to_numpy() for name in _IDS])
     first = np.sort(np.unique(ids, return_index=True)[1])  # of each detection
-    row = first % max(len(tracklets), 1)
-    columns = {"track_id": tracklets["track_id"].to_numpy()[row]}
+    found_in = first % max(len(tracklets), 1)
+    xy = candidates.position_m[found.candidate] / metres
+    confirmed = {
+        "track_id": found.track_id,
+        "frame": candidates.frame[found.candidate],
+        "time_s": candidates.time_s[found.candidate],
+        "x_px": xy[:, 0],
+        "y_px": xy[:, 1],
+        "detection_id": candidates.detection_id[found.candidate],
+    }
+    known = {"track_id": tracklets["track_id"].to_numpy()[found_in], "detection_id": ids[first]}
     for name, of_detection in (
         ("frame", "frame_{}"),
         ("time_s", "time_{}_s"),
         ("x_px", "x_{}_px"),
         ("y_px", "y_{}_px"),
     ):
-        columns[name] = np.concatenate([tracklets[of_detection.format(k)].to_numpy() for k in range(3)])[first]
-    seen = pd.DataFrame({**columns, "detection_id": ids[first], "source": 0})
-    xy = candidates.position_m[found.candidate] / metres
-    confirmed = pd.DataFrame(
-        {
-            "track_id": found.track_id,
-            "frame": candidates.frame[found.candidate],
-            "time_s": candidates.time_s[found.candidate],
-            "x_px": xy[:, 0],
-            "y_px": xy[:, 1],
-            "detection_id": candidates.detection_id[found.candidate],
-            "source": 1,
-        }
-    )
-    known = pd.concat([seen, confirmed], ignore_index=True)
+        known[name] = np.concatenate([tracklets[of_detection.format(k)].to_numpy() for k in range(3)])[first]
+    known = {name: np.concatenate([known[name], values]) for name, values in confirmed.items()}
+    known["source"] = np.repeat([0, 1], [len(first), len(xy)])
     numbers, times_s = np.flatnonzero(frames.usable), frames.times_s
     inferred = [_between_frames(known, numbers, times_s), _across_gaps(found, candidates, metres, numbers, times_s)]
-    between = pd.concat(inferred, ignore_index=True).assign(detection_id=-1, source=2)
-    return _keep_surest(pd.concat([known, between], ignore_index=True))
+    parts = [known]
+    for one in inferred:
+        parts.append({**one, "detection_id": np.full_like(one["frame"], -1), "source": np.full_like(one["frame"], 2)})
+
+    def column(name: str) -> np.ndarray:
+        return np.concatenate([part[name] for part in parts])
+
+    rows = _surest(column("frame"), column("track_id"), column("source"))
+    return pd.DataFrame({name: column(name)[rows] for name in known}, copy=False)
+
+
+def _surest(frame: IntArray, track: IntArray, source: IntArray) -> IntArray:
+    """Of a track's positions in one frame (n,), the row of the one that is surest; by frame and track."""
+    order = np.lexsort((source, track, frame))
+    frame, track = frame[order], track[order]
+    changes = (np.diff(frame) != 0) | (np.diff(track) != 0)
+    return np.asarray(order[np.r_[True, changes][: len(order)]])
+
+
+def _keep_surest(positions: pd.DataFrame) -> pd.DataFrame:
+    """The rows of `_surest`."""
+    rows = _surest(*(positions[name].to_numpy() for name in ("frame", "track_id", "source")))
+    return positions.iloc[rows].reset_index(drop=True)
+
+
+def _between_frames(known: _Columns, frames: IntArray, times_s: FloatArray) -> _Columns:
+    """Frames that a track misses for a moment, linearly in time."""
+    order = np.lexsort((known["frame"], known["track_id"]))
+    track, time_s = known["track_id"][order], known["time_s"][order]
+    rank = np.searchsorted(frames, known["frame"][order])
+    same = np.diff(track) == 0
+    missed = np.where(same & (np.diff(time_s) <= _MISSED_S), np.maximum(np.diff(rank) - 1, 0), 0)
+    row = np.repeat(np.arange(len(missed)), missed)
+    step = np.arange(len(row)) - np.repeat(np.cumsum(missed) - missed, missed) + 1
+    frame = frames[rank[row] + step] if len(row) else np.empty(0, np.int64)
+    part = (times_s[frame] - time_s[row]) / (time_s[row + 1] - time_s[row])
+    before, after = order[row], order[row + 1]
+    xy = {one: known[one][before] + part * (known[one][after] - known[one][before]) for one in ("x_px", "y_px")}
+    return {"track_id": track[row], "frame": frame, "time_s": times_s[frame], **xy}
 
 
 def _across_gaps(
     found: Recovered, candidates: Candidates, metres: float, frames: IntArray, times_s: FloatArray
-) -> pd.DataFrame:
+) -> _Columns:
     """Frames within the gaps that were closed, on the way across them."""
     usable_s = times_s[frames]  # ascending
     tracks, inside, places = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [np.empty((0, 2))]
@@ -252,28 +286,7 @@ def _across_gaps(
             places.append(interpolate_gap(gap, candidates, times_s[here]) / metres)
     frame, xy = np.concatenate(inside), np.concatenate(places)
     columns = {"track_id": np.concatenate(tracks), "frame": frame, "time_s": times_s[frame]}
-    return pd.DataFrame({**columns, "x_px": xy[:, 0], "y_px": xy[:, 1]})
-
-
-def _keep_surest(positions: pd.DataFrame) -> pd.DataFrame:
-    """Of a track's positions in one frame, the one that is surest; by frame and track."""
-    table = positions.sort_values(["frame", "track_id", "source"], kind="stable", ignore_index=True)
-    return table.drop_duplicates(["frame", "track_id"], ignore_index=True)
-
-
-def _between_frames(known: pd.DataFrame, frames: IntArray, times_s: FloatArray) -> pd.DataFrame:
-    """Frames that a track misses for a moment, linearly in time."""
-    table = known.sort_values(["track_id", "frame"], ignore_index=True)
-    rank = np.searchsorted(frames, table["frame"].to_numpy())
-    same = np.diff(table["track_id"].to_numpy()) == 0
-    missed = np.where(same & (np.diff(table["time_s"].to_numpy()) <= _MISSED_S), np.maximum(np.diff(rank) - 1, 0), 0)
-    row = np.repeat(np.arange(len(missed)), missed)
-    step = np.arange(len(row)) - np.repeat(np.cumsum(missed) - missed, missed) + 1
-    frame = frames[rank[row] + step] if len(row) else np.empty(0, np.int64)
-    before, after = table.iloc[row].reset_index(drop=True), table.iloc[row + 1].reset_index(drop=True)
-    part = (times_s[frame] - before["time_s"]) / (after["time_s"] - before["time_s"])
-    xy = {name: before[name] + part * (after[name] - before[name]) for name in ("x_px", "y_px")}
-    return pd.DataFrame({"track_id": before["track_id"], "frame": frame, "time_s": times_s[frame], **xy})
+    return {**columns, "x_px": xy[:, 0], "y_px": xy[:, 1]}
 
 
 @dataclass(frozen=True)
