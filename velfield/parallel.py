@@ -13,12 +13,13 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+def parallel_map(function: Callable[[T], R], items: Iterable[T], *, at_most: int | None = None) -> list[R]:
     """Apply ``function`` to every item on a pool of threads, one a processor; results in the order of the items.
 
-    Worth it where ``function`` spends its time in kernels that release the GIL.
+    Worth it where ``function`` spends its time in kernels that release the GIL. ``at_most`` so many threads, where each
+    takes much memory.
     """
-    with ThreadPoolExecutor(usable_processors()) as pool:
+    with ThreadPoolExecutor(min(usable_processors(), at_most or usable_processors())) as pool:
         return list(pool.map(function, items))
 
 

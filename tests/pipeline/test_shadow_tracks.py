@@ -9,12 +9,14 @@ import pandas as pd
 import pytest
 
 from schemas.job import Inputs, Job
+from velfield import parallel
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import Plan, make_plan, write_flight_record
 from velfield.pipeline.stage import stages_before
 from velfield.pipeline.stages import tracks as stage
 from velfield.pipeline.stages.rectified_frames import FrameLook
+from velfield.pipeline.stages.tracklets import read_chosen, read_unit
 from velfield.run.stores import open_frames
 from velfield.tracking.casters import Caster
 
@@ -62,6 +64,32 @@ def test_the_track_of_a_shadow_is_moved_or_left_out(plan: Plan, monkeypatch: pyt
             expected[name] += rows * offset_m["xy".index(name[0])] / GSD_M
         pd.testing.assert_frame_equal(new, expected, check_exact=False, rtol=0, atol=1e-9)
     assert set(before[2]["track_id"]) - set(after[2]["track_id"]) == {moved, bent}, "a shadow's dimensions are none"
+
+
+def test_tracks_are_the_same_however_many_units_are_read_and_written_at_once(
+    plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = []
+    for processors in (1, 2, 3):
+        monkeypatch.setattr(parallel, "usable_processors", lambda number=processors: number)
+        monkeypatch.setattr(stage, "usable_processors", lambda number=processors: number)
+        compute_stages(plan, ["tracks"])
+        paths = sorted(path for path in plan.layout.tracks.rglob("*.parquet"))
+        found.append([(path.name, path.read_bytes()) for path in paths])
+    assert found[0] == found[1] == found[2]
+
+
+def test_chosen_detections_are_those_of_all(plan: Plan) -> None:
+    whole = read_unit(plan, 1)
+    rows = np.arange(0, len(whole.column["detection_id"]), 3)
+    ids = np.append(whole.column["detection_id"][rows], 2**60)
+    chosen = read_chosen(plan, 1, ids)
+    for name, values in chosen.column.items():
+        np.testing.assert_array_equal(values, whole.column[name][rows])
+    for name in ("chips", "xy_work"):
+        np.testing.assert_array_equal(chosen.patches[name], whole.patches[name][rows])
+    assert len(rows) > 10
+    assert len(read_chosen(plan, 1, np.empty(0, np.int64)).column["frame"]) == 0
 
 
 def test_without_images_of_tracks_there_are_no_shadows(plan: Plan) -> None:

@@ -63,6 +63,9 @@ def test_patches_come_back_by_name(tmp_path: Path) -> None:
     read = read_patches(tmp_path / "p.npz")
     assert read.keys() == patches.keys()
     assert all(np.array_equal(read[name], values) for name, values in patches.items())
+    some = read_patches(tmp_path / "p.npz", only=["none"])
+    assert some.keys() == {"none"}
+    assert some["none"].shape == (0, 8, 16)
     assert list(tmp_path.glob("*.partial")) == []
 
 

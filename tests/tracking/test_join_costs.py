@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from schemas.arrays import FloatArray
+from schemas.arrays import FloatArray, IntArray
 from tests.tracking_scenes import together
+from velfield.tracking import join_costs
 from velfield.tracking.join_costs import GapLimits, TrackEnds, find_candidates
 from velfield.tracking.joins import EndContext, close_gaps
 
@@ -107,9 +108,29 @@ def test_no_join_is_lost_where_only_near_starts_are_weighed(seed: int, monkeypat
     place = end.position_m + way * np.column_stack([np.cos(turned), np.sin(turned)]) + rng.normal(0, 2, (count, 2))
     start = ends_at(end.time_s + gap_s, place, np.abs(speed + rng.normal(0, 1, count)), turned)
     length_m = rng.choice([np.nan, 4.0, 18.0], count)
-    near = find_candidates(end, start, LIMITS, length_m)
-    monkeypatch.setattr("velfield.tracking.join_costs._REACH_M", np.inf)
-    whole = find_candidates(end, start, LIMITS, length_m)
-    assert len(whole[0]) > 300
-    np.testing.assert_array_equal(near[0], whole[0])
-    np.testing.assert_array_equal(near[1], whole[1])
+    monkeypatch.setattr("velfield.tracking.join_costs._PAIRS_AT_ONCE", 9000)
+    for limits in (LIMITS, GapLimits(4.0, 60.0, 15.0, 1.15), GapLimits(2.0, 5.0, 8.0, 6.0)):
+        pairs, cost = find_candidates(end, start, limits, length_m)
+        expected_pairs, expected_cost = weigh_all_pairs(end, start, limits, length_m)
+        assert len(expected_pairs) > 300
+        np.testing.assert_array_equal(pairs, expected_pairs)
+        np.testing.assert_array_equal(cost, expected_cost)
+
+
+def weigh_all_pairs(
+    ends: TrackEnds, starts: TrackEnds, limits: GapLimits, length_m: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """`find_candidates` by every model of every end and every start after it."""
+    slack = 0.9 * np.maximum(np.nan_to_num(length_m) - 4.8, 0.0)
+    end, start = np.nonzero(starts.time_s > ends.time_s[:, None])
+    gaps = join_costs._Gaps(
+        starts.time_s[start] - ends.time_s[end],
+        starts.position_m[start] - ends.position_m[end],
+        ends.velocity_m_per_s[end],
+        starts.velocity_m_per_s[start],
+        (slack[end] + slack[start]) / 2,
+    )
+    cost = np.min([model(gaps, limits) for model in join_costs._MODELS], axis=0)
+    rank = np.lexsort((start, end, cost))
+    rank = rank[np.isfinite(cost[rank])]
+    return np.column_stack([end, start])[rank], cost[rank]

@@ -194,13 +194,15 @@ def segment_table(tracklets: pd.DataFrame, config: FieldConfig) -> Segments:
         A position, a velocity or a time is not finite, or an interval is not positive.
     """
     both: Segments = np.zeros(2 * len(tracklets), SEGMENT_DTYPE)  # filled in place: of a long flight each copy is much
-    for first, half in enumerate(np.split(both, 2)):
-        _fill_with_half(half, tracklets, first)
+    for first in (0, 1):
+        _fill_with_half(np.split(both, 2)[first], tracklets, first)
+    del tracklets
     _check(both)
     order = np.lexsort((both["detection_1"], both["detection_0"], both["start_s"], both["track"]))
     if config.shared_segment_weight != 1:
         return both[order]
     segments = both[order[_first_of_duplicates(both, order)]]
+    del both, order
     _average_velocities(segments, config.velocity_span_s)
     return segments
 

@@ -220,7 +220,12 @@ class Run:
         Of a run by an earlier release, which measured no vehicles, dimensions are NaN.
         """
         gsd_m = self.grid.gsd_m
-        vehicles = find_vehicles(self._tracklet_columns(VEHICLE_COLUMNS), self.detections(), gsd_m=gsd_m)
+        tracklets, paths = (
+            self._tracklet_columns(VEHICLE_COLUMNS),
+            sorted(self.layout.detections.glob("unit-*.parquet")),
+        )
+        axes = read_tables(paths, DETECTION_COLUMNS, only=["detection_id", "orientation_rad"])
+        vehicles = find_vehicles(tracklets, axes, gsd_m=gsd_m)
         return add_dimensions(vehicles, self._dimensions(), gsd_m)
 
     def _dimensions(self) -> pd.DataFrame:
@@ -246,8 +251,8 @@ class Run:
 
     def segments(self) -> Segments:
         """Vehicles from one frame to the next, each once: by track and time (`velfield.field.segments`)."""
-        tracklets = self._tracklet_columns(SEGMENT_COLUMNS)
-        return segment_table(tracklets, self.record.config.field.model_copy(update=_EACH_ONCE))
+        config = self.record.config.field.model_copy(update=_EACH_ONCE)
+        return segment_table(self._tracklet_columns(SEGMENT_COLUMNS), config)  # unnamed, so that it is soon free
 
     def crossings(self, start_xy: tuple[float, float], end_xy: tuple[float, float]) -> pd.DataFrame:
         """Crossings of the line between two base pixels by vehicles: `find_crossings`."""

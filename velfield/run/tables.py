@@ -130,17 +130,17 @@ def write_patches(path: Path, patches: Mapping[str, NDArray[Any]]) -> None:
     write_atomically(path, buffer.getvalue())
 
 
-def read_patches(path: Path) -> Patches:
-    """Image patches of the detections by name.
+def read_patches(path: Path, *, only: Sequence[str] | None = None) -> Patches:
+    """Image patches of the detections by name; ``only`` selects some, and of a file on a disk no others are read.
 
     Raises
     ------
     StoreError
         The file is damaged.
     """
-    data = path.read_bytes()
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except Exception as error:
-        raise _damage_error(path, error) from error
+    with io.BytesIO(path.read_bytes()) if is_remote(path) else path.open("rb") as opened:
+        try:
+            with np.load(opened, allow_pickle=False) as file:
+                return {name: file[name] for name in (only or file.files)}
+        except Exception as error:
+            raise _damage_error(path, error) from error

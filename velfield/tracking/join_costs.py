@@ -8,6 +8,7 @@ was hidden and turned.
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from schemas.arrays import FloatArray, IntArray
 from schemas.flight import STATIONARY_SPEED_M_PER_S
@@ -52,7 +53,12 @@ _REACH, _REACH_S, _REACH_M = 1.1, 0.5, 20.0
 """Farther than its way at the greatest pace, so much longer, with the greatest speed for so many seconds, and so many
 metres, no vehicle gets at a finite cost: a hidden one is off its way by 0.06 of it and 2.2 m, the tolerance of one that
 drives on is 0.4 s of its speed and 3 m, a stop takes 12.5 m with a tolerance of 4.5 m."""
-_PAIRS_AT_ONCE = 100_000
+_MAX_RELATIVE = 1.2
+"""Offset of a hidden vehicle, in tolerances, beyond which it is not the same."""
+_MAX_TURNED = float(np.cos(_MIN_TURN_RAD))
+_ROOM = 1e-3
+"""In m, m/s and cosines: more than roundings, in conditions that decide only what is weighed."""
+_PAIRS_AT_ONCE = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -109,28 +115,89 @@ def find_candidates(
     longest = max(limits.moving_s, limits.stationary_s, limits.hidden_s)
     low = np.searchsorted(times, ends.time_s, side="right")
     high = np.searchsorted(times, ends.time_s + longest, side="right")
-    count = np.maximum(high - low, 0)
-    fastest = ends.speed_m_per_s, starts.speed_m_per_s
+    bounds = np.array([limits.moving_s, limits.stationary_s, limits.hidden_s, limits.stationary_speed_m_per_s])
+    sides = [(one.time_s, one.position_m, one.velocity_m_per_s, one.speed_m_per_s, slack) for one in (ends, starts)]
+    total = np.cumsum(np.maximum(high - low, 0))
     found = []
-    for block in np.split(np.arange(len(count)), np.flatnonzero(np.diff(np.cumsum(count) // _PAIRS_AT_ONCE)) + 1):
-        end = np.repeat(block, count[block])
-        within = np.arange(len(end)) - np.repeat(np.cumsum(count[block]) - count[block], count[block])
-        start = order[low[end] + within]
-        duration = starts.time_s[start] - ends.time_s[end]
-        displacement = starts.position_m[start] - ends.position_m[end]
-        speed = np.maximum(fastest[0][end], fastest[1][start])
-        reach = _REACH * (speed + _FASTER_M_PER_S) * duration + _REACH_S * speed + _REACH_M + slack[end] + slack[start]
-        near = np.flatnonzero(np.sum(displacement**2, axis=1) <= reach**2)
-        end, start = end[near], start[near]
-        before, after = ends.velocity_m_per_s[end], starts.velocity_m_per_s[start]
-        gaps = _Gaps(duration[near], displacement[near], before, after, (slack[end] + slack[start]) / 2)
-        cost = np.min([model(gaps, limits) for model in _MODELS], axis=0)
+    for block in np.split(np.arange(len(total)), np.flatnonzero(np.diff(total // _PAIRS_AT_ONCE)) + 1):
+        end, start, models = _possible_pairs(*sides, block, order, low, high, bounds)
+        cost = np.full(len(end), np.inf)
+        for k, model in enumerate(_MODELS):
+            rows = np.flatnonzero(models & (1 << k))
+            gaps = _Gaps(
+                starts.time_s[start[rows]] - ends.time_s[end[rows]],
+                starts.position_m[start[rows]] - ends.position_m[end[rows]],
+                ends.velocity_m_per_s[end[rows]],
+                starts.velocity_m_per_s[start[rows]],
+                (slack[end[rows]] + slack[start[rows]]) / 2,
+            )
+            cost[rows] = np.minimum(cost[rows], model(gaps, limits))
         possible = np.flatnonzero(np.isfinite(cost))
         found.append(np.stack([cost[possible], end[possible], start[possible]], axis=1))
     table = np.concatenate(found) if found else np.empty((0, 3))
     pairs = table[:, 1:].astype(np.int64)
     rank = np.lexsort((pairs[:, 1], pairs[:, 0], table[:, 0]))
     return pairs[rank], table[rank, 0]
+
+
+@njit(cache=True, nogil=True)
+def _possible_pairs(ends, starts, block, order, low, high, bounds):  # type: ignore[no-untyped-def]
+    """Pairs of ends (those of ``block``) and starts that a model may find possible, and which: a bit a model, in the
+    order of `_MODELS`.
+
+    Most pairs are far from possible, and a model costs many times what it takes to see that: so the conditions here are
+    what is cheap of theirs, each with some room (`_ROOM`) for roundings, and a pair that is left out has no finite
+    cost. ``order`` of the starts by time, of which ``low`` to ``high`` come into question for an end.
+
+    Sides are (times, positions, velocities, speeds, slack); ``bounds`` the fields of `GapLimits`.
+    """
+    end_s, end_m, end_v, end_speed, slack = ends
+    start_s, start_m, start_v, start_speed, _ = starts
+    moving_s, stationary_s, hidden_s, standing_speed = bounds
+    count = 0
+    for i in block:
+        count += max(high[i] - low[i], 0)
+    end, start, models = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.uint8)
+    n = 0
+    for i in block:
+        for position in range(low[i], high[i]):
+            j = order[position]
+            seconds, more = start_s[j] - end_s[i], 0.5 * (slack[i] + slack[j])
+            dx, dy = start_m[j, 0] - end_m[i, 0], start_m[j, 1] - end_m[i, 1]
+            square = dx * dx + dy * dy
+            slow, fast = min(end_speed[i], start_speed[j]), max(end_speed[i], start_speed[j])
+            found = 0
+            if seconds <= moving_s:
+                reach = _SLACK_M + _ACCELERATION_CHANGE_M_PER_S2 * seconds**2 / 8 + more
+                aside_x = dx - 0.5 * (end_v[i, 0] + start_v[j, 0]) * seconds
+                aside_y = dy - 0.5 * (end_v[i, 1] + start_v[j, 1]) * seconds
+                found |= int(aside_x**2 + aside_y**2 <= (reach + _ROOM) ** 2)
+            if seconds <= stationary_s and (fast <= _MAX_STOP_SPEED_M_PER_S + _ROOM or fast < standing_speed + _ROOM):
+                stopping = (slow**2 + fast**2) / (2 * _TYPICAL_ACCELERATION_M_PER_S2)
+                reach = max(stopping + _MAX_STOP_OFFSET_M + more + _SLACK_M, STATIONARY_OFFSET_M + _ASIDE_M)
+                found |= 2 * int(square <= (reach + _ROOM) ** 2)
+            if _MIN_HIDDEN_S <= seconds <= hidden_s:
+                reach = _REACH * (fast + _FASTER_M_PER_S) * seconds + _REACH_S * fast + _REACH_M + 2 * more
+                if square <= (reach + _ROOM) ** 2:
+                    found |= 4 * _goes_on(dx, dy, end_v[i, 0] + start_v[j, 0], end_v[i, 1] + start_v[j, 1])
+                    turned = end_v[i, 0] * start_v[j, 0] + end_v[i, 1] * start_v[j, 1]
+                    turns = slow >= _MIN_TURN_SPEED_M_PER_S - _ROOM and turned <= (_MAX_TURNED + _ROOM) * slow * fast
+                    found |= 8 * int(turns)
+            if found:
+                end[n], start[n], models[n] = i, j, found
+                n += 1
+    return end[:n].copy(), start[:n].copy(), models[:n].copy()
+
+
+@njit(cache=True, nogil=True)
+def _goes_on(dx, dy, vx, vy):  # type: ignore[no-untyped-def]
+    """Whether a displacement may be of a vehicle that keeps to its way, the direction of a sum of velocities."""
+    length = np.sqrt(vx * vx + vy * vy)
+    if length < _ROOM:
+        return True  # of no direction that could be told
+    width = _LANE_OFFSET_M + _LANE_OFFSET_FRACTION * np.sqrt(dx * dx + dy * dy)
+    ahead, aside = dx * vx + dy * vy, abs(vx * dy - vy * dx)
+    return ahead > -_ROOM * length and aside <= (_MAX_RELATIVE * width + _ROOM) * length
 
 
 @dataclass(frozen=True)
@@ -236,7 +303,7 @@ def _cost_of_pace(gaps: _Gaps, limits: GapLimits, way: FloatArray, across: Float
     pace_sd = _PACE_SD_M_PER_S + _PACE_SD_FRACTION * mean
     relative = np.hypot((pace - mean) / pace_sd / 1.5, across / width)
     area = np.hypot(_FOUND_WITHIN_M, pace_sd * gaps.duration) * width / _LANE_OFFSET_M
-    possible = (gaps.duration >= _MIN_HIDDEN_S) & (gaps.duration <= limits.hidden_s) & (relative <= 1.2)
+    possible = (gaps.duration >= _MIN_HIDDEN_S) & (gaps.duration <= limits.hidden_s) & (relative <= _MAX_RELATIVE)
     possible &= pace <= speeds.max(axis=0) + _FASTER_M_PER_S
     return np.where(possible, relative + np.log(area) / CERTAINTY_SLOPE, np.inf)
 

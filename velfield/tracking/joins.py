@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from numba import njit
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, min_weight_full_bipartite_matching
@@ -297,9 +298,10 @@ def _assign_sparse(row: IntArray, column: IntArray, gain: FloatArray) -> tuple[I
 def _margins(row: IntArray, column: IntArray, gain: FloatArray, best: IntArray) -> FloatArray:
     """By how much the total gain falls without each of the best pairs (k, 2), the others around it assigned again."""
     rows, columns = int(row.max()) + 1, int(column.max()) + 1
-    order = np.argsort(row, kind="stable")
-    gains = np.split(gain[order], np.searchsorted(row[order], np.arange(1, rows)))
-    beside = (_lists(row, column, rows), _lists(column, row, columns))
+    order, order_of_starts = (np.argsort(one, kind="stable") for one in (row, column))
+    begins = np.searchsorted(row[order], np.arange(rows + 1))
+    begins_of_starts = np.searchsorted(column[order_of_starts], np.arange(columns + 1))
+    beside = (begins, column[order], begins_of_starts, row[order_of_starts])
     partner = (np.full(rows, -1), np.full(columns, -1))
     partner[0][best[:, 0]], partner[1][best[:, 1]] = best[:, 1], best[:, 0]
     is_best = partner[0][row] == column
@@ -310,48 +312,68 @@ def _margins(row: IntArray, column: IntArray, gain: FloatArray, best: IntArray) 
     own[row[is_best]] = gain[is_best]
     bound = own[best[:, 0]] - best_of_row[best[:, 0]] - best_of_column[best[:, 1]]
     margins = np.maximum(bound, 0.0)
-    for number in np.flatnonzero(bound < _SURE_MARGIN):
-        end, start = best[number].tolist()
-        ends, starts = _neighbourhood(end, start, beside, partner)
-        at = {column: k for k, column in enumerate(starts)}
-        near, whole = np.zeros((len(ends), len(starts))), 0.0
-        for k, i in enumerate(ends):
-            for j, value in zip(beside[0][i], gains[i].tolist(), strict=True):
-                if j in at:
-                    near[k, at[j]] = value
-                    whole += value if j == partner[0][i] else 0.0
+    gains, at = gain[order], (np.full(rows, -1), np.full(columns, -1))
+    for number in np.flatnonzero(bound < _SURE_MARGIN).tolist():
+        near, whole = _neighbourhood(best[number, 0], best[number, 1], beside, partner, gains, at)
         near[0, 0] = 0  # the pair itself: it is the first of the neighbourhood
         other = linear_sum_assignment(-near)
         margins[number] = max(whole - float(near[other].sum()), 0.0)
     return margins
 
 
-def _lists(of: IntArray, values: IntArray, count: int) -> list[list[int]]:
-    """The values of each of ``count`` numbers."""
-    order = np.argsort(of, kind="stable")
-    parts = np.split(values[order], np.searchsorted(of[order], np.arange(1, count)))
-    return [part.tolist() for part in parts]
+@njit(cache=True, nogil=True)
+def _neighbourhood(end, start, beside, partner, gains, at):  # type: ignore[no-untyped-def]
+    """The gains (n, m) of ends and starts around a pair, the nearest by candidates first, each with its partner; and
+    the sum of those of partners.
 
-
-def _neighbourhood(
-    end: int, start: int, beside: tuple[list[list[int]], list[list[int]]], partner: tuple[IntArray, IntArray]
-) -> tuple[list[int], list[int]]:
-    """Ends and starts around a pair, the nearest by candidates first, each with its partner."""
-    found: tuple[dict[int, None], dict[int, None]] = ({end: None}, {start: None})
+    ``beside``: where the candidates of each end begin, and they; then of each start. ``gains`` as those of the ends.
+    ``partner`` of each end, and start; -1 is none. ``at`` is scratch, the place of each end, and start; -1 and so left.
+    """
+    begins, starts_beside, begins_of_starts, ends_beside = beside
+    ends, starts = [end], [start]
+    at[0][end], at[1][start] = 0, 0
     front = [(0, end), (1, start)]
-    while front and len(found[0]) + len(found[1]) < _NEIGHBOURHOOD:
-        following = []
+    while len(front) and len(ends) + len(starts) < _NEIGHBOURHOOD:
+        following = [(0, end) for _ in range(0)]
         for side, one in front:
-            for other in beside[side][one]:
-                if other not in found[1 - side]:
-                    found[1 - side][other] = None
-                    following.append((1 - side, other))
-                    back = int(partner[1 - side][other])
-                    if back >= 0 and back not in found[side]:
-                        found[side][back] = None
-                        following.append((side, back))
+            if side == 0:
+                for k in range(begins[one], begins[one + 1]):
+                    other = starts_beside[k]
+                    if at[1][other] < 0:
+                        at[1][other] = len(starts)
+                        starts.append(other)
+                        following.append((1, other))
+                        back = partner[1][other]
+                        if back >= 0 and at[0][back] < 0:
+                            at[0][back] = len(ends)
+                            ends.append(back)
+                            following.append((0, back))
+            else:
+                for k in range(begins_of_starts[one], begins_of_starts[one + 1]):
+                    other = ends_beside[k]
+                    if at[0][other] < 0:
+                        at[0][other] = len(ends)
+                        ends.append(other)
+                        following.append((0, other))
+                        back = partner[0][other]
+                        if back >= 0 and at[1][back] < 0:
+                            at[1][back] = len(starts)
+                            starts.append(back)
+                            following.append((1, back))
         front = following
-    return list(found[0]), list(found[1])
+    near, whole = np.zeros((len(ends), len(starts))), 0.0
+    for i in range(len(ends)):
+        for k in range(begins[ends[i]], begins[ends[i] + 1]):
+            j = starts_beside[k]
+            if at[1][j] >= 0:
+                near[i, at[1][j]] = gains[k]
+                if j == partner[0][ends[i]]:
+                    whole += gains[k]
+    for one in ends:
+        at[0][one] = -1
+    for one in starts:
+        at[1][one] = -1
+    return near, whole
 
 
 def assign_tracks(detection_ids: IntArray) -> IntArray:

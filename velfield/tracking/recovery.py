@@ -31,6 +31,8 @@ _POSITION_GAIN, _VELOCITY_GAIN = 0.7, 0.2
 """Of a candidate against the prediction: a detection's position is accurate to a pixel only."""
 _FILL_M, _FILL_M_PER_S, _MAX_FILL_M = 0.8, 0.5, 1.6
 """How far a candidate may lie from the way across a gap, at once and growing with the time to what is known."""
+_ROOM_M = 1e-3
+"""More than roundings."""
 _SPACING_M, _SPACING_S, _MAX_SPACING_M = 5.0, 0.25, 8.0
 """From centre to centre, and more with speed: two cars that queue bumper to bumper are 6 m apart, and driving ones keep
 a gap of half a second and more."""
@@ -239,18 +241,27 @@ class Gap:
 
     def at(self, time_s: FloatArray) -> FloatArray:
         """Positions (n, 2) by Hermite's cubic: the velocities of both sides are met."""
-        (t0, t1), (p0, p1), (v0, v1) = self.time_s, self.position_m, self.velocity_m_per_s
-        span = t1 - t0
-        u = ((time_s - t0) / span)[:, None]
-        # A cubic overshoots where the pace within the gap is far below that of both sides.
-        mean = np.hypot(*(p1 - p0)) / span
-        v0, v1 = (v * min(1.0, 3 * mean / max(float(np.hypot(*v)), 1e-9)) for v in (v0, v1))
+        (p0, p1), (v0, v1), span = self.position_m, self._velocities(), self.time_s[1] - self.time_s[0]
+        u = ((time_s - self.time_s[0]) / span)[:, None]
         return np.asarray(
             (1 + 2 * u) * (1 - u) ** 2 * p0
             + u * (1 - u) ** 2 * span * v0
             + u**2 * (3 - 2 * u) * p1
             + u**2 * (u - 1) * span * v1
         )
+
+    def box(self) -> tuple[FloatArray, FloatArray]:
+        """The least and the greatest coordinates (2,) that `at` may give within the gap."""
+        (p0, p1), (v0, v1), span = self.position_m, self._velocities(), self.time_s[1] - self.time_s[0]
+        points = np.stack([p0, p0 + span / 3 * v0, p1 - span / 3 * v1, p1])
+        return points.min(axis=0), points.max(axis=0)
+
+    def _velocities(self) -> tuple[FloatArray, FloatArray]:
+        """Of both sides, no faster than a cubic can be that does not overshoot where the pace within is far lower."""
+        (p0, p1), span = self.position_m, self.time_s[1] - self.time_s[0]
+        mean = np.hypot(*(p1 - p0)) / span
+        v0, v1 = (v * min(1.0, 3 * mean / max(float(np.hypot(*v)), 1e-9)) for v in self.velocity_m_per_s)
+        return v0, v1
 
 
 def interpolate_gap(gap: Gap, candidates: Candidates, time_s: FloatArray) -> FloatArray:
@@ -267,7 +278,12 @@ def fill_gap(gap: Gap, candidates: Candidates, free: Mask) -> IntArray:
     """Candidates on the way across a gap, one a frame at most; they are cleared in ``free``."""
     low, high = np.searchsorted(candidates.time_s, gap.time_s, side="right")
     rows = np.arange(low, high)
-    rows = rows[free[rows] & (candidates.time_s[rows] < gap.time_s[1])]
+    rows = rows[free[low:high] & (candidates.time_s[low:high] < gap.time_s[1])]
+    # Most are far from it: the way, a Bezier curve, is within the box of its control points.
+    least, most = gap.box()
+    place = candidates.position_m[rows]
+    inside = (place >= least - _MAX_FILL_M - _ROOM_M) & (place <= most + _MAX_FILL_M + _ROOM_M)
+    rows = rows[inside[:, 0] & inside[:, 1]]
     if not len(rows):
         return rows
     time = candidates.time_s[rows]
@@ -308,16 +324,17 @@ def find_doubles(positions: pd.DataFrame, grey: pd.Series, metres: float) -> Int
     pairs = _near_pairs(table, metres)
     if not len(pairs):
         return np.empty(0, np.int64)
-    count = table["track_id"].value_counts()
+    ids, counts = np.unique(table["track_id"].to_numpy(), return_counts=True)
+    count, level = dict(zip(ids.tolist(), counts.tolist(), strict=True)), grey.to_dict()
     doubles: set[int] = set()
     part, _, both_seen = _count_seen(pairs)
-    for rows in (pairs[part[k] : part[k + 1]] for k in np.flatnonzero(both_seen >= _MIN_FRAMES)):
-        both = [int(rows[name].iloc[0]) for name in ("one", "other")]
-        darker, brighter = sorted(both, key=lambda track: (grey.get(track, np.inf), -track))
-        black = grey.get(darker, np.nan) <= _BLACK * grey.get(brighter, np.nan)
+    for k in np.flatnonzero(both_seen >= _MIN_FRAMES).tolist():
+        rows = pairs.part(part[k], part[k + 1])
+        darker, brighter = sorted(rows.ids(), key=lambda track: (level.get(track, np.inf), -track))
+        black = level.get(darker, np.nan) <= _BLACK * level.get(brighter, np.nan)
         long_enough = len(rows) >= _MIN_SHARE * min(count[darker], count[brighter])
         abreast_m = _BLACK_ABREAST_M if black else _ABREAST_M
-        if long_enough and brighter not in doubles and _in_lockstep(rows[rows["seen"] == 2], abreast_m):
+        if long_enough and brighter not in doubles and _in_lockstep(rows.both_seen(), abreast_m):
             doubles.add(darker)
     return np.array(sorted(doubles), np.int64)
 
@@ -353,8 +370,8 @@ def find_split_tracks(positions: pd.DataFrame, metres: float) -> pd.Series:
     possible = (np.diff(part) >= _MIN_FRAMES) & (both_seen <= _MAX_SEEN_SHARE * np.diff(part)) & (one_seen > 0)
     track, frame = table["track_id"].to_numpy(np.int64), table["frame"].to_numpy(np.int64)
     found = []
-    for rows in (pairs[part[k] : part[k + 1]] for k in np.flatnonzero(possible)):
-        both = [int(rows[name].iloc[0]) for name in ("one", "other")]
+    for rows in (pairs.part(part[k], part[k + 1]) for k in np.flatnonzero(possible)):
+        both = rows.ids()
         first, second = (frame[slice(*np.searchsorted(track, [number, number + 1]))] for number in both)
         if _in_one_place(rows).sum() >= max(_SPLIT_SHARE * len(np.intersect1d(first, second)), _MIN_FRAMES):
             found.append(both)
@@ -364,12 +381,55 @@ def find_split_tracks(positions: pd.DataFrame, metres: float) -> pd.Series:
     return pd.Series(component_minimum(ids, edges.reshape(-1, 2)), index=ids)
 
 
-def _count_seen(pairs: pd.DataFrame) -> tuple[IntArray, IntArray, IntArray]:
-    """Of a table of `_near_pairs`, where the rows of each pair begin (k + 1,), and in how many of them one is seen, and
-    both (k,)."""
-    numbers, seen = pairs[["one", "other"]].to_numpy(), pairs["seen"].to_numpy()
-    begin = np.flatnonzero(np.r_[True, (np.diff(numbers, axis=0) != 0).any(axis=1)][: len(pairs)])
-    counts = [np.add.reduceat((seen == n).astype(np.int64), begin) if len(begin) else begin for n in (1, 2)]
+@dataclass(frozen=True)
+class _Pairs:
+    """Pairs of tracks that are near in a frame, by track and time.
+
+    Attributes
+    ----------
+    one, other
+        (n,) ids of the tracks.
+    time_s
+        (n,)
+    xy_m, offset_m
+        (2, n) position of one, and offset of the other, m: a row is in one piece of memory, so that sums over it are
+        accurate.
+    seen
+        (n,) how many of the two are seen.
+    """
+
+    one: IntArray
+    other: IntArray
+    time_s: FloatArray
+    xy_m: FloatArray
+    offset_m: FloatArray
+    seen: IntArray
+
+    def __len__(self) -> int:
+        return len(self.one)
+
+    def part(self, begin: int, end: int) -> "_Pairs":
+        """Rows from one to another."""
+        rows = slice(begin, end)
+        xy_m, offset_m = self.xy_m[:, rows], self.offset_m[:, rows]
+        return _Pairs(self.one[rows], self.other[rows], self.time_s[rows], xy_m, offset_m, self.seen[rows])
+
+    def both_seen(self) -> "_Pairs":
+        """The rows in which both are seen."""
+        rows = np.flatnonzero(self.seen == 2)
+        xy_m, offset_m = np.take(self.xy_m, rows, axis=1), np.take(self.offset_m, rows, axis=1)
+        return _Pairs(self.one[rows], self.other[rows], self.time_s[rows], xy_m, offset_m, self.seen[rows])
+
+    def ids(self) -> tuple[int, int]:
+        """Both tracks, of rows of one pair."""
+        return int(self.one[0]), int(self.other[0])
+
+
+def _count_seen(pairs: _Pairs) -> tuple[IntArray, IntArray, IntArray]:
+    """Where the rows of each pair of tracks begin (k + 1,), and in how many of them one is seen, and both (k,)."""
+    changes = (np.diff(pairs.one) != 0) | (np.diff(pairs.other) != 0)
+    begin = np.flatnonzero(np.r_[True, changes][: len(pairs)])
+    counts = [np.add.reduceat((pairs.seen == n).astype(np.int64), begin) if len(begin) else begin for n in (1, 2)]
     return np.r_[begin, len(pairs)], counts[0], counts[1]
 
 
@@ -389,7 +449,7 @@ def _inferred_s(table: pd.DataFrame) -> FloatArray:
     return np.asarray((after - before).fillna(np.inf), dtype=np.float64)
 
 
-def _in_one_place(rows: pd.DataFrame) -> FloatArray:
+def _in_one_place(rows: _Pairs) -> FloatArray:
     """Whether a pair is nearer in each row than two vehicles are, along the way and across it."""
     offset, heading, _ = _driven(rows)
     along = (offset * heading).sum(axis=1)
@@ -397,12 +457,8 @@ def _in_one_place(rows: pd.DataFrame) -> FloatArray:
     return np.asarray((np.abs(along) <= _PARTS_M) & (across <= _MAX_ASIDE_M))
 
 
-def _near_pairs(table: pd.DataFrame, metres: float) -> pd.DataFrame:
-    """Pairs of tracks that are near in a frame, by track and time.
-
-    Columns ``one, other, time_s``; how many of the two are ``seen``; position ``x, y`` of one and offset ``dx, dy`` of
-    the other, m.
-    """
+def _near_pairs(table: pd.DataFrame, metres: float) -> _Pairs:
+    """Pairs of tracks that are near in a frame."""
     xy, track = table[["x_px", "y_px"]].to_numpy(np.float64) * metres, table["track_id"].to_numpy(np.int64)
     found: list[IntArray] = [np.empty((0, 2), np.int64)]
     frame = table["frame"].to_numpy(np.int64)
@@ -411,16 +467,16 @@ def _near_pairs(table: pd.DataFrame, metres: float) -> pd.DataFrame:
         near = cKDTree(xy[rows]).query_pairs(_MAX_SPACING_M + _MAX_SPREAD_M, output_type="ndarray")
         found.append(rows[near])
     pair = np.concatenate(found)
-    pair = np.where((track[pair[:, 0]] > track[pair[:, 1]])[:, None], pair[:, ::-1], pair)
-    offset = xy[pair[:, 1]] - xy[pair[:, 0]]
-    columns = {"one": track[pair[:, 0]], "other": track[pair[:, 1]], "time_s": table["time_s"].to_numpy()[pair[:, 0]]}
-    seen = (table["source"].to_numpy() < _SEEN)[pair].sum(axis=1)
-    places = {"x": xy[pair[:, 0], 0], "y": xy[pair[:, 0], 1], "dx": offset[:, 0], "dy": offset[:, 1]}
-    pairs = pd.DataFrame({**columns, **places, "seen": seen})
-    return pairs.sort_values(["one", "other", "time_s"], ignore_index=True)
+    one, other = np.where(track[pair[:, 0]] > track[pair[:, 1]], pair[:, ::-1].T, pair.T)
+    time_s = table["time_s"].to_numpy(np.float64)[one]
+    rank = np.lexsort((time_s, track[other], track[one]))
+    one, other = one[rank], other[rank]
+    seen = (table["source"].to_numpy() < _SEEN).astype(np.int64)
+    place, further = (np.take(xy.T, rows, axis=1) for rows in (one, other))
+    return _Pairs(track[one], track[other], time_s[rank], place, further - place, seen[one] + seen[other])
 
 
-def _in_lockstep(rows: pd.DataFrame, abreast_m: float) -> bool:
+def _in_lockstep(rows: _Pairs, abreast_m: float) -> bool:
     """Whether the pair keeps its spacing, in the world as a shadow does, or along the vehicle as a load does.
 
     To any side up to ``abreast_m``.
@@ -437,12 +493,11 @@ def _in_lockstep(rows: pd.DataFrame, abreast_m: float) -> bool:
     return bool(near and spread <= _MAX_SPREAD_M)
 
 
-def _driven(rows: pd.DataFrame) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of a pair of tracks (rows of `_near_pairs`): offsets (n, 2) m, and the first one's headings (n, 2), unit vectors,
-    and speeds (n,) m/s."""
-    velocity = np.gradient(rows[["x", "y"]].to_numpy(), rows["time_s"].to_numpy(), axis=0)
+def _driven(rows: _Pairs) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of a pair of tracks: offsets (n, 2) m, and the first one's headings (n, 2), unit vectors, and speeds (n,) m/s."""
+    velocity = np.gradient(rows.xy_m.T, rows.time_s, axis=0)
     speed = np.hypot(*velocity.T)
-    return rows[["dx", "dy"]].to_numpy(), velocity / np.maximum(speed, 1e-9)[:, None], speed
+    return rows.offset_m.T, velocity / np.maximum(speed, 1e-9)[:, None], speed
 
 
 def _spread(offset: FloatArray) -> float:

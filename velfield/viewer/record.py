@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from schemas.arrays import FloatArray, IntArray
 from schemas.records import FlightRecord, GridRecord
@@ -66,16 +67,16 @@ def write_view_data(layout: RunLayout) -> list[Path]:
         path = layout.view / "base" / name
         write_atomically(path, data)
         written.append(path)
+    vehicles = run.vehicles()  # before the segments: the tables of both at once fill the memory
     segments = run.segments()
     write_segments(layout.view_segments, _columns(segments))
     written += sorted(path for path in layout.view_segments.rglob("*") if path.is_file())
-    return written + _write_animations(run, segments)
+    return written + _write_animations(run, segments, vehicles)
 
 
-def _write_animations(run: Run, segments: Segments) -> list[Path]:
+def _write_animations(run: Run, segments: Segments, vehicles: pd.DataFrame) -> list[Path]:
     """Write what the page animates: the tracks, and draws from the field."""
     grid, view = run.grid, run.layout.view
-    vehicles = run.vehicles()
     first_s, last_s = _span(run.times_s)
     chunks = replay_chunks(
         vehicle_paths(segments, (vehicles["state"] == "parked").to_numpy()),

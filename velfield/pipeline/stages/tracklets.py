@@ -1,10 +1,12 @@
 """Tracklets of a unit of frames, exact across its border."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 
+from schemas.arrays import IntArray, Mask
 from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
 from velfield.detection.detector import ONNX_SUFFIX
 from velfield.pipeline.plan import Plan, widen_interval
@@ -15,6 +17,8 @@ from velfield.run.stores import open_frames, open_registration
 from velfield.run.tables import Patches, read_patches, read_tables, write_table
 from velfield.tracking.association import FrameTable, window_frames
 from velfield.tracking.tracklets import link_windows
+
+_READ = ["detection_id", "frame", "x_px", "y_px", "orientation_rad", "orientation_sd_rad", "score"]
 
 
 def tracklet_files(plan: Plan) -> list[Path]:
@@ -63,48 +67,80 @@ def link_unit(plan: Plan, frames: range) -> StageResult:
     return StageResult([path], {"frames": len(frames), "tracklets": len(tracklets), **counts})
 
 
-def frame_tables(
-    plan: Plan, window: range, times_s: np.ndarray, usable: np.ndarray, *, weak: bool = False
+def frame_tables(plan: Plan, window: range, times_s: np.ndarray, usable: np.ndarray) -> list[FrameTable]:
+    """Detections of a range of frames."""
+    units = range(window.start // plan.unit_frames, (window.stop - 1) // plan.unit_frames + 1)
+    return tables_of_units(plan, window, times_s, usable, {unit: read_unit(plan, unit) for unit in units})
+
+
+@dataclass(frozen=True)
+class UnitDetections:
+    """Detections of a unit of frames: ``column``, their columns by name, (n,) each, and ``patches``, (n, ...) each."""
+
+    column: dict[str, np.ndarray]
+    patches: Patches
+
+
+def read_unit(plan: Plan, unit: int) -> UnitDetections:
+    """Detections of a unit and their patches."""
+    path = plan.layout.unit_file(plan.layout.detections, unit, ".parquet")
+    table = read_tables([path], DETECTION_COLUMNS, only=_READ)
+    patches = read_patches(path.with_suffix(".patches.npz"), only=["patches", "chips", "xy_work", "working_scale"])
+    return UnitDetections({name: table[name].to_numpy() for name in _READ}, patches)
+
+
+def read_chosen(plan: Plan, unit: int, ids: IntArray) -> UnitDetections:
+    """Those of a unit's detections and weak candidates that have one of some ids, with their chips, no patches.
+
+    ``ids`` (n,) ascending. The weak ones come after the others.
+    """
+    layout, parts = plan.layout, []
+    for folder in (layout.detections, layout.weak_detections):
+        path = layout.unit_file(folder, unit, ".parquet")
+        table = read_tables([path], DETECTION_COLUMNS, only=_READ)
+        rows = np.flatnonzero(among(table["detection_id"].to_numpy(), ids))
+        patches = read_patches(path.with_suffix(".patches.npz"), only=["chips", "xy_work", "working_scale"])
+        column = {name: table[name].to_numpy()[rows] for name in _READ}
+        parts.append((column, {name: patches[name][rows] for name in ("chips", "xy_work")}, patches["working_scale"]))
+    column, patches = (
+        {name: np.concatenate([part[k][name] for part in parts]) for name in parts[0][k]} for k in (0, 1)
+    )
+    return UnitDetections(column, {**patches, "working_scale": parts[0][2]})
+
+
+def among(values: IntArray, ascending: IntArray) -> Mask:
+    """(n,) whether each of some values (n,) is among others (m,), which ascend."""
+    if not len(ascending):
+        return np.zeros(len(values), bool)
+    at = np.minimum(np.searchsorted(ascending, values), len(ascending) - 1)
+    return np.asarray(ascending[at] == values)
+
+
+def tables_of_units(
+    plan: Plan, window: range, times_s: np.ndarray, usable: np.ndarray, units: Mapping[int, UnitDetections]
 ) -> list[FrameTable]:
-    """Detections of a range of frames, with the weak candidates after them where asked for."""
+    """Detections of a range of frames, by the frames' units, which are read."""
     store = open_registration(plan.layout.registration)
     heldout = store.column("heldout_px", window.start, window.stop).astype(np.float64)
     kept = store.column("n_inliers", window.start, window.stop).astype(np.float64)
     tables: list[FrameTable] = []
-    for unit in range(window.start // plan.unit_frames, (window.stop - 1) // plan.unit_frames + 1):
-        table, patches = _read_unit(plan, unit, weak=weak)
-        first, last = unit * plan.unit_frames, min((unit + 1) * plan.unit_frames, window.stop)
-        for frame in range(max(first, window.start), last):
-            k = frame - window.start
-            residual = float(np.nan_to_num(heldout[k]))
-            tables.append(
-                _frame_table(
-                    table,
-                    patches,
-                    frame,
-                    time_s=float(times_s[frame]),
-                    registered=bool(usable[frame]),
-                    residual_px=residual,
-                    map_sd_px=residual * float(np.sqrt(MAP_PARAMETERS / max(kept[k], MAP_PARAMETERS))),
-                )
+    for k, frame in enumerate(window):
+        residual = float(np.nan_to_num(heldout[k]))
+        tables.append(
+            _frame_table(
+                units[frame // plan.unit_frames],
+                frame,
+                time_s=float(times_s[frame]),
+                registered=bool(usable[frame]),
+                residual_px=residual,
+                map_sd_px=residual * float(np.sqrt(MAP_PARAMETERS / max(kept[k], MAP_PARAMETERS))),
             )
+        )
     return tables
 
 
-def _read_unit(plan: Plan, unit: int, *, weak: bool) -> tuple[pd.DataFrame, Patches]:
-    """Detections of a unit and their patches; weak candidates after them, by frame in the order of their ids."""
-    layout = plan.layout
-    folders = (layout.detections, layout.weak_detections) if weak else (layout.detections,)
-    paths = [layout.unit_file(folder, unit, ".parquet") for folder in folders]
-    table = read_tables(paths, DETECTION_COLUMNS)
-    parts = [read_patches(path.with_suffix(".patches.npz")) for path in paths]
-    arrays = {name: np.concatenate([part[name] for part in parts]) for name in ("patches", "chips", "xy_work")}
-    return table, {**arrays, "working_scale": parts[0]["working_scale"]}
-
-
 def _frame_table(
-    table: pd.DataFrame,
-    patches: Patches,
+    unit: UnitDetections,
     frame: int,
     *,
     time_s: float,
@@ -112,23 +148,22 @@ def _frame_table(
     residual_px: float,
     map_sd_px: float,
 ) -> FrameTable:
-    rows = np.flatnonzero(table["frame"].to_numpy() == frame)
-    mine = table.iloc[rows]
-    column = {
-        name: mine[name].to_numpy(np.float64)
-        for name in ("x_px", "y_px", "orientation_rad", "orientation_sd_rad", "score")
-    }
+    rows, patches = np.flatnonzero(unit.column["frame"] == frame), unit.patches
     return FrameTable(
         frame=frame,
         time_s=time_s,
         registered=registered,
         residual_px=residual_px,
-        detection_id=mine["detection_id"].to_numpy(np.int64),
-        patches=patches["patches"][rows],
+        detection_id=unit.column["detection_id"][rows].astype(np.int64),
+        x_px=unit.column["x_px"][rows].astype(np.float64),
+        y_px=unit.column["y_px"][rows].astype(np.float64),
+        orientation_rad=unit.column["orientation_rad"][rows].astype(np.float64),
+        orientation_sd_rad=unit.column["orientation_sd_rad"][rows].astype(np.float64),
+        score=unit.column["score"][rows].astype(np.float64),
+        patches=patches["patches"][rows] if "patches" in patches else None,
         crops=patches["chips"][rows],
         x_work=patches["xy_work"][rows, 0],
         y_work=patches["xy_work"][rows, 1],
         working_scale=float(patches["working_scale"]),
         registration_sd_px=map_sd_px,
-        **column,
     )

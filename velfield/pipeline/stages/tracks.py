@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import Lock
 
 import numpy as np
 import pandas as pd
@@ -9,11 +11,19 @@ import pandas as pd
 from schemas.arrays import ByteArray, Float32Array, FloatArray, IntArray, Mask
 from schemas.flight import PAPER_GSD_M
 from schemas.tables import DETECTION_COLUMNS, DIMENSION_COLUMNS, JOIN_COLUMNS, TRACK_POSITION_COLUMNS, TRACKLET_COLUMNS
+from velfield.parallel import parallel_map, usable_processors
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.rectified_frames import FrameLook
 from velfield.pipeline.stages.registration import usable_frames
-from velfield.pipeline.stages.tracklets import explain_no_tracklets, frame_tables, tracklet_files
+from velfield.pipeline.stages.tracklets import (
+    UnitDetections,
+    among,
+    explain_no_tracklets,
+    read_chosen,
+    tables_of_units,
+    tracklet_files,
+)
 from velfield.run.frame_transforms import FrameTransforms, read_tracking_gsd
 from velfield.run.layout import RunLayout
 from velfield.run.stores import open_frames
@@ -42,6 +52,8 @@ from velfield.tracking.recovery import (
     recover_tracks,
 )
 
+_Columns = dict[str, np.ndarray]
+"""Of positions, (n,) each, by their names."""
 _MIDDLE = ["frame_1", "time_1_s", "x_1_px", "y_1_px"]
 _IDS = [f"detection_id_{k}" for k in range(3)]
 _BORDER_M, _BORDER_S = 5.0, 0.6
@@ -52,14 +64,14 @@ _CONFIDENCE = 0.95
 """Of a tracklet that only its track confirms: as many were right in simulated flights, or more."""
 _HIDDEN_S = 1.5
 """A track that ends so shortly before the last frame, or begins so shortly after the first, did not vanish."""
+_AT_ONCE = 4
+"""Threads, each of which holds what is stored of one unit's detections."""
 
 
 def chain_tracks(plan: Plan) -> StageResult:
     """Give every tracklet the track that it belongs to: reads a few columns of all units, writes unit by unit."""
     sources, layout = tracklet_files(plan), plan.layout
-    tracklets = read_tables(
-        sources, TRACKLET_COLUMNS, only=[*_IDS, "frame_1", "time_1_s", "x_1_px", "y_1_px", *END_COLUMNS]
-    )
+    tracklets = read_tables(sources, TRACKLET_COLUMNS, only=[*_IDS, *_MIDDLE, *END_COLUMNS])
     ids, chain = np.unique(assign_tracks(tracklets[_IDS].to_numpy(np.int64)), return_inverse=True)
     strips = sum_strips(layout, tracklets.assign(track_id=ids[chain]), len(plan.units))
     gsd_m = read_tracking_gsd(layout) or PAPER_GSD_M
@@ -67,39 +79,30 @@ def chain_tracks(plan: Plan) -> StageResult:
     candidates = read_candidates(plan, tracklets, gsd_m)
     context = find_context(plan, ends, starts, strips)
     found = recover_tracks(ids, ends, starts, _gap_limits(plan), context, candidates)
-    tracklets = tracklets.assign(track_id=found.tracks[chain])
     flight = _Frames(open_frames(layout.frames).column("time_s"), usable_frames(plan))
-    positions = all_positions(tracklets, found, candidates, gsd_m, flight)
+    positions = all_positions(tracklets.assign(track_id=found.tracks[chain]), found, candidates, gsd_m, flight)
+    first_frame = np.array(tracklets["frame_0"])
+    del tracklets, candidates, context  # what follows needs no more of them, and they are large
     whole = find_split_tracks(positions, gsd_m)
     if len(whole):
-        positions, tracklets = _keep_surest(_join_parts(positions, whole)), _join_parts(tracklets, whole)
+        positions = _keep_surest(_join_parts(positions, whole))
         found = replace(found, tracks=_rename_parts(found.tracks, whole), joins=_join_parts(found.joins, whole))
     doubles = find_doubles(positions, mean_grey(strips, found.tracks), gsd_m)
     positions = _without(positions, doubles)
     images = images_of_tracks(strips, found.tracks)
+    del strips
     casters = find_shadows(plan, images, positions, gsd_m)
     bent = [one for one in casters if not keeps_direction(positions[positions["track_id"] == one], gsd_m)]
     left_out = np.union1d(doubles, np.array(bent, np.int64))  # where a bent track's caster is follows from no offset
     offsets_px = {track: casters[track].offset_m / gsd_m for track in casters if track not in bent}
     positions = _move_tracks(_without(positions, left_out), offsets_px, [("x_px", "y_px")])
-    written, start, recovered = [], 0, 0
-    for unit, frames in enumerate(plan.units):
-        path = layout.unit_file(layout.tracklets, unit, ".parquet")
-        if path.exists():
-            table = read_tables([path], TRACKLET_COLUMNS).assign(recovered=False)
-            table["track_id"] = tracklets["track_id"].to_numpy()[start : start + len(table)]
-            start += len(table)
-            table = _without(table, left_out)
-            more = recovered_tracklets(plan, frames, positions, flight)
-            recovered += len(more)
-            table = pd.concat([table, more.assign(recovered=True)], ignore_index=True)
-            table = table.sort_values(["frame_0", "tracklet_id"], kind="stable", ignore_index=True)
-            table = _move_tracks(table, offsets_px, [(f"x_{k}_px", f"y_{k}_px") for k in range(3)])
-            written.append(layout.tracks / path.name)
-            write_tracks(written[-1], table)
-        here = positions[(positions["frame"] >= frames.start) & (positions["frame"] < frames.stop)]
-        written.append(layout.unit_file(layout.track_positions, unit, ".parquet"))
-        write_table(written[-1], here, TRACK_POSITION_COLUMNS)
+    triples = find_triples(positions, flight, plan.config.tracking.max_interval_s)
+    track = found.tracks[chain]
+    output = _Output(plan, first_frame, track, positions, flight, triples, np.unique(triples.ids), left_out, offsets_px)
+    count = min(usable_processors(), _AT_ONCE, len(plan.units))
+    runs = np.array_split(np.arange(len(plan.units)), max(count, 1))
+    parts = parallel_map(output.write, [run for run in runs if len(run)])
+    written, recovered = [path for paths, _ in parts for path in paths], sum(number for _, number in parts)
     for folder in (layout.tracks, layout.track_positions):
         for stale in set(folder.glob("unit-*.parquet")) - set(written):
             stale.unlink()  # of an earlier plan with more units
@@ -111,12 +114,12 @@ def chain_tracks(plan: Plan) -> StageResult:
         write_table(path, _without(table, left_out), columns)
         written.append(path)
     advance("tracks")
-    warnings = [] if len(tracklets) else [explain_no_tracklets(plan)]
-    kept = _without(tracklets, left_out)
+    warnings = [] if len(track) else [explain_no_tracklets(plan)]
+    kept = track[~among(track, left_out)]
     counts = {
         "tracklets": float(len(kept) + recovered),
         "recovered": float(recovered),
-        "tracks": float(kept["track_id"].nunique()),
+        "tracks": float(len(np.unique(kept))),
         "moved_from_shadows": float(len(offsets_px)),
     }
     return StageResult(written, counts, warnings=warnings)
@@ -170,15 +173,17 @@ def read_candidates(plan: Plan, tracklets: pd.DataFrame, metres: float) -> Candi
     layout = plan.layout
     names = ["detection_id", "frame", "time_s", "x_px", "y_px", "orientation_rad"]
     used = np.unique(tracklets[_IDS].to_numpy(np.int64))
-    parts = []
-    for unit in range(len(plan.units)):
-        for folder in (layout.detections, layout.weak_detections):
-            path = layout.unit_file(folder, unit, ".parquet")
-            if path.exists():
-                table = read_tables([path], DETECTION_COLUMNS, only=names)
-                ids = table["detection_id"].to_numpy(np.int64)
-                at = np.minimum(np.searchsorted(used, ids), max(len(used) - 1, 0))
-                parts.append(table[used[at] != ids] if len(used) else table)
+
+    def read(path: Path) -> pd.DataFrame:
+        table = read_tables([path], DETECTION_COLUMNS, only=names)
+        return table[~among(table["detection_id"].to_numpy(np.int64), used)]
+
+    paths = [
+        layout.unit_file(folder, unit, ".parquet")
+        for unit in range(len(plan.units))
+        for folder in (layout.detections, layout.weak_detections)
+    ]
+    parts = parallel_map(read, [path for path in paths if path.exists()], at_most=_AT_ONCE)
     table = pd.concat(parts) if parts else empty_table({name: DETECTION_COLUMNS[name] for name in names})
     table = table.sort_values(["frame", "detection_id"], ignore_index=True)
     return Candidates(
@@ -202,91 +207,211 @@ def all_positions(
     tracklets: pd.DataFrame, found: Recovered, candidates: Candidates, metres: float, frames: _Frames
 ) -> pd.DataFrame:
     """Positions of every track (`TRACK_POSITION_COLUMNS`) by frame and track: seen, confirmed and interpolated."""
-    parts = [
-        tracklets[["track_id", f"frame_{k}", f"time_{k}_s", f"x_{k}_px", f"y_{k}_px", f"detection_id_{k}"]].set_axis(
-            ["track_id", "frame", "time_s", "x_px", "y_px", "detection_id"], axis=1
-        )
-        for k in range(3)
-    ]
-    seen = pd.concat(parts, ignore_index=True).drop_duplicates("detection_id").assign(source=0)
+    ids = np.concatenate([tracklets[name].to_numpy() for name in _IDS])
+    first = np.sort(np.unique(ids, return_index=True)[1])  # of each detection
+    found_in = first % max(len(tracklets), 1)
     xy = candidates.position_m[found.candidate] / metres
-    confirmed = pd.DataFrame(
-        {
-            "track_id": found.track_id,
-            "frame": candidates.frame[found.candidate],
-            "time_s": candidates.time_s[found.candidate],
-            "x_px": xy[:, 0],
-            "y_px": xy[:, 1],
-            "detection_id": candidates.detection_id[found.candidate],
-            "source": 1,
-        }
-    )
-    known = pd.concat([seen, confirmed], ignore_index=True)
+    confirmed = {
+        "track_id": found.track_id,
+        "frame": candidates.frame[found.candidate],
+        "time_s": candidates.time_s[found.candidate],
+        "x_px": xy[:, 0],
+        "y_px": xy[:, 1],
+        "detection_id": candidates.detection_id[found.candidate],
+    }
+    known = {"track_id": tracklets["track_id"].to_numpy()[found_in], "detection_id": ids[first]}
+    for name, of_detection in (
+        ("frame", "frame_{}"),
+        ("time_s", "time_{}_s"),
+        ("x_px", "x_{}_px"),
+        ("y_px", "y_{}_px"),
+    ):
+        known[name] = np.concatenate([tracklets[of_detection.format(k)].to_numpy() for k in range(3)])[first]
+    known = {name: np.concatenate([known[name], values]) for name, values in confirmed.items()}
+    known["source"] = np.repeat([0, 1], [len(first), len(xy)])
     numbers, times_s = np.flatnonzero(frames.usable), frames.times_s
-    inferred = [_between_frames(known, numbers, times_s)]
-    for gap in found.gaps:
-        inside = numbers[(times_s[numbers] > gap.time_s[0]) & (times_s[numbers] < gap.time_s[1])]
-        x, y = interpolate_gap(gap, candidates, times_s[inside]).T / metres
-        columns = {"track_id": gap.track_id, "frame": inside, "time_s": times_s[inside], "x_px": x, "y_px": y}
-        inferred.append(pd.DataFrame(columns))
-    between = pd.concat(inferred, ignore_index=True).assign(detection_id=-1, source=2)
-    return _keep_surest(pd.concat([known, between], ignore_index=True))
+    inferred = [_between_frames(known, numbers, times_s), _across_gaps(found, candidates, metres, numbers, times_s)]
+    parts = [known]
+    for one in inferred:
+        parts.append({**one, "detection_id": np.full_like(one["frame"], -1), "source": np.full_like(one["frame"], 2)})
+
+    def column(name: str) -> np.ndarray:
+        return np.concatenate([part[name] for part in parts])
+
+    rows = _surest(column("frame"), column("track_id"), column("source"))
+    return pd.DataFrame({name: column(name)[rows] for name in known}, copy=False)
+
+
+def _surest(frame: IntArray, track: IntArray, source: IntArray) -> IntArray:
+    """Of a track's positions in one frame (n,), the row of the one that is surest; by frame and track."""
+    order = np.lexsort((source, track, frame))
+    frame, track = frame[order], track[order]
+    changes = (np.diff(frame) != 0) | (np.diff(track) != 0)
+    return np.asarray(order[np.r_[True, changes][: len(order)]])
 
 
 def _keep_surest(positions: pd.DataFrame) -> pd.DataFrame:
-    """Of a track's positions in one frame, the one that is surest; by frame and track."""
-    table = positions.sort_values(["frame", "track_id", "source"], kind="stable", ignore_index=True)
-    return table.drop_duplicates(["frame", "track_id"], ignore_index=True)
+    """The rows of `_surest`."""
+    rows = _surest(*(positions[name].to_numpy() for name in ("frame", "track_id", "source")))
+    return positions.iloc[rows].reset_index(drop=True)
 
 
-def _between_frames(known: pd.DataFrame, frames: IntArray, times_s: FloatArray) -> pd.DataFrame:
+def _between_frames(known: _Columns, frames: IntArray, times_s: FloatArray) -> _Columns:
     """Frames that a track misses for a moment, linearly in time."""
-    table = known.sort_values(["track_id", "frame"], ignore_index=True)
-    rank = np.searchsorted(frames, table["frame"].to_numpy())
-    same = np.diff(table["track_id"].to_numpy()) == 0
-    missed = np.where(same & (np.diff(table["time_s"].to_numpy()) <= _MISSED_S), np.maximum(np.diff(rank) - 1, 0), 0)
+    order = np.lexsort((known["frame"], known["track_id"]))
+    track, time_s = known["track_id"][order], known["time_s"][order]
+    rank = np.searchsorted(frames, known["frame"][order])
+    same = np.diff(track) == 0
+    missed = np.where(same & (np.diff(time_s) <= _MISSED_S), np.maximum(np.diff(rank) - 1, 0), 0)
     row = np.repeat(np.arange(len(missed)), missed)
     step = np.arange(len(row)) - np.repeat(np.cumsum(missed) - missed, missed) + 1
     frame = frames[rank[row] + step] if len(row) else np.empty(0, np.int64)
-    before, after = table.iloc[row].reset_index(drop=True), table.iloc[row + 1].reset_index(drop=True)
-    part = (times_s[frame] - before["time_s"]) / (after["time_s"] - before["time_s"])
-    xy = {name: before[name] + part * (after[name] - before[name]) for name in ("x_px", "y_px")}
-    return pd.DataFrame({"track_id": before["track_id"], "frame": frame, "time_s": times_s[frame], **xy})
+    part = (times_s[frame] - time_s[row]) / (time_s[row + 1] - time_s[row])
+    before, after = order[row], order[row + 1]
+    xy = {one: known[one][before] + part * (known[one][after] - known[one][before]) for one in ("x_px", "y_px")}
+    return {"track_id": track[row], "frame": frame, "time_s": times_s[frame], **xy}
 
 
-def recovered_tracklets(plan: Plan, frames: range, positions: pd.DataFrame, flight: "_Frames") -> pd.DataFrame:
-    """Tracklets that start in a unit and hold a detection that only the track confirmed (`TRACKLET_COLUMNS`)."""
-    times_s, usable = flight.times_s, flight.usable
-    config = plan.config.tracking
-    window = window_frames(list(usable), list(times_s), frames, config.max_interval_s)
-    known = positions[positions["source"] < 2]
-    known = known[(known["frame"] >= window.start) & (known["frame"] < window.stop)]
-    known = known.sort_values(["track_id", "frame"], ignore_index=True)
-    rank = np.cumsum(usable)[known["frame"].to_numpy()]
-    near = (np.diff(known["track_id"].to_numpy()) == 0) & (np.diff(rank) == 1)
-    near &= np.diff(known["time_s"].to_numpy()) <= config.max_interval_s
+def _across_gaps(
+    found: Recovered, candidates: Candidates, metres: float, frames: IntArray, times_s: FloatArray
+) -> _Columns:
+    """Frames within the gaps that were closed, on the way across them."""
+    usable_s = times_s[frames]  # ascending
+    tracks, inside, places = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [np.empty((0, 2))]
+    for gap in found.gaps:
+        here = frames[slice(*(np.searchsorted(usable_s, gap.time_s[k], side=("right", "left")[k]) for k in (0, 1)))]
+        if len(here):
+            tracks.append(np.full(len(here), gap.track_id))
+            inside.append(here)
+            places.append(interpolate_gap(gap, candidates, times_s[here]) / metres)
+    frame, xy = np.concatenate(inside), np.concatenate(places)
+    columns = {"track_id": np.concatenate(tracks), "frame": frame, "time_s": times_s[frame]}
+    return {**columns, "x_px": xy[:, 0], "y_px": xy[:, 1]}
+
+
+@dataclass(frozen=True)
+class _Triples:
+    """Detections of a track in three usable frames in a row of which only the track confirmed one, by track and frame.
+
+    ``track_id`` (n,), ``frame`` (n,) of the first, ``ids`` (n, 3) of the detections.
+    """
+
+    track_id: IntArray
+    frame: IntArray
+    ids: IntArray
+
+    def take(self, rows: IntArray) -> "_Triples":
+        return _Triples(self.track_id[rows], self.frame[rows], self.ids[rows])
+
+
+def find_triples(positions: pd.DataFrame, frames: _Frames, max_interval_s: float) -> _Triples:
+    """What may be a tracklet where only the track confirmed a detection, from `TRACK_POSITION_COLUMNS`."""
+    known = positions[positions["source"] < 2].sort_values(["track_id", "frame"], ignore_index=True)
+    track, frame = known["track_id"].to_numpy(), known["frame"].to_numpy()
+    near = (np.diff(track) == 0) & (np.diff(np.cumsum(frames.usable)[frame]) == 1)
+    near &= np.diff(known["time_s"].to_numpy()) <= max_interval_s
     confirmed = known["source"].to_numpy() == 1
     first = np.flatnonzero(near[:-1] & near[1:]) if len(near) > 1 else np.empty(0, np.int64)
     first = first[(confirmed[first] | confirmed[first + 1] | confirmed[first + 2])]
-    first = first[known["frame"].to_numpy()[first] < frames.stop]
-    if not len(first):
+    ids = known["detection_id"].to_numpy()
+    return _Triples(track[first], frame[first], np.stack([ids[first + k] for k in range(3)], axis=1))
+
+
+def recovered_tracklets(
+    plan: Plan, frames: range, triples: _Triples, flight: _Frames, units: Mapping[int, UnitDetections]
+) -> pd.DataFrame:
+    """Tracklets (`TRACKLET_COLUMNS`) of the triples of a unit's frames that pass the gates; ``units``, what is read of
+    the units that `_window` needs, with the triples' detections."""
+    if not len(triples.frame):
         return empty_table(TRACKLET_COLUMNS)
-    tables = [one for one in frame_tables(plan, window, times_s, usable, weak=True) if one.registered]
+    config, window = plan.config.tracking, _window(plan, frames, flight)
+    found = tables_of_units(plan, window, flight.times_s, flight.usable, units)
+    tables = [one for one in found if one.registered]
     index = {one.frame: k for k, one in enumerate(tables)}
-    start = np.array([index[frame] for frame in known["frame"].to_numpy()[first]])
-    ids = np.stack([known["detection_id"].to_numpy()[first + k] for k in range(3)], axis=1)
+    start = np.array([index[frame] for frame in triples.frame])
     limits = Limits.from_config(config, read_tracking_gsd(plan.layout))
     windows = []
     for at in np.unique(start).tolist():
-        rows = np.flatnonzero(start == at)
-        places = np.stack([np.searchsorted(tables[at + k].detection_id, ids[rows, k]) for k in range(3)], axis=1)
+        ids = triples.ids[start == at]
+        places = np.stack([np.searchsorted(tables[at + k].detection_id, ids[:, k]) for k in range(3)], axis=1)
         first_of, middle, last = (tables[at + k].states(limits).take(places[:, k]) for k in range(3))
         places = places[triples_pass((first_of, middle, last), limits)]
         nothing = np.full((len(places), 2), np.nan)
         windows.append(LinkedTriples(at, places, nothing, np.full(len(places), _CONFIDENCE)))
     made, _ = tracklet_table(tables, windows, limits, refine=config.refine)
-    track = pd.Series(known["track_id"].to_numpy()[first], index=ids[:, 1])
+    track = pd.Series(triples.track_id, index=triples.ids[:, 1])
     return made.assign(track_id=track.reindex(made["tracklet_id"]).to_numpy())
+
+
+def _window(plan: Plan, frames: range, flight: _Frames) -> range:
+    """Frames that the triples of a unit reach."""
+    return window_frames(list(flight.usable), list(flight.times_s), frames, plan.config.tracking.max_interval_s)
+
+
+@dataclass(frozen=True)
+class _Output:
+    """Writes the tables of units.
+
+    ``first_frame`` and ``track`` (n,) of the tracklets of all units, by frame; ``positions`` by frame, moved, without
+    those that are ``left_out`` (k,); ``triples``, and the ``ids`` (m,) of their detections, ascending; ``offsets_px``,
+    by track, for the tracklets.
+    """
+
+    plan: Plan
+    first_frame: IntArray
+    track: IntArray
+    positions: pd.DataFrame
+    flight: _Frames
+    triples: _Triples
+    ids: IntArray
+    left_out: IntArray
+    offsets_px: Mapping[int, FloatArray]
+
+    def write(self, units: IntArray) -> tuple[list[Path], int]:
+        """The files of consecutive units, and how many tracklets in them only tracks confirm.
+
+        What is read of a unit is kept for the one before it and itself, which alone need it where units are long.
+        """
+        written, recovered = [], 0
+        kept: dict[int, UnitDetections] = {}
+        for unit in units.tolist():
+            kept = {k: one for k, one in kept.items() if k >= unit}
+            paths, number = self._write_unit(unit, kept)
+            written += paths
+            recovered += number
+        return written, recovered
+
+    def _write_unit(self, unit: int, kept: dict[int, UnitDetections]) -> tuple[list[Path], int]:
+        layout, frames = self.plan.layout, self.plan.units[unit]
+        written, recovered = [], 0
+        path = layout.unit_file(layout.tracklets, unit, ".parquet")
+        if path.exists():
+            table = read_tables([path], TRACKLET_COLUMNS).assign(recovered=False)
+            begin = np.searchsorted(self.first_frame, frames.start)
+            table["track_id"] = self.track[begin : begin + len(table)]
+            table = _without(table, self.left_out)
+            more = self._recovered(unit, kept)
+            recovered = len(more)
+            table = pd.concat([table, more.assign(recovered=True)], ignore_index=True)
+            table = table.sort_values(["frame_0", "tracklet_id"], kind="stable", ignore_index=True)
+            table = _move_tracks(table, self.offsets_px, [(f"x_{k}_px", f"y_{k}_px") for k in range(3)])
+            written.append(layout.tracks / path.name)
+            write_tracks(written[-1], table)
+        rows = slice(*np.searchsorted(self.positions["frame"].to_numpy(), [frames.start, frames.stop]))
+        written.append(layout.unit_file(layout.track_positions, unit, ".parquet"))
+        write_table(written[-1], self.positions[rows], TRACK_POSITION_COLUMNS)
+        return written, recovered
+
+    def _recovered(self, unit: int, kept: dict[int, UnitDetections]) -> pd.DataFrame:
+        plan, frames = self.plan, self.plan.units[unit]
+        of_unit = self.triples.frame // plan.unit_frames
+        mine = self.triples.take(np.flatnonzero(of_unit == unit))
+        if len(mine.frame):
+            last = (_window(plan, frames, self.flight).stop - 1) // plan.unit_frames
+            for one in range(unit, last + 1):
+                if one not in kept:
+                    kept[one] = read_chosen(plan, one, self.ids)
+        return recovered_tracklets(plan, frames, mine, self.flight, kept)
 
 
 def _gap_limits(plan: Plan) -> GapLimits:
@@ -317,32 +442,38 @@ class StripSums:
 def sum_strips(layout: RunLayout, tracklets: pd.DataFrame, units: int) -> StripSums:
     """Read the strips that stand for each chain, unit by unit, as all together take much space."""
     ids, chosen = sample_tracks(tracklets)
+    numbers, chains = chosen["detection_id"].to_numpy(), chosen["track"].to_numpy()
+    heading, whys = chosen["heading_rad"].to_numpy(), [chosen[name].to_numpy() for name in ("spread", "start", "end")]
     total, count = np.zeros((3, len(ids), *STRIP_SHAPE), np.float32), np.zeros((3, len(ids)), np.int64)
-    shade, scale = np.zeros((len(ids), 3)), 1.0
-    for unit in range(units):
-        path = layout.unit_file(layout.detections, unit, ".parquet")
-        if path.exists():
-            table = read_tables([path], DETECTION_COLUMNS, only=["detection_id", "orientation_rad"])
-            patches = read_patches(path.with_suffix(".patches.npz"))
-            scale = float(patches["working_scale"])
-            here = chosen[chosen["detection_id"].isin(table["detection_id"])]
-            strips = _along_headings(here, table, patches["strips"])
-            for which, name in enumerate(("spread", "start", "end")):
-                rows = np.flatnonzero(here[name])
-                np.add.at(total[which], here["track"].to_numpy()[rows], strips[rows])  # whole numbers: sums are exact
-                np.add.at(count[which], here["track"].to_numpy()[rows], 1)
-            spread = here[here["spread"]]
-            at = pd.Index(table["detection_id"]).get_indexer(spread["detection_id"])
-            np.add.at(shade, spread["track"].to_numpy(), shade_moments(patches["chips"][at]))
-    return StripSums(ids, total, count, shade, scale)
+    shade, lock = np.zeros((len(ids), 3)), Lock()
+
+    def add(path: Path) -> float:
+        table = read_tables([path], DETECTION_COLUMNS, only=["detection_id", "orientation_rad"])
+        patches = read_patches(path.with_suffix(".patches.npz"), only=["strips", "chips", "working_scale"])
+        here = np.flatnonzero(among(numbers, table["detection_id"].to_numpy()))
+        at, chain = np.searchsorted(table["detection_id"].to_numpy(), numbers[here]), chains[here]
+        strips = _along_headings(
+            patches["strips"][at], table["orientation_rad"].to_numpy(np.float64)[at], heading[here]
+        )
+        spread = whys[0][here]
+        moments = shade_moments(patches["chips"][at[spread]])
+        with lock:  # whole numbers and halves: sums are exact, in whatever order
+            for which, why in enumerate(whys):
+                rows = why[here]
+                np.add.at(total[which], chain[rows], strips[rows])
+                np.add.at(count[which], chain[rows], 1)
+            np.add.at(shade, chain[spread], moments)
+        return float(patches["working_scale"])
+
+    paths = [layout.unit_file(layout.detections, unit, ".parquet") for unit in range(units)]
+    scales = parallel_map(add, [path for path in paths if path.exists()], at_most=_AT_ONCE)
+    return StripSums(ids, total, count, shade, scales[-1] if scales else 1.0)
 
 
-def _along_headings(chosen: pd.DataFrame, table: pd.DataFrame, strips: ByteArray) -> Float32Array:
-    """The strips of chosen detections, turned along their vehicles' headings."""
-    rows = pd.Index(table["detection_id"]).get_indexer(chosen["detection_id"])
-    axis = table["orientation_rad"].to_numpy(np.float64)[rows]
-    backward = direction_of_axes(axis, chosen["heading_rad"].to_numpy())
-    found = np.asarray(strips[rows], np.float32)
+def _along_headings(strips: ByteArray, axis_rad: FloatArray, heading_rad: FloatArray) -> Float32Array:
+    """Strips (n, length, width), turned along their vehicles' headings (n,)."""
+    backward = direction_of_axes(axis_rad, heading_rad)
+    found = np.asarray(strips, np.float32)
     found[backward] = found[backward, ::-1, ::-1]
     return found
 
