@@ -44,7 +44,7 @@ class CnnDetector(Detector):
     record: CnnRecord
     method: ClassVar[str] = "cnn"
     context_px: ClassVar[int] = 16
-    box_cost_px: ClassVar[int] = 1200
+    box_cost_px: ClassVar[int] = 2000
 
     @cached_property
     def network(self) -> Network:
