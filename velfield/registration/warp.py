@@ -8,7 +8,7 @@ interpolated between those is wrong by less than a pixel, and two or three evalu
 A frame is resampled whole (`warp_to_base`) or where it is asked for (`Rectification`).
 """
 
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Protocol
 
 import cv2
@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
-from velfield.registration.resampling.cells import CELL_PX, FRACTION_BITS, PAD_PX, resample_kernel
+from velfield.registration.resampling.cells import CELL_PX, PAD_PX, resample_kernel
 
 Window = tuple[int, int, int, int]
 """x, y, width, height in base px."""
@@ -29,8 +29,6 @@ _CELL_PX = 16, 8
 """Sides of the cells that are tried, output px."""
 _CHECKS, _MAX_BEND_PX = 24, 0.05
 """Rows and columns of places where interpolation is checked, and the error that is allowed there."""
-_SHARPNESS = -0.75
-"""Of cubic interpolation, as in OpenCV."""
 _SPARSE, _CORRECTIONS, _MAX_ERROR_PX = 4, 8, 2e-3
 """Nodes whose inverse is computed from nothing: every fourth. At the others it starts from their interpolation, and is
 corrected until it is this accurate, base px, at most so many times; nodes that are not by then start from nothing."""
@@ -319,17 +317,7 @@ def resample_cells(
     cells
         (n, 2) row and column of cells of `CELL_PX`.
     """
-    resample_kernel(extended, coarse, step, cells, _cubic_weights(), image, valid)
-
-
-@cache
-def _cubic_weights() -> Float32Array:
-    """Weights (128,) of four pixels in a row, from the second of which a position lies 0, 1/32, 2/32... px."""
-    x, a = np.arange(1 << FRACTION_BITS) / (1 << FRACTION_BITS), _SHARPNESS
-    first = ((a * (x + 1) - 5 * a) * (x + 1) + 8 * a) * (x + 1) - 4 * a
-    second = ((a + 2) * x - (a + 3)) * x * x + 1
-    third = ((a + 2) * (1 - x) - (a + 3)) * (1 - x) * (1 - x) + 1
-    return np.stack([first, second, third, 1 - first - second - third], axis=1).astype(np.float32).ravel()
+    resample_kernel(extended, coarse, step, cells, image, valid)
 
 
 def _raw_px_per_output_px(coarse: FloatArray, step: int) -> float:
