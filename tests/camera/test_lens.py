@@ -89,3 +89,15 @@ def test_the_pinhole_changes_nothing() -> None:
     assert lens.is_identity
     assert np.array_equal(lens.undistort_points(xy), xy)
     assert np.array_equal(lens.distort_points(xy), xy)
+
+
+@pytest.mark.parametrize("a", [0.3, -0.3, 0.0])
+def test_harris_is_the_plain_formula_to_the_bit(a: float) -> None:
+    xy = np.random.default_rng(2).uniform(-2000, 3000, (500, 2))
+    xy[0] = np.nan
+    lens = HarrisLens(a, 640.3, 470.1, 800.0)
+    offsets = xy - [640.3, 470.1]
+    square = 1 - a * ((offsets[:, :1] ** 2 + offsets[:, 1:] ** 2) / 800.0**2)
+    plain = offsets / np.sqrt(np.where(square > 0, square, np.nan)) + [640.3, 470.1]
+    np.testing.assert_array_equal(lens.undistort_points(xy), plain)
+    assert lens.undistort_points(xy[:1].reshape(1, 1, 2)).shape == (1, 1, 2)

@@ -216,3 +216,22 @@ def test_cholesky_solves_several_right_hand_sides_and_marks_an_indefinite_matrix
     np.testing.assert_allclose(matrix @ kernels.solve_cholesky(matrix, right), right, atol=1e-8)
     matrix[7, 7] = -1.0
     assert np.isnan(kernels.solve_cholesky(matrix, right)).all()
+
+
+@pytest.mark.parametrize("knots", [0, KNOTS])
+@pytest.mark.parametrize("shape", [(0, 0), (3, 4), (1, 1)])
+def test_the_whole_map_is_its_parts_one_after_the_other(knots: int, shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(12)
+    raw = rng.uniform(-300, 1000, (200, 2))
+    raw[:3] = [[np.nan, 5.0], [7.0, np.inf], [-np.inf, 8.0]]
+    undistorted = raw * 1.1 - 20
+    c = coefficients(rng)
+    c[2, 1:3] = 0.8  # some points lie beyond the horizon
+    rows, mesh = rng.normal(0, 1.5, (3, knots)) * [[1], [1], [1e-3]], rng.normal(0, 1, (*shape, 2))
+    found = kernels.to_base(undistorted, raw, rows, HEIGHT, CENTRE, c, SOURCE, TARGET, mesh, 200)
+    corrected = kernels.remove_row_motion(undistorted, np.ascontiguousarray(raw[:, 1]), rows, HEIGHT, CENTRE)
+    expected = kernels.rational(corrected, c, SOURCE, TARGET)
+    if mesh.size:
+        expected += kernels.mesh_displacement(raw, mesh, 200)
+    assert 20 < np.isnan(expected[:, 0]).sum() < 180
+    np.testing.assert_array_equal(found, expected)

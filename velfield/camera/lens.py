@@ -12,6 +12,7 @@ from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
+from numba import njit
 
 from schemas.arrays import FloatArray, Points
 from schemas.camera import DivisionLensRecord, HarrisLensRecord, LensRecord, PolynomialLensRecord
@@ -49,6 +50,18 @@ def _squares(offsets: FloatArray) -> FloatArray:
     """Squared lengths (..., 1) of vectors (..., 2): numpy's sum over so short an axis takes five times as long."""
     x, y = offsets[..., :1], offsets[..., 1:]
     return np.asarray(x * x + y * y)
+
+
+@njit(cache=True, nogil=True)
+def _divide_by_root(points, a, centre_x, centre_y, unit2):  # type: ignore[no-untyped-def]
+    """Points (n, 2) at r from a centre moved to r / sqrt(1 + a r^2 / unit2); NaN where there is no root."""
+    out = np.empty((points.shape[0], 2))
+    for i in range(points.shape[0]):
+        x, y = points[i, 0] - centre_x, points[i, 1] - centre_y
+        square = 1.0 + a * ((x * x + y * y) / unit2)
+        root = np.sqrt(square) if square > 0 else np.nan
+        out[i, 0], out[i, 1] = x / root + centre_x, y / root + centre_y
+    return out
 
 
 @dataclass(frozen=True)
@@ -94,10 +107,10 @@ class HarrisLens:
         return self._scale_radially(xy, self.a)
 
     def _scale_radially(self, xy: Points, a: float) -> Points:
-        offsets, radius2 = self._offsets(xy)
-        square = 1.0 + a * radius2
-        scaled = offsets / np.sqrt(np.where(square > 0, square, np.nan))
-        return np.asarray(scaled + np.array([self.centre_x_px, self.centre_y_px]))
+        points = np.ascontiguousarray(xy, dtype=np.float64)
+        centre = self.centre_x_px, self.centre_y_px
+        scaled = _divide_by_root(points.reshape(-1, 2), a, *centre, self.half_diagonal_px**2)
+        return np.asarray(scaled.reshape(points.shape))
 
     def undistort_tangents(self, xy_raw: Points, tangents: Points) -> Points:
         """Directions (n, 2) at raw pixels (n, 2), multiplied by the Jacobian of the undistortion."""

@@ -14,6 +14,8 @@ import numpy as np
 from numba import njit
 
 _INVERSE_STEPS = 25
+_BLOCK = 64
+"""Points that `to_base` maps at a time."""
 
 
 @njit(cache=True, nogil=True)
@@ -164,6 +166,73 @@ def mesh_displacement(points, mesh, cell):  # type: ignore[no-untyped-def]
             top = mesh[k, j, c] + fx * (mesh[k, j1, c] - mesh[k, j, c])
             bottom = mesh[k1, j, c] + fx * (mesh[k1, j1, c] - mesh[k1, j, c])
             out[i, c] = top + fy * (bottom - top)
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def to_base(undistorted, raw, rows, height, centre, coefficients, source, target, mesh, cell):  # type: ignore[no-untyped-def]
+    """Base px (n, 2) of undistorted points (n, 2), whose raw points are given: `remove_row_motion` with ``rows``
+    (3, knots), `rational` and `mesh_displacement` in one, to the bit. A mesh (0, 0, 2) is no displacement.
+
+    Some points at a time, with loops of their own for what depends on a table: the other loops become vectors, which
+    divide four times as fast.
+    """
+    count, size, one = np.uint64(undistorted.shape[0]), np.uint64(_BLOCK), np.uint64(1)
+    out = np.empty((undistorted.shape[0], 2))
+    spans, my, mx = np.int32(rows.shape[1] - 3), mesh.shape[0], mesh.shape[1]
+    last_row = float(spans)
+    (a0, a1, a2, a3, a4, a5), (b0, b1, b2, b3, b4, b5), (c0, c1, c2, c3, c4, c5) = coefficients
+    (source_x, source_y, source_scale), (target_x, target_y, target_scale) = source, target
+    first, weight = np.empty(_BLOCK, np.int32), np.empty((4, _BLOCK))
+    at_x, at_y, base_x, base_y = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
+    for begin in range(np.uint64(0), count, size):
+        points = min(size, count - begin)
+        for i in range(points):
+            at_x[i], at_y[i] = undistorted[begin + i, 0], undistorted[begin + i, 1]
+        if spans > 0:
+            for i in range(points):
+                t = (raw[begin + i, 1] + 0.5) / height * spans
+                t = min(max(t, 0.0), last_row) if t == t else 0.0
+                first[i] = min(np.int32(t), spans - np.int32(1))
+                f = t - float(first[i])
+                g = 1.0 - f
+                weight[0, i] = g * g * g / 6.0
+                weight[1, i] = (3.0 * f * f * f - 6.0 * f * f + 4.0) / 6.0
+                weight[2, i] = (3.0 * g * g * g - 6.0 * g * g + 4.0) / 6.0
+                weight[3, i] = f * f * f / 6.0
+            for i in range(points):
+                dx, dy, turn, k = 0.0, 0.0, 0.0, np.uint64(first[i])
+                for m in range(np.uint64(4)):
+                    dx += weight[m, i] * rows[0, k + m]
+                    dy += weight[m, i] * rows[1, k + m]
+                    turn += weight[m, i] * rows[2, k + m]
+                dx, dy = dx - turn * (at_y[i] - centre[1]), dy + turn * (at_x[i] - centre[0])
+                at_x[i], at_y[i] = at_x[i] + dx, at_y[i] + dy
+        for i in range(points):
+            x, y = (at_x[i] - source_x) * source_scale, (at_y[i] - source_y) * source_scale
+            xx, xy, yy = x * x, x * y, y * y
+            w = c0 + c1 * x + c2 * y + c3 * xx + c4 * xy + c5 * yy
+            w = w if w > 1e-9 else np.nan
+            base_x[i] = (a0 + a1 * x + a2 * y + a3 * xx + a4 * xy + a5 * yy) / w / target_scale + target_x
+            base_y[i] = (b0 + b1 * x + b2 * y + b3 * xx + b4 * xy + b5 * yy) / w / target_scale + target_y
+        if my > 0:
+            for i in range(points):
+                at_x[i] = (raw[begin + i, 0] + 0.5) / cell - 0.5
+                at_y[i] = (raw[begin + i, 1] + 0.5) / cell - 0.5
+            for i in range(points):
+                if math.isfinite(at_x[i]) and math.isfinite(at_y[i]):
+                    gx, gy = min(max(at_x[i], 0.0), mx - 1.0), min(max(at_y[i], 0.0), my - 1.0)
+                    j, k = np.uint64(min(int(gx), max(mx - 2, 0))), np.uint64(min(int(gy), max(my - 2, 0)))
+                    fx, fy = gx - float(j), gy - float(k)
+                    j1, k1 = min(j + one, np.uint64(mx - 1)), min(k + one, np.uint64(my - 1))
+                    top = mesh[k, j, 0] + fx * (mesh[k, j1, 0] - mesh[k, j, 0])
+                    bottom = mesh[k1, j, 0] + fx * (mesh[k1, j1, 0] - mesh[k1, j, 0])
+                    base_x[i] += top + fy * (bottom - top)
+                    top = mesh[k, j, 1] + fx * (mesh[k, j1, 1] - mesh[k, j, 1])
+                    bottom = mesh[k1, j, 1] + fx * (mesh[k1, j1, 1] - mesh[k1, j, 1])
+                    base_y[i] += top + fy * (bottom - top)
+        for i in range(points):
+            out[begin + i, 0], out[begin + i, 1] = base_x[i], base_y[i]
     return out
 
 

@@ -17,6 +17,7 @@ _INVERSE_TOLERANCE_PX = 1e-5
 _NEARBY_PX = 0.01
 _DIFFERENCE_PX = 0.25
 """Step of the numerical derivative: small against the row spline's knot spacing, large against rounding errors."""
+_NO_MESH = np.zeros((0, 0, 2))
 _OUTSIDE_FRACTION = 0.1
 _OUTSIDE_PX = 64.0
 """An inverse that lies farther outside the frame than both this and the fraction of its longer side is rejected."""
@@ -218,11 +219,14 @@ class FrameTransform:
 
     def to_base(self, xy_raw: FloatArray) -> FloatArray:
         """Raw pixels (n, 2) to base pixels (n, 2); NaN rows outside the domain of the lens or the polyprojective."""
-        raw = as_points(xy_raw)
-        base = self.polyprojective(self.remove_row_motion(raw))
-        if self.mesh is not None:
-            base += kernels.mesh_displacement(raw, self.mesh, self.cell_size_px)
-        return base
+        raw, p = as_points(xy_raw), self.polyprojective
+        undistorted = as_points(self.lens.undistort_points(raw))
+        mesh = _NO_MESH if self.mesh is None else self.mesh
+        rational = p.coefficients, p.source, p.target
+        base = kernels.to_base(
+            undistorted, raw, self.row_coefficients, self.height, self.centre, *rational, mesh, self.cell_size_px
+        )
+        return np.asarray(base)
 
     def to_raw(self, xy_base: FloatArray) -> FloatArray:
         """Base pixels (n, 2) to raw pixels (n, 2), by Newton's method to well below 1e-3 px.

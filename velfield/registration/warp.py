@@ -21,6 +21,8 @@ from velfield.registration.resampling.cells import CELL_PX, PAD_PX, resample_ker
 Window = tuple[int, int, int, int]
 """x, y, width, height in base px."""
 
+_Places = tuple[IntArray, FloatArray, FloatArray]
+"""Of nodes along an axis: number of the known node before each, distance from it, and from it to the next, in nodes."""
 _INVALID = -1e5
 _MIN_SHRINK = 1.35
 """At this many raw pixels per output pixel or more the raw frame is area-averaged first; below, aliasing is slight."""
@@ -107,16 +109,37 @@ def _interpolable_map(
     exact = transform.to_raw(np.stack([base_x.ravel(), base_y.ravel()], axis=1)).reshape(between.shape)
     if not (np.abs(between - exact)[np.isfinite(exact + between)] > _MAX_BEND_PX).any():
         return step, coarse
-    return _CELL_PX[1], _coarse_map(transform, window=window, scale=scale, step=_CELL_PX[1], shape=shape)
+    half = _CELL_PX[1]
+    return half, _coarse_map(transform, window=window, scale=scale, step=half, shape=shape, twice_as_large=coarse)
 
 
-def _coarse_map(transform: RawToBase, *, window: Window, scale: float, step: int, shape: tuple[int, int]) -> FloatArray:
-    """Raw coordinates (my, mx, 2) at the cell centres, with one more cell on each side; NaN where there is none."""
+def _coarse_map(
+    transform: RawToBase,
+    *,
+    window: Window,
+    scale: float,
+    step: int,
+    shape: tuple[int, int],
+    twice_as_large: FloatArray | None = None,
+) -> FloatArray:
+    """Raw coordinates (my, mx, 2) at the cell centres, with one more cell on each side; NaN where there is none.
+
+    Where those of cells twice as large are given, it starts from them.
+    """
     rows, columns = (-(-size // step) + 2 for size in shape)
     y = (np.arange(rows) - 1) * step + (step - 1) / 2
     x = (np.arange(columns) - 1) * step + (step - 1) / 2
     base_x, base_y = np.meshgrid(window[0] + (x + 0.5) / scale - 0.5, window[1] + (y + 0.5) / scale - 0.5)
-    return invert_on_grid(transform, np.stack([base_x, base_y], axis=2))
+    base = np.stack([base_x, base_y], axis=2)
+    if twice_as_large is None:
+        return invert_on_grid(transform, base)
+    return _invert_between(transform, base, twice_as_large, _within_halved(rows), _within_halved(columns))
+
+
+def _within_halved(count: int) -> _Places:
+    """Places of ``count`` cells in cells twice as large: centres lie a quarter of those before or behind theirs."""
+    before, odd = np.divmod(np.arange(count), 2)
+    return before, np.where(odd, 1.5, 0.5), np.full(count, 2.0)
 
 
 def invert_on_grid(transform: RawToBase, base: FloatArray) -> FloatArray:
@@ -128,8 +151,15 @@ def invert_on_grid(transform: RawToBase, base: FloatArray) -> FloatArray:
     rows, columns = (_sparse_nodes(size) for size in base.shape[:2])
     sparse_base = base[np.ix_(rows, columns)]
     sparse = transform.to_raw(sparse_base.reshape(-1, 2)).reshape(sparse_base.shape)
+    return _invert_between(transform, base, sparse, _neighbours(rows), _neighbours(columns))
+
+
+def _invert_between(
+    transform: RawToBase, base: FloatArray, known: FloatArray, in_rows: _Places, in_columns: _Places
+) -> FloatArray:
+    """As `invert_on_grid`, from raw coordinates (r, c, 2) known on another grid, and the nodes' places in it."""
     pitch_x, pitch_y = base[0, 1, 0] - base[0, 0, 0], base[1, 0, 1] - base[0, 0, 1]
-    raw, slopes, near, lost = _starts(sparse, *_neighbours(rows), *_neighbours(columns), pitch_x, pitch_y)
+    raw, slopes, near, lost = _starts(known, *in_rows, *in_columns, pitch_x, pitch_y)
     target = base.reshape(-1, 2)
     for _ in range(_CORRECTIONS):
         mapped = transform.to_base(raw[near])
@@ -147,7 +177,7 @@ def _sparse_nodes(count: int) -> IntArray:
     return np.unique(np.r_[np.arange(0, count, _SPARSE), count - 1])
 
 
-def _neighbours(nodes: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
+def _neighbours(nodes: IntArray) -> _Places:
     """For all places up to the last of some nodes: number of the node before, distance from it and to the next."""
     at = np.arange(nodes[-1] + 1)
     if len(nodes) == 1:
