@@ -23,6 +23,7 @@ from velfield.field.modes import (
     deconvolution_factor,
     kernel_variance,
     max_cells,
+    occupied_box,
     quantile,
     speed_cells,
     velocity_modes,
@@ -53,6 +54,17 @@ def test_the_speed_histogram_conserves_the_weight_and_its_quantiles_are_the_spee
     for p in (0.15, 0.5, 0.85):
         assert quantile(cells, total, p) == pytest.approx(np.quantile(speed, p), abs=0.03)
     assert quantile(cells, total, 0.0) <= quantile(cells, total, 1.0) <= len(cells) / CELLS_PER_BIN
+
+
+@pytest.mark.parametrize("filled", [0, 1, 2, 7])
+def test_the_occupied_box_holds_the_bins_that_are_not_zero(filled: int) -> None:
+    rng = np.random.default_rng(filled)
+    for _ in range(20):
+        h = np.zeros((11, 11), np.int32)
+        h[rng.integers(0, 11, filled), rng.integers(0, 11, filled)] = rng.integers(1, 2**31 - 1, filled)
+        y, x = np.nonzero(h)
+        expected = (y.min(), y.max() + 1, x.min(), x.max() + 1) if filled else (0, 0, 0, 0)
+        assert occupied_box(h) == expected
 
 
 @pytest.mark.parametrize("true_sd", [0.5, 1.0, 2.0])

@@ -22,7 +22,7 @@ from velfield.report.colours import direction_colours, ramp_colours
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run
 from velfield.run.stores import open_field
-from velfield.viewer.flow import DRAWS, draw_bins
+from velfield.viewer.flow import DRAWS, _draw_tile, draw_bins
 from velfield.viewer.replay import CHUNK_S, chunk_count, replay_chunks, vehicle_paths
 
 PAINTED = """(() => {
@@ -136,6 +136,24 @@ def test_draws_follow_the_weights_within_one_draw() -> None:
     expected = weights / weights.sum(axis=1, keepdims=True) * DRAWS
     assert np.abs(drawn - expected).max() <= 1
     assert drawn[weights == 0].sum() == 0
+
+
+@pytest.mark.parametrize("side", [1, 4])
+def test_the_draws_of_a_tile_are_those_from_the_sums_of_its_cells(side: int) -> None:
+    rng = np.random.default_rng(side)
+    count = rng.integers(0, 3, (8, 12)).astype(np.int32)
+    count[:4, 4:8] = 0  # a cell that no vehicle passed
+    histogram = rng.integers(0, 2**27, (8, 12, 9, 9)) * (rng.random((8, 12, 9, 9)) < 0.1) * (count > 0)[..., None, None]
+    histogram[..., 4, 4] += count > 0
+    across = 12 // side
+    cells, vehicles, bins = _draw_tile(histogram.astype(np.int32), count, side, across)
+    for cell, most, drawn in zip(cells, vehicles, bins, strict=True):
+        window = np.s_[cell // across * side :, cell % across * side :]
+        here = np.s_[:side, :side]
+        assert most == count[window][here].max()
+        weights = histogram[window][here].sum(axis=(0, 1)).reshape(1, -1)
+        np.testing.assert_array_equal(drawn, draw_bins(weights)[0])
+    assert len(cells) == count.reshape(8 // side, side, across, side).any(axis=(1, 3)).sum()
 
 
 def test_the_flow_holds_the_distribution_of_the_field(run: Run, record: ViewRecord) -> None:

@@ -35,14 +35,44 @@ def kernel_variance(sigma: float) -> float:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def occupied_box(h: NDArray[np.int32]) -> tuple[int, int, int, int]:
+    """First row, row after the last, first column and column after the last of the bins that are not zero; zeros where
+    all are.
+
+    A vehicle fills some ten of the thousand bins, and each statistic would look at all of them.
+    """
+    top, bottom = h.shape[0], 0
+    for y in range(h.shape[0]):
+        any_bit = 0
+        for x in range(h.shape[1]):  # without a branch, so that several bins are compared at once
+            any_bit |= h[y, x]
+        if any_bit != 0:
+            top, bottom = min(top, y), y + 1
+    if bottom == 0:
+        return 0, 0, 0, 0
+    left, right = h.shape[1], 0
+    for y in range(top, bottom):
+        x = 0
+        while x < left and h[y, x] == 0:
+            x += 1
+        left = x
+        x = h.shape[1]
+        while x > right and h[y, x - 1] == 0:
+            x -= 1
+        right = x
+    return top, bottom, left, right
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def speed_cells(h: NDArray[np.int32], reach: int, cells: FloatArray) -> float:
     """Fill ``cells`` with the histogram of speed, each bin spread uniformly over one bin's width of speed; returns the
     sum."""
     cells[:] = 0.0
     total = 0.0
     half = CELLS_PER_BIN // 2
-    for y in range(h.shape[0]):
-        for x in range(h.shape[1]):
+    top, bottom, left, right = occupied_box(h)
+    for y in range(top, bottom):
+        for x in range(left, right):
             if h[y, x] <= 0:
                 continue
             weight = float(h[y, x])
@@ -66,9 +96,10 @@ def quantile(cells: FloatArray, total: float, probability: float) -> float:
     target = min(max(probability, 0.0), 1.0) * total
     below = 0.0
     for c in range(cells.size):
-        if below + cells[c] >= target and cells[c] > 0.0:
-            return float((c + max(target - below, 0.0) / cells[c]) / CELLS_PER_BIN)
-        below += cells[c]
+        if cells[c] > 0.0:  # most are empty: only the sums of the others wait for one another
+            if below + cells[c] >= target:
+                return float((c + max(target - below, 0.0) / cells[c]) / CELLS_PER_BIN)
+            below += cells[c]
     return cells.size / CELLS_PER_BIN
 
 
@@ -78,9 +109,10 @@ def deconvolution_factor(cells: FloatArray, total: float, blur: float) -> float:
     quantiles move towards the median."""
     mean, square = 0.0, 0.0
     for c in range(cells.size):
-        speed = (c + 0.5) / CELLS_PER_BIN
-        mean += cells[c] * speed
-        square += cells[c] * speed * speed
+        if cells[c] > 0.0:
+            speed = (c + 0.5) / CELLS_PER_BIN
+            mean += cells[c] * speed
+            square += cells[c] * speed * speed
     variance = square / total - (mean / total) ** 2
     return sqrt(max(variance - blur, 0.0) / variance)
 
@@ -118,13 +150,14 @@ def _mean_shift(h: NDArray[np.int32], y: float, x: float, window: float) -> tupl
     """Mean shift from (y, x), bins, to a maximum of the smoothed histogram."""
     n = h.shape[0]
     reach = 3.0 * window
+    top, bottom, left, right = occupied_box(h)
     kernel_x = np.empty(n)
     for _ in range(_ITERATIONS):
         total, sum_y, sum_x = 0.0, 0.0, 0.0
-        first, last = max(0, floor(x - reach + 0.5)), min(n - 1, floor(x + reach + 0.5))
+        first, last = max(left, floor(x - reach + 0.5)), min(right - 1, floor(x + reach + 0.5))
         for i in range(first, last + 1):
             kernel_x[i] = exp(-0.5 * (i - x) ** 2 / (window * window))
-        for j in range(max(0, floor(y - reach + 0.5)), min(n - 1, floor(y + reach + 0.5)) + 1):
+        for j in range(max(top, floor(y - reach + 0.5)), min(bottom - 1, floor(y + reach + 0.5)) + 1):
             row, row_x = 0.0, 0.0
             for i in range(first, last + 1):
                 w = h[j, i] * kernel_x[i]
@@ -149,8 +182,9 @@ def _mean_shift(h: NDArray[np.int32], y: float, x: float, window: float) -> tupl
 def _main_mode(h: NDArray[np.int32], window: float) -> tuple[float, float]:
     """(y, x) in bins of the highest mode of a histogram that is not empty. Equal peaks: the first in raster order."""
     best, best_y, best_x = np.int64(-1), 0, 0
-    for y in range(h.shape[0]):
-        for x in range(h.shape[1]):
+    top, bottom, left, right = occupied_box(h)
+    for y in range(top, bottom):
+        for x in range(left, right):
             if h[y, x] > 0:
                 value = _smooth(h, y, x)
                 if value > best:
@@ -181,8 +215,9 @@ def pixel_modes(h: NDArray[np.int32], window: float, modes: NDArray[np.float64])
     """
     found = np.empty((64, 3), np.float64)
     n_found = 0
-    for y in range(h.shape[0]):
-        for x in range(h.shape[1]):
+    top, bottom, left, right = occupied_box(h)
+    for y in range(top, bottom):
+        for x in range(left, right):
             if h[y, x] > 0 and n_found < found.shape[0] and _is_peak(h, y, x):
                 mode_y, mode_x = _mean_shift(h, float(y), float(x), window)
                 known = False
@@ -193,8 +228,8 @@ def pixel_modes(h: NDArray[np.int32], window: float, modes: NDArray[np.float64])
                     found[n_found] = (mode_y, mode_x, 0.0)
                     n_found += 1
     total = 0.0
-    for y in range(h.shape[0]):
-        for x in range(h.shape[1]):
+    for y in range(top, bottom):
+        for x in range(left, right):
             if h[y, x] > 0:
                 nearest = 0
                 min_distance = np.inf

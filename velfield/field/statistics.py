@@ -34,6 +34,7 @@ from velfield.field.modes import (
     kernel_variance,
     max_cells,
     modal_velocity,
+    occupied_box,
     quantile,
     speed_cells,
 )
@@ -98,9 +99,10 @@ def _median_speed(
     median = quantile(cells, total, 0.5)
     mean, square = 0.0, 0.0
     for c in range(cells.size):
-        speed = (c + 0.5) / CELLS_PER_BIN
-        mean += cells[c] * speed
-        square += cells[c] * speed * speed
+        if cells[c] > 0.0:
+            speed = (c + 0.5) / CELLS_PER_BIN
+            mean += cells[c] * speed
+            square += cells[c] * speed * speed
     mean /= total
     variance = max(square / total - mean * mean - blur, 0.0)
     typical = measurement_variance + (TYPICAL_SPEED_SD * median) ** 2 + MIN_SPEED_SD_BINS**2
@@ -122,8 +124,9 @@ def _modal_direction(
     speed = hypot(mode_x, mode_y)
     along_x, along_y = mode_x / speed, mode_y / speed
     mode_weight, total, mean, square = 0.0, 0.0, 0.0, 0.0
-    for y in range(h.shape[0]):
-        for x in range(h.shape[1]):
+    top, bottom, left, right = occupied_box(h)
+    for y in range(top, bottom):
+        for x in range(left, right):
             if h[y, x] > 0:
                 weight = float(h[y, x])
                 total += weight
@@ -242,8 +245,9 @@ def _moments(
     variance, 5 entropy, 6 circular dispersion."""
     total, mode_weight, sum_x, sum_y = 0.0, 0.0, 0.0, 0.0
     moving, cosine, sine, plogp = 0.0, 0.0, 0.0, 0.0
-    for y in range(h.shape[0]):
-        for x in range(h.shape[1]):
+    top, bottom, left, right = occupied_box(h)
+    for y in range(top, bottom):
+        for x in range(left, right):
             if h[y, x] <= 0:
                 continue
             weight = float(h[y, x])
@@ -277,8 +281,9 @@ def _circular_dispersion(
     """Circular dispersion (1 - mean cos 2(theta - direction)) / (2 length^2): n times the variance of the mean
     direction, rad^2."""
     cosine = 0.0
-    for y in range(h.shape[0]):
-        for x in range(h.shape[1]):
+    top, bottom, left, right = occupied_box(h)
+    for y in range(top, bottom):
+        for x in range(left, right):
             if h[y, x] > 0:
                 vx, vy = float(x - reach), float(y - reach)
                 if hypot(vx, vy) > stationary:

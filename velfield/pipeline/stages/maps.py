@@ -10,6 +10,7 @@ from schemas.arrays import FloatArray, Mask
 from velfield.exports.cog import write_cog
 from velfield.field.segments import stationary_speed_px_per_s
 from velfield.field.statistics import direction_rad, speed_px_per_s
+from velfield.parallel import parallel_map
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.report.figures import MapScale, direction_figure, png_bytes, speed_figure
@@ -31,15 +32,15 @@ def make_maps(plan: Plan) -> StageResult:
     grid, config, layout = read_grid(plan.layout), plan.config.field, plan.layout
     slow = stationary_speed_px_per_s(config, grid.gsd_m)
     scale = MapScale(gsd_m=grid.gsd_m, north_rad=north_direction_rad(grid))
-    # One map after the other, each of the few pixels that vehicles passed: whole layers of float64 fill the memory.
-    written = [
-        *_write_direction(plan, scale, slow),
-        *_write_speed(plan, scale),
-        *_write_quality_figures(plan),
-        *write_view_data(layout),
-    ]
+
+    def write_figures() -> list[Path]:
+        # One map after the other, each of the few pixels that vehicles passed: whole layers of float64 fill the memory.
+        return [*_write_direction(plan, scale, slow), *_write_speed(plan, scale), *_write_quality_figures(plan)]
+
+    # The viewer's data take about as long as the figures.
+    written = parallel_map(lambda write: write(), [write_figures, lambda: write_view_data(layout)])
     advance("maps")
-    return StageResult(written, {"maps": 2.0})
+    return StageResult([path for paths in written for path in paths], {"maps": 2.0})
 
 
 def _modal_velocity(plan: Plan) -> tuple[Mask, FloatArray]:
