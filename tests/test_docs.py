@@ -58,6 +58,12 @@ def commands() -> list[tuple[str, str]]:
     return sorted({(page, line) for page, line in lines if line.startswith("velfield ")})
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_no_section_stands_twice_on_a_page(page: Path) -> None:
+    titles = re.findall(r"^## .+", BLOCK.sub("", page.read_text()), re.MULTILINE)
+    assert [title for title in titles if titles.count(title) > 1] == []
+
+
 @pytest.fixture
 def folder(whole: tuple[Path, RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A working folder with the files that the pages name."""
