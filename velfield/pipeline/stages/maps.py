@@ -1,5 +1,7 @@
 """Maps of modal direction and speed, as figures and as layers for GIS; and the data of the viewer."""
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -38,9 +40,14 @@ def make_maps(plan: Plan) -> StageResult:
         return [*_write_direction(plan, scale, slow), *_write_speed(plan, scale), *_write_quality_figures(plan)]
 
     # The viewer's data take about as long as the figures.
-    written = parallel_map(lambda write: write(), [write_figures, lambda: write_view_data(layout)])
+    writers: list[Callable[[], list[Path]]] = [write_figures, partial(write_view_data, layout)]
+    written = parallel_map(_call, writers)
     advance("maps")
     return StageResult([path for paths in written for path in paths], {"maps": 2.0})
+
+
+def _call(write: Callable[[], list[Path]]) -> list[Path]:
+    return write()
 
 
 def _modal_velocity(plan: Plan) -> tuple[Mask, FloatArray]:
