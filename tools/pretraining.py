@@ -180,8 +180,8 @@ def focal_loss(out: Tensor, batch: Batch) -> Tensor:
 
 def _predict(teacher: Network, images: Float32Array) -> tuple[Tensor, Tensor]:
     grey = np.rint(images * 255).astype(np.uint8)
-    probability, orientation = teacher.session.run(None, {"image": grey[:, None]})
-    return torch.from_numpy(probability[:, 0]), torch.from_numpy(orientation)
+    probability, orientation = teacher.predict(grey)
+    return torch.from_numpy(probability), torch.from_numpy(orientation)
 
 
 def _distillation_loss(out: Tensor, batch: Batch, probability: Tensor, orientation: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from velfield.detection.cascade.feature_image import (
     FeatureImage,
     PatchScale,
     compute_features,
+    pack_words_kernel,
     score_poses,
 )
 from velfield.detection.cascade.feature_matrix import feature_values, fit_feature_binner
@@ -65,6 +66,13 @@ def plain_value(patch: np.ndarray, reach: tuple[int, int], channel: int, rectang
         part = patch[channel, reach[1] + y0 : reach[1] + y1, reach[0] + x0 : reach[0] + x1]
         total += sign * (part - mean).sum()
     return float(total / (patch[1].mean() + patch[2].mean() + FLOOR))
+
+
+@pytest.mark.parametrize("shape", [(40, 57), (1, 9), (2, 3)])
+def test_words_hold_the_grey_and_the_gradients_of_sobel(shape: tuple[int, int]) -> None:
+    grey = np.random.default_rng(4).integers(0, 256, shape).astype(np.uint8)
+    along, across = (cv2.Sobel(grey, cv2.CV_16S, 1 - k, k).astype(np.int64) >> 1 for k in (0, 1))
+    np.testing.assert_array_equal(pack_words_kernel(grey), grey + (along + 512) * 256 + ((across + 512) << 18))
 
 
 @pytest.mark.parametrize("scale", [FINE, COARSE])

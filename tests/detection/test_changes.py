@@ -19,7 +19,7 @@ from velfield.detection.detect import (
 )
 from velfield.detection.detector import Detections, concatenate, shipped_detector
 from velfield.detection.frame import ComparableFrame, half_resolution
-from velfield.detection.mosaic import Box, find_in_boxes, pack_boxes
+from velfield.detection.mosaic import Box, find_in_boxes, owners_kernel, pack_boxes
 
 _SHAPE = 300, 420
 
@@ -145,6 +145,16 @@ def test_what_is_found_in_a_mosaic_of_boxes_is_what_is_found_in_each_box() -> No
     alone = [find_in_boxes(detector, searched, None, [box], 0.0) for box in boxes]
     assert [len(one) for one in alone] == [1, 1, 1, 1, 1]
     np.testing.assert_allclose(together.to_rows(), concatenate(alone).to_rows(), rtol=0, atol=1e-4)
+
+
+def test_a_position_belongs_to_the_box_of_the_crop_that_it_lies_in() -> None:
+    crops = np.array([(0, 0, 48, 56), (0, 56, 40, 64), (48, 0, 40, 40)])
+    owner = np.full((88, 120), -1)
+    for number, (top, left, rows, columns) in enumerate(crops):
+        owner[top + 16 : top + rows - 16, left + 16 : left + columns - 16] = number
+    xy = np.random.default_rng(8).uniform(-5, 125, (500, 2))
+    column, row = (np.clip(np.floor(xy[:, k] + 0.5).astype(int), 0, size - 1) for k, size in ((0, 120), (1, 88)))
+    np.testing.assert_array_equal(owners_kernel(xy, crops, 16, 88, 120), owner[row, column])
 
 
 def test_a_detector_of_another_kind_searches_each_box_by_itself() -> None:

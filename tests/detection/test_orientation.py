@@ -122,6 +122,23 @@ def test_chips_at_the_edge_repeat_the_last_pixels() -> None:
     assert (chip[:16, :16] == image[0, 0]).all()
 
 
+def test_crops_are_those_of_whole_grids() -> None:
+    rng = np.random.default_rng(7)
+    image = rng.integers(0, 256, (90, 120)).astype(np.uint8)
+    xy, axes = rng.uniform(-3, 1, (40, 2)) % [120, 90], rng.uniform(0, np.pi, 40)
+    across, along = np.meshgrid(np.arange(10) - 4.5, np.arange(32) - 15.5)
+    cosine, sine = np.cos(axes)[:, None, None], np.sin(axes)[:, None, None]
+    x = xy[:, 0, None, None] + along * cosine - across * sine
+    y = xy[:, 1, None, None] + along * sine + across * cosine
+    grids = (values.reshape(40, -1).astype(np.float32) for values in (x, y))
+    plain = cv2.remap(image, *grids, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    found = oriented_patches(image, xy, axes, width=10, length=32)
+    np.testing.assert_array_equal(found, plain.reshape(40, 32, 10))
+    padded = np.pad(image, 32, mode="edge")
+    for chip, (left, top) in zip(upright_chips(image, xy), np.rint(xy).astype(int) + 16, strict=True):
+        np.testing.assert_array_equal(chip, padded[top : top + 32, left : left + 32])
+
+
 def test_no_positions_give_no_crops() -> None:
     image = np.zeros((40, 50), np.uint8)
     assert oriented_patches(image, np.empty((0, 2)), np.empty(0)).shape == (0, 16, 8)

@@ -10,7 +10,7 @@ from schemas.detector import CnnConfig
 from velfield.detection.cnn import network as networks
 from velfield.detection.cnn import quantization
 from velfield.detection.cnn.detector import CnnDetector
-from velfield.detection.cnn.model import forward
+from velfield.detection.cnn.model import forward, predict_crops
 from velfield.detection.cnn.network import (
     FORMER_TOPOLOGY,
     TOPOLOGY,
@@ -20,7 +20,13 @@ from velfield.detection.cnn.network import (
     Topology,
     convolutions,
 )
-from velfield.detection.cnn.quantization import calibrate, is_exact, quantized_to_onnx
+from velfield.detection.cnn.quantization import (
+    FirstLayer,
+    calibrate,
+    is_exact,
+    quantized_to_onnx,
+    unpack_heatmap_kernel,
+)
 from velfield.detection.detector import load_detector, shipped_detector
 
 
@@ -73,7 +79,7 @@ class PlainGraph(quantization._QuantizedGraph):
 
 
 @pytest.mark.usefixtures("exact")
-def test_the_first_layer_in_whole_floats_and_blocks_by_rows_change_nothing() -> None:
+def test_a_first_layer_of_our_own_and_rows_of_channels_change_nothing() -> None:
     network = replace(shipped().network, ranges=calibrate(shipped().network, [cars(1), cars(2)]))
     assert network.ranges is not None
     plain = PlainGraph(network, network.ranges)
@@ -83,6 +89,32 @@ def test_the_first_layer_in_whole_floats_and_blocks_by_rows_change_nothing() -> 
     found = forward(network, images)
     np.testing.assert_array_equal(found[0], expected[0][:, 0])
     np.testing.assert_array_equal(found[1], expected[1])
+
+
+@pytest.mark.parametrize("shape", [(1, 4, 4), (2, 40, 24), (3, 36, 68)])
+def test_the_first_layer_is_a_strided_convolution_in_blocks(shape: tuple[int, int, int]) -> None:
+    rng = np.random.default_rng(5)
+    weights = rng.integers(-127, 128, (16, 16)).astype(np.float32)
+    biases = rng.integers(-20_000, 20_000, 16).astype(np.float32)
+    factors = rng.uniform(0.001, 0.02, 16).astype(np.float32)
+    images = rng.integers(0, 256, shape).astype(np.uint8)
+    padded = np.pad(images, ((0, 0), (1, 1), (1, 1))).astype(np.float32)
+    taps = np.lib.stride_tricks.sliding_window_view(padded, (4, 4), (1, 2))[:, ::2, ::2].reshape(-1, 16)
+    sums = np.maximum(taps.astype(np.int64) @ weights.astype(np.int64) + biases.astype(np.int64), 0)
+    levels = np.minimum(np.rint(sums.astype(np.float32) * factors), 255).astype(np.uint8)
+    count, rows, columns = shape[0], shape[1] // 2, shape[2] // 2
+    framed = np.pad(levels.reshape(count, rows, columns, 16), ((0, 0), (1, 1), (1, 1), (0, 0)))
+    blocks = framed.reshape(count, rows // 2 + 1, 2, columns // 2 + 1, 2, 16).transpose(0, 1, 3, 2, 4, 5)
+    found = FirstLayer(weights, biases, factors).blocks(images)
+    np.testing.assert_array_equal(found, blocks.reshape(found.shape))
+
+
+def test_the_blocks_of_the_head_are_a_heatmap() -> None:
+    values = np.random.default_rng(6).normal(size=(2, 3, 5, 12)).astype(np.float32)
+    pixels = values.reshape(2, 3, 5, 2, 2, 3).transpose(0, 5, 1, 3, 2, 4).reshape(2, 3, 6, 10)
+    heatmap, vectors = unpack_heatmap_kernel(np.exp(values), values)
+    np.testing.assert_array_equal(heatmap, np.exp(pixels[:, 0]))
+    np.testing.assert_array_equal(vectors, pixels[:, 1:])
 
 
 @pytest.mark.usefixtures("exact")
@@ -108,6 +140,20 @@ def test_a_crop_gives_the_same_alone_and_among_others() -> None:
     images = np.stack([cars(k, (96, 96)) for k in range(5)])
     together, _ = forward(eight, images)
     np.testing.assert_array_equal(together, np.concatenate([forward(eight, one[None])[0] for one in images]))
+
+
+def test_crops_of_an_image_are_predicted_as_if_alone() -> None:
+    network, image = shipped().network, cars(2, (120, 160))
+    crops = ((0, 0, 48, 40), (0, 40, 48, 40), (48, 8, 64, 104), (8, 80, 40, 48))
+    probability, orientation = np.zeros((60, 80), np.float32), np.zeros((2, 60, 80), np.float32)
+    for y, x, height, width in crops:
+        part = slice(y // 2, (y + height) // 2), slice(x // 2, (x + width) // 2)
+        alone = forward(network, image[None, y : y + height, x : x + width])
+        probability[part], orientation[:, *part] = alone[0][0], alone[1][0]
+    found = predict_crops(network, image, crops)
+    np.testing.assert_allclose(found[0], probability, atol=1e-5)
+    np.testing.assert_allclose(found[1], orientation, atol=1e-5)
+    assert not found[0][:, 64:].any()
 
 
 def test_ranges_are_of_the_flight_and_the_setting_and_come_back_from_the_file(tmp_path) -> None:  # type: ignore[no-untyped-def]

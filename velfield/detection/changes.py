@@ -15,24 +15,32 @@ BOX_AREA = (BOX_PX // 2) ** 2
 @njit(cache=True, nogil=True)
 def difference_kernel(image, other, valid, other_valid, sums, counts, one_only):  # type: ignore[no-untyped-def]
     """Difference of two images (h, w) where both are valid, else 0; of each cell its sum, the number of such pixels,
-    and whether there are some where just one is valid."""
+    and whether there are some where just one is valid.
+
+    Rows whole, one quantity after the other, then by cells: loops over the few pixels of a cell, or over arrays of many
+    types, are not vectorised.
+    """
     side = np.uint64(CELL_PX // 2)
     height, width = np.uint64(image.shape[0]), np.uint64(image.shape[1])
     out = np.empty(image.shape, np.int16)
-    for y in range(height):
-        for x in range(width):
-            both = valid[y, x] & other_valid[y, x]
-            out[y, x] = (np.int16(image[y, x]) - np.int16(other[y, x])) * both
-        row = y // side
+    total, number, unlike = np.empty(width, np.int16), np.empty(width, np.uint8), np.empty(width, np.bool_)
+    for row in range(np.uint64(sums.shape[0])):
+        total[:], number[:], unlike[:] = 0, 0, False
+        for y in range(row * side, min((row + np.uint64(1)) * side, height)):
+            for x in range(width):
+                both = valid[y, x] & other_valid[y, x]
+                out[y, x] = (np.int16(image[y, x]) - np.int16(other[y, x])) * both
+            for x in range(width):
+                total[x] += out[y, x]
+            for x in range(width):
+                number[x] += valid[y, x] & other_valid[y, x]
+            for x in range(width):
+                unlike[x] |= valid[y, x] ^ other_valid[y, x]
         for column in range(np.uint64(sums.shape[1])):
-            total = number = unlike = np.int32(0)
             for x in range(column * side, min((column + np.uint64(1)) * side, width)):
-                total = np.int32(total + out[y, x])
-                number = np.int32(number + (valid[y, x] & other_valid[y, x]))
-                unlike = np.int32(unlike + (valid[y, x] ^ other_valid[y, x]))
-            sums[row, column] += np.float32(total)
-            counts[row, column] += np.float32(number)
-            one_only[row, column] |= unlike > 0
+                sums[row, column] += np.float32(total[x])
+                counts[row, column] += np.float32(number[x])
+                one_only[row, column] |= unlike[x]
     return out
 
 
@@ -59,26 +67,37 @@ def changed_kernel(boxes, slow, slope, valid, other_valid, limit, shift):  # typ
     side, scale = np.uint64(CELL_PX // 2), np.float32(1 / BOX_AREA)
     out = np.zeros(slow.shape, np.bool_)
     height, width = np.uint64(valid.shape[0]), np.uint64(valid.shape[1])
-    for y in range(height):
-        row = y // side
+    about, above = np.empty(width, np.float32), np.empty(width, np.bool_)
+    for row in range(np.uint64(slow.shape[0])):
         for column in range(np.uint64(slow.shape[1])):
-            about, above = slow[row, column], np.int32(0)
-            for x in range(column * side, min((column + np.uint64(1)) * side, width)):
-                change = abs(np.float32(boxes[y, x]) * scale - about)
-                exceeds = (change > limit + shift * slope[y, x]) & valid[y, x] & other_valid[y, x]
-                above = np.int32(above + exceeds)
-            out[row, column] |= above > 0
+            about[column * side : (column + np.uint64(1)) * side] = slow[row, column]
+        above[:] = False
+        for y in range(row * side, min((row + np.uint64(1)) * side, height)):
+            for x in range(width):
+                change = abs(np.float32(boxes[y, x]) * scale - about[x])
+                above[x] |= (change > limit + shift * slope[y, x]) & valid[y, x] & other_valid[y, x]
+        _mark_cells(above, out[row])
     return out
+
+
+@njit(cache=True, nogil=True)
+def _mark_cells(pixels, cells):  # type: ignore[no-untyped-def]
+    """Mark the cells of a row in which a row of pixels holds anywhere."""
+    side, width = np.uint64(CELL_PX // 2), np.uint64(pixels.size)
+    for column in range(np.uint64(cells.size)):
+        for x in range(column * side, min((column + np.uint64(1)) * side, width)):
+            cells[column] |= pixels[x]
 
 
 @njit(cache=True, nogil=True)
 def any_kernel(half, out):  # type: ignore[no-untyped-def]
     """Mark the cells (rows, columns) in which a mask at half the resolution holds anywhere."""
     side = np.uint64(CELL_PX // 2)
-    width = np.uint64(half.shape[1])
-    for y in range(np.uint64(half.shape[0])):
-        for column in range(np.uint64(out.shape[1])):
-            number = np.int32(0)
-            for x in range(column * side, min((column + np.uint64(1)) * side, width)):
-                number = np.int32(number + half[y, x])
-            out[y // side, column] |= number > 0
+    height, width = np.uint64(half.shape[0]), np.uint64(half.shape[1])
+    found = np.empty(width, np.bool_)
+    for row in range(np.uint64(out.shape[0])):
+        found[:] = False
+        for y in range(row * side, min((row + np.uint64(1)) * side, height)):
+            for x in range(width):
+                found[x] |= half[y, x]
+        _mark_cells(found, out[row])

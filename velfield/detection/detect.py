@@ -82,12 +82,23 @@ def oriented_patches(
     count = len(xy)
     if not count:
         return np.empty((0, length, width), np.uint8)
-    along = np.arange(length) - (length - 1) / 2
-    across = np.arange(width) - (width - 1) / 2
-    cos, sin = np.cos(orientation_rad)[:, None, None], np.sin(orientation_rad)[:, None, None]
-    x = xy[:, 0, None, None] + along[:, None] * cos - across * sin
-    y = xy[:, 1, None, None] + along[:, None] * sin + across * cos
-    return _sample(image, x, y)
+    x, y = _grid_kernel(xy, np.cos(orientation_rad), np.sin(orientation_rad), length, width)
+    return _sample(image, x, y).reshape(count, length, width)
+
+
+@njit(cache=True, nogil=True)
+def _grid_kernel(xy, cosine, sine, length, width):  # type: ignore[no-untyped-def]
+    """Where the pixels of patches lie in an image, row by row: x and y, each (n, length width) float32."""
+    x, y = np.empty((len(xy), length * width), np.float32), np.empty((len(xy), length * width), np.float32)
+    for n in range(len(xy)):
+        for i in range(length):
+            along = i - (length - 1) / 2
+            begin_x, begin_y = xy[n, 0] + along * cosine[n], xy[n, 1] + along * sine[n]
+            for j in range(width):
+                across = j - (width - 1) / 2
+                x[n, i * width + j] = begin_x - across * sine[n]
+                y[n, i * width + j] = begin_y + across * cosine[n]
+    return x, y
 
 
 def upright_chips(image: GreyImage, xy: FloatArray, *, side: int = _CHIP_PX) -> GreyImage:
@@ -101,6 +112,11 @@ def _chips_kernel(image, corners, side):  # type: ignore[no-untyped-def]
     height, width = image.shape
     out = np.empty((len(corners), side, side), np.uint8)
     for n in range(len(corners)):
+        left, top = corners[n]
+        if 0 <= left <= width - side and 0 <= top <= height - side:
+            for i in range(side):
+                out[n, i] = image[top + i, left : left + side]
+            continue
         for i in range(side):
             y = min(max(corners[n, 1] + i, 0), height - 1)
             for j in range(side):
@@ -121,14 +137,12 @@ def oriented_strips(
     return oriented_patches(half_image, (xy - 0.5) / 2, orientation_rad, width=width, length=length)
 
 
-def _sample(image: GreyImage, x: FloatArray, y: FloatArray) -> GreyImage:
-    shape = x.shape
-    flat_x, flat_y = (np.ascontiguousarray(c.reshape(shape[0], -1), np.float32) for c in (x, y))
+def _sample(image: GreyImage, x: Float32Array, y: Float32Array) -> GreyImage:
     rows = []
-    for start in range(0, shape[0], 16_000):  # remap takes at most 32,767 rows
+    for start in range(0, len(x), 16_000):  # remap takes at most 32,767 rows
         part = slice(start, start + 16_000)
-        rows.append(cv2.remap(image, flat_x[part], flat_y[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
-    return np.asarray(np.concatenate(rows).reshape(shape), np.uint8)
+        rows.append(cv2.remap(image, x[part], y[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+    return np.asarray(np.concatenate(rows) if len(rows) > 1 else rows[0], np.uint8)
 
 
 @dataclass(frozen=True)
@@ -323,7 +337,7 @@ def box_mean_slope(frame: SearchableFrame) -> Float32Array:
     side = BOX_PX // 2
     mean = cv2.boxFilter(frame.half_image, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REPLICATE)
     along, across = (cv2.Sobel(mean, cv2.CV_32F, 1 - k, k, scale=1 / 8) for k in (0, 1))
-    return np.asarray(cv2.magnitude(along, across), np.float32)
+    return np.asarray(cv2.magnitude(along, across, along), np.float32)
 
 
 def _slow_part(difference: Float32Array, covered: Float32Array) -> Float32Array:

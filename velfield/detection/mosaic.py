@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 
 from schemas.arrays import GreyImage, IntArray
 from velfield.detection.changes import CELL_PX
@@ -103,17 +104,28 @@ def _find_in_mosaic(
     valid = _assemble(frame.valid.view(np.uint8), corners, mosaic, cv2.BORDER_CONSTANT).view(np.bool_)
     ground = None if background is None else _assemble(background, corners, mosaic, cv2.BORDER_REFLECT_101)
     found = detector.find_in_crops(image, valid, ground, mosaic.crops, threshold=threshold)
-    owner = np.full(mosaic.shape, -1, np.int32)
-    for k, (row, column, height, width) in enumerate(mosaic.crops):
-        owner[row + context : row + height - context, column + context : column + width - context] = k
-    x, y = np.floor(found.xy + 0.5).astype(np.int64).T
-    crop = owner[np.clip(y, 0, owner.shape[0] - 1), np.clip(x, 0, owner.shape[1] - 1)]
+    placed = np.array(mosaic.crops)
+    crop = owners_kernel(found.xy, placed, context, *mosaic.shape)
     inside = np.flatnonzero(crop >= 0)
     found, crop = found.take(inside), crop[inside]
-    shift = corners[crop] - np.array([placed[:2] for placed in mosaic.crops])[crop]
+    shift = (corners - placed[:, :2])[crop]
     cars = found.to_rows()
     cars[:, :2] += shift[:, ::-1]
     return Detections.from_rows(cars[:, :5], cars[:, 5]), mosaic.numbers[crop]
+
+
+@njit(cache=True, nogil=True)
+def owners_kernel(xy, crops, context, height, width):  # type: ignore[no-untyped-def]
+    """Number of the crop in whose box, within the context, the pixel of each position (n, 2) lies; -1 where in none."""
+    out = np.full(len(xy), -1, np.int64)
+    for n in range(len(xy)):
+        x = min(max(int(np.floor(xy[n, 0] + 0.5)), 0), width - 1)
+        y = min(max(int(np.floor(xy[n, 1] + 0.5)), 0), height - 1)
+        for k in range(len(crops)):
+            top, left, rows, columns = crops[k]
+            if top + context <= y < top + rows - context and left + context <= x < left + columns - context:
+                out[n] = k
+    return out
 
 
 def _assemble(image: GreyImage, corners: IntArray, mosaic: Mosaic, border: int) -> GreyImage:

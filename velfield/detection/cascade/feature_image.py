@@ -203,8 +203,7 @@ def compute_features(image: GreyImage, background: GreyImage | None = None, scal
 def features_of_reduced(image: GreyImage, background: GreyImage | None, scale: PatchScale) -> FeatureImage:
     """The same of images that have the scale's resolution already."""
     grey, window = _smooth(image), np.ones((3, 3), np.uint8)
-    gx, gy = (cv2.Sobel(grey, cv2.CV_16S, 1 - k, k) for k in (0, 1))
-    words = _pack_words(grey, gx, gy)
+    words = pack_words_kernel(grey)
     difference = np.zeros(1, np.uint8)
     if background is not None:
         ground = _smooth(background)
@@ -215,13 +214,28 @@ def features_of_reduced(image: GreyImage, background: GreyImage | None, scale: P
 
 
 @njit(cache=True, nogil=True)
-def _pack_words(grey, gx, gy):  # type: ignore[no-untyped-def]
-    """Grey, and half of each gradient above its zero, in one word a pixel."""
+def pack_words_kernel(grey):  # type: ignore[no-untyped-def]
+    """Grey, and half of each gradient (Sobel's, mirrored at the edge) above its zero, in one word a pixel."""
+    height, width = np.uint64(grey.shape[0]), np.uint64(grey.shape[1])
+    one, two = np.uint64(1), np.uint64(2)
     words = np.empty(grey.shape, np.uint32)
-    for y in range(grey.shape[0]):
-        for x in range(grey.shape[1]):
-            along, across = np.uint32((gx[y, x] >> 1) + GRADIENT_ZERO), np.uint32((gy[y, x] >> 1) + GRADIENT_ZERO)
-            words[y, x] = np.uint32(grey[y, x]) | along << np.uint32(8) | across << np.uint32(18)
+    # Of a column of three pixels, with one column beyond either edge: their smooth sum, and the last less the first.
+    sums, slopes = np.empty(width + two, np.int16), np.empty(width + two, np.int16)
+    for y in range(height):
+        above = grey[y - one] if y > 0 else grey[min(one, height - one)]
+        below = grey[y + one] if y + one < height else grey[max(height, two) - two]
+        at = grey[y]
+        for x in range(width):
+            sums[x + one] = np.int16(above[x]) + np.int16(below[x]) + np.int16(2) * np.int16(at[x])
+        for x in range(width):
+            slopes[x + one] = np.int16(below[x]) - np.int16(above[x])
+        for line in (sums, slopes):
+            line[0], line[width + one] = line[min(two, width)], line[max(width, two) - one]
+        for x in range(width):
+            across = slopes[x] + slopes[x + two] + np.int16(2) * slopes[x + one]
+            along = sums[x + two] - sums[x]
+            high = np.uint32((across >> 1) + GRADIENT_ZERO) << np.uint32(18)
+            words[y, x] = np.uint32(at[x]) | np.uint32((along >> 1) + GRADIENT_ZERO) << np.uint32(8) | high
     return words
 
 

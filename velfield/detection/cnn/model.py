@@ -49,8 +49,7 @@ def forward(network: Network, images: GreyImage) -> tuple[Float32Array, Float32A
     -------
     (n, h / 2, w / 2) probability of a car's centre; (n, 2, h / 2, w / 2) cosine and sine of twice its orientation.
     """
-    probability, orientation = network.session.run(None, {"image": np.ascontiguousarray(images[:, None])})
-    return probability[:, 0], orientation
+    return network.predict(images)
 
 
 def predict_heatmap(
@@ -111,23 +110,44 @@ def predict_crops(network: Network, image: GreyImage, crops: Sequence[Crop]) -> 
     """
     probability = np.zeros((image.shape[0] // STRIDE, image.shape[1] // STRIDE), np.float32)
     orientation = np.zeros((2, *probability.shape), np.float32)
-    by_size: dict[tuple[int, int], list[Crop]] = {}
-    for crop in crops:
-        by_size.setdefault(crop[2:], []).append(crop)
+    by_size: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for y, x, height, width in crops:
+        by_size.setdefault((height, width), []).append((y, x))
     for (height, width), alike in by_size.items():
-        at_once = max(1, _BATCH_PX // (height * width))
-        for start in range(0, len(alike), at_once):
-            batch = alike[start : start + at_once]
-            pixels = np.stack([image[y : y + height, x : x + width] for y, x, _, _ in batch])
+        corners, at_once = np.array(alike), max(1, _BATCH_PX // (height * width))
+        for start in range(0, len(corners), at_once):
+            batch = corners[start : start + at_once]
+            pixels = _cut_kernel(image, batch, height, width)
             if max(height, width) > _TILE_PX:
                 heatmap, vector = predict_heatmap(network, pixels[0], border_px=0)
                 heatmaps, vectors = heatmap[None], vector[None]
             else:
                 heatmaps, vectors = forward(network, pixels)
-            for k, (y, x, _, _) in enumerate(batch):
-                part = slice(y // STRIDE, (y + height) // STRIDE), slice(x // STRIDE, (x + width) // STRIDE)
-                probability[part], orientation[:, *part] = heatmaps[k], vectors[k]
+            _place_kernel(heatmaps, vectors, batch // STRIDE, probability, orientation)
     return probability, orientation
+
+
+@njit(cache=True, nogil=True)
+def _cut_kernel(image, corners, height, width):  # type: ignore[no-untyped-def]
+    """Crops (n, height, width) with these corners (n, 2): y, x."""
+    out = np.empty((len(corners), height, width), np.uint8)
+    for n in range(len(corners)):
+        top, left = corners[n]
+        for row in range(height):
+            out[n, row] = image[top + row, left : left + width]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _place_kernel(heatmaps, vectors, corners, probability, orientation):  # type: ignore[no-untyped-def]
+    """Write the heatmaps and orientation vectors of crops where these lie (n, 2): y, x."""
+    height, width = heatmaps.shape[1:]
+    for n in range(len(corners)):
+        top, left = corners[n]
+        for row in range(height):
+            probability[top + row, left : left + width] = heatmaps[n, row]
+            for k in range(2):
+                orientation[k, top + row, left : left + width] = vectors[n, k, row]
 
 
 SCORE_OFFSET = 0.35

@@ -11,7 +11,7 @@ bring operators of its own.
 
 import warnings
 from base64 import b64decode, b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, TypeAlias
@@ -21,7 +21,7 @@ import onnx
 import onnxruntime as ort
 from onnx import TensorProto, helper, numpy_helper
 
-from schemas.arrays import Float32Array
+from schemas.arrays import Float32Array, GreyImage
 from schemas.detector import LayerRecord
 from schemas.flight import Device
 from velfield.errors import InputError
@@ -169,19 +169,33 @@ class Network:
         return _alignment(self.topology)
 
     @cached_property
-    def session(self) -> ort.InferenceSession:
+    def predict(self) -> "Predict":
         """The network in onnxruntime, on the device of `use_device`; in 8 bits on a processor that has them exactly."""
         if self.ranges is not None and not uses_cuda(_device):
-            from velfield.detection.cnn.quantization import is_exact, quantized_to_onnx
+            from velfield.detection.cnn.quantization import is_exact, open_quantized
 
             if is_exact():
-                return open_session(quantized_to_onnx(self, self.ranges), "cpu")
+                return open_quantized(self, self.ranges)
             warnings.warn(INEXACT, RuntimeWarning, stacklevel=2)
-        return open_session(network_to_onnx(self), _device)
+        return predict_by(open_session(network_to_onnx(self), _device))
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the session, which no other process can use."""
-        return {name: value for name, value in self.__dict__.items() if name != "session"}
+        return {name: value for name, value in self.__dict__.items() if name != "predict"}
+
+
+Predict: TypeAlias = Callable[[GreyImage], tuple[Float32Array, Float32Array]]
+"""Of images (n, h, w): heatmap (n, h / 2, w / 2) and orientation vectors (n, 2, h / 2, w / 2)."""
+
+
+def predict_by(session: ort.InferenceSession) -> Predict:
+    """What a session of a model with the inputs and outputs of `network_to_onnx` predicts."""
+
+    def predict(images: GreyImage) -> tuple[Float32Array, Float32Array]:
+        probability, orientation = session.run(None, {"image": np.ascontiguousarray(images[:, None])})
+        return probability[:, 0], orientation
+
+    return predict
 
 
 _CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
@@ -299,11 +313,14 @@ class GraphBuilder:
         outputs += [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in observed]
         return serialize(helper.make_graph(self.nodes, "velfield-cnn", [image], outputs, self.constants))
 
-    def layers(self, layers: Topology, value: str, prefix: str = "") -> str:
-        """Output of a sequence of layers. Space-to-depth and the convolution after it are one strided convolution."""
+    def layers(self, layers: Topology, value: str, prefix: str = "", *, first: int = 0) -> str:
+        """Output of a sequence of layers, from the ``first`` of them on.
+
+        Space-to-depth and the convolution after it are one strided convolution.
+        """
         block = 1
         head = not prefix and list(convolutions(layers))[-1]
-        for number, layer in enumerate(layers):
+        for number, layer in enumerate(layers[first:], first):
             name = f"{prefix}{number}"
             if isinstance(layer, SpaceToDepth):
                 block *= 2

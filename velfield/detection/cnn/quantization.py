@@ -3,30 +3,43 @@
 On processors that multiply bytes (VNNI of x86, dot products of ARM) it takes 0.52 to 0.62 of the time. The range of an
 activation is measured on crops of the flight at hand (`calibrate`), without the outermost ten-thousandth at either end,
 whose place the rest of the values would pay for with their precision. The graph is that of `model.network_to_onnx` with
-pairs of QuantizeLinear and DequantizeLinear (QDQ), which onnxruntime fuses; the head stays in floating point, and the
-first convolution takes the same whole numbers in it.
+pairs of QuantizeLinear and DequantizeLinear (QDQ), which onnxruntime fuses; the head stays in floating point.
+
+Of one channel onnxruntime convolves bytes slowly, and of large images strided convolutions as well, and it moves every
+pixel of the first layer and of the heatmap four times. So the first layer is computed here (`FirstLayer`), in the same
+whole numbers, and handed over in the blocks of 2 x 2 pixels that the second one is a plain convolution of; and the
+heatmap is taken as the head leaves it, a block of 2 x 2 pixels a row.
 
 Older x86 processors add products of bytes in 16 bits, which saturates. Whether this one is exact is tested, not looked
 up (`is_exact`): elsewhere the network runs in floating point, with a warning.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage
 from velfield.detection.cnn.network import (
+    TOPOLOGY,
     Conv,
     GraphBuilder,
     Network,
+    Predict,
     Ranges,
+    Topology,
     convolutions,
     onnx_kernel,
     open_session,
+    predict_by,
     serialize,
 )
 from velfield.parallel import parallel_map
@@ -36,6 +49,10 @@ _LEVELS = 255
 _CROP_PX, _CROPS_AT_ONCE = 96, 32
 _ROW = 256
 """Values of which one extreme is kept to find the tails: a tenth of the time of sorting all."""
+LANES = 16
+"""Channels of the first layer."""
+_BLOCKS = "blocks"
+"""The input of the network after its first layer."""
 
 
 def calibrate(
@@ -96,9 +113,159 @@ def _tails(values: Float32Array) -> tuple[float, float]:
 
 
 def quantized_to_onnx(network: Network, ranges: Ranges) -> bytes:
-    """The network as an ONNX model in 8 bits, with the inputs and outputs of `model.network_to_onnx`."""
+    """The network as an ONNX model in 8 bits, with the inputs and outputs of `network.network_to_onnx`."""
     graph = _QuantizedGraph(network, ranges)
     return graph.finish(graph.layers(network.topology, "image"))
+
+
+def open_quantized(network: Network, ranges: Ranges) -> Predict:
+    """The network in 8 bits on the processor, as `Network.predict`; layers other than `TOPOLOGY` as one ONNX model."""
+    if network.topology != TOPOLOGY:
+        return predict_by(open_session(quantized_to_onnx(network, ranges), "cpu"))
+    graph = _BlockGraph(network, ranges)
+    first = graph.first_layer()
+    session = open_session(graph.finish(graph.layers(network.topology, _BLOCKS, first=1)), "cpu")
+
+    def predict(images: GreyImage) -> tuple[Float32Array, Float32Array]:
+        values, probability = session.run(None, {_BLOCKS: first.blocks(images)})
+        count, height, width = images.shape
+        shape = count, height // 4, width // 4, 12
+        heatmap, vectors = unpack_heatmap_kernel(probability.reshape(shape), values.reshape(shape))
+        return heatmap, vectors
+
+    return predict
+
+
+@dataclass(frozen=True)
+class FirstLayer:
+    """A strided convolution of a kernel of 4 x 4 taps, with a ReLU, of grey levels in whole numbers.
+
+    Attributes
+    ----------
+    weights, biases : (16, LANES) and (LANES,) whole numbers in single precision, by tap and channel out.
+    factors : (LANES,) levels of the output a unit.
+    """
+
+    weights: Float32Array
+    biases: Float32Array
+    factors: Float32Array
+
+    def blocks(self, images: GreyImage) -> GreyImage:
+        """Levels of the output of images (n, h, w), sizes multiples of 4: (n, h / 4 + 1, w / 4 + 1, 4 LANES) uint8.
+
+        Of the output at half the resolution, with a border of one pixel of zeros, a block of 2 x 2 pixels a row.
+        """
+        return np.asarray(first_layer_kernel(np.ascontiguousarray(images), self.weights, self.biases, self.factors))
+
+
+@intrinsic
+def _convolve_row(_context, rows, starts, weights, biases, factors, count, target, first):  # type: ignore[no-untyped-def]
+    """Levels of ``count`` pixels of one row of the first layer, to one half of a row of blocks.
+
+    numba keeps the sums of the channels in memory, and asks after each pixel whether the weights are what it wrote:
+    here both stay in registers. Whole numbers: the order of the sums does not matter.
+    """
+    signature = types.void(rows, starts, weights, biases, factors, count, target, first)
+    number, lanes = ir.IntType(64), ir.VectorType(ir.FloatType(), LANES)
+
+    def generate(context: Any, build: Any, _signature: Any, arguments: Any) -> Any:
+        values, places, taps, added, scale, out = (
+            cgutils.create_struct_proxy(kind)(context, build, arguments[k]).data
+            for kind, k in ((rows, 0), (starts, 1), (weights, 2), (biases, 3), (factors, 4), (target, 6))
+        )
+
+        def vector(start: Any, k: int) -> Any:
+            at = build.bitcast(build.gep(start, [ir.Constant(number, k * LANES)]), lanes.as_pointer())
+            loaded = build.load(at)
+            loaded.align = 4
+            return loaded
+
+        def spread(value: Any) -> Any:
+            one = build.insert_element(ir.Constant(lanes, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
+            every = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+            return build.shuffle_vector(one, ir.Constant(lanes, ir.Undefined), every)
+
+        kernel = [vector(taps, k) for k in range(16)]
+        bias, factor = vector(added, 0), vector(scale, 0)
+        begins = [build.load(build.gep(places, [ir.Constant(number, k)])) for k in range(4)]
+        none, most = (ir.Constant(lanes, [float(level)] * LANES) for level in (0, _LEVELS))
+        rint, fma = (
+            cgutils.get_or_insert_function(build.module, ir.FunctionType(lanes, [lanes] * n), f"llvm.{name}.v16f32")
+            for name, n in (("rint", 1), ("fma", 3))
+        )
+        with cgutils.for_range_slice(build, ir.Constant(number, 0), arguments[5], ir.Constant(number, 1), number) as (
+            pixel,
+            _,
+        ):
+            column, total = build.mul(pixel, ir.Constant(number, 2)), bias
+            for k in range(16):
+                place = build.add(begins[k // 4], build.add(column, ir.Constant(number, k % 4)))
+                total = build.call(fma, [spread(build.load(build.gep(values, [place]))), kernel[k], total])
+            total = build.select(build.fcmp_ordered(">", total, none), total, none)
+            level = build.call(rint, [build.fmul(total, factor)])
+            level = build.select(build.fcmp_ordered("<", level, most), level, most)
+            levels = build.trunc(
+                build.fptosi(level, ir.VectorType(ir.IntType(32), LANES)), ir.VectorType(ir.IntType(8), LANES)
+            )
+            shifted = build.add(pixel, ir.Constant(number, 1))
+            block = build.mul(build.lshr(shifted, ir.Constant(number, 1)), ir.Constant(number, 4 * LANES))
+            within = build.mul(build.and_(shifted, ir.Constant(number, 1)), ir.Constant(number, LANES))
+            at = build.gep(out, [build.add(arguments[7], build.add(block, within))])
+            build.store(levels, build.bitcast(at, levels.type.as_pointer())).align = 1
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@njit(cache=True, nogil=True)
+def first_layer_kernel(images, weights, biases, factors):  # type: ignore[no-untyped-def]
+    """Blocks as of `FirstLayer.blocks`."""
+    count, height, width = images.shape
+    out = np.zeros((count, height // 4 + 1, width // 4 + 1, 4 * LANES), np.uint8)
+    flat = out.reshape(-1)
+    # Of the rows that a row of the output reads, the last four of the image, with a pixel of zeros at either end.
+    rows = np.zeros((4, width + 2), np.float32)
+    flat_rows, starts = rows.reshape(-1), np.empty(4, np.int64)
+    for n in range(count):
+        rows[0] = np.float32(0)
+        filled = 1
+        for y in range(height // 2):
+            while filled < 2 * y + 4:
+                row = rows[filled % 4]
+                if filled <= height:
+                    source = images[n, filled - 1]
+                    for x in range(width):
+                        row[x + 1] = np.float32(source[x])
+                else:
+                    row[:] = np.float32(0)
+                filled += 1
+            for k in range(4):
+                starts[k] = (2 * y + k) % 4 * (width + 2)
+            block = (n * out.shape[1] + (y + 1) // 2) * out.shape[2] * 4 * LANES
+            _convolve_row(
+                flat_rows, starts, weights, biases, factors, np.int64(width // 2), flat,
+                np.int64(block + (y + 1) % 2 * 2 * LANES),
+            )  # fmt: skip
+    return out
+
+
+@njit(cache=True, nogil=True)
+def unpack_heatmap_kernel(probability, values):  # type: ignore[no-untyped-def]
+    """(n, 2 h, 2 w) and (n, 2, 2 h, 2 w) of blocks of 2 x 2 pixels of 3 channels, each (n, h, w, 12)."""
+    count, height, width = values.shape[:3]
+    heatmap = np.empty((count, 2 * height, 2 * width), np.float32)
+    vectors = np.empty((count, 2, 2 * height, 2 * width), np.float32)
+    for n in range(count):
+        for y in range(height):
+            for side in range(2):
+                row, cosine, sine = heatmap[n, 2 * y + side], vectors[n, 0, 2 * y + side], vectors[n, 1, 2 * y + side]
+                for x in range(width):
+                    for k in range(2):
+                        channel = 6 * side + 3 * k
+                        row[2 * x + k] = probability[n, y, x, channel]
+                        cosine[2 * x + k] = values[n, y, x, channel + 1]
+                        sine[2 * x + k] = values[n, y, x, channel + 2]
+    return heatmap, vectors
 
 
 class _ObservedGraph(GraphBuilder):
@@ -124,10 +291,7 @@ class _QuantizedGraph(GraphBuilder):
         self._head = list(convolutions(network.topology))[-1]
 
     def activation(self, value: str, name: str) -> str:
-        low, high = (float(end) for end in self._ranges[name])
-        low, high = min(low, 0.0), max(high, 0.0)
-        scale = np.float32(max((high - low) / _LEVELS, 1e-8))
-        zero = int(np.clip(round(-low / float(scale)), 0, _LEVELS))
+        scale, zero = self.levels(name)
         scale_and_zero = self._constants(name, scale, zero)
         if self._unscaled is None:
             quantized = self.node("QuantizeLinear", [value, *scale_and_zero])
@@ -137,6 +301,13 @@ class _QuantizedGraph(GraphBuilder):
             quantized = self.node("QuantizeLinear", [levels, *self._constants(f"{name}.levels", np.float32(1), zero)])
             self._unscaled = None
         return self._dequantize(quantized, scale_and_zero, scale)
+
+    def levels(self, name: str) -> tuple[np.float32, int]:
+        """What a level of an activation is worth, and the level of zero."""
+        low, high = (float(end) for end in self._ranges[name])
+        low, high = min(low, 0.0), max(high, 0.0)
+        scale = np.float32(max((high - low) / _LEVELS, 1e-8))
+        return scale, int(np.clip(round(-low / float(scale)), 0, _LEVELS))
 
     def _constants(self, name: str, scale: np.float32, zero: int) -> list[str]:
         scale_name = self.constant(f"{name}.scale", np.array(scale))
@@ -150,11 +321,7 @@ class _QuantizedGraph(GraphBuilder):
     def conv(self, layer: Conv, value: str, block: int) -> str:
         if layer.name == self._head:
             return super().conv(layer, value, block)
-        kernel = onnx_kernel(self.network.weights[layer.name], layer.kernel, block).astype(np.float32)
-        scales = np.maximum(np.abs(kernel).max(axis=(1, 2, 3)) / 127, 1e-8).astype(np.float32)
-        weights = np.rint(kernel / scales[:, None, None, None]).astype(np.int8)
-        bias_scales = (scales * self._scale[value]).astype(np.float32)
-        bias = np.rint(self.network.biases[layer.name] / bias_scales.astype(np.float64))
+        weights, scales, bias, bias_scales = self.whole_numbers(layer, self.kernel(layer, value, block), value)
         if value == "image":
             return self._conv_of_image(layer, weights, bias, bias_scales, block)
         limit = 2**31 - 1
@@ -167,6 +334,20 @@ class _QuantizedGraph(GraphBuilder):
             inputs = [self.constant(f"{layer.name}.{name}{end}", part) for end, part in parts]
             names.append(self.node("DequantizeLinear", inputs, axis=0))
         return self.convolve(layer, [value, *names], block)
+
+    def kernel(self, layer: Conv, value: str, block: int) -> Float32Array:
+        """Weights of the convolution of a value: (out, in, height, width)."""
+        return onnx_kernel(self.network.weights[layer.name], layer.kernel, block).astype(np.float32)
+
+    def whole_numbers(
+        self, layer: Conv, kernel: Float32Array, value: str
+    ) -> tuple[NDArray[np.int8], Float32Array, FloatArray, Float32Array]:
+        """Weights as whole numbers and what one is worth, by channel out; biases likewise."""
+        scales = np.maximum(np.abs(kernel).max(axis=(1, 2, 3)) / 127, 1e-8).astype(np.float32)
+        weights = np.rint(kernel / scales[:, None, None, None]).astype(np.int8)
+        bias_scales = (scales * self._scale[value]).astype(np.float32)
+        bias = np.rint(self.network.biases[layer.name] / bias_scales.astype(np.float64))
+        return weights, scales, bias, bias_scales
 
     def _conv_of_image(
         self, layer: Conv, weights: NDArray[np.int8], bias: FloatArray, scales: Float32Array, block: int
@@ -186,12 +367,84 @@ class _QuantizedGraph(GraphBuilder):
     def depth_to_space(self, value: str) -> str:
         """By rows of channels, as they lie in the convolutions of bytes: onnxruntime's operator moves byte by byte."""
         pixels = self.node("Transpose", [value], perm=[0, 2, 3, 1])
-        name, shape = f"blocks_{len(self.nodes)}", self.node("Shape", [pixels])
-        for operator, factors in (("Mul", [1, 2, 2, 0]), ("Add", [0, 0, 0, -1])):
-            shape = self.node(operator, [shape, self.constant(f"{name}.{operator}", np.array(factors))])
+        name = f"blocks_{len(self.nodes)}"
+        shape = self.twice_the_size(pixels, name)
         blocks = self.node("Reshape", [pixels, self.constant(name, np.array([0, 0, 0, 2, 2, -1]))])
         pixels = self.node("Reshape", [self.node("Transpose", [blocks], perm=[0, 1, 3, 2, 4, 5]), shape])
         return self.node("Transpose", [pixels], perm=[0, 3, 1, 2])
+
+    def twice_the_size(self, pixels: str, name: str) -> str:
+        """Shape of rows of channels (n, h, w, c) at twice the resolution."""
+        return self.derived_shape(pixels, name, [1, 2, 2, 0], [0, 0, 0, -1])
+
+    def derived_shape(self, value: str, name: str, factors: list[int], summands: list[int]) -> str:
+        """A shape computed from that of a value."""
+        shape = self.node("Shape", [value])
+        for operator, numbers in (("Mul", factors), ("Add", summands)):
+            shape = self.node(operator, [shape, self.constant(f"{name}.{operator}", np.array(numbers))])
+        return shape
+
+
+class _BlockGraph(_QuantizedGraph):
+    """The quantized graph of `TOPOLOGY`, from the levels of the first layer in blocks to the head's blocks."""
+
+    _blocks = ""
+    """The value that they are."""
+
+    def first_layer(self) -> FirstLayer:
+        """What the graph is given the output of."""
+        layer = convolutions(self.network.topology)["stem"]
+        weights, _, bias, scales = self.whole_numbers(layer, self.kernel(layer, "image", 1), "image")
+        scale, zero = self.levels("0")
+        assert zero == 0, "there is a ReLU after the first layer"
+        taps = np.ascontiguousarray(weights.reshape(layer.channels_out, -1).T, np.float32)
+        return FirstLayer(taps, bias.astype(np.float32), (scales / scale).astype(np.float32))
+
+    def conv(self, layer: Conv, value: str, block: int) -> str:
+        if layer.name == self._head:
+            # Rows of channels, as they lie in the convolutions of bytes.
+            pixels = self.node("Transpose", [value], perm=[0, 2, 3, 1])
+            rows = self.node("Reshape", [pixels, self.constant("rows", np.array([-1, layer.channels_in]))])
+            names = [
+                self.constant(f"{layer.name}.{name}", values.astype(np.float16).astype(np.float32))
+                for name, values in (
+                    ("weight", self.network.weights[layer.name][0]),
+                    ("bias", self.network.biases[layer.name]),
+                )
+            ]
+            return self.node("Gemm", [rows, *names], output="values")
+        if value == _BLOCKS:
+            # A kernel of 4 x 4 pixels and a stride of 2 is one of 2 x 2 blocks.
+            scale, zero = self.levels("0")
+            pixels = self.node("Transpose", [value], perm=[0, 3, 1, 2])
+            self._blocks = self._dequantize(pixels, self._constants("0", scale, zero), scale)
+            return super().conv(layer, self._blocks, block)
+        return super().conv(layer, value, block)
+
+    def kernel(self, layer: Conv, value: str, block: int) -> Float32Array:
+        kernel = super().kernel(layer, value, block)
+        if value != self._blocks:
+            return kernel
+        blocks = kernel.reshape(len(kernel), -1, 2, 2, 2, 2).transpose(0, 3, 5, 1, 2, 4)
+        return np.ascontiguousarray(blocks.reshape(len(kernel), -1, 2, 2))
+
+    def convolve(self, layer: Conv, inputs: Sequence[str], block: int) -> str:
+        return self.node("Conv", inputs) if inputs[0] == self._blocks else super().convolve(layer, inputs, block)
+
+    def twice_the_size(self, pixels: str, name: str) -> str:
+        # That of the blocks that came in: onnxruntime would turn the value into floats to ask for its shape.
+        return self.derived_shape(_BLOCKS, name, [1, 1, 1, 0], [0, -1, -1, -1])
+
+    def _unpack_heatmap(self, layers: Topology, value: str) -> str:
+        return value
+
+    def finish(self, out: str, observed: Sequence[str] = ()) -> bytes:
+        self.node("Sigmoid", [out], output="probability")
+        blocks = helper.make_tensor_value_info(_BLOCKS, TensorProto.UINT8, ["n", "h / 4 + 1", "w / 4 + 1", 4 * LANES])
+        outputs = [
+            helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n h w / 16", 12]) for name in (out, "probability")
+        ]
+        return serialize(helper.make_graph(self.nodes, "velfield-cnn", [blocks], outputs, self.constants))
 
 
 @cache
