@@ -17,7 +17,7 @@ SCIENCE = ("sources", "camera", "registration", "detection", "tracking", "field"
 """Arrays in, arrays out: no run folder, no graph."""
 ONLY_IN_TOOLS = ("torch",)
 """Libraries of developers' tools that are in no environment of ours: torch's wheel brings gigabytes of CUDA."""
-MAX_ROOMS, MAX_ARROWS, MAX_LOOSE_MODULES, MAX_FILES = 18, 55, 5, 18
+MAX_ROOMS, MAX_ARROWS, MAX_LOOSE_MODULES, MAX_FILES = 18, 57, 5, 18
 
 
 def modules() -> list[Path]:

@@ -13,7 +13,7 @@ from velfield.pipeline.stage import STAGES
 from velfield.pipeline.units import prepare_stage, stage_units
 
 ROOT = Path(__file__).resolve().parents[2]
-MAX_FILES = 56
+MAX_FILES = 57
 ON_THE_WAY = ("frames", "quality", "registration", "detections", "tracklets", "tracks", "field")
 
 

@@ -14,13 +14,13 @@ import cv2
 import numpy as np
 from llvmlite import ir
 from numba import njit, types
-from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from velfield.registration.joint import ControlPoints
 from velfield.registration.transforms import FrameTransform
+from velfield.vectors import LONG, REAL, WORD, Vectors
 
 N_PATCHES_SAME_SENSOR, N_PATCHES_CROSS_SENSOR = 3000, 6000
 """Patches of a base image of the frames' own camera, and of another sensor's: about half of those fail to align."""
@@ -248,51 +248,7 @@ def _reflect(at, size):  # type: ignore[no-untyped-def]
     return min(max(at, 0), size - 1)
 
 
-class _Vectors:
-    """Builds instructions on vectors of ``lanes`` values, where numba alone makes loops over single ones: it does not
-    know that the arrays do not overlap. No sum is reordered and no product fused, so that all processors agree."""
-
-    def __init__(self, context: Any, build: Any, signature: Any, arguments: Any, lanes: int) -> None:
-        self.build, self.lanes = build, lanes
-        self.arguments = [
-            cgutils.create_struct_proxy(kind)(context, build, value).data if isinstance(kind, types.Array) else value
-            for kind, value in zip(signature.args, arguments, strict=True)
-        ]
-
-    def kind(self, element: Any) -> Any:
-        return ir.VectorType(element, self.lanes)
-
-    def constant(self, element: Any, values: Any) -> Any:
-        return ir.Constant(self.kind(element), list(np.broadcast_to(values, self.lanes).tolist()))
-
-    def spread(self, value: Any) -> Any:
-        """The same value in every lane."""
-        first = self.build.insert_element(ir.Constant(self.kind(value.type), ir.Undefined), value, _WORD(0))
-        return self.build.shuffle_vector(first, first, self.constant(_WORD, 0))
-
-    def place(self, start: Any, *offsets: Any) -> Any:
-        """Pointer to the vector at the sum of these offsets, numbers or 64-bit values."""
-        for offset in offsets:
-            start = self.build.gep(start, [_LONG(offset) if isinstance(offset, int) else offset])
-        return self.build.bitcast(start, self.kind(start.type.pointee).as_pointer())
-
-    def load(self, start: Any, *offsets: Any) -> Any:
-        loaded = self.build.load(self.place(start, *offsets))
-        loaded.align = 1
-        return loaded
-
-    def store(self, value: Any, start: Any, *offsets: Any) -> None:
-        self.build.store(value, self.place(start, *offsets)).align = 1
-
-    def add(self, value: Any, start: Any, *offsets: Any) -> None:
-        """Add to what is stored there."""
-        self.store(self.build.fadd(self.load(start, *offsets), value), start, *offsets)
-
-
-_WORD, _LONG, _REAL = ir.IntType(32), ir.IntType(64), ir.FloatType()
-
-
-def _blurred(vectors: _Vectors, factors: list[Any], values: list[Any]) -> Any:
+def _blurred(vectors: Vectors, factors: list[Any], values: list[Any]) -> Any:
     """Sum of seven vectors by the centre's and the following three of seven symmetric factors."""
     build, total = vectors.build, vectors.build.fmul(factors[0], values[3])
     for k in (1, 2, 3):
@@ -305,10 +261,10 @@ def _blur_across(_context, source, first, taps, out, place):  # type: ignore[no-
     """Blur 8 pixels along a row of bytes, ``source[first]`` the third before the first of them."""
 
     def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
-        v = _Vectors(context, build, signature, arguments, _LANES)
+        v = Vectors(context, build, signature, arguments, _LANES)
         source, first, taps, out, place = v.arguments
-        factors = [v.spread(build.load(build.gep(taps, [_LONG(k)]))) for k in range(4)]
-        values = [build.uitofp(v.load(source, first, k), v.kind(_REAL)) for k in range(7)]
+        factors = [v.spread(build.load(build.gep(taps, [LONG(k)]))) for k in range(4)]
+        values = [build.uitofp(v.load(source, first, k), v.kind(REAL)) for k in range(7)]
         v.store(_blurred(v, factors, values), out, place)
         return context.get_dummy_value()
 
@@ -320,12 +276,12 @@ def _blur_down(_context, source, first, stride, taps, out, place):  # type: igno
     """Blur 8 pixels down rows ``stride`` values apart, ``source[first]`` three rows above; in steps of grey levels."""
 
     def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
-        v = _Vectors(context, build, signature, arguments, _LANES)
+        v = Vectors(context, build, signature, arguments, _LANES)
         source, first, stride, taps, out, place = v.arguments
-        factors = [v.spread(build.load(build.gep(taps, [_LONG(k)]))) for k in range(4)]
-        values = [v.load(source, first, build.mul(stride, _LONG(k))) for k in range(7)]
-        steps = build.fmul(_blurred(v, factors, values), v.constant(_REAL, float(_GREY_STEPS)))
-        v.store(build.fptosi(build.fadd(steps, v.constant(_REAL, 0.5)), v.kind(_WORD)), out, place)
+        factors = [v.spread(build.load(build.gep(taps, [LONG(k)]))) for k in range(4)]
+        values = [v.load(source, first, build.mul(stride, LONG(k))) for k in range(7)]
+        steps = build.fmul(_blurred(v, factors, values), v.constant(REAL, float(_GREY_STEPS)))
+        v.store(build.fptosi(build.fadd(steps, v.constant(REAL, 0.5)), v.kind(WORD)), out, place)
         return context.get_dummy_value()
 
     return types.void(source, first, stride, taps, out, place), generate
@@ -336,12 +292,12 @@ def _pack_four(_context, levels, first, stride, out, place):  # type: ignore[no-
     """Pack 8 pixels of an int32 image, from ``levels[first]`` on, each with those right of and below it and between."""
 
     def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
-        v = _Vectors(context, build, signature, arguments, _LANES)
+        v = Vectors(context, build, signature, arguments, _LANES)
         levels, first, stride, out, place = v.arguments
-        shift, far = v.constant(_WORD, 16), v.constant(_LONG, 32)
+        shift, far = v.constant(WORD, 16), v.constant(LONG, 32)
         upper = build.or_(v.load(levels, first), build.shl(v.load(levels, first, 1), shift))
         lower = build.or_(v.load(levels, first, stride), build.shl(v.load(levels, first, stride, 1), shift))
-        upper, lower = (build.zext(pair, v.kind(_LONG)) for pair in (upper, lower))
+        upper, lower = (build.zext(pair, v.kind(LONG)) for pair in (upper, lower))
         v.store(build.or_(upper, build.shl(lower, far)), out, place)
         return context.get_dummy_value()
 
@@ -357,35 +313,35 @@ def _add_samples(_context, window, stride, last, x, y, step_x, step_y, templates
     """
 
     def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
-        v = _Vectors(context, build, signature, arguments, _BLOCK)
+        v = Vectors(context, build, signature, arguments, _BLOCK)
         window, stride, last, x, y, step_x, step_y, templates, first, count, near, sums = v.arguments
-        lanes = v.constant(_REAL, np.arange(_BLOCK, dtype=float))
+        lanes = v.constant(REAL, np.arange(_BLOCK, dtype=float))
         fractions, pixels = [], []
         for start, step in ((x, step_x), (y, step_y)):
             position = build.fadd(v.spread(start), build.fmul(lanes, v.spread(step)))
-            pixels.append(build.fptosi(position, v.kind(_WORD)))
-            fractions.append(build.fsub(position, build.sitofp(pixels[-1], v.kind(_REAL))))
+            pixels.append(build.fptosi(position, v.kind(WORD)))
+            fractions.append(build.fsub(position, build.sitofp(pixels[-1], v.kind(REAL))))
         at = build.add(build.mul(pixels[1], v.spread(stride)), pixels[0])
-        for limit, order in ((v.constant(_WORD, 0), ">"), (v.spread(last), "<")):  # lanes beyond the patch
+        for limit, order in ((v.constant(WORD, 0), ">"), (v.spread(last), "<")):  # lanes beyond the patch
             at = build.select(build.icmp_signed(order, at, limit), at, limit)
-        four = ir.Constant(v.kind(_LONG), ir.Undefined)
+        four = ir.Constant(v.kind(LONG), ir.Undefined)
         for k in range(_BLOCK):
-            number = build.zext(build.extract_element(at, _WORD(k)), _LONG)
-            four = build.insert_element(four, build.load(build.gep(window, [number])), _WORD(k))
-        low, shift = v.constant(_WORD, 0xFFFF), v.constant(_WORD, 16)
+            number = build.zext(build.extract_element(at, WORD(k)), LONG)
+            four = build.insert_element(four, build.load(build.gep(window, [number])), WORD(k))
+        low, shift = v.constant(WORD, 0xFFFF), v.constant(WORD, 16)
         rows = []
-        for pair in (four, build.lshr(four, v.constant(_LONG, 32))):
-            word = build.trunc(pair, v.kind(_WORD))
+        for pair in (four, build.lshr(four, v.constant(LONG, 32))):
+            word = build.trunc(pair, v.kind(WORD))
             left, right = build.and_(word, low), build.lshr(word, shift)
-            left, right = (build.sitofp(value, v.kind(_REAL)) for value in (left, right))
+            left, right = (build.sitofp(value, v.kind(REAL)) for value in (left, right))
             rows.append(build.fadd(left, build.fmul(fractions[0], build.fsub(right, left))))
         value = build.fadd(rows[0], build.fmul(fractions[1], build.fsub(rows[1], rows[0])))
-        value = build.fsub(build.fmul(value, v.constant(_REAL, 1.0 / _GREY_STEPS)), v.spread(near))
+        value = build.fsub(build.fmul(value, v.constant(REAL, 1.0 / _GREY_STEPS)), v.spread(near))
         value = build.fmul(value, v.load(templates, first))
         v.add(value, sums)
         v.add(build.fmul(value, value), sums, _BLOCK)
         for k in (1, 2, 3):
-            v.add(build.fmul(value, v.load(templates, first, build.mul(count, _LONG(k)))), sums, (k + 1) * _BLOCK)
+            v.add(build.fmul(value, v.load(templates, first, build.mul(count, LONG(k)))), sums, (k + 1) * _BLOCK)
         return context.get_dummy_value()
 
     arguments = (window, stride, last, x, y, step_x, step_y, templates, first, count, near, sums)
@@ -402,7 +358,7 @@ def _add_gradients(_context, padded, row, mean, factor, templates, inner, first,
     """
 
     def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
-        v = _Vectors(context, build, signature, arguments, _BLOCK)
+        v = Vectors(context, build, signature, arguments, _BLOCK)
         padded, row, mean, factor, templates, inner, first, count, sums = v.arguments
         value = build.fsub(v.load(padded, first, row), v.spread(mean))
         value = build.fmul(value, v.load(templates, first))
@@ -410,7 +366,7 @@ def _add_gradients(_context, padded, row, mean, factor, templates, inner, first,
         x = build.fmul(scale, build.fsub(v.load(padded, first, row, 1), v.load(padded, first, row, -1)))
         y = build.fmul(scale, build.fsub(v.load(padded, first, row, row), v.load(padded, first)))
         for k, part in enumerate((value, x, y)):
-            v.store(part, templates, first, build.mul(count, _LONG(k + 1)))
+            v.store(part, templates, first, build.mul(count, LONG(k + 1)))
         products = ((value, value), (x, x), (x, y), (y, y), (x, value), (y, value))
         for k, part in enumerate([*(build.fmul(one, other) for one, other in products), x, y]):
             v.add(part, sums, k * _BLOCK)

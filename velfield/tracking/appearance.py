@@ -15,7 +15,7 @@ from numba import njit, types
 from numba.extending import intrinsic
 
 from schemas.arrays import ByteArray, FloatArray, IntArray
-from velfield.tracking.crop_alignment import BYTE, WORD, Vectors
+from velfield.vectors import BYTE, WORD, Vectors
 
 MAX_PATCH_SHIFT_PX = 2
 """Patches are compared at shifts of up to this, working px, either way and either axis."""

@@ -5,15 +5,14 @@ to 1/32 px, the same weights, the same order of sums. OpenCV takes 8 ns a pixel,
 the pixels; here it is 1.6 ns in all, for a row of a cell, 16 px, is one vector throughout.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
 from numba import njit, types
-from numba.core import cgutils
 from numba.extending import intrinsic
+
+from velfield.vectors import BYTE, LONG, REAL, WORD, Vectors
 
 CELL_PX = 16
 """Side of a cell, output px."""
@@ -26,89 +25,25 @@ PAD_PX = 3
 _SHARPNESS = -0.75
 """Of cubic interpolation, as in OpenCV."""
 
-_BYTE, _WORD, _REAL, _INDEX = ir.IntType(8), ir.IntType(32), ir.FloatType(), ir.IntType(64)
-_BYTES, _WORDS, _REALS = (ir.VectorType(element, CELL_PX) for element in (_BYTE, _WORD, _REAL))
 
+def _cubic_weights(v: Vectors, fine: Any) -> list[Any]:
+    """Weights of four pixels in a row, from the second of which positions lie 0, 1/32, 2/32... px.
 
-@dataclass(frozen=True)
-class _Vectors:
-    """Instructions on vectors of `CELL_PX` numbers, put where a builder stands."""
+    All products and sums here are exact: they have at most 18 bits.
+    """
+    build, a = v.build, _SHARPNESS
+    fraction = build.and_(fine, v.constant(WORD, (1 << _FRACTION_BITS) - 1))
+    x = build.fmul(build.sitofp(fraction, v.kind(REAL)), v.constant(REAL, 1 / (1 << _FRACTION_BITS)))
+    rest = build.fsub(v.constant(REAL, 1.0), x)
 
-    context: Any
-    build: Any
+    def outer(near: Any, far: Any) -> Any:  # a near far^2
+        return build.fmul(build.fmul(build.fmul(v.constant(REAL, a), near), far), far)
 
-    def start(self, kind: Any, array: Any) -> Any:
-        """Pointer to the first element of an array of a numba type."""
-        return cgutils.create_struct_proxy(kind)(self.context, self.build, array).data
+    def inner(distance: Any) -> Any:  # (a + 2) d^3 - (a + 3) d^2 + 1
+        slope = v.multiply_add(v.constant(REAL, a + 2), distance, v.constant(REAL, -(a + 3)))
+        return v.multiply_add(build.fmul(slope, distance), distance, v.constant(REAL, 1.0))
 
-    def pointer(self, start: Any, index: Any, element: Any) -> Any:
-        return self.build.bitcast(self.build.gep(start, [index]), element.as_pointer())
-
-    def load(self, start: Any, index: Any, element: Any) -> Any:
-        loaded = self.build.load(self.pointer(start, index, element))
-        loaded.align = 1
-        return loaded
-
-    def store(self, value: Any, start: Any, index: Any) -> None:
-        self.build.store(value, self.pointer(start, index, value.type)).align = 1
-
-    def call(self, name: str, *values: Any) -> Any:
-        kind = values[0].type
-        declared = ir.FunctionType(kind, [kind] * len(values))
-        full = f"llvm.{name}.v{kind.count}{'f' if kind.element == _REAL else 'i'}32"
-        return self.build.call(cgutils.get_or_insert_function(self.build.module, declared, full), values)
-
-    def real(self, value: float) -> Any:
-        return ir.Constant(_REALS, [value] * CELL_PX)
-
-    def word(self, value: int) -> Any:
-        return ir.Constant(_WORDS, [value] * CELL_PX)
-
-    def splat(self, value: Any) -> Any:
-        """A vector all of whose elements are one number."""
-        empty = ir.Constant(ir.VectorType(value.type, CELL_PX), ir.Undefined)
-        return self.build.shuffle_vector(self.build.insert_element(empty, value, _WORD(0)), empty, self.word(0))
-
-    def join(self, parts: Sequence[Any]) -> Any:
-        """One vector of a power of two of short ones."""
-        while len(parts) > 1:
-            size = 2 * parts[0].type.count
-            order = ir.Constant(ir.VectorType(_WORD, size), list(range(size)))
-            pairs = zip(parts[::2], parts[1::2], strict=True)
-            parts = [self.build.shuffle_vector(one, other, order) for one, other in pairs]
-        return parts[0]
-
-    def multiply_add(self, one: Any, other: Any, total: Any) -> Any:
-        return self.build.fmul(one, other) if total is None else self.call("fmuladd", one, other, total)
-
-    def cubic_weights(self, fine: Any) -> list[Any]:
-        """Weights of four pixels in a row, from the second of which positions lie 0, 1/32, 2/32... px.
-
-        All products and sums here are exact: they have at most 18 bits.
-        """
-        build, a = self.build, _SHARPNESS
-        fraction = build.and_(fine, self.word((1 << _FRACTION_BITS) - 1))
-        x = build.fmul(build.sitofp(fraction, _REALS), self.real(1 / (1 << _FRACTION_BITS)))
-        rest = build.fsub(self.real(1.0), x)
-
-        def outer(near: Any, far: Any) -> Any:  # a near far^2
-            return build.fmul(build.fmul(build.fmul(self.real(a), near), far), far)
-
-        def inner(distance: Any) -> Any:  # (a + 2) d^3 - (a + 3) d^2 + 1
-            slope = self.multiply_add(self.real(a + 2), distance, self.real(-(a + 3)))
-            return self.multiply_add(build.fmul(slope, distance), distance, self.real(1.0))
-
-        return [outer(x, rest), inner(x), inner(rest), outer(rest, x)]
-
-
-def _generator(fill: Callable[[_Vectors, Any, Any], None]) -> Any:
-    """What numba asks of an intrinsic that returns nothing."""
-
-    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
-        fill(_Vectors(context, build), signature.args, arguments)
-        return context.get_dummy_value()
-
-    return generate
+    return [outer(x, rest), inner(x), inner(rest), outer(rest, x)]
 
 
 @intrinsic
@@ -125,49 +60,48 @@ def _place_row(  # type: ignore[no-untyped-def]
     Positions are in units of the fraction, from a margin of so many pixels: all positive, so that truncation rounds
     down.
     """
-    signature = types.void(height, stride, nodes, above, across, down, places, row, inside, at)
 
-    def fill(vectors: _Vectors, kinds: Any, arguments: Any) -> None:
-        build, unit = vectors.build, float(1 << _FRACTION_BITS)
-        frame_height, source_stride, _, first_row, _, fraction, _, number, _, flags_at = arguments
-        node, part, target, flags = (vectors.start(kinds[k], arguments[k]) for k in (2, 4, 6, 8))
-        along_y, along_x = vectors.splat(fraction), vectors.load(part, _INDEX(0), _REALS)
-        row_at = build.mul(first_row, _INDEX(4 * CELL_PX))
+    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
+        v, unit = Vectors(context, build, signature, arguments, CELL_PX), float(1 << _FRACTION_BITS)
+        height, stride, nodes, above, across, down, places, row, inside, at = v.arguments
+        along_y, along_x = v.spread(down), v.load(across)
+        nodes_at = build.mul(above, LONG(4 * CELL_PX))
 
         def at_centre(k: int) -> Any:
-            upper = vectors.load(node, build.add(row_at, _INDEX(k * CELL_PX)), _REALS)
-            lower = vectors.load(node, build.add(row_at, _INDEX((4 + k) * CELL_PX)), _REALS)
+            upper, lower = (v.load(nodes, nodes_at, part * CELL_PX) for part in (k, 4 + k))
             value = build.fadd(upper, build.fmul(along_y, build.fsub(lower, upper)))
-            return build.fmul(build.fadd(value, vectors.real(_MARGIN_PX)), vectors.real(unit))
+            return build.fmul(build.fadd(value, v.constant(REAL, _MARGIN_PX)), v.constant(REAL, unit))
 
-        width = build.sub(source_stride, _WORD(2 * PAD_PX))
+        zero = v.constant(REAL, 0.0)
+        width = build.sub(stride, WORD(2 * PAD_PX))
         in_frame, fine, first = None, [], []
-        for k, size in ((0, width), (2, frame_height)):
+        for k, size in ((0, width), (2, height)):
             before, after = at_centre(k), at_centre(k + 1)
             position = build.fadd(before, build.fmul(along_x, build.fsub(after, before)))
-            length = vectors.splat(build.fmul(build.sitofp(size, _REAL), _REAL(unit)))
-            start = vectors.real((_MARGIN_PX - 0.5) * unit)
+            length = v.spread(build.fmul(build.sitofp(size, REAL), REAL(unit)))
+            start = v.constant(REAL, (_MARGIN_PX - 0.5) * unit)
             for test in (
                 build.fcmp_ordered(">=", position, start),
                 build.fcmp_ordered("<=", position, build.fadd(start, length)),
             ):
                 in_frame = test if in_frame is None else build.and_(in_frame, test)
-            last = build.fadd(length, vectors.real(2 * _MARGIN_PX * unit))
-            rounded = build.fadd(position, vectors.real(0.5))
-            rounded = build.select(build.fcmp_ordered(">", rounded, vectors.real(0.0)), rounded, vectors.real(0.0))
+            last = build.fadd(length, v.constant(REAL, 2 * _MARGIN_PX * unit))
+            rounded = build.fadd(position, v.constant(REAL, 0.5))
+            rounded = build.select(build.fcmp_ordered(">", rounded, zero), rounded, zero)
             rounded = build.select(build.fcmp_ordered("<", rounded, last), rounded, last)
-            fine.append(build.fptosi(rounded, _WORDS))
+            fine.append(build.fptosi(rounded, v.kind(WORD)))
             # Of the first of four pixels, in the extended source: beyond its ends all four are the border's.
-            whole = build.ashr(fine[-1], vectors.word(_FRACTION_BITS))
-            whole = build.add(whole, vectors.word(PAD_PX - _MARGIN_PX - 1))
-            most = vectors.splat(build.add(size, _WORD(2)))
-            first.append(vectors.call("smin", vectors.call("smax", whole, vectors.word(0)), most))
-        index = build.add(build.mul(first[1], vectors.splat(source_stride)), first[0])
+            whole = build.ashr(fine[-1], v.constant(WORD, _FRACTION_BITS))
+            whole = build.add(whole, v.constant(WORD, PAD_PX - _MARGIN_PX - 1))
+            most = v.spread(build.add(size, WORD(2)))
+            first.append(v.call("smin", v.call("smax", whole, v.constant(WORD, 0)), most))
+        index = build.add(build.mul(first[1], v.spread(stride)), first[0])
         for k, value in enumerate((index, *fine)):
-            vectors.store(value, target, build.add(build.mul(number, _INDEX(3 * CELL_PX)), _INDEX(k * CELL_PX)))
-        vectors.store(build.zext(in_frame, _BYTES), flags, flags_at)
+            v.store(value, places, build.mul(row, LONG(3 * CELL_PX)), k * CELL_PX)
+        v.store(build.zext(in_frame, v.kind(BYTE)), inside, at)
+        return context.get_dummy_value()
 
-    return signature, _generator(fill)
+    return types.void(height, stride, nodes, above, across, down, places, row, inside, at), generate
 
 
 @intrinsic
@@ -176,38 +110,35 @@ def _interpolate_row(_context, grey, stride, places, row, out, at):  # type: ign
 
     Four pixels in a row are loaded as one word.
     """
-    signature = types.void(grey, stride, places, row, out, at)
 
-    def fill(vectors: _Vectors, kinds: Any, arguments: Any) -> None:
-        build = vectors.build
-        _, source_stride, _, number, _, out_at = arguments
-        pixels, place, target = (vectors.start(kinds[k], arguments[k]) for k in (0, 2, 4))
-        index_at = build.mul(number, _INDEX(3 * CELL_PX))
-        by_column, by_row = (
-            vectors.cubic_weights(vectors.load(place, build.add(index_at, _INDEX(k * CELL_PX)), _WORDS)) for k in (1, 2)
-        )
-        tops = [pixels]
+    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, build, signature, arguments, CELL_PX)
+        grey, stride, places, row, out, at = v.arguments
+        row_at = build.mul(row, LONG(3 * CELL_PX))
+        by_column, by_row = (_cubic_weights(v, v.load(places, row_at, k * CELL_PX)) for k in (1, 2))
+        tops = [grey]
         for _ in range(3):
-            tops.append(build.gep(tops[-1], [build.zext(source_stride, _INDEX)]))
+            tops.append(build.gep(tops[-1], [build.zext(stride, LONG)]))
         four: list[list[Any]] = [[] for _ in tops]
         for q in range(CELL_PX):  # pixel by pixel, so that few vectors are open at a time
-            index = build.zext(build.load(build.gep(place, [build.add(index_at, _INDEX(q))])), _INDEX)
+            index = build.zext(v.load(places, row_at, q, kind=WORD), LONG)
             for top, parts in zip(tops, four, strict=True):
                 if q % 4 == 0:
-                    parts.append(ir.Constant(ir.VectorType(_WORD, 4), ir.Undefined))
-                parts[-1] = build.insert_element(parts[-1], vectors.load(top, index, _WORD), _WORD(q % 4))
+                    parts.append(ir.Constant(ir.VectorType(WORD, 4), ir.Undefined))
+                parts[-1] = build.insert_element(parts[-1], v.load(top, index, kind=WORD), WORD(q % 4))
         total = None
         for parts, weight in zip(four, by_row, strict=True):
-            words, sums = vectors.join(parts), None
+            words, sums = v.join(parts), None
             for k in range(4):
-                value = build.and_(build.lshr(words, vectors.word(8 * k)), vectors.word(255))
-                sums = vectors.multiply_add(build.sitofp(value, _REALS), by_column[k], sums)
-            total = vectors.multiply_add(sums, weight, total)
-        level = vectors.call("maxnum", vectors.call("rint", total), vectors.real(0.0))
-        level = vectors.call("minnum", level, vectors.real(255.0))
-        vectors.store(build.trunc(build.fptosi(level, _WORDS), _BYTES), target, out_at)
+                value = build.and_(build.lshr(words, v.constant(WORD, 8 * k)), v.constant(WORD, 255))
+                sums = v.multiply_add(build.sitofp(value, v.kind(REAL)), by_column[k], sums)
+            total = v.multiply_add(sums, weight, total)
+        level = v.call("maxnum", v.call("rint", total), v.constant(REAL, 0.0))
+        level = v.call("minnum", level, v.constant(REAL, 255.0))
+        v.store(build.trunc(build.fptosi(level, v.kind(WORD)), v.kind(BYTE)), out, at)
+        return context.get_dummy_value()
 
-    return signature, _generator(fill)
+    return types.void(grey, stride, places, row, out, at), generate
 
 
 @njit(cache=True, nogil=True)
