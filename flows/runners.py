@@ -113,6 +113,7 @@ class ThreadsRunner(Runner):
         # One pool for all units at once: each on threads of its own, two cores ran four blocks at a time, out of each
         # other's cache.
         self._pool = ThreadPoolExecutor(threads, "dask")
+        self._pool.submit(load_stages)  # while the run is planned
         self.description = f"{threads} threads of this process"
 
     def compute(self, graph: Any) -> Any:
