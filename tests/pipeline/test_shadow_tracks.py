@@ -50,20 +50,23 @@ def finder(casters: dict[int, Caster]) -> Callable[..., dict[int, Caster]]:
 
 def test_the_track_of_a_shadow_is_moved_or_left_out(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     before = tables(plan)
-    moved, bent = (int(track) for track in before[0]["track_id"].value_counts().index[:2])
+    moved, bent, double = (int(track) for track in before[0]["track_id"].value_counts().index[:3])
     offset_m = np.array([-4.6, 2.3])
-    monkeypatch.setattr(stage, "find_shadows", finder({one: Caster(offset_m, 12.0, 2.5) for one in (moved, bent)}))
-    monkeypatch.setattr(stage, "keeps_direction", lambda track, _: track["track_id"].iloc[0] == moved)
+    shadows = {one: Caster(offset_m, 12.0, 2.5, tracked=one == double) for one in (moved, bent, double)}
+    monkeypatch.setattr(stage, "find_shadows", finder(shadows))
+    monkeypatch.setattr(stage, "keeps_direction", lambda track, _: track["track_id"].iloc[0] != bent)
     after = tables(plan)
     columns = ([f"{axis}_{k}_px" for axis in "xy" for k in range(3)], ["x_px", "y_px"])
     for old, new, names in zip(before, after, columns, strict=False):
-        expected = old[old["track_id"] != bent].reset_index(drop=True)
+        expected = old[~old["track_id"].isin([bent, double])].reset_index(drop=True)
         rows = expected["track_id"] == moved
         assert rows.sum() > 3
         for name in names:
             expected[name] += rows * offset_m["xy".index(name[0])] / GSD_M
         pd.testing.assert_frame_equal(new, expected, check_exact=False, rtol=0, atol=1e-9)
-    assert set(before[2]["track_id"]) - set(after[2]["track_id"]) == {moved, bent}, "a shadow's dimensions are none"
+    assert set(before[2]["track_id"]) - set(after[2]["track_id"]) == {moved, bent, double}, (
+        "a shadow's dimensions are none"
+    )
 
 
 def test_tracks_are_the_same_however_many_units_are_read_and_written_at_once(

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from schemas.arrays import Float32Array, FloatArray
-from velfield.tracking.casters import HALF_WINDOW_M, Caster, find_casters, keeps_direction
+from velfield.tracking.casters import HALF_WINDOW_M, Caster, find_caster, find_casters, keeps_direction
 from velfield.tracking.dimensions import may_be_shadows, shade_moments, shadow_direction
 
 PIXEL_M = 0.5
@@ -139,9 +139,20 @@ def test_the_road_and_its_lines_are_no_part_of_the_bus(sun: tuple[float, float])
     assert np.hypot(*(shadow(0.0) + found[1].offset_m - bus.centre(0.0))) < 0.7
 
 
-def test_a_bus_that_is_tracked_itself_is_no_new_one() -> None:
+def test_it_is_told_whether_a_bus_has_a_track_of_its_own() -> None:
     bus = body((30.0, 60.0), 9.0)
-    assert casters(Scene([bus], EAST), track(1, of_shadow(bus, EAST)), track(2, bus.centre)) == {}
+    shadow, other = track(1, of_shadow(bus, EAST)), body((30.0, 75.0), 9.0)
+    assert casters(Scene([bus], EAST), shadow, track(2, bus.centre))[1].tracked
+    assert not casters(Scene([bus], EAST), shadow, track(2, other.centre))[1].tracked
+
+
+@pytest.mark.parametrize(("gap_px", "touches"), [(0, True), (1, True), (2, True), (3, False)])
+def test_a_metre_may_lie_between_a_bus_and_its_shadow(gap_px: int, touches: bool) -> None:
+    changes = np.zeros((8, 89, 89), np.float32)  # 0.5 m a pixel
+    changes[:, 42:47, 40:50] = -100
+    changes[:, 42:47, 40 - gap_px - 24 : 40 - gap_px] = 80
+    found = find_caster(changes, 150.0, np.array(EAST), np.array(EAST), 0.5)
+    assert (found is not None) == touches
 
 
 def test_a_track_that_is_too_short_to_be_judged_stays() -> None:

@@ -284,7 +284,7 @@ STAGES: tuple[Stage, ...] = (
     # Tracklets of all units that belong to one vehicle.
     Stage(
         name="tracks",
-        version=10,
+        version=11,
         label="tracks",
         lines=(
             Line(

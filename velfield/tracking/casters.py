@@ -4,15 +4,15 @@ A large white vehicle is sometimes not detected, while its shadow is, as a black
 separates it from one. What does is beside it: towards the sun, and touching it, there is a bright body of a vehicle's
 shape that moves with it. So the frames of a black track are compared with the same ground in other frames, while the
 vehicle is elsewhere, which takes away the road, its markings and the buildings beside it, and are laid over each other
-along the track, which blurs what drives at another pace. Where such a body stays, and no other track is on it, the
-track is of its shadow, and the body is where the vehicle is.
+along the track, which blurs what drives at another pace. Where such a body stays, the track is of its shadow. Where no
+other track is on the body, it is where the vehicle is; else the vehicle has a track, and its shadow should have none.
 
 Which tracks are looked at, and in which direction shadows lie, follows without frames from what is stored of each
 detection (`velfield.tracking.dimensions.may_be_shadows`, `shadow_direction`).
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
 
@@ -48,11 +48,16 @@ Look = Callable[[int, FloatArray], Float32Array]
 
 @dataclass(frozen=True)
 class Caster:
-    """A vehicle beside its shadow: the offset of its centre from the track's positions, (2,) m, and its dimensions."""
+    """A vehicle beside its shadow.
+
+    ``offset_m`` (2,) of its centre from the positions of the shadow's track; its dimensions; whether it has a track of
+    its own.
+    """
 
     offset_m: FloatArray
     length_m: float
     width_m: float
+    tracked: bool = False
 
 
 @dataclass(frozen=True)
@@ -103,8 +108,9 @@ def find_casters(
         if not len(seen):
             continue
         caster = find_caster(own, float(np.median(seen)), view.heading, direction, pixel_m)
-        if caster is not None and not _is_tracked(caster, view, positions[positions["track_id"] != track], metres):
-            casters[track] = caster
+        if caster is not None:
+            tracked = _is_tracked(caster, view, positions[positions["track_id"] != track], metres)
+            casters[track] = replace(caster, tracked=tracked)
     return casters
 
 
@@ -178,7 +184,7 @@ def find_caster(
         return None
     contrast = -float(np.nanmedian(changes[:, shadow]))
     bright = (changes > _BODY * contrast).mean(axis=0) >= _MIN_SHARE
-    reach = 2 * int(np.ceil(_MAX_GAP_M / pixel_m)) + 1
+    reach = 2 * (int(_MAX_GAP_M / pixel_m) + 1) + 1  # so many pixels may lie between
     near = cv2.dilate(shadow.astype(np.uint8), np.ones((reach, reach), np.uint8)).astype(bool)
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(bright.astype(np.uint8), connectivity=4)
     touching = np.unique(labels[near & bright])

@@ -92,9 +92,14 @@ def chain_tracks(plan: Plan) -> StageResult:
     images = images_of_tracks(strips, found.tracks)
     del strips
     casters = find_shadows(plan, images, positions, gsd_m)
-    bent = [one for one in casters if not keeps_direction(positions[positions["track_id"] == one], gsd_m)]
-    left_out = np.union1d(doubles, np.array(bent, np.int64))  # where a bent track's caster is follows from no offset
-    offsets_px = {track: casters[track].offset_m / gsd_m for track in casters if track not in bent}
+    # Of a caster that has a track the shadow needs none; where that of a bent track is follows from no offset.
+    dropped = [
+        track
+        for track, caster in casters.items()
+        if caster.tracked or not keeps_direction(positions[positions["track_id"] == track], gsd_m)
+    ]
+    left_out = np.union1d(doubles, np.array(dropped, np.int64))
+    offsets_px = {track: caster.offset_m / gsd_m for track, caster in casters.items() if track not in dropped}
     positions = _move_tracks(_without(positions, left_out), offsets_px, [("x_px", "y_px")])
     triples = find_triples(positions, flight, plan.config.tracking.max_interval_s)
     track = found.tracks[chain]
