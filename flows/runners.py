@@ -1,7 +1,7 @@
 """The one place that knows about clusters: where the Dask graph of a unit is computed.
 
-Measured (see CONTRIBUTING): a Prefect thread runner whose tasks compute their graphs on Dask's threads is fastest on
-a laptop; the same tasks submitting their graphs to a cluster survive a killed worker. prefect-dask is not needed for
+Measured (see CONTRIBUTING): a Prefect thread runner whose tasks compute their graphs on one pool of threads is fastest
+on a laptop; the same tasks submitting their graphs to a cluster survive a killed worker. prefect-dask is not needed for
 either.
 """
 

@@ -142,6 +142,20 @@ def test_a_crop_gives_the_same_alone_and_among_others() -> None:
     np.testing.assert_array_equal(together, np.concatenate([forward(eight, one[None])[0] for one in images]))
 
 
+def test_of_long_crops_of_one_size_each_is_predicted() -> None:
+    """They are longer than a tile, and several would fit into a batch."""
+    network = shipped_detector().network  # type: ignore[attr-defined]
+    image = np.random.default_rng(4).integers(0, 256, (64, 2112), dtype=np.uint8)
+    crops = [(0, 0, 24, 2056), (32, 16, 24, 2056)]
+    together = predict_crops(network, image, crops)
+    for y, x, height, width in crops:
+        alone = predict_crops(network, image, [(y, x, height, width)])
+        part = slice(y // 2, (y + height) // 2), slice(x // 2, (x + width) // 2)
+        np.testing.assert_array_equal(together[0][part], alone[0][part])
+        assert alone[0][part].any()
+        np.testing.assert_array_equal(together[1][:, *part], alone[1][:, *part])
+
+
 def test_crops_of_an_image_are_predicted_as_if_alone() -> None:
     network, image = shipped().network, cars(2, (120, 160))
     crops = ((0, 0, 48, 40), (0, 40, 48, 40), (48, 8, 64, 104), (8, 80, 40, 48))

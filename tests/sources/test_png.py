@@ -216,3 +216,12 @@ def test_any_damage_ends_as_with_pillow(tmp_path_factory: pytest.TempPathFactory
         found, by_pillow = outcome(path), read_by_pillow(path, monkeypatch)
     assert type(found) is type(by_pillow)
     np.testing.assert_array_equal(found, by_pillow)
+
+
+def test_a_png_with_far_more_bytes_than_pixels_is_left_to_pillow() -> None:
+    """Else all of them would be read at once."""
+    pixels = np.zeros((4, 5, 1), np.uint8)
+    plain = png(pixels, np.zeros(4, int))
+    assert read_plain(plain) is not None
+    empty = chunk(b"IDAT", b"") * 10_000
+    assert read_plain(plain.replace(chunk(b"IEND", b""), empty + chunk(b"IEND", b""))) is None

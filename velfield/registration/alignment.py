@@ -417,7 +417,7 @@ def _fill_window(image, taps, x0, y0, rows, columns, line, across, levels, windo
 def _sample_patch(window, columns, x0, y0, shape, patch, start, derivative, shift, spacing, sample, visible):  # type: ignore[no-untyped-def]
     """Sample the frame under a patch shifted by ``shift``; the number of pixels in the frame, their mean in both.
 
-    ``window`` holds the frame of this shape from pixel (x0, y0) on, ``columns`` a row, as `_pack_window` makes it.
+    ``window`` holds the frame of this shape from pixel (x0, y0) on, ``columns`` a row, as `_fill_window` makes it.
     """
     side = patch.shape[0]
     half = side // 2

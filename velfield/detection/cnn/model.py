@@ -114,11 +114,12 @@ def predict_crops(network: Network, image: GreyImage, crops: Sequence[Crop]) -> 
     for y, x, height, width in crops:
         by_size.setdefault((height, width), []).append((y, x))
     for (height, width), alike in by_size.items():
-        corners, at_once = np.array(alike), max(1, _BATCH_PX // (height * width))
+        tiled = max(height, width) > _TILE_PX
+        corners, at_once = np.array(alike), 1 if tiled else max(1, _BATCH_PX // (height * width))
         for start in range(0, len(corners), at_once):
             batch = corners[start : start + at_once]
             pixels = _cut_kernel(image, batch, height, width)
-            if max(height, width) > _TILE_PX:
+            if tiled:
                 heatmap, vector = predict_heatmap(network, pixels[0], border_px=0)
                 heatmaps, vectors = heatmap[None], vector[None]
             else:

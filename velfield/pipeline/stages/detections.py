@@ -114,7 +114,7 @@ def _supported(working: WorkingGrid, found: "_Found", frame: int) -> Mask:
     """Which of the cars and candidates (n,) lie where control points support the frame's map."""
     transform = working.maps.transform(frame)
     assert transform is not None, "a frame that was searched is registered"
-    raw = transform.to_raw(found.rectified.to_base(found.detections.xy))
+    raw = transform.to_raw(found.xy_base)
     return np.asarray(np.isfinite(working.maps.position_sd_px(frame, raw)))
 
 
@@ -141,7 +141,7 @@ def _from_boxes(plan: Plan, working: WorkingGrid, frame: int, boxes: pd.DataFram
     if rectified is None or transform is None:
         return None
     cars = external_detections(plan, rectified, transform, boxes)
-    return _Found(cars, len(cars), rectified, np.nan)
+    return _Found.in_frame(cars, len(cars), rectified, np.nan)
 
 
 @dataclass(frozen=True)
@@ -151,18 +151,26 @@ class _Found:
     Attributes
     ----------
     detections : cars and, after so many (``cars``), weak candidates.
-    rectified : the frame.
-    searched : the fraction of it that was searched.
+    xy_base : their positions (n, 2), base px.
+    scale : working px a base px.
+    searched : the fraction of the frame that was searched.
     """
 
     detections: FrameDetections
     cars: int
-    rectified: WorkingFrame
+    xy_base: Points
+    scale: float
     searched: float
+
+    @classmethod
+    def in_frame(cls, detections: FrameDetections, cars: int, rectified: WorkingFrame, searched: float) -> "_Found":
+        """What was found in a frame, which itself is not kept: a block's frames together are large."""
+        return cls(detections, cars, rectified.to_base(detections.xy), rectified.scale, searched)
 
     def keep(self, rows: Mask) -> "_Found":
         """Some of the cars and candidates."""
-        return replace(self, detections=self.detections.select(rows), cars=int(rows[: self.cars].sum()))
+        detections, cars = self.detections.select(rows), int(rows[: self.cars].sum())
+        return replace(self, detections=detections, cars=cars, xy_base=self.xy_base[rows])
 
 
 @dataclass(frozen=True)
@@ -204,7 +212,7 @@ class _Search:
         found = concatenate([cars, searched.weak])
         order = np.lexsort((found.xy[:, 0], found.xy[:, 1], np.arange(len(found)) >= len(cars)))
         crops = attach_crops(rectified.image, found, order, half_image=searched.frame.half_image)
-        return _Found(crops, len(cars), rectified, searched.searched)
+        return _Found.in_frame(crops, len(cars), rectified, searched.searched)
 
     def _begin_group(self, frame: int) -> None:
         every = self._plan.config.detection.full_frame_every
@@ -264,8 +272,8 @@ def _tabulate(parts: Sequence[_FrameCars]) -> BlockDetections:
     counts = np.array([len(one) for one in detections])
     number = np.concatenate([np.arange(count) for count in counts])
     frame = np.repeat([part.frame for part in parts], counts)
-    scale = np.repeat([one.rectified.scale for one in all_found], counts)
-    xy = np.concatenate([one.rectified.to_base(one.detections.xy) for one in all_found])
+    scale = np.repeat([one.scale for one in all_found], counts)
+    xy = np.concatenate([one.xy_base for one in all_found])
     columns = {
         "detection_id": frame * ID_STEP + number,
         "frame": frame,
