@@ -1,7 +1,8 @@
 """Cloud-optimised GeoTIFF: layers of the field for GIS, with names, units, NaN and the reference system."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,18 @@ def write_cog(
     write_atomically(path, cog_bytes(layers, names=names, units=units, crs_wkt=crs_wkt, affine=affine))
 
 
+@contextmanager
+def ignore_missing_georeference() -> Iterator[None]:
+    """Without a warning that an image is not georeferenced, as many are not.
+
+    What warnings are ignored is a matter of the whole process: where one of several threads writes images, enter this
+    before they start, or another that leaves `warnings.catch_warnings` meanwhile takes it back.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        yield
+
+
 def cog_bytes(
     layers: Sequence[NDArray[np.generic]],
     *,
@@ -77,9 +90,8 @@ def cog_bytes(
     }
     if crs_wkt is not None and affine is not None:
         profile |= {"crs": crs_wkt, "transform": Affine(*affine)}
-    with warnings.catch_warnings(), MemoryFile() as plain, MemoryFile() as optimised:
+    with ignore_missing_georeference(), MemoryFile() as plain, MemoryFile() as optimised:
         # A run without a base image has no georeference; its layers are exported all the same.
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
         with plain.open(**profile) as dataset:
             dataset.write(stack)
             for band, (name, unit) in enumerate(zip(names, units, strict=True), start=1):

@@ -201,7 +201,7 @@ def _read_plain_png(image: PngImagePlugin.PngImageFile) -> GreyImage | None:
     if codec != "zip" or extents != (0, 0, *image.size) or not channels or image.fp is None:
         return None
     size = image.height * (1 + image.width * channels)
-    most = size + size // 64 + _PNG_OVERHEAD  # what cannot be compressed takes little more: beyond, it is not plain
+    most = 2 * size + _PNG_OVERHEAD  # what cannot be compressed takes little more: beyond, it is not plain
     image.fp.seek(offset - 8)
     data = image.fp.read(most + 1)
     filtered = None if len(data) > most else _inflate_pixels(data, size)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, Mask
-from velfield.exports.cog import write_cog
+from velfield.exports.cog import ignore_missing_georeference, write_cog
 from velfield.field.segments import stationary_speed_px_per_s
 from velfield.field.statistics import direction_rad, speed_px_per_s
 from velfield.parallel import parallel_map
@@ -41,7 +41,8 @@ def make_maps(plan: Plan) -> StageResult:
 
     # The viewer's data take about as long as the figures.
     writers: list[Callable[[], list[Path]]] = [write_figures, partial(write_view_data, layout)]
-    written = parallel_map(_call, writers)
+    with ignore_missing_georeference():
+        written = parallel_map(_call, writers)
     advance("maps")
     return StageResult([path for paths in written for path in paths], {"maps": 2.0})
 
