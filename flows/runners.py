@@ -128,6 +128,10 @@ class ThreadsRunner(Runner):
     def restart_workers(self) -> None:
         pass  # its threads are of this process
 
+    def close(self) -> None:
+        """Let its threads end, without waiting for what they import."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
 
 class ClientRunner(Runner):
     """A Dask cluster. Graphs hold functions of ``velfield`` alone, so workers need no ``flows``."""
@@ -206,7 +210,11 @@ def open_runner(config: RunnerConfig, warn: Callable[[str], None] = warnings.war
     ``warn`` is called, once a minute at most, while a cluster has no workers.
     """
     if config == RunnerConfig():
-        yield ThreadsRunner(usable_processors())
+        runner = ThreadsRunner(usable_processors())
+        try:
+            yield runner
+        finally:
+            runner.close()
         return
     from distributed import Client
     from distributed.versions import VersionMismatchWarning
