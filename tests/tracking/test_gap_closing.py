@@ -197,7 +197,8 @@ def test_a_neighbourhood_is_the_nearest_by_candidates(tracks: int) -> None:
     partner[0][best[:, 0]], partner[1][best[:, 1]] = best.T[::-1]
     by_column = np.argsort(column, kind="stable")
     begins, begins_of_starts = (np.searchsorted(np.sort(one), np.arange(tracks + 1)) for one in (row, column))
-    beside, at = (begins, column, begins_of_starts, row[by_column]), (np.full(tracks, -1), np.full(tracks, -1))
+    beside = begins, np.ascontiguousarray(column), begins_of_starts, row[by_column]
+    at = np.full(tracks, -1), np.full(tracks, -1)
     for end, start in best[:30].tolist():
         ends, starts = nearest_by_candidates(end, start, table > 0, partner)
         near, whole = _neighbourhood(end, start, beside, partner, gain, at)

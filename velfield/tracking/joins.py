@@ -329,38 +329,27 @@ def _neighbourhood(end, start, beside, partner, gains, at):  # type: ignore[no-u
     ``beside``: where the candidates of each end begin, and they; then of each start. ``gains`` as those of the ends.
     ``partner`` of each end, and start; -1 is none. ``at`` is scratch, the place of each end, and start; -1 and so left.
     """
-    begins, starts_beside, begins_of_starts, ends_beside = beside
-    ends, starts = [end], [start]
+    found = ([end], [start])
     at[0][end], at[1][start] = 0, 0
     front = [(0, end), (1, start)]
-    while len(front) and len(ends) + len(starts) < _NEIGHBOURHOOD:
+    while len(front) and len(found[0]) + len(found[1]) < _NEIGHBOURHOOD:
         following = [(0, end) for _ in range(0)]
         for side, one in front:
-            if side == 0:
-                for k in range(begins[one], begins[one + 1]):
-                    other = starts_beside[k]
-                    if at[1][other] < 0:
-                        at[1][other] = len(starts)
-                        starts.append(other)
-                        following.append((1, other))
-                        back = partner[1][other]
-                        if back >= 0 and at[0][back] < 0:
-                            at[0][back] = len(ends)
-                            ends.append(back)
-                            following.append((0, back))
-            else:
-                for k in range(begins_of_starts[one], begins_of_starts[one + 1]):
-                    other = ends_beside[k]
-                    if at[0][other] < 0:
-                        at[0][other] = len(ends)
-                        ends.append(other)
-                        following.append((0, other))
-                        back = partner[0][other]
-                        if back >= 0 and at[1][back] < 0:
-                            at[1][back] = len(starts)
-                            starts.append(back)
-                            following.append((1, back))
+            begins, others, across = beside[2 * side], beside[2 * side + 1], 1 - side
+            for k in range(begins[one], begins[one + 1]):
+                other = others[k]
+                if at[across][other] < 0:
+                    at[across][other] = len(found[across])
+                    found[across].append(other)
+                    following.append((across, other))
+                    back = partner[across][other]
+                    if back >= 0 and at[side][back] < 0:
+                        at[side][back] = len(found[side])
+                        found[side].append(back)
+                        following.append((side, back))
         front = following
+    ends, starts = found
+    begins, starts_beside = beside[0], beside[1]
     near, whole = np.zeros((len(ends), len(starts))), 0.0
     for i in range(len(ends)):
         for k in range(begins[ends[i]], begins[ends[i] + 1]):
