@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 
 from schemas.analysis import AnalysisColumn, AnalysisRecord, AnalysisRow, AnalysisTable, EstimateRecord, GeometryRecord
+from schemas.arrays import IntArray
 from schemas.summary import RunSummary
 from schemas.view import ViewRecord
 from tests.browser import MIDDLE_OF_MAP, NEEDS_PAGE, Browser, Page, browser, served
@@ -22,7 +23,7 @@ from velfield.report.colours import direction_colours, ramp_colours
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run
 from velfield.run.stores import open_field
-from velfield.viewer.flow import DRAWS, _draw_tile, draw_bins
+from velfield.viewer.flow import DRAWS, _draw_tile
 from velfield.viewer.replay import CHUNK_S, chunk_count, replay_chunks, vehicle_paths
 
 PAINTED = """(() => {
@@ -127,6 +128,17 @@ def test_no_vehicles_make_files_too() -> None:
     vehicles = pd.DataFrame({"state": [], "vehicle_class": []} | {name: np.zeros(0) for name in numbers})
     (chunk,) = replay_chunks(paths, vehicles, first_time_s=0.0, duration_s=3.0, step_px=1.0)
     assert decode(chunk, 1.0) == {}
+
+
+def draw_bins(weights: IntArray) -> IntArray:
+    """(n, DRAWS) systematic sample of bins with these weights (n, bins), each row with some: in plain numpy."""
+    cumulative = np.cumsum(weights, axis=1)
+    at = (np.arange(DRAWS) + 0.5) / DRAWS * cumulative[:, -1:]
+    return np.stack([np.searchsorted(row, where, side="right") for row, where in zip(cumulative, at, strict=True)])
+
+
+def test_the_reference_draws_in_proportion() -> None:
+    assert np.bincount(draw_bins(np.array([[3, 0, 1]]))[0]).tolist() == [12, 0, 4]
 
 
 def test_draws_follow_the_weights_within_one_draw() -> None:

@@ -87,7 +87,7 @@ def _draw_tile(
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _draw_cells(histogram: NDArray[np.int32], y: IntArray, x: IntArray, first: IntArray, bins: IntArray) -> None:
-    """Fill ``bins`` (n, DRAWS) as `draw_bins` does of the sums of the histograms (ty, tx, bins) at the pixels
+    """Fill ``bins`` (n, DRAWS) with a systematic sample of the sums of the histograms (ty, tx, bins) at the pixels
     ``first[k]`` to ``first[k + 1]`` of each cell: those of a tile at once would be as large as the tile, twice."""
     total = np.empty(histogram.shape[2], np.int64)
     for cell in range(bins.shape[0]):
@@ -105,16 +105,3 @@ def _draw_cells(histogram: NDArray[np.int32], y: IntArray, x: IntArray, first: I
             while drawn < DRAWS and float(cumulative) > (drawn + 0.5) / DRAWS * weight:
                 bins[cell, drawn] = b
                 drawn += 1
-
-
-def draw_bins(weights: IntArray) -> IntArray:
-    """(n, DRAWS) systematic sample of bins with these weights (n, bins), each row with some.
-
-    Examples
-    --------
-    >>> np.bincount(draw_bins(np.array([[3, 0, 1]]))[0]).tolist()
-    [12, 0, 4]
-    """
-    cumulative = np.cumsum(weights, axis=1)
-    at = (np.arange(DRAWS) + 0.5) / DRAWS * cumulative[:, -1:]
-    return np.stack([np.searchsorted(row, where, side="right") for row, where in zip(cumulative, at, strict=True)])
