@@ -25,8 +25,11 @@ _MANY_GAPS = 0.3
 _LATE = 1.5
 """A frame may come late by half an interval."""
 OPTIONAL_INPUTS = tuple(name for name in Inputs.model_fields if name != "source")
-_UNITS = ((256, 16), (4096, 64))
-"""Up to so many frames, so many a unit: a short flight is cut finely enough for several workers ..."""
+_ONE_UNIT = 16
+"""Up to so many frames are one unit."""
+_UNITS = ((256, 32), (4096, 64))
+"""Up to so many frames, so many a unit: a short flight is cut finely enough for several workers, but the first frame of
+each unit is registered by its keypoints, at five times the cost of the others; ..."""
 _LARGEST_UNIT = 256
 """... and a flight of hours stays below 3,000 task runs. These are upper limits: units are cut evenly,
 and an even number of them, so that no core of two idles over a last short one."""
@@ -63,8 +66,8 @@ class Plan:
         if setting != "auto":
             return setting
         largest = next((unit for frames, unit in _UNITS if self.frame_count <= frames), _LARGEST_UNIT)
-        if self.frame_count <= largest:
-            return largest
+        if self.frame_count <= _ONE_UNIT:
+            return _ONE_UNIT
         units = 2 * -(-self.frame_count // (2 * largest))
         even = -(-self.frame_count // units)
         # Of whole blocks where that leaves no short one: a block that is cut searches one frame more as a whole.
