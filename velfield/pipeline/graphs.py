@@ -10,6 +10,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from dask import delayed
+from dask.local import get_sync
 
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import commit
@@ -39,6 +40,11 @@ def unit_graph(plan: Plan, stage: Stage, unit: Unit) -> Graph:
     if stage.block is not None:
         blocks = [[_node(resolve(stage.block), constant, frames) for frames in unit_blocks(plan, stage, unit)]]
     return _committed(constant, stage, unit, _node(resolve(stage.unit), constant, *unit.part, *blocks))
+
+
+def compute_here(graph: Graph) -> Any:
+    """The value of a graph, computed on this thread."""
+    return graph.compute(scheduler=get_sync)
 
 
 def rebase_graph(plan: Plan, stage: Stage, unit: Unit, rebase: "Rebase") -> Graph:

@@ -13,7 +13,7 @@ from pathlib import Path
 from schemas.job import Inputs, Job
 from schemas.simulation import SimulationConfig
 from velfield.pipeline.configuration import resolve_config
-from velfield.pipeline.graphs import unit_graph
+from velfield.pipeline.graphs import compute_here, unit_graph
 from velfield.pipeline.plan import Plan, make_plan, write_flight_record
 from velfield.pipeline.stage import STAGE, STAGES
 from velfield.pipeline.units import prepare_stage, stage_units
@@ -30,7 +30,7 @@ def compute_stages(plan: Plan, stages: Iterable[str] = tuple(STAGE)) -> None:
             continue
         prepare_stage(plan, stage)
         for unit in stage_units(plan, stage):
-            unit_graph(plan, stage, unit).compute(scheduler="synchronous")
+            compute_here(unit_graph(plan, stage, unit))
 
 
 def compile_kernels() -> None:

@@ -17,7 +17,7 @@ from schemas.job import Job
 from schemas.records import InputsRecord
 from schemas.summary import RunSummary
 from velfield.detection.detector import shipped_detector
-from velfield.pipeline.graphs import unit_graph
+from velfield.pipeline.graphs import compute_here, unit_graph
 from velfield.pipeline.plan import Plan, write_flight_record
 from velfield.pipeline.result import without_progress
 from velfield.pipeline.stage import STAGES, Stage, stage_keys, stages_before
@@ -52,7 +52,7 @@ def make_first_preview(plan: Plan) -> int:
     """
     remove_tree(plan.layout.preview)
     first = _first_plan(plan)
-    _make(first, STAGES, lambda graph: graph.compute(scheduler="synchronous"))
+    _make(first, STAGES, compute_here)
     _write_page(plan, first, f"the first {first.frame_count} of {plan.frame_count} frames")
     return first.frame_count
 
