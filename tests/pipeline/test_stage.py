@@ -1,6 +1,8 @@
 """The table of stages: whole, the only one, and keys change exactly where a stage reads what changed."""
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future
 from pathlib import Path
@@ -175,3 +177,17 @@ def test_the_graphs_compute_what_the_bare_functions_do(
     bare = digests(tmp_path / "bare")
     assert {name for name in bare if by_graphs.get(name) != bare[name]} == set()
     assert {name.split("/")[0] for name in by_graphs.keys() - bare.keys()} <= {"view"}  # what the report adds
+
+
+def test_kernels_are_loaded_before_they_are_called() -> None:
+    module = "import numpy as np; from velfield.sources import png_filters as module; "
+    call = "module.undo_filters(np.zeros(8, np.uint8), 3, np.zeros((2, 3), np.uint8))"
+    signatures = "module.undo_filters.signatures"
+    run_python(module + call)  # compiled, and so cached
+    loaded = f"from velfield.pipeline.stage import load_kernels; assert not {signatures}; assert load_kernels() > 0; "
+    run_python(f"{module}{loaded}assert {signatures}")
+
+
+def run_python(code: str) -> None:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

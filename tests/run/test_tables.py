@@ -15,9 +15,9 @@ from velfield.run.tables import (
     empty_table,
     link_file,
     link_files,
-    read_patches,
+    read_arrays,
     read_tables,
-    write_patches,
+    write_arrays,
     write_table,
 )
 
@@ -59,11 +59,11 @@ def test_a_table_without_rows_has_its_types(count: int, tmp_path: Path) -> None:
 
 def test_patches_come_back_by_name(tmp_path: Path) -> None:
     patches = {"small": np.arange(24, dtype=np.uint8).reshape(2, 3, 4), "none": np.empty((0, 8, 16), np.uint8)}
-    write_patches(tmp_path / "p.npz", patches)
-    read = read_patches(tmp_path / "p.npz")
+    write_arrays(tmp_path / "p.npz", patches)
+    read = read_arrays(tmp_path / "p.npz")
     assert read.keys() == patches.keys()
     assert all(np.array_equal(read[name], values) for name, values in patches.items())
-    some = read_patches(tmp_path / "p.npz", only=["none"])
+    some = read_arrays(tmp_path / "p.npz", only=["none"])
     assert some.keys() == {"none"}
     assert some["none"].shape == (0, 8, 16)
     assert list(tmp_path.glob("*.partial")) == []

@@ -8,6 +8,7 @@ Functions are named, ``module:function``, and resolved where a unit is computed,
 the plan imports anything heavy.
 """
 
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
@@ -172,7 +173,7 @@ STAGES: tuple[Stage, ...] = (
     # Key points of spread frames, two passes to their median; or the registration of a given image.
     Stage(
         name="base",
-        version=10,
+        version=11,
         label="base image",
         lines=(
             Line(
@@ -395,11 +396,33 @@ def resolve(function: str) -> Callable[..., Any]:
 
 
 def load_stages() -> None:
-    """Import what the stages need: a second of a worker's time, which has nothing to do while a run is planned."""
+    """Import what the stages need, and load their kernels: two seconds of a worker's time, which has nothing to do
+    while a run is planned."""
     for stage in STAGES:
         for path in (stage.unit, stage.block):
             if path is not None:
                 resolve(path)
+    load_kernels()
+
+
+def load_kernels() -> int:
+    """Load all that numba's cache has of the kernels of the modules that are imported; returns their number.
+
+    A kernel is loaded when it is called first, in a hundredth of a second; threads that need it wait for each other.
+    """
+    from numba.core.caching import FunctionCache
+    from numba.core.dispatcher import Dispatcher
+
+    modules = [module for name, module in list(sys.modules.items()) if name.split(".")[0] == "velfield"]
+    kernels = {id(one): one for module in modules for one in vars(module).values() if isinstance(one, Dispatcher)}
+    count = 0
+    for kernel in kernels.values():
+        cache: Any = getattr(kernel, "_cache", None)  # numba has no public way to ask what it holds
+        if isinstance(cache, FunctionCache):
+            for signature, *_ in cache._cache_file._load_index():
+                kernel.compile(signature)
+                count += 1
+    return count
 
 
 def stage_keys(config: FlightConfig, inputs: InputsRecord) -> dict[str, str]:

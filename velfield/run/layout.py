@@ -189,6 +189,11 @@ class RunLayout:
         return self.base / "own_base_mask.png"
 
     @property
+    def base_features(self) -> Path:
+        """Key points and patches of the image that frames are registered to: each process would detect them again."""
+        return self.base / "features.npz"
+
+    @property
     def base_error_map(self) -> Path:
         """Cross-validated error of the registration to a given base image."""
         return self.base / "error_map.png"

@@ -1,4 +1,4 @@
-"""Tables of a run folder: Parquet parts of one unit each, and image patches of the detections."""
+"""Tables of a run folder: Parquet parts of one unit each; arrays in one file, as image patches of the detections."""
 
 import io
 import os
@@ -15,7 +15,7 @@ from velfield.errors import StoreError
 from velfield.run.commits import write_atomically
 from velfield.run.layout import copy_objects, is_remote
 
-Patches = dict[str, NDArray[Any]]
+Arrays = dict[str, NDArray[Any]]
 
 
 def conform(table: pd.DataFrame, columns: Mapping[str, str]) -> pd.DataFrame:
@@ -120,18 +120,19 @@ def _damage_error(path: Path, error: Exception) -> StoreError:
     return StoreError(f"{path} is damaged ({' '.join(str(error).split())[:100]}); `velfield verify` finds its unit")
 
 
-def write_patches(path: Path, patches: Mapping[str, NDArray[Any]]) -> None:
-    """Write image patches of the detections, each (n, h, w) uint8, in the table's order.
+def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays by name: image patches of the detections, (n, h, w) uint8 each in the table's order, features of the
+    base image.
 
     Not compressed: that would save a quarter of the space, and cost as much time as all else but the network.
     """
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **patches)
+    np.savez(buffer, allow_pickle=False, **arrays)
     write_atomically(path, buffer.getvalue())
 
 
-def read_patches(path: Path, *, only: Sequence[str] | None = None) -> Patches:
-    """Image patches of the detections by name; ``only`` selects some, and of a file on a disk no others are read.
+def read_arrays(path: Path, *, only: Sequence[str] | None = None) -> Arrays:
+    """Arrays by name; ``only`` selects some, and of a file on a disk no others are read.
 
     Raises
     ------

@@ -25,9 +25,15 @@ from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.base_fit import BaseFit, check_scale, covered_fraction
 from velfield.pipeline.stages.direct import accept_lens, register_directly, trial_frames
 from velfield.pipeline.stages.lens import select_usable_frames
-from velfield.pipeline.stages.registration import FrameKeypoints, detect_unit_keypoints, read_given_base
+from velfield.pipeline.stages.registration import (
+    FrameKeypoints,
+    detect_unit_keypoints,
+    read_given_base,
+    write_reference,
+)
 from velfield.registration.base_mesh import fit_base_mesh
 from velfield.registration.intersensor import IntersensorResult, register_intersensor
+from velfield.registration.intrasensor import prepare_base
 from velfield.registration.keypoints import Keypoints
 from velfield.registration.own_base import OwnBase, build_own_base
 from velfield.report.figures import png_bytes
@@ -80,7 +86,11 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageR
         if direct.fit is not None:  # half a pixel all over the frame: no other area reaches that
             grid = _given_grid(plan, given, reference, direct.fit)
             layout.own_to_base.unlink(missing_ok=True)
-            outputs = [*write_given_image(layout, given), *_written_lens(layout)]
+            outputs = [
+                *write_given_image(layout, given),
+                *_written_lens(layout),
+                write_reference(plan, direct.reference),
+            ]
             finished = _finish(plan, grid, outputs, given=given, fit=direct.fit)
             return replace(finished, notes=[*finished.notes, *direct.notes])
         lens, lens_notes = _check_area(plan, store.read(reference), given, direct.lens)
@@ -92,7 +102,13 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageR
         raise InputError(f"no base image can be built from the flight: {own.reason}; give one with --base")
     write_atomically(layout.own_base_image, png_bytes(own.image))
     write_atomically(layout.own_base_mask, png_bytes(own.valid.astype(np.uint8) * 255))
-    outputs = [layout.own_base_image, layout.own_base_mask, *_written_lens(layout)]
+    reference_image = prepare_base(own.image, plan.config.registration, mask=own.valid, frame_shape=store.shape)
+    outputs = [
+        layout.own_base_image,
+        layout.own_base_mask,
+        *_written_lens(layout),
+        write_reference(plan, reference_image),
+    ]
     fit = None
     if given is None:
         grid = _own_grid(plan, own, reference)

@@ -25,7 +25,7 @@ from velfield.pipeline.stages.registration import external_boxes, usable_frames
 from velfield.registration.transforms import FrameMap
 from velfield.run.frame_transforms import read_working
 from velfield.run.stores import open_frames
-from velfield.run.tables import write_patches, write_table
+from velfield.run.tables import write_arrays, write_table
 
 _AXIS_SD_RAD = 0.1
 
@@ -330,6 +330,6 @@ def write_detections(plan: Plan, frames: range, blocks: Sequence[BlockDetections
 def _write_part(path: Path, part: BlockDetections, scale: float) -> list[Path]:
     patches = path.with_suffix(".patches.npz")
     arrays = {"patches": part.patches, "chips": part.chips, "strips": part.strips}
-    write_patches(patches, {**arrays, "xy_work": part.xy_work, "working_scale": np.array(scale)})
+    write_arrays(patches, {**arrays, "xy_work": part.xy_work, "working_scale": np.array(scale)})
     write_table(path, part.table, DETECTION_COLUMNS)
     return [path, patches]

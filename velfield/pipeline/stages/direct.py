@@ -17,7 +17,7 @@ from velfield.camera.map_fit import MapFit, fit_lens_to_map, mean_lens
 from velfield.parallel import parallel_map
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.stages.base_fit import BaseFit, check_scale, covered_fraction
-from velfield.registration.intrasensor import FrameRegistration, prepare_base, register_frame
+from velfield.registration.intrasensor import BaseReference, FrameRegistration, prepare_base, register_frame
 from velfield.registration.keypoints import Keypoints
 from velfield.run.commits import write_atomically
 from velfield.run.stores import open_frames
@@ -36,11 +36,13 @@ Register = Callable[[int, Lens], FrameRegistration]
 
 @dataclass(frozen=True)
 class DirectRegistration:
-    """How sampled frames register directly (None: one of them does not), the lens by their matches, notes on it."""
+    """How sampled frames register directly (None: one of them does not), the lens by their matches, notes on it, and
+    the features of the given image."""
 
     fit: BaseFit | None
     lens: Lens
     notes: list[str]
+    reference: BaseReference
 
 
 def trial_frames(spread: list[int]) -> list[int]:
@@ -68,7 +70,7 @@ def register_directly(plan: Plan, given: BaseRaster, keypoints: dict[int, Keypoi
         lens, first, notes = _refine_by_one(plan, register, frames[0], lens, first)
     results = _register_others(register, frames, lens, first)
     if results is None:
-        return DirectRegistration(None, lens, notes)
+        return DirectRegistration(None, lens, notes, reference)
     if refines:
         for _ in range(_LENS_ROUNDS):
             fit = _fit_lens(results, lens, shape)
@@ -79,7 +81,7 @@ def register_directly(plan: Plan, given: BaseRaster, keypoints: dict[int, Keypoi
                 break
             notes = accept_lens(plan, fit.lens, _evidence(again))
             lens, results = fit.lens, again
-    return DirectRegistration(_summarise(plan, given, results), lens, notes)
+    return DirectRegistration(_summarise(plan, given, results), lens, notes, reference)
 
 
 def _refine_by_one(

@@ -1,10 +1,11 @@
 """Stage ``registration``: every frame of a unit to the base image and to the frame before it, in chains."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache, partial
 from pathlib import Path
 from threading import Lock
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,11 +16,11 @@ from schemas.arrays import FloatArray, GreyImage, Mask
 from velfield.camera.tilt import FOCAL_HALF_DIAGONALS, MIN_TURN
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
-from velfield.registration.intrasensor import BaseReference, FrameRegistration, prepare_base, register_chain
+from velfield.registration.alignment import Templates
+from velfield.registration.intrasensor import BaseReference, FrameRegistration, register_chain
 from velfield.registration.keypoints import Keypoints, detect_keypoints
 from velfield.registration.transforms import FrameTransform, vector_length
 from velfield.run.frame_transforms import read_grid, read_lens
-from velfield.run.layout import local_copy
 from velfield.run.stores import (
     ERROR_CELLS,
     POSITION_SD_CELLS,
@@ -30,8 +31,8 @@ from velfield.run.stores import (
     open_registration,
     store_key,
 )
+from velfield.run.tables import read_arrays, write_arrays
 from velfield.sources.geo import BaseRaster, read_base_raster
-from velfield.sources.images import read_grey_image
 from velfield.sources.labels.detections import read_detections
 from velfield.sources.quality import UNUSABLE, describe_flags
 
@@ -39,6 +40,7 @@ MAP_PARAMETERS = 65
 """Approximate number of parameters of a frame's map: its standard error is residual * sqrt(parameters / points)."""
 MAX_SCALE_CHANGE = 1.15
 """Change of a frame's scale that is reported; a drone that holds its height changes by 2 %."""
+_FEATURES: dict[str, Any] = {"keypoints": Keypoints, "templates": Templates, "dense_templates": Templates}
 _REFERENCE_LOCK = Lock()
 _references: dict[tuple[str, str], BaseReference] = {}
 _BOXES: dict[str, pd.DataFrame] = {}
@@ -239,25 +241,32 @@ def vehicle_free_mask(plan: Plan, frame: int, shape: tuple[int, int]) -> Mask | 
 
 
 def base_reference(plan: Plan) -> BaseReference:
-    """The base image with its features; the last one is cached, because all units of a run use the same."""
+    """The features of the base image; the last ones are cached, because all units of a run use the same."""
     with _REFERENCE_LOCK:
         key = (str(plan.layout.root), plan.keys["base"])
         if key not in _references:
             _references.clear()
-            _references[key] = _make_reference(plan)
+            _references[key] = _read_reference(plan)
         return _references[key]
 
 
-def _make_reference(plan: Plan) -> BaseReference:
-    limit = plan.config.frames.max_pixels
-    shape = open_frames(plan.layout.frames).shape
-    if read_grid(plan.layout).registered_to == "given":
-        given = read_given_base(plan)
-        assert given is not None, "the grid says that a base image was given"
-        return prepare_base(given.grey, plan.config.registration, mask=given.valid, frame_shape=shape)
-    with local_copy(plan.layout.own_base_image) as image, local_copy(plan.layout.own_base_mask) as valid:
-        grey, mask = read_grey_image(image, limit), read_grey_image(valid, limit) > 0
-    return prepare_base(grey, plan.config.registration, mask=mask, frame_shape=shape)
+def write_reference(plan: Plan, reference: BaseReference) -> Path:
+    """Write the features of the base image; returns the file."""
+    arrays: dict[str, NDArray[np.generic]] = {"shape": np.array(reference.shape)}
+    for name in _FEATURES:
+        arrays |= {f"{name}.{key}": array for key, array in vars(getattr(reference, name)).items()}
+    write_arrays(plan.layout.base_features, arrays)
+    return plan.layout.base_features
+
+
+def _read_reference(plan: Plan) -> BaseReference:
+    arrays = read_arrays(plan.layout.base_features)
+    features = {
+        name: kind(**{one.name: arrays[f"{name}.{one.name}"] for one in fields(kind)})
+        for name, kind in _FEATURES.items()
+    }
+    height, width = arrays["shape"].tolist()
+    return BaseReference((height, width), **features)
 
 
 def read_given_base(plan: Plan) -> BaseRaster | None:

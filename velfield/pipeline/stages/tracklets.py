@@ -14,7 +14,7 @@ from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.registration import MAP_PARAMETERS, usable_frames
 from velfield.run.frame_transforms import read_tracking_gsd
 from velfield.run.stores import open_frames, open_registration
-from velfield.run.tables import Patches, read_patches, read_tables, write_table
+from velfield.run.tables import Arrays, read_arrays, read_tables, write_table
 from velfield.tracking.association import FrameTable, window_frames
 from velfield.tracking.tracklets import link_windows
 
@@ -78,14 +78,14 @@ class UnitDetections:
     """Detections of a unit of frames: ``column``, their columns by name, (n,) each, and ``patches``, (n, ...) each."""
 
     column: dict[str, np.ndarray]
-    patches: Patches
+    patches: Arrays
 
 
 def read_unit(plan: Plan, unit: int) -> UnitDetections:
     """Detections of a unit and their patches."""
     path = plan.layout.unit_file(plan.layout.detections, unit, ".parquet")
     table = read_tables([path], DETECTION_COLUMNS, only=_READ)
-    patches = read_patches(path.with_suffix(".patches.npz"), only=["patches", "chips", "xy_work", "working_scale"])
+    patches = read_arrays(path.with_suffix(".patches.npz"), only=["patches", "chips", "xy_work", "working_scale"])
     return UnitDetections({name: table[name].to_numpy() for name in _READ}, patches)
 
 
@@ -99,7 +99,7 @@ def read_chosen(plan: Plan, unit: int, ids: IntArray) -> UnitDetections:
         path = layout.unit_file(folder, unit, ".parquet")
         table = read_tables([path], DETECTION_COLUMNS, only=_READ)
         rows = np.flatnonzero(among(table["detection_id"].to_numpy(), ids))
-        patches = read_patches(path.with_suffix(".patches.npz"), only=["chips", "xy_work", "working_scale"])
+        patches = read_arrays(path.with_suffix(".patches.npz"), only=["chips", "xy_work", "working_scale"])
         column = {name: table[name].to_numpy()[rows] for name in _READ}
         parts.append((column, {name: patches[name][rows] for name in ("chips", "xy_work")}, patches["working_scale"]))
     column, patches = (

@@ -27,7 +27,7 @@ from velfield.pipeline.stages.tracklets import (
 from velfield.run.frame_transforms import FrameTransforms, read_tracking_gsd
 from velfield.run.layout import RunLayout
 from velfield.run.stores import open_frames
-from velfield.run.tables import empty_table, read_patches, read_tables, write_table, write_tracks
+from velfield.run.tables import empty_table, read_arrays, read_tables, write_table, write_tracks
 from velfield.tracking.association import LinkedTriples, tracklet_table, window_frames
 from velfield.tracking.casters import HALF_WINDOW_M, MIN_DRIVEN_M, Caster, find_casters, keeps_direction
 from velfield.tracking.dimensions import (
@@ -454,7 +454,7 @@ def sum_strips(layout: RunLayout, tracklets: pd.DataFrame, units: int) -> StripS
 
     def add(path: Path) -> float:
         table = read_tables([path], DETECTION_COLUMNS, only=["detection_id", "orientation_rad"])
-        patches = read_patches(path.with_suffix(".patches.npz"), only=["strips", "chips", "working_scale"])
+        patches = read_arrays(path.with_suffix(".patches.npz"), only=["strips", "chips", "working_scale"])
         here = np.flatnonzero(among(numbers, table["detection_id"].to_numpy()))
         at, chain = np.searchsorted(table["detection_id"].to_numpy(), numbers[here]), chains[here]
         strips = _along_headings(
