@@ -210,19 +210,21 @@ def _displacements(
 ) -> FloatArray:
     """(n, 2, 4): displacement in x and y, its standard deviation, and whether it is from the crops, of both links of
     each tracklet."""
-    keys = np.concatenate([np.stack([start + k, indices[:, k], indices[:, k + 1]], axis=1) for k in (0, 1)])
-    links, where = np.unique(keys, axis=0, return_inverse=True)  # a link that two tracklets share is aligned once
+    size = max([1, *(table.detection_id.size for table in tables)])
+    keys = np.concatenate([((start + k) * size + indices[:, k]) * size + indices[:, k + 1] for k in (0, 1)])
+    links, where = np.unique(keys, return_inverse=True)  # a link that two tracklets share is aligned once
+    window, first, second = links // size**2, links // size % size, links % size
     displacement = np.zeros((len(links), 4))
     crops: dict[
         int, UprightCrops | None
     ] = {}  # of the two frames of a link: what is prepared of them is kept for the next
-    for i in map(int, np.unique(links[:, 0])):
-        rows = links[:, 0] == i
+    for i in map(int, np.unique(window)):
+        rows = window == i
         crops = {k: crops[k] if k in crops else tables[k].upright_crops() if refine else None for k in (i, i + 1)}
         displacement[rows] = _frame_displacements(
-            tables[i], tables[i + 1], crops[i], crops[i + 1], links[rows, 1], links[rows, 2], limits
+            tables[i], tables[i + 1], crops[i], crops[i + 1], first[rows], second[rows], limits
         )
-    return np.moveaxis(displacement[where.ravel()].reshape(2, -1, 4), 0, 1)
+    return np.moveaxis(displacement[where].reshape(2, -1, 4), 0, 1)
 
 
 def _frame_displacements(
