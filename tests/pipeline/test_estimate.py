@@ -40,6 +40,14 @@ def test_four_hours_are_fewer_than_3000_task_runs(tmp_path: Path) -> None:
     assert "GB needed" in text
 
 
+@pytest.mark.parametrize("frames", [17, 33, 60, 64, 65, 100, 128, 257, 300, 1126])
+def test_units_are_cut_evenly(tmp_path: Path, frames: int) -> None:
+    lengths = [len(unit) for unit in planned(frames, tmp_path).units]
+    assert sum(lengths) == frames
+    assert len(lengths) % 2 == 0
+    assert min(lengths) >= 0.8 * max(lengths)
+
+
 def test_task_runs_grow_with_chunks_not_with_frames(tmp_path: Path) -> None:
     runs = {frames: len(planned(frames, tmp_path).units) for frames in (18, 300, 3000, 30_000, FOUR_HOURS)}
     assert max(runs.values()) < 300

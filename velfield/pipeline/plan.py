@@ -70,10 +70,11 @@ class Plan:
             return _ONE_UNIT
         units = 2 * -(-self.frame_count // (2 * largest))
         even = -(-self.frame_count // units)
-        # Of whole blocks where that leaves no short one: a block that is cut searches one frame more as a whole.
+        # Of whole blocks where that leaves no shorter one: a block that is cut searches one frame more as a whole, but
+        # of two units on two processors the longer one decides.
         blocks = -(-even // self.config.work.block_frames) * self.config.work.block_frames
         last = self.frame_count - (units - 1) * blocks
-        return blocks if blocks <= largest and 2 * last > blocks else even
+        return blocks if blocks <= largest and 10 * last > 9 * blocks else even
 
     @property
     def units(self) -> list[range]:

@@ -101,7 +101,7 @@ def _plan(flight: Path, root: Path, preset: str, frames: int) -> "Plan":
     from velfield.pipeline.plan import make_plan, write_flight_record
 
     # Units so short that two workers share a few frames evenly, and every eighth frame is searched whole as it is.
-    overrides = {"gsd_m": 0.23, "work.unit_frames": max(1, min(16, frames // 2))}
+    overrides = {"gsd_m": 0.23, "work.unit_frames": max(1, min(32, frames // 2))}
     config = resolve_config(preset=preset, overrides=overrides)
     plan = make_plan(Job(root=str(root), inputs=Inputs.from_simulated_flight(flight), config=config))
     write_flight_record(plan)
