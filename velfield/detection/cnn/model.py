@@ -74,6 +74,10 @@ def predict_heatmap(
     side = [unit * -(-size // (unit * -(-size // _TILE_PX))) for size in whole]
     end = [border_px + size - given for size, given in zip(whole, image.shape, strict=True)]
     padded = cv2.copyMakeBorder(image, border_px, end[0], border_px, end[1], _BORDER) if any(end) else image
+    if network.canvases is not None:
+        of_padded = network.canvases.predict_crops(padded, [(0, 0, *padded.shape)])
+        rows, columns = (slice(border_px // STRIDE, -(-(border_px + size) // STRIDE)) for size in image.shape)
+        return of_padded[0][rows, columns], of_padded[1][:, rows, columns]
     if len(range(0, whole[0], side[0])) == len(range(0, whole[1], side[1])) == 1 and not border_px:
         of_image = forward(network, padded[None])
         return of_image[0][0][: -(-height // STRIDE), : -(-width // STRIDE)], of_image[1][0]
@@ -108,6 +112,8 @@ def predict_crops(network: Network, image: GreyImage, crops: Sequence[Crop]) -> 
     -------
     As of `predict_heatmap`; zero where no crop is.
     """
+    if network.canvases is not None:
+        return network.canvases.predict_crops(image, crops)
     probability = np.zeros((image.shape[0] // STRIDE, image.shape[1] // STRIDE), np.float32)
     orientation = np.zeros((2, *probability.shape), np.float32)
     by_size: dict[tuple[int, int], list[tuple[int, int]]] = {}

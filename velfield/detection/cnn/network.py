@@ -14,7 +14,7 @@ from base64 import b64decode, b64encode
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 import onnx
@@ -25,6 +25,9 @@ from schemas.arrays import Float32Array, GreyImage
 from schemas.detector import LayerRecord
 from schemas.flight import Device
 from velfield.errors import InputError
+
+if TYPE_CHECKING:
+    from velfield.detection.cnn.canvas import Canvases
 
 
 @dataclass(frozen=True)
@@ -171,7 +174,9 @@ class Network:
     @cached_property
     def predict(self) -> "Predict":
         """The network in onnxruntime, on the device of `use_device`; in 8 bits on a processor that has them exactly."""
-        if self.ranges is not None and not uses_cuda(_device):
+        if self.canvases is not None:
+            return self.canvases.predict
+        if self.ranges is not None:
             from velfield.detection.cnn.quantization import is_exact, open_quantized
 
             if is_exact():
@@ -179,9 +184,18 @@ class Network:
             warnings.warn(INEXACT, RuntimeWarning, stacklevel=2)
         return predict_by(open_session(network_to_onnx(self), _device))
 
+    @cached_property
+    def canvases(self) -> "Canvases | None":
+        """On a GPU, what runs the network on images of few sizes; else none, and images may have any size."""
+        if not uses_cuda(_device):
+            return None
+        from velfield.detection.cnn.canvas import Canvases
+
+        return Canvases(self, _device)
+
     def __getstate__(self) -> dict[str, Any]:
-        """Without the session, which no other process can use."""
-        return {name: value for name, value in self.__dict__.items() if name != "predict"}
+        """Without the sessions, which no other process can use."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("predict", "canvases")}
 
 
 Predict: TypeAlias = Callable[[GreyImage], tuple[Float32Array, Float32Array]]
