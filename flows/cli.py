@@ -16,7 +16,7 @@ from flows.commands.start import own_command
 from flows.launch import limit_threads
 from flows.options import Device, Preset, Settings, parse_frame_size, renamed_option
 from flows.stopping import STOPPED, as_ctrl_c, leave
-from velfield.errors import IneffectiveSettingWarning, InputError, OldNameWarning, StoreError
+from velfield.errors import DeviceWarning, IneffectiveSettingWarning, InputError, OldNameWarning, StoreError
 
 if TYPE_CHECKING:
     from flows.console import Console, Verbosity
@@ -480,7 +480,7 @@ def _warn_of_settings_in_one_line() -> None:
     show = warnings.showwarning
 
     def showwarning(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
-        if issubclass(category, OldNameWarning | IneffectiveSettingWarning):
+        if issubclass(category, OldNameWarning | IneffectiveSettingWarning | DeviceWarning):
             print(f"velfield: {message}", file=sys.stderr)
         else:
             show(message, category, *where, **options)

@@ -1,4 +1,4 @@
-"""What goes wrong: bad input, a damaged run, a full disk, a frame or chunk that cannot be done; and two warnings."""
+"""What goes wrong: bad input, a damaged run, a full disk, a frame or chunk that cannot be done; and three warnings."""
 
 import errno
 import json
@@ -34,6 +34,10 @@ class OldNameWarning(FutureWarning):
 
 class IneffectiveSettingWarning(UserWarning):
     """A setting that the chosen method does not read. The message says which setting chose the method."""
+
+
+class DeviceWarning(RuntimeWarning):
+    """The network does not run as fast as it was to on this machine. The message says why, and what to do."""
 
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

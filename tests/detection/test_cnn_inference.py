@@ -1,7 +1,6 @@
 """Detections from the network: decoding of heatmaps, rotation and shift of the image, truncation, the motion bonus."""
 
 from functools import cache
-from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -9,11 +8,9 @@ import pytest
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage
 from schemas.detector import MotionRecord
-from schemas.flight import Device
 from velfield.bench.scenes import simulated_image
 from velfield.detection.cascade.classifier import nms_oriented
 from velfield.detection.cnn import model
-from velfield.detection.cnn import network as networks
 from velfield.detection.cnn.dataset import PATCH_PX, encode_targets
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.model import (
@@ -27,7 +24,6 @@ from velfield.detection.cnn.model import (
 from velfield.detection.cnn.network import Network
 from velfield.detection.detector import shipped_detector
 from velfield.detection.orientation import axial_difference
-from velfield.errors import InputError
 
 
 def network() -> Network:
@@ -192,51 +188,6 @@ def test_the_difference_to_the_background_is_that_around_a_position() -> None:
 def test_the_bonus_is_a_ramp() -> None:
     motion = MotionRecord(bonus_ramp_start=10, bonus_ramp_end=30, max_score_bonus=0.2)
     np.testing.assert_allclose(motion_score_bonus(motion, np.array([0.0, 10, 20, 30, 90])), [0, 0, 0.1, 0.2, 0.2])
-
-
-class _Session:
-    """Stands in for onnxruntime's; ``started`` are the providers that its last one could start."""
-
-    started: ClassVar[list[str]] = []
-    asked: ClassVar[list[Any]] = []
-
-    def __init__(self, model: bytes, options: Any, providers: list[Any]) -> None:
-        type(self).asked = providers
-
-    def get_providers(self) -> list[str]:
-        return self.started
-
-
-@pytest.fixture
-def gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An onnxruntime that offers CUDA."""
-    offered = ["CUDAExecutionProvider", "CPUExecutionProvider"]
-    monkeypatch.setattr(networks.ort, "get_available_providers", lambda: offered)
-    monkeypatch.setattr(networks.ort, "InferenceSession", _Session)
-    monkeypatch.setattr(_Session, "started", offered)
-
-
-@pytest.mark.parametrize(("device", "first"), [("auto", "CUDA"), ("cuda", "CUDA"), ("cpu", "CPU")])
-def test_a_gpu_runs_the_network_where_there_is_one_and_it_may(gpu: None, device: Device, first: str) -> None:
-    networks.open_session(b"", device)
-    names = [one if isinstance(one, str) else one[0] for one in _Session.asked]
-    assert names[0] == f"{first}ExecutionProvider"
-    assert names[-1] == "CPUExecutionProvider"
-
-
-def test_a_gpu_that_does_not_start_is_no_silent_fallback(gpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_Session, "started", ["CPUExecutionProvider"])
-    with pytest.raises(InputError, match=r"--device cuda: found a GPU that .* could not start, expected CUDA"):
-        networks.open_session(b"", "cuda")
-
-
-def test_without_a_gpu_cuda_is_refused_and_auto_is_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(networks.ort, "get_available_providers", lambda: ["CPUExecutionProvider"])
-    with pytest.raises(InputError, match=r"--device cuda: found onnxruntime with CPU.*pip install velfield\[cuda\]"):
-        networks.check_device("cuda")
-    networks.check_device("auto")
-    session = networks.open_session(networks.network_to_onnx(network()), "auto")
-    assert session.get_providers() == ["CPUExecutionProvider"]
 
 
 def test_peaks_are_those_of_the_plain_form() -> None:

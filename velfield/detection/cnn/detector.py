@@ -17,6 +17,7 @@ from velfield.detection.cnn.network import (
     INEXACT,
     Network,
     current_device,
+    device_limitations,
     network_from_layers,
     network_from_record,
     uses_cuda,
@@ -62,9 +63,9 @@ class CnnDetector(Detector):
 
     @property
     def limitations(self) -> list[str]:
-        """A processor without exact sums of products of 8 bits."""
+        """A GPU that does not start; a processor without exact sums of products of 8 bits."""
         wanted = self.record.activation_ranges is not None and not uses_cuda(current_device())
-        return [INEXACT] if wanted and not is_exact() else []
+        return device_limitations(current_device()) + ([INEXACT] if wanted and not is_exact() else [])
 
     @property
     def uses_background(self) -> bool:

@@ -9,11 +9,14 @@ network as ONNX, but only the weights are read from it, and the graph is built a
 bring operators of its own.
 """
 
+import io
 import warnings
 from base64 import b64decode, b64encode
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
+from textwrap import shorten
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
@@ -24,7 +27,7 @@ from onnx import TensorProto, helper, numpy_helper
 from schemas.arrays import Float32Array, GreyImage
 from schemas.detector import LayerRecord
 from schemas.flight import Device
-from velfield.errors import InputError
+from velfield.errors import DeviceWarning, InputError
 
 if TYPE_CHECKING:
     from velfield.detection.cnn.canvas import Canvases
@@ -181,7 +184,7 @@ class Network:
 
             if is_exact():
                 return open_quantized(self, self.ranges)
-            warnings.warn(INEXACT, RuntimeWarning, stacklevel=2)
+            warnings.warn(INEXACT, DeviceWarning, stacklevel=2)
         return predict_by(open_session(network_to_onnx(self), _device))
 
     @cached_property
@@ -213,8 +216,9 @@ def predict_by(session: ort.InferenceSession) -> Predict:
 
 
 _CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
-_ERRORS = 3
-"""Of onnxruntime's levels of severity: its warnings are of how a graph was exported, many lines in each process."""
+_WARNINGS, _ERRORS, _FATAL = 2, 3, 4
+"""Of onnxruntime's levels of severity. The warnings of a session are of how its graph was exported, many lines in each
+process; without a session, its warnings and errors are shown."""
 _device: Device = "auto"
 
 
@@ -230,8 +234,65 @@ def current_device() -> Device:
 
 
 def uses_cuda(device: Device) -> bool:
-    """Whether networks run on a GPU."""
-    return device != "cpu" and _CUDA in ort.get_available_providers()
+    """Whether networks run on a GPU; warn once a process where onnxruntime has CUDA that does not start."""
+    if device == "auto":
+        _warn_of_cuda()
+    return device != "cpu" and _cuda_fault() is None
+
+
+def device_limitations(device: Device) -> list[str]:
+    """Why networks run on the processor, where onnxruntime has CUDA and the processor was not asked for."""
+    fault = _cuda_fault() if device == "auto" and _CUDA in ort.get_available_providers() else None
+    if fault is None:
+        return []
+    return [f"found {fault}, {_EXPECTED}: the network runs on the processor; {_REMEDY}"]
+
+
+_EXPECTED = "expected CUDA, cuDNN and an NVIDIA GPU"
+_REMEDY = "pip install velfield[cuda] as docs/scale.md says, or use --device cpu"
+
+
+@cache
+def _warn_of_cuda() -> None:
+    for text in device_limitations("auto"):
+        warnings.warn(text, DeviceWarning, stacklevel=3)
+
+
+@cache
+def _cuda_fault() -> str | None:
+    """What was found in place of a GPU, if networks cannot run on one: tried once a process by a convolution.
+
+    The package says only what it was compiled for. Without CUDA's libraries, or a GPU, its sessions fall back to the
+    processor; without cuDNN they fail at the first convolution.
+    """
+    offered = ort.get_available_providers()
+    if _CUDA not in offered:
+        return f"onnxruntime with {', '.join(offered)}"
+    printed = io.StringIO()
+    ort.set_default_logger_severity(_FATAL)
+    try:
+        with redirect_stdout(printed):  # it prints which libraries it misses, and that it falls back
+            if hasattr(ort, "preload_dlls"):  # from 1.21 on: those that pip installed, which no loader looks for
+                ort.preload_dlls()
+            session = ort.InferenceSession(_probe(), _session_options(), providers=_providers(gpu=True))
+            session.run(None, {"image": np.zeros((1, 1, 8, 8), np.float32)})
+        if _CUDA in session.get_providers():
+            return None
+        missing = printed.getvalue().strip().splitlines()
+        why = missing[0] if missing else "no GPU, or no driver of it"
+    except Exception as error:  # onnxruntime's own kinds have no common base
+        why = str(error).strip().rpartition(" : ")[2]
+    finally:
+        ort.set_default_logger_severity(_WARNINGS)
+    return f"onnxruntime with CUDA that does not start ({shorten(why, 200)})"
+
+
+def _probe() -> bytes:
+    """A convolution, as an ONNX model."""
+    image, out = (helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 1, 8, 8]) for name in ("image", "out"))
+    kernel = numpy_helper.from_array(np.ones((1, 1, 3, 3), np.float32), "kernel")
+    node = helper.make_node("Conv", ["image", "kernel"], ["out"], pads=[1] * 4)
+    return serialize(helper.make_graph([node], "probe", [image], [out], [kernel]))
 
 
 INEXACT = (
@@ -242,8 +303,9 @@ INEXACT = (
 
 def check_device(device: Device) -> None:
     """Raise InputError where onnxruntime cannot use a device."""
-    if device == "cuda" and _CUDA not in ort.get_available_providers():
-        raise InputError(_no_cuda(f"onnxruntime with {', '.join(ort.get_available_providers())}"))
+    fault = _cuda_fault() if device == "cuda" else None
+    if fault is not None:
+        raise InputError(f"--device cuda: found {fault}, {_EXPECTED}; {_REMEDY}")
 
 
 def open_session(model: bytes, device: Device) -> ort.InferenceSession:
@@ -255,20 +317,31 @@ def open_session(model: bytes, device: Device) -> ort.InferenceSession:
         ``device`` is cuda, and onnxruntime cannot use it.
     """
     check_device(device)
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = _ERRORS
-    providers: list[Any] = [_CPU]
-    if uses_cuda(device):
-        providers.insert(0, (_CUDA, {"use_tf32": "0"}))  # with its shorter mantissa scores would differ visibly
-    session = ort.InferenceSession(model, options, providers=providers)
-    if device == "cuda" and _CUDA not in session.get_providers():
-        raise InputError(_no_cuda("a GPU that onnxruntime could not start"))
+    gpu = uses_cuda(device)
+    session = ort.InferenceSession(model, _session_options(), providers=_providers(gpu=gpu))
+    if gpu and _CUDA not in session.get_providers():  # though another did: its memory is full
+        found = f"a GPU on which no further session starts, {_EXPECTED}"
+        if device == "cuda":
+            raise InputError(f"--device cuda: found {found}; free its memory, or use --device cpu")
+        warnings.warn(f"found {found}: this one runs on the processor; free its memory", DeviceWarning, stacklevel=2)
     return session
 
 
-def _no_cuda(found: str) -> str:
-    return f"--device cuda: found {found}, expected CUDA; pip install velfield[cuda], or use --device cpu"
+def _session_options() -> ort.SessionOptions:
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = _ERRORS
+    return options
+
+
+def _providers(*, gpu: bool) -> list[Any]:
+    """What a session asks for, first choice first.
+
+    With TF32's shorter mantissa scores would differ visibly. Trying all of cuDNN's ways (EXHAUSTIVE) takes five times
+    as long at each new size, and finds none that is faster.
+    """
+    cuda = (_CUDA, {"use_tf32": "0", "cudnn_conv_algo_search": "HEURISTIC"})
+    return [cuda, _CPU] if gpu else [_CPU]
 
 
 def network_to_onnx(network: Network) -> bytes:

@@ -1,0 +1,183 @@
+"""Where networks run: sessions that start on a GPU, that fall back to the processor, and packages without CUDA."""
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+
+from schemas.arrays import GreyImage
+from schemas.detector import CnnConfig
+from schemas.flight import Device
+from velfield.detection.cnn import network as networks
+from velfield.detection.cnn.detector import CnnDetector
+from velfield.detection.cnn.network import Network
+from velfield.detection.detector import shipped_detector
+from velfield.errors import DeviceWarning, InputError
+
+CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
+
+
+class Runtime:
+    """An onnxruntime that offers CUDA; its sessions run on the processor and say that they got what ``starts``."""
+
+    def __init__(self) -> None:
+        self.offered, self.starts, self.missing, self.fails = [CUDA, CPU], True, "", ""
+        self.asked: list[list[Any]] = []
+        self.preloaded = 0
+
+    def session(self, model: bytes, options: Any, providers: list[Any]) -> onnxruntime.InferenceSession:
+        gpu = providers != [CPU]
+        assert self.preloaded or not gpu, "libraries are loaded before the first session"
+        self.asked.append(providers)
+        session = onnxruntime.InferenceSession(model, options, providers=[CPU])
+        session.get_providers = lambda: [CUDA, CPU] if gpu and self.starts else [CPU]
+        if gpu and self.fails:
+            session.run = self.fail
+        return session
+
+    def fail(self, *_: Any) -> None:
+        raise RuntimeError(self.fails)
+
+    def preload(self) -> None:
+        self.preloaded += 1
+        if self.missing:
+            print(self.missing, "see https://onnxruntime.ai", sep="\n")
+
+
+class Stub:
+    """onnxruntime with these in place of its own."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self.InferenceSession, self.preload_dlls = runtime.session, runtime.preload
+        self.get_available_providers = lambda: runtime.offered
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(onnxruntime, name)
+
+
+@pytest.fixture
+def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Runtime]:
+    found = Runtime()
+    monkeypatch.setattr(networks, "ort", Stub(found))
+    monkeypatch.setattr(networks, "_device", "auto")
+    caches = networks._cuda_fault, networks._warn_of_cuda
+    for cache in caches:
+        cache.cache_clear()
+    yield found
+    for cache in caches:
+        cache.cache_clear()
+
+
+def shipped() -> CnnDetector:
+    detector = shipped_detector()
+    assert isinstance(detector, CnnDetector)
+    return detector
+
+
+def in_floating_point() -> Network:
+    return replace(shipped().network, ranges=None)
+
+
+def image(seed: int = 0) -> GreyImage:
+    return np.random.default_rng(seed).integers(0, 256, (96, 128)).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("device", "gpu"), [("auto", True), ("cuda", True), ("cpu", False)])
+def test_a_gpu_runs_the_network_where_there_is_one_and_it_may(runtime: Runtime, device: Device, gpu: bool) -> None:
+    networks.check_device(device)
+    session = networks.open_session(networks.network_to_onnx(in_floating_point()), device)
+    assert (CUDA in session.get_providers()) == gpu == networks.uses_cuda(device)
+    assert runtime.asked[-1][-1] == CPU
+    assert networks.device_limitations(device) == []
+    if gpu:
+        name, options = runtime.asked[-1][0]
+        assert (name, options["use_tf32"], options["cudnn_conv_algo_search"]) == (CUDA, "0", "HEURISTIC")
+
+
+def test_a_gpu_is_tried_once_a_process_and_never_where_only_the_processor_may(runtime: Runtime) -> None:
+    assert not networks.uses_cuda("cpu")
+    assert (runtime.preloaded, runtime.asked) == (0, [])
+    assert [networks.uses_cuda(device) for device in ("auto", "cuda", "auto")] == [True] * 3  # type: ignore[arg-type]
+    assert (runtime.preloaded, len(runtime.asked)) == (1, 1)
+
+
+def test_on_a_gpu_all_runs_on_canvases_in_floating_point(runtime: Runtime) -> None:
+    """With the ranges of a flight too, by which it would be run in 8 bits on a processor."""
+    detector = shipped().for_flight([image()], CnnConfig())
+    network = detector.network
+    assert network.canvases is not None
+    assert network.predict == network.canvases.predict
+    assert detector.limitations == []
+    networks.use_device("cpu")
+    expected = in_floating_point().predict(image()[None])
+    for found, plain in zip(network.predict(image()[None]), expected, strict=True):
+        np.testing.assert_array_equal(found, plain)
+
+
+@pytest.mark.parametrize(
+    ("fault", "why"),
+    [
+        ({"starts": False}, "no GPU"),
+        (
+            {"starts": False, "missing": "Failed to load libcublas.so.13: no such file"},
+            "Failed to load libcublas.so.13",
+        ),
+        ({"fails": "[ONNXRuntimeError] : 9 : NOT_IMPLEMENTED : cuDNN is not available.\n"}, "cuDNN is not available"),
+    ],
+)
+def test_cuda_that_does_not_start_is_told_once_and_the_processor_runs_8_bits(
+    runtime: Runtime, fault: dict[str, Any], why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    vars(runtime).update(fault)
+    detector = shipped().for_flight([image()], CnnConfig())
+    with pytest.warns(DeviceWarning) as told:
+        found = detector.network.predict(image()[None])
+    assert len(told) == 1
+    message = str(told[0].message)
+    assert "\n" not in message
+    assert f"found onnxruntime with CUDA that does not start ({why}" in message
+    assert "expected CUDA, cuDNN and an NVIDIA GPU: the network runs on the processor; pip install" in message
+    assert capsys.readouterr().out == ""
+    assert detector.network.canvases is None
+    assert message in detector.limitations
+    networks.use_device("cpu")
+    again = shipped().for_flight([image()], CnnConfig())
+    np.testing.assert_array_equal(found[0], again.network.predict(image()[None])[0])
+    with pytest.raises(InputError, match="--device cuda: found onnxruntime with CUDA that does not start") as refused:
+        networks.check_device("cuda")
+    assert why in str(refused.value)
+
+
+def test_without_cuda_in_the_package_it_is_refused_and_auto_is_the_processor(runtime: Runtime) -> None:
+    runtime.offered = ["AzureExecutionProvider", CPU]
+    with pytest.raises(InputError, match=r"--device cuda: found onnxruntime with Azure.*pip install velfield\[cuda\]"):
+        networks.open_session(b"", "cuda")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not networks.uses_cuda("auto")
+        assert in_floating_point().canvases is None
+    assert networks.device_limitations("auto") == []
+    assert (runtime.preloaded, runtime.asked) == (0, [])
+
+
+def test_an_onnxruntime_that_preloads_nothing_is_tried_as_it_is(
+    runtime: Runtime, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runtime.preloaded = 1
+    monkeypatch.setattr(networks.ort, "preload_dlls", None)
+    monkeypatch.delattr(networks.ort, "preload_dlls")
+    assert networks.uses_cuda("auto") or not hasattr(onnxruntime, "preload_dlls")
+
+
+def test_a_session_that_a_full_gpu_refuses_is_no_silent_fallback(runtime: Runtime) -> None:
+    model = networks.network_to_onnx(in_floating_point())
+    assert networks.uses_cuda("auto")
+    runtime.starts = False
+    with pytest.warns(DeviceWarning, match="no further session starts, .*: this one runs on the processor"):
+        networks.open_session(model, "auto")
+    with pytest.raises(InputError, match="--device cuda: found a GPU on which no further session starts"):
+        networks.open_session(model, "cuda")
