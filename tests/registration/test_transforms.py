@@ -109,7 +109,7 @@ def test_polyprojective_inverse_undoes_it(seed: int) -> None:
     np.testing.assert_allclose(p.inverse(p(grid())), grid(), atol=1e-3)
 
 
-def test_polyprojective_inverse_is_newton_s_method() -> None:
+def test_polyprojective_inverse_is_newtons_method() -> None:
     p = bent(np.random.default_rng(7))
     target = np.concatenate([p(grid()), [[1e7, 1e7], [np.nan, 3.0]]])
     guess = HomographyTransform(p.homography()).inverse(target)
@@ -125,7 +125,7 @@ def test_polyprojective_inverse_is_newton_s_method() -> None:
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=lambda lens: type(lens).__name__)
-def test_to_raw_is_newton_s_method(lens: Lens) -> None:
+def test_to_raw_is_newtons_method(lens: Lens) -> None:
     t = replace(frame_transform(np.random.default_rng(8)), lens=lens)
     target = np.concatenate([t.to_base(grid(inset=-90)), [[1e7, 1e7], [np.nan, 3.0]]])
     raw = t.to_raw_roughly(target)
@@ -227,6 +227,12 @@ def test_a_homography_and_its_inverse_cancel(seed: int) -> None:
     h = HomographyTransform(homography(np.random.default_rng(seed)))
     np.testing.assert_allclose(h.inverse(h(grid())), grid(), atol=1e-6)
     np.testing.assert_allclose(h(h.inverse(h(grid()))), h(grid()), atol=1e-6)
+
+
+def test_a_homography_is_the_plain_formula() -> None:
+    matrix = homography(np.random.default_rng(9))
+    x, y, w = matrix @ np.column_stack([grid(), np.ones(len(grid()))]).T
+    np.testing.assert_allclose(HomographyTransform(matrix)(grid()), np.stack([x / w, y / w], axis=1), atol=1e-9)
 
 
 def test_a_homography_has_no_value_beyond_its_horizon() -> None:

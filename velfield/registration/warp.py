@@ -275,7 +275,18 @@ def _downscale(
         size = max(1, round(width / shrink)), max(1, round(height / shrink))
         source = np.asarray(cv2.resize(grey_raw, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         coarse = (coarse + 0.5) * np.array([size[0] / width, size[1] / height]) - 0.5
-    return source, np.where(np.isfinite(coarse), coarse, _INVALID).astype(np.float32)
+    return source, _fill_invalid(coarse)
+
+
+@njit(cache=True, nogil=True)
+def _fill_invalid(coarse):  # type: ignore[no-untyped-def]
+    """A map (my, mx, 2) as float32, `_INVALID` where it is not finite."""
+    out = np.empty(coarse.shape, np.float32)
+    for i in range(coarse.shape[0]):
+        for j in range(coarse.shape[1]):
+            for c in range(2):
+                out[i, j, c] = coarse[i, j, c] if np.isfinite(coarse[i, j, c]) else _INVALID
+    return out
 
 
 class Rectification:
