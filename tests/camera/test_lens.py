@@ -101,3 +101,20 @@ def test_harris_is_the_plain_formula_to_the_bit(a: float) -> None:
     plain = offsets / np.sqrt(np.where(square > 0, square, np.nan)) + [640.3, 470.1]
     np.testing.assert_array_equal(lens.undistort_points(xy), plain)
     assert lens.undistort_points(xy[:1].reshape(1, 1, 2)).shape == (1, 1, 2)
+
+
+def test_division_and_polynomial_are_the_plain_formulas_to_the_bit() -> None:
+    xy = np.random.default_rng(3).uniform(-2000, 3000, (500, 2))
+    xy[0] = np.nan
+    offsets = (xy - [640.3, 470.1]) / 800.0
+    radius2 = offsets[:, :1] ** 2 + offsets[:, 1:] ** 2
+    for k in (0.2, -0.2):
+        divisor = 1 - k * radius2
+        inside = (divisor > 0) & (k * radius2 > -1)
+        plain = offsets * (1 / np.where(inside, divisor, np.nan)) * 800.0 + [640.3, 470.1]
+        np.testing.assert_array_equal(DivisionLens(k, 640.3, 470.1, 800.0).undistort_points(xy), plain)
+    for coefficients in ((0.1, 0.03), (-0.1, 0.02), ()):
+        lens = PolynomialLens(coefficients, 640.3, 470.1, 800.0)
+        scale = np.polynomial.polynomial.polyval(radius2, [1.0, *coefficients])
+        plain = offsets * np.where(radius2 < lens.fold_radius() ** 2, scale, np.nan) * 800.0 + [640.3, 470.1]
+        np.testing.assert_array_equal(lens.undistort_points(xy), plain)

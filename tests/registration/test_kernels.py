@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline, RegularGridInterpolator
 
+from velfield.camera.lens import HarrisLens
 from velfield.registration import kernels
 
 WIDTH, HEIGHT, KNOTS, FOLDS = 640, 480, 12, 3
@@ -224,11 +225,12 @@ def test_the_whole_map_is_its_parts_one_after_the_other(knots: int, shape: tuple
     rng = np.random.default_rng(12)
     raw = rng.uniform(-300, 1000, (200, 2))
     raw[:3] = [[np.nan, 5.0], [7.0, np.inf], [-np.inf, 8.0]]
-    undistorted = raw * 1.1 - 20
+    lens = HarrisLens(0.2, 300.0, 250.0, 500.0)
     c = coefficients(rng)
     c[2, 1:3] = 0.8  # some points lie beyond the horizon
     rows, mesh = rng.normal(0, 1.5, (3, knots)) * [[1], [1], [1e-3]], rng.normal(0, 1, (*shape, 2))
-    found = kernels.to_base(undistorted, raw, rows, HEIGHT, CENTRE, c, SOURCE, TARGET, mesh, 200)
+    frame = kernels.MapArrays(lens.radial, WIDTH, HEIGHT, rows, CENTRE, c, SOURCE, TARGET, mesh, 200)
+    found, undistorted = kernels.to_base(raw, frame), lens.undistort_points(raw)
     corrected = kernels.remove_row_motion(undistorted, np.ascontiguousarray(raw[:, 1]), rows, HEIGHT, CENTRE)
     expected = kernels.rational(corrected, c, SOURCE, TARGET)
     if mesh.size:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.flight import RegistrationConfig
-from velfield.camera.lens import HarrisLens
+from velfield.camera.lens import DivisionLens, HarrisLens, Lens, PolynomialLens
 from velfield.registration import kernels
 from velfield.registration.transforms import (
     FrameTransform,
@@ -23,6 +23,11 @@ from velfield.registration.transforms import (
 
 WIDTH, HEIGHT = 640, 480
 CONFIG = RegistrationConfig(row_spline_knots=20)
+LENSES = (
+    HarrisLens(0.2, 323.0, 236.0, 400.0),
+    DivisionLens(0.1, 323.0, 236.0, 400.0),
+    PolynomialLens((0.1, 0.02), 323.0, 236.0, 400.0),
+)
 
 
 def grid(columns: int = 17, rows: int = 13, *, inset: float = 0.0) -> np.ndarray:
@@ -63,6 +68,12 @@ def frame_transform(rng: np.random.Generator, *, mesh: bool = True) -> FrameTran
     )
 
 
+def solve(jacobian: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Cramer's rule: numpy's `solve` raises if a single matrix is singular."""
+    (a, b), (c, d), (x, y) = jacobian[:, 0].T, jacobian[:, 1].T, residual.T
+    return np.stack([d * x - b * y, a * y - c * x], axis=1) / (a * d - b * c)[:, None]
+
+
 def test_rational_is_the_plain_formula() -> None:
     p = bent(np.random.default_rng(0))
     xy = grid()
@@ -96,6 +107,37 @@ def test_polyprojective_without_bending_is_the_homography() -> None:
 def test_polyprojective_inverse_undoes_it(seed: int) -> None:
     p = bent(np.random.default_rng(seed))
     np.testing.assert_allclose(p.inverse(p(grid())), grid(), atol=1e-3)
+
+
+def test_polyprojective_inverse_is_newtons_method() -> None:
+    p = bent(np.random.default_rng(7))
+    target = np.concatenate([p(grid()), [[1e7, 1e7], [np.nan, 3.0]]])
+    guess = HomographyTransform(p.homography()).inverse(target)
+    for _ in range(25):
+        residual = target - p(guess)
+        if np.nanmax(np.abs(residual)) < 1e-5:
+            break
+        with np.errstate(invalid="ignore"):
+            guess = guess + solve(p.jacobian(guess), residual)
+    failed = ~(np.abs(target - p(guess)).max(axis=1) < 1e-3)
+    assert 2 <= failed.sum() < 10
+    np.testing.assert_allclose(p.inverse(target), np.where(failed[:, None], np.nan, guess), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=lambda lens: type(lens).__name__)
+def test_to_raw_is_newtons_method(lens: Lens) -> None:
+    t = replace(frame_transform(np.random.default_rng(8)), lens=lens)
+    target = np.concatenate([t.to_base(grid(inset=-90)), [[1e7, 1e7], [np.nan, 3.0]]])
+    raw = t.to_raw_roughly(target)
+    for _ in range(25):
+        residual = target - t.to_base(raw)
+        far = np.abs(residual).max(axis=1) > 1e-5
+        steps = [(t.to_base(raw[far] + 0.25 * unit) - t.to_base(raw[far])) / 0.25 for unit in np.eye(2)]
+        raw[far] += solve(np.stack(steps, axis=2), residual[far])
+    outside = ~((raw >= -64) & (raw <= np.array([WIDTH, HEIGHT]) + 64)).all(axis=1)
+    raw[outside | ~(np.abs(target - t.to_base(raw)).max(axis=1) < 1e-3)] = np.nan
+    assert 10 < np.isnan(raw[:, 0]).sum() < 100
+    np.testing.assert_allclose(t.to_raw(target), raw, rtol=0, atol=1e-9)
 
 
 @settings(deadline=None, max_examples=25)
@@ -185,6 +227,12 @@ def test_a_homography_and_its_inverse_cancel(seed: int) -> None:
     h = HomographyTransform(homography(np.random.default_rng(seed)))
     np.testing.assert_allclose(h.inverse(h(grid())), grid(), atol=1e-6)
     np.testing.assert_allclose(h(h.inverse(h(grid()))), h(grid()), atol=1e-6)
+
+
+def test_a_homography_is_the_plain_formula() -> None:
+    matrix = homography(np.random.default_rng(9))
+    x, y, w = matrix @ np.column_stack([grid(), np.ones(len(grid()))]).T
+    np.testing.assert_allclose(HomographyTransform(matrix)(grid()), np.stack([x / w, y / w], axis=1), atol=1e-9)
 
 
 def test_a_homography_has_no_value_beyond_its_horizon() -> None:

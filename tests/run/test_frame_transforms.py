@@ -86,6 +86,7 @@ def test_the_transforms_come_back_and_a_frame_without_one_has_none(layout: RunLa
     for frame, expected in ((0, similarity(1.1, 0.1, (5, 7))), (2, similarity(0.9, -0.2, (0, 3)))):
         found = transforms.transform(frame)
         assert found is not None
+        assert transforms.transform(frame) is found, "it is kept"
         np.testing.assert_array_equal(found.to_base(points()), frame_transform(expected).to_base(points()))
         np.testing.assert_allclose(found.to_raw(found.to_base(points())), points(), atol=1e-6)
     with pytest.raises(InputError, match="frame 3 is not in the run: its frames go from 0 to 2"):

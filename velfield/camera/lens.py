@@ -8,8 +8,8 @@ Other packages use the protocol `Lens` and do not depend on the model.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Protocol
+from functools import cached_property, lru_cache
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numba import njit
@@ -21,12 +21,32 @@ _NEWTON_STEPS = 60
 _NEWTON_TOLERANCE = 1e-13
 
 
+class RadialModel(NamedTuple):
+    """An undistortion as compiled code takes it, see `undistort`: offsets from the centre are multiplied by a power of
+    a polynomial in the squared radius."""
+
+    centre_x_px: float
+    centre_y_px: float
+    half_diagonal_px: float
+    polynomial: FloatArray
+    """Lowest power first, the radius in half-diagonals."""
+    power: float
+    """1, -1 or, of two terms only, -1/2."""
+    limit_r2: float
+    """Squared radius from which on there is no value."""
+
+
 class Lens(Protocol):
     """A map between raw and undistorted pixels; points are (n, 2) float64 as (x, y)."""
 
     @property
     def is_identity(self) -> bool:
         """Whether raw and undistorted pixels are the same."""
+        ...
+
+    @property
+    def radial(self) -> RadialModel:
+        """The undistortion, for compiled code."""
         ...
 
     def undistort_points(self, xy_raw: Points) -> Points:
@@ -64,6 +84,37 @@ def _divide_by_root(points, a, centre_x, centre_y, unit2):  # type: ignore[no-un
     return out
 
 
+@njit(cache=True, nogil=True)
+def _scale_by_polynomial(points, lens):  # type: ignore[no-untyped-def]
+    """Points (n, 2) at r from a centre moved to r p(r^2), or r / p(r^2); NaN where p is not positive or r too large."""
+    out, terms, unit = np.empty((points.shape[0], 2)), len(lens.polynomial), lens.half_diagonal_px
+    for i in range(points.shape[0]):
+        x, y = (points[i, 0] - lens.centre_x_px) / unit, (points[i, 1] - lens.centre_y_px) / unit
+        radius2 = x * x + y * y
+        value = lens.polynomial[terms - 1]
+        for k in range(terms - 2, -1, -1):
+            value = lens.polynomial[k] + value * radius2
+        scale = np.nan
+        if value > 0 and radius2 < lens.limit_r2:
+            scale = 1.0 / value if lens.power < 0 else value
+        out[i, 0], out[i, 1] = x * scale * unit + lens.centre_x_px, y * scale * unit + lens.centre_y_px
+    return out
+
+
+@njit(cache=True, nogil=True)
+def undistort(points, lens):  # type: ignore[no-untyped-def]
+    """Raw pixels (n, 2) to undistorted pixels (n, 2) by a `RadialModel`; NaN rows outside its domain."""
+    if lens.power == -0.5:  # its loop becomes vectors
+        unit2 = lens.half_diagonal_px**2
+        return _divide_by_root(points, lens.polynomial[1], lens.centre_x_px, lens.centre_y_px, unit2)
+    return _scale_by_polynomial(points, lens)
+
+
+def _move_radially(xy: Points, model: RadialModel) -> Points:
+    points = np.ascontiguousarray(xy, dtype=np.float64)
+    return np.asarray(undistort(points.reshape(-1, 2), model).reshape(points.shape))
+
+
 @dataclass(frozen=True)
 class HarrisLens:
     """Harris' model, r_d = r / sqrt(1 + a r^2), with its closed inverse r = r_d / sqrt(1 - a r_d^2).
@@ -94,23 +145,27 @@ class HarrisLens:
         """Whether there is no distortion."""
         return self.a == 0.0
 
+    @cached_property
+    def radial(self) -> RadialModel:
+        """The undistortion, for compiled code."""
+        return _build_radial(self, (1.0, -self.a), -0.5)
+
     def _offsets(self, xy: Points) -> tuple[Points, Points]:
         offsets = np.asarray(xy, dtype=np.float64) - (self.centre_x_px, self.centre_y_px)
         return offsets, _squares(offsets) / self.half_diagonal_px**2
 
     def undistort_points(self, xy_raw: Points) -> Points:
         """Raw pixels (n, 2) to undistorted pixels (n, 2); NaN rows at and beyond r_d = 1 / sqrt(a)."""
-        return self._scale_radially(xy_raw, -self.a)
+        return _move_radially(xy_raw, self.radial)
 
     def distort_points(self, xy: Points) -> Points:
         """Undistorted pixels (n, 2) to raw pixels (n, 2); NaN rows where pincushion distortion has no inverse."""
-        return self._scale_radially(xy, self.a)
+        return _move_radially(xy, self._inverse)
 
-    def _scale_radially(self, xy: Points, a: float) -> Points:
-        points = np.ascontiguousarray(xy, dtype=np.float64)
-        centre = self.centre_x_px, self.centre_y_px
-        scaled = _divide_by_root(points.reshape(-1, 2), a, *centre, self.half_diagonal_px**2)
-        return np.asarray(scaled.reshape(points.shape))
+    @cached_property
+    def _inverse(self) -> RadialModel:
+        """The inverse is the model with the opposite sign."""
+        return _build_radial(self, (1.0, self.a), -0.5)
 
     def undistort_tangents(self, xy_raw: Points, tangents: Points) -> Points:
         """Directions (n, 2) at raw pixels (n, 2), multiplied by the Jacobian of the undistortion."""
@@ -160,6 +215,12 @@ class DivisionLens:
         """Whether there is no distortion."""
         return self.k == 0.0
 
+    @cached_property
+    def radial(self) -> RadialModel:
+        """The undistortion, for compiled code."""
+        # Pincushion distortion folds at k r_d^2 = -1; barrel distortion diverges where the divisor is zero.
+        return _build_radial(self, (1.0, -self.k), -1.0, -1.0 / self.k if self.k < 0 else np.inf)
+
     def _offsets(self, xy: Points) -> tuple[Points, Points]:
         offsets = (np.asarray(xy, dtype=np.float64) - (self.centre_x_px, self.centre_y_px)) / self.half_diagonal_px
         return offsets, _squares(offsets)
@@ -175,8 +236,7 @@ class DivisionLens:
 
     def undistort_points(self, xy_raw: Points) -> Points:
         """Raw pixels (n, 2) to undistorted pixels (n, 2); NaN rows outside the model's domain."""
-        offsets, radius2 = self._offsets(xy_raw)
-        return self._to_pixels(offsets * self._scale(radius2))
+        return _move_radially(xy_raw, self.radial)
 
     def distort_points(self, xy: Points) -> Points:
         """Undistorted pixels (n, 2) to raw pixels (n, 2); NaN rows where pincushion distortion has no inverse."""
@@ -239,6 +299,11 @@ class PolynomialLens:
         """Whether there is no distortion."""
         return not any(self.coefficients)
 
+    @cached_property
+    def radial(self) -> RadialModel:
+        """The undistortion, for compiled code."""
+        return _build_radial(self, (1.0, *self.coefficients), 1.0, self.fold_radius() ** 2)
+
     def _polynomial(self) -> FloatArray:
         """The scale as a polynomial in the squared radius, lowest power first."""
         return np.array((1.0, *self.coefficients))
@@ -256,9 +321,7 @@ class PolynomialLens:
 
     def undistort_points(self, xy_raw: Points) -> Points:
         """Raw pixels (n, 2) to undistorted pixels (n, 2); NaN rows beyond the radius where the model folds."""
-        offsets, radius2 = self._offsets(xy_raw)
-        scale = np.polynomial.polynomial.polyval(radius2, self._polynomial())
-        return self._to_pixels(offsets * np.where(radius2 < self.fold_radius() ** 2, scale, np.nan))
+        return _move_radially(xy_raw, self.radial)
 
     def distort_points(self, xy: Points) -> Points:
         """Undistorted pixels (n, 2) to raw pixels (n, 2); NaN rows beyond the radius where the model folds."""
@@ -310,6 +373,17 @@ class PolynomialLens:
             centre_y_px=self.centre_y_px,
             half_diagonal_px=self.half_diagonal_px,
         )
+
+
+def _build_radial(
+    lens: HarrisLens | DivisionLens | PolynomialLens,
+    polynomial: tuple[float, ...],
+    power: float,
+    limit_r2: float = np.inf,
+) -> RadialModel:
+    # floats and nothing else: kernels are compiled for the types of their arguments
+    centre_and_unit = float(lens.centre_x_px), float(lens.centre_y_px), float(lens.half_diagonal_px)
+    return RadialModel(*centre_and_unit, np.array(polynomial, np.float64), power, float(limit_r2))
 
 
 def _differentiate_radially(offsets: Points, tangents: Points, scale: Points, derivative_r2: Points) -> Points:

@@ -1,6 +1,6 @@
 """Numba kernels of the raw-to-base map (rational function, row spline, displacement mesh) and of its joint fit.
 
-All take plain arrays. The map of one point, in order, is
+All take plain arrays, the map as a tuple of them. The map of one point, in order, is
 
     undistorted u, raw row y  ->  v = u + shift(y) + roll(y) x (u - c)  ->  P(v)  ->  + mesh(raw x, raw y)
 
@@ -9,16 +9,55 @@ with its plain numpy form.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+from schemas.arrays import FloatArray
+from velfield.camera.lens import RadialModel, undistort
+
 _INVERSE_STEPS = 25
-_BLOCK = 64
+_TOLERANCE_PX = 1e-5
+_MAX_ERROR_PX = 1e-3
+"""Inverses of which the residual is not below the first are corrected; those not below the second in the end fail."""
+DIFFERENCE_PX = 0.25
+"""Step of the numerical derivative: small against the row spline's knot spacing, large against rounding errors."""
+_BLOCK = 128
 """Points that `to_base` maps at a time."""
 
 
-@njit(cache=True, nogil=True)
+class MapArrays(NamedTuple):
+    """The map of a frame, raw to base px."""
+
+    lens: RadialModel
+    width: int
+    height: int
+    rows: FloatArray
+    """(3, knots): coefficients as of `remove_row_motion`."""
+    centre: FloatArray
+    coefficients: FloatArray
+    """(3, 6), with ``source`` and ``target`` as of `rational`."""
+    source: FloatArray
+    target: FloatArray
+    mesh: FloatArray
+    """(my, mx, 2) as of `mesh_displacement`; (0, 0, 2) is no displacement."""
+    cell: int
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def divide_by_third(linear, constant):  # type: ignore[no-untyped-def]
+    """Points (n, 2) of homogeneous ones, the sum of ``linear`` (n, 3) and a constant (3,); NaN where the third
+    coordinate has not the constant's sign."""
+    out, sign = np.empty((len(linear), 2)), np.sign(constant[2])
+    for i in range(len(linear)):
+        w = linear[i, 2] + constant[2]
+        w = w if w * sign > 1e-12 else np.nan
+        out[i, 0], out[i, 1] = (linear[i, 0] + constant[0]) / w, (linear[i, 1] + constant[1]) / w
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def rational(points, coefficients, source, target):  # type: ignore[no-untyped-def]
     """Second-order rational function of points (n, 2); NaN where the denominator is not positive.
 
@@ -26,51 +65,35 @@ def rational(points, coefficients, source, target):  # type: ignore[no-untyped-d
     ``source`` and ``target`` each (cx, cy, s).
     """
     out = np.empty((points.shape[0], 2))
+    (a0, a1, a2, a3, a4, a5), (b0, b1, b2, b3, b4, b5), (c0, c1, c2, c3, c4, c5) = coefficients
+    (source_x, source_y, source_scale), (target_x, target_y, target_scale) = source, target
     for i in range(points.shape[0]):
-        x = (points[i, 0] - source[0]) * source[2]
-        y = (points[i, 1] - source[1]) * source[2]
+        x, y = (points[i, 0] - source_x) * source_scale, (points[i, 1] - source_y) * source_scale
         xx, xy, yy = x * x, x * y, y * y
-        w = 0.0
-        p = 0.0
-        q = 0.0
-        for row in range(3):
-            c = coefficients[row]
-            value = c[0] + c[1] * x + c[2] * y + c[3] * xx + c[4] * xy + c[5] * yy
-            if row == 0:
-                p = value
-            elif row == 1:
-                q = value
-            else:
-                w = value
-        if w > 1e-9:
-            out[i, 0] = p / w / target[2] + target[0]
-            out[i, 1] = q / w / target[2] + target[1]
-        else:
-            out[i, 0] = np.nan
-            out[i, 1] = np.nan
+        w = c0 + c1 * x + c2 * y + c3 * xx + c4 * xy + c5 * yy
+        w = w if w > 1e-9 else np.nan
+        out[i, 0] = (a0 + a1 * x + a2 * y + a3 * xx + a4 * xy + a5 * yy) / w / target_scale + target_x
+        out[i, 1] = (b0 + b1 * x + b2 * y + b3 * xx + b4 * xy + b5 * yy) / w / target_scale + target_y
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def rational_jacobian(points, coefficients, source, target):  # type: ignore[no-untyped-def]
     """Jacobian (n, 2, 2) of `rational`: [i, a, b] is d out_a / d in_b."""
     out = np.empty((points.shape[0], 2, 2))
-    scale = source[2] / target[2]
+    (a0, a1, a2, a3, a4, a5), (b0, b1, b2, b3, b4, b5), (c0, c1, c2, c3, c4, c5) = coefficients
+    source_x, source_y, scale = source[0], source[1], source[2] / target[2]
     for i in range(points.shape[0]):
-        x = (points[i, 0] - source[0]) * source[2]
-        y = (points[i, 1] - source[1]) * source[2]
-        value = np.empty(3)
-        dx = np.empty(3)
-        dy = np.empty(3)
-        for row in range(3):
-            c = coefficients[row]
-            value[row] = c[0] + c[1] * x + c[2] * y + c[3] * x * x + c[4] * x * y + c[5] * y * y
-            dx[row] = c[1] + 2 * c[3] * x + c[4] * y
-            dy[row] = c[2] + c[4] * x + 2 * c[5] * y
-        w = value[2] if value[2] > 1e-9 else np.nan
-        for row in range(2):
-            out[i, row, 0] = (dx[row] - value[row] / w * dx[2]) / w * scale
-            out[i, row, 1] = (dy[row] - value[row] / w * dy[2]) / w * scale
+        x, y = (points[i, 0] - source_x) * source[2], (points[i, 1] - source_y) * source[2]
+        w = c0 + c1 * x + c2 * y + c3 * x * x + c4 * x * y + c5 * y * y
+        w = w if w > 1e-9 else np.nan
+        p = (a0 + a1 * x + a2 * y + a3 * x * x + a4 * x * y + a5 * y * y) / w
+        q = (b0 + b1 * x + b2 * y + b3 * x * x + b4 * x * y + b5 * y * y) / w
+        w_x, w_y = c1 + 2 * c3 * x + c4 * y, c2 + c4 * x + 2 * c5 * y
+        out[i, 0, 0] = (a1 + 2 * a3 * x + a4 * y - p * w_x) / w * scale
+        out[i, 0, 1] = (a2 + a4 * x + 2 * a5 * y - p * w_y) / w * scale
+        out[i, 1, 0] = (b1 + 2 * b3 * x + b4 * y - q * w_x) / w * scale
+        out[i, 1, 1] = (b2 + b4 * x + 2 * b5 * y - q * w_y) / w * scale
     return out
 
 
@@ -105,6 +128,43 @@ def rational_inverse(points, guess, coefficients, source, target, tolerance):  #
                 break
             u += (jyy * ex - jxy * ey) / determinant
             v += (jxx * ey - jyx * ex) / determinant
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def invert_plane(points, guess, coefficients, source, target, mesh, cell):  # type: ignore[no-untyped-def]
+    """Inverse of `rational` plus `mesh_displacement` at points (n, 2) from ``guess`` (n, 2); NaN where that fails.
+
+    By Newton's method with the Jacobian of `rational` alone, all points until the last is accurate: a mesh bends by far
+    less than a pixel a pixel. A mesh (0, 0, 2) is no displacement.
+    """
+    for step in range(_INVERSE_STEPS + 1):
+        mapped, largest = rational(guess, coefficients, source, target), 0.0
+        if mesh.shape[0] > 0:
+            mapped += mesh_displacement(guess, mesh, cell)
+        residual = points - mapped
+        for i in range(len(points)):
+            for c in range(2):
+                size = abs(residual[i, c])
+                largest = size if size > largest else largest
+        if largest < _TOLERANCE_PX or step == _INVERSE_STEPS:
+            break
+        guess = guess + _solve_all(rational_jacobian(guess, coefficients, source, target), residual)
+    out = guess.copy()
+    for i in range(len(points)):
+        if not (abs(residual[i, 0]) < _MAX_ERROR_PX and abs(residual[i, 1]) < _MAX_ERROR_PX):
+            out[i] = np.nan
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _solve_all(jacobian, residual):  # type: ignore[no-untyped-def]
+    """Solve 2 x 2 systems (n, 2, 2) for residuals (n, 2) by Cramer's rule; not finite where one is singular."""
+    out = np.empty((len(residual), 2))
+    for i in range(len(residual)):
+        (a, b), (c, d) = (jacobian[i, 0, 0], jacobian[i, 0, 1]), (jacobian[i, 1, 0], jacobian[i, 1, 1])
+        determinant, x, y = a * d - b * c, residual[i, 0], residual[i, 1]
+        out[i, 0], out[i, 1] = (d * x - b * y) / determinant, (a * y - c * x) / determinant
     return out
 
 
@@ -170,25 +230,27 @@ def mesh_displacement(points, mesh, cell):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def to_base(undistorted, raw, rows, height, centre, coefficients, source, target, mesh, cell):  # type: ignore[no-untyped-def]
-    """Base px (n, 2) of undistorted points (n, 2), whose raw points are given: `remove_row_motion` with ``rows``
-    (3, knots), `rational` and `mesh_displacement` in one, to the bit. A mesh (0, 0, 2) is no displacement.
+def to_base(raw, frame):  # type: ignore[no-untyped-def]
+    """Base px (n, 2) of raw points (n, 2) by `MapArrays`: `undistort`, `remove_row_motion`, `rational` and
+    `mesh_displacement` in one, to the bit.
 
     Some points at a time, with loops of their own for what depends on a table: the other loops become vectors, which
     divide four times as fast.
     """
-    count, size, one = np.uint64(undistorted.shape[0]), np.uint64(_BLOCK), np.uint64(1)
-    out = np.empty((undistorted.shape[0], 2))
+    rows, mesh, height, centre, cell = frame.rows, frame.mesh, frame.height, frame.centre, frame.cell
+    count, size, one = np.uint64(raw.shape[0]), np.uint64(_BLOCK), np.uint64(1)
+    out = np.empty((raw.shape[0], 2))
     spans, my, mx = np.int32(rows.shape[1] - 3), mesh.shape[0], mesh.shape[1]
     last_row = float(spans)
-    (a0, a1, a2, a3, a4, a5), (b0, b1, b2, b3, b4, b5), (c0, c1, c2, c3, c4, c5) = coefficients
-    (source_x, source_y, source_scale), (target_x, target_y, target_scale) = source, target
+    (a0, a1, a2, a3, a4, a5), (b0, b1, b2, b3, b4, b5), (c0, c1, c2, c3, c4, c5) = frame.coefficients
+    (source_x, source_y, source_scale), (target_x, target_y, target_scale) = frame.source, frame.target
     first, weight = np.empty(_BLOCK, np.int32), np.empty((4, _BLOCK))
     at_x, at_y, base_x, base_y = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
     for begin in range(np.uint64(0), count, size):
         points = min(size, count - begin)
+        undistorted = undistort(raw[begin : begin + points], frame.lens)
         for i in range(points):
-            at_x[i], at_y[i] = undistorted[begin + i, 0], undistorted[begin + i, 1]
+            at_x[i], at_y[i] = undistorted[i, 0], undistorted[i, 1]
         if spans > 0:
             for i in range(points):
                 t = (raw[begin + i, 1] + 0.5) / height * spans
@@ -234,6 +296,87 @@ def to_base(undistorted, raw, rows, height, centre, coefficients, source, target
         for i in range(points):
             out[begin + i, 0], out[begin + i, 1] = base_x[i], base_y[i]
     return out
+
+
+@njit(cache=True, nogil=True)
+def _difference_jacobian(raw, mapped, frame):  # type: ignore[no-untyped-def]
+    """Jacobian (n, 2, 2) of `to_base` at raw points (n, 2), by differences from what they are mapped to."""
+    out, ahead = np.empty((len(raw), 2, 2)), raw.copy()
+    for axis in range(2):
+        ahead[:, axis] += DIFFERENCE_PX
+        moved = to_base(ahead, frame)
+        ahead[:, axis] = raw[:, axis]
+        for i in range(len(raw)):
+            for c in range(2):
+                out[i, c, axis] = (moved[i, c] - mapped[i, c]) / DIFFERENCE_PX
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _take_finite(points):  # type: ignore[no-untyped-def]
+    """Numbers of the points (n, 2) that are finite."""
+    return np.flatnonzero(np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]))
+
+
+@njit(cache=True, nogil=True)
+def to_raw(points, guess, frame, margin):  # type: ignore[no-untyped-def]
+    """Inverse of `to_base` at points (n, 2) by Newton's method from ``guess`` (n, 2), each point until it is accurate.
+
+    NaN rows where that fails, or the inverse lies outside the frame by more than ``margin``.
+    """
+    raw, error = guess.copy(), np.full(len(guess), np.nan)
+    todo = _take_finite(raw)
+    for step in range(_INVERSE_STEPS + 1):
+        here = raw[todo]
+        mapped, left = to_base(here, frame), 0
+        residual = np.empty((len(todo), 2))
+        for k in range(len(todo)):
+            at = todo[k]
+            x, y = points[at, 0] - mapped[k, 0], points[at, 1] - mapped[k, 1]
+            error[at] = max(abs(x), abs(y)) if x == x else np.nan  # both are NaN, or none
+            if error[at] > _TOLERANCE_PX:
+                todo[left], here[left], mapped[left] = at, here[k], mapped[k]
+                residual[left, 0], residual[left, 1] = x, y
+                left += 1
+        todo = todo[:left]
+        if not left or step == _INVERSE_STEPS:
+            break
+        change = _solve_all(_difference_jacobian(here[:left], mapped[:left], frame), residual[:left])
+        for k in range(left):
+            for c in range(2):
+                raw[todo[k], c] += change[k, c]
+    for i in range(len(raw)):
+        x, y = raw[i]
+        inside = x >= -margin and x <= frame.width + margin and y >= -margin and y <= frame.height + margin
+        if not (error[i] < _MAX_ERROR_PX and inside):
+            raw[i] = np.nan
+    return raw
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def to_raw_in_two_steps(points, guess, frame, margin):  # type: ignore[no-untyped-def]
+    """Inverse of `to_base` at points (n, 2) by two steps from ``guess`` (n, 2), and the inverse Jacobian (n, 2, 2).
+
+    NaN where the guess lies outside the frame by ``margin`` or more.
+    """
+    raw, inverse = np.full((len(points), 2), np.nan), np.full((len(points), 2, 2), np.nan)
+    x, y = guess[:, 0], guess[:, 1]
+    inside = (x > -margin) & (y > -margin) & (x < frame.width + margin) & (y < frame.height + margin)
+    todo = np.flatnonzero(inside)
+    here, target = guess[todo], points[todo]
+    mapped = to_base(here, frame)
+    here += _solve_all(_difference_jacobian(here, mapped, frame), target - mapped)
+    mapped = to_base(here, frame)
+    jacobian = _difference_jacobian(here, mapped, frame)
+    for k in range(len(todo)):
+        (a, b), (c, d) = (jacobian[k, 0, 0], jacobian[k, 0, 1]), (jacobian[k, 1, 0], jacobian[k, 1, 1])
+        determinant, at = a * d - b * c, todo[k]
+        inverse[at, 0, 0], inverse[at, 0, 1] = d / determinant, -b / determinant
+        inverse[at, 1, 0], inverse[at, 1, 1] = -c / determinant, a / determinant
+        for axis in range(2):
+            change = inverse[at, axis, 0] * (target[k, 0] - mapped[k, 0])
+            raw[at, axis] = here[k, axis] + (change + inverse[at, axis, 1] * (target[k, 1] - mapped[k, 1]))
+    return raw, inverse
 
 
 @njit(cache=True, nogil=True)

@@ -4,19 +4,16 @@ Paper: registration. Points are (n, 2) float64 as (x, y); pixel (0, 0) is the ce
 """
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
-from schemas.arrays import FloatArray, Mask
+from schemas.arrays import FloatArray
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
 from velfield.registration import kernels
 
-_INVERSE_STEPS = 25
-_INVERSE_TOLERANCE_PX = 1e-5
 _NEARBY_PX = 0.01
-_DIFFERENCE_PX = 0.25
-"""Step of the numerical derivative: small against the row spline's knot spacing, large against rounding errors."""
 _NO_MESH = np.zeros((0, 0, 2))
 _OUTSIDE_FRACTION = 0.1
 _OUTSIDE_PX = 64.0
@@ -36,16 +33,17 @@ class HomographyTransform:
 
     def __call__(self, xy: FloatArray) -> FloatArray:
         """Map points (n, 2)."""
-        points = as_points(xy)
-        mapped = points @ self.matrix[:, :2].T + self.matrix[:, 2]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            w = np.where(mapped[:, 2] * np.sign(self.matrix[2, 2]) > 1e-12, mapped[:, 2], np.nan)
-            return np.asarray(mapped[:, :2] / w[:, None])
+        linear = as_points(xy) @ self.matrix[:, :2].T
+        return np.asarray(kernels.divide_by_third(linear, np.ascontiguousarray(self.matrix[:, 2])))
 
     def inverse(self, xy: FloatArray) -> FloatArray:
         """Map points (n, 2) back, in closed form."""
+        return self._inverted(xy)
+
+    @cached_property
+    def _inverted(self) -> "HomographyTransform":
         inverted = np.linalg.inv(self.matrix)
-        return HomographyTransform(inverted / inverted[2, 2])(xy)
+        return HomographyTransform(inverted / inverted[2, 2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,16 +95,16 @@ class PolyprojectiveTransform:
 
     def inverse(self, xy: FloatArray) -> FloatArray:
         """Map points (n, 2) back by Newton's method from the homography's inverse; NaN rows where it fails."""
-        target = as_points(xy)
-        guess = HomographyTransform(self.homography()).inverse(target)
-        for _ in range(_INVERSE_STEPS):
-            residual = target - self(guess)
-            if np.nanmax(np.abs(residual), initial=0.0) < _INVERSE_TOLERANCE_PX:
-                break
-            guess = guess + _solve_2x2(self.jacobian(guess), residual)
-        failed = ~(np.abs(target - self(guess)).max(axis=1, initial=0.0) < 1e-3)
-        guess[failed] = np.nan
-        return guess
+        points, rational = as_points(xy), (self.coefficients, self.source, self.target)
+        return np.asarray(kernels.invert_plane(points, self.homography_inverse(points), *rational, _NO_MESH, 1))
+
+    def homography_inverse(self, xy: FloatArray) -> FloatArray:
+        """Map points (n, 2) back by the first-order terms alone."""
+        return self._homography.inverse(xy)
+
+    @cached_property
+    def _homography(self) -> HomographyTransform:
+        return HomographyTransform(self.homography())
 
 
 def normalisation_matrix(norm: FloatArray) -> FloatArray:
@@ -121,21 +119,6 @@ def fit_normalisation(xy: FloatArray) -> FloatArray:
     centre = 0.5 * (finite.min(axis=0) + finite.max(axis=0))
     reach = float(np.abs(finite - centre).max())
     return np.array([centre[0], centre[1], 1.0 / max(reach, 1e-9)])
-
-
-def _solve_2x2(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
-    """Solve 2 x 2 systems (n, 2, 2) by Cramer's rule: `numpy.linalg.solve` raises if a single one is singular."""
-    a, b, c, d = jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 1, 0], jacobian[:, 1, 1]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        determinant = a * d - b * c
-        x = (d * residual[:, 0] - b * residual[:, 1]) / determinant
-        y = (a * residual[:, 1] - c * residual[:, 0]) / determinant
-    return np.stack([x, y], axis=1)
-
-
-def invert_2x2(matrices: FloatArray) -> FloatArray:
-    """Inverses (n, 2, 2); not finite where a matrix is singular."""
-    return np.stack([_solve_2x2(matrices, np.broadcast_to(unit, (len(matrices), 2))) for unit in np.eye(2)], axis=2)
 
 
 def mesh_shape(width: int, height: int, cell_size_px: int) -> tuple[int, int]:
@@ -219,14 +202,23 @@ class FrameTransform:
 
     def to_base(self, xy_raw: FloatArray) -> FloatArray:
         """Raw pixels (n, 2) to base pixels (n, 2); NaN rows outside the domain of the lens or the polyprojective."""
-        raw, p = as_points(xy_raw), self.polyprojective
-        undistorted = as_points(self.lens.undistort_points(raw))
-        mesh = _NO_MESH if self.mesh is None else self.mesh
-        rational = p.coefficients, p.source, p.target
-        base = kernels.to_base(
-            undistorted, raw, self.row_coefficients, self.height, self.centre, *rational, mesh, self.cell_size_px
+        return np.asarray(kernels.to_base(as_points(xy_raw), self._arrays))
+
+    @cached_property
+    def _arrays(self) -> kernels.MapArrays:
+        p = self.polyprojective
+        return kernels.MapArrays(
+            lens=self.lens.radial,
+            width=self.width,
+            height=self.height,
+            rows=np.ascontiguousarray(self.row_coefficients),
+            centre=self.centre,
+            coefficients=np.ascontiguousarray(p.coefficients),
+            source=np.ascontiguousarray(p.source),
+            target=np.ascontiguousarray(p.target),
+            mesh=_NO_MESH if self.mesh is None else np.ascontiguousarray(self.mesh),
+            cell=self.cell_size_px,
         )
-        return np.asarray(base)
 
     def to_raw(self, xy_base: FloatArray) -> FloatArray:
         """Base pixels (n, 2) to raw pixels (n, 2), by Newton's method to well below 1e-3 px.
@@ -234,61 +226,27 @@ class FrameTransform:
         NaN rows where there is no inverse, or where it lies outside the frame by more than a tenth of its size and
         more than 64 px.
         """
-        target, raw = as_points(xy_base), self.to_raw_roughly(xy_base)
-        todo = np.flatnonzero(np.isfinite(raw).all(axis=1))
-        error = np.full(len(raw), np.nan)
-        for _ in range(_INVERSE_STEPS):
-            mapped = self.to_base(raw[todo])
-            residual = target[todo] - mapped
-            error[todo] = np.maximum(np.abs(residual[:, 0]), np.abs(residual[:, 1]))
-            far = error[todo] > _INVERSE_TOLERANCE_PX
-            todo, residual, mapped = todo[far], residual[far], mapped[far]
-            if not todo.size:
-                break
-            raw[todo] += _solve_2x2(self._slopes(raw[todo], mapped), residual)
-        if todo.size:
-            error[todo] = np.abs(target[todo] - self.to_base(raw[todo])).max(axis=1)
-        raw[~(error < 1e-3) | self._far_outside(raw)] = np.nan
-        return raw
+        margin = max(_OUTSIDE_PX, _OUTSIDE_FRACTION * max(self.width, self.height))
+        return np.asarray(
+            kernels.to_raw(as_points(xy_base), self.to_raw_roughly(xy_base), self._arrays, margin), np.float64
+        )
 
     def to_raw_nearby(self, xy_base: FloatArray) -> FloatArray:
         """As `to_raw_roughly`, to 0.01 px of that, by a compiled inverse: to decide what is in the frame."""
         p, xy = self.polyprojective, as_points(xy_base)
-        guess = HomographyTransform(p.homography()).inverse(xy)
-        inverse = kernels.rational_inverse(xy, guess, p.coefficients, p.source, p.target, _NEARBY_PX)
+        inverse = kernels.rational_inverse(xy, p.homography_inverse(xy), p.coefficients, p.source, p.target, _NEARBY_PX)
         return as_points(self.lens.distort_points(inverse))
 
     def to_raw_in_frame(self, xy_base: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Base pixels (n, 2) to raw pixels (n, 2), to some hundredths of a pixel, and the inverse Jacobian (n, 2, 2)
         there: what is needed to start a search from. NaN where the frame does not show the point."""
-        target, raw = as_points(xy_base), self.to_raw_nearby(xy_base)
-        inverse = np.full((len(raw), 2, 2), np.nan)
-        with np.errstate(invalid="ignore"):
-            inside = ((raw > -_OUTSIDE_PX) & (raw < np.array([self.width, self.height]) + _OUTSIDE_PX)).all(axis=1)
-        todo = np.flatnonzero(inside)
-        here = raw[todo]
-        mapped = self.to_base(here)
-        here += _solve_2x2(self._slopes(here, mapped), target[todo] - mapped)
-        mapped = self.to_base(here)
-        slopes = invert_2x2(self._slopes(here, mapped))
-        here += np.einsum("nij,nj->ni", slopes, target[todo] - mapped)
-        raw[:], raw[todo], inverse[todo] = np.nan, here, slopes
-        return raw, inverse
+        guess = self.to_raw_nearby(xy_base)
+        raw, inverse = kernels.to_raw_in_two_steps(as_points(xy_base), guess, self._arrays, _OUTSIDE_PX)
+        return np.asarray(raw), np.asarray(inverse)
 
     def to_raw_roughly(self, xy_base: FloatArray) -> FloatArray:
         """The inverse without row motion and mesh, so wrong by these; NaN rows where there is none."""
         return as_points(self.lens.distort_points(self.polyprojective.inverse(as_points(xy_base))))
-
-    def _slopes(self, raw: FloatArray, mapped: FloatArray) -> FloatArray:
-        """Jacobian by differences from what is mapped already: half as many points to map as `jacobian`."""
-        steps = [self.to_base(raw + _DIFFERENCE_PX * unit) - mapped for unit in np.eye(2)]
-        return np.stack(steps, axis=2) / _DIFFERENCE_PX
-
-    def _far_outside(self, raw: FloatArray) -> Mask:
-        margin = max(_OUTSIDE_PX, _OUTSIDE_FRACTION * max(self.width, self.height))
-        with np.errstate(invalid="ignore"):
-            inside = (raw >= -margin) & (raw <= np.array([self.width, self.height]) + margin)
-        return np.asarray(~inside.all(axis=1))
 
     def jacobian(self, xy_raw: FloatArray) -> FloatArray:
         """Jacobian (n, 2, 2) of `to_base` at raw pixels (n, 2), by central differences."""
@@ -296,8 +254,8 @@ class FrameTransform:
         columns = []
         for axis in range(2):
             step = np.zeros(2)
-            step[axis] = _DIFFERENCE_PX
-            columns.append((self.to_base(raw + step) - self.to_base(raw - step)) / (2 * _DIFFERENCE_PX))
+            step[axis] = kernels.DIFFERENCE_PX
+            columns.append((self.to_base(raw + step) - self.to_base(raw - step)) / (2 * kernels.DIFFERENCE_PX))
         return np.stack(columns, axis=2)
 
     def scale_and_rotation(self) -> tuple[float, float]:
@@ -379,16 +337,12 @@ class MeshedTransform:
         return np.stack(columns, axis=2)
 
     def inverse(self, xy: FloatArray) -> FloatArray:
-        """Map points (n, 2) back; the mesh bends by far less than a pixel a pixel, so that a few steps settle."""
-        target = as_points(xy)
-        guess = self.polyprojective.inverse(target)
-        for _ in range(_INVERSE_STEPS):
-            residual = target - self(guess)
-            if np.nanmax(np.abs(residual), initial=0.0) < _INVERSE_TOLERANCE_PX:
-                break
-            guess = guess + _solve_2x2(self.polyprojective.jacobian(guess), residual)
-        guess[~(np.abs(target - self(guess)).max(axis=1, initial=0.0) < 1e-3)] = np.nan
-        return guess
+        """Map points (n, 2) back; NaN rows where there is no inverse."""
+        points, p = as_points(xy), self.polyprojective
+        rational = p.coefficients, p.source, p.target
+        return np.asarray(
+            kernels.invert_plane(points, p.inverse(points), *rational, self.mesh, self.cell_size_px), np.float64
+        )
 
 
 PlaneTransform = PolyprojectiveTransform | MeshedTransform

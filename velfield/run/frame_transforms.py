@@ -42,6 +42,8 @@ from velfield.registration.transforms import (
 from velfield.run.layout import RunLayout, local_copy
 from velfield.run.stores import RegistrationStore, open_frames, open_registration
 
+_MAX_MAPS = 64
+
 
 def read_grid(layout: RunLayout) -> GridRecord:
     """The grid of base pixels: ``base/grid.json``, with scale, north and place by `read_georeference`.
@@ -262,6 +264,8 @@ class FrameTransforms:
     config: RegistrationConfig
     _units: dict[str, tuple[int, NDArray[Any]]] = field(default_factory=dict, repr=False, compare=False)
     """By column, number of a unit of frames and its values: those read last."""
+    _maps: dict[int, FrameMap] = field(default_factory=dict, repr=False, compare=False)
+    """The transforms of the frames asked for last, of which a stage asks for each several times."""
 
     @classmethod
     def open(cls, layout: RunLayout, config: FlightConfig) -> "FrameTransforms":
@@ -278,6 +282,14 @@ class FrameTransforms:
 
     def transform(self, frame: int) -> FrameMap | None:
         """The transform of one frame; None where it is not registered."""
+        transform = self._maps.get(frame)
+        if transform is None and (transform := self._read(frame)) is not None:
+            if len(self._maps) >= _MAX_MAPS:
+                self._maps.clear()
+            self._maps[frame] = transform
+        return transform
+
+    def _read(self, frame: int) -> FrameMap | None:
         vector = self._vector(frame)
         if not np.isfinite(vector).all():
             return None
