@@ -301,17 +301,30 @@ def measure_support(xy: FloatArray, residuals: FloatArray, *, width: int, height
     reach_px = reach(width, height)
     cell_px = float(np.sqrt(_POINTS_PER_CELL * width * height / len(xy)))
     distances, nearest = nearest_points(as_points(xy), centres, min(_AVERAGED, len(xy)), cell_px)
-    squares = (residuals**2).sum(axis=1)[nearest]
-    near = np.asarray(distances <= reach_px)
-    count = near.sum(axis=1)
-    local = np.sqrt(np.where(near, squares, 0.0).sum(axis=1) / np.maximum(count, 1))
+    count, mean = average_near(distances, nearest, residuals, reach_px)
     beyond = np.clip(distances[:, NEIGHBOURS - 1] / reach_px, 0.0, 1.0)
-    variance = local**2 * (_INDEPENDENT / np.maximum(count, _INDEPENDENT) + (_GROWTH * beyond**2) ** 2)
+    variance = mean * (_INDEPENDENT / np.maximum(count, _INDEPENDENT) + (_GROWTH * beyond**2) ** 2)
     limit = max(MAX_SD_PX, _MAX_SD_RATIO * float(np.sqrt((residuals**2).sum(axis=1).mean())))
     supported = (count >= NEIGHBOURS) & (variance <= limit**2)
     sd[supported] = np.sqrt(variance[supported])
     cells = int(_BRIDGED * reach_px * rows / height), int(_BRIDGED * reach_px * columns / width)
     return Support(bridge_holes(sd.reshape(CELLS), cells), width, height)
+
+
+@njit(cache=True, nogil=True)
+def average_near(distances, nearest, residuals, reach_px):  # type: ignore[no-untyped-def]
+    """How many of the nearest points (m, count) are within the reach (m,), and the mean of the squares of their
+    residuals (n, 2), 0 without any (m,)."""
+    numbers, means = np.zeros(len(nearest), np.int64), np.zeros(len(nearest))
+    for c in range(len(nearest)):
+        for k in range(nearest.shape[1]):
+            if distances[c, k] > reach_px:  # nearest first
+                break
+            x, y = residuals[nearest[c, k]]
+            means[c] += x * x + y * y
+            numbers[c] += 1
+        means[c] /= max(numbers[c], 1)
+    return numbers, means
 
 
 @njit(cache=True, nogil=True)
