@@ -7,7 +7,6 @@ from velfield.camera.lens import HarrisLens
 from velfield.errors import Failure
 from velfield.registration.fitting import fit_by_case_deletion, fit_by_simplex, fit_polyprojective
 from velfield.registration.joint import ControlPoints, JointFit, fit_jointly, robust_weights
-from velfield.registration.kernels import solve_cholesky
 from velfield.registration.mesh import fit_mesh, fit_robust_mesh
 from velfield.registration.transforms import HomographyTransform, PolyprojectiveTransform, fit_normalisation
 
@@ -197,11 +196,3 @@ def test_the_mesh_follows_a_hill_whose_points_disagree_with_the_smooth_map_and_n
         return float(np.abs(np.median(left[on_hill], axis=0)).max())
 
     assert off(3) < 0.15 < 0.4 * off(1)
-
-
-def test_small_systems_are_solved_as_lapack_does() -> None:
-    rng = np.random.default_rng(10)
-    half = rng.normal(size=(40, 40))
-    matrix, right = half @ half.T + np.eye(40), rng.normal(size=(40, 2))
-    np.testing.assert_allclose(solve_cholesky(matrix, right), np.linalg.solve(matrix, right), atol=1e-9)
-    assert np.isnan(solve_cholesky(-matrix, right)).all()

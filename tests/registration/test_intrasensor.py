@@ -23,6 +23,7 @@ from velfield.registration.intrasensor import (
     map_keypoints,
     prepare_base,
     register_chain,
+    shrink,
 )
 from velfield.registration.joint import ControlPoints, JointFit
 from velfield.registration.keypoints import Keypoints, detect_keypoints
@@ -324,3 +325,10 @@ def test_patches_that_do_not_align_are_tried_in_turn() -> None:
     assert set.union(*chosen) == everything
     history.frame += 8  # inliers of long ago are tried in turn as well
     assert len(history.choose(before, (480, 640))) < len(chosen[0])
+
+
+def test_a_frame_is_shrunk_as_by_opencv() -> None:
+    grey = np.random.default_rng(10).integers(0, 256, (160, 240)).astype(np.uint8)
+    expected = cv2.resize(grey, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    np.testing.assert_array_equal(shrink(grey), expected)
+    np.testing.assert_array_equal(shrink(np.pad(grey, ((0, 3), (0, 1)))), expected)  # what fills no square is left out

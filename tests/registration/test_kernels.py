@@ -80,10 +80,33 @@ def jacobian(problem: dict[str, np.ndarray]) -> np.ndarray:
     return np.stack(columns, axis=2)
 
 
-def normal_equations(problem: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def equations(problem: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     names = ("undistorted", "corrected", "first", "basis", "observed", "weight", "fold")
-    arguments = [problem[name] for name in names]
+    arguments = (problem[name] for name in names)
     return kernels.normal_equations(*arguments, FOLDS, KNOTS, problem["coefficients"], NORMS, CENTRE)
+
+
+def symmetric(bands: np.ndarray, width: int) -> np.ndarray:
+    """A symmetric matrix from its bands."""
+    out = np.zeros((len(bands),) * 2)
+    for d in range(width):
+        out += np.diag(bands[: len(out) - d, d], d) + (np.diag(bands[: len(out) - d, d], -d) if d else 0)
+    return out
+
+
+ORDER = np.concatenate([np.arange(17), 17 + np.arange(3 * KNOTS).reshape(KNOTS, 3).T.ravel()])
+"""Where each parameter is among the 17 and the row coefficients knot by knot."""
+
+
+def normal_equations(problem: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Full matrices (folds, p, p), right-hand sides (folds, p) and sums of squares of each fold."""
+    bands, border, corner = equations(problem)
+    normal = np.zeros((FOLDS, 17 + 3 * KNOTS, 17 + 3 * KNOTS))
+    for fold in range(FOLDS):
+        normal[fold, :17, :17], normal[fold, 17:, 17:] = corner[fold, :17, :17], symmetric(bands[fold], 12)
+        normal[fold, 17:, :17], normal[fold, :17, 17:] = border[fold, :, :17], border[fold, :, :17].T
+    right = np.concatenate([corner[:, :17, 17], border[:, :, 17]], axis=1)
+    return normal[:, ORDER[:, None], ORDER], right[:, ORDER], corner[:, 17, 17]
 
 
 def test_evaluation_in_one_is_that_of_the_kernels_one_by_one(problem: dict[str, np.ndarray]) -> None:
@@ -151,18 +174,61 @@ def test_predicted_change_is_that_of_the_model_to_first_order(problem: dict[str,
         np.testing.assert_allclose(change[here], moved[here], rtol=1e-3, atol=1e-6)
 
 
-def test_solving_without_a_fold_equals_leaving_it_out(problem: dict[str, np.ndarray]) -> None:
+@pytest.mark.parametrize("homography", [False, True])
+def test_a_step_is_that_of_the_full_matrix(problem: dict[str, np.ndarray], homography: bool) -> None:
+    """With all priors, of all points and without each fold; a homography has fixed parameters."""
+    rng, p, theta = np.random.default_rng(7), 17 + 3 * KNOTS, problem["theta"]
+    free = np.isin(np.arange(17), [0, 1, 2, 6, 7, 8, 12, 13]) | (not homography)
+    stiffness = rng.uniform([3.0, -1.0, 0.0], [4.0, 1.0, 1.0], (3 * KNOTS, 3))
+    gauge, prior, gauge_weight = rng.normal(size=(3 * KNOTS, 4)), rng.uniform(0.0, 3.0, 17), 1e3
+    spaced = np.zeros((3 * KNOTS, 7))
+    spaced[:, ::3] = stiffness
+    penalty = np.zeros((p, p))
+    penalty[:17, :17], penalty[17:, 17:] = np.diag(prior), symmetric(spaced, 7) + gauge_weight * gauge @ gauge.T
+    penalty = penalty[ORDER[:, None], ORDER]
     normal, right, squares = normal_equations(problem)
-    p = right.shape[1]
-    penalty, theta = np.diag(np.linspace(1.0, 3.0, p)), problem["theta"]
-    total, steps = kernels.solve_without_folds(normal, right, squares, penalty, theta)
-    expected = 0.0
+    kept = np.concatenate([np.flatnonzero(free), np.arange(17, p)])
+
+    def step(folds: list[int]) -> np.ndarray:
+        matrix, out = normal[folds].sum(axis=0) + penalty, np.zeros(p)
+        out[kept] = np.linalg.solve(matrix[np.ix_(kept, kept)], (right[folds].sum(axis=0) - penalty @ theta)[kept])
+        return out
+
+    arguments = (*equations(problem), stiffness, gauge, gauge_weight, prior, free, theta)
+    (found,) = kernels.solve_steps(*arguments, False)
+    np.testing.assert_allclose(found, step([*range(FOLDS)]), rtol=1e-6, atol=1e-9)
+    steps, expected = kernels.solve_steps(*arguments, True), 0.0
     for fold in range(FOLDS):
-        others = [f for f in range(FOLDS) if f != fold]
-        step = np.linalg.solve(normal[others].sum(axis=0) + penalty, right[others].sum(axis=0) - penalty @ theta)
-        np.testing.assert_allclose(steps[fold], step, rtol=1e-6, atol=1e-9)
-        expected += squares[fold] - 2 * step @ right[fold] + step @ normal[fold] @ step  # of the fold left out
-    assert total == pytest.approx(expected, rel=1e-9)
+        left = step([f for f in range(FOLDS) if f != fold])
+        np.testing.assert_allclose(steps[fold], left, rtol=1e-6, atol=1e-9)
+        expected += squares[fold] - 2 * left @ right[fold] + left @ normal[fold] @ left  # of the fold left out
+    assert kernels.predict_squares(*equations(problem), steps) == pytest.approx(expected, rel=1e-9)
+
+
+def test_an_indefinite_matrix_has_no_step(problem: dict[str, np.ndarray]) -> None:
+    theta, free = problem["theta"], np.ones(17, bool)
+    stiffness, gauge = np.full((3 * KNOTS, 3), [1.0, 0.0, 0.0]), np.zeros((3 * KNOTS, 0))
+    for row, prior in ((-1e9, 1.0), (1.0, -1e9)):
+        stiffness[5, 0] = row
+        arguments = (*equations(problem), stiffness, gauge, 1.0, np.full(17, prior), free, theta)
+        assert np.isnan(kernels.solve_steps(*arguments, True)).all()
+
+
+def test_weights_and_scale_are_those_of_numpy() -> None:
+    rng = np.random.default_rng(8)
+    residuals, sigma = rng.normal(size=(100, 2)), rng.uniform(0.1, 1.0, 100)
+    residuals[:2] = [[np.nan, 1.0], [np.inf, 1.0]]
+    size = np.linalg.norm(residuals, axis=1) / sigma
+    assert kernels.median_size(residuals, sigma) == pytest.approx(np.median(size[np.isfinite(size)]))
+    expected = np.nan_to_num(1 / (1 + (size / 2.5) ** 2) ** 2)
+    np.testing.assert_allclose(kernels.geman_mcclure(residuals, sigma, 2.5), expected, atol=1e-15)
+    assert np.isnan(kernels.median_size(residuals[:2], sigma))
+
+
+def test_only_points_of_weight_must_be_finite() -> None:
+    residuals = np.array([[1.0, 2.0], [np.nan, 0.0], [3.0, np.inf]])
+    assert kernels.are_finite(residuals, np.array([1.0, 0.0, 0.0]))
+    assert not kernels.are_finite(residuals, np.array([1.0, 0.0, 0.5]))
 
 
 def test_spline_basis_is_the_uniform_cubic_b_spline() -> None:
@@ -208,15 +274,6 @@ def test_rational_has_no_value_beyond_its_pole() -> None:
     xy = np.array([[600.0, 10.0], [639.9, 10.0], [640.1, 10.0], [900.0, 10.0]])
     assert np.isfinite(kernels.rational(xy, c, SOURCE, TARGET)).all(axis=1).tolist() == [True, True, False, False]
     assert np.isnan(kernels.rational_jacobian(xy[3:], c, SOURCE, TARGET)).all()
-
-
-def test_cholesky_solves_several_right_hand_sides_and_marks_an_indefinite_matrix() -> None:
-    rng = np.random.default_rng(6)
-    half = rng.normal(size=(20, 20))
-    matrix, right = half @ half.T + 0.1 * np.eye(20), rng.normal(size=(20, 3))
-    np.testing.assert_allclose(matrix @ kernels.solve_cholesky(matrix, right), right, atol=1e-8)
-    matrix[7, 7] = -1.0
-    assert np.isnan(kernels.solve_cholesky(matrix, right)).all()
 
 
 @pytest.mark.parametrize("knots", [0, KNOTS])

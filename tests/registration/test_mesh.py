@@ -29,9 +29,9 @@ def test_the_weights_interpolate_as_the_kernel_does() -> None:
 
 
 def dense(bands: np.ndarray) -> np.ndarray:
-    """A symmetric matrix from its lower bands."""
-    out = np.zeros((bands.shape[1],) * 2)
-    for k, band in enumerate(bands):
+    """A symmetric matrix from its bands."""
+    out = np.zeros((bands.shape[0],) * 2)
+    for k, band in enumerate(bands.T):
         out += np.diag(band[: len(out) - k], -k) + (np.diag(band[: len(out) - k], k) if k else 0)
     return out
 
@@ -55,9 +55,11 @@ def test_the_bands_hold_the_normal_equations_of_each_fold(seed: int) -> None:
         part = basis[fold == k]
         np.testing.assert_allclose(dense(bands[k]), part.T @ (part * weights[fold == k, None]), atol=1e-12)
         np.testing.assert_allclose(right[k], part.T @ (weights[:, None] * residuals)[fold == k], atol=1e-12)
-    matrix = bands.sum(axis=0) + mesh.smoothness_bands(6, 8)
-    expected = np.linalg.solve(dense(matrix), right.sum(axis=0))
-    np.testing.assert_allclose(mesh._solve(matrix, right.sum(axis=0)), expected, atol=1e-11)
+    meshes = mesh.solve_without_folds(bands, right, mesh.smoothness_bands(6, 8), 3.0)
+    for k in range(FOLDS + 1):
+        used = np.arange(FOLDS) != k
+        matrix = dense(bands[used].sum(axis=0) + 3.0 * mesh.smoothness_bands(6, 8))
+        np.testing.assert_allclose(meshes[k], np.linalg.solve(matrix, right[used].sum(axis=0)), atol=1e-11)
 
 
 def test_a_smooth_displacement_is_recovered_where_there_are_points() -> None:

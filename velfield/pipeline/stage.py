@@ -173,7 +173,7 @@ STAGES: tuple[Stage, ...] = (
     # Key points of spread frames, two passes to their median; or the registration of a given image.
     Stage(
         name="base",
-        version=11,
+        version=12,
         label="base image",
         lines=(
             Line(
@@ -195,7 +195,7 @@ STAGES: tuple[Stage, ...] = (
     # The chain over the unit's frames.
     Stage(
         name="registration",
-        version=12,
+        version=13,
         label="registration",
         lines=(
             Line("{registered:.0f} of {frames:.0f} frames registered, hold-out registration error {heldout_px:.2f} px"),

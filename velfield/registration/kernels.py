@@ -9,14 +9,21 @@ with its plain numpy form.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
 from schemas.arrays import FloatArray
 from velfield.camera.lens import RadialModel, undistort
+from velfield.vectors import LONG, Vectors
 
+LANES = 8
+"""Values of one vector: systems that are solved at once, or values of one row."""
+_POINTS = 16
+"""Points that are linearised at a time: what is stored value by value can be read as vectors only a while later."""
 _INVERSE_STEPS = 25
 _TOLERANCE_PX = 1e-5
 _MAX_ERROR_PX = 1e-3
@@ -411,94 +418,201 @@ def evaluate(undistorted, first, basis, observed, theta, knots, norms, centre): 
     return corrected, residuals
 
 
+@intrinsic
+def _add_products(_context, out, at, factor, row, start, blocks):  # type: ignore[no-untyped-def]
+    """Add ``factor`` times ``blocks`` x 8 values of ``row`` from ``start`` on to those of ``out`` from ``at`` on."""
+
+    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, build, signature, arguments, LANES)
+        out, at, factor, row, start, blocks = v.arguments
+        factor = v.spread(factor)
+        with cgutils.for_range(build, blocks) as loop:
+            offset = build.mul(loop.index, LONG(LANES))
+            v.add(build.fmul(factor, v.load(row, start, offset)), out, at, offset)
+        return context.get_dummy_value()
+
+    return types.void(out, at, factor, row, start, blocks), generate
+
+
+@intrinsic
+def _subtract_products(_context, out, at, factors, place, inverse, row, start, count):  # type: ignore[no-untyped-def]
+    """Subtract ``factors[place] * inverse`` times ``count`` vectors of ``row`` from ``start`` on from those of ``out``
+    from ``at`` on: all places count vectors of 8 values."""
+
+    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, build, signature, arguments, LANES)
+        out, at, factors, place, inverse, row, start, count = v.arguments
+        at, place, start = (build.mul(number, LONG(LANES)) for number in (at, place, start))
+        factor = build.fmul(v.load(factors, place), v.load(inverse))
+        with cgutils.for_range(build, count) as loop:
+            offset = build.mul(loop.index, LONG(LANES))
+            value = build.fmul(factor, v.load(row, start, offset))
+            v.store(build.fsub(v.load(out, at, offset), value), out, at, offset)
+        return context.get_dummy_value()
+
+    return types.void(out, at, factors, place, inverse, row, start, count), generate
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _differentiate(undistorted, corrected, observed, begin, count, coefficients, norms, centre, rows, motion, inside):  # type: ignore[no-untyped-def]
+    """Derivatives of ``count`` mapped points from ``begin`` on by the 17 parameters of the rational function, ``rows``
+    (2, 17 and more each), with the residual behind them, and by shift x, shift y and roll, ``motion`` (2, 3 each);
+    and whether each is ``inside`` the map's domain."""
+    (a0, a1, a2, a3, a4, a5), (b0, b1, b2, b3, b4, b5), (c0, c1, c2, c3, c4, c5) = coefficients
+    source_x, source_y, source_scale, unit, target_x, target_y, target_scale = norms
+    for n in range(count):
+        i = begin + n
+        x, y = (corrected[i, 0] - source_x) * source_scale, (corrected[i, 1] - source_y) * source_scale
+        xx, xy, yy = x * x, x * y, y * y
+        w = c0 + c1 * x + c2 * y + c3 * xx + c4 * xy + c5 * yy
+        inside[n] = w > 1e-9
+        px = (a0 + a1 * x + a2 * y + a3 * xx + a4 * xy + a5 * yy) / w
+        py = (b0 + b1 * x + b2 * y + b3 * xx + b4 * xy + b5 * yy) / w
+        over = 1.0 / (w * target_scale)
+        monomials = over, x * over, y * over, xx * over, xy * over, yy * over
+        for k in range(6):
+            rows[n, 0, k] = monomials[k]
+            rows[n, 1, 6 + k] = monomials[k]
+        for k in range(5):
+            rows[n, 0, 12 + k] = -px * monomials[k + 1]
+            rows[n, 1, 12 + k] = -py * monomials[k + 1]
+        rows[n, 0, 17] = observed[i, 0] - (px / target_scale + target_x)
+        rows[n, 1, 17] = observed[i, 1] - (py / target_scale + target_y)
+        s = source_scale * over
+        wx, wy = c1 + 2 * c3 * x + c4 * y, c2 + c4 * x + 2 * c5 * y
+        jxx, jxy = (a1 + 2 * a3 * x + a4 * y - px * wx) * s, (a2 + a4 * x + 2 * a5 * y - px * wy) * s
+        jyx, jyy = (b1 + 2 * b3 * x + b4 * y - py * wx) * s, (b2 + b4 * x + 2 * b5 * y - py * wy) * s
+        far_x, far_y = (undistorted[i, 0] - centre[0]) / unit, (undistorted[i, 1] - centre[1]) / unit
+        motion[n, 0, 0], motion[n, 0, 1], motion[n, 0, 2] = jxx, jxy, jxy * far_x - jxx * far_y
+        motion[n, 1, 0], motion[n, 1, 1], motion[n, 1, 2] = jyx, jyy, jyy * far_x - jyx * far_y
+
+
+@njit(cache=True, nogil=True)
+def _multiply(basis, weight, begin, count, rows, motion, both, near, products):  # type: ignore[no-untyped-def]
+    """Prepare what `_add_points` adds of the points that `_differentiate` has: the derivatives by a (as those by b),
+    by c in x and in y, ``both`` (24); the products of one knot's coefficients with the twelve, ``near`` (3, 32), and
+    with the 17 and the residual, ``products`` (3, 24); all zero behind their values."""
+    for n in range(count):
+        i, w = begin + n, weight[begin + n]
+        for k in range(6):
+            both[n, k], both[n, 6 + k], both[n, 12 + k] = rows[n, 0, k], rows[n, 0, 12 + k], rows[n, 1, 12 + k]
+        for c in range(3):
+            for d in range(3):
+                value = w * (motion[n, 0, c] * motion[n, 0, d] + motion[n, 1, c] * motion[n, 1, d])
+                for k in range(4):
+                    near[n, c, 3 * k + d] = basis[i, k] * value
+    products[:] = 0.0
+    for n in range(count):
+        for c in range(3):
+            for axis in range(2):
+                factor = weight[begin + n] * motion[n, axis, c]
+                _add_products(products, (3 * n + c) * 24, factor, rows, (2 * n + axis) * 24, 3)
+
+
+@njit(cache=True, nogil=True)
+def _add_points(first, basis, weight, fold, begin, count, inside, both, near, products, bands, border, sums):  # type: ignore[no-untyped-def]
+    """Add points, prepared by `_multiply`, to the ``bands`` (folds, 3 knots, 16) and the ``border`` (folds, 3 knots,
+    24) of the row coefficients, and to ``sums`` (folds, 12, 24): of a with a and c, and of c with c."""
+    for n in range(count):
+        i, w, f = begin + n, weight[begin + n], fold[begin + n]
+        if not (w > 0.0 and inside[n]):
+            continue
+        for k in range(6):
+            own, above, below = n * 24, (f * 12 + k) * 24, (f * 12 + 6 + k) * 24
+            _add_products(sums, above, w * both[n, k], both, own, 3)
+            _add_products(sums, below, w * both[n, 6 + k], both, own + 6, 1)
+            _add_products(sums, below, w * both[n, 12 + k], both, own + 12, 1)
+        row = f * bands.shape[1] + 3 * first[i]
+        for k in range(4 if bands.shape[1] > 0 else 0):
+            for c in range(3):
+                _add_products(bands, row * 16, basis[i, k], near, (3 * n + c) * 32 + 3 * k + c, 2 if k < 2 else 1)
+                _add_products(border, row * 24, basis[i, k], products, (3 * n + c) * 24, 3)
+                row += 1
+
+
 @njit(cache=True, nogil=True)
 def normal_equations(  # type: ignore[no-untyped-def]
     undistorted, corrected, first, basis, observed, weight, fold, folds, knots, coefficients, norms, centre
 ):
-    """Gauss-Newton normal equations per fold: matrices (folds, p, p), right-hand sides (folds, p), sums of squares.
+    """Gauss-Newton normal equations per fold: bands (folds, 3 knots, 16), border (folds, 3 knots, 24) and corner
+    (folds, 18, 18).
 
     Parameters are the 17 of the rational function (a, b: 6 each, c without its leading 1), then ``knots`` each of the
-    row shift in x, in y, and the roll (px at a distance ``norms[3]`` from the centre). Each point depends on 17 + 12
-    of them, so a loop over points is cheaper than a dense matrix product. ``norms`` = source cx, cy, s, roll unit,
-    target cx, cy, s. Residuals are in output px, weighted by ``weight`` (n,).
+    row shift in x, in y, and the roll (px at a distance ``norms[3]`` from the centre). ``norms`` = source cx, cy, s,
+    roll unit, target cx, cy, s. Residuals are in output px, weighted by ``weight`` (n,).
+
+    A point depends on four knots side by side. With the three coefficients of each knot next to each other, those of
+    the rows have a banded matrix: ``bands[f, i, d]`` is that of coefficients i and i + d, for d < 12. ``border`` has
+    their products with the 17, ``corner`` those of the 17; column 17 in both is the right-hand side, and the last of
+    ``corner`` the sum of squares.
     """
-    p = 17 + 3 * knots
-    normal = np.zeros((folds, p, p))
-    right = np.zeros((folds, p))
-    squares = np.zeros(folds)
-    index = np.empty(29, np.int64)
-    gx = np.empty(29)
-    gy = np.empty(29)
-    m = np.empty(6)
-    count = 29 if knots > 0 else 17
-    ts = norms[6]
-    for i in range(undistorted.shape[0]):
-        if weight[i] <= 0.0:
-            continue
-        x = (corrected[i, 0] - norms[0]) * norms[2]
-        y = (corrected[i, 1] - norms[1]) * norms[2]
-        m[0], m[1], m[2], m[3], m[4], m[5] = 1.0, x, y, x * x, x * y, y * y
-        px, py, w = 0.0, 0.0, 0.0
-        for k in range(6):
-            px += coefficients[0, k] * m[k]
-            py += coefficients[1, k] * m[k]
-            w += coefficients[2, k] * m[k]
-        if w <= 1e-9:
-            continue
-        px, py = px / w, py / w
-        for k in range(6):
-            index[k] = k
-            gx[k] = m[k] / w / ts
-            gy[k] = 0.0
-            index[6 + k] = 6 + k
-            gx[6 + k] = 0.0
-            gy[6 + k] = m[k] / w / ts
-        for k in range(5):
-            index[12 + k] = 12 + k
-            gx[12 + k] = -px * m[k + 1] / w / ts
-            gy[12 + k] = -py * m[k + 1] / w / ts
-        if knots > 0:
-            c = coefficients
-            s = norms[2] / ts / w
-            wx = c[2, 1] + 2 * c[2, 3] * x + c[2, 4] * y
-            wy = c[2, 2] + c[2, 4] * x + 2 * c[2, 5] * y
-            jxx = (c[0, 1] + 2 * c[0, 3] * x + c[0, 4] * y - px * wx) * s
-            jxy = (c[0, 2] + c[0, 4] * x + 2 * c[0, 5] * y - px * wy) * s
-            jyx = (c[1, 1] + 2 * c[1, 3] * x + c[1, 4] * y - py * wx) * s
-            jyy = (c[1, 2] + c[1, 4] * x + 2 * c[1, 5] * y - py * wy) * s
-            rx = -(undistorted[i, 1] - centre[1]) / norms[3]
-            ry = (undistorted[i, 0] - centre[0]) / norms[3]
-            for k in range(4):
-                b = basis[i, k]
-                q = first[i] + k
-                index[17 + k] = 17 + q
-                gx[17 + k] = jxx * b
-                gy[17 + k] = jyx * b
-                index[21 + k] = 17 + knots + q
-                gx[21 + k] = jxy * b
-                gy[21 + k] = jyy * b
-                index[25 + k] = 17 + 2 * knots + q
-                gx[25 + k] = (jxx * rx + jxy * ry) * b
-                gy[25 + k] = (jyx * rx + jyy * ry) * b
-        ex = observed[i, 0] - (px / ts + norms[4])
-        ey = observed[i, 1] - (py / ts + norms[5])
-        f = fold[i]
-        squares[f] += weight[i] * (ex * ex + ey * ey)
-        for k in range(count):
-            vx, vy = gx[k] * weight[i], gy[k] * weight[i]
-            right[f, index[k]] += vx * ex + vy * ey
-            row = normal[f, index[k]]
-            for j in range(np.uint64(min(k + 1, 17))):  # the first 17 lie side by side, then each four
-                row[j] += vx * gx[j] + vy * gy[j]
-            for begin in range(17, k + 1, 4):
-                part, px_of, py_of = row[index[begin] :], gx[begin:], gy[begin:]
-                for j in range(np.uint64(min(k + 1 - begin, 4))):
-                    part[j] += vx * px_of[j] + vy * py_of[j]
+    bands, border = aligned_zeros(folds, 3 * knots, 16), aligned_zeros(folds, 3 * knots, 24)
+    sums, corner = aligned_zeros(folds, 12, 24), np.zeros((folds, 18, 18))
+    rows, motion, inside = np.zeros((_POINTS, 2, 24)), np.zeros((_POINTS, 2, 3)), np.empty(_POINTS, np.bool_)
+    both, near, products = np.zeros((_POINTS, 24)), np.zeros((_POINTS, 3, 32)), np.zeros((_POINTS, 3, 24))
+    for begin in range(0, undistorted.shape[0], _POINTS):
+        count = min(_POINTS, undistorted.shape[0] - begin)
+        _differentiate(
+            undistorted, corrected, observed, begin, count, coefficients, norms, centre, rows, motion, inside
+        )
+        _multiply(basis, weight, begin, count, rows, motion, both, near, products)
+        _add_points(first, basis, weight, fold, begin, count, inside, both, near, products, bands, border, sums)
     for f in range(folds):
-        for k in range(p):
-            for j in range(k):
-                normal[f, j, k] = normal[f, k, j]
-    return normal, right, squares
+        _fill_corner(sums[f], corner[f])
+    return bands, border, corner
+
+
+@njit(cache=True, nogil=True)
+def aligned_zeros(count, rows, columns):  # type: ignore[no-untyped-def]
+    """Zeros (count, rows, columns) from a multiple of 64 bytes on: vectors of eight do not cross lines of the cache,
+    which takes the fit a quarter longer."""
+    size = count * rows * columns
+    values = np.zeros(size + LANES)
+    start = (-(values.ctypes.data // 8)) % LANES
+    return values[start : start + size].reshape((count, rows, columns))
+
+
+@njit(cache=True, nogil=True)
+def _fill_corner(sums, corner):  # type: ignore[no-untyped-def]
+    """The symmetric matrix of a, b, c and the residual from their products as `normal_equations` has them."""
+    for k in range(6):
+        for j in range(6):
+            corner[k, j] = corner[6 + k, 6 + j] = sums[k, j]
+            corner[k, 12 + j] = corner[12 + j, k] = sums[k, 6 + j]
+            corner[6 + k, 12 + j] = corner[12 + j, 6 + k] = sums[k, 12 + j]
+            corner[12 + k, 12 + j] = sums[6 + k, j]
+
+
+@njit(cache=True, nogil=True)
+def are_finite(residuals, weights):  # type: ignore[no-untyped-def]
+    """Whether the residuals (n, 2) of positive weight (n,) are finite."""
+    for i in range(residuals.shape[0]):
+        if weights[i] > 0.0 and not (math.isfinite(residuals[i, 0]) and math.isfinite(residuals[i, 1])):
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def median_size(residuals, sigma):  # type: ignore[no-untyped-def]
+    """Median length of the residuals (n, 2) over sigma (n,), of those that are finite; NaN without any."""
+    sizes, count = np.empty(residuals.shape[0]), 0
+    for i in range(residuals.shape[0]):
+        size = np.sqrt(residuals[i, 0] ** 2 + residuals[i, 1] ** 2) / sigma[i]
+        if math.isfinite(size):
+            sizes[count] = size
+            count += 1
+    return np.median(sizes[:count]) if count else np.nan
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def geman_mcclure(residuals, sigma, unit):  # type: ignore[no-untyped-def]
+    """Geman-McClure weights (n,) of the length of residuals (n, 2) over sigma (n,), in this unit; 0 if not finite."""
+    weights = np.empty(residuals.shape[0])
+    for i in range(residuals.shape[0]):
+        size = np.sqrt(residuals[i, 0] ** 2 + residuals[i, 1] ** 2) / sigma[i] / unit
+        below = 1.0 + size * size
+        weights[i] = 1.0 / (below * below) if math.isfinite(size) else 0.0
+    return weights
 
 
 @njit(cache=True, nogil=True)
@@ -544,81 +658,166 @@ def predict_change(undistorted, corrected, first, basis, step, fold, knots, coef
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _dot(a, b, count):  # type: ignore[no-untyped-def]
-    total = 0.0
-    for k in range(count):
-        total += a[k] * b[k]
-    return total
+@njit(cache=True, nogil=True, error_model="numpy")
+def eliminate_bands(bands, border, corner):  # type: ignore[no-untyped-def]
+    """Eliminate the unknowns of eight symmetric systems at once, value by value: in place, without a root.
 
-
-_ROWS = np.uint64(4)
-
-
-@njit(cache=True, nogil=True)
-def solve_cholesky(matrix, right):  # type: ignore[no-untyped-def]
-    """Solution (p, m) of a positive definite system by Cholesky factorisation; NaN if it is not positive definite.
-
-    LAPACK is not used: its threads, several per worker thread of the pipeline, busy-wait on systems this small.
+    Parameters
+    ----------
+    bands
+        (n, width, 8): ``bands[i, d]`` is the matrix's value of unknowns i and i + d.
+    border
+        (n, m, 8) products with further unknowns, and behind them right-hand sides.
+    corner
+        (k, m, 8), k <= m: those of the further unknowns, of which the upper triangle is read and written.
     """
-    p, m = np.uint64(right.shape[0]), np.uint64(right.shape[1])  # unsigned: numba checks no index for its sign
-    one = np.uint64(1)
-    upper = matrix.copy()  # row by row from the diagonal on, so that the inner loops run along rows
-    for first in range(np.uint64(0), p, _ROWS):
-        end = min(first + _ROWS, p)
-        for j in range(first, end):
-            if not upper[j, j] > 0.0:
-                return np.full(right.shape, np.nan)
-            inverse = 1.0 / np.sqrt(upper[j, j])
-            for k in range(j, p):
-                upper[j, k] *= inverse
-            for i in range(j + one, end):
-                factor = upper[j, i]
-                for k in range(i, p):
-                    upper[i, k] -= factor * upper[j, k]
-        if end == first + _ROWS:  # four rows at once: the rest of the matrix is read and written a quarter as often
-            a, b, c, d = upper[first], upper[first + one], upper[first + one + one], upper[end - one]
-            for i in range(end, p):
-                fa, fb, fc, fd = a[i], b[i], c[i], d[i]
-                row = upper[i]
-                for k in range(i, p):
-                    row[k] = row[k] - fa * a[k] - fb * b[k] - fc * c[k] - fd * d[k]
-    out = right.copy()
-    for c in range(m):
-        for i in range(p):
-            out[i, c] /= upper[i, i]
-            for k in range(i + one, p):
-                out[k, c] -= upper[i, k] * out[i, c]
-        for j in range(p):
-            last = p - one - j
-            total = out[last, c]
-            for k in range(last + one, p):
-                total -= upper[last, k] * out[k, c]
-            out[last, c] = total / upper[last, last]
+    size, width, columns = bands.shape[0], bands.shape[1], border.shape[1]
+    inverse = np.empty(LANES)
+    for i in range(size):
+        for lane in range(LANES):
+            inverse[lane] = 1.0 / bands[i, 0, lane]
+        at, beside = i * width, i * columns
+        for d in range(1, min(width, size - i)):
+            _subtract_products(bands, at + d * width, bands, at + d, inverse, bands, at + d, width - d)
+            _subtract_products(border, beside + d * columns, bands, at + d, inverse, border, beside, columns)
+        for k in range(corner.shape[0]):
+            _subtract_products(corner, k * columns + k, border, beside + k, inverse, border, beside + k, columns - k)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def substitute_back(bands, border, known):  # type: ignore[no-untyped-def]
+    """Solutions (n, m - k, 8) after `eliminate_bands`, whose arrays it takes, by the further unknowns (k, m - k, 8)."""
+    size, width, columns, inner = bands.shape[0], bands.shape[1], border.shape[1], known.shape[0]
+    sides, one = columns - inner, np.ones(LANES)
+    out = np.empty((size, sides, LANES))
+    for i in range(size - 1, -1, -1):
+        at, right = i * width, i * columns + inner
+        for k in range(inner):
+            _subtract_products(border, right, border, i * columns + k, one, known, k * sides, sides)
+        for d in range(1, min(width, size - i)):
+            _subtract_products(border, right, bands, at + d, one, out, (i + d) * sides, sides)
+        for side in range(sides):
+            for lane in range(LANES):
+                out[i, side, lane] = border[i, inner + side, lane] / bands[i, 0, lane]
     return out
 
 
 @njit(cache=True, nogil=True)
-def solve_without_folds(normal, right, squares, penalty, theta):  # type: ignore[no-untyped-def]
-    """Cross-validated sum of squares over all folds, and the step (folds, p) of the fit without each fold."""
-    folds, p = right.shape
-    steps = np.zeros((folds, p))
-    all_normal = penalty.copy()
-    all_right = np.zeros((p, 1))
-    rest = np.zeros((p, 1))
-    for i in range(p):
-        all_right[i, 0] = -_dot(penalty[i], theta, p)
-        for f in range(folds):
-            all_right[i, 0] += right[f, i]
-            for j in range(p):
-                all_normal[i, j] += normal[f, i, j]
-    total = 0.0
-    for f in range(folds):
-        for i in range(p):
-            rest[i, 0] = all_right[i, 0] - right[f, i]
-        step = solve_cholesky(all_normal - normal[f], rest)[:, 0].copy()
-        steps[f] = step
-        total += squares[f]
-        for i in range(p):
-            total += step[i] * (_dot(normal[f, i], step, p) - 2.0 * right[f, i])
-    return total, steps
+def add_folds(parts, leave_out, systems, begin):  # type: ignore[no-untyped-def]
+    """Add to eight systems (n, m, 8), from column ``begin`` on, the sums over all folds of ``parts`` (folds, n, k or
+    more); where each is left out, to the first of them without a fold each. It adds k = m - ``begin`` columns at most.
+    """
+    folds, size, columns = parts.shape
+    for i in range(size):
+        for d in range(min(columns, systems.shape[1] - begin)):
+            total = 0.0
+            for f in range(folds):
+                total += parts[f, i, d]
+            for lane in range(LANES):
+                systems[i, begin + d, lane] += total
+            for f in range(folds if leave_out else 0):
+                systems[i, begin + d, f] -= parts[f, i, d]
+
+
+@njit(cache=True, nogil=True)
+def _interleave(theta):  # type: ignore[no-untyped-def]
+    """Row coefficients (3 knots,), those of each knot next to each other, of parameters (17 + 3 knots,)."""
+    return theta[17:].reshape((3, (len(theta) - 17) // 3)).T.copy().ravel()
+
+
+@njit(cache=True, nogil=True)
+def _make_priors(stiffness, gauge, gauge_weight, prior, theta):  # type: ignore[no-untyped-def]
+    """What `solve_steps` adds the folds to: bands and border of the row coefficients, and the matrix of the others."""
+    size, directions, rows = stiffness.shape[0], gauge.shape[1], _interleave(theta)
+    bands, border = aligned_zeros(size, 12, LANES), aligned_zeros(size, directions + 18, LANES)
+    corner = aligned_zeros(directions + 18, directions + 18, LANES)
+    for i in range(size):
+        for d in range(min(3, (size - i + 2) // 3)):
+            bands[i, 3 * d] = stiffness[i, d]
+            border[i, -1] -= stiffness[i, d] * rows[i + 3 * d]
+            if d > 0:
+                border[i + 3 * d, -1] -= stiffness[i, d] * rows[i]
+        for k in range(directions):
+            border[i, k] = gauge[i, k]
+            corner[k, -1] -= gauge[i, k] * rows[i]
+    for k in range(directions):
+        corner[k, k] = -1.0 / gauge_weight
+    for k in range(17):
+        corner[directions + k, directions + k] = prior[k]
+        corner[directions + k, -1] = -prior[k] * theta[k]
+    return bands, border, corner
+
+
+@njit(cache=True, nogil=True)
+def solve_steps(bands, border, corner, stiffness, gauge, gauge_weight, prior, free, theta, leave_out):  # type: ignore[no-untyped-def]
+    """Gauss-Newton step (1, p) of the penalised squares, or the step (folds, p) without each fold; NaN where their
+    matrix is not positive definite.
+
+    The gauge's penalty, ``gauge_weight`` times the square of gauge . x, would couple all knots. It enters by one
+    multiplier for each of its directions, which are further unknowns as the 17 parameters are: their equations read
+    gauge . x = multiplier / gauge_weight.
+
+    Parameters
+    ----------
+    bands, border, corner
+        From `normal_equations`, of at most eight folds where each is left out.
+    stiffness
+        (3 knots, 3) penalty of each row coefficient with itself and those of the next two knots.
+    gauge
+        (3 knots, g) directions.
+    prior, free
+        (17,) penalty of the other parameters, and whether each is free.
+    """
+    matrix, beside, inner = _make_priors(stiffness, gauge, gauge_weight, prior, theta)
+    directions = gauge.shape[1]
+    add_folds(bands, leave_out, matrix, 0)
+    add_folds(border, leave_out, beside, directions)
+    add_folds(corner, leave_out, inner[directions:], directions)
+    for k in range(17):
+        if not free[k]:  # its step is zero
+            at = directions + k
+            beside[:, at], inner[at], inner[:, at] = 0.0, 0.0, 0.0
+            inner[at, at] = 1.0
+    eliminate_bands(matrix, beside, inner[:-1])
+    dense, known = _solve_dense(inner)
+    rows = substitute_back(matrix, beside, known)
+    steps = np.full((len(bands) if leave_out else 1, len(theta)), np.nan)
+    for f in range(len(steps)):
+        definite = (matrix[:, 0, f] > 0.0).all() and (dense[directions:, 0, f] > 0.0).all()
+        if definite and (dense[:directions, 0, f] < 0.0).all():
+            steps[f, :17] = known[directions:, 0, f]
+            steps[f, 17:] = rows[:, 0, f].copy().reshape((-1, 3)).T.copy().ravel()
+    return steps
+
+
+@njit(cache=True, nogil=True)
+def _solve_dense(systems):  # type: ignore[no-untyped-def]
+    """Solutions (n, 1, 8) of eight symmetric systems (n and one more, n + 1, 8), of which the upper triangle is read,
+    and the bands that they are eliminated by."""
+    count = systems.shape[0] - 1
+    bands, right = aligned_zeros(count, count, LANES), aligned_zeros(count, 1, LANES)
+    for k in range(count):
+        bands[k, : count - k], right[k, 0] = systems[k, k:count], systems[k, count]
+    nothing = np.zeros((0, 1, LANES))
+    eliminate_bands(bands, right, nothing)
+    return bands, substitute_back(bands, right, nothing)
+
+
+@njit(cache=True, nogil=True)
+def predict_squares(bands, border, corner, steps):  # type: ignore[no-untyped-def]
+    """Sum of squares of all folds, to first order, each after its step (folds, p)."""
+    size, total, inner = bands.shape[1], 0.0, np.empty(18)
+    for f in range(len(steps)):
+        moved = _interleave(steps[f])
+        inner[:17], inner[17] = steps[f, :17], -1.0
+        for i in range(size):
+            value = bands[f, i, 0] * moved[i]
+            for d in range(1, min(12, size - i)):
+                value += 2.0 * bands[f, i, d] * moved[i + d]
+            for k in range(18):
+                value += 2.0 * border[f, i, k] * inner[k]
+            total += moved[i] * value
+        for k in range(18):
+            for j in range(18):
+                total += inner[k] * corner[f, k, j] * inner[j]
+    return total

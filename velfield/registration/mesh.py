@@ -4,8 +4,8 @@ Paper: registration, 200 x 200 cells. The mesh models what the polyprojective ca
 deviations of the lens from its model. Its nodes are the cell centres. A first-difference penalty couples neighbouring
 nodes; cross-validation selects its weight, and drops the mesh if that does not lower the cross-validated residual.
 
-A node is coupled to its eight neighbours only, so the normal equations are banded: they are stored as the lower bands
-of LAPACK's ``pbsv``, and a fit costs nodes * columns^2 in place of nodes^3.
+A node is coupled to its eight neighbours only, so the normal equations are banded: a fit costs nodes *
+rows^2 in place of nodes^3, and the fits without each fold are solved as one.
 
 How accurate the whole map is where, `measure_support`: a standard deviation in cells, none where no control points
 support it.
@@ -20,14 +20,16 @@ the distance to the nearest control points. Its two constants were set on simula
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpbsv
 
 from schemas.arrays import Float32Array, FloatArray, IntArray
+from velfield.registration import kernels
 from velfield.registration.joint import FOLDS, ControlPoints, JointFit, assign_folds, robust_weights
+from velfield.registration.kernels import LANES
 from velfield.registration.transforms import as_points, mesh_shape
 
 _STIFFNESSES = tuple(10.0**k for k in (-1, 0, 1, 2, 3))
@@ -143,34 +145,55 @@ def fit_mesh(
     my, mx = mesh_shape(width, height, cell_size_px)
     if len(xy_raw) < _MIN_POINTS_PER_CELL * my * mx or my * mx < 4:
         return MeshFit(None, residuals, cv_residuals)
-    nodes, shares = bilinear_weights(xy_raw, my, mx, cell_size_px)
+    # columns of nodes one after the other: they are the shorter ones, so there are fewer bands
+    nodes, shares = bilinear_weights(xy_raw[:, ::-1], mx, my, cell_size_px)
     fold = assign_folds(xy_raw) if fold is None else fold
-    normal, right = accumulate_bands(nodes, shares, weights, residuals, fold, FOLDS, my * mx, mx + 2)
-    normal_all, right_all = normal.sum(axis=0), right.sum(axis=0)
+    equations = accumulate_bands(nodes, shares, weights, residuals, fold, FOLDS, my * mx, my + 2)
     # A fold is left out of both fits: the mesh of the others must explain the cross-validated residual.
-    smoothness = smoothness_bands(my, mx)
-    squares_without = float((weights[:, None] * cv_residuals**2).sum())
-    best, best_squares, best_cv = None, squares_without * (1 - _MIN_GAIN), cv_residuals
+    smoothness = smoothness_bands(mx, my)
+    squares_without = weighted_squares(weights, cv_residuals)
+    best, best_squares, best_cv, mesh = None, squares_without * (1 - _MIN_GAIN), cv_residuals, None
     for stiffness in stiffnesses:
-        meshes = np.stack(
-            [_solve(normal_all - normal[f] + stiffness * smoothness, right_all - right[f]) for f in range(FOLDS)]
-        )
+        meshes = solve_without_folds(*equations, smoothness, stiffness)
         mesh_cv = cv_residuals - interpolate_mesh(nodes, shares, meshes, fold)
-        squares = float((weights[:, None] * mesh_cv**2).sum())
+        squares = weighted_squares(weights, mesh_cv)
         if squares < best_squares:
-            best, best_squares, best_cv = stiffness, squares, mesh_cv
-    if best is None:
+            best, best_squares, best_cv, mesh = stiffness, squares, mesh_cv, meshes[FOLDS]
+    if best is None or mesh is None:
         return MeshFit(None, residuals, cv_residuals)
-    mesh = _solve(normal_all + best * smoothness, right_all)
     left = residuals - interpolate_mesh(nodes, shares, mesh[None], np.zeros_like(fold))
-    return MeshFit(np.ascontiguousarray(mesh.reshape(my, mx, 2)), left, best_cv, best)
+    return MeshFit(np.ascontiguousarray(mesh.reshape(mx, my, 2).swapaxes(0, 1)), left, best_cv, best)
 
 
-def _solve(bands: FloatArray, right: FloatArray) -> FloatArray:
-    _, solution, failed = dpbsv(bands, right, lower=1)
-    if failed:
-        raise np.linalg.LinAlgError("the mesh's normal equations are not positive definite")
-    return np.asarray(solution)
+@njit(cache=True, nogil=True)
+def solve_without_folds(normal, right, smoothness, stiffness):  # type: ignore[no-untyped-def]
+    """Meshes (folds + 1, count, 2) of the fits without each fold, and of that to all: eight systems at once.
+
+    ``normal`` and ``right`` from `accumulate_bands`, of at most seven folds, ``smoothness`` from `smoothness_bands`.
+    """
+    folds, count, width = normal.shape
+    bands, sides = kernels.aligned_zeros(count, width, LANES), kernels.aligned_zeros(count, 2, LANES)
+    for i in range(count):
+        for d in range(width):
+            bands[i, d] = stiffness * smoothness[i, d]
+    kernels.add_folds(normal, True, bands, 0)
+    kernels.add_folds(right, True, sides, 0)
+    nothing = np.zeros((0, 2, LANES))
+    kernels.eliminate_bands(bands, sides, nothing)
+    found = kernels.substitute_back(bands, sides, nothing)
+    meshes = np.empty((folds + 1, count, 2))
+    for f in range(folds + 1):
+        meshes[f] = found[:, :, f]
+    return meshes
+
+
+@njit(cache=True, nogil=True)
+def weighted_squares(weights, vectors):  # type: ignore[no-untyped-def]
+    """Sum of the squared lengths of vectors (n, 2) by weights (n,)."""
+    total = 0.0
+    for i in range(len(weights)):
+        total += weights[i] * (vectors[i, 0] ** 2 + vectors[i, 1] ** 2)
+    return total
 
 
 @njit(cache=True, nogil=True)
@@ -192,8 +215,9 @@ def bilinear_weights(xy_raw, my, mx, cell):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def accumulate_bands(nodes, shares, weights, residuals, fold, folds, count, bands):  # type: ignore[no-untyped-def]
-    """Normal equations of each fold: lower bands (folds, bands, count) and right-hand sides (folds, count, 2)."""
-    normal, right = np.zeros((folds, bands, count)), np.zeros((folds, count, 2))
+    """Normal equations of each fold: bands (folds, count, bands) as those of `kernels.eliminate_bands`, and right-hand
+    sides (folds, count, 2)."""
+    normal, right = np.zeros((folds, count, bands)), np.zeros((folds, count, 2))
     for i in range(len(nodes)):
         f = fold[i]
         for p in range(4):
@@ -203,7 +227,7 @@ def accumulate_bands(nodes, shares, weights, residuals, fold, folds, count, band
             for q in range(4):
                 column = nodes[i, q]
                 if row >= column:
-                    normal[f, row - column, column] += share * shares[i, q]
+                    normal[f, column, row - column] += share * shares[i, q]
     return normal, right
 
 
@@ -219,17 +243,16 @@ def interpolate_mesh(nodes, shares, meshes, which):  # type: ignore[no-untyped-d
     return out
 
 
+@cache
 def smoothness_bands(my: int, mx: int) -> FloatArray:
-    """Lower bands (mx + 2, nodes) of the squared differences between neighbouring nodes, plus a small ridge."""
-    bands = np.zeros((mx + 2, my * mx))
-    bands[0] = 0.05
-    diagonal = np.zeros(my * mx, np.int64)
+    """Bands (nodes, mx + 2) of the squared differences between neighbouring nodes, plus a small ridge."""
+    bands = np.zeros((my * mx, mx + 2))
+    bands[:, 0] = 0.05
     node: NDArray[np.int64] = np.arange(my * mx).reshape(my, mx)
     for later, earlier in ((node[:, 1:], node[:, :-1]), (node[1:], node[:-1])):
         i, j = later.ravel(), earlier.ravel()
-        np.add.at(bands, (diagonal[i], i), 1.0)
-        np.add.at(bands, (diagonal[j], j), 1.0)
-        np.add.at(bands, (i - j, j), -1.0)
+        bands[:, 0] += np.bincount(i, minlength=my * mx) + np.bincount(j, minlength=my * mx)
+        bands[j, i - j] = -1.0
     return bands
 
 
@@ -278,17 +301,30 @@ def measure_support(xy: FloatArray, residuals: FloatArray, *, width: int, height
     reach_px = reach(width, height)
     cell_px = float(np.sqrt(_POINTS_PER_CELL * width * height / len(xy)))
     distances, nearest = nearest_points(as_points(xy), centres, min(_AVERAGED, len(xy)), cell_px)
-    squares = (residuals**2).sum(axis=1)[nearest]
-    near = np.asarray(distances <= reach_px)
-    count = near.sum(axis=1)
-    local = np.sqrt(np.where(near, squares, 0.0).sum(axis=1) / np.maximum(count, 1))
+    count, mean = average_near(distances, nearest, residuals, reach_px)
     beyond = np.clip(distances[:, NEIGHBOURS - 1] / reach_px, 0.0, 1.0)
-    variance = local**2 * (_INDEPENDENT / np.maximum(count, _INDEPENDENT) + (_GROWTH * beyond**2) ** 2)
+    variance = mean * (_INDEPENDENT / np.maximum(count, _INDEPENDENT) + (_GROWTH * beyond**2) ** 2)
     limit = max(MAX_SD_PX, _MAX_SD_RATIO * float(np.sqrt((residuals**2).sum(axis=1).mean())))
     supported = (count >= NEIGHBOURS) & (variance <= limit**2)
     sd[supported] = np.sqrt(variance[supported])
     cells = int(_BRIDGED * reach_px * rows / height), int(_BRIDGED * reach_px * columns / width)
     return Support(bridge_holes(sd.reshape(CELLS), cells), width, height)
+
+
+@njit(cache=True, nogil=True)
+def average_near(distances, nearest, residuals, reach_px):  # type: ignore[no-untyped-def]
+    """How many of the nearest points (m, count) are within the reach (m,), and the mean of the squares of their
+    residuals (n, 2), 0 without any (m,)."""
+    numbers, means = np.zeros(len(nearest), np.int64), np.zeros(len(nearest))
+    for c in range(len(nearest)):
+        for k in range(nearest.shape[1]):
+            if distances[c, k] > reach_px:  # nearest first
+                break
+            x, y = residuals[nearest[c, k]]
+            means[c] += x * x + y * y
+            numbers[c] += 1
+        means[c] /= max(numbers[c], 1)
+    return numbers, means
 
 
 @njit(cache=True, nogil=True)
