@@ -46,10 +46,6 @@ MIN_CARS = 8
 """Fewer labelled cars than this do not train a detector."""
 
 
-Crop = tuple[int, int, int, int]
-"""Of an image: first row, first column, height and width, px."""
-
-
 @dataclass(frozen=True)
 class Detections:
     """Cars of an image, in no order.
@@ -148,7 +144,7 @@ class Detector(ABC):
         image: GreyImage,
         valid: Mask | None,
         background: GreyImage | None,
-        crops: Sequence[Crop],
+        crops: IntArray,
         *,
         threshold: float | None = None,
     ) -> Detections:
@@ -156,9 +152,14 @@ class Detector(ABC):
 
         Each crop is taken by itself; a detector may do better where that changes nothing. What the cascade proposes
         depends on the whole image: of two simulated cities it found 4 to 18 % fewer cars in all crops at once.
+
+        Parameters
+        ----------
+        crops
+            (n, 4) first row, first column, height and width.
         """
         found = []
-        for row, column, height, width in crops:
+        for row, column, height, width in crops.tolist():
             part = np.s_[row : row + height, column : column + width]
             covered = None if valid is None else valid[part]
             ground = None if background is None else background[part]

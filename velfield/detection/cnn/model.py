@@ -11,16 +11,16 @@ A detector adapted to a flight by self-training adds a score bonus where the fra
 """
 
 import math
-from collections.abc import Sequence
+from functools import partial
 
 import cv2
 import numpy as np
 from numba import njit
 
-from schemas.arrays import Float32Array, FloatArray, GreyImage, Mask
+from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from schemas.detector import MotionRecord
 from velfield.detection.cnn.network import STRIDE, Network
-from velfield.detection.detector import Crop
+from velfield.detection.cnn.quantization import BlockPredict
 from velfield.detection.orientation import sample_nearest
 
 _TILE_PX, HALO_PX = 2048, 64
@@ -94,7 +94,7 @@ def predict_heatmap(
     return probability[: size[0], : size[1]], orientation[:, : size[0], : size[1]]
 
 
-def predict_crops(network: Network, image: GreyImage, crops: Sequence[Crop]) -> tuple[Float32Array, Float32Array]:
+def predict_crops(network: Network, image: GreyImage, crops: IntArray) -> tuple[Float32Array, Float32Array]:
     """The same of crops of an image, each predicted as if it were alone; those of one size in one call.
 
     Parameters
@@ -102,7 +102,8 @@ def predict_crops(network: Network, image: GreyImage, crops: Sequence[Crop]) -> 
     image
         (h, w) uint8, even.
     crops
-        Disjoint, at multiples of `Network.alignment` and of such sizes.
+        (n, 4) first row, first column, height and width; disjoint, at multiples of `Network.alignment` and of such
+        sizes.
 
     Returns
     -------
@@ -110,22 +111,39 @@ def predict_crops(network: Network, image: GreyImage, crops: Sequence[Crop]) -> 
     """
     probability = np.zeros((image.shape[0] // STRIDE, image.shape[1] // STRIDE), np.float32)
     orientation = np.zeros((2, *probability.shape), np.float32)
-    by_size: dict[tuple[int, int], list[tuple[int, int]]] = {}
-    for y, x, height, width in crops:
-        by_size.setdefault((height, width), []).append((y, x))
-    for (height, width), alike in by_size.items():
+    predict = network.predict
+    fill = predict.fill_crops if isinstance(predict, BlockPredict) else partial(_fill_crops, network)
+    by_size = crops[np.lexsort((crops[:, 3], crops[:, 2]))]
+    ends = [*np.flatnonzero((by_size[1:, 2:] != by_size[:-1, 2:]).any(axis=1)) + 1, len(by_size)]
+    begin = 0
+    for end in ends:
+        height, width = by_size[begin, 2:].tolist()
         tiled = max(height, width) > _TILE_PX
-        corners, at_once = np.array(alike), 1 if tiled else max(1, _BATCH_PX // (height * width))
-        for start in range(0, len(corners), at_once):
-            batch = corners[start : start + at_once]
-            pixels = _cut_kernel(image, batch, height, width)
-            if tiled:
-                heatmap, vector = predict_heatmap(network, pixels[0], border_px=0)
-                heatmaps, vectors = heatmap[None], vector[None]
-            else:
-                heatmaps, vectors = forward(network, pixels)
-            _place_kernel(heatmaps, vectors, batch // STRIDE, probability, orientation)
+        at_once = 1 if tiled else max(1, _BATCH_PX // (height * width))
+        for start in range(begin, end, at_once):
+            corners = by_size[start : min(start + at_once, end), :2]
+            (partial(_fill_crops, network) if tiled else fill)(image, corners, height, width, probability, orientation)
+        begin = end
     return probability, orientation
+
+
+def _fill_crops(
+    network: Network,
+    image: GreyImage,
+    corners: IntArray,
+    height: int,
+    width: int,
+    probability: Float32Array,
+    orientation: Float32Array,
+) -> None:
+    """As `BlockPredict.fill_crops` does, of any network, or of one crop of any size."""
+    pixels = _cut_kernel(image, corners, height, width)
+    if max(height, width) > _TILE_PX:
+        heatmap, vector = predict_heatmap(network, pixels[0], border_px=0)
+        heatmaps, vectors = heatmap[None], vector[None]
+    else:
+        heatmaps, vectors = forward(network, pixels)
+    _place_kernel(heatmaps, vectors, corners // STRIDE, probability, orientation)
 
 
 @njit(cache=True, nogil=True)
@@ -180,7 +198,7 @@ def detect_cars(
     tta_range: tuple[float, float] = NO_TTA,
     *,
     border_px: int = BORDER_PX,
-    crops: Sequence[Crop] | None = None,
+    crops: IntArray | None = None,
 ) -> FloatArray:
     """Detect cars in a frame, or in an image of crops; a car may be detected several times, see `nms_oriented`.
 
