@@ -334,7 +334,7 @@ def pack_poses(
     c, s = np.cos(angles), np.sin(angles)
     x, y = ((xy[:, k] + 0.5) / scale.step + PAD_PX for k in (0, 1))
     rows = np.stack([x, y, c * size, s * size, -s * side, c * side, c, s])
-    filled = np.pad(rows, ((0, 0), (0, -n % LANES)), mode="edge")
+    filled = rows[:, np.minimum(np.arange(n + -n % LANES), n - 1)]
     return np.ascontiguousarray(filled.reshape(8, -1, LANES).transpose(1, 0, 2), np.float32)
 
 
@@ -394,6 +394,59 @@ def signed_grey_areas(table: NDArray[np.int32], starts: NDArray[np.int32], chann
     return np.where(channels == 0, total, 0).astype(np.float32)
 
 
+@dataclass(frozen=True, eq=False)
+class OffsetScorer:
+    """A classifier at some offsets from a pose, (m, 2) whole px along and across the axis, and what its kernel reads.
+
+    ``channels`` is that of the images.
+    """
+
+    stumps: BoostedStumps
+    offsets: IntArray
+    channels: int
+    scale: PatchScale
+
+    @cached_property
+    def _patch(self) -> RotatedPatch:
+        return RotatedPatch.for_offsets(self.offsets, self.channels, self.scale)
+
+    @cached_property
+    def _rectangles(self) -> tuple[FlatIndices, NDArray[np.int32], NDArray[np.int32], FlatIndices, Float32Array]:
+        """Corners and signs of the rectangles, where those of each round start, and its channel and area."""
+        stumps = self.stumps
+        areas = signed_grey_areas(stumps.rectangles, stumps.starts, stumps.channels)
+        signs = stumps.rectangles[:, 0].copy()
+        return self._patch.corners(stumps.rectangles), signs, stumps.starts, self._patch.planes(stumps.channels), areas
+
+    def scores(
+        self, features: FeatureImage, xy: FloatArray, angles: FloatArray, *, contrast_floor: float, rounds: int
+    ) -> Float32Array:
+        """Scores (n, m) of the first rounds at positions (n, 2) and axes (n,).
+
+        They are divided by the square root of the number of rounds, so that they compare between classifiers.
+        """
+        patch, poses = self._patch, pack_poses(xy, angles, self.scale)
+        out = np.empty((len(poses), len(self.offsets), LANES), np.float32)
+        score_poses_kernel(
+            features.words,
+            features.difference,
+            features.stride,
+            poses,
+            contrast_floor,
+            patch.window,
+            patch.scale.window_area,
+            *self._rectangles,
+            self.stumps.thresholds,
+            self.stumps.leaves,
+            patch.centres(self.offsets),
+            rounds,
+            patch.allocate(),
+            out,
+        )
+        by_pose = out.transpose(0, 2, 1).reshape(-1, len(self.offsets))[: len(xy)]
+        return np.asarray(by_pose / np.float32(np.sqrt(rounds)))
+
+
 def score_poses(
     stumps: BoostedStumps,
     features: FeatureImage,
@@ -404,34 +457,8 @@ def score_poses(
     contrast_floor: float,
     rounds: int | None = None,
 ) -> Float32Array:
-    """Scores (n, offsets) of a classifier's first rounds at positions (n, 2) and axes (n,).
-
-    They are divided by the square root of the number of rounds, so that they compare between classifiers. ``offsets``
-    (m, 2) are whole px along and across the axis.
-    """
+    """Scores (n, offsets) of a classifier's first rounds, all by default, as of `OffsetScorer.scores`."""
     n = len(stumps) if rounds is None else min(rounds, len(stumps))
     channels = features.channels if np.any(stumps.channels[:n] == 3) else 3
-    patch = RotatedPatch.for_offsets(offsets, channels, features.scale)
-    poses = pack_poses(xy, angles, features.scale)
-    out = np.empty((len(poses), len(offsets), LANES), np.float32)
-    score_poses_kernel(
-        features.words,
-        features.difference,
-        features.stride,
-        poses,
-        contrast_floor,
-        patch.window,
-        patch.scale.window_area,
-        patch.corners(stumps.rectangles),
-        stumps.rectangles[:, 0].copy(),
-        stumps.starts,
-        patch.planes(stumps.channels),
-        signed_grey_areas(stumps.rectangles, stumps.starts, stumps.channels),
-        stumps.thresholds,
-        stumps.leaves,
-        patch.centres(offsets),
-        n,
-        patch.allocate(),
-        out,
-    )
-    return np.asarray(out.transpose(0, 2, 1).reshape(-1, len(offsets))[: len(xy)] / np.float32(np.sqrt(n)))
+    scorer = OffsetScorer(stumps, offsets, channels, features.scale)
+    return scorer.scores(features, xy, angles, contrast_floor=contrast_floor, rounds=n)
