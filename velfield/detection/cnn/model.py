@@ -34,6 +34,8 @@ _BORDER = cv2.BORDER_REFLECT_101
 SMOOTHING_SIGMA = 0.8
 """Of the heatmap, in its pixels."""
 _LEAST_PROBABILITY = 1e-6
+_SPAN = 64
+"""Pixels of the heatmap that are searched for peaks, or are not, together."""
 _QUARTER_CAR_PX = 4.0
 
 
@@ -153,7 +155,9 @@ def _cut_kernel(image, corners, height, width):  # type: ignore[no-untyped-def]
     for n in range(len(corners)):
         top, left = corners[n]
         for row in range(height):
-            out[n, row] = image[top + row, left : left + width]
+            source, target = image[top + row], out[n, row]
+            for x in range(np.uint64(width)):
+                target[x] = source[np.uint64(left) + x]
     return out
 
 
@@ -305,29 +309,37 @@ def _peaks_kernel(smooth, orientation, valid, stride, least):  # type: ignore[no
     """A peak is no smaller than its eight neighbours. Its offset is that of a parabola through their logarithms."""
     height, width = smooth.shape
     masked = valid.size > 0
-    count = 0
+    # Most spans of a row hold nothing: to count is vectorised, to look at every pixel is not.
+    counts = np.empty((height, -(-width // _SPAN)), np.int32)
     for y in range(height):
-        for x in range(width):
-            count += smooth[y, x] > least
-    out = np.empty((count, 5))
+        for span in range(counts.shape[1]):
+            counts[y, span] = _count_above(smooth[y, span * _SPAN : (span + 1) * _SPAN], least)
+    out = np.empty((counts.sum(), 5))
     n = 0
-    for y in range(height):
-        for x in range(width):
+    for y, span in np.argwhere(counts):
+        top, bottom = max(y - 1, 0), min(y + 1, height - 1)
+        for x in range(span * _SPAN, min((span + 1) * _SPAN, width)):
             value = smooth[y, x]
             if not value > least or (masked and not valid[y * stride, x * stride]):
                 continue
-            left, right, top, bottom = max(x - 1, 0), min(x + 1, width - 1), max(y - 1, 0), min(y + 1, height - 1)
-            highest = True
-            for v in range(top, bottom + 1):
-                for u in range(left, right + 1):
-                    highest = highest and value >= smooth[v, u]
-            if not highest:
+            left, right = max(x - 1, 0), min(x + 1, width - 1)
+            if value < max(smooth[y, left], smooth[y, right], smooth[top, x], smooth[bottom, x]):
+                continue
+            if value < max(smooth[top, left], smooth[top, right], smooth[bottom, left], smooth[bottom, right]):
                 continue
             out[n, 0] = (x + _offset(smooth[y, left], value, smooth[y, right])) * stride + (stride - 1) / 2
             out[n, 1] = (y + _offset(smooth[top, x], value, smooth[bottom, x])) * stride + (stride - 1) / 2
             out[n, 2], out[n, 3], out[n, 4] = orientation[0, y, x], orientation[1, y, x], value
             n += 1
     return out[:n]
+
+
+@njit(cache=True, nogil=True)
+def _count_above(values, least):  # type: ignore[no-untyped-def]
+    count = np.int32(0)
+    for x in range(np.uint64(values.size)):
+        count += np.int32(values[x] > least)
+    return count
 
 
 @njit(cache=True, nogil=True)
