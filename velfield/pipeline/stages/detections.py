@@ -108,7 +108,7 @@ def detect_block(plan: Plan, frames: range) -> BlockDetections:
     working = WorkingGrid.open(plan, record.scale)
     times_s = open_frames(plan.layout.frames).column("time_s")
     usable = usable_frames(plan)
-    search = _searcher(plan, working, has_background=record.has_background)
+    search = _searcher(plan, working, usable, has_background=record.has_background)
     parts = []
     for frame in frames:
         found = search(frame) if usable[frame] else None
@@ -126,7 +126,9 @@ def _supported(working: WorkingGrid, found: "_Found", frame: int) -> Mask:
     return np.asarray(np.isfinite(working.maps.position_sd_px(frame, raw)))
 
 
-def _searcher(plan: Plan, working: WorkingGrid, *, has_background: bool) -> "Callable[[int], _Found | None]":
+def _searcher(
+    plan: Plan, working: WorkingGrid, usable: Mask, *, has_background: bool
+) -> "Callable[[int], _Found | None]":
     """What gives the cars of a frame: given boxes, a detector of raw frames, or one of the working grid."""
     if plan.job.inputs.detections:
         table = external_boxes(plan)
@@ -134,7 +136,7 @@ def _searcher(plan: Plan, working: WorkingGrid, *, has_background: bool) -> "Cal
     use_device(plan.config.work.device)
     detector = _detector(plan.layout.detector, plan.keys["detector"])
     if not detector.reads_raw_frames:
-        return _Search(plan, working, detector, has_background=has_background).detect
+        return _Search(plan, working, usable, detector, has_background=has_background).detect
     store, threshold = open_frames(plan.layout.frames), plan.config.detection.threshold
 
     def search(frame: int) -> "_Found | None":
@@ -198,10 +200,12 @@ class _Search:
     Groups are counted from the start of the flight, so that results are the same however it is cut into units.
     """
 
-    def __init__(self, plan: Plan, working: WorkingGrid, detector: Detector, *, has_background: bool) -> None:
+    def __init__(
+        self, plan: Plan, working: WorkingGrid, usable: Mask, detector: Detector, *, has_background: bool
+    ) -> None:
         self._plan, self._working, self._has_background = plan, working, has_background
         self._detector = detector
-        self._usable = usable_frames(plan)
+        self._usable = usable
         self._group, self._first = range(0), -1
         self._window: Window | None = None
         self._reference: SearchedFrame | None = None
