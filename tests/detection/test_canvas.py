@@ -34,9 +34,10 @@ from velfield.detection.cnn.network import (
     Topology,
     convolutions,
 )
-from velfield.detection.detector import Crop, shipped_detector
+from velfield.detection.detector import shipped_detector
 
 SIDES = 64, 320
+Rectangle = tuple[int, int, int, int]
 OTHER_TOPOLOGY: Topology = (
     Conv("stem", 3, 1, 4),
     Conv("whole", 3, 4, 4),
@@ -65,6 +66,10 @@ def on_canvases(network: Network, sides_px: Sequence[int] = SIDES) -> Network:
     return same
 
 
+def as_rows(crops: list[Rectangle]) -> IntArray:
+    return np.array(crops, np.int64).reshape(-1, 4)
+
+
 def assert_same(found: tuple[object, object], expected: tuple[object, object]) -> None:
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_array_equal(one, other)  # type: ignore[call-overload]
@@ -72,18 +77,18 @@ def assert_same(found: tuple[object, object], expected: tuple[object, object]) -
 
 @pytest.mark.parametrize("topology", [TOPOLOGY, FORMER_TOPOLOGY, OTHER_TOPOLOGY])
 @pytest.mark.parametrize("crops", [MANY, LARGE, MANY[:1], []], ids=["many", "large", "one", "none"])
-def test_crops_are_predicted_as_if_each_were_alone(topology: Topology, crops: list[Crop]) -> None:
+def test_crops_are_predicted_as_if_each_were_alone(topology: Topology, crops: list[Rectangle]) -> None:
     """Crops of many sizes, at the image's edges, larger than a canvas; of an image that is a part of another one."""
     network = random_network(1, topology)
-    image = grey(5, 504, 900)[:, 50:858]
-    assert_same(predict_crops(on_canvases(network), image, crops), predict_crops(network, image, crops))
+    image, rows = grey(5, 504, 900)[:, 50:858], as_rows(crops)
+    assert_same(predict_crops(on_canvases(network), image, rows), predict_crops(network, image, rows))
 
 
 def test_crops_of_any_alignment_of_an_older_network_are() -> None:
     network, image = random_network(2, FORMER_TOPOLOGY), grey(6, 200, 200)
-    crops = [(4, 0, 12, 20), (60, 100, 140, 100), (20, 28, 4, 4)]
+    rows = as_rows([(4, 0, 12, 20), (60, 100, 140, 100), (20, 28, 4, 4)])
     assert network.alignment == 4
-    assert_same(predict_crops(on_canvases(network), image, crops), predict_crops(network, image, crops))
+    assert_same(predict_crops(on_canvases(network), image, rows), predict_crops(network, image, rows))
 
 
 @pytest.mark.parametrize("border_px", [0, 16])
@@ -113,7 +118,7 @@ def test_detections_are_the_same_with_test_time_augmentation_too() -> None:
 
 def test_without_masks_crops_would_touch_each_other() -> None:
     network, image = random_network(3), grey(10, 64, 64)
-    crops = [(0, 0, 24, 24), (0, 32, 24, 24)]
+    crops = as_rows([(0, 0, 24, 24), (0, 32, 24, 24)])
     canvases = Canvases(network, "cpu", SIDES)
     expected = predict_crops(network, image, crops)
 
@@ -171,7 +176,7 @@ def test_pieces_lie_on_canvases_with_a_gap_between_them(sizes: list[tuple[int, i
 
 @given(UNITS.map(lambda size: 4 * size), UNITS.map(lambda size: 4 * size), st.sampled_from([4, 8]))
 def test_pieces_without_their_halos_are_the_crop_once(height: int, width: int, unit: int) -> None:
-    pieces = cut_into_pieces([(16, 24, height, width)], 320, unit)
+    pieces = cut_into_pieces(as_rows([(16, 24, height, width)]), 320, unit)
     assert (pieces[:, 2:4] <= 320).all()
     assert (pieces[:, :4] % unit == 0).all()
     covered = np.zeros((height, width), int)
@@ -187,8 +192,8 @@ def test_pieces_without_their_halos_are_the_crop_once(height: int, width: int, u
     assert (covered == 1).all()
 
 
-def pieces_of(crops: list[Crop]) -> IntArray:
-    return cut_into_pieces(crops, 320, 8)
+def pieces_of(crops: list[Rectangle]) -> IntArray:
+    return cut_into_pieces(as_rows(crops), 320, 8)
 
 
 def test_what_is_copied_is_what_slices_copy() -> None:

@@ -13,7 +13,10 @@ from velfield.detection.cascade.feature_image import (
     PAD_PX,
     FeatureImage,
     PatchScale,
+    RotatedPatch,
     compute_features,
+    fill_integrals,
+    pack_poses,
     pack_words_kernel,
     score_poses,
 )
@@ -102,6 +105,29 @@ def plain_score(of: BoostedStumps, patch: np.ndarray, reach: tuple[int, int], ro
         value = plain_value(patch, reach, of.channels[k], of.rectangles[of.starts[k] : of.starts[k + 1]])
         total += of.leaves[k, int(value > of.thresholds[k])]
     return total / np.sqrt(rounds)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_integral_images_are_sums_over_the_nearest_pixels(channels: int) -> None:
+    features = compute_features(noise(4), noise(5))
+    rng = np.random.default_rng(6)
+    poses = pack_poses(rng.uniform(5, 70, (16, 2)), rng.uniform(0, np.pi, 16), FINE)[0]
+    patch = RotatedPatch.for_offsets(np.array([[3, 0]], np.int64), channels, FINE)
+    found = patch.allocate()
+    fill_integrals(features.words, features.difference, features.stride, poses, channels, found)
+    v, u = (np.float32(np.arange(size) - (size - 1) / 2) for size in (patch.across, patch.along))
+    x, y = (
+        (poses[k] + v[:, None] * poses[4 + k])[:, None] + u[:, None] * poses[2 + k] for k in (0, 1)
+    )  # (across, along, LANES)
+    index = y.astype(np.int32) * features.stride + x.astype(np.int32)
+    words = features.words[index]
+    gx, gy = (np.float32((words >> shift & 1023).astype(np.int32) - 512) for shift in (8, 18))
+    c, s = poses[6], poses[7]
+    sampled = [words & 255, np.abs(gx * c + gy * s), np.abs(gy * c - gx * s), features.difference[index]]
+    expected = np.zeros_like(found)
+    for k in range(channels):
+        expected[k, 1:, 1:] = sampled[k].astype(np.int32).cumsum(axis=0).cumsum(axis=1)
+    np.testing.assert_array_equal(found, expected)
 
 
 @given(SEEDS)

@@ -19,7 +19,7 @@ from velfield.detection.detect import (
 )
 from velfield.detection.detector import Detections, concatenate, shipped_detector
 from velfield.detection.frame import ComparableFrame, half_resolution
-from velfield.detection.mosaic import Box, find_in_boxes, owners_kernel, pack_boxes
+from velfield.detection.mosaic import Box, assemble_kernel, find_in_boxes, owners_kernel, pack_boxes
 
 _SHAPE = 300, 420
 
@@ -145,6 +145,55 @@ def test_what_is_found_in_a_mosaic_of_boxes_is_what_is_found_in_each_box() -> No
     alone = [find_in_boxes(detector, searched, None, [box], 0.0) for box in boxes]
     assert [len(one) for one in alone] == [1, 1, 1, 1, 1]
     np.testing.assert_allclose(together.to_rows(), concatenate(alone).to_rows(), rtol=0, atol=1e-4)
+
+
+def test_boxes_lie_on_shelves_the_tallest_first() -> None:
+    rng = np.random.default_rng(9)
+    boxes: list[Box] = [(0, 0, int(rows), int(columns)) for rows, columns in rng.integers(1, 60, (80, 2))]
+    sizes = [(8 * rows + 32, 8 * columns + 32) for _, _, rows, columns in boxes]
+    expected: list[list[tuple[int, ...]]] = [[]]
+    y = x = shelf = 0
+    for k in sorted(range(len(boxes)), key=lambda k: (-sizes[k][0], sizes[k][1], k)):
+        height, width = sizes[k]
+        if x and x + width > 1024:
+            y, x, shelf = y + shelf, 0, 0
+        if y and not x and y + height > 1024:
+            expected.append([])
+            y = 0
+        expected[-1].append((k, y, x, height, width))
+        x, shelf = x + width, max(shelf, height)
+    found = pack_boxes(boxes, 16)
+    assert len(found) > 2
+    assert [np.column_stack([one.numbers, one.crops]).tolist() for one in found] == [
+        [list(row) for row in rows] for rows in expected
+    ]
+    for one, rows in zip(found, expected, strict=True):
+        assert one.shape == (max(row[1] + row[3] for row in rows), max(row[2] + row[4] for row in rows))
+    assert pack_boxes([], 16) == []
+
+
+@pytest.mark.parametrize("border", [cv2.BORDER_REFLECT_101, cv2.BORDER_CONSTANT])
+def test_windows_that_reach_beyond_the_image_go_on_as_opencv_continues_them(border: int) -> None:
+    image = np.random.default_rng(7).integers(1, 256, (50, 60), dtype=np.uint8)
+    windows = [
+        (-16, -16, 40, 48),
+        (5, 7, 40, 40),
+        (33, 43, 40, 40),
+        (47, 10, 24, 40),
+        (-23, 59, 24, 24),
+        (-8, -8, 80, 90),
+    ]
+    crops = np.array(
+        [(0, 0, 40, 48), (0, 48, 40, 40), (40, 0, 40, 40), (40, 40, 24, 40), (0, 88, 24, 24), (80, 2, 80, 90)]
+    )
+    expected = np.zeros((160, 112), np.uint8)
+    for (top, left, rows, columns), (y, x, _, _) in zip(windows, crops, strict=True):
+        inside = image[max(0, top) : top + rows, max(0, left) : left + columns]
+        beyond = max(0, -top), max(0, top + rows - 50), max(0, -left), max(0, left + columns - 60)
+        expected[y : y + rows, x : x + columns] = cv2.copyMakeBorder(inside, *beyond, border)
+    reflected = border == cv2.BORDER_REFLECT_101
+    found = assemble_kernel(image, np.array(windows)[:, :2], crops, 160, 112, reflected)
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_a_position_belongs_to_the_box_of_the_crop_that_it_lies_in() -> None:

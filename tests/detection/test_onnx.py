@@ -350,9 +350,8 @@ def test_a_run_detects_with_it_on_raw_frames(whole: tuple[Path, RunSummary], tmp
     raw = detector.detect_raw(run.frames.read(frame), threshold=0.75)
     assert len(raw) > 3
     expected = run.to_base(frame, raw[["x_px", "y_px"]].to_numpy())
-    assert sorted_rows(block.table[["x_px", "y_px"]].round(1)) == sorted_rows(
-        expected[np.isfinite(expected[:, 0])].round(1)
-    )
+    found = np.column_stack([block.cars.column["x_px"], block.cars.column["y_px"]])
+    assert sorted_rows(found.round(1)) == sorted_rows(expected[np.isfinite(expected[:, 0])].round(1))
     assert block.searched.tolist() == [1.0]
 
 

@@ -24,8 +24,8 @@ from velfield.detection.cnn.quantization import (
     FirstLayer,
     calibrate,
     is_exact,
+    place_heatmaps_kernel,
     quantized_to_onnx,
-    unpack_heatmap_kernel,
 )
 from velfield.detection.detector import load_detector, shipped_detector
 
@@ -105,16 +105,24 @@ def test_the_first_layer_is_a_strided_convolution_in_blocks(shape: tuple[int, in
     count, rows, columns = shape[0], shape[1] // 2, shape[2] // 2
     framed = np.pad(levels.reshape(count, rows, columns, 16), ((0, 0), (1, 1), (1, 1), (0, 0)))
     blocks = framed.reshape(count, rows // 2 + 1, 2, columns // 2 + 1, 2, 16).transpose(0, 1, 3, 2, 4, 5)
-    found = FirstLayer(weights, biases, factors).blocks(images)
+    corners = np.column_stack([3 + shape[1] * np.arange(count), np.full(count, 5)])
+    around = np.pad(images.reshape(-1, shape[2]), ((3, 2), (5, 1)), constant_values=255)
+    found = FirstLayer(weights, biases, factors).blocks(around, corners, *shape[1:])
     np.testing.assert_array_equal(found, blocks.reshape(found.shape))
 
 
-def test_the_blocks_of_the_head_are_a_heatmap() -> None:
+def test_the_blocks_of_the_head_are_heatmaps_where_crops_lie() -> None:
     values = np.random.default_rng(6).normal(size=(2, 3, 5, 12)).astype(np.float32)
     pixels = values.reshape(2, 3, 5, 2, 2, 3).transpose(0, 5, 1, 3, 2, 4).reshape(2, 3, 6, 10)
-    heatmap, vectors = unpack_heatmap_kernel(np.exp(values), values)
-    np.testing.assert_array_equal(heatmap, np.exp(pixels[:, 0]))
-    np.testing.assert_array_equal(vectors, pixels[:, 1:])
+    heatmap, vectors = np.zeros((20, 24), np.float32), np.zeros((2, 20, 24), np.float32)
+    flat, corners = values.reshape(-1, 12), np.array([(8, 4), (20, 28)])
+    place_heatmaps_kernel(np.exp(flat), flat, corners, 3, 5, heatmap, vectors)
+    for n, (top, left) in enumerate(corners // 2):
+        part = np.s_[top : top + 6, left : left + 10]
+        np.testing.assert_array_equal(heatmap[part], np.exp(pixels[n, 0]))
+        np.testing.assert_array_equal(vectors[:, *part], pixels[n, 1:])
+    assert np.count_nonzero(heatmap) == 2 * 60
+    assert np.count_nonzero(vectors) == 4 * 60
 
 
 @pytest.mark.usefixtures("exact")
@@ -146,10 +154,10 @@ def test_of_long_crops_of_one_size_each_is_predicted() -> None:
     """They are longer than a tile, and several would fit into a batch."""
     network = shipped_detector().network  # type: ignore[attr-defined]
     image = np.random.default_rng(4).integers(0, 256, (64, 2112), dtype=np.uint8)
-    crops = [(0, 0, 24, 2056), (32, 16, 24, 2056)]
+    crops = np.array([(0, 0, 24, 2056), (32, 16, 24, 2056)])
     together = predict_crops(network, image, crops)
     for y, x, height, width in crops:
-        alone = predict_crops(network, image, [(y, x, height, width)])
+        alone = predict_crops(network, image, np.array([(y, x, height, width)]))
         part = slice(y // 2, (y + height) // 2), slice(x // 2, (x + width) // 2)
         np.testing.assert_array_equal(together[0][part], alone[0][part])
         assert alone[0][part].any()
@@ -158,7 +166,7 @@ def test_of_long_crops_of_one_size_each_is_predicted() -> None:
 
 def test_crops_of_an_image_are_predicted_as_if_alone() -> None:
     network, image = shipped().network, cars(2, (120, 160))
-    crops = ((0, 0, 48, 40), (0, 40, 48, 40), (48, 8, 64, 104), (8, 80, 40, 48))
+    crops = np.array([(0, 0, 48, 40), (0, 40, 48, 40), (48, 8, 64, 104), (8, 80, 40, 48)])
     probability, orientation = np.zeros((60, 80), np.float32), np.zeros((2, 60, 80), np.float32)
     for y, x, height, width in crops:
         part = slice(y // 2, (y + height) // 2), slice(x // 2, (x + width) // 2)

@@ -69,6 +69,17 @@ def test_patches_come_back_by_name(tmp_path: Path) -> None:
     assert list(tmp_path.glob("*.partial")) == []
 
 
+def test_arrays_in_parts_are_written_as_numpy_writes_them_whole(tmp_path: Path) -> None:
+    whole = {"crops": np.arange(60, dtype=np.uint8).reshape(5, 3, 4), "xy": np.arange(8.0).reshape(2, 4).T}
+    whole |= {"scale": np.array(0.5), "none": np.empty((0, 2))}
+    crops = [whole["crops"][:0], whole["crops"][:2], whole["crops"][2:]]
+    write_arrays(tmp_path / "parts.npz", whole | {"crops": crops, "xy": np.ascontiguousarray(whole["xy"])})
+    np.savez(tmp_path / "whole.npz", allow_pickle=False, **(whole | {"xy": np.ascontiguousarray(whole["xy"])}))
+    assert (tmp_path / "parts.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()
+    write_arrays(tmp_path / "columns.npz", {"xy": whole["xy"]})
+    np.testing.assert_array_equal(read_arrays(tmp_path / "columns.npz")["xy"], whole["xy"])
+
+
 def test_a_second_name_has_the_same_bytes_and_does_not_follow_a_replacement(tmp_path: Path) -> None:
     source, target = tmp_path / "a.bin", tmp_path / "deep/b.bin"
     source.write_bytes(b"one")

@@ -70,7 +70,8 @@ def changed_kernel(boxes, slow, slope, valid, other_valid, limit, shift):  # typ
     about, above = np.empty(width, np.float32), np.empty(width, np.bool_)
     for row in range(np.uint64(slow.shape[0])):
         for column in range(np.uint64(slow.shape[1])):
-            about[column * side : (column + np.uint64(1)) * side] = slow[row, column]
+            for x in range(column * side, min((column + np.uint64(1)) * side, width)):
+                about[x] = slow[row, column]
         above[:] = False
         for y in range(row * side, min((row + np.uint64(1)) * side, height)):
             for x in range(width):

@@ -115,7 +115,9 @@ def _chips_kernel(image, corners, side):  # type: ignore[no-untyped-def]
         left, top = corners[n]
         if 0 <= left <= width - side and 0 <= top <= height - side:
             for i in range(side):
-                out[n, i] = image[top + i, left : left + side]
+                source, target = image[top + i], out[n, i]
+                for j in range(np.uint64(side)):
+                    target[j] = source[np.uint64(left) + j]
             continue
         for i in range(side):
             y = min(max(corners[n, 1] + i, 0), height - 1)
@@ -430,15 +432,28 @@ def _find_extents(cells, box, of_rows, of_columns):  # type: ignore[no-untyped-d
     Returns their number.
     """
     top, left, bottom, right = box
-    count = 0
-    of_rows[top:bottom, 0], of_rows[top:bottom, 1] = right, 0
-    of_columns[left:right, 0], of_columns[left:right, 1] = bottom, 0
+    width, count = np.uint64(right - left), 0
+    # Of the columns, counted from ``left``: without a branch on each cell, so that the loop is vectorised.
+    first, last = np.full(right - left, bottom, np.int32), np.zeros(right - left, np.int32)
     for row in range(top, bottom):
-        for column in range(left, right):
-            if cells[row, column]:
-                of_rows[row, 0], of_rows[row, 1] = min(of_rows[row, 0], column), column + 1
-                of_columns[column, 0], of_columns[column, 1] = min(of_columns[column, 0], row), row + 1
-                count += 1
+        line, marked, below, after = cells[row, left:right], np.int32(0), np.int32(row), np.int32(row + 1)
+        for column in range(width):
+            marked += np.int32(line[column])
+        of_rows[row, 0], of_rows[row, 1] = right, 0
+        if marked == 0:
+            continue
+        count += int(marked)
+        for column in range(width):
+            first[column] = min(first[column], below) if line[column] else first[column]
+            last[column] = after if line[column] else last[column]
+        begin, end = left, right
+        while not cells[row, begin]:
+            begin += 1
+        while not cells[row, end - 1]:
+            end -= 1
+        of_rows[row, 0], of_rows[row, 1] = begin, end
+    for column in range(width):
+        of_columns[left + column, 0], of_columns[left + column, 1] = first[column], last[column]
     return count
 
 

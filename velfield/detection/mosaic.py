@@ -8,13 +8,12 @@ the network), or else one after another (`Detector.find_in_crops`); candidates i
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numba import njit
 
 from schemas.arrays import GreyImage, IntArray
 from velfield.detection.changes import CELL_PX
-from velfield.detection.detector import Crop, Detections, Detector, concatenate
+from velfield.detection.detector import Detections, Detector, concatenate
 from velfield.detection.frame import SearchableFrame
 
 Box = tuple[int, int, int, int]
@@ -30,39 +29,44 @@ class Mosaic:
     Attributes
     ----------
     shape : (height, width), px.
-    numbers : of the boxes, in the order of the crops.
-    crops : where they lie.
+    numbers : (n,) of the boxes, in the order of the crops.
+    crops : (n, 4) where they lie: first row, first column, height and width.
     """
 
     shape: tuple[int, int]
     numbers: IntArray
-    crops: tuple[Crop, ...]
+    crops: IntArray
 
 
 def pack_boxes(boxes: Sequence[Box], context_px: int) -> list[Mosaic]:
     """Pack boxes with their context into mosaics, the tallest first."""
-    around = 2 * context_px
-    sizes = [(CELL_PX * (box[2] - box[0]) + around, CELL_PX * (box[3] - box[1]) + around) for box in boxes]
-    mosaics: list[Mosaic] = []
-    numbers: list[int] = []
-    crops: list[Crop] = []
-    y = x = shelf = 0
-    for k in sorted(range(len(boxes)), key=lambda k: (-sizes[k][0], sizes[k][1], k)):
+    if not len(boxes):
+        return []
+    cells = np.array(boxes)
+    sizes = CELL_PX * (cells[:, 2:] - cells[:, :2]) + 2 * context_px
+    order = np.lexsort((sizes[:, 1], -sizes[:, 0]))
+    number, corners = shelve_kernel(sizes[order], _SIDE_PX)
+    crops = np.column_stack([corners, sizes[order]])
+    ends = np.flatnonzero(np.diff(number)) + 1
+    parts = zip(np.split(order, ends), np.split(crops, ends), strict=True)
+    return [Mosaic((int((of[:, 0] + of[:, 2]).max()), int((of[:, 1] + of[:, 3]).max())), one, of) for one, of in parts]
+
+
+@njit(cache=True, nogil=True)
+def shelve_kernel(sizes, side):  # type: ignore[no-untyped-def]
+    """Number of the mosaic (n,) of crops of sizes (n, 2), height and width, the tallest first, and its corner there
+    (n, 2): row and column. A mosaic is no larger than a side, unless a crop is."""
+    number, corners = np.zeros(len(sizes), np.int64), np.zeros((len(sizes), 2), np.int64)
+    mosaic = y = x = shelf = 0
+    for k in range(len(sizes)):
         height, width = sizes[k]
-        if x and x + width > _SIDE_PX:
+        if x > 0 and x + width > side:
             y, x, shelf = y + shelf, 0, 0
-        if y and not x and y + height > _SIDE_PX:
-            mosaics.append(_close(numbers, crops))
-            numbers, crops, y = [], [], 0
-        numbers.append(k)
-        crops.append((y, x, height, width))
+        if y > 0 and x == 0 and y + height > side:
+            mosaic, y = mosaic + 1, 0
+        number[k], corners[k, 0], corners[k, 1] = mosaic, y, x
         x, shelf = x + width, max(shelf, height)
-    return [*mosaics, _close(numbers, crops)] if crops else mosaics
-
-
-def _close(numbers: list[int], crops: list[Crop]) -> Mosaic:
-    shape = max(y + height for y, _, height, _ in crops), max(x + width for _, x, _, width in crops)
-    return Mosaic(shape, np.array(numbers), tuple(crops))
+    return number, corners
 
 
 def find_in_boxes(
@@ -98,13 +102,12 @@ def _find_in_mosaic(
     threshold: float | None,
 ) -> tuple[Detections, IntArray]:
     """The candidates of a mosaic, in px of the frame, and the number of the box of each."""
-    context = detector.context_px
-    corners = np.array([boxes[k][:2] for k in mosaic.numbers]) * CELL_PX - context
-    image = _assemble(frame.image, corners, mosaic, cv2.BORDER_REFLECT_101)
-    valid = _assemble(frame.valid.view(np.uint8), corners, mosaic, cv2.BORDER_CONSTANT).view(np.bool_)
-    ground = None if background is None else _assemble(background, corners, mosaic, cv2.BORDER_REFLECT_101)
-    found = detector.find_in_crops(image, valid, ground, mosaic.crops, threshold=threshold)
-    placed = np.array(mosaic.crops)
+    context, placed = detector.context_px, mosaic.crops
+    corners = np.array(boxes)[mosaic.numbers, :2] * CELL_PX - context
+    image = assemble_kernel(frame.image, corners, placed, *mosaic.shape, True)
+    valid = assemble_kernel(frame.valid.view(np.uint8), corners, placed, *mosaic.shape, False).view(np.bool_)
+    ground = None if background is None else assemble_kernel(background, corners, placed, *mosaic.shape, True)
+    found = detector.find_in_crops(image, valid, ground, placed, threshold=threshold)
     crop = owners_kernel(found.xy, placed, context, *mosaic.shape)
     inside = np.flatnonzero(crop >= 0)
     found, crop = found.take(inside), crop[inside]
@@ -128,15 +131,41 @@ def owners_kernel(xy, crops, context, height, width):  # type: ignore[no-untyped
     return out
 
 
-def _assemble(image: GreyImage, corners: IntArray, mosaic: Mosaic, border: int) -> GreyImage:
-    """A mosaic of the windows of an image with these corners (n, 2), beyond the image by OpenCV's border mode."""
-    assembled = np.zeros(mosaic.shape, np.uint8)
-    height, width = image.shape
-    for (top, left), (row, column, rows, columns) in zip(corners.tolist(), mosaic.crops, strict=True):
-        bottom, right = top + rows, left + columns
-        inside = image[max(0, top) : bottom, max(0, left) : right]
-        if top < 0 or left < 0 or bottom > height or right > width:
-            outside = max(0, -top), max(0, bottom - height), max(0, -left), max(0, right - width)
-            inside = np.asarray(cv2.copyMakeBorder(inside, *outside, border), np.uint8)
-        assembled[row : row + rows, column : column + columns] = inside
-    return assembled
+@njit(cache=True, nogil=True)
+def assemble_kernel(image, corners, crops, height, width, reflected):  # type: ignore[no-untyped-def]
+    """A mosaic (height, width) of the windows of an image with these corners (n, 2), where crops (n, 4) lie.
+
+    Beyond the image a window is zero, or what of it lies inside goes on by reflection (OpenCV's BORDER_REFLECT_101).
+    """
+    out = np.zeros((height, width), np.uint8)
+    for n in range(len(crops)):
+        row, column, rows, columns = crops[n]
+        top, left = corners[n]
+        first_row, first_column = max(0, -top), max(0, -left)
+        inner_rows = min(rows, image.shape[0] - top) - first_row
+        inner_columns = min(columns, image.shape[1] - left) - first_column
+        whole = inner_rows == rows and inner_columns == columns
+        for y in range(rows):
+            inside = 0 <= y - first_row < inner_rows
+            if not inside and not reflected:
+                continue
+            source = image[top + first_row + _reflect(y - first_row, inner_rows)]
+            target = out[row + y, column : column + columns]
+            shift, begin = left + first_column, np.uint64(first_column)
+            # By a loop: numba assigns slices byte by byte, at seven times the cost.
+            for x in range(np.uint64(inner_columns)):
+                target[begin + x] = source[np.uint64(shift) + x]
+            if reflected and not whole:
+                for x in range(first_column):
+                    target[x] = source[shift + _reflect(x - first_column, inner_columns)]
+                for x in range(first_column + inner_columns, columns):
+                    target[x] = source[shift + _reflect(x - first_column, inner_columns)]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _reflect(place, count):  # type: ignore[no-untyped-def]
+    """The place among so many that one beyond them is the mirror image of, about the first or the last."""
+    while not 0 <= place < count:
+        place = 0 if count == 1 else -place if place < 0 else 2 * count - 2 - place
+    return place

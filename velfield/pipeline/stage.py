@@ -249,7 +249,7 @@ STAGES: tuple[Stage, ...] = (
     # Cars of each block, then one table with their crops.
     Stage(
         name="detections",
-        version=16,
+        version=17,
         label="detections",
         lines=(
             Line(

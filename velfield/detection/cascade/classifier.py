@@ -30,7 +30,13 @@ from numba import njit
 from schemas.arrays import Float32Array, FloatArray, IntArray, Mask
 from schemas.detector import LongVehicleRecord
 from velfield.detection.boosting import BoostedStumps
-from velfield.detection.cascade.feature_image import FeatureImage, PatchScale, features_of_reduced, score_poses
+from velfield.detection.cascade.feature_image import (
+    FeatureImage,
+    OffsetScorer,
+    PatchScale,
+    features_of_reduced,
+    score_poses,
+)
 from velfield.detection.detector import Detections, concatenate
 from velfield.detection.frame import SearchableFrame
 from velfield.detection.orientation import CAR_ASPECT
@@ -323,6 +329,11 @@ class LongVehicleClassifier:
         """Its rounds."""
         return BoostedStumps.from_rounds(self.record.rounds)
 
+    @cached_property
+    def scorer(self) -> OffsetScorer:
+        """These at `OFFSETS`: they read no background."""
+        return OffsetScorer(self.stumps, OFFSETS, 3, LONG)
+
     def scores(
         self, features: FeatureImage, xy: FloatArray, axes: FloatArray, rounds: int | None = None
     ) -> Float32Array:
@@ -330,8 +341,8 @@ class LongVehicleClassifier:
 
         By the first rounds alone where a number of them is given.
         """
-        floor = self.record.contrast_floor
-        return score_poses(self.stumps, features, xy, axes, OFFSETS, contrast_floor=floor, rounds=rounds)
+        n = len(self.stumps) if rounds is None else min(rounds, len(self.stumps))
+        return self.scorer.scores(features, xy, axes, contrast_floor=self.record.contrast_floor, rounds=n)
 
     def centre(self, features: FeatureImage, cars: FloatArray, valid: Mask, settled: Mask | None = None) -> FloatArray:
         """Cars (n, 2...) as x, y, axis, the best first: long vehicles at their centre, one detection each.

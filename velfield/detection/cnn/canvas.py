@@ -31,7 +31,6 @@ from velfield.detection.cnn.network import (
     Topology,
     open_session,
 )
-from velfield.detection.detector import Crop
 
 _SIDES_PX = 320, 1152
 """Most frames' crops lie on one canvas of the larger; few small ones, as in test-time augmentation, on the smaller."""
@@ -118,12 +117,12 @@ class Canvases:
     def predict(self, images: GreyImage) -> tuple[Float32Array, Float32Array]:
         """As `Network.predict`."""
         count, height, width = images.shape
-        crops = [(k * height, 0, height, width) for k in range(count)]
+        crops = np.array([(k * height, 0, height, width) for k in range(count)], np.int64).reshape(-1, 4)
         probability, orientation = self.predict_crops(images.reshape(count * height, width), crops)
         shape = count, height // STRIDE, width // STRIDE
         return probability.reshape(shape), orientation.reshape(2, *shape).transpose(1, 0, 2, 3)
 
-    def predict_crops(self, image: GreyImage, crops: Sequence[Crop]) -> tuple[Float32Array, Float32Array]:
+    def predict_crops(self, image: GreyImage, crops: IntArray) -> tuple[Float32Array, Float32Array]:
         """As `model.predict_crops`."""
         probability = np.zeros((image.shape[0] // STRIDE, image.shape[1] // STRIDE), np.float32)
         orientation = np.zeros((2, *probability.shape), np.float32)
@@ -150,7 +149,7 @@ class Canvases:
         return side, places
 
 
-def cut_into_pieces(crops: Sequence[Crop], side_px: int, unit: int) -> IntArray:
+def cut_into_pieces(crops: IntArray, side_px: int, unit: int) -> IntArray:
     """Crops, those larger than a canvas in tiles with halos, which do not reach over the crop.
 
     Returns
@@ -159,7 +158,7 @@ def cut_into_pieces(crops: Sequence[Crop], side_px: int, unit: int) -> IntArray:
     """
     pieces = [
         (top + y, left + x, rows, columns, above, before, below, after)
-        for top, left, height, width in crops
+        for top, left, height, width in crops.tolist()
         for y, rows, above, below in _tile_spans(height, side_px, unit)
         for x, columns, before, after in _tile_spans(width, side_px, unit)
     ]

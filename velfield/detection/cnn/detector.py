@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from schemas.arrays import GreyImage, Mask
+from schemas.arrays import GreyImage, IntArray, Mask
 from schemas.detector import CascadeConfig, CnnConfig, CnnRecord, DetectorConfig
 from velfield.detection.cascade.classifier import suppress_and_centre
 from velfield.detection.cascade.detector import CascadeDetector
@@ -24,7 +24,7 @@ from velfield.detection.cnn.network import (
 )
 from velfield.detection.cnn.quantization import calibrate, is_exact
 from velfield.detection.cnn.self_training import self_train_from_motion
-from velfield.detection.detector import Crop, Detections, Detector, shipped_detector, train_detector
+from velfield.detection.detector import Detections, Detector, shipped_detector, train_detector
 from velfield.detection.frame import SearchableFrame, whole_frame
 from velfield.detection.orientation import CAR_ASPECT
 from velfield.detection.samples import LabelledImage
@@ -105,7 +105,7 @@ class CnnDetector(Detector):
         image: GreyImage,
         valid: Mask | None,
         background: GreyImage | None,
-        crops: Sequence[Crop],
+        crops: IntArray,
         *,
         threshold: float | None = None,
     ) -> Detections:
@@ -125,7 +125,7 @@ class CnnDetector(Detector):
         threshold: float | None,
         *,
         border_px: int = 0,
-        crops: Sequence[Crop] | None = None,
+        crops: IntArray | None = None,
     ) -> Detections:
         length_px, motion = self.record.working_car_length_px, self.record.motion
         rows = detect_cars(self.network, image, valid, self.record.tta_range, border_px=border_px, crops=crops)

@@ -11,16 +11,16 @@ A detector adapted to a flight by self-training adds a score bonus where the fra
 """
 
 import math
-from collections.abc import Sequence
+from functools import partial
 
 import cv2
 import numpy as np
 from numba import njit
 
-from schemas.arrays import Float32Array, FloatArray, GreyImage, Mask
+from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
 from schemas.detector import MotionRecord
 from velfield.detection.cnn.network import STRIDE, Network
-from velfield.detection.detector import Crop
+from velfield.detection.cnn.quantization import BlockPredict
 from velfield.detection.orientation import sample_nearest
 
 _TILE_PX, HALO_PX = 2048, 64
@@ -34,6 +34,8 @@ _BORDER = cv2.BORDER_REFLECT_101
 SMOOTHING_SIGMA = 0.8
 """Of the heatmap, in its pixels."""
 _LEAST_PROBABILITY = 1e-6
+_SPAN = 64
+"""Pixels of the heatmap that are searched for peaks, or are not, together."""
 _QUARTER_CAR_PX = 4.0
 
 
@@ -75,7 +77,7 @@ def predict_heatmap(
     end = [border_px + size - given for size, given in zip(whole, image.shape, strict=True)]
     padded = cv2.copyMakeBorder(image, border_px, end[0], border_px, end[1], _BORDER) if any(end) else image
     if network.canvases is not None:
-        of_padded = network.canvases.predict_crops(padded, [(0, 0, *padded.shape)])
+        of_padded = network.canvases.predict_crops(padded, np.array([(0, 0, *padded.shape)]))
         rows, columns = (slice(border_px // STRIDE, -(-(border_px + size) // STRIDE)) for size in image.shape)
         return of_padded[0][rows, columns], of_padded[1][:, rows, columns]
     if len(range(0, whole[0], side[0])) == len(range(0, whole[1], side[1])) == 1 and not border_px:
@@ -98,7 +100,7 @@ def predict_heatmap(
     return probability[: size[0], : size[1]], orientation[:, : size[0], : size[1]]
 
 
-def predict_crops(network: Network, image: GreyImage, crops: Sequence[Crop]) -> tuple[Float32Array, Float32Array]:
+def predict_crops(network: Network, image: GreyImage, crops: IntArray) -> tuple[Float32Array, Float32Array]:
     """The same of crops of an image, each predicted as if it were alone; those of one size in one call.
 
     Parameters
@@ -106,7 +108,8 @@ def predict_crops(network: Network, image: GreyImage, crops: Sequence[Crop]) -> 
     image
         (h, w) uint8, even.
     crops
-        Disjoint, at multiples of `Network.alignment` and of such sizes.
+        (n, 4) first row, first column, height and width; disjoint, at multiples of `Network.alignment` and of such
+        sizes.
 
     Returns
     -------
@@ -116,22 +119,39 @@ def predict_crops(network: Network, image: GreyImage, crops: Sequence[Crop]) -> 
         return network.canvases.predict_crops(image, crops)
     probability = np.zeros((image.shape[0] // STRIDE, image.shape[1] // STRIDE), np.float32)
     orientation = np.zeros((2, *probability.shape), np.float32)
-    by_size: dict[tuple[int, int], list[tuple[int, int]]] = {}
-    for y, x, height, width in crops:
-        by_size.setdefault((height, width), []).append((y, x))
-    for (height, width), alike in by_size.items():
+    predict = network.predict
+    fill = predict.fill_crops if isinstance(predict, BlockPredict) else partial(_fill_crops, network)
+    by_size = crops[np.lexsort((crops[:, 3], crops[:, 2]))]
+    changes = np.flatnonzero((by_size[1:, 2:] != by_size[:-1, 2:]).any(axis=1)) + 1
+    begin = 0
+    for end in [*changes, len(by_size)] if len(by_size) else []:
+        height, width = by_size[begin, 2:].tolist()
         tiled = max(height, width) > _TILE_PX
-        corners, at_once = np.array(alike), 1 if tiled else max(1, _BATCH_PX // (height * width))
-        for start in range(0, len(corners), at_once):
-            batch = corners[start : start + at_once]
-            pixels = _cut_kernel(image, batch, height, width)
-            if tiled:
-                heatmap, vector = predict_heatmap(network, pixels[0], border_px=0)
-                heatmaps, vectors = heatmap[None], vector[None]
-            else:
-                heatmaps, vectors = forward(network, pixels)
-            _place_kernel(heatmaps, vectors, batch // STRIDE, probability, orientation)
+        at_once = 1 if tiled else max(1, _BATCH_PX // (height * width))
+        for start in range(begin, end, at_once):
+            corners = by_size[start : min(start + at_once, end), :2]
+            (partial(_fill_crops, network) if tiled else fill)(image, corners, height, width, probability, orientation)
+        begin = end
     return probability, orientation
+
+
+def _fill_crops(
+    network: Network,
+    image: GreyImage,
+    corners: IntArray,
+    height: int,
+    width: int,
+    probability: Float32Array,
+    orientation: Float32Array,
+) -> None:
+    """As `BlockPredict.fill_crops` does, of any network, or of one crop of any size."""
+    pixels = _cut_kernel(image, corners, height, width)
+    if max(height, width) > _TILE_PX:
+        heatmap, vector = predict_heatmap(network, pixels[0], border_px=0)
+        heatmaps, vectors = heatmap[None], vector[None]
+    else:
+        heatmaps, vectors = forward(network, pixels)
+    _place_kernel(heatmaps, vectors, corners // STRIDE, probability, orientation)
 
 
 @njit(cache=True, nogil=True)
@@ -141,7 +161,9 @@ def _cut_kernel(image, corners, height, width):  # type: ignore[no-untyped-def]
     for n in range(len(corners)):
         top, left = corners[n]
         for row in range(height):
-            out[n, row] = image[top + row, left : left + width]
+            source, target = image[top + row], out[n, row]
+            for x in range(np.uint64(width)):
+                target[x] = source[np.uint64(left) + x]
     return out
 
 
@@ -186,7 +208,7 @@ def detect_cars(
     tta_range: tuple[float, float] = NO_TTA,
     *,
     border_px: int = BORDER_PX,
-    crops: Sequence[Crop] | None = None,
+    crops: IntArray | None = None,
 ) -> FloatArray:
     """Detect cars in a frame, or in an image of crops; a car may be detected several times, see `nms_oriented`.
 
@@ -293,29 +315,37 @@ def _peaks_kernel(smooth, orientation, valid, stride, least):  # type: ignore[no
     """A peak is no smaller than its eight neighbours. Its offset is that of a parabola through their logarithms."""
     height, width = smooth.shape
     masked = valid.size > 0
-    count = 0
+    # Most spans of a row hold nothing: to count is vectorised, to look at every pixel is not.
+    counts = np.empty((height, -(-width // _SPAN)), np.int32)
     for y in range(height):
-        for x in range(width):
-            count += smooth[y, x] > least
-    out = np.empty((count, 5))
+        for span in range(counts.shape[1]):
+            counts[y, span] = _count_above(smooth[y, span * _SPAN : (span + 1) * _SPAN], least)
+    out = np.empty((counts.sum(), 5))
     n = 0
-    for y in range(height):
-        for x in range(width):
+    for y, span in np.argwhere(counts):
+        top, bottom = max(y - 1, 0), min(y + 1, height - 1)
+        for x in range(span * _SPAN, min((span + 1) * _SPAN, width)):
             value = smooth[y, x]
             if not value > least or (masked and not valid[y * stride, x * stride]):
                 continue
-            left, right, top, bottom = max(x - 1, 0), min(x + 1, width - 1), max(y - 1, 0), min(y + 1, height - 1)
-            highest = True
-            for v in range(top, bottom + 1):
-                for u in range(left, right + 1):
-                    highest = highest and value >= smooth[v, u]
-            if not highest:
+            left, right = max(x - 1, 0), min(x + 1, width - 1)
+            if value < max(smooth[y, left], smooth[y, right], smooth[top, x], smooth[bottom, x]):
+                continue
+            if value < max(smooth[top, left], smooth[top, right], smooth[bottom, left], smooth[bottom, right]):
                 continue
             out[n, 0] = (x + _offset(smooth[y, left], value, smooth[y, right])) * stride + (stride - 1) / 2
             out[n, 1] = (y + _offset(smooth[top, x], value, smooth[bottom, x])) * stride + (stride - 1) / 2
             out[n, 2], out[n, 3], out[n, 4] = orientation[0, y, x], orientation[1, y, x], value
             n += 1
     return out[:n]
+
+
+@njit(cache=True, nogil=True)
+def _count_above(values, least):  # type: ignore[no-untyped-def]
+    count = np.int32(0)
+    for x in range(np.uint64(values.size)):
+        count += np.int32(values[x] > least)
+    return count
 
 
 @njit(cache=True, nogil=True)

@@ -7,10 +7,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, GreyImage, Mask, Points
 from schemas.tables import DETECTION_COLUMNS
@@ -71,27 +73,33 @@ ID_STEP = 1 << 20
 
 
 @dataclass(frozen=True)
-class BlockDetections:
-    """Cars of a block of frames: the table, their patches, and their positions on the working grid.
+class Cars:
+    """Cars of a block of frames, one after the other.
 
-    ``searched`` (frames,) is the fraction of each frame that the detector was run on. Of each frame the cars come
-    first, then the ``weak`` (n,) candidates.
+    Attributes
+    ----------
+    column : of the table, (n,) each, by name.
+    crops : patches, chips and strips, and positions on the working grid, by name: a part a frame, after an empty one.
+        They are not put together, as what is written is most of all that a block gives.
     """
 
-    table: pd.DataFrame
-    patches: GreyImage
-    chips: GreyImage
-    strips: GreyImage
-    xy_work: Points
-    weak: Mask
-    searched: FloatArray
+    column: dict[str, NDArray[Any]]
+    crops: dict[str, list[NDArray[Any]]]
 
-    def take(self, rows: Mask) -> "BlockDetections":
-        """Some of them."""
-        crops = self.patches[rows], self.chips[rows], self.strips[rows]
-        return BlockDetections(
-            self.table[rows].reset_index(drop=True), *crops, self.xy_work[rows], self.weak[rows], self.searched
-        )
+    def __len__(self) -> int:
+        return len(self.column["frame"])
+
+
+@dataclass(frozen=True)
+class BlockDetections:
+    """Cars of a block of frames, and its weak candidates.
+
+    ``searched`` (frames,) is the fraction of each frame that the detector was run on.
+    """
+
+    cars: Cars
+    weak: Cars
+    searched: FloatArray
 
 
 def detect_block(plan: Plan, frames: range) -> BlockDetections:
@@ -128,7 +136,7 @@ def _searcher(
     use_device(plan.config.work.device)
     detector = _detector(plan.layout.detector, plan.keys["detector"])
     if not detector.reads_raw_frames:
-        return _Search(plan, working, detector, usable, has_background=has_background).detect
+        return _Search(plan, working, usable, detector, has_background=has_background).detect
     store, threshold = open_frames(plan.layout.frames), plan.config.detection.threshold
 
     def search(frame: int) -> "_Found | None":
@@ -171,6 +179,8 @@ class _Found:
 
     def keep(self, rows: Mask) -> "_Found":
         """Some of the cars and candidates."""
+        if rows.all():
+            return self
         detections, cars = self.detections.select(rows), int(rows[: self.cars].sum())
         return replace(self, detections=detections, cars=cars, xy_base=self.xy_base[rows])
 
@@ -191,10 +201,11 @@ class _Search:
     """
 
     def __init__(
-        self, plan: Plan, working: WorkingGrid, detector: Detector, usable: Mask, *, has_background: bool
+        self, plan: Plan, working: WorkingGrid, usable: Mask, detector: Detector, *, has_background: bool
     ) -> None:
         self._plan, self._working, self._has_background = plan, working, has_background
-        self._detector, self._usable = detector, usable
+        self._detector = detector
+        self._usable = usable
         self._group, self._first = range(0), -1
         self._window: Window | None = None
         self._reference: SearchedFrame | None = None
@@ -266,73 +277,77 @@ def _background_of(plan: Plan, rectified: WorkingFrame) -> GreyImage:
     return np.asarray(cv2.warpAffine(whole, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
+_NO_CROPS: dict[str, NDArray[Any]] = {
+    "patches": np.empty((0, 16, 8), np.uint8),
+    "chips": np.empty((0, 32, 32), np.uint8),
+    "strips": np.empty((0, 32, 10), np.uint8),
+    "xy_work": np.empty((0, 2)),
+}
+
+
 def _tabulate(parts: Sequence[_FrameCars]) -> BlockDetections:
-    """Frames as one table: a table a frame, then joined, cost 4 ms a frame."""
-    if not parts:
-        return _concatenate([])
+    """Frames as two tables, of the cars and of the weak candidates."""
+    cars = _select_rows(parts, [slice(0, part.found.cars) for part in parts])
+    weak = _select_rows(parts, [slice(part.found.cars, None) for part in parts])
+    return BlockDetections(cars, weak, np.array([part.found.searched for part in parts]))
+
+
+def _select_rows(parts: Sequence[_FrameCars], rows: Sequence[slice]) -> Cars:
+    """Some rows of each frame, as one table: a table a frame, then joined, cost 4 ms a frame."""
     all_found = [part.found for part in parts]
     detections = [one.detections for one in all_found]
-    counts = np.array([len(one) for one in detections])
-    number = np.concatenate([np.arange(count) for count in counts])
-    frame = np.repeat([part.frame for part in parts], counts)
-    scale = np.repeat([one.scale for one in all_found], counts)
-    xy = np.concatenate([one.xy_base for one in all_found])
-    columns = {
-        "detection_id": frame * ID_STEP + number,
+    number = [np.arange(len(one))[some] for one, some in zip(detections, rows, strict=True)]
+    counts = [len(one) for one in number]
+
+    def repeat(values: Sequence[float], dtype: str) -> NDArray[Any]:
+        return np.repeat(np.array(values, dtype), counts)
+
+    def join(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        return np.concatenate([np.empty(0), *(array[some] for array, some in zip(arrays, rows, strict=True))])
+
+    frame = repeat([part.frame for part in parts], "int64")
+    column = {
+        "detection_id": frame * ID_STEP + np.concatenate([np.empty(0, np.int64), *number]),
         "frame": frame,
-        "time_s": np.repeat([part.time_s for part in parts], counts),
-        "x_px": xy[:, 0],
-        "y_px": xy[:, 1],
-        "orientation_rad": np.concatenate([one.orientation_rad for one in detections]),
-        "orientation_sd_rad": np.concatenate([one.orientation_sd_rad for one in detections]),
-        "area_px": np.concatenate([one.area_px for one in detections]) / scale**2,
-        "score": np.concatenate([one.score for one in detections]),
+        "time_s": repeat([part.time_s for part in parts], "float64"),
+        "x_px": join([one.xy_base[:, 0] for one in all_found]),
+        "y_px": join([one.xy_base[:, 1] for one in all_found]),
+        "orientation_rad": join([one.orientation_rad for one in detections]),
+        "orientation_sd_rad": join([one.orientation_sd_rad for one in detections]),
+        "area_px": join([one.area_px for one in detections]) / repeat([one.scale for one in all_found], "float64") ** 2,
+        "score": join([one.score for one in detections]),
     }
-    return BlockDetections(
-        pd.DataFrame(columns).astype(DETECTION_COLUMNS),
-        np.concatenate([one.patches for one in detections]),
-        np.concatenate([one.chips for one in detections]),
-        np.concatenate([one.strips for one in detections]),
-        np.concatenate([one.xy for one in detections]),
-        number >= np.repeat([one.cars for one in all_found], counts),
-        np.array([one.searched for one in all_found]),
-    )
-
-
-def _concatenate(parts: Sequence[BlockDetections]) -> BlockDetections:
-    if not parts:
-        table = pd.DataFrame({name: np.empty(0, dtype) for name, dtype in DETECTION_COLUMNS.items()})
-        patches, chips, strips = (np.empty((0, *size), np.uint8) for size in ((16, 8), (32, 32), (32, 10)))
-        return BlockDetections(table, patches, chips, strips, np.empty((0, 2)), np.empty(0, bool), np.empty(0))
-    return BlockDetections(
-        pd.concat([part.table for part in parts], ignore_index=True),
-        np.concatenate([part.patches for part in parts]),
-        np.concatenate([part.chips for part in parts]),
-        np.concatenate([part.strips for part in parts]),
-        np.concatenate([part.xy_work for part in parts]),
-        np.concatenate([part.weak for part in parts]),
-        np.concatenate([part.searched for part in parts]),
-    )
+    crops: dict[str, list[NDArray[Any]]] = {name: [none] for name, none in _NO_CROPS.items()}
+    for one, some in zip(detections, rows, strict=True):
+        for name in _NO_CROPS:
+            crops[name].append((one.xy if name == "xy_work" else getattr(one, name))[some])
+    return Cars(column, crops)
 
 
 def write_detections(plan: Plan, frames: range, blocks: Sequence[BlockDetections]) -> StageResult:
-    """Write the table of a unit, that of its weak candidates, and the patches of both."""
-    whole = _concatenate([block for block in blocks if len(block.searched)])
+    """Write the table of a unit, that of its weak candidates, and the patches of both.
+
+    Of weak candidates only the chips: tracks align them, and take the appearance and the size from the cars.
+    """
     unit = frames.start // plan.unit_frames
     scale = read_working(plan.layout).scale
-    written = []
-    for folder, part in ((plan.layout.detections, ~whole.weak), (plan.layout.weak_detections, whole.weak)):
-        written += _write_part(plan.layout.unit_file(folder, unit, ".parquet"), whole.take(part), scale)
+    cars, weak = [block.cars for block in blocks], [block.weak for block in blocks]
+    written = _write_part(plan.layout.unit_file(plan.layout.detections, unit, ".parquet"), cars, scale, list(_NO_CROPS))
+    path = plan.layout.unit_file(plan.layout.weak_detections, unit, ".parquet")
+    written += _write_part(path, weak, scale, ["chips", "xy_work"])
     used = int(usable_frames(plan)[frames.start : frames.stop].sum())
-    counts = {"frames": float(used), "cars": float(np.sum(~whole.weak)), "weak": float(np.sum(whole.weak))}
-    if np.isfinite(whole.searched).any():
-        counts["searched"] = float(np.nanmean(whole.searched))
+    counts = {"frames": float(used), "cars": float(sum(map(len, cars))), "weak": float(sum(map(len, weak)))}
+    searched = np.concatenate([block.searched for block in blocks])
+    if np.isfinite(searched).any():
+        counts["searched"] = float(np.nanmean(searched))
     return StageResult(written, counts)
 
 
-def _write_part(path: Path, part: BlockDetections, scale: float) -> list[Path]:
+def _write_part(path: Path, parts: Sequence[Cars], scale: float, crops: Sequence[str]) -> list[Path]:
+    """Write the table of a unit's blocks, and those of their crops."""
+    arrays = {name: [array for part in parts for array in part.crops[name]] for name in crops}
     patches = path.with_suffix(".patches.npz")
-    arrays = {"patches": part.patches, "chips": part.chips, "strips": part.strips}
-    write_arrays(patches, {**arrays, "xy_work": part.xy_work, "working_scale": np.array(scale)})
-    write_table(path, part.table, DETECTION_COLUMNS)
+    write_arrays(patches, {**arrays, "working_scale": np.array(scale)})
+    columns = {name: np.concatenate([part.column[name] for part in parts]) for name in DETECTION_COLUMNS}
+    write_table(path, pd.DataFrame(columns), DETECTION_COLUMNS)
     return [path, patches]
