@@ -8,6 +8,7 @@ frames from the store, and only key points, tables and patches go from node to n
 
 import time
 from typing import TYPE_CHECKING, Any
+from uuid import uuid4
 
 from dask import delayed
 from dask.local import get_sync
@@ -38,7 +39,11 @@ def unit_graph(plan: Plan, stage: Stage, unit: Unit) -> Graph:
     constant = _constant(plan)
     blocks = []
     if stage.block is not None:
-        blocks = [[_node(resolve(stage.block), constant, frames) for frames in unit_blocks(plan, stage, unit)]]
+        block, parts = resolve(stage.block), unit_blocks(plan, stage, unit)
+        # Dask computes what is alike in the order of its keys, which it would draw at random: the last block, a short
+        # one, may so come first, and a long one be left over for one thread alone.
+        keys = [f"{stage.name}-{unit.name}-{k:06d}-{uuid4().hex}" for k in range(len(parts))]
+        blocks = [[_node(block, constant, frames, dask_key_name=key) for frames, key in zip(parts, keys, strict=True)]]
     return _committed(constant, stage, unit, _node(resolve(stage.unit), constant, *unit.part, *blocks))
 
 
