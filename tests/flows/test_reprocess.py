@@ -11,12 +11,15 @@ import pytest
 
 from flows.console import Console
 from flows.reprocess import run_reprocess
+from schemas.job import Inputs, Job
 from schemas.records import RebaseRecord
 from schemas.summary import RunSummary
 from tests.new_base import NEW_FROM_OLD, SCALE, TURN_RAD, write_new_base
 from tests.small_flight import digests
 from velfield import open_run
 from velfield.errors import InputError
+from velfield.pipeline.configuration import resolve_config
+from velfield.pipeline.stages.rebase import plan_rebase
 from velfield.pipeline.verify import verify_run
 from velfield.run.lineage import describe_base_image
 from velfield.run.results import result_name
@@ -75,6 +78,16 @@ def test_no_frame_is_processed_again(mapped: tuple[Path, RunSummary]) -> None:
         "detector",
         "tracklets",
     ]
+
+
+def test_units_are_those_that_the_run_was_cut_into(run: Path, new_base: Path, mapped: tuple[Path, RunSummary]) -> None:
+    """Another release may cut units of another length: detections lie in a file a unit."""
+    before, record = open_run(run), RebaseRecord.model_validate_json((mapped[0] / "base/rebased.json").read_bytes())
+    config = resolve_config(settings=["work.unit_frames=5"])
+    job = Job(root=str(run), inputs=Inputs(source="none", base=str(new_base)), config=config)
+    lengths = [len(unit) for unit in plan_rebase(before, job, record).units]
+    assert len(lengths) == len(list(before.layout.detections.glob("unit-*.parquet")))
+    assert sum(lengths) == before.frames.count
 
 
 def test_mapped_results_are_right_to_the_stated_error(run: Path, mapped: tuple[Path, RunSummary]) -> None:

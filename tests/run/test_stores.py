@@ -14,6 +14,7 @@ from velfield.run.stores import (
     create_field,
     create_frames,
     create_registration,
+    is_cut_as,
     open_field,
     open_frames,
     open_registration,
@@ -145,3 +146,15 @@ def test_a_column_that_never_was_is_not_called_damaged(tmp_path: Path) -> None:
     create_registration(tmp_path / "r.zarr", key="k", count=2, vector_length=3, unit_frames=2)
     with pytest.raises(InputError, match=r"found no column 'bogus'; it has .*heldout_px"):
         open_registration(tmp_path / "r.zarr").column("bogus")
+
+
+def test_a_store_of_units_of_another_length_is_not_taken_for_one_of_ours(tmp_path: Path) -> None:
+    frame_store(tmp_path / "f.zarr", noise(1, 5, 24, 32))
+    create_registration(tmp_path / "r.zarr", key="k", count=5, vector_length=3, unit_frames=2)
+    for path in (tmp_path / "f.zarr", tmp_path / "r.zarr"):
+        assert is_cut_as(path, "k", 2)
+        assert not is_cut_as(path, "other", 2)
+        assert not is_cut_as(path, "k", 3)
+    frame_store(tmp_path / "g.zarr", noise(1, 1, 24, 32))
+    assert is_cut_as(tmp_path / "g.zarr", "k", 32)  # one unit that is not full
+    assert not is_cut_as(tmp_path / "none.zarr", "k", 2)

@@ -414,14 +414,17 @@ def load_kernels() -> int:
     from numba.core.dispatcher import Dispatcher
 
     modules = [module for name, module in list(sys.modules.items()) if name.split(".")[0] == "velfield"]
-    kernels = {id(one): one for module in modules for one in vars(module).values() if isinstance(one, Dispatcher)}
+    values = [one for module in modules for one in list(vars(module).values())]  # others may be importing
+    kernels: dict[int, Any] = {id(one): one for one in values if isinstance(one, Dispatcher)}
     count = 0
     for kernel in kernels.values():
         cache: Any = getattr(kernel, "_cache", None)  # numba has no public way to ask what it holds
         if isinstance(cache, FunctionCache):
-            for signature, *_ in cache._cache_file._load_index():
-                kernel.compile(signature)
-                count += 1
+            processor = kernel.targetctx.codegen().magic_tuple()
+            for signature, compiled_for, _ in cache._cache_file._load_index():
+                if compiled_for == processor:  # what is of another one would be compiled again
+                    kernel.compile(signature)
+                    count += 1
     return count
 
 

@@ -5,7 +5,8 @@ All take plain arrays, the map as a tuple of them. The map of one point, in orde
     undistorted u, raw row y  ->  v = u + shift(y) + roll(y) x (u - c)  ->  P(v)  ->  + mesh(raw x, raw y)
 
 with P the rational function in normalised coordinates. ``tests/registration/test_transforms.py`` compares each kernel
-with its plain numpy form.
+with its plain numpy form. After a change here change or touch ``mesh.py`` and ``joint.py`` too, whose kernels may have
+some of these in them: numba's cache asks for a kernel's own file alone.
 """
 
 import math

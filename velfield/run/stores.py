@@ -157,6 +157,16 @@ def store_key(path: Path) -> str | None:
         return None
 
 
+def is_cut_as(path: Path, key: str, unit_frames: int) -> bool:
+    """Whether a store was created under a key, for units of so many frames: earlier releases cut others, and units that
+    share a chunk would overwrite each other's rows."""
+    if store_key(path) != key:
+        return False
+    group = zarr.open_group(**_location(path), mode="r", zarr_format=3, use_consolidated=False)
+    column: Any = group["vector" if "vector" in group else "time_s"]
+    return bool(column.chunks[0] == min(unit_frames, max(column.shape[0], 1)))
+
+
 FRAME_COLUMNS: dict[str, tuple[str, float]] = {
     "time_s": ("float64", np.nan),
     "source_index": ("int64", -1),

@@ -142,6 +142,8 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any] | Sequence[NDArra
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array_header_1_0(member, header)
                 for part in parts:
+                    if (part.dtype, part.shape[1:]) != (kind.dtype, kind.shape[1:]):
+                        raise ValueError(f"{path}: the parts of {name} are of different types or sizes")
                     member.write(np.ascontiguousarray(part).reshape(-1).view(np.uint8).data)
 
 
@@ -151,11 +153,13 @@ def read_arrays(path: Path, *, only: Sequence[str] | None = None) -> Arrays:
     Raises
     ------
     StoreError
-        The file is damaged.
+        The file is damaged or gone.
     """
-    with io.BytesIO(path.read_bytes()) if is_remote(path) else path.open("rb") as opened:
-        try:
-            with np.load(opened, allow_pickle=False) as file:
-                return {name: file[name] for name in (only or file.files)}
-        except Exception as error:
-            raise _damage_error(path, error) from error
+    try:
+        with (
+            io.BytesIO(path.read_bytes()) if is_remote(path) else path.open("rb") as opened,
+            np.load(opened, allow_pickle=False) as file,
+        ):
+            return {name: file[name] for name in (only or file.files)}
+    except Exception as error:
+        raise _damage_error(path, error) from error

@@ -16,7 +16,7 @@ from schemas.arrays import IntArray
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
-from velfield.run.stores import THUMBNAIL_SHAPE, FrameStore, create_frames, open_frames, store_key
+from velfield.run.stores import THUMBNAIL_SHAPE, FrameStore, create_frames, is_cut_as, open_frames
 from velfield.sources.quality import (
     UNUSABLE,
     FrameFlag,
@@ -104,9 +104,9 @@ def _find_outliers(store: FrameStore, tested: IntArray) -> IntArray:
 
 
 def create_frame_store(plan: Plan) -> None:
-    """Create ``frames.zarr`` unless it exists under this plan's key."""
+    """Create ``frames.zarr`` unless it exists under this plan's key and cut into its units."""
     path = plan.layout.frames
-    if store_key(path) == plan.keys["frames"]:
+    if is_cut_as(path, plan.keys["frames"], plan.unit_frames):
         return
     create_frames(
         path,

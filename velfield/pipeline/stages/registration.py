@@ -27,9 +27,9 @@ from velfield.run.stores import (
     REGISTRATION_COLUMNS,
     FrameStore,
     create_registration,
+    is_cut_as,
     open_frames,
     open_registration,
-    store_key,
 )
 from velfield.run.tables import read_arrays, write_arrays
 from velfield.sources.geo import BaseRaster, read_base_raster
@@ -55,9 +55,9 @@ class FrameKeypoints:
 
 
 def create_registration_store(plan: Plan) -> None:
-    """Create ``registration.zarr`` unless there is one of this plan's key."""
+    """Create ``registration.zarr`` unless there is one of this plan's key, cut into its units."""
     path = plan.layout.registration
-    if store_key(path) == plan.keys["registration"]:
+    if is_cut_as(path, plan.keys["registration"], plan.unit_frames):
         return
     length = vector_length(plan.info.width, plan.info.height, plan.config.registration)
     create_registration(
