@@ -351,6 +351,12 @@ class LongVehicleRecord(Model):
     contrast_floor: PositiveFloat
     attribution: tuple[str, ...] = Field(default=(), max_length=50)
 
+    @model_validator(mode="after")
+    def _reads_no_background(self) -> Self:
+        if any(one.channel == 3 for one in self.rounds):  # long vehicles are told on images that have three channels
+            raise ValueError("found a round of channel 3, the difference to a background; expected channels 0 to 2")
+        return self
+
 
 class DimensionsRecord(Model):
     """The network that measures vehicles: fully connected layers with ReLU between them."""

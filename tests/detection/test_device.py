@@ -1,8 +1,13 @@
 """Where networks run: sessions that start on a GPU, that fall back to the processor, and packages without CUDA."""
 
+import sys
+import time
 import warnings
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,27 +17,47 @@ import pytest
 from schemas.arrays import GreyImage
 from schemas.detector import CnnConfig
 from schemas.flight import Device
+from tests.detection.test_onnx import tiny_yolo
 from velfield.detection.cnn import network as networks
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.network import Network
 from velfield.detection.detector import shipped_detector
 from velfield.errors import DeviceWarning, InputError
+from velfield.pipeline import check_inputs
 
 CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
+NO_DRIVER = (
+    "/onnxruntime_src/onnxruntime/core/providers/cuda/cuda_call.cc:129 std::conditional_t<THRW, void, "
+    "onnxruntime::common::Status> onnxruntime::CudaCall(ERRTYPE, const char*, const char*, SUCCTYPE, const char*, "
+    "const char*, int) [with ERRTYPE = cudaError; bool THRW = true; SUCCTYPE = cudaError] CUDA failure 35: CUDA driver "
+    "version is insufficient for CUDA runtime version ; GPU=-1 ; hostname=ed12 ; file=/onnxruntime_src/onnxruntime/"
+    "core/providers/cuda/cuda_execution_provider.cc ; line=282 ; expr=cudaSetDevice(info_.device_id);"
+)
+"""What a session raises with CUDA's libraries and no driver."""
 
 
 class Runtime:
     """An onnxruntime that offers CUDA; its sessions run on the processor and say that they got what ``starts``."""
 
     def __init__(self) -> None:
-        self.offered, self.starts, self.missing, self.fails = [CUDA, CPU], True, "", ""
+        self.offered, self.starts, self.missing, self.fails, self.refuses = [CUDA, CPU], True, "", "", ""
+        self.takes_s, self.most = 0.0, 1000
+        """Sessions that a GPU has room for."""
         self.asked: list[list[Any]] = []
         self.preloaded = 0
 
-    def session(self, model: bytes, options: Any, providers: list[Any]) -> onnxruntime.InferenceSession:
+    def session(
+        self, model: bytes, options: Any, providers: list[Any], enable_fallback: int = 1
+    ) -> onnxruntime.InferenceSession:
         gpu = providers != [CPU]
         assert self.preloaded or not gpu, "libraries are loaded before the first session"
         self.asked.append(providers)
+        refused = self.refuses or ("CUDA failure 2: out of memory ; GPU=0" if len(self.asked) > self.most else "")
+        if gpu and refused:  # as onnxruntime_inference_collection.py does
+            if not enable_fallback:
+                raise RuntimeError(refused)
+            print("*************** EP Error ***************", f"EP Error {refused} when using {providers}", sep="\n")
+            gpu = False
         session = onnxruntime.InferenceSession(model, options, providers=[CPU])
         session.get_providers = lambda: [CUDA, CPU] if gpu and self.starts else [CPU]
         if gpu and self.fails:
@@ -44,6 +69,7 @@ class Runtime:
 
     def preload(self) -> None:
         self.preloaded += 1
+        time.sleep(self.takes_s)
         if self.missing:
             print(self.missing, "see https://onnxruntime.ai", sep="\n")
 
@@ -64,7 +90,8 @@ def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Runtime]:
     found = Runtime()
     monkeypatch.setattr(networks, "ort", Stub(found))
     monkeypatch.setattr(networks, "_device", "auto")
-    caches = networks._cuda_fault, networks._warn_of_cuda
+    monkeypatch.setattr(networks, "_limitations_reported", False)
+    caches = networks._find_cuda_fault, networks._warn_of_cuda
     for cache in caches:
         cache.cache_clear()
     yield found
@@ -126,6 +153,7 @@ def test_on_a_gpu_all_runs_on_canvases_in_floating_point(runtime: Runtime) -> No
             {"starts": False, "missing": "Failed to load libcublas.so.13: no such file"},
             "Failed to load libcublas.so.13",
         ),
+        ({"refuses": NO_DRIVER}, "CUDA failure 35: CUDA driver version is insufficient for CUDA runtime version)"),
         ({"fails": "[ONNXRuntimeError] : 9 : NOT_IMPLEMENTED : cuDNN is not available.\n"}, "cuDNN is not available"),
     ],
 )
@@ -181,3 +209,52 @@ def test_a_session_that_a_full_gpu_refuses_is_no_silent_fallback(runtime: Runtim
         networks.open_session(model, "auto")
     with pytest.raises(InputError, match="--device cuda: found a GPU on which no further session starts"):
         networks.open_session(model, "cuda")
+
+
+def test_on_a_full_gpu_all_runs_in_8_bits_on_the_processor(
+    runtime: Runtime, capsys: pytest.CaptureFixture[str]
+) -> None:
+    detector = shipped().for_flight([image()], CnnConfig())
+    runtime.most = len(runtime.asked) + 2  # the probe and the first of two canvases
+    with pytest.warns(DeviceWarning, match="no further session starts"):
+        found = detector.network.predict(image()[None])
+    assert detector.network.canvases is None
+    assert capsys.readouterr().out == ""
+    networks.use_device("cpu")
+    again = shipped().for_flight([image()], CnnConfig())
+    np.testing.assert_array_equal(found[0], again.network.predict(image()[None])[0])
+
+
+def test_threads_at_once_try_a_gpu_once_and_what_others_print_is_printed(
+    runtime: Runtime, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runtime.takes_s, stdout, network = 0.2, sys.stdout, in_floating_point()
+    with ThreadPoolExecutor(3) as pool:
+        found = [pool.submit(lambda: network.canvases) for _ in range(2)]
+        time.sleep(0.1)
+        pool.submit(print, "of another thread").result()
+    assert sys.stdout is stdout
+    assert capsys.readouterr().out == "of another thread\n"
+    assert found[0].result() is found[1].result() is not None
+    assert (runtime.preloaded, len(runtime.asked)) == (1, 3)
+
+
+def test_what_a_stage_says_is_not_warned_of_too(runtime: Runtime, tmp_path: Path) -> None:
+    """For another maker's model neither where it is read before any work."""
+    runtime.starts = False
+    plan: Any = SimpleNamespace(config=SimpleNamespace(work=SimpleNamespace(device="auto")))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        detector = check_inputs._read_detector(tiny_yolo(tmp_path / "m.onnx", "boxes"), plan)
+        in_floating_point().predict(image()[None])
+    assert len(detector.limitations) == 1
+    assert detector.limitations == shipped().limitations
+
+
+def test_cuda_that_every_worker_must_have_is_refused_without_it(runtime: Runtime) -> None:
+    """In 8 bits too."""
+    detector = shipped().for_flight([image()], CnnConfig())
+    runtime.offered = [CPU]
+    networks.use_device("cuda")
+    with pytest.raises(InputError, match="--device cuda"):
+        detector.network.predict(image()[None])

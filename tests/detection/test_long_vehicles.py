@@ -5,8 +5,10 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from schemas.arrays import FloatArray
+from schemas.detector import LongVehicleRecord
 from tools.shipped_detector import LORRY_SEEDS, LORRY_SEEDS_HELD_OUT
 from velfield.bench.scenes import simulated_image
 from velfield.detection.cascade.classifier import (
@@ -124,3 +126,12 @@ def test_a_vehicle_whose_centre_is_out_of_view_stays_where_it_was_detected(centr
     xy = np.array([centre]) + (12.0 if centre[0] < 0 else -12.0) * np.array([[np.cos(axis[0]), np.sin(axis[0])]])
     centred = classifier_of(np.array([centre])).centre(blank(), rows(xy, axis), valid)
     np.testing.assert_array_equal(centred[:, :2], xy)
+
+
+def test_a_record_that_reads_a_background_is_refused() -> None:
+    """It would be read beyond the features, which have none."""
+    record = shipped_long_vehicles().record
+    rounds = [one.model_dump() for one in record.rounds[:2]]
+    rounds[1]["channel"] = 3
+    with pytest.raises(ValidationError, match=r"found a round of channel 3, .* expected channels 0 to 2"):
+        LongVehicleRecord.model_validate({**record.model_dump(), "rounds": rounds})

@@ -334,7 +334,9 @@ def test_of_two_boxes_of_one_vehicle_the_better_is_kept() -> None:
         assert kept.score.tolist() == [0.9, 0.4]
 
 
-def test_a_run_detects_with_it_on_raw_frames(whole: tuple[Path, RunSummary], tmp_path: Path) -> None:
+def test_a_run_detects_with_it_on_raw_frames(
+    whole: tuple[Path, RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     root = tmp_path / "run"
     shutil.copytree(whole[0], root)
     path = tiny_yolo(tmp_path / "m.onnx", "oriented_boxes")
@@ -342,8 +344,10 @@ def test_a_run_detects_with_it_on_raw_frames(whole: tuple[Path, RunSummary], tmp
     inputs = made.job.inputs.model_copy(update={"labels": None, "detector": str(path)})
     config = made.config.model_copy(update={"detection": made.config.detection.model_copy(update={"threshold": 0.75})})
     plan = Plan(Job(root=str(root), inputs=inputs, config=config), made.info, made.indices, made.inputs, made.keys)
-    counts = make_detector(plan).counts
-    assert counts["threshold"] == 0.25
+    monkeypatch.setattr("velfield.detection.onnx.detector.device_limitations", lambda device: [f"no GPU: {device}"])
+    outcome = make_detector(plan)
+    assert outcome.counts["threshold"] == 0.25
+    assert outcome.warnings.count("no GPU: auto") == 1
     run, frame = open_run(root), 3
     block = detect_block(plan, range(frame, frame + 1))
     detector: Detector = load_detector(path)
@@ -353,6 +357,8 @@ def test_a_run_detects_with_it_on_raw_frames(whole: tuple[Path, RunSummary], tmp
     found = np.column_stack([block.cars.column["x_px"], block.cars.column["y_px"]])
     assert sorted_rows(found.round(1)) == sorted_rows(expected[np.isfinite(expected[:, 0])].round(1))
     assert block.searched.tolist() == [1.0]
+    assert set(block.cars.crops) == {"patches", "chips", "strips", "xy_work"}
+    assert set(block.weak.crops) == {"chips", "xy_work"}, "what is written of weak candidates"
 
 
 def test_a_model_that_finds_nothing_is_told_what_to_check(

@@ -209,6 +209,7 @@ def test_small_images_are_calibrated_on_smaller_crops_and_smaller_ones_refused()
 def test_a_processor_that_saturates_takes_floating_point_and_says_so(monkeypatch) -> None:  # type: ignore[no-untyped-def]
     monkeypatch.setattr(quantization, "is_exact", lambda: False)
     monkeypatch.setattr("velfield.detection.cnn.detector.is_exact", lambda: False)
+    monkeypatch.setattr(networks, "_limitations_reported", False)
     detector = shipped().for_flight([cars(1)], CnnConfig())
     assert detector.limitations == [networks.INEXACT]
     with pytest.warns(RuntimeWarning, match="VNNI"):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from schemas.arrays import GreyImage
 from velfield.camera.lens import pinhole
-from velfield.detection.detector import load_detector
+from velfield.detection.detector import Detector, load_detector
 from velfield.errors import Failure, InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import committed
@@ -29,7 +29,7 @@ _LONG_PX = 50_000_000
 _READ: dict[str, Callable[[Path, Plan], object]] = {
     "base": lambda path, plan: read_base_raster(path, plan.config.frames),
     "labels": lambda path, plan: read_labels(path, plan.info),
-    "detector": lambda path, plan: load_detector(path),
+    "detector": lambda path, plan: _read_detector(path, plan),
     "detections": lambda path, plan: read_detections(path, plan.info),
     "telemetry": lambda path, plan: read_telemetry_file(path),
 }
@@ -43,6 +43,10 @@ def validate_inputs(plan: Plan) -> None:
     InputError
         One cannot be read or is not what its option expects, or there is no such device; the message names the option.
     """
+    if plan.config.work.device == "cuda":
+        from velfield.detection.cnn.network import check_device
+
+        check_device("cuda")
     for option, read in _READ.items():
         path = getattr(plan.job.inputs, option)
         if path and _is_pending(plan, option):
@@ -52,10 +56,14 @@ def validate_inputs(plan: Plan) -> None:
                 raise InputError(f"--{option}: {error}") from None
     if plan.job.inputs.base and _is_pending(plan, "base") and _takes_long(plan):
         check_base_area(plan)
-    if plan.config.work.device == "cuda":
-        from velfield.detection.cnn.network import check_device
 
-        check_device("cuda")
+
+def _read_detector(path: Path, plan: Plan) -> Detector:
+    """A model of another maker opens a session: on the device of the stages, which report what limits it."""
+    from velfield.detection.cnn.network import use_device
+
+    use_device(plan.config.work.device)
+    return load_detector(path)
 
 
 def check_base_area(plan: Plan) -> None:

@@ -9,15 +9,17 @@ network as ONNX, but only the weights are read from it, and the graph is built a
 bring operators of its own.
 """
 
-import io
+import re
+import sys
 import warnings
 from base64 import b64decode, b64encode
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
 from functools import cache, cached_property
 from textwrap import shorten
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from threading import RLock, get_ident
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeAlias, TypeVar
 
 import numpy as np
 import onnx
@@ -148,6 +150,28 @@ def _alignment(layers: Topology) -> int:
     return worst
 
 
+_T = TypeVar("_T")
+_STARTING = RLock()
+"""Held while a GPU is tried and sessions are opened: several threads at once would each do so."""
+
+
+class _Once(Generic[_T]):
+    """A cached property that one thread makes for all: `functools.cached_property` has no lock from Python 3.12 on."""
+
+    def __init__(self, make: Callable[[Any], _T]) -> None:
+        self.make, self.name, self.__doc__ = make, make.__name__, make.__doc__
+
+    def __get__(self, owner: Any, kind: type[Any]) -> _T:
+        if owner is None:  # of the class, as what reads docstrings asks for it
+            return self  # type: ignore[return-value]
+        with _STARTING:
+            known = vars(owner)
+            if self.name not in known:
+                known[self.name] = self.make(owner)
+            found: _T = known[self.name]
+            return found
+
+
 Ranges: TypeAlias = Mapping[str, tuple[float, float]]
 """Least and largest value of each activation, by its name in the graph."""
 
@@ -174,27 +198,31 @@ class Network:
         """What the height and the width of an image must be multiples of."""
         return _alignment(self.topology)
 
-    @cached_property
+    @_Once
     def predict(self) -> "Predict":
         """The network in onnxruntime, on the device of `use_device`; in 8 bits on a processor that has them exactly."""
         if self.canvases is not None:
             return self.canvases.predict
+        check_device(_device)
         if self.ranges is not None:
             from velfield.detection.cnn.quantization import is_exact, open_quantized
 
             if is_exact():
                 return open_quantized(self, self.ranges)
-            warnings.warn(INEXACT, DeviceWarning, stacklevel=2)
-        return predict_by(open_session(network_to_onnx(self), _device))
+            if not _limitations_reported:
+                warnings.warn(INEXACT, DeviceWarning, stacklevel=3)
+        return predict_by(open_session(network_to_onnx(self), "cpu"))
 
-    @cached_property
+    @_Once
     def canvases(self) -> "Canvases | None":
         """On a GPU, what runs the network on images of few sizes; else none, and images may have any size."""
         if not uses_cuda(_device):
             return None
         from velfield.detection.cnn.canvas import Canvases
 
-        return Canvases(self, _device)
+        found = Canvases(self, _device)
+        # Of a session that a full GPU refused the processor would be slow: it has 8 bits.
+        return found if all(_CUDA in session.get_providers() for session in found.sessions.values()) else None
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the sessions, which no other process can use."""
@@ -220,12 +248,16 @@ _WARNINGS, _ERRORS, _FATAL = 2, 3, 4
 """Of onnxruntime's levels of severity. The warnings of a session are of how its graph was exported, many lines in each
 process; without a session, its warnings and errors are shown."""
 _device: Device = "auto"
+_limitations_reported = False
 
 
 def use_device(device: Device) -> None:
-    """Set where the networks of this process are run that have not been run yet."""
-    global _device
-    _device = device
+    """Set where the networks of this process are run that have not been run yet.
+
+    Its caller reports `Detector.limitations`, which are not warned of any more: each process would repeat them.
+    """
+    global _device, _limitations_reported
+    _device, _limitations_reported = device, True
 
 
 def current_device() -> Device:
@@ -234,8 +266,8 @@ def current_device() -> Device:
 
 
 def uses_cuda(device: Device) -> bool:
-    """Whether networks run on a GPU; warn once a process where onnxruntime has CUDA that does not start."""
-    if device == "auto":
+    """Whether networks run on a GPU; without `use_device`, warn once a process where CUDA does not start."""
+    if device == "auto" and not _limitations_reported:
         _warn_of_cuda()
     return device != "cpu" and _cuda_fault() is None
 
@@ -258,33 +290,64 @@ def _warn_of_cuda() -> None:
         warnings.warn(text, DeviceWarning, stacklevel=3)
 
 
-@cache
 def _cuda_fault() -> str | None:
-    """What was found in place of a GPU, if networks cannot run on one: tried once a process by a convolution.
+    """What was found in place of a GPU, if networks cannot run on one: tried once a process."""
+    with _STARTING:
+        return _find_cuda_fault()
 
-    The package says only what it was compiled for. Without CUDA's libraries, or a GPU, its sessions fall back to the
-    processor; without cuDNN they fail at the first convolution.
+
+class _Captured:
+    """Standard output whose lines of this thread are kept; those of others are passed on."""
+
+    def __init__(self) -> None:
+        self.printed, self._thread, self._stdout = "", get_ident(), sys.stdout
+
+    def write(self, text: str) -> int:
+        if get_ident() != self._thread:
+            return self._stdout.write(text)
+        self.printed += text
+        return len(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stdout, name)
+
+
+_CAUSE = re.compile(r"CUDA failure [^;]*|Failed to load [^\n]*")
+"""In what onnxruntime says: without a driver a line of 600 characters, most of them C++."""
+
+
+@cache
+def _find_cuda_fault() -> str | None:
+    """By a convolution.
+
+    The package says only what it was compiled for. Without CUDA's libraries its sessions have no CUDA, without a driver
+    none is made, and without cuDNN they fail at the first convolution.
     """
     offered = ort.get_available_providers()
     if _CUDA not in offered:
         return f"onnxruntime with {', '.join(offered)}"
-    printed = io.StringIO()
+    output: Any = _Captured()
     ort.set_default_logger_severity(_FATAL)
     try:
-        with redirect_stdout(printed):  # it prints which libraries it misses, and that it falls back
-            if hasattr(ort, "preload_dlls"):  # from 1.21 on: those that pip installed, which no loader looks for
+        if hasattr(ort, "preload_dlls"):  # from 1.21 on: those that pip installed, which no loader looks for
+            with redirect_stdout(output):  # it prints which libraries it misses
                 ort.preload_dlls()
-            session = ort.InferenceSession(_probe(), _session_options(), providers=_providers(gpu=True))
-            session.run(None, {"image": np.zeros((1, 1, 8, 8), np.float32)})
+        session = _cuda_session(_probe())
+        session.run(None, {"image": np.zeros((1, 1, 8, 8), np.float32)})
         if _CUDA in session.get_providers():
             return None
-        missing = printed.getvalue().strip().splitlines()
-        why = missing[0] if missing else "no GPU, or no driver of it"
+        why, messages = next(iter(output.printed.strip().splitlines()), "no GPU, or no driver of it"), output.printed
     except Exception as error:  # onnxruntime's own kinds have no common base
-        why = str(error).strip().rpartition(" : ")[2]
+        why, messages = str(error).strip().rpartition(" : ")[2], f"{output.printed}\n{error}"
     finally:
         ort.set_default_logger_severity(_WARNINGS)
-    return f"onnxruntime with CUDA that does not start ({shorten(why, 200)})"
+    cause = _CAUSE.search(messages)
+    return f"onnxruntime with CUDA that does not start ({shorten(cause[0] if cause else why, 200)})"
+
+
+def _cuda_session(model: bytes) -> ort.InferenceSession:
+    """A session on a GPU; an error where none starts: onnxruntime's own fallback prints five lines on it."""
+    return ort.InferenceSession(model, _session_options(), providers=_providers(gpu=True), enable_fallback=0)
 
 
 def _probe() -> bytes:
@@ -318,7 +381,12 @@ def open_session(model: bytes, device: Device) -> ort.InferenceSession:
     """
     check_device(device)
     gpu = uses_cuda(device)
-    session = ort.InferenceSession(model, _session_options(), providers=_providers(gpu=gpu))
+    session = None
+    if gpu:
+        with suppress(Exception):  # onnxruntime's own kinds; a faulty model fails on the processor too
+            session = _cuda_session(model)
+    if session is None:
+        session = ort.InferenceSession(model, _session_options(), providers=_providers(gpu=False))
     if gpu and _CUDA not in session.get_providers():  # though another did: its memory is full
         found = f"a GPU on which no further session starts, {_EXPECTED}"
         if device == "cuda":

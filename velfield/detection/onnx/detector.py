@@ -17,7 +17,7 @@ import pandas as pd
 
 from schemas.arrays import GreyImage, Mask
 from schemas.detector import OnnxRecord
-from velfield.detection.cnn.network import current_device, open_session
+from velfield.detection.cnn.network import current_device, device_limitations, open_session
 from velfield.detection.detector import Detections, Detector
 from velfield.detection.onnx.boxes import Boxes, cut_tile, decode, suppress, tile_corners, whole_in_tile
 from velfield.detection.onnx.description import check_output, describe_model
@@ -62,6 +62,11 @@ class OnnxDetector(Detector):
             raise
         except Exception as error:  # onnxruntime's own kinds have no common base
             raise self._refusal(error) from None
+
+    @property
+    def limitations(self) -> list[str]:
+        """A GPU that does not start."""
+        return device_limitations(current_device())
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the session, which no other process can use."""

@@ -3,7 +3,7 @@
 Detections of another program in place of ours (`--detections`): later stages do not know the difference.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -79,7 +79,8 @@ class Cars:
     Attributes
     ----------
     column : of the table, (n,) each, by name.
-    crops : patches, chips and strips, and positions on the working grid, by name: a part a frame, after an empty one.
+    crops : patches, chips and strips, and positions on the working grid, by name: a part a frame, after an empty one;
+        of weak candidates `_WEAK_CROPS`.
         They are not put together, as what is written is most of all that a block gives.
     """
 
@@ -283,17 +284,19 @@ _NO_CROPS: dict[str, NDArray[Any]] = {
     "strips": np.empty((0, 32, 10), np.uint8),
     "xy_work": np.empty((0, 2)),
 }
+_WEAK_CROPS = ("chips", "xy_work")
+"""Those of weak candidates: tracks align them, and take the appearance and the size from the cars."""
 
 
 def _tabulate(parts: Sequence[_FrameCars]) -> BlockDetections:
     """Frames as two tables, of the cars and of the weak candidates."""
-    cars = _select_rows(parts, [slice(0, part.found.cars) for part in parts])
-    weak = _select_rows(parts, [slice(part.found.cars, None) for part in parts])
+    cars = _select_rows(parts, [slice(0, part.found.cars) for part in parts], _NO_CROPS)
+    weak = _select_rows(parts, [slice(part.found.cars, None) for part in parts], _WEAK_CROPS)
     return BlockDetections(cars, weak, np.array([part.found.searched for part in parts]))
 
 
-def _select_rows(parts: Sequence[_FrameCars], rows: Sequence[slice]) -> Cars:
-    """Some rows of each frame, as one table: a table a frame, then joined, cost 4 ms a frame."""
+def _select_rows(parts: Sequence[_FrameCars], rows: Sequence[slice], names: Iterable[str]) -> Cars:
+    """Some rows of each frame, as one table, and their crops of these names: a table a frame cost 4 ms a frame."""
     all_found = [part.found for part in parts]
     detections = [one.detections for one in all_found]
     number = [np.arange(len(one))[some] for one, some in zip(detections, rows, strict=True)]
@@ -317,24 +320,21 @@ def _select_rows(parts: Sequence[_FrameCars], rows: Sequence[slice]) -> Cars:
         "area_px": join([one.area_px for one in detections]) / repeat([one.scale for one in all_found], "float64") ** 2,
         "score": join([one.score for one in detections]),
     }
-    crops: dict[str, list[NDArray[Any]]] = {name: [none] for name, none in _NO_CROPS.items()}
+    crops: dict[str, list[NDArray[Any]]] = {name: [_NO_CROPS[name]] for name in names}
     for one, some in zip(detections, rows, strict=True):
-        for name in _NO_CROPS:
+        for name in crops:
             crops[name].append((one.xy if name == "xy_work" else getattr(one, name))[some])
     return Cars(column, crops)
 
 
 def write_detections(plan: Plan, frames: range, blocks: Sequence[BlockDetections]) -> StageResult:
-    """Write the table of a unit, that of its weak candidates, and the patches of both.
-
-    Of weak candidates only the chips: tracks align them, and take the appearance and the size from the cars.
-    """
+    """Write the table of a unit, that of its weak candidates, and the crops of both."""
     unit = frames.start // plan.unit_frames
     scale = read_working(plan.layout).scale
     cars, weak = [block.cars for block in blocks], [block.weak for block in blocks]
-    written = _write_part(plan.layout.unit_file(plan.layout.detections, unit, ".parquet"), cars, scale, list(_NO_CROPS))
+    written = _write_part(plan.layout.unit_file(plan.layout.detections, unit, ".parquet"), cars, scale, _NO_CROPS)
     path = plan.layout.unit_file(plan.layout.weak_detections, unit, ".parquet")
-    written += _write_part(path, weak, scale, ["chips", "xy_work"])
+    written += _write_part(path, weak, scale, _WEAK_CROPS)
     used = int(usable_frames(plan)[frames.start : frames.stop].sum())
     counts = {"frames": float(used), "cars": float(sum(map(len, cars))), "weak": float(sum(map(len, weak)))}
     searched = np.concatenate([block.searched for block in blocks])
@@ -343,7 +343,7 @@ def write_detections(plan: Plan, frames: range, blocks: Sequence[BlockDetections
     return StageResult(written, counts)
 
 
-def _write_part(path: Path, parts: Sequence[Cars], scale: float, crops: Sequence[str]) -> list[Path]:
+def _write_part(path: Path, parts: Sequence[Cars], scale: float, crops: Iterable[str]) -> list[Path]:
     """Write the table of a unit's blocks, and those of their crops."""
     arrays = {name: [array for part in parts for array in part.crops[name]] for name in crops}
     patches = path.with_suffix(".patches.npz")

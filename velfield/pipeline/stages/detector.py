@@ -288,7 +288,7 @@ def _finish(
             detector = detector.for_flight(
                 _images_to_calibrate(plan, 1.0 if scale is None else scale), plan.config.detection
             )
-            warnings += detector.limitations
+        warnings += detector.limitations
         write_atomically(layout.detector, detector.to_json().encode())
         outputs.append(layout.detector)
         given = Path(plan.job.inputs.detector or "").name
