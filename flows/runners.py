@@ -25,7 +25,7 @@ from schemas.model import Model
 from velfield.errors import InputError
 from velfield.parallel import usable_processors
 from velfield.pipeline.graphs import compute_here
-from velfield.pipeline.stage import load_stages
+from velfield.pipeline.stage import load_kernels, load_stages
 
 T = TypeVar("T")
 
@@ -114,7 +114,7 @@ class ThreadsRunner(Runner):
         # One pool for all units at once: each on threads of its own, two cores ran four blocks at a time, out of each
         # other's cache.
         self._pool = ThreadPoolExecutor(threads, "dask")
-        self._pool.submit(load_stages)  # while the run is planned
+        self._pool.submit(_load)  # while the run is planned
         self.description = f"{threads} threads of this process"
 
     def compute(self, graph: Any) -> Any:
@@ -203,6 +203,11 @@ class ClientRunner(Runner):
         )
 
 
+def _load() -> None:
+    load_stages()
+    load_kernels()
+
+
 def _count_tasks(dask_scheduler: Any) -> int:
     return len(dask_scheduler.tasks)
 
@@ -240,7 +245,10 @@ def open_runner(config: RunnerConfig, warn: Callable[[str], None] = warnings.war
 
 
 def _load_stages(client: Any) -> None:
-    """Let each worker import what it will need, while the run is planned; without waiting for it."""
+    """Let each worker import what it will need, while the run is planned; without waiting for it.
+
+    Its one thread has just the time for it: kernels are loaded when they are called first.
+    """
     for address in client.scheduler_info(n_workers=-1)["workers"]:
         loaded = client.submit(load_stages, workers=[address], pure=False)
         loaded.add_done_callback(lambda future: future.release())

@@ -396,13 +396,11 @@ def resolve(function: str) -> Callable[..., Any]:
 
 
 def load_stages() -> None:
-    """Import what the stages need, and load their kernels: two seconds of a worker's time, which has nothing to do
-    while a run is planned."""
+    """Import what the stages need: a second of a worker's time, which has nothing to do while a run is planned."""
     for stage in STAGES:
         for path in (stage.unit, stage.block):
             if path is not None:
                 resolve(path)
-    load_kernels()
 
 
 def load_kernels() -> int:
