@@ -17,7 +17,7 @@ from velfield.detection.cnn.canvas import (
     _MaskedGraph,
     cut_into_pieces,
     fill_kernel,
-    pack_kernel,
+    pack,
     place_kernel,
     reading_scales,
 )
@@ -162,8 +162,7 @@ UNITS = st.integers(1, 40).map(lambda k: 8 * k)
 @given(st.lists(st.tuples(UNITS, UNITS), max_size=30))
 def test_pieces_lie_on_canvases_with_a_gap_between_them(sizes: list[tuple[int, int]]) -> None:
     pieces = pieces_of([(0, 0, height, width) for height, width in sizes])
-    order = np.lexsort((pieces[:, 3], -pieces[:, 2]))
-    places = pack_kernel(pieces, order, 320, 8)
+    places = pack(pieces, 320, 8)
     taken = np.zeros((places[:, 0].max(initial=0) + 1, 328, 328), int)
     for (canvas, y, x), (height, width) in zip(places, sizes, strict=True):
         assert y + height <= 320
@@ -199,7 +198,7 @@ def pieces_of(crops: list[Rectangle]) -> IntArray:
 def test_what_is_copied_is_what_slices_copy() -> None:
     image = grey(11, 480, 520)
     pieces = pieces_of([(0, 0, 448, 480), (456, 488, 24, 32), (456, 0, 16, 8)])
-    places = pack_kernel(pieces, np.arange(len(pieces)), 320, 8)
+    places = pack(pieces, 320, 8)
     rng = np.random.default_rng(12)
     probability, orientation = np.zeros((240, 260), np.float32), np.zeros((2, 240, 260), np.float32)
     expected = np.zeros((3, 240, 260), np.float32)

@@ -31,6 +31,7 @@ from velfield.detection.cnn.network import (
     Topology,
     open_session,
 )
+from velfield.detection.mosaic import shelve_kernel
 
 _SIDES_PX = 320, 1152
 """Most frames' crops lie on one canvas of the larger; few small ones, as in test-time augmentation, on the smaller."""
@@ -139,11 +140,10 @@ class Canvases:
 
     def _lay_out(self, pieces: IntArray) -> tuple[int, IntArray]:
         """Side of the canvases, the smallest of which one is enough or else the largest; places on them."""
-        order = np.lexsort((pieces[:, 3], -pieces[:, 2]))
         largest = pieces[:, 2:4].max(initial=0)
         for side in self.sessions:
             if largest <= side:
-                places = pack_kernel(pieces, order, side, self.unit)
+                places = pack(pieces, side, self.unit)
                 if not places[:, 0].any():
                     break
         return side, places
@@ -180,22 +180,14 @@ def _tile_spans(size: int, side_px: int, unit: int) -> tuple[tuple[int, int, int
     return tuple(spans)
 
 
-@njit(cache=True, nogil=True)
-def pack_kernel(pieces, order, side, gap):  # type: ignore[no-untyped-def]
-    """Canvas, y and x (n, 3) of pieces (n, 8), on shelves in an order from high to low, with a gap between them.
+def pack(pieces: IntArray, side_px: int, gap_px: int) -> IntArray:
+    """Canvas, y and x (n, 3) of pieces (n, 8), on shelves from high to low, with a gap between them.
 
     A gap of a pixel of the lowest level is enough, and none at a canvas's edges: no kernel reaches farther at once.
     """
+    order = np.lexsort((pieces[:, 3], -pieces[:, 2]))
     places = np.empty((len(pieces), 3), np.int64)
-    canvas = y = x = shelf = 0
-    for n in order:
-        height, width = pieces[n, 2], pieces[n, 3]
-        if x > 0 and x + width > side:
-            y, x, shelf = y + shelf + gap, 0, 0
-        if x == 0 and y > 0 and y + height > side:
-            canvas, y = canvas + 1, 0
-        places[n, 0], places[n, 1], places[n, 2] = canvas, y, x
-        x, shelf = x + width + gap, max(shelf, height)
+    places[order, 0], places[order, 1:] = shelve_kernel(pieces[order, 2:4], side_px, gap_px)
     return places
 
 
