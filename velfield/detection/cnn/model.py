@@ -120,7 +120,8 @@ def predict_crops(network: Network, image: GreyImage, crops: IntArray) -> tuple[
     probability = np.zeros((image.shape[0] // STRIDE, image.shape[1] // STRIDE), np.float32)
     orientation = np.zeros((2, *probability.shape), np.float32)
     predict = network.predict
-    fill = predict.fill_crops if isinstance(predict, BlockPredict) else partial(_fill_crops, network)
+    fill_any = partial(_fill_crops, network)
+    fill = predict.fill_crops if isinstance(predict, BlockPredict) else fill_any
     by_size = crops[np.lexsort((crops[:, 3], crops[:, 2]))]
     changes = np.flatnonzero((by_size[1:, 2:] != by_size[:-1, 2:]).any(axis=1)) + 1
     begin = 0
@@ -130,7 +131,7 @@ def predict_crops(network: Network, image: GreyImage, crops: IntArray) -> tuple[
         at_once = 1 if tiled else max(1, _BATCH_PX // (height * width))
         for start in range(begin, end, at_once):
             corners = by_size[start : min(start + at_once, end), :2]
-            (partial(_fill_crops, network) if tiled else fill)(image, corners, height, width, probability, orientation)
+            (fill_any if tiled else fill)(image, corners, height, width, probability, orientation)
         begin = end
     return probability, orientation
 
