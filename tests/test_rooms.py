@@ -17,7 +17,6 @@ SCIENCE = ("sources", "camera", "registration", "detection", "tracking", "field"
 """Arrays in, arrays out: no run folder, no graph."""
 ONLY_IN_TOOLS = ("torch",)
 """Libraries of developers' tools that are in no environment of ours: torch's wheel brings gigabytes of CUDA."""
-MAX_ROOMS, MAX_ARROWS, MAX_LOOSE_MODULES, MAX_FILES = 18, 57, 5, 18
 
 
 def modules() -> list[Path]:
@@ -142,22 +141,6 @@ def test_no_package_cycles() -> None:
         graph.prepare()
     except CycleError as error:
         pytest.fail(f"packages import each other in a circle: {' -> '.join(error.args[1])}")
-
-
-def test_the_house_stays_small() -> None:
-    velfield = ROOT / "velfield"
-    rooms = {room_of(".".join(path.relative_to(ROOT).with_suffix("").parts)) for path in velfield.rglob("*.py")}
-    loose = [path.name for path in velfield.glob("*.py") if path.name != "__init__.py"]
-    crowded = {
-        folder.relative_to(ROOT).as_posix(): count
-        for top in FLOORS
-        for folder in {path.parent for path in (ROOT / top).rglob("*.py")}
-        if (count := len([path for path in folder.glob("*.py") if path.name != "__init__.py"])) > MAX_FILES
-    }
-    assert len(rooms) <= MAX_ROOMS, sorted(map(str, rooms))
-    assert len(arrows()) <= MAX_ARROWS, sorted(arrows())
-    assert len(loose) <= MAX_LOOSE_MODULES, loose
-    assert crowded == {}
 
 
 def test_no_print_no_exit_in_the_library() -> None:
