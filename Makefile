@@ -3,7 +3,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+PIP := $(BIN)/python -m pip --disable-pip-version-check
 export UV_LINK_MODE := copy
+# As pip does: the certificate authorities of the machine, such as that of a company's proxy.
+export UV_SYSTEM_CERTS := true
 # Where this is set, every process of ours compiles all that it imports anew: 12 s each for Prefect.
 export PYTHONDONTWRITEBYTECODE :=
 
@@ -23,19 +26,20 @@ test: page  ## every check: lint, types, tests
 
 # The viewer's page from page/: built where its sources changed. Node is the machine's, else PyPI's into the environment.
 page: $(STAMP)
-	@$(BIN)/python page/build.py --has-node || $(BIN)/uv pip install --quiet --python $(BIN)/python \
-	  "$$($(BIN)/python page/build.py --node-wheel)"
+	@$(BIN)/python page/build.py --has-node || $(PIP) install --quiet "$$($(BIN)/python page/build.py --node-wheel)"
 	@$(BIN)/python page/build.py
 
 env: page  ## the environment, with the viewer's page
 
-# uv installs the locked environment in seconds where pip takes a minute and a half; pip brings uv.
+# uv installs the locked environment in seconds where pip takes two minutes; pip brings uv, and does its work where uv
+# cannot: where only a certificate authority that uv does not read is trusted, say.
 $(STAMP): requirements.lock pyproject.toml
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check "uv>=0.5"
-	$(BIN)/uv pip install --quiet --python $(BIN)/python --require-hashes -r requirements.lock
-	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation --editable .
-	touch $@
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@{ $(PIP) install --quiet "uv>=0.8" && $(BIN)/uv pip install --quiet --python $(BIN)/python --require-hashes -r requirements.lock; } \
+	  || { echo "make: uv could not install the packages; pip installs them, in about two minutes"; \
+	       $(PIP) install --quiet --require-hashes -r requirements.lock; }
+	@$(PIP) install --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
