@@ -37,7 +37,7 @@ $(STAMP): requirements.lock pyproject.toml
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@{ $(PIP) install --quiet "uv>=0.8" && $(BIN)/uv pip install --quiet --python $(BIN)/python --require-hashes -r requirements.lock; } \
 	  || { echo "make: uv could not install the packages; pip installs them, in about two minutes"; \
-	       $(PIP) install --quiet --require-hashes -r requirements.lock; }
+	       $(PIP) install --quiet --no-deps --require-hashes -r requirements.lock; }
 	@$(PIP) install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
 
