@@ -68,7 +68,7 @@ soak: $(STAMP)  ## fifty kills at random moments: every result equal to the bit
 	$(BIN)/python -m tests.kills --kills 50
 
 docs: $(STAMP)  ## the documentation as pages, in build/docs
-	$(BIN)/mkdocs build --quiet
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
 detector: $(STAMP)  ## make the detector that ships anew: make detector DATA=folder with songdo/ and kit_ais/
 	$(BIN)/python -m tools.make_detector $(DATA)

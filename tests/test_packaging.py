@@ -66,7 +66,11 @@ def test_the_lock_names_no_registry() -> None:
 
 
 # What conda-forge calls by another name, or splits.
-CONDA_NAMES = {"opencv-python-headless": {"opencv"}, "dask": {"dask-core", "distributed"}}
+CONDA_NAMES = {
+    "dask": {"dask-core", "distributed"},
+    "matplotlib": {"matplotlib-base"},
+    "opencv-python-headless": {"opencv"},
+}
 
 
 def requirement(line: str) -> tuple[str, str]:
