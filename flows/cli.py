@@ -13,10 +13,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 from cyclopts import App, Argument, CycloptsError, MissingArgumentError, Parameter
 
 from flows.commands.start import own_command
-from flows.launch import limit_threads
+from flows.launch import limit_threads, use_writable_folders
 from flows.options import Device, Preset, Settings, parse_frame_size, renamed_option
 from flows.stopping import STOPPED, as_ctrl_c, leave
-from velfield.errors import DeviceWarning, IneffectiveSettingWarning, InputError, OldNameWarning, StoreError
+from velfield.errors import (
+    CacheWarning,
+    DeviceWarning,
+    IneffectiveSettingWarning,
+    InputError,
+    OldNameWarning,
+    StoreError,
+)
 
 if TYPE_CHECKING:
     from flows.console import Console, Verbosity
@@ -480,7 +487,7 @@ def _warn_of_settings_in_one_line() -> None:
     show = warnings.showwarning
 
     def showwarning(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
-        if issubclass(category, OldNameWarning | IneffectiveSettingWarning | DeviceWarning):
+        if issubclass(category, CacheWarning | OldNameWarning | IneffectiveSettingWarning | DeviceWarning):
             print(f"velfield: {message}", file=sys.stderr)
         else:
             show(message, category, *where, **options)
@@ -515,6 +522,8 @@ def main() -> None:
     as_ctrl_c()
     _warn_of_settings_in_one_line()
     try:
+        if not {"--help", "-h", "--version"} & set(sys.argv):
+            use_writable_folders()
         options = {"result_action": "return_value", "exit_on_error": False, "print_error": False}
         status = _start() if len(sys.argv) == 1 else app(sys.argv[1:], **options)
     except MissingArgumentError as error:

@@ -6,11 +6,14 @@ The user's own settings win: every variable is a default.
 import ctypes
 import os
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from subprocess import DEVNULL, Popen
+
+from velfield.errors import CacheWarning
+from velfield.kernel_cache import cache_root, is_writable, temporary_cache, user_home
 
 PAGES, PAGES_OF = "VELFIELD_PAGES", "VELFIELD_PAGES_OF"
 """Environment: where `velfield serve` shows the pages of runs, and of which folder."""
@@ -43,6 +46,8 @@ _MEMORY: dict[str, tuple[int, int]] = {
 """glibc's settings: environment for workers; number and bytes for `mallopt` here. Images of some MB are
 allocated and freed all the time: from and to the system each time, they cost a quarter of all processor time; with the
 64 KiB that Dask sets for its workers half as much again."""
+_HOMES = {"PREFECT_HOME": "prefect", "MPLCONFIGDIR": "matplotlib", "XDG_CACHE_HOME": "cache"}
+"""Environment: folders that libraries have in the home folder, and their names in a temporary one."""
 _QUIET: dict[str, str] = {
     # Only the terminal is quiet: PREFECT_LOGGING_LEVEL would hide retries in the UI too.
     "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "CRITICAL",
@@ -64,6 +69,30 @@ def prepare_process(*, verbose: bool) -> None:
 
     # The work is parallel by frames: OpenCV's own threads would only compete with it.
     cv2.setNumThreads(1)
+
+
+def use_writable_folders() -> None:
+    """Keep in a temporary folder what libraries keep in the home folder, where that cannot be written, and warn.
+
+    Call before matplotlib, numba and prefect are imported.
+
+    Raises
+    ------
+    InputError
+        There is no writable temporary folder either.
+    """
+    home = user_home()
+    missing = {name: folder for name, folder in _HOMES.items() if name not in os.environ}
+    if not missing or (home is not None and is_writable(home)):
+        return
+    temporary = temporary_cache()
+    os.environ.update({name: str(temporary / folder) for name, folder in missing.items()})
+    warnings.warn(
+        f"found the home folder ({os.environ.get('HOME') or 'HOME is not set'}) not writable: Prefect's database, "
+        f"compiled code and other caches go to {temporary}; set HOME to a folder that is writable to keep them",
+        CacheWarning,
+        stacklevel=2,
+    )
 
 
 def _keep_memory() -> None:
@@ -110,12 +139,7 @@ def kernels_beside() -> Iterator[None]:
     A minute of a first run is waiting for the compiler on one processor, kernel after kernel; this way the later ones
     are cached when they are needed. Should it fail, nothing is lost.
     """
-    spec = find_spec("velfield")
-    folders = spec.submodule_search_locations if spec else None
-    if (
-        any(found for folder in folders or () for found in Path(folder).rglob("*.nbi"))
-        or "NUMBA_CACHE_DIR" in os.environ
-    ):
+    if any(cache_root().rglob("*.nbi")):
         yield
         return
     command = [sys.executable, "-m", "velfield.pipeline.local"]

@@ -1,4 +1,4 @@
-"""What goes wrong: bad input, a damaged run, a full disk, a frame or chunk that cannot be done; and three warnings."""
+"""What goes wrong: bad input, a damaged run, a full disk, a frame or chunk that cannot be done; and four warnings."""
 
 import errno
 import json
@@ -34,6 +34,10 @@ class OldNameWarning(FutureWarning):
 
 class IneffectiveSettingWarning(UserWarning):
     """A setting that the chosen method does not read. The message says which setting chose the method."""
+
+
+class CacheWarning(RuntimeWarning):
+    """Compiled code or settings are kept in a temporary folder. The message says where, and what to set."""
 
 
 class DeviceWarning(RuntimeWarning):

@@ -1,8 +1,5 @@
 """Instructions on vectors for numba's intrinsics, where numba alone makes loops over single values: it does not know
 that arrays do not overlap.
-
-Numba's cache of a kernel (``cache=True``) asks for the kernel's own file alone, not for what it imports: after a change
-here, change or touch the files of the kernels that use it, or they run as compiled before.
 """
 
 from collections.abc import Sequence
