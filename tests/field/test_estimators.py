@@ -105,6 +105,18 @@ def test_modes_have_the_weights_of_their_basins_and_the_largest_comes_first() ->
     assert np.isnan(modes[2]).all()
 
 
+def test_a_ring_about_an_empty_bin_has_one_mode_that_holds_all_the_weight() -> None:
+    """The smoothed histogram is highest at the bin in the middle, which no vehicle filled."""
+    h = np.zeros((2 * REACH + 1, 2 * REACH + 1), np.int32)
+    h[REACH + 4 : REACH + 7, REACH + 7 : REACH + 10] = 5
+    h[REACH + 5, REACH + 8] = 0
+    modes = velocity_modes(h[None, None], np.array([[1_000_000]], np.int32), bins=BINS)[0, 0]
+    assert np.isfinite(modes[0]).all()
+    assert np.isnan(modes[1:]).all()
+    np.testing.assert_allclose(modes[0, :2], BINS.from_bins(np.array([REACH + 8.0, REACH + 5.0])), atol=0.1)
+    assert modes[0, 2] == 1.0
+
+
 @pytest.mark.parametrize("dof", [3.0, 5.5, 12.0, 60.0, 1000.0])
 def test_students_quantile_is_that_of_scipy(dof: float) -> None:
     assert _student_t95(dof) == pytest.approx(stats.t.ppf(0.95, dof), rel=0.003)

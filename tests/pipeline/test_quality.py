@@ -183,3 +183,17 @@ def test_a_flight_without_a_sound_frame_is_refused_with_the_faults(flight: Path,
         InputError, match=r"found 2 frames without a fault of 18 \(15 duplicate, 16 black\), expected 3 or more; "
     ):
         compute_stages(plan, stages_before("lens"))
+
+
+def test_a_unit_of_frames_that_are_all_unreadable_is_lost_frames_and_the_rest_goes_on(
+    flight: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(flight, tmp_path / "flight")
+    for path in sorted((tmp_path / "flight" / "frames").iterdir())[8:16]:
+        path.write_bytes(b"not a picture")
+    summary = process(job(tmp_path / "flight", tmp_path / "run"))
+    assert not summary.complete  # `velfield run` ends with status 3
+    store = open_frames(RunLayout(str(tmp_path / "run")).frames)
+    unreadable = (store.column("flags") & int(FrameFlag.UNREADABLE)) > 0
+    assert np.flatnonzero(unreadable).tolist() == list(range(8, 16))
+    assert sum("unreadable" in line for line in summary.frames_lost) == 8

@@ -196,3 +196,21 @@ def test_the_mesh_follows_a_hill_whose_points_disagree_with_the_smooth_map_and_n
         return float(np.abs(np.median(left[on_hill], axis=0)).max())
 
     assert off(3) < 0.15 < 0.4 * off(1)
+
+
+@pytest.mark.parametrize("knots", [0, 48])
+@pytest.mark.parametrize("reach", [(500.0, 300.0), (600.0, 0.0), (0.0, 0.0)])
+def test_points_on_a_line_or_in_one_place_are_a_failure_that_says_so(reach: tuple[float, float], knots: int) -> None:
+    raw = np.array([LENS.centre_x_px, LENS.centre_y_px]) + np.linspace(-1, 1, 60)[:, None] * reach
+    base = shaken(raw, amplitude_px=0.0, cycles=0.0) + np.array([3.0, -2.0])
+    found = fit(ControlPoints(raw, base, np.full(60, 0.5)), knots=knots)
+    assert isinstance(found, Failure)
+    assert found.reason == "60 control points do not determine the map: they lie on a line or in one place"
+
+
+def test_points_of_one_fold_are_a_failure_as_nothing_is_left_to_test_the_fit_with() -> None:
+    raw = np.random.default_rng(0).uniform(0, 47, (60, 2)) + 480
+    base = shaken(raw, amplitude_px=0.0, cycles=0.0)
+    found = fit(ControlPoints(raw, base, np.full(60, 0.5)), knots=0)
+    assert isinstance(found, Failure)
+    assert found.reason == "60 control points do not determine the map without a fifth of them"

@@ -332,3 +332,29 @@ def test_a_frame_is_shrunk_as_by_opencv() -> None:
     expected = cv2.resize(grey, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
     np.testing.assert_array_equal(shrink(grey), expected)
     np.testing.assert_array_equal(shrink(np.pad(grey, ((0, 3), (0, 1)))), expected)  # what fills no square is left out
+
+
+def test_a_chain_by_optical_flow_counts_only_what_it_measured_against_the_base_image(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Near the right border no patch aligns: points that flow carries there are the frame before's, not evidence."""
+
+    def align_on_the_left(*arguments: object, **options: object) -> tuple[ControlPoints, int]:
+        points, shown = align_patches(*arguments, **options)
+        return points.select(points.xy_raw[:, 0] < 558), shown
+
+    monkeypatch.setattr(intrasensor, "align_patches", align_on_the_left)
+    monkeypatch.setattr(intrasensor, "_is_worse", lambda *_: False)
+    first, *by_flow = registered("still", [0, 1, 2, 3])
+    assert (first.control_points.xy_raw[:, 0] > 562).any()
+    for result in by_flow:
+        assert not (result.control_points.xy_raw[:, 0] > 562).any()
+        assert np.isnan(result.error_map[:, -1]).all()
+        assert result.n_matches_base >= result.n_inliers
+        assert result.n_matches_previous == 0
+
+
+def test_a_chain_by_optical_flow_counts_patches_and_not_points_that_it_followed() -> None:
+    for result in registered("city", [0, 1, 2, 3])[1:]:
+        assert result.n_inliers > intrasensor._FLOW_POINTS
+        assert result.n_matches_base >= result.n_inliers

@@ -196,6 +196,8 @@ def _main_mode(h: NDArray[np.int32], window: float) -> tuple[float, float]:
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _is_peak(h: NDArray[np.int32], y: int, x: int) -> bool:
     here = _smooth(h, y, x)
+    if here <= 0:
+        return False
     for j in range(max(y - 1, 0), min(y + 2, h.shape[0])):
         for i in range(max(x - 1, 0), min(x + 2, h.shape[1])):
             if (j, i) == (y, x):
@@ -211,14 +213,15 @@ def _is_peak(h: NDArray[np.int32], y: int, x: int) -> bool:
 def pixel_modes(h: NDArray[np.int32], window: float, modes: NDArray[np.float64]) -> int:
     """Fill ``modes`` (k, 3) with (y, x, weight) in bins, the largest weight first; returns their number.
 
-    Each bin's weight is assigned to the nearest mode, so that the weights of all modes sum to one.
+    Each bin's weight is assigned to the nearest mode, so that the weights of all modes sum to one. The highest bin of
+    the smoothed histogram may itself be empty, where vehicles went a little faster or slower.
     """
     found = np.empty((64, 3), np.float64)
     n_found = 0
     top, bottom, left, right = occupied_box(h)
     for y in range(top, bottom):
         for x in range(left, right):
-            if h[y, x] > 0 and n_found < found.shape[0] and _is_peak(h, y, x):
+            if n_found < found.shape[0] and _is_peak(h, y, x):
                 mode_y, mode_x = _mean_shift(h, float(y), float(x), window)
                 known = False
                 for k in range(n_found):

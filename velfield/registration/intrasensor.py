@@ -15,9 +15,9 @@ way below loses, goes through these steps:
 
 Every other frame starts from the one before (``start="optical_flow"``): the inliers of that frame are tracked into this
 one by pyramidal Lucas-Kanade, a fit to them takes the place of steps 1 to 3, and steps 4 and 5 follow. Nothing of the
-earlier frame's error remains, as the patches are aligned to the base image itself. Keypoints cost more than all else of
-a frame's registration. A frame that comes out worse than the one that its chain began with is registered again by its
-keypoints.
+earlier frame's error remains: only patches that are aligned to the base image itself are fitted and counted.
+Keypoints cost more than all else of a frame's registration. A frame that comes out worse than the one that its chain
+began with is registered again by its keypoints.
 
 Matches to the previous frame propagate its errors and would let the chain drift: they are used only in those cells of
 the frame where the base image gives no match. Where the base image covers the frame, the result does not depend on
@@ -130,7 +130,8 @@ class FrameRegistration:
     ----------
     transform : raw to base pixels; None if it failed.
     status : ``ok`` or ``failed:<reason with counts>``.
-    n_matches_base, n_matches_previous : control points matched to the base image and to the previous frame.
+    n_matches_base, n_matches_previous : control points matched to the base image and to the previous frame; in a frame
+        that optical flow starts, the patches aligned to the base image.
     n_inliers : inliers of the robust fit.
     residual_px, heldout_px : RMS residual of the inliers, fitted and cross-validated; NaN if failed.
     coverage : fraction of the frame's cells with inliers.
@@ -344,7 +345,7 @@ def _register_by_flow(
     if isinstance(fitted, Failure):
         return None
     used, fit = fitted
-    result = fitter.with_quality_metrics(used, fit, len(points), 0)
+    result = fitter.with_quality_metrics(used, fit, len(used), 0)
     return result if result.ok else None
 
 
@@ -498,7 +499,8 @@ class _FrameFitter:
     ) -> tuple[ControlPoints, JointFit] | Failure:
         """Fit to matched keypoints, then twice to patches of the base image aligned through that fit.
 
-        Patches that were ``chosen`` are taken as they are; else the usual set, or the denser one.
+        Patches that were ``chosen`` are taken as they are, and ``points`` for a start only; else the usual set, or the
+        denser one, and ``points`` in cells where no patch aligns.
 
         If few patches align at the fine level, a coarse level with a larger search range comes first. Otherwise it does
         harm: at the border of another sensor's image, where few patches align correctly, wrong alignments from the
@@ -523,7 +525,10 @@ class _FrameFitter:
                 aligned, in_frame = align_patches(image, fit.transform, templates, coarse=is_coarse, max_shift_px=limit)
             if not len(aligned) or len(aligned) < _MIN_ALIGNED_FRACTION * in_frame:
                 return Failure(f"{len(aligned)} of {in_frame} patches of the base image align")
-            used = aligned.concatenate(_select_in_empty_cells(points, aligned, *self.size))
+            # points that optical flow carried on are the frame before's word: a chain would confirm itself by them
+            used = (
+                aligned.concatenate(_select_in_empty_cells(points, aligned, *self.size)) if chosen is None else aligned
+            )
             refit = self._fit(used, fit.transform.polyprojective, fit)
             if isinstance(refit, Failure):
                 return refit

@@ -263,7 +263,10 @@ def fit_jointly(
     )
     state = problem.evaluate(_initial_parameters(problem, start, start_rows))
     rough = rough and start_stiffness is not None
-    state, weights, scale, stiffness = _irls_annealed(problem, state, start_scale_px, start_stiffness, rough=rough)
+    fitted = _irls_annealed(problem, state, start_scale_px, start_stiffness, rough=rough)
+    if isinstance(fitted, Failure):
+        return fitted
+    state, weights, scale, stiffness = fitted
     return _to_result(problem, state, weights, scale, stiffness, lens=lens, width=width, rough=rough)
 
 
@@ -408,18 +411,23 @@ def _irls_annealed(
     start_stiffness: tuple[float, float] | None,
     *,
     rough: bool,
-) -> tuple[_State, FloatArray, float, tuple[float, float]]:
-    """IRLS with a weight function that narrows from step to step: the map, weights, scale and stiffness."""
+) -> tuple[_State, FloatArray, float, tuple[float, float]] | Failure:
+    """IRLS with a weight function that narrows from step to step: the map, weights, scale and stiffness.
+
+    A failure if the normal equations are not positive definite, or if the last step was not possible."""
     stiffness = start_stiffness or _INITIAL_STIFFNESS
     widths: tuple[float, ...] = _ANNEALING if start_stiffness is None else _WARM_ANNEALING
     widths = _ROUGH_ANNEALING if rough else widths + (widths[-1],) * _FINAL_STEPS
     limit = start_scale_px / float(np.median(problem.sigma))
     weights, scale = _weights_and_scale(state.residuals, problem.sigma, widths[0], limit)
-    no_folds, equations, settled = np.zeros_like(problem.fold), None, rough
+    no_folds, equations, settled, moved = np.zeros_like(problem.fold), None, rough, False
     for iteration, width in enumerate(widths):
         if equations is None:
             equations = problem.equations(state, _inverse_variance(problem, weights, scale), no_folds, 1)
-        state = _take_step(problem, state, equations, weights, stiffness)
+        stepped = _take_step(problem, state, equations, weights, stiffness)
+        if isinstance(stepped, Failure):
+            return stepped
+        moved, state = stepped is not state, stepped
         weights, scale = _weights_and_scale(state.residuals, problem.sigma, width, limit)
         equations = None
         if iteration in _SELECT_STIFFNESS_AFTER and problem.knots and not settled:
@@ -434,6 +442,8 @@ def _irls_annealed(
             selected = _select_stiffness(problem, (bands, border, corner), state.theta, start_stiffness)
             settled = start_stiffness is not None and selected == stiffness
             stiffness = selected
+    if not moved:
+        return Failure(f"the fit to {len(weights)} control points did not converge: a step folds the map over")
     return state, weights, scale, stiffness if problem.knots else (1.0, 1.0)
 
 
@@ -463,6 +473,8 @@ def _to_result(
         return JointFit(transform, weights, residuals, residuals, scale, stiffness)
     equations = problem.equations(state, _inverse_variance(problem, weights, scale), problem.fold, FOLDS)
     steps = problem.steps(equations, theta, stiffness, leave_out=True)
+    if not np.isfinite(steps).all():
+        return Failure(f"{len(weights)} control points do not determine the map without a fifth of them")
     change = kernels.predict_change(
         problem.undistorted,
         state.corrected,
@@ -488,9 +500,14 @@ def _take_step(
     equations: _Equations,
     weights: FloatArray,
     stiffness: tuple[float, float],
-) -> _State:
-    """One Gauss-Newton step, halved until every control point of positive weight stays in the map's domain."""
+) -> _State | Failure:
+    """One Gauss-Newton step, halved until every control point of positive weight stays in the map's domain.
+
+    Returns the state itself if no halving suffices; a failure if the control points do not determine the map.
+    """
     (step,) = problem.steps(equations, state.theta, stiffness, leave_out=False)
+    if not np.isfinite(step).all():
+        return Failure(f"{len(weights)} control points do not determine the map: they lie on a line or in one place")
     for _ in range(_HALVINGS):
         stepped = problem.evaluate(state.theta + step)
         if kernels.are_finite(stepped.residuals, weights):

@@ -122,10 +122,7 @@ def create_frame_store(plan: Plan) -> None:
 def read_unit(plan: Plan, frames: range) -> StageResult:
     """Decode a unit of frames and write them, one chunk each; an unreadable frame is black and flagged.
 
-    Raises
-    ------
-    InputError
-        None of the unit's frames could be read.
+    A unit of which no frame is readable is written like any other: `flag_frames` judges the recording as a whole.
     """
     store = open_frames(plan.layout.frames, "r+")
     indices = plan.indices[frames.start : frames.stop]
@@ -144,10 +141,6 @@ def read_unit(plan: Plan, frames: range) -> StageResult:
             quality = frame_quality(found.grey)
             sharpness[k], brightness[k], thumbnails[k] = quality.sharpness, quality.brightness, quality.thumbnail
         advance("frames")
-    if np.all(flags & FrameFlag.UNREADABLE):
-        raise InputError(
-            f"{source}: none of the frames {indices[0]} to {indices[-1]} could be read; is the file whole?"
-        )
     times_s = plan.info.times_s[indices]
     columns: dict[str, NDArray[Any]] = {
         "time_s": times_s,
