@@ -25,7 +25,7 @@ from velfield.detection.orientation import fill_missing_orientation
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 from velfield.parallel import parallel_map
-from velfield.sources.labels.yolo import car_in_upright_box, length_from_upright_box
+from velfield.sources.labels.shapes import car_in_upright_box, length_from_upright_box
 
 ATTRIBUTION = (
     "Songdo Vision (R. Fonod and others), CC-BY 4.0: three frames, scaled to cars of 16 px",

@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from velfield.detection.detect import oriented_patches, upright_chips
 from velfield.detection.orientation import (
     axial_difference,
+    contradict_axes,
     fill_missing_orientation,
+    outline_axes,
     sample_nearest,
     structure_tensor_axis,
 )
@@ -143,3 +145,20 @@ def test_no_positions_give_no_crops() -> None:
     image = np.zeros((40, 50), np.uint8)
     assert oriented_patches(image, np.empty((0, 2)), np.empty(0)).shape == (0, 16, 8)
     assert upright_chips(image, np.empty((0, 2))).shape == (0, 32, 32)
+
+
+def test_axes_of_labels_that_are_not_those_of_the_cars_are_reported() -> None:
+    rng = np.random.default_rng(5)
+    image = np.full((400, 400), 90, np.uint8)
+    centres = np.array([(x, y) for x in range(40, 400, 40) for y in range(40, 400, 40)], np.float64)
+    axes = rng.uniform(0, np.pi, len(centres))
+    for (x, y), axis in zip(centres, axes, strict=True):
+        corners = cv2.boxPoints(((x, y), (16, 7), np.degrees(axis)))
+        cv2.fillPoly(image, [corners.round().astype(np.int32)], 200)
+    cars = np.column_stack([centres, axes, np.full((len(axes), 2), (16.0, 7.0))])
+    found = outline_axes(image, cars)
+    assert not contradict_axes(found, axes)
+    (mirrored,) = contradict_axes(found, -axes)
+    assert "if angles are counted the other way round" in mirrored
+    assert "check the angles" in contradict_axes(found, np.zeros(len(axes)))[0]
+    assert not contradict_axes(found[:5], np.zeros(5))

@@ -198,8 +198,7 @@ def kinds(folder: Path) -> list[Kind]:
     from velfield.run.flight_record import read_flight_record
     from velfield.run.tables import read_tables
     from velfield.sources.geo import read_base_raster
-    from velfield.sources.labels.detections import read_detections
-    from velfield.sources.labels.labels import read_labels
+    from velfield.sources.labels.labels import read_detections, read_labels
     from velfield.sources.source import probe
     from velfield.sources.telemetry.image_tags import read_image_telemetry
     from velfield.sources.telemetry.read import read_telemetry_file

@@ -1,6 +1,7 @@
 """Labels and external detections in raw pixels; what is none is refused."""
 
 import math
+import shutil
 
 import numpy as np
 import pytest
@@ -10,9 +11,8 @@ from hypothesis import strategies as st
 from schemas.tables import LABEL_COLUMNS
 from velfield.errors import InputError
 from velfield.sources.frames import SourceInfo
-from velfield.sources.labels.detections import RAW_DETECTION_COLUMNS, read_detections
-from velfield.sources.labels.labels import read_labels
-from velfield.sources.labels.yolo import length_from_upright_box
+from velfield.sources.labels.labels import RAW_DETECTION_COLUMNS, read_detections, read_labels
+from velfield.sources.labels.shapes import length_from_upright_box
 
 FOLDER = SourceInfo("folder", 200, 100, 3, np.arange(3) / 5, ("a.png", "b.png", "c.png"))
 VIDEO = SourceInfo("video", 200, 100, 50, np.arange(50) / 25, tuple(str(index) for index in range(50)))
@@ -52,6 +52,7 @@ def test_a_video_is_labelled_by_frame_index_before_every(tmp_path):
 
 
 def test_a_yolo_folder_is_read_by_stem_and_other_classes_are_left_alone(tmp_path):
+    write(tmp_path / "y" / "classes.txt", "car\nbus\ntree\n")
     write(tmp_path / "y" / "a.txt", "0 0.5 0.5 0.1 0.05\n2 0.25 0.5 0.2 0.2\n")
     write(tmp_path / "y" / "b.txt", "")
     write(tmp_path / "y" / "elsewhere.txt", "0 0.5 0.5 0.1 0.1\n")
@@ -59,7 +60,10 @@ def test_a_yolo_folder_is_read_by_stem_and_other_classes_are_left_alone(tmp_path
     assert labels.frames == ("a.png", "b.png")
     assert (len(labels.cars), len(labels.ignored)) == (1, 1)
     assert labels.cars.loc[0, ["x_px", "y_px"]].tolist() == [99.5, 49.5]
-    assert labels.notes == ("1 label files name no frame of this source: not used",)
+    assert labels.notes == (
+        "classes by classes.txt: cars are car (1); ignored: tree (1)",
+        "1 labelled images are no frames of this source: not used",
+    )
 
 
 @pytest.mark.parametrize(
@@ -108,16 +112,17 @@ def test_length_of_a_usual_car_comes_out_of_its_upright_box_at_any_turn(angle, l
         ("l.csv", "frame,x_px,y_px\n", "found no cars"),
         ("l.csv", "frame,x_px,y_px\na.png,,\n", "found no cars"),
         ("l.csv", "frame,x_px,y_px,length_px\na.png,5,5,-2\n", "both > 0"),
-        ("l.csv", "filename,xmin,ymin,xmax,ymax,label\na.png,1,2,3,4,car\n", "expected labels as CSV `frame,x_px,y_px"),
+        ("l.csv", "filename,left,top,width,height\na.png,1,2,3,4\n", "expected labels as CSV `frame,x_px,y_px"),
+        ("l.csv", "frame,x_px,y_px,orientation_rad\na.png,5,5,84\n", "convert degrees"),
         ("l.csv", "frame,x_px,y_px,angle\na.png,5,5,3\n", "expected labels as CSV"),
-        ("l.json", '{"shapes": []}', "found JSON of another kind, expected COCO, LabelMe, VIA or GeoJSON"),
-        ("l.xml", "<annotation/>", "found XML"),
-        ("l.txt", "1,2,3,4\n", "a .txt that is not YOLO"),
+        ("l.json", '{"shapes": []}', "found JSON of another kind, expected labels of GeoJSON, COCO"),
+        ("l.xml", "<annotation/>", "found XML of another kind"),
+        ("l.txt", "1 2 3 4\n", "a .txt that is not YOLO"),
         ("a.txt", "0 0.5 0.5 0.1 0.1\n0 12 34 10 10\n", "fractions of the image"),
-        ("a.txt", "0 0.5 0.5 0.1 0.1\ncar 1 2\n", "line 2: found 'car 1 2', expected YOLO"),
+        ("a.txt", "0 0.5 0.5 0.1 0.1\ncar 1 2\n", "line 2: found 'car 1 2', expected YOLO.*; fix line 2"),
         ("q.txt", "0 0.5 0.5 0.1 0.1\n", "none named as a frame"),
         ("y/z.txt", "0 0.5 0.5 0.1 0.1\n", "none named as a frame"),
-        ("y/readme.md", "", "no .txt files"),
+        ("y/readme.md", "", "no .txt, .json or .xml files"),
     ],
 )
 def test_what_is_no_label_of_these_frames_is_refused(tmp_path, name, content, match):
@@ -151,7 +156,7 @@ def test_detections_of_others_are_read_with_what_they_know(tmp_path):
         ("frame,x_px,y_px\na.png,500,20\n", "1 detections outside the image"),
         ("frame,x_px,y_px\n", "found no detections"),
         ("frame,x_px,y_px\nz.png,5,20\n", "found frame 'z.png'"),
-        ("frame,x_px,y_px\na.png,,20\n", "x_px or y_px empty"),
+        ("frame,x_px,y_px\na.png,,20\n", "one of x_px and y_px empty"),
         ("frame,x,y\na.png,1,20\n", "expected detections as CSV"),
     ],
 )
@@ -160,12 +165,16 @@ def test_bad_detections_are_refused(tmp_path, content, match):
 
 
 @pytest.mark.footage
-def test_kit_ais_labels_are_read_as_they_are(footage):
+def test_kit_ais_labels_are_read_with_the_names_of_their_classes(footage, tmp_path):
     from schemas.flight import FramesConfig
     from velfield.sources.source import probe
 
     folder = footage("kit_ais") / "MOS155_street"
     info = probe(folder, frames=FramesConfig(fps=2))
-    labels = read_labels(folder, info)
+    assert_refused(folder, r"classes 0 \(1311 boxes\), 2 .* without names", info)
+    for file in folder.glob("*.txt"):
+        shutil.copy(file, tmp_path)
+    write(tmp_path / "classes.txt", "car\n\nlorry\ntrailer\n")
+    labels = read_labels(tmp_path, info)
     assert (len(labels.cars), len(labels.ignored), len(labels.frames)) == (1311, 27, 25)
     assert 28 < labels.cars["length_px"].median() < 40  # about 37 x 17 px by its source

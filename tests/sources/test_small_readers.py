@@ -16,8 +16,8 @@ from schemas.flight import FramesConfig
 from velfield.errors import InputError
 from velfield.sources.frames import local_path
 from velfield.sources.images import image_size, read_grey_image
-from velfield.sources.labels.boxes import car_shape
-from velfield.sources.labels.yolo import CAR_ASPECT, car_class_numbers, car_in_upright_box, tilt_of_upright_box
+from velfield.sources.labels.classes import choose_cars
+from velfield.sources.labels.shapes import CAR_ASPECT, car_in_upright_box, car_shape, tilt_of_upright_box
 from velfield.sources.quality import (
     BLACK_LEVEL,
     FLAT_SD,
@@ -159,9 +159,9 @@ def test_a_point_and_a_line_have_no_shape() -> None:
 
 def test_cars_are_known_by_their_names_and_lorries_are_none() -> None:
     names = ["truck", "Passenger Car", "large-vehicle", "van", "", "caravan", "motorcycle", "small-vehicle"]
-    assert car_class_numbers(enumerate(names), Path("classes.txt")) == {1, 3, 7}
+    assert choose_cars([0, 1, 2, 3, 5, 6, 7], dict(enumerate(names)), "classes.txt")[0] == {1, 3, 7}
     with pytest.raises(InputError, match="found the classes bus, tram, expected one of cars"):
-        car_class_numbers([(0, "bus"), (1, "tram")], Path("classes.txt"))
+        choose_cars([0, 1], {0: "bus", 1: "tram"}, "classes.txt")
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 6), (7, 2), (33, 40)])

@@ -181,7 +181,7 @@ class Detector(ABC):
 
         Returns
         -------
-        The columns of `velfield.sources.labels.detections.RAW_DETECTION_COLUMNS` from ``x_px`` on.
+        The columns of `velfield.sources.labels.labels.RAW_DETECTION_COLUMNS` from ``x_px`` on.
         """
         raise NotImplementedError
 

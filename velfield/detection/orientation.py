@@ -22,6 +22,7 @@ _OUTLINE_SIGMA_PX = 1.0
 _ALONG = np.linspace(-0.4, 0.4, 9)
 """Sampled part of a side, in lengths from its middle: the corners are round."""
 _SIZES = (0.85, 1.0, 1.15)
+_AGREES_RAD, _MIN_CARS, _RIGHT_AGREEMENT = np.pi / 6, 8, 0.7
 _END_WEIGHT = 0.5
 """Bumpers are shorter than sides, and a windscreen's edge is as sharp."""
 
@@ -85,6 +86,37 @@ def fill_missing_orientation(
         score -= np.nan_to_num(0.5 * ((candidates - abs_box_angle_rad[unknown, None]) / _BOX_SD_RAD) ** 2)
     cars[unknown, 2] = _CANDIDATES[score.argmax(axis=1)]
     return cars
+
+
+def outline_axes(image: GreyImage, cars: FloatArray) -> FloatArray:
+    """Axes (n,) at which the outlines of cars (n, 5), as of `fill_missing_orientation`, fit the image best."""
+    return np.asarray(_CANDIDATES[_outline_scores(image, cars).argmax(axis=1)])
+
+
+def contradict_axes(axes: FloatArray, labelled: FloatArray) -> list[str]:
+    """A warning where the axes of labels are not those of the cars in the images; else none.
+
+    Parameters
+    ----------
+    axes, labelled
+        (n,) of the same cars, by `outline_axes` and by the labels. By right labels 0.76 and more are within 30 degrees
+        of each other, by wrong ones a third.
+    """
+    turns = {
+        "as labelled": labelled,
+        "counted the other way round": -labelled,
+        "at a right angle": labelled + np.pi / 2,
+    }
+    agreement = {how: float((axial_difference(axes, turn) < _AGREES_RAD).mean()) for how, turn in turns.items()}
+    own = agreement.pop("as labelled")
+    if len(axes) < _MIN_CARS or own + 1 / np.sqrt(len(axes)) > _RIGHT_AGREEMENT:
+        return []
+    how, best = max(agreement.items(), key=lambda item: item[1])
+    advice = f"; {best:.0%} are if angles are {how}" if best > max(_RIGHT_AGREEMENT, own + 0.3) else ""
+    return [
+        f"{own:.0%} of {len(axes)} labelled axes are within 30 degrees of the cars' outlines in the images, 76 % or "
+        f"more expected{advice}: check the angles of the labels"
+    ]
 
 
 def _outline_scores(image: GreyImage, cars: FloatArray) -> FloatArray:

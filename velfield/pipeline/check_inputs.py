@@ -15,8 +15,7 @@ from velfield.pipeline.stages.labels import rescale
 from velfield.pipeline.units import WHOLE
 from velfield.registration.intersensor import MIRRORED, IntersensorResult, register_intersensor
 from velfield.sources.geo import read_base_raster
-from velfield.sources.labels.detections import read_detections
-from velfield.sources.labels.labels import read_labels
+from velfield.sources.labels.labels import read_detections, read_labels
 from velfield.sources.quality import UNUSABLE
 from velfield.sources.source import iter_frames
 from velfield.sources.telemetry.read import read_telemetry_file

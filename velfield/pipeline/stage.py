@@ -232,7 +232,7 @@ STAGES: tuple[Stage, ...] = (
     # Labels and training, from labelled frames or from what moves; or a given detector.
     Stage(
         name="detector",
-        version=22,
+        version=23,
         label="detector",
         lines=(
             Line("skipped: external detections", lambda counts: bool(counts) and "threshold" not in counts),

@@ -27,6 +27,7 @@ from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.labels import (
     base_px_per_raw_px,
+    check_label_axes,
     check_label_scale,
     labelled_images,
     labels_of_run,
@@ -157,8 +158,10 @@ def _from_labels(plan: Plan) -> StageResult:
     samples = list(labelled_images(source, plan.info, labels, work_per_raw=work_per_raw))
     detector = train_detector(samples, plan.config.detection)
     outcome = _finish(plan, detector, scale, "labels", count=len(labels.cars))
-    found = check_label_scale(labels.cars, base_per_raw, read_first_grid(plan.layout).gsd_m)
-    return replace(outcome, warnings=[*outcome.warnings, *found])
+    found = check_label_axes(samples) or check_label_scale(
+        labels.cars, base_per_raw, read_first_grid(plan.layout).gsd_m
+    )
+    return replace(outcome, notes=[*labels.notes, *outcome.notes], warnings=[*outcome.warnings, *found])
 
 
 def _from_motion(plan: Plan) -> StageResult:

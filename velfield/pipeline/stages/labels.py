@@ -4,7 +4,7 @@ A labelled frame need not be among the processed frames, nor be registered: a ca
 the raw frame is rescaled by the local scale of the map raw -> base.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -14,6 +14,7 @@ import pandas as pd
 from schemas.arrays import FloatArray, GreyImage
 from schemas.scale import ScaleEstimate
 from velfield.analysis.vehicle_scale import estimate_vehicle_scale
+from velfield.detection.orientation import contradict_axes, outline_axes
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
@@ -95,6 +96,13 @@ def check_label_scale(cars: pd.DataFrame, base_per_raw: float, gsd_m: float | No
         return check_vehicle_length(median_car_length_raw_px(cars) * base_per_raw, gsd_m)
     given = ScaleEstimate(gsd_m=gsd_m, low_m=gsd_m, high_m=gsd_m, source="given")
     return list(choose_scale([given, found]).disagreements)
+
+
+def check_label_axes(samples: Sequence[LabelledImage]) -> list[str]:
+    """A warning where the axes that labels give are not those of the cars in their images; else none."""
+    known = [sample.cars[np.isfinite(sample.cars[:, 2])] for sample in samples]
+    axes = [outline_axes(sample.image, cars) for sample, cars in zip(samples, known, strict=True)]
+    return contradict_axes(np.concatenate(axes), np.concatenate([cars[:, 2] for cars in known])) if known else []
 
 
 def labelled_images(source: Path, info: SourceInfo, labels: Labels, *, work_per_raw: float) -> Iterator[LabelledImage]:

@@ -33,7 +33,7 @@ from velfield.run.stores import (
 )
 from velfield.run.tables import read_arrays, write_arrays
 from velfield.sources.geo import BaseRaster, read_base_raster
-from velfield.sources.labels.detections import read_detections
+from velfield.sources.labels.labels import read_detections
 from velfield.sources.quality import UNUSABLE, describe_flags
 
 MAP_PARAMETERS = 65

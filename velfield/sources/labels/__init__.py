@@ -1,1 +1,1 @@
-"""Labels and boxes: CSV, YOLO, COCO, LabelMe, VIA, GeoJSON."""
+"""Labels and detections of other programs: the formats, their classes, frames and shapes."""
