@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from schemas.arrays import FloatArray
+from velfield.analysis.answers import find_answers
 from velfield.analysis.changes import find_changes
 from velfield.analysis.flow.conflicts import find_conflicts, persistent
 from velfield.analysis.flow.speeds import slowing
@@ -17,6 +18,7 @@ from velfield.analysis.signals.cycles import find_signal, queues
 from velfield.analysis.signals.phases import START_DELAY_S, fit_phases
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import Trajectories, group_rows, make_trajectories, moving
+from velfield.pipeline.analysis.tables import unusual_table
 
 STEP_S, CYCLE_S, SPEED = 0.2, 40.0, 12.0
 Track = tuple[FloatArray, FloatArray]
@@ -328,3 +330,14 @@ def test_a_time_to_collision_counts_where_it_lasts() -> None:
     expected = [3.0, 3.0] + 6 * [np.inf]  # within 0.4 s: rows 0 to 2, 1 to 3; then a gap, or the end
     order = np.random.default_rng(1).permutation(8)
     assert persistent(pair[order], time_s[order], value_s[order]).tolist() == np.array(expected)[order].tolist()
+
+
+def test_an_unusual_track_is_named_as_in_the_file() -> None:
+    tracks = [drive(EAST, 4.0 * k) for k in range(12)] + [drive(EAST[::-1], 20.0)]
+    made = gather(tracks)
+    named = replace(made, track_id=made.track_id * 7 + 100_000)
+    answer = next(a for a in find_answers(TrafficAnalysis(named)) if a.topic == "unusual")
+    assert answer.state == "found"
+    assert f"track {12 * 7 + 100_000})" in answer.text
+    table = unusual_table(TrafficAnalysis(named))
+    assert [row.cells["track"] for row in table.rows] == [12 * 7 + 100_000]

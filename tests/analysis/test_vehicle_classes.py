@@ -7,9 +7,9 @@ import pytest
 
 from schemas.arrays import FloatArray, IntArray
 from tests.analysis.test_traffic_analysis import crossroads, gather
+from velfield.analysis.answers import find_answers
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.vehicle_classes import COUNTED_CLASSES, HEAVY, find_classes
-from velfield.pipeline.analysis.answers import answers
 from velfield.pipeline.analysis.class_tables import class_table
 from velfield.pipeline.analysis.tables import movement_table
 from velfield.synthetic.traffic.traffic import draw_dimensions
@@ -107,7 +107,7 @@ def test_movements_are_counted_by_class(analysis: TrafficAnalysis) -> None:
     whole = table["all tracks that move"]
     assert whole["vehicles"] == len(analysis.trajectories)
     assert whole["lorry_or_bus"].low <= len(turning_tracks(analysis)) <= whole["lorry_or_bus"].high
-    assert any(line.startswith("classes") and "lorry or bus" in line for line in answers(analysis))
+    assert any(a.topic == "classes" and "lorry or bus" in a.text for a in find_answers(analysis))
 
 
 def test_without_dimensions_there_are_no_classes(analysis: TrafficAnalysis) -> None:
@@ -115,4 +115,4 @@ def test_without_dimensions_there_are_no_classes(analysis: TrafficAnalysis) -> N
     assert class_table(unknown).rows == ()
     assert "not known" in class_table(unknown).note
     assert all(row.cells["heavy"].value is None for row in movement_table(unknown).rows)
-    assert not any(line.startswith("classes") for line in answers(unknown))
+    assert [a.state for a in find_answers(unknown) if a.topic == "classes"] == ["too little data"]

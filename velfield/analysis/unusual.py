@@ -26,7 +26,7 @@ _CELL_M, _SHORT_M, _MIN_SHORT = 12.0, 15.0, 5
 
 @dataclass(frozen=True)
 class Unusual:
-    """An unusual track: what it did, where, and when; ``detail`` in words."""
+    """An unusual track, by its number in the trajectories: what it did, where and when; ``detail`` in words."""
 
     kind: UnusualKind
     track: int
@@ -123,7 +123,7 @@ def _unusual(
 ) -> Unusual:
     rows = slice(int(trajectories.first[track]), int(trajectories.first[track + 1]))
     k = int(np.argmin(np.abs(trajectories.time_s[rows] - time_s)))
-    return Unusual(kind, int(trajectories.track_id[track]), time_s, int(trajectories.frame[rows][k]), xy_m, detail)
+    return Unusual(kind, track, time_s, int(trajectories.frame[rows][k]), xy_m, detail)
 
 
 def find_doubtful_places(trajectories: Trajectories) -> list[DoubtfulPlace]:

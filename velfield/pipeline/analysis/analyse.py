@@ -3,6 +3,7 @@
 import base64
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 from typing import Literal
 
@@ -11,12 +12,12 @@ import numpy as np
 
 from schemas.analysis import AnalysisColumn, AnalysisRecord, AnalysisTable, LanesRecord
 from schemas.arrays import GreyImage
+from velfield.analysis.answers import explain_none, find_answers
 from velfield.analysis.movements.time_slices import SLICE_S
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import make_trajectories, moving
 from velfield.errors import InputError
 from velfield.exports.georeference import Georeference
-from velfield.pipeline.analysis.answers import answers, explain_empty
 from velfield.pipeline.analysis.clips import Frames, unusual_clips
 from velfield.pipeline.analysis.lanes_record import lanes_geojson, lanes_record
 from velfield.pipeline.analysis.page import report_html
@@ -31,6 +32,7 @@ from velfield.sources.trajectories import read_tracks
 
 TRACKS = "tracks"
 """The stage whose results are analysed."""
+MAX_LINES = 12
 _MAX_PICTURE_PX = 1600
 _TRACKS_GSD_M = 0.1
 """Base pixels of tracks given in metres."""
@@ -156,10 +158,10 @@ def write_analysis(
         gsd_known=gsd_known,
         duration_s=round(analysis.trajectories.duration_s, 3),
         tracks=len(analysis.trajectories),
-        tables=tuple(_with_clips(explain_empty(table, analysis), clips) for table in all_tables(analysis)),
+        tables=tuple(_with_clips(_explain_empty(table, analysis), clips) for table in all_tables(analysis)),
     )
     write_atomically(out / "analysis.json", record.model_dump_json().encode())
-    yield from answers(analysis)
+    yield from answer_lines(analysis)
     html = report_html(record, lanes, georeference.shape, _data_url(picture), clips)
     write_atomically(out / "report.html", html.encode())
     yield f"report      {out / 'report.html'}"
@@ -168,6 +170,23 @@ def write_analysis(
         yield f"workbook    {out / 'analysis.xlsx'}"
     else:
         yield f"workbook    not written: pip install '{EXTRA}'"
+
+
+def answer_lines(analysis: TrafficAnalysis) -> Iterator[str]:
+    """A line for each answer, `MAX_LINES` of a topic: those with the most vehicles."""
+    for topic, group in groupby(find_answers(analysis), key=lambda answer: answer.topic):
+        found = list(group)
+        for answer in found[:MAX_LINES]:
+            yield f"{topic:11} {answer.subject}{': ' if answer.subject else ''}{answer.text}"
+        if len(found) > MAX_LINES:
+            yield f"{'':11} and {len(found) - MAX_LINES} more"
+
+
+def _explain_empty(table: AnalysisTable, analysis: TrafficAnalysis) -> AnalysisTable:
+    """An empty table with the reason in its note; others as they are."""
+    if table.rows:
+        return table
+    return table.model_copy(update={"note": f"{explain_none(table.name, analysis)} {table.note}".strip()})
 
 
 def clip_name(number: int) -> str:

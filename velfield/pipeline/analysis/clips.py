@@ -44,19 +44,18 @@ class Frames:
 
 def unusual_clips(analysis: TrafficAnalysis, frames: Frames) -> Iterator[tuple[int, bytes]]:
     """JPEG strips of the unusual tracks, by their number in ``analysis.unusual``; none where no frame is there."""
-    numbers = {int(track): k for k, track in enumerate(analysis.trajectories.track_id)}
     for number, found in enumerate(analysis.unusual[:MAX_CLIPS]):
-        strip = make_strip(analysis, frames, found, numbers[found.track])
+        strip = make_strip(analysis, frames, found)
         if strip is not None:
             done, data = cv2.imencode(".jpg", strip, [cv2.IMWRITE_JPEG_QUALITY, 80])
             if done:
                 yield number, data.tobytes()
 
 
-def make_strip(analysis: TrafficAnalysis, frames: Frames, found: Unusual, track: int) -> GreyImage | None:
+def make_strip(analysis: TrafficAnalysis, frames: Frames, found: Unusual) -> GreyImage | None:
     """Pictures side by side, two seconds before to two after, the vehicle in a ring; None where no frame is there."""
     tracks = analysis.trajectories
-    rows = slice(int(tracks.first[track]), int(tracks.first[track + 1]))
+    rows = slice(int(tracks.first[found.track]), int(tracks.first[found.track + 1]))
     time, xy = tracks.time_s[rows], tracks.xy_m[rows] / tracks.gsd_m
     centre = [float(np.interp(found.time_s, time, xy[:, k])) for k in (0, 1)]
     side = _SIDE_M / tracks.gsd_m

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from html import escape
 
 from schemas.analysis import AnalysisRecord, AnalysisTable, Cell, EstimateRecord, LanesRecord
-from velfield.pipeline.analysis.answers import duration_text
+from velfield.analysis.answers import duration_text
 
 MAX_ROWS = 400
 """Rows of a table that are shown; the workbook and the JSON have all."""

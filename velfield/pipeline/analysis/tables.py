@@ -373,7 +373,13 @@ def unusual_table(analysis: TrafficAnalysis) -> AnalysisTable:
     }
     rows = (
         make_row(
-            {"kind": u.kind, "track": u.track, "frame": u.frame, "time": round(u.time_s, 1), "detail": u.detail},
+            {
+                "kind": u.kind,
+                "track": int(analysis.trajectories.track_id[u.track]),
+                "frame": u.frame,
+                "time": round(u.time_s, 1),
+                "detail": u.detail,
+            },
             point_geometry(u.xy_m, analysis),
         )
         for u in analysis.unusual

@@ -1,0 +1,201 @@
+"""Answers for people: a number with its interval, none and at most so many an hour, or what is missing for one."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+from velfield.analysis.intervals import Estimate
+from velfield.analysis.signals.cycles import JunctionSignal, queues
+from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.analysis.vehicle_classes import COUNTED_CLASSES
+
+State = Literal["found", "none", "too little data"]
+_SHORT_S, _FEW_TRACKS = 60.0, 30
+"""In a shorter clip with fewer vehicles nothing is expected to be found; what it did not show may still be frequent."""
+_NONE_PROBABILITY = 0.1
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answer to one question.
+
+    Attributes
+    ----------
+    topic, subject
+        The question (``signal``), and the place or group that it is asked of (``junction 3``; empty: the flight).
+    state
+        ``found``: there is a number, or a list; ``none``: seen to be absent; ``too little data``: ``text`` says what is
+        missing.
+    text
+        The answer in words, with intervals and counts.
+    estimate, unit
+        The number that the answer gives, with its interval; None where it gives several, or none.
+    at_most_per_h
+        Of a state ``none``: the rate that is not exceeded with 90 % probability; None in clips of less than a minute.
+    """
+
+    topic: str
+    subject: str
+    state: State
+    text: str
+    estimate: Estimate | None = None
+    unit: str = ""
+    at_most_per_h: float | None = None
+
+
+def find_answers(analysis: TrafficAnalysis) -> Iterator[Answer]:
+    """The answer to every question, in the order in which they are printed; the largest groups of each first."""
+    yield _lanes(analysis)
+    if analysis.trajectories.duration_s < _SHORT_S or len(analysis.trajectories) < _FEW_TRACKS:
+        yield Answer("length", "", "too little data", too_short(analysis))
+    yield _classes(analysis)
+    yield from _movements(analysis)
+    yield from _scene(analysis)
+    yield from _speeds(analysis)
+    for number, signal in analysis.signals.items():
+        yield _signal(number, signal)
+    seconds = analysis.trajectories.duration_s
+    yield _events("u-turns", len(analysis.reversals), seconds)
+    yield _conflicts(analysis)
+    yield _unusual(analysis)
+
+
+def too_short(analysis: TrafficAnalysis) -> str:
+    """What a short clip with few vehicles allows to say."""
+    tracks, seconds = len(analysis.trajectories), analysis.trajectories.duration_s
+    verb = "is" if tracks == 1 else "are"
+    return (
+        f"{count_text(tracks, 'moving vehicle')} in {duration_text(seconds)} {verb} too few for most questions: a "
+        "movement needs 5, free flow 8 that go freely, a signal two cycles"
+    )
+
+
+def explain_none(topic: str, analysis: TrafficAnalysis) -> str:
+    """Why a table is empty: how rare the events of ``topic`` are at most, too little data, or none found."""
+    seconds, tracks = analysis.trajectories.duration_s, len(analysis.trajectories)
+    if topic in ("u_turns", "conflicts", "unusual"):
+        return f"{_events(topic, 0, seconds).text.capitalize()}."
+    if seconds < _SHORT_S or tracks < _FEW_TRACKS:
+        return f"Too little data: {count_text(tracks, 'moving vehicle')} in {duration_text(seconds)}."
+    return "None found."
+
+
+def _lanes(analysis: TrafficAnalysis) -> Answer:
+    graph, tracks = analysis.lanes, analysis.trajectories
+    seen = f"{count_text(len(tracks), 'moving vehicle')} in {duration_text(tracks.duration_s)}"
+    if not len(graph):
+        return Answer("lanes", "", "too little data", f"too little data: no lane that three of {seen} drove")
+    text = (
+        f"{count_text(len(graph), 'lane')} of {sum(lane.length_m for lane in graph) / 1000:.2f} km, "
+        f"{count_text(len(graph.junctions), 'junction')}, from {seen}"
+    )
+    return Answer("lanes", "", "found", text)
+
+
+def _classes(analysis: TrafficAnalysis) -> Answer:
+    if analysis.classes is None or not len(analysis.classes.measured):
+        text = "too little data: lengths and widths in metres are not known of these tracks"
+        return Answer("classes", "", "too little data", text)
+    shares = analysis.classes.estimate_shares(analysis.classes.measured)
+    known = [(name, share) for name, share in zip(COUNTED_CLASSES, shares, strict=True) if share is not None]
+    rest = ", ".join(f"{name} {100 * s.value:.1f} % ({100 * s.low:.1f} to {100 * s.high:.1f})" for name, s in known)
+    text = f"of {count_text(len(analysis.classes.measured), 'measured vehicle')}: {rest or 'too little data'}"
+    return Answer("classes", "", "found" if known else "too little data", text)
+
+
+def _movements(analysis: TrafficAnalysis) -> Iterator[Answer]:
+    found = [(j.junction.kind, m) for j in analysis.movements for m in j.movements]
+    for kind, m in sorted(found, key=lambda pair: -(pair[1].seen + pair[1].inferred)):
+        share = f", {estimate_text(m.share, '%', 100)} of the entry" if m.share else ""
+        delay = f", delay {estimate_text(m.delay_s, 's')}" if m.delay_s else ""
+        subject = f"{kind} {m.junction}, {m.arm_in} to {m.arm_out}"
+        text = f"{m.seen + m.inferred:.0f}{share}{delay}"
+        yield Answer("movement", subject, "found", text, m.flow_veh_per_h, "veh/h")
+
+
+def _scene(analysis: TrafficAnalysis) -> Iterator[Answer]:
+    for r in analysis.scene.relations if analysis.scene else ():
+        share = f", {estimate_text(r.share, '%', 100)} of the entry" if r.share else ""
+        text = f"{r.vehicles:.0f}, seen whole {r.seen}{share}"
+        yield Answer("scene", f"{r.origin.name} to {r.destination.name}", "found", text, r.share, "")
+
+
+def _speeds(analysis: TrafficAnalysis) -> Iterator[Answer]:
+    known = [(road, road.speed_m_per_s) for road in analysis.free_flow if road.speed_m_per_s]
+    for road, speed in sorted(known, key=lambda pair: -pair[1].n):
+        text = f"free flow {estimate_text(speed, 'km/h', 3.6)}, limit about {road.limit_km_per_h:.0f}"
+        yield Answer("speed", f"lanes {' '.join(map(str, road.lanes))}", "found", text, speed.in_units(3.6), "km/h")
+    if not known:
+        text = "too little data: no road with 8 vehicles that go freely and steadily"
+        yield Answer("speed", "", "too little data", text)
+
+
+def _signal(number: int, signal: JunctionSignal) -> Answer:
+    subject = f"junction {number}"
+    if not signal.signalised or signal.cycle_s is None:
+        state: State = "too little data" if signal.signalised is None else "none"
+        return Answer("signal", subject, state, signal.reason)
+    text = f"cycle {estimate_text(signal.cycle_s, 's')}, {count_text(len(signal.phases), 'phase')}"
+    for lanes in signal.phases:
+        streams = [s for s in signal.streams if s.stream.approach.lane in lanes]
+        longest = max((q for s in streams for q in queues(s.stream, s.green_s)), key=lambda q: q.length_m, default=None)
+        text += f"; lanes {' '.join(map(str, lanes))}: green at {estimate_text(streams[0].green_phase_s, 's')}"
+        if longest:
+            text += f", longest queue {count_text(longest.vehicles, 'vehicle')}, {longest.length_m:.0f} m"
+    return Answer("signal", subject, "found", text, signal.cycle_s, "s")
+
+
+def _conflicts(analysis: TrafficAnalysis) -> Answer:
+    likely = [c for c in analysis.conflicts if c.probability >= 0.5]
+    kinds = ", ".join(f"{sum(c.kind == k for c in likely)} {k}" for k in sorted({c.kind for c in likely}))
+    return _events(
+        "conflicts", len(likely), analysis.trajectories.duration_s, f"{kinds}, more likely than not below 1.5 s"
+    )
+
+
+def _unusual(analysis: TrafficAnalysis) -> Answer:
+    ids = analysis.trajectories.track_id
+    first = "; ".join(
+        f"{u.kind} at {u.time_s:.1f} s (frame {u.frame}, track {ids[u.track]}): {u.detail}"
+        for u in analysis.unusual[:3]
+    )
+    return _events("unusual", len(analysis.unusual), analysis.trajectories.duration_s, first)
+
+
+def _events(topic: str, n: int, seconds: float, detail: str = "") -> Answer:
+    """A number of events; of none how rare they are at least."""
+    if n:
+        return Answer(topic, "", "found", f"{n}: {detail}" if detail else str(n))
+    if seconds < _SHORT_S:
+        text = f"none in {duration_text(seconds)}, too short to say how rare they are"
+        return Answer(topic, "", "too little data", text)
+    hourly = -math.log(_NONE_PROBABILITY) / seconds * 3600
+    rate = f"{hourly:.2g}" if hourly < 10 else f"{hourly:.0f}"
+    text = f"none in {duration_text(seconds)}, so fewer than {rate} an hour with 90 % probability"
+    return Answer(topic, "", "none", text, at_most_per_h=hourly)
+
+
+def count_text(n: int, noun: str) -> str:
+    """A number and its noun.
+
+    Examples
+    --------
+    >>> count_text(1, "lane"), count_text(2, "lane")
+    ('1 lane', '2 lanes')
+    """
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def duration_text(seconds: float) -> str:
+    """A duration in seconds or minutes, for people."""
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.1f} min"
+
+
+def estimate_text(estimate: Estimate | None, unit: str, factor: float = 1.0) -> str:
+    """An estimate in another unit with its interval and count; or that there is too little data."""
+    if estimate is None:
+        return "too little data"
+    scaled = estimate.in_units(factor)
+    value, low, high = (f"{x:.0f}" if abs(x) >= 1000 else f"{x:.3g}" for x in (scaled.value, scaled.low, scaled.high))
+    return f"{value} {unit} ({low} to {high}, n {scaled.n})"
