@@ -20,6 +20,7 @@ from flows.console import Console
 from flows.previews import Previews
 from flows.runners import Runner, RunnerConfig, open_runner, parallel_units
 from flows.stale import mark_crashed, name_run
+from flows.stopping import stop_lost
 from flows.work import Work
 from schemas.job import Job
 from schemas.summary import RunSummary
@@ -51,7 +52,7 @@ def run_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
 def process_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
     """Aerial video in, velocity field out."""
     layout = RunLayout(Path(job.root))
-    with locked(layout), _leave_no_trace(layout), open_runner(runner, console.warn) as where:
+    with locked(layout, stop_lost), _leave_no_trace(layout), open_runner(runner, console.warn) as where:
         mark_crashed(name_run(job)())
         sweep_partial(layout.root)
         remove_tree(layout.preview)

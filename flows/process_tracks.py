@@ -9,6 +9,7 @@ from flows.console import Console
 from flows.process_flight import publish_report, record_start
 from flows.runners import RunnerConfig, open_runner, parallel_units
 from flows.stale import mark_crashed, name_run
+from flows.stopping import stop_lost
 from flows.work import Work
 from schemas.job import Job
 from schemas.summary import RunSummary
@@ -39,7 +40,7 @@ def process_tracks(job: Job, runner: RunnerConfig, console: Console) -> RunSumma
     check_format(Path(job.root))
     plan = plan_tracks(job)  # refuses bad tracks before the folder is there
     layout = RunLayout(Path(job.root))
-    with locked(layout), open_runner(runner, console.warn) as where:
+    with locked(layout, stop_lost), open_runner(runner, console.warn) as where:
         mark_crashed(name_run(job)())
         sweep_partial(layout.root)
         record_start(plan, f"tracks over {plan.frame_count} times, {where.description}", console)

@@ -16,6 +16,7 @@ from flows.console import Console
 from flows.process_flight import process_flight, publish_report
 from flows.runners import RunnerConfig, open_runner, parallel_units
 from flows.stale import mark_crashed
+from flows.stopping import stop_lost
 from flows.work import Work
 from schemas.job import Inputs, Job, absolute
 from schemas.records import RebaseRecord
@@ -80,7 +81,7 @@ def reprocess(
     check_format(Path(root))
     run = open_run(root)
     run.require_frames()
-    with locked(run.layout):
+    with locked(run.layout, stop_lost):
         mark_crashed(f"{root} on {name}")
         if result_exists(run.layout, name, Path(base)):
             console.event("start", f"{run.layout.results / name} is the result on this base image already")

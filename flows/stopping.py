@@ -108,6 +108,14 @@ def leave(status: int) -> None:
     os._exit(status)
 
 
+def stop_lost(message: str) -> None:
+    """End at once, with all child processes, as the lock of the run folder is lost: nothing more may be written."""
+    _leaves.acquire()
+    print(f"velfield: {message}", file=sys.stderr, flush=True)
+    end_children(_END_S)
+    os._exit(1)
+
+
 def end_children(patience_s: float) -> None:
     """Terminate the children of this process; kill those that do not end in time."""
     import psutil

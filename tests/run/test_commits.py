@@ -1,5 +1,6 @@
 """Content keys, commit records and the lock."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -9,9 +10,11 @@ from schemas.records import CommitRecord, InputsRecord, SourceRecord
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.stage import STAGE, stage_keys
 from velfield.run.commits import (
+    commit_path,
     content_key,
     digest_file,
     digest_input,
+    digest_outputs,
     sweep_partial,
     valid_commit,
     write_atomically,
@@ -98,3 +101,26 @@ def test_partial_files_are_swept(tmp_path: Path) -> None:
     (tmp_path / "a" / "torn.77.partial").write_bytes(b"1")
     assert sweep_partial(tmp_path) == 1
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["whole"]
+
+
+def test_outputs_are_on_the_disk_before_the_record_that_vouches_for_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    layout = RunLayout(tmp_path)
+    (tmp_path / "frames.zarr/c/0").mkdir(parents=True)
+    chunks = [tmp_path / f"frames.zarr/c/0/{k}" for k in range(3)]
+    for chunk in chunks:
+        chunk.write_bytes(b"chunk")
+    synced: list[int] = []
+
+    def note(descriptor: int) -> None:
+        assert not commit_path(layout, "frames", "000000-000002").exists()
+        synced.append(os.fstat(descriptor).st_ino)
+
+    monkeypatch.setattr(os, "fsync", note)
+    outputs = digest_outputs(layout, chunks)
+    record = CommitRecord(stage="frames", unit="000000-000002", key="k", outputs=outputs, code_version="0")
+    write_commit(layout, record)
+    on_disk = [path.stat().st_ino for path in (*chunks, chunks[0].parent)]
+    assert sorted(synced[:-1]) == sorted(on_disk)
+    assert synced[-1] == commit_path(layout, "frames", "000000-000002").stat().st_ino

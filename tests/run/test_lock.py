@@ -197,3 +197,101 @@ def test_a_write_whose_answer_was_lost_is_known_for_ones_own(lease: RunLayout, m
     monkeypatch.setattr(S3ObjectPath, "replace_version", lose_answer)
     with locked(lease):
         assert record(lease)["pid"] == os.getpid()
+
+
+def test_connections_that_fail_do_not_end_the_renewal(lease: RunLayout, monkeypatch: pytest.MonkeyPatch) -> None:
+    from botocore.exceptions import EndpointConnectionError
+
+    from velfield.run.s3 import S3ObjectPath
+
+    replace, tries = S3ObjectPath.replace_version, []
+
+    def refuse_twice(path: S3ObjectPath, version: str, data: bytes) -> str | None:
+        tries.append(version)
+        if len(tries) <= 2:
+            raise EndpointConnectionError(endpoint_url="http://127.0.0.1:9")
+        return replace(path, version, data)
+
+    monkeypatch.setattr(lock, "_LEASE_S", 1.5)
+    monkeypatch.setattr(S3ObjectPath, "replace_version", refuse_twice)
+    with locked(lease):
+        time.sleep(2.5)
+        assert record(lease)["until_s"] > time.time()  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("fault", ["taken over", "no answer"])
+def test_a_run_that_lost_its_lease_stops_writing(fault: str, lease: RunLayout, monkeypatch: pytest.MonkeyPatch) -> None:
+    from velfield.run.s3 import S3ObjectPath
+
+    def refuse(*_: object) -> None:
+        raise ConnectionError("no network")
+
+    monkeypatch.setattr(lock, "_LEASE_S", 0.6)
+    written: list[int] = []
+
+    def write() -> None:
+        if fault == "taken over":
+            lease.lock.write_bytes(json.dumps(json.loads(EXPIRED) | {"until_s": time.time() + 60}).encode())
+        else:
+            monkeypatch.setattr(S3ObjectPath, "replace_version", refuse)
+        for k in range(300):
+            time.sleep(0.02)
+            written.append(k)
+
+    with pytest.raises(InputError, match="taken over by another process, or no answer"), locked(lease):
+        write()
+    assert len(written) < 300
+
+
+def test_a_lock_of_a_container_with_the_same_host_name_is_respected(lease: RunLayout) -> None:
+    with locked(lease):
+        found = record(lease)
+    for machine in ("another boot pid:[4026531836]", ""):
+        other = found | {"machine": machine, "pid": 2**22 + 1, "lease": "", "until_s": time.time() + 60}
+        lease.lock.write_bytes(json.dumps(other).encode())
+        with pytest.raises(InputError, match="is locked by"), locked(lease):
+            pass
+        assert not holder_is_gone(lease)
+    lease.lock.write_bytes(json.dumps(other | {"machine": found["machine"]}).encode())
+    with locked(lease):
+        pass
+
+
+def test_on_a_disk_too_a_container_with_the_same_host_name_is_not_taken_for_gone(tmp_path: Path) -> None:
+    layout = RunLayout(tmp_path / "run")
+    with locked(layout):
+        found = record(layout)
+    layout.lock.write_text(json.dumps(found | {"machine": "another", "pid": 2**22 + 1}))
+    assert not holder_is_gone(layout)
+    layout.lock.write_text(json.dumps(found | {"pid": 2**22 + 1}))
+    assert holder_is_gone(layout)
+
+
+def test_a_file_system_without_locks_is_not_taken_for_a_locked_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import errno
+    import fcntl
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with pytest.raises(OSError, match="No locks available"):
+        locked(RunLayout(tmp_path / "run")).__enter__()
+
+
+def test_the_lock_of_a_file_that_was_removed_meanwhile_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    layout, tries = RunLayout(tmp_path / "run"), []
+
+    def remove_once(file: object) -> bool:
+        tries.append(file)
+        if len(tries) == 1:
+            layout.lock.unlink()
+            layout.root.rmdir()
+        return True
+
+    monkeypatch.setattr(lock, "try_lock", remove_once)
+    with locked(layout):
+        assert record(layout)["pid"] == os.getpid()
+    assert len(tries) == 2

@@ -232,5 +232,23 @@ def valid_commit(layout: RunLayout, stage: str, unit: str, key: str) -> CommitRe
 
 
 def digest_outputs(layout: RunLayout, paths: Iterable[Path]) -> dict[str, str]:
-    """Digests of a unit's output files, by path in the run folder."""
-    return {path.relative_to(layout.root).as_posix(): digest_file(path) for path in paths}
+    """Digests of a unit's output files, by path in the run folder; they are on the disk then, even if the power is cut.
+
+    A record that vouches for them is written afterwards.
+    """
+    outputs = {path.relative_to(layout.root).as_posix(): _digest_synced(path) for path in paths}
+    if not is_remote(layout.root) and os.name == "posix":  # of a new file the folder's entry too
+        for folder in {(layout.root / name).parent for name in outputs}:
+            descriptor = os.open(folder, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+    return outputs
+
+
+def _digest_synced(path: Path) -> str:
+    if not is_remote(path):
+        with path.open("rb" if os.name == "posix" else "rb+") as file:
+            os.fsync(file.fileno())
+    return digest_file(path)

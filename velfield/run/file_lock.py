@@ -3,6 +3,7 @@
 Windows locks bytes, and nobody else can read them: the one byte that is locked lies far behind the content.
 """
 
+import errno
 import sys
 from typing import IO
 
@@ -10,7 +11,13 @@ _FAR_BYTE = 1 << 30
 
 
 def try_lock(file: IO[str]) -> bool:
-    """Lock an open file for this process; whether it was free."""
+    """Lock an open file for this process; whether it was free.
+
+    Raises
+    ------
+    OSError
+        The file system has no locks.
+    """
     try:
         if sys.platform == "win32":
             import msvcrt
@@ -25,6 +32,8 @@ def try_lock(file: IO[str]) -> bool:
             import fcntl
 
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    except OSError as error:
+        if error.errno not in (errno.EAGAIN, errno.EACCES, errno.EDEADLK):
+            raise
         return False
     return True

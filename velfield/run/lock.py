@@ -4,16 +4,19 @@ The lease is an object that is never removed. Every change of it is one conditio
 "only if its content still is what I read", so that of several processes that find it expired one gets it.
 """
 
+import _thread
 import json
 import os
 import socket
+import sys
 import threading
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import psutil
 
@@ -26,32 +29,54 @@ if TYPE_CHECKING:
 
 _LEASE_S = 60.0
 """How long a lock on S3 outlives a process that was killed on another machine."""
+Lost = Callable[[str], object]
+"""Called from another thread, with a line for people, when the lock is lost: has to stop all writing at once."""
+
+
+def _interrupt(_message: str) -> None:
+    _thread.interrupt_main()  # the line is that of the InputError with which the context ends
 
 
 @contextmanager
-def locked(layout: RunLayout) -> Iterator[None]:
+def locked(layout: RunLayout, lost: Lost = _interrupt) -> Iterator[None]:
     """Hold the run folder's lock; the kernel frees it when the process ends, however it ends.
+
+    A lock on S3 can be lost while it is held, where this process stands still, or has no network, for longer than the
+    lease. ``lost`` is called then; the default interrupts the main thread, as Ctrl-C does.
 
     Raises
     ------
     InputError
         Another process holds it: with its pid, host and since when. A symbolic link leads out of the folder. Or, on
-        S3, this process stood still for longer than the lease, and another took the lock over meanwhile.
+        S3, the lock was lost.
     """
     if is_remote(layout.lock):
-        with _leased(layout.lock, str(layout.root)):
+        with _leased(layout.lock, str(layout.root), lost):
             yield
         return
     layout.root.mkdir(parents=True, exist_ok=True)
     _refuse_links(layout.root)
-    with layout.lock.open("a+") as file:
-        if not try_lock(file):
-            file.seek(0)
-            raise InputError(_refusal(str(layout.root), file.read()))
-        file.truncate(0)
-        file.write(_record())
-        file.flush()
-        yield
+    while True:
+        with layout.lock.open("a+") as file:
+            if not try_lock(file):
+                file.seek(0)
+                raise InputError(_refusal(str(layout.root), file.read()))
+            if not _is_at(layout.lock, file.fileno()):
+                continue  # its holder has removed it meanwhile, and others lock the next one
+            file.truncate(0)
+            file.write(_record())
+            file.flush()
+            yield
+            return
+
+
+def _is_at(path: Path, descriptor: int) -> bool:
+    """Whether an open file still is the one at a path."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(descriptor))
+    except FileNotFoundError:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return False
 
 
 def _refuse_links(root: Path) -> None:
@@ -78,7 +103,7 @@ def _refuse_links(root: Path) -> None:
 def _record(lease_s: float = 0.0, lease: str = "") -> str:
     """JSON of this process; no two are equal, for S3 compares contents."""
     since = time.strftime("%Y-%m-%d %H:%M:%S")
-    owner = {"pid": os.getpid(), "host": socket.gethostname(), "since": since, "lease": lease}
+    owner = {"pid": os.getpid(), "host": socket.gethostname(), "machine": _machine(), "since": since, "lease": lease}
     return json.dumps(owner | {"until_s": time.time() + lease_s, "write": uuid.uuid4().hex})
 
 
@@ -134,29 +159,46 @@ class _Lease:
 
 
 @contextmanager
-def _leased(path: "S3ObjectPath", name: str) -> Iterator[None]:
+def _leased(path: "S3ObjectPath", name: str, lost: Lost) -> Iterator[None]:
     lease = _Lease(path, name)
     lease.acquire()
-    ended = threading.Event()
+    ended, gone = threading.Event(), threading.Event()
+    message = (
+        f"{name}: found the lock taken over by another process, or no answer of the store for {_LEASE_S:.0f} s; "
+        "this process stopped writing: check the folder with `velfield verify`, and the same command resumes"
+    )
 
     def keep() -> None:
+        kept_s = time.time()  # the clock that others compare the lease with; it runs on while this machine sleeps
         while not ended.wait(_LEASE_S / 3):
-            with suppress(OSError):  # the next attempt comes before the lease expires
-                lease.renew()
+            try:
+                kept = lease.renew()
+            except Exception:  # a refused connection is no OSError to botocore; the next attempt comes in time
+                kept = time.time() - kept_s < _LEASE_S
+            else:
+                kept_s = time.time() if kept else kept_s
+            if not kept:
+                gone.set()
+                lost(message)
+                return
 
     thread = threading.Thread(target=keep, name="lease", daemon=True)
     thread.start()
+    kept = False
     try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
-        kept = lease.release()
-    if not kept:
-        raise InputError(
-            f"{name}: found the lock taken over by another process, expected it renewed every {_LEASE_S / 3:.0f} s; "
-            "this process stood still: check the folder with `velfield verify`"
-        )
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+            if not gone.is_set():
+                with suppress(Exception):  # it expires by itself
+                    kept = lease.release()
+    except KeyboardInterrupt:
+        if not gone.is_set():
+            raise
+    if gone.is_set() or not kept:
+        raise InputError(message)
 
 
 def holder_is_gone(layout: RunLayout) -> bool:
@@ -164,10 +206,7 @@ def holder_is_gone(layout: RunLayout) -> bool:
     has expired."""
     try:
         text = layout.lock.read_text(encoding="utf-8")
-        if is_remote(layout.lock):
-            return _is_expired(text)
-        record = parse_json(text)
-        return bool(record["host"] == socket.gethostname()) and not _is_running(int(record["pid"]))
+        return _is_expired(text) if is_remote(layout.lock) else _has_ended(parse_json(text))
     except (OSError, ValueError, KeyError, TypeError):
         return False
 
@@ -176,10 +215,26 @@ def _is_expired(text: str) -> bool:
     """Whether the writer of the record is gone: it was not renewed in time, or its process on this machine ended."""
     try:
         record = parse_json(text)
-        gone = record["host"] == socket.gethostname() and not _is_running(int(record["pid"]))
-        return gone or time.time() > float(record["until_s"])
-    except (ValueError, KeyError):
+        return _has_ended(record) or time.time() > float(record["until_s"])
+    except (ValueError, KeyError, TypeError):
         return True
+
+
+def _has_ended(record: dict[str, Any]) -> bool:
+    """Whether the writer of a record is a process of this machine that does not run any more."""
+    return _machine() != "" and record.get("machine") == _machine() and not _is_running(int(record["pid"]))
+
+
+@cache
+def _machine() -> str:
+    """What tells apart all systems whose process numbers differ, containers of one host name too; empty: not known."""
+    if sys.platform != "linux":
+        return f"{sys.platform} {socket.gethostname()} {uuid.getnode()}"
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+        return f"{boot} {os.readlink('/proc/self/ns/pid')}"
+    except OSError:
+        return ""
 
 
 def _is_running(pid: int) -> bool:
