@@ -258,7 +258,7 @@ def demo(
     seed: int = 1,
     quiet: Quiet = False,
 ) -> int:
-    """Simulate a flight and process it, with the preset `fast` and a small detector.
+    """Simulate a drone clip, process it with nothing else given, analyse it, and compare it with its ground truth.
 
     Parameters
     ----------
@@ -273,28 +273,28 @@ def demo(
     quiet
         Warnings only.
     """
+    from flows.commands.analyse import analyse
     from flows.launch import first_start_beside, kernels_beside, prepare_process
     from schemas.job import Inputs, Job
     from velfield.pipeline.configuration import resolve_config
+    from velfield.synthetic.clip import CLIP_NAME
 
     prepare_process(verbose=False)
-    flight = out / "flight"
-    inputs = Inputs.from_simulated_flight(flight)
-    # From an empty clone kernels compile first; the network is adapted in seconds.
-    quick = {"detection.fine_tune_steps": 30}
-    config = resolve_config(preset="fast", overrides={"gsd_m": 0.23, **quick})
+    flight, run = out / "flight", out / "run"
     with kernels_beside():
         with first_start_beside():
-            _simulate(flight, frames=frames, size=size, seed=seed, quiet=quiet)
-        job = Job(root=str(out / "run"), inputs=inputs, config=config)
-        status = _process(job, verbosity="quiet" if quiet else "normal")
+            _simulate(flight, frames=frames, size=size, seed=seed, quiet=quiet, clip="beside")
+        config = resolve_config(preset="fast")
+        inputs = Inputs(source=str(flight / CLIP_NAME))
+        status = _process(Job(root=str(run), inputs=inputs, config=config), verbosity="quiet" if quiet else "normal")
     if status in (DONE, INCOMPLETE):
-        _score(out / "run", flight)
+        analyse(run)
+        _score(run, flight)
         if not quiet:
-            given = [word for name in ("timestamps", "base", "labels") for word in (f"--{name}", getattr(inputs, name))]
-            chosen = [word for name, value in quick.items() for word in ("--set", f"{name}={value}")]
-            words = ["velfield", "run", inputs.source, *given, "--gsd-m", "0.23", "--preset", "fast", *chosen]
-            print("equivalent command:", shlex.join([*words, "--out", str(out / "run")]))
+            print(f"the map:    velfield view {shlex.quote(str(run))}")
+            print(f"the report: {run / 'analysis' / 'report.html'}")
+            words = ["velfield", "run", inputs.source, "--preset", "fast", "--out", str(run)]
+            print("the same on your own clip:", shlex.join(words))
     return status
 
 
