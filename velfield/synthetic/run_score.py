@@ -19,7 +19,7 @@ from velfield.synthetic.score import (
     score_registration,
     score_tracklets,
 )
-from velfield.synthetic.track_score import TrackScore, score_run_tracks, track_positions
+from velfield.synthetic.track_score import TrackScore, score_run_tracks
 from velfield.synthetic.truth import load_truth
 
 _ANOTHER_BASE_PX = 30.0  # no registered frame is that far off its own base image
@@ -51,7 +51,7 @@ class RunScore:
                 f"  speeds     {t.speed_error_mean_km_per_h:.2f} km/h mean error over three frames",
                 f"  identity   {self.traffic.tracks_per_vehicle:.2f} tracks per vehicle that drives (1 is ideal), "
                 f"{self.traffic.switches} swapped between two vehicles",
-                f"  direction  within 10 degrees at {f.fraction_within:.1%} of the {f.pixels} pixels that five vehicles "
+                f"  direction  within 10 degrees at {f.fraction_within:.1%} of {f.pixels} pixels that five vehicles "
                 f"or more passed; undefined at {f.undirected} where most vehicles are stationary",
             )
         )
@@ -93,8 +93,6 @@ def score_run(root: str | Path, flight: str | Path, *, min_count: int = 5) -> Ru
         score_run_tracks, truth, frame_of={frame: frame_of[frame] for frame in registered}, to_truth=to_truth
     )
     tracklets, vehicles, positions = run.tracklets(), run.vehicles(), run.track_positions()
-    if positions.empty:  # of an earlier release
-        positions = track_positions(tracklets)
     in_traffic = vehicles.loc[vehicles["state"] != "parked", "track_id"]
     return RunScore(
         registration=registration,

@@ -57,16 +57,6 @@ class TrackScore:
     mixed_tracks: float
 
 
-def track_positions(tracklets: pd.DataFrame) -> pd.DataFrame:
-    """Frame, track_id, x_px and y_px of every detection of every track, once each."""
-    columns = {"frame": "frame_{}", "detection_id": "detection_id_{}", "x_px": "x_{}_px", "y_px": "y_{}_px"}
-    parts = [
-        tracklets[["track_id", *(name.format(k) for name in columns.values())]].set_axis(["track_id", *columns], axis=1)
-        for k in range(3)
-    ]
-    return pd.concat(parts).drop_duplicates("detection_id").sort_values(["frame", "track_id"], ignore_index=True)
-
-
 def score_run_tracks(
     truth: Truth,
     tracks: pd.DataFrame,
@@ -80,7 +70,7 @@ def score_run_tracks(
     Parameters
     ----------
     tracks
-        ``frame, track_id, x_px, y_px`` of each position: of `track_positions`, or of ``run.track_positions()``.
+        ``frame, track_id, x_px, y_px`` of each position (`Run.track_positions`).
     frame_of
         Frame of the flight for each frame of the run, of those that are registered.
     to_truth
