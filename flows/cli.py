@@ -253,7 +253,7 @@ def simulate(
 def demo(
     *,
     out: Path = Path("velfield-demo"),
-    frames: int = 56,
+    frames: int = 120,
     size: str = "800x600",
     seed: int = 1,
     quiet: Quiet = False,
@@ -283,7 +283,8 @@ def demo(
     flight, run = out / "flight", out / "run"
     with kernels_beside():
         with first_start_beside():
-            _simulate(flight, frames=frames, size=size, seed=seed, quiet=quiet, clip="beside")
+            # Ten frames a second: twice what a run uses, and two fifths of what a drone's clip takes to render.
+            _simulate(flight, frames=frames, size=size, seed=seed, quiet=quiet, clip="beside", fps=10.0)
         config = resolve_config(preset="fast")
         inputs = Inputs(source=str(flight / CLIP_NAME))
         status = _process(Job(root=str(run), inputs=inputs, config=config), verbosity="quiet" if quiet else "normal")
@@ -317,6 +318,7 @@ def _simulate(
     seed: int,
     quiet: bool,
     clip: Literal["beside", "embedded"] | None = None,
+    fps: float = 25.0,
 ) -> None:
     from flows.console import Console
     from schemas.simulation import SimulationConfig
@@ -325,7 +327,7 @@ def _simulate(
     width, height = parse_frame_size(size, "as 1280x960")
     console = Console("quiet" if quiet else "normal")
     config = SimulationConfig(frames=frames, width=width, height=height, seed=seed)
-    config = config if clip is None else config.as_clip(clip)
+    config = config if clip is None else config.as_clip(clip, fps=fps)
     with console.stage("simulate", "simulate", frames) as progress:
         write_flight(out, config, lambda done, _total: progress.at_least(done))
     console.event("stage", f"simulated     {frames} frames of {width} x {height} px in {out}")
@@ -334,7 +336,7 @@ def _simulate(
 def _score(run_folder: Path, flight: Path) -> None:
     from velfield.synthetic.run_score import score_run
 
-    print(score_run(run_folder, flight).text())
+    print(score_run(run_folder, flight, min_count=1).text())
 
 
 def _tracks_inputs(tracks: Path | None, base: Path | None, frames_only: list[str]) -> "Inputs":

@@ -191,9 +191,9 @@ class SimulationConfig(Model):
     scene: SceneSimulation = SceneSimulation()
     base: OtherSensorSimulation = OtherSensorSimulation()
 
-    def as_clip(self, clip: Literal["beside", "embedded"]) -> "SimulationConfig":
-        """The same flight by a drone: 25 frames a second, a gimbal, a sensor that is read out in 25 ms."""
-        regular = {"fps": 25.0, "late_half_share": 0.0, "late_whole_share": 0.0, "jitter_s": 0.0}
+    def as_clip(self, clip: Literal["beside", "embedded"], *, fps: float = 25.0) -> "SimulationConfig":
+        """The same flight by a drone: regular frames, a gimbal, a sensor that is read out in 25 ms."""
+        regular = {"fps": fps, "late_half_share": 0.0, "late_whole_share": 0.0, "jitter_s": 0.0}
         times = self.times.model_copy(update=regular)
         drone = {"readout_s": 0.025, "vibration_px": 0.4, "tilt_deg": 0.6, "motion_blur_px": 0.2}
         camera = self.camera.model_copy(update=drone)

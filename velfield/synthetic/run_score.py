@@ -51,8 +51,8 @@ class RunScore:
                 f"  speeds     {t.speed_error_mean_km_per_h:.2f} km/h mean error over three frames",
                 f"  identity   {self.traffic.tracks_per_vehicle:.2f} tracks per vehicle that drives (1 is ideal), "
                 f"{self.traffic.switches} swapped between two vehicles",
-                f"  direction  within 10 degrees at {f.fraction_within:.1%} of {f.pixels} pixels that five vehicles "
-                f"or more passed; undefined at {f.undirected} where most vehicles are stationary",
+                f"  direction  within 10 degrees at {f.fraction_within:.1%} of {f.pixels} pixels of the map "
+                f"that vehicles passed; undefined at {f.undirected} where most vehicles are stationary",
             )
         )
 
