@@ -1,5 +1,6 @@
 """Another maker's network in the place of our detector: a tiny YOLO, made here, of every layout."""
 
+import json
 import re
 import shutil
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from schemas.summary import RunSummary
 from velfield import open_run
 from velfield.detection.detector import Detector, load_detector
 from velfield.detection.onnx.boxes import Boxes, suppress
+from velfield.detection.onnx.description import describe_model
 from velfield.detection.onnx.detector import OnnxDetector
 from velfield.errors import InputError
 from velfield.pipeline.georeference import plan_of_finished
@@ -377,3 +379,82 @@ def test_a_model_that_finds_nothing_is_told_what_to_check(
     assert explain_no_tracklets(plan).endswith(
         "and if not check the model's classes, threshold and input values (docs/detection.md#another-detector)"
     )
+
+
+def declared(path: Path, output: tuple[int | None, ...], **metadata: str) -> Path:
+    """A model that only declares what it takes and gives."""
+    graph = helper.make_graph(
+        [helper.make_node("Identity", ["images"], ["output0"])],
+        "declared",
+        [helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, TILE, TILE])],
+        [helper.make_tensor_value_info("output0", TensorProto.FLOAT, output)],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    helper.set_model_props(model, {"task": "detect", **metadata})
+    onnx.save(model, str(path))
+    return path
+
+
+TWELVE = [f"thing{k}" for k in range(12)]
+TWELVE[2], TWELVE[5] = "car", "bus"
+NAME_DIALECTS = {
+    "Python's dictionary": {"names": str(dict(enumerate(TWELVE)))},
+    "text keys": {"names": json.dumps({str(k): name for k, name in enumerate(TWELVE)})},
+    "text keys of Python": {"names": str({str(k): name for k, name in sorted(enumerate(TWELVE), key=str)})},
+    "a list": {"names": str(TWELVE)},
+    "a list as JSON": {"classes": json.dumps(TWELVE)},
+    "from names to numbers": {"names": json.dumps({name: k for k, name in enumerate(TWELVE)})},
+    "a name a line": {"labels": "\n".join(TWELVE)},
+    "commas": {"class_names": ", ".join(TWELVE)},
+}
+
+
+@pytest.mark.parametrize("dialect", NAME_DIALECTS)
+def test_names_of_classes_are_in_order_of_their_numbers(dialect: str, tmp_path: Path) -> None:
+    record = describe_model(declared(tmp_path / "m.onnx", (1, 16, 8400), **NAME_DIALECTS[dialect]))
+    assert record.classes == tuple(TWELVE)
+    assert record.vehicles == (2, 5)
+
+
+@pytest.mark.parametrize("text", ["", "{}", "{'a': 'b'}", "{-1: 'car'}", "[[", "{99999: 'car'}"])
+def test_names_that_say_nothing_are_asked_for(text: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="YAML of its name beside it"):
+        describe_model(declared(tmp_path / "m.onnx", (1, 16, 8400), names=text))
+
+
+ONE, TWO = str(["car"]), str(["car", "bus"])
+SIX_COLUMNS = {
+    "YOLOv5 of one class": ((1, 25200, 6), ONE, "boxes_with_objectness"),
+    "suppressed in the graph": ((1, 300, 6), ONE, "end_to_end"),
+    "suppressed, two classes": ((1, 300, 6), TWO, "end_to_end"),
+    "transposed, two classes": ((1, 8400, 6), TWO, None),
+    "open number of boxes": ((1, None, 6), ONE, None),
+    "many classes": ((1, 25200, 6), str(TWELVE), "end_to_end"),
+    "YOLOv8": ((1, 6, 8400), TWO, "boxes"),
+    "a list of boxes of all images": ((None, 7), TWO, None),
+}
+
+
+@pytest.mark.parametrize("case", SIX_COLUMNS)
+def test_six_columns_are_read_only_where_they_can_be_one_layout(case: str, tmp_path: Path) -> None:
+    sizes, names, layout = SIX_COLUMNS[case]
+    path = declared(tmp_path / "m.onnx", sizes, names=names)
+    if layout is not None:
+        assert describe_model(path).layout == layout
+        return
+    with pytest.raises(InputError, match="YAML of its name beside it"):
+        describe_model(path)
+    if sizes[1] is None:
+        assert describe_model(declared(path, sizes, names=names, end2end="True")).layout == "end_to_end"
+
+
+@pytest.mark.footage
+@pytest.mark.parametrize("name", ["v8", "strkeys"])
+def test_reported_models_find_their_cars(name: str) -> None:
+    path = Path(__file__).parents[3] / "shared" / "cases" / "20-onnx-string-keys" / f"{name}.onnx"
+    if not path.exists():
+        pytest.skip(f"{path.name} is not there")
+    detector = OnnxDetector.from_file(path)
+    assert detector.record.vehicles == (2, 5, 7)
+    assert len(detector.detect_raw(np.full((640, 640), 90, np.uint8))) == 20
+    assert "vehicles are car, bus, truck" in detector.notes[0]

@@ -257,6 +257,11 @@ class Detector(ABC):
         return self
 
     @property
+    def notes(self) -> list[str]:
+        """What was assumed of the detector's file, one line each."""
+        return []
+
+    @property
     def limitations(self) -> list[str]:
         """What this machine cannot do of what the detector is set to do, one line each."""
         return []

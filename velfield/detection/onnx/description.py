@@ -2,6 +2,7 @@
 
 import ast
 import hashlib
+import re
 from collections.abc import Iterator
 from difflib import get_close_matches
 from pathlib import Path
@@ -14,13 +15,16 @@ from pydantic_core import ErrorDetails
 
 from schemas.detector import OnnxDescription, OnnxLayout, OnnxRecord
 from schemas.model import load_yaml
-from velfield.errors import InputError
+from velfield.errors import InputError, parse_json
 
 MAX_BYTES = 1 << 30
 _VEHICLES = (
     *("car", "van", "truck", "lorry", "bus", "taxi", "pickup", "vehicle", "suv", "minibus", "coach", "automobile"),
     *("small vehicle", "large vehicle", "small car", "light vehicle", "heavy vehicle", "motor vehicle", "freight car"),
 )
+_NAME_KEYS = ("names", "classes", "class_names", "labels", "categories")
+_MAX_CLASSES, _MAX_SUPPRESSED = 10_000, 1000
+"""Most classes; most boxes that a network leaves after suppression in the graph."""
 _THRESHOLD, _DEFAULT_SIDE_PX, _MIN_SIDE_PX, _MAX_SIDE_PX = 0.25, 640, 32, 8192
 _COLUMNS: dict[OnnxLayout, int] = {
     "boxes": 4,
@@ -68,7 +72,7 @@ def describe_model(path: Path, car_length_px: float = 16.0) -> OnnxRecord:
         raise InputError(f"{path.name}: found {len(inputs)} inputs, expected one, the image; export it again")
     given = _read_yaml(path.with_suffix(".yaml"))
     metadata = {one.key: one.value for one in model.metadata_props}
-    names = given.classes or _class_names(metadata.get("names", ""))
+    names = given.classes or _class_names(metadata)
     layout = given.layout or _layout(path, metadata, _sizes(boxes), names)
     vehicles = _vehicles(path, names) if given.vehicles is None else _given_vehicles(path, given.vehicles, names)
     check_output(path.name, _sizes(boxes), layout, names, vehicles)
@@ -159,15 +163,40 @@ def _fault(error: ErrorDetails) -> str:
     return f"{place}: {problem[:1].lower()}{problem[1:]}"
 
 
-def _class_names(text: str) -> tuple[str, ...]:
-    """Ultralytics writes a dictionary, {0: 'car', ...}."""
-    try:
-        names = ast.literal_eval(text)
-    except (ValueError, SyntaxError):
-        return ()
+def _class_names(metadata: dict[str, str]) -> tuple[str, ...]:
+    """Names in order of their numbers: a dictionary or a list, as JSON or Python writes them, or one name a line.
+
+    Examples
+    --------
+    >>> _class_names({"names": '{"0": "bus", "10": "van", "2": "car"}'})[:3]
+    ('bus', '', 'car')
+    """
+    text = next((metadata[key] for key in _NAME_KEYS if metadata.get(key, "").strip()), "")
+    names: Any = None
+    for parse in (parse_json, ast.literal_eval):
+        try:
+            names = parse(text)
+            break
+        except (ValueError, SyntaxError, MemoryError, RecursionError):
+            continue
     if isinstance(names, dict):
-        names = [names[key] for key in sorted(names)]
-    return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
+        numbers = _numbers(names)
+        return tuple(numbers.get(number, "") for number in range(max(numbers, default=-1) + 1))
+    if isinstance(names, list | tuple):
+        return tuple(map(str, names))
+    lines = [name.strip() for name in re.split(r"[\n,;]", text)]
+    return tuple(lines) if any(lines) and not re.search(r"[{}\[\]]", text) else ()
+
+
+def _numbers(names: dict[Any, Any]) -> dict[int, str]:
+    """Names by number; those of a dictionary that goes from names to numbers too. Empty where neither is so."""
+    for pairs in (names.items(), ((value, key) for key, value in names.items())):
+        try:
+            found = {int(number): str(name) for number, name in pairs}
+        except (TypeError, ValueError):
+            continue
+        return found if found and min(found) >= 0 and max(found) < _MAX_CLASSES else {}
+    return {}
 
 
 def _sizes(value: Any) -> tuple[int | None, ...]:
@@ -181,18 +210,29 @@ def _layout(path: Path, metadata: dict[str, str], sizes: tuple[int | None, ...],
         found = f"the task {task!r}" if task else "no metadata"
         raise InputError(f"{path.name}: found {found} and an output of {sizes}, expected a detector's; {_ASK}")
     oriented = task == "obb"
-    if sizes[2] == 6 + oriented and sizes[1] != 4 + len(names) + oriented:
-        return "end_to_end_oriented" if oriented else "end_to_end"
-    if sizes[1] == 4 + len(names) + oriented:
-        return "oriented_boxes" if oriented else "boxes"
+    box = 4 + oriented
+    possible: list[OnnxLayout] = []
+    if sizes[1] == box + len(names):
+        possible.append("oriented_boxes" if oriented else "boxes")
     if sizes[2] == 5 + len(names) and not oriented:
-        return "boxes_with_objectness"
-    raise InputError(f"{path.name}: found an output of {sizes} for {len(names)} classes, expected boxes; {_ASK}")
+        possible.append("boxes_with_objectness")
+    if sizes[2] == 6 + oriented:
+        possible.append("end_to_end_oriented" if oriented else "end_to_end")
+    # Six columns may also be those of one or two classes: after suppression in the graph few boxes are left.
+    is_end = metadata.get("end2end") == "True" or "'nms': True" in metadata.get("args", "")
+    if not is_end and sizes[2] == 6 + oriented and len(names) <= 2:
+        is_end = sizes[1] is not None and sizes[1] <= _MAX_SUPPRESSED
+        possible = [one for one in possible if one.startswith("end") == is_end and sizes[1] is not None]
+    elif is_end:
+        possible = [one for one in possible if one.startswith("end")]
+    if len(possible) != 1:
+        raise InputError(f"{path.name}: found an output of {sizes} for {len(names)} classes, expected boxes; {_ASK}")
+    return possible[0]
 
 
 def _vehicles(path: Path, names: tuple[str, ...]) -> tuple[int, ...]:
     plain = [name.lower().replace("-", " ").replace("_", " ").strip() for name in names]
-    found = tuple(index for index, name in enumerate(plain) if name in _VEHICLES)
+    found = tuple(index for index, name in enumerate(plain) if {name, name.removesuffix("s")} & {*_VEHICLES})
     if not found:
         raise InputError(
             f"{path.name}: found the classes {', '.join(names)[:120] or 'unnamed'}, expected one that is a vehicle; "
@@ -238,6 +278,7 @@ def _tile(
 def _side(metadata: dict[str, str]) -> int:
     """By Ultralytics' metadata, where it is there."""
     try:
-        return int(max(ast.literal_eval(metadata.get("imgsz", "0"))))
+        size = ast.literal_eval(metadata.get("imgsz", str(_DEFAULT_SIDE_PX)))
+        return int(max(size) if isinstance(size, list | tuple) else size)
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
         return _DEFAULT_SIDE_PX

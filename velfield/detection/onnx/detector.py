@@ -5,6 +5,7 @@ program's (`--detections`). Frames are grey, so that its three channels are equa
 """
 
 import hashlib
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -67,6 +68,15 @@ class OnnxDetector(Detector):
     def limitations(self) -> list[str]:
         """A GPU that does not start."""
         return device_limitations(current_device())
+
+    @property
+    def notes(self) -> list[str]:
+        """Which classes count as vehicles, where they have names."""
+        classes, vehicles = self.record.classes, self.record.vehicles
+        used = ", ".join(classes[number] for number in vehicles) if classes else ""
+        left = ", ".join(name for number, name in enumerate(classes) if name and number not in vehicles)
+        ignored = f"; ignored: {textwrap.shorten(left, 120, placeholder=' ...')}" if left else ""
+        return [f"classes of {Path(self.record.path).name}: vehicles are {used}{ignored}"] if classes else []
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the session, which no other process can use."""

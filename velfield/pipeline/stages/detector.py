@@ -296,6 +296,7 @@ def _finish(
         outputs.append(layout.detector)
         given = Path(plan.job.inputs.detector or "").name
         notes.append(f"detector: {detector.method}, {_TRAINED.get(training_source, f'of the file {given}')}")
+        notes += detector.notes
     if background is not None and detector is not None and detector.uses_background:
         write_background(layout, background)
         outputs.append(layout.background)
