@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
 from velfield.sources.frames import local_path
-from velfield.sources.images import image_size, read_grey_image
+from velfield.sources.images import image_size
 from velfield.sources.labels.classes import choose_cars
 from velfield.sources.labels.shapes import CAR_ASPECT, car_in_upright_box, car_shape, tilt_of_upright_box
 from velfield.sources.quality import (
@@ -232,19 +232,6 @@ def test_a_dark_frame_and_fog_are_black() -> None:
     assert not is_black(scene)
     assert is_black((scene // 32).astype(np.uint8))
     assert is_black(np.full((60, 80), 180, np.uint8))
-
-
-@pytest.mark.parametrize(
-    ("mode", "levels", "message"),
-    [("F", 0.5, "mode 'F'"), ("I", 70_000, "found levels 70000 to 70000, expected 0 to 65535")],
-)
-def test_an_image_whose_numbers_are_no_grey_levels_is_refused(
-    mode: str, levels: float, message: str, tmp_path: Path
-) -> None:
-    path = tmp_path / "a.tif"
-    Image.new(mode, (8, 6), levels).save(path)
-    with pytest.raises(InputError, match=message):
-        read_grey_image(path, 1000)
 
 
 def test_a_header_that_is_damaged_or_declares_too_much_is_refused_before_any_pixel(tmp_path: Path) -> None:

@@ -15,8 +15,8 @@ import numpy as np
 from schemas.arrays import FloatArray, IntArray
 from schemas.flight import FramesConfig
 from velfield.errors import Failure, InputError
+from velfield.sources.folder import natural_key
 from velfield.sources.frames import SourceFrame, SourceInfo, local_path
-from velfield.sources.images import natural_key
 from velfield.sources.telemetry.find import find_beside
 from velfield.sources.telemetry.read import read_telemetry
 from velfield.sources.telemetry.telemetry import QUANTITIES, Telemetry

@@ -122,6 +122,8 @@ class SourceInfo:
         Frame rate behind the times, where the user gave one and the source had none.
     max_pixels
         Limit on the size of an image, refused before memory is taken.
+    levels
+        Levels of frames of more than 8 bits that become 0 and 255 in every frame.
     parts
         Of several clips (`velfield.sources.clips`), in order of time: path, facts, and start in s from the first one's.
     """
@@ -139,6 +141,7 @@ class SourceInfo:
     entries: Mask = field(default_factory=lambda: np.zeros(0, np.bool_))
     fps: float | None = None
     max_pixels: int = 400_000_000
+    levels: tuple[float, float] | None = None
     parts: tuple[tuple[str, "SourceInfo", float], ...] = ()
 
     @property

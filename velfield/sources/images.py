@@ -1,30 +1,21 @@
-"""Read one image safely: a local file, of a known format and bounded size, whole, as stored (no EXIF rotation).
-
-A folder of images as a source: natural order, times from a CSV or from a frame rate that the user gives.
-"""
+"""Read one image safely: a local file, of a known format and bounded size, whole, as stored (no EXIF rotation)."""
 
 import io
-import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import BmpImagePlugin, Image, JpegImagePlugin, PngImagePlugin, TiffImagePlugin
 
-from schemas.arrays import FloatArray, GreyImage, IntArray
-from schemas.flight import FramesConfig
+from schemas.arrays import FloatArray, GreyImage
 from velfield.errors import InputError
-from velfield.sources.frames import FootageLoss, SourceFrame, SourceInfo, local_path, unreadable_frame
+from velfield.sources.frames import local_path
 from velfield.sources.png_filters import luma, undo_filters
-from velfield.sources.quality import FrameFlag
-from velfield.sources.timestamps import read_timestamps
-
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-"""Files of a folder that are images."""
 
 # The format comes from the first bytes, never from the name: GDAL and others open a VRT named .tif, which reads other
 # files. The plugins are called directly: `Image.open` would bring its own limit on pixels, a global of the process.
@@ -35,7 +26,12 @@ _MAGIC: tuple[tuple[bytes, type], ...] = (
     (b"MM\0*", TiffImagePlugin.TiffImageFile),
     (b"BM", BmpImagePlugin.BmpImageFile),
 )
+Levels = tuple[float, float]
+"""Levels that become 0 and 255."""
+_PERCENTILES, _FILLED, _SAMPLED = (0.1, 99.9), 0.005, 16
+_BGR_LUMA = np.array([0.114, 0.587, 0.299])
 _READ = "PNG, JPEG, TIFF or BMP"
+_DAMAGED = (OSError, ValueError, SyntaxError, EOFError, OverflowError, MemoryError, UserWarning)
 _MAX_TAG_BYTES = 2**20
 _PNG_XMP = b"XML:com.adobe.xmp\0\0\0\0\0"
 """Key, no compression, no language, no translated key."""
@@ -114,7 +110,7 @@ def _read_png_tail(path: Path) -> tuple[Image.Exif, bytes]:
     return exif, xmp
 
 
-def read_grey_image(path: Path | str, max_pixels: int) -> GreyImage:
+def read_grey_image(path: Path | str, max_pixels: int, levels: Levels | None = None) -> GreyImage:
     """Read an image as grey.
 
     Parameters
@@ -123,15 +119,17 @@ def read_grey_image(path: Path | str, max_pixels: int) -> GreyImage:
         PNG, JPEG, TIFF or BMP on this machine.
     max_pixels
         Most pixels that memory is allocated for.
+    levels
+        Levels of an image of more than 8 bits a channel that become 0 and 255; None: by `stretch_levels` of itself.
 
     Returns
     -------
-    (h, w) uint8, rows as stored; colours by ITU-R 601 luma; 16 bits by their upper 8.
+    (h, w) uint8, rows as stored; colours by ITU-R 601 luma.
 
     Raises
     ------
     InputError
-        An address, another format, too large, truncated or damaged, or pixels that are no grey levels (float).
+        An address, another format, several pages, too large, truncated or damaged, or colours of another space.
     """
     file = local_path(path, "image")
     with _open_image(file) as image:
@@ -139,10 +137,10 @@ def read_grey_image(path: Path | str, max_pixels: int) -> GreyImage:
         try:
             image.draft("L", image.size)  # a JPEG's luma is decoded alone
             plain = _read_plain_png(image) if isinstance(image, PngImagePlugin.PngImageFile) else None
-            return _to_grey(file, image) if plain is None else plain
+            return _to_grey(file, image, levels) if plain is None else plain
         except InputError:
             raise
-        except (OSError, ValueError, SyntaxError, EOFError, OverflowError, MemoryError, UserWarning) as error:
+        except _DAMAGED as error:
             raise InputError(
                 f"{file.name}: the image is truncated or damaged ({error}), expected a whole one; replace it"
             ) from None
@@ -152,21 +150,27 @@ def _open_image(path: Path) -> Image.Image:
     plugin = _image_plugin(path)
     try:
         image: Image.Image = plugin(path)
-    except (
-        OSError,
-        ValueError,
-        SyntaxError,
-        EOFError,
-        OverflowError,
-        KeyError,
-        TypeError,
-        IndexError,
-        UserWarning,
-    ) as error:
+        if getattr(image, "n_frames", 1) > 1 and isinstance(image, TiffImagePlugin.TiffImageFile):
+            _refuse_pages(path, image)
+    except (*_DAMAGED, KeyError, TypeError, IndexError) as error:
         raise InputError(
             f"{path.name}: the image's header is damaged ({error}), expected {_READ}; replace it"
         ) from None
     return image
+
+
+def _refuse_pages(path: Path, image: TiffImagePlugin.TiffImageFile) -> None:
+    """Refuse a TIFF of several frames; reduced copies of the first page (overviews) are none."""
+    size = image.size
+    image.seek(1)
+    if image.size == size:
+        pages = image.n_frames
+        image.close()
+        raise InputError(
+            f"{path.name}: found {pages} pages of {size[0]}x{size[1]}, expected one frame a file; write each "
+            "page as a file"
+        )
+    image.seek(0)
 
 
 def _image_plugin(path: Path) -> type:
@@ -242,16 +246,14 @@ def _inflate_pixels(data: bytes, size: int) -> NDArray[np.uint8] | None:
     return inflated if count == size and inflater.eof and not inflater.unused_data else None
 
 
-def _to_grey(path: Path, image: Image.Image) -> GreyImage:
+def _to_grey(path: Path, image: Image.Image, levels: Levels | None = None) -> GreyImage:
     mode = image.mode
-    if mode.startswith("I;16"):
-        return np.asarray(np.asarray(image).astype(np.uint16) >> 8, np.uint8)
-    if mode == "I":
-        return _upper_bits(path, np.asarray(image))
-    if mode in ("F", "LAB", "HSV"):
-        raise InputError(
-            f"{path.name}: found pixels of mode {mode!r}, expected grey or colour levels of 8 or 16 bits; convert it"
-        )
+    deep = _deep_values(path, image)
+    if deep is not None:
+        low, high = levels or stretch_levels([deep])
+        return np.asarray(np.clip(np.nan_to_num((deep - low) * (255.0 / (high - low))), 0, 255).round(), np.uint8)
+    if mode in ("LAB", "HSV"):
+        raise InputError(f"{path.name}: found pixels of mode {mode!r}, expected grey or colour levels; convert it")
     if mode in ("P", "PA"):
         image = image.convert("RGB")
     elif mode in ("LA", "La"):
@@ -259,178 +261,46 @@ def _to_grey(path: Path, image: Image.Image) -> GreyImage:
     return np.array(image.convert("L"), np.uint8)
 
 
-def _upper_bits(path: Path, values: NDArray[np.int32]) -> GreyImage:
-    if values.min() < 0 or values.max() > 65535:
-        raise InputError(
-            f"{path.name}: found levels {values.min()} to {values.max()}, expected 0 to 65535; convert it to 8 bits"
-        )
-    return np.asarray(values >> 8, np.uint8)
+def _deep_values(path: Path, image: Image.Image) -> FloatArray | None:
+    """Grey levels (h, w) of an image of more than 8 bits a channel, as stored; else None."""
+    if image.mode.startswith("I") or image.mode == "F":
+        return np.asarray(image, np.float64)
+    if ";16" not in str(getattr(image, "tile", "")):
+        return None
+    colours = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)  # Pillow keeps the upper 8 bits alone
+    if colours is None:
+        raise InputError(f"{path.name}: the image is truncated or damaged, expected a whole one; replace it")
+    return np.asarray(colours[..., :3] @ _BGR_LUMA if colours.ndim == 3 else colours, np.float64)
 
 
-_DIGITS = re.compile(r"(\d+)")
-_FEW = 5
+def stretch_levels(images: Iterable[FloatArray]) -> Levels:
+    """The levels of images (h, w) of more than 8 bits that become 0 and 255: their 0.1 and 99.9 percentile.
 
-
-def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
-    """Sort key that puts numbers in order of value.
-
-    Examples
-    --------
-    >>> sorted(["f10.png", "f9.png", "F1.png"], key=natural_key)
-    ['F1.png', 'f9.png', 'f10.png']
+    A level that fills much of an image at either end is no data (a border, a saturated area), and does not count.
     """
-    parts = _DIGITS.split(name.casefold())
-    return (*((0, int(part)) if part.isdecimal() else (1, part) for part in parts), (1, name))
+    sample = np.concatenate([np.asarray(image, np.float64)[::4, ::4].ravel() for image in images])
+    sample = sample[np.isfinite(sample)]
+    for end in (np.min, np.max):
+        filled = sample == end(sample) if len(sample) else sample > 0
+        if _FILLED < filled.mean() < 1:
+            sample = sample[~filled]
+    if not len(sample):
+        return 0.0, 1.0
+    low, high = (float(level) for level in np.percentile(sample, _PERCENTILES))
+    return low, max(high, low + 1e-6 * max(abs(low), 1.0))
 
 
-def probe_folder(path: Path, *, frames: FramesConfig, timestamps: Path | None) -> SourceInfo:
-    """Facts of a folder (`velfield.sources.source.probe`). Reads every image's header, no pixels."""
-    names = list_images(path)
-    names, times_s, warnings = _with_times(path, names, frames, timestamps)
-    sizes, broken = _group_by_size(path, names, frames.max_pixels)
-    if not sizes:
-        raise InputError(
-            f"{path.name}: found {len(names)} images, none of them readable, expected frames; {broken[0][1]}"
-        )
-    width, height = _common_size(path, sizes)
-    if broken:
-        warnings += (f"{len(broken)} of {len(names)} images cannot be read (first: {broken[0][1]})",)
-    return SourceInfo(
-        kind="folder",
-        width=width,
-        height=height,
-        frame_count=len(names),
-        times_s=times_s,
-        names=names,
-        warnings=warnings,
-        fps=frames.fps,
-        max_pixels=frames.max_pixels,
-    )
-
-
-def list_images(path: Path) -> tuple[str, ...]:
-    """Names of the images in a folder, naturally sorted; without hidden files (``._x.jpg`` of a Mac).
-
-    Raises
-    ------
-    InputError
-        There is none.
-    """
-    try:
-        names = [entry.name for entry in path.iterdir() if entry.suffix.lower() in IMAGE_SUFFIXES]
-    except OSError as error:
-        raise InputError(f"{path.name}: the folder cannot be listed ({error.strerror}); check it") from None
-    names = [name for name in names if not name.startswith(".")]
-    if not names:
-        raise InputError(
-            f"{path.name}: found no images in the folder, expected {', '.join(IMAGE_SUFFIXES)}; "
-            "give the folder that holds them, or a video"
-        )
-    return tuple(sorted(names, key=natural_key))
-
-
-def iter_folder(path: Path, info: SourceInfo, indices: IntArray) -> Iterator[SourceFrame]:
-    """Read the images `indices`; one that cannot be read is yielded with the flag UNREADABLE."""
-    for index in indices:
-        yield _read(path, info, int(index))
-
-
-def _read(path: Path, info: SourceInfo, index: int) -> SourceFrame:
-    name = info.names[index]
-    try:
-        check_size(path / name, *image_size(path / name, max_pixels=info.max_pixels), info.max_pixels)
-        grey = read_grey_image(path / name, info.max_pixels)
-    except InputError as error:
-        return unreadable_frame(path, info, index, int(FrameFlag.UNREADABLE), str(error))
-    if grey.shape != info.shape:
-        raise InputError(
-            f"{path.name}: found {name} of {grey.shape[1]}x{grey.shape[0]}, expected {info.width}x{info.height}; "
-            "the folder changed meanwhile, start again"
-        )
-    return SourceFrame(index, name, float(info.times_s[index]), grey, 0)
-
-
-def _with_times(
-    path: Path, names: tuple[str, ...], frames: FramesConfig, timestamps: Path | None
-) -> tuple[tuple[str, ...], FloatArray, tuple[str, ...]]:
-    """Names and times in order of time, and notes on irregularities."""
-    if timestamps is None:
-        if frames.fps is None:
-            raise InputError(
-                f"{path.name}: found {len(names)} images without times, expected them from a side file or a rate; "
-                "give --timestamps CSV (frame,time_s) or --fps F"
-            )
-        return names, np.arange(len(names)) / frames.fps, ()
-    side = read_timestamps(timestamps)
-    kept = tuple(name for name in names if name in side)
-    if not kept:
-        raise InputError(
-            f"{timestamps.name}: found frames such as {next(iter(side))!r}, none an image of {path.name} "
-            f"(such as {names[0]!r}), expected the images' file names as `frame`; fix them"
-        )
-    return _sorted_by_time(
-        kept, np.array([side[name] for name in kept]), _unmatched_notes(path, timestamps, names, kept, side)
-    )
-
-
-def _unmatched_notes(
-    path: Path, timestamps: Path, names: tuple[str, ...], kept: tuple[str, ...], side: dict[str, float]
-) -> tuple[str, ...]:
-    untimed = [name for name in names if name not in side]
-    absent = sorted(set(side) - set(kept), key=natural_key)
-    notes: tuple[str, ...] = ()
-    if untimed:
-        notes += (
-            FootageLoss(f"{len(untimed)} of {len(names)} images have no time and are dropped ({_shorten(untimed)})"),
-        )
-    if absent:
-        notes += (
-            FootageLoss(f"{len(absent)} frames of {timestamps.name} are not in {path.name} ({_shorten(absent)})"),
-        )
-    return notes
-
-
-def _sorted_by_time(
-    names: tuple[str, ...], times_s: FloatArray, notes: tuple[str, ...]
-) -> tuple[tuple[str, ...], FloatArray, tuple[str, ...]]:
-    order = np.argsort(times_s, kind="stable")
-    backwards = int(np.count_nonzero(np.diff(times_s) < 0))
-    times_s = times_s[order]
-    equal = int(np.count_nonzero(np.diff(times_s) == 0))
-    if backwards:
-        notes += (f"times run backwards {backwards} times in the order of names: frames are taken in order of time",)
-    if equal:
-        notes += (FootageLoss(f"{equal} frames have the time of the frame before and are dropped"),)
-    return tuple(names[i] for i in order), times_s, notes
-
-
-def _group_by_size(
-    path: Path, names: tuple[str, ...], max_pixels: int
-) -> tuple[dict[tuple[int, int], list[str]], list[tuple[str, str]]]:
-    """Names by size, and the names of unreadable images with the reason; one too large is an error."""
-    sizes: dict[tuple[int, int], list[str]] = {}
-    broken: list[tuple[str, str]] = []
-    for name in names:
+def folder_levels(files: Sequence[Path], max_pixels: int) -> Levels | None:
+    """One range of levels for images of a flight, by some of them; None where they have 8 bits a channel."""
+    found = []
+    for file in files[:: -(-len(files) // _SAMPLED)]:
         try:
-            size = image_size(path / name, max_pixels=max(max_pixels, 2**62))
-        except InputError as error:
-            broken.append((name, str(error)))
-            continue
-        check_size(path / name, *size, max_pixels)
-        sizes.setdefault(size, []).append(name)
-    return sizes, broken
-
-
-def _common_size(path: Path, sizes: dict[tuple[int, int], list[str]]) -> tuple[int, int]:
-    size, usual = max(sizes.items(), key=lambda item: len(item[1]))
-    if len(sizes) > 1:
-        (width, height), odd = next((other, names) for other, names in sizes.items() if other != size)
-        raise InputError(
-            f"{path.name}: found {odd[0]} of {width}x{height}, expected {size[0]}x{size[1]} as {len(usual)} others; "
-            "take it out of the folder, frames must be of one size"
-        )
-    return size
-
-
-def _shorten(names: list[str]) -> str:
-    return ", ".join(names[:_FEW]) + (", ..." if len(names) > _FEW else "")
+            with _open_image(file) as image:
+                check_size(file, *image.size, max_pixels)
+                deep = _deep_values(file, image)
+        except (InputError, *_DAMAGED):
+            continue  # the frame itself is reported where it is read
+        if deep is None:
+            return None
+        found.append(deep)
+    return stretch_levels(found) if found else None

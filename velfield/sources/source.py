@@ -11,8 +11,8 @@ from schemas.flight import FramesConfig
 from velfield.errors import InputError
 from velfield.sources.capture_times import describe_rate
 from velfield.sources.clips import CLIPS_SUFFIX, iter_clips, probe_clips, read_clip_list
+from velfield.sources.folder import iter_folder, list_images, probe_folder
 from velfield.sources.frames import SourceFrame, SourceInfo, local_path
-from velfield.sources.images import iter_folder, list_images, probe_folder
 from velfield.sources.quality import FrameFlag, is_black, is_duplicate
 from velfield.sources.selection import select_frames
 from velfield.sources.video.corruption import libav_log

@@ -11,8 +11,8 @@ import pandas as pd
 
 from schemas.tables import LABEL_COLUMNS
 from velfield.errors import InputError
+from velfield.sources.folder import natural_key
 from velfield.sources.frames import SourceInfo, local_path
-from velfield.sources.images import natural_key
 from velfield.sources.labels.annotation import Annotation, Parsed
 from velfield.sources.labels.classes import choose_cars, names_of_numbers
 from velfield.sources.labels.formats import FORMATS, SUFFIXES, is_readable, label_files, read_file

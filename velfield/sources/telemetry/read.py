@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from velfield.errors import Failure, InputError
+from velfield.sources.folder import list_images
 from velfield.sources.frames import SourceInfo, local_path
-from velfield.sources.images import list_images
 from velfield.sources.telemetry.image_tags import read_image_telemetry
 from velfield.sources.telemetry.klv import KLV_KEY, KLV_SUFFIX, NEEDS_KLV, parse_klv
 from velfield.sources.telemetry.srt import parse_srt, telemetry_from_cues
