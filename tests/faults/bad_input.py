@@ -265,8 +265,8 @@ def kinds(folder: Path) -> list[Kind]:
         Kind("tracks (FCD)", (FCD,), "tracks.xml", read_tracks),
         Kind("tags (JPEG)", (_tagged("JPEG"),), "x.jpg", read_image_telemetry),
         Kind("tags (PNG)", (_tagged("PNG"), _tagged("PNG", late=True)), "x.png", read_image_telemetry),
-        Kind("subtitles", (SUBTITLES,), "x.srt", read_telemetry_file, 2),
-        Kind("KLV", (b"".join(KLV),), "x.klv", read_telemetry_file, 2),
+        Kind("subtitles", (SUBTITLES,), "x.srt", lambda path: read_telemetry_file(path, info), 2),
+        Kind("KLV", (b"".join(KLV),), "x.klv", lambda path: read_telemetry_file(path, info), 2),
         Kind("KLV, a set with its checksum", tuple(packet[:-2] for packet in KLV), "x.klv", read_klv_summed, 2),
     ]
 

@@ -15,6 +15,7 @@ from tests.sources.test_telemetry import simulated_poses
 from velfield.errors import Failure, InputError
 from velfield.pipeline.stages.georeference import describe
 from velfield.sources.capture_times import read_flight_start
+from velfield.sources.frames import SourceInfo
 from velfield.sources.source import probe
 from velfield.sources.telemetry.find import find_beside
 from velfield.sources.telemetry.klv import parse_klv
@@ -40,6 +41,9 @@ def beside(packets: list[bytes], folder: Path) -> Telemetry | Failure:
     path = write_video(folder / "x.mp4", list(drifting(5)))
     (folder / "x.klv").write_bytes(b"".join(packets))
     return read_telemetry(path, probe(path, frames=FramesConfig()), find_beside(path))
+
+
+VIDEO = SourceInfo("video", 640, 480, 2, np.arange(2) / 25, ("0", "1"))
 
 
 @pytest.mark.parametrize("seed", [111, 112, 113])
@@ -154,9 +158,9 @@ def test_without_klv_parser_one_line_says_what_to_install(tmp_path: Path, monkey
 def test_a_file_that_is_no_klv_is_refused(tmp_path: Path) -> None:
     (tmp_path / "x.klv").write_bytes(b"no key" * 20)
     with pytest.raises(InputError, match="found 0 MISB ST 0601 sets"):
-        read_telemetry_file(tmp_path / "x.klv")
+        read_telemetry_file(tmp_path / "x.klv", VIDEO)
     (tmp_path / "x.mp4").touch()
     assert find_beside(tmp_path / "x.mp4") is None
     (tmp_path / "x.bin").write_bytes(encode_set(NADIR))
-    assert read_telemetry_file(tmp_path / "x.bin").height_m == pytest.approx([500.0], abs=0.35)
+    assert read_telemetry_file(tmp_path / "x.bin", VIDEO).height_m == pytest.approx([500.0], abs=0.35)
     assert KEY in (tmp_path / "x.bin").read_bytes()

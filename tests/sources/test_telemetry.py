@@ -12,6 +12,7 @@ from schemas.flight import FramesConfig
 from schemas.simulation import SimulationConfig
 from tests.media import drifting, write_video
 from velfield.errors import Failure, InputError
+from velfield.sources.frames import SourceInfo
 from velfield.sources.source import probe
 from velfield.sources.telemetry.find import find_beside
 from velfield.sources.telemetry.image_tags import parse_xmp
@@ -63,6 +64,9 @@ FORMATS = {
 }
 
 
+VIDEO = SourceInfo("video", 640, 480, 2, np.arange(2) / 25, ("0", "1"))
+
+
 @pytest.mark.parametrize(("text", "expected"), FORMATS.values(), ids=list(FORMATS))
 def test_subtitles_of_every_format_are_read(text: str, expected: dict[str, float]) -> None:
     found = parse_cue(text)
@@ -75,10 +79,10 @@ def test_subtitles_that_are_no_telemetry_are_none(tmp_path: Path) -> None:
     assert isinstance(parse_srt(plain, "x.srt"), Failure)
     (tmp_path / "x.srt").write_text(plain)
     with pytest.raises(InputError, match="expected a drone's telemetry"):
-        read_telemetry_file(tmp_path / "x.srt")
+        read_telemetry_file(tmp_path / "x.srt", VIDEO)
     (tmp_path / "x.srt").write_text("no cue at all")
     with pytest.raises(InputError, match="expected a drone's telemetry"):
-        read_telemetry_file(tmp_path / "x.srt")
+        read_telemetry_file(tmp_path / "x.srt", VIDEO)
     (tmp_path / "x.mp4").touch()
     assert find_beside(tmp_path / "x.mp4") is None
     (tmp_path / "x.SRT").write_text(f"1\n00:00:01,000 --> 00:00:02,000\n{FORMATS['Mavic Mini'][0]}\n")

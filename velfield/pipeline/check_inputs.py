@@ -30,7 +30,7 @@ _READ: dict[str, Callable[[Path, Plan], object]] = {
     "labels": lambda path, plan: read_labels(path, plan.info),
     "detector": lambda path, plan: _read_detector(path, plan),
     "detections": lambda path, plan: read_detections(path, plan.info),
-    "telemetry": lambda path, plan: read_telemetry_file(path),
+    "telemetry": lambda path, plan: read_telemetry_file(path, plan.info),
 }
 
 

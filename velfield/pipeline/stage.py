@@ -125,7 +125,7 @@ STAGES: tuple[Stage, ...] = (
     # Decode, measure and write each frame.
     Stage(
         name="frames",
-        version=3,
+        version=4,
         label="frames",
         lines=(Line("{usable:.0f} of {frames:.0f} frames read"),),
         prepare=f"{_STAGES}.frames:create_frame_store",
@@ -213,7 +213,7 @@ STAGES: tuple[Stage, ...] = (
     # Scale, north and place of the base image: by its own reference system, --gsd-m, control points and telemetry.
     Stage(
         name="georeference",
-        version=2,
+        version=3,
         label="georeference",
         lines=(
             Line("{gsd_m:.4g} m a pixel by control points", lambda counts: bool(counts.get("by_control_points"))),

@@ -53,7 +53,7 @@ def read_flight_start(source: Path, info: SourceInfo, telemetry: Path | None = N
     telemetry
         A file of telemetry given; its times count from the first frame.
     """
-    if telemetry is not None and (start := _start(read_telemetry_file(telemetry), telemetry)) is not None:
+    if telemetry is not None and (start := _start(read_telemetry_file(telemetry, info), telemetry)) is not None:
         return start
     if info.kind == "folder":
         taken = _capture_time(source / info.names[0]) if info.names else None

@@ -5,12 +5,17 @@ from datetime import UTC, datetime
 from math import isfinite
 from pathlib import Path
 
+import numpy as np
 from PIL import ExifTags
 
-from velfield.sources.images import read_image_tags
+from velfield.sources.images import image_size, read_image_tags
 from velfield.sources.telemetry.attitude import camera_angles, rotation_to_ned
 
-_FOCAL_35MM, _TAKEN, _FRACTION = 0xA405, 0x9003, 0x9291
+_FOCAL_35MM, _FOCAL, _ZOOM, _TAKEN, _FRACTION, _WIDTH, _HEIGHT = 0xA405, 0x920A, 0xA404, 0x9003, 0x9291, 0xA002, 0xA003
+_CENTRE = (("CalibratedOpticalCenterX", "x"), ("CalibratedOpticalCenterY", "y"))
+_SAME_ASPECT, _MAX_CENTRE, _MAX_LOG_FOCAL, _DIAGONAL_35MM = 0.01, 0.15, 0.3, 43.267
+_CROPS = 0.9, 15.0
+"""Equivalent over own focal length: 1 of 36 mm x 24 mm, up to 15 of a telephone's sensors."""
 _XMP_NUMBER = r"""\s*(?:=\s*["']|>)\s*([-+]?\d+(?:\.\d+)?)(?:/(\d+))?"""
 """As an attribute or an element; Parrot writes fractions."""
 _XMP: tuple[tuple[str, str], ...] = (
@@ -39,8 +44,10 @@ _PIX4D_ORIENTATION = tuple((f"Camera:{name}", quantity) for name, quantity in _O
 """Of older Autel firmware, and of Parrot's beside its own: a pitch of 0 is straight down."""
 
 
-def read_image_telemetry(path: Path) -> dict[str, float]:
-    """The quantities in one image's EXIF and XMP, by their names in `Telemetry`; empty where there are none.
+def read_image_telemetry(path: Path) -> tuple[dict[str, float], list[str]]:
+    """The quantities in one image's EXIF and XMP, by their names in `Telemetry`, and notes on what is not used.
+
+    Tags describe the picture that the camera wrote: a focal length in its pixels is scaled to this one's.
 
     Raises
     ------
@@ -48,8 +55,53 @@ def read_image_telemetry(path: Path) -> dict[str, float]:
         It is no image.
     """
     exif, xmp = read_image_tags(path)
-    found = _exif_position(exif.get_ifd(ExifTags.IFD.GPSInfo)) | _exif_camera(exif.get_ifd(ExifTags.IFD.Exif))
-    return found | parse_xmp(xmp.decode("utf-8", "replace"))
+    tags, text = exif.get_ifd(ExifTags.IFD.Exif), xmp.decode("utf-8", "replace")
+    found = _exif_position(exif.get_ifd(ExifTags.IFD.GPSInfo)) | _exif_camera(tags) | parse_xmp(text)
+    taken = _number(tags.get(_WIDTH)), _number(tags.get(_HEIGHT))
+    centre = _find_properties(_CENTRE, text)
+    return _of_this_size(found, image_size(path, max_pixels=2**62), taken, centre)
+
+
+def _of_this_size(
+    found: dict[str, float], size: tuple[int, int], taken: tuple[float | None, float | None], centre: dict[str, float]
+) -> tuple[dict[str, float], list[str]]:
+    """The quantities as they are for a picture of a size, px, whose camera wrote one of another size.
+
+    A resized picture shows all of the camera's, so that its focal length in pixels is reduced alike; of a part of the
+    picture neither that nor the equivalent focal length is known.
+    """
+    width, height = size
+    written = (float(taken[0]), float(taken[1])) if taken[0] and taken[1] else size
+    across = {"focal_35mm", "focal_px"}
+    note = f"the images are {width}x{height}, their tags of {written[0]:g}x{written[1]:g}"
+    notes = []
+    if abs(np.log(width / height * written[0] / written[1])) < _SAME_ASPECT and abs(np.log(width / height)) > 0.05:
+        written = written[1], written[0]
+        found = {name: value for name, value in found.items() if name != "yaw_deg"}
+        notes.append(f"{note}: turned, so that their heading is not used")
+    if abs(np.log(width / height / (written[0] / written[1]))) > _SAME_ASPECT:
+        left = {name: value for name, value in found.items() if name not in across}
+        return left, [f"{note}: a part of the picture, so that their focal length is not used"] if left != found else []
+    factor = width / written[0]
+    equivalent_px = found.get("focal_35mm", 0.0) / _DIAGONAL_35MM * float(np.hypot(*written))
+    # The optical centre lies near the middle of the picture that was calibrated.
+    off = abs(np.log(2 * centre["x"] * factor / width)) if centre.get("x", 0) > 0 else 0.0
+    if "focal_px" in found:
+        if off > _MAX_CENTRE:
+            found = {name: value for name, value in found.items() if name != "focal_px"}
+            notes.append(
+                f"the images are {width} px wide, their calibration is of {2 * centre['x']:.0f}: it is not used"
+            )
+        else:
+            if equivalent_px and abs(np.log(found["focal_px"] / equivalent_px)) > _MAX_LOG_FOCAL:
+                notes.append(
+                    f"the calibrated focal length is {found['focal_px']:.0f} px, by that of 35 mm film it is "
+                    f"{equivalent_px:.0f} px: the calibrated one is not used"
+                )
+                return {name: value for name, value in found.items() if name != "focal_px"}, notes
+            found = found | {"focal_px": found["focal_px"] * factor}
+            notes += [f"{note}: the calibrated focal length is scaled"] if factor != 1 else []
+    return found, notes
 
 
 def parse_xmp(text: str) -> dict[str, float]:
@@ -98,9 +150,11 @@ def _exif_position(gps: dict[int, object]) -> dict[str, float]:
 
 def _exif_camera(tags: dict[int, object]) -> dict[str, float]:
     found = {}
-    focal = _number(tags.get(_FOCAL_35MM))
-    if focal:
+    focal, own, zoom = (_number(tags.get(tag)) for tag in (_FOCAL_35MM, _FOCAL, _ZOOM))
+    if focal and (not own or _CROPS[0] <= focal / own <= _CROPS[1]):
         found["focal_35mm"] = focal
+    if zoom and zoom > 0:
+        found["zoom"] = zoom
     try:
         taken = datetime.strptime(str(tags.get(_TAKEN)), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
     except ValueError:

@@ -31,6 +31,8 @@ _HEIGHT_SD = 0.007
 _TILT_SD_DEG, _UNKNOWN_TILT_SD_DEG = 1.0, 4.0
 MAX_TILT_DEG = 25.0
 """Tilted further, a frame has no one scale."""
+_VIEW_DEG = 0.5, 140.0
+"""Angles of view that cameras of drones have, of the width: telephoto lenses with zoom to action cameras."""
 _COMPASS_SD_DEG = 1.5
 _SATELLITES_SD_M = 2.5
 _Z90 = 1.645
@@ -87,7 +89,10 @@ class FramePoses:
         by_width = self.width / 2 / np.tan(np.radians(self.telemetry.hfov_deg / 2))
         by_height = self.height / 2 / np.tan(np.radians(self.telemetry.vfov_deg / 2))
         by_view = np.where(np.isfinite(by_width), by_width, by_height)
-        return np.where(np.isfinite(zoomed), zoomed, by_view)
+        found = np.where(np.isfinite(zoomed), zoomed, by_view)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            view_deg = np.degrees(2 * np.arctan(self.width / 2 / found))
+        return np.where((view_deg >= _VIEW_DEG[0]) & (view_deg <= _VIEW_DEG[1]), found, np.nan)
 
     @property
     def focal_sd(self) -> float:
@@ -106,7 +111,7 @@ def estimate_scale(poses: FramePoses) -> ScaleEstimate | Failure:
     height_m, focal_px, tilt = poses.telemetry.height_m, poses.focal_px, np.abs(poses.tilt_deg)
     for values, what in ((height_m, "height above the ground"), (focal_px, "focal length")):
         if not np.isfinite(values).any():
-            return Failure(f"{poses.telemetry.origin} has no {what}")
+            return Failure(f"{poses.telemetry.origin} has no {what} that can be")
     down = tilt <= MAX_TILT_DEG
     if not down.any():
         return Failure(f"the camera is tilted by {np.median(tilt):.0f}° from straight down, {MAX_TILT_DEG:g}° at most")

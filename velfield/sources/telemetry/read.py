@@ -9,6 +9,7 @@ from typing import Any
 from velfield.errors import Failure, InputError
 from velfield.sources.folder import list_images
 from velfield.sources.frames import SourceInfo, local_path
+from velfield.sources.telemetry.flight_log import is_flight_log, parse_flight_log
 from velfield.sources.telemetry.image_tags import read_image_telemetry
 from velfield.sources.telemetry.klv import KLV_KEY, KLV_SUFFIX, NEEDS_KLV, parse_klv
 from velfield.sources.telemetry.srt import parse_srt, telemetry_from_cues
@@ -38,7 +39,7 @@ def read_telemetry(source: Path, info: SourceInfo, given: Path | None = None) ->
     source, info
         The video or folder of images, and its facts.
     given
-        A file of subtitles or of MISB KLV.
+        A file of subtitles, a flight log or MISB KLV.
 
     Raises
     ------
@@ -46,14 +47,14 @@ def read_telemetry(source: Path, info: SourceInfo, given: Path | None = None) ->
         The file given cannot be read or holds no telemetry.
     """
     if given is not None:
-        return read_telemetry_file(given)
+        return read_telemetry_file(given, info)
     if info.kind == "folder":
         return _from_images(source, info)
     return _from_video(source)
 
 
-def read_telemetry_file(path: Path) -> Telemetry:
-    """The telemetry in a file of subtitles or, by its suffix ``.klv`` or its key, of MISB KLV.
+def read_telemetry_file(path: Path, info: SourceInfo) -> Telemetry:
+    """The telemetry of a source in a file: subtitles; a flight log; or, by the suffix ``.klv`` or its key, MISB KLV.
 
     Raises
     ------
@@ -66,27 +67,30 @@ def read_telemetry_file(path: Path) -> Telemetry:
     data = file.read_bytes()
     if file.suffix.lower() == KLV_SUFFIX or KLV_KEY in data[:_HEAD_BYTES]:
         found = parse_klv(data, file.name)
+    elif is_flight_log(text := data.decode("utf-8-sig", "replace")):
+        found = parse_flight_log(text, file.name, float(info.times_s[-1] - info.times_s[0]))
     else:
-        found = parse_srt(data.decode("utf-8", "replace"), file.name)
+        found = parse_srt(text, file.name)
     if isinstance(found, Failure):
-        raise InputError(f"{found.reason}; leave it out, or give the drone's own .SRT or .klv")
+        raise InputError(f"{found.reason}; leave it out, or give the drone's own .SRT, .klv or log as CSV")
     return found
 
 
 def _from_images(folder: Path, info: SourceInfo) -> Telemetry | Failure:
     names = info.names or list_images(folder)
     step = -(-len(names) // MAX_IMAGES)
-    records = []
+    records, notes = [], dict[str, None]()
     for index in range(0, len(names), step):
         try:
-            tags = read_image_telemetry(folder / names[index])
+            tags, more = read_image_telemetry(folder / names[index])
         except InputError:
             continue  # the frame itself is reported where it is decoded
-        if set(tags) - {"clock_s", "focal_35mm"}:
+        if set(tags) - {"clock_s", "focal_35mm", "zoom"}:
             records.append((float(info.times_s[index] - info.times_s[0]), tags))
+            notes |= dict.fromkeys(more)
     if not records:
         return Failure("the images have no position, height or attitude in EXIF or XMP")
-    return Telemetry.from_records("the images' EXIF and XMP", records)
+    return Telemetry.from_records("the images' EXIF and XMP", records, list(notes))
 
 
 def _from_video(path: Path) -> Telemetry | Failure:

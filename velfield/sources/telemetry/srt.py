@@ -2,8 +2,10 @@
 
 DJI, since 2018   [iso : 100] ... [focal_len: 24.00] [latitude: 52.5] [longitude: 13.4] [rel_alt: 100.2 abs_alt: 134.1]
                   [gb_yaw: -12.3 gb_pitch: -90.0 gb_roll: 0.0]
-Phantom 4, Mavic  HOME(13.4,52.5) 2017.08.05 14:11:51 / GPS(13.4,52.5,16) BAROMETER:91.2
+Phantom 4, Mavic  HOME(13.4,52.5) 2017.8.5 14:11:51 / GPS(13.4,52.5,16) BAROMETER:91.2, or Hb:91.2
+Matrice 300       2022.06.21 16:06:17 / GPS(52.5,13.4,0.0M) BAROMETER:91.2M
 Mavic Mini, P4R   F/2.8, SS 206.14, ISO 150, GPS (13.4, 52.5, 15), D 48.6m, H 4.6m, G_PRY (-90.0°, 0.0°, 43.7°)
+                  with RTK (13.4, 52.5, 15) in place of GPS
 Autel             HOME(E: 13.4, N: 52.5) / GPS(E: 13.4, N: 52.5, 100.1m) / G.PRY (-90.0°, 0.0°, -3.7°)
 """
 
@@ -18,20 +20,23 @@ from velfield.sources.telemetry.telemetry import Telemetry
 _NUMBER = r"\s*([-+]?\d+(?:\.\d+)?)"
 _CUE = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _TAG = re.compile(r"<[^>]*>")
-_PAIR = re.compile(rf"([A-Za-z_]+)\s*:{_NUMBER}")
-_GPS = re.compile(rf"GPS\s*\({_NUMBER}\s*,{_NUMBER}")
-_GPS_SIGNED = re.compile(
-    rf"GPS\s*\(\s*([EW])\s*:{_NUMBER}\s*,\s*([NS])\s*:{_NUMBER}\s*(?:,{_NUMBER}\s*m)?", re.IGNORECASE
+_PAIR = re.compile(rf"([A-Za-z_]+)\s*:{_NUMBER}\s*(ft\b|feet\b)?", re.IGNORECASE)
+_PLACE = re.compile(rf"(GPS|RTK)\s*\({_NUMBER}\s*,{_NUMBER}\s*(?:,{_NUMBER}\s*(m)?)?", re.IGNORECASE)
+_PLACE_SIGNED = re.compile(
+    rf"(?:GPS|RTK)\s*\(\s*([EW])\s*:{_NUMBER}\s*,\s*([NS])\s*:{_NUMBER}\s*(?:,{_NUMBER}\s*m)?", re.IGNORECASE
 )
-_HEIGHT = re.compile(rf"(?:^|[\s,])H{_NUMBER}\s*m\b")
+_HEIGHT = re.compile(rf"(?:^|[\s,])H{_NUMBER}\s*(m|ft)\b")
+_FOCAL = re.compile(rf"focal_len\s*:{_NUMBER}")
+_ZOOM = re.compile(rf"\bDZOOM\s+{_NUMBER}")
 _ATTITUDE = re.compile(rf"G[._]PRY\s*\({_NUMBER}°?\s*,{_NUMBER}°?\s*,{_NUMBER}")
-_CLOCK = re.compile(r"(\d{4})[-.](\d\d)[-.](\d\d)\s+(\d\d):(\d\d):(\d\d)(?:[.,:](\d{3}))?")
+_CLOCK = re.compile(r"(\d{4})[-./](\d\d?)[-./](\d\d?)\s+(\d\d?):(\d\d?):(\d\d?)(?:[.,:](\d{3}))?")
 _PAIRS = {
     "latitude": "latitude_deg",
     "longitude": "longitude_deg",
     "longtitude": "longitude_deg",  # as DJI wrote it for years
     "rel_alt": "height_m",
     "barometer": "height_m",
+    "hb": "height_m",
     "abs_alt": "altitude_m",
     "altitude": "altitude_m",
     "gb_yaw": "yaw_deg",
@@ -40,9 +45,14 @@ _PAIRS = {
     "focal_len": "focal_35mm",
     "dzoom_ratio": "zoom",
 }
+FOOT_M = 0.3048
 _MIN_FOCAL_35MM = 15.0
 """A smaller number is the lens's own focal length, which means nothing without the sensor's size."""
-_MAX_ZOOM = 100.0
+_AMBIGUOUS_FROM, _TENTHS_OF_MM = 150.0, (190.0, 1000.0)
+"""Whole numbers between are tenths of a millimetre, as DJI wrote them up to 2021 (240 is 24 mm). From 150 up to these,
+and above, they may be either: no drone has a lens of 16.6 mm, nor of 100 mm in that format."""
+_ZOOM_OF_ONE = 10_000
+_MAX_ZOOM = 200.0
 
 
 def parse_srt(text: str, origin: str) -> Telemetry | Failure:
@@ -60,8 +70,14 @@ def parse_srt(text: str, origin: str) -> Telemetry | Failure:
 
 def telemetry_from_cues(cues: Iterator[tuple[float, str]], origin: str) -> Telemetry | Failure:
     """Telemetry of subtitles, each with its time in s from the first frame; a failure where they hold none."""
-    records = [(start_s, found) for start_s, text in cues if (found := parse_cue(text))]
-    telemetry = Telemetry.from_records(origin, records)
+    texts = list(cues)
+    records = [(start_s, found) for start_s, text in texts if (found := parse_cue(text))]
+    lens = [
+        match[2] for _, text in texts if (match := _PAIR.search(text, text.find("focal_len"))) and "focal_len" in text
+    ]
+    unread = lens and not any("focal_35mm" in found for _, found in records)
+    notes = [f"{origin}: focal_len {lens[0]} may be of two units, or of the lens itself: not used"] if unread else []
+    telemetry = Telemetry.from_records(origin, records, notes)
     if not set(telemetry.known_quantities()) - {"clock_s", "zoom", "focal_35mm"}:
         return Failure(
             f"{origin}: found no position, height or attitude in the subtitles, expected a drone's telemetry"
@@ -79,36 +95,46 @@ def parse_cue(text: str) -> dict[str, float]:
     >>> parse_cue("HOME(13.1,52.1) 2017.08.05 14:11:51 GPS(13.4,52.5,16) BAROMETER:91.2")["height_m"]
     91.2
     """
-    plain = _TAG.sub(" ", text)
-    pairs = [(_PAIRS[name.lower()], float(number)) for name, number in _PAIR.findall(plain) if name.lower() in _PAIRS]
-    found = dict(pairs)
-    if "focal_35mm" in found:
-        found |= _focal(found.pop("focal_35mm"))
-    if found.get("zoom", 0.0) > _MAX_ZOOM:
-        found["zoom"] /= 10_000  # 10000 is 1.0
+    plain, found = _TAG.sub(" ", text), dict[str, float]()
+    for name, number, feet in _PAIR.findall(plain):
+        if (quantity := _PAIRS.get(name.lower())) is not None:
+            value = _focal(number) if quantity == "focal_35mm" else float(number) * (FOOT_M if feet else 1.0)
+            found |= {} if value is None else {quantity: value}
+    if match := _ZOOM.search(plain):
+        found["zoom"] = float(match[1])
+    if found.get("zoom", 0.0) >= _ZOOM_OF_ONE:
+        found["zoom"] /= _ZOOM_OF_ONE
     found |= _position(plain) | _attitude(plain) | _clock(plain)
     if found.get("latitude_deg") == found.get("longitude_deg") == 0.0:
         del found["latitude_deg"], found["longitude_deg"]  # no satellites yet
     return found
 
 
-def _focal(value: float) -> dict[str, float]:
-    """The 35 mm equivalent; 240 is 24.0 in the formats up to 2021."""
-    value = value / 10 if value >= 150 and value == int(value) else value
-    return {"focal_35mm": value} if value >= _MIN_FOCAL_35MM else {}
+def _focal(number: str) -> float | None:
+    """The 35 mm equivalent, mm; None where the number may be of two units, or of the lens itself."""
+    value = float(number)
+    if "." not in number and value >= _AMBIGUOUS_FROM:
+        if not _TENTHS_OF_MM[0] <= value < _TENTHS_OF_MM[1]:
+            return None
+        value /= 10
+    return value if value >= _MIN_FOCAL_35MM else None
 
 
 def _position(text: str) -> dict[str, float]:
     found = {}
-    if match := _GPS_SIGNED.search(text):
+    if match := _PLACE_SIGNED.search(text):
         east, longitude, north, latitude, altitude = match.groups()
         found["longitude_deg"] = _with_sign(longitude, east in "Ww")
         found["latitude_deg"] = _with_sign(latitude, north in "Ss")
         found |= {"height_m": float(altitude)} if altitude else {}
-    elif match := _GPS.search(text):
-        found["longitude_deg"], found["latitude_deg"] = map(float, match.groups())
+    elif places := _PLACE.findall(text):
+        _, first, second, _, metres = next((place for place in places if place[0].upper() == "RTK"), places[0])
+        x, y = float(first), float(second)
+        # Longitude comes first, but in the dialect whose altitude has a unit; a latitude is 90 degrees at most.
+        latitude_first = abs(y) > 90 or (bool(metres) and abs(x) <= 90)
+        found["longitude_deg"], found["latitude_deg"] = (y, x) if latitude_first else (x, y)
     if match := _HEIGHT.search(text):
-        found["height_m"] = float(match[1])
+        found["height_m"] = float(match[1]) * (FOOT_M if match[2] == "ft" else 1.0)
     return found
 
 

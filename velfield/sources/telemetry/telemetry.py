@@ -26,6 +26,23 @@ QUANTITIES = (
 )
 """What a record may hold; `Telemetry` says what each is."""
 _ANGLES = ("yaw_deg", "roll_deg")
+_LIMITS = {
+    "latitude_deg": (-90.0, 90.0),
+    "longitude_deg": (-180.0, 360.0),
+    "height_m": (-500.0, 20_000.0),
+    "altitude_m": (-1000.0, 30_000.0),
+    "yaw_deg": (-360.0, 360.0),
+    "pitch_deg": (-180.0, 180.0),
+    "roll_deg": (-360.0, 360.0),
+    "focal_35mm": (10.0, 3000.0),
+    "focal_px": (10.0, 1e6),
+    "hfov_deg": (0.2, 150.0),
+    "vfov_deg": (0.2, 150.0),
+    "zoom": (0.0, 200.0),
+}
+"""What a value can be; others are of another unit, or wrong."""
+_E7 = 1e6
+_DOWN_RAD = 0.2
 
 
 @dataclass(frozen=True)
@@ -109,11 +126,15 @@ class Telemetry:
         height: HeightSource = ABOVE_TAKE_OFF,
         is_utc: bool = False,
     ) -> "Telemetry":
-        """From (time in s, quantities) pairs, in any order."""
+        """From (time in s, quantities) pairs, in any order; what cannot be is left out, with a note.
+
+        Places and attitudes in radians, and places in 1e-7 degrees, become degrees.
+        """
         ordered = sorted(records, key=lambda record: record[0])
         columns = {name: np.array([one.get(name, np.nan) for _, one in ordered], np.float64) for name in QUANTITIES}
         times_s = np.array([time_s for time_s, _ in ordered], np.float64)
-        return cls(origin, times_s, notes=tuple(notes), height=height, is_utc=is_utc, **columns)
+        found = [*notes, *(f"{origin}: {note}" for note in (*_to_degrees(columns), *_leave_out(columns)))]
+        return cls(origin, times_s, notes=tuple(found), height=height, is_utc=is_utc, **columns)
 
     def at(self, times_s: FloatArray) -> "Telemetry":
         """The telemetry at other times (m,), s from the source's first frame, interpolated between records."""
@@ -137,3 +158,39 @@ class Telemetry:
     def known_quantities(self) -> tuple[str, ...]:
         """Names of the quantities that at least one record has."""
         return tuple(name for name in QUANTITIES if np.isfinite(getattr(self, name)).any())
+
+
+def _to_degrees(columns: dict[str, FloatArray]) -> list[str]:
+    """Change places and attitudes of other units to degrees; a note for each."""
+    notes = []
+    place = np.column_stack([columns["latitude_deg"], columns["longitude_deg"]])
+    place = place[np.isfinite(place).all(axis=1)]
+    if len(place) and (np.abs(place) > _E7).all():
+        notes.append(_scale(columns, ("latitude_deg", "longitude_deg"), 1e-7, "positions are in 1e-7 degrees"))
+    # Taken for degrees, all places that radians can give lie in the Gulf of Guinea, at sea.
+    elif len(place) and (np.abs(place) <= (np.pi / 2, np.pi)).all():
+        notes.append(_scale(columns, ("latitude_deg", "longitude_deg"), 180 / np.pi, "positions are in radians"))
+    attitude = np.column_stack([columns[name] for name in ("pitch_deg", "yaw_deg", "roll_deg")])
+    known = attitude[np.isfinite(attitude[:, :2]).all(axis=1)]
+    is_small = len(known) > 0 and bool((np.abs(np.nan_to_num(known)) <= 2 * np.pi).all())
+    if is_small and abs(np.median(known[:, 0]) + np.pi / 2) < _DOWN_RAD:
+        notes.append(_scale(columns, ("pitch_deg", "yaw_deg", "roll_deg"), 180 / np.pi, "angles are in radians"))
+    return notes
+
+
+def _scale(columns: dict[str, FloatArray], names: Sequence[str], factor: float, note: str) -> str:
+    for name in names:
+        columns[name] = columns[name] * factor
+    return note
+
+
+def _leave_out(columns: dict[str, FloatArray]) -> list[str]:
+    """Drop values that cannot be; a note for each quantity."""
+    notes = []
+    for name, (low, high) in _LIMITS.items():
+        wrong = (columns[name] < low) | (columns[name] > high)
+        if wrong.any():
+            first = columns[name][wrong][0]
+            columns[name] = np.where(wrong, np.nan, columns[name])
+            notes.append(f"{name} {first:g} is not from {low:g} to {high:g}: {int(wrong.sum())} values are not used")
+    return notes
