@@ -8,21 +8,22 @@ import pytest
 from schemas.arrays import FloatArray, GreyImage
 from velfield.bench.scenes import simulated_image
 from velfield.detection.detector import shipped_detector
-from velfield.detection.scale_search import STEP, View, contradict_motion, find_scale
+from velfield.detection.scale_search import STEP, View, contradict_motion, find_scale, is_plausible_scale
 from velfield.pipeline.stages.labels import rescale
 from velfield.tracking.dimensions import measure
 
 SCALES = 0.4 * STEP ** np.arange(11)
 
 
+def measure_px(strips: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    size = measure(strips)
+    return size.length, size.length_sd, size.width
+
+
 def search(image: GreyImage) -> float | None:
     def views(scale: float) -> Iterator[View]:
         resampled = rescale(image, scale)
         yield resampled, np.ones(resampled.shape, bool)
-
-    def measure_px(strips: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        size = measure(strips)
-        return size.length, size.length_sd, size.width
 
     return find_scale(views, shipped_detector(), SCALES, measure_px)
 
@@ -33,6 +34,13 @@ def test_the_scale_of_cars_is_found(seed: int, factor: float) -> None:
     found = search(rescale(image, factor))
     assert found is not None
     assert found == pytest.approx(1 / factor, rel=0.2)
+
+
+def test_only_the_right_scale_is_plausible() -> None:
+    image = simulated_image(951).image
+    images = [rescale(image, factor) for factor in (0.25, 1.0, 4.0)]
+    views = [[(one, np.ones(one.shape, bool))] for one in images]
+    assert [is_plausible_scale(one, shipped_detector(), measure_px) for one in views] == [False, True, False]
 
 
 def test_no_scale_is_found_without_cars() -> None:

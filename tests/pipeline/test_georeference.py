@@ -1,5 +1,6 @@
 """A finished run is put on Earth by control points, or by a drone's telemetry, without its frames."""
 
+import re
 import shutil
 from pathlib import Path
 
@@ -160,6 +161,37 @@ def test_the_lengths_of_vehicles_give_the_scale_and_contradict_a_wrong_one(
     assert not warnings[None]
     assert not warnings[0.23]
     assert all("by the lengths of vehicles" in warnings[wrong][0] for wrong in (0.23 * 1.2, 0.23 / 1.2))
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.35, 5.0, 0.2])
+def test_metadata_that_the_cars_contradict_are_not_used(
+    factor: float, whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
+) -> None:
+    """Heights are wrong by a factor, as by a unit or a zoom; what looks like a car does not depend on them."""
+    shutil.copytree(whole[0], tmp_path / "run")
+    config = SimulationConfig.model_validate_json((flight / "simulation.json").read_text())
+    simulated = Flight(config)
+    text = srt_text(simulate_telemetry(config, simulated.camera, simulated.base_shape), simulated.times_s)
+    wrong = re.sub(r"rel_alt: ([\d.]+)", lambda match: f"rel_alt: {float(match[1]) * factor:.3f}", text)
+    (tmp_path / "x.SRT").write_text(wrong)
+    run = open_run(tmp_path / "run")
+    plan = made_plan(run, Inputs(source=str(flight / "frames"), telemetry=str(tmp_path / "x.SRT")))
+    first = georeference_run(plan)
+    record = read_first_georeference(run.layout)
+    assert record is not None
+    assert record.scale.used is not None
+    is_impossible = factor in (5.0, 0.2)  # at a third more the detector finds the same cars
+    assert record.scale.used.source == ("vehicles" if is_impossible else "metadata")
+    assert (sum("by the metadata: speeds" in line for line in first.warnings) == 1) == is_impossible
+    if is_impossible:
+        assert record.scale.used.gsd_m == pytest.approx(0.23, rel=0.2)
+    done = scale_run(plan)
+    record = read_georeference(run.layout)
+    assert record is not None
+    assert record.scale.used is not None
+    assert record.scale.used.source == ("metadata" if factor == 1 else "vehicles")
+    assert record.scale.used.gsd_m == pytest.approx(0.23, rel=0.06)
+    assert sum("by the metadata: speeds" in line for line in done.warnings) == (factor != 1)
 
 
 def stopping_street(gsd_m: float, fps: float) -> pd.DataFrame:

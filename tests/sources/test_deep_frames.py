@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -81,3 +82,22 @@ def test_pages_of_a_tiff_are_no_frame_and_overviews_are_none(tmp_path: Path) -> 
     pages[0].save(tmp_path / "a.tif", save_all=True, append_images=pages[1:])
     with pytest.raises(InputError, match=r"found 3 pages of .*; write each page as a file"):
         probe(tmp_path, frames=FPS)
+
+
+@pytest.mark.parametrize("pixels", ["gray16le", "gray10le", "gray"])
+def test_a_grey_video_of_more_than_8_bits_is_stretched_by_one_range(pixels: str, tmp_path: Path) -> None:
+    frames = list(drifting(6))
+    with av.open(str(tmp_path / "x.mkv"), "w") as container:
+        stream = container.add_stream("ffv1", rate=25)
+        stream.width, stream.height, stream.pix_fmt = frames[0].shape[1], frames[0].shape[0], pixels
+        for grey in frames:
+            deep = grey if pixels == "gray" else radiometric(grey)
+            frame = av.VideoFrame.from_ndarray(deep, format="gray" if pixels == "gray" else "gray16le")
+            container.mux(stream.encode(frame.reformat(format=pixels)))
+        container.mux(stream.encode(None))
+    info = probe(tmp_path / "x.mkv", frames=FramesConfig())
+    assert (info.levels is None) == (pixels == "gray")
+    for frame, grey in zip(iter_frames(tmp_path / "x.mkv", info, range(6)), frames, strict=True):
+        assert not frame.flags
+        assert np.corrcoef(frame.grey.ravel(), grey.ravel())[0, 1] > 0.99
+        assert frame.grey.std() > 0.9 * grey.std()

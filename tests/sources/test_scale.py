@@ -27,6 +27,18 @@ def test_disagreement_is_reported_where_intervals_do_not_meet() -> None:
     assert "0.833 times" in line
 
 
+@pytest.mark.parametrize(
+    ("metadata_m", "used"), [(1.0, "vehicles"), (0.12, "metadata"), (0.105, "metadata"), (0.07, "vehicles")]
+)
+def test_lengths_of_vehicles_overrule_metadata_that_cannot_be_alone(metadata_m: float, used: str) -> None:
+    vehicles, metadata = estimate(0.1, "vehicles", 0.08), estimate(metadata_m, "metadata")
+    choice = choose_scale([metadata, vehicles])
+    assert choice.used is not None
+    assert choice.used.source == used
+    assert len(choice.disagreements) == (metadata_m != 0.105)
+    assert choose_scale([metadata, vehicles, estimate(0.1, "given")]).used == estimate(0.1, "given")
+
+
 def test_an_interval_holds_its_estimate() -> None:
     with pytest.raises(ValidationError, match="not between"):
         ScaleEstimate(gsd_m=0.1, low_m=0.2, high_m=0.3, source="given")

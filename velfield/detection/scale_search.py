@@ -24,6 +24,7 @@ _MIN_DETECTIONS = 12
 _MIN_AGREEMENT = 0.04
 """Mean score times the fraction of the size of cars: 0.07 to 0.14 at the right scale of real and simulated images,
 0.03 to 0.05 at wrong ones."""
+_RIGHT_AGREEMENT = 0.06
 _MIN_RATIO = 1.3
 """The best scale must surpass all that are not beside it by this factor."""
 _MAX_MOTION_RATIO = 1.5
@@ -66,6 +67,12 @@ def find_scale(
         return None
     beside = slice(max(best - 1, 0), best + 2)
     return float(np.exp(np.average(np.log(scales[beside]), weights=agreement[beside] ** 2)))
+
+
+def is_plausible_scale(views: Iterable[View], detector: Detector, measure: Measure) -> bool:
+    """Whether the detector finds cars of its size in images of one scale, as it does at the right one."""
+    agreement, count = _agreement([_judge(view, detector, measure) for view in views])
+    return agreement >= _RIGHT_AGREEMENT and count >= _MIN_DETECTIONS
 
 
 def contradict_motion(by_motion: float, by_appearance: float | None, car_length_px: float) -> list[str]:

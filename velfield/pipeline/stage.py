@@ -220,6 +220,7 @@ STAGES: tuple[Stage, ...] = (
             Line("{gsd_m:.4g} m a pixel by the base image", lambda counts: bool(counts.get("by_base"))),
             Line("{gsd_m:.4g} m a pixel as given", lambda counts: bool(counts.get("by_given"))),
             Line("{gsd_m:.4g} m a pixel by the drone's metadata", lambda counts: bool(counts.get("by_metadata"))),
+            Line("{gsd_m:.2g} m a pixel by the size of cars", lambda counts: bool(counts.get("by_vehicles"))),
             Line("the scale is not known yet: it will be estimated by the lengths of vehicles"),
         ),
         unit=f"{_STAGES}.georeference:georeference_run",

@@ -10,7 +10,7 @@ from schemas.arrays import FloatArray, IntArray
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
 from velfield.sources.frames import FootageLoss, SourceFrame, SourceInfo, unreadable_frame
-from velfield.sources.images import check_size, folder_levels, image_size, read_grey_image
+from velfield.sources.images import check_size, describe_levels, folder_levels, image_size, read_grey_image
 from velfield.sources.quality import FrameFlag
 from velfield.sources.timestamps import read_timestamps
 
@@ -46,9 +46,7 @@ def probe_folder(path: Path, *, frames: FramesConfig, timestamps: Path | None) -
         warnings += (f"{len(broken)} of {len(names)} images cannot be read (first: {broken[0][1]})",)
     levels = folder_levels([path / name for name in sizes[width, height]], frames.max_pixels)
     if levels is not None:
-        warnings += (
-            f"images of more than 8 bits: levels {levels[0]:g} to {levels[1]:g} become 0 to 255 in all frames",
-        )
+        warnings += (describe_levels(levels),)
     return SourceInfo(
         kind="folder",
         width=width,

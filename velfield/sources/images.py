@@ -250,8 +250,7 @@ def _to_grey(path: Path, image: Image.Image, levels: Levels | None = None) -> Gr
     mode = image.mode
     deep = _deep_values(path, image)
     if deep is not None:
-        low, high = levels or stretch_levels([deep])
-        return np.asarray(np.clip(np.nan_to_num((deep - low) * (255.0 / (high - low))), 0, 255).round(), np.uint8)
+        return stretch(deep, levels or stretch_levels([deep]))
     if mode in ("LAB", "HSV"):
         raise InputError(f"{path.name}: found pixels of mode {mode!r}, expected grey or colour levels; convert it")
     if mode in ("P", "PA"):
@@ -271,6 +270,17 @@ def _deep_values(path: Path, image: Image.Image) -> FloatArray | None:
     if colours is None:
         raise InputError(f"{path.name}: the image is truncated or damaged, expected a whole one; replace it")
     return np.asarray(colours[..., :3] @ _BGR_LUMA if colours.ndim == 3 else colours, np.float64)
+
+
+def stretch(image: FloatArray, levels: Levels) -> GreyImage:
+    """An image (h, w) in 8 bits, its levels mapped to 0 and 255."""
+    low, high = levels
+    return np.asarray(np.clip(np.nan_to_num((image - low) * (255.0 / (high - low))), 0, 255).round(), np.uint8)
+
+
+def describe_levels(levels: Levels) -> str:
+    """What is done with frames of more than 8 bits, one line."""
+    return f"frames of more than 8 bits: levels {levels[0]:g} to {levels[1]:g} become 0 to 255 in all frames"
 
 
 def stretch_levels(images: Iterable[FloatArray]) -> Levels:

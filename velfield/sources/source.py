@@ -13,10 +13,11 @@ from velfield.sources.capture_times import describe_rate
 from velfield.sources.clips import CLIPS_SUFFIX, iter_clips, probe_clips, read_clip_list
 from velfield.sources.folder import iter_folder, list_images, probe_folder
 from velfield.sources.frames import SourceFrame, SourceInfo, local_path
+from velfield.sources.images import describe_levels
 from velfield.sources.quality import FrameFlag, is_black, is_duplicate
 from velfield.sources.selection import select_frames
 from velfield.sources.video.corruption import libav_log
-from velfield.sources.video.decoding import iter_video
+from velfield.sources.video.decoding import iter_video, video_levels
 from velfield.sources.video.packets import open_video, video_stream
 from velfield.sources.video.probe import probe_video
 
@@ -52,7 +53,10 @@ def probe(path: Path | str, *, frames: FramesConfig, timestamps: Path | None = N
         return replace(info, warnings=info.warnings + describe_rate(source, info.names, frames.fps))
     if source.suffix == CLIPS_SUFFIX:
         return probe_clips(source, frames=frames, timestamps=timestamps)
-    return probe_video(source, frames=frames, timestamps=timestamps)
+    info = probe_video(source, frames=frames, timestamps=timestamps)
+    levels = video_levels(source, info)
+    note = () if levels is None else (describe_levels(levels),)
+    return replace(info, levels=levels, warnings=info.warnings + note)
 
 
 def check_source(path: Path | str) -> None:

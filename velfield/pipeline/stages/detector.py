@@ -5,26 +5,27 @@ or training on the given labels (`--labels`), or self-training on vehicles that 
 shipped pre-trained detector is used.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from schemas.arrays import FloatArray, GreyImage
+from schemas.arrays import GreyImage
 from schemas.records import WorkingRecord
 from velfield.analysis.vehicle_scale import CAR_LENGTH_M
 from velfield.detection.cnn.network import use_device
 from velfield.detection.detector import Detector, detector_class, load_detector, shipped_detector, train_detector
 from velfield.detection.motion.difference import MotionBackground, MotionFrame, motion_background
 from velfield.detection.motion.labels import MotionLabels, choose_frames, labels_from_motion, working_scale
-from velfield.detection.scale_search import STEP, View, contradict_motion, find_scale
+from velfield.detection.scale_search import contradict_motion
 from velfield.detection.unlabelled import UnlabelledFlight
 from velfield.errors import InputError
 from velfield.parallel import count_steps, parallel_map
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
+from velfield.pipeline.stages.car_size import search_scale
 from velfield.pipeline.stages.labels import (
     base_px_per_raw_px,
     check_label_axes,
@@ -38,13 +39,8 @@ from velfield.pipeline.stages.registration import external_boxes, usable_frames
 from velfield.run.commits import write_atomically
 from velfield.run.frame_transforms import read_first_grid
 from velfield.run.stores import open_frames
-from velfield.tracking.dimensions import measure
 
 _FRAMES_TO_MEASURE = 4
-_FRAMES_TO_SEARCH = 3
-_GSD_RANGE_M = 0.02, 0.6
-"""Metres a base pixel at which cars are looked for where nothing gives their size."""
-_MAX_SEARCH_PX = 4e7
 _FRAMES_TO_CALIBRATE = 3
 _MIN_FRAMES_WITH_BOXES = 0.5
 """Fraction of the frames in which another program's boxes are expected."""
@@ -181,7 +177,7 @@ def _from_motion(plan: Plan) -> StageResult:
     by_appearance, contradicted = None, []
     if known is None and labels.usable:
         scale = working_scale(plan.config.detection, None, labels, labels_scale=scale)
-        by_appearance = _search_scale(plan, shipped_detector())
+        by_appearance = search_scale(plan, shipped_detector())
         contradicted = contradict_motion(scale, by_appearance, length_px)
         if by_appearance is not None and contradicted:
             scale = by_appearance
@@ -218,36 +214,12 @@ def _without_labels(
     It needs a car's size: ``scale``, else ``by_appearance``, else it is looked for. ``contradicted``: warnings so far.
     """
     reason, detector = "; ".join(labels.warnings), shipped_detector()
-    found = scale or by_appearance or _search_scale(plan, detector)
+    found = scale or by_appearance or search_scale(plan, detector)
     if found is None:
         raise InputError(f"{reason}; or give --gsd-m, so that the shipped detector can be used")
     outcome = _finish(plan, detector, found, "shipped", motion=labels, car_length_m=plan.config.detection.car_length_m)
     used = "The shipped detector is used" + ("" if scale else ", at the scale at which it finds cars of their size")
     return replace(outcome, warnings=[*outcome.warnings, *contradicted, f"{reason}. {used}"])
-
-
-def _search_scale(plan: Plan, detector: Detector) -> float | None:
-    """Working px a base px, by the detector that ships; None where it finds cars at no scale, or at several."""
-    usable = np.flatnonzero(usable_frames(plan))
-    chosen = usable[np.unique(np.linspace(0, len(usable) - 1, _FRAMES_TO_SEARCH).astype(int))]
-    grid = read_first_grid(plan.layout)
-    gsd_m = _GSD_RANGE_M[0] * STEP ** np.arange(np.log(_GSD_RANGE_M[1] / _GSD_RANGE_M[0]) / np.log(STEP))
-    scales = np.array([working_scale(plan.config.detection, float(one)) for one in gsd_m])
-    scales = scales[scales**2 * grid.width_px * grid.height_px < _MAX_SEARCH_PX]
-
-    def views(scale: float) -> Iterator[View]:
-        working = WorkingGrid.open(plan, scale)
-        for frame in chosen:
-            rectified = working.frame(int(frame), working.whole)
-            if rectified is not None:
-                yield rectified.image, rectified.valid
-        advance("detector", 0)
-
-    def measure_px(strips: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        size = measure(strips)
-        return size.length, size.length_sd, size.width
-
-    return find_scale(views, detector, scales, measure_px)
 
 
 def _motion_frames(plan: Plan, scale: float) -> list[MotionFrame]:

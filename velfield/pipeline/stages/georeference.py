@@ -67,6 +67,13 @@ def georeference_run(plan: Plan) -> StageResult:
     layout, grid = plan.layout, read_own_grid(plan.layout)
     layout.scale.unlink(missing_ok=True)  # its stage follows
     record, notes = compare_sources(plan, grid)
+    used = record.scale.used
+    if used is not None and used.source == "metadata":
+        from velfield.pipeline.stages.car_size import contradict_metadata
+
+        found = contradict_metadata(plan, used)
+        if found is not None:
+            record, notes = compare_sources(plan, grid, found)
     outputs = write_georeference(layout, layout.georeference, record, plan.config.frames)
     advance("georeference")
     notes = [*describe(record), *notes, *_gsd_of_frames(plan, grid)]

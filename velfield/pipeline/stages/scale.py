@@ -37,6 +37,8 @@ def scale_run(plan: Plan) -> StageResult:
     """Write ``base/scale.json``; and the base image as GeoTIFF where its place became known here."""
     layout, before = plan.layout, read_first_georeference(plan.layout) or GeoreferenceRecord()
     measured, vehicles = scale_of_tracks(layout)
+    if measured is None and before.scale.used is not None and before.scale.used.source == "vehicles":
+        measured = before.scale.used  # too few were tracked, but the metadata are contradicted all the same
     record, _ = compare_sources(plan, read_own_grid(layout), measured)
     outputs = write_georeference(layout, layout.scale, record, plan.config.frames)
     advance("scale")

@@ -14,10 +14,12 @@ import numpy as np
 from schemas.arrays import GreyImage, IntArray
 from velfield.errors import InputError
 from velfield.sources.frames import SourceFrame, SourceInfo, unreadable_frame
+from velfield.sources.images import Levels, stretch, stretch_levels
 from velfield.sources.quality import FrameFlag
 from velfield.sources.video.corruption import BlockArtifactDetector, CorruptionTracker, capture_errors, libav_log
 from velfield.sources.video.packets import iter_packets, open_video, video_stream
 
+_DEEP, _SAMPLED = "gray16le", 16
 _LUMA_FIRST = {"gray", "yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "nv21"}
 _FULL_RANGE = 2  # AVCOL_RANGE_JPEG
 _INTRA = 1  # AV_PICTURE_TYPE_I
@@ -96,7 +98,7 @@ def _decode(path: Path, info: SourceInfo, entry: int, corruption: CorruptionTrac
                     corruption.note_key_frame(is_intra=int(frame.pict_type) == _INTRA)
                 if frame.is_corrupt:
                     corruption.mark_frame(index)
-                grey = _grey(frame)
+                grey = _grey(frame, info.levels)
                 recent.append(index)
                 for ago in artifacts.feed(grey):
                     corruption.mark_artifacts(recent[-1 - ago])
@@ -182,8 +184,25 @@ def _source_frame(path: Path, info: SourceInfo, decoded: _Decoded, corruption: C
     return SourceFrame(index, info.names[index], time_s, grey, int(FrameFlag.SUSPECT) if suspect else 0, reason)
 
 
-def _grey(frame: Any) -> GreyImage:
+def video_levels(path: Path, info: SourceInfo) -> Levels | None:
+    """Levels of a grey video of more than 8 bits that become 0 and 255 in all frames; None of another."""
+    with libav_log(), ExitStack() as stack:
+        container = stack.enter_context(open_video(path))
+        stream = video_stream(container, path)
+        pixels = stream.codec_context.format
+        if pixels is None or not pixels.name.startswith("gray") or pixels.components[0].bits <= 8:
+            return None
+        found = []
+        for at in info.pts[np.unique(np.linspace(0, len(info.pts) - 1, _SAMPLED).astype(int))] if len(info.pts) else ():
+            container.seek(int(at), stream=stream, backward=True, any_frame=False)
+            found += [frame.to_ndarray(format=_DEEP) for frame in itertools.islice(container.decode(stream), 1)]
+    return stretch_levels(found) if found else None
+
+
+def _grey(frame: Any, levels: Levels | None = None) -> GreyImage:
     """Luma as (h, w) uint8 of full range, straight from the plane: converting colours would cost ten times as much."""
+    if levels is not None:
+        return stretch(np.asarray(frame.to_ndarray(format=_DEEP), np.float64), levels)
     if frame.format.name not in _LUMA_FIRST:
         return np.ascontiguousarray(frame.to_ndarray(format="gray"), np.uint8)
     plane = frame.planes[0]

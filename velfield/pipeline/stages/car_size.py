@@ -1,0 +1,80 @@
+"""The size of a car in the base image, by what the detector that ships takes for cars, whatever else is known."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from schemas.arrays import FloatArray
+from schemas.scale import ScaleEstimate
+from velfield.analysis.vehicle_scale import CAR_LENGTH_M
+from velfield.detection.detector import Detector, shipped_detector
+from velfield.detection.scale_search import STEP, View, find_scale, is_plausible_scale
+from velfield.pipeline.plan import Plan
+from velfield.pipeline.result import advance
+from velfield.pipeline.stages.rectified_frames import WorkingGrid
+from velfield.pipeline.stages.registration import usable_frames
+from velfield.run.frame_transforms import read_own_grid
+from velfield.tracking.dimensions import measure
+
+_FRAMES = 3
+_GSD_RANGE_M = 0.02, 0.6
+"""Metres a base pixel at which cars are looked for."""
+_MAX_PX = 4e7
+_MAX_RATIO = 1.5
+"""Of two scales: the detector finds cars that are a quarter larger or smaller too, and its search is right to 15 %."""
+_SEARCH_SD = 0.15
+
+
+def search_scale(plan: Plan, detector: Detector) -> float | None:
+    """Working px a base px, by the detector that ships; None where it finds cars at no scale, or at several."""
+    grid = read_own_grid(plan.layout)
+    gsd_m = _GSD_RANGE_M[0] * STEP ** np.arange(np.log(_GSD_RANGE_M[1] / _GSD_RANGE_M[0]) / np.log(STEP))
+    scales = detector.record.working_car_length_px / (plan.config.detection.car_length_m / gsd_m)
+    scales = scales[scales**2 * grid.width_px * grid.height_px < _MAX_PX]
+    return find_scale(_views(plan), detector, scales, _measure_px)
+
+
+def contradict_metadata(plan: Plan, metadata: ScaleEstimate) -> ScaleEstimate | None:
+    """The scale by what looks like a car, where the metadata's can not be; else None.
+
+    Cars are looked for at the scale of the metadata first, and at all others only where few are found there: what the
+    detector finds at one scale can not confirm another.
+    """
+    detector, grid = shipped_detector(), read_own_grid(plan.layout)
+    car_px = float(detector.record.working_car_length_px)
+    scale = car_px * metadata.gsd_m / CAR_LENGTH_M
+    if scale**2 * grid.width_px * grid.height_px < _MAX_PX and is_plausible_scale(
+        _views(plan)(scale), detector, _measure_px
+    ):
+        return None
+    found = search_scale(plan, detector)
+    if found is None or abs(np.log(found / scale)) <= np.log(_MAX_RATIO):
+        return None
+    gsd_m, factor = found * CAR_LENGTH_M / car_px, float(np.exp(1.645 * _SEARCH_SD))
+    return ScaleEstimate(
+        gsd_m=gsd_m,
+        low_m=gsd_m / factor,
+        high_m=gsd_m * factor,
+        source="vehicles",
+        note="at the scale of the metadata nothing looks like a car",
+    )
+
+
+def _views(plan: Plan) -> Callable[[float], Iterator[View]]:
+    usable = np.flatnonzero(usable_frames(plan))
+    chosen = usable[np.unique(np.linspace(0, len(usable) - 1, _FRAMES).astype(int))] if len(usable) else usable
+
+    def views(scale: float) -> Iterator[View]:
+        working = WorkingGrid.open(plan, scale)
+        for frame in chosen:
+            rectified = working.frame(int(frame), working.whole)
+            if rectified is not None:
+                yield rectified.image, rectified.valid
+        advance("detector", 0)
+
+    return views
+
+
+def _measure_px(strips: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    size = measure(strips)
+    return size.length, size.length_sd, size.width
