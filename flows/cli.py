@@ -14,14 +14,13 @@ from cyclopts import App, Argument, CycloptsError, MissingArgumentError, Paramet
 
 from flows.commands.start import own_command
 from flows.launch import limit_threads, use_writable_folders
-from flows.options import Device, Preset, Settings, parse_frame_size, renamed_option
+from flows.options import Device, Preset, Settings, parse_frame_size
 from flows.stopping import STOPPED, as_ctrl_c, leave
 from velfield.errors import (
     CacheWarning,
     DeviceWarning,
     IneffectiveSettingWarning,
     InputError,
-    OldNameWarning,
     StoreError,
 )
 
@@ -98,7 +97,6 @@ def run(
     start_s: float | None = None,
     stop_s: float | None = None,
     intervals: str | None = None,
-    old_intervals: Annotated[str | None, Parameter(name="--slice", show=False)] = None,
     workers: int | None = None,
     scheduler: str | None = None,
     cluster: Path | None = None,
@@ -181,7 +179,7 @@ def run(
         "frames.fps": fps,
         "frames.start_s": start_s,
         "frames.stop_s": stop_s,
-        "field.time_intervals": renamed_option(intervals, old_intervals, name="--intervals", old_name="--slice"),
+        "field.time_intervals": intervals,
         "work.device": device,
         "position_unit": unit,
     }
@@ -489,7 +487,7 @@ def _warn_of_settings_in_one_line() -> None:
     show = warnings.showwarning
 
     def showwarning(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
-        if issubclass(category, CacheWarning | OldNameWarning | IneffectiveSettingWarning | DeviceWarning):
+        if issubclass(category, CacheWarning | IneffectiveSettingWarning | DeviceWarning):
             print(f"velfield: {message}", file=sys.stderr)
         else:
             show(message, category, *where, **options)

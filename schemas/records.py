@@ -8,17 +8,15 @@ from schemas.flight import FlightConfig
 from schemas.job import Inputs
 from schemas.model import Model
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 1
 """Version of the run folder's layout."""
-READABLE_FORMATS = (1, FORMAT_VERSION)
-"""Versions that `velfield.open_run` reads; a run continues in a folder of the present one only."""
 
 
 class SealedRecord(Model):
     """A record that its file holds together with a digest of it, so that a damaged one is known."""
 
     digest: str | None = None
-    """BLAKE2b digest of all other keys; none in records of version 0.1."""
+    """BLAKE2b digest of all other keys."""
 
 
 class CommitRecord(SealedRecord):

@@ -41,11 +41,10 @@ TRACKLET_COLUMNS: dict[str, str] = {
     "confidence": "float32",  # [0, 1]
 }
 
-TRACK_COLUMNS: dict[str, str] = TRACKLET_COLUMNS | {"passage_id": "int64", "recovered": "bool"}
+TRACK_COLUMNS: dict[str, str] = TRACKLET_COLUMNS | {"recovered": "bool"}
 """Tracklets with the track that they belong to.
 
-``recovered``: of detections that only the track confirmed. ``passage_id``, the old name of ``track_id``, is deprecated:
-it holds the same values, and the next format drops it.
+``recovered``: of detections that only the track confirmed.
 """
 
 DIMENSION_COLUMNS: dict[str, str] = {

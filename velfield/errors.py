@@ -28,10 +28,6 @@ class StoreError(RuntimeError):
     """A store or a file of a run is damaged or not as expected: names it, and the chunk."""
 
 
-class OldNameWarning(FutureWarning):
-    """A name of an earlier format was given; it is read for this release. The message says the present name."""
-
-
 class IneffectiveSettingWarning(UserWarning):
     """A setting that the chosen method does not read. The message says which setting chose the method."""
 

@@ -1,7 +1,5 @@
 """The seam between the pipeline and its detectors: the registry, detector files, what another detector needs."""
 
-import json
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,11 +20,6 @@ from schemas.detector import (
     Rectangle,
     Round,
 )
-from schemas.renames import DETECTOR_KEYS, DETECTOR_LAYERS, upgrade_detector
-from tests.detection.test_cnn import layers_of
-from tests.detection.test_cnn_layers import random_network
-from velfield.detection.cnn.detector import CnnDetector
-from velfield.detection.cnn.network import FORMER_TOPOLOGY
 from velfield.detection.detect import detect_frame
 from velfield.detection.detector import (
     Detections,
@@ -39,7 +32,7 @@ from velfield.detection.detector import (
     train_detector,
 )
 from velfield.detection.samples import LabelledImage
-from velfield.errors import InputError, OldNameWarning
+from velfield.errors import InputError
 
 
 class ToyConfig(DetectorConfig):
@@ -181,55 +174,6 @@ def test_a_detector_comes_back_from_its_file(make, tmp_path: Path) -> None:  # t
     assert again.with_threshold(0.7, None).threshold == 0.7
 
 
-def of_version_1(record: BaseRecord) -> dict[str, object]:
-    """The content of a detector file as version 0.1 wrote it: one record for all methods."""
-    old_keys = {new: old for old, new in DETECTOR_KEYS.items()}
-    old_layers = {new: old for old, new in DETECTOR_LAYERS.items()}
-
-    def renamed(value: object) -> object:
-        if isinstance(value, dict):
-            return {old_keys.get(name, name): renamed(inner) for name, inner in value.items()}
-        return [renamed(inner) for inner in value] if isinstance(value, list) else value
-
-    found = renamed(json.loads(record.model_dump_json(exclude={"response_sigma_px", "min_region_px"})))
-    assert isinstance(found, dict)
-    if isinstance(record, CnnRecord):
-        del found["onnx"], found["tta_range"]
-        layers = layers_of(random_network(0, FORMER_TOPOLOGY))
-        found["network"] = {old_layers[name]: layer.model_dump(mode="json") for name, layer in layers.items()}
-    every = {"rounds": [], "network": None, "motion": None, "grey_bits": 8, "contrast_floor": None, "proposer": None}
-    method = {"cnn": "network", "cascade": "aligned", "paper": "dense"}[record.method]
-    return every | found | {"version": 1, "method": method}
-
-
-@pytest.mark.parametrize("make", [cascade, paper, cnn])
-def test_a_file_of_version_1_is_read_with_a_line_and_written_as_version_2(make, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    old, new = tmp_path / "old.json", tmp_path / "new.json"
-    old.write_text(json.dumps(of_version_1(make())))
-    with pytest.warns(OldNameWarning, match="a detector file of format version 1") as caught:
-        detector = load_detector(old)
-    assert len(caught) == 1
-    assert "\n" not in str(caught[0].message)
-    if isinstance(detector, CnnDetector):
-        np.testing.assert_array_equal(
-            detector.network.weights["head"], random_network(0, FORMER_TOPOLOGY).weights["head"]
-        )
-    else:
-        assert detector.record == make()
-    detector.save(new)
-    assert json.loads(new.read_text())["version"] == 2
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert load_detector(new) == detector
-
-
-def test_what_version_1_kept_for_other_methods_is_dropped_but_no_unknown_key() -> None:
-    upgraded = upgrade_detector(of_version_1(paper()) | {"colour": "red"})
-    assert "proposer" not in upgraded
-    assert "layers" not in upgraded
-    assert upgraded["colour"] == "red"
-
-
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
@@ -238,10 +182,9 @@ def test_what_version_1_kept_for_other_methods_is_dropped_but_no_unknown_key() -
         ('{"kind": "other"}', "the file: unable to extract tag"),
         ('{"kind": "velfield-detector", "version": 2, "method": "yolo"}', "'cnn', 'cascade', 'paper'"),
         ('{"kind": "velfield-detector", "version": 3, "method": "paper"}', "paper.version"),
-        ('{"kind": "velfield-detector", "version": 1, "method": "aligned"}', "cascade.working_car_length_px"),
+        ('{"kind": "velfield-detector", "version": 1, "method": "paper"}', "paper.version"),
     ],
 )
-@pytest.mark.filterwarnings("ignore::velfield.errors.OldNameWarning")
 def test_another_file_is_one_clear_line(content: str, problem: str, tmp_path: Path) -> None:
     file = tmp_path / "detector.json"
     file.write_text(content)

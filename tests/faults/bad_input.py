@@ -231,7 +231,7 @@ def kinds(folder: Path) -> list[Kind]:
     def run_folder(path: Path) -> object:
         return read_flight_record(path.parent)
 
-    record = {"format_version": 2, "code_version": "0", "config": FlightConfig().model_dump(mode="json")}
+    record = {"format_version": 1, "code_version": "0", "config": FlightConfig().model_dump(mode="json")}
     source = {"path": "a", "kind": "folder", "digest": "d", "width": 9, "height": 9, "frame_count": 9}
     flight = json.dumps(record | {"inputs": {"source": source}, "keys": {}}).encode()
     return [

@@ -124,7 +124,7 @@ def _units_with(root: Path, names: Sequence[str]) -> set[str]:
     for stage in (*STAGE, PAGE):
         for record in read_commits(layout, stage):
             if set(record.outputs) & set(names) or whole & {Path(name).parts[0] for name in record.outputs}:
-                found.add(f"{layout.stored_name(stage)}/{record.unit}")
+                found.add(f"{stage}/{record.unit}")
     return found
 
 

@@ -32,18 +32,6 @@ def test_usage_is_status_2() -> None:
     assert velfield("fly").returncode == 2
 
 
-def test_an_old_option_works_for_this_release_with_a_line_that_gives_the_present_one(tmp_path: Path) -> None:
-    out = str(tmp_path / "out")
-    result = velfield("run", "none.mp4", "--out", out, "--slice", "15min", "--set", "registration.window_px=60")
-    lines = result.stderr.splitlines()
-    assert lines[0] == "velfield: --slice is now --intervals; the old name works until 0.3"
-    assert lines[1].startswith("velfield: --set: registration.window_px is now registration.match_search_px;")
-    assert "none.mp4" in lines[2]
-    both = velfield("run", "none.mp4", "--out", out, "--slice", "15min", "--intervals", "15min")
-    assert (both.returncode, "keep --intervals" in both.stderr) == (1, True)
-    assert "--slice" not in velfield("run", "--help").stdout
-
-
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [

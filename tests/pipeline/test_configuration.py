@@ -1,16 +1,14 @@
 """The configuration: which source overrides which, and the errors of wrong keys."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import permutations
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from schemas.detector import METHODS, CascadeConfig, CascadeTraining, CnnConfig, DetectorConfig, PaperConfig
 from schemas.flight import READ_WITH, FlightConfig
-from schemas.renames import OLD_KEYS, OLD_VALUES, REMOVED_KEYS, upgrade_config
-from velfield.errors import IneffectiveSettingWarning, InputError, OldNameWarning
+from velfield.errors import IneffectiveSettingWarning, InputError
 from velfield.pipeline.configuration import resolve_config
 
 
@@ -64,21 +62,6 @@ def test_a_key_of_another_method_is_refused_with_the_method_that_reads_it() -> N
         resolve_config(settings=["detection.cascade.round=100"])
 
 
-def test_a_section_of_format_1_is_read_by_its_method() -> None:
-    """It held the keys of all methods; those that its own read elsewhere, or not at all, are said."""
-    old = {"method": "network", "network_steps": 9, "rounds": 70, "folds": 3, "car_radius_px": 6.0, "seed": 4}
-    tree, lines = upgrade_config({"detection": old})
-    assert FlightConfig.model_validate(tree).detection == CnnConfig(
-        fine_tune_steps=9, cascade=CascadeTraining(rounds=70, folds=3), seed=4
-    )
-    assert "detection.car_radius_px is ignored: method cnn does not read it" in lines
-    assert any(line.startswith("detection.rounds is now detection.cascade.rounds") for line in lines)
-    tree, _ = upgrade_config({"detection": old | {"method": "dense"}})
-    assert FlightConfig.model_validate(tree).detection == PaperConfig(rounds=70, seed=4)
-    tree, _ = upgrade_config({"detection": old | {"method": "aligned"}})
-    assert FlightConfig.model_validate(tree).detection == CascadeConfig(rounds=70, folds=3, seed=4)
-
-
 def test_an_option_that_was_not_given_changes_nothing() -> None:
     assert resolve_config(overrides={"gsd_m": None, "frames.every": None}) == FlightConfig()
 
@@ -129,44 +112,6 @@ def test_a_file_that_is_not_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "present"),
-    [
-        ("registration.window_px=60", "registration.match_search_px=60"),
-        ("tracking.linking=links", "tracking.linking=pairwise"),
-        ("detection.network_steps=100", "detection.fine_tune_steps=100"),
-        ("detection.method=aligned", "detection.method=cascade"),
-        ("field.one_pixel_wide=true", "field.path_width=pixel"),
-        ("field.weigh_shared_segments=twice", "field.shared_segment_weight=2"),
-        ("field.slice=15min", "field.time_intervals=15min"),
-    ],
-)
-def test_an_old_name_is_read_with_a_warning_that_gives_the_present_one(old: str, present: str, tmp_path: Path) -> None:
-    with pytest.warns(OldNameWarning, match=present.partition("=")[0]) as caught:
-        from_setting = resolve_config(settings=[old])
-    assert len(caught) == 1
-    assert from_setting == resolve_config(settings=[present]) != resolve_config()
-    dotted, _, value = old.partition("=")
-    section, _, key = dotted.partition(".")
-    file = tmp_path / "flight.yaml"
-    file.write_text(f"{section}:\n  {key}: {value}\n")
-    with pytest.warns(OldNameWarning, match=str(file)):
-        assert resolve_config(file=file) == from_setting
-
-
-def test_an_old_key_warns_in_one_line() -> None:
-    with pytest.warns(OldNameWarning) as caught:
-        resolve_config(settings=["registration.window_px=60"])
-    assert str(caught[0].message) == (
-        "--set: registration.window_px is now registration.match_search_px; the old name works until 0.3"
-    )
-
-
-def test_a_removed_key_is_ignored_with_a_warning() -> None:
-    with pytest.warns(OldNameWarning, match="patch_width_px is ignored"):
-        assert resolve_config(settings=["tracking.patch_width_px=10"]) == resolve_config()
-
-
-@pytest.mark.parametrize(
     ("settings", "message"),
     [
         (
@@ -197,32 +142,3 @@ def test_what_decides_whether_a_key_is_read_is_a_key_and_its_values_are_valid() 
         resolve_config(overrides={other: values[0] for other, values in deciding.items()})
         section, name = key.split(".")
         assert name in type(getattr(FlightConfig(), section)).model_fields
-
-
-def test_an_old_and_a_present_name_of_one_parameter_are_refused() -> None:
-    settings = ["field.slice=15min", "field.time_intervals=15min"]
-    with pytest.raises(InputError, match=r"two names of one parameter; keep field\.time_intervals"):
-        resolve_config(settings=settings)
-
-
-def test_a_setting_by_its_present_name_overrides_the_old_name_in_the_file(tmp_path: Path) -> None:
-    file = tmp_path / "flight.yaml"
-    file.write_text("field: {by_time: true}\n")
-    with pytest.warns(OldNameWarning):
-        assert not resolve_config(file=file, settings=["field.time_weighted=false"]).field.time_weighted
-
-
-def dotted_keys(tree: dict[str, Any], prefix: str = "") -> Iterator[str]:
-    for name, value in tree.items():
-        yield prefix + name
-        if isinstance(value, dict):
-            yield from dotted_keys(value, f"{prefix}{name}.")
-
-
-def test_old_names_are_none_of_the_present_ones() -> None:
-    tree = FlightConfig().model_dump(mode="json")
-    present = set(dotted_keys(tree))
-    assert set(OLD_KEYS.values()) <= present
-    assert set(OLD_VALUES) <= present
-    assert not present & (set(OLD_KEYS) | set(REMOVED_KEYS))
-    assert upgrade_config(tree) == (tree, [])

@@ -10,7 +10,6 @@ Another one is a package ``velfield/detection/<method>`` whose module ``detector
 ``DetectorRecord``.
 """
 
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +23,6 @@ from pydantic import TypeAdapter, ValidationError
 
 from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
 from schemas.detector import (
-    DETECTOR_VERSION,
     METHODS,
     RECORDS,
     BaseRecord,
@@ -32,9 +30,8 @@ from schemas.detector import (
     DetectorRecord,
     PrecisionRecallCurve,
 )
-from schemas.renames import OLD_NAMES_UNTIL, upgrade_detector
 from velfield.detection.frame import SearchableFrame
-from velfield.errors import InputError, OldNameWarning, parse_json
+from velfield.errors import InputError, parse_json
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -384,14 +381,6 @@ def shipped_detector() -> Detector:
 def _parse(data: bytes, name: str) -> Detector:
     try:
         content = parse_json(data)
-        if isinstance(content, dict) and content.get("version") == 1:
-            content = upgrade_detector(content)
-            warnings.warn(
-                f"{name}: a detector file of format version 1, written now is version {DETECTOR_VERSION}; the old one "
-                f"is read until {OLD_NAMES_UNTIL}",
-                OldNameWarning,
-                stacklevel=3,
-            )
         return from_record(_RECORD.validate_python(content))
     except (ValueError, ValidationError) as error:
         raise InputError(

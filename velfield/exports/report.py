@@ -1,13 +1,10 @@
 """The report as one HTML file that holds all it shows, to send by mail."""
 
-import json
 from pathlib import Path
 
 from schemas.export import ExportOptions
-from schemas.records import FORMAT_VERSION
-from schemas.renames import upgrade_record
 from schemas.report import Report
-from velfield.errors import InputError, parse_json
+from velfield.errors import InputError
 from velfield.report.report import render_report
 from velfield.report.run_figures import report_figures
 from velfield.run.layout import RunLayout
@@ -29,9 +26,4 @@ def _read_report(layout: RunLayout) -> Report:
     path = layout.report_record
     if not path.exists():
         raise InputError(f"{path} is not there: the run was not finished, or an older velfield wrote it; run it again")
-    record = parse_json(path.read_bytes())
-    if layout.format_version != FORMAT_VERSION:
-        record = upgrade_record("report", record)
-        if record.get("detection"):
-            record["detection"] = upgrade_record("precision_recall", record["detection"])
-    return Report.model_validate_json(json.dumps(record))
+    return Report.model_validate_json(path.read_bytes())

@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from schemas.records import FORMAT_VERSION
 from velfield.analysis.changes import find_changes
 from velfield.exports.cog import write_cog
 from velfield.field.comparison import FDR_LEVEL, MIN_COUNT, Change, compare_fields
@@ -96,9 +95,9 @@ def _traffic_lines(before: Run, after: Run, out: Path) -> list[str]:
 
 
 def _show_in_the_viewer(changes: dict[str, Change], before: Path, run: Run) -> None:
-    """Write significant changes as layers of the later run's page, where it has one of the present format, in the units
+    """Write significant changes as layers of the later run's page, where it has one, in the units
     of its field."""
-    if run.layout.format_version != FORMAT_VERSION or not run.layout.view_record.exists():
+    if not run.layout.view_record.exists():
         return
     units = {"direction": "rad", "speed": "px s-1", "volume": "vehicles h-1"}
     layers = {

@@ -12,8 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from schemas.flight import PRESETS, READ_WITH, FlightConfig, Preset
 from schemas.model import load_yaml
-from schemas.renames import upgrade_config
-from velfield.errors import IneffectiveSettingWarning, InputError, OldNameWarning
+from velfield.errors import IneffectiveSettingWarning, InputError
 from velfield.sources.table import read_text
 
 Tree = dict[str, Any]
@@ -49,14 +48,14 @@ def resolve_config(
     >>> resolve_config(settings=["tracking.max_speed_m_per_s=20"]).tracking.max_speed_m_per_s
     20.0
     """
-    given = _present_names(_read(file), str(file)) if file else {}
+    given = _read(file) if file else {}
     asked: Tree = {}
     for setting in settings:
         key, equals, value = setting.partition("=")
         if not equals:
             raise InputError(f"--set {setting}: found no '='; expected section.key=value")
         _put(asked, key.strip(), _yaml(value, f"--set {setting}"))
-    given = _merge(given, _present_names(asked, "--set"))
+    given = _merge(given, asked)
     for dotted, override in (overrides or {}).items():
         if override is not None:
             _put(given, dotted, override)
@@ -95,17 +94,6 @@ def _read(file: Path) -> Tree:
         )
     # A section all of whose keys are commented out, as `velfield init` writes it, is null.
     return {key: value for key, value in tree.items() if value is not None or not section_models(key)}
-
-
-def _present_names(tree: Tree, what: str) -> Tree:
-    """The tree by the present names; a warning for each old one."""
-    try:
-        tree, messages = upgrade_config(tree)
-    except ValueError as error:
-        raise InputError(f"{what}: {error}") from None
-    for message in messages:
-        warnings.warn(f"{what}: {message}", OldNameWarning, stacklevel=3)
-    return tree
 
 
 def section_models(section: str) -> list[type[BaseModel]]:

@@ -11,7 +11,7 @@ from schemas.records import CommitRecord, FlightRecord
 from velfield.errors import InputError
 from velfield.pipeline.stage import STAGE, STAGES, Cut
 from velfield.pipeline.units import WHOLE
-from velfield.run.commits import ANALYSIS, PAGE, commit_path, digest_file, digest_input, read_commit, read_commits
+from velfield.run.commits import ANALYSIS, PAGE, commit_path, digest_file, read_commit, read_commits
 from velfield.run.layout import RunLayout, remove_tree
 from velfield.run.results import read_results
 from velfield.run.stores import is_of_creation
@@ -40,9 +40,9 @@ class Damage:
 
 def verify_run(layout: RunLayout, record: FlightRecord) -> list[Damage]:
     """Read all that is committed and compare it with its digests; units that were never finished are listed too."""
-    stages = [stage.name for stage in STAGES if not record.keys or stage.name in record.keys]  # format 1 had fewer
+    stages = [stage.name for stage in STAGES]
     by_stage = {stage: read_commits(layout, stage) for stage in stages}
-    besides = [record for name in _BESIDES for record in read_commits(layout, name)]  # of no earlier version
+    besides = [record for name in _BESIDES for record in read_commits(layout, name)]
     found = [damage for stage in (*stages, *_BESIDES) for damage in _damaged_records(layout, stage)]
     damaged = {(damage.stage, damage.unit) for damage in found}
     found += [damage for damage in _unfinished(by_stage) if (damage.stage, damage.unit) not in damaged]
@@ -55,7 +55,7 @@ def verify_run(layout: RunLayout, record: FlightRecord) -> list[Damage]:
 
 def _damaged_records(layout: RunLayout, stage: str) -> Iterator[Damage]:
     """Commit records that are there and cannot be read."""
-    for path in sorted((layout.commits / layout.stored_name(stage)).glob("*.json")):
+    for path in sorted((layout.commits / stage).glob("*.json")):
         if read_commit(layout, stage, path.stem) is None:
             yield Damage(stage, path.stem, path.relative_to(layout.root).as_posix(), "damaged")
 
@@ -73,7 +73,7 @@ def _check(layout: RunLayout, record: CommitRecord) -> list[Damage]:
     for name, digest in record.outputs.items():
         try:
             path = layout.root / name
-            whole = digest in (digest_file(path), digest_input(path))  # the latter of large files by earlier versions
+            whole = digest == digest_file(path)
         except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
             found.append(Damage(record.stage, record.unit, name, "gone"))
         else:

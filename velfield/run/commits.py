@@ -19,7 +19,6 @@ from typing import Any, BinaryIO
 from pydantic import BaseModel, ValidationError
 
 from schemas.records import FORMAT_VERSION, CommitRecord, SealedRecord
-from schemas.renames import upgrade_record
 from velfield.errors import parse_json
 from velfield.run.layout import RunLayout, is_remote
 
@@ -172,7 +171,7 @@ def sweep_partial(root: Path) -> int:
 
 def commit_path(layout: RunLayout, stage: str, unit: str) -> Path:
     """Path of the record of one unit."""
-    return layout.commits / layout.stored_name(stage) / f"{unit}.json"
+    return layout.commits / stage / f"{unit}.json"
 
 
 def write_commit(layout: RunLayout, record: CommitRecord) -> None:
@@ -204,17 +203,14 @@ def read_commit(layout: RunLayout, stage: str, unit: str) -> CommitRecord | None
     """The record of a unit; None where there is none or it is damaged."""
     path = commit_path(layout, stage, unit)
     try:
-        record = CommitRecord.model_validate_json(json.dumps(read_sealed(path.read_bytes())))
+        return CommitRecord.model_validate_json(json.dumps(read_sealed(path.read_bytes())))
     except (FileNotFoundError, ValidationError, ValueError):
         return None
-    if layout.format_version == FORMAT_VERSION:
-        return record
-    return record.model_copy(update={"stage": stage, "counts": upgrade_record("commit_counts", record.counts)})
 
 
 def read_commits(layout: RunLayout, stage: str) -> list[CommitRecord]:
     """The records of all finished units of a stage, by name."""
-    folder = layout.commits / layout.stored_name(stage)
+    folder = layout.commits / stage
     found = (read_commit(layout, stage, path.stem) for path in sorted(folder.glob("*.json")))
     return [record for record in found if record is not None]
 

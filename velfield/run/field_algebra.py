@@ -4,7 +4,6 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from schemas.records import FORMAT_VERSION
 from velfield.errors import InputError
 from velfield.field.accumulate import FieldTile
 from velfield.field.algebra import merge_tiles, subtract_tile
@@ -12,7 +11,7 @@ from velfield.field.segments import VelocityBins
 from velfield.run.commits import content_key, digest_file, write_atomically
 from velfield.run.field_reader import TileReader, tile_reader
 from velfield.run.field_writer import GroupWriter, create_field_store, tile_groups
-from velfield.run.flight_record import open_layout, read_flight_record
+from velfield.run.flight_record import read_flight_record
 from velfield.run.frame_transforms import read_grid, read_working
 from velfield.run.layout import RunLayout
 from velfield.run.stores import HISTOGRAM_TIME_WEIGHTED, FieldStore, open_field, store_key
@@ -80,8 +79,6 @@ def check_same_grid(first: Path, other: Path) -> None:
     for name in (*_SAME, *_SAME_GEOREFERENCE):
         if a.attributes.get(name) != b.attributes.get(name):
             raise InputError(_mismatch(first, other, name, a.attributes.get(name), b.attributes.get(name)))
-    if "velocity_variance_sum" not in a.layer_names() or "velocity_variance_sum" not in b.layer_names():
-        raise InputError(f"{first} or {other} was written by an older velfield: run the flight again")
     if not a.attributes.get("crs_wkt") and _base_digest(first) != _base_digest(other):
         raise InputError(
             f"{first} and {other} have different base images, and no coordinates to relate their pixels: "
@@ -121,7 +118,7 @@ def _write(
     observed_s: float,
     made_from: Mapping[str, object],
 ) -> None:
-    layout, first = RunLayout(out), open_layout(roots[0])
+    layout, first = RunLayout(out), RunLayout(roots[0])
     if out.exists() and any(out.iterdir()):
         raise InputError(f"--out {out} exists and holds files: give a new folder")
     record, grid = read_flight_record(roots[0]), read_grid(first)
@@ -147,7 +144,6 @@ def _write(
     bins = VelocityBins.from_config(config, grid.gsd_m)
     for group in tile_groups(grid, config):
         _write_group(GroupWriter(target, group, grid=grid, config=config, bins=bins), kinds, combine)
-    record = record.model_copy(update={"format_version": FORMAT_VERSION})
     write_atomically(layout.flight, record.model_dump_json(indent=1).encode())  # last: without it nothing is whole
 
 

@@ -76,8 +76,6 @@ def field_from_store(
     path, histogram = store.path, HISTOGRAM_TIME_WEIGHTED if time_weighted else HISTOGRAM
     if histogram not in store.histogram_names():
         raise InputError(f"{path} holds no {histogram}: run the flight again with --set field.time_weighted=true")
-    if "velocity_variance_sum" not in store.layer_names():
-        raise InputError(f"{path} was written by an older velfield and has no intervals: run the flight again")
     count = store.layer("count")
     read = tile_reader(store, histogram)
 

@@ -1,4 +1,4 @@
-"""``flight.json``: the resolved flight of a run folder, of the present format or of the one before."""
+"""``flight.json``: the resolved flight of a run folder, of the present format."""
 
 import json
 from pathlib import Path
@@ -6,8 +6,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from schemas.records import FORMAT_VERSION, READABLE_FORMATS, FlightRecord
-from schemas.renames import OLD_FOLDERS, upgrade_config
+from schemas.records import FORMAT_VERSION, FlightRecord
 from velfield.errors import InputError
 from velfield.run.commits import read_sealed
 from velfield.run.layout import RunLayout, check_store, is_remote
@@ -25,28 +24,23 @@ def suggest_run(root: Path) -> str:
 
 
 def read_flight_record(root: Path) -> FlightRecord:
-    """The flight of a run folder by the present names; ``format_version`` is that of the folder.
+    """The flight of a run folder.
 
     Raises
     ------
     InputError
-        The folder is not a run folder, or one of a format that is not read.
+        The folder is not a run folder, or one of another format.
     """
     layout = RunLayout(root)
     if not layout.flight.exists():
         raise InputError(f"{root} is not a run folder: it has no flight.json; {suggest_run(root)}")
     record = _parse(layout.flight)
     version = record.get("format_version")
-    if version not in READABLE_FORMATS:
-        known = " and ".join(map(str, READABLE_FORMATS))
-        raise InputError(
-            f"{root} is a run folder of format {version}, this velfield reads formats {known}; "
-            "run the flight again into a new folder"
-        )
     if version != FORMAT_VERSION:
-        stages = {old: stage for stage, old in OLD_FOLDERS.items()}
-        record["config"], _ = upgrade_config(record["config"])
-        record["keys"] = {stages.get(name, name): key for name, key in record.get("keys", {}).items()}
+        raise InputError(
+            f"{root} is a run folder of format {version}, this velfield reads format {FORMAT_VERSION}; run the flight "
+            "again into a new folder"
+        )
     try:
         return FlightRecord.model_validate_json(json.dumps(record))
     except ValidationError as error:
@@ -55,11 +49,6 @@ def read_flight_record(root: Path) -> FlightRecord:
             f"{layout.flight}: found {'.'.join(map(str, first['loc']))} that is not of this version of velfield "
             f"({first['msg'].lower()}); run the flight again with the same command"
         ) from None
-
-
-def open_layout(root: Path) -> RunLayout:
-    """Paths of a run folder of any format that is read."""
-    return RunLayout(root, read_flight_record(root).format_version)
 
 
 def check_format(root: Path) -> None:
@@ -81,10 +70,9 @@ def check_format(root: Path) -> None:
         return
     if version == FORMAT_VERSION:
         return
-    reading = "`velfield.open_run` reads it, " if version in READABLE_FORMATS else ""
     raise InputError(
-        f"{root} is a run folder of format {version}; {reading}this velfield continues runs of format "
-        f"{FORMAT_VERSION} only: give another --out"
+        f"{root} is a run folder of format {version}; this velfield continues runs of format {FORMAT_VERSION} only: "
+        "give another --out"
     )
 
 

@@ -19,16 +19,14 @@ from schemas.camera import CameraRecord, PolynomialLensRecord
 from schemas.flight import FlightConfig, FramesConfig, RegistrationConfig
 from schemas.georeference import GeoreferenceRecord
 from schemas.records import (
-    FORMAT_VERSION,
     GridRecord,
     OwnToBaseRecord,
     PolyprojectiveRecord,
     RebaseRecord,
     WorkingRecord,
 )
-from schemas.renames import upgrade_record
 from velfield.camera.lens import Lens, lens_from_record
-from velfield.errors import InputError, parse_json
+from velfield.errors import InputError
 from velfield.registration.base_mesh import BaseMesh
 from velfield.registration.mesh import Support, sample_cells
 from velfield.registration.transforms import (
@@ -55,7 +53,7 @@ def read_grid(layout: RunLayout) -> GridRecord:
     """
     if not layout.grid.exists():
         raise InputError(f"{layout.grid} is not there: run `velfield run` on this folder first")
-    grid = _parse_grid(layout.grid.read_bytes(), layout.format_version)
+    grid = _parse_grid(layout.grid.read_bytes())
     record = read_georeference(layout)
     return grid if record is None else _apply_georeference(grid, record)
 
@@ -79,7 +77,7 @@ def read_tracking_gsd(layout: RunLayout) -> float | None:
 
 def read_own_grid(layout: RunLayout) -> GridRecord:
     """``base/grid.json`` alone: what the base image itself gives."""
-    return _parse_grid(layout.grid.read_bytes(), layout.format_version)
+    return _parse_grid(layout.grid.read_bytes())
 
 
 def read_georeference(layout: RunLayout) -> GeoreferenceRecord | None:
@@ -126,10 +124,7 @@ def read_working(layout: RunLayout) -> WorkingRecord:
     """
     if not layout.working.exists():
         raise InputError(f"{layout.working} is not there: run `velfield run` on this folder first")
-    data = layout.working.read_bytes()
-    if layout.format_version == FORMAT_VERSION:
-        return WorkingRecord.model_validate_json(data)
-    return WorkingRecord.model_validate(upgrade_record("working", parse_json(data)))
+    return WorkingRecord.model_validate_json(layout.working.read_bytes())
 
 
 def read_base_image(layout: RunLayout, config: FramesConfig) -> GreyImage:
@@ -163,10 +158,8 @@ def heading_deg(direction_rad: FloatArray, north_rad: float | None) -> FloatArra
 
 
 @lru_cache(maxsize=8)
-def _parse_grid(data: bytes, format_version: int) -> GridRecord:
-    if format_version == FORMAT_VERSION:
-        return GridRecord.model_validate_json(data)
-    return GridRecord.model_validate(upgrade_record("grid", parse_json(data)))
+def _parse_grid(data: bytes) -> GridRecord:
+    return GridRecord.model_validate_json(data)
 
 
 def read_lens(layout: RunLayout) -> Lens:

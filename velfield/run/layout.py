@@ -15,8 +15,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeGuard, cast
 
-from schemas.records import FORMAT_VERSION
-from schemas.renames import OLD_FOLDERS
 from velfield.errors import InputError
 
 if TYPE_CHECKING:
@@ -133,21 +131,9 @@ class RunLayout:
     """
 
     root: Path
-    format_version: int = FORMAT_VERSION
-    """Of the folder: in format 1 some folders have other names (`schemas.renames.OLD_FOLDERS`)."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "root", to_path(self.root))
-
-    def stored_name(self, name: str) -> str:
-        """The name that this folder's format has for a stage or a folder.
-
-        Examples
-        --------
-        >>> RunLayout(Path("RUN")).stored_name("tracks"), RunLayout(Path("RUN"), 1).stored_name("tracks")
-        ('tracks', 'tracklets')
-        """
-        return name if self.format_version == FORMAT_VERSION else OLD_FOLDERS.get(name, name)
 
     @property
     def flight(self) -> Path:
@@ -271,12 +257,12 @@ class RunLayout:
     @property
     def tracklets(self) -> Path:
         """Tracklets by unit, before those that share detections are chained into tracks."""
-        return self.root / self.stored_name("tracklets")
+        return self.root / "tracklets"
 
     @property
     def tracks(self) -> Path:
         """Tracklets by unit, each with the track of the vehicle that it belongs to."""
-        return self.root / self.stored_name("tracks")
+        return self.root / "tracks"
 
     @property
     def field(self) -> Path:
@@ -285,7 +271,7 @@ class RunLayout:
     @property
     def intervals(self) -> Path:
         """Fields of time intervals, a store each."""
-        return self.root / self.stored_name("intervals")
+        return self.root / "intervals"
 
     @property
     def maps(self) -> Path:

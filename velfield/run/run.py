@@ -1,6 +1,5 @@
 """`open_run`: one object over a run folder, the Python side of the contract of outputs."""
 
-import warnings
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, GreyImage, Mask, Points
 from schemas.georeference import FlightStart
-from schemas.records import FORMAT_VERSION, FlightRecord, GridRecord
+from schemas.records import FlightRecord, GridRecord
 from schemas.tables import (
     DETECTION_COLUMNS,
     DIMENSION_COLUMNS,
@@ -23,7 +22,7 @@ from schemas.tables import (
 from velfield.analysis.crossings import find_crossings, hysteresis_px
 from velfield.analysis.vehicle_classes import add_dimensions
 from velfield.analysis.vehicles import VEHICLE_COLUMNS, find_vehicles
-from velfield.errors import InputError, OldNameWarning
+from velfield.errors import InputError
 from velfield.field.segments import SEGMENT_COLUMNS, Segments, require_gsd_m, segment_table
 from velfield.field.view import VelocityField
 from velfield.registration.warp import warp_to_base
@@ -33,25 +32,22 @@ from velfield.run.flight_record import read_flight_record
 from velfield.run.frame_transforms import FrameTransforms, read_base_image, read_georeference, read_grid
 from velfield.run.layout import RunLayout, to_path
 from velfield.run.stores import FrameStore, RegistrationStore, open_field, open_frames, open_registration
-from velfield.run.tables import conform, read_tables, read_track_tables
+from velfield.run.tables import read_tables
 
 _EACH_ONCE = {"shared_segment_weight": 1}
 """The preset `paper` weights segments that two tracklets share twice; counting vehicles does not."""
 
 
 def open_run(root: str | Path) -> "Run":
-    """Open a run folder for reading. One of format 1 is read by the present names, with a warning.
+    """Open a run folder for reading.
 
     Raises
     ------
     InputError
-        The folder is not a run folder, or one of a format that is not read.
+        The folder is not a run folder, or one of another format.
     """
     record = read_flight_record(to_path(root))
-    if record.format_version != FORMAT_VERSION:
-        message = f"{root} is a run folder of format {record.format_version}, read by the names of {FORMAT_VERSION}"
-        warnings.warn(message, OldNameWarning, stacklevel=2)
-    return Run(RunLayout(to_path(root), record.format_version), record)
+    return Run(RunLayout(to_path(root)), record)
 
 
 class Run:
@@ -194,30 +190,18 @@ class Run:
         return read_tables(sorted(self.layout.detections.glob("unit-*.parquet")), DETECTION_COLUMNS)
 
     def tracklets(self) -> pd.DataFrame:
-        """All tracklets, in base pixels: the columns of ``schemas.tables.TRACK_COLUMNS``.
-
-        ``passage_id`` is deprecated: the old name of ``track_id``, with the same values.
-        """
+        """All tracklets, in base pixels: the columns of ``schemas.tables.TRACK_COLUMNS``."""
         self.require_frames()
-        paths = sorted(self.layout.tracks.glob("unit-*.parquet"))
-        if self.layout.format_version == FORMAT_VERSION:
-            return read_track_tables(paths, TRACK_COLUMNS)
-        stored = {name: kind for name, kind in TRACK_COLUMNS.items() if name != "track_id"}
-        table = read_track_tables(paths, stored)
-        return conform(table.assign(track_id=table["passage_id"]), TRACK_COLUMNS)
+        return read_tables(sorted(self.layout.tracks.glob("unit-*.parquet")), TRACK_COLUMNS)
 
     def _tracklet_columns(self, names: Sequence[str]) -> pd.DataFrame:
         """Some columns of all tracklets: all of them are much, of a long flight."""
         self.require_frames()
-        if self.layout.format_version != FORMAT_VERSION:
-            return self.tracklets()[list(names)]
         return read_tables(sorted(self.layout.tracks.glob("unit-*.parquet")), TRACK_COLUMNS, only=list(names))
 
     def vehicles(self) -> pd.DataFrame:
         """One row a track: when and where, its length, width and class, and whether it moves, waits in a lane or is
         parked: `find_vehicles`, `add_dimensions`.
-
-        Of a run by an earlier release, which measured no vehicles, dimensions are NaN.
         """
         gsd_m = self.grid.gsd_m
         tracklets, paths = (
@@ -235,18 +219,14 @@ class Run:
     def track_positions(self) -> pd.DataFrame:
         """Where each track's vehicle was in each registered frame: ``schemas.tables.TRACK_POSITION_COLUMNS``.
 
-        ``source`` distinguishes what is seen from what is inferred, by name (``POSITION_SOURCES``). Empty of a run by
-        an earlier release.
+        ``source`` distinguishes what is seen from what is inferred, by name (``POSITION_SOURCES``).
         """
         self.require_frames()
         table = read_tables(sorted(self.layout.track_positions.glob("unit-*.parquet")), TRACK_POSITION_COLUMNS)
         return table.assign(source=pd.Categorical.from_codes(table["source"], pd.Index(POSITION_SOURCES)))
 
     def joins(self) -> pd.DataFrame:
-        """Joins of tracks over gaps, each with the probability that it is right: ``schemas.tables.JOIN_COLUMNS``.
-
-        Empty of a run by an earlier release.
-        """
+        """Joins of tracks over gaps, each with the probability that it is right: ``schemas.tables.JOIN_COLUMNS``."""
         return read_tables([self.layout.joins] if self.layout.joins.exists() else [], JOIN_COLUMNS)
 
     def segments(self) -> Segments:

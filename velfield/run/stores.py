@@ -21,14 +21,13 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray
 from schemas.records import FORMAT_VERSION
-from schemas.renames import OLD_ARRAYS, OLD_ATTRIBUTES, OLD_WEIGHTS
 from velfield.errors import InputError, StoreError
 from velfield.run.layout import is_remote
 
 _ZSTANDARD = ZstdCodec(level=1, checksum=True)
 _STATUS_BYTES = 160
 _FORMAT_KEY = "format_version"
-"""Attribute of a store that names its format; stores of format 1 have none."""
+"""Attribute of a store that names its format; """
 HISTOGRAM = "velocity_histogram"
 HISTOGRAM_TIME_WEIGHTED = "velocity_histogram_time_weighted"
 HISTOGRAMS: dict[str, dict[str, str]] = {HISTOGRAM: {"long_name": "velocity histogram", "units": "1"}}
@@ -62,46 +61,26 @@ def _location(path: Path) -> dict[str, Any]:
     return {"store": path}
 
 
-def _present_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Attributes of a store of format 1 by the present names."""
-    names = {old: name for name, old in OLD_ATTRIBUTES.items()}
-    weights = {old: weight for weight, old in OLD_WEIGHTS.items()}
-    present = {names.get(name, name): value for name, value in attributes.items()}
-    if "weighted_by" in present:
-        present["weighted_by"] = weights.get(present["weighted_by"], present["weighted_by"])
-    return present
-
-
 class _Group:
-    """A group, opened, whose arrays are opened once: on S3 each opening is a request or two.
-
-    Arrays are named as in the present format; those of a store of format 1 are found by their old names.
-    """
+    """A group, opened, whose arrays are opened once: on S3 each opening is a request or two."""
 
     def __init__(self, group: zarr.Group) -> None:
         self._group = group
         self._arrays: dict[str, zarr.Array[Any]] = {}
-        self._old = _FORMAT_KEY not in group.attrs
 
     @property
     def attrs(self) -> Mapping[str, Any]:
-        attributes: dict[str, Any] = dict(self._group.attrs)
-        return _present_attributes(attributes) if self._old else attributes
+        return dict(self._group.attrs)
 
     def __getitem__(self, name: str) -> zarr.Array[Any]:
         if name not in self._arrays:
-            self._arrays[name] = cast("zarr.Array[Any]", self._group[self.stored_name(name)])
+            self._arrays[name] = cast("zarr.Array[Any]", self._group[name])
         return self._arrays[name]
-
-    def stored_name(self, name: str) -> str:
-        """The name that the store has for an array."""
-        return OLD_ARRAYS.get(name, name) if self._old else name
 
     @cached_property
     def by_axes(self) -> dict[int, list[str]]:
         """Names of the arrays by their number of axes, sorted."""
-        present = {old: name for name, old in OLD_ARRAYS.items()} if self._old else {}
-        self._arrays |= {present.get(name, name): array for name, array in self._group.arrays()}
+        self._arrays |= dict(self._group.arrays())
         names: dict[int, list[str]] = {}
         for name in sorted(self._arrays):
             names.setdefault(self._arrays[name].ndim, []).append(name)
@@ -158,8 +137,10 @@ def store_key(path: Path) -> str | None:
 
 
 def is_cut_as(path: Path, key: str, unit_frames: int) -> bool:
-    """Whether a store was created under a key, for units of so many frames: earlier releases cut others, and units that
-    share a chunk would overwrite each other's rows."""
+    """Whether a store was created under a key, for units of so many frames.
+
+    Units that share a chunk would overwrite each other's rows.
+    """
     if store_key(path) != key:
         return False
     group = zarr.open_group(**_location(path), mode="r", zarr_format=3, use_consolidated=False)
@@ -353,15 +334,13 @@ class RegistrationStore:
         stored none the last is the hold-out error in coarser cells, which is larger.
         """
         _check_column(self.path, name, (*REGISTRATION_COLUMNS, "vector", *_CELL_ARRAYS))
-        if name == "position_sd_px" and name not in self.group.by_axes.get(3, ()):
-            name = "error_px"
         return _read(self.path, self.group, name, slice(start, stop))
 
     def files(self, start: int) -> list[Path]:
         """Files that hold the unit from frame ``start`` on, and the store's metadata."""
         unit = start // int(self.group["vector"].chunks[0])
         tables = [self.path / name / "c" / str(unit) / "0" for name in ("vector", "status")]
-        columns = [self.path / self.group.stored_name(name) / "c" / str(unit) for name in REGISTRATION_COLUMNS]
+        columns = [self.path / name / "c" / str(unit) for name in REGISTRATION_COLUMNS]
         cells = [self.path / name / "c" / str(unit) / "0" / "0" for name in _CELL_ARRAYS]
         return [*_metadata(self.path), *_existing([*tables, *columns, *cells])]
 
@@ -499,7 +478,7 @@ class FieldStore:
 
     def has_tile(self, row: int, column: int, name: str = HISTOGRAM) -> bool:
         """Whether the tile's chunk exists."""
-        return (self.path / self.group.stored_name(name) / "c" / str(row) / str(column) / "0" / "0").exists()
+        return (self.path / name / "c" / str(row) / str(column) / "0" / "0").exists()
 
     def read_tile(self, row: int, column: int, name: str = HISTOGRAM) -> NDArray[np.int32]:
         """One tile of a histogram, (ty, tx, nvy, nvx) int32; clipped at the border.
@@ -526,9 +505,8 @@ class FieldStore:
     def files(self, tiles: Iterable[tuple[int, int]], group: tuple[int, int]) -> list[Path]:
         """Files that hold the tiles (row, column) and the layers of one group; and the store's metadata."""
         chunks = [Path("c", str(row), str(column), "0", "0") for row, column in tiles]
-        stored = self.group.stored_name
-        histogram = [self.path / stored(name) / chunk for name in self.histogram_names() for chunk in chunks]
-        layers = [self.path / stored(name) / "c" / str(group[0]) / str(group[1]) for name in self.layer_names()]
+        histogram = [self.path / name / chunk for name in self.histogram_names() for chunk in chunks]
+        layers = [self.path / name / "c" / str(group[0]) / str(group[1]) for name in self.layer_names()]
         axes = [self.path / name / "c" / "0" for name in self.group.by_axes.get(1, ())]
         return [*_metadata(self.path), *_existing([*histogram, *layers, *axes])]
 
@@ -547,10 +525,7 @@ class FieldStore:
 
     def stored_chunks(self, name: str) -> list[tuple[int, int]]:
         """(row, column) of the stored chunks of an array; those of only the fill value are not stored."""
-        return sorted(
-            (int(path.parent.name), int(path.name))
-            for path in (self.path / self.group.stored_name(name) / "c").glob("*/*")
-        )
+        return sorted((int(path.parent.name), int(path.name)) for path in (self.path / name / "c").glob("*/*"))
 
 
 def open_field(path: Path, mode: str = "r") -> FieldStore:

@@ -50,19 +50,8 @@ def write_table(path: Path, table: pd.DataFrame, columns: Mapping[str, str]) -> 
 
 
 def write_tracks(path: Path, tracklets: pd.DataFrame) -> None:
-    """Write one part of the tracks: tracklets, whose deprecated ``passage_id`` is their ``track_id``.
-
-    They are ``recovered`` where the table says so.
-    """
-    recovered = tracklets.get("recovered", False)
-    write_table(path, tracklets.assign(passage_id=tracklets["track_id"], recovered=recovered), TRACK_COLUMNS)
-
-
-def read_track_tables(paths: Sequence[Path], columns: Mapping[str, str]) -> pd.DataFrame:
-    """Parts of the tracks; of a run by an earlier release nothing is ``recovered``."""
-    parts = [pd.read_parquet(io.BytesIO(path.read_bytes())) for path in paths]
-    parts = [part if "recovered" in part else part.assign(recovered=False) for part in parts if len(part)]
-    return conform(pd.concat(parts, ignore_index=True), columns) if parts else empty_table(columns)
+    """Write one part of the tracks: tracklets with their ``track_id``, ``recovered`` where the table says so."""
+    write_table(path, tracklets.assign(recovered=tracklets.get("recovered", False)), TRACK_COLUMNS)
 
 
 def link_file(source: Path, target: Path) -> Path:

@@ -44,7 +44,7 @@ from velfield.run.frame_transforms import (
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run
 from velfield.run.stores import open_registration
-from velfield.run.tables import link_file, read_tables, read_track_tables, write_table, write_tracks
+from velfield.run.tables import link_file, read_tables, write_table, write_tracks
 from velfield.sources.frames import SourceInfo
 from velfield.sources.geo import BaseRaster, read_base_raster
 from velfield.sources.scale import choose_scale
@@ -210,7 +210,7 @@ def rebase_detections(plan: Plan, frames: range, rebase: Rebase) -> StageResult:
     written, counts = [], {"frames": 0.0, "cars": 0.0}
     for source, target in ((old.detections, layout.detections), (old.weak_detections, layout.weak_detections)):
         path = layout.unit_file(source, unit, ".parquet")
-        if path.exists():  # of a run by an earlier release there are no weak candidates
+        if path.exists():
             table = map_detections(read_tables([path], DETECTION_COLUMNS), transform)
             write_table(target / path.name, table, DETECTION_COLUMNS)
             patches = path.with_suffix(".patches.npz")
@@ -225,7 +225,7 @@ def rebase_tracks(plan: Plan, rebase: Rebase) -> StageResult:
     """Map all tracklets, unit by unit."""
     transform, written, tracks, count = polyprojective_from_record(rebase.record.transform), [], set[int](), 0
     for source in sorted(rebase.old.tracks.glob("unit-*.parquet")):
-        table = map_tracklets(read_track_tables([source], TRACKLET_COLUMNS | {"recovered": "bool"}), transform)
+        table = map_tracklets(read_tables([source], TRACKLET_COLUMNS | {"recovered": "bool"}), transform)
         written.append(plan.layout.tracks / source.name)
         write_tracks(written[-1], table)
         tracks.update(table["track_id"].unique().tolist())

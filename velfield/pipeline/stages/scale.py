@@ -25,7 +25,7 @@ from velfield.pipeline.stages.georeference import (
 )
 from velfield.run.frame_transforms import read_first_georeference, read_own_grid, read_tracking_gsd
 from velfield.run.layout import RunLayout
-from velfield.run.tables import read_tables, read_track_tables
+from velfield.run.tables import read_tables
 
 _OTHER_LIMITS = 0.25
 """Where the limits of tracking were for a scale that differs by more than this fraction, vehicles may be missed."""
@@ -85,7 +85,7 @@ def _check_times(plan: Plan, record: GeoreferenceRecord) -> tuple[list[str], lis
         size += path.stat().st_size
         if size > _CHECKED_BYTES:
             break
-    check = check_times(moving(from_tracklets(read_track_tables(paths, TRACK_COLUMNS), used.gsd_m)))
+    check = check_times(moving(from_tracklets(read_tables(paths, TRACK_COLUMNS), used.gsd_m)))
     given = f"--fps {fps:g}" if fps else "--timestamps" if plan.job.inputs.timestamps else None
     if not check.known:
         short = f"{check.vehicles} vehicles set off or stop, {MIN_VEHICLES} are needed to check them"
