@@ -19,7 +19,7 @@ from velfield.exports.figures import resized_map
 from velfield.field.segments import Segments, stationary_speed_px_per_s
 from velfield.report.colours import ramp_colours
 from velfield.report.figures import MapScale, colour_scale_max, round_up
-from velfield.report.panel import Legend, draw_bar_panel
+from velfield.report.panel import Legend, legend_panel
 from velfield.run.run import Run
 
 FILE_NAME = "video.mp4"
@@ -126,10 +126,9 @@ class _Scene:
         scale = MapScale(gsd_m=run.grid.gsd_m, unit=options.unit, north_rad=shown.scale.north_rad)
         top = round_up(colour_scale_max(scale.shown_speed(speed)) or 10.0)
         note = "Boxes: vehicles, at their speed; grey: parked. Lanes, paler: the speed of most vehicles."
-        legend = Legend(f"Speed, {scale.shown_unit}", note)
-        panel = draw_bar_panel(
-            shown.grey.shape, legend, top=top, gsd_m=shown.scale.gsd_m, north_rad=shown.scale.north_rad
-        )
+        title = f"Speed, {scale.shown_unit}"
+        legend = Legend(title, note, "speed", top, shown.scale.gsd_m, shown.scale.north_rad)
+        panel = legend_panel(shown.grey.shape, legend)
         per_px_per_s = float(scale.shown_speed(np.ones(1))[0])
         return cls(
             scale=width / run.grid.width_px,

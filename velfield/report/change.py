@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from schemas.arrays import GreyImage, RGBImage
 from velfield.report.colours import change_colours
-from velfield.report.figures import MapScale, blend_over_image, round_up
-from velfield.report.panel import Legend, draw_bar_panel
+from velfield.report.figures import MapScale, beside, blend_over_image, round_up
+from velfield.report.panel import Legend
 
 
 def change_figure(grey: GreyImage, change: NDArray[np.floating], scale: MapScale, *, title: str) -> RGBImage:
@@ -34,6 +34,5 @@ def change_figure(grey: GreyImage, change: NDArray[np.floating], scale: MapScale
     known = np.isfinite(change)
     top = round_up(float(np.percentile(np.abs(change[known]), 99))) if known.any() else 10.0
     image = blend_over_image(grey, change, change_colours(change / top))
-    legend = Legend(title, "After minus before, where significant. Bare grey: no significant change.")
-    panel = draw_bar_panel(grey.shape, legend, top=top, gsd_m=scale.gsd_m, north_rad=scale.north_rad, changes=True)
-    return np.hstack([image, panel])
+    note = "After minus before, where significant. Bare grey: no significant change."
+    return beside(image, Legend(title, note, "change", top, scale.gsd_m, scale.north_rad))

@@ -1,16 +1,17 @@
 """The field's two figures over the dimmed base image (paper: velocity field): direction as hue, speed as colour."""
 
-from dataclasses import dataclass
+import io
+from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from schemas.arrays import FloatArray, GreyImage, Mask, RGBImage
 from schemas.export import SpeedUnit
 from velfield.errors import InputError
 from velfield.report.colours import direction_colours, ramp_colours
-from velfield.report.panel import Legend, draw_bar_panel, draw_wheel_panel
+from velfield.report.panel import Legend, legend_panel
 
 PER_M_PER_S: dict[SpeedUnit, float] = {"km/h": 3.6, "mph": 2.2369362920544, "m/s": 1.0}
 """Units in one metre a second; px/s is not metric."""
@@ -52,6 +53,13 @@ class MapScale:
         return speed * self.gsd_m * PER_M_PER_S[self.unit]
 
 
+def direction_map(grey: GreyImage, direction_rad: NDArray[np.floating], scale: MapScale) -> tuple[RGBImage, Legend]:
+    """The modal direction as hue over the base image, (h, w, 3), and its legend; parameters as `direction_figure`."""
+    image = blend_over_image(grey, direction_rad, direction_colours(direction_rad))
+    note = "Hue: the direction of most vehicles. Bare grey: none, or stationary."
+    return image, Legend("Direction of travel", note, "direction", gsd_m=scale.gsd_m, north_rad=scale.north_rad)
+
+
 def direction_figure(grey: GreyImage, direction_rad: NDArray[np.floating], scale: MapScale) -> RGBImage:
     """The modal direction as hue, with a colour wheel beside it.
 
@@ -74,10 +82,22 @@ def direction_figure(grey: GreyImage, direction_rad: NDArray[np.floating], scale
     InputError
         Where the shapes differ.
     """
-    _same_shape(grey, direction_rad)
-    image = _blend(grey, direction_colours(direction_rad), ~np.isnan(direction_rad))
-    legend = Legend("Direction of travel", "Hue: the direction of most vehicles. Bare grey: none, or stationary.")
-    return np.hstack([image, draw_wheel_panel(grey.shape, legend, gsd_m=scale.gsd_m, north_rad=scale.north_rad)])
+    return beside(*direction_map(grey, direction_rad, scale))
+
+
+def speed_map(
+    grey: GreyImage, speed_px_per_s: NDArray[np.floating], scale: MapScale, *, top: float | None = None
+) -> tuple[RGBImage, Legend]:
+    """The modal speed as colour over the base image, (h, w, 3), and its legend; parameters as in `speed_figure`."""
+    shown = scale.shown_speed(speed_px_per_s)
+    top = top or round_up(colour_scale_max(shown) or 10.0)
+    image = blend_over_image(grey, shown, ramp_colours(shown / top))
+    note = "Colour: the speed of most vehicles. Bare grey: no vehicles."
+    maximum = float(np.nanmax(shown, initial=0.0))
+    if maximum > top:
+        note += f" Speeds above {top:g} have the last colour; the maximum is {maximum:.3g}."
+    title = f"Speed, {scale.shown_unit}"
+    return image, Legend(title, note, "speed", top, scale.gsd_m, scale.north_rad)
 
 
 def speed_figure(
@@ -99,20 +119,13 @@ def speed_figure(
     bar_gsd_m
         Metres a pixel of the figure, for the scale bar, where it is not drawn at base resolution.
     """
-    _same_shape(grey, speed_px_per_s)
-    shown = scale.shown_speed(speed_px_per_s)
-    if top is None:
-        highest = colour_scale_max(shown)
-        top = 10.0 if highest is None else round_up(highest)
-    image = _blend(grey, ramp_colours(shown / top), np.isfinite(shown))
-    note = "Colour: the speed of most vehicles. Bare grey: no vehicles."
-    maximum = float(np.nanmax(shown, initial=0.0))
-    if maximum > top:
-        note += f" Speeds above {top:g} have the last colour; the maximum is {maximum:.3g}."
-    legend = Legend(f"Speed, {scale.shown_unit}", note)
-    gsd_m = scale.gsd_m if bar_gsd_m is None else bar_gsd_m
-    panel = draw_bar_panel(grey.shape, legend, top=top, gsd_m=gsd_m, north_rad=scale.north_rad)
-    return np.hstack([image, panel])
+    image, legend = speed_map(grey, speed_px_per_s, scale, top=top)
+    return beside(image, legend if bar_gsd_m is None else replace(legend, gsd_m=bar_gsd_m))
+
+
+def beside(image: RGBImage, legend: Legend) -> RGBImage:
+    """A map with its legend to the right of it."""
+    return np.hstack([image, legend_panel(image.shape, legend)])
 
 
 def colour_scale_max(speed: NDArray[np.floating]) -> float | None:
@@ -139,27 +152,23 @@ def round_up(value: float) -> float:
     return float(10 * power)
 
 
-def png_bytes(rgb: RGBImage) -> bytes:
+def png_bytes(image: NDArray[np.uint8]) -> bytes:
     """An RGB, RGBA or grey image as PNG."""
-    if rgb.ndim == 2:
-        order = rgb
-    else:
-        order = cv2.cvtColor(rgb, cv2.COLOR_RGBA2BGRA if rgb.shape[2] == 4 else cv2.COLOR_RGB2BGR)
-    done, data = cv2.imencode(".png", order)
-    if not done:
-        raise ValueError(f"no PNG can be made of an array of shape {rgb.shape} and type {rgb.dtype}")
-    return bytes(data)
+    return _saved(Image.fromarray(image), "PNG", compress_level=2)
 
 
 def jpeg_bytes(rgb: RGBImage, *, quality: int = 88, max_side: int | None = None) -> bytes:
     """An RGB image as JPEG, reduced so that no side is longer than ``max_side``: for small pages."""
-    if max_side is not None and max(rgb.shape[:2]) > max_side:
-        factor = max_side / max(rgb.shape[:2])
-        rgb = np.asarray(cv2.resize(rgb, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)
-    done, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
-    if not done:
-        raise ValueError(f"no JPEG can be made of an array of shape {rgb.shape} and type {rgb.dtype}")
-    return bytes(data)
+    image = Image.fromarray(rgb)
+    if max_side is not None:
+        image.thumbnail((max_side, max_side), Image.Resampling.BOX)
+    return _saved(image, "JPEG", quality=quality)
+
+
+def _saved(image: Image.Image, kind: str, **options: int) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, kind, **options)
+    return buffer.getvalue()
 
 
 def blend_over_image(grey: GreyImage, values: NDArray[np.floating], colours: RGBImage) -> RGBImage:

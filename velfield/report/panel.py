@@ -1,166 +1,150 @@
-"""The legend beside a map: colour wheel or bar, north, scale bar. Drawn with Pillow at the map's height."""
+"""The legend of a map: colour wheel or bar, north, scale bar; beside the map's pixels, or on a sheet."""
 
+import textwrap
 from dataclasses import dataclass
 from math import cos, pi, sin
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
 
 from schemas.arrays import FloatArray, RGBImage
 from velfield.report.colours import change_colours, direction_colours, ramp_colours
+from velfield.report.drawing import POINTS_PER_INCH, figure_pixels, new_figure
 
-_BACKGROUND = (18, 21, 26)
-_TEXT, _FAINT = (240, 242, 245), (168, 175, 184)
-_SUPERSAMPLING = 3  # supersampling of the drawing, for smooth edges
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+WIDTH_EM = 11.5
+"""Width of a legend in letter heights."""
+_DARK, _LIGHT = ("#12151a", "#f0f2f5", "#a8afb8"), ("#ffffff", "#14161a", "#58616b")
+"""Background, text, and text of less weight."""
+_LETTER_EM = 0.6
 
 
 @dataclass(frozen=True)
 class Legend:
-    """Texts of a legend."""
+    """A legend's content.
+
+    Attributes
+    ----------
+    colours
+        Which scale: a wheel of directions, a bar of speeds from 0 to ``top``, or one of changes from ``-top``.
+    gsd_m
+        Metres a pixel of the map; None: the scale bar is in pixels.
+    north_rad
+        Direction of north in the image; None: unknown.
+    """
 
     title: str
     note: str
+    colours: Literal["direction", "speed", "change"]
+    top: float = 1.0
+    gsd_m: float | None = None
+    north_rad: float | None = None
 
 
-class _Panel:
-    """A column drawn from the top down, with a scale bar at its foot."""
-
-    def __init__(self, map_shape: tuple[int, ...], legend: Legend) -> None:
-        height, width = int(map_shape[0]), int(map_shape[1])
-        usual = (height * width) ** 0.5 / 46
-        self.text_px = int(min(max(usual, 13.0), 52.0, max(height / 24, 8.0)))
-        self.margin = self.text_px
-        self.width, self.height = round(11.5 * self.text_px), height
-        self.image = Image.new("RGB", (self.width, height), _BACKGROUND)
-        self.draw = ImageDraw.Draw(self.image)
-        self.y = float(self.margin)
-        self.write(legend.title, 1.15, _TEXT)
-        self.note = legend.note
-
-    @property
-    def inner(self) -> int:
-        """Width between the margins."""
-        return self.width - 2 * self.margin
-
-    def font(self, size: float = 1.0) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-        return ImageFont.load_default(max(8.0, self.text_px * size))
-
-    def write(self, text: str, size: float, colour: tuple[int, int, int]) -> None:
-        """A paragraph, its lines broken at words."""
-        font = self.font(size)
-        for line in self._lines(text, font):
-            self.draw.text((self.margin, self.y), line, font=font, fill=colour)
-            self.y += 1.25 * size * self.text_px
-        self.y += 0.5 * self.text_px
-
-    def _lines(self, text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> list[str]:
-        lines = [""]
-        for word in text.split():
-            longer = f"{lines[-1]} {word}".strip()
-            if self.draw.textlength(longer, font=font) <= self.inner:
-                lines[-1] = longer
-            else:
-                lines.append(word)
-        return [line for line in lines if line]
-
-    def finish(self, gsd_m: float | None, north_rad: float | None) -> RGBImage:
-        self.write(self.note, 0.8, _FAINT)
-        if north_rad is None:
-            self.write("North is unknown.", 0.8, _FAINT)
-        self._scale_bar(gsd_m)
-        return np.asarray(self.image).copy()
-
-    def _scale_bar(self, gsd_m: float | None) -> None:
-        """A bar of a round length that fits, at the map's scale."""
-        per_px, unit = (1.0, "px") if gsd_m is None else (gsd_m, "m")
-        length = round_down(self.inner * per_px)
-        x, y, half = self.margin, self.height - self.margin, self.text_px / 4
-        right = x + length / per_px
-        stroke = max(1, self.text_px // 8)
-        for line in ((x, y, right, y), (x, y - half, x, y + half), (right, y - half, right, y + half)):
-            self.draw.line(line, fill=_TEXT, width=stroke)
-        label = f"{length / 1000:g} km" if unit == "m" and length >= 1000 else f"{length:g} {unit}"
-        self.draw.text((x, y - half - 1.2 * self.text_px), label, font=self.font(0.9), fill=_TEXT)
+def legend_panel(map_shape: tuple[int, ...], legend: Legend) -> RGBImage:
+    """(h, legend, 3) legend for the right side of a map of ``map_shape``."""
+    height = int(map_shape[0])
+    usual = (height * int(map_shape[1])) ** 0.5 / 46
+    em = int(min(max(usual, 13.0), 52.0, max(height / 24, 8.0)))
+    width = round(WIDTH_EM * em)
+    figure = new_figure(width / POINTS_PER_INCH, height / POINTS_PER_INCH, dpi=POINTS_PER_INCH)
+    figure.set_facecolor(_DARK[0])
+    draw_legend(figure.add_axes((0, 0, 1, 1)), legend, (WIDTH_EM, height / em), em_pt=em, px_per_em=em, dark=True)
+    return figure_pixels(figure)[:height, :width]
 
 
-def draw_wheel_panel(
-    map_shape: tuple[int, ...], legend: Legend, *, gsd_m: float | None, north_rad: float | None
-) -> RGBImage:
-    """(h, legend, 3) legend of directions; the wheel is oriented as the map, with N at north."""
-    panel = _Panel(map_shape, legend)
-    side = min(panel.inner, max(panel.height // 3, 3 * panel.text_px))
-    letter = 1.3 * panel.text_px
-    radius = side / 2 - letter
-    centre = (panel.width / 2, panel.y + side / 2)
-    _paste_wheel(panel, centre, radius)
-    names = {"up": -pi / 2} if north_rad is None else {n: north_rad + k * pi / 2 for k, n in enumerate("NESW")}
-    for name, angle in names.items():
-        position = centre[0] + (radius + letter / 2) * cos(angle), centre[1] + (radius + letter / 2) * sin(angle)
-        panel.draw.text(position, name, font=panel.font(), fill=_TEXT, anchor="mm")
-    panel.y += side + 0.5 * panel.text_px
-    return panel.finish(gsd_m, north_rad)
+def draw_legend(
+    axes: "Axes", legend: Legend, size_em: tuple[float, float], *, em_pt: float, px_per_em: float, dark: bool = False
+) -> None:
+    """Draw a legend into axes of its size.
+
+    Parameters
+    ----------
+    size_em
+        Width and height, in letter heights.
+    em_pt
+        Height of a letter, pt.
+    px_per_em
+        Pixels of the map over that height, for the scale bar.
+    """
+    _, text, faint = _DARK if dark else _LIGHT
+    width, height = size_em
+    axes.set(xlim=(0, width), ylim=(height, 0), autoscale_on=False)
+    axes.axis("off")
+
+    def write(y: float, words: str, size: float, colour: str) -> float:
+        lines = textwrap.wrap(words, max(int((width - 1.5) / (_LETTER_EM * size)), 8))
+        for k, line in enumerate(lines):
+            axes.text(1, y + 1.25 * size * (k + 0.8), line, fontsize=em_pt * size, color=colour)
+        return y + 1.25 * size * len(lines) + 0.5
+
+    y = write(0.7, legend.title, 1.1, text)
+    draw = _draw_wheel if legend.colours == "direction" else _draw_bar
+    y = draw(axes, legend, y, size_em, em_pt, text)
+    y = write(y, legend.note, 0.8, faint)
+    if legend.north_rad is None:
+        write(y, "North is unknown.", 0.8, faint)
+    per_px, unit = (1.0, "px") if legend.gsd_m is None else (legend.gsd_m, "m")
+    length = round_down((width - 2) * px_per_em * per_px)
+    right, foot = 1 + length / per_px / px_per_em, height - 0.8
+    axes.plot([1, 1, right, right], [foot - 0.3, foot, foot, foot - 0.3], color=text, linewidth=em_pt / 8)
+    label = f"{length / 1000:g} km" if unit == "m" and length >= 1000 else f"{length:g} {unit}"
+    axes.text(1, foot - 0.5, label, fontsize=0.9 * em_pt, color=text)
 
 
-def _paste_wheel(panel: _Panel, centre: tuple[float, float], radius: float) -> None:
-    """A ring coloured by direction, with outward arrows inside."""
-    side = 2 * int(radius) + 1
-    axis = (np.arange(side * _SUPERSAMPLING) + 0.5) / _SUPERSAMPLING - side / 2
-    x, y = np.meshgrid(axis, axis)
-    distance = np.hypot(x, y)
-    ring = (distance <= radius) & (distance >= 0.42 * radius)
-    colours = np.where(ring[..., None], direction_colours(np.arctan2(y, x)), np.array(_BACKGROUND, np.uint8))
-    wheel = Image.fromarray(colours.astype(np.uint8)).resize((side, side), Image.Resampling.BOX)
-    panel.image.paste(wheel, (round(centre[0] - side / 2), round(centre[1] - side / 2)))
+def _draw_wheel(
+    axes: "Axes", legend: Legend, y: float, size_em: tuple[float, float], em_pt: float, colour: str
+) -> float:
+    """A ring coloured by direction, oriented as the map, with N at north; returns where it ends."""
+    radius = max(min(size_em[0] / 2 - 2.3, size_em[1] / 6), 1.5)
+    x, y = size_em[0] / 2, y + radius + 1.3
+    at = np.linspace(-1, 1, 301)
+    across, down = np.meshgrid(at, at)
+    distance = np.hypot(across, down)
+    ring = (distance <= 1) & (distance >= 0.42)
+    image = np.dstack([direction_colours(np.arctan2(down, across)), np.where(ring, 255, 0).astype(np.uint8)])
+    axes.imshow(image, extent=(x - radius, x + radius, y + radius, y - radius), aspect="auto")
+    axes.set(xlim=(0, size_em[0]), ylim=(size_em[1], 0))
     for k in range(4):
-        _arrow(panel, centre, k * pi / 2, 0.08 * radius, 0.36 * radius)
+        _arrow(axes, (x, y), k * pi / 2, 0.05 * radius, 0.38 * radius, colour, em_pt)
+    north = legend.north_rad
+    names = {"up": -pi / 2} if north is None else {n: north + k * pi / 2 for k, n in enumerate("NESW")}
+    for name, angle in names.items():
+        place = x + (radius + 0.75) * cos(angle), y + (radius + 0.75) * sin(angle)
+        axes.text(*place, name, fontsize=em_pt, color=colour, ha="center", va="center")
+    return y + radius + 1.6
 
 
-def _arrow(panel: _Panel, centre: tuple[float, float], angle: float, start: float, end: float) -> None:
-    ux, uy = cos(angle), sin(angle)
-    tip = (centre[0] + end * ux, centre[1] + end * uy)
-    head = max(3.0, (end - start) * 0.4)
-    stroke = max(1, panel.text_px // 10)
-    foot = (tip[0] - head * ux, tip[1] - head * uy)
-    panel.draw.line((centre[0] + start * ux, centre[1] + start * uy, *foot), fill=_FAINT, width=stroke)
-    wings = [(foot[0] - s * 0.5 * head * uy, foot[1] + s * 0.5 * head * ux) for s in (1, -1)]
-    panel.draw.polygon([tip, *wings], fill=_FAINT)
-
-
-def draw_bar_panel(
-    map_shape: tuple[int, ...],
-    legend: Legend,
-    *,
-    top: float,
-    gsd_m: float | None,
-    north_rad: float | None,
-    changes: bool = False,
-) -> RGBImage:
-    """(h, legend, 3) legend of a quantity from 0 to ``top``, of changes from ``-top``; with an arrow to north where
-    it is known."""
-    panel = _Panel(map_shape, legend)
-    height = int(max(panel.height * 0.36, 3 * panel.text_px))
-    width = round(1.6 * panel.text_px)
-    x, y = panel.margin, round(panel.y + 0.5 * panel.text_px)
-    bottom = -top if changes else 0.0
-    values = np.repeat(np.linspace(top, bottom, height)[:, None], width, axis=1) / top
-    panel.image.paste(Image.fromarray(change_colours(values) if changes else ramp_colours(values)), (x, y))
-    ticks = bar_ticks(top)
+def _draw_bar(axes: "Axes", legend: Legend, y: float, size_em: tuple[float, float], em_pt: float, colour: str) -> float:
+    """A bar of colours with ticks, and an arrow to north where it is known; returns where it ends."""
+    changes, height, y = legend.colours == "change", max(size_em[1] * 0.36, 3.0), y + 0.5
+    bottom = -legend.top if changes else 0.0
+    values = np.linspace(legend.top, bottom, 256)[:, None] / legend.top
+    image = change_colours(values) if changes else ramp_colours(values)
+    axes.imshow(image, extent=(1, 2.6, y + height, y), aspect="auto")
+    axes.set(xlim=(0, size_em[0]), ylim=(size_em[1], 0))
+    ticks = bar_ticks(legend.top)
     for tick in [*-ticks[:0:-1], *ticks] if changes else ticks:
-        level = y + (height - 1) * (top - tick) / (top - bottom)
-        panel.draw.line((x + width, level, x + width + 0.35 * panel.text_px, level), fill=_TEXT)
-        position = (x + width + 0.6 * panel.text_px, level)
-        panel.draw.text(position, f"{tick:+g}" if changes else f"{tick:g}", font=panel.font(), fill=_TEXT, anchor="lm")
-    if north_rad is not None:
-        _north(panel, north_rad, (panel.width - panel.margin - 1.2 * panel.text_px, y + 1.6 * panel.text_px))
-    panel.y = y + height + panel.text_px
-    return panel.finish(gsd_m, north_rad)
+        level = y + height * (legend.top - tick) / (legend.top - bottom)
+        axes.plot([2.6, 2.95], [level, level], color=colour, linewidth=em_pt / 12)
+        name = f"{tick:+g}" if changes else f"{tick:g}"
+        axes.text(3.2, level, name, fontsize=em_pt, color=colour, va="center")
+    if legend.north_rad is not None:
+        centre = size_em[0] - 2.2, y + 1.6
+        _arrow(axes, centre, legend.north_rad, -1.2, 0.7, colour, em_pt)
+        place = centre[0] + 1.4 * cos(legend.north_rad), centre[1] + 1.4 * sin(legend.north_rad)
+        axes.text(*place, "N", fontsize=em_pt, color=colour, ha="center", va="center")
+    return y + height + 1
 
 
-def _north(panel: _Panel, north_rad: float, centre: tuple[float, float]) -> None:
-    length = 1.4 * panel.text_px
-    _arrow(panel, centre, north_rad, -length, 0.5 * length)
-    position = (centre[0] + length * cos(north_rad), centre[1] + length * sin(north_rad))
-    panel.draw.text(position, "N", font=panel.font(), fill=_TEXT, anchor="mm")
+def _arrow(
+    axes: "Axes", at: tuple[float, float], angle: float, start: float, end: float, colour: str, em_pt: float
+) -> None:
+    tail, tip = ((at[0] + d * cos(angle), at[1] + d * sin(angle)) for d in (start, end))
+    style = {"arrowstyle": "-|>", "color": colour, "linewidth": em_pt / 12, "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", xy=tip, xytext=tail, arrowprops={**style, "mutation_scale": 0.7 * em_pt})
 
 
 def bar_ticks(top: float) -> FloatArray:

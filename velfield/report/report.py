@@ -117,6 +117,10 @@ def _figure(figure: ReportFigure) -> str:
     return _section(figure.title, body)
 
 
+def _plot(svg: bytes, alt_text: str) -> str:
+    return f'<img class="plot" alt="{alt_text}" src="data:image/svg+xml;base64,{b64encode(svg).decode()}">'
+
+
 def _stages(stages: Sequence[ReportStage]) -> str:
     if not stages:
         return ""
@@ -145,7 +149,9 @@ def _registration(report: Report) -> str:
     if good:
         middle, late = good[len(good) // 2], good[min(int(len(good) * 0.95), len(good) - 1)]
         text += f" Residual on held-out control points: median {middle:.2f} px, 95 % below {late:.2f} px."
-    return _section("Registration", f"<p>{escape(text)}</p>{residual_plot(series)}")
+    return _section(
+        "Registration", f"<p>{escape(text)}</p>{_plot(residual_plot(series), 'Registration residual against time')}"
+    )
 
 
 def _detection(report: Report) -> str:
@@ -153,7 +159,9 @@ def _detection(report: Report) -> str:
     if curve is None or not curve.recall:
         return ""
     description = f"<p>Measured on {escape(curve.description)}.</p>" if curve.description else ""
-    return _section("Detection", description + precision_recall_plot(curve))
+    return _section(
+        "Detection", description + _plot(precision_recall_plot(curve), "Precision of the detector against its recall")
+    )
 
 
 def _gates(gates: dict[str, int]) -> str:

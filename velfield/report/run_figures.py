@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
+from PIL import Image
 
 from schemas.report import ReportFigure
 from velfield.report.figures import jpeg_bytes
@@ -41,14 +41,12 @@ def report_figures(maps: Path) -> dict[str, ReportFigure]:
     for name, (title, caption, alt_text) in _CAPTIONS.items():
         if not (maps / f"{name}.png").exists():
             continue  # a pinhole lens has no such figure
-        encoded = np.frombuffer((maps / f"{name}.png").read_bytes(), np.uint8)
-        image = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
         figures[name] = ReportFigure(
             title=title,
             caption=caption,
             alt_text=alt_text,
             mime="image/jpeg",
-            data=jpeg_bytes(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), max_side=_PICTURE_SIDE_PX),
+            data=jpeg_bytes(np.asarray(Image.open(maps / f"{name}.png").convert("RGB")), max_side=_PICTURE_SIDE_PX),
             full_size=f"maps/{name}.png",
         )
     return figures
