@@ -36,7 +36,7 @@ def test_an_svg_holds_its_texts_and_asks_for_nothing(whole: tuple[Path, RunSumma
     facts = next(line for line in texts if "vehicles in traffic" in line)
     assert f"n = {(vehicles['state'] != 'parked').sum()} vehicles in traffic" in facts
     assert "2024-05-01 12:00 UTC" in facts
-    assert {"Direction of travel", "Speed, km/h", "up"} <= set(texts)
+    assert {"Direction of", "travel", "Speed, km/h", "up"} <= set(texts)
     assert sum(bool(re.fullmatch(r"\d+ m", line)) for line in texts) == 2  # a scale bar a map
     assert not re.findall(r'href="(?!data:|#)', text)
 

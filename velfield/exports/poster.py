@@ -10,8 +10,9 @@ from velfield.errors import InputError
 from velfield.exports.figures import resized_map
 from velfield.field.segments import stationary_speed_px_per_s
 from velfield.report.drawing import POINTS_PER_INCH, figure_bytes, new_figure
-from velfield.report.figures import direction_map, speed_map
+from velfield.report.figures import MapScale, direction_map, speed_map
 from velfield.report.panel import WIDTH_EM, draw_legend
+from velfield.run.frame_transforms import north_direction_rad
 from velfield.run.run import Run
 
 if TYPE_CHECKING:
@@ -52,9 +53,11 @@ def draw_poster(run: Run, options: ExportOptions) -> "Figure":
     speed = run.field.modal_speed_px_per_s()
     direction = np.where(speed >= slow, run.field.modal_direction_rad(), np.nan)
     em = _LEGEND / WIDTH_EM
+    # the layers are in base pixels a second, whatever the width of the sheet's maps
+    scale = MapScale(run.grid.gsd_m, options.unit, north_direction_rad(run.grid))
     for k, values in enumerate((direction, speed)):
         shown = resized_map(run, values, sized)
-        image, legend = (speed_map if k else direction_map)(shown.grey, shown.layer, shown.scale)
+        image, legend = (speed_map if k else direction_map)(shown.grey, shown.layer, scale)
         left = _MARGIN + k * (column + _GAP)
 
         def box(x: float, height: float, wide: float) -> tuple[float, float, float, float]:
@@ -66,7 +69,7 @@ def draw_poster(run: Run, options: ExportOptions) -> "Figure":
         axes.axis("off")
         draw_legend(
             figure.add_axes(box(left + width + _GAP, body, _LEGEND)), legend, (WIDTH_EM, body / em),
-            em_pt=em / _MM_PER_INCH * POINTS_PER_INCH, px_per_em=image.shape[1] / width * em,
+            em_pt=em / _MM_PER_INCH * POINTS_PER_INCH, px_per_em=run.grid.width_px / width * em,
         )  # fmt: skip
     return figure
 
