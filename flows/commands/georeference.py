@@ -88,8 +88,8 @@ def page_app(run_folder: Path, epsg: int | None, model: Model | None, given_map:
     from velfield.pipeline.georeference import fit_run_points, open_finished_run
     from velfield.pipeline.georeference import georeference as georeference_run
     from velfield.pipeline.stages.georeference import saved_control_points
-    from velfield.sources.reference_map import open_map
     from velfield.viewer.georeferencer import georeference_app, marked_points
+    from velfield.viewer.reference_map import open_map
 
     run = open_finished_run(run_folder)
 

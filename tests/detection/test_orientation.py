@@ -15,6 +15,8 @@ from velfield.detection.orientation import (
     sample_nearest,
     structure_tensor_axis,
 )
+from velfield.detection.samples import LabelledImage
+from velfield.pipeline.stages.labels import check_label_axes
 
 ANGLES = st.floats(-10, 10, allow_nan=False)
 
@@ -162,3 +164,13 @@ def test_axes_of_labels_that_are_not_those_of_the_cars_are_reported() -> None:
     assert "if angles are counted the other way round" in mirrored
     assert "check the angles" in contradict_axes(found, np.zeros(len(axes)))[0]
     assert not contradict_axes(found[:5], np.zeros(5))
+
+
+def test_axes_are_compared_over_all_labelled_images() -> None:
+    images, cars = [car(40.0) for _ in range(10)], np.array([[32.0, 32.0, np.radians(40.0), 16.0, 7.0]])
+    for turn, is_right in ((0.0, True), (np.pi / 2, False)):
+        labelled = cars + np.array([0, 0, turn, 0, 0])
+        samples = [LabelledImage(image, labelled, np.empty((0, 3)), np.full(1, np.nan)) for image in images]
+        assert (not check_label_axes(samples)) == is_right
+    unknown = LabelledImage(images[0], cars * np.array([1, 1, np.nan, 1, 1]), np.empty((0, 3)), np.full(1, 0.5))
+    assert not check_label_axes([unknown] * 10)

@@ -18,15 +18,15 @@ from flows.cli import app
 from schemas.georeference import ControlPoint, ControlPointsRecord, MarkedPoint, MarkedPoints
 from schemas.summary import RunSummary
 from tests.browser import NEEDS_PAGE, Page, browser
-from tests.sources.test_reference_map import squares, write_geotiff
 from tests.viewer.test_accessibility import AXE, FINDINGS
+from tests.viewer.test_reference_map import squares, write_geotiff
 from tests.viewer.test_viewer_server import Client, command, served
 from velfield import open_run
 from velfield.errors import InputError
 from velfield.pipeline.georeference import fit_run_points
 from velfield.sources.control_points import fit_control_points
-from velfield.sources.reference_map import ReferenceMap, TileServer, open_map
 from velfield.viewer.georeferencer import georeference_app, marked_points, read_marked_points
+from velfield.viewer.reference_map import ReferenceMap, TileServer, open_map
 
 PIXELS = ((60, 50), (580, 70), (560, 430), (80, 400))
 LON, LAT, GSD_M = 13.4, 52.5, 0.25

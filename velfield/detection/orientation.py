@@ -90,7 +90,7 @@ def fill_missing_orientation(
 
 def outline_axes(image: GreyImage, cars: FloatArray) -> FloatArray:
     """Axes (n,) at which the outlines of cars (n, 5), as of `fill_missing_orientation`, fit the image best."""
-    return np.asarray(_CANDIDATES[_outline_scores(image, cars).argmax(axis=1)])
+    return np.asarray(_CANDIDATES[_outline_scores(image, cars).argmax(axis=1)]) if len(cars) else np.empty(0)
 
 
 def contradict_axes(axes: FloatArray, labelled: FloatArray) -> list[str]:

@@ -11,7 +11,7 @@ from velfield.detection.motion.labels import working_scale
 from velfield.detection.review import collect_tp_fn_fp_crops, contact_sheet
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
-from velfield.pipeline.stages.labels import labelled_images, median_car_length_raw_px
+from velfield.pipeline.stages.labels import check_label_axes, labelled_images, median_car_length_raw_px
 from velfield.report.figures import png_bytes
 from velfield.sources.labels.labels import Labels, read_labels
 from velfield.sources.source import probe
@@ -72,7 +72,7 @@ def _base_detector(name: str | None) -> Detector | None:
 def write_training(training: Training, out: Path, review: Path | None = None) -> list[str]:
     """Write the detector file and, with ``review``, the contact sheet; returns lines for people."""
     training.detector.save(out)
-    record, lines = training.detector.record, [*training.labels.notes]
+    record, lines = training.detector.record, [*training.labels.notes, *check_label_axes(training.samples)]
     lines.append(
         f"{out}: {record.cars} cars, labelled frames: {len(training.samples)}, score threshold {record.threshold:.3f}"
     )

@@ -12,8 +12,8 @@ from schemas.georeference import ControlPoint, ControlPointsRecord, MarkedPlace,
 from velfield.errors import InputError
 from velfield.report.viewer_page import render_editor
 from velfield.sources.control_points import WGS84, scale_text
-from velfield.sources.reference_map import ReferenceMap, TileServer, to_coordinates, to_degrees
 from velfield.viewer.editing import editing_app
+from velfield.viewer.reference_map import ReferenceMap, TileServer, to_coordinates, to_degrees
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette

@@ -14,8 +14,8 @@ from rasterio.transform import Affine
 from rasterio.warp import transform
 
 from velfield.errors import InputError
-from velfield.sources import reference_map
-from velfield.sources.reference_map import ReferenceMap, TileServer, open_map, to_coordinates, to_degrees
+from velfield.viewer import reference_map
+from velfield.viewer.reference_map import ReferenceMap, TileServer, open_map, to_coordinates, to_degrees
 
 EAST, NORTH, GSD_M = 391_000.0, 5_819_000.0, 0.25
 SIDE, SQUARE = 600, 100
