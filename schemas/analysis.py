@@ -63,6 +63,13 @@ class AnalysisTable(Model):
     rows: tuple[AnalysisRow, ...]
 
 
+class QuestionRecord(Model):
+    """A question of the first page, and the lines of its answer."""
+
+    question: str
+    lines: tuple[str, ...]
+
+
 class AnalysisRecord(Model):
     """``analysis.json``: all tables."""
 
@@ -76,6 +83,8 @@ class AnalysisRecord(Model):
     """Tracks of moving vehicles that were analysed."""
     level: float = Field(0.9, gt=0, lt=1)
     """Probability that an interval is to have."""
+    answers: tuple[QuestionRecord, ...] = ()
+    """The first page of the report; last, what could not be said and why."""
     tables: tuple[AnalysisTable, ...]
 
 

@@ -14,6 +14,7 @@ def analyse(
     fps: float | None = None,
     unit: Literal["m", "px"] | None = None,
     slice_s: float = 300.0,
+    speed_unit: Literal["km/h", "mph"] = "km/h",
 ) -> int:
     """Lanes, turning counts, speeds, signals, flow, conflicts: write `analysis/` with a report.
 
@@ -33,6 +34,8 @@ def analyse(
         Of columns named x and y in `--tracks`.
     slice_s
         Counts by time are of slices so long, where the flight is longer than two.
+    speed_unit
+        Unit of speeds in the report's diagrams.
     """
     from velfield.errors import InputError
     from velfield.pipeline.analysis.analyse import analyse_run, analyse_tracks
@@ -40,11 +43,11 @@ def analyse(
     if (run_folder is None) == (tracks is None):
         raise InputError("expected a run folder or --tracks FILE; give one of them")
     if tracks is None:
-        lines = analyse_run(Path(run_folder or "."), slice_s=slice_s)
+        lines = analyse_run(Path(run_folder or "."), slice_s=slice_s, speed_unit=speed_unit)
     elif out is None:
         raise InputError(f"found --tracks {tracks} and no folder for the answers; give --out")
     else:
-        lines = analyse_tracks(tracks, out, gsd_m=gsd_m, fps=fps, unit=unit, slice_s=slice_s)
+        lines = analyse_tracks(tracks, out, gsd_m=gsd_m, fps=fps, unit=unit, slice_s=slice_s, speed_unit=speed_unit)
     for line in lines:
         print(line, flush=True)
     return 0

@@ -39,6 +39,7 @@ interface Analysis {
   tracks: number;
   level: number;
   gsd_known: boolean;
+  answers?: { question: string; lines: string[] }[];
   tables: Table[];
 }
 
@@ -97,7 +98,8 @@ export class AnalysisPanel {
     const metres = analysis.gsd_known ? "" : " Metres a pixel are not known: lengths are by 0.23 m.";
     const about = `${analysis.tracks} tracks of moving vehicles in ${analysis.duration_s.toFixed(0)} s. In grey: ${Math.round(100 * analysis.level)} % interval, n.${metres}`;
     const note = make("p", { class: "note" }, table.note);
-    const content: HTMLElement[] = [make("p", { class: "note" }, about), make("label", {}, "Table ", choice), note];
+    const answers = (analysis.answers ?? []).flatMap(({ question, lines }) => [make("dt", {}, question), ...lines.map((line) => make("dd", {}, line))]);
+    const content: HTMLElement[] = [make("p", { class: "note" }, about), make("dl", { class: "answers" }, ...answers), make("label", {}, "Table ", choice), note];
     content.push(table.rows.length ? this.rows(table) : make("p", {}, "Nothing of this kind was found."));
     if (table.rows.length > MAX_ROWS) content.push(make("p", { class: "note" }, `and ${table.rows.length - MAX_ROWS} more, in analysis/analysis.json`));
     find("analysis-content").replaceChildren(...content);

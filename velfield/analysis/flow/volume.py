@@ -12,7 +12,7 @@ from velfield.analysis.trajectories import VEHICLE_LENGTH_M
 _FOLLOW_S = 3.0
 """A vehicle with a shorter headway follows the one before."""
 LOS_SIGNAL_S = (10.0, 20.0, 35.0, 55.0, 80.0)
-"""Control delay, s, up to which levels A to E reach at signals: Highway Capacity Manual, 6th edition, Exhibit 19-8."""
+"""Control delay, s, up to which levels A to E reach at signals: Highway Capacity Manual, 7th edition, Exhibit 19-8."""
 LOS_YIELD_S = (10.0, 15.0, 25.0, 35.0, 50.0)
 """The same without signals: Exhibits 20-2 (stop control) and 22-8 (roundabouts)."""
 

@@ -1,17 +1,16 @@
 """`analyse_run`, `analyse_tracks`: answers from the tracks of a run, or of another program, written into a folder."""
 
-import base64
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 
-from schemas.analysis import AnalysisColumn, AnalysisRecord, AnalysisTable, LanesRecord
+from schemas.analysis import AnalysisColumn, AnalysisRecord, AnalysisTable, LanesRecord, QuestionRecord
 from schemas.arrays import GreyImage
+from schemas.export import SpeedUnit
 from velfield.analysis.answers import explain_none, find_answers
 from velfield.analysis.movements.time_slices import SLICE_S
 from velfield.analysis.traffic_analysis import TrafficAnalysis
@@ -20,9 +19,11 @@ from velfield.errors import InputError
 from velfield.exports.georeference import Georeference
 from velfield.pipeline.analysis.clips import Frames, unusual_clips
 from velfield.pipeline.analysis.lanes_record import lanes_geojson, lanes_record
-from velfield.pipeline.analysis.page import report_html
 from velfield.pipeline.analysis.tables import all_tables
 from velfield.pipeline.analysis.workbook import EXTRA, can_write_workbook, workbook_bytes
+from velfield.report.traffic.diagrams import traffic_diagrams
+from velfield.report.traffic.first_page import first_page
+from velfield.report.traffic.report import report_html, report_pdf
 from velfield.run.commits import code_version, read_commits, record_analysis, write_atomically
 from velfield.run.flight_record import read_flight_record
 from velfield.run.layout import RunLayout, remove_tree, to_path
@@ -33,12 +34,11 @@ from velfield.sources.trajectories import read_tracks
 TRACKS = "tracks"
 """The stage whose results are analysed."""
 MAX_LINES = 12
-_MAX_PICTURE_PX = 1600
 _TRACKS_GSD_M = 0.1
 """Base pixels of tracks given in metres."""
 
 
-def analyse_run(run_folder: Path, *, slice_s: float = SLICE_S) -> Iterator[str]:
+def analyse_run(run_folder: Path, *, slice_s: float = SLICE_S, speed_unit: SpeedUnit = "km/h") -> Iterator[str]:
     """Analyse the tracks of a run and write ``analysis/`` into its folder; a line for people on each question.
 
     Raises
@@ -58,6 +58,7 @@ def analyse_run(run_folder: Path, *, slice_s: float = SLICE_S) -> Iterator[str]:
             gsd_known=run.grid.gsd_m is not None,
             picture=run.base_image,
             frames=_frames(run),
+            speed_unit=speed_unit,
         )
         record_analysis(run.layout, slice_s=slice_s)
 
@@ -93,6 +94,7 @@ def analyse_tracks(
     fps: float | None,
     unit: Literal["m", "px"] | None,
     slice_s: float = SLICE_S,
+    speed_unit: SpeedUnit = "km/h",
 ) -> Iterator[str]:
     """Analyse the tracks of another program and write the answers into ``out``.
 
@@ -124,7 +126,12 @@ def analyse_tracks(
     width, height = np.ceil(xy_m.max(axis=0) / gsd).astype(int) + 1
     georeference = Georeference((int(height), int(width)), gsd_m=gsd)
     yield from write_analysis(
-        TrafficAnalysis(tracks, slice_s), to_path(out), georeference, gsd_known=True, picture=None
+        TrafficAnalysis(tracks, slice_s),
+        to_path(out),
+        georeference,
+        gsd_known=True,
+        picture=None,
+        speed_unit=speed_unit,
     )
 
 
@@ -141,6 +148,7 @@ def write_analysis(
     gsd_known: bool,
     picture: GreyImage | None,
     frames: Frames | None = None,
+    speed_unit: SpeedUnit = "km/h",
 ) -> Iterator[str]:
     """Write lanes, tables, report and workbook, and strips of pictures of unusual tracks; a line on each."""
     analysis.answer_all()
@@ -152,19 +160,22 @@ def write_analysis(
     remove_tree(out / "clips")  # of an earlier analysis
     for number, data in clips.items():
         write_atomically(out / clip_name(number), data)
+    page = first_page(analysis)
     record = AnalysisRecord(
         code_version=code_version(),
         gsd_m=gsd_m,
         gsd_known=gsd_known,
         duration_s=round(analysis.trajectories.duration_s, 3),
         tracks=len(analysis.trajectories),
+        answers=tuple(QuestionRecord(question=question, lines=lines) for question, lines in page.sections),
         tables=tuple(_with_clips(_explain_empty(table, analysis), clips) for table in all_tables(analysis)),
     )
     write_atomically(out / "analysis.json", record.model_dump_json().encode())
     yield from answer_lines(analysis)
-    html = report_html(record, lanes, georeference.shape, _data_url(picture), clips)
-    write_atomically(out / "report.html", html.encode())
-    yield f"report      {out / 'report.html'}"
+    diagrams = list(traffic_diagrams(analysis, picture, unit=speed_unit))
+    write_atomically(out / "report.html", report_html(record, page, diagrams, clips).encode())
+    write_atomically(out / "report.pdf", report_pdf(record, page, diagrams))
+    yield f"report      {out / 'report.html'}; to print: {out / 'report.pdf'}"
     if can_write_workbook():
         write_atomically(out / "analysis.xlsx", workbook_bytes(record))
         yield f"workbook    {out / 'analysis.xlsx'}"
@@ -227,12 +238,3 @@ def _with_answers(lanes: LanesRecord, analysis: TrafficAnalysis) -> LanesRecord:
             ),
         }
     )
-
-
-def _data_url(picture: GreyImage | None) -> str | None:
-    if picture is None:
-        return None
-    scale = min(1.0, _MAX_PICTURE_PX / max(picture.shape))
-    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else picture
-    done, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 70])
-    return f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode()}" if done else None

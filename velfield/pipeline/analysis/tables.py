@@ -150,7 +150,7 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
     note = (
         "Arms are named by the side of the image. Inferred: a track is cut, and its other end follows from what enters "
         "and leaves (Furness). Delay is against the fastest tenth of the movement. Levels of service: Highway Capacity "
-        "Manual, 6th edition, Exhibit 19-8 at signals, 20-2 and 22-8 elsewhere."
+        "Manual, 7th edition, Exhibit 19-8 at signals, 20-2 and 22-8 elsewhere."
     )
     return make_table("movements", "Movements", "Turning counts", note, columns, rows)
 

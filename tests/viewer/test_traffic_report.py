@@ -1,0 +1,76 @@
+"""The report of a traffic analysis: what the first page says, what the diagrams show, and that files do not change."""
+
+import re
+
+import numpy as np
+import pytest
+
+from tests.analysis.test_traffic_analysis import CYCLE_S, analysis, drive, gather
+from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.report.drawing import new_figure, pages_bytes
+from velfield.report.traffic.approaches import approach_delays, lane_names
+from velfield.report.traffic.diagrams import draw_queues, draw_time_space, red_times, traffic_diagrams
+from velfield.report.traffic.first_page import first_page
+
+__all__ = ["analysis"]
+
+
+def test_the_first_page_answers_five_questions_and_says_what_is_missing(analysis: TrafficAnalysis) -> None:
+    page = first_page(analysis)
+    answers = {question: " ".join(lines) for question, lines in page.answers}
+    assert len(answers) == 5
+    assert "cycle 40 s" in answers["Is there a signal?"]
+    assert re.search(r"longest queue from W, lane \d: 4 vehicles", " ".join(answers.values()))
+    assert any(line.startswith("classes") for line in page.withheld)
+    assert page.sections[-1][0].startswith("What could not be said")
+
+
+def test_a_short_clip_is_answered_by_what_is_missing() -> None:
+    east = np.array([[0.0, 10.0], [100.0, 10.0]])
+    short = TrafficAnalysis(gather([drive(east, 2.0 * k) for k in range(3)]))
+    page = first_page(short)
+    assert any("too few" in line for line in page.withheld)
+    assert {d.name for d in traffic_diagrams(short, None)} <= {"place", "speed-profile"}
+
+
+def test_every_diagram_is_drawn_and_two_pdfs_are_the_same(analysis: TrafficAnalysis) -> None:
+    made = list(traffic_diagrams(analysis, np.full((1100, 1300), 128, np.uint8), unit="mph"))
+    kinds = {re.sub(r"-\d+$", "", diagram.name) for diagram in made}
+    assert kinds >= {"place", "turning", "delay", "time-space", "queue", "speed-profile", "fundamental", "flow"}
+    files = []
+    for _ in range(2):
+        pages = [new_figure(7, diagram.height_in) for diagram in made]
+        for page, diagram in zip(pages, made, strict=True):
+            diagram.draw(page.add_subplot())
+            assert any(len(axes.get_children()) > 10 for axes in page.axes), diagram.name
+        files.append(pages_bytes(pages))
+    assert files[0] == files[1]
+    assert files[0].count(b"/Type /Page\n") + files[0].count(b"/Type /Page ") == len(made)
+
+
+def test_red_is_where_vehicles_stand_and_queues_are_of_four(analysis: TrafficAnalysis) -> None:
+    junction = next(n for n, s in analysis.signals.items() if s.signalised)
+    stream = next(s for s in analysis.signals[junction].streams if s.red_phase_s)
+    reds = red_times(stream, CYCLE_S)
+    assert all(15 < end - begin < 30 for begin, end in reds)
+    axes = new_figure(7, 3).add_subplot()
+    draw_queues(axes, analysis=analysis, streams=[stream], names={})
+    times, counts = (np.asarray(values, np.float64) for values in axes.lines[0].get_data())
+    shown = [(begin, end) for begin, end in reds if times[0] < begin and end < times[-1]]
+    assert len(shown) >= 5
+    for begin, end in shown:  # none stands when red begins, four when it ends
+        assert counts[np.searchsorted(times, begin) - 1] == 0
+        assert counts[np.searchsorted(times, end) - 1] == 4
+    axes = new_figure(7, 3).add_subplot()
+    draw_time_space(axes, analysis=analysis, stream=stream)
+    assert len(axes.collections[0].get_paths()) > 20
+
+
+def test_delay_of_an_approach_is_the_mean_over_its_vehicles(analysis: TrafficAnalysis) -> None:
+    found = next(m for m in analysis.movements if m.junction.kind == "intersection")
+    delays = {d.arm: d for d in approach_delays(found, analysis.signals[found.junction.number])}
+    mine = [m for m in found.movements if m.arm_in == "W" and m.delay_s]
+    total = sum((m.seen + m.inferred) * m.delay_s.value for m in mine if m.delay_s)
+    assert delays["W"].delay_s == pytest.approx(total / sum(m.seen + m.inferred for m in mine))
+    assert delays["W"].level in "AB"
+    assert sorted(name.split(",")[0] for name in lane_names(found).values()) == ["from N", "from W"]

@@ -1,0 +1,1 @@
+"""The report of a traffic analysis: diagrams, the first page, HTML and PDF."""

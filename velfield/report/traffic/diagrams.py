@@ -1,0 +1,360 @@
+"""Diagrams of a traffic analysis, each drawn into axes: legible in black and white, most important first."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from schemas.arrays import FloatArray, GreyImage
+from schemas.export import SpeedUnit
+from velfield.analysis.flow.volume import flow_slices
+from velfield.analysis.movements.movements import JunctionMovements
+from velfield.analysis.signals.cycles import StreamSignal, queues
+from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.report.figures import PER_M_PER_S
+from velfield.report.traffic.approaches import ApproachDelay, approach_delays, lane_names
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_TONES = ("#1f3b73", "#c8553d", "#3a8f6b", "#8a6fb0", "#b08a1e", "#5b6770")
+_STROKES = ("-", "--", "-.", ":")
+_MARKS = "os^Dvx"
+_RED = "#c62828"
+_MAX_JUNCTIONS = 4
+_SHOWN_S, _SLICE_S = 300.0, 60.0
+_BESIDE_M, _AHEAD_RAD = 2.5, np.radians(45)
+_LIKELY = 0.5
+
+
+@dataclass(frozen=True)
+class Diagram:
+    """A picture of the report: ``draw`` fills axes that are ``height_in`` high on a page 7 inches wide."""
+
+    name: str
+    title: str
+    caption: str
+    draw: Callable[["Axes"], None]
+    height_in: float = 3.2
+
+
+def traffic_diagrams(
+    analysis: TrafficAnalysis, picture: GreyImage | None, *, unit: SpeedUnit = "km/h"
+) -> Iterator[Diagram]:
+    """The diagrams that the data allow: the place first, then junctions, signals, speeds, flows and conflicts."""
+    yield Diagram(
+        "place",
+        "The place",
+        "Lanes with their direction of travel; J: junctions, by the number used in the tables.",
+        partial(draw_place, analysis=analysis, picture=picture),
+        4.6,
+    )
+    junctions = sorted(
+        (m for m in analysis.movements if m.junction.kind in ("intersection", "roundabout") and m.movements),
+        key=lambda found: -found.volume,
+    )[:_MAX_JUNCTIONS]
+    for found in junctions:
+        yield Diagram(
+            f"turning-{found.junction.number}",
+            f"Junction {found.junction.number}: where vehicles go",
+            "Arrows are as wide as the flow. Vehicles counted, and their share of those that enter by the same arm. "
+            "Arms are named by the side of the image that they lead to (N: its top).",
+            partial(draw_turning, found=found),
+            4.6,
+        )
+        delays = approach_delays(found, analysis.signals.get(found.junction.number))
+        if delays:
+            yield Diagram(
+                f"delay-{found.junction.number}",
+                f"Junction {found.junction.number}: delay and level of service by approach",
+                "Mean delay against vehicles that pass freely. Letters: level of service by the Highway Capacity "
+                "Manual, 7th edition (A: best, F: worst); dashed: where the next level begins.",
+                partial(draw_delays, delays=delays),
+                1.4 + 0.4 * len(delays),
+            )
+        yield from _signal_diagrams(analysis, found)
+    yield from _road_diagrams(analysis, junctions, unit)
+    likely = [c for c in analysis.conflicts if c.probability >= _LIKELY]
+    if likely:
+        yield Diagram(
+            "conflicts",
+            "Where vehicles come near to each other",
+            f"{len(likely)} pairs that are more likely than not within 1.5 s of a collision, or of each other.",
+            partial(draw_conflicts, analysis=analysis, picture=picture),
+            4.6,
+        )
+
+
+def _signal_diagrams(analysis: TrafficAnalysis, found: JunctionMovements) -> Iterator[Diagram]:
+    signal = analysis.signals.get(found.junction.number)
+    streams = [s for s in signal.streams if s.stream.stop_line_m is not None] if signal else []
+    if not streams:
+        return
+    number, names = found.junction.number, lane_names(found)
+    busiest = max(streams, key=lambda s: len(s.stream.stop_track))
+    name = names.get(busiest.stream.approach.lane, f"lane {busiest.stream.approach.lane}")
+    yield Diagram(
+        f"time-space-{number}",
+        f"Junction {number}: vehicles on the approach {name}",
+        "Each line is a vehicle; where it is level the vehicle stands. Thick red bar at the stop line (0 m): the "
+        "signal is red, as found from who stops and who goes.",
+        partial(draw_time_space, analysis=analysis, stream=busiest),
+    )
+    yield Diagram(
+        f"queue-{number}",
+        f"Junction {number}: queues against time",
+        "Vehicles that stand before the stop line of each approach.",
+        partial(draw_queues, analysis=analysis, streams=streams, names=names),
+    )
+
+
+def _road_diagrams(analysis: TrafficAnalysis, junctions: list[JunctionMovements], unit: SpeedUnit) -> Iterator[Diagram]:
+    lane = max(analysis.lanes, key=lambda lane: lane.tracks * lane.length_m, default=None)
+    if lane is not None and any(station.p50 for station in analysis.profile(lane.number)):
+        yield Diagram(
+            "speed-profile",
+            f"Speed along lane {lane.number}, the busiest",
+            "Half of the vehicles are slower than the median, 85 % slower than the upper line, 15 % slower than the "
+            "lower one. Grey: 90 % interval of the median.",
+            partial(draw_speed_profile, analysis=analysis, lane=lane.number, unit=unit),
+        )
+    points = fundamental_points(analysis)
+    if len(points) >= 5:
+        yield Diagram(
+            "fundamental",
+            "Flow against density",
+            f"A point is a lane in {_SLICE_S:.0f} s. Free traffic rises with the density; where points fall off to "
+            "the right, it is congested. Dashed: the speed that 85 % do not exceed.",
+            partial(draw_fundamental, points=points, per_m_per_s=PER_M_PER_S[unit], unit=unit),
+        )
+    for found in junctions[:1]:
+        if analysis.trajectories.duration_s >= 2 * _SLICE_S:
+            yield Diagram(
+                "flow",
+                f"Junction {found.junction.number}: vehicles that enter, by minute",
+                "By the arm that they enter from.",
+                partial(draw_flow, analysis=analysis, found=found),
+            )
+
+
+def _draw_map(axes: "Axes", analysis: TrafficAnalysis, picture: GreyImage | None) -> None:
+    """The base image, pale, with the lanes' centre lines; metres, y down."""
+    gsd = analysis.trajectories.gsd_m
+    if picture is not None:
+        step = max(1, max(picture.shape) // 1600)
+        height, width = picture.shape
+        pale = 255 - (255 - picture[::step, ::step].astype(np.float32)) * 0.55
+        axes.imshow(pale, cmap="gray", vmin=0, vmax=255, extent=(0, width * gsd, height * gsd, 0))
+    for lane in analysis.lanes:
+        axes.plot(*lane.xy_m.T, color="#1b1f24", linewidth=0.9)
+    if picture is None and len(analysis.lanes):
+        axes.invert_yaxis()
+    axes.set_aspect("equal")
+    axes.axis("off")
+
+
+def draw_place(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | None) -> None:
+    """Lanes with arrows, and the junctions' numbers, over the base image."""
+    _draw_map(axes, analysis, picture)
+    for lane in analysis.lanes:
+        if lane.length_m >= 12:
+            at = lane.at(lane.length_m / 2), lane.at(lane.length_m / 2 + 3)
+            style = {"arrowstyle": "-|>", "color": "#1b1f24", "mutation_scale": 11}
+            axes.annotate("", xy=(at[1][0], at[1][1]), xytext=(at[0][0], at[0][1]), arrowprops=style)
+    for junction in analysis.lanes.junctions:
+        if junction.kind in ("intersection", "roundabout"):
+            box = {"facecolor": "white", "edgecolor": "#1b1f24", "boxstyle": "round,pad=0.25"}
+            x, y = junction.centre_m
+            axes.text(x, y, f"J{junction.number}", ha="center", va="center", fontsize=11, fontweight="bold", bbox=box)
+
+
+def draw_turning(axes: "Axes", *, found: JunctionMovements) -> None:
+    """The turning-movement diagram of a junction."""
+    arms = {arm.name: arm for arm in found.gates.arms}
+    angle = {name: np.arctan2(*(arm.xy_m - found.junction.centre_m)[::-1]) for name, arm in arms.items()}
+    most = max(m.seen + m.inferred for m in found.movements)
+    for k, name in enumerate(arms):
+        outward = np.array([np.cos(angle[name]), np.sin(angle[name])])
+        aside = np.array([-outward[1], outward[0]])
+        mine = sorted((m for m in found.movements if m.arm_in == name), key=lambda m: -(m.seen + m.inferred))
+        for rank, m in enumerate(mine):
+            out = np.array([np.cos(angle[m.arm_out]), np.sin(angle[m.arm_out])])
+            out_aside = np.array([-out[1], out[0]])
+            lane = 0.1 + 0.09 * rank
+            start, end = outward - aside * lane, out * 0.97 + out_aside * (0.1 + 0.06 * k)
+            line = _bezier(start, 0.25 * (outward - aside * lane), 0.25 * (out + out_aside * 0.1), end)
+            width = 1.2 + 11 * (m.seen + m.inferred) / most
+            tone = _TONES[k % len(_TONES)]
+            axes.plot(*line[:-4].T, color=tone, linewidth=width, alpha=0.8, solid_capstyle="butt")
+            style = {"arrowstyle": "-|>", "color": tone, "mutation_scale": 9 + 1.4 * width, "linewidth": 0}
+            axes.annotate("", xy=(line[-1, 0], line[-1, 1]), xytext=(line[-8, 0], line[-8, 1]), arrowprops=style)
+        total = sum(m.seen + m.inferred for m in mine)
+        lines = [f"from {name}: {total:.0f}" if mine else f"{name}: exit only"]
+        lines += [
+            f"to {m.arm_out}: {m.seen + m.inferred:.0f}" + (f" ({100 * m.share.value:.0f} %)" if m.share else "")
+            for m in mine
+        ]
+        side = "left" if outward[0] > 0.3 else "right" if outward[0] < -0.3 else "center"
+        up = "top" if outward[1] > 0.7 else "bottom" if outward[1] < -0.7 else "center"
+        axes.text(
+            1.12 * outward[0],
+            1.12 * outward[1],
+            "\n".join(lines),
+            ha=side,
+            va=up,
+            fontsize=9,
+            color=_TONES[k % len(_TONES)],
+        )
+    axes.set(xlim=(-2.2, 2.2), ylim=(1.5, -1.5), aspect="equal")
+    axes.axis("off")
+
+
+def _bezier(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
+    t = np.linspace(0, 1, 60)[:, None]
+    return np.asarray((1 - t) ** 3 * a + 3 * (1 - t) ** 2 * t * b + 3 * (1 - t) * t**2 * c + t**3 * d)
+
+
+def draw_delays(axes: "Axes", *, delays: list[ApproachDelay]) -> None:
+    """Delay by approach with levels of service."""
+    limits = delays[0].limits_s
+    top = max(max(d.delay_s for d in delays) * 1.35, limits[1])
+    for limit in limits:
+        if limit < top:
+            axes.axvline(limit, color="#8a929b", linestyle="--", linewidth=0.8, zorder=0)
+    for k, delay in enumerate(delays):
+        axes.barh(k, delay.delay_s, color="#5b6770", height=0.6)
+        label = f" {delay.level}   {delay.delay_s:.0f} s, {delay.vehicles:.0f} vehicles"
+        axes.text(delay.delay_s, k, label, va="center", fontsize=9, fontweight="bold",
+                  bbox={"facecolor": "white", "edgecolor": "none", "pad": 1})  # fmt: skip
+    axes.set(yticks=range(len(delays)), yticklabels=[f"from {d.arm}" for d in delays], xlabel="delay, s", xlim=(0, top))
+    axes.invert_yaxis()
+
+
+def _window(analysis: TrafficAnalysis) -> tuple[float, float]:
+    begin, end = analysis.window_s
+    middle = (begin + end) / 2
+    return max(begin, middle - _SHOWN_S / 2), min(end, middle + _SHOWN_S / 2)
+
+
+def red_times(stream: StreamSignal, cycle_s: float) -> list[tuple[float, float]]:
+    """Begin and end of red of each cycle; none where the onset of red is not known."""
+    if stream.red_phase_s is None:
+        return []
+    length = (stream.green_phase_s.value - stream.red_phase_s.value) % cycle_s
+    return [(float(green - length), float(green)) for green in stream.green_s]
+
+
+def _cycle_s(analysis: TrafficAnalysis, stream: StreamSignal) -> float:
+    cycle = analysis.signals[stream.stream.approach.junction].cycle_s
+    return cycle.value if cycle else np.inf
+
+
+def draw_time_space(axes: "Axes", *, analysis: TrafficAnalysis, stream: StreamSignal) -> None:
+    """Distance to the stop line against time of every vehicle on an approach, with red at the line."""
+    from matplotlib.collections import LineCollection
+
+    path, line = stream.stream.approach.path_m, stream.stream.stop_line_m or 0.0
+    begin, end = _window(analysis)
+    samples = analysis.samples
+    rows = np.flatnonzero((samples.time_s >= begin) & (samples.time_s <= end))
+    found = cKDTree(path).query(samples.xy_m[rows], distance_upper_bound=_BESIDE_M)
+    away, place = np.asarray(found[0]), np.asarray(found[1])
+    near = np.isfinite(away)
+    rows, place = rows[near], place[near]
+    step = np.gradient(path, axis=0)
+    along_rad = np.arctan2(step[:, 1], step[:, 0])
+    turned = np.angle(np.exp(1j * (samples.direction_rad[rows] - along_rad[place])))
+    rows, place = rows[np.abs(turned) < _AHEAD_RAD], place[np.abs(turned) < _AHEAD_RAD]
+    new = np.flatnonzero((np.diff(samples.track[rows]) != 0) | (np.abs(np.diff(place)) > 15)) + 1
+    points = np.column_stack([samples.time_s[rows], place - line])
+    axes.add_collection(LineCollection(np.split(points, new), colors="#30363d", linewidths=0.8))
+    for red in red_times(stream, _cycle_s(analysis, stream)):
+        axes.plot(red, [0, 0], color=_RED, linewidth=5, solid_capstyle="butt")
+    low = float(points[:, 1].min(initial=-20.0))
+    axes.set(xlim=(begin, end), ylim=(max(low, -120), 40), xlabel="time, s", ylabel="beyond the stop line, m")
+
+
+def draw_queues(axes: "Axes", *, analysis: TrafficAnalysis, streams: list[StreamSignal], names: dict[int, str]) -> None:
+    """Vehicles that stand, by approach, against time."""
+    begin, end = _window(analysis)
+    times = np.arange(begin, end, 1.0)
+    for k, stream in enumerate(streams[: len(_TONES)]):
+        lane = stream.stream.approach.lane
+        counts = [q.vehicles for q in queues(stream.stream, times)]
+        axes.step(times, counts, where="post", color=_TONES[k], linestyle=_STROKES[k % 4], linewidth=1.5,
+                  label=names.get(lane, f"lane {lane}"))  # fmt: skip
+    axes.set(xlabel="time, s", ylabel="vehicles that stand", ylim=(0, None), xlim=(begin, end))
+    axes.legend(loc="upper left", bbox_to_anchor=(0, 1.17), ncols=4, frameon=False, fontsize=9)
+
+
+def draw_speed_profile(axes: "Axes", *, analysis: TrafficAnalysis, lane: int, unit: SpeedUnit) -> None:
+    """p15, p50 and p85 of speed along a lane, with the band of p50."""
+    factor, stations = PER_M_PER_S[unit], [s for s in analysis.profile(lane) if s.p50]
+    at = [s.along_m for s in stations]
+    low, high = ([getattr(s.p50, end) * factor for s in stations] for end in ("low", "high"))
+    axes.fill_between(at, low, high, color="#d5d9de", label="90 % of the median")
+    for name, label, stroke in (("p85", "85 %", "--"), ("p50", "median", "-"), ("p15", "15 %", ":")):
+        known = [(s.along_m, getattr(s, name).value * factor) for s in stations if getattr(s, name)]
+        if known:
+            axes.plot(*np.array(known).T, color="#1b1f24", linestyle=stroke, label=label)
+    axes.set(xlabel="along the lane, m", ylabel=f"speed, {unit}", ylim=(0, None))
+    axes.legend(ncols=4, frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(0, 1.17))
+
+
+def fundamental_points(analysis: TrafficAnalysis) -> FloatArray:
+    """(n, 4): lane, density (veh/km), flow (veh/h), speed (m/s) of each lane and slice with traffic."""
+    begin, end = analysis.window_s
+    rows = []
+    for lane in analysis.lanes:
+        found = flow_slices(analysis.lane_traffic, lane.number, begin, end, slice_s=_SLICE_S)
+        known = np.isfinite(found.speed_m_per_s)
+        columns = found.density_veh_per_km, found.flow_veh_per_h, found.speed_m_per_s
+        rows.append(np.column_stack([np.full(known.sum(), lane.number), *(c[known] for c in columns)]))
+    return np.concatenate(rows) if rows else np.empty((0, 4))
+
+
+def draw_fundamental(axes: "Axes", *, points: FloatArray, per_m_per_s: float, unit: SpeedUnit) -> None:
+    """Flow against density, the lanes apart by their marks; a lane's speed is the slope from the origin."""
+    lanes, counts = np.unique(points[:, 0], return_counts=True)
+    shown = lanes[np.argsort(-counts, kind="stable")][: len(_MARKS)]
+    for k, lane in enumerate(shown):
+        mine = points[points[:, 0] == lane]
+        axes.plot(mine[:, 1], mine[:, 2], _MARKS[k], color=_TONES[k], markersize=5, alpha=0.8, label=f"lane {lane:.0f}")
+    speed = float(np.quantile(points[:, 3], 0.85))
+    right = float(points[:, 1].max())
+    top = float(points[:, 2].max()) * 1.15
+    edge = min(right, top / max(speed * 3.6, 1e-9))
+    axes.plot([0, edge], [0, edge * speed * 3.6], color="#8a929b", linestyle="--")
+    middle = (0.55 * edge, 0.55 * edge * speed * 3.6)
+    axes.annotate(f"{speed * per_m_per_s:.0f} {unit} ", middle, fontsize=9, ha="right", va="bottom")
+    axes.set(xlabel="density, vehicles a km", ylabel="flow, vehicles an hour", xlim=(0, right * 1.05), ylim=(0, top))
+    axes.legend(frameon=False, fontsize=9, ncols=6, loc="upper left", bbox_to_anchor=(0, 1.17), columnspacing=1)
+
+
+def draw_flow(axes: "Axes", *, analysis: TrafficAnalysis, found: JunctionMovements) -> None:
+    """Vehicles that enter a junction in each minute, by arm."""
+    begin, end = analysis.window_s
+    edges = np.arange(begin, end + 1e-9, _SLICE_S)
+    passes, gates = found.passes, found.gates
+    arm = np.array([gate.arm for gate in gates.gates] + [-1])[passes.gate_in]
+    for k, one in enumerate(gates.arms):
+        counts = np.histogram(passes.entry_s[(arm == one.number) & np.isfinite(passes.entry_s)], edges)[0]
+        if counts.any():
+            minutes = np.append(counts, counts[-1])
+            axes.step(edges / 60, minutes, where="post", color=_TONES[k % 6], linestyle=_STROKES[k % 4],
+                      linewidth=1.6, label=f"from {one.name}")  # fmt: skip
+    axes.set(xlabel="time, min", ylabel="vehicles a minute", ylim=(0, None))
+    axes.legend(frameon=False, fontsize=9, ncols=6, loc="upper left", bbox_to_anchor=(0, 1.17))
+
+
+def draw_conflicts(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | None) -> None:
+    """Conflicts by kind on the map."""
+    _draw_map(axes, analysis, picture)
+    likely = [c for c in analysis.conflicts if c.probability >= _LIKELY]
+    for k, kind in enumerate(sorted({c.kind for c in likely})):
+        at = np.array([c.xy_m for c in likely if c.kind == kind])
+        axes.plot(*at.T, _MARKS[k], color=_RED, markeredgecolor="white", markersize=8, label=f"{kind}: {len(at)}")
+    axes.legend(frameon=True, fontsize=9, loc="upper left")

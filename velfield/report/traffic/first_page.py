@@ -1,0 +1,77 @@
+"""The first page: five questions with their answers, and what could not be said."""
+
+from dataclasses import dataclass
+
+from velfield.analysis.answers import duration_text, find_answers
+from velfield.analysis.signals.cycles import queues
+from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.report.traffic.approaches import approach_delays, lane_names
+
+_PER_QUESTION = 3
+
+
+@dataclass(frozen=True)
+class FirstPage:
+    """What was seen, answers by question, and what is missing for the rest."""
+
+    seen: str
+    answers: tuple[tuple[str, tuple[str, ...]], ...]
+    withheld: tuple[str, ...]
+
+    @property
+    def sections(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
+        """The questions, and what could not be said as the last one where there is any."""
+        missing = ("What could not be said, and why", self.withheld)
+        return (*self.answers, missing) if self.withheld else self.answers
+
+
+def first_page(analysis: TrafficAnalysis) -> FirstPage:
+    """The first page's words."""
+    found: dict[str, list[str]] = {}
+    withheld = []
+    for answer in find_answers(analysis):
+        text = f"{answer.subject}: {answer.text}" if answer.subject else answer.text
+        if answer.state == "too little data":
+            withheld.append(f"{answer.topic}: {text}")
+        else:
+            found.setdefault(answer.topic, []).append(text)
+    events = [f"{topic}: {text}" for topic in ("conflicts", "u-turns", "unusual") for text in found.get(topic, [])[:1]]
+    questions = (
+        ("Where do vehicles go?", found.get("movement", []) or found.get("scene", [])),
+        ("Which approach waits longest, and how long are the queues?", _waits(analysis)),
+        ("Is there a signal?", found.get("signal", [])),
+        ("How fast do vehicles drive?", found.get("speed", [])),
+        ("Where is it dangerous?", events),
+    )
+    n = len(analysis.trajectories)
+    seen = f"{n} vehicle{'s' if n != 1 else ''} that move, in {duration_text(analysis.trajectories.duration_s)}"
+    return FirstPage(
+        seen,
+        tuple((question, tuple(lines[:_PER_QUESTION]) or ("Not known.",)) for question, lines in questions),
+        tuple(dict.fromkeys(withheld)),
+    )
+
+
+def _waits(analysis: TrafficAnalysis) -> list[str]:
+    """A line on each junction with a known delay or queue, those with most vehicles first."""
+    out = []
+    for found in sorted(analysis.movements, key=lambda m: -m.volume):
+        number = found.junction.number
+        signal = analysis.signals.get(number)
+        if found.junction.kind not in ("intersection", "roundabout"):
+            continue
+        parts = [f"from {d.arm} {d.delay_s:.0f} s (level of service {d.level})" for d in approach_delays(found, signal)]
+        names = lane_names(found)
+        longest = max(
+            ((q, s) for s in (signal.streams if signal else ()) for q in queues(s.stream, s.green_s)),
+            key=lambda pair: pair[0].length_m,
+            default=None,
+        )
+        line = f"junction {number}: mean delay " + ", ".join(parts) if parts else f"junction {number}:"
+        if longest and longest[0].vehicles:
+            lane = longest[1].stream.approach.lane
+            line += f"; longest queue {names.get(lane, f'lane {lane}')}: "
+            line += f"{longest[0].vehicles} vehicles, {longest[0].length_m:.0f} m"
+        if not line.endswith(":"):
+            out.append(line)
+    return out
