@@ -102,6 +102,8 @@ def contradict_axes(axes: FloatArray, labelled: FloatArray) -> list[str]:
         (n,) of the same cars, by `outline_axes` and by the labels. By right labels 0.76 and more are within 30 degrees
         of each other, by wrong ones a third.
     """
+    if len(axes) < _MIN_CARS:
+        return []
     turns = {
         "as labelled": labelled,
         "counted the other way round": -labelled,
@@ -109,7 +111,7 @@ def contradict_axes(axes: FloatArray, labelled: FloatArray) -> list[str]:
     }
     agreement = {how: float((axial_difference(axes, turn) < _AGREES_RAD).mean()) for how, turn in turns.items()}
     own = agreement.pop("as labelled")
-    if len(axes) < _MIN_CARS or own + 1 / np.sqrt(len(axes)) > _RIGHT_AGREEMENT:
+    if own + 1 / np.sqrt(len(axes)) > _RIGHT_AGREEMENT:
         return []
     how, best = max(agreement.items(), key=lambda item: item[1])
     advice = f"; {best:.0%} are if angles are {how}" if best > max(_RIGHT_AGREEMENT, own + 0.3) else ""
