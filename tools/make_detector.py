@@ -1,6 +1,6 @@
 """Trains the shipped detectors again and prints their accuracy on held-out sites: ``make detector DATA=FOLDER``.
 
-Two hours on two cores; it needs PyTorch (`pip install torch`).
+About 40 minutes on one free core; it needs PyTorch (`pip install torch`).
 """
 
 import sys
@@ -10,7 +10,7 @@ from flows.launch import limit_threads, prepare_process
 
 if __name__ == "__main__":
     if len(sys.argv) != 2:
-        sys.exit("usage: make detector DATA=FOLDER   (one that holds songdo and kit_ais)")
+        sys.exit("usage: make detector DATA=FOLDER   (one that holds the sets of tools.training_data)")
     limit_threads()
     prepare_process(verbose=False)
     import velfield.detection

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from schemas.arrays import FloatArray
-from tools.shipped_detector import read_boxes
+from tools.training_data import read_boxes
 from velfield import open_run
 from velfield.bench.still import SHARP_PX, centre_on_medians, track_corners, unused_corners
 from velfield.registration.alignment import Templates

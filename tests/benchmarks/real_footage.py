@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.shipped_detector import read_boxes
+from tools.training_data import read_boxes
 from velfield import open_run
 from velfield.run.run import Run
 

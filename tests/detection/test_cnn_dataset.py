@@ -240,10 +240,10 @@ def test_unlabelled_orientations_are_filled_in_from_the_image() -> None:
 def test_camouflage_brings_cars_nearer_to_the_road_and_leaves_the_rest() -> None:
     patch = np.full((PATCH_PX, PATCH_PX), 0.4, np.float32)
     patch[44:52, 40:56] = 0.9
-    centre, angle = np.array([[47.5, 47.5]]), np.zeros(1)
+    vehicles = np.array([[47.5, 47.5, 0, 16, 8]])
     contrasts = []
     for seed in range(40):
-        changed = dataset._camouflage_cars(patch.copy(), centre, angle, np.random.default_rng(seed))
+        changed = dataset._camouflage_cars(patch.copy(), vehicles, np.random.default_rng(seed))
         np.testing.assert_array_equal(changed[:30], patch[:30])
         contrasts.append(float(changed[47, 48] - changed[10, 10]))
     assert min(contrasts) < 0.25  # of 0.5
@@ -270,3 +270,28 @@ def test_hard_patches_are_an_option_of_pretraining() -> None:
     plain, hard = PatchDataset([[sample]], [1.0], 0)(0), PatchDataset([[sample]], [1.0], 0, hard=True)(0)
     assert plain.images.shape == hard.images.shape
     assert not np.array_equal(plain.images, hard.images)
+
+
+def test_the_gaussian_of_a_bus_is_longer_along_its_axis_alone() -> None:
+    bus, _, _ = encode_targets(np.array([[48.5, 48.5]]), np.array([np.pi / 2]), np.array([48.0]))
+    car, _, _ = encode_targets(np.array([[48.5, 48.5]]), np.array([np.pi / 2]), np.array([16.0]))
+    np.testing.assert_allclose(bus[24], car[24], atol=1e-6)
+    assert (bus[22, 24], bus[26, 24]) == pytest.approx((car[24, 22] ** (1 / 3),) * 2, rel=1e-4)
+
+
+def test_the_losses_of_video_keep_a_patch_and_its_range() -> None:
+    patch = patches(bars()).images[0]
+    lossy = dataset._compress(patch, np.random.default_rng(0))
+    assert lossy.shape == patch.shape
+    assert 0 <= lossy.min() < lossy.max() <= 1
+    assert 0.002 < np.abs(lossy - patch).mean() < 0.1
+
+
+def test_patches_are_centred_near_long_vehicles_more_often() -> None:
+    image = np.zeros((400, 400), np.uint8)
+    cars = np.array([[100.0, 100, 0, 16, 7], [300.0, 300, 0, 45, 9]])
+    rng = np.random.default_rng(0)
+    matrices = [_random_similarity(sample(image, cars), rng, large_weight=5.0) for _ in range(400)]
+    inside = [(np.abs(cars[:, :2] @ m[:, :2].T + m[:, 2] - PATCH_PX / 2) < PATCH_PX / 2).all(axis=1) for m in matrices]
+    of_car, of_bus = np.mean(inside, axis=0)
+    assert of_bus > 2.5 * of_car

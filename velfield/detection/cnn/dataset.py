@@ -2,18 +2,21 @@
 
 A patch is cut by a random similarity transform (position, rotation, mirroring, scale) and then augmented
 photometrically (gamma, contrast, brightness, blur, a shadow's edge, noise), to resemble images of other sensors and in
-other light. Targets are a Gaussian heatmap of car centres and the orientation at each heatmap pixel.
+other light. For pre-training there are also inverted polarity (as heat has), haze, the losses of compressed video, cars
+in the tone of the road, and cars that the image's edge cuts. Targets are a heatmap with a Gaussian at each vehicle's
+centre, and the orientation at each of its pixels.
 """
 
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from math import cos, sin
+from math import cos, sin, sqrt
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from schemas.arrays import Float32Array, FloatArray, Mask
+from schemas.arrays import Float32Array, FloatArray, IntArray, Mask
 from velfield.detection.cnn.network import STRIDE
 from velfield.detection.cnn.trainer import Batch
 from velfield.detection.orientation import fill_missing_orientation
@@ -22,7 +25,11 @@ from velfield.detection.samples import LabelledImage
 PATCH_PX = 96
 """Side of a patch: six cars."""
 BATCH_SIZE = 16
+USUAL_SIZE_PX = 16.0, 7.2
+"""Length and width of a usual car, working px: of a vehicle whose label gives none."""
 HEATMAP_SIGMA_PX = 2.2
+"""Of a car, and of any vehicle across its axis. Along the axis it grows with the square root of the length: the centre
+of a bus is less sharp. In pre-training only."""
 _CENTRED_FRACTION, _CENTRING_SD_PX = 0.7, 19.0
 """Fraction of the patches that are centred near a labelled car, and standard deviation of that position."""
 _LOG_SCALE_RANGE = 0.2
@@ -36,16 +43,33 @@ _SHADOW_PROBABILITY, _SHADOW_DEPTH, _SHADOW_EDGE_SIGMA_PX = 0.25, (0.2, 0.6), (0
 _MAX_NOISE_SD = 0.03
 _TARGET_MARGIN_PX = 8
 """Cars beyond the border of a patch by no more than this still show in its targets."""
-_HEATMAP_REACH = 8
-"""Pixels of the heatmap: farther from a car's centre its Gaussian is below 1e-11, and zero is taken."""
+_HEATMAP_REACH = 10
+"""Pixels of the heatmap: farther from a vehicle's centre its Gaussian is below 1e-6, and zero is taken."""
 _HEATMAP_PX = np.arange(PATCH_PX // STRIDE) * STRIDE + (STRIDE - 1) / 2
 """Positions of the heatmap's rows and columns in the patch, px."""
 
 _CAMOUFLAGE_PROBABILITY, _CAMOUFLAGED_FRACTION = 0.5, 0.5
 """Of the patches, and of the cars in such a patch."""
 _CAMOUFLAGE_CONTRAST, _CAMOUFLAGE_SHIFT = (0.25, 0.9), (-0.08, 0.02)
-_CAR_HALF_PX, _ROAD_MEDIAN_PX = (10.0, 5.5), 31
+_COVER_RATIO, _ROAD_MEDIAN_PX = (1.25, 1.5), 31
+"""Length and width of what is redrawn, over the vehicle's."""
 _EDGE_PROBABILITY = 0.12
+_LARGE_RATIO, _LARGE_WEIGHT = 1.35, 5.0
+"""A vehicle this many times as long as a car is that many times as often the one that a patch is centred near."""
+_INVERSION_PROBABILITY = 0.1
+_HAZE_PROBABILITY, _HAZE_CONTRAST, _HAZE_LEVEL = 0.15, (0.15, 0.5), (0.4, 0.8)
+_VIDEO_PROBABILITY, _VIDEO_QUALITY, _VIDEO_REDUCTION = 0.25, (12, 60), (0.6, 1.0)
+
+
+class Patch(NamedTuple):
+    """A patch and its targets, in the order of `Batch`; its vehicles (n, 5): x, y, axis, length and width, px of it."""
+
+    image: Float32Array
+    heatmap: Float32Array
+    mask: Float32Array
+    orientation: Float32Array
+    orientation_weight: Float32Array
+    vehicles: FloatArray
 
 
 class PatchDataset:
@@ -70,46 +94,55 @@ class PatchDataset:
         self._groups = [[_with_orientations(sample) for sample in group] for group in groups]
         self._probabilities = np.array(weights, float) / np.sum(weights)
         self._seed = seed
-        self._pool = ThreadPoolExecutor(1)
+        self._pool: ThreadPoolExecutor | None = None
         self._next: tuple[int, Future[Batch]] | None = None
 
     def __call__(self, step: int) -> Batch:
         """Batch of a step; that of the next step is prepared in the background."""
-        prepared, self._next = self._next, (step + 1, self._pool.submit(self._make_batch, step + 1))
-        return prepared[1].result() if prepared is not None and prepared[0] == step else self._make_batch(step)
+        self._pool = self._pool or ThreadPoolExecutor(1)
+        prepared, self._next = self._next, (step + 1, self._pool.submit(self.make_batch, step + 1))
+        return prepared[1].result() if prepared is not None and prepared[0] == step else self.make_batch(step)
 
-    def _make_batch(self, step: int) -> Batch:
+    def make_batch(self, step: int) -> Batch:
+        """Batch of a step."""
+        return to_batch(self.make_patches(step))
+
+    def make_patches(self, step: int) -> list[Patch]:
+        """The patches of a step."""
         rng = np.random.default_rng((self._seed, step))
         patches = []
         for _ in range(BATCH_SIZE):
             group = self._groups[rng.choice(len(self._groups), p=self._probabilities)]
             patches.append(_sample_patch(group[rng.integers(len(group))], rng, hard=self._hard))
-        return Batch(*(np.stack(part) for part in zip(*patches, strict=True)))
+        return patches
+
+
+def to_batch(patches: Sequence[Patch]) -> Batch:
+    """Patches as a batch of training, without their vehicles."""
+    return Batch(*(np.stack(part) for part in list(zip(*patches, strict=True))[:-1]))
 
 
 def _with_orientations(sample: LabelledImage) -> LabelledImage:
     return replace(sample, cars=fill_missing_orientation(sample.image, sample.cars, sample.abs_box_angle_rad))
 
 
-def _sample_patch(
-    sample: LabelledImage, rng: np.random.Generator, *, hard: bool = False
-) -> tuple[Float32Array, Float32Array, Float32Array, Float32Array, Float32Array]:
-    """A patch and its targets, in the order of `Batch`."""
-    matrix = _random_similarity(sample, rng)
+def _sample_patch(sample: LabelledImage, rng: np.random.Generator, *, hard: bool = False) -> Patch:
+    matrix = _random_similarity(sample, rng, large_weight=_LARGE_WEIGHT if hard else 1.0)
     rows, columns, window_matrix = _source_window(matrix, sample.image.shape)
     image = sample.image[rows, columns].astype(np.float32)
     patch = cv2.warpAffine(image, window_matrix, (PATCH_PX, PATCH_PX), borderMode=cv2.BORDER_REFLECT_101)
     patch *= np.float32(1 / 255)
-    centres = sample.cars[:, :2] @ matrix[:, :2].T + matrix[:, 2]
+    vehicles, scale = sample.cars[:, :5].copy(), float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
+    vehicles[:, :2] = vehicles[:, :2] @ matrix[:, :2].T + matrix[:, 2]
     direction = np.column_stack([np.cos(sample.cars[:, 2]), np.sin(sample.cars[:, 2])]) @ matrix[:, :2].T
-    angles = np.arctan2(direction[:, 1], direction[:, 0])
+    vehicles[:, 2] = np.arctan2(direction[:, 1], direction[:, 0])
+    vehicles[:, 3:] *= scale
     if hard:
-        patch = _camouflage_cars(patch, centres, angles, rng)
-    heatmap, orientation, orientation_weight = encode_targets(centres, angles)
+        patch = _camouflage_cars(patch, vehicles, rng)
+    heatmap, orientation, weight = encode_targets(vehicles[:, :2], vehicles[:, 2], vehicles[:, 3] if hard else None)
     valid = np.ones(image.shape, np.uint8) if sample.valid is None else sample.valid[rows, columns].astype(np.uint8)
     on_heatmap = window_matrix / STRIDE  # every second pixel of the patch
     mask = cv2.warpAffine(valid, on_heatmap, (len(_HEATMAP_PX), len(_HEATMAP_PX)), flags=cv2.INTER_NEAREST) > 0
-    scale = float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
     circles = np.column_stack([sample.ignore[:, :2] @ matrix[:, :2].T + matrix[:, 2], scale * sample.ignore[:, 2]])
     reach = circles[:, 2:] + STRIDE
     nearby = ((circles[:, :2] > -reach) & (circles[:, :2] < PATCH_PX + reach)).all(axis=1)
@@ -118,23 +151,23 @@ def _sample_patch(
         mask &= ~ignored | (heatmap > 0.1)
     if hard and rng.random() < _EDGE_PROBABILITY:
         patch = _cut_by_edge(patch, mask, rng)
-    return _augment_photometry(patch, rng), heatmap, mask.astype(np.float32), orientation, orientation_weight * mask
+    patch = _augment_photometry(patch, rng, hard=hard)
+    return Patch(patch, heatmap, mask.astype(np.float32), orientation, weight * mask, vehicles)
 
 
-def _camouflage_cars(
-    patch: Float32Array, centres: FloatArray, angles: FloatArray, rng: np.random.Generator
-) -> Float32Array:
+def _camouflage_cars(patch: Float32Array, vehicles: FloatArray, rng: np.random.Generator) -> Float32Array:
     """Draw some cars in a tone nearer to that of the road about them, and darker: what a detector misses most."""
-    near = np.flatnonzero(((centres > -_TARGET_MARGIN_PX) & (centres < PATCH_PX + _TARGET_MARGIN_PX)).all(axis=1))
+    near = _near_patch(vehicles)
     if not len(near) or rng.random() > _CAMOUFLAGE_PROBABILITY:
         return patch
     road = cv2.medianBlur((np.clip(patch, 0, 1) * 255).astype(np.uint8), _ROAD_MEDIAN_PX).astype(np.float32) / 255
     y, x = np.mgrid[:PATCH_PX, :PATCH_PX].astype(np.float32)
-    for (cx, cy), angle in zip(centres[near], angles[near], strict=True):
+    for cx, cy, angle, length, width in with_usual_size(vehicles[near]):
         if rng.random() > _CAMOUFLAGED_FRACTION:
             continue
-        along = np.abs(np.cos(angle) * (x - cx) + np.sin(angle) * (y - cy)) / _CAR_HALF_PX[0]
-        across = np.abs(-np.sin(angle) * (x - cx) + np.cos(angle) * (y - cy)) / _CAR_HALF_PX[1]
+        half_length, half_width = _COVER_RATIO[0] * length / 2, _COVER_RATIO[1] * width / 2
+        along = np.abs(np.cos(angle) * (x - cx) + np.sin(angle) * (y - cy)) / half_length
+        across = np.abs(-np.sin(angle) * (x - cx) + np.cos(angle) * (y - cy)) / half_width
         cover = np.clip(3 - 2 * np.maximum(along, across), 0, 1).astype(np.float32)
         contrast, darker = rng.uniform(*_CAMOUFLAGE_CONTRAST), rng.uniform(*_CAMOUFLAGE_SHIFT)
         patch = patch * (1 - cover) + cover * (road + contrast * (patch - road) + darker)
@@ -154,11 +187,16 @@ def _cut_by_edge(patch: Float32Array, mask: Mask, rng: np.random.Generator) -> F
     return np.asarray(cut, np.float32)
 
 
-def _random_similarity(sample: LabelledImage, rng: np.random.Generator) -> FloatArray:
+def _random_similarity(sample: LabelledImage, rng: np.random.Generator, *, large_weight: float = 1.0) -> FloatArray:
     """Affine matrix (2, 3) from image to patch: centred near a car or anywhere, rotated, mirrored, scaled."""
     height, width = sample.image.shape
     if len(sample.cars) and rng.random() < _CENTRED_FRACTION:
-        centre = sample.cars[rng.integers(len(sample.cars)), :2] + rng.normal(0, _CENTRING_SD_PX, 2)
+        if large_weight == 1.0:
+            chosen = int(rng.integers(len(sample.cars)))
+        else:
+            chance = np.where(sample.cars[:, 3] > _LARGE_RATIO * USUAL_SIZE_PX[0], large_weight, 1.0)
+            chosen = int(np.searchsorted(np.cumsum(chance), rng.random() * chance.sum(), side="right"))
+        centre = sample.cars[chosen, :2] + rng.normal(0, _CENTRING_SD_PX, 2)
     else:
         centre = rng.uniform(0, (width, height))
     angle, scale = rng.uniform(0, 2 * np.pi), np.exp(rng.uniform(-_LOG_SCALE_RANGE, _LOG_SCALE_RANGE))
@@ -183,37 +221,66 @@ def _source_window(matrix: FloatArray, shape: tuple[int, ...]) -> tuple[slice, s
     return slice(first[1], last[1] + 1), slice(first[0], last[0] + 1), shifted
 
 
-def encode_targets(centres: FloatArray, orientation_rad: FloatArray) -> tuple[Float32Array, Float32Array, Float32Array]:
+def _near_patch(vehicles: FloatArray) -> IntArray:
+    """Rows of vehicles (n, 2...) whose centre is in the patch, or near its border."""
+    xy = vehicles[:, :2]
+    return np.flatnonzero(((xy > -_TARGET_MARGIN_PX) & (xy < PATCH_PX + _TARGET_MARGIN_PX)).all(axis=1))
+
+
+def with_usual_size(vehicles: FloatArray) -> FloatArray:
+    """Vehicles (n, 5), those of unknown length or width with that of a usual car."""
+    return np.column_stack([vehicles[:, :3], np.where(np.isfinite(vehicles[:, 3:5]), vehicles[:, 3:5], USUAL_SIZE_PX)])
+
+
+def encode_targets(
+    centres: FloatArray, orientation_rad: FloatArray, lengths_px: FloatArray | None = None
+) -> tuple[Float32Array, Float32Array, Float32Array]:
     """Target maps of a patch.
 
     Parameters
     ----------
-    centres, orientation_rad
-        (n, 2) positions and (n,) axial orientations of cars in the patch, px and rad.
+    centres, orientation_rad, lengths_px
+        (n, 2) positions, (n,) axial orientations and lengths of vehicles in the patch, px and rad; NaN or none: of a
+        usual car.
 
     Returns
     -------
-    (m, m) heatmap, 1 at a car's centre and a Gaussian around it (the highest one where cars overlap); (m, m, 2) cosine
-    and sine of twice the orientation of that car; (m, m) weight of the orientation in the loss. m = `PATCH_PX` /
-    `STRIDE`.
+    (m, m) heatmap, 1 at a vehicle's centre and a Gaussian around it (the highest one where they overlap); (m, m, 2)
+    cosine and sine of twice the orientation of that vehicle; (m, m) weight of the orientation in the loss. m =
+    `PATCH_PX` / `STRIDE`.
     """
-    size = len(_HEATMAP_PX)
-    heatmap, orientation = np.zeros((size, size), np.float32), np.zeros((size, size, 2), np.float32)
-    near = ((centres > -_TARGET_MARGIN_PX) & (centres < PATCH_PX + _TARGET_MARGIN_PX)).all(axis=1)
-    squared_distance = (_HEATMAP_PX - centres[near, :2, None]) ** 2
-    profiles = np.exp(-squared_distance / (2 * HEATMAP_SIGMA_PX**2)).astype(np.float32)
-    cells = np.rint((centres[near] - _HEATMAP_PX[0]) / STRIDE).astype(int)
-    for (along_x, along_y), (x, y), angle in zip(profiles, cells, orientation_rad[near], strict=True):
-        rows, columns = (slice(max(0, at - _HEATMAP_REACH), max(0, at + _HEATMAP_REACH + 1)) for at in (y, x))
-        gaussian, part = along_y[rows, None] * along_x[columns], heatmap[rows, columns]
-        nearest = gaussian > part
-        part[nearest] = gaussian[nearest]
-        orientation[rows, columns][nearest] = cos(2 * angle), sin(2 * angle)
+    lengths = np.full(len(centres), np.nan) if lengths_px is None else lengths_px
+    heatmap, number = highest_gaussians(np.column_stack([centres, orientation_rad, lengths]))
+    vectors = np.column_stack([np.cos(2 * orientation_rad), np.sin(2 * orientation_rad)]).astype(np.float32)
+    orientation = np.concatenate([vectors, np.zeros((1, 2), np.float32)])[number]
     return heatmap, orientation, np.square(heatmap)
 
 
-def _augment_photometry(patch: Float32Array, rng: np.random.Generator) -> Float32Array:
-    """Photometric augmentation: gamma, contrast, brightness, blur, shadow, noise; grey stays in [0, 1]."""
+def highest_gaussians(vehicles: FloatArray) -> tuple[Float32Array, IntArray]:
+    """Heatmap (m, m) of vehicles (n, 4...) as x, y, axis, length, and whose Gaussian each pixel shows; -1: none's."""
+    size = len(_HEATMAP_PX)
+    heatmap, number = np.zeros((size, size), np.float32), np.full((size, size), -1)
+    for k in _near_patch(vehicles):
+        x, y, angle, length = vehicles[k, :4]
+        column, row = np.rint((vehicles[k, :2] - _HEATMAP_PX[0]) / STRIDE).astype(int)
+        rows, columns = (slice(max(0, at - _HEATMAP_REACH), max(0, at + _HEATMAP_REACH + 1)) for at in (row, column))
+        dx, dy = _HEATMAP_PX[None, columns] - x, _HEATMAP_PX[rows, None] - y
+        c, s, longer = cos(angle), sin(angle), max(np.nan_to_num(length) / USUAL_SIZE_PX[0], 1.0)
+        along, across = (dx * c + dy * s) / sqrt(longer), dy * c - dx * s
+        gaussian = np.exp(-(along * along + across * across) / (2 * HEATMAP_SIGMA_PX**2)).astype(np.float32)
+        nearest = gaussian > heatmap[rows, columns]
+        heatmap[rows, columns][nearest] = gaussian[nearest]
+        number[rows, columns][nearest] = k
+    return heatmap, number
+
+
+def _augment_photometry(patch: Float32Array, rng: np.random.Generator, *, hard: bool = False) -> Float32Array:
+    """Photometric augmentation: gamma, contrast, brightness, blur, shadow, noise; grey stays in [0, 1].
+
+    ``hard`` adds inverted polarity, haze and the losses of video.
+    """
+    if hard and rng.random() < _INVERSION_PROBABILITY:
+        patch = 1 - patch
     grey = cv2.pow(np.clip(patch, 0, 1), float(np.exp(rng.uniform(-_LOG_GAMMA_RANGE, _LOG_GAMMA_RANGE))))
     contrast, brightness = rng.uniform(*_CONTRAST_RANGE), rng.uniform(-_BRIGHTNESS_RANGE, _BRIGHTNESS_RANGE)
     grey *= np.float32(contrast)
@@ -222,8 +289,24 @@ def _augment_photometry(patch: Float32Array, rng: np.random.Generator) -> Float3
         grey = cv2.GaussianBlur(grey, (0, 0), rng.uniform(*_BLUR_SIGMA_PX))
     if rng.random() < _SHADOW_PROBABILITY:
         grey *= 1 - np.float32(rng.uniform(*_SHADOW_DEPTH)) * _random_shadow(rng)
+    if hard and rng.random() < _HAZE_PROBABILITY:
+        share, level = np.float32(rng.uniform(*_HAZE_CONTRAST)), np.float32(rng.uniform(*_HAZE_LEVEL))
+        grey = share * grey + (1 - share) * level
     grey += rng.normal(0, rng.uniform(0, _MAX_NOISE_SD), grey.shape).astype(np.float32)
-    return np.asarray(np.clip(grey, 0, 1, out=grey), np.float32)
+    grey = np.clip(grey, 0, 1, out=grey)
+    if hard and rng.random() < _VIDEO_PROBABILITY:
+        grey = _compress(grey, rng)
+    return np.asarray(grey, np.float32)
+
+
+def _compress(grey: Float32Array, rng: np.random.Generator) -> Float32Array:
+    """A patch as a frame of video that was made smaller, compressed and made larger again."""
+    side = round(PATCH_PX * rng.uniform(*_VIDEO_REDUCTION))
+    small = cv2.resize(grey, (side, side), interpolation=cv2.INTER_AREA)
+    quality = int(rng.integers(*_VIDEO_QUALITY))
+    _, coded = cv2.imencode(".jpg", np.rint(small * 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    decoded = np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.float32) / 255
+    return np.asarray(cv2.resize(decoded, (PATCH_PX, PATCH_PX), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def _random_shadow(rng: np.random.Generator) -> Float32Array:
