@@ -374,6 +374,11 @@ QUESTIONS = {
         ),
         "augmented or repeated",
     ),
+    "no finite number": (
+        "l.json",
+        coco("a.png", [{"image_id": 1, "category_id": 3, "bbox": [5, 5, float("inf"), 9]}]),
+        "no finite number",
+    ),
     "a document type": ("l.xml", "<!DOCTYPE a [<!ENTITY b 'c'>]><annotations/>", "document type"),
 }
 

@@ -54,7 +54,10 @@ class Parsed:
     ) -> None:
         """Add a shape."""
         turn = None if rotation_deg is None else math.radians(rotation_deg)
-        self.annotations.append(Annotation(image, label, [(float(p[0]), float(p[1])) for p in points], turn))
+        places = [(float(point[0]), float(point[1])) for point in points]
+        if not all(map(math.isfinite, (*(value for place in places for value in place), turn or 0.0))):
+            raise ValueError("a position or an angle that is no finite number")
+        self.annotations.append(Annotation(image, label, places, turn))
 
 
 def box_points(x: Any, y: Any, w: Any, h: Any) -> list[Point]:
