@@ -138,7 +138,7 @@ def test_without_a_cycle_there_is_no_signal(analysis: TrafficAnalysis) -> None:
     rng = np.random.default_rng(0)
     scattered = [replace(s, head_time_s=np.sort(rng.uniform(0, 480, len(s.head_time_s)))) for s in streams]
     assert find_signal(0, scattered, 0.0, 480.0).signalised is False
-    few = [replace(s, head_time_s=s.head_time_s[:2], cross_time_s=s.cross_time_s[:3]) for s in streams]
+    few = [replace(s, head_time_s=s.head_time_s[:1]) for s in streams]
     assert find_signal(0, few, 0.0, 480.0).signalised is None
 
 

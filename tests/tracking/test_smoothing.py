@@ -1,99 +1,92 @@
-"""Smoothing of positions: against the least squares that it solves, and against the truth."""
+"""Smoothing of positions whose errors last: against the least squares that it solves, and against the truth."""
 
 import numpy as np
 import pytest
 
-from velfield.tracking.smoothing import ACCELERATION_NOISE, estimate_position_error, smooth_paths
-
-
-def true_path(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Uneven times (n,), and positions (n, 2) of a vehicle that brakes, waits, and turns off."""
-    rng = np.random.default_rng(seed)
-    time_s = np.cumsum(rng.choice([0.2, 0.3, 0.4], n, p=[0.8, 0.1, 0.1]))
-    fine = np.arange(0, time_s[-1] + 0.02, 0.01)
-    speed = 6 + 6 * np.cos(fine * 2 * np.pi / 20)
-    heading = 0.8 * np.tanh((fine - 14) / 2)
-    steps = 0.01 * speed[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
-    path = np.cumsum(steps, axis=0)
-    return time_s, np.column_stack([np.interp(time_s, fine, path[:, k]) for k in range(2)])
-
-
-def least_squares(time_s: np.ndarray, x: np.ndarray, error: float) -> np.ndarray:
-    """The positions that agree best with the measured ones and with a velocity that changes by white noise."""
-    n = len(x)
-    rows, values = [], []
-    for i in range(n):
-        row = np.zeros(2 * n)
-        row[2 * i] = 1 / error
-        rows.append(row)
-        values.append(x[i] / error)
-    first_speed = np.zeros(2 * n)
-    first_speed[1] = 1 / 20.0
-    rows.append(first_speed)
-    values.append(0.0)
-    for i in range(n - 1):
-        dt = time_s[i + 1] - time_s[i]
-        covariance = ACCELERATION_NOISE * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-        whiten = np.linalg.inv(np.linalg.cholesky(covariance))
-        motion = np.array([[1, dt], [0, 1]])
-        block = np.zeros((2, 2 * n))
-        block[:, 2 * i : 2 * i + 2], block[:, 2 * i + 2 : 2 * i + 4] = -motion, np.eye(2)
-        rows.extend(whiten @ block)
-        values.extend([0.0, 0.0])
-    return np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)[0][::2]
+from tests.analysis.noisy_tracks import Noise, add_noise, driven
+from velfield.tracking.smoothing import (
+    ACCELERATION_NOISE,
+    PositionErrors,
+    clean_tracks,
+    measure_errors,
+    smooth_paths,
+)
 
 
 def test_it_is_the_least_squares_of_the_whole_track() -> None:
-    time_s, xy = true_path(5, 40)
     rng = np.random.default_rng(5)
-    seen = xy + rng.normal(0, 0.4, xy.shape)
-    found = smooth_paths(np.array([0, 25, 40]), time_s, seen, 0.4).xy_m
+    time_s = np.cumsum(rng.choice([0.2, 0.3, 0.4], 40))
+    seen = np.column_stack([8 * time_s, 0.2 * time_s**2]) + rng.normal(0, 0.4, (40, 2))
+    errors = PositionErrors(0.2, 0.4, 1.1)
+    found = smooth_paths(np.array([0, 25, 40]), time_s, seen, errors).xy_m
     for rows in (slice(0, 25), slice(25, 40)):
-        for axis in range(2):
-            expected = least_squares(time_s[rows], seen[rows, axis], 0.4)
-            assert np.abs(found[rows, axis] - expected).max() < 1e-6
+        t = time_s[rows]
+        n, precision = len(t), np.linalg.inv(errors.covariance(t))
+        bend = np.zeros((n - 2, n))
+        for i in range(1, n - 1):
+            before, after = t[i] - t[i - 1], t[i + 1] - t[i]
+            row = np.array([1 / before, -1 / before - 1 / after, 1 / after]) / np.sqrt((before + after) / 2)
+            bend[i - 1, i - 1 : i + 2] = row / np.sqrt(ACCELERATION_NOISE)
+        expected = np.linalg.solve(precision + bend.T @ bend, precision @ seen[rows])
+        assert np.abs(found[rows] - expected).max() < 1e-4
 
 
-@pytest.mark.parametrize("error_m", [0.1, 0.3, 0.6])
-def test_the_error_is_measured_and_halved(error_m: float) -> None:
-    found, before, after, claimed = [], [], [], []
-    for seed in range(20):
-        time_s, xy = true_path(seed, 110)
-        seen = xy + np.random.default_rng(seed).normal(0, error_m, xy.shape)
-        first = np.array([0, len(xy)])
-        estimate = estimate_position_error(first, time_s, seen)
-        assert estimate is not None
-        smoothed = smooth_paths(first, time_s, seen, estimate)
-        found.append(estimate)
-        before.append(seen - xy)
-        after.append(smoothed.xy_m - xy)
-        claimed.append(smoothed.position_sd_m)
-    assert np.mean(found) == pytest.approx(error_m, rel=0.1)
-    left = float(np.sqrt(np.mean(np.square(after))))
-    assert left < {0.1: 0.75, 0.3: 0.6, 0.6: 0.5}[error_m] * float(np.sqrt(np.mean(np.square(before))))
-    assert left == pytest.approx(float(np.sqrt(np.mean(np.square(claimed)))), rel=0.25)
+@pytest.mark.parametrize(
+    "noise", [Noise(0.2), Noise(0.5), Noise(1.0), Noise(0.05, 0.3, 1.0), Noise(0.05, 0.6, 1.5)], ids=str
+)
+def test_errors_are_measured_and_made_smaller(noise: Noise) -> None:
+    tracks = driven()
+    seen = add_noise(tracks, noise, seed=1)
+    errors = measure_errors(tracks.first, tracks.time_s, seen)
+    assert errors is not None
+    assert errors.total_m == pytest.approx(np.hypot(noise.white_m, noise.lasting_m), rel=0.35)
+    smoothed = smooth_paths(tracks.first, tracks.time_s, seen, errors)
+    left, before = (float(np.sqrt(np.mean((xy - tracks.xy_m) ** 2))) for xy in (smoothed.xy_m, seen))
+    assert left < (0.95 if noise.lasting_m else 0.6) * before
+    assert 0.6 * left < smoothed.position_sd_m < 1.9 * left
 
 
-def test_positions_without_errors_have_none() -> None:
-    time_s, xy = true_path(1, 110)
-    estimate = estimate_position_error(np.array([0, len(xy)]), time_s, xy)
-    assert estimate is not None
-    assert estimate < 0.01
+def test_a_vehicle_that_stands_is_at_one_place() -> None:
+    time_s = np.arange(0, 40, 0.2)
+    along = np.where(time_s < 12, 10 * time_s, np.where(time_s < 30, 120.0, 120.0 + 10 * (time_s - 30)))
+    true = np.column_stack([along, 0 * along])
+    rng = np.random.default_rng(0)
+    errors = PositionErrors(0.05, 0.3, 1.0)
+    seen = true + rng.normal(size=(2, len(time_s))).T @ np.diag([0.05, 0.05])
+    seen += np.linalg.cholesky(errors.covariance(time_s)) @ rng.normal(size=true.shape)
+    found = smooth_paths(np.array([0, len(time_s)]), time_s, seen, errors).xy_m
+    waits = (time_s > 16) & (time_s < 26)
+    assert np.ptp(seen[waits], axis=0).min() > 0.5
+    assert np.ptp(found[waits], axis=0).max() < 0.02
 
 
-def test_of_four_positions_nothing_is_known() -> None:
-    time_s, xy = true_path(1, 8)
-    assert estimate_position_error(np.array([0, 4, 8]), time_s, xy) is None
-    smoothed = smooth_paths(np.array([0, 1, 8]), time_s, xy, 0.2)  # a track of one position stays where it is
-    assert smoothed.xy_m[0] == pytest.approx(xy[0])
+def test_positions_without_errors_stay_and_a_jump_is_cut() -> None:
+    tracks = driven()
+    owner = np.repeat(np.arange(len(tracks.first) - 1), np.diff(tracks.first))
+    clean = clean_tracks(owner, tracks.time_s, tracks.xy_m)
+    assert clean.errors is None
+    assert clean.cuts == 0
+    np.testing.assert_array_equal(clean.xy_m, tracks.xy_m)
+    jumped = tracks.xy_m.copy()
+    a, b = tracks.first[3], tracks.first[4]
+    middle = (a + b) // 2
+    jumped[middle:b] += [0.0, 7.0]
+    cut = clean_tracks(owner, tracks.time_s, jumped)
+    assert cut.cuts == 1
+    assert (cut.track[a:middle] == 3).all()
+    assert len(np.unique(cut.track[middle:b])) == 1
+    assert cut.track[middle] not in owner
 
 
-def test_a_vehicle_twice_at_one_time_is_one_more_measurement() -> None:
-    time_s, xy = true_path(2, 60)
-    seen = xy + np.random.default_rng(2).normal(0, 0.3, xy.shape)
-    time_s, seen = np.insert(time_s, 30, time_s[30]), np.insert(seen, 30, seen[30] + 0.2, axis=0)
-    error = estimate_position_error(np.array([0, 61]), time_s, seen)
-    assert error == pytest.approx(0.3, rel=0.25)
-    smoothed = smooth_paths(np.array([0, 61]), time_s, seen, 0.3)
-    assert np.isfinite(smoothed.xy_m).all()
-    assert smoothed.xy_m[30] == pytest.approx(smoothed.xy_m[31], abs=1e-9)
+def test_of_few_positions_nothing_is_known() -> None:
+    time_s = 0.2 * np.arange(8)
+    assert measure_errors(np.array([0, 4, 8]), time_s, np.column_stack([time_s, time_s])) is None
+
+
+def test_tracks_do_not_touch_each_other() -> None:
+    tracks = driven()
+    seen, errors = add_noise(tracks, Noise(0.3, 0.3, 1.0), seed=2), PositionErrors(0.3, 0.3, 1.0)
+    whole = smooth_paths(tracks.first, tracks.time_s, seen, errors).xy_m
+    a, b = int(tracks.first[5]), int(tracks.first[6])
+    alone = smooth_paths(np.array([0, b - a]), tracks.time_s[a:b], seen[a:b], errors).xy_m
+    assert np.abs(whole[a:b] - alone).max() < 1e-5

@@ -143,7 +143,7 @@ class TrafficAnalysis:
     @cached_property
     def reversals(self) -> list[Reversal]:
         """U-turns."""
-        return find_reversals(self.samples, self.lanes)
+        return find_reversals(self.samples, self.lanes, position_sd_m=self.trajectories.position_sd_m)
 
     @cached_property
     def streams(self) -> dict[int, list[Stream]]:

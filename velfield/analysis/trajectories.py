@@ -48,6 +48,8 @@ class Trajectories:
         Metres a base pixel.
     measured_length_m
         (n,) lengths of the vehicles, NaN where one was not measured; None: none was.
+    position_sd_m
+        Standard deviation of a position along one axis, of errors that last; 0: less than a lane's width matters to.
     """
 
     track_id: IntArray
@@ -58,6 +60,7 @@ class Trajectories:
     velocity_m_per_s: FloatArray
     gsd_m: float
     measured_length_m: FloatArray | None = None
+    position_sd_m: float = 0.0
 
     def __len__(self) -> int:
         return len(self.track_id)
@@ -109,6 +112,7 @@ class Trajectories:
             self.velocity_m_per_s[rows],
             self.gsd_m,
             None if self.measured_length_m is None else self.measured_length_m[keep],
+            self.position_sd_m,
         )
 
 
@@ -130,6 +134,7 @@ def make_trajectories(
     *,
     gsd_m: float,
     displacement_m: FloatArray | None = None,
+    position_sd_m: float = 0.0,
 ) -> Trajectories:
     """Trajectories of positions (m,) in any order; those of a track at one time are taken once.
 
@@ -142,6 +147,8 @@ def make_trajectories(
     displacement_m
         (m, 2) measured displacement to the track's next position, NaN where there is none; more accurate than the
         difference of the positions.
+    position_sd_m
+        Standard deviation of a position along one axis, of errors that last.
     """
     same = track[1:] == track[:-1]
     if (track[1:] < track[:-1]).any() or (same & (time_s[1:] <= time_s[:-1])).any():
@@ -158,7 +165,7 @@ def make_trajectories(
         np.copyto(step, displacement_m, where=known[:, None])
         _bridge(first, time_s, step, known, _BRIDGE_S, _BRIDGE_M)
     xy, velocity = _smooth(first, time_s, xy_m, step, _SMOOTHING_S, _VELOCITY_S)
-    return Trajectories(track[starts], first, frame, time_s, xy, velocity, gsd_m)
+    return Trajectories(track[starts], first, frame, time_s, xy, velocity, gsd_m, position_sd_m=position_sd_m)
 
 
 def from_tracklets(tracklets: pd.DataFrame, gsd_m: float) -> Trajectories:

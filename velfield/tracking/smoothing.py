@@ -1,37 +1,146 @@
-"""Smoothing of positions whose errors are independent from one to the next, as those of detections are.
+"""Smoothing of positions whose errors may last, as those of boxes that keep to a shadow, or of a drifting map, do.
 
-The error is measured from the positions themselves: how far each lies from the cubic through its neighbours. Then a
-Kalman filter of nearly constant velocity (white noise in the acceleration; Bar-Shalom and others 2001, 6.2) runs over
-each track, and back (Rauch, Tung and Striebel 1965).
+The error along an axis is white noise and an Ornstein-Uhlenbeck process. Both are measured on the tracks, by the
+spectrum of residuals: of vehicles that stand along both axes, of those that drive across their direction. The smoother
+is the fixed-interval smoother of a vehicle whose acceleration is white noise (Bar-Shalom and others 2001, 6.2) observed
+with these errors. As positions and errors are Markov chains its normal equations are banded: all tracks are one system.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
-from numba import njit
+from scipy.linalg import solveh_banded
+from scipy.optimize import minimize
 
-from schemas.arrays import FloatArray, IntArray
+from schemas.arrays import FloatArray, IntArray, Mask
 
+LEAST_ERROR_M = 0.05
+"""Smaller errors, as data sets of smoothed trajectories have them, are left as they are."""
 ACCELERATION_NOISE = 2.0
 """Spectral density of the acceleration, m^2/s^3: a vehicle's velocity changes by 1.4 m/s within a second."""
-_FIRST_SPEED_M_PER_S = 20.0
-"""Standard deviation of a velocity of which nothing is known yet."""
-_NORMAL_MEDIAN = 0.6745
-"""Median of the absolute value of a standard normal variable."""
+_WINDOWS_S, _POINTS = (6.0, 3.0, 1.5), 24
+"""Windows whose residuals are measured: the longest that enough tracks fill; and points in each at most."""
+_MAX_WINDOWS = 4000
+_STANDS_M, _DRIVES_M_PER_S = 1.0, 2.5
+"""A vehicle stands in a window in whose halves its mean place differs by less, and drives where it is faster."""
+_MIN_WINDOWS = 8
+_CHI2_MEDIAN = 0.4549
+"""Median of the square of a standard normal variable."""
+_LASTING_S = (0.3, 3.0)
+"""Limits of the time over which errors last."""
+_LEAST_M = 1e-3
+_CHUNK = 500_000
+_JUMP_M, _JUMP_SIGMAS = 3.0, 14.0
+"""A step that differs by more from those around it goes from one vehicle to another."""
+_STAND_S, _STAND_M_PER_S, _STAND_SIGMAS = 2.0, 0.4, 2.6
+"""A vehicle stands where its displacement over 2 s, for as long or longer, is slower than this or within its errors."""
+_EDGE_S, _STAND_SD_M = 0.6, 0.01
+"""So long after it stops and before it goes a vehicle may still move; between, a step has this standard deviation."""
+
+
+@dataclass(frozen=True)
+class PositionErrors:
+    """Errors of positions along one axis: the standard deviations of white noise and of noise that lasts, m, and the
+    time ``lasts_s`` in which the correlation of the second falls to 1/e, s."""
+
+    white_m: float
+    lasting_m: float
+    lasts_s: float
+
+    @property
+    def total_m(self) -> float:
+        """Standard deviation of a position."""
+        return float(np.hypot(self.white_m, self.lasting_m))
+
+    def covariance(self, time_s: FloatArray) -> FloatArray:
+        """(n, n) of the errors at the times (n,)."""
+        lag = np.abs(time_s[:, None] - time_s)
+        return np.asarray(self.white_m**2 * (lag == 0) + self.lasting_m**2 * np.exp(-lag / self.lasts_s))
+
+    @property
+    def text(self) -> str:
+        """For people: what errors were found."""
+        if self.lasting_m < 0.1 * self.white_m:
+            return f"{self.white_m:.2f} m, new at each position"
+        return f"{self.total_m:.2f} m, of which {self.lasting_m:.2f} m last {self.lasts_s:.1f} s"
+
+
+@dataclass(frozen=True)
+class CleanTracks:
+    """Tracks without their errors.
+
+    Attributes
+    ----------
+    track
+        (m,) id of the track of each position: new ones where a track was cut.
+    xy_m
+        (m, 2) smoothed positions.
+    errors
+        Of the positions as they were; None: not known, or too small to smooth.
+    position_sd_m, velocity_sd_m_per_s
+        Standard deviations along one axis that are left; 0 where nothing was smoothed.
+    cuts
+        Number of places at which a track jumped from one vehicle to another.
+    """
+
+    track: IntArray
+    xy_m: FloatArray
+    errors: PositionErrors | None
+    position_sd_m: float
+    velocity_sd_m_per_s: float
+    cuts: int
+
+    @property
+    def notes(self) -> list[str]:
+        """For people: what errors were found, and what was done."""
+        out = (
+            []
+            if self.errors is None
+            else [f"the positions have errors of {self.errors.text}: smoothed to {self.position_sd_m:.2f} m"]
+        )
+        return out + ([f"{self.cuts} jumps from one vehicle to another: tracks cut there"] if self.cuts else [])
+
+
+def clean_tracks(track: IntArray, time_s: FloatArray, xy_m: FloatArray) -> CleanTracks:
+    """Measure the errors of tracks, cut them where they jump, and smooth them where their errors reach `LEAST_ERROR_M`.
+
+    Parameters
+    ----------
+    track, time_s, xy_m
+        (m,) track and time, (m, 2) position; sorted by track and time.
+    """
+    first = _first_rows(track)
+    errors = measure_errors(first, time_s, xy_m)
+    jumps = find_jumps(first, time_s, xy_m, errors.total_m if errors else 0.0)
+    if jumps.any():
+        piece = np.cumsum(jumps)
+        begun = np.repeat(piece[first[:-1]], np.diff(first))  # pieces before this track
+        track = np.where(piece > begun, track.max() + piece, track)
+        first = _first_rows(track)
+    cuts = int(jumps.sum())
+    if errors is None or errors.total_m < LEAST_ERROR_M:
+        return CleanTracks(track, xy_m, None, 0.0, 0.0, cuts)
+    paths = smooth_paths(first, time_s, xy_m, errors)
+    return CleanTracks(track, paths.xy_m, errors, paths.position_sd_m, paths.velocity_sd_m_per_s, cuts)
+
+
+def _first_rows(track: IntArray) -> IntArray:
+    return np.asarray(np.r_[0, np.flatnonzero(np.diff(track)) + 1, len(track)], np.int64)
 
 
 @dataclass(frozen=True)
 class SmoothedPaths:
-    """Smoothed positions ``xy_m`` (m, 2), and the standard deviations (m,) of a position along one axis,
-    ``position_sd_m``, and of a velocity, ``velocity_sd_m_per_s``."""
+    """Smoothed positions ``xy_m`` (m, 2), and the standard deviations along one axis, in the middle of a long track:
+    of a position, ``position_sd_m``, and of a velocity, ``velocity_sd_m_per_s``."""
 
     xy_m: FloatArray
-    position_sd_m: FloatArray
-    velocity_sd_m_per_s: FloatArray
+    position_sd_m: float
+    velocity_sd_m_per_s: float
 
 
-def estimate_position_error(first: IntArray, time_s: FloatArray, xy_m: FloatArray) -> float | None:
-    """Standard deviation of the positions' errors along one axis, m.
+def measure_errors(first: IntArray, time_s: FloatArray, xy_m: FloatArray) -> PositionErrors | None:
+    """Errors of the positions.
 
     Parameters
     ----------
@@ -42,95 +151,213 @@ def estimate_position_error(first: IntArray, time_s: FloatArray, xy_m: FloatArra
 
     Returns
     -------
-    float
-        None where no track has five positions.
+    PositionErrors
+        None where too few tracks are long enough to show them.
     """
-    errors = _cubic_residuals(first, time_s, xy_m)
-    errors = errors[np.isfinite(errors)]
-    return float(np.median(np.abs(errors)) / _NORMAL_MEDIAN) if len(errors) else None
+    found = (_measure(first, time_s, xy_m, window_s) for window_s in _WINDOWS_S)
+    return next((errors for errors in found if errors is not None), None)
 
 
-def smooth_paths(first: IntArray, time_s: FloatArray, xy_m: FloatArray, error_m: float) -> SmoothedPaths:
-    """Smooth the positions of tracks (as of `estimate_position_error`) whose standard deviation is ``error_m``."""
-    out = _smooth(first, time_s, xy_m, ACCELERATION_NOISE, error_m**2, _FIRST_SPEED_M_PER_S**2)
-    return SmoothedPaths(out[:, :2].copy(), np.sqrt(out[:, 2]), np.sqrt(out[:, 3]))
+def _measure(first: IntArray, time_s: FloatArray, xy_m: FloatArray, window_s: float) -> PositionErrors | None:
+    rows, step_s = _windows(first, time_s, window_s)
+    if len(rows) < _MIN_WINDOWS:
+        return None
+    n = rows.shape[1]
+    place = xy_m[rows]
+    half = place[:, n // 2 :].mean(axis=1) - place[:, : n // 2].mean(axis=1)
+    gone = np.hypot(*(place[:, -n // 4 :].mean(axis=1) - place[:, : n // 4].mean(axis=1)).T)
+    stands, drives = np.hypot(*half.T) < _STANDS_M, gone > _DRIVES_M_PER_S * step_s * n
+    direction = half / np.maximum(np.hypot(*half.T), 1e-9)[:, None]
+    across = place[..., 1] * direction[:, None, 0] - place[..., 0] * direction[:, None, 1]
+    groups = [
+        (np.concatenate([place[stands][..., 0], place[stands][..., 1]]), 1),  # a slow creep is not an error
+        (across[drives], 3),  # nor is a bend
+    ]
+    spectra = []
+    times = np.asarray(step_s * np.arange(n), np.float64)
+    for values, degree in groups:
+        if len(values) < _MIN_WINDOWS:
+            continue
+        basis = _contrasts(n, degree)
+        spectra.append((basis, np.median((values @ basis) ** 2, axis=0) / _CHI2_MEDIAN, len(values)))
+    if not spectra:
+        return None
+
+    def misfit(parameters: FloatArray) -> float:
+        errors = _errors(parameters)
+        covariance = errors.covariance(times) + _LEAST_M**2 * np.eye(n)
+        total = 0.0
+        for basis, power, count in spectra:
+            expected = np.einsum("ik,ij,jk->k", basis, covariance, basis)
+            total += min(count, 200) * float(np.mean((np.log(power + _LEAST_M**2) - np.log(expected)) ** 2))
+        return total
+
+    start = np.sqrt(max(float(np.median(spectra[0][1][-n // 3 :])), _LEAST_M**2))
+    found = [
+        minimize(misfit, np.log([start, lasting, lasts]), method="Nelder-Mead", options={"maxiter": 300})
+        for lasting in (0.1 * start + _LEAST_M, 3 * start)
+        for lasts in (0.6, 1.5)
+    ]
+    return _errors(min(found, key=lambda result: float(result.fun)).x)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _cubic_residuals(first: IntArray, time_s: FloatArray, xy: FloatArray) -> FloatArray:
-    """Distance of each position from the cubic through the two before and the two after, along each axis, over the
-    standard deviation that it has where each position's own is 1; NaN where there are none."""
-    out = np.full(xy.shape, np.nan)
-    weight = np.zeros(4)
-    for k in range(len(first) - 1):
-        for i in range(first[k] + 2, first[k + 1] - 2):
-            if not (np.diff(time_s[i - 2 : i + 3]) > 0).all():
-                continue  # the same vehicle twice at one time
-            variance = 1.0
-            for u in range(4):
-                j = i - 2 + u + (u > 1)
-                weight[u] = 1.0
-                for v in range(4):
-                    other = i - 2 + v + (v > 1)
-                    if v != u:
-                        weight[u] *= (time_s[i] - time_s[other]) / (time_s[j] - time_s[other])
-                variance += weight[u] ** 2
-            for axis in range(2):
-                expected = 0.0
-                for u in range(4):
-                    expected += weight[u] * xy[i - 2 + u + (u > 1), axis]
-                out[i, axis] = (xy[i, axis] - expected) / np.sqrt(variance)
+def _errors(parameters: FloatArray) -> PositionErrors:
+    white, lasting, lasts = np.exp(np.clip(parameters, -12.0, 5.0))
+    return PositionErrors(float(white), float(lasting), float(np.clip(lasts, *_LASTING_S)))
+
+
+def _windows(first: IntArray, time_s: FloatArray, window_s: float) -> tuple[IntArray, float]:
+    """Rows (windows, points) evenly spaced in time, and their spacing, s; windows with gaps are left out."""
+    own_s = _median_step_s(first, time_s)
+    stride = max(round(window_s / _POINTS / own_s), 1)
+    points = max(min(int(window_s / (stride * own_s)), _POINTS), 8)
+    span = (points - 1) * stride
+    windows = [np.arange(a, b - span, span + 1) for a, b in pairwise(first.tolist())]
+    starts = np.concatenate([np.empty(0, np.int64), *windows])
+    lasts = time_s[starts + span] - time_s[starts]
+    starts = starts[np.abs(lasts - span * own_s) < 0.15 * span * own_s]
+    starts = starts[:: max(len(starts) // _MAX_WINDOWS, 1)]
+    return starts[:, None] + stride * np.arange(points), stride * own_s
+
+
+def _contrasts(n: int, degree: int) -> FloatArray:
+    """(n, n - degree - 1) orthonormal contrasts free of polynomials of a degree, slow ones first."""
+    k = np.arange(n)
+    cosines = np.cos(np.pi * (k[:, None] + 0.5) * k / n)
+    powers = np.linspace(-1, 1, n)[:, None] ** np.arange(degree + 1)
+    return np.asarray(np.linalg.qr(np.column_stack([powers, cosines]))[0][:, degree + 1 : n])
+
+
+def smooth_paths(first: IntArray, time_s: FloatArray, xy_m: FloatArray, errors: PositionErrors) -> SmoothedPaths:
+    """Smooth the positions of tracks (as of `measure_errors`) that have these errors."""
+    position, velocity, slow = _deviations(first, time_s, errors)
+    out = _solve(first, time_s, xy_m, errors, np.zeros(len(xy_m), bool))
+    stands = _find_stands(first, time_s, out, position, slow)
+    if stands.any():
+        out = _solve(first, time_s, xy_m, errors, stands)
+    return SmoothedPaths(out, position, velocity)
+
+
+def _solve(first: IntArray, time_s: FloatArray, xy_m: FloatArray, errors: PositionErrors, stands: Mask) -> FloatArray:
+    """The most probable positions; where a vehicle stands, one place."""
+    out = np.empty_like(xy_m)
+    begin = 0
+    while begin < len(first) - 1:  # whole tracks, so many rows at a time
+        end = max(int(np.searchsorted(first, first[begin] + _CHUNK, side="right")) - 1, begin + 1)
+        rows = slice(int(first[begin]), int(first[end]))
+        bands = _bands(first[begin : end + 1] - first[begin], time_s[rows], errors, stands[rows])
+        origin = xy_m[rows].mean(axis=0) if rows.stop > rows.start else 0.0
+        observed = np.zeros((2 * (rows.stop - rows.start), 2))
+        observed[::2] = observed[1::2] = (xy_m[rows] - origin) / max(errors.white_m, _LEAST_M) ** 2
+        out[rows] = solveh_banded(bands, observed)[::2] + origin
+        begin = end
     return out
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _smooth(
-    first: IntArray, time_s: FloatArray, xy: FloatArray, noise: float, error2: float, speed2: float
-) -> FloatArray:
-    """Rows (x, y, variance of a position, variance of a velocity). Both axes have one covariance [a b; b c]."""
-    out = np.empty((len(xy), 4))
-    for k in range(len(first) - 1):
-        begin, n = first[k], first[k + 1] - first[k]
-        state, covariance = np.empty((n, 2, 2)), np.empty((n, 3))  # after each position
-        ahead, predicted = np.empty((n, 2, 2)), np.empty((n, 3))  # before it
-        for i in range(n):
-            if i == 0:
-                a, b, c = error2, 0.0, speed2
-                state[0, 0], state[0, 1] = xy[begin], 0.0
-                ahead[0], predicted[0] = state[0], (a, b, c)
-            else:
-                dt = time_s[begin + i] - time_s[begin + i - 1]
-                a, b, c = (
-                    a + 2 * dt * b + dt**2 * c + noise * dt**3 / 3,
-                    b + dt * c + noise * dt**2 / 2,
-                    c + noise * dt,
-                )
-                predicted[i] = (a, b, c)
-                ahead[i, 0], ahead[i, 1] = state[i - 1, 0] + dt * state[i - 1, 1], state[i - 1, 1]
-                gain, speed_gain = a / (a + error2), b / (a + error2)
-                miss = xy[begin + i] - ahead[i, 0]
-                state[i, 0], state[i, 1] = ahead[i, 0] + gain * miss, ahead[i, 1] + speed_gain * miss
-                a, b, c = (1 - gain) * a, (1 - gain) * b, c - speed_gain * b
-            covariance[i] = (a, b, c)
-        last, sure = state[n - 1].copy(), covariance[n - 1].copy()
-        for i in range(n - 1, -1, -1):
-            if i < n - 1:
-                dt = time_s[begin + i + 1] - time_s[begin + i]
-                a, b, c = covariance[i]
-                p, q, r = predicted[i + 1]
-                determinant = p * r - q * q
-                # gain of the smoother: covariance, times the transposed motion, times the inverse of the prediction's
-                g00 = ((a + dt * b) * r - b * q) / determinant
-                g01 = (b * p - (a + dt * b) * q) / determinant
-                g10 = ((b + dt * c) * r - c * q) / determinant
-                g11 = (c * p - (b + dt * c) * q) / determinant
-                change = last - ahead[i + 1]
-                last[0] = state[i, 0] + g00 * change[0] + g01 * change[1]
-                last[1] = state[i, 1] + g10 * change[0] + g11 * change[1]
-                d0, d1, d2 = sure[0] - p, sure[1] - q, sure[2] - r
-                sure[0] = a + g00 * (g00 * d0 + g01 * d1) + g01 * (g00 * d1 + g01 * d2)
-                sure[1] = b + g10 * (g00 * d0 + g01 * d1) + g11 * (g00 * d1 + g01 * d2)
-                sure[2] = c + g10 * (g10 * d0 + g11 * d1) + g11 * (g10 * d1 + g11 * d2)
-            out[begin + i, 0], out[begin + i, 1] = last[0, 0], last[0, 1]
-            out[begin + i, 2], out[begin + i, 3] = max(sure[0], 0.0), max(sure[2], 0.0)
+def _find_stands(
+    first: IntArray, time_s: FloatArray, xy_m: FloatArray, position_sd_m: float, slow_sd_m_per_s: float
+) -> Mask:
+    """Whether a vehicle stands at each of its smoothed positions."""
+    out = np.zeros(len(time_s), bool)
+    owner = np.repeat(np.arange(len(first) - 1), np.diff(first))
+    reach = max(round(_STAND_S / 2 / _median_step_s(first, time_s)), 1)
+    rows = np.arange(len(time_s))
+    low = np.maximum(rows - reach, first[:-1][owner])
+    high = np.minimum(rows + reach, first[1:][owner] - 1)
+    duration = np.maximum(time_s[high] - time_s[low], 1e-3)
+    speed = np.hypot(*(xy_m[high] - xy_m[low]).T) / duration
+    slow = (speed < max(_STAND_M_PER_S, _STAND_SIGMAS * slow_sd_m_per_s)) & (duration > _STAND_S / 2)
+    edge = np.flatnonzero(np.diff(np.r_[-1, np.where(slow, owner, -1), -1]) != 0)
+    for a, b in pairwise(edge.tolist()):
+        if not slow[a] or time_s[b - 1] - time_s[a] < _STAND_S:
+            continue
+        a_in, b_in = (int(np.searchsorted(time_s[a:b], t)) + a for t in (time_s[a] + _EDGE_S, time_s[b - 1] - _EDGE_S))
+        middle = (a_in + b_in) // 2
+        if b_in - a_in < 2:
+            continue
+        drift = float(np.hypot(*(xy_m[middle:b_in].mean(axis=0) - xy_m[a_in : middle + 1].mean(axis=0))))
+        out[a_in:b_in] = drift < max(1.0, 4 * position_sd_m)
+    return out
+
+
+def _median_step_s(first: IntArray, time_s: FloatArray) -> float:
+    """Median time from one position of a track to the next, s."""
+    within = np.ones(max(len(time_s) - 1, 0), bool)
+    within[first[1:-1] - 1] = False
+    steps = np.diff(time_s)[within]
+    steps = steps[steps > 0]
+    return float(np.median(steps)) if len(steps) else 0.2
+
+
+def _bands(first: IntArray, time_s: FloatArray, errors: PositionErrors, stands: Mask) -> FloatArray:
+    """Upper bands (5, 2 n) of the normal equations of position and lasting error, alternating, of each row."""
+    n = len(time_s)
+    out = np.zeros((5, 2 * n))
+    main, off1, off2, off4 = out[4], out[3], out[2], out[0]
+    weight = 1 / max(errors.white_m, _LEAST_M) ** 2
+    main += weight
+    off1[1::2] = weight  # position and error of one row add up to the observation
+    same = np.ones(n, bool)
+    same[first[:-1][first[:-1] < n]] = False  # whether the row before is of the same track
+    dt = np.maximum(np.diff(time_s, prepend=time_s[:1]), 1e-3)
+    # an Ornstein-Uhlenbeck process: e[i] = a e[i - 1] + noise
+    variance = max(errors.lasting_m, _LEAST_M) ** 2
+    a = np.where(same, np.exp(-dt / errors.lasts_s), 0.0)
+    precision = 1 / (variance * (1 - a**2))
+    main[1::2] += precision
+    main[1:-1:2] += (a**2 * precision)[1:]
+    off2[3::2] -= (a * precision)[1:]
+    # white acceleration: the second divided difference of the positions has the variance noise / duration
+    inner = np.flatnonzero(same[1:-1] & same[2:]) + 1
+    before, after = dt[inner], dt[inner + 1]
+    w = (before + after) / 2 / ACCELERATION_NOISE
+    c0, c2 = 2 / (before * (before + after)), 2 / (after * (before + after))
+    c1 = -c0 - c2
+    even = 2 * inner
+    np.add.at(main, even - 2, w * c0**2)
+    np.add.at(main, even, w * c1**2)
+    np.add.at(main, even + 2, w * c2**2)
+    np.add.at(off2, even, w * c0 * c1)
+    np.add.at(off2, even + 2, w * c1 * c2)
+    np.add.at(off4, even + 2, w * c0 * c2)
+    still = 2 * (np.flatnonzero(stands[1:] & stands[:-1] & same[1:]) + 1)
+    for band, rows, sign in ((main, still, 1), (main, still - 2, 1), (off2, still, -1)):
+        np.add.at(band, rows, sign / _STAND_SD_M**2)
+    return out
+
+
+def _deviations(first: IntArray, time_s: FloatArray, errors: PositionErrors) -> tuple[float, float, float]:
+    """Standard deviations in the middle of a long track: of a position, m, of a velocity, and of the mean velocity of
+    `_STAND_S`, m/s."""
+    dt = _median_step_s(first, time_s)
+    n = int(np.clip(24.0 / dt, 21, 2000))
+    bands = _bands(np.array([0, n]), np.asarray(dt * np.arange(n), np.float64), errors, np.zeros(n, bool))
+    k = n - n % 2
+    unit = np.zeros((2 * n, 3))
+    unit[k, 0] = 1.0
+    unit[k + 2, 1], unit[k - 2, 1] = 0.5 / dt, -0.5 / dt
+    reach = min(max(round(_STAND_S / 2 / dt), 1), n // 4)
+    unit[k + 2 * reach, 2], unit[k - 2 * reach, 2] = 0.5 / (reach * dt), -0.5 / (reach * dt)
+    position, velocity, slow = np.sqrt(np.maximum((unit * solveh_banded(bands, unit)).sum(axis=0), 0.0)).tolist()
+    return position, velocity, slow
+
+
+def find_jumps(first: IntArray, time_s: FloatArray, xy_m: FloatArray, error_m: float) -> Mask:
+    """Whether each position (m,) begins the track of another vehicle: the step to it differs from those before and
+    after by more than errors, or driving, explain."""
+    same = np.ones(len(time_s), bool)
+    same[first[:-1][first[:-1] < len(time_s)]] = False
+    out = np.zeros(len(time_s), bool)
+    if len(time_s) < 4:
+        return out
+    dt = np.maximum(np.diff(time_s), 1e-3)
+    moved = np.diff(xy_m, axis=0)
+    rows = np.flatnonzero(same[1:-2] & same[2:-1] & same[3:]) + 2  # the step to row i lies between two others
+    around = (moved[rows - 2] / dt[rows - 2, None] + moved[rows] / dt[rows, None]) / 2
+    excess = np.hypot(*(moved[rows - 1] - around * dt[rows - 1, None]).T)
+    driven = 4.0 * dt[rows - 1] ** 2  # braking hard across a gap
+    unlike = np.zeros(len(time_s))
+    unlike[rows] = excess
+    largest = (unlike[rows] > unlike[rows - 1]) & (unlike[rows] >= unlike[rows + 1])  # the steps beside it differ, too
+    out[rows] = largest & (excess > np.maximum(_JUMP_M, _JUMP_SIGMAS * error_m) + driven)
     return out

@@ -46,7 +46,7 @@ def find_lanes(
         return LaneGraph((), (), (), _no_samples())
     keys = bin_keys(samples.xy_m, samples.direction_rad)
     bins, bin_of = bin_samples(samples, keys)
-    nodes = find_nodes(bins, min_weight=float(min_tracks))
+    nodes = find_nodes(bins, min_weight=float(min_tracks), position_sd_m=trajectories.position_sd_m)
     node = nodes.of_bin[bin_of]
     chains = make_chains(nodes, count_links(samples.track, node, nodes), min_tracks=min_tracks)
     chains = _drop_rare(chains, samples.track, node, len(nodes), min_tracks)

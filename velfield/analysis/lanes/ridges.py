@@ -86,29 +86,33 @@ def bin_samples(samples: PathSamples, keys: IntArray) -> tuple[Bins, IntArray]:
     return bins, np.asarray(inverse, np.int64)
 
 
-def find_nodes(bins: Bins, *, min_weight: float) -> Nodes:
-    """Nodes along the ridges; those with fewer samples than ``min_weight`` within their reach are left out."""
-    xy, direction = _contract(bins)
+def find_nodes(bins: Bins, *, min_weight: float, position_sd_m: float = 0.0) -> Nodes:
+    """Nodes along the ridges; those with fewer samples than ``min_weight`` within their reach are left out.
+
+    Paths with errors are spread about their lane: the kernel, and the distance of two ridges, are wider by these.
+    """
+    lateral = float(np.hypot(_LATERAL_M, position_sd_m))
+    xy, direction = _contract(bins, lateral)
     density = _density(xy, direction, bins)
-    chosen, of_bin = _choose(xy, direction, density)
+    chosen, of_bin = _choose(xy, direction, density, _APART_M * lateral / _LATERAL_M)
     weight = np.asarray(np.bincount(of_bin, bins.weight, len(chosen)), np.float64)
     keep: Mask = weight >= min_weight
     number = np.where(keep, np.cumsum(keep) - 1, -1)
     return Nodes(xy[chosen][keep], direction[chosen][keep], weight[keep], number[of_bin])
 
 
-def _contract(bins: Bins) -> tuple[FloatArray, FloatArray]:
+def _contract(bins: Bins, lateral: float) -> tuple[FloatArray, FloatArray]:
     """Centroids moved onto the ridges, and the directions there."""
     tree = cKDTree(bins.xy_m)
     xy, direction = bins.xy_m.copy(), bins.direction_rad.copy()
-    reach = 2.5 * max(_LATERAL_M, _ALONG_M)
+    reach = 2.5 * max(lateral, _ALONG_M)
     pairs = tree.query_pairs(reach + 0.5, output_type="ndarray")
     turn = np.abs(np.angle(np.exp(1j * (direction[pairs[:, 0]] - direction[pairs[:, 1]]))))
     pairs = pairs[turn < 3 * _TURN_RAD]
     first, other = _adjacency(pairs, len(xy))
     for _ in range(_ITERATIONS):
         xy, direction = _shift(
-            xy, direction, bins.xy_m, bins.direction_rad, bins.weight, first, other, _LATERAL_M, _ALONG_M, _TURN_RAD
+            xy, direction, bins.xy_m, bins.direction_rad, bins.weight, first, other, lateral, _ALONG_M, _TURN_RAD
         )
     return xy, direction
 
@@ -169,13 +173,13 @@ def _density(xy: FloatArray, direction: FloatArray, bins: Bins) -> FloatArray:
     return out
 
 
-def _choose(xy: FloatArray, direction: FloatArray, density: FloatArray) -> tuple[IntArray, IntArray]:
+def _choose(xy: FloatArray, direction: FloatArray, density: FloatArray, apart: float) -> tuple[IntArray, IntArray]:
     """Points that are nodes, and the number of each point's node: densest first, those near it are its."""
     tree = cKDTree(xy)
     pairs = tree.query_pairs(NODE_SPACING_M, output_type="ndarray")
     first, other = _adjacency(pairs, len(xy))
     order = np.argsort(-density, kind="stable").astype(np.int64)
-    chosen, owner = _suppress(xy, direction, order, first, other, NODE_SPACING_M / 2, _APART_M, _APART_RAD)
+    chosen, owner = _suppress(xy, direction, order, first, other, NODE_SPACING_M / 2, apart, _APART_RAD)
     return chosen, owner
 
 

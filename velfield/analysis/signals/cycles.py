@@ -13,8 +13,18 @@ from velfield.analysis.signals.queues import Stream
 from velfield.analysis.trajectories import VEHICLE_LENGTH_M
 
 MIN_CYCLE_S, MAX_CYCLE_S = 24.0, 200.0
-MIN_STARTS = 4
-"""A stream with fewer starts of queues says nothing of a signal."""
+MIN_STARTS = 2
+"""A stream with fewer starts of queues says nothing of a cycle."""
+_JUNCTION_STARTS = 4
+"""Fewest starts of queues of a junction, of at least two streams or of one that alone has so many."""
+_NO_CYCLE_STARTS, _NO_CYCLE_S = 16, 300.0
+"""With so many starts in so long a fixed cycle would show."""
+_FEW_STOP, _FEW_STOP_N, _FEW_STOP_S = 0.08, 60, 150.0
+"""At a junction without a signal fewer stop than this share, with 95 % probability; all of a shorter clip may have come
+at green."""
+_DRAWN_STARTS, _DRAWS = 40, 2000
+"""Of so few starts the probability of recurring by chance is found by drawing starts that do not."""
+_QUEUE_GAP_S = 8.0
 _MAX_P_VALUE = 0.005
 """Probability by chance above which starts do not recur."""
 _MIN_CONCENTRATION = 0.85
@@ -80,27 +90,35 @@ class JunctionSignal:
 
 def find_signal(junction: int, streams: Sequence[Stream], begin_s: float, end_s: float) -> JunctionSignal:
     """The signal of a junction from its streams, seen from ``begin_s`` to ``end_s``."""
-    used = [stream for stream in streams if len(stream.head_time_s) >= MIN_STARTS]
-    used = [stream for stream in used if len(_queue_heads(stream)) >= MIN_STARTS]
+    used = [stream for stream in streams if len(_queue_heads(stream)) >= MIN_STARTS]
     events = [_queue_heads(stream) for stream in used]
-    n = sum(len(times) for times in events)
-    if n < 2 * MIN_STARTS or not events:
-        reason = f"too little data: {n} starts of queues, {2 * MIN_STARTS} needed"
-        crossed = sum(len(s.cross_time_s) for s in streams)
-        if crossed >= 60 and n <= 0.02 * crossed:
-            return JunctionSignal(
-                junction, False, f"no signal: {n} of {crossed} vehicles stopped at a line", None, (), ()
-            )
+    n, duration = sum(len(times) for times in events), end_s - begin_s
+    stopped, share = _stopping(streams)
+    if n < _JUNCTION_STARTS:
+        if share is not None and share.n >= _FEW_STOP_N and share.high < _FEW_STOP and duration >= _FEW_STOP_S:
+            most = f"at most {100 * share.high:.1f} % stop"
+            reason = f"no signal: {stopped} of {share.n} vehicles stopped, {most} with 95 % probability"
+            return JunctionSignal(junction, False, reason, None, (), ())
+        reason = (
+            f"too little data: {n} starts of queues that recur in a lane in {duration:.0f} s, {_JUNCTION_STARTS} "
+            f"needed; {stopped} of {share.n if share else 0} vehicles stopped"
+        )
         return JunctionSignal(junction, None, reason, None, (), ())
-    longest = min(MAX_CYCLE_S, (end_s - begin_s) / 3)
+    longest = min(MAX_CYCLE_S, duration / 2)
     found = _find_cycle(events, longest) if longest > MIN_CYCLE_S else None
     if found is None:
-        reason = f"too little data: {end_s - begin_s:.0f} s, three cycles needed"
+        reason = f"too little data: {duration:.0f} s, two cycles of {MIN_CYCLE_S:.0f} s or more needed"
         return JunctionSignal(junction, None, reason, None, (), ())
     cycle, concentration, p_value = found
     if p_value > _MAX_P_VALUE or concentration < _MIN_CONCENTRATION:
-        reason = f"no fixed cycle: {n} starts of queues, concentration {concentration:.2f}"
-        return JunctionSignal(junction, False, reason, None, (), ())
+        if n >= _NO_CYCLE_STARTS and duration >= _NO_CYCLE_S:
+            reason = f"no fixed cycle: {n} starts of queues, concentration {concentration:.2f}"
+            return JunctionSignal(junction, False, reason, None, (), ())
+        reason = (
+            f"too little data: {n} starts of queues in {duration:.0f} s do not tell a cycle from chance "
+            f"({stopped} of {share.n if share else 0} vehicles stopped)"
+        )
+        return JunctionSignal(junction, None, reason, None, (), ())
     estimate, phases = fit_phases(events, cycle)
     signals = [
         _stream_signal(used[k], phase.green_s, estimate.value, begin_s, end_s)
@@ -114,20 +132,24 @@ def find_signal(junction: int, streams: Sequence[Stream], begin_s: float, end_s:
 def _queue_heads(stream: Stream) -> FloatArray:
     """Starts at the stop line, the first of each queue: a second start within 8 s is of the same green."""
     time = np.sort(stream.head_time_s)
-    return time[np.r_[True, np.diff(time) > 8.0]] if len(time) else time
+    return time[np.r_[True, np.diff(time) > _QUEUE_GAP_S]] if len(time) else time
+
+
+def _stopping(streams: Sequence[Stream]) -> tuple[int, Estimate | None]:
+    """Vehicles that stop on the approaches, and their share of all that stop or cross."""
+    stopped = np.unique(np.concatenate([s.stop_track for s in streams] or [np.empty(0, np.int64)]))
+    every = np.unique(np.concatenate([stopped, *(s.cross_track for s in streams)]))
+    return len(stopped), estimate_share(float(len(stopped)), len(every))
 
 
 def _find_cycle(events: Sequence[FloatArray], longest_s: float) -> tuple[float, float, float] | None:
     """The period at which the starts of each stream recur: s, concentration, and probability by chance."""
     n = sum(len(times) for times in events)
     span = max(float(np.ptp(times)) for times in events)
-    if span < 2 * MIN_CYCLE_S:
+    if span < MIN_CYCLE_S:
         return None
     frequency = np.arange(1 / longest_s, 1 / MIN_CYCLE_S, 0.1 / span)
-    power = np.zeros(len(frequency))
-    for times in events:
-        power += np.abs(np.exp(2j * np.pi * frequency[:, None] * times).sum(axis=1))
-    power /= n
+    power = _concentration(frequency, events)
     # Starts that recur every P recur every P / 2 too: the longest period nearly as good as the best is the cycle.
     peak = np.flatnonzero((power >= np.r_[0, power[:-1]]) & (power >= np.r_[power[1:], 0]))
     good = peak[power[peak] > power.max() - 0.06]
@@ -136,8 +158,31 @@ def _find_cycle(events: Sequence[FloatArray], longest_s: float) -> tuple[float, 
     sharp = sum(np.abs(np.exp(2j * np.pi * fine[:, None] * times).sum(axis=1)) for times in events) / n
     k = int(np.argmax(sharp))
     concentration = float(sharp[k])
+    if n <= _DRAWN_STARTS:
+        return float(1 / fine[k]), concentration, _chance(events, frequency, concentration)
     excess = max(n * concentration - 1.0 * len(events), 0.0) ** 2 / n
     return float(1 / fine[k]), concentration, float(min(len(frequency) / 5 * np.exp(-excess), 1.0))
+
+
+def _concentration(frequency: FloatArray, events: Sequence[FloatArray]) -> FloatArray:
+    """Mean resultant length (frequencies,) of the phases of all starts, each stream about its own mean."""
+    power = np.zeros(len(frequency))
+    for times in events:
+        power += np.abs(np.exp(2j * np.pi * frequency[:, None] * times).sum(axis=1))
+    return np.asarray(power / sum(len(times) for times in events))
+
+
+def _chance(events: Sequence[FloatArray], frequency: FloatArray, concentration: float) -> float:
+    """Probability that starts at random times, as many and as far apart at least, are as concentrated."""
+    rng = np.random.default_rng(0)
+    begin, end = min(float(t.min()) for t in events), max(float(t.max()) for t in events)
+    total = np.zeros((_DRAWS, len(frequency)))
+    for times in events:
+        free = max(end - begin - _QUEUE_GAP_S * (len(times) - 1), 0.0)
+        drawn = np.sort(rng.uniform(0, free, (_DRAWS, len(times))), axis=1) + _QUEUE_GAP_S * np.arange(len(times))
+        total += np.abs(np.exp(2j * np.pi * drawn[:, None, :] * frequency[:, None]).sum(axis=2))
+    best = total.max(axis=1) / sum(len(times) for times in events)
+    return float((1 + np.sum(best >= concentration - 1e-9)) / (1 + _DRAWS))
 
 
 def _stream_signal(stream: Stream, green: Estimate, cycle_s: float, begin_s: float, end_s: float) -> StreamSignal:

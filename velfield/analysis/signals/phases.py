@@ -47,7 +47,7 @@ def fit_phases(starts_s: Sequence[FloatArray], cycle_s: float) -> tuple[Estimate
     phases = []
     for k, streams in enumerate(groups):
         rows = group == k
-        if rows.sum() >= 3:
+        if rows.sum() >= 2:
             green = _green(number[rows], time[rows], cycle)
             phases.append(Phase(tuple(streams), green))
     return cycle, tuple(sorted(phases, key=lambda phase: phase.green_s.value))

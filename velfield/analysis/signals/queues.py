@@ -262,7 +262,7 @@ def _along(path_m: FloatArray, xy_m: FloatArray) -> tuple[FloatArray, FloatArray
 def _stop_line(front_m: FloatArray, border_m: float) -> float | None:
     """Where the foremost of many stops are, front bumpers: the last peak of their density near the border."""
     front = front_m[np.abs(front_m - border_m) < 25.0]
-    if len(front) < 4:
+    if len(front) < 2:
         return None
     grid = np.arange(front.min() - 1, front.max() + 1, 0.25)
     density = np.exp(-0.5 * ((grid[:, None] - front) / 0.8) ** 2).sum(axis=1)

@@ -30,6 +30,7 @@ from velfield.run.layout import RunLayout, remove_tree, to_path
 from velfield.run.lock import locked
 from velfield.run.run import Run, open_run
 from velfield.sources.trajectories import read_tracks
+from velfield.tracking.smoothing import clean_tracks
 
 TRACKS = "tracks"
 """The stage whose results are analysed."""
@@ -115,9 +116,13 @@ def analyse_tracks(
         gsd = gsd_m
         xy_m = table[["x_px", "y_px"]].to_numpy(np.float64) * gsd
     ids, frames = table["track_id"].to_numpy(np.int64), table["frame"].to_numpy(np.int64)
-    made = make_trajectories(ids, frames, table["time_s"].to_numpy(np.float64), xy_m, gsd_m=gsd)
+    time_s = table["time_s"].to_numpy(np.float64)
+    clean = clean_tracks(ids, time_s, xy_m)
+    yield from (f"{'errors':11} {note}" for note in clean.notes)
+    made = make_trajectories(clean.track, frames, time_s, clean.xy_m, gsd_m=gsd, position_sd_m=clean.position_sd_m)
     if "length_m" in table:
-        made = replace(made, measured_length_m=table.groupby("track_id")["length_m"].median().to_numpy(np.float64))
+        lengths = table["length_m"].groupby(clean.track).median()
+        made = replace(made, measured_length_m=lengths.reindex(made.track_id).to_numpy(np.float64))
     tracks = moving(made)
     if not len(tracks):
         raise InputError(

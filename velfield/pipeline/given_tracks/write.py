@@ -29,7 +29,7 @@ from velfield.run.tables import conform, empty_table, write_table, write_tracks
 from velfield.sources.geo import BaseRaster, read_base_raster
 from velfield.sources.source import select_frames
 from velfield.sources.trajectories import read_tracks
-from velfield.tracking.smoothing import estimate_position_error, smooth_paths
+from velfield.tracking.smoothing import LEAST_ERROR_M, clean_tracks
 
 GSD_M = 0.2
 """Base pixels of tracks given in metres, where --gsd-m does not say."""
@@ -38,8 +38,6 @@ MARGIN_M = 10.0
 _STEP_S = 0.2
 _GAPS = 2.5
 """A track is interpolated over no more than so many of the file's own steps."""
-_DISPLACEMENT_SD_M = 0.05
-"""Of smooth tracks, as data sets of trajectories state it. Positions with smaller errors are left as they are."""
 _INSIDE = 0.5
 """Fewer positions within the base image are of another image."""
 _CAR_M = (4.5, 1.8)
@@ -180,19 +178,23 @@ def write_given_tracks(plan: Plan) -> StageResult:
     """Write base image and grid, empty stores of frames and registration, detections, tracklets and tracks."""
     base = plan.job.inputs.base
     given = read_given_tracks(Path(plan.job.inputs.source), plan.config, base=Path(base) if base else None)
-    table, smoothed = _smooth_table(given.table, given.gsd_m)
+    table, metres = given.table, given.table[["x_px", "y_px"]].to_numpy(np.float64) * given.gsd_m
+    clean = clean_tracks(table["track_id"].to_numpy(np.int64), table["time_s"].to_numpy(np.float64), metres)
+    x_px, y_px = (clean.xy_m / given.gsd_m).T
+    given = replace(given, table=table.assign(track_id=clean.track, x_px=x_px, y_px=y_px))
+    table = given.table
     positions = at_frames(table, plan.info.times_s)
     positions = positions[positions.groupby("track_id")["frame"].transform("size") >= 3].reset_index(drop=True)
     if not len(positions):
         raise InputError(f"{plan.job.inputs.source}: found no track of three positions, expected tracks of vehicles")
     positions = _with_ids(positions)
-    displacement_sd_m = max(_DISPLACEMENT_SD_M, smoothed.displacement_sd_m if smoothed else 0.0)
+    displacement_sd_m = max(LEAST_ERROR_M, clean.velocity_sd_m_per_s * _own_step_s(table))
     tracklets = make_tracklets(positions, _longest_step_s(plan, table), displacement_sd_m / given.gsd_m)
     written = [*_write_stores(plan), *_write_base(plan.layout, given, positions)]
     written += _write_tables(plan, given, positions, tracklets)
     advance("tracks")
     counts = {"tracklets": float(len(tracklets)), "tracks": float(tracklets["track_id"].nunique())}
-    return StageResult(written, counts, [*_notes(given), *([smoothed.note] if smoothed else [])])
+    return StageResult(written, counts, [*_notes(given), *clean.notes])
 
 
 def _notes(given: GivenTracks) -> list[str]:
@@ -200,33 +202,6 @@ def _notes(given: GivenTracks) -> list[str]:
         return []
     x, y = given.origin_m
     return [f"base pixel (0, 0) is at x = {x:.3f} m, y = {y:.3f} m of the tracks; a pixel is {given.gsd_m:g} m"]
-
-
-@dataclass(frozen=True)
-class _Smoothing:
-    """Standard deviations along one axis, m: of the positions before and after, and of a displacement."""
-
-    before_m: float
-    after_m: float
-    displacement_sd_m: float
-
-    @property
-    def note(self) -> str:
-        return f"the positions have errors of {self.before_m:.2f} m: smoothed to {self.after_m:.2f} m"
-
-
-def _smooth_table(table: pd.DataFrame, gsd_m: float) -> tuple[pd.DataFrame, _Smoothing | None]:
-    """The table (sorted by track and time) with smoothed positions, where they have errors to speak of."""
-    track, time_s = table["track_id"].to_numpy(np.int64), table["time_s"].to_numpy(np.float64)
-    first = np.r_[0, np.flatnonzero(np.diff(track)) + 1, len(track)].astype(np.int64)
-    xy_m = table[["x_px", "y_px"]].to_numpy(np.float64) * gsd_m
-    error_m = estimate_position_error(first, time_s, xy_m)
-    if error_m is None or error_m < _DISPLACEMENT_SD_M:
-        return table, None
-    paths = smooth_paths(first, time_s, xy_m, error_m)
-    moved_sd_m = float(np.median(paths.velocity_sd_m_per_s)) * _own_step_s(table)
-    out = table.assign(x_px=paths.xy_m[:, 0] / gsd_m, y_px=paths.xy_m[:, 1] / gsd_m)
-    return out, _Smoothing(error_m, float(np.median(paths.position_sd_m)), moved_sd_m)
 
 
 def _longest_step_s(plan: Plan, table: pd.DataFrame) -> float:

@@ -1,0 +1,66 @@
+"""What is said of tracks with errors, and of short clips, is true or withheld."""
+
+import numpy as np
+import pytest
+
+from tests.analysis.noisy_tracks import CYCLE_S, Noise, analyse, clip, driven
+from velfield.analysis.answers import find_answers
+from velfield.analysis.traffic_analysis import TrafficAnalysis
+
+NOISES = [
+    Noise(0.2),
+    Noise(0.5),
+    Noise(1.0),
+    Noise(0.05, 0.3, 1.0),
+    Noise(0.05, 0.6, 1.5),
+    Noise(0.05, 0.35, 0.5, True),
+]
+
+
+@pytest.fixture(scope="module")
+def truth() -> TrafficAnalysis:
+    return analyse(driven(), Noise())
+
+
+def signals_are_true_or_withheld(analysis: TrafficAnalysis) -> int:
+    """Asserts that no signal is denied and no cycle is wrong; the number of cycles that are found."""
+    found = 0
+    for signal in analysis.signals.values():
+        assert signal.signalised is not False, signal.reason
+        if signal.signalised is None:
+            assert signal.reason.startswith("too little data")
+        else:
+            assert signal.cycle_s is not None
+            assert signal.cycle_s.low - 0.5 <= CYCLE_S <= signal.cycle_s.high + 0.5
+            found += 1
+    return found
+
+
+@pytest.mark.parametrize("noise", NOISES, ids=str)
+def test_errors_make_no_lanes_u_turns_or_cycles(noise: Noise, truth: TrafficAnalysis) -> None:
+    analysis = analyse(driven(), noise)
+    driven_m = [sum(lane.length_m for lane in a.lanes) for a in (truth, analysis)]
+    assert driven_m[1] == pytest.approx(driven_m[0], rel=0.1)
+    assert len(analysis.lanes) == pytest.approx(len(truth.lanes), rel=0.25)
+    assert len(analysis.reversals) <= len(truth.reversals) + 6  # a circle of short lanes is not always seen as one
+    assert signals_are_true_or_withheld(analysis) == 1
+
+
+@pytest.mark.parametrize("seconds", [20.0, 35.0, 50.0, 63.0, 90.0])
+@pytest.mark.parametrize("noise", [Noise(), Noise(0.3)], ids=str)
+def test_short_clips_deny_nothing(seconds: float, noise: Noise) -> None:
+    for begin_s in (0.0, 45.0):
+        analysis = analyse(clip(driven(), begin_s, begin_s + seconds), noise)
+        signals_are_true_or_withheld(analysis)
+        for answer in find_answers(analysis):
+            assert answer.state != "none" or answer.at_most_per_h is not None, answer
+            if answer.state == "too little data":
+                assert "too" in answer.text, answer
+
+
+def test_two_cycles_give_a_cycle_with_its_interval() -> None:
+    analysis = analyse(clip(driven(), 0.0, 63.0), Noise())
+    cycles = [s.cycle_s for s in analysis.signals.values() if s.cycle_s]
+    assert len(cycles) == 1
+    assert cycles[0].low < CYCLE_S < cycles[0].high
+    assert np.ptp([cycles[0].low, cycles[0].high]) > 0.3
