@@ -24,6 +24,8 @@ ExportFormat = Literal[
     "opendrive",
     "highd",
     "trajectories",
+    "turning_counts",
+    "moving_features",
 ]
 """Each is a module of `velfield.exports`, of the same name; those of lanes lie in ``roads``."""
 EXPORT_FORMATS: dict[ExportFormat, str] = {
@@ -41,6 +43,8 @@ EXPORT_FORMATS: dict[ExportFormat, str] = {
     "opendrive": "the lanes as OpenDRIVE",
     "highd": "trajectories as CSV in highD's columns",
     "trajectories": "trajectories as Parquet, or as CSV with `--out FILE.csv`",
+    "turning_counts": "turning counts by 15 minutes as Excel workbook, with peak-hour factor",
+    "moving_features": "trajectories as OGC Moving Features JSON",
     "video": "the stabilised clip with vehicles, speeds and the field, as MP4",
     "poster": "both maps on a sheet with legend, scale, north, n and date, as PDF or SVG",
 }

@@ -287,7 +287,7 @@ def draw_queues(axes: "Axes", *, analysis: TrafficAnalysis, streams: list[Stream
         axes.step(times, counts, where="post", color=_TONES[k], linestyle=_STROKES[k % 4], linewidth=1.5,
                   label=names.get(lane, f"lane {lane}"))  # fmt: skip
     axes.set(xlabel="time, s", ylabel="vehicles that stand", ylim=(0, None), xlim=(begin, end))
-    axes.legend(loc="upper left", bbox_to_anchor=(0, 1.17), ncols=4, frameon=False, fontsize=9)
+    axes.legend(loc="upper left", bbox_to_anchor=(0, 1.14), ncols=4, frameon=False, fontsize=9)
 
 
 def draw_speed_profile(axes: "Axes", *, analysis: TrafficAnalysis, lane: int, unit: SpeedUnit) -> None:
@@ -301,7 +301,7 @@ def draw_speed_profile(axes: "Axes", *, analysis: TrafficAnalysis, lane: int, un
         if known:
             axes.plot(*np.array(known).T, color="#1b1f24", linestyle=stroke, label=label)
     axes.set(xlabel="along the lane, m", ylabel=f"speed, {unit}", ylim=(0, None))
-    axes.legend(ncols=4, frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(0, 1.17))
+    axes.legend(ncols=4, frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(0, 1.14))
 
 
 def fundamental_points(analysis: TrafficAnalysis) -> FloatArray:
@@ -331,7 +331,7 @@ def draw_fundamental(axes: "Axes", *, points: FloatArray, per_m_per_s: float, un
     middle = (0.55 * edge, 0.55 * edge * speed * 3.6)
     axes.annotate(f"{speed * per_m_per_s:.0f} {unit} ", middle, fontsize=9, ha="right", va="bottom")
     axes.set(xlabel="density, vehicles a km", ylabel="flow, vehicles an hour", xlim=(0, right * 1.05), ylim=(0, top))
-    axes.legend(frameon=False, fontsize=9, ncols=6, loc="upper left", bbox_to_anchor=(0, 1.17), columnspacing=1)
+    axes.legend(frameon=False, fontsize=9, ncols=6, loc="upper left", bbox_to_anchor=(0, 1.14), columnspacing=1)
 
 
 def draw_flow(axes: "Axes", *, analysis: TrafficAnalysis, found: JunctionMovements) -> None:
@@ -347,7 +347,7 @@ def draw_flow(axes: "Axes", *, analysis: TrafficAnalysis, found: JunctionMovemen
             axes.step(edges / 60, minutes, where="post", color=_TONES[k % 6], linestyle=_STROKES[k % 4],
                       linewidth=1.6, label=f"from {one.name}")  # fmt: skip
     axes.set(xlabel="time, min", ylabel="vehicles a minute", ylim=(0, None))
-    axes.legend(frameon=False, fontsize=9, ncols=6, loc="upper left", bbox_to_anchor=(0, 1.17))
+    axes.legend(frameon=False, fontsize=9, ncols=6, loc="upper left", bbox_to_anchor=(0, 1.14))
 
 
 def draw_conflicts(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | None) -> None:

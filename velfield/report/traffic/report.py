@@ -84,7 +84,7 @@ def report_pdf(record: AnalysisRecord, page: FirstPage, diagrams: Sequence[Diagr
     pages = [_front(record, page, diagrams[0])] if diagrams else []
     left = 0.0
     for diagram in diagrams[1:]:
-        needed = diagram.height_in + 1.1
+        needed = diagram.height_in + 1.2
         if left < needed:
             pages.append(new_figure(*_PAGE_IN))
             left = _PAGE_IN[1] - 1.2
@@ -120,8 +120,8 @@ def _write(figure: "Figure", text: str, y_in: float, *, bold: bool) -> float:
 def _place(figure: "Figure", diagram: Diagram, top_in: float) -> None:
     """A diagram with its title and caption, from a height of the page downwards."""
     high = _PAGE_IN[1]
-    figure.text(0.08, (top_in - 0.15) / high, diagram.title, fontsize=12, fontweight="bold")
-    bottom = top_in - 0.35 - diagram.height_in
+    figure.text(0.08, (top_in - 0.05) / high, diagram.title, fontsize=12, fontweight="bold")
+    bottom = top_in - 0.45 - diagram.height_in
     diagram.draw(figure.add_axes((0.13, (bottom + 0.55) / high, 0.8, (diagram.height_in - 0.65) / high)))
     for k, line in enumerate(textwrap.wrap(diagram.caption, 118)):
         figure.text(0.08, (bottom - 0.02 - 0.15 * k) / high, line, fontsize=8, color="#4b545d")
