@@ -9,10 +9,11 @@ import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from subprocess import DEVNULL, Popen
 
-from velfield.errors import CacheWarning
+from velfield.errors import CacheWarning, DeviceWarning
 from velfield.kernel_cache import cache_root, is_writable, temporary_cache, user_home
 
 PAGES, PAGES_OF = "VELFIELD_PAGES", "VELFIELD_PAGES_OF"
@@ -48,6 +49,7 @@ allocated and freed all the time: from and to the system each time, they cost a 
 64 KiB that Dask sets for its workers half as much again."""
 _HOMES = {"PREFECT_HOME": "prefect", "MPLCONFIGDIR": "matplotlib", "XDG_CACHE_HOME": "cache"}
 """Environment: folders that libraries have in the home folder, and their names in a temporary one."""
+_THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
 _QUIET: dict[str, str] = {
     # Only the terminal is quiet: PREFECT_LOGGING_LEVEL would hide retries in the UI too.
     "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "CRITICAL",
@@ -64,11 +66,34 @@ def prepare_process(*, verbose: bool) -> None:
     """Set this process up to run flows. Call before prefect is imported."""
     for name, value in (_SETTINGS if verbose else _SETTINGS | _QUIET).items():
         os.environ.setdefault(name, value)
+    spare_proxies()
     _keep_memory()
     import cv2
 
     # The work is parallel by frames: OpenCV's own threads would only compete with it.
     cv2.setNumThreads(1)
+
+
+def spare_proxies() -> None:
+    """Reach this machine's own server without a proxy, and leave out proxies that Prefect cannot use, with a warning.
+
+    Its client refuses to start where one is set that it cannot speak with, even where it would not use it.
+    """
+    given = os.environ.get("no_proxy") or os.environ.get("NO_PROXY") or ""
+    hosts = [host for host in given.split(",") if host.strip()]
+    hosts += [host for host in _THIS_MACHINE if host not in hosts]
+    os.environ["no_proxy"] = os.environ["NO_PROXY"] = ",".join(hosts)
+    known = ("http", "https", *(("socks5", "socks5h") if find_spec("socksio") else ()))
+    for name in [one for one in os.environ if one.lower() in ("http_proxy", "https_proxy", "all_proxy")]:
+        scheme, separator, _ = os.environ[name].partition("://")
+        if separator and scheme.lower() not in known:
+            del os.environ[name]
+            warnings.warn(
+                f"found {name} = {scheme}://..., which Prefect cannot use here: left out; for a server behind it give "
+                "an http:// proxy, or install httpx[socks]",
+                DeviceWarning,
+                stacklevel=3,
+            )
 
 
 def use_writable_folders() -> None:

@@ -63,20 +63,20 @@ class Previews:
             self._first_tried = True
             if is_long(self.plan) and not self.plan.layout.report.exists():
                 return lambda: self._make(self._show_first_frames)
-        linked = next((stage for stage in stages if stage.stage.name == "tracklets"), None)
-        if linked is None or not self._is_worth_it(linked):
+        found = next((stage for stage in stages if stage.stage.name == "detections"), None)
+        if found is None or not self._is_worth_it(found):
             return None
-        self._units_shown = len(linked.ended)
-        return lambda: self._make(partial(self._show_finished_units, linked.plan))
+        self._units_shown = len(found.ended)
+        return lambda: self._make(partial(self._show_finished_units, found.plan))
 
-    def _is_worth_it(self, linked: UnderWay) -> bool:
+    def _is_worth_it(self, found: UnderWay) -> bool:
         """Whether units came since the last preview, most of the work is still to come, and little time went into
         previews."""
-        now_s, done, units = time.monotonic(), len(linked.ended), len(linked.units)
-        if done <= self._units_shown or linked.lost or now_s < self._next_s:
+        now_s, done, units = time.monotonic(), len(found.ended), len(found.units)
+        if done <= self._units_shown or found.lost or now_s < self._next_s:
             return False
-        left_s = (now_s - linked.started_s) / done * (units - done)
-        return left_s >= max(WORTH_S, TIMES_ITS_COST * self._cost_s) and not committed(linked.plan, "tracks", WHOLE)
+        left_s = (now_s - found.started_s) / done * (units - done)
+        return left_s >= max(WORTH_S, TIMES_ITS_COST * self._cost_s) and not committed(found.plan, "tracks", WHOLE)
 
     def _show_first_frames(self) -> int:
         frames = self.runner.call(make_first_preview, self.plan)
@@ -116,7 +116,7 @@ class Previews:
             yield
 
     def before(self, stage: str) -> None:
-        """From the run's own tracks on, no preview is made or published."""
+        """From the run's own tracklets on, no preview is made or published."""
         if stage in FIELD_STAGES:
             with self._publishing:
                 self._off = True

@@ -18,10 +18,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from subprocess import DEVNULL, Popen, TimeoutExpired
 
+from velfield.errors import InputError
+
 _HOST = "127.0.0.1"
 _NOT_ASKED_FOR = 4
 """Exit status where Prefect's settings name a server, or forbid a temporary one."""
 _END_S = 5.0
+_ANSWER_S = 8.0
 
 
 def start_server() -> "TemporaryServer":
@@ -37,6 +40,33 @@ def start_server() -> "TemporaryServer":
     return TemporaryServer(port, Popen([sys.executable, "-m", __spec__.name, str(port)], stderr=DEVNULL))
 
 
+def check_server() -> None:
+    """Refuse settings of Prefect that name a server which does not answer: each of its requests would be repeated.
+
+    Raises
+    ------
+    InputError
+        One line: the address, and what became of the request.
+    """
+    from prefect.client.orchestration import get_client
+    from prefect.settings import get_current_settings
+
+    url = get_current_settings().api.url
+    if url is None:
+        return
+    try:
+        with get_client(httpx_settings={"timeout": _ANSWER_S}, sync_client=True) as client:
+            error = client.api_healthcheck()
+    except Exception as refused:  # of the address, of a proxy
+        error = refused
+    if error is not None:
+        raise InputError(
+            f"PREFECT_API_URL {url}: found no Prefect server that answers "
+            f"({' '.join(str(error).split()) or type(error).__name__}); start it, correct the address, or unset it "
+            "(`prefect config unset PREFECT_API_URL`): then a temporary one is used"
+        )
+
+
 class TemporaryServer:
     """A server on a port of this machine, in a process of its own."""
 
@@ -47,13 +77,20 @@ class TemporaryServer:
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
-        """Prefect's settings with this server, once it answers; unchanged where another is set or this one ended."""
+        """Prefect's settings with this server, once it answers; unchanged where another is set or this one ended.
+
+        Raises
+        ------
+        InputError
+            Another is set, and does not answer.
+        """
         if self._wait():
             from prefect.settings import PREFECT_API_URL, PREFECT_UI_URL, temporary_settings
 
             with temporary_settings({PREFECT_API_URL: self._url, PREFECT_UI_URL: ""}):  # it has no UI to link to
                 yield
         else:
+            check_server()
             yield
 
     def stop(self) -> None:

@@ -1,9 +1,4 @@
-"""The units of the stages as Prefect tasks: named for people, retried, linked to the units that they read.
-
-Units are submitted as soon as what they read is there, and no more of them than run at once: a unit of a stage that
-follows another unit by unit (``Stage.follows``) need not wait for the whole of that stage, and of the units that can
-run, those of the later stage come first.
-"""
+"""The units of the stages as Prefect tasks: named for people, retried, linked to the units that they read."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -24,9 +19,9 @@ from velfield.errors import InputError, is_disk_full
 from velfield.pipeline.graphs import unit_graph
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import committed
-from velfield.pipeline.stage import STAGE, STAGES, Cut, Stage, stages_awaited
+from velfield.pipeline.stage import STAGE, STAGES, Cut, Stage
 from velfield.pipeline.summary import summarise_stage
-from velfield.pipeline.units import WHOLE, Unit, prepare_stage, stage_units
+from velfield.pipeline.units import WHOLE, Unit, discard_unit, prepare_stage, stage_units
 from velfield.run.commits import read_commits
 
 Future = PrefectFuture[Any]
@@ -62,15 +57,6 @@ class UnderWay:
     before: list[CommitRecord] = field(default_factory=list)
     """Records of the units that an earlier run finished."""
 
-    @property
-    def done(self) -> bool:
-        return len(self.ended) == len(self.units)
-
-    @property
-    def waiting(self) -> list[int]:
-        """Units not submitted yet."""
-        return [k for k in range(len(self.units)) if k not in self.futures]
-
 
 class Aside(Protocol):
     """Work beside the stages, none of whose results they read: done where there is some, in place of a unit."""
@@ -98,10 +84,10 @@ class Work:
     at_once: int = 2
     aside: Aside | None = None
     summaries: list[StageSummary] = field(default_factory=list)
-    _under_way: dict[str, UnderWay] = field(default_factory=dict)
-    _last_end_s: float = 0.0
-    _given: Plan | None = None
-    _ends: "SimpleQueue[tuple[str, int, Future]]" = field(default_factory=SimpleQueue)
+    _stages: dict[str, UnderWay] = field(default_factory=dict)
+    _running: int = 0
+    _beside: Future | None = None
+    _ends: "SimpleQueue[tuple[int | None, Future]]" = field(default_factory=SimpleQueue)
 
     def __post_init__(self) -> None:
         self._given = self.plan
@@ -109,10 +95,10 @@ class Work:
     def run(
         self, stages: Sequence[Stage] = STAGES, graph: GraphOf = unit_graph, *, essential: bool | None = None
     ) -> None:
-        """Compute all units of some stages, in the order of the table, and wait for them.
+        """Compute all units of some stages, stage by stage in the order of the table.
 
-        A unit waits for all units of the stages that its stage reads, done or lost: it goes on with what is there. Of
-        the stages that its own follows it waits for the units of the same frames, and as many after as the halo.
+        A unit that fails is lost, and with it the same unit of the stages that read it; all others go on with what is
+        there. Where an error ends the run, it is raised when nothing writes into the run folder any more.
 
         Parameters
         ----------
@@ -121,35 +107,40 @@ class Work:
         essential
             Nothing can follow without these stages: their failure is the run's. Default: as the table says.
         """
-        todo = list(stages)
-        running = 0
-        aside: Future | None = None
         with self.console.stages() as bars:
-            while todo or running or aside is not None:
-                for stage in [stage for stage in todo if self._can_start(stage, todo)]:
-                    if not running and aside is None:
+            try:
+                for stage in stages:
+                    if self._beside is None:
                         self._restart_before(stage)
-                    self._start(stage, bars.add(stage.name, stage.label), essential)
-                    todo.remove(stage)
-                if aside is None:
-                    aside = self._submit_aside()
-                room = self.at_once + _QUEUED - running - (aside is not None)
-                running += self._submit_ready(graph, room)
-                if not running and aside is None:
-                    continue
-                name, k, future = self._ends.get()
-                if not name:
-                    aside = None
-                    if self.aside is not None:
-                        self.aside.finish(_failure_cause(future) if _is_lost(future) else None)
-                    continue
-                running -= 1
-                try:
-                    self._end(self._under_way[name], k)
-                except BaseException:
-                    for _ in range(running):  # what is under way writes into the run folder
-                        self._ends.get()
-                    raise
+                    self._compute(self._start(stage, bars.add(stage.name, stage.label), essential), graph)
+            finally:
+                if self.aside is not None:
+                    self.aside.before("")
+                while self._running or self._beside is not None:
+                    self._next_end()
+
+    def _compute(self, under_way: UnderWay, graph: GraphOf) -> None:
+        """Compute the units of a stage: no more of them are submitted than run at once, and a few."""
+        left = [k for k in range(len(under_way.units)) if k not in under_way.ended]
+        while left or self._running:
+            self._submit_aside()
+            while left and self._running < self.at_once + _QUEUED - (self._beside is not None):
+                self._submit(under_way, left.pop(0), graph)
+            k = self._next_end()
+            if k is not None:
+                self._end(under_way, k)
+        self._finish(under_way)
+
+    def _next_end(self) -> int | None:
+        """Wait until something ends: the number of a unit, or None where it is the work beside."""
+        k, future = self._ends.get()
+        if k is None:
+            self._beside = None
+            if self.aside is not None:
+                self.aside.finish(_failure_cause(future) if _is_lost(future) else None)
+        else:
+            self._running -= 1
+        return k
 
     def _restart_before(self, stage: Stage) -> None:
         """Where a flight is long, let a stage that takes much memory start without what earlier work left."""
@@ -159,61 +150,39 @@ class Work:
         if any(committed(self.plan, stage.name, unit.name) is None for unit in units):
             self.runner.restart_workers()
 
-    def _can_start(self, stage: Stage, todo: Sequence[Stage]) -> bool:
-        """Whether all that it reads is done; of a stage that it follows, whether that has started."""
-        left = {one.name for one in todo}
-        for name in stage.after:
-            before = self._under_way.get(name)
-            if name in left or (before is not None and name not in stage.follows and not before.done):
-                return False
-        return True
-
-    def _start(self, stage: Stage, progress: StageProgress, essential: bool | None) -> None:
-        assert self._given is not None
-        awaited = stages_awaited(stage.name)
-        lost = [f"{name} {unit}" for name in awaited if name in self._under_way for unit in self._under_way[name].lost]
-        plan = self._given.with_lost_units(lost)
+    def _start(self, stage: Stage, progress: StageProgress, essential: bool | None) -> UnderWay:
         if self.aside is not None:
             self.aside.before(stage.name)
-        prepare_stage(plan, stage)
-        units = stage_units(plan, stage)
+        prepare_stage(self.plan, stage)
+        units = stage_units(self.plan, stage)
         total = sum(unit.steps for unit in units)
         progress.expect(total)
         whole = stage.essential if essential is None else essential
         artifact = LongStage(stage.name, total)
-        under_way = UnderWay(stage, plan, units, whole, progress, artifact, time.monotonic())
-        self._under_way[stage.name] = under_way
-        if not units:
-            self._finish(under_way)
+        under_way = UnderWay(stage, self.plan, units, whole, progress, artifact, time.monotonic())
+        self._stages[stage.name] = under_way
+        for k, unit in enumerate(units):
+            if gone := [name for name in self._alike(stage) if unit.name in self._stages[name].lost]:
+                under_way.ended.add(k)
+                under_way.lost[unit.name] = f"{self._describe(under_way, unit)} not done: its {gone[0]} are lost"
+                discard_unit(self.plan, stage, unit.name)
+        return under_way
 
-    def _submit_ready(self, graph: GraphOf, room: int) -> int:
-        """Submit units whose reading is there, those of later stages first; returns their number."""
-        count = 0
-        for under_way in reversed(list(self._under_way.values())):
-            for k in under_way.waiting:
-                if count >= room:
-                    return count
-                if self._is_ready(under_way, k):
-                    self._submit(under_way, k, graph)
-                    count += 1
-        return count
-
-    def _is_ready(self, under_way: UnderWay, k: int) -> bool:
-        followed = [self._under_way[name] for name in under_way.stage.follows if name in self._under_way]
-        return all(set(_same_units(under_way, before, k)) <= before.ended for before in followed)
+    def _alike(self, stage: Stage) -> list[str]:
+        """Names of the stages that a stage reads and that are cut by frames as it is."""
+        by_frames = stage.cut is Cut.BY_FRAMES
+        return [name for name in stage.after if by_frames and name in self._stages and STAGE[name].cut is stage.cut]
 
     def _upstream(self, under_way: UnderWay, k: int) -> list[Future]:
-        """What a unit, by its number, reads: of stages cut as its own the same units, of others what was not lost."""
+        """Futures of the units that a unit reads, for the lineage in Prefect's UI: of what is not lost."""
         found: list[Future] = []
         for name in under_way.stage.after:
-            before = self._under_way.get(name)
-            if before is None:
-                continue
-            if under_way.stage.cut is before.stage.cut is Cut.BY_FRAMES:
-                found += [before.futures[j] for j in _same_units(under_way, before, k)]
-            else:
-                found += [before.futures[j] for j in sorted(before.ended) if not _is_lost(before.futures[j])]
-        return found
+            before = self._stages.get(name)
+            if before is not None and name in self._alike(under_way.stage):
+                found += [before.futures[j] for j in (k, k + 1) if j in before.futures]
+            elif before is not None:
+                found += before.futures.values()
+        return [future for future in found if not _is_lost(future)]
 
     def carry_over(self, stage: Stage) -> None:
         """Summarise a stage whose units an earlier result finished, and that this one takes as they are."""
@@ -241,17 +210,18 @@ class Work:
             persist_result=False,
         ).submit(wait_for=self._upstream(under_way, k))
         under_way.futures[k] = future
-        future.add_done_callback(lambda done: self._ends.put((stage.name, k, done)))
+        self._running += 1
+        future.add_done_callback(lambda done: self._ends.put((k, done)))
 
-    def _submit_aside(self) -> Future | None:
-        do = None if self.aside is None else self.aside.next_task(list(self._under_way.values()))
-        if do is None:
-            return None
-        future = task(
-            do, name="preview", task_run_name="preview", retries=0, cache_policy=NO_CACHE, persist_result=False
-        ).submit()
-        future.add_done_callback(lambda done: self._ends.put(("", 0, done)))
-        return future
+    def _submit_aside(self) -> None:
+        if self.aside is None or self._beside is not None:
+            return
+        do = self.aside.next_task(list(self._stages.values()))
+        if do is not None:
+            self._beside = task(
+                do, name="preview", task_run_name="preview", retries=0, cache_policy=NO_CACHE, persist_result=False
+            ).submit()
+            self._beside.add_done_callback(lambda done: self._ends.put((None, done)))
 
     def _end(self, under_way: UnderWay, k: int) -> None:
         """Note that a unit is done or lost; raises its error where nothing can follow without it."""
@@ -264,11 +234,10 @@ class Work:
             reason = " ".join(str(error).split()) or type(error).__name__
             under_way.lost[unit.name] = f"{self._describe(under_way, unit)} failed: {reason}; re-run to retry"
             self.console.warn(under_way.lost[unit.name])
+            discard_unit(under_way.plan, under_way.stage, unit.name)
         steps = sum(under_way.units[j].steps for j in under_way.ended)
         under_way.progress.at_least(steps)
         under_way.artifact.update(steps)
-        if under_way.done:
-            self._finish(under_way)
 
     def _describe(self, under_way: UnderWay, unit: Unit) -> str:
         """A unit for people: with its run, and the times of its frames."""
@@ -280,21 +249,20 @@ class Work:
 
     def _finish(self, under_way: UnderWay) -> None:
         under_way.progress.remove()
-        futures = [under_way.futures[k] for k in range(len(under_way.units))]
         lost = under_way.lost = dict(sorted(under_way.lost.items()))
+        records = [future.result() for _, future in sorted(under_way.futures.items()) if not _is_lost(future)]
         # Units that failed change the keys of all that is made without them.
-        self.plan = self.plan.with_lost_units([f"{under_way.stage.name} {unit}" for unit in lost])
+        gone = [f"{name} {unit}" for name, one in self._stages.items() for unit in one.lost]
+        self.plan = self._given.with_lost_units(gone)
         summary = summarise_stage(
             under_way.stage.name,
-            [future.result() for future in futures if not _is_lost(future)],
+            records,
             units=len(under_way.units),
             before=under_way.before,
             lost=lost,
-            seconds=time.monotonic() - max(under_way.started_s, self._last_end_s),
+            seconds=time.monotonic() - under_way.started_s,
         )
-        self._last_end_s = time.monotonic()
         self.summaries.append(summary)
-        self.summaries.sort(key=lambda one: list(STAGE).index(one.name))
         self._print(under_way.stage, summary)
 
     def _print(self, stage: Stage, summary: StageSummary) -> None:
@@ -309,11 +277,6 @@ class Work:
             self.console.warn(warning)
         if len(summary.warnings) > 5:
             self.console.warn(f"... and {len(summary.warnings) - 5} more of {stage.label}; all are in the report")
-
-
-def _same_units(under_way: UnderWay, before: UnderWay, k: int) -> range:
-    """Numbers of the units of the same frames, and as many after as the halo, of a stage that is cut alike."""
-    return range(k, min(k + 1 + under_way.stage.halo, len(before.units)))
 
 
 def _without_outputs(record: CommitRecord) -> CommitRecord:

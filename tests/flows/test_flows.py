@@ -189,6 +189,11 @@ def test_a_unit_that_fails_once_is_retried(
     assert len(calls) == summary.stages[0].units + 1
 
 
+def starts(root: Path) -> set[int]:
+    """Frames at which tracklets start."""
+    return set(open_run(root).tracklets()["frame_0"])
+
+
 def test_a_unit_that_always_fails_is_lost_and_computed_by_the_next_run(
     whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -206,7 +211,9 @@ def test_a_unit_that_always_fails_is_lost_and_computed_by_the_next_run(
     monkeypatch.setattr(step, "detect_block", failing)
     summary = process(job(flight, root))
     lost = {stage.name: stage.lost for stage in summary.stages if stage.lost}
-    assert lost["detections"] == ("000008-000015",)
+    assert lost == {"detections": ("000008-000015",), "tracklets": ("000008-000015",)}
+    # The units beside it lose no more than the windows that reach into it.
+    assert starts(root) == {frame for frame in starts(whole[0]) if frame < 6 or frame >= 16}
     assert not summary.complete
     (why,) = next(stage.failures for stage in summary.stages if stage.name == "detections")
     assert why.startswith(f"{root}: detections of frames 8 to 15 (")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from flows import launch
-from velfield.errors import CacheWarning
+from velfield.errors import CacheWarning, DeviceWarning, InputError
 
 
 @pytest.mark.parametrize("compiled", [True, False], ids=["compiled", "not yet"])
@@ -48,3 +48,36 @@ def test_without_a_home_caches_are_temporary_and_one_line_names_them(
     launch.use_writable_folders()  # a warning is an error: once is enough
     assert os.environ["PREFECT_HOME"] == "of the user"
     assert os.environ["MPLCONFIGDIR"] == str(tmp_path / "matplotlib")
+
+
+def test_this_machine_is_reached_without_a_proxy_and_unusable_proxies_are_left_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name, value in {
+        "no_proxy": "",
+        "NO_PROXY": "intranet",
+        "http_proxy": "http://127.0.0.1:9",
+        "https_proxy": "proxy:3128",
+        "ALL_PROXY": "socks5h://user:secret@127.0.0.1:9",
+    }.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(launch, "find_spec", lambda name: None)
+    with pytest.warns(DeviceWarning, match="ALL_PROXY = socks5h") as warned:
+        launch.spare_proxies()
+    assert "secret" not in str(warned[0].message)
+    assert os.environ["no_proxy"] == os.environ["NO_PROXY"] == "intranet,127.0.0.1,localhost,::1"
+    assert "ALL_PROXY" not in os.environ
+    assert (os.environ["http_proxy"], os.environ["https_proxy"]) == ("http://127.0.0.1:9", "proxy:3128")
+    launch.spare_proxies()
+    assert os.environ["no_proxy"] == "intranet,127.0.0.1,localhost,::1"
+
+
+def test_a_server_that_does_not_answer_is_one_line() -> None:
+    from prefect.settings import PREFECT_API_URL, temporary_settings
+
+    from flows.temporary_server import check_server
+
+    dead = "http://127.0.0.1:9/api"
+    with temporary_settings({PREFECT_API_URL: dead}), pytest.raises(InputError, match=f"{dead}: found no") as caught:
+        check_server()
+    assert "\n" not in str(caught.value)

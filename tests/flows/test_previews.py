@@ -80,7 +80,9 @@ def test_previews_come_and_grow_and_leave_no_trace(
     run_flight(job(flight, root), RunnerConfig(), console)
     assert console.warnings == []
     # Of the first frames, by the detector that ships; then of the first unit, whose windows reach into the second.
-    assert [found for found, _, _ in console.seen] == [16, 8]
+    first, then = (found for found, _, _ in console.seen)
+    assert first == 16
+    assert then in (8, 16)  # of the first unit, or of both that were through when it began
     for found, title, vehicles in console.seen:
         assert f"{found} of {FRAMES} frames" in title or f"the first {found} of" in title
         assert vehicles > 0

@@ -10,6 +10,8 @@ import pytest
 
 _FLOW = """if True:
     import sys
+    from flows.launch import spare_proxies
+    spare_proxies()
     from flows.temporary_server import start_server
     server = start_server()
     from prefect import flow, task
@@ -44,8 +46,9 @@ def _run(folder: Path, **environment: str) -> "subprocess.CompletedProcess[str]"
     )
 
 
-def test_a_flow_runs_on_the_server_that_started_beside_it(tmp_path: Path) -> None:
-    done = _run(tmp_path)
+@pytest.mark.parametrize("proxies", [{}, {"http_proxy": "http://127.0.0.1:9", "no_proxy": "", "NO_PROXY": ""}])
+def test_a_flow_runs_on_the_server_that_started_beside_it(tmp_path: Path, proxies: dict[str, str]) -> None:
+    done = _run(tmp_path, **proxies)
     assert done.returncode == 0, done.stderr
     url, result, status = done.stdout.split()
     assert url.startswith("http://127.0.0.1:")

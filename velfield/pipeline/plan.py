@@ -46,6 +46,8 @@ class Plan:
     inputs: InputsRecord
     keys: dict[str, str]
     """Content key of each stage."""
+    lost: tuple[str, ...] = ()
+    """Units that failed, ``stage unit`` each: what was there of them is not read."""
 
     @property
     def layout(self) -> RunLayout:
@@ -102,7 +104,7 @@ class Plan:
         if not lost:
             return self
         keys = {stage: content_key(stage, 0, inputs=[key, *sorted(lost)]) for stage, key in self.keys.items()}
-        return replace(self, keys=keys)
+        return replace(self, keys=keys, lost=(*self.lost, *lost))
 
     def blocks(self, frames: range) -> list[range]:
         """A unit's frames cut into Dask blocks."""

@@ -3,8 +3,9 @@
 A preview is a run folder of its own inside the run's, `RunLayout.preview`, made by the stages of any run; its field,
 maps and page then take the place of those in the run folder. The first one is of a few frames alone, with the detector
 that ships unless one is given: lens and base image of the flight need frames of all of it. The later ones share all
-that is finished, and add the tracks, the field and the maps of what is there. They have keys of their own, as if the
-other units were lost: nothing of a preview is taken for the result, which is to the bit what it is without them.
+that is finished, and add the tracklets, the tracks, the field and the maps of what is there. They have keys of their
+own, as if the other units were lost: nothing of a preview is taken for the result, which is to the bit what it is
+without them.
 """
 
 from collections.abc import Callable
@@ -31,9 +32,9 @@ from velfield.run.results import link_shared_outputs
 
 FIRST_FRAMES = 16
 """Frames of the first preview: three seconds."""
-_BEFORE = stages_before("tracks")
+_BEFORE = stages_before("tracklets")
 FIELD_STAGES = tuple(stage.name for stage in STAGES if stage.name not in _BEFORE)
-"""What is computed of the units that are finished: tracks, field and maps."""
+"""What is computed of the units that are finished: tracklets, tracks, field and maps."""
 Compute = Callable[[Any], Any]
 """Gives the value of a Dask graph."""
 Publishing = AbstractContextManager[object]
@@ -64,12 +65,12 @@ def publish_first_preview(plan: Plan, publishing: Publishing) -> None:
 
 
 def preview_finished_units(plan: Plan, compute: Compute, publishing: Publishing) -> int:
-    """Make and publish the preview of the units whose tracklets are finished; returns the number of their frames."""
+    """Make and publish the preview of the units whose detections are finished; returns the number of their frames."""
     remove_tree(plan.layout.preview)
-    units = {unit.name: len(unit.frames) for unit in stage_units(plan, _stage("tracklets"))}
-    found = {name: valid_commit(plan.layout, "tracklets", name, plan.keys["tracklets"]) for name in units}
+    units = {unit.name: len(unit.frames) for unit in stage_units(plan, _stage("detections"))}
+    found = {name: valid_commit(plan.layout, "detections", name, plan.keys["detections"]) for name in units}
     finished = [name for name, record in found.items() if record is not None]
-    so_far = _with_root(plan).with_lost_units([f"tracklets {name}" for name in units if name not in finished])
+    so_far = _with_root(plan).with_lost_units([f"detections {name}" for name in units if name not in finished])
     link_shared_outputs(plan.layout, so_far.layout, _BEFORE)
     _make(so_far, [_stage(name) for name in FIELD_STAGES], compute)
     frames = sum(units[name] for name in finished)
@@ -111,7 +112,8 @@ def _make(plan: Plan, stages: tuple[Stage, ...] | list[Stage], compute: Compute)
         for stage in stages:
             prepare_stage(plan, stage)
             for unit in stage_units(plan, stage):
-                compute(unit_graph(plan, stage, unit))
+                if f"detections {unit.name}" not in plan.lost:
+                    compute(unit_graph(plan, stage, unit))
 
 
 def _write_page(plan: Plan, preview: Plan, what: str) -> None:

@@ -69,12 +69,10 @@ class Stage:
     prepare : function ``(plan) -> None`` that creates the stage's store before its units fill it.
     store : the store's path in the run folder.
     after : stages that it reads.
-    follows : of those, the ones of which a unit reads the same frames' units alone (and the halo): it need not wait
-        for the others.
     inputs : of the inputs (`schemas.records.InputsRecord`), those that it reads.
     config : of the configuration (`schemas.flight.FlightConfig`), the sections and keys that it reads.
     unread : keys of those sections that it does not read.
-    cut, halo : how it is cut; a unit of frames also reads so many units after its own.
+    cut : how it is cut; a unit of frames is lost with the same unit of a stage that it reads.
     new_workers : in a long flight its workers start without what earlier stages left in theirs: its memory grows with
         the flight, whose tables it reads as a whole, or is the most that any takes.
     new_base, remap : what `velfield reprocess` makes of it; ``remap`` is ``(plan, *part, rebase) -> StageResult``.
@@ -93,12 +91,10 @@ class Stage:
     prepare: str | None = None
     store: str | None = None
     after: tuple[str, ...] = ()
-    follows: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
     config: tuple[str, ...] = ()
     unread: tuple[str, ...] = ()
     cut: Cut = Cut.WHOLE
-    halo: int = 0
     new_workers: bool = False
     new_base: NewBase = NewBase.COMPUTED
     remap: str | None = None
@@ -268,7 +264,7 @@ STAGES: tuple[Stage, ...] = (
         new_base=NewBase.MAPPED,
         remap=f"{_STAGES}.rebase:rebase_detections",
     ),
-    # Windows of three frames that start in the unit; they reach into the unit after.
+    # Windows of three frames that start in the unit; they reach 2 * max_interval_s behind it.
     Stage(
         name="tracklets",
         version=3,
@@ -276,11 +272,9 @@ STAGES: tuple[Stage, ...] = (
         lines=(Line("{tracklets:.0f} tracklets over three frames"),),
         unit=f"{_STAGES}.tracklets:link_unit",
         after=("detections",),
-        follows=("detections",),
         config=("tracking",),
         unread=("tracking.max_gap_s", "tracking.max_stationary_gap_s", "tracking.max_hidden_gap_s"),
         cut=Cut.BY_FRAMES,
-        halo=1,
         new_base=NewBase.COUNTS,
     ),
     # Tracklets of all units that belong to one vehicle.
@@ -368,26 +362,6 @@ def stages_before(name: str) -> list[str]:
     """
     names = list(STAGE)
     return names[: names.index(name)]
-
-
-def stages_awaited(name: str) -> list[str]:
-    """Names of the stages that are done, or lost units, before any unit of a stage is computed, in the order of the
-    work: its key depends on what they lost.
-
-    Examples
-    --------
-    >>> "detections" in stages_awaited("tracklets"), "detections" in stages_awaited("tracks")
-    (False, True)
-    """
-    found: set[str] = set()
-    for before in STAGE[name].after:
-        found |= set(stages_awaited(before) if before in STAGE[name].follows else [before, *_all_read(before)])
-    return [one for one in STAGE if one in found]
-
-
-def _all_read(name: str) -> set[str]:
-    """Names of the stages that a stage reads, and those that they read."""
-    return {one for before in STAGE[name].after for one in {before} | _all_read(before)}
 
 
 def resolve(function: str) -> Callable[..., Any]:

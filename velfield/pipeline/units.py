@@ -6,7 +6,7 @@ from typing import Any
 
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.stage import Cut, Stage, resolve
-from velfield.run.commits import read_commit
+from velfield.run.commits import commit_path, read_commit
 
 WHOLE = "all"
 """Name of the one unit of a stage that is not cut."""
@@ -66,16 +66,21 @@ def prepare_stage(plan: Plan, stage: Stage) -> None:
     _remove_stale_units(plan, stage)
 
 
+def discard_unit(plan: Plan, stage: Stage, unit: str) -> None:
+    """Remove the record of a unit, and the files that it vouches for outside the stage's store: no stage reads them."""
+    record = read_commit(plan.layout, stage.name, unit)
+    commit_path(plan.layout, stage.name, unit).unlink(missing_ok=True)
+    if record is not None and stage.store is None:
+        for output in record.outputs:
+            (plan.layout.root / output).unlink(missing_ok=True)
+
+
 def _remove_stale_units(plan: Plan, stage: Stage) -> None:
     """Remove the records of units that this plan does not have, and their files: fewer frames, or other units."""
     current = {unit.name for unit in stage_units(plan, stage)}
     for path in (plan.layout.commits / stage.name).glob("*.json"):
         if path.stem not in current:
-            record = read_commit(plan.layout, stage.name, path.stem)
-            path.unlink(missing_ok=True)
-            if record is not None and stage.store is None:
-                for output in record.outputs:
-                    (plan.layout.root / output).unlink(missing_ok=True)
+            discard_unit(plan, stage, path.stem)
 
 
 def stage_units(plan: Plan, stage: Stage) -> list[Unit]:

@@ -12,6 +12,7 @@ from velfield.detection.detector import ONNX_SUFFIX
 from velfield.pipeline.plan import Plan, widen_interval
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.registration import MAP_PARAMETERS, usable_frames
+from velfield.pipeline.units import unit_name
 from velfield.run.frame_transforms import read_tracking_gsd
 from velfield.run.stores import open_frames, open_registration
 from velfield.run.tables import Arrays, read_arrays, read_tables, write_table
@@ -54,9 +55,12 @@ def explain_no_tracklets(plan: Plan) -> str:
 
 
 def link_unit(plan: Plan, frames: range) -> StageResult:
-    """Tracklets of all windows that start in ``frames``; reads the detections of as many frames after as they need."""
+    """Tracklets of all windows that start in ``frames``; reads the detections of as many frames after as they need.
+
+    Frames whose detections are lost are passed over, as frames that are not registered are.
+    """
     times_s = open_frames(plan.layout.frames).column("time_s")
-    usable = usable_frames(plan)
+    usable = linkable_frames(plan)
     window = window_frames(list(usable), list(times_s), frames, plan.config.tracking.max_interval_s)
     tables = frame_tables(plan, window, times_s, usable)
     tracklets, log = link_windows(tables, plan.config.tracking, gsd_m=read_tracking_gsd(plan.layout), starts=frames)
@@ -70,7 +74,22 @@ def link_unit(plan: Plan, frames: range) -> StageResult:
 def frame_tables(plan: Plan, window: range, times_s: np.ndarray, usable: np.ndarray) -> list[FrameTable]:
     """Detections of a range of frames."""
     units = range(window.start // plan.unit_frames, (window.stop - 1) // plan.unit_frames + 1)
-    return tables_of_units(plan, window, times_s, usable, {unit: read_unit(plan, unit) for unit in units})
+    read = {unit: read_unit(plan, unit) for unit in units if not has_lost_detections(plan, unit)}
+    return tables_of_units(plan, window, times_s, usable, read)
+
+
+def linkable_frames(plan: Plan) -> Mask:
+    """Frames (frames,) that are registered, have no fault, and whose detections are not lost."""
+    usable = usable_frames(plan)
+    for unit, frames in enumerate(plan.units):
+        if has_lost_detections(plan, unit):
+            usable[frames.start : frames.stop] = False
+    return usable
+
+
+def has_lost_detections(plan: Plan, unit: int) -> bool:
+    """Whether the detections of a unit, by its number, are lost."""
+    return f"detections {unit_name(plan.units[unit])}" in plan.lost
 
 
 @dataclass(frozen=True)
@@ -119,7 +138,8 @@ def among(values: IntArray, ascending: IntArray) -> Mask:
 def tables_of_units(
     plan: Plan, window: range, times_s: np.ndarray, usable: np.ndarray, units: Mapping[int, UnitDetections]
 ) -> list[FrameTable]:
-    """Detections of a range of frames, by the frames' units, which are read."""
+    """Detections of a range of frames, by the frames' units, which are read; frames of others are not usable."""
+    none = next(iter(units.values()))  # it holds no detections of the frames of others
     store = open_registration(plan.layout.registration)
     heldout = store.column("heldout_px", window.start, window.stop).astype(np.float64)
     kept = store.column("n_inliers", window.start, window.stop).astype(np.float64)
@@ -128,7 +148,7 @@ def tables_of_units(
         residual = float(np.nan_to_num(heldout[k]))
         tables.append(
             _frame_table(
-                units[frame // plan.unit_frames],
+                units.get(frame // plan.unit_frames, none),
                 frame,
                 time_s=float(times_s[frame]),
                 registered=bool(usable[frame]),

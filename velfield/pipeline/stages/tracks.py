@@ -20,6 +20,8 @@ from velfield.pipeline.stages.tracklets import (
     UnitDetections,
     among,
     explain_no_tracklets,
+    has_lost_detections,
+    linkable_frames,
     read_chosen,
     tables_of_units,
     tracklet_files,
@@ -79,7 +81,7 @@ def chain_tracks(plan: Plan) -> StageResult:
     candidates = read_candidates(plan, tracklets, gsd_m)
     context = find_context(plan, ends, starts, strips)
     found = recover_tracks(ids, ends, starts, _gap_limits(plan), context, candidates)
-    flight = _Frames(open_frames(layout.frames).column("time_s"), usable_frames(plan))
+    flight = _Frames(open_frames(layout.frames).column("time_s"), linkable_frames(plan))
     positions = all_positions(tracklets.assign(track_id=found.tracks[chain]), found, candidates, gsd_m, flight)
     first_frame = np.array(tracklets["frame_0"])
     del tracklets, candidates, context  # what follows needs no more of them, and they are large
@@ -414,7 +416,7 @@ class _Output:
         if len(mine.frame):
             last = (_window(plan, frames, self.flight).stop - 1) // plan.unit_frames
             for one in range(unit, last + 1):
-                if one not in kept:
+                if one not in kept and not has_lost_detections(plan, one):
                     kept[one] = read_chosen(plan, one, self.ids)
         return recovered_tracklets(plan, frames, mine, self.flight, kept)
 
