@@ -70,14 +70,6 @@ def test_the_bottleneck_begins_where_traffic_slows_down(run: Run) -> None:
     assert row.upstream_speed_px_per_s * GSD_M == pytest.approx(12.0, abs=0.5)
 
 
-def test_the_u_turn_is_found_with_its_track_and_path(run: Run) -> None:
-    found = run.analysis.u_turns()
-    assert found["track_id"].tolist() == [16]
-    assert (found.x_px[0], found.y_px[0]) == pytest.approx((350.0, 130.0), abs=5)
-    assert np.degrees(found.turn_rad[0]) == pytest.approx(180, abs=12)
-    assert run.analysis.u_turns(max_path_m=8.0).empty  # the arc is 16 m long
-
-
 @pytest.mark.parametrize(
     ("direction", "north", "heading"),
     [(-np.pi / 2, None, 0.0), (0.0, None, 90.0), (np.pi, None, 270.0), (0.0, 0.0, 0.0), (np.pi / 2, np.pi, 270.0)],

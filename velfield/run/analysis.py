@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from math import radians
 
 import numpy as np
 import pandas as pd
@@ -20,9 +19,8 @@ from velfield.analysis.regions import Regions
 from velfield.analysis.stops import find_stops
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import Trajectories, from_tracklets, moving
-from velfield.analysis.u_turns import find_u_turns
 from velfield.analysis.vehicle_classes import VehicleClasses, find_classes
-from velfield.field.segments import Segments, stationary_speed_px_per_s
+from velfield.field.segments import stationary_speed_px_per_s
 from velfield.field.statistics import direction_rad
 from velfield.run.frame_transforms import heading_deg, north_direction_rad
 
@@ -38,8 +36,6 @@ class RunAnalysis:
     ----------
     layer
         Returns a (y, x) layer of ``field.zarr`` by its name.
-    segments
-        Returns the segment table of the run.
     tracklets
         Returns the tracklets of the run, with their tracks.
     grid, config
@@ -51,7 +47,6 @@ class RunAnalysis:
     """
 
     layer: Callable[[str], NDArray[np.generic]]
-    segments: Callable[[], Segments]
     tracklets: Callable[[], pd.DataFrame]
     grid: GridRecord
     config: FieldConfig
@@ -168,23 +163,6 @@ class RunAnalysis:
             max_ratio=max_ratio,
             min_count=min_count,
             min_area_px=self._area_px(min_area_m2),
-        )
-
-    def u_turns(self, *, max_path_m: float = 40.0, min_turn_deg: float = 150.0) -> pd.DataFrame:
-        """Tracks that reverse their direction within a short path, one row each: `find_u_turns`.
-
-        Parameters
-        ----------
-        max_path_m
-            Longest path of a U-turn.
-        min_turn_deg
-            Smallest change of direction.
-        """
-        return find_u_turns(
-            self.segments(),
-            stationary_speed_px_per_s=stationary_speed_px_per_s(self.config, self.grid.gsd_m),
-            max_path_px=max_path_m / self.gsd_m,
-            min_turn_rad=radians(min_turn_deg),
         )
 
     @cached_property

@@ -255,14 +255,12 @@ class Run:
 
     @cached_property
     def analysis(self) -> RunAnalysis:
-        """Lanes, carriageways, stops, bottlenecks and U-turns: ``run.analysis.stops().table``."""
+        """Lanes, carriageways, stops and bottlenecks: ``run.analysis.stops().table``."""
 
         def layer(name: str) -> NDArray[np.generic]:
             return open_field(self.layout.field).layer(name)
 
-        return RunAnalysis(
-            layer, self.segments, self.tracklets, self.grid, self.record.config.field, self._dimensions, self.vehicles
-        )
+        return RunAnalysis(layer, self.tracklets, self.grid, self.record.config.field, self._dimensions, self.vehicles)
 
     @cached_property
     def base_image(self) -> GreyImage:
