@@ -70,7 +70,7 @@ soak: $(STAMP)  ## fifty kills at random moments: every result equal to the bit
 docs: $(STAMP)  ## the documentation as pages, in build/docs
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
-detector: $(STAMP)  ## make the detector that ships anew: make detector DATA=folder with songdo/ and kit_ais/
+detector: $(STAMP)  ## train the detector that ships further: make detector DATA=folder with the sets of tools/training_data.py
 	$(BIN)/python -m tools.make_detector $(DATA)
 
 # Universal, with hashes, and without a registry's address in it.
