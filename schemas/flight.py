@@ -213,8 +213,8 @@ class WorkConfig(Model):
     block_frames: PositiveInt = Field(8, le=4096)
     """Frames a Dask block; one-frame blocks cost 10 ms each."""
     unit_frames: Annotated[int, Field(ge=1, le=65536)] | Literal["auto"] = "auto"
-    """Frames a unit, that is a Prefect task run and a commit record; ``auto``: 16 up to 256 frames, 64 up to
-    4096, then 256."""
+    """Frames a unit, that is a Prefect task run and a commit record; ``auto``: all of
+    16 frames, else an even number of units of at most 32 up to 256 frames, 64 up to 4096, then 256."""
     previews: bool = True
     """Make maps of a long flight while it is processed: of its first frames, then of all that are through."""
     retries: int = Field(2, ge=0, le=100)
@@ -230,9 +230,9 @@ class FlightConfig(Model):
     preset: Preset = "best"
     """The set of defaults that this configuration started from."""
     gsd_m: float | None = Field(None, ge=0.001, le=5)
-    position_unit: Literal["m", "px"] | None = None
-    """Of columns named x and y in the tracks of `velfield run --tracks`."""
     """Ground sample distance of the base image, m a pixel; None: from its CRS, the metadata or the vehicles."""
+    position_unit: Literal["m", "px"] | None = None
+    """Unit of the columns x and y in the tracks of `velfield run --tracks`."""
     frames: FramesConfig = FramesConfig()
     lens: LensConfig = LensConfig()
     base: BaseConfig = BaseConfig()

@@ -142,3 +142,10 @@ def test_what_decides_whether_a_key_is_read_is_a_key_and_its_values_are_valid() 
         resolve_config(overrides={other: values[0] for other, values in deciding.items()})
         section, name = key.split(".")
         assert name in type(getattr(FlightConfig(), section)).model_fields
+
+
+def test_every_key_has_a_description_in_the_schema() -> None:
+    schema = FlightConfig.model_json_schema()
+    properties = {name: found for name, found in schema["properties"].items() if "$ref" not in str(found)}
+    assert set(properties) >= {"gsd_m", "position_unit"}
+    assert [name for name, found in properties.items() if not found.get("description")] == []
