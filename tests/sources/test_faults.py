@@ -4,6 +4,7 @@ import struct
 import zlib
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from PIL import Image
@@ -20,6 +21,7 @@ from velfield.sources.quality import (
     frame_quality,
 )
 from velfield.sources.source import iter_frames, probe
+from velfield.sources.video.decoding import _grey
 
 ALL = FramesConfig()
 FPS = FramesConfig(fps=5)
@@ -96,7 +98,9 @@ def test_an_avi_that_repeats_images_is_no_truncated_one(tmp_path, frames):
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize(("suffix", "codec"), [(".mp4", "libx264"), (".ts", "libx264"), (".avi", "mpeg4")])
+@pytest.mark.parametrize(
+    ("suffix", "codec"), [(".mp4", "libx264"), (".ts", "libx264"), (".avi", "mpeg4"), (".mp4", "libx265")]
+)
 def test_no_wrong_frame_of_a_damaged_stretch_goes_unflagged(tmp_path, frames, suffix, codec, seed):
     clean = {
         round(frame.time_s, 3): frame.grey
@@ -108,6 +112,38 @@ def test_no_wrong_frame_of_a_damaged_stretch_goes_unflagged(tmp_path, frames, su
     assert wrong
     assert not [frame.source_index for frame in wrong if not frame.flags & UNUSABLE]
     assert all(frame.reason for frame in read if frame.flags)
+
+
+SOUND = {
+    "intra refresh": ("libx264", "x264-params", "intra-refresh=1:keyint=10:bframes=0"),
+    "open groups": ("libx264", "x264-params", "open-gop=1:keyint=12:bframes=3"),
+    "pyramid": ("libx264", "x264-params", "keyint=30:bframes=5:b-pyramid=normal"),
+    "HEVC, open groups": ("libx265", "x265-params", "open-gop=1:keyint=12:bframes=3:log-level=none"),
+    "HEVC, intra refresh": ("libx265", "x265-params", "intra-refresh=1:keyint=10:bframes=0:log-level=none"),
+}
+
+
+@pytest.mark.parametrize("kind", SOUND)
+def test_a_sound_stream_has_no_suspect_frame_however_it_is_coded_and_cut(tmp_path, frames, kind):
+    """Frames asked for alone, in units, are to the bit those of a decoder that is left to itself."""
+    codec, name, value = SOUND[kind]
+    path = write_video(tmp_path / "a.mp4", frames, codec=codec, options={"preset": "veryfast", name: value})
+    with av.open(str(path)) as container:
+        plain = [_grey(frame) for frame in container.decode(video=0)]
+    info = probe(path, frames=ALL)
+    chosen = range(0, 60, 3)
+    for size in (5, 20):
+        read = [one for k in range(0, 20, size) for one in iter_frames(path, info, list(chosen)[k : k + size])]
+        assert [(frame.source_index, frame.flags, frame.reason) for frame in read] == [(k, 0, "") for k in chosen]
+        assert all(np.array_equal(frame.grey, plain[frame.source_index]) for frame in read)
+
+
+def test_ten_bits_are_the_grey_levels_of_eight(tmp_path):
+    ramp = np.tile(np.linspace(0, 255, 320).astype(np.uint8), (240, 1))
+    deep = av.VideoFrame.from_ndarray(ramp, format="gray").reformat(format="yuv420p10le")
+    flat = av.VideoFrame.from_ndarray(ramp, format="gray").reformat(format="yuv420p")
+    assert np.abs(_grey(deep).astype(int) - _grey(flat)).max() <= 2
+    assert np.abs(_grey(deep).astype(int) - ramp).max() <= 2
 
 
 def test_frames_are_good_again_from_the_next_key_frame_on(tmp_path, frames):

@@ -1,4 +1,4 @@
-"""The parts of reading a video, each alone: time stamps, corruption in decoding order, block artefacts."""
+"""The parts of reading a video, each alone: time stamps, corruption in decoding order."""
 
 from dataclasses import dataclass
 from fractions import Fraction
@@ -78,13 +78,13 @@ def test_a_frame_is_found_by_its_time_stamp_and_equal_ones_by_order() -> None:
     assert [unstamped.of_frame(FakePacket(None)) for _ in range(3)] == [0, 1, None]
 
 
-def test_decoding_starts_a_group_before_the_one_that_is_needed() -> None:
+def test_decoding_starts_at_the_last_key_frame_and_of_open_groups_at_the_one_before() -> None:
     keys = np.isin(np.arange(50), [0, 10, 20, 30, 40])
     info = SourceInfo("video", 8, 8, 50, np.arange(50.0), tuple(map(str, range(50))), key_frames=keys, entries=keys)
-    assert _entry_points(info, 35) == [20, 10, 0]
+    assert _entry_points(info, 35) == [30, 20, 10, 0]
     assert _entry_points(info, 3) == [0]
     open_groups = SourceInfo("video", 8, 8, 50, info.times_s, info.names, key_frames=keys, entries=keys & False)
-    assert _entry_points(open_groups, 35) == [10, 0]
+    assert _entry_points(open_groups, 35) == [20, 10, 0]
 
 
 def tracked(groups: int = 3, length: int = 10, **options: bool) -> CorruptionTracker:
@@ -115,7 +115,7 @@ def test_a_frame_marked_as_corrupt_and_a_lost_one_affect_their_group_alone() -> 
     assert suspects(tracker) == list(range(21, 30))
     lost = tracked()
     lost.mark_lost(13)
-    assert suspects(lost) == list(range(10, 20))
+    assert suspects(lost) == list(range(10, 20))  # from four packets before
     assert lost.last_error == "a frame was lost"
 
 
@@ -150,7 +150,15 @@ def test_with_gradual_refresh_a_group_refers_to_the_one_before_and_the_first_to_
     tracker = tracked()
     tracker.mark_frame(15)
     tracker.note_key_frame(is_intra=False)
-    assert suspects(tracker) == [*range(10), *range(11, 30)]
+    assert suspects(tracker) == list(range(11, 30))
+
+
+def test_frames_before_the_first_key_frame_are_suspect() -> None:
+    tracker = CorruptionTracker()
+    for index in range(12):
+        tracker.feed(FakePacket(index, is_keyframe=index == 5), index)
+    assert suspects(tracker, 12) == list(range(5))
+    assert tracker.last_error == "no key frame before it"
 
 
 def scene_with_blocks(blocks: int, shift: int = 0) -> np.ndarray:

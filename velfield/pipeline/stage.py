@@ -121,7 +121,7 @@ STAGES: tuple[Stage, ...] = (
     # Decode, measure and write each frame.
     Stage(
         name="frames",
-        version=4,
+        version=5,
         label="frames",
         lines=(Line("{usable:.0f} of {frames:.0f} frames read"),),
         prepare=f"{_STAGES}.frames:create_frame_store",

@@ -107,12 +107,14 @@ _HARMLESS = (
     "unsupported color",
 )
 
-# The first bytes of a burst often decode without an error: so many frames before the first one are suspect, too.
-_MARGIN = 4
+MARGIN = 4
+"""The first bytes of a burst often decode without an error: so many frames before the first one are suspect, too."""
 
 _lock = threading.Lock()
 _users = 0
 _before: tuple[int | None, bool] = (None, True)
+_capture = av.logging.Capture(local=False)
+_errors = 0
 
 
 @contextmanager
@@ -121,6 +123,7 @@ def libav_log() -> Iterator[None]:
     global _users, _before
     with _lock:
         if _users == 0:
+            _capture.__enter__()
             _before = (av.logging.get_level(), av.logging.get_skip_repeated())
             av.logging.set_level(_LEVEL)
             av.logging.set_skip_repeated(False)  # a repeated error is an error each time
@@ -131,8 +134,20 @@ def libav_log() -> Iterator[None]:
         with _lock:
             _users -= 1
             if _users == 0:
+                _capture.__exit__(None, None, None)
+                _capture.logs.clear()
                 av.logging.set_level(_before[0])
                 av.logging.set_skip_repeated(_before[1])
+
+
+def count_errors() -> int:
+    """Number of errors that libav's own threads have logged so far, of all decoders of this process."""
+    global _errors
+    with _lock:
+        count = len(_capture.logs)
+        _errors += sum(_is_error(level, message) for level, _, message in _capture.logs[:count])
+        del _capture.logs[:count]
+        return _errors
 
 
 @contextmanager
@@ -170,7 +185,7 @@ class CorruptionTracker:
         self._count = 0
         self._group = 0  # groups are counted by key frames; group 0 precedes the first one and cannot be decoded
         self._key_index = -1
-        self._first_error: dict[int, int] = {0: 0}
+        self._first_error: dict[int, int] = {}
         self._position: dict[int, tuple[int, int, bool]] = {}
         self._key_of: dict[int, int] = {}
         self._gradual = False
@@ -182,6 +197,9 @@ class CorruptionTracker:
             self._group += 1
             self._key_index = -1 if index is None else index
             self._key_of[self._group] = self._key_index
+        elif self._group == 0 and packet.size and not self._first_error:
+            self._first_error[0] = 0  # a frame before the first key frame lacks what it refers to
+            self.last_error = "no key frame before it"
         if index is not None:
             # Presented before the key frame it follows in the file: it may refer to the group before, too.
             self._position[index] = (self._count, self._group, index < self._key_index)
@@ -191,7 +209,7 @@ class CorruptionTracker:
         if self._midway and self._group == 1 and message.startswith("mmco"):
             return
         self.last_error = message
-        self._first_error.setdefault(self._group, self._count - _MARGIN)
+        self._first_error.setdefault(self._group, self._count - MARGIN)
 
     def mark_frame(self, index: int) -> None:
         """Register that the decoder marked frame `index` as corrupt."""
@@ -199,7 +217,7 @@ class CorruptionTracker:
         self.last_error = self.last_error or "marked as corrupt by the decoder"
         if position is not None:
             count, group, _ = position
-            self._first_error[group] = min(count - _MARGIN, self._first_error.get(group, count))
+            self._first_error[group] = min(count - MARGIN, self._first_error.get(group, count))
 
     def mark_artifacts(self, index: int) -> None:
         """Register block artefacts in frame `index`. On a key frame after corruption they are the repair."""
@@ -217,14 +235,15 @@ class CorruptionTracker:
         position = self._position.get(index)
         self.last_error = self.last_error or "a frame was lost"
         if position is not None:
-            self._first_error.setdefault(position[1], 0)
+            count, group, _ = position
+            self._first_error[group] = min(count - MARGIN, self._first_error.get(group, count))
 
     def is_suspect(self, index: int) -> bool:
         """Whether frame `index` may be corrupt, by the errors so far."""
         # Where packets carry no time stamp (AVI), the frame's position is unknown: then any error since the key frame
         # before the last one counts.
         count, group, leading = self._position.get(index, (self._count, self._group, True))
-        if self.lasting and len(self._first_error) > 1:
+        if self.lasting and self._first_error:
             return True
         own = group in self._first_error and count >= self._first_error[group]
         return own or ((leading or self._gradual) and group - 1 in self._first_error)
