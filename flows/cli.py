@@ -502,7 +502,7 @@ def _start() -> int:
 
 
 def _choices(argument: Argument | None) -> str:
-    """What an option may be, where that is one of some words."""
+    """Allowed values of an option, in parentheses; empty if it is not one of a set of words."""
     words = get_args(argument.hint) if argument is not None and get_origin(argument.hint) is Literal else ()
     return f" (one of {', '.join(words)})" if words else ""
 

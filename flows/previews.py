@@ -29,7 +29,7 @@ WORTH_S = 30.0
 TIMES_ITS_COST = 3.0
 """... and so many times what it takes."""
 COST_S_A_MPX = 2.5
-"""What a preview takes until one was timed."""
+"""Assumed time that a preview takes, until one has been timed."""
 SHARE = 0.1
 """Fraction of the time that goes into previews."""
 

@@ -62,7 +62,7 @@ class Aside(Protocol):
     """Work beside the stages, none of whose results they read: done where there is some, in place of a unit."""
 
     def next_task(self, stages: Sequence[UnderWay]) -> Callable[[], None] | None:
-        """What to do now, if anything."""
+        """The next task, None if there is nothing to do."""
 
     def finish(self, error: BaseException | None) -> None:
         """Called when it is done, or failed."""

@@ -114,7 +114,7 @@ class ConnectionRecord(Model):
     end: NonNegativeInt
     tracks: NonNegativeInt
     share: float = Field(ge=0, le=1)
-    """Of the tracks that leave the lane ``start``."""
+    """Fraction of the tracks that leave the lane ``start``."""
     turn: Literal["straight", "left", "right", "u-turn"]
 
 

@@ -1,4 +1,4 @@
-"""What the annotation page sends: cars labelled in raw frames."""
+"""Data that the annotation page sends: cars labelled in raw frames."""
 
 from pydantic import Field, PositiveFloat
 

@@ -53,7 +53,7 @@ SpeedUnit = Literal["km/h", "mph", "m/s", "px/s"]
 
 
 class ExportOptions(Model):
-    """What some formats ask for."""
+    """Options of some formats."""
 
     width_px: int | None = Field(default=None, gt=0)
     """Width of a figure's or a video's map; None: one pixel a base pixel, of a video at most 1920."""

@@ -96,7 +96,7 @@ class RegistrationConfig(Model):
     """Knots of the row spline, which represents up to a third as many cycles a frame. Its stiffness is cross-validated
     for each frame, so that more knots than needed do no harm."""
     start: Literal["optical_flow", "keypoints"] = "optical_flow"
-    """What a frame's fit starts from: the frame before, by optical flow, with keypoints for the first of a chain and
+    """Start of a frame's fit: the frame before, by optical flow, with keypoints for the first of a chain and
     wherever that fails; or the keypoints of every frame."""
     max_keypoints: PositiveInt = 4000
     """Keypoints kept a frame, spread by cells."""

@@ -37,7 +37,7 @@ class ControlPointsRecord(Model):
 
     points: tuple[ControlPoint, ...]
     epsg: PositiveInt
-    """Of the points' coordinates as they were given; 4326: longitude and latitude."""
+    """EPSG code of the points' coordinates as they were given; 4326: longitude and latitude."""
     model: Literal["similarity", "affine"]
     crs_wkt: str
     """Reference system of the map."""
@@ -50,7 +50,7 @@ class ControlPointsRecord(Model):
     rms_m: NonNegativeFloat
     left_out_rms_m: NonNegativeFloat | None = None
     base_digest: str
-    """Of the base image that the pixels belong to."""
+    """Digest of the base image that the pixels belong to."""
     degrees_of_freedom: NonNegativeInt = 0
 
     def text(self) -> str:
@@ -68,12 +68,12 @@ class MarkedPoint(Model):
 
 
 class MarkedPoints(Model):
-    """What the georeferencing page sends."""
+    """Control points that the georeferencing page sends."""
 
     points: tuple[MarkedPoint, ...] = Field(max_length=10_000)
     order: Literal["longitude_latitude", "latitude_longitude", "x_y"]
     epsg: int | None = Field(None, gt=0, lt=2**31)
-    """Of x, y; not read with longitude and latitude."""
+    """EPSG code of x, y; not read with longitude and latitude."""
 
 
 class MarkedPlace(Model):
@@ -102,7 +102,7 @@ class FlightStart(Model):
 
 
 class GeoreferenceRecord(Model):
-    """What is known of scale, north and place."""
+    """Scale, north and place of the map, as far as they are known."""
 
     scale: ScaleChoice = ScaleChoice()
     telemetry: str = ""
@@ -117,4 +117,4 @@ class GeoreferenceRecord(Model):
     affine: Affine | None = None
     """Base pixel (column, row) -> CRS coordinates, GDAL's corner convention, as rasterio's ``Affine``."""
     remarks: tuple[str, ...] = ()
-    """What contradicts what, one line each."""
+    """Contradictions between the sources, one line each."""

@@ -1,4 +1,4 @@
-"""What a run is asked to do: its inputs, its configuration, its folder."""
+"""Specification of a run: its inputs, its configuration, its folder."""
 
 import os
 from pathlib import Path

@@ -92,7 +92,7 @@ class GridRecord(Model):
     base_source: Literal["flight", "given"]
     """``flight``: the base image is built from the flight; ``given``: it is the image given as ``--base``."""
     registered_to: Literal["flight", "given"] = "flight"
-    """What frames are registered to: the base image built from the flight, or directly the given one."""
+    """Image that frames are registered to: the base image built from the flight, or directly the given one."""
     reference_frame: NonNegativeInt
     intersensor_error_px: float | None = None
     """Mean error at left-out points of the registration to the given picture."""

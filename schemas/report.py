@@ -1,4 +1,4 @@
-"""What the report shows, apart from its figures."""
+"""Content of the report, apart from its figures."""
 
 from typing import Literal
 
@@ -12,7 +12,7 @@ class ReportStage(Model):
 
     name: str
     text: str
-    """What it did, with counts, for people."""
+    """Summary of the stage's results, with counts."""
     seconds: float = Field(ge=0)
     lost: int = Field(0, ge=0)
     """Units that failed in every try."""
@@ -36,7 +36,7 @@ class PrecisionRecall(Model):
     operating_point: int | None = None
     """Index of the score threshold in use."""
     description: str = ""
-    """What the curve was measured on."""
+    """Data that the curve was measured on."""
 
 
 class Report(Model):
@@ -53,19 +53,19 @@ class Report(Model):
     low_coverage_note: str = ""
     """A note for people where hardly any pixel was passed by several vehicles."""
     inputs: tuple[tuple[str, str], ...] = ()
-    """What went in: base image, ground distance, labels, preset; label and value."""
+    """Inputs of the run: base image, ground distance, labels, preset; label and value."""
     stages: tuple[ReportStage, ...] = ()
     residual: ResidualSeries | None = None
     detection: PrecisionRecall | None = None
     gates: dict[str, int] = Field(default_factory=dict)
-    """What tracking tried, rejected and kept, by the names of `velfield.tracking.gates.GateLog`."""
+    """Counts of what tracking tried, rejected and kept, by the names of `velfield.tracking.gates.GateLog`."""
     notes: tuple[str, ...] = ()
     """Remarks of the stages."""
     warnings: tuple[str, ...] = ()
     """Warnings of the stages."""
     frames_lost: tuple[str, ...] = ()
     footage_lost: tuple[str, ...] = ()
-    """What of the recording is not there, one line each; also among the warnings."""
+    """Missing parts of the recording, one line each; also among the warnings."""
     files: tuple[tuple[str, str], ...] = ()
     """Files of the run folder worth opening: path relative to the report, and what it is."""
 
@@ -76,7 +76,7 @@ class ReportFigure(Model):
     title: str
     caption: str
     alt_text: str
-    """What the image shows, for those who do not see it."""
+    """Description of the image for readers who cannot see it."""
     mime: Literal["image/png", "image/jpeg"]
     data: bytes = Field(b"", repr=False)
     file: str | None = None

@@ -29,7 +29,7 @@ class ScaleEstimate(Model):
     """Upper end of the 90 % interval, m a base pixel."""
     source: ScaleSource
     note: str = ""
-    """What it rests on, one line."""
+    """Basis of the estimate, one line."""
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:

@@ -22,9 +22,9 @@ class StageSummary(Model):
     warnings: tuple[str, ...] = ()
     """Warnings, one line each."""
     seconds: float
-    """What this run spent on it."""
+    """Time that this run spent on the stage."""
     seconds_before: float = 0.0
-    """What earlier runs spent on the units that they had finished, added up."""
+    """Total time that earlier runs spent on the units that they had finished."""
     text: str
     """The stage in one line, for people."""
 
@@ -37,7 +37,7 @@ class RunSummary(Model):
     frames_lost: tuple[str, ...] = ()
     """Frames that are in no tracklet though the source has them, and why: ``frame 12 (2.412 s): failed:...``."""
     footage_lost: tuple[str, ...] = ()
-    """What of the recording the source does not have: ``clip.mp4: 31 frames read of 60 declared: ...``."""
+    """Parts of the recording that the source does not have: ``clip.mp4: 31 frames read of 60 declared: ...``."""
 
     @property
     def complete(self) -> bool:

@@ -68,7 +68,7 @@ TRACK_POSITION_COLUMNS: dict[str, str] = {
 }
 """Where each track's vehicle was in each registered frame, a row a track and frame."""
 POSITION_SOURCES = ("tracklet", "candidate", "interpolated")
-"""Of a position: a detection in a tracklet; a detection, perhaps of a low score, that the track confirmed; or none."""
+"""Source of a position: detection in a tracklet; detection, perhaps of a low score, confirmed by the track; or none."""
 
 JOIN_COLUMNS: dict[str, str] = {
     "track_id": "int64",

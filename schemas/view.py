@@ -21,7 +21,7 @@ class ViewLayer(Model):
     arrays: tuple[str, ...] = Field(min_length=1, max_length=2)
     """Arrays of ``field.zarr``: one, or the x and y components of a velocity."""
     units: str
-    """Of what is stored."""
+    """Units of the stored values."""
     colour_max: float
     """Value of the last colour, in stored units; of a change, on either side of zero."""
     data_max: float

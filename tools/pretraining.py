@@ -46,7 +46,7 @@ SIZED_TOPOLOGY: Topology = (*TOPOLOGY[:-2], Conv("head", 1, 32, 20, relu=False),
 LEARNING_RATE = 2e-3
 _ORIENTATION_WEIGHT, _SIZE_WEIGHT = 0.5, 2.0
 _AVERAGE = 0.998
-"""Of the exponential moving average of the weights, which is what is kept."""
+"""Decay of the exponential moving average of the weights, which is what is kept."""
 _MOMENTUM, _MIN_VARIANCE = 0.05, 1e-5
 _MAX_LOGIT = 11.0
 _CERTAIN_CAR, _CERTAIN_GROUND, _KNOWN_RADIUS_PX = 0.4, 0.15, 9.0
@@ -187,7 +187,7 @@ class SizedBatch:
 
     @classmethod
     def of(cls, patches: Sequence[Patch]) -> "SizedBatch":
-        """Of patches."""
+        """Batch of the given patches."""
         sizes, weights = zip(*(_encode_sizes(patch) for patch in patches), strict=True)
         return cls(to_batch(patches), np.stack(sizes), np.stack(weights))
 

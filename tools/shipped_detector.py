@@ -34,7 +34,7 @@ from velfield.detection.samples import LabelledImage
 from velfield.parallel import parallel_map
 
 CONFIG = CascadeConfig(seed=7)
-"""Of the classifier of long vehicles."""
+"""Configuration of the classifier of long vehicles."""
 STEPS, TILES_FROM, SEED = 30_000, 10_000, 7
 SIMULATED_SEEDS = (*range(9001, 9061), *range(9301, 9501))
 """Every third of them with many long vehicles."""
@@ -43,12 +43,12 @@ _SIMULATED_WEIGHT = 3.0
 LORRY_SEEDS, LORRY_SEEDS_HELD_OUT = range(9101, 9181), range(9201, 9225)
 _LORRY_SCENE_SIZE = (1280, 960)
 _LARGE_VEHICLE_FRACTION, _LARGE_RATIO = 0.35, 1.4
-"""Of the simulated traffic that the classifier of long vehicles is trained on: a usual city has too few. A longer
-vehicle than so many cars is none of the cars of the real pictures."""
+"""Fraction of long vehicles in the simulated traffic on which their classifier is trained, as a usual city has too few;
+and length, in cars, from which a vehicle of the real pictures is not used as a car."""
 _SENSORS = ((1.7, 0.7, 0.0), (0.6, 0.0, 4.0))
 """Photometric augmentation: gamma, blur in px, noise in grey levels."""
 _TOLERANCE = 0.005
-"""Of the F1: less is no loss."""
+"""Decrease of F1 up to which a network is not worse."""
 
 
 def _simulate_sensor(sample: LabelledImage, gamma: float, blur_px: float, noise_grey: float) -> LabelledImage:

@@ -19,7 +19,7 @@ from velfield.synthetic.traffic.vehicles import LAYERS, draw_tones
 from velfield.tracking.dimensions import STRIP_SHAPE, normalise
 
 _PX_PER_M = 3.6
-"""Of a strip's full resolution: a car of 4.5 m is 16 px long."""
+"""Full resolution of a strip: a car of 4.5 m is 16 px long."""
 _STEP_PX = 0.25
 _SPAN_PX = STRIP_SHAPE[0], STRIP_SHAPE[1]
 """Half the strip's sides, full resolution."""

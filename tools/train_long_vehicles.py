@@ -38,7 +38,7 @@ _DETECTION_REACH_PX, _CAR_DETECTION_REACH_PX = 9.0, 2.0
 """How far along its axis a long vehicle, or a car, may be detected off its centre."""
 _MINING_MIN_SCORE, _MINING_MIN_DISTANCE_PX = -0.05, 4.0
 _FALSE_POSITIVE_RATE = 0.0005
-"""Of held-out cars that may be taken for part of a long vehicle."""
+"""Maximum fraction of held-out cars that are taken for part of a long vehicle."""
 
 
 _Detections: TypeAlias = tuple[FloatArray, FloatArray]

@@ -23,7 +23,7 @@ CHANNEL_MIXES = 5
 _MIX_CONCENTRATION = (1.5, 3.0, 1.5)
 """Weights of blue, green and red in them: parameters of a Dirichlet distribution."""
 _LARGE_WIDTH_RATIO = 0.5
-"""Of a bus or lorry in an upright box: its width over a car's length (2.25 m over 4.5 m)."""
+"""Width of a bus or lorry in an upright box, as a fraction of a car's length (2.25 m over 4.5 m)."""
 _IGNORE_RADIUS_PX = 8.0
 _SEED = 7
 

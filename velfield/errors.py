@@ -1,4 +1,4 @@
-"""What goes wrong: bad input, a damaged run, a full disk, a frame or chunk that cannot be done; and four warnings."""
+"""Errors and warnings: bad input, a damaged run, a full disk, a frame or chunk that fails; and four warnings."""
 
 import errno
 import json
@@ -55,7 +55,7 @@ def is_disk_full(error: BaseException) -> bool:
 
 
 def parse_json(data: str | bytes) -> Any:
-    """What JSON says, of a file that anyone may have written.
+    """Parse JSON from an untrusted file.
 
     Raises
     ------

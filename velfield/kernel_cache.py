@@ -32,7 +32,7 @@ _UNUSED_S = 30 * 86400.0
 
 
 class Locator:
-    """What numba asks where to keep the code of one function: its interface of cache locators."""
+    """Location of one function's cached code: numba's interface of cache locators."""
 
     def __init__(self, py_func: Any, source: Path) -> None:
         self._line = str(py_func.__code__.co_firstlineno)
@@ -55,11 +55,11 @@ class Locator:
         return str(self._folder)
 
     def get_source_stamp(self) -> str:
-        """What differs where the code is out of date."""
+        """Stamp of the source, which changes when the cached code is out of date."""
         return self._stamp
 
     def get_disambiguator(self) -> str:
-        """What differs between functions of one name in a file."""
+        """Line number, which distinguishes functions of one name in a file."""
         return self._line
 
 

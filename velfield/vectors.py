@@ -76,7 +76,7 @@ class Vectors:
         return self.build.bitcast(start, (kind or self.kind(start.type.pointee)).as_pointer())
 
     def load(self, start: Any, *offsets: Any, kind: Any = None) -> Any:
-        """What lies at the `place` given likewise; it need not be aligned."""
+        """Load the value at the `place` of the same arguments; it need not be aligned."""
         loaded = self.build.load(self.place(start, *offsets, kind=kind))
         loaded.align = 1
         return loaded

@@ -62,7 +62,7 @@ def find_answers(analysis: TrafficAnalysis) -> Iterator[Answer]:
 
 
 def too_short(analysis: TrafficAnalysis) -> str:
-    """What a short clip with few vehicles allows to say."""
+    """Explanation that a clip has too few moving vehicles for most questions, with their number and its duration."""
     tracks, seconds = len(analysis.trajectories), analysis.trajectories.duration_s
     verb = "is" if tracks == 1 else "are"
     return (

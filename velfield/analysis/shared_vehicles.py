@@ -18,7 +18,7 @@ _MIN_STEPS, _MIN_AGREEMENT = 4, 0.7
 """Steps that both tracks cover; fraction of them at which they are one vehicle's."""
 _MOVES_M = 5.0
 _TRACKS_OF_THE_OFFSET = 300
-"""So many moving tracks, evenly spread, give the offset of the clocks."""
+"""Number of moving tracks, evenly spread, by which the offset of the clocks is estimated."""
 _NEARLY_AS_MANY = 0.9
 """The smallest offset at which so large a part of the most tracks agree is used."""
 

@@ -26,7 +26,7 @@ _MAX_LAG = 40
 
 @dataclass(frozen=True)
 class TimeCheck:
-    """What the vehicles' accelerations say of the times.
+    """Check of the times by the vehicles' accelerations.
 
     Attributes
     ----------

@@ -11,7 +11,7 @@ from numba import njit
 from schemas.arrays import FloatArray, IntArray, Mask
 
 VEHICLE_LENGTH_M, VEHICLE_WIDTH_M = 4.5, 1.8
-"""Of a vehicle that was not measured."""
+"""Dimensions assumed for a vehicle that was not measured."""
 _LENGTH_SD_M = 0.5
 """A length that is known worse says less than that most vehicles are cars."""
 _SMOOTHING_S = 1.0

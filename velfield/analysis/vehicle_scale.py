@@ -21,8 +21,8 @@ _CLASSES = ((0.84, np.log(CAR_LENGTH_M), 0.075), (0.08, np.log(5.5), 0.09), (0.0
 """Fraction, mean and standard deviation of the logarithm of the length, m: cars; vans; lorries and buses."""
 _OUTLIERS = 0.02
 TRACK_LENGTH_BIAS, TRACK_LENGTH_SD = 1.02, 0.015
-"""Of the lengths that are measured on tracks, over the true ones: their median over simulated flights, and how much the
-median of a flight scatters about it (seeds 901 to 905)."""
+"""Ratio of the lengths measured on tracks to the true ones: its median over simulated flights, and the standard
+deviation of a flight's median about it (seeds 901 to 905)."""
 _STEP = 0.004
 _Z = 1.645  # of a 90 % interval
 
@@ -75,7 +75,7 @@ def estimate_track_scale(length_px: FloatArray, length_sd_px: FloatArray) -> Sca
 
 
 def _log_likelihood(log_m: FloatArray, variance: FloatArray) -> float:
-    """Of logarithms of lengths (n,) m with measurement variances (n,) among the classes of vehicles."""
+    """Log likelihood of logarithms of lengths (n,) m with measurement variances (n,), by the classes of vehicles."""
     density = np.full_like(log_m, _OUTLIERS / 3.0)
     for fraction, mean, sd in _CLASSES:
         total = sd**2 + variance

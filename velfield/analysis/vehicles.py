@@ -27,7 +27,7 @@ _CELL_M, _SECTOR_RAD = 0.5, np.pi / 12
 _REACH_M, _HALF_WIDTH_M = 8.0, 1.0
 """A lane is looked for so far ahead and behind, and to either side: parked cars stand 2 m and more beside it."""
 _DRIVEN_FRACTION = 0.4
-"""Of that length, what others drove where a vehicle stands in a lane."""
+"""Minimum fraction of that length that others drove, for a stationary vehicle to be in a lane."""
 
 
 VEHICLE_COLUMNS = (
@@ -123,7 +123,7 @@ class _DrivenLanes:
 
     @classmethod
     def of(cls, tracklets: pd.DataFrame, metres: float) -> "_DrivenLanes":
-        """Of the tracklets of moving vehicles: their paths in steps of a cell."""
+        """Driven lanes by the tracklets of moving vehicles: their paths in steps of a cell."""
         keys = [np.empty(0, np.int64)]
         for k in (0, 1):
             start, end = (tracklets[[f"x_{j}_px", f"y_{j}_px"]].to_numpy(np.float64) * metres for j in (k, k + 1))

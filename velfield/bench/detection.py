@@ -189,7 +189,7 @@ def network_gflop(width: int, height: int) -> float:
 
 
 def matmul_gflops(size: int = 1024, side: int = 64) -> float:
-    """What this machine does in a product of float32 matrices, GFLOP/s; one core where BLAS is held to one thread.
+    """Speed of this machine in a product of float32 matrices, GFLOP/s; of one core where BLAS is limited to one thread.
 
     The faster of numpy's and onnxruntime's, which need not use the same instructions: where numpy's BLAS was held to
     those of an older processor, the network did more than its peak.

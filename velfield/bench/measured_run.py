@@ -34,7 +34,7 @@ class Memory:
 
 @dataclass(frozen=True)
 class MeasuredRun:
-    """What a run took."""
+    """Time and memory that a run took."""
 
     wall_s: float
     driver: Memory

@@ -1,4 +1,4 @@
-"""What other libraries take for the same work on the same flight: the peers of `velfield bench speed`.
+"""Times that other libraries take for the same work on the same flight: the peers of `velfield bench speed`.
 
 Each does less than the stage beside it: the text says what.
 """
@@ -109,7 +109,7 @@ Samples = FloatArray
 
 
 def _samples(segments: Segments, origin: tuple[int, int], side: int, bins: VelocityBins, radius: float) -> Samples:
-    """What is counted of a tile: each segment's velocity at the pixels within a radius of its path."""
+    """Samples of a tile: each segment's velocity at the pixels within a radius of its path."""
     y, x = (axis.ravel().astype(np.float64) for axis in np.mgrid[0:side, 0:side])
     parts = []
     for one in segments:

@@ -265,7 +265,7 @@ class DivisionLens:
 
 @lru_cache(maxsize=64)
 def _fold_radius(coefficients: tuple[float, ...]) -> float:
-    """Of a polynomial; kept, as points are undistorted in tens of thousands of calls."""
+    """Radius at which a polynomial folds, inf if it does not; cached, as points are undistorted very often."""
     scale = np.array((1.0, *coefficients))
     growth = scale * (1.0 + 2.0 * np.arange(len(scale)))
     # The root of a vanishing last term is at infinity and would spoil the accuracy of the others.

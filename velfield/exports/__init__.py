@@ -1,1 +1,1 @@
-"""What goes out: formats that others read."""
+"""Exports of a run to formats that other software reads."""

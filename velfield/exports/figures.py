@@ -1,4 +1,4 @@
-"""What the exported figures share: base image and layer at the requested width."""
+"""Common parts of the exported figures: base image and layer at the requested width."""
 
 from dataclasses import dataclass
 

@@ -35,7 +35,7 @@ class Georeference:
 
     @classmethod
     def from_grid(cls, grid: GridRecord) -> "Georeference":
-        """Of a run's base image."""
+        """Georeference of a run's base image."""
         return cls((grid.height_px, grid.width_px), grid.crs_wkt, grid.affine, grid.gsd_m)
 
     @property

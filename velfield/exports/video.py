@@ -27,7 +27,7 @@ Progress = Callable[[int, int], None]
 
 _DEFAULT_WIDTH_PX = 1920
 _MAX_SIDE_PX = 8192
-"""Of H.264 as players read it."""
+"""Maximum side of an H.264 video that players read."""
 _TICKS = 90_000
 _DIMMED, _OUTSIDE, _FIELD = 0.75, 0.4, 0.4
 """Brightness of the frame, and of the base image where the frame does not reach; opacity of the field."""
@@ -81,7 +81,7 @@ def _images(run: Run, scene: "_Scene", frames: list[int]) -> Iterator[tuple[int,
 
 @dataclass(frozen=True)
 class _Scene:
-    """What is the same in all images of the video, at its size.
+    """Parts that are the same in all images of the video, at its size.
 
     Attributes
     ----------

@@ -65,7 +65,7 @@ _QUANTITY_NAMES = {
 
 
 def describe_telemetry(source: Path, info: SourceInfo) -> str:
-    """What gives scale and north of the source, in a line.
+    """Telemetry that gives scale and north of the source, in one line.
 
     Raises
     ------
@@ -113,12 +113,12 @@ def _keys(section: BaseModel, indent: str = "  ") -> list[str]:
 
 
 def _of_other_methods(section: str) -> list[str]:
-    """What the other methods of a section read in place of those keys, a paragraph each."""
+    """Keys of the other methods of a section, a paragraph each."""
     lines = []
     for model in section_models(section)[1:]:
         other = model()
         keys = ", ".join(f"{name}: {_value(getattr(other, name))}" for name in model.model_fields)
-        lines += _comment(f"In place of all these, another method: {keys}", "  ")
+        lines += _comment(f"Keys of another method, instead of all these: {keys}", "  ")
     return lines
 
 

@@ -188,7 +188,7 @@ def _parts(location: Sequence[str | int]) -> tuple[str, str | None, tuple[str, .
 
 
 def _unread(section: str, method: str, key: str) -> str:
-    """That a key is read by other methods of a section than the chosen one, and what to do; empty where it is not."""
+    """Message that a key belongs to other methods of a section than the chosen one, and what to do; else empty."""
     models = {str(m.model_fields["method"].default): m for m in section_models(section)}
     readers = [name for name, model in models.items() if key in model.model_fields]
     if not readers:

@@ -21,7 +21,7 @@ _TOUCHED = 0.1
 
 _PROCESS_BYTES = 500_000_000
 _MEMORY_BYTES_A_PIXEL = 350
-"""What a process takes by itself, and for each unit at a time: peaks of runs of 1280 x 960 and 1920 x 1080 px."""
+"""Memory of a process, and of each of its concurrent units a pixel: peaks of runs of 1280 x 960 and 1920 x 1080 px."""
 
 
 def planned_units(plan: Plan) -> dict[str, list[str]]:

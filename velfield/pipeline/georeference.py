@@ -49,7 +49,7 @@ _OTHER_LIMITS = 0.1
 
 @dataclass(frozen=True)
 class Georeferenced:
-    """What `georeference` did.
+    """Result of `georeference`.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Georeferenced:
     notes: tuple[str, ...] = ()
 
     def all_notes(self) -> tuple[str, ...]:
-        """What sources disagree on, what contradicts what, and the notes."""
+        """Disagreements between the sources of scale, contradictions, and the notes."""
         return (*self.record.scale.disagreements, *self.record.remarks, *self.notes)
 
 
@@ -155,7 +155,7 @@ def plan_of_finished(run: Run) -> Plan:
 
 
 def _vehicle_counts(layout: RunLayout, stage: str) -> dict[str, float]:
-    """What the vehicles gave, as the stage counted it when it was computed."""
+    """Counts of the stage that concern the scale by vehicles, from its commit records."""
     return {
         key: value
         for record in read_commits(layout, stage)
@@ -165,7 +165,7 @@ def _vehicle_counts(layout: RunLayout, stage: str) -> dict[str, float]:
 
 
 def _list_outdated(layout: RunLayout) -> list[str]:
-    """What was made of the run with the place and scale before, and is not made again here."""
+    """Notes on results that were computed with the previous place and scale and are not recomputed here."""
     if not layout.analysis.exists():
         return []
     again = f"`velfield analyse {layout.root}`"

@@ -34,7 +34,7 @@ FIRST_FRAMES = 16
 """Frames of the first preview: three seconds."""
 _BEFORE = stages_before("tracklets")
 FIELD_STAGES = tuple(stage.name for stage in STAGES if stage.name not in _BEFORE)
-"""What is computed of the units that are finished: tracklets, tracks, field and maps."""
+"""Stages that a preview computes from the finished units: tracklets, tracks, field and maps."""
 Compute = Callable[[Any], Any]
 """Gives the value of a Dask graph."""
 Publishing = AbstractContextManager[object]

@@ -35,7 +35,7 @@ class Cut(Enum):
 
 
 class NewBase(Enum):
-    """What becomes of a stage when a finished run is mapped onto a new base image (`velfield reprocess`)."""
+    """Treatment of a stage when a finished run is mapped onto a new base image (`velfield reprocess`)."""
 
     SHARED = "its outputs are shared with the run before, apart from those in base/"
     COUNTS = "only its counts are kept, in its commit records"

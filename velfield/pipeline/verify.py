@@ -19,7 +19,7 @@ from velfield.run.stores import is_of_creation
 _THREADS = min(4, os.cpu_count() or 1)
 NOT_FINISHED = "not finished"
 _BESIDES = (PAGE, ANALYSIS)
-"""What has commit records and is no stage."""
+"""Names that have commit records but are not stages."""
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ _MIN_VISIBLE_FRACTION = 0.6
 """Fraction of a patch that must lie in the frame: patches of the first and last rows are cut in half."""
 _CONVERGED_PX = 0.02
 _GREY_STEPS = 256
-"""Of one grey level of the blurred frame, which is sampled from 16 bits: far below its noise."""
+"""Steps in one grey level of the blurred frame, which is sampled from 16 bits: a step is far below its noise."""
 _LANES, _BLOCK = 8, 16
 """Values of float32 in a vector of the processor; values of one pass of a loop over a patch: two vectors."""
 _MAX_REACH_PX = 256.0

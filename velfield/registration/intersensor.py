@@ -152,7 +152,7 @@ def _matches_flipped(pair: ImagePair) -> bool:
 
 
 def _explain_failure(pair: ImagePair, scores: list[str]) -> str:
-    """What was found, what to do, and the scores."""
+    """Message with the cause of a failed registration, what to do, and the scores."""
     flipped = estimate_sift_homography(pair.image, pair.base, pair.lens, scale=pair.config.coarse_scale, mirrored=True)
     if flipped.matrix is not None:
         return f"{MIRRORED} ({flipped.inliers} of {flipped.matches} SIFT matches are inliers); flip it"

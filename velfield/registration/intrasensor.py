@@ -96,7 +96,7 @@ _MIN_ALIGNED_FRACTION = 0.15
 _FLOW_SIGMA_PX = 0.7
 _FLOW_POINTS = 500
 _FLOW_SCALE, _FLOW_LEVELS, _FLOW_WINDOW_PX = 0.25, 3, 21
-"""Of optical flow: scale of the frames as by `shrink`, levels of their pyramids above that, side of the window."""
+"""Optical flow: scale of the frames as by `shrink`, levels of their pyramids above that, side of the window."""
 _FLOW_ENDS = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 10, 0.03)
 """A point is followed for so many iterations, or until it moves by less than so many px of the scaled frame."""
 _MAX_COVERAGE_LOSS, _MAX_RESIDUAL_RATIO = 0.05, 1.5
@@ -666,7 +666,7 @@ def _cell_index(xy_raw: FloatArray, width: int, height: int) -> IntArray:
 
 
 def _select_in_empty_cells(points: ControlPoints, aligned: ControlPoints, width: int, height: int) -> ControlPoints:
-    """Those of ``points`` in the cells of the frame where ``aligned`` has none."""
+    """Select the control points of ``points`` in the cells of the frame where ``aligned`` has none."""
     empty = np.ones(QUALITY_CELLS[0] * QUALITY_CELLS[1], bool)
     empty[_cell_index(aligned.xy_raw, width, height)] = False
     return points.select(empty[_cell_index(points.xy_raw, width, height)])

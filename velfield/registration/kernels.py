@@ -728,7 +728,7 @@ def _interleave(theta):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _make_priors(stiffness, gauge, gauge_weight, prior, theta):  # type: ignore[no-untyped-def]
-    """What `solve_steps` adds the folds to: bands and border of the row coefficients, and the matrix of the others."""
+    """Priors to which `solve_steps` adds the folds: bands and border of the row coefficients, matrix of the others."""
     size, directions, rows = stiffness.shape[0], gauge.shape[1], _interleave(theta)
     bands, border = aligned_zeros(size, 12, LANES), aligned_zeros(size, directions + 18, LANES)
     corner = aligned_zeros(directions + 18, directions + 18, LANES)

@@ -49,14 +49,14 @@ farther than a third of it."""
 MIN_REACH_PX = 80.0
 """And at least so far: the control points of small images are no closer to each other."""
 NEIGHBOURS = 3
-"""So many must be that near: one alone may be a chance match."""
+"""Minimum number of control points within that distance: one alone may be a chance match."""
 MAX_SD_PX = 1.0
 _MAX_SD_RATIO = 1.5
 """A larger standard deviation is no evidence either, unless the control points themselves scatter as much."""
 _AVERAGED = 24
 """Control points of which the hold-out residual is averaged about a cell."""
 _POINTS_PER_CELL = 6.0
-"""Of the cells in which the nearest control points are looked up, about so many each."""
+"""Approximate number of control points in each cell of the grid for the search of nearest points."""
 _INDEPENDENT = 6.0
 """Neighbouring residuals that count as one: relief and roofs displace neighbours alike."""
 _BRIDGED = 2.0

@@ -22,7 +22,7 @@ Window = tuple[int, int, int, int]
 """x, y, width, height in base px."""
 
 _Places = tuple[IntArray, FloatArray, FloatArray]
-"""Of nodes along an axis: number of the known node before each, distance from it, and from it to the next, in nodes."""
+"""Nodes along an axis: number of the known node before each, distance from it, and from it to the next, in nodes."""
 _INVALID = -1e5
 _MIN_SHRINK = 1.35
 """At this many raw pixels per output pixel or more the raw frame is area-averaged first; below, aliasing is slight."""

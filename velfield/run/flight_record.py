@@ -15,7 +15,7 @@ _MAX_ENTRIES = 1000
 
 
 def suggest_run(root: Path) -> str:
-    """What to do with a folder that is no run: the runs that lie in it, else how to make one."""
+    """Suggest what to do with a folder that is not a run: use the runs inside it, else make one."""
     folders = sorted(root.iterdir())[:_MAX_ENTRIES] if not is_remote(root) and root.is_dir() else []
     runs = [str(folder) for folder in folders if RunLayout(folder).flight.exists()]
     if runs:

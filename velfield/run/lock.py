@@ -227,7 +227,7 @@ def _has_ended(record: dict[str, Any]) -> bool:
 
 @cache
 def _machine() -> str:
-    """What tells apart all systems whose process numbers differ, containers of one host name too; empty: not known."""
+    """Identity of the process number space, different for containers of one host name too; empty: not known."""
     if sys.platform != "linux":
         return f"{sys.platform} {socket.gethostname()} {uuid.getnode()}"
     try:

@@ -1,1 +1,1 @@
-"""What comes in: video and image folders with true times, labels, external detections, base images."""
+"""Inputs: video and image folders with true times, labels, external detections, base images."""

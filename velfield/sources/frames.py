@@ -93,7 +93,7 @@ class FootageLoss(str):
 
 @dataclass(frozen=True)
 class SourceInfo:
-    """What is known of a video or an image folder before any frame is decoded.
+    """Properties of a video or an image folder that are known before any frame is decoded.
 
     Attributes
     ----------

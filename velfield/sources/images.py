@@ -279,7 +279,7 @@ def stretch(image: FloatArray, levels: Levels) -> GreyImage:
 
 
 def describe_levels(levels: Levels) -> str:
-    """What is done with frames of more than 8 bits, one line."""
+    """Describe the conversion of frames of more than 8 bits, in one line."""
     return f"frames of more than 8 bits: levels {levels[0]:g} to {levels[1]:g} become 0 to 255 in all frames"
 
 

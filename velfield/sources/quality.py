@@ -222,7 +222,7 @@ def _correlation(one: FloatArray, other: FloatArray) -> float:
 
 
 def describe_light(brightness: FloatArray, contrast: FloatArray, sharpness: FloatArray) -> list[str]:
-    """What the light of a flight makes uncertain, one line each; columns (n,) of its usable frames.
+    """Describe what the light of a flight makes uncertain, one line each; arguments (n,) for its usable frames.
 
     Examples
     --------

@@ -34,7 +34,7 @@ Style: Default,Arial,16,&Hffffff,2,1
 [Events]
 Format: Layer, Start, End, Style, Name, MarginL, MarginR, MarginV, Effect, Text
 """
-"""What libav's encoder of subtitles wants to know of their style."""
+"""Style header that libav's subtitle encoder requires."""
 
 
 def simulate_telemetry(config: SimulationConfig, camera: Camera, base_shape: tuple[int, int]) -> list[str]:

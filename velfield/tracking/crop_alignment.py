@@ -111,7 +111,7 @@ class UprightCrops:
 
     @cached_property
     def prepared(self) -> "AlignableCrops":
-        """What every alignment of these crops needs, computed once: a crop is aligned to two frames."""
+        """Data that every alignment of these crops needs, computed once: a crop is aligned to two frames."""
         return prepare_crops(self.pixels, self.axis_rad)
 
 
@@ -566,7 +566,7 @@ def _lucas_kanade(template, image, u, v, scratch):  # type: ignore[no-untyped-de
 
 @njit(cache=True, nogil=True)
 def _images():  # type: ignore[no-untyped-def]
-    """What `_unfold` fills in."""
+    """Buffers that `_unfold` fills in."""
     return (
         np.zeros((_SIDE, _SIDE), np.float32),
         np.zeros((_SIDE, _SIDE), np.float32),

@@ -31,8 +31,8 @@ _END_STRIPS = 5
 _MIN_CONTRAST = 8.0
 """Grey levels: below it a strip is not stretched further, as it shows little but noise."""
 _BLACK, _BRIGHTER = 0.4, 0.25
-"""Of the road's grey level: what is darker may be a shadow; and of the contrast of both, how much brighter than the
-road is what casts it."""
+"""Fraction of the road's grey level below which a pixel may be a shadow; and how much brighter than the road its caster
+is, as a fraction of the contrast between road and shadow."""
 _MIN_SUNLIT, _MIN_AGREEMENT, _MIN_SHADE_PX = 12, 0.6, 8
 """Vehicles that show the direction of shadows; the length of their vectors' sum, of the sum of their lengths; pixels of
 a shadow, in a chip of which every other one is looked at."""
@@ -154,8 +154,8 @@ def looks_difference(before: FloatArray, after: FloatArray) -> FloatArray:
 
 
 def shade_moments(chips: ByteArray) -> FloatArray:
-    """Of chips (n, 32, 32) about detections: sums of x and of y over the pixels in the shade, and their number, (n, 3);
-    every other pixel, in pixels of the chip."""
+    """Moments (n, 3) of the shade in chips (n, 32, 32) about detections: sums of x and of y over its pixels, and their
+    number; every other pixel, in pixels of the chip."""
     if not len(chips):
         return np.empty((0, 3))
     some = chips[:, ::2, ::2]

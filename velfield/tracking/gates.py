@@ -136,7 +136,7 @@ class DetectionStates:
     time_s: float
 
     def take(self, rows: IntArray) -> "DetectionStates":
-        """Those of some detections, in this order; one may come more than once."""
+        """States of the given detections, in this order; a row may occur more than once."""
         columns = {name: getattr(self, name)[rows] for name in ("x_px", "y_px", "axis_rad", "axis_sd_rad")}
         return replace(self, **columns)
 

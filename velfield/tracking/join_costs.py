@@ -32,21 +32,23 @@ STATIONARY_OFFSET_M = 1.6
 """Tolerance for a vehicle that is stationary on both sides of the gap; another one would arrive moving."""
 _TYPICAL_ACCELERATION_M_PER_S2, _MAX_ACCELERATION_M_PER_S2, _STOP_SLACK_M = 2.0, 4.0, 0.5
 _MAX_STOP_SPEED_M_PER_S, _MAX_STOP_OFFSET_M = 5.0, 4.0
-"""Of a vehicle that stops in the gap: beyond these speeds the distance that it takes is too uncertain."""
+"""Maximum speed of a vehicle that stops in the gap, as its stopping distance is too uncertain above it, and maximum
+tolerance of that distance."""
 _STOP_COST = 0.5
 _HIDDEN_COST, _MIN_HIDDEN_S = 0.2, 0.5
 _FOUND_WITHIN_M = 1.0
-"""Of a hidden vehicle: where it may come out is not known better than this, however short the gap."""
+"""Minimum uncertainty of the place where a hidden vehicle reappears, however short the gap."""
 _PACE_SD_M_PER_S, _PACE_SD_FRACTION, _FASTER_M_PER_S = 1.0, 0.35, 2.5
-"""Of a hidden vehicle: how far its mean speed is from the mean of those before and after, and how far above both it may
-be."""
+"""Hidden vehicles: standard deviation of the mean speed about the mean of those before and after, a constant and a
+fraction of that mean; and how far above both it may be."""
 _LANE_OFFSET_M, _LANE_OFFSET_FRACTION, _MAX_BEND_RAD = 1.8, 0.05, np.radians(50)
 """How far aside a hidden vehicle may appear, and how much its direction may differ from the way that it took."""
 _TURN_COST, _MIN_TURN_RAD, _MAX_JUNCTION_RAD, _MAX_TURN_RAD = 0.4, *np.radians([30, 120, 179])
 _MIN_RADIUS_M, _MIN_TURN_SPEED_M_PER_S, _MAX_SIDEWAYS_M_PER_S2 = 4.0, 1.5, 4.0
 _JUNCTION_OFFSET_FRACTION, _ARC_OFFSET_FRACTION = 0.25, 0.08
-"""Of a hidden vehicle that turns: fewer do, none on a smaller circle or faster on it; where at a junction it turns is
-unknown, and on a circle two directions say it, each known to some degrees."""
+"""Hidden vehicles that turn: cost, as fewer turn; limits of the angle; minimum radius and speed and maximum sideways
+acceleration; tolerance across the way as a fraction of the chord, at a junction, where the place of the turn is
+unknown, and on an arc, which two directions determine, each known to some degrees."""
 CERTAINTY_SLOPE = 3.0
 """Log odds that a join is right, for each unit that the total would cost more without it."""
 _REACH, _REACH_S, _REACH_M = 1.1, 0.5, 20.0
@@ -216,7 +218,7 @@ class _Gaps:
 
 
 def _cost_in_motion(gaps: _Gaps, limits: GapLimits) -> FloatArray:
-    """Of gaps in which a vehicle drives on, its acceleration nearly constant; inf beyond the tolerance."""
+    """Cost of gaps in which a vehicle drives on, its acceleration nearly constant; inf beyond the tolerance."""
     mean = (gaps.before + gaps.after) / 2
     offset = gaps.displacement - mean * gaps.duration[:, None]
     along, _ = _components(offset, mean)
@@ -229,10 +231,10 @@ def _cost_in_motion(gaps: _Gaps, limits: GapLimits) -> FloatArray:
 
 
 def _cost_of_stop(gaps: _Gaps, limits: GapLimits) -> FloatArray:
-    """Of gaps in which a vehicle stops and sets off again, or stands throughout; inf beyond the tolerance.
+    """Cost of gaps in which a vehicle stops and sets off again, or is stationary throughout; inf beyond the tolerance.
 
     It brakes from one velocity to rest and accelerates to the other along one line: how far that takes it follows from
-    the speeds, whatever the gap.
+    the speeds, independent of the gap's duration.
     """
     before, after = gaps.speeds()
     stands = (before < limits.stationary_speed_m_per_s) & (after < limits.stationary_speed_m_per_s)
@@ -250,7 +252,7 @@ def _cost_of_stop(gaps: _Gaps, limits: GapLimits) -> FloatArray:
 
 
 def _cost_when_hidden(gaps: _Gaps, limits: GapLimits) -> FloatArray:
-    """Of gaps in which a vehicle keeps to its way at an unknown, moderate pace; inf where it cannot be.
+    """Cost of gaps in which a vehicle keeps its direction at an unknown, moderate speed; inf where it cannot.
 
     A vehicle that is at rest on one side goes the way that the other side gives.
     """
@@ -268,7 +270,7 @@ def _cost_when_hidden(gaps: _Gaps, limits: GapLimits) -> FloatArray:
 
 
 def _cost_of_hidden_turn(gaps: _Gaps, limits: GapLimits) -> FloatArray:
-    """Of gaps in which a vehicle turns at an unknown, moderate pace, at a junction or on a circle; inf where it cannot.
+    """Cost of gaps in which a vehicle turns at an unknown, moderate speed, at a junction or on an arc; else inf.
 
     It drives straight on, along an arc, and straight on again. Where the turn is halfway, the chord's direction is
     halfway between those before and after.
@@ -293,7 +295,7 @@ def _cost_of_hidden_turn(gaps: _Gaps, limits: GapLimits) -> FloatArray:
 
 
 def _cost_of_pace(gaps: _Gaps, limits: GapLimits, way: FloatArray, across: FloatArray, width: FloatArray) -> FloatArray:
-    """Of hidden vehicles, by the length of their ways and how far aside they appear, where ``width`` is usual.
+    """Cost of hidden vehicles by the length of their paths and their lateral offset, relative to the usual ``width``.
 
     The larger the area in which a vehicle may come out, the less one that comes out at a place speaks for it: the
     normalisation of a density, whose logarithm over the slope of the certainty is a cost.

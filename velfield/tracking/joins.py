@@ -29,11 +29,13 @@ from velfield.tracking.join_costs import CERTAINTY_SLOPE, STATIONARY_OFFSET_M, G
 _ALONE_COST = 1.0
 """Cost of a track's end, or start, that continues in none; a pair costs at most twice as much."""
 _VANISHED_COST = 0.6
-"""Of one in the middle of the frames and of the flight so much more: few vehicles vanish there, under trees."""
+"""Additional cost of an end or start in the middle of the frames and of the flight: few vehicles vanish there, under
+trees."""
 _DOUBTFUL_S, _DOUBTFUL_COST = 1.0, 0.8
-"""Of a track that stays so shortly in one place amid the frames: two of five are of no vehicle (simulated flights)."""
+"""Maximum duration of a doubtful track, in one place amid the frames, and the cost of its end or start: two of five are
+of no vehicle (simulated flights)."""
 _UNDECIDED_LOOKS_DIFFERENCE = 0.68
-"""Of looks, in standard deviations of a strip, that one vehicle has as often on both sides as two have: the median is
+"""Difference of looks, in standard deviations of a strip, that is as likely for one vehicle as for two: the median is
 0.43 for one, 1.08 for two, the logarithm normal with a standard deviation of 0.5 for both (simulated flights)."""
 _LOOKS_WEIGHT, _MIN_LOOKS_COST, _MAX_LOOKS_COST = 1.23, -0.3, 1.3
 """Cost of looks by the logarithm of their difference over that, which is a log likelihood ratio in units of cost; and
@@ -60,7 +62,7 @@ END_COLUMNS = [
 
 @dataclass(frozen=True)
 class EndContext:
-    """What is known of the ends and the starts of tracks beside their motion; tracks in the order of their ids.
+    """Properties of the ends and the starts of tracks, apart from their motion; tracks in the order of their ids.
 
     Attributes
     ----------
@@ -245,7 +247,7 @@ def _cost_of_looks(before: FloatArray, after: FloatArray) -> FloatArray:
 
 
 def _assign(pairs: IntArray, gain: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Of candidate pairs (m, 2), each end with at most one start and the reverse, those of the greatest total gain.
+    """Select the candidate pairs (m, 2) of the greatest total gain, each end with at most one start and the reverse.
 
     Returns
     -------

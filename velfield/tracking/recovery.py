@@ -28,7 +28,7 @@ _ALONG_M, _ACROSS_M, _ACCELERATION_M_PER_S2, _ACROSS_M_PER_S = 0.9, 0.8, 4.0, 0.
 _MAX_AXIS_RAD, _AXIS_FROM_M_PER_S = np.radians(30), 2.0
 """How far its axis may differ from the way, of a vehicle faster than this."""
 _POSITION_GAIN, _VELOCITY_GAIN = 0.7, 0.2
-"""Of a candidate against the prediction: a detection's position is accurate to a pixel only."""
+"""Gains of the offset between candidate and prediction: a detection's position is accurate to a pixel only."""
 _FILL_M, _FILL_M_PER_S, _MAX_FILL_M = 0.8, 0.5, 1.6
 """How far a candidate may lie from the way across a gap, at once and growing with the time to what is known."""
 _ROOM_M = 1e-3
@@ -47,9 +47,9 @@ _MIN_SPEED_M_PER_S, _MIN_EXTENT_M = 2.5, 8.0
 _MIN_FRAMES, _MIN_SHARE = 4, 0.6
 """Frames that both have, and their share of those of the shorter one."""
 _PARTS_M, _SPLIT_SHARE, _MAX_SEEN_SHARE, _MAX_SPLIT_S = 3.5, 0.8, 0.35, 4.0
-"""Of tracks that were split: how far apart along the way the parts of a lorry are; of the frames that both have, the
-share in which they are in one place, at least, and in which both are seen, at most; and how long either is inferred,
-beyond which its place is too uncertain."""
+"""Tracks that were split: maximum distance along the way between the parts of a lorry; minimum fraction of the common
+frames in which they are in one place; maximum fraction in which both are seen; and maximum duration for which either
+is inferred, as its place is too uncertain beyond it."""
 _SEEN = 2
 """Positions whose ``source`` is below this are seen; the others are inferred."""
 
@@ -257,7 +257,7 @@ class Gap:
         return points.min(axis=0), points.max(axis=0)
 
     def _velocities(self) -> tuple[FloatArray, FloatArray]:
-        """Of both sides, no faster than a cubic can be that does not overshoot where the pace within is far lower."""
+        """Velocities of both sides, limited so that the cubic does not overshoot if the mean speed within is low."""
         (p0, p1), span = self.position_m, self.time_s[1] - self.time_s[0]
         mean = np.hypot(*(p1 - p0)) / span
         v0, v1 = (v * min(1.0, 3 * mean / max(float(np.hypot(*v)), 1e-9)) for v in self.velocity_m_per_s)
@@ -494,7 +494,7 @@ def _in_lockstep(rows: _Pairs, abreast_m: float) -> bool:
 
 
 def _driven(rows: _Pairs) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of a pair of tracks: offsets (n, 2) m, and the first one's headings (n, 2), unit vectors, and speeds (n,) m/s."""
+    """Offsets (n, 2) m of a pair of tracks, and the first one's headings (n, 2), unit vectors, and speeds (n,) m/s."""
     velocity = np.gradient(rows.xy_m.T, rows.time_s, axis=0)
     speed = np.hypot(*velocity.T)
     return rows.offset_m.T, velocity / np.maximum(speed, 1e-9)[:, None], speed

@@ -22,7 +22,7 @@ DRAWS = 16
 _SIDE_M = 0.8
 _MIN_MOVING_FRACTION = 0.1
 _MAX_CELLS = 2**22
-"""Of the whole grid, as the page has it in memory."""
+"""Maximum number of cells of the whole grid, which the page holds in memory."""
 
 
 def cell_side(shape: tuple[int, int], gsd_m: float | None) -> int:

@@ -143,7 +143,7 @@ def _describe(record: ControlPointsRecord) -> dict[str, Any]:
 
 
 def marked_points(record: ControlPointsRecord | None, epsg: int | None) -> MarkedPoints:
-    """What the page begins with: the points of a record, else none, in the reference system ``epsg``."""
+    """Points that the page starts with: those of a record, else none, in the reference system ``epsg``."""
     if record is None:
         return MarkedPoints(points=(), order="longitude_latitude" if epsg in (None, WGS84) else "x_y", epsg=epsg)
     points = [MarkedPoint(x_px=p.x_px, y_px=p.y_px, coordinates=f"{p.x!r}, {p.y!r}") for p in record.points]

@@ -10,7 +10,7 @@ from velfield.errors import InputError
 
 TILE_PX = 512
 OVERLAP_PX = 1
-"""Of a tile over its right and lower neighbours: edges at fractions of a screen pixel would show as seams."""
+"""Overlap of a tile with its right and lower neighbours: edges at fractions of a screen pixel would show as seams."""
 _QUALITY = 88
 
 

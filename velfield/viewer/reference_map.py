@@ -266,7 +266,7 @@ def _cut(start: float, step: float, count: int) -> tuple[int, int, float, float]
 
 
 def open_map(given: str) -> ReferenceMap | TileServer:
-    """What the user gives as map: the address of tiles, else a file.
+    """Open the map that the user gives: the address of tiles, else a file.
 
     Raises
     ------

@@ -18,7 +18,7 @@ from velfield.analysis.trajectories import VEHICLE_WIDTH_M, Trajectories, group_
 ConflictKind = Literal["crossing", "merging", "following"]
 MAX_PET_S, MAX_TTC_S = 3.0, 3.0
 POSITION_SD_M, SPEED_SD_M_PER_S = 0.35, 0.3
-"""Of a vehicle's bumper along its path: of its position, and of a length that is not known; and of its speed."""
+"""Standard deviations of a bumper's position on its path, including that of an unknown length, and of the speed."""
 _MIN_SPEED_M_PER_S = 1.0
 _MIN_FOLLOWER_M_PER_S = 3.0
 _OVERLAP_M = 1.0

@@ -45,7 +45,7 @@ class LaneTraffic:
         return LaneSamples(*columns), first
 
     def samples(self, lane: int) -> LaneSamples:
-        """Those on one lane, by track and along it."""
+        """Samples on one lane, by track and along it."""
         samples, first = self._by_lane
         rows = slice(int(first[lane]), int(first[lane + 1]))
         return LaneSamples(*(getattr(samples, name)[rows] for name in LaneSamples.__dataclass_fields__))
@@ -55,7 +55,7 @@ class LaneTraffic:
         return find_passings(self.samples(lane), along_m)
 
     def all_passings(self, lane: int, places_m: Sequence[float]) -> list[Passings]:
-        """Those at several distances."""
+        """Passings at several distances along a lane."""
         samples = self.samples(lane)
         return [find_passings(samples, at) for at in places_m]
 

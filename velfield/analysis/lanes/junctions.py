@@ -14,7 +14,7 @@ from velfield.analysis.lanes.model import Connection, Junction, JunctionKind, La
 _NEAR_M = 15.0
 """Meeting points nearer to each other are of one junction: a median is up to 14 m wide."""
 _MARGIN_M = 4.0
-"""Of a junction's area around its meeting points."""
+"""Margin of a junction's area around its meeting points."""
 _CROSSING_RAD = np.radians(25)
 """Lanes whose directions differ less do not cross: they merge or run beside each other."""
 _STEP_M = 1.5

@@ -28,7 +28,7 @@ _INWARDS_M, _OUTWARDS_M, _ASIDE_M = 20.0, 15.0, 2.5
 _REACH_M = float(np.hypot(max(_INWARDS_M, _OUTWARDS_M), _ASIDE_M))
 _TURN_RAD = np.radians(35)
 _MIN_FRACTION = 0.5
-"""Of the tracks on the first 20 m of an entry so many begin there."""
+"""Minimum fraction of an entry's tracks, on its first 20 m, that start there."""
 _HIDDEN_M = 40.0
 """A place that is hidden from above is no longer."""
 _INSIDE_M = 25.0

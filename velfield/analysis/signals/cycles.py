@@ -23,7 +23,7 @@ _FEW_STOP, _FEW_STOP_N, _FEW_STOP_S = 0.08, 60, 150.0
 """At a junction without a signal fewer stop than this share, with 95 % probability; all of a shorter clip may have come
 at green."""
 _DRAWN_STARTS, _DRAWS = 40, 2000
-"""Of so few starts the probability of recurring by chance is found by drawing starts that do not."""
+"""Maximum number of starts for which the probability of recurring by chance is simulated, and number of simulations."""
 _QUEUE_GAP_S = 8.0
 _MAX_P_VALUE = 0.005
 """Probability by chance above which starts do not recur."""

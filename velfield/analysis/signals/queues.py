@@ -146,7 +146,7 @@ def _space_evenly(line: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Stream:
-    """What happens on an approach.
+    """Traffic on an approach: queue starts, stops and crossings of the stop line.
 
     Attributes
     ----------

@@ -123,7 +123,7 @@ def _routes_xml(network: RoadNetwork) -> str:
 
 
 def _edge_data_xml(network: RoadNetwork) -> str:
-    """What was measured on each lane, as SUMO writes what it simulated: to compare and to calibrate."""
+    """Measured speed and vehicle count of each lane, in SUMO's format of results, to compare and to calibrate."""
     rows = [f'<interval begin="0.00" end="{max(network.duration_s, 0.01):.2f}" id="velfield">']
     rows += [
         f'    <edge id="lane{lane.number}" speed="{lane.speed_m_per_s:.2f}" entered="{lane.vehicles}"/>'

@@ -202,7 +202,7 @@ def limit_table(analysis: TrafficAnalysis) -> AnalysisTable:
 
 
 def reduction_table(analysis: TrafficAnalysis) -> AnalysisTable:
-    """What junctions take from speed."""
+    """Table of the speed reduction at junctions."""
     columns: Columns = {
         "junction": ("Junction", ""),
         "lane": ("From lane", ""),

@@ -21,7 +21,7 @@ _GSD_RANGE_M = 0.02, 0.6
 """Metres a base pixel at which cars are looked for."""
 _MAX_PX = 4e7
 _MAX_RATIO = 1.5
-"""Of two scales: the detector finds cars that are a quarter larger or smaller too, and its search is right to 15 %."""
+"""Maximum ratio of two scales that agree: cars a quarter larger or smaller are found; the search is right to 15 %."""
 _SEARCH_SD = 0.15
 
 

@@ -46,7 +46,7 @@ class DirectRegistration:
 
 
 def trial_frames(spread: list[int]) -> list[int]:
-    """Of the spread frames, those that are registered directly to a given image first."""
+    """Select the spread frames that are registered directly to a given image first."""
     count = min(_N_TRIALS, len(spread))
     return [spread[k] for k in np.unique(np.linspace(0, len(spread) - 1, count).round().astype(int))]
 

@@ -53,7 +53,7 @@ def _list_groups(plan: Plan, block: Group) -> list[Group]:
 
 
 def field_weight(config: FieldConfig) -> Weight:
-    """What a track adds at a pixel: one in all, or one a segment as in the paper."""
+    """Weight that a track adds at a pixel: one in all, or one a segment as in the paper."""
     return "segment" if config.shared_segment_weight == 2 else "track"
 
 

@@ -92,7 +92,7 @@ def _describe_footage(store: FrameStore, usable: IntArray) -> list[str]:
 
 
 def _find_outliers(store: FrameStore, tested: IntArray) -> IntArray:
-    """Those of the tested frames, by their place among them, that are unlike the one before and the one after."""
+    """Indices, among the tested frames, of those that are unlike the one before and the one after."""
     found = [np.empty(0, np.int64)]
     for start in range(0, len(tested), _CHUNK):
         first = max(start - 1, 0)

@@ -83,7 +83,7 @@ def georeference_run(plan: Plan) -> StageResult:
 def compare_sources(
     plan: Plan, grid: GridRecord, measured: ScaleEstimate | None = None
 ) -> tuple[GeoreferenceRecord, list[str]]:
-    """What all sources give, and notes on what they do not give; ``measured``: the scale by the lengths of vehicles.
+    """Combine all sources, with notes on what they do not give; ``measured``: the scale by the lengths of vehicles.
 
     Raises
     ------
@@ -302,7 +302,7 @@ def compass_text(bearing_deg: float) -> str:
 
 
 def describe(record: GeoreferenceRecord) -> list[str]:
-    """What is used, and what the other sources give, one line each."""
+    """Describe the estimates that are used and those of the other sources, one line each."""
     used = record.scale.used
     lines = [] if used is None else [f"scale: {used.text()}{f' ({used.note})' if used.note else ''}"]
     lines += [f"scale, not used: {other.text()}" for other in record.scale.others]

@@ -52,7 +52,7 @@ from velfield.sources.scale import choose_scale
 
 @dataclass(frozen=True)
 class Rebase:
-    """What a unit of the new result needs besides its plan: the old run, and the transform from it."""
+    """Inputs of a unit of the new result, besides its plan: the old run, and the transform from it."""
 
     old: RunLayout
     record: RebaseRecord

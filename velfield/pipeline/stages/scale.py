@@ -30,7 +30,7 @@ from velfield.run.tables import read_tables
 _OTHER_LIMITS = 0.25
 """Where the limits of tracking were for a scale that differs by more than this fraction, vehicles may be missed."""
 _CHECKED_BYTES = 20_000_000
-"""Of the tracks' files, by which the times are checked: minutes of dense traffic."""
+"""Size of the tracks' files by which the times are checked: minutes of dense traffic."""
 
 
 def scale_run(plan: Plan) -> StageResult:

@@ -109,7 +109,7 @@ def read_unit(plan: Plan, unit: int) -> UnitDetections:
 
 
 def read_chosen(plan: Plan, unit: int, ids: IntArray) -> UnitDetections:
-    """Those of a unit's detections and weak candidates that have one of some ids, with their chips, no patches.
+    """Read a unit's detections and weak candidates that have one of the given ids, with their chips but no patches.
 
     ``ids`` (n,) ascending. The weak ones come after the others.
     """

@@ -17,13 +17,13 @@ from velfield.vectors import BYTE, LONG, REAL, WORD, Vectors
 CELL_PX = 16
 """Side of a cell, output px."""
 _FRACTION_BITS = 5
-"""Of positions: 1/32 px, to which OpenCV's remap rounds them as well."""
+"""Fractional bits of positions: 1/32 px, to which OpenCV's remap rounds them as well."""
 _MARGIN_PX = 1024
 """About the frame: what lies farther outside is taken as if it were that far."""
 PAD_PX = 3
-"""Of the source: pixels farther outside are those of its border."""
+"""Width of the source's padding: pixels farther outside have the values of its border."""
 _SHARPNESS = -0.75
-"""Of cubic interpolation, as in OpenCV."""
+"""Coefficient of cubic interpolation, as in OpenCV."""
 
 
 def _cubic_weights(v: Vectors, fine: Any) -> list[Any]:

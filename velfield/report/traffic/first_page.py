@@ -12,7 +12,7 @@ _PER_QUESTION = 3
 
 @dataclass(frozen=True)
 class FirstPage:
-    """What was seen, answers by question, and what is missing for the rest."""
+    """Content of the first page: summary of the flight, answers by question, and what is missing for the rest."""
 
     seen: str
     answers: tuple[tuple[str, tuple[str, ...]], ...]

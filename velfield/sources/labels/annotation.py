@@ -39,7 +39,7 @@ class Annotation:
 
 @dataclass
 class Parsed:
-    """What a file holds: annotations, every image that it names, also those without any, and these images' sizes."""
+    """Contents of a file: annotations, every image that it names, also those without any, and these images' sizes."""
 
     annotations: list[Annotation] = field(default_factory=list)
     images: dict[str, tuple[int, int] | None] = field(default_factory=dict)

@@ -144,7 +144,7 @@ def _numbers(stems: dict[str, str]) -> dict[str, int]:
 
 
 def _varying(groups: dict[str, list[str]]) -> dict[str, list[str]]:
-    """Of several numbers in each name those that are not the same in all: the others name the recording."""
+    """Keep only the numbers in each name that are not the same in all names: the others name the recording."""
     rows = list(groups.values())
     if len(rows) < 2 or len({len(row) for row in rows}) > 1:
         return groups

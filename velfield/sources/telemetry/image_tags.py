@@ -41,7 +41,7 @@ _ORIENTATION = (("Yaw", "yaw_deg"), ("Pitch", "pitch_deg"), ("Roll", "roll_deg")
 _SKYDIO_ORIENTATION = re.compile(r"[:\s<]CameraOrientationNED\b(.*?)(?:/>|</[\w-]+:CameraOrientationNED>)", re.DOTALL)
 """A structure; others beside it (of the vehicle, in other axes) have properties of the same names."""
 _PIX4D_ORIENTATION = tuple((f"Camera:{name}", quantity) for name, quantity in _ORIENTATION)
-"""Of older Autel firmware, and of Parrot's beside its own: a pitch of 0 is straight down."""
+"""Orientation tags of older Autel firmware, and of Parrot, which also writes its own: a pitch of 0 is straight down."""
 
 
 def read_image_telemetry(path: Path) -> tuple[dict[str, float], list[str]]:

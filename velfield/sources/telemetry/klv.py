@@ -17,11 +17,11 @@ from velfield.sources.telemetry.attitude import camera_angles, rotation_to_ned
 from velfield.sources.telemetry.telemetry import ABOVE_GROUND, Telemetry
 
 KLV_KEY = bytes.fromhex("060e2b34020b01010e01030101000000")
-"""Of a UAS Datalink Local Set."""
+"""Key of a UAS Datalink Local Set."""
 KLV_SUFFIX = ".klv"
 NEEDS_KLV = "needs klv-parser: pip install 'velfield[klv]'"
 MAX_SETS = 20_000
-"""So many sets are read, evenly spread: some 80 microseconds each."""
+"""Maximum number of sets that are read, evenly spread: about 80 microseconds each."""
 _TIME, _HEADING, _PITCH, _ROLL, _LATITUDE, _LONGITUDE, _ALTITUDE = 2, 5, 6, 7, 13, 14, 15
 _WIDTH, _HEIGHT, _AZIMUTH, _ELEVATION, _SENSOR_ROLL, _RANGE, _GROUND = 16, 17, 18, 19, 20, 21, 25
 _ELLIPSOID, _GROUND_ELLIPSOID, _FULL_PITCH, _FULL_ROLL = 75, 78, 90, 91

@@ -19,7 +19,7 @@ from velfield.sources.geo import utm_crs
 from velfield.sources.telemetry.telemetry import Telemetry
 
 _DIAGONAL_35MM = 43.267
-"""Of 36 mm x 24 mm: equivalent focal lengths compare diagonal angles of view."""
+"""Diagonal of 36 mm x 24 mm film, mm: equivalent focal lengths compare diagonal angles of view."""
 _PHOTO_ASPECT = 1.55
 """Up to this ratio of width to height a frame shows the whole sensor (4:3, 3:2); a wider one is cropped in height."""
 _CROPPED_DIAGONAL = 1.25

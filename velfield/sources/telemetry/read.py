@@ -18,7 +18,7 @@ from velfield.sources.video.corruption import libav_log
 from velfield.sources.video.packets import iter_packets, open_video, video_stream
 
 MAX_IMAGES = 200
-"""Of a folder, so many images' tags are read, evenly spread: a header each."""
+"""Maximum number of a folder's images whose tags are read, evenly spread: only the headers are read."""
 _MAX_BYTES, _HEAD_BYTES = 256 * 2**20, 2**16
 NOT_READ = "is not read"
 """In a failure: the source holds telemetry all the same, in a format of `_NOT_READ`."""

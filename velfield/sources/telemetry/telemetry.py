@@ -24,7 +24,7 @@ QUANTITIES = (
     "zoom",
     "clock_s",
 )
-"""What a record may hold; `Telemetry` says what each is."""
+"""Quantities that a record may hold; `Telemetry` describes each."""
 _ANGLES = ("yaw_deg", "roll_deg")
 _LIMITS = {
     "latitude_deg": (-90.0, 90.0),
@@ -40,14 +40,14 @@ _LIMITS = {
     "vfov_deg": (0.2, 150.0),
     "zoom": (0.0, 200.0),
 }
-"""What a value can be; others are of another unit, or wrong."""
+"""Range of valid values; others are in another unit, or wrong."""
 _E7 = 1e6
 _DOWN_RAD = 0.2
 
 
 @dataclass(frozen=True)
 class HeightSource:
-    """What heights are above, for people, and their standard deviation, m."""
+    """Reference of heights, in words, and their standard deviation, m."""
 
     above: str
     sd_m: float

@@ -44,7 +44,7 @@ class BlockArtifactDetector:
     """
 
     LONGEST_AGO = _MIN_HISTORY_FRAMES - 1
-    """Of the frames that `feed` returns."""
+    """Largest age, in frames, of a frame that `feed` returns."""
 
     def __init__(self) -> None:
         self._previous: Float32Array | None = None
