@@ -1,5 +1,6 @@
 """The figures of a run's report, read from its maps."""
 
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -39,14 +40,16 @@ def report_figures(maps: Path) -> dict[str, ReportFigure]:
     """The figures of a run's report from its folder of maps, their bytes in them, by name."""
     figures = {}
     for name, (title, caption, alt_text) in _CAPTIONS.items():
-        if not (maps / f"{name}.png").exists():
+        path = maps / f"{name}.png"
+        if not path.exists():
             continue  # a pinhole lens has no such figure
+        picture = Image.open(BytesIO(path.read_bytes())).convert("RGB")  # Pillow opens no object of S3
         figures[name] = ReportFigure(
             title=title,
             caption=caption,
             alt_text=alt_text,
             mime="image/jpeg",
-            data=jpeg_bytes(np.asarray(Image.open(maps / f"{name}.png").convert("RGB")), max_side=_PICTURE_SIDE_PX),
+            data=jpeg_bytes(np.asarray(picture), max_side=_PICTURE_SIDE_PX),
             full_size=f"maps/{name}.png",
         )
     return figures
