@@ -11,6 +11,7 @@ import os
 import re
 import shutil
 import stat
+import sys
 import tempfile
 import time
 import warnings
@@ -183,10 +184,12 @@ def temporary_cache() -> Path:
         No temporary folder can be written.
     """
     try:
-        folder = Path(tempfile.gettempdir()) / f"velfield-{os.getuid() if hasattr(os, 'getuid') else 'cache'}"
+        # of Windows st_uid is 0 for every file, and the temporary folder is the user's own
+        user = 0 if sys.platform == "win32" else os.getuid()
+        folder = Path(tempfile.gettempdir()) / f"velfield-{user}"
         folder.mkdir(mode=0o700, exist_ok=True)
         found = folder.lstat()
-        if stat.S_ISDIR(found.st_mode) and (not hasattr(os, "getuid") or found.st_uid == os.getuid()):
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == user:
             return folder
         return Path(tempfile.mkdtemp(prefix="velfield-"))  # the name is taken: what lies there is not ours to run
     except OSError as error:
