@@ -280,7 +280,7 @@ STAGES: tuple[Stage, ...] = (
     # Tracklets of all units that belong to one vehicle.
     Stage(
         name="tracks",
-        version=11,
+        version=12,
         label="tracks",
         lines=(
             Line(
