@@ -355,9 +355,16 @@ def test_nothing_there_an_empty_folder_and_a_folder_of_videos_stop(tmp_path, fra
     assert_stops(tmp_path / "loop", "found no video or image folder")
 
 
-def test_float_images_are_no_frames(tmp_path):
-    Image.fromarray(np.ones((8, 8), np.float32)).save(tmp_path / "a.tif")
-    info = probe(tmp_path, frames=FPS)
-    (read,) = iter_frames(tmp_path, info, [0])
+@pytest.mark.parametrize("level", [1.0, np.nan])
+def test_a_float_image_of_one_level_is_read_and_is_black(tmp_path, level):
+    Image.fromarray(np.full((8, 8), level, np.float32)).save(tmp_path / "a.tif")
+    (read,) = iter_frames(tmp_path, probe(tmp_path, frames=FPS), [0])
+    assert read.flags == FrameFlag.BLACK
+    assert not read.grey.any()
+
+
+def test_colours_of_another_space_are_no_frames(tmp_path):
+    Image.frombytes("LAB", (8, 8), bytes(192)).save(tmp_path / "a.tif")
+    (read,) = iter_frames(tmp_path, probe(tmp_path, frames=FPS), [0])
     assert read.flags == FrameFlag.UNREADABLE
     assert "expected grey or colour levels" in read.reason

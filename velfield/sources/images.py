@@ -290,12 +290,12 @@ def stretch_levels(images: Iterable[FloatArray]) -> Levels:
     """
     sample = np.concatenate([np.asarray(image, np.float64)[::4, ::4].ravel() for image in images])
     sample = sample[np.isfinite(sample)]
-    for end in (np.min, np.max):
-        filled = sample == end(sample) if len(sample) else sample > 0
-        if _FILLED < filled.mean() < 1:
-            sample = sample[~filled]
     if not len(sample):
         return 0.0, 1.0
+    for end in (np.min, np.max):
+        filled = sample == end(sample)
+        if _FILLED < filled.mean() < 1:
+            sample = sample[~filled]
     low, high = (float(level) for level in np.percentile(sample, _PERCENTILES))
     return low, max(high, low + 1e-6 * max(abs(low), 1.0))
 
