@@ -193,9 +193,24 @@ def duration_text(seconds: float) -> str:
 
 
 def estimate_text(estimate: Estimate | None, unit: str, factor: float = 1.0) -> str:
-    """An estimate in another unit with its interval and count; or that there is too little data."""
+    """An estimate in another unit with its interval and count; or that there is too little data.
+
+    Seconds have one decimal; km/h have none where the value is 10 or more; others have three digits.
+
+    Examples
+    --------
+    >>> estimate_text(Estimate(0.991, 0.819, 1.16, 57), "s"), estimate_text(Estimate(13.62, 2.5, 15, 9), "km/h", 3.6)
+    ('1.0 s (0.8 to 1.2, n 57)', '49 km/h (9 to 54, n 9)')
+    """
     if estimate is None:
         return "too little data"
     scaled = estimate.in_units(factor)
-    value, low, high = (f"{x:.0f}" if abs(x) >= 1000 else f"{x:.3g}" for x in (scaled.value, scaled.low, scaled.high))
+    decimals = {"s": 1, "km/h": int(abs(scaled.value) < 10)}.get(unit)
+
+    def rounded(x: float) -> str:
+        if decimals is not None:
+            return f"{x:.{decimals}f}"
+        return f"{x:.0f}" if abs(x) >= 1000 else f"{x:.3g}"
+
+    value, low, high = map(rounded, (scaled.value, scaled.low, scaled.high))
     return f"{value} {unit} ({low} to {high}, n {scaled.n})"
