@@ -13,7 +13,6 @@ from pydantic import (
     Discriminator,
     Field,
     FiniteFloat,
-    NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
     PositiveInt,
@@ -36,9 +35,8 @@ class DetectorConfig(Model):
     """How cars are detected (paper: car detection): the keys that every method reads."""
 
     method: str
-    """The detector: ``cnn``, a convolutional network, pre-trained and fine-tuned on the flight; ``cascade``, region
-    proposals, then a boosted classifier of crops rotated to the car's axis, three times as fast; ``paper``, the
-    paper's dense response."""
+    """The detector: ``cnn``, a convolutional network, pre-trained and fine-tuned on the flight; ``paper``, the
+    paper's dense response, which needs labels."""
     threshold: float | None = None
     """Score threshold; none: chosen in training and stored with the detector."""
     working_car_length_px: PositiveFloat = 16.0
@@ -62,27 +60,7 @@ class DetectorConfig(Model):
         return target.model_validate(values | (nested.model_dump() if isinstance(nested, Model) else {}))
 
 
-class CascadeTraining(Model):
-    """Training of the cascade."""
-
-    rounds: PositiveInt = 800
-    """Rounds of AdaBoost of the classifier; half as many for each member of an ensemble. Paper: 200."""
-    feature_pool: PositiveInt = 3000
-    """Random features that a round chooses from."""
-    corner_sigma_px: PositiveFloat = 10.0
-    """Standard deviation of the rectangles' corners, working px. Paper: 10."""
-    folds: int = Field(4, ge=2)
-    """Spatial folds for the score threshold: each holds out one part of the labelled cars. With 20 cars or more, all
-    of them labelled, the detectors of the folds and that of all cars form an ensemble."""
-
-
-class _WithMotionChannel(DetectorConfig):
-    motion_channel: Literal["auto", "always", "never"] = "auto"
-    """Whether a detector that is trained on labels from motion reads |frame - background|; ``auto``: where appearance
-    is not sufficient to distinguish cars."""
-
-
-class CnnConfig(_WithMotionChannel):
+class CnnConfig(DetectorConfig):
     """How cars are detected (paper: car detection), here by the convolutional network."""
 
     method: Literal["cnn"] = "cnn"
@@ -90,15 +68,6 @@ class CnnConfig(_WithMotionChannel):
     """Optimiser steps of the fine-tuning on labelled cars."""
     precision: Literal["int8", "float32"] = "int8"
     """Numbers that the network is run with on a processor; a GPU always takes ``float32``."""
-    cascade: CascadeTraining = CascadeTraining()
-    """The cascade that takes the network's place: where labels come from motion and few vehicles move, and where cars
-    are not as long as those that the pre-trained network knows."""
-
-
-class CascadeConfig(CascadeTraining, _WithMotionChannel):
-    """How cars are detected (paper: car detection), here by the boosted cascade."""
-
-    method: Literal["cascade"] = "cascade"
 
 
 class PaperConfig(DetectorConfig):
@@ -134,7 +103,7 @@ def _read_method(section: object) -> object:
 
 
 DetectionConfig = Annotated[
-    Annotated[CnnConfig, Tag("cnn")] | Annotated[CascadeConfig, Tag("cascade")] | Annotated[PaperConfig, Tag("paper")],
+    Annotated[CnnConfig, Tag("cnn")] | Annotated[PaperConfig, Tag("paper")],
     Discriminator(_read_method),
 ]
 """The section of the chosen method; without ``method``, that of the network."""
@@ -164,8 +133,8 @@ class Rectangle(Model):
 class Round(Model):
     """One round of boosting, a decision stump: a feature, which is a sum of rectangles, its threshold, two leaves."""
 
-    channel: Literal[0, 1, 2, 3]
-    """0 grey, 1 gradient along the axis, 2 gradient across it, 3 difference to the background."""
+    channel: Literal[0, 1, 2]
+    """0 grey, 1 gradient along the axis, 2 gradient across it."""
     rectangles: tuple[Rectangle, ...] = Field(min_length=1, max_length=16)
     threshold: float
     leaf_low: float
@@ -186,16 +155,6 @@ class PrecisionRecallCurve(Model):
     """Which cars it was measured on."""
 
 
-class Proposer(Model):
-    """The region proposals of a cascade: a coarse classifier at half the resolution, dense over all poses."""
-
-    rounds: tuple[Round, ...] = Field(min_length=1, max_length=500)
-    min_score: float
-    """Proposals with a lower score are rejected."""
-    min_stage1_score: float
-    """Proposals with a lower score by the first rounds of the classifier, its stage 1, are rejected."""
-
-
 class LayerRecord(Model):
     """A layer of the network: its weights by kernel tap, input channel and output channel, then its biases."""
 
@@ -213,22 +172,6 @@ class LayerRecord(Model):
             raise ValueError("the weights of a layer are not base64") from None
         if found != 2 * (taps * into * out + out):
             raise ValueError(f"a layer of {taps} x {into} x {out} with {found} bytes of weights")
-        return self
-
-
-class MotionRecord(Model):
-    """Bonus on the score of a detection that differs from the background: a linear ramp."""
-
-    bonus_ramp_start: NonNegativeFloat
-    """Mean absolute difference, grey levels, up to which there is none."""
-    bonus_ramp_end: PositiveFloat
-    """Difference from which the bonus is full."""
-    max_score_bonus: NonNegativeFloat
-
-    @model_validator(mode="after")
-    def _is_a_ramp(self) -> Self:
-        if self.bonus_ramp_end <= self.bonus_ramp_start:
-            raise ValueError(f"the ramp ends at {self.bonus_ramp_end:g} and starts at {self.bonus_ramp_start:g}")
         return self
 
 
@@ -259,8 +202,6 @@ class CnnRecord(BaseRecord):
     """The network of a file that was of format version 1."""
     tta_range: tuple[float, float] = (0.0, 1.0)
     """Probabilities between which a candidate is scored again on rotated crops."""
-    motion: MotionRecord | None = None
-    """The bonus of moving objects; none: it reads no background."""
     activation_ranges: dict[str, tuple[FiniteFloat, FiniteFloat]] | None = Field(default=None, max_length=100)
     """Least and largest value of the network's activations, on images of the flight; none: it is run in float32."""
 
@@ -274,17 +215,6 @@ class CnnRecord(BaseRecord):
             except ValueError:
                 raise ValueError("the network is not base64") from None
         return self
-
-
-class CascadeRecord(BaseRecord):
-    """A trained cascade."""
-
-    method: Literal["cascade"] = "cascade"
-    proposer: Proposer
-    rounds: tuple[Round, ...] = Field(min_length=1, max_length=50_000)
-    """The classifier of the proposals, on crops rotated to the car's axis."""
-    contrast_floor: PositiveFloat
-    """Features are divided by the mean gradient of the window plus this."""
 
 
 class PaperRecord(BaseRecord):
@@ -334,7 +264,7 @@ class OnnxRecord(BaseRecord):
     """Width and height of the network's input."""
 
 
-DetectorRecord = Annotated[CnnRecord | CascadeRecord | PaperRecord | OnnxRecord, Field(discriminator="method")]
+DetectorRecord = Annotated[CnnRecord | PaperRecord | OnnxRecord, Field(discriminator="method")]
 
 RECORDS: tuple[type[BaseRecord], ...] = get_args(get_args(DetectorRecord)[0])
 
@@ -350,12 +280,6 @@ class LongVehicleRecord(Model):
     """A position with a higher score is the centre of a long vehicle."""
     contrast_floor: PositiveFloat
     attribution: tuple[str, ...] = Field(default=(), max_length=50)
-
-    @model_validator(mode="after")
-    def _reads_no_background(self) -> Self:
-        if any(one.channel == 3 for one in self.rounds):  # long vehicles are told on images that have three channels
-            raise ValueError("found a round of channel 3, the difference to a background; expected channels 0 to 2")
-        return self
 
 
 class DimensionsRecord(Model):

@@ -250,11 +250,7 @@ PRESETS: dict[Preset, dict[str, dict[str, object]]] = {
     "best": {},
     "fast": {
         "registration": {"max_keypoints": 1500, "keypoint_scale": 0.25},
-        "detection": {
-            "method": "cnn",
-            "fine_tune_steps": 120,
-            "cascade": {"rounds": 300, "feature_pool": 1500, "folds": 2},
-        },
+        "detection": {"method": "cnn", "fine_tune_steps": 120},
     },
     "paper": {
         "lens": {"refine": "never"},

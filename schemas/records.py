@@ -175,15 +175,10 @@ class WorkingRecord(Model):
     scale: PositiveFloat
     """Working pixels a base pixel: a car is about ``working_car_length_px`` long on that grid."""
     training_source: str
-    """``labels``, ``motion``, ``file`` (a detector file), ``shipped`` or ``detections`` (another detector's boxes)."""
-    has_background: bool = False
-    """Whether ``base/background.npz`` holds the flight's background on the working grid."""
+    """``labels``, ``file`` (a detector file), ``shipped`` or ``detections`` (another detector's boxes)."""
     labels: NonNegativeInt = 0
     """Training labels of the detector."""
     vehicle_gsd_m: PositiveFloat | None = None
-    """Metres a base pixel by the median length of labels, boxes or moving objects, where nothing else gives the scale:
+    """Metres a base pixel by the median length of labels or boxes, or by the scale at which the detector finds cars,
+    where nothing else gives it:
     good enough for the limits of tracking."""
-    label_precision_estimate: float | None = None
-    """Estimated precision of the labels from motion."""
-    axial_motion_fraction: float | None = None
-    """Fraction of moving objects that move along their axis: about 1 for cars, less where roofs shift by parallax."""

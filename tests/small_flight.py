@@ -12,10 +12,7 @@ from velfield.run.commits import digest_bytes
 from velfield.run.layout import RunLayout
 
 SMALL = (
-    "detection.method=cascade",
-    "detection.rounds=40",
-    "detection.feature_pool=250",
-    "detection.folds=2",
+    "detection.fine_tune_steps=6",
     "lens.refine=never",
     "registration.max_keypoints=1200",
     "work.unit_frames=8",

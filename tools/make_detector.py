@@ -14,8 +14,7 @@ if __name__ == "__main__":
     limit_threads()
     prepare_process(verbose=False)
     import velfield.detection
-    from tools.shipped_detector import make_shipped_detector, make_shipped_long_vehicles
+    from tools.shipped_detector import make_shipped_detector
 
     data, folder = Path(sys.argv[1]), Path(velfield.detection.__path__[0])
-    print(make_shipped_long_vehicles(data, folder / "cascade" / "shipped_long_vehicles.json"))
     print("\n".join(make_shipped_detector(data, folder / "shipped_detector.json")))

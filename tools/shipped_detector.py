@@ -7,20 +7,12 @@ is written only where the new network is worse than the former one on none of th
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
-import cv2
-import numpy as np
-
-from schemas.detector import CascadeConfig, CnnConfig
-from tools.train_long_vehicles import train_long_vehicles
+from schemas.detector import CnnConfig
 from tools.training_data import (
     ATTRIBUTION,
-    CHANNEL_MIXES,
-    read_kit_ais,
     read_sites,
-    read_songdo,
     read_swissimage_unlabelled,
 )
 from velfield.bench.scenes import simulated_image
@@ -33,53 +25,22 @@ from velfield.detection.orientation import fill_missing_orientation
 from velfield.detection.samples import LabelledImage
 from velfield.parallel import parallel_map
 
-CONFIG = CascadeConfig(seed=7)
-"""Configuration of the classifier of long vehicles."""
 STEPS, TILES_FROM, SEED = 30_000, 10_000, 7
 SIMULATED_SEEDS = (*range(9001, 9061), *range(9301, 9501))
 """Every third of them with many long vehicles."""
 SIMULATED_SEEDS_HELD_OUT = range(9201, 9213)
 _SIMULATED_WEIGHT = 3.0
-LORRY_SEEDS, LORRY_SEEDS_HELD_OUT = range(9101, 9181), range(9201, 9225)
-_LORRY_SCENE_SIZE = (1280, 960)
 _LARGE_VEHICLE_FRACTION, _LARGE_RATIO = 0.35, 1.4
-"""Fraction of long vehicles in the simulated traffic on which their classifier is trained, as a usual city has too few;
-and length, in cars, from which a vehicle of the real pictures is not used as a car."""
-_SENSORS = ((1.7, 0.7, 0.0), (0.6, 0.0, 4.0))
-"""Photometric augmentation: gamma, blur in px, noise in grey levels."""
+"""Fraction of long vehicles in every third simulated city, as a usual city has too few; and length, in cars, from which
+a vehicle of the real pictures is not used as a car."""
 _TOLERANCE = 0.005
 """Decrease of F1 up to which a network is not worse."""
-
-
-def _simulate_sensor(sample: LabelledImage, gamma: float, blur_px: float, noise_grey: float) -> LabelledImage:
-    """The image as another sensor might have taken it."""
-    grey = 255 * (sample.image / 255) ** gamma
-    if blur_px:
-        grey = cv2.GaussianBlur(grey, (0, 0), blur_px)
-    noise = np.random.default_rng(0).normal(0, 1, grey.shape) * noise_grey
-    return replace(sample, image=np.clip(grey + noise, 0, 255).astype(np.uint8))
-
-
-def make_shipped_long_vehicles(data: Path, out: Path) -> str:
-    """Train and write the classifier of long vehicles; returns a line about it."""
-    simulate = partial(simulated_image, size=_LORRY_SCENE_SIZE)
-    scenes = parallel_map(partial(simulate, large_share=_LARGE_VEHICLE_FRACTION), LORRY_SEEDS)
-    samples = [
-        sample if k % 3 == 0 else _simulate_sensor(sample, *_SENSORS[k % 3 - 1]) for k, sample in enumerate(scenes)
-    ]
-    for site in (*read_songdo(data), *read_kit_ais(data)):
-        grey = [_known_cars(sample) for sample in site.training[:: CHANNEL_MIXES + 1]]
-        samples += grey + [_simulate_sensor(sample, *sensor) for sample in grey for sensor in _SENSORS]
-    held_out = parallel_map(simulate, LORRY_SEEDS_HELD_OUT)
-    record = train_long_vehicles(samples, held_out, CONFIG, ATTRIBUTION)
-    out.write_text(record.model_dump_json())
-    return f"long vehicles: {len(record.rounds)} rounds, threshold {record.threshold:.3f}"
 
 
 def _known_cars(sample: LabelledImage) -> LabelledImage:
     """The cars of known size, with their orientations."""
     cars = fill_missing_orientation(sample.image, sample.cars, sample.abs_box_angle_rad)
-    known = cars[:, 3] < _LARGE_RATIO * CONFIG.working_car_length_px
+    known = cars[:, 3] < _LARGE_RATIO * CnnConfig().working_car_length_px
     return replace(sample, cars=cars[known], abs_box_angle_rad=None)
 
 

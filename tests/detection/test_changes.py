@@ -141,8 +141,8 @@ def test_what_is_found_in_a_mosaic_of_boxes_is_what_is_found_in_each_box() -> No
     for row, column, height, width in mosaics[0].crops:
         taken[row : row + height, column : column + width] += 1
     assert taken.max() == 1, "crops do not overlap"
-    together = find_in_boxes(detector, searched, None, boxes, 0.0)
-    alone = [find_in_boxes(detector, searched, None, [box], 0.0) for box in boxes]
+    together = find_in_boxes(detector, searched, boxes, 0.0)
+    alone = [find_in_boxes(detector, searched, [box], 0.0) for box in boxes]
     assert [len(one) for one in alone] == [1, 1, 1, 1, 1]
     np.testing.assert_allclose(together.to_rows(), concatenate(alone).to_rows(), rtol=0, atol=1e-4)
 
@@ -210,16 +210,16 @@ def test_a_detector_of_another_kind_searches_each_box_by_itself() -> None:
     seen = []
 
     class Recording(CnnDetector):
-        def find(self, image, valid=None, background=None, *, threshold=None):  # type: ignore[no-untyped-def]
-            assert valid.shape == background.shape == image.shape
+        def find(self, image, valid=None, *, threshold=None):  # type: ignore[no-untyped-def]
+            assert valid.shape == image.shape
             seen.append(image.shape)
-            return super().find(image, valid, background, threshold=threshold)
+            return super().find(image, valid, threshold=threshold)
 
     shipped = shipped_detector()
     detector = Recording(shipped.record.model_copy(update={"tta_range": (0.3, 0.6)}))
     image = with_cars(ground(3), [(30, 40), (100, 100), (300, 200)])
     boxes = boxes_of_px((0, 0, 80, 64), (80, 80, 144, 128), (176, 256, 224, 336))
-    found = find_in_boxes(detector, frame(image), image, boxes, 0.0)
+    found = find_in_boxes(detector, frame(image), boxes, 0.0)
     assert sorted(seen) == [(80, 112), (96, 80), (112, 96)]
     assert all(near(found.xy, x, y) for x, y in [(30, 40), (100, 100), (300, 200)])
 

@@ -7,22 +7,19 @@ import numpy as np
 import pytest
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage
-from schemas.detector import MotionRecord
 from velfield.bench.scenes import simulated_image
-from velfield.detection.cascade.classifier import nms_oriented
 from velfield.detection.cnn import model
 from velfield.detection.cnn.dataset import PATCH_PX, encode_targets
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.model import (
     SCORE_OFFSET,
     SMOOTHING_SIGMA,
-    background_difference_at,
     detect_cars,
     find_peaks,
-    motion_score_bonus,
 )
 from velfield.detection.cnn.network import Network
 from velfield.detection.detector import shipped_detector
+from velfield.detection.nms import nms_oriented
 from velfield.detection.orientation import axial_difference
 
 
@@ -172,22 +169,6 @@ def test_a_car_truncated_by_the_frame_is_not_detected() -> None:
     cars = detections[detections[:, 3] > 0]
     assert (np.hypot(cars[:, 0] - 79.5, cars[:, 1] - 47.5) < 4).any()
     assert not (cars[:, 0] < 3).any()
-
-
-def test_the_difference_to_the_background_is_that_around_a_position() -> None:
-    background = np.full((60, 80), 100, np.uint8)
-    image = background.copy()
-    image[20:41, 30:51] = 140
-    near, far = background_difference_at(image, background, np.array([[40.0, 30.0], [5.0, 5.0]]), 16.0)
-    assert near == pytest.approx(40, abs=0.5)
-    assert far == pytest.approx(0, abs=0.1)
-    darker = background_difference_at(background, image, np.array([[40.0, 30.0]]), 16.0)
-    assert darker[0] == pytest.approx(near)
-
-
-def test_the_bonus_is_a_ramp() -> None:
-    motion = MotionRecord(bonus_ramp_start=10, bonus_ramp_end=30, max_score_bonus=0.2)
-    np.testing.assert_allclose(motion_score_bonus(motion, np.array([0.0, 10, 20, 30, 90])), [0, 0, 0.1, 0.2, 0.2])
 
 
 def test_peaks_are_those_of_the_plain_form() -> None:

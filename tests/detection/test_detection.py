@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from schemas.detector import CascadeConfig, CascadeTraining, CnnConfig, PaperConfig
+from schemas.detector import CnnConfig, PaperConfig
 from velfield.bench.detection import row_response
 from velfield.detection.boosting import BoostedStumps
 from velfield.detection.detect import FrameDetections, detect_frame
@@ -19,7 +19,6 @@ from velfield.pipeline.stages.labels import rescale
 from velfield.synthetic import Flight, small_flight
 
 SCALE = 0.92  # 16 px a car at 0.23 m a pixel
-CASCADE = CascadeConfig(rounds=120, feature_pool=800, folds=2)
 PAPER = PaperConfig(rounds=120, feature_pool=800)
 MATCH_PX = 8.0
 
@@ -38,7 +37,7 @@ def sample(of: Flight, frame: int) -> LabelledImage:
 
 @cache
 def detector(method: str) -> Detector:
-    return train_detector([sample(flight(5), 0)], {"cascade": CASCADE, "paper": PAPER}[method])
+    return shipped_detector() if method == "cnn" else train_detector([sample(flight(5), 0)], PAPER)
 
 
 def detect(of: Flight, frame: int, method: str) -> tuple[FrameDetections, LabelledImage]:
@@ -63,15 +62,15 @@ def f_measure(of: Detector, truth: LabelledImage) -> float:
     return 2 * len(matches(found, truth)) / max(len(found.xy) + len(truth.cars), 1)
 
 
-def test_the_cascade_on_a_city_that_it_was_not_trained_on() -> None:
-    found, truth = detect(flight(6), 1, "cascade")
+def test_the_network_on_a_city_that_it_was_not_trained_on() -> None:
+    found, truth = detect(flight(6), 1, "cnn")
     pairs = matches(found, truth)
     assert len(pairs) / len(found.xy) > 0.85
     assert len(pairs) / len(truth.cars) > 0.7
 
 
-def test_orientations_of_the_cascade() -> None:
-    found, truth = detect(flight(6), 1, "cascade")
+def test_orientations_of_the_network() -> None:
+    found, truth = detect(flight(6), 1, "cnn")
     k, car = np.array(matches(found, truth)).T
     off = np.degrees(axial_difference(np.asarray(found.orientation_rad[k], np.float64), truth.cars[car, 2]))
     assert np.median(off) < 5
@@ -81,7 +80,7 @@ def test_orientations_of_the_cascade() -> None:
 
 
 def test_detections_of_a_frame_go_from_top_to_bottom_with_their_crops() -> None:
-    found, _ = detect(flight(6), 1, "cascade")
+    found, _ = detect(flight(6), 1, "cnn")
     n = len(found)
     assert np.all(np.diff(found.xy[:, 1]) >= 0)
     assert found.patches.shape == (n, 16, 8)
@@ -90,7 +89,7 @@ def test_detections_of_a_frame_go_from_top_to_bottom_with_their_crops() -> None:
 
 
 def test_training_twice_gives_the_same_detector() -> None:
-    quick = CASCADE.model_copy(update={"rounds": 40, "feature_pool": 250})
+    quick = PAPER.model_copy(update={"rounds": 40, "feature_pool": 250})
     once, again = (train_detector([sample(flight(5), 0)], quick) for _ in range(2))
     assert again.record == once.record
 
@@ -119,7 +118,7 @@ def test_the_papers_detector_by_the_response_at_every_pixel(monkeypatch: pytest.
     assert abs(len(matches(ours, truth)) - len(matches(plain, truth))) <= 0.05 * len(truth.cars)
 
 
-@pytest.mark.parametrize("method", ["cascade", "paper"])
+@pytest.mark.parametrize("method", ["cnn", "paper"])
 def test_a_higher_threshold_detects_fewer(method: str) -> None:
     truth, normal = sample(flight(6), 1), detector(method)
     strict = detect_frame(truth.image, None, normal, threshold=normal.threshold + 0.3)
@@ -127,7 +126,7 @@ def test_a_higher_threshold_detects_fewer(method: str) -> None:
     assert strict.score.min() > normal.threshold + 0.3
 
 
-@pytest.mark.parametrize("method", ["cascade", "paper"])
+@pytest.mark.parametrize("method", ["cnn", "paper"])
 def test_nothing_is_detected_where_the_frame_does_not_reach(method: str) -> None:
     truth = sample(flight(6), 1)
     valid = np.zeros(truth.image.shape, bool)
@@ -137,7 +136,7 @@ def test_nothing_is_detected_where_the_frame_does_not_reach(method: str) -> None
     assert found.xy[:, 0].max() < truth.image.shape[1] // 2 + 4
 
 
-@pytest.mark.parametrize("method", ["cascade", "paper"])
+@pytest.mark.parametrize("method", ["cnn", "paper"])
 def test_an_empty_road_has_no_cars(method: str) -> None:
     found = detect_frame(np.full((96, 128), 120, np.uint8), None, detector(method))
     assert len(found) == 0
@@ -145,33 +144,17 @@ def test_an_empty_road_has_no_cars(method: str) -> None:
     assert found.chips.shape == (0, 32, 32)
 
 
-def test_few_cars_continue_an_earlier_cascade() -> None:
-    truth = sample(flight(5), 0)
-    few = LabelledImage(image=truth.image, cars=truth.cars[:12], complete=False)
-    base = detector("cascade")
-    continued = train_detector([few], CASCADE, base=base)
-    assert 0.9 * CASCADE.rounds < len(continued.record.rounds) - len(base.record.rounds) <= CASCADE.rounds
-    assert continued.record.attribution == base.record.attribution
-    assert continued.threshold == pytest.approx((0.15 + 4 * base.threshold) / 5)
-    assert f_measure(continued, sample(flight(6), 1)) > 0.7
-
-
 def test_labels_fine_tune_the_network_where_it_knows_cars_of_their_length() -> None:
     truth = sample(flight(5), 0)
     few = LabelledImage(image=truth.image, cars=truth.cars[:12], complete=False)
     assert train_detector([few], CnnConfig(fine_tune_steps=3)).record.method == "cnn"
-    cascade = CascadeTraining(rounds=40, feature_pool=250)
-    other = train_detector([few], CnnConfig(working_car_length_px=20.0, cascade=cascade))
-    assert other.record.method == "cascade"
-    assert len(other.record.rounds) == 40
 
 
 def test_a_detector_that_does_not_fit_is_not_continued() -> None:
     with pytest.raises(InputError, match="found a detector of method paper to continue"):
-        train_detector([sample(flight(5), 0)], CASCADE, base=detector("paper"))
-    other = CASCADE.model_copy(update={"working_car_length_px": 20.0})
+        train_detector([sample(flight(5), 0)], CnnConfig(), base=detector("paper"))
     with pytest.raises(InputError, match="cars of 16 px to continue, expected 20 px"):
-        train_detector([sample(flight(5), 0)], other, base=detector("cascade"))
+        train_detector([sample(flight(5), 0)], CnnConfig(working_car_length_px=20.0))
 
 
 def test_the_shipped_detector_names_its_data_and_detects_cars_of_unseen_cities() -> None:

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from velfield.detection.cascade.fitting import rejection_threshold
 from velfield.detection.evaluation import (
     MATCH_PX,
     HeldOutScores,
@@ -183,13 +182,6 @@ def test_distances_to_the_nearest_car() -> None:
     cars = np.array([[0.0, 0.0, 1.0], [10.0, 0.0, 1.0]])
     assert distance_to_nearest_car(np.array([[3.0, 4.0], [9.0, 0.0]]), cars).tolist() == [5.0, 1.0]
     assert np.isinf(distance_to_nearest_car(np.zeros((2, 2)), cars[:0])).all()
-
-
-def test_rejection_loses_few_held_out_cars_by_a_margin() -> None:
-    scores = np.linspace(0, 1, 1001)
-    assert rejection_threshold(scores) == pytest.approx(0.02 - 0.1)
-    assert rejection_threshold(np.r_[scores, -np.inf, np.nan]) == rejection_threshold(scores)
-    assert rejection_threshold(np.array([-np.inf])) == -1.0
 
 
 def test_the_contact_sheet_has_a_section_for_each_kind() -> None:

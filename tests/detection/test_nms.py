@@ -1,22 +1,15 @@
-"""Oriented non-maximum suppression, the stages of the cascade, and its region proposals."""
+"""Oriented non-maximum suppression."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from velfield.detection.boosting import BoostedStumps
-from velfield.detection.cascade.classifier import (
-    PoseScorer,
-    classify_proposals,
+from velfield.detection.nms import (
     in_view,
     nms_oriented,
     offset_along_axis,
-    offset_grid,
-    propose_regions,
 )
-from velfield.detection.cascade.feature_image import COARSE, compute_features
-from velfield.detection.orientation import axial_difference
 
 LENGTH = 16.0
 SEEDS = st.integers(0, 2**32 - 1)
@@ -103,105 +96,6 @@ def test_offsets_are_along_and_across_the_axis(seed: int) -> None:
     axis = np.column_stack([np.cos(angles), np.sin(angles)])
     np.testing.assert_allclose((moved * axis).sum(axis=1), offsets[:, 0], atol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(moved, axis=1), np.linalg.norm(offsets, axis=1), atol=1e-9)
-
-
-def test_a_grid_of_offsets() -> None:
-    assert len(offset_grid(4, 4, 2)) == 25
-    assert offset_grid(1, 0).tolist() == [[-1, 0], [0, 0], [1, 0]]
-
-
-def bright_bar(along: int = 14, across: int = 7) -> BoostedStumps:
-    """A classifier of bright bars of 16 x 8 px along the axis: their middle brighter than their sides and ends."""
-    half_a, half_b = along // 2, across // 2
-    rectangles = [
-        (1, -half_a, -half_b, half_a, half_b),
-        (-1, -half_a, half_b + 1, half_a, half_b + 1 + across),
-        (1, -half_a, -half_b, half_a, half_b),
-        (-1, -half_a, -half_b - 1 - across, half_a, -half_b - 1),
-        (1, 0, -half_b, half_a, half_b),
-        (-1, half_a + 1, -half_b, half_a + 1 + half_a, half_b),
-        (1, -half_a, -half_b, 0, half_b),
-        (-1, -half_a - 1 - half_a, -half_b, -half_a - 1, half_b),
-    ]
-    rectangles = [tuple(np.clip(r, [-1, -14, -11, -14, -11], [1, 14, 11, 14, 11])) for r in rectangles]
-    thresholds = np.repeat([30.0, 80.0, 150.0], 4).astype(np.float32)
-    table = np.array(rectangles * 3, np.int32)
-    starts = np.arange(0, 25, 2, dtype=np.int32)
-    leaves = np.tile(np.array([[-1.0, 1.0]], np.float32), (12, 1))
-    return BoostedStumps(table, starts, np.zeros(12, np.int32), thresholds, leaves)
-
-
-def road(bars: list[tuple[float, float, float]]) -> np.ndarray:
-    """Bright bars of 16 x 8 px, blurred, on grey."""
-    y, x = np.mgrid[:120, :160].astype(float)
-    image = np.full((120, 160), 70.0)
-    for bx, by, angle in bars:
-        u = (x - bx) * np.cos(angle) + (y - by) * np.sin(angle)
-        v = (y - by) * np.cos(angle) - (x - bx) * np.sin(angle)
-        image += 130 / (1 + np.exp(2 * (np.abs(u) - 8))) / (1 + np.exp(2 * (np.abs(v) - 4)))
-    return image.astype(np.uint8)
-
-
-BARS = [(40.0, 40.0, 0.0), (100.0, 40.0, 0.6), (50.0, 90.0, 1.4), (120.0, 85.0, 2.5)]
-
-
-def test_the_stages_refine_a_displaced_and_rotated_proposal() -> None:
-    scorer = PoseScorer(compute_features(road(BARS)), bright_bar(), 12.0)
-    proposals = np.array([[x + 2.0, y - 2.0, angle + np.radians(12)] for x, y, angle in BARS])
-    cars = nms_oriented(classify_proposals(scorer, proposals, min_score=0.0), LENGTH)
-    assert len(cars) == 4
-    for x, y, angle in BARS:
-        nearest = np.hypot(cars[:, 0] - x, cars[:, 1] - y).argmin()
-        assert np.hypot(*(cars[nearest, :2] - [x, y])) < 2.0
-        assert axial_difference(cars[nearest, 2], angle) < np.radians(20)
-    assert (cars[:, 4] > 0).all()
-
-
-def test_stages_reject_what_scores_too_low() -> None:
-    scorer = PoseScorer(compute_features(road(BARS)), bright_bar(), 12.0)
-    proposals = np.array([[x, y, angle] for x, y, angle in BARS])
-    assert classify_proposals(scorer, proposals[:0], min_score=0.0).shape == (0, 5)
-    assert classify_proposals(scorer, proposals, min_score=0.0, min_stage1_score=99.0).shape == (0, 5)
-    assert classify_proposals(scorer, proposals, min_score=99.0).shape == (0, 5)
-    empty = np.array([[80.0, 65.0, 0.0]])
-    assert classify_proposals(scorer, empty, min_score=0.0).shape == (0, 5)
-
-
-def coarse_bar() -> BoostedStumps:
-    """The same classifier at half the resolution."""
-    fine = bright_bar(8, 4)
-    table = fine.rectangles.copy()
-    table[:, 1:] = np.clip(table[:, 1:], [-10, -8, -10, -8], [10, 8, 10, 8])
-    return BoostedStumps(table, fine.starts, fine.channels, fine.thresholds / 4, fine.leaves)
-
-
-def test_every_bar_is_proposed_and_no_two_proposals_of_a_rotation_lie_close() -> None:
-    image = road(BARS)
-    proposals = propose_regions(
-        compute_features(image, None, COARSE), image.shape, None, coarse_bar(), contrast_floor=12.0, min_score=0.0
-    )
-    assert np.all(np.diff(proposals[:, 3]) <= 0)
-    for x, y, angle in BARS:
-        near = (np.hypot(proposals[:, 0] - x, proposals[:, 1] - y) < 5) & (
-            axial_difference(proposals[:, 2], np.full(len(proposals), angle)) < np.radians(35)
-        )
-        assert near.any()
-    for angle in np.unique(proposals[:, 2]):
-        xy = proposals[proposals[:, 2] == angle, :2]
-        gap = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1)) + 99 * np.eye(len(xy))
-        assert gap.min(initial=99) > 3
-
-
-def test_proposals_keep_to_the_valid_part_and_to_their_number() -> None:
-    image = road(BARS)
-    coarse = compute_features(image, None, COARSE)
-    valid = np.zeros(image.shape, bool)
-    valid[:, :80] = True
-    inside = propose_regions(coarse, image.shape, valid, coarse_bar(), contrast_floor=12.0)
-    assert len(inside) > 0
-    assert inside[:, 0].max() < 80.5
-    few = propose_regions(coarse, image.shape, None, coarse_bar(), contrast_floor=12.0, per_megapixel=0)
-    assert len(few) == 8
 
 
 @pytest.mark.parametrize(

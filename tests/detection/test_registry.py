@@ -12,11 +12,9 @@ from schemas.detector import (
     METHODS,
     RECORDS,
     BaseRecord,
-    CascadeRecord,
     CnnRecord,
     DetectorConfig,
     PaperRecord,
-    Proposer,
     Rectangle,
     Round,
 )
@@ -101,7 +99,6 @@ def test_another_detector_is_trained_and_run_by_its_name() -> None:
     assert found.xy.tolist() == sample.cars[:, :2].tolist()  # top to bottom
     assert found.patches.shape == (9, 16, 8)
     assert len(detect_frame(sample.image, None, detector, threshold=250)) == 0
-    assert not detector.uses_background
 
 
 @pytest.mark.usefixtures("toy")
@@ -147,13 +144,6 @@ def one_round() -> Round:
     return Round(channel=0, rectangles=(rectangle,), threshold=0.5, leaf_low=-0.25, leaf_high=0.75)
 
 
-def cascade() -> CascadeRecord:
-    proposer = Proposer(rounds=(one_round(),), min_score=-0.4, min_stage1_score=-0.3)
-    return CascadeRecord(
-        working_car_length_px=16, threshold=0.15, proposer=proposer, rounds=(one_round(),) * 2, contrast_floor=12
-    )
-
-
 def paper() -> PaperRecord:
     return PaperRecord(working_car_length_px=16, threshold=1.5, rounds=(one_round(),), grey_bits=5)
 
@@ -164,7 +154,7 @@ def cnn() -> CnnRecord:
     return record
 
 
-@pytest.mark.parametrize("make", [cascade, paper, cnn])
+@pytest.mark.parametrize("make", [paper, cnn])
 def test_a_detector_comes_back_from_its_file(make, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     detector, file = from_record(make()), tmp_path / "detector.json"
     detector.save(file)
@@ -180,7 +170,7 @@ def test_a_detector_comes_back_from_its_file(make, tmp_path: Path) -> None:  # t
         ("{", "this is not JSON"),
         ("[1]", "expected a detector file"),
         ('{"kind": "other"}', "the file: unable to extract tag"),
-        ('{"kind": "velfield-detector", "version": 2, "method": "yolo"}', "'cnn', 'cascade', 'paper'"),
+        ('{"kind": "velfield-detector", "version": 2, "method": "yolo"}', "'cnn', 'paper'"),
         ('{"kind": "velfield-detector", "version": 3, "method": "paper"}', "paper.version"),
         ('{"kind": "velfield-detector", "version": 1, "method": "paper"}', "paper.version"),
     ],

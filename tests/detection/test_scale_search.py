@@ -8,7 +8,7 @@ import pytest
 from schemas.arrays import FloatArray, GreyImage
 from velfield.bench.scenes import simulated_image
 from velfield.detection.detector import shipped_detector
-from velfield.detection.scale_search import STEP, View, contradict_motion, find_scale, is_plausible_scale
+from velfield.detection.scale_search import STEP, View, find_scale, is_plausible_scale
 from velfield.pipeline.stages.labels import rescale
 from velfield.tracking.dimensions import measure
 
@@ -48,24 +48,3 @@ def test_no_scale_is_found_without_cars() -> None:
     coarse = rng.uniform(60, 180, (24, 32))
     ground = np.kron(coarse, np.ones((20, 20))) + rng.normal(0, 8, (480, 640))
     assert search(np.clip(ground, 0, 255).astype(np.uint8)) is None
-
-
-@pytest.mark.parametrize(
-    ("by_motion", "by_appearance", "lengths"),
-    [
-        (0.2, 0.56, ("80 px", "29 px")),  # roofs: three times too long
-        (0.56, 0.2, ("29 px", "80 px")),  # parts of vehicles
-        (0.4, 0.61, ("40 px", "26 px")),
-        (0.4, 0.59, ()),  # within what the search may be off by
-        (0.59, 0.4, ()),
-        (0.4, 0.4, ()),
-        (0.4, None, ()),  # nothing looks like a car: motion alone
-    ],
-)
-def test_motion_of_things_that_are_no_cars_is_told(
-    by_motion: float, by_appearance: float | None, lengths: tuple[str, ...]
-) -> None:
-    told = contradict_motion(by_motion, by_appearance, 16.0)
-    assert len(told) == bool(lengths)
-    assert all(length in line for line in told for length in lengths)
-    assert all("give --gsd-m" in line and "\n" not in line for line in told)

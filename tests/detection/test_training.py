@@ -12,9 +12,8 @@ from flows.cli import app
 from flows.commands import train as train_command
 from schemas.flight import FramesConfig
 from schemas.tables import LABEL_COLUMNS
-from velfield.detection.cascade.scenes import make_scene
 from velfield.detection.detector import load_detector, shipped_detector
-from velfield.detection.orientation import axial_difference
+from velfield.detection.orientation import axial_difference, fill_missing_orientation
 from velfield.errors import InputError
 from velfield.pipeline.stages.labels import check_label_scale, check_vehicle_length, labelled_images
 from velfield.sources.labels.labels import read_labels
@@ -98,7 +97,8 @@ def test_an_upright_box_about_a_rotated_car_becomes_an_oriented_label(tmp_path: 
     np.savetxt(tmp_path / "labels" / "0.txt", rows, fmt="%.6f")
     info = probe(tmp_path, frames=FramesConfig(fps=1.0))
     (image,) = labelled_images(tmp_path, info, read_labels(tmp_path / "labels", info), work_per_raw=0.92)
-    off = np.degrees(axial_difference(make_scene(image, has_background=False).cars[:, 2], axis))
+    found = fill_missing_orientation(image.image, image.cars, image.abs_box_angle_rad)[:, 2]
+    off = np.degrees(axial_difference(found, axis))
     assert len(off) > 15
     assert np.mean(off < 15) > 0.85
 

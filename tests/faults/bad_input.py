@@ -129,7 +129,7 @@ def read_detector(path: Path) -> int:
 
     image = np.random.default_rng(0).integers(0, 255, (64, 96), dtype=np.uint8)
     detector = load_detector(path)
-    return len(detector.detect(image, background=image if detector.uses_background else None))
+    return len(detector.detect(image))
 
 
 def link_detections(path: Path) -> int:

@@ -23,10 +23,6 @@ import psutil
 ROOT = Path(__file__).resolve().parents[2]
 SIMULATED = 120
 SETTINGS = (
-    "detection.method=cascade",
-    "detection.rounds=20",
-    "detection.feature_pool=200",
-    "detection.folds=2",
     "lens.calibrate=never",
     "registration.model=homography",
     "registration.max_keypoints=300",

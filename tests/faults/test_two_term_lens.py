@@ -88,7 +88,6 @@ def test_detections_and_tracklets_lie_where_there_are_positions(flight: LensFlig
 
 
 def test_vehicles_are_where_the_truth_has_them(flight: LensFlight) -> None:
-    """With a cascade of 40 rounds, which takes a roof's edge for a car now and then."""
     assert flight.score.detection.precision > 0.9
     assert flight.score.tracking.precision > 0.9
     assert flight.score.tracking.speed_error_mean_km_per_h < 1.5

@@ -11,17 +11,13 @@ import pytest
 from flows.cli import _conclude
 from flows.console import Console
 from flows.runners import ClientRunner, RunnerConfig
-from schemas.detector import MotionRecord
 from schemas.summary import RunSummary
 from schemas.tables import DETECTION_COLUMNS, TRACK_COLUMNS
 from tests.small_flight import FRAMES, digests, job, process, redone
 from velfield import open_run
-from velfield.detection.detector import from_record, shipped_detector
 from velfield.errors import InputError
 from velfield.pipeline.plan import make_plan
 from velfield.pipeline.stage import STAGE, STAGES
-from velfield.pipeline.stages.detections import detect_block
-from velfield.pipeline.stages.detector import make_detector
 from velfield.pipeline.stages.report import make_report
 from velfield.pipeline.summary import summarise_run
 from velfield.report.report import render_report
@@ -136,20 +132,6 @@ def test_a_ground_sample_distance_given_later_keeps_what_does_not_depend_on_it(
 def following_names(first: str) -> list[str]:
     names = list(STAGE)
     return names[names.index(first) :]
-
-
-def test_a_detector_that_uses_the_background_gets_that_of_this_flight(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path
-) -> None:
-    root, file, found = tmp_path / "copy", tmp_path / "detector.json", []
-    shutil.copytree(whole[0], root)
-    for motion in (None, MotionRecord(bonus_ramp_start=8, bonus_ramp_end=20, max_score_bonus=0.3)):
-        from_record(shipped_detector().record.model_copy(update={"motion": motion, "threshold": 0.35})).save(file)
-        plan = make_plan(job(flight, root, detector=str(file)))
-        outcome = make_detector(plan)
-        assert (RunLayout(root).background in outcome.outputs) == (motion is not None)
-        found.append(len(detect_block(plan, range(8, 9)).cars))
-    assert found[1] > found[0] + 5
 
 
 def test_workers_give_the_same_bits(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from schemas.detector import METHODS, CascadeConfig, CascadeTraining, CnnConfig, DetectorConfig, PaperConfig
+from schemas.detector import METHODS, CnnConfig, DetectorConfig, PaperConfig
 from schemas.flight import READ_WITH, FlightConfig
 from velfield.errors import IneffectiveSettingWarning, InputError
 from velfield.pipeline.configuration import resolve_config
@@ -36,10 +36,9 @@ def test_a_method_and_its_keys_are_set_in_any_order(settings: Sequence[str], pre
 
 
 def test_a_preset_sets_keys_of_its_own_method_only() -> None:
-    quick = CascadeTraining(rounds=300, feature_pool=1500, folds=2)
-    assert resolve_config(preset="fast").detection == CnnConfig(fine_tune_steps=120, cascade=quick)
-    fast = resolve_config(preset="fast", settings=["detection.method=cascade", "detection.rounds=200"]).detection
-    assert fast == CascadeConfig(rounds=200, feature_pool=1500, folds=2)
+    assert resolve_config(preset="fast").detection == CnnConfig(fine_tune_steps=120)
+    fast = resolve_config(preset="fast", settings=["detection.method=paper", "detection.rounds=100"]).detection
+    assert fast == PaperConfig(rounds=100)
 
 
 @pytest.mark.parametrize("model", METHODS)
@@ -55,11 +54,8 @@ def test_a_key_of_another_method_is_refused_with_the_method_that_reads_it() -> N
     with pytest.raises(InputError) as caught:
         resolve_config(settings=["detection.rounds=100"])
     assert str(caught.value) == (
-        "configuration: detection.rounds is read by cascade and paper, not by cnn; set detection.cascade.rounds, "
-        "choose detection.method=cascade or leave it out"
+        "configuration: detection.rounds is read by paper, not by cnn; choose detection.method=paper or leave it out"
     )
-    with pytest.raises(InputError, match=r"did you mean 'detection\.cascade\.rounds'"):
-        resolve_config(settings=["detection.cascade.round=100"])
 
 
 def test_an_option_that_was_not_given_changes_nothing() -> None:
@@ -73,7 +69,7 @@ def test_an_option_that_was_not_given_changes_nothing() -> None:
         (["tracking.max_speed_m_per_s=.nan"], "finite"),
         (["tracking.max_speed_m_per_s=.inf"], "finite"),
         (["tracking.max_speed_m_per_s=-1"], "greater than 0"),
-        (["detection.method=dnse"], "expected one of 'cnn', 'cascade', 'paper'"),
+        (["detection.method=dnse"], "expected one of 'cnn', 'paper'"),
         (["gsd_m"], "expected section.key=value"),
         (["gsd_m.metres=1", "gsd_m=2"], ""),
         (["preset=worst"], "best, fast, paper"),

@@ -39,7 +39,6 @@ def first_changed(a: dict[str, str], b: dict[str, str]) -> str | None:
         ("base.median_frames=32", "base"),
         ("registration.match_search_px=60", "base"),  # the own base image is made by registration
         ("detection.fine_tune_steps=100", "detector"),
-        ("detection.cascade.rounds=100", "detector"),
         ("tracking.max_turn_rad=0.4", "tracklets"),
         ("field.bin_width_m_per_s=1", "field"),
         ("work.retries=5", None),

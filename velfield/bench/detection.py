@@ -12,24 +12,15 @@ from numba import njit
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from schemas.detector import CascadeConfig
-from velfield.bench.scenes import simulated_image
 from velfield.detection.boosting import BoostedStumps, draw_feature_pool
-from velfield.detection.cascade.classifier import PoseScorer, offset_grid
-from velfield.detection.cascade.detector import CascadeDetector
-from velfield.detection.cascade.feature_image import compute_features
 from velfield.detection.cnn.network import TOPOLOGY, DepthToSpace, Residual, SpaceToDepth, Topology
 from velfield.detection.detect import detect_frame
 from velfield.detection.detector import Detector
 from velfield.detection.paper.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, dense_response, quantise_and_pad
 from velfield.synthetic import small_flight
 
-_ROTATIONS = np.radians(np.arange(0.0, 180.0, 15.0))
 _DENSE_ROUNDS = 200
 _NUMPY_ROUNDS = 10
-_TILE_PX = 8
-_TRAINING_SEED = 978
-"""Seed of the city; `city` shows that of seed 77."""
 
 
 def _c2f(step: int, into: int, out: int, repeats: int) -> list[tuple[int, int, int, int]]:
@@ -154,11 +145,6 @@ def response_speed(image: NDArray[np.uint8]) -> tuple[Speed, Speed]:
     return Speed(what, "whole rows of int32", fast, rows), Speed(what, "numpy", fast, slow)
 
 
-def train_on_one_frame() -> CascadeDetector:
-    """A cascade of the usual size, trained on the cars of one frame of another simulated city."""
-    return CascadeDetector.train([simulated_image(_TRAINING_SEED)], CascadeConfig())
-
-
 def cnn_speed(image: NDArray[np.uint8], detector: Detector) -> Speed:
     """The CNN, beside convolutions of YOLOv8n's sizes on such a frame."""
     fast = _fastest(lambda: detect_frame(image, None, detector), 2)
@@ -214,25 +200,6 @@ def _convolution_seconds(size: tuple[int, int], taps: int, into: int, out: int, 
     session = ort.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
     image = np.ones((1, into, *size), np.float32)
     return _fastest(partial(session.run, None, {"x": image}), repeats)
-
-
-def cascade_speed(image: NDArray[np.uint8], detector: CascadeDetector, name: str, *, crop_px: int = 96) -> Speed:
-    """The cascade against its classifier at every pixel and rotation of a crop, scaled up.
-
-    The more confident a detector is, the fewer proposals pass its first stages.
-    """
-    fast = _fastest(lambda: detect_frame(image, None, detector), 2)
-    scorer = PoseScorer(compute_features(image), detector.classifier, detector.record.contrast_floor)
-    spots = np.arange(0, crop_px, _TILE_PX) + _TILE_PX / 2
-    tiles = np.stack(np.meshgrid(spots, spots), axis=-1).reshape(-1, 2).astype(np.float64)
-    half = offset_grid(_TILE_PX // 2, _TILE_PX // 2)
-    offsets = half[(half > -_TILE_PX // 2).all(axis=1)]
-    slow = _fastest(lambda: scorer.scores(tiles, np.zeros(len(tiles)), np.asarray(_ROTATIONS, np.float64), offsets), 1)
-    slow *= image.size / crop_px**2
-    rounds = len(detector.record.rounds)
-    return Speed(
-        f"the cascade, {name}, {rounds} rounds", f"dense over pixels and {len(_ROTATIONS)} rotations", fast, slow
-    )
 
 
 def _fastest(work: Callable[[], object], repeats: int) -> float:

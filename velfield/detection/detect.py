@@ -27,7 +27,6 @@ import numpy as np
 from numba import njit
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
-from velfield.detection.cascade.classifier import confirm_long_vehicles, nms_oriented
 from velfield.detection.changes import (
     BOX_AREA,
     BOX_PX,
@@ -39,7 +38,9 @@ from velfield.detection.changes import (
 )
 from velfield.detection.detector import Detections, Detector, concatenate
 from velfield.detection.frame import SearchableFrame, half_resolution
+from velfield.detection.long_vehicles.classifier import confirm_long_vehicles
 from velfield.detection.mosaic import Box, find_in_boxes
+from velfield.detection.nms import nms_oriented
 
 _SLOW_PX = 96
 """Side of the boxes over which a difference counts as illumination."""
@@ -171,12 +172,11 @@ def detect_frame(
     image: GreyImage,
     valid: Mask | None,
     detector: Detector,
-    background: GreyImage | None = None,
     *,
     threshold: float | None = None,
 ) -> FrameDetections:
     """Detect the cars of a frame, top to bottom; the parameters are those of `Detector.detect`."""
-    cars = detector.detect(image, valid, background, threshold=threshold)
+    cars = detector.detect(image, valid, threshold=threshold)
     order = np.lexsort((cars.xy[:, 0], cars.xy[:, 1]))
     return attach_crops(image, cars, order)
 
@@ -225,7 +225,6 @@ class SearchedFrame:
 def search_frame(
     detector: Detector,
     frame: SearchableFrame,
-    background: GreyImage | None = None,
     *,
     reference: SearchedFrame | None = None,
     threshold: float | None = None,
@@ -234,7 +233,7 @@ def search_frame(
 
     Parameters
     ----------
-    background, threshold
+    threshold
         As of `Detector.detect`; `Detector.weak_margin` below the threshold begin the weak candidates.
     reference
         A frame that was searched whole, on the same grid; none: this one is searched whole.
@@ -258,7 +257,7 @@ def search_frame(
     for top, left, bottom, right in boxes:
         searched[top:bottom, left:right] = True
     frame.resample(_grow(searched, -(-detector.context_px // CELL_PX)), CELL_PX)
-    found = find_in_boxes(detector, frame, background, boxes, weak_above)
+    found = find_in_boxes(detector, frame, boxes, weak_above)
     above = found.score > own if detector.weak_margin else np.ones(len(found), bool)
     kept = None if reference is None else _outside(reference.detections, searched, frame.half_valid)
     cars = detector.refine(frame, found.take(np.flatnonzero(above)), kept)

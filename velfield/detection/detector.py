@@ -1,9 +1,8 @@
 """What every car detector offers, and the registry of detectors by name of their method.
 
-A detector is trained on labelled images (`Detector.train`), or on a flight without any (`Detector.train_from_motion`),
-detects cars on images in base orientation, rescaled to a car's usual length (`Detector.detect`), and is a record that
-goes into a JSON file (`Detector.save`) and comes back, from this and the last format version (`load_detector`); one
-ships (`shipped_detector`).
+A detector is trained on labelled images (`Detector.train`), detects cars on images in base orientation, rescaled to a
+car's usual length (`Detector.detect`), and is a record that goes into a JSON file (`Detector.save`) and comes back
+(`load_detector`); one ships (`shipped_detector`).
 
 Another one is a package ``velfield/detection/<method>`` whose module ``detector`` names its class ``DETECTOR``, and in
 `schemas.detector` its configuration and its record, added to the unions ``DetectionConfig`` (with its ``Tag``) and
@@ -37,7 +36,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from velfield.detection.samples import LabelledImage
-    from velfield.detection.unlabelled import UnlabelledFlight
 
 MIN_CARS = 8
 """Fewer labelled cars than this do not train a detector."""
@@ -117,7 +115,6 @@ class Detector(ABC):
         self,
         image: GreyImage,
         valid: Mask | None = None,
-        background: GreyImage | None = None,
         *,
         threshold: float | None = None,
     ) -> Detections:
@@ -129,8 +126,6 @@ class Detector(ABC):
             (h, w) uint8 on the working grid.
         valid
             (h, w): where the frame covers it; none: everywhere.
-        background
-            (h, w) uint8 temporal median, for a detector that `uses_background`.
         threshold
             Score threshold in place of the detector's own.
         """
@@ -139,26 +134,23 @@ class Detector(ABC):
         self,
         image: GreyImage,
         valid: Mask | None = None,
-        background: GreyImage | None = None,
         *,
         threshold: float | None = None,
     ) -> Detections:
         """Candidates of a crop that has `context_px` on every side: what `refine` makes the detections of."""
-        return self.detect(image, valid, background, threshold=threshold)
+        return self.detect(image, valid, threshold=threshold)
 
     def find_in_crops(
         self,
         image: GreyImage,
         valid: Mask | None,
-        background: GreyImage | None,
         crops: IntArray,
         *,
         threshold: float | None = None,
     ) -> Detections:
         """Candidates of an image of crops side by side, each of which has `context_px` on every side.
 
-        Each crop is taken by itself; a detector may do better where that changes nothing. What the cascade proposes
-        depends on the whole image: of two simulated cities it found 4 to 18 % fewer cars in all crops at once.
+        Each crop is taken by itself; a detector may do better where that changes nothing.
 
         Parameters
         ----------
@@ -169,8 +161,7 @@ class Detector(ABC):
         for row, column, height, width in crops.tolist():
             part = np.s_[row : row + height, column : column + width]
             covered = None if valid is None else valid[part]
-            ground = None if background is None else background[part]
-            found.append(self.find(image[part], covered, ground, threshold=threshold).shifted(column, row))
+            found.append(self.find(image[part], covered, threshold=threshold).shifted(column, row))
         return concatenate(found)
 
     def detect_raw(self, grey: GreyImage, *, threshold: float | None = None) -> "pd.DataFrame":
@@ -209,16 +200,6 @@ class Detector(ABC):
         InputError
             ``base`` cannot be continued.
         """
-
-    @classmethod
-    def train_from_motion(cls, flight: "UnlabelledFlight", config: Any) -> "Detector":
-        """Train on cars that move; the score threshold follows from how detections move."""
-        return flight.calibrate(flight.train(config), config)
-
-    @property
-    def uses_background(self) -> bool:
-        """Whether it reads |frame - background|."""
-        return False
 
     @property
     def threshold(self) -> float:

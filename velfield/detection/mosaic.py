@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from schemas.arrays import GreyImage, IntArray
+from schemas.arrays import IntArray
 from velfield.detection.changes import CELL_PX
 from velfield.detection.detector import Detections, Detector, concatenate
 from velfield.detection.frame import SearchableFrame
@@ -72,7 +72,6 @@ def shelve_kernel(sizes, side, gap):  # type: ignore[no-untyped-def]
 def find_in_boxes(
     detector: Detector,
     frame: SearchableFrame,
-    background: GreyImage | None,
     boxes: Sequence[Box],
     threshold: float | None,
 ) -> Detections:
@@ -82,12 +81,12 @@ def find_in_boxes(
     ----------
     frame
         Resampled in the boxes and within `Detector.context_px` of them.
-    background, threshold
+    threshold
         As of `Detector.find`.
     """
     found, numbers = [concatenate([])], [np.empty(0, np.int64)]
     for mosaic in pack_boxes(boxes, detector.context_px):
-        candidates, of_box = _find_in_mosaic(detector, frame, background, boxes, mosaic, threshold)
+        candidates, of_box = _find_in_mosaic(detector, frame, boxes, mosaic, threshold)
         found.append(candidates)
         numbers.append(of_box)
     return concatenate(found).take(np.argsort(np.concatenate(numbers), kind="stable"))
@@ -96,7 +95,6 @@ def find_in_boxes(
 def _find_in_mosaic(
     detector: Detector,
     frame: SearchableFrame,
-    background: GreyImage | None,
     boxes: Sequence[Box],
     mosaic: Mosaic,
     threshold: float | None,
@@ -106,8 +104,7 @@ def _find_in_mosaic(
     corners = np.array(boxes)[mosaic.numbers, :2] * CELL_PX - context
     image = assemble_kernel(frame.image, corners, placed, *mosaic.shape, True)
     valid = assemble_kernel(frame.valid.view(np.uint8), corners, placed, *mosaic.shape, False).view(np.bool_)
-    ground = None if background is None else assemble_kernel(background, corners, placed, *mosaic.shape, True)
-    found = detector.find_in_crops(image, valid, ground, placed, threshold=threshold)
+    found = detector.find_in_crops(image, valid, placed, threshold=threshold)
     crop = owners_kernel(found.xy, placed, context, *mosaic.shape)
     inside = np.flatnonzero(crop >= 0)
     found, crop = found.take(inside), crop[inside]

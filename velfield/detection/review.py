@@ -19,7 +19,7 @@ def collect_tp_fn_fp_crops(detector: Detector, samples: Sequence[LabelledImage])
     """Upright crops (n, 32, 32) uint8 of each kind, the highest scores first."""
     kinds: dict[str, list[ByteArray]] = {TRUE_POSITIVES: [], MISSED: [], FALSE_POSITIVES: []}
     for sample in samples:
-        detections = detect_frame(sample.image, sample.valid, detector, sample.background)
+        detections = detect_frame(sample.image, sample.valid, detector)
         order = np.argsort(-detections.score, kind="stable")
         correct = match_greedy(detections.xy[order], sample.cars)
         gap = np.hypot(*(sample.cars[:, None, :2] - detections.xy[None, :, :2]).transpose(2, 0, 1))

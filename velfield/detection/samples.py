@@ -22,7 +22,6 @@ class LabelledImage:
     cars : (n, 5): x, y, orientation, length, width in working px; NaN where the label has none.
     ignore : (k, 3): x, y, radius of objects that are neither car nor background.
     valid : (h, w) bool, none: everywhere.
-    background : (h, w) uint8 temporal median, none: not known.
     complete : whether every car is labelled, so that all else is background.
     abs_box_angle_rad : (n,) of cars without an orientation |angle| to the rows, from an upright box; NaN without one.
     """
@@ -31,7 +30,6 @@ class LabelledImage:
     cars: FloatArray
     ignore: FloatArray = field(default_factory=_no_circles)
     valid: Mask | None = None
-    background: GreyImage | None = None
     complete: bool = True
     abs_box_angle_rad: FloatArray | None = None
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from schemas.arrays import FloatArray, GreyImage, Mask
+from schemas.detector import DetectorConfig
 from velfield.detection.detect import oriented_strips
 from velfield.detection.detector import Detector
 from velfield.detection.frame import half_resolution
@@ -27,10 +28,6 @@ _MIN_AGREEMENT = 0.04
 _RIGHT_AGREEMENT = 0.06
 _MIN_RATIO = 1.3
 """The best scale must surpass all that are not beside it by this factor."""
-_MAX_MOTION_RATIO = 1.5
-"""Between a car's length by what moves and by what looks like a car, which is right to some 15 %; roofs, or parts of
-vehicles, that are taken for cars are several times as long or short."""
-
 View = tuple[GreyImage, Mask]
 Measure = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
 """Lengths, their standard deviations and widths (n,) by strips (n, 32, 10), px of the image."""
@@ -75,27 +72,9 @@ def is_plausible_scale(views: Iterable[View], detector: Detector, measure: Measu
     return agreement >= _RIGHT_AGREEMENT and count >= _MIN_DETECTIONS
 
 
-def contradict_motion(by_motion: float, by_appearance: float | None, car_length_px: float) -> list[str]:
-    """Compare the scale by what moves with that by what looks like a car.
-
-    Parameters
-    ----------
-    by_motion, by_appearance
-        Working px a base px; None where no scale was found.
-    car_length_px
-        Of a car on the working grid.
-
-    Returns
-    -------
-    A warning where they differ by more than a factor of 1.5, so that the scale by appearance is to be used; else none.
-    """
-    if by_appearance is None or abs(np.log(by_motion / by_appearance)) <= np.log(_MAX_MOTION_RATIO):
-        return []
-    moving_px, car_px = car_length_px / by_motion, car_length_px / by_appearance
-    return [
-        f"what moves is {moving_px:.0f} px long, what looks like a car {car_px:.0f} px (expected to be the same within "
-        f"a factor of {_MAX_MOTION_RATIO:g}): cars are taken to be {car_px:.0f} px long; give --gsd-m"
-    ]
+def working_scale(config: DetectorConfig, gsd_m: float) -> float:
+    """Working px a base px at which a usual car is `working_car_length_px` long, by the ground sample distance, m."""
+    return config.working_car_length_px * gsd_m / config.car_length_m
 
 
 def _judge(view: View, detector: Detector, measure: Measure) -> tuple[FloatArray, Mask]:

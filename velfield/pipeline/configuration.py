@@ -102,7 +102,7 @@ def section_models(section: str) -> list[type[BaseModel]]:
     Examples
     --------
     >>> [model.__name__ for model in section_models("detection")]
-    ['CnnConfig', 'CascadeConfig', 'PaperConfig']
+    ['CnnConfig', 'PaperConfig']
     """
     info = FlightConfig.model_fields.get(section)
     return [] if info is None else _models(info.annotation)

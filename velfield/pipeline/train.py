@@ -7,9 +7,9 @@ import numpy as np
 
 from schemas.flight import FlightConfig
 from velfield.detection.detector import Detector, load_detector, shipped_detector, train_detector
-from velfield.detection.motion.labels import working_scale
 from velfield.detection.review import collect_tp_fn_fp_crops, contact_sheet
 from velfield.detection.samples import LabelledImage
+from velfield.detection.scale_search import working_scale
 from velfield.errors import InputError
 from velfield.pipeline.stages.labels import check_label_axes, labelled_images, median_car_length_raw_px
 from velfield.report.figures import png_bytes
@@ -38,7 +38,7 @@ def train_from_labels(source: Path, labels: Path, config: FlightConfig, *, conti
     config
         ``gsd_m`` sets the working scale where it is given, else the labels' length does.
     continued
-        A detector file to continue, or ``shipped``: a network is fine-tuned, a cascade votes together with the new one.
+        A detector file to continue, or ``shipped``, to fine-tune.
 
     Raises
     ------

@@ -214,10 +214,6 @@ class RunLayout:
         return self.base / "control_points.json"
 
     @property
-    def background(self) -> Path:
-        return self.base / "background.npz"
-
-    @property
     def working(self) -> Path:
         """The grid that cars are detected on."""
         return self.base / "working.json"

@@ -19,7 +19,7 @@ from math import prod
 import numpy as np
 import pandas as pd
 
-from schemas.arrays import ByteArray, FloatArray, IntArray, Mask
+from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.detector import DimensionsRecord
 
 STRIP_SHAPE = (32, 10)
@@ -30,12 +30,6 @@ _END_STRIPS = 5
 """Detections at either end of a track that stand for its looks there."""
 _MIN_CONTRAST = 8.0
 """Grey levels: below it a strip is not stretched further, as it shows little but noise."""
-_BLACK, _BRIGHTER = 0.4, 0.25
-"""Fraction of the road's grey level below which a pixel may be a shadow; and how much brighter than the road its caster
-is, as a fraction of the contrast between road and shadow."""
-_MIN_SUNLIT, _MIN_AGREEMENT, _MIN_SHADE_PX = 12, 0.6, 8
-"""Vehicles that show the direction of shadows; the length of their vectors' sum, of the sum of their lengths; pixels of
-a shadow, in a chip of which every other one is looked at."""
 
 
 @dataclass(frozen=True)
@@ -151,55 +145,3 @@ def looks_difference(before: FloatArray, after: FloatArray) -> FloatArray:
     """(k,) mean absolute difference of looks (k, 16, 6), either way round; NaN where one is unknown."""
     ways = [np.abs(before - one).mean(axis=(1, 2)) for one in (after, after[:, ::-1, ::-1])]
     return np.asarray(np.minimum(*ways))
-
-
-def shade_moments(chips: ByteArray) -> FloatArray:
-    """Moments (n, 3) of the shade in chips (n, 32, 32) about detections: sums of x and of y over its pixels, and their
-    number; every other pixel, in pixels of the chip."""
-    if not len(chips):
-        return np.empty((0, 3))
-    some = chips[:, ::2, ::2]
-    at = np.arange(0, chips.shape[1], 2) - (chips.shape[1] - 1) / 2
-    inside = np.hypot(at, at[:, None]) < chips.shape[1] / 2 - 1
-    shade = (some < _BLACK * np.median(some, axis=(1, 2))[:, None, None]) & inside
-    return np.stack([shade.sum(axis=1) @ at, shade.sum(axis=2) @ at, shade.sum(axis=(1, 2))], axis=1)
-
-
-def shadow_direction(moments: FloatArray, count: IntArray, strips: FloatArray) -> FloatArray | None:
-    """Where shadows lie from the vehicles that cast them, a unit vector (2,); None where it is not clear.
-
-    Parameters
-    ----------
-    moments, count
-        (tracks, 3) sums of `shade_moments` over so many chips of each track that moves.
-    strips
-        (tracks, 32, 10) mean strips.
-    """
-    if len(strips) < _MIN_SUNLIT:
-        return None
-    bright = _middle(strips) > _road(strips)
-    rows = np.flatnonzero(bright & (moments[:, 2] >= _MIN_SHADE_PX * count))
-    total, apart = moments[rows, :2].sum(axis=0), np.hypot(*moments[rows, :2].T).sum()
-    length = float(np.hypot(*total))
-    if len(rows) < _MIN_SUNLIT or length < _MIN_AGREEMENT * apart or length == 0:
-        return None
-    return np.asarray(total / length)
-
-
-def may_be_shadows(strips: FloatArray) -> Mask:
-    """(tracks,) whether mean strips (tracks, 32, 10) are black in the middle with something bright beside it."""
-    if not len(strips):
-        return np.zeros(0, bool)
-    middle, road = _middle(strips), _road(strips)
-    blocks = np.lib.stride_tricks.sliding_window_view(strips, (3, 2), axis=(1, 2)).mean(axis=(-1, -2))
-    brightest = blocks.max(axis=(1, 2))
-    return np.asarray((middle <= _BLACK * road) & (brightest >= road + _BRIGHTER * (road - middle)))
-
-
-def _middle(strips: FloatArray) -> FloatArray:
-    along, across = strips.shape[1] // 2, strips.shape[2] // 2
-    return np.asarray(strips[:, along - 2 : along + 2, across - 1 : across + 1].mean(axis=(1, 2)))
-
-
-def _road(strips: FloatArray) -> FloatArray:
-    return np.asarray(np.median(strips[:, :, [0, 1, -2, -1]], axis=(1, 2)))

@@ -4,19 +4,18 @@ from flows.options import parse_frame_size
 
 
 def detection(*, size: str = "2560x1920") -> int:
-    """Times of the CNN, the cascade and the paper's dense response on one core, each beside a plain peer.
+    """Times of the CNN and the paper's dense response on one core, each beside a plain peer.
 
     Parameters
     ----------
     size
         Frame size, WxH in pixels.
     """
-    from velfield.bench.detection import cascade_speed, city, cnn_speed, response_speed, train_on_one_frame
+    from velfield.bench.detection import city, cnn_speed, response_speed
     from velfield.detection.detector import shipped_detector
 
     image = city(*parse_frame_size(size, "128 or more each, as 2560x1920", min_px=128))
     for speed in response_speed(image):
         print(speed.text())
-    print(cascade_speed(image, train_on_one_frame(), "trained on one labelled frame").text())
     print(cnn_speed(image, shipped_detector()).text())
     return 0

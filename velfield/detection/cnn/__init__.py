@@ -1,1 +1,1 @@
-"""The convolutional network: model, inference, training, self-training from motion."""
+"""The convolutional network: model, inference, training."""

@@ -1,4 +1,4 @@
-"""The convolutional network as a detector: pre-trained, fine-tuned on labelled cars, or self-trained on moving ones."""
+"""The convolutional network as a detector: pre-trained, and fine-tuned on labelled cars."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,11 +8,9 @@ from typing import ClassVar
 import numpy as np
 
 from schemas.arrays import GreyImage, IntArray, Mask
-from schemas.detector import CascadeConfig, CnnConfig, CnnRecord, DetectorConfig
-from velfield.detection.cascade.classifier import suppress_and_centre
-from velfield.detection.cascade.detector import CascadeDetector
+from schemas.detector import CnnConfig, CnnRecord, DetectorConfig
 from velfield.detection.cnn.fine_tuning import fine_tune
-from velfield.detection.cnn.model import BORDER_PX, NO_TTA, background_difference_at, detect_cars, motion_score_bonus
+from velfield.detection.cnn.model import BORDER_PX, NO_TTA, detect_cars
 from velfield.detection.cnn.network import (
     INEXACT,
     Network,
@@ -23,19 +21,15 @@ from velfield.detection.cnn.network import (
     uses_cuda,
 )
 from velfield.detection.cnn.quantization import calibrate, is_exact
-from velfield.detection.cnn.self_training import self_train_from_motion
-from velfield.detection.detector import Detections, Detector, shipped_detector, train_detector
+from velfield.detection.detector import Detections, Detector, shipped_detector
 from velfield.detection.frame import SearchableFrame, whole_frame
+from velfield.detection.long_vehicles.classifier import suppress_and_centre
 from velfield.detection.orientation import CAR_ASPECT
 from velfield.detection.samples import LabelledImage
-from velfield.detection.unlabelled import UnlabelledFlight
+from velfield.errors import InputError
 
-_FRAMES = 12
-"""Frames that the self-training samples."""
 _WEAK_MARGIN = 0.2
 """Below the threshold: in a simulated city a fifth more candidates, among them most cars that are not detected."""
-_MIN_VEHICLES = 20
-"""With fewer moving vehicles the network would overfit to these."""
 
 
 @dataclass(frozen=True)
@@ -68,11 +62,6 @@ class CnnDetector(Detector):
         return device_limitations(current_device()) + ([INEXACT] if wanted and not is_exact() else [])
 
     @property
-    def uses_background(self) -> bool:
-        """Whether a detection that differs from the background has a bonus on its score."""
-        return self.record.motion is not None
-
-    @property
     def weak_margin(self) -> float:
         """In terms of probability."""
         return _WEAK_MARGIN
@@ -81,30 +70,27 @@ class CnnDetector(Detector):
         self,
         image: GreyImage,
         valid: Mask | None = None,
-        background: GreyImage | None = None,
         *,
         threshold: float | None = None,
     ) -> Detections:
-        """Detect cars: peaks of the heatmap, the motion bonus, non-maximum suppression, long vehicles centred."""
-        found = self._find(image, valid, background, threshold, border_px=BORDER_PX)
+        """Detect cars: peaks of the heatmap, non-maximum suppression, long vehicles centred."""
+        found = self._find(image, valid, threshold, border_px=BORDER_PX)
         return self.refine(whole_frame(image, valid), found)
 
     def find(
         self,
         image: GreyImage,
         valid: Mask | None = None,
-        background: GreyImage | None = None,
         *,
         threshold: float | None = None,
     ) -> Detections:
-        """Peaks of the heatmap above the threshold, with the motion bonus."""
-        return self._find(image, valid, background, threshold)
+        """Peaks of the heatmap above the threshold."""
+        return self._find(image, valid, threshold)
 
     def find_in_crops(
         self,
         image: GreyImage,
         valid: Mask | None,
-        background: GreyImage | None,
         crops: IntArray,
         *,
         threshold: float | None = None,
@@ -114,24 +100,20 @@ class CnnDetector(Detector):
         The rotated crops of test-time augmentation see farther than the context.
         """
         if self.record.tta_range != NO_TTA:
-            return super().find_in_crops(image, valid, background, crops, threshold=threshold)
-        return self._find(image, valid, background, threshold, crops=crops)
+            return super().find_in_crops(image, valid, crops, threshold=threshold)
+        return self._find(image, valid, threshold, crops=crops)
 
     def _find(
         self,
         image: GreyImage,
         valid: Mask | None,
-        background: GreyImage | None,
         threshold: float | None,
         *,
         border_px: int = 0,
         crops: IntArray | None = None,
     ) -> Detections:
-        length_px, motion = self.record.working_car_length_px, self.record.motion
+        length_px = self.record.working_car_length_px
         rows = detect_cars(self.network, image, valid, self.record.tta_range, border_px=border_px, crops=crops)
-        if motion is not None and background is not None:
-            difference = background_difference_at(image, background, rows[:, :2], length_px)
-            rows[:, 3] += motion_score_bonus(motion, difference)
         above = rows[rows[:, 3] > (self.threshold if threshold is None else threshold)] if len(rows) else rows
         return Detections.from_rows(above, np.full(len(above), length_px * length_px * CAR_ASPECT))
 
@@ -141,41 +123,14 @@ class CnnDetector(Detector):
 
     @classmethod
     def train(cls, samples: Sequence[LabelledImage], config: CnnConfig, *, base: Detector | None = None) -> Detector:
-        """Fine-tune the base, or the pre-trained network; a cascade where cars have another length than it knows."""
-        network = base if isinstance(base, CnnDetector) else _pretrained(config)
-        if network is None:
-            return train_detector(samples, config.for_method("cascade"))
-        return fine_tune(samples, network, config)
-
-    @classmethod
-    def train_from_motion(cls, flight: UnlabelledFlight, config: CnnConfig) -> Detector:
-        """The network, self-trained; a cascade where it is not for cars of this length, or few vehicles move.
-
-        A cascade is not tried first, as it was: on five flights of five its appearance alone was not sufficient, and to
-        find that out took two thirds of the time.
-        """
-        network = _pretrained(config)
-        if network is not None and config.motion_channel != "never" and flight.labels.vehicles >= _MIN_VEHICLES:
-            trained = self_train_from_motion(
-                flight.samples(_FRAMES),
-                network,
-                flight.bursts(),
-                flight.background.median,
-                config,
-                max_interval_s=flight.max_interval_s,
+        """Fine-tune the base, or the pre-trained network."""
+        pretrained = shipped_detector() if base is None else base
+        if not isinstance(pretrained, CnnDetector):
+            raise InputError(
+                f"found a detector of method {pretrained.method} to continue, expected one of method cnn; "
+                "leave --continue out"
             )
-            if trained is not None:
-                return trained
-        cascade = config.for_method("cascade")
-        assert isinstance(cascade, CascadeConfig)
-        return CascadeDetector.train_from_motion(flight, cascade)
-
-
-def _pretrained(config: CnnConfig) -> CnnDetector | None:
-    """The network that ships, where it was trained on cars of the configured length."""
-    shipped = shipped_detector()
-    assert isinstance(shipped, CnnDetector)
-    return shipped if shipped.record.working_car_length_px == config.working_car_length_px else None
+        return fine_tune(samples, pretrained, config)
 
 
 DETECTOR = CnnDetector

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from schemas.arrays import Float32Array, Mask
+from schemas.arrays import Mask
 from schemas.detector import CnnConfig, CnnRecord, PrecisionRecallCurve
-from velfield.detection.cascade.classifier import nms_oriented
 from velfield.detection.cnn.dataset import PatchDataset
 from velfield.detection.cnn.model import NO_TTA, detect_cars, predict_heatmap
 from velfield.detection.cnn.network import Network, network_to_record
@@ -28,6 +27,7 @@ from velfield.detection.evaluation import (
     precision_recall_curve,
     spatial_fold,
 )
+from velfield.detection.nms import nms_oriented
 from velfield.detection.orientation import fill_missing_orientation
 from velfield.detection.samples import LabelledImage, in_region, restrict_to_region
 from velfield.parallel import parallel_map, usable_processors
@@ -86,22 +86,6 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: "CnnDetector", confi
             update={"attribution": pretrained.record.attribution, "tta_range": pretrained.record.tta_range}
         )
     )
-
-
-def fine_tune_interpolated(
-    samples: Sequence[LabelledImage], pretrained: "CnnDetector", config: CnnConfig, *, fraction: float
-) -> Network:
-    """Fine-tune, then interpolate between the weights before (0) and after (1): WiSE-FT (Wortsman et al. 2022)."""
-    before = pretrained.network
-    masked = parallel_map(lambda sample: _mask_unlabelled_positives(sample, before), samples)
-    after, _ = _fine_tune_fold(masked, before, config, None)
-
-    def interpolate(old: Float32Array, new: Float32Array) -> Float32Array:
-        return old + np.float32(fraction) * (new - old)
-
-    weights = {name: interpolate(old, after.weights[name]) for name, old in before.weights.items()}
-    biases = {name: interpolate(old, after.biases[name]) for name, old in before.biases.items()}
-    return Network(weights, biases, before.topology)
 
 
 def select_threshold(

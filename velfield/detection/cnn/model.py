@@ -18,10 +18,8 @@ import numpy as np
 from numba import njit
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
-from schemas.detector import MotionRecord
 from velfield.detection.cnn.network import STRIDE, Network
 from velfield.detection.cnn.quantization import BlockPredict
-from velfield.detection.orientation import sample_nearest
 
 _TILE_PX, HALO_PX = 2048, 64
 """Larger images are processed in tiles, each with a halo wider than the reach of the receptive field."""
@@ -237,24 +235,6 @@ def detect_cars(
     axis = np.mod(0.5 * np.arctan2(vector[:, 1], vector[:, 0]), np.pi)
     detections = np.column_stack([xy, axis, score - SCORE_OFFSET, 0.5 * np.sqrt(-2 * np.log(resultant))])
     return detections[are_mostly_visible(detections, image.shape, valid)]
-
-
-def background_difference_at(
-    image: GreyImage, background: GreyImage, xy: FloatArray, car_length_px: float
-) -> FloatArray:
-    """Mean absolute difference of a frame to the background around (n, 2) positions, grey levels.
-
-    The mean is weighted by a Gaussian with a standard deviation of a fifth of a car's length.
-    """
-    difference = cv2.absdiff(image, background).astype(np.float32)
-    return sample_nearest(cv2.GaussianBlur(difference, (0, 0), car_length_px / 5), xy)
-
-
-def motion_score_bonus(motion: MotionRecord, difference: FloatArray) -> FloatArray:
-    """Score added to detections by their difference to the background: a linear ramp, clipped at both ends."""
-    ramp = motion.bonus_ramp_end - motion.bonus_ramp_start
-    fraction = (difference - motion.bonus_ramp_start) / ramp
-    return motion.max_score_bonus * np.clip(fraction, 0.0, 1.0)
 
 
 def _predict_rotated_crops(

@@ -153,7 +153,6 @@ class OnnxDetector(Detector):
         self,
         image: GreyImage,
         valid: Mask | None = None,
-        background: GreyImage | None = None,
         *,
         threshold: float | None = None,
     ) -> Detections:

@@ -32,7 +32,6 @@ class PaperDetector(Detector):
         self,
         image: GreyImage,
         valid: Mask | None = None,
-        background: GreyImage | None = None,
         *,
         threshold: float | None = None,
     ) -> Detections:
@@ -56,7 +55,7 @@ class PaperDetector(Detector):
         """Train from scratch: the paper does not continue a detector."""
         if base is not None:
             raise InputError(
-                f"found a detector of method {base.method} to continue, expected one of method cnn or cascade: the "
+                f"found a detector of method {base.method} to continue, expected one of method cnn: the "
                 "paper's is trained from scratch; leave --continue out"
             )
         return cls(train_paper(samples, config))

@@ -9,12 +9,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray, GreyImage, Mask, Points
+from schemas.arrays import FloatArray, Mask, Points
 from schemas.tables import DETECTION_COLUMNS
 from velfield.detection.cnn.network import use_device
 from velfield.detection.detect import FrameDetections, SearchedFrame, attach_crops, search_frame
@@ -22,7 +21,7 @@ from velfield.detection.detector import Detections, Detector, concatenate, load_
 from velfield.detection.orientation import CAR_ASPECT, axial_difference, fill_missing_orientation
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
-from velfield.pipeline.stages.rectified_frames import Window, WorkingFrame, WorkingGrid, read_background
+from velfield.pipeline.stages.rectified_frames import Window, WorkingFrame, WorkingGrid
 from velfield.pipeline.stages.registration import external_boxes, usable_frames
 from velfield.registration.transforms import FrameMap
 from velfield.run.frame_transforms import read_working
@@ -109,7 +108,7 @@ def detect_block(plan: Plan, frames: range) -> BlockDetections:
     working = WorkingGrid.open(plan, record.scale)
     times_s = open_frames(plan.layout.frames).column("time_s")
     usable = usable_frames(plan)
-    search = _searcher(plan, working, usable, has_background=record.has_background)
+    search = _searcher(plan, working, usable)
     parts = []
     for frame in frames:
         found = search(frame) if usable[frame] else None
@@ -127,9 +126,7 @@ def _supported(working: WorkingGrid, found: "_Found", frame: int) -> Mask:
     return np.asarray(np.isfinite(working.maps.position_sd_px(frame, raw)))
 
 
-def _searcher(
-    plan: Plan, working: WorkingGrid, usable: Mask, *, has_background: bool
-) -> "Callable[[int], _Found | None]":
+def _searcher(plan: Plan, working: WorkingGrid, usable: Mask) -> "Callable[[int], _Found | None]":
     """What gives the cars of a frame: given boxes, a detector of raw frames, or one of the working grid."""
     if plan.job.inputs.detections:
         table = external_boxes(plan)
@@ -137,7 +134,7 @@ def _searcher(
     use_device(plan.config.work.device)
     detector = _detector(plan.layout.detector, plan.keys["detector"])
     if not detector.reads_raw_frames:
-        return _Search(plan, working, usable, detector, has_background=has_background).detect
+        return _Search(plan, working, usable, detector).detect
     store, threshold = open_frames(plan.layout.frames), plan.config.detection.threshold
 
     def search(frame: int) -> "_Found | None":
@@ -201,10 +198,8 @@ class _Search:
     Groups are counted from the start of the flight, so that results are the same however it is cut into units.
     """
 
-    def __init__(
-        self, plan: Plan, working: WorkingGrid, usable: Mask, detector: Detector, *, has_background: bool
-    ) -> None:
-        self._plan, self._working, self._has_background = plan, working, has_background
+    def __init__(self, plan: Plan, working: WorkingGrid, usable: Mask, detector: Detector) -> None:
+        self._plan, self._working = plan, working
         self._detector = detector
         self._usable = usable
         self._group, self._first = range(0), -1
@@ -249,7 +244,6 @@ class _Search:
         searched = search_frame(
             self._detector,
             image,
-            _background_of(self._plan, rectified) if self._has_background else None,
             reference=reference,
             threshold=self._plan.config.detection.threshold,
         )
@@ -259,23 +253,6 @@ class _Search:
 @lru_cache(maxsize=2)
 def _detector(path: Path, _key: str) -> Detector:
     return load_detector(path)
-
-
-@lru_cache(maxsize=2)
-def _background(plan_root: Path, _key: str) -> GreyImage:
-    from velfield.run.layout import RunLayout
-
-    return read_background(RunLayout(plan_root)).median
-
-
-def _background_of(plan: Plan, rectified: WorkingFrame) -> GreyImage:
-    """The background in a frame's window, whose corner is not aligned with the pixels of the whole working grid."""
-    whole = _background(plan.layout.root, plan.keys["detector"])
-    shift = np.array(rectified.window[:2]) * rectified.scale
-    matrix = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]]])
-    size = (rectified.image.shape[1], rectified.image.shape[0])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpAffine(whole, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
 _NO_CROPS: dict[str, NDArray[Any]] = {

@@ -1,11 +1,9 @@
 """Stage `detector`: loads or trains the detector of a flight, and sets the scale of the working grid.
 
 The detector comes from, in this order: other boxes (`--detections`, none is needed), a file (`--detector`), fine-tuning
-or training on the given labels (`--labels`), or self-training on vehicles that move. Where too little moves, the
-shipped pre-trained detector is used.
+or training on the given labels (`--labels`), or the shipped weights as they are.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,16 +11,13 @@ import numpy as np
 import pandas as pd
 
 from schemas.arrays import GreyImage
+from schemas.detector import CnnConfig
 from schemas.records import WorkingRecord
 from velfield.analysis.vehicle_scale import CAR_LENGTH_M
 from velfield.detection.cnn.network import use_device
-from velfield.detection.detector import Detector, detector_class, load_detector, shipped_detector, train_detector
-from velfield.detection.motion.difference import MotionBackground, MotionFrame, motion_background
-from velfield.detection.motion.labels import MotionLabels, choose_frames, labels_from_motion, working_scale
-from velfield.detection.scale_search import contradict_motion
-from velfield.detection.unlabelled import UnlabelledFlight
+from velfield.detection.detector import Detector, load_detector, shipped_detector, train_detector
+from velfield.detection.scale_search import working_scale
 from velfield.errors import InputError
-from velfield.parallel import count_steps, parallel_map
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.car_size import search_scale
@@ -34,7 +29,7 @@ from velfield.pipeline.stages.labels import (
     labels_of_run,
     median_car_length_raw_px,
 )
-from velfield.pipeline.stages.rectified_frames import WorkingGrid, write_background
+from velfield.pipeline.stages.rectified_frames import WorkingGrid
 from velfield.pipeline.stages.registration import external_boxes, usable_frames
 from velfield.run.commits import write_atomically
 from velfield.run.frame_transforms import read_first_grid
@@ -48,7 +43,6 @@ _MIN_FRAMES_WITH_BOXES = 0.5
 
 _TRAINED = {
     "labels": "trained on labelled cars",
-    "motion": "trained on what moves: it finds fewer cars that stand; label one frame (--labels) where queues matter",
     "shipped": "as it ships",
 }
 
@@ -62,15 +56,14 @@ def make_detector(plan: Plan) -> StageResult:
         return _from_file(plan)
     if plan.job.inputs.labels:
         return _from_labels(plan)
-    return _from_motion(plan)
+    return _shipped(plan)
 
 
 def _from_file(plan: Plan) -> StageResult:
-    """Load a detector file; one that uses the difference to the background gets that of this flight."""
+    """Load a detector file."""
     detector = load_detector(Path(plan.job.inputs.detector or ""))
     scale = _scale_of_boxes(plan, detector) if detector.reads_raw_frames else _known_scale(plan)
-    background = motion_background(_motion_frames(plan, scale)) if detector.uses_background else None
-    return _finish(plan, detector, scale, "file", background=background)
+    return _finish(plan, detector, scale, "file")
 
 
 def _scale_of_boxes(plan: Plan, detector: Detector) -> float:
@@ -160,84 +153,19 @@ def _from_labels(plan: Plan) -> StageResult:
     return replace(outcome, notes=[*labels.notes, *outcome.notes], warnings=[*outcome.warnings, *found])
 
 
-def _from_motion(plan: Plan) -> StageResult:
-    """Train on vehicles that move; without ``--gsd-m`` a car's length is estimated from them first.
-
-    What the shipped detector takes for cars must be of that length: from an aeroplane roofs move too, by parallax.
-    """
-    known = _scale_of_gsd(plan)
-    scale = known or 1.0
-    frames = _motion_frames(plan, scale)
-    background = motion_background(frames)
-    length_px = plan.config.detection.working_car_length_px
-    max_interval_s = plan.config.tracking.max_interval_s
-    labels = labels_from_motion(
-        frames, background, car_length_px=length_px if known else None, max_interval_s=max_interval_s
-    )
-    by_appearance, contradicted = None, []
-    if known is None and labels.usable:
-        scale = working_scale(plan.config.detection, None, labels, labels_scale=scale)
-        by_appearance = search_scale(plan, shipped_detector())
-        contradicted = contradict_motion(scale, by_appearance, length_px)
-        if by_appearance is not None and contradicted:
-            scale = by_appearance
-        frames = _motion_frames(plan, scale)
-        background = motion_background(frames)
-        labels = labels_from_motion(frames, background, car_length_px=length_px, max_interval_s=max_interval_s)
-    if not labels.usable:
-        return _without_labels(plan, known, labels, by_appearance, contradicted)
-    flight = UnlabelledFlight(frames, labels, background, max_interval_s)
+def _shipped(plan: Plan) -> StageResult:
+    """Use the shipped detector as it is, at the scale of ``--gsd-m``, else at the one at which it finds cars."""
     config = plan.config.detection
-    detector = detector_class(config.method).train_from_motion(flight, config)
-    outcome = _finish(
-        plan,
-        detector,
-        scale,
-        "motion",
-        count=labels.count,
-        motion=labels,
-        background=background,
-        car_length_m=config.car_length_m if contradicted else CAR_LENGTH_M,
-    )
-    return replace(outcome, warnings=[*outcome.warnings, *contradicted, *labels.warnings])
-
-
-def _without_labels(
-    plan: Plan,
-    scale: float | None,
-    labels: MotionLabels,
-    by_appearance: float | None = None,
-    contradicted: Sequence[str] = (),
-) -> StageResult:
-    """Neither given labels nor enough vehicles that move: use the shipped detector, with a warning.
-
-    It needs a car's size: ``scale``, else ``by_appearance``, else it is looked for. ``contradicted``: warnings so far.
-    """
-    reason, detector = "; ".join(labels.warnings), shipped_detector()
-    found = scale or by_appearance or search_scale(plan, detector)
-    if found is None:
-        raise InputError(f"{reason}; or give --gsd-m, so that the shipped detector can be used")
-    outcome = _finish(plan, detector, found, "shipped", motion=labels, car_length_m=plan.config.detection.car_length_m)
-    used = "The shipped detector is used" + ("" if scale else ", at the scale at which it finds cars of their size")
-    return replace(outcome, warnings=[*outcome.warnings, *contradicted, f"{reason}. {used}"])
-
-
-def _motion_frames(plan: Plan, scale: float) -> list[MotionFrame]:
-    """Frames to label by motion, whole, on the working grid."""
-    times_s = open_frames(plan.layout.frames).column("time_s")
-    usable = np.flatnonzero(usable_frames(plan))
-    if len(usable) < 3:
-        raise InputError(f"{len(usable)} frames are registered, 3 or more needed; see the reasons above")
-    chosen = [int(frame) for frame in usable[choose_frames(times_s[usable])]]
-    working = WorkingGrid.open(plan, scale)
-    count_steps(0, announced=len(chosen))
-
-    def rectify(frame: int) -> MotionFrame | None:
-        rectified = working.frame(frame, working.whole)
-        count_steps(1)
-        return MotionFrame(rectified.image, rectified.valid, float(times_s[frame])) if rectified is not None else None
-
-    return [frame for frame in parallel_map(rectify, chosen) if frame is not None]
+    if config.method != CnnConfig.model_fields["method"].default:
+        raise InputError(f"detection.method={config.method} needs labelled cars: found none; give --labels")
+    detector = shipped_detector()
+    scale = _scale_of_gsd(plan) or search_scale(plan, detector)
+    if scale is None:
+        raise InputError(
+            "the size of a car is not known: the detector finds cars at no scale of the image, or at several; give "
+            "--gsd-m (metres a base pixel), or label the cars of one frame (--labels)"
+        )
+    return _finish(plan, detector, scale, "shipped", car_length_m=config.car_length_m)
 
 
 def _finish(
@@ -247,11 +175,9 @@ def _finish(
     training_source: str,
     *,
     count: int = 0,
-    motion: MotionLabels | None = None,
-    background: MotionBackground | None = None,
     car_length_m: float = CAR_LENGTH_M,
 ) -> StageResult:
-    """Write the detector, the working grid, and the background where the detector uses it.
+    """Write the detector and the working grid.
 
     ``scale``: working px a base px; None: the size of a car is not known, and working px are base px. ``car_length_m``:
     length of the cars that it makes `working_car_length_px` long.
@@ -269,24 +195,13 @@ def _finish(
         given = Path(plan.job.inputs.detector or "").name
         notes.append(f"detector: {detector.method}, {_TRAINED.get(training_source, f'of the file {given}')}")
         notes += detector.notes
-    if background is not None and detector is not None and detector.uses_background:
-        write_background(layout, background)
-        outputs.append(layout.background)
-    if motion is not None and training_source == "motion":
-        notes.append(
-            f"{motion.count} labels of {motion.vehicles} vehicles from motion: estimated precision "
-            f"{motion.precision_estimate:.0%}, {motion.axial_motion_fraction:.0%} of objects move along their axis"
-        )
     by_vehicles = None if _scale_of_gsd(plan) is not None else scale
     car_px = plan.config.detection.working_car_length_px
     record = WorkingRecord(
         scale=scale or 1.0,
         vehicle_gsd_m=None if by_vehicles is None else car_length_m * by_vehicles / car_px,
         training_source=training_source,
-        has_background=layout.background in outputs,
         labels=count,
-        label_precision_estimate=None if motion is None else motion.precision_estimate,
-        axial_motion_fraction=None if motion is None else motion.axial_motion_fraction,
     )
     write_atomically(layout.working, record.model_dump_json(indent=1).encode())
     advance("detector")

@@ -133,9 +133,7 @@ def rebase_image(plan: Plan, rebase: Rebase) -> StageResult:
     outputs = write_given_image(layout, given)
     grid = _mapped_grid(read_grid(old), given, record)
     working = read_working(old)
-    rescaled = WorkingRecord.model_validate(
-        working.model_dump() | {"scale": working.scale / record.scale, "has_background": False}
-    )
+    rescaled = WorkingRecord.model_validate(working.model_dump() | {"scale": working.scale / record.scale})
     for path, model in ((layout.rebased, record), (layout.grid, grid), (layout.working, rescaled)):
         write_atomically(path, model.model_dump_json(indent=1).encode())
         outputs.append(path)

@@ -1,6 +1,5 @@
 """Frames on the working grid: the base image's, scaled so that a car is about 8 x 16 px whatever the footage."""
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -8,15 +7,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.arrays import Float32Array, FloatArray
 from schemas.records import GridRecord
-from velfield.detection.motion.difference import MotionBackground
 from velfield.pipeline.plan import Plan
 from velfield.registration.transforms import FrameMap
 from velfield.registration.warp import Rectification, footprint, warp_to_base
-from velfield.run.commits import write_atomically
 from velfield.run.frame_transforms import FrameTransforms, read_grid
-from velfield.run.layout import RunLayout
 from velfield.run.stores import FrameStore, open_frames
 
 Window = tuple[int, int, int, int]
@@ -114,62 +109,3 @@ class WorkingGrid:
         left, top = max(0, int(np.floor(x0))), max(0, int(np.floor(y0)))
         right, bottom = min(self.grid.width_px, int(np.ceil(x1)) + 1), min(self.grid.height_px, int(np.ceil(y1)) + 1)
         return (left, top, right - left, bottom - top) if right > left and bottom > top else None
-
-
-@dataclass(frozen=True)
-class FrameLook:
-    """Frames of a run about positions, at half the working grid's resolution.
-
-    ``scale``, px a base px; ``half``, px from the middle of an image to its border.
-    """
-
-    frames: FrameStore
-    maps: FrameTransforms
-    scale: float
-    half: int
-
-    @classmethod
-    def open(cls, plan: Plan, working_scale: float, metres: float, half_m: float) -> "FrameLook":
-        """The frames of a plan's run folder; ``metres`` a base px, ``half_m`` from the middle to the border."""
-        scale = working_scale / 2
-        half = int(np.ceil(half_m / metres * scale))
-        return cls(open_frames(plan.layout.frames), FrameTransforms.open(plan.layout, plan.config), scale, half)
-
-    def __call__(self, frame: int, xy_px: FloatArray) -> Float32Array:
-        """A frame about positions (k, 2), base px: (k, n, n) grey levels, NaN outside the frame."""
-        size = 2 * self.half + 1
-        images = np.full((len(xy_px), size, size), np.nan, np.float32)
-        transform = self.maps.transform(frame)
-        if transform is None:
-            return images
-        raw, reach = self.frames.read(frame), int(np.ceil((self.half + 2) / self.scale))
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        for k, (x, y) in enumerate(xy_px):
-            window = (int(x) - reach, int(y) - reach, 2 * reach + 1, 2 * reach + 1)
-            image, valid = warp_to_base(raw, transform, window=window, scale=self.scale)
-            part = image.astype(np.float32)
-            part[~valid] = np.nan
-            # The window begins at a whole base px: what is left is shifted, so that the position is in the middle.
-            left, top = WorkingFrame(image, valid, window, self.scale).to_work(xy_px[k : k + 1])[0] - self.half
-            images[k] = cv2.warpAffine(part, np.array([[1.0, 0.0, left], [0.0, 1.0, top]]), (size, size), flags=flags)
-        return images
-
-
-def write_background(layout: RunLayout, background: MotionBackground) -> None:
-    """Write ``base/background.npz``."""
-    buffer = io.BytesIO()
-    np.savez_compressed(
-        buffer,
-        allow_pickle=False,
-        median=background.median,
-        low=background.low,
-        high=background.high,
-        valid=background.valid,
-    )
-    write_atomically(layout.background, buffer.getvalue())
-
-
-def read_background(layout: RunLayout) -> MotionBackground:
-    """Read ``base/background.npz``."""
-    with np.load(io.BytesIO(layout.background.read_bytes()), allow_pickle=False) as file:
-        return MotionBackground(file["median"], file["low"], file["high"], file["valid"])

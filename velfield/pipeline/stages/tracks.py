@@ -14,7 +14,6 @@ from schemas.tables import DETECTION_COLUMNS, DIMENSION_COLUMNS, JOIN_COLUMNS, T
 from velfield.parallel import parallel_map, usable_processors
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
-from velfield.pipeline.stages.rectified_frames import FrameLook
 from velfield.pipeline.stages.registration import usable_frames
 from velfield.pipeline.stages.tracklets import (
     UnitDetections,
@@ -31,16 +30,12 @@ from velfield.run.layout import RunLayout
 from velfield.run.stores import open_frames
 from velfield.run.tables import empty_table, read_arrays, read_tables, write_table, write_tracks
 from velfield.tracking.association import LinkedTriples, tracklet_table, window_frames
-from velfield.tracking.casters import HALF_WINDOW_M, MIN_DRIVEN_M, Caster, find_casters, keeps_direction
 from velfield.tracking.dimensions import (
     STRIP_SHAPE,
     direction_of_axes,
     looks,
-    may_be_shadows,
     measure,
     sample_tracks,
-    shade_moments,
-    shadow_direction,
 )
 from velfield.tracking.gates import Limits, triples_pass
 from velfield.tracking.join_costs import GapLimits, TrackEnds
@@ -93,19 +88,9 @@ def chain_tracks(plan: Plan) -> StageResult:
     positions = _without(positions, doubles)
     images = images_of_tracks(strips, found.tracks)
     del strips
-    casters = find_shadows(plan, images, positions, gsd_m)
-    # Of a caster that has a track the shadow needs none; where that of a bent track is follows from no offset.
-    dropped = [
-        track
-        for track, caster in casters.items()
-        if caster.tracked or not keeps_direction(positions[positions["track_id"] == track], gsd_m)
-    ]
-    left_out = np.union1d(doubles, np.array(dropped, np.int64))
-    offsets_px = {track: caster.offset_m / gsd_m for track, caster in casters.items() if track not in dropped}
-    positions = _move_tracks(_without(positions, left_out), offsets_px, [("x_px", "y_px")])
     triples = find_triples(positions, flight, plan.config.tracking.max_interval_s)
     track = found.tracks[chain]
-    output = _Output(plan, first_frame, track, positions, flight, triples, np.unique(triples.ids), left_out, offsets_px)
+    output = _Output(plan, first_frame, track, positions, flight, triples, np.unique(triples.ids), doubles)
     count = min(usable_processors(), _AT_ONCE, len(plan.units))
     runs = np.array_split(np.arange(len(plan.units)), max(count, 1))
     parts = parallel_map(output.write, [run for run in runs if len(run)])
@@ -113,51 +98,21 @@ def chain_tracks(plan: Plan) -> StageResult:
     for folder in (layout.tracks, layout.track_positions):
         for stale in set(folder.glob("unit-*.parquet")) - set(written):
             stale.unlink()  # of an earlier plan with more units
-    measured = _without(measure_tracks(images), np.array(list(offsets_px), np.int64))  # of shadows
     for path, table, columns in (
-        (layout.dimensions, measured, DIMENSION_COLUMNS),
+        (layout.dimensions, measure_tracks(images), DIMENSION_COLUMNS),
         (layout.joins, found.joins, JOIN_COLUMNS),
     ):
-        write_table(path, _without(table, left_out), columns)
+        write_table(path, _without(table, doubles), columns)
         written.append(path)
     advance("tracks")
     warnings = [] if len(track) else [explain_no_tracklets(plan)]
-    kept = track[~among(track, left_out)]
+    kept = track[~among(track, doubles)]
     counts = {
         "tracklets": float(len(kept) + recovered),
         "recovered": float(recovered),
         "tracks": float(len(np.unique(kept))),
-        "moved_from_shadows": float(len(offsets_px)),
     }
     return StageResult(written, counts, warnings=warnings)
-
-
-def find_shadows(plan: Plan, images: "TrackImages", positions: pd.DataFrame, metres: float) -> dict[int, Caster]:
-    """The tracks of shadows, and the vehicles that cast them; ``metres`` a base px.
-
-    Frames are read only where a track may be of a shadow: it is black, something bright is beside it, and the shadows
-    of the flight's other vehicles agree on a direction.
-    """
-    xy = positions.groupby("track_id")[["x_px", "y_px"]]
-    extent = pd.Series(np.hypot(*(xy.max() - xy.min()).to_numpy().T) * metres, index=xy.size().index)
-    moving = extent.reindex(images.ids).to_numpy() >= MIN_DRIVEN_M
-    suspects = images.ids[moving & may_be_shadows(images.strips)]
-    direction = shadow_direction(images.shade[moving], images.count[moving], images.strips[moving])
-    if direction is None or not len(suspects):
-        return {}
-    look = FrameLook.open(plan, images.scale, metres, HALF_WINDOW_M)
-    return find_casters(positions, suspects, direction, look, metres / look.scale, metres)
-
-
-def _move_tracks(
-    table: pd.DataFrame, offsets_px: Mapping[int, FloatArray], columns: list[tuple[str, str]]
-) -> pd.DataFrame:
-    """A table with ``track_id`` where some tracks are moved by offsets (2,) px; ``columns``, pairs of x and y."""
-    for track, offset in offsets_px.items():
-        rows = table["track_id"] == track
-        for names in columns:
-            table = table.assign(**{name: table[name] + rows * offset[axis] for axis, name in enumerate(names)})
-    return table
 
 
 def _rename_parts(track_id: IntArray, whole: pd.Series) -> IntArray:
@@ -359,9 +314,8 @@ def _window(plan: Plan, frames: range, flight: _Frames) -> range:
 class _Output:
     """Writes the tables of units.
 
-    ``first_frame`` and ``track`` (n,) of the tracklets of all units, by frame; ``positions`` by frame, moved, without
-    those that are ``left_out`` (k,); ``triples``, and the ``ids`` (m,) of their detections, ascending; ``offsets_px``,
-    by track, for the tracklets.
+    ``first_frame`` and ``track`` (n,) of the tracklets of all units, by frame; ``positions`` by frame, without
+    the ``doubles`` (k,); ``triples``, and the ``ids`` (m,) of their detections, ascending.
     """
 
     plan: Plan
@@ -371,8 +325,7 @@ class _Output:
     flight: _Frames
     triples: _Triples
     ids: IntArray
-    left_out: IntArray
-    offsets_px: Mapping[int, FloatArray]
+    doubles: IntArray
 
     def write(self, units: IntArray) -> tuple[list[Path], int]:
         """The files of consecutive units, and how many tracklets in them only tracks confirm.
@@ -396,12 +349,11 @@ class _Output:
             table = read_tables([path], TRACKLET_COLUMNS).assign(recovered=False)
             begin = np.searchsorted(self.first_frame, frames.start)
             table["track_id"] = self.track[begin : begin + len(table)]
-            table = _without(table, self.left_out)
+            table = _without(table, self.doubles)
             more = self._recovered(unit, kept)
             recovered = len(more)
             table = pd.concat([table, more.assign(recovered=True)], ignore_index=True)
             table = table.sort_values(["frame_0", "tracklet_id"], kind="stable", ignore_index=True)
-            table = _move_tracks(table, self.offsets_px, [(f"x_{k}_px", f"y_{k}_px") for k in range(3)])
             written.append(layout.tracks / path.name)
             write_tracks(written[-1], table)
         rows = slice(*np.searchsorted(self.positions["frame"].to_numpy(), [frames.start, frames.stop]))
@@ -430,14 +382,12 @@ def _gap_limits(plan: Plan) -> GapLimits:
 class StripSums:
     """Sums of the strips of each chain of tracklets, and their numbers: spread over it, at its start, at its end.
 
-    ``total`` (3, chains, 32, 10), ``count`` (3, chains); ``ids`` (chains,); ``scale``, working px a base px. ``shade``
-    (chains, 3), sums of `velfield.tracking.dimensions.shade_moments` over the detections that are spread over it.
+    ``total`` (3, chains, 32, 10), ``count`` (3, chains); ``ids`` (chains,); ``scale``, working px a base px.
     """
 
     ids: IntArray
     total: Float32Array
     count: IntArray
-    shade: FloatArray
     scale: float
 
     def mean(self, which: int) -> FloatArray:
@@ -452,29 +402,26 @@ def sum_strips(layout: RunLayout, tracklets: pd.DataFrame, units: int) -> StripS
     numbers, chains = chosen["detection_id"].to_numpy(), chosen["track"].to_numpy()
     heading, whys = chosen["heading_rad"].to_numpy(), [chosen[name].to_numpy() for name in ("spread", "start", "end")]
     total, count = np.zeros((3, len(ids), *STRIP_SHAPE), np.float32), np.zeros((3, len(ids)), np.int64)
-    shade, lock = np.zeros((len(ids), 3)), Lock()
+    lock = Lock()
 
     def add(path: Path) -> float:
         table = read_tables([path], DETECTION_COLUMNS, only=["detection_id", "orientation_rad"])
-        patches = read_arrays(path.with_suffix(".patches.npz"), only=["strips", "chips", "working_scale"])
+        patches = read_arrays(path.with_suffix(".patches.npz"), only=["strips", "working_scale"])
         here = np.flatnonzero(among(numbers, table["detection_id"].to_numpy()))
         at, chain = np.searchsorted(table["detection_id"].to_numpy(), numbers[here]), chains[here]
         strips = _along_headings(
             patches["strips"][at], table["orientation_rad"].to_numpy(np.float64)[at], heading[here]
         )
-        spread = whys[0][here]
-        moments = shade_moments(patches["chips"][at[spread]])
         with lock:  # whole numbers and halves: sums are exact, in whatever order
             for which, why in enumerate(whys):
                 rows = why[here]
                 np.add.at(total[which], chain[rows], strips[rows])
                 np.add.at(count[which], chain[rows], 1)
-            np.add.at(shade, chain[spread], moments)
         return float(patches["working_scale"])
 
     paths = [layout.unit_file(layout.detections, unit, ".parquet") for unit in range(units)]
     scales = parallel_map(add, [path for path in paths if path.exists()], at_most=_AT_ONCE)
-    return StripSums(ids, total, count, shade, scales[-1] if scales else 1.0)
+    return StripSums(ids, total, count, scales[-1] if scales else 1.0)
 
 
 def _along_headings(strips: ByteArray, axis_rad: FloatArray, heading_rad: FloatArray) -> Float32Array:
@@ -489,25 +436,24 @@ def _along_headings(strips: ByteArray, axis_rad: FloatArray, heading_rad: FloatA
 class TrackImages:
     """What is known of tracks without reading frames.
 
-    ``ids`` (tracks,); ``strips`` (tracks, 32, 10), the means of ``count`` (tracks,) strips; ``shade`` (tracks, 3), sums
-    of `velfield.tracking.dimensions.shade_moments` over as many chips; ``scale``, working px a base px.
+    ``ids`` (tracks,); ``strips`` (tracks, 32, 10), the means of ``count`` (tracks,) strips; ``scale``, working px
+    a base px.
     """
 
     ids: IntArray
     strips: FloatArray
     count: IntArray
-    shade: FloatArray
     scale: float
 
 
 def images_of_tracks(strips: StripSums, tracks: IntArray) -> TrackImages:
-    """Mean strips and shade by track, of all chains of each; ``tracks`` (chains,)."""
+    """Mean strips by track, of all chains of each; ``tracks`` (chains,)."""
     ids, track = np.unique(tracks, return_inverse=True)
-    total, count, shade = np.zeros((len(ids), *STRIP_SHAPE)), np.zeros(len(ids), np.int64), np.zeros((len(ids), 3))
-    for target, source in ((total, strips.total[0]), (count, strips.count[0]), (shade, strips.shade)):
+    total, count = np.zeros((len(ids), *STRIP_SHAPE)), np.zeros(len(ids), np.int64)
+    for target, source in ((total, strips.total[0]), (count, strips.count[0])):
         np.add.at(target, track, source)
     seen = np.flatnonzero(count)
-    return TrackImages(ids[seen], total[seen] / count[seen, None, None], count[seen], shade[seen], strips.scale)
+    return TrackImages(ids[seen], total[seen] / count[seen, None, None], count[seen], strips.scale)
 
 
 def measure_tracks(images: TrackImages) -> pd.DataFrame:

@@ -1,10 +1,10 @@
 """Images, poses and stumps in the layout of the kernels: packed channels, rotated patches, flat corner indices.
 
-The channels are those of integral channel features: grey, gradient along and across the car's axis, and, where there is
-one, the difference to the background. They are computed once for an image; a patch is sampled and rotated from them for
+The channels are those of integral channel features: grey, gradient along and across the axis of the vehicle.
+They are computed once for an image; a patch is sampled and rotated from them for
 each pose, and its integral images give the sum of any rectangle in four look-ups.
 
-Kernels of the cascade: rotated patches, their integral images, rectangle sums over them.
+Kernels: rotated patches, their integral images, rectangle sums over them.
 
 Sixteen patches are interleaved as the innermost axis of every array (structure of arrays), so that the corner of a
 rectangle is one vector load in place of a gather: four times as fast a pixel, and twenty times a rectangle, as patch
@@ -23,34 +23,34 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
+from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray
 from velfield.detection.boosting import BoostedStumps
-from velfield.detection.cascade.rounds import LANES, normalise, score_offsets, signed_corners, sum_rectangles
+from velfield.detection.long_vehicles.rounds import LANES, score_offsets, signed_corners
 
-CHANNELS = 4
-"""Grey, |gradient along|, |gradient across|, |frame - background|."""
+CHANNELS = 3
+"""Grey, |gradient along|, |gradient across|."""
 GRADIENT_ZERO = 512
 """Gradients are packed as unsigned ten-bit numbers, with this standing for zero."""
 
 
 @intrinsic
-def _integrate_row(_context, packed, difference, stride, poses, x, y, channels, out, first, plane):  # type: ignore[no-untyped-def]
+def _integrate_row(_context, packed, stride, poses, x, y, out, first, plane):  # type: ignore[no-untyped-def]
     """One row of the integral images of ``LANES`` patches, whose second pixel along begins at ``first`` of ``out``.
 
     ``x`` and ``y`` (LANES,) are the middle of the row, ``plane`` is the size of a channel. By numba each quantity of
     the row went through memory before the next: here all stays in registers, for half the time.
     """
-    signature = types.void(packed, difference, stride, poses, x, y, channels, out, first, plane)
+    signature = types.void(packed, stride, poses, x, y, out, first, plane)
 
     def generate(context: Any, build: Any, _signature: Any, arguments: Any) -> Any:
         row = _RowBuilder(build)
-        words, levels, turns, middle_x, middle_y, target = (
+        words, turns, middle_x, middle_y, target = (
             cgutils.create_struct_proxy(kind)(context, build, arguments[k])
-            for kind, k in ((packed, 0), (difference, 1), (poses, 3), (x, 4), (y, 5), (out, 7))
+            for kind, k in ((packed, 0), (poses, 2), (x, 3), (y, 4), (out, 5))
         )
         step_x, step_y, cosine, sine = (row.load(turns.data, row.number(k * LANES), _FLOAT) for k in (2, 3, 6, 7))
         middle_x, middle_y = (row.load(one.data, row.number(0), _FLOAT) for one in (middle_x, middle_y))
-        width = row.spread(build.trunc(arguments[2], _INT))
+        width = row.spread(build.trunc(arguments[1], _INT))
         # The integral images have one pixel more along than the patches.
         along = build.sub(build.extract_value(target.shape, 2), row.number(1))
         line = build.mul(build.extract_value(target.shape, 2), row.number(LANES))
@@ -58,7 +58,7 @@ def _integrate_row(_context, packed, difference, stride, poses, x, y, channels, 
         runs = [cgutils.alloca_once_value(build, ir.Constant(_INTS, [0] * LANES)) for _ in range(CHANNELS)]
 
         def add(channel: int, values: Any, at: Any) -> None:
-            place = build.add(at, build.mul(row.number(channel), arguments[9]))
+            place = build.add(at, build.mul(row.number(channel), arguments[7]))
             build.store(build.add(build.load(runs[channel]), values), runs[channel])
             above = row.load(target.data, build.sub(place, line), _INT)
             row.store(build.add(above, build.load(runs[channel])), target.data, place)
@@ -70,14 +70,12 @@ def _integrate_row(_context, packed, difference, stride, poses, x, y, channels, 
                 for middle, step in ((middle_x, step_x), (middle_y, step_y))
             )
             index = build.add(build.mul(line_number, width), column)
-            at = build.add(arguments[8], build.mul(pixel, row.number(LANES)))
+            at = build.add(arguments[6], build.mul(pixel, row.number(LANES)))
             word = row.gather(words.data, index, _INT)
             gx, gy = (row.gradient(word, shift) for shift in (8, 18))
             add(0, build.and_(word, row.integers(255)), at)
             add(1, row.truncated_size(build.fadd(build.fmul(gx, cosine), build.fmul(gy, sine))), at)
             add(2, row.truncated_size(build.fsub(build.fmul(gy, cosine), build.fmul(gx, sine))), at)
-            with build.if_then(build.icmp_signed(">", arguments[6], ir.Constant(arguments[6].type, 3))):
-                add(3, build.zext(row.gather(levels.data, index, ir.IntType(8)), _INTS), at)
         return context.get_dummy_value()
 
     return signature, generate
@@ -140,11 +138,11 @@ class _RowBuilder:
 
 
 @njit(cache=True, nogil=True)
-def fill_integrals(packed, difference, stride, poses, channels, out):  # type: ignore[no-untyped-def]
+def fill_integrals(packed, stride, poses, out):  # type: ignore[no-untyped-def]
     """Integral images of ``LANES`` rotated patches, sampled at the nearest pixel (as accurate as interpolated).
 
     ``packed`` (h * w,) uint32: grey, and the gradient in x and y. ``poses`` (8, LANES) float32: x, y of the centre plus
-    a half; the step in x and y along the patch, and across it; cosine and sine of the axis. ``out`` (channels,
+    a half; the step in x and y along the patch, and across it; cosine and sine of the axis. ``out`` (CHANNELS,
     across + 1, along + 1, LANES) int32 with zeros in its first row and column.
     """
     across, along = out.shape[1] - 1, out.shape[2] - 1
@@ -157,59 +155,24 @@ def fill_integrals(packed, difference, stride, poses, channels, out):  # type: i
             x[lane] = poses[0, lane] + v * poses[4, lane]
             y[lane] = poses[1, lane] + v * poses[5, lane]
         first = ((i + 1) * (along + 1) + 1) * LANES
-        _integrate_row(
-            packed, difference, np.int64(stride), poses, x, y, np.int64(channels), out, np.int64(first), np.int64(plane)
-        )
+        _integrate_row(packed, np.int64(stride), poses, x, y, out, np.int64(first), np.int64(plane))
 
 
 @njit(cache=True, nogil=True)
 def score_poses_kernel(  # type: ignore[no-untyped-def]
-    packed, difference, stride, poses, floor, window, window_area, corners, signs, starts, planes, areas, thresholds,
-    leaves, bases, rounds, integral, out,
+    packed, stride, poses, floor, window, window_area, corners, signs, starts, planes, areas, thresholds, leaves,
+    bases, rounds, integral, out,
 ):  # fmt: skip
     """Scores (groups, offsets, LANES) of poses (groups, 8, LANES); ``integral`` is scratch memory."""
     flat = integral.reshape(-1)
     plane = np.uint64(flat.size // integral.shape[0])
     signed = signed_corners(corners, signs)
     for g in range(len(poses)):
-        fill_integrals(packed, difference, stride, poses[g], integral.shape[0], integral)
+        fill_integrals(packed, stride, poses[g], integral)
         score_offsets(
             flat, window, window_area, plane, floor, signed, starts, planes, areas, thresholds, leaves, bases, rounds,
             out[g],
         )  # fmt: skip
-
-
-@njit(cache=True, nogil=True)
-def feature_values_kernel(  # type: ignore[no-untyped-def]
-    packed,
-    difference,
-    stride,
-    poses,
-    floor,
-    window,
-    window_area,
-    corners,
-    signs,
-    starts,
-    planes,
-    areas,
-    base,
-    integral,
-    out,
-):
-    """Values (features, groups, LANES) float32 of every feature at every pose, brightness and contrast normalised."""
-    flat = integral.reshape(-1)
-    plane = np.uint64(flat.size // integral.shape[0])
-    signed = signed_corners(corners, signs)
-    total = np.zeros(LANES, np.int32)
-    mean, contrast = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
-    for g in range(len(poses)):
-        fill_integrals(packed, difference, stride, poses[g], integral.shape[0], integral)
-        normalise(flat, window, window_area, plane, base, floor, total, mean, contrast)
-        for f in range(len(planes)):
-            sum_rectangles(flat, signed, starts[f], starts[f + 1], base + planes[f], total)
-            for lane in range(LANES):
-                out[f, g, lane] = (np.float32(total[lane]) - areas[f] * mean[lane]) / contrast[lane]
 
 
 FlatIndices = NDArray[np.uint64]
@@ -238,10 +201,6 @@ class PatchScale:
         return 4 * self.reach[0] * self.reach[1]
 
 
-FINE = PatchScale(1, (14, 11))
-COARSE = PatchScale(2, (10, 8))
-
-
 @dataclass(frozen=True)
 class FeatureImage:
     """An image, padded, its channels packed into words.
@@ -249,34 +208,19 @@ class FeatureImage:
     Attributes
     ----------
     words : (h * w,) uint32: grey and gradient of the padded image.
-    difference : (h * w,) uint8 |frame - background|; (1,) where there is none.
     stride : its width.
-    channels : 3, or 4 with the difference.
     """
 
     scale: PatchScale
     words: NDArray[np.uint32]
-    difference: GreyImage
     stride: int
-    channels: int
 
 
-def compute_features(image: GreyImage, background: GreyImage | None = None, scale: PatchScale = FINE) -> FeatureImage:
-    """Channels of an image (h, w) and, where there is one, of its difference to the background."""
-    return features_of_reduced(_reduce(image, scale), None if background is None else _reduce(background, scale), scale)
-
-
-def features_of_reduced(image: GreyImage, background: GreyImage | None, scale: PatchScale) -> FeatureImage:
-    """The same of images that have the scale's resolution already."""
-    grey, window = _smooth(image), np.ones((3, 3), np.uint8)
-    words = pack_words_kernel(grey)
-    difference = np.zeros(1, np.uint8)
-    if background is not None:
-        ground = _smooth(background)
-        # Outside the range within a pixel, not |grey - background|: half a pixel of jitter lights up every roof's edge.
-        low, high = cv2.erode(ground, window), cv2.dilate(ground, window)
-        difference = np.maximum(cv2.subtract(grey, high), cv2.subtract(low, grey))
-    return FeatureImage(scale, words.ravel(), difference.ravel(), grey.shape[1], 3 if background is None else 4)
+def features_of_reduced(image: GreyImage, scale: PatchScale) -> FeatureImage:
+    """Channels of an image (h, w) that has the scale's resolution already."""
+    padded = cv2.copyMakeBorder(image, PAD_PX, PAD_PX, PAD_PX, PAD_PX, cv2.BORDER_REPLICATE)
+    grey = np.asarray(cv2.GaussianBlur(padded, (0, 0), SMOOTHING_SIGMA_PX), np.uint8)
+    return FeatureImage(scale, pack_words_kernel(grey).ravel(), grey.shape[1])
 
 
 @njit(cache=True, nogil=True)
@@ -305,35 +249,12 @@ def pack_words_kernel(grey):  # type: ignore[no-untyped-def]
     return words
 
 
-def _reduce(image: GreyImage, scale: PatchScale) -> GreyImage:
-    height, width = image.shape
-    if scale.step == 1:
-        return image
-    image = np.pad(image, ((0, -height % scale.step), (0, -width % scale.step)), mode="edge")
-    size = image.shape[1] // scale.step, image.shape[0] // scale.step
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def _smooth(image: GreyImage) -> GreyImage:
-    padded = cv2.copyMakeBorder(image, PAD_PX, PAD_PX, PAD_PX, PAD_PX, cv2.BORDER_REPLICATE)
-    return np.asarray(cv2.GaussianBlur(padded, (0, 0), SMOOTHING_SIGMA_PX), np.uint8)
-
-
-def pack_poses(
-    xy: FloatArray,
-    angles: FloatArray,
-    scale: PatchScale,
-    *,
-    sizes: FloatArray | None = None,
-    mirrored: Mask | None = None,
-) -> Float32Array:
+def pack_poses(xy: FloatArray, angles: FloatArray, scale: PatchScale) -> Float32Array:
     """Poses (groups, 8, LANES) of positions (n, 2) and axes (n,); the last pose is repeated to fill the last group."""
     n = len(xy)
-    size = np.ones(n) if sizes is None else sizes
-    side = size if mirrored is None else np.where(mirrored, -size, size)
     c, s = np.cos(angles), np.sin(angles)
     x, y = ((xy[:, k] + 0.5) / scale.step + PAD_PX for k in (0, 1))
-    rows = np.stack([x, y, c * size, s * size, -s * side, c * side, c, s])
+    rows = np.stack([x, y, c, s, -s, c, c, s])
     filled = rows[:, np.minimum(np.arange(n + -n % LANES), n - 1)]
     return np.ascontiguousarray(filled.reshape(8, -1, LANES).transpose(1, 0, 2), np.float32)
 
@@ -344,22 +265,21 @@ class RotatedPatch:
 
     along: int
     across: int
-    channels: int
     scale: PatchScale
 
     @classmethod
-    def for_offsets(cls, offsets: IntArray, channels: int, scale: PatchScale) -> "RotatedPatch":
+    def for_offsets(cls, offsets: IntArray, scale: PatchScale) -> "RotatedPatch":
         """The smallest patch that holds the rectangles at all of these offsets (m, 2)."""
         reach = np.abs(offsets).max(axis=0) + scale.reach
-        return cls(2 * int(reach[0]), 2 * int(reach[1]), channels, scale)
+        return cls(2 * int(reach[0]), 2 * int(reach[1]), scale)
 
     def allocate(self) -> NDArray[np.int32]:
         """Integral images to be filled, zero in the first row and column."""
-        return np.zeros((self.channels, self.across + 1, self.along + 1, LANES), np.int32)
+        return np.zeros((CHANNELS, self.across + 1, self.along + 1, LANES), np.int32)
 
     def flat_index(self, x: IntArray, y: IntArray) -> IntArray:
         """Of (x, y), relative to the first corner."""
-        return (y * (self.along + 1) + x) * LANES
+        return np.asarray((y * (self.along + 1) + x) * LANES, np.int64)
 
     def centres(self, offsets: IntArray) -> FlatIndices:
         """Of the centre, displaced by offsets (m, 2)."""
@@ -396,19 +316,15 @@ def signed_grey_areas(table: NDArray[np.int32], starts: NDArray[np.int32], chann
 
 @dataclass(frozen=True, eq=False)
 class OffsetScorer:
-    """A classifier at some offsets from a pose, (m, 2) whole px along and across the axis, and what its kernel reads.
-
-    ``channels`` is that of the images.
-    """
+    """A classifier at offsets (m, 2), whole px along and across the axis of a pose, and what its kernel reads."""
 
     stumps: BoostedStumps
     offsets: IntArray
-    channels: int
     scale: PatchScale
 
     @cached_property
     def _patch(self) -> RotatedPatch:
-        return RotatedPatch.for_offsets(self.offsets, self.channels, self.scale)
+        return RotatedPatch.for_offsets(self.offsets, self.scale)
 
     @cached_property
     def _rectangles(self) -> tuple[FlatIndices, NDArray[np.int32], NDArray[np.int32], FlatIndices, Float32Array]:
@@ -429,7 +345,6 @@ class OffsetScorer:
         out = np.empty((len(poses), len(self.offsets), LANES), np.float32)
         score_poses_kernel(
             features.words,
-            features.difference,
             features.stride,
             poses,
             contrast_floor,
@@ -445,20 +360,3 @@ class OffsetScorer:
         )
         by_pose = out.transpose(0, 2, 1).reshape(-1, len(self.offsets))[: len(xy)]
         return np.asarray(by_pose / np.float32(np.sqrt(rounds)))
-
-
-def score_poses(
-    stumps: BoostedStumps,
-    features: FeatureImage,
-    xy: FloatArray,
-    angles: FloatArray,
-    offsets: IntArray,
-    *,
-    contrast_floor: float,
-    rounds: int | None = None,
-) -> Float32Array:
-    """Scores (n, offsets) of a classifier's first rounds, all by default, as of `OffsetScorer.scores`."""
-    n = len(stumps) if rounds is None else min(rounds, len(stumps))
-    channels = features.channels if np.any(stumps.channels[:n] == 3) else 3
-    scorer = OffsetScorer(stumps, offsets, channels, features.scale)
-    return scorer.scores(features, xy, angles, contrast_floor=contrast_floor, rounds=n)

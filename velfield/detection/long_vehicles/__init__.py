@@ -1,0 +1,1 @@
+"""The classifier of long vehicles: lorries and buses at their centre."""

@@ -1,1 +1,0 @@
-"""Training labels from motion: background difference, blobs, three-frame links, boxes."""
