@@ -128,7 +128,7 @@ def run(
         Ground sample distance, metres a base pixel. Default: by the base image's CRS, the drone's metadata or the
         lengths of the vehicles.
     labels
-        Labelled cars to train on (docs/detection.md#label-formats). Default: labels from motion.
+        Labelled cars to fine-tune the detector on (docs/detection.md#label-formats). Default: none.
     detector
         A trained detector file, or a YOLO-type ONNX model, instead of training.
     detections

@@ -169,7 +169,7 @@ def test_random_features_keep_to_their_rules(seed: int, max_rectangles: int, max
 
 def test_stumps_survive_the_record() -> None:
     rng = np.random.default_rng(2)
-    pool = draw_feature_pool(30, channels=4, sigma_xy_px=(6.0, 4.0), reach_xy_px=(14, 11), max_rectangles=3, rng=rng)
+    pool = draw_feature_pool(30, channels=3, sigma_xy_px=(6.0, 4.0), reach_xy_px=(14, 11), max_rectangles=3, rng=rng)
     chosen = rng.integers(30, size=10)
     thresholds, leaves = rng.normal(0, 1, 10).astype(np.float32), rng.normal(0, 1, (10, 2)).astype(np.float32)
     rounds = rounds_from_stumps(pool, boosting.StumpSelection(chosen, thresholds, leaves))

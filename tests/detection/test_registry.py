@@ -53,7 +53,6 @@ class ToyDetector(Detector):
         self,
         image: np.ndarray,
         valid: np.ndarray | None = None,
-        background: np.ndarray | None = None,
         *,
         threshold: float | None = None,
     ) -> Detections:

@@ -1,4 +1,4 @@
-"""The size of a car by the detector that ships: where too little moves to measure it, and to check what moves.
+"""The size of a car by the shipped detector, where neither scale nor labels are given.
 
 The network was trained on cars of one length in pixels. At the right scale of the image its scores are highest, and
 what it finds has a car's length and width; at others the network finds parts of things that look like cars, of any

@@ -226,10 +226,10 @@ STAGES: tuple[Stage, ...] = (
         new_base=NewBase.MAPPED,
         remap=f"{_STAGES}.rebase:rebase_georeference",
     ),
-    # Labels and training, from labelled frames or from what moves; or a given detector.
+    # The shipped detector, one that is fine-tuned on labelled frames, or a given one.
     Stage(
         name="detector",
-        version=23,
+        version=24,
         label="detector",
         lines=(
             Line("skipped: external detections", lambda counts: bool(counts) and "threshold" not in counts),
@@ -246,7 +246,7 @@ STAGES: tuple[Stage, ...] = (
     # Cars of each block, then one table with their crops.
     Stage(
         name="detections",
-        version=17,
+        version=18,
         label="detections",
         lines=(
             Line(

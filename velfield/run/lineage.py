@@ -142,7 +142,6 @@ def describe_detector(run: Run) -> str:
         return f"external detections, digest {run.record.inputs.detections}"
     how = {
         "labels": f"trained on {working.labels} labelled cars (digest of the labels {run.record.inputs.labels})",
-        "motion": f"self-trained on {working.labels} moving cars",
         "file": f"given as a file, digest {run.record.inputs.detector}",
         "shipped": "the shipped one",
     }[working.training_source]

@@ -4,9 +4,6 @@ A strip shows a vehicle whole, with its shadow, the road and its neighbours, at 
 (`velfield.detection.detect.oriented_strips`). A track's strips are averaged: the road that it passes blurs, the vehicle
 does not, and noise falls below the contrast of a black car and its shadow. A small network reads the mean of log length
 and log width and their standard deviations off it; it was trained on drawn vehicles (`tools/train_dimensions.py`).
-
-What a strip shows beside a black vehicle is evidence, too, that it may be a shadow; and the chips about bright vehicles
-show in which direction shadows lie.
 """
 
 from base64 import b64decode

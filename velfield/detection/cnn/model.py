@@ -6,8 +6,6 @@ pixel as (cos 2a, sin 2a); its layers are those of `velfield.detection.cnn.netwo
 Peaks of the heatmap are candidates at sub-pixel positions. Those between two probabilities that the detector file gives
 are scored again on two crops, one rotated to the predicted orientation and one across it, and the outputs are averaged
 (test-time augmentation). Non-maximum suppression is left to the caller.
-
-A detector adapted to a flight by self-training adds a score bonus where the frame differs from the background.
 """
 
 import math
@@ -188,9 +186,7 @@ NO_TTA = 1.0, 1.0
 """No test-time augmentation (TTA), as in the shipped detector: on unseen images it scored cars no better (F1 0.900 in
 place of 0.907 on the minsk clip), at three times the cost."""
 FULL_TTA = 0.0, 1.0
-"""TTA of all candidates, where the distribution of the scores counts: self-training compares that of
-stationary cars to that of moving ones, which it was trained on. Otherwise it found 0.16 of the stationary cars on a
-simulated flight in place of 0.69."""
+"""TTA of all candidates."""
 _CROP_PX = 48
 _CENTRE = _CROP_PX // (2 * STRIDE)
 """Row and column of the heatmap of a crop where the candidate's centre is."""

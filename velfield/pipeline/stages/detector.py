@@ -159,6 +159,7 @@ def _shipped(plan: Plan) -> StageResult:
     if config.method != CnnConfig.model_fields["method"].default:
         raise InputError(f"detection.method={config.method} needs labelled cars: found none; give --labels")
     detector = shipped_detector()
+    detector.check_car_length(config.working_car_length_px)
     scale = _scale_of_gsd(plan) or search_scale(plan, detector)
     if scale is None:
         raise InputError(

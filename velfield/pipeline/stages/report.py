@@ -26,7 +26,6 @@ from velfield.viewer.record import write_view_record
 
 _TRAINING_SOURCES = {
     "labels": "labelled cars",
-    "motion": "labels from motion",
     "file": "none: a detector file",
     "shipped": "none: the shipped detector",
     "detections": "none: external detections",
