@@ -6,10 +6,6 @@ from functools import partial
 from typing import TypeAlias
 
 import numpy as np
-
-from schemas.arrays import ByteArray, FloatArray
-from schemas.detector import DetectorConfig, LongVehicleRecord, Round
-from velfield.detection.boosting import BoostedStumps, draw_feature_pool
 from velfield.detection.cascade.classifier import (
     LONG,
     MIN_LENGTH_RATIO,
@@ -21,6 +17,10 @@ from velfield.detection.cascade.feature_image import FeatureImage, compute_featu
 from velfield.detection.cascade.feature_matrix import FeatureBinner, fit_feature_binner
 from velfield.detection.cascade.scenes import Poses, augment_poses
 from velfield.detection.cascade.training import CONTRAST_FLOOR
+
+from schemas.arrays import ByteArray, FloatArray
+from schemas.detector import DetectorConfig, LongVehicleRecord, Round
+from velfield.detection.boosting import BoostedStumps, draw_feature_pool
 from velfield.detection.samples import LabelledImage
 from velfield.parallel import parallel_map
 
