@@ -9,7 +9,7 @@ from pathlib import Path
 
 from schemas.records import CommitRecord, FlightRecord
 from velfield.errors import InputError
-from velfield.pipeline.stage import STAGE, STAGES, Cut
+from velfield.pipeline.stage import STAGE, Cut
 from velfield.pipeline.units import WHOLE
 from velfield.run.commits import ANALYSIS, PAGE, commit_path, digest_file, read_commit, read_commits
 from velfield.run.layout import RunLayout, remove_tree
@@ -40,7 +40,7 @@ class Damage:
 
 def verify_run(layout: RunLayout, record: FlightRecord) -> list[Damage]:
     """Read all that is committed and compare it with its digests; units that were never finished are listed too."""
-    stages = [stage.name for stage in STAGES]
+    stages = [stage for stage in STAGE if not record.keys or stage in record.keys]  # a run of given tracks has fewer
     by_stage = {stage: read_commits(layout, stage) for stage in stages}
     besides = [record for name in _BESIDES for record in read_commits(layout, name)]
     found = [damage for stage in (*stages, *_BESIDES) for damage in _damaged_records(layout, stage)]
