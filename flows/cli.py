@@ -81,7 +81,8 @@ def run(
     *more: Path,
     out: Path,
     tracks: Path | None = None,
-    unit: Literal["m", "px"] | None = None,
+    unit: Literal["m", "ft", "px", "deg"] | None = None,
+    y_axis: Literal["up", "down"] | None = None,
     base: Path | None = None,
     gsd_m: float | None = None,
     labels: Path | None = None,
@@ -120,7 +121,9 @@ def run(
         Tracks of another program instead of a video: CSV or Parquet (geo-trax, highD and others), or SUMO's FCD. Field,
         maps and analysis are made of them.
     unit
-        Of columns named x and y in `--tracks`.
+        Unit of the columns x and y in `--tracks`, where their names do not say it.
+    y_axis
+        Where y points in `--tracks`: up, as north in maps, or down, as in images.
     base
         Image whose pixels become the base pixels: GeoTIFF, PNG with world file, or plain.
         Default: built from the flight.
@@ -182,6 +185,7 @@ def run(
         "field.time_intervals": intervals,
         "work.device": device,
         "position_unit": unit,
+        "position_y_axis": y_axis,
     }
     resolved = resolve_config(preset=preset, file=config, settings=settings, overrides=overrides)
     if tracks is not None or source is None:

@@ -12,7 +12,8 @@ def analyse(
     out: Path | None = None,
     gsd_m: float | None = None,
     fps: float | None = None,
-    unit: Literal["m", "px"] | None = None,
+    unit: Literal["m", "ft", "px", "deg"] | None = None,
+    y_axis: Literal["up", "down"] | None = None,
     slice_s: float = 300.0,
     speed_unit: Literal["km/h", "mph"] = "km/h",
 ) -> int:
@@ -23,7 +24,7 @@ def analyse(
     run_folder
         The run folder.
     tracks
-        Tracks of another program instead: CSV or Parquet (geo-trax, highD and others), or SUMO's FCD.
+        Tracks of another program instead: CSV or Parquet (geo-trax, inD, NGSIM and others), or SUMO's FCD.
     out
         Folder for the answers from `--tracks`.
     gsd_m
@@ -31,7 +32,9 @@ def analyse(
     fps
         Frames a second of `--tracks`, where they have no times.
     unit
-        Of columns named x and y in `--tracks`.
+        Unit of the columns x and y in `--tracks`, where their names do not say it.
+    y_axis
+        Where y points in `--tracks`: up, as north in maps, or down, as in images.
     slice_s
         Counts by time are of slices so long, where the flight is longer than two.
     speed_unit
@@ -47,7 +50,9 @@ def analyse(
     elif out is None:
         raise InputError(f"found --tracks {tracks} and no folder for the answers; give --out")
     else:
-        lines = analyse_tracks(tracks, out, gsd_m=gsd_m, fps=fps, unit=unit, slice_s=slice_s, speed_unit=speed_unit)
+        lines = analyse_tracks(
+            tracks, out, gsd_m=gsd_m, fps=fps, unit=unit, y_axis=y_axis, slice_s=slice_s, speed_unit=speed_unit
+        )
     for line in lines:
         print(line, flush=True)
     return 0

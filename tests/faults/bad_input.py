@@ -202,7 +202,7 @@ def kinds(folder: Path) -> list[Kind]:
     from velfield.sources.source import probe
     from velfield.sources.telemetry.image_tags import read_image_telemetry
     from velfield.sources.telemetry.read import read_telemetry_file
-    from velfield.sources.trajectories import read_tracks
+    from velfield.sources.tracks.read import read_tracks
 
     frames = list(drifting(FRAMES, WIDTH, HEIGHT))
     names = write_images(folder / "frames", frames)

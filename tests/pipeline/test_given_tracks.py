@@ -17,8 +17,9 @@ from tests.analysis.test_traffic_analysis import crossroads, gather
 from tests.small_flight import digests
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import InputError
+from velfield.pipeline.given_tracks.load import load_tracks
 from velfield.pipeline.given_tracks.plan import list_track_stages, plan_tracks
-from velfield.pipeline.given_tracks.write import at_frames, read_given_tracks
+from velfield.pipeline.given_tracks.write import at_frames
 from velfield.pipeline.result import commit
 from velfield.pipeline.stage import resolve
 from velfield.pipeline.units import prepare_stage, stage_units
@@ -61,7 +62,8 @@ def write(form: str, path: Path) -> tuple[Path, dict[str, float | str]]:
             return path.with_suffix(".csv"), said
         case "geotrax":
             table = pd.DataFrame({"Vehicle_ID": t["vehicle_id"], "Timestamp": t["time_s"], "Frame_Number": t["frame"]})
-            table = table.assign(Ortho_X=t["x_m"], Ortho_Y=t["y_m"], Vehicle_Length=t["length_m"])
+            table = table.assign(Ortho_X=t["x_px"], Ortho_Y=t["y_px"], Local_X=t["x_m"], Local_Y=-t["y_m"])
+            table = table.assign(Vehicle_Length=t["length_m"], Vehicle_Width=1.8)
         case "highd":
             table = pd.DataFrame({"frame": t["frame"] + 1, "id": t["vehicle_id"], "time": t["time_s"]})
             table = table.assign(
@@ -208,9 +210,9 @@ def test_positions_are_interpolated_over_short_gaps_alone() -> None:
     ("text", "settings", "message"),
     [
         ("id,time,x_px,y_px\n1,0,1,1\n1,1,9,9\n1,2,9,9\n", {}, "--gsd-m"),
-        ("id,time,x_m,y_m\n1,0,1,1\n1,1,9e7,9\n1,2,9e7,9\n", {}, "too large a map"),
+        ("id,time,x_m,y_m\n1,0,1,1\n1,1,9,9\n1,2,19,9\n2,0,9e7,9\n", {}, "too large a map"),
         ("id,time,x_m,y_m\n1,0,1,1\n1,1,9,9\n", {}, "expected 3 or more"),
-        ("id,time,x_px,y_px\n1,0,-9,1\n1,1,9,9\n1,2,9,9\n", {"gsd_m": 0.2}, "none below 0"),
+        ("id,time,x_px,y_px\n1,0,-9,1\n1,1,39,9\n1,2,99,9\n", {"gsd_m": 0.2}, "none below 0"),
     ],
 )
 def test_bad_tracks_are_one_line(text: str, settings: dict[str, float], message: str, tmp_path: Path) -> None:
@@ -226,10 +228,10 @@ def test_bad_tracks_are_one_line(text: str, settings: dict[str, float], message:
 def test_pixels_of_another_image_are_refused(tmp_path: Path) -> None:
     import cv2
 
-    (tmp_path / "t.csv").write_text("id,time,x_px,y_px\n1,0,900,900\n1,1,901,900\n1,2,902,900\n")
+    (tmp_path / "t.csv").write_text("id,time,x_px,y_px\n1,0,900,900\n1,1,930,900\n1,2,960,900\n")
     cv2.imwrite(str(tmp_path / "base.png"), np.zeros((50, 60), np.uint8))
     with pytest.raises(InputError, match="0% of the positions within --base of 60 x 50 px"):
-        read_given_tracks(tmp_path / "t.csv", FlightConfig(gsd_m=0.2), base=tmp_path / "base.png")
+        load_tracks(tmp_path / "t.csv", FlightConfig(gsd_m=0.2), base=tmp_path / "base.png")
 
 
 def test_options_of_frames_are_refused(tmp_path: Path) -> None:

@@ -86,6 +86,7 @@ READERS: dict[str, tuple[str, ...]] = {
     "preset": (),
     "gsd_m": ("georeference",),
     "position_unit": (),  # part of the digest of given tracks
+    "position_y_axis": (),
     "frames": ("frames",),
     "lens": ("lens",),
     "base": ("base",),

@@ -4,13 +4,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from schemas.analysis import AnalysisColumn, AnalysisRecord, AnalysisTable, LanesRecord, QuestionRecord
 from schemas.arrays import GreyImage
 from schemas.export import SpeedUnit
+from schemas.flight import FlightConfig, FramesConfig
 from velfield.analysis.answers import explain_none, find_answers
 from velfield.analysis.movements.time_slices import SLICE_S
 from velfield.analysis.traffic_analysis import TrafficAnalysis
@@ -21,6 +21,7 @@ from velfield.pipeline.analysis.clips import Frames, unusual_clips
 from velfield.pipeline.analysis.lanes_record import lanes_geojson, lanes_record
 from velfield.pipeline.analysis.tables import all_tables
 from velfield.pipeline.analysis.workbook import EXTRA, can_write_workbook, workbook_bytes
+from velfield.pipeline.given_tracks.load import load_tracks
 from velfield.report.traffic.diagrams import traffic_diagrams
 from velfield.report.traffic.first_page import first_page
 from velfield.report.traffic.report import report_html, report_pdf
@@ -29,14 +30,11 @@ from velfield.run.flight_record import read_flight_record
 from velfield.run.layout import RunLayout, remove_tree, to_path
 from velfield.run.lock import locked
 from velfield.run.run import Run, open_run
-from velfield.sources.trajectories import read_tracks
-from velfield.tracking.smoothing import clean_tracks
+from velfield.sources.tracks.formats import Unit, YAxis
 
 TRACKS = "tracks"
 """The stage whose results are analysed."""
 MAX_LINES = 12
-_TRACKS_GSD_M = 0.1
-"""Base pixels of tracks given in metres."""
 
 
 def analyse_run(run_folder: Path, *, slice_s: float = SLICE_S, speed_unit: SpeedUnit = "km/h") -> Iterator[str]:
@@ -93,7 +91,8 @@ def analyse_tracks(
     *,
     gsd_m: float | None,
     fps: float | None,
-    unit: Literal["m", "px"] | None,
+    unit: Unit | None,
+    y_axis: YAxis | None,
     slice_s: float = SLICE_S,
     speed_unit: SpeedUnit = "km/h",
 ) -> Iterator[str]:
@@ -102,34 +101,21 @@ def analyse_tracks(
     Raises
     ------
     InputError
-        The file holds no tracks, or pixels without a ground sample distance.
+        As `load_tracks`.
     """
     _check_slice(slice_s)
-    table = read_tracks(path, fps=fps, unit=unit)
-    if "x_m" in table:
-        gsd = gsd_m or _TRACKS_GSD_M
-        xy_m = table[["x_m", "y_m"]].to_numpy(np.float64)
-        xy_m = xy_m - xy_m.min(axis=0)
-    else:
-        if gsd_m is None:
-            raise InputError(f"{path}: found positions in pixels, expected their size; give --gsd-m, metres a pixel")
-        gsd = gsd_m
-        xy_m = table[["x_px", "y_px"]].to_numpy(np.float64) * gsd
+    config = FlightConfig(gsd_m=gsd_m, position_unit=unit, position_y_axis=y_axis, frames=FramesConfig(fps=fps))
+    given = load_tracks(path, config)
+    yield from (f"tracks      {note}" for note in given.notes)
+    table = given.table
     ids, frames = table["track_id"].to_numpy(np.int64), table["frame"].to_numpy(np.int64)
     time_s = table["time_s"].to_numpy(np.float64)
-    clean = clean_tracks(ids, time_s, xy_m)
-    yield from (f"{'errors':11} {note}" for note in clean.notes)
-    made = make_trajectories(clean.track, frames, time_s, clean.xy_m, gsd_m=gsd, position_sd_m=clean.position_sd_m)
+    made = make_trajectories(ids, frames, time_s, given.xy_m, gsd_m=given.gsd_m, position_sd_m=given.position_sd_m)
     if "length_m" in table:
-        lengths = table["length_m"].groupby(clean.track).median()
+        lengths = table.groupby("track_id")["length_m"].median()
         made = replace(made, measured_length_m=lengths.reindex(made.track_id).to_numpy(np.float64))
     tracks = moving(made)
-    if not len(tracks):
-        raise InputError(
-            f"{path}: found no track that moves 6 m or more, expected tracks of vehicles; check unit and --gsd-m"
-        )
-    width, height = np.ceil(xy_m.max(axis=0) / gsd).astype(int) + 1
-    georeference = Georeference((int(height), int(width)), gsd_m=gsd)
+    georeference = Georeference(given.shape, given.crs_wkt, given.affine, given.gsd_m)
     yield from write_analysis(
         TrafficAnalysis(tracks, slice_s),
         to_path(out),

@@ -7,7 +7,8 @@ import numpy as np
 from schemas.job import Job
 from schemas.records import InputsRecord, SourceRecord
 from velfield.errors import InputError
-from velfield.pipeline.given_tracks.write import read_given_tracks
+from velfield.pipeline.given_tracks.load import load_tracks
+from velfield.pipeline.given_tracks.write import frame_times
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.stage import STAGES, Stage, stage_keys
 from velfield.run.commits import digest_path
@@ -49,15 +50,21 @@ def plan_tracks(job: Job) -> Plan:
     """
     job, path = job.anywhere(), Path(job.inputs.source)
     base = Path(job.inputs.base) if job.inputs.base else None
-    given = read_given_tracks(path, job.config, base=base)
-    times_s = given.times_s
+    given = load_tracks(path, job.config, base=base)
+    height, width = given.shape
+    if height * width > job.config.frames.max_pixels:
+        size = f"{width * given.gsd_m:.0f} x {height * given.gsd_m:.0f} m"
+        raise InputError(
+            f"{path}: found positions over {size}, too large a map at {given.gsd_m:g} m a pixel; check the unit, leave "
+            "out stray positions or give a larger --gsd-m"
+        )
+    times_s = frame_times(given.table, job.config)
     if len(times_s) < 3:
         raise InputError(f"{path}: found {len(times_s)} times, expected 3 or more for a velocity; give longer tracks")
-    height, width = given.shape
     source = SourceRecord(
         path=str(path),
         kind=TRACKS,
-        digest=f"{digest_path(path)} {job.config.position_unit or ''}".strip(),
+        digest=" ".join((digest_path(path), job.config.position_unit or "", job.config.position_y_axis or "")).strip(),
         width=width,
         height=height,
         frame_count=len(times_s),

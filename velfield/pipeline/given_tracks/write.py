@@ -1,10 +1,10 @@
-"""Tracks in place of frames: what the stages up to the tracks would have written (`velfield run --tracks`).
+"""Tables and stores of the stages up to the tracks, written from given tracks (`velfield run --tracks`).
 
-Positions that have errors are smoothed. Tracks are interpolated at common times, some 0.2 s apart, where a track has a
+Tracks are interpolated at common times, some 0.2 s apart, where a track has a
 position shortly before and after; three positions in a row are a tracklet, as in a run of a video.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,6 +16,7 @@ from schemas.flight import FlightConfig
 from schemas.records import GridRecord, WorkingRecord
 from schemas.tables import DETECTION_COLUMNS, DIMENSION_COLUMNS, JOIN_COLUMNS, TRACK_POSITION_COLUMNS, TRACKLET_COLUMNS
 from velfield.errors import InputError
+from velfield.pipeline.given_tracks.load import LoadedTracks, load_tracks, own_step_s
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stage import STAGE, stages_before
@@ -26,124 +27,23 @@ from velfield.run.commits import write_atomically
 from velfield.run.layout import RunLayout
 from velfield.run.stores import open_frames
 from velfield.run.tables import conform, empty_table, write_table, write_tracks
-from velfield.sources.geo import BaseRaster, read_base_raster
+from velfield.sources.geo import BaseRaster
 from velfield.sources.source import select_frames
-from velfield.sources.trajectories import read_tracks
-from velfield.tracking.smoothing import LEAST_ERROR_M, clean_tracks
 
-GSD_M = 0.2
-"""Base pixels of tracks given in metres, where --gsd-m does not say."""
-MARGIN_M = 10.0
-"""Around the positions, where no base image is given."""
 _STEP_S = 0.2
 _GAPS = 2.5
 """A track is interpolated over no more than so many of the file's own steps."""
-_INSIDE = 0.5
-"""Fewer positions within the base image are of another image."""
 _CAR_M = (4.5, 1.8)
 _FRAME_BITS = 20
-
-
-@dataclass(frozen=True)
-class GivenTracks:
-    """Tracks of a file on a grid of base pixels.
-
-    Attributes
-    ----------
-    table
-        ``track_id, source_id, time_s, x_px, y_px``; and ``length_m``, ``width_m`` where the file has them.
-    times_s
-        Times of all frames.
-    shape, gsd_m
-        (height, width) of the base image, px, and metres a pixel.
-    origin_m
-        Position of the centre of base pixel (0, 0) in the file's metres; None where the file has pixels.
-    base
-        The base image that was given.
-    """
-
-    table: pd.DataFrame
-    times_s: FloatArray
-    shape: tuple[int, int]
-    gsd_m: float
-    origin_m: tuple[float, float] | None
-    base: BaseRaster | None
-
-
-def read_given_tracks(path: Path, config: FlightConfig, *, base: Path | None) -> GivenTracks:
-    """Read tracks and lay them on a grid.
-
-    Raises
-    ------
-    InputError
-        No tracks, no scale, an area that no image can hold, or a base image of another place.
-    """
-    table = read_tracks(path, fps=config.frames.fps, unit=config.position_unit)
-    raster = read_base_raster(base, config.frames) if base else None
-    if "x_m" in table:
-        if raster is not None:
-            raise InputError(f"{path}: found metres and --base, expected positions in the pixels of that image")
-        gsd_m = config.gsd_m or GSD_M
-        xy = table[["x_m", "y_m"]].to_numpy(np.float64)
-        corner = xy.min(axis=0) - MARGIN_M
-        table[["x_px", "y_px"]] = (xy - corner) / gsd_m
-        origin = (float(corner[0]), float(corner[1]))
-        return _on_grid(table, path, config, gsd_m, origin, None)
-    known = config.gsd_m or (raster.gsd_m if raster else None)
-    if known is None:
-        raise InputError(f"{path}: found positions in pixels, expected their size; give --gsd-m, metres a pixel")
-    return _on_grid(table, path, config, known, None, raster)
-
-
-def _on_grid(
-    table: pd.DataFrame,
-    path: Path,
-    config: FlightConfig,
-    gsd_m: float,
-    origin: tuple[float, float] | None,
-    base: BaseRaster | None,
-) -> GivenTracks:
-    xy = table[["x_px", "y_px"]].to_numpy(np.float64)
-    if base is not None:
-        height, width = base.grey.shape
-        inside = ((xy >= 0) & (xy <= [width - 1, height - 1])).all(axis=1)
-        if inside.mean() < _INSIDE:
-            raise InputError(
-                f"{path}: found {inside.mean():.0%} of the positions within --base of {width} x {height} px, expected "
-                "most; give the image whose pixels they are"
-            )
-        table, shape = table.iloc[np.flatnonzero(inside)].reset_index(drop=True), (height, width)
-    else:
-        low = xy.min(axis=0)
-        if (low < 0).any():
-            raise InputError(
-                f"{path}: found pixels down to {low.min():.0f}, expected none below 0; give them from 0 on"
-            )
-        far = xy.max(axis=0) + MARGIN_M / gsd_m * (origin is not None)
-        if float(far[0]) * float(far[1]) > config.frames.max_pixels:
-            size = f"{far[0] * gsd_m:.0f} x {far[1] * gsd_m:.0f} m"
-            raise InputError(
-                f"{path}: found positions over {size}, too large a map at {gsd_m:g} m a pixel; check the unit, leave "
-                "out stray positions or give a larger --gsd-m"
-            )
-        shape = (int(np.ceil(far[1])) + 1, int(np.ceil(far[0])) + 1)
-    return GivenTracks(table, frame_times(table, config), shape, gsd_m, origin, base)
 
 
 def frame_times(table: pd.DataFrame, config: FlightConfig) -> FloatArray:
     """Times of the frames, s: the file's own, some 0.2 s apart, where its tracks share them; else every 0.2 s."""
     own = np.unique(table["time_s"].to_numpy(np.float64).round(4))
     duration = float(own[-1]) if len(own) else 0.0
-    shared = len(own) <= 1.5 * duration / max(_own_step_s(table), 1e-3) + 10
+    shared = len(own) <= 1.5 * duration / max(own_step_s(table), 1e-3) + 10
     times = own if shared else np.arange(0.0, duration + 1e-9, _STEP_S)
     return np.asarray(times[select_frames(times, config.frames)])
-
-
-def _own_step_s(table: pd.DataFrame) -> float:
-    """Median time from one position of a track to the next."""
-    same = table["track_id"].to_numpy()[1:] == table["track_id"].to_numpy()[:-1]
-    steps = np.diff(table["time_s"].to_numpy(np.float64))[same]
-    return float(np.median(steps[steps > 0])) if (steps > 0).any() else _STEP_S
 
 
 def at_frames(table: pd.DataFrame, times_s: FloatArray) -> pd.DataFrame:
@@ -165,7 +65,7 @@ def at_frames(table: pd.DataFrame, times_s: FloatArray) -> pd.DataFrame:
     after = np.clip(np.searchsorted(key, query - 1e-4), starts[owner], ends[owner])
     before = np.maximum(np.searchsorted(key, query + 1e-4, side="right") - 1, starts[owner])
     gap = time[after] - time[before]
-    near = gap <= max(_GAPS * _own_step_s(table), 2 * _STEP_S)
+    near = gap <= max(_GAPS * own_step_s(table), 2 * _STEP_S)
     f = np.clip((asked - time[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
     out = {"track_id": track[starts][owner], "frame": frame, "time_s": times_s[frame]}
     for axis in ("x_px", "y_px"):
@@ -177,38 +77,26 @@ def at_frames(table: pd.DataFrame, times_s: FloatArray) -> pd.DataFrame:
 def write_given_tracks(plan: Plan) -> StageResult:
     """Write base image and grid, empty stores of frames and registration, detections, tracklets and tracks."""
     base = plan.job.inputs.base
-    given = read_given_tracks(Path(plan.job.inputs.source), plan.config, base=Path(base) if base else None)
-    table, metres = given.table, given.table[["x_px", "y_px"]].to_numpy(np.float64) * given.gsd_m
-    clean = clean_tracks(table["track_id"].to_numpy(np.int64), table["time_s"].to_numpy(np.float64), metres)
-    x_px, y_px = (clean.xy_m / given.gsd_m).T
-    given = replace(given, table=table.assign(track_id=clean.track, x_px=x_px, y_px=y_px))
-    table = given.table
-    positions = at_frames(table, plan.info.times_s)
+    given = load_tracks(Path(plan.job.inputs.source), plan.config, base=Path(base) if base else None)
+    positions = at_frames(given.table, plan.info.times_s)
     positions = positions[positions.groupby("track_id")["frame"].transform("size") >= 3].reset_index(drop=True)
     if not len(positions):
         raise InputError(f"{plan.job.inputs.source}: found no track of three positions, expected tracks of vehicles")
     positions = _with_ids(positions)
-    displacement_sd_m = max(LEAST_ERROR_M, clean.velocity_sd_m_per_s * _own_step_s(table))
-    tracklets = make_tracklets(positions, _longest_step_s(plan, table), displacement_sd_m / given.gsd_m)
+    longest_s = _longest_step_s(plan, given.table)
+    tracklets = make_tracklets(positions, longest_s, given.displacement_sd_m / given.gsd_m)
     written = [*_write_stores(plan), *_write_base(plan.layout, given, positions)]
     written += _write_tables(plan, given, positions, tracklets)
     advance("tracks")
     counts = {"tracklets": float(len(tracklets)), "tracks": float(tracklets["track_id"].nunique())}
-    return StageResult(written, counts, [*_notes(given), *clean.notes])
-
-
-def _notes(given: GivenTracks) -> list[str]:
-    if given.origin_m is None:
-        return []
-    x, y = given.origin_m
-    return [f"base pixel (0, 0) is at x = {x:.3f} m, y = {y:.3f} m of the tracks; a pixel is {given.gsd_m:g} m"]
+    return StageResult(written, counts, list(given.notes))
 
 
 def _longest_step_s(plan: Plan, table: pd.DataFrame) -> float:
     """Positions farther apart in time are not of one tracklet."""
     steps = np.diff(plan.info.times_s)
     own = float(np.median(steps)) if len(steps) else _STEP_S
-    return max(plan.config.tracking.max_interval_s, 1.5 * own, 1.5 * _own_step_s(table))
+    return max(plan.config.tracking.max_interval_s, 1.5 * own, 1.5 * own_step_s(table))
 
 
 def _with_ids(positions: pd.DataFrame) -> pd.DataFrame:
@@ -263,7 +151,7 @@ def _write_stores(plan: Plan) -> list[Path]:
     return written
 
 
-def _write_base(layout: RunLayout, given: GivenTracks, positions: pd.DataFrame) -> list[Path]:
+def _write_base(layout: RunLayout, given: LoadedTracks, positions: pd.DataFrame) -> list[Path]:
     """The base image: as given, else the paths of all tracks, drawn; and its grid."""
     raster = given.base or BaseRaster(draw_paths(positions, given.shape))
     written = write_given_image(layout, raster)
@@ -272,8 +160,8 @@ def _write_base(layout: RunLayout, given: GivenTracks, positions: pd.DataFrame) 
         width_px=width,
         height_px=height,
         gsd_m=given.gsd_m,
-        crs_wkt=raster.crs_wkt,
-        affine=raster.affine,
+        crs_wkt=given.crs_wkt,
+        affine=given.affine,
         base_source="given",
         registered_to="given",
         reference_frame=0,
@@ -299,7 +187,7 @@ def draw_paths(positions: pd.DataFrame, shape: tuple[int, int]) -> GreyImage:
     return image
 
 
-def _write_tables(plan: Plan, given: GivenTracks, positions: pd.DataFrame, tracklets: pd.DataFrame) -> list[Path]:
+def _write_tables(plan: Plan, given: LoadedTracks, positions: pd.DataFrame, tracklets: pd.DataFrame) -> list[Path]:
     layout, written = plan.layout, []
     length_m, width_m = (_track_medians(given.table, positions, name) for name in ("length_m", "width_m"))
     area = np.nan_to_num(length_m, nan=_CAR_M[0]) * np.nan_to_num(width_m, nan=_CAR_M[1]) / given.gsd_m**2

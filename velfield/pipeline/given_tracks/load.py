@@ -1,0 +1,159 @@
+"""`load_tracks`: tracks of another program, checked, smoothed and laid on base pixels, for `run` and `analyse`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from rasterio.crs import CRS
+
+from schemas.arrays import FloatArray
+from schemas.flight import FlightConfig
+from velfield.errors import InputError
+from velfield.sources.geo import BaseRaster, read_base_raster
+from velfield.sources.tracks.checks import check_speeds, require_motion, split_reused
+from velfield.sources.tracks.read import GivenPositions, read_tracks
+from velfield.tracking.smoothing import LEAST_ERROR_M, clean_tracks
+
+GSD_M = 0.2
+"""Base pixels of tracks given in metres, where --gsd-m does not say."""
+MARGIN_M = 10.0
+"""Around the positions, where no base image is given."""
+_STEP_S = 0.2
+_INSIDE = 0.5
+"""Fewer positions within the base image are of another image."""
+
+
+@dataclass(frozen=True)
+class LoadedTracks:
+    """Tracks of a file on a grid of base pixels.
+
+    Attributes
+    ----------
+    table
+        ``track_id, source_id, frame, time_s, x_px, y_px``, smoothed, by track and time; and ``length_m``, ``width_m``
+        where the file has them.
+    shape, gsd_m
+        (height, width) of the grid, px, and metres a pixel.
+    base
+        The base image that was given.
+    crs_wkt, affine
+        Reference system of the grid and (column, row) of pixel corners to its coordinates: a UTM zone where the file
+        has degrees, else that of the base image; None without one.
+    position_sd_m, displacement_sd_m
+        Standard deviations of a smoothed position, and of a displacement from one position to the next, along one axis.
+    notes
+        What was read and done, a line each.
+    """
+
+    table: pd.DataFrame
+    shape: tuple[int, int]
+    gsd_m: float
+    base: BaseRaster | None
+    crs_wkt: str | None
+    affine: tuple[float, float, float, float, float, float] | None
+    position_sd_m: float
+    displacement_sd_m: float
+    notes: tuple[str, ...]
+
+    @property
+    def xy_m(self) -> FloatArray:
+        """(n, 2) positions, m, from the centre of base pixel (0, 0) to the right and down."""
+        return self.table[["x_px", "y_px"]].to_numpy(np.float64) * self.gsd_m
+
+
+def load_tracks(path: Path, config: FlightConfig, *, base: Path | None = None) -> LoadedTracks:
+    """Read tracks of another program, check and smooth them, and lay them on base pixels.
+
+    Parameters
+    ----------
+    path
+        See `velfield.sources.tracks.read.read_tracks`.
+    config
+        ``gsd_m``, ``position_unit``, ``position_y_axis`` and ``frames.fps`` are used.
+    base
+        The image whose pixels the positions are.
+
+    Raises
+    ------
+    InputError
+        No tracks, no scale, positions outside the base image, or speeds that contradict the file or the vehicles.
+    """
+    unit = config.position_unit or ("px" if base else None)
+    given = read_tracks(path, fps=config.frames.fps, unit=unit, y_axis=config.position_y_axis)
+    raster = read_base_raster(base, config.frames) if base else None
+    if given.unit == "m" and raster is not None:
+        raise InputError(f"{path}: found metres and --base, expected positions in the pixels of that image")
+    gsd_m = _gsd_m(path, given, config.gsd_m, raster)
+    corner = np.zeros(2)
+    if given.unit == "m":
+        corner = given.table[["x", "y"]].to_numpy(np.float64).min(axis=0) - MARGIN_M
+    to_px = 1 / gsd_m if given.unit == "m" else 1.0
+    table = given.table.rename(columns={"x": "x_px", "y": "y_px"})
+    table[["x_px", "y_px"]] = (table[["x_px", "y_px"]] - corner) * to_px
+    xy_m = table[["x_px", "y_px"]].to_numpy(np.float64) * gsd_m
+    table, more = split_reused(table, xy_m)
+    notes = [*given.notes, *check_speeds(path, table, xy_m, given.speed), *more]
+    require_motion(path, table, xy_m)
+    if raster is None:
+        shape = _shape(path, given.unit, table, gsd_m)
+    else:
+        shape = (raster.grey.shape[0], raster.grey.shape[1])
+        table = _inside(path, table, shape)
+    xy_m = table[["x_px", "y_px"]].to_numpy(np.float64) * gsd_m
+    clean = clean_tracks(table["track_id"].to_numpy(np.int64), table["time_s"].to_numpy(np.float64), xy_m)
+    x_px, y_px = (clean.xy_m / gsd_m).T
+    table = table.assign(track_id=clean.track, x_px=x_px, y_px=y_px)
+    displacement_sd_m = max(LEAST_ERROR_M, clean.velocity_sd_m_per_s * own_step_s(table))
+    crs_wkt, affine = (raster.crs_wkt, raster.affine) if raster is not None else (None, None)
+    if given.crs_wkt is not None:
+        east, north = float(corner[0] - gsd_m / 2), float(-corner[1] + gsd_m / 2)
+        crs_wkt, affine = given.crs_wkt, (gsd_m, 0.0, east, 0.0, -gsd_m, north)
+    notes += [*_place(given, corner, gsd_m), *clean.notes]
+    errors = (clean.position_sd_m, displacement_sd_m)
+    return LoadedTracks(table, shape, gsd_m, raster, crs_wkt, affine, *errors, tuple(notes))
+
+
+def _gsd_m(path: Path, given: GivenPositions, gsd_m: float | None, raster: BaseRaster | None) -> float:
+    if given.unit == "m":
+        return gsd_m or GSD_M
+    known = gsd_m or (raster.gsd_m if raster else None)
+    if known is None:
+        raise InputError(f"{path}: found positions in pixels, expected their size; give --gsd-m, metres a pixel")
+    return known
+
+
+def _place(given: GivenPositions, corner: FloatArray, gsd_m: float) -> list[str]:
+    """Where the grid lies in the file's axes."""
+    if given.unit != "m":
+        return []
+    x, y = float(corner[0]), float(-corner[1] if given.y_axis == "up" else corner[1])
+    where = "m of the tracks" if given.crs_wkt is None else f"m of {CRS.from_wkt(given.crs_wkt).to_string()}"
+    return [f"base pixel (0, 0) is at x = {x:.3f}, y = {y:.3f} {where}; a pixel is {gsd_m:g} m"]
+
+
+def _shape(path: Path, unit: str, table: pd.DataFrame, gsd_m: float) -> tuple[int, int]:
+    xy = table[["x_px", "y_px"]].to_numpy(np.float64)
+    low, far = xy.min(axis=0), xy.max(axis=0) + MARGIN_M / gsd_m * (unit == "m")
+    if (low < 0).any():
+        raise InputError(f"{path}: found pixels down to {low.min():.0f}, expected none below 0; give them from 0 on")
+    return int(np.ceil(far[1])) + 1, int(np.ceil(far[0])) + 1
+
+
+def _inside(path: Path, table: pd.DataFrame, shape: tuple[int, int]) -> pd.DataFrame:
+    height, width = shape
+    xy = table[["x_px", "y_px"]].to_numpy(np.float64)
+    inside = ((xy >= 0) & (xy <= [width - 1, height - 1])).all(axis=1)
+    if inside.mean() < _INSIDE:
+        raise InputError(
+            f"{path}: found {inside.mean():.0%} of the positions within --base of {width} x {height} px, expected "
+            "most; give the image whose pixels they are"
+        )
+    return table.iloc[np.flatnonzero(inside)].reset_index(drop=True)
+
+
+def own_step_s(table: pd.DataFrame) -> float:
+    """Median time from one position of a track to the next, s, of a table sorted by track and time."""
+    same = table["track_id"].to_numpy()[1:] == table["track_id"].to_numpy()[:-1]
+    steps = np.diff(table["time_s"].to_numpy(np.float64))[same]
+    return float(np.median(steps[steps > 0])) if (steps > 0).any() else _STEP_S

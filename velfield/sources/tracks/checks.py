@@ -1,0 +1,155 @@
+"""Checks of tracks against themselves: speeds by the positions and by the file, repeated rows, what vehicles can do."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from schemas.arrays import FloatArray, IntArray
+from velfield.errors import InputError
+from velfield.sources.tracks.formats import FOOT_M, MILE_PER_HOUR
+
+_SPAN_S = 0.5
+"""Speeds are of positions at least so far apart in time, where the file has such."""
+_SAME = 0.15
+"""Speeds by the positions and by the file that differ by more than this fraction are in different units."""
+_MIN_ROWS = 10
+_MOVING_M_PER_S = 2.0
+_FASTEST_M_PER_S = 85.0
+"""306 km/h: where a tenth of all moving rows are faster, a unit is wrong."""
+_JUMP_M, _JUMP_M_PER_S, _LONGEST_GAP_S = 15.0, 120.0, 300.0
+_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": MILE_PER_HOUR, "ft/s": FOOT_M}
+_MOSTLY_SAME = 0.01
+_MIN_EXTENT_M = 6.0
+
+
+@dataclass(frozen=True)
+class GivenSpeed:
+    """Speeds by the file, in a unit of ``factor`` m/s (None: not known), and the columns' name for messages."""
+
+    values: FloatArray
+    factor: float | None
+    name: str
+
+
+def step_speeds(table: pd.DataFrame, xy: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Speeds (k,) by positions of a table sorted by track and time, and the rows (k, 2) between which they are."""
+    track, time_s = table["track_id"].to_numpy(np.int64), table["time_s"].to_numpy(np.float64)
+    steps = np.diff(time_s)[np.diff(track) == 0]
+    step_s = float(np.median(steps[steps > 0])) if (steps > 0).any() else _SPAN_S
+    ahead = max(1, round(_SPAN_S / step_s))
+    ahead = max(1, min(ahead, int(np.bincount(track).max(initial=1)) - 1))
+    first = np.flatnonzero((track[ahead:] == track[:-ahead]) & (time_s[ahead:] > time_s[:-ahead]))
+    rows = np.column_stack([first, first + ahead])
+    moved = np.hypot(*(xy[rows[:, 1]] - xy[rows[:, 0]]).T)
+    return moved / (time_s[rows[:, 1]] - time_s[rows[:, 0]]), rows
+
+
+def check_speeds(path: object, table: pd.DataFrame, xy_m: FloatArray, given: GivenSpeed | None) -> list[str]:
+    """Compare the speeds by the positions (m, 2), m, with those of the file and with what vehicles can do.
+
+    Raises
+    ------
+    InputError
+        They contradict the file's speeds, whose unit is known; or vehicles cannot be so fast.
+    """
+    speed, rows = step_speeds(table, xy_m)
+    notes = []
+    if given is not None:
+        stated = given.values[rows].mean(axis=1)
+        known = np.isfinite(stated) & (stated * (given.factor or 1 / 3.6) > _MOVING_M_PER_S)
+        if known.sum() >= _MIN_ROWS and np.median(speed[known]) > 0:
+            notes += _compare(path, float(np.median(speed[known] / stated[known])), speed[known], given)
+    moving = speed[speed > _MOVING_M_PER_S]
+    if len(moving) and np.quantile(moving, 0.9) > _FASTEST_M_PER_S:
+        raise InputError(
+            f"{path}: found vehicles at {3.6 * np.quantile(moving, 0.9):.0f} km/h by their positions and times; check "
+            "the units of positions (--unit, --gsd-m) and of times (--fps)"
+        )
+    return notes
+
+
+def _compare(path: object, ratio: float, speed: FloatArray, given: GivenSpeed) -> list[str]:
+    """``ratio``: m/s by the positions over the file's number."""
+    if given.factor is None:
+        unit = next((name for name, factor in _UNITS.items() if abs(ratio / factor - 1) < _SAME / 2), None)
+        if unit is not None:
+            return [f"{given.name} agrees with the positions in {unit}"]
+        return [
+            f"warning: {given.name} is {1 / ratio:.3g} for 1 m/s by the positions, no usual unit: check --unit, --fps"
+        ]
+    if abs(ratio / given.factor - 1) <= _SAME:
+        return []
+    shown = 3.6 * float(np.median(speed))
+    raise InputError(
+        f"{path}: found {shown:.3g} km/h by the positions and {shown * given.factor / ratio:.3g} km/h by {given.name}; "
+        "check the unit of the positions (--unit, --gsd-m) and the times (--fps)"
+    )
+
+
+def drop_repeated(path: object, table: pd.DataFrame, columns: list[str]) -> tuple[pd.DataFrame, list[str]]:
+    """A table with one position of each track at a time, and a note on rows that were dropped.
+
+    Raises
+    ------
+    InputError
+        Tracks are at two places at one time: a column of their names is missing, or times are too coarse.
+    """
+    repeated = table.duplicated(["track_id", "time_s"])
+    if not repeated.any():
+        return table, []
+    same = table.duplicated(["track_id", "time_s", *columns])
+    elsewhere = float((repeated & ~same).mean())
+    if elsewhere > _MOSTLY_SAME:
+        raise InputError(
+            f"{path}: found {elsewhere:.0%} of the rows at a second place of the same track at the same time; several "
+            "recordings in one table need a column recordingId, coarse times need --fps and a column of the frame"
+        )
+    kept = table[~repeated].reset_index(drop=True)
+    return kept, [f"{int(repeated.sum())} rows of a track and time that were there already are left out"]
+
+
+def split_reused(table: pd.DataFrame, xy_m: FloatArray) -> tuple[pd.DataFrame, list[str]]:
+    """A table (sorted by track and time) whose tracks end where no vehicle could go on, and a note on it."""
+    track, time_s = table["track_id"].to_numpy(np.int64), table["time_s"].to_numpy(np.float64)
+    gap, moved = np.diff(time_s), np.hypot(*np.diff(xy_m, axis=0).T)
+    jump = (gap > _LONGEST_GAP_S) | ((moved > _JUMP_M) & (moved > _JUMP_M_PER_S * gap))
+    cut = (np.diff(track) == 0) & jump
+    if not cut.any():
+        return table, []
+    part = np.r_[0, np.cumsum(cut | (np.diff(track) != 0))]
+    named = f"{int(cut.sum())} names of tracks come back elsewhere or after {_LONGEST_GAP_S:.0f} s: other vehicles"
+    return table.assign(track_id=part), [named]
+
+
+def require_motion(path: object, table: pd.DataFrame, xy_m: FloatArray) -> None:
+    """Refuse tracks of which none goes anywhere.
+
+    Raises
+    ------
+    InputError
+        No track moves by 6 m.
+    """
+    first = np.flatnonzero(np.r_[True, np.diff(table["track_id"].to_numpy(np.int64)) != 0])
+    low, high = (reduce.reduceat(xy_m, first, axis=0) for reduce in (np.minimum, np.maximum))
+    longest = float(np.hypot(*(high - low).T).max())
+    if longest < _MIN_EXTENT_M:
+        raise InputError(
+            f"{path}: found no track that moves {_MIN_EXTENT_M:g} m or more (the longest: {longest:.3g} m), expected "
+            "tracks of vehicles; check --unit and --gsd-m"
+        )
+
+
+def mirrored_and_scale(xy_up: FloatArray, east_north: FloatArray) -> tuple[bool, float] | None:
+    """Whether y points against the north of the same positions (n, 2) in metres, and metres of those for one of these.
+
+    None where the positions lie on a line, or agree with neither.
+    """
+    z, w = ((a - a.mean(axis=0)) @ np.array([1.0, 1j]) for a in (xy_up, east_north))
+    power = float(np.vdot(z, z).real)
+    straight, turned = abs(np.vdot(z, w)) / power, abs(np.vdot(z.conj(), w)) / power
+    total = float(np.sqrt(np.vdot(w, w).real / power))
+    best, other = max(straight, turned), min(straight, turned)
+    if best < 0.98 * total or other > 0.98 * best:
+        return None
+    return bool(turned > straight), best
