@@ -2,6 +2,7 @@
 
 import json
 import re
+from base64 import b64decode
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import median
@@ -338,23 +339,30 @@ def test_a_short_clip_is_marked_as_of_few_vehicles_a_pixel(page: Page, address: 
     assert facts["of that, by 5 or more"] == coverage.percent(well, known)
 
 
-LABELS = """[...document.querySelectorAll('svg.plot')].filter((plot) => plot.checkVisibility()).map((plot) =>
-  [...plot.querySelectorAll('text')].map((text) => (({left, right, top, bottom}) => [left, right, top, bottom])(
-    text.getBoundingClientRect())))"""
+PLOTS = """[...document.querySelectorAll('img.plot')].filter((plot) => plot.checkVisibility()).map((plot) =>
+  [plot.src, plot.getBoundingClientRect().width / plot.naturalWidth])"""
+LABELS = """[...document.querySelectorAll('text')].map((text) => text.getBoundingClientRect()).map(
+  ({left, right, top, bottom}) => [left, right, top, bottom])"""
 
 
 @pytest.mark.parametrize("width", [390, 1400])
-def test_the_labels_of_the_plots_can_be_read_on_any_screen(chromium: Browser, address: str, width: int) -> None:
+def test_the_labels_of_the_plots_can_be_read_on_any_screen(
+    chromium: Browser, address: str, tmp_path: Path, width: int
+) -> None:
     with chromium.page(width=width, height=844) as opened:
         opened.open(f"{address}#tab=summary")
         opened.wait("document.querySelector('#summary-panel').hidden === false")
-        plots = opened.value(LABELS)
-    assert plots
-    for boxes in plots:
-        assert min(bottom - top for _, _, top, bottom in boxes) >= 13  # a letter of 11 px or more
-        for k, (left, right, top, bottom) in enumerate(boxes):
-            for a, b, c, d in boxes[k + 1 :]:
-                assert right < a or b < left or bottom < c + 3 or d < top + 3
+        plots = opened.value(PLOTS)
+        assert plots
+        for source, scale in plots:
+            (tmp_path / "plot.svg").write_bytes(b64decode(source.partition(",")[2]))
+            opened.open((tmp_path / "plot.svg").as_uri())
+            boxes = scale * np.array(opened.value(LABELS))
+            assert len(boxes) > 4
+            assert min(bottom - top for _, _, top, bottom in boxes) >= 13  # a letter of 11 px or more
+            for k, (left, right, top, bottom) in enumerate(boxes):
+                for a, b, c, d in boxes[k + 1 :]:
+                    assert right < a or b < left or bottom < c + 3 or d < top + 3
 
 
 @pytest.mark.parametrize("tab", ["map", "summary"])
