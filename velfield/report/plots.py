@@ -50,7 +50,7 @@ def precision_recall_plot(curve: PrecisionRecall) -> bytes:
 
 
 def _plot(draw: Callable[["Axes"], None]) -> bytes:
-    figure = new_figure(4.0, 2.5)  # about the width of a phone's page: its letters can be read there
+    figure = new_figure(3.8, 2.4)  # about the width of a phone's page: its letters can be read there
     axes = figure.add_axes((0.15, 0.2, 0.81, 0.74))
     axes.grid(axis="y", alpha=0.4)
     draw(axes)
