@@ -169,6 +169,7 @@ def test_a_run_on_s3_whose_lease_expired_is_crashed_once_another_works_there(ser
     from prefect.states import Running
 
     from flows.stale import mark_abandoned, mark_crashed
+    from velfield.run.lock import _machine
 
     @flow
     def nothing() -> None:
@@ -206,7 +207,8 @@ def test_runs_whose_process_was_killed_are_crashed_and_others_are_not(server: No
         runs = {}
         for name, pid in pids.items():
             (tmp_path / name).mkdir()
-            (tmp_path / name / ".lock").write_text(json.dumps({"pid": pid, "host": socket.gethostname()}))
+            owner = {"pid": pid, "host": socket.gethostname(), "machine": _machine()}
+            (tmp_path / name / ".lock").write_text(json.dumps(owner))
             runs[name] = client.create_flow_run(nothing, name=str(tmp_path / name), state=Running())
         assert mark_crashed(str(tmp_path / "resumed")) == 2
         states = {name: client.read_flow_run(run.id).state_name for name, run in runs.items()}
