@@ -169,7 +169,6 @@ def test_a_run_on_s3_whose_lease_expired_is_crashed_once_another_works_there(ser
     from prefect.states import Running
 
     from flows.stale import mark_abandoned, mark_crashed
-    from velfield.run.lock import _machine
 
     @flow
     def nothing() -> None:
