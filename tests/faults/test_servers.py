@@ -194,6 +194,7 @@ def test_runs_whose_process_was_killed_are_crashed_and_others_are_not(server: No
     from prefect.states import Running
 
     from flows.stale import mark_abandoned, mark_crashed
+    from velfield.run.lock import _machine
 
     @flow
     def nothing() -> None:
