@@ -79,7 +79,7 @@ def test_bad_input_is_one_line(tmp_path: Path) -> None:
 def test_the_answers_are_printed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     analyse(tracks=folder.parent / "tracks.csv", out=folder.parent / "again")
     text = capsys.readouterr().out
-    assert re.search(r"signal +junction \d: cycle 40 s \(\d", text)
+    assert re.search(r"signal +junction \d: cycle 40.0 s \(\d", text)
     assert re.search(r"W to E: \d+, [\d.]+ % \([\d.]+ to [\d.]+, n \d+\) of the entry", text)
     assert re.search(r"u-turns +none in \d.* min, so fewer than \d", text)
 

@@ -91,7 +91,7 @@ def parse_cue(text: str) -> dict[str, float]:
     Examples
     --------
     >>> parse_cue("[focal_len: 240] [latitude: 52.5] [longtitude: 13.4] [rel_alt: 100.5 abs_alt: 134.1]")
-    {'latitude_deg': 52.5, 'longitude_deg': 13.4, 'height_m': 100.5, 'altitude_m': 134.1, 'focal_35mm': 24.0}
+    {'focal_35mm': 24.0, 'latitude_deg': 52.5, 'longitude_deg': 13.4, 'height_m': 100.5, 'altitude_m': 134.1}
     >>> parse_cue("HOME(13.1,52.1) 2017.08.05 14:11:51 GPS(13.4,52.5,16) BAROMETER:91.2")["height_m"]
     91.2
     """
