@@ -15,6 +15,7 @@ from tests.analysis.test_traffic_analysis import crossroads
 from tests.field_runs import field_run, tracklets_along
 from velfield.errors import InputError
 from velfield.pipeline.analysis.workbook import can_write_workbook
+from velfield.pipeline.given_tracks.load import MARGIN_M
 from velfield.run.commits import sealed_json, write_atomically, write_commit
 from velfield.run.flight_record import read_flight_record
 
@@ -43,10 +44,11 @@ def test_tables_and_lanes_are_valid_and_agree(folder: Path) -> None:
     for table in record.tables:
         names = {column.name for column in table.columns}
         assert all(set(row.cells) == names for row in table.rows), table.name
-    width, height = 260 / record.gsd_m, 220 / record.gsd_m
-    for x, y in (point for lane in lanes.lanes for point in lane.xy_px):
-        assert -20 < x < width + 20
-        assert -20 < y < height + 20
+    # base pixel (0, 0) lies outside the tracks by a margin; lanes end where vehicles drove: 0 to 260 m, 0 to 220 m
+    for lane in lanes.lanes:
+        x, y = np.array(lane.xy_px).T * record.gsd_m - MARGIN_M
+        assert -1 < x.min() < x.max() < 261
+        assert -1 < y.min() < y.max() < 221
 
 
 def test_the_report_says_where_data_is_too_little(folder: Path) -> None:
