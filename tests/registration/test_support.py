@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy.spatial import KDTree
 
 from schemas.arrays import FloatArray
-from velfield.registration.mesh import CELLS, average_near, measure_support, nearest_points, reach
+from velfield.registration.mesh import CELLS, measure_support, reach
 
 WIDTH, HEIGHT = 1280, 960
 
@@ -64,28 +63,3 @@ def test_a_hole_amid_control_points_is_bridged_and_one_at_the_border_is_not() ->
     assert np.isfinite(amid)
     assert amid > 2 * beside
     assert np.isnan(border)
-
-
-@pytest.mark.parametrize(("n", "count"), [(3, 3), (40, 24), (1500, 24), (1500, 1)])
-def test_the_nearest_points_are_those_of_a_tree(n: int, count: int) -> None:
-    """Points in one corner too, and centres far from all of them."""
-    rng = np.random.default_rng(n)
-    xy = rng.uniform(0, 1, (n, 2)) * (600, 300) + (200, 100)
-    centres = rng.uniform(-500, 2000, (200, 2))
-    distances, nearest = nearest_points(xy, centres, count, 40.0)
-    expected = KDTree(xy).query(centres, k=[*range(1, count + 1)])
-    np.testing.assert_allclose(distances, expected[0], rtol=1e-14)
-    np.testing.assert_array_equal(nearest, expected[1])
-
-
-def test_squares_are_averaged_within_the_reach() -> None:
-    rng = np.random.default_rng(9)
-    distances, nearest = np.sort(rng.uniform(0, 2, (50, 24)), axis=1), rng.integers(0, 100, (50, 24))
-    distances[:2, 0] = [1.5, 1.0]
-    distances[:2, 1:] = 1.5
-    residuals, near = rng.normal(size=(100, 2)), distances <= 1.0
-    count, mean = average_near(distances, nearest, residuals, 1.0)
-    np.testing.assert_array_equal(count, near.sum(axis=1))
-    assert count[:2].tolist() == [0, 1]
-    expected = np.where(near, (residuals**2).sum(axis=1)[nearest], 0.0).sum(axis=1) / np.maximum(near.sum(axis=1), 1)
-    np.testing.assert_allclose(mean, expected, atol=1e-14)

@@ -25,6 +25,7 @@ from functools import cache
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from schemas.arrays import Float32Array, FloatArray, IntArray
 from velfield.registration import kernels
@@ -55,8 +56,6 @@ _MAX_SD_RATIO = 1.5
 """A larger standard deviation is no evidence either, unless the control points themselves scatter as much."""
 _AVERAGED = 24
 """Control points of which the hold-out residual is averaged about a cell."""
-_POINTS_PER_CELL = 6.0
-"""Approximate number of control points in each cell of the grid for the search of nearest points."""
 _INDEPENDENT = 6.0
 """Neighbouring residuals that count as one: relief and roofs displace neighbours alike."""
 _BRIDGED = 2.0
@@ -299,9 +298,11 @@ def measure_support(xy: FloatArray, residuals: FloatArray, *, width: int, height
     x, y = (np.arange(columns) + 0.5) * width / columns - 0.5, (np.arange(rows) + 0.5) * height / rows - 0.5
     centres = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     reach_px = reach(width, height)
-    cell_px = float(np.sqrt(_POINTS_PER_CELL * width * height / len(xy)))
-    distances, nearest = nearest_points(as_points(xy), centres, min(_AVERAGED, len(xy)), cell_px)
-    count, mean = average_near(distances, nearest, residuals, reach_px)
+    distances, nearest = map(np.asarray, cKDTree(as_points(xy)).query(centres, min(_AVERAGED, len(xy))))
+    near = np.asarray(distances <= reach_px)
+    count = near.sum(axis=1)
+    squares = (residuals**2).sum(axis=1)
+    mean = np.where(near, squares[nearest], 0.0).sum(axis=1) / np.maximum(count, 1)
     beyond = np.clip(distances[:, NEIGHBOURS - 1] / reach_px, 0.0, 1.0)
     variance = mean * (_INDEPENDENT / np.maximum(count, _INDEPENDENT) + (_GROWTH * beyond**2) ** 2)
     limit = max(MAX_SD_PX, _MAX_SD_RATIO * float(np.sqrt((residuals**2).sum(axis=1).mean())))
@@ -309,68 +310,6 @@ def measure_support(xy: FloatArray, residuals: FloatArray, *, width: int, height
     sd[supported] = np.sqrt(variance[supported])
     cells = int(_BRIDGED * reach_px * rows / height), int(_BRIDGED * reach_px * columns / width)
     return Support(bridge_holes(sd.reshape(CELLS), cells), width, height)
-
-
-@njit(cache=True, nogil=True)
-def average_near(distances, nearest, residuals, reach_px):  # type: ignore[no-untyped-def]
-    """How many of the nearest points (m, count) are within the reach (m,), and the mean of the squares of their
-    residuals (n, 2), 0 without any (m,)."""
-    numbers, means = np.zeros(len(nearest), np.int64), np.zeros(len(nearest))
-    for c in range(len(nearest)):
-        for k in range(nearest.shape[1]):
-            if distances[c, k] > reach_px:  # nearest first
-                break
-            x, y = residuals[nearest[c, k]]
-            means[c] += x * x + y * y
-            numbers[c] += 1
-        means[c] /= max(numbers[c], 1)
-    return numbers, means
-
-
-@njit(cache=True, nogil=True)
-def nearest_points(xy, centres, count, cell):  # type: ignore[no-untyped-def]
-    """Distances and indices (m, count) of the points (n, 2) nearest to each of the centres (m, 2), nearest first.
-
-    Points are looked up in square cells of side ``cell``, ring by ring; ``count`` is at most n. In place of a tree,
-    which takes more than twice as long for as few centres.
-    """
-    n, m = xy.shape[0], centres.shape[0]
-    left, top = xy[:, 0].min(), xy[:, 1].min()
-    columns, rows = int((xy[:, 0].max() - left) / cell) + 1, int((xy[:, 1].max() - top) / cell) + 1
-    starts, of_point = np.zeros(rows * columns + 1, np.int64), np.empty(n, np.int64)
-    for i in range(n):
-        of_point[i] = int((xy[i, 1] - top) / cell) * columns + int((xy[i, 0] - left) / cell)
-        starts[of_point[i] + 1] += 1
-    starts = np.cumsum(starts)
-    order, place = np.empty(n, np.int64), starts.copy()
-    for i in range(n):
-        order[place[of_point[i]]] = i
-        place[of_point[i]] += 1
-    squares, nearest = np.full((m, count), np.inf), np.zeros((m, count), np.int64)
-    for c in range(m):
-        square, index = squares[c], nearest[c]
-        x, y = centres[c, 0], centres[c, 1]
-        column, row = int(np.floor((x - left) / cell)), int(np.floor((y - top) / cell))
-        rings = max(column, columns - 1 - column, row, rows - 1 - row)
-        for ring in range(rings + 1):
-            if ring and square[count - 1] <= ((ring - 1) * cell) ** 2:
-                break  # all of this ring is farther away
-            for r in range(max(row - ring, 0), min(row + ring, rows - 1) + 1):
-                step = 1 if abs(r - row) == ring else max(2 * ring, 1)  # the whole side, or its two ends
-                for k in range(column - ring, column + ring + 1, step):
-                    if not 0 <= k < columns:
-                        continue
-                    for at in range(starts[r * columns + k], starts[r * columns + k + 1]):
-                        i = order[at]
-                        distance = (xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2
-                        if not distance < square[count - 1]:
-                            continue
-                        q = count - 1
-                        while q > 0 and square[q - 1] > distance:
-                            square[q], index[q] = square[q - 1], index[q - 1]
-                            q -= 1
-                        square[q], index[q] = distance, i
-    return np.sqrt(squares), nearest
 
 
 def bridge_holes(sd: Float32Array, cells: tuple[int, int]) -> Float32Array:

@@ -2,20 +2,17 @@
 
 import io
 import struct
-import zlib
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from PIL import BmpImagePlugin, Image, JpegImagePlugin, PngImagePlugin, TiffImagePlugin
 
 from schemas.arrays import FloatArray, GreyImage
 from velfield.errors import InputError
 from velfield.sources.frames import local_path
-from velfield.sources.png_filters import luma, undo_filters
 
 # The format comes from the first bytes, never from the name: GDAL and others open a VRT named .tif, which reads other
 # files. The plugins are called directly: `Image.open` would bring its own limit on pixels, a global of the process.
@@ -35,12 +32,6 @@ _DAMAGED = (OSError, ValueError, SyntaxError, EOFError, OverflowError, MemoryErr
 _MAX_TAG_BYTES = 2**20
 _PNG_XMP = b"XML:com.adobe.xmp\0\0\0\0\0"
 """Key, no compression, no language, no translated key."""
-_PNG_CHANNELS = {"L": 1, "LA": 2, "RGB": 3, "RGBA": 4}
-"""Bytes a pixel of the plain PNGs, by Pillow's name of how they are stored; with 16 bits or a palette it is another."""
-_PNG_OVERHEAD = 2**16
-"""Bytes of a PNG's chunks beside its pixels, at most."""
-_INFLATED_AT_A_TIME = 2**17
-"""Bytes of a PNG, inflated between two looks at how many pixels there are; smaller and larger parts take longer."""
 
 
 def check_size(path: Path, width: int, height: int, max_pixels: int) -> None:
@@ -136,8 +127,7 @@ def read_grey_image(path: Path | str, max_pixels: int, levels: Levels | None = N
         check_size(file, *image.size, max_pixels)
         try:
             image.draft("L", image.size)  # a JPEG's luma is decoded alone
-            plain = _read_plain_png(image) if isinstance(image, PngImagePlugin.PngImageFile) else None
-            return _to_grey(file, image, levels) if plain is None else plain
+            return _to_grey(file, image, levels)
         except InputError:
             raise
         except _DAMAGED as error:
@@ -189,61 +179,6 @@ def _image_plugin(path: Path) -> type:
             f"{path.name}: found a VRT, which names other files, expected {_READ}; write it out with gdal_translate"
         )
     raise InputError(f"{path.name}: found the bytes {head[:4].hex(' ')} at its start, expected {_READ}; convert it")
-
-
-def _read_plain_png(image: PngImagePlugin.PngImageFile) -> GreyImage | None:
-    """Grey levels of a whole and plain PNG, in half of Pillow's time (see `velfield.sources.png_filters`).
-
-    None of one with a palette, 16 bits, interlacing, transparent colours or several frames, with a chunk behind its
-    pixels, or with anything wrong: those are Pillow's, to read or to refuse. Like Pillow, this looks at the checksum of
-    the pixels, not at those of the chunks that hold them.
-    """
-    if image.is_animated or {"interlace", "transparency", "bbox"} & image.info.keys() or len(image.tile) != 1:
-        return None
-    codec, extents, offset, stored = image.tile[0]
-    channels = _PNG_CHANNELS.get(str(stored), 0)
-    if codec != "zip" or extents != (0, 0, *image.size) or not channels or image.fp is None:
-        return None
-    size = image.height * (1 + image.width * channels)
-    most = 2 * size + _PNG_OVERHEAD  # what cannot be compressed takes little more: beyond, it is not plain
-    image.fp.seek(offset - 8)
-    data = image.fp.read(most + 1)
-    filtered = None if len(data) > most else _inflate_pixels(data, size)
-    pixels = np.empty((image.height, image.width * channels), np.uint8)
-    if filtered is None or not undo_filters(filtered, channels, pixels):
-        return None
-    if stored == "L":
-        return pixels
-    coloured = pixels.reshape(image.height, image.width, channels)
-    return np.ascontiguousarray(coloured[..., 0]) if stored == "LA" else np.asarray(luma(coloured), np.uint8)
-
-
-def _inflate_pixels(data: bytes, size: int) -> NDArray[np.uint8] | None:
-    """The `size` bytes that a PNG's chunks of pixels hold, where only the end of the file follows them; else None.
-
-    `data` is the file from the first of these chunks on.
-    """
-    view, start, parts = memoryview(data), 0, []
-    while data[start + 4 : start + 8] == b"IDAT":
-        end = start + 8 + int.from_bytes(data[start : start + 4])
-        parts.append(view[start + 8 : end])
-        start = end + 4
-    if data[start + 4 : start + 8] != b"IEND":
-        return None
-    deflated = memoryview(b"".join(parts))
-    inflated, count, inflater = np.empty(size, np.uint8), 0, zlib.decompressobj()
-    target = inflated.data
-    try:
-        for start in range(0, len(deflated), _INFLATED_AT_A_TIME):
-            # One more than there may be, so that what is too large shows before memory is taken for it.
-            part = inflater.decompress(deflated[start : start + _INFLATED_AT_A_TIME], size - count + 1)
-            if count + len(part) > size:
-                return None
-            target[count : count + len(part)] = part
-            count += len(part)
-    except zlib.error:
-        return None
-    return inflated if count == size and inflater.eof and not inflater.unused_data else None
 
 
 def _to_grey(path: Path, image: Image.Image, levels: Levels | None = None) -> GreyImage:
