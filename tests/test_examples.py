@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from schemas.summary import RunSummary
-from velfield.detection.detector import load_detector
+from velfield.detection.registry import load_detector
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 

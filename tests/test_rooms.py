@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 FLOORS = {"schemas": 0, "velfield": 1, "flows": 2, "tools": 3}
-SCIENCE = ("sources", "camera", "registration", "detection", "tracking", "field", "analysis")
+SCIENCE = ("sources", "camera", "registration", "detection", "paper", "tracking", "field", "analysis")
 """Arrays in, arrays out: no run folder, no graph."""
 ONLY_IN_TOOLS = ("torch",)
 """Libraries of developers' tools that are in no environment of ours: torch's wheel brings gigabytes of CUDA."""

@@ -19,9 +19,9 @@ from velfield.bench.scenes import simulated_image
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.fine_tuning import evaluate_network, make_record, select_threshold
 from velfield.detection.cnn.network import Network
-from velfield.detection.detector import shipped_detector
 from velfield.detection.evaluation import HeldOutScores, merge_scores
 from velfield.detection.orientation import fill_missing_orientation
+from velfield.detection.registry import shipped_detector
 from velfield.detection.samples import LabelledImage
 from velfield.parallel import parallel_map
 

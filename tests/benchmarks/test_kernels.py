@@ -8,9 +8,9 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from schemas.flight import FieldConfig
 from velfield.bench.detection import plain_response, random_stumps, row_response
-from velfield.detection.paper.response import dense_response
 from velfield.field.accumulate import accumulate_tile
 from velfield.field.segments import SEGMENT_DTYPE, VelocityBins
+from velfield.paper.response import dense_response
 
 
 @pytest.fixture

@@ -34,7 +34,7 @@ from velfield.detection.cnn.network import (
     Topology,
     convolutions,
 )
-from velfield.detection.detector import shipped_detector
+from velfield.detection.registry import shipped_detector
 
 SIDES = 64, 320
 Rectangle = tuple[int, int, int, int]

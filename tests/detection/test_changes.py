@@ -17,9 +17,10 @@ from velfield.detection.detect import (
     search_frame,
     split_into_boxes,
 )
-from velfield.detection.detector import Detections, concatenate, shipped_detector
 from velfield.detection.frame import ComparableFrame, half_resolution
+from velfield.detection.interface import Detections, concatenate
 from velfield.detection.mosaic import Box, assemble_kernel, find_in_boxes, owners_kernel, pack_boxes
+from velfield.detection.registry import shipped_detector
 
 _SHAPE = 300, 420
 

@@ -22,7 +22,7 @@ from velfield.detection.cnn.network import (
     network_to_record,
 )
 from velfield.detection.cnn.trainer import Trainer, train
-from velfield.detection.detector import from_record, shipped_detector
+from velfield.detection.registry import shipped_detector, train_detector
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 
@@ -95,18 +95,20 @@ def test_the_shipped_network_detects_cars_of_an_unseen_city() -> None:
 def test_fine_tuning_is_deterministic_and_keeps_the_attribution() -> None:
     few = replace(city(9504), cars=city(9504).cars[:12], complete=False)
     config = CnnConfig(fine_tune_steps=5)
-    one, again = (fine_tune([few], shipped_detector(), config) for _ in range(2))
-    assert one.record == again.record
-    assert one.record.attribution == shipped_detector().record.attribution
-    assert one.threshold == shipped_detector().threshold  # too few cars for folds
-    assert one.record.onnx != shipped_detector().record.onnx
+    record = shipped_detector().record
+    one, again = (fine_tune([few], shipped(), record, config) for _ in range(2))
+    assert one == again
+    assert one.attribution == record.attribution
+    assert one.threshold == record.threshold  # too few cars for folds
+    assert one.onnx != record.onnx
 
 
 def test_the_threshold_of_few_cars_is_shrunk_towards_the_pretrained_one() -> None:
     labelled = city(9504)
-    own = fine_tune([labelled], shipped_detector(), CnnConfig(fine_tune_steps=2)).record
-    strict = shipped_detector().record.model_copy(update={"threshold": shipped_detector().threshold + 0.1})
-    shrunk = fine_tune([labelled], from_record(strict), CnnConfig(fine_tune_steps=2)).record
+    config, record = CnnConfig(fine_tune_steps=2), shipped_detector().record
+    own = fine_tune([labelled], shipped(), record, config)
+    strict = record.model_copy(update={"threshold": record.threshold + 0.1})
+    shrunk = fine_tune([labelled], shipped(), strict, config)
     weight = len(labelled.cars) / (len(labelled.cars) + 150)
     assert shrunk.threshold - own.threshold == pytest.approx(0.1 * (1 - weight))
     assert own.curve is not None
@@ -116,4 +118,4 @@ def test_the_threshold_of_few_cars_is_shrunk_towards_the_pretrained_one() -> Non
 
 def test_a_network_for_cars_of_another_size_is_not_fine_tuned() -> None:
     with pytest.raises(InputError, match="cars of 16 px to continue, expected 20 px"):
-        fine_tune([city(9504)], shipped_detector(), CnnConfig(working_car_length_px=20.0))
+        train_detector([city(9504)], CnnConfig(working_car_length_px=20.0))

@@ -18,9 +18,9 @@ from velfield.detection.cnn.model import (
     find_peaks,
 )
 from velfield.detection.cnn.network import Network
-from velfield.detection.detector import shipped_detector
 from velfield.detection.nms import nms_oriented
 from velfield.detection.orientation import axial_difference
+from velfield.detection.registry import shipped_detector
 
 
 def network() -> Network:
@@ -196,7 +196,7 @@ def test_the_number_of_threads_changes_nothing_that_matters() -> None:
     import onnxruntime as ort
 
     from velfield.detection.cnn.network import network_to_onnx, open_session
-    from velfield.detection.detector import shipped_detector
+    from velfield.detection.registry import shipped_detector
 
     model = network_to_onnx(shipped_detector().network)  # type: ignore[attr-defined]
     session = open_session(model, "cpu")

@@ -8,13 +8,14 @@ import pytest
 
 from schemas.detector import CnnConfig, PaperConfig
 from velfield.bench.detection import row_response
-from velfield.detection.boosting import BoostedStumps
 from velfield.detection.detect import FrameDetections, detect_frame
-from velfield.detection.detector import Detector, shipped_detector, train_detector
+from velfield.detection.interface import Detector
 from velfield.detection.orientation import axial_difference
-from velfield.detection.paper.response import dense_response
+from velfield.detection.registry import shipped_detector, train_detector
 from velfield.detection.samples import LabelledImage
+from velfield.detection.stumps import BoostedStumps
 from velfield.errors import InputError
+from velfield.paper.response import dense_response
 from velfield.pipeline.stages.labels import rescale
 from velfield.synthetic import Flight, small_flight
 
@@ -109,7 +110,7 @@ def test_the_papers_detector_by_the_response_at_every_pixel(monkeypatch: pytest.
     def at_every_pixel(image: np.ndarray, stumps: BoostedStumps, *, grey_bits: int) -> np.ndarray:
         return row_response(image, stumps, grey_bits)
 
-    monkeypatch.setattr("velfield.detection.paper.detector.dense_response", at_every_pixel)
+    monkeypatch.setattr("velfield.paper.detector.dense_response", at_every_pixel)
     plain = detect_frame(truth.image, None, detector("paper"))
     gap = np.hypot(*(ours.xy[:, None] - plain.xy[None]).transpose(2, 0, 1))
     for nearest in (gap.min(axis=0), gap.min(axis=1)):

@@ -21,7 +21,7 @@ from tests.detection.test_onnx import tiny_yolo
 from velfield.detection.cnn import network as networks
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.network import Network
-from velfield.detection.detector import shipped_detector
+from velfield.detection.registry import shipped_detector
 from velfield.errors import DeviceWarning, InputError
 from velfield.pipeline import check_inputs
 

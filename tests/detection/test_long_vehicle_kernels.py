@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from velfield.detection.boosting import BoostedStumps, FeaturePool, draw_feature_pool
 from velfield.detection.long_vehicles.feature_image import (
     PAD_PX,
     FeatureImage,
@@ -18,6 +17,8 @@ from velfield.detection.long_vehicles.feature_image import (
     pack_poses,
     pack_words_kernel,
 )
+from velfield.detection.stumps import BoostedStumps
+from velfield.paper.boosting import FeaturePool, draw_feature_pool
 
 FLOOR = 12.0
 FINE = PatchScale(1, (14, 11))

@@ -16,10 +16,11 @@ from schemas.detector import OnnxLayout
 from schemas.job import Job
 from schemas.summary import RunSummary
 from velfield import open_run
-from velfield.detection.detector import Detector, load_detector
+from velfield.detection.interface import Detector
 from velfield.detection.onnx.boxes import Boxes, suppress
 from velfield.detection.onnx.description import describe_model
 from velfield.detection.onnx.detector import OnnxDetector
+from velfield.detection.registry import load_detector
 from velfield.errors import InputError
 from velfield.pipeline.georeference import plan_of_finished
 from velfield.pipeline.plan import Plan

@@ -7,7 +7,7 @@ from velfield.bench.scenes import simulated_image
 from velfield.detection.cnn.dataset import PatchDataset
 from velfield.detection.cnn.network import Network
 from velfield.detection.cnn.trainer import LossNormaliser, Trainer, focal_loss_and_gradient
-from velfield.detection.detector import shipped_detector
+from velfield.detection.registry import shipped_detector
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: `pip install torch`")
 

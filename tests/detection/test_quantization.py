@@ -27,7 +27,7 @@ from velfield.detection.cnn.quantization import (
     place_heatmaps_kernel,
     quantized_to_onnx,
 )
-from velfield.detection.detector import load_detector, shipped_detector
+from velfield.detection.registry import load_detector, shipped_detector
 
 
 def cars(seed: int = 0, shape: tuple[int, int] = (208, 304)) -> GreyImage:

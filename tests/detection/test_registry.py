@@ -19,9 +19,8 @@ from schemas.detector import (
     Round,
 )
 from velfield.detection.detect import detect_frame
-from velfield.detection.detector import (
-    Detections,
-    Detector,
+from velfield.detection.interface import Detections, Detector
+from velfield.detection.registry import (
     detector_class,
     from_record,
     load_detector,
@@ -74,7 +73,7 @@ class ToyDetector(Detector):
 
 @pytest.fixture
 def toy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("velfield.detection.detector._CLASSES", {})
+    monkeypatch.setattr("velfield.detection.registry._CLASSES", {})
     register(ToyDetector)
 
 
@@ -184,7 +183,7 @@ def test_another_file_is_one_clear_line(content: str, problem: str, tmp_path: Pa
 
 
 def test_a_file_that_is_far_too_large_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("velfield.detection.detector.MAX_BYTES", 10)
+    monkeypatch.setattr("velfield.detection.registry.MAX_BYTES", 10)
     file = tmp_path / "detector.json"
     file.write_text("x" * 11)
     with pytest.raises(InputError, match="found 11 bytes, expected 10 at most"):

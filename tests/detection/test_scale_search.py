@@ -7,7 +7,7 @@ import pytest
 
 from schemas.arrays import FloatArray, GreyImage
 from velfield.bench.scenes import simulated_image
-from velfield.detection.detector import shipped_detector
+from velfield.detection.registry import shipped_detector
 from velfield.detection.scale_search import STEP, View, find_scale, is_plausible_scale
 from velfield.pipeline.stages.labels import rescale
 from velfield.tracking.dimensions import measure

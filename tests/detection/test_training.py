@@ -12,8 +12,8 @@ from flows.cli import app
 from flows.commands import train as train_command
 from schemas.flight import FramesConfig
 from schemas.tables import LABEL_COLUMNS
-from velfield.detection.detector import load_detector, shipped_detector
 from velfield.detection.orientation import axial_difference, fill_missing_orientation
+from velfield.detection.registry import load_detector, shipped_detector
 from velfield.errors import InputError
 from velfield.pipeline.stages.labels import check_label_scale, check_vehicle_length, labelled_images
 from velfield.sources.labels.labels import read_labels

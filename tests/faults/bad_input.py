@@ -125,7 +125,7 @@ def read_frames(path: Path, timestamps: Path | None = None) -> int:
 
 def read_detector(path: Path) -> int:
     """Load a detector, and look for cars: weights are read then."""
-    from velfield.detection.detector import load_detector
+    from velfield.detection.registry import load_detector
 
     image = np.random.default_rng(0).integers(0, 255, (64, 96), dtype=np.uint8)
     detector = load_detector(path)
@@ -175,7 +175,7 @@ def _onnx_files() -> tuple[bytes, ...]:
     from onnx import TensorProto, helper
 
     from velfield.detection.cnn.network import network_to_onnx
-    from velfield.detection.detector import shipped_detector
+    from velfield.detection.registry import shipped_detector
 
     good = network_to_onnx(shipped_detector().network)  # type: ignore[attr-defined]
     external = onnx.ModelProto.FromString(good)
@@ -193,7 +193,7 @@ def _onnx_files() -> tuple[bytes, ...]:
 def kinds(folder: Path) -> list[Kind]:
     """All kinds; `folder` gets the good files that others refer to."""
     from flows.runners import read_runner
-    from velfield.detection.detector import shipped_detector
+    from velfield.detection.registry import shipped_detector
     from velfield.pipeline.configuration import resolve_config
     from velfield.run.flight_record import read_flight_record
     from velfield.run.tables import read_tables

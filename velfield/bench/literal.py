@@ -12,9 +12,9 @@ from pathlib import Path
 
 from schemas.job import Inputs, Job
 from velfield.bench.detection import plain_response, random_stumps, row_response
-from velfield.detection.detector import load_detector
-from velfield.detection.paper.detector import PaperDetector
-from velfield.detection.paper.response import dense_response
+from velfield.detection.registry import load_detector
+from velfield.paper.detector import PaperDetector
+from velfield.paper.response import dense_response
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.local import compute_stages
 from velfield.pipeline.plan import Plan, make_plan, write_flight_record

@@ -36,8 +36,8 @@ from velfield.detection.changes import (
     changed_kernel,
     difference_kernel,
 )
-from velfield.detection.detector import Detections, Detector, concatenate
 from velfield.detection.frame import SearchableFrame, half_resolution
+from velfield.detection.interface import Detections, Detector, concatenate
 from velfield.detection.long_vehicles.classifier import confirm_long_vehicles
 from velfield.detection.mosaic import Box, find_in_boxes
 from velfield.detection.nms import nms_oriented

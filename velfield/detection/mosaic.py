@@ -13,8 +13,8 @@ from numba import njit
 
 from schemas.arrays import IntArray
 from velfield.detection.changes import CELL_PX
-from velfield.detection.detector import Detections, Detector, concatenate
 from velfield.detection.frame import SearchableFrame
+from velfield.detection.interface import Detections, Detector, concatenate
 
 Box = tuple[int, int, int, int]
 """Of cells: first row, first column, row and column after the last."""

@@ -7,8 +7,8 @@ import numpy as np
 
 from schemas.arrays import ByteArray, GreyImage
 from velfield.detection.detect import detect_frame, upright_chips
-from velfield.detection.detector import Detector
 from velfield.detection.evaluation import MATCH_PX, match_greedy
+from velfield.detection.interface import Detector
 from velfield.detection.samples import LabelledImage
 
 _COLUMNS, _ZOOM, _HEAD_PX, _MAX_CROPS = 16, 2, 22, 96

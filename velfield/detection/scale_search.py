@@ -12,8 +12,8 @@ import numpy as np
 from schemas.arrays import FloatArray, GreyImage, Mask
 from schemas.detector import DetectorConfig
 from velfield.detection.detect import oriented_strips
-from velfield.detection.detector import Detector
 from velfield.detection.frame import half_resolution
+from velfield.detection.interface import Detector
 
 STEP = 1.25
 """Between the scales that are tried: the network finds cars that are a quarter larger or smaller too."""

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from schemas.arrays import GreyImage
 from velfield.camera.lens import pinhole
-from velfield.detection.detector import Detector, load_detector
+from velfield.detection.interface import Detector
+from velfield.detection.registry import load_detector
 from velfield.errors import Failure, InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import committed

@@ -17,7 +17,7 @@ from typing import Any
 from schemas.job import Job
 from schemas.records import InputsRecord
 from schemas.summary import RunSummary
-from velfield.detection.detector import shipped_detector
+from velfield.detection.registry import shipped_detector
 from velfield.pipeline.graphs import compute_here, unit_graph
 from velfield.pipeline.plan import Plan, write_flight_record
 from velfield.pipeline.result import without_progress

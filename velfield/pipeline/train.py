@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from schemas.flight import FlightConfig
-from velfield.detection.detector import Detector, load_detector, shipped_detector, train_detector
+from velfield.detection.interface import Detector
+from velfield.detection.registry import load_detector, shipped_detector, train_detector
 from velfield.detection.review import collect_tp_fn_fp_crops, contact_sheet
 from velfield.detection.samples import LabelledImage
 from velfield.detection.scale_search import working_scale

@@ -12,7 +12,7 @@ def detection(*, size: str = "2560x1920") -> int:
         Frame size, WxH in pixels.
     """
     from velfield.bench.detection import city, cnn_speed, response_speed
-    from velfield.detection.detector import shipped_detector
+    from velfield.detection.registry import shipped_detector
 
     image = city(*parse_frame_size(size, "128 or more each, as 2560x1920", min_px=128))
     for speed in response_speed(image):

@@ -130,7 +130,7 @@ def _time_stages(plan: "Plan") -> dict[str, float]:
 
 def _time_network(width: int, height: int) -> None:
     from velfield.bench.detection import city, cnn_speed, matmul_gflops, network_gflop
-    from velfield.detection.detector import shipped_detector
+    from velfield.detection.registry import shipped_detector
 
     image, peak = city(width, height), matmul_gflops()
     network = cnn_speed(image, shipped_detector())

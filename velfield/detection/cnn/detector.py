@@ -21,8 +21,8 @@ from velfield.detection.cnn.network import (
     uses_cuda,
 )
 from velfield.detection.cnn.quantization import calibrate, is_exact
-from velfield.detection.detector import Detections, Detector, shipped_detector
 from velfield.detection.frame import SearchableFrame, whole_frame
+from velfield.detection.interface import Detections, Detector
 from velfield.detection.long_vehicles.classifier import suppress_and_centre
 from velfield.detection.orientation import CAR_ASPECT
 from velfield.detection.samples import LabelledImage
@@ -123,14 +123,12 @@ class CnnDetector(Detector):
 
     @classmethod
     def train(cls, samples: Sequence[LabelledImage], config: CnnConfig, *, base: Detector | None = None) -> Detector:
-        """Fine-tune the base, or the pre-trained network."""
-        pretrained = shipped_detector() if base is None else base
-        if not isinstance(pretrained, CnnDetector):
-            raise InputError(
-                f"found a detector of method {pretrained.method} to continue, expected one of method cnn; "
-                "leave --continue out"
-            )
-        return fine_tune(samples, pretrained, config)
+        """Fine-tune the base."""
+        if not isinstance(base, CnnDetector):
+            found = "nothing" if base is None else f"a detector of method {base.method}"
+            raise InputError(f"found {found} to continue, expected a detector of method cnn; leave --continue out")
+        base.check_car_length(config.working_car_length_px)
+        return cls(fine_tune(samples, base.network, base.record, config))
 
 
 DETECTOR = CnnDetector

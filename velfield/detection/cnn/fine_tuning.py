@@ -6,7 +6,6 @@ images and evaluated there. With few labels it is shrunk towards the pre-trained
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -32,9 +31,6 @@ from velfield.detection.orientation import fill_missing_orientation
 from velfield.detection.samples import LabelledImage, in_region, restrict_to_region
 from velfield.parallel import parallel_map, usable_processors
 
-if TYPE_CHECKING:
-    from velfield.detection.cnn.detector import CnnDetector
-
 _FOLDS = 2
 """Each trained for its share of the steps, so that all of them cost as much as the network itself."""
 _FINE_TUNING_RATE = 1e-3
@@ -47,7 +43,7 @@ _PRIOR_CARS = 150
 cars of another site without a gain; in four cases of four the best threshold lay nearer to the pre-trained one."""
 
 
-def fine_tune(samples: Sequence[LabelledImage], pretrained: "CnnDetector", config: CnnConfig) -> "CnnDetector":
+def fine_tune(samples: Sequence[LabelledImage], pretrained: Network, record: CnnRecord, config: CnnConfig) -> CnnRecord:
     """Fine-tune a pre-trained network on labelled images and choose its score threshold on held-out folds.
 
     Parameters
@@ -55,37 +51,27 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: "CnnDetector", confi
     samples
         Labelled images. Where labels are incomplete, what the pre-trained network detects elsewhere is not used as
         background.
-
-    Raises
-    ------
-    InputError
-        The pre-trained detector is for cars of another size.
+    record
+        Of the pre-trained detector: its threshold, and who made it.
     """
-    pretrained.check_car_length(config.working_car_length_px)
-    masked = parallel_map(lambda sample: _mask_unlabelled_positives(sample, pretrained.network), samples)
+    masked = parallel_map(lambda sample: _mask_unlabelled_positives(sample, pretrained), samples)
     count = sum(len(sample.cars) for sample in samples)
     folds = _FOLDS if count >= MIN_CARS_FOR_FOLDS else 0
     tasks: list[int | None] = [None, *range(folds)]
     spare = usable_processors() > len(tasks) - 1  # the folds together take as long as the network itself
     (network, _), *held_out = parallel_map(
-        lambda fold: _fine_tune_fold(
-            masked, pretrained.network, config, fold, pretrained.record.tta_range, halves_at_once=spare
-        ),
+        lambda fold: _fine_tune_fold(masked, pretrained, config, fold, record.tta_range, halves_at_once=spare),
         tasks,
     )
     evidence = merge_scores([part for _, parts in held_out for part in parts]) if held_out else None
-    threshold, curve = select_threshold(evidence, pretrained.threshold, FOLDS_DESCRIPTION)
+    threshold, curve = select_threshold(evidence, record.threshold, FOLDS_DESCRIPTION)
     if curve is not None:
         weight = count / (count + _PRIOR_CARS)
-        threshold = weight * threshold + (1 - weight) * pretrained.threshold
+        threshold = weight * threshold + (1 - weight) * record.threshold
         nearest = int(np.abs(np.array(curve.threshold) - threshold).argmin())
         curve = curve.model_copy(update={"operating_point": nearest})
-    record = make_record(network, threshold if config.threshold is None else config.threshold, curve, count, config)
-    return type(pretrained)(
-        record.model_copy(
-            update={"attribution": pretrained.record.attribution, "tta_range": pretrained.record.tta_range}
-        )
-    )
+    found = make_record(network, threshold if config.threshold is None else config.threshold, curve, count, config)
+    return found.model_copy(update={"attribution": record.attribution, "tta_range": record.tta_range})
 
 
 def select_threshold(

@@ -13,11 +13,11 @@ import numpy as np
 
 from schemas.arrays import Float32Array, FloatArray, Mask
 from schemas.detector import LongVehicleRecord
-from velfield.detection.boosting import BoostedStumps
-from velfield.detection.detector import Detections, concatenate
 from velfield.detection.frame import SearchableFrame
+from velfield.detection.interface import Detections, concatenate
 from velfield.detection.long_vehicles.feature_image import FeatureImage, OffsetScorer, PatchScale, features_of_reduced
 from velfield.detection.nms import in_view, nms_oriented, offset_along_axis
+from velfield.detection.stumps import BoostedStumps
 
 LONG = PatchScale(2, (16, 7))
 MIN_LENGTH_RATIO = 1.4

@@ -24,8 +24,8 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray
-from velfield.detection.boosting import BoostedStumps
 from velfield.detection.long_vehicles.rounds import LANES, score_offsets, signed_corners
+from velfield.detection.stumps import BoostedStumps
 
 CHANNELS = 3
 """Grey, |gradient along|, |gradient across|."""

@@ -7,7 +7,8 @@ import numpy as np
 from schemas.arrays import FloatArray
 from schemas.scale import ScaleEstimate
 from velfield.analysis.vehicle_scale import CAR_LENGTH_M
-from velfield.detection.detector import Detector, shipped_detector
+from velfield.detection.interface import Detector
+from velfield.detection.registry import shipped_detector
 from velfield.detection.scale_search import STEP, View, find_scale, is_plausible_scale
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import advance

@@ -12,7 +12,7 @@ import numpy as np
 from schemas.report import PrecisionRecall, Report, ReportStage, ResidualSeries
 from schemas.summary import RunSummary, StageSummary
 from velfield.analysis.coverage import low_coverage_note, percent
-from velfield.detection.detector import load_detector
+from velfield.detection.registry import load_detector
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.stage import STAGES
 from velfield.report.report import render_report

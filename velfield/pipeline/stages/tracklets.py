@@ -8,7 +8,7 @@ import numpy as np
 
 from schemas.arrays import IntArray, Mask
 from schemas.tables import DETECTION_COLUMNS, TRACKLET_COLUMNS
-from velfield.detection.detector import ONNX_SUFFIX
+from velfield.detection.registry import ONNX_SUFFIX
 from velfield.pipeline.plan import Plan, widen_interval
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.registration import MAP_PARAMETERS, usable_frames

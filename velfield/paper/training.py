@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from schemas.arrays import GreyImage, IntArray, Mask
 from schemas.detector import PaperConfig, PaperRecord
-from velfield.detection.boosting import (
-    BoostedStumps,
+from velfield.detection.samples import LabelledImage
+from velfield.detection.stumps import BoostedStumps
+from velfield.paper.boosting import (
     FeaturePool,
     assign_bins,
     boost,
@@ -18,8 +19,7 @@ from velfield.detection.boosting import (
     quantile_bin_edges,
     rounds_from_stumps,
 )
-from velfield.detection.paper.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, dense_response, quantise_and_pad
-from velfield.detection.samples import LabelledImage
+from velfield.paper.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, dense_response, quantise_and_pad
 
 _REACH_PX = 40
 _MAX_CAR_SAMPLES = 4000

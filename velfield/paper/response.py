@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from schemas.arrays import Float32Array, GreyImage, Mask
-from velfield.detection.boosting import BoostedStumps
+from velfield.detection.stumps import BoostedStumps
 
 MARGIN_PX = 64
 """Images are extended by this at their edges: no rectangle reaches farther."""

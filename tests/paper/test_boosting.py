@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from velfield.detection import boosting
-from velfield.detection.boosting import (
+from velfield.detection.stumps import BoostedStumps
+from velfield.paper import boosting
+from velfield.paper.boosting import (
     N_BINS,
-    BoostedStumps,
     assign_bins,
     boost,
     draw_feature_pool,

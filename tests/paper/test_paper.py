@@ -11,11 +11,11 @@ from skimage.segmentation import watershed
 
 from schemas.detector import PaperConfig
 from velfield.bench.detection import plain_response, random_stumps, row_response
-from velfield.detection.detector import train_detector
 from velfield.detection.orientation import axial_difference
-from velfield.detection.paper.response import dense_response, quantise_and_pad, response_at_even_pixels
-from velfield.detection.paper.segmentation import region_moments, segment_response
+from velfield.detection.registry import train_detector
 from velfield.detection.samples import LabelledImage
+from velfield.paper.response import dense_response, quantise_and_pad, response_at_even_pixels
+from velfield.paper.segmentation import region_moments, segment_response
 
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -7,13 +7,13 @@ from typing import ClassVar
 
 from schemas.arrays import GreyImage, Mask
 from schemas.detector import PaperConfig, PaperRecord
-from velfield.detection.boosting import BoostedStumps
-from velfield.detection.detector import Detections, Detector
-from velfield.detection.paper.response import dense_response
-from velfield.detection.paper.segmentation import region_moments, segment_response
-from velfield.detection.paper.training import train_paper
+from velfield.detection.interface import Detections, Detector
 from velfield.detection.samples import LabelledImage
+from velfield.detection.stumps import BoostedStumps
 from velfield.errors import InputError
+from velfield.paper.response import dense_response
+from velfield.paper.segmentation import region_moments, segment_response
+from velfield.paper.training import train_paper
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ features, and weights are trimmed (Friedman, Hastie and Tibshirani 2000). Hand-w
 dependency, and its AdaBoost sorts unbinned values for every stump.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -229,42 +228,3 @@ def rounds_from_stumps(pool: FeaturePool, stumps: StumpSelection) -> tuple[Round
         }
         rounds.append(Round.model_validate(fields))
     return tuple(rounds)
-
-
-@dataclass(frozen=True)
-class BoostedStumps:
-    """A boosted classifier as arrays, for the kernels.
-
-    Attributes
-    ----------
-    rectangles
-        (r, 5) int32: sign, x0, y0, x1, y1 from the centre.
-    starts
-        (rounds + 1,) int32: the rectangles of round k are ``starts[k]:starts[k + 1]``.
-    channels
-        (rounds,) int32.
-    thresholds, leaves
-        (rounds,) and (rounds, 2) float32: what a round adds to the score at or below its threshold, and above.
-    """
-
-    rectangles: Int32s
-    starts: Int32s
-    channels: Int32s
-    thresholds: Float32Array
-    leaves: Float32Array
-
-    @classmethod
-    def from_rounds(cls, rounds: Sequence[Round]) -> "BoostedStumps":
-        """Of a detector's record."""
-        table = [(r.sign, r.x0, r.y0, r.x1, r.y1) for one in rounds for r in one.rectangles]
-        starts = np.cumsum([0, *(len(one.rectangles) for one in rounds)])
-        return cls(
-            rectangles=np.array(table, np.int32).reshape(-1, 5),
-            starts=starts.astype(np.int32),
-            channels=np.array([one.channel for one in rounds], np.int32),
-            thresholds=np.array([one.threshold for one in rounds], np.float32),
-            leaves=np.array([(one.leaf_low, one.leaf_high) for one in rounds], np.float32),
-        )
-
-    def __len__(self) -> int:
-        return len(self.thresholds)
