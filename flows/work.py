@@ -143,7 +143,7 @@ class Work:
         return k
 
     def _restart_before(self, stage: Stage) -> None:
-        """Where a flight is long, let a stage that takes much memory start without what earlier work left."""
+        """Restart the workers of a long flight before a stage that takes much memory."""
         if not (stage.new_workers and is_long(self.plan)):
             return
         units = stage_units(self.plan, stage)
@@ -287,7 +287,7 @@ def _without_outputs(record: CommitRecord) -> CommitRecord:
 def _worth_retrying(_task: Any, run: Any, state: Any) -> bool:
     """Bad input stays bad, and a full disk full: only what may pass, such as a killed worker, is tried again.
 
-    What killed all workers that tried it is given to a fresh one once: more would kill those of other units too.
+    A unit that killed all workers that tried it gets one more, fresh worker: further ones would kill other units too.
     """
     try:
         state.result()

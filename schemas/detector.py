@@ -176,7 +176,7 @@ class LayerRecord(Model):
 
 
 class BaseRecord(Model):
-    """What the file of every trained detector holds."""
+    """Content that every detector file has in common."""
 
     kind: Literal["velfield-detector"] = "velfield-detector"
     version: Literal[2] = 2
@@ -223,7 +223,7 @@ class PaperRecord(BaseRecord):
     method: Literal["paper"] = "paper"
     rounds: tuple[Round, ...] = Field(min_length=1, max_length=50_000)
     grey_bits: int = Field(default=8, ge=1, le=8)
-    """So many bits of the grey levels are read."""
+    """Number of most significant bits of the grey levels that are used."""
     response_sigma_px: PositiveFloat = 3.0
     """Gaussian blur of the response before its maxima are taken."""
     min_region_px: PositiveInt = 10
@@ -231,7 +231,7 @@ class PaperRecord(BaseRecord):
 
 
 OnnxLayout = Literal["boxes", "oriented_boxes", "boxes_with_objectness", "end_to_end", "end_to_end_oriented"]
-"""What a YOLO-type network gives for an image: ``boxes``, (4 + classes, n) as of YOLOv8 and later; ``oriented_boxes``,
+"""Output of a YOLO-type network for an image: ``boxes``, (4 + classes, n) as of YOLOv8 and later; ``oriented_boxes``,
 the same and an angle; ``boxes_with_objectness``, (n, 5 + classes) as of YOLOv5; ``end_to_end``, (n, 6) corners, score
 and class, duplicates suppressed; ``end_to_end_oriented``, (n, 7) centre, size, score, class and angle."""
 
@@ -288,6 +288,6 @@ class DimensionsRecord(Model):
     widths: list[PositiveInt]
     """Numbers of values from layer to layer, input and output included."""
     weights_f16: list[str]
-    """Of each layer (in, out), half precision, base64."""
+    """Weights of each layer (in, out), half precision, base64."""
     biases_f16: list[str]
-    """Of each layer (out,)."""
+    """Biases of each layer (out,), half precision, base64."""

@@ -55,7 +55,7 @@ _NAMES: dict[ScaleSource, str] = {
 
 
 class ScaleChoice(Model):
-    """Which estimate a run uses, and what the others say."""
+    """The estimate of scale that a run uses, and the others."""
 
     used: ScaleEstimate | None = None
     """None: no source knows the scale, and speeds stay in px/s."""

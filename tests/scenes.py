@@ -46,7 +46,7 @@ def by_homography(matrix: FloatArray, xy: FloatArray) -> FloatArray:
 
 
 def photograph(ground: GreyImage, to_ground: FloatArray, lens: Lens, shape: tuple[int, int], seed: int) -> GreyImage:
-    """What a camera sees: ``to_ground`` (3, 3) takes undistorted frame px to ground px; twofold oversampled, noisy."""
+    """A photograph: ``to_ground`` (3, 3) takes undistorted frame px to ground px; twofold oversampled, noisy."""
     height, width = shape
     y, x = np.mgrid[0 : 2 * height, 0 : 2 * width]
     raw = np.stack([(x.ravel() + 0.5) / 2 - 0.5, (y.ravel() + 0.5) / 2 - 0.5], axis=1)

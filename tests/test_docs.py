@@ -184,7 +184,7 @@ def reference_rows() -> list[str]:
 
 
 def parameter_names(function: Any) -> str:
-    """Those of a method, a star before those that must be named."""
+    """Parameters of a method, with a star before the keyword-only ones."""
     found = list(signature(function).parameters.values())[1:]
     by_name = [one.name for one in found if one.kind is Parameter.KEYWORD_ONLY]
     others = [one.name for one in found if one.kind is not Parameter.KEYWORD_ONLY]

@@ -1,4 +1,4 @@
-"""What pyproject promises: the extras that pages and messages name, and a lock that holds them all."""
+"""Promises of pyproject: the extras that pages and messages name, and a lock that holds them all."""
 
 import json
 import re
@@ -51,7 +51,7 @@ def test_the_lock_is_within_the_bounds() -> None:
 
 
 def test_the_licences_of_what_ships_are_listed() -> None:
-    """Of the page's packages, with their versions, and of the data that the detectors were trained on."""
+    """The page's packages with their versions, and the data that the detectors were trained on, are listed."""
     listed = (ROOT / "THIRD-PARTY-LICENSES.md").read_text()
     assert "THIRD-PARTY-LICENSES.md" in PROJECT["license-files"]
     packages = json.loads((ROOT / "page/package.json").read_text())["dependencies"]

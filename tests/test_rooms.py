@@ -58,7 +58,7 @@ def test_imports_go_down_the_floors() -> None:
 
 
 def names_of(module: str) -> set[str]:
-    """What a module offers; of a tool whose library is not in the environment, what its text defines."""
+    """Names that a module defines; for a tool whose library is not installed, the names in its source."""
     try:
         return set(dir(importlib.import_module(module)))
     except ModuleNotFoundError as error:
@@ -74,7 +74,7 @@ def test_only_tools_import_what_velfield_does_not_install() -> None:
 
 
 def test_every_import_within_the_house_is_there() -> None:
-    """Those inside functions too, which nothing imports before a command runs."""
+    """Imports inside functions are checked too, which nothing imports before a command runs."""
     missing = []
     for path in modules():
         for node in ast.walk(ast.parse(path.read_text())):

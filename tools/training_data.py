@@ -154,7 +154,7 @@ def read_oriented(
     Parameters
     ----------
     car_length_px
-        Of the pictures; none: the median of those labelled as cars.
+        Length of a car in the pictures, px; None: the median length of the labelled cars.
     not_vehicles
         Classes that are background; ``ignore`` and ``motorcycle`` are neither.
     nominal_length_px

@@ -23,7 +23,7 @@ class Vectors:
     Parameters
     ----------
     context, build, signature, arguments
-        What numba gives an intrinsic that is to generate its code.
+        Arguments that numba passes to an intrinsic's code generator.
     lanes
         Values in a vector, a power of two. LLVM makes of a vector as many of the processor's as it needs.
 
@@ -34,7 +34,7 @@ class Vectors:
     lanes
         As given.
     arguments
-        Of the intrinsic: pointers to the first value of arrays, all else as it is.
+        Arguments of the intrinsic: a pointer to the first value of each array, all else unchanged.
     """
 
     def __init__(self, context: Any, build: Any, signature: Any, arguments: Any, lanes: int) -> None:

@@ -54,7 +54,7 @@ def driven(seed: int = 913, seconds: float = 140.0) -> TrueTracks:
 
 
 def clip(tracks: TrueTracks, begin_s: float, end_s: float) -> TrueTracks:
-    """What is seen between two times."""
+    """The tracks between two times."""
     keep = (tracks.time_s >= begin_s) & (tracks.time_s < end_s)
     owner = np.repeat(np.arange(len(tracks.first) - 1), np.diff(tracks.first))[keep]
     first = np.r_[0, np.flatnonzero(np.diff(owner)) + 1, len(owner)].astype(np.int64)

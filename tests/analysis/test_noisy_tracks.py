@@ -1,4 +1,4 @@
-"""What is said of tracks with errors, and of short clips, is true or withheld."""
+"""Answers about tracks with errors, and about short clips, are true or withheld."""
 
 import numpy as np
 import pytest

@@ -62,7 +62,7 @@ class TrueGrid:
 
 
 def scale_by(record: GeoreferenceRecord, source: str) -> ScaleEstimate | None:
-    """What one source gave."""
+    """The estimate by one source, None if there is none."""
     every = [record.scale.used, *record.scale.others]
     return next((one for one in every if one is not None and one.source == source), None)
 

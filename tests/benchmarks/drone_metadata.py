@@ -15,7 +15,7 @@ from velfield.sources.telemetry.placement import estimate_north, estimate_scale
 
 
 def errors(seed: int) -> tuple[float, float, bool]:
-    """Of scale, as a fraction; of north, deg; and whether the interval of the scale holds the truth."""
+    """Error of the scale, as a fraction; error of north, deg; and whether the scale's interval holds the truth."""
     config, poses = simulated_poses(seed)
     scale, north = estimate_scale(poses), estimate_north(poses)
     assert not isinstance(scale, Failure)

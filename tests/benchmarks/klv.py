@@ -21,7 +21,7 @@ from velfield.sources.telemetry.telemetry import Telemetry
 
 
 def errors(config: SimulationConfig, poses: FramePoses) -> tuple[float, float, bool]:
-    """Of the scale, %, of north, degrees, and whether the scale's interval holds the truth."""
+    """Error of the scale, %; error of north, degrees; and whether the scale's interval holds the truth."""
     scale, north = estimate_scale(poses), estimate_north(poses)
     assert isinstance(scale, ScaleEstimate)
     assert isinstance(north, North)

@@ -1,4 +1,4 @@
-"""What measured lengths of vehicles change in gaps and post-encroachment times: ``python -m tests.benchmarks.lengths``.
+"""Effect of measured vehicle lengths on gaps and post-encroachment times: ``python -m tests.benchmarks.lengths``.
 
 Simulated flights without images; lengths are the true ones with an error of 0.3 m (standard deviation), as of tracks.
 """

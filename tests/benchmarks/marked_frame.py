@@ -1,4 +1,4 @@
-"""What a run of the kharkiv clip found in the frame whose cars are marked by eye, tests/data/kharkiv_marks.csv.
+"""Detections of a run of the kharkiv clip in the frame whose cars are marked by eye, tests/data/kharkiv_marks.csv.
 
 velfield run FOLDER/kharkiv/drone.mp4 --gsd-m 0.426 --out RUN
 python -m tests.benchmarks.marked_frame RUN

@@ -21,7 +21,7 @@ def pairs(frames: int = 6) -> FramePairs:
 
 
 def record(a: float | None, a_sd: float = 0.01, *, accepted: bool = True) -> CameraRecord:
-    """What the plumb line gave: distortion ``a`` and its inflated deviation; None: no estimate at all."""
+    """A record of the plumb line: distortion ``a`` and its inflated deviation; None: no estimate at all."""
     lens = HarrisLens(a or 0.0, 320.0, 239.0, HALF) if accepted else pinhole(SHAPE)
     row = ModelEvidence(model="harris", parameters=(a or 0.0, 0.0, 0.0), residual_px=0.2, heldout_px=0.2)
     return CameraRecord(

@@ -88,7 +88,7 @@ def fitted(overlap: FramePairs) -> MultiViewFit:
 
 
 def lined(a: float, a_sd: float, *, accepted: bool = True) -> CameraRecord:
-    """What the straight lines gave: a distortion and its deviation, borne out or not."""
+    """A record of the straight lines: a distortion and its deviation, accepted or not."""
     return CameraRecord(
         lens=(lens_of(a) if accepted else pinhole(SHAPE)).to_record(),
         frame_width_px=WIDTH,

@@ -43,7 +43,7 @@ def streets(
 
 
 def by_straightness(lines: LineSet, a_sd: float, off: float) -> PlumbLineFit:
-    """What straightness might have said: off by ``off`` of its deviations, the centre by as much of 4 px."""
+    """A possible fit by straightness: wrong by ``off`` of its deviations, and the centre by as much of 4 px."""
     spread = np.array([a_sd, 4.0 / HALF, 4.0 / HALF])
     return PlumbLineFit(FAMILY, TRUTH + off * spread * (1, -1, 1), np.diag(spread**2), 0.2, np.ones(lines.count))
 

@@ -54,7 +54,7 @@ def test_axial_difference_is_a_distance_of_axes(a: float, b: float) -> None:
 @pytest.mark.parametrize("degrees", [0.0, 20.0, 45.0, 90.0, 130.0])
 @pytest.mark.parametrize("has_box", [False, True])
 def test_windscreens_do_not_mislead_the_outline(degrees: float, *, has_box: bool) -> None:
-    """What lies across a car is sharper than its sides, and there is as much of it."""
+    """The edges across a car are sharper than its sides, and as long."""
     label, angle = np.array([[32.0, 32.0, np.nan, np.nan, np.nan]]), np.radians(degrees)
     box_angle = np.array([np.arcsin(abs(np.sin(angle)))]) if has_box else None
     filled = fill_missing_orientation(car(degrees), label, box_angle)[0, 2]

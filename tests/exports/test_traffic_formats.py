@@ -1,4 +1,4 @@
-"""What engineers hand on: turning counts as a workbook, moving features, each read back by a reader of its own."""
+"""Files that engineers pass on: turning counts as a workbook, moving features, each read back by another reader."""
 
 import io
 import re

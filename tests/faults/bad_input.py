@@ -356,7 +356,7 @@ def _time_limit() -> Any:
 
 
 def problem_of_case(kind: Kind, data: bytes, folder: Path) -> str:
-    """What is wrong with the answer to a case; empty where it is accepted, or refused as it should be."""
+    """Fault of the answer to a case; empty if the case is accepted, or rejected as it should be."""
     place = folder / "case"
     place.mkdir(exist_ok=True)
     file = place / kind.file

@@ -113,7 +113,7 @@ def trials(flight: Flight, modes: Sequence[Mode], every: int) -> list[tuple[str,
 
 
 def sample(flight: Flight, count: int, seed: int, steps: Sequence[str] = STEPS) -> list[tuple[str, Mode, int]]:
-    """So many random trials, of which every stage has about as many: the field makes half of all calls."""
+    """``count`` random trials, spread evenly over the stages: the field alone makes half of all calls."""
     rng = np.random.default_rng(seed)
     return [
         (str(step), MODES[int(rng.integers(len(MODES)))], int(rng.integers(flight.calls[str(step)])))

@@ -34,7 +34,7 @@ _SAMPLE_S = 5.0
 
 @dataclass(frozen=True)
 class Sample:
-    """What the processes of a run held at one moment."""
+    """Memory and files that the processes of a run held at one moment."""
 
     seconds: float
     commits: int

@@ -1,4 +1,4 @@
-"""What `tests.faults.determinism` calls a difference, and how large."""
+"""Differences that `tests.faults.determinism` reports, and their sizes."""
 
 import json
 from pathlib import Path

@@ -158,7 +158,7 @@ def bases(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, P
 def test_a_wrong_base_image_is_refused_before_a_frame_is_stored(
     flight: Path, bases: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of flights that take long: a short one's base stage comes soon enough."""
+    """Long flights only: the base stage of a short one comes soon enough."""
     checked: list[object] = []
     plans = {name: make_plan(job(flight, tmp_path / "run", base=str(path))) for name, path in bases.items()}
     monkeypatch.setattr(check_inputs, "_LONG_PX", 1)

@@ -62,7 +62,7 @@ def test_a_cluster_file_that_is_none_is_refused(tmp_path: Path, text: str) -> No
 
 
 def test_workers_of_our_own_keep_memory_for_pictures() -> None:
-    """What Dask sets costs half as much time again."""
+    """Dask's own setting makes a run take half as long again."""
     from dask import delayed
 
     from flows.launch import prepare_process
@@ -259,7 +259,7 @@ _HIDDEN = "import sys; sys.modules['velfield'] = None; from distributed.cli.dask
 
 
 def test_workers_without_velfield_are_refused_and_live_on() -> None:
-    """What is of velfield would end each of them, one after the other, without a word to the run."""
+    """A task of velfield would end these workers one after the other, and the run would not notice."""
     with LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0") as cluster:
         address = cluster.scheduler_address
         options = ["--no-nanny", "--nthreads", "1", "--no-dashboard", "--host", "127.0.0.1"]

@@ -1,4 +1,4 @@
-"""What a run tells while a stage works, where its output is a file and no bar is seen."""
+"""Progress lines of a run whose output is a file, so that no bar is drawn."""
 
 import json
 

@@ -190,6 +190,6 @@ def test_kernels_are_loaded_before_they_are_called() -> None:
 
 
 def run_python(code: str) -> str:
-    """What a process of its own says of its failure, nothing where it succeeds."""
+    """Error output of a separate process, empty if it succeeds."""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     return (done.stderr or "failed") if done.returncode else ""

@@ -41,7 +41,7 @@ def shift(x: float, y: float) -> np.ndarray:
 
 
 def frame_of(base: np.ndarray, to_base: np.ndarray) -> np.ndarray:
-    """What a camera of that homography, raw to base px, sees of the base image."""
+    """The base image as seen by a camera with a homography from raw to base px."""
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     return cv2.warpPerspective(base, to_base, (WIDTH, HEIGHT), flags=flags, borderMode=cv2.BORDER_REPLICATE)
 
@@ -182,7 +182,7 @@ def test_shifts_beyond_the_limit_are_rejected(base: np.ndarray) -> None:
 
 
 def test_noise_moves_a_corner_as_far_as_its_sigma_predicts(base: np.ndarray) -> None:
-    """Of corners whose sigma lies well above the floor, the scatter over noisy frames is about that sigma."""
+    """The scatter of corners over noisy frames is about their sigma, if that lies well above the floor."""
     templates = make_templates(base)
     templates = templates.select(templates.sigma_px > 0.12)
     rng, errors = np.random.default_rng(0), []

@@ -165,7 +165,7 @@ def test_cross_validation_of_too_few_points_is_worse_than_any_error() -> None:
 
 
 def test_second_order_terms_without_need_raise_the_cross_validated_error() -> None:
-    """What chooses the model: on a plane and few points, nine more parameters fit noise."""
+    """The choice of the model: with a plane and few points, nine more parameters fit noise."""
     rng = np.random.default_rng(2)
     source = rng.uniform(0, 400, (30, 2))
     target = by_homography(TO_BASE, source) + rng.normal(0, 1.0, (30, 2))

@@ -308,7 +308,7 @@ def test_patches_are_found_below_the_pixel(shift_px: float) -> None:
 
 
 def test_patches_that_do_not_align_are_tried_in_turn() -> None:
-    """Of another sensor's base image most never align: a chain tries all of them within eight frames."""
+    """Most patches of another sensor's base image never align: a chain tries all of them within eight frames."""
     base, results = base_of("city"), registered("city", [0])
     (first,) = results
     history = _PatchHistory.begin(base, first)

@@ -22,7 +22,7 @@ def moved(matrix: np.ndarray, *, a: float = 0.0) -> FrameTransform:
 
 
 def wobbling(amplitude_px: float) -> FrameTransform:
-    """Of a frame of 640x480 whose rows move in x, in four cycles."""
+    """Transform of a frame of 640x480 whose rows move in x, in four cycles."""
     rows = np.zeros((3, 48))
     rows[0] = amplitude_px * np.sin(np.linspace(0, 2 * np.pi * 4, 48))
     return FrameTransform(

@@ -44,7 +44,7 @@ def flat(car: Car) -> list[float]:
 
 
 def box(car: Car) -> tuple[float, float, float, float]:
-    """Of the rectangle before it is turned: left, top, width, height."""
+    """The rectangle before it is rotated: left, top, width, height."""
     return car[0] + 0.5 - LENGTH / 2, car[1] + 0.5 - WIDTH / 2, LENGTH, WIDTH
 
 

@@ -1,4 +1,4 @@
-"""What drones write: subtitles of every format, tags of images, and scale, north and place by them."""
+"""Files that drones write: subtitles of every format, tags of images, and scale, north and place from them."""
 
 from pathlib import Path
 

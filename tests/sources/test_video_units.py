@@ -21,7 +21,7 @@ PATH, MS = Path("flight.mp4"), Fraction(1, 1000)
 
 @dataclass
 class FakePacket:
-    """What `CorruptionTracker` reads of a packet of PyAV."""
+    """The part of a PyAV packet that `CorruptionTracker` reads."""
 
     pts: int | None
     is_keyframe: bool = False

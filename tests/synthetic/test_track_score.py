@@ -14,7 +14,7 @@ def score(
     counts: tuple[bool, bool] = (True, True),
     lengths_px: tuple[float, float] = (16.0, 16.0),
 ) -> TrackScore:
-    """Of two vehicles at x = 0 and 20, standing; each frame gives the ids and the x of track positions."""
+    """Score of two stationary vehicles at x = 0 and 20; each frame gives the ids and the x of track positions."""
     objects = [
         FrameObjects(
             vehicle=VEHICLES,

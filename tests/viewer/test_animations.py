@@ -1,4 +1,4 @@
-"""What the page animates: the replay's files and the draws of the flow, read back; both in a real browser."""
+"""Animations of the page: the replay's files and the draws of the flow, read back; both in a real browser."""
 
 import base64
 import json

@@ -1,4 +1,4 @@
-"""What a run folder holds for its page: tiles of the base image, the list of layers, the report as a file."""
+"""Content of a run folder for its page: tiles of the base image, the list of layers, the report as a file."""
 
 import re
 import shutil

@@ -32,7 +32,8 @@ class Answer:
     estimate, unit
         The number that the answer gives, with its interval; None where it gives several, or none.
     at_most_per_h
-        Of a state ``none``: the rate that is not exceeded with 90 % probability; None in clips of less than a minute.
+        Upper bound, for the state ``none``: the rate that is not exceeded with 90 % probability; None in clips of less
+        than a minute.
     """
 
     topic: str

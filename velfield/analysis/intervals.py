@@ -145,7 +145,7 @@ def estimate_rate(
     counts
         (k,) events in k slices of equal length.
     exposure
-        Of all slices together, h.
+        Total time of all slices, h.
     dispersion
         Variance over mean, where it is known from elsewhere.
     """

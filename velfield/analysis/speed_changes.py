@@ -1,4 +1,4 @@
-"""How fast vehicles set off and come to a stop, and what that says of the times of a flight.
+"""Accelerations of vehicles that start and stop, as a check of the frame rate.
 
 An acceleration grows with the square of a wrong frame rate, and people accelerate much alike everywhere: comfort and
 tyres set it, not the street. So the median over the vehicles that set off or stop reveals a rate of twice or half the

@@ -54,7 +54,7 @@ class TrafficAnalysis:
     parked
         (n, 3) position, m, and axial orientation, rad, of parked vehicles; None: not known.
     classes
-        Of the vehicles of the trajectories; None: not known.
+        Class of the vehicle of each trajectory; None: unknown.
 
     Examples
     --------
@@ -181,7 +181,7 @@ class TrafficAnalysis:
 
     @cached_property
     def reductions(self) -> list[Reduction]:
-        """How each junction slows the vehicles of each lane into it that do not stop."""
+        """Speed reduction by each junction of the vehicles that enter it by each lane without stopping."""
         first = np.searchsorted(self.samples.track, np.arange(len(self.trajectories) + 1))
         arrays = PathArrays(first, self.samples.time_s, self.samples.speed_m_per_s)
         out = []
@@ -215,5 +215,5 @@ class TrafficAnalysis:
 
     @cached_property
     def doubtful_places(self) -> list[DoubtfulPlace]:
-        """Where tracks are unlikely to be vehicles."""
+        """Places where tracks are unlikely to be vehicles."""
         return find_doubtful_places(self.trajectories)

@@ -338,7 +338,7 @@ def sample_paths(trajectories: Trajectories, spacing_m: float = 1.0) -> PathSamp
 def _find_vertices(
     xy: FloatArray, a: int, b: int, min_step: float, vertex: IntArray, along: FloatArray
 ) -> tuple[int, float]:
-    """How many vertices the path of the rows ``a`` to ``b`` has, its length; written: their rows, and how far along.
+    """Number of vertices of the path of the rows ``a`` to ``b``, and its length; writes their rows and distances along.
 
     Vertices are positions at least ``min_step`` from the vertex before.
     """

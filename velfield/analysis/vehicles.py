@@ -117,7 +117,7 @@ def _position_sd_px(tracklets: pd.DataFrame, ids: IntArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _DrivenLanes:
-    """Where vehicles drove, and along which axis: sorted keys of cells and sectors."""
+    """Cells in which vehicles drove, with the sector of their axis: sorted keys."""
 
     keys: IntArray
 

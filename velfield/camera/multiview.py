@@ -250,7 +250,7 @@ def _weights(residuals: FloatArray, valid: Mask) -> FloatArray:
 class _ReducedEquations:
     """Normal equations with the homographies eliminated (Schur complement).
 
-    Of each pair: the normal matrix (pairs, m, m) and right-hand side (pairs, m) of its shared parameters, at
+    For each pair: the normal matrix (pairs, m, m) and right-hand side (pairs, m) of its shared parameters, at
     ``indices`` (pairs, m) among all; ``own`` (pairs, 8) and ``coupling`` (pairs, 8, m) give the homographies by back
     substitution.
     """

@@ -366,8 +366,8 @@ def _decide(
 def harris_amount(fit: PlumbLineFit) -> tuple[float, float]:
     """Distortion as Harris' a, and its standard deviation.
 
-    Of a lens of several terms it is the a of the Harris lens that displaces as much at `_COMPARED_RADIUS`: where one
-    term cannot describe the lens, its value depends on where the lines happen to lie.
+    For a lens of several terms, the a of the Harris lens with the same displacement at `_COMPARED_RADIUS`: if one term
+    cannot describe the lens, its fitted value depends on where the lines happen to lie.
     """
     if fit.family.name == "harris":
         return float(fit.parameters[0]), float(np.sqrt(fit.covariance[0, 0]))

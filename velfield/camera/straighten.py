@@ -139,7 +139,8 @@ def _information(
 def _prior(information: FloatArray, score_covariance: FloatArray) -> FloatArray:
     """Diagonal precision of the prior on the centre, in units of the cost.
 
-    Those follow from the sandwich covariance, clustered by line: errors of a line's points are correlated.
+    The standard deviations follow from the sandwich covariance, clustered by line: errors of a line's points are
+    correlated.
     """
     diagonal = np.full(len(information), 1e-9)
     bread = np.linalg.inv(information + np.diag(diagonal))

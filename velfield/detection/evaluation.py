@@ -18,7 +18,7 @@ MIN_CURVE_SCORE = -0.25
 FOLDS_DESCRIPTION = "cars in held-out stripes of the images, detected by detectors trained on the other stripes"
 _CURVE_POINTS = 400
 _RECALL_FRACTION = 0.95
-"""Of the recall at the lowest score: the operating point where labels are incomplete, so that precision is unknown."""
+"""Fraction of the recall at the lowest score: the operating point if labels are incomplete (precision unknown)."""
 _BETA = 0.8
 """Recall counts less than precision, since false tracks harm the field more than missed ones; and not by more, since
 detectors that were trained without the held-out cars are worse than the one trained on all of them."""

@@ -11,7 +11,7 @@ from schemas.arrays import GreyImage, Mask
 
 
 class SearchableFrame(Protocol):
-    """What is read of a frame that is searched: `ComparableFrame`, or `velfield.registration.warp.Rectification`."""
+    """Interface of a frame to search: `ComparableFrame`, or `velfield.registration.warp.Rectification`."""
 
     @property
     def image(self) -> GreyImage:
@@ -30,11 +30,11 @@ class SearchableFrame(Protocol):
 
     @property
     def half_valid(self) -> Mask:
-        """Where the frame covers it."""
+        """Mask of `half_image`, true where the frame covers it."""
         ...
 
     def resample(self, cells: Mask, side_px: int) -> None:
-        """Fill `image` and `valid` in the cells (rows, columns) of a mask, of so many px."""
+        """Fill `image` and `valid` in the cells (rows, columns) of a mask; cells are ``side_px`` wide and high."""
         ...
 
 
@@ -47,7 +47,7 @@ def half_resolution(image: GreyImage) -> GreyImage:
 
 @dataclass(frozen=True, eq=False)
 class ComparableFrame:
-    """A frame that is there whole.
+    """A frame on the working grid, computed whole.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What every car detector offers, and what it gives.
+"""Interface of all car detectors, and of their detections.
 
 A detector is trained on labelled images (`Detector.train`), detects cars on images in base orientation, rescaled to a
 car's usual length (`Detector.detect`), and is a record that goes into a JSON file (`Detector.save`); by the name of
@@ -45,7 +45,7 @@ class Detections:
 
     @classmethod
     def from_rows(cls, rows: FloatArray, area_px: FloatArray) -> "Detections":
-        """Of rows (n, 5): x, y, axis, score, standard deviation of the axis; and areas (n,)."""
+        """Detections from rows (n, 5) of x, y, axis, score, standard deviation of the axis, and from areas (n,)."""
         return cls(rows[:, :2], rows[:, 2], rows[:, 4], area_px, rows[:, 3])
 
     def to_rows(self) -> FloatArray:
@@ -64,7 +64,7 @@ class Detections:
         return Detections(self.xy[rows], *of_axis, self.area_px[rows], self.score[rows])
 
     def shifted(self, x: float, y: float) -> "Detections":
-        """Of a crop whose corner lies there, on the grid of the image."""
+        """Detections of a crop whose first corner is at (x, y), in pixels of the whole image."""
         return replace(self, xy=self.xy + np.array([x, y]))
 
     def __len__(self) -> int:
@@ -89,7 +89,7 @@ class Detector(ABC):
     reads_raw_frames: ClassVar[bool] = False
     """Whether it is run on raw frames (`detect_raw`), at their own resolution, and not on the working grid."""
     context_px: ClassVar[int] = 32
-    """What it reads around a car to find it, working px on every side: the margin of a crop."""
+    """Margin around a car that the detector reads, working px on every side: the margin of a crop."""
     box_cost_px: ClassVar[int] = 4000
     """Fixed cost of searching one more crop, as an area."""
 
@@ -196,7 +196,7 @@ class Detector(ABC):
 
     @property
     def weak_margin(self) -> float:
-        """How far below the threshold a candidate's score may be that a track can confirm; 0: there are none."""
+        """Candidates that a track can confirm score at most this much below the threshold; 0: no such candidates."""
         return 0.0
 
     def with_threshold(self, threshold: float, curve: PrecisionRecallCurve | None) -> Self:
@@ -204,7 +204,7 @@ class Detector(ABC):
         return type(self)(self.record.model_copy(update={"threshold": threshold, "curve": curve}))
 
     def check_car_length(self, expected_px: float) -> None:
-        """Raise InputError where it was trained on cars of another length than this, working px."""
+        """Raise InputError if the detector was trained on cars of another length, working px."""
         length_px = self.record.working_car_length_px
         if length_px != expected_px:
             raise InputError(
@@ -213,18 +213,18 @@ class Detector(ABC):
             )
 
     def for_flight(self, images: Sequence[GreyImage], config: Any) -> "Detector":
-        """The detector, adjusted to images (h, w) of the flight on the working grid, where it can be; ``config`` is the
+        """The detector, adjusted if possible to images (h, w) of the flight on the working grid; ``config`` is the
         section of its method, or of another."""
         return self
 
     @property
     def notes(self) -> list[str]:
-        """What was assumed of the detector's file, one line each."""
+        """Assumptions made about the detector's file, one line each."""
         return []
 
     @property
     def limitations(self) -> list[str]:
-        """What this machine cannot do of what the detector is set to do, one line each."""
+        """Settings of the detector that this machine cannot follow, one line each."""
         return []
 
     def to_json(self) -> str:

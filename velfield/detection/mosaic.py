@@ -17,9 +17,9 @@ from velfield.detection.frame import SearchableFrame
 from velfield.detection.interface import Detections, Detector, concatenate
 
 Box = tuple[int, int, int, int]
-"""Of cells: first row, first column, row and column after the last."""
+"""Rectangle of cells: first row, first column, row and column after the last."""
 _SIDE_PX = 1024
-"""Of a mosaic, unless a crop is larger."""
+"""Side of a mosaic, unless a crop is larger."""
 
 
 @dataclass(frozen=True)

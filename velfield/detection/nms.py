@@ -41,7 +41,7 @@ def nms_oriented(cars: FloatArray, car_length_px: float) -> FloatArray:
 
 @njit(cache=True, nogil=True)
 def _survivors(cars, length, width):  # type: ignore[no-untyped-def]
-    """Which cars, the best first, are not suppressed."""
+    """Mask (n,) of the cars that are not suppressed; the cars are sorted by score, best first."""
     kept = np.zeros(len(cars), np.bool_)
     covered = np.empty(_SPOTS_ALONG * _SPOTS_ACROSS, np.bool_)
     for i in range(len(cars)):

@@ -20,7 +20,7 @@ STEP = 1.25
 _TOP = 20
 """Detections a frame whose scores count."""
 _LENGTHS, _WIDTHS, _MAX_SD = (0.8, 1.5), (0.31, 0.62), 0.13
-"""Of a car, in lengths of `working_car_length_px`; and the relative standard deviation of a length that is measured."""
+"""Length and width of a car, in units of `working_car_length_px`; largest relative deviation of a measured length."""
 _MIN_DETECTIONS = 12
 _MIN_AGREEMENT = 0.04
 """Mean score times the fraction of the size of cars: 0.07 to 0.14 at the right scale of real and simulated images,

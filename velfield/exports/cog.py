@@ -53,7 +53,7 @@ def write_cog(
 def ignore_missing_georeference() -> Iterator[None]:
     """Without a warning that an image is not georeferenced, as many are not.
 
-    What warnings are ignored is a matter of the whole process: where one of several threads writes images, enter this
+    Filters of warnings belong to the whole process: where one of several threads writes images, enter this
     before they start, or another that leaves `warnings.catch_warnings` meanwhile takes it back.
     """
     with warnings.catch_warnings():
@@ -74,7 +74,7 @@ def cog_bytes(
     Parameters
     ----------
     names, units
-        Of each band, as GIS shows them.
+        Name and unit of each band, as GIS shows them.
     crs_wkt, affine
         Reference system, and (column, row) of pixel corners to its coordinates; none: pixels.
     """

@@ -81,7 +81,7 @@ def accumulate_tile(
     radius_px
         Half the width of a segment's band, px; None: lines of one pixel, as in the paper.
     weight
-        What a track adds at a pixel; see the head of this file.
+        Weight of a track at a pixel; see the head of this file.
     zeros
         (height, width, nvy, nvx) of zeros that becomes the histogram; None: allocated.
 

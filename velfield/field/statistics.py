@@ -210,7 +210,7 @@ class TileStatistics:
         1 - length of the mean direction vector of the moving weight: 0 all in one direction, 1 no mean direction; NaN
         where none moves.
     entropy_nats
-        Of the normalised histogram, nats; log(number of bins) for a uniform one.
+        Entropy of the normalised histogram, nats; log(number of bins) for a uniform one.
     direction_se_rad
         Standard error of the mean direction of the moving weight, rad; NaN with fewer than two tracks.
     direction_half_width_rad
@@ -351,7 +351,7 @@ def tile_statistics(
     stationary_speed_px_per_s
         Below it there is no direction, nor below a bin and a half.
     percentiles
-        Of speed, %.
+        Percentiles of speed to compute, %.
     """
     mode_px_per_s = modal_velocity(histogram, count, bins=bins)
     shape = count.shape

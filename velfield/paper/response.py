@@ -17,7 +17,7 @@ MARGIN_PX = 64
 """Images are extended by this at their edges: no rectangle reaches farther."""
 STEP_PX = 2
 GREY_BITS = 5
-"""Of a new detector: five to eight detect cars alike, and with five all but the widest sums fit 16 bits."""
+"""Bits of a new detector: five to eight detect cars alike, and with five all but the widest sums fit 16 bits."""
 _MAX_INT16 = 32767
 MAX_AREA_PX = _MAX_INT16 // (2**GREY_BITS - 1)
 """A sum whose rectangles of one sign cover no more fits 16 bits."""

@@ -64,7 +64,7 @@ def compare_runs(before: Path, after: Path, out: Path, *, min_count: int = MIN_C
 def _traffic_lines(before: Run, after: Run, out: Path) -> list[str]:
     """Write what differs in shares, flows, travel times, cycles and free-flow speeds; a line on each that does.
 
-    Of a merged or subtracted field there are no tracks to ask.
+    A merged or subtracted field has no tracks to use.
     """
     if before.made_from or after.made_from:
         return []

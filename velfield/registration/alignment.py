@@ -562,7 +562,7 @@ def _step_inside(window, columns, start, derivative, shift, spacing, side, templ
 
 @njit(cache=True, nogil=True)
 def _reach_in_frame(derivative, reach, max_shift):  # type: ignore[no-untyped-def]
-    """How far from its start a patch is sampled in a frame, px along x and y, and a pixel more."""
+    """Largest distance from its start at which a patch is sampled in a frame, px along x and y, plus one pixel."""
     x = reach * (abs(derivative[0, 0]) + abs(derivative[0, 1])) + max_shift * np.hypot(
         derivative[0, 0], derivative[0, 1]
     )

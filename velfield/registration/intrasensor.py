@@ -239,7 +239,7 @@ class _ChainFrame:
 
 @dataclass
 class _PatchHistory:
-    """Which patches of the base image were inliers lately in a chain of frames.
+    """Patches of the base image that were recently inliers in a chain of frames.
 
     Attributes
     ----------
@@ -276,7 +276,7 @@ class _PatchHistory:
 
 
 def _are_inliers(templates: Templates, result: FrameRegistration) -> Mask:
-    """Which patches (n,) are among a frame's inliers: both are whole pixels of the base image."""
+    """Mask of the patches (n,) that are among a frame's inliers: both are whole pixels of the base image."""
     inliers = result.control_points
     if inliers is None:
         return np.zeros(len(templates), bool)

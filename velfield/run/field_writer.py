@@ -206,7 +206,7 @@ def create_field_store(
     Parameters
     ----------
     weighted_by
-        What a track adds at a pixel.
+        Weight of a track at a pixel.
     observed_s
         Duration of the observation, s, for comparing counts.
     time_weighted

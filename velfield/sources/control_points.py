@@ -114,7 +114,7 @@ def fit_control_points(
     shape
         (h, w) of the base image.
     base_digest
-        Of the base image.
+        Digest of the base image.
     model
         None: a similarity, or with six points or more an affine transform where that is closer at points left out.
 

@@ -25,7 +25,7 @@ def local_path(path: Path | str, what: str) -> Path:
     path
         As given by the user.
     what
-        What it is, for the message: "video or image folder", "base image".
+        Name of the thing, for the message: "video or image folder", "base image".
 
     Returns
     -------
@@ -74,7 +74,7 @@ class SourceFrame:
     flags
         Bits of `velfield.sources.quality.FrameFlag`.
     reason
-        What was wrong, one line; else empty.
+        The fault, in one line; empty if there was none.
     """
 
     source_index: int
@@ -125,7 +125,8 @@ class SourceInfo:
     levels
         Levels of frames of more than 8 bits that become 0 and 255 in every frame.
     parts
-        Of several clips (`velfield.sources.clips`), in order of time: path, facts, and start in s from the first one's.
+        Parts of several clips (`velfield.sources.clips`), in order of time: path, facts, and start in s from the start
+        of the first.
     """
 
     kind: SourceKind

@@ -40,7 +40,7 @@ class BaseRaster:
         Reference system; (a, b, c, d, e, f) from (column, row) of pixel corners to its coordinates, as rasterio's
         `Affine`; metres a pixel by the reference system's local scale at the centre. None without a reference system.
     notes
-        What was changed, one line each.
+        Notes on what was changed, one line each.
     """
 
     grey: GreyImage

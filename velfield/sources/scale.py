@@ -1,4 +1,4 @@
-"""Which of several estimates of the ground sample distance is used, and which of the others contradict it."""
+"""Choice among several estimates of the ground sample distance, and contradictions between them."""
 
 from collections.abc import Iterable
 

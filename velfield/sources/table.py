@@ -44,7 +44,7 @@ def read_csv_rows(
     required, optional
         Columns it must and may have; ``optional = None`` allows any others.
     what
-        What the table holds, for messages.
+        Name of the table's content, for messages.
 
     Raises
     ------

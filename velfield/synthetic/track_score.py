@@ -76,7 +76,7 @@ def score_run_tracks(
     to_truth
         Homography to the truth's base image, where the run has another one.
     moving_only
-        Of the vehicles that move at some time of the flight; tracks of the others are ignored.
+        Score only the vehicles that move at some time of the flight; tracks of the others are ignored.
     """
     by_frame = dict(list(tracks.groupby("frame")))
     moving = truth.cars.loc[truth.cars["moving"], "vehicle_id"].unique()

@@ -82,7 +82,7 @@ class Truth:
     def segments(self, *, max_interval_s: float = 0.45) -> pd.DataFrame:
         """True displacements from frame to frame: vehicle_id, frame, x_0, y_0, x_1, y_1 (base px), vx, vy px/s.
 
-        Of vehicles that are visible and moving in both frames: the segments of a perfect tracker.
+        Only vehicles that are visible and moving in both frames: the segments of a perfect tracker.
         """
         cars = self.cars[self.cars["visible"] & self.cars["moving"]].sort_values(["vehicle_id", "frame"])
         later = cars.shift(-1)

@@ -195,7 +195,7 @@ def crop_differences(before: PreparedCrops, after: PreparedCrops, first: IntArra
 
 
 def _shifts_shortest_first() -> IntArray:
-    """Where in the parts of the other crop a shift (y, x) leads the odd rows and columns of the one, shortest first."""
+    """Positions of this crop's odd rows and columns in the parts of the other, after a shift (y, x), shortest first."""
     steps = np.arange(-MAX_CROP_SHIFT_PX, MAX_CROP_SHIFT_PX + 1)
     dy, dx = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
     order = np.argsort(dy**2 + dx**2, kind="stable")

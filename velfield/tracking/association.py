@@ -103,7 +103,7 @@ def window_frames(registered: Sequence[bool], times_s: Sequence[float], starts: 
     Parameters
     ----------
     registered, times_s
-        Of every frame of the flight, in time order.
+        For every frame of the flight, in time order: whether it is registered, and its time.
     starts
         Positions at which a window may start.
     max_interval_s
@@ -300,7 +300,7 @@ def appearance_cost(differences: FloatArray, typical: float) -> FloatArray:
 
 
 def best_triples(triples: Triples, counts: tuple[int, int, int]) -> tuple[Mask, FloatArray]:
-    """Which triples are mutual best, and the confidence of each.
+    """Mask of the triples that are mutual best, and the confidence of each.
 
     Parameters
     ----------

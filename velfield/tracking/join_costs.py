@@ -1,4 +1,4 @@
-"""Which ends and starts of tracks may be one vehicle's, and what each join costs by their motion.
+"""Pairs of a track's end and another's start that may be one vehicle's, and the cost of each join by their motion.
 
 A cost is 0 as predicted and 1 at the tolerance of a short gap. Four models of what happened in the gap, each with a
 cost of its own; the least counts: the vehicle drove on; it stopped, or stood; it was hidden for longer, straight on; it
@@ -98,7 +98,7 @@ def find_candidates(
     Parameters
     ----------
     ends, starts
-        Of each track.
+        Last and first positions of each track.
     limits
         The longest gaps.
     length_m

@@ -136,7 +136,7 @@ def close_gaps(
     ids
         (tracks,) ascending.
     ends, starts
-        Of each track.
+        Last and first positions of each track.
     gaps
         The longest gaps.
     context

@@ -89,7 +89,7 @@ class Recovered:
     track_id, candidate
         (k,) each: candidates that belong to tracks.
     gaps
-        Those of the joins, with the candidates in them: where vehicles were while nothing was found.
+        Gaps of the joins, with the candidates in them: positions of vehicles while nothing was detected.
     """
 
     tracks: IntArray
@@ -109,7 +109,7 @@ def recover_tracks(
     ids
         (chains,) ascending ids of the chains of tracklets.
     ends, starts
-        Of each chain.
+        Last and first positions of each chain.
     """
     free = np.ones(len(candidates), bool)
     first = close_gaps(ids, ends, starts, limits, context)
@@ -426,7 +426,7 @@ class _Pairs:
 
 
 def _count_seen(pairs: _Pairs) -> tuple[IntArray, IntArray, IntArray]:
-    """Where the rows of each pair of tracks begin (k + 1,), and in how many of them one is seen, and both (k,)."""
+    """First row of each pair of tracks (k + 1,), and the numbers of rows in which one is seen, and both (k,)."""
     changes = (np.diff(pairs.one) != 0) | (np.diff(pairs.other) != 0)
     begin = np.flatnonzero(np.r_[True, changes][: len(pairs)])
     counts = [np.add.reduceat((pairs.seen == n).astype(np.int64), begin) if len(begin) else begin for n in (1, 2)]
@@ -443,7 +443,7 @@ def _moving(table: pd.DataFrame, metres: float) -> pd.DataFrame:
 
 
 def _inferred_s(table: pd.DataFrame) -> FloatArray:
-    """How long the track is inferred around each position (n,), of a table by track and frame; 0 where it is seen."""
+    """Duration of the inferred part of the track around each position (n,), sorted by track and frame; 0 where seen."""
     seen = table["time_s"].where(table["source"] < _SEEN)
     before, after = seen.groupby(table["track_id"]).ffill(), seen.groupby(table["track_id"]).bfill()
     return np.asarray((after - before).fillna(np.inf), dtype=np.float64)

@@ -77,7 +77,7 @@ class CleanTracks:
     xy_m
         (m, 2) smoothed positions.
     errors
-        Of the positions as they were; None: not known, or too small to smooth.
+        Errors of the unsmoothed positions; None: not known, or too small to smooth.
     position_sd_m, velocity_sd_m_per_s
         Standard deviations along one axis that are left; 0 where nothing was smoothed.
     cuts

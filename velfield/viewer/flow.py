@@ -64,7 +64,7 @@ def flow_bytes(store: FieldStore, *, gsd_m: float | None, stationary_speed_px_pe
 
 
 def _flowing(store: FieldStore, stationary_speed_px_per_s: float) -> Mask:
-    """Where the mode moves, or more than a tenth of the vehicles."""
+    """Mask of the pixels where the modal velocity, or more than a tenth of the vehicles, moves."""
     moving = np.hypot(store.layer("modal_vx"), store.layer("modal_vy")) > stationary_speed_px_per_s
     if "stationary_fraction" in store.layer_names():
         moving |= store.layer("stationary_fraction") < 1 - _MIN_MOVING_FRACTION

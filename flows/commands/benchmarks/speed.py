@@ -49,13 +49,13 @@ def speed(
     Parameters
     ----------
     frames
-        Of the simulated flight (seed 77); its first labels train the detector.
+        Frames of the simulated flight (seed 77); its first labels train the detector.
     size
         Frame size, WxH in pixels.
     preset
         best, fast or paper.
     parts
-        What to measure: `stages` on one core; the `network` against the machine's peak; `peers` (stabilo, trackpy,
+        Parts to measure: `stages` on one core; the `network` against the machine's peak; `peers` (stabilo, trackpy,
         boost-histogram and xhistogram, where `make bench` installed them, and convolutions of YOLOv8n's sizes); the
         `paper`'s chain read literally; two `workers` against one; the whole `job` by `velfield run --workers 2`, with
         the memory of driver and workers. All but the first two follow on the stages.

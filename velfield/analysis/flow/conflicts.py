@@ -125,7 +125,7 @@ def _merges(traffic: LaneTraffic, lengths: FloatArray, vehicle: IntArray, thresh
 
 
 def _sources(vehicle: IntArray, samples: list[IntArray]) -> IntArray:
-    """Which lane each vehicle (n,) came by, -1: none: the one that it drove longest, as it touches the ends of others
+    """Lane by which each vehicle (n,) came, -1 if none: the one that it drove longest, as it touches the ends of others
     where they join. ``samples``: the vehicle of each sample on each lane."""
     if not len(vehicle):
         return np.empty(0, np.int64)

@@ -84,7 +84,7 @@ class FreeFlow:
     Attributes
     ----------
     lanes
-        Of the road.
+        Lanes of the road.
     speed_m_per_s
         Median speed at which drivers go where nobody is ahead; None: too few of them are seen to. Those who follow
         count as faster than they go (Botma's estimator of free speeds).
@@ -192,7 +192,7 @@ def roads(graph: LaneGraph) -> list[list[int]]:
 
 @dataclass(frozen=True)
 class Reduction:
-    """How a junction slows the vehicles that reach it by a lane and pass it without stopping.
+    """Speed reduction at a junction of the vehicles that reach it by a lane and pass it without stopping.
 
     Attributes
     ----------

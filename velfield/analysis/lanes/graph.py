@@ -81,7 +81,7 @@ def _moves(track: IntArray, node: IntArray) -> tuple[IntArray, IntArray]:
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def count_once(owner: IntArray, number: IntArray, n: int) -> IntArray:
-    """How many owners have each of n numbers, an owner's rows being together."""
+    """Number of owners that have each of n numbers; the rows of an owner are consecutive."""
     count, last = np.zeros(n, np.int64), np.full(n, -1, np.int64)
     for k in range(len(owner)):
         if last[number[k]] != owner[k]:

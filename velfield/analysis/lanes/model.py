@@ -21,7 +21,7 @@ class Lane:
     Attributes
     ----------
     number
-        Of the lane in its graph.
+        Number of the lane in its graph.
     xy_m
         (n, 2) centre line in the direction of travel; it begins where its strongest predecessor ends.
     tracks
@@ -80,7 +80,7 @@ class Junction:
     Attributes
     ----------
     number, kind
-        Of the junction in its graph; what it is.
+        Number of the junction in its graph; its kind.
     centre_m
         (2,).
     hull_m

@@ -27,7 +27,7 @@ class CutTracks:
     vehicle
         (tracks,) number of each track's vehicle.
     trajectories
-        Of the vehicles, over the gaps.
+        Trajectories of the vehicles, with gaps filled.
     first
         (vehicles + 1,) rows of ``track`` and ``start_s``.
     track, start_s

@@ -91,7 +91,7 @@ def group_gates(found: list[tuple[int, bool, FloatArray, float]]) -> IntArray:
     Parameters
     ----------
     found
-        Of each gate its lane, whether it leads inwards, its position, m, and its direction, rad.
+        For each gate: its lane, whether it leads inwards, its position, m, and its direction, rad.
     """
     n = len(found)
     label = np.arange(n)

@@ -53,7 +53,7 @@ class Movement:
     seen, inferred
         Vehicles seen from entry to exit by one track, and those inferred from tracks that are cut.
     share
-        Of the vehicles that enter by the arm.
+        Fraction of the vehicles that enter by the arm.
     flow_veh_per_h
         Vehicles an hour.
     travel_time_s, delay_s
@@ -112,7 +112,7 @@ def find_movements(
     window_s
         Only vehicles that enter (or, unseen there, leave) from the first time up to the second.
     cut_tracks
-        Those of the trajectories, where they are known already.
+        Cut tracks of the trajectories, if already known.
     """
     cut = join_cut_tracks(trajectories) if cut_tracks is None else cut_tracks
     samples = cut.samples

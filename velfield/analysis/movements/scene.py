@@ -77,9 +77,9 @@ class Relation:
         Vehicles seen from entry to exit; those whose track is cut, joined or inferred; and inferred of those still in
         the picture at the end.
     share
-        Of the vehicles that enter by the arm.
+        Fraction of the vehicles that enter by the arm.
     travel_time_s
-        Of the vehicles seen.
+        Median travel time of the observed vehicles, s.
     """
 
     origin: Arm
@@ -274,7 +274,7 @@ def _name_arms(middle: dict[int, FloatArray], outward: dict[int, float], inside:
 def trace_trips(
     vehicles: CutTracks, graph: LaneGraph, gates: tuple[Gate, ...], arms: tuple[Arm, ...], window_s: tuple[float, float]
 ) -> OriginDestination:
-    """Which arms vehicles enter by and leave by, and where those went whose tracks are cut."""
+    """Arms by which vehicles enter and leave, and the inferred destinations of vehicles whose tracks are cut."""
     trajectories, samples = vehicles.trajectories, vehicles.samples
     n = len(trajectories)
     origin, entry = _terminal_arms(samples, n, gates, first=True)

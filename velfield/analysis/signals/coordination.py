@@ -1,4 +1,4 @@
-"""How queues grow in red, and the offsets between the signals of junctions that follow each other."""
+"""Growth of queues during red, and offsets between the signals of successive junctions."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ class QueueGrowth:
 
 @dataclass(frozen=True)
 class Offset:
-    """How long after the green of ``lane_a`` at one junction that of ``lane_b`` begins at the next of its direction."""
+    """Offset: time from the start of green of ``lane_a`` at one junction to that of ``lane_b`` at the next."""
 
     junction_a: int
     junction_b: int

@@ -28,13 +28,13 @@ BATCH_SIZE = 16
 USUAL_SIZE_PX = 16.0, 7.2
 """Length and width of a usual car, working px: of a vehicle whose label gives none."""
 HEATMAP_SIGMA_PX = 2.2
-"""Of a car, and of any vehicle across its axis. Along the axis it grows with the square root of the length: the centre
-of a bus is less sharp. In pre-training only."""
+"""Standard deviation of a car's peak, and of any vehicle's across its axis. Along the axis it grows with the square
+root of the length, because the centre of a bus is less sharp; in pre-training only."""
 _CENTRED_FRACTION, _CENTRING_SD_PX = 0.7, 19.0
 """Fraction of the patches that are centred near a labelled car, and standard deviation of that position."""
 _LOG_SCALE_RANGE = 0.2
 _WINDOW_MARGIN_PX = 2
-"""Of the source window, for interpolation."""
+"""Margin of the source window, for interpolation."""
 _LOG_GAMMA_RANGE, _CONTRAST_RANGE, _BRIGHTNESS_RANGE = 0.7, (0.5, 1.4), 0.15
 _MEAN_GREY = 0.45
 """Contrast is changed about this grey."""
@@ -49,7 +49,7 @@ _HEATMAP_PX = np.arange(PATCH_PX // STRIDE) * STRIDE + (STRIDE - 1) / 2
 """Positions of the heatmap's rows and columns in the patch, px."""
 
 _CAMOUFLAGE_PROBABILITY, _CAMOUFLAGED_FRACTION = 0.5, 0.5
-"""Of the patches, and of the cars in such a patch."""
+"""Fraction of the patches with camouflaged cars, and fraction of the cars in such a patch."""
 _CAMOUFLAGE_CONTRAST, _CAMOUFLAGE_SHIFT = (0.25, 0.9), (-0.08, 0.02)
 _COVER_RATIO, _ROAD_MEDIAN_PX = (1.25, 1.5), 31
 """Length and width of what is redrawn, over the vehicle's."""
@@ -82,7 +82,7 @@ class PatchDataset:
     weights
         Sampling weight of each group, whatever its number of images.
     seed
-        Of all random numbers.
+        Seed of all random numbers.
     hard
         Bring cars near to the tone of the road about them, and cut patches as the image's edge does: for pre-training.
     """

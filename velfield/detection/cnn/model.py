@@ -25,10 +25,10 @@ BORDER_PX = 16
 """An image is continued so far by reflection, for cars at its edge: F1 0.837 in place of 0.833 on the minsk clip, cars
 that the edge cuts included; with 64 px 0.836."""
 _BATCH_PX = 500_000
-"""Of the crops that the network is run on at once: more no longer stays in the processor's cache."""
+"""Pixels of the crops that the network is run on at once: more no longer stays in the processor's cache."""
 _BORDER = cv2.BORDER_REFLECT_101
 SMOOTHING_SIGMA = 0.8
-"""Of the heatmap, in its pixels."""
+"""Standard deviation by which the heatmap is smoothed, in its pixels."""
 _LEAST_PROBABILITY = 1e-6
 _SPAN = 64
 """Pixels of the heatmap that are searched for peaks, or are not, together."""
@@ -278,7 +278,7 @@ def find_peaks(
     probability, orientation
         (h, w) and (2, h, w), a pixel for every ``stride`` of the image.
     valid
-        Of the image: where a peak counts; none: everywhere.
+        Mask of the image, true where a peak counts; None: everywhere.
     min_probability
         After smoothing.
     """

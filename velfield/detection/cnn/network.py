@@ -56,7 +56,7 @@ class Conv:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Of the weights: kernel taps, channels in, channels out."""
+        """Shape of the weights: kernel taps, channels in, channels out."""
         return self.kernel**2, self.channels_in, self.channels_out
 
 
@@ -116,11 +116,11 @@ FORMER_TOPOLOGY: Topology = (
 )
 """That of the detectors of version 0.1, whose files are read."""
 TOPOLOGIES: tuple[Topology, ...] = (TOPOLOGY, FORMER_TOPOLOGY)
-"""Those that a detector file may hold."""
+"""Topologies that a detector file may hold."""
 STRIDE = 2
 """Working px a pixel of the heatmap."""
 _OPSET, _IR_VERSION = 17, 9
-"""Of the ONNX files: what onnxruntime has read since 1.15."""
+"""Versions of the ONNX files that are written: onnxruntime reads them since 1.15."""
 
 
 def convolutions(layers: Topology) -> dict[str, Conv]:
@@ -135,7 +135,7 @@ def convolutions(layers: Topology) -> dict[str, Conv]:
 
 
 def _alignment(layers: Topology) -> int:
-    """What the height and the width of an image must be multiples of: two to the number of halvings."""
+    """Height and width of an image must be multiples of this: two to the number of halvings."""
     scale = worst = 1
     for layer in layers:
         if isinstance(layer, SpaceToDepth):
@@ -195,7 +195,7 @@ class Network:
 
     @cached_property
     def alignment(self) -> int:
-        """What the height and the width of an image must be multiples of."""
+        """Height and width of an image must be multiples of this."""
         return _alignment(self.topology)
 
     @_Once
@@ -230,11 +230,11 @@ class Network:
 
 
 Predict: TypeAlias = Callable[[GreyImage], tuple[Float32Array, Float32Array]]
-"""Of images (n, h, w): heatmap (n, h / 2, w / 2) and orientation vectors (n, 2, h / 2, w / 2)."""
+"""Function of images (n, h, w): heatmap (n, h / 2, w / 2) and orientation vectors (n, 2, h / 2, w / 2)."""
 
 
 def predict_by(session: ort.InferenceSession) -> Predict:
-    """What a session of a model with the inputs and outputs of `network_to_onnx` predicts."""
+    """Predictions by a session of a model with the inputs and outputs of `network_to_onnx`."""
 
     def predict(images: GreyImage) -> tuple[Float32Array, Float32Array]:
         probability, orientation = session.run(None, {"image": np.ascontiguousarray(images[:, None])})
@@ -245,7 +245,7 @@ def predict_by(session: ort.InferenceSession) -> Predict:
 
 _CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 _WARNINGS, _ERRORS, _FATAL = 2, 3, 4
-"""Of onnxruntime's levels of severity. The warnings of a session are of how its graph was exported, many lines in each
+"""onnxruntime's levels of severity. A session's warnings are about how its graph was exported, many lines in each
 process; without a session, its warnings and errors are shown."""
 _device: Device = "auto"
 _limitations_reported = False
@@ -261,7 +261,7 @@ def use_device(device: Device) -> None:
 
 
 def current_device() -> Device:
-    """What `use_device` set."""
+    """The device that `use_device` has set."""
     return _device
 
 
@@ -291,7 +291,7 @@ def _warn_of_cuda() -> None:
 
 
 def _cuda_fault() -> str | None:
-    """What was found in place of a GPU, if networks cannot run on one: tried once a process."""
+    """Reason why networks cannot run on a GPU, None if they can: tried once per process."""
     with _STARTING:
         return _find_cuda_fault()
 
@@ -403,7 +403,7 @@ def _session_options() -> ort.SessionOptions:
 
 
 def _providers(*, gpu: bool) -> list[Any]:
-    """What a session asks for, first choice first.
+    """Execution providers that a session requests, first choice first.
 
     With TF32's shorter mantissa scores would differ visibly. Trying all of cuDNN's ways (EXHAUSTIVE) takes five times
     as long at each new size, and finds none that is faster.
@@ -496,7 +496,7 @@ class GraphBuilder:
         return value
 
     def _unpack_heatmap(self, layers: Topology, value: str) -> str:
-        """What follows the head."""
+        """The layers after the head: blocks of channels moved into pixels."""
         for layer in layers:
             assert isinstance(layer, DepthToSpace), "only the heatmap is unpacked after the head"
             value = self.node("DepthToSpace", [value], blocksize=2, mode="DCR")
@@ -507,7 +507,7 @@ class GraphBuilder:
         return self.node("DepthToSpace", [value], blocksize=2, mode="DCR")
 
     def activation(self, value: str, name: str) -> str:
-        """What the layers read in place of a value before the head; ``name`` is its place in the topology."""
+        """The value as the next layer reads it; subclasses quantize it. ``name``: its place in the topology."""
         return value
 
     def conv(self, layer: Conv, value: str, block: int) -> str:

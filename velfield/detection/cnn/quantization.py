@@ -5,10 +5,10 @@ activation is measured on crops of the flight at hand (`calibrate`), without the
 whose place the rest of the values would pay for with their precision. The graph is that of `model.network_to_onnx` with
 pairs of QuantizeLinear and DequantizeLinear (QDQ), which onnxruntime fuses; the head stays in floating point.
 
-Of one channel onnxruntime convolves bytes slowly, and of large images strided convolutions as well, and it moves every
+onnxruntime is slow at byte convolutions of one channel and at strided convolutions of large images, and it moves every
 pixel of the first layer and of the heatmap four times. So the first layer is computed here (`FirstLayer`), in the same
-whole numbers, and handed over in the blocks of 2 x 2 pixels that the second one is a plain convolution of; and the
-heatmap is taken as the head leaves it, a block of 2 x 2 pixels a row.
+whole numbers, and passed on in blocks of 2 x 2 pixels, of which the second layer is a plain convolution; and the
+heatmap is read as the head leaves it, one block of 2 x 2 pixels per row.
 
 Older x86 processors add products of bytes in 16 bits, which saturates. Whether this one is exact is tested, not looked
 up (`is_exact`): elsewhere the network runs in floating point, with a warning.
@@ -147,7 +147,7 @@ class FirstLayer:
     def blocks(self, image: GreyImage, corners: IntArray, height: int, width: int) -> GreyImage:
         """Levels of the output of crops of an image, sizes multiples of 4: (n, h / 4 + 1, w / 4 + 1, 4 LANES) uint8.
 
-        Of the output at half the resolution, with a border of one pixel of zeros, a block of 2 x 2 pixels a row.
+        The output is at half the resolution, with a border of one pixel of zeros, one block of 2 x 2 pixels per row.
 
         Parameters
         ----------
@@ -364,7 +364,7 @@ class _QuantizedGraph(GraphBuilder):
         return self._dequantize(quantized, scale_and_zero, scale)
 
     def levels(self, name: str) -> tuple[np.float32, int]:
-        """What a level of an activation is worth, and the level of zero."""
+        """Scale of an activation (real units per level), and the level that stands for zero."""
         low, high = (float(end) for end in self._ranges[name])
         low, high = min(low, 0.0), max(high, 0.0)
         scale = np.float32(max((high - low) / _LEVELS, 1e-8))
@@ -415,7 +415,7 @@ class _QuantizedGraph(GraphBuilder):
     ) -> str:
         """The same whole numbers in single precision, which holds them exactly, unscaled.
 
-        Of one channel onnxruntime convolves floats in a quarter of the time.
+        onnxruntime convolves floats of one channel in a quarter of the time.
         """
         grey = self.node("Cast", ["image"], to=TensorProto.FLOAT)
         names = [
@@ -453,7 +453,7 @@ class _BlockGraph(_QuantizedGraph):
     """The value that they are."""
 
     def first_layer(self) -> FirstLayer:
-        """What the graph is given the output of."""
+        """The first convolution, which runs before the graph; its output is the input of the graph."""
         layer = convolutions(self.network.topology)["stem"]
         weights, _, bias, scales = self.whole_numbers(layer, self.kernel(layer, "image", 1), "image")
         scale, zero = self.levels("0")

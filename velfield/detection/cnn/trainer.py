@@ -79,7 +79,7 @@ class LossNormaliser:
 
     @classmethod
     def of(cls, batch: Batch) -> "LossNormaliser":
-        """Of a whole batch; its halves are divided by the same."""
+        """Normalisers of a whole batch; its halves are divided by the same numbers."""
         return cls(float(_positive_weight(batch).sum()) + 1, float(batch.orientation_weight.sum()) + 1)
 
 
@@ -323,7 +323,7 @@ def focal_loss_and_gradient(out: Float32Array, batch: Batch, normaliser: LossNor
     batch
         The targets.
     normaliser
-        Of the whole batch.
+        Normalisers of the whole batch.
     """
     heatmap, mask = batch.heatmap, batch.mask
     logits = np.clip(out[..., 0], -_MAX_LOGIT, _MAX_LOGIT)

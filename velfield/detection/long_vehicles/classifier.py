@@ -63,7 +63,7 @@ class LongVehicleClassifier:
         Parameters
         ----------
         features
-            Of the image, at the scale `LONG`.
+            Features of the image, at the scale `LONG`.
         valid
             (h, w) at that scale: where the frame covers the image; a vehicle whose centre is elsewhere stays where it
             was detected.
@@ -88,7 +88,7 @@ class LongVehicleClassifier:
         return np.asarray(cars[~self._is_covered(cars, long)])
 
     def confirm(self, features: FeatureImage, weak: FloatArray, valid: Mask) -> FloatArray:
-        """Of candidates (n, 4...) as x, y, axis, score those on a long vehicle, moved to its centre, one detection
+        """Candidates (n, 4...) of x, y, axis, score that lie on a long vehicle, moved to its centre, one detection
         each; ``features`` and ``valid`` as of `centre`."""
         weak = weak[self._may_be_long(features, weak)]
         if not len(weak):
@@ -147,7 +147,7 @@ def centre_long_vehicles(
 ) -> FloatArray:
     """Cars (n, 2...), suppressed already, with long vehicles at their centre; unchanged for cars of another length.
 
-    Those that are ``settled`` (n,) stay where they are.
+    Rows that are ``settled`` (n,) stay unchanged.
     """
     long = shipped_long_vehicles()
     if car_length_px != long.record.working_car_length_px or (settled is not None and settled.all()):

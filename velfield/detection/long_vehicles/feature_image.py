@@ -197,7 +197,7 @@ class PatchScale:
 
     @property
     def window_area(self) -> int:
-        """Of the window whose mean grey and gradient normalise the features for brightness and contrast."""
+        """Area of the window whose mean grey and gradient normalise the features for brightness and contrast."""
         return 4 * self.reach[0] * self.reach[1]
 
 
@@ -278,15 +278,15 @@ class RotatedPatch:
         return np.zeros((CHANNELS, self.across + 1, self.along + 1, LANES), np.int32)
 
     def flat_index(self, x: IntArray, y: IntArray) -> IntArray:
-        """Of (x, y), relative to the first corner."""
+        """Flat index of (x, y), relative to the first corner."""
         return np.asarray((y * (self.along + 1) + x) * LANES, np.int64)
 
     def centres(self, offsets: IntArray) -> FlatIndices:
-        """Of the centre, displaced by offsets (m, 2)."""
+        """Flat indices of the centre displaced by offsets (m, 2)."""
         return self.flat_index(offsets[:, 0] + self.along // 2, offsets[:, 1] + self.across // 2).astype(np.uint64)
 
     def corners(self, table: NDArray[np.int32]) -> FlatIndices:
-        """Of the four corners of rectangles (sign, x0, y0, x1, y1) from the centre; unsigned, so that they wrap."""
+        """Flat indices of the corners of rectangles (sign, x0, y0, x1, y1) from the centre; unsigned: they wrap."""
         _, x0, y0, x1, y1 = table.astype(np.int64).T
         corners = [
             self.flat_index(x1, y1),
@@ -298,12 +298,12 @@ class RotatedPatch:
 
     @cached_property
     def window(self) -> FlatIndices:
-        """Of the corners of the window that normalises for brightness and contrast."""
+        """Flat indices of the corners of the window that normalises for brightness and contrast."""
         u, v = self.scale.reach
         return self.corners(np.array([[1, -u, -v, u, v]], np.int32))
 
     def planes(self, channels: NDArray[np.int32]) -> FlatIndices:
-        """Of the start of each round's channel."""
+        """Flat index of the start of each round's channel."""
         return (channels.astype(np.int64) * ((self.along + 1) * (self.across + 1) * LANES)).astype(np.uint64)
 
 

@@ -9,7 +9,7 @@ from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray
 from schemas.detector import OnnxLayout
 
 OVERLAP = 0.25
-"""Of a tile with the next, as a fraction of its side: a vehicle at a tile's edge is whole in the next one."""
+"""Overlap of a tile with the next, as a fraction of its side: a vehicle at a tile's edge is whole in the next one."""
 _MAX_OVERLAP = 0.5
 """Boxes that overlap by more than this (intersection over union) are of one vehicle."""
 _EDGE_PX = 2.0
@@ -119,7 +119,7 @@ def _half_extent(boxes: Boxes) -> FloatArray:
 
 
 def suppress(boxes: Boxes, min_score: float) -> Boxes:
-    """Of boxes that overlap, the one of the highest score."""
+    """Non-maximum suppression: of boxes that overlap, the one with the highest score."""
     if not len(boxes):
         return boxes
     upright = np.abs(boxes.angle_rad).max() < 1e-3

@@ -1,4 +1,4 @@
-"""What an ONNX detector takes and gives: from Ultralytics' metadata, or a small YAML beside the model."""
+"""Inputs and outputs of an ONNX detector, from Ultralytics' metadata or from a small YAML file next to the model."""
 
 import ast
 import hashlib
@@ -33,7 +33,7 @@ _COLUMNS: dict[OnnxLayout, int] = {
     "end_to_end": 6,
     "end_to_end_oriented": 7,
 }
-"""Of a box, those of its classes' scores aside."""
+"""Numbers for each box, without the scores of its classes."""
 _ASK = "describe it in a YAML of its name beside it (docs/detection.md)"
 
 
@@ -96,9 +96,9 @@ def check_output(
     Parameters
     ----------
     name
-        Of the model, for the message.
+        Name of the model, for the message.
     sizes
-        Of the output, (1, ...); None where the model leaves one open.
+        Sizes of the output, (1, ...); None where the model leaves one open.
     layout, classes, vehicles
         As in `OnnxRecord`.
 
@@ -242,7 +242,7 @@ def _vehicles(path: Path, names: tuple[str, ...]) -> tuple[int, ...]:
 
 
 def _given_vehicles(path: Path, vehicles: tuple[int, ...], names: tuple[str, ...]) -> tuple[int, ...]:
-    """Those of the YAML, where they are numbers of classes: others would match no box, without an error."""
+    """The vehicle classes of the YAML file, checked: numbers of no class would silently match no box."""
     highest = len(names) - 1 if names else None
     wrong = [one for one in vehicles if one < 0 or (highest is not None and one > highest)]
     if wrong or not vehicles:

@@ -66,12 +66,12 @@ class OnnxDetector(Detector):
 
     @property
     def limitations(self) -> list[str]:
-        """A GPU that does not start."""
+        """One line if the GPU does not start."""
         return device_limitations(current_device())
 
     @property
     def notes(self) -> list[str]:
-        """Which classes count as vehicles, where they have names."""
+        """One line that says which classes count as vehicles, if the classes have names."""
         classes, vehicles = self.record.classes, self.record.vehicles
         used = ", ".join(classes[number] for number in vehicles) if classes else ""
         left = ", ".join(name for number, name in enumerate(classes) if name and number not in vehicles)

@@ -43,7 +43,7 @@ class LoadedTracks:
     position_sd_m, displacement_sd_m
         Standard deviations of a smoothed position, and of a displacement from one position to the next, along one axis.
     notes
-        What was read and done, a line each.
+        Notes on what was read and done, one line each.
     """
 
     table: pd.DataFrame

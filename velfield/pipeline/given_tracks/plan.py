@@ -25,7 +25,7 @@ def list_track_stages() -> list[Stage]:
 
 
 def describe_tracks(job: Job) -> str:
-    """What would be made of the tracks, in one line.
+    """One line that says what the run would make of the tracks.
 
     Raises
     ------

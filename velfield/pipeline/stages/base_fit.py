@@ -1,4 +1,4 @@
-"""How the frames are registered to the image given as ``--base``: scale, rotation and coverage, and their limits."""
+"""Registration of the frames to the image given as ``--base``: scale, rotation and coverage, and their limits."""
 
 from dataclasses import dataclass
 

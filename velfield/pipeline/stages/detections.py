@@ -120,7 +120,7 @@ def detect_block(plan: Plan, frames: range) -> BlockDetections:
 
 
 def _supported(working: WorkingGrid, found: "_Found", frame: int) -> Mask:
-    """Which of the cars and candidates (n,) lie where control points support the frame's map."""
+    """Mask (n,) of the cars and candidates that lie where control points support the frame's map."""
     transform = working.maps.transform(frame)
     assert transform is not None, "a frame that was searched is registered"
     raw = transform.to_raw(found.xy_base)
@@ -128,7 +128,7 @@ def _supported(working: WorkingGrid, found: "_Found", frame: int) -> Mask:
 
 
 def _searcher(plan: Plan, working: WorkingGrid, usable: Mask) -> "Callable[[int], _Found | None]":
-    """What gives the cars of a frame: given boxes, a detector of raw frames, or one of the working grid."""
+    """Function that finds the cars of a frame: given boxes, a detector of raw frames, or one of the working grid."""
     if plan.job.inputs.detections:
         table = external_boxes(plan)
         return lambda frame: _from_boxes(plan, working, frame, table[table["source_index"] == plan.indices[frame]])
@@ -155,11 +155,12 @@ def _from_boxes(plan: Plan, working: WorkingGrid, frame: int, boxes: pd.DataFram
 
 @dataclass(frozen=True)
 class _Found:
-    """What was found in a frame.
+    """Cars and candidates found in a frame.
 
     Attributes
     ----------
-    detections : cars and, after so many (``cars``), weak candidates.
+    detections : cars first, then weak candidates.
+    cars : number of cars among them.
     xy_base : their positions (n, 2), base px.
     scale : working px a base px.
     searched : the fraction of the frame that was searched.
@@ -173,7 +174,7 @@ class _Found:
 
     @classmethod
     def in_frame(cls, detections: FrameDetections, cars: int, rectified: WorkingFrame, searched: float) -> "_Found":
-        """What was found in a frame, which itself is not kept: a block's frames together are large."""
+        """Cars and candidates of a frame; the frame itself is not kept, as a block's frames together are large."""
         return cls(detections, cars, rectified.to_base(detections.xy), rectified.scale, searched)
 
     def keep(self, rows: Mask) -> "_Found":
@@ -186,7 +187,7 @@ class _Found:
 
 @dataclass(frozen=True)
 class _FrameCars:
-    """What was found in a frame, by its number and time."""
+    """Cars and candidates of a frame, with its number and time."""
 
     frame: int
     time_s: float
@@ -263,7 +264,7 @@ _NO_CROPS: dict[str, NDArray[Any]] = {
     "xy_work": np.empty((0, 2)),
 }
 _WEAK_CROPS = ("chips", "xy_work")
-"""Those of weak candidates: tracks align them, and take the appearance and the size from the cars."""
+"""Arrays of weak candidates: tracks align them, and take the appearance and the size from the cars."""
 
 
 def _tabulate(parts: Sequence[_FrameCars]) -> BlockDetections:

@@ -36,7 +36,7 @@ Register = Callable[[int, Lens], FrameRegistration]
 
 @dataclass(frozen=True)
 class DirectRegistration:
-    """How sampled frames register directly (None: one of them does not), the lens by their matches, notes on it, and
+    """Direct registration of the sampled frames (None if one fails), the lens from their matches, notes on it, and
     the features of the given image."""
 
     fit: BaseFit | None

@@ -249,7 +249,7 @@ def _with_telemetry(
 
 
 def _contradictions(grid: GridRecord, poses: FramePoses, north: North) -> list[str]:
-    """Where the camera's telemetry contradicts the place that the map has."""
+    """Contradictions between the camera's telemetry and the position of the map, one line each."""
     known_rad = north_direction_rad(grid)
     if known_rad is None or grid.gsd_m is None or grid.affine is None:
         return []

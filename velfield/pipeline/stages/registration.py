@@ -222,7 +222,7 @@ def external_boxes(plan: Plan) -> pd.DataFrame:
 
 
 def vehicle_free_mask(plan: Plan, frame: int, shape: tuple[int, int]) -> Mask | None:
-    """Where a raw frame (h, w) shows no vehicle by the given boxes: key points are detected there only.
+    """Mask of a raw frame (h, w), true outside the given vehicle boxes: key points are detected there only.
 
     None without given boxes. Boxes without a size mask nothing; key points on these vehicles are outliers of the fit.
     """

@@ -50,7 +50,7 @@ from velfield.tracking.recovery import (
 )
 
 _Columns = dict[str, np.ndarray]
-"""Of positions, (n,) each, by their names."""
+"""Columns of positions, (n,) each, by name."""
 _MIDDLE = ["frame_1", "time_1_s", "x_1_px", "y_1_px"]
 _IDS = [f"detection_id_{k}" for k in range(3)]
 _BORDER_M, _BORDER_S = 5.0, 0.6
@@ -58,7 +58,7 @@ _BORDER_M, _BORDER_S = 5.0, 0.6
 _MISSED_S = 1.0
 """A track that misses frames for so long goes on linearly meanwhile."""
 _CONFIDENCE = 0.95
-"""Of a tracklet that only its track confirms: as many were right in simulated flights, or more."""
+"""Confidence of a tracklet that only its track confirms: at least this fraction was right in simulated flights."""
 _HIDDEN_S = 1.5
 """A track that ends so shortly before the last frame, or begins so shortly after the first, did not vanish."""
 _AT_ONCE = 4
@@ -205,7 +205,7 @@ def all_positions(
 
 
 def _surest(frame: IntArray, track: IntArray, source: IntArray) -> IntArray:
-    """Of a track's positions in one frame (n,), the row of the one that is surest; by frame and track."""
+    """Row of the most certain position of each track in each frame, sorted by frame and track."""
     order = np.lexsort((source, track, frame))
     frame, track = frame[order], track[order]
     changes = (np.diff(frame) != 0) | (np.diff(track) != 0)
@@ -267,7 +267,7 @@ class _Triples:
 
 
 def find_triples(positions: pd.DataFrame, frames: _Frames, max_interval_s: float) -> _Triples:
-    """What may be a tracklet where only the track confirmed a detection, from `TRACK_POSITION_COLUMNS`."""
+    """Candidate tracklets that contain a detection confirmed by its track only, from `TRACK_POSITION_COLUMNS`."""
     known = positions[positions["source"] < 2].sort_values(["track_id", "frame"], ignore_index=True)
     track, frame = known["track_id"].to_numpy(), known["frame"].to_numpy()
     near = (np.diff(track) == 0) & (np.diff(np.cumsum(frames.usable)[frame]) == 1)
@@ -330,7 +330,7 @@ class _Output:
     def write(self, units: IntArray) -> tuple[list[Path], int]:
         """The files of consecutive units, and how many tracklets in them only tracks confirm.
 
-        What is read of a unit is kept for the one before it and itself, which alone need it where units are long.
+        Data read from a unit are kept only until the next one is written: units can be long.
         """
         written, recovered = [], 0
         kept: dict[int, UnitDetections] = {}
@@ -434,7 +434,7 @@ def _along_headings(strips: ByteArray, axis_rad: FloatArray, heading_rad: FloatA
 
 @dataclass(frozen=True)
 class TrackImages:
-    """What is known of tracks without reading frames.
+    """Appearance of tracks, as far as known without reading frames.
 
     ``ids`` (tracks,); ``strips`` (tracks, 32, 10), the means of ``count`` (tracks,) strips; ``scale``, working px
     a base px.
@@ -476,7 +476,7 @@ def mean_grey(strips: StripSums, tracks: IntArray) -> pd.Series:
 
 
 def find_context(plan: Plan, ends: TrackEnds, starts: TrackEnds, strips: StripSums) -> EndContext:
-    """Where chains vanish and appear, and how they look there."""
+    """Places where chains end and start, and their appearance there."""
     metres = read_tracking_gsd(plan.layout) or PAPER_GSD_M
     maps = FrameTransforms.open(plan.layout, plan.config)
     times_s = open_frames(plan.layout.frames).column("time_s")[usable_frames(plan)]

@@ -53,9 +53,9 @@ def choose_cars(labels: Iterable[Label], names: Mapping[int, str], origin: str) 
     Parameters
     ----------
     labels
-        Of every annotation.
+        Class of every annotation.
     names
-        Of the numbers among them.
+        Names of the classes that are given by number.
     origin
         Where the names stand, for the lines.
 

@@ -348,7 +348,7 @@ def read_file(path: Path, info: SourceInfo, found: Parsed, *, name: str) -> None
     Raises
     ------
     InputError
-        Of none of the formats, or content that violates the format.
+        The file has none of the formats, or its content violates the format.
     """
     suffix = path.suffix.lower()
     if suffix == ".txt":

@@ -1,4 +1,4 @@
-"""Which frame of the source an image that labels name is.
+"""Frame of the source for an image that labels name.
 
 An image of a folder is found by its file name or stem. A frame of a video has a number, which labelling tools write
 into the name of the image: it is read only where one number can be meant.

@@ -13,7 +13,7 @@ _HEAD = 4000
 
 
 def text_kind(path: Path) -> str | None:
-    """Which dialect a .txt is, by its first line of labels; empty of a file without any."""
+    """Dialect of a .txt file, by its first line of labels; empty if it has none."""
     with path.open("rb") as file:
         lines = [line.strip() for line in file.read(_HEAD).decode("utf-8-sig", "replace").splitlines()]
     line = next((one for one in lines if one and not re.match(r"(imagesource|gsd)\s*:", one)), "")

@@ -166,7 +166,7 @@ class Place:
     crs_wkt, affine
         The UTM zone, and (column, row) of pixel corners to its coordinates, as `velfield.sources.geo.BaseRaster`.
     longitude_deg, latitude_deg
-        Of the middle of the frames.
+        Position of the middle of the frames.
     sd_m
         Standard deviation of a position in either direction, m.
     """

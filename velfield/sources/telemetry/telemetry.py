@@ -70,15 +70,15 @@ class Telemetry:
     time_s
         Ascending, s from the source's first frame.
     latitude_deg, longitude_deg
-        Of the camera, WGS 84.
+        Position of the camera, WGS 84.
     height_m
         As ``height`` says.
     altitude_m
         Above the sea or the ellipsoid: not comparable with the ground, whose altitude is not known.
     yaw_deg
-        Of the camera, clockwise from north: where the top of a picture taken straight down points.
+        Yaw of the camera, clockwise from north: the direction of the top of a picture taken straight down.
     pitch_deg, roll_deg
-        Of the camera: -90 is straight down.
+        Pitch and roll of the camera; a pitch of -90 is straight down.
     focal_35mm
         Focal length that gives the same diagonal angle of view on 36 mm x 24 mm, mm, before digital zoom.
     focal_px
@@ -92,7 +92,7 @@ class Telemetry:
     notes
         One line each: what could not be read.
     height
-        What ``height_m`` is above.
+        Reference of ``height_m``.
     is_utc
         Whether the clock shows UTC.
     """

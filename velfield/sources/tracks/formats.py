@@ -49,7 +49,7 @@ class TrackFormat:
     times, frame
         Columns of the time with their units (None: by the values), and of the frame.
     point
-        What a position is of. A corner is the upper left one of a box, whose sizes are in ``size``.
+        Point of the vehicle that a position gives. A corner is the upper left one of a box; its sizes are in ``size``.
     speed
         The speed by the file, with which the positions are compared.
     size

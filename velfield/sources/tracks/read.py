@@ -51,7 +51,7 @@ class GivenPositions:
         ``track_id`` (int) and ``source_id``, its name in the file, ``frame`` (int), ``time_s`` from 0 on, ``x``, ``y``
         with y downwards; ``length_m``, ``width_m`` where the file has them (NaN: not known); by track and time.
     unit
-        Of ``x``, ``y``: ``m`` or ``px``.
+        Unit of ``x`` and ``y``: ``m`` or ``px``.
     y_axis
         Where y points in the file.
     crs_wkt
@@ -59,7 +59,7 @@ class GivenPositions:
     speed
         Speeds of the rows by the file.
     notes
-        What was read, and what was noticed, a line each.
+        Notes on what was read and noticed, one line each.
     """
 
     table: pd.DataFrame

@@ -28,7 +28,7 @@ def to_seconds(series: pd.Series, unit: TimeUnit | None, path: Path) -> tuple[Fl
     series
         A column: numbers, dates with or without zones, times of day.
     unit
-        Of numbers; None: seconds, or since 1970 in the unit that gives a year of today.
+        Unit of times given as numbers; None: seconds, or since 1970 in the unit that gives a year of today.
     path
         The file, for messages.
 

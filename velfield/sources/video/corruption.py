@@ -168,7 +168,7 @@ def _is_error(level: int, message: str) -> bool:
 
 
 class CorruptionTracker:
-    """Which frames are suspect, given the packets in decoding order and the errors as they are logged.
+    """Finds suspect frames, given the packets in decoding order and the errors as they are logged.
 
     Attributes
     ----------

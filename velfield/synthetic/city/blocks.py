@@ -182,7 +182,7 @@ def place_street_trees(canvas: Canvas, plan: p.CityPlan, scene: SceneSimulation,
 def _stems(
     span: tuple[float, float], crossings: list[float], stop_m: float, share: float, rng: np.random.Generator
 ) -> list[float]:
-    """Where along a kerb trees stand: rows that take a share of it, none near a crossing."""
+    """Positions of trees along a kerb: rows that take a share of it, none near a crossing."""
     found, at = [], span[0] - rng.uniform(0, _ROW_M[1])
     while at < span[1]:
         row = rng.uniform(*_ROW_M)
