@@ -83,7 +83,7 @@ _RECORD: TypeAdapter[DetectorRecord] = TypeAdapter(DetectorRecord)
 
 
 ONNX_SUFFIX = ".onnx"
-"""Of another maker's network: see `velfield.detection.onnx`."""
+"""Suffix of another program's network: see `velfield.detection.onnx`."""
 _OTHER_FORMATS = (
     ".pt",
     ".pth",
@@ -96,7 +96,7 @@ _OTHER_FORMATS = (
     ".mlmodel",
     ".safetensors",
 )
-"""Those that the trainers of such networks write, and that are not read."""
+"""Suffixes of files that the trainers of such networks write, and that cannot be read."""
 
 
 def load_detector(path: Path) -> Detector:

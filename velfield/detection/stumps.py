@@ -36,7 +36,7 @@ class BoostedStumps:
 
     @classmethod
     def from_rounds(cls, rounds: Sequence[Round]) -> "BoostedStumps":
-        """Of a detector's record."""
+        """The stumps of the rounds in a detector's record."""
         table = [(r.sign, r.x0, r.y0, r.x1, r.y1) for one in rounds for r in one.rectangles]
         starts = np.cumsum([0, *(len(one.rectangles) for one in rounds)])
         return cls(

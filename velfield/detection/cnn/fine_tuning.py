@@ -52,7 +52,7 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: Network, record: Cnn
         Labelled images. Where labels are incomplete, what the pre-trained network detects elsewhere is not used as
         background.
     record
-        Of the pre-trained detector: its threshold, and who made it.
+        Record of the pre-trained detector: its threshold, and who made it.
     """
     masked = parallel_map(lambda sample: _mask_unlabelled_positives(sample, pretrained), samples)
     count = sum(len(sample.cars) for sample in samples)
