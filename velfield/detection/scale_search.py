@@ -1,11 +1,13 @@
-"""The size of a car by the shipped detector, where neither scale nor labels are given.
+"""The scale of an image by the shipped detector, where neither scale nor labels are given.
 
-The network was trained on cars of one length in pixels. At the right scale of the image its scores are highest, and
-what it finds has a car's length and width; at others the network finds parts of things that look like cars, of any
-size. So the image is searched at every scale, and the scale is taken where the product of both is greatest.
+The network was trained on cars of one length in pixels. At the right scale of the image it finds the most cars, with
+the highest scores and of a car's length and width; at others it finds parts of things that look like cars, of any size.
+So parts of the image are searched at every scale (the scan), and about the best one more of it, where the median length
+of the cars that are found gives the scale (the refinement).
 """
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,32 +18,68 @@ from velfield.detection.frame import half_resolution
 from velfield.detection.interface import Detector
 
 STEP = 1.25
-"""Between the scales that are tried: the network finds cars that are a quarter larger or smaller too."""
+"""Ratio of two scales of the scan: the network finds cars that are a quarter larger or smaller too."""
+SCAN_PX, REFINE_PX = 800_000, 2_500_000
+"""Area that is searched at a scale of the scan, and in the refinement, working px."""
+_COLUMNS, _ROWS = 3, 2
+"""Windows of an image that is larger than that."""
 _TOP = 20
-"""Detections a frame whose scores count."""
+"""Detections whose scores count for the agreement, the highest."""
 _LENGTHS, _WIDTHS, _MAX_SD = (0.8, 1.5), (0.31, 0.62), 0.13
 """Length and width of a car, in units of `working_car_length_px`; largest relative deviation of a measured length."""
-_MIN_DETECTIONS = 12
+_LENGTH_BIAS = 1.027
+"""Ratio of the median measured length to the true one at the right scale, on KIT AIS, minsk, songdo and six simulated
+cities; 1.0 to 1.05 on all but one."""
+_MIN_DETECTIONS, _MIN_CARS = 12, 6
+"""Of any size; of a car's size."""
 _MIN_AGREEMENT = 0.04
-"""Mean score times the fraction of the size of cars: 0.07 to 0.14 at the right scale of real and simulated images,
-0.03 to 0.05 at wrong ones."""
+"""Mean score times the fraction of the size of cars: 0.07 to 0.28 at the right scale of real and simulated images,
+0.03 to 0.08 at wrong ones."""
 _RIGHT_AGREEMENT = 0.06
 _MIN_RATIO = 1.3
-"""The best scale must surpass all that are not beside it by this factor."""
+"""The density of cars at the best scale must surpass that at all scales but its neighbours by this factor."""
+_CLOSE = 1.1
+"""The refinement is repeated where it changes the scale by more than this factor: lengths are unbiased near the right
+scale alone."""
 View = tuple[GreyImage, Mask]
+Views = Callable[[float, int], Iterable[View]]
+"""Images and where they are valid, (h, w) each, resampled by a factor, of some total area in px of these."""
+Window = tuple[int, int, int, int]
+"""x, y, width, height."""
 Measure = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
 """Lengths, their standard deviations and widths (n,) by strips (n, 32, 10), px of the image."""
 
 
-def find_scale(
-    views: Callable[[float], Iterable[View]], detector: Detector, scales: FloatArray, measure: Measure
-) -> float | None:
-    """Scale at which cars are of the detector's size.
+@dataclass(frozen=True)
+class _Finds:
+    """Detections at one scale.
+
+    Attributes
+    ----------
+    count : of any size.
+    agreement : mean of the highest scores times the fraction that has the size of a car.
+    density : sum of the scores of those of the size of a car, per megapixel.
+    length_px : (n,) of those of the size of a car.
+    """
+
+    count: int
+    agreement: float
+    density: float
+    length_px: FloatArray
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether there are cars."""
+        return self.count >= _MIN_DETECTIONS and len(self.length_px) >= _MIN_CARS and self.agreement >= _MIN_AGREEMENT
+
+
+def find_scale(views: Views, detector: Detector, scales: FloatArray, measure: Measure) -> float | None:
+    """Scale at which the median car is of the detector's length.
 
     Parameters
     ----------
     views
-        Images and where they are valid, (h, w) each, resampled by a factor; the same ones for every factor.
+        Parts of the image.
     detector
         Its record has `working_car_length_px`.
     scales
@@ -51,25 +89,32 @@ def find_scale(
 
     Returns
     -------
-    A factor between two of ``scales``, right to some 15 %; None where no factor is clearly better than others.
+    A factor, right to some 5 % of the length of the cars in view; None where no factor is clearly better than others.
     """
-    found = [_agreement([_judge(view, detector, measure) for view in views(float(scale))]) for scale in scales]
-    agreement, count = np.array(found).reshape(-1, 2).T
-    if not len(agreement):
+    if not len(scales):
         return None
-    best = int(agreement.argmax())
+    density = np.array([_search(views(float(scale), SCAN_PX), detector, measure).density for scale in scales])
+    best = int(density.argmax())
     apart = np.abs(np.arange(len(scales)) - best) > 2
-    surpassed = agreement[best] > _MIN_RATIO * agreement[apart].max(initial=0.0)
-    if agreement[best] < _MIN_AGREEMENT or count[best] < _MIN_DETECTIONS or not surpassed:
+    if density[best] <= _MIN_RATIO * density[apart].max(initial=0.0):
         return None
     beside = slice(max(best - 1, 0), best + 2)
-    return float(np.exp(np.average(np.log(scales[beside]), weights=agreement[beside] ** 2)))
+    scale = float(np.exp(np.average(np.log(scales[beside]), weights=density[beside] ** 2)))
+    for _ in range(2):
+        found = _search(views(scale, REFINE_PX), detector, measure)
+        if not found.is_enough:
+            return None
+        factor = _LENGTH_BIAS * detector.record.working_car_length_px / float(np.median(found.length_px))
+        scale *= factor
+        if 1 / _CLOSE < factor < _CLOSE:
+            break
+    return scale
 
 
 def is_plausible_scale(views: Iterable[View], detector: Detector, measure: Measure) -> bool:
     """Whether the detector finds cars of its size in images of one scale, as it does at the right one."""
-    agreement, count = _agreement([_judge(view, detector, measure) for view in views])
-    return agreement >= _RIGHT_AGREEMENT and count >= _MIN_DETECTIONS
+    found = _search(views, detector, measure)
+    return found.agreement >= _RIGHT_AGREEMENT and found.count >= _MIN_DETECTIONS
 
 
 def working_scale(config: DetectorConfig, gsd_m: float) -> float:
@@ -77,23 +122,39 @@ def working_scale(config: DetectorConfig, gsd_m: float) -> float:
     return config.working_car_length_px * gsd_m / config.car_length_m
 
 
-def _judge(view: View, detector: Detector, measure: Measure) -> tuple[FloatArray, Mask]:
-    """Scores of what is found, the highest, and which of all have the size of a car."""
-    image, valid = view
-    cars = detector.detect(image, valid)
-    if not len(cars):
-        return np.empty(0), np.empty(0, bool)
-    strips = oriented_strips(half_resolution(image), cars.xy, cars.orientation_rad)
-    length, length_sd, width = measure(np.asarray(strips, np.float64))
+def spread_windows(width: int, height: int, area: float) -> list[Window]:
+    """Windows of an image, spread over it, of some total area: one where that holds it whole."""
+    share = min(1.0, float(np.sqrt(area / (width * height))))
+    columns, rows = (1, 1) if share == 1.0 else (_COLUMNS, _ROWS)
+    cell = width / columns, height / rows
+    size = [max(1, int(side * share)) for side in cell]
+    corners = [
+        [int((k + 0.5) * side - part / 2) for k in range(n)]
+        for side, part, n in zip(cell, size, (columns, rows), strict=True)
+    ]
+    return [(x, y, size[0], size[1]) for y in corners[1] for x in corners[0]]
+
+
+def _search(views: Iterable[View], detector: Detector, measure: Measure) -> _Finds:
+    """Detect cars in all views, and measure them."""
     car_px = float(detector.record.working_car_length_px)
-    is_car = length_sd < _MAX_SD * length
-    for values, (low, high) in ((length, _LENGTHS), (width, _WIDTHS)):
-        is_car &= (values > low * car_px) & (values < high * car_px)
-    return np.sort(cars.score)[::-1][:_TOP], is_car
-
-
-def _agreement(parts: list[tuple[FloatArray, Mask]]) -> tuple[float, float]:
-    """Mean of the highest scores times the fraction that has the size of a car; and the number of detections."""
-    score = np.concatenate([np.empty(0), *(part[0] for part in parts)])
-    is_car = np.concatenate([np.empty(0, bool), *(part[1] for part in parts)])
-    return (float(score.mean() * is_car.mean()), float(len(is_car))) if len(is_car) else (0.0, 0.0)
+    scores, lengths, sizes, area = [np.empty(0)], [np.empty(0)], [np.empty(0, bool)], 0
+    for image, valid in views:
+        area += int(valid.sum())
+        cars = detector.detect(image, valid)
+        if not len(cars):
+            continue
+        strips = oriented_strips(half_resolution(image), cars.xy, cars.orientation_rad)
+        length, length_sd, width = measure(np.asarray(strips, np.float64))
+        is_car = length_sd < _MAX_SD * length
+        for values, (low, high) in ((length, _LENGTHS), (width, _WIDTHS)):
+            is_car &= (values > low * car_px) & (values < high * car_px)
+        scores.append(cars.score)
+        lengths.append(length)
+        sizes.append(is_car)
+    score, length, is_car = np.concatenate(scores), np.concatenate(lengths), np.concatenate(sizes)
+    if not len(score):
+        return _Finds(0, 0.0, 0.0, length)
+    agreement = float(np.sort(score)[-_TOP:].mean() * is_car.mean())
+    density = float(np.maximum(score, 0)[is_car].sum()) / area * 1e6
+    return _Finds(len(score), agreement, density, length[is_car])

@@ -209,7 +209,7 @@ STAGES: tuple[Stage, ...] = (
     # Scale, north and place of the base image: by its own reference system, --gsd-m, control points and telemetry.
     Stage(
         name="georeference",
-        version=3,
+        version=4,
         label="georeference",
         lines=(
             Line("{gsd_m:.4g} m a pixel by control points", lambda counts: bool(counts.get("by_control_points"))),
@@ -229,7 +229,7 @@ STAGES: tuple[Stage, ...] = (
     # The shipped detector, one that is fine-tuned on labelled frames, or a given one.
     Stage(
         name="detector",
-        version=24,
+        version=25,
         label="detector",
         lines=(
             Line("skipped: external detections", lambda counts: bool(counts) and "threshold" not in counts),

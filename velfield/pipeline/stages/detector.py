@@ -167,7 +167,7 @@ def _shipped(plan: Plan) -> StageResult:
             "the size of a car is not known: the detector finds cars at no scale of the image, or at several; give "
             "--gsd-m (metres a base pixel), or label the cars of one frame (--labels)"
         )
-    return _finish(plan, detector, scale, "shipped", car_length_m=config.car_length_m)
+    return _finish(plan, detector, scale, "shipped")
 
 
 def _finish(
@@ -177,12 +177,10 @@ def _finish(
     training_source: str,
     *,
     count: int = 0,
-    car_length_m: float = CAR_LENGTH_M,
 ) -> StageResult:
     """Write the detector and the working grid.
 
-    ``scale``: working px a base px; None: the size of a car is not known, and working px are base px. ``car_length_m``:
-    length of the cars that it makes `working_car_length_px` long.
+    ``scale``: working px a base px; None: the size of a car is not known, and working px are base px.
     """
     layout, outputs, notes = plan.layout, [plan.layout.working], []
     warnings: list[str] = []
@@ -201,7 +199,7 @@ def _finish(
     car_px = plan.config.detection.working_car_length_px
     record = WorkingRecord(
         scale=scale or 1.0,
-        vehicle_gsd_m=None if by_vehicles is None else car_length_m * by_vehicles / car_px,
+        vehicle_gsd_m=None if by_vehicles is None else CAR_LENGTH_M * by_vehicles / car_px,
         training_source=training_source,
         labels=count,
     )
