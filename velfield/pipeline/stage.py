@@ -300,7 +300,7 @@ STAGES: tuple[Stage, ...] = (
     # Scale, north and place again, with the lengths of the vehicles.
     Stage(
         name="scale",
-        version=1,
+        version=2,
         label="scale",
         lines=(
             Line(

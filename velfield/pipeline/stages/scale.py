@@ -7,12 +7,14 @@ with an interval. It is used where there is no other, and else compared with the
 """
 
 import numpy as np
+import pandas as pd
 
 from schemas.georeference import GeoreferenceRecord
 from schemas.scale import ScaleEstimate
 from schemas.tables import DIMENSION_COLUMNS, TRACK_COLUMNS
 from velfield.analysis.speed_changes import MIN_VEHICLES, PLAUSIBLE_M_PER_S2, check_times
 from velfield.analysis.trajectories import from_tracklets, moving
+from velfield.analysis.vehicle_scale import MIN_VEHICLES as MIN_LENGTHS
 from velfield.analysis.vehicle_scale import estimate_track_scale
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
@@ -55,12 +57,32 @@ def scale_run(plan: Plan) -> StageResult:
 
 
 def scale_of_tracks(layout: RunLayout) -> tuple[ScaleEstimate | None, int]:
-    """The scale by the measured lengths of a run's vehicles, None of too few; and their number."""
+    """The scale by the measured lengths of a run's vehicles, None of too few; and their number.
+
+    Of those that moved by their length where there are enough: among things that stand are some that are no vehicles.
+    """
     if not layout.dimensions.exists():
         return None, 0
-    lengths = read_tables([layout.dimensions], DIMENSION_COLUMNS, only=["length_px", "length_sd_px"])
-    length, sd = (lengths[name].to_numpy(np.float64) for name in lengths)
-    return estimate_track_scale(length, sd), int(np.isfinite(length).sum())
+    table = read_tables([layout.dimensions], DIMENSION_COLUMNS, only=["track_id", "length_px", "length_sd_px"])
+    table = table[np.isfinite(table["length_px"])]
+    moved = table[_path_extent_px(layout).reindex(table["track_id"]).to_numpy() > table["length_px"].to_numpy()]
+    used = moved if len(moved) >= MIN_LENGTHS else table
+    length, sd = (used[name].to_numpy(np.float64) for name in ("length_px", "length_sd_px"))
+    return estimate_track_scale(length, sd), len(used)
+
+
+def _path_extent_px(layout: RunLayout) -> pd.Series:
+    """Diagonal of the box about each track's positions, base px, by ``track_id``."""
+    names = ["track_id", "x_1_px", "y_1_px"]
+    boxes = [
+        read_tables([path], TRACK_COLUMNS, only=names).groupby("track_id").agg(["min", "max"])
+        for path in sorted(layout.tracks.glob("unit-*.parquet"))
+    ]
+    if not boxes:
+        return pd.Series(dtype=np.float64)
+    both = pd.concat(boxes).groupby(level=0)
+    span = both.max().xs("max", axis=1, level=1) - both.min().xs("min", axis=1, level=1)
+    return pd.Series(np.hypot(span["x_1_px"], span["y_1_px"]))
 
 
 def _other_limits(plan: Plan, record: GeoreferenceRecord) -> list[str]:
