@@ -50,24 +50,24 @@ app = App(
 )
 
 # Each in a file of its own, imported when it runs.
-app.command("flows.commands.init:init", name="init", help="Probe a video and write a commented flight.yaml.")
+app.command("flows.commands.init:init", name="init", help="Inspect a video and write a commented flight.yaml.")
 app.command("flows.commands.config:config", name="config", help="Print the configuration of a run.")
 app.command("flows.commands.view:view", name="view", help="Show a run's page in the browser.")
 app.command("flows.commands.analyse:analyse", name="analyse", help="Lanes, turning counts, speeds, signals: a report.")
 app.command("flows.commands.annotate:annotate", name="annotate", help="Label cars in the browser, as training data.")
 app.command("flows.commands.train:train", name="train", help="Train a detector from labelled cars.")
 app.command("flows.commands.export:export", name="export", help="Write a finished run in another format.")
-app.command("flows.commands.lineage:lineage", name="lineage", help="Lineage of a run, or of a pixel of its field.")
-app.command("flows.commands.reprocess:reprocess", name="reprocess", help="Map a finished run onto a new base image.")
+app.command("flows.commands.lineage:lineage", name="lineage", help="Print the lineage of a run, or of a pixel.")
+app.command("flows.commands.reprocess:reprocess", name="reprocess", help="Put a new base image under a finished run.")
 app.command(
-    "flows.commands.georeference:georeference", name="georeference", help="Put a run's map on Earth by control points."
+    "flows.commands.georeference:georeference", name="georeference", help="Georeference a run by control points."
 )
 app.command("flows.commands.serve:serve", name="serve", help="Process flights that arrive in a folder, with a UI.")
-app.command("flows.commands.verify:verify", name="verify", help="Check the integrity of a run folder, and repair it.")
-app.command("flows.commands.algebra:merge", name="merge", help="Add the fields of runs on one grid, exactly.")
-app.command("flows.commands.algebra:subtract", name="subtract", help="Subtract a merged field again, exactly.")
+app.command("flows.commands.verify:verify", name="verify", help="Check the integrity of a run folder, or repair it.")
+app.command("flows.commands.algebra:merge", name="merge", help="Add the fields of runs that share a grid, exactly.")
+app.command("flows.commands.algebra:subtract", name="subtract", help="Subtract a field from a merged one, exactly.")
 app.command("flows.commands.algebra:compare", name="compare", help="Map what changed between two fields.")
-app.command("flows.commands.bench:bench", name="bench", help="Speed and accuracy, against a peer in the same run.")
+app.command("flows.commands.bench:bench", name="bench", help="Measure speed and accuracy against other programs.")
 
 Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative=())]
 Verbose = Annotated[bool, Parameter(name=["--verbose", "-v"], negative=())]
@@ -107,39 +107,39 @@ def run(
     verbose: Verbose = False,
     log_json: LogJson = False,
 ) -> int:
-    """Aerial video in, velocity field out. The same command again resumes.
+    """Compute a velocity field from aerial video. Run the same command again to resume.
 
     Parameters
     ----------
     source
         Video file, or folder of images.
     more
-        Further clips of the same place, one after the other in time: one map, one clock by the files' own times.
+        Additional clips of the same site, in time order: they give one map, with the times of the files.
     out
         Run folder: everything is written there.
     tracks
         Tracks of another program instead of a video: CSV or Parquet (geo-trax, highD and others), or SUMO's FCD. Field,
         maps and analysis are made of them.
     unit
-        Unit of the columns x and y in `--tracks`, where their names do not say it.
+        Unit of the columns x and y in `--tracks`, if their names do not give it.
     y_axis
-        Where y points in `--tracks`: up, as north in maps, or down, as in images.
+        Direction of the y axis in `--tracks`: up (north, as in maps) or down (as in images).
     base
         Image whose pixels become the base pixels: GeoTIFF, PNG with world file, or plain.
         Default: built from the flight.
     gsd_m
-        Ground sample distance, metres a base pixel. Default: by the base image's CRS, the drone's metadata or the
+        Ground sample distance, metres per base pixel. Default: from the base image's CRS, the drone's metadata or the
         lengths of the vehicles.
     labels
         Labelled cars to fine-tune the detector on (docs/detection.md#label-formats). Default: none.
     detector
-        A trained detector file, or a YOLO-type ONNX model, instead of training.
+        A trained detector file, or a YOLO-type ONNX model. Default: the detector that comes with velfield.
     detections
-        Boxes of another detector, instead of this one's.
+        Boxes found by another program, instead of running a detector.
     timestamps
         CSV `frame,time_s` for a folder of images.
     telemetry
-        Subtitles (.SRT) or MISB KLV (.klv) of a drone. Default: those beside the video, or in it, or the images' tags.
+        Drone metadata: subtitles (.SRT) or MISB KLV (.klv). Default: the file next to the video, or the metadata in it.
     fps
         Frame rate of a folder of images without timestamps, or of `--tracks` that have no times.
     config
@@ -147,7 +147,7 @@ def run(
     preset
         Set of defaults to start from.
     settings
-        `section.key=value`, any number of times.
+        One parameter, as `section.key=value`; can be repeated.
     every
         Take every n-th frame; `auto`: the frames nearest to 0.2 s apart.
     start_s
@@ -155,7 +155,7 @@ def run(
     stop_s
         Skip frames from this time on, seconds from the first frame.
     intervals
-        A field for each time interval too: `15min`, or `07:00-09:00,15:00-18:00`, or seconds `0-300,300-600`.
+        Also compute a field for each time interval: `15min`, `07:00-09:00,15:00-18:00`, or seconds `0-300,300-600`.
     workers
         Processes of a local cluster. Default: threads of this process.
     scheduler
@@ -163,15 +163,15 @@ def run(
     cluster
         File with the class of Dask clusters to use and its arguments; see `examples/cluster-*.yaml`.
     device
-        Where the network is run: cpu, cuda, or auto (default): a GPU if onnxruntime can use one.
+        Device that runs the network: cpu, cuda, or auto (default), which uses a GPU if there is one.
     plan
         Print what would be computed, and stop.
     quiet
-        Warnings only.
+        Print warnings only.
     verbose
-        More detail.
+        Print more detail.
     log_json
-        Lines of JSON instead of text.
+        Print lines of JSON instead of text.
     """
     from schemas.job import Inputs, Job
     from velfield.pipeline.configuration import resolve_config
@@ -231,23 +231,23 @@ def simulate(
     out
         Folder to write to.
     frames
-        How many frames.
+        Number of frames.
     size
         Frame size, WxH in pixels.
     seed
-        Another seed, another city and another flight.
+        Seed of the city and the flight.
     clip
-        Write a drone's clip DJI_0001.MP4, 25 frames a second, in place of frames/, with its telemetry: in a file
-        `beside` it, or `embedded`.
+        Write a drone clip DJI_0001.MP4 (25 frames per second) instead of frames/, with its telemetry `beside` it, in
+        a file DJI_0001.SRT, or `embedded` in the clip.
     quiet
-        Warnings only.
+        Print warnings only.
     """
     _simulate(out, frames=frames, size=size, seed=seed, quiet=quiet, clip=clip)
     if clip is not None:
-        print(f"{out}: try  velfield run {out}/DJI_0001.MP4 --out RUN")
+        print(f"{out}: try  {own_command()} run {out}/DJI_0001.MP4 --out RUN")
         return DONE
     given = f"--timestamps {out}/timestamps.csv --base {out}/base.png --labels {out}/labels.csv --gsd-m 0.23"
-    print(f"{out}: try  velfield run {out}/frames {given} --out RUN")
+    print(f"{out}: try  {own_command()} run {out}/frames {given} --out RUN")
     return DONE
 
 
@@ -267,13 +267,13 @@ def demo(
     out
         Folder to write to.
     frames
-        How many frames.
+        Number of frames.
     size
         Frame size, WxH in pixels.
     seed
-        Another seed, another city.
+        Seed of the city and the flight.
     quiet
-        Warnings only.
+        Print warnings only.
     """
     from flows.commands.analyse import analyse
     from flows.launch import first_start_beside, kernels_beside, prepare_process
@@ -294,10 +294,9 @@ def demo(
         analyse(run)
         _score(run, flight)
         if not quiet:
-            print(f"the map:    velfield view {shlex.quote(str(run))}")
+            print(f"the map:    {own_command()} view {shlex.quote(str(run))}")
             print(f"the report: {run / 'analysis' / 'report.html'}")
-            words = ["velfield", "run", inputs.source, "--preset", "fast", "--out", str(run)]
-            print("the same on your own clip:", shlex.join(words))
+            print(f"your own clip: {own_command()} run VIDEO --preset fast --out RUN")
     return status
 
 
@@ -346,9 +345,9 @@ def _tracks_inputs(tracks: Path | None, base: Path | None, frames_only: list[str
     from schemas.job import Inputs
 
     if tracks is None:
-        raise InputError("found neither a video nor --tracks; give a video, a folder of images, or --tracks FILE")
+        raise InputError("no input; give a video, a folder of images, or --tracks FILE")
     if frames_only:
-        raise InputError(f"found --tracks and {', '.join(frames_only)}, expected tracks alone, which have no frames")
+        raise InputError(f"--tracks cannot be combined with {', '.join(frames_only)}: tracks have no frames")
     return Inputs(source=str(tracks), base=_text(base))
 
 
@@ -356,9 +355,9 @@ def _runner(workers: int | None, scheduler: str | None, cluster: Path | None) ->
     from flows.runners import RunnerConfig, check_scheduler, read_runner
 
     if sum(given is not None for given in (workers, scheduler, cluster)) > 1:
-        raise InputError("found more than one of --workers, --scheduler and --cluster; give one")
+        raise InputError("--workers, --scheduler and --cluster exclude each other; give only one")
     if workers is not None and workers < 1:
-        raise InputError(f"--workers {workers}: expected a whole number from 1 on; leave it out for this process alone")
+        raise InputError(f"--workers {workers}: must be a positive integer; omit it to run in this process")
     if scheduler is not None:
         check_scheduler(scheduler)  # before Prefect's server starts, which takes longer
     return read_runner(cluster) if cluster else RunnerConfig(workers=workers, scheduler=scheduler)
@@ -435,9 +434,9 @@ def _conclude(summary: "RunSummary", console: "Console") -> int:
     for line in (*summary.footage_lost, *summary.frames_lost[:10]):
         console.warn(line)
     lost_units = sum(len(stage.lost) for stage in summary.stages)
-    absent = ", a part of the recording is not there" if summary.footage_lost else ""
+    absent = ", part of the recording is missing" if summary.footage_lost else ""
     console.warn(
-        f"{summary.root}: done, but not complete: {len(summary.frames_lost)} frames and {lost_units} units lost"
+        f"{summary.root}: done, but incomplete: {len(summary.frames_lost)} frames and {lost_units} units lost"
         f"{absent}; the report lists them"
     )
     return INCOMPLETE
@@ -462,7 +461,9 @@ def _clip_list(source: Path, more: tuple[Path, ...], out: Path) -> Path:
 
     if is_remote(to_path(out)):
         raise InputError(
-            f"{out}: several clips need a list on a disk; write x{CLIPS_SUFFIX}, a path a line, and run it"
+            f"{out}: several clips need a list on a local disk; write their paths, one per line, into "
+            f"clips{CLIPS_SUFFIX} "
+            "and run that file"
         )
     path = out / f"source{CLIPS_SUFFIX}"
     write_clip_list(path, (source, *more))
@@ -473,7 +474,7 @@ def _every(text: str | None) -> int | str | None:
     if text is None or text == "auto":
         return text
     if not text.isdigit() or int(text) < 1:
-        raise InputError(f"--every {text}: expected a whole number from 1 on, or auto")
+        raise InputError(f"--every {text}: must be a positive integer, or auto")
     return int(text)
 
 
@@ -514,8 +515,8 @@ def _choices(argument: Argument | None) -> str:
 def _explain_s3(error: Exception) -> str:
     if type(error).__name__ == "NoCredentialsError":
         return (
-            "found no credentials, expected AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, a profile (AWS_PROFILE) or "
-            "this machine's role; set them"
+            "no credentials; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or a profile (AWS_PROFILE), or give this "
+            "machine a role"
         )
     return " ".join(str(error).split())  # no such server, an address that is none
 
@@ -535,7 +536,7 @@ def main() -> None:
         name = f"value for {missing}" if missing else getattr(error.argument, "name", "")
         choices = "" if missing else _choices(error.argument)
         print(
-            f"velfield: {chain}: found no {name}, which is needed{choices}; see `velfield {chain} --help`",
+            f"velfield: {chain}: {name} is missing{choices}; see `velfield {chain} --help`",
             file=sys.stderr,
         )
         status = USAGE

@@ -133,6 +133,7 @@ class Console:
 
     def __init__(self, verbosity: Verbosity = "normal") -> None:
         self.verbosity: Verbosity = verbosity
+        self._warnings: list[str] = []
         self._rich = RichConsole(stderr=True, quiet=verbosity in ("quiet", "json"), highlight=False)
 
     def event(self, kind: str, text: str, **values: object) -> None:
@@ -148,6 +149,19 @@ class Console:
             self.event("warning", text)
         else:
             RichConsole(stderr=True, highlight=False).print(f"warning: {text}", markup=False, soft_wrap=True)
+
+    def warn_at_end(self, text: str) -> None:
+        """A warning for `print_warnings`, so that it does not stand between lines of progress; JSON at once."""
+        if self.verbosity == "json":
+            self.warn(text)
+        else:
+            self._warnings.append(text)
+
+    def print_warnings(self) -> None:
+        """Print the warnings that were kept for the end, together."""
+        kept, self._warnings = self._warnings, []
+        for text in kept:
+            self.warn(text)
 
     def result(self, text: str) -> None:
         """A result of the command, on standard output."""

@@ -89,7 +89,7 @@ def spare_proxies() -> None:
         if separator and scheme.lower() not in known:
             del os.environ[name]
             warnings.warn(
-                f"found {name} = {scheme}://..., which Prefect cannot use here: left out; for a server behind it give "
+                f"ignoring {name} = {scheme}://..., which Prefect cannot use; to reach a server through it, set "
                 "an http:// proxy, or install httpx[socks]",
                 DeviceWarning,
                 stacklevel=3,
@@ -113,8 +113,8 @@ def use_writable_folders() -> None:
     temporary = temporary_cache()
     os.environ.update({name: str(temporary / folder) for name, folder in missing.items()})
     warnings.warn(
-        f"found the home folder ({os.environ.get('HOME') or 'HOME is not set'}) not writable: Prefect's database, "
-        f"compiled code and other caches go to {temporary}; set HOME to a folder that is writable to keep them",
+        f"found the home folder ({os.environ.get('HOME') or 'HOME is not set'}) is not writable: Prefect's database, "
+        f"compiled code and other caches go to {temporary}; set HOME to a writable folder to keep them",
         CacheWarning,
         stacklevel=2,
     )

@@ -101,7 +101,8 @@ def record_start(plan: Plan, what: str, console: Console) -> None:
 
 
 def publish_report(plan: Plan, summary: RunSummary, runner: Runner, console: Console) -> None:
-    """Write the page and the report, and show the summary in Prefect's UI."""
+    """Write the page and the report, print the warnings, and show the summary in Prefect's UI."""
     for note in runner.call(write_report, plan, summary):  # it reads whole tables
-        console.warn(note)
+        console.warn_at_end(note)
+    console.print_warnings()
     publish_summary(plan, summary)

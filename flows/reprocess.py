@@ -65,7 +65,7 @@ def run_reprocess(
     """
     where = runner or RunnerConfig()
     if not base.exists():
-        raise InputError(f"--base: {base} is not there; give a path that exists")
+        raise InputError(f"--base {base}: no such file; check the path")
     chosen = result_name(name, base)
     task_runner = ThreadPoolTaskRunner(max_workers=parallel_units(where))
     return reprocess.with_options(task_runner=task_runner)(
@@ -98,10 +98,10 @@ def reprocess(
 
 def _new_job(run: Run, name: str, base: str) -> Job:
     if run.layout.rebased.exists():
-        raise InputError(f"{run.layout.root} is itself mapped onto a new base image; reprocess the run that it is of")
+        raise InputError(f"{run.layout.root} is itself mapped onto a new base image; reprocess the original run")
     if run.record.inputs.source.kind == TRACKS:
         raise InputError(
-            f"{run.layout.root} is of tracks, without frames; run `velfield run --tracks` with the new --base"
+            f"{run.layout.root} was made from tracks and has no frames; run `velfield run --tracks` with the new --base"
         )
     if set(run.record.keys) != set(STAGE):
         raise InputError(f"{run.layout.root} was made by another version of velfield; run `velfield run` on it again")

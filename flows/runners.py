@@ -74,10 +74,10 @@ def read_runner(path: Path) -> RunnerConfig:
     try:
         file = ClusterFile.model_validate(load_yaml(path.read_text(encoding="utf-8")))
     except FileNotFoundError:
-        raise InputError(f"--cluster: {path} is not there; see examples/ for some") from None
+        raise InputError(f"--cluster {path}: no such file; see examples/ for some") from None
     except (yaml.YAMLError, ValidationError, ValueError, RecursionError) as error:
         details = " ".join(str(error).split())
-        raise InputError(f"--cluster {path}: expected cluster_class, cluster_kwargs, workers; {details}") from None
+        raise InputError(f"--cluster {path}: {details}; keys: cluster_class, cluster_kwargs, workers") from None
     return RunnerConfig(**file.model_dump())
 
 
@@ -265,7 +265,7 @@ def check_scheduler(address: str) -> None:
     from distributed import rpc
     from distributed.security import Security
 
-    expected = "expected a Dask scheduler, as tcp://HOST:8786 (`dask scheduler` prints its address; the dashboard's"
+    expected = "give the address that `dask scheduler` prints, such as tcp://HOST:8786, not the dashboard's"
 
     async def ask() -> str:
         async with rpc(address, connection_args=Security().get_connection_args("client")) as service:
@@ -278,7 +278,7 @@ def check_scheduler(address: str) -> None:
     except Exception as error:  # of the address, of the name's look-up, of what another service answers
         found = " ".join(str(error).split()) or type(error).__name__
     if found != "Scheduler":
-        raise InputError(f"--scheduler {address}: found {found}; {expected} is another); give that of one that runs")
+        raise InputError(f"--scheduler {address}: no Dask scheduler there ({found}); {expected}")
 
 
 def _wait_for_worker(client: Any, warn: Callable[[str], None]) -> None:
@@ -289,8 +289,9 @@ def _wait_for_worker(client: Any, warn: Callable[[str], None]) -> None:
             return
         except TimeoutError:
             warn(
-                f"found no workers at {client.scheduler.address} after {_NO_WORKERS_S:.0f} s, expected one at least: "
-                "the run waits for them; see whether the cluster's queue holds their jobs, and their log"
+                f"no workers at {client.scheduler.address} after {_NO_WORKERS_S:.0f} s; the run waits: check the "
+                "cluster's "
+                "queue for their jobs, and their logs"
             )
 
 
@@ -303,7 +304,7 @@ def _check_workers(client: Any, warn: Callable[[str], None]) -> None:
     without = sorted(address for address, spec in found.items() if spec is None or isinstance(spec, Exception))
     if without:
         raise InputError(
-            f"found no velfield on {_list_some(without)} of the cluster's {len(found)} workers, expected it on all; "
+            f"velfield is not installed on {_list_some(without)} of the cluster's {len(found)} workers; "
             "install the wheel in the environment from which `dask worker` is started, or stop those workers"
         )
     versions = client.get_versions(packages=["velfield"])
@@ -318,7 +319,7 @@ def _check_workers(client: Any, warn: Callable[[str], None]) -> None:
         text = f"found {name} {other} on {_list_some(addresses)} of its workers, expected {version_here} as here"
         if name == "velfield":
             raise InputError(f"{text}; install the same wheel there")
-        warn(f"{text}: the last bits of the results may differ, or work fail; install the same versions there")
+        warn(f"{text}: results may differ slightly, or tasks may fail; install the same versions there")
 
 
 def _list_some(addresses: list[str]) -> str:

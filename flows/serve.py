@@ -85,8 +85,7 @@ def check(config: ServeConfig) -> None:
     """
     if config.host not in ("127.0.0.1", "localhost", "::1") and not config.auth:
         raise InputError(
-            f"--host {config.host}: other machines could run flows here; give --auth USER:PASSWORD with it, "
-            "or leave it at 127.0.0.1"
+            f"--host {config.host}: other machines could run flows here; add --auth USER:PASSWORD, or use 127.0.0.1"
         )
     if config.auth is not None and not all(config.auth.partition(":")):
         raise InputError("--auth: expected USER:PASSWORD")

@@ -113,6 +113,9 @@ class Work:
                     if self._beside is None:
                         self._restart_before(stage)
                     self._compute(self._start(stage, bars.add(stage.name, stage.label), essential), graph)
+            except BaseException:
+                self.console.print_warnings()
+                raise
             finally:
                 if self.aside is not None:
                     self.aside.before("")
@@ -274,9 +277,11 @@ class Work:
         for note in summary.notes:
             self.console.event("note", f"  {note}")
         for warning in summary.warnings[:5]:
-            self.console.warn(warning)
+            self.console.warn_at_end(warning)
         if len(summary.warnings) > 5:
-            self.console.warn(f"... and {len(summary.warnings) - 5} more of {stage.label}; all are in the report")
+            self.console.warn_at_end(
+                f"... and {len(summary.warnings) - 5} more of {stage.label}; all are in the report"
+            )
 
 
 def _without_outputs(record: CommitRecord) -> CommitRecord:

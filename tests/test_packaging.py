@@ -2,13 +2,17 @@
 
 import json
 import re
+import tarfile
 import tomllib
+import zipfile
 from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from hatchling.builders.sdist import SdistBuilder
+from hatchling.builders.wheel import WheelBuilder
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -63,6 +67,47 @@ def test_the_licences_of_what_ships_are_listed() -> None:
 
 def test_the_lock_names_no_registry() -> None:
     assert re.findall(r"^.*(?:--index-url|--find-links|--extra-index-url|://).*$", LOCK, re.M) == []
+
+
+def test_the_wheel_holds_what_runs_and_nothing_else(tmp_path: Path) -> None:
+    """Built from this checkout, whose page `make page` has built: without network."""
+    (built,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
+    assert Path(built).stat().st_size < 3_000_000
+    with zipfile.ZipFile(built) as wheel:
+        names = set(wheel.namelist())
+    page = {f"velfield/report/page/{name}" for name in ("viewer.html", "viewer.js", "viewer.css", "LICENSES.txt")}
+    licences = f"velfield-{PROJECT['version']}.dist-info/licenses"
+    expected = page | {"velfield/detection/shipped_detector.json", "velfield/py.typed", "flows/cli.py"}
+    assert expected | {f"{licences}/{name}" for name in PROJECT["license-files"]} <= names
+    sources = {
+        str(path.relative_to(ROOT)) for room in ("flows", "velfield", "schemas") for path in (ROOT / room).rglob("*.py")
+    }
+    assert sources <= names
+    assert {name.split("/")[0] for name in names} == {
+        "flows",
+        "velfield",
+        "schemas",
+        f"velfield-{PROJECT['version']}.dist-info",
+    }
+
+
+def test_the_source_distribution_holds_what_its_tests_read(tmp_path: Path) -> None:
+    (built,) = SdistBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
+    with tarfile.open(built) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    data = {
+        str(path.relative_to(ROOT)) for path in (ROOT / "tests").rglob("*") if path.suffix in (".py", ".csv", ".zip")
+    }
+    read = {
+        "requirements.lock",
+        "Makefile",
+        "conda/meta.yaml",
+        "docs/index.md",
+        "mkdocs.yml",
+        "CITATION.cff",
+        "page/build.py",
+    }
+    assert data | read | {"velfield/report/page/viewer.html"} <= names
 
 
 # What conda-forge calls by another name, or splits.

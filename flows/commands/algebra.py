@@ -6,7 +6,7 @@ from pathlib import Path
 def merge(*run_folders: Path, out: Path) -> int:
     """Add the fields of two or more run folders on one grid, exactly.
 
-    A vehicle that two of them saw at the same time counts twice; how many did is printed, where the runs have clocks.
+    A vehicle in two flights at the same time counts twice; their number is printed, if the runs have clocks.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def compare(before: Path, after: Path, /, *, out: Path | None = None, min_count:
     out
         Folder for the figures and layers. Default: `comparison/` in the later run's folder.
     min_count
-        Vehicles that both fields need at a pixel for direction and speed to be compared.
+        Smallest number of vehicles in both fields at a pixel, to compare direction and speed there.
     """
     from velfield.pipeline.compare import compare_runs
 

@@ -1,4 +1,4 @@
-"""``velfield analyse``: what a traffic engineer asks of a run, or of another program's tracks."""
+"""``velfield analyse``: the traffic analysis of a run, or of another program's tracks."""
 
 from pathlib import Path
 from typing import Literal
@@ -26,17 +26,17 @@ def analyse(
     tracks
         Tracks of another program instead: CSV or Parquet (geo-trax, inD, NGSIM and others), or SUMO's FCD.
     out
-        Folder for the answers from `--tracks`.
+        Folder for the report and tables, with `--tracks`.
     gsd_m
-        Metres a pixel of `--tracks`, where they are in pixels.
+        Metres per pixel of `--tracks`, if they are in pixels.
     fps
-        Frames a second of `--tracks`, where they have no times.
+        Frames per second of `--tracks`, if they have no times.
     unit
-        Unit of the columns x and y in `--tracks`, where their names do not say it.
+        Unit of the columns x and y in `--tracks`, if their names do not give it.
     y_axis
-        Where y points in `--tracks`: up, as north in maps, or down, as in images.
+        Direction of the y axis in `--tracks`: up (north, as in maps) or down (as in images).
     slice_s
-        Counts by time are of slices so long, where the flight is longer than two.
+        Length of a time slice for counts, seconds; used if the flight is longer than two slices.
     speed_unit
         Unit of speeds in the report's diagrams.
     """
@@ -44,11 +44,11 @@ def analyse(
     from velfield.pipeline.analysis.analyse import analyse_run, analyse_tracks
 
     if (run_folder is None) == (tracks is None):
-        raise InputError("expected a run folder or --tracks FILE; give one of them")
+        raise InputError("give either a run folder or --tracks FILE")
     if tracks is None:
         lines = analyse_run(Path(run_folder or "."), slice_s=slice_s, speed_unit=speed_unit)
     elif out is None:
-        raise InputError(f"found --tracks {tracks} and no folder for the answers; give --out")
+        raise InputError(f"--tracks {tracks}: --out is missing, the folder for the report and tables")
     else:
         lines = analyse_tracks(
             tracks, out, gsd_m=gsd_m, fps=fps, unit=unit, y_axis=y_axis, slice_s=slice_s, speed_unit=speed_unit

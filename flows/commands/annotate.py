@@ -15,21 +15,21 @@ def annotate(
     port: int | None = None,
     open_browser: Annotated[bool, Parameter(name="--open")] = True,
 ) -> int:
-    """Label cars in the browser, by a drag along each; saved as labels for `velfield run --labels`.
+    """Label cars in the browser by dragging along each; the file is for `velfield run --labels`.
 
     Parameters
     ----------
     place
-        The image of a frame, or a run folder: frames spread over its flight.
+        Image of a frame, or a run folder: then frames spread over its flight are shown.
     labels
-        CSV file to write; its labels of other frames are kept. Default: `labels.csv` in the run folder, or beside the
-        image.
+        CSV file to write; its labels of other frames are kept. Default: `labels.csv` in the run folder, or next to
+        the image.
     frames
-        How many frames of a run to show.
+        Number of frames of a run to show.
     port
-        Port to listen on. Default: any that is free.
+        Port to listen on. Default: any free port.
     open_browser
-        Open the browser, where there is a screen.
+        Open the browser, if there is a screen.
     """
     from flows.commands.view import serve_until_interrupted
     from velfield.viewer.annotations import frames_to_annotate

@@ -2,26 +2,26 @@
 
 from cyclopts import App
 
-bench = App(name="bench", help="Speed and accuracy, against a peer in the same run.")
+bench = App(name="bench", help="Measure speed and accuracy against other programs.")
 bench.command(
     "flows.commands.benchmarks.speed:speed",
     name="speed",
-    help="What each stage of the whole job costs on one core, and the network against the machine's peak.",
+    help="Time of each stage on one core, and of the network relative to the machine's peak.",
 )
 bench.command(
     "flows.commands.benchmarks.registration:registration",
     name="registration",
-    help="Register simulated flights of unseen seeds: errors against the truth, beside stabilo.",
+    help="Registration errors on simulated flights, for velfield and for stabilo.",
 )
 bench.command(
     "flows.commands.benchmarks.still:still",
     name="still",
-    help="Stability of stationary objects on a run's map: registration jitter, on your own footage.",
+    help="Registration jitter on your own footage: stability of stationary objects on the map.",
 )
 bench.command(
     "flows.commands.benchmarks.overhead:overhead",
     name="overhead",
-    help="What Prefect and Dask add to the bare functions, start-up left out.",
+    help="Overhead of Prefect and Dask over the plain functions, without start-up.",
 )
 bench.command(
     "flows.commands.benchmarks.field:field",
@@ -31,5 +31,5 @@ bench.command(
 bench.command(
     "flows.commands.benchmarks.detection:detection",
     name="detection",
-    help="How fast cars are found, beside plain peers in the same run.",
+    help="Speed of the detector and of comparable programs.",
 )

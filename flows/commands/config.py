@@ -4,7 +4,7 @@ from pathlib import Path
 
 from cyclopts import App
 
-config = App(name="config", help="The configuration of a run.")
+config = App(name="config", help="Print the configuration of a run.")
 
 
 @config.command

@@ -32,11 +32,11 @@ def export(
     out
         File to write. Default: in the run folder's `exports/`.
     width
-        Width of a figure's or a video's map, px. Default: a pixel a base pixel, of a video 1920 at most.
+        Width of the map in a figure or video, px. Default: that of the base image; a video has at most 1920.
     unit
         Unit of speed in a figure.
     start
-        When the flight began, as 2024-05-01T12:00:00Z; for `stac` and `poster`.
+        Start time of the flight, such as 2024-05-01T12:00:00Z; for `stac` and `poster`.
     """
     from flows.console import Console
     from velfield.exports.export import export_run
@@ -56,4 +56,4 @@ def _parse_time(text: str | None) -> datetime | None:
     try:
         return None if text is None else datetime.fromisoformat(text)
     except ValueError:
-        raise InputError(f"--start {text}: expected a time as 2024-05-01T12:00:00Z") from None
+        raise InputError(f"--start {text}: not a time; write it as 2024-05-01T12:00:00Z") from None

@@ -28,32 +28,32 @@ def georeference(
     port: int | None = None,
     open_browser: Annotated[bool, Parameter(name="--open")] = True,
 ) -> int:
-    """Put a finished run's map on Earth by three or more ground control points; no frame is registered again.
+    """Georeference a finished run by three or more ground control points; no frame is registered again.
 
-    Maps, exports and the page have coordinates, metres and north by the points from then on. Without --points the
-    points are clicked in the browser.
+    Afterwards the maps, exports and page have coordinates, metres and north. Without --points a page in the browser
+    opens, on which you click the points.
 
     Parameters
     ----------
     run_folder
         The run folder.
     points
-        CSV `x_px,y_px,longitude,latitude`, or `x_px,y_px,x,y` with --epsg; `name` is optional. Pixels of the map, as
-        the page shows them. Default: a page in the browser, to click them.
+        CSV `x_px,y_px,longitude,latitude`, or `x_px,y_px,x,y` with --epsg; a column `name` is optional. Pixels are
+        those of the map, as the page shows them. Default: click the points in the browser.
     epsg
-        Reference system of `x,y`, as 32633.
+        EPSG code of the reference system of `x,y`, such as 32633.
     model
-        How the map is fitted. Default: a similarity, or with six points or more an affine transform where that is
-        closer at points left out.
+        Transform to fit. Default: a similarity; with six or more points an affine transform, if its error at left-out
+        points is smaller.
     map_
-        A map of your own, shown beside the run's in the page to click coordinates on: GeoTIFF, MBTiles of images, or
-        the address of a tile server as https://HOST/{z}/{x}/{y}.png. Nothing is loaded from elsewhere.
+        Your own map, shown next to the run's in the page to click coordinates on: GeoTIFF, MBTiles of images, or a tile
+        server, such as https://HOST/{z}/{x}/{y}.png. Nothing is loaded from anywhere else.
     check
-        Print residuals of --points, and change nothing.
+        Print the residuals of --points and change nothing.
     port
-        Port of the page. Default: any that is free.
+        Port of the page. Default: any free port.
     open_browser
-        Open the browser, where there is a screen.
+        Open the browser, if there is a screen.
     """
     from velfield.errors import InputError
     from velfield.pipeline.georeference import fit_run_points
@@ -65,12 +65,12 @@ def georeference(
         from flows.commands.view import serve_until_interrupted
 
         if check:
-            raise InputError("found --check without --points, expected both; the page shows residuals by itself")
+            raise InputError("--check needs --points; the page shows residuals itself")
         app = page_app(run_folder, epsg, model, map_)
         serve_until_interrupted(app, port=port, open_browser=open_browser, place=run_folder, purpose="control points")
         return 0
     if map_ is not None:
-        raise InputError("found --map with --points, expected one of them; the map is for clicking points in the page")
+        raise InputError("--map cannot be combined with --points: the map is for clicking points in the page")
     read, code = read_control_points(points, epsg)
     if check:
         print(residual_table(fit_run_points(open_run(run_folder), read, code, model)))

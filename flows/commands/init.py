@@ -12,7 +12,7 @@ def init(
     timestamps: Path | None = None,
     fps: float | None = None,
 ) -> int:
-    """Probe a video and write a commented flight.yaml: its properties, and every parameter with its default.
+    """Inspect a video, and write a commented flight.yaml with every parameter and its default.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def init(
     from velfield.sources.source import probe
 
     if out.exists():
-        raise InputError(f"{out} exists already; name another file with --out, or move it away")
+        raise InputError(f"{out} exists already; give another file with --out, or move it away")
     info = probe(source, frames=FramesConfig(fps=fps), timestamps=timestamps)
     write_atomically(out, config_template(str(source), info).encode())
     print("\n".join([*describe_source(info, resolve_config()), describe_telemetry(source, info)]))

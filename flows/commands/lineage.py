@@ -17,7 +17,7 @@ def lineage(
     pixel: str | None = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> int:
-    """Tracklets, frames, detector and base image behind a pixel; without one, the stages of the run and their keys.
+    """Print the tracklets, frames, detector and base image behind a pixel; without a pixel, the stages of the run.
 
     Parameters
     ----------
@@ -28,9 +28,9 @@ def lineage(
     y
         Row of the pixel, base pixels.
     pixel
-        The pixel as X,Y, in place of the two.
+        The pixel as X,Y.
     as_json
-        JSON in place of text.
+        Print JSON instead of text.
     """
     from velfield.run.lineage import describe_lineage, describe_pixel, pixel_lineage, stage_lineage
     from velfield.run.run import open_run
@@ -52,7 +52,7 @@ def _pixel(x: str | None, y: int | None, text: str | None) -> tuple[int, int] | 
         return None
     parts = ",".join(given).split(",")
     if len(parts) != 2 or not all(part.strip().removeprefix("-").isdigit() for part in parts):
-        raise InputError(f"found {' '.join(given)}; expected a pixel as two whole numbers, X Y or X,Y")
+        raise InputError(f"{' '.join(given)}: not a pixel; give two whole numbers, X Y or X,Y")
     return int(parts[0]), int(parts[1])
 
 

@@ -20,29 +20,29 @@ def reprocess(
     scheduler: str | None = None,
     quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], negative=())] = False,
 ) -> int:
-    """A new base image: recompute only what depends on it. The previous result is kept beside the new one.
+    """Put a new base image under a finished run, and recompute only what depends on it. The old result is kept.
 
-    Where the new image registers well to the old base image, all results are mapped onto it in seconds, and the error
-    that this adds is printed; else the frames are registered again.
+    If the new image registers well to the old base image, all results are mapped onto it in seconds, and the added
+    error is printed; otherwise the frames are registered again.
 
     Parameters
     ----------
     run_folder
         The run folder.
     base
-        The new image, as for `velfield run`.
+        The new base image, as for `velfield run`.
     out
         Name of the new result, a folder under RUN/results. Default: the image's name.
     full
-        Register the frames again in any case.
+        Always register the frames again.
     max_error_px
-        Map only where the new image registers to the old one with a smaller error, new base pixels.
+        Largest error of the registration to the old base image, in new base pixels, for mapping the results.
     workers
         Processes of a local cluster. Default: threads of this process.
     scheduler
         Address of a Dask scheduler.
     quiet
-        Warnings only.
+        Print warnings only.
     """
     from flows.launch import prepare_process
     from flows.stopping import stop_on_signals

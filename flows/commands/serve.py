@@ -16,29 +16,29 @@ def serve(
     limit: int = 1,
     cluster: Path | None = None,
 ) -> int:
-    """Process flights that arrive, reprocess runs when a base image arrives, show both in the Prefect UI, until Ctrl-C.
+    """Process flights and base images that arrive in a folder, with the Prefect UI, until Ctrl-C.
 
-    Drop flights into FOLDER/incoming and base images into FOLDER/base-images; the runs are in FOLDER/runs. The event
-    `velfield.base-image.arrived` with `base` (and `run`) in its payload starts a reprocess too, and so does the night.
+    Drop flights into FOLDER/incoming and base images into FOLDER/base-images; runs are written to FOLDER/runs. The
+    event `velfield.base-image.arrived` with `base` (and `run`) in its payload starts a reprocess, as does --nightly.
 
     Parameters
     ----------
     folder
         Folder of incoming files and of the runs.
     host
-        Address to serve on. Another than this machine's own needs `--auth`.
+        Address to serve on. Any address that other machines can reach needs `--auth`.
     port
         Port of the server and its UI.
     database
-        `postgresql+asyncpg://...` in place of SQLite.
+        `postgresql+asyncpg://...`. Default: SQLite.
     auth
-        USER:PASSWORD that the server asks for.
+        USER:PASSWORD required by the server.
     nightly
         Cron expression of the nightly reprocess.
     settle_s
-        A file that has not changed for so many seconds is complete.
+        Seconds without a change after which a file counts as complete.
     limit
-        Flow runs at a time.
+        Number of flow runs at a time.
     cluster
         Cluster file, as for `velfield run`.
     """

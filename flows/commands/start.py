@@ -49,12 +49,12 @@ def _of_runs(runs: list[Path]) -> Iterator[str]:
     for run in runs[:_SHOWN]:
         name = shlex.quote(run.name)
         if not (run / "index.html").is_file():
-            yield f"{run.name} is a run that is not finished: the command that began it resumes it.\n"
+            yield f"{run.name} is an unfinished run: repeat the command that started it to resume.\n"
             continue
         yield f"{run.name} is a finished run:"
         yield f"  velfield view {name}                              # its map, in the browser"
         yield f"  velfield export {name} --format cog               # for a GIS; other formats: velfield export --help"
-        yield f"  velfield georeference {name} --points points.csv  # put it on Earth by control points\n"
+        yield f"  velfield georeference {name} --points points.csv  # georeference it by control points\n"
 
 
 def _of_videos(videos: list[Path], runs: set[str], entries: list[Path]) -> Iterator[str]:
@@ -62,7 +62,7 @@ def _of_videos(videos: list[Path], runs: set[str], entries: list[Path]) -> Itera
     new = [video for video in videos if f"{video.stem}-run" not in runs]
     for video in new[:_SHOWN]:
         known = video.stem in subtitles
-        scale = "the telemetry beside it may give scale and north" if known else "add --gsd-m METRES if you know it"
+        scale = "its telemetry file may give scale and north" if known else "add --gsd-m METRES if you know it"
         yield f"{video.name} is a video, {scale}:"
         yield f"  velfield run {shlex.quote(video.name)} --out {shlex.quote(video.stem + '-run')}"
         yield f"  velfield init {shlex.quote(video.name)}   # writes flight.yaml with every parameter, to change some\n"

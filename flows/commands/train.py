@@ -30,21 +30,21 @@ def train(
     source
         Video file, or folder of images, that the labels belong to.
     labels
-        Marked cars: CSV, GeoJSON, YOLO, COCO, LabelMe, VIA. All cars of every frame that is named must be marked.
+        Labels: CSV, GeoJSON, YOLO, COCO, LabelMe, VIA. Every car of each labelled frame must be labelled.
     out
-        The detector file, with its precision-recall curve on cars left out of training.
+        Detector file to write, with its precision-recall curve on cars held out of training.
     gsd_m
-        Ground sample distance of the frames, metres a pixel. Default: from the length of the marked cars.
+        Ground sample distance of the frames, metres per pixel. Default: from the length of the labelled cars.
     continued
-        A detector file to fine-tune on the labels. Default, and `shipped`: the one that ships.
+        Detector file to fine-tune. Default: `shipped`, the detector that comes with velfield.
     review
-        PNG to write: what was taken for cars and what was not.
+        PNG to write, with the detections on the labelled frames.
     config
         flight.yaml with the flight's configuration.
     preset
         Set of defaults to start from.
     settings
-        `section.key=value`, any number of times.
+        One parameter, as `section.key=value`; can be repeated.
     """
     from velfield.pipeline.configuration import resolve_config
     from velfield.pipeline.train import train_from_labels, write_training
@@ -52,7 +52,7 @@ def train(
     resolved = resolve_config(preset=preset, file=config, settings=settings, overrides={"gsd_m": gsd_m})
     for file in (out, review):
         if file is not None and not file.parent.is_dir():
-            raise InputError(f"{file}: found no folder {file.parent}, expected one to write to; make it")
+            raise InputError(f"{file}: the folder {file.parent} does not exist; create it first")
     from flows.console import training_progress
 
     stop_on_signals(resumes=False, grace_s=0.0)

@@ -16,16 +16,16 @@ WHOLE, DAMAGED = 0, 3
 
 
 def verify(run_folder: Path, /, *, repair: Annotated[bool, Parameter(negative=())] = False) -> int:
-    """Compare every file and chunk of a run with its commit record; list what is damaged or gone.
+    """Compare every file and chunk of a run with its commit record; list what is damaged or missing.
 
-    Exit status 0: whole; 3: something is damaged, or was never finished.
+    Exit status 0: intact; 3: damaged, or never finished.
 
     Parameters
     ----------
     run_folder
         The run folder.
     repair
-        Compute the damaged units again, from the same inputs.
+        Recompute the damaged units from the same inputs.
     """
     from velfield.pipeline.verify import describe_damage, has_damage, verify_run
     from velfield.run.run import open_run
@@ -38,9 +38,9 @@ def verify(run_folder: Path, /, *, repair: Annotated[bool, Parameter(negative=()
         return WHOLE
     if not repair:
         if has_damage(damages):
-            print(f"velfield verify {run_folder} --repair  computes these units again")
+            print(f"velfield verify {run_folder} --repair  recomputes these units")
         else:
-            print(f"velfield run ... --out {run_folder}  resumes it, or repeats why it was refused")
+            print(f"velfield run ... --out {run_folder}  resumes the run, or prints why it was rejected")
         return DAMAGED
     _repair(run)
     damages = verify_run(run.layout, open_run(run_folder).record)
@@ -76,7 +76,7 @@ def _repair(run: "Run") -> None:
     # Where the inputs changed since, it would be another run and not a repair.
     if plan.keys != run.record.keys:
         raise InputError(
-            f"{job.root}: its inputs or the code changed since it was made; run `velfield run` on it again"
+            f"{job.root}: its inputs or the code have changed since the run; run `velfield run` on it again"
         )
     analysis = read_commit(run.layout, ANALYSIS, "all")
     with locked(run.layout):

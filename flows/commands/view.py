@@ -18,16 +18,16 @@ def view(
     port: int | None = None,
     open_browser: Annotated[bool, Parameter(name="--open")] = True,
 ) -> int:
-    """Show a run's page in the browser, served from this machine to itself, until Ctrl-C.
+    """Show a run's page in the browser until Ctrl-C; only this machine can open it.
 
     Parameters
     ----------
     run_folder
         The run folder.
     port
-        Port to listen on. Default: any that is free.
+        Port to listen on. Default: any free port.
     open_browser
-        Open the browser, where there is a screen.
+        Open the browser, if there is a screen.
     """
     from velfield.viewer.server import view_app
 
@@ -35,7 +35,7 @@ def view(
         from schemas.job import absolute
 
         raise InputError(
-            f"{absolute(str(run_folder))}: found a run on S3, expected a folder of this machine; copy it first, as by "
+            f"{absolute(str(run_folder))}: a run on S3 cannot be shown; copy it to this machine first, such as with "
             "`aws s3 sync`"
         )
 

@@ -95,8 +95,8 @@ export class AnalysisPanel {
       find("analysis-content").dataset.milliseconds = (performance.now() - started).toFixed(1);
       find("table").focus();
     });
-    const metres = analysis.gsd_known ? "" : " Metres a pixel are not known: lengths are by 0.23 m.";
-    const about = `${analysis.tracks} tracks of moving vehicles in ${analysis.duration_s.toFixed(0)} s. In grey: ${Math.round(100 * analysis.level)} % interval, n.${metres}`;
+    const metres = analysis.gsd_known ? "" : " The scale is not known: lengths assume 0.23 m per pixel.";
+    const about = `${analysis.tracks} tracks of moving vehicles in ${analysis.duration_s.toFixed(0)} s. Grey: ${Math.round(100 * analysis.level)} % interval and n, the number of observations.${metres}`;
     const note = make("p", { class: "note" }, table.note);
     const answers = (analysis.answers ?? []).flatMap(({ question, lines }) => [make("dt", {}, question), ...lines.map((line) => make("dd", {}, line))]);
     const content: HTMLElement[] = [make("p", { class: "note" }, about), make("dl", { class: "answers" }, ...answers), make("label", {}, "Table ", choice), note];

@@ -34,7 +34,7 @@ KINDS = {
     "blurred": "is blurred",
     "unlike its neighbours": "is unlike the frames around it",
     "suspect": "bitstream corrupt",
-    "cut": "the picture changes wholly",
+    "cut": "the picture changes completely",
     "dark": "the flight is dark",
     "fog": "as in fog",
     "oblique": "looks at the ground obliquely",

@@ -205,7 +205,7 @@ def test_a_session_that_a_full_gpu_refuses_is_no_silent_fallback(runtime: Runtim
     model = networks.network_to_onnx(in_floating_point())
     assert networks.uses_cuda("auto")
     runtime.starts = False
-    with pytest.warns(DeviceWarning, match="no further session starts, .*: this one runs on the processor"):
+    with pytest.warns(DeviceWarning, match="GPU unavailable, no further session starts on it: using the CPU"):
         networks.open_session(model, "auto")
     with pytest.raises(InputError, match="--device cuda: found a GPU on which no further session starts"):
         networks.open_session(model, "cuda")

@@ -132,5 +132,5 @@ def test_a_wrong_gsd_is_reported_by_the_labelled_cars(factor: float, n_warnings:
 
 def test_a_folder_that_is_missing_is_an_error_before_anything_is_trained(tmp_path: Path) -> None:
     out = tmp_path / "no" / "d.json"
-    with pytest.raises(InputError, match=r"found no folder .*no, expected one to write to; make it"):
+    with pytest.raises(InputError, match=r"the folder .*no does not exist; create it first"):
         train_command.train(tmp_path, labels=tmp_path / "labels.csv", out=out)

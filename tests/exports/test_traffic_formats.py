@@ -52,7 +52,7 @@ def test_no_junction_is_one_line() -> None:
 
     pytest.importorskip("xlsxwriter")
     alone = TrafficAnalysis(gather([drive(np.array([[0.0, 10.0], [100.0, 10.0]]), 0.0)]))
-    with pytest.raises(InputError, match="found no junction with movements"):
+    with pytest.raises(InputError, match="no junction with movements was found"):
         turning_workbook(alone)
 
 

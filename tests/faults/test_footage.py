@@ -87,7 +87,7 @@ def test_a_video_of_high_dynamic_range_is_reported(tmp_path: Path) -> None:
 def test_rotation_metadata_is_reported_and_pixels_stay_as_stored(tmp_path: Path) -> None:
     info = probe(encoded(tmp_path / "r.mp4", rotation=90), frames=WARNED)
     (line,) = info.warnings
-    assert "turned by" in line
+    assert "rotated by 90 degrees" in line
     assert (info.width, info.height) == (160, 128)
 
 
@@ -116,7 +116,7 @@ def test_fog_is_reported(tmp_path: Path) -> None:
 def test_a_cut_to_another_place_is_reported(tmp_path: Path) -> None:
     frames = [*drifting(8, seed=1), *drifting(8, seed=5)]
     (line,) = quality_warnings(tmp_path, frames)
-    assert "the picture changes wholly at frame 8 (1.600 s)" in line
+    assert "the picture changes completely at frame 8 (1.600 s)" in line
 
 
 @pytest.mark.parametrize(("seed", "fps"), [(21, 25.0), (22, 25.0), (23, 5.0)])

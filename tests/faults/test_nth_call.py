@@ -37,7 +37,7 @@ def test_a_full_disk_stops_the_run_in_one_line_and_keeps_what_is_finished(disk: 
     root = disk.folder / "full"
     job, fault = tiny_job(disk.folder / "flight", root), Fault("fills up", 60)
     with (
-        pytest.raises(InputError, match=r"full: the disk is full at .* GB more needed.* GB free; make room") as caught,
+        pytest.raises(InputError, match=r"full: the disk is full at .* GB more needed.* GB free; free space") as caught,
         failing_disk(root, fault),
         disk_full_as_input_error(make_plan(job)),
     ):

@@ -46,15 +46,15 @@ def command(
     ("arguments", "status", "text"),
     [
         (("train", "frames"), 2, "--labels"),
-        (("run",), 2, "run: found no --out"),
-        (("export", "x"), 2, "export: found no --format, which is needed (one of cog, geoparquet, "),
-        (("simulate", "x", "--clip"), 2, "simulate: found no value for --clip"),
+        (("run",), 2, "run: --out is missing"),
+        (("export", "x"), 2, "export: --format is missing (one of cog, geoparquet, "),
+        (("simulate", "x", "--clip"), 2, "simulate: value for --clip is missing"),
         (("fly",), 2, 'Unknown command "fly"'),
         (("run", "a", "--out", "b", "--workers", "many"), 2, "--workers"),
-        (("run", "a", "--out", "b", "--workers", "0"), 1, "--workers 0: expected a whole number from 1 on"),
+        (("run", "a", "--out", "b", "--workers", "0"), 1, "--workers 0: must be a positive integer"),
         (("run", "a", "--out", "b", "--gsd-m", "23"), 1, "gsd_m = 23"),
         (("verify", "/dev/null"), 1, "/dev/null"),
-        (("view", "s3://runs/flight"), 1, "s3://runs/flight: found a run on S3"),
+        (("view", "s3://runs/flight"), 1, "s3://runs/flight: a run on S3 cannot be shown"),
     ],
 )
 def test_a_command_that_cannot_be_is_one_line(
@@ -103,7 +103,7 @@ def test_no_credentials_for_an_object_store_are_one_line(tmp_path: Path) -> None
     ended = subprocess.run(command, timeout=120, check=False, **given)
     lines = ended.stderr.splitlines()
     assert (ended.returncode, len(lines)) == (1, 1), lines
-    assert lines[0].startswith("velfield: S3: found no credentials, expected AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_")
+    assert lines[0].startswith("velfield: S3: no credentials; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_")
 
 
 @pytest.mark.parametrize("option", ["base", "labels"])
@@ -246,7 +246,7 @@ def test_a_run_counts_the_steps_of_its_detector() -> None:
 
 
 def test_every_training_counts_its_steps() -> None:
-    from velfield.detection import boosting
+    from velfield.paper import boosting
     from velfield.parallel import subscribe_steps
 
     received: list[tuple[int, int]] = []

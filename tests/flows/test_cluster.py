@@ -57,7 +57,7 @@ def test_an_example_whose_package_is_not_there_says_so() -> None:
 )
 def test_a_cluster_file_that_is_none_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "cluster.yaml").write_text(text)
-    with pytest.raises(InputError, match="expected cluster_class"):
+    with pytest.raises(InputError, match="keys: cluster_class"):
         read_runner(tmp_path / "cluster.yaml")
 
 
@@ -216,8 +216,8 @@ def test_a_cluster_without_workers_is_said_and_waited_for(monkeypatch: pytest.Mo
             with pytest.raises(TimeoutError, match="its own"):  # not that of the waiting
                 runner.compute(delayed(_out_of_time)())
     assert warned
-    assert "found no workers at" in warned[0]
-    assert "expected one at least" in warned[0]
+    assert "no workers at" in warned[0]
+    assert "the run waits" in warned[0]
 
 
 @pytest.mark.parametrize(
@@ -243,14 +243,14 @@ def test_an_address_without_a_scheduler_is_refused_in_one_line(
         )
     assert (status, len(lines)) == (1, 1), lines
     assert text in lines[0]
-    assert "expected a Dask scheduler, as tcp://HOST:8786" in lines[0]
+    assert "give the address that `dask scheduler` prints, such as tcp://HOST:8786" in lines[0]
     assert not (tmp_path / "run").exists()
 
 
 def test_a_worker_is_no_scheduler() -> None:
     with (
         LocalCluster(n_workers=1, processes=False, dashboard_address="127.0.0.1:0", protocol="tcp") as cluster,
-        pytest.raises(InputError, match="found Worker; expected a Dask scheduler"),
+        pytest.raises(InputError, match=r"no Dask scheduler there \(Worker\)"),
     ):
         check_scheduler(next(iter(cluster.workers.values())).address)
 
@@ -268,7 +268,9 @@ def test_workers_without_velfield_are_refused_and_live_on() -> None:
             with Client(address, set_as_default=False) as client:
                 client.wait_for_workers(1, timeout=60)
             with (
-                pytest.raises(InputError, match=r"found no velfield on 1 \(tcp://.*\) of the cluster's 1 workers"),
+                pytest.raises(
+                    InputError, match=r"velfield is not installed on 1 \(tcp://.*\) of the cluster's 1 workers"
+                ),
                 open_runner(RunnerConfig(scheduler=address)),
             ):
                 pass

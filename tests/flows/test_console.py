@@ -1,4 +1,4 @@
-"""Progress lines of a run whose output is a file, so that no bar is drawn."""
+"""Progress lines and warnings of a run whose output is a file, so that no bar is drawn."""
 
 import json
 
@@ -34,3 +34,28 @@ def test_a_program_gets_it_as_an_event_and_quiet_means_quiet(
     (line,) = capsys.readouterr().err.splitlines()
     told = json.loads(line)
     assert (told["event"], told["text"]) == ("progress", "frames: 4 of 9 steps")
+
+
+def test_warnings_of_stages_are_printed_together_at_the_end(capsys: pytest.CaptureFixture[str]) -> None:
+    lines = Console()
+    lines.warn_at_end("the flight is dark")
+    lines.event("stage", "frames  3 of 3 frames read")
+    lines.warn_at_end("no scale: give --gsd-m")
+    lines.event("stage", "lens  8 terms")
+    lines.print_warnings()
+    lines.print_warnings()
+    assert capsys.readouterr().err.splitlines() == [
+        "frames  3 of 3 frames read",
+        "lens  8 terms",
+        "warning: the flight is dark",
+        "warning: no scale: give --gsd-m",
+    ]
+
+
+def test_quiet_keeps_warnings_and_a_program_gets_them_at_once(capsys: pytest.CaptureFixture[str]) -> None:
+    quiet = Console("quiet")
+    quiet.warn_at_end("the flight is dark")
+    quiet.print_warnings()
+    assert capsys.readouterr().err == "warning: the flight is dark\n"
+    Console("json").warn_at_end("the flight is dark")
+    assert json.loads(capsys.readouterr().err)["event"] == "warning"

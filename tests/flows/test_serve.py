@@ -45,7 +45,7 @@ def free_port() -> int:
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "10.0.0.1"])
 def test_another_address_is_refused_without_an_auth_string(host: str) -> None:
-    with pytest.raises(InputError, match="give --auth USER:PASSWORD"):
+    with pytest.raises(InputError, match="add --auth USER:PASSWORD"):
         check(ServeConfig(Path("x"), host=host, port=free_port()))
 
 
@@ -86,9 +86,9 @@ def test_a_flight_that_fails_says_so_in_the_terminal(
     server: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Else "has arrived" is the last word about it there."""
-    with pytest.raises(InputError, match="is not there"):
+    with pytest.raises(InputError, match="does not exist"):
         process_dropped(str(tmp_path / "street.mp4"), str(tmp_path / "runs"))
-    assert f"street.mp4 failed: {tmp_path / 'street.mp4'} is not there" in capsys.readouterr().out
+    assert f"street.mp4 failed: {tmp_path / 'street.mp4'} does not exist" in capsys.readouterr().out
 
 
 def test_all_addresses_with_a_password(tmp_path: Path) -> None:

@@ -36,9 +36,9 @@ def test_videos_runs_and_images_are_named(tmp_path: Path) -> None:
         (tmp_path / "frames" / f"{number}.jpg").touch()
     text = printed(tmp_path)
     assert "velfield run DJI_0001.MP4 --out DJI_0001-run" in text
-    assert "the telemetry beside it may give scale and north" in text
+    assert "its telemetry file may give scale and north" in text
     assert "velfield run 'my flight.mov' --out 'my flight-run'" in text
-    assert "old is a run that is not finished" in text
+    assert "old is an unfinished run" in text
     assert "velfield view done" in text
     assert "velfield run frames --timestamps" in text
     assert "velfield demo" not in text

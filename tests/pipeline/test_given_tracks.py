@@ -170,7 +170,7 @@ def test_the_flow_writes_the_same_bits_and_repairs_what_was_damaged(run: Run, se
     assert digests(root) == before
     path.write_text(path.read_text() + "9999,0,0.0,1.0,1.0,4.5\n")
     (root / "tracks" / "source_ids.csv").unlink()
-    with pytest.raises(InputError, match="its inputs or the code changed"):
+    with pytest.raises(InputError, match="its inputs or the code have changed"):
         verify(root, repair=True)
 
 
@@ -235,7 +235,7 @@ def test_pixels_of_another_image_are_refused(tmp_path: Path) -> None:
 
 
 def test_options_of_frames_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="neither a video nor --tracks"):
+    with pytest.raises(InputError, match="no input; give a video"):
         run_command(out=tmp_path / "run")
-    with pytest.raises(InputError, match="--tracks and VIDEO, --labels"):
+    with pytest.raises(InputError, match="--tracks cannot be combined with VIDEO, --labels"):
         run_command(tmp_path / "a.mp4", out=tmp_path / "run", tracks=tmp_path / "t.csv", labels=tmp_path / "l.csv")

@@ -126,7 +126,7 @@ def test_a_merged_field_has_no_tracks_to_export(two: tuple[list[Flight], list[Pa
     merged = open_run(tmp_path / "merged")
     assert repr(merged) == f"Run({str(tmp_path / 'merged')!r}, field of {two[1][0]}, {two[1][1]})"
     for name in ("geoparquet", "geotrax", "sumo", "highd", "trajectories", "report", "video"):
-        with pytest.raises(InputError, match=r"run-a and .*run-b, without frames and tracks"):
+        with pytest.raises(InputError, match=r"run-a and .*run-b and has no frames or tracks"):
             export_run(merged, name, tmp_path / f"{name}.out")
     assert export_run(merged, "cog", tmp_path / "cog.tif").stat().st_size > 1000
     assert merge_runs([tmp_path / "merged", two[1][0]], tmp_path / "again")[0].startswith(

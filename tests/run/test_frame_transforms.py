@@ -148,7 +148,7 @@ def test_a_record_of_a_transform_gives_it_back_to_the_bit() -> None:
 def test_what_was_not_made_yet_is_said_with_the_command_that_makes_it(tmp_path: Path) -> None:
     layout = RunLayout(tmp_path)
     for read, name in ((read_lens, "camera.json"), (read_grid, "grid.json"), (read_working, "working.json")):
-        with pytest.raises(InputError, match=f"{name} is not there: run `velfield run`"):
+        with pytest.raises(InputError, match=f"{name} does not exist: run `velfield run`"):
             read(layout)
 
 

@@ -68,9 +68,7 @@ def test_without_the_extra_a_path_on_s3_is_refused_with_what_to_install(
     missing: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(layout, "find_spec", lambda name: None if name == missing else object())
-    with pytest.raises(
-        InputError, match=r"s3://bucket/run: a run folder on s3:// needs the extra; pip install '.*\[s3\]'"
-    ):
+    with pytest.raises(InputError, match=r"s3://bucket/run: a run folder on s3:// needs s3fs; pip install '.*\[s3\]'"):
         to_path("s3://bucket/run")
     assert to_path("run") == Path("run")
 

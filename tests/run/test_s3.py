@@ -55,7 +55,7 @@ def test_the_same_bits_as_on_a_disk(remote: tuple[Path, RunSummary], whole: tupl
 
 def test_a_bucket_that_is_not_there_is_refused_before_anything_starts(s3: None, flight: Path) -> None:
     work = job(flight, to_path("s3://nowhere/runs/whole"))
-    with pytest.raises(InputError, match=r"^s3://nowhere/runs/whole/flight.json: found no bucket nowhere, expected it"):
+    with pytest.raises(InputError, match=r"^s3://nowhere/runs/whole/flight.json: the bucket nowhere does not exist"):
         make_plan(work)
 
 

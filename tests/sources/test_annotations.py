@@ -107,7 +107,7 @@ def test_frames_of_a_video_are_named_by_number(tmp_path):
         ('{"a": 1}', "JSON of another kind"),
         (json.dumps(coco() | {"annotations": [{"image_id": 99, "bbox": [1, 1, 2, 2]}]}), "COCO labels with KeyError"),
         (json.dumps(labelme() | {"shapes": [{"points": "x"}]}), "LabelMe labels with ValueError"),
-        (json.dumps(labelme() | {"imagePath": "elsewhere.png"}), "none named as a frame of this source"),
+        (json.dumps(labelme() | {"imagePath": "elsewhere.png"}), "no frame of this source has such a name"),
         (json.dumps(labelme() | {"shapes": [{"label": "tree", "points": [[5, 5]]}]}), "expected one of cars"),
         (json.dumps(labelme() | {"shapes": [{"label": "car", "points": [[500, 5]]}]}), "outside the image"),
         (json.dumps(geojson() | {"features": []}), "found labels of the images none"),

@@ -165,7 +165,7 @@ def test_vrt_urls_truncated_and_large_images_are_refused(tmp_path, scene):
         cut: "truncated or damaged",
         half: "truncated or damaged",
         tmp_path / "none.tif": "found no base image",
-        "https://example.org/b.tif": "is refused",
+        "https://example.org/b.tif": "is not supported",
         "/vsicurl/https://example.org/b.tif": "found no base image",
     }
     for path, match in refusals.items():

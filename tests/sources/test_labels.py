@@ -120,8 +120,8 @@ def test_length_of_a_usual_car_comes_out_of_its_upright_box_at_any_turn(angle, l
         ("l.txt", "1 2 3 4\n", "a .txt that is not YOLO"),
         ("a.txt", "0 0.5 0.5 0.1 0.1\n0 12 34 10 10\n", "fractions of the image"),
         ("a.txt", "0 0.5 0.5 0.1 0.1\ncar 1 2\n", "line 2: found 'car 1 2', expected YOLO.*; fix line 2"),
-        ("q.txt", "0 0.5 0.5 0.1 0.1\n", "none named as a frame"),
-        ("y/z.txt", "0 0.5 0.5 0.1 0.1\n", "none named as a frame"),
+        ("q.txt", "0 0.5 0.5 0.1 0.1\n", "no frame of this source has such a name"),
+        ("y/z.txt", "0 0.5 0.5 0.1 0.1\n", "no frame of this source has such a name"),
         ("y/readme.md", "", "no .txt, .json or .xml files"),
     ],
 )
@@ -131,7 +131,7 @@ def test_what_is_no_label_of_these_frames_is_refused(tmp_path, name, content, ma
 
 
 def test_addresses_and_nothing_there_are_refused(tmp_path):
-    assert_refused("http://example.org/labels.csv", "is refused")
+    assert_refused("http://example.org/labels.csv", "is not supported, expected a local path")
     assert_refused(tmp_path / "none.csv", "found no labels")
 
 

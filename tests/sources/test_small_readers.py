@@ -87,7 +87,7 @@ def test_an_address_is_refused_and_a_file_of_such_a_name_is_not(
     path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match="is refused, expected a local path; fetch it first"):
+    with pytest.raises(InputError, match="is not supported, expected a local path; download it first"):
         local_path(path, "video")
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     Path(path).touch()
@@ -116,7 +116,7 @@ def test_of_frames_of_one_time_the_first_is_chosen_and_no_time_at_all_is_refused
         select_frames(np.arange(3.0), FramesConfig(every=1, start_s=3.0))
     with pytest.raises(ValidationError, match="found stop_s = 1, expected it after start_s = 1"):
         FramesConfig(every=1, start_s=1.0, stop_s=1.0)
-    with pytest.raises(InputError, match="a source without frames"):
+    with pytest.raises(InputError, match="the source has no frames"):
         select_frames(np.zeros(0), FramesConfig())
 
 

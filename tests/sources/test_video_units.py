@@ -51,7 +51,9 @@ def test_a_gap_in_a_recording_is_no_outlier() -> None:
 
 def test_two_recordings_in_one_file_are_refused() -> None:
     pts = np.r_[100_000 + np.arange(30), np.arange(30)].astype(np.int64) * 40
-    with pytest.raises(InputError, match=r"time runs back by 40\d\d\.\d s at frame 30, expected one recording a file"):
+    with pytest.raises(
+        InputError, match=r"timestamps jump back 40\d\d\.\d s at frame 30, expected one recording per file"
+    ):
         drop_timestamp_outliers(PATH, packets(pts), MS)
 
 

@@ -176,12 +176,12 @@ def test_coordinates_are_read_as_they_are_copied(text: str) -> None:
 
 
 def test_check_needs_a_file_of_points(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--check without --points"):
+    with pytest.raises(InputError, match="--check needs --points"):
         app(["georeference", str(tmp_path), "--check"], result_action="return_value")
 
 
 def test_a_map_is_for_the_page(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--map with --points"):
+    with pytest.raises(InputError, match="--map cannot be combined with --points"):
         app(["georeference", str(tmp_path), "--points", "p.csv", "--map", "m.tif"], result_action="return_value")
 
 
@@ -248,7 +248,7 @@ def test_places_on_the_map_become_coordinates_and_back(tmp_path: Path) -> None:
             assert others == [None, None]
         asked = json.dumps({"longitude": LON, "latitude": LAT, "order": "x_y"})
         status, answer, _ = client.ask("/coordinates", "POST", token, asked)
-        assert (status, answer) == (422, "found no EPSG code for x, y, expected one as 32633; fill it in")
+        assert (status, answer) == (422, "found no EPSG code for x, y, expected one such as 32633; fill it in")
 
 
 def screen(page: Page) -> list[tuple[float, float]]:

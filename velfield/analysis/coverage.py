@@ -23,8 +23,8 @@ def low_coverage_note(pixels: int, pixels_5: int) -> str:
         return ""
     fraction = f"{percent(pixels_5, pixels)} of the known pixels were" if pixels_5 else "No pixel was"
     return (
-        f"{fraction} passed by 5 or more vehicles. Directions hold; speeds and percentiles are those of single "
-        "vehicles. Fly longer, or add flights up."
+        f"{fraction} passed by 5 or more vehicles. Directions are reliable; speeds and percentiles are those of "
+        "single vehicles. Record for longer, or merge several flights."
     )
 
 

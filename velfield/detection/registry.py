@@ -110,7 +110,7 @@ def load_detector(path: Path) -> Detector:
     if not path.is_file():
         raise InputError(
             f"{path}: found {'a folder' if path.is_dir() else 'no such detector file'}, expected a file: one that "
-            "`velfield train` wrote, or an ONNX model; give its path, or leave the option out"
+            "`velfield train` wrote, or an ONNX model; give its path, or omit the option"
         )
     if path.suffix.lower() == ONNX_SUFFIX:
         from velfield.detection.onnx.detector import OnnxDetector

@@ -53,8 +53,8 @@ class Georeference:
         """
         if self.crs_wkt is None or self.affine is None:
             raise InputError(
-                "found a run whose base image has no reference system, expected one for this format; "
-                "run `velfield georeference RUN`, or with --base GEOTIFF, or export a format in pixels"
+                "the base image is not georeferenced, and this format needs coordinates; "
+                "run `velfield georeference RUN`, or run with --base GEOTIFF, or export a format in pixels"
             )
         a, b, c, d, e, f = self.affine
         column, row = xy_px[:, 0] + 0.5, xy_px[:, 1] + 0.5  # our origin is a pixel's centre, theirs its corner
@@ -77,9 +77,7 @@ class Georeference:
             The ground sample distance is unknown.
         """
         if self.gsd_m is None:
-            raise InputError(
-                "found a run without a ground sample distance, expected one for this format; run with --gsd-m"
-            )
+            raise InputError("the run has no scale, and this format needs metres; run with --gsd-m")
         rows = self.shape[0]
         return np.column_stack([xy_px[:, 0] + 0.5, rows - 0.5 - xy_px[:, 1]]) * self.gsd_m
 

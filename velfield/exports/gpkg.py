@@ -40,9 +40,7 @@ def tracklets_gpkg(tracklets: pd.DataFrame, georeference: Georeference) -> bytes
     try:
         import pyogrio
     except ImportError:
-        raise InputError(
-            "found no pyogrio, which writes GeoPackage; pip install 'velfield[gis]', or export geoparquet"
-        ) from None
+        raise InputError("GeoPackage needs pyogrio; pip install 'velfield[gis]', or export geoparquet") from None
     table, _ = tracklet_lines(tracklets, georeference)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / FILE_NAME

@@ -25,5 +25,5 @@ def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
 def _read_report(layout: RunLayout) -> Report:
     path = layout.report_record
     if not path.exists():
-        raise InputError(f"{path} is not there: the run was not finished, or an older velfield wrote it; run it again")
+        raise InputError(f"{path} does not exist: the run is unfinished; run it again")
     return Report.model_validate_json(path.read_bytes())

@@ -31,7 +31,7 @@ def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
         The extra ``excel`` is not installed, or no junction was found.
     """
     if find_spec("xlsxwriter") is None:
-        raise InputError("found no xlsxwriter, expected it for a workbook; pip install 'velfield[excel]'")
+        raise InputError("the workbook needs xlsxwriter; pip install 'velfield[excel]'")
     return turning_workbook(run.analysis.traffic)
 
 
@@ -41,7 +41,7 @@ def turning_workbook(analysis: TrafficAnalysis) -> bytes:
 
     junctions = [m for m in analysis.movements if m.movements]
     if not junctions:
-        raise InputError("found no junction with movements, expected one for turning counts")
+        raise InputError("no junction with movements was found, so there are no turning counts")
     buffer = io.BytesIO()
     book = xlsxwriter.Workbook(buffer, {"in_memory": True})
     book.set_properties({"created": datetime(2000, 1, 1), "author": "velfield"})

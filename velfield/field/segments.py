@@ -30,8 +30,8 @@ def require_gsd_m(gsd_m: float | None) -> float:
     """
     if gsd_m is None:
         raise InputError(
-            "found a run without a ground sample distance, expected one for metres and km/h; run it again with "
-            "--gsd-m, put it on Earth (`velfield georeference RUN`), or take px and px/s"
+            "the run has no scale, so metres and km/h are unknown; run it again with "
+            "--gsd-m, georeference it (`velfield georeference RUN`), or use px and px/s"
         )
     return gsd_m
 

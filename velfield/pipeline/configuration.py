@@ -86,7 +86,7 @@ def _of_methods(preset: Mapping[str, Any], given: Mapping[str, Any]) -> Tree:
 
 def _read(file: Path) -> Tree:
     if not file.exists():
-        raise InputError(f"--config: {file} is not there; give a YAML file, see examples/flight.yaml")
+        raise InputError(f"--config {file}: no such file; give a YAML file such as examples/flight.yaml")
     tree = _yaml(read_text(file, "configuration"), str(file)) or {}
     if not isinstance(tree, dict):
         raise InputError(

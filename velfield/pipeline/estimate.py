@@ -64,7 +64,7 @@ def check_space(plan: Plan) -> None:
     if needed > free:
         raise InputError(
             f"{plan.layout.root}: about {needed / 1e9:.2f} GB needed, {free / 1e9:.2f} GB free; "
-            "make room, give --out on another disk, or fewer frames with --every or --stop-s"
+            "free space, put --out on another disk, or take fewer frames with --every or --stop-s"
         )
 
 
@@ -87,7 +87,7 @@ def disk_full_as_input_error(plan: Plan) -> Iterator[None]:
         where = "" if error.filename is None else f" at {error.filename}"
         raise InputError(
             f"{root}: the disk is full{where} ({error.strerror}): about {_bytes_left(plan) / 1e9:.2f} GB more needed"
-            f"{_free(root)}; make room, and the same command resumes: what is finished is kept"
+            f"{_free(root)}; free space and run the same command again: it resumes"
         ) from None
 
 

@@ -129,7 +129,7 @@ def _check_optional_inputs(job: Job) -> None:
     for name in OPTIONAL_INPUTS:
         path = getattr(job.inputs, name)
         if path is not None and not Path(path).exists():
-            raise InputError(f"--{name}: {path} is not there; give a path that exists")
+            raise InputError(f"--{name} {path}: no such file; check the path")
 
 
 def make_plan(job: Job) -> Plan:
@@ -148,7 +148,7 @@ def make_plan(job: Job) -> Plan:
     indices = select_frames(info.times_s, job.config.frames)
     if len(indices) < 3:
         raise InputError(
-            f"{job.inputs.source}: {len(indices)} frames to process, 3 or more needed for a tracklet; "
+            f"{job.inputs.source}: {len(indices)} frames to process, but a tracklet needs 3; "
             "widen --start-s/--stop-s or lower --every"
         )
     info = replace(info, warnings=(*info.warnings, *_gaps(info.times_s[indices], job.config.tracking.max_interval_s)))

@@ -82,7 +82,7 @@ def write_training(training: Training, out: Path, review: Path | None = None) ->
         precision, recall = record.curve.precision[k], record.curve.recall[k]
         lines.append(f"precision {precision:.2f} at recall {recall:.2f}: {record.curve.description}")
     else:
-        lines.append("too few labelled cars to hold some out: precision and recall are not known; label 16 or more")
+        lines.append("too few labelled cars to hold some out, so precision and recall are unknown; label 16 or more")
     if review is not None:
         kinds = collect_tp_fn_fp_crops(training.detector, training.samples)
         review.write_bytes(png_bytes(contact_sheet(kinds)))

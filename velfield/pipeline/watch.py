@@ -27,7 +27,7 @@ def run_name(drop: Path) -> str:
     stem = drop.stem if drop.suffix.lower() in VIDEOS else drop.name
     name = re.sub(r"[^A-Za-z0-9_-]+", "-", stem).strip("-")
     if not name:
-        raise InputError(f"{drop}: found no letter or digit in its name; rename it, the run is named after it")
+        raise InputError(f"{drop}: its name has no letter or digit, and the run is named after it; rename it")
     return name
 
 
@@ -53,7 +53,7 @@ def inputs_of(drop: Path) -> tuple[Inputs, Path | None]:
     if drop.is_file():
         return Inputs(source=str(drop)), None
     if not drop.is_dir():
-        raise InputError(f"{drop} is not there; drop a video or a folder")
+        raise InputError(f"{drop} does not exist; drop a video or a folder")
     source = _source_in(drop)
     if source == drop:
         return Inputs(source=str(drop)), None
@@ -107,7 +107,7 @@ def find_image(folder: Path, name: str) -> Path:
     """
     path = _inside(folder, name)
     if not path.is_file():
-        raise InputError(f"{path} is not there; base images are taken from {folder} alone")
+        raise InputError(f"{path} does not exist; base images are taken from {folder} only")
     return path
 
 
@@ -121,7 +121,7 @@ def _inside(folder: Path, name: str) -> Path:
     """The path in a folder by its name or in full; never outside of it, by ``..`` or by a link."""
     path = (folder / name).resolve()
     if path.parent != folder.resolve():
-        raise InputError(f"{name!r} is not in {folder}; give the name of what is there")
+        raise InputError(f"{name!r} is not in {folder}; give the name of a file or folder in it")
     return path
 
 

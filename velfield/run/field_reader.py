@@ -106,7 +106,7 @@ def tile_reader(store: FieldStore, histogram: str = HISTOGRAM) -> TileReader:
             return None
         if not store.has_tile(row, column, histogram):
             raise StoreError(
-                f"{store.path / histogram}: the chunk of tile ({row}, {column}) is gone; run the flight again"
+                f"{store.path / histogram}: the chunk of tile ({row}, {column}) is missing; run the flight again"
             )
         return FieldTile(store.read_tile(row, column, histogram), count, occupancy_ms, noise)
 

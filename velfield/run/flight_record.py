@@ -46,7 +46,7 @@ def read_flight_record(root: Path) -> FlightRecord:
     except ValidationError as error:
         first = error.errors()[0]
         raise InputError(
-            f"{layout.flight}: found {'.'.join(map(str, first['loc']))} that is not of this version of velfield "
+            f"{layout.flight}: {'.'.join(map(str, first['loc']))} is not valid in this version of velfield "
             f"({first['msg'].lower()}); run the flight again with the same command"
         ) from None
 

@@ -52,7 +52,7 @@ def read_grid(layout: RunLayout) -> GridRecord:
         There is no base image yet.
     """
     if not layout.grid.exists():
-        raise InputError(f"{layout.grid} is not there: run `velfield run` on this folder first")
+        raise InputError(f"{layout.grid} does not exist: run `velfield run` on this folder first")
     grid = _parse_grid(layout.grid.read_bytes())
     record = read_georeference(layout)
     return grid if record is None else _apply_georeference(grid, record)
@@ -123,7 +123,7 @@ def read_working(layout: RunLayout) -> WorkingRecord:
         There is no detector yet.
     """
     if not layout.working.exists():
-        raise InputError(f"{layout.working} is not there: run `velfield run` on this folder first")
+        raise InputError(f"{layout.working} does not exist: run `velfield run` on this folder first")
     return WorkingRecord.model_validate_json(layout.working.read_bytes())
 
 
@@ -171,7 +171,7 @@ def read_lens(layout: RunLayout) -> Lens:
         The lens was not calibrated yet.
     """
     if not layout.camera.exists():
-        raise InputError(f"{layout.camera} is not there: run `velfield run` on this folder first")
+        raise InputError(f"{layout.camera} does not exist: run `velfield run` on this folder first")
     if layout.map_lens.exists():
         return lens_from_record(PolynomialLensRecord.model_validate_json(layout.map_lens.read_bytes()))
     return lens_from_record(CameraRecord.model_validate_json(layout.camera.read_bytes()).lens)

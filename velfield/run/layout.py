@@ -33,7 +33,7 @@ def to_path(path: str | Path) -> Path:
     if not text.startswith("s3:/"):
         return Path(path)
     if find_spec("s3fs") is None or find_spec("upath") is None:
-        raise InputError(f"{text}: a run folder on s3:// needs the extra; pip install 'velfield[s3]'")
+        raise InputError(f"{text}: a run folder on s3:// needs s3fs; pip install 'velfield[s3]'")
     from velfield.run.s3 import s3_path  # the extra
 
     return cast(Path, s3_path(text))
@@ -59,8 +59,7 @@ def check_store(path: Path) -> None:
         path.fs.call_s3("list_objects_v2", Bucket=bucket, Prefix=prefix, MaxKeys=1)
     except FileNotFoundError:
         raise InputError(
-            f"{path}: found no bucket {bucket}, expected it to be there; make it (`aws s3 mb s3://{bucket}`) or "
-            "correct the address"
+            f"{path}: the bucket {bucket} does not exist; create it (`aws s3 mb s3://{bucket}`) or correct the address"
         ) from None
 
 

@@ -79,8 +79,8 @@ class Run:
         """
         if self.made_from:
             raise InputError(
-                f"{self.layout.root}: found a field made of those of {' and '.join(self.made_from)}, without frames "
-                "and tracks, expected a run of its own; give one of these"
+                f"{self.layout.root}: this field was computed from {' and '.join(self.made_from)} and has no frames "
+                "or tracks; give one of these runs"
             )
 
     @cached_property

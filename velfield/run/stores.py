@@ -91,7 +91,7 @@ def _open(path: Path, mode: str) -> _Group:
     try:
         return _Group(zarr.open_group(**_location(path), mode=cast(Any, mode), zarr_format=3, use_consolidated=False))
     except FileNotFoundError:
-        raise InputError(f"{path} is not there: run `velfield run` on this folder first") from None
+        raise InputError(f"{path} does not exist: run `velfield run` on this folder first") from None
 
 
 def _read(path: Path, group: _Group, name: str, selection: Any) -> NDArray[Any]:
@@ -209,7 +209,7 @@ class FrameStore:
         """
         _check_frame(self.path, frame, self.count)
         if not (self.path / "raw" / "c" / str(frame) / "0" / "0").exists():
-            raise StoreError(f"{self.path}: the chunk of frame {frame} is gone; `velfield run` writes it again")
+            raise StoreError(f"{self.path}: the chunk of frame {frame} is missing; `velfield run` writes it again")
         try:
             return np.asarray(self.group["raw"][frame], dtype=np.uint8)
         except Exception as error:

@@ -42,9 +42,9 @@ def write_clip_list(path: Path, clips: Sequence[Path]) -> None:
     files = [local_path(clip, "video") for clip in clips]
     folders = [file.name for file in files if not file.is_file()]
     if folders:
-        raise InputError(f"found the folder {folders[0]} among several clips, expected videos; give one folder alone")
+        raise InputError(f"found the folder {folders[0]} among several clips, expected videos; give the folder alone")
     if len(set(files)) < len(files):
-        raise InputError("found a clip twice, expected different ones; leave one out")
+        raise InputError("the same clip is given twice; omit one")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("".join(f"{file}\n" for file in files), encoding="utf-8")
 
@@ -79,7 +79,7 @@ def probe_clips(path: Path, *, frames: FramesConfig, timestamps: Path | None) ->
         A clip cannot be read, frames of several sizes, clips that overlap in time.
     """
     if timestamps is not None:
-        raise InputError("found --timestamps with several clips, expected the clips' own times; leave it out")
+        raise InputError("--timestamps cannot be combined with several clips; omit it: the clips' own times are used")
     clips = read_clip_list(path)
     infos = [probe_video(clip, frames=frames, timestamps=None) for clip in clips]
     for clip, info in zip(clips, infos, strict=True):
@@ -102,11 +102,12 @@ def _join(parts: tuple[tuple[str, SourceInfo, float], ...], notes: tuple[str, ..
         times_s = info.times_s - info.times_s[0] + start_s
         if times_s[0] <= end_s:
             raise InputError(
-                f"{name}: found it to begin {end_s - times_s[0]:.1f} s before the clip before it ends, expected clips "
-                "one after the other; of two cameras run each on the same --base, and `velfield merge` the fields"
+                f"{name}: begins {end_s - times_s[0]:.1f} s before the previous clip ends, expected clips in time "
+                "order; "
+                "if they are of two cameras, run each with the same --base, and `velfield merge` the fields"
             )
         if times and times_s[0] - end_s > _NOTED_GAP_S:
-            warnings.append(f"a gap of {times_s[0] - end_s:.1f} s before {name}: no tracklet reaches over it")
+            warnings.append(f"a gap of {times_s[0] - end_s:.1f} s before {name}: no vehicle is tracked across it")
         warnings += [type(warning)(f"{name}: {warning}") for warning in info.warnings]
         names += [f"{name}:{index}" for index in info.names]
         times.append(times_s)

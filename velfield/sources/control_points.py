@@ -58,7 +58,7 @@ def read_control_points(path: Path | str, epsg: int | None = None) -> tuple[tupl
     if columns == ("x", "y"):
         epsg = epsg if epsg is not None else _epsg_column(file, [row for _, row in rows])
     elif epsg not in (None, WGS84):
-        raise InputError(f"--epsg {epsg}: found columns {longitude} and {latitude}, which are degrees; leave it out")
+        raise InputError(f"--epsg {epsg}: found columns {longitude} and {latitude}, which are degrees; omit it")
     points = [
         ControlPoint(
             x_px=_number(file, line, row, "x_px"),
@@ -77,7 +77,7 @@ def _epsg_column(file: Path, rows: Sequence[dict[str, str]]) -> int:
     code = codes.pop() if len(codes) == 1 else ""
     if not code.isdecimal():
         raise InputError(
-            f"{file.name}: found coordinates x, y without one reference system, expected its EPSG code; give --epsg, "
+            f"{file.name}: found coordinates x, y without one reference system, expected an EPSG code; give --epsg, "
             "or columns longitude and latitude"
         )
     return int(code)
@@ -148,13 +148,16 @@ def _check(points: Sequence[ControlPoint], shape: tuple[int, int]) -> None:
             )
         if not max(abs(point.x), abs(point.y)) < _MAX_COORDINATE:
             raise InputError(
-                f"control point {point.name or number}: found coordinates ({point.x:g}, {point.y:g}), which are beyond "
-                "the Earth in metres and in feet; correct them"
+                f"control point {point.name or number}: found coordinates ({point.x:g}, {point.y:g}), too large in "
+                "metres and "
+                "in feet; correct them"
             )
     pixels = np.array([[point.x_px, point.y_px] for point in points])
     spread = np.linalg.svd(pixels - pixels.mean(axis=0), compute_uv=False)
     if spread[1] < 0.02 * max(spread[0], 1.0):
-        raise InputError("found all control points on one line, expected them spread over the map; add one beside it")
+        raise InputError(
+            "found all control points on one line, expected them spread over the map; add one off that line"
+        )
 
 
 def _project(points: Sequence[ControlPoint], epsg: int) -> tuple[CRS, Points]:
@@ -162,7 +165,9 @@ def _project(points: Sequence[ControlPoint], epsg: int) -> tuple[CRS, Points]:
     try:
         crs = CRS.from_epsg(epsg)
     except CRSError:
-        raise InputError(f"--epsg {epsg}: found no such reference system, expected an EPSG code as 32633") from None
+        raise InputError(
+            f"--epsg {epsg}: found no such reference system, expected an EPSG code such as 32633"
+        ) from None
     xs, ys = [point.x for point in points], [point.y for point in points]
     if not crs.is_geographic:
         return crs, np.column_stack([xs, ys])

@@ -98,7 +98,7 @@ def _read(path: Path, info: SourceInfo, index: int) -> SourceFrame:
     if grey.shape != info.shape:
         raise InputError(
             f"{path.name}: found {name} of {grey.shape[1]}x{grey.shape[0]}, expected {info.width}x{info.height}; "
-            "the folder changed meanwhile, start again"
+            "the folder has changed; start again"
         )
     return SourceFrame(index, name, float(info.times_s[index]), grey, 0)
 
@@ -180,7 +180,7 @@ def _common_size(path: Path, sizes: dict[tuple[int, int], list[str]]) -> tuple[i
         (width, height), odd = next((other, names) for other, names in sizes.items() if other != size)
         raise InputError(
             f"{path.name}: found {odd[0]} of {width}x{height}, expected {size[0]}x{size[1]} as {len(usual)} others; "
-            "take it out of the folder, frames must be of one size"
+            "remove it: all frames must have one size"
         )
     return size
 

@@ -42,7 +42,8 @@ def local_path(path: Path | str, what: str) -> Path:
     protocol = _PROTOCOL.match(text)
     if protocol and not Path(text).exists():
         raise InputError(
-            f"found {text!r} as {what}: the protocol {protocol[1]!r} is refused, expected a local path; fetch it first"
+            f"found {text!r} as {what}: the protocol {protocol[1]!r} is not supported, expected a local path; "
+            "download it first"
         )
     try:
         return Path(text).resolve(strict=True)

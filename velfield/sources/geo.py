@@ -104,7 +104,7 @@ def ground_sample_distance_m(crs: CRS, affine: Affine, shape: tuple[int, int], *
     if abs(across - down) > _SQUARE * max(across, down):
         raise InputError(
             f"{name}: found pixels of {across:.4g} m by {down:.4g} m on the ground, expected square ones; "
-            "resample it, as with gdalwarp -tr"
+            "resample it, such as with gdalwarp -tr"
         )
     return float(np.sqrt(across * down))
 
@@ -139,7 +139,7 @@ def reconcile_gsd(from_crs_m: float | None, given_m: float | None) -> float | No
     if abs(given_m - from_crs_m) > MAX_GSD_DISAGREEMENT * from_crs_m:
         raise InputError(
             f"found --gsd-m {given_m:g}, expected {from_crs_m:.4g} m a pixel by the base image's reference "
-            "system; leave --gsd-m out, or fix the image's georeference"
+            "system; omit --gsd-m, or fix the image's georeference"
         )
     return from_crs_m
 

@@ -35,7 +35,7 @@ def select_frames(times_s: FloatArray, frames: FramesConfig) -> IntArray:
     """
     times_s = np.asarray(times_s, np.float64)
     if times_s.size == 0:
-        raise InputError("found a source without frames, expected at least one; nothing to do")
+        raise InputError("the source has no frames")
     start_s = 0.0 if frames.start_s is None else frames.start_s
     stop_s = np.inf if frames.stop_s is None else frames.stop_s
     later = np.r_[True, np.diff(times_s) > 0]
@@ -45,7 +45,7 @@ def select_frames(times_s: FloatArray, frames: FramesConfig) -> IntArray:
     if inside.size == 0:
         raise InputError(
             f"found no frame from {start_s:g} s to {stop_s:g} s, the source lasts {since_first[-1]:.3f} s; "
-            "give --start-s and --stop-s as s from the first frame"
+            "--start-s and --stop-s count from the first frame, in s"
         )
     if frames.every == "auto":
         return inside[_nearest_to_interval(times_s[inside], frames.target_interval_s)]

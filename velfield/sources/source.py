@@ -45,7 +45,7 @@ def probe(path: Path | str, *, frames: FramesConfig, timestamps: Path | None = N
     if timestamps is not None:
         timestamps = local_path(timestamps, "time stamps file")
         if frames.fps is not None:
-            raise InputError("found both --timestamps and --fps, expected one of them; leave --fps out")
+            raise InputError("--timestamps and --fps exclude each other; omit --fps")
     if source.is_dir():
         info = probe_folder(source, frames=frames, timestamps=timestamps)
         if frames.fps is None:

@@ -99,9 +99,9 @@ def _claim(out: Path, config: SimulationConfig) -> None:
     record = out / "simulation.json"
     if out.exists() and any(out.iterdir()):
         if not record.is_file():
-            raise InputError(f"{out} holds other files; name an empty or new folder for the simulated flight")
+            raise InputError(f"{out} contains other files; give an empty or new folder for the simulated flight")
         if SimulationConfig.model_validate_json(record.read_text(encoding="utf-8")) != config:
-            raise InputError(f"{out} holds a flight of another configuration (simulation.json); name a new folder")
+            raise InputError(f"{out} contains a flight of another configuration (simulation.json); give a new folder")
     (out if config.clip != "none" else out / "frames").mkdir(parents=True, exist_ok=True)
     record.write_text(config.model_dump_json(indent=1), encoding="utf-8")
 

@@ -55,7 +55,7 @@ def frames_to_annotate(path: Path, *, max_frames: int) -> Frames:
     if RunLayout(path).flight.exists():
         return _frames_of_run(open_run(path), max_frames)
     if path.is_dir() or not path.exists():
-        raise InputError(f"{path}: found no run folder and no image, expected one of them; name a frame's file")
+        raise InputError(f"{path}: found no run folder and no image, expected one of them; give the file of a frame")
     grey = read_grey_image(path, FramesConfig().max_pixels)
     return Frames((path.name,), grey.shape[1], grey.shape[0], lambda _: grey)
 
@@ -83,8 +83,8 @@ def _names(run: Run) -> Callable[[int], str]:
     timestamps = Path(given.timestamps) if given and given.timestamps else None
     if not Path(source.path).is_dir():
         raise InputError(
-            f"{run.layout.root}: found no images at {source.path}, expected them for their names; put them back, or "
-            "annotate a frame's file"
+            f"{run.layout.root}: found no images at {source.path}, expected them there; put them back, or "
+            "annotate the file of a frame"
         )
     names = probe(Path(source.path), frames=run.record.config.frames, timestamps=timestamps).names
     return lambda index: names[index]

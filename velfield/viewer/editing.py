@@ -57,7 +57,7 @@ def editing_app(
     from starlette.routing import Route
 
     if not page_is_built():
-        raise InputError("the page is not built in this checkout: `make page`, then try again")
+        raise InputError("the page is not built in this checkout; run `make page` first")
     token = secrets.token_urlsafe(24)
     alone = threading.Lock()
 

@@ -132,7 +132,7 @@ def write_coordinates(place: MarkedPlace) -> str:
     if place.order == "latitude_longitude":
         return f"{place.latitude:.8f}, {place.longitude:.8f}"
     if place.epsg is None:
-        raise InputError("found no EPSG code for x, y, expected one as 32633; fill it in")
+        raise InputError("found no EPSG code for x, y, expected one such as 32633; fill it in")
     x, y = to_coordinates(place.longitude, place.latitude, place.epsg)
     return f"{x:.8f}, {y:.8f}" if abs(x) <= 360 and abs(y) <= 360 else f"{x:.3f}, {y:.3f}"
 
@@ -166,7 +166,7 @@ def read_marked_points(marked: MarkedPoints) -> tuple[tuple[ControlPoint, ...], 
     13.4
     """
     if marked.order == "x_y" and marked.epsg is None:
-        raise InputError("found no EPSG code for x, y, expected one as 32633; fill it in")
+        raise InputError("found no EPSG code for x, y, expected one such as 32633; fill it in")
     points = []
     for number, point in enumerate(marked.points, start=1):
         x, y = _read_coordinates(number, point.coordinates)
@@ -180,5 +180,7 @@ def _read_coordinates(number: int, text: str) -> tuple[float, float]:
     parts = re.split(r"[\s,;]+", text.strip(_BRACKETS).replace("\N{MINUS SIGN}", "-"))
     if len(parts) != 2 or not all(_NUMBER.fullmatch(part) for part in parts):
         found = repr(text) if text.strip() else "no coordinates"
-        raise InputError(f"control point {number}: found {found}, expected two decimal numbers as 13.4050, 52.5200")
+        raise InputError(
+            f"control point {number}: found {found}, expected two decimal numbers such as 13.4050, 52.5200"
+        )
     return float(parts[0]), float(parts[1])

@@ -166,7 +166,7 @@ class ReferenceMap:
         source, name = self._source, self.name
         if source.crs is None or tuple(source.transform)[:6] == _NO_TRANSFORM:
             raise InputError(
-                f"--map {name}: found no reference system, expected a map with coordinates; give it one, as with "
+                f"--map {name}: found no reference system, expected a map with coordinates; add one, such as with "
                 "gdal_translate -a_srs -a_ullr"
             )
         if any(kind.startswith("complex") for kind in source.dtypes):
@@ -337,7 +337,7 @@ def _crs(epsg: int) -> CRS:
     try:
         return CRS.from_epsg(epsg)
     except CRSError:
-        raise InputError(f"EPSG code {epsg}: found no such reference system, expected one as 32633") from None
+        raise InputError(f"EPSG code {epsg}: found no such reference system, expected one such as 32633") from None
 
 
 def _one_line(error: BaseException) -> str:

@@ -160,7 +160,7 @@ def _listen(port: int | None) -> socket.socket:
     try:
         return socket.create_server((HOST, port or 0))
     except (OSError, OverflowError) as error:
-        raise InputError(f"--port {port}: {error}; leave it out for one that is free") from error
+        raise InputError(f"--port {port}: {error}; omit it to use a free port") from error
 
 
 def _has_screen() -> bool:

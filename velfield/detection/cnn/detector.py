@@ -126,7 +126,7 @@ class CnnDetector(Detector):
         """Fine-tune the base."""
         if not isinstance(base, CnnDetector):
             found = "nothing" if base is None else f"a detector of method {base.method}"
-            raise InputError(f"found {found} to continue, expected a detector of method cnn; leave --continue out")
+            raise InputError(f"found {found} to continue, expected a detector of method cnn; omit --continue")
         base.check_car_length(config.working_car_length_px)
         return cls(fine_tune(samples, base.network, base.record, config))
 

@@ -391,7 +391,11 @@ def open_session(model: bytes, device: Device) -> ort.InferenceSession:
         found = f"a GPU on which no further session starts, {_EXPECTED}"
         if device == "cuda":
             raise InputError(f"--device cuda: found {found}; free its memory, or use --device cpu")
-        warnings.warn(f"found {found}: this one runs on the processor; free its memory", DeviceWarning, stacklevel=2)
+        warnings.warn(
+            "GPU unavailable, no further session starts on it: using the CPU; free the GPU's memory",
+            DeviceWarning,
+            stacklevel=2,
+        )
     return session
 
 

@@ -34,7 +34,7 @@ _COLUMNS: dict[OnnxLayout, int] = {
     "end_to_end_oriented": 7,
 }
 """Numbers for each box, without the scores of its classes."""
-_ASK = "describe it in a YAML of its name beside it (docs/detection.md)"
+_ASK = "describe it in a YAML file of the same name next to it (docs/detection.md)"
 
 
 def describe_model(path: Path, car_length_px: float = 16.0) -> OnnxRecord:
@@ -122,7 +122,8 @@ def check_output(
         wanted = f"(1, {expected}, n)" if axis == 1 else f"(1, n, {expected})"
         raise InputError(
             f"{name}: found an output of {sizes}, expected {wanted} of the layout {layout}; give its layout and all "
-            "of its classes in a YAML of its name beside it (docs/detection.md)"
+            "its "
+            "classes in a YAML file of the same name next to it (docs/detection.md)"
         )
 
 
@@ -236,7 +237,7 @@ def _vehicles(path: Path, names: tuple[str, ...]) -> tuple[int, ...]:
     if not found:
         raise InputError(
             f"{path.name}: found the classes {', '.join(names)[:120] or 'unnamed'}, expected one that is a vehicle; "
-            "list their numbers as `vehicles: [...]` in a YAML of its name beside it"
+            "list their numbers as `vehicles: [...]` in a YAML file of the same name next to it"
         )
     return found
 

@@ -56,7 +56,7 @@ class OnnxDetector(Detector):
         except OSError as error:
             raise InputError(f"{path}: the detector's model is gone ({error.strerror}); put it back") from None
         if hashlib.blake2b(data, digest_size=16).hexdigest() != self.record.digest:
-            raise InputError(f"{path}: found another model than the run began with; put it back, or start a new run")
+            raise InputError(f"{path}: the model has changed since the run began; restore it, or start a new run")
         try:
             return open_session(data, current_device())
         except InputError:
@@ -121,8 +121,8 @@ class OnnxDetector(Detector):
         if 0 < size <= _FRACTION and np.abs(found.xy).max() <= _FRACTION:
             name = Path(self.record.path).name
             raise InputError(
-                f"{name}: found boxes within {_FRACTION:g} px of the input's corner, as fractions of its sides would "
-                "lie, expected pixels; multiply them by its width and height in the graph"
+                f"{name}: found boxes within {_FRACTION:g} px of the input's corner, like "
+                "fractions of its sides, expected pixels; multiply them by its width and height in the graph"
             )
 
     def _refusal(self, error: Exception, where: str = "") -> InputError:
@@ -168,7 +168,9 @@ class OnnxDetector(Detector):
     @classmethod
     def train(cls, samples: Sequence[LabelledImage], config: Any, *, base: Detector | None = None) -> Detector:
         """It cannot be trained here: raises InputError."""
-        raise InputError("found an ONNX detector to train, expected one of velfield's; train it where it is from")
+        raise InputError(
+            "found an ONNX detector to train, expected a detector of velfield; train it with the program that made it"
+        )
 
 
 DETECTOR = OnnxDetector

@@ -62,10 +62,10 @@ def road_network(run: Run) -> RoadNetwork:
         The ground sample distance is not known, or no lanes were found.
     """
     if run.grid.gsd_m is None:
-        raise InputError("found a run without a ground sample distance, expected one for roads; run with --gsd-m")
+        raise InputError("the run has no scale, and roads need metres; run with --gsd-m")
     graph, trajectories = run.analysis.lanes(), run.analysis.trajectories
     if not len(graph):
-        raise InputError("found no lanes in the tracks of this run, expected some: a longer flight has more traffic")
+        raise InputError("no lanes were found in the tracks of this run; a longer flight shows more traffic")
     samples, georeference = graph.samples, Georeference.from_grid(run.grid)
     lanes = []
     for lane in graph:

@@ -26,7 +26,7 @@ def trajectory_table(run: Run) -> pd.DataFrame:
         The ground sample distance is not known.
     """
     if run.grid.gsd_m is None:
-        raise InputError("found a run without a ground sample distance, expected one for metres; run with --gsd-m")
+        raise InputError("the run has no scale, and this table needs metres; run with --gsd-m")
     paths, samples = run.analysis.trajectories, run.analysis.lanes().samples
     owner = paths.owner
     acceleration = np.zeros_like(paths.velocity_m_per_s)

@@ -74,8 +74,7 @@ def _stale_lines(layout: RunLayout) -> Iterator[str]:
     record, commits = read_flight_record(layout.root), read_commits(layout, TRACKS)
     if not commits:
         raise InputError(
-            f"{layout.root}: found a run whose tracks are not computed, expected a finished one; "
-            "run `velfield run` with this folder to the end"
+            f"{layout.root}: the run has no tracks yet; finish it by running the same `velfield run` command again"
         )
     key = record.keys.get(TRACKS)
     if key is not None and any(commit.key != key for commit in commits):
@@ -128,7 +127,7 @@ def analyse_tracks(
 
 def _check_slice(slice_s: float) -> None:
     if not slice_s > 0:
-        raise InputError(f"found --slice-s {slice_s:g}, expected a length in seconds; counts are by slices so long")
+        raise InputError(f"--slice-s {slice_s:g}: must be a positive number of seconds")
 
 
 def write_analysis(

@@ -108,7 +108,7 @@ def _from_detections(plan: Plan) -> StageResult:
     if with_boxes < _MIN_FRAMES_WITH_BOXES * plan.frame_count:
         warnings.append(
             f"--detections has boxes in {with_boxes} of the {plan.frame_count} frames processed: the others count as "
-            "free of cars; give boxes of all frames, or use it as --labels"
+            "empty; give boxes of all frames, or use it as --labels"
         )
     unused = [f"--{name}" for name in ("labels", "detector") if getattr(plan.job.inputs, name)]
     if unused:

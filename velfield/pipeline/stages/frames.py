@@ -79,8 +79,8 @@ def _describe_footage(store: FrameStore, usable: IntArray) -> list[str]:
         contrast.append(thumbnails.reshape(len(frames), -1).std(axis=1))
         for k in find_cuts(thumbnails):
             found.append(
-                f"the picture changes wholly at frame {frames[k]} ({times_s[frames[k]]:.3f} s), as at a cut to another "
-                "place: frames that the base image does not show are not registered; run each place by itself, with "
+                f"the picture changes completely at frame {frames[k]} ({times_s[frames[k]]:.3f} s), as at a cut "
+                "to another place: only frames of one place are registered; run each place separately, with "
                 "--start-s and --stop-s"
             )
     light = describe_light(

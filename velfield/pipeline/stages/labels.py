@@ -52,7 +52,7 @@ def base_px_per_raw_px(plan: Plan) -> float:
     statuses = open_registration(plan.layout.registration).statuses()
     registered = [k for k, status in enumerate(statuses) if status == "ok"]
     if not registered:
-        raise InputError("no frame could be registered: is the video of one place, seen from above?")
+        raise InputError("no frame could be registered; the video must show one place from above")
     cross = np.array([[-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]]) * 64 + np.array([[maps.width, maps.height]]) / 2
     scales = []
     for k in registered[:: max(1, len(registered) // 15)]:

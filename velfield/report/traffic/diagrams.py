@@ -99,8 +99,8 @@ def _signal_diagrams(analysis: TrafficAnalysis, found: JunctionMovements) -> Ite
     yield Diagram(
         f"time-space-{number}",
         f"Junction {number}: vehicles on the approach {name}",
-        "Each line is a vehicle; where it is level the vehicle stands. Thick red bar at the stop line (0 m): the "
-        "signal is red, as found from who stops and who goes.",
+        "Each line is a vehicle; where it is level the vehicle has stopped. Thick red bar at the stop line (0 m): the "
+        "signal is red, as inferred from the vehicles that stop and go.",
         partial(draw_time_space, analysis=analysis, stream=busiest),
     )
     yield Diagram(

@@ -21,7 +21,7 @@ class FirstPage:
     @property
     def sections(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
         """The questions, and what could not be said as the last one where there is any."""
-        missing = ("What could not be said, and why", self.withheld)
+        missing = ("What is not known, and why", self.withheld)
         return (*self.answers, missing) if self.withheld else self.answers
 
 

@@ -50,7 +50,7 @@ def report_html(
         for question, lines in page.answers
     )
     withheld = "".join(f"<li>{escape(line)}</li>" for line in page.withheld)
-    missing = f'<div class="withheld"><h2>What could not be said</h2><ul>{withheld}</ul></div>' if withheld else ""
+    missing = f'<div class="withheld"><h2>What is not known</h2><ul>{withheld}</ul></div>' if withheld else ""
     pictures = [_picture(diagram) for diagram in diagrams]
     tables = "".join(_table(table) + _clips(table, clips or {}) for table in record.tables)
     return (

@@ -130,7 +130,7 @@ def read_detections(path: Path | str, info: SourceInfo) -> pd.DataFrame:
     rows = [{**vars(box), "source_index": index_of[box.frame]} for box in boxes if box.is_car]
     if not rows:
         raise InputError(
-            f"{file.name}: found no detections, expected {FORMATS}; leave --detections out to use velfield's detector"
+            f"{file.name}: found no detections, expected {FORMATS}; omit --detections to use velfield's detector"
         )
     table = pd.DataFrame(rows)[list(RAW_DETECTION_COLUMNS)].astype(RAW_DETECTION_COLUMNS).fillna({"score": 1.0})
     return table.sort_values("source_index", kind="stable", ignore_index=True)
@@ -176,8 +176,9 @@ def _read_files(path: Path, info: SourceInfo, what: str) -> tuple[list[Box], lis
     if not frame_of:
         first = repr(next(iter(found.images))) if found.images else "none"
         raise InputError(
-            f"{path.name}: found labels of the images {first} and so on, none named as a frame of this source (such as "
-            f"{info.names[0]!r}); rename them"
+            f"{path.name}: found labels of the images {first} and others, but no frame of this source has such a "
+            "name (they are named "
+            f"{info.names[0]!r} and so on); rename them"
         )
     drawn = [one for one in found.annotations if one.image in frame_of]
     names, origin = dict[int, str](), path.name

@@ -72,7 +72,7 @@ def read_telemetry_file(path: Path, info: SourceInfo) -> Telemetry:
     else:
         found = parse_srt(text, file.name)
     if isinstance(found, Failure):
-        raise InputError(f"{found.reason}; leave it out, or give the drone's own .SRT, .klv or log as CSV")
+        raise InputError(f"{found.reason}; omit it, or give the drone's own .SRT, .klv or log as CSV")
     return found
 
 
@@ -99,7 +99,7 @@ def _from_video(path: Path) -> Telemetry | Failure:
         unread = [what for stream in container.streams if (what := _unread_format(stream))]
         texts = [stream for stream in container.streams.subtitles if _is_text(stream)]
         klv = [stream for stream in container.streams.data if _has_format(stream, _KLV_NAMES)]
-        found: Telemetry | Failure = Failure("the video has no subtitles, and there is no .SRT beside it")
+        found: Telemetry | Failure = Failure("the video has no subtitles, and there is no .SRT file next to it")
         if texts:
             found = telemetry_from_cues(_embedded_cues(container, texts[0]), f"the subtitles of {path.name}")
         elif klv:

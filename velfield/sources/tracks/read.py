@@ -183,7 +183,7 @@ class _Reader:
         asked = [p for p in there if p.unit in (None, self.unit)] if self.unit else there
         if not asked:
             units = ", ".join(dict.fromkeys(str(p.unit) for p in there))
-            raise InputError(f"{self.path}: found positions in {units} and --unit {self.unit}; leave --unit out")
+            raise InputError(f"{self.path}: found positions in {units} and --unit {self.unit}; omit --unit")
         return next((p for p in asked if p.unit is not None and p.y_axis is not None), asked[0])
 
     def _unit(self, position: Position) -> Unit:
@@ -191,7 +191,7 @@ class _Reader:
         if unit is None:
             raise InputError(
                 f"{self.path}: found columns {self.columns[position.x]} and {self.columns[position.y]} without a unit; "
-                "say --unit m, ft, px or deg"
+                "give --unit m, ft, px or deg"
             )
         return unit
 
@@ -201,8 +201,8 @@ class _Reader:
         axis = position.y_axis or self.y_axis or usual
         if axis is None:
             raise InputError(
-                f"{self.path}: found columns {self.columns[position.x]} and {self.columns[position.y]} in {unit}, and "
-                "not where y points: say --y-axis up (north, as in maps) or --y-axis down (as in images)"
+                f"{self.path}: found columns {self.columns[position.x]} and {self.columns[position.y]} in {unit}, "
+                "but not which way y points: give --y-axis up (north, as in maps) or --y-axis down (as in images)"
             )
         if self.y_axis is not None and axis != self.y_axis:
             raise InputError(f"{self.path}: found --y-axis {self.y_axis}, expected {axis}, as in this format; omit it")
@@ -248,7 +248,7 @@ class _Reader:
         if abs(scale - 1) > _SAME_SCALE:
             raise InputError(
                 f"{self.path}: found {scale:.3g} m by longitude and latitude for one of {self.columns[position.x]}, "
-                "expected 1; say --unit deg to use the degrees"
+                "expected 1; give --unit deg to use the degrees"
             )
         if not mirrored:
             return axis, xy, []
@@ -281,16 +281,16 @@ class _Reader:
             if fps is None:
                 raise InputError(
                     f"{self.path}: found {len(np.unique(seconds))} times of {len(np.unique(frame))} frames in column "
-                    f"{found[0]}: too coarse; give the frames a second with --fps"
+                    f"{found[0]}: too coarse; give the frame rate with --fps"
                 )
-            notes.append(f"{found[0]} is too coarse: times are by the frames")
+            notes.append(f"{found[0]} is too coarse: times are computed from the frames")
         if frame is None:
             raise self._missing("a column of the time or of the frame")
         rate = fps or self._rate_beside()
         if rate is None:
             usual = "" if self.form is None or self.form.frame_rate is None else f" ({self.form.name}: mostly "
             usual += f"{self.form.frame_rate:g})" if usual and self.form is not None else ""
-            raise InputError(f"{self.path}: found frames and no times; give the frames a second with --fps{usual}")
+            raise InputError(f"{self.path}: found frames and no times; give the frame rate with --fps{usual}")
         frame = frame - frame.min()
         return frame / rate, frame.astype(np.int64), f"{frame_column} at {rate:g} a second", notes
 
@@ -338,7 +338,7 @@ class _Reader:
         recordings = self.raw[columns[:-1]].drop_duplicates() if len(columns) > 1 else ()
         if len(recordings) > 1:
             what = ", ".join(columns[:-1])
-            notes.append(f"{len(recordings)} recordings ({what}) are laid over each other, each vehicle its own track")
+            notes.append(f"{len(recordings)} recordings ({what}) are combined, and their vehicles are kept apart")
         return (pd.factorize(names, sort=False)[0], names.to_numpy()), notes
 
     # sizes and speeds

@@ -102,8 +102,9 @@ def _from_text(text: pd.Series, series: pd.Series, path: Path) -> tuple[FloatArr
     if zoned.any() and not zoned.all():
         row = int(np.flatnonzero((zoned != zoned.iloc[0]).to_numpy())[0])
         raise InputError(
-            f"{path}: found times with and without a zone in column {series.name} (row {row + 2}), expected one zone "
-            "for all, or each with its own; add it, as +02:00"
+            f"{path}: found times with and without a time zone in column {series.name} (row {row + 2}); add the zone "
+            "to "
+            "each, such as +02:00"
         )
     try:
         stamps = pd.to_datetime(text, errors="coerce", utc=True, **options)  # type: ignore[call-overload]

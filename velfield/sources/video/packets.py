@@ -34,7 +34,8 @@ def open_video(path: Path) -> Any:
     except (av.error.FFmpegError, OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or str(error)
         raise InputError(
-            f"{path.name}: could not be opened as video ({why}), expected MP4, MOV, AVI, MKV, TS or the like, whole; "
+            f"{path.name}: could not be opened as video ({why}), expected an intact MP4, MOV, AVI, MKV, TS or "
+            "similar file; "
             "give a video or a folder of images"
         ) from None
 
@@ -47,7 +48,7 @@ def video_stream(container: Any, path: Path) -> Any:
         raise InputError(f"{path.name}: found no video stream, expected one; give a video or a folder of images")
     if videos[0].codec_context is None:
         raise InputError(
-            f"{path.name}: found a video stream without a decoder, expected H.264, HEVC or the like; convert it"
+            f"{path.name}: found a video stream without a decoder, expected H.264, HEVC or similar; convert it"
         )
     return videos[0]
 
@@ -144,9 +145,9 @@ def drop_timestamp_outliers(
     if back.size and back.max() > max_deviation:
         index = int(np.argmax(back > max_deviation))
         raise InputError(
-            f"{path.name}: found that time runs back by {float(back[index] * time_base):.1f} s at frame {index}, "
-            "expected one recording "
-            "a file; cut it there, or give --timestamps"
+            f"{path.name}: timestamps jump back {float(back[index] * time_base):.1f} s at frame {index}, expected "
+            "one recording "
+            "per file; split it there, or give --timestamps"
         )
     return packets, notes
 

@@ -145,18 +145,19 @@ def _picture_warnings(path: Path, max_pixels: int) -> tuple[str, ...]:
             return ()
         if picture.interlaced_frame:
             found.append(
-                "the video is interlaced: every other row is half a frame later, so that what moves is a comb; "
+                "the video is interlaced, and moving vehicles look like combs; "
                 "deinterlace it first (`ffmpeg -i IN -vf bwdif OUT`)"
             )
         if int(picture.color_trc) in _HDR:
             found.append(
-                f"the video is of high dynamic range ({_HDR[int(picture.color_trc)]}): its grey levels are used as "
-                "stored, which are flatter than the detector was trained on; convert it to BT.709 first"
+                f"the video is of high dynamic range ({_HDR[int(picture.color_trc)]}): its grey levels have "
+                "less contrast than the detector expects; convert it to BT.709 first"
             )
         if picture.rotation % 360:
             found.append(
-                f"the file asks for its pictures to be turned by {picture.rotation % 360} degrees for display: they "
-                "are used as stored, and so are the coordinates of labels and detections"
+                f"the file's pictures are rotated by {picture.rotation % 360} degrees for display; velfield uses "
+                "them as "
+                "stored, and expects labels and detections in stored pixels"
             )
     return tuple(found)
 
