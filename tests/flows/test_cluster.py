@@ -223,10 +223,10 @@ def test_a_cluster_without_workers_is_said_and_waited_for(monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("address", "text"),
     [
-        ("tcp://127.0.0.1:{silent}", "found no answer within 1 s"),  # as the port of the dashboard, or of anything else
-        ("tcp://127.0.0.1:{refused}", "found no answer within 1 s"),
-        ("http://127.0.0.1:8787", "found unknown address scheme 'http'"),
-        ("host", "found missing port number"),
+        ("tcp://127.0.0.1:{silent}", "no answer within 1 s"),  # as the port of the dashboard, or of anything else
+        ("tcp://127.0.0.1:{refused}", "no answer within 1 s"),
+        ("http://127.0.0.1:8787", "unknown address scheme 'http'"),
+        ("host", "missing port number"),
     ],
 )
 def test_an_address_without_a_scheduler_is_refused_in_one_line(
