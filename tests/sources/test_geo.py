@@ -182,3 +182,57 @@ def test_a_prj_that_is_none_stops(tmp_path, scene):
     (tmp_path / "b.prj").write_text("somewhere")
     with pytest.raises(InputError, match="found no reference system"):
         read_base_raster(tmp_path / "b.png", CONFIG)
+
+
+def local(unit: str) -> CRS:
+    return CRS.from_wkt(f'LOCAL_CS["Arbitrary",{unit}]')
+
+
+@pytest.mark.parametrize(
+    ("crs", "pixel", "gsd_m"),
+    [
+        (local('UNIT["metre",1]'), 0.23, 0.23),
+        (local('UNIT["foot",0.3048]'), 0.5, 0.1524),
+        (local('UNIT["unknown",1]'), 0.5, None),
+        (local('UNIT["degree",0.0174532925199433]'), 0.5, None),
+        (CRS.from_epsg(5773), 0.5, None),  # of heights
+    ],
+)
+def test_a_local_reference_system_gives_the_scale_and_no_place(tmp_path, scene, crs, pixel, gsd_m):
+    Image.fromarray(scene).save(tmp_path / "b.png")  # GDAL writes any other unit of a local system as metres to TIFF
+    (tmp_path / "b.pgw").write_text(f"{pixel}\n0\n0\n{-pixel}\n100\n200\n")
+    (tmp_path / "b.prj").write_text(crs.to_wkt())
+    base = read_base_raster(tmp_path / "b.png", CONFIG)
+    assert base.gsd_m == (None if gsd_m is None else pytest.approx(gsd_m, rel=1e-6))
+    assert (base.crs_wkt, base.affine) == (None, None)
+    assert len(base.notes) == 1
+    assert ("local one" if gsd_m else "is not used") in base.notes[0]
+
+
+@pytest.mark.parametrize("name", ["b.tif", "b.png"])
+@pytest.mark.parametrize("beside", ["place", "system"])
+def test_half_a_georeference_is_noted(tmp_path, scene, name, beside):
+    Image.fromarray(scene).save(tmp_path / name)
+    if beside == "place":
+        (tmp_path / name).with_suffix({"b.tif": ".tfw", "b.png": ".pgw"}[name]).write_text("0.2\n0\n0\n-0.2\n7\n9\n")
+    else:
+        (tmp_path / "b.prj").write_text(CRS.from_epsg(32636).to_wkt())
+    base = read_base_raster(tmp_path / name, CONFIG)
+    assert base.gsd_m is None
+    assert "it is not used" in base.notes[0]
+
+
+def test_ground_control_points_in_the_file_are_noted(tmp_path, scene):
+    points = [rasterio.control.GroundControlPoint(row, row / 2, 10.0 + row, 50.0 + row) for row in (0, 50, 100)]
+    path = save_tif(tmp_path / "b.tif", scene, CRS.from_epsg(4326), gcps=points)
+    assert "its 3 ground control points are not used" in read_base_raster(path, CONFIG).notes[0]
+
+
+@pytest.mark.parametrize(
+    "crs", [CRS.from_epsg(32636), CRS.from_wkt(CRS.from_epsg(4326).to_wkt().replace("6378137", "1737400"))]
+)
+def test_a_place_beyond_the_reference_system_is_one_line(tmp_path, scene, crs):
+    path = save_tif(tmp_path / "b.tif", scene, crs, from_origin(1e9, 1e9, 0.25, 0.25))
+    with pytest.raises(InputError, match=r"b\.tif: found") as caught:
+        read_base_raster(path, CONFIG)
+    assert "\n" not in str(caught.value)

@@ -67,9 +67,7 @@ class Georeference:
         return np.column_stack([longitude, latitude]).astype(np.float64)
 
     def to_metres(self, xy_px: Points) -> Points:
-        """(n, 2) base pixels to (n, 2) metres east and north of the base image's lower left corner.
-
-        Without a reference system "north" is the image's top.
+        """(n, 2) base pixels to (n, 2) metres to the right of the base image's lower left corner, and up from it.
 
         Raises
         ------

@@ -4,14 +4,19 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from rasterio.crs import CRS
+from rasterio.warp import transform
 
 from schemas.arrays import Points
 from schemas.export import ExportOptions
 from velfield.exports.georeference import MPS_TO_KMH, Georeference
 from velfield.exports.tracks import track_points
 from velfield.run.run import Run
+from velfield.sources.geo import utm_crs
 
 FILE_NAME = "tracks.csv"
+_SAME = 0.01
+"""A unit of the reference system that differs by more than this from a metre on the ground is none."""
 
 
 def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
@@ -32,14 +37,15 @@ def geotrax_table(
     Returns
     -------
     DataFrame with ``Vehicle_ID, Timestamp, Frame_Number, Ortho_X, Ortho_Y, Local_X, Local_Y, Latitude, Longitude,
-    ...``: ``Timestamp`` in s of the source's clock, ``Ortho`` base pixels, ``Local`` the reference system's coordinates
-    or, without one, metres; ``Vehicle_Speed`` km/h, ``Vehicle_Acceleration`` m/s^2.
+    ...``: ``Timestamp`` in s of the source's clock, ``Ortho`` base pixels (y down), ``Local`` metres with y up: the
+    reference system's coordinates, of the UTM zone where its unit is no metre on the ground (feet, Web Mercator), from
+    the map's lower left corner without one; ``Vehicle_Speed`` km/h, ``Vehicle_Acceleration`` m/s^2.
     """
     points = track_points(tracklets)
     xy = points[["x_px", "y_px"]].to_numpy(np.float64)
     empty = np.full(len(points), np.nan)
-    local = georeference.to_crs(xy) if georeference.has_crs else _metres_or_nan(georeference, xy)
     lonlat = georeference.to_lonlat(xy) if georeference.has_crs else np.column_stack([empty, empty])
+    local = _local_metres(georeference, xy, lonlat)
     gsd_m = np.nan if georeference.gsd_m is None else georeference.gsd_m
     velocity = points[["vx_px_per_s", "vy_px_per_s"]].to_numpy(np.float64)
     speed = pd.Series(np.linalg.norm(velocity, axis=1) * gsd_m)
@@ -82,5 +88,12 @@ def geotrax_csv(tracklets: pd.DataFrame, georeference: Georeference, vehicles: p
     return str(table.to_csv(index=False, lineterminator="\n"))
 
 
-def _metres_or_nan(georeference: Georeference, xy: Points) -> Points:
-    return np.full(xy.shape, np.nan) if georeference.gsd_m is None else georeference.to_metres(xy)
+def _local_metres(georeference: Georeference, xy: Points, lonlat: Points) -> Points:
+    if georeference.affine is None or not len(xy):
+        return np.full(xy.shape, np.nan) if georeference.gsd_m is None else georeference.to_metres(xy)
+    a, b, _, d, e, _ = georeference.affine
+    unit_m = (georeference.gsd_m or np.nan) / np.sqrt(abs(a * e - b * d))
+    if abs(unit_m - 1) < _SAME:
+        return georeference.to_crs(xy)
+    utm = utm_crs(*np.median(lonlat, axis=0))
+    return np.column_stack(transform(CRS.from_epsg(4326), utm, lonlat[:, 0], lonlat[:, 1]))

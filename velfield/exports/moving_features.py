@@ -17,8 +17,9 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 def encode(run: Run, _path: Path, options: ExportOptions) -> bytes:
     """A feature a vehicle, with its speed in m/s by time: see `velfield.exports.export.ExportModule`.
 
-    Positions are longitude and latitude where the base image has a reference system, else metres from its lower left
-    corner. Times count from ``--start``, else from what the camera wrote, else from 1970.
+    Positions are longitude and latitude where the base image has a reference system, else metres to the right of its
+    lower left corner and up from it, and ``crs`` is null. Times count from ``--start``, else from what the camera
+    wrote, else from 1970.
     """
     paths, georeference = run.analysis.trajectories, Georeference.from_grid(run.grid)
     xy_px = paths.xy_m / paths.gsd_m
@@ -41,4 +42,7 @@ def encode(run: Run, _path: Path, options: ExportOptions) -> bytes:
                 "temporalProperties": [{"datetimes": when, "speed": speed}],
             }
         )
-    return json.dumps({"type": "FeatureCollection", "features": features}).encode()
+    collection: dict[str, object] = {"type": "FeatureCollection", "features": features}
+    if not georeference.has_crs:
+        collection["crs"] = None  # left out, it would be WGS 84
+    return json.dumps(collection).encode()

@@ -9,6 +9,7 @@ import pandas as pd
 from schemas.export import ExportOptions
 from velfield.exports.georeference import Georeference
 from velfield.exports.tracks import track_points
+from velfield.run.frame_transforms import heading_deg
 from velfield.run.run import Run
 
 FILE_NAME = "tracks.fcd.xml"
@@ -27,15 +28,15 @@ def sumo_fcd(tracklets: pd.DataFrame, georeference: Georeference, *, vehicle_typ
     tracklets
         Columns of `schemas.tables.TRACKLET_COLUMNS`.
     georeference
-        Its ground sample distance is needed: SUMO works in metres. x east, y north, from the base image's lower left
-        corner.
+        Its ground sample distance is needed: SUMO works in metres. x to the right of the map and y up, from its lower
+        left corner, as in the exported network.
     vehicle_type
         ``type`` of all vehicles.
 
     Returns
     -------
-    XML text. ``time`` in s from the first tracked frame, ``speed`` m/s, ``angle`` degrees clockwise from north;
-    from the image's top where the base image has no reference system.
+    XML text. ``time`` in s from the first tracked frame, ``speed`` m/s, ``angle`` degrees clockwise from +y: SUMO has
+    one frame for both, so that it is from the map's top wherever north is. Positions are of the vehicle's centre.
 
     Raises
     ------
@@ -46,7 +47,7 @@ def sumo_fcd(tracklets: pd.DataFrame, georeference: Georeference, *, vehicle_typ
     xy = points[["x_px", "y_px"]].to_numpy(np.float64)
     velocity = points[["vx_px_per_s", "vy_px_per_s"]].to_numpy(np.float64)
     metres = georeference.to_metres(xy)
-    angle = georeference.heading_deg(xy, velocity)
+    angle = heading_deg(np.arctan2(velocity[:, 1], velocity[:, 0]), None)
     speed = np.linalg.norm(velocity, axis=1) * (georeference.gsd_m or np.nan)
     start_s = points["time_s"].min() if len(points) else 0.0
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<fcd-export>"]

@@ -12,6 +12,7 @@ from velfield.pipeline.stage import STAGES, Cut, Stage
 from velfield.pipeline.units import group_name, stage_units, unit_name
 from velfield.run.field_writer import FIELD_BLOCK, GROUP_TILES
 from velfield.run.layout import is_remote
+from velfield.sources.geo import read_base_raster
 
 _BYTES_A_DETECTION_FRAME = 150_000
 _BYTES_A_TILE = 200_000
@@ -95,6 +96,12 @@ def describe_plan(plan: Plan, at_a_time: int = 2) -> str:
     """The plan as text: a line a stage, then bytes needed and free, and memory for so many units at a time."""
     lines = [f"{plan.job.inputs.source}: {plan.info.frame_count} frames of {plan.info.width} x {plan.info.height} px, "]
     lines[0] += f"{plan.frame_count} of them to process, {plan.unit_frames} a unit"
+    if plan.job.inputs.base is not None:
+        base = read_base_raster(Path(plan.job.inputs.base), plan.config.frames)
+        size = f"{base.grey.shape[1]} x {base.grey.shape[0]} px"
+        scale = "of unknown scale" if base.gsd_m is None else f"of {base.gsd_m:.4g} m"
+        place = "placed on Earth" if base.crs_wkt is not None else "without a place on Earth"
+        lines += [f"{plan.job.inputs.base}: {size} {scale}, {place}", *(f"  {note}" for note in base.notes)]
     total = 0
     for stage, units in planned_units(plan).items():
         done = sum(committed(plan, stage, unit) is not None for unit in units)

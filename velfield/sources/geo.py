@@ -1,12 +1,14 @@
 """The base image and its georeference: read safely, reprojected from degrees, its ground sample distance measured."""
 
 import warnings
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rasterio
+from rasterio._err import CPLE_BaseError  # what PROJ refuses; rasterio's public errors have none for it
 from rasterio.crs import CRS
 from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioError
 from rasterio.transform import Affine
@@ -38,9 +40,10 @@ class BaseRaster:
         (h, w) bool, False where there is no data; None where all pixels have some.
     crs_wkt, affine, gsd_m
         Reference system; (a, b, c, d, e, f) from (column, row) of pixel corners to its coordinates, as rasterio's
-        `Affine`; metres a pixel by the reference system's local scale at the centre. None without a reference system.
+        `Affine`; metres a pixel by the reference system's local scale at the centre. None without a reference system;
+        of a local one, which has metres but no place on Earth, only ``gsd_m`` is known.
     notes
-        Notes on what was changed, one line each.
+        Notes on what was changed or is not used, one line each.
     """
 
     grey: GreyImage
@@ -58,7 +61,8 @@ def read_base_raster(path: Path | str, config: FramesConfig) -> BaseRaster:
     ----------
     path
         GeoTIFF; or PNG, JPEG, TIFF, BMP, with its reference system where there are a world file and a ``.prj`` or
-        ``.aux.xml`` beside it. An image in degrees is reprojected to the UTM zone of its centre.
+        ``.aux.xml`` beside it. An image in degrees is reprojected to the UTM zone of its centre. A local reference
+        system, as of a survey without GPS, gives the scale alone.
     config
         ``max_pixels``.
 
@@ -74,7 +78,7 @@ def read_base_raster(path: Path | str, config: FramesConfig) -> BaseRaster:
         raster = _read_geotiff(file, config.max_pixels)
     else:
         grey = read_grey_image(file, config.max_pixels)  # refuses what it cannot read
-        raster = _Raster(grey, None, *_georeference(file, head))
+        raster = _read_beside(file, grey, head)
     return _to_base_raster(file, raster, config.max_pixels)
 
 
@@ -94,19 +98,33 @@ def ground_sample_distance_m(crs: CRS, affine: Affine, shape: tuple[int, int], *
     x0, y0 = columns / 2, rows / 2
     ends = [(x0 - step, y0), (x0 + step, y0), (x0, y0 - step), (x0, y0 + step)]
     xs, ys = zip(*(_apply_affine(affine, *end) for end in ends), strict=True)
-    longitude, latitude = (np.radians(np.asarray(values)) for values in transform(crs, CRS.from_epsg(4326), xs, ys))
-    if not (np.isfinite(longitude).all() and np.isfinite(latitude).all()):
-        raise InputError(
-            f"{name}: found a reference system that does not cover the image, expected one that does; fix it"
-        )
+    longitude, latitude = (np.radians(values) for values in _to_degrees(crs, xs, ys, name))
     across = _ground_distance(longitude[:2], latitude[:2]) / (2 * step)
     down = _ground_distance(longitude[2:], latitude[2:]) / (2 * step)
-    if abs(across - down) > _SQUARE * max(across, down):
+    return _square_side(across, down, name)
+
+
+def _square_side(across: float, down: float, name: str) -> float:
+    if not abs(across - down) <= _SQUARE * max(across, down):
         raise InputError(
             f"{name}: found pixels of {across:.4g} m by {down:.4g} m on the ground, expected square ones; "
             "resample it, such as with gdalwarp -tr"
         )
     return float(np.sqrt(across * down))
+
+
+def _to_degrees(crs: CRS, xs: Sequence[float], ys: Sequence[float], name: str) -> tuple[FloatArray, FloatArray]:
+    """Longitude and latitude (n,) of coordinates of a reference system, degrees."""
+    try:
+        longitude, latitude = (np.asarray(values) for values in transform(crs, CRS.from_epsg(4326), xs, ys))
+        reason = "" if np.isfinite([longitude, latitude]).all() else "coordinates beyond its area"
+    except (CPLE_BaseError, RasterioError) as error:
+        reason = _one_line(error)
+    if reason:
+        raise InputError(
+            f"{name}: found a reference system that does not cover the image ({reason}), expected one that does; fix it"
+        )
+    return longitude, latitude
 
 
 def utm_crs(longitude: float, latitude: float) -> CRS:
@@ -146,18 +164,19 @@ def reconcile_gsd(from_crs_m: float | None, given_m: float | None) -> float | No
 
 @dataclass(frozen=True)
 class _Raster:
-    """Grey levels and georeference as read from the file."""
+    """Grey levels and georeference as read from the file; ``gsd_m`` of a local reference system."""
 
     grey: GreyImage
     valid: Mask | None
-    crs: CRS | None
-    affine: Affine | None
+    crs: CRS | None = None
+    affine: Affine | None = None
     notes: tuple[str, ...] = ()
+    gsd_m: float | None = None
 
 
 def _to_base_raster(path: Path, raster: _Raster, max_pixels: int) -> BaseRaster:
     if raster.crs is None or raster.affine is None:
-        return BaseRaster(raster.grey, valid=raster.valid, notes=raster.notes)
+        return BaseRaster(raster.grey, gsd_m=raster.gsd_m, valid=raster.valid, notes=raster.notes)
     if raster.crs.is_geographic:
         raster = _to_utm(path, raster, max_pixels)
     assert raster.crs is not None
@@ -192,19 +211,45 @@ def _read_geotiff(path: Path, max_pixels: int) -> _Raster:
             dataset = rasterio.open(path, driver="GTiff")
         with dataset:
             check_size(path, dataset.width, dataset.height, max_pixels)
-            crs = dataset.crs
-            affine = None if dataset.transform.is_identity else dataset.transform
+            crs, affine, points = dataset.crs, dataset.transform, len(dataset.gcps[0])
             grey, valid = _grey_levels(path, dataset)
     except RasterioError as error:
         raise InputError(
             f"{path.name}: the TIFF is truncated or damaged ({_one_line(error)}), expected a whole one"
         ) from None
+    return _with_georeference(path, _Raster(grey, valid), crs, affine, points)
+
+
+def _with_georeference(path: Path, raster: _Raster, crs: CRS | None, affine: Affine, points: int = 0) -> _Raster:
+    """The image with the georeference that is there, or with a note why it is not used."""
+    crs = crs if crs is not None else _prj(path)
+    if affine.is_identity:
+        if points:
+            return replace(raster, notes=(f"its {points} ground control points are not used: apply gdalwarp",))
+        return raster if crs is None else replace(raster, notes=("a reference system without a place: it is not used",))
     if crs is None:
-        prj = _prj(path)
-        return _Raster(grey, valid, prj, affine) if prj is not None else _Raster(grey, valid, None, None)
-    if affine is None:
-        return _Raster(grey, valid, None, None, ("a reference system without a geotransform: it is not used",))
-    return _Raster(grey, valid, crs, affine)
+        note = "a place without a .prj, .aux.xml or tag that names its reference system: it is not used"
+        return replace(raster, notes=(note,))
+    if crs.is_geographic or crs.is_projected:
+        return replace(raster, crs=crs, affine=affine)
+    return _with_local_scale(path, raster, crs, affine)
+
+
+def _with_local_scale(path: Path, raster: _Raster, crs: CRS, affine: Affine) -> _Raster:
+    """The image with the scale of a reference system that has no place on Earth, as surveys without GPS write it."""
+    system = crs.to_dict(projjson=True)
+    unit = system.get("coordinate_system", {}).get("axis", [{}])[0].get("unit")
+    if isinstance(unit, dict) and unit.get("type") == "LinearUnit" and unit.get("name") != "unknown":
+        metres = float(unit["conversion_factor"])
+    else:
+        metres = 1.0 if unit == "metre" else 0.0
+    if system.get("type") != "EngineeringCRS" or not metres:
+        note = f"its reference system {system.get('name', '')} is none of a map in metres or degrees: it is not used"
+        return replace(raster, notes=(note,))
+    a, b, _, d, e, _ = tuple(affine)[:6]
+    gsd_m = _square_side(float(np.hypot(a, d)) * metres, float(np.hypot(b, e)) * metres, path.name)
+    note = f"its reference system {system.get('name', '')} is a local one: {gsd_m:.4g} m a pixel, no place on Earth"
+    return replace(raster, gsd_m=gsd_m, notes=(note,))
 
 
 def _grey_levels(path: Path, dataset: Any) -> tuple[GreyImage, Mask | None]:
@@ -240,24 +285,20 @@ def _first_band(path: Path, dataset: Any) -> Float32Array:
     return np.asarray(table[band], np.float32)
 
 
-def _georeference(path: Path, head: bytes) -> tuple[CRS | None, Affine | None, tuple[str, ...]]:
-    """Georeference of a plain image, from the world file and ``.prj`` or ``.aux.xml`` beside it."""
+def _read_beside(path: Path, grey: GreyImage, head: bytes) -> _Raster:
+    """A plain image with the georeference of the world file and ``.prj`` or ``.aux.xml`` beside it."""
+    raster = _Raster(grey, None)
     driver = next((name for magic, name in _PICTURE_DRIVERS if head.startswith(magic)), None)
     if driver is None:
-        return None, None, ()
+        return raster
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             with rasterio.open(path, driver=driver) as dataset:
-                crs, affine = dataset.crs, dataset.transform
+                crs, affine, points = dataset.crs, dataset.transform, len(dataset.gcps[0])
     except RasterioError as error:
-        return None, None, (f"its reference could not be read: {_one_line(error)}",)
-    crs = crs if crs is not None else _prj(path)
-    if affine.is_identity:
-        return None, None, ()
-    if crs is None:
-        return None, None, ("a world file without a .prj or .aux.xml that names its reference system: it is not used",)
-    return crs, affine, ()
+        return replace(raster, notes=(f"its reference could not be read: {_one_line(error)}",))
+    return _with_georeference(path, raster, crs, affine, points)
 
 
 def _prj(path: Path) -> CRS | None:
@@ -278,7 +319,7 @@ def _to_utm(path: Path, raster: _Raster, max_pixels: int) -> _Raster:
     assert raster.affine is not None
     rows, columns = raster.grey.shape
     centre_x, centre_y = _apply_affine(raster.affine, columns / 2, rows / 2)
-    (longitude,), (latitude,) = transform(raster.crs, CRS.from_epsg(4326), [centre_x], [centre_y])
+    (longitude,), (latitude,) = _to_degrees(raster.crs, [centre_x], [centre_y], path.name)
     if not (-180 <= longitude <= 180 and -80 <= latitude <= 84):
         raise InputError(
             f"{path.name}: found its centre at {longitude:g}, {latitude:g} degrees, expected it between 80 south and "

@@ -25,12 +25,19 @@ def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
 
 
 def opendrive_xml(network: RoadNetwork, georeference: Georeference) -> bytes:
-    """OpenDRIVE's XML; x and y in metres from the map's lower left corner."""
+    """OpenDRIVE's XML; x to the right of the map and y up, in metres from its lower left corner.
+
+    Where the map has a place, the header's ``userData`` has the corner's longitude and latitude, and the bearing of +y
+    in degrees clockwise from north.
+    """
     root = ET.Element("OpenDRIVE")
     header = ET.SubElement(root, "header", revMajor="1", revMinor="7", name="velfield", vendor="velfield")
     if georeference.has_crs:
-        lonlat = georeference.to_lonlat(np.array([[-0.5, georeference.shape[0] - 0.5]]))[0]
-        ET.SubElement(header, "userData", code="origin", value=f"{lonlat[0]:.7f} {lonlat[1]:.7f}")
+        corner = np.array([[-0.5, georeference.shape[0] - 0.5]])
+        longitude, latitude = georeference.to_lonlat(corner)[0]
+        bearing_deg = georeference.heading_deg(corner, np.array([[0.0, -1.0]]))[0]
+        ET.SubElement(header, "userData", code="origin", value=f"{longitude:.7f} {latitude:.7f}")
+        ET.SubElement(header, "userData", code="bearing_of_y_deg", value=f"{bearing_deg:.3f}")
     nodes, lines = lane_nodes(network), {lane.number: _left_border(lane, network) for lane in network.lanes}
     for lane in network.lanes:
         road = _road(root, lane.number, lines[lane.number], lane.width_m, lane.high_speed_m_per_s)

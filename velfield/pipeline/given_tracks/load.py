@@ -10,7 +10,7 @@ from rasterio.crs import CRS
 from schemas.arrays import FloatArray
 from schemas.flight import FlightConfig
 from velfield.errors import InputError
-from velfield.sources.geo import BaseRaster, read_base_raster
+from velfield.sources.geo import BaseRaster, read_base_raster, reconcile_gsd
 from velfield.sources.tracks.checks import check_speeds, require_motion, split_reused
 from velfield.sources.tracks.read import GivenPositions, read_tracks
 from velfield.tracking.smoothing import LEAST_ERROR_M, clean_tracks
@@ -109,7 +109,7 @@ def load_tracks(path: Path, config: FlightConfig, *, base: Path | None = None) -
     if given.crs_wkt is not None:
         east, north = float(corner[0] - gsd_m / 2), float(-corner[1] + gsd_m / 2)
         crs_wkt, affine = given.crs_wkt, (gsd_m, 0.0, east, 0.0, -gsd_m, north)
-    notes += [*_place(given, corner, gsd_m), *clean.notes]
+    notes += [*_place(given, corner, gsd_m), *(() if raster is None else raster.notes), *clean.notes]
     errors = (clean.position_sd_m, displacement_sd_m)
     return LoadedTracks(table, shape, gsd_m, raster, crs_wkt, affine, *errors, tuple(notes))
 
@@ -117,7 +117,7 @@ def load_tracks(path: Path, config: FlightConfig, *, base: Path | None = None) -
 def _gsd_m(path: Path, given: GivenPositions, gsd_m: float | None, raster: BaseRaster | None) -> float:
     if given.unit == "m":
         return gsd_m or GSD_M
-    known = gsd_m or (raster.gsd_m if raster else None)
+    known = reconcile_gsd(raster.gsd_m if raster else None, gsd_m)
     if known is None:
         raise InputError(f"{path}: found positions in pixels, expected their size; give --gsd-m, metres a pixel")
     return known

@@ -90,8 +90,7 @@ def compare_sources(
     InputError
         ``--gsd-m`` contradicts the base image's own reference system.
     """
-    if grid.crs_wkt is not None:
-        reconcile_gsd(grid.gsd_m, plan.config.gsd_m)
+    reconcile_gsd(grid.gsd_m, plan.config.gsd_m)
     points, remarks = saved_control_points(plan.layout)
     estimates = [*scale_by_grid(grid), *_given_scale(plan.config.gsd_m), *([] if measured is None else [measured])]
     estimates += [] if points is None else [scale_of_points(points)]
@@ -112,7 +111,7 @@ def compare_sources(
 def _gsd_of_frames(plan: Plan, grid: GridRecord) -> list[str]:
     """A note where ``--gsd-m`` is of a given base image whose pixels are not as large as the frames'."""
     given_m = plan.config.gsd_m
-    if given_m is None or grid.base_source == "flight" or grid.crs_wkt is not None:
+    if given_m is None or grid.base_source == "flight" or grid.gsd_m is not None:
         return []
     scale = base_px_per_raw_px(plan)
     if abs(np.log(scale)) <= _MAX_LOG_SCALE:
@@ -123,7 +122,7 @@ def _gsd_of_frames(plan: Plan, grid: GridRecord) -> list[str]:
 
 def scale_by_grid(grid: GridRecord) -> list[ScaleEstimate]:
     """The scale by the base image's own reference system, where it has one."""
-    if grid.crs_wkt is None or grid.gsd_m is None:
+    if grid.gsd_m is None:
         return []
     low, high = grid.gsd_m * (1 - _CRS_SD), grid.gsd_m * (1 + _CRS_SD)
     return [ScaleEstimate(gsd_m=grid.gsd_m, low_m=low, high_m=high, source="base")]

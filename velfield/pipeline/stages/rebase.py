@@ -157,7 +157,7 @@ def _mapped_grid(old: GridRecord, given: BaseRaster, record: RebaseRecord) -> Gr
     return GridRecord(
         width_px=width,
         height_px=height,
-        gsd_m=record.gsd_m,
+        gsd_m=given.gsd_m,  # another is that of `rebase_georeference`
         crs_wkt=given.crs_wkt,
         affine=given.affine,
         base_source="given",
