@@ -403,17 +403,17 @@ def _prefect_console(
 
 
 def _process_tracks(job: "Job", runner: "RunnerConfig", verbosity: "Verbosity", *, plan_only: bool) -> int:
-    from velfield.pipeline.given_tracks.plan import describe_tracks
-
     if plan_only:
+        from velfield.pipeline.given_tracks.plan import describe_tracks
+
         print(describe_tracks(job))
         return DONE
-    from velfield.pipeline.analysis.analyse import analyse_run
-
     with _prefect_console(verbosity, "flows.process_tracks") as console:
         from flows.process_tracks import run_tracks
 
         summary = run_tracks(job, runner, console)
+    from velfield.pipeline.analysis.analyse import analyse_run
+
     for line in analyse_run(Path(job.root)):
         console.result(line)
     return _conclude(summary, console)

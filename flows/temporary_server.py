@@ -10,12 +10,14 @@ Run as a module, with a port: is the server.
 import atexit
 import os
 import socket
+import ssl
 import sys
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
+from http.client import HTTPException
 from subprocess import DEVNULL, Popen, TimeoutExpired
 
 from velfield.errors import InputError
@@ -24,7 +26,7 @@ _HOST = "127.0.0.1"
 _NOT_ASKED_FOR = 4
 """Exit status where Prefect's settings name a server, or forbid a temporary one."""
 _END_S = 5.0
-_ANSWER_S = 8.0
+_ANSWER_S = 5.0
 
 
 def start_server() -> "TemporaryServer":
@@ -33,11 +35,51 @@ def start_server() -> "TemporaryServer":
     Should it fail to start, nothing is lost: Prefect starts its own, and reports errors. Call before prefect is
     imported: what Prefect does at the end of the process, such as sending the last of its log, then comes before the
     end of the server.
+
+    Raises
+    ------
+    InputError
+        Nothing answers at the address in PREFECT_API_URL.
     """
+    check_address()
     with socket.socket() as free:
         free.bind((_HOST, 0))
         port = int(free.getsockname()[1])
     return TemporaryServer(port, Popen([sys.executable, "-m", __spec__.name, str(port)], stderr=DEVNULL))
+
+
+def check_address() -> None:
+    """Refuse an address in PREFECT_API_URL at which nothing answers, before Prefect is imported, which takes seconds.
+
+    What answers is left to `check_server`, which knows all of Prefect's settings.
+
+    Raises
+    ------
+    InputError
+        One line, within seconds.
+    """
+    url = os.environ.get("PREFECT_API_URL")
+    if not url:
+        return
+    try:
+        with urllib.request.urlopen(f"{url}/health", timeout=_ANSWER_S):
+            return
+    except urllib.error.HTTPError:
+        return
+    except urllib.error.URLError as error:
+        if isinstance(error.reason, ssl.SSLError):
+            return  # Prefect has certificates of its own
+        raise _no_answer(url, error.reason) from None
+    except (OSError, ValueError, HTTPException) as error:  # no time left; no address; no HTTP
+        raise _no_answer(url, error) from None
+
+
+def _no_answer(url: str, error: object) -> InputError:
+    return InputError(
+        f"PREFECT_API_URL {url}: found no Prefect server that answers "
+        f"({' '.join(str(error).split()) or type(error).__name__}); start it, correct the address, or unset it "
+        "(`prefect config unset PREFECT_API_URL`): then a temporary one is used"
+    )
 
 
 def check_server() -> None:
@@ -60,11 +102,7 @@ def check_server() -> None:
     except Exception as refused:  # of the address, of a proxy
         error = refused
     if error is not None:
-        raise InputError(
-            f"PREFECT_API_URL {url}: found no Prefect server that answers "
-            f"({' '.join(str(error).split()) or type(error).__name__}); start it, correct the address, or unset it "
-            "(`prefect config unset PREFECT_API_URL`): then a temporary one is used"
-        )
+        raise _no_answer(url, error)
 
 
 class TemporaryServer:

@@ -447,15 +447,3 @@ def test_six_columns_are_read_only_where_they_can_be_one_layout(case: str, tmp_p
         describe_model(path)
     if sizes[1] is None:
         assert describe_model(declared(path, sizes, names=names, end2end="True")).layout == "end_to_end"
-
-
-@pytest.mark.footage
-@pytest.mark.parametrize("name", ["v8", "strkeys"])
-def test_reported_models_find_their_cars(name: str) -> None:
-    path = Path(__file__).parents[3] / "shared" / "cases" / "20-onnx-string-keys" / f"{name}.onnx"
-    if not path.exists():
-        pytest.skip(f"{path.name} is not there")
-    detector = OnnxDetector.from_file(path)
-    assert detector.record.vehicles == (2, 5, 7)
-    assert len(detector.detect_raw(np.full((640, 640), 90, np.uint8))) == 20
-    assert "vehicles are car, bus, truck" in detector.notes[0]

@@ -194,7 +194,7 @@ def test_runs_whose_process_was_killed_are_crashed_and_others_are_not(server: No
     from prefect.states import Running
 
     from flows.stale import mark_abandoned, mark_crashed
-    from velfield.run.lock import _machine
+    from velfield.run.lock import machine_id
 
     @flow
     def nothing() -> None:
@@ -207,7 +207,7 @@ def test_runs_whose_process_was_killed_are_crashed_and_others_are_not(server: No
         runs = {}
         for name, pid in pids.items():
             (tmp_path / name).mkdir()
-            owner = {"pid": pid, "host": socket.gethostname(), "machine": _machine()}
+            owner = {"pid": pid, "host": socket.gethostname(), "machine": machine_id()}
             (tmp_path / name / ".lock").write_text(json.dumps(owner))
             runs[name] = client.create_flow_run(nothing, name=str(tmp_path / name), state=Running())
         assert mark_crashed(str(tmp_path / "resumed")) == 2

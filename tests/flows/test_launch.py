@@ -1,13 +1,14 @@
 """A first run compiles the kernels in a process of its own, and no folder of the user's is needed."""
 
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from flows import launch
+from flows import launch, temporary_server
 from velfield.errors import CacheWarning, DeviceWarning, InputError
 
 
@@ -70,6 +71,20 @@ def test_this_machine_is_reached_without_a_proxy_and_unusable_proxies_are_left_o
     assert (os.environ["http_proxy"], os.environ["https_proxy"]) == ("http://127.0.0.1:9", "proxy:3128")
     launch.spare_proxies()
     assert os.environ["no_proxy"] == "intranet,127.0.0.1,localhost,::1"
+
+
+@pytest.mark.parametrize("url", ["http://127.0.0.1:9/api", "nonsense", "http://not-there.invalid/api", "silent"])
+def test_an_address_without_a_server_is_one_line_within_seconds(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before Prefect is imported; ``silent`` takes connections and answers none."""
+    for proxy in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
+        monkeypatch.delenv(proxy, raising=False)
+    monkeypatch.setattr(temporary_server, "_ANSWER_S", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"http://127.0.0.1:{silent.getsockname()[1]}/api" if url == "silent" else url
+        monkeypatch.setenv("PREFECT_API_URL", address)
+        with pytest.raises(InputError, match=f"{address}: found no Prefect server") as caught:
+            temporary_server.check_address()
+    assert "\n" not in str(caught.value)
 
 
 def test_a_server_that_does_not_answer_is_one_line() -> None:

@@ -16,7 +16,6 @@ from velfield.sources.labels.labels import Labels, read_detections, read_labels
 SIZE = 800, 600
 FOLDER = SourceInfo("folder", *SIZE, 3, np.arange(3) / 5, ("a.png", "b.png", "DJI_0001.png"))
 VIDEO = SourceInfo("video", *SIZE, 60, np.arange(60) / 25, tuple(map(str, range(60))))
-CASES = Path(__file__).parents[3] / "shared" / "cases"
 CENTRES = [(120.0, 80.0), (400.5, 300.25), (700.0, 500.0), (60.0, 400.0)]
 ANGLES = {
     "turned": (147.0, 12.0, 84.0, 175.0),
@@ -408,32 +407,3 @@ def test_labels_of_a_reduced_image_are_scaled(tmp_path: Path) -> None:
     labels = read_labels(tmp_path / "l.json", FOLDER)
     assert_are(labels, cars("turned"))
     assert any("scaled to the frames' 800x600" in note for note in labels.notes)
-
-
-@pytest.mark.footage
-@pytest.mark.parametrize("folder", ["labels/train", "."])
-def test_a_data_set_of_ultralytics_has_104_cars(folder: str) -> None:
-    labels = read_labels(case("07-yolo-dataset-layout") / "dataset" / folder, ONE)
-    assert (len(labels.cars), len(labels.ignored)) == (104, 9)
-
-
-@pytest.mark.footage
-def test_rotations_of_cvat_in_coco_are_axes() -> None:
-    found = read_labels(case("06-cvat-coco-rotation") / "instances_default.json", ONE).cars["orientation_rad"]
-    assert len(found) == 104
-    assert (np.degrees(found.min()), np.degrees(found.max())) == pytest.approx((80.73, 175.21), abs=0.01)
-
-
-@pytest.mark.footage
-def test_a_frame_in_the_name_of_a_coco_image_is_that_frame() -> None:
-    video = SourceInfo("video", 640, 480, 60, np.arange(60) / 25, tuple(map(str, range(60))))
-    assert read_labels(case("21-video-frame-names") / "coco.json", video).frames == ("2",)
-
-
-ONE = SourceInfo("folder", 800, 600, 1, np.zeros(1), ("00000.png",))
-
-
-def case(name: str) -> Path:
-    """A folder of a fault that people reported; skips the test where it is not there."""
-    path = CASES / name
-    return path if path.exists() else pytest.skip(f"{name} is not there")

@@ -19,7 +19,6 @@ from velfield.sources.telemetry.srt import parse_srt
 from velfield.sources.telemetry.telemetry import Telemetry
 
 VIDEO = SourceInfo("video", 640, 480, 251, np.arange(251) / 25, tuple(map(str, range(251))))
-CASES = Path(__file__).parents[3] / "shared" / "cases"
 
 
 def srt(*cues: str) -> str:
@@ -121,19 +120,6 @@ def test_a_field_of_view_that_no_camera_has_is_refused() -> None:
         found = estimate_scale(pose(**wrong))
         assert isinstance(found, Failure), wrong
         assert "no focal length that can be" in found.reason
-
-
-@pytest.mark.footage
-def test_the_telephoto_lens_that_was_reported_has_its_scale() -> None:
-    path = CASES / "04-srt-tele-166" / "tele.SRT"
-    if not path.exists():
-        pytest.skip("the case is not there")
-    found = read_telemetry_file(path, VIDEO)
-    assert set(found.focal_35mm) == {166.0}
-    poses = FramePoses(found, 640, 480, np.zeros((len(found.time_s), 2)), np.tile(np.eye(2), (len(found.time_s), 1, 1)))
-    scale = estimate_scale(poses)
-    assert not isinstance(scale, Failure)
-    assert scale.gsd_m == pytest.approx(0.236, rel=0.02)
 
 
 def image(size: tuple[int, int], *, tags: dict[int, object], calibrated: float = 0.0, centre: float = 0.0) -> bytes:

@@ -103,7 +103,7 @@ def _refuse_links(root: Path) -> None:
 def _record(lease_s: float = 0.0, lease: str = "") -> str:
     """JSON of this process; no two are equal, for S3 compares contents."""
     since = time.strftime("%Y-%m-%d %H:%M:%S")
-    owner = {"pid": os.getpid(), "host": socket.gethostname(), "machine": _machine(), "since": since, "lease": lease}
+    owner = {"pid": os.getpid(), "host": socket.gethostname(), "machine": machine_id(), "since": since, "lease": lease}
     return json.dumps(owner | {"until_s": time.time() + lease_s, "write": uuid.uuid4().hex})
 
 
@@ -222,12 +222,12 @@ def _is_expired(text: str) -> bool:
 
 def _has_ended(record: dict[str, Any]) -> bool:
     """Whether the writer of a record is a process of this machine that does not run any more."""
-    return _machine() != "" and record.get("machine") == _machine() and not _is_running(int(record["pid"]))
+    return machine_id() != "" and record.get("machine") == machine_id() and not _is_running(int(record["pid"]))
 
 
 @cache
-def _machine() -> str:
-    """Identity of the process number space, different for containers of one host name too; empty: not known."""
+def machine_id() -> str:
+    """Name the process number space, different for containers of one host name too; empty: not known."""
     if sys.platform != "linux":
         return f"{sys.platform} {socket.gethostname()} {uuid.getnode()}"
     try:

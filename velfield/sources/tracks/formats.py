@@ -5,7 +5,7 @@ Names of columns are compared as `normal_name` writes them: lower case, without 
 
 import re
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 Unit = Literal["m", "ft", "px", "deg"]
@@ -79,6 +79,16 @@ _GEOTRAX_POSITIONS = (
     Position("longitude", "latitude", "deg", "up"),
     Position("orthox", "orthoy", "px", "down"),
 )
+_INTERACTION = TrackFormat(
+    "INTERACTION",
+    ("trackid", "frameid", "timestampms", "agenttype", "x", "y", "vx", "vy"),
+    ("caseid", "trackid"),
+    _metres_up(),
+    (("timestampms", "ms"),),
+    "frameid",
+    speed=Speed(("vx", "vy"), 1.0),
+    size=("length", "width", 1.0),
+)
 FORMATS = (
     TrackFormat(
         "geo-trax",
@@ -125,26 +135,8 @@ FORMATS = (
         size=("width", "height", 1.0),
         frame_rate=25,
     ),
-    TrackFormat(
-        "SinD",
-        ("trackid", "frameid", "timestampms", "agenttype", "x", "y", "vx", "vy", "ax", "ay"),
-        ("trackid",),
-        _metres_up(),
-        (("timestampms", "ms"),),
-        "frameid",
-        speed=Speed(("vx", "vy"), 1.0),
-        size=("length", "width", 1.0),
-    ),
-    TrackFormat(
-        "INTERACTION",
-        ("trackid", "frameid", "timestampms", "agenttype", "x", "y", "vx", "vy"),
-        ("caseid", "trackid"),
-        _metres_up(),
-        (("timestampms", "ms"),),
-        "frameid",
-        speed=Speed(("vx", "vy"), 1.0),
-        size=("length", "width", 1.0),
-    ),
+    replace(_INTERACTION, name="SinD", needs=(*_INTERACTION.needs, "ax", "ay"), track=("trackid",)),
+    _INTERACTION,
     TrackFormat(
         "DataFromSky",
         ("trackid", "datafromsky"),
