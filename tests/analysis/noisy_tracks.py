@@ -36,16 +36,21 @@ class TrueTracks:
 
 
 @cache
+def flight(seed: int, seconds: float) -> Flight:
+    """A flight at 5 frames a second over a crossroads with a signal."""
+    traffic = TrafficSimulation(cycle_s=CYCLE_S)
+    return Flight(
+        SimulationConfig(seed=seed, frames=round(5 * seconds), width=1300, height=1000, gsd_m=GSD_M, traffic=traffic)
+    )
+
+
+@cache
 def driven(seed: int = 913, seconds: float = 140.0) -> TrueTracks:
     """True tracks of one flight."""
-    traffic = TrafficSimulation(cycle_s=CYCLE_S)
-    config = SimulationConfig(
-        seed=seed, frames=round(5 * seconds), width=1300, height=1000, gsd_m=GSD_M, traffic=traffic
-    )
-    flight = Flight(config)
+    made = flight(seed, seconds)
     rng = np.random.default_rng(seed)
-    observe = partial(observed_detections, shape=flight.base_shape, rng=rng, errors=NO_ERRORS)
-    table = observe(flight.city.traffic, flight.times_s, flight.city.to_px)
+    observe = partial(observed_detections, shape=made.base_shape, rng=rng, errors=NO_ERRORS)
+    table = observe(made.city.traffic, made.times_s, made.city.to_px)
     table = table.sort_values(["vehicle_id", "frame"], kind="stable")
     owner = table["vehicle_id"].to_numpy()
     first = np.r_[0, np.flatnonzero(np.diff(owner)) + 1, len(owner)].astype(np.int64)

@@ -19,6 +19,12 @@ _LEG_M, _LEG_SIGMAS = 8, 6.0
 """Before the turn and after it the vehicle goes on so far, and farther than its errors by so many standard deviations,
 the opposite way."""
 _OPPOSITE_RAD = np.radians(140)
+_BEND_M, _BEND_RAD = 8, np.radians(20)
+"""A turn goes on where the next so many metres bend on by more."""
+_STRAIGHT_M = 16
+"""Between the bends of a circle and of its arms the course is straight over less."""
+_CIRCLE_RAD = np.radians(215)
+"""Who turns by more goes round a circle: it is entered, and left, by a bend the other way."""
 
 
 @dataclass(frozen=True)
@@ -50,26 +56,57 @@ def find_reversals(samples: PathSamples, graph: LaneGraph, *, position_sd_m: flo
         best = int(group[np.argmax(np.abs(turn[group]))])
         middle = best + _PATH_M // 2
         inside_ring = any(inside_hull(samples.xy_m[[middle]], hull)[0] for hull in rings)
-        if not inside_ring and _comes_by_road(samples, best) and _goes_back(samples, group, position_sd_m):
+        if not inside_ring and _comes_by_road(samples, best) and _goes_back(samples, course, best, position_sd_m):
             track = int(samples.track[middle])
             out.append(Reversal(track, float(samples.time_s[middle]), samples.xy_m[middle], bool(turn[best] < 0)))
     return sorted(out, key=lambda row: row.time_s)
 
 
-def _goes_back(samples: PathSamples, group: IntArray, position_sd_m: float) -> bool:
+def _goes_back(samples: PathSamples, course: FloatArray, row: int, position_sd_m: float) -> bool:
     """Whether the track goes one way before the turn, and the other after it, farther than errors explain."""
+    start, end = _turn_rows(samples.track, course, row)
+    if abs(course[end] - course[start]) > _CIRCLE_RAD:
+        return False
+    start, end = _straight(samples.track, course, start, -1), _straight(samples.track, course, end, 1)
     leg = max(_LEG_M, int(np.ceil(_LEG_SIGMAS * position_sd_m)))
-    for row in group:
-        before, after = row - np.array([leg // 2, -leg // 2]), row + _PATH_M + np.array([-leg // 2, leg // 2])
-        rows = np.r_[before[0], before[1], after[0], after[1]]
-        if rows.min() < 0 or rows.max() >= len(samples) or np.ptp(samples.track[rows]):
-            continue
-        ways = samples.xy_m[rows[[1, 3]]] - samples.xy_m[rows[[0, 2]]]
-        length = np.hypot(*ways.T)
-        turn = np.abs(np.angle(np.exp(1j * float(np.subtract(*np.arctan2(ways[:, 1], ways[:, 0]))))))
-        if length.min() > 0.7 * leg and turn >= _OPPOSITE_RAD:
-            return True
-    return False
+    rows = np.array([start - leg, start, end, end + leg])
+    if rows[0] < 0 or rows[-1] >= len(samples) or np.ptp(samples.track[rows]):
+        return False
+    ways = samples.xy_m[rows[[1, 3]]] - samples.xy_m[rows[[0, 2]]]
+    turn = np.abs(np.angle(np.exp(1j * float(np.subtract(*np.arctan2(ways[:, 1], ways[:, 0]))))))
+    return bool(np.hypot(*ways.T).min() > 0.7 * leg and turn >= _OPPOSITE_RAD)
+
+
+def _straight(track: IntArray, course: FloatArray, row: int, side: int) -> int:
+    """First row from ``row`` on, forwards (``side`` 1) or back (-1), from which the track hardly bends, one way or the
+    other, over `_STRAIGHT_M`; where it ends before, over what there is of it."""
+    while True:
+        rows = np.arange(row, row + side * _STRAIGHT_M, side)
+        rows = rows[(rows >= 0) & (rows < len(track))]
+        rows = rows[track[rows] == track[row]]
+        if len(rows) < _LEG_M or np.ptp(course[rows]) <= _BEND_RAD * len(rows) / _STRAIGHT_M:
+            return row
+        row += side
+
+
+def _turn_rows(track: IntArray, course: FloatArray, row: int) -> tuple[int, int]:
+    """First and last row of the turn that is found in the window from ``row`` on: it may be shorter, or longer."""
+    start, end = row, row + _PATH_M
+    sense = np.sign(course[end] - course[start])
+
+    def bends(a: int, b: int) -> bool:
+        inside = a >= 0 and b < len(track) and track[a] == track[row] == track[b]
+        return bool(inside and sense * (course[b] - course[a]) > _BEND_RAD)
+
+    while start < end and not bends(start, start + _BEND_M):
+        start += 1
+    while end > start and not bends(end - _BEND_M, end):
+        end -= 1
+    while bends(start - _BEND_M, start):
+        start -= 1
+    while bends(end, end + _BEND_M):
+        end += 1
+    return start, end
 
 
 def _comes_by_road(samples: PathSamples, row: int) -> bool:
