@@ -1,6 +1,8 @@
-"""Tables of answers (`schemas.analysis.AnalysisTable`): their cells, rows and geometries."""
+"""Tables of answers (`schemas.analysis.AnalysisTable`) of columns: each once, with its key, title, unit and value."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -11,21 +13,48 @@ from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.pipeline.analysis.lanes_record import points_px
 
 KM_PER_H = 3.6
-Columns = dict[str, tuple[str, str]]
-"""Name -> title and unit."""
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Column(Generic[T]):
+    """A column: key of its cells, title, unit, and the value of a row's item; numbers are rounded to ``digits``."""
+
+    key: str
+    title: str
+    unit: str
+    value: Callable[[T], Cell]
+    digits: int | None = None
+
+    def cell(self, item: T) -> Cell:
+        """The value of an item."""
+        value = self.value(item)
+        return round(value, self.digits) if self.digits is not None and isinstance(value, float) else value
+
+
+def estimates(key: str, title: str, unit: str, value: Callable[[T], Estimate | None], factor: float = 1.0) -> Column[T]:
+    """A column of estimates, which are multiplied by ``factor`` into its unit."""
+    return Column(key, title, unit, lambda item: estimate_cell(value(item), factor))
 
 
 def make_table(
-    name: str, section: str, title: str, note: str, columns: Columns, rows: Iterable[AnalysisRow]
+    name: str,
+    section: str,
+    title: str,
+    note: str,
+    columns: Sequence[Column[T]],
+    items: Iterable[T],
+    place: Callable[[T], GeometryRecord | None],
 ) -> AnalysisTable:
-    """A table of rows whose cells have the columns' names."""
-    made = tuple(AnalysisColumn(name=key, title=text, unit=unit) for key, (text, unit) in columns.items())
-    return AnalysisTable(name=name, section=section, title=title, note=note, columns=made, rows=tuple(rows))
-
-
-def make_row(cells: dict[str, Cell], geometry: GeometryRecord | None) -> AnalysisRow:
-    """A row, and where it is on the map."""
-    return AnalysisRow(cells=cells, geometry=geometry)
+    """A table with a row for each item, at its place on the map."""
+    return AnalysisTable(
+        name=name,
+        section=section,
+        title=title,
+        note=note,
+        columns=tuple(AnalysisColumn(name=c.key, title=c.title, unit=c.unit) for c in columns),
+        rows=tuple(AnalysisRow(cells={c.key: c.cell(item) for c in columns}, geometry=place(item)) for item in items),
+    )
 
 
 def estimate_cell(estimate: Estimate | None, factor: float = 1.0) -> EstimateRecord:

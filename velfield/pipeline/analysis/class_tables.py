@@ -5,11 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.analysis import AnalysisTable, Cell, EstimateRecord, GeometryRecord
+from schemas.analysis import AnalysisTable, Cell, GeometryRecord
 from schemas.arrays import IntArray
+from velfield.analysis.intervals import Estimate
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.vehicle_classes import COUNTED_CLASSES, HEAVY
-from velfield.pipeline.analysis.cells import Columns, estimate_cell, line_geometry, make_row, make_table
+from velfield.pipeline.analysis.cells import Column, estimate_cell, line_geometry, make_table
 
 
 @dataclass(frozen=True)
@@ -26,30 +27,36 @@ class _Group:
 def class_table(analysis: TrafficAnalysis) -> AnalysisTable:
     """Vehicles by class."""
     classes = analysis.classes
-    names = {name: name.replace(" ", "_") for name in COUNTED_CLASSES}
-    columns: Columns = {"of": ("Of", ""), "where": ("Where", ""), "vehicles": ("Vehicles", "")}
-    columns |= {"measured": ("Measured", "")} | {key: (name.capitalize(), "veh") for name, key in names.items()}
-    if classes is None:
-        note = "Lengths and widths in metres are not known of these tracks."
-        return make_table("classes", "Movements", "Vehicles by class", note, columns, ())
-    rows = []
-    for group in _groups(analysis):
-        cells: dict[str, Cell] = {"of": group.kind, "where": group.name, "vehicles": round(group.vehicles, 1)}
-        cells["measured"] = int(np.isin(group.tracks, classes.measured).sum())
-        for key, share in zip(names.values(), classes.estimate_shares(group.tracks), strict=True):
-            cells[key] = estimate_cell(share, group.vehicles)
-        rows.append(make_row(cells, group.geometry))
+    groups = [] if classes is None else list(_groups(analysis))
+    shares = {group.name: classes.estimate_shares(group.tracks) for group in groups if classes}
+    measured = classes.measured if classes else np.empty(0, np.int64)
+
+    def vehicles(number: int, name: str) -> Column[_Group]:
+        def value(group: _Group) -> Cell:
+            return estimate_cell(shares[group.name][number], group.vehicles)
+
+        return Column(name.replace(" ", "_"), name.capitalize(), "veh", value)
+
+    columns: list[Column[_Group]] = [
+        Column("of", "Of", "", lambda group: group.kind),
+        Column("where", "Where", "", lambda group: group.name),
+        Column("vehicles", "Vehicles", "", lambda group: group.vehicles, 1),
+        Column("measured", "Measured", "", lambda group: int(np.isin(group.tracks, measured).sum())),
+        *(vehicles(number, name) for number, name in enumerate(COUNTED_CLASSES)),
+    ]
     note = (
         "By the shares of the classes under which the measured lengths and widths are most likely: a vehicle whose "
         "dimensions fit two classes counts in part for either. Intervals are of the shares in the long run, and wider "
         "where dimensions do not separate the classes. Vehicles that were not measured are taken to be as the others."
     )
-    return make_table("classes", "Movements", "Vehicles by class", note, columns, rows)
+    if classes is None:
+        note = "Lengths and widths in metres are not known of these tracks."
+    return make_table("classes", "Movements", "Vehicles by class", note, columns, groups, lambda group: group.geometry)
 
 
-def heavy_cell(analysis: TrafficAnalysis, tracks: IntArray) -> EstimateRecord:
-    """Share of lorries and buses among the vehicles of some tracks, %."""
-    return estimate_cell(analysis.classes.estimate_shares(tracks)[HEAVY] if analysis.classes else None, 100.0)
+def heavy_share(analysis: TrafficAnalysis, tracks: IntArray) -> Estimate | None:
+    """Share of lorries and buses among the vehicles of some tracks."""
+    return analysis.classes.estimate_shares(tracks)[HEAVY] if analysis.classes else None
 
 
 def _groups(analysis: TrafficAnalysis) -> Iterator[_Group]:

@@ -4,15 +4,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from schemas.analysis import AnalysisTable, Cell
+from schemas.analysis import AnalysisTable, GeometryRecord
+from velfield.analysis.movements.car_parks import CarPark
+from velfield.analysis.movements.gates import Arm
 from velfield.analysis.movements.scene import OriginDestination, Relation
 from velfield.analysis.movements.time_slices import SliceCount
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.pipeline.analysis.cells import (
-    Columns,
-    estimate_cell,
+    Column,
+    estimates,
     line_geometry,
-    make_row,
     make_table,
     point_geometry,
     polygon_geometry,
@@ -29,21 +30,29 @@ def scene_tables(analysis: TrafficAnalysis) -> Iterator[AnalysisTable]:
 def matrix_table(analysis: TrafficAnalysis) -> AnalysisTable:
     """Vehicles, seen and inferred, by origin (rows) and destination (columns)."""
     scene = analysis.scene
-    columns: Columns = {"from": ("From", "")}
-    if scene is None:
-        return make_table("origins", "Movements", "Origins and destinations, vehicles", "", columns, ())
-    exits = [arm for arm in scene.arms if any(gate.arm == arm.number and not gate.inwards for gate in scene.gates)]
-    columns |= {f"to_{arm.name}": (f"To {arm.name}", "") for arm in exits} | {"all": ("All", "")}
-    vehicles = {(r.origin.number, r.destination.number): r.vehicles for r in scene.relations}
-    rows = []
-    for arm in scene.arms:
-        if any(gate.arm == arm.number and gate.inwards for gate in scene.gates):
-            counts = [vehicles.get((arm.number, to.number), 0.0) for to in exits]
-            cells: dict[str, Cell] = {"from": arm.name}
-            cells |= {f"to_{to.name}": round(n, 1) for to, n in zip(exits, counts, strict=True)}
-            entered = int((scene.trips.origin == arm.number).sum())
-            rows.append(make_row({**cells, "all": entered}, point_geometry(arm.xy_m, analysis)))
-    return make_table("origins", "Movements", "Origins and destinations, vehicles", _note(scene), columns, rows)
+    arms = scene.arms if scene else ()
+    gates = scene.gates if scene else ()
+    entries, exits = (
+        [arm for arm in arms if any(g.arm == arm.number and g.inwards == inwards for g in gates)]
+        for inwards in (True, False)
+    )
+    relations = scene.relations if scene else ()
+    vehicles = {(r.origin.number, r.destination.number): r.vehicles for r in relations}
+
+    def entered(arm: Arm) -> int:
+        return int((scene.trips.origin == arm.number).sum()) if scene else 0
+
+    def column(to: Arm) -> Column[Arm]:
+        title = f"To {to.name}"
+        return Column(f"to_{to.name}", title, "", lambda arm: vehicles.get((arm.number, to.number), 0.0), 1)
+
+    columns: list[Column[Arm]] = [Column("from", "From", "", lambda arm: arm.name), *map(column, exits)]
+    columns += [Column("all", "All", "", entered)] if scene else []
+    note = _note(scene) if scene else ""
+    return make_table(
+        "origins", "Movements", "Origins and destinations, vehicles", note, columns, entries,
+        lambda arm: point_geometry(arm.xy_m, analysis),
+    )  # fmt: skip
 
 
 def _note(scene: OriginDestination) -> str:
@@ -59,72 +68,47 @@ def _note(scene: OriginDestination) -> str:
 
 def relation_table(analysis: TrafficAnalysis) -> AnalysisTable:
     """Each pair of an origin and a destination."""
-    columns: Columns = {
-        "from": ("From", ""),
-        "to": ("To", ""),
-        "seen": ("Vehicles seen whole", ""),
-        "cut": ("Of cut tracks, joined or inferred", ""),
-        "remaining": ("Inferred of those still there at the end", ""),
-        "share": ("Share of the entry", "%"),
-        "flow": ("Flow", "veh/h"),
-        "travel_time": ("Travel time", "s"),
-    }
-    relations = analysis.scene.relations if analysis.scene else ()
-    rows = (make_row(_relation_cells(r), line_geometry(_between(r), analysis)) for r in relations)
+    columns: list[Column[Relation]] = [
+        Column("from", "From", "", lambda r: r.origin.name),
+        Column("to", "To", "", lambda r: r.destination.name),
+        Column("seen", "Vehicles seen whole", "", lambda r: r.seen),
+        Column("cut", "Of cut tracks, joined or inferred", "", lambda r: r.cut, 1),
+        Column("remaining", "Inferred of those still there at the end", "", lambda r: r.remaining, 1),
+        estimates("share", "Share of the entry", "%", lambda r: r.share, 100.0),
+        estimates("flow", "Flow", "veh/h", lambda r: r.flow_veh_per_h),
+        estimates("travel_time", "Travel time", "s", lambda r: r.travel_time_s),
+    ]
     note = (
         "Arms are named by the side of the image that they lead to; “inside” is a yard or a garage. A vehicle whose "
         "track is cut, and not found again, is taken to go where the others went that drove where it was lost."
     )
-    return make_table("origin_destination", "Movements", "From origin to destination", note, columns, rows)
 
+    def place(r: Relation) -> GeometryRecord:
+        return line_geometry(np.array([r.origin.xy_m, r.destination.xy_m]), analysis)
 
-def _relation_cells(r: Relation) -> dict[str, Cell]:
-    return {
-        "from": r.origin.name,
-        "to": r.destination.name,
-        "seen": r.seen,
-        "cut": round(r.cut, 1),
-        "remaining": round(r.remaining, 1),
-        "share": estimate_cell(r.share, 100.0),
-        "flow": estimate_cell(r.flow_veh_per_h),
-        "travel_time": estimate_cell(r.travel_time_s),
-    }
-
-
-def _between(r: Relation) -> np.ndarray:
-    return np.array([r.origin.xy_m, r.destination.xy_m])
+    relations = analysis.scene.relations if analysis.scene else ()
+    return make_table("origin_destination", "Movements", "From origin to destination", note, columns, relations, place)
 
 
 def car_park_table(analysis: TrafficAnalysis) -> AnalysisTable:
     """Through traffic of car parks."""
-    columns: Columns = {
-        "parked": ("Parked vehicles", ""),
-        "entered": ("Vehicles that drive in", ""),
-        "through": ("Of these, through without a stop", ""),
-        "share": ("Share", "%"),
-        "flow": ("Flow", "veh/h"),
-        "time": ("Time inside", "s"),
-    }
-    rows = (
-        make_row(
-            {
-                "parked": park.parked,
-                "entered": park.entered,
-                "through": park.through,
-                "share": estimate_cell(park.through_share, 100.0),
-                "flow": estimate_cell(park.through_veh_per_h),
-                "time": estimate_cell(park.time_s),
-            },
-            polygon_geometry(park.hull_m, analysis),
-        )
-        for park in analysis.car_parks
-    )
+    columns: list[Column[CarPark]] = [
+        Column("parked", "Parked vehicles", "", lambda park: park.parked),
+        Column("entered", "Vehicles that drive in", "", lambda park: park.entered),
+        Column("through", "Of these, through without a stop", "", lambda park: park.through),
+        estimates("share", "Share", "%", lambda park: park.through_share, 100.0),
+        estimates("flow", "Flow", "veh/h", lambda park: park.through_veh_per_h),
+        estimates("time", "Time inside", "s", lambda park: park.time_s),
+    ]
     note = (
         "Areas of six parked vehicles or more, 10 m wide or more, kerbs left out, and who drives 15 m or more in them."
     )
     if analysis.parked is None:
         note = "Parked vehicles are not known of these tracks."
-    return make_table("car_parks", "Movements", "Through traffic of car parks", note, columns, rows)
+    return make_table(
+        "car_parks", "Movements", "Through traffic of car parks", note, columns, analysis.car_parks,
+        lambda park: polygon_geometry(park.hull_m, analysis),
+    )  # fmt: skip
 
 
 def time_tables(analysis: TrafficAnalysis) -> Iterator[AnalysisTable]:
@@ -132,44 +116,25 @@ def time_tables(analysis: TrafficAnalysis) -> Iterator[AnalysisTable]:
     if not len(analysis.slice_edges_s):
         return
     note = f"Slices of {analysis.slice_s:g} s, by the time of entry."
-    columns: Columns = {"junction": ("Junction", ""), **_SLICE_COLUMNS}
+    columns: list[Column[SliceCount]] = [
+        Column("from", "From", "", lambda c: c.arm_in),
+        Column("to", "To", "", lambda c: c.arm_out),
+        Column("begin", "Slice from", "s", lambda c: c.begin_s, 1),
+        Column("end", "to", "s", lambda c: c.end_s, 1),
+        Column("seen", "Vehicles seen", "", lambda c: c.seen),
+        Column("inferred", "Vehicles inferred", "", lambda c: c.inferred, 1),
+        estimates("flow", "Flow", "veh/h", lambda c: c.flow_veh_per_h),
+    ]
+    junction: Column[SliceCount] = Column("junction", "Junction", "", lambda c: c.junction)
     lines = {(m.junction, m.arm_in, m.arm_out): m.line_m for found in analysis.movements for m in found.movements}
-    rows = (
-        make_row(
-            {"junction": c.junction, **_slice_cells(c)},
-            line_geometry(lines[c.junction or 0, c.arm_in, c.arm_out], analysis),
-        )
-        for c in analysis.counts_by_time
-    )
-    yield make_table("movements_by_time", "Movements", "Turning counts by time", note, columns, rows)
-    arms = {arm.name: arm.xy_m for arm in analysis.scene.arms} if analysis.scene else {}
-    rows = (
-        make_row(_slice_cells(c), line_geometry(np.array([arms[c.arm_in], arms[c.arm_out]]), analysis))
-        for c in analysis.scene_by_time
-    )
     yield make_table(
-        "origin_destination_by_time", "Movements", "From origin to destination by time", note, _SLICE_COLUMNS, rows
-    )
-
-
-_SLICE_COLUMNS: Columns = {
-    "from": ("From", ""),
-    "to": ("To", ""),
-    "begin": ("Slice from", "s"),
-    "end": ("to", "s"),
-    "seen": ("Vehicles seen", ""),
-    "inferred": ("Vehicles inferred", ""),
-    "flow": ("Flow", "veh/h"),
-}
-
-
-def _slice_cells(c: SliceCount) -> dict[str, Cell]:
-    return {
-        "from": c.arm_in,
-        "to": c.arm_out,
-        "begin": round(c.begin_s, 1),
-        "end": round(c.end_s, 1),
-        "seen": c.seen,
-        "inferred": round(c.inferred, 1),
-        "flow": estimate_cell(c.flow_veh_per_h),
-    }
+        "movements_by_time", "Movements", "Turning counts by time", note, [junction, *columns],
+        analysis.counts_by_time,
+        lambda c: line_geometry(lines[c.junction or 0, c.arm_in, c.arm_out], analysis),
+    )  # fmt: skip
+    arms = {arm.name: arm.xy_m for arm in analysis.scene.arms} if analysis.scene else {}
+    yield make_table(
+        "origin_destination_by_time", "Movements", "From origin to destination by time", note, columns,
+        analysis.scene_by_time,
+        lambda c: line_geometry(np.array([arms[c.arm_in], arms[c.arm_out]]), analysis),
+    )  # fmt: skip
