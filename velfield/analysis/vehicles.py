@@ -1,14 +1,16 @@
 """Vehicles: one row a track, and whether it is part of the traffic.
 
-A detector finds parked cars as well as those that drive, and things on roofs that stand as still as they do. The image
-does not distinguish a parked car in a yard from a vent; but the traffic distinguishes both from a car that waits: where
-vehicles drive along its axis, ahead of it, behind it or over its place at another time, it stands in a lane.
+A detector finds parked cars as well as those that drive, and things on roofs that stand as still as they do. The
+traffic distinguishes both from a car that waits: where vehicles drive along its axis, ahead of it, behind it or over
+its place at another time, it stands in a lane. Of the rest, those far from where anything drove, and from likelier
+vehicles, whose scores are low beside those of this flight's traffic are doubtful: roof gear, sheds, shadows.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.flight import PAPER_GSD_M, STATIONARY_SPEED_M_PER_S
@@ -28,6 +30,12 @@ _REACH_M, _HALF_WIDTH_M = 8.0, 1.0
 """A lane is looked for so far ahead and behind, and to either side: parked cars stand 2 m and more beside it."""
 _DRIVEN_FRACTION = 0.4
 """Minimum fraction of that length that others drove, for a stationary vehicle to be in a lane."""
+_ROAD_M = 10.0
+"""Nearer than this to where others drove a standing vehicle is not doubted: it stands at the kerb or in a drive."""
+_ROW_M = 6.0
+"""Nor one so near to another of a higher score: in a row of parked cars, or a second detection of one."""
+_DOUBTFUL_SCORE, _MIN_TRAFFIC = 0.5, 10
+"""Scores below this fraction of the median score of the traffic are doubtful; fewer vehicles in it give no median."""
 
 
 VEHICLE_COLUMNS = (
@@ -46,7 +54,7 @@ def find_vehicles(tracklets: pd.DataFrame, detections: pd.DataFrame, *, gsd_m: f
     tracklets
         `VEHICLE_COLUMNS`.
     detections
-        ``schemas.tables.DETECTION_COLUMNS``: ``detection_id`` and ``orientation_rad`` are read.
+        ``schemas.tables.DETECTION_COLUMNS``: ``detection_id``, ``orientation_rad`` and ``score`` are read.
     gsd_m
         Metres a base pixel; None: the paper's.
 
@@ -55,7 +63,9 @@ def find_vehicles(tracklets: pd.DataFrame, detections: pd.DataFrame, *, gsd_m: f
     DataFrame
         ``track_id, first_frame, last_frame, first_time_s, last_time_s, detections`` (their number), ``x_px, y_px``
         (median position), ``orientation_rad`` (axial, NaN where unknown), ``displacement_m`` (from the first positions
-        to the last), ``state`` (of `STATES`); by ``track_id``.
+        to the last), ``state`` (of `STATES`), ``score`` (mean of its detections), ``doubtful`` (bool: parked,
+        10 m or more from where anything drove and 6 m from vehicles of higher scores, with a score below half the
+        median of the traffic); by ``track_id``.
     """
     metres = PAPER_GSD_M if gsd_m is None else gsd_m
     positions = _track_positions(tracklets, detections)
@@ -70,6 +80,7 @@ def find_vehicles(tracklets: pd.DataFrame, detections: pd.DataFrame, *, gsd_m: f
         y_px=("y_px", "median"),
         cos=("cos", "mean"),
         sin=("sin", "mean"),
+        score=("score", "mean"),
     ).reset_index()
     between = (_mean_of_ends(positions, last=True) - _mean_of_ends(positions, last=False)).to_numpy(np.float64)
     displacement_m = np.hypot(between[:, 1], between[:, 2]) * metres
@@ -82,9 +93,23 @@ def find_vehicles(tracklets: pd.DataFrame, detections: pd.DataFrame, *, gsd_m: f
     lane = driven.along(table.loc[~moving, ["x_px", "y_px"]].to_numpy(np.float64) * metres, axis[~moving])
     state = np.full(len(table), STATES[0], object)
     state[~moving] = np.where(lane >= _DRIVEN_FRACTION, STATES[1], STATES[2])
+    doubtful = _find_doubtful(table, positions, state != STATES[2], metres)
     return table.drop(columns=["cos", "sin"]).assign(
-        orientation_rad=axis, displacement_m=displacement_m, state=pd.Categorical(state, STATES)
+        orientation_rad=axis, displacement_m=displacement_m, state=pd.Categorical(state, STATES), doubtful=doubtful
     )
+
+
+def _find_doubtful(table: pd.DataFrame, positions: pd.DataFrame, in_traffic: Mask, metres: float) -> Mask:
+    """Which vehicles (n,) of `find_vehicles` stand far from all traffic and from likely vehicles, with a low score."""
+    if in_traffic.sum() < _MIN_TRAFFIC:
+        return np.zeros(len(table), bool)
+    score, xy_m = table["score"].to_numpy(), table[["x_px", "y_px"]].to_numpy(np.float64) * metres
+    low = score < _DOUBTFUL_SCORE * float(np.median(score[in_traffic]))
+    driven = positions.loc[positions["track_id"].isin(table["track_id"][in_traffic]), ["x_px", "y_px"]]
+    cells = np.unique(np.rint(driven.to_numpy(np.float64) * metres), axis=0)  # of 1 m: they are many of a long flight
+    far = cKDTree(cells).query(xy_m)[0] >= _ROAD_M
+    alone = cKDTree(xy_m[~low]).query(xy_m)[0] >= _ROW_M
+    return np.asarray(~in_traffic & low & far & alone)
 
 
 def _track_positions(tracklets: pd.DataFrame, detections: pd.DataFrame) -> pd.DataFrame:
@@ -97,8 +122,9 @@ def _track_positions(tracklets: pd.DataFrame, detections: pd.DataFrame) -> pd.Da
         for k in range(3)
     ]
     positions = pd.concat(parts, ignore_index=True).drop_duplicates("detection_id").sort_values("frame", kind="stable")
-    doubled = 2 * detections.set_index("detection_id")["orientation_rad"].reindex(positions["detection_id"]).to_numpy()
-    return positions.assign(cos=np.cos(doubled), sin=np.sin(doubled))
+    seen = detections.set_index("detection_id")[["orientation_rad", "score"]].reindex(positions["detection_id"])
+    doubled = 2 * seen["orientation_rad"].to_numpy()
+    return positions.assign(cos=np.cos(doubled), sin=np.sin(doubled), score=seen["score"].to_numpy(np.float64))
 
 
 def _mean_of_ends(positions: pd.DataFrame, *, last: bool) -> pd.DataFrame:

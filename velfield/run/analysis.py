@@ -65,7 +65,8 @@ class RunAnalysis:
         if self.vehicles is None:
             return TrafficAnalysis(self.trajectories, classes=self._classes)
         known = self.vehicles()
-        parked = known.loc[(known["state"] == "parked").to_numpy(), ["x_px", "y_px", "orientation_rad"]]
+        is_parked = ((known["state"] == "parked") & ~known["doubtful"]).to_numpy()
+        parked = known.loc[is_parked, ["x_px", "y_px", "orientation_rad"]]
         scale = [self.gsd_m, self.gsd_m, 1.0]
         return TrafficAnalysis(self.trajectories, parked=parked.to_numpy(np.float64) * scale, classes=self._classes)
 

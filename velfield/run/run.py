@@ -200,16 +200,16 @@ class Run:
         return read_tables(sorted(self.layout.tracks.glob("unit-*.parquet")), TRACK_COLUMNS, only=list(names))
 
     def vehicles(self) -> pd.DataFrame:
-        """One row a track: when and where, its length, width and class, and whether it moves, waits in a lane or is
-        parked: `find_vehicles`, `add_dimensions`.
+        """One row a track: when and where, its length, width and class, whether it moves, waits in a lane or is
+        parked, and whether it is doubtful: `find_vehicles`, `add_dimensions`.
         """
         gsd_m = self.grid.gsd_m
         tracklets, paths = (
             self._tracklet_columns(VEHICLE_COLUMNS),
             sorted(self.layout.detections.glob("unit-*.parquet")),
         )
-        axes = read_tables(paths, DETECTION_COLUMNS, only=["detection_id", "orientation_rad"])
-        vehicles = find_vehicles(tracklets, axes, gsd_m=gsd_m)
+        seen = read_tables(paths, DETECTION_COLUMNS, only=["detection_id", "orientation_rad", "score"])
+        vehicles = find_vehicles(tracklets, seen, gsd_m=gsd_m)
         return add_dimensions(vehicles, self._dimensions(), gsd_m)
 
     def _dimensions(self) -> pd.DataFrame:
