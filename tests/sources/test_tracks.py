@@ -139,3 +139,111 @@ def test_parquet_with_times_of_its_own_kind(tmp_path: Path) -> None:
     table = pd.DataFrame({"id": t["id"], "time": stamps, "x_m": t["east"], "y_m": 90 - t["north"]})
     (tmp_path / "t.parquet").write_bytes(parquet_bytes(table))
     assert_left_turn_at_36_km_h(load(tmp_path / "t.parquet", {}), duration_s=t["t"].max())
+
+
+def queues(unit_m: float, vehicles: int = 12) -> pd.DataFrame:
+    """Vehicles that come at 12 m/s, stand 7 m behind the one before, and drive on, all at 1.5 m/s2; x in a unit."""
+    parts = []
+    for k in range(vehicles):
+        time_s, place, arrives, departs = np.arange(0, 80, 0.4), 150.0 - 7.0 * k, 25.0 + 1.5 * k, 48 + 1.5 * k
+        to_go, gone = (np.clip(span, 0, None) for span in (arrives - time_s, time_s - departs))
+        braking, speeding = (
+            0.75 * np.minimum(span, 8) ** 2 + 12 * np.clip(span - 8, 0, None) for span in (to_go, gone)
+        )
+        x = place - braking + speeding
+        there = (x > 0) & (x < 330)
+        parts.append(pd.DataFrame({"id": k, "time_s": time_s[there], "x_m": x[there] / unit_m, "y_m": 5.0 / unit_m}))
+    return pd.concat(parts)
+
+
+@pytest.mark.parametrize(("unit_m", "warned"), [(1.0, 0), (0.3048, 2), (3.2808, 2)])
+def test_gaps_and_accelerations_show_a_wrong_unit(unit_m: float, warned: int, tmp_path: Path) -> None:
+    """Speeds alone would be those of a motorway, or of a street."""
+    queues(unit_m).to_csv(tmp_path / "t.csv", index=False)
+    notes = load(tmp_path / "t.csv", {}).notes
+    found = [note for note in notes if note.startswith("warning")]
+    assert len(found) == warned, notes
+    assert all("--unit" in note for note in found)
+
+
+def table_by_rule(number: int) -> tuple[str, bytes, dict[str, object], float]:
+    """A table of `queues` with unit, axis, times, names, separator, encoding, line ends and order by lot: its name,
+    bytes and options, and metres for one of what it says are metres; 1: it says the truth."""
+    lot = np.random.default_rng(number)
+
+    def one(*choices: object) -> str:
+        return str(choices[lot.integers(len(choices))])
+
+    table, unit, axis, said_unit = queues(1.0), one("m", "ft", "px"), one("up", "down"), one("name", "option")
+    wrong = unit != "px" and lot.random() < 0.25
+    x, y = table["x_m"], 60.0 + np.sin(table["x_m"] / 50) * (1 if axis == "down" else -1)
+    called = {"m": "ft", "ft": "m"}[unit] if wrong else unit
+    per_m = {"m": 1.0, "ft": 1 / 0.3048, "px": 5.0}[unit]
+    suffix = f"_{called}" if said_unit == "name" else ""
+    options: dict[str, object] = {} if said_unit == "name" else {"unit": called}
+    if not (called == "m" and suffix) and called != "px":
+        options["y_axis"] = axis
+    if (called == "m" and suffix) or called == "px":  # y points down by that name
+        y = 60.0 + np.sin(table["x_m"] / 50)
+    options |= {"gsd_m": 0.2} if unit == "px" else {}
+    stamps = {
+        "time_s": table["time_s"],
+        "timestamp_ms": (table["time_s"] * 1000).round().astype("int64"),
+        "time": (pd.Timestamp("2025-06-01T12:00:00Z") + pd.to_timedelta(table["time_s"], unit="s")).astype(str),
+        "unixtime": (1.75e12 + table["time_s"] * 1000).round().astype("int64"),
+    }
+    time_name = one(*stamps)
+    made = pd.DataFrame({one("track_id", "Vehicle ID", "ID", "objectId"): table["id"], time_name: stamps[time_name]})
+    made[f"x{suffix}"], made[f"y{suffix}"] = x * per_m, y * per_m
+    if lot.random() < 0.3:
+        moved = table.groupby("id")[["x_m", "time_s"]].diff().bfill()
+        name, factor = [("speed_mps", 1.0), ("speed [km/h]", 3.6), ("speed", 3.6), ("Speed (mph)", 1 / 0.44704)][
+            number % 4
+        ]
+        made[name] = moved["x_m"] / moved["time_s"] * factor
+    if lot.random() < 0.5:
+        made = made.sample(frac=1.0, random_state=number)
+    separator, encoding, end = (
+        one(",", ";", "\t", "|", ";,"),
+        one("utf-8", "utf-8-sig", "utf-16"),
+        one("\n", "\r\n", "\r"),
+    )
+    text = made.to_csv(
+        index=False, sep=separator[0], decimal="," if separator == ";," else ".", lineterminator=end, quoting=number % 2
+    )
+    factor = 1.0 if not wrong else {"m": 0.3048, "ft": 1 / 0.3048}[unit]
+    return (
+        f"{number}: {unit} called {called} by {said_unit}, {axis}, {time_name}",
+        text.encode(encoding),
+        options,
+        factor,
+    )
+
+
+def outcome(path: Path, options: dict[str, object]) -> tuple[LoadedTracks | None, str]:
+    """What was loaded, and the warnings; or nothing, and the refusal."""
+    try:
+        loaded = load(path, options)
+    except InputError as error:
+        return None, str(error)
+    return loaded, " ".join(note for note in loaded.notes if note.startswith("warning"))
+
+
+@pytest.mark.filterwarnings("error")
+def test_two_hundred_tables_by_rule_are_right_or_not_without_a_word(tmp_path: Path) -> None:
+    truth = queues(1.0).groupby("id")["x_m"].agg(lambda x: x.iloc[-1] - x.iloc[0]).to_numpy()
+    right = 0
+    for number in range(200):
+        name, data, options, factor = table_by_rule(number)
+        (tmp_path / "t.csv").write_bytes(data)
+        loaded, said = outcome(tmp_path / "t.csv", options)
+        assert "\n" not in said, name
+        assert bool(said) == (factor != 1.0), f"{name}: {said}"
+        if said or loaded is None:
+            continue
+        xy = loaded.xy_m - loaded.xy_m.min(axis=0)
+        found = pd.Series(xy[:, 0]).groupby(loaded.table["source_id"].to_numpy()).agg(lambda x: x.iloc[-1] - x.iloc[0])
+        assert sorted(found) == pytest.approx(sorted(truth), abs=1.0), name
+        assert np.corrcoef(np.sin(xy[:, 0] / 50), xy[:, 1])[0, 1] > 0.98, name  # y down
+        right += 1
+    assert 120 < right < 180

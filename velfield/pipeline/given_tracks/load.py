@@ -9,9 +9,11 @@ from rasterio.crs import CRS
 
 from schemas.arrays import FloatArray
 from schemas.flight import FlightConfig
+from velfield.analysis.speed_changes import PLAUSIBLE_M_PER_S2, check_times
+from velfield.analysis.trajectories import make_trajectories
 from velfield.errors import InputError
 from velfield.sources.geo import BaseRaster, read_base_raster, reconcile_gsd
-from velfield.sources.tracks.checks import check_speeds, require_motion, split_reused
+from velfield.sources.tracks.checks import check_speeds, check_standing_gaps, require_motion, split_reused
 from velfield.sources.tracks.read import GivenPositions, read_tracks
 from velfield.tracking.smoothing import LEAST_ERROR_M, clean_tracks
 
@@ -20,6 +22,7 @@ GSD_M = 0.2
 MARGIN_M = 10.0
 """Around the positions, where no base image is given."""
 _STEP_S = 0.2
+_CHECKED_TRACKS = 500
 _INSIDE = 0.5
 """Fewer positions within the base image are of another image."""
 
@@ -104,6 +107,7 @@ def load_tracks(path: Path, config: FlightConfig, *, base: Path | None = None) -
     clean = clean_tracks(table["track_id"].to_numpy(np.int64), table["time_s"].to_numpy(np.float64), xy_m)
     x_px, y_px = (clean.xy_m / gsd_m).T
     table = table.assign(track_id=clean.track, x_px=x_px, y_px=y_px)
+    notes += check_standing_gaps(table, clean.xy_m) + _check_accelerations(table, clean.xy_m, gsd_m)
     displacement_sd_m = max(LEAST_ERROR_M, clean.velocity_sd_m_per_s * own_step_s(table))
     crs_wkt, affine = (raster.crs_wkt, raster.affine) if raster is not None else (None, None)
     if given.crs_wkt is not None:
@@ -112,6 +116,21 @@ def load_tracks(path: Path, config: FlightConfig, *, base: Path | None = None) -
     notes += [*_place(given, corner, gsd_m), *(() if raster is None else raster.notes), *clean.notes]
     errors = (clean.position_sd_m, displacement_sd_m)
     return LoadedTracks(table, shape, gsd_m, raster, crs_wkt, affine, *errors, tuple(notes))
+
+
+def _check_accelerations(table: pd.DataFrame, xy_m: FloatArray, gsd_m: float) -> list[str]:
+    """A warning where vehicles set off and stop as nobody drives: positions in another unit, or wrong times."""
+    ids = table["track_id"].to_numpy(np.int64)
+    some = np.isin(ids, np.unique(ids)[:_CHECKED_TRACKS])
+    frames, time_s = (table[name].to_numpy()[some] for name in ("frame", "time_s"))
+    check = check_times(make_trajectories(ids[some], frames, time_s, xy_m[some], gsd_m=gsd_m))
+    if check.plausible:
+        return []
+    low, high = PLAUSIBLE_M_PER_S2
+    return [
+        f"warning: {check.vehicles} vehicles set off and stop with {check.median_m_per_s2:.2g} m/s2 (median), expected "
+        f"{low:g} to {high:g}: check the unit of positions (--unit, --gsd-m) and the times (--fps)"
+    ]
 
 
 def _gsd_m(path: Path, given: GivenPositions, gsd_m: float | None, raster: BaseRaster | None) -> float:

@@ -19,6 +19,9 @@ _FASTEST_M_PER_S = 85.0
 """306 km/h: where a tenth of all moving rows are faster, a unit is wrong."""
 _JUMP_M, _JUMP_M_PER_S, _LONGEST_GAP_S = 15.0, 120.0, 300.0
 _UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": MILE_PER_HOUR, "ft/s": FOOT_M}
+_STANDING_M_PER_S, _QUEUE_M, _LANE_M, _MOMENTS = 0.3, 60.0, 1.9, 300
+_GAPS_M = 3.5, 12.0
+"""Least median, and largest tenth percentile, of the gaps of vehicles that queue."""
 _MOSTLY_SAME = 0.01
 _MIN_EXTENT_M = 6.0
 
@@ -85,6 +88,47 @@ def _compare(path: object, ratio: float, speed: FloatArray, given: GivenSpeed) -
         f"{path}: found {shown:.3g} km/h by the positions and {shown * given.factor / ratio:.3g} km/h by {given.name}; "
         "check the unit of the positions (--unit, --gsd-m) and the times (--fps)"
     )
+
+
+def check_standing_gaps(table: pd.DataFrame, xy_m: FloatArray) -> list[str]:
+    """Compare how far apart vehicles stand in queues with what their lengths allow; a warning where it cannot be.
+
+    Queued vehicles stand 6 to 9 m apart, from middle to middle, whatever the road: feet taken for metres are 20 to 30,
+    metres taken for feet 2 to 3.
+
+    Parameters
+    ----------
+    table
+        ``track_id, time_s``, by track and time.
+    xy_m
+        (n, 2) positions, m.
+    """
+    speed, rows = step_speeds(table, xy_m)
+    track = table["track_id"].to_numpy(np.int64)[rows[:, 0]]
+    here, step = xy_m[rows[:, 0]], xy_m[rows[:, 1]] - xy_m[rows[:, 0]]
+    heading = np.where((speed > _MOVING_M_PER_S)[:, None], step / np.maximum(np.hypot(*step.T), 1e-9)[:, None], np.nan)
+    heading = pd.DataFrame(heading).groupby(track).ffill().to_numpy()  # of a vehicle that stands: where it drove before
+    standing = np.flatnonzero((speed < _STANDING_M_PER_S) & np.isfinite(heading).all(axis=1))
+    moments = pd.DataFrame({"time_s": table["time_s"].to_numpy()[rows[standing, 0]].round(2)}).groupby("time_s").indices
+    spread = np.linspace(0, max(len(moments) - 1, 0), min(len(moments), _MOMENTS)).astype(int)
+    gaps: dict[int, float] = {}
+    for at in [list(moments.values())[k] for k in spread]:
+        cars = standing[at]
+        away = here[cars][None] - here[cars][:, None]
+        along = (away * heading[cars][:, None]).sum(axis=2)
+        across = np.abs(away[..., 0] * heading[cars][:, None, 1] - away[..., 1] * heading[cars][:, None, 0])
+        ahead = np.where((along > 0) & (along < _QUEUE_M) & (across < _LANE_M), along, np.inf).min(axis=1)
+        for car, gap in zip(track[cars[np.isfinite(ahead)]], ahead[np.isfinite(ahead)], strict=True):
+            gaps[int(car)] = min(gap, gaps.get(int(car), np.inf))
+    if len(gaps) < _MIN_ROWS:
+        return []
+    low, middle = np.quantile(list(gaps.values()), [0.1, 0.5])
+    if low <= _GAPS_M[1] and middle >= _GAPS_M[0]:
+        return []
+    return [
+        f"warning: {len(gaps)} vehicles stand {middle:.3g} m behind the next in queues (median, middle to middle), "
+        "expected 6 to 9 m: check the unit of positions (--unit, --gsd-m)"
+    ]
 
 
 def drop_repeated(path: object, table: pd.DataFrame, columns: list[str]) -> tuple[pd.DataFrame, list[str]]:
