@@ -102,7 +102,7 @@ def test_tracks_older_than_the_settings_are_said_to_be(tmp_path: Path, capsys: p
     rng = np.random.default_rng(0)
     paths = [np.column_stack([np.arange(0, 390, 6.0), 50 + rng.normal(0, 0.1, 65)]) for _ in range(8)]
     run = field_run(tmp_path / "run", tracklets_along(paths), shape=(100, 400), gsd_m=0.25)
-    with pytest.raises(InputError, match="tracks are not computed"):
+    with pytest.raises(InputError, match="has no tracks yet"):
         analyse(tmp_path / "run")
     record = CommitRecord(stage="tracks", unit="all", key="old", code_version="1")
     write_commit(run.layout, record)
