@@ -196,6 +196,7 @@ def test_positions_with_errors_are_smoothed_to_the_same_lanes(tmp_path: Path) ->
     assert len(found.lanes) == len(TrafficAnalysis(exact).lanes) == 5
     notes = [note for of in read_commits(RunLayout(tmp_path / "run"), "tracks") for note in of.notes]
     assert any(re.search(r"errors of 0\.[345]\d m.*: smoothed to 0\.[123]", note) for note in notes)
+    assert 0.1 < found.trajectories.position_sd_m < 0.4  # lanes and U-turns of the run need evidence above it
 
 
 def test_positions_are_interpolated_over_short_gaps_alone() -> None:

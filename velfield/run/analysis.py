@@ -1,7 +1,7 @@
 """`Run.analysis`: the analyses of `velfield.analysis` on the stored layers and tracks of a run, lengths in metres."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -44,6 +44,8 @@ class RunAnalysis:
         Returns the dimensions of the vehicles (`schemas.tables.DIMENSION_COLUMNS`); None: they were not measured.
     vehicles
         Returns the vehicles (`velfield.run.run.Run.vehicles`), of which some are parked; None: not known.
+    position_sd_m
+        Standard deviation of a position along one axis, of tracks of another program.
     """
 
     layer: Callable[[str], NDArray[np.generic]]
@@ -52,11 +54,13 @@ class RunAnalysis:
     config: FieldConfig
     dimensions: Callable[[], pd.DataFrame] | None = None
     vehicles: Callable[[], pd.DataFrame] | None = None
+    position_sd_m: float = 0.0
 
     @cached_property
     def trajectories(self) -> Trajectories:
         """Tracks of vehicles that move, in metres."""
-        trajectories = moving(from_tracklets(self.tracklets(), self.gsd_m))
+        made = from_tracklets(self.tracklets(), self.gsd_m)
+        trajectories = moving(replace(made, position_sd_m=self.position_sd_m))
         return trajectories if self.dimensions is None else trajectories.with_lengths(self.dimensions())
 
     @cached_property

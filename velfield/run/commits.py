@@ -29,6 +29,8 @@ _DIGEST = "digest"
 """Key of a record of which the digest of all others is the value."""
 PAGE, ANALYSIS, _WHOLE = "page", "analysis", "all"
 """Names of the commit records of the page and of the analysis, which are no stages, and of their one unit."""
+POSITION_SD_M = "position_sd_m"
+"""Count of the stage of given tracks: the standard deviation of a smoothed position along one axis, m."""
 
 
 def code_version() -> str:

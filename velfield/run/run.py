@@ -27,6 +27,7 @@ from velfield.field.segments import SEGMENT_COLUMNS, Segments, require_gsd_m, se
 from velfield.field.view import VelocityField
 from velfield.registration.warp import warp_to_base
 from velfield.run.analysis import RunAnalysis
+from velfield.run.commits import POSITION_SD_M, read_commits
 from velfield.run.field_reader import IntervalField, open_field_intervals, open_velocity_field, source_runs
 from velfield.run.flight_record import read_flight_record
 from velfield.run.frame_transforms import FrameTransforms, read_base_image, read_georeference, read_grid
@@ -260,7 +261,18 @@ class Run:
         def layer(name: str) -> NDArray[np.generic]:
             return open_field(self.layout.field).layer(name)
 
-        return RunAnalysis(layer, self.tracklets, self.grid, self.record.config.field, self._dimensions, self.vehicles)
+        position_sd_m = max(
+            (c.counts.get(POSITION_SD_M, 0.0) for c in read_commits(self.layout, "tracks")), default=0.0
+        )
+        return RunAnalysis(
+            layer,
+            self.tracklets,
+            self.grid,
+            self.record.config.field,
+            self._dimensions,
+            self.vehicles,
+            position_sd_m,
+        )
 
     @cached_property
     def base_image(self) -> GreyImage:

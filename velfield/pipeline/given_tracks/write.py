@@ -23,7 +23,7 @@ from velfield.pipeline.stage import STAGE, stages_before
 from velfield.pipeline.stages.base_image import write_given_image
 from velfield.pipeline.stages.frames import create_frame_store
 from velfield.pipeline.stages.registration import create_registration_store
-from velfield.run.commits import write_atomically
+from velfield.run.commits import POSITION_SD_M, write_atomically
 from velfield.run.layout import RunLayout
 from velfield.run.stores import open_frames
 from velfield.run.tables import conform, empty_table, write_table, write_tracks
@@ -89,6 +89,7 @@ def write_given_tracks(plan: Plan) -> StageResult:
     written += _write_tables(plan, given, positions, tracklets)
     advance("tracks")
     counts = {"tracklets": float(len(tracklets)), "tracks": float(tracklets["track_id"].nunique())}
+    counts[POSITION_SD_M] = given.position_sd_m
     return StageResult(written, counts, list(given.notes))
 
 
