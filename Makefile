@@ -10,7 +10,7 @@ export UV_SYSTEM_CERTS := true
 # Where this is set, every process of ours compiles all that it imports anew: 12 s each for Prefect.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test page docs lint types check format env lock bench audit detector soak clean
+.PHONY: demo test test-newest page docs lint types check format env lock bench audit detector soak clean
 
 demo: page  ## simulate a flight, run the whole job, say where the report is
 	$(BIN)/velfield demo --out demo
@@ -23,6 +23,15 @@ test: page  ## every check: lint, types, tests
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+# In build/newest, without the lock: what somebody gets who installs the wheel today.
+test-newest: export OPENBLAS_NUM_THREADS := 1
+test-newest: export OMP_NUM_THREADS := 1
+test-newest: page  ## the tests on the newest versions that pyproject.toml allows
+	$(PYTHON) -m venv --clear build/newest
+	$(BIN)/uv pip install --quiet --python build/newest/bin/python --editable ".[dev,gis,s3]"
+	$(BIN)/uv pip list --quiet --python build/newest/bin/python
+	build/newest/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 # The viewer's page from page/: built where its sources changed. Node is the machine's, else PyPI's into the environment.
 page: $(STAMP)
