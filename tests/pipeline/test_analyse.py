@@ -66,7 +66,7 @@ def test_the_workbook_has_a_sheet_a_table(folder: Path) -> None:
 
 
 def test_bad_input_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="one of them"):
+    with pytest.raises(InputError, match="either a run folder or --tracks"):
         analyse()
     with pytest.raises(InputError, match="--out"):
         analyse(tracks=tmp_path / "t.csv")
