@@ -2,7 +2,7 @@
 
 Both are tagged unions, discriminated by ``method``: a key that the chosen method never reads is refused. Another
 detector needs its two models here, added to the unions ``DetectionConfig`` (with its ``Tag``) and ``DetectorRecord``,
-and a package ``velfield/detection/<method>``. A detector file is JSON with a schema, never pickle; it holds numbers
+and its class in `velfield.detection.registry`. A detector file is JSON with a schema, never pickle; it holds numbers
 only, no image that the detector was trained on.
 """
 
@@ -17,13 +17,11 @@ from pydantic import (
     PositiveFloat,
     PositiveInt,
     Tag,
+    field_validator,
     model_validator,
 )
 
 from schemas.model import Model
-
-DETECTOR_VERSION = 2
-"""Version of the detector file; `schemas.renames.upgrade_detector` reads those of version 1."""
 
 Coordinate = Annotated[int, Field(ge=-64, le=64)]
 
@@ -155,26 +153,6 @@ class PrecisionRecallCurve(Model):
     """Which cars it was measured on."""
 
 
-class LayerRecord(Model):
-    """A layer of the network: its weights by kernel tap, input channel and output channel, then its biases."""
-
-    shape: tuple[PositiveInt, PositiveInt, PositiveInt]
-    """Kernel taps (1 or 9), input channels, output channels."""
-    weights_f16: str = Field(max_length=2_000_000)
-    """Base64 of little-endian half-precision floats."""
-
-    @model_validator(mode="after")
-    def _is_whole(self) -> Self:
-        taps, into, out = self.shape
-        try:
-            found = len(b64decode(self.weights_f16, validate=True))
-        except ValueError:
-            raise ValueError("the weights of a layer are not base64") from None
-        if found != 2 * (taps * into * out + out):
-            raise ValueError(f"a layer of {taps} x {into} x {out} with {found} bytes of weights")
-        return self
-
-
 class BaseRecord(Model):
     """Content that every detector file has in common."""
 
@@ -196,25 +174,19 @@ class CnnRecord(BaseRecord):
     """A trained convolutional network."""
 
     method: Literal["cnn"] = "cnn"
-    onnx: str | None = Field(default=None, max_length=8_000_000)
-    """The network as an ONNX model, base64; none in a file that was of format version 1."""
-    layers: dict[str, LayerRecord] | None = Field(default=None, max_length=100)
-    """The network of a file that was of format version 1."""
-    tta_range: tuple[float, float] = (0.0, 1.0)
-    """Probabilities between which a candidate is scored again on rotated crops."""
+    onnx: str = Field(max_length=8_000_000)
+    """The network as an ONNX model, base64."""
     activation_ranges: dict[str, tuple[FiniteFloat, FiniteFloat]] | None = Field(default=None, max_length=100)
     """Least and largest value of the network's activations, on images of the flight; none: it is run in float32."""
 
-    @model_validator(mode="after")
-    def _has_a_network(self) -> Self:
-        if (self.onnx is None) == (self.layers is None):
-            raise ValueError("found a record with both onnx and layers, or with neither; one holds the network")
-        if self.onnx is not None:
-            try:
-                b64decode(self.onnx, validate=True)
-            except ValueError:
-                raise ValueError("the network is not base64") from None
-        return self
+    @field_validator("onnx")
+    @classmethod
+    def _is_base64(cls, onnx: str) -> str:
+        try:
+            b64decode(onnx, validate=True)
+        except ValueError:
+            raise ValueError("the network is not base64") from None
+        return onnx
 
 
 class PaperRecord(BaseRecord):

@@ -116,29 +116,36 @@ def test_science_knows_neither_run_folder_nor_pipeline(room: str) -> None:
     assert found == []
 
 
+def test_no_file_imports_itself_through_others() -> None:
+    """A package's ``__init__`` is a file like any other, so that packages form no circle through them either."""
+    names = {path.relative_to(ROOT).with_suffix("").as_posix().replace("/", "."): path for path in modules()}
+    names = {name.removesuffix(".__init__"): path for name, path in names.items()}
+    after: dict[str, set[str]] = {name: set() for name in names}
+    for name, path in names.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module in names:
+                below = {f"{node.module}.{alias.name}" for alias in node.names} & names.keys()
+                after[name] |= (below or {node.module}) - {name}
+    try:
+        TopologicalSorter(after).prepare()
+    except CycleError as error:
+        pytest.fail(f"files import each other in a circle: {' -> '.join(error.args[1])}")
+
+
 def room_of(module: str) -> str | None:
     """The room of ``velfield`` that a dotted module name lies in: a package or a loose module."""
     parts = module.split(".")
     return parts[1] if parts[0] == "velfield" and len(parts) > 1 else None
 
 
-def arrows() -> set[tuple[str, str]]:
-    """Imports between rooms of ``velfield``, each once."""
-    found = set()
-    for path in modules():
-        own = path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".")
-        room = room_of(own)
-        found |= {(room, other) for name in imports(path) if room and (other := room_of(name)) and other != room}
-    return found
-
-
 def test_no_package_cycles() -> None:
     after: dict[str, set[str]] = {}
-    for room, other in arrows():
-        after.setdefault(room, set()).add(other)
-    graph = TopologicalSorter(after)
+    for path in modules():
+        room = room_of(path.relative_to(ROOT).with_suffix("").as_posix().replace("/", "."))
+        others = {room_of(name) for name in imports(path)} if room else set()
+        after.setdefault(room or "", set()).update(other for other in others if other and other != room)
     try:
-        graph.prepare()
+        TopologicalSorter(after).prepare()
     except CycleError as error:
         pytest.fail(f"packages import each other in a circle: {' -> '.join(error.args[1])}")
 

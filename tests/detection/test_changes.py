@@ -18,7 +18,7 @@ from velfield.detection.detect import (
     split_into_boxes,
 )
 from velfield.detection.frame import ComparableFrame, half_resolution
-from velfield.detection.interface import Detections, concatenate
+from velfield.detection.interface import Detections, Detector, concatenate
 from velfield.detection.mosaic import Box, assemble_kernel, find_in_boxes, owners_kernel, pack_boxes
 from velfield.detection.registry import shipped_detector
 
@@ -211,13 +211,14 @@ def test_a_detector_of_another_kind_searches_each_box_by_itself() -> None:
     seen = []
 
     class Recording(CnnDetector):
+        find_in_crops = Detector.find_in_crops
+
         def find(self, image, valid=None, *, threshold=None):  # type: ignore[no-untyped-def]
             assert valid.shape == image.shape
             seen.append(image.shape)
             return super().find(image, valid, threshold=threshold)
 
-    shipped = shipped_detector()
-    detector = Recording(shipped.record.model_copy(update={"tta_range": (0.3, 0.6)}))
+    detector = Recording(shipped_detector().record)
     image = with_cars(ground(3), [(30, 40), (100, 100), (300, 200)])
     boxes = boxes_of_px((0, 0, 80, 64), (80, 80, 144, 128), (176, 256, 224, 336))
     found = find_in_boxes(detector, frame(image), boxes, 0.0)

@@ -1,32 +1,30 @@
-"""Detections from the network: decoding of heatmaps, rotation and shift of the image, truncation, the motion bonus."""
+"""Detections from the network: decoding of heatmaps, rotation and shift of the image, truncation."""
 
 from functools import cache
 
 import cv2
 import numpy as np
-import pytest
 
-from schemas.arrays import Float32Array, FloatArray, GreyImage
+from schemas.arrays import FloatArray, GreyImage
 from velfield.bench.scenes import simulated_image
-from velfield.detection.cnn import model
-from velfield.detection.cnn.dataset import PATCH_PX, encode_targets
+from velfield.detection.cnn.dataset import encode_targets
 from velfield.detection.cnn.detector import CnnDetector
+from velfield.detection.cnn.inference import Predictor
 from velfield.detection.cnn.model import (
     SCORE_OFFSET,
     SMOOTHING_SIGMA,
     detect_cars,
     find_peaks,
 )
-from velfield.detection.cnn.network import Network
 from velfield.detection.nms import nms_oriented
 from velfield.detection.orientation import axial_difference
 from velfield.detection.registry import shipped_detector
 
 
-def network() -> Network:
+def network() -> Predictor:
     shipped = shipped_detector()
     assert isinstance(shipped, CnnDetector)
-    return shipped.network
+    return shipped.predictor
 
 
 @cache
@@ -51,65 +49,16 @@ def nearest(found: FloatArray, expected: FloatArray) -> tuple[FloatArray, FloatA
     return gap.min(axis=1), axial_difference(found[gap.argmin(axis=1), 2], expected[:, 2])
 
 
-def test_positions_and_orientations_are_decoded_from_a_heatmap(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The network is replaced by one that predicts the targets of four cars and, on rotated crops, what is set."""
+def test_positions_and_orientations_are_decoded_from_a_heatmap() -> None:
     centres = np.array([[20.3, 30.9], [60.0, 22.2], [40.7, 70.1], [75.4, 60.6]])
     angles = np.array([0.2, 1.1, 2.0, 2.9])
     heatmap, orientation, _ = encode_targets(centres, angles)
-    heatmap *= np.float32(0.45)  # unsure: looked at again
-    probability = 0.77
-
-    def predict_crops(_: Network, crops: GreyImage) -> tuple[Float32Array, Float32Array]:
-        relative = np.tile([0.0, -np.pi / 2], len(crops) // 2)  # along the axis, and across it
-        vectors = np.stack([np.cos(2 * relative), np.sin(2 * relative)], axis=1)[..., None, None]
-        return np.full((len(crops), 24, 24), probability, np.float32), np.tile(vectors, (24, 24)).astype(np.float32)
-
-    monkeypatch.setattr(model, "predict_heatmap", lambda network, image, **_: (heatmap, orientation.transpose(2, 0, 1)))
-    monkeypatch.setattr(model, "forward", predict_crops)
-    found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None, (0.25, 0.5))
+    found = find_peaks(heatmap, orientation.transpose(2, 0, 1), None, stride=2, min_probability=0.2)
     assert len(found) == 4
-    distance, difference = nearest(found, np.column_stack([centres, angles]))
+    axes = 0.5 * np.arctan2(found[:, 3], found[:, 2])
+    distance, difference = nearest(np.column_stack([found[:, :2], axes]), np.column_stack([centres, angles]))
     assert distance.max() < 0.15
     assert difference.max() < 1e-3
-    np.testing.assert_allclose(found[:, 3], probability - SCORE_OFFSET, atol=1e-6)
-    assert (found[:, 4] < 0.05).all()  # both crops agree on the orientation
-
-
-def test_crops_that_disagree_on_the_orientation_make_it_uncertain(monkeypatch: pytest.MonkeyPatch) -> None:
-    heatmap, orientation, _ = encode_targets(np.array([[40.5, 40.5]]), np.array([0.5]))
-
-    heatmap *= np.float32(0.45)
-
-    def predict_crops(_: Network, crops: GreyImage) -> tuple[Float32Array, Float32Array]:
-        vectors = np.zeros((len(crops), 2, 24, 24), np.float32)
-        vectors[:, 0] = 1  # each along its own crop: across each other
-        return np.full((len(crops), 24, 24), 0.5, np.float32), vectors
-
-    monkeypatch.setattr(model, "predict_heatmap", lambda network, image, **_: (heatmap, orientation.transpose(2, 0, 1)))
-    monkeypatch.setattr(model, "forward", predict_crops)
-    found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None, (0.25, 0.5))
-    assert found.shape == (1, 5)
-    assert found[0, 4] > np.radians(45)
-
-
-@pytest.mark.parametrize(("factor", "looks"), [(1.0, 0), (0.45, 2), (0.24, 0)])
-def test_only_candidates_of_the_chosen_probabilities_are_looked_at_again(
-    monkeypatch: pytest.MonkeyPatch, factor: float, looks: int
-) -> None:
-    heatmap, orientation, _ = encode_targets(np.array([[40.5, 40.5]]), np.array([0.5]))
-    heatmap *= np.float32(factor)
-    seen = []
-
-    def predict_crops(_: Network, crops: GreyImage) -> tuple[Float32Array, Float32Array]:
-        seen.append(len(crops))
-        return np.full((len(crops), 24, 24), 0.9, np.float32), np.ones((len(crops), 2, 24, 24), np.float32)
-
-    monkeypatch.setattr(model, "predict_heatmap", lambda network, image, **_: (heatmap, orientation.transpose(2, 0, 1)))
-    monkeypatch.setattr(model, "forward", predict_crops)
-    found = detect_cars(network(), np.zeros((PATCH_PX, PATCH_PX), np.uint8), None, (0.25, 0.5))
-    assert sum(seen) == looks
-    if not looks:
-        assert all(axial_difference(found[:, 2], np.full(len(found), 0.5)) < 0.02)
 
 
 def test_an_image_without_peaks_has_no_detections() -> None:
@@ -195,8 +144,8 @@ def test_the_number_of_threads_changes_nothing_that_matters() -> None:
     """A session has one thread, so that the order of its sums never changes; with more, scores differ by rounding."""
     import onnxruntime as ort
 
-    from velfield.detection.cnn.network import network_to_onnx, open_session
-    from velfield.detection.registry import shipped_detector
+    from velfield.detection.cnn.graph import network_to_onnx
+    from velfield.detection.runtime import open_session
 
     model = network_to_onnx(shipped_detector().network)  # type: ignore[attr-defined]
     session = open_session(model, "cpu")

@@ -12,23 +12,18 @@ from scipy.signal import correlate
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage
 from velfield.detection.cnn import layers
+from velfield.detection.cnn.graph import network_from_onnx, network_to_onnx, onnx_kernel, weights_from_onnx
+from velfield.detection.cnn.inference import HALO_PX, Predictor, predict_heatmap
 from velfield.detection.cnn.layers import conv2d, conv2d_backward, depth_to_space, relu_backward, space_to_depth
-from velfield.detection.cnn.model import HALO_PX, forward, predict_heatmap
 from velfield.detection.cnn.network import (
     STRIDE,
-    TOPOLOGIES,
     TOPOLOGY,
     Conv,
     DepthToSpace,
     Network,
     Residual,
     SpaceToDepth,
-    Topology,
     convolutions,
-    network_from_onnx,
-    network_to_onnx,
-    onnx_kernel,
-    weights_from_onnx,
 )
 from velfield.detection.cnn.trainer import Trainer
 from velfield.errors import InputError
@@ -41,14 +36,14 @@ def normal(*shape: int, seed: int = 0) -> Float32Array:
     return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
 
 
-def random_network(seed: int = 0, topology: Topology = TOPOLOGY) -> Network:
+def random_network(seed: int = 0) -> Network:
     """Random weights that keep the size of the activations, exact at half precision."""
     rng, weights, biases = np.random.default_rng(seed), {}, {}
-    for name, conv in convolutions(topology).items():
+    for name, conv in convolutions(TOPOLOGY).items():
         scale = np.sqrt(2 / (conv.shape[0] * conv.channels_in))
         weights[name] = rng.normal(0, scale, conv.shape).astype(np.float16).astype(np.float32)
         biases[name] = rng.normal(0, 0.1, conv.channels_out).astype(np.float16).astype(np.float32)
-    return Network(weights, biases, topology)
+    return Network(weights, biases)
 
 
 def grey(seed: int, *shape: int) -> GreyImage:
@@ -161,8 +156,7 @@ def test_depth_to_space_inverts_space_to_depth(n: int, half_h: int, half_w: int,
     np.testing.assert_array_equal(depth_to_space(deep), images)
 
 
-@pytest.mark.parametrize("topology", TOPOLOGIES)
-def test_channels_and_resolutions_of_the_topology_fit(topology: Topology) -> None:
+def test_channels_and_resolutions_of_the_topology_fit() -> None:
     def walk(layers: tuple[object, ...], channels: int, stride: float) -> tuple[int, float]:
         for layer in layers:
             if isinstance(layer, Conv):
@@ -177,7 +171,7 @@ def test_channels_and_resolutions_of_the_topology_fit(topology: Topology) -> Non
                 assert walk(layer.layers, channels, stride) == (channels, stride)
         return channels, stride
 
-    assert walk(topology, 1, 1) == (3, STRIDE)
+    assert walk(TOPOLOGY, 1, 1) == (3, STRIDE)
 
 
 def test_forward_equals_the_network_written_out_with_scipy() -> None:
@@ -209,21 +203,18 @@ def test_forward_equals_the_network_written_out_with_scipy() -> None:
     np.testing.assert_allclose(out[0], expected, atol=2e-4)
 
 
-@pytest.mark.parametrize("topology", TOPOLOGIES)
 @pytest.mark.parametrize("shape", [(1, 64, 96), (3, 48, 48)])
-def test_onnxruntime_equals_the_numpy_reference(topology: Topology, shape: tuple[int, int, int]) -> None:
-    network, images = random_network(1, topology), grey(2, *shape)
+def test_onnxruntime_equals_the_numpy_reference(shape: tuple[int, int, int]) -> None:
+    network, images = random_network(1), grey(2, *shape)
     expected = Trainer.from_network(network).predict(images.astype(np.float32) / 255)
-    probability, orientation = forward(network, images)
+    probability, orientation = Predictor(network)(images)
     np.testing.assert_allclose(probability, 1 / (1 + np.exp(-expected[..., 0])), atol=2e-5)
     np.testing.assert_allclose(orientation, expected[..., 1:].transpose(0, 3, 1, 2), atol=5e-4)
 
 
-@pytest.mark.parametrize("topology", TOPOLOGIES)
-def test_a_network_comes_back_from_onnx_with_the_same_weights(topology: Topology) -> None:
-    network = random_network(3, topology)
+def test_a_network_comes_back_from_onnx_with_the_same_weights() -> None:
+    network = random_network(3)
     again = network_from_onnx(network_to_onnx(network))
-    assert again.topology == topology
     for name in network.weights:
         np.testing.assert_array_equal(again.weights[name], network.weights[name])
         np.testing.assert_array_equal(again.biases[name], network.biases[name])
@@ -274,19 +265,18 @@ def test_the_onnx_model_is_valid_and_of_few_operators() -> None:
 
 
 def test_images_of_a_batch_do_not_touch_each_other() -> None:
-    network, images = random_network(), grey(2, 3, 48, 64)
-    batch = forward(network, images)
+    forward, images = Predictor(random_network()), grey(2, 3, 48, 64)
+    batch = forward(images)
     for k in range(3):
-        for of_one, of_all in zip(forward(network, images[k : k + 1]), batch, strict=True):
+        for of_one, of_all in zip(forward(images[k : k + 1]), batch, strict=True):
             np.testing.assert_allclose(of_one[0], of_all[k], atol=1e-5)
 
 
-@pytest.mark.parametrize("topology", TOPOLOGIES)
-def test_a_pixel_reaches_no_farther_than_the_halo_of_a_tile(topology: Topology) -> None:
-    network, image = random_network(0, topology), np.full((1, 256, 256), 128, np.uint8)
+def test_a_pixel_reaches_no_farther_than_the_halo_of_a_tile() -> None:
+    forward, image = Predictor(random_network(0)), np.full((1, 256, 256), 128, np.uint8)
     changed = image.copy()
     changed[0, 126:130, 126:130] = 255
-    differs = forward(network, changed)[1][0] != forward(network, image)[1][0]
+    differs = forward(changed)[1][0] != forward(image)[1][0]
     y, x = np.nonzero(differs.any(axis=0))
     distance = np.abs(np.stack([y, x]) * STRIDE + (STRIDE - 1) / 2 - 127.5).max()
     assert 20 < distance < HALO_PX
@@ -295,16 +285,16 @@ def test_a_pixel_reaches_no_farther_than_the_halo_of_a_tile(topology: Topology) 
 @pytest.mark.parametrize("shape", [(150, 90), (64, 64), (65, 3)])
 def test_tiles_do_not_show_in_the_heatmap(monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]) -> None:
     network, image = random_network(), grey(3, *shape)
-    whole = predict_heatmap(network, image)
-    monkeypatch.setattr("velfield.detection.cnn.model._TILE_PX", 64)
-    tiled = predict_heatmap(network, image)
+    whole = predict_heatmap(Predictor(network), image)
+    monkeypatch.setattr("velfield.detection.cnn.inference._TILE_PX", 64)
+    tiled = predict_heatmap(Predictor(network), image)
     assert tiled[0].shape == (-(-shape[0] // 2), -(-shape[1] // 2))
     np.testing.assert_allclose(tiled[0], whole[0], atol=1e-5)
     np.testing.assert_allclose(tiled[1], whole[1], atol=1e-4)
 
 
 def test_a_network_crosses_processes_without_its_session() -> None:
-    network, image = random_network(), grey(4, 1, 32, 32)
-    expected = forward(network, image)
-    again = pickle.loads(pickle.dumps(network))
-    np.testing.assert_array_equal(forward(again, image)[0], expected[0])
+    forward, image = Predictor(random_network()), grey(4, 1, 32, 32)
+    expected = forward(image)
+    again = pickle.loads(pickle.dumps(forward))
+    np.testing.assert_array_equal(again(image)[0], expected[0])

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.arrays import FloatArray
-from velfield.detection.cnn.network import TOPOLOGY, Network, Residual, convolutions
+from tests.detection.test_cnn_layers import random_network
+from velfield.detection.cnn.network import Network
 from velfield.detection.cnn.trainer import (
     MAX_GRAD_NORM,
     WEIGHT_DECAY,
@@ -36,11 +37,12 @@ def as_double(batch: Batch) -> Batch:
     return Batch(**double)
 
 
-def trained(normalised: bool) -> Trainer:
-    trainer = Trainer.initialise(1)
+def trained() -> Trainer:
+    """A new trainer of weights that have seen a few steps."""
+    trainer = Trainer.from_network(random_network(1))
     for _ in range(5):
         trainer.train_step(random_batch(), 1e-3)
-    return trainer if normalised else Trainer.from_network(trainer.network())
+    return Trainer.from_network(trainer.network())
 
 
 def naive_loss(out: FloatArray, batch: Batch, normaliser: LossNormaliser) -> float:
@@ -118,10 +120,8 @@ def test_the_halves_of_a_batch_add_up_to_it() -> None:
     np.testing.assert_allclose(np.concatenate([by_one, by_two]), gradient)
 
 
-@pytest.mark.parametrize("normalised", [True, False])
-def test_gradients_equal_finite_differences(normalised: bool) -> None:
-    trainer = trained(normalised)
-    assert trainer.is_normalised == normalised
+def test_gradients_equal_finite_differences() -> None:
+    trainer = trained()
     _, gradients = trainer.loss_and_gradients(random_batch())
     assert gradients.keys() == trainer.parameters.keys()
     for name, gradient in gradients.items():
@@ -136,7 +136,7 @@ def test_gradients_equal_finite_differences(normalised: bool) -> None:
 
 
 def test_the_forward_pass_of_training_is_that_of_inference() -> None:
-    trainer, batch = trained(normalised=False), random_batch(n=1)
+    trainer, batch = trained(), random_batch(n=1)
     expected, _ = focal_loss_and_gradient(
         Trainer.from_network(trainer.network()).predict(batch.images), batch, LossNormaliser.of(batch)
     )
@@ -144,7 +144,7 @@ def test_the_forward_pass_of_training_is_that_of_inference() -> None:
 
 
 def test_fine_tuning_does_not_depend_on_how_a_batch_is_halved() -> None:
-    trainer, batch = trained(normalised=False), random_batch(n=3)
+    trainer, batch = trained(), random_batch(n=3)
     order = [2, 0, 1]
     shuffled = Batch(**{name: values[order] for name, values in vars(batch).items()})
     loss, gradients = trainer.loss_and_gradients(batch)
@@ -155,7 +155,7 @@ def test_fine_tuning_does_not_depend_on_how_a_batch_is_halved() -> None:
 
 
 def test_the_halves_at_once_or_one_after_the_other_give_the_same_bits() -> None:
-    network = trained(normalised=False).network()
+    network = trained().network()
     results = []
     for at_once in (True, False):
         trainer = Trainer.from_network(network, halves_at_once=at_once)
@@ -166,35 +166,8 @@ def test_the_halves_at_once_or_one_after_the_other_give_the_same_bits() -> None:
         np.testing.assert_array_equal(results[1][name], values)
 
 
-def test_initial_weights_have_the_variance_of_he_and_predict_few_cars() -> None:
-    trainer = Trainer.initialise(0)
-    for name, conv in convolutions(TOPOLOGY).items():
-        weights = trainer.parameters[f"{name}.w"]
-        assert weights.std() == pytest.approx(np.sqrt(2 / (conv.shape[0] * conv.channels_in)), rel=0.2), name
-        assert (f"{name}.g" in trainer.parameters) == conv.relu
-    assert trainer.parameters["head.b"].tolist() == [-4, 0, 0] * 4  # of the four pixels of a block
-    outer = next(layer for layer in TOPOLOGY if isinstance(layer, Residual))
-    last = [block.layers[-1].name for block in outer.layers if isinstance(block, Residual)]  # type: ignore[union-attr]
-    halved = [
-        name
-        for name in convolutions(TOPOLOGY)
-        if f"{name}.g" in trainer.parameters and trainer.parameters[f"{name}.g"][0] < 1
-    ]
-    assert halved == last == ["res1_1", "res2_1"]
-    np.testing.assert_array_equal(Trainer.initialise(0).parameters["dec1.w"], trainer.parameters["dec1.w"])
-    assert not np.array_equal(Trainer.initialise(1).parameters["dec1.w"], trainer.parameters["dec1.w"])
-
-
-def test_batch_normalisation_is_folded_into_the_weights() -> None:
-    trainer, batch = Trainer.initialise(2), random_batch(n=1)
-    for learning_rate in [1e-3] * 5 + [0.0] * 160:  # then the running statistics are those of this batch
-        trainer.train_step(batch, learning_rate)
-    loss, _ = Trainer.from_network(trainer.network()).loss_and_gradients(batch)
-    assert loss == pytest.approx(trainer.loss_and_gradients(batch)[0], rel=2e-3)
-
-
 def test_fine_tuning_starts_from_copies_of_the_weights() -> None:
-    network = trained(normalised=False).network()
+    network = trained().network()
     before = {name: weights.copy() for name, weights in network.weights.items()}
     trainer = Trainer.from_network(network)
     trainer.train_step(random_batch(), 1e-2)
@@ -205,7 +178,7 @@ def test_fine_tuning_starts_from_copies_of_the_weights() -> None:
 
 def test_the_first_step_is_that_of_adam_with_decoupled_weight_decay() -> None:
     """Bias correction makes the first step the sign of the gradient, whatever its size."""
-    trainer, rate = trained(normalised=False), 1e-3
+    trainer, rate = trained(), 1e-3
     before = dict(trainer.parameters)
     loss, gradients = trainer.loss_and_gradients(random_batch())
     assert trainer.train_step(random_batch(), rate) == loss
@@ -238,7 +211,7 @@ def test_the_learning_rate_rises_then_falls(one: float, other: float) -> None:
 def test_training_follows_the_schedule_and_reports_each_step(monkeypatch: pytest.MonkeyPatch) -> None:
     rates: list[float] = []
     steps: list[tuple[int, float]] = []
-    trainer = trained(normalised=False)
+    trainer = trained()
     monkeypatch.setattr(Trainer, "train_step", lambda self, batch, rate: rates.append(rate) or len(rates))
     batches = [random_batch(n=1, seed=k) for k in range(4)]
     network = train(
@@ -250,7 +223,7 @@ def test_training_follows_the_schedule_and_reports_each_step(monkeypatch: pytest
 
 
 def test_no_steps_leave_a_network_as_it_is() -> None:
-    network = trained(normalised=False).network()
+    network = trained().network()
     same = train(Trainer.from_network(network), lambda _: random_batch(), steps=0, learning_rate=1.0)
     for name, weights in network.weights.items():
         np.testing.assert_array_equal(same.weights[name], weights)
@@ -259,7 +232,7 @@ def test_no_steps_leave_a_network_as_it_is() -> None:
 def test_a_single_batch_can_be_overfitted() -> None:
     losses: list[float] = []
     train(
-        Trainer.initialise(0),
+        Trainer.from_network(random_network(0)),
         lambda _: random_batch(n=1, side=16),
         steps=150,
         learning_rate=3e-3,

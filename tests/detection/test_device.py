@@ -5,7 +5,6 @@ import time
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,9 +17,10 @@ from schemas.arrays import GreyImage
 from schemas.detector import CnnConfig
 from schemas.flight import Device
 from tests.detection.test_onnx import tiny_yolo
-from velfield.detection.cnn import network as networks
+from velfield.detection import runtime as sessions
 from velfield.detection.cnn.detector import CnnDetector
-from velfield.detection.cnn.network import Network
+from velfield.detection.cnn.graph import network_to_onnx
+from velfield.detection.cnn.inference import Predictor, predict_crops, predict_heatmap
 from velfield.detection.registry import shipped_detector
 from velfield.errors import DeviceWarning, InputError
 from velfield.pipeline import check_inputs
@@ -88,10 +88,10 @@ class Stub:
 @pytest.fixture
 def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Runtime]:
     found = Runtime()
-    monkeypatch.setattr(networks, "ort", Stub(found))
-    monkeypatch.setattr(networks, "_device", "auto")
-    monkeypatch.setattr(networks, "_limitations_reported", False)
-    caches = networks._find_cuda_fault, networks._warn_of_cuda
+    monkeypatch.setattr(sessions, "ort", Stub(found))
+    monkeypatch.setattr(sessions, "_device", "auto")
+    monkeypatch.setattr(sessions, "_limitations_reported", False)
+    caches = sessions._find_cuda_fault, sessions._warn_of_cuda
     for cache in caches:
         cache.cache_clear()
     yield found
@@ -105,8 +105,8 @@ def shipped() -> CnnDetector:
     return detector
 
 
-def in_floating_point() -> Network:
-    return replace(shipped().network, ranges=None)
+def in_floating_point() -> Predictor:
+    return Predictor(shipped().network)
 
 
 def image(seed: int = 0) -> GreyImage:
@@ -115,34 +115,43 @@ def image(seed: int = 0) -> GreyImage:
 
 @pytest.mark.parametrize(("device", "gpu"), [("auto", True), ("cuda", True), ("cpu", False)])
 def test_a_gpu_runs_the_network_where_there_is_one_and_it_may(runtime: Runtime, device: Device, gpu: bool) -> None:
-    networks.check_device(device)
-    session = networks.open_session(networks.network_to_onnx(in_floating_point()), device)
-    assert (CUDA in session.get_providers()) == gpu == networks.uses_cuda(device)
+    sessions.check_device(device)
+    session = sessions.open_session(network_to_onnx(shipped().network), device)
+    assert (CUDA in session.get_providers()) == gpu == sessions.uses_cuda(device)
     assert runtime.asked[-1][-1] == CPU
-    assert networks.device_limitations(device) == []
+    assert sessions.device_limitations(device) == []
     if gpu:
         name, options = runtime.asked[-1][0]
         assert (name, options["use_tf32"], options["cudnn_conv_algo_search"]) == (CUDA, "0", "HEURISTIC")
 
 
 def test_a_gpu_is_tried_once_a_process_and_never_where_only_the_processor_may(runtime: Runtime) -> None:
-    assert not networks.uses_cuda("cpu")
+    assert not sessions.uses_cuda("cpu")
     assert (runtime.preloaded, runtime.asked) == (0, [])
-    assert [networks.uses_cuda(device) for device in ("auto", "cuda", "auto")] == [True] * 3  # type: ignore[arg-type]
+    assert [sessions.uses_cuda(device) for device in ("auto", "cuda", "auto")] == [True] * 3  # type: ignore[arg-type]
     assert (runtime.preloaded, len(runtime.asked)) == (1, 1)
 
 
-def test_on_a_gpu_all_runs_on_canvases_in_floating_point(runtime: Runtime) -> None:
+def test_on_a_gpu_all_runs_in_floating_point_on_images_of_one_size(
+    runtime: Runtime, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With the ranges of a flight too, by which it would be run in 8 bits on a processor."""
     detector = shipped().for_flight([image()], CnnConfig())
-    network = detector.network
-    assert network.canvases is not None
-    assert network.predict == network.canvases.predict
+    predict, sizes = detector.predictor, set()
+    assert sessions.on_cuda(predict.session)
     assert detector.limitations == []
-    networks.use_device("cpu")
-    expected = in_floating_point().predict(image()[None])
-    for found, plain in zip(network.predict(image()[None]), expected, strict=True):
-        np.testing.assert_array_equal(found, plain)
+    run = predict.session.run
+    monkeypatch.setattr(predict.session, "run", lambda _, of: sizes.add(of["image"].shape) or run(None, of))
+    whole = np.random.default_rng(1).integers(0, 256, (300, 1200)).astype(np.uint8)
+    found = predict_heatmap(predict, whole)
+    crops = np.array([(0, 0, 96, 96), (96, 200, 48, 64)])
+    np.testing.assert_array_equal(predict_crops(predict, whole, crops)[0], found[0])
+    assert sizes == {(1, 1, 1152, 1152)}
+    sessions.use_device("cpu")
+    expected = predict_heatmap(in_floating_point(), whole)
+    inner = np.s_[..., 40:110, 40:560]  # farther from the edge than the network sees
+    for of_gpu, plain in zip(found, expected, strict=True):
+        np.testing.assert_allclose(of_gpu[inner], plain[inner], atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -163,66 +172,66 @@ def test_cuda_that_does_not_start_is_told_once_and_the_processor_runs_8_bits(
     vars(runtime).update(fault)
     detector = shipped().for_flight([image()], CnnConfig())
     with pytest.warns(DeviceWarning) as told:
-        found = detector.network.predict(image()[None])
+        found = detector.predictor(image()[None])
     assert len(told) == 1
     message = str(told[0].message)
     assert "\n" not in message
     assert f"found onnxruntime with CUDA that does not start ({why}" in message
     assert "expected CUDA, cuDNN and an NVIDIA GPU: the network runs on the processor; pip install" in message
     assert capsys.readouterr().out == ""
-    assert detector.network.canvases is None
+    assert not sessions.on_cuda(detector.predictor.session)
     assert message in detector.limitations
-    networks.use_device("cpu")
+    sessions.use_device("cpu")
     again = shipped().for_flight([image()], CnnConfig())
-    np.testing.assert_array_equal(found[0], again.network.predict(image()[None])[0])
+    np.testing.assert_array_equal(found[0], again.predictor(image()[None])[0])
     with pytest.raises(InputError, match="--device cuda: found onnxruntime with CUDA that does not start") as refused:
-        networks.check_device("cuda")
+        sessions.check_device("cuda")
     assert why in str(refused.value)
 
 
 def test_without_cuda_in_the_package_it_is_refused_and_auto_is_the_processor(runtime: Runtime) -> None:
     runtime.offered = ["AzureExecutionProvider", CPU]
     with pytest.raises(InputError, match=r"--device cuda: found onnxruntime with Azure.*pip install velfield\[cuda\]"):
-        networks.open_session(b"", "cuda")
+        sessions.open_session(b"", "cuda")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert not networks.uses_cuda("auto")
-        assert in_floating_point().canvases is None
-    assert networks.device_limitations("auto") == []
-    assert (runtime.preloaded, runtime.asked) == (0, [])
+        assert not sessions.uses_cuda("auto")
+        assert not sessions.on_cuda(in_floating_point().session)
+    assert sessions.device_limitations("auto") == []
+    assert (runtime.preloaded, runtime.asked) == (0, [[CPU]])
 
 
 def test_an_onnxruntime_that_preloads_nothing_is_tried_as_it_is(
     runtime: Runtime, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runtime.preloaded = 1
-    monkeypatch.setattr(networks.ort, "preload_dlls", None)
-    monkeypatch.delattr(networks.ort, "preload_dlls")
-    assert networks.uses_cuda("auto") or not hasattr(onnxruntime, "preload_dlls")
+    monkeypatch.setattr(sessions.ort, "preload_dlls", None)
+    monkeypatch.delattr(sessions.ort, "preload_dlls")
+    assert sessions.uses_cuda("auto") or not hasattr(onnxruntime, "preload_dlls")
 
 
 def test_a_session_that_a_full_gpu_refuses_is_no_silent_fallback(runtime: Runtime) -> None:
-    model = networks.network_to_onnx(in_floating_point())
-    assert networks.uses_cuda("auto")
+    model = network_to_onnx(shipped().network)
+    assert sessions.uses_cuda("auto")
     runtime.starts = False
     with pytest.warns(DeviceWarning, match="GPU unavailable, no further session starts on it: using the CPU"):
-        networks.open_session(model, "auto")
+        sessions.open_session(model, "auto")
     with pytest.raises(InputError, match="--device cuda: found a GPU on which no further session starts"):
-        networks.open_session(model, "cuda")
+        sessions.open_session(model, "cuda")
 
 
 def test_on_a_full_gpu_all_runs_in_8_bits_on_the_processor(
     runtime: Runtime, capsys: pytest.CaptureFixture[str]
 ) -> None:
     detector = shipped().for_flight([image()], CnnConfig())
-    runtime.most = len(runtime.asked) + 2  # the probe and the first of two canvases
+    runtime.most = len(runtime.asked) + 1  # the probe
     with pytest.warns(DeviceWarning, match="no further session starts"):
-        found = detector.network.predict(image()[None])
-    assert detector.network.canvases is None
+        found = detector.predictor(image()[None])
+    assert not sessions.on_cuda(detector.predictor.session)
     assert capsys.readouterr().out == ""
-    networks.use_device("cpu")
+    sessions.use_device("cpu")
     again = shipped().for_flight([image()], CnnConfig())
-    np.testing.assert_array_equal(found[0], again.network.predict(image()[None])[0])
+    np.testing.assert_array_equal(found[0], again.predictor(image()[None])[0])
 
 
 def test_threads_at_once_try_a_gpu_once_and_what_others_print_is_printed(
@@ -230,13 +239,13 @@ def test_threads_at_once_try_a_gpu_once_and_what_others_print_is_printed(
 ) -> None:
     runtime.takes_s, stdout, network = 0.2, sys.stdout, in_floating_point()
     with ThreadPoolExecutor(3) as pool:
-        found = [pool.submit(lambda: network.canvases) for _ in range(2)]
+        found = [pool.submit(lambda: network.session) for _ in range(2)]
         time.sleep(0.1)
         pool.submit(print, "of another thread").result()
     assert sys.stdout is stdout
     assert capsys.readouterr().out == "of another thread\n"
     assert found[0].result() is found[1].result() is not None
-    assert (runtime.preloaded, len(runtime.asked)) == (1, 3)
+    assert (runtime.preloaded, len(runtime.asked)) == (1, 2)
 
 
 def test_what_a_stage_says_is_not_warned_of_too(runtime: Runtime, tmp_path: Path) -> None:
@@ -246,7 +255,7 @@ def test_what_a_stage_says_is_not_warned_of_too(runtime: Runtime, tmp_path: Path
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         detector = check_inputs._read_detector(tiny_yolo(tmp_path / "m.onnx", "boxes"), plan)
-        in_floating_point().predict(image()[None])
+        in_floating_point()(image()[None])
     assert len(detector.limitations) == 1
     assert detector.limitations == shipped().limitations
 
@@ -255,6 +264,6 @@ def test_cuda_that_every_worker_must_have_is_refused_without_it(runtime: Runtime
     """In 8 bits too."""
     detector = shipped().for_flight([image()], CnnConfig())
     runtime.offered = [CPU]
-    networks.use_device("cuda")
+    sessions.use_device("cuda")
     with pytest.raises(InputError, match="--device cuda"):
-        detector.network.predict(image()[None])
+        detector.predictor(image()[None])

@@ -174,7 +174,7 @@ def _onnx_files() -> tuple[bytes, ...]:
     import onnx
     from onnx import TensorProto, helper
 
-    from velfield.detection.cnn.network import network_to_onnx
+    from velfield.detection.cnn.graph import network_to_onnx
     from velfield.detection.registry import shipped_detector
 
     good = network_to_onnx(shipped_detector().network)  # type: ignore[attr-defined]

@@ -45,7 +45,7 @@ def pack_boxes(boxes: Sequence[Box], context_px: int) -> list[Mosaic]:
     cells = np.array(boxes)
     sizes = CELL_PX * (cells[:, 2:] - cells[:, :2]) + 2 * context_px
     order = np.lexsort((sizes[:, 1], -sizes[:, 0]))
-    number, corners = shelve_kernel(sizes[order], _SIDE_PX, 0)
+    number, corners = shelve_kernel(sizes[order], _SIDE_PX)
     crops = np.column_stack([corners, sizes[order]])
     ends = np.flatnonzero(np.diff(number)) + 1
     parts = zip(np.split(order, ends), np.split(crops, ends), strict=True)
@@ -53,19 +53,19 @@ def pack_boxes(boxes: Sequence[Box], context_px: int) -> list[Mosaic]:
 
 
 @njit(cache=True, nogil=True)
-def shelve_kernel(sizes, side, gap):  # type: ignore[no-untyped-def]
+def shelve_kernel(sizes, side):  # type: ignore[no-untyped-def]
     """Number of the mosaic (n,) of crops of sizes (n, 2), height and width, the tallest first, and its corner there
-    (n, 2): row and column. A mosaic is no larger than a side, unless a crop is; between crops there is a gap."""
+    (n, 2): row and column. A mosaic is no larger than a side, unless a crop is."""
     number, corners = np.zeros(len(sizes), np.int64), np.zeros((len(sizes), 2), np.int64)
     mosaic = y = x = shelf = 0
     for k in range(len(sizes)):
         height, width = sizes[k]
         if x > 0 and x + width > side:
-            y, x, shelf = y + shelf + gap, 0, 0
+            y, x, shelf = y + shelf, 0, 0
         if y > 0 and x == 0 and y + height > side:
             mosaic, y = mosaic + 1, 0
         number[k], corners[k, 0], corners[k, 1] = mosaic, y, x
-        x, shelf = x + width + gap, max(shelf, height)
+        x, shelf = x + width, max(shelf, height)
     return number, corners
 
 

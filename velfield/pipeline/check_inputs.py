@@ -44,7 +44,7 @@ def validate_inputs(plan: Plan) -> None:
         One cannot be read or is not what its option expects, or there is no such device; the message names the option.
     """
     if plan.config.work.device == "cuda":
-        from velfield.detection.cnn.network import check_device
+        from velfield.detection.runtime import check_device
 
         check_device("cuda")
     for option, read in _READ.items():
@@ -60,7 +60,7 @@ def validate_inputs(plan: Plan) -> None:
 
 def _read_detector(path: Path, plan: Plan) -> Detector:
     """A model of another maker opens a session: on the device of the stages, which report what limits it."""
-    from velfield.detection.cnn.network import use_device
+    from velfield.detection.runtime import use_device
 
     use_device(plan.config.work.device)
     return load_detector(path)

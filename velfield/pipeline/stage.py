@@ -246,7 +246,7 @@ STAGES: tuple[Stage, ...] = (
     # Cars of each block, then one table with their crops.
     Stage(
         name="detections",
-        version=18,
+        version=19,
         label="detections",
         lines=(
             Line(

@@ -1,7 +1,7 @@
 """The convolutional network as a detector: pre-trained, and fine-tuned on labelled cars."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
 
@@ -10,21 +10,16 @@ import numpy as np
 from schemas.arrays import GreyImage, IntArray, Mask
 from schemas.detector import CnnConfig, CnnRecord, DetectorConfig
 from velfield.detection.cnn.fine_tuning import fine_tune
-from velfield.detection.cnn.model import BORDER_PX, NO_TTA, detect_cars
-from velfield.detection.cnn.network import (
-    INEXACT,
-    Network,
-    current_device,
-    device_limitations,
-    network_from_layers,
-    network_from_record,
-    uses_cuda,
-)
-from velfield.detection.cnn.quantization import calibrate, is_exact
+from velfield.detection.cnn.graph import network_from_record
+from velfield.detection.cnn.inference import BORDER_PX, Predictor
+from velfield.detection.cnn.model import detect_cars
+from velfield.detection.cnn.network import Network
+from velfield.detection.cnn.quantization import INEXACT, calibrate, is_exact
 from velfield.detection.frame import SearchableFrame, whole_frame
 from velfield.detection.interface import Detections, Detector
 from velfield.detection.long_vehicles.classifier import suppress_and_centre
 from velfield.detection.orientation import CAR_ASPECT
+from velfield.detection.runtime import current_device, device_limitations, uses_cuda
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 
@@ -44,15 +39,17 @@ class CnnDetector(Detector):
     @cached_property
     def network(self) -> Network:
         """Its weights."""
-        record = self.record
-        if record.onnx is None:
-            return network_from_layers(record.layers or {})
-        return replace(network_from_record(record.onnx), ranges=record.activation_ranges)
+        return network_from_record(self.record.onnx)
+
+    @cached_property
+    def predictor(self) -> Predictor:
+        """The network where it is run."""
+        return Predictor(self.network, self.record.activation_ranges)
 
     def for_flight(self, images: Sequence[GreyImage], config: DetectorConfig) -> "CnnDetector":
         """With the ranges of the activations on these images, so that it can be run in 8 bits."""
-        wanted = isinstance(config, CnnConfig) and config.precision == "int8" and self.record.onnx is not None
-        ranges = calibrate(replace(self.network, ranges=None), images) if wanted else None
+        wanted = isinstance(config, CnnConfig) and config.precision == "int8"
+        ranges = calibrate(self.network, images) if wanted else None
         return CnnDetector(self.record.model_copy(update={"activation_ranges": ranges}))
 
     @property
@@ -95,12 +92,7 @@ class CnnDetector(Detector):
         *,
         threshold: float | None = None,
     ) -> Detections:
-        """The network run on each crop by itself, those of one size at once; its heatmaps are searched together.
-
-        The rotated crops of test-time augmentation see farther than the context.
-        """
-        if self.record.tta_range != NO_TTA:
-            return super().find_in_crops(image, valid, crops, threshold=threshold)
+        """The network run on each crop by itself, those of one size at once; its heatmaps are searched together."""
         return self._find(image, valid, threshold, crops=crops)
 
     def _find(
@@ -113,7 +105,7 @@ class CnnDetector(Detector):
         crops: IntArray | None = None,
     ) -> Detections:
         length_px = self.record.working_car_length_px
-        rows = detect_cars(self.network, image, valid, self.record.tta_range, border_px=border_px, crops=crops)
+        rows = detect_cars(self.predictor, image, valid, border_px=border_px, crops=crops)
         above = rows[rows[:, 3] > (self.threshold if threshold is None else threshold)] if len(rows) else rows
         return Detections.from_rows(above, np.full(len(above), length_px * length_px * CAR_ASPECT))
 

@@ -13,8 +13,10 @@ import numpy as np
 from schemas.arrays import Mask
 from schemas.detector import CnnConfig, CnnRecord, PrecisionRecallCurve
 from velfield.detection.cnn.dataset import PatchDataset
-from velfield.detection.cnn.model import NO_TTA, detect_cars, predict_heatmap
-from velfield.detection.cnn.network import Network, network_to_record
+from velfield.detection.cnn.graph import network_to_record
+from velfield.detection.cnn.inference import Predictor, predict_heatmap
+from velfield.detection.cnn.model import detect_cars
+from velfield.detection.cnn.network import Network
 from velfield.detection.cnn.trainer import Trainer, train
 from velfield.detection.evaluation import (
     FOLDS_DESCRIPTION,
@@ -60,7 +62,7 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: Network, record: Cnn
     tasks: list[int | None] = [None, *range(folds)]
     spare = usable_processors() > len(tasks) - 1  # the folds together take as long as the network itself
     (network, _), *held_out = parallel_map(
-        lambda fold: _fine_tune_fold(masked, pretrained, config, fold, record.tta_range, halves_at_once=spare),
+        lambda fold: _fine_tune_fold(masked, pretrained, config, fold, halves_at_once=spare),
         tasks,
     )
     evidence = merge_scores([part for _, parts in held_out for part in parts]) if held_out else None
@@ -71,7 +73,7 @@ def fine_tune(samples: Sequence[LabelledImage], pretrained: Network, record: Cnn
         nearest = int(np.abs(np.array(curve.threshold) - threshold).argmin())
         curve = curve.model_copy(update={"operating_point": nearest})
     found = make_record(network, threshold if config.threshold is None else config.threshold, curve, count, config)
-    return found.model_copy(update={"attribution": record.attribution, "tta_range": record.tta_range})
+    return found.model_copy(update={"attribution": record.attribution})
 
 
 def select_threshold(
@@ -89,7 +91,6 @@ def make_record(
 ) -> CnnRecord:
     """Content of the detector file."""
     return CnnRecord(
-        tta_range=NO_TTA,
         working_car_length_px=config.working_car_length_px,
         onnx=network_to_record(network),
         threshold=float(threshold),
@@ -103,7 +104,6 @@ def _fine_tune_fold(
     pretrained: Network,
     config: CnnConfig,
     fold: int | None,
-    tta_range: tuple[float, float] = NO_TTA,
     *,
     halves_at_once: bool = True,
 ) -> tuple[Network, list[HeldOutScores]]:
@@ -119,7 +119,7 @@ def _fine_tune_fold(
     steps = -(-steps // _FOLDS)
     network = train(trainer, dataset, steps=steps, learning_rate=_FINE_TUNING_RATE)
     return network, [
-        evaluate_network(network, sample, region, tta_range) for sample, region in zip(samples, held_out, strict=True)
+        evaluate_network(network, sample, region) for sample, region in zip(samples, held_out, strict=True)
     ]
 
 
@@ -129,7 +129,7 @@ def _mask_unlabelled_positives(sample: LabelledImage, network: Network) -> Label
     sample = replace(sample, cars=cars, abs_box_angle_rad=None)
     if sample.complete:
         return sample
-    probability, _ = predict_heatmap(network, sample.image)
+    probability, _ = predict_heatmap(Predictor(network), sample.image)
     likely = cv2.resize(probability, sample.image.shape[::-1]) > _UNLABELLED_MIN_PROBABILITY
     side = 2 * _UNLABELLED_MARGIN_PX + 1
     unlabelled = cv2.dilate(likely.astype(np.uint8), np.ones((side, side), np.uint8))
@@ -143,10 +143,9 @@ def evaluate_network(
     network: Network,
     sample: LabelledImage,
     region: Mask | None = None,
-    tta_range: tuple[float, float] = NO_TTA,
 ) -> HeldOutScores:
     """Match a network's detections to the labels of an image, or of a region (h, w) of it."""
-    detections = nms_oriented(detect_cars(network, sample.image, sample.valid, tta_range), _NMS_RADIUS_PX)
+    detections = nms_oriented(detect_cars(Predictor(network), sample.image, sample.valid), _NMS_RADIUS_PX)
     detections = detections[detections[:, 3] > MIN_CURVE_SCORE]
     cars = sample.cars
     if region is not None:

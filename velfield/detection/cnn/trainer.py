@@ -1,10 +1,7 @@
-"""Training of the network: forward and backward pass, focal loss, AdamW with warm-up and cosine decay.
+"""Fine-tuning of the network: forward and backward pass, focal loss, AdamW with warm-up and cosine decay.
 
-From scratch, each convolution followed by a ReLU is batch-normalised, and the running statistics are folded into its
-weights and bias at the end; fine-tuning starts from a folded network and normalises nothing.
-
-The training loop is our own on numpy: jax measured no faster (478 against 443 ms a step from scratch, 309 against 351
-ms fine-tuning, before this loop took 0.55 of its time) and adds 380 MB of wheels, and the wheel of torch brings CUDA.
+The training loop is our own on numpy: jax measured no faster (309 against 351 ms a step, before this loop took 0.55 of
+its time) and adds 380 MB of wheels, and the wheel of torch brings CUDA.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,16 +20,10 @@ from velfield.detection.cnn.network import (
     Network,
     Residual,
     SpaceToDepth,
-    Topology,
     convolutions,
 )
 from velfield.parallel import count_steps, parallel_map
 
-_STATISTICS_MOMENTUM, _MIN_VARIANCE = 0.05, 1e-5
-_PRIOR_LOGIT = -4.0
-"""Initial bias of the heatmap: the logit of a car at any pixel before training, about 2 %."""
-_RESIDUAL_GAIN = 0.5
-"""Initial gain of the last convolution of a residual block."""
 _ORIENTATION_LOSS_WEIGHT = 0.5
 WEIGHT_DECAY, ADAM_BETAS, MAX_GRAD_NORM = 1e-2, (0.9, 0.999), 5.0
 _WARMUP_FRACTION = 0.1
@@ -94,57 +85,27 @@ class Trainer:
 
     Attributes
     ----------
-    parameters : by name: ``LAYER.w``, ``LAYER.b`` and, of a batch-normalised layer, ``LAYER.g``, its gain.
-    means, variances : running batch statistics of the normalised layers, by layer.
+    parameters : by name: ``LAYER.w`` and ``LAYER.b``.
     halves_at_once : whether the two halves of a batch are computed on two processors; the result is the same.
     """
 
     parameters: dict[str, Float32Array]
-    topology: Topology = TOPOLOGY
-    means: dict[str, Float32Array] = field(default_factory=dict)
-    variances: dict[str, Float32Array] = field(default_factory=dict)
     halves_at_once: bool = True
     _moments: dict[str, tuple[Float32Array, Float32Array]] = field(default_factory=dict)
     _steps: int = 0
-
-    @classmethod
-    def initialise(cls, seed: int) -> "Trainer":
-        """Random weights (He initialisation), for training from scratch."""
-        rng, parameters = np.random.default_rng(seed), {}
-        for name, conv in convolutions(TOPOLOGY).items():
-            taps, channels_in, channels_out = conv.shape
-            weights = rng.normal(0, np.sqrt(2 / (taps * channels_in)), conv.shape)
-            parameters[f"{name}.w"] = weights.astype(np.float32)
-            parameters[f"{name}.b"] = np.zeros(channels_out, np.float32)
-            if conv.relu:
-                parameters[f"{name}.g"] = np.ones(channels_out, np.float32)
-        for name in _last_of_residual_blocks(TOPOLOGY):
-            parameters[f"{name}.g"] *= np.float32(_RESIDUAL_GAIN)
-        parameters["head.b"][::3] = _PRIOR_LOGIT  # of each pixel that the head predicts
-        return cls(parameters)
 
     @classmethod
     def from_network(cls, network: Network, *, halves_at_once: bool = True) -> "Trainer":
         """A trained network, for fine-tuning."""
         parameters = {f"{name}.w": weights.copy() for name, weights in network.weights.items()}
         parameters |= {f"{name}.b": biases.copy() for name, biases in network.biases.items()}
-        return cls(parameters, network.topology, halves_at_once=halves_at_once)
-
-    @property
-    def is_normalised(self) -> bool:
-        """Whether any layer is batch-normalised."""
-        return any(name.endswith(".g") for name in self.parameters)
+        return cls(parameters, halves_at_once=halves_at_once)
 
     def network(self) -> Network:
-        """The trained network, batch normalisation folded into its weights."""
-        weights, biases = {}, {}
-        for name in convolutions(self.topology):
-            weight, bias = self.parameters[f"{name}.w"], self.parameters[f"{name}.b"]
-            if f"{name}.g" in self.parameters:
-                gain = self.parameters[f"{name}.g"] / np.sqrt(self.variances[name] + _MIN_VARIANCE)
-                weight, bias = weight * gain, bias - self.means[name] * gain
-            weights[name], biases[name] = weight.astype(np.float32), bias.astype(np.float32)
-        return Network(weights, biases, self.topology)
+        """The trained network."""
+        names = convolutions(TOPOLOGY)
+        weights, biases = ({name: self.parameters[f"{name}.{part}"].copy() for name in names} for part in "wb")
+        return Network(weights, biases)
 
     def train_step(self, batch: Batch, learning_rate: float) -> float:
         """One step of the optimiser, gradients clipped by their norm; returns the loss before it."""
@@ -170,16 +131,16 @@ class Trainer:
 
     def predict(self, images: Float32Array) -> Float32Array:
         """Logits and orientation vectors (n, h / 2, w / 2, 3) of images (n, h, w), grey in [0, 1]."""
-        return _Pass(self).forward(self.topology, images[..., None])[0]
+        return _Pass(self).forward(TOPOLOGY, images[..., None])[0]
 
     def loss_and_gradients(self, batch: Batch) -> tuple[float, dict[str, Float32Array]]:
         """Loss, and its gradient by every parameter.
 
-        Without batch normalisation both halves of the batch are computed by themselves: their gradients add up to those
-        of the whole, whatever the number of processors.
+        Both halves of the batch are computed by themselves: their gradients add up to those of the whole, whatever the
+        number of processors.
         """
         normaliser = LossNormaliser.of(batch)
-        if self.is_normalised or len(batch.images) < 2:
+        if len(batch.images) < 2:
             return self._loss_and_gradients(batch, normaliser)
         apply = parallel_map if self.halves_at_once else map
         (first, of_first), (second, of_second) = apply(
@@ -189,22 +150,10 @@ class Trainer:
 
     def _loss_and_gradients(self, batch: Batch, normaliser: LossNormaliser) -> tuple[float, dict[str, Float32Array]]:
         differentiable = _Pass(self)
-        out, backward = differentiable.forward(self.topology, batch.images[..., None])
+        out, backward = differentiable.forward(TOPOLOGY, batch.images[..., None])
         loss, gradient = focal_loss_and_gradient(out, batch, normaliser)
         backward(gradient)
         return loss, differentiable.gradients
-
-
-def _last_of_residual_blocks(layers: Sequence[Layer]) -> list[str]:
-    """Names of the normalised convolutions whose output is added to a residual block's input."""
-    names = []
-    for layer in layers:
-        if isinstance(layer, Residual):
-            names += _last_of_residual_blocks(layer.layers)
-            last = layer.layers[-1]
-            if isinstance(last, Conv) and last.relu:
-                names.append(last.name)
-    return names
 
 
 class _Pass:
@@ -241,8 +190,6 @@ class _Pass:
             return depth_to_space(values), space_to_depth
         if isinstance(layer, Residual):
             return self._residual(layer, values)
-        if f"{layer.name}.g" in self.trainer.parameters:
-            return self._normalised_conv(layer, values)
         return self._conv(layer, values)
 
     def _residual(self, block: Residual, values: Float32Array) -> tuple[Float32Array, Backward]:
@@ -278,36 +225,10 @@ class _Pass:
 
     def _convolve_backward(self, layer: Conv, values: Float32Array, gradient: Float32Array) -> Float32Array:
         """Keep the gradient by the weights; the gradient by the input, which nobody needs of the image itself."""
-        weights, is_first = self.trainer.parameters[f"{layer.name}.w"], layer is self.trainer.topology[0]
+        weights, is_first = self.trainer.parameters[f"{layer.name}.w"], layer is TOPOLOGY[0]
         by_values, by_weights = conv2d_backward(values, weights, gradient, by_images=not is_first)
         self.gradients[f"{layer.name}.w"] = by_weights
         return gradient if by_values is None else by_values
-
-    def _normalised_conv(self, layer: Conv, values: Float32Array) -> tuple[Float32Array, Backward]:
-        """Convolution, batch normalisation and ReLU."""
-        trainer, name = self.trainer, layer.name
-        weights, gain = trainer.parameters[f"{name}.w"], trainer.parameters[f"{name}.g"]
-        convolved = conv2d(values, weights)
-        mean, variance = convolved.mean(axis=(0, 1, 2)), convolved.var(axis=(0, 1, 2))
-        for running, current in ((trainer.means, mean), (trainer.variances, variance)):
-            old = running.get(name)
-            running[name] = (
-                current if old is None else (1 - _STATISTICS_MOMENTUM) * old + _STATISTICS_MOMENTUM * current
-            )
-        scale = 1 / np.sqrt(variance + _MIN_VARIANCE)
-        normalised = (convolved - mean) * scale
-        out = np.asarray(np.maximum(normalised * gain + trainer.parameters[f"{name}.b"], 0), np.float32)
-        pixels = out.size // out.shape[-1]
-
-        def backward(gradient: Float32Array) -> Float32Array:
-            gradient, by_bias = relu_backward(gradient, out)
-            by_gain = (gradient * normalised).sum(axis=(0, 1, 2))
-            self.gradients[f"{name}.b"], self.gradients[f"{name}.g"] = by_bias, by_gain
-            by_convolved = gradient - (by_bias + normalised * by_gain) / np.float32(pixels)
-            by_convolved *= gain * scale
-            return self._convolve_backward(layer, values, by_convolved)
-
-        return out, backward
 
 
 def focal_loss_and_gradient(out: Float32Array, batch: Batch, normaliser: LossNormaliser) -> tuple[float, Float32Array]:

@@ -1,26 +1,19 @@
 """Images, poses and stumps in the layout of the kernels: packed channels, rotated patches, flat corner indices.
 
-The channels are those of integral channel features: grey, gradient along and across the axis of the vehicle.
-They are computed once for an image; a patch is sampled and rotated from them for
-each pose, and its integral images give the sum of any rectangle in four look-ups.
-
-Kernels: rotated patches, their integral images, rectangle sums over them.
+The channels are those of integral channel features: grey, gradient along and across the axis of the vehicle. They are
+computed once for an image; a patch is sampled and rotated from them for each pose, and its integral images give the sum
+of any rectangle in four look-ups.
 
 Sixteen patches are interleaved as the innermost axis of every array (structure of arrays), so that the corner of a
-rectangle is one vector load in place of a gather: four times as fast a pixel, and twenty times a rectangle, as patch
-after patch.
+rectangle is one vector load in place of a gather.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import cv2
 import numpy as np
-from llvmlite import ir
-from numba import njit, types
-from numba.core import cgutils
-from numba.extending import intrinsic
+from numba import njit
 from numpy.typing import NDArray
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray
@@ -33,110 +26,6 @@ GRADIENT_ZERO = 512
 """Gradients are packed as unsigned ten-bit numbers, with this standing for zero."""
 
 
-@intrinsic
-def _integrate_row(_context, packed, stride, poses, x, y, out, first, plane):  # type: ignore[no-untyped-def]
-    """One row of the integral images of ``LANES`` patches, whose second pixel along begins at ``first`` of ``out``.
-
-    ``x`` and ``y`` (LANES,) are the middle of the row, ``plane`` is the size of a channel. By numba each quantity of
-    the row went through memory before the next: here all stays in registers, for half the time.
-    """
-    signature = types.void(packed, stride, poses, x, y, out, first, plane)
-
-    def generate(context: Any, build: Any, _signature: Any, arguments: Any) -> Any:
-        row = _RowBuilder(build)
-        words, turns, middle_x, middle_y, target = (
-            cgutils.create_struct_proxy(kind)(context, build, arguments[k])
-            for kind, k in ((packed, 0), (poses, 2), (x, 3), (y, 4), (out, 5))
-        )
-        step_x, step_y, cosine, sine = (row.load(turns.data, row.number(k * LANES), _FLOAT) for k in (2, 3, 6, 7))
-        middle_x, middle_y = (row.load(one.data, row.number(0), _FLOAT) for one in (middle_x, middle_y))
-        width = row.spread(build.trunc(arguments[1], _INT))
-        # The integral images have one pixel more along than the patches.
-        along = build.sub(build.extract_value(target.shape, 2), row.number(1))
-        line = build.mul(build.extract_value(target.shape, 2), row.number(LANES))
-        half = build.fmul(build.sitofp(build.sub(along, row.number(1)), _FLOAT), ir.Constant(_FLOAT, 0.5))
-        runs = [cgutils.alloca_once_value(build, ir.Constant(_INTS, [0] * LANES)) for _ in range(CHANNELS)]
-
-        def add(channel: int, values: Any, at: Any) -> None:
-            place = build.add(at, build.mul(row.number(channel), arguments[7]))
-            build.store(build.add(build.load(runs[channel]), values), runs[channel])
-            above = row.load(target.data, build.sub(place, line), _INT)
-            row.store(build.add(above, build.load(runs[channel])), target.data, place)
-
-        with cgutils.for_range_slice(build, row.number(0), along, row.number(1), _NUMBER) as (pixel, _):
-            u = row.spread(build.fsub(build.sitofp(pixel, _FLOAT), half))
-            column, line_number = (
-                build.fptosi(build.fadd(middle, build.fmul(u, step)), _INTS)
-                for middle, step in ((middle_x, step_x), (middle_y, step_y))
-            )
-            index = build.add(build.mul(line_number, width), column)
-            at = build.add(arguments[6], build.mul(pixel, row.number(LANES)))
-            word = row.gather(words.data, index, _INT)
-            gx, gy = (row.gradient(word, shift) for shift in (8, 18))
-            add(0, build.and_(word, row.integers(255)), at)
-            add(1, row.truncated_size(build.fadd(build.fmul(gx, cosine), build.fmul(gy, sine))), at)
-            add(2, row.truncated_size(build.fsub(build.fmul(gy, cosine), build.fmul(gx, sine))), at)
-        return context.get_dummy_value()
-
-    return signature, generate
-
-
-_NUMBER, _INT, _FLOAT = ir.IntType(64), ir.IntType(32), ir.FloatType()
-_INTS = ir.VectorType(_INT, LANES)
-
-
-class _RowBuilder:
-    """Instructions on ``LANES`` values at once."""
-
-    def __init__(self, build: Any) -> None:
-        self._build = build
-
-    def number(self, value: int) -> Any:
-        """A constant index."""
-        return ir.Constant(_NUMBER, value)
-
-    def integers(self, value: int) -> Any:
-        """A constant in every lane."""
-        return ir.Constant(_INTS, [value] * LANES)
-
-    def load(self, start: Any, place: Any, kind: Any) -> Any:
-        """The values from a place on."""
-        at = self._build.bitcast(self._build.gep(start, [place]), ir.VectorType(kind, LANES).as_pointer())
-        loaded = self._build.load(at)
-        loaded.align = 4
-        return loaded
-
-    def store(self, values: Any, start: Any, place: Any) -> None:
-        """Write values from a place on."""
-        at = self._build.gep(start, [place])
-        self._build.store(values, self._build.bitcast(at, values.type.as_pointer())).align = 4
-
-    def spread(self, value: Any) -> Any:
-        """One value in every lane."""
-        kind = ir.VectorType(value.type, LANES)
-        one = self._build.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(_INT, 0))
-        return self._build.shuffle_vector(one, ir.Constant(kind, ir.Undefined), ir.Constant(_INTS, [0] * LANES))
-
-    def gather(self, start: Any, index: Any, kind: Any) -> Any:
-        """Values at unsigned indices."""
-        found = ir.Constant(ir.VectorType(kind, LANES), ir.Undefined)
-        for lane in (ir.Constant(_INT, k) for k in range(LANES)):
-            place = self._build.zext(self._build.extract_element(index, lane), _NUMBER)
-            found = self._build.insert_element(found, self._build.load(self._build.gep(start, [place])), lane)
-        return found
-
-    def gradient(self, word: Any, shift: int) -> Any:
-        """One of the gradients that words hold."""
-        bits = self._build.and_(self._build.lshr(word, self.integers(shift)), self.integers(2 * GRADIENT_ZERO - 1))
-        return self._build.sitofp(self._build.sub(bits, self.integers(GRADIENT_ZERO)), ir.VectorType(_FLOAT, LANES))
-
-    def truncated_size(self, values: Any) -> Any:
-        """Whole part of the sizes of numbers."""
-        whole = self._build.fptosi(values, _INTS)
-        negative = self._build.icmp_signed("<", whole, self.integers(0))
-        return self._build.select(negative, self._build.sub(self.integers(0), whole), whole)
-
-
 @njit(cache=True, nogil=True)
 def fill_integrals(packed, stride, poses, out):  # type: ignore[no-untyped-def]
     """Integral images of ``LANES`` rotated patches, sampled at the nearest pixel (as accurate as interpolated).
@@ -146,16 +35,28 @@ def fill_integrals(packed, stride, poses, out):  # type: ignore[no-untyped-def]
     across + 1, along + 1, LANES) int32 with zeros in its first row and column.
     """
     across, along = out.shape[1] - 1, out.shape[2] - 1
-    x, y = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
-    half = np.float32((across - 1) / 2)
-    plane = (across + 1) * (along + 1) * LANES
+    half_across, half_along = np.float32((across - 1) / 2), np.float32((along - 1) / 2)
+    mask, zero = np.uint32(2 * GRADIENT_ZERO - 1), np.int32(GRADIENT_ZERO)
+    index, runs = np.empty(LANES, np.uint64), np.empty((CHANNELS, LANES), np.int32)
     for i in range(across):
-        v = np.float32(i) - half
-        for lane in range(LANES):
-            x[lane] = poses[0, lane] + v * poses[4, lane]
-            y[lane] = poses[1, lane] + v * poses[5, lane]
-        first = ((i + 1) * (along + 1) + 1) * LANES
-        _integrate_row(packed, np.int64(stride), poses, x, y, out, np.int64(first), np.int64(plane))
+        v = np.float32(i) - half_across
+        runs[:] = 0
+        for j in range(along):
+            u = np.float32(j) - half_along
+            for lane in range(LANES):
+                column = np.int32(poses[0, lane] + v * poses[4, lane] + u * poses[2, lane])
+                line = np.int32(poses[1, lane] + v * poses[5, lane] + u * poses[3, lane])
+                index[lane] = np.uint64(line * stride + column)
+            for lane in range(LANES):
+                word = packed[index[lane]]
+                gx = np.float32(np.int32(word >> np.uint32(8) & mask) - zero)
+                gy = np.float32(np.int32(word >> np.uint32(18) & mask) - zero)
+                runs[0, lane] += np.int32(word & np.uint32(255))
+                runs[1, lane] += np.int32(abs(gx * poses[6, lane] + gy * poses[7, lane]))
+                runs[2, lane] += np.int32(abs(gy * poses[6, lane] - gx * poses[7, lane]))
+            for channel in range(CHANNELS):
+                for lane in range(LANES):
+                    out[channel, i + 1, j + 1, lane] = out[channel, i, j + 1, lane] + runs[channel, lane]
 
 
 @njit(cache=True, nogil=True)

@@ -1,50 +1,19 @@
 """Scores of a boosted classifier at many offsets of patches whose integral images lie side by side, one a lane."""
 
-from typing import Any
-
 import numpy as np
-from llvmlite import ir
-from numba import njit, types
-from numba.core import cgutils
-from numba.extending import intrinsic
+from numba import njit
 
 LANES = 16
 
 
-@intrinsic
-def sum_rectangles(_context, flat, corners, first, last, base, total):  # type: ignore[no-untyped-def]
-    """Sum rectangles ``first`` to ``last``, whose corners (n, 4) have the shares +, -, -, +, in each lane.
-
-    numba keeps the sums of the lanes in memory, rectangle by rectangle, and asks each time whether that is the memory
-    that it reads; here they stay in a register.
-    """
-    signature = types.void(flat, corners, first, last, base, total)
-    number = ir.IntType(64)
-
-    def generate(context: Any, build: Any, _signature: Any, arguments: Any) -> Any:
-        values, places, target = (
-            cgutils.create_struct_proxy(kind)(context, build, arguments[k]).data
-            for kind, k in ((flat, 0), (corners, 1), (total, 5))
-        )
-        lanes = ir.VectorType(ir.IntType(32), LANES)
-        begin, end = (
-            build.sext(arguments[k], number) if kind.bitwidth < 64 else arguments[k]
-            for k, kind in ((2, first), (3, last))
-        )
-        sums = cgutils.alloca_once_value(build, ir.Constant(lanes, [0] * LANES))
-        with cgutils.for_range_slice(build, begin, end, ir.Constant(number, 1), number) as (rectangle, _):
-            row, found = build.mul(rectangle, ir.Constant(number, 4)), []
-            for k in range(4):
-                place = build.load(build.gep(places, [build.add(row, ir.Constant(number, k))]))
-                start = build.gep(values, [build.add(arguments[4], place)])
-                found.append(build.load(build.bitcast(start, lanes.as_pointer())))
-                found[-1].align = 4
-            positive, negative = build.add(found[0], found[3]), build.add(found[1], found[2])
-            build.store(build.add(build.load(sums), build.sub(positive, negative)), sums)
-        build.store(build.load(sums), build.bitcast(target, lanes.as_pointer())).align = 4
-        return context.get_dummy_value()
-
-    return signature, generate
+@njit(cache=True, nogil=True)
+def sum_rectangles(flat, corners, first, last, base, total):  # type: ignore[no-untyped-def]
+    """Sum rectangles ``first`` to ``last``, whose corners (n, 4) have the shares +, -, -, +, in each lane."""
+    total[:] = 0
+    for r in range(first, last):
+        a, b, c, d = corners[r, 0] + base, corners[r, 1] + base, corners[r, 2] + base, corners[r, 3] + base
+        for lane in range(np.uint64(LANES)):
+            total[lane] += flat[a + lane] - flat[b + lane] - flat[c + lane] + flat[d + lane]
 
 
 @njit(cache=True, nogil=True)

@@ -18,11 +18,11 @@ import pandas as pd
 
 from schemas.arrays import GreyImage, Mask
 from schemas.detector import OnnxRecord
-from velfield.detection.cnn.network import current_device, device_limitations, open_session
 from velfield.detection.interface import Detections, Detector
 from velfield.detection.onnx.boxes import Boxes, cut_tile, decode, suppress, tile_corners, whole_in_tile
 from velfield.detection.onnx.description import check_output, describe_model
 from velfield.detection.orientation import fill_missing_orientation
+from velfield.detection.runtime import current_device, device_limitations, open_session
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
 

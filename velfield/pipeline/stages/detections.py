@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, Mask, Points
 from schemas.tables import DETECTION_COLUMNS
-from velfield.detection.cnn.network import use_device
 from velfield.detection.detect import FrameDetections, SearchedFrame, attach_crops, search_frame
 from velfield.detection.interface import Detections, Detector, concatenate
 from velfield.detection.orientation import CAR_ASPECT, axial_difference, fill_missing_orientation
 from velfield.detection.registry import load_detector
+from velfield.detection.runtime import use_device
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.rectified_frames import Window, WorkingFrame, WorkingGrid

@@ -14,9 +14,9 @@ from schemas.arrays import GreyImage
 from schemas.detector import CnnConfig
 from schemas.records import WorkingRecord
 from velfield.analysis.vehicle_scale import CAR_LENGTH_M
-from velfield.detection.cnn.network import use_device
 from velfield.detection.interface import Detector
 from velfield.detection.registry import load_detector, shipped_detector, train_detector
+from velfield.detection.runtime import use_device
 from velfield.detection.scale_search import working_scale
 from velfield.errors import InputError
 from velfield.pipeline.plan import Plan

@@ -1,0 +1,185 @@
+"""Inference of the network: heatmaps of images of any size, and of crops, by onnxruntime.
+
+On a processor it is run in 8 bits where the flight's ranges are known and the processor has them exactly, else in
+floating point. On a GPU it is run in floating point and on images of one size: cuDNN plans its convolutions again for
+each size, which takes 20 to 110 ms, and frames are searched by crops of some 60 sizes.
+"""
+
+import warnings
+from typing import Any, TypeAlias
+
+import cv2
+import numpy as np
+import onnxruntime as ort
+from numba import njit
+
+from schemas.arrays import Float32Array, GreyImage, IntArray
+from velfield.detection.cnn.graph import network_to_onnx
+from velfield.detection.cnn.network import ALIGNMENT, STRIDE, Network
+from velfield.detection.cnn.quantization import INEXACT, Ranges, is_exact, quantized_to_onnx
+from velfield.detection.runtime import (
+    STARTING,
+    check_device,
+    current_device,
+    limitations_are_reported,
+    on_cuda,
+    open_session,
+    uses_cuda,
+)
+from velfield.errors import DeviceWarning
+
+_TILE_PX, HALO_PX = 2048, 64
+"""Larger images are processed in tiles, each with a halo wider than the reach of the receptive field."""
+_GPU_TILE_PX = 1024
+"""On a GPU all images are, and they have their halo on every side."""
+BORDER_PX = 16
+"""An image is continued so far by reflection, for cars at its edge: F1 0.837 in place of 0.833 on the minsk clip, cars
+that the edge cuts included; with 64 px 0.836."""
+_BATCH_PX = 500_000
+"""Of the crops that the network is run on at once: more no longer stays in the processor's cache."""
+
+Heatmaps: TypeAlias = tuple[Float32Array, Float32Array]
+"""Probability of a car's centre, and cosine and sine of twice its orientation."""
+
+
+class Predictor:
+    """A network where it is run: on the device of `use_device`, in a session that is opened when first needed.
+
+    Parameters
+    ----------
+    ranges
+        Of its activations: with them it is run in 8 bits on a processor.
+    """
+
+    def __init__(self, network: Network, ranges: Ranges | None = None) -> None:
+        self.network, self.ranges = network, ranges
+        self._session: ort.InferenceSession | None = None
+
+    @property
+    def session(self) -> ort.InferenceSession:
+        """The network in onnxruntime, opened by one thread for all."""
+        with STARTING:
+            if self._session is None:
+                self._session = self._open()
+            return self._session
+
+    def _open(self) -> ort.InferenceSession:
+        check_device(current_device())
+        if uses_cuda(current_device()):
+            session = open_session(network_to_onnx(self.network), current_device())
+            # Of a session that a full GPU refused the processor would be slow: it has 8 bits.
+            if on_cuda(session) or self.ranges is None:
+                return session
+        if self.ranges is not None:
+            if is_exact():
+                return open_session(quantized_to_onnx(self.network, self.ranges), "cpu")
+            if not limitations_are_reported():
+                warnings.warn(INEXACT, DeviceWarning, stacklevel=4)
+        return open_session(network_to_onnx(self.network), "cpu")
+
+    def __call__(self, images: GreyImage) -> Heatmaps:
+        """Heatmaps (n, h / 2, w / 2) and vectors (n, 2, h / 2, w / 2) of images (n, h, w), multiples of `ALIGNMENT`."""
+        probability, orientation = self.session.run(None, {"image": np.ascontiguousarray(images[:, None])})
+        return probability[:, 0], orientation
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the session, which no other process can use."""
+        return self.__dict__ | {"_session": None}
+
+
+def predict_heatmap(predict: Predictor, image: GreyImage, *, border_px: int = BORDER_PX) -> Heatmaps:
+    """Probability and orientation of a car at each pixel of the heatmap, by tiled inference.
+
+    Parameters
+    ----------
+    image
+        (h, w) uint8 of any size.
+    border_px
+        How far it is continued by reflection; 0 of a crop that has context already. On a GPU always by `HALO_PX`.
+
+    Returns
+    -------
+    (h / 2, w / 2) probability and (2, h / 2, w / 2) orientation vector, sizes rounded up; heatmap pixel (x, y) is
+    centred at (2 x + 0.5, 2 y + 0.5) of the image.
+    """
+    gpu = on_cuda(predict.session)
+    border_px, unit = (HALO_PX, _GPU_TILE_PX) if gpu else (border_px, ALIGNMENT)
+    whole = [unit * -(-size // unit) for size in image.shape]
+    side = [unit if gpu else unit * -(-size // (unit * -(-size // _TILE_PX))) for size in whole]
+    end = [border_px + size - given for size, given in zip(whole, image.shape, strict=True)]
+    padded = cv2.copyMakeBorder(image, border_px, end[0], border_px, end[1], cv2.BORDER_REFLECT_101)
+    probability = np.empty((whole[0] // STRIDE, whole[1] // STRIDE), np.float32)
+    orientation = np.empty((2, *probability.shape), np.float32)
+    for y in range(0, whole[0], side[0]):
+        for x in range(0, whole[1], side[1]):
+            # Beside other tiles the halo, at the image's edge its border: so tiles do not show.
+            top, left = max(0, y + border_px - HALO_PX), max(0, x + border_px - HALO_PX)
+            tile = padded[top : y + border_px + side[0] + HALO_PX, left : x + border_px + side[1] + HALO_PX]
+            of_tile = predict(tile[None])
+            down, right = (y + border_px - top) // STRIDE, (x + border_px - left) // STRIDE
+            rows, columns = min(side[0], whole[0] - y), min(side[1], whole[1] - x)
+            inner = slice(down, down + rows // STRIDE), slice(right, right + columns // STRIDE)
+            part = slice(y // STRIDE, (y + rows) // STRIDE), slice(x // STRIDE, (x + columns) // STRIDE)
+            probability[part], orientation[:, *part] = of_tile[0][0][inner], of_tile[1][0][:, *inner]
+    size = -(-image.shape[0] // STRIDE), -(-image.shape[1] // STRIDE)
+    return probability[: size[0], : size[1]], orientation[:, : size[0], : size[1]]
+
+
+def predict_crops(predict: Predictor, image: GreyImage, crops: IntArray) -> Heatmaps:
+    """The same of crops of an image, each predicted as if it were alone, those of one size at once; on a GPU of the
+    whole image.
+
+    Parameters
+    ----------
+    image
+        (h, w) uint8, even.
+    crops
+        (n, 4) first row, first column, height and width; disjoint, at multiples of `ALIGNMENT` and of such sizes.
+
+    Returns
+    -------
+    As of `predict_heatmap`; on a processor zero where no crop is.
+    """
+    if on_cuda(predict.session):
+        return predict_heatmap(predict, image)
+    probability = np.zeros((image.shape[0] // STRIDE, image.shape[1] // STRIDE), np.float32)
+    orientation = np.zeros((2, *probability.shape), np.float32)
+    for height, width in np.unique(crops[:, 2:], axis=0).tolist():
+        corners = crops[(crops[:, 2:] == (height, width)).all(axis=1), :2]
+        tiled = max(height, width) > _TILE_PX
+        at_once = 1 if tiled else max(1, _BATCH_PX // (height * width))
+        for start in range(0, len(corners), at_once):
+            some = corners[start : start + at_once]
+            pixels = _cut_kernel(image, some, height, width)
+            if tiled:
+                heatmap, vector = predict_heatmap(predict, pixels[0], border_px=0)
+                heatmaps, vectors = heatmap[None], vector[None]
+            else:
+                heatmaps, vectors = predict(pixels)
+            _place_kernel(heatmaps, vectors, some // STRIDE, probability, orientation)
+    return probability, orientation
+
+
+@njit(cache=True, nogil=True)
+def _cut_kernel(image, corners, height, width):  # type: ignore[no-untyped-def]
+    """Crops (n, height, width) with these corners (n, 2): y, x."""
+    out = np.empty((len(corners), height, width), np.uint8)
+    for n in range(len(corners)):
+        top, left = corners[n]
+        for row in range(height):
+            source, target = image[top + row], out[n, row]
+            for x in range(np.uint64(width)):
+                target[x] = source[np.uint64(left) + x]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _place_kernel(heatmaps, vectors, corners, probability, orientation):  # type: ignore[no-untyped-def]
+    """Write the heatmaps and orientation vectors of crops where these lie (n, 2): y, x."""
+    height, width = heatmaps.shape[1:]
+    for n in range(len(corners)):
+        top, left = corners[n]
+        for row in range(height):
+            probability[top + row, left : left + width] = heatmaps[n, row]
+            for k in range(2):
+                orientation[k, top + row, left : left + width] = vectors[n, k, row]
