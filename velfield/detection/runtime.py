@@ -21,12 +21,12 @@ from schemas.flight import Device
 from velfield.errors import DeviceWarning, InputError
 
 _OPSET, _IR_VERSION = 17, 9
-"""Of the ONNX files: what onnxruntime has read since 1.15."""
+"""Versions of the ONNX files that are written: onnxruntime reads them since 1.15."""
 STARTING = RLock()
 """Held while a GPU is tried and sessions are opened: several threads at once would each do so."""
 _CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 _WARNINGS, _ERRORS, _FATAL = 2, 3, 4
-"""Of onnxruntime's levels of severity. The warnings of a session are of how its graph was exported, many lines in each
+"""onnxruntime's levels of severity. A session's warnings are about how its graph was exported, many lines in each
 process; without a session, its warnings and errors are shown."""
 _device: Device = "auto"
 _limitations_reported = False
@@ -42,7 +42,7 @@ def use_device(device: Device) -> None:
 
 
 def current_device() -> Device:
-    """What `use_device` set."""
+    """The device that `use_device` has set."""
     return _device
 
 
@@ -82,7 +82,7 @@ def _warn_of_cuda() -> None:
 
 
 def _cuda_fault() -> str | None:
-    """What was found in place of a GPU, if networks cannot run on one: tried once a process."""
+    """Reason why networks cannot run on a GPU, None if they can: tried once per process."""
     with STARTING:
         return _find_cuda_fault()
 
@@ -192,7 +192,7 @@ def _session_options() -> ort.SessionOptions:
 
 
 def _providers(*, gpu: bool) -> list[Any]:
-    """What a session asks for, first choice first.
+    """Execution providers that a session requests, first choice first.
 
     With TF32's shorter mantissa scores would differ visibly. Trying all of cuDNN's ways (EXHAUSTIVE) takes five times
     as long at each new size, and finds none that is faster.

@@ -31,12 +31,12 @@ from velfield.errors import DeviceWarning
 _TILE_PX, HALO_PX = 2048, 64
 """Larger images are processed in tiles, each with a halo wider than the reach of the receptive field."""
 _GPU_TILE_PX = 1024
-"""On a GPU all images are, and they have their halo on every side."""
+"""Side of the tiles of all images on a GPU, whose halo lies on every side."""
 BORDER_PX = 16
 """An image is continued so far by reflection, for cars at its edge: F1 0.837 in place of 0.833 on the minsk clip, cars
 that the edge cuts included; with 64 px 0.836."""
 _BATCH_PX = 500_000
-"""Of the crops that the network is run on at once: more no longer stays in the processor's cache."""
+"""Pixels of the crops that the network is run on at once: more no longer stays in the processor's cache."""
 
 Heatmaps: TypeAlias = tuple[Float32Array, Float32Array]
 """Probability of a car's centre, and cosine and sine of twice its orientation."""
@@ -48,7 +48,7 @@ class Predictor:
     Parameters
     ----------
     ranges
-        Of its activations: with them it is run in 8 bits on a processor.
+        Ranges of its activations: with them it is run in 8 bits on a processor.
     """
 
     def __init__(self, network: Network, ranges: Ranges | None = None) -> None:

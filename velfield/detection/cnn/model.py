@@ -13,7 +13,7 @@ from velfield.detection.cnn.inference import BORDER_PX, Predictor, predict_crops
 from velfield.detection.cnn.network import STRIDE
 
 SMOOTHING_SIGMA = 0.8
-"""Of the heatmap, in its pixels."""
+"""Standard deviation by which the heatmap is smoothed, in its pixels."""
 _LEAST_PROBABILITY = 1e-6
 _SPAN = 64
 """Pixels of the heatmap that are searched for peaks, or are not, together."""
@@ -63,7 +63,7 @@ def find_peaks(
     probability, orientation
         (h, w) and (2, h, w), a pixel for every ``stride`` of the image.
     valid
-        Of the image: where a peak counts; none: everywhere.
+        Mask of the image, true where a peak counts; None: everywhere.
     min_probability
         After smoothing.
     """

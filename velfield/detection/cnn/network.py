@@ -32,7 +32,7 @@ class Conv:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Of the weights: kernel taps, channels in, channels out."""
+        """Shape of the weights: kernel taps, channels in, channels out."""
         return self.kernel**2, self.channels_in, self.channels_out
 
 
@@ -81,7 +81,7 @@ resolution: 15.9 GMAC a frame of 2560 x 1920."""
 STRIDE = 2
 """Working px a pixel of the heatmap."""
 ALIGNMENT = 8
-"""What the height and the width of an image must be multiples of: two to the number of halvings."""
+"""Height and width of an image must be multiples of this: two to the number of halvings."""
 
 
 def convolutions(layers: Topology) -> dict[str, Conv]:
