@@ -82,8 +82,8 @@ class BaseConfig(Model):
     """Case deletion ends when the mean error is below this. Paper: 2 px, at which some outliers remain."""
     min_control_points: PositiveInt = 40
     """With fewer control points left, the given image does not show this area."""
-    median_frames: PositiveInt = 64
-    """Frames, spread over the flight, whose median is the base image if none is given, and the background."""
+    median_frames: PositiveInt = 40
+    """At most so many frames, spread over the flight, whose median is the base image if none is given."""
 
 
 class RegistrationConfig(Model):

@@ -9,7 +9,7 @@ from schemas.job import Inputs, Job
 from velfield.pipeline.configuration import resolve_config
 from velfield.pipeline.plan import make_plan
 from velfield.pipeline.stages.frames import create_frame_store, read_unit
-from velfield.pipeline.stages.registration import detect_unit_keypoints, vehicle_free_mask
+from velfield.pipeline.stages.registration import detect_frame_keypoints, vehicle_free_mask
 
 
 def test_no_key_point_lies_on_a_given_vehicle(tmp_path: Path) -> None:
@@ -35,7 +35,7 @@ def test_no_key_point_lies_on_a_given_vehicle(tmp_path: Path) -> None:
     assert not free[46:74, 52:108].any()
     assert free[:43].all()
     assert free[:, 114:].all()
-    everywhere, masked, unsized = (found.keypoints.xy for found in detect_unit_keypoints(plan, [0, 1, 2]))
+    everywhere, masked, unsized = (detect_frame_keypoints(plan, frame).xy for frame in range(3))
 
     def on_the_vehicle(xy: np.ndarray) -> int:
         return int(((np.abs(xy - [80, 60])) < [28, 13]).all(axis=1).sum())

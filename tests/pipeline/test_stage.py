@@ -25,7 +25,7 @@ INPUTS = InputsRecord(source=SOURCE, base="b", labels="l", detector="d", detecti
 
 
 def functions(stage: Stage) -> list[str]:
-    named = (stage.prepare, stage.block, stage.block_frames, stage.tiles, stage.unit, stage.remap)
+    named = (stage.prepare, stage.block, stage.tiles, stage.unit, stage.remap)
     return [name for name in named if name is not None]
 
 

@@ -17,7 +17,7 @@ from velfield.pipeline.plan import Plan, make_plan
 from velfield.pipeline.stage import STAGE, stages_before
 from velfield.pipeline.stages.base_image import build_base
 from velfield.pipeline.stages.georeference import georeference_run
-from velfield.pipeline.stages.registration import detect_unit_keypoints, register_unit
+from velfield.pipeline.stages.registration import register_unit
 from velfield.pipeline.units import prepare_stage
 from velfield.registration.intersensor import register_intersensor
 from velfield.run.frame_transforms import read_grid, read_lens
@@ -61,7 +61,7 @@ def views(base: np.ndarray) -> list[np.ndarray]:
 
 def test_the_note_gives_scale_and_rotation(base: np.ndarray, tmp_path: Path) -> None:
     plan = plan_on(base, views(base), tmp_path, gsd_m=0.2)
-    outcome = build_base(plan, [detect_unit_keypoints(plan, range(3))])
+    outcome = build_base(plan)
     assert "frames registered directly to the base image: scale 1.00, rotation 5° cw" in outcome.notes[0]
     assert not outcome.warnings
     assert outcome.counts["covered"] == 1.0
@@ -71,7 +71,7 @@ def test_the_note_gives_scale_and_rotation(base: np.ndarray, tmp_path: Path) -> 
 def test_another_scale_is_related_to_gsd_m(base: np.ndarray, tmp_path: Path) -> None:
     small = cv2.resize(base, None, fx=0.7, fy=0.7, interpolation=cv2.INTER_AREA)
     plan = plan_on(small, views(base), tmp_path, gsd_m=0.2)
-    outcome = build_base(plan, [detect_unit_keypoints(plan, range(3))])
+    outcome = build_base(plan)
     assert not outcome.warnings
     prepare_stage(plan, STAGE["registration"])
     register_unit(plan, range(3))
@@ -87,13 +87,13 @@ def test_a_base_image_of_low_resolution_is_rejected_with_the_size_needed(base: n
     with pytest.raises(
         InputError, match=r"found 0\.35 base pixels per frame pixel, expected 0\.5 to 2; .* (639|640|641) x"
     ):
-        build_base(plan, [detect_unit_keypoints(plan, range(3))])
+        build_base(plan)
 
 
 def test_a_base_image_of_a_part_of_the_flight_warns_with_its_coverage(base: np.ndarray, tmp_path: Path) -> None:
     part = np.ascontiguousarray(base[:, :420])
     plan = plan_on(part, views(base), tmp_path)
-    warnings = build_base(plan, [detect_unit_keypoints(plan, range(3))]).warnings
+    warnings = build_base(plan).warnings
     # Frames are 480 px wide about column 315: from column 75 on, so 345 of 480 columns are covered.
     (percent,) = (int(word[:-1]) for line in warnings for word in line.split() if word.endswith("%"))
     assert 66 <= percent <= 78
@@ -102,7 +102,7 @@ def test_a_base_image_of_a_part_of_the_flight_warns_with_its_coverage(base: np.n
 def test_frames_with_a_rolling_shutter_register_directly(base: np.ndarray, tmp_path: Path) -> None:
     frames = [displace_rows(frame) for frame in views(base)]
     plan = plan_on(base, frames, tmp_path)
-    build_base(plan, [detect_unit_keypoints(plan, range(3))])
+    build_base(plan)
     assert read_grid(plan.layout).registered_to == "given"
     assert isinstance(register_intersensor(frames[1], base, plan.config.base, lens=pinhole(SHAPE)), Failure)
 
@@ -117,7 +117,7 @@ def test_the_frames_matches_with_the_given_image_correct_the_lens(tmp_path: Path
     taken = HarrisLens(0.13, 319.5, 239.5, 400.0)
     record = CameraRecord.model_validate_json(plan.layout.camera.read_bytes())
     plan.layout.camera.write_text(record.model_copy(update={"lens": taken.to_record()}).model_dump_json())
-    outcome = build_base(plan, [detect_unit_keypoints(plan, range(4))])
+    outcome = build_base(plan)
     assert any(note.startswith("lens by the base image: k = ") for note in outcome.notes), outcome.notes
     assert plan.layout.map_lens in outcome.outputs
     points = frame_grid(shape)
@@ -137,7 +137,7 @@ def test_a_lens_far_off_in_the_corners_is_corrected_before_the_given_image_is_ju
     taken = HarrisLens(0.346, 322.5, 248.0, 400.0)
     record = CameraRecord.model_validate_json(plan.layout.camera.read_bytes())
     plan.layout.camera.write_text(record.model_copy(update={"lens": taken.to_record()}).model_dump_json())
-    build_base(plan, [detect_unit_keypoints(plan, range(4))])
+    build_base(plan)
     points = frame_grid(shape)
     before = rms_after_homography(taken.undistort_points(points), true.undistort_points(points))
     after = rms_after_homography(read_lens(plan.layout).undistort_points(points), true.undistort_points(points))
@@ -147,6 +147,6 @@ def test_a_lens_far_off_in_the_corners_is_corrected_before_the_given_image_is_ju
 
 def test_a_lens_that_is_right_stays(base: np.ndarray, tmp_path: Path) -> None:
     plan = plan_on(base, views(base), tmp_path, calibrate="auto")
-    outcome = build_base(plan, [detect_unit_keypoints(plan, range(3))])
+    outcome = build_base(plan)
     assert not any("lens" in note for note in outcome.notes)
     assert not plan.layout.map_lens.exists()

@@ -265,7 +265,9 @@ def test_own_base_image_serves_as_well_as_a_given_one() -> None:
     lens = lens_of(flight)
     greys = [flight.frame(k) for k in range(6)]
     keypoints = {k: detect_keypoints(grey, CONFIG) for k, grey in enumerate(greys)}
-    own = build_own_base(greys.__getitem__, keypoints, reference=4, lens=lens, config=CONFIG, threads=2)
+    own = build_own_base(
+        greys.__getitem__, keypoints.__getitem__, range(6), reference=4, lens=lens, config=CONFIG, threads=2
+    )
     assert own
     assert own.frames == 6
     base = prepare_base(own.image, CONFIG, mask=own.valid, frame_shape=greys[0].shape)
@@ -285,7 +287,12 @@ def test_own_base_of_strange_frames_is_a_failure_with_counts() -> None:
     greys = [rng.integers(0, 255, (60, 80), dtype=np.uint8).repeat(4, 0).repeat(4, 1) for _ in range(3)]
     keypoints = {k: detect_keypoints(grey, CONFIG) for k, grey in enumerate(greys)}
     found = build_own_base(
-        greys.__getitem__, keypoints, reference=0, lens=HarrisLens(0, 159.5, 119.5, 200), config=CONFIG
+        greys.__getitem__,
+        keypoints.__getitem__,
+        range(3),
+        reference=0,
+        lens=HarrisLens(0, 159.5, 119.5, 200),
+        config=CONFIG,
     )
     assert not found
     assert found.reason == "1 of 3 frames overlap with frame 0, 3 needed"

@@ -7,7 +7,7 @@ import pytest
 from velfield.camera.lens import HarrisLens, pinhole
 from velfield.detection.frame import ComparableFrame
 from velfield.registration import warp
-from velfield.registration.background import median_background
+from velfield.registration.background import NOT_COVERED, median_of_stack
 from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, fit_normalisation
 from velfield.registration.warp import CELL_PX, Rectification, footprint, warp_to_base
 
@@ -105,40 +105,24 @@ def test_footprint_holds_the_frame() -> None:
     assert footprint(moved(shift), (HEIGHT, WIDTH)) == pytest.approx((7, -3, WIDTH + 6, HEIGHT - 4))
 
 
-def test_background_has_no_traffic_on_it() -> None:
-    rng = np.random.default_rng(1)
-    ground = rng.integers(60, 120, (50, 80), dtype=np.uint8)
-    frames, masks = [], []
+def test_the_median_has_no_traffic_on_it() -> None:
+    ground = np.random.default_rng(1).integers(60, 120, (50, 80), dtype=np.uint8)
+    stack = np.tile(ground, (11, 1, 1))
     for k in range(11):
-        frame = ground.copy()
-        frame[20:28, 7 * k : 7 * k + 12] = 250
-        frames.append(frame)
-        masks.append(np.ones(frame.shape, bool))
-    found = median_background(frames, masks, trim=0.2)
-    np.testing.assert_array_equal(found.median, ground)
-    np.testing.assert_array_equal(found.high, ground)
-    assert found.valid.all()
+        stack[k, 20:28, 7 * k : 7 * k + 12] = 250
+    np.testing.assert_array_equal(median_of_stack(stack, np.full(ground.shape, 11)), ground)
 
 
-def test_background_is_the_median_of_those_that_see() -> None:
-    rng = np.random.default_rng(2)
-    frames = [rng.integers(0, 256, (9, 7), dtype=np.uint8) for _ in range(6)]
-    masks = [rng.random((9, 7)) < 0.6 for _ in range(6)]
-    masks[0][0, 0] = False
-    for mask in masks:
-        mask[0, 0] = False
-    found = median_background(frames, masks, trim=0.0)
-    stack = np.ma.array(frames, mask=~np.array(masks))
-    seen = found.valid
-    plain = np.floor(np.ma.median(stack, axis=0).filled(0)[seen] + 0.5)
-    np.testing.assert_array_equal(found.median[seen], plain)
-    np.testing.assert_array_equal(found.low[seen], stack.min(axis=0).filled(0)[seen])
-    assert not seen[0, 0]
-
-
-def test_background_of_nothing_is_refused() -> None:
-    with pytest.raises(ValueError, match="0 images"):
-        median_background([], [])
+@pytest.mark.parametrize("frames", [1, 2, 3, 6, 25, 40, 64])
+def test_the_median_is_that_of_the_frames_that_cover_a_pixel(frames: int) -> None:
+    rng = np.random.default_rng(frames)
+    stack = rng.integers(0, 256, (frames, 3, 700), dtype=np.uint8)
+    covered = rng.random(stack.shape) < 0.6
+    covered[:, 0, 0] = False
+    stack[~covered] = NOT_COVERED
+    found = median_of_stack(stack, covered.sum(axis=0))
+    plain = np.ma.median(np.ma.array(stack, mask=~covered), axis=0).filled(0)
+    np.testing.assert_array_equal(found, np.floor(plain + 0.5))
 
 
 @pytest.mark.parametrize(("scale", "amplitude_px"), [(1.0, 0.3), (0.9, 6.0), (0.4, 0.3)])

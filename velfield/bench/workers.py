@@ -19,7 +19,7 @@ def compute_bare(plan: Plan, pool: Executor, stages: Iterable[str] = tuple(STAGE
         prepare_stage(plan, stage)
         under_way = []
         for unit in stage_units(plan, stage):
-            frames = unit_blocks(plan, stage, unit) if stage.block else []
+            frames = unit_blocks(plan, unit) if stage.block else []
             under_way.append((unit, [pool.submit(resolve(str(stage.block)), plan, part) for part in frames]))
         ends = []
         for unit, blocks in under_way:

@@ -39,7 +39,7 @@ def unit_graph(plan: Plan, stage: Stage, unit: Unit) -> Graph:
     constant = _constant(plan)
     blocks = []
     if stage.block is not None:
-        block, parts = resolve(stage.block), unit_blocks(plan, stage, unit)
+        block, parts = resolve(stage.block), unit_blocks(plan, unit)
         # Dask computes what is alike in the order of its keys, which it would draw at random: the last block, a short
         # one, may so come first, and a long one be left over for one thread alone.
         keys = [f"{stage.name}-{unit.name}-{k:06d}-{uuid4().hex}" for k in range(len(parts))]

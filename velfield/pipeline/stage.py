@@ -64,7 +64,6 @@ class Stage:
     unit : function ``(plan, *part, *blocks) -> StageResult``; ``part`` is the unit's frames or group of tiles, none
         where the stage is whole; ``blocks`` are the results of the stage's blocks, where it has any.
     block : function ``(plan, frames) -> Any`` of a few frames: the costly part of a unit, and the parallel one.
-    block_frames : function ``(plan) -> frames`` that the blocks of a whole stage are cut of.
     tiles : function ``(plan) -> groups`` of a stage that is cut by tiles.
     prepare : function ``(plan) -> None`` that creates the stage's store before its units fill it.
     store : the store's path in the run folder.
@@ -86,7 +85,6 @@ class Stage:
     lines: tuple[Line, ...]
     unit: str
     block: str | None = None
-    block_frames: str | None = None
     tiles: str | None = None
     prepare: str | None = None
     store: str | None = None
@@ -166,10 +164,10 @@ STAGES: tuple[Stage, ...] = (
         config=("lens",),
         new_base=NewBase.SHARED,
     ),
-    # Key points of spread frames, two passes to their median; or the registration of a given image.
+    # Spread frames registered to the sharpest, and their median; or the registration of a given image.
     Stage(
         name="base",
-        version=12,
+        version=13,
         label="base image",
         lines=(
             Line(
@@ -179,8 +177,6 @@ STAGES: tuple[Stage, ...] = (
             ),
             Line("base image {width:.0f} x {height:.0f} px from {frames:.0f} frames"),
         ),
-        block=f"{_STAGES}.registration:detect_unit_keypoints",
-        block_frames=f"{_STAGES}.base_image:keypoint_frames",
         unit=f"{_STAGES}.base_image:build_base",
         after=("frames", "lens"),
         inputs=("base", "detections"),

@@ -1,6 +1,5 @@
 """The units of a stage: what is computed, committed and, should it fail, tried again as one."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -92,15 +91,12 @@ def stage_units(plan: Plan, stage: Stage) -> list[Unit]:
     return [Unit(WHOLE)]
 
 
-def unit_blocks(plan: Plan, stage: Stage, unit: Unit) -> list[Sequence[int]]:
-    """The blocks of frames that a unit is computed by, where the stage has such.
+def unit_blocks(plan: Plan, unit: Unit) -> list[range]:
+    """The blocks of frames that a unit is computed by, where its stage has such.
 
     Blocks of a unit of frames end at multiples of their length in the flight, where frames that are searched whole lie.
     """
     step = plan.config.work.block_frames
-    if stage.block_frames is not None:
-        frames = resolve(stage.block_frames)(plan)
-        return [frames[start : start + step] for start in range(0, len(frames), step)]
     first, last = unit.frames.start, unit.frames.stop
     ends = [*range((first // step + 1) * step, last, step), last]
     return [range(start, end) for start, end in zip([first, *ends[:-1]], ends, strict=True)]

@@ -1,44 +1,48 @@
 """The flight's own base image: a median mosaic of its frames, free of traffic.
 
 First of two passes: frames sampled over the flight are registered to the sharpest one (the reference), and their median
-on its undistorted grid is the base image. It is built in rounds: first a few frames are registered to the reference,
-then all to the median of the round before, which sharpens the median and adds frames that do not overlap the reference.
-The second pass is the usual registration of all frames of the flight to this base image.
+on its undistorted grid is the base image. Each starts from the one before, by optical flow, as in any registration:
+keypoints are detected where that fails. Frames that do not overlap the reference are added in further rounds, in which
+all are registered to the median of the round before. The second pass is the usual registration of all frames of the
+flight to this base image.
 
 The rolling shutter of the reference frame distorts the grid, and all frames would be registered to that distortion. Its
 row motion is estimated as the mean displacement of all frames' control points relative to their smooth maps, as a
 function of the reference's row: the frames' own row motions average out. It is removed from the grid in every round.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 
 import cv2
 import numpy as np
 
-from schemas.arrays import FloatArray, GreyImage, Mask
+from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
 from velfield.registration import kernels
-from velfield.registration.background import median_background
-from velfield.registration.intrasensor import BaseReference, FrameRegistration, prepare_base, register_frame
+from velfield.registration.background import NOT_COVERED, median_of_stack
+from velfield.registration.intrasensor import BaseReference, FrameRegistration, prepare_base, register_chain
 from velfield.registration.joint import ControlPoints
 from velfield.registration.keypoints import Keypoints
 from velfield.registration.transforms import FrameTransform, PolyprojectiveTransform, as_points, fit_normalisation
-from velfield.registration.warp import Window, footprint, warp_to_base
+from velfield.registration.warp import RawToBase, Rectification, Window, footprint, warp_to_base
 
 ReadFrame = Callable[[int], GreyImage]
+DetectKeypoints = Callable[[int], Keypoints]
 
 _MIN_FRAMES = 3
-_FIRST_FRAMES = 24
-"""Frames of the first round, in which the reference is a single frame."""
 _MAX_ROUNDS = 4
-"""Rounds after the second only add frames that did not overlap the base image before."""
+"""Rounds after the first add frames that did not overlap the base image before."""
+_CHAIN_FRAMES = 16
+"""Frames of a chain, each started from the one before, the first by its keypoints."""
 _MAX_EXTENT = 2.0
 """The base image extends at most this many frame sizes beyond the reference on each side."""
-_STACK_BYTES = 200_000_000
+_STACK_BYTES = 400_000_000
+"""Rectified frames in memory at a time: a band of rows of all of them."""
 _MOTION_KNOTS = 48
 _MOTION_RIDGE = 1e-3
 
@@ -112,7 +116,8 @@ class _RowCorrectedMap:
 
 def build_own_base(
     read: ReadFrame,
-    keypoints: Mapping[int, Keypoints],
+    detect: DetectKeypoints,
+    frames: Sequence[int],
     *,
     reference: int,
     lens: Lens,
@@ -125,12 +130,14 @@ def build_own_base(
     ----------
     read
         Frame number to grey frame (h, w) uint8.
-    keypoints
-        Keypoints, raw px, of the frames to use, including the reference.
+    detect
+        Frame number to its keypoints, raw px.
+    frames
+        The frames to use, in time order, including the reference.
     reference
         The frame that defines the grid: the sharpest.
     threads
-        Frames registered concurrently; the result does not depend on it.
+        Chains registered, and frames rectified, concurrently; the result does not depend on it.
 
     Returns
     -------
@@ -139,23 +146,19 @@ def build_own_base(
     grey = read(reference)
     height = grey.shape[0]
     grid, base, mask = _undistort_reference(grey, lens)
-    frames = sorted(keypoints)
-    first_round = np.unique(np.linspace(0, len(frames) - 1, min(_FIRST_FRAMES, len(frames))).round().astype(int))
-    selected = sorted({reference, *(frames[k] for k in first_round)})
     motion_px, count = np.zeros((height, 2)), 0
-    for iteration in range(_MAX_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         reference_image = prepare_base(base, config, mask=mask, frame_shape=grey.shape)
-        registered = _register_frames(read, keypoints, selected, reference_image, lens, config, threads)
+        registered = _register_frames(read, detect, frames, reference_image, lens, config, threads)
         if len(registered) < _MIN_FRAMES:
             return Failure(
-                f"{len(registered)} of {len(selected)} frames overlap with frame {reference}, {_MIN_FRAMES} needed"
+                f"{len(registered)} of {len(frames)} frames overlap with frame {reference}, {_MIN_FRAMES} needed"
             )
         motion = _estimate_row_motion(registered, grid)
         motion_px += _evaluate_spline(motion, np.arange(height, dtype=np.float64), height)
-        offset, base, mask = _build_mosaic(read, registered, grid, motion)
+        offset, base, mask = _build_mosaic(read, registered, grid, motion, threads)
         grid = replace(grid, origin=(grid.origin[0] + offset[0], grid.origin[1] + offset[1]))
-        selected = frames
-        if iteration > 0 and (len(registered) == len(frames) or len(registered) == count):
+        if len(registered) in (len(frames), count):
             break
         count = len(registered)
     return OwnBase(base, mask, grid.origin, len(registered), motion_px)
@@ -172,20 +175,22 @@ def _undistort_reference(grey: GreyImage, lens: Lens) -> tuple[_Grid, GreyImage,
 
 def _register_frames(
     read: ReadFrame,
-    keypoints: Mapping[int, Keypoints],
-    frames: list[int],
+    detect: DetectKeypoints,
+    frames: Sequence[int],
     base: BaseReference,
     lens: Lens,
     config: RegistrationConfig,
     threads: int,
 ) -> dict[int, tuple[FrameTransform, ControlPoints]]:
-    """Register frames to the base image, each independently: maps and control points of those that succeed."""
+    """Register frames to the base image, in chains: maps and control points of those that succeed."""
+    chains = np.array_split(np.asarray(frames), -(-len(frames) // _CHAIN_FRAMES))
 
-    def register(frame: int) -> FrameRegistration:
-        return register_frame(read(frame), keypoints[frame], base, lens, config)
+    def register(chain: IntArray) -> list[FrameRegistration]:
+        shown = ((int(frame), read(int(frame)), lru_cache(1)(partial(detect, int(frame)))) for frame in chain)
+        return register_chain(shown, base, lens, config)
 
     with ThreadPoolExecutor(max_workers=threads) as pool:
-        results = list(pool.map(register, frames))
+        results = [result for chain in pool.map(register, chains) for result in chain]
     return {
         frame: (result.transform, result.control_points)
         for frame, result in zip(frames, results, strict=True)
@@ -230,22 +235,43 @@ def _row_motion(coefficients: FloatArray, grid: _Grid, xy_base: FloatArray) -> F
 
 
 def _build_mosaic(
-    read: ReadFrame, registered: Mapping[int, tuple[FrameTransform, ControlPoints]], grid: _Grid, motion: FloatArray
+    read: ReadFrame,
+    registered: Mapping[int, tuple[FrameTransform, ControlPoints]],
+    grid: _Grid,
+    motion: FloatArray,
+    threads: int,
 ) -> tuple[tuple[int, int], GreyImage, Mask]:
     """Offset from the grid's origin, median of the frames, and mask of the pixels that enough frames cover."""
     width, height = grid.width, grid.height
     maps = {frame: _RowCorrectedMap(registered[frame][0], grid, motion) for frame in sorted(registered)}
     boxes = np.array([footprint(t, (height, width)) for t in maps.values()])
     reach = _MAX_EXTENT * max(width, height)
-    x0, y0 = np.maximum(np.floor(np.nanmin(boxes[:, :2], axis=0)), -reach).astype(int)
-    x1, y1 = np.minimum(np.ceil(np.nanmax(boxes[:, 2:], axis=0)), np.array([width, height]) + reach).astype(int)
-    band = max(64, _STACK_BYTES // (2 * len(maps) * int(x1 - x0 + 1)))
-    needed = min(_MIN_FRAMES, len(maps))
-    images, masks = [], []
-    for top in range(int(y0), int(y1) + 1, band):
-        window: Window = (int(x0), top, int(x1 - x0) + 1, min(band, int(y1) + 1 - top))
-        warped = [warp_to_base(read(f), t, window=window, interpolation=cv2.INTER_CUBIC) for f, t in maps.items()]
-        background = median_background([image for image, _ in warped], [mask for _, mask in warped])
-        images.append(background.median)
-        masks.append(background.count >= needed)
-    return (int(x0), int(y0)), np.concatenate(images), np.concatenate(masks)
+    x0, y0 = np.maximum(np.floor(np.nanmin(boxes[:, :2], axis=0)), -reach).astype(int).tolist()
+    x1, y1 = (
+        np.minimum(np.ceil(np.nanmax(boxes[:, 2:], axis=0)), np.array([width, height]) + reach).astype(int).tolist()
+    )
+    band = max(64, _STACK_BYTES // (len(maps) * (x1 - x0 + 1)))
+    windows: list[Window] = [(x0, top, x1 - x0 + 1, min(band, y1 + 1 - top)) for top in range(y0, y1 + 1, band)]
+    with ThreadPoolExecutor(max_workers=threads) as pool:
+        parts = [_median_in(read, maps, window, pool) for window in windows]
+    covered = np.concatenate([count for _, count in parts]) >= min(_MIN_FRAMES, len(maps))
+    return (x0, y0), np.concatenate([median for median, _ in parts]), covered
+
+
+def _median_in(
+    read: ReadFrame, maps: Mapping[int, RawToBase], window: Window, pool: ThreadPoolExecutor
+) -> tuple[GreyImage, IntArray]:
+    """The median of frames in a window of the grid, and the number of those that cover each pixel, both (h, w)."""
+    stack = np.empty((len(maps), window[3], window[2]), np.uint8)
+
+    def rectify(k: int, frame: int) -> Mask:
+        found = Rectification(read(frame), maps[frame], window=window)
+        found.resample_all()
+        stack[k] = found.image
+        stack[k][~found.valid] = NOT_COVERED
+        return found.valid
+
+    count = np.zeros(stack.shape[1:], np.uint8)
+    for valid in pool.map(rectify, range(len(maps)), maps):
+        count += valid
+    return median_of_stack(stack, count), count

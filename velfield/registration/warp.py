@@ -339,6 +339,10 @@ class Rectification:
         resample_cells(extend_border(source), coarse, step, np.argwhere(cells), image, valid)
         return image, valid
 
+    def resample_all(self) -> None:
+        """Fill `image` and `valid` everywhere."""
+        self.resample(np.ones(self._done.shape, bool))
+
     def resample(self, cells: Mask, side_px: int = CELL_PX) -> None:
         """Fill `image` and `valid` in the cells of `CELL_PX` in which those of a mask lie, unless filled before.
 

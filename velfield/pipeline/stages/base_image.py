@@ -5,9 +5,8 @@ to the flight's own base image, a median mosaic free of traffic: the same camera
 pixel. A given image is then first checked against one frame, and the own base image is registered to it once.
 """
 
-import os
-from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 
 import cv2
@@ -19,23 +18,17 @@ from velfield.camera.lens import Lens, pinhole
 from velfield.camera.map_fit import fit_lens_to_map
 from velfield.errors import Failure, InputError
 from velfield.exports.cog import write_cog
-from velfield.parallel import parallel_map
+from velfield.parallel import parallel_map, usable_processors
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.pipeline.stages.base_fit import BaseFit, check_scale, covered_fraction
 from velfield.pipeline.stages.direct import accept_lens, register_directly, trial_frames
 from velfield.pipeline.stages.lens import select_usable_frames
-from velfield.pipeline.stages.registration import (
-    FrameKeypoints,
-    detect_unit_keypoints,
-    read_given_base,
-    write_reference,
-)
+from velfield.pipeline.stages.registration import detect_frame_keypoints, read_given_base, write_reference
 from velfield.registration.base_mesh import fit_base_mesh
 from velfield.registration.intersensor import IntersensorResult, register_intersensor
 from velfield.registration.intrasensor import prepare_base
-from velfield.registration.keypoints import Keypoints
-from velfield.registration.own_base import OwnBase, build_own_base
+from velfield.registration.own_base import DetectKeypoints, OwnBase, build_own_base
 from velfield.report.figures import png_bytes
 from velfield.run.commits import write_atomically
 from velfield.run.frame_transforms import base_mesh_to_record, read_lens
@@ -46,23 +39,21 @@ from velfield.sources.geo import BaseRaster, reconcile_gsd
 _LENS_ROUNDS = 4
 _MIN_LENS_CHANGE_PX = 0.7
 """RMS change over the frame that is worth it: the mesh follows less, and a rolling shutter passes for less."""
-_THREADS = min(4, os.cpu_count() or 1)
+_SAME_TRAFFIC_S, _FEW_FRAMES = 0.4, 16
+"""Frames of the median are no nearer, for within that time few vehicles pass their own length; at least so many."""
 _MOST_REFERENCES, _REFERENCES_APART, _OVERLAPPING = 3, 0.2, 0.5
 """Frames that are tried as the reference, how far apart they are as a fraction of the flight, and the fraction of
 frames that overlap with one after which no other is tried."""
 
 
-def keypoint_frames(plan: Plan) -> list[int]:
-    """Frames whose keypoints are detected before: none where an image is given, which may need those of a few only."""
-    return _spread_frames(plan) if plan.job.inputs.base is None else []
-
-
 def _spread_frames(plan: Plan) -> list[int]:
-    """Frames sampled over the flight, of which the own base image is built."""
-    return select_usable_frames(plan, plan.config.base.median_frames)
+    """Frames sampled over the flight, of which the own base image is built: nearer ones show the same traffic."""
+    times_s = plan.info.times_s[plan.indices[[0, -1]]]
+    enough = max(_FEW_FRAMES, round(float(times_s[1] - times_s[0]) / _SAME_TRAFFIC_S))
+    return select_usable_frames(plan, min(enough, plan.config.base.median_frames))
 
 
-def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageResult:
+def build_base(plan: Plan) -> StageResult:
     """Write ``base/``.
 
     Raises
@@ -70,8 +61,8 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageR
     InputError
         The given base image does not show this area (with the scores), or too few frames overlap.
     """
-    keypoints = {result.frame: result.keypoints for block in blocks for result in block}
     given = read_given_base(plan)
+    detect = cache(partial(detect_frame_keypoints, plan))
     if given is not None:
         reconcile_gsd(given.gsd_m, plan.config.gsd_m)  # the stage `georeference` does it again, after much work
     plan.layout.map_lens.unlink(missing_ok=True)
@@ -81,8 +72,8 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageR
     spread = _spread_frames(plan)
     reference = max(spread, key=lambda frame: float(np.nan_to_num(sharpness[frame])))
     if given is not None:
-        keypoints |= _detect_keypoints(plan, _missing(trial_frames(spread), keypoints))
-        direct = register_directly(plan, given, keypoints, lens)
+        trial = trial_frames(spread)
+        direct = register_directly(plan, given, dict(zip(trial, parallel_map(detect, trial), strict=True)), lens)
         if direct.fit is not None:  # half a pixel all over the frame: no other area reaches that
             grid = _given_grid(plan, given, reference, direct.fit)
             layout.own_to_base.unlink(missing_ok=True)
@@ -95,9 +86,7 @@ def build_base(plan: Plan, blocks: Sequence[Sequence[FrameKeypoints]]) -> StageR
             return replace(finished, notes=[*finished.notes, *direct.notes])
         lens, lens_notes = _check_area(plan, store.read(reference), given, direct.lens)
         lens_notes = lens_notes or direct.notes
-        keypoints |= _detect_keypoints(plan, _missing(spread, keypoints))
-        keypoints = dict(sorted(keypoints.items()))
-    own, reference = _build_own_base(plan, keypoints, lens, _reference_frames(spread, sharpness))
+    own, reference = _build_own_base(plan, detect, lens, spread, _reference_frames(spread, sharpness))
     if isinstance(own, Failure):
         raise InputError(f"no base image can be built from the flight: {own.reason}; give one with --base")
     write_atomically(layout.own_base_image, png_bytes(own.image))
@@ -136,7 +125,7 @@ def _reference_frames(spread: list[int], sharpness: FloatArray) -> list[int]:
 
 
 def _build_own_base(
-    plan: Plan, keypoints: dict[int, Keypoints], lens: Lens, references: list[int]
+    plan: Plan, detect: DetectKeypoints, lens: Lens, frames: list[int], references: list[int]
 ) -> tuple[OwnBase | Failure, int]:
     """The own base image on the grid of the first frame with which most others overlap, and that frame.
 
@@ -146,29 +135,21 @@ def _build_own_base(
     for reference in references:
         own = build_own_base(
             store.read,
-            keypoints,
+            detect,
+            frames,
             reference=reference,
             lens=lens,
             config=plan.config.registration,
-            threads=_THREADS,
+            threads=usable_processors(),
         )
         tried.append((own, reference))
-        if not isinstance(own, Failure) and own.frames > _OVERLAPPING * len(keypoints):
+        if not isinstance(own, Failure) and own.frames > _OVERLAPPING * len(frames):
             break
     return max(tried, key=lambda pair: 0 if isinstance(pair[0], Failure) else pair[0].frames)
 
 
 def _written_lens(layout: RunLayout) -> list[Path]:
     return [layout.map_lens] if layout.map_lens.exists() else []
-
-
-def _missing(frames: list[int], keypoints: dict[int, Keypoints]) -> list[int]:
-    return [frame for frame in frames if frame not in keypoints]
-
-
-def _detect_keypoints(plan: Plan, frames: list[int]) -> dict[int, Keypoints]:
-    blocks = parallel_map(lambda frame: detect_unit_keypoints(plan, [frame]), frames)
-    return {result.frame: result.keypoints for block in blocks for result in block}
 
 
 def _finish(

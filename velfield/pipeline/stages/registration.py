@@ -1,7 +1,7 @@
 """Stage ``registration``: every frame of a unit to the base image and to the frame before it, in chains."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from functools import lru_cache, partial
 from pathlib import Path
 from threading import Lock
@@ -44,14 +44,6 @@ _FEATURES: dict[str, Any] = {"keypoints": Keypoints, "templates": Templates, "de
 _REFERENCE_LOCK = Lock()
 _references: dict[tuple[str, str], BaseReference] = {}
 _BOXES: dict[str, pd.DataFrame] = {}
-
-
-@dataclass(frozen=True)
-class FrameKeypoints:
-    """Keypoints of one frame, raw px."""
-
-    frame: int
-    keypoints: Keypoints
 
 
 def create_registration_store(plan: Plan) -> None:
@@ -206,10 +198,9 @@ def lost_frames(plan: Plan) -> tuple[str, ...]:
     )
 
 
-def detect_unit_keypoints(plan: Plan, frames: Sequence[int]) -> list[FrameKeypoints]:
-    """Detect the keypoints of a block of frames."""
-    store = open_frames(plan.layout.frames)
-    return [FrameKeypoints(frame, _detect_keypoints(plan, frame, store.read(frame))) for frame in frames]
+def detect_frame_keypoints(plan: Plan, frame: int) -> Keypoints:
+    """Detect the keypoints of a frame, raw px, outside the vehicles of the given boxes."""
+    return _detect_keypoints(plan, frame, open_frames(plan.layout.frames).read(frame))
 
 
 def external_boxes(plan: Plan) -> pd.DataFrame:
