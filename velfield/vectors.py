@@ -3,7 +3,7 @@ that arrays do not overlap.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -13,6 +13,13 @@ from numba.core import cgutils
 BYTE, WORD, LONG = (ir.IntType(bits) for bits in (8, 32, 64))
 REAL = ir.FloatType()
 """Types of values in vectors: integers of 8, 32 and 64 bits, with a sign or without, and float32."""
+
+
+class Place(NamedTuple):
+    """A place in an array: its address, and the type of the array's values, which a pointer need not tell."""
+
+    address: Any
+    element: Any
 
 
 class Vectors:
@@ -34,15 +41,19 @@ class Vectors:
     lanes
         As given.
     arguments
-        Arguments of the intrinsic: a pointer to the first value of each array, all else unchanged.
+        Arguments of the intrinsic: the `Place` of the first value of each array, all else unchanged.
     """
 
     def __init__(self, context: Any, build: Any, signature: Any, arguments: Any, lanes: int) -> None:
         self.build, self.lanes = build, lanes
         self.arguments = [
-            cgutils.create_struct_proxy(kind)(context, build, value).data if isinstance(kind, types.Array) else value
+            self._first(context, kind, value) if isinstance(kind, types.Array) else value
             for kind, value in zip(signature.args, arguments, strict=True)
         ]
+
+    def _first(self, context: Any, kind: types.Array, value: Any) -> Place:
+        data = cgutils.create_struct_proxy(kind)(context, self.build, value).data
+        return Place(data, context.get_data_type(kind.dtype))
 
     def kind(self, element: Any) -> Any:
         """The type of a vector of such elements."""
@@ -66,24 +77,26 @@ class Vectors:
             parts = [self.build.shuffle_vector(one, other, order) for one, other in pairs]
         return parts[0]
 
-    def place(self, start: Any, *offsets: Any, kind: Any = None) -> Any:
-        """Pointer to what lies at the sum of these offsets, numbers or 64-bit values, each in values of the array.
-
-        It is a vector of values as ``start`` points to, unless the type of something else is given as ``kind``.
-        """
+    def place(self, start: Place, *offsets: Any) -> Place:
+        """The place by the sum of these offsets further on: numbers or 64-bit values, each in values of the array."""
+        address = start.address
         for offset in offsets:
-            start = self.build.gep(start, [LONG(offset) if isinstance(offset, int) else offset])
-        return self.build.bitcast(start, (kind or self.kind(start.type.pointee)).as_pointer())
+            step = LONG(offset) if isinstance(offset, int) else offset
+            address = self.build.gep(address, [step], source_etype=start.element)
+        return Place(address, start.element)
 
-    def load(self, start: Any, *offsets: Any, kind: Any = None) -> Any:
-        """Load the value at the `place` of the same arguments; it need not be aligned."""
-        loaded = self.build.load(self.place(start, *offsets, kind=kind))
-        loaded.align = 1
-        return loaded
+    def load(self, start: Place, *offsets: Any, kind: Any = None) -> Any:
+        """Load what lies at the `place` of the same arguments; it need not be aligned.
 
-    def store(self, value: Any, start: Any, *offsets: Any) -> None:
-        """Store a vector of values as ``start`` points to at a `place`; it need not be aligned."""
-        self.build.store(value, self.place(start, *offsets)).align = 1
+        It is a vector of the array's values, unless the type of something else is given as ``kind``.
+        """
+        address = self.place(start, *offsets).address
+        return self.build.load(address, align=1, typ=kind or self.kind(start.element))
+
+    def store(self, value: Any, start: Place, *offsets: Any) -> None:
+        """Store a value at the `place` of the same arguments; it need not be aligned."""
+        address = self.place(start, *offsets).address
+        self.build.store(value, self.build.bitcast(address, value.type.as_pointer()), align=1)
 
     def add(self, value: Any, start: Any, *offsets: Any) -> None:
         """Add a vector of reals to what is stored at a `place`."""

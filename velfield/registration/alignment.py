@@ -263,7 +263,7 @@ def _blur_across(_context, source, first, taps, out, place):  # type: ignore[no-
     def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
         v = Vectors(context, build, signature, arguments, _LANES)
         source, first, taps, out, place = v.arguments
-        factors = [v.spread(build.load(build.gep(taps, [LONG(k)]))) for k in range(4)]
+        factors = [v.spread(v.load(taps, k, kind=REAL)) for k in range(4)]
         values = [build.uitofp(v.load(source, first, k), v.kind(REAL)) for k in range(7)]
         v.store(_blurred(v, factors, values), out, place)
         return context.get_dummy_value()
@@ -278,7 +278,7 @@ def _blur_down(_context, source, first, stride, taps, out, place):  # type: igno
     def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
         v = Vectors(context, build, signature, arguments, _LANES)
         source, first, stride, taps, out, place = v.arguments
-        factors = [v.spread(build.load(build.gep(taps, [LONG(k)]))) for k in range(4)]
+        factors = [v.spread(v.load(taps, k, kind=REAL)) for k in range(4)]
         values = [v.load(source, first, build.mul(stride, LONG(k))) for k in range(7)]
         steps = build.fmul(_blurred(v, factors, values), v.constant(REAL, float(_GREY_STEPS)))
         v.store(build.fptosi(build.fadd(steps, v.constant(REAL, 0.5)), v.kind(WORD)), out, place)
@@ -327,7 +327,7 @@ def _add_samples(_context, window, stride, last, x, y, step_x, step_y, templates
         four = ir.Constant(v.kind(LONG), ir.Undefined)
         for k in range(_BLOCK):
             number = build.zext(build.extract_element(at, WORD(k)), LONG)
-            four = build.insert_element(four, build.load(build.gep(window, [number])), WORD(k))
+            four = build.insert_element(four, v.load(window, number, kind=LONG), WORD(k))
         low, shift = v.constant(WORD, 0xFFFF), v.constant(WORD, 16)
         rows = []
         for pair in (four, build.lshr(four, v.constant(LONG, 32))):

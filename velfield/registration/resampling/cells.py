@@ -118,7 +118,7 @@ def _interpolate_row(_context, grey, stride, places, row, out, at):  # type: ign
         by_column, by_row = (_cubic_weights(v, v.load(places, row_at, k * CELL_PX)) for k in (1, 2))
         tops = [grey]
         for _ in range(3):
-            tops.append(build.gep(tops[-1], [build.zext(stride, LONG)]))
+            tops.append(v.place(tops[-1], build.zext(stride, LONG)))
         four: list[list[Any]] = [[] for _ in tops]
         for q in range(CELL_PX):  # pixel by pixel, so that few vectors are open at a time
             index = build.zext(v.load(places, row_at, q, kind=WORD), LONG)
