@@ -290,8 +290,7 @@ def _wait_for_worker(client: Any, warn: Callable[[str], None]) -> None:
         except TimeoutError:
             warn(
                 f"no workers at {client.scheduler.address} after {_NO_WORKERS_S:.0f} s; the run waits: check the "
-                "cluster's "
-                "queue for their jobs, and their logs"
+                "cluster's queue for their jobs, and their logs"
             )
 
 
