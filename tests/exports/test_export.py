@@ -150,7 +150,7 @@ def test_a_stac_item_elsewhere_names_files_by_their_whole_address(remote_root: s
 
 
 def test_an_export_that_fails_leaves_nothing_behind(run: Run, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no reference system"):
+    with pytest.raises(InputError, match="not georeferenced"):
         export_run(run, "arrows", tmp_path / "arrows.geojson")
     assert list(tmp_path.iterdir()) == []
 

@@ -122,8 +122,7 @@ def check_output(
         wanted = f"(1, {expected}, n)" if axis == 1 else f"(1, n, {expected})"
         raise InputError(
             f"{name}: found an output of {sizes}, expected {wanted} of the layout {layout}; give its layout and all "
-            "its "
-            "classes in a YAML file of the same name next to it (docs/detection.md)"
+            "its classes in a YAML file of the same name next to it (docs/detection.md)"
         )
 
 

@@ -103,8 +103,7 @@ def _from_text(text: pd.Series, series: pd.Series, path: Path) -> tuple[FloatArr
         row = int(np.flatnonzero((zoned != zoned.iloc[0]).to_numpy())[0])
         raise InputError(
             f"{path}: found times with and without a time zone in column {series.name} (row {row + 2}); add the zone "
-            "to "
-            "each, such as +02:00"
+            "to each, such as +02:00"
         )
     try:
         stamps = pd.to_datetime(text, errors="coerce", utc=True, **options)  # type: ignore[call-overload]
