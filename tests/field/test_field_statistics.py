@@ -79,7 +79,7 @@ def test_speeds_in_km_per_h_need_the_scale() -> None:
     names = ("modal_speed", "modal_velocity", "percentiles", "median_speed_interval")
     asked = [partial(getattr, unknown.at(80, 50), f"{name}_km_per_h") for name in names]
     for ask in (*asked, unknown.modal_speed_km_per_h):
-        with pytest.raises(InputError, match=r"without a ground sample distance.*--gsd-m.*px/s"):
+        with pytest.raises(InputError, match=r"no scale.*--gsd-m.*px/s"):
             ask()
 
 
