@@ -82,5 +82,5 @@ def test_a_run_converts_to_metres_where_its_scale_is_known(whole: tuple[Path, Ru
     np.testing.assert_allclose(run.to_metres([[0, 0], [412, 300]]), [[0, 0], [412 * run.gsd_m, 300 * run.gsd_m]])
     vars(run)["grid"] = run.grid.model_copy(update={"gsd_m": None})
     for ask in (lambda: run.gsd_m, lambda: run.to_metres([[1, 2]])):
-        with pytest.raises(InputError, match=r"without a ground sample distance.*--gsd-m"):
+        with pytest.raises(InputError, match=r"no scale.*--gsd-m"):
             ask()
