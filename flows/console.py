@@ -58,12 +58,6 @@ class StageProgress:
             self.bar.update(self.task, total=total)  # type: ignore[arg-type]
         self.at_least(done)
 
-    def set_progress(self, done: int, total: int) -> None:
-        """Set the number of steps that are done, and of all."""
-        with self.lock:
-            self.total = total
-        self.at_least(done)
-
     def at_least(self, done: int) -> None:
         """Set the progress to at least so many steps."""
         with self.lock:
