@@ -70,7 +70,7 @@ def test_a_flipped_bit_is_never_read_as_an_image(tmp_path: Path, bit: int) -> No
 def test_a_chunk_that_is_gone_is_not_read_as_black(tmp_path: Path) -> None:
     store = frame_store(tmp_path / "f.zarr", noise(3, 2, 24, 32))
     (store.path / "raw" / "c" / "1" / "0" / "0").unlink()
-    with pytest.raises(StoreError, match="frame 1 is gone"):
+    with pytest.raises(StoreError, match="frame 1 is missing"):
         store.read(1)
 
 
