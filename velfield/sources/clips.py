@@ -103,8 +103,7 @@ def _join(parts: tuple[tuple[str, SourceInfo, float], ...], notes: tuple[str, ..
         if times_s[0] <= end_s:
             raise InputError(
                 f"{name}: begins {end_s - times_s[0]:.1f} s before the previous clip ends, expected clips in time "
-                "order; "
-                "if they are of two cameras, run each with the same --base, and `velfield merge` the fields"
+                "order; if they are of two cameras, run each with the same --base, and `velfield merge` the fields"
             )
         if times and times_s[0] - end_s > _NOTED_GAP_S:
             warnings.append(f"a gap of {times_s[0] - end_s:.1f} s before {name}: no vehicle is tracked across it")

@@ -148,8 +148,7 @@ def _check(points: Sequence[ControlPoint], shape: tuple[int, int]) -> None:
         if not max(abs(point.x), abs(point.y)) < _MAX_COORDINATE:
             raise InputError(
                 f"control point {point.name or number}: found coordinates ({point.x:g}, {point.y:g}), too large in "
-                "metres and "
-                "in feet; correct them"
+                "metres and in feet; correct them"
             )
     pixels = np.array([[point.x_px, point.y_px] for point in points])
     spread = np.linalg.svd(pixels - pixels.mean(axis=0), compute_uv=False)

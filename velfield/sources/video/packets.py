@@ -35,8 +35,7 @@ def open_video(path: Path) -> Any:
         why = getattr(error, "strerror", None) or str(error)
         raise InputError(
             f"{path.name}: could not be opened as video ({why}), expected an intact MP4, MOV, AVI, MKV, TS or "
-            "similar file; "
-            "give a video or a folder of images"
+            "similar file; give a video or a folder of images"
         ) from None
 
 
@@ -146,8 +145,7 @@ def drop_timestamp_outliers(
         index = int(np.argmax(back > max_deviation))
         raise InputError(
             f"{path.name}: timestamps jump back {float(back[index] * time_base):.1f} s at frame {index}, expected "
-            "one recording "
-            "per file; split it there, or give --timestamps"
+            "one recording per file; split it there, or give --timestamps"
         )
     return packets, notes
 

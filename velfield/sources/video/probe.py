@@ -156,8 +156,7 @@ def _picture_warnings(path: Path, max_pixels: int) -> tuple[str, ...]:
         if picture.rotation % 360:
             found.append(
                 f"the file's pictures are rotated by {picture.rotation % 360} degrees for display; velfield uses "
-                "them as "
-                "stored, and expects labels and detections in stored pixels"
+                "them as stored, and expects labels and detections in stored pixels"
             )
     return tuple(found)
 
