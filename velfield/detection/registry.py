@@ -100,7 +100,7 @@ _OTHER_FORMATS = (
 
 
 def load_detector(path: Path) -> Detector:
-    """Read a detector file, or another maker's ONNX model; a warning where it is of an old format.
+    """Read a detector file, or another maker's ONNX model.
 
     Raises
     ------
@@ -136,8 +136,7 @@ def shipped_detector() -> Detector:
 
 def _parse(data: bytes, name: str) -> Detector:
     try:
-        content = parse_json(data)
-        return from_record(_RECORD.validate_python(content))
+        return from_record(_RECORD.validate_python(parse_json(data)))
     except (ValueError, ValidationError) as error:
         raise InputError(
             f"{name}: {_problem(error)}; expected a detector file as velfield writes it (detector.json): "

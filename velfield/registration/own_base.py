@@ -14,7 +14,7 @@ function of the reference's row: the frames' own row motions average out. It is 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 
 import cv2
 import numpy as np
@@ -131,7 +131,7 @@ def build_own_base(
     read
         Frame number to grey frame (h, w) uint8.
     detect
-        Frame number to its keypoints, raw px.
+        Frame number to its keypoints, raw px; it may be asked for the same ones several times.
     frames
         The frames to use, in time order, including the reference.
     reference
@@ -186,7 +186,7 @@ def _register_frames(
     chains = np.array_split(np.asarray(frames), -(-len(frames) // _CHAIN_FRAMES))
 
     def register(chain: IntArray) -> list[FrameRegistration]:
-        shown = ((int(frame), read(int(frame)), lru_cache(1)(partial(detect, int(frame)))) for frame in chain)
+        shown = ((int(frame), read(int(frame)), partial(detect, int(frame))) for frame in chain)
         return register_chain(shown, base, lens, config)
 
     with ThreadPoolExecutor(max_workers=threads) as pool:

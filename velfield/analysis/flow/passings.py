@@ -1,6 +1,5 @@
 """When tracks pass a place on a lane."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -53,11 +52,6 @@ class LaneTraffic:
     def passings(self, lane: int, along_m: float) -> Passings:
         """Tracks that pass a distance along a lane."""
         return find_passings(self.samples(lane), along_m)
-
-    def all_passings(self, lane: int, places_m: Sequence[float]) -> list[Passings]:
-        """Passings at several distances along a lane."""
-        samples = self.samples(lane)
-        return [find_passings(samples, at) for at in places_m]
 
 
 def find_passings(samples: LaneSamples, along_m: float) -> Passings:

@@ -65,6 +65,7 @@ class _GraphBuilder:
 
     def __init__(self, network: Network, *, half: bool) -> None:
         self.network, self.half = network, half
+        self.blocks = _blocks(TOPOLOGY)
         self.nodes: list[onnx.NodeProto] = []
         self.constants: list[onnx.TensorProto] = []
 
@@ -80,24 +81,20 @@ class _GraphBuilder:
 
     def layers(self, layers: Topology, value: str) -> str:
         """Output of a sequence of layers. Space-to-depth and the convolution after it are one strided convolution."""
-        block = 1
         for layer in layers:
-            if isinstance(layer, SpaceToDepth):
-                block *= 2
-                continue
             if isinstance(layer, Conv):
-                value = self.conv(layer, value, block)
+                value = self.conv(layer, value)
             elif isinstance(layer, DepthToSpace):
                 value = self.node("DepthToSpace", [value], blocksize=2, mode="DCR")
-            else:
+            elif isinstance(layer, Residual):
                 value = self.node("Add", [self.layers(layer.layers, value), value])
-            block = 1
             if isinstance(layer, Conv | Residual) and layer.relu:
                 value = self.node("Relu", [value])
         return value
 
-    def conv(self, layer: Conv, value: str, block: int) -> str:
+    def conv(self, layer: Conv, value: str) -> str:
         """Output of a convolution, which is named as the layer."""
+        block = self.blocks[layer.name]
         kernel = onnx_kernel(self.network.weights[layer.name], layer.kernel, block)
         inputs = [value]
         for part, values in (("weight", kernel), ("bias", self.network.biases[layer.name])):

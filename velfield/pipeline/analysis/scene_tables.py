@@ -29,30 +29,28 @@ def scene_tables(analysis: TrafficAnalysis) -> Iterator[AnalysisTable]:
 
 def matrix_table(analysis: TrafficAnalysis) -> AnalysisTable:
     """Vehicles, seen and inferred, by origin (rows) and destination (columns)."""
-    scene = analysis.scene
-    arms = scene.arms if scene else ()
-    gates = scene.gates if scene else ()
+    scene, title = analysis.scene, "Origins and destinations, vehicles"
+    columns: list[Column[Arm]] = [Column("from", "From", "", lambda arm: arm.name)]
+
+    def place(arm: Arm) -> GeometryRecord:
+        return point_geometry(arm.xy_m, analysis)
+
+    if scene is None:
+        return make_table("origins", "Movements", title, "", columns, (), place)
     entries, exits = (
-        [arm for arm in arms if any(g.arm == arm.number and g.inwards == inwards for g in gates)]
+        [arm for arm in scene.arms if any(g.arm == arm.number and g.inwards == inwards for g in scene.gates)]
         for inwards in (True, False)
     )
-    relations = scene.relations if scene else ()
-    vehicles = {(r.origin.number, r.destination.number): r.vehicles for r in relations}
-
-    def entered(arm: Arm) -> int:
-        return int((scene.trips.origin == arm.number).sum()) if scene else 0
+    vehicles = {(r.origin.number, r.destination.number): r.vehicles for r in scene.relations}
+    trips = scene.trips
 
     def column(to: Arm) -> Column[Arm]:
-        title = f"To {to.name}"
-        return Column(f"to_{to.name}", title, "", lambda arm: vehicles.get((arm.number, to.number), 0.0), 1)
+        number = to.number
+        return Column(f"to_{to.name}", f"To {to.name}", "", lambda arm: vehicles.get((arm.number, number), 0.0), 1)
 
-    columns: list[Column[Arm]] = [Column("from", "From", "", lambda arm: arm.name), *map(column, exits)]
-    columns += [Column("all", "All", "", entered)] if scene else []
-    note = _note(scene) if scene else ""
-    return make_table(
-        "origins", "Movements", "Origins and destinations, vehicles", note, columns, entries,
-        lambda arm: point_geometry(arm.xy_m, analysis),
-    )  # fmt: skip
+    columns += map(column, exits)
+    columns.append(Column("all", "All", "", lambda arm: int((trips.origin == arm.number).sum())))
+    return make_table("origins", "Movements", title, _note(scene), columns, entries, place)
 
 
 def _note(scene: OriginDestination) -> str:

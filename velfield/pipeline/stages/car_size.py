@@ -82,9 +82,9 @@ def _views(plan: Plan) -> Views:
         working, grid = replace(opened, scale=scale), opened.grid
         windows = spread_windows(grid.width_px, grid.height_px, area_px / scale**2)
         frames = int(np.clip(area_px // (grid.width_px * grid.height_px * scale**2), 1, _FRAMES))
-        turns = [(k, k) for k in range(len(windows))] if len(windows) > 1 else [(0, k) for k in range(frames)]
-        for window, k in turns if len(chosen) else []:
-            rectified = working.frame(int(chosen[k % len(chosen)]), windows[window])
+        count = len(windows) if len(windows) > 1 else frames
+        for k in range(count if len(chosen) else 0):
+            rectified = working.frame(int(chosen[k % len(chosen)]), windows[k % len(windows)])
             if rectified is not None:
                 yield rectified.image, rectified.valid
         advance("detector", 0)
