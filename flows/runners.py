@@ -180,8 +180,8 @@ class ClientRunner(Runner):
                         "kills them"
                     ) from None
                 except TimeoutError:
-                    if future.done():  # the graph's own
-                        raise
+                    if future.done():  # the graph's own error, or it ended as the wait did
+                        return future.result()
                     self._look_for_workers()
         finally:
             future.release()  # else the scheduler computes it again where the worker that holds it ends
