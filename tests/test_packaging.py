@@ -5,7 +5,7 @@ import re
 import tarfile
 import tomllib
 import zipfile
-from importlib.metadata import distribution
+from importlib.metadata import distribution, packages_distributions
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +52,11 @@ def test_the_lock_is_within_the_bounds() -> None:
     asked = {one.name.lower(): one for one in map(Requirement, PROJECT["dependencies"])}
     assert [pin for pin in pins if pin[0] in asked and not asked[pin[0]].specifier.contains(pin[1])] == []
     assert set(asked) <= {name for name, _ in pins}
+
+
+def test_one_opencv_is_installed() -> None:
+    """Two lie over each other, and only the headless one can be imported where there is no libGL."""
+    assert set(packages_distributions()["cv2"]) == {"opencv-python-headless"}
 
 
 def test_the_licences_of_what_ships_are_listed() -> None:
