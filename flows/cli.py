@@ -546,7 +546,9 @@ def main() -> None:
     except InputError as error:
         print(f"velfield: {error}", file=sys.stderr)
         status = BAD_INPUT
-    except BrokenPipeError:  # the reader of our output has closed it
+    except (BrokenPipeError, SystemExit) as error:  # the reader of our output has closed it: rich, of --help, exits
+        if not isinstance(error, BrokenPipeError) and not isinstance(error.__context__, BrokenPipeError):
+            raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = DONE
     except (StoreError, OSError) as error:  # a damaged run; a disk that is full, read-only or gone

@@ -164,7 +164,7 @@ def test_no_print_no_exit_in_the_library() -> None:
     assert calls == []
 
 
-@pytest.mark.parametrize("heavy", ["prefect", "dask", "zarr", "pandas", "numba", "cv2"])
+@pytest.mark.parametrize("heavy", ["prefect", "dask", "zarr", "pandas", "numba", "cv2", "numpy", "psutil"])
 def test_the_command_imports_nothing_heavy(heavy: str) -> None:
     code = f"import sys, flows.cli; sys.exit({heavy!r} in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

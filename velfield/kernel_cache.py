@@ -17,17 +17,13 @@ import time
 import warnings
 from functools import cache
 from hashlib import blake2b
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-
-import psutil
 
 from velfield.errors import CacheWarning, InputError
 
 _SOURCES = Path(__file__).resolve().parents[1]
 _IMPORT = re.compile(rb"^\s*from ((?:velfield|schemas)[\w.]*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
-_STARTED_S = float(psutil.Process().create_time())
 _UNUSED_S = 30 * 86400.0
 """A folder of code that nothing used for so long is removed when newer code of its file is compiled."""
 
@@ -91,6 +87,8 @@ def source_stamp(source: Path) -> str:
 
     A file that changed since this process started may be imported as it was: the digest is this process's own then.
     """
+    from importlib.metadata import version  # here, as psutil below: `velfield --help` would wait for them
+
     digest = blake2b(version("llvmlite").encode(), digest_size=10)
     files, left = set[Path](), [source]
     while left:
@@ -100,9 +98,16 @@ def source_stamp(source: Path) -> str:
             left += _imported(file)
     for file in sorted(files):
         digest.update(f"\0{file.relative_to(_SOURCES).as_posix()}\0".encode() + _read(file))
-        if file.stat().st_mtime > _STARTED_S:
-            digest.update(f"{os.getpid()} {_STARTED_S}".encode())
+        if file.stat().st_mtime > _started_s():
+            digest.update(f"{os.getpid()} {_started_s()}".encode())
     return digest.hexdigest()
+
+
+@cache
+def _started_s() -> float:
+    import psutil
+
+    return float(psutil.Process().create_time())
 
 
 @cache

@@ -23,6 +23,17 @@ def test_help_lists_the_commands() -> None:
     assert [name for name in ("demo", "run", "schema", "simulate") if name not in text.stdout] == []
 
 
+@pytest.mark.parametrize("arguments", [("--help",), ("run", "--help"), ("schema",)])
+def test_output_that_nobody_reads_is_no_error(arguments: tuple[str, ...]) -> None:
+    """As by ``velfield --help | head -1``: the pipe is closed."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "flows.cli", *arguments]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False, cwd=ROOT)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_the_version_is_that_of_the_package() -> None:
     assert velfield("--version").stdout.strip() == version("velfield")
 
