@@ -10,7 +10,7 @@ export UV_SYSTEM_CERTS := true
 # Where this is set, every process of ours compiles all that it imports anew: 12 s each for Prefect.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-newest page docs lint types check format env lock bench audit detector soak clean
+.PHONY: demo test test-newest test-oldest page docs lint types check format env lock bench audit detector soak clean
 
 demo: page  ## simulate a flight, run the whole job, say where the report is
 	$(BIN)/velfield demo --out demo
@@ -24,14 +24,19 @@ test: page  ## every check: lint, types, tests
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-# In build/newest, without the lock: what somebody gets who installs the wheel today.
-test-newest: export OPENBLAS_NUM_THREADS := 1
-test-newest: export OMP_NUM_THREADS := 1
-test-newest: page  ## the tests on the newest versions that pyproject.toml allows
-	$(PYTHON) -m venv --clear build/newest
-	$(BIN)/uv pip install --quiet --python build/newest/bin/python --editable ".[dev,gis,s3]"
-	$(BIN)/uv pip list --quiet --python build/newest/bin/python
-	build/newest/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+# In build/newest and build/oldest, without the lock: what somebody gets who installs the wheel today, or beside old
+# software. The tools of the tests are the newest there too; numba would go up with the numpy that they bring.
+RESOLUTION_newest := highest
+RESOLUTION_oldest := lowest-direct
+test-newest test-oldest: export OPENBLAS_NUM_THREADS := 1
+test-newest test-oldest: export OMP_NUM_THREADS := 1
+test-newest test-oldest: test-%: page  ## the tests on the newest, the oldest versions that pyproject.toml allows
+	$(PYTHON) -m venv --clear build/$*
+	$(BIN)/uv pip install --quiet --python build/$*/bin/python --resolution $(RESOLUTION_$*) --editable ".[gis,s3]"
+	$(BIN)/uv pip list --quiet --python build/$*/bin/python | awk '/^numba /{print $$1 "==" $$2}' > build/$*.txt
+	$(BIN)/uv pip install --quiet --python build/$*/bin/python --constraint build/$*.txt --editable ".[dev,gis,s3]"
+	$(BIN)/uv pip list --quiet --python build/$*/bin/python
+	build/$*/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 # The viewer's page from page/: built where its sources changed. Node is the machine's, else PyPI's into the environment.
 page: $(STAMP)
