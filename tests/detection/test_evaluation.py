@@ -16,7 +16,7 @@ from velfield.detection.evaluation import (
     to_curve_record,
 )
 from velfield.detection.review import FALSE_POSITIVES, MISSED, TRUE_POSITIVES, contact_sheet
-from velfield.detection.samples import LabelledImage, distance_to_nearest_car, in_region, restrict_to_region
+from velfield.detection.samples import LabelledImage, in_region, restrict_to_region
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -176,12 +176,6 @@ def test_restricting_an_image_keeps_what_belongs_together() -> None:
     assert part.abs_box_angle_rad.tolist() == angles[inside].tolist()
     assert part.valid is not None
     assert (part.valid == (region & valid)).all()
-
-
-def test_distances_to_the_nearest_car() -> None:
-    cars = np.array([[0.0, 0.0, 1.0], [10.0, 0.0, 1.0]])
-    assert distance_to_nearest_car(np.array([[3.0, 4.0], [9.0, 0.0]]), cars).tolist() == [5.0, 1.0]
-    assert np.isinf(distance_to_nearest_car(np.zeros((2, 2)), cars[:0])).all()
 
 
 def test_the_contact_sheet_has_a_section_for_each_kind() -> None:

@@ -12,8 +12,6 @@ from velfield.detection.orientation import (
     contradict_axes,
     fill_missing_orientation,
     outline_axes,
-    sample_nearest,
-    structure_tensor_axis,
 )
 from velfield.detection.samples import LabelledImage
 from velfield.pipeline.stages.labels import check_label_axes
@@ -84,25 +82,6 @@ def test_given_orientations_stay_to_the_bit() -> None:
     assert np.isfinite(filled[1, 2])
     assert np.isnan(labels[1, 2])  # the caller's array is left alone
     assert fill_missing_orientation(car(30.0), filled)[:, 2].tolist() == filled[:, 2].tolist()
-
-
-@pytest.mark.parametrize("angle", np.linspace(0, np.pi, 7, endpoint=False))
-def test_the_structure_tensor_gives_the_axis_of_a_bar(angle: float) -> None:
-    axis, coherence = structure_tensor_axis(bar(angle))
-    assert axial_difference(np.array([float(axis[32, 32])]), np.array([angle]))[0] < np.radians(6)
-    assert 0 <= coherence.min() <= coherence.max() <= 1 + 1e-6
-
-
-def test_a_flat_image_has_no_coherence() -> None:
-    axis, coherence = structure_tensor_axis(np.full((20, 30), 77, np.uint8))
-    assert coherence.max() == 0
-    assert np.isfinite(axis).all()
-
-
-def test_nearest_sampling_clips_to_the_image() -> None:
-    values = np.arange(12, dtype=np.float32).reshape(3, 4)
-    xy = np.array([[0.4, 0.4], [2.6, 1.4], [-5.0, 9.0], [9.0, -5.0]])
-    assert sample_nearest(values, xy).tolist() == [0.0, 7.0, 8.0, 3.0]
 
 
 @pytest.mark.parametrize("angle", [0.3, 1.2, 2.5])

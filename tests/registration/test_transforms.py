@@ -171,16 +171,6 @@ def test_to_raw_is_nan_far_outside_the_frame() -> None:
     assert np.isnan(t.to_base(np.array([[np.nan, 1.0]]))).all()
 
 
-def test_row_motion_is_a_shift_and_a_roll_by_the_raw_row() -> None:
-    t = frame_transform(np.random.default_rng(4), mesh=False)
-    raw = grid()
-    motion = t.row_motion(raw[:, 1])
-    undistorted = t.lens.undistort_points(raw)
-    offset = undistorted - t.centre
-    turned = np.stack([-offset[:, 1], offset[:, 0]], axis=1) * motion[:, 2:]
-    np.testing.assert_allclose(t.remove_row_motion(raw), undistorted + motion[:, :2] + turned, atol=1e-9)
-
-
 def test_spline_of_equal_coefficients_is_constant() -> None:
     first, weights = kernels.spline_basis(np.linspace(-50, HEIGHT + 50, 301), HEIGHT, 12)
     np.testing.assert_allclose(weights.sum(axis=1), 1.0)

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -198,10 +198,6 @@ class Detector(ABC):
     def weak_margin(self) -> float:
         """Candidates that a track can confirm score at most this much below the threshold; 0: no such candidates."""
         return 0.0
-
-    def with_threshold(self, threshold: float, curve: PrecisionRecallCurve | None) -> Self:
-        """The detector with another score threshold, and the curve that it was chosen on."""
-        return type(self)(self.record.model_copy(update={"threshold": threshold, "curve": curve}))
 
     def check_car_length(self, expected_px: float) -> None:
         """Raise InputError if the detector was trained on cars of another length, working px."""

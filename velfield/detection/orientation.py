@@ -1,8 +1,7 @@
-"""Orientations (axial: an axis without a front) from the image: structure tensor, outlines of labelled cars.
+"""Orientations (axial: an axis without a front) of labelled cars that have none, from their outlines in the image.
 
-The structure tensor gives the main direction of the gradients at every pixel. It is misled by windscreens, which lie
-across the car, and by parked neighbours. For a labelled car without an orientation the gradients across the sides and
-ends of a rectangle of its size are compared at each candidate angle instead: a template match of the outline.
+The gradients across the sides and ends of a rectangle of the car's size are compared at each candidate angle: a
+template match. The structure tensor would be misled by windscreens, which lie across the car, and by neighbours.
 """
 
 import cv2
@@ -10,8 +9,6 @@ import numpy as np
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage
 
-GRADIENT_SIGMA_PX = 0.8
-WINDOW_SIGMA_PX = 3.0
 CAR_ASPECT = 0.45
 """A usual car's width over its length."""
 _USUAL_LENGTH_PX = 16.0
@@ -25,29 +22,6 @@ _SIZES = (0.85, 1.0, 1.15)
 _AGREES_RAD, _MIN_CARS, _RIGHT_AGREEMENT = np.pi / 6, 8, 0.7
 _END_WEIGHT = 0.5
 """Bumpers are shorter than sides, and a windscreen's edge is as sharp."""
-
-
-def structure_tensor_axis(image: GreyImage) -> tuple[Float32Array, Float32Array]:
-    """Axis and coherence of the structure tensor at every pixel.
-
-    Returns
-    -------
-    (h, w) axis in [0, pi), from +x towards +y (down), along the edges; (h, w) coherence in [0, 1].
-    """
-    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), GRADIENT_SIGMA_PX)
-    gx, gy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
-    xx, yy, xy = (cv2.GaussianBlur(g, (0, 0), WINDOW_SIGMA_PX) for g in (gx * gx, gy * gy, gx * gy))
-    # Edges run at a right angle to the main direction of the gradients.
-    axis = 0.5 * np.arctan2(2 * xy, xx - yy) + np.pi / 2
-    coherence = np.sqrt((xx - yy) ** 2 + 4 * xy**2) / np.maximum(xx + yy, 1e-6)
-    return np.mod(axis, np.pi).astype(np.float32), coherence.astype(np.float32)
-
-
-def sample_nearest(values: Float32Array, xy: FloatArray) -> FloatArray:
-    """Values (h, w) at the pixels nearest to positions (n, 2)."""
-    x = np.clip(np.rint(xy[:, 0]), 0, values.shape[1] - 1).astype(np.int64)
-    y = np.clip(np.rint(xy[:, 1]), 0, values.shape[0] - 1).astype(np.int64)
-    return np.asarray(values[y, x], np.float64)
 
 
 def axial_difference(a: FloatArray, b: FloatArray) -> FloatArray:

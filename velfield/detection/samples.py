@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from schemas.arrays import FloatArray, GreyImage, Mask
 
@@ -45,10 +44,3 @@ def in_region(region: Mask, xy: FloatArray) -> Mask:
     """Whether positions (n, 2...) lie in a region (h, w)."""
     x, y = (np.clip(np.rint(xy[:, k]), 0, region.shape[1 - k] - 1).astype(np.int64) for k in (0, 1))
     return np.asarray(region[y, x])
-
-
-def distance_to_nearest_car(xy: FloatArray, cars: FloatArray) -> FloatArray:
-    """From positions (n, 2...) to the nearest of the cars (m, 2...); infinite without any."""
-    if not len(cars):
-        return np.full(len(xy), np.inf)
-    return np.asarray(KDTree(cars[:, :2]).query(xy[:, :2])[0])

@@ -191,15 +191,6 @@ class FrameTransform:
         rows = np.ascontiguousarray(raw[:, 1])
         return np.asarray(kernels.remove_row_motion(undistorted, rows, self.row_coefficients, self.height, self.centre))
 
-    def row_motion(self, rows: FloatArray) -> FloatArray:
-        """Row motion (n, 3) at raw rows (n,): shift in x and y, undistorted px, and roll, rad."""
-        if self.row_coefficients.shape[1] < 4:
-            return np.zeros((len(rows), 3))
-        first, weights = kernels.spline_basis(
-            np.asarray(rows, dtype=np.float64), self.height, self.row_coefficients.shape[1]
-        )
-        return np.asarray(np.einsum("nk,cnk->nc", weights, self.row_coefficients[:, first[:, None] + np.arange(4)]))
-
     def to_base(self, xy_raw: FloatArray) -> FloatArray:
         """Raw pixels (n, 2) to base pixels (n, 2); NaN rows outside the domain of the lens or the polyprojective."""
         return np.asarray(kernels.to_base(as_points(xy_raw), self._arrays))
