@@ -1,4 +1,4 @@
-"""Carriageways, stops, bottlenecks and U-turns of constructed fields."""
+"""Carriageways and bottlenecks of constructed fields."""
 
 import math
 
@@ -6,7 +6,6 @@ import numpy as np
 
 from velfield.analysis.bottlenecks import find_bottlenecks
 from velfield.analysis.carriageways import find_carriageways
-from velfield.analysis.stops import find_stops
 
 
 def test_opposite_lanes_that_touch_are_two_carriageways_and_a_bend_is_one() -> None:
@@ -35,17 +34,6 @@ def test_direction_that_wraps_at_pi_does_not_split_a_carriageway() -> None:
     table = find_carriageways(direction, np.full(direction.shape, 4)).table
     assert len(table) == 1
     assert abs(abs(table.direction_rad[0]) - math.pi) < 0.01
-
-
-def test_a_queue_is_a_stop_and_a_car_park_is_not() -> None:
-    fraction, count = np.zeros((60, 100)), np.full((60, 100), 8)
-    fraction[20:25, 40:60] = 0.5
-    fraction[40:50, 10:30] = 1.0
-    found = find_stops(fraction, count)
-    labels, table = found.labels, found.table
-    assert len(table) == 1
-    assert labels[22, 50] == table.region[0]
-    assert labels[45, 20] == 0
 
 
 def test_a_slow_section_is_a_bottleneck_downstream_of_its_approach() -> None:

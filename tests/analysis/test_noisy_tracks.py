@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests.analysis.noisy_tracks import CYCLE_S, Noise, analyse, clip, driven
+from tests.benchmarks.short_clips import make_cases
 from velfield.analysis.answers import find_answers
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 
@@ -64,3 +65,13 @@ def test_two_cycles_give_a_cycle_with_its_interval() -> None:
     assert len(cycles) == 1
     assert cycles[0].low < CYCLE_S < cycles[0].high
     assert np.ptp([cycles[0].low, cycles[0].high]) > 0.3
+
+
+@pytest.mark.parametrize("seed", [3009, 3023, 3035])
+def test_every_statement_about_short_sparse_and_noisy_clips_is_true_or_withheld(seed: int) -> None:
+    said: set[str] = set()
+    for case in make_cases(seed):
+        for statement in case.statements():
+            assert statement.true, f"{case.name}: {statement.kind}: {statement.text}"
+            said.add(statement.kind)
+    assert {"signal", "u-turns", "limit", "speed", "count", "flow", "words"} <= said

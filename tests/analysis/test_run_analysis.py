@@ -51,13 +51,10 @@ def test_the_two_directions_are_two_carriageways_with_their_headings_and_speeds(
 
 
 def test_the_stop_is_where_half_of_the_vehicles_wait(run: Run) -> None:
-    found = run.analysis.stops()
-    assert len(found.table) == 1
-    stop = found.table.iloc[0]
-    assert (stop.x_px, stop.y_px) == pytest.approx((STOP_X_PX, 80.0), abs=2)
-    assert stop.stationary_fraction == pytest.approx(0.5, abs=0.1)
-    assert found.labels[40, 200] == 0
-    assert run.analysis.stops(max_fraction=0.3).table.empty
+    stops = run.analysis.traffic.stops
+    assert len(stops.track) == 4
+    assert stops.xy_m / GSD_M == pytest.approx(np.tile([STOP_X_PX, 80.0], (4, 1)), abs=2)
+    assert (stops.end_s > stops.start_s + 1.5).all()
 
 
 def test_the_bottleneck_begins_where_traffic_slows_down(run: Run) -> None:

@@ -203,7 +203,7 @@ def approach(start_s: float, gap_m: float, follower: float, leader: float, final
 
 def test_a_fast_approach_is_a_conflict_and_a_queue_and_a_double_are_none() -> None:
     free = [drive(EAST, 8.0 * k) for k in range(12)]
-    near = approach(120.0, 30.0, 12.0, 6.0, 3.0)  # 3 m at 6 m/s: 0.5 s
+    near = approach(120.0, 30.0, 12.0, 6.0, 1.0)  # 1 m at 6 m/s: 0.17 s, and 3.4 m before, which need 5.3 m/s2
     creeping = approach(200.0, 12.0, 2.5, 1.5, 1.0)  # below 3 m/s: closing up in a queue
     double = approach(420.0, -2.5, 8.0, 8.0, -2.5)  # 2 m from centre to centre
     analysis = TrafficAnalysis(gather([*free, *near, *creeping, *double]))
@@ -211,8 +211,14 @@ def test_a_fast_approach_is_a_conflict_and_a_queue_and_a_double_are_none() -> No
     following = [(c.first, c.second) for c in found if c.kind == "following"]
     assert following == [(12, 13)]
     conflict = next(c for c in found if c.kind == "following")
-    assert conflict.value_s == pytest.approx(3.0 / 6.0 + 0.4, abs=0.15)  # what it is below for 0.4 s
+    assert conflict.value_s == pytest.approx(1.0 / 6.0 + 0.4, abs=0.15)  # what it is below for 0.4 s
     assert conflict.probability > 0.9
+
+
+def test_queues_behind_a_signal_are_no_conflicts(analysis: TrafficAnalysis) -> None:
+    following = [c for c in analysis.conflicts if c.kind == "following"]
+    assert sum(c.value_s < 1.5 for c in following) > 10  # who stops behind another has less than 1.5 s to collision
+    assert [c for c in following if c.probability >= 0.5] == []
 
 
 def test_a_changed_cycle_and_nothing_else_is_a_change(analysis: TrafficAnalysis) -> None:

@@ -23,7 +23,7 @@ from velfield.analysis.lanes.find import find_lanes
 from velfield.analysis.movements.movements import JunctionMovements, find_passes
 from velfield.analysis.movements.scene import trace_trips
 from velfield.analysis.signals.cycles import JunctionSignal, queues
-from velfield.analysis.signals.queues import Stops, find_stops, observe_stream
+from velfield.analysis.signals.queues import Stops, observe_stream
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import PathSamples, Trajectories, make_trajectories, moving, sample_paths
 from velfield.synthetic.city.city_plan import STOP_A, STOP_B
@@ -251,7 +251,7 @@ def _same_entry(found: TrafficAnalysis, r: Reduction, true: TrafficAnalysis, oth
 
 
 def _signals(case: Case, found: TrafficAnalysis, true: TrafficAnalysis, results: Results) -> None:
-    samples, stops = true.samples, find_stops(true.trajectories)
+    samples, stops = true.samples, true.stops
     for junction in found.lanes.junctions:
         signal = found.signals.get(junction.number)
         if signal is None:

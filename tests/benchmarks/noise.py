@@ -7,13 +7,12 @@ tracks without errors, U-turns against the vehicles that turned, signals that ar
 import argparse
 from collections import defaultdict
 from collections.abc import Iterator
-from functools import cache
 
 import numpy as np
 
-from schemas.arrays import IntArray
-from tests.analysis.noisy_tracks import CYCLE_S, GSD_M, Noise, TrueTracks, analyse, clip, driven, flight
+from tests.analysis.noisy_tracks import CYCLE_S, GSD_M, Noise, TrueTracks, analyse, clip, driven, flight, true_numbers
 from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.synthetic.flight import Flight
 
 NOISES = {
     "none": Noise(),
@@ -27,10 +26,9 @@ NOISES = {
 CLIPS_S = (20.0, 35.0, 50.0, 63.0, 90.0)
 
 
-@cache
-def turn_middles_m(seed: int, seconds: float) -> list[np.ndarray]:
+def turn_middles_m(made: Flight) -> list[np.ndarray]:
     """(2,) middles of the turns on which vehicles reverse from one carriageway of a road to the other."""
-    city = flight(seed, seconds).city
+    city = made.city
     net = city.plan.road_network
     into, out = net.in_edges(), net.out_edges()
     middles = []
@@ -61,9 +59,9 @@ def score(
     analysis: TrafficAnalysis, true: TrafficAnalysis, tracks: TrueTracks, middles_m: list[np.ndarray]
 ) -> dict[str, float]:
     """Counts of what is said of a clip."""
-    times: IntArray = np.searchsorted(tracks.first, np.arange(len(tracks.xy_m)), side="right") - 1
     whole, begun = (true_u_turns(tracks, middles_m, seen_m=m) for m in (20.0, 0.0))
-    found = {_owner(analysis, r.track, tracks, times) for r in analysis.reversals}
+    numbers = true_numbers(analysis, tracks)
+    found = {int(numbers[r.track]) for r in analysis.reversals}
     signals = analysis.signals.values()
     wrong = [s for s in signals if s.cycle_s and not s.cycle_s.low - 0.5 <= CYCLE_S <= s.cycle_s.high + 0.5]
     return {
@@ -79,18 +77,10 @@ def score(
     }  # fmt: skip
 
 
-def _owner(analysis: TrafficAnalysis, track: int, tracks: TrueTracks, owner: IntArray) -> int:
-    """Number of the true track of a track, by the place and time of its first position: ids may be of pieces."""
-    t = analysis.trajectories
-    row = (t.first[track] + t.first[track + 1]) // 2
-    same = np.flatnonzero(np.abs(tracks.time_s - t.time_s[row]) < 1e-6)
-    return int(owner[same[np.argmin(np.hypot(*(tracks.xy_m[same] - t.xy_m[row]).T))]])
-
-
 def measure(seed: int, seconds: float, clips_s: tuple[float, ...]) -> Iterator[tuple[str, str, dict[str, float]]]:
     """Errors, length, and counts of each clip of a flight."""
     whole = driven(seed, seconds)
-    middles = turn_middles_m(seed, seconds)
+    middles = turn_middles_m(flight(seed, seconds))
     pieces = [("whole", whole)]
     for length in clips_s:
         begins = np.arange(0.0, seconds - length + 1e-9, max(length, 30.0))[:3]

@@ -125,7 +125,8 @@ def _scene(analysis: TrafficAnalysis) -> Iterator[Answer]:
 def _speeds(analysis: TrafficAnalysis) -> Iterator[Answer]:
     known = [(road, road.speed_m_per_s) for road in analysis.free_flow if road.speed_m_per_s]
     for road, speed in sorted(known, key=lambda pair: -pair[1].n):
-        text = f"free flow {estimate_text(speed, 'km/h', 3.6)}, limit about {road.limit_km_per_h:.0f}"
+        limit = f"about {road.limit_km_per_h:.0f}" if road.limit_km_per_h else "between two signs"
+        text = f"free flow {estimate_text(speed, 'km/h', 3.6)}, limit {limit}"
         yield Answer("speed", f"lanes {' '.join(map(str, road.lanes))}", "found", text, speed.in_units(3.6), "km/h")
     if not known:
         text = "too little data: no road with 8 vehicles that go freely and steadily"

@@ -34,7 +34,7 @@ from velfield.analysis.movements.time_slices import (
     slice_edges,
 )
 from velfield.analysis.signals.cycles import JunctionSignal, find_signal
-from velfield.analysis.signals.queues import Stream, find_approaches, find_stops, observe_stream
+from velfield.analysis.signals.queues import Stops, Stream, find_approaches, find_stops, observe_stream
 from velfield.analysis.trajectories import PathSamples, Trajectories, sample_paths
 from velfield.analysis.unusual import DoubtfulPlace, Unusual, find_doubtful_places, find_unusual
 from velfield.analysis.vehicle_classes import VehicleClasses
@@ -146,16 +146,19 @@ class TrafficAnalysis:
         return find_reversals(self.samples, self.lanes, position_sd_m=self.trajectories.position_sd_m)
 
     @cached_property
+    def stops(self) -> Stops:
+        """Stops of vehicles, parked ones left out."""
+        return find_stops(self.trajectories)
+
+    @cached_property
     def streams(self) -> dict[int, list[Stream]]:
         """Stops and crossings of the approaches of each junction, by its number."""
-        stops = find_stops(self.trajectories) if len(self.trajectories) else None
         return {
             junction.number: [
-                observe_stream(a, self.samples, stops, self.trajectories.length_m)
+                observe_stream(a, self.samples, self.stops, self.trajectories.length_m)
                 for a in find_approaches(self.lanes, junction)
             ]
             for junction in self.lanes.junctions
-            if stops is not None
         }
 
     @cached_property

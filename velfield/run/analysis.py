@@ -16,7 +16,6 @@ from velfield.analysis.carriageways import find_carriageways
 from velfield.analysis.lanes.find import MIN_TRACKS, find_lanes
 from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.regions import Regions
-from velfield.analysis.stops import find_stops
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import Trajectories, from_tracklets, moving
 from velfield.analysis.vehicle_classes import VehicleClasses, find_classes
@@ -114,34 +113,6 @@ class RunAnalysis:
         direction = found.table["direction_rad"].to_numpy(np.float64)
         return Regions(
             found.labels, found.table.assign(heading_deg=heading_deg(direction, north_direction_rad(self.grid)))
-        )
-
-    def stops(
-        self,
-        *,
-        min_fraction: float = 0.2,
-        max_fraction: float = 0.9,
-        min_count: int = 3,
-        min_area_m2: float = 1.5,
-    ) -> Regions:
-        """Regions where some vehicles are stationary and others are not: `find_stops`.
-
-        Parameters
-        ----------
-        min_fraction, max_fraction
-            Limits of the stationary fraction of the tracks; above the upper one vehicles are parked.
-        min_count
-            Fewest tracks of a pixel.
-        min_area_m2
-            Smaller regions are dropped.
-        """
-        return find_stops(
-            self._float_layer("stationary_fraction"),
-            self._count,
-            min_fraction=min_fraction,
-            max_fraction=max_fraction,
-            min_count=min_count,
-            min_area_px=self._area_px(min_area_m2),
         )
 
     def bottlenecks(

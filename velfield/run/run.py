@@ -256,7 +256,7 @@ class Run:
 
     @cached_property
     def analysis(self) -> RunAnalysis:
-        """Lanes, carriageways, stops and bottlenecks: ``run.analysis.stops().table``."""
+        """Traffic answers, carriageways and bottlenecks: ``run.analysis.traffic.signals``."""
 
         def layer(name: str) -> NDArray[np.generic]:
             return open_field(self.layout.field).layer(name)

@@ -1,5 +1,5 @@
 """Conflicts: post-encroachment time where paths cross or merge, time to collision behind a leader; with the probability
-that each lies below a threshold, given the errors of positions."""
+that each is a conflict, given the errors of positions."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -14,17 +14,24 @@ from velfield.analysis.lanes.find import project
 from velfield.analysis.lanes.junctions import Crossing, find_crossings
 from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.trajectories import VEHICLE_WIDTH_M, Trajectories, group_rows
+from velfield.tracking.smoothing import ACCELERATION_NOISE
 
 ConflictKind = Literal["crossing", "merging", "following"]
 MAX_PET_S, MAX_TTC_S = 3.0, 3.0
 POSITION_SD_M, SPEED_SD_M_PER_S = 0.35, 0.3
-"""Standard deviations of a bumper's position on its path, including that of an unknown length, and of the speed."""
+"""Standard deviations of a bumper's position on its path, including that of an unknown length, and of the speed, of
+tracks without further errors."""
+HARD_BRAKING_M_PER_S2 = 3.4
+"""Drivers brake by this, and no harder, where nothing surprises them (AASHTO, A Policy on Geometric Design, 3.2.2): who
+closes up on a queue so has less than 1.5 s to collision, and no conflict."""
 _MIN_SPEED_M_PER_S = 1.0
 _MIN_FOLLOWER_M_PER_S = 3.0
 _OVERLAP_M = 1.0
 _PERSISTENCE_S = 0.4
 _JOINED_M = 4.0
 """A lane that joins another is on it so far after its own end."""
+_APART_M = 1.8
+"""Lanes that lie nearer to each other on their whole way, and by errors, are one."""
 _CAME_M = 3
 """A vehicle came by a lane on which it drove so far."""
 
@@ -38,7 +45,8 @@ class Conflict:
     value_s, sd_s
         Post-encroachment time (crossing, merging), or least time to collision (following), and its standard deviation.
     probability
-        That it is below ``threshold_s``.
+        That it is below ``threshold_s``; of following, and that the follower must brake harder than
+        `HARD_BRAKING_M_PER_S2` not to collide.
     """
 
     kind: ConflictKind
@@ -73,15 +81,23 @@ def find_conflicts(
         (tracks,) number of each track's vehicle, where tracks are cut; None: each track is one.
     """
     vehicles = np.arange(len(trajectories)) if vehicle is None else vehicle
+    sd_m, speed_sd = _deviations(trajectories.position_sd_m)
     lengths = trajectories.length_m if lengths_m is None else lengths_m
     found = [
         conflict
         for crossing in find_crossings(traffic.graph.lanes)
-        for conflict in _post_encroachments(crossing, traffic, lengths, pet_s)
+        for conflict in _post_encroachments(crossing, traffic, lengths, pet_s, sd_m)
     ]
-    found += _merges(traffic, lengths, vehicles, pet_s)
-    found += time_to_collision(trajectories, traffic.graph, lengths, ttc_s)
+    found += _merges(traffic, lengths, vehicles, pet_s, sd_m)
+    found += time_to_collision(trajectories, traffic.graph, lengths, ttc_s, (sd_m, speed_sd))
     return sorted(_closest(found), key=lambda c: c.time_s)
+
+
+def _deviations(position_sd_m: float) -> tuple[float, float]:
+    """Standard deviations of a bumper's position, m, and of a speed, m/s, of tracks whose smoothed positions have this
+    one: of a smoother of white acceleration the second follows from the first."""
+    smoothed = float(np.cbrt(ACCELERATION_NOISE * position_sd_m / (2 * np.sqrt(2))))
+    return float(np.hypot(POSITION_SD_M, position_sd_m)), max(SPEED_SD_M_PER_S, smoothed)
 
 
 def _closest(found: list[Conflict]) -> list[Conflict]:
@@ -95,7 +111,7 @@ def _closest(found: list[Conflict]) -> list[Conflict]:
 
 
 def _post_encroachments(
-    crossing: Crossing, traffic: LaneTraffic, lengths: FloatArray, threshold_s: float
+    crossing: Crossing, traffic: LaneTraffic, lengths: FloatArray, threshold_s: float, sd_m: float
 ) -> list[Conflict]:
     """Pairs that cross one after the other, by different lanes."""
     a = traffic.passings(crossing.lane, crossing.along_m)
@@ -103,10 +119,12 @@ def _post_encroachments(
     half_m = VEHICLE_WIDTH_M / 2 / max(abs(np.sin(crossing.angle_rad)), 0.3)
     both = Passings(np.r_[a.track, b.track], np.r_[a.time_s, b.time_s], np.r_[a.speed_m_per_s, b.speed_m_per_s])
     stream = np.repeat([0, 1], [len(a), len(b)])
-    return _pairs("crossing", both, stream, crossing.xy_m, lengths, half_m, threshold_s)
+    return _pairs("crossing", both, stream, crossing.xy_m, lengths, half_m, threshold_s, sd_m)
 
 
-def _merges(traffic: LaneTraffic, lengths: FloatArray, vehicle: IntArray, threshold_s: float) -> list[Conflict]:
+def _merges(
+    traffic: LaneTraffic, lengths: FloatArray, vehicle: IntArray, threshold_s: float, sd_m: float
+) -> list[Conflict]:
     """Pairs that come from different lanes onto one."""
     graph, out = traffic.graph, []
     for lane in graph:
@@ -119,8 +137,18 @@ def _merges(traffic: LaneTraffic, lengths: FloatArray, vehicle: IntArray, thresh
         at = traffic.passings(lane.number, place)
         source = _sources(vehicle[at.track], [vehicle[traffic.samples(k).track] for k in sources])
         known = source >= 0
+        source = _apart([graph.lanes[k].xy_m for k in sources], _APART_M + 2 * sd_m)[source]
         at = Passings(at.track[known], at.time_s[known], at.speed_m_per_s[known])
-        out += _pairs("merging", at, source[known], lane.at(place), lengths, 0.0, threshold_s)
+        out += _pairs("merging", at, source[known], lane.at(place), lengths, 0.0, threshold_s, sd_m)
+    return out
+
+
+def _apart(lanes: list[FloatArray], apart_m: float) -> IntArray:
+    """(n,) the first lane that each is not farther from, anywhere on its way: errors split one lane into several."""
+    out = np.arange(len(lanes))
+    for b in range(len(lanes)):
+        near = [a for a in range(b) if np.abs(project(lanes[b], lanes[a])[1]).max() < apart_m]
+        out[b] = out[near[0]] if near else b
     return out
 
 
@@ -141,6 +169,7 @@ def _pairs(
     lengths: FloatArray,
     half_m: float,
     threshold_s: float,
+    sd_m: float,
 ) -> list[Conflict]:
     """Consecutive passings of different streams (n,), nearer than ``MAX_PET_S``."""
     order = np.argsort(at.time_s, kind="stable")
@@ -149,7 +178,7 @@ def _pairs(
     k = np.flatnonzero((np.diff(stream) != 0) & (np.diff(time) < MAX_PET_S + 3.0) & (np.diff(track) != 0))
     reach = lengths[track] / 2 + half_m
     value = (time[k + 1] - reach[k + 1] / speed[k + 1]) - (time[k] + reach[k] / speed[k])
-    sd = POSITION_SD_M * np.hypot(1 / speed[k], 1 / speed[k + 1])
+    sd = sd_m * np.hypot(1 / speed[k], 1 / speed[k + 1])
     probability = stats.norm.cdf((threshold_s - value) / sd)
     return [
         Conflict(
@@ -161,13 +190,17 @@ def _pairs(
 
 
 def time_to_collision(
-    trajectories: Trajectories, graph: LaneGraph, lengths: FloatArray, threshold_s: float
+    trajectories: Trajectories,
+    graph: LaneGraph,
+    lengths: FloatArray,
+    threshold_s: float,
+    sds: tuple[float, float] = (POSITION_SD_M, SPEED_SD_M_PER_S),
 ) -> list[Conflict]:
     """Least time to collision of each follower and its leader on a lane, where it is below ``MAX_TTC_S``.
 
     Followers slower than 3 m/s are left out: closing up in a queue is no conflict. So are pairs that overlap at some
     time: two tracks of one vehicle, or vehicles side by side on a wide lane. A pair's value is the least that holds
-    for `_PERSISTENCE_S`, not that of one noisy frame.
+    for `_PERSISTENCE_S`, not that of one noisy frame. ``sds``: standard deviations of a position, m, and a speed, m/s.
     """
     lane, along = positions_on_lanes(trajectories, graph)
     rows = np.flatnonzero(lane >= 0)
@@ -186,10 +219,12 @@ def time_to_collision(
     value = persistent(pair, trajectories.time_s[a], gap / closing)
     lasts = np.isfinite(value)
     a, b, gap, closing, pair, value = a[lasts], b[lasts], gap[lasts], closing[lasts], pair[lasts], value[lasts]
-    sd = value * np.hypot(np.sqrt(2) * POSITION_SD_M / gap, np.sqrt(2) * SPEED_SD_M_PER_S / closing)
-    # the probability on the closing speed's side: gap < threshold * closing
-    spread = np.hypot(np.sqrt(2) * POSITION_SD_M, threshold_s * np.sqrt(2) * SPEED_SD_M_PER_S)
-    probability = stats.norm.cdf((threshold_s * closing - gap) / spread)
+    gap_sd, closing_sd = (np.sqrt(2) * sd for sd in sds)
+    sd = value * np.hypot(gap_sd / gap, closing_sd / closing)
+    # the probability on the closing speed's side: the gap is shorter than what this speed needs
+    needed = np.minimum(threshold_s * closing, closing**2 / (2 * HARD_BRAKING_M_PER_S2))
+    slope = np.minimum(threshold_s, closing / HARD_BRAKING_M_PER_S2)
+    probability = stats.norm.cdf((needed - gap) / np.hypot(gap_sd, slope * closing_sd))
     best = np.lexsort((value, pair))
     _, first = np.unique(pair[best], return_index=True)
     return [

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from scipy import stats
 
-from schemas.arrays import FloatArray, IntArray
+from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.analysis.flow.passings import LaneTraffic, find_passings
 from velfield.analysis.intervals import (
     LEVEL,
@@ -27,6 +27,8 @@ _STEADY_M, _STEADY = 30.0, 0.03
 """A vehicle that goes freely changes its speed by no more than this fraction over so long a distance."""
 _STEADY_SD = 0.002
 """By which the median of such speeds may differ from what drivers would like: standard deviation, as a fraction."""
+_RISES = 0.01
+"""One that is faster by more than this fraction at its end still speeds up: it would like to go faster than it does."""
 _MIN_FREE = 8
 SIGN_KM_PER_H = 10.0
 """Speed limits are multiples of it."""
@@ -89,7 +91,7 @@ class FreeFlow:
         Median speed at which drivers go where nobody is ahead; None: too few of them are seen to. Those who follow
         count as faster than they go (Botma's estimator of free speeds).
     limit_km_per_h
-        The multiple of ten nearest to it.
+        The multiple of ten nearest to it; None where its interval holds the border of two.
     p85_m_per_s
         Which 85 of 100 drivers do not exceed.
     """
@@ -105,20 +107,24 @@ def free_flow(traffic: LaneTraffic) -> list[FreeFlow]:
     speeds = [_steady_speeds(traffic, lane.number) for lane in traffic.graph]
     out = []
     for lanes in roads(traffic.graph):
-        tracks, values, headway = (np.concatenate([speeds[lane][k] for lane in lanes]) for k in range(3))
-        median, p85 = (_free_quantile(tracks, values, headway, q) for q in (0.5, 0.85))
-        limit = None if median is None else round(median.value * 3.6 / SIGN_KM_PER_H) * SIGN_KM_PER_H
+        tracks, values, headway, rises = (np.concatenate([speeds[lane][k] for lane in lanes]) for k in range(4))
+        median, p85 = (_free_quantile(tracks, values, headway, rises, q) for q in (0.5, 0.85))
+        signs = {round(v * 3.6 / SIGN_KM_PER_H) for v in (median.low, median.high)} if median else set()
+        limit = signs.pop() * SIGN_KM_PER_H if len(signs) == 1 else None
         out.append(FreeFlow(tuple(lanes), median, limit, p85))
     return out
 
 
-def _free_quantile(tracks: IntArray, speeds: FloatArray, headway_s: FloatArray, q: float) -> Estimate | None:
+def _free_quantile(
+    tracks: IntArray, speeds: FloatArray, headway_s: FloatArray, rises: Mask, q: float
+) -> Estimate | None:
     """A quantile of free speeds: the mean for both headways from which on a vehicle may follow, and the interval that
     holds both of theirs."""
     found = []
     for follows_s in _FOLLOWS_HEADWAY_S:
         free = headway_s > _FREE_HEADWAY_S
         used = np.flatnonzero(free | (headway_s < follows_s))
+        free = free & ~rises
         # a vehicle once: its fastest steady stretch, as it goes slowly for other reasons too
         order = used[np.lexsort((-speeds[used], tracks[used]))]
         _, first = np.unique(tracks[order], return_index=True)
@@ -134,17 +140,18 @@ def _free_quantile(tracks: IntArray, speeds: FloatArray, headway_s: FloatArray, 
     return Estimate(value, low, high, min(estimate.n for estimate in known))
 
 
-def _steady_speeds(traffic: LaneTraffic, lane: int) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Tracks, their speeds where they go steadily, and their headways there, s."""
+def _steady_speeds(traffic: LaneTraffic, lane: int) -> tuple[IntArray, FloatArray, FloatArray, Mask]:
+    """Tracks, their speeds where they go steadily, their headways there, s, and whether they still speed up."""
     samples = traffic.samples(lane)
     length = traffic.graph.lanes[lane].length_m
     window = min(_STEADY_M, 0.6 * length)
-    tracks, speeds, headways = [np.empty(0, np.int64)], [np.empty(0)], [np.empty(0)]
+    tracks, speeds, headways, rises = [np.empty(0, np.int64)], [np.empty(0)], [np.empty(0)], [np.empty(0, bool)]
     steps = int(window)
     if steps < 5 or len(samples) <= steps:
-        return tracks[0], speeds[0], headways[0]
+        return tracks[0], speeds[0], headways[0], rises[0]
     low, high = (_of_windows(samples.speed_m_per_s, steps, of) for of in (np.minimum, np.maximum))
     mean = (low + high) / 2
+    rise = samples.speed_m_per_s[steps - 1 :] - samples.speed_m_per_s[: len(low)]
     one = samples.track[: len(low)] == samples.track[steps - 1 :]
     steady = one & (high - low < 2 * _STEADY * mean) & (low > 2.0)
     for at in np.arange(0.5 * window, length, 10.0):
@@ -158,7 +165,8 @@ def _steady_speeds(traffic: LaneTraffic, lane: int) -> tuple[IntArray, FloatArra
         tracks.append(samples.track[begin])
         speeds.append(mean[begin])
         headways.append(headway[order][k[known]] if len(passed) else np.empty(0))
-    return np.concatenate(tracks), np.concatenate(speeds), np.concatenate(headways)
+        rises.append(rise[begin] > _RISES * mean[begin])
+    return np.concatenate(tracks), np.concatenate(speeds), np.concatenate(headways), np.concatenate(rises)
 
 
 def _of_windows(values: FloatArray, steps: int, of: np.ufunc) -> FloatArray:

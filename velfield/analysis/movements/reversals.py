@@ -15,7 +15,7 @@ _MIN_TURN_RAD = np.radians(150)
 _ROAD_M_PER_S = 5.5
 """Who is slower all the way from 40 m before a turn to 40 m after it turns in a car park."""
 _APPROACH_M = 40
-_LEG_M, _LEG_SIGMAS = 8, 6.0
+_LEG_M, _LEG_SIGMAS = 8, 24.0
 """Before the turn and after it the vehicle goes on so far, and farther than its errors by so many standard deviations,
 the opposite way."""
 _OPPOSITE_RAD = np.radians(140)

@@ -104,12 +104,17 @@ def find_signal(junction: int, streams: Sequence[Stream], begin_s: float, end_s:
             f"needed; {stopped} of {share.n if share else 0} vehicles stopped"
         )
         return JunctionSignal(junction, None, reason, None, (), ())
-    longest = min(MAX_CYCLE_S, duration / 2)
-    found = _find_cycle(events, longest) if longest > MIN_CYCLE_S else None
+    # Two streams whose greens alternate recur at half the cycle, too: cycles of which two are not seen compete with it.
+    found = _find_cycle(events, min(MAX_CYCLE_S, duration)) if duration > 2 * MIN_CYCLE_S else None
     if found is None:
         reason = f"too little data: {duration:.0f} s, two cycles of {MIN_CYCLE_S:.0f} s or more needed"
         return JunctionSignal(junction, None, reason, None, (), ())
     cycle, concentration, p_value = found
+    if cycle > duration / 2:
+        reason = (
+            f"too little data: starts of queues may recur every {cycle:.0f} s, of which {duration:.0f} s hold no two"
+        )
+        return JunctionSignal(junction, None, reason, None, (), ())
     if p_value > _MAX_P_VALUE or concentration < _MIN_CONCENTRATION:
         if n >= _NO_CYCLE_STARTS and duration >= _NO_CYCLE_S:
             reason = f"no fixed cycle: {n} starts of queues, concentration {concentration:.2f}"

@@ -6,7 +6,7 @@ import numpy as np
 
 from schemas.analysis import AnalysisTable, GeometryRecord
 from schemas.arrays import FloatArray
-from velfield.analysis.flow.conflicts import Conflict
+from velfield.analysis.flow.conflicts import HARD_BRAKING_M_PER_S2, Conflict
 from velfield.analysis.flow.speeds import FreeFlow, Reduction, Station
 from velfield.analysis.flow.volume import LaneFlow, level_of_service
 from velfield.analysis.lanes.model import Lane
@@ -259,10 +259,13 @@ def conflict_table(analysis: TrafficAnalysis) -> AnalysisTable:
         Column("time", "Time", "s", lambda c: c.time_s, 1),
         Column("value", "Time to collision, or post-encroachment time", "s", lambda c: c.value_s, 2),
         Column("sd", "Standard deviation", "s", lambda c: c.sd_s, 2),
-        Column("probability", "Probability that it is below 1.5 s", "%", lambda c: 100 * c.probability, 1),
+        Column("probability", "Probability that it is a conflict (below 1.5 s)", "%", lambda c: 100 * c.probability, 1),
     ]
     rows = [c for c in sorted(analysis.conflicts, key=lambda c: -c.probability) if c.probability >= 0.05]
-    note = "Following: least time to collision behind a leader. Crossing and merging: post-encroachment time."
+    note = (
+        "Following: least time to collision behind a leader; a conflict needs braking harder than "
+        f"{HARD_BRAKING_M_PER_S2} m/s2, too. Crossing and merging: post-encroachment time."
+    )
     place = _at(analysis)
     return make_table("conflicts", "Conflicts", "Conflicts", note, columns, rows, lambda c: place(c.xy_m))
 
