@@ -4,9 +4,6 @@ import os
 import shlex
 import sys
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 
@@ -276,7 +273,7 @@ def demo(
         Print warnings only.
     """
     from flows.commands.analyse import analyse
-    from flows.launch import first_start_beside, kernels_beside, prepare_process
+    from flows.launch import kernels_beside, prepare_process
     from schemas.job import Inputs, Job
     from velfield.pipeline.configuration import resolve_config
     from velfield.synthetic.clip import CLIP_NAME
@@ -284,9 +281,8 @@ def demo(
     prepare_process(verbose=False)
     flight, run = out / "flight", out / "run"
     with kernels_beside():
-        with first_start_beside():
-            # Ten frames a second: twice what a run uses, and two fifths of what a drone's clip takes to render.
-            _simulate(flight, frames=frames, size=size, seed=seed, quiet=quiet, clip="beside", fps=10.0)
+        # Ten frames a second: twice what a run uses, and two fifths of what a drone's clip takes to render.
+        _simulate(flight, frames=frames, size=size, seed=seed, quiet=quiet, clip="beside", fps=10.0)
         config = resolve_config(preset="fast")
         inputs = Inputs(source=str(flight / CLIP_NAME))
         status = _process(Job(root=str(run), inputs=inputs, config=config), verbosity="quiet" if quiet else "normal")
@@ -371,35 +367,25 @@ def _process(
 ) -> int:
     from velfield.pipeline.plan import check_inputs
 
-    with _prefect_console(verbosity, "flows.process_flight", lambda: check_inputs(job)) as console:
-        from flows.process_flight import run_flight
-        from flows.runners import RunnerConfig
+    console = _prepare(verbosity)
+    check_inputs(job)
+    from flows.process_flight import run_flight
+    from flows.runners import RunnerConfig
 
-        summary = run_flight(job, runner or RunnerConfig(), console)
+    summary = run_flight(job, runner or RunnerConfig(), console)
     return _conclude(summary, console)
 
 
-@contextmanager
-def _prefect_console(
-    verbosity: "Verbosity", flow: str, check: Callable[[], object] = lambda: None
-) -> Iterator["Console"]:
-    """A console, with Prefect's server in use; ``check``, and the import of the flow, pass while the server starts."""
-    from flows.launch import first_start, prepare_process
+def _prepare(verbosity: "Verbosity") -> "Console":
+    """Set this process up for a run; its console."""
+    from flows.launch import prepare_process
     from flows.stopping import stop_on_signals
-    from flows.temporary_server import start_server
 
     stop_on_signals()
     prepare_process(verbose=verbosity == "verbose")
-    server = start_server()
-    check()
     from flows.console import Console
 
-    console = Console(verbosity)
-    if first_start():
-        console.event("start", "creating the Prefect database (first run only, about 30 s)")
-    import_module(flow)
-    with server.in_use():
-        yield console
+    return Console(verbosity)
 
 
 def _process_tracks(job: "Job", runner: "RunnerConfig", verbosity: "Verbosity", *, plan_only: bool) -> int:
@@ -408,10 +394,10 @@ def _process_tracks(job: "Job", runner: "RunnerConfig", verbosity: "Verbosity", 
 
         print(describe_tracks(job))
         return DONE
-    with _prefect_console(verbosity, "flows.process_tracks") as console:
-        from flows.process_tracks import run_tracks
+    console = _prepare(verbosity)
+    from flows.process_tracks import run_tracks
 
-        summary = run_tracks(job, runner, console)
+    summary = run_tracks(job, runner, console)
     from velfield.pipeline.analysis.analyse import analyse_run
 
     for line in analyse_run(Path(job.root)):

@@ -10,7 +10,6 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
-from pathlib import Path
 from subprocess import DEVNULL, Popen
 
 from velfield.errors import CacheWarning, DeviceWarning
@@ -19,10 +18,8 @@ from velfield.kernel_cache import cache_root, is_writable, temporary_cache, user
 PAGES, PAGES_OF = "VELFIELD_PAGES", "VELFIELD_PAGES_OF"
 """Environment: where `velfield serve` shows the pages of runs, and of which folder."""
 _SETTINGS: dict[str, str] = {
-    # The temporary server imports from the working folder: a module there with a common name would break it.
+    # Prefect's server imports from the working folder: a module there with a common name would break it.
     "PYTHONSAFEPATH": "1",
-    # The first flow on a cold machine took 8-20 s to get its server, whose time-out is 20 s.
-    "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "180",
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
     "DO_NOT_TRACK": "1",
     # Prefect's default lets any page that a browser shows talk to the server.
@@ -66,7 +63,6 @@ def prepare_process(*, verbose: bool) -> None:
     """Set this process up to run flows. Call before prefect is imported."""
     for name, value in (_SETTINGS if verbose else _SETTINGS | _QUIET).items():
         os.environ.setdefault(name, value)
-    spare_proxies()
     _keep_memory()
     import cv2
 
@@ -127,34 +123,6 @@ def _keep_memory() -> None:
             os.environ[name] = str(size)
             if mallopt is not None:
                 mallopt(number, size)
-
-
-def first_start() -> bool:
-    """Whether Prefect has yet to create the database of its temporary server, which takes half a minute."""
-    from prefect.settings import get_current_settings
-
-    settings = get_current_settings()
-    url = settings.server.database.connection_url
-    kind, _, file = url.get_secret_value().partition(":///") if url else ("", "", "")
-    return settings.api.url is None and kind.startswith("sqlite") and not Path(file).exists()
-
-
-@contextmanager
-def first_start_beside() -> Iterator[None]:
-    """Create the Prefect database, where there is none, in another process while this one does something else.
-
-    Should it fail, nothing is lost: the start itself does what is left, and reports errors.
-    """
-    if not first_start():
-        yield
-        return
-    command = [sys.executable, "-m", "prefect", "server", "database", "upgrade", "-y"]
-    with Popen(command, stdout=DEVNULL, stderr=DEVNULL) as beside:
-        try:
-            yield
-        except BaseException:
-            beside.terminate()
-            raise
 
 
 @contextmanager

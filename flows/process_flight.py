@@ -1,25 +1,22 @@
-"""The whole job: all stages of one flight as a Prefect flow.
+"""The whole job: all stages of one flight as a flow.
 
 The stages and their order stand in ``velfield.pipeline.stage``. A task is thin glue: it asks
 ``velfield.pipeline.graphs`` for the Dask graph of its unit and computes it on the runner. What is finished is known
-from the run folder's commit records, so a task whose unit has one returns at once, whatever Prefect remembers of it.
-Futures of one stage are passed to the next, which draws the lineage in the UI. On a long flight a task beside them
-makes maps of what there is so far. The report is written last, from the
-summary of all stages, by every run: it is no stage, for nothing depends on it and it takes a moment.
+from the run folder's commit records, so a task whose unit has one returns at once. Futures of one stage are passed to
+the next, which draws the lineage in Prefect's UI. On a long flight a task beside them makes maps of what there is so
+far. The report is written last, from the summary of all stages, by every run: it is no stage, for nothing depends on it
+and it takes a moment.
 """
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from prefect import flow
-from prefect.task_runners import ThreadPoolTaskRunner
-
-from flows.artifacts import publish_summary
 from flows.console import Console
+from flows.orchestration import Orchestration, run_name
+from flows.prefect_server import choose_orchestration
 from flows.previews import Previews
 from flows.runners import Runner, RunnerConfig, open_runner, parallel_units
-from flows.stale import mark_crashed, name_run
 from flows.stopping import stop_lost
 from flows.work import Work
 from schemas.job import Job
@@ -43,24 +40,28 @@ def run_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
     InputError
         The inputs or the configuration are not usable; committed units are kept.
     """
-    task_runner = ThreadPoolTaskRunner(max_workers=parallel_units(runner))
-    named = process_flight.with_options(task_runner=task_runner, flow_run_name=name_run(job))
-    return named(job, runner, console)
+    by = choose_orchestration()
+    return by.run(
+        lambda: process_flight(job, runner, console, by),
+        name="process-flight",
+        run_name=run_name(job.root),
+        threads=parallel_units(runner),
+        parameters=job,
+    )
 
 
-@flow(name="process-flight", flow_run_name="{job.root}", persist_result=False, validate_parameters=False)
-def process_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
+def process_flight(job: Job, runner: RunnerConfig, console: Console, by: Orchestration) -> RunSummary:
     """Aerial video in, velocity field out."""
     layout = RunLayout(Path(job.root))
     with locked(layout, stop_lost), _leave_no_trace(layout), open_runner(runner, console.warn) as where:
-        mark_crashed(name_run(job)())
+        by.mark_killed(run_name(job.root))
         sweep_partial(layout.root)
         remove_tree(layout.preview)
         plan = make_plan(job)
         validate_inputs(plan)
         check_space(plan)
         with disk_full_as_input_error(plan):
-            return _run_stages(job, plan, where, parallel_units(runner), console)
+            return _run_stages(plan, where, parallel_units(runner), console, by)
 
 
 @contextmanager
@@ -76,17 +77,17 @@ def _leave_no_trace(layout: RunLayout) -> Iterator[None]:
         raise
 
 
-def _run_stages(job: Job, plan: Plan, runner: Runner, at_once: int, console: Console) -> RunSummary:
+def _run_stages(plan: Plan, runner: Runner, at_once: int, console: Console, by: Orchestration) -> RunSummary:
     """All stages, then the report."""
     dropped = dropped_inputs(plan)
     record_start(plan, f"{plan.frame_count} frames to process, {runner.description}", console)
     for warning in (*dropped, *plan.info.warnings):
         console.warn(warning)
-    work = Work(plan, runner, console, at_once=at_once, aside=Previews(plan, runner, console))
+    work = Work(plan, runner, console, by, at_once=at_once, aside=Previews(plan, runner, console))
     work.run()
     remove_tree(plan.layout.preview)
     summary = summarise_run(work.plan, work.summaries)
-    publish_report(work.plan, summary, runner, console)
+    publish_report(work.plan, summary, runner, console, by)
     return summary
 
 
@@ -100,9 +101,9 @@ def record_start(plan: Plan, what: str, console: Console) -> None:
         console.event("changed", f"{plan.layout.root}: {text}", changed=changed)
 
 
-def publish_report(plan: Plan, summary: RunSummary, runner: Runner, console: Console) -> None:
-    """Write the page and the report, print the warnings, and show the summary in Prefect's UI."""
+def publish_report(plan: Plan, summary: RunSummary, runner: Runner, console: Console, by: Orchestration) -> None:
+    """Write the page and the report, print the warnings, and show the summary."""
     for note in runner.call(write_report, plan, summary):  # it reads whole tables
         console.warn_at_end(note)
     console.print_warnings()
-    publish_summary(plan, summary)
+    by.publish(plan, summary)

@@ -2,13 +2,11 @@
 
 from pathlib import Path
 
-from prefect import flow
-from prefect.task_runners import ThreadPoolTaskRunner
-
 from flows.console import Console
+from flows.orchestration import Orchestration, run_name
+from flows.prefect_server import choose_orchestration
 from flows.process_flight import publish_report, record_start
 from flows.runners import RunnerConfig, open_runner, parallel_units
-from flows.stale import mark_crashed, name_run
 from flows.stopping import stop_lost
 from flows.work import Work
 from schemas.job import Job
@@ -29,23 +27,27 @@ def run_tracks(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
     InputError
         The tracks or the configuration are not usable.
     """
-    task_runner = ThreadPoolTaskRunner(max_workers=parallel_units(runner))
-    named = process_tracks.with_options(task_runner=task_runner, flow_run_name=name_run(job))
-    return named(job, runner, console)
+    by = choose_orchestration()
+    return by.run(
+        lambda: process_tracks(job, runner, console, by),
+        name="process-tracks",
+        run_name=run_name(job.root),
+        threads=parallel_units(runner),
+        parameters=job,
+    )
 
 
-@flow(name="process-tracks", flow_run_name="{job.root}", persist_result=False, validate_parameters=False)
-def process_tracks(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
+def process_tracks(job: Job, runner: RunnerConfig, console: Console, by: Orchestration) -> RunSummary:
     """Tracks in, velocity field out."""
     check_format(Path(job.root))
     plan = plan_tracks(job)  # refuses bad tracks before the folder is there
     layout = RunLayout(Path(job.root))
     with locked(layout, stop_lost), open_runner(runner, console.warn) as where:
-        mark_crashed(name_run(job)())
+        by.mark_killed(run_name(job.root))
         sweep_partial(layout.root)
         record_start(plan, f"tracks over {plan.frame_count} times, {where.description}", console)
-        work = Work(plan, where, console, at_once=parallel_units(runner))
+        work = Work(plan, where, console, by, at_once=parallel_units(runner))
         work.run(list_track_stages(), tracks_graph, essential=True)
         summary = RunSummary(root=job.root, stages=tuple(work.summaries))
-        publish_report(work.plan, summary, where, console)
+        publish_report(work.plan, summary, where, console, by)
     return summary

@@ -8,14 +8,11 @@ again.
 from functools import partial
 from pathlib import Path
 
-from prefect import flow, task
-from prefect.cache_policies import NO_CACHE
-from prefect.task_runners import ThreadPoolTaskRunner
-
 from flows.console import Console
+from flows.orchestration import Orchestration
+from flows.prefect_server import choose_orchestration
 from flows.process_flight import process_flight, publish_report
 from flows.runners import RunnerConfig, open_runner, parallel_units
-from flows.stale import mark_crashed
 from flows.stopping import stop_lost
 from flows.work import Work
 from schemas.job import Inputs, Job, absolute
@@ -67,29 +64,37 @@ def run_reprocess(
     if not base.exists():
         raise InputError(f"--base {base}: no such file; check the path")
     chosen = result_name(name, base)
-    task_runner = ThreadPoolTaskRunner(max_workers=parallel_units(where))
-    return reprocess.with_options(task_runner=task_runner)(
-        absolute(str(root)), absolute(str(base)), chosen, full, max_added_error_px, where, console or Console("normal")
+    run, image, by = absolute(str(root)), absolute(str(base)), choose_orchestration()
+    limit_px = None if full else max_added_error_px
+    return by.run(
+        lambda: reprocess(run, image, chosen, limit_px, where, console or Console("normal"), by),
+        name="reprocess",
+        run_name=f"{run} on {chosen}",
+        threads=parallel_units(where),
+        parameters={"run": run, "base": image, "name": chosen, "full": full},
     )
 
 
-@flow(name="reprocess", flow_run_name="{root} on {name}", persist_result=False, validate_parameters=False)
 def reprocess(
-    root: str, base: str, name: str, full: bool, max_added_error_px: float, runner: RunnerConfig, console: Console
+    root: str, base: str, name: str, limit_px: float | None, runner: RunnerConfig, console: Console, by: Orchestration
 ) -> tuple[Path, RunSummary | None]:
     """One run, a new base image, a new result beside the old one."""
     check_format(Path(root))
     run = open_run(root)
     run.require_frames()
     with locked(run.layout, stop_lost):
-        mark_crashed(f"{root} on {name}")
+        by.mark_killed(f"{root} on {name}")
         if result_exists(run.layout, name, Path(base)):
             console.event("start", f"{run.layout.results / name} is the result on this base image already")
             return publish_result(run, name, Path(base)), None
         job = _new_job(run, name, base)
-        found = None if full else _registered(run, base, max_added_error_px, console)
+        found = None if limit_px is None else _registered(run, base, limit_px, console, by)
         try:
-            summary = _again(run, job, runner, console) if found is None else _mapped(run, job, found, runner, console)
+            summary = (
+                _again(run, job, runner, console, by)
+                if found is None
+                else _mapped(run, job, found, runner, console, by)
+            )
         except InputError:
             discard_result(RunLayout(Path(job.root)))
             raise
@@ -112,12 +117,10 @@ def _new_job(run: Run, name: str, base: str) -> Job:
     return Job(root=str(staging_layout(run.layout, name).root), inputs=inputs, config=run.record.config)
 
 
-def _registered(run: Run, base: str, limit_px: float, console: Console) -> RebaseRecord | None:
+def _registered(run: Run, base: str, limit_px: float, console: Console, by: Orchestration) -> RebaseRecord | None:
     """The registration of the new image to the old base image; none, with a warning, where it is not good enough."""
-    measure = task(
-        measure_rebase, name="new base image on the old one", cache_policy=NO_CACHE, persist_result=False, retries=0
-    )
-    found = measure(run, Path(base))
+    name = "new base image on the old one"
+    found = by.submit(lambda: measure_rebase(run, Path(base)), name=name, run_name=name).result()
     if isinstance(found, Failure):
         console.warn(
             f"the new base image does not register to the old one, so the frames are registered again: {found.reason}"
@@ -133,15 +136,16 @@ def _registered(run: Run, base: str, limit_px: float, console: Console) -> Rebas
     return found
 
 
-def _again(run: Run, job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
+def _again(run: Run, job: Job, runner: RunnerConfig, console: Console, by: Orchestration) -> RunSummary:
     """Register the frames to the new base image: a run of its own that starts from the stages before the base image."""
     layout = RunLayout(Path(job.root))
     link_shared_outputs(run.layout, layout, stages_before("base"))
-    task_runner = ThreadPoolTaskRunner(max_workers=parallel_units(runner))
-    return process_flight.with_options(task_runner=task_runner)(job, runner, console)
+    return process_flight(job, runner, console, by)
 
 
-def _mapped(run: Run, job: Job, found: RebaseRecord, runner: RunnerConfig, console: Console) -> RunSummary:
+def _mapped(
+    run: Run, job: Job, found: RebaseRecord, runner: RunnerConfig, console: Console, by: Orchestration
+) -> RunSummary:
     layout = RunLayout(Path(job.root))
     link_shared_outputs(run.layout, layout, _names(NewBase.SHARED), without=("base/",))
     link_shared_outputs(run.layout, layout, _names(NewBase.COUNTS), without=("",))  # no outputs, only the records
@@ -149,10 +153,10 @@ def _mapped(run: Run, job: Job, found: RebaseRecord, runner: RunnerConfig, conso
     plan = plan_rebase(run, job, found)
     write_flight_record(plan)
     with open_runner(runner, console.warn) as where:
-        work = Work(plan, where, console, at_once=parallel_units(runner))
+        work = Work(plan, where, console, by, at_once=parallel_units(runner))
         _run_stages(work, Rebase(run.layout, found))
         summary = summarise_run(plan, work.summaries)
-        publish_report(plan, summary, where, console)
+        publish_report(plan, summary, where, console, by)
     return summary
 
 

@@ -1,7 +1,6 @@
 """Flow runs that were killed stay "Running" in Prefect for ever, unless they are marked as crashed."""
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 from prefect.client.orchestration import get_client
@@ -10,7 +9,6 @@ from prefect.client.schemas.objects import FlowRun, StateType
 from prefect.runtime import flow_run
 from prefect.states import Crashed
 
-from schemas.job import Job, absolute
 from velfield.run.layout import RunLayout, to_path
 from velfield.run.lock import holder_is_gone
 
@@ -18,15 +16,6 @@ _PAGE = 200
 _S3 = "s3:/"
 _RESUMED = "the process was killed; the next run of this folder resumed from its commits"
 _ENDED = "the process was killed; the same command resumes from its commits"
-
-
-def name_run(job: Job) -> Callable[[], str]:
-    """The name in Prefect of a run of a job: its folder, from the root on.
-
-    By a folder as it is given, two runs on a folder `RUN` of two places would be one, and one that was killed could
-    not be distinguished from one that lives.
-    """
-    return partial(absolute, job.root)  # a function: Prefect takes braces in a text for fields
 
 
 def mark_crashed(name: str) -> int:

@@ -1,18 +1,15 @@
-"""The units of the stages as Prefect tasks: named for people, retried, linked to the units that they read."""
+"""The units of the stages as tasks: named for people, retried, linked to the units that they read."""
 
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from queue import SimpleQueue
 from typing import Any, Protocol
 
-from prefect import task
-from prefect.cache_policies import NO_CACHE
-from prefect.futures import PrefectFuture
-
-from flows.artifacts import LongStage
 from flows.console import Console, StageProgress
-from flows.runners import Runner, WorkersKilledError
+from flows.orchestration import Orchestration
+from flows.runners import Runner
 from schemas.records import CommitRecord
 from schemas.summary import StageSummary
 from velfield.errors import InputError, is_disk_full
@@ -24,7 +21,6 @@ from velfield.pipeline.summary import summarise_stage
 from velfield.pipeline.units import WHOLE, Unit, discard_unit, prepare_stage, stage_units
 from velfield.run.commits import read_commits
 
-Future = PrefectFuture[Any]
 GraphOf = Callable[[Plan, Stage, Unit], Any]
 """The Dask graph of a unit."""
 LONG_MPX = 1200.0
@@ -47,9 +43,10 @@ class UnderWay:
     units: list[Unit]
     essential: bool
     progress: StageProgress
-    artifact: LongStage
+    show: Callable[[int], None]
+    """Called with the steps that are done."""
     started_s: float
-    futures: dict[int, Future] = field(default_factory=dict)
+    futures: dict[int, Future[Any]] = field(default_factory=dict)
     """By the number of the unit: those submitted."""
     ended: set[int] = field(default_factory=set)
     lost: dict[str, str] = field(default_factory=dict)
@@ -81,13 +78,14 @@ class Work:
     plan: Plan
     runner: Runner
     console: Console
+    orchestration: Orchestration
     at_once: int = 2
     aside: Aside | None = None
     summaries: list[StageSummary] = field(default_factory=list)
     _stages: dict[str, UnderWay] = field(default_factory=dict)
     _running: int = 0
-    _beside: Future | None = None
-    _ends: "SimpleQueue[tuple[int | None, Future]]" = field(default_factory=SimpleQueue)
+    _beside: Future[Any] | None = None
+    _ends: "SimpleQueue[tuple[int | None, Future[Any]]]" = field(default_factory=SimpleQueue)
 
     def __post_init__(self) -> None:
         self._given = self.plan
@@ -140,7 +138,7 @@ class Work:
         if k is None:
             self._beside = None
             if self.aside is not None:
-                self.aside.finish(_failure_cause(future) if _is_lost(future) else None)
+                self.aside.finish(future.exception())
         else:
             self._running -= 1
         return k
@@ -161,8 +159,8 @@ class Work:
         total = sum(unit.steps for unit in units)
         progress.expect(total)
         whole = stage.essential if essential is None else essential
-        artifact = LongStage(stage.name, total)
-        under_way = UnderWay(stage, self.plan, units, whole, progress, artifact, time.monotonic())
+        show = self.orchestration.show_progress(stage.name, total)
+        under_way = UnderWay(stage, self.plan, units, whole, progress, show, time.monotonic())
         self._stages[stage.name] = under_way
         for k, unit in enumerate(units):
             if gone := [name for name in self._alike(stage) if unit.name in self._stages[name].lost]:
@@ -176,16 +174,16 @@ class Work:
         by_frames = stage.cut is Cut.BY_FRAMES
         return [name for name in stage.after if by_frames and name in self._stages and STAGE[name].cut is stage.cut]
 
-    def _upstream(self, under_way: UnderWay, k: int) -> list[Future]:
-        """Futures of the units that a unit reads, for the lineage in Prefect's UI: of what is not lost."""
-        found: list[Future] = []
+    def _upstream(self, under_way: UnderWay, k: int) -> list[Future[Any]]:
+        """Futures of the units that a unit reads, for the lineage: of what is not lost."""
+        found: list[Future[Any]] = []
         for name in under_way.stage.after:
             before = self._stages.get(name)
             if before is not None and name in self._alike(under_way.stage):
                 found += [before.futures[j] for j in (k, k + 1) if j in before.futures]
             elif before is not None:
                 found += before.futures.values()
-        return [future for future in found if not _is_lost(future)]
+        return [future for future in found if future.exception() is None]
 
     def carry_over(self, stage: Stage) -> None:
         """Summarise a stage whose units an earlier result finished, and that this one takes as they are."""
@@ -202,16 +200,13 @@ class Work:
             return _without_outputs(record or self.runner.compute(graph(plan, stage, unit)))
 
         label = stage.label if unit.name == WHOLE else f"{stage.label} {unit.name}"
-        future = task(
+        future = self.orchestration.submit(
             do,
             name=stage.label,
-            task_run_name=label,
+            run_name=label,
             retries=self.plan.config.work.retries,
-            retry_delay_seconds=1,
-            retry_condition_fn=_worth_retrying,
-            cache_policy=NO_CACHE,
-            persist_result=False,
-        ).submit(wait_for=self._upstream(under_way, k))
+            after=self._upstream(under_way, k),
+        )
         under_way.futures[k] = future
         self._running += 1
         future.add_done_callback(lambda done: self._ends.put((k, done)))
@@ -221,17 +216,14 @@ class Work:
             return
         do = self.aside.next_task(list(self._stages.values()))
         if do is not None:
-            self._beside = task(
-                do, name="preview", task_run_name="preview", retries=0, cache_policy=NO_CACHE, persist_result=False
-            ).submit()
+            self._beside = self.orchestration.submit(do, name="preview", run_name="preview")
             self._beside.add_done_callback(lambda done: self._ends.put((None, done)))
 
     def _end(self, under_way: UnderWay, k: int) -> None:
         """Note that a unit is done or lost; raises its error where nothing can follow without it."""
         under_way.ended.add(k)
         future, unit = under_way.futures[k], under_way.units[k]
-        if _is_lost(future):
-            error = _failure_cause(future)
+        if (error := future.exception()) is not None:
             if isinstance(error, InputError) or is_disk_full(error) or under_way.essential:
                 raise error
             reason = " ".join(str(error).split()) or type(error).__name__
@@ -240,7 +232,7 @@ class Work:
             discard_unit(under_way.plan, under_way.stage, unit.name)
         steps = sum(under_way.units[j].steps for j in under_way.ended)
         under_way.progress.at_least(steps)
-        under_way.artifact.update(steps)
+        under_way.show(steps)
 
     def _describe(self, under_way: UnderWay, unit: Unit) -> str:
         """A unit for people: with its run, and the times of its frames."""
@@ -253,7 +245,7 @@ class Work:
     def _finish(self, under_way: UnderWay) -> None:
         under_way.progress.remove()
         lost = under_way.lost = dict(sorted(under_way.lost.items()))
-        records = [future.result() for _, future in sorted(under_way.futures.items()) if not _is_lost(future)]
+        records = [future.result() for _, future in sorted(under_way.futures.items()) if future.exception() is None]
         # Units that failed change the keys of all that is made without them.
         gone = [f"{name} {unit}" for name, one in self._stages.items() for unit in one.lost]
         self.plan = self._given.with_lost_units(gone)
@@ -285,35 +277,5 @@ class Work:
 
 
 def _without_outputs(record: CommitRecord) -> CommitRecord:
-    """Prefect keeps what a task returns: hundreds of digests a unit would make the driver grow with the flight."""
+    """What a task returns is kept: hundreds of digests a unit would make the driver grow with the flight."""
     return record.model_copy(update={"outputs": {}})
-
-
-def _worth_retrying(_task: Any, run: Any, state: Any) -> bool:
-    """Bad input stays bad, and a full disk full: only what may pass, such as a killed worker, is tried again.
-
-    A unit that killed all workers that tried it gets one more, fresh worker: further ones would kill other units too.
-    """
-    try:
-        state.result()
-    except InputError:
-        return False
-    except WorkersKilledError:
-        return bool(run.run_count <= 1)
-    except Exception as error:
-        return not is_disk_full(error)
-    return False
-
-
-def _is_lost(future: Future) -> bool:
-    future.wait()  # a callback may come an instant before its state says so
-    return not future.state.is_completed()
-
-
-def _failure_cause(future: Future) -> BaseException:
-    if not future.state.is_final():
-        return RuntimeError("a unit that it reads failed")
-    outcome = future.result(raise_on_failure=False)
-    if isinstance(outcome, BaseException):
-        return outcome
-    return RuntimeError(future.state.message or f"not run ({future.state.name})")

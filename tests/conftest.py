@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from flows.launch import prepare_process
+from flows.launch import prepare_process, spare_proxies
 from schemas.simulation import SimulationConfig
 from schemas.summary import RunSummary
 from tests.s3_server import s3_server
@@ -69,6 +69,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """A Prefect server of our own, once a session: its start takes longer than a small flight."""
+    spare_proxies()
     prepare_process(verbose=False)
     from prefect.testing.utilities import prefect_test_harness
 

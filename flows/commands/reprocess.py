@@ -46,21 +46,18 @@ def reprocess(
     """
     from flows.launch import prepare_process
     from flows.stopping import stop_on_signals
-    from flows.temporary_server import start_server
 
     stop_on_signals()
     prepare_process(verbose=False)
-    server = start_server()
     from flows.console import Console
     from flows.reprocess import run_reprocess
     from flows.runners import RunnerConfig
 
     console = Console("quiet" if quiet else "normal")
     where = RunnerConfig(workers=workers, scheduler=scheduler)
-    with server.in_use():
-        root, summary = run_reprocess(
-            run_folder, base, name=out, full=full, max_added_error_px=max_error_px, runner=where, console=console
-        )
+    root, summary = run_reprocess(
+        run_folder, base, name=out, full=full, max_added_error_px=max_error_px, runner=where, console=console
+    )
     console.result(f"result  {root}")
     console.result(f"names   {root.parents[1] / 'results.json'}")
     return DONE if summary is None or summary.complete else INCOMPLETE

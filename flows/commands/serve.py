@@ -42,8 +42,9 @@ def serve(
     cluster
         Cluster file, as for `velfield run`.
     """
-    from flows.launch import prepare_process
+    from flows.launch import prepare_process, spare_proxies
 
+    spare_proxies()
     prepare_process(verbose=False)
     from flows.serve import ServeConfig, serve_folder
 

@@ -56,7 +56,6 @@ def _repair(run: "Run") -> None:
     from flows.process_flight import run_flight
     from flows.process_tracks import run_tracks
     from flows.runners import RunnerConfig
-    from flows.temporary_server import check_server
     from schemas.job import Job
     from velfield.analysis.movements.time_slices import SLICE_S
     from velfield.pipeline.analysis.analyse import analyse_run
@@ -67,7 +66,6 @@ def _repair(run: "Run") -> None:
     from velfield.run.flight_record import check_format
     from velfield.run.lock import locked
 
-    check_server()
     check_format(run.layout.root)
     given = _inputs(run.record, run.layout.root)
     job = Job(root=str(run.layout.root), inputs=given, config=run.record.config)

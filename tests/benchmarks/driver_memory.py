@@ -5,6 +5,7 @@ python -m tests.benchmarks.driver_memory
 
 import tempfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +15,20 @@ from flows.launch import prepare_process
 def main() -> None:
     """Print the resident memory of this process before and after each flight."""
     prepare_process(verbose=False)
-    from prefect import flow
-    from prefect.task_runners import ThreadPoolTaskRunner
+    from flows.orchestration import Threads
 
     with tempfile.TemporaryDirectory() as folder:
         print(f"{'frames':>8} {'unit':>5} {'tasks':>6} {'MB before':>10} {'MB after':>9}")
         for frames, unit in ((256, 8), (5000, 8), (5000, "auto"), (72_000, "auto")):
-            flown = flow(name="driver-memory", validate_parameters=False, persist_result=False)(_stages)
+            by = Threads()
             root = Path(folder) / f"{frames}-{unit}"
             before = _resident_mb()
-            tasks = flown.with_options(task_runner=ThreadPoolTaskRunner(max_workers=4))(root, frames, unit)
+            stages = partial(_stages, root, frames, unit, by)
+            tasks = by.run(stages, name="driver-memory", run_name=root.name, threads=4, parameters=None)
             print(f"{frames:>8} {unit:>5} {tasks:>6} {before:>10.0f} {_resident_mb():>9.0f}", flush=True)
 
 
-def _stages(root: Path, frames: int, unit: Any) -> int:
+def _stages(root: Path, frames: int, unit: Any, by: Any) -> int:
     from dask import delayed
 
     from flows.console import Console
@@ -37,7 +38,7 @@ def _stages(root: Path, frames: int, unit: Any) -> int:
     from velfield.pipeline.stage import STAGES, Cut
 
     plan = planned(frames, root, unit_frames=unit)
-    work = Work(plan, ThreadsRunner(2), Console("quiet"), at_once=4)
+    work = Work(plan, ThreadsRunner(2), Console("quiet"), by, at_once=4)
     by_frames = [replace(stage, prepare=None) for stage in STAGES if stage.cut is Cut.BY_FRAMES]
     work.run(by_frames, lambda plan, stage, part: delayed(_commit, pure=False)(plan, stage.name, part))
     return len(by_frames) * len(plan.units)

@@ -1,9 +1,9 @@
-"""A long flight of small frames: memory, file descriptors and Prefect's database must not grow with the frames.
+"""A long flight of small frames: memory and file descriptors must not grow with the frames.
 
 python -m tests.faults.soak [--frames 20000] [--size 160x120] [--folder FOLDER]
 
 The frames are those of a simulated flight, there and back as often as needed (hard links). A process of its own runs
-them; this one reads its memory and descriptors, and those of all that it started, every few seconds.
+them; this one reads its memory and descriptors every few seconds.
 """
 
 import argparse
@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
@@ -34,16 +35,12 @@ _SAMPLE_S = 5.0
 
 @dataclass(frozen=True)
 class Sample:
-    """Memory and files that the processes of a run held at one moment."""
+    """Memory and files that a run's process held at one moment."""
 
     seconds: float
     commits: int
-    run_rss_mb: float
-    """Resident memory of the run's own process; not of Prefect's server."""
-    server_rss_mb: float
+    rss_mb: float
     descriptors: int
-    """Of the run's own process."""
-    database_kb: float
 
 
 def write_long_flight(folder: Path, frames: int, width: int, height: int, seed: int) -> None:
@@ -65,22 +62,17 @@ def write_long_flight(folder: Path, frames: int, width: int, height: int, seed: 
             writer.writerow((linked, f"{0.2 * k:.3f}"))
 
 
-def samples(process: "subprocess.Popen[bytes]", root: Path, database: Path) -> Iterator[Sample]:
+def samples(process: "subprocess.Popen[bytes]", root: Path) -> Iterator[Sample]:
     """A sample every few seconds until the process ends."""
     own, started = psutil.Process(process.pid), time.monotonic()
     while process.poll() is None:
-        try:
-            others = sum(child.memory_info().rss for child in own.children(recursive=True))
+        with suppress(psutil.Error):
             yield Sample(
                 seconds=time.monotonic() - started,
                 commits=sum(1 for _ in root.glob("commits/*/*.json")),
-                run_rss_mb=own.memory_info().rss / 1e6,
-                server_rss_mb=others / 1e6,
+                rss_mb=own.memory_info().rss / 1e6,
                 descriptors=own.num_fds(),
-                database_kb=sum(path.stat().st_size for path in database.parent.glob(f"{database.name}*")) / 1e3,
             )
-        except psutil.Error:
-            pass
         time.sleep(_SAMPLE_S)
 
 
@@ -95,7 +87,7 @@ def main() -> None:
     folder = Path(tempfile.mkdtemp(prefix="velfield-soak-", dir=given.folder))
     width, height = map(int, given.size.split("x"))
     write_long_flight(folder, given.frames, width, height, given.seed)
-    environment = os.environ | {"PREFECT_HOME": str(folder / "prefect"), "PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "flows.cli", "run", str(folder / "frames"), "--out", str(folder / "run")]
     command += ["--timestamps", str(folder / "timestamps.csv")]
     command += ["--labels", str(folder / "simulated/labels.csv"), "--gsd-m", "0.23"]
@@ -107,7 +99,7 @@ def main() -> None:
     ):
         writer = csv.writer(file)
         writer.writerow(names)
-        for sample in samples(process, folder / "run", folder / "prefect/prefect.db"):
+        for sample in samples(process, folder / "run"):
             writer.writerow(astuple(sample))
             taken.append(sample)
     print(f"status {process.returncode}; {given.frames} frames of {given.size}; samples in {folder / 'samples.csv'}")

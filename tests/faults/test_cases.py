@@ -213,13 +213,12 @@ def ended(command: list[str], environment: dict[str, str], folder: Path) -> str:
 
 @pytest.mark.slow
 def test_case_02_proxies_for_every_address(tmp_path: Path) -> None:
-    """Prefect's server is on this machine, which no proxy reaches; a SOCKS proxy needs a package that is not there."""
+    """A run reaches no address, so none stands in its way; a SOCKS proxy needs a package that is not there."""
     proxies = {"http_proxy": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
     proxies["ALL_PROXY"] = "socks5h://127.0.0.1:9"
     tracks = case("01") / "tracks.csv"
     command = [sys.executable, "-m", "flows.cli", "run", "--tracks", str(tracks), "--out", str(tmp_path / "run")]
-    said = ended(command, {**proxies, "PYTHONPATH": os.getcwd(), "PREFECT_HOME": str(tmp_path / "prefect")}, tmp_path)
-    assert "ALL_PROXY = socks5h://..." in said
+    ended(command, {**proxies, "PYTHONPATH": os.getcwd()}, tmp_path)
     assert (tmp_path / "run" / "index.html").exists()
 
 

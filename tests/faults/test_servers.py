@@ -16,8 +16,8 @@ import numpy as np
 import psutil
 import pytest
 
+from flows.orchestration import run_name
 from flows.runners import RunnerConfig, open_runner
-from flows.stale import name_run
 from schemas.summary import RunSummary
 from tests.small_flight import job, process
 from tests.viewer.test_viewer_server import served
@@ -104,15 +104,6 @@ def test_a_local_cluster_listens_on_this_machine_alone() -> None:
     assert {ip for _, ip, _ in opened} == {"127.0.0.1"}
 
 
-def test_the_temporary_server_of_prefect_is_for_this_machine_alone() -> None:
-    """By the address that it is started with: to start one takes ten seconds, which other tests do."""
-    from flows import temporary_server
-
-    assert temporary_server._HOST == "127.0.0.1"
-    with socket.create_server((temporary_server._HOST, 0)) as probe:
-        assert probe.getsockname()[0] == "127.0.0.1"
-
-
 @pytest.mark.skipif(not page_is_built(), reason="the page is not built: `make page`")
 def test_annotate_serves_its_frames_and_nothing_else(tmp_path: Path) -> None:
     image = tmp_path / "frames" / "a.png"
@@ -160,7 +151,7 @@ def test_a_run_is_named_by_its_folder_from_the_root_on(
     named = FlowRunFilter(name=FlowRunFilterName(any_=[str(tmp_path / "RUN {x}")]))
     with get_client(sync_client=True) as client:
         assert len(client.read_flow_runs(flow_run_filter=named)) == 1
-    assert name_run(job(flight, Path("s3://runs/flight")))() == "s3://runs/flight"  # `Path` drops a slash
+    assert run_name(job(flight, Path("s3://runs/flight")).root) == "s3://runs/flight"  # `Path` drops a slash
 
 
 def test_a_run_on_s3_whose_lease_expired_is_crashed_once_another_works_there(server: None, s3: None) -> None:

@@ -99,26 +99,6 @@ def test_a_plan_is_shown_and_nothing_is_done(tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize(
-    ("database", "api", "first"),
-    [
-        ("sqlite+aiosqlite:///{folder}/none.db", None, True),
-        ("sqlite+aiosqlite:///{folder}/there.db", None, False),
-        ("sqlite+aiosqlite:///{folder}/none.db", "http://127.0.0.1:4200/api", False),
-        ("postgresql+asyncpg://host/prefect", None, False),
-    ],
-)
-def test_prefects_first_start_is_known_beforehand(tmp_path: Path, database: str, api: str | None, first: bool) -> None:
-    from prefect.settings import PREFECT_API_DATABASE_CONNECTION_URL, PREFECT_API_URL, temporary_settings
-
-    from flows.launch import first_start
-
-    (tmp_path / "there.db").touch()
-    settings = {PREFECT_API_DATABASE_CONNECTION_URL: database.format(folder=tmp_path), PREFECT_API_URL: api}
-    with temporary_settings(settings):
-        assert first_start() == first
-
-
 @pytest.fixture(scope="module")
 def wheel_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The built wheel, unpacked where nothing else is."""

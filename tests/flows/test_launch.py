@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from flows import launch, temporary_server
+from flows import launch, prefect_server
 from velfield.errors import CacheWarning, DeviceWarning, InputError
 
 
@@ -78,19 +78,19 @@ def test_an_address_without_a_server_is_one_line_within_seconds(url: str, monkey
     """Before Prefect is imported; ``silent`` takes connections and answers none."""
     for proxy in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(proxy, raising=False)
-    monkeypatch.setattr(temporary_server, "_ANSWER_S", 0.5)
+    monkeypatch.setattr(prefect_server, "_ANSWER_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"http://127.0.0.1:{silent.getsockname()[1]}/api" if url == "silent" else url
         monkeypatch.setenv("PREFECT_API_URL", address)
         with pytest.raises(InputError, match=f"{address}: found no Prefect server") as caught:
-            temporary_server.check_address()
+            prefect_server.check_address()
     assert "\n" not in str(caught.value)
 
 
 def test_a_server_that_does_not_answer_is_one_line() -> None:
     from prefect.settings import PREFECT_API_URL, temporary_settings
 
-    from flows.temporary_server import check_server
+    from flows.prefect_server import check_server
 
     dead = "http://127.0.0.1:9/api"
     with temporary_settings({PREFECT_API_URL: dead}), pytest.raises(InputError, match=f"{dead}: found no") as caught:

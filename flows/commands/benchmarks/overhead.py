@@ -1,4 +1,4 @@
-"""``velfield bench overhead``: the overhead of Prefect and Dask over the bare functions, start-up excluded.
+"""``velfield bench overhead``: the overhead of flow and Dask over the bare functions, start-up excluded.
 
 The peer runs the same stage functions in the same order on a pool of as many processes, in a plain loop. Both are
 measured from the first unit to the last commit, in wall time, and in the processor time of all processes together,
@@ -26,7 +26,7 @@ class Cost:
 
 
 def overhead(flight: Path, /, *, work: Path, workers: int = 2) -> int:
-    """Compare Prefect and Dask with the bare functions, on a simulated flight.
+    """Compare flow and Dask with the bare functions, on a simulated flight; with Prefect where a server is set.
 
     Parameters
     ----------

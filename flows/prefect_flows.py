@@ -1,0 +1,86 @@
+"""Runs as Prefect flows, and their units as tasks: named for people, retried, linked to the units that they read."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from typing import Any, TypeVar
+
+from prefect import flow as prefect_flow
+from prefect import task
+from prefect.cache_policies import NO_CACHE
+from prefect.futures import PrefectFuture
+from prefect.task_runners import ThreadPoolTaskRunner
+
+from flows.artifacts import LongStage, publish_summary
+from flows.orchestration import RETRY_S, Orchestration, worth_retrying
+from flows.stale import mark_crashed
+from schemas.summary import RunSummary
+from velfield.pipeline.plan import Plan
+
+T = TypeVar("T")
+
+
+class PrefectFlows(Orchestration):
+    """Flows and tasks of the server that Prefect's settings name."""
+
+    def __init__(self) -> None:
+        self._shown: dict[Future[Any], PrefectFuture[Any]] = {}
+
+    def run(self, flow: Callable[[], T], *, name: str, run_name: str, threads: int, parameters: Any) -> T:
+        def shown(parameters: Any) -> T:
+            return flow()
+
+        options = {"persist_result": False, "validate_parameters": False}
+        runner = ThreadPoolTaskRunner(max_workers=threads)
+        # The name by a function: Prefect takes braces in a text for fields.
+        run: Any = prefect_flow(shown, name=name, flow_run_name=lambda: run_name, task_runner=runner, **options)
+        result: T = run(parameters)
+        return result
+
+    def submit(
+        self, do: Callable[[], T], *, name: str, run_name: str, retries: int = 0, after: Sequence[Future[Any]] = ()
+    ) -> "Future[T]":
+        future: Future[T] = Future()
+        self._shown[future] = shown = task(
+            do,
+            name=name,
+            task_run_name=run_name,
+            retries=retries,
+            retry_delay_seconds=RETRY_S,
+            retry_condition_fn=_worth_retrying,
+            cache_policy=NO_CACHE,
+            persist_result=False,
+        ).submit(wait_for=[self._shown[one] for one in after])
+        shown.add_done_callback(lambda done: _settle(future, done))
+        return future
+
+    def mark_killed(self, run_name: str) -> None:
+        mark_crashed(run_name)
+
+    def show_progress(self, stage: str, steps: int) -> Callable[[int], None]:
+        return LongStage(stage, steps).update
+
+    def publish(self, plan: Plan, summary: RunSummary) -> None:
+        publish_summary(plan, summary)
+
+
+def _worth_retrying(_task: Any, run: Any, state: Any) -> bool:
+    try:
+        state.result()
+    except Exception as error:
+        return worth_retrying(error, run.run_count)
+    return False
+
+
+def _settle(future: "Future[T]", shown: PrefectFuture[T]) -> None:
+    """Give a future the outcome of Prefect's."""
+    shown.wait()  # a callback may come an instant before its state says so
+    if not shown.state.is_final():
+        future.set_exception(RuntimeError("a unit that it reads failed"))
+        return
+    outcome: Any = shown.result(raise_on_failure=False)
+    if shown.state.is_completed():
+        future.set_result(outcome)
+    elif isinstance(outcome, BaseException):
+        future.set_exception(outcome)
+    else:
+        future.set_exception(RuntimeError(shown.state.message or f"not run ({shown.state.name})"))

@@ -1,0 +1,100 @@
+"""Flows on threads of this process, and as Prefect shows them: the same results, retries and errors."""
+
+import subprocess
+import sys
+from concurrent.futures import Future
+from pathlib import Path
+
+import pytest
+
+from flows import orchestration, prefect_server
+from flows.orchestration import Orchestration, Threads
+from flows.prefect_server import choose_orchestration
+from flows.runners import WorkersKilledError
+from velfield.errors import InputError
+
+
+@pytest.fixture(params=["threads", "prefect"])
+def by(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Orchestration:
+    monkeypatch.setattr(orchestration, "RETRY_S", 0.0)
+    if request.param == "threads":
+        return Threads()
+    request.getfixturevalue("server")
+    from flows import prefect_flows
+
+    monkeypatch.setattr(prefect_flows, "RETRY_S", 0.0)
+    chosen = choose_orchestration()
+    assert isinstance(chosen, prefect_flows.PrefectFlows)
+    return chosen
+
+
+@pytest.mark.parametrize(
+    ("error", "attempts"),
+    [
+        (OSError("blinked"), 3),
+        (InputError("stays bad"), 1),
+        (OSError(28, "No space left on device"), 1),
+        (WorkersKilledError("all of them"), 2),
+    ],
+)
+def test_what_may_pass_is_tried_again_and_its_error_is_kept(by: Orchestration, error: Exception, attempts: int) -> None:
+    calls: list[int] = []
+
+    def fail() -> None:
+        calls.append(1)
+        raise error
+
+    def flow() -> BaseException | None:
+        return by.submit(fail, name="fails", run_name="fails 0", retries=2).exception(60)
+
+    found = by.run(flow, name="flow", run_name="flow {x}", threads=2, parameters={"a": 1})
+    assert (type(found), str(found)) == (type(error), str(error))
+    assert len(calls) == attempts
+
+
+def test_tasks_read_those_before_and_a_flow_within_another_has_threads_of_its_own(by: Orchestration) -> None:
+    def inner() -> int:
+        first = by.submit(lambda: 1, name="one", run_name="one")
+        assert first.result(60) == 1
+        return by.submit(lambda: 2, name="two", run_name="two", after=[first]).result(60)
+
+    def outer() -> tuple[int, int]:
+        nested = by.run(inner, name="inner", run_name="inner", threads=1, parameters=None)
+        last: Future[int] = by.submit(lambda: 3, name="three", run_name="three")
+        return nested, last.result(60)
+
+    assert by.run(outer, name="outer", run_name="outer", threads=1, parameters=None) == (2, 3)
+
+
+def test_an_error_of_the_flow_is_raised(by: Orchestration) -> None:
+    def refuse() -> None:
+        raise InputError("no such file")
+
+    with pytest.raises(InputError, match="no such file"):
+        by.run(refuse, name="flow", run_name="flow", threads=1, parameters=None)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "imported"),
+    [
+        (None, "", False),
+        ("pyproject.toml", "[tool.ruff]", False),
+        ("prefect.toml", "", True),
+        (".env", "PREFECT_API_URL=", True),
+        ("home/profiles.toml", "", True),
+    ],
+)
+def test_prefect_is_imported_only_where_its_settings_may_name_a_server(
+    tmp_path: Path, file: str | None, text: str, imported: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "home").mkdir()
+    if file is not None:
+        (tmp_path / file).write_text(text)
+    for name in prefect_server._NAMING_A_SERVER:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("PREFECT_HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).resolve().parents[2]))
+    code = "import sys, flows.process_flight, flows.process_tracks, flows.reprocess, flows.prefect_server as o; "
+    code += "print(type(o.choose_orchestration()).__name__, 'prefect' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert done.stdout.split() == ["Threads", str(imported)]
