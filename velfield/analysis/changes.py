@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from schemas.arrays import FloatArray
 from velfield.analysis.intervals import LEVEL, Estimate
@@ -55,9 +55,9 @@ def find_changes(before: TrafficAnalysis, after: TrafficAnalysis) -> list[Change
 
 def p_value(a: Estimate, b: Estimate) -> float:
     """Probability of so large a difference by chance, by the standard errors of the two intervals."""
-    z = stats.norm.ppf((1 + LEVEL) / 2)
+    z = special.ndtri((1 + LEVEL) / 2)
     error = np.hypot((a.high - a.low) / (2 * z), (b.high - b.low) / (2 * z))
-    return float(2 * stats.norm.sf(abs(a.value - b.value) / max(float(error), 1e-12)))
+    return float(2 * special.ndtr(-abs(a.value - b.value) / max(float(error), 1e-12)))
 
 
 def _discoveries(p: FloatArray) -> FloatArray:

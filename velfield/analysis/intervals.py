@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from schemas.arrays import FloatArray, IntArray
 
@@ -45,7 +45,7 @@ def estimate_mean(values: NDArray[np.floating], *, min_n: int = MIN_VEHICLES) ->
     if len(known) < min_n:
         return None
     mean = float(known.mean())
-    half = float(stats.t.ppf((1 + LEVEL) / 2, len(known) - 1) * known.std(ddof=1) / np.sqrt(len(known)))
+    half = float(special.stdtrit(len(known) - 1, (1 + LEVEL) / 2) * known.std(ddof=1) / np.sqrt(len(known)))
     return Estimate(mean, mean - half, mean + half, len(known))
 
 
@@ -103,7 +103,7 @@ def estimate_censored_quantile(
     known = np.flatnonzero((survival > 0) & (survival < 1))
     if not len(known):
         return None
-    z = float(stats.norm.ppf((1 + LEVEL) / 2)) * np.sqrt(variance[known]) / np.abs(np.log(survival[known]))
+    z = float(special.ndtri((1 + LEVEL) / 2)) * np.sqrt(variance[known]) / np.abs(np.log(survival[known]))
     curves = (survival[known] ** np.exp(z), survival[known], survival[known] ** np.exp(-z))
     low, value, high = (_first_below(np.asarray(curve), ordered[known], 1 - q) for curve in curves)
     if low is None or value is None:
@@ -120,7 +120,7 @@ def _fractional_order(ordered: FloatArray, q: float, alpha: float) -> float:
     """The order statistic, interpolated, that lies above the quantile ``q`` with probability ``alpha``."""
     n = len(ordered)
     ranks = np.arange(1, n + 1)
-    above = 1 - stats.beta.cdf(q, ranks, n - ranks + 1)  # probability that the statistic of a rank lies above
+    above = 1 - special.betainc(ranks, n - ranks + 1, q)  # probability that the statistic of a rank lies above
     return float(np.interp(alpha, above, ordered))
 
 
@@ -129,8 +129,8 @@ def estimate_share(successes: float, n: int, *, min_n: int = MIN_VEHICLES) -> Es
     if n < min_n:
         return None
     a, b = successes + 0.5, n - successes + 0.5
-    low = 0.0 if successes <= 0 else float(stats.beta.ppf((1 - LEVEL) / 2, a, b))
-    high = 1.0 if successes >= n else float(stats.beta.ppf((1 + LEVEL) / 2, a, b))
+    low = 0.0 if successes <= 0 else float(special.betaincinv(a, b, (1 - LEVEL) / 2))
+    high = 1.0 if successes >= n else float(special.betaincinv(a, b, (1 + LEVEL) / 2))
     return Estimate(successes / n, low, high, n)
 
 
@@ -154,7 +154,7 @@ def estimate_rate(
         return None
     factor = _dispersion(np.asarray(counts, np.float64)) if dispersion is None else dispersion
     shape = (total + 0.5) / factor
-    low, high = (float(stats.gamma.ppf(p, shape) * factor) for p in ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
+    low, high = (float(special.gammaincinv(shape, p) * factor) for p in ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
     return Estimate(total / exposure, low / exposure, high / exposure, round(total))
 
 

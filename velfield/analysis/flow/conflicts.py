@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 from numba import njit
-from scipy import stats
+from scipy import special
 
 from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.flow.passings import LaneTraffic, Passings
@@ -179,7 +179,7 @@ def _pairs(
     reach = lengths[track] / 2 + half_m
     value = (time[k + 1] - reach[k + 1] / speed[k + 1]) - (time[k] + reach[k] / speed[k])
     sd = sd_m * np.hypot(1 / speed[k], 1 / speed[k + 1])
-    probability = stats.norm.cdf((threshold_s - value) / sd)
+    probability = special.ndtr((threshold_s - value) / sd)
     return [
         Conflict(
             kind, int(track[i]), int(track[i + 1]), float(time[i + 1]), xy_m, float(v), float(s), threshold_s, float(p)
@@ -224,7 +224,7 @@ def time_to_collision(
     # the probability on the closing speed's side: the gap is shorter than what this speed needs
     needed = np.minimum(threshold_s * closing, closing**2 / (2 * HARD_BRAKING_M_PER_S2))
     slope = np.minimum(threshold_s, closing / HARD_BRAKING_M_PER_S2)
-    probability = stats.norm.cdf((needed - gap) / np.hypot(gap_sd, slope * closing_sd))
+    probability = special.ndtr((needed - gap) / np.hypot(gap_sd, slope * closing_sd))
     best = np.lexsort((value, pair))
     _, first = np.unique(pair[best], return_index=True)
     return [

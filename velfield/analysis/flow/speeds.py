@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy import stats
+from scipy import special
 
 from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.analysis.flow.passings import LaneTraffic, find_passings
@@ -134,7 +134,7 @@ def _free_quantile(
     if not known:
         return None
     value = float(np.mean([estimate.value for estimate in known]))
-    systematic = float(stats.norm.ppf((1 + LEVEL) / 2)) * _STEADY_SD * value
+    systematic = float(special.ndtri((1 + LEVEL) / 2)) * _STEADY_SD * value
     below, above = value - min(e.low for e in known), max(e.high for e in known) - value
     low, high = value - float(np.hypot(below, systematic)), value + float(np.hypot(above, systematic))
     return Estimate(value, low, high, min(estimate.n for estimate in known))

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.intervals import LEVEL, Estimate, estimate_mean, estimate_share
@@ -219,7 +219,7 @@ def _red_onset(stream: Stream, green_s: float, cycle_s: float) -> Estimate | Non
     rate = max(crossings, _MIN_RATE_CROSSINGS) / (_RATE_S - 1)
     early, middle, late = (_last_crossing_gap(p, rate) for p in ((1 - LEVEL) / 2, 0.5, (1 + LEVEL) / 2))
     value = quiet_s + last + middle
-    systematic = float(stats.norm.ppf((1 + LEVEL) / 2)) * _RED_SD_S
+    systematic = float(special.ndtri((1 + LEVEL) / 2)) * _RED_SD_S
     low = value - float(np.hypot(middle - early, systematic))
     high = value + float(np.hypot(late - middle, systematic))
     shift = green_s - cycle_s * np.floor((value + green_s) / cycle_s)

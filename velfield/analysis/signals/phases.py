@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.intervals import Estimate
@@ -102,7 +102,7 @@ def _fit_cycle(number: IntArray, time: FloatArray, group: IntArray) -> Estimate:
     free = max(len(k) - len(np.unique(group)) - 1, 1)
     slope = float((k * t).sum() / (k**2).sum())
     residual = float(np.sqrt(((t - slope * k) ** 2).sum() / free))
-    half = float(stats.t.ppf(0.95, free) * max(residual, 0.1) / np.sqrt((k**2).sum()))
+    half = float(special.stdtrit(free, 0.95) * max(residual, 0.1) / np.sqrt((k**2).sum()))
     return Estimate(slope, slope - half, slope + half, len(k))
 
 
@@ -111,7 +111,7 @@ def _green(number: IntArray, time: FloatArray, cycle: Estimate) -> Estimate:
     onset = np.sort(time - number * cycle.value)
     early = float(np.quantile(onset, _CLEAR_QUANTILE))
     # A low quantile of few values: its error is about that of the mean.
-    scatter = float(onset.std(ddof=1) / np.sqrt(len(onset))) * float(stats.t.ppf(0.95, len(onset) - 1))
+    scatter = float(onset.std(ddof=1) / np.sqrt(len(onset))) * float(special.stdtrit(len(onset) - 1, 0.95))
     drift = float(np.abs(number.mean())) * (cycle.high - cycle.low) / 2
     half = float(np.sqrt(scatter**2 + drift**2 + (1.645 * START_DELAY_SD_S) ** 2))
     value = (early - START_DELAY_S) % cycle.value
