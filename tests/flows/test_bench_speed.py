@@ -56,6 +56,21 @@ def test_every_stage_is_timed(capsys: pytest.CaptureFixture[str], monkeypatch: p
     assert 0 < float(rate) < 1.2 * float(peak)
 
 
+def test_clips_are_timed_with_nothing_given(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = {"480p H.264": (640, 480), "480p H.265": (640, 480)}
+    monkeypatch.setattr("velfield.bench.clips.CLIPS", small)
+    assert speed(frames=45, preset="fast", parts=("clips",), work=tmp_path) == 0
+    told = capsys.readouterr().out
+    for name in small:
+        assert f"{name}, 45 frames, " in told
+    assert len(re.findall(r"^frames +[\d.]+ s, +[\d.]+ s of processor", told, re.MULTILINE)) == len(small)
+    decoded, whole = (re.findall(rf"{text} ([\d.]+) s", told) for text in ("libav alone, all frames:", "velfield run:"))
+    assert len(decoded) == len(whole) == len(small)
+    assert probe(tmp_path / "480p-H.265-45.mp4", frames=FramesConfig(every=1)).frame_count == 45
+
+
 def test_the_literal_chain_puts_a_response_in_the_place_of_the_presets() -> None:
     chain = LiteralChain({"registration": 1.0, "detections": 3.0}, 2.0, response_rows=8.0, response_arrays=98.0)
     _, preset, rows, arrays = chain.text(ours_s=0.5)

@@ -1,5 +1,6 @@
-"""A command with all that it starts: wall time, and the memory of its driver and of its workers while it runs."""
+"""A command with all that it starts: time, and the memory of its driver and of its workers while it runs."""
 
+import os
 import subprocess
 import time
 from collections.abc import Sequence
@@ -37,6 +38,7 @@ class MeasuredRun:
     """Time and memory that a run took."""
 
     wall_s: float
+    processor_s: float
     driver: Memory
     worker: Memory
     appeared_s: float | None = None
@@ -49,7 +51,7 @@ class MeasuredRun:
             if memory.samples:
                 quarters = ", ".join(f"{memory.largest_in(k / 4, (k + 1) / 4) / 1000:.2f}" for k in range(4))
                 parts.append(f"{name} {memory.peak_mb / 1000:.2f} GB at its peak (by quarters of the run {quarters})")
-        return f"{self.wall_s:.1f} s; memory: {'; '.join(parts)}"
+        return f"{self.wall_s:.1f} s, {self.processor_s:.1f} s of processor; memory: {'; '.join(parts)}"
 
 
 def run_measured(command: Sequence[str], watch: Path | None = None) -> MeasuredRun:
@@ -62,7 +64,7 @@ def run_measured(command: Sequence[str], watch: Path | None = None) -> MeasuredR
     """
     driver, worker = Memory(), Memory()
     appeared_s = None
-    start = time.monotonic()
+    start, used_s = time.monotonic(), _processor_s()
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
         while process.poll() is None:
             _sample(process.pid, time.monotonic() - start, driver, worker)
@@ -72,7 +74,13 @@ def run_measured(command: Sequence[str], watch: Path | None = None) -> MeasuredR
         error = process.stderr.read().decode() if process.stderr else ""
     if process.returncode:
         raise RuntimeError(f"{' '.join(command)} ended with status {process.returncode}: {error[-2000:]}")
-    return MeasuredRun(time.monotonic() - start, driver, worker, appeared_s)
+    return MeasuredRun(time.monotonic() - start, _processor_s() - used_s, driver, worker, appeared_s)
+
+
+def _processor_s() -> float:
+    """Time of all processes that this one started and that ended."""
+    used = os.times()
+    return used.children_user + used.children_system
 
 
 def _sample(pid: int, at_s: float, driver: Memory, worker: Memory) -> None:

@@ -13,8 +13,8 @@ from flows.options import parse_frame_size
 if TYPE_CHECKING:
     from velfield.pipeline.plan import Plan
 
-Part = Literal["stages", "network", "peers", "paper", "workers", "job"]
-PARTS: tuple[Part, ...] = ("stages", "network", "peers", "paper", "workers", "job")
+Part = Literal["stages", "network", "peers", "paper", "workers", "job", "clips"]
+PARTS: tuple[Part, ...] = ("stages", "network", "peers", "paper", "workers", "job", "clips")
 
 
 def peak_memory_bytes() -> int:
@@ -58,7 +58,8 @@ def speed(
         Parts to measure: `stages` on one core; the `network` against the machine's peak; `peers` (stabilo, trackpy,
         boost-histogram and xhistogram, where `make bench` installed them, and convolutions of YOLOv8n's sizes); the
         `paper`'s chain read literally; two `workers` against one; the whole `job` by `velfield run --workers 2`, with
-        the memory of driver and workers. All but the first two follow on the stages.
+        the memory of driver and workers; `clips` of 1080p and 4K with nothing given, as many frames at 30 a second.
+        All but `network` and `clips` follow on the stages.
     work
         Folder for flight and runs, kept; a flight that is there is used again. Default: a temporary one.
     """
@@ -69,10 +70,14 @@ def speed(
     width, height = parse_frame_size(size, "480 or more each, as 2560x1920", min_px=480)
     with nullcontext(work) if work is not None else tempfile.TemporaryDirectory(prefix="velfield-speed-") as folder:
         root = Path(str(folder))
+        if "clips" in parts:
+            _time_clips(root, preset, frames)
+        if set(parts) == {"clips"}:
+            return 0
         flight = _simulate(root / f"flight-{frames}-{width}x{height}", frames, width, height)
         plan = _plan(flight, root / f"run-{preset}", preset, frames)
         print(f"{frames} frames of {width}x{height}, preset {preset}")
-        seconds = _time_stages(plan) if set(parts) - {"network", "job"} else {}
+        seconds = _time_stages(plan) if set(parts) - {"network", "job", "clips"} else {}
         if "network" in parts or "peers" in parts:
             _time_network(width, height)
         if "peers" in parts:
@@ -170,6 +175,29 @@ def _time_workers(plan: "Plan") -> None:
 
     one_s, two_s = (time_workers(plan, stages_by_frame(), workers) for workers in (1, 2))
     print(f"stages by frame on one worker {one_s:.1f} s, on two {two_s:.1f} s: {one_s / two_s:.3g} times")
+
+
+def _time_clips(root: Path, preset: str, frames: int) -> None:
+    from schemas.job import Inputs, Job
+    from velfield.bench.clips import CLIPS, decode_s, make_clip
+    from velfield.bench.measured_run import run_measured
+    from velfield.pipeline.configuration import resolve_config
+    from velfield.pipeline.plan import make_plan, write_flight_record
+    from velfield.run.layout import remove_tree
+
+    root.mkdir(parents=True, exist_ok=True)
+    for name in CLIPS:
+        clip = make_clip(name, root, frames)
+        out = root / f"run-{clip.stem}"
+        remove_tree(out)
+        plan = make_plan(Job(root=str(out), inputs=Inputs(source=str(clip)), config=resolve_config(preset=preset)))
+        write_flight_record(plan)
+        print(f"{name}, {frames} frames, {plan.frame_count} of them used, nothing given")
+        _time_stages(plan)
+        print(f"libav alone, all frames: {decode_s(clip):.1f} s of processor")
+        remove_tree(out)
+        command = [sys.executable, "-m", "flows.cli", "run", str(clip), f"--preset={preset}", "--quiet", f"--out={out}"]
+        print(f"velfield run: {run_measured(command).text()}", flush=True)
 
 
 def _time_job(flight: Path, out: Path, preset: str, frames: int) -> None:
