@@ -292,7 +292,7 @@ def demo(
         if not quiet:
             print(f"the map:    {own_command()} view {shlex.quote(str(run))}")
             print(f"the report: {run / 'analysis' / 'report.html'}")
-            print(f"your own clip: {own_command()} run VIDEO --preset fast --out RUN")
+            print(f"your own clip: {own_command()} run VIDEO --out RUN")
     return status
 
 
