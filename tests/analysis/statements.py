@@ -214,10 +214,12 @@ def conflicts_found(analysis: TrafficAnalysis, truth: Truth) -> tuple[int, int]:
 
 def _conflicts(analysis: TrafficAnalysis, truth: Truth, numbers: IntArray) -> Iterator[Statement]:
     near = near_in_time(truth)
+    levels = np.empty((0, 2)) if truth.signals else truth.crossings_m
     for c in analysis.conflicts:
         if c.probability >= 0.5:
             pair = frozenset((int(numbers[c.first]), int(numbers[c.second])))
-            value = near.get(pair, np.inf)
+            bridge = c.kind == "crossing" and np.hypot(*(levels - c.xy_m).T).min(initial=np.inf) < CROSSING_M
+            value = np.inf if bridge else near.get(pair, np.inf)
             text = f"{c.kind} {c.value_s:.2f} s, p {c.probability:.2f}, in truth {value:.2f} s"
             yield Statement(f"conflict, {c.kind}", value < c.threshold_s + PET_SLACK_S, text)
 

@@ -347,3 +347,9 @@ def test_an_unusual_track_is_named_as_in_the_file() -> None:
     assert f"track {12 * 7 + 100_000})" in answer.text
     table = unusual_table(TrafficAnalysis(named))
     assert [row.cells["track"] for row in table.rows] == [12 * 7 + 100_000]
+
+
+def test_a_road_above_another_makes_no_conflicts() -> None:
+    tracks = [drive(EAST, 4.0 * k) for k in range(12)] + [drive(SOUTH, 4.0 * k + 4.2) for k in range(12)]
+    analysis = TrafficAnalysis(gather(tracks))  # at (150, 100) both are there at once, at 4 k + 12.5 s
+    assert [c for c in analysis.conflicts if c.kind == "crossing"] == []

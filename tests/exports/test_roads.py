@@ -5,6 +5,9 @@ import shutil
 import subprocess
 import xml.etree.ElementTree as ET
 import zipfile
+from collections import Counter
+from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +72,17 @@ def test_the_network_is_whole(run: Run, network: RoadNetwork, tmp_path: Path) ->
     measured = ET.parse(tmp_path / "velfield.edgedata.xml").getroot().find("interval")
     assert measured is not None
     assert {edge.get("id") for edge in measured} == set(edges)
+
+
+def test_sumolib_reads_the_turn_counts_as_its_route_sampler_does(
+    run: Run, network: RoadNetwork, tmp_path: Path
+) -> None:
+    unpack(run, tmp_path)
+    intervals = import_module("sumolib").xml.parse(str(tmp_path / "velfield.turns.xml"), "interval", heterogeneous=True)
+    counted = {(turn.attr_from, turn.to): int(turn.count) for one in intervals for turn in one.edgeRelation}
+    driven = Counter((f"lane{a}", f"lane{b}") for trip in network.trips for a, b in pairwise(trip.lanes))
+    assert counted == driven
+    assert sorted(counted.values()) == [5, 8]
 
 
 def unpack(run: Run, folder: Path) -> None:

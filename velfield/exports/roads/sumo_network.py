@@ -1,12 +1,16 @@
-"""SUMO's network and traffic: nodes, edges and connections for netconvert, routes, measured edge data, in one archive.
+"""SUMO's network and traffic: nodes, edges and connections for netconvert, routes, counts of edges and turns, as ZIP.
 
     unzip sumo-network.zip && netconvert -c velfield.netccfg && sumo -c velfield.sumocfg
 
-Each lane is an edge with one lane, of the shape that vehicles drove.
+Each lane is an edge with one lane, of the shape that vehicles drove. SUMO's sampler reads the counts:
+
+    routeSampler.py -r velfield.rou.xml --edgedata-files velfield.edgedata.xml --turn-files velfield.turns.xml
 """
 
 import io
 import zipfile
+from collections import Counter
+from itertools import pairwise
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -15,6 +19,7 @@ import numpy as np
 from schemas.arrays import FloatArray
 from schemas.export import ExportOptions
 from velfield.exports.roads.network import RoadNetwork, road_network
+from velfield.exports.turning_counts import BIN_S
 from velfield.run.run import Run
 
 FILE_NAME = "sumo-network.zip"
@@ -57,6 +62,7 @@ def sumo_archive(network: RoadNetwork) -> bytes:
         "velfield.con.xml": _connections_xml(network),
         "velfield.rou.xml": _routes_xml(network),
         "velfield.edgedata.xml": _edge_data_xml(network),
+        "velfield.turns.xml": _turns_xml(network),
         "velfield.netccfg": _NETCONVERT,
         "velfield.sumocfg": _SUMO.format(head=_HEAD, end=network.duration_s + _END_LATER_S),
     }
@@ -130,6 +136,22 @@ def _edge_data_xml(network: RoadNetwork) -> str:
         for lane in network.lanes
     ]
     return _document("meandata", [*rows, "</interval>"])
+
+
+def _turns_xml(network: RoadNetwork) -> str:
+    """Vehicles from lane to lane by 15 minutes of their departure, in SUMO's format of edge relations."""
+    turns = Counter((int(trip.depart_s // BIN_S), pair) for trip in network.trips for pair in pairwise(trip.lanes))
+    rows = []
+    for k in range(max(int(np.ceil(network.duration_s / BIN_S)), 1)):
+        end = min((k + 1) * BIN_S, max(network.duration_s, 0.01))
+        rows.append(f'<interval begin="{k * BIN_S:.2f}" end="{end:.2f}" id="velfield">')
+        rows += [
+            f'    <edgeRelation from="lane{a}" to="lane{b}" count="{count}"/>'
+            for (at, (a, b)), count in sorted(turns.items())
+            if at == k
+        ]
+        rows.append("</interval>")
+    return _document("data", rows)
 
 
 def _document(root: str, rows: list[str]) -> str:

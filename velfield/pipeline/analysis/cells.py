@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
+import pandas as pd
 
 from schemas.analysis import AnalysisColumn, AnalysisRow, AnalysisTable, Cell, EstimateRecord, GeometryRecord
 from schemas.arrays import FloatArray
@@ -55,6 +56,29 @@ def make_table(
         columns=tuple(AnalysisColumn(name=c.key, title=c.title, unit=c.unit) for c in columns),
         rows=tuple(AnalysisRow(cells={c.key: c.cell(item) for c in columns}, geometry=place(item)) for item in items),
     )
+
+
+def data_frame(table: AnalysisTable) -> pd.DataFrame:
+    """A table with units in the names of its columns; an estimate has four: its value, ``low``, ``high`` and ``n``.
+
+    Examples
+    --------
+    >>> speed = AnalysisColumn(name="p50", title="Speed p50", unit="km/h")
+    >>> rows = (AnalysisRow(cells={"p50": EstimateRecord(value=48.0, low=45.0, high=51.0, n=30)}),)
+    >>> data_frame(AnalysisTable(name="speed", section="", title="", columns=(speed,), rows=rows)).columns.tolist()
+    ['p50_km_per_h', 'p50_low_km_per_h', 'p50_high_km_per_h', 'p50_n']
+    """
+    out: dict[str, list[object]] = {}
+    for column in table.columns:
+        cells = [row.cells.get(column.name) for row in table.rows]
+        unit = column.unit.replace("/", "_per_").replace("%", "percent").replace(" ", "_")
+        suffix = f"_{unit}" if unit else ""
+        if any(isinstance(cell, EstimateRecord) for cell in cells):
+            for part, name in (("value", suffix), ("low", f"_low{suffix}"), ("high", f"_high{suffix}"), ("n", "_n")):
+                out[column.name + name] = [getattr(cell, part, None) for cell in cells]
+        else:
+            out[column.name + suffix] = list(cells)
+    return pd.DataFrame(out)
 
 
 def estimate_cell(estimate: Estimate | None, factor: float = 1.0) -> EstimateRecord:
