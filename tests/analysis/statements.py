@@ -203,7 +203,9 @@ def _counts(analysis: TrafficAnalysis, truth: Truth) -> Iterator[Statement]:
 
 
 def conflicts_found(analysis: TrafficAnalysis, truth: Truth) -> tuple[int, int]:
-    """Conflicts beyond doubt in truth, and how many of them are found."""
+    """Conflicts beyond doubt in truth, and how many of them are found; none of roads on two levels."""
+    if not truth.signals:
+        return 0, 0
     numbers = true_numbers(analysis, truth.tracks)
     near = near_in_time(truth, longest_s=1.5 - PET_SLACK_S, slack=1 / BRAKING_SLACK)
     said = {
