@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.analysis.test_traffic_analysis import CYCLE_S, analysis, drive, gather
+from velfield.analysis.answers import duration_text
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.report.drawing import new_figure, pages_bytes
 from velfield.report.traffic.approaches import approach_delays, lane_names
@@ -30,6 +31,12 @@ def test_a_short_clip_is_answered_by_what_is_missing() -> None:
     short = TrafficAnalysis(gather([drive(east, 2.0 * k) for k in range(3)]))
     page = first_page(short)
     assert any("too few" in line for line in page.withheld)
+    assert [lines for _, lines in page.answers[1:]] == [
+        ("Not known: no junction of lanes was found.",),
+        ("Not known: no junction of lanes was found.",),
+        ("Not known: no road with 8 vehicles that go freely and steadily.",),
+        (f"Not known: none in {duration_text(short.trajectories.duration_s)}, too short to say how rare they are.",),
+    ]
     assert {d.name for d in traffic_diagrams(short, None)} <= {"place", "speed-profile"}
 
 

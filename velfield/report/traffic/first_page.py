@@ -28,26 +28,35 @@ class FirstPage:
 def first_page(analysis: TrafficAnalysis) -> FirstPage:
     """The first page's words."""
     found: dict[str, list[str]] = {}
-    withheld = []
+    withheld: list[str] = []
+    reasons: dict[str, str] = {}
     for answer in find_answers(analysis):
         text = f"{answer.subject}: {answer.text}" if answer.subject else answer.text
         if answer.state == "too little data":
             withheld.append(f"{answer.topic}: {text}")
+            reasons.setdefault(answer.topic, text.removeprefix("too little data: "))
         else:
             found.setdefault(answer.topic, []).append(text)
     events = [f"{topic}: {text}" for topic in ("conflicts", "u-turns", "unusual") for text in found.get(topic, [])[:1]]
+    no_junction = "no junction of lanes was found"
     questions = (
-        ("Where do vehicles go?", found.get("movement", []) or found.get("scene", [])),
-        ("Which approach waits longest, and how long are the queues?", _waits(analysis)),
-        ("Is there a signal?", found.get("signal", [])),
-        ("How fast do vehicles drive?", found.get("speed", [])),
-        ("Where is it dangerous?", events),
+        ("Where do vehicles go?", found.get("movement", []) or found.get("scene", []), "no turn was seen five times"),
+        (
+            "Which approach waits longest, and how long are the queues?",
+            _waits(analysis),
+            "no approach has a signal or a delay that could be measured" if analysis.movements else no_junction,
+        ),
+        ("Is there a signal?", found.get("signal", []), reasons.get("signal", no_junction)),
+        ("How fast do vehicles drive?", found.get("speed", []), reasons.get("speed", "no lane was found")),
+        ("Where is it dangerous?", events, reasons.get("conflicts", "no lane was found")),
     )
     n = len(analysis.trajectories)
     seen = f"{n} vehicle{'s' if n != 1 else ''} that move, in {duration_text(analysis.trajectories.duration_s)}"
     return FirstPage(
         seen,
-        tuple((question, tuple(lines[:_PER_QUESTION]) or ("Not known.",)) for question, lines in questions),
+        tuple(
+            (question, tuple(lines[:_PER_QUESTION]) or (f"Not known: {why}.",)) for question, lines, why in questions
+        ),
         tuple(dict.fromkeys(withheld)),
     )
 
