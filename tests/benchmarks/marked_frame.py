@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from velfield import open_run
+from velfield.run.run import Run
 
 MARKS = Path(__file__).parents[1] / "data" / "kharkiv_marks.csv"
 TIME_S = 90 / 25
@@ -23,24 +24,31 @@ def main() -> None:
     """Judge, print."""
     parser = argparse.ArgumentParser()
     parser.add_argument("run", type=Path)
-    run, marks = open_run(parser.parse_args().run), pd.read_csv(MARKS)
+    run = open_run(parser.parse_args().run)
     found = run.detections()
     frame = int(found["frame"].iloc[(found["time_s"] - TIME_S).abs().argmin()])
-    found = found[found["frame"] == frame].sort_values("score", ascending=False, kind="stable")
+    precision, recall = judge(run, frame, found[found["frame"] == frame])
+    print(f"frame {frame}: precision {precision:.3f}, recall {recall['all']:.3f}")
+    for name in ("moving", "standing"):
+        print(f"{name:9} recall {recall[name]:.3f}")
+
+
+def judge(run: Run, frame: int, found: pd.DataFrame) -> tuple[float, dict[str, float]]:
+    """Precision of detections in the marked frame, and the fraction found of ``all`` marks and by their kind."""
+    marks = pd.read_csv(MARKS)
     places = run.to_base(frame, marks[["x_px", "y_px"]].to_numpy(float))
     kind, unclear = marks["kind"].to_numpy(), (marks["kind"] == "unclear").to_numpy()
     radius = np.nan_to_num(marks["radius_px"].to_numpy(float), nan=_NEAR_PX)
     taken, wrong = np.zeros(len(marks), bool), 0
-    for place in found[["x_px", "y_px"]].to_numpy():
+    for place in found.sort_values("score", ascending=False, kind="stable")[["x_px", "y_px"]].to_numpy():
         off = np.hypot(*(places - place).T)
         to_be_found = np.where(unclear | taken, np.inf, off)
         if to_be_found.min() <= _NEAR_PX:
             taken[to_be_found.argmin()] = True
         elif not (unclear & (off <= radius)).any():
             wrong += 1
-    print(f"frame {frame}: precision {taken.sum() / (taken.sum() + wrong):.3f}, recall {taken[~unclear].mean():.3f}")
-    for name in ("moving", "standing"):
-        print(f"{name:9} {(kind == name).sum():3}: recall {taken[kind == name].mean():.3f}")
+    of_kind = {name: float(taken[kind == name].mean()) for name in ("moving", "standing")}
+    return float(taken.sum() / (taken.sum() + wrong)), {"all": float(taken[~unclear].mean()), **of_kind}
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from tools.training_data import read_boxes
@@ -43,8 +44,8 @@ def main() -> None:
         subprocess.run([*command, "--out", str(root / "run")], check=True)
         run = open_run(root / "run")
         boxes = [read_boxes(picture)[1] for picture in pictures]
-        moving = _moving(run, boxes)
-        judged = [_judge(run, k, boxes[k], moving[k]) for k in range(1, len(pictures))]
+        moving = find_moving(run, boxes)
+        judged = [judge(run, k, run.detections(), boxes[k], moving[k]) for k in range(1, len(pictures))]
     right, right_moving, wrong, there, move = np.sum(judged, axis=0)
     print(f"{asked.folder.name}: {len(judged)} pictures, {right + wrong} found")
     for name, hits, cars in (("all cars", right, there), ("those that move", right_moving, move)):
@@ -53,7 +54,7 @@ def main() -> None:
         print(f"{name:16} {cars:5}: precision {precision:.3f}, recall {recall:.3f}, F1 {f1:.3f}")
 
 
-def _moving(run: Run, boxes: list[NDArray[np.float64]]) -> list[NDArray[np.bool_]]:
+def find_moving(run: Run, boxes: list[NDArray[np.float64]]) -> list[NDArray[np.bool_]]:
     """Which of the marked cars of each picture have none in their place on the map in the picture before or after."""
     cars = [table[table[:, 0] == 0] for table in boxes]
     places = [run.to_base(k, np.ascontiguousarray(table[:, 1:3])) for k, table in enumerate(cars)]
@@ -65,12 +66,11 @@ def _moving(run: Run, boxes: list[NDArray[np.float64]]) -> list[NDArray[np.bool_
     return moving
 
 
-def _judge(
-    run: Run, frame: int, boxes: NDArray[np.float64], moving: NDArray[np.bool_]
+def judge(
+    run: Run, frame: int, table: pd.DataFrame, boxes: NDArray[np.float64], moving: NDArray[np.bool_]
 ) -> tuple[int, int, int, int, int]:
     """Finds on a car of their own (within half its length), of these on one that moves, on none; cars, and moving."""
     cars = boxes[boxes[:, 0] == 0]
-    table = run.detections()
     table = table[table["frame"] == frame].sort_values("score", ascending=False)
     found = run.to_raw(frame, table[["x_px", "y_px"]].to_numpy())
     taken, wrong = np.zeros(len(cars), np.bool_), 0

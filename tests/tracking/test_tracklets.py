@@ -13,7 +13,7 @@ from schemas.flight import TrackingConfig
 from schemas.tables import TRACKLET_COLUMNS
 from tests.tracking_scenes import SCENES, Detector, Watched, car, crossing, platoon, score, two_lanes_opposed, watch
 from velfield.errors import InputError
-from velfield.tracking.association import window_frames
+from velfield.tracking.association import FrameTable, window_frames
 from velfield.tracking.gates import GateLog
 from velfield.tracking.tracklets import link_windows
 
@@ -199,3 +199,31 @@ def test_positions_alone_give_tracklets() -> None:
     assert result.recall >= 0.9
     assert found["sad_01"].isna().all()
     assert log["links_refined"] == 0
+
+
+def _split(seen: Watched, weak_cars: set[int]) -> tuple[list[FrameTable], list[FrameTable]]:
+    """Detections, and weak candidates: those of some cars, and all that are of none."""
+    sure, weak = [], []
+    for table in seen.tables:
+        is_weak = np.array([seen.car_of[one] in weak_cars for one in table.detection_id.tolist()], bool)
+        sure.append(table.take(np.flatnonzero(~is_weak)))
+        weak.append(replace(table.take(np.flatnonzero(is_weak)), patches=None, score=np.full(is_weak.sum(), 0.01)))
+    return sure, weak
+
+
+def test_weak_candidates_that_move_as_a_vehicle_make_tracklets_and_change_no_other() -> None:
+    rng = np.random.default_rng(9)
+    cars = [car(rng, (20, 140), (60, 0)), car(rng, (200, 20), (0, 0)), *two_lanes_opposed(rng)]
+    seen = watch(cars, uneven_times(rng, 12), rng=rng, detector=Detector(recall=1.0, false_alarms=12.0))
+    sure, weak = _split(seen, {-1, 0, 1})
+    config = TrackingConfig()
+    alone, _ = link_windows(sure, config, gsd_m=None, starts=ALL)
+    both, log = link_windows(sure, config, gsd_m=None, starts=ALL, weak=weak)
+    added = both[~both["tracklet_id"].isin(alone["tracklet_id"])]
+    pd.testing.assert_frame_equal(both.drop(added.index).reset_index(drop=True), alone)
+    assert log["moving_candidates"] == len(added)
+    owner = np.array([[seen.car_of[one] for one in added[f"detection_id_{k}"]] for k in range(3)])
+    of_mover = (owner == 0).all(axis=0)
+    assert of_mover.sum() >= 7, "of ten windows"
+    assert of_mover.mean() >= 0.9, "neither the car that stands nor what is no car"
+    assert np.median(added["vx_01_px_per_s"][of_mover]) == pytest.approx(60, abs=2)

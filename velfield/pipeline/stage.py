@@ -242,7 +242,7 @@ STAGES: tuple[Stage, ...] = (
     # Cars of each block, then one table with their crops.
     Stage(
         name="detections",
-        version=19,
+        version=20,
         label="detections",
         lines=(
             Line(
@@ -263,7 +263,7 @@ STAGES: tuple[Stage, ...] = (
     # Windows of three frames that start in the unit; they reach 2 * max_interval_s behind it.
     Stage(
         name="tracklets",
-        version=3,
+        version=4,
         label="tracklets",
         lines=(Line("{tracklets:.0f} tracklets over three frames"),),
         unit=f"{_STAGES}.tracklets:link_unit",
@@ -276,7 +276,7 @@ STAGES: tuple[Stage, ...] = (
     # Tracklets of all units that belong to one vehicle.
     Stage(
         name="tracks",
-        version=12,
+        version=13,
         label="tracks",
         lines=(
             Line(

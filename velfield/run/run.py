@@ -186,9 +186,22 @@ class Run:
         return transformed
 
     def detections(self) -> pd.DataFrame:
-        """All detections, in base pixels: the columns of ``schemas.tables.DETECTION_COLUMNS``."""
+        """All detections, in base pixels: the columns of ``schemas.tables.DETECTION_COLUMNS``.
+
+        Candidates below the score threshold are among them where a track confirms them.
+        """
+        return self._detections(list(DETECTION_COLUMNS))
+
+    def _detections(self, names: list[str]) -> pd.DataFrame:
         self.require_frames()
-        return read_tables(sorted(self.layout.detections.glob("unit-*.parquet")), DETECTION_COLUMNS)
+        sure, weak = (
+            read_tables(sorted(folder.glob("unit-*.parquet")), DETECTION_COLUMNS, only=names)
+            for folder in (self.layout.detections, self.layout.weak_detections)
+        )
+        paths = sorted(self.layout.track_positions.glob("unit-*.parquet"))
+        seen = read_tables(paths, TRACK_POSITION_COLUMNS, only=["detection_id"])["detection_id"]
+        confirmed = weak[weak["detection_id"].isin(seen)]
+        return pd.concat([sure, confirmed]).sort_values("detection_id", ignore_index=True) if len(confirmed) else sure
 
     def tracklets(self) -> pd.DataFrame:
         """All tracklets, in base pixels: the columns of ``schemas.tables.TRACK_COLUMNS``."""
@@ -205,11 +218,8 @@ class Run:
         parked, and whether it is doubtful: `find_vehicles`, `add_dimensions`.
         """
         gsd_m = self.grid.gsd_m
-        tracklets, paths = (
-            self._tracklet_columns(VEHICLE_COLUMNS),
-            sorted(self.layout.detections.glob("unit-*.parquet")),
-        )
-        seen = read_tables(paths, DETECTION_COLUMNS, only=["detection_id", "orientation_rad", "score"])
+        tracklets = self._tracklet_columns(VEHICLE_COLUMNS)
+        seen = self._detections(["detection_id", "orientation_rad", "score"])
         vehicles = find_vehicles(tracklets, seen, gsd_m=gsd_m)
         return add_dimensions(vehicles, self._dimensions(), gsd_m)
 

@@ -14,8 +14,8 @@ motion), each about half a chi square, i.e. a negative log-likelihood:
 Also here: the input of tracking by frame, the frames that a part of a flight needs, and the table of tracklets.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -73,6 +73,23 @@ class FrameTable:
     working_scale: float = 1.0
     registration_sd_px: float = 0.0
 
+    def take(self, rows: IntArray) -> "FrameTable":
+        """Some of the detections, in this order."""
+        return self._with_arrays(lambda name: None if (array := getattr(self, name)) is None else array[rows])
+
+    def with_weak(self, weak: "FrameTable") -> "FrameTable":
+        """The detections, then the weak candidates of the same frame; without patches, which those lack."""
+
+        def join(name: str) -> NDArray[Any] | None:
+            both = getattr(self, name), getattr(weak, name)
+            return None if any(array is None for array in both) else np.concatenate(both)
+
+        return self._with_arrays(join)
+
+    def _with_arrays(self, make: Callable[[str], NDArray[Any] | None]) -> "FrameTable":
+        arrays: dict[str, Any] = {name: make(name) for name in _ARRAYS}
+        return replace(self, **arrays)
+
     def states(self, limits: Limits) -> DetectionStates:
         """Positions and axes of the detections, for the gates."""
         return DetectionStates(
@@ -95,6 +112,13 @@ class FrameTable:
             axis_rad=np.asarray(self.orientation_rad, np.float64),
             scale=self.working_scale,
         )
+
+
+_ARRAYS = (
+    *("detection_id", "x_px", "y_px", "orientation_rad", "orientation_sd_rad", "score"),
+    *("patches", "crops", "x_work", "y_work"),
+)
+"""Attributes of `FrameTable` with a row a detection."""
 
 
 def window_frames(registered: Sequence[bool], times_s: Sequence[float], starts: range, max_interval_s: float) -> range:

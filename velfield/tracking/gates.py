@@ -80,8 +80,9 @@ class GateLog(Mapping[str, int]):
     ``speed``, ``axis``, and, with ``linking = pairwise``, ``appearance`` (not the mutual best in appearance). Pairs of
     links of every window: ``pairs_tried``, of which rejected by ``turn``, ``acceleration``, ``not_best`` (a pair
     through one of the same detections is cheaper) or ``confidence`` (the best, but ambiguous). Windows: ``windows``,
-    ``frames_not_registered``, ``gaps_too_long``. Accepted: ``tracklets``; and of their links, two each,
-    ``links_refined`` and ``links_not_refined`` (displacement not from the crops).
+    ``frames_not_registered``, ``gaps_too_long``. Accepted: ``tracklets``, and ``moving_candidates``, those that weak
+    candidates are part of; and of the links of both, two each, ``links_refined`` and ``links_not_refined``
+    (displacement not from the crops).
     """
 
     counts: dict[str, int] = field(default_factory=dict)

@@ -263,8 +263,8 @@ _NO_CROPS: dict[str, NDArray[Any]] = {
     "strips": np.empty((0, 32, 10), np.uint8),
     "xy_work": np.empty((0, 2)),
 }
-_WEAK_CROPS = ("chips", "xy_work")
-"""Arrays of weak candidates: tracks align them, and take the appearance and the size from the cars."""
+_WEAK_CROPS = ("chips", "strips", "xy_work")
+"""Arrays of weak candidates: patches serve the linking of detections alone."""
 
 
 def _tabulate(parts: Sequence[_FrameCars]) -> BlockDetections:

@@ -62,8 +62,9 @@ def link_unit(plan: Plan, frames: range) -> StageResult:
     times_s = open_frames(plan.layout.frames).column("time_s")
     usable = linkable_frames(plan)
     window = window_frames(list(usable), list(times_s), frames, plan.config.tracking.max_interval_s)
-    tables = frame_tables(plan, window, times_s, usable)
-    tracklets, log = link_windows(tables, plan.config.tracking, gsd_m=read_tracking_gsd(plan.layout), starts=frames)
+    tables, weak = (frame_tables(plan, window, times_s, usable, weak=which) for which in (False, True))
+    config, gsd_m = plan.config.tracking, read_tracking_gsd(plan.layout)
+    tracklets, log = link_windows(tables, config, gsd_m=gsd_m, starts=frames, weak=weak)
     path = plan.layout.unit_file(plan.layout.tracklets, frames.start // plan.unit_frames, ".parquet")
     write_table(path, tracklets, TRACKLET_COLUMNS)
     advance("tracklets", len(frames))
@@ -71,10 +72,10 @@ def link_unit(plan: Plan, frames: range) -> StageResult:
     return StageResult([path], {"frames": len(frames), "tracklets": len(tracklets), **counts})
 
 
-def frame_tables(plan: Plan, window: range, times_s: np.ndarray, usable: np.ndarray) -> list[FrameTable]:
-    """Detections of a range of frames."""
+def frame_tables(plan: Plan, window: range, times_s: np.ndarray, usable: np.ndarray, *, weak: bool) -> list[FrameTable]:
+    """Detections of a range of frames, or their weak candidates."""
     units = range(window.start // plan.unit_frames, (window.stop - 1) // plan.unit_frames + 1)
-    read = {unit: read_unit(plan, unit) for unit in units if not has_lost_detections(plan, unit)}
+    read = {unit: read_unit(plan, unit, weak=weak) for unit in units if not has_lost_detections(plan, unit)}
     return tables_of_units(plan, window, times_s, usable, read)
 
 
@@ -100,11 +101,12 @@ class UnitDetections:
     patches: Arrays
 
 
-def read_unit(plan: Plan, unit: int) -> UnitDetections:
-    """Detections of a unit and their patches."""
-    path = plan.layout.unit_file(plan.layout.detections, unit, ".parquet")
+def read_unit(plan: Plan, unit: int, *, weak: bool) -> UnitDetections:
+    """Detections of a unit and their patches, or its weak candidates, which have none."""
+    path = plan.layout.unit_file(plan.layout.weak_detections if weak else plan.layout.detections, unit, ".parquet")
     table = read_tables([path], DETECTION_COLUMNS, only=_READ)
-    patches = read_arrays(path.with_suffix(".patches.npz"), only=["patches", "chips", "xy_work", "working_scale"])
+    names = ["chips", "xy_work", "working_scale"] if weak else ["patches", "chips", "xy_work", "working_scale"]
+    patches = read_arrays(path.with_suffix(".patches.npz"), only=names)
     return UnitDetections({name: table[name].to_numpy() for name in _READ}, patches)
 
 

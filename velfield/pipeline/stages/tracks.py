@@ -419,7 +419,8 @@ def sum_strips(layout: RunLayout, tracklets: pd.DataFrame, units: int) -> StripS
                 np.add.at(count[which], chain[rows], 1)
         return float(patches["working_scale"])
 
-    paths = [layout.unit_file(layout.detections, unit, ".parquet") for unit in range(units)]
+    folders = layout.detections, layout.weak_detections
+    paths = [layout.unit_file(folder, unit, ".parquet") for unit in range(units) for folder in folders]
     scales = parallel_map(add, [path for path in paths if path.exists()], at_most=_AT_ONCE)
     return StripSums(ids, total, count, scales[-1] if scales else 1.0)
 

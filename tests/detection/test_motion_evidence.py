@@ -1,0 +1,62 @@
+"""Weak candidates that motion confirms, on real footage: never worse than the shipped weights alone."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from schemas.job import Inputs, Job
+from schemas.tables import DETECTION_COLUMNS
+from tests.benchmarks import marked_frame, real_footage
+from tests.small_flight import process
+from tools.training_data import read_boxes
+from velfield import open_run
+from velfield.pipeline.configuration import resolve_config
+from velfield.run.run import Run
+from velfield.run.tables import read_tables
+
+
+def _run(source: Path, root: Path, *settings: str) -> Run:
+    """A run given the video and nothing else but what makes the test short."""
+    config = resolve_config(settings=["lens.calibrate=never", *settings], overrides={})
+    assert process(Job(root=str(root), inputs=Inputs(source=str(source)), config=config)).complete
+    return open_run(root)
+
+
+def _both(run: Run) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """What the shipped weights alone detect, and that with what tracks confirm."""
+    return read_tables(sorted(run.layout.detections.glob("unit-*.parquet")), DETECTION_COLUMNS), run.detections()
+
+
+@pytest.mark.footage
+def test_kharkiv(footage: Callable[[str], Path], tmp_path: Path) -> None:
+    run = _run(footage("kharkiv") / "drone.mp4", tmp_path, "frames.start_s=2.6", "frames.stop_s=4.8")
+    frame = int(np.abs(run.times_s - marked_frame.TIME_S).argmin())
+    (alone, found_alone), (precision, found) = (
+        marked_frame.judge(run, frame, table[table["frame"] == frame]) for table in _both(run)
+    )
+    assert precision >= alone - 0.01
+    assert found["moving"] >= found_alone["moving"] + 0.15
+    assert found["standing"] >= found_alone["standing"]
+
+
+@pytest.mark.footage
+@pytest.mark.parametrize("name", ["MOS155_street", "MOS74_crossroad"])
+def test_kit_ais(footage: Callable[[str], Path], tmp_path: Path, name: str) -> None:
+    pictures = sorted((footage("kit_ais") / name).glob("*.png"))[:10]
+    (tmp_path / "pictures").mkdir()
+    for path in pictures:
+        shutil.copy(path, tmp_path / "pictures")
+    run = _run(tmp_path / "pictures", tmp_path / "run", "frames.fps=2", "tracking.max_interval_s=0.6")
+    boxes = [read_boxes(path)[1] for path in pictures]
+    moving = real_footage.find_moving(run, boxes)
+    judged = [
+        np.sum([real_footage.judge(run, k, table, boxes[k], moving[k]) for k in range(len(pictures))], axis=0)
+        for table in _both(run)
+    ]
+    (right_alone, _, wrong_alone, _, _), (right, _, wrong, cars, _) = judged
+    assert right >= right_alone > 0.8 * cars
+    assert right / (right + wrong) >= right_alone / (right_alone + wrong_alone) - 0.01
