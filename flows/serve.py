@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 from flows.console import print_with_time
 from flows.launch import PAGES, PAGES_OF
-from flows.stopping import as_ctrl_c, end_children, end_children_when_killed
+from flows.stopping import end_children, stop_on_signals
 from velfield.errors import InputError
 from velfield.pipeline.watch import FolderWatcher, is_flight
 
@@ -261,8 +261,8 @@ def serve_folder(config: ServeConfig) -> None:
     # Server and flow runs import from their working folder despite PYTHONSAFEPATH: it must be one of ours.
     os.chdir(config.folder)
     os.environ.update(settings(config))
-    as_ctrl_c()
-    end_children_when_killed()
+    # Late, where the interrupt was lost: it may be raised where Python can only print it, as while it frees an object.
+    stop_on_signals(resumes=False, grace_s=3 * _STOP_S)
     try:
         with server(config):
             from prefect import serve
