@@ -355,7 +355,7 @@ def _runner(workers: int | None, scheduler: str | None, cluster: Path | None) ->
     if workers is not None and workers < 1:
         raise InputError(f"--workers {workers}: must be a positive integer; omit it to run in this process")
     if scheduler is not None:
-        check_scheduler(scheduler)  # before Prefect's server starts, which takes longer
+        check_scheduler(scheduler)  # before the cluster's client, which would wait for it
     return read_runner(cluster) if cluster else RunnerConfig(workers=workers, scheduler=scheduler)
 
 

@@ -109,8 +109,8 @@ def use_writable_folders() -> None:
     temporary = temporary_cache()
     os.environ.update({name: str(temporary / folder) for name, folder in missing.items()})
     warnings.warn(
-        f"the home folder ({os.environ.get('HOME') or 'HOME is not set'}) is not writable: Prefect's database, "
-        f"compiled code and other caches go to {temporary}; set HOME to a writable folder to keep them",
+        f"the home folder ({os.environ.get('HOME') or 'HOME is not set'}) is not writable: compiled code "
+        f"and other caches go to {temporary}; set HOME to a writable folder to keep them",
         CacheWarning,
         stacklevel=2,
     )

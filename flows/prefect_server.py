@@ -82,10 +82,12 @@ def check_address() -> None:
 
 
 def _no_answer(url: str, error: object) -> InputError:
+    in_settings = "`prefect config unset PREFECT_API_URL`, or from prefect.toml or .env"
+    remove = "`unset PREFECT_API_URL`" if os.environ.get("PREFECT_API_URL") else in_settings
     return InputError(
         f"PREFECT_API_URL {url}: found no Prefect server that answers "
-        f"({' '.join(str(error).split()) or type(error).__name__}); start it, correct the address, or unset it "
-        "(`prefect config unset PREFECT_API_URL`): a run needs none"
+        f"({' '.join(str(error).split()) or type(error).__name__}); start it, correct the address, or remove it "
+        f"({remove}): a run needs none"
     )
 
 

@@ -59,7 +59,7 @@ def stop_on_signals(*, resumes: bool = True, grace_s: float = _GRACE_S) -> None:
 
 
 def end_children_when_killed() -> None:
-    """End child processes with this one even where it is killed: Prefect's server would run for ever.
+    """End child processes with this one even where it is killed: workers and the server of `velfield serve` would stay.
 
     SIGKILL cannot be handled, so another process waits for the end of this one, and identifies its children by a mark
     in their environment.

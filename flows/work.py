@@ -196,8 +196,17 @@ class Work:
         record = committed(plan, stage.name, unit.name)
         under_way.before += [] if record is None else [_without_outputs(record)]
 
+        failed = ""
+
         def do() -> CommitRecord:
-            return _without_outputs(record or self.runner.compute(graph(plan, stage, unit)))
+            nonlocal failed
+            if failed:
+                self.console.warn(f"{self._describe(under_way, unit)} failed: {failed}; trying again")
+            try:
+                return _without_outputs(record or self.runner.compute(graph(plan, stage, unit)))
+            except Exception as error:
+                failed = _reason(error)
+                raise
 
         label = stage.label if unit.name == WHOLE else f"{stage.label} {unit.name}"
         future = self.orchestration.submit(
@@ -226,8 +235,7 @@ class Work:
         if (error := future.exception()) is not None:
             if isinstance(error, InputError) or is_disk_full(error) or under_way.essential:
                 raise error
-            reason = " ".join(str(error).split()) or type(error).__name__
-            under_way.lost[unit.name] = f"{self._describe(under_way, unit)} failed: {reason}; re-run to retry"
+            under_way.lost[unit.name] = f"{self._describe(under_way, unit)} failed: {_reason(error)}; re-run to retry"
             self.console.warn(under_way.lost[unit.name])
             discard_unit(under_way.plan, under_way.stage, unit.name)
         steps = sum(under_way.units[j].steps for j in under_way.ended)
@@ -279,3 +287,8 @@ class Work:
 def _without_outputs(record: CommitRecord) -> CommitRecord:
     """What a task returns is kept: hundreds of digests a unit would make the driver grow with the flight."""
     return record.model_copy(update={"outputs": {}})
+
+
+def _reason(error: BaseException) -> str:
+    """An error in one line."""
+    return " ".join(str(error).split()) or type(error).__name__

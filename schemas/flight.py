@@ -213,7 +213,7 @@ class WorkConfig(Model):
     block_frames: PositiveInt = Field(8, le=4096)
     """Frames a Dask block; one-frame blocks cost 10 ms each."""
     unit_frames: Annotated[int, Field(ge=1, le=65536)] | Literal["auto"] = "auto"
-    """Frames a unit, that is a Prefect task run and a commit record; ``auto``: all of
+    """Frames a unit: what is committed, retried or lost as a whole; ``auto``: all of
     16 frames, else an even number of units of at most 32 up to 256 frames, 64 up to 4096, then 256."""
     previews: bool = True
     """Make maps of a long flight while it is processed: of its first frames, then of all that are through."""

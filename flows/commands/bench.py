@@ -21,7 +21,7 @@ bench.command(
 bench.command(
     "flows.commands.benchmarks.overhead:overhead",
     name="overhead",
-    help="Overhead of Prefect and Dask over the plain functions, without start-up.",
+    help="Overhead of Dask, and of Prefect where a server is set, over the plain functions, without start-up.",
 )
 bench.command(
     "flows.commands.benchmarks.field:field",

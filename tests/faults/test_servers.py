@@ -76,7 +76,7 @@ def sockets_seen(process: psutil.Process, *, until: Callable[[], bool], fewest: 
 
 
 def test_a_run_listens_on_this_machine_alone(flight: Path, tmp_path: Path) -> None:
-    """As a process: Prefect's temporary server, scheduler, workers and dashboard of `--workers`."""
+    """As a process: scheduler, workers and dashboard of `--workers`."""
     registered = tmp_path / "run" / "commits" / "base"
     given = [str(flight / "frames"), "--timestamps", str(flight / "timestamps.csv"), "--out", str(tmp_path / "run")]
     settings = ["--preset", "fast", "--gsd-m", "0.23", "--base", str(flight / "base.png"), "--workers", "1"]

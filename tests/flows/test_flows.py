@@ -148,7 +148,11 @@ def test_workers_give_the_same_bits(
 
 
 def test_a_unit_that_fails_once_is_retried(
-    whole: tuple[Path, RunSummary], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: tuple[Path, RunSummary],
+    flight: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     from velfield.pipeline.stages import frames as step
 
@@ -169,6 +173,7 @@ def test_a_unit_that_fails_once_is_retried(
     assert redone(summary) == ["frames"]
     assert not summary.stages[0].lost
     assert len(calls) == summary.stages[0].units + 1
+    assert capsys.readouterr().err.count("failed: the disk blinked; trying again") == 1
 
 
 def starts(root: Path) -> set[int]:

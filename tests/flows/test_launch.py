@@ -85,14 +85,17 @@ def test_an_address_without_a_server_is_one_line_within_seconds(url: str, monkey
         with pytest.raises(InputError, match=f"{address}: found no Prefect server") as caught:
             prefect_server.check_address()
     assert "\n" not in str(caught.value)
+    assert "(`unset PREFECT_API_URL`)" in str(caught.value)
 
 
-def test_a_server_that_does_not_answer_is_one_line() -> None:
+def test_a_server_that_does_not_answer_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     from prefect.settings import PREFECT_API_URL, temporary_settings
 
     from flows.prefect_server import check_server
 
+    monkeypatch.delenv("PREFECT_API_URL", raising=False)
     dead = "http://127.0.0.1:9/api"
     with temporary_settings({PREFECT_API_URL: dead}), pytest.raises(InputError, match=f"{dead}: found no") as caught:
         check_server()
     assert "\n" not in str(caught.value)
+    assert "`prefect config unset PREFECT_API_URL`" in str(caught.value)

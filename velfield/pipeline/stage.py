@@ -27,7 +27,7 @@ Counts = Mapping[str, float]
 
 
 class Cut(Enum):
-    """How a stage is cut into units; a unit is a Prefect task run and a commit record."""
+    """How a stage is cut into units; a unit has a commit record, and is retried or lost as a whole."""
 
     WHOLE = "one unit"
     BY_FRAMES = "a unit a range of frames"
