@@ -25,6 +25,8 @@ def test_counts_are_those_of_the_crossroads(analysis: TrafficAnalysis) -> None:
     head = rows["From the start, min"]
     counted = dict(zip(head[1:], rows["Counted"][1:], strict=True))
     assert counted == {"EB R": 12, "EB T": 48, "SB T": 48, "All": 108}
+    total = counted["All"] + rows["Inferred of cut tracks"][-1]
+    assert total == pytest.approx(sum(m.seen + m.inferred for m in found.movements), abs=0.2)
     assert "an hour is needed" in rows["Peak-hour factor"][1]
     assert set(rows["Heavy vehicles, %"][1:]) == {"not known"}
 

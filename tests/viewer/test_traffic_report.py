@@ -1,6 +1,7 @@
 """The report of a traffic analysis: what the first page says, what the diagrams show, and that files do not change."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -80,4 +81,6 @@ def test_delay_of_an_approach_is_the_mean_over_its_vehicles(analysis: TrafficAna
     total = sum((m.seen + m.inferred) * m.delay_s.value for m in mine if m.delay_s)
     assert delays["W"].delay_s == pytest.approx(total / sum(m.seen + m.inferred for m in mine))
     assert delays["W"].level in "AB"
+    unknown = replace(analysis.signals[found.junction.number], signalised=None)
+    assert {d.level for d in approach_delays(found, unknown)} == {""}
     assert sorted(name.split(",")[0] for name in lane_names(found).values()) == ["from N", "from W"]

@@ -68,7 +68,7 @@ def too_short(analysis: TrafficAnalysis) -> str:
     verb = "is" if tracks == 1 else "are"
     return (
         f"{count_text(tracks, 'moving vehicle')} in {duration_text(seconds)} {verb} too few for most questions: a "
-        "movement needs 5, free flow 8 that go freely, a signal two cycles"
+        "movement needs 3, free flow 8 that go freely, a signal two cycles"
     )
 
 

@@ -87,7 +87,7 @@ def junction_rows(analysis: TrafficAnalysis, found: JunctionMovements) -> list[l
         last = min((k + 1) * BIN_S, end - begin)
         rows.append([f"{k * BIN_S / 60:.0f} to {last / 60:.1f}", *counts[:, k].tolist(), int(counts[:, k].sum())])
     rows.append(["Counted", *counts.sum(axis=1).tolist(), int(counts.sum())])
-    inferred = [round(m.inferred, 1) for m in moves]
+    inferred = [round(m.seen + m.inferred - n, 1) for m, n in zip(moves, counts.sum(axis=1).tolist(), strict=True)]
     rows.append(["Inferred of cut tracks", *inferred, round(sum(inferred), 1)])
     whole = counts[:, : int((end - begin) // BIN_S)]
     factors = [peak_hour_factor(one) for one in [*whole, whole.sum(axis=0)]]

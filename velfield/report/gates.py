@@ -7,6 +7,7 @@ _TOTALS = {
     "links_tried": "Links tried, from a car to one in the next frame",
     "pairs_tried": "Pairs of links tried, over three frames",
     "tracklets": "Pairs accepted: tracklets",
+    "moving_candidates": "Tracklets of candidates that the detector was not sure of, by their motion",
     "links_refined": "Links of tracklets refined in the images",
     "links_not_refined": "Links of tracklets not refined",
 }

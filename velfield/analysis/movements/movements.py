@@ -240,7 +240,7 @@ def furness(seen: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArr
 
 
 def _delay(passes: Passes, rows: FloatArray) -> tuple[Estimate | None, Estimate | None]:
-    """Travel time of a movement, and its delay against the quarter of vehicles that are the fastest."""
+    """Travel time of a movement, and its delay against the fastest tenth of its vehicles."""
     time = (passes.exit_s - passes.upstream_s)[rows]
     time = time[np.isfinite(time)]
     travel = estimate_mean(time)

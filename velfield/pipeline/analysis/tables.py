@@ -94,8 +94,10 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
 
     def service(found: JunctionMovements, m: Movement) -> str | None:
         signal = analysis.signals.get(found.junction.number)
-        signalised = bool(signal and signal.signalised)
-        return None if m.delay_s is None else level_of_service(m.delay_s.value, signalised=signalised)
+        signalised = signal.signalised if signal else False
+        if m.delay_s is None or signalised is None:
+            return None
+        return level_of_service(m.delay_s.value, signalised=signalised)
 
     columns: list[Column[tuple[JunctionMovements, Movement]]] = [
         Column("junction", "Junction", "", lambda row: row[1].junction),
@@ -116,7 +118,7 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
     note = (
         "Arms are named by the side of the image. Inferred: a track is cut, and its other end follows from what enters "
         "and leaves (Furness). Delay is against the fastest tenth of the movement. Levels of service: Highway Capacity "
-        "Manual, 7th edition, Exhibit 19-8 at signals, 20-2 and 22-8 elsewhere."
+        "Manual, 7th edition, Exhibit 19-8 at signals, 20-2 and 22-8 elsewhere; none where it is not known which."
     )
 
     def place(row: tuple[JunctionMovements, Movement]) -> GeometryRecord:

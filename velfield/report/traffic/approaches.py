@@ -9,7 +9,10 @@ from velfield.analysis.signals.cycles import JunctionSignal
 
 @dataclass(frozen=True)
 class ApproachDelay:
-    """Mean delay of the vehicles that enter by an arm, its level of service, and where the next levels begin."""
+    """Mean delay of the vehicles that enter by an arm, its level of service, and where the next levels begin.
+
+    The level is empty, and its limits none, where it is not known whether there is a signal.
+    """
 
     arm: str
     delay_s: float
@@ -20,15 +23,16 @@ class ApproachDelay:
 
 def approach_delays(found: JunctionMovements, signal: JunctionSignal | None) -> list[ApproachDelay]:
     """Delay by arm, the mean over its movements weighted by their vehicles; the longest first."""
-    signalised = bool(signal and signal.signalised)
+    signalised = signal.signalised if signal else False
     out = []
     for arm in dict.fromkeys(m.arm_in for m in found.movements):
         known = [(m.delay_s.value, m.seen + m.inferred) for m in found.movements if m.arm_in == arm and m.delay_s]
         vehicles = sum(n for _, n in known)
         if vehicles:
             delay = sum(value * n for value, n in known) / vehicles
-            level = level_of_service(delay, signalised=signalised)
-            out.append(ApproachDelay(arm, delay, vehicles, level, LOS_SIGNAL_S if signalised else LOS_YIELD_S))
+            level = "" if signalised is None else level_of_service(delay, signalised=signalised)
+            limits = {None: (), True: LOS_SIGNAL_S, False: LOS_YIELD_S}[signalised]
+            out.append(ApproachDelay(arm, delay, vehicles, level, limits))
     return sorted(out, key=lambda one: -one.delay_s)
 
 

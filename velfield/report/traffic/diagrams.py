@@ -220,7 +220,7 @@ def _bezier(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Float
 def draw_delays(axes: "Axes", *, delays: list[ApproachDelay]) -> None:
     """Delay by approach with levels of service."""
     limits = delays[0].limits_s
-    top = max(max(d.delay_s for d in delays) * 1.35, limits[1])
+    top = max(max(d.delay_s for d in delays) * 1.35, *limits[1:2])
     for limit in limits:
         if limit < top:
             axes.axvline(limit, color="#8a929b", linestyle="--", linewidth=0.8, zorder=0)

@@ -40,7 +40,7 @@ def first_page(analysis: TrafficAnalysis) -> FirstPage:
     events = [f"{topic}: {text}" for topic in ("conflicts", "u-turns", "unusual") for text in found.get(topic, [])[:1]]
     no_junction = "no junction of lanes was found"
     questions = (
-        ("Where do vehicles go?", found.get("movement", []) or found.get("scene", []), "no turn was seen five times"),
+        ("Where do vehicles go?", found.get("movement", []) or found.get("scene", []), "no turn was seen three times"),
         (
             "Which approach waits longest, and how long are the queues?",
             _waits(analysis),
@@ -69,7 +69,10 @@ def _waits(analysis: TrafficAnalysis) -> list[str]:
         signal = analysis.signals.get(number)
         if found.junction.kind not in ("intersection", "roundabout"):
             continue
-        parts = [f"from {d.arm} {d.delay_s:.0f} s (level of service {d.level})" for d in approach_delays(found, signal)]
+        parts = [
+            f"from {d.arm} {d.delay_s:.0f} s" + (f" (level of service {d.level})" if d.level else "")
+            for d in approach_delays(found, signal)
+        ]
         names = lane_names(found)
         longest = max(
             ((q, s) for s in (signal.streams if signal else ()) for q in queues(s.stream, s.green_s)),
