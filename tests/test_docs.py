@@ -168,19 +168,20 @@ def summary_line(documented: object) -> str:
 
 def reference_rows() -> list[str]:
     """A row for each public method, property and documented attribute of what `velfield.open_run` leads to."""
-    rows = []
+    rows: dict[str, str] = {}
     for path, owner in REFERENCE:
         if is_dataclass(owner):
-            rows.append(f"| `{path}` | with {', '.join(f'`{one.name}`' for one in fields(owner))} |")
+            names = f"with {', '.join(f'`{one.name}`' for one in fields(owner))}"
+            rows[path] = f"{rows[path]}; {names}" if path in rows else names
         for name, member in vars(owner).items():
             plain = member.__func__ if isinstance(member, classmethod) else member
             if name.startswith("_") or isinstance(member, classmethod) or not getdoc(plain):
                 continue
             if callable(plain):
-                rows.append(f"| `{path}.{name}({parameter_names(plain)})` | {summary_line(plain)} |")
+                rows[f"{path}.{name}({parameter_names(plain)})"] = summary_line(plain)
             elif isinstance(plain, property | cached_property):
-                rows.append(f"| `{path}.{name}` | {summary_line(plain)} |")
-    return rows
+                rows[f"{path}.{name}"] = summary_line(plain)
+    return [f"| `{path}` | {text} |" for path, text in rows.items()]
 
 
 def parameter_names(function: Any) -> str:

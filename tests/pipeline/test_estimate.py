@@ -35,7 +35,7 @@ def test_four_hours_are_fewer_than_3000_task_runs(tmp_path: Path) -> None:
     total = sum(len(units) for units in planned_units(plan).values())
     assert total < 3000
     text = describe_plan(plan)
-    assert f"{total} task runs" in text
+    assert f"{total} units; " in text
     assert "memory" in text
     assert "GB needed" in text
 

@@ -1,4 +1,4 @@
-"""The estimate of a run before it starts: units, task runs, bytes, memory, what is finished already."""
+"""The estimate of a run before it starts: units, bytes, memory, what is finished already."""
 
 import shutil
 from collections.abc import Iterator
@@ -108,7 +108,7 @@ def describe_plan(plan: Plan, at_a_time: int = 2) -> str:
         total += len(units)
         lines.append(f"  {stage:<13} {len(units):>5} units, {done:>5} done")
     root = plan.layout.root
-    lines.append(f"{total} task runs; about {estimated_bytes(plan) / 1e9:.2f} GB needed in {root}{_free(root)}")
+    lines.append(f"{total} units; about {estimated_bytes(plan) / 1e9:.2f} GB needed in {root}{_free(root)}")
     memory = estimated_memory(plan, at_a_time) / 1e9
     lines.append(f"about {memory:.1f} GB of memory with {at_a_time} units at a time")
     return "\n".join(lines)

@@ -31,7 +31,7 @@ _UNITS = ((256, 32), (4096, 64))
 """Up to so many frames, so many a unit: a short flight is cut finely enough for several workers, but the first frame of
 each unit is registered by its keypoints, at five times the cost of the others; ..."""
 _LARGEST_UNIT = 256
-"""... and a flight of hours stays below 3,000 task runs. These are upper limits: units are cut evenly,
+"""... and a flight of hours stays below 3,000 units. These are upper limits: units are cut evenly,
 and an even number of them, so that no core of two idles over a last short one."""
 
 
