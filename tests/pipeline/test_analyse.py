@@ -98,6 +98,19 @@ def test_a_short_clip_is_said_to_be_short(tmp_path: Path, capsys: pytest.Capture
     assert next(t for t in tables if t.name == "signals").note.startswith("Too little data: 4 moving vehicles in 6 s.")
 
 
+@pytest.mark.parametrize("gsd_m", [0.25, None])
+def test_that_the_size_of_a_pixel_is_not_known_is_said(
+    gsd_m: float | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths = [np.column_stack([np.arange(0, 390, 6.0), np.full(65, 50.0 + k)]) for k in range(8)]
+    run = field_run(tmp_path / "run", tracklets_along(paths), shape=(100, 400), gsd_m=gsd_m)
+    write_commit(run.layout, CommitRecord(stage="tracks", unit="all", key="k", code_version="1"))
+    assert analyse(tmp_path / "run") == 0
+    assert ("the paper's 0.23 m a pixel" in capsys.readouterr().out) is (gsd_m is None)
+    report = (tmp_path / "run" / "analysis" / "report.html").read_text()
+    assert ("those of 0.23 m" in report) is (gsd_m is None)
+
+
 def test_tracks_older_than_the_settings_are_said_to_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(0)
     paths = [np.column_stack([np.arange(0, 390, 6.0), 50 + rng.normal(0, 0.1, 65)]) for _ in range(8)]

@@ -10,7 +10,7 @@ import numpy as np
 from schemas.analysis import AnalysisColumn, AnalysisRecord, AnalysisTable, LanesRecord, QuestionRecord
 from schemas.arrays import GreyImage
 from schemas.export import SpeedUnit
-from schemas.flight import FlightConfig, FramesConfig
+from schemas.flight import PAPER_GSD_M, FlightConfig, FramesConfig
 from velfield.analysis.answers import explain_none, find_answers
 from velfield.analysis.movements.time_slices import SLICE_S
 from velfield.analysis.traffic_analysis import TrafficAnalysis
@@ -50,6 +50,12 @@ def analyse_run(run_folder: Path, *, slice_s: float = SLICE_S, speed_unit: Speed
     run.require_frames()
     with locked(run.layout):
         yield from _stale_lines(run.layout)
+        if run.grid.gsd_m is None:
+            yield (
+                f"warning     the size of a pixel of {run.layout.root} is not known: speeds and lengths are those of the "
+                f"paper's {PAPER_GSD_M} m a pixel, and wrong by as much as that is; counts hold. Run the flight again with "
+                "--gsd-m"
+            )
         yield from write_analysis(
             replace(run.analysis.traffic, slice_s=slice_s),
             run.layout.analysis,

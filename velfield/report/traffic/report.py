@@ -7,6 +7,7 @@ from html import escape
 from typing import TYPE_CHECKING
 
 from schemas.analysis import AnalysisRecord, AnalysisTable, Cell, EstimateRecord
+from schemas.flight import PAPER_GSD_M
 from velfield.report.drawing import figure_bytes, new_figure, pages_bytes
 from velfield.report.traffic.diagrams import Diagram
 from velfield.report.traffic.first_page import FirstPage
@@ -64,7 +65,12 @@ def report_html(
 
 
 def _seen(record: AnalysisRecord, page: FirstPage) -> str:
-    known = "" if record.gsd_known else " The size of a pixel is not known: lengths and speeds are by the paper's."
+    known = (
+        ""
+        if record.gsd_known
+        else f" The size of a pixel is not known: lengths and speeds are those of {PAPER_GSD_M} m, the paper's; "
+        "give it by --gsd-m."
+    )
     return f"{page.seen}.{known}"
 
 
