@@ -68,8 +68,8 @@ def _seen(record: AnalysisRecord, page: FirstPage) -> str:
     known = (
         ""
         if record.gsd_known
-        else f" The size of a pixel is not known: lengths and speeds are those of {PAPER_GSD_M} m, the paper's; "
-        "give it by --gsd-m."
+        else f" The size of a pixel is not known: lengths and speeds are those of {PAPER_GSD_M} m, the paper's; give "
+        "it by --gsd-m."
     )
     return f"{page.seen}.{known}"
 
