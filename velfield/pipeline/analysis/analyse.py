@@ -52,9 +52,9 @@ def analyse_run(run_folder: Path, *, slice_s: float = SLICE_S, speed_unit: Speed
         yield from _stale_lines(run.layout)
         if run.grid.gsd_m is None:
             yield (
-                f"warning     the size of a pixel of {run.layout.root} is not known: speeds and lengths are those of the "
-                f"paper's {PAPER_GSD_M} m a pixel, and wrong by as much as that is; counts hold. Run the flight again "
-                "with --gsd-m"
+                f"warning     the size of a pixel of {run.layout.root} is not known: speeds and lengths are those of "
+                f"the paper's {PAPER_GSD_M} m a pixel, and wrong by as much as that is; counts hold. Run the flight "
+                "again with --gsd-m"
             )
         yield from write_analysis(
             replace(run.analysis.traffic, slice_s=slice_s),
