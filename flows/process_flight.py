@@ -8,7 +8,7 @@ far. The report is written last, from the summary of all stages, by every run: i
 and it takes a moment.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -40,10 +40,21 @@ def run_flight(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
     InputError
         The inputs or the configuration are not usable; committed units are kept.
     """
+    return run_flow(process_flight, "process-flight", job, runner, console)
+
+
+def run_flow(
+    flow: Callable[[Job, RunnerConfig, Console, Orchestration], RunSummary],
+    name: str,
+    job: Job,
+    runner: RunnerConfig,
+    console: Console,
+) -> RunSummary:
+    """Run a flow of one job, named by its folder, with as many concurrent units as the runner can use."""
     by = choose_orchestration()
     return by.run(
-        lambda: process_flight(job, runner, console, by),
-        name="process-flight",
+        lambda: flow(job, runner, console, by),
+        name=name,
         run_name=run_name(job.root),
         threads=parallel_units(runner),
         parameters=job,

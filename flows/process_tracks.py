@@ -4,8 +4,7 @@ from pathlib import Path
 
 from flows.console import Console
 from flows.orchestration import Orchestration, run_name
-from flows.prefect_server import choose_orchestration
-from flows.process_flight import publish_report, record_start
+from flows.process_flight import publish_report, record_start, run_flow
 from flows.runners import RunnerConfig, open_runner, parallel_units
 from flows.stopping import stop_lost
 from flows.work import Work
@@ -27,14 +26,7 @@ def run_tracks(job: Job, runner: RunnerConfig, console: Console) -> RunSummary:
     InputError
         The tracks or the configuration are not usable.
     """
-    by = choose_orchestration()
-    return by.run(
-        lambda: process_tracks(job, runner, console, by),
-        name="process-tracks",
-        run_name=run_name(job.root),
-        threads=parallel_units(runner),
-        parameters=job,
-    )
+    return run_flow(process_tracks, "process-tracks", job, runner, console)
 
 
 def process_tracks(job: Job, runner: RunnerConfig, console: Console, by: Orchestration) -> RunSummary:

@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
+from scipy.special import expit, logit
 
-from schemas.arrays import ByteArray, FloatArray, IntArray
+from schemas.arrays import ByteArray, FloatArray, IntArray, Mask
 from schemas.flight import PAPER_GSD_M, TrackingConfig
 from velfield.errors import InputError
 from velfield.tracking.appearance import AppearanceFeatures, appearance_differences, prepare_crops
@@ -179,15 +180,10 @@ def _check_order(tables: Sequence[FrameTable]) -> None:
 
 def _select_triples(start: int, frames: _Frames, min_confidence: float, log: GateLog) -> LinkedTriples:
     """Gate the pairs of links of the window that starts at ``start``, and select the tracklets among them."""
-    before, after = frames.pair(start), frames.pair(start + 1)
-    states = (frames.states[start], frames.states[start + 1], frames.states[start + 2])
-    pairs = gate_link_pairs(states, before.links, after.links, frames.limits)
+    pairs, triples, best, confidence = _link_window(start, frames)
     log.add("windows", 1)
     for gate, count in zip(("pairs_tried", "turn", "acceleration"), pairs.rejected, strict=True):
         log.add(gate, count)
-    triples = _triples(frames.features(start), frames.features(start + 2), before, after, pairs)
-    counts = (states[0].x_px.size, states[1].x_px.size, states[2].x_px.size)
-    best, confidence = best_triples(triples, counts)
     accepted = best & (confidence >= min_confidence)
     log.add("not_best", int(np.sum(~best)))
     log.add("confidence", int(np.sum(best & ~accepted)))
@@ -201,6 +197,15 @@ def _select_triples(start: int, frames: _Frames, min_confidence: float, log: Gat
     return LinkedTriples(start, detections, np.stack(differences, axis=1), confidence[selected])
 
 
+def _link_window(start: int, frames: _Frames) -> tuple[LinkPairs, Triples, Mask, FloatArray]:
+    """Pairs of links of the window that starts at ``start``, and its triples: which are best, and how likely."""
+    before, after = frames.pair(start), frames.pair(start + 1)
+    states = (frames.states[start], frames.states[start + 1], frames.states[start + 2])
+    pairs = gate_link_pairs(states, before.links, after.links, frames.limits)
+    triples = _triples(frames.features(start), frames.features(start + 2), before, after, pairs)
+    return pairs, triples, *best_triples(triples, (states[0].x_px.size, states[1].x_px.size, states[2].x_px.size))
+
+
 def _select_moving(
     tables: Sequence[FrameTable], selected: LinkedTriples, frames: _Frames, stands_px: float, log: GateLog
 ) -> LinkedTriples:
@@ -211,12 +216,10 @@ def _select_moving(
     """
     window = tables[selected.start : selected.start + 3]
     places = [np.column_stack([t.x_px, t.y_px]) for t in window]
-    rows = [np.setdiff1d(_movable(places, k, stands_px), selected.detections[:, k]) for k in range(3)]
+    movable = _movable(places, stands_px)
+    rows = [np.setdiff1d(movable[k], selected.detections[:, k]) for k in range(3)]
     left = _Frames([t.take(one) for t, one in zip(window, rows, strict=True)], frames.limits, frames.config)
-    states = (left.states[0], left.states[1], left.states[2])
-    pairs = gate_link_pairs(states, left.pair(0).links, left.pair(1).links, left.limits)
-    triples = _triples(left.features(0), left.features(2), left.pair(0), left.pair(1), pairs)
-    best, likely = best_triples(triples, (len(rows[0]), len(rows[1]), len(rows[2])))
+    _, triples, best, likely = _link_window(0, left)
     found = np.stack([rows[k][triples.detections[:, k]] for k in range(3)], axis=1)
     moved_px = np.hypot(*(places[2][found[:, 2]] - places[0][found[:, 0]]).T)
     score = np.mean([window[k].score[found[:, k]] for k in range(3)], axis=0)
@@ -228,19 +231,22 @@ def _select_moving(
     return LinkedTriples(selected.start, found[chosen], nothing, confidence[chosen])
 
 
-def _movable(places: Sequence[FloatArray], k: int, stands_px: float) -> IntArray:
-    """Rows of frame k of three where, in another frame, there is nothing."""
-    stands = np.ones(len(places[k]), np.bool_)
-    for other in (places[j] for j in range(3) if j != k):
-        stands &= np.isfinite(cKDTree(other).query(places[k], distance_upper_bound=stands_px)[0])
-    return np.flatnonzero(~stands)
+def _movable(places: Sequence[FloatArray], stands_px: float) -> list[IntArray]:
+    """Rows of each of three frames where, in another frame, there is nothing."""
+    trees = [cKDTree(xy) for xy in places]
+    out = []
+    for k, xy in enumerate(places):
+        others = [tree for j, tree in enumerate(trees) if j != k]
+        near = [np.isfinite(tree.query(xy, distance_upper_bound=stands_px)[0]) for tree in others]
+        out.append(np.flatnonzero(~(near[0] & near[1])))
+    return out
 
 
 def _moving_vehicle(score: FloatArray, likely: FloatArray) -> FloatArray:
     """Probability (n,) that three candidates which seem to move are on one vehicle, from the mean of their scores and
     the probability that they belong together."""
-    odds = np.log(np.clip(likely, 1e-9, 1) / np.clip(1 - likely, 1e-9, 1))
-    return np.asarray(1 / (1 + np.exp(-(_CONSTANT + _OF_SCORE * score + _OF_ODDS * odds))))
+    odds = logit(np.clip(likely, 1e-9, 1 - 1e-9))
+    return np.asarray(expit(_CONSTANT + _OF_SCORE * score + _OF_ODDS * odds))
 
 
 def _patch_differences(
