@@ -331,18 +331,27 @@ def _cluster(config: RunnerConfig) -> Iterator[Any]:
     if config.scheduler is not None:
         yield config.scheduler
         return
-    cluster_class, arguments = _local_cluster(config) if config.cluster_class is None else _import_class(config)
+    if config.cluster_class is None:
+        with _local_cluster(config) as cluster:
+            yield cluster
+        return
+    cluster_class, arguments = _import_class(config)
     with cluster_class(**arguments) as cluster:
-        if config.cluster_class is not None:
-            cluster.scale(config.workers)
+        cluster.scale(config.workers)
         yield cluster
 
 
-def _local_cluster(config: RunnerConfig) -> tuple[Any, dict[str, Any]]:
+@contextmanager
+def _local_cluster(config: RunnerConfig) -> Iterator[Any]:
+    import dask
     from dask.distributed import LocalCluster
 
     here = {"dashboard_address": "127.0.0.1:0", "host": "127.0.0.1"}
-    return LocalCluster, {"n_workers": config.workers, "threads_per_worker": 1, **here}
+    # The cluster gives up a worker that is away so long after it was restarted, though it may be away for being
+    # restarted once more; then nothing ever computes. Our nannies bring workers back themselves.
+    kept = {"distributed.deploy.lost-worker-timeout": "720h"}
+    with dask.config.set(kept), LocalCluster(n_workers=config.workers, threads_per_worker=1, **here) as cluster:
+        yield cluster
 
 
 def _import_class(config: RunnerConfig) -> tuple[Any, dict[str, Any]]:

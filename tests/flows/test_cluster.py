@@ -98,6 +98,18 @@ def test_workers_of_our_own_are_restarted_and_others_are_left_alone() -> None:
         assert runner.call(os.getpid) == before
 
 
+@pytest.mark.timeout(90)
+def test_workers_that_are_being_restarted_are_not_given_up() -> None:
+    """Dask gives a worker up so long after it left, and would look just while it is away again."""
+    with (
+        dask.config.set({"distributed.deploy.lost-worker-timeout": "300ms"}),
+        open_runner(RunnerConfig(workers=1)) as runner,
+    ):
+        before = runner.call(os.getpid)
+        runner.restart_workers()
+        assert runner.call(os.getpid) not in (before, os.getpid())
+
+
 def note_slowly(path: Path) -> None:
     time.sleep(0.5)
     with path.open("a") as file:
