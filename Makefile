@@ -15,6 +15,8 @@ export PYTHONDONTWRITEBYTECODE :=
 demo: page  ## simulate a flight, run the whole job, say where the report is
 	$(BIN)/velfield demo --out demo
 
+# Where a process of the tests dies, they end with the name of its test: xdist waits for ever where it starts another.
+IN_TWO := -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart=0
 # Two processes on two cores: BLAS threads of their own make training in the tests many times slower.
 test: export OPENBLAS_NUM_THREADS := 1
 test: export OMP_NUM_THREADS := 1
@@ -22,7 +24,7 @@ test: page  ## every check: lint, types, tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest $(IN_TWO)
 
 # In build/newest and build/oldest, without the lock: what somebody gets who installs the wheel today, or beside old
 # software. The tools of the tests are the newest there too; numba would go up with the numpy that they bring.
@@ -36,7 +38,7 @@ test-newest test-oldest: test-%: page  ## the tests on the newest, the oldest ve
 	$(BIN)/uv pip list --quiet --python build/$*/bin/python | awk '/^numba /{print $$1 "==" $$2}' > build/$*.txt
 	$(BIN)/uv pip install --quiet --python build/$*/bin/python --constraint build/$*.txt --editable ".[dev,gis,s3]"
 	$(BIN)/uv pip list --quiet --python build/$*/bin/python
-	build/$*/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	build/$*/bin/python -m pytest $(IN_TWO)
 
 # The viewer's page from page/: built where its sources changed. Node is the machine's, else PyPI's into the environment.
 page: $(STAMP)
