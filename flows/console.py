@@ -55,7 +55,7 @@ class StageProgress:
         """Set the progress to at least so many steps of a number that was not known before."""
         if total != self.total:
             self.total = total
-            self.bar.update(self.task, total=total)  # type: ignore[arg-type]
+            self.bar.update(self.task, total=total)
         self.at_least(done)
 
     def at_least(self, done: int) -> None:

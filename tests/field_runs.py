@@ -97,7 +97,7 @@ def field_run(
         indices=np.arange(2),
         time_intervals=[] if asked is None else parse_time_intervals(asked, 0.0, seconds),
     )
-    create_field_stores(plan)  # type: ignore[arg-type]  # all of a plan that the field reads
-    for group in field_blocks(plan):  # type: ignore[arg-type]
-        accumulate_block(plan, group)  # type: ignore[arg-type]
+    create_field_stores(plan)  # all of a plan that the field reads
+    for group in field_blocks(plan):
+        accumulate_block(plan, group)
     return open_run(root)

@@ -125,7 +125,7 @@ CONDA_NAMES = {
 
 def requirement(line: str) -> tuple[str, str]:
     """Name and bounds of a requirement, without extras and spaces."""
-    name, bounds = re.fullmatch(r"([\w.-]+)(?:\[[^]]*\])?\s*(.*)", line).groups()  # type: ignore[union-attr]
+    name, bounds = re.fullmatch(r"([\w.-]+)(?:\[[^]]*\])?\s*(.*)", line).groups()
     return name, bounds.replace(" ", "")
 
 

@@ -72,7 +72,7 @@ def appearance(rng: np.random.Generator, similarity: float = 0.0) -> tuple[float
     body = float(rng.choice([225.0, 190.0, 140.0, 60.0, 35.0]) + rng.normal(0, 12))
     mine = (body, float(rng.uniform(20, 70)), float(rng.normal(0, 25)), rng.uniform(14, 18), rng.uniform(6.8, 8.2))
     same = (190.0, 45.0, 10.0, 16.0, 7.5)
-    return tuple(similarity * s + (1 - similarity) * m for s, m in zip(same, mine, strict=True))  # type: ignore[return-value]
+    return tuple(similarity * s + (1 - similarity) * m for s, m in zip(same, mine, strict=True))
 
 
 def road(rng: np.random.Generator, shape: tuple[int, int]) -> FloatArray:

@@ -80,9 +80,9 @@ def test_points_of_the_diagram_obey_its_equation(analysis: TrafficAnalysis) -> N
     table = diagram_table(analysis)
     assert len(table.rows) > 10
     for row in table.rows:
-        density, flow, speed = (float(row.cells[n]) for n in ("density", "flow", "speed"))  # type: ignore[arg-type]
+        density, flow, speed = (float(row.cells[n]) for n in ("density", "flow", "speed"))
         assert flow == pytest.approx(density * speed, rel=0.02)
-        assert int(row.cells["vehicles"]) >= 3  # type: ignore[arg-type]
+        assert int(row.cells["vehicles"]) >= 3
     assert len(growth_table(analysis).rows) == len(queue_growth(signal_of_crossroads(analysis)))
 
 

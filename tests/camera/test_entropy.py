@@ -106,10 +106,7 @@ def test_a_lens_that_shrinks_the_image_gains_nothing() -> None:
         def undistort_tangents(self, xy: np.ndarray, tangents: np.ndarray) -> np.ndarray:
             return tangents * self.factor
 
-    plain, shrunk = (
-        hough_entropy(arcs, Scaling(factor), angle_bins=180, distance_bin_px=0.5)  # type: ignore[arg-type]
-        for factor in (1.0, 0.5)
-    )
+    plain, shrunk = (hough_entropy(arcs, Scaling(factor), angle_bins=180, distance_bin_px=0.5) for factor in (1.0, 0.5))
     assert shrunk > plain - 0.02
 
 

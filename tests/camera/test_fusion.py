@@ -93,7 +93,7 @@ def test_else_the_plumb_line_lens_is_kept(
 
 def test_a_small_loss_is_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     says(monkeypatch, 0.2, 0.01, after_px=1.019)
-    assert refine_lens(record(0.2, 0.01), pairs()).overlap.used  # type: ignore[union-attr]
+    assert refine_lens(record(0.2, 0.01), pairs()).overlap.used
 
 
 def test_a_plumb_line_lens_without_a_profile_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:

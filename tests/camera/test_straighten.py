@@ -51,7 +51,7 @@ def test_the_lens_is_recovered_within_its_uncertainty(seed: int) -> None:
     deviation = np.sqrt(np.diag(fit.covariance))
     assert abs(fit.parameters[0] - 0.2) < 4 * deviation[0] < 0.03
     assert np.abs(fit.parameters[1:] - TRUTH[1:]).max() < 0.01  # half-diagonals; the prior draws it to the middle
-    assert error_px(fit.lens) < 0.4  # type: ignore[arg-type]
+    assert error_px(fit.lens) < 0.4
     assert fit.residual_px == pytest.approx(0.15, rel=0.15)
 
 

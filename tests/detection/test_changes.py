@@ -213,7 +213,7 @@ def test_a_detector_of_another_kind_searches_each_box_by_itself() -> None:
     class Recording(CnnDetector):
         find_in_crops = Detector.find_in_crops
 
-        def find(self, image, valid=None, *, threshold=None):  # type: ignore[no-untyped-def]
+        def find(self, image, valid=None, *, threshold=None):
             assert valid.shape == image.shape
             seen.append(image.shape)
             return super().find(image, valid, threshold=threshold)

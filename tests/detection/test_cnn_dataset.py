@@ -32,7 +32,7 @@ ANGLES = st.floats(0, np.pi)
 
 def sample(image: GreyImage, cars: FloatArray | None = None, **known: object) -> LabelledImage:
     rows = np.empty((0, 5)) if cars is None else cars
-    return LabelledImage(image=image, cars=rows, **known)  # type: ignore[arg-type]
+    return LabelledImage(image=image, cars=rows, **known)
 
 
 def patches(*groups: LabelledImage, weights: tuple[float, ...] = (1.0,), seed: int = 0, step: int = 0) -> Batch:

@@ -147,7 +147,7 @@ def test_the_number_of_threads_changes_nothing_that_matters() -> None:
     from velfield.detection.cnn.graph import network_to_onnx
     from velfield.detection.runtime import open_session
 
-    model = network_to_onnx(shipped_detector().network)  # type: ignore[attr-defined]
+    model = network_to_onnx(shipped_detector().network)
     session = open_session(model, "cpu")
     assert session.get_session_options().intra_op_num_threads == 1
     image = np.random.default_rng(3).integers(0, 255, (1, 1, 64, 96), dtype=np.uint8)

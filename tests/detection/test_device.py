@@ -128,7 +128,7 @@ def test_a_gpu_runs_the_network_where_there_is_one_and_it_may(runtime: Runtime, 
 def test_a_gpu_is_tried_once_a_process_and_never_where_only_the_processor_may(runtime: Runtime) -> None:
     assert not sessions.uses_cuda("cpu")
     assert (runtime.preloaded, runtime.asked) == (0, [])
-    assert [sessions.uses_cuda(device) for device in ("auto", "cuda", "auto")] == [True] * 3  # type: ignore[arg-type]
+    assert [sessions.uses_cuda(device) for device in ("auto", "cuda", "auto")] == [True] * 3
     assert (runtime.preloaded, len(runtime.asked)) == (1, 1)
 
 

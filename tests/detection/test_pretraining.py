@@ -13,7 +13,7 @@ torch = pytest.importorskip("torch", reason="PyTorch is not installed: `pip inst
 
 
 def shipped() -> Network:
-    network: Network = shipped_detector().network  # type: ignore[attr-defined]
+    network: Network = shipped_detector().network
     return network
 
 

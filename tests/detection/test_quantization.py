@@ -93,7 +93,7 @@ def test_crops_of_an_image_are_predicted_as_if_alone() -> None:
     assert not found[0][:, 64:].any()
 
 
-def test_ranges_are_of_the_flight_and_the_setting_and_come_back_from_the_file(tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_ranges_are_of_the_flight_and_the_setting_and_come_back_from_the_file(tmp_path) -> None:
     detector = shipped()
     eight = detector.for_flight([cars(1)], CnnConfig())
     again = detector.for_flight([cars(1)], CnnConfig())
@@ -113,7 +113,7 @@ def test_small_images_are_calibrated_on_smaller_crops_and_smaller_ones_refused()
         calibrate(network, [np.zeros((4, 90), np.uint8)], crops=4)
 
 
-def test_a_processor_that_saturates_takes_floating_point_and_says_so(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def test_a_processor_that_saturates_takes_floating_point_and_says_so(monkeypatch) -> None:
     for module in ("detector", "inference"):
         monkeypatch.setattr(f"velfield.detection.cnn.{module}.is_exact", lambda: False)
     monkeypatch.setattr(runtime, "_limitations_reported", False)

@@ -153,7 +153,7 @@ def cnn() -> CnnRecord:
 
 
 @pytest.mark.parametrize("make", [paper, cnn])
-def test_a_detector_comes_back_from_its_file(make, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_a_detector_comes_back_from_its_file(make, tmp_path: Path) -> None:
     detector, file = from_record(make()), tmp_path / "detector.json"
     detector.save(file)
     again = load_detector(file)

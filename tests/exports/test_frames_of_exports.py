@@ -113,7 +113,7 @@ def test_lines_and_arrows_point_where_their_headings_do(georeference: Georeferen
         assert_same_deg(bearing_deg(steps), np.full(2, heading), within=1.0)
     velocity = np.full((*SHAPE, 2), np.nan, np.float32)
     velocity[50, 60], velocity[150, 200] = (30.0, -40.0), (-20.0, 0.0)
-    for arrow in arrows_geojson(velocity, np.ones(SHAPE, np.int32), georeference)["features"]:  # type: ignore[attr-defined]
+    for arrow in arrows_geojson(velocity, np.ones(SHAPE, np.int32), georeference)["features"]:
         step = ground_steps(np.array(arrow["geometry"]["coordinates"][0]))
         assert_same_deg(bearing_deg(step), np.full(1, arrow["properties"]["heading_deg"]), within=1.5)
         assert np.hypot(*step[0]) == pytest.approx(arrow["properties"]["speed_km_per_h"] / 3.6 * 0.5, rel=0.02)

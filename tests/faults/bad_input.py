@@ -177,7 +177,7 @@ def _onnx_files() -> tuple[bytes, ...]:
     from velfield.detection.cnn.graph import network_to_onnx
     from velfield.detection.registry import shipped_detector
 
-    good = network_to_onnx(shipped_detector().network)  # type: ignore[attr-defined]
+    good = network_to_onnx(shipped_detector().network)
     external = onnx.ModelProto.FromString(good)
     tensor = external.graph.initializer[0]
     tensor.ClearField("raw_data")

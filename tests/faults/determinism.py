@@ -60,7 +60,7 @@ def largest_difference(one: Path, other: Path) -> float:
     if one.suffix == ".json" and one.name != "zarr.json":
         return _values(*(json.loads(path.read_bytes()) for path in (one, other)))
     arrays = [_array_of(path) for path in (one, other)]
-    return np.inf if any(array is None for array in arrays) else _numbers(*arrays)  # type: ignore[arg-type]
+    return np.inf if any(array is None for array in arrays) else _numbers(*arrays)
 
 
 def _array_of(chunk: Path) -> FloatArray | None:

@@ -147,11 +147,11 @@ def failing_disk(root: Path, fault: Fault) -> Iterator[None]:
         if descriptor != _NO_FILE:
             true_sync(descriptor)
 
-    Path.open, Path.replace, os.fsync = opened, replaced, synced  # type: ignore[assignment,method-assign]
+    Path.open, Path.replace, os.fsync = opened, replaced, synced
     try:
         yield
     finally:
-        Path.open, Path.replace, os.fsync = true_open, true_replace, true_sync  # type: ignore[method-assign]
+        Path.open, Path.replace, os.fsync = true_open, true_replace, true_sync
 
 
 _S3_WRITES = {

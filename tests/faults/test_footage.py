@@ -40,7 +40,7 @@ def quality_warnings(folder: Path, frames: Sequence[GreyImage], *settings: str) 
     return flag_frames(planned(folder, frames, "quality", *settings)).warnings
 
 
-def planned(folder: Path, frames: Sequence[GreyImage], stage: str, *settings: str):  # type: ignore[no-untyped-def]
+def planned(folder: Path, frames: Sequence[GreyImage], stage: str, *settings: str):
     """The plan of a flight of these images, computed up to a stage."""
     write_images(folder / "frames", frames)
     config = resolve_config(settings=["frames.fps=5", "frames.every=1", "registration.max_keypoints=800", *settings])
@@ -61,7 +61,7 @@ def encoded(path: Path, **settings: object) -> Path:
         for name in ("color_trc", "flags"):
             if name in settings:
                 setattr(stream.codec_context, name, settings[name])
-        stream.options = dict(settings.get("options", {}))  # type: ignore[call-overload]
+        stream.options = dict(settings.get("options", {}))
         if "rotation" in settings:
             stream.set_display_rotation(settings["rotation"])
         for number, grey in enumerate(drifting(6, 160, 128)):

@@ -139,7 +139,7 @@ def layers(**values: float) -> dict[str, np.ndarray]:
     return {name: np.full((1, 1), value) for name, value in (base | values).items()}
 
 
-def compared(before: dict[str, np.ndarray], after: dict[str, np.ndarray], hours: tuple[float, float] = (1.0, 1.0)):  # type: ignore[no-untyped-def]
+def compared(before: dict[str, np.ndarray], after: dict[str, np.ndarray], hours: tuple[float, float] = (1.0, 1.0)):
     return compare_fields(
         before.__getitem__,
         after.__getitem__,
@@ -253,7 +253,7 @@ def test_tiles_are_read_once_while_they_are_cached() -> None:
     made = field(drive(polar(np.array([12.0]), np.array([0.0]))))
     read = []
     source = made._source
-    made._source = lambda ty, tx: read.append((ty, tx)) or source(ty, tx)  # type: ignore[func-returns-value]
+    made._source = lambda ty, tx: read.append((ty, tx)) or source(ty, tx)
     for x in (70, 75, 80):
         assert made.at(x, 50).n == 1
     assert read == [(0, 1)]

@@ -111,7 +111,7 @@ def segments_of(flight: Flight, traffic: Traffic, seed: int, **errors: object) -
         flight.city.to_px,
         shape=flight.base_shape,
         rng=np.random.default_rng(seed),
-        **errors,  # type: ignore[arg-type]
+        **errors,
     )
     return segment_table(tracklets, CONFIG)
 

@@ -133,11 +133,11 @@ def one_that_kills_its_worker(plan: object, frames: range) -> object:
     """In place of the step: the first worker that gets frame 8 dies of it."""
     from velfield.pipeline.stages.detections import detect_block
 
-    mark = Path(plan.job.root) / "killed"  # type: ignore[attr-defined]
+    mark = Path(plan.job.root) / "killed"
     if 8 in frames and not mark.exists():
         mark.touch()
         os.kill(os.getpid(), 9)
-    return detect_block(plan, frames)  # type: ignore[arg-type]
+    return detect_block(plan, frames)
 
 
 def test_a_worker_killed_in_mid_chunk_on_a_cluster_by_class(
@@ -165,13 +165,13 @@ def one_that_needs_too_much_memory(plan: object, frames: range) -> object:
     from velfield.pipeline.stages.detections import detect_block
 
     if 8 in frames:
-        with (Path(plan.job.root) / "attempts").open("a") as file:  # type: ignore[attr-defined]
+        with (Path(plan.job.root) / "attempts").open("a") as file:
             file.write(f"{os.getpid()}\n")
         taken = []
         for _ in range(600):  # the worker's nanny looks a few times a second
             taken.append(b"\1" * (20 << 20))
             time.sleep(0.02)
-    return detect_block(plan, frames)  # type: ignore[arg-type]
+    return detect_block(plan, frames)
 
 
 def test_a_unit_over_the_memory_limit_is_tried_once_more_and_then_left_out_with_the_reason(

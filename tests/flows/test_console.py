@@ -29,7 +29,7 @@ def test_a_program_gets_it_as_an_event_and_quiet_means_quiet(
 ) -> None:
     monkeypatch.setattr(console, "_LOG_EVERY_S", 0.0)
     for verbosity in ("json", "quiet"):
-        with Console(verbosity).stage("frames", "frames", 9) as progress:  # type: ignore[arg-type]
+        with Console(verbosity).stage("frames", "frames", 9) as progress:
             progress.at_least(4)
     (line,) = capsys.readouterr().err.splitlines()
     told = json.loads(line)

@@ -163,7 +163,7 @@ def test_a_unit_that_fails_once_is_retried(
         calls.append(frames)
         if len(calls) == 1:
             raise OSError("the disk blinked")
-        return true(plan, frames)  # type: ignore[arg-type]
+        return true(plan, frames)
 
     monkeypatch.setattr(step, "read_unit", failing)
     root = tmp_path / "run"
@@ -191,7 +191,7 @@ def test_a_unit_that_always_fails_is_lost_and_computed_by_the_next_run(
     def failing(plan: object, frames: range) -> object:
         if 8 in frames:
             raise RuntimeError("this chunk kills its worker")
-        return true(plan, frames)  # type: ignore[arg-type]
+        return true(plan, frames)
 
     root = tmp_path / "run"
     link_shared_outputs(RunLayout(whole[0]), RunLayout(root), ("lens", "base", "detector"))

@@ -23,7 +23,7 @@ def test_kernels_are_compiled_beside_a_first_run_only(
 
     def start(command: list[str], **options: int) -> "subprocess.Popen[bytes]":
         assert command[1:] == ["-m", "velfield.pipeline.local"]
-        started.append(subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], **options))  # type: ignore[call-overload]
+        started.append(subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], **options))
         return started[-1]
 
     monkeypatch.setattr(launch, "cache_root", lambda: tmp_path)

@@ -155,7 +155,7 @@ def test_no_other_file_lists_the_stages() -> None:
         for node in ast.walk(ast.parse(path.read_text())):
             names = listed(node)
             if len(names) > isinstance(node, ast.Dict) + 1 and set(names) <= set(STAGE):
-                found.append(f"{path.relative_to(ROOT)}:{node.lineno}: {names}")  # type: ignore[attr-defined]
+                found.append(f"{path.relative_to(ROOT)}:{node.lineno}: {names}")
     assert found == []
 
 

@@ -53,7 +53,7 @@ def errors_px(
     coarse = bool(options.get("coarse", False))
     image = smooth_coarse(smooth_fine(frame)) if coarse else smooth_fine(frame)
     arguments = {"coarse": coarse, "max_shift_px": 2.5} | options
-    aligned, in_frame = align_patches(image, transform(start), make_templates(base), **arguments)  # type: ignore[arg-type]
+    aligned, in_frame = align_patches(image, transform(start), make_templates(base), **arguments)
     assert len(aligned) > 0.5 * in_frame
     return np.linalg.norm(transform(true).to_base(aligned.xy_raw) - aligned.xy_base, axis=1)
 
@@ -116,7 +116,7 @@ def test_bytes_align_as_the_blurred_frame_does(base: np.ndarray) -> None:
     frame, templates = frame_of(base, true), make_templates(base)
     arguments = {"coarse": False, "max_shift_px": 2.5}
     found, plain = (
-        align_patches(image, transform(shift(4.4, -3.3)), templates, **arguments)  # type: ignore[arg-type]
+        align_patches(image, transform(shift(4.4, -3.3)), templates, **arguments)
         for image in (frame[:, ::-1].copy()[:, ::-1], smooth_fine(frame))
     )
     assert found[1] == plain[1]

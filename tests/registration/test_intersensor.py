@@ -42,7 +42,7 @@ def view(scale: float, rotation_deg: float) -> np.ndarray:
 
 
 def found(image: np.ndarray, base: np.ndarray, **arguments: object) -> IntersensorResult:
-    result = register_intersensor(image, base, CONFIG, lens=LENS, **arguments)  # type: ignore[arg-type]
+    result = register_intersensor(image, base, CONFIG, lens=LENS, **arguments)
     assert isinstance(result, IntersensorResult), result.reason
     return result
 

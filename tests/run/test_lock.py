@@ -152,8 +152,8 @@ def test_a_lease_is_renewed_while_it_is_held_and_expires_when_it_is_given_back(
     with locked(lease):
         first = record(lease)
         time.sleep(0.5)
-        assert record(lease)["until_s"] > first["until_s"]  # type: ignore[operator]
-    assert record(lease)["until_s"] <= time.time()  # type: ignore[operator]
+        assert record(lease)["until_s"] > first["until_s"]
+    assert record(lease)["until_s"] <= time.time()
 
 
 def test_the_holder_of_a_lease_is_gone_when_it_expired(lease: RunLayout) -> None:
@@ -216,7 +216,7 @@ def test_connections_that_fail_do_not_end_the_renewal(lease: RunLayout, monkeypa
     monkeypatch.setattr(S3ObjectPath, "replace_version", refuse_twice)
     with locked(lease):
         time.sleep(2.5)
-        assert record(lease)["until_s"] > time.time()  # type: ignore[operator]
+        assert record(lease)["until_s"] > time.time()
 
 
 @pytest.mark.parametrize("fault", ["taken over", "no answer"])

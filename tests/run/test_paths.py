@@ -59,7 +59,7 @@ def test_a_path_on_s3_travels_to_a_worker_as_it_is() -> None:
     received = pickle.loads(pickle.dumps(layout))
     assert received == layout
     assert is_remote(received.camera)
-    assert received.camera.storage_options == layout.camera.storage_options  # type: ignore[attr-defined]
+    assert received.camera.storage_options == layout.camera.storage_options
     assert hash(received) == hash(layout)
 
 
@@ -117,7 +117,7 @@ def test_libraries_read_and_write_a_local_file(root: Path) -> None:
 
 def test_what_failed_half_way_is_not_uploaded(remote: S3ObjectPath) -> None:
     def fail() -> None:
-        with local_output(remote / "a.bin") as local:  # type: ignore[arg-type,operator]
+        with local_output(remote / "a.bin") as local:
             local.write_bytes(b"half")
             raise ZeroDivisionError
 
@@ -130,7 +130,7 @@ def test_objects_are_copied_within_the_store(remote: S3ObjectPath) -> None:
     names = [f"{k}.bin" for k in range(5)]
     for name in names:
         (remote / "from" / name).write_bytes(name.encode())
-    copy_objects([(remote / "from" / name, remote / "to" / name) for name in names])  # type: ignore[misc]
+    copy_objects([(remote / "from" / name, remote / "to" / name) for name in names])
     copy_objects([])
     assert [(remote / "to" / name).read_bytes() for name in names] == [name.encode() for name in names]
 

@@ -52,7 +52,7 @@ def test_scale_north_and_place_by_klv(seed: int, written: object, tmp_path: Path
     """The truth of a simulated flight, through the platform's and the sensor's angles, within the encoding's steps."""
     _, poses = simulated_poses(seed)
     packets = encode_telemetry(poses.telemetry, true_hfov_deg(seed))
-    found = written(packets, tmp_path)  # type: ignore[operator]
+    found = written(packets, tmp_path)
     assert isinstance(found, Telemetry)
     truth = poses.telemetry
     expected_s = np.arange(len(packets)) / 25 if written is in_transport_stream else truth.time_s

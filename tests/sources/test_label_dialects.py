@@ -270,14 +270,14 @@ NAMES_IN_VIDEO = {
 
 @pytest.mark.parametrize(("image", "write"), list(product(NAMES_IN_FOLDER, (cvat_coco, labelme))))
 def test_renamed_images_of_a_folder_are_found(tmp_path: Path, image: str, write: object) -> None:
-    (tmp_path / "l.json").write_text(write(image, cars("turned")))  # type: ignore[operator]
+    (tmp_path / "l.json").write_text(write(image, cars("turned")))
     assert_are(read_labels(tmp_path / "l.json", FOLDER), cars("turned"))
 
 
 @pytest.mark.parametrize(("image", "write"), list(product(NAMES_IN_VIDEO, (cvat_coco, via, yolo_obb))))
 def test_the_frame_of_a_video_is_the_right_one_or_asked_for(tmp_path: Path, image: str, write: object) -> None:
     path = tmp_path / (f"{image.rsplit('.', 1)[0]}.txt" if write is yolo_obb else "l.json")
-    path.write_text(write(image, cars("turned")))  # type: ignore[operator]
+    path.write_text(write(image, cars("turned")))
     frame = NAMES_IN_VIDEO[image]
     if frame is None:
         with pytest.raises(InputError, match="; rename"):

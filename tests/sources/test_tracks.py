@@ -32,7 +32,7 @@ def load(path: Path, options: dict[str, object]) -> LoadedTracks:
             "gsd_m": options.get("gsd_m"),
             "position_unit": options.get("unit"),
             "position_y_axis": options.get("y_axis"),
-            "frames": FramesConfig(fps=options.get("fps")),  # type: ignore[arg-type]
+            "frames": FramesConfig(fps=options.get("fps")),
         }
     )
     return load_tracks(path, config)

@@ -29,7 +29,7 @@ class FakePacket:
 
 
 def packets(pts: np.ndarray, key: np.ndarray | None = None, stamps: str = "pts") -> Packets:
-    return Packets(pts, np.zeros(len(pts), np.bool_) if key is None else key, stamps, ())  # type: ignore[arg-type]
+    return Packets(pts, np.zeros(len(pts), np.bool_) if key is None else key, stamps, ())
 
 
 @given(st.integers(0, 59), st.sampled_from([-9e6, 9e6]))

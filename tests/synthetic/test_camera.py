@@ -36,7 +36,7 @@ def raw_points(config: SimulationConfig, n: int = 400, seed: int = 0) -> FloatAr
 
 
 @pytest.mark.parametrize("case", [homography_only, lens_only, lens_and_wobble, vibration_and_drift, two_term_lens])
-def test_to_raw_inverts_to_base(case) -> None:  # type: ignore[no-untyped-def]
+def test_to_raw_inverts_to_base(case) -> None:
     flight = simulate(case(width=640, height=480, frames=4))
     xy = raw_points(flight.config)
     for frame in range(4):

@@ -44,7 +44,7 @@ def chain(lengths_m: Sequence[float], speed: float = 20.0, signals: dict[int, in
     nodes = [network.node(float(x), 0.0, 0.0) for x in np.concatenate([[0.0], np.cumsum(lengths_m)])]
     for k, (a, b) in enumerate(pairwise(nodes)):
         kind = "box" if k - 1 in (signals or {}) else "avenue"
-        network.straight(a, b, kind, speed, signal=(signals or {}).get(k, -1))  # type: ignore[arg-type]
+        network.straight(a, b, kind, speed, signal=(signals or {}).get(k, -1))
     network.sources.append((nodes[0], 1.0))
     return network
 

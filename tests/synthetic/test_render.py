@@ -44,7 +44,7 @@ def camera(
         width, height, focal_px, 0.0, (width - 1) / 2, (height - 1) / 2,
         np.array([60.0, 50.0, -focal_px]), 0.0, NO_WAVES, NO_SHAKE, 0.0, np.array([0.0]), relief or flat,
     )  # fmt: skip
-    return replace(made, **changes)  # type: ignore[arg-type]
+    return replace(made, **changes)
 
 
 def render(of: Camera, scene: SceneMaps) -> tuple[Float32Array, FloatArray]:

@@ -28,7 +28,7 @@ from velfield.tracking.crop_alignment import (
 )
 
 
-def moved_cars(n: int, *, noise: float = 3.0, jitter: float = 0.8):  # type: ignore[no-untyped-def]
+def moved_cars(n: int, *, noise: float = 3.0, jitter: float = 0.8):
     """Crops of cars before and after a displacement over a fixed background; axes; the true shift between the crops."""
     rng = np.random.default_rng(11)
     ground = road(rng, (96, 96))
@@ -40,7 +40,7 @@ def moved_cars(n: int, *, noise: float = 3.0, jitter: float = 0.8):  # type: ign
         seen = []
         for k in (0, 1):
             x, y = at + k * step
-            it = Car(lambda t, x=x, y=y: (x, y), lambda t, h=heading: h, *style)  # type: ignore[misc]
+            it = Car(lambda t, x=x, y=y: (x, y), lambda t, h=heading: h, *style)
             image = draw(ground, [it], 0.0) + rng.normal(0, noise, (96, 96))
             found = np.array([[x, y]]) + rng.normal(0, jitter, (1, 2))
             (before, after)[k].append(crops_of(image, found)[0])

@@ -23,7 +23,7 @@ GSD_M = 0.25
 INTERVAL_S = 0.2
 
 
-def seen(start_s: float, frames: int, x_m: float, speed: float, acceleration: float = 0.0, lane_m: float = 0.0):  # type: ignore[no-untyped-def]
+def seen(start_s: float, frames: int, x_m: float, speed: float, acceleration: float = 0.0, lane_m: float = 0.0):
     """Tracklets of a vehicle along x, detected in so many frames: `END_COLUMNS`."""
     t = start_s + INTERVAL_S * np.arange(frames)
     x = x_m + speed * (t - start_s) + acceleration * (t - start_s) ** 2 / 2

@@ -55,7 +55,7 @@ def test_links_equal_a_double_loop() -> None:
     assert np.array_equal(np.stack([links.first, links.second], 1), np.argwhere(apart <= 30 + 3 * np.sqrt(2)))
 
 
-def window(second: tuple[float, float], third: tuple[float, float], times: tuple[float, float] = (0.2, 0.4)):  # type: ignore[no-untyped-def]
+def window(second: tuple[float, float], third: tuple[float, float], times: tuple[float, float] = (0.2, 0.4)):
     """Pairs of links of one car detected at the origin and at two further positions; negligible jitter."""
     p = [states([(0, 0)], 0.0, np.nan, 0.01), states([second], times[0], np.nan, 0.01)]
     p.append(states([third], times[1], np.nan, 0.01))

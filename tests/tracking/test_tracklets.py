@@ -28,7 +28,7 @@ def uneven_times(rng: np.random.Generator, n: int, interval_s: float = 0.2) -> l
 def scene(name: str, seed: int = 0, frames: int = 16, **how: object) -> Watched:
     rng = np.random.default_rng(seed)
     cars = SCENES[name](rng)
-    return watch(cars, uneven_times(rng, frames), rng=rng, **how)  # type: ignore[arg-type]
+    return watch(cars, uneven_times(rng, frames), rng=rng, **how)
 
 
 @pytest.mark.parametrize("name", list(SCENES))

@@ -29,5 +29,5 @@ def test_tracks_are_the_connected_components_in_any_order(rows: list[tuple[int, 
     expected = [min(next(g for g in groups if row[0] in g)) for row in rows]
     assert tracks.tolist() == expected
     order = list(range(len(rows)))
-    random.shuffle(order)  # type: ignore[attr-defined]
+    random.shuffle(order)
     assert assign_tracks(ids[order]).tolist() == tracks[order].tolist()

@@ -221,7 +221,7 @@ def test_a_click_on_a_vehicle_of_the_replay_tells_its_speed(chromium: Browser, a
         shown = json.loads(page.value("document.querySelector('#answer [data-name=vehicle_speed]').dataset.value"))
         assert shown == pytest.approx(speed, rel=0.02)
         answer = page.value("document.getElementById('answer').innerText")
-        vehicle = run.vehicles().iloc[int(re.search(r"Vehicle (\d+)", answer)[1])]  # type: ignore[index]
+        vehicle = run.vehicles().iloc[int(re.search(r"Vehicle (\d+)", answer)[1])]
         assert vehicle["vehicle_class"] in CLASS_NAMES, "the test needs a vehicle that was measured"
         percent = f"{100 * vehicle['class_probability']:.0f}".replace("100", "> 99")
         assert re.search(rf"Class\s+{vehicle['vehicle_class']} \({percent} %\)", answer)

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from schemas.arrays import FloatArray, Mask
+from velfield.compiled import kernel
 
 _EIGHT_NEIGHBOURS = np.ones((3, 3), np.int8)
 
@@ -68,7 +68,7 @@ def region_table(labels: NDArray[np.int32], medians: Mapping[str, NDArray[np.flo
     return pd.DataFrame(rows, columns=["region", "x_px", "y_px", "area_px", *medians])
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _root(parent: NDArray[np.int32], i: int) -> int:
     while parent[i] != i:
         parent[i] = parent[parent[i]]
@@ -76,7 +76,7 @@ def _root(parent: NDArray[np.int32], i: int) -> int:
     return i
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def label_smooth(angle_rad: FloatArray, max_step_rad: float) -> NDArray[np.int32]:
     """Connected components (4-connectivity) of pixels whose angles differ by at most ``max_step_rad``; 0 where NaN."""
     height, width = angle_rad.shape

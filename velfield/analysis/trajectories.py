@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from numba import njit
 
 from schemas.arrays import FloatArray, IntArray, Mask
+from velfield.compiled import kernel
 
 VEHICLE_LENGTH_M, VEHICLE_WIDTH_M = 4.5, 1.8
 """Dimensions assumed for a vehicle that was not measured."""
@@ -199,7 +199,7 @@ def from_tracklets(tracklets: pd.DataFrame, gsd_m: float) -> Trajectories:
     )
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _smooth(
     first: IntArray, time_s: FloatArray, xy: FloatArray, step: FloatArray, reach_s: float, velocity_s: float
 ) -> tuple[FloatArray, FloatArray]:
@@ -238,7 +238,7 @@ def _smooth(
     return out, velocity
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _bridge(first: IntArray, time_s: FloatArray, step: FloatArray, known: Mask, longest_s: float, reach: float) -> None:
     """Give displacements that were not measured, in place, the mean velocity of the measured ones beside them, where
     the positions do not contradict it."""
@@ -295,7 +295,7 @@ def within(xy_m: FloatArray, low_m: FloatArray, high_m: FloatArray) -> IntArray:
     return np.asarray(rows[(y >= low_m[1]) & (y <= high_m[1])])
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def group_rows(group: IntArray, n: int) -> tuple[IntArray, IntArray]:
     """Rows in the order of their group (rows,), and the borders (n + 1,) of the n groups among them: a counting sort,
     in the time of a few copies.
@@ -334,7 +334,7 @@ def sample_paths(trajectories: Trajectories, spacing_m: float = 1.0) -> PathSamp
     return out
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _find_vertices(
     xy: FloatArray, a: int, b: int, min_step: float, vertex: IntArray, along: FloatArray
 ) -> tuple[int, float]:
@@ -355,7 +355,7 @@ def _find_vertices(
     return count, along[count - 1] if count else 0.0
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _count_samples(first: IntArray, xy: FloatArray, spacing: float, min_step: float) -> IntArray:
     """Points ``spacing`` apart along each track (tracks,)."""
     steps = np.zeros(len(first) - 1, np.int64)
@@ -367,7 +367,7 @@ def _count_samples(first: IntArray, xy: FloatArray, spacing: float, min_step: fl
     return steps
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _resample(
     tracks: IntArray,
     first: IntArray,
@@ -405,7 +405,7 @@ def _resample(
             out_speed[n] = speed[i] + f * (speed[j] - speed[i])
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _vertex_at(
     xy: FloatArray, vertex: IntArray, along: FloatArray, count: int, s: float, at: int
 ) -> tuple[float, float, int]:

@@ -8,10 +8,10 @@ from functools import partial
 import cv2
 import numpy as np
 import onnxruntime as ort
-from numba import njit
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
+from velfield.compiled import kernel
 from velfield.detection.cnn.network import TOPOLOGY, DepthToSpace, Residual, SpaceToDepth, Topology
 from velfield.detection.detect import detect_frame
 from velfield.detection.interface import Detector
@@ -86,8 +86,8 @@ def row_response(image: NDArray[np.uint8], stumps: BoostedStumps, grey_bits: int
     return out
 
 
-@njit(cache=True, nogil=True)
-def _rows(integral, rectangles, starts, thresholds, leaves, out):  # type: ignore[no-untyped-def]
+@kernel
+def _rows(integral, rectangles, starts, thresholds, leaves, out) -> None:  # type: ignore[no-untyped-def]
     height, width = out.shape
     row = np.empty(width, np.int32)
     for y in range(height):

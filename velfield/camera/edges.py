@@ -12,9 +12,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
+from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
+from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
+from velfield.compiled import kernel
 
 Apply = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 """Applies a function to each of several things, as `map` does: one that uses several threads is faster."""
@@ -48,8 +49,8 @@ class Arcs:
         return Arcs(self.xy[step], self.tangents[step], self.arc[step], self.frame, self.length_px)
 
 
-@njit(cache=True, nogil=True)
-def _edge_points(smooth, min_gradient):  # type: ignore[no-untyped-def]  # numba
+@kernel
+def _edge_points(smooth: Float32Array, min_gradient: np.float32) -> tuple[Float32Array, NDArray[np.int32]]:
     """Non-maximum suppression of the gradient: subpixel (x, y) and unit gradient, in raster order; index image."""
     height, width = smooth.shape
     gradient = np.zeros((height, width), dtype=np.float32)
@@ -82,8 +83,8 @@ def _edge_points(smooth, min_gradient):  # type: ignore[no-untyped-def]  # numba
     return points[:count].copy(), index
 
 
-@njit(cache=True, nogil=True)
-def _bilinear(values, x, y):  # type: ignore[no-untyped-def]  # numba
+@kernel
+def _bilinear(values: Float32Array, x: float, y: float) -> float:
     """Bilinear value at (x, y), inside the image."""
     x0 = int(x)
     y0 = int(y)
@@ -91,11 +92,11 @@ def _bilinear(values, x, y):  # type: ignore[no-untyped-def]  # numba
     fy = y - y0
     upper = values[y0, x0] * (1 - fx) + values[y0, x0 + 1] * fx
     lower = values[y0 + 1, x0] * (1 - fx) + values[y0 + 1, x0 + 1] * fx
-    return upper * (1 - fy) + lower * fy
+    return float(upper * (1 - fy) + lower * fy)
 
 
-@njit(cache=True, nogil=True)
-def _find_next(points, index, used_points, current, tx, ty, reach, min_cosine):  # type: ignore[no-untyped-def]  # numba
+@kernel
+def _find_next(points, index, used_points, current, tx, ty, reach, min_cosine) -> int:  # type: ignore[no-untyped-def]  # numba
     """The unused point that continues the chain best, or -1."""
     height, width = index.shape
     px, py = points[current, 0], points[current, 1]
@@ -120,8 +121,10 @@ def _find_next(points, index, used_points, current, tx, ty, reach, min_cosine): 
     return best
 
 
-@njit(cache=True, nogil=True)
-def _link_chains(points, index, min_points, min_cosine):  # type: ignore[no-untyped-def]  # numba
+@kernel
+def _link_chains(
+    points: Float32Array, index: NDArray[np.int32], min_points: int, min_cosine: float
+) -> tuple[IntArray, IntArray]:
     """Link edge points into chains, in both directions from a seed: point indices, and the start of each chain."""
     count = points.shape[0]
     used_points = np.zeros(count, dtype=np.bool_)
@@ -165,8 +168,10 @@ def _link_chains(points, index, min_points, min_cosine):  # type: ignore[no-unty
     return order[:used].copy(), np.array(starts)
 
 
-@njit(cache=True, nogil=True)
-def _fit_parabola(points, order, begin, end, out):  # type: ignore[no-untyped-def]  # numba
+@kernel
+def _fit_parabola(
+    points: Float32Array, order: IntArray, begin: int, end: int, out: FloatArray
+) -> tuple[float, float, float, float, float, NDArray[np.floating]]:
     """Least-squares parabola over the chord of a piece of chain; writes the residuals, returns axes and terms."""
     first, last = order[begin], order[end - 1]
     ox, oy = points[first, 0], points[first, 1]
@@ -194,8 +199,10 @@ def _fit_parabola(points, order, begin, end, out):  # type: ignore[no-untyped-de
     return ox, oy, tx, ty, chord, terms
 
 
-@njit(cache=True, nogil=True)
-def _split_into_arcs(points, order, starts, min_length, tolerance, max_curvature):  # type: ignore[no-untyped-def]  # numba
+@kernel
+def _split_into_arcs(
+    points: Float32Array, order: IntArray, starts: IntArray, min_length: float, tolerance: float, max_curvature: float
+) -> tuple[FloatArray, FloatArray]:
     """Split chains until a parabola fits each piece; keep long, slightly curved ones: (x, y, tx, ty, arc), chords."""
     rows = np.empty((order.size, 5))
     chords = []  # type: ignore[var-annotated]  # numba infers it

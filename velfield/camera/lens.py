@@ -15,10 +15,10 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numba import njit
 
 from schemas.arrays import FloatArray, Points
 from schemas.camera import DivisionLensRecord, HarrisLensRecord, LensRecord, PolynomialLensRecord
+from velfield.compiled import kernel
 
 _NEWTON_STEPS = 60
 _NEWTON_TOLERANCE = 1e-13
@@ -75,8 +75,8 @@ def _squares(offsets: FloatArray) -> FloatArray:
     return np.asarray(x * x + y * y)
 
 
-@njit(cache=True, nogil=True)
-def _divide_by_root(points, a, centre_x, centre_y, unit2):  # type: ignore[no-untyped-def]
+@kernel
+def _divide_by_root(points: FloatArray, a: float, centre_x: float, centre_y: float, unit2: float) -> FloatArray:
     """Points (n, 2) at r from a centre moved to r / sqrt(1 + a r^2 / unit2); NaN where there is no root."""
     out = np.empty((points.shape[0], 2))
     for i in range(points.shape[0]):
@@ -87,8 +87,8 @@ def _divide_by_root(points, a, centre_x, centre_y, unit2):  # type: ignore[no-un
     return out
 
 
-@njit(cache=True, nogil=True)
-def _scale_by_polynomial(points, lens):  # type: ignore[no-untyped-def]
+@kernel
+def _scale_by_polynomial(points: FloatArray, lens: RadialModel) -> FloatArray:
     """Points (n, 2) at r from a centre moved to r p(r^2), or r / p(r^2); NaN where p is not positive or r too large."""
     out, terms, unit = np.empty((points.shape[0], 2)), len(lens.polynomial), lens.half_diagonal_px
     for i in range(points.shape[0]):
@@ -104,8 +104,8 @@ def _scale_by_polynomial(points, lens):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True)
-def undistort(points, lens):  # type: ignore[no-untyped-def]
+@kernel
+def undistort(points: FloatArray, lens: RadialModel) -> FloatArray:
     """Raw pixels (n, 2) to undistorted pixels (n, 2) by a `RadialModel`; NaN rows outside its domain."""
     if lens.power == -0.5:  # its loop becomes vectors
         unit2 = lens.half_diagonal_px**2

@@ -1,7 +1,10 @@
 """Kernels that find where two frames differ, all at half the resolution, by cells of `CELL_PX`."""
 
 import numpy as np
-from numba import njit
+from numpy.typing import NDArray
+
+from schemas.arrays import Mask
+from velfield.compiled import kernel
 
 CELL_PX = 8
 """Side of the cells in which frames are compared and searched, working px. It stands beside the kernels that hold it:
@@ -12,8 +15,8 @@ BOX_AREA = (BOX_PX // 2) ** 2
 """In pixels at half the resolution."""
 
 
-@njit(cache=True, nogil=True)
-def difference_kernel(image, other, valid, other_valid, sums, counts, one_only):  # type: ignore[no-untyped-def]
+@kernel
+def difference_kernel(image, other, valid, other_valid, sums, counts, one_only) -> NDArray[np.int16]:  # type: ignore[no-untyped-def]
     """Difference of two images (h, w) where both are valid, else 0; of each cell its sum, the number of such pixels,
     and whether there are some where just one is valid.
 
@@ -44,8 +47,8 @@ def difference_kernel(image, other, valid, other_valid, sums, counts, one_only):
     return out
 
 
-@njit(cache=True, nogil=True)
-def box_sums_kernel(difference):  # type: ignore[no-untyped-def]
+@kernel
+def box_sums_kernel(difference: NDArray[np.int16]) -> NDArray[np.int16]:
     """Sums over boxes of `BOX_PX` at half the resolution, from two pixels before each; beyond the edge it goes on."""
     height, width = difference.shape
     out = np.empty((height, width), np.int16)
@@ -61,8 +64,8 @@ def box_sums_kernel(difference):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True)
-def changed_kernel(boxes, slow, slope, valid, other_valid, limit, shift):  # type: ignore[no-untyped-def]
+@kernel
+def changed_kernel(boxes, slow, slope, valid, other_valid, limit, shift) -> Mask:  # type: ignore[no-untyped-def]
     """Cells that hold a pixel whose change exceeds the limit and what a shift by so many px would make."""
     side, scale = np.uint64(CELL_PX // 2), np.float32(1 / BOX_AREA)
     out = np.zeros(slow.shape, np.bool_)
@@ -81,8 +84,8 @@ def changed_kernel(boxes, slow, slope, valid, other_valid, limit, shift):  # typ
     return out
 
 
-@njit(cache=True, nogil=True)
-def _mark_cells(pixels, cells):  # type: ignore[no-untyped-def]
+@kernel
+def _mark_cells(pixels: Mask, cells: Mask) -> None:
     """Mark the cells of a row in which a row of pixels holds anywhere."""
     side, width = np.uint64(CELL_PX // 2), np.uint64(pixels.size)
     for column in range(np.uint64(cells.size)):
@@ -90,8 +93,8 @@ def _mark_cells(pixels, cells):  # type: ignore[no-untyped-def]
             cells[column] |= pixels[x]
 
 
-@njit(cache=True, nogil=True)
-def any_kernel(half, out):  # type: ignore[no-untyped-def]
+@kernel
+def any_kernel(half: Mask, out: Mask) -> None:
     """Mark the cells (rows, columns) in which a mask at half the resolution holds anywhere."""
     side = np.uint64(CELL_PX // 2)
     height, width = np.uint64(half.shape[0]), np.uint64(half.shape[1])

@@ -24,9 +24,9 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from numba import njit
 
-from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
+from schemas.arrays import ByteArray, Float32Array, FloatArray, GreyImage, IntArray, Mask
+from velfield.compiled import kernel
 from velfield.detection.changes import (
     BOX_AREA,
     BOX_PX,
@@ -87,8 +87,10 @@ def oriented_patches(
     return _sample(image, x, y).reshape(count, length, width)
 
 
-@njit(cache=True, nogil=True)
-def _grid_kernel(xy, cosine, sine, length, width):  # type: ignore[no-untyped-def]
+@kernel
+def _grid_kernel(
+    xy: FloatArray, cosine: FloatArray, sine: FloatArray, length: int, width: int
+) -> tuple[Float32Array, Float32Array]:
     """Where the pixels of patches lie in an image, row by row: x and y, each (n, length width) float32."""
     x, y = np.empty((len(xy), length * width), np.float32), np.empty((len(xy), length * width), np.float32)
     for n in range(len(xy)):
@@ -107,8 +109,8 @@ def upright_chips(image: GreyImage, xy: FloatArray, *, side: int = _CHIP_PX) -> 
     return np.asarray(_chips_kernel(image, np.rint(xy).astype(np.int64) - side // 2, side))
 
 
-@njit(cache=True, nogil=True)
-def _chips_kernel(image, corners, side):  # type: ignore[no-untyped-def]
+@kernel
+def _chips_kernel(image: ByteArray, corners: IntArray, side: int) -> ByteArray:
     """Crops with these corners (n, 2); beyond the image its edge goes on."""
     height, width = image.shape
     out = np.empty((len(corners), side, side), np.uint8)
@@ -366,8 +368,8 @@ def split_into_boxes(cells: Mask, margin: float, box_cost: float) -> list[Box]:
     return [(int(top), int(left), int(bottom), int(right)) for top, left, bottom, right in found]
 
 
-@njit(cache=True, nogil=True)
-def _split_kernel(cells, margin, box_cost):  # type: ignore[no-untyped-def]
+@kernel
+def _split_kernel(cells: Mask, margin: float, box_cost: float) -> IntArray:
     """Boxes (n, 4). Nodes of the tree are numbered so that parts come after the box that they are parts of."""
     height, width = cells.shape
     of_rows, of_columns = np.empty((height + 1, 2), np.int64), np.empty((width + 1, 2), np.int64)
@@ -424,8 +426,10 @@ def _split_kernel(cells, margin, box_cost):  # type: ignore[no-untyped-def]
     return boxes[:count]
 
 
-@njit(cache=True, nogil=True)
-def _find_extents(cells, box, of_rows, of_columns):  # type: ignore[no-untyped-def]
+@kernel
+def _find_extents(
+    cells: Mask, box: tuple[int, int, int, int] | tuple[int, ...], of_rows: IntArray, of_columns: IntArray
+) -> int:
     """First marked cell of each row and column of a box, and that after the last; the last is 0 where none is.
 
     Returns their number.
@@ -456,8 +460,8 @@ def _find_extents(cells, box, of_rows, of_columns):  # type: ignore[no-untyped-d
     return count
 
 
-@njit(cache=True, nogil=True)
-def _bounds(extents, begin, end):  # type: ignore[no-untyped-def]
+@kernel
+def _bounds(extents: IntArray, begin: int, end: int) -> tuple[int, ...]:
     """Bounding box of the marked cells in a range of rows (or columns): first row and column, and one past the last."""
     while begin < end and extents[begin, 1] == 0:
         begin += 1
@@ -470,8 +474,8 @@ def _bounds(extents, begin, end):  # type: ignore[no-untyped-def]
     return begin, first, end, last
 
 
-@njit(cache=True, nogil=True)
-def _best_split(extents, begin, end, margin):  # type: ignore[no-untyped-def]
+@kernel
+def _best_split(extents: IntArray, begin: int, end: int, margin: float) -> tuple[float, int]:
     """The least area of two boxes with margins, of the rows (or columns) of a box before and after one, and that row;
     inf for one row. The first and the last have a mark."""
     count = end - begin

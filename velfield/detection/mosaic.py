@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
-from schemas.arrays import IntArray
+from schemas.arrays import ByteArray, FloatArray, IntArray
+from velfield.compiled import kernel
 from velfield.detection.changes import CELL_PX
 from velfield.detection.frame import SearchableFrame
 from velfield.detection.interface import Detections, Detector, concatenate
@@ -52,8 +52,8 @@ def pack_boxes(boxes: Sequence[Box], context_px: int) -> list[Mosaic]:
     return [Mosaic((int((of[:, 0] + of[:, 2]).max()), int((of[:, 1] + of[:, 3]).max())), one, of) for one, of in parts]
 
 
-@njit(cache=True, nogil=True)
-def shelve_kernel(sizes, side):  # type: ignore[no-untyped-def]
+@kernel
+def shelve_kernel(sizes: IntArray, side: int) -> tuple[IntArray, IntArray]:
     """Number of the mosaic (n,) of crops of sizes (n, 2), height and width, the tallest first, and its corner there
     (n, 2): row and column. A mosaic is no larger than a side, unless a crop is."""
     number, corners = np.zeros(len(sizes), np.int64), np.zeros((len(sizes), 2), np.int64)
@@ -114,8 +114,8 @@ def _find_in_mosaic(
     return Detections.from_rows(cars[:, :5], cars[:, 5]), mosaic.numbers[crop]
 
 
-@njit(cache=True, nogil=True)
-def owners_kernel(xy, crops, context, height, width):  # type: ignore[no-untyped-def]
+@kernel
+def owners_kernel(xy: FloatArray, crops: IntArray, context: int, height: int, width: int) -> IntArray:
     """Number of the crop in whose box, within the context, the pixel of each position (n, 2) lies; -1 where in none."""
     out = np.full(len(xy), -1, np.int64)
     for n in range(len(xy)):
@@ -128,8 +128,10 @@ def owners_kernel(xy, crops, context, height, width):  # type: ignore[no-untyped
     return out
 
 
-@njit(cache=True, nogil=True)
-def assemble_kernel(image, corners, crops, height, width, reflected):  # type: ignore[no-untyped-def]
+@kernel
+def assemble_kernel(
+    image: ByteArray, corners: IntArray, crops: IntArray, height: int, width: int, reflected: bool
+) -> ByteArray:
     """A mosaic (height, width) of the windows of an image with these corners (n, 2), where crops (n, 4) lie.
 
     Beyond the image a window is zero, or what of it lies inside goes on by reflection (OpenCV's BORDER_REFLECT_101).
@@ -160,8 +162,8 @@ def assemble_kernel(image, corners, crops, height, width, reflected):  # type: i
     return out
 
 
-@njit(cache=True, nogil=True)
-def _reflect(place, count):  # type: ignore[no-untyped-def]
+@kernel
+def _reflect(place: int, count: int) -> int:
     """The place among so many that one beyond them is the mirror image of, about the first or the last."""
     while not 0 <= place < count:
         place = 0 if count == 1 else -place if place < 0 else 2 * count - 2 - place

@@ -1,9 +1,9 @@
 """Non-maximum suppression of oriented rectangles, and positions along their axes."""
 
 import numpy as np
-from numba import njit
 
 from schemas.arrays import FloatArray, Mask
+from velfield.compiled import kernel
 from velfield.detection.orientation import CAR_ASPECT
 
 _NMS_ALONG, _NMS_ACROSS = 0.66, 0.4
@@ -39,8 +39,8 @@ def nms_oriented(cars: FloatArray, car_length_px: float) -> FloatArray:
     return np.asarray(cars[_survivors(cars, car_length_px, CAR_ASPECT * car_length_px)])
 
 
-@njit(cache=True, nogil=True)
-def _survivors(cars, length, width):  # type: ignore[no-untyped-def]
+@kernel
+def _survivors(cars: FloatArray, length: float, width: float) -> Mask:
     """Mask (n,) of the cars that are not suppressed; the cars are sorted by score, best first."""
     kept = np.zeros(len(cars), np.bool_)
     covered = np.empty(_SPOTS_ALONG * _SPOTS_ACROSS, np.bool_)

@@ -18,10 +18,10 @@ from math import erf, floor, sqrt
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, IntArray
+from velfield.compiled import kernel
 from velfield.errors import InputError
 from velfield.field.segments import Segments, VelocityBins
 
@@ -121,7 +121,7 @@ def accumulate_tile(
     return FieldTile(histogram, count, occupancy_ms, variance_sum)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _bin_fractions(position: float, sigma: float, n: int, fractions: FloatArray) -> tuple[int, int]:
     """Fractions of a Gaussian (in bins) in each bin, truncated at three sigmas; returns the first bin and their number.
 
@@ -139,7 +139,7 @@ def _bin_fractions(position: float, sigma: float, n: int, fractions: FloatArray)
     return first, last - first + 1
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _band_pixels(
     x0: float,
     y0: float,
@@ -177,7 +177,7 @@ def _band_pixels(
     return found
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _line_pixels(
     x0: float,
     y0: float,
@@ -206,7 +206,7 @@ def _line_pixels(
     return found
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _add_kernel(
     flat: NDArray[np.int32], offset: int, weight: int, n: int, kernel: NDArray[np.int32], peak: int
 ) -> None:
@@ -229,7 +229,7 @@ def _add_kernel(
     flat[offset + peak // n_x * n + peak % n_x] += remainder
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _unit_kernel(fractions_x: FloatArray, fractions_y: FloatArray, kernel: NDArray[np.int32]) -> int:
     """Fill ``kernel`` with the outer product of the fractions in fixed point, sum `UNIT`; returns its peak (flat)."""
     remainder = UNIT
@@ -242,7 +242,7 @@ def _unit_kernel(fractions_x: FloatArray, fractions_y: FloatArray, kernel: NDArr
     return int(peak_y * fractions_x.size + peak_x)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _accumulate(
     path: FloatArray,
     velocity: FloatArray,

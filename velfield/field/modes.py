@@ -11,30 +11,30 @@ The distribution of speed at a pixel, from its velocity histogram.
 from math import exp, floor, hypot, sqrt
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray
+from velfield.compiled import kernel
 from velfield.field.segments import VelocityBins
 
 CELLS_PER_BIN = 8
 """Bins of the speed histogram (cells) a bin of velocity."""
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def max_cells(reach: int) -> int:
     """Number of cells for the speeds of a velocity histogram with ``reach`` bins on either side."""
     return int((floor(1.5 * reach) + 3) * CELLS_PER_BIN)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def kernel_variance(sigma: float) -> float:
     """Variance that the histogram adds to a speed, bins^2: the kernel's, and twice that of a bin's width (once when
     bins are filled, once when they are spread over cells)."""
     return sigma * sigma + 2.0 / 12.0
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def occupied_box(h: NDArray[np.int32]) -> tuple[int, int, int, int]:
     """First row, row after the last, first column and column after the last of the bins that are not zero; zeros where
     all are.
@@ -63,7 +63,7 @@ def occupied_box(h: NDArray[np.int32]) -> tuple[int, int, int, int]:
     return top, bottom, left, right
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def speed_cells(h: NDArray[np.int32], reach: int, cells: FloatArray) -> float:
     """Fill ``cells`` with the histogram of speed, each bin spread uniformly over one bin's width of speed; returns the
     sum."""
@@ -90,7 +90,7 @@ def speed_cells(h: NDArray[np.int32], reach: int, cells: FloatArray) -> float:
     return total
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def quantile(cells: FloatArray, total: float, probability: float) -> float:
     """Quantile of the speed, bins; linear within a cell."""
     target = min(max(probability, 0.0), 1.0) * total
@@ -103,7 +103,7 @@ def quantile(cells: FloatArray, total: float, probability: float) -> float:
     return cells.size / CELLS_PER_BIN
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def deconvolution_factor(cells: FloatArray, total: float, blur: float) -> float:
     """Standard deviation of the speed without the kernel's variance ``blur`` over that with it: the factor by which
     quantiles move towards the median."""
@@ -129,7 +129,7 @@ _SAME_MODE_BINS = 1.0
 """Modes nearer to each other than this are one, bins."""
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _smooth(h: NDArray[np.int32], y: int, x: int) -> np.int64:
     """The histogram at a bin smoothed by a binomial 3x3 kernel, so that a peak spread over two bins is one maximum."""
     total = np.int64(0)
@@ -139,13 +139,13 @@ def _smooth(h: NDArray[np.int32], y: int, x: int) -> np.int64:
     return total
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def bandwidth_bins(tracks: int) -> float:
     """Bandwidth for a number of tracks, bins."""
     return max(float(BANDWIDTH_BINS * max(tracks, 1) ** (-1.0 / 6.0)), MIN_BANDWIDTH_BINS)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _mean_shift(h: NDArray[np.int32], y: float, x: float, window: float) -> tuple[float, float]:
     """Mean shift from (y, x), bins, to a maximum of the smoothed histogram."""
     n = h.shape[0]
@@ -178,7 +178,7 @@ def _mean_shift(h: NDArray[np.int32], y: float, x: float, window: float) -> tupl
     return y, x
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _main_mode(h: NDArray[np.int32], window: float) -> tuple[float, float]:
     """(y, x) in bins of the highest mode of a histogram that is not empty. Equal peaks: the first in raster order."""
     best, best_y, best_x = np.int64(-1), 0, 0
@@ -193,7 +193,7 @@ def _main_mode(h: NDArray[np.int32], window: float) -> tuple[float, float]:
     return y_mode, x_mode
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _is_peak(h: NDArray[np.int32], y: int, x: int) -> bool:
     here = _smooth(h, y, x)
     if here <= 0:
@@ -209,7 +209,7 @@ def _is_peak(h: NDArray[np.int32], y: int, x: int) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def pixel_modes(h: NDArray[np.int32], window: float, modes: NDArray[np.float64]) -> int:
     """Fill ``modes`` (k, 3) with (y, x, weight) in bins, the largest weight first; returns their number.
 
@@ -250,7 +250,7 @@ def pixel_modes(h: NDArray[np.int32], window: float, modes: NDArray[np.float64])
     return int(kept)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _modal_tile(histogram: NDArray[np.int32], count: NDArray[np.int32], out: NDArray[np.float64]) -> None:
     for y in range(count.shape[0]):
         for x in range(count.shape[1]):
@@ -259,7 +259,7 @@ def _modal_tile(histogram: NDArray[np.int32], count: NDArray[np.int32], out: NDA
                 out[y, x, 0], out[y, x, 1] = mode_x, mode_y
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _modes_tile(histogram: NDArray[np.int32], count: NDArray[np.int32], out: NDArray[np.float64]) -> None:
     modes = np.empty((out.shape[2], 3))
     for y in range(count.shape[0]):

@@ -15,10 +15,10 @@ bins has a small weight besides, for what is not Gaussian.
 from math import exp, floor, hypot, log, nan, pi, sqrt
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray
+from velfield.compiled import kernel
 from velfield.field.modes import MAX_MODES, bandwidth_bins, pixel_modes
 
 PRIOR_PSEUDOCOUNT = 1.0
@@ -39,7 +39,7 @@ BROAD_WEIGHT = 0.02
 """Mixture weight of a broad Gaussian on the map's level, so that no velocity has zero density."""
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _kernel_density(h: FloatArray, v_y: float, v_x: float) -> float:
     """Kernel density per square bin at (v_y, v_x) of weights ``h``, which need not sum to one."""
     reach = 3.5 * BIN_SIGMA_BINS
@@ -52,7 +52,7 @@ def _kernel_density(h: FloatArray, v_y: float, v_x: float) -> float:
     return float(total / (2.0 * pi * BIN_SIGMA_BINS**2))
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _mode_gaussians(h: FloatArray, n: float, blur: float, out: FloatArray) -> int:
     """Fill ``out`` (k, 6) with a Gaussian a mode: weight, mean x and y, covariance xx, xy, yy, in bins; returns k.
 
@@ -111,7 +111,7 @@ def _mode_gaussians(h: FloatArray, n: float, blur: float, out: FloatArray) -> in
     return kept
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _level_density(h: FloatArray, gaussians: FloatArray, v_y: float, v_x: float) -> float:
     """Density per square bin of a level: the mixture of its modes and the kernel density of its bins."""
     density = 0.0
@@ -124,7 +124,7 @@ def _level_density(h: FloatArray, gaussians: FloatArray, v_y: float, v_x: float)
     return float((1.0 - BINS_WEIGHT) * density + BINS_WEIGHT * _kernel_density(h, v_y, v_x))
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _neighbourhood(
     histogram: NDArray[np.int32], count: NDArray[np.int32], x: int, y: int, radius: int, nearby: FloatArray
 ) -> float:
@@ -150,21 +150,21 @@ def _neighbourhood(
     return float(tracks / window)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _gaussian_at_rest(v_y: float, v_x: float, reach: float, sigma: float) -> float:
     """Density per square bin of an isotropic Gaussian at zero velocity, i.e. at the bin ``reach`` of either axis."""
     square = (v_x - reach) ** 2 + (v_y - reach) ** 2
     return exp(-0.5 * square / (sigma * sigma)) / (2.0 * pi * sigma * sigma)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _mix_levels(n: float, level: float, coarser: float, at_rest: float, stationary_count: float) -> float:
     """A level's density shrunk towards the coarser level's and that of zero velocity, by tracks and pseudocounts."""
     total = n + PRIOR_PSEUDOCOUNT + stationary_count
     return (n * level + PRIOR_PSEUDOCOUNT * coarser + stationary_count * at_rest) / total
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _map_density(map_weights: FloatArray, known: bool, v_y: float, v_x: float) -> float:
     """Density per square bin of the coarsest level; ``known``: whether the map has any tracks."""
     reach = (map_weights.shape[0] - 1) / 2
@@ -173,7 +173,7 @@ def _map_density(map_weights: FloatArray, known: bool, v_y: float, v_x: float) -
     return float((1.0 - weight) * _kernel_density(map_weights, v_y, v_x) + weight * broad)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def densities_at_pixel(
     histogram: NDArray[np.int32],
     count: NDArray[np.int32],
@@ -216,7 +216,7 @@ def densities_at_pixel(
     return out
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def log_density_in_window(
     histogram: NDArray[np.int32],
     count: NDArray[np.int32],

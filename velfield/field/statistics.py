@@ -23,10 +23,10 @@ from dataclasses import dataclass
 from math import atan2, cos, erf, hypot, log, pi, sqrt
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray
+from velfield.compiled import kernel
 from velfield.field.accumulate import VARIANCE_UNIT
 from velfield.field.modes import (
     CELLS_PER_BIN,
@@ -61,7 +61,7 @@ MEDIAN_SE_RATIO = 1.2533
 _Z = 1.6449
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _student_t95(dof: float) -> float:
     """95 % quantile of Student's t (Cornish-Fisher expansion): accurate to 0.3 % from 3 degrees of freedom on.
 
@@ -81,7 +81,7 @@ def _student_t95(dof: float) -> float:
     )
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _half_width(variance: float, typical: float, pseudocount: float, tracks: float, correlation: float) -> float:
     """Half the 90 % interval of a mean of ``tracks`` whose sample has ``variance`` (about its mean, divisor n)."""
     design_effect = 1.0 + correlation * (min(tracks, PLATOON_SIZE) - 1.0)
@@ -90,7 +90,7 @@ def _half_width(variance: float, typical: float, pseudocount: float, tracks: flo
     return float(_student_t95(dof) * sqrt(pooled * design_effect / tracks))
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _median_speed(
     h: NDArray[np.int32], tracks: float, measurement_variance: float, blur: float, cells: FloatArray
 ) -> tuple[float, float]:
@@ -115,7 +115,7 @@ def _median_speed(
     return max(median - max(half_width, below), 0.0), median + max(half_width, above)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _modal_direction(
     h: NDArray[np.int32], mode_x: float, mode_y: float, tracks: float, measurement_variance: float, blur: float
 ) -> float:
@@ -146,7 +146,7 @@ def _modal_direction(
     return min(hypot(half_width, _Z * MIN_MODE_SD_BINS) / speed, float(np.pi))
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def tile_intervals(
     histogram: NDArray[np.int32],
     count: NDArray[np.int32],
@@ -237,7 +237,7 @@ class TileStatistics:
     median_speed_high_px_per_s: FloatArray
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _moments(
     h: NDArray[np.int32], reach: int, stationary: float, mode_y: float, mode_x: float, out: FloatArray
 ) -> None:
@@ -274,7 +274,7 @@ def _moments(
         out[6] = _circular_dispersion(h, reach, stationary, atan2(sine, cosine), moving, length)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _circular_dispersion(
     h: NDArray[np.int32], reach: int, stationary: float, direction: float, moving: float, length: float
 ) -> float:
@@ -293,7 +293,7 @@ def _circular_dispersion(
     return max(1.0 - cosine / moving, 0.0) / (2.0 * length * length)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _tile(
     histogram: NDArray[np.int32],
     count: NDArray[np.int32],

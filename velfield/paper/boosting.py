@@ -9,11 +9,11 @@ dependency, and its AdaBoost sorts unbinned values for every stump.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from schemas.arrays import ByteArray, Float32Array, FloatArray, IntArray, Mask
 from schemas.detector import Round
+from velfield.compiled import kernel
 from velfield.parallel import count_steps
 
 Int32s = NDArray[np.int32]
@@ -170,8 +170,8 @@ def quantile_bin_edges(values: Float32Array) -> Float32Array:
     return np.asarray(np.quantile(values, np.linspace(0, 1, N_BINS + 1)[1:-1], axis=1).T, np.float32)
 
 
-@njit(cache=True, nogil=True)
-def assign_bins(values, edges):  # type: ignore[no-untyped-def]
+@kernel
+def assign_bins(values: Float32Array, edges: Float32Array) -> ByteArray:
     """(features, samples) uint8 bins of values (features, samples)."""
     bins = np.empty(values.shape, np.uint8)
     for f in range(values.shape[0]):
@@ -187,8 +187,10 @@ def assign_bins(values, edges):  # type: ignore[no-untyped-def]
     return bins
 
 
-@njit(cache=True, nogil=True)
-def _best_stump(bins, weights, cars, others, searched):  # type: ignore[no-untyped-def]
+@kernel
+def _best_stump(
+    bins: ByteArray, weights: FloatArray, cars: IntArray, others: IntArray, searched: IntArray
+) -> tuple[int, int]:
     """The feature, of those searched, and the bin edge with the lowest exponential loss."""
     best_loss, best_feature, best_edge = np.inf, searched[0], 0
     car, other = np.zeros(256), np.zeros(256)

@@ -7,10 +7,10 @@ four phases, one for each parity of row and column, so that the corners of a row
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from schemas.arrays import Float32Array, GreyImage, Mask
+from velfield.compiled import kernel
 from velfield.detection.stumps import BoostedStumps
 
 MARGIN_PX = 64
@@ -99,13 +99,13 @@ def _corner_indices(phases: NDArray[np.signedinteger], rectangles: NDArray[np.in
     return np.stack(flat, axis=1).astype(np.uint64)
 
 
-@njit(cache=True, nogil=True)
-def _corners_of(corners, r, down):  # type: ignore[no-untyped-def]
+@kernel
+def _corners_of(corners: NDArray[np.uint64], r: np.uint64, down: np.uint64) -> tuple[int, int, int, int]:
     return corners[r, 0] + down, corners[r, 1] + down, corners[r, 2] + down, corners[r, 3] + down
 
 
-@njit(cache=True, nogil=True)
-def _add_rounds(flat, stride, corners, starts, rounds, thresholds, steps, out):  # type: ignore[no-untyped-def]
+@kernel
+def _add_rounds(flat, stride, corners, starts, rounds, thresholds, steps, out) -> None:  # type: ignore[no-untyped-def]
     """Indices are unsigned, which spares numba its check for negative ones: only then are the loops over x vector
     ones."""
     height, width = out.shape

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from schemas.arrays import GreyImage, IntArray, Mask
+from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
 from schemas.detector import PaperConfig, PaperRecord
+from velfield.compiled import kernel
 from velfield.detection.samples import LabelledImage
 from velfield.detection.stumps import BoostedStumps
 from velfield.paper.boosting import (
@@ -84,8 +84,8 @@ def _sample_pixels(
     return np.concatenate([cars, others])[:, ::-1], np.arange(len(cars) + len(others)) < len(cars)
 
 
-@njit(cache=True, nogil=True)
-def _distance_to_nearest(height, width, cars):  # type: ignore[no-untyped-def]
+@kernel
+def _distance_to_nearest(height: int, width: int, cars: FloatArray) -> FloatArray:
     out = np.full((height, width), np.inf)
     for k in range(len(cars)):
         for y in range(max(0, int(cars[k, 1]) - 32), min(height, int(cars[k, 1]) + 33)):

@@ -13,11 +13,12 @@ from typing import Any
 import cv2
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
+from schemas.arrays import ByteArray, Float32Array, FloatArray, GreyImage, IntArray, Mask
+from velfield.compiled import kernel
 from velfield.registration.joint import ControlPoints
 from velfield.registration.transforms import FrameTransform
 from velfield.vectors import LONG, REAL, WORD, Vectors
@@ -161,8 +162,8 @@ def _mask_away_from(xy: FloatArray, shape: tuple[int, ...]) -> NDArray[np.uint8]
     return np.asarray(cv2.distanceTransform(free, cv2.DIST_C, 3) > HALF_PATCH, np.uint8)
 
 
-@njit(cache=True, nogil=True)
-def _find_cell_maxima(strength, cell):  # type: ignore[no-untyped-def]
+@kernel
+def _find_cell_maxima(strength: Float32Array, cell: int) -> tuple[IntArray, Float32Array]:
     """Position (n, 2) and value (n,) of each cell's first maximum, in rows of cells."""
     height, width = strength.shape
     columns = -(-width // cell)
@@ -240,8 +241,8 @@ def align_patches(
     return ControlPoints(raw, templates.xy[good], sigma), int(in_frame.sum())
 
 
-@njit(cache=True, nogil=True)
-def _reflect(at, size):  # type: ignore[no-untyped-def]
+@kernel
+def _reflect(at: int, size: int) -> int:
     """Index within an axis of this size of a position beyond its ends, as OpenCV's default border: 2 1 0 1 2."""
     at = abs(at)
     at = 2 * (size - 1) - at if at >= size else at
@@ -375,8 +376,8 @@ def _add_gradients(_context, padded, row, mean, factor, templates, inner, first,
     return types.void(padded, row, mean, factor, templates, inner, first, count, sums), generate
 
 
-@njit(cache=True, nogil=True)
-def _fill_window(image, taps, x0, y0, rows, columns, line, across, levels, window):  # type: ignore[no-untyped-def]
+@kernel
+def _fill_window(image, taps, x0, y0, rows, columns, line, across, levels, window) -> float:  # type: ignore[no-untyped-def]
     """Fill in ``window`` (rows * columns) from pixel (x0, y0) of a frame on: each pixel of the blurred frame with those
     right of, below, and right below it, 16 bits each, one number to load where an interpolation needs four.
 
@@ -410,11 +411,13 @@ def _fill_window(image, taps, x0, y0, rows, columns, line, across, levels, windo
                 levels[r * columns + c] = np.int32(grey * np.float32(_GREY_STEPS) + np.float32(0.5))
     for at in range(np.uint64(0), np.uint64(rows - 1) * stride, eight):
         _pack_four(levels, at, stride, window, at)
-    return levels[(rows // 2) * columns + columns // 2] / _GREY_STEPS
+    return float(levels[(rows // 2) * columns + columns // 2] / _GREY_STEPS)
 
 
-@njit(cache=True, nogil=True)
-def _sample_patch(window, columns, x0, y0, shape, patch, start, derivative, shift, spacing, sample, visible):  # type: ignore[no-untyped-def]
+@kernel
+def _sample_patch(  # type: ignore[no-untyped-def]
+    window, columns, x0, y0, shape, patch, start, derivative, shift, spacing, sample, visible
+) -> tuple[int, float, float]:
     """Sample the frame under a patch shifted by ``shift``; the number of pixels in the frame, their mean in both.
 
     ``window`` holds the frame of this shape from pixel (x0, y0) on, ``columns`` a row, as `_fill_window` makes it.
@@ -443,8 +446,10 @@ def _sample_patch(window, columns, x0, y0, shape, patch, start, derivative, shif
     return count, frame_mean / max(count, 1), patch_mean / max(count, 1)
 
 
-@njit(cache=True, nogil=True)
-def _gauss_newton_step(patch, sample, visible, frame_mean, patch_mean, spacing):  # type: ignore[no-untyped-def]
+@kernel
+def _gauss_newton_step(
+    patch: Float32Array, sample: Float32Array, visible: Mask, frame_mean: float, patch_mean: float, spacing: int
+) -> tuple[float, float, float]:
     """Gauss-Newton step (2) of a patch and its correlation over the visible pixels; correlation -1: no texture."""
     side = patch.shape[0]
     frame_square, patch_square, product = 0.0, 0.0, 0.0
@@ -477,8 +482,8 @@ def _gauss_newton_step(patch, sample, visible, frame_mean, patch_mean, spacing):
     return x, y, product / np.sqrt(frame_square * patch_square)
 
 
-@njit(cache=True, nogil=True)
-def _prepare_patch(patch, spacing, row, padded, templates, inner, sums):  # type: ignore[no-untyped-def]
+@kernel
+def _prepare_patch(patch, spacing, row, padded, templates, inner, sums) -> tuple[float, ...]:  # type: ignore[no-untyped-def]
     """Fill in a patch less its mean and its gradients, zero in the border and beyond; sums that every step needs.
 
     ``templates`` (4 * n) starts with ones in the patch, zeros beyond, in rows of ``row`` values, whole vectors. The
@@ -503,19 +508,23 @@ def _prepare_patch(patch, spacing, row, padded, templates, inner, sums):  # type
     return out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7]
 
 
-@njit(cache=True, nogil=True)
-def _is_inside(image, start, derivative, shift, reach):  # type: ignore[no-untyped-def]
+@kernel
+def _is_inside(
+    image: ByteArray | Float32Array, start: FloatArray, derivative: FloatArray, shift: FloatArray, reach: int
+) -> bool:
     """Whether a whole patch, shifted by ``shift``, lies in the frame."""
     height, width = image.shape
     x = start[0] + derivative[0, 0] * shift[0] + derivative[0, 1] * shift[1]
     y = start[1] + derivative[1, 0] * shift[0] + derivative[1, 1] * shift[1]
     dx = reach * (abs(derivative[0, 0]) + abs(derivative[0, 1]))
     dy = reach * (abs(derivative[1, 0]) + abs(derivative[1, 1]))
-    return x - dx >= 0.0 and y - dy >= 0.0 and x + dx < width - 1.0 and y + dy < height - 1.0
+    return bool(x - dx >= 0.0 and y - dy >= 0.0 and x + dx < width - 1.0 and y + dy < height - 1.0)
 
 
-@njit(cache=True, nogil=True)
-def _step_inside(window, columns, start, derivative, shift, spacing, side, templates, of_patch, near, sums):  # type: ignore[no-untyped-def]
+@kernel
+def _step_inside(  # type: ignore[no-untyped-def]
+    window, columns, start, derivative, shift, spacing, side, templates, of_patch, near, sums
+) -> tuple[float, ...]:
     """Gauss-Newton step of a patch that lies in the frame as a whole, its correlation, and the frame's mean under it.
 
     Equal to `_sample_patch` and `_gauss_newton_step` but for the rounding of float32. ``start`` is in px of the window
@@ -560,8 +569,8 @@ def _step_inside(window, columns, start, derivative, shift, spacing, side, templ
     )
 
 
-@njit(cache=True, nogil=True)
-def _reach_in_frame(derivative, reach, max_shift):  # type: ignore[no-untyped-def]
+@kernel
+def _reach_in_frame(derivative: FloatArray, reach: int, max_shift: float) -> tuple[float, float]:
     """Largest distance from its start at which a patch is sampled in a frame, px along x and y, plus one pixel."""
     x = reach * (abs(derivative[0, 0]) + abs(derivative[0, 1])) + max_shift * np.hypot(
         derivative[0, 0], derivative[0, 1]
@@ -572,8 +581,10 @@ def _reach_in_frame(derivative, reach, max_shift):  # type: ignore[no-untyped-de
     return x + 1.0, y + 1.0
 
 
-@njit(cache=True, nogil=True)
-def _align_patches_kernel(image, taps, patches, chosen, start, derivative, spacing, max_shift, iterations):  # type: ignore[no-untyped-def]
+@kernel
+def _align_patches_kernel(  # type: ignore[no-untyped-def]
+    image, taps, patches, chosen, start, derivative, spacing, max_shift, iterations
+) -> tuple[FloatArray, FloatArray]:
     """Shift (n, 2) in base px and correlation (n,) of each of the ``chosen`` (n,) patches.
 
     The frame is blurred about each patch alone, where ``taps`` are given, in a window that the processor's caches hold.

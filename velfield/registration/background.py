@@ -8,16 +8,16 @@ rows of pixels, in vectors, and costs a thirtieth of sorting pixel by pixel.
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 
 from schemas.arrays import ByteArray, GreyImage, IntArray
+from velfield.compiled import kernel
 
 NOT_COVERED = 255
 """Grey level in place of pixels that a frame does not cover: they come last when sorted."""
 _TILE_PX = 512
 
 
-def median_of_stack(stack: ByteArray, count: IntArray) -> GreyImage:
+def median_of_stack(stack: ByteArray, count: ByteArray) -> GreyImage:
     """The median of each pixel over the frames that cover it, (h, w) uint8, halves rounded up; 0 where none does.
 
     Parameters
@@ -49,8 +49,8 @@ def _comparisons(count: int) -> IntArray:
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 
-@njit(cache=True, nogil=True)
-def _medians(stack, count, pairs, median):  # type: ignore[no-untyped-def]
+@kernel
+def _medians(stack: ByteArray, count: ByteArray, pairs: IntArray, median: ByteArray) -> None:
     """Fill the median (h, w) from a stack (n, h, w), tile by tile, each small enough for the processor's cache."""
     frames, height, width = stack.shape
     values = np.empty((frames, _TILE_PX), np.uint8)

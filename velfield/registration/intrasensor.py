@@ -29,11 +29,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numba import njit
 
-from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
+from schemas.arrays import ByteArray, Float32Array, FloatArray, GreyImage, IntArray, Mask
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
+from velfield.compiled import kernel
 from velfield.errors import Failure
 from velfield.registration.alignment import (
     HALF_PATCH,
@@ -293,8 +293,8 @@ def _is_worse(result: FrameRegistration, first: FrameRegistration) -> bool:
     )
 
 
-@njit(cache=True, nogil=True)
-def shrink(grey):  # type: ignore[no-untyped-def]
+@kernel
+def shrink(grey: ByteArray) -> ByteArray:
     """The frame as optical flow sees it: the means of squares of 4 x 4 px, halves to the even grey level.
 
     A sixteenth of OpenCV's time, which sums squares of this size value by value. What fills no square is left out.

@@ -178,7 +178,7 @@ class _Problem:
         return _State(theta, corrected, residuals)
 
     def equations(self, state: "_State", weight: FloatArray, fold: IntArray, folds: int) -> _Equations:
-        return kernels.normal_equations(  # type: ignore[no-any-return]
+        return kernels.normal_equations(
             self.undistorted,
             state.corrected,
             self.first,
@@ -198,7 +198,7 @@ class _Problem:
     ) -> FloatArray:
         """Gauss-Newton step (1, p) of the penalised squares, or those (folds, p) that leave out a fold each; zero for
         fixed parameters."""
-        return kernels.solve_steps(  # type: ignore[no-any-return]
+        return kernels.solve_steps(
             *equations,
             _stiffness_bands(self.knots, *stiffness),
             self.gauge,

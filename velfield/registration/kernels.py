@@ -13,12 +13,13 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from schemas.arrays import FloatArray
+from schemas.arrays import FloatArray, IntArray
 from velfield.camera.lens import RadialModel, undistort
+from velfield.compiled import compiled, kernel
 from velfield.vectors import LONG, Vectors
 
 LANES = 8
@@ -53,8 +54,8 @@ class MapArrays(NamedTuple):
     cell: int
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def divide_by_third(linear, constant):  # type: ignore[no-untyped-def]
+@compiled(error_model="numpy")
+def divide_by_third(linear: FloatArray, constant: FloatArray) -> FloatArray:
     """Points (n, 2) of homogeneous ones, the sum of ``linear`` (n, 3) and a constant (3,); NaN where the third
     coordinate has not the constant's sign."""
     out, sign = np.empty((len(linear), 2)), np.sign(constant[2])
@@ -65,8 +66,8 @@ def divide_by_third(linear, constant):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def rational(points, coefficients, source, target):  # type: ignore[no-untyped-def]
+@compiled(error_model="numpy")
+def rational(points: FloatArray, coefficients: FloatArray, source: FloatArray, target: FloatArray) -> FloatArray:
     """Second-order rational function of points (n, 2); NaN where the denominator is not positive.
 
     ``coefficients`` (3, 6) over the monomials 1, x, y, x^2, xy, y^2 of normalised coordinates (x - cx) * s, with
@@ -85,8 +86,10 @@ def rational(points, coefficients, source, target):  # type: ignore[no-untyped-d
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def rational_jacobian(points, coefficients, source, target):  # type: ignore[no-untyped-def]
+@compiled(error_model="numpy")
+def rational_jacobian(
+    points: FloatArray, coefficients: FloatArray, source: FloatArray, target: FloatArray
+) -> FloatArray:
     """Jacobian (n, 2, 2) of `rational`: [i, a, b] is d out_a / d in_b."""
     out = np.empty((points.shape[0], 2, 2))
     (a0, a1, a2, a3, a4, a5), (b0, b1, b2, b3, b4, b5), (c0, c1, c2, c3, c4, c5) = coefficients
@@ -105,8 +108,8 @@ def rational_jacobian(points, coefficients, source, target):  # type: ignore[no-
     return out
 
 
-@njit(cache=True, nogil=True)
-def rational_inverse(points, guess, coefficients, source, target, tolerance):  # type: ignore[no-untyped-def]
+@kernel
+def rational_inverse(points, guess, coefficients, source, target, tolerance) -> FloatArray:  # type: ignore[no-untyped-def]
     """Inverse of `rational` at points (n, 2) by Newton's method from ``guess`` (n, 2), each point until its residual is
     below ``tolerance``; NaN where that fails. Arguments as in `rational`."""
     out = np.full((points.shape[0], 2), np.nan)
@@ -139,8 +142,8 @@ def rational_inverse(points, guess, coefficients, source, target, tolerance):  #
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def invert_plane(points, guess, coefficients, source, target, mesh, cell):  # type: ignore[no-untyped-def]
+@compiled(error_model="numpy")
+def invert_plane(points, guess, coefficients, source, target, mesh, cell) -> FloatArray:  # type: ignore[no-untyped-def]
     """Inverse of `rational` plus `mesh_displacement` at points (n, 2) from ``guess`` (n, 2); NaN where that fails.
 
     By Newton's method with the Jacobian of `rational` alone, all points until the last is accurate: a mesh bends by far
@@ -158,15 +161,15 @@ def invert_plane(points, guess, coefficients, source, target, mesh, cell):  # ty
         if largest < _TOLERANCE_PX or step == _INVERSE_STEPS:
             break
         guess = guess + _solve_all(rational_jacobian(guess, coefficients, source, target), residual)
-    out = guess.copy()
+    out: FloatArray = guess.copy()
     for i in range(len(points)):
         if not (abs(residual[i, 0]) < _MAX_ERROR_PX and abs(residual[i, 1]) < _MAX_ERROR_PX):
             out[i] = np.nan
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _solve_all(jacobian, residual):  # type: ignore[no-untyped-def]
+@compiled(error_model="numpy")
+def _solve_all(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
     """Solve 2 x 2 systems (n, 2, 2) for residuals (n, 2) by Cramer's rule; not finite where one is singular."""
     out = np.empty((len(residual), 2))
     for i in range(len(residual)):
@@ -176,8 +179,8 @@ def _solve_all(jacobian, residual):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True)
-def spline_basis(rows, height, knots):  # type: ignore[no-untyped-def]
+@kernel
+def spline_basis(rows: FloatArray, height: int, knots: int) -> tuple[IntArray, FloatArray]:
     """Uniform cubic B-spline basis at rows (n,): index of the first of four coefficients (n,), their weights (n, 4).
 
     Rows outside the frame are clamped to its border.
@@ -199,8 +202,10 @@ def spline_basis(rows, height, knots):  # type: ignore[no-untyped-def]
     return first, weights
 
 
-@njit(cache=True, nogil=True)
-def remove_row_motion(undistorted, rows, coefficients, height, centre):  # type: ignore[no-untyped-def]
+@kernel
+def remove_row_motion(
+    undistorted: FloatArray, rows: FloatArray, coefficients: FloatArray, height: int, centre: FloatArray
+) -> FloatArray:
     """Undistorted points (n, 2) corrected for rolling shutter; ``coefficients`` (3, knots): x, y px, roll rad."""
     out = undistorted.copy()
     if coefficients.shape[1] < 4:
@@ -216,8 +221,8 @@ def remove_row_motion(undistorted, rows, coefficients, height, centre):  # type:
     return out
 
 
-@njit(cache=True, nogil=True)
-def mesh_displacement(points, mesh, cell):  # type: ignore[no-untyped-def]
+@kernel
+def mesh_displacement(points: FloatArray, mesh: FloatArray, cell: int) -> FloatArray:
     """Displacement (n, 2) at raw points by bilinear interpolation of a mesh (my, mx, 2) with nodes at cell centres."""
     out = np.zeros((points.shape[0], 2))
     my, mx = mesh.shape[0], mesh.shape[1]
@@ -237,8 +242,8 @@ def mesh_displacement(points, mesh, cell):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def to_base(raw, frame):  # type: ignore[no-untyped-def]
+@compiled(error_model="numpy")
+def to_base(raw: FloatArray, frame: MapArrays) -> FloatArray:
     """Base px (n, 2) of raw points (n, 2) by `MapArrays`: `undistort`, `remove_row_motion`, `rational` and
     `mesh_displacement` in one, to the bit.
 
@@ -306,8 +311,8 @@ def to_base(raw, frame):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True)
-def _difference_jacobian(raw, mapped, frame):  # type: ignore[no-untyped-def]
+@kernel
+def _difference_jacobian(raw: FloatArray, mapped: FloatArray, frame: MapArrays) -> FloatArray:
     """Jacobian (n, 2, 2) of `to_base` at raw points (n, 2), by differences from what they are mapped to."""
     out, ahead = np.empty((len(raw), 2, 2)), raw.copy()
     for axis in range(2):
@@ -320,14 +325,14 @@ def _difference_jacobian(raw, mapped, frame):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True)
-def _take_finite(points):  # type: ignore[no-untyped-def]
+@kernel
+def _take_finite(points: FloatArray) -> IntArray:
     """Numbers of the points (n, 2) that are finite."""
     return np.flatnonzero(np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]))
 
 
-@njit(cache=True, nogil=True)
-def to_raw(points, guess, frame, margin):  # type: ignore[no-untyped-def]
+@kernel
+def to_raw(points: FloatArray, guess: FloatArray, frame: MapArrays, margin: float) -> FloatArray:
     """Inverse of `to_base` at points (n, 2) by Newton's method from ``guess`` (n, 2), each point until it is accurate.
 
     NaN rows where that fails, or the inverse lies outside the frame by more than ``margin``.
@@ -361,8 +366,10 @@ def to_raw(points, guess, frame, margin):  # type: ignore[no-untyped-def]
     return raw
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def to_raw_in_two_steps(points, guess, frame, margin):  # type: ignore[no-untyped-def]
+@compiled(error_model="numpy")
+def to_raw_in_two_steps(
+    points: FloatArray, guess: FloatArray, frame: MapArrays, margin: float
+) -> tuple[FloatArray, FloatArray]:
     """Inverse of `to_base` at points (n, 2) by two steps from ``guess`` (n, 2), and the inverse Jacobian (n, 2, 2).
 
     NaN where the guess lies outside the frame by ``margin`` or more.
@@ -387,8 +394,8 @@ def to_raw_in_two_steps(points, guess, frame, margin):  # type: ignore[no-untype
     return raw, inverse
 
 
-@njit(cache=True, nogil=True)
-def evaluate(undistorted, first, basis, observed, theta, knots, norms, centre):  # type: ignore[no-untyped-def]
+@kernel
+def evaluate(undistorted, first, basis, observed, theta, knots, norms, centre) -> tuple[FloatArray, FloatArray]:  # type: ignore[no-untyped-def]
     """Points (n, 2) without row motion and their residuals (n, 2) by the parameters ``theta``, as `remove_row_motion`
     and `rational` in one; arguments as in `normal_equations`. NaN where the denominator is not positive."""
     corrected, residuals = np.empty((undistorted.shape[0], 2)), np.empty((undistorted.shape[0], 2))
@@ -454,8 +461,10 @@ def _subtract_products(_context, out, at, factors, place, inverse, row, start, c
     return types.void(out, at, factors, place, inverse, row, start, count), generate
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _differentiate(undistorted, corrected, observed, begin, count, coefficients, norms, centre, rows, motion, inside):  # type: ignore[no-untyped-def]
+@compiled(error_model="numpy")
+def _differentiate(  # type: ignore[no-untyped-def]
+    undistorted, corrected, observed, begin, count, coefficients, norms, centre, rows, motion, inside
+) -> None:
     """Derivatives of ``count`` mapped points from ``begin`` on by the 17 parameters of the rational function, ``rows``
     (2, 17 and more each), with the residual behind them, and by shift x, shift y and roll, ``motion`` (2, 3 each);
     and whether each is ``inside`` the map's domain."""
@@ -488,8 +497,8 @@ def _differentiate(undistorted, corrected, observed, begin, count, coefficients,
         motion[n, 1, 0], motion[n, 1, 1], motion[n, 1, 2] = jyx, jyy, jyy * far_x - jyx * far_y
 
 
-@njit(cache=True, nogil=True)
-def _multiply(basis, weight, begin, count, rows, motion, both, near, products):  # type: ignore[no-untyped-def]
+@kernel
+def _multiply(basis, weight, begin, count, rows, motion, both, near, products) -> None:  # type: ignore[no-untyped-def]
     """Prepare what `_add_points` adds of the points that `_differentiate` has: the derivatives by a (as those by b),
     by c in x and in y, ``both`` (24); the products of one knot's coefficients with the twelve, ``near`` (3, 32), and
     with the 17 and the residual, ``products`` (3, 24); all zero behind their values."""
@@ -510,8 +519,8 @@ def _multiply(basis, weight, begin, count, rows, motion, both, near, products): 
                 _add_products(products, (3 * n + c) * 24, factor, rows, (2 * n + axis) * 24, 3)
 
 
-@njit(cache=True, nogil=True)
-def _add_points(first, basis, weight, fold, begin, count, inside, both, near, products, bands, border, sums):  # type: ignore[no-untyped-def]
+@kernel
+def _add_points(first, basis, weight, fold, begin, count, inside, both, near, products, bands, border, sums) -> None:  # type: ignore[no-untyped-def]
     """Add points, prepared by `_multiply`, to the ``bands`` (folds, 3 knots, 16) and the ``border`` (folds, 3 knots,
     24) of the row coefficients, and to ``sums`` (folds, 12, 24): of a with a and c, and of c with c."""
     for n in range(count):
@@ -531,10 +540,10 @@ def _add_points(first, basis, weight, fold, begin, count, inside, both, near, pr
                 row += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def normal_equations(  # type: ignore[no-untyped-def]
     undistorted, corrected, first, basis, observed, weight, fold, folds, knots, coefficients, norms, centre
-):
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Gauss-Newton normal equations per fold: bands (folds, 3 knots, 16), border (folds, 3 knots, 24) and corner
     (folds, 18, 18).
 
@@ -563,8 +572,8 @@ def normal_equations(  # type: ignore[no-untyped-def]
     return bands, border, corner
 
 
-@njit(cache=True, nogil=True)
-def aligned_zeros(count, rows, columns):  # type: ignore[no-untyped-def]
+@kernel
+def aligned_zeros(count: int, rows: int, columns: int) -> FloatArray:
     """Zeros (count, rows, columns) from a multiple of 64 bytes on: vectors of eight do not cross lines of the cache,
     which takes the fit a quarter longer."""
     size = count * rows * columns
@@ -573,8 +582,8 @@ def aligned_zeros(count, rows, columns):  # type: ignore[no-untyped-def]
     return values[start : start + size].reshape((count, rows, columns))
 
 
-@njit(cache=True, nogil=True)
-def _fill_corner(sums, corner):  # type: ignore[no-untyped-def]
+@kernel
+def _fill_corner(sums: FloatArray, corner: FloatArray) -> None:
     """The symmetric matrix of a, b, c and the residual from their products as `normal_equations` has them."""
     for k in range(6):
         for j in range(6):
@@ -584,8 +593,8 @@ def _fill_corner(sums, corner):  # type: ignore[no-untyped-def]
             corner[12 + k, 12 + j] = sums[6 + k, j]
 
 
-@njit(cache=True, nogil=True)
-def are_finite(residuals, weights):  # type: ignore[no-untyped-def]
+@kernel
+def are_finite(residuals: FloatArray, weights: FloatArray) -> bool:
     """Whether the residuals (n, 2) of positive weight (n,) are finite."""
     for i in range(residuals.shape[0]):
         if weights[i] > 0.0 and not (math.isfinite(residuals[i, 0]) and math.isfinite(residuals[i, 1])):
@@ -593,8 +602,8 @@ def are_finite(residuals, weights):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def median_size(residuals, sigma):  # type: ignore[no-untyped-def]
+@compiled(error_model="numpy")
+def median_size(residuals: FloatArray, sigma: FloatArray) -> float:
     """Median length of the residuals (n, 2) over sigma (n,), of those that are finite; NaN without any."""
     sizes, count = np.empty(residuals.shape[0]), 0
     for i in range(residuals.shape[0]):
@@ -605,8 +614,8 @@ def median_size(residuals, sigma):  # type: ignore[no-untyped-def]
     return np.median(sizes[:count]) if count else np.nan
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def geman_mcclure(residuals, sigma, unit):  # type: ignore[no-untyped-def]
+@compiled(error_model="numpy")
+def geman_mcclure(residuals: FloatArray, sigma: FloatArray, unit: float) -> FloatArray:
     """Geman-McClure weights (n,) of the length of residuals (n, 2) over sigma (n,), in this unit; 0 if not finite."""
     weights = np.empty(residuals.shape[0])
     for i in range(residuals.shape[0]):
@@ -616,8 +625,8 @@ def geman_mcclure(residuals, sigma, unit):  # type: ignore[no-untyped-def]
     return weights
 
 
-@njit(cache=True, nogil=True)
-def predict_change(undistorted, corrected, first, basis, step, fold, knots, coefficients, norms, centre):  # type: ignore[no-untyped-def]
+@kernel
+def predict_change(undistorted, corrected, first, basis, step, fold, knots, coefficients, norms, centre) -> FloatArray:  # type: ignore[no-untyped-def]
     """First-order change (n, 2) of the mapped points under ``step`` (folds, p), each point by the step of its fold."""
     out = np.zeros((undistorted.shape[0], 2))
     ts = norms[6]
@@ -659,8 +668,8 @@ def predict_change(undistorted, corrected, first, basis, step, fold, knots, coef
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def eliminate_bands(bands, border, corner):  # type: ignore[no-untyped-def]
+@compiled(error_model="numpy")
+def eliminate_bands(bands: FloatArray, border: FloatArray, corner: FloatArray) -> None:
     """Eliminate the unknowns of eight symmetric systems at once, value by value: in place, without a root.
 
     Parameters
@@ -685,8 +694,8 @@ def eliminate_bands(bands, border, corner):  # type: ignore[no-untyped-def]
             _subtract_products(corner, k * columns + k, border, beside + k, inverse, border, beside + k, columns - k)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def substitute_back(bands, border, known):  # type: ignore[no-untyped-def]
+@compiled(error_model="numpy")
+def substitute_back(bands: FloatArray, border: FloatArray, known: FloatArray) -> FloatArray:
     """Solutions (n, m - k, 8) after `eliminate_bands`, whose arrays it takes, by the further unknowns (k, m - k, 8)."""
     size, width, columns, inner = bands.shape[0], bands.shape[1], border.shape[1], known.shape[0]
     sides, one = columns - inner, np.ones(LANES)
@@ -703,8 +712,8 @@ def substitute_back(bands, border, known):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True)
-def add_folds(parts, leave_out, systems, begin):  # type: ignore[no-untyped-def]
+@kernel
+def add_folds(parts: FloatArray, leave_out: bool, systems: FloatArray, begin: int) -> None:
     """Add to eight systems (n, m, 8), from column ``begin`` on, the sums over all folds of ``parts`` (folds, n, k or
     more); where each is left out, to the first of them without a fold each. It adds k = m - ``begin`` columns at most.
     """
@@ -720,14 +729,16 @@ def add_folds(parts, leave_out, systems, begin):  # type: ignore[no-untyped-def]
                 systems[i, begin + d, f] -= parts[f, i, d]
 
 
-@njit(cache=True, nogil=True)
-def _interleave(theta):  # type: ignore[no-untyped-def]
+@kernel
+def _interleave(theta: FloatArray) -> FloatArray:
     """Row coefficients (3 knots,), those of each knot next to each other, of parameters (17 + 3 knots,)."""
     return theta[17:].reshape((3, (len(theta) - 17) // 3)).T.copy().ravel()
 
 
-@njit(cache=True, nogil=True)
-def _make_priors(stiffness, gauge, gauge_weight, prior, theta):  # type: ignore[no-untyped-def]
+@kernel
+def _make_priors(
+    stiffness: FloatArray, gauge: FloatArray, gauge_weight: float, prior: FloatArray, theta: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Priors to which `solve_steps` adds the folds: bands and border of the row coefficients, matrix of the others."""
     size, directions, rows = stiffness.shape[0], gauge.shape[1], _interleave(theta)
     bands, border = aligned_zeros(size, 12, LANES), aligned_zeros(size, directions + 18, LANES)
@@ -749,8 +760,8 @@ def _make_priors(stiffness, gauge, gauge_weight, prior, theta):  # type: ignore[
     return bands, border, corner
 
 
-@njit(cache=True, nogil=True)
-def solve_steps(bands, border, corner, stiffness, gauge, gauge_weight, prior, free, theta, leave_out):  # type: ignore[no-untyped-def]
+@kernel
+def solve_steps(bands, border, corner, stiffness, gauge, gauge_weight, prior, free, theta, leave_out) -> FloatArray:  # type: ignore[no-untyped-def]
     """Gauss-Newton step (1, p) of the penalised squares, or the step (folds, p) without each fold; NaN where their
     matrix is not positive definite.
 
@@ -791,8 +802,8 @@ def solve_steps(bands, border, corner, stiffness, gauge, gauge_weight, prior, fr
     return steps
 
 
-@njit(cache=True, nogil=True)
-def _solve_dense(systems):  # type: ignore[no-untyped-def]
+@kernel
+def _solve_dense(systems: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Solutions (n, 1, 8) of eight symmetric systems (n and one more, n + 1, 8), of which the upper triangle is read,
     and the bands that they are eliminated by."""
     count = systems.shape[0] - 1
@@ -804,8 +815,8 @@ def _solve_dense(systems):  # type: ignore[no-untyped-def]
     return bands, substitute_back(bands, right, nothing)
 
 
-@njit(cache=True, nogil=True)
-def predict_squares(bands, border, corner, steps):  # type: ignore[no-untyped-def]
+@kernel
+def predict_squares(bands: FloatArray, border: FloatArray, corner: FloatArray, steps: FloatArray) -> float:
     """Sum of squares of all folds, to first order, each after its step (folds, p)."""
     size, total, inner = bands.shape[1], 0.0, np.empty(18)
     for f in range(len(steps)):

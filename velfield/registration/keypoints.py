@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 
 from schemas.arrays import ByteArray, FloatArray, GreyImage, IntArray, Mask
 from schemas.flight import RegistrationConfig
+from velfield.compiled import kernel
 from velfield.errors import Failure
 from velfield.registration.transforms import HomographyTransform
 
@@ -206,8 +206,10 @@ def match_guided(predicted: FloatArray, descriptors: ByteArray, reference: Keypo
     return np.stack([rows, best[rows]], axis=1)
 
 
-@njit(cache=True, nogil=True)
-def _nearest_in_window(predicted, moving, xy, reference, order, starts, shape, origin, cell, ratio, limit):  # type: ignore[no-untyped-def]
+@kernel
+def _nearest_in_window(  # type: ignore[no-untyped-def]
+    predicted, moving, xy, reference, order, starts, shape, origin, cell, ratio, limit
+) -> tuple[IntArray, IntArray]:
     """Nearest reference index for each prediction (-1: none), and nearest prediction for each reference keypoint."""
     best = np.full(predicted.shape[0], -1, np.int64)
     back = np.full(xy.shape[0], -1, np.int64)

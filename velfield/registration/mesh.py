@@ -23,11 +23,11 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from schemas.arrays import Float32Array, FloatArray, IntArray
+from velfield.compiled import kernel
 from velfield.registration import kernels
 from velfield.registration.joint import FOLDS, ControlPoints, JointFit, assign_folds, robust_weights
 from velfield.registration.kernels import LANES
@@ -164,8 +164,8 @@ def fit_mesh(
     return MeshFit(np.ascontiguousarray(mesh.reshape(mx, my, 2).swapaxes(0, 1)), left, best_cv, best)
 
 
-@njit(cache=True, nogil=True)
-def solve_without_folds(normal, right, smoothness, stiffness):  # type: ignore[no-untyped-def]
+@kernel
+def solve_without_folds(normal: FloatArray, right: FloatArray, smoothness: FloatArray, stiffness: float) -> FloatArray:
     """Meshes (folds + 1, count, 2) of the fits without each fold, and of that to all: eight systems at once.
 
     ``normal`` and ``right`` from `accumulate_bands`, of at most seven folds, ``smoothness`` from `smoothness_bands`.
@@ -186,8 +186,8 @@ def solve_without_folds(normal, right, smoothness, stiffness):  # type: ignore[n
     return meshes
 
 
-@njit(cache=True, nogil=True)
-def weighted_squares(weights, vectors):  # type: ignore[no-untyped-def]
+@kernel
+def weighted_squares(weights: FloatArray, vectors: FloatArray) -> float:
     """Sum of the squared lengths of vectors (n, 2) by weights (n,)."""
     total = 0.0
     for i in range(len(weights)):
@@ -195,8 +195,8 @@ def weighted_squares(weights, vectors):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, nogil=True)
-def bilinear_weights(xy_raw, my, mx, cell):  # type: ignore[no-untyped-def]
+@kernel
+def bilinear_weights(xy_raw: FloatArray, my: int, mx: int, cell: int) -> tuple[IntArray, FloatArray]:
     """Nodes (n, 4) about raw points and their bilinear weights (n, 4), as those of `kernels.mesh_displacement`."""
     nodes = np.empty((len(xy_raw), 4), np.int64)
     shares = np.empty((len(xy_raw), 4))
@@ -212,8 +212,8 @@ def bilinear_weights(xy_raw, my, mx, cell):  # type: ignore[no-untyped-def]
     return nodes, shares
 
 
-@njit(cache=True, nogil=True)
-def accumulate_bands(nodes, shares, weights, residuals, fold, folds, count, bands):  # type: ignore[no-untyped-def]
+@kernel
+def accumulate_bands(nodes, shares, weights, residuals, fold, folds, count, bands) -> tuple[FloatArray, FloatArray]:  # type: ignore[no-untyped-def]
     """Normal equations of each fold: bands (folds, count, bands) as those of `kernels.eliminate_bands`, and right-hand
     sides (folds, count, 2)."""
     normal, right = np.zeros((folds, count, bands)), np.zeros((folds, count, 2))
@@ -230,8 +230,8 @@ def accumulate_bands(nodes, shares, weights, residuals, fold, folds, count, band
     return normal, right
 
 
-@njit(cache=True, nogil=True)
-def interpolate_mesh(nodes, shares, meshes, which):  # type: ignore[no-untyped-def]
+@kernel
+def interpolate_mesh(nodes: IntArray, shares: FloatArray, meshes: FloatArray, which: IntArray) -> FloatArray:
     """Displacements (n, 2) at points, each from the mesh ``which`` (n,) of meshes (k, count, 2)."""
     out = np.zeros((len(nodes), 2))
     for i in range(len(nodes)):

@@ -8,9 +8,9 @@ from enum import IntFlag
 
 import cv2
 import numpy as np
-from numba import njit
 
-from schemas.arrays import Float32Array, FloatArray, GreyImage, Mask
+from schemas.arrays import ByteArray, Float32Array, FloatArray, GreyImage, Mask
+from velfield.compiled import kernel
 
 
 class FrameFlag(IntFlag):
@@ -94,8 +94,8 @@ def frame_quality(grey: GreyImage) -> FrameQuality:
     return FrameQuality(sharpness, float(mean[0, 0]), float(deviation[0, 0]), small - small.mean())
 
 
-@njit(cache=True, nogil=True)
-def _laplacian_sd(bordered):  # type: ignore[no-untyped-def]
+@kernel
+def _laplacian_sd(bordered: ByteArray) -> float:
     """Standard deviation of the Laplacian inside a border of one pixel: `cv2.Laplacian`'s, which is not kept."""
     height, width = bordered.shape[0] - 2, bordered.shape[1] - 2
     total, squares = np.int64(0), np.int64(0)
@@ -111,7 +111,7 @@ def _laplacian_sd(bordered):  # type: ignore[no-untyped-def]
         total += row
         squares += row_squares
     mean = total / (height * width)
-    return np.sqrt(max(squares / (height * width) - mean * mean, 0.0))
+    return float(np.sqrt(max(squares / (height * width) - mean * mean, 0.0)))
 
 
 def is_black(grey: GreyImage) -> bool:

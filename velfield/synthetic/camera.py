@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 
 from schemas.arrays import FloatArray
 from schemas.simulation import CameraSimulation, SimulationConfig
+from velfield.compiled import kernel
 from velfield.errors import InputError
 from velfield.synthetic.city.relief import Relief, ground_height, ground_height_at
 
@@ -294,8 +294,10 @@ def _radial(xy: FloatArray, centre: tuple[float, float], a: float, unit: float) 
     return np.asarray(offset * scale[:, None] + centre)
 
 
-@njit(cache=True, nogil=True)
-def _intersect_ground(undistorted, table, pinhole, relief, relief_frame):  # type: ignore[no-untyped-def]
+@kernel
+def _intersect_ground(
+    undistorted: FloatArray, table: FloatArray, pinhole: FloatArray, relief: FloatArray, relief_frame: FloatArray
+) -> FloatArray:
     out = np.empty((len(undistorted), 2))
     for i in range(len(undistorted)):
         r = table[i]

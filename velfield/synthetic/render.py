@@ -8,10 +8,10 @@ over it by supersampling, each at its position when its row was exposed.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from schemas.arrays import FloatArray, GreyImage, IntArray
+from schemas.arrays import ByteArray, FloatArray, GreyImage, IntArray, Mask
+from velfield.compiled import compiled, kernel
 from velfield.synthetic.city.relief import ground_height_at
 from velfield.synthetic.traffic.vehicles import LAYERS
 
@@ -57,10 +57,10 @@ class VehicleSprites:
     box: IntArray
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@compiled(fastmath=True)
 def render_ground(  # type: ignore[no-untyped-def]
     und_x, und_y, table, pinhole, relief, relief_frame, mosaic, height, reach, origin, step, out, occluder
-):
+) -> None:
     """Fill ``out`` (h, w) float32 with the scene without vehicles, ``occluder`` with 1 where vehicles are hidden."""
     f, cx, cy = pinhole[0], pinhole[1], pinhole[2]
     mh, mw = mosaic.shape
@@ -105,8 +105,10 @@ def render_ground(  # type: ignore[no-untyped-def]
             out[i, j] = shade * (top * (1 - fy) + low * fy)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _first_hit(x, y, sx, sy, highest, height, origin, step):  # type: ignore[no-untyped-def]
+@compiled(fastmath=True)
+def _first_hit(
+    x: float, y: float, sx: float, sy: float, highest: float, height: ByteArray, origin: FloatArray, step: float
+) -> tuple[float, float, float, bool]:
     """First intersection of a ray, which meets the ground at (x, y), with the height map: position, height, whether on
     a wall.
 
@@ -130,8 +132,8 @@ def _first_hit(x, y, sx, sy, highest, height, origin, step):  # type: ignore[no-
     return x, y, 0.0, False
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _draw_vehicles(out, occluder, pose, shape, tones, box, table, pinhole, lens, sun, layers):  # type: ignore[no-untyped-def]
+@compiled(fastmath=True)
+def _draw_vehicles(out, occluder, pose, shape, tones, box, table, pinhole, lens, sun, layers) -> None:  # type: ignore[no-untyped-def]
     """Draw vehicles and their shadows over ``out`` (h, w) float32; ``lens``: `Camera.lens_array`.
 
     The transform from the image to a vehicle's axes is linear within a pixel to a good approximation: three rays a
@@ -167,8 +169,10 @@ def _draw_vehicles(out, occluder, pose, shape, tones, box, table, pinhole, lens,
                     out[i, j] = (grey + light * out[i, j]) / (SAMPLES * SAMPLES)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _ray(u, v, pose, table, pinhole, lens):  # type: ignore[no-untyped-def]
+@compiled(fastmath=True)
+def _ray(
+    u: float, v: float, pose: FloatArray, table: FloatArray, pinhole: FloatArray, lens: FloatArray
+) -> tuple[float, ...]:
     """The ray of a raw position in a vehicle's axes: its intersection with the ground along and across, and its
     slopes."""
     ox, oy = u - lens[1], v - lens[2]
@@ -197,8 +201,8 @@ def _ray(u, v, pose, table, pinhole, lens):  # type: ignore[no-untyped-def]
     return c * x + s * y, c * y - s * x, c * sx + s * sy, c * sy - s * sx
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _layer(a, b, slope_a, slope_b, pose, layers):  # type: ignore[no-untyped-def]
+@compiled(fastmath=True)
+def _layer(a: float, b: float, slope_a: float, slope_b: float, pose: FloatArray, layers: FloatArray) -> int:
     """The highest layer that a ray to the ground at (a, b) intersects; -1: none."""
     for m in range(layers.shape[0]):
         z = layers[m, 0] * pose[8]
@@ -207,19 +211,19 @@ def _layer(a, b, slope_a, slope_b, pose, layers):  # type: ignore[no-untyped-def
     return -1
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _inside(a, b, layer, length, width):  # type: ignore[no-untyped-def]
+@compiled(fastmath=True)
+def _inside(a: float, b: float, layer: FloatArray, length: float, width: float) -> bool:
     """Whether (a along, b across) is in a layer's rectangle with rounded corners."""
     middle, half = 0.5 * (layer[1] + layer[2]) * length, 0.5 * (layer[2] - layer[1]) * length
     radius = layer[4] * width
     da, db = abs(a - middle) - (half - radius), abs(b) - (layer[3] * width - radius)
     if da > radius or db > radius:
         return False
-    return da <= 0 or db <= 0 or da * da + db * db <= radius * radius
+    return bool(da <= 0 or db <= 0 or da * da + db * db <= radius * radius)
 
 
-@njit(cache=True, nogil=True)
-def occluded(ground, slope, height, origin, step):  # type: ignore[no-untyped-def]
+@kernel
+def occluded(ground: FloatArray, slope: FloatArray, height: ByteArray, origin: FloatArray, step: float) -> Mask:
     """Whether the rays of ``slope`` (n, 2) to the ground at ``ground`` (n, 2) meet an occluder."""
     out = np.zeros(len(ground), dtype=np.bool_)
     highest = height.max() * step

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 
 from schemas.arrays import ByteArray, FloatArray, IntArray
+from velfield.compiled import kernel
 from velfield.vectors import BYTE, WORD, Vectors
 
 MAX_PATCH_SHIFT_PX = 2
@@ -95,8 +96,8 @@ def _absolute_sum(_context, before, at, after, to, counted):  # type: ignore[no-
     return types.int32(before, at, after, to, counted), generate
 
 
-@njit(cache=True, nogil=True)
-def _differences(before, after, first, second, shift):  # type: ignore[no-untyped-def]
+@kernel
+def _differences(before: ByteArray, after: ByteArray, first: IntArray, second: IntArray, shift: int) -> FloatArray:
     """Patches by columns, so that a shift is an offset in whole chunks; the rest of a chunk is not counted."""
     length, width = before.shape[1], before.shape[2]
     size = length * width
@@ -224,8 +225,8 @@ def _split_row(_context, row, at, out, to):  # type: ignore[no-untyped-def]
     return types.void(row, at, out, to), generate
 
 
-@njit(cache=True, nogil=True)
-def _prepare(crops, axes, parts):  # type: ignore[no-untyped-def]
+@kernel
+def _prepare(crops: ByteArray, axes: FloatArray, parts: ByteArray) -> IntArray:
     """Fill in the ``parts`` of `PreparedCrops`; returns its ``rows``."""
     n, side = crops.shape[0], crops.shape[1]
     low, high = np.empty((side, side), np.uint8), np.empty((side, side), np.uint8)
@@ -290,8 +291,10 @@ def _compare_chunk(_context, before, at, after, to):  # type: ignore[no-untyped-
     return types.int32(before, at, after, to), generate
 
 
-@njit(cache=True, nogil=True)
-def _crop_differences(before, rows, after, shifts, first, second):  # type: ignore[no-untyped-def]
+@kernel
+def _crop_differences(
+    before: ByteArray, rows: IntArray, after: ByteArray, shifts: IntArray, first: IntArray, second: IntArray
+) -> FloatArray:
     """`crop_differences` of crops with 64 bytes about them; ``shifts`` are those of `_shifts_shortest_first`.
 
     Every second pixel in x and y is as accurate as all of them, in a quarter of the time.

@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numba import njit
 from numpy.typing import NDArray
 
 from schemas.arrays import ByteArray, FloatArray, IntArray, Mask
 from schemas.tables import TRACKLET_COLUMNS
+from velfield.compiled import kernel
 from velfield.tracking.crop_alignment import UprightCrops, refine_links
 from velfield.tracking.gates import DetectionStates, Limits
 
@@ -343,8 +343,10 @@ def best_triples(triples: Triples, counts: tuple[int, int, int]) -> tuple[Mask, 
     return best.astype(np.bool_), confidence
 
 
-@njit(cache=True, nogil=True)
-def _best(detections, cost, counts, false_alarm_cost):  # type: ignore[no-untyped-def]
+@kernel
+def _best(
+    detections: IntArray, cost: FloatArray, counts: IntArray, false_alarm_cost: float
+) -> tuple[ByteArray, FloatArray]:
     m = cost.size
     largest = counts.max()
     minimum = np.full((3, largest), np.inf)

@@ -24,12 +24,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from schemas.arrays import ByteArray, Float32Array, FloatArray, IntArray
+from velfield.compiled import kernel
 from velfield.vectors import LONG, REAL, WORD, Vectors
 
 CAR_LENGTH_PX = 14.0
@@ -138,7 +139,7 @@ class AlignableCrops:
     pixels: NDArray[np.int16]
     counts: IntArray
 
-    def fields(self) -> tuple[NDArray[Any], ...]:
+    def fields(self) -> tuple[Float32Array, Float32Array, NDArray[np.int16], IntArray]:
         """The arrays, in this order."""
         return self.grey, self.weight, self.pixels, self.counts
 
@@ -218,8 +219,8 @@ def align_prepared(before: AlignableCrops, after: AlignableCrops, first: IntArra
     return np.asarray(_align_all(before.fields(), after.fields(), first, second, _SHIFTS), dtype=np.float64)
 
 
-@njit(cache=True, nogil=True)
-def _blur(crop, taps, rows, out):  # type: ignore[no-untyped-def]
+@kernel
+def _blur(crop: ByteArray, taps: Float32Array, rows: Float32Array, out: Float32Array) -> None:
     """Fill ``out`` (side, side) with the separably blurred crop, edge values repeated; ``rows`` is scratch."""
     side, radius = crop.shape[0], taps.size // 2
     line = np.empty(side + 2 * radius, np.float32)
@@ -243,8 +244,8 @@ def _blur(crop, taps, rows, out):  # type: ignore[no-untyped-def]
                 into[x] += tap * part[x]
 
 
-@njit(cache=True, nogil=True)
-def _fill_weights(axis, out):  # type: ignore[no-untyped-def]
+@kernel
+def _fill_weights(axis: float, out: Float32Array) -> None:
     """Weights over the box: one on the car, tapering to zero around it; a disc where the axis is unknown."""
     cos, sin, unknown = np.cos(axis), np.sin(axis), np.isnan(axis)
     for row in range(_ROWS):
@@ -261,8 +262,10 @@ def _fill_weights(axis, out):  # type: ignore[no-untyped-def]
                 line[column] = min(max(1.0 - beyond / TAPER_PX, 0.0), 1.0)
 
 
-@njit(cache=True, nogil=True)
-def _prepare(crops, axes, taps):  # type: ignore[no-untyped-def]
+@kernel
+def _prepare(
+    crops: ByteArray, axes: FloatArray, taps: Float32Array
+) -> tuple[Float32Array, Float32Array, NDArray[np.int16], IntArray]:
     """The fields of `AlignableCrops`."""
     n, side, radius = crops.shape[0], crops.shape[1], taps.size // 2
     grey, weight = np.empty((n, side, side), np.float32), np.empty((n, _ROWS, _COLUMNS), np.float32)
@@ -293,8 +296,8 @@ def _prepare(crops, axes, taps):  # type: ignore[no-untyped-def]
     return grey, weight, pixels, counts
 
 
-@njit(cache=True, nogil=True)
-def _unfold(blurred, weight, unfolded):  # type: ignore[no-untyped-def]
+@kernel
+def _unfold(blurred: Float32Array, weight: Float32Array, unfolded: tuple[Float32Array, ...]) -> None:
     """Fill in a crop's images about its centre, (40, 40) each: grey levels and weights, 0 beyond the crop and the box;
     and over the box the slopes of the grey levels in x and in y, those without weight too."""
     grey, weights, slope_x, slope_y = unfolded
@@ -320,8 +323,8 @@ def _unfold(blurred, weight, unfolded):  # type: ignore[no-untyped-def]
             across[x] = half * (below[x] - above[x])
 
 
-@njit(cache=True, nogil=True)
-def _integer_shift(template, own_weight, pixels, image, image_weight, shifts):  # type: ignore[no-untyped-def]
+@kernel
+def _integer_shift(template, own_weight, pixels, image, image_weight, shifts) -> tuple[int, int]:  # type: ignore[no-untyped-def]
     """Integer shift of minimum mean absolute difference over the pixels on the car in both; over half of the pixels,
     which suffices here."""
     value_at, weight_at = template.ravel(), own_weight.ravel()
@@ -354,8 +357,8 @@ def _integer_shift(template, own_weight, pixels, image, image_weight, shifts):  
     return best_x, best_y
 
 
-@njit(cache=True, nogil=True)
-def _cubic(fraction):  # type: ignore[no-untyped-def]
+@kernel
+def _cubic(fraction: float) -> tuple[np.float32, ...]:
     """Weights of Catmull-Rom interpolation at a fraction in [0, 1) between the second and the third of four samples."""
     t = fraction
     return (
@@ -366,8 +369,8 @@ def _cubic(fraction):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
-def _differences(grey, own, image, image_weight, top, u, v, near, lines, difference, weight):  # type: ignore[no-untyped-def]
+@kernel
+def _differences(grey, own, image, image_weight, top, u, v, near, lines, difference, weight) -> int:  # type: ignore[no-untyped-def]
     """Fill in the differences of image and template (rows, columns) at this shift, and the weights of those pixels on
     the car in both; returns their number. A pixel without weight has the difference `_BEYOND`.
 
@@ -435,8 +438,8 @@ def _count_near(_context, values, count, middle, limit):  # type: ignore[no-unty
     return types.int32(values, count, middle, limit), generate
 
 
-@njit(cache=True, nogil=True)
-def _median(values, middle, count):  # type: ignore[no-untyped-def]
+@kernel
+def _median(values: Float32Array, middle: np.float32, count: int) -> np.float32:
     """Median of ``count`` grey levels, to a sixteenth of one, or where ``middle`` is given that of the distances from
     it; by halving the range, as counting takes vector instructions. Values above 256 do not count: so many of them
     follow that ``values`` are whole vectors."""
@@ -496,8 +499,8 @@ def _sum_columns(_context, difference, weight, slope_x, slope_y, rows, middle, s
     return types.void(difference, weight, slope_x, slope_y, rows, middle, scale, sums), generate
 
 
-@njit(cache=True, nogil=True)
-def _step(difference, weight, slope_x, slope_y, count, sums):  # type: ignore[no-untyped-def]
+@kernel
+def _step(difference, weight, slope_x, slope_y, count, sums) -> tuple[float, float, float]:  # type: ignore[no-untyped-def]
     """One robust Gauss-Newton step with the brightness offset eliminated: (step x, step y, variance); NaN where it is
     underdetermined.
 
@@ -531,8 +534,14 @@ def _step(difference, weight, slope_x, slope_y, count, sums):  # type: ignore[no
     return -(yy * xd - xy * yd) / determinant, -(xx * yd - xy * xd) / determinant, variance
 
 
-@njit(cache=True, nogil=True)
-def _lucas_kanade(template, image, u, v, scratch):  # type: ignore[no-untyped-def]
+@kernel
+def _lucas_kanade(
+    template: tuple[Float32Array, Float32Array, Float32Array, Float32Array, IntArray],
+    image: tuple[Float32Array, Float32Array, Float32Array, Float32Array, IntArray],
+    u: float,
+    v: float,
+    scratch: tuple[Float32Array, Float32Array, Float32Array, Float32Array],
+) -> tuple[float, float, float]:
     """Shift of the template in the image, and its variance; NaN where it leaves the search range or does not
     converge. Each crop is (grey, weight, slopes in x and in y, counts), as in `AlignableCrops`; the scratch is that of
     `_align_all`."""
@@ -564,8 +573,8 @@ def _lucas_kanade(template, image, u, v, scratch):  # type: ignore[no-untyped-de
     return np.nan, np.nan, np.nan
 
 
-@njit(cache=True, nogil=True)
-def _images():  # type: ignore[no-untyped-def]
+@kernel
+def _images() -> tuple[Float32Array, ...]:
     """Buffers that `_unfold` fills in."""
     return (
         np.zeros((_SIDE, _SIDE), np.float32),
@@ -575,8 +584,14 @@ def _images():  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
-def _align_all(before, after, first, second, shifts):  # type: ignore[no-untyped-def]
+@kernel
+def _align_all(
+    before: tuple[Float32Array, Float32Array, NDArray[np.int16], IntArray],
+    after: tuple[Float32Array, Float32Array, NDArray[np.int16], IntArray],
+    first: IntArray,
+    second: IntArray,
+    shifts: IntArray,
+) -> FloatArray:
     """`align_prepared`; ``before`` and ``after`` are the fields of `AlignableCrops`."""
     grey_a, weight_a, pixels_a, counts_a = before
     grey_b, weight_b, _, counts_b = after

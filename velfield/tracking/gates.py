@@ -14,10 +14,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numba import njit
 
 from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.flight import PAPER_GSD_M, TrackingConfig
+from velfield.compiled import kernel
 
 
 @dataclass(frozen=True)
@@ -211,16 +211,18 @@ def gate_links(before: DetectionStates, after: DetectionStates, limits: Limits) 
     return Links(first[ranked], second[ranked], cost[ranked], interval, counts)
 
 
-@njit(cache=True, nogil=True)
-def _axis_offset(dx, dy, axis):  # type: ignore[no-untyped-def]
+@kernel
+def _axis_offset(dx: float, dy: float, axis: float) -> float:
     """Angle between a motion and an axis, [0, pi/2]."""
     along = abs(dx * np.cos(axis) + dy * np.sin(axis))
     across = abs(dy * np.cos(axis) - dx * np.sin(axis))
-    return np.arctan2(across, along)
+    return float(np.arctan2(across, along))
 
 
-@njit(cache=True, nogil=True)
-def _axis_test(dx, dy, axis, axis_sd, slow, max_offset, noise, sigmas):  # type: ignore[no-untyped-def]
+@kernel
+def _axis_test(
+    dx: float, dy: float, axis: float, axis_sd: float, slow: float, max_offset: float, noise: float, sigmas: float
+) -> tuple[bool, float]:
     """Whether motion is along a detection's axis, and half the squared sideways component in standard deviations."""
     if np.isnan(axis):
         return True, 0.0
@@ -234,8 +236,10 @@ def _axis_test(dx, dy, axis, axis_sd, slow, max_offset, noise, sigmas):  # type:
     return offset <= max_offset + sigmas * np.hypot(sd, noise / length), cost
 
 
-@njit(cache=True, nogil=True)
-def _links(x0, y0, a0, s0, x1, y1, a1, s1, order, low, high, reach, slow, max_offset, noise, sigmas):  # type: ignore[no-untyped-def]
+@kernel
+def _links(  # type: ignore[no-untyped-def]
+    x0, y0, a0, s0, x1, y1, a1, s1, order, low, high, reach, slow, max_offset, noise, sigmas
+) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
     """Pairs within reach whose motion is along both axes; counts of the pairs tried and rejected."""
     capacity = np.sum(high - low)
     first = np.empty(capacity, np.int64)
@@ -342,8 +346,8 @@ TYPICAL_ACCELERATION_FRACTION = 0.1
 """Standard deviation of a car's acceleration as a fraction of the gate's limit: 2.3 m/s^2 of 23."""
 
 
-@njit(cache=True, nogil=True)
-def _turn_passes(ax, ay, bx, by, dt, sd, limit):  # type: ignore[no-untyped-def]
+@kernel
+def _turn_passes(ax: float, ay: float, bx: float, by: float, dt: FloatArray, sd: FloatArray, limit: FloatArray) -> bool:
     """Whether the direction changes by no more than the limit between two segments; slow ones have none and pass."""
     length_a = np.hypot(ax, ay)
     length_b = np.hypot(bx, by)
@@ -355,11 +359,13 @@ def _turn_passes(ax, ay, bx, by, dt, sd, limit):  # type: ignore[no-untyped-def]
     # An error of the middle position changes both directions, in opposite senses.
     noise = np.sqrt((sd[0] / length_a) ** 2 + (sd[1] * (1 / length_a + 1 / length_b)) ** 2 + (sd[2] / length_b) ** 2)
     turn = abs(np.arctan2(ax * by - ay * bx, ax * bx + ay * by))
-    return turn <= limit[0] + sigmas * noise
+    return bool(turn <= limit[0] + sigmas * noise)
 
 
-@njit(cache=True, nogil=True)
-def _pairs(x0, y0, x1, y1, x2, y2, a_of, b_of, c_of, begins, dt, sd, limit):  # type: ignore[no-untyped-def]
+@kernel
+def _pairs(  # type: ignore[no-untyped-def]
+    x0, y0, x1, y1, x2, y2, a_of, b_of, c_of, begins, dt, sd, limit
+) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
     """Pairs of links that share their middle detection; counts of the pairs tried and rejected."""
     capacity = 0
     for i in range(b_of.size):

@@ -8,10 +8,10 @@ was hidden and turned.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
-from schemas.arrays import FloatArray, IntArray
+from schemas.arrays import ByteArray, FloatArray, IntArray
 from schemas.flight import STATIONARY_SPEED_M_PER_S
+from velfield.compiled import kernel
 
 _SLACK_M = 2.0
 """Tolerance of the prediction for a gap of no length: detections are not always at the same point of a car."""
@@ -122,7 +122,7 @@ def find_candidates(
     total = np.cumsum(np.maximum(high - low, 0))
     found = []
     for block in np.split(np.arange(len(total)), np.flatnonzero(np.diff(total // _PAIRS_AT_ONCE)) + 1):
-        end, start, models = _possible_pairs(*sides, block, order, low, high, bounds)
+        end, start, models = _possible_pairs(sides[0], sides[1], block, order, low, high, bounds)
         cost = np.full(len(end), np.inf)
         for k, model in enumerate(_MODELS):
             rows = np.flatnonzero(models & (1 << k))
@@ -142,8 +142,8 @@ def find_candidates(
     return pairs[rank], table[rank, 0]
 
 
-@njit(cache=True, nogil=True)
-def _possible_pairs(ends, starts, block, order, low, high, bounds):  # type: ignore[no-untyped-def]
+@kernel
+def _possible_pairs(ends, starts, block, order, low, high, bounds) -> tuple[IntArray, IntArray, ByteArray]:  # type: ignore[no-untyped-def]
     """Pairs of ends (those of ``block``) and starts that a model may find possible, and which: a bit a model, in the
     order of `_MODELS`.
 
@@ -191,15 +191,15 @@ def _possible_pairs(ends, starts, block, order, low, high, bounds):  # type: ign
     return end[:n].copy(), start[:n].copy(), models[:n].copy()
 
 
-@njit(cache=True, nogil=True)
-def _goes_on(dx, dy, vx, vy):  # type: ignore[no-untyped-def]
+@kernel
+def _goes_on(dx: float, dy: float, vx: float, vy: float) -> bool:
     """Whether a displacement may be of a vehicle that keeps to its way, the direction of a sum of velocities."""
     length = np.sqrt(vx * vx + vy * vy)
     if length < _ROOM:
         return True  # of no direction that could be told
     width = _LANE_OFFSET_M + _LANE_OFFSET_FRACTION * np.sqrt(dx * dx + dy * dy)
     ahead, aside = dx * vx + dy * vy, abs(vx * dy - vy * dx)
-    return ahead > -_ROOM * length and aside <= (_MAX_RELATIVE * width + _ROOM) * length
+    return bool(ahead > -_ROOM * length and aside <= (_MAX_RELATIVE * width + _ROOM) * length)
 
 
 @dataclass(frozen=True)

@@ -16,13 +16,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numba import njit
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, min_weight_full_bipartite_matching
 
 from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.flight import PAPER_GSD_M
+from velfield.compiled import kernel
 from velfield.tracking.dimensions import looks_difference
 from velfield.tracking.join_costs import CERTAINTY_SLOPE, STATIONARY_OFFSET_M, GapLimits, TrackEnds, find_candidates
 
@@ -323,8 +323,8 @@ def _margins(row: IntArray, column: IntArray, gain: FloatArray, best: IntArray) 
     return margins
 
 
-@njit(cache=True, nogil=True)
-def _neighbourhood(end, start, beside, partner, gains, at):  # type: ignore[no-untyped-def]
+@kernel
+def _neighbourhood(end, start, beside, partner, gains, at) -> tuple[FloatArray, float]:  # type: ignore[no-untyped-def]
     """The gains (n, m) of ends and starts around a pair, the nearest by candidates first, each with its partner; and
     the sum of those of partners.
 

@@ -11,11 +11,11 @@ floor(16 w) or ceil(16 w) times, so that one of them at random is a draw from th
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from schemas.arrays import IntArray, Mask
 from schemas.flight import PAPER_GSD_M
+from velfield.compiled import kernel
 from velfield.run.stores import HISTOGRAM, FieldStore
 
 DRAWS = 16
@@ -85,7 +85,7 @@ def _draw_tile(
     return cell, np.maximum.reduceat(count[y, x], first), bins
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _draw_cells(histogram: NDArray[np.int32], y: IntArray, x: IntArray, first: IntArray, bins: IntArray) -> None:
     """Fill ``bins`` (n, DRAWS) with a systematic sample of the sums of the histograms (ty, tx, bins) at the pixels
     ``first[k]`` to ``first[k + 1]`` of each cell: those of a tile at once would be as large as the tile, twice."""

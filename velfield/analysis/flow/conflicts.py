@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from scipy import special
 from scipy.spatial import cKDTree
 
@@ -15,6 +14,7 @@ from velfield.analysis.lanes.find import project
 from velfield.analysis.lanes.junctions import Crossing, find_crossings
 from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.trajectories import VEHICLE_WIDTH_M, Trajectories, group_rows
+from velfield.compiled import kernel
 from velfield.tracking.smoothing import ACCELERATION_NOISE
 
 ConflictKind = Literal["crossing", "merging", "following"]
@@ -256,7 +256,7 @@ def time_to_collision(
     ]
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _sort_along(rows: IntArray, lane: IntArray, frame: IntArray, along: FloatArray) -> None:
     """Bring rows, in place, of one frame and lane, which are together and few, into their order along the lane."""
     for i in range(1, len(rows)):
@@ -272,7 +272,7 @@ def _sort_along(rows: IntArray, lane: IntArray, frame: IntArray, along: FloatArr
         rows[k] = row
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _followers(
     rows: IntArray,
     lane: IntArray,
@@ -338,7 +338,7 @@ def positions_on_lanes(trajectories: Trajectories, graph: LaneGraph) -> tuple[In
     return lane, along
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _between(
     first: IntArray,
     time_s: FloatArray,

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy import special
 
 from schemas.arrays import FloatArray, IntArray, Mask
@@ -16,6 +15,7 @@ from velfield.analysis.intervals import (
     estimate_quantile,
 )
 from velfield.analysis.lanes.model import Junction, LaneGraph, LaneSamples
+from velfield.compiled import kernel
 
 STATION_M = 10.0
 """Length of a profile's stations."""
@@ -238,7 +238,7 @@ def speed_reduction(
     )
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def slowing(
     first: IntArray, time_s: FloatArray, speed: FloatArray, tracks: IntArray, entry_s: FloatArray
 ) -> FloatArray:

@@ -3,7 +3,6 @@
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from numba import njit
 from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, IntArray
@@ -12,6 +11,7 @@ from velfield.analysis.lanes.junctions import find_junctions
 from velfield.analysis.lanes.model import Connection, Lane, LaneGraph, LaneSamples, Turn, WidthSource
 from velfield.analysis.lanes.ridges import Nodes, bin_keys, bin_samples, find_nodes
 from velfield.analysis.trajectories import VEHICLE_WIDTH_M, PathSamples, Trajectories, group_rows, sample_paths
+from velfield.compiled import kernel
 
 MIN_TRACKS = 3
 """A lane, or a connection, that fewer tracks drove is not one: an error of tracking or of a driver."""
@@ -155,7 +155,7 @@ def project(xy_m: FloatArray, line_m: FloatArray) -> tuple[FloatArray, FloatArra
     return along, offset
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _project(
     xy: FloatArray, line: IntArray, points: FloatArray, border: IntArray, out_along: FloatArray, out_offset: FloatArray
 ) -> None:

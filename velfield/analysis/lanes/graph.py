@@ -10,10 +10,10 @@ from itertools import pairwise
 
 import numpy as np
 import pandas as pd
-from numba import njit
 
 from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.analysis.lanes.ridges import NODE_SPACING_M, Nodes
+from velfield.compiled import kernel
 
 _MAX_STEP_M = 4 * NODE_SPACING_M
 """Farther nodes are not linked: the track had a gap between them."""
@@ -64,7 +64,7 @@ def count_links(track: IntArray, node: IntArray, nodes: Nodes) -> Links:
     return Links(pairs // len(nodes), pairs % len(nodes), count)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _moves(track: IntArray, node: IntArray) -> tuple[IntArray, IntArray]:
     """Rows at which a track leaves a node, and at which it is at the next; those without a node are passed over."""
     first, second = np.empty(len(track), np.int64), np.empty(len(track), np.int64)
@@ -79,7 +79,7 @@ def _moves(track: IntArray, node: IntArray) -> tuple[IntArray, IntArray]:
     return first[:n], second[:n]
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def count_once(owner: IntArray, number: IntArray, n: int) -> IntArray:
     """Number of owners that have each of n numbers; the rows of an owner are consecutive."""
     count, last = np.zeros(n, np.int64), np.full(n, -1, np.int64)

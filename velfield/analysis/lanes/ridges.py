@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numba import njit
 from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.analysis.trajectories import PathSamples
+from velfield.compiled import kernel
 
 BIN_M, SECTORS = 0.5, 24
 """Sides of a bin, and sectors of its direction."""
@@ -51,7 +51,7 @@ class Nodes:
         return len(self.xy_m)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def bin_keys(xy_m: FloatArray, direction_rad: FloatArray) -> IntArray:
     """One number (n,) for the bin of each sample; positions lie within 500 km of the origin."""
     out = np.empty(len(xy_m), np.int64)
@@ -126,7 +126,7 @@ def _adjacency(pairs: IntArray, n: int) -> tuple[IntArray, IntArray]:
     return np.searchsorted(a[order], np.arange(n + 1)).astype(np.int64), b[order].astype(np.int64)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _shift(
     xy: FloatArray,
     direction: FloatArray,
@@ -183,7 +183,7 @@ def _choose(xy: FloatArray, direction: FloatArray, density: FloatArray, apart: f
     return chosen, owner
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _suppress(
     xy: FloatArray,
     direction: FloatArray,

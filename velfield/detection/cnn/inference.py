@@ -11,9 +11,9 @@ from typing import Any, TypeAlias
 import cv2
 import numpy as np
 import onnxruntime as ort
-from numba import njit
 
-from schemas.arrays import Float32Array, GreyImage, IntArray
+from schemas.arrays import ByteArray, Float32Array, GreyImage, IntArray
+from velfield.compiled import kernel
 from velfield.detection.cnn.graph import network_to_onnx
 from velfield.detection.cnn.network import ALIGNMENT, STRIDE, Network
 from velfield.detection.cnn.quantization import INEXACT, Ranges, is_exact, quantized_to_onnx
@@ -160,8 +160,8 @@ def predict_crops(predict: Predictor, image: GreyImage, crops: IntArray) -> Heat
     return probability, orientation
 
 
-@njit(cache=True, nogil=True)
-def _cut_kernel(image, corners, height, width):  # type: ignore[no-untyped-def]
+@kernel
+def _cut_kernel(image: ByteArray, corners: IntArray, height: int, width: int) -> ByteArray:
     """Crops (n, height, width) with these corners (n, 2): y, x."""
     out = np.empty((len(corners), height, width), np.uint8)
     for n in range(len(corners)):
@@ -173,8 +173,14 @@ def _cut_kernel(image, corners, height, width):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True)
-def _place_kernel(heatmaps, vectors, corners, probability, orientation):  # type: ignore[no-untyped-def]
+@kernel
+def _place_kernel(
+    heatmaps: Float32Array,
+    vectors: Float32Array,
+    corners: IntArray,
+    probability: Float32Array,
+    orientation: Float32Array,
+) -> None:
     """Write the heatmaps and orientation vectors of crops where these lie (n, 2): y, x."""
     height, width = heatmaps.shape[1:]
     for n in range(len(corners)):

@@ -10,9 +10,9 @@ import threading
 from collections.abc import Iterator
 
 import numpy as np
-from numba import njit
 
 from schemas.arrays import Float32Array
+from velfield.compiled import kernel
 
 _BLOCK_ROWS = 576
 """Pixels of one matrix product: an eighth of half a batch at a quarter of the resolution."""
@@ -155,7 +155,7 @@ def _neighbourhoods(images: Float32Array, weights: Float32Array) -> Iterator[tup
         yield start, stop, columns
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _first_value(shape: tuple[int, int, int, int], stride: int, pixel: int) -> int:
     """Where the neighbourhood of an output pixel begins in padded images of a shape, by the number of the value."""
     _, height, width, channels = shape
@@ -164,7 +164,7 @@ def _first_value(shape: tuple[int, int, int, int], stride: int, pixel: int) -> i
     return ((image * height + y * stride) * width + x * stride) * channels
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _gather(padded: Float32Array, columns: Float32Array, side: int, stride: int, first: int) -> None:
     """Fill rows with the neighbourhoods (side x side x channels) of successive output pixels from the first."""
     width, channels = padded.shape[2:]
@@ -180,7 +180,7 @@ def _gather(padded: Float32Array, columns: Float32Array, side: int, stride: int,
                 target[k] = source[k]
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _scatter(columns: Float32Array, padded: Float32Array, side: int, stride: int, first: int) -> None:
     """Add rows to the neighbourhoods that `_gather` reads: its adjoint."""
     width, channels = padded.shape[2:]
@@ -195,7 +195,7 @@ def _scatter(columns: Float32Array, padded: Float32Array, side: int, stride: int
                 target[k] += source[k]
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _add_bias(rows: Float32Array, bias: Float32Array, relu: bool) -> None:
     """Add a bias (channels,) to rows (n, channels) in place, then a ReLU."""
     for row in range(rows.shape[0]):
@@ -220,7 +220,7 @@ def relu_backward(gradient: Float32Array, out: Float32Array) -> tuple[Float32Arr
     return by_input, total
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@kernel
 def _mask_and_sum(gradient: Float32Array, out: Float32Array, masked: Float32Array, total: Float32Array) -> None:
     for row in range(gradient.shape[0]):
         source, activation, target = gradient[row], out[row], masked[row]

@@ -6,9 +6,9 @@ import math
 
 import cv2
 import numpy as np
-from numba import njit
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
+from velfield.compiled import kernel
 from velfield.detection.cnn.inference import BORDER_PX, Predictor, predict_crops, predict_heatmap
 from velfield.detection.cnn.network import STRIDE
 
@@ -72,8 +72,10 @@ def find_peaks(
     return np.asarray(_peaks_kernel(smooth, orientation, everywhere, stride, np.float32(min_probability)))
 
 
-@njit(cache=True, nogil=True)
-def _peaks_kernel(smooth, orientation, valid, stride, least):  # type: ignore[no-untyped-def]
+@kernel
+def _peaks_kernel(
+    smooth: Float32Array, orientation: Float32Array, valid: Mask, stride: int, least: np.float32
+) -> FloatArray:
     """A peak is no smaller than its eight neighbours. Its offset is that of a parabola through their logarithms."""
     height, width = smooth.shape
     masked = valid.size > 0
@@ -102,16 +104,16 @@ def _peaks_kernel(smooth, orientation, valid, stride, least):  # type: ignore[no
     return out[:n]
 
 
-@njit(cache=True, nogil=True)
-def _count_above(values, least):  # type: ignore[no-untyped-def]
+@kernel
+def _count_above(values: Float32Array, least: np.float32) -> np.int32:
     count = np.int32(0)
     for x in range(np.uint64(values.size)):
         count += np.int32(values[x] > least)
     return count
 
 
-@njit(cache=True, nogil=True)
-def _offset(before, at, after):  # type: ignore[no-untyped-def]
+@kernel
+def _offset(before: float, at: float, after: float) -> float:
     before, after = math.log(max(before, _LEAST_PROBABILITY)), math.log(max(after, _LEAST_PROBABILITY))
     bend = max(2 * math.log(max(at, _LEAST_PROBABILITY)) - before - after, 1e-6)
     return min(max((after - before) / (2 * bend), -0.5), 0.5)
@@ -126,8 +128,8 @@ def are_mostly_visible(cars: FloatArray, shape: tuple[int, ...], valid: Mask | N
     return np.asarray(_visible_kernel(cars, shape[0], shape[1], everywhere))
 
 
-@njit(cache=True, nogil=True)
-def _visible_kernel(cars, height, width, valid):  # type: ignore[no-untyped-def]
+@kernel
+def _visible_kernel(cars: FloatArray, height: int, width: int, valid: Mask) -> Mask:
     out = np.ones(len(cars), np.bool_)
     for n in range(len(cars)):
         for way in (-1.0, 1.0):

@@ -13,10 +13,10 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray
+from schemas.arrays import ByteArray, Float32Array, FloatArray, GreyImage, IntArray
+from velfield.compiled import kernel
 from velfield.detection.long_vehicles.rounds import LANES, score_offsets, signed_corners
 from velfield.detection.stumps import BoostedStumps
 
@@ -26,8 +26,8 @@ GRADIENT_ZERO = 512
 """Gradients are packed as unsigned ten-bit numbers, with this standing for zero."""
 
 
-@njit(cache=True, nogil=True)
-def fill_integrals(packed, stride, poses, out):  # type: ignore[no-untyped-def]
+@kernel
+def fill_integrals(packed: NDArray[np.uint32], stride: int, poses: Float32Array, out: NDArray[np.int32]) -> None:
     """Integral images of ``LANES`` rotated patches, sampled at the nearest pixel (as accurate as interpolated).
 
     ``packed`` (h * w,) uint32: grey, and the gradient in x and y. ``poses`` (8, LANES) float32: x, y of the centre plus
@@ -59,11 +59,11 @@ def fill_integrals(packed, stride, poses, out):  # type: ignore[no-untyped-def]
                     out[channel, i + 1, j + 1, lane] = out[channel, i, j + 1, lane] + runs[channel, lane]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def score_poses_kernel(  # type: ignore[no-untyped-def]
     packed, stride, poses, floor, window, window_area, corners, signs, starts, planes, areas, thresholds, leaves,
     bases, rounds, integral, out,
-):  # fmt: skip
+) -> None:  # fmt: skip
     """Scores (groups, offsets, LANES) of poses (groups, 8, LANES); ``integral`` is scratch memory."""
     flat = integral.reshape(-1)
     plane = np.uint64(flat.size // integral.shape[0])
@@ -124,8 +124,8 @@ def features_of_reduced(image: GreyImage, scale: PatchScale) -> FeatureImage:
     return FeatureImage(scale, pack_words_kernel(grey).ravel(), grey.shape[1])
 
 
-@njit(cache=True, nogil=True)
-def pack_words_kernel(grey):  # type: ignore[no-untyped-def]
+@kernel
+def pack_words_kernel(grey: ByteArray) -> NDArray[np.uint32]:
     """Grey, and half of each gradient (Sobel's, mirrored at the edge) above its zero, in one word a pixel."""
     height, width = np.uint64(grey.shape[0]), np.uint64(grey.shape[1])
     one, two = np.uint64(1), np.uint64(2)

@@ -1,13 +1,15 @@
 """Scores of a boosted classifier at many offsets of patches whose integral images lie side by side, one a lane."""
 
 import numpy as np
-from numba import njit
+from numpy.typing import NDArray
+
+from velfield.compiled import kernel
 
 LANES = 16
 
 
-@njit(cache=True, nogil=True)
-def sum_rectangles(flat, corners, first, last, base, total):  # type: ignore[no-untyped-def]
+@kernel
+def sum_rectangles(flat, corners, first, last, base, total) -> None:  # type: ignore[no-untyped-def]
     """Sum rectangles ``first`` to ``last``, whose corners (n, 4) have the shares +, -, -, +, in each lane."""
     total[:] = 0
     for r in range(first, last):
@@ -16,8 +18,8 @@ def sum_rectangles(flat, corners, first, last, base, total):  # type: ignore[no-
             total[lane] += flat[a + lane] - flat[b + lane] - flat[c + lane] + flat[d + lane]
 
 
-@njit(cache=True, nogil=True)
-def signed_corners(corners, signs):  # type: ignore[no-untyped-def]
+@kernel
+def signed_corners(corners: NDArray[np.uint64], signs: NDArray[np.int32]) -> NDArray[np.uint64]:
     """Corners (n, 4) in the order of their shares +, -, -, +: those of a negative rectangle are swapped."""
     out = corners.copy()
     for r in range(len(corners)):
@@ -26,8 +28,8 @@ def signed_corners(corners, signs):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True)
-def normalise(flat, window, window_area, plane, base, floor, total, mean, contrast):  # type: ignore[no-untyped-def]
+@kernel
+def normalise(flat, window, window_area, plane, base, floor, total, mean, contrast) -> None:  # type: ignore[no-untyped-def]
     """Mean grey of the window about a position, and its mean gradient plus ``floor``."""
     scale, first, last = np.float32(1 / window_area), np.int32(0), np.int32(1)
     sum_rectangles(flat, window, first, last, base, total)
@@ -41,10 +43,10 @@ def normalise(flat, window, window_area, plane, base, floor, total, mean, contra
         contrast[lane] += np.float32(total[lane]) * scale
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def score_offsets(  # type: ignore[no-untyped-def]
     flat, window, window_area, plane, floor, corners, starts, planes, areas, thresholds, leaves, bases, rounds, out,
-):  # fmt: skip
+) -> None:  # fmt: skip
     """Sums of the leaves of the first ``rounds``, (offsets, LANES), at every offset of ``LANES`` patches.
 
     ``corners`` and ``window`` as of `signed_corners`.

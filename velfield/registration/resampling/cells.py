@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 
+from schemas.arrays import ByteArray, Float32Array, IntArray, Mask
+from velfield.compiled import kernel
 from velfield.vectors import BYTE, LONG, REAL, WORD, Vectors
 
 CELL_PX = 16
@@ -141,15 +143,17 @@ def _interpolate_row(_context, grey, stride, places, row, out, at):  # type: ign
     return types.void(grey, stride, places, row, out, at), generate
 
 
-@njit(cache=True, nogil=True)
-def resample_kernel(extended, coarse, step, cells, image, valid):  # type: ignore[no-untyped-def]
+@kernel
+def resample_kernel(
+    extended: ByteArray, coarse: Float32Array, step: int, cells: IntArray, image: ByteArray, valid: Mask
+) -> None:
     """As `velfield.registration.warp.resample_cells`."""
     height, stride = np.int32(extended.shape[0] - 2 * PAD_PX), np.int32(extended.shape[1])
     side, one, two = np.uint64(CELL_PX), np.uint64(1), np.uint64(2)  # unsigned: numba checks no index for its sign
     across, runs = np.empty(CELL_PX, np.float32), np.empty(CELL_PX, np.uint64)
     for j in range(CELL_PX):
-        at = (j + 0.5) / step + 0.5
-        across[j], runs[j] = at - int(at), np.uint64(at)
+        below = (j + 0.5) / step + 0.5
+        across[j], runs[j] = below - int(below), np.uint64(below)
     grey, flat, flat_valid, flat_coarse = extended.reshape(-1), image.reshape(-1), valid.reshape(-1), coarse.reshape(-1)
     width, coarse_width = np.uint64(image.shape[1]), np.uint64(coarse.shape[1])
     last = np.uint64(coarse.shape[0] * coarse.shape[1] - 1)  # past it only for pixels that no cell has

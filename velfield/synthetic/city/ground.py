@@ -6,10 +6,10 @@ contrast of patches. Texture and shadows are applied at the end.
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from schemas.arrays import ByteArray, Float32Array, FloatArray, GreyImage
+from velfield.compiled import kernel
 from velfield.synthetic.render import MOSAIC_SCALE, REACH_CELL, SHADOW_LIGHT
 
 Tone = tuple[int, int, int, int]
@@ -163,8 +163,8 @@ def apply_light(tone: GreyImage, light: Float32Array) -> GreyImage:
     return np.asarray(cv2.multiply(tone, enlarged, dtype=cv2.CV_8U))
 
 
-@njit(cache=True, nogil=True)
-def _shadows(height, reach, step, direction, light):  # type: ignore[no-untyped-def]
+@kernel
+def _shadows(height: ByteArray, reach: ByteArray, step: float, direction: FloatArray, light: Float32Array) -> None:
     reach_px = np.sqrt(direction[0] ** 2 + direction[1] ** 2)
     ux, uy = direction[0] / reach_px, direction[1] / reach_px
     for i in range(height.shape[0]):

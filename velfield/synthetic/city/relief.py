@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from schemas.arrays import FloatArray
+from velfield.compiled import kernel
 
 GRID_PX = 16.0
 """Spacing of the relief's grid, base px."""
@@ -35,8 +35,8 @@ def make_relief(
     return Relief(grid * height_px, np.array([bounds[0], bounds[1], GRID_PX]))
 
 
-@njit(cache=True, nogil=True)
-def ground_height_at(x, y, grid, frame):  # type: ignore[no-untyped-def]
+@kernel
+def ground_height_at(x: float, y: float, grid: FloatArray, frame: FloatArray) -> float:
     """Height at one position, base px; outside the grid that of its border."""
     gx = min(max((x - frame[0]) / frame[2], 0.0), grid.shape[1] - 1.001)
     gy = min(max((y - frame[1]) / frame[2], 0.0), grid.shape[0] - 1.001)
@@ -44,11 +44,11 @@ def ground_height_at(x, y, grid, frame):  # type: ignore[no-untyped-def]
     fy, fx = gy - i, gx - j
     top = grid[i, j] + fx * (grid[i, j + 1] - grid[i, j])
     bottom = grid[i + 1, j] + fx * (grid[i + 1, j + 1] - grid[i + 1, j])
-    return top + fy * (bottom - top)
+    return float(top + fy * (bottom - top))
 
 
-@njit(cache=True, nogil=True)
-def ground_height(x, y, grid, frame):  # type: ignore[no-untyped-def]
+@kernel
+def ground_height(x: FloatArray, y: FloatArray, grid: FloatArray, frame: FloatArray) -> FloatArray:
     """Heights (n,) at positions x, y (n,), base px."""
     out = np.empty(len(x))
     for i in range(len(x)):

@@ -9,9 +9,9 @@ centre along its edge; ``leg`` is the index of that edge in its route.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from schemas.arrays import FloatArray, IntArray
+from schemas.arrays import FloatArray, IntArray, Mask
+from velfield.compiled import kernel
 
 ACCELERATION, BRAKING, MIN_GAP = 2.2, 2.4, 1.8
 """Parameters a, b, s0 of the IDM: m/s^2, m/s^2, m."""
@@ -58,25 +58,25 @@ class CarStates(NamedTuple):
     route_first: IntArray
 
 
-@njit(cache=True, nogil=True)
-def idm_acceleration(v, desired_speed, gap, approach, headway):  # type: ignore[no-untyped-def]
+@kernel
+def idm_acceleration(v: float, desired_speed: float, gap: float, approach: float, headway: float) -> float:
     """Acceleration of the IDM at speed ``v``, ``gap`` to the leader, and closing speed ``approach``; m, m/s, s."""
     free = 1.0 - (v / desired_speed) ** 4
     if gap >= FAR:
         return ACCELERATION * free
     desired_gap = MIN_GAP + max(0.0, v * headway + v * approach / (2.0 * np.sqrt(ACCELERATION * BRAKING)))
-    return ACCELERATION * (free - (desired_gap / max(gap, 0.1)) ** 2)
+    return float(ACCELERATION * (free - (desired_gap / max(gap, 0.1)) ** 2))
 
 
-@njit(cache=True, nogil=True)
-def is_green(group, time_s, offsets, cycle_s, all_red_s):  # type: ignore[no-untyped-def]
+@kernel
+def is_green(group: int, time_s: float, offsets: FloatArray, cycle_s: float, all_red_s: float) -> bool:
     """Whether a signal group (2 * intersection + axis) is green."""
     t = (time_s + offsets[group // 2]) % cycle_s - (group % 2) * cycle_s / 2
-    return 0.0 <= t < cycle_s / 2 - all_red_s
+    return bool(0.0 <= t < cycle_s / 2 - all_red_s)
 
 
-@njit(cache=True, nogil=True)
-def sort_by_edge(active, roads, cars, first, order):  # type: ignore[no-untyped-def]
+@kernel
+def sort_by_edge(active: IntArray, roads: RoadArrays, cars: CarStates, first: IntArray, order: IntArray) -> None:
     """Active cars by edge, rearmost first: those of edge e are order[first[e]:first[e + 1]]."""
     n = len(active)
     key = np.empty(n)
@@ -93,8 +93,8 @@ def sort_by_edge(active, roads, cars, first, order):  # type: ignore[no-untyped-
         order[k] = active[by_key[k]]
 
 
-@njit(cache=True, nogil=True)
-def find_leader(i, roads, cars, first, order):  # type: ignore[no-untyped-def]
+@kernel
+def find_leader(i: int, roads: RoadArrays, cars: CarStates, first: IntArray, order: IntArray) -> tuple[float, int]:
     """Gap to and number of the leader on car ``i``'s route, or of a vehicle whose rear blocks it; (FAR, -1): none
     near."""
     start = cars.route_first[i] + cars.leg[i]
@@ -123,8 +123,8 @@ def find_leader(i, roads, cars, first, order):  # type: ignore[no-untyped-def]
     return best, leader
 
 
-@njit(cache=True, nogil=True)
-def list_conflicts(active, roads, cars, head, chain, entry_car, entry_leg, entry_distance):  # type: ignore[no-untyped-def]
+@kernel
+def list_conflicts(active, roads, cars, head, chain, entry_car, entry_leg, entry_distance) -> int:  # type: ignore[no-untyped-def]
     """For each node where edges merge, the cars on the way to it and their distances, as a linked list."""
     head[:] = -1
     n = 0
@@ -144,8 +144,8 @@ def list_conflicts(active, roads, cars, head, chain, entry_car, entry_leg, entry
     return n
 
 
-@njit(cache=True, nogil=True)
-def accepts_gap(i, h, distance, roads, cars, lists, first, order):  # type: ignore[no-untyped-def]
+@kernel
+def accepts_gap(i, h, distance, roads, cars, lists, first, order) -> bool:  # type: ignore[no-untyped-def]
     """Gap acceptance: whether car ``i``, ``distance`` m from the node at the end of its route's edge ``h``, may
     merge."""
     head, chain, entry_car, entry_leg, entry_distance = lists
@@ -179,8 +179,8 @@ def accepts_gap(i, h, distance, roads, cars, lists, first, order):  # type: igno
     return True
 
 
-@njit(cache=True, nogil=True)
-def conflict_acceleration(i, h, distance, roads, cars, lists):  # type: ignore[no-untyped-def]
+@kernel
+def conflict_acceleration(i, h, distance, roads, cars, lists) -> float:  # type: ignore[no-untyped-def]
     """Acceleration behind vehicles that are nearer to the same node on another edge and have priority or have
     merged."""
     head, chain, entry_car, entry_leg, entry_distance = lists
@@ -216,8 +216,8 @@ def conflict_acceleration(i, h, distance, roads, cars, lists):  # type: ignore[n
     return acceleration
 
 
-@njit(cache=True, nogil=True)
-def route_acceleration(i, time_s, roads, cars, lists, first, order):  # type: ignore[no-untyped-def]
+@kernel
+def route_acceleration(i, time_s, roads, cars, lists, first, order) -> float:  # type: ignore[no-untyped-def]
     """Acceleration by the route: speed limits, red lights, give-way lines, merging vehicles."""
     v, half = cars.v[i], 0.5 * cars.length[i]
     start = cars.route_first[i] + cars.leg[i]
@@ -259,8 +259,8 @@ def route_acceleration(i, time_s, roads, cars, lists, first, order):  # type: ig
     return acceleration
 
 
-@njit(cache=True, nogil=True)
-def box_has_room(i, h, roads, cars, first, order):  # type: ignore[no-untyped-def]
+@kernel
+def box_has_room(i: int, h: int, roads: RoadArrays, cars: CarStates, first: IntArray, order: IntArray) -> bool:
     """Whether there is room for car ``i`` beyond the intersection box that follows edge ``h`` of its route."""
     if h + 2 >= cars.route_first[i + 1]:
         return True
@@ -272,11 +272,11 @@ def box_has_room(i, h, roads, cars, first, order):  # type: ignore[no-untyped-de
             room = cars.s[j] - 0.5 * cars.length[j] + cars.v[j] ** 2
     for k in range(first[box], first[box + 1]):
         room -= cars.length[order[k]] + 3.0
-    return room > cars.length[i] + 2.0
+    return bool(room > cars.length[i] + 2.0)
 
 
-@njit(cache=True, nogil=True)
-def box_is_clear(group, roads, cars, first, order):  # type: ignore[no-untyped-def]
+@kernel
+def box_is_clear(group: int, roads: RoadArrays, cars: CarStates, first: IntArray, order: IntArray) -> bool:
     """Whether crossing traffic has left the intersection box."""
     other = group ^ 1
     for q in range(roads.boxes_first[other], roads.boxes_first[other + 1]):
@@ -286,8 +286,8 @@ def box_is_clear(group, roads, cars, first, order):  # type: ignore[no-untyped-d
     return True
 
 
-@njit(cache=True, nogil=True)
-def advance(active, time_s, dt, roads, cars, scratch):  # type: ignore[no-untyped-def]
+@kernel
+def advance(active, time_s, dt, roads, cars, scratch) -> Mask:  # type: ignore[no-untyped-def]
     """Advance all active cars by ``dt``; returns which are still on their route (bool, like ``active``)."""
     first, order, head, chain, entry_car, entry_leg, entry_distance = scratch
     sort_by_edge(active, roads, cars, first, order)
@@ -323,8 +323,8 @@ def advance(active, time_s, dt, roads, cars, scratch):  # type: ignore[no-untype
     return on_route
 
 
-@njit(cache=True, nogil=True)
-def try_enter(i, active, roads, cars, first, order):  # type: ignore[no-untyped-def]
+@kernel
+def try_enter(i: int, active: IntArray, roads: RoadArrays, cars: CarStates, first: IntArray, order: IntArray) -> bool:
     """Insert car ``i`` at the start of its route if there is room; sets its speed and returns whether it is in."""
     sort_by_edge(active, roads, cars, first, order)
     gap, j = find_leader(i, roads, cars, first, order)

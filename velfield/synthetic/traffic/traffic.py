@@ -8,11 +8,11 @@ from collections.abc import Sequence, Sized
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, IntArray
 from schemas.simulation import TrafficSimulation
+from velfield.compiled import kernel
 from velfield.synthetic.city.road_network import RoadNetwork, clear_until_m
 from velfield.synthetic.traffic.driving import CarStates, RoadArrays, advance, try_enter
 
@@ -276,8 +276,13 @@ def _trajectories(
     )
 
 
-@njit(cache=True, nogil=True)
-def _states_at(vehicle, step, drives, paths):  # type: ignore[no-untyped-def]
+@kernel
+def _states_at(
+    vehicle: IntArray,
+    step: FloatArray,
+    drives: tuple[IntArray, IntArray, FloatArray, FloatArray],
+    paths: tuple[IntArray, FloatArray, FloatArray],
+) -> FloatArray:
     """Position x, y, direction and speed (m a step) of vehicles, each at its own time in steps."""
     start_step, first, driven, speed = drives
     path_first, points, along = paths
@@ -294,8 +299,8 @@ def _states_at(vehicle, step, drives, paths):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True)
-def _interpolate_step(s0, s1, v0, v1, t):  # type: ignore[no-untyped-def]
+@kernel
+def _interpolate_step(s0: float, s1: float, v0: float, v1: float, t: float) -> tuple[float, float]:
     """Distance and speed at fraction ``t`` of a step: cubic Hermite; extrapolated at constant speed."""
     if t < 0:
         return s0 + v0 * t, v0
@@ -306,11 +311,11 @@ def _interpolate_step(s0, s1, v0, v1, t):  # type: ignore[no-untyped-def]
     return s0 + t * (v0 + t * (q + t * c)), v0 + t * (2 * q + 3 * c * t)
 
 
-@njit(cache=True, nogil=True)
-def _point_on_path(points, along, s):  # type: ignore[no-untyped-def]
+@kernel
+def _point_on_path(points: FloatArray, along: FloatArray, s: float) -> tuple[float, float, float]:
     """Position and direction at distance ``s`` along a path; the direction is interpolated between pieces."""
     last = len(along) - 2
-    k = min(max(np.searchsorted(along, s, side="right") - 1, 0), last)
+    k = min(max(int(np.searchsorted(along, s, side="right")) - 1, 0), last)
     length = along[k + 1] - along[k]
     dx, dy = (points[k + 1, 0] - points[k, 0]) / length, (points[k + 1, 1] - points[k, 1]) / length
     x, y = points[k, 0] + (s - along[k]) * dx, points[k, 1] + (s - along[k]) * dy
