@@ -60,21 +60,14 @@ class Orchestration(ABC):
 class Threads(Orchestration):
     """Threads of this process; nothing is shown."""
 
-    def __init__(self) -> None:
-        self._pools: list[ThreadPoolExecutor] = []
-
     def run(self, flow: Callable[[], T], *, name: str, run_name: str, threads: int, parameters: Any) -> T:
-        with ThreadPoolExecutor(threads, name) as pool:
-            self._pools.append(pool)  # of a flow within another its own
-            try:
-                return flow()
-            finally:
-                self._pools.pop()
+        with ThreadPoolExecutor(threads, name) as self._pool:
+            return flow()
 
     def submit(
         self, do: Callable[[], T], *, name: str, run_name: str, retries: int = 0, after: "Sequence[Future[Any]]" = ()
     ) -> "Future[T]":
-        return self._pools[-1].submit(_call_with_retries, do, retries)
+        return self._pool.submit(_call_with_retries, do, retries)
 
     def mark_killed(self, run_name: str) -> None:
         pass  # nothing remembers them

@@ -14,9 +14,9 @@ import numpy as np
 from schemas.simulation import TrafficSimulation
 from tests.analysis.noisy_tracks import GSD_M, Noise, TrueTracks, analyse, clip, flight, true_tracks
 from tests.analysis.statements import Interval, Statement, Truth, conflicts_found, intervals, statements
-from tests.benchmarks.noise import true_u_turns, turn_middles_m
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.vehicle_classes import find_classes
+from velfield.synthetic.flight import Flight
 
 FLIGHT_S, CLIPS = 140.0, 4
 NOISES = (*map(Noise, (0.0, 0.2, 0.5, 1.0)), Noise(0.05, 0.3), Noise(0.05, 0.6, 1.5), Noise(0.05, 0.35, 0.5, True))
@@ -71,6 +71,35 @@ def make_cases(seed: int, *, clips: int = CLIPS) -> Iterator[Case]:
         turns = tuple(true_u_turns(piece, middles, seen_m=m) for m in (20.0, 0.0))
         name = f"{seed}/{k} {seconds:.0f} s {'signal' if signals else 'no signal'} {keep:g} 1/{every} {noise}"
         yield Case(name, analysis, Truth(made, signals, piece), (turns[0], turns[1]))
+
+
+def turn_middles_m(made: Flight) -> list[np.ndarray]:
+    """(2,) middles of the turns on which vehicles reverse from one carriageway of a road to the other."""
+    city = made.city
+    net = city.plan.road_network
+    into, out = net.in_edges(), net.out_edges()
+    middles = []
+    for edge in net.edges:
+        first, last = np.diff(edge.path[:2], axis=0)[0], np.diff(edge.path[-2:], axis=0)[0]
+        turn = abs(float(np.angle(np.exp(1j * (np.arctan2(*last[::-1]) - np.arctan2(*first[::-1]))))))
+        in_car_park = any(net.edges[k].kind == "aisle" for k in into[edge.start] + out[edge.end])
+        if edge.kind == "turn" and turn >= 2.6 and not in_car_park:
+            middles.append(city.to_px(edge.path[len(edge.path) // 2][None])[0] * GSD_M)
+    return middles
+
+
+def true_u_turns(tracks: TrueTracks, middles_m: list[np.ndarray], *, seen_m: float) -> set[int]:
+    """Numbers of the tracks that reverse, seen so far before and after the middle of the turn."""
+    out = set()
+    for k, (a, b) in enumerate(zip(tracks.first[:-1], tracks.first[1:], strict=True)):
+        own = tracks.xy_m[a:b]
+        along = np.r_[0.0, np.hypot(*np.diff(own, axis=0).T).cumsum()]
+        for middle in middles_m:
+            distance = np.hypot(*(own - middle).T)
+            at = along[np.argmin(distance)]
+            if distance.min() < 2.5 and min(at, along[-1] - at) >= seen_m:
+                out.add(k)
+    return out
 
 
 def _sparse(tracks: TrueTracks, keep: float, every: int, rng: np.random.Generator) -> TrueTracks:

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from concurrent.futures import Future
 from pathlib import Path
 
 import pytest
@@ -52,18 +51,13 @@ def test_what_may_pass_is_tried_again_and_its_error_is_kept(by: Orchestration, e
     assert len(calls) == attempts
 
 
-def test_tasks_read_those_before_and_a_flow_within_another_has_threads_of_its_own(by: Orchestration) -> None:
-    def inner() -> int:
+def test_tasks_read_those_before(by: Orchestration) -> None:
+    def flow() -> int:
         first = by.submit(lambda: 1, name="one", run_name="one")
         assert first.result(60) == 1
         return by.submit(lambda: 2, name="two", run_name="two", after=[first]).result(60)
 
-    def outer() -> tuple[int, int]:
-        nested = by.run(inner, name="inner", run_name="inner", threads=1, parameters=None)
-        last: Future[int] = by.submit(lambda: 3, name="three", run_name="three")
-        return nested, last.result(60)
-
-    assert by.run(outer, name="outer", run_name="outer", threads=1, parameters=None) == (2, 3)
+    assert by.run(flow, name="flow", run_name="flow", threads=1, parameters=None) == 2
 
 
 def test_an_error_of_the_flow_is_raised(by: Orchestration) -> None:

@@ -129,8 +129,10 @@ def test_a_setting_that_the_chosen_method_does_not_read_is_warned_of(settings: t
 
 def test_settings_that_are_read_and_defaults_of_presets_are_not_warned_of() -> None:
     """Warnings are errors here."""
-    resolve_config(preset="paper", settings=["registration.drop_fraction=0.1", "tracking.min_confidence=0.5"])
-    resolve_config(settings=["registration.model=homography", "field.lane_width_m=3", "frames.target_interval_s=0.1"])
+    paper = resolve_config(preset="paper", settings=["registration.drop_fraction=0.1", "tracking.min_confidence=0.5"])
+    assert (paper.registration.drop_fraction, paper.tracking.min_confidence) == (0.1, 0.5)
+    read = ["registration.model=homography", "field.lane_width_m=3", "frames.target_interval_s=0.1"]
+    assert resolve_config(settings=read).field.lane_width_m == 3
 
 
 def test_what_decides_whether_a_key_is_read_is_a_key_and_its_values_are_valid() -> None:

@@ -173,6 +173,11 @@ class TrafficAnalysis:
             if self.lanes.junctions[number].kind in ("intersection", "roundabout")
         }
 
+    def is_signalised(self, junction: int) -> bool | None:
+        """Whether a junction has a signal; None where that is not known."""
+        signal = self.signals.get(junction)
+        return signal.signalised if signal else False
+
     def profile(self, lane: int) -> list[Station]:
         """Speeds along a lane."""
         return speed_profile(self.lane_traffic, lane)

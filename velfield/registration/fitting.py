@@ -4,17 +4,16 @@ The default of a frame's registration is the joint fit (`velfield.registration.j
 ``model="polyprojective"`` only, and in inter-sensor registration (`velfield.registration.control`) always.
 
 Paper: registration. Case deletion fits all remaining points, then drops the fraction ``drop_fraction`` with the largest
-errors, until the mean error is small. The paper minimises by Downhill Simplex (`fit_by_simplex`, a reference for the
-tests); a linear fit refined by Levenberg-Marquardt (`fit_polyprojective`) reaches the same minimum some 300 times
-faster. `scipy.optimize.least_squares` with the same Jacobian is as accurate (500 points with 0.5 px of noise: 0.10 px
-either way) and takes 2.8 in place of 0.6 ms, of which case deletion and cross-validation need dozens.
+errors, until the mean error is small. The paper minimises by Downhill Simplex; a linear fit refined by
+Levenberg-Marquardt (`fit_polyprojective`) reaches the same minimum some 300 times faster.
+`scipy.optimize.least_squares` with the same Jacobian is as accurate (500 points with 0.5 px of noise: 0.10 px either
+way) and takes 2.8 in place of 0.6 ms, of which case deletion and cross-validation need dozens.
 """
 
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import minimize
 
 from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.errors import Failure
@@ -59,10 +58,6 @@ def _free_parameters(model: Model) -> IntArray:
     if model == "polyprojective":
         return np.arange(17)
     return np.array([0, 1, 2, 6, 7, 8, 12, 13])
-
-
-def _pack(coefficients: FloatArray) -> FloatArray:
-    return np.concatenate([coefficients[0], coefficients[1], coefficients[2, 1:]])
 
 
 def _unpack(parameters: FloatArray) -> FloatArray:
@@ -181,30 +176,6 @@ def _solve_normal_equations(design: FloatArray, target_normalised: FloatArray) -
     normal = design.T @ design
     normal[np.diag_indices_from(normal)] += 1e-12 * np.trace(normal) / len(normal)
     return np.asarray(np.linalg.solve(normal, design.T @ target_normalised))
-
-
-def fit_by_simplex(
-    source: FloatArray, target: FloatArray, *, start: PolyprojectiveTransform, model: Model = "polyprojective"
-) -> PolyprojectiveTransform:
-    """Minimise the same squares by the paper's Downhill Simplex (Nelder-Mead) from ``start``: a slow reference."""
-    columns = _free_parameters(model)
-    fixed = _pack(start.coefficients)
-
-    def squares(free: FloatArray) -> float:
-        parameters = fixed.copy()
-        parameters[columns] = free
-        mapped = PolyprojectiveTransform(_unpack(parameters), start.source, start.target)(source)
-        return float(np.nansum((mapped - target) ** 2)) if np.isfinite(mapped).all() else 1e30
-
-    best = fixed[columns]
-    for _ in range(8):  # a simplex may collapse in a narrow valley: restart it
-        result = minimize(
-            squares, best, method="Nelder-Mead", options={"maxiter": 20_000, "maxfev": 20_000, "adaptive": True}
-        )
-        best = result.x
-    parameters = fixed.copy()
-    parameters[columns] = best
-    return PolyprojectiveTransform(_unpack(parameters), start.source, start.target)
 
 
 def fit_by_case_deletion(

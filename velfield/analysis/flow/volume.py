@@ -124,13 +124,15 @@ def _ratio(slices: FlowSlices) -> Estimate | None:
     return Estimate(ratio, max(ratio - half, 0.0), ratio + half, n)
 
 
-def level_of_service(delay_s: float, *, signalised: bool) -> str:
-    """Level of service A to F by the control delay.
+def level_of_service(delay_s: float, *, signalised: bool | None) -> str:
+    """Level of service A to F by the control delay; empty where it is not known whether there is a signal.
 
     Examples
     --------
     >>> level_of_service(12.0, signalised=True), level_of_service(51.0, signalised=False)
     ('B', 'F')
     """
+    if signalised is None:
+        return ""
     limits = LOS_SIGNAL_S if signalised else LOS_YIELD_S
     return "ABCDEF"[int(np.searchsorted(limits, delay_s))]

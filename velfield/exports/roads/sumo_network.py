@@ -9,7 +9,7 @@ Each lane is an edge with one lane, of the shape that vehicles drove. SUMO's sam
 
 import io
 import zipfile
-from collections import Counter
+from collections import Counter, defaultdict
 from itertools import pairwise
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -140,15 +140,16 @@ def _edge_data_xml(network: RoadNetwork) -> str:
 
 def _turns_xml(network: RoadNetwork) -> str:
     """Vehicles from lane to lane by 15 minutes of their departure, in SUMO's format of edge relations."""
-    turns = Counter((int(trip.depart_s // BIN_S), pair) for trip in network.trips for pair in pairwise(trip.lanes))
+    turns: defaultdict[int, Counter[tuple[int, int]]] = defaultdict(Counter)
+    for trip in network.trips:
+        turns[int(trip.depart_s // BIN_S)].update(pairwise(trip.lanes))
     rows = []
     for k in range(max(int(np.ceil(network.duration_s / BIN_S)), 1)):
         end = min((k + 1) * BIN_S, max(network.duration_s, 0.01))
         rows.append(f'<interval begin="{k * BIN_S:.2f}" end="{end:.2f}" id="velfield">')
         rows += [
             f'    <edgeRelation from="lane{a}" to="lane{b}" count="{count}"/>'
-            for (at, (a, b)), count in sorted(turns.items())
-            if at == k
+            for (a, b), count in sorted(turns[k].items())
         ]
         rows.append("</interval>")
     return _document("data", rows)

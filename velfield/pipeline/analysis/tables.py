@@ -93,11 +93,9 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
     """Turning counts."""
 
     def service(found: JunctionMovements, m: Movement) -> str | None:
-        signal = analysis.signals.get(found.junction.number)
-        signalised = signal.signalised if signal else False
-        if m.delay_s is None or signalised is None:
+        if m.delay_s is None:
             return None
-        return level_of_service(m.delay_s.value, signalised=signalised)
+        return level_of_service(m.delay_s.value, signalised=analysis.is_signalised(found.junction.number)) or None
 
     columns: list[Column[tuple[JunctionMovements, Movement]]] = [
         Column("junction", "Junction", "", lambda row: row[1].junction),

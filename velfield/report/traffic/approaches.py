@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from velfield.analysis.flow.volume import LOS_SIGNAL_S, LOS_YIELD_S, level_of_service
 from velfield.analysis.movements.movements import JunctionMovements
-from velfield.analysis.signals.cycles import JunctionSignal
+from velfield.analysis.traffic_analysis import TrafficAnalysis
 
 
 @dataclass(frozen=True)
@@ -21,16 +21,16 @@ class ApproachDelay:
     limits_s: tuple[float, ...]
 
 
-def approach_delays(found: JunctionMovements, signal: JunctionSignal | None) -> list[ApproachDelay]:
+def approach_delays(analysis: TrafficAnalysis, found: JunctionMovements) -> list[ApproachDelay]:
     """Delay by arm, the mean over its movements weighted by their vehicles; the longest first."""
-    signalised = signal.signalised if signal else False
+    signalised = analysis.is_signalised(found.junction.number)
     out = []
     for arm in dict.fromkeys(m.arm_in for m in found.movements):
         known = [(m.delay_s.value, m.seen + m.inferred) for m in found.movements if m.arm_in == arm and m.delay_s]
         vehicles = sum(n for _, n in known)
         if vehicles:
             delay = sum(value * n for value, n in known) / vehicles
-            level = "" if signalised is None else level_of_service(delay, signalised=signalised)
+            level = level_of_service(delay, signalised=signalised)
             limits = {None: (), True: LOS_SIGNAL_S, False: LOS_YIELD_S}[signalised]
             out.append(ApproachDelay(arm, delay, vehicles, level, limits))
     return sorted(out, key=lambda one: -one.delay_s)

@@ -65,7 +65,7 @@ def traffic_diagrams(
             partial(draw_turning, found=found),
             4.6,
         )
-        delays = approach_delays(found, analysis.signals.get(found.junction.number))
+        delays = approach_delays(analysis, found)
         if delays:
             yield Diagram(
                 f"delay-{found.junction.number}",

@@ -71,7 +71,7 @@ def _waits(analysis: TrafficAnalysis) -> list[str]:
             continue
         parts = [
             f"from {d.arm} {d.delay_s:.0f} s" + (f" (level of service {d.level})" if d.level else "")
-            for d in approach_delays(found, signal)
+            for d in approach_delays(analysis, found)
         ]
         names = lane_names(found)
         longest = max(
