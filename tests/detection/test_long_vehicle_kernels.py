@@ -11,10 +11,7 @@ from velfield.detection.long_vehicles.feature_image import (
     FeatureImage,
     OffsetScorer,
     PatchScale,
-    RotatedPatch,
     features_of_reduced,
-    fill_integrals,
-    pack_poses,
     pack_words_kernel,
 )
 from velfield.detection.stumps import BoostedStumps
@@ -87,28 +84,6 @@ def plain_score(of: BoostedStumps, patch: np.ndarray, reach: tuple[int, int], ro
         value = plain_value(patch, reach, of.channels[k], of.rectangles[of.starts[k] : of.starts[k + 1]])
         total += of.leaves[k, int(value > of.thresholds[k])]
     return total / np.sqrt(rounds)
-
-
-def test_integral_images_are_sums_over_the_nearest_pixels() -> None:
-    features = features_of_reduced(noise(4), FINE)
-    rng = np.random.default_rng(6)
-    poses = pack_poses(rng.uniform(5, 70, (16, 2)), rng.uniform(0, np.pi, 16), FINE)[0]
-    patch = RotatedPatch.for_offsets(np.array([[3, 0]], np.int64), FINE)
-    found = patch.allocate()
-    fill_integrals(features.words, features.stride, poses, found)
-    v, u = (np.float32(np.arange(size) - (size - 1) / 2) for size in (patch.across, patch.along))
-    x, y = (
-        (poses[k] + v[:, None] * poses[4 + k])[:, None] + u[:, None] * poses[2 + k] for k in (0, 1)
-    )  # (across, along, LANES)
-    index = y.astype(np.int32) * features.stride + x.astype(np.int32)
-    words = features.words[index]
-    gx, gy = (np.float32((words >> shift & 1023).astype(np.int32) - 512) for shift in (8, 18))
-    c, s = poses[6], poses[7]
-    sampled = [words & 255, np.abs(gx * c + gy * s), np.abs(gy * c - gx * s)]
-    expected = np.zeros_like(found)
-    for k in range(3):
-        expected[k, 1:, 1:] = sampled[k].astype(np.int32).cumsum(axis=0).cumsum(axis=1)
-    np.testing.assert_array_equal(found, expected)
 
 
 @given(SEEDS)

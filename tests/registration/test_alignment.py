@@ -8,7 +8,6 @@ import pytest
 
 from tests.scenes import city
 from velfield.camera.lens import pinhole
-from velfield.registration import alignment
 from velfield.registration.alignment import (
     HALF_PATCH,
     align_patches,
@@ -84,32 +83,6 @@ def test_gain_offset_and_vignetting_do_not_matter(base: np.ndarray) -> None:
     assert changed < plain + 0.02
 
 
-def window_at(image: np.ndarray, x0: int, y0: int, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """A window of a frame as the kernel packs it, and its grey levels (rows - 1, columns, 4): each pixel's four."""
-    taps = cv2.getGaussianKernel(7, 0.8, cv2.CV_32F).ravel()[3:]
-    line, across = np.zeros(columns + 6, np.uint8), np.zeros((rows + 6) * columns, np.float32)
-    levels, window = np.zeros((rows + 1) * columns, np.int32), np.zeros(rows * columns, np.int64)
-    taps = taps if image.dtype == np.uint8 else taps[:0]
-    alignment._fill_window(image, taps, x0, y0, rows, columns, line, across, levels, window)
-    four = window.reshape(rows, columns)[:-1].astype("<i8").view("<u2").reshape(rows - 1, columns, 4)
-    return window, four / 256.0
-
-
-@pytest.mark.parametrize("at", [(100, 80), (-9, 60), (WIDTH - 20, 60), (90, -11), (90, HEIGHT - 9), (-10, -10)])
-@pytest.mark.parametrize("blurred", [False, True])
-def test_a_window_holds_the_blurred_frame(base: np.ndarray, at: tuple[int, int], blurred: bool) -> None:
-    """Against OpenCV's blur of the whole frame, whose border is mirrored; each pixel with three neighbours."""
-    rows, columns = 22, 24
-    wide = cv2.copyMakeBorder(base, 16, 16, 16, 16, cv2.BORDER_REFLECT_101)
-    plain = smooth_fine(wide)[16 + at[1] :, 16 + at[0] :][:rows, :columns]
-    _, four = window_at(smooth_fine(base) if blurred else base, *at, rows, columns)
-    for k, (dy, dx) in enumerate([(0, 0), (0, 1), (1, 0), (1, 1)]):
-        expected = plain[dy : rows - 1 + dy, dx:]
-        np.testing.assert_allclose(
-            four[:, : columns - 1, k][:, : expected.shape[1]], expected[:, : columns - 1], atol=0.003
-        )
-
-
 def test_bytes_align_as_the_blurred_frame_does(base: np.ndarray) -> None:
     """The same patches, to a thousandth of a pixel, those that the border cuts among them."""
     true = shift(4.0, -3.0)
@@ -130,31 +103,6 @@ def test_a_map_that_spreads_a_patch_over_the_frame_aligns_none(base: np.ndarray)
     aligned, in_frame = align_patches(base, transform(squeezed), templates, coarse=False, max_shift_px=2.5)
     assert in_frame > 0
     assert not len(aligned)
-
-
-def test_a_step_within_the_frame_is_the_plain_one(base: np.ndarray) -> None:
-    """Sums of vectors against the loops pixel by pixel, which patches at the border take."""
-    templates = make_templates(base)
-    derivative, shift = np.array([[0.98, -0.12], [0.11, 1.03]]), np.array([0.4, -0.7])
-    side, row, size = 2 * HALF_PATCH + 1, 16, 32
-    for start, patch in zip(templates.xy[5:25] + 0.3, templates.fine[5:25].reshape(-1, side, side), strict=True):
-        padded, packed = np.zeros((side + 2) * row, np.float32), np.zeros((4, side, row), np.float32)
-        inner, sums = np.zeros((side, row), np.float32), np.zeros(8 * 16, np.float32)
-        packed[0, :, :side], inner[1:-1, 1 : side - 1] = 1.0, 1.0
-        flat = packed.reshape(-1)
-        of_patch = alignment._prepare_patch(patch, 1, row, padded, flat, inner.reshape(-1), sums)
-        origin = np.floor(start).astype(int) - size // 2
-        window, _ = window_at(base, *origin.tolist(), size, size)
-        arguments = (derivative, shift, 1, side, flat, of_patch, 100.0, sums)
-        *found, mean = alignment._step_inside(window, size, start - origin, *arguments)
-        plain, visible = np.empty((side, side), np.float32), np.empty((side, side), np.bool_)
-        count, *means = alignment._sample_patch(
-            window, size, *origin.tolist(), base.shape, patch, start, derivative, shift, 1, plain, visible
-        )
-        assert count == side * side
-        assert mean == pytest.approx(means[0], abs=1e-3)
-        np.testing.assert_allclose(found, alignment._gauss_newton_step(patch, plain, visible, *means, 1), atol=1e-4)
-        np.testing.assert_allclose(packed[2, 1:-1, 1 : side - 1], np.gradient(patch, axis=1)[1:-1, 1:-1], atol=1e-4)
 
 
 def test_the_coarse_level_reaches_farther(base: np.ndarray) -> None:

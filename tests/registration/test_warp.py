@@ -148,17 +148,6 @@ def test_resampled_by_cells_a_frame_is_as_when_resampled_whole(scale: float, amp
     assert (by_cells.half_valid != half.half_valid).mean() < 0.01
 
 
-def test_scale_and_invalid_places_of_a_map_are_the_plain_ones() -> None:
-    coarse = np.random.default_rng(5).uniform(0, 3000, (9, 12, 2))
-    coarse[2, 3] = coarse[7, 0] = np.nan
-    along_x, along_y = np.diff(coarse, axis=1)[:-1], np.diff(coarse, axis=0)[:, :-1]
-    area = np.abs(along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0])
-    assert warp._raw_px_per_cell(coarse) == np.sqrt(np.median(area[np.isfinite(area)]))
-    assert np.isnan(warp._raw_px_per_cell(np.full((3, 3, 2), np.nan)))
-    plain = np.where(np.isfinite(coarse), coarse, warp._INVALID).astype(np.float32)
-    np.testing.assert_array_equal(warp._fill_invalid(coarse), plain)
-
-
 def test_a_map_inverted_on_a_grid_is_the_inverse() -> None:
     transform = wobbling(6.0)
     base = np.stack(np.meshgrid(np.arange(-40.0, 680, 16), np.arange(-40.0, 520, 16)), axis=2)

@@ -8,14 +8,12 @@ import pandas as pd
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-from schemas.arrays import IntArray, Mask
 from velfield.tracking.join_costs import GapLimits
 from velfield.tracking.joins import (
     END_COLUMNS,
     _assign,
     _assign_sparse,
     _assign_table,
-    _neighbourhood,
     reconnect_tracks,
 )
 
@@ -183,50 +181,6 @@ def test_a_margin_is_what_the_total_loses_without_the_pair(tracks: int) -> None:
     assert 0 < sure.sum() < len(best)
     assert margins[~sure] == pytest.approx(np.array(exact)[~sure], abs=1e-9)
     assert (margins <= np.array(exact) + 1e-9).all()
-
-
-@pytest.mark.parametrize("tracks", [4, 60, 900])
-def test_a_neighbourhood_is_the_nearest_by_candidates(tracks: int) -> None:
-    rng = np.random.default_rng(tracks)
-    row, column = np.unique(np.sort(rng.integers(0, tracks, (3 * tracks, 2)), axis=1), axis=0).T
-    gain, table = rng.uniform(0.01, 4, len(row)), np.zeros((tracks, tracks))
-    table[row, column] = gain
-    best = np.stack(linear_sum_assignment(-table), axis=1)
-    best = best[table[best[:, 0], best[:, 1]] > 0]
-    partner = (np.full(tracks, -1), np.full(tracks, -1))
-    partner[0][best[:, 0]], partner[1][best[:, 1]] = best.T[::-1]
-    by_column = np.argsort(column, kind="stable")
-    begins, begins_of_starts = (np.searchsorted(np.sort(one), np.arange(tracks + 1)) for one in (row, column))
-    beside = begins, np.ascontiguousarray(column), begins_of_starts, row[by_column]
-    at = np.full(tracks, -1), np.full(tracks, -1)
-    for end, start in best[:30].tolist():
-        ends, starts = nearest_by_candidates(end, start, table > 0, partner)
-        near, whole = _neighbourhood(end, start, beside, partner, gain, at)
-        np.testing.assert_array_equal(near, table[np.ix_(ends, starts)])
-        pairs = [(one, int(partner[0][one])) for one in ends if partner[0][one] in starts]
-        assert whole == sum(float(table[pair]) for pair in pairs)
-    assert (np.concatenate(at) == -1).all()
-
-
-def nearest_by_candidates(
-    end: int, start: int, candidate: Mask, partner: tuple[IntArray, IntArray]
-) -> tuple[list[int], list[int]]:
-    """`_neighbourhood` by lists: ends and starts, each with its partner."""
-    found: tuple[list[int], list[int]] = ([end], [start])
-    front = [(0, end), (1, start)]
-    while front and len(found[0]) + len(found[1]) < 80:
-        following = []
-        for side, one in front:
-            for other in np.flatnonzero(candidate[one] if side == 0 else candidate[:, one]).tolist():
-                if other not in found[1 - side]:
-                    found[1 - side].append(other)
-                    following.append((1 - side, other))
-                    back = int(partner[1 - side][other])
-                    if back >= 0 and back not in found[side]:
-                        found[side].append(back)
-                        following.append((side, back))
-        front = following
-    return found
 
 
 def test_memory_grows_with_the_pairs_and_not_with_their_square() -> None:

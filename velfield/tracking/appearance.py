@@ -209,20 +209,12 @@ _HALF_SIDE, _PART = 16, 256
 _SHIFTS = _shifts_shortest_first()
 
 
-@intrinsic
-def _split_row(_context, row, at, out, to):  # type: ignore[no-untyped-def]
+@kernel
+def _split_row(row: ByteArray, at: np.uint64, out: ByteArray, to: np.uint64) -> None:
     """Store the even ones of 32 bytes from ``row[at]`` on from ``out[to]`` on, the odd ones a part farther."""
-
-    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
-        v = Vectors(context, build, signature, arguments, 2 * _HALF_SIDE)
-        row, at, out, to = v.arguments
-        half, line = Vectors(context, build, signature, arguments, _HALF_SIDE), v.load(row, at)
-        for odd in range(2):
-            order = half.constant(WORD, np.arange(odd, 2 * _HALF_SIDE, 2))
-            half.store(build.shuffle_vector(line, line, order), out, to, odd * _PART)
-        return context.get_dummy_value()
-
-    return types.void(row, at, out, to), generate
+    for k in range(np.uint64(_HALF_SIDE)):
+        out[to + k] = row[at + k + k]
+        out[to + np.uint64(_PART) + k] = row[at + k + k + np.uint64(1)]
 
 
 @kernel

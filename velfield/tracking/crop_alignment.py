@@ -18,7 +18,6 @@ deviation.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -31,7 +30,7 @@ from numpy.typing import NDArray
 
 from schemas.arrays import ByteArray, Float32Array, FloatArray, IntArray
 from velfield.compiled import kernel
-from velfield.vectors import LONG, REAL, WORD, Vectors
+from velfield.vectors import LONG, REAL, Vectors
 
 CAR_LENGTH_PX = 14.0
 CAR_WIDTH_PX = 6.0
@@ -399,43 +398,22 @@ def _differences(grey, own, image, image_weight, top, u, v, near, lines, differe
     return n
 
 
-def _count(v: Vectors, values: Any, count: Any, holds: Callable[[Any], Any]) -> Any:
-    """Number of the first ``count`` values, a multiple of 32, for which a condition on vectors holds."""
-    build, total = v.build, cgutils.alloca_once_value(v.build, v.constant(WORD, 0))
-    with cgutils.for_range_slice(build, LONG(0), count, LONG(_RUN)) as (at, _):
-        one = build.zext(holds(v.load(values, at)), v.kind(WORD))
-        build.store(build.add(build.load(total), one), total)
-    return v.call("vector.reduce.add", build.load(total), returns=WORD)
+@kernel
+def _count_below(values: Float32Array, limit: np.float32) -> np.int32:
+    """Number of the values that lie below ``limit``."""
+    count = np.int32(0)
+    for k in range(np.uint64(values.size)):
+        count += np.int32(values[k] < limit)
+    return count
 
 
-@intrinsic
-def _count_below(_context, values, count, limit):  # type: ignore[no-untyped-def]
-    """Number of the first ``count`` values that lie below ``limit``."""
-
-    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
-        v = Vectors(context, build, signature, arguments, _RUN)
-        values, count, limit = v.arguments
-        limits = v.spread(limit)
-        return _count(v, values, count, lambda value: build.fcmp_ordered("<", value, limits))
-
-    return types.int32(values, count, limit), generate
-
-
-@intrinsic
-def _count_near(_context, values, count, middle, limit):  # type: ignore[no-untyped-def]
-    """Number of the first ``count`` values that lie closer than ``limit`` to ``middle``."""
-
-    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
-        v = Vectors(context, build, signature, arguments, _RUN)
-        values, count, middle, limit = v.arguments
-        middles, limits = v.spread(middle), v.spread(limit)
-
-        def is_near(value: Any) -> Any:
-            return build.fcmp_ordered("<", v.call("fabs", build.fsub(value, middles)), limits)
-
-        return _count(v, values, count, is_near)
-
-    return types.int32(values, count, middle, limit), generate
+@kernel
+def _count_near(values: Float32Array, middle: np.float32, limit: np.float32) -> np.int32:
+    """Number of the values that lie closer than ``limit`` to ``middle``."""
+    count = np.int32(0)
+    for k in range(np.uint64(values.size)):
+        count += np.int32(abs(values[k] - middle) < limit)
+    return count
 
 
 @kernel
@@ -444,17 +422,17 @@ def _median(values: Float32Array, middle: np.float32, count: int) -> np.float32:
     it; by halving the range, as counting takes vector instructions. Values above 256 do not count: so many of them
     follow that ``values`` are whole vectors."""
     low, high, steps = np.float32(-256.0), np.float32(256.0), _MEDIAN_STEPS
-    half, size = (count + 1) // 2, np.uint64(values.size)
+    half = (count + 1) // 2
     distances = not np.isnan(middle)
     if distances:
         low = np.float32(0.0)
-        if _count_near(values, size, middle, _NEAR_MEDIAN) >= half:
+        if _count_near(values, middle, _NEAR_MEDIAN) >= half:
             high, steps = _NEAR_MEDIAN, _NEAR_STEPS
-    elif _count_below(values, size, -_NEAR_MEDIAN) < half <= _count_below(values, size, _NEAR_MEDIAN):
+    elif _count_below(values, -_NEAR_MEDIAN) < half <= _count_below(values, _NEAR_MEDIAN):
         low, high, steps = -_NEAR_MEDIAN, _NEAR_MEDIAN, _NEAR_STEPS
     for _ in range(steps):
         limit = np.float32(0.5) * (low + high)
-        below = _count_near(values, size, middle, limit) if distances else _count_below(values, size, limit)
+        below = _count_near(values, middle, limit) if distances else _count_below(values, limit)
         if below < half:
             low = limit
         else:
