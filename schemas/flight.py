@@ -248,6 +248,12 @@ class FlightConfig(Model):
 PAPER_GSD_M = 0.23
 """The paper's ground sample distance, by which limits in metres become pixels where none is known."""
 
+
+def assumed_gsd_m(gsd_m: float | None) -> float:
+    """A ground sample distance, the paper's where none is known: for limits and pictures, never for a figure."""
+    return gsd_m or PAPER_GSD_M
+
+
 PRESETS: dict[Preset, dict[str, dict[str, object]]] = {
     "best": {},
     "fast": {

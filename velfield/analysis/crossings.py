@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from schemas.arrays import FloatArray, IntArray
-from schemas.flight import PAPER_GSD_M
+from schemas.flight import assumed_gsd_m
 from velfield.field.segments import Segments
 
 CROSSING_COLUMNS = ["track_id", "time_s", "x_px", "y_px", "vx_px_per_s", "vy_px_per_s", "speed_px_per_s", "direction"]
@@ -15,7 +15,7 @@ _HYSTERESIS_M = 2.0
 
 def hysteresis_px(gsd_m: float | None) -> float:
     """Distance beyond a line at which a vehicle has crossed it, px: half a car, more than jitter."""
-    return _HYSTERESIS_M / (gsd_m or PAPER_GSD_M)
+    return _HYSTERESIS_M / assumed_gsd_m(gsd_m)
 
 
 def find_crossings(

@@ -13,7 +13,7 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, IntArray, Mask
-from schemas.flight import PAPER_GSD_M, STATIONARY_SPEED_M_PER_S
+from schemas.flight import STATIONARY_SPEED_M_PER_S, assumed_gsd_m
 
 STATES = ("moving", "stopped", "parked")
 """``moving``: at some time; ``stopped``: never, but in a lane that others drive; ``parked``: never, and in none, or no
@@ -67,7 +67,7 @@ def find_vehicles(tracklets: pd.DataFrame, detections: pd.DataFrame, *, gsd_m: f
         10 m or more from where anything drove and 6 m from vehicles of higher scores, with a score below half the
         median of the traffic); by ``track_id``.
     """
-    metres = PAPER_GSD_M if gsd_m is None else gsd_m
+    metres = assumed_gsd_m(gsd_m)
     positions = _track_positions(tracklets, detections)
     groups = positions.groupby("track_id", sort=True)
     table = groups.agg(

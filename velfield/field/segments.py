@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, IntArray, Mask
-from schemas.flight import PAPER_GSD_M, FieldConfig
+from schemas.flight import FieldConfig, assumed_gsd_m
 from velfield.errors import InputError
 
 
@@ -72,7 +72,7 @@ class VelocityBins:
     @classmethod
     def from_config(cls, config: FieldConfig, gsd_m: float | None) -> "VelocityBins":
         """Bins of a configuration; without a ground sample distance its metres are converted by the paper's."""
-        metres = gsd_m or PAPER_GSD_M
+        metres = assumed_gsd_m(gsd_m)
         return cls(
             width_px_per_s=config.bin_width_m_per_s / metres,
             reach=max(1, ceil(config.max_speed_m_per_s / config.bin_width_m_per_s - 1e-9)),
@@ -135,12 +135,12 @@ def band_radius_px(config: FieldConfig, gsd_m: float | None) -> float | None:
     if config.path_width == "pixel":
         return None
     # Below 0.71 px a path could pass between the pixel centres and touch no pixel.
-    return max(config.lane_width_m / 4 / (gsd_m or PAPER_GSD_M), 0.75)
+    return max(config.lane_width_m / 4 / assumed_gsd_m(gsd_m), 0.75)
 
 
 def stationary_speed_px_per_s(config: FieldConfig, gsd_m: float | None) -> float:
     """The speed below which a vehicle is stationary and has no direction, px/s."""
-    return config.stationary_speed_m_per_s / (gsd_m or PAPER_GSD_M)
+    return config.stationary_speed_m_per_s / assumed_gsd_m(gsd_m)
 
 
 SEGMENT_DTYPE = np.dtype(

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 
-from schemas.flight import PAPER_GSD_M
+from schemas.flight import assumed_gsd_m
 from velfield.analysis.shared_vehicles import MAX_OFFSET_S, find_shared_vehicles
 from velfield.run.field_algebra import merge_fields
 from velfield.run.run import Run, open_run
@@ -54,7 +54,7 @@ def _shared_line(first: Run, second: Run) -> list[str]:
         table.assign(time_s=table["time_s"] - run.times_s[0] + shift_s)
         for table, run, shift_s in zip(tables, (first, second), (0.0, ahead_s), strict=True)
     )
-    shared = find_shared_vehicles(*tables, gsd_m=first.grid.gsd_m or PAPER_GSD_M)
+    shared = find_shared_vehicles(*tables, gsd_m=assumed_gsd_m(first.grid.gsd_m))
     counts = [table["track_id"].nunique() for table in tables]
     apart = f"; their clocks differ by {abs(shared.offset_s):.1f} s" if shared.offset_s else ""
     return [

@@ -9,7 +9,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray
-from schemas.flight import PAPER_GSD_M, FieldConfig
+from schemas.flight import FieldConfig, assumed_gsd_m
 from schemas.records import GridRecord
 from velfield.analysis.bottlenecks import find_bottlenecks
 from velfield.analysis.carriageways import find_carriageways
@@ -154,7 +154,7 @@ class RunAnalysis:
     @property
     def gsd_m(self) -> float:
         """Metres a base pixel; the paper's where it is unknown."""
-        return self.grid.gsd_m or PAPER_GSD_M
+        return assumed_gsd_m(self.grid.gsd_m)
 
     def _area_px(self, area_m2: float) -> int:
         return max(1, round(area_m2 / self.gsd_m**2))

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from schemas.arrays import FloatArray, IntArray, Mask
-from schemas.flight import PAPER_GSD_M, TrackingConfig
+from schemas.flight import TrackingConfig, assumed_gsd_m
 from velfield.compiled import kernel
 
 
@@ -55,7 +55,7 @@ class Limits:
         >>> Limits.from_config(TrackingConfig(), None).max_speed_px_per_s
         150.0
         """
-        metres = PAPER_GSD_M if gsd_m is None else gsd_m
+        metres = assumed_gsd_m(gsd_m)
         return cls(
             max_speed_px_per_s=config.max_speed_m_per_s / metres,
             stationary_speed_px_per_s=config.stationary_speed_m_per_s / metres,

@@ -21,7 +21,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, min_weight_full_bipartite_matching
 
 from schemas.arrays import FloatArray, IntArray, Mask
-from schemas.flight import PAPER_GSD_M
+from schemas.flight import assumed_gsd_m
 from velfield.compiled import kernel
 from velfield.tracking.dimensions import looks_difference
 from velfield.tracking.join_costs import CERTAINTY_SLOPE, STATIONARY_OFFSET_M, GapLimits, TrackEnds, find_candidates
@@ -192,7 +192,7 @@ def find_ends(tracklets: pd.DataFrame, track: IntArray, count: int, gsd_m: float
     A velocity is that of the last link, unless the links and positions before contradict it: half under a tree a crop
     aligns with the leaves.
     """
-    metres = PAPER_GSD_M if gsd_m is None else gsd_m
+    metres = assumed_gsd_m(gsd_m)
     first, last = end_rows(tracklets, track, count)
     starts = _ends(tracklets, track, first, ("0", "01", "12"), metres)
     return starts, _ends(tracklets, track, last, ("2", "12", "01"), metres)

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.special import expit, logit
 
 from schemas.arrays import ByteArray, FloatArray, IntArray, Mask
-from schemas.flight import PAPER_GSD_M, TrackingConfig
+from schemas.flight import TrackingConfig, assumed_gsd_m
 from velfield.errors import InputError
 from velfield.tracking.appearance import AppearanceFeatures, appearance_differences, prepare_crops
 from velfield.tracking.association import (
@@ -158,7 +158,7 @@ def link_windows(
         if i + 2 < len(good.tables) and good.adjacent(i + 1):
             triples.append(_select_triples(i, good, config.min_confidence, log))
             if weak:
-                stands_px = _STANDS_M / (PAPER_GSD_M if gsd_m is None else gsd_m)
+                stands_px = _STANDS_M / assumed_gsd_m(gsd_m)
                 triples.append(_select_moving(every, triples[-1], good, stands_px, log))
         good.release(i)
     rows, refined = tracklet_table(every, triples, limits, refine=config.refine)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.arrays import IntArray, Mask
-from schemas.flight import PAPER_GSD_M
+from schemas.flight import assumed_gsd_m
 from velfield.compiled import kernel
 from velfield.run.stores import HISTOGRAM, FieldStore
 
@@ -34,7 +34,7 @@ def cell_side(shape: tuple[int, int], gsd_m: float | None) -> int:
     (4, 1)
     """
     side = 1
-    while side * (gsd_m or PAPER_GSD_M) < _SIDE_M or shape[0] * shape[1] / side**2 > _MAX_CELLS:
+    while side * assumed_gsd_m(gsd_m) < _SIDE_M or shape[0] * shape[1] / side**2 > _MAX_CELLS:
         side *= 2
     return side
 

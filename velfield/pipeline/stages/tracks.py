@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from schemas.arrays import ByteArray, Float32Array, FloatArray, IntArray, Mask
-from schemas.flight import PAPER_GSD_M
+from schemas.flight import assumed_gsd_m
 from schemas.tables import DETECTION_COLUMNS, DIMENSION_COLUMNS, JOIN_COLUMNS, TRACK_POSITION_COLUMNS, TRACKLET_COLUMNS
 from velfield.parallel import parallel_map, usable_processors
 from velfield.pipeline.plan import Plan
@@ -71,7 +71,7 @@ def chain_tracks(plan: Plan) -> StageResult:
     tracklets = read_tables(sources, TRACKLET_COLUMNS, only=[*_IDS, *_MIDDLE, *END_COLUMNS])
     ids, chain = np.unique(assign_tracks(tracklets[_IDS].to_numpy(np.int64)), return_inverse=True)
     strips = sum_strips(layout, tracklets.assign(track_id=ids[chain]), len(plan.units))
-    gsd_m = read_tracking_gsd(layout) or PAPER_GSD_M
+    gsd_m = assumed_gsd_m(read_tracking_gsd(layout))
     starts, ends = find_ends(tracklets, chain, len(ids), gsd_m)
     candidates = read_candidates(plan, tracklets, gsd_m)
     context = find_context(plan, ends, starts, strips)
@@ -478,7 +478,7 @@ def mean_grey(strips: StripSums, tracks: IntArray) -> pd.Series:
 
 def find_context(plan: Plan, ends: TrackEnds, starts: TrackEnds, strips: StripSums) -> EndContext:
     """Places where chains end and start, and their appearance there."""
-    metres = read_tracking_gsd(plan.layout) or PAPER_GSD_M
+    metres = assumed_gsd_m(read_tracking_gsd(plan.layout))
     maps = FrameTransforms.open(plan.layout, plan.config)
     times_s = open_frames(plan.layout.frames).column("time_s")[usable_frames(plan)]
     first_s, last_s = (times_s[0], times_s[-1]) if len(times_s) else (0.0, 0.0)
