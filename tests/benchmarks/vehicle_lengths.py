@@ -17,7 +17,7 @@ from schemas.arrays import FloatArray
 from schemas.scale import ScaleEstimate
 from schemas.simulation import SimulationConfig
 from velfield.analysis.vehicle_scale import CAR_LENGTH_M, POPULATION_SD, TRACK_LENGTH_SD, estimate_vehicle_scale
-from velfield.detection.detect import oriented_strips
+from velfield.detection.crops import oriented_strips
 from velfield.detection.frame import half_resolution
 from velfield.pipeline.stages.labels import rescale
 from velfield.sources.scale import choose_scale

@@ -7,15 +7,11 @@ import numpy as np
 import pytest
 
 from schemas.arrays import GreyImage, Mask, Points
+from velfield.detection.boxes import split_into_boxes
 from velfield.detection.changes import CELL_PX
 from velfield.detection.cnn.detector import CnnDetector
-from velfield.detection.detect import (
-    SearchedFrame,
-    changed_cells,
-    oriented_strips,
-    search_frame,
-    split_into_boxes,
-)
+from velfield.detection.crops import oriented_strips
+from velfield.detection.detect import SearchedFrame, changed_cells, search_frame
 from velfield.detection.frame import ComparableFrame, half_resolution
 from velfield.detection.interface import Detections, Detector, concatenate
 from velfield.detection.mosaic import Box, assemble_kernel, find_in_boxes, owners_kernel, pack_boxes

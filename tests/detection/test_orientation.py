@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from velfield.detection.detect import oriented_patches, upright_chips
+from velfield.detection.crops import oriented_patches, upright_chips
 from velfield.detection.orientation import (
     axial_difference,
     contradict_axes,

@@ -5,7 +5,7 @@ import pytest
 from scipy.interpolate import BSpline, RegularGridInterpolator
 
 from velfield.camera.lens import HarrisLens
-from velfield.registration import kernels
+from velfield.registration import fit_kernels, kernels
 
 WIDTH, HEIGHT, KNOTS, FOLDS = 640, 480, 12, 3
 SOURCE, TARGET = np.array([320.0, 240.0, 1 / 320]), np.array([410.0, 190.0, 1 / 400])
@@ -83,7 +83,7 @@ def jacobian(problem: dict[str, np.ndarray]) -> np.ndarray:
 def equations(problem: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     names = ("undistorted", "corrected", "first", "basis", "observed", "weight", "fold")
     arguments = (problem[name] for name in names)
-    return kernels.normal_equations(*arguments, FOLDS, KNOTS, problem["coefficients"], NORMS, CENTRE)
+    return fit_kernels.normal_equations(*arguments, FOLDS, KNOTS, problem["coefficients"], NORMS, CENTRE)
 
 
 def symmetric(bands: np.ndarray, width: int) -> np.ndarray:
@@ -111,19 +111,23 @@ def normal_equations(problem: dict[str, np.ndarray]) -> tuple[np.ndarray, np.nda
 
 def test_evaluation_in_one_is_that_of_the_kernels_one_by_one(problem: dict[str, np.ndarray]) -> None:
     p = problem
-    corrected, found = kernels.evaluate(
+    corrected, found = fit_kernels.evaluate(
         p["undistorted"], p["first"], p["basis"], p["observed"], p["theta"], KNOTS, NORMS, CENTRE
     )
     np.testing.assert_allclose(corrected, p["corrected"], atol=1e-9)
     np.testing.assert_allclose(found, residuals(p["theta"], p["undistorted"], p["rows"], p["observed"]), atol=1e-9)
-    still, _ = kernels.evaluate(p["undistorted"], p["first"], p["basis"], p["observed"], p["theta"], 0, NORMS, CENTRE)
+    still, _ = fit_kernels.evaluate(
+        p["undistorted"], p["first"], p["basis"], p["observed"], p["theta"], 0, NORMS, CENTRE
+    )
     np.testing.assert_array_equal(still, p["undistorted"])
 
 
 def test_evaluation_has_no_value_beyond_the_pole(problem: dict[str, np.ndarray]) -> None:
     p, theta = problem, problem["theta"].copy()
     theta[12:17] = [-2.0, 0.0, 0.0, 0.0, 0.0]
-    _, found = kernels.evaluate(p["undistorted"], p["first"], p["basis"], p["observed"], theta, KNOTS, NORMS, CENTRE)
+    _, found = fit_kernels.evaluate(
+        p["undistorted"], p["first"], p["basis"], p["observed"], theta, KNOTS, NORMS, CENTRE
+    )
     beyond = (problem["corrected"][:, 0] - SOURCE[0]) * SOURCE[2] >= 0.5
     assert beyond.any()
     np.testing.assert_array_equal(np.isnan(found).all(axis=1), beyond)
@@ -164,7 +168,7 @@ def test_points_without_weight_do_not_enter_the_normal_equations(problem: dict[s
 def test_predicted_change_is_that_of_the_model_to_first_order(problem: dict[str, np.ndarray]) -> None:
     step = 1e-5 * np.random.default_rng(1).normal(size=(FOLDS, len(problem["theta"])))
     names = ("undistorted", "corrected", "first", "basis")
-    change = kernels.predict_change(
+    change = fit_kernels.predict_change(
         *(problem[name] for name in names), step, problem["fold"], KNOTS, problem["coefficients"], NORMS, CENTRE
     )
     for fold in range(FOLDS):
@@ -195,14 +199,14 @@ def test_a_step_is_that_of_the_full_matrix(problem: dict[str, np.ndarray], homog
         return out
 
     arguments = (*equations(problem), stiffness, gauge, gauge_weight, prior, free, theta)
-    (found,) = kernels.solve_steps(*arguments, False)
+    (found,) = fit_kernels.solve_steps(*arguments, False)
     np.testing.assert_allclose(found, step([*range(FOLDS)]), rtol=1e-6, atol=1e-9)
-    steps, expected = kernels.solve_steps(*arguments, True), 0.0
+    steps, expected = fit_kernels.solve_steps(*arguments, True), 0.0
     for fold in range(FOLDS):
         left = step([f for f in range(FOLDS) if f != fold])
         np.testing.assert_allclose(steps[fold], left, rtol=1e-6, atol=1e-9)
         expected += squares[fold] - 2 * left @ right[fold] + left @ normal[fold] @ left  # of the fold left out
-    assert kernels.predict_squares(*equations(problem), steps) == pytest.approx(expected, rel=1e-9)
+    assert fit_kernels.predict_squares(*equations(problem), steps) == pytest.approx(expected, rel=1e-9)
 
 
 def test_an_indefinite_matrix_has_no_step(problem: dict[str, np.ndarray]) -> None:
@@ -211,7 +215,7 @@ def test_an_indefinite_matrix_has_no_step(problem: dict[str, np.ndarray]) -> Non
     for row, prior in ((-1e9, 1.0), (1.0, -1e9)):
         stiffness[5, 0] = row
         arguments = (*equations(problem), stiffness, gauge, 1.0, np.full(17, prior), free, theta)
-        assert np.isnan(kernels.solve_steps(*arguments, True)).all()
+        assert np.isnan(fit_kernels.solve_steps(*arguments, True)).all()
 
 
 def test_weights_and_scale_are_those_of_numpy() -> None:
@@ -219,16 +223,16 @@ def test_weights_and_scale_are_those_of_numpy() -> None:
     residuals, sigma = rng.normal(size=(100, 2)), rng.uniform(0.1, 1.0, 100)
     residuals[:2] = [[np.nan, 1.0], [np.inf, 1.0]]
     size = np.linalg.norm(residuals, axis=1) / sigma
-    assert kernels.median_size(residuals, sigma) == pytest.approx(np.median(size[np.isfinite(size)]))
+    assert fit_kernels.median_size(residuals, sigma) == pytest.approx(np.median(size[np.isfinite(size)]))
     expected = np.nan_to_num(1 / (1 + (size / 2.5) ** 2) ** 2)
-    np.testing.assert_allclose(kernels.geman_mcclure(residuals, sigma, 2.5), expected, atol=1e-15)
-    assert np.isnan(kernels.median_size(residuals[:2], sigma))
+    np.testing.assert_allclose(fit_kernels.geman_mcclure(residuals, sigma, 2.5), expected, atol=1e-15)
+    assert np.isnan(fit_kernels.median_size(residuals[:2], sigma))
 
 
 def test_only_points_of_weight_must_be_finite() -> None:
     residuals = np.array([[1.0, 2.0], [np.nan, 0.0], [3.0, np.inf]])
-    assert kernels.are_finite(residuals, np.array([1.0, 0.0, 0.0]))
-    assert not kernels.are_finite(residuals, np.array([1.0, 0.0, 0.5]))
+    assert fit_kernels.are_finite(residuals, np.array([1.0, 0.0, 0.0]))
+    assert not fit_kernels.are_finite(residuals, np.array([1.0, 0.0, 0.5]))
 
 
 def test_spline_basis_is_the_uniform_cubic_b_spline() -> None:

@@ -5,9 +5,6 @@ barrel distortion. A model is an immutable value with a closed-form undistortion
 division) or computed by Newton's method to 1e-9 px (polynomial), NaN where there is none.
 
 Other packages use the protocol `Lens` and do not depend on the model.
-
-Numba's cache asks for a kernel's own file alone: after a change of `undistort` or `RadialModel` change or touch
-``velfield/registration/kernels.py`` too, whose kernels have it in them.
 """
 
 from dataclasses import dataclass

@@ -7,8 +7,7 @@ from schemas.arrays import Mask
 from velfield.compiled import kernel
 
 CELL_PX = 8
-"""Side of the cells in which frames are compared and searched, working px. It stands beside the kernels that hold it:
-numba's cache asks whether a kernel's own file has changed."""
+"""Side of the cells in which frames are compared and searched, working px."""
 BOX_PX = 8
 """Side of the boxes that the difference is averaged over: about half a car."""
 BOX_AREA = (BOX_PX // 2) ** 2

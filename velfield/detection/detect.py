@@ -18,15 +18,14 @@ Candidates of a lower score than a detection's are kept apart (`SearchedFrame.we
 must be, they are enough evidence of it, as in the second association of ByteTrack (Zhang and others 2022).
 """
 
-import math
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 
 import cv2
 import numpy as np
 
-from schemas.arrays import ByteArray, Float32Array, FloatArray, GreyImage, IntArray, Mask
-from velfield.compiled import kernel
+from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
+from velfield.detection.boxes import split_into_boxes
 from velfield.detection.changes import (
     BOX_AREA,
     BOX_PX,
@@ -36,10 +35,11 @@ from velfield.detection.changes import (
     changed_kernel,
     difference_kernel,
 )
+from velfield.detection.crops import CHIP_PX, oriented_patches, oriented_strips, upright_chips
 from velfield.detection.frame import SearchableFrame, half_resolution
 from velfield.detection.interface import Detections, Detector, concatenate
 from velfield.detection.long_vehicles.classifier import confirm_long_vehicles
-from velfield.detection.mosaic import Box, find_in_boxes
+from velfield.detection.mosaic import find_in_boxes
 from velfield.detection.nms import nms_oriented
 
 _SLOW_PX = 96
@@ -58,96 +58,6 @@ _REACH_CARS = 1.75
 _UNSURE_FRACTION = 0.1
 """Fraction of the detections, those with the lowest scores, that is never kept. Most false detections are among them,
 and kept detections make tracklets: precision 0.984 with all kept, 0.988 without these, in a simulated city."""
-
-
-_CHIP_PX = 32
-"""Side of the upright chips, the widest crops."""
-
-
-def oriented_patches(
-    image: GreyImage, xy: FloatArray, orientation_rad: FloatArray, *, width: int = 8, length: int = 16
-) -> GreyImage:
-    """Patches rotated so that the car's axis runs along the columns (paper: the 8 x 16 oriented patch).
-
-    Parameters
-    ----------
-    image
-        (h, w) uint8 on the working grid.
-    xy, orientation_rad
-        (n, 2) centres, working px, and (n,) axes.
-
-    Returns
-    -------
-    (n, length, width) uint8
-    """
-    count = len(xy)
-    if not count:
-        return np.empty((0, length, width), np.uint8)
-    x, y = _grid_kernel(xy, np.cos(orientation_rad), np.sin(orientation_rad), length, width)
-    return _sample(image, x, y).reshape(count, length, width)
-
-
-@kernel
-def _grid_kernel(
-    xy: FloatArray, cosine: FloatArray, sine: FloatArray, length: int, width: int
-) -> tuple[Float32Array, Float32Array]:
-    """Where the pixels of patches lie in an image, row by row: x and y, each (n, length width) float32."""
-    x, y = np.empty((len(xy), length * width), np.float32), np.empty((len(xy), length * width), np.float32)
-    for n in range(len(xy)):
-        for i in range(length):
-            along = i - (length - 1) / 2
-            begin_x, begin_y = xy[n, 0] + along * cosine[n], xy[n, 1] + along * sine[n]
-            for j in range(width):
-                across = j - (width - 1) / 2
-                x[n, i * width + j] = begin_x - across * sine[n]
-                y[n, i * width + j] = begin_y + across * cosine[n]
-    return x, y
-
-
-def upright_chips(image: GreyImage, xy: FloatArray, *, side: int = _CHIP_PX) -> GreyImage:
-    """Crops about the rounded positions, (n, side, side) uint8: pixel (side / 2, side / 2) is the rounded position."""
-    return np.asarray(_chips_kernel(image, np.rint(xy).astype(np.int64) - side // 2, side))
-
-
-@kernel
-def _chips_kernel(image: ByteArray, corners: IntArray, side: int) -> ByteArray:
-    """Crops with these corners (n, 2); beyond the image its edge goes on."""
-    height, width = image.shape
-    out = np.empty((len(corners), side, side), np.uint8)
-    for n in range(len(corners)):
-        left, top = corners[n]
-        if 0 <= left <= width - side and 0 <= top <= height - side:
-            for i in range(side):
-                source, target = image[top + i], out[n, i]
-                for j in range(np.uint64(side)):
-                    target[j] = source[np.uint64(left) + j]
-            continue
-        for i in range(side):
-            y = min(max(corners[n, 1] + i, 0), height - 1)
-            for j in range(side):
-                out[n, i, j] = image[y, min(max(corners[n, 0] + j, 0), width - 1)]
-    return out
-
-
-def oriented_strips(
-    half_image: GreyImage, xy: FloatArray, orientation_rad: FloatArray, *, length: int = 32, width: int = 10
-) -> GreyImage:
-    """Patches of twice a bus's length at half the resolution, the axis along the columns: (n, length, width) uint8.
-
-    Parameters
-    ----------
-    half_image
-        The image on the working grid at half its resolution, as of `ComparableFrame.half_image`.
-    """
-    return oriented_patches(half_image, (xy - 0.5) / 2, orientation_rad, width=width, length=length)
-
-
-def _sample(image: GreyImage, x: Float32Array, y: Float32Array) -> GreyImage:
-    rows = []
-    for start in range(0, len(x), 16_000):  # remap takes at most 32,767 rows
-        part = slice(start, start + 16_000)
-        rows.append(cv2.remap(image, x[part], y[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
-    return np.asarray(np.concatenate(rows) if len(rows) > 1 else rows[0], np.uint8)
 
 
 @dataclass(frozen=True)
@@ -296,7 +206,7 @@ def _cells_of_crops(xy: FloatArray, shape: tuple[int, ...]) -> Mask:
     """Cells (rows, columns) that the crops about positions reach into."""
     cells = np.zeros(shape, bool)
     cells[_locate_cells(xy, shape)] = True
-    return _grow(cells, -(-_CHIP_PX // (2 * CELL_PX)))
+    return _grow(cells, -(-CHIP_PX // (2 * CELL_PX)))
 
 
 def changed_cells(frame: SearchableFrame, reference: SearchableFrame, slope: Float32Array | None = None) -> Mask:
@@ -348,155 +258,6 @@ def _slow_part(difference: Float32Array, covered: Float32Array) -> Float32Array:
     reach = _SLOW_PX // CELL_PX
     parts = [cv2.blur(mean, (reach, reach), borderType=cv2.BORDER_REPLICATE) for mean in (difference, covered)]
     return np.asarray(parts[0] / np.maximum(parts[1], 1e-3), np.float32)
-
-
-def split_into_boxes(cells: Mask, margin: float, box_cost: float) -> list[Box]:
-    """Disjoint boxes that cover the marked cells, cheap to search.
-
-    Boxes are split in two, by the row or the column after which both are smallest, down to single cells; then, from
-    the smallest up, a box takes the place of its parts where it costs no more. The cost of a box is its area with a
-    margin on every side, plus a constant.
-
-    Parameters
-    ----------
-    cells
-        (rows, columns).
-    margin, box_cost
-        In cells, and in areas of a cell.
-    """
-    found = _split_kernel(np.ascontiguousarray(cells), margin, box_cost)
-    return [(int(top), int(left), int(bottom), int(right)) for top, left, bottom, right in found]
-
-
-@kernel
-def _split_kernel(cells: Mask, margin: float, box_cost: float) -> IntArray:
-    """Boxes (n, 4). Nodes of the tree are numbered so that parts come after the box that they are parts of."""
-    height, width = cells.shape
-    of_rows, of_columns = np.empty((height + 1, 2), np.int64), np.empty((width + 1, 2), np.int64)
-    of_rows[height], of_columns[width] = 0, 0
-    _find_extents(cells, (0, 0, height, width), of_rows, of_columns)
-    nodes = [_bounds(of_rows, 0, height)]
-    parts = [(0, 0)]
-    done = 0
-    two_cells = 2 * ((1 + 2 * margin) ** 2 + box_cost)
-    while done < len(nodes):
-        top, left, bottom, right = nodes[done]
-        cost = (bottom - top + 2 * margin) * (right - left + 2 * margin) + box_cost
-        # Parts are not made where they cannot cost less: two boxes cost no less than those of two cells, nor than
-        # squares that hold as many cells as are marked.
-        marked = 0.0
-        if cost > two_cells:
-            marked = _find_extents(cells, nodes[done], of_rows, of_columns)
-        if cost <= max(two_cells, marked + 4 * margin * math.sqrt(marked) + 8 * margin * margin + 2 * box_cost):
-            done += 1
-            continue
-        by_row, row = _best_split(of_rows, top, bottom, margin)
-        by_column, column = _best_split(of_columns, left, right, margin)
-        if min(by_row, by_column) < np.inf:
-            if by_row <= by_column:
-                nodes.append(_bounds(of_rows, top, row))
-                nodes.append(_bounds(of_rows, row, bottom))
-            else:
-                for begin, end in ((left, column), (column, right)):
-                    first_column, first_row, last_column, last_row = _bounds(of_columns, begin, end)
-                    nodes.append((first_row, first_column, last_row, last_column))
-            parts[done] = (len(nodes) - 2, len(nodes) - 1)
-            parts.append((0, 0))
-            parts.append((0, 0))
-        done += 1
-    costs = np.zeros(len(nodes))
-    split = np.zeros(len(nodes), np.bool_)
-    for k in range(len(nodes) - 1, -1, -1):
-        top, left, bottom, right = nodes[k]
-        costs[k] = (bottom - top + 2 * margin) * (right - left + 2 * margin) + box_cost
-        one, other = parts[k]
-        if one > 0 and costs[one] + costs[other] < costs[k]:
-            costs[k], split[k] = costs[one] + costs[other], True
-    boxes = np.empty((len(nodes), 4), np.int64)
-    count = 0
-    taken = np.zeros(len(nodes), np.bool_)
-    taken[0] = nodes[0][2] > nodes[0][0]
-    for k in range(len(nodes)):
-        if taken[k] and split[k]:
-            taken[parts[k][0]] = taken[parts[k][1]] = True
-        elif taken[k]:
-            for side in range(4):
-                boxes[count, side] = nodes[k][side]
-            count += 1
-    return boxes[:count]
-
-
-@kernel
-def _find_extents(
-    cells: Mask, box: tuple[int, int, int, int] | tuple[int, ...], of_rows: IntArray, of_columns: IntArray
-) -> int:
-    """First marked cell of each row and column of a box, and that after the last; the last is 0 where none is.
-
-    Returns their number.
-    """
-    top, left, bottom, right = box
-    width, count = np.uint64(right - left), 0
-    # Of the columns, counted from ``left``: without a branch on each cell, so that the loop is vectorised.
-    first, last = np.full(right - left, bottom, np.int32), np.zeros(right - left, np.int32)
-    for row in range(top, bottom):
-        line, marked, below, after = cells[row, left:right], np.int32(0), np.int32(row), np.int32(row + 1)
-        for column in range(width):
-            marked += np.int32(line[column])
-        of_rows[row, 0], of_rows[row, 1] = right, 0
-        if marked == 0:
-            continue
-        count += int(marked)
-        for column in range(width):
-            first[column] = min(first[column], below) if line[column] else first[column]
-            last[column] = after if line[column] else last[column]
-        begin, end = left, right
-        while not cells[row, begin]:
-            begin += 1
-        while not cells[row, end - 1]:
-            end -= 1
-        of_rows[row, 0], of_rows[row, 1] = begin, end
-    for column in range(width):
-        of_columns[left + column, 0], of_columns[left + column, 1] = first[column], last[column]
-    return count
-
-
-@kernel
-def _bounds(extents: IntArray, begin: int, end: int) -> tuple[int, ...]:
-    """Bounding box of the marked cells in a range of rows (or columns): first row and column, and one past the last."""
-    while begin < end and extents[begin, 1] == 0:
-        begin += 1
-    while end > begin and extents[end - 1, 1] == 0:
-        end -= 1
-    first, last = extents[begin, 0], extents[begin, 1]
-    for line in range(begin + 1, end):
-        if extents[line, 1] > 0:
-            first, last = min(first, extents[line, 0]), max(last, extents[line, 1])
-    return begin, first, end, last
-
-
-@kernel
-def _best_split(extents: IntArray, begin: int, end: int, margin: float) -> tuple[float, int]:
-    """The least area of two boxes with margins, of the rows (or columns) of a box before and after one, and that row;
-    inf for one row. The first and the last have a mark."""
-    count = end - begin
-    if count < 2:
-        return np.inf, begin
-    area = np.zeros(count)
-    for way in range(2):
-        edge = 0 if way == 0 else count - 1
-        first, last, nearest = extents[begin + edge, 0], extents[begin + edge, 1], edge
-        for step in range(count - 1):
-            line = step if way == 0 else count - 1 - step
-            if extents[begin + line, 1] > 0:
-                first, last = min(first, extents[begin + line, 0]), max(last, extents[begin + line, 1])
-                nearest = line
-            size = abs(nearest - edge) + 1
-            area[line + 1 if way == 0 else line] += (size + 2 * margin) * (last - first + 2 * margin)
-    best = 1
-    for line in range(2, count):
-        if area[line] < area[best]:
-            best = line
-    return area[best], begin + best
 
 
 def _outside(detections: Detections, searched: Mask, half_valid: Mask) -> Detections:

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 
 from schemas.arrays import ByteArray, GreyImage
-from velfield.detection.detect import detect_frame, upright_chips
+from velfield.detection.crops import upright_chips
+from velfield.detection.detect import detect_frame
 from velfield.detection.evaluation import MATCH_PX, match_greedy
 from velfield.detection.interface import Detector
 from velfield.detection.samples import LabelledImage

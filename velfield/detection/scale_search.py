@@ -13,7 +13,7 @@ import numpy as np
 
 from schemas.arrays import FloatArray, GreyImage, Mask
 from schemas.detector import DetectorConfig
-from velfield.detection.detect import oriented_strips
+from velfield.detection.crops import oriented_strips
 from velfield.detection.frame import half_resolution
 from velfield.detection.interface import Detector
 

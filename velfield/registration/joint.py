@@ -23,7 +23,7 @@ import numpy as np
 from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.camera.lens import Lens
 from velfield.errors import Failure
-from velfield.registration import kernels
+from velfield.registration import fit_kernels, kernels
 from velfield.registration.transforms import (
     FrameTransform,
     PolyprojectiveTransform,
@@ -141,7 +141,7 @@ def _rms(vectors: FloatArray) -> float:
 
 
 _Equations: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
-"""Bands, border and corner of the normal equations of each fold, see `kernels.normal_equations`."""
+"""Bands, border and corner of the normal equations of each fold, see `fit_kernels.normal_equations`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,13 +172,13 @@ class _Problem:
 
     def evaluate(self, theta: FloatArray) -> "_State":
         """The map by these parameters, at all control points."""
-        corrected, residuals = kernels.evaluate(
+        corrected, residuals = fit_kernels.evaluate(
             self.undistorted, self.first, self.basis, self.xy_base, theta, self.knots, self.norms, self.centre
         )
         return _State(theta, corrected, residuals)
 
     def equations(self, state: "_State", weight: FloatArray, fold: IntArray, folds: int) -> _Equations:
-        return kernels.normal_equations(
+        return fit_kernels.normal_equations(
             self.undistorted,
             state.corrected,
             self.first,
@@ -198,7 +198,7 @@ class _Problem:
     ) -> FloatArray:
         """Gauss-Newton step (1, p) of the penalised squares, or those (folds, p) that leave out a fold each; zero for
         fixed parameters."""
-        return kernels.solve_steps(
+        return fit_kernels.solve_steps(
             *equations,
             _stiffness_bands(self.knots, *stiffness),
             self.gauge,
@@ -376,9 +376,9 @@ def _weights_and_scale(
     residuals: FloatArray, sigma: FloatArray, width: float, limit: float
 ) -> tuple[FloatArray, float]:
     """Geman-McClure weights (n,) and the robust scale (median) of the residuals over sigma."""
-    median = float(kernels.median_size(residuals, sigma))
+    median = float(fit_kernels.median_size(residuals, sigma))
     scale = max(min(median / 1.1774, limit) if np.isfinite(median) else limit, _MIN_SIGMA_PX)
-    return kernels.geman_mcclure(residuals, sigma, width * scale), scale
+    return fit_kernels.geman_mcclure(residuals, sigma, width * scale), scale
 
 
 def is_inlier(weights: FloatArray) -> Mask:
@@ -388,7 +388,7 @@ def is_inlier(weights: FloatArray) -> Mask:
 
 def robust_scale(residuals: FloatArray, sigma: FloatArray) -> float:
     """Robust standard deviation per coordinate of residuals (n, 2) over sigma (n,), by their median."""
-    return max(float(kernels.median_size(residuals, sigma)) / 1.1774, _MIN_SIGMA_PX)
+    return max(float(fit_kernels.median_size(residuals, sigma)) / 1.1774, _MIN_SIGMA_PX)
 
 
 def robust_weights(residuals: FloatArray, sigma: FloatArray, scale: float) -> FloatArray:
@@ -401,7 +401,7 @@ def robust_weights(residuals: FloatArray, sigma: FloatArray, scale: float) -> Fl
     scale
         `JointFit.scale`.
     """
-    return np.asarray(kernels.geman_mcclure(residuals, sigma, scale * _ANNEALING[-1]))
+    return np.asarray(fit_kernels.geman_mcclure(residuals, sigma, scale * _ANNEALING[-1]))
 
 
 def _irls_annealed(
@@ -475,7 +475,7 @@ def _to_result(
     steps = problem.steps(equations, theta, stiffness, leave_out=True)
     if not np.isfinite(steps).all():
         return Failure(f"{len(weights)} control points do not determine the map without a fifth of them")
-    change = kernels.predict_change(
+    change = fit_kernels.predict_change(
         problem.undistorted,
         state.corrected,
         problem.first,
@@ -510,7 +510,7 @@ def _take_step(
         return Failure(f"{len(weights)} control points do not determine the map: they lie on a line or in one place")
     for _ in range(_HALVINGS):
         stepped = problem.evaluate(state.theta + step)
-        if kernels.are_finite(stepped.residuals, weights):
+        if fit_kernels.are_finite(stepped.residuals, weights):
             return stepped
         step = 0.5 * step
     return state
@@ -530,7 +530,7 @@ def _select_stiffness(
     @cache
     def squares(candidate: tuple[float, float]) -> float:
         steps = problem.steps(equations, theta, candidate, leave_out=True)
-        total = float(kernels.predict_squares(*equations, steps))
+        total = float(fit_kernels.predict_squares(*equations, steps))
         return total if np.isfinite(total) else np.inf
 
     shift, _ = _select_stiffest_near_best([(s, roll) for s in shifts], squares)

@@ -28,9 +28,9 @@ from scipy.spatial import cKDTree
 
 from schemas.arrays import Float32Array, FloatArray, IntArray
 from velfield.compiled import kernel
-from velfield.registration import kernels
+from velfield.registration import fit_kernels
+from velfield.registration.fit_kernels import LANES
 from velfield.registration.joint import FOLDS, ControlPoints, JointFit, assign_folds, robust_weights
-from velfield.registration.kernels import LANES
 from velfield.registration.transforms import as_points, mesh_shape
 
 _STIFFNESSES = tuple(10.0**k for k in (-1, 0, 1, 2, 3))
@@ -171,15 +171,15 @@ def solve_without_folds(normal: FloatArray, right: FloatArray, smoothness: Float
     ``normal`` and ``right`` from `accumulate_bands`, of at most seven folds, ``smoothness`` from `smoothness_bands`.
     """
     folds, count, width = normal.shape
-    bands, sides = kernels.aligned_zeros(count, width, LANES), kernels.aligned_zeros(count, 2, LANES)
+    bands, sides = fit_kernels.aligned_zeros(count, width, LANES), fit_kernels.aligned_zeros(count, 2, LANES)
     for i in range(count):
         for d in range(width):
             bands[i, d] = stiffness * smoothness[i, d]
-    kernels.add_folds(normal, True, bands, 0)
-    kernels.add_folds(right, True, sides, 0)
+    fit_kernels.add_folds(normal, True, bands, 0)
+    fit_kernels.add_folds(right, True, sides, 0)
     nothing = np.zeros((0, 2, LANES))
-    kernels.eliminate_bands(bands, sides, nothing)
-    found = kernels.substitute_back(bands, sides, nothing)
+    fit_kernels.eliminate_bands(bands, sides, nothing)
+    found = fit_kernels.substitute_back(bands, sides, nothing)
     meshes = np.empty((folds + 1, count, 2))
     for f in range(folds + 1):
         meshes[f] = found[:, :, f]
@@ -214,8 +214,8 @@ def bilinear_weights(xy_raw: FloatArray, my: int, mx: int, cell: int) -> tuple[I
 
 @kernel
 def accumulate_bands(nodes, shares, weights, residuals, fold, folds, count, bands) -> tuple[FloatArray, FloatArray]:  # type: ignore[no-untyped-def]
-    """Normal equations of each fold: bands (folds, count, bands) as those of `kernels.eliminate_bands`, and right-hand
-    sides (folds, count, 2)."""
+    """Normal equations of each fold: bands (folds, count, bands) as those of `fit_kernels.eliminate_bands`, and
+    right-hand sides (folds, count, 2)."""
     normal, right = np.zeros((folds, count, bands)), np.zeros((folds, count, 2))
     for i in range(len(nodes)):
         f = fold[i]
