@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from velfield.tracking.recovery import find_doubles, find_split_tracks
+from velfield.tracking.doubles import find_doubles, find_split_tracks
 
 GSD_M = 0.25
 

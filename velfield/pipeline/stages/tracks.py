@@ -8,7 +8,7 @@ from threading import Lock
 import numpy as np
 import pandas as pd
 
-from schemas.arrays import ByteArray, Float32Array, FloatArray, IntArray, Mask
+from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.flight import assumed_gsd_m
 from schemas.tables import DETECTION_COLUMNS, DIMENSION_COLUMNS, JOIN_COLUMNS, TRACK_POSITION_COLUMNS, TRACKLET_COLUMNS
 from velfield.parallel import parallel_map, usable_processors
@@ -32,21 +32,21 @@ from velfield.run.tables import empty_table, read_arrays, read_tables, write_tab
 from velfield.tracking.association import LinkedTriples, tracklet_table, window_frames
 from velfield.tracking.dimensions import (
     STRIP_SHAPE,
-    direction_of_axes,
     looks,
-    measure,
     sample_tracks,
 )
+from velfield.tracking.doubles import find_doubles, find_split_tracks
 from velfield.tracking.gates import Limits, triples_pass
 from velfield.tracking.join_costs import GapLimits, TrackEnds
 from velfield.tracking.joins import END_COLUMNS, EndContext, assign_tracks, find_ends
-from velfield.tracking.recovery import (
-    Candidates,
-    Recovered,
-    find_doubles,
-    find_split_tracks,
-    interpolate_gap,
-    recover_tracks,
+from velfield.tracking.recovery import Candidates, Recovered, interpolate_gap, recover_tracks
+from velfield.tracking.strips import (
+    StripSums,
+    along_headings,
+    certain_length,
+    images_of_tracks,
+    mean_grey,
+    measure_tracks,
 )
 
 _Columns = dict[str, np.ndarray]
@@ -378,24 +378,6 @@ def _gap_limits(plan: Plan) -> GapLimits:
     return GapLimits(c.max_gap_s, c.max_stationary_gap_s, c.max_hidden_gap_s, c.stationary_speed_m_per_s)
 
 
-@dataclass(frozen=True)
-class StripSums:
-    """Sums of the strips of each chain of tracklets, and their numbers: spread over it, at its start, at its end.
-
-    ``total`` (3, chains, 32, 10), ``count`` (3, chains); ``ids`` (chains,); ``scale``, working px a base px.
-    """
-
-    ids: IntArray
-    total: Float32Array
-    count: IntArray
-    scale: float
-
-    def mean(self, which: int) -> FloatArray:
-        """(chains, 32, 10); NaN where there are none."""
-        count = np.where(self.count[which], self.count[which], np.nan)[:, None, None]
-        return np.asarray(self.total[which] / count)
-
-
 def sum_strips(layout: RunLayout, tracklets: pd.DataFrame, units: int) -> StripSums:
     """Read the strips that stand for each chain, unit by unit, as all together take much space."""
     ids, chosen = sample_tracks(tracklets)
@@ -409,9 +391,7 @@ def sum_strips(layout: RunLayout, tracklets: pd.DataFrame, units: int) -> StripS
         patches = read_arrays(path.with_suffix(".patches.npz"), only=["strips", "working_scale"])
         here = np.flatnonzero(among(numbers, table["detection_id"].to_numpy()))
         at, chain = np.searchsorted(table["detection_id"].to_numpy(), numbers[here]), chains[here]
-        strips = _along_headings(
-            patches["strips"][at], table["orientation_rad"].to_numpy(np.float64)[at], heading[here]
-        )
+        strips = along_headings(patches["strips"][at], table["orientation_rad"].to_numpy(np.float64)[at], heading[here])
         with lock:  # whole numbers and halves: sums are exact, in whatever order
             for which, why in enumerate(whys):
                 rows = why[here]
@@ -425,57 +405,6 @@ def sum_strips(layout: RunLayout, tracklets: pd.DataFrame, units: int) -> StripS
     return StripSums(ids, total, count, scales[-1] if scales else 1.0)
 
 
-def _along_headings(strips: ByteArray, axis_rad: FloatArray, heading_rad: FloatArray) -> Float32Array:
-    """Strips (n, length, width), turned along their vehicles' headings (n,)."""
-    backward = direction_of_axes(axis_rad, heading_rad)
-    found = np.asarray(strips, np.float32)
-    found[backward] = found[backward, ::-1, ::-1]
-    return found
-
-
-@dataclass(frozen=True)
-class TrackImages:
-    """Appearance of tracks, as far as known without reading frames.
-
-    ``ids`` (tracks,); ``strips`` (tracks, 32, 10), the means of ``count`` (tracks,) strips; ``scale``, working px
-    a base px.
-    """
-
-    ids: IntArray
-    strips: FloatArray
-    count: IntArray
-    scale: float
-
-
-def images_of_tracks(strips: StripSums, tracks: IntArray) -> TrackImages:
-    """Mean strips by track, of all chains of each; ``tracks`` (chains,)."""
-    ids, track = np.unique(tracks, return_inverse=True)
-    total, count = np.zeros((len(ids), *STRIP_SHAPE)), np.zeros(len(ids), np.int64)
-    for target, source in ((total, strips.total[0]), (count, strips.count[0])):
-        np.add.at(target, track, source)
-    seen = np.flatnonzero(count)
-    return TrackImages(ids[seen], total[seen] / count[seen, None, None], count[seen], strips.scale)
-
-
-def measure_tracks(images: TrackImages) -> pd.DataFrame:
-    """Dimensions by track (`DIMENSION_COLUMNS`)."""
-    found = measure(images.strips)
-    columns = {
-        name: getattr(found, name.removesuffix("_px")) / images.scale
-        for name in ("length_px", "length_sd_px", "width_px", "width_sd_px")
-    }
-    return pd.DataFrame({"track_id": images.ids, **columns, "strips": images.count})
-
-
-def mean_grey(strips: StripSums, tracks: IntArray) -> pd.Series:
-    """Mean grey level of the vehicle by track, from the middle of the strips of all chains of each; ``tracks``
-    (chains,)."""
-    along, across = STRIP_SHAPE[0] // 2, STRIP_SHAPE[1] // 2
-    middle = strips.total[0][:, along - 2 : along + 2, across - 1 : across + 1].mean(axis=(1, 2))
-    sums = pd.DataFrame({"grey": middle, "count": strips.count[0]}).groupby(tracks).sum()
-    return sums["grey"] / sums["count"].replace(0, np.nan)
-
-
 def find_context(plan: Plan, ends: TrackEnds, starts: TrackEnds, strips: StripSums) -> EndContext:
     """Places where chains end and start, and their appearance there."""
     metres = assumed_gsd_m(read_tracking_gsd(plan.layout))
@@ -487,15 +416,8 @@ def find_context(plan: Plan, ends: TrackEnds, starts: TrackEnds, strips: StripSu
         _stays_inside(maps, starts, -1, metres) & (starts.time_s - first_s > _HIDDEN_S),
         looks(strips.mean(2)),
         looks(strips.mean(1)),
-        _certain_length(strips) * metres,
+        certain_length(strips) * metres,
     )
-
-
-def _certain_length(strips: StripSums) -> FloatArray:
-    """(chains,) px: the mean less a standard deviation; NaN where unknown."""
-    found = measure_tracks(images_of_tracks(strips, strips.ids)).set_index("track_id")
-    length = (found["length_px"] - found["length_sd_px"]).reindex(strips.ids)
-    return np.asarray(length, dtype=np.float64)
 
 
 def _stays_inside(maps: FrameTransforms, ends: TrackEnds, sign: int, metres: float) -> Mask:
