@@ -49,9 +49,9 @@ def estimate_mean(values: NDArray[np.floating], *, min_n: int = MIN_VEHICLES) ->
     return Estimate(mean, mean - half, mean + half, len(known))
 
 
-def estimate_median(values: NDArray[np.floating], *, min_n: int = MIN_VEHICLES) -> Estimate | None:
+def estimate_median(values: NDArray[np.floating]) -> Estimate | None:
     """Median of independent values, the interval by order statistics."""
-    return estimate_quantile(values, 0.5, min_n=min_n)
+    return estimate_quantile(values, 0.5)
 
 
 def estimate_quantile(values: NDArray[np.floating], q: float, *, min_n: int = MIN_VEHICLES) -> Estimate | None:
@@ -124,9 +124,9 @@ def _fractional_order(ordered: FloatArray, q: float, alpha: float) -> float:
     return float(np.interp(alpha, above, ordered))
 
 
-def estimate_share(successes: float, n: int, *, min_n: int = MIN_VEHICLES) -> Estimate | None:
+def estimate_share(successes: float, n: int) -> Estimate | None:
     """A fraction of independent vehicles, by the interval of Jeffreys."""
-    if n < min_n:
+    if n < MIN_VEHICLES:
         return None
     a, b = successes + 0.5, n - successes + 0.5
     low = 0.0 if successes <= 0 else float(special.betaincinv(a, b, (1 - LEVEL) / 2))
@@ -134,9 +134,7 @@ def estimate_share(successes: float, n: int, *, min_n: int = MIN_VEHICLES) -> Es
     return Estimate(successes / n, low, high, n)
 
 
-def estimate_rate(
-    counts: IntArray | FloatArray, exposure: float, *, min_n: int = MIN_VEHICLES, dispersion: float | None = None
-) -> Estimate | None:
+def estimate_rate(counts: IntArray | FloatArray, exposure: float) -> Estimate | None:
     """Events per unit of exposure from counts of equal slices of it; slices show how much more, or less, than Poisson
     the events vary.
 
@@ -146,13 +144,11 @@ def estimate_rate(
         (k,) events in k slices of equal length.
     exposure
         Total time of all slices, h.
-    dispersion
-        Variance over mean, where it is known from elsewhere.
     """
     total = float(np.sum(counts))
-    if total < min_n or exposure <= 0:
+    if total < MIN_VEHICLES or exposure <= 0:
         return None
-    factor = _dispersion(np.asarray(counts, np.float64)) if dispersion is None else dispersion
+    factor = _dispersion(np.asarray(counts, np.float64))
     shape = (total + 0.5) / factor
     low, high = (float(special.gammaincinv(shape, p) * factor) for p in ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
     return Estimate(total / exposure, low / exposure, high / exposure, round(total))

@@ -63,9 +63,7 @@ class Tilt:
         return self.gain_nats >= MIN_GAIN_NATS and MIN_CONVERGENCE <= size < _END
 
 
-def tilt_of_frames(
-    frames: Sequence[GreyImage], lens: Lens, *, max_points: int = _MAX_POINTS, apply: Apply = map
-) -> Tilt | None:
+def tilt_of_frames(frames: Sequence[GreyImage], lens: Lens, *, apply: Apply = map) -> Tilt | None:
     """Estimate the perspective of the ground from frames (h, w) uint8 of one camera; None: they show too few lines.
 
     ``apply`` applies a function to every frame.
@@ -78,7 +76,7 @@ def tilt_of_frames(
         max_curvature_per_px=_MAX_CURVATURE / diagonal_px,
         apply=apply,
     )
-    return estimate_tilt(pool_arcs(parts, max_points=max_points), lens, shape)
+    return estimate_tilt(pool_arcs(parts, max_points=_MAX_POINTS), lens, shape)
 
 
 def estimate_tilt(arcs: Arcs, lens: Lens, shape: tuple[int, int]) -> Tilt | None:

@@ -50,9 +50,9 @@ def _grid_kernel(
     return x, y
 
 
-def upright_chips(image: GreyImage, xy: FloatArray, *, side: int = CHIP_PX) -> GreyImage:
-    """Crops about the rounded positions, (n, side, side) uint8: pixel (side / 2, side / 2) is the rounded position."""
-    return np.asarray(_chips_kernel(image, np.rint(xy).astype(np.int64) - side // 2, side))
+def upright_chips(image: GreyImage, xy: FloatArray) -> GreyImage:
+    """Crops about the rounded positions, (n, 32, 32) uint8: pixel (16, 16) is the rounded position."""
+    return np.asarray(_chips_kernel(image, np.rint(xy).astype(np.int64) - CHIP_PX // 2, CHIP_PX))
 
 
 @kernel
@@ -75,17 +75,15 @@ def _chips_kernel(image: ByteArray, corners: IntArray, side: int) -> ByteArray:
     return out
 
 
-def oriented_strips(
-    half_image: GreyImage, xy: FloatArray, orientation_rad: FloatArray, *, length: int = 32, width: int = 10
-) -> GreyImage:
-    """Patches of twice a bus's length at half the resolution, the axis along the columns: (n, length, width) uint8.
+def oriented_strips(half_image: GreyImage, xy: FloatArray, orientation_rad: FloatArray) -> GreyImage:
+    """Patches of twice a bus's length at half the resolution, the axis along the columns: (n, 32, 10) uint8.
 
     Parameters
     ----------
     half_image
         The image on the working grid at half its resolution, as of `ComparableFrame.half_image`.
     """
-    return oriented_patches(half_image, (xy - 0.5) / 2, orientation_rad, width=width, length=length)
+    return oriented_patches(half_image, (xy - 0.5) / 2, orientation_rad, width=10, length=32)
 
 
 def _sample(image: GreyImage, x: Float32Array, y: Float32Array) -> GreyImage:

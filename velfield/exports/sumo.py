@@ -1,7 +1,6 @@
 """SUMO floating car data: the position of each vehicle at each time, for SUMO's tools."""
 
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pandas as pd
@@ -20,7 +19,7 @@ def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
     return sumo_fcd(run.tracklets(), Georeference.from_grid(run.grid)).encode()
 
 
-def sumo_fcd(tracklets: pd.DataFrame, georeference: Georeference, *, vehicle_type: str = "car") -> str:
+def sumo_fcd(tracklets: pd.DataFrame, georeference: Georeference) -> str:
     """Tracks as SUMO's FCD XML.
 
     Parameters
@@ -30,8 +29,6 @@ def sumo_fcd(tracklets: pd.DataFrame, georeference: Georeference, *, vehicle_typ
     georeference
         Its ground sample distance is needed: SUMO works in metres. x to the right of the map and y up, from its lower
         left corner, as in the exported network.
-    vehicle_type
-        ``type`` of all vehicles.
 
     Returns
     -------
@@ -51,14 +48,13 @@ def sumo_fcd(tracklets: pd.DataFrame, georeference: Georeference, *, vehicle_typ
     speed = np.linalg.norm(velocity, axis=1) * (georeference.gsd_m or np.nan)
     start_s = points["time_s"].min() if len(points) else 0.0
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<fcd-export>"]
-    kind = quoteattr(vehicle_type)
     numbers = points["track_id"].to_numpy()
     for time_s, rows in points.reset_index(drop=True).groupby("time_s", sort=True).indices.items():
         lines.append(f'    <timestep time="{float(str(time_s)) - start_s:.3f}">')
         for k in rows:
             lines.append(
                 f'        <vehicle id="{numbers[k]}" x="{metres[k, 0]:.2f}" y="{metres[k, 1]:.2f}" '
-                f'angle="{angle[k]:.2f}" type={kind} speed="{speed[k]:.2f}"/>'
+                f'angle="{angle[k]:.2f}" type="car" speed="{speed[k]:.2f}"/>'
             )
         lines.append("    </timestep>")
     return "\n".join([*lines, "</fcd-export>", ""])

@@ -130,9 +130,9 @@ class VelocityField:
             self._modal = out
         return self._modal.copy()
 
-    def modal_direction_rad(self, *, stationary_speed_px_per_s: float | None = None) -> FloatArray:
+    def modal_direction_rad(self) -> FloatArray:
         """(y, x) direction of the highest mode in (-pi, pi], from +x to +y (down); NaN where empty or stationary."""
-        limit = self.stationary_speed_px_per_s if stationary_speed_px_per_s is None else stationary_speed_px_per_s
+        limit = self.stationary_speed_px_per_s
         return direction_rad(self.modal_velocity().astype(np.float64), stationary_speed_px_per_s=limit)
 
     def modal_speed_px_per_s(self) -> FloatArray:

@@ -85,12 +85,11 @@ def direction_figure(grey: GreyImage, direction_rad: NDArray[np.floating], scale
     return beside(*direction_map(grey, direction_rad, scale))
 
 
-def speed_map(
-    grey: GreyImage, speed_px_per_s: NDArray[np.floating], scale: MapScale, *, top: float | None = None
-) -> tuple[RGBImage, Legend]:
-    """The modal speed as colour over the base image, (h, w, 3), and its legend; parameters as in `speed_figure`."""
+def speed_map(grey: GreyImage, speed_px_per_s: NDArray[np.floating], scale: MapScale) -> tuple[RGBImage, Legend]:
+    """The modal speed as colour over the base image, (h, w, 3), up to `colour_scale_max` rounded up as on the page;
+    and its legend. Parameters as in `speed_figure`."""
     shown = scale.shown_speed(speed_px_per_s)
-    top = top or round_up(colour_scale_max(shown) or 10.0)
+    top = round_up(colour_scale_max(shown) or 10.0)
     image = blend_over_image(grey, shown, ramp_colours(shown / top))
     note = "Colour: the speed of most vehicles. Bare grey: no vehicles."
     maximum = float(np.nanmax(shown, initial=0.0))
@@ -101,12 +100,7 @@ def speed_map(
 
 
 def speed_figure(
-    grey: GreyImage,
-    speed_px_per_s: NDArray[np.floating],
-    scale: MapScale,
-    *,
-    top: float | None = None,
-    bar_gsd_m: float | None = None,
+    grey: GreyImage, speed_px_per_s: NDArray[np.floating], scale: MapScale, *, bar_gsd_m: float | None = None
 ) -> RGBImage:
     """The modal speed as colour, with a bar beside it; parameters as in `direction_figure`.
 
@@ -114,12 +108,10 @@ def speed_figure(
     ----------
     speed_px_per_s
         (h, w) speed, px/s. NaN is not drawn.
-    top
-        Speed at the bar's end, in the shown unit; None: `colour_scale_max` rounded up, as on the page.
     bar_gsd_m
         Metres a pixel of the figure, for the scale bar, where it is not drawn at base resolution.
     """
-    image, legend = speed_map(grey, speed_px_per_s, scale, top=top)
+    image, legend = speed_map(grey, speed_px_per_s, scale)
     return beside(image, legend if bar_gsd_m is None else replace(legend, gsd_m=bar_gsd_m))
 
 

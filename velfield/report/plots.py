@@ -57,10 +57,10 @@ def _plot(draw: Callable[["Axes"], None]) -> bytes:
     return figure_bytes(figure, "svg")
 
 
-def highest_of_runs(times: np.ndarray, values: np.ndarray, most: int = _MOST_POINTS) -> tuple[np.ndarray, np.ndarray]:
-    """At most ``most`` points, the highest of each run of frames, so that no peak is lost; NaN where none is known."""
-    if len(times) <= most:
+def highest_of_runs(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """At most `_MOST_POINTS`, the highest of each run of frames, so that no peak is lost; NaN where none is known."""
+    if len(times) <= _MOST_POINTS:
         return times, values
-    starts = np.arange(0, len(times), -(-len(times) // most))
+    starts = np.arange(0, len(times), -(-len(times) // _MOST_POINTS))
     highest = np.maximum.reduceat(np.where(np.isnan(values), -np.inf, values), starts)
     return times[starts], np.where(np.isneginf(highest), np.nan, highest)

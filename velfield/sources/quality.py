@@ -139,17 +139,13 @@ def is_duplicate(grey: GreyImage, previous: GreyImage) -> bool:
     return not any(np.any(cv2.absdiff(grey[rows], previous[rows]) > 1) for rows in (some, slice(None)))
 
 
-def flag_blurred(sharpness: FloatArray, *, fraction: float = 0.5, window: int = 15) -> Mask:
-    """Frames less sharp than `fraction` of the median of their neighbours.
+def flag_blurred(sharpness: FloatArray) -> Mask:
+    """Frames less than half as sharp as the median of the 15 frames about them.
 
     Parameters
     ----------
     sharpness
         (n,) as `frame_quality` gives it; NaN where unreadable.
-    fraction
-        Below this fraction of the neighbours' median a frame is blurred.
-    window
-        How many frames, the frame itself in the middle, are its neighbours.
 
     Examples
     --------
@@ -159,12 +155,11 @@ def flag_blurred(sharpness: FloatArray, *, fraction: float = 0.5, window: int = 
     sharpness = np.asarray(sharpness, np.float64)
     if sharpness.size < 3:
         return np.zeros(sharpness.shape, np.bool_)
-    half = window // 2
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(sharpness, half, constant_values=np.nan), 2 * half + 1)
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(sharpness, 7, constant_values=np.nan), 15)
     seen = np.isfinite(around).any(axis=1)
     usual = np.full(sharpness.shape, np.nan)
     usual[seen] = np.nanmedian(around[seen], axis=1)
-    return np.asarray(sharpness < fraction * usual, np.bool_)
+    return np.asarray(sharpness < 0.5 * usual, np.bool_)
 
 
 DARK_LEVEL = 30.0
@@ -248,19 +243,13 @@ def describe_light(brightness: FloatArray, contrast: FloatArray, sharpness: Floa
     return found
 
 
-def flag_outlier_frames(
-    thumbnails: Float32Array, *, max_step: float = MAX_CUT_CORRELATION, min_across: float = MIN_SCENE_CORRELATION
-) -> Mask:
+def flag_outlier_frames(thumbnails: Float32Array) -> Mask:
     """Frames that correlate neither with the frame before nor with the frame after, while those two do with each other.
 
     Parameters
     ----------
     thumbnails
         (n, 16, 16) as `frame_quality` gives them.
-    max_step
-        An outlier's correlation with the frames before and after is below this.
-    min_across
-        The correlation between the frame before and the frame after is above this: the scene did not change.
     """
     count = len(thumbnails)
     outlier = np.zeros(count, np.bool_)
@@ -270,5 +259,6 @@ def flag_outlier_frames(
     if count >= 3:
         step = np.einsum("ij,ij->i", unit[:-1], unit[1:])
         across = np.einsum("ij,ij->i", unit[:-2], unit[2:])
-        outlier[1:-1] = (np.maximum(step[:-1], step[1:]) < max_step) & (across > min_across)
+        same_scene = across > MIN_SCENE_CORRELATION
+        outlier[1:-1] = (np.maximum(step[:-1], step[1:]) < MAX_CUT_CORRELATION) & same_scene
     return outlier

@@ -44,7 +44,7 @@ def read_timestamps(path: Path) -> Times:
     return times
 
 
-def check_against_container(side_s: FloatArray, container_s: FloatArray, path: Path, *, tolerance: float = 0.5) -> None:
+def check_against_container(side_s: FloatArray, container_s: FloatArray, path: Path) -> None:
     """Refuse frame times whose intervals disagree with the container's.
 
     A constant offset is allowed: a CSV often counts from take-off.
@@ -55,18 +55,16 @@ def check_against_container(side_s: FloatArray, container_s: FloatArray, path: P
         (n,) times of the same frames, s, in the container's order.
     path
         The CSV, for the message.
-    tolerance
-        Largest disagreement, in median frame intervals.
 
     Raises
     ------
     InputError
-        Some frame's time since the first differs by more than `tolerance` of the median interval.
+        Some frame's time since the first differs by more than half of the median interval.
     """
     if side_s.size < 2:
         return
     difference = (side_s - side_s[0]) - (container_s - container_s[0])
-    limit = tolerance * float(np.median(np.abs(np.diff(container_s))))
+    limit = 0.5 * float(np.median(np.abs(np.diff(container_s))))
     worst = int(np.argmax(np.abs(difference)))
     if limit > 0 and abs(difference[worst]) > limit:
         raise InputError(

@@ -19,6 +19,8 @@ from velfield.tracking.smoothing import ACCELERATION_NOISE
 
 ConflictKind = Literal["crossing", "merging", "following"]
 MAX_PET_S, MAX_TTC_S = 3.0, 3.0
+_NEAR_S = 1.5
+"""Threshold of the probability, of either time."""
 POSITION_SD_M, SPEED_SD_M_PER_S = 0.35, 0.3
 """Standard deviations of a bumper's position on its path, including that of an unknown length, and of the speed, of
 tracks without further errors."""
@@ -68,8 +70,6 @@ def find_conflicts(
     trajectories: Trajectories,
     traffic: LaneTraffic,
     *,
-    pet_s: float = 1.5,
-    ttc_s: float = 1.5,
     lengths_m: FloatArray | None = None,
     vehicle: IntArray | None = None,
 ) -> list[Conflict]:
@@ -77,8 +77,6 @@ def find_conflicts(
 
     Parameters
     ----------
-    pet_s, ttc_s
-        Thresholds of the probability.
     lengths_m
         (tracks,) lengths of the vehicles; None: as measured, a car's where they were not.
     vehicle
@@ -90,11 +88,11 @@ def find_conflicts(
     found = [
         conflict
         for crossing in find_crossings(traffic.graph.lanes)
-        for conflict in _post_encroachments(crossing, traffic, lengths, pet_s, sd_m)
+        for conflict in _post_encroachments(crossing, traffic, lengths, _NEAR_S, sd_m)
     ]
     found = _on_one_level(found)
-    found += _merges(traffic, lengths, vehicles, pet_s, sd_m)
-    found += time_to_collision(trajectories, traffic.graph, lengths, ttc_s, (sd_m, speed_sd))
+    found += _merges(traffic, lengths, vehicles, _NEAR_S, sd_m)
+    found += time_to_collision(trajectories, traffic.graph, lengths, _NEAR_S, (sd_m, speed_sd))
     return sorted(_closest(found), key=lambda c: c.time_s)
 
 

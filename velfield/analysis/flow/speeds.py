@@ -55,11 +55,11 @@ class Station:
     p85: Estimate | None
 
 
-def speed_profile(traffic: LaneTraffic, lane: int, *, station_m: float = STATION_M) -> list[Station]:
+def speed_profile(traffic: LaneTraffic, lane: int) -> list[Station]:
     """Speeds of the vehicles at each station of a lane, every vehicle once."""
     samples = traffic.samples(lane)
     length = traffic.graph.lanes[lane].length_m
-    count = max(round(length / station_m), 1)
+    count = max(round(length / STATION_M), 1)
     station = np.clip((samples.along_m / length * count).astype(np.int64), 0, count - 1)
     out = []
     for k, speeds in enumerate(_speeds_by_station(samples, station, count)):

@@ -23,6 +23,8 @@ from velfield.analysis.trajectories import PathSamples, Trajectories, within
 _UPSTREAM_M = 60
 """A travel time begins so far before the junction where the track does."""
 _FURNESS_STEPS = 60
+_SLICE_S = 120.0
+"""Counts of slices so long show how much the flow varies."""
 _MIN_PASSES = 3
 _STOP_S, _STOP_M_PER_S = 2.0, 1.0
 
@@ -96,36 +98,24 @@ class JunctionMovements:
 
 
 def find_movements(
-    trajectories: Trajectories,
-    graph: LaneGraph,
-    *,
-    slice_s: float = 120.0,
-    window_s: tuple[float, float] | None = None,
-    cut_tracks: CutTracks | None = None,
+    trajectories: Trajectories, graph: LaneGraph, *, cut_tracks: CutTracks | None = None
 ) -> tuple[JunctionMovements, ...]:
     """Movements through every junction of a lane graph.
 
     Parameters
     ----------
-    slice_s
-        Counts of slices so long show how much the flow varies.
-    window_s
-        Only vehicles that enter (or, unseen there, leave) from the first time up to the second.
     cut_tracks
         Cut tracks of the trajectories, if already known.
     """
     cut = join_cut_tracks(trajectories) if cut_tracks is None else cut_tracks
     samples = cut.samples
-    begin, end = window_s or (
-        (float(trajectories.time_s.min()), float(trajectories.time_s.max())) if len(trajectories) else (0.0, 0.0)
-    )
+    times_s = trajectories.time_s if len(trajectories) else np.zeros(1)
+    begin, end = float(times_s.min()), float(times_s.max())
     out = []
     for junction in graph.junctions:
         gates = find_gates(graph, junction)
         passes = _within(_by_track(find_passes(samples, junction, gates), cut), begin, end)
-        out.append(
-            JunctionMovements(junction, gates, passes, tuple(_count(junction, gates, passes, begin, end, slice_s)))
-        )
+        out.append(JunctionMovements(junction, gates, passes, tuple(_count(junction, gates, passes, begin, end))))
     return tuple(out)
 
 
@@ -178,9 +168,7 @@ def _within(passes: Passes, begin_s: float, end_s: float) -> Passes:
     return Passes(*(getattr(passes, name)[keep] for name in Passes.__dataclass_fields__))
 
 
-def _count(
-    junction: Junction, gates: Gates, passes: Passes, begin_s: float, end_s: float, slice_s: float
-) -> Iterator[Movement]:
+def _count(junction: Junction, gates: Gates, passes: Passes, begin_s: float, end_s: float) -> Iterator[Movement]:
     arm = np.array([gate.arm for gate in gates.gates] + [-1], np.int64)
     arm_in, arm_out = arm[passes.gate_in], arm[passes.gate_out]
     n = len(gates.arms)
@@ -192,13 +180,13 @@ def _count(
     found = np.bincount(arm_out[(arm_out >= 0) & (arm_in < 0)], minlength=n).astype(np.float64)
     known = seen + joined
     inferred = joined + furness(known, lost, found)
-    slices = max(round((end_s - begin_s) / slice_s), 1)
+    slices = max(round((end_s - begin_s) / _SLICE_S), 1)
     hours = max(end_s - begin_s, 1e-9) / 3600
     for i, j in zip(*np.nonzero(known >= _MIN_PASSES), strict=True):
         rows = both & (arm_in == i) & (arm_out == j)
         total = seen[i, j] + inferred[i, j]
         entering = seen[i].sum() + inferred[i].sum()
-        slice_of = np.clip(((passes.entry_s[rows] - begin_s) / slice_s).astype(int), 0, slices - 1)
+        slice_of = np.clip(((passes.entry_s[rows] - begin_s) / _SLICE_S).astype(int), 0, slices - 1)
         counts = np.bincount(slice_of, minlength=slices) * total / max(known[i, j], 1)
         travel, delay = _delay(passes, rows)
         effective = round(float(known[i].sum()))

@@ -37,15 +37,13 @@ _COLUMNS: dict[OnnxLayout, int] = {
 _ASK = "describe it in a YAML file of the same name next to it (docs/detection.md)"
 
 
-def describe_model(path: Path, car_length_px: float = 16.0) -> OnnxRecord:
+def describe_model(path: Path) -> OnnxRecord:
     """The record of a model file.
 
     Parameters
     ----------
     path
         The ``.onnx`` file; a ``.yaml`` of its name beside it wins over its metadata.
-    car_length_px
-        Length of a car on the working grid, px.
 
     Raises
     ------
@@ -77,7 +75,7 @@ def describe_model(path: Path, car_length_px: float = 16.0) -> OnnxRecord:
     vehicles = _vehicles(path, names) if given.vehicles is None else _given_vehicles(path, given.vehicles, names)
     check_output(path.name, _sizes(boxes), layout, names, vehicles)
     return OnnxRecord(
-        working_car_length_px=car_length_px,
+        working_car_length_px=16.0,
         threshold=_THRESHOLD if given.threshold is None else given.threshold,
         path=str(path.resolve()),
         digest=hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest(),

@@ -104,8 +104,8 @@ def tilt_of_upright_box(w: float, h: float, *, aspect: float = CAR_ASPECT) -> fl
     return min(max(tilt, 0.0), math.pi / 2)
 
 
-def length_from_upright_box(w: float, h: float, *, aspect: float = CAR_ASPECT) -> float:
-    """Length of a rotated car of a known aspect in its upright box of w x h, px.
+def length_from_upright_box(w: float, h: float) -> float:
+    """Length of a rotated car of `CAR_ASPECT` in its upright box of w x h, px.
 
     With L the length, r the aspect, S = |sin 2 theta|: w h = L^2 (r + (1 + r^2) S / 2) and
     w^2 + h^2 = L^2 (1 + r^2 + 2 r S); their quotient gives S, then either gives L.
@@ -118,7 +118,7 @@ def length_from_upright_box(w: float, h: float, *, aspect: float = CAR_ASPECT) -
     >>> round(length_from_upright_box(side, side), 3)
     40.0
     """
-    squares = w * w + h * h
+    aspect, squares = CAR_ASPECT, w * w + h * h
     quotient = w * h / squares
     sine = (quotient * (1 + aspect**2) - aspect) / ((1 + aspect**2) / 2 - 2 * aspect * quotient)
     sine = min(max(sine, 0.0), 1.0)
