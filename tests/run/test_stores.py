@@ -5,8 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+import zarr
 
 from velfield.errors import InputError
+from velfield.run.shards import decode_tile, encode_tile
 from velfield.run.stores import (
     HISTOGRAM,
     FrameStore,
@@ -109,7 +111,7 @@ def test_the_field_opens_with_xarray_labelled(tmp_path: Path) -> None:
     )
     tile = np.arange(4 * 6 * 9, dtype=np.int32).reshape(4, 6, 3, 3)
     store = open_field(path, "r+")
-    store.write_tile(2, 3, tile)
+    store.write_tile(2, 3, tile, np.ones((4, 6), np.int32))
     np.testing.assert_array_equal(store.read_tile(2, 3), tile)
     assert store.has_tile(2, 3)
     assert not store.has_tile(0, 0)
@@ -121,6 +123,40 @@ def test_the_field_opens_with_xarray_labelled(tmp_path: Path) -> None:
         np.testing.assert_array_equal(field["vx_m_per_s"], centres / 2)
         assert field[HISTOGRAM].sel(y=17, x=25, vy=0, vx=10) == tile[1, 1, 1, 2]
         assert int(field["count"].sum()) == 0
+
+
+def test_a_flipped_bit_of_a_tile_changes_no_value_in_silence(tmp_path: Path) -> None:
+    count = np.zeros((16, 16), np.int32)
+    count[2:5, 9:] = 1
+    tile = np.where(count[..., None, None] > 0, noise(4, 16, 16, 5, 5), 0).astype(np.int32)
+    shard = encode_tile(tile, count, 16)
+    np.testing.assert_array_equal(decode_tile(shard, tile.shape, 16), tile)
+    path = tmp_path / "field.zarr"
+    create_field(
+        path,
+        key="k",
+        height=16,
+        width=16,
+        tile=16,
+        group_tiles=1,
+        velocities_px_per_s=np.arange(5.0),
+        attributes={},
+        layers={},
+    )
+    store = open_field(path, "r+")
+    store.write_tile(0, 0, tile, count)
+    np.testing.assert_array_equal(zarr.open_array(path / HISTOGRAM, mode="r")[:], tile)  # by zarr's own codec
+    file = path / HISTOGRAM / "c" / "0" / "0" / "0" / "0"
+    refused = 0
+    for at in range(len(shard)):
+        file.write_bytes(shard[:at] + bytes([shard[at] ^ 1 << at % 8]) + shard[at + 1 :])
+        try:
+            read = store.read_tile(0, 0)
+        except StoreError:
+            refused += 1
+        else:
+            np.testing.assert_array_equal(read, tile)  # a bit that Zstandard does not use
+    assert refused > 0.99 * len(shard)
 
 
 def test_untouched_tiles_take_no_space(tmp_path: Path) -> None:

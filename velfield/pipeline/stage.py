@@ -320,7 +320,7 @@ STAGES: tuple[Stage, ...] = (
     # The velocity histogram of a block of tiles, from the segments that reach it.
     Stage(
         name="field",
-        version=3,
+        version=4,
         label="field",
         lines=(Line("vehicles passed {pixels:.0f} pixels, 5 or more vehicles {pixels_5:.0f} of them"),),
         prepare=f"{_STAGES}.field:create_field_stores",

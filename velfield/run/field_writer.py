@@ -169,7 +169,7 @@ class GroupWriter:
         """Write a histogram, then fill it with zeros."""
         passed = tile.count > 0
         if tile.histogram[passed].any():  # weights of milliseconds may all be zero
-            self.store.write_tile(row, column, tile.histogram, name)
+            self.store.write_tile(row, column, tile.histogram, tile.count, name)
             tile.histogram[passed] = 0
         return tile.histogram
 

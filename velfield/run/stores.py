@@ -22,7 +22,9 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray
 from schemas.records import FORMAT_VERSION
 from velfield.errors import InputError, StoreError
+from velfield.run.commits import write_atomically
 from velfield.run.layout import is_remote
+from velfield.run.shards import block_side, decode_tile, encode_tile
 
 _ZSTANDARD = ZstdCodec(level=1, checksum=True)
 _STATUS_BYTES = 160
@@ -385,8 +387,9 @@ def create_field(
             group,
             name,
             (height, width, n, n),
-            (tile, tile, n, n),
+            (block_side(tile), block_side(tile), n, n),
             "int32",
+            shards=(tile, tile, n, n),
             fill_value=0,
             dimension_names=("y", "x", "vy", "vx"),
         )
@@ -454,7 +457,7 @@ class FieldStore:
 
     @property
     def tile(self) -> int:
-        return int(self.group[HISTOGRAM].chunks[0])
+        return self.chunk_shape(HISTOGRAM)[0]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -470,15 +473,18 @@ class FieldStore:
         """Names of the (y, x, vy, vx) histograms."""
         return [name for name in (HISTOGRAM, HISTOGRAM_TIME_WEIGHTED) if name in self.group.by_axes.get(4, ())]
 
-    def write_tile(self, row: int, column: int, histogram: NDArray[np.int32], name: str = HISTOGRAM) -> None:
-        """Write one tile of a histogram, (ty, tx, nvy, nvx): one chunk."""
-        y, x, side = row * self.tile, column * self.tile, self.tile
-        # Written whatever it holds: to look whether all of it is zero takes a quarter of the time.
-        self.group[name].with_config({"write_empty_chunks": True})[y : y + side, x : x + side] = histogram
+    def write_tile(
+        self, row: int, column: int, histogram: NDArray[np.int32], count: NDArray[np.int32], name: str = HISTOGRAM
+    ) -> None:
+        """Write one tile of a histogram, (ty, tx, nvy, nvx), zero where ``count`` (ty, tx) is: one file."""
+        write_atomically(self._tile_path(row, column, name), encode_tile(histogram, count, self.tile))
+
+    def _tile_path(self, row: int, column: int, name: str) -> Path:
+        return self.path / name / "c" / str(row) / str(column) / "0" / "0"
 
     def has_tile(self, row: int, column: int, name: str = HISTOGRAM) -> bool:
-        """Whether the tile's chunk exists."""
-        return (self.path / name / "c" / str(row) / str(column) / "0" / "0").exists()
+        """Whether the tile's file exists."""
+        return self._tile_path(row, column, name).exists()
 
     def read_tile(self, row: int, column: int, name: str = HISTOGRAM) -> NDArray[np.int32]:
         """One tile of a histogram, (ty, tx, nvy, nvx) int32; clipped at the border.
@@ -486,11 +492,13 @@ class FieldStore:
         Raises
         ------
         StoreError
-            The chunk is damaged.
+            The tile is damaged or gone.
         """
-        y, x, side = row * self.tile, column * self.tile, self.tile
+        height, width, *bins = self.group[name].shape
+        side = self.tile
+        shape = (min(side, height - row * side), min(side, width - column * side), *bins)
         try:
-            return np.asarray(self.group[name][y : y + side, x : x + side], dtype=np.int32)
+            return decode_tile(self._tile_path(row, column, name).read_bytes(), shape, side)
         except Exception as error:
             raise StoreError(f"{self.path}: the chunk of tile ({row}, {column}) is damaged ({error})") from error
 
@@ -519,8 +527,9 @@ class FieldStore:
         return dict(self.group[name].attrs)
 
     def chunk_shape(self, name: str) -> tuple[int, int]:
-        """(height, width) of a chunk of an array, px."""
-        height, width = self.group[name].chunks[:2]
+        """(height, width) of what one file of an array holds, px."""
+        array = self.group[name]
+        height, width = (array.shards or array.chunks)[:2]
         return int(height), int(width)
 
     def stored_chunks(self, name: str) -> list[tuple[int, int]]:

@@ -1,0 +1,74 @@
+"""A tile of the histogram as a shard of Zarr's codec ``sharding_indexed``: blocks of pixels, each compressed by itself.
+
+Vehicles passed a tenth of the pixels of a tile of 22 MB. zarr's own codec looks at all of it and takes a third of a
+millisecond a block; here only the blocks that vehicles passed are looked at.
+"""
+
+from math import gcd, prod
+
+import google_crc32c
+import numpy as np
+from numcodecs.zstd import Zstd
+from numpy.typing import NDArray
+
+_BLOCK_PX = 8
+_NOT_STORED = np.iinfo(np.uint64).max
+"""Offset and size, in the index, of a block that holds zeros only."""
+_CHECKSUM_BYTES = 4
+_CODEC = Zstd(level=1, checksum=True)
+
+
+def block_side(tile: int) -> int:
+    """Side of the blocks of a tile, px: 8, or the largest that divides both."""
+    return gcd(tile, _BLOCK_PX)
+
+
+def encode_tile(histogram: NDArray[np.int32], count: NDArray[np.int32], tile: int) -> bytes:
+    """The shard of a tile of ``tile`` px.
+
+    Parameters
+    ----------
+    histogram
+        (ty, tx, nvy, nvx), smaller than the tile at the map's edge.
+    count
+        (ty, tx); where it is zero the histogram is.
+    """
+    side = block_side(tile)
+    index = np.full((tile // side, tile // side, 2), _NOT_STORED, "<u8")
+    parts, end = [], 0
+    for row, column in np.unique(np.argwhere(count) // side, axis=0):
+        window = np.s_[row * side : (row + 1) * side, column * side : (column + 1) * side]
+        block = np.ascontiguousarray(histogram[window], "<i4")
+        if block.shape[:2] != (side, side):  # at the map's edge
+            block = np.pad(block, [(0, side - block.shape[0]), (0, side - block.shape[1]), (0, 0), (0, 0)])
+        parts.append(_CODEC.encode(block))
+        index[row, column] = end, len(parts[-1])
+        end += len(parts[-1])
+    return b"".join([*parts, index.tobytes(), _checksum(index.tobytes())])
+
+
+def decode_tile(shard: bytes, shape: tuple[int, ...], tile: int) -> NDArray[np.int32]:
+    """The histogram of a shard, of shape (ty, tx, nvy, nvx).
+
+    Raises
+    ------
+    ValueError, RuntimeError
+        The shard is damaged.
+    """
+    side = block_side(tile)
+    blocks = (tile // side, tile // side, 2)
+    index_bytes = shard[-8 * prod(blocks) - _CHECKSUM_BYTES : -_CHECKSUM_BYTES]
+    if _checksum(index_bytes) != shard[-_CHECKSUM_BYTES:]:
+        raise ValueError("the checksum of its index is wrong")
+    index = np.frombuffer(index_bytes, "<u8").reshape(blocks)
+    histogram = np.zeros(shape, np.int32)
+    for row, column in np.argwhere(index[..., 0] != _NOT_STORED):
+        start, size = map(int, index[row, column])
+        block = np.frombuffer(_CODEC.decode(shard[start : start + size]), "<i4").reshape(side, side, *shape[2:])
+        target = histogram[row * side : (row + 1) * side, column * side : (column + 1) * side]
+        target[:] = block[: target.shape[0], : target.shape[1]]
+    return histogram
+
+
+def _checksum(data: bytes) -> bytes:
+    return int(google_crc32c.value(data)).to_bytes(_CHECKSUM_BYTES, "little")
