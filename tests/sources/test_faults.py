@@ -12,13 +12,13 @@ from PIL import Image
 from schemas.flight import FramesConfig
 from tests.media import drifting, flip_bytes, ground, write_images, write_times, write_video
 from velfield.errors import InputError
+from velfield.sources.frame_measures import frame_quality
 from velfield.sources.quality import (
     UNUSABLE,
     FrameFlag,
     describe_flags,
     flag_blurred,
     flag_outlier_frames,
-    frame_quality,
 )
 from velfield.sources.source import iter_frames, probe
 from velfield.sources.video.decoding import _grey

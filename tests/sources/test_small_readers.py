@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
+from velfield.sources.frame_measures import frame_quality
 from velfield.sources.frames import local_path
 from velfield.sources.images import image_size
 from velfield.sources.labels.classes import choose_cars
@@ -24,7 +25,6 @@ from velfield.sources.quality import (
     find_cuts,
     flag_blurred,
     flag_outlier_frames,
-    frame_quality,
     is_black,
     is_duplicate,
 )

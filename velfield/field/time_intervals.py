@@ -5,12 +5,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import floor
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from schemas.arrays import IntArray
 from velfield.errors import InputError
-from velfield.field.segments import Segments
+
+if TYPE_CHECKING:  # planning needs neither it nor pandas, half a second of imports
+    from velfield.field.segments import Segments
 
 DAY_S = 86_400.0
 MAX_INTERVALS = 400
@@ -96,7 +99,7 @@ def _moment(text: str, part: str, midnight_s: float) -> float:
     return float(text)
 
 
-def assign_intervals(segments: Segments, intervals: Sequence[TimeInterval]) -> IntArray:
+def assign_intervals(segments: "Segments", intervals: Sequence[TimeInterval]) -> IntArray:
     """Index of the time interval of each segment, (n,): that of the midpoint of its track, so that no track is split.
 
     Parameters

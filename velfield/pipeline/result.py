@@ -13,10 +13,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from schemas.records import CommitRecord
-from velfield.pipeline.plan import Plan
 from velfield.run.commits import code_version, digest_outputs, valid_commit, write_commit
+
+if TYPE_CHECKING:  # the console imports this file before the first line of a run
+    from velfield.pipeline.plan import Plan
 
 Listener = Callable[[str, int], None]
 
@@ -74,7 +77,7 @@ class StageResult:
     """One line each."""
 
 
-def commit(plan: Plan, stage: str, unit: str, result: StageResult, *, started: float) -> CommitRecord:
+def commit(plan: "Plan", stage: str, unit: str, result: StageResult, *, started: float) -> CommitRecord:
     """Write the record of a finished unit: from now on it is not computed again."""
     record = CommitRecord(
         stage=stage,
@@ -100,6 +103,6 @@ def _return_free_memory() -> None:
         trim(0)
 
 
-def committed(plan: Plan, stage: str, unit: str) -> CommitRecord | None:
+def committed(plan: "Plan", stage: str, unit: str) -> CommitRecord | None:
     """The record of a unit where it is finished as this plan wants it."""
     return valid_commit(plan.layout, stage, unit, plan.keys[stage])

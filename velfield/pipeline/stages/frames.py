@@ -17,6 +17,7 @@ from velfield.errors import InputError
 from velfield.pipeline.plan import Plan
 from velfield.pipeline.result import StageResult, advance
 from velfield.run.stores import THUMBNAIL_SHAPE, FrameStore, create_frames, is_cut_as, open_frames
+from velfield.sources.frame_measures import frame_quality
 from velfield.sources.quality import (
     UNUSABLE,
     FrameFlag,
@@ -25,7 +26,6 @@ from velfield.sources.quality import (
     find_cuts,
     flag_blurred,
     flag_outlier_frames,
-    frame_quality,
 )
 from velfield.sources.source import iter_frames
 
