@@ -89,7 +89,8 @@ def build_base(plan: Plan) -> StageResult:
     own, reference = _build_own_base(plan, detect, lens, spread, _reference_frames(spread, sharpness))
     if isinstance(own, Failure):
         raise InputError(f"no base image can be built from the flight: {own.reason}; give one with --base")
-    write_atomically(layout.own_base_image, png_bytes(own.image))
+    own_png = png_bytes(own.image)
+    write_atomically(layout.own_base_image, own_png)
     write_atomically(layout.own_base_mask, png_bytes(own.valid.astype(np.uint8) * 255))
     reference_image = prepare_base(own.image, plan.config.registration, mask=own.valid, frame_shape=store.shape)
     outputs = [
@@ -101,7 +102,7 @@ def build_base(plan: Plan) -> StageResult:
     fit = None
     if given is None:
         grid = _own_grid(plan, own, reference)
-        write_atomically(layout.base_image, png_bytes(own.image))
+        write_atomically(layout.base_image, own_png)
         layout.base_image_tif.unlink(missing_ok=True)
         layout.own_to_base.unlink(missing_ok=True)
         outputs.append(layout.base_image)
