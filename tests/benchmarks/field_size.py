@@ -48,7 +48,7 @@ def _plan(root: Path, shape: tuple[int, int], tracklets: Any) -> Any:
     plan = planned(FRAMES, root, WIDTH, HEIGHT)
     grid = GridRecord(width_px=shape[1], height_px=shape[0], gsd_m=GSD_M, base_source="given", reference_frame=0)
     write_atomically(plan.layout.grid, grid.model_dump_json().encode())
-    write_tracks(plan.layout.unit_file(plan.layout.tracks, 0, ".parquet"), tracklets)
+    write_tracks(plan.layout.unit_file(plan.layout.tracks, 0), tracklets)
     return plan
 
 

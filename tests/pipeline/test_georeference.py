@@ -225,7 +225,7 @@ def test_a_frame_rate_that_vehicles_contradict_is_reported(
     for fps in (5.0, 10.0, 2.5):
         plan = with_config(made, frames=made.config.frames.model_copy(update={"fps": fps}), gsd_m=0.23)
         georeference_run(plan)
-        write_tracks(run.layout.unit_file(run.layout.tracks, 0, ".parquet"), stopping_street(0.23, fps))
+        write_tracks(run.layout.unit_file(run.layout.tracks, 0), stopping_street(0.23, fps))
         results[fps] = scale_run(plan)
     assert not any("--fps" in line for line in [*results[5.0].warnings, *results[5.0].notes])
     (fast,) = [line for line in results[10.0].warnings if "--fps 10" in line]
@@ -233,9 +233,7 @@ def test_a_frame_rate_that_vehicles_contradict_is_reported(
     assert "give --fps 5 " in fast
     (slow,) = [line for line in results[2.5].warnings if "--fps 2.5" in line]
     assert "about 0.5" in slow
-    write_tracks(
-        run.layout.unit_file(run.layout.tracks, 0, ".parquet"), stopping_street(0.23, 5.0).query("track_id < 4")
-    )
+    write_tracks(run.layout.unit_file(run.layout.tracks, 0), stopping_street(0.23, 5.0).query("track_id < 4"))
     assert any("4 vehicles set off or stop, 10 are needed" in line for line in scale_run(plan).notes)
 
 

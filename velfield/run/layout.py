@@ -119,6 +119,16 @@ def local_output(path: Path) -> Iterator[Path]:
         path.write_bytes(local.read_bytes())
 
 
+class _Inside:
+    """A path of a run folder, from its root."""
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+
+    def __get__(self, layout: "RunLayout", owner: type) -> Path:
+        return layout.root / self._path
+
+
 @dataclass(frozen=True)
 class RunLayout:
     """Paths inside one run folder.
@@ -131,210 +141,85 @@ class RunLayout:
 
     root: Path
 
+    flight = _Inside("flight.json")
+    frames = _Inside("frames.zarr")
+    camera = _Inside("camera.json")
+    map_lens = _Inside("base/lens.json")
+    """The lens by matches with the given base image, where they decide for another than ``camera.json``."""
+    base = _Inside("base")
+    base_image = _Inside("base/base_image.png")
+    base_image_tif = _Inside("base/base_image.tif")
+    own_base_image = _Inside("base/own_base_image.png")
+    """Median of the flight's own frames in the reference frame's grid; every frame is registered to it."""
+    own_base_mask = _Inside("base/own_base_mask.png")
+    """Valid pixels of the own base image."""
+    base_features = _Inside("base/features.npz")
+    """Key points and patches of the image that frames are registered to: each process would detect them again."""
+    base_error_map = _Inside("base/error_map.png")
+    """Cross-validated error of the registration to a given base image."""
+    own_to_base = _Inside("base/own_to_base.json")
+    """Own base pixels -> base pixels, where a base image was given."""
+    rebased = _Inside("base/rebased.json")
+    """Pixels of the base image before -> base pixels, where a result was mapped onto a new base image."""
+    grid = _Inside("base/grid.json")
+    georeference = _Inside("base/georeference.json")
+    """Scale, north and place of the base image, and where each is from."""
+    scale = _Inside("base/scale.json")
+    """`georeference` once more, when the lengths of vehicles are known: it takes its place."""
+    control_points = _Inside("base/control_points.json")
+    """Ground control points, where `velfield georeference` was given some."""
+    working = _Inside("base/working.json")
+    """The grid that cars are detected on."""
+    registration = _Inside("registration.zarr")
+    detector = _Inside("detector.json")
+    detections = _Inside("detections")
+    weak_detections = _Inside("detections/weak")
+    """Candidates of a lower score than a detection's, which tracks can confirm."""
+    dimensions = _Inside("tracks/dimensions.parquet")
+    """Dimensions of the vehicles, a row a track."""
+    track_positions = _Inside("tracks/positions")
+    """Where each track's vehicle was in each frame, by unit."""
+    joins = _Inside("tracks/joins.parquet")
+    """Joins of tracks over a gap, with their probabilities."""
+    tracklets = _Inside("tracklets")
+    """Tracklets by unit, before those that share detections are chained into tracks."""
+    tracks = _Inside("tracks")
+    """Tracklets by unit, each with the track of the vehicle that it belongs to."""
+    field = _Inside("field.zarr")
+    intervals = _Inside("intervals")
+    """Fields of time intervals, a store each."""
+    maps = _Inside("maps")
+    report = _Inside("index.html")
+    view = _Inside("view")
+    """Data of the viewer page beside the field's tiles."""
+    view_record = _Inside("view/run.json")
+    view_segments = _Inside("view/segments.zarr")
+    """Segments of tracks, from one frame to the next."""
+    view_changes = _Inside("view/change.zarr")
+    """Layers of the change since another run, written by `velfield compare`."""
+    report_record = _Inside("view/report.json")
+    """The report's content, from which it is rendered."""
+    analysis = _Inside("analysis")
+    """Results of `velfield analyse`."""
+    results = _Inside("results")
+    """Results on other base images, a run folder each, by name."""
+    results_index = _Inside("results.json")
+    """Names of all results, this folder's own first."""
+    commits = _Inside("commits")
+    preview = _Inside(".preview")
+    """Run folder of a map made before the run is through, while it is being made (`velfield.pipeline.preview`)."""
+    lock = _Inside(".lock")
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "root", to_path(self.root))
 
-    @property
-    def flight(self) -> Path:
-        return self.root / "flight.json"
-
-    @property
-    def frames(self) -> Path:
-        return self.root / "frames.zarr"
-
-    @property
-    def camera(self) -> Path:
-        return self.root / "camera.json"
-
-    @property
-    def map_lens(self) -> Path:
-        """The lens by matches with the given base image, where they decide for another than ``camera.json``."""
-        return self.base / "lens.json"
-
-    @property
-    def base(self) -> Path:
-        return self.root / "base"
-
-    @property
-    def base_image(self) -> Path:
-        return self.base / "base_image.png"
-
-    @property
-    def base_image_tif(self) -> Path:
-        return self.base / "base_image.tif"
-
-    @property
-    def own_base_image(self) -> Path:
-        """Median of the flight's own frames in the reference frame's grid; every frame is registered to it."""
-        return self.base / "own_base_image.png"
-
-    @property
-    def own_base_mask(self) -> Path:
-        """Valid pixels of the own base image."""
-        return self.base / "own_base_mask.png"
-
-    @property
-    def base_features(self) -> Path:
-        """Key points and patches of the image that frames are registered to: each process would detect them again."""
-        return self.base / "features.npz"
-
-    @property
-    def base_error_map(self) -> Path:
-        """Cross-validated error of the registration to a given base image."""
-        return self.base / "error_map.png"
-
-    @property
-    def own_to_base(self) -> Path:
-        """Own base pixels -> base pixels, where a base image was given."""
-        return self.base / "own_to_base.json"
-
-    @property
-    def rebased(self) -> Path:
-        """Pixels of the base image before -> base pixels, where a result was mapped onto a new base image."""
-        return self.base / "rebased.json"
-
-    @property
-    def grid(self) -> Path:
-        return self.base / "grid.json"
-
-    @property
-    def georeference(self) -> Path:
-        """Scale, north and place of the base image, and where each is from."""
-        return self.base / "georeference.json"
-
-    @property
-    def scale(self) -> Path:
-        """`georeference` once more, when the lengths of vehicles are known: it takes its place."""
-        return self.base / "scale.json"
-
-    @property
-    def control_points(self) -> Path:
-        """Ground control points, where `velfield georeference` was given some."""
-        return self.base / "control_points.json"
-
-    @property
-    def working(self) -> Path:
-        """The grid that cars are detected on."""
-        return self.base / "working.json"
-
-    @property
-    def registration(self) -> Path:
-        return self.root / "registration.zarr"
-
-    @property
-    def detector(self) -> Path:
-        return self.root / "detector.json"
-
-    @property
-    def detections(self) -> Path:
-        return self.root / "detections"
-
-    @property
-    def weak_detections(self) -> Path:
-        """Candidates of a lower score than a detection's, which tracks can confirm."""
-        return self.detections / "weak"
-
-    @property
-    def dimensions(self) -> Path:
-        """Dimensions of the vehicles, a row a track."""
-        return self.tracks / "dimensions.parquet"
-
-    @property
-    def track_positions(self) -> Path:
-        """Where each track's vehicle was in each frame, by unit."""
-        return self.tracks / "positions"
-
-    @property
-    def joins(self) -> Path:
-        """Joins of tracks over a gap, with their probabilities."""
-        return self.tracks / "joins.parquet"
-
-    @property
-    def tracklets(self) -> Path:
-        """Tracklets by unit, before those that share detections are chained into tracks."""
-        return self.root / "tracklets"
-
-    @property
-    def tracks(self) -> Path:
-        """Tracklets by unit, each with the track of the vehicle that it belongs to."""
-        return self.root / "tracks"
-
-    @property
-    def field(self) -> Path:
-        return self.root / "field.zarr"
-
-    @property
-    def intervals(self) -> Path:
-        """Fields of time intervals, a store each."""
-        return self.root / "intervals"
-
-    @property
-    def maps(self) -> Path:
-        return self.root / "maps"
-
-    @property
-    def report(self) -> Path:
-        return self.root / "index.html"
-
-    @property
-    def view(self) -> Path:
-        """Data of the viewer page beside the field's tiles."""
-        return self.root / "view"
-
-    @property
-    def view_record(self) -> Path:
-        return self.view / "run.json"
-
-    @property
-    def view_segments(self) -> Path:
-        """Segments of tracks, from one frame to the next."""
-        return self.view / "segments.zarr"
-
-    @property
-    def view_changes(self) -> Path:
-        """Layers of the change since another run, written by `velfield compare`."""
-        return self.view / "change.zarr"
-
-    @property
-    def report_record(self) -> Path:
-        """The report's content, from which it is rendered."""
-        return self.view / "report.json"
-
-    @property
-    def analysis(self) -> Path:
-        """Results of `velfield analyse`."""
-        return self.root / "analysis"
-
-    @property
-    def results(self) -> Path:
-        """Results on other base images, a run folder each, by name."""
-        return self.root / "results"
-
-    @property
-    def results_index(self) -> Path:
-        """Names of all results, this folder's own first."""
-        return self.root / "results.json"
-
-    @property
-    def commits(self) -> Path:
-        return self.root / "commits"
-
-    @property
-    def preview(self) -> Path:
-        """Run folder of a map made before the run is through, while it is being made (`velfield.pipeline.preview`)."""
-        return self.root / ".preview"
-
-    @property
-    def lock(self) -> Path:
-        return self.root / ".lock"
-
-    def unit_file(self, folder: Path, unit: int, suffix: str) -> Path:
+    def unit_file(self, folder: Path, unit: int) -> Path:
         """File of one unit of frames in ``folder``.
 
         Examples
         --------
         >>> layout = RunLayout(Path("RUN"))
-        >>> layout.unit_file(layout.detections, 3, ".parquet").as_posix()
+        >>> layout.unit_file(layout.detections, 3).as_posix()
         'RUN/detections/unit-00003.parquet'
         """
-        return folder / f"unit-{unit:05d}{suffix}"
+        return folder / f"unit-{unit:05d}.parquet"

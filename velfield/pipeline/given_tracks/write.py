@@ -203,9 +203,9 @@ def _write_tables(plan: Plan, given: LoadedTracks, positions: pd.DataFrame, trac
             (layout.detections, DETECTION_COLUMNS),
             (layout.track_positions, TRACK_POSITION_COLUMNS),
         ):
-            written.append(layout.unit_file(folder, unit, ".parquet"))
+            written.append(layout.unit_file(folder, unit))
             write_table(written[-1], here, columns)
-        written.append(layout.unit_file(layout.tracks, unit, ".parquet"))
+        written.append(layout.unit_file(layout.tracks, unit))
         write_tracks(written[-1], part)
     first = positions.assign(length_m=length_m, width_m=width_m).drop_duplicates("track_id")
     sizes = {f"{a}_px": first[f"{a}_m"] / given.gsd_m for a in ("length", "width")}

@@ -311,8 +311,8 @@ def write_detections(plan: Plan, frames: range, blocks: Sequence[BlockDetections
     unit = frames.start // plan.unit_frames
     scale = read_working(plan.layout).scale
     cars, weak = [block.cars for block in blocks], [block.weak for block in blocks]
-    written = _write_part(plan.layout.unit_file(plan.layout.detections, unit, ".parquet"), cars, scale, _NO_CROPS)
-    path = plan.layout.unit_file(plan.layout.weak_detections, unit, ".parquet")
+    written = _write_part(plan.layout.unit_file(plan.layout.detections, unit), cars, scale, _NO_CROPS)
+    path = plan.layout.unit_file(plan.layout.weak_detections, unit)
     written += _write_part(path, weak, scale, _WEAK_CROPS)
     used = int(usable_frames(plan)[frames.start : frames.stop].sum())
     counts = {"frames": float(used), "cars": float(sum(map(len, cars))), "weak": float(sum(map(len, weak)))}

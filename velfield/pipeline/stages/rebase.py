@@ -201,13 +201,13 @@ def _rescale(estimate: ScaleEstimate, scale: float) -> ScaleEstimate:
 def rebase_detections(plan: Plan, frames: range, rebase: Rebase) -> StageResult:
     """Map the detections of a unit, and its weak candidates; their image patches are linked."""
     unit, layout, old = frames.start // plan.unit_frames, plan.layout, rebase.old
-    if not layout.unit_file(old.detections, unit, ".parquet").exists():
+    if not layout.unit_file(old.detections, unit).exists():
         warning = f"frames {frames.start} to {frames.stop - 1} have no detections"
         return StageResult([], {"frames": 0.0, "cars": 0.0}, warnings=[warning])
     transform = polyprojective_from_record(rebase.record.transform)
     written, counts = [], {"frames": 0.0, "cars": 0.0}
     for source, target in ((old.detections, layout.detections), (old.weak_detections, layout.weak_detections)):
-        path = layout.unit_file(source, unit, ".parquet")
+        path = layout.unit_file(source, unit)
         if path.exists():
             table = map_detections(read_tables([path], DETECTION_COLUMNS), transform)
             write_table(target / path.name, table, DETECTION_COLUMNS)

@@ -25,7 +25,7 @@ _READ = ["detection_id", "frame", "x_px", "y_px", "orientation_rad", "orientatio
 def tracklet_files(plan: Plan) -> list[Path]:
     """Tables of tracklets of the units that are finished, in order."""
     layout = plan.layout
-    paths = [layout.unit_file(layout.tracklets, unit, ".parquet") for unit in range(len(plan.units))]
+    paths = [layout.unit_file(layout.tracklets, unit) for unit in range(len(plan.units))]
     return [path for path in paths if path.exists()]
 
 
@@ -65,7 +65,7 @@ def link_unit(plan: Plan, frames: range) -> StageResult:
     tables, weak = (frame_tables(plan, window, times_s, usable, weak=which) for which in (False, True))
     config, gsd_m = plan.config.tracking, read_tracking_gsd(plan.layout)
     tracklets, log = link_windows(tables, config, gsd_m=gsd_m, starts=frames, weak=weak)
-    path = plan.layout.unit_file(plan.layout.tracklets, frames.start // plan.unit_frames, ".parquet")
+    path = plan.layout.unit_file(plan.layout.tracklets, frames.start // plan.unit_frames)
     write_table(path, tracklets, TRACKLET_COLUMNS)
     advance("tracklets", len(frames))
     counts = {f"gate_{name}": float(count) for name, count in log.items()}
@@ -103,7 +103,7 @@ class UnitDetections:
 
 def read_unit(plan: Plan, unit: int, *, weak: bool) -> UnitDetections:
     """Detections of a unit and their patches, or its weak candidates, which have none."""
-    path = plan.layout.unit_file(plan.layout.weak_detections if weak else plan.layout.detections, unit, ".parquet")
+    path = plan.layout.unit_file(plan.layout.weak_detections if weak else plan.layout.detections, unit)
     table = read_tables([path], DETECTION_COLUMNS, only=_READ)
     names = ["chips", "xy_work", "working_scale"] if weak else ["patches", "chips", "xy_work", "working_scale"]
     patches = read_arrays(path.with_suffix(".patches.npz"), only=names)
@@ -117,7 +117,7 @@ def read_chosen(plan: Plan, unit: int, ids: IntArray) -> UnitDetections:
     """
     layout, parts = plan.layout, []
     for folder in (layout.detections, layout.weak_detections):
-        path = layout.unit_file(folder, unit, ".parquet")
+        path = layout.unit_file(folder, unit)
         table = read_tables([path], DETECTION_COLUMNS, only=_READ)
         rows = np.flatnonzero(among(table["detection_id"].to_numpy(), ids))
         patches = read_arrays(path.with_suffix(".patches.npz"), only=["chips", "xy_work", "working_scale"])

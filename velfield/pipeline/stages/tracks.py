@@ -141,7 +141,7 @@ def read_candidates(plan: Plan, tracklets: pd.DataFrame, metres: float) -> Candi
         return table[~among(table["detection_id"].to_numpy(np.int64), used)]
 
     paths = [
-        layout.unit_file(folder, unit, ".parquet")
+        layout.unit_file(folder, unit)
         for unit in range(len(plan.units))
         for folder in (layout.detections, layout.weak_detections)
     ]
@@ -344,7 +344,7 @@ class _Output:
     def _write_unit(self, unit: int, kept: dict[int, UnitDetections]) -> tuple[list[Path], int]:
         layout, frames = self.plan.layout, self.plan.units[unit]
         written, recovered = [], 0
-        path = layout.unit_file(layout.tracklets, unit, ".parquet")
+        path = layout.unit_file(layout.tracklets, unit)
         if path.exists():
             table = read_tables([path], TRACKLET_COLUMNS).assign(recovered=False)
             begin = np.searchsorted(self.first_frame, frames.start)
@@ -357,7 +357,7 @@ class _Output:
             written.append(layout.tracks / path.name)
             write_tracks(written[-1], table)
         rows = slice(*np.searchsorted(self.positions["frame"].to_numpy(), [frames.start, frames.stop]))
-        written.append(layout.unit_file(layout.track_positions, unit, ".parquet"))
+        written.append(layout.unit_file(layout.track_positions, unit))
         write_table(written[-1], self.positions[rows], TRACK_POSITION_COLUMNS)
         return written, recovered
 
@@ -400,7 +400,7 @@ def sum_strips(layout: RunLayout, tracklets: pd.DataFrame, units: int) -> StripS
         return float(patches["working_scale"])
 
     folders = layout.detections, layout.weak_detections
-    paths = [layout.unit_file(folder, unit, ".parquet") for unit in range(units) for folder in folders]
+    paths = [layout.unit_file(folder, unit) for unit in range(units) for folder in folders]
     scales = parallel_map(add, [path for path in paths if path.exists()], at_most=_AT_ONCE)
     return StripSums(ids, total, count, scales[-1] if scales else 1.0)
 
