@@ -50,6 +50,8 @@ EXPORT_FORMATS: dict[ExportFormat, str] = {
 }
 """Format -> what it holds, for the command's help."""
 SpeedUnit = Literal["km/h", "mph", "m/s", "px/s"]
+PER_M_PER_S: dict[SpeedUnit, float] = {"km/h": 3.6, "mph": 2.2369362920544, "m/s": 1.0}
+"""What a speed of 1 m/s is in each metric unit."""
 
 
 class ExportOptions(Model):

@@ -38,7 +38,7 @@ def analyse(
     slice_s
         Length of a time slice for counts, seconds; used if the flight is longer than two slices.
     speed_unit
-        Unit of speeds in the report's diagrams.
+        Unit of speeds in what is printed, the report, the tables and the workbook.
     """
     from velfield.errors import InputError
     from velfield.pipeline.analysis.analyse import analyse_run, analyse_tracks

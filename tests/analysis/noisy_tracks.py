@@ -29,9 +29,10 @@ class Noise:
 
 @dataclass(frozen=True)
 class TrueTracks:
-    """True positions (m, 2), their times, the first row of each vehicle (n + 1,), and its number (n,)."""
+    """True positions (m, 2), their frames and times, the first row of each vehicle (n + 1,), and its number (n,)."""
 
     first: IntArray
+    frame: IntArray
     time_s: FloatArray
     xy_m: FloatArray
     vehicle: IntArray
@@ -46,7 +47,7 @@ class TrueTracks:
         owner = self.owner[rows]
         begin = np.flatnonzero(np.diff(owner, prepend=-1))
         first = np.r_[begin, len(owner)].astype(np.int64)
-        return TrueTracks(first, self.time_s[rows], self.xy_m[rows], self.vehicle[owner[begin]])
+        return TrueTracks(first, self.frame[rows], self.time_s[rows], self.xy_m[rows], self.vehicle[owner[begin]])
 
 
 TRAFFIC = TrafficSimulation(cycle_s=CYCLE_S)
@@ -80,7 +81,8 @@ def true_tracks(made: Flight, seed: int) -> TrueTracks:
     first = np.r_[0, np.flatnonzero(np.diff(owner)) + 1, len(owner)].astype(np.int64)
     time_s = table["time_s"].to_numpy(np.float64)
     xy_m = table[["x_px", "y_px"]].to_numpy(np.float64) * GSD_M
-    return TrueTracks(first, time_s - time_s.min(), xy_m, owner[first[:-1]])
+    frame = table["frame"].to_numpy(np.int64)
+    return TrueTracks(first, frame, time_s - time_s.min(), xy_m, owner[first[:-1]])
 
 
 def clip(tracks: TrueTracks, begin_s: float, end_s: float) -> TrueTracks:
@@ -130,9 +132,8 @@ def analyse(
     lengths, ``known``: what else the analysis is given."""
     owner = tracks.owner
     clean = clean_tracks(owner, tracks.time_s, add_noise(tracks, noise, seed=seed))
-    frame = np.round(5 * tracks.time_s).astype(np.int64)
     made = make_trajectories(
-        clean.track, frame, tracks.time_s, clean.xy_m, gsd_m=GSD_M, position_sd_m=clean.position_sd_m
+        clean.track, tracks.frame, tracks.time_s, clean.xy_m, gsd_m=GSD_M, position_sd_m=clean.position_sd_m
     )
     if lengths_m is not None:
         of = tracks.vehicle[np.minimum(made.track_id, len(tracks.vehicle) - 1)]

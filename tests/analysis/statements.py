@@ -49,11 +49,12 @@ class Interval:
 
 @dataclass(frozen=True)
 class Truth:
-    """The simulated flight of a clip, and its true tracks."""
+    """The simulated flight of a clip, its true tracks, and the analysis of all vehicles of the flight: ``scene``."""
 
     flight: Flight
     signals: bool
     tracks: TrueTracks
+    scene: TrafficAnalysis
 
     @property
     def cycle_s(self) -> float:
@@ -145,13 +146,17 @@ def _signals(analysis: TrafficAnalysis, truth: Truth) -> Iterator[Statement]:
 
 
 def _queues(signal: JunctionSignal, truth: Truth) -> Iterator[Statement]:
+    for estimate, n in queue_pairs(signal, truth):
+        yield Statement("queue", estimate.low - 1 <= n <= estimate.high + 1, f"queue {estimate}, in truth {n}")
+
+
+def queue_pairs(signal: JunctionSignal, truth: Truth) -> Iterator[tuple[Estimate, int]]:
+    """Queues that were found at the onsets of green, and the vehicles that stood there: of all, seen or not."""
+    scene = truth.scene
     for stream in signal.streams:
-        true = observe_stream(
-            stream.stream.approach, truth.analysis.samples, truth.analysis.stops, truth.analysis.trajectories.length_m
-        )
+        true = observe_stream(stream.stream.approach, scene.samples, scene.stops, scene.trajectories.length_m)
         found, real = (queues(s, stream.green_s) for s in (stream.stream, true))
-        for a, b in zip(found, real, strict=False):
-            yield Statement("queue", abs(a.vehicles - b.vehicles) <= 1, f"queue {a}, in truth {b}")
+        yield from ((a.vehicles, b.vehicles.n) for a, b in zip(found, real, strict=False))
 
 
 def _u_turns(analysis: TrafficAnalysis, numbers: IntArray, whole: set[int], begun: set[int]) -> Iterator[Statement]:
@@ -172,11 +177,11 @@ def _limits(analysis: TrafficAnalysis, truth: Truth) -> Iterator[Statement]:
         at = np.concatenate([analysis.lanes.lanes[k].xy_m for k in road.lanes])
         free = truth.free_speed_m_per_s(at)
         yield Statement("speed", _near(road.speed_m_per_s, free, 0.2), f"{road.speed_m_per_s}, in truth {free:.2f}")
-        if road.limit_km_per_h is None:
+        if road.limit() is None:
             yield Statement("limit", True, "", withheld=True)
         else:
             right = round(free * 3.6 / 10) * 10
-            yield Statement("limit", road.limit_km_per_h == right, f"{road.limit_km_per_h}, in truth {free * 3.6:.0f}")
+            yield Statement("limit", road.limit() == right, f"{road.limit()}, in truth {free * 3.6:.0f}")
 
 
 def true_counts(found: JunctionMovements, truth: Truth) -> IntArray:
@@ -207,7 +212,7 @@ def conflicts_found(analysis: TrafficAnalysis, truth: Truth) -> tuple[int, int]:
     if not truth.signals:
         return 0, 0
     numbers = true_numbers(analysis, truth.tracks)
-    near = near_in_time(truth, longest_s=1.5 - PET_SLACK_S, slack=1 / BRAKING_SLACK)
+    near = near_in_time(truth, longest_s=1.5 - PET_SLACK_S, doubtless=True)
     said = {
         frozenset((int(numbers[c.first]), int(numbers[c.second]))) for c in analysis.conflicts if c.probability >= 0.5
     }
@@ -226,18 +231,21 @@ def _conflicts(analysis: TrafficAnalysis, truth: Truth, numbers: IntArray) -> It
             yield Statement(f"conflict, {c.kind}", value < c.threshold_s + PET_SLACK_S, text)
 
 
-def near_in_time(truth: Truth, *, longest_s: float = 3.0, slack: float = BRAKING_SLACK) -> dict[frozenset[int], float]:
+def near_in_time(truth: Truth, *, longest_s: float = 3.0, doubtless: bool = False) -> dict[frozenset[int], float]:
     """Least time to collision, or post-encroachment time, of each pair of true tracks for which it is below
-    ``longest_s``; ``slack``: by this factor less than the braking of a conflict is enough."""
-    out = _times_to_collision(truth, longest_s, HARD_BRAKING_M_PER_S2 / slack)
-    for pair, value in _encroachments(truth, longest_s).items():
+    ``longest_s``; ``doubtless``: those that need harder braking than a conflict, not those that need nearly as hard."""
+    slack = 1 / BRAKING_SLACK if doubtless else BRAKING_SLACK
+    out = _times_to_collision(truth, longest_s, HARD_BRAKING_M_PER_S2 / slack, doubtless=doubtless)
+    for pair, value in _encroachments(truth, longest_s, doubtless=doubtless).items():
         out[pair] = min(value, out.get(pair, np.inf))
     return out
 
 
-def _times_to_collision(truth: Truth, longest_s: float, braking_m_per_s2: float) -> dict[frozenset[int], float]:
+def _times_to_collision(
+    truth: Truth, longest_s: float, braking_m_per_s2: float, *, doubtless: bool
+) -> dict[frozenset[int], float]:
     """By true positions: a follower faster than 3 m/s that closes in by .5 m/s, in one lane, in one frame, and must
-    brake harder than ``braking_m_per_s2``."""
+    brake harder than ``braking_m_per_s2``; ``doubtless``: neither turns."""
     t = truth.analysis.trajectories
     owner, speed = t.track_id[t.owner], t.speed_m_per_s
     length, way = truth.lengths_m[truth.tracks.vehicle][owner], t.velocity_m_per_s / np.maximum(speed, 0.1)[:, None]
@@ -250,7 +258,9 @@ def _times_to_collision(truth: Truth, longest_s: float, braking_m_per_s2: float)
     closing = speed[follower] - (t.velocity_m_per_s[leader] * way[follower]).sum(axis=1)
     value = (along - (length[follower] + length[leader]) / 2) / np.maximum(closing, 0.1)
     hard = closing / (2 * np.maximum(value, 1e-3)) > braking_m_per_s2
+    same_way = (way[follower] * way[leader]).sum(axis=1) > np.cos(np.radians(30))
     counts = (along > 0) & (across < 1.5) & (closing > 0.5) & (speed[follower] > 3.0) & hard & (value < longest_s)
+    counts &= (same_way | (not doubtless)) & (owner[follower] != owner[leader])
     out: dict[frozenset[int], float] = {}
     for k in np.flatnonzero(counts):
         pair = frozenset((int(owner[follower[k]]), int(owner[leader[k]])))
@@ -258,8 +268,9 @@ def _times_to_collision(truth: Truth, longest_s: float, braking_m_per_s2: float)
     return out
 
 
-def _encroachments(truth: Truth, longest_s: float) -> dict[frozenset[int], float]:
-    """Least time between one vehicle's rear and another's front at a place to which they came by different ways."""
+def _encroachments(truth: Truth, longest_s: float, *, doubtless: bool) -> dict[frozenset[int], float]:
+    """Least time between one vehicle's rear and another's front at a place to which they came by different ways;
+    ``doubtless``: of both it is known by which."""
     samples, lengths = truth.analysis.samples, truth.lengths_m[truth.tracks.vehicle]
     ids = truth.analysis.trajectories.track_id[samples.track]
     half = lengths[ids] / 2 / np.maximum(samples.speed_m_per_s, 1.0)
@@ -268,7 +279,10 @@ def _encroachments(truth: Truth, longest_s: float) -> dict[frozenset[int], float
     close = np.abs(samples.time_s[pairs[:, 0]] - samples.time_s[pairs[:, 1]]) < longest_s + 6.0
     pairs = pairs[close & (ids[pairs[:, 0]] != ids[pairs[:, 1]])]
     before = np.maximum(np.arange(len(ids)) - 12, 0)
-    before = np.where(samples.track[before] == samples.track, before, np.arange(len(ids)))
+    known = samples.track[before] == samples.track
+    before = np.where(known, before, np.arange(len(ids)))
+    if doubtless:
+        pairs = pairs[known[pairs].all(axis=1)]
     a, b = pairs.T
     turned = np.abs(np.angle(np.exp(1j * (samples.direction_rad[before[a]] - samples.direction_rad[before[b]]))))
     apart = np.hypot(*(samples.xy_m[before[a]] - samples.xy_m[before[b]]).T)
@@ -322,6 +336,7 @@ def intervals(analysis: TrafficAnalysis, truth: Truth) -> Iterator[Interval]:
         crossing = np.hypot(*(truth.crossings_m - centre).T).min(initial=np.inf) < CROSSING_M
         if signal.cycle_s and crossing and truth.signals:
             yield Interval("cycle", truth.cycle_s, signal.cycle_s)
+            yield from (Interval("queue", n, estimate) for estimate, n in queue_pairs(signal, truth))
     if analysis.classes is not None:
         shares = analysis.classes.estimate_shares(analysis.classes.measured)
         if shares[-1]:

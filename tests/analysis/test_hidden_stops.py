@@ -46,7 +46,7 @@ def test_a_tree_over_the_stop_line_does_not_move_it(whole: TrafficAnalysis) -> N
     assert found.head_time_s == pytest.approx(stream.head_time_s, abs=1.0)
     (signal,) = [s for s in hidden.signals.values() if s.signalised]
     for one in signal.streams:
-        counts = [queue.vehicles for queue in queues(one.stream, one.green_s[1:-1])]
+        counts = [queue.vehicles.value for queue in queues(one.stream, one.green_s[1:-1])]
         assert np.median(counts) == 4
 
 

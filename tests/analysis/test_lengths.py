@@ -50,7 +50,7 @@ def test_a_queue_ends_at_its_last_vehicles_rear() -> None:
             # the same centres: both bumpers are a metre farther out
             assert t.stream.stop_line_m - s.stream.stop_line_m == pytest.approx(1.0, abs=0.3)
             rows = zip(queues(s.stream, s.green_s[1:-1]), queues(t.stream, t.green_s[1:-1]), strict=True)
-            more = [y.length_m - x.length_m for x, y in rows if x.vehicles == y.vehicles > 0]
+            more = [y.length_m - x.length_m for x, y in rows if x.vehicles.value == y.vehicles.value > 0]
             assert np.median(more) == pytest.approx(2.0, abs=0.5)
 
 

@@ -296,7 +296,7 @@ def _streams(case: Case, signal: JunctionSignal, samples: PathSamples, stops: St
             results.values["signals: stop line, m"].append(abs(distance - (STOP_B if axis else STOP_A)))
         truth = observe_stream(stream.stream.approach, samples, stops)
         pairs = zip(queues(stream.stream, stream.green_s), queues(truth, stream.green_s), strict=False)
-        results.values["signals: queue, vehicles"] += [abs(a.vehicles - b.vehicles) for a, b in pairs]
+        results.values["signals: queue, vehicles"] += [abs(a.vehicles.value - b.vehicles.value) for a, b in pairs]
 
 
 def _u_turns(case: Case, found: TrafficAnalysis, results: Results) -> None:

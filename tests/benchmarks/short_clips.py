@@ -52,6 +52,7 @@ def make_cases(seed: int, *, clips: int = CLIPS) -> Iterator[Case]:
     )
     made = flight(seed, FLIGHT_S, traffic, signals)
     whole, middles = true_tracks(made, seed), turn_middles_m(made)
+    scene = analyse(whole, Noise(), lengths_m=made.city.traffic.dimensions.length_m)
     parked = made.city.vehicles.parked_pose
     parked = parked[((parked[:, :2] > 0) & (parked[:, :2] < made.base_shape[::-1])).all(axis=1)] * [GSD_M, GSD_M, 1]
     for k in range(clips):
@@ -70,7 +71,7 @@ def make_cases(seed: int, *, clips: int = CLIPS) -> Iterator[Case]:
         analysis = analyse(piece, noise, seed=seed + k, lengths_m=lengths, parked=parked, classes=classes)
         turns = tuple(true_u_turns(piece, middles, seen_m=m) for m in (20.0, 0.0))
         name = f"{seed}/{k} {seconds:.0f} s {'signal' if signals else 'no signal'} {keep:g} 1/{every} {noise}"
-        yield Case(name, analysis, Truth(made, signals, piece), (turns[0], turns[1]))
+        yield Case(name, analysis, Truth(made, signals, piece, scene), (turns[0], turns[1]))
 
 
 def turn_middles_m(made: Flight) -> list[np.ndarray]:
@@ -105,7 +106,7 @@ def true_u_turns(tracks: TrueTracks, middles_m: list[np.ndarray], *, seen_m: flo
 def _sparse(tracks: TrueTracks, keep: float, every: int, rng: np.random.Generator) -> TrueTracks:
     """A part of the vehicles, and of the frames."""
     kept = rng.uniform(size=len(tracks.vehicle)) < keep
-    return tracks.select(kept[tracks.owner] & (np.round(5 * tracks.time_s).astype(np.int64) % every == 0))
+    return tracks.select(kept[tracks.owner] & (tracks.frame % every == 0))
 
 
 def main() -> None:

@@ -6,9 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from schemas.analysis import EstimateRecord
 from tests.analysis.test_traffic_analysis import CYCLE_S, analysis, drive, gather
 from velfield.analysis.answers import duration_text
 from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.pipeline.analysis.tables import all_tables, limit_table
 from velfield.report.drawing import new_figure, pages_bytes
 from velfield.report.traffic.approaches import approach_delays, lane_names
 from velfield.report.traffic.diagrams import draw_queues, draw_time_space, red_times, traffic_diagrams
@@ -87,3 +89,21 @@ def test_delay_of_an_approach_is_the_mean_over_its_vehicles(
     monkeypatch.setitem(analysis.signals, number, replace(analysis.signals[number], signalised=None))
     assert {d.level for d in approach_delays(analysis, found)} == {""}
     assert sorted(name.split(",")[0] for name in lane_names(found).values()) == ["from N", "from W"]
+
+
+def test_speeds_are_in_the_unit_of_choice_everywhere(analysis: TrafficAnalysis) -> None:
+    """43 km/h are 27 mph: the nearest sign is one of 25 mph where signs are in mph."""
+    page = first_page(analysis, unit="mph")
+    (speeds,) = [lines for question, lines in page.answers if question.startswith("How fast")]
+    assert all(" mph (" in line and "km/h" not in line for line in speeds)
+    for km_per_h, mph in zip(all_tables(analysis), all_tables(analysis, unit="mph"), strict=True):
+        for a, b in zip(km_per_h.columns, mph.columns, strict=True):
+            assert b.unit == ("mph" if a.unit == "km/h" else a.unit)
+            for row, other in zip(km_per_h.rows, mph.rows, strict=True):
+                value, same = row.cells[a.name], other.cells[b.name]
+                if a.unit == "km/h" and isinstance(value, EstimateRecord) and value.value:
+                    assert isinstance(same, EstimateRecord)
+                    assert same.value == pytest.approx(value.value / 1.609344, rel=1e-3)
+    limits = {row.cells["limit"] for row in limit_table(analysis, "mph").rows}
+    assert 25.0 in limits
+    assert limits <= {None, 25.0}

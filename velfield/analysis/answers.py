@@ -5,8 +5,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
+from schemas.export import PER_M_PER_S, SpeedUnit
 from velfield.analysis.intervals import Estimate
-from velfield.analysis.signals.cycles import JunctionSignal, queues
+from velfield.analysis.signals.cycles import JunctionSignal, Queue, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.vehicle_classes import COUNTED_CLASSES
 
@@ -45,15 +46,21 @@ class Answer:
     at_most_per_h: float | None = None
 
 
-def find_answers(analysis: TrafficAnalysis) -> Iterator[Answer]:
-    """The answer to every question, in the order in which they are printed; the largest groups of each first."""
+def find_answers(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iterator[Answer]:
+    """The answer to every question, in the order in which they are printed; the largest groups of each first.
+
+    Parameters
+    ----------
+    unit
+        Unit of speeds: km/h or mph.
+    """
     yield _lanes(analysis)
     if analysis.trajectories.duration_s < _SHORT_S or len(analysis.trajectories) < _FEW_TRACKS:
         yield Answer("length", "", "too little data", too_short(analysis))
     yield _classes(analysis)
     yield from _movements(analysis)
     yield from _scene(analysis)
-    yield from _speeds(analysis)
+    yield from _speeds(analysis, unit)
     for number, signal in analysis.signals.items():
         yield _signal(number, signal)
     seconds = analysis.trajectories.duration_s
@@ -122,12 +129,13 @@ def _scene(analysis: TrafficAnalysis) -> Iterator[Answer]:
         yield Answer("scene", f"{r.origin.name} to {r.destination.name}", "found", text, r.share, "")
 
 
-def _speeds(analysis: TrafficAnalysis) -> Iterator[Answer]:
+def _speeds(analysis: TrafficAnalysis, unit: SpeedUnit) -> Iterator[Answer]:
     known = [(road, road.speed_m_per_s) for road in analysis.free_flow if road.speed_m_per_s]
     for road, speed in sorted(known, key=lambda pair: -pair[1].n):
-        limit = f"about {road.limit_km_per_h:.0f}" if road.limit_km_per_h else "between two signs"
-        text = f"free flow {estimate_text(speed, 'km/h', 3.6)}, limit {limit}"
-        yield Answer("speed", f"lanes {' '.join(map(str, road.lanes))}", "found", text, speed.in_units(3.6), "km/h")
+        sign, factor = road.limit(unit), PER_M_PER_S[unit]
+        limit = f"about {sign:.0f}" if sign else "between two signs"
+        text = f"free flow {estimate_text(speed, unit, factor)}, limit {limit}"
+        yield Answer("speed", f"lanes {' '.join(map(str, road.lanes))}", "found", text, speed.in_units(factor), unit)
     if not known:
         text = "too little data: no road with 8 vehicles that go freely and steadily"
         yield Answer("speed", "", "too little data", text)
@@ -144,7 +152,7 @@ def _signal(number: int, signal: JunctionSignal) -> Answer:
         longest = max((q for s in streams for q in queues(s.stream, s.green_s)), key=lambda q: q.length_m, default=None)
         text += f"; lanes {' '.join(map(str, lanes))}: green at {estimate_text(streams[0].green_phase_s, 's')}"
         if longest:
-            text += f", longest queue {count_text(longest.vehicles, 'vehicle')}, {longest.length_m:.0f} m"
+            text += f", longest queue {queue_text(longest)}"
     return Answer("signal", subject, "found", text, signal.cycle_s, "s")
 
 
@@ -189,6 +197,18 @@ def count_text(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
+def queue_text(queue: Queue) -> str:
+    """Vehicles of a queue, with their interval, and its length.
+
+    Examples
+    --------
+    >>> queue_text(Queue(12.0, Estimate(4, 3, 6, 3), 23.4))
+    '4 vehicles (3 to 6), 23 m'
+    """
+    n = queue.vehicles
+    return f"{count_text(round(n.value), 'vehicle')} ({n.low:.0f} to {n.high:.0f}), {queue.length_m:.0f} m"
+
+
 def duration_text(seconds: float) -> str:
     """A duration in seconds or minutes, for people."""
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.1f} min"
@@ -197,7 +217,7 @@ def duration_text(seconds: float) -> str:
 def estimate_text(estimate: Estimate | None, unit: str, factor: float = 1.0) -> str:
     """An estimate in another unit with its interval and count; or that there is too little data.
 
-    Seconds have one decimal; km/h have none where the value is 10 or more; others have three digits.
+    Seconds have one decimal; km/h and mph have none where the value is 10 or more; others have three digits.
 
     Examples
     --------
@@ -207,7 +227,8 @@ def estimate_text(estimate: Estimate | None, unit: str, factor: float = 1.0) -> 
     if estimate is None:
         return "too little data"
     scaled = estimate.in_units(factor)
-    decimals = {"s": 1, "km/h": int(abs(scaled.value) < 10)}.get(unit)
+    speed = int(abs(scaled.value) < 10)
+    decimals = {"s": 1, "km/h": speed, "mph": speed}.get(unit)
 
     def rounded(x: float) -> str:
         if decimals is not None:

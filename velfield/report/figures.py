@@ -8,13 +8,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from schemas.arrays import FloatArray, GreyImage, Mask, RGBImage
-from schemas.export import SpeedUnit
+from schemas.export import PER_M_PER_S, SpeedUnit
 from velfield.errors import InputError
 from velfield.report.colours import direction_colours, ramp_colours
 from velfield.report.panel import Legend, legend_panel
-
-PER_M_PER_S: dict[SpeedUnit, float] = {"km/h": 3.6, "mph": 2.2369362920544, "m/s": 1.0}
-"""Units in one metre a second; px/s is not metric."""
 
 _DIMMED = 0.5
 """Brightness of the base image under the colours."""

@@ -66,6 +66,18 @@ class PositionErrors:
         return f"{self.total_m:.2f} m, of which {self.lasting_m:.2f} m last {self.lasts_s:.1f} s"
 
 
+def speed_sd_m_per_s(position_sd_m: float) -> float:
+    """Standard deviation of a speed, m/s, of tracks whose smoothed positions have this one: of a smoother of white
+    acceleration it follows from it.
+
+    Examples
+    --------
+    >>> speed_sd_m_per_s(0.0), round(speed_sd_m_per_s(0.3), 2)
+    (0.0, 0.6)
+    """
+    return float(np.cbrt(ACCELERATION_NOISE * position_sd_m / (2 * np.sqrt(2))))
+
+
 @dataclass(frozen=True)
 class CleanTracks:
     """Tracks without their errors.

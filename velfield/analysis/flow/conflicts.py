@@ -1,7 +1,7 @@
 """Conflicts: post-encroachment time where paths cross or merge, time to collision behind a leader; with the probability
 that each is a conflict, given the errors of positions."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -15,7 +15,7 @@ from velfield.analysis.lanes.junctions import Crossing, find_crossings
 from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.trajectories import VEHICLE_WIDTH_M, Trajectories, group_rows
 from velfield.compiled import kernel
-from velfield.tracking.smoothing import ACCELERATION_NOISE
+from velfield.tracking.smoothing import speed_sd_m_per_s
 
 ConflictKind = Literal["crossing", "merging", "following"]
 MAX_PET_S, MAX_TTC_S = 3.0, 3.0
@@ -31,9 +31,13 @@ _MIN_SPEED_M_PER_S = 1.0
 _MIN_FOLLOWER_M_PER_S = 3.0
 _OVERLAP_M = 1.0
 _PERSISTENCE_S = 0.4
-_THROUGH_SIGMAS, _THROUGH_SHARE, _BRIDGE_M = 3.0, 0.03, 40.0
-"""Vehicles drive through each other where one road is above the other: this fraction of the pairs within so far, by so
-many standard deviations of their times. Of those that know nothing of each other 8 % do."""
+_AT_ONCE_S, _BRIDGE_M = 0.5, 40.0
+_ONE_LEVEL, _TWO_LEVELS = (1.0, 30.0), (3.0, 6.0)
+"""Where one road is above the other vehicles know nothing of each other: of the pairs that pass within 3 s a third or
+so has less than half a second between them, or none; on one level they avoid it. Beta distributions of that share,
+which shows in the pairs within so far."""
+_ONE_LEVEL_BEFORE, _LEAST_ONE_LEVEL = 0.1, 0.05
+"""Few pairs do not rule out two levels: to be taken for one level roads must be ten times as likely on it."""
 _JOINED_M = 4.0
 """A lane that joins another is on it so far after its own end."""
 _APART_M = 1.8
@@ -97,18 +101,36 @@ def find_conflicts(
 
 
 def _on_one_level(found: list[Conflict]) -> list[Conflict]:
-    """The crossings less those on two levels: near them pairs are at one place at one time, beyond errors."""
+    """The crossings, each as probable as its roads are on one level; without those that are hardly on one."""
     xy = np.array([c.xy_m for c in found]).reshape(-1, 2)
-    through = np.array([c.value_s < -_THROUGH_SIGMAS * c.sd_s for c in found], bool)
+    at_once = np.array([c.value_s < _AT_ONCE_S for c in found], bool)
     near = cKDTree(xy).query_ball_point(xy, _BRIDGE_M) if len(xy) else []
-    return [c for c, rows in zip(found, near, strict=True) if through[rows].mean() < _THROUGH_SHARE]
+    level = [one_level_probability(int(at_once[rows].sum()), at_once[rows].size) for rows in near]
+    return [
+        replace(c, probability=c.probability * p) for c, p in zip(found, level, strict=True) if p > _LEAST_ONE_LEVEL
+    ]
+
+
+def one_level_probability(at_once: int, pairs: int) -> float:
+    """Probability that roads cross on one level, of ``pairs`` within 3 s of which some are ``at_once``: by Bayes' rule,
+    before any pair `_ONE_LEVEL_BEFORE`.
+
+    Examples
+    --------
+    >>> [round(one_level_probability(k, 20), 2) for k in (0, 2, 5)]
+    [0.8, 0.14, 0.01]
+    """
+    one, two = (
+        float(special.betaln(at_once + a, pairs - at_once + b) - special.betaln(a, b))
+        for a, b in (_ONE_LEVEL, _TWO_LEVELS)
+    )
+    return float(special.expit(one - two + special.logit(_ONE_LEVEL_BEFORE)))
 
 
 def _deviations(position_sd_m: float) -> tuple[float, float]:
     """Standard deviations of a bumper's position, m, and of a speed, m/s, of tracks whose smoothed positions have this
-    one: of a smoother of white acceleration the second follows from the first."""
-    smoothed = float(np.cbrt(ACCELERATION_NOISE * position_sd_m / (2 * np.sqrt(2))))
-    return float(np.hypot(POSITION_SD_M, position_sd_m)), max(SPEED_SD_M_PER_S, smoothed)
+    one."""
+    return float(np.hypot(POSITION_SD_M, position_sd_m)), max(SPEED_SD_M_PER_S, speed_sd_m_per_s(position_sd_m))
 
 
 def _closest(found: list[Conflict]) -> list[Conflict]:

@@ -1,11 +1,13 @@
 """Speeds along lanes: profiles, free flow and the limit that it shows, and what a feature takes from it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import special
 
 from schemas.arrays import FloatArray, IntArray, Mask
+from schemas.export import PER_M_PER_S, SpeedUnit
 from velfield.analysis.flow.passings import LaneTraffic, find_passings
 from velfield.analysis.intervals import (
     LEVEL,
@@ -30,8 +32,8 @@ _STEADY_SD = 0.002
 _RISES = 0.01
 """One that is faster by more than this fraction at its end still speeds up: it would like to go faster than it does."""
 _MIN_FREE = 8
-SIGN_KM_PER_H = 10.0
-"""Speed limits are multiples of it."""
+SIGNS: dict[SpeedUnit, float] = {"km/h": 10.0, "mph": 5.0}
+"""Speed limits are multiples of these."""
 _AWAY_M, _WAY_M, _MIN_WAY_M = 50, 45, 15
 """A speed before a junction is that so far from its area; the lowest is sought so far into it, of tracks seen at least
 so far."""
@@ -90,54 +92,80 @@ class FreeFlow:
     speed_m_per_s
         Median speed at which drivers go where nobody is ahead; None: too few of them are seen to. Those who follow
         count as faster than they go (Botma's estimator of free speeds).
-    limit_km_per_h
-        The multiple of ten nearest to it; None where its interval holds the border of two.
     p85_m_per_s
         Which 85 of 100 drivers do not exceed.
     """
 
     lanes: tuple[int, ...]
     speed_m_per_s: Estimate | None
-    limit_km_per_h: float | None
     p85_m_per_s: Estimate | None
+
+    def limit(self, unit: SpeedUnit = "km/h") -> float | None:
+        """The speed on a sign that is nearest to the free speed (`SIGNS`), in km/h or mph; None where its interval
+        holds the border of two."""
+        if self.speed_m_per_s is None or unit not in SIGNS:
+            return None
+        ends = self.speed_m_per_s.low, self.speed_m_per_s.high
+        signs = {round(end * PER_M_PER_S[unit] / SIGNS[unit]) for end in ends}
+        return signs.pop() * SIGNS[unit] if len(signs) == 1 else None
 
 
 def free_flow(traffic: LaneTraffic) -> list[FreeFlow]:
     """Free flow of every road of a lane graph."""
-    speeds = [_steady_speeds(traffic, lane.number) for lane in traffic.graph]
+    lanes = [_steady_speeds(traffic, lane.number) for lane in traffic.graph]
+    found = [(road, [np.concatenate([lanes[k][c] for k in road]) for c in range(4)]) for road in roads(traffic.graph)]
+    by_vehicle = [
+        [_by_vehicle(*speeds, follows_s=follows_s) for follows_s in _FOLLOWS_HEADWAY_S] for _, speeds in found
+    ]
+    spread = _spread([one[0] for one in by_vehicle])
     out = []
-    for lanes in roads(traffic.graph):
-        tracks, values, headway, rises = (np.concatenate([speeds[lane][k] for lane in lanes]) for k in range(4))
-        median, p85 = (_free_quantile(tracks, values, headway, rises, q) for q in (0.5, 0.85))
-        signs = {round(v * 3.6 / SIGN_KM_PER_H) for v in (median.low, median.high)} if median else set()
-        limit = signs.pop() * SIGN_KM_PER_H if len(signs) == 1 else None
-        out.append(FreeFlow(tuple(lanes), median, limit, p85))
+    for (road, _), speeds in zip(found, by_vehicle, strict=True):
+        median, p85 = (_free_quantile(speeds, q, spread) for q in (0.5, 0.85))
+        out.append(FreeFlow(tuple(road), median, p85))
     return out
 
 
+def _by_vehicle(
+    tracks: IntArray, speeds: FloatArray, headway_s: FloatArray, rises: Mask, *, follows_s: float
+) -> tuple[FloatArray, Mask]:
+    """The fastest steady stretch of each vehicle, as it goes slowly for other reasons too, and whether it goes freely
+    there; else it would like to go faster. ``follows_s``: headway below which a vehicle follows."""
+    free = headway_s > _FREE_HEADWAY_S
+    used = np.flatnonzero(free | (headway_s < follows_s))
+    order = used[np.lexsort((-speeds[used], tracks[used]))]
+    best = order[np.unique(tracks[order], return_index=True)[1]]
+    return speeds[best], (free & ~rises)[best]
+
+
+def _spread(by_road: Sequence[tuple[FloatArray, Mask]]) -> tuple[float, int]:
+    """Standard deviation of the logarithms of drivers' free speeds about their road's mean, and its degrees of
+    freedom."""
+    logs = [np.log(speeds[free]) for speeds, free in by_road if free.sum() > 1]
+    squares, degrees = sum(float(((x - x.mean()) ** 2).sum()) for x in logs), sum(len(x) - 1 for x in logs)
+    return float(np.sqrt(squares / degrees)) if degrees else 0.0, degrees
+
+
 def _free_quantile(
-    tracks: IntArray, speeds: FloatArray, headway_s: FloatArray, rises: Mask, q: float
+    by_headway: Sequence[tuple[FloatArray, Mask]], q: float, spread: tuple[float, int]
 ) -> Estimate | None:
     """A quantile of free speeds: the mean for both headways from which on a vehicle may follow, and the interval that
-    holds both of theirs."""
-    found = []
-    for follows_s in _FOLLOWS_HEADWAY_S:
-        free = headway_s > _FREE_HEADWAY_S
-        used = np.flatnonzero(free | (headway_s < follows_s))
-        free = free & ~rises
-        # a vehicle once: its fastest steady stretch, as it goes slowly for other reasons too
-        order = used[np.lexsort((-speeds[used], tracks[used]))]
-        _, first = np.unique(tracks[order], return_index=True)
-        best = order[first]
-        found.append(estimate_censored_quantile(speeds[best], free[best], q, min_n=_MIN_FREE))
+    holds both of theirs.
+
+    Order statistics of few drivers may lie near to each other by chance: the interval is no narrower than the
+    ``spread`` of the drivers of all roads gives (`_spread`).
+    """
+    found = [estimate_censored_quantile(speeds, free, q, min_n=_MIN_FREE) for speeds, free in by_headway]
     known = [estimate for estimate in found if estimate is not None]
     if not known:
         return None
-    value = float(np.mean([estimate.value for estimate in known]))
+    value, n = float(np.mean([estimate.value for estimate in known])), min(estimate.n for estimate in known)
+    sd, degrees = spread
+    density = float(np.exp(-(special.ndtri(q) ** 2) / 2) / np.sqrt(2 * np.pi))
+    least = value * sd * float(special.stdtrit(degrees, (1 + LEVEL) / 2)) * np.sqrt(q * (1 - q) / n) / density
     systematic = float(special.ndtri((1 + LEVEL) / 2)) * _STEADY_SD * value
     below, above = value - min(e.low for e in known), max(e.high for e in known) - value
-    low, high = value - float(np.hypot(below, systematic)), value + float(np.hypot(above, systematic))
-    return Estimate(value, low, high, min(estimate.n for estimate in known))
+    low, high = (float(np.hypot(max(side, least), systematic)) for side in (below, above))
+    return Estimate(value, value - low, value + high, n)
 
 
 def _steady_speeds(traffic: LaneTraffic, lane: int) -> tuple[IntArray, FloatArray, FloatArray, Mask]:

@@ -13,8 +13,9 @@ from velfield.analysis.lanes.model import Connection, Junction, JunctionKind, La
 
 _NEAR_M = 15.0
 """Meeting points nearer to each other are of one junction: a median is up to 14 m wide."""
-_MARGIN_M = 4.0
-"""Margin of a junction's area around its meeting points."""
+_MARGIN_M, _HALF_LANE_M = 4.0, 2.0
+"""Margin of a junction's area around its meeting points; and to the side of a lane's centre line in it, as vehicles
+beside the centre line pass it, too."""
 _CROSSING_RAD = np.radians(25)
 """Lanes whose directions differ less do not cross: they merge or run beside each other."""
 _STEP_M = 1.5
@@ -36,7 +37,7 @@ def find_junctions(lanes: Sequence[Lane], connections: Sequence[Connection]) -> 
     groups.sort(key=lambda group: (group[0][:, 1].mean(), group[0][:, 0].mean()))
     made: list[Junction] = []
     for xy, kind in groups:
-        hull = buffered_hull(xy, _MARGIN_M)
+        hull = _with_whole_lanes(buffered_hull(xy, _MARGIN_M), lanes)
         lanes_in, lanes_out, inside_ = _members(lanes, hull)
         made.append(
             Junction(
@@ -50,6 +51,17 @@ def find_junctions(lanes: Sequence[Lane], connections: Sequence[Connection]) -> 
             )
         )
     return tuple(made)
+
+
+def _with_whole_lanes(hull_m: FloatArray, lanes: Sequence[Lane]) -> FloatArray:
+    """The hull (n, 2), widened to hold the whole width of the lanes that run through it."""
+    points = [hull_m]
+    for lane in lanes:
+        inside = inside_hull(lane.xy_m, hull_m)
+        across = np.column_stack([-np.sin(lane.direction_rad), np.cos(lane.direction_rad)])[inside] * _HALF_LANE_M
+        points += [lane.xy_m[inside] - across, lane.xy_m[inside] + across]
+    every = np.concatenate(points)
+    return np.asarray(every[ConvexHull(every).vertices])
 
 
 def _kind(kinds: IntArray) -> JunctionKind:

@@ -1,5 +1,6 @@
 """Gates: where lanes cross the border of a junction, grouped into its arms."""
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ _ARM_M = 17.0
 """Gates of one arm are nearer to each other: a median may lie between them."""
 _ARM_RAD = np.radians(35)
 """Axes of one arm's gates differ by less."""
-COMPASS = ("E", "SE", "S", "SW", "W", "NW", "N", "NE")
+_COMPASS = ("E", "SE", "S", "SW", "W", "NW", "N", "NE")
 """Sides of the image by direction, every 45° from the right, clockwise."""
 
 
@@ -76,7 +77,7 @@ def find_gates(graph: LaneGraph, junction: Junction) -> Gates:
     order = sorted(range(len(numbers)), key=lambda k: float((outward[k] + np.pi / 2) % (2 * np.pi)))
     rank = {numbers[k]: i for i, k in enumerate(order)}
     gates = tuple(Gate(*f, arm=rank[int(arm)]) for f, arm in zip(found, arms, strict=True))
-    names = _names([outward[k] for k in order])
+    names = name_arms({i: outward[k] for i, k in enumerate(order)}, {i: middles[k] for i, k in enumerate(order)})
     return Gates(gates, tuple(Arm(i, names[i], middles[k]) for i, k in enumerate(order)))
 
 
@@ -104,9 +105,33 @@ def group_gates(found: list[tuple[int, bool, FloatArray, float]]) -> IntArray:
     return label
 
 
-def _names(outward_rad: list[float]) -> list[str]:
-    names: list[str] = []
-    for angle in outward_rad:
-        name = COMPASS[int(np.round(angle / (np.pi / 4))) % 8]
-        names.append(name if name not in names else f"{name}{sum(other.startswith(name) for other in names) + 1}")
+def name_arms(
+    outward_rad: Mapping[int, float], xy_m: Mapping[int, FloatArray], inside: Collection[int] = ()
+) -> dict[int, str]:
+    """Names of arms by their numbers: the side of the image that each leads to, or ``inside``.
+
+    Several arms of one side are numbered from the top, or from the left: ``N1``, ``N2``.
+
+    Parameters
+    ----------
+    outward_rad
+        Direction of each arm away from the traffic, rad.
+    xy_m
+        (2,) position of each arm.
+    inside
+        Arms that lead to a place within the scene.
+
+    Examples
+    --------
+    >>> at = {0: np.array([30.0, 0.0]), 1: np.array([10.0, 0.0]), 2: np.array([90.0, 40.0])}
+    >>> name_arms({0: -1.6, 1: -1.5, 2: 0.0}, at)
+    {0: 'N2', 1: 'N1', 2: 'E'}
+    """
+    side = {k: "inside" if k in inside else _COMPASS[round(a / (np.pi / 4)) % 8] for k, a in outward_rad.items()}
+    names = dict(side)
+    for name in set(side.values()):
+        across = (1, 0) if name in ("E", "W", "inside") else (0, 1)
+        members = sorted((k for k in side if side[k] == name), key=lambda k: tuple(xy_m[k][list(across)]))
+        if len(members) > 1:
+            names.update((k, f"{name}{number}") for number, k in enumerate(members, 1))
     return names

@@ -7,7 +7,6 @@ track that is cut inside the picture is lost on a lane; where those of known des
 went.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -20,7 +19,7 @@ from velfield.analysis.intervals import Estimate, estimate_mean, estimate_rate, 
 from velfield.analysis.lanes.junctions import buffered_hull
 from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.movements.cut_tracks import CutTracks
-from velfield.analysis.movements.gates import COMPASS, Arm, Gate, group_gates
+from velfield.analysis.movements.gates import Arm, Gate, group_gates, name_arms
 from velfield.analysis.trajectories import PathSamples, Trajectories, within
 
 _INWARDS_M, _OUTWARDS_M, _ASIDE_M = 20.0, 15.0, 2.5
@@ -199,7 +198,7 @@ def find_scene_gates(
         for k in label
     }
     inside = {k for k in middle if _from_border_m(middle[k], graph) > _INSIDE_M}
-    names = dict(_name_arms(middle, outward, inside))
+    names = name_arms(outward, middle, inside)
     order = sorted(
         names, key=lambda k: (names[k].startswith("inside"), (outward[k] + np.pi / 2) % (2 * np.pi), names[k])
     )
@@ -259,16 +258,6 @@ def _from_border_m(xy_m: FloatArray, graph: LaneGraph) -> float:
     """Distance from the convex hull of all lanes' border, inwards, m."""
     hull = ConvexHull(buffered_hull(np.concatenate([lane.xy_m for lane in graph]), 1.0))
     return float(-(hull.equations[:, :2] @ xy_m + hull.equations[:, 2]).max())
-
-
-def _name_arms(middle: dict[int, FloatArray], outward: dict[int, float], inside: set[int]) -> Iterator[tuple[int, str]]:
-    """Names by the side of the image that each arm leads to; several of one side from the top, or from the left."""
-    side = {k: "inside" if k in inside else COMPASS[int(np.round(a / (np.pi / 4))) % 8] for k, a in outward.items()}
-    for name in sorted(set(side.values())):
-        across = (1, 0) if name in ("E", "W", "inside") else (0, 1)
-        members = sorted((k for k in side if side[k] == name), key=lambda k: tuple(middle[k][list(across)]))
-        for number, k in enumerate(members, 1):
-            yield k, name if len(members) == 1 else f"{name}{number}"
 
 
 def trace_trips(

@@ -53,7 +53,7 @@ def queue_growth(signal: JunctionSignal) -> list[QueueGrowth]:
         greens = stream.green_s[1:]
         for after in [*np.arange(0.0, red_s - _STEP_S / 2, _STEP_S).tolist(), red_s]:
             found = queues(stream.stream, greens - red_s + after)
-            counts, lengths = (np.array([getattr(q, n) for q in found], np.float64) for n in ("vehicles", "length_m"))
+            counts, lengths = np.array([(q.vehicles.value, q.length_m) for q in found]).reshape(-1, 2).T
             out.append(
                 QueueGrowth(
                     signal.junction,

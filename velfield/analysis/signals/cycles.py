@@ -1,7 +1,7 @@
 """Cycles: whether the starts of queues recur, and when each stream has green."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import special
@@ -31,6 +31,10 @@ _MIN_CONCENTRATION = 0.85
 """Mean resultant length of the starts' phases under a signal; one that traffic actuates has less."""
 _SPACING_M = 6.4
 """From front to front in a queue."""
+_MAX_HIDDEN = 2.4
+"""Room for more vehicles than this ends a queue."""
+_BEYOND_M, _SAME_M = 3.2, 2.0
+"""The first of a queue stands so far beyond its stop line at most; fronts that lie nearer to each other are one's."""
 _START_UP_VEHICLES = 4
 """The first vehicles of a queue lose time at the start (HCM)."""
 _MIN_CROSSINGS = 20
@@ -131,7 +135,17 @@ def find_signal(junction: int, streams: Sequence[Stream], begin_s: float, end_s:
         for k in phase.streams
     ]
     lanes = tuple(tuple(sorted(used[k].approach.lane for k in phase.streams)) for phase in phases)
-    return JunctionSignal(junction, True, "", estimate, tuple(signals), lanes)
+    return JunctionSignal(junction, True, "", estimate, _with_hidden_share(signals), lanes)
+
+
+def _with_hidden_share(signals: Sequence[StreamSignal]) -> tuple[StreamSignal, ...]:
+    """The streams with the share of the vehicles of the junction's queues that are not seen: its lower bound."""
+    used = [s for s in signals if s.stream.stop_line_m is not None]
+    found = [_stand_at(s.stream, float(t), 0.0, through_gaps=True) for s in used for t in s.green_s]
+    hidden = sum(f.hidden for f in found)
+    share = estimate_share(hidden, hidden + sum(f.seen for f in found))
+    sure = share.low if share else 0.0
+    return tuple(replace(s, stream=replace(s.stream, hidden_share=sure)) for s in signals)
 
 
 def _queue_heads(stream: Stream) -> FloatArray:
@@ -276,38 +290,68 @@ def stopping_share(stream: Stream) -> Estimate | None:
 
 @dataclass(frozen=True)
 class Queue:
-    """The queue of a stream at an onset of green, or at its longest: vehicles that stand, and its length from the stop
-    line to the last one's rear, m."""
+    """The queue of a stream at a time.
+
+    Attributes
+    ----------
+    vehicles
+        Vehicles that stand, with those for which there is a place between others: a tree hides them, or they were
+        missed. ``n`` is the number of those that are seen; the interval begins with those that are sure to stand at the
+        time, and ends with those that may, with as many others between them as there is room for, and with those that
+        are hidden behind the last one: vehicles are as often as between others.
+    length_m
+        From the stop line to the last one's rear.
+    """
 
     time_s: float
-    vehicles: int
+    vehicles: Estimate
     length_m: float
 
 
 def queues(stream: Stream, times_s: FloatArray) -> list[Queue]:
-    """Queues that stand at the stop line at given times (as the onsets of green).
-
-    A place for one or two vehicles between others that stand is taken as theirs: a tree hides them.
-    """
+    """Queues that stand at the stop line at given times (as the onsets of green)."""
     if stream.stop_line_m is None:
         return []
-    end = np.where(np.isfinite(stream.stop_end_s), stream.stop_end_s, stream.stop_start_s + 3.0)
+    late = float(special.ndtri((1 + LEVEL) / 2)) * stream.stop_time_sd_s
+    share = stream.hidden_share
+    behind = int(np.log((1 - LEVEL) / 2) / np.log(share)) if share > 0 else 0
     out = []
     for time in times_s:
-        stands = (stream.stop_start_s <= time) & (end >= time)
-        length = stream.vehicle_length_m[stands]
-        front = stream.stop_along_m[stands] + length / 2
-        order = np.argsort(-front, kind="stable")
-        order = order[front[order] < stream.stop_line_m + 4.0]
-        last_m = VEHICLE_LENGTH_M
-        count, at = 0, stream.stop_line_m + _SPACING_M
-        for position, last in zip(front[order], length[order], strict=True):
-            if at - position > 3.4 * _SPACING_M:
-                break
-            count, at = (
-                count + max(round((at - position) / _SPACING_M), 0 if count == 0 else int(at - position > 2.0)),
-                position,
-            )
-            last_m = float(last)
-        out.append(Queue(float(time), count, float(stream.stop_line_m - at + last_m) if count else 0.0))
+        least, found = (_stand_at(stream, float(time), margin) for margin in (-late, 0.0))
+        most = _stand_at(stream, float(time), late, through_gaps=True)
+        value = found.seen + found.hidden
+        vehicles = Estimate(value, min(least.seen, value), max(most.seen + most.room, value) + behind, found.seen)
+        out.append(Queue(float(time), vehicles, found.length_m))
     return out
+
+
+@dataclass(frozen=True)
+class _Standing:
+    """Vehicles that are seen to stand, those for which there is a place between them, and for which there is room."""
+
+    seen: int
+    hidden: int
+    room: int
+    length_m: float
+
+
+def _stand_at(stream: Stream, time_s: float, margin_s: float, *, through_gaps: bool = False) -> _Standing:
+    """Vehicles that stand from the stop line on, to the first long gap; their stops are longer by ``margin_s`` at
+    either end."""
+    line = stream.stop_line_m or 0.0
+    stands = (stream.stop_start_s - margin_s <= time_s) & (stream.stop_seen_s + margin_s >= time_s)
+    length = stream.stop_length_m[stands]
+    front = stream.stop_along_m[stands] + length / 2
+    order = np.argsort(-front, kind="stable")
+    order = order[front[order] < line + _BEYOND_M]
+    seen, hidden, room, at, rear = 0, 0, 0, np.inf, line + _SPACING_M - VEHICLE_LENGTH_M
+    for position, own in zip(front[order].tolist(), length[order].tolist(), strict=True):
+        free = rear - position - (_SPACING_M - VEHICLE_LENGTH_M)
+        if free > _MAX_HIDDEN * _SPACING_M and not through_gaps:
+            break
+        if at - position > _SAME_M:  # else two tracks of one vehicle
+            seen += 1
+            hidden += max(round(free / _SPACING_M), 0)
+            room += max(int(free / VEHICLE_LENGTH_M), 0)
+        at, rear = position, position - own
+    return _Standing(seen, hidden, room, line - rear if seen else 0.0)

@@ -19,6 +19,8 @@ reaction, and the time to reach walking speed. It differs from junction to junct
 _TOGETHER_S = 4.0
 _PROMPT_S = 3.0
 """Starts that differ by more from the phase's median are of vehicles that crept, or did not look."""
+_START_SD_S = 1.0
+"""Standard deviation of prompt starts before any is seen, as of one degree of freedom."""
 _CLEAR_QUANTILE = 0.2
 """In the earliest of so many cycles nothing is left in the junction at green."""
 
@@ -99,10 +101,12 @@ def _fit_cycle(number: IntArray, time: FloatArray, group: IntArray) -> Estimate:
         rows = group == one
         k[rows] -= k[rows].mean()
         t[rows] -= t[rows].mean()
-    free = max(len(k) - len(np.unique(group)) - 1, 1)
+    # of few cycles the residuals are small by chance: two starts lie on a line
+    free = len(k) - len(np.unique(group))
     slope = float((k * t).sum() / (k**2).sum())
-    residual = float(np.sqrt(((t - slope * k) ** 2).sum() / free))
-    half = float(special.stdtrit(free, 0.95) * max(residual, 0.1) / np.sqrt((k**2).sum()))
+    residual = float(np.sqrt((((t - slope * k) ** 2).sum() + _START_SD_S**2) / free))
+    late = float(min(special.stdtrit(free, 0.95) * residual, special.ndtri(0.95) * _PROMPT_S / np.sqrt(3)))
+    half = late / float(np.sqrt((k**2).sum()))
     return Estimate(slope, slope - half, slope + half, len(k))
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.analysis.lanes.model import Junction, LaneGraph
 from velfield.analysis.trajectories import VEHICLE_LENGTH_M, PathSamples, Trajectories, within
+from velfield.tracking.smoothing import speed_sd_m_per_s
 
 STOP_M_PER_S, GO_M_PER_S = 0.7, 1.4
 """A vehicle has stopped below the one, and goes again above the other."""
@@ -24,12 +25,15 @@ _CROSSES_S = 8.0
 @dataclass(frozen=True)
 class Stops:
     """Stops of vehicles, one row each: ``track``, ``start_s`` and ``end_s`` (when it goes again; NaN: its track ends
-    before), ``xy_m`` (n, 2)."""
+    before), ``xy_m`` (n, 2), ``seen_s`` (until when it is seen to stand); ``time_sd_s``: standard deviation of a
+    start or an end, s."""
 
     track: IntArray
     start_s: FloatArray
     end_s: FloatArray
     xy_m: FloatArray
+    seen_s: FloatArray
+    time_sd_s: float
 
 
 def find_stops(trajectories: Trajectories) -> Stops:
@@ -50,7 +54,17 @@ def find_stops(trajectories: Trajectories) -> Stops:
     long = (np.where(goes, start, time[last]) - time[first]) >= MIN_STOP_S
     xy = trajectories.xy_m[last]
     _stop_under_trees(trajectories, slow, first, last, xy, end)
-    return Stops(owner[first[long]], time[first[long]], end[long], xy[long])
+    seen = np.where(np.isfinite(end), end, time[last])
+    return Stops(owner[first[long]], time[first[long]], end[long], xy[long], seen[long], _time_sd_s(trajectories))
+
+
+def _time_sd_s(trajectories: Trajectories) -> float:
+    """Standard deviation of the time at which a vehicle stops or goes: it lies between two positions, and is late or
+    early as the error of the speed is over the acceleration."""
+    owner = trajectories.owner
+    steps = np.diff(trajectories.time_s)[owner[1:] == owner[:-1]]
+    step_s = float(np.median(steps)) if len(steps) else 0.0
+    return float(np.hypot(step_s / np.sqrt(12), speed_sd_m_per_s(trajectories.position_sd_m) / _SETS_OFF_M_PER_S2))
 
 
 def _stop_under_trees(
@@ -154,8 +168,13 @@ class Stream:
         Where the first of the queues stand, front bumper, along the approach's path; None: nobody stops.
     head_time_s, head_track
         Starts of vehicles that stood at the stop line.
-    stop_track, stop_start_s, stop_end_s, stop_along_m, stop_length_m
-        Stops on the approach, and the lengths of their vehicles.
+    stop_track, stop_start_s, stop_end_s, stop_along_m, stop_length_m, stop_seen_s
+        Stops on the approach, the lengths of their vehicles (a car's where none was measured), and until when these
+        are seen to stand.
+    stop_time_sd_s
+        Standard deviation of a stop's start or end.
+    hidden_share
+        Share of the vehicles in queues that are not seen, at least.
     cross_time_s, cross_track, cross_speed_m_per_s
         When tracks cross the stop line (the border without one), and how fast; in time order.
     """
@@ -171,14 +190,10 @@ class Stream:
     cross_time_s: FloatArray
     cross_track: IntArray
     cross_speed_m_per_s: FloatArray
-    stop_length_m: FloatArray | None = None
-
-    @property
-    def vehicle_length_m(self) -> FloatArray:
-        """(n,) length of the vehicle of each stop; a car's where none was measured."""
-        if self.stop_length_m is None:
-            return np.full(len(self.stop_track), VEHICLE_LENGTH_M)
-        return self.stop_length_m
+    stop_length_m: FloatArray
+    stop_seen_s: FloatArray
+    stop_time_sd_s: float
+    hidden_share: float = 0.0
 
 
 def observe_stream(
@@ -214,6 +229,8 @@ def observe_stream(
         along,
         *cross,
         2 * half[here],
+        stops.seen_s[here],
+        stops.time_sd_s,
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from schemas.analysis import AnalysisColumn, AnalysisRecord, AnalysisTable, LanesRecord, QuestionRecord
 from schemas.arrays import GreyImage
-from schemas.export import SpeedUnit
+from schemas.export import PER_M_PER_S, SpeedUnit
 from schemas.flight import PAPER_GSD_M, FlightConfig, FramesConfig
 from velfield.analysis.answers import explain_none, find_answers
 from velfield.analysis.movements.time_slices import SLICE_S
@@ -149,14 +149,14 @@ def write_analysis(
     """Write lanes, tables, report and workbook, and strips of pictures of unusual tracks; a line on each."""
     analysis.answer_all()
     gsd_m = analysis.trajectories.gsd_m
-    lanes = _with_answers(lanes_record(analysis.lanes, gsd_m), analysis)
+    lanes = _with_answers(lanes_record(analysis.lanes, gsd_m), analysis, speed_unit)
     write_atomically(out / "lanes.json", lanes.model_dump_json().encode())
     write_atomically(out / "lanes.geojson", lanes_geojson(lanes, georeference).encode())
     clips = dict(unusual_clips(analysis, frames)) if frames else {}
     remove_tree(out / "clips")  # of an earlier analysis
     for number, data in clips.items():
         write_atomically(out / clip_name(number), data)
-    page = first_page(analysis)
+    page = first_page(analysis, unit=speed_unit)
     record = AnalysisRecord(
         code_version=code_version(),
         gsd_m=gsd_m,
@@ -164,10 +164,12 @@ def write_analysis(
         duration_s=round(analysis.trajectories.duration_s, 3),
         tracks=len(analysis.trajectories),
         answers=tuple(QuestionRecord(question=question, lines=lines) for question, lines in page.sections),
-        tables=tuple(_with_clips(_explain_empty(table, analysis), clips) for table in all_tables(analysis)),
+        tables=tuple(
+            _with_clips(_explain_empty(table, analysis), clips) for table in all_tables(analysis, unit=speed_unit)
+        ),
     )
     write_atomically(out / "analysis.json", record.model_dump_json().encode())
-    yield from answer_lines(analysis)
+    yield from answer_lines(analysis, unit=speed_unit)
     diagrams = list(traffic_diagrams(analysis, picture, unit=speed_unit))
     write_atomically(out / "report.html", report_html(record, page, diagrams, clips).encode())
     write_atomically(out / "report.pdf", report_pdf(record, page, diagrams))
@@ -179,9 +181,9 @@ def write_analysis(
         yield f"workbook    not written: pip install '{EXTRA}'"
 
 
-def answer_lines(analysis: TrafficAnalysis) -> Iterator[str]:
+def answer_lines(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iterator[str]:
     """A line for each answer, `MAX_LINES` of a topic: those with the most vehicles."""
-    for topic, group in groupby(find_answers(analysis), key=lambda answer: answer.topic):
+    for topic, group in groupby(find_answers(analysis, unit=unit), key=lambda answer: answer.topic):
         found = list(group)
         for answer in found[:MAX_LINES]:
             yield f"{topic:11} {answer.subject}{': ' if answer.subject else ''}{answer.text}"
@@ -219,10 +221,10 @@ def _with_clips(table: AnalysisTable, clips: Mapping[int, bytes]) -> AnalysisTab
     return table.model_copy(update={"rows": rows, "columns": (*table.columns, column)})
 
 
-def _with_answers(lanes: LanesRecord, analysis: TrafficAnalysis) -> LanesRecord:
+def _with_answers(lanes: LanesRecord, analysis: TrafficAnalysis, unit: SpeedUnit) -> LanesRecord:
     """With the limits of lanes, and whether junctions have a signal."""
-    roads = [road for road in analysis.free_flow if road.limit_km_per_h]
-    limits = {lane: (road.limit_km_per_h or 0.0) / 3.6 for road in roads for lane in road.lanes}
+    known = [(road, sign) for road in analysis.free_flow if (sign := road.limit(unit))]
+    limits = {lane: sign / PER_M_PER_S[unit] for road, sign in known for lane in road.lanes}
     return lanes.model_copy(
         update={
             "lanes": tuple(lane.model_copy(update={"limit_m_per_s": limits.get(lane.lane)}) for lane in lanes.lanes),

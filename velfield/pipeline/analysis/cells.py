@@ -9,6 +9,7 @@ import pandas as pd
 
 from schemas.analysis import AnalysisColumn, AnalysisRow, AnalysisTable, Cell, EstimateRecord, GeometryRecord
 from schemas.arrays import FloatArray
+from schemas.export import PER_M_PER_S, SpeedUnit
 from velfield.analysis.intervals import Estimate
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.pipeline.analysis.lanes_record import points_px
@@ -56,6 +57,35 @@ def make_table(
         columns=tuple(AnalysisColumn(name=c.key, title=c.title, unit=c.unit) for c in columns),
         rows=tuple(AnalysisRow(cells={c.key: c.cell(item) for c in columns}, geometry=place(item)) for item in items),
     )
+
+
+def in_speed_unit(table: AnalysisTable, unit: SpeedUnit) -> AnalysisTable:
+    """A table whose columns in km/h are in another unit.
+
+    Examples
+    --------
+    >>> speed = AnalysisColumn(name="speed", title="Speed", unit="km/h")
+    >>> table = AnalysisTable(name="speed", section="", title="", columns=(speed,), rows=())
+    >>> in_speed_unit(table.model_copy(update={"rows": (AnalysisRow(cells={"speed": 100.0}),)}), "mph").rows[0].cells
+    {'speed': 62.14}
+    """
+    factor = PER_M_PER_S[unit] / KM_PER_H
+    names = {column.name for column in table.columns if column.unit == "km/h"}
+    if unit == "km/h" or not names:
+        return table
+
+    def converted(cell: Cell) -> Cell:
+        if isinstance(cell, EstimateRecord) and cell.value is not None:
+            ends = {name: float(f"{getattr(cell, name) * factor:.4g}") for name in ("value", "low", "high")}
+            return cell.model_copy(update=ends)
+        return float(f"{cell * factor:.4g}") if isinstance(cell, float) else cell
+
+    columns = (c.model_copy(update={"unit": unit}) if c.name in names else c for c in table.columns)
+    rows = (
+        row.model_copy(update={"cells": {k: converted(v) if k in names else v for k, v in row.cells.items()}})
+        for row in table.rows
+    )
+    return table.model_copy(update={"columns": tuple(columns), "rows": tuple(rows)})
 
 
 def data_frame(table: AnalysisTable) -> pd.DataFrame:

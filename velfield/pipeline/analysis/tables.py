@@ -6,8 +6,9 @@ import numpy as np
 
 from schemas.analysis import AnalysisTable, GeometryRecord
 from schemas.arrays import FloatArray
+from schemas.export import SpeedUnit
 from velfield.analysis.flow.conflicts import HARD_BRAKING_M_PER_S2, Conflict
-from velfield.analysis.flow.speeds import FreeFlow, Reduction, Station
+from velfield.analysis.flow.speeds import SIGNS, FreeFlow, Reduction, Station
 from velfield.analysis.flow.volume import LaneFlow, level_of_service
 from velfield.analysis.lanes.model import Lane
 from velfield.analysis.movements.movements import JunctionMovements, Movement
@@ -20,6 +21,7 @@ from velfield.pipeline.analysis.cells import (
     KM_PER_H,
     Column,
     estimates,
+    in_speed_unit,
     line_geometry,
     make_table,
     point_geometry,
@@ -29,8 +31,12 @@ from velfield.pipeline.analysis.flow_tables import diagram_table, growth_table, 
 from velfield.pipeline.analysis.scene_tables import scene_tables, time_tables
 
 
-def all_tables(analysis: TrafficAnalysis) -> Iterator[AnalysisTable]:
-    """Every question's table, in the order of the report."""
+def all_tables(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iterator[AnalysisTable]:
+    """Every question's table, in the order of the report, with speeds in a unit: km/h or mph."""
+    yield from (in_speed_unit(table, unit) for table in _tables(analysis, unit))
+
+
+def _tables(analysis: TrafficAnalysis, unit: SpeedUnit) -> Iterator[AnalysisTable]:
     yield from (
         lane_table(analysis),
         profile_table(analysis),
@@ -39,7 +45,7 @@ def all_tables(analysis: TrafficAnalysis) -> Iterator[AnalysisTable]:
         *time_tables(analysis),
         class_table(analysis),
         reversal_table(analysis),
-        limit_table(analysis),
+        limit_table(analysis, unit),
         reduction_table(analysis),
         signal_table(analysis),
         stream_table(analysis),
@@ -138,17 +144,17 @@ def reversal_table(analysis: TrafficAnalysis) -> AnalysisTable:
     )
 
 
-def limit_table(analysis: TrafficAnalysis) -> AnalysisTable:
-    """Speed limits."""
+def limit_table(analysis: TrafficAnalysis, unit: SpeedUnit = "km/h") -> AnalysisTable:
+    """Speed limits, of signs in a unit."""
     columns: list[Column[FreeFlow]] = [
         Column("lanes", "Lanes", "", lambda road: _numbers(road.lanes)),
-        Column("limit", "Limit, inferred", "km/h", lambda road: road.limit_km_per_h),
+        Column("limit", "Limit, inferred", unit, lambda road: road.limit(unit)),
         estimates("free_speed", "Free-flow speed", "km/h", lambda road: road.speed_m_per_s, KM_PER_H),
         estimates("p85", "Free-flow speed p85", "km/h", lambda road: road.p85_m_per_s, KM_PER_H),
     ]
     note = (
         "Median speed of vehicles that keep their speed over 30 m, 4 s and more behind the one before; speeds of those "
-        "that follow within 3 s are lower bounds. The limit is the multiple of 10 km/h nearest to it."
+        f"that follow within 3 s are lower bounds. The limit is the multiple of {SIGNS[unit]:g} {unit} nearest to it."
     )
 
     def place(road: FreeFlow) -> GeometryRecord:
@@ -215,9 +221,9 @@ def stream_table(analysis: TrafficAnalysis) -> AnalysisTable:
         estimates("red", "Red begins at", "s of the cycle", lambda row: row[1].red_phase_s),
         estimates("lost", "Start-up lost time", "s", lambda row: row[1].start_up_lost_s),
         estimates("saturation", "Saturation flow", "veh/h", lambda row: row[1].saturation_veh_per_h),
-        Column("queue", "Queue at green", "veh", lambda row: _mean([q.vehicles for q in row[2]]), 1),
-        Column("queue_max", "Longest queue", "veh", lambda row: max((q.vehicles for q in row[2]), default=None)),
-        Column("queue_max_m", "Longest queue", "m", lambda row: max((q.length_m for q in row[2]), default=None), 1),
+        Column("queue", "Queue at green", "veh", lambda row: _mean([q.vehicles.value for q in row[2]]), 1),
+        estimates("queue_max", "Longest queue", "veh", lambda row: _longest(row[2]).vehicles if row[2] else None),
+        Column("queue_max_m", "Longest queue", "m", lambda row: _longest(row[2]).length_m if row[2] else None, 1),
         estimates("stops", "Vehicles that stop", "%", lambda row: stopping_share(row[1].stream), 100.0),
     ]
     note = (
@@ -307,5 +313,9 @@ def _numbers(numbers: Iterable[int]) -> str:
     return " ".join(map(str, numbers))
 
 
-def _mean(numbers: list[int]) -> float | None:
+def _longest(found: list[Queue]) -> Queue:
+    return max(found, key=lambda queue: queue.length_m)
+
+
+def _mean(numbers: list[float]) -> float | None:
     return float(np.mean(numbers)) if numbers else None

@@ -9,12 +9,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, GreyImage
-from schemas.export import SpeedUnit
+from schemas.export import PER_M_PER_S, SpeedUnit
 from velfield.analysis.flow.volume import flow_slices
 from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.signals.cycles import StreamSignal, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.report.figures import PER_M_PER_S
 from velfield.report.traffic.approaches import ApproachDelay, approach_delays, lane_names
 
 if TYPE_CHECKING:
@@ -283,7 +282,7 @@ def draw_queues(axes: "Axes", *, analysis: TrafficAnalysis, streams: list[Stream
     times = np.arange(begin, end, 1.0)
     for k, stream in enumerate(streams[: len(_TONES)]):
         lane = stream.stream.approach.lane
-        counts = [q.vehicles for q in queues(stream.stream, times)]
+        counts = [q.vehicles.value for q in queues(stream.stream, times)]
         axes.step(times, counts, where="post", color=_TONES[k], linestyle=_STROKES[k % 4], linewidth=1.5,
                   label=names.get(lane, f"lane {lane}"))  # fmt: skip
     axes.set(xlabel="time, s", ylabel="vehicles that stand", ylim=(0, None), xlim=(begin, end))

@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-from velfield.analysis.answers import duration_text, find_answers
+from schemas.export import SpeedUnit
+from velfield.analysis.answers import duration_text, find_answers, queue_text
 from velfield.analysis.signals.cycles import queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.report.traffic.approaches import approach_delays, lane_names
@@ -25,12 +26,12 @@ class FirstPage:
         return (*self.answers, missing) if self.withheld else self.answers
 
 
-def first_page(analysis: TrafficAnalysis) -> FirstPage:
-    """The first page's words."""
+def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstPage:
+    """The first page's words, with speeds in a unit: km/h or mph."""
     found: dict[str, list[str]] = {}
     withheld: list[str] = []
     reasons: dict[str, str] = {}
-    for answer in find_answers(analysis):
+    for answer in find_answers(analysis, unit=unit):
         text = f"{answer.subject}: {answer.text}" if answer.subject else answer.text
         if answer.state == "too little data":
             withheld.append(f"{answer.topic}: {text}")
@@ -80,10 +81,9 @@ def _waits(analysis: TrafficAnalysis) -> list[str]:
             default=None,
         )
         line = f"junction {number}: mean delay " + ", ".join(parts) if parts else f"junction {number}:"
-        if longest and longest[0].vehicles:
+        if longest and longest[0].vehicles.value:
             lane = longest[1].stream.approach.lane
-            line += f"; longest queue {names.get(lane, f'lane {lane}')}: "
-            line += f"{longest[0].vehicles} vehicles, {longest[0].length_m:.0f} m"
+            line += f"; longest queue {names.get(lane, f'lane {lane}')}: {queue_text(longest[0])}"
         if not line.endswith(":"):
             out.append(line)
     return out

@@ -1,0 +1,73 @@
+"""Queues of vehicles that are hidden, long, or still there when the film ends: their intervals hold the truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.analysis.test_traffic_analysis import CYCLE_S, crossroads, gather
+from velfield.analysis.signals.cycles import StreamSignal, queues
+from velfield.analysis.signals.queues import Stream
+from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.analysis.trajectories import VEHICLE_LENGTH_M
+
+
+def signals_from_the_north(analysis: TrafficAnalysis) -> list[StreamSignal]:
+    """The streams down the image: four vehicles stand there at each green."""
+    streams = [s for signal in analysis.signals.values() for s in signal.streams]
+    return [s for s in streams if abs(np.diff(s.stream.approach.path_m[[0, -30]], axis=0)[0, 0]) < 2]
+
+
+@pytest.fixture(scope="module")
+def stream() -> Stream:
+    (found,) = signals_from_the_north(TrafficAnalysis(gather(crossroads())))
+    return found.stream
+
+
+def only(stream: Stream, keep: np.ndarray) -> Stream:
+    columns = ("track", "start_s", "end_s", "along_m", "length_m", "seen_s")
+    return replace(stream, **{f"stop_{name}": getattr(stream, f"stop_{name}")[keep] for name in columns})
+
+
+def test_who_stands_as_the_film_ends_stands_to_its_end() -> None:
+    last_s = 10 * CYCLE_S + 20.0
+    tracks = [(t[t <= last_s], xy[t <= last_s]) for t, xy in crossroads()]
+    (found,) = signals_from_the_north(TrafficAnalysis(gather([track for track in tracks if len(track[0]) > 5])))
+    (queue,) = queues(found.stream, np.array([last_s - 0.5]))
+    assert queue.vehicles.value == queue.vehicles.low == 4
+
+
+def test_who_sets_off_about_that_time_may_stand(stream: Stream) -> None:
+    first_s = stream.stop_end_s[stream.stop_along_m > stream.stop_along_m.max() - 3.0][5]
+    early, late = queues(stream, np.array([first_s - 0.05, first_s + 0.05]))
+    for queue in (early, late):
+        assert (queue.vehicles.low, queue.vehicles.high) == (3, 4)
+    (sure,) = queues(stream, np.array([first_s - 1.0]))
+    assert sure.vehicles.low == sure.vehicles.high == 4
+
+
+def test_a_long_vehicle_hides_nobody(stream: Stream) -> None:
+    """Every other one is missed: a lorry of 11.5 m stands in its place, and in that of the next, or nobody is seen."""
+    second = np.argsort(np.argsort(-stream.stop_along_m)) >= 0
+    for start in np.unique(np.round(stream.stop_start_s / CYCLE_S)):
+        cycle = np.flatnonzero(np.round(stream.stop_start_s / CYCLE_S) == start)
+        second[cycle[np.argsort(-stream.stop_along_m[cycle])][1::2]] = False
+    fewer = only(stream, second)
+    time = np.array([5 * CYCLE_S + 19.0])
+    (cars,) = queues(fewer, time)
+    assert cars.vehicles.n == cars.vehicles.low == 2
+    assert cars.vehicles.value == 3
+    lorry = fewer.stop_length_m.copy() + 7.0
+    moved = replace(fewer, stop_length_m=lorry, stop_along_m=fewer.stop_along_m - 3.5)  # the same front bumpers
+    (lorries,) = queues(moved, time)
+    assert lorries.vehicles.value == lorries.vehicles.high == 2
+    assert fewer.stop_length_m == pytest.approx(VEHICLE_LENGTH_M)
+
+
+def test_where_some_are_hidden_others_may_be_behind_the_last() -> None:
+    rng = np.random.default_rng(5)
+    tracks = [track for track in crossroads() if rng.uniform() < 0.6]
+    (found,) = signals_from_the_north(TrafficAnalysis(gather(tracks)))
+    assert found.stream.hidden_share > 0.1
+    held = [q.vehicles.low <= 4 <= q.vehicles.high for q in queues(found.stream, found.green_s[1:-1])]
+    assert np.mean(held) >= 0.8
