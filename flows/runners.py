@@ -140,10 +140,18 @@ class ThreadsRunner(Runner):
 class ClientRunner(Runner):
     """A Dask cluster. Graphs hold functions of ``velfield`` alone, so workers need no ``flows``."""
 
-    def __init__(self, client: Any, warn: Callable[[str], None], *, own_workers: bool = False) -> None:
-        self._own_workers = own_workers
-        workers = len(client.scheduler_info(n_workers=-1)["workers"])
+    def __init__(
+        self,
+        client: Any,
+        warn: Callable[[str], None],
+        *,
+        cluster: Any = None,
+        asked: int = 0,
+        own_workers: bool = False,
+    ) -> None:
+        self._own_workers, self._cluster, self._asked = own_workers, cluster, asked
         self._client, self._warn = client, warn
+        workers = self._count_workers()
         self._address = str(client.scheduler.address)
         self._lock, self._without_since_s = threading.Lock(), float("inf")
         self.description = f"Dask at {self._address}, {workers} worker{'' if workers == 1 else 's'}"
@@ -163,8 +171,11 @@ class ClientRunner(Runner):
         end_s = time.monotonic() + _WAIT_S
         while self._client.run_on_scheduler(_count_tasks) and time.monotonic() < end_s:
             time.sleep(0.05)  # what is released is forgotten a moment later; until then it would be computed again
-        workers = self._client.scheduler_info(n_workers=-1)["workers"]
-        self._client.restart_workers(list(workers), timeout=_RESTART_S, raise_for_error=False)
+        # Others in their place: while Dask restarts them, its cluster may give them up.
+        self._cluster.scale(0)
+        while self._count_workers() and time.monotonic() < end_s + _RESTART_S:
+            time.sleep(0.05)
+        self._cluster.scale(self._asked)
 
     def _wait(self, future: Any) -> Any:
         from distributed.scheduler import KilledWorker
@@ -186,10 +197,19 @@ class ClientRunner(Runner):
         finally:
             future.release()  # else the scheduler computes it again where the worker that holds it ends
 
+    def _count_workers(self) -> int:
+        return len(self._client.scheduler_info(n_workers=-1)["workers"])
+
     def _look_for_workers(self) -> None:
-        """Say, once a minute, that there is nothing that could compute: Dask waits for workers without a word."""
-        workers = len(self._client.scheduler_info(n_workers=-1)["workers"])
+        """Say, once a minute, that there is nothing that could compute: Dask waits for workers without a word.
+
+        A cluster of ours gives up a worker that is away for 15 s, as after it was killed on a busy machine, and starts
+        another one only if it is asked again for as many as before.
+        """
+        workers = self._count_workers()
         with self._lock:
+            if workers < self._asked:
+                self._cluster.scale(self._asked)
             now_s = time.monotonic()
             self._without_since_s = float("inf") if workers else min(self._without_since_s, now_s)
             waited_s = now_s - self._without_since_s
@@ -241,7 +261,8 @@ def open_runner(config: RunnerConfig, warn: Callable[[str], None] = warnings.war
             own = config.scheduler is None and config.cluster_class is None
             if own:
                 _load_stages(client)
-            yield ClientRunner(client, warn, own_workers=own)
+            ours = {} if config.scheduler is not None else {"cluster": cluster, "asked": config.workers}
+            yield ClientRunner(client, warn, own_workers=own, **ours)
 
 
 def _load_stages(client: Any) -> None:
@@ -332,25 +353,15 @@ def _cluster(config: RunnerConfig) -> Iterator[Any]:
         yield config.scheduler
         return
     if config.cluster_class is None:
-        with _local_cluster(config) as cluster:
+        from dask.distributed import LocalCluster
+
+        here = {"dashboard_address": "127.0.0.1:0", "host": "127.0.0.1"}
+        with LocalCluster(n_workers=config.workers, threads_per_worker=1, **here) as cluster:
             yield cluster
         return
     cluster_class, arguments = _import_class(config)
     with cluster_class(**arguments) as cluster:
         cluster.scale(config.workers)
-        yield cluster
-
-
-@contextmanager
-def _local_cluster(config: RunnerConfig) -> Iterator[Any]:
-    import dask
-    from dask.distributed import LocalCluster
-
-    here = {"dashboard_address": "127.0.0.1:0", "host": "127.0.0.1"}
-    # The cluster gives up a worker that is away so long after it was restarted, though it may be away for being
-    # restarted once more; then nothing ever computes. Our nannies bring workers back themselves.
-    kept = {"distributed.deploy.lost-worker-timeout": "720h"}
-    with dask.config.set(kept), LocalCluster(n_workers=config.workers, threads_per_worker=1, **here) as cluster:
         yield cluster
 
 

@@ -17,6 +17,8 @@ from tests.small_flight import FRAMES, digests, job, process
 
 FOOTAGE = Path(__file__).resolve().parents[2] / "shared" / "data"
 
+# A shell that starts the tests in the background has them ignore Ctrl-C, and all that they start.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 _LONGEST = (
     *("kills", "accuracy", "serve", "reprocess", "s3", "cluster", "viewer", "flows", "cli", "docs", "training"),

@@ -16,7 +16,15 @@ from dask import delayed
 from distributed import Client, LocalCluster
 from distributed.versions import VersionMismatchWarning, get_versions
 
-from flows.runners import ClusterFile, RunnerConfig, _wait_for_worker, check_scheduler, open_runner, read_runner
+from flows.runners import (
+    ClusterFile,
+    RunnerConfig,
+    WorkersKilledError,
+    _wait_for_worker,
+    check_scheduler,
+    open_runner,
+    read_runner,
+)
 from schemas.summary import RunSummary
 from tests.faults.test_refusals import command
 from tests.foreign_cluster import foreign_cluster
@@ -99,14 +107,22 @@ def test_workers_of_our_own_are_restarted_and_others_are_left_alone() -> None:
 
 
 @pytest.mark.timeout(90)
-def test_workers_that_are_being_restarted_are_not_given_up() -> None:
-    """Dask gives a worker up so long after it left, and would look just while it is away again."""
-    with (
-        dask.config.set({"distributed.deploy.lost-worker-timeout": "300ms"}),
-        open_runner(RunnerConfig(workers=1)) as runner,
-    ):
+@pytest.mark.parametrize("cluster_class", [None, "distributed.LocalCluster"])
+def test_workers_that_the_cluster_gave_up_are_replaced(
+    cluster_class: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Dask gives a worker up that is away for so long, as while it is restarted: then there would be none for ever."""
+    monkeypatch.setattr("flows.runners._WAIT_S", 1.0)
+    elsewhere = {"threads_per_worker": 1, "n_workers": 0, "dashboard_address": "127.0.0.1:0"}
+    config = RunnerConfig(workers=1, cluster_class=cluster_class, cluster_kwargs=elsewhere if cluster_class else {})
+    soon = {"distributed.deploy.lost-worker-timeout": "300ms", "distributed.scheduler.allowed-failures": 0}
+    with dask.config.set(soon), open_runner(config) as runner:
         before = runner.call(os.getpid)
-        runner.restart_workers()
+        if cluster_class is None:
+            runner.restart_workers()
+        else:
+            with pytest.raises(WorkersKilledError):
+                runner.call(os.kill, before, 9)
         assert runner.call(os.getpid) not in (before, os.getpid())
 
 
