@@ -361,6 +361,17 @@ def test_vehicles_that_cross_hardly_after_each_other_show_two_levels() -> None:
     assert [c for c in TrafficAnalysis(gather(tracks)).conflicts if c.kind == "crossing"] == []
 
 
+def test_few_pairs_that_cross_where_levels_are_not_clear_are_neither_conflicts_nor_none() -> None:
+    tracks = [drive(EAST, 30.0 * k) for k in range(4)] + [drive(SOUTH, 30.0 * k + 5.6) for k in range(4)]
+    analysis = TrafficAnalysis(gather(tracks))
+    (answer,) = (a for a in find_answers(analysis) if a.topic == "conflicts")
+    assert answer.state == "too little data"
+    assert "pairs below 1.5 s where it is not clear that the roads are on one level" in answer.text
+    junction = analysis.lanes.junctions[0].hull_m
+    signalised = find_conflicts(analysis.trajectories, analysis.lane_traffic, signalised_m=[junction])
+    assert sum(c.kind == "crossing" and c.probability > 0.5 for c in signalised) == 4
+
+
 def test_two_starts_do_not_make_a_certain_cycle() -> None:
     """Two starts lie on a line: how far each was late is not seen."""
     rng, held = np.random.default_rng(2), []

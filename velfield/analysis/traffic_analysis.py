@@ -214,7 +214,10 @@ class TrafficAnalysis:
         """Pairs of vehicles near in time."""
         if not len(self.lanes):
             return []
-        return find_conflicts(self.trajectories, self.lane_traffic, vehicle=self.cut_tracks.vehicle)
+        signalised = [self.lanes.junctions[k].hull_m for k in self.signals if self.is_signalised(k)]
+        return find_conflicts(
+            self.trajectories, self.lane_traffic, vehicle=self.cut_tracks.vehicle, signalised_m=signalised
+        )
 
     @cached_property
     def unusual(self) -> list[Unusual]:

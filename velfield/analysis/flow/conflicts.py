@@ -1,6 +1,7 @@
 """Conflicts: post-encroachment time where paths cross or merge, time to collision behind a leader; with the probability
 that each is a conflict, given the errors of positions."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -11,7 +12,7 @@ from scipy.spatial import cKDTree
 from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.flow.passings import LaneTraffic, Passings
 from velfield.analysis.lanes.find import project
-from velfield.analysis.lanes.junctions import Crossing, find_crossings
+from velfield.analysis.lanes.junctions import Crossing, find_crossings, inside_hull
 from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.trajectories import VEHICLE_WIDTH_M, Trajectories, group_rows
 from velfield.compiled import kernel
@@ -55,8 +56,10 @@ class Conflict:
     value_s, sd_s
         Post-encroachment time (crossing, merging), or least time to collision (following), and its standard deviation.
     probability
-        That it is below ``threshold_s``; of following, and that the follower must brake harder than
-        `HARD_BRAKING_M_PER_S2` not to collide.
+        That it is below ``threshold_s``, and of crossing that the roads are on one level; of following, and that the
+        follower must brake harder than `HARD_BRAKING_M_PER_S2` not to collide.
+    one_level
+        Probability that the roads are on one level.
     """
 
     kind: ConflictKind
@@ -68,6 +71,7 @@ class Conflict:
     sd_s: float
     threshold_s: float
     probability: float
+    one_level: float = 1.0
 
 
 def find_conflicts(
@@ -76,6 +80,7 @@ def find_conflicts(
     *,
     lengths_m: FloatArray | None = None,
     vehicle: IntArray | None = None,
+    signalised_m: Sequence[FloatArray] = (),
 ) -> list[Conflict]:
     """All pairs with a post-encroachment time or time to collision below 3 s, by time.
 
@@ -85,6 +90,8 @@ def find_conflicts(
         (tracks,) lengths of the vehicles; None: as measured, a car's where they were not.
     vehicle
         (tracks,) number of each track's vehicle, where tracks are cut; None: each track is one.
+    signalised_m
+        (n, 2) corners of the area of each junction with a signal: its roads are on one level.
     """
     vehicles = np.arange(len(trajectories)) if vehicle is None else vehicle
     sd_m, speed_sd = _deviations(trajectories.position_sd_m)
@@ -94,20 +101,24 @@ def find_conflicts(
         for crossing in find_crossings(traffic.graph.lanes)
         for conflict in _post_encroachments(crossing, traffic, lengths, _NEAR_S, sd_m)
     ]
-    found = _on_one_level(found)
+    found = _on_one_level(found, signalised_m)
     found += _merges(traffic, lengths, vehicles, _NEAR_S, sd_m)
     found += time_to_collision(trajectories, traffic.graph, lengths, _NEAR_S, (sd_m, speed_sd))
     return sorted(_closest(found), key=lambda c: c.time_s)
 
 
-def _on_one_level(found: list[Conflict]) -> list[Conflict]:
+def _on_one_level(found: list[Conflict], signalised_m: Sequence[FloatArray]) -> list[Conflict]:
     """The crossings, each as probable as its roads are on one level; without those that are hardly on one."""
     xy = np.array([c.xy_m for c in found]).reshape(-1, 2)
     at_once = np.array([c.value_s < _AT_ONCE_S for c in found], bool)
     near = cKDTree(xy).query_ball_point(xy, _BRIDGE_M) if len(xy) else []
-    level = [one_level_probability(int(at_once[rows].sum()), at_once[rows].size) for rows in near]
+    level = np.array([one_level_probability(int(at_once[rows].sum()), at_once[rows].size) for rows in near])
+    for hull in signalised_m:
+        level[inside_hull(xy, hull)] = 1.0
     return [
-        replace(c, probability=c.probability * p) for c, p in zip(found, level, strict=True) if p > _LEAST_ONE_LEVEL
+        replace(c, probability=float(c.probability * p), one_level=float(p))
+        for c, p in zip(found, level, strict=True)
+        if p > _LEAST_ONE_LEVEL
     ]
 
 
