@@ -515,7 +515,7 @@ def main() -> None:
     try:
         if not {"--help", "-h", "--version"} & set(sys.argv):
             use_writable_folders()
-        options = {"result_action": "return_value", "exit_on_error": False, "print_error": False}
+        options: dict[str, Any] = {"result_action": "return_value", "exit_on_error": False, "print_error": False}
         status = _start() if len(sys.argv) == 1 else app(sys.argv[1:], **options)
     except MissingArgumentError as error:
         chain, missing = " ".join(error.command_chain or ()), error.keyword

@@ -29,19 +29,21 @@ class PrefectFlows(Orchestration):
         def shown(parameters: Any) -> T:
             return flow()
 
-        options = {"persist_result": False, "validate_parameters": False}
-        runner = ThreadPoolTaskRunner(max_workers=threads)
-        # The name by a function: Prefect takes braces in a text for fields.
-        run: Any = prefect_flow(shown, name=name, flow_run_name=lambda: run_name, task_runner=runner, **options)
-        result: T = run(parameters)
-        return result
+        runner: Any = ThreadPoolTaskRunner(max_workers=threads)
+        as_flow = prefect_flow(
+            name=name,
+            flow_run_name=lambda: run_name,  # by a function: Prefect takes braces in a text for fields
+            task_runner=runner,
+            persist_result=False,
+            validate_parameters=False,
+        )
+        return as_flow(shown)(parameters)
 
     def submit(
         self, do: Callable[[], T], *, name: str, run_name: str, retries: int = 0, after: Sequence[Future[Any]] = ()
     ) -> "Future[T]":
         future: Future[T] = Future()
-        self._shown[future] = shown = task(
-            do,
+        as_task = task(
             name=name,
             task_run_name=run_name,
             retries=retries,
@@ -49,7 +51,9 @@ class PrefectFlows(Orchestration):
             retry_condition_fn=_worth_retrying,
             cache_policy=NO_CACHE,
             persist_result=False,
-        ).submit(wait_for=[self._shown[one] for one in after])
+        )
+        before = [self._shown[one] for one in after]
+        self._shown[future] = shown = as_task(do).submit(return_state=False, wait_for=before)
         shown.add_done_callback(lambda done: _settle(future, done))
         return future
 

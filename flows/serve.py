@@ -17,7 +17,7 @@ from base64 import b64encode
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from flows.console import print_with_time
 from flows.launch import PAGES, PAGES_OF
@@ -122,7 +122,7 @@ def settings(config: ServeConfig) -> dict[str, str]:
 def deployments(config: ServeConfig) -> list["RunnerDeployment"]:
     """The three deployments; ``prefect.yaml`` has the same."""
     from prefect.events import DeploymentEventTrigger
-    from prefect.flows import EntrypointType
+    from prefect.types.entrypoint import EntrypointType
 
     from flows.deployed import process_dropped, reprocess_runs
 
@@ -166,7 +166,8 @@ def deployments(config: ServeConfig) -> list["RunnerDeployment"]:
         parameters={**images, **where},
         entrypoint_type=EntrypointType.MODULE_PATH,
     )
-    return [dropped, arrived, nightly]
+    made: list[Any] = [dropped, arrived, nightly]  # awaitable only where called in a coroutine
+    return made
 
 
 @contextlib.contextmanager
