@@ -33,6 +33,7 @@ MODES: tuple[Mode, ...] = ("fails", "tears", "fills up")
 and the process writes nothing after it; ``fills up``: no space from that call on."""
 TINY = SimulationConfig(frames=6, width=320, height=240, seed=21)
 _SETTINGS = (
+    "detection.fine_tune_steps=2",
     "lens.calibrate=never",
     "registration.max_keypoints=600",
     "registration.min_control_points=20",
