@@ -37,7 +37,8 @@ def test_a_csv_of_all_columns_is_read_in_raw_pixels(tmp_path):
         "frame,x_px,y_px,orientation_rad,length_px,width_px\na.png,10.5,20,0.5,16,7\na.png,30,40,-0.5,,\nb.png,,,,,\n",
     )
     labels = read_labels(path, FOLDER)
-    assert labels.cars.dtypes.astype(str).to_dict() == LABEL_COLUMNS
+    assert list(labels.cars) == list(LABEL_COLUMNS)
+    assert labels.cars.dtypes.equals(labels.cars.astype(LABEL_COLUMNS).dtypes)  # pandas 2 has no type of text
     assert labels.cars["x_px"].tolist() == [10.5, 30.0]
     assert labels.cars["orientation_rad"].tolist() == pytest.approx([0.5, math.pi - 0.5])
     assert labels.cars["length_px"].isna().tolist() == [False, True]
@@ -143,7 +144,8 @@ def test_two_images_of_one_stem_cannot_have_yolo_labels(tmp_path):
 def test_detections_of_others_are_read_with_what_they_know(tmp_path):
     path = write(tmp_path / "d.csv", "frame,x_px,y_px,score,track\nb.png,10,20,0.7,x\na.png,30,40,,y\n")
     table = read_detections(path, FOLDER)
-    assert table.dtypes.astype(str).to_dict() == RAW_DETECTION_COLUMNS
+    assert list(table) == list(RAW_DETECTION_COLUMNS)
+    assert table.dtypes.equals(table.astype(RAW_DETECTION_COLUMNS).dtypes)
     assert table["source_index"].tolist() == [0, 1]
     assert table["score"].tolist() == [1.0, 0.7]
     yolo = write(tmp_path / "y" / "c.txt", "0 0.5 0.5 0.1 0.05 0.25\n").parent
