@@ -145,9 +145,9 @@ class ClientRunner(Runner):
         client: Any,
         warn: Callable[[str], None],
         *,
-        cluster: Any = None,
-        asked: int = 0,
-        own_workers: bool = False,
+        cluster: Any,
+        asked: int,
+        own_workers: bool,
     ) -> None:
         self._own_workers, self._cluster, self._asked = own_workers, cluster, asked
         self._client, self._warn = client, warn
@@ -261,8 +261,8 @@ def open_runner(config: RunnerConfig, warn: Callable[[str], None] = warnings.war
             own = config.scheduler is None and config.cluster_class is None
             if own:
                 _load_stages(client)
-            ours = {} if config.scheduler is not None else {"cluster": cluster, "asked": config.workers}
-            yield ClientRunner(client, warn, own_workers=own, **ours)
+            asked = 0 if config.scheduler is not None else config.workers or 0
+            yield ClientRunner(client, warn, cluster=cluster, asked=asked, own_workers=own)
 
 
 def _load_stages(client: Any) -> None:

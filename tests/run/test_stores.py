@@ -125,6 +125,21 @@ def test_the_field_opens_with_xarray_labelled(tmp_path: Path) -> None:
         assert int(field["count"].sum()) == 0
 
 
+def create_empty_field(path: Path, *, side: int, tile: int, bins: int) -> None:
+    """A field of a square map without layers."""
+    create_field(
+        path,
+        key="k",
+        height=side,
+        width=side,
+        tile=tile,
+        group_tiles=min(side // tile, 8),
+        velocities_px_per_s=np.arange(float(bins)),
+        attributes={},
+        layers={},
+    )
+
+
 def test_a_flipped_bit_of_a_tile_changes_no_value_in_silence(tmp_path: Path) -> None:
     count = np.zeros((16, 16), np.int32)
     count[2:5, 9:] = 1
@@ -132,17 +147,7 @@ def test_a_flipped_bit_of_a_tile_changes_no_value_in_silence(tmp_path: Path) -> 
     shard = encode_tile(tile, count, 16)
     np.testing.assert_array_equal(decode_tile(shard, tile.shape, 16), tile)
     path = tmp_path / "field.zarr"
-    create_field(
-        path,
-        key="k",
-        height=16,
-        width=16,
-        tile=16,
-        group_tiles=1,
-        velocities_px_per_s=np.arange(5.0),
-        attributes={},
-        layers={},
-    )
+    create_empty_field(path, side=16, tile=16, bins=5)
     store = open_field(path, "r+")
     store.write_tile(0, 0, tile, count)
     np.testing.assert_array_equal(zarr.open_array(path / HISTOGRAM, mode="r")[:], tile)  # by zarr's own codec
@@ -161,17 +166,7 @@ def test_a_flipped_bit_of_a_tile_changes_no_value_in_silence(tmp_path: Path) -> 
 
 def test_untouched_tiles_take_no_space(tmp_path: Path) -> None:
     path = tmp_path / "field.zarr"
-    create_field(
-        path,
-        key="k",
-        height=2048,
-        width=2048,
-        tile=64,
-        group_tiles=8,
-        velocities_px_per_s=np.arange(37.0),
-        attributes={},
-        layers={},
-    )
+    create_empty_field(path, side=2048, tile=64, bins=37)
     assert sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) < 100_000
 
 

@@ -44,7 +44,8 @@ def encode_tile(histogram: NDArray[np.int32], count: NDArray[np.int32], tile: in
         parts.append(_CODEC.encode(block))
         index[row, column] = end, len(parts[-1])
         end += len(parts[-1])
-    return b"".join([*parts, index.tobytes(), _checksum(index.tobytes())])
+    index_bytes = index.tobytes()
+    return b"".join([*parts, index_bytes, _checksum(index_bytes)])
 
 
 def decode_tile(shard: bytes, shape: tuple[int, ...], tile: int) -> NDArray[np.int32]:

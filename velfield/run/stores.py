@@ -512,8 +512,8 @@ class FieldStore:
 
     def files(self, tiles: Iterable[tuple[int, int]], group: tuple[int, int]) -> list[Path]:
         """Files that hold the tiles (row, column) and the layers of one group; and the store's metadata."""
-        chunks = [Path("c", str(row), str(column), "0", "0") for row, column in tiles]
-        histogram = [self.path / name / chunk for name in self.histogram_names() for chunk in chunks]
+        places = list(tiles)
+        histogram = [self._tile_path(*place, name) for name in self.histogram_names() for place in places]
         layers = [self.path / name / "c" / str(group[0]) / str(group[1]) for name in self.layer_names()]
         axes = [self.path / name / "c" / "0" for name in self.group.by_axes.get(1, ())]
         return [*_metadata(self.path), *_existing([*histogram, *layers, *axes])]
