@@ -241,19 +241,6 @@ DetectorRecord = Annotated[CnnRecord | PaperRecord | OnnxRecord, Field(discrimin
 RECORDS: tuple[type[BaseRecord], ...] = get_args(get_args(DetectorRecord)[0])
 
 
-class LongVehicleRecord(Model):
-    """A classifier of the centres of lorries and buses, against all other positions along their axis and cars."""
-
-    kind: Literal["velfield-long-vehicles"] = "velfield-long-vehicles"
-    version: Literal[2] = 2
-    working_car_length_px: PositiveFloat = Field(le=200)
-    rounds: tuple[Round, ...] = Field(min_length=1, max_length=5000)
-    threshold: float
-    """A position with a higher score is the centre of a long vehicle."""
-    contrast_floor: PositiveFloat
-    attribution: tuple[str, ...] = Field(default=(), max_length=50)
-
-
 class DimensionsRecord(Model):
     """The network that measures vehicles: fully connected layers with ReLU between them."""
 

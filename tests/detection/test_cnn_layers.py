@@ -175,7 +175,7 @@ def test_channels_and_resolutions_of_the_topology_fit() -> None:
 
 
 def test_forward_equals_the_network_written_out_with_scipy() -> None:
-    network, image = random_network(), np.random.default_rng(1).random((16, 24))
+    network, image = random_network(), np.random.default_rng(1).random((16, 32))
 
     def conv(name: str, x: FloatArray) -> FloatArray:
         return scipy_conv(x, network.weights[name]) + network.biases[name]
@@ -196,10 +196,13 @@ def test_forward_equals_the_network_written_out_with_scipy() -> None:
     skip = relu(conv("enc1", relu(conv("down1", relu(conv("stem", image[..., None]))))))
     x = relu(conv("down2", deep(skip)))
     x = x + relu(conv("res1_1", relu(conv("res1_0", x))))
+    y = relu(conv("down3", deep(x)))
+    y = y + relu(conv("res3_1", relu(conv("res3_0", y))))
+    x = relu(wide(conv("up2", y)) + x)
     x = x + relu(conv("res2_1", relu(conv("res2_0", x))))
     expected = wide(conv("head", relu(conv("dec1", relu(wide(conv("up1", x)) + skip)))))
     out = Trainer.from_network(network).predict(image.astype(np.float32)[None])
-    assert out.shape == (1, 8, 12, 3)
+    assert out.shape == (1, 8, 16, 3)
     np.testing.assert_allclose(out[0], expected, atol=2e-4)
 
 

@@ -13,9 +13,9 @@ from velfield.detection.interface import Detector
 from velfield.detection.orientation import axial_difference
 from velfield.detection.registry import shipped_detector, train_detector
 from velfield.detection.samples import LabelledImage
-from velfield.detection.stumps import BoostedStumps
 from velfield.errors import InputError
 from velfield.paper.response import dense_response
+from velfield.paper.stumps import BoostedStumps
 from velfield.pipeline.stages.labels import rescale
 from velfield.synthetic import Flight, small_flight
 

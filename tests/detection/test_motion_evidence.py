@@ -39,7 +39,8 @@ def test_kharkiv(footage: Callable[[str], Path], tmp_path: Path) -> None:
         marked_frame.judge(run, frame, table[table["frame"] == frame]) for table in _both(run)
     )
     assert precision >= alone - 0.01
-    assert found["moving"] >= found_alone["moving"] + 0.15
+    assert found["moving"] >= found_alone["moving"] + 0.05
+    assert found["moving"] > 0.88
     assert found["standing"] >= found_alone["standing"]
 
 

@@ -1,15 +1,10 @@
 """Oriented non-maximum suppression."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from velfield.detection.nms import (
-    in_view,
-    nms_oriented,
-    offset_along_axis,
-)
+from velfield.detection.nms import nms_oriented
 
 LENGTH = 16.0
 SEEDS = st.integers(0, 2**32 - 1)
@@ -85,23 +80,3 @@ def test_cars_that_do_not_touch_are_all_kept() -> None:
     grid = np.stack(np.meshgrid(np.arange(5) * 20.0, np.arange(5) * 12.0), axis=-1).reshape(-1, 2)
     cars = np.column_stack([grid, np.zeros(25), np.linspace(1, 0.1, 25), np.full(25, 0.1)])
     assert len(nms_oriented(cars, LENGTH)) == 25
-
-
-@given(SEEDS)
-@settings(max_examples=20, deadline=None)
-def test_offsets_are_along_and_across_the_axis(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    xy, angles, offsets = rng.uniform(-9, 9, (6, 2)), rng.uniform(-4, 4, 6), rng.uniform(-9, 9, (6, 2))
-    moved = offset_along_axis(xy, angles, offsets) - xy
-    axis = np.column_stack([np.cos(angles), np.sin(angles)])
-    np.testing.assert_allclose((moved * axis).sum(axis=1), offsets[:, 0], atol=1e-9)
-    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), np.linalg.norm(offsets, axis=1), atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("xy", "expected"),
-    [((0.0, 0.0), True), ((-0.4, -0.4), True), ((-0.6, 3.0), False), ((9.4, 5.4), True), ((9.6, 3.0), False)],
-)
-def test_positions_in_view(xy: tuple[float, float], *, expected: bool) -> None:
-    assert in_view(np.array([xy]), (6, 10), None).tolist() == [expected]
-    assert in_view(np.array([xy]), (6, 10), np.zeros((6, 10), bool)).tolist() == [False]

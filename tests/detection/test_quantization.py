@@ -81,7 +81,7 @@ def test_of_long_crops_of_one_size_each_is_predicted() -> None:
 
 def test_crops_of_an_image_are_predicted_as_if_alone() -> None:
     network, image = shipped().predictor, cars(2, (120, 160))
-    crops = np.array([(0, 0, 48, 40), (0, 40, 48, 40), (48, 8, 64, 104), (8, 80, 40, 48)])
+    crops = np.array([(0, 0, 48, 32), (0, 32, 48, 32), (48, 8, 64, 112), (0, 80, 48, 48)])
     probability, orientation = np.zeros((60, 80), np.float32), np.zeros((2, 60, 80), np.float32)
     for y, x, height, width in crops:
         part = slice(y // 2, (y + height) // 2), slice(x // 2, (x + width) // 2)

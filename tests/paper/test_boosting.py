@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from velfield.detection.stumps import BoostedStumps
 from velfield.paper import boosting
 from velfield.paper.boosting import (
     N_BINS,
@@ -15,6 +14,7 @@ from velfield.paper.boosting import (
     quantile_bin_edges,
     rounds_from_stumps,
 )
+from velfield.paper.stumps import BoostedStumps
 
 
 def plain_boost(

@@ -15,9 +15,9 @@ from velfield.compiled import kernel
 from velfield.detection.cnn.network import TOPOLOGY, DepthToSpace, Residual, SpaceToDepth, Topology
 from velfield.detection.detect import detect_frame
 from velfield.detection.interface import Detector
-from velfield.detection.stumps import BoostedStumps
 from velfield.paper.boosting import draw_feature_pool
 from velfield.paper.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, dense_response, quantise_and_pad
+from velfield.paper.stumps import BoostedStumps
 from velfield.synthetic import small_flight
 
 _DENSE_ROUNDS = 200

@@ -38,8 +38,7 @@ from velfield.detection.changes import (
 from velfield.detection.crops import CHIP_PX, oriented_patches, oriented_strips, upright_chips
 from velfield.detection.frame import SearchableFrame, half_resolution
 from velfield.detection.interface import Detections, Detector, concatenate
-from velfield.detection.long_vehicles.classifier import confirm_long_vehicles
-from velfield.detection.mosaic import find_in_boxes
+from velfield.detection.mosaic import CROP_UNIT_PX, find_in_boxes
 from velfield.detection.nms import nms_oriented
 
 _SLOW_PX = 96
@@ -120,7 +119,7 @@ class SearchedFrame:
     frame : the frame.
     detections : its cars.
     searched : fraction of the frame's cells that the detector was run on.
-    weak : candidates of a lower score that no car covers; long vehicles among them are in ``detections``.
+    weak : candidates of a lower score that no car covers.
     """
 
     frame: SearchableFrame
@@ -168,20 +167,16 @@ def search_frame(
     searched = np.zeros(cells.shape, bool)
     for top, left, bottom, right in boxes:
         searched[top:bottom, left:right] = True
-    frame.resample(_grow(searched, -(-detector.context_px // CELL_PX)), CELL_PX)
+    frame.resample(_grow(searched, -(-(detector.context_px + CROP_UNIT_PX - CELL_PX) // CELL_PX)), CELL_PX)
     found = find_in_boxes(detector, frame, boxes, weak_above)
     above = found.score > own if detector.weak_margin else np.ones(len(found), bool)
     kept = None if reference is None else _outside(reference.detections, searched, frame.half_valid)
-    cars = detector.refine(frame, found.take(np.flatnonzero(above)), kept)
+    cars = detector.refine(found.take(np.flatnonzero(above)), kept)
     weak = found.take(np.flatnonzero(~above))
     if reference is not None:
         weak = concatenate([weak, _outside(reference.weak, searched, frame.half_valid)])
     length_px = detector.record.working_car_length_px
     weak = suppress_weak(weak, cars, length_px)
-    long = confirm_long_vehicles(frame, weak, cars, length_px)
-    if len(long):
-        cars = concatenate([cars, long])
-        weak = suppress_weak(weak, long, length_px)
     frame.resample(_cells_of_crops(np.concatenate([cars.xy, weak.xy]), cells.shape), CELL_PX)
     fraction = float(searched[covered].mean()) if covered.any() else 0.0
     return SearchedFrame(frame, cars, fraction, weak)

@@ -15,7 +15,6 @@ import numpy as np
 
 from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
 from schemas.detector import BaseRecord, PrecisionRecallCurve
-from velfield.detection.frame import SearchableFrame
 from velfield.errors import InputError
 
 if TYPE_CHECKING:
@@ -156,7 +155,7 @@ class Detector(ABC):
         """
         raise NotImplementedError
 
-    def refine(self, frame: SearchableFrame, found: Detections, kept: Detections | None = None) -> Detections:
+    def refine(self, found: Detections, kept: Detections | None = None) -> Detections:
         """Detections of a whole frame from the candidates of its parts.
 
         Parameters

@@ -20,6 +20,8 @@ Box = tuple[int, int, int, int]
 """Rectangle of cells: first row, first column, row and column after the last."""
 _SIDE_PX = 1024
 """Side of a mosaic, unless a crop is larger."""
+CROP_UNIT_PX = 16
+"""Sides of crops are multiples of this: the network halves the resolution four times."""
 
 
 @dataclass(frozen=True)
@@ -39,17 +41,23 @@ class Mosaic:
 
 
 def pack_boxes(boxes: Sequence[Box], context_px: int) -> list[Mosaic]:
-    """Pack boxes with their context into mosaics, the tallest first."""
+    """Pack boxes with their context, and what a multiple of `CROP_UNIT_PX` needs below and to the right, into mosaics,
+    the tallest first."""
     if not len(boxes):
         return []
-    cells = np.array(boxes)
-    sizes = CELL_PX * (cells[:, 2:] - cells[:, :2]) + 2 * context_px
+    sizes = CROP_UNIT_PX * -(-(_sizes_px(boxes) + 2 * context_px) // CROP_UNIT_PX)
     order = np.lexsort((sizes[:, 1], -sizes[:, 0]))
     number, corners = shelve_kernel(sizes[order], _SIDE_PX)
     crops = np.column_stack([corners, sizes[order]])
     ends = np.flatnonzero(np.diff(number)) + 1
     parts = zip(np.split(order, ends), np.split(crops, ends), strict=True)
     return [Mosaic((int((of[:, 0] + of[:, 2]).max()), int((of[:, 1] + of[:, 3]).max())), one, of) for one, of in parts]
+
+
+def _sizes_px(boxes: Sequence[Box]) -> IntArray:
+    """Height and width (n, 2) of boxes."""
+    cells = np.array(boxes)
+    return np.asarray(CELL_PX * (cells[:, 2:] - cells[:, :2]))
 
 
 @kernel
@@ -80,7 +88,7 @@ def find_in_boxes(
     Parameters
     ----------
     frame
-        Resampled in the boxes and within `Detector.context_px` of them.
+        Resampled in the boxes and within `Detector.context_px` and `CROP_UNIT_PX` of them.
     threshold
         As of `Detector.find`.
     """
@@ -105,7 +113,8 @@ def _find_in_mosaic(
     image = assemble_kernel(frame.image, corners, placed, *mosaic.shape, True)
     valid = assemble_kernel(frame.valid.view(np.uint8), corners, placed, *mosaic.shape, False).view(np.bool_)
     found = detector.find_in_crops(image, valid, placed, threshold=threshold)
-    crop = owners_kernel(found.xy, placed, context, *mosaic.shape)
+    searched = np.column_stack([placed[:, :2] + context, _sizes_px(boxes)[mosaic.numbers]])
+    crop = owners_kernel(found.xy, searched, *mosaic.shape)
     inside = np.flatnonzero(crop >= 0)
     found, crop = found.take(inside), crop[inside]
     shift = (corners - placed[:, :2])[crop]
@@ -115,15 +124,15 @@ def _find_in_mosaic(
 
 
 @kernel
-def owners_kernel(xy: FloatArray, crops: IntArray, context: int, height: int, width: int) -> IntArray:
-    """Number of the crop in whose box, within the context, the pixel of each position (n, 2) lies; -1 where in none."""
+def owners_kernel(xy: FloatArray, boxes: IntArray, height: int, width: int) -> IntArray:
+    """Number of the box (n, 4) of a mosaic in which the pixel of each position (n, 2) lies; -1 where in none."""
     out = np.full(len(xy), -1, np.int64)
     for n in range(len(xy)):
         x = min(max(int(np.floor(xy[n, 0] + 0.5)), 0), width - 1)
         y = min(max(int(np.floor(xy[n, 1] + 0.5)), 0), height - 1)
-        for k in range(len(crops)):
-            top, left, rows, columns = crops[k]
-            if top + context <= y < top + rows - context and left + context <= x < left + columns - context:
+        for k in range(len(boxes)):
+            top, left, rows, columns = boxes[k]
+            if top <= y < top + rows and left <= x < left + columns:
                 out[n] = k
     return out
 

@@ -1,4 +1,4 @@
-"""Non-maximum suppression of oriented rectangles, and positions along their axes."""
+"""Non-maximum suppression of oriented rectangles."""
 
 import numpy as np
 
@@ -12,20 +12,6 @@ _MAX_OVERLAP = 0.25
 """A detection is suppressed where better ones cover more than this fraction of its rectangle."""
 _SPOTS_ALONG, _SPOTS_ACROSS = 12, 5
 """Sample points of a rectangle."""
-
-
-def in_view(xy: FloatArray, shape: tuple[int, int], valid: Mask | None) -> Mask:
-    """Whether positions (n, 2...) lie in an image (h, w), and where it is ``valid``."""
-    x, y = (np.clip(np.rint(xy[:, k]), 0, shape[1 - k] - 1).astype(np.int64) for k in (0, 1))
-    inside = (np.abs(xy[:, 0] - x) <= 0.5) & (np.abs(xy[:, 1] - y) <= 0.5)
-    return np.asarray(inside if valid is None else inside & valid[y, x])
-
-
-def offset_along_axis(xy: FloatArray, angles: FloatArray, offsets: FloatArray) -> FloatArray:
-    """Positions (n, 2) displaced by offsets (n, 2) along and across their axes (n,)."""
-    c, s = np.cos(angles), np.sin(angles)
-    u, v = offsets[:, 0], offsets[:, 1]
-    return xy + np.column_stack([u * c - v * s, u * s + v * c])
 
 
 def nms_oriented(cars: FloatArray, car_length_px: float) -> FloatArray:

@@ -9,10 +9,10 @@ from schemas.arrays import GreyImage, Mask
 from schemas.detector import PaperConfig, PaperRecord
 from velfield.detection.interface import Detections, Detector
 from velfield.detection.samples import LabelledImage
-from velfield.detection.stumps import BoostedStumps
 from velfield.errors import InputError
 from velfield.paper.response import dense_response
 from velfield.paper.segmentation import region_moments, segment_response
+from velfield.paper.stumps import BoostedStumps
 from velfield.paper.training import train_paper
 
 

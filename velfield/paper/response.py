@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from schemas.arrays import Float32Array, GreyImage, Mask
 from velfield.compiled import kernel
-from velfield.detection.stumps import BoostedStumps
+from velfield.paper.stumps import BoostedStumps
 
 MARGIN_PX = 64
 """Images are extended by this at their edges: no rectangle reaches farther."""

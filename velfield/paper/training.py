@@ -10,7 +10,6 @@ from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
 from schemas.detector import PaperConfig, PaperRecord
 from velfield.compiled import kernel
 from velfield.detection.samples import LabelledImage
-from velfield.detection.stumps import BoostedStumps
 from velfield.paper.boosting import (
     FeaturePool,
     assign_bins,
@@ -20,6 +19,7 @@ from velfield.paper.boosting import (
     rounds_from_stumps,
 )
 from velfield.paper.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, dense_response, quantise_and_pad
+from velfield.paper.stumps import BoostedStumps
 
 _REACH_PX = 40
 _MAX_CAR_SAMPLES = 4000

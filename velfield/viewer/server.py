@@ -117,7 +117,9 @@ def serve_in_thread(app: "Starlette", port: int) -> Iterator[str]:
     except InputError:
         listener = _listen(None)
     with listener:
-        server = uvicorn.Server(uvicorn.Config(app, log_level="warning", lifespan="off", server_header=False))
+        server = uvicorn.Server(
+            uvicorn.Config(app, log_level="warning", lifespan="off", ws="none", server_header=False)
+        )
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, name="pages", daemon=True)
         thread.start()
         try:
@@ -152,7 +154,7 @@ def serve(app: "Starlette", *, port: int | None, open_browser: bool, announce: C
         if open_browser and _has_screen():
             # The socket listens already: the browser waits for the response.
             threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
-        config = uvicorn.Config(app, log_level="warning", lifespan="off", server_header=False)
+        config = uvicorn.Config(app, log_level="warning", lifespan="off", ws="none", server_header=False)
         uvicorn.Server(config).run(sockets=[listener])
 
 

@@ -58,7 +58,9 @@ _LARGE_RATIO, _LARGE_WEIGHT = 1.35, 5.0
 """A vehicle this many times as long as a car is that many times as often the one that a patch is centred near."""
 _INVERSION_PROBABILITY = 0.1
 _HAZE_PROBABILITY, _HAZE_CONTRAST, _HAZE_LEVEL = 0.15, (0.15, 0.5), (0.4, 0.8)
-_VIDEO_PROBABILITY, _VIDEO_QUALITY, _VIDEO_REDUCTION = 0.25, (12, 60), (0.6, 1.0)
+_VIDEO_PROBABILITY, _VIDEO_QUALITY, _VIDEO_REDUCTION = 0.35, (12, 70), (0.5, 1.0)
+_SHARPENING_PROBABILITY, _SHARPENING, _SHARPENING_SIGMA_PX = 0.2, (0.3, 1.5), (0.6, 1.2)
+"""Drones sharpen their video: halos about cars."""
 
 
 class Patch(NamedTuple):
@@ -292,6 +294,9 @@ def _augment_photometry(patch: Float32Array, rng: np.random.Generator, *, hard: 
     if hard and rng.random() < _HAZE_PROBABILITY:
         share, level = np.float32(rng.uniform(*_HAZE_CONTRAST)), np.float32(rng.uniform(*_HAZE_LEVEL))
         grey = share * grey + (1 - share) * level
+    if hard and rng.random() < _SHARPENING_PROBABILITY:
+        smooth = cv2.GaussianBlur(grey, (0, 0), rng.uniform(*_SHARPENING_SIGMA_PX))
+        grey += np.float32(rng.uniform(*_SHARPENING)) * (grey - smooth)
     grey += rng.normal(0, rng.uniform(0, _MAX_NOISE_SD), grey.shape).astype(np.float32)
     grey = np.clip(grey, 0, 1, out=grey)
     if hard and rng.random() < _VIDEO_PROBABILITY:

@@ -15,9 +15,8 @@ from velfield.detection.cnn.inference import BORDER_PX, Predictor
 from velfield.detection.cnn.model import detect_cars
 from velfield.detection.cnn.network import Network
 from velfield.detection.cnn.quantization import INEXACT, calibrate, is_exact
-from velfield.detection.frame import SearchableFrame, whole_frame
-from velfield.detection.interface import Detections, Detector
-from velfield.detection.long_vehicles.classifier import suppress_and_centre
+from velfield.detection.interface import Detections, Detector, concatenate
+from velfield.detection.nms import nms_oriented
 from velfield.detection.orientation import CAR_ASPECT
 from velfield.detection.runtime import current_device, device_limitations, uses_cuda
 from velfield.detection.samples import LabelledImage
@@ -70,9 +69,8 @@ class CnnDetector(Detector):
         *,
         threshold: float | None = None,
     ) -> Detections:
-        """Detect cars: peaks of the heatmap, non-maximum suppression, long vehicles centred."""
-        found = self._find(image, valid, threshold, border_px=BORDER_PX)
-        return self.refine(whole_frame(image, valid), found)
+        """Detect cars: peaks of the heatmap, non-maximum suppression."""
+        return self.refine(self._find(image, valid, threshold, border_px=BORDER_PX))
 
     def find(
         self,
@@ -109,9 +107,11 @@ class CnnDetector(Detector):
         above = rows[rows[:, 3] > (self.threshold if threshold is None else threshold)] if len(rows) else rows
         return Detections.from_rows(above, np.full(len(above), length_px * length_px * CAR_ASPECT))
 
-    def refine(self, frame: SearchableFrame, found: Detections, kept: Detections | None = None) -> Detections:
-        """Non-maximum suppression; long vehicles centred."""
-        return suppress_and_centre(frame, found, kept, self.record.working_car_length_px)
+    def refine(self, found: Detections, kept: Detections | None = None) -> Detections:
+        """Non-maximum suppression."""
+        rows = concatenate([found] if kept is None else [found, kept]).to_rows()
+        kept_rows = nms_oriented(rows, self.record.working_car_length_px)
+        return Detections.from_rows(kept_rows[:, :5], kept_rows[:, 5])
 
     @classmethod
     def train(cls, samples: Sequence[LabelledImage], config: CnnConfig, *, base: Detector | None = None) -> Detector:

@@ -28,7 +28,7 @@ from velfield.detection.runtime import (
 )
 from velfield.errors import DeviceWarning
 
-_TILE_PX, HALO_PX = 2048, 64
+_TILE_PX, HALO_PX = 2048, 96
 """Larger images are processed in tiles, each with a halo wider than the reach of the receptive field."""
 _GPU_TILE_PX = 1024
 """Side of the tiles of all images on a GPU, whose halo lies on every side."""

@@ -66,6 +66,16 @@ TOPOLOGY: Topology = (
             SpaceToDepth(),
             Conv("down2", 1, 128, 48),
             Residual((Conv("res1_0", 3, 48, 48), Conv("res1_1", 3, 48, 48))),
+            Residual(
+                (
+                    SpaceToDepth(),
+                    Conv("down3", 1, 192, 96),
+                    Residual((Conv("res3_0", 3, 96, 96), Conv("res3_1", 3, 96, 96))),
+                    Conv("up2", 1, 96, 192, relu=False),
+                    DepthToSpace(),
+                ),
+                relu=True,
+            ),
             Residual((Conv("res2_0", 3, 48, 48), Conv("res2_1", 3, 48, 48))),
             Conv("up1", 1, 48, 128, relu=False),
             DepthToSpace(),
@@ -80,7 +90,7 @@ TOPOLOGY: Topology = (
 resolution: 15.9 GMAC a frame of 2560 x 1920."""
 STRIDE = 2
 """Working px a pixel of the heatmap."""
-ALIGNMENT = 8
+ALIGNMENT = 16
 """Height and width of an image must be multiples of this: two to the number of halvings."""
 
 

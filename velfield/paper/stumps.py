@@ -1,4 +1,4 @@
-"""A trained boosted classifier as arrays: the paper's detector and the classifier of long vehicles are such ones."""
+"""A trained boosted classifier as arrays."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

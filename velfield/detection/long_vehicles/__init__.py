@@ -1,1 +1,0 @@
-"""The classifier of long vehicles: lorries and buses at their centre."""
