@@ -6,10 +6,16 @@ from cyclopts import Parameter
 
 from velfield.errors import InputError
 
+DONE, BAD_INPUT, USAGE, INCOMPLETE = 0, 1, 2, 3
+"""Exit statuses. 3: done, but frames were lost."""
 Preset = Literal["best", "fast", "paper"]
 Device = Literal["auto", "cpu", "cuda"]
 Settings = Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False, negative=(), show_default=False)]
 """``section.key=value``, any number of times."""
+
+Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative=())]
+Verbose = Annotated[bool, Parameter(name=["--verbose", "-v"], negative=())]
+LogJson = Annotated[bool, Parameter(name="--log-json", negative=())]
 
 
 def parse_frame_size(size: str, expected: str, min_px: int = 0) -> tuple[int, int]:

@@ -81,6 +81,23 @@ def read_runner(path: Path) -> RunnerConfig:
     return RunnerConfig(**file.model_dump())
 
 
+def choose_runner(workers: int | None, scheduler: str | None, cluster: Path | None) -> RunnerConfig:
+    """Where the commands' options say that graphs are computed.
+
+    Raises
+    ------
+    InputError
+        More than one of them is given, there are no workers, the scheduler does not answer, or the file is not one.
+    """
+    if sum(given is not None for given in (workers, scheduler, cluster)) > 1:
+        raise InputError("--workers, --scheduler and --cluster exclude each other; give only one")
+    if workers is not None and workers < 1:
+        raise InputError(f"--workers {workers}: must be a positive integer; omit it to run in this process")
+    if scheduler is not None:
+        check_scheduler(scheduler)  # before the cluster's client, which would wait for it
+    return read_runner(cluster) if cluster else RunnerConfig(workers=workers, scheduler=scheduler)
+
+
 class WorkersKilledError(RuntimeError):
     """Every worker that computed a graph was killed meanwhile, as often as the cluster tries."""
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-DONE, INCOMPLETE = 0, 3
+from flows.options import DONE, INCOMPLETE, Quiet
 
 
 def reprocess(
@@ -18,7 +18,8 @@ def reprocess(
     max_error_px: float = 1.0,
     workers: int | None = None,
     scheduler: str | None = None,
-    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], negative=())] = False,
+    cluster: Path | None = None,
+    quiet: Quiet = False,
 ) -> int:
     """Put a new base image under a finished run, and recompute only what depends on it. The old result is kept.
 
@@ -41,6 +42,8 @@ def reprocess(
         Processes of a local cluster. Default: threads of this process.
     scheduler
         Address of a Dask scheduler.
+    cluster
+        YAML file that names a class of Dask clusters.
     quiet
         Print warnings only.
     """
@@ -51,10 +54,10 @@ def reprocess(
     prepare_process(verbose=False)
     from flows.console import Console
     from flows.reprocess import run_reprocess
-    from flows.runners import RunnerConfig
+    from flows.runners import choose_runner
 
     console = Console("quiet" if quiet else "normal")
-    where = RunnerConfig(workers=workers, scheduler=scheduler)
+    where = choose_runner(workers, scheduler, cluster)
     root, summary = run_reprocess(
         run_folder, base, name=out, full=full, max_added_error_px=max_error_px, runner=where, console=console
     )

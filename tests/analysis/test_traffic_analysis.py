@@ -147,12 +147,32 @@ def test_free_flow_and_edie(analysis: TrafficAnalysis) -> None:
     assert known
     assert known[0].value == pytest.approx(SPEED, abs=0.4)
     lane = max(analysis.lanes, key=lambda lane: lane.tracks)
-    slices = flow_slices(analysis.lane_traffic, lane.number, *analysis.window_s)
+    slices = flow_slices(analysis.lane_traffic, lane.number, analysis.trajectories.observed_s)
     driven = (slices.flow_veh_per_h / 3600).mean() * (analysis.window_s[1] - analysis.window_s[0])
     assert driven == pytest.approx(lane.tracks, rel=0.1)
     used = slices.density_veh_per_km > 0
     product = slices.density_veh_per_km[used] * slices.speed_m_per_s[used] * 3.6
     assert product == pytest.approx(slices.flow_veh_per_h[used])
+
+
+def test_flow_is_of_the_times_that_are_seen() -> None:
+    """Two clips of three minutes, half an hour apart: a vehicle every 4 s is 900 an hour."""
+    clips = [drive(EAST, begin + 4.0 * k) for begin in (0.0, 1980.0) for k in range(45)]
+    whole = gather(clips)
+    last = float(whole.time_s[whole.time_s < 1000].max())
+    analysis = TrafficAnalysis(replace(whole, gaps_s=np.array([[last, 1980.0]])), slice_s=100.0)
+    assert analysis.trajectories.duration_s == pytest.approx(2 * last, abs=1.0)
+    flow = max(analysis.flows, key=lambda one: one.flow_veh_per_h.value if one.flow_veh_per_h else 0.0)
+    assert flow.flow_veh_per_h is not None
+    assert flow.flow_veh_per_h.value == pytest.approx(90 / (2 * last) * 3600, rel=0.02)
+    assert flow.flow_veh_per_h.low > 600
+    assert flow.headway_s is not None
+    assert flow.headway_s.value == pytest.approx(4.0, abs=0.05)
+    slices = flow_slices(analysis.lane_traffic, flow.lane, analysis.trajectories.observed_s)
+    assert len(slices.start_s) == 6
+    assert slices.flow_veh_per_h.min() > 600
+    edges = np.array([0.0, 100.0, 1000.0, 2000.0])
+    np.testing.assert_allclose(analysis.trajectories.observed_within(edges), [100, last - 100, 20], atol=0.5)
 
 
 def test_a_u_turn_a_wrong_way_and_a_conflict() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from flows.cli import _conclude
+from flows.commands.run import conclude
 from flows.console import Console
 from flows.runners import ClientRunner, RunnerConfig
 from schemas.summary import RunSummary
@@ -233,7 +233,7 @@ def test_footage_that_is_not_all_there_ends_with_status_3(
     assert whole[1].complete
     assert not summary.complete
     assert len(summary.footage_lost) == 1
-    assert _conclude(summary, Console()) == 3
+    assert conclude(summary, Console()) == 3
     assert summary.footage_lost[0] in capsys.readouterr().err
     assert "Not complete" in render_report(make_report(plan, summary), [])
 

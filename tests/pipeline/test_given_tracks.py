@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from flows.cli import run as run_command
+from flows.commands.run import run as run_command
 from flows.commands.verify import DAMAGED, WHOLE, verify
 from schemas.flight import FlightConfig
 from schemas.job import Inputs, Job

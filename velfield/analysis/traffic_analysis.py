@@ -130,15 +130,21 @@ class TrafficAnalysis:
         """Borders of the slices of time; none where the flight is no longer than two of them."""
         return slice_edges(*self.window_s, self.slice_s)
 
+    @property
+    def _slices(self) -> tuple[FloatArray, FloatArray]:
+        """Their borders, and how long each is seen, s."""
+        edges = self.slice_edges_s
+        return edges, self.trajectories.observed_within(edges) if len(edges) else edges
+
     @cached_property
     def counts_by_time(self) -> list[SliceCount]:
         """Movements through each junction by slice of time."""
-        return movements_by_slice(self.movements, self.slice_edges_s)
+        return movements_by_slice(self.movements, *self._slices)
 
     @cached_property
     def scene_by_time(self) -> list[SliceCount]:
         """Vehicles from origins to destinations by slice of time."""
-        return origins_by_slice(self.scene, self.slice_edges_s)
+        return origins_by_slice(self.scene, *self._slices)
 
     @cached_property
     def reversals(self) -> list[Reversal]:
@@ -206,8 +212,8 @@ class TrafficAnalysis:
     @cached_property
     def flows(self) -> list[LaneFlow]:
         """Traffic of each lane."""
-        lengths = self.trajectories.length_m
-        return [lane_flow(self.lane_traffic, lane.number, *self.window_s, lengths_m=lengths) for lane in self.lanes]
+        lengths, observed = self.trajectories.length_m, self.trajectories.observed_s
+        return [lane_flow(self.lane_traffic, lane.number, observed, lengths_m=lengths) for lane in self.lanes]
 
     @cached_property
     def conflicts(self) -> list[Conflict]:

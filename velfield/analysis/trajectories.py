@@ -50,6 +50,8 @@ class Trajectories:
         (n,) lengths of the vehicles, NaN where one was not measured; None: none was.
     position_sd_m
         Standard deviation of a position along one axis, of errors that last; 0: less than a lane's width matters to.
+    gaps_s
+        (k, 2) begins and ends of the times without frames, in time order; None: there are none.
     """
 
     track_id: IntArray
@@ -61,6 +63,7 @@ class Trajectories:
     gsd_m: float
     measured_length_m: FloatArray | None = None
     position_sd_m: float = 0.0
+    gaps_s: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.track_id)
@@ -93,9 +96,24 @@ class Trajectories:
         return replace(self, measured_length_m=np.where(sd <= _LENGTH_SD_M, length, np.nan))
 
     @property
+    def observed_s(self) -> FloatArray:
+        """(k, 2) begins and ends of the times with frames, from the first position of all tracks to the last."""
+        if not len(self.time_s):
+            return np.empty((0, 2))
+        begin, end = float(self.time_s.min()), float(self.time_s.max())
+        gaps = np.empty((0, 2)) if self.gaps_s is None else self.gaps_s
+        gaps = gaps[(gaps[:, 0] > begin) & (gaps[:, 1] < end)]
+        return np.column_stack([np.r_[begin, gaps[:, 1]], np.r_[gaps[:, 0], end]])
+
+    def observed_within(self, edges_s: FloatArray) -> FloatArray:
+        """Length (k,) of the times with frames between successive edges (k + 1,), s."""
+        begin, end = self.observed_s.T[:, :, None]
+        return np.asarray(np.clip(np.minimum(end, edges_s[1:]) - np.maximum(begin, edges_s[:-1]), 0, None).sum(axis=0))
+
+    @property
     def duration_s(self) -> float:
-        """From the first position of all tracks to the last, s."""
-        return float(np.ptp(self.time_s)) if len(self.time_s) else 0.0
+        """Length of the times with frames, s."""
+        return float(np.diff(self.observed_s, axis=1).sum())
 
     def select(self, keep: Mask) -> "Trajectories":
         """The tracks (n,) that are kept."""
@@ -113,6 +131,7 @@ class Trajectories:
             self.gsd_m,
             None if self.measured_length_m is None else self.measured_length_m[keep],
             self.position_sd_m,
+            self.gaps_s,
         )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from schemas.arrays import IntArray
+from schemas.arrays import IntArray, Mask
 from schemas.export import ExportOptions
 from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.traffic_analysis import TrafficAnalysis
@@ -83,13 +83,18 @@ def junction_rows(analysis: TrafficAnalysis, found: JunctionMovements) -> list[l
         ["From arm, to arm", *(f"{m.arm_in} to {m.arm_out}" for m in moves)],
         ["From the start, min", *head, "All"],
     ]
+    edges = np.linspace(begin, begin + bins * BIN_S, bins + 1)
+    seen = analysis.trajectories.observed_within(edges)
     for k in range(bins):
         last = min((k + 1) * BIN_S, end - begin)
-        rows.append([f"{k * BIN_S / 60:.0f} to {last / 60:.1f}", *counts[:, k].tolist(), int(counts[:, k].sum())])
+        unseen = "" if seen[k] > last - k * BIN_S - 1 else f", of which {seen[k] / 60:.1f} seen"
+        rows.append(
+            [f"{k * BIN_S / 60:.0f} to {last / 60:.1f}{unseen}", *counts[:, k].tolist(), int(counts[:, k].sum())]
+        )
     rows.append(["Counted", *counts.sum(axis=1).tolist(), int(counts.sum())])
     inferred = [round(m.seen + m.inferred - n, 1) for m, n in zip(moves, counts.sum(axis=1).tolist(), strict=True)]
     rows.append(["Inferred of cut tracks", *inferred, round(sum(inferred), 1)])
-    whole = counts[:, : int((end - begin) // BIN_S)]
+    whole = counts[:, _longest_run(seen > BIN_S - 1)]
     factors = [peak_hour_factor(one) for one in [*whole, whole.sum(axis=0)]]
     if factors[-1] is None:
         rows.append(["Peak-hour factor", "too little data: an hour is needed"])
@@ -97,6 +102,13 @@ def junction_rows(analysis: TrafficAnalysis, found: JunctionMovements) -> list[l
         rows.append(["Peak-hour factor", *factors])
     rows.append(["Heavy vehicles, %", *(_heavy_percent(analysis, found.tracks(m)) for m in moves)])
     return rows
+
+
+def _longest_run(whole: Mask) -> slice:
+    """The most slices in a row that hold."""
+    borders = np.flatnonzero(np.diff(np.r_[False, whole, False]))
+    runs = borders.reshape(-1, 2)
+    return slice(*runs[np.diff(runs, axis=1).argmax()]) if len(runs) else slice(0)
 
 
 def _entries(found: JunctionMovements, arm_in: str, arm_out: str, begin_s: float, bins: int) -> IntArray:

@@ -23,6 +23,9 @@ from velfield.field.segments import stationary_speed_px_per_s
 from velfield.field.statistics import direction_rad
 from velfield.run.frame_transforms import heading_deg, north_direction_rad
 
+_GAP_S = 5.0
+"""Longer from one frame to the next, and nothing is known of the traffic between."""
+
 
 @dataclass(frozen=True)
 class RunAnalysis:
@@ -45,6 +48,8 @@ class RunAnalysis:
         Returns the vehicles (`velfield.run.run.Run.vehicles`), of which some are parked; None: not known.
     position_sd_m
         Standard deviation of a position along one axis, of tracks of another program.
+    frame_times_s
+        (n,) times of the frames; None: not known.
     """
 
     layer: Callable[[str], NDArray[np.generic]]
@@ -54,12 +59,13 @@ class RunAnalysis:
     dimensions: Callable[[], pd.DataFrame] | None = None
     vehicles: Callable[[], pd.DataFrame] | None = None
     position_sd_m: float = 0.0
+    frame_times_s: FloatArray | None = None
 
     @cached_property
     def trajectories(self) -> Trajectories:
         """Tracks of vehicles that move, in metres."""
         made = from_tracklets(self.tracklets(), self.gsd_m)
-        trajectories = moving(replace(made, position_sd_m=self.position_sd_m))
+        trajectories = moving(replace(made, position_sd_m=self.position_sd_m, gaps_s=self._gaps_s))
         return trajectories if self.dimensions is None else trajectories.with_lengths(self.dimensions())
 
     @cached_property
@@ -72,6 +78,14 @@ class RunAnalysis:
         parked = known.loc[is_parked, ["x_px", "y_px", "orientation_rad"]]
         scale = [self.gsd_m, self.gsd_m, 1.0]
         return TrafficAnalysis(self.trajectories, parked=parked.to_numpy(np.float64) * scale, classes=self._classes)
+
+    @property
+    def _gaps_s(self) -> FloatArray | None:
+        """Begins and ends (k, 2) of the times between clips: no track goes on over them."""
+        if self.frame_times_s is None:
+            return None
+        before = np.flatnonzero(np.diff(self.frame_times_s) > _GAP_S)
+        return np.column_stack([self.frame_times_s[before], self.frame_times_s[before + 1]])
 
     @property
     def _classes(self) -> VehicleClasses | None:

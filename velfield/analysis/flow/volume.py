@@ -1,10 +1,10 @@
 """Volume, density and space-mean speed of lanes by Edie's definitions; headways; levels of service."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from schemas.arrays import FloatArray
+from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.analysis.flow.passings import LaneTraffic
 from velfield.analysis.intervals import Estimate, estimate_mean, estimate_median, estimate_rate
 from velfield.analysis.trajectories import VEHICLE_LENGTH_M
@@ -45,6 +45,7 @@ class FlowSlices:
     its fundamental diagram."""
 
     start_s: FloatArray
+    end_s: FloatArray
     flow_veh_per_h: FloatArray
     density_veh_per_km: FloatArray
     speed_m_per_s: FloatArray
@@ -53,25 +54,27 @@ class FlowSlices:
 def lane_flow(
     traffic: LaneTraffic,
     lane: int,
-    begin_s: float,
-    end_s: float,
+    observed_s: FloatArray,
     *,
     slice_s: float = 60.0,
     lengths_m: FloatArray | None = None,
 ) -> LaneFlow:
-    """Traffic of one lane from ``begin_s`` to ``end_s``.
+    """Traffic of one lane.
 
     Parameters
     ----------
+    observed_s
+        (k, 2) begins and ends of the times that are seen, in time order.
     lengths_m
         (tracks,) lengths of the vehicles; None: a car's.
     """
-    slices = flow_slices(traffic, lane, begin_s, end_s, slice_s=slice_s)
+    slices = flow_slices(traffic, lane, observed_s, slice_s=slice_s)
     passing = traffic.passings(lane, traffic.graph.lanes[lane].length_m / 2)
-    inside = (passing.time_s >= begin_s) & (passing.time_s <= end_s)
-    number = max(round((end_s - begin_s) / slice_s), 1)
-    counts = np.histogram(passing.time_s[inside], number, (begin_s, max(end_s, begin_s + 1e-9)))[0]
-    headway = passing.headway_s
+    place, inside = _slice_of(passing.time_s, slices)
+    counts = np.bincount(place[inside], minlength=len(slices.start_s))
+    # the first vehicle after a gap follows nobody that is known
+    period = np.searchsorted(observed_s[:, 0], passing.time_s, side="right")
+    headway = np.where(np.diff(period, prepend=period[:1]) == 0, passing.headway_s, np.nan)
     follows = headway < _FOLLOW_S
     length = np.full(len(passing), VEHICLE_LENGTH_M) if lengths_m is None else lengths_m[passing.track]
     between = (length + np.r_[length[:1], length[:-1]]) / 2  # the leader's rear half, the follower's front half
@@ -79,7 +82,7 @@ def lane_flow(
     enough = len(passing) >= 5
     return LaneFlow(
         lane,
-        estimate_rate(counts, (end_s - begin_s) / 3600),
+        estimate_rate(counts, float(np.diff(observed_s, axis=1).sum()) / 3600),
         estimate_mean(slices.density_veh_per_km) if enough else None,
         _ratio(slices) if enough else None,
         estimate_mean(headway),
@@ -87,28 +90,34 @@ def lane_flow(
     )
 
 
-def flow_slices(traffic: LaneTraffic, lane: int, begin_s: float, end_s: float, *, slice_s: float = 60.0) -> FlowSlices:
-    """Edie's quantities of one lane by slice of time."""
+def flow_slices(traffic: LaneTraffic, lane: int, observed_s: FloatArray, *, slice_s: float = 60.0) -> FlowSlices:
+    """Edie's quantities of one lane by slice of the times (k, 2) that are seen; no slice holds parts of two of them."""
     samples, length = traffic.samples(lane), traffic.graph.lanes[lane].length_m
-    number = max(int((end_s - begin_s) / slice_s), 1)
-    width = (end_s - begin_s) / number if end_s > begin_s else 1.0
+    edges = [np.linspace(begin, end, max(int((end - begin) / slice_s), 1) + 1) for begin, end in observed_s]
+    start, stop = (np.concatenate([np.empty(0), *(one[part] for one in edges)]) for part in (slice(-1), slice(1, None)))
+    found = FlowSlices(start, stop, *np.zeros((3, len(start))))
     one = samples.track[1:] == samples.track[:-1]
     step = np.where(one, samples.along_m[1:] - samples.along_m[:-1], 0.0)
     wait = np.where(one, samples.time_s[1:] - samples.time_s[:-1], 0.0)
     ok = one & (step >= 0) & (step < 20.0) & (wait > 0)
-    driven, spent = np.zeros(number), np.zeros(number)
+    driven, spent = np.zeros(len(start)), np.zeros(len(start))
     # a long wait between two samples spreads over slices
     for part in range(8):
         at = samples.time_s[:-1][ok] + wait[ok] * (part + 0.5) / 8
-        k = np.floor((at - begin_s) / width).astype(np.int64)
-        inside = (k >= 0) & (k < number)
-        driven += np.bincount(k[inside], step[ok][inside] / 8, number)
-        spent += np.bincount(k[inside], wait[ok][inside] / 8, number)
-    area = length * width
-    speed = np.divide(driven, spent, out=np.full(number, np.nan), where=spent > 0)
-    start = np.asarray(begin_s + width * np.arange(number), np.float64)
-    flow, density = np.asarray(driven / area * 3600, np.float64), np.asarray(spent / area * 1000, np.float64)
-    return FlowSlices(start, flow, density, np.asarray(speed, np.float64))
+        k, inside = _slice_of(at, found)
+        driven += np.bincount(k[inside], step[ok][inside] / 8, len(start))
+        spent += np.bincount(k[inside], wait[ok][inside] / 8, len(start))
+    area = length * np.maximum(stop - start, 1e-9)
+    speed = np.divide(driven, spent, out=np.full(len(start), np.nan), where=spent > 0)
+    return replace(
+        found, flow_veh_per_h=driven / area * 3600, density_veh_per_km=spent / area * 1000, speed_m_per_s=speed
+    )
+
+
+def _slice_of(time_s: FloatArray, slices: FlowSlices) -> tuple[IntArray, Mask]:
+    """Number of the slice (n,) that each time may lie in, and whether it does."""
+    number = np.searchsorted(slices.start_s, time_s, side="right") - 1
+    return number, (number >= 0) & (time_s <= slices.end_s[number])
 
 
 def _ratio(slices: FlowSlices) -> Estimate | None:

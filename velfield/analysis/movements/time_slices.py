@@ -47,13 +47,15 @@ def slice_edges(begin_s: float, end_s: float, slice_s: float) -> FloatArray:
     return np.append(begin_s + slice_s * np.arange(whole), end_s)
 
 
-def movements_by_slice(junctions: Sequence[JunctionMovements], edges_s: FloatArray) -> list[SliceCount]:
-    """Movements of each junction by slice of their entry: what is inferred of an entry's lost vehicles goes to the
-    slices in which they were lost."""
-    return [count for junction in junctions if len(edges_s) for count in _of_junction(junction, edges_s)]
+def movements_by_slice(
+    junctions: Sequence[JunctionMovements], edges_s: FloatArray, seen_s: FloatArray
+) -> list[SliceCount]:
+    """Movements of each junction by slice of their entry, of which ``seen_s`` (k,) is seen: what is inferred of an
+    entry's lost vehicles goes to the slices in which they were lost."""
+    return [count for junction in junctions if len(edges_s) for count in _of_junction(junction, edges_s, seen_s)]
 
 
-def _of_junction(found: JunctionMovements, edges_s: FloatArray) -> Iterator[SliceCount]:
+def _of_junction(found: JunctionMovements, edges_s: FloatArray, seen_s: FloatArray) -> Iterator[SliceCount]:
     passes, names = found.passes, [arm.name for arm in found.gates.arms]
     arm = np.array([gate.arm for gate in found.gates.gates] + [-1], np.int64)
     arm_in, arm_out = arm[passes.gate_in], arm[passes.gate_out]
@@ -63,10 +65,10 @@ def _of_junction(found: JunctionMovements, edges_s: FloatArray) -> Iterator[Slic
         seen, joined = (_histogram(passes.entry_s[whole & rows], edges_s) for rows in (~passes.joined, passes.joined))
         lost = _histogram(passes.entry_s[(arm_in == i) & (arm_out < 0)], edges_s)
         inferred = joined + (movement.inferred - joined.sum()) * lost / max(lost.sum(), 1.0)
-        yield from _counts(movement.junction, names[i], names[j], edges_s, seen, inferred)
+        yield from _counts(movement.junction, names[i], names[j], edges_s, seen_s, seen, inferred)
 
 
-def origins_by_slice(scene: OriginDestination | None, edges_s: FloatArray) -> list[SliceCount]:
+def origins_by_slice(scene: OriginDestination | None, edges_s: FloatArray, seen_s: FloatArray) -> list[SliceCount]:
     """Vehicles from origins to destinations by slice of their entry."""
     if scene is None or not len(edges_s):
         return []
@@ -78,7 +80,7 @@ def origins_by_slice(scene: OriginDestination | None, edges_s: FloatArray) -> li
         seen = _histogram(trips.entry_s[own & trips.seen & (trips.destination[:, j] == 1.0)], edges_s)
         rows = own & ~trips.seen
         inferred = np.histogram(trips.entry_s[rows], edges_s, weights=trips.destination[rows, j])[0]
-        out += _counts(None, relation.origin.name, relation.destination.name, edges_s, seen, inferred)
+        out += _counts(None, relation.origin.name, relation.destination.name, edges_s, seen_s, seen, inferred)
     return out
 
 
@@ -87,8 +89,16 @@ def _histogram(time_s: FloatArray, edges_s: FloatArray) -> IntArray:
 
 
 def _counts(
-    junction: int | None, arm_in: str, arm_out: str, edges_s: FloatArray, seen: IntArray, inferred: FloatArray
+    junction: int | None,
+    arm_in: str,
+    arm_out: str,
+    edges_s: FloatArray,
+    seen_s: FloatArray,
+    seen: IntArray,
+    inferred: FloatArray,
 ) -> Iterator[SliceCount]:
     for k, (begin, end) in enumerate(pairwise(edges_s)):
-        flow = estimate_rate(np.array([seen[k] + inferred[k]]), float(end - begin) / 3600)
+        if seen_s[k] == 0:
+            continue
+        flow = estimate_rate(np.array([seen[k] + inferred[k]]), float(seen_s[k]) / 3600)
         yield SliceCount(junction, arm_in, arm_out, float(begin), float(end), int(seen[k]), float(inferred[k]), flow)

@@ -39,8 +39,7 @@ def diagram_table(analysis: TrafficAnalysis) -> AnalysisTable:
         Column("flow", "Flow", "veh/h", lambda s: s.flow_veh_per_h, 1),
         Column("speed", "Space-mean speed", "km/h", lambda s: s.speed_m_per_s * KM_PER_H, 2),
     ]
-    begin, end = analysis.window_s
-    slice_s = max(_SLICE_S, (end - begin) / _MAX_SLICES)
+    slice_s = max(_SLICE_S, analysis.trajectories.duration_s / _MAX_SLICES)
     note = (
         f"Edie's definitions over each lane and slices of {slice_s:.0f} s with {_MIN_VEHICLES} vehicles or more; a row "
         "is a point of the lane's diagram."
@@ -52,12 +51,10 @@ def diagram_table(analysis: TrafficAnalysis) -> AnalysisTable:
 
 
 def _slices(analysis: TrafficAnalysis, slice_s: float) -> Iterator[_Slice]:
-    begin, end = analysis.window_s
     for lane in analysis.lanes:
-        found = flow_slices(analysis.lane_traffic, lane.number, begin, end, slice_s=slice_s)
+        found = flow_slices(analysis.lane_traffic, lane.number, analysis.trajectories.observed_s, slice_s=slice_s)
         samples = analysis.lane_traffic.samples(lane.number)
-        width = (end - begin) / len(found.start_s) if end > begin else 1.0
-        number = np.clip(((samples.time_s - begin) / width).astype(np.int64), 0, len(found.start_s) - 1)
+        number = np.maximum(np.searchsorted(found.start_s, samples.time_s, side="right") - 1, 0)
         tracks = int(samples.track.max(initial=0)) + 1
         vehicles = np.bincount(np.unique(number * tracks + samples.track) // tracks, minlength=len(found.start_s))
         values = found.start_s, vehicles, found.density_veh_per_km, found.flow_veh_per_h, found.speed_m_per_s

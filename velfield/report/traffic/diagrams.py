@@ -305,10 +305,9 @@ def draw_speed_profile(axes: "Axes", *, analysis: TrafficAnalysis, lane: int, un
 
 def fundamental_points(analysis: TrafficAnalysis) -> FloatArray:
     """(n, 4): lane, density (veh/km), flow (veh/h), speed (m/s) of each lane and slice with traffic."""
-    begin, end = analysis.window_s
     rows = []
     for lane in analysis.lanes:
-        found = flow_slices(analysis.lane_traffic, lane.number, begin, end, slice_s=_SLICE_S)
+        found = flow_slices(analysis.lane_traffic, lane.number, analysis.trajectories.observed_s, slice_s=_SLICE_S)
         known = np.isfinite(found.speed_m_per_s)
         columns = found.density_veh_per_km, found.flow_veh_per_h, found.speed_m_per_s
         rows.append(np.column_stack([np.full(known.sum(), lane.number), *(c[known] for c in columns)]))
@@ -337,12 +336,14 @@ def draw_flow(axes: "Axes", *, analysis: TrafficAnalysis, found: JunctionMovemen
     """Vehicles that enter a junction in each minute, by arm."""
     begin, end = analysis.window_s
     edges = np.arange(begin, end + 1e-9, _SLICE_S)
+    seen = analysis.trajectories.observed_within(edges)
     passes, gates = found.passes, found.gates
     arm = np.array([gate.arm for gate in gates.gates] + [-1])[passes.gate_in]
     for k, one in enumerate(gates.arms):
         counts = np.histogram(passes.entry_s[(arm == one.number) & np.isfinite(passes.entry_s)], edges)[0]
         if counts.any():
-            minutes = np.append(counts, counts[-1])
+            minutes = np.where(seen > 0, counts / np.maximum(seen / _SLICE_S, 1e-9), np.nan)
+            minutes = np.append(minutes, minutes[-1])
             axes.step(edges / 60, minutes, where="post", color=_TONES[k % 6], linestyle=_STROKES[k % 4],
                       linewidth=1.6, label=f"from {one.name}")  # fmt: skip
     axes.set(xlabel="time, min", ylabel="vehicles a minute", ylim=(0, None))

@@ -1,0 +1,277 @@
+"""``velfield run``: from a video, or tracks, to the maps."""
+
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from flows.commands.start import own_command
+from flows.options import DONE, INCOMPLETE, Device, LogJson, Preset, Quiet, Settings, Verbose
+from schemas.job import Inputs, Job
+from velfield.errors import InputError
+from velfield.pipeline.configuration import resolve_config
+
+if TYPE_CHECKING:
+    from flows.console import Console, Verbosity
+    from flows.runners import RunnerConfig
+    from schemas.summary import RunSummary
+
+
+def run(
+    source: Path | None = None,
+    /,
+    *more: Path,
+    out: Path,
+    tracks: Path | None = None,
+    unit: Literal["m", "ft", "px", "deg"] | None = None,
+    y_axis: Literal["up", "down"] | None = None,
+    base: Path | None = None,
+    gsd_m: float | None = None,
+    labels: Path | None = None,
+    detector: Path | None = None,
+    detections: Path | None = None,
+    timestamps: Path | None = None,
+    telemetry: Path | None = None,
+    fps: float | None = None,
+    config: Path | None = None,
+    preset: Preset | None = None,
+    settings: Settings = (),
+    every: str | None = None,
+    start_s: float | None = None,
+    stop_s: float | None = None,
+    intervals: str | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    cluster: Path | None = None,
+    device: Device | None = None,
+    plan: Annotated[bool, Parameter(negative=())] = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    log_json: LogJson = False,
+) -> int:
+    """Compute a velocity field from aerial video. Run the same command again to resume.
+
+    Parameters
+    ----------
+    source
+        Video file, or folder of images.
+    more
+        Additional clips of the same site, in time order: they give one map, with the times of the files.
+    out
+        Run folder: everything is written there.
+    tracks
+        Tracks of another program instead of a video: CSV or Parquet (geo-trax, highD and others), or SUMO's FCD. Field,
+        maps and analysis are made of them.
+    unit
+        Unit of the columns x and y in `--tracks`, if their names do not give it.
+    y_axis
+        Direction of the y axis in `--tracks`: up (north, as in maps) or down (as in images).
+    base
+        Image whose pixels become the base pixels: GeoTIFF, PNG with world file, or plain.
+        Default: built from the flight.
+    gsd_m
+        Ground sample distance, metres per base pixel. Default: from the base image's CRS, the drone's metadata or the
+        lengths of the vehicles.
+    labels
+        Labelled cars to fine-tune the detector on (docs/detection.md#label-formats). Default: none.
+    detector
+        A trained detector file, or a YOLO-type ONNX model. Default: the detector that comes with velfield.
+    detections
+        Boxes found by another program, instead of running a detector.
+    timestamps
+        CSV `frame,time_s` for a folder of images.
+    telemetry
+        Drone metadata: subtitles (.SRT) or MISB KLV (.klv). Default: the file next to the video, or the metadata in it.
+    fps
+        Frame rate of a folder of images without timestamps, or of `--tracks` that have no times.
+    config
+        flight.yaml with the flight's configuration.
+    preset
+        Set of defaults to start from.
+    settings
+        One parameter, as `section.key=value`; can be repeated.
+    every
+        Take every n-th frame; `auto`: the frames nearest to 0.2 s apart.
+    start_s
+        Skip frames before this time, seconds from the first frame.
+    stop_s
+        Skip frames from this time on, seconds from the first frame.
+    intervals
+        Also compute a field for each time interval: `15min`, `07:00-09:00,15:00-18:00`, or seconds `0-300,300-600`.
+    workers
+        Processes of a local cluster. Default: threads of this process.
+    scheduler
+        Address of a Dask scheduler.
+    cluster
+        File with the class of Dask clusters to use and its arguments; see `examples/cluster-*.yaml`.
+    device
+        Device that runs the network: cpu, cuda, or auto (default), which uses a GPU if there is one.
+    plan
+        Print what would be computed, and stop.
+    quiet
+        Print warnings only.
+    verbose
+        Print more detail.
+    log_json
+        Print lines of JSON instead of text.
+    """
+    from flows.runners import choose_runner
+
+    overrides = {
+        "gsd_m": gsd_m,
+        "frames.every": _every(every),
+        "frames.fps": fps,
+        "frames.start_s": start_s,
+        "frames.stop_s": stop_s,
+        "field.time_intervals": intervals,
+        "work.device": device,
+        "position_unit": unit,
+        "position_y_axis": y_axis,
+    }
+    resolved = resolve_config(preset=preset, file=config, settings=settings, overrides=overrides)
+    if tracks is not None or source is None:
+        frames_only = {
+            "VIDEO": source, "--labels": labels, "--detector": detector, "--detections": detections,
+            "--timestamps": timestamps, "--telemetry": telemetry, "--device": device,
+        }  # fmt: skip
+        inputs = _tracks_inputs(tracks, base, [name for name, value in frames_only.items() if value is not None])
+        job = Job(root=str(out), inputs=inputs, config=resolved)
+        return _process_tracks(
+            job, choose_runner(workers, scheduler, cluster), _verbosity(quiet, verbose, log_json), plan_only=plan
+        )
+    inputs = Inputs(
+        source=str(_clip_list(source, more, out) if more else source),
+        base=_text(base),
+        labels=_text(labels),
+        detector=_text(detector),
+        detections=_text(detections),
+        timestamps=_text(timestamps),
+        telemetry=_text(telemetry),
+    )
+    job = Job(root=str(out), inputs=inputs, config=resolved)
+    where = choose_runner(workers, scheduler, cluster)
+    if plan:
+        return _show_plan(job, where)
+    return process(job, runner=where, verbosity=_verbosity(quiet, verbose, log_json))
+
+
+def _tracks_inputs(tracks: Path | None, base: Path | None, frames_only: list[str]) -> Inputs:
+    """Inputs of a run of given tracks; ``frames_only``: options that were given and need frames."""
+    if tracks is None:
+        raise InputError("no input; give a video, a folder of images, or --tracks FILE")
+    if frames_only:
+        raise InputError(f"--tracks cannot be combined with {', '.join(frames_only)}: tracks have no frames")
+    return Inputs(source=str(tracks), base=_text(base))
+
+
+def process(job: Job, *, runner: "RunnerConfig | None" = None, verbosity: "Verbosity" = "normal") -> int:
+    """Run a job on frames; the exit status."""
+    from velfield.pipeline.plan import check_inputs
+
+    console = _prepare(verbosity)
+    check_inputs(job)
+    from flows.process_flight import run_flight
+    from flows.runners import RunnerConfig
+
+    summary = run_flight(job, runner or RunnerConfig(), console)
+    return conclude(summary, console)
+
+
+def _prepare(verbosity: "Verbosity") -> "Console":
+    """Set this process up for a run; its console."""
+    from flows.launch import prepare_process
+    from flows.stopping import stop_on_signals
+
+    stop_on_signals()
+    prepare_process(verbose=verbosity == "verbose")
+    from flows.console import Console
+
+    return Console(verbosity)
+
+
+def _process_tracks(job: Job, runner: "RunnerConfig", verbosity: "Verbosity", *, plan_only: bool) -> int:
+    if plan_only:
+        from velfield.pipeline.given_tracks.plan import describe_tracks
+
+        print(describe_tracks(job))
+        return DONE
+    console = _prepare(verbosity)
+    from flows.process_tracks import run_tracks
+
+    summary = run_tracks(job, runner, console)
+    from velfield.pipeline.analysis.analyse import analyse_run
+
+    for line in analyse_run(Path(job.root)):
+        console.result(line)
+    return conclude(summary, console)
+
+
+def conclude(summary: "RunSummary", console: "Console") -> int:
+    """Say where the results are and what was lost; the exit status."""
+    from velfield.run.layout import is_remote, to_path
+
+    root = to_path(summary.root)
+    console.result(f"maps    {root / 'maps'}")
+    console.result(f"report  {root / 'index.html'}")
+    if is_remote(root):  # `velfield view` shows a folder of this machine
+        console.result(f"page    aws s3 sync {shlex.quote(str(root))} RUN && {own_command()} view RUN")
+    else:
+        console.result(f"page    {own_command()} view {shlex.quote(str(root))}")
+    if summary.complete:
+        return DONE
+    for line in (*summary.footage_lost, *summary.frames_lost[:10]):
+        console.warn(line)
+    lost_units = sum(len(stage.lost) for stage in summary.stages)
+    absent = ", part of the recording is missing" if summary.footage_lost else ""
+    console.warn(
+        f"{summary.root}: done, but incomplete: {len(summary.frames_lost)} frames and {lost_units} units lost"
+        f"{absent}; the report lists them"
+    )
+    return INCOMPLETE
+
+
+def _show_plan(job: Job, runner: "RunnerConfig") -> int:
+    from flows.runners import parallel_units
+    from velfield.pipeline.check_inputs import validate_inputs
+    from velfield.pipeline.estimate import describe_plan
+    from velfield.pipeline.plan import make_plan
+
+    plan = make_plan(job)
+    validate_inputs(plan)
+    print(describe_plan(plan, parallel_units(runner)))
+    return DONE
+
+
+def _clip_list(source: Path, more: tuple[Path, ...], out: Path) -> Path:
+    """The list of several clips, written into the run folder."""
+    from velfield.run.layout import is_remote, to_path
+    from velfield.sources.clips import CLIPS_SUFFIX, write_clip_list
+
+    if is_remote(to_path(out)):
+        raise InputError(
+            f"{out}: several clips need a list on a local disk; write their paths, one per line, into "
+            f"clips{CLIPS_SUFFIX} "
+            "and run that file"
+        )
+    path = out / f"source{CLIPS_SUFFIX}"
+    write_clip_list(path, (source, *more))
+    return path
+
+
+def _every(text: str | None) -> int | str | None:
+    if text is None or text == "auto":
+        return text
+    if not text.isdigit() or int(text) < 1:
+        raise InputError(f"--every {text}: must be a positive integer, or auto")
+    return int(text)
+
+
+def _text(path: Path | None) -> str | None:
+    return None if path is None else str(path)
+
+
+def _verbosity(quiet: bool, verbose: bool, log_json: bool) -> "Verbosity":
+    if log_json:
+        return "json"
+    return "quiet" if quiet else "verbose" if verbose else "normal"
