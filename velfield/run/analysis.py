@@ -48,8 +48,8 @@ class RunAnalysis:
         Returns the vehicles (`velfield.run.run.Run.vehicles`), of which some are parked; None: not known.
     position_sd_m
         Standard deviation of a position along one axis, of tracks of another program.
-    frame_times_s
-        (n,) times of the frames; None: not known.
+    frame_times
+        Returns the times (n,) of the frames, s; None: not known.
     """
 
     layer: Callable[[str], NDArray[np.generic]]
@@ -59,7 +59,7 @@ class RunAnalysis:
     dimensions: Callable[[], pd.DataFrame] | None = None
     vehicles: Callable[[], pd.DataFrame] | None = None
     position_sd_m: float = 0.0
-    frame_times_s: FloatArray | None = None
+    frame_times: Callable[[], FloatArray] | None = None
 
     @cached_property
     def trajectories(self) -> Trajectories:
@@ -82,10 +82,11 @@ class RunAnalysis:
     @property
     def _gaps_s(self) -> FloatArray | None:
         """Begins and ends (k, 2) of the times between clips: no track goes on over them."""
-        if self.frame_times_s is None:
+        if self.frame_times is None:
             return None
-        before = np.flatnonzero(np.diff(self.frame_times_s) > _GAP_S)
-        return np.column_stack([self.frame_times_s[before], self.frame_times_s[before + 1]])
+        times = self.frame_times()
+        before = np.flatnonzero(np.diff(times) > _GAP_S)
+        return np.column_stack([times[before], times[before + 1]])
 
     @property
     def _classes(self) -> VehicleClasses | None:

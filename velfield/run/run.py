@@ -282,7 +282,7 @@ class Run:
             self._dimensions,
             self.vehicles,
             position_sd_m,
-            None if self.made_from else self.times_s,
+            lambda: self.times_s,
         )
 
     @cached_property
