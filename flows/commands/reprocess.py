@@ -43,7 +43,7 @@ def reprocess(
     scheduler
         Address of a Dask scheduler.
     cluster
-        YAML file that names a class of Dask clusters.
+        File with the class of Dask clusters to use and its arguments; see `examples/cluster-*.yaml`.
     quiet
         Print warnings only.
     """

@@ -1,5 +1,7 @@
 """Origins and destinations of constructed traffic, of which some tracks are cut; counts by slice of time."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -50,6 +52,29 @@ def test_entries_and_exits_are_found_and_counted(whole: TrafficAnalysis) -> None
     assert share.value == pytest.approx(12 / 59)
 
 
+def test_two_clips_of_the_same_traffic_have_the_flows_of_one(whole: TrafficAnalysis) -> None:
+    """An hour apart: the time between counts nowhere."""
+    begin, end = whole.window_s
+    later = [(times + end + 3600, xy) for times, xy in crossroads()]
+    both = replace(gather([*crossroads(), *later]), gaps_s=np.array([[end, end + 3600 + begin]]))
+    twice = TrafficAnalysis(both, slice_s=100.0)
+    assert twice.trajectories.duration_s == pytest.approx(2 * whole.trajectories.duration_s, abs=0.1)
+
+    def flows(analysis: TrafficAnalysis) -> dict[tuple[str, str], float]:
+        scene = analysis.scene
+        assert scene is not None
+        moves = [m for found in analysis.movements for m in found.movements]
+        return {("junction", m.arm_in + m.arm_out): m.flow_veh_per_h.value for m in moves if m.flow_veh_per_h} | {
+            (r.origin.name, r.destination.name): r.flow_veh_per_h.value for r in scene.relations if r.flow_veh_per_h
+        }
+
+    expected = flows(whole)
+    assert len(expected) == 6
+    assert flows(twice) == pytest.approx(expected, rel=0.03)
+    assert {c.begin_s > end + 600 for c in twice.counts_by_time} == {False, True}
+    assert all(c.end_s <= end + 100 or c.begin_s >= end + 3500 for c in twice.counts_by_time)
+
+
 def test_tracks_that_are_cut_go_where_the_others_went(whole: TrafficAnalysis) -> None:
     tracks = crossroads()
     turning = [k for k, (_, xy) in enumerate(tracks) if xy[0, 0] == 0 and xy[-1, 1] > 200]
@@ -76,7 +101,7 @@ def test_a_road_under_a_tree_is_no_exit() -> None:
     """All tracks are cut there: the lane ends before it, and another begins behind it."""
     pieces = [part for k in range(12) for part in cut(drive(EAST, 4.0 * k), begin=0.45, end=0.55)]
     analysis = TrafficAnalysis(gather(pieces))
-    gates, arms = find_scene_gates(analysis.trajectories, analysis.samples, analysis.lanes, analysis.window_s)
+    gates, arms = find_scene_gates(analysis.trajectories, analysis.samples, analysis.lanes)
     assert [arm.name for arm in arms] == ["E", "W"]
     assert len(gates) == 2
 

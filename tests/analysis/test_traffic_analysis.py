@@ -169,7 +169,7 @@ def test_flow_is_of_the_times_that_are_seen() -> None:
     assert flow.headway_s is not None
     assert flow.headway_s.value == pytest.approx(4.0, abs=0.05)
     slices = flow_slices(analysis.lane_traffic, flow.lane, analysis.trajectories.observed_s)
-    assert len(slices.start_s) == 6
+    assert len(slices.slices) == 6
     assert slices.flow_veh_per_h.min() > 600
     edges = np.array([0.0, 100.0, 1000.0, 2000.0])
     np.testing.assert_allclose(analysis.trajectories.observed_within(edges), [100, last - 100, 20], atol=0.5)

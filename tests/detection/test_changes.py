@@ -10,11 +10,12 @@ from schemas.arrays import GreyImage, Mask, Points
 from velfield.detection.boxes import split_into_boxes
 from velfield.detection.changes import CELL_PX
 from velfield.detection.cnn.detector import CnnDetector
+from velfield.detection.cnn.network import ALIGNMENT
 from velfield.detection.crops import oriented_strips
 from velfield.detection.detect import SearchedFrame, changed_cells, search_frame
 from velfield.detection.frame import ComparableFrame, half_resolution
 from velfield.detection.interface import Detections, Detector, concatenate
-from velfield.detection.mosaic import Box, assemble_kernel, find_in_boxes, owners_kernel, pack_boxes
+from velfield.detection.mosaic import CROP_UNIT_PX, Box, assemble_kernel, find_in_boxes, owners_kernel, pack_boxes
 from velfield.detection.registry import shipped_detector
 
 _SHAPE = 300, 420
@@ -135,6 +136,7 @@ def test_crops_of_many_boxes_overlap_nowhere_and_fill_half_of_their_mosaics() ->
         assert taken.max() == 1
         assert taken.mean() > 0.5
     assert pack_boxes([], 16) == []
+    assert CROP_UNIT_PX == ALIGNMENT, "what the network needs"
 
 
 @pytest.mark.parametrize("border", [cv2.BORDER_REFLECT_101, cv2.BORDER_CONSTANT])

@@ -90,8 +90,7 @@ class TrafficAnalysis:
     @property
     def window_s(self) -> tuple[float, float]:
         """First and last time of all tracks."""
-        time = self.trajectories.time_s
-        return (float(time.min()), float(time.max())) if len(time) else (0.0, 0.0)
+        return self.trajectories.window_s
 
     @cached_property
     def lanes(self) -> LaneGraph:

@@ -51,7 +51,7 @@ class Trajectories:
     position_sd_m
         Standard deviation of a position along one axis, of errors that last; 0: less than a lane's width matters to.
     gaps_s
-        (k, 2) begins and ends of the times without frames, in time order; None: there are none.
+        (k, 2) begins and ends of longer times without frames, as between clips, in time order; None: there are none.
     """
 
     track_id: IntArray
@@ -96,11 +96,16 @@ class Trajectories:
         return replace(self, measured_length_m=np.where(sd <= _LENGTH_SD_M, length, np.nan))
 
     @property
+    def window_s(self) -> tuple[float, float]:
+        """First and last time of all tracks."""
+        return (float(self.time_s.min()), float(self.time_s.max())) if len(self.time_s) else (0.0, 0.0)
+
+    @property
     def observed_s(self) -> FloatArray:
         """(k, 2) begins and ends of the times with frames, from the first position of all tracks to the last."""
         if not len(self.time_s):
             return np.empty((0, 2))
-        begin, end = float(self.time_s.min()), float(self.time_s.max())
+        begin, end = self.window_s
         gaps = np.empty((0, 2)) if self.gaps_s is None else self.gaps_s
         gaps = gaps[(gaps[:, 0] > begin) & (gaps[:, 1] < end)]
         return np.column_stack([np.r_[begin, gaps[:, 1]], np.r_[gaps[:, 0], end]])
@@ -109,6 +114,12 @@ class Trajectories:
         """Length (k,) of the times with frames between successive edges (k + 1,), s."""
         begin, end = self.observed_s.T[:, :, None]
         return np.asarray(np.clip(np.minimum(end, edges_s[1:]) - np.maximum(begin, edges_s[:-1]), 0, None).sum(axis=0))
+
+    def is_cut_by_time(self, time_s: FloatArray, within_s: float, *, begins: bool) -> Mask:
+        """Whether each time (n,) at which a track begins, or ends, is so near to where a time with frames does."""
+        edges = self.observed_s[:, 0 if begins else 1]
+        after = time_s[:, None] - edges if begins else edges - time_s[:, None]
+        return np.asarray(((after >= 0) & (after < within_s)).any(axis=1))
 
     @property
     def duration_s(self) -> float:

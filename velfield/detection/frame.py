@@ -69,8 +69,3 @@ class ComparableFrame:
 
     def resample(self, cells: Mask, side_px: int) -> None:
         """Nothing: all of it is there."""
-
-
-def whole_frame(image: GreyImage, valid: Mask | None) -> ComparableFrame:
-    """An image (h, w) as a frame; ``valid`` none: it covers all of it."""
-    return ComparableFrame(image, np.ones(image.shape, bool) if valid is None else valid)

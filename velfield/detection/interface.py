@@ -119,7 +119,7 @@ class Detector(ABC):
         *,
         threshold: float | None = None,
     ) -> Detections:
-        """Candidates of a crop that has `context_px` on every side: what `refine` makes the detections of."""
+        """Candidates of a crop that has `context_px` or more on every side: what `refine` makes the detections of."""
         return self.detect(image, valid, threshold=threshold)
 
     def find_in_crops(
@@ -130,7 +130,7 @@ class Detector(ABC):
         *,
         threshold: float | None = None,
     ) -> Detections:
-        """Candidates of an image of crops side by side, each of which has `context_px` on every side.
+        """Candidates of an image of crops side by side, each of which has `context_px` or more on every side.
 
         Each crop is taken by itself; a detector may do better where that changes nothing.
 

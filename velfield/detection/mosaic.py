@@ -41,11 +41,10 @@ class Mosaic:
 
 
 def pack_boxes(boxes: Sequence[Box], context_px: int) -> list[Mosaic]:
-    """Pack boxes with their context, and what a multiple of `CROP_UNIT_PX` needs below and to the right, into mosaics,
-    the tallest first."""
+    """Pack boxes with their context into mosaics, the tallest first."""
     if not len(boxes):
         return []
-    sizes = CROP_UNIT_PX * -(-(_sizes_px(boxes) + 2 * context_px) // CROP_UNIT_PX)
+    sizes = _windows_px(boxes, context_px)[:, 2:]
     order = np.lexsort((sizes[:, 1], -sizes[:, 0]))
     number, corners = shelve_kernel(sizes[order], _SIDE_PX)
     crops = np.column_stack([corners, sizes[order]])
@@ -54,10 +53,13 @@ def pack_boxes(boxes: Sequence[Box], context_px: int) -> list[Mosaic]:
     return [Mosaic((int((of[:, 0] + of[:, 2]).max()), int((of[:, 1] + of[:, 3]).max())), one, of) for one, of in parts]
 
 
-def _sizes_px(boxes: Sequence[Box]) -> IntArray:
-    """Height and width (n, 2) of boxes."""
-    cells = np.array(boxes)
-    return np.asarray(CELL_PX * (cells[:, 2:] - cells[:, :2]))
+def _windows_px(boxes: Sequence[Box], context_px: int) -> IntArray:
+    """First row, first column, height and width (n, 4) of what is cut out: boxes with context, from and to multiples of
+    `CROP_UNIT_PX` of the frame, so that the network's coarse pixels lie as in the whole frame."""
+    cells = np.array(boxes) * CELL_PX
+    first = (cells[:, :2] - context_px) // CROP_UNIT_PX * CROP_UNIT_PX
+    last = -(-(cells[:, 2:] + context_px) // CROP_UNIT_PX) * CROP_UNIT_PX
+    return np.column_stack([first, last - first])
 
 
 @kernel
@@ -108,12 +110,12 @@ def _find_in_mosaic(
     threshold: float | None,
 ) -> tuple[Detections, IntArray]:
     """The candidates of a mosaic, in px of the frame, and the number of the box of each."""
-    context, placed = detector.context_px, mosaic.crops
-    corners = np.array(boxes)[mosaic.numbers, :2] * CELL_PX - context
+    placed, inner = mosaic.crops, np.array(boxes)[mosaic.numbers] * CELL_PX
+    corners = _windows_px(boxes, detector.context_px)[mosaic.numbers, :2]
     image = assemble_kernel(frame.image, corners, placed, *mosaic.shape, True)
     valid = assemble_kernel(frame.valid.view(np.uint8), corners, placed, *mosaic.shape, False).view(np.bool_)
     found = detector.find_in_crops(image, valid, placed, threshold=threshold)
-    searched = np.column_stack([placed[:, :2] + context, _sizes_px(boxes)[mosaic.numbers]])
+    searched = np.column_stack([placed[:, :2] + inner[:, :2] - corners, inner[:, 2:] - inner[:, :2]])
     crop = owners_kernel(found.xy, searched, *mosaic.shape)
     inside = np.flatnonzero(crop >= 0)
     found, crop = found.take(inside), crop[inside]

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
-from schemas.arrays import IntArray, Mask
+from schemas.arrays import IntArray
 from schemas.export import ExportOptions
 from velfield.analysis.movements.movements import JunctionMovements
 from velfield.analysis.traffic_analysis import TrafficAnalysis
@@ -94,7 +95,7 @@ def junction_rows(analysis: TrafficAnalysis, found: JunctionMovements) -> list[l
     rows.append(["Counted", *counts.sum(axis=1).tolist(), int(counts.sum())])
     inferred = [round(m.seen + m.inferred - n, 1) for m, n in zip(moves, counts.sum(axis=1).tolist(), strict=True)]
     rows.append(["Inferred of cut tracks", *inferred, round(sum(inferred), 1)])
-    whole = counts[:, _longest_run(seen > BIN_S - 1)]
+    whole = np.where(seen > BIN_S - 1, counts, -1)
     factors = [peak_hour_factor(one) for one in [*whole, whole.sum(axis=0)]]
     if factors[-1] is None:
         rows.append(["Peak-hour factor", "too little data: an hour is needed"])
@@ -102,13 +103,6 @@ def junction_rows(analysis: TrafficAnalysis, found: JunctionMovements) -> list[l
         rows.append(["Peak-hour factor", *factors])
     rows.append(["Heavy vehicles, %", *(_heavy_percent(analysis, found.tracks(m)) for m in moves)])
     return rows
-
-
-def _longest_run(whole: Mask) -> slice:
-    """The most slices in a row that hold."""
-    borders = np.flatnonzero(np.diff(np.r_[False, whole, False]))
-    runs = borders.reshape(-1, 2)
-    return slice(*runs[np.diff(runs, axis=1).argmax()]) if len(runs) else slice(0)
 
 
 def _entries(found: JunctionMovements, arm_in: str, arm_out: str, begin_s: float, bins: int) -> IntArray:
@@ -122,14 +116,20 @@ def _entries(found: JunctionMovements, arm_in: str, arm_out: str, begin_s: float
 def peak_hour_factor(counts: IntArray) -> float | None:
     """The hour's vehicles over four times its busiest 15 minutes, in the busiest hour; None of less than an hour.
 
+    Parameters
+    ----------
+    counts
+        (n,) vehicles by 15 minutes; negative where they were not seen whole.
+
     Examples
     --------
-    >>> peak_hour_factor(np.array([10, 20, 30, 20, 10]))
-    0.667
+    >>> peak_hour_factor(np.array([10, 20, 30, 20, 10])), peak_hour_factor(np.array([10, 20, -1, 20, 10]))
+    (0.667, None)
     """
-    if len(counts) < 4:
+    hours = sliding_window_view(counts, 4) if len(counts) >= 4 else np.empty((0, 4))
+    hours = hours[(hours >= 0).all(axis=1)]
+    if not len(hours):
         return None
-    hours = np.lib.stride_tricks.sliding_window_view(counts, 4)
     hour = hours[int(hours.sum(axis=1).argmax())]
     return round(float(hour.sum() / (4 * hour.max())), 3) if hour.max() else None
 

@@ -225,7 +225,7 @@ STAGES: tuple[Stage, ...] = (
     # The shipped detector, one that is fine-tuned on labelled frames, or a given one.
     Stage(
         name="detector",
-        version=25,
+        version=26,
         label="detector",
         lines=(
             Line("skipped: external detections", lambda counts: bool(counts) and "threshold" not in counts),
@@ -242,7 +242,7 @@ STAGES: tuple[Stage, ...] = (
     # Cars of each block, then one table with their crops.
     Stage(
         name="detections",
-        version=20,
+        version=21,
         label="detections",
         lines=(
             Line(

@@ -24,7 +24,7 @@ from velfield.field.statistics import direction_rad
 from velfield.run.frame_transforms import heading_deg, north_direction_rad
 
 _GAP_S = 5.0
-"""Longer from one frame to the next, and nothing is known of the traffic between."""
+"""Longer from one frame to the next, and what passed between is not known."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class RunAnalysis:
 
     @property
     def _gaps_s(self) -> FloatArray | None:
-        """Begins and ends (k, 2) of the times between clips: no track goes on over them."""
+        """Begins and ends (k, 2) of the times between clips."""
         if self.frame_times is None:
             return None
         times = self.frame_times()

@@ -282,7 +282,7 @@ class Run:
             self._dimensions,
             self.vehicles,
             position_sd_m,
-            lambda: self.times_s,
+            None if self.record.inputs.source.kind == "tracks" else lambda: self.times_s,
         )
 
     @cached_property

@@ -1,12 +1,13 @@
 """Volume, density and space-mean speed of lanes by Edie's definitions; headways; levels of service."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.arrays import FloatArray, IntArray, Mask
+from schemas.arrays import FloatArray
 from velfield.analysis.flow.passings import LaneTraffic
 from velfield.analysis.intervals import Estimate, estimate_mean, estimate_median, estimate_rate
+from velfield.analysis.observed import ObservedSlices
 from velfield.analysis.trajectories import VEHICLE_LENGTH_M
 
 _FOLLOW_S = 3.0
@@ -44,8 +45,7 @@ class FlowSlices:
     """Edie's flow (veh/h), density (veh/km) and speed (m/s; NaN without traffic) of a lane by slice of time: points of
     its fundamental diagram."""
 
-    start_s: FloatArray
-    end_s: FloatArray
+    slices: ObservedSlices
     flow_veh_per_h: FloatArray
     density_veh_per_km: FloatArray
     speed_m_per_s: FloatArray
@@ -68,10 +68,8 @@ def lane_flow(
     lengths_m
         (tracks,) lengths of the vehicles; None: a car's.
     """
-    slices = flow_slices(traffic, lane, observed_s, slice_s=slice_s)
+    by_slice = flow_slices(traffic, lane, observed_s, slice_s=slice_s)
     passing = traffic.passings(lane, traffic.graph.lanes[lane].length_m / 2)
-    place, inside = _slice_of(passing.time_s, slices)
-    counts = np.bincount(place[inside], minlength=len(slices.start_s))
     # the first vehicle after a gap follows nobody that is known
     period = np.searchsorted(observed_s[:, 0], passing.time_s, side="right")
     headway = np.where(np.diff(period, prepend=period[:1]) == 0, passing.headway_s, np.nan)
@@ -82,42 +80,31 @@ def lane_flow(
     enough = len(passing) >= 5
     return LaneFlow(
         lane,
-        estimate_rate(counts, float(np.diff(observed_s, axis=1).sum()) / 3600),
-        estimate_mean(slices.density_veh_per_km) if enough else None,
-        _ratio(slices) if enough else None,
+        estimate_rate(by_slice.slices.sums(passing.time_s), by_slice.slices.hours),
+        estimate_mean(by_slice.density_veh_per_km) if enough else None,
+        _ratio(by_slice) if enough else None,
         estimate_mean(headway),
         estimate_median(gap[gap > 0]),
     )
 
 
 def flow_slices(traffic: LaneTraffic, lane: int, observed_s: FloatArray, *, slice_s: float = 60.0) -> FlowSlices:
-    """Edie's quantities of one lane by slice of the times (k, 2) that are seen; no slice holds parts of two of them."""
+    """Edie's quantities of one lane by slice of the times (k, 2) that are seen."""
     samples, length = traffic.samples(lane), traffic.graph.lanes[lane].length_m
-    edges = [np.linspace(begin, end, max(int((end - begin) / slice_s), 1) + 1) for begin, end in observed_s]
-    start, stop = (np.concatenate([np.empty(0), *(one[part] for one in edges)]) for part in (slice(-1), slice(1, None)))
-    found = FlowSlices(start, stop, *np.zeros((3, len(start))))
+    slices = ObservedSlices.of(observed_s, slice_s)
     one = samples.track[1:] == samples.track[:-1]
     step = np.where(one, samples.along_m[1:] - samples.along_m[:-1], 0.0)
     wait = np.where(one, samples.time_s[1:] - samples.time_s[:-1], 0.0)
     ok = one & (step >= 0) & (step < 20.0) & (wait > 0)
-    driven, spent = np.zeros(len(start)), np.zeros(len(start))
+    driven, spent = np.zeros(len(slices)), np.zeros(len(slices))
     # a long wait between two samples spreads over slices
     for part in range(8):
         at = samples.time_s[:-1][ok] + wait[ok] * (part + 0.5) / 8
-        k, inside = _slice_of(at, found)
-        driven += np.bincount(k[inside], step[ok][inside] / 8, len(start))
-        spent += np.bincount(k[inside], wait[ok][inside] / 8, len(start))
-    area = length * np.maximum(stop - start, 1e-9)
-    speed = np.divide(driven, spent, out=np.full(len(start), np.nan), where=spent > 0)
-    return replace(
-        found, flow_veh_per_h=driven / area * 3600, density_veh_per_km=spent / area * 1000, speed_m_per_s=speed
-    )
-
-
-def _slice_of(time_s: FloatArray, slices: FlowSlices) -> tuple[IntArray, Mask]:
-    """Number of the slice (n,) that each time may lie in, and whether it does."""
-    number = np.searchsorted(slices.start_s, time_s, side="right") - 1
-    return number, (number >= 0) & (time_s <= slices.end_s[number])
+        driven += slices.sums(at, step[ok] / 8)
+        spent += slices.sums(at, wait[ok] / 8)
+    area = length * np.maximum(slices.end_s - slices.begin_s, 1e-9)
+    speed = np.divide(driven, spent, out=np.full(len(slices), np.nan), where=spent > 0)
+    return FlowSlices(slices, driven / area * 3600, spent / area * 1000, speed)
 
 
 def _ratio(slices: FlowSlices) -> Estimate | None:

@@ -143,6 +143,8 @@ def _chain(trajectories: Trajectories, before: IntArray) -> CutTracks:
         trajectories.xy_m[rows],
         trajectories.velocity_m_per_s[rows],
         trajectories.gsd_m,
+        position_sd_m=trajectories.position_sd_m,
+        gaps_s=trajectories.gaps_s,
     )
     gap = np.full(n, np.nan)
     later = before[track] >= 0

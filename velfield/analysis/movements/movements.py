@@ -18,6 +18,7 @@ from velfield.analysis.lanes.junctions import inside_hull
 from velfield.analysis.lanes.model import Junction, LaneGraph, Turn
 from velfield.analysis.movements.cut_tracks import CutTracks, join_cut_tracks
 from velfield.analysis.movements.gates import Gates, find_gates
+from velfield.analysis.observed import ObservedSlices
 from velfield.analysis.trajectories import PathSamples, Trajectories, within
 
 _UPSTREAM_M = 60
@@ -109,13 +110,12 @@ def find_movements(
     """
     cut = join_cut_tracks(trajectories) if cut_tracks is None else cut_tracks
     samples = cut.samples
-    times_s = trajectories.time_s if len(trajectories) else np.zeros(1)
-    begin, end = float(times_s.min()), float(times_s.max())
+    slices = ObservedSlices.of(trajectories.observed_s, _SLICE_S)
     out = []
     for junction in graph.junctions:
         gates = find_gates(graph, junction)
-        passes = _within(_by_track(find_passes(samples, junction, gates), cut), begin, end)
-        out.append(JunctionMovements(junction, gates, passes, tuple(_count(junction, gates, passes, begin, end))))
+        passes = _within(_by_track(find_passes(samples, junction, gates), cut), *trajectories.window_s)
+        out.append(JunctionMovements(junction, gates, passes, tuple(_count(junction, gates, passes, slices))))
     return tuple(out)
 
 
@@ -168,7 +168,7 @@ def _within(passes: Passes, begin_s: float, end_s: float) -> Passes:
     return Passes(*(getattr(passes, name)[keep] for name in Passes.__dataclass_fields__))
 
 
-def _count(junction: Junction, gates: Gates, passes: Passes, begin_s: float, end_s: float) -> Iterator[Movement]:
+def _count(junction: Junction, gates: Gates, passes: Passes, slices: ObservedSlices) -> Iterator[Movement]:
     arm = np.array([gate.arm for gate in gates.gates] + [-1], np.int64)
     arm_in, arm_out = arm[passes.gate_in], arm[passes.gate_out]
     n = len(gates.arms)
@@ -180,14 +180,11 @@ def _count(junction: Junction, gates: Gates, passes: Passes, begin_s: float, end
     found = np.bincount(arm_out[(arm_out >= 0) & (arm_in < 0)], minlength=n).astype(np.float64)
     known = seen + joined
     inferred = joined + furness(known, lost, found)
-    slices = max(round((end_s - begin_s) / _SLICE_S), 1)
-    hours = max(end_s - begin_s, 1e-9) / 3600
     for i, j in zip(*np.nonzero(known >= _MIN_PASSES), strict=True):
         rows = both & (arm_in == i) & (arm_out == j)
         total = seen[i, j] + inferred[i, j]
         entering = seen[i].sum() + inferred[i].sum()
-        slice_of = np.clip(((passes.entry_s[rows] - begin_s) / _SLICE_S).astype(int), 0, slices - 1)
-        counts = np.bincount(slice_of, minlength=slices) * total / max(known[i, j], 1)
+        counts = slices.sums(passes.entry_s[rows]) * total / max(known[i, j], 1)
         travel, delay = _delay(passes, rows)
         effective = round(float(known[i].sum()))
         share = estimate_share(total / entering * effective, effective)
@@ -199,7 +196,7 @@ def _count(junction: Junction, gates: Gates, passes: Passes, begin_s: float, end
             int(seen[i, j]),
             float(inferred[i, j]),
             share,
-            estimate_rate(counts, hours),
+            estimate_rate(counts, slices.hours),
             travel,
             delay,
             np.array([gates.arms[i].xy_m, junction.centre_m, gates.arms[j].xy_m]),

@@ -20,6 +20,7 @@ from velfield.analysis.lanes.junctions import buffered_hull
 from velfield.analysis.lanes.model import LaneGraph
 from velfield.analysis.movements.cut_tracks import CutTracks
 from velfield.analysis.movements.gates import Arm, Gate, group_gates, name_arms
+from velfield.analysis.observed import ObservedSlices
 from velfield.analysis.trajectories import PathSamples, Trajectories, within
 
 _INWARDS_M, _OUTWARDS_M, _ASIDE_M = 20.0, 15.0, 2.5
@@ -108,8 +109,8 @@ class OriginDestination:
         Vehicles that entered while it was filmed.
     before, unknown
         Tracks of vehicles that were there in the first frame, and those that began inside later: cut ones, mostly.
-    window_s
-        First and last time.
+    observed_s
+        (k, 2) begins and ends of the times that are seen.
     """
 
     arms: tuple[Arm, ...]
@@ -117,15 +118,13 @@ class OriginDestination:
     trips: Trips
     before: int
     unknown: int
-    window_s: tuple[float, float]
+    observed_s: FloatArray
 
     @cached_property
     def relations(self) -> tuple[Relation, ...]:
         """All pairs of arms between which a vehicle drove, the most driven first."""
         trips = self.trips
-        begin, end = self.window_s
-        slices = max(round((end - begin) / _DISPERSION_SLICE_S), 1)
-        slice_of = np.clip(((trips.entry_s - begin) / max(end - begin, 1e-9) * slices).astype(np.int64), 0, slices - 1)
+        slices = ObservedSlices.of(self.observed_s, _DISPERSION_SLICE_S)
         out = []
         for i, j in product(range(len(self.arms)), repeat=2):
             rows = trips.origin == i
@@ -135,7 +134,6 @@ class OriginDestination:
             known = rows & np.isfinite(trips.exit_s)
             seen = trips.seen & rows & (trips.destination[:, j] == 1.0)
             n, entering = int(known.sum()), float(trips.destination[rows].sum())
-            counts = np.bincount(slice_of, weight, slices)
             out.append(
                 Relation(
                     self.arms[i],
@@ -144,7 +142,7 @@ class OriginDestination:
                     float(weight[~trips.seen & ~trips.remains].sum()),
                     float(weight[trips.remains].sum()),
                     estimate_share(weight.sum() / entering * n, n),
-                    estimate_rate(counts, (end - begin) / 3600),
+                    estimate_rate(slices.sums(trips.entry_s, weight), slices.hours),
                     estimate_mean((trips.exit_s - trips.entry_s)[seen]),
                 )
             )
@@ -167,15 +165,14 @@ def find_origins_destinations(
     """
     if not len(graph) or not len(samples):
         return None
-    window = float(trajectories.time_s.min()), float(trajectories.time_s.max())
-    gates, arms = find_scene_gates(trajectories, samples, graph, window)
+    gates, arms = find_scene_gates(trajectories, samples, graph)
     if not any(gate.inwards for gate in gates) or all(gate.inwards for gate in gates):
         return None
-    return trace_trips(cut_tracks, graph, gates, arms, window)
+    return trace_trips(cut_tracks, graph, gates, arms)
 
 
 def find_scene_gates(
-    trajectories: Trajectories, samples: PathSamples, graph: LaneGraph, window_s: tuple[float, float]
+    trajectories: Trajectories, samples: PathSamples, graph: LaneGraph
 ) -> tuple[tuple[Gate, ...], tuple[Arm, ...]]:
     """Entries and exits of the scene, and the arms that they are of."""
     ends = [(lane, True) for lane in graph.entries] + [(lane, False) for lane in graph.exits]
@@ -186,7 +183,7 @@ def find_scene_gates(
         found.append((lane, inwards, line.xy_m[k], float(line.direction_rad[k])))
     facing = {k for i, a in enumerate(found) for j, b in enumerate(found) if _faces(a, b) for k in (i, j)}
     found = [end for k, end in enumerate(found) if k not in facing]
-    used = [end for end in found if _mostly_ends(end, trajectories, samples, window_s)]
+    used = [end for end in found if _mostly_ends(end, trajectories, samples)]
     if not used:
         return (), ()
     label = group_gates(used)
@@ -221,7 +218,7 @@ def _faces(a: End, b: End) -> bool:
     return bool(-3.0 < ahead < _HIDDEN_M and aside < 2.0 + 0.2 * max(ahead, 0.0) and turn < _TURN_RAD)
 
 
-def _mostly_ends(end: End, trajectories: Trajectories, samples: PathSamples, window_s: tuple[float, float]) -> bool:
+def _mostly_ends(end: End, trajectories: Trajectories, samples: PathSamples) -> bool:
     """Whether most tracks at a lane's start begin there (at its end: end there), but those that time cuts."""
     _, inwards, xy, direction = end
     near = within(samples.xy_m, xy - _REACH_M, xy + _REACH_M)
@@ -229,7 +226,7 @@ def _mostly_ends(end: End, trajectories: Trajectories, samples: PathSamples, win
     here = np.unique(samples.track[near[here]])
     rows = _terminal(samples, len(trajectories), first=inwards)[here]
     time = samples.time_s[rows]
-    by_time = (time < window_s[0] + _CUT_BY_TIME_S) if inwards else (time > window_s[1] - _CUT_BY_TIME_S)
+    by_time = trajectories.is_cut_by_time(time, _CUT_BY_TIME_S, begins=inwards)
     ends = _at_gate(samples.xy_m[rows], samples.direction_rad[rows], xy, direction, inwards=inwards)
     known = ends | ~by_time
     return bool(ends.sum() >= _MIN_WHOLE and ends.sum() >= _MIN_FRACTION * known.sum())
@@ -261,7 +258,7 @@ def _from_border_m(xy_m: FloatArray, graph: LaneGraph) -> float:
 
 
 def trace_trips(
-    vehicles: CutTracks, graph: LaneGraph, gates: tuple[Gate, ...], arms: tuple[Arm, ...], window_s: tuple[float, float]
+    vehicles: CutTracks, graph: LaneGraph, gates: tuple[Gate, ...], arms: tuple[Arm, ...]
 ) -> OriginDestination:
     """Arms by which vehicles enter and leave, and the inferred destinations of vehicles whose tracks are cut."""
     trajectories, samples = vehicles.trajectories, vehicles.samples
@@ -269,13 +266,13 @@ def trace_trips(
     origin, entry = _terminal_arms(samples, n, gates, first=True)
     destination, leaves = _terminal_arms(samples, n, gates, first=False)
     begins, ends = trajectories.time_s[trajectories.first[:-1]], trajectories.time_s[trajectories.first[1:] - 1]
-    before = begins < window_s[0] + _CUT_BY_TIME_S
+    before = trajectories.is_cut_by_time(begins, _CUT_BY_TIME_S, begins=True)
     entered = (origin >= 0) & ~before
     known = (origin >= 0) & (destination >= 0)
     probability = np.zeros((n, len(arms)))
     probability[destination >= 0, destination[destination >= 0]] = 1.0
     _infer(probability, origin, destination, known, np.flatnonzero(entered & (destination < 0)), graph, vehicles)
-    remains = (destination < 0) & (ends > window_s[1] - _CUT_BY_TIME_S)
+    remains = (destination < 0) & trajectories.is_cut_by_time(ends, _CUT_BY_TIME_S, begins=False)
     rows = np.flatnonzero(entered)
     trips = Trips(
         vehicles.track[vehicles.first[rows]],
@@ -287,7 +284,7 @@ def trace_trips(
         remains[rows],
     )
     unknown = int(((origin < 0) & ~before).sum())
-    return OriginDestination(arms, gates, trips, int(before.sum()), unknown, window_s)
+    return OriginDestination(arms, gates, trips, int(before.sum()), unknown, trajectories.observed_s)
 
 
 def _terminal_arms(

@@ -98,7 +98,7 @@ def _counts(
     inferred: FloatArray,
 ) -> Iterator[SliceCount]:
     for k, (begin, end) in enumerate(pairwise(edges_s)):
-        if seen_s[k] == 0:
+        if seen_s[k] < (end - begin) / 4:
             continue
         flow = estimate_rate(np.array([seen[k] + inferred[k]]), float(seen_s[k]) / 3600)
         yield SliceCount(junction, arm_in, arm_out, float(begin), float(end), int(seen[k]), float(inferred[k]), flow)

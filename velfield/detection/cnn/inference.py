@@ -33,8 +33,7 @@ _TILE_PX, HALO_PX = 2048, 96
 _GPU_TILE_PX = 1024
 """Side of the tiles of all images on a GPU, whose halo lies on every side."""
 BORDER_PX = 16
-"""An image is continued so far by reflection, for cars at its edge: F1 0.837 in place of 0.833 on the minsk clip, cars
-that the edge cuts included; with 64 px 0.836."""
+"""An image is continued so far by reflection, for cars at its edge."""
 _BATCH_PX = 500_000
 """Pixels of the crops that the network is run on at once: more no longer stays in the processor's cache."""
 

@@ -45,7 +45,7 @@ class Trip:
 
 @dataclass(frozen=True)
 class RoadNetwork:
-    """Lanes, connections (from, to), trips in order of time, and the time that all tracks cover, s."""
+    """Lanes, connections (from, to), trips in order of time, and the time from the first position to the last, s."""
 
     lanes: tuple[RoadLane, ...]
     connections: tuple[tuple[int, int], ...]
@@ -85,7 +85,7 @@ def road_network(run: Run) -> RoadNetwork:
     first_s = float(trajectories.time_s.min()) if len(trajectories.time_s) else 0.0
     trips = _trips(samples.track, samples.lane, samples.time_s - first_s, samples.speed_m_per_s, set(connections))
     named = tuple(Trip(int(trajectories.track_id[trip.track_id]), *_rest(trip)) for trip in trips)
-    return RoadNetwork(tuple(lanes), connections, named, trajectories.duration_s)
+    return RoadNetwork(tuple(lanes), connections, named, float(np.diff(trajectories.window_s)[0]))
 
 
 def _rest(trip: Trip) -> tuple[float, tuple[int, ...], float]:

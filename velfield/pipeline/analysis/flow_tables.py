@@ -41,8 +41,8 @@ def diagram_table(analysis: TrafficAnalysis) -> AnalysisTable:
     ]
     slice_s = max(_SLICE_S, analysis.trajectories.duration_s / _MAX_SLICES)
     note = (
-        f"Edie's definitions over each lane and slices of {slice_s:.0f} s with {_MIN_VEHICLES} vehicles or more; a row "
-        "is a point of the lane's diagram."
+        f"Edie's definitions over each lane and slices of about {slice_s:.0f} s with {_MIN_VEHICLES} vehicles or more; "
+        "a row is a point of the lane's diagram."
     )
     return make_table(
         "fundamental_diagram", "Flow", "Fundamental diagram of lanes", note, columns, _slices(analysis, slice_s),
@@ -54,10 +54,10 @@ def _slices(analysis: TrafficAnalysis, slice_s: float) -> Iterator[_Slice]:
     for lane in analysis.lanes:
         found = flow_slices(analysis.lane_traffic, lane.number, analysis.trajectories.observed_s, slice_s=slice_s)
         samples = analysis.lane_traffic.samples(lane.number)
-        number = np.maximum(np.searchsorted(found.start_s, samples.time_s, side="right") - 1, 0)
-        tracks = int(samples.track.max(initial=0)) + 1
-        vehicles = np.bincount(np.unique(number * tracks + samples.track) // tracks, minlength=len(found.start_s))
-        values = found.start_s, vehicles, found.density_veh_per_km, found.flow_veh_per_h, found.speed_m_per_s
+        number = found.slices.number(samples.time_s)
+        pairs = np.unique(np.column_stack([number, samples.track])[number >= 0], axis=0)
+        vehicles = np.bincount(pairs[:, 0], minlength=len(found.slices))
+        values = found.slices.begin_s, vehicles, found.density_veh_per_km, found.flow_veh_per_h, found.speed_m_per_s
         # on a lane of a metre or two vehicles have one sample each, and no speed
         for k in np.flatnonzero((vehicles >= _MIN_VEHICLES) & np.isfinite(found.speed_m_per_s)):
             yield _Slice(lane, *(column[k].item() for column in values))

@@ -342,7 +342,7 @@ def draw_flow(axes: "Axes", *, analysis: TrafficAnalysis, found: JunctionMovemen
     for k, one in enumerate(gates.arms):
         counts = np.histogram(passes.entry_s[(arm == one.number) & np.isfinite(passes.entry_s)], edges)[0]
         if counts.any():
-            minutes = np.where(seen > 0, counts / np.maximum(seen / _SLICE_S, 1e-9), np.nan)
+            minutes = np.where(seen > _SLICE_S / 4, counts * _SLICE_S / np.maximum(seen, 1e-9), np.nan)
             minutes = np.append(minutes, minutes[-1])
             axes.step(edges / 60, minutes, where="post", color=_TONES[k % 6], linestyle=_STROKES[k % 4],
                       linewidth=1.6, label=f"from {one.name}")  # fmt: skip
