@@ -19,7 +19,6 @@ from velfield.field.time_intervals import parse_time_intervals
 from velfield.pipeline.stages.field import accumulate_block, create_field_stores, field_blocks
 from velfield.run.layout import RunLayout
 from velfield.run.run import Run, open_run
-from velfield.run.stores import create_frames, open_frames
 from velfield.run.tables import write_tracks
 from velfield.synthetic.flight import Flight
 from velfield.synthetic.observed import observed_tracklets
@@ -90,10 +89,6 @@ def field_run(
     source = SourceRecord(path="none", kind="folder", digest="0", width=shape[1], height=shape[0], frame_count=60)
     record = FlightRecord(code_version="0", config=flight_config, inputs=InputsRecord(source=source))
     layout.flight.write_text(record.model_dump_json())
-    times = tracklets.groupby("frame_2")["time_2_s"].first()
-    count = int(times.index.max()) + 1 if len(times) else 1
-    create_frames(layout.frames, key="test", count=count, height=1, width=1, unit_frames=count, source={})
-    open_frames(layout.frames, "r+").write_columns(0, {"time_s": np.interp(np.arange(count), times.index, times)})
     plan = SimpleNamespace(
         layout=layout,
         config=flight_config,

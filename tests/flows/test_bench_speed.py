@@ -21,9 +21,10 @@ from velfield.sources.source import iter_frames, probe
 def test_the_networks_arithmetic_is_that_of_its_layers() -> None:
     """By hand: channels in and out, taps, and the pixels of the layer's output."""
     pixels = 2560 * 1920
-    half, quarter, eighth = pixels / 4, pixels / 16, pixels / 64
+    half, quarter, eighth, sixteenth = pixels / 4, pixels / 16, pixels / 64, pixels / 256
     stem, down1 = half * 16 * 16, quarter * 16 * 16 * 32
     lowest = eighth * (128 * 48 + 4 * 9 * 48 * 48 + 48 * 128)
+    lowest += sixteenth * (192 * 96 + 2 * 9 * 96 * 96 + 96 * 192)
     rest = quarter * (2 * 9 * 32 * 32 + 32 * 12)
     assert network_gflop(2560, 1920) == pytest.approx(2e-9 * (stem + down1 + lowest + rest))
 

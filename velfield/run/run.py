@@ -116,6 +116,11 @@ class Run:
         return warp_to_base(self.frames.read(frame), transform, window=window, scale=scale)
 
     @property
+    def has_frames(self) -> bool:
+        """Whether it was made of frames; False of tracks of another program, and of merged fields."""
+        return self.record.inputs.source.kind != "tracks" and self.layout.frames.exists()
+
+    @property
     def times_s(self) -> FloatArray:
         """(frames,) true times, s."""
         return self.frames.column("time_s")
@@ -282,7 +287,7 @@ class Run:
             self._dimensions,
             self.vehicles,
             position_sd_m,
-            None if self.record.inputs.source.kind == "tracks" else lambda: self.times_s,
+            (lambda: self.times_s) if self.has_frames else None,
         )
 
     @cached_property

@@ -70,7 +70,7 @@ def analyse_run(run_folder: Path, *, slice_s: float = SLICE_S, speed_unit: Speed
 
 def _frames(run: Run) -> Frames | None:
     """The frames of a run; None of one that was made of tracks."""
-    if run.record.inputs.source.kind == "tracks" or not run.layout.frames.exists():
+    if not run.has_frames:
         return None
     return Frames(run.times_s, run.frames.read, run.frame_transforms.transform)
 
