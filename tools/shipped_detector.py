@@ -7,7 +7,6 @@ former one on none of them.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +21,7 @@ from velfield.bench.scenes import simulated_image
 from velfield.detection.cnn.detector import CnnDetector
 from velfield.detection.cnn.fine_tuning import evaluate_network, make_record
 from velfield.detection.cnn.network import Network
-from velfield.detection.evaluation import HeldOutScores, merge_scores, precision_recall_curve
-from velfield.detection.orientation import fill_missing_orientation
+from velfield.detection.evaluation import HeldOutScores, f_measure, merge_scores, precision_recall_curve
 from velfield.detection.registry import shipped_detector
 from velfield.detection.samples import LabelledImage
 from velfield.parallel import parallel_map
@@ -33,18 +31,10 @@ SIMULATED_SEEDS = (*range(9001, 9061), *range(9301, 9501))
 """Every third of them with many long vehicles."""
 SIMULATED_SEEDS_HELD_OUT = range(9201, 9213)
 _SIMULATED_WEIGHT = 5.0
-_LARGE_VEHICLE_FRACTION, _LARGE_RATIO = 0.35, 1.4
-"""Fraction of long vehicles in every third simulated city, as a usual city has too few; and length, in cars, from which
-a vehicle of the real pictures is not used as a car."""
+_LARGE_VEHICLE_FRACTION = 0.35
+"""Fraction of long vehicles in every third simulated city, as a usual city has too few."""
 _TOLERANCE = 0.005
 """Decrease of F1 up to which a network is not worse, or by one car of the part where that is more."""
-
-
-def _known_cars(sample: LabelledImage) -> LabelledImage:
-    """The cars of known size, with their orientations."""
-    cars = fill_missing_orientation(sample.image, sample.cars, sample.abs_box_angle_rad)
-    known = cars[:, 3] < _LARGE_RATIO * CnnConfig().working_car_length_px
-    return replace(sample, cars=cars[known], abs_box_angle_rad=None)
 
 
 def _simulate_city(seed: int) -> LabelledImage:
@@ -117,8 +107,8 @@ def _precision_recall(evaluation: HeldOutScores, threshold: float) -> tuple[floa
 
 
 def _f_score(evaluation: HeldOutScores, threshold: float, beta: float = 1.0) -> float:
-    precision, recall = _precision_recall(evaluation, threshold)
-    return (1 + beta**2) * precision * recall / max(beta**2 * precision + recall, 1e-9)
+    precision, recall = np.array(_precision_recall(evaluation, threshold))
+    return float(f_measure(precision, recall, beta=beta))
 
 
 def _accuracy_line(name: str, evaluation: HeldOutScores, threshold: float) -> str:

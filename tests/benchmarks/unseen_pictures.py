@@ -12,7 +12,7 @@ import numpy as np
 from schemas.arrays import FloatArray
 from tools.training_data import read_sites, read_upright
 from velfield.bench.scenes import simulated_image
-from velfield.detection.evaluation import MATCH_PX, match_greedy
+from velfield.detection.evaluation import MATCH_PX, f_measure, match_labels
 from velfield.detection.orientation import axial_difference
 from velfield.detection.registry import shipped_detector
 from velfield.detection.samples import LabelledImage
@@ -42,12 +42,9 @@ def _judge(samples: Sequence[LabelledImage]) -> str:
     for sample in samples:
         found = detector.detect(sample.image, sample.valid, threshold=_LOWEST)
         found = found.take(np.argsort(-found.score, kind="stable"))
-        right = match_greedy(found.xy, sample.cars)
-        ignored = np.zeros(len(found), bool)
-        for x, y, radius in sample.ignore:
-            ignored |= ~right & (np.hypot(found.xy[:, 0] - x, found.xy[:, 1] - y) <= radius)
-        scores.append(found.score[~ignored])
-        correct.append(right[~ignored])
+        right, counted = match_labels(found.xy, sample.cars, sample.ignore)
+        scores.append(found.score[counted])
+        correct.append(right[counted])
         sure = found.score > detector.threshold
         axes.append(_axis_errors(found.xy[right & sure], found.orientation_rad[right & sure], sample.cars))
         for car in sample.cars[sample.cars[:, 3] > _LONG_PX]:
@@ -59,7 +56,7 @@ def _judge(samples: Sequence[LabelledImage]) -> str:
     errors = np.degrees(np.concatenate(axes))
     parts = [
         f"{count} vehicles in {len(samples)} pictures: precision {precision:.3f}, recall {recall:.3f}",
-        f"F1 {2 * precision * recall / (precision + recall):.3f}",
+        f"F1 {f_measure(precision, recall):.3f}",
         f"average precision {_average(score, right, count):.3f}",
     ]
     if len(errors):

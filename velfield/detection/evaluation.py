@@ -65,6 +65,16 @@ def match_greedy(detections: FloatArray, cars: FloatArray) -> Mask:
     return correct
 
 
+def match_labels(detections: FloatArray, cars: FloatArray, ignore: FloatArray) -> tuple[Mask, Mask]:
+    """Whether each detection (n, 2...), the best first, is a true positive, and whether it counts: one that is none
+    does not count within an ignored circle (k, 3) as x, y, radius."""
+    correct = match_greedy(detections, cars)
+    counted = np.ones(len(detections), bool)
+    for x, y, radius in ignore:
+        counted &= correct | (np.hypot(detections[:, 0] - x, detections[:, 1] - y) > radius)
+    return correct, counted
+
+
 def merge_scores(parts: Sequence[HeldOutScores]) -> HeldOutScores:
     """The detections of several images or folds together."""
     return HeldOutScores(
@@ -115,7 +125,12 @@ def to_curve_record(
     )
 
 
+def f_measure(precision: FloatArray, recall: FloatArray, *, beta: float = 1.0) -> FloatArray:
+    """F measure of precisions and recalls (n,), recall weighted by ``beta``."""
+    return (1 + beta**2) * precision * recall / np.maximum(beta**2 * precision + recall, 1e-9)
+
+
 def f_measure_plateau(precision: FloatArray, recall: FloatArray, *, beta: float) -> IntArray:
     """Indices of a curve at which the F measure, recall weighted by ``beta``, is nearly its maximum."""
-    f_measure = (1 + beta**2) * precision * recall / np.maximum(beta**2 * precision + recall, 1e-9)
-    return np.flatnonzero(f_measure > _PLATEAU * f_measure.max())
+    measure = f_measure(precision, recall, beta=beta)
+    return np.flatnonzero(measure > _PLATEAU * measure.max())

@@ -22,6 +22,7 @@ from velfield.run.flight_record import suggest_run
 from velfield.run.layout import RunLayout
 
 if TYPE_CHECKING:
+    import uvicorn
     from starlette.applications import Starlette
 
 HOST = "127.0.0.1"
@@ -110,16 +111,12 @@ def trusted_host_middleware() -> Any:
 @contextmanager
 def serve_in_thread(app: "Starlette", port: int) -> Iterator[str]:
     """Serve in a thread while the context lasts, on this port, or on any if it is in use; yields the address."""
-    import uvicorn
-
     try:
         listener = _listen(port)
     except InputError:
         listener = _listen(None)
     with listener:
-        server = uvicorn.Server(
-            uvicorn.Config(app, log_level="warning", lifespan="off", ws="none", server_header=False)
-        )
+        server = _server(app)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, name="pages", daemon=True)
         thread.start()
         try:
@@ -146,16 +143,19 @@ def serve(app: "Starlette", *, port: int | None, open_browser: bool, announce: C
     InputError
         The port is in use.
     """
-    import uvicorn
-
     with _listen(port) as listener:
         address = f"http://{HOST}:{listener.getsockname()[1]}/"
         announce(address)
         if open_browser and _has_screen():
             # The socket listens already: the browser waits for the response.
             threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
-        config = uvicorn.Config(app, log_level="warning", lifespan="off", ws="none", server_header=False)
-        uvicorn.Server(config).run(sockets=[listener])
+        _server(app).run(sockets=[listener])
+
+
+def _server(app: "Starlette") -> "uvicorn.Server":
+    import uvicorn
+
+    return uvicorn.Server(uvicorn.Config(app, log_level="warning", lifespan="off", ws="none", server_header=False))
 
 
 def _listen(port: int | None) -> socket.socket:

@@ -15,7 +15,7 @@ from velfield.detection.cnn.inference import BORDER_PX, Predictor
 from velfield.detection.cnn.model import detect_cars
 from velfield.detection.cnn.network import Network
 from velfield.detection.cnn.quantization import INEXACT, calibrate, is_exact
-from velfield.detection.interface import Detections, Detector, concatenate
+from velfield.detection.interface import Detections, Detector
 from velfield.detection.nms import nms_oriented
 from velfield.detection.orientation import CAR_ASPECT
 from velfield.detection.runtime import current_device, device_limitations, uses_cuda
@@ -109,9 +109,8 @@ class CnnDetector(Detector):
 
     def refine(self, found: Detections, kept: Detections | None = None) -> Detections:
         """Non-maximum suppression."""
-        rows = concatenate([found] if kept is None else [found, kept]).to_rows()
-        kept_rows = nms_oriented(rows, self.record.working_car_length_px)
-        return Detections.from_rows(kept_rows[:, :5], kept_rows[:, 5])
+        rows = nms_oriented(super().refine(found, kept).to_rows(), self.record.working_car_length_px)
+        return Detections.from_rows(rows[:, :5], rows[:, 5])
 
     @classmethod
     def train(cls, samples: Sequence[LabelledImage], config: CnnConfig, *, base: Detector | None = None) -> Detector:

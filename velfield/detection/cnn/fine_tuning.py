@@ -23,7 +23,7 @@ from velfield.detection.evaluation import (
     MIN_CARS_FOR_FOLDS,
     MIN_CURVE_SCORE,
     HeldOutScores,
-    match_greedy,
+    match_labels,
     merge_scores,
     precision_recall_curve,
     spatial_fold,
@@ -150,8 +150,5 @@ def evaluate_network(
     cars = sample.cars
     if region is not None:
         detections, cars = detections[in_region(region, detections)], cars[in_region(region, cars)]
-    correct = match_greedy(detections, cars)
-    for x, y, radius in sample.ignore:
-        counted = correct | (np.hypot(detections[:, 0] - x, detections[:, 1] - y) > radius)
-        detections, correct = detections[counted], correct[counted]
-    return HeldOutScores(detections[:, 3], correct, len(cars), sample.complete)
+    correct, counted = match_labels(detections, cars, sample.ignore)
+    return HeldOutScores(detections[counted, 3], correct[counted], len(cars), sample.complete)
