@@ -142,7 +142,7 @@ def test_rows_pulled_off_by_few_matches_are_fitted_again_from_their_neighbours()
     rows = fit.transform.row_coefficients.copy()
     rows[1, 18:24] -= 4.0
     pulled_rows = replace(fit.transform, row_coefficients=rows)
-    aligned, _ = align_patches(fitter.grey, pulled_rows, templates, coarse=False, max_shift_px=2.5)
+    aligned, _ = align_patches(fitter.fine, pulled_rows, templates, coarse=False, max_shift_px=2.5)
     pulled = fitter._fit(aligned, pulled_rows.polyprojective, replace(fit, transform=pulled_rows))
     grid = np.column_stack([np.full(60, 300.0), np.linspace(160, 270, 60)])
     good = fit.transform.to_base(grid)

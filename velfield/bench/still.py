@@ -22,6 +22,7 @@ from velfield.registration.alignment import (
     Templates,
     align_patches,
     make_templates,
+    smooth_fine,
 )
 from velfield.registration.transforms import FrameTransform
 from velfield.run.run import Run
@@ -143,7 +144,7 @@ def _select_sharpest(run: Run, within: FloatArray | None) -> Templates:
 
 def track_corners(grey: GreyImage, transform: FrameTransform, templates: Templates) -> FloatArray:
     """Positions (n, 2) of the corners by one frame, base px; NaN where they are not located."""
-    corners, _ = align_patches(grey, transform, templates, coarse=False, max_shift_px=_MAX_SHIFT_PX)
+    corners, _ = align_patches(smooth_fine(grey), transform, templates, coarse=False, max_shift_px=_MAX_SHIFT_PX)
     number = {(float(x), float(y)): k for k, (x, y) in enumerate(templates.xy)}
     rows = [number[(float(x), float(y))] for x, y in corners.xy_base]
     positions = np.full((len(templates), 2), np.nan)

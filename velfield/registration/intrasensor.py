@@ -26,6 +26,7 @@ where the chain began.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -33,7 +34,6 @@ import numpy as np
 from schemas.arrays import ByteArray, Float32Array, FloatArray, GreyImage, IntArray, Mask
 from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
-from velfield.compiled import kernel
 from velfield.errors import Failure
 from velfield.registration.alignment import (
     HALF_PATCH,
@@ -293,24 +293,11 @@ def _is_worse(result: FrameRegistration, first: FrameRegistration) -> bool:
     )
 
 
-@kernel
 def shrink(grey: ByteArray) -> ByteArray:
-    """The frame as optical flow sees it: the means of squares of 4 x 4 px, halves to the even grey level.
-
-    A sixteenth of OpenCV's time, which sums squares of this size value by value. What fills no square is left out.
-    """
-    rows, columns, one = grey.shape[0] // 4, np.uint64(grey.shape[1] // 4), np.uint64(1)
-    out, sums = np.empty((rows, grey.shape[1] // 4), np.uint8), np.empty(grey.shape[1], np.uint16)
-    for i in range(rows):
-        a, b, c, d = grey[4 * i], grey[4 * i + 1], grey[4 * i + 2], grey[4 * i + 3]
-        for k in range(len(sums)):
-            sums[k] = np.uint16(a[k]) + np.uint16(b[k]) + np.uint16(c[k]) + np.uint16(d[k])
-        for k in range(columns):
-            at = np.uint64(4) * k
-            total = np.int32(sums[at]) + np.int32(sums[at + one])
-            total += np.int32(sums[at + one + one]) + np.int32(sums[at + np.uint64(3)])
-            out[i, k] = (total + np.int32(7) + ((total >> np.int32(4)) & np.int32(1))) >> np.int32(4)
-    return out
+    """The frame as optical flow sees it: the means of squares of 4 x 4 px; what fills no square is left out."""
+    rows, columns = grey.shape[0] // 4, grey.shape[1] // 4
+    small = cv2.resize(grey[: 4 * rows, : 4 * columns], (columns, rows), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8)
 
 
 def _register_by_flow(
@@ -459,6 +446,11 @@ class _FrameFitter:
     lens: Lens
     config: RegistrationConfig
 
+    @cached_property
+    def fine(self) -> Float32Array:
+        """The frame at the fine blur level, at which patches are aligned."""
+        return smooth_fine(self.grey)
+
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the frame, px."""
@@ -511,14 +503,14 @@ class _FrameFitter:
             return fit
         templates = chosen or self.base.templates
         aligned, in_frame = align_patches(
-            self.grey, fit.transform, templates, coarse=False, max_shift_px=_FINE_SHIFT_PX
+            self.fine, fit.transform, templates, coarse=False, max_shift_px=_FINE_SHIFT_PX
         )
         enough = chosen is not None or len(aligned) >= _ENOUGH_FRACTION * in_frame
         if not enough:
             templates = self.base.dense_templates
-        steps: list[tuple[GreyImage | Float32Array, bool, float]] = [(self.grey, False, _FINE_SHIFT_PX)] * 2
+        steps: list[tuple[Float32Array, bool, float]] = [(self.fine, False, _FINE_SHIFT_PX)] * 2
         if len(aligned) < _NEAR_FRACTION * in_frame:
-            steps.insert(0, (smooth_coarse(smooth_fine(self.grey)), True, _COARSE_SHIFT_PX))
+            steps.insert(0, (smooth_coarse(self.fine), True, _COARSE_SHIFT_PX))
         used, settled_px = points, _SETTLED_PX if chosen is None else _SETTLED_IN_CHAIN_PX
         for k, (image, is_coarse, limit) in enumerate(steps):
             if k or not enough:
@@ -560,7 +552,7 @@ class _FrameFitter:
         for part in rows:
             part[weak] = np.interp(np.flatnonzero(weak), np.flatnonzero(~weak), part[~weak])
         bridged = replace(fit, transform=replace(fit.transform, row_coefficients=rows))
-        aligned, _ = align_patches(self.grey, bridged.transform, templates, coarse=False, max_shift_px=_FINE_SHIFT_PX)
+        aligned, _ = align_patches(self.fine, bridged.transform, templates, coarse=False, max_shift_px=_FINE_SHIFT_PX)
         again = aligned.concatenate(_select_in_empty_cells(used, aligned, *self.size))
         refit = self._fit(again, bridged.transform.polyprojective, bridged)
         if isinstance(refit, Failure):
