@@ -167,7 +167,7 @@ STAGES: tuple[Stage, ...] = (
     # Spread frames registered to the sharpest, and their median; or the registration of a given image.
     Stage(
         name="base",
-        version=14,
+        version=15,
         label="base image",
         lines=(
             Line(
@@ -242,7 +242,7 @@ STAGES: tuple[Stage, ...] = (
     # Cars of each block, then one table with their crops.
     Stage(
         name="detections",
-        version=21,
+        version=22,
         label="detections",
         lines=(
             Line(

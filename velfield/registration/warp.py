@@ -3,26 +3,24 @@
 The inverse map, output pixels to raw pixels, is exact at the centres of cells of 16 px and interpolated bilinearly
 between, or of 8 px where the map bends by more than a twentieth of a pixel in between (fast rolling shutter). Inverting
 every pixel would cost a hundred times as much. At the centres it is inverted from every fourth of them on: what is
-interpolated between those is wrong by less than a pixel, and two or three evaluations of the forward map correct it.
+interpolated between those is wrong by less than a pixel, and three evaluations of the forward map correct it.
 
 A frame is resampled whole (`warp_to_base`) or where it is asked for (`Rectification`).
 """
 
 from functools import cached_property, lru_cache
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.arrays import Float32Array, FloatArray, GreyImage, IntArray, Mask
-from velfield.compiled import kernel
-from velfield.registration.resampling.cells import CELL_PX, PAD_PX, resample_kernel
+from velfield.registration.resampling.cells import CELL_PX, PAD_PX, as_words, resample_kernel
 
 Window = tuple[int, int, int, int]
 """x, y, width, height in base px."""
 
-_Places = tuple[IntArray, FloatArray, FloatArray]
-"""Nodes along an axis: number of the known node before each, distance from it, and from it to the next, in nodes."""
 _INVALID = -1e5
 _MIN_SHRINK = 1.35
 """At this many raw pixels per output pixel or more the raw frame is area-averaged first; below, aliasing is slight."""
@@ -31,9 +29,9 @@ _CELL_PX = 16, 8
 """Sides of the cells that are tried, output px."""
 _CHECKS, _MAX_BEND_PX = 24, 0.05
 """Rows and columns of places where interpolation is checked, and the error that is allowed there."""
-_SPARSE, _CORRECTIONS, _MAX_ERROR_PX = 4, 8, 2e-3
+_SPARSE, _CORRECTIONS, _MAX_ERROR_PX = 4, 3, 2e-3
 """Nodes whose inverse is computed from nothing: every fourth. At the others it starts from their interpolation, and is
-corrected until it is this accurate, base px, at most so many times; nodes that are not by then start from nothing."""
+corrected so many times; nodes that are not this accurate before the last one, base px, start from nothing."""
 
 
 class RawToBase(Protocol):
@@ -139,13 +137,9 @@ def _coarse_map(
     base = np.stack([base_x, base_y], axis=2)
     if twice_as_large is None:
         return invert_on_grid(transform, base)
-    return _invert_between(transform, base, twice_as_large, _within_halved(rows), _within_halved(columns))
-
-
-def _within_halved(count: int) -> _Places:
-    """Places of ``count`` cells in cells twice as large: centres lie a quarter of those before or behind theirs."""
-    before, odd = np.divmod(np.arange(count), 2)
-    return before, np.where(odd, 1.5, 0.5), np.full(count, 2.0)
+    # centres of cells lie a quarter of those twice as large before or behind theirs
+    places = (2.0 * np.arange(size) - 0.5 for size in twice_as_large.shape[:2])
+    return _invert_between(transform, base, twice_as_large, *places)
 
 
 def invert_on_grid(transform: RawToBase, base: FloatArray) -> FloatArray:
@@ -154,115 +148,39 @@ def invert_on_grid(transform: RawToBase, base: FloatArray) -> FloatArray:
     Some nodes by `to_raw`. The others start from what is interpolated between those; the slope of that is the inverse's
     Jacobian, near enough for the error to fall by a factor of ten or more with every correction.
     """
-    (rows, in_rows), (columns, in_columns) = (_sparse_nodes(size) for size in base.shape[:2])
+    rows, columns = (np.unique(np.r_[np.arange(0, size, _SPARSE), size - 1]) for size in base.shape[:2])
     sparse_base = base[np.ix_(rows, columns)]
     sparse = transform.to_raw(sparse_base.reshape(-1, 2)).reshape(sparse_base.shape)
-    return _invert_between(transform, base, sparse, in_rows, in_columns)
+    return _invert_between(transform, base, sparse, rows, columns)
 
 
 def _invert_between(
-    transform: RawToBase, base: FloatArray, known: FloatArray, in_rows: _Places, in_columns: _Places
+    transform: RawToBase, base: FloatArray, known: FloatArray, rows: NDArray[Any], columns: NDArray[Any]
 ) -> FloatArray:
-    """As `invert_on_grid`, from raw coordinates (r, c, 2) known on another grid, and the nodes' places in it."""
-    pitch_x, pitch_y = base[0, 1, 0] - base[0, 0, 0], base[1, 0, 1] - base[0, 0, 1]
-    raw, slopes, near, lost = _starts(known, *in_rows, *in_columns, pitch_x, pitch_y)
-    target = base.reshape(-1, 2)
+    """As `invert_on_grid`, from raw coordinates (r, c, 2) known on another grid, at these rows and columns of nodes."""
+    (above, down), (before, across) = _places(rows, base.shape[0]), _places(columns, base.shape[1])
+    start = known[above] + down[:, None, None] * (known[above + 1] - known[above])
+    start = start[:, before] + across[:, None] * (start[:, before + 1] - start[:, before])
+    # Where no node around has an inverse, none between them is in the frame.
+    lost = np.isfinite(known[..., 0])
+    lost = lost[above] | lost[above + 1]
+    lost = (lost[:, before] | lost[:, before + 1]).ravel()
+    pitches = base[1, 0, 1] - base[0, 0, 1], base[0, 1, 0] - base[0, 0, 0]
+    by_y, by_x = (slope.reshape(-1, 2) for slope in np.gradient(start, *pitches, axis=(0, 1)))
+    raw, target = start.reshape(-1, 2), base.reshape(-1, 2)
     for _ in range(_CORRECTIONS):
-        near = _correct(raw, slopes, near, target, transform.to_base(_take(raw, near)), lost)
-        if not near.size:
-            break
-    at = np.flatnonzero(lost)
-    if at.size:
-        raw[at] = transform.to_raw(target[at])
+        error = target - transform.to_base(raw)
+        raw += by_x * error[:, :1] + by_y * error[:, 1:]
+    lost &= ~(np.abs(error) < _MAX_ERROR_PX).all(axis=1)
+    if lost.any():
+        raw[lost] = transform.to_raw(target[lost])
     return np.asarray(raw.reshape(base.shape))
 
 
-@lru_cache(maxsize=16)
-def _sparse_nodes(count: int) -> tuple[IntArray, _Places]:
-    """Every fourth of ``count`` nodes, and the last; and the places of all among them."""
-    nodes = np.unique(np.r_[np.arange(0, count, _SPARSE), count - 1])
-    if count == 1:
-        return nodes, (np.zeros(1, np.int64), np.zeros(1), np.ones(1))
-    at = np.arange(count)
-    before = np.clip(np.searchsorted(nodes, at, side="right") - 1, 0, len(nodes) - 2)
-    places = before, (at - nodes[before]).astype(np.float64), (nodes[before + 1] - nodes[before]).astype(np.float64)
-    return nodes, places
-
-
-@kernel
-def _starts(  # type: ignore[no-untyped-def]
-    sparse, above, down, height, before, across, width, pitch_x, pitch_y
-) -> tuple[FloatArray, FloatArray, IntArray, Mask]:
-    """Where the correction starts: nodes interpolated between the sparse ones (r, c, 2).
-
-    Returns the nodes (n, 2), slopes in x and y (n, 2, 2), the numbers of nodes that can be corrected, and which may
-    have an inverse (n,): where no node around has one, none between them is in the frame.
-    """
-    rows, columns = len(above), len(before)
-    raw, slopes = np.empty((rows * columns, 2)), np.empty((rows * columns, 2, 2))
-    near, count = np.empty(rows * columns, np.int64), 0
-    lost = np.empty(rows * columns, np.bool_)
-    left, slope_x, slope_y, twist = np.empty(2), np.empty(2), np.empty(2), np.empty(2)
-    known = np.empty((2, 2), np.bool_)
-    last_row, last_column = sparse.shape[0] - 1, sparse.shape[1] - 1
-    for i in range(rows):
-        k = above[i]
-        below = min(k + 1, last_row)
-        for j in range(columns):
-            m, n = before[j], i * columns + j
-            if j == 0 or m != before[j - 1]:  # the same for all nodes between two sparse ones
-                after = min(m + 1, last_column)
-                for c in range(2):
-                    slope_y[c] = (sparse[below, m, c] - sparse[k, m, c]) / height[i]
-                    slope_after = (sparse[below, after, c] - sparse[k, after, c]) / height[i]
-                    left[c] = sparse[k, m, c] + slope_y[c] * down[i]
-                    slope_x[c] = (sparse[k, after, c] + slope_after * down[i] - left[c]) / width[j]
-                    twist[c] = (slope_after - slope_y[c]) / width[j]
-                for side, column in enumerate((m, after)):
-                    known[0, side] = down[i] < height[i] and not np.isnan(sparse[k, column, 0])
-                    known[1, side] = down[i] > 0 and not np.isnan(sparse[below, column, 0])
-            finite = True
-            for c in range(2):
-                raw[n, c] = left[c] + slope_x[c] * across[j]
-                slopes[n, 0, c] = slope_x[c] / pitch_x
-                slopes[n, 1, c] = (slope_y[c] + twist[c] * across[j]) / pitch_y
-                finite &= np.isfinite(raw[n, c] + slopes[n, 0, c] + slopes[n, 1, c])
-            if finite:
-                near[count] = n
-                count += 1
-            lost[n] = (across[j] < width[j] and (known[0, 0] or known[1, 0])) or (
-                across[j] > 0 and (known[0, 1] or known[1, 1])
-            )
-    return raw, slopes, near[:count], lost
-
-
-@kernel
-def _take(points: FloatArray, numbers: IntArray) -> FloatArray:
-    """Some of the points (n, 2), in a quarter of numpy's time."""
-    out = np.empty((len(numbers), 2))
-    for k in range(len(numbers)):
-        out[k, 0], out[k, 1] = points[numbers[k], 0], points[numbers[k], 1]
-    return out
-
-
-@kernel
-def _correct(
-    raw: FloatArray, slopes: FloatArray, near: IntArray, target: FloatArray, mapped: FloatArray, lost: Mask
-) -> IntArray:
-    """Correct nodes by what they are mapped to; the numbers of those that were not accurate. The others are not
-    lost."""
-    inaccurate, count = np.empty_like(near), 0
-    for n in range(len(near)):
-        at = near[n]
-        error_x, error_y = target[at, 0] - mapped[n, 0], target[at, 1] - mapped[n, 1]
-        for c in range(2):
-            raw[at, c] += slopes[at, 0, c] * error_x + slopes[at, 1, c] * error_y
-        if abs(error_x) < _MAX_ERROR_PX and abs(error_y) < _MAX_ERROR_PX:
-            lost[at] = False
-        else:
-            inaccurate[count] = at
-            count += 1
-    return inaccurate[:count]
+def _places(known: NDArray[Any], count: int) -> tuple[IntArray, FloatArray]:
+    """Where ``count`` nodes lie between known places: the number of the one before each, and the fraction beyond it."""
+    before = np.clip(np.searchsorted(known, np.arange(count), side="right") - 1, 0, len(known) - 2)
+    return before, (np.arange(count) - known[before]) / (known[before + 1] - known[before])
 
 
 def _downscale(
@@ -279,18 +197,7 @@ def _downscale(
         size = max(1, round(width / shrink)), max(1, round(height / shrink))
         source = np.asarray(cv2.resize(grey_raw, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         coarse = (coarse + 0.5) * np.array([size[0] / width, size[1] / height]) - 0.5
-    return source, _fill_invalid(coarse)
-
-
-@kernel
-def _fill_invalid(coarse: FloatArray) -> Float32Array:
-    """A map (my, mx, 2) as float32, `_INVALID` where it is not finite."""
-    out = np.empty(coarse.shape, np.float32)
-    for i in range(coarse.shape[0]):
-        for j in range(coarse.shape[1]):
-            for c in range(2):
-                out[i, j, c] = coarse[i, j, c] if np.isfinite(coarse[i, j, c]) else _INVALID
-    return out
+    return source, np.where(np.isfinite(coarse), coarse, _INVALID).astype(np.float32)
 
 
 class Rectification:
@@ -390,29 +297,15 @@ def resample_cells(
     cells
         (n, 2) row and column of cells of `CELL_PX`.
     """
-    resample_kernel(extended, coarse, step, cells, image, valid)
+    resample_kernel(extended, as_words(extended), coarse, step, cells, image, valid)
 
 
 def _raw_px_per_cell(coarse: FloatArray) -> float:
     """Raw px along the side of a cell of the map (my, mx, 2), the median; NaN where there is no cell."""
-    areas = _areas(coarse)
+    right, below = coarse[:-1, 1:] - coarse[:-1, :-1], coarse[1:, :-1] - coarse[:-1, :-1]
+    areas = np.abs(right[..., 0] * below[..., 1] - right[..., 1] * below[..., 0])
+    areas = areas[np.isfinite(areas)]
     return float(np.sqrt(np.median(areas))) if areas.size else np.nan
-
-
-@kernel
-def _areas(coarse: FloatArray) -> FloatArray:
-    """Areas of the cells of a map (my, mx, 2), of those that have one."""
-    rows, columns = coarse.shape[0] - 1, coarse.shape[1] - 1
-    areas, count = np.empty(rows * columns), 0
-    for i in range(rows):
-        for j in range(columns):
-            x, y = coarse[i, j]
-            (right_x, right_y), (below_x, below_y) = coarse[i, j + 1], coarse[i + 1, j]
-            area = abs((right_x - x) * (below_y - y) - (right_y - y) * (below_x - x))
-            if np.isfinite(area):
-                areas[count] = area
-                count += 1
-    return areas[:count]
 
 
 def footprint(transform: RawToBase, frame_shape: tuple[int, int]) -> tuple[float, float, float, float]:
