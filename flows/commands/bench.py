@@ -28,8 +28,3 @@ bench.command(
     name="field",
     help="Kernel and bins of the field with the best likelihood of held-out tracks.",
 )
-bench.command(
-    "flows.commands.benchmarks.detection:detection",
-    name="detection",
-    help="Speed of the detector and of comparable programs.",
-)

@@ -1,27 +1,11 @@
 """Speed of the kernels beside a plain peer in the same run: read the ratio, not the time. `make bench` runs them."""
 
-from collections.abc import Callable
-
 import numpy as np
-import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from schemas.flight import FieldConfig
-from velfield.bench.detection import plain_response, random_stumps, row_response
 from velfield.field.accumulate import accumulate_tile
 from velfield.field.segments import SEGMENT_DTYPE, VelocityBins
-from velfield.paper.response import dense_response
-
-
-@pytest.fixture
-def picture() -> np.ndarray:
-    return np.random.default_rng(0).integers(0, 256, (240, 320), dtype=np.uint8)
-
-
-@pytest.mark.parametrize("how", [dense_response, row_response, plain_response])
-def test_dense_response(benchmark: BenchmarkFixture, picture: np.ndarray, how: Callable[..., np.ndarray]) -> None:
-    benchmark.group = "dense response, 20 rounds, 320 x 240"
-    assert benchmark(how, picture, random_stumps(20)).shape == picture.shape
 
 
 def test_tile_of_the_field(benchmark: BenchmarkFixture) -> None:

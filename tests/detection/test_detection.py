@@ -2,20 +2,16 @@
 
 from functools import cache
 
-import cv2
 import numpy as np
 import pytest
 
 from schemas.detector import CnnConfig, PaperConfig
-from velfield.bench.detection import row_response
 from velfield.detection.detect import FrameDetections, detect_frame
 from velfield.detection.interface import Detector
 from velfield.detection.orientation import axial_difference
 from velfield.detection.registry import shipped_detector, train_detector
 from velfield.detection.samples import LabelledImage
 from velfield.errors import InputError
-from velfield.paper.response import dense_response
-from velfield.paper.stumps import BoostedStumps
 from velfield.pipeline.stages.labels import rescale
 from velfield.synthetic import Flight, small_flight
 
@@ -98,25 +94,6 @@ def test_training_twice_gives_the_same_detector() -> None:
 def test_the_papers_detector_where_it_was_trained() -> None:
     found, truth = detect(flight(5), 0, "paper")
     assert len(matches(found, truth)) / len(truth.cars) > 0.4
-
-
-def test_the_papers_detector_by_the_response_at_every_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sampled at every second pixel, the blurred response is the same to 1/40, a region's position to half a px."""
-    ours, truth = detect(flight(5), 0, "paper")
-    stumps, sigma = detector("paper").stumps, PAPER.response_sigma_px
-    blurred = [cv2.GaussianBlur(how(truth.image, stumps), (0, 0), sigma) for how in (row_response, dense_response)]
-    assert np.std(blurred[0] - blurred[1]) < 0.03 * np.std(blurred[0])
-
-    def at_every_pixel(image: np.ndarray, stumps: BoostedStumps, *, grey_bits: int) -> np.ndarray:
-        return row_response(image, stumps, grey_bits)
-
-    monkeypatch.setattr("velfield.paper.detector.dense_response", at_every_pixel)
-    plain = detect_frame(truth.image, None, detector("paper"))
-    gap = np.hypot(*(ours.xy[:, None] - plain.xy[None]).transpose(2, 0, 1))
-    for nearest in (gap.min(axis=0), gap.min(axis=1)):
-        assert np.median(nearest) < 0.6
-        assert np.mean(nearest < 2.0) > 0.88
-    assert abs(len(matches(ours, truth)) - len(matches(plain, truth))) <= 0.05 * len(truth.cars)
 
 
 @pytest.mark.parametrize("method", ["cnn", "paper"])

@@ -12,7 +12,6 @@ from flows.commands.benchmarks.speed import speed, stages_by_frame
 from schemas.flight import PRESETS, FramesConfig
 from tests.benchmarks.long_flight import encode_frames, repeat_frames
 from velfield.bench.detection import network_gflop
-from velfield.bench.literal import LiteralChain
 from velfield.bench.measured_run import run_measured
 from velfield.pipeline.stage import STAGE
 from velfield.sources.source import iter_frames, probe
@@ -70,14 +69,6 @@ def test_clips_are_timed_with_nothing_given(
     decoded, whole = (re.findall(rf"{text} ([\d.]+) s", told) for text in ("libav alone, all frames:", "velfield run:"))
     assert len(decoded) == len(whole) == len(small)
     assert probe(tmp_path / "480p-H.265-45.mp4", frames=FramesConfig(every=1)).frame_count == 45
-
-
-def test_the_literal_chain_puts_a_response_in_the_place_of_the_presets() -> None:
-    chain = LiteralChain({"registration": 1.0, "detections": 3.0}, 2.0, response_rows=8.0, response_arrays=98.0)
-    _, preset, rows, arrays = chain.text(ours_s=0.5)
-    assert "4.00 s a frame; ours 0.50 s: 8 times" in preset
-    assert "10.00 s a frame; ours 0.50 s: 20 times" in rows
-    assert "100.00 s a frame; ours 0.50 s: 200 times" in arrays
 
 
 def test_memory_is_that_of_the_driver_and_of_the_largest_worker() -> None:

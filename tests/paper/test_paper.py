@@ -10,52 +10,48 @@ from skimage.measure import regionprops
 from skimage.segmentation import watershed
 
 from schemas.detector import PaperConfig
-from velfield.bench.detection import plain_response, random_stumps, row_response
 from velfield.detection.orientation import axial_difference
 from velfield.detection.registry import train_detector
 from velfield.detection.samples import LabelledImage
-from velfield.paper.response import dense_response, quantise_and_pad, response_at_even_pixels
+from velfield.paper.boosting import draw_feature_pool
+from velfield.paper.response import MARGIN_PX, dense_response
 from velfield.paper.segmentation import region_moments, segment_response
+from velfield.paper.stumps import BoostedStumps
 
 SEEDS = st.integers(0, 2**32 - 1)
 
 
+def random_stumps(rounds: int, *, seed: int = 1) -> BoostedStumps:
+    rng = np.random.default_rng(seed)
+    pool = draw_feature_pool(rounds, sigma_xy_px=(10.0, 10.0), reach_xy_px=(40, 40), max_rectangles=5, rng=rng)
+    leaves = rng.normal(0, 1, (rounds, 2)).astype(np.float32)
+    return BoostedStumps(pool.table, pool.starts, np.zeros(rounds, np.float32), leaves)
+
+
 @settings(max_examples=25, deadline=None)
-@given(
-    SEEDS,
-    st.integers(65, 100),
-    st.integers(65, 100),
-    st.integers(1, 30),
-    st.sampled_from([3, 5, 8]),
-)
-def test_at_every_second_pixel_it_is_the_plain_response(
+@given(SEEDS, st.integers(65, 100), st.integers(65, 100), st.integers(1, 30), st.sampled_from([3, 5, 8]))
+def test_the_response_is_that_of_the_sums_of_its_rectangles(
     seed: int, height: int, width: int, rounds: int, bits: int
 ) -> None:
-    """Also where sums leave 16 bits, as most of 8-bit grey do; but for the rounding of the leaves."""
     image = np.random.default_rng(seed).integers(0, 256, (height, width), dtype=np.uint8)
-    stumps = random_stumps(rounds, seed=seed, max_area_px=None)
-    rounding = np.abs(np.diff(stumps.leaves)).sum() / (32767 - rounds) * rounds / 2
-    ours, plain = response_at_even_pixels(image, stumps, grey_bits=bits), plain_response(image, stumps, bits)
-    np.testing.assert_allclose(ours, plain[::2, ::2], atol=rounding + 1e-5)
-    np.testing.assert_allclose(row_response(image, stumps, bits), plain, atol=1e-4)
+    stumps = random_stumps(rounds, seed=seed)
+    padded = np.pad(image.astype(np.int64) >> (8 - bits), MARGIN_PX, mode="reflect")
+    y, x = (at.item() + MARGIN_PX for at in np.random.default_rng(seed).integers(0, (height, width), 2)[:, None])
+    expected = 0.0
+    for k in range(rounds):
+        parts = stumps.rectangles[stumps.starts[k] : stumps.starts[k + 1]]
+        total = sum(sign * padded[y + y0 : y + y1, x + x0 : x + x1].sum() for sign, x0, y0, x1, y1 in parts)
+        expected += stumps.leaves[k, int(total > stumps.thresholds[k])]
+    response = dense_response(image, stumps, grey_bits=bits)
+    assert response[y - MARGIN_PX, x - MARGIN_PX] == pytest.approx(expected, abs=1e-4)
 
 
 def test_an_image_smaller_than_the_margin() -> None:
-    image = np.full((20, 31), 90, np.uint8)
-    assert response_at_even_pixels(image, random_stumps(5), grey_bits=5).shape == (10, 16)
-    assert dense_response(image, random_stumps(5)).shape == image.shape
+    assert dense_response(np.full((20, 31), 90, np.uint8), random_stumps(5)).shape == (20, 31)
 
 
 def test_without_rounds_the_response_is_zero() -> None:
     assert not dense_response(np.full((30, 40), 90, np.uint8), random_stumps(0)).any()
-
-
-@pytest.mark.parametrize("bits", [1, 5, 8])
-def test_grey_levels_are_quantised_to_their_upper_bits(bits: int) -> None:
-    image = np.arange(256, dtype=np.uint8).reshape(16, 16)
-    padded = quantise_and_pad(image, bits)
-    assert padded.shape == (16 + 128, 16 + 128)
-    assert padded[64:-64, 64:-64].tolist() == (image // 2 ** (8 - bits)).tolist()
 
 
 def smooth_noise(seed: int, shape: tuple[int, int] = (60, 80), sigma: float = 3.0) -> np.ndarray:
@@ -152,7 +148,7 @@ def parking(seed: int, cars: int = 12) -> LabelledImage:
 
 
 def test_it_detects_rectangles_and_their_axes_and_keeps_its_settings_in_its_record() -> None:
-    config = PaperConfig(rounds=20, feature_pool=100, response_sigma_px=2.0, min_region_px=20)
+    config = PaperConfig(rounds=80, feature_pool=300, response_sigma_px=2.0, min_region_px=20)
     detector = train_detector([parking(0)], config)
     assert (detector.record.response_sigma_px, detector.record.min_region_px) == (2.0, 20)
     sample = parking(1)

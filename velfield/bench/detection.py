@@ -1,27 +1,19 @@
-"""Speed of the detectors, each beside a plain implementation in the same run: read the ratios, not the times."""
+"""Speed of the network, beside another one's convolutions in the same run: read the ratio, not the times."""
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
-import cv2
 import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from velfield.compiled import kernel
 from velfield.detection.cnn.network import TOPOLOGY, DepthToSpace, Residual, SpaceToDepth, Topology
 from velfield.detection.detect import detect_frame
 from velfield.detection.interface import Detector
-from velfield.paper.boosting import draw_feature_pool
-from velfield.paper.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, dense_response, quantise_and_pad
-from velfield.paper.stumps import BoostedStumps
 from velfield.synthetic import small_flight
-
-_DENSE_ROUNDS = 200
-_NUMPY_ROUNDS = 10
 
 
 def _c2f(step: int, into: int, out: int, repeats: int) -> list[tuple[int, int, int, int]]:
@@ -60,90 +52,11 @@ class Speed:
         return f"{self.what}: {ours:.0f} ms; {self.peer}: {theirs:.0f} ms; {theirs / ours:.3g} times"
 
 
-def plain_response(image: NDArray[np.uint8], stumps: BoostedStumps, grey_bits: int = GREY_BITS) -> NDArray[np.float32]:
-    """The dense response by numpy slices, a rectangle at a time: the reference of `response_at_even_pixels`."""
-    padded = quantise_and_pad(image, grey_bits).astype(np.int32)
-    integral = np.pad(padded, ((1, 0), (1, 0))).cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32)
-    height, width = image.shape
-    out = np.zeros(image.shape, np.float32)
-
-    def corner(y: int, x: int) -> NDArray[np.int32]:
-        return integral[MARGIN_PX + y : MARGIN_PX + y + height, MARGIN_PX + x : MARGIN_PX + x + width]
-
-    for f in range(len(stumps)):
-        total = np.zeros(image.shape, np.int32)
-        for sign, x0, y0, x1, y1 in stumps.rectangles[stumps.starts[f] : stumps.starts[f + 1]]:
-            total += sign * (corner(y1, x1) - corner(y0, x1) - corner(y1, x0) + corner(y0, x0))
-        out += np.where(total > stumps.thresholds[f], stumps.leaves[f, 1], stumps.leaves[f, 0])
-    return out
-
-
-def row_response(image: NDArray[np.uint8], stumps: BoostedStumps, grey_bits: int = GREY_BITS) -> NDArray[np.float32]:
-    """The same at every pixel, whole rows at a time over one integral image of int32: the plain vectorised peer."""
-    integral = cv2.integral(quantise_and_pad(image, grey_bits), sdepth=cv2.CV_32S)
-    out = np.zeros(image.shape, np.float32)
-    _rows(np.ascontiguousarray(integral), stumps.rectangles, stumps.starts, stumps.thresholds, stumps.leaves, out)
-    return out
-
-
-@kernel
-def _rows(integral, rectangles, starts, thresholds, leaves, out) -> None:  # type: ignore[no-untyped-def]
-    height, width = out.shape
-    row = np.empty(width, np.int32)
-    for y in range(height):
-        response = out[y]
-        for f in range(len(thresholds)):
-            row[:] = 0
-            for r in range(starts[f], starts[f + 1]):
-                top = integral[y + MARGIN_PX + rectangles[r, 2]]
-                bottom = integral[y + MARGIN_PX + rectangles[r, 4]]
-                left, right = MARGIN_PX + rectangles[r, 1], MARGIN_PX + rectangles[r, 3]
-                a, b = bottom[right : right + width], bottom[left : left + width]
-                c, d = top[right : right + width], top[left : left + width]
-                if rectangles[r, 0] > 0:
-                    for x in range(width):
-                        row[x] += a[x] - b[x] - c[x] + d[x]
-                else:
-                    for x in range(width):
-                        row[x] -= a[x] - b[x] - c[x] + d[x]
-            threshold, low, high = thresholds[f], leaves[f, 0], leaves[f, 1]
-            for x in range(width):
-                response[x] += high if row[x] > threshold else low
-
-
-def random_stumps(rounds: int, *, seed: int = 1, max_area_px: int | None = MAX_AREA_PX) -> BoostedStumps:
-    """A classifier of the paper's shape, untrained: only its cost counts."""
-    rng = np.random.default_rng(seed)
-    pool = draw_feature_pool(
-        rounds,
-        channels=1,
-        sigma_xy_px=(10.0, 10.0),
-        reach_xy_px=(40, 40),
-        max_rectangles=5,
-        rng=rng,
-        max_area_px=max_area_px,
-    )
-    leaves = rng.normal(0, 1, (rounds, 2)).astype(np.float32)
-    return BoostedStumps(pool.table, pool.starts, pool.channels, np.zeros(rounds, np.float32), leaves)
-
-
 def city(width: int, height: int) -> NDArray[np.uint8]:
     """A frame of a simulated city, repeated to the size."""
     frame = small_flight(frames=1, seed=77).frame(0)
     times = -(-height // frame.shape[0]), -(-width // frame.shape[1])
     return np.ascontiguousarray(np.tile(frame, times)[:height, :width])
-
-
-def response_speed(image: NDArray[np.uint8]) -> tuple[Speed, Speed]:
-    """The paper's dense response against whole rows of int32 at every pixel; and numpy, whose rounds are fewer and
-    scaled up."""
-    stumps, few = random_stumps(_DENSE_ROUNDS), random_stumps(_NUMPY_ROUNDS)
-    what = f"dense response, {_DENSE_ROUNDS} rounds"
-    fast = _fastest(lambda: dense_response(image, stumps), 3)
-    rows = _fastest(lambda: row_response(image, stumps), 2)
-    ratio = len(stumps.rectangles) / len(few.rectangles)
-    slow = _fastest(lambda: plain_response(image, few), 1) * ratio
-    return Speed(what, "whole rows of int32", fast, rows), Speed(what, "numpy", fast, slow)
 
 
 def cnn_speed(image: NDArray[np.uint8], detector: Detector) -> Speed:

@@ -1,9 +1,9 @@
 """AdaBoost with decision stumps on integral-image features (Viola and Jones 2001; paper: car detection).
 
-A feature is a signed sum of random rectangles of one channel, as in integral channel features (Dollár 2009). Values are
-binned once, so that a round of boosting is a histogram for each feature. Each round searches a random subset of the
-features, and weights are trimmed (Friedman, Hastie and Tibshirani 2000). Hand-written: scikit-learn would be another
-dependency, and its AdaBoost sorts unbinned values for every stump.
+A feature is a signed sum of random rectangles, as in integral channel features (Dollár 2009). Values are binned once,
+so that a round of boosting is a histogram for each feature. Each round searches a random subset of the features, and
+weights are trimmed (Friedman, Hastie and Tibshirani 2000). Hand-written: scikit-learn would be another dependency, and
+its AdaBoost sorts unbinned values for every stump.
 """
 
 from dataclasses import dataclass
@@ -26,54 +26,41 @@ _TRIM_EVERY, _TRIMMED_WEIGHT = 10, 0.01
 
 @dataclass(frozen=True)
 class FeaturePool:
-    """Random features: for each a channel and some positive and negative rectangles.
+    """Random features: for each some positive and negative rectangles.
 
     Attributes
     ----------
     table : (r, 5) int32: sign, x0, y0, x1, y1 from the centre.
     starts : (features + 1,) int32: the rectangles of feature k are ``starts[k]:starts[k + 1]``.
-    channels : (features,) int32.
     """
 
     table: Int32s
     starts: Int32s
-    channels: Int32s
 
     def __len__(self) -> int:
-        return len(self.channels)
+        return len(self.starts) - 1
 
 
 def draw_feature_pool(
     count: int,
     *,
-    channels: int,
     sigma_xy_px: tuple[float, float],
     reach_xy_px: tuple[int, int],
     max_rectangles: int,
     rng: np.random.Generator,
-    max_area_px: int | None = None,
 ) -> FeaturePool:
-    """Draw features of 1 to ``max_rectangles`` rectangles of either sign, their corners Gaussian about the centre.
-
-    ``max_area_px`` bounds the summed area of the rectangles of one sign.
-    """
+    """Draw features of 1 to ``max_rectangles`` rectangles of either sign, their corners Gaussian about the centre."""
     table: list[tuple[int, int, int, int, int]] = []
-    starts, chosen = [0], []
-
-    def draw_rectangles(sign: int) -> list[tuple[int, int, int, int, int]]:
-        drawn = []
-        for _ in range(int(rng.integers(1, max_rectangles + 1))):
-            x0, x1 = _draw_interval(sigma_xy_px[0], reach_xy_px[0], rng)
-            y0, y1 = _draw_interval(sigma_xy_px[1], reach_xy_px[1], rng)
-            drawn.append((sign, x0, y0, x1, y1))
-        fits = max_area_px is None or sum((x1 - x0) * (y1 - y0) for _, x0, y0, x1, y1 in drawn) <= max_area_px
-        return drawn if fits else draw_rectangles(sign)
+    starts = [0]
 
     for _ in range(count):
-        table += draw_rectangles(1) + draw_rectangles(-1)
+        for sign in (1, -1):
+            for _ in range(int(rng.integers(1, max_rectangles + 1))):
+                x0, x1 = _draw_interval(sigma_xy_px[0], reach_xy_px[0], rng)
+                y0, y1 = _draw_interval(sigma_xy_px[1], reach_xy_px[1], rng)
+                table.append((sign, x0, y0, x1, y1))
         starts.append(len(table))
-        chosen.append(int(rng.integers(channels)))
-    return FeaturePool(np.array(table, np.int32), np.array(starts, np.int32), np.array(chosen, np.int32))
+    return FeaturePool(np.array(table, np.int32).reshape(-1, 5), np.array(starts, np.int32))
 
 
 def _draw_interval(sigma: float, reach: int, rng: np.random.Generator) -> tuple[int, int]:
@@ -170,21 +157,9 @@ def quantile_bin_edges(values: Float32Array) -> Float32Array:
     return np.asarray(np.quantile(values, np.linspace(0, 1, N_BINS + 1)[1:-1], axis=1).T, np.float32)
 
 
-@kernel
 def assign_bins(values: Float32Array, edges: Float32Array) -> ByteArray:
     """(features, samples) uint8 bins of values (features, samples)."""
-    bins = np.empty(values.shape, np.uint8)
-    for f in range(values.shape[0]):
-        for k in range(values.shape[1]):
-            low, high = 0, edges.shape[1]
-            while low < high:
-                middle = (low + high) // 2
-                if edges[f, middle] < values[f, k]:
-                    low = middle + 1
-                else:
-                    high = middle
-            bins[f, k] = low
-    return bins
+    return np.stack([np.searchsorted(*one) for one in zip(edges, values, strict=True)]).astype(np.uint8)
 
 
 @kernel
@@ -222,7 +197,7 @@ def rounds_from_stumps(pool: FeaturePool, stumps: StumpSelection) -> tuple[Round
         rows = pool.table[pool.starts[feature] : pool.starts[feature + 1]]
         names = ("sign", "x0", "y0", "x1", "y1")
         fields = {
-            "channel": int(pool.channels[feature]),
+            "channel": 0,
             "rectangles": [dict(zip(names, map(int, row), strict=True)) for row in rows],
             "threshold": float(threshold),
             "leaf_low": float(low),

@@ -22,15 +22,12 @@ class BoostedStumps:
         (r, 5) int32: sign, x0, y0, x1, y1 from the centre.
     starts
         (rounds + 1,) int32: the rectangles of round k are ``starts[k]:starts[k + 1]``.
-    channels
-        (rounds,) int32.
     thresholds, leaves
         (rounds,) and (rounds, 2) float32: what a round adds to the score at or below its threshold, and above.
     """
 
     rectangles: Int32s
     starts: Int32s
-    channels: Int32s
     thresholds: Float32Array
     leaves: Float32Array
 
@@ -42,7 +39,6 @@ class BoostedStumps:
         return cls(
             rectangles=np.array(table, np.int32).reshape(-1, 5),
             starts=starts.astype(np.int32),
-            channels=np.array([one.channel for one in rounds], np.int32),
             thresholds=np.array([one.threshold for one in rounds], np.float32),
             leaves=np.array([(one.leaf_low, one.leaf_high) for one in rounds], np.float32),
         )

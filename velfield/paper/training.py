@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from schemas.arrays import FloatArray, GreyImage, IntArray, Mask
 from schemas.detector import PaperConfig, PaperRecord
-from velfield.compiled import kernel
 from velfield.detection.samples import LabelledImage
 from velfield.paper.boosting import (
     FeaturePool,
@@ -18,7 +17,7 @@ from velfield.paper.boosting import (
     quantile_bin_edges,
     rounds_from_stumps,
 )
-from velfield.paper.response import GREY_BITS, MARGIN_PX, MAX_AREA_PX, dense_response, quantise_and_pad
+from velfield.paper.response import GREY_BITS, MARGIN_PX, dense_response, padded_integral
 from velfield.paper.stumps import BoostedStumps
 
 _REACH_PX = 40
@@ -33,12 +32,10 @@ def train_paper(samples: Sequence[LabelledImage], config: PaperConfig) -> PaperR
     rng = np.random.default_rng(config.seed)
     pool = draw_feature_pool(
         config.feature_pool,
-        channels=1,
         sigma_xy_px=(config.corner_sigma_px, config.corner_sigma_px),
         reach_xy_px=(_REACH_PX, _REACH_PX),
         max_rectangles=config.max_rectangles,
         rng=rng,
-        max_area_px=MAX_AREA_PX,
     )
     values, is_car = [], []
     for sample in samples:
@@ -84,20 +81,20 @@ def _sample_pixels(
     return np.concatenate([cars, others])[:, ::-1], np.arange(len(cars) + len(others)) < len(cars)
 
 
-@kernel
 def _distance_to_nearest(height: int, width: int, cars: FloatArray) -> FloatArray:
+    """Distance (h, w) to the nearest car, px; infinite beyond 32 px."""
     out = np.full((height, width), np.inf)
-    for k in range(len(cars)):
-        for y in range(max(0, int(cars[k, 1]) - 32), min(height, int(cars[k, 1]) + 33)):
-            for x in range(max(0, int(cars[k, 0]) - 32), min(width, int(cars[k, 0]) + 33)):
-                out[y, x] = min(out[y, x], np.hypot(x - cars[k, 0], y - cars[k, 1]))
+    for x, y in cars:
+        rows, columns = (slice(max(0, int(at) - 32), max(0, int(at) + 33)) for at in (y, x))
+        part = out[rows, columns]
+        down, along = np.ogrid[rows.start : rows.start + part.shape[0], columns.start : columns.start + part.shape[1]]
+        np.minimum(part, np.hypot(along - x, down - y), out=part)
     return out
 
 
 def _feature_values(image: GreyImage, xy: IntArray, pool: FeaturePool) -> NDArray[np.int32]:
     """Values (n, features) of all features at pixels (n, 2)."""
-    padded = quantise_and_pad(image, GREY_BITS).astype(np.int32)
-    integral = np.pad(padded, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
+    integral = padded_integral(image, GREY_BITS)
     x, y = xy[:, 0] + MARGIN_PX, xy[:, 1] + MARGIN_PX
     out = np.zeros((len(xy), len(pool)), np.int32)
     for f in range(len(pool)):

@@ -13,8 +13,8 @@ from flows.options import parse_frame_size
 if TYPE_CHECKING:
     from velfield.pipeline.plan import Plan
 
-Part = Literal["stages", "network", "peers", "paper", "workers", "job", "clips"]
-PARTS: tuple[Part, ...] = ("stages", "network", "peers", "paper", "workers", "job", "clips")
+Part = Literal["stages", "network", "peers", "workers", "job", "clips"]
+PARTS: tuple[Part, ...] = ("stages", "network", "peers", "workers", "job", "clips")
 
 
 def peak_memory_bytes() -> int:
@@ -56,10 +56,10 @@ def speed(
         best, fast or paper.
     parts
         Parts to measure: `stages` on one core; the `network` against the machine's peak; `peers` (stabilo, trackpy,
-        boost-histogram and xhistogram, where `make bench` installed them, and convolutions of YOLOv8n's sizes); the
-        `paper`'s chain read literally; two `workers` against one; the whole `job` by `velfield run --workers 2`, with
-        the memory of driver and workers; `clips` of 1080p and 4K with nothing given, as many frames at 30 a second.
-        All but `network` and `clips` follow on the stages.
+        boost-histogram and xhistogram, where `make bench` installed them, and convolutions of YOLOv8n's sizes); two
+        `workers` against one; the whole `job` by `velfield run --workers 2`, with the memory of driver and workers;
+        `clips` of 1080p and 4K with nothing given, as many frames at 30 a second. All but `network` and `clips` follow
+        on the stages.
     work
         Folder for flight and runs, kept; a flight that is there is used again. Default: a temporary one.
     """
@@ -82,8 +82,6 @@ def speed(
             _time_network(width, height)
         if "peers" in parts:
             _time_peers(plan, flight, seconds)
-        if "paper" in parts:
-            _time_paper(flight, root / "run-literal", sum(seconds[name] for name in stages_by_frame()) / frames)
         if "workers" in parts:
             _time_workers(plan)
         if "job" in parts:
@@ -162,12 +160,6 @@ def _time_peers(plan: "Plan", flight: Path, seconds: dict[str, float]) -> None:
             print("\n".join(peer()))
         except InputError as error:
             print(error)
-
-
-def _time_paper(flight: Path, root: Path, ours_s: float) -> None:
-    from velfield.bench.literal import time_literal_chain
-
-    print("\n".join(time_literal_chain(flight, root, stages_by_frame()).text(ours_s)))
 
 
 def _time_workers(plan: "Plan") -> None:
