@@ -38,7 +38,6 @@ def test_the_peak_hour_is_the_busiest_one() -> None:
 
 
 def test_the_workbook_holds_the_counts(analysis: TrafficAnalysis) -> None:
-    pytest.importorskip("xlsxwriter")
     data = turning_workbook(analysis)
     with zipfile.ZipFile(io.BytesIO(data)) as book:
         names = re.findall(r'sheet name="([^"]+)"', book.read("xl/workbook.xml").decode())
@@ -52,7 +51,6 @@ def test_the_workbook_holds_the_counts(analysis: TrafficAnalysis) -> None:
 def test_no_junction_is_one_line() -> None:
     from tests.analysis.test_traffic_analysis import drive, gather
 
-    pytest.importorskip("xlsxwriter")
     alone = TrafficAnalysis(gather([drive(np.array([[0.0, 10.0], [100.0, 10.0]]), 0.0)]))
     with pytest.raises(InputError, match="no junction with movements was found"):
         turning_workbook(alone)

@@ -14,7 +14,6 @@ from schemas.records import CommitRecord
 from tests.analysis.test_traffic_analysis import crossroads
 from tests.field_runs import field_run, tracklets_along
 from velfield.errors import InputError
-from velfield.pipeline.analysis.workbook import can_write_workbook
 from velfield.pipeline.given_tracks.load import MARGIN_M
 from velfield.run.commits import sealed_json, write_atomically, write_commit
 from velfield.run.flight_record import read_flight_record
@@ -57,7 +56,6 @@ def test_the_report_says_where_data_is_too_little(folder: Path) -> None:
     assert "Highway Capacity Manual" in text
 
 
-@pytest.mark.skipif(not can_write_workbook(), reason="needs the extra velfield[excel]")
 def test_the_workbook_has_a_sheet_a_table(folder: Path) -> None:
     record = AnalysisRecord.model_validate_json((folder / "analysis.json").read_text())
     with zipfile.ZipFile(folder / "analysis.xlsx") as book:

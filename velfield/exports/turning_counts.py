@@ -2,11 +2,11 @@
 
 import io
 from datetime import datetime
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xlsxwriter
 from numpy.lib.stride_tricks import sliding_window_view
 
 from schemas.arrays import IntArray
@@ -29,17 +29,13 @@ def encode(run: Run, _path: Path, _options: ExportOptions) -> bytes:
     Raises
     ------
     InputError
-        The extra ``excel`` is not installed, or no junction was found.
+        No junction was found.
     """
-    if find_spec("xlsxwriter") is None:
-        raise InputError("the workbook needs xlsxwriter; pip install 'velfield[excel]'")
     return turning_workbook(run.analysis.traffic)
 
 
 def turning_workbook(analysis: TrafficAnalysis) -> bytes:
     """The workbook of all junctions at which movements were found."""
-    import xlsxwriter
-
     junctions = [m for m in analysis.movements if m.movements]
     if not junctions:
         raise InputError("no junction with movements was found, so there are no turning counts")

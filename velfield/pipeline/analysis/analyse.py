@@ -20,7 +20,7 @@ from velfield.exports.georeference import Georeference
 from velfield.pipeline.analysis.clips import Frames, unusual_clips
 from velfield.pipeline.analysis.lanes_record import lanes_geojson, lanes_record
 from velfield.pipeline.analysis.tables import all_tables
-from velfield.pipeline.analysis.workbook import EXTRA, can_write_workbook, workbook_bytes
+from velfield.pipeline.analysis.workbook import workbook_bytes
 from velfield.pipeline.given_tracks.load import load_tracks
 from velfield.report.traffic.diagrams import traffic_diagrams
 from velfield.report.traffic.first_page import first_page
@@ -174,11 +174,8 @@ def write_analysis(
     write_atomically(out / "report.html", report_html(record, page, diagrams, clips).encode())
     write_atomically(out / "report.pdf", report_pdf(record, page, diagrams))
     yield f"report      {out / 'report.html'}; to print: {out / 'report.pdf'}"
-    if can_write_workbook():
-        write_atomically(out / "analysis.xlsx", workbook_bytes(record))
-        yield f"workbook    {out / 'analysis.xlsx'}"
-    else:
-        yield f"workbook    not written: pip install '{EXTRA}'"
+    write_atomically(out / "analysis.xlsx", workbook_bytes(record))
+    yield f"workbook    {out / 'analysis.xlsx'}"
 
 
 def answer_lines(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iterator[str]:

@@ -1,22 +1,14 @@
 """The tables as an Excel workbook: a sheet a table, an estimate in four columns."""
 
 import io
-from importlib.util import find_spec
+
+import xlsxwriter
 
 from schemas.analysis import AnalysisRecord, AnalysisTable, EstimateRecord
-
-EXTRA = "velfield[excel]"
-
-
-def can_write_workbook() -> bool:
-    """Whether the library is installed (the extra ``excel``)."""
-    return find_spec("xlsxwriter") is not None
 
 
 def workbook_bytes(record: AnalysisRecord) -> bytes:
     """The file's content."""
-    import xlsxwriter
-
     buffer = io.BytesIO()
     book = xlsxwriter.Workbook(buffer, {"in_memory": True})
     bold, wrapped = book.add_format({"bold": True}), book.add_format({"text_wrap": True})
