@@ -17,11 +17,9 @@ class Flight:
         self.tracklets: list[dict[str, float]] = []
         self.detections: list[dict[str, float]] = []
 
-    def add(
-        self, track: int, x_m: np.ndarray, y_m: float, axis_rad: float = 0.0, sd_px: float = 0.3, score: float = 0.3
-    ) -> None:
+    def add(self, track: int, x_m: np.ndarray, y_m: float, axis_rad: float = 0.0, sd_px: float = 0.3) -> None:
         ids = track * 1000 + np.arange(len(x_m))
-        self.detections += [{"detection_id": one, "orientation_rad": axis_rad, "score": score} for one in ids]
+        self.detections += [{"detection_id": one, "orientation_rad": axis_rad, "score": 0.3} for one in ids]
         for k in range(len(x_m) - 2):
             row: dict[str, float] = {"track_id": track, "displacement_sd_01_px": sd_px, "displacement_sd_12_px": sd_px}
             for j in range(3):
@@ -85,28 +83,6 @@ def test_a_small_displacement_counts_where_it_is_certain(step_m: float, frames: 
     made = Flight()
     made.add(1, step_m * np.arange(frames), 10.0, sd_px=sd_px)
     assert made.find()["state"].tolist() == [state]
-
-
-@pytest.mark.parametrize(
-    ("y_m", "score", "traffic", "doubtful"),
-    [
-        (80.0, 0.1, 10, True),  # on a roof
-        (80.0, 0.2, 10, False),  # it looks like a car
-        (57.0, 0.1, 10, False),  # beside the road
-        (94.0, 0.1, 10, False),  # beside a car of a higher score
-        (50.3, 0.1, 10, False),  # it waits in the lane
-        (80.0, 0.1, 9, False),  # too few vehicles to compare with
-    ],
-)
-def test_what_stands_far_from_traffic_with_a_low_score_is_doubtful(
-    y_m: float, score: float, traffic: int, doubtful: bool
-) -> None:
-    made = Flight()
-    for track in range(traffic):
-        made.add(track, 20 + 2.0 * np.arange(21), 50.0)
-    made.add(50, standing(40.0), 98.0)
-    made.add(51, standing(40.0), y_m, score=score)
-    assert made.find()["doubtful"].tolist() == [False] * (traffic + 1) + [doubtful]
 
 
 def test_a_row_tells_when_and_where() -> None:

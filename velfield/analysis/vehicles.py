@@ -1,41 +1,29 @@
 """Vehicles: one row a track, and whether it is part of the traffic.
 
-A detector finds parked cars as well as those that drive, and things on roofs that stand as still as they do. The
-traffic distinguishes both from a car that waits: where vehicles drive along its axis, ahead of it, behind it or over
-its place at another time, it stands in a lane. Of the rest, those far from where anything drove, and from likelier
-vehicles, whose scores are low beside those of this flight's traffic are doubtful: roof gear, sheds, shadows.
+A detector finds parked cars as well as those that drive. The traffic distinguishes them from a car that waits: where
+vehicles drive along its axis, ahead of it, behind it or over its place at another time, it stands in a lane.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy.spatial import cKDTree
 
 from schemas.arrays import FloatArray, IntArray, Mask
 from schemas.flight import STATIONARY_SPEED_M_PER_S, assumed_gsd_m
+from velfield.tracking.doubtful import MOVED_M, end_means
 
 STATES = ("moving", "stopped", "parked")
 """``moving``: at some time; ``stopped``: never, but in a lane that others drive; ``parked``: never, and in none, or no
 vehicle at all."""
-_MOVED_M = 2.0
-"""A displacement of half a car's length is no error of its position."""
 _MOVED_SIGMAS = 4.0
 """A shorter one counts where it is so many standard deviations, at more than a stationary vehicle's speed."""
-_ENDS = 3
-"""Positions averaged at each end of a track, where it has twice as many; of a shorter one fewer."""
 _CELL_M, _SECTOR_RAD = 0.5, np.pi / 12
 """Sides of the cells and sectors of axial direction in which driven lanes are noted."""
 _REACH_M, _HALF_WIDTH_M = 8.0, 1.0
 """A lane is looked for so far ahead and behind, and to either side: parked cars stand 2 m and more beside it."""
 _DRIVEN_FRACTION = 0.4
 """Minimum fraction of that length that others drove, for a stationary vehicle to be in a lane."""
-_ROAD_M = 10.0
-"""Nearer than this to where others drove a standing vehicle is not doubted: it stands at the kerb or in a drive."""
-_ROW_M = 6.0
-"""Nor one so near to another of a higher score: in a row of parked cars, or a second detection of one."""
-_DOUBTFUL_SCORE, _MIN_TRAFFIC = 0.5, 10
-"""Scores below this fraction of the median score of the traffic are doubtful; fewer vehicles in it give no median."""
 
 
 VEHICLE_COLUMNS = (
@@ -63,9 +51,7 @@ def find_vehicles(tracklets: pd.DataFrame, detections: pd.DataFrame, *, gsd_m: f
     DataFrame
         ``track_id, first_frame, last_frame, first_time_s, last_time_s, detections`` (their number), ``x_px, y_px``
         (median position), ``orientation_rad`` (axial, NaN where unknown), ``displacement_m`` (from the first positions
-        to the last), ``state`` (of `STATES`), ``score`` (mean of its detections), ``doubtful`` (bool: parked,
-        10 m or more from where anything drove and 6 m from vehicles of higher scores, with a score below half the
-        median of the traffic); by ``track_id``.
+        to the last), ``state`` (of `STATES`), ``score`` (mean of its detections); by ``track_id``.
     """
     metres = assumed_gsd_m(gsd_m)
     positions = _track_positions(tracklets, detections)
@@ -82,34 +68,20 @@ def find_vehicles(tracklets: pd.DataFrame, detections: pd.DataFrame, *, gsd_m: f
         sin=("sin", "mean"),
         score=("score", "mean"),
     ).reset_index()
-    between = (_mean_of_ends(positions, last=True) - _mean_of_ends(positions, last=False)).to_numpy(np.float64)
+    between = (end_means(positions, last=True) - end_means(positions, last=False)).to_numpy(np.float64)
     displacement_m = np.hypot(between[:, 1], between[:, 2]) * metres
     sd_m = _position_sd_px(tracklets, table["track_id"].to_numpy()) * metres
     speed = displacement_m / np.maximum(between[:, 0], 1e-9)
     surely = (displacement_m > _MOVED_SIGMAS * sd_m) & (speed > STATIONARY_SPEED_M_PER_S)
-    moving = (displacement_m > _MOVED_M) | surely
+    moving = (displacement_m > MOVED_M) | surely
     axis = np.mod(np.arctan2(table["sin"].to_numpy(np.float64), table["cos"].to_numpy(np.float64)) / 2, np.pi)
     driven = _DrivenLanes.of(tracklets[np.isin(tracklets["track_id"], table["track_id"][moving])], metres)
     lane = driven.along(table.loc[~moving, ["x_px", "y_px"]].to_numpy(np.float64) * metres, axis[~moving])
     state = np.full(len(table), STATES[0], object)
     state[~moving] = np.where(lane >= _DRIVEN_FRACTION, STATES[1], STATES[2])
-    doubtful = _find_doubtful(table, positions, state != STATES[2], metres)
     return table.drop(columns=["cos", "sin"]).assign(
-        orientation_rad=axis, displacement_m=displacement_m, state=pd.Categorical(state, STATES), doubtful=doubtful
+        orientation_rad=axis, displacement_m=displacement_m, state=pd.Categorical(state, STATES)
     )
-
-
-def _find_doubtful(table: pd.DataFrame, positions: pd.DataFrame, in_traffic: Mask, metres: float) -> Mask:
-    """Which vehicles (n,) of `find_vehicles` stand far from all traffic and from likely vehicles, with a low score."""
-    if in_traffic.sum() < _MIN_TRAFFIC:
-        return np.zeros(len(table), bool)
-    score, xy_m = table["score"].to_numpy(), table[["x_px", "y_px"]].to_numpy(np.float64) * metres
-    low = score < _DOUBTFUL_SCORE * float(np.median(score[in_traffic]))
-    driven = positions.loc[positions["track_id"].isin(table["track_id"][in_traffic]), ["x_px", "y_px"]]
-    cells = np.unique(np.rint(driven.to_numpy(np.float64) * metres), axis=0)  # of 1 m: they are many of a long flight
-    far = cKDTree(cells).query(xy_m)[0] >= _ROAD_M
-    alone = cKDTree(xy_m[~low]).query(xy_m)[0] >= _ROW_M
-    return np.asarray(~in_traffic & low & far & alone)
 
 
 def _track_positions(tracklets: pd.DataFrame, detections: pd.DataFrame) -> pd.DataFrame:
@@ -125,14 +97,6 @@ def _track_positions(tracklets: pd.DataFrame, detections: pd.DataFrame) -> pd.Da
     seen = detections.set_index("detection_id")[["orientation_rad", "score"]].reindex(positions["detection_id"])
     doubled = 2 * seen["orientation_rad"].to_numpy()
     return positions.assign(cos=np.cos(doubled), sin=np.sin(doubled), score=seen["score"].to_numpy(np.float64))
-
-
-def _mean_of_ends(positions: pd.DataFrame, *, last: bool) -> pd.DataFrame:
-    """Mean ``time_s, x_px, y_px`` of the first or last positions of each track, by ``track_id``."""
-    groups = positions.groupby("track_id")
-    rank, size = groups.cumcount(ascending=not last), groups["frame"].transform("size")
-    ends = positions[rank < np.clip(size // 2, 1, _ENDS)]
-    return pd.DataFrame(ends.groupby("track_id")[["time_s", "x_px", "y_px"]].mean())
 
 
 def _position_sd_px(tracklets: pd.DataFrame, ids: IntArray) -> FloatArray:

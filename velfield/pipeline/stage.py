@@ -276,7 +276,7 @@ STAGES: tuple[Stage, ...] = (
     # Tracklets of all units that belong to one vehicle.
     Stage(
         name="tracks",
-        version=13,
+        version=14,
         label="tracks",
         lines=(
             Line(

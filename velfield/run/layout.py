@@ -179,6 +179,8 @@ class RunLayout:
     """Dimensions of the vehicles, a row a track."""
     track_positions = _Inside("tracks/positions")
     """Where each track's vehicle was in each frame, by unit."""
+    doubtful = _Inside("tracks/doubtful")
+    """Tracklets of doubtful tracks, by unit: what is probably no vehicle is in none of the other tables of tracks."""
     joins = _Inside("tracks/joins.parquet")
     """Joins of tracks over a gap, with their probabilities."""
     tracklets = _Inside("tracklets")

@@ -1,6 +1,6 @@
 """`open_run`: one object over a run folder, the Python side of the contract of outputs."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
 
@@ -191,13 +191,16 @@ class Run:
         return transformed
 
     def detections(self) -> pd.DataFrame:
-        """All detections, in base pixels: the columns of ``schemas.tables.DETECTION_COLUMNS``.
+        """Detections, in base pixels: the columns of ``schemas.tables.DETECTION_COLUMNS``.
 
-        Candidates below the score threshold are among them where a track confirms them.
+        Candidates below the score threshold are among them where a track confirms them. Those of doubtful tracks
+        (`vehicles`) are not.
         """
-        return self._detections(list(DETECTION_COLUMNS))
+        found = self._all_detections(list(DETECTION_COLUMNS))
+        doubtful = self._tracklets_of(self.layout.doubtful, [f"detection_id_{k}" for k in range(3)])
+        return found[~found["detection_id"].isin(np.unique(doubtful.to_numpy()))].reset_index(drop=True)
 
-    def _detections(self, names: list[str]) -> pd.DataFrame:
+    def _all_detections(self, names: list[str]) -> pd.DataFrame:
         self.require_frames()
         sure, weak = (
             read_tables(sorted(folder.glob("unit-*.parquet")), DETECTION_COLUMNS, only=names)
@@ -210,22 +213,25 @@ class Run:
 
     def tracklets(self) -> pd.DataFrame:
         """All tracklets, in base pixels: the columns of ``schemas.tables.TRACK_COLUMNS``."""
-        self.require_frames()
-        return read_tables(sorted(self.layout.tracks.glob("unit-*.parquet")), TRACK_COLUMNS)
+        return self._tracklets_of(self.layout.tracks, TRACK_COLUMNS)
 
-    def _tracklet_columns(self, names: Sequence[str]) -> pd.DataFrame:
-        """Some columns of all tracklets: all of them are much, of a long flight."""
+    def _tracklets_of(self, folder: Path, names: Iterable[str]) -> pd.DataFrame:
+        """Some columns of the tracklets in a folder: all of them are much, of a long flight."""
         self.require_frames()
-        return read_tables(sorted(self.layout.tracks.glob("unit-*.parquet")), TRACK_COLUMNS, only=list(names))
+        return read_tables(sorted(folder.glob("unit-*.parquet")), TRACK_COLUMNS, only=list(names))
 
     def vehicles(self) -> pd.DataFrame:
         """One row a track: when and where, its length, width and class, whether it moves, waits in a lane or is
         parked, and whether it is doubtful: `find_vehicles`, `add_dimensions`.
+
+        Doubtful things stand far from vehicles, with a low score (`velfield.tracking.doubtful`); no other table has
+        them.
         """
         gsd_m = self.grid.gsd_m
-        tracklets = self._tracklet_columns(VEHICLE_COLUMNS)
-        seen = self._detections(["detection_id", "orientation_rad", "score"])
-        vehicles = find_vehicles(tracklets, seen, gsd_m=gsd_m)
+        parts = [self._tracklets_of(folder, VEHICLE_COLUMNS) for folder in (self.layout.tracks, self.layout.doubtful)]
+        seen = self._all_detections(["detection_id", "orientation_rad", "score"])
+        vehicles = find_vehicles(pd.concat(parts, ignore_index=True), seen, gsd_m=gsd_m)
+        vehicles = vehicles.assign(doubtful=vehicles["track_id"].isin(parts[1]["track_id"]))
         return add_dimensions(vehicles, self._dimensions(), gsd_m)
 
     def _dimensions(self) -> pd.DataFrame:
@@ -248,7 +254,9 @@ class Run:
     def segments(self) -> Segments:
         """Vehicles from one frame to the next, each once: by track and time (`velfield.field.segments`)."""
         config = self.record.config.field.model_copy(update=_EACH_ONCE)
-        return segment_table(self._tracklet_columns(SEGMENT_COLUMNS), config)  # unnamed, so that it is soon free
+        return segment_table(
+            self._tracklets_of(self.layout.tracks, SEGMENT_COLUMNS), config
+        )  # unnamed, so that it is soon free
 
     def crossings(self, start_xy: tuple[float, float], end_xy: tuple[float, float]) -> pd.DataFrame:
         """Crossings of the line between two base pixels by vehicles: `find_crossings`."""

@@ -222,12 +222,14 @@ def rebase_detections(plan: Plan, frames: range, rebase: Rebase) -> StageResult:
 def rebase_tracks(plan: Plan, rebase: Rebase) -> StageResult:
     """Map all tracklets, unit by unit."""
     transform, written, tracks, count = polyprojective_from_record(rebase.record.transform), [], set[int](), 0
-    for source in sorted(rebase.old.tracks.glob("unit-*.parquet")):
-        table = map_tracklets(read_tables([source], TRACKLET_COLUMNS | {"recovered": "bool"}), transform)
-        written.append(plan.layout.tracks / source.name)
-        write_tracks(written[-1], table)
-        tracks.update(table["track_id"].unique().tolist())
-        count += len(table)
+    for old, new in ((rebase.old.tracks, plan.layout.tracks), (rebase.old.doubtful, plan.layout.doubtful)):
+        for source in sorted(old.glob("unit-*.parquet")):
+            table = map_tracklets(read_tables([source], TRACKLET_COLUMNS | {"recovered": "bool"}), transform)
+            written.append(new / source.name)
+            write_tracks(written[-1], table)
+            if old == rebase.old.tracks:
+                tracks.update(table["track_id"].unique().tolist())
+                count += len(table)
     for source in sorted(rebase.old.track_positions.glob("unit-*.parquet")):
         table = read_tables([source], TRACK_POSITION_COLUMNS)
         table[["x_px", "y_px"]] = transform(table[["x_px", "y_px"]].to_numpy(np.float64))

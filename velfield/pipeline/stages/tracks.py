@@ -26,7 +26,6 @@ from velfield.pipeline.stages.tracklets import (
     tracklet_files,
 )
 from velfield.run.frame_transforms import FrameTransforms, read_tracking_gsd
-from velfield.run.layout import RunLayout
 from velfield.run.stores import open_frames
 from velfield.run.tables import empty_table, read_arrays, read_tables, write_table, write_tracks
 from velfield.tracking.association import LinkedTriples, tracklet_table, window_frames
@@ -36,6 +35,7 @@ from velfield.tracking.dimensions import (
     sample_tracks,
 )
 from velfield.tracking.doubles import find_doubles, find_split_tracks
+from velfield.tracking.doubtful import find_doubtful
 from velfield.tracking.gates import Limits, triples_pass
 from velfield.tracking.join_costs import GapLimits, TrackEnds
 from velfield.tracking.joins import END_COLUMNS, EndContext, assign_tracks, find_ends
@@ -70,7 +70,7 @@ def chain_tracks(plan: Plan) -> StageResult:
     sources, layout = tracklet_files(plan), plan.layout
     tracklets = read_tables(sources, TRACKLET_COLUMNS, only=[*_IDS, *_MIDDLE, *END_COLUMNS])
     ids, chain = np.unique(assign_tracks(tracklets[_IDS].to_numpy(np.int64)), return_inverse=True)
-    strips = sum_strips(layout, tracklets.assign(track_id=ids[chain]), len(plan.units))
+    strips = sum_strips(plan, tracklets.assign(track_id=ids[chain]))
     gsd_m = assumed_gsd_m(read_tracking_gsd(layout))
     starts, ends = find_ends(tracklets, chain, len(ids), gsd_m)
     candidates = read_candidates(plan, tracklets, gsd_m)
@@ -86,31 +86,34 @@ def chain_tracks(plan: Plan) -> StageResult:
         found = replace(found, tracks=_rename_parts(found.tracks, whole), joins=_join_parts(found.joins, whole))
     doubles = find_doubles(positions, mean_grey(strips, found.tracks), gsd_m)
     positions = _without(positions, doubles)
+    doubtful = find_doubtful(positions[positions["source"] < 2], mean_scores(plan, positions), gsd_m)
+    positions = _without(positions, doubtful)
     images = images_of_tracks(strips, found.tracks)
     del strips
     triples = find_triples(positions, flight, plan.config.tracking.max_interval_s)
     track = found.tracks[chain]
-    output = _Output(plan, first_frame, track, positions, flight, triples, np.unique(triples.ids), doubles)
+    output = _Output(plan, first_frame, track, positions, flight, triples, np.unique(triples.ids), doubles, doubtful)
     count = min(usable_processors(), _AT_ONCE, len(plan.units))
     runs = np.array_split(np.arange(len(plan.units)), max(count, 1))
     parts = parallel_map(output.write, [run for run in runs if len(run)])
     written, recovered = [path for paths, _ in parts for path in paths], sum(number for _, number in parts)
-    for folder in (layout.tracks, layout.track_positions):
+    for folder in (layout.tracks, layout.track_positions, layout.doubtful):
         for stale in set(folder.glob("unit-*.parquet")) - set(written):
             stale.unlink()  # of an earlier plan with more units
     for path, table, columns in (
         (layout.dimensions, measure_tracks(images), DIMENSION_COLUMNS),
         (layout.joins, found.joins, JOIN_COLUMNS),
     ):
-        write_table(path, _without(table, doubles), columns)
+        write_table(path, _without(table, np.concatenate([doubles, doubtful])), columns)
         written.append(path)
     advance("tracks")
     warnings = [] if len(track) else [explain_no_tracklets(plan)]
-    kept = track[~among(track, doubles)]
+    kept = track[~among(track, doubles) & ~among(track, doubtful)]
     counts = {
         "tracklets": float(len(kept) + recovered),
         "recovered": float(recovered),
         "tracks": float(len(np.unique(kept))),
+        "doubtful": float(len(doubtful)),
     }
     return StageResult(written, counts, warnings=warnings)
 
@@ -132,7 +135,6 @@ def _without(table: pd.DataFrame, doubles: IntArray) -> pd.DataFrame:
 
 def read_candidates(plan: Plan, tracklets: pd.DataFrame, metres: float) -> Candidates:
     """Detections in no tracklet, and weak candidates, of the whole flight."""
-    layout = plan.layout
     names = ["detection_id", "frame", "time_s", "x_px", "y_px", "orientation_rad"]
     used = np.unique(tracklets[_IDS].to_numpy(np.int64))
 
@@ -140,12 +142,7 @@ def read_candidates(plan: Plan, tracklets: pd.DataFrame, metres: float) -> Candi
         table = read_tables([path], DETECTION_COLUMNS, only=names)
         return table[~among(table["detection_id"].to_numpy(np.int64), used)]
 
-    paths = [
-        layout.unit_file(folder, unit)
-        for unit in range(len(plan.units))
-        for folder in (layout.detections, layout.weak_detections)
-    ]
-    parts = parallel_map(read, [path for path in paths if path.exists()], at_most=_AT_ONCE)
+    parts = parallel_map(read, _detection_files(plan), at_most=_AT_ONCE)
     table = pd.concat(parts) if parts else empty_table({name: DETECTION_COLUMNS[name] for name in names})
     table = table.sort_values(["frame", "detection_id"], ignore_index=True)
     return Candidates(
@@ -155,6 +152,30 @@ def read_candidates(plan: Plan, tracklets: pd.DataFrame, metres: float) -> Candi
         position_m=table[["x_px", "y_px"]].to_numpy(np.float64) * metres,
         axis_rad=table["orientation_rad"].to_numpy(np.float64),
     )
+
+
+def mean_scores(plan: Plan, positions: pd.DataFrame) -> pd.Series:
+    """Mean score of the detections of each track, by ``track_id``."""
+    seen = positions.loc[positions["source"] < 2, ["track_id", "detection_id"]].sort_values("detection_id")
+    ids, track = seen["detection_id"].to_numpy(np.int64), seen["track_id"].to_numpy(np.int64)
+
+    def read(path: Path) -> pd.DataFrame:
+        table = read_tables([path], DETECTION_COLUMNS, only=["detection_id", "score"])
+        table = table[among(table["detection_id"].to_numpy(np.int64), ids)]
+        of_track = track[np.searchsorted(ids, table["detection_id"].to_numpy(np.int64))]
+        return table["score"].astype(np.float64).groupby(of_track).agg(["sum", "size"])
+
+    sums = parallel_map(read, _detection_files(plan), at_most=_AT_ONCE)
+    total = pd.concat(sums).groupby(level=0).sum() if sums else pd.DataFrame({"sum": [], "size": []})
+    return total["sum"] / total["size"]
+
+
+def _detection_files(plan: Plan) -> list[Path]:
+    """The files of detections and of weak candidates that are there, unit by unit."""
+    layout = plan.layout
+    folders = layout.detections, layout.weak_detections
+    paths = [layout.unit_file(folder, unit) for unit in range(len(plan.units)) for folder in folders]
+    return [path for path in paths if path.exists()]
 
 
 @dataclass(frozen=True)
@@ -315,7 +336,7 @@ class _Output:
     """Writes the tables of units.
 
     ``first_frame`` and ``track`` (n,) of the tracklets of all units, by frame; ``positions`` by frame, without
-    the ``doubles`` (k,); ``triples``, and the ``ids`` (m,) of their detections, ascending.
+    the tracks that are ``doubles`` or ``doubtful``; ``triples``, and the ``ids`` (m,) of their detections, ascending.
     """
 
     plan: Plan
@@ -326,6 +347,7 @@ class _Output:
     triples: _Triples
     ids: IntArray
     doubles: IntArray
+    doubtful: IntArray
 
     def write(self, units: IntArray) -> tuple[list[Path], int]:
         """The files of consecutive units, and how many tracklets in them only tracks confirm.
@@ -350,6 +372,10 @@ class _Output:
             begin = np.searchsorted(self.first_frame, frames.start)
             table["track_id"] = self.track[begin : begin + len(table)]
             table = _without(table, self.doubles)
+            is_doubtful = among(table["track_id"].to_numpy(np.int64), self.doubtful)
+            written.append(layout.unit_file(layout.doubtful, unit))
+            write_tracks(written[-1], table[is_doubtful].reset_index(drop=True))
+            table = table[~is_doubtful]
             more = self._recovered(unit, kept)
             recovered = len(more)
             table = pd.concat([table, more.assign(recovered=True)], ignore_index=True)
@@ -378,7 +404,7 @@ def _gap_limits(plan: Plan) -> GapLimits:
     return GapLimits(c.max_gap_s, c.max_stationary_gap_s, c.max_hidden_gap_s, c.stationary_speed_m_per_s)
 
 
-def sum_strips(layout: RunLayout, tracklets: pd.DataFrame, units: int) -> StripSums:
+def sum_strips(plan: Plan, tracklets: pd.DataFrame) -> StripSums:
     """Read the strips that stand for each chain, unit by unit, as all together take much space."""
     ids, chosen = sample_tracks(tracklets)
     numbers, chains = chosen["detection_id"].to_numpy(), chosen["track"].to_numpy()
@@ -399,9 +425,7 @@ def sum_strips(layout: RunLayout, tracklets: pd.DataFrame, units: int) -> StripS
                 np.add.at(count[which], chain[rows], 1)
         return float(patches["working_scale"])
 
-    folders = layout.detections, layout.weak_detections
-    paths = [layout.unit_file(folder, unit) for unit in range(units) for folder in folders]
-    scales = parallel_map(add, [path for path in paths if path.exists()], at_most=_AT_ONCE)
+    scales = parallel_map(add, _detection_files(plan), at_most=_AT_ONCE)
     return StripSums(ids, total, count, scales[-1] if scales else 1.0)
 
 

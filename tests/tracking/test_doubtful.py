@@ -1,0 +1,66 @@
+"""Doubtful tracks: by hand-made tracks beside a road that ten vehicles drive."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from velfield.tracking.doubtful import find_doubtful
+
+METRES = 0.25
+
+
+class Flight:
+    """Tracks made by hand, positions in metres: ten vehicles of score 0.3 drive along y = 50 m, and one stands."""
+
+    def __init__(self, traffic: int = 10, score: float = 0.3) -> None:
+        self.positions: list[pd.DataFrame] = []
+        self.scores: dict[int, float] = {}
+        for track in range(traffic):
+            self.add(track, 20 + 2.0 * np.arange(21), 50.0, score)
+
+    def add(self, track: int, x_m: np.ndarray, y_m: float, score: float) -> None:
+        """A track and the mean score of its detections."""
+        self.positions.append(
+            pd.DataFrame(
+                {"track_id": track, "time_s": 0.2 * np.arange(len(x_m)), "x_px": x_m / METRES, "y_px": y_m / METRES}
+            )
+        )
+        self.scores[track] = score
+
+    def doubts(self, y_m: float, score: float) -> bool:
+        """Whether a thing that stands there is doubtful; nothing else ever is."""
+        self.add(51, 40.0 + np.random.default_rng(0).normal(0, 0.08, 10), y_m, score)
+        found = find_doubtful(pd.concat(self.positions), pd.Series(self.scores), METRES)
+        assert set(found.tolist()) <= {51}
+        return len(found) > 0
+
+
+@pytest.mark.parametrize(
+    ("y_m", "score", "doubtful"),
+    [
+        (70.0, 0.05, True),  # on a roof, with a sixth of the usual score
+        (65.0, 0.13, False),  # in a drive, with two fifths
+        (120.0, 0.13, True),  # far from everything it has to look more like a car
+        (120.0, 0.25, False),
+        (55.0, 0.05, False),  # at the kerb
+        (50.5, -0.2, False),  # others drive over its place
+        (94.0, 0.05, False),  # next to a car in a yard
+    ],
+)
+def test_what_stands_needs_a_higher_score_the_farther_it_is_from_vehicles(
+    y_m: float, score: float, doubtful: bool
+) -> None:
+    made = Flight()
+    made.add(50, np.full(10, 40.0), 98.0, 0.4)
+    assert made.doubts(y_m, score) == doubtful
+
+
+def test_what_moves_is_never_doubtful() -> None:
+    made = Flight()
+    made.add(50, 40.0 + 0.3 * np.arange(15), 150.0, -0.2)
+    assert not made.doubts(50.0, 0.3)
+
+
+@pytest.mark.parametrize("made", [Flight(traffic=9), Flight(score=-0.02), Flight(traffic=0)])
+def test_without_a_usual_score_nothing_is_doubtful(made: Flight) -> None:
+    assert not made.doubts(120.0, 0.01)
