@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline, RegularGridInterpolator
 
-from velfield.camera.lens import HarrisLens
 from velfield.registration import fit_kernels, kernels
 
 WIDTH, HEIGHT, KNOTS, FOLDS = 640, 480, 12, 3
@@ -131,19 +130,6 @@ def test_evaluation_has_no_value_beyond_the_pole(problem: dict[str, np.ndarray])
     beyond = (problem["corrected"][:, 0] - SOURCE[0]) * SOURCE[2] >= 0.5
     assert beyond.any()
     np.testing.assert_array_equal(np.isnan(found).all(axis=1), beyond)
-
-
-def test_the_inverse_of_the_rational_function_undoes_it() -> None:
-    rng = np.random.default_rng(3)
-    c, xy = coefficients(rng), points(rng, 200)
-    there = kernels.rational(xy, c, SOURCE, TARGET)
-    back = kernels.rational_inverse(there, xy + rng.normal(0, 20, xy.shape), c, SOURCE, TARGET, 1e-6)
-    np.testing.assert_allclose(back, xy, atol=1e-5)
-    there[:2], nowhere = np.nan, np.full((1, 2), 1e9)
-    back = kernels.rational_inverse(
-        np.concatenate([there, nowhere]), np.concatenate([xy, nowhere]), c, SOURCE, TARGET, 1e-6
-    )
-    assert np.isnan(back[[0, 1, -1]]).all()
 
 
 def test_normal_equations_are_those_of_the_dense_jacobian(problem: dict[str, np.ndarray]) -> None:
@@ -278,23 +264,3 @@ def test_rational_has_no_value_beyond_its_pole() -> None:
     xy = np.array([[600.0, 10.0], [639.9, 10.0], [640.1, 10.0], [900.0, 10.0]])
     assert np.isfinite(kernels.rational(xy, c, SOURCE, TARGET)).all(axis=1).tolist() == [True, True, False, False]
     assert np.isnan(kernels.rational_jacobian(xy[3:], c, SOURCE, TARGET)).all()
-
-
-@pytest.mark.parametrize("knots", [0, KNOTS])
-@pytest.mark.parametrize("shape", [(0, 0), (3, 4), (1, 1)])
-def test_the_whole_map_is_its_parts_one_after_the_other(knots: int, shape: tuple[int, int]) -> None:
-    rng = np.random.default_rng(12)
-    raw = rng.uniform(-300, 1000, (200, 2))
-    raw[:3] = [[np.nan, 5.0], [7.0, np.inf], [-np.inf, 8.0]]
-    lens = HarrisLens(0.2, 300.0, 250.0, 500.0)
-    c = coefficients(rng)
-    c[2, 1:3] = 0.8  # some points lie beyond the horizon
-    rows, mesh = rng.normal(0, 1.5, (3, knots)) * [[1], [1], [1e-3]], rng.normal(0, 1, (*shape, 2))
-    frame = kernels.MapArrays(lens.radial, WIDTH, HEIGHT, rows, CENTRE, c, SOURCE, TARGET, mesh, 200)
-    found, undistorted = kernels.to_base(raw, frame), lens.undistort_points(raw)
-    corrected = kernels.remove_row_motion(undistorted, np.ascontiguousarray(raw[:, 1]), rows, HEIGHT, CENTRE)
-    expected = kernels.rational(corrected, c, SOURCE, TARGET)
-    if mesh.size:
-        expected += kernels.mesh_displacement(raw, mesh, 200)
-    assert 20 < np.isnan(expected[:, 0]).sum() < 180
-    np.testing.assert_array_equal(found, expected)

@@ -159,7 +159,6 @@ def test_to_raw_in_frame_starts_a_search_where_to_raw_ends(seed: int) -> None:
     np.testing.assert_allclose(
         slopes @ transform.jacobian(raw), np.broadcast_to(np.eye(2), (len(raw), 2, 2)), atol=0.02
     )
-    assert np.hypot(*(transform.to_raw_nearby(base) - transform.to_raw_roughly(base)).T).max() < 0.05
     far = transform.to_base(np.array([[-300.0, 100.0]]))
     assert all(np.isnan(part).all() for part in transform.to_raw_in_frame(far))
 

@@ -127,24 +127,6 @@ def test_rendered_features_are_where_the_truth_has_them(camera: CameraSimulation
     assert np.median(np.hypot(*shifts.T)) < limit_px
 
 
-def test_raised_points_are_displaced_away_from_the_nadir() -> None:
-    flight = small_flight(frames=1, camera=PINHOLE, scene=FLAT)
-    foot = flight.camera.to_base(0, np.array([[600.0, 240.0]]))
-    raised = flight.camera.to_raw(0, foot, above_px=40.0)
-    assert raised[0, 0] > 605
-
-
-def test_times_ascend_irregularly_about_the_nominal_rate() -> None:
-    times = small_flight(frames=400).times_s
-    step = np.diff(times)
-    assert (step > 0.15).all()
-    assert np.median(step) == pytest.approx(0.2, abs=0.002)
-    late = step > 0.25
-    assert 0.05 < late.mean() < 0.2
-    assert np.abs(step[late] - 0.3).min() < 0.02
-    assert np.abs(step[late] - 0.4).min() < 0.02
-
-
 def test_a_lens_that_folds_within_the_frame_is_refused() -> None:
     config = small_flight().config.model_copy(update={"camera": CameraSimulation(lens_terms=(-0.5,))})
     with pytest.raises(InputError, match="found a lens that folds"):

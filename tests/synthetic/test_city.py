@@ -22,7 +22,6 @@ from velfield.synthetic.city.ground import (
     add_texture,
     apply_light,
     light_map,
-    lighten,
     reach_map,
 )
 from velfield.synthetic.city.relief import GRID_PX, ground_height, ground_height_at, make_relief
@@ -179,12 +178,6 @@ def test_raising_sets_polygons_and_keeps_the_higher_disc() -> None:
     painted.raise_disc(30.0, 45.0, 4.0, 9.0)
     assert (painted.height_m == 9.0).sum() == pytest.approx(np.pi * 16, rel=0.2)
     assert painted.height_m[0, 0] == 0.0
-
-
-def test_tones_stay_within_their_range() -> None:
-    assert lighten(ASPHALT, 1000.0)[:2] == (245, 245)
-    assert lighten(ASPHALT, -1000.0)[:2] == (8, 8)
-    assert lighten(ASPHALT, 10.0) == (ASPHALT[0] + 10, ASPHALT[1] + 10, *ASPHALT[2:])
 
 
 def test_texture_scales_with_its_strength_and_vegetation_is_lighter_for_the_other_sensor() -> None:

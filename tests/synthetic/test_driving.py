@@ -27,7 +27,6 @@ from velfield.synthetic.traffic.driving import (
 from velfield.synthetic.traffic.traffic import (
     STEP_S,
     Traffic,
-    _interpolate_step,
     draw_dimensions,
     road_arrays,
     simulate_traffic,
@@ -274,16 +273,6 @@ def test_vehicles_are_present_from_their_first_to_their_last_step(straight_traff
     assert position[0] == pytest.approx([0.0, 0.0], abs=0.5)
     assert direction[0] == pytest.approx(0.0)
     assert speed[0] == pytest.approx(traffic.speed_m_per_s[traffic.first[vehicle]])
-
-
-@settings(deadline=None)
-@given(v0=st.floats(0, 3), v1=st.floats(0, 3), d=st.floats(0, 3), t=st.floats(0.01, 0.99))
-def test_the_interpolated_speed_is_the_derivative_of_the_distance(v0: float, v1: float, d: float, t: float) -> None:
-    s0, s1 = 10.0, 10.0 + d
-    assert _interpolate_step(s0, s1, v0, v1, 0.0) == pytest.approx((s0, v0))
-    assert _interpolate_step(s0, s1, v0, v1, 1.0) == pytest.approx((s1, v1))
-    ahead, behind = (_interpolate_step(s0, s1, v0, v1, t + step)[0] for step in (1e-4, -1e-4))
-    assert _interpolate_step(s0, s1, v0, v1, t)[1] == pytest.approx((ahead - behind) / 2e-4, abs=1e-3)
 
 
 def test_dimensions_are_those_of_the_kinds_of_vehicle() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from schemas.arrays import Float32Array, FloatArray
-from schemas.simulation import CameraSimulation, OtherSensorSimulation, SceneSimulation, TrafficSimulation
+from schemas.simulation import OtherSensorSimulation, SceneSimulation, TrafficSimulation
 from velfield.synthetic import Flight, small_flight
 from velfield.synthetic.camera import Camera, Waves
 from velfield.synthetic.cases import FLAT, PINHOLE
@@ -310,14 +310,3 @@ def test_the_motion_kernel_is_normalised_and_along_its_direction(angle: float) -
     along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
     assert (kernel * along**2).sum() > 5 * (kernel * across**2).sum()
     assert _motion_kernel(0.1, angle) is None
-
-
-def test_defaults_of_the_camera_shake_and_blur() -> None:
-    config = CameraSimulation()
-    assert config.vibration_low_hz < config.vibration_high_hz
-    flight = small_flight(frames=1, width=96, height=64, traffic=EMPTY)
-    sharp = small_flight(
-        frames=1, width=96, height=64, traffic=EMPTY, camera=config.model_copy(update={"optics_blur_px": 0.0})
-    )
-    gradients = [np.abs(np.diff(f.city.scene.mosaic.astype(int), axis=1)).mean() for f in (flight, sharp)]
-    assert gradients[0] < 0.95 * gradients[1]

@@ -32,16 +32,6 @@ def test_streams_of_one_seed_are_reproducible_and_independent() -> None:
     assert len(set(frames)) == 3
 
 
-def test_the_numbers_of_the_streams_are_those_that_seeds_mean() -> None:
-    assert {s.name: s.value for s in RandomStream} == {
-        "TIMES": 0, "CAMERA": 1, "RELIEF": 2, "PLAN": 3, "TRAFFIC": 4, "PAINT": 5, "GRAIN": 6, "APPEARANCE": 7,
-        "PARKED": 8, "OTHER_SENSOR": 9, "FRAME": 10, "TELEMETRY": 11,
-    }  # fmt: skip
-    assert random_generator(3, RandomStream.FRAME, 2).integers(10**6) == np.random.default_rng([3, 10, 2]).integers(
-        10**6
-    )
-
-
 def small(**sections: object) -> Flight:
     return small_flight(frames=2, width=96, height=64, seed=4, **sections)
 

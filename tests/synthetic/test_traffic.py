@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from schemas.arrays import FloatArray
 from schemas.simulation import TrafficSimulation
 from velfield.synthetic.city.city_plan import make_city_plan
-from velfield.synthetic.city.road_network import Node, RoadNetwork, clear_until_m, min_radius_m, smooth_curve
+from velfield.synthetic.city.road_network import RoadNetwork
 from velfield.synthetic.traffic.driving import is_green
 from velfield.synthetic.traffic.traffic import Traffic, road_arrays, simulate_traffic
 
@@ -122,24 +122,3 @@ def test_same_seed_same_traffic() -> None:
     again = simulate_traffic(plan.road_network, CONFIG, duration_s=120.0, rng=rng)
     assert np.array_equal(first.distance_m, again.distance_m)
     assert np.array_equal(first.dimensions.length_m, again.dimensions.length_m)
-
-
-def test_a_large_city_has_several_connected_intersections() -> None:
-    rng = np.random.default_rng(0)
-    plan = make_city_plan((-400, -330, 410, 320), rng, turn_share=0.15, cycle_s=60.0)
-    assert len(plan.road_network.signal_offsets_s) >= 4
-    assert len(plan.roundabouts) >= 2
-    out, into = plan.road_network.out_edges(), plan.road_network.in_edges()
-    sources = {node for node, _ in plan.road_network.sources}
-    for number, node in enumerate(plan.road_network.nodes):
-        if out[number] and not into[number]:
-            assert number in sources, node
-
-
-def test_curves_join_smoothly() -> None:
-    path = smooth_curve(Node(0, 0, 0.0), Node(7.75, 7.75, np.pi / 2))
-    assert path[0] == pytest.approx([0, 0])
-    assert path[-1] == pytest.approx([7.75, 7.75])
-    assert min_radius_m(path) > 7.0
-    straight = np.column_stack([np.full(60, 7.75), np.linspace(-20, 7.75, 60)])
-    assert 2 < clear_until_m(path, straight, from_end=True) < 8

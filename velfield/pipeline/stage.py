@@ -167,7 +167,7 @@ STAGES: tuple[Stage, ...] = (
     # Spread frames registered to the sharpest, and their median; or the registration of a given image.
     Stage(
         name="base",
-        version=15,
+        version=16,
         label="base image",
         lines=(
             Line(
@@ -187,7 +187,7 @@ STAGES: tuple[Stage, ...] = (
     # The chain over the unit's frames.
     Stage(
         name="registration",
-        version=15,
+        version=16,
         label="registration",
         lines=(
             Line("{registered:.0f} of {frames:.0f} frames registered, hold-out registration error {heldout_px:.2f} px"),
@@ -225,7 +225,7 @@ STAGES: tuple[Stage, ...] = (
     # The shipped detector, one that is fine-tuned on labelled frames, or a given one.
     Stage(
         name="detector",
-        version=26,
+        version=27,
         label="detector",
         lines=(
             Line("skipped: external detections", lambda counts: bool(counts) and "threshold" not in counts),
@@ -242,7 +242,7 @@ STAGES: tuple[Stage, ...] = (
     # Cars of each block, then one table with their crops.
     Stage(
         name="detections",
-        version=22,
+        version=23,
         label="detections",
         lines=(
             Line(

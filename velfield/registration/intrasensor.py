@@ -270,7 +270,7 @@ class _PatchHistory:
         """Inliers of the last frames, those that the frame before did not show, and some of the others in turn."""
         recent = self.frame - self.last_inlier <= _RETEST_FRAMES
         turn = np.arange(len(self.templates)) % _RETEST_FRAMES == self.frame % _RETEST_FRAMES
-        xy_raw = before.transform.to_raw_nearby(self.templates.xy)  # row motion and mesh are a few pixels
+        xy_raw = before.transform.to_raw_roughly(self.templates.xy)  # row motion and mesh are a few pixels
         shown = ((xy_raw >= _SHOWN_PX) & (xy_raw <= np.array(shape[::-1]) - 1 - _SHOWN_PX)).all(axis=1)
         return self.templates.select(recent | turn | ~shown)
 

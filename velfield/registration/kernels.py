@@ -23,8 +23,6 @@ _MAX_ERROR_PX = 1e-3
 """Inverses of which the residual is not below the first are corrected; those not below the second in the end fail."""
 DIFFERENCE_PX = 0.25
 """Step of the numerical derivative: small against the row spline's knot spacing, large against rounding errors."""
-_BLOCK = 128
-"""Points that `to_base` maps at a time."""
 
 
 class MapArrays(NamedTuple):
@@ -99,40 +97,6 @@ def rational_jacobian(
     return out
 
 
-@kernel
-def rational_inverse(points, guess, coefficients, source, target, tolerance) -> FloatArray:  # type: ignore[no-untyped-def]
-    """Inverse of `rational` at points (n, 2) by Newton's method from ``guess`` (n, 2), each point until its residual is
-    below ``tolerance``; NaN where that fails. Arguments as in `rational`."""
-    out = np.full((points.shape[0], 2), np.nan)
-    scale = source[2] / target[2]
-    c = coefficients
-    for i in range(points.shape[0]):
-        u, v = guess[i, 0], guess[i, 1]
-        for _ in range(_INVERSE_STEPS):
-            x, y = (u - source[0]) * source[2], (v - source[1]) * source[2]
-            xx, xy, yy = x * x, x * y, y * y
-            w = c[2, 0] + c[2, 1] * x + c[2, 2] * y + c[2, 3] * xx + c[2, 4] * xy + c[2, 5] * yy
-            if not w > 1e-9:
-                break
-            p = (c[0, 0] + c[0, 1] * x + c[0, 2] * y + c[0, 3] * xx + c[0, 4] * xy + c[0, 5] * yy) / w
-            q = (c[1, 0] + c[1, 1] * x + c[1, 2] * y + c[1, 3] * xx + c[1, 4] * xy + c[1, 5] * yy) / w
-            ex, ey = points[i, 0] - (p / target[2] + target[0]), points[i, 1] - (q / target[2] + target[1])
-            if abs(ex) < tolerance and abs(ey) < tolerance:
-                out[i, 0], out[i, 1] = u, v
-                break
-            wx, wy = c[2, 1] + 2 * c[2, 3] * x + c[2, 4] * y, c[2, 2] + c[2, 4] * x + 2 * c[2, 5] * y
-            jxx = (c[0, 1] + 2 * c[0, 3] * x + c[0, 4] * y - p * wx) / w * scale
-            jxy = (c[0, 2] + c[0, 4] * x + 2 * c[0, 5] * y - p * wy) / w * scale
-            jyx = (c[1, 1] + 2 * c[1, 3] * x + c[1, 4] * y - q * wx) / w * scale
-            jyy = (c[1, 2] + c[1, 4] * x + 2 * c[1, 5] * y - q * wy) / w * scale
-            determinant = jxx * jyy - jxy * jyx
-            if determinant == 0.0:
-                break
-            u += (jyy * ex - jxy * ey) / determinant
-            v += (jxx * ey - jyx * ex) / determinant
-    return out
-
-
 @compiled(error_model="numpy")
 def invert_plane(points, guess, coefficients, source, target, mesh, cell) -> FloatArray:  # type: ignore[no-untyped-def]
     """Inverse of `rational` plus `mesh_displacement` at points (n, 2) from ``guess`` (n, 2); NaN where that fails.
@@ -193,7 +157,7 @@ def spline_basis(rows: FloatArray, height: int, knots: int) -> tuple[IntArray, F
     return first, weights
 
 
-@kernel
+@compiled(error_model="numpy")
 def remove_row_motion(
     undistorted: FloatArray, rows: FloatArray, coefficients: FloatArray, height: int, centre: FloatArray
 ) -> FloatArray:
@@ -202,13 +166,15 @@ def remove_row_motion(
     if coefficients.shape[1] < 4:
         return out
     first, weights = spline_basis(rows, height, coefficients.shape[1])
-    for i in range(undistorted.shape[0]):
-        motion = np.zeros(3)
-        for k in range(4):
-            for c in range(3):
-                motion[c] += weights[i, k] * coefficients[c, first[i] + k]
-        out[i, 0] += motion[0] - motion[2] * (undistorted[i, 1] - centre[1])
-        out[i, 1] += motion[1] + motion[2] * (undistorted[i, 0] - centre[0])
+    for i in range(len(out)):
+        dx, dy, turn = 0.0, 0.0, 0.0
+        for m in range(4):
+            weight, k = weights[i, m], first[i] + m
+            dx += weight * coefficients[0, k]
+            dy += weight * coefficients[1, k]
+            turn += weight * coefficients[2, k]
+        out[i, 0] += dx - turn * (undistorted[i, 1] - centre[1])
+        out[i, 1] += dy + turn * (undistorted[i, 0] - centre[0])
     return out
 
 
@@ -235,70 +201,12 @@ def mesh_displacement(points: FloatArray, mesh: FloatArray, cell: int) -> FloatA
 
 @compiled(error_model="numpy")
 def to_base(raw: FloatArray, frame: MapArrays) -> FloatArray:
-    """Base px (n, 2) of raw points (n, 2) by `MapArrays`: `undistort`, `remove_row_motion`, `rational` and
-    `mesh_displacement` in one, to the bit.
-
-    Some points at a time, with loops of their own for what depends on a table: the other loops become vectors, which
-    divide four times as fast.
-    """
-    rows, mesh, height, centre, cell = frame.rows, frame.mesh, frame.height, frame.centre, frame.cell
-    count, size, one = np.uint64(raw.shape[0]), np.uint64(_BLOCK), np.uint64(1)
-    out = np.empty((raw.shape[0], 2))
-    spans, my, mx = np.int32(rows.shape[1] - 3), mesh.shape[0], mesh.shape[1]
-    last_row = float(spans)
-    (a0, a1, a2, a3, a4, a5), (b0, b1, b2, b3, b4, b5), (c0, c1, c2, c3, c4, c5) = frame.coefficients
-    (source_x, source_y, source_scale), (target_x, target_y, target_scale) = frame.source, frame.target
-    first, weight = np.empty(_BLOCK, np.int32), np.empty((4, _BLOCK))
-    at_x, at_y, base_x, base_y = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
-    for begin in range(np.uint64(0), count, size):
-        points = min(size, count - begin)
-        undistorted = undistort(raw[begin : begin + points], frame.lens)
-        for i in range(points):
-            at_x[i], at_y[i] = undistorted[i, 0], undistorted[i, 1]
-        if spans > 0:
-            for i in range(points):
-                t = (raw[begin + i, 1] + 0.5) / height * spans
-                t = min(max(t, 0.0), last_row) if t == t else 0.0
-                first[i] = min(np.int32(t), spans - np.int32(1))
-                f = t - float(first[i])
-                g = 1.0 - f
-                weight[0, i] = g * g * g / 6.0
-                weight[1, i] = (3.0 * f * f * f - 6.0 * f * f + 4.0) / 6.0
-                weight[2, i] = (3.0 * g * g * g - 6.0 * g * g + 4.0) / 6.0
-                weight[3, i] = f * f * f / 6.0
-            for i in range(points):
-                dx, dy, turn, k = 0.0, 0.0, 0.0, np.uint64(first[i])
-                for m in range(np.uint64(4)):
-                    dx += weight[m, i] * rows[0, k + m]
-                    dy += weight[m, i] * rows[1, k + m]
-                    turn += weight[m, i] * rows[2, k + m]
-                dx, dy = dx - turn * (at_y[i] - centre[1]), dy + turn * (at_x[i] - centre[0])
-                at_x[i], at_y[i] = at_x[i] + dx, at_y[i] + dy
-        for i in range(points):
-            x, y = (at_x[i] - source_x) * source_scale, (at_y[i] - source_y) * source_scale
-            xx, xy, yy = x * x, x * y, y * y
-            w = c0 + c1 * x + c2 * y + c3 * xx + c4 * xy + c5 * yy
-            w = w if w > 1e-9 else np.nan
-            base_x[i] = (a0 + a1 * x + a2 * y + a3 * xx + a4 * xy + a5 * yy) / w / target_scale + target_x
-            base_y[i] = (b0 + b1 * x + b2 * y + b3 * xx + b4 * xy + b5 * yy) / w / target_scale + target_y
-        if my > 0:
-            for i in range(points):
-                at_x[i] = (raw[begin + i, 0] + 0.5) / cell - 0.5
-                at_y[i] = (raw[begin + i, 1] + 0.5) / cell - 0.5
-            for i in range(points):
-                if math.isfinite(at_x[i]) and math.isfinite(at_y[i]):
-                    gx, gy = min(max(at_x[i], 0.0), mx - 1.0), min(max(at_y[i], 0.0), my - 1.0)
-                    j, k = np.uint64(min(int(gx), max(mx - 2, 0))), np.uint64(min(int(gy), max(my - 2, 0)))
-                    fx, fy = gx - float(j), gy - float(k)
-                    j1, k1 = min(j + one, np.uint64(mx - 1)), min(k + one, np.uint64(my - 1))
-                    top = mesh[k, j, 0] + fx * (mesh[k, j1, 0] - mesh[k, j, 0])
-                    bottom = mesh[k1, j, 0] + fx * (mesh[k1, j1, 0] - mesh[k1, j, 0])
-                    base_x[i] += top + fy * (bottom - top)
-                    top = mesh[k, j, 1] + fx * (mesh[k, j1, 1] - mesh[k, j, 1])
-                    bottom = mesh[k1, j, 1] + fx * (mesh[k1, j1, 1] - mesh[k1, j, 1])
-                    base_y[i] += top + fy * (bottom - top)
-        for i in range(points):
-            out[begin + i, 0], out[begin + i, 1] = base_x[i], base_y[i]
+    """Base px (n, 2) of raw points (n, 2) by `MapArrays`."""
+    undistorted = undistort(raw, frame.lens)
+    corrected = remove_row_motion(undistorted, raw[:, 1], frame.rows, frame.height, frame.centre)
+    out = rational(corrected, frame.coefficients, frame.source, frame.target)
+    if frame.mesh.shape[0] > 0:
+        out += mesh_displacement(raw, frame.mesh, frame.cell)
     return out
 
 
@@ -355,31 +263,3 @@ def to_raw(points: FloatArray, guess: FloatArray, frame: MapArrays, margin: floa
         if not (error[i] < _MAX_ERROR_PX and inside):
             raw[i] = np.nan
     return raw
-
-
-@compiled(error_model="numpy")
-def to_raw_in_two_steps(
-    points: FloatArray, guess: FloatArray, frame: MapArrays, margin: float
-) -> tuple[FloatArray, FloatArray]:
-    """Inverse of `to_base` at points (n, 2) by two steps from ``guess`` (n, 2), and the inverse Jacobian (n, 2, 2).
-
-    NaN where the guess lies outside the frame by ``margin`` or more.
-    """
-    raw, inverse = np.full((len(points), 2), np.nan), np.full((len(points), 2, 2), np.nan)
-    x, y = guess[:, 0], guess[:, 1]
-    inside = (x > -margin) & (y > -margin) & (x < frame.width + margin) & (y < frame.height + margin)
-    todo = np.flatnonzero(inside)
-    here, target = guess[todo], points[todo]
-    mapped = to_base(here, frame)
-    here += _solve_all(_difference_jacobian(here, mapped, frame), target - mapped)
-    mapped = to_base(here, frame)
-    jacobian = _difference_jacobian(here, mapped, frame)
-    for k in range(len(todo)):
-        (a, b), (c, d) = (jacobian[k, 0, 0], jacobian[k, 0, 1]), (jacobian[k, 1, 0], jacobian[k, 1, 1])
-        determinant, at = a * d - b * c, todo[k]
-        inverse[at, 0, 0], inverse[at, 0, 1] = d / determinant, -b / determinant
-        inverse[at, 1, 0], inverse[at, 1, 1] = -c / determinant, a / determinant
-        for axis in range(2):
-            change = inverse[at, axis, 0] * (target[k, 0] - mapped[k, 0])
-            raw[at, axis] = here[k, axis] + (change + inverse[at, axis, 1] * (target[k, 1] - mapped[k, 1]))
-    return raw, inverse

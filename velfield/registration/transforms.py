@@ -13,7 +13,6 @@ from schemas.flight import RegistrationConfig
 from velfield.camera.lens import Lens
 from velfield.registration import kernels
 
-_NEARBY_PX = 0.01
 _NO_MESH = np.zeros((0, 0, 2))
 _OUTSIDE_FRACTION = 0.1
 _OUTSIDE_PX = 64.0
@@ -222,18 +221,11 @@ class FrameTransform:
             kernels.to_raw(as_points(xy_base), self.to_raw_roughly(xy_base), self._arrays, margin), np.float64
         )
 
-    def to_raw_nearby(self, xy_base: FloatArray) -> FloatArray:
-        """As `to_raw_roughly`, to 0.01 px of that, by a compiled inverse: to decide what is in the frame."""
-        p, xy = self.polyprojective, as_points(xy_base)
-        inverse = kernels.rational_inverse(xy, p.homography_inverse(xy), p.coefficients, p.source, p.target, _NEARBY_PX)
-        return as_points(self.lens.distort_points(inverse))
-
     def to_raw_in_frame(self, xy_base: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Base pixels (n, 2) to raw pixels (n, 2), to some hundredths of a pixel, and the inverse Jacobian (n, 2, 2)
-        there: what is needed to start a search from. NaN where the frame does not show the point."""
-        guess = self.to_raw_nearby(xy_base)
-        raw, inverse = kernels.to_raw_in_two_steps(as_points(xy_base), guess, self._arrays, _OUTSIDE_PX)
-        return np.asarray(raw), np.asarray(inverse)
+        """As `to_raw`, with the inverse Jacobian (n, 2, 2) there: what is needed to start a search from."""
+        raw = self.to_raw(xy_base)
+        (a, b), (c, d) = np.moveaxis(self.jacobian(raw), 0, -1)
+        return raw, np.moveaxis(np.array([[d, -b], [-c, a]]) / (a * d - b * c), -1, 0)
 
     def to_raw_roughly(self, xy_base: FloatArray) -> FloatArray:
         """The inverse without row motion and mesh, so wrong by these; NaN rows where there is none."""
