@@ -74,7 +74,7 @@ def read_runner(path: Path) -> RunnerConfig:
     try:
         file = ClusterFile.model_validate(load_yaml(path.read_text(encoding="utf-8")))
     except FileNotFoundError:
-        raise InputError(f"--cluster {path}: no such file; see examples/ for some") from None
+        raise InputError(f"--cluster {path}: no such file; the documentation has some, on its page Examples") from None
     except (yaml.YAMLError, ValidationError, ValueError, RecursionError) as error:
         details = " ".join(str(error).split())
         raise InputError(f"--cluster {path}: {details}; keys: cluster_class, cluster_kwargs, workers") from None

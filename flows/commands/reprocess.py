@@ -43,7 +43,7 @@ def reprocess(
     scheduler
         Address of a Dask scheduler.
     cluster
-        File with the class of Dask clusters to use and its arguments; see `examples/cluster-*.yaml`.
+        File with the class of Dask clusters to use and its arguments; the documentation's page Examples has some.
     quiet
         Print warnings only.
     """

@@ -74,7 +74,7 @@ def run(
         Ground sample distance, metres per base pixel. Default: from the base image's CRS, the drone's metadata or the
         lengths of the vehicles.
     labels
-        Labelled cars to fine-tune the detector on (docs/detection.md#label-formats). Default: none.
+        Labelled cars to fine-tune the detector on: CSV, GeoJSON, YOLO, COCO, LabelMe, VIA. Default: none.
     detector
         A trained detector file, or a YOLO-type ONNX model. Default: the detector that comes with velfield.
     detections
@@ -104,7 +104,7 @@ def run(
     scheduler
         Address of a Dask scheduler.
     cluster
-        File with the class of Dask clusters to use and its arguments; see `examples/cluster-*.yaml`.
+        File with the class of Dask clusters to use and its arguments; the documentation's page Examples has some.
     device
         Device that runs the network: cpu, cuda, or auto (default), which uses a GPU if there is one.
     plan

@@ -86,11 +86,11 @@ def _of_methods(preset: Mapping[str, Any], given: Mapping[str, Any]) -> Tree:
 
 def _read(file: Path) -> Tree:
     if not file.exists():
-        raise InputError(f"--config {file}: no such file; give a YAML file such as examples/flight.yaml")
+        raise InputError(f"--config {file}: no such file; `velfield init VIDEO` writes one")
     tree = _yaml(read_text(file, "configuration"), str(file)) or {}
     if not isinstance(tree, dict):
         raise InputError(
-            f"{file}: found a {type(tree).__name__}; expected sections with keys, see examples/flight.yaml"
+            f"{file}: found a {type(tree).__name__}; expected sections with keys, as `velfield init VIDEO` writes them"
         )
     # A section all of whose keys are commented out, as `velfield init` writes it, is null.
     return {key: value for key, value in tree.items() if value is not None or not section_models(key)}
@@ -133,7 +133,9 @@ def _yaml(text: str, what: str) -> Any:
         return load_yaml(text)
     except (RecursionError, ValueError) as error:  # sections within sections without end; a date that is none
         problem = "sections lie too deep in each other" if isinstance(error, RecursionError) else str(error)
-        raise InputError(f"{what}: this is not YAML that can be read ({problem}); see examples/flight.yaml") from None
+        raise InputError(
+            f"{what}: this is not YAML that can be read ({problem}); `velfield init VIDEO` writes one that can"
+        ) from None
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = "" if mark is None or "\n" not in text.strip() else f"line {mark.line + 1}: "
