@@ -4,7 +4,6 @@ import itertools
 import math
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,7 +13,6 @@ from pydantic import ValidationError
 
 from schemas.flight import FramesConfig
 from velfield.errors import InputError
-from velfield.sources.frame_measures import frame_quality
 from velfield.sources.frames import local_path
 from velfield.sources.images import image_size
 from velfield.sources.labels.classes import choose_cars
@@ -162,13 +160,6 @@ def test_cars_are_known_by_their_names_and_lorries_are_none() -> None:
     assert choose_cars([0, 1, 2, 3, 5, 6, 7], dict(enumerate(names)), "classes.txt")[0] == {1, 3, 7}
     with pytest.raises(InputError, match="found the classes bus, tram, expected one of cars"):
         choose_cars([0, 1], {0: "bus", 1: "tram"}, "classes.txt")
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 6), (7, 2), (33, 40)])
-def test_sharpness_is_the_standard_deviation_of_opencv_s_laplacian(shape: tuple[int, int]) -> None:
-    for grey in (np.random.default_rng(shape).integers(0, 256, shape).astype(np.uint8), np.full(shape, 90, np.uint8)):
-        _, expected = cv2.meanStdDev(cv2.Laplacian(grey, cv2.CV_16S))
-        assert math.isclose(frame_quality(grey).sharpness, float(expected[0, 0]), abs_tol=1e-9)
 
 
 def test_black_frames_are_those_of_numpy_s_percentile_and_deviation() -> None:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, sparse
+from scipy.sparse.csgraph import connected_components
 
 from schemas.arrays import FloatArray, Mask
-from velfield.compiled import kernel
 
 _EIGHT_NEIGHBOURS = np.ones((3, 3), np.int8)
 
@@ -68,37 +68,18 @@ def region_table(labels: NDArray[np.int32], medians: Mapping[str, NDArray[np.flo
     return pd.DataFrame(rows, columns=["region", "x_px", "y_px", "area_px", *medians])
 
 
-@kernel
-def _root(parent: NDArray[np.int32], i: int) -> int:
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = int(parent[i])
-    return i
-
-
-@kernel
 def label_smooth(angle_rad: FloatArray, max_step_rad: float) -> NDArray[np.int32]:
     """Connected components (4-connectivity) of pixels whose angles differ by at most ``max_step_rad``; 0 where NaN."""
-    height, width = angle_rad.shape
-    parent = np.arange(height * width).astype(np.int32)
-    for y in range(height):
-        for x in range(width):
-            for dy, dx in ((0, 1), (1, 0)):
-                j, i = y + dy, x + dx
-                if j < height and i < width:
-                    step = abs((angle_rad[y, x] - angle_rad[j, i] + np.pi) % (2 * np.pi) - np.pi)
-                    if step <= max_step_rad:  # False for NaN
-                        a, b = _root(parent, y * width + x), _root(parent, j * width + i)
-                        parent[max(a, b)] = min(a, b)
-    labels = np.zeros((height, width), np.int32)
-    number = np.zeros(height * width, np.int32)
-    found = 0
-    for y in range(height):
-        for x in range(width):
-            if not np.isnan(angle_rad[y, x]):
-                root = _root(parent, y * width + x)
-                if number[root] == 0:
-                    found += 1
-                    number[root] = found
-                labels[y, x] = number[root]
+    number = np.arange(angle_rad.size).reshape(angle_rad.shape)
+    pairs = []
+    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        step = np.abs((angle_rad[here] - angle_rad[there] + np.pi) % (2 * np.pi) - np.pi)
+        joined = step <= max_step_rad  # False for NaN
+        pairs.append((number[here][joined], number[there][joined]))
+    a, b = np.concatenate(pairs, axis=1)
+    links = sparse.coo_array((np.ones(len(a), bool), (a, b)), (number.size, number.size))
+    _, component = connected_components(links, directed=False)
+    known = ~np.isnan(angle_rad)
+    labels = np.zeros(angle_rad.shape, np.int32)
+    labels[known] = pd.factorize(component[known.ravel()])[0] + 1  # numbered in raster order
     return labels

@@ -325,27 +325,10 @@ def within(xy_m: FloatArray, low_m: FloatArray, high_m: FloatArray) -> IntArray:
     return np.asarray(rows[(y >= low_m[1]) & (y <= high_m[1])])
 
 
-@kernel
 def group_rows(group: IntArray, n: int) -> tuple[IntArray, IntArray]:
-    """Rows in the order of their group (rows,), and the borders (n + 1,) of the n groups among them: a counting sort,
-    in the time of a few copies.
-
-    Raises
-    ------
-    ValueError
-        A group is not one of 0 to n - 1.
-    """
-    border = np.zeros(n + 1, np.int64)
-    for k in group:
-        if k < 0 or k >= n:
-            raise ValueError("a group is not one of those that are counted")
-        border[k + 1] += 1
-    border = np.cumsum(border)
-    order, at = np.empty(len(group), np.int64), border.copy()
-    for i in range(len(group)):
-        order[at[group[i]]] = i
-        at[group[i]] += 1
-    return order, border
+    """Rows in the order of their group (rows,), and the borders (n + 1,) of the n groups among them."""
+    order = np.argsort(group, kind="stable")
+    return order, np.searchsorted(group[order], np.arange(n + 1))
 
 
 def sample_paths(trajectories: Trajectories, spacing_m: float = 1.0) -> PathSamples:

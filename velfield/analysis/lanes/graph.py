@@ -13,7 +13,6 @@ import pandas as pd
 
 from schemas.arrays import FloatArray, IntArray, Mask
 from velfield.analysis.lanes.ridges import NODE_SPACING_M, Nodes
-from velfield.compiled import kernel
 
 _MAX_STEP_M = 4 * NODE_SPACING_M
 """Farther nodes are not linked: the track had a gap between them."""
@@ -64,30 +63,17 @@ def count_links(track: IntArray, node: IntArray, nodes: Nodes) -> Links:
     return Links(pairs // len(nodes), pairs % len(nodes), count)
 
 
-@kernel
 def _moves(track: IntArray, node: IntArray) -> tuple[IntArray, IntArray]:
     """Rows at which a track leaves a node, and at which it is at the next; those without a node are passed over."""
-    first, second = np.empty(len(track), np.int64), np.empty(len(track), np.int64)
-    n, last = 0, -1
-    for i in range(len(track)):
-        if node[i] < 0:
-            continue
-        if last >= 0 and track[i] == track[last] and node[i] != node[last]:
-            first[n], second[n] = last, i
-            n += 1
-        last = i
-    return first[:n], second[:n]
+    rows = np.flatnonzero(node >= 0)
+    a, b = rows[:-1], rows[1:]
+    moves = (track[a] == track[b]) & (node[a] != node[b])
+    return a[moves], b[moves]
 
 
-@kernel
 def count_once(owner: IntArray, number: IntArray, n: int) -> IntArray:
-    """Number of owners that have each of n numbers; the rows of an owner are consecutive."""
-    count, last = np.zeros(n, np.int64), np.full(n, -1, np.int64)
-    for k in range(len(owner)):
-        if last[number[k]] != owner[k]:
-            last[number[k]] = owner[k]
-            count[number[k]] += 1
-    return count
+    """Number of owners that have each of n numbers."""
+    return np.bincount(pd.unique(owner * np.int64(n) + number) % n, minlength=n)
 
 
 def make_chains(nodes: Nodes, links: Links, *, min_tracks: int) -> Chains:

@@ -51,16 +51,11 @@ class Nodes:
         return len(self.xy_m)
 
 
-@kernel
 def bin_keys(xy_m: FloatArray, direction_rad: FloatArray) -> IntArray:
     """One number (n,) for the bin of each sample; positions lie within 500 km of the origin."""
-    out = np.empty(len(xy_m), np.int64)
-    for i in range(len(xy_m)):
-        x = np.int64(np.floor(xy_m[i, 0] / BIN_M)) + (1 << 20)
-        y = np.int64(np.floor(xy_m[i, 1] / BIN_M)) + (1 << 20)
-        sector = np.int64(np.rint(direction_rad[i] / (2 * np.pi / SECTORS))) % SECTORS
-        out[i] = (y << 21 | x) * SECTORS + sector
-    return out
+    x, y = np.floor(xy_m.T / BIN_M).astype(np.int64) + (1 << 20)
+    sector = np.rint(direction_rad / (2 * np.pi / SECTORS)).astype(np.int64) % SECTORS
+    return np.asarray((y << 21 | x) * SECTORS + sector)
 
 
 def bin_samples(samples: PathSamples, keys: IntArray) -> tuple[Bins, IntArray]:
