@@ -30,4 +30,8 @@ def __getattr__(name: str) -> Any:
         from velfield.run import run
 
         return getattr(run, name)
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("velfield")
     raise AttributeError(f"module 'velfield' has no attribute {name!r}")

@@ -1,6 +1,7 @@
 """``velfield run``: from a video, or tracks, to the maps."""
 
 import shlex
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -153,7 +154,10 @@ def run(
     where = choose_runner(workers, scheduler, cluster)
     if plan:
         return _show_plan(job, where)
-    return process(job, runner=where, verbosity=_verbosity(quiet, verbose, log_json))
+    status = process(job, runner=where, verbosity=_verbosity(quiet, verbose, log_json))
+    if status in (DONE, INCOMPLETE):
+        print(f"answers {own_command()} analyse {shlex.quote(str(out))}   (turning counts, queues, signals, speeds)")
+    return status
 
 
 def _tracks_inputs(tracks: Path | None, base: Path | None, frames_only: list[str]) -> Inputs:
@@ -171,6 +175,7 @@ def process(job: Job, *, runner: "RunnerConfig | None" = None, verbosity: "Verbo
 
     console = _prepare(verbosity)
     check_inputs(job)
+    _announce(job, console)
     from flows.process_flight import run_flight
     from flows.runners import RunnerConfig
 
@@ -190,6 +195,11 @@ def _prepare(verbosity: "Verbosity") -> "Console":
     return Console(verbosity)
 
 
+def _announce(job: Job, console: "Console") -> None:
+    """The first line, before imports and inputs take their seconds."""
+    console.event("open", f"velfield {version('velfield')}: {job.inputs.source} into {job.root}")
+
+
 def _process_tracks(job: Job, runner: "RunnerConfig", verbosity: "Verbosity", *, plan_only: bool) -> int:
     if plan_only:
         from velfield.pipeline.given_tracks.plan import describe_tracks
@@ -197,6 +207,7 @@ def _process_tracks(job: Job, runner: "RunnerConfig", verbosity: "Verbosity", *,
         print(describe_tracks(job))
         return DONE
     console = _prepare(verbosity)
+    _announce(job, console)
     from flows.process_tracks import run_tracks
 
     summary = run_tracks(job, runner, console)
@@ -213,7 +224,6 @@ def conclude(summary: "RunSummary", console: "Console") -> int:
 
     root = to_path(summary.root)
     console.result(f"maps    {root / 'maps'}")
-    console.result(f"report  {root / 'index.html'}")
     if is_remote(root):  # `velfield view` shows a folder of this machine
         console.result(f"page    aws s3 sync {shlex.quote(str(root))} RUN && {own_command()} view RUN")
     else:

@@ -38,7 +38,7 @@ def next_steps(folder: Path) -> Iterator[str]:
         yield f"A folder of images, {entry.name}. They need times:"
         yield f"  velfield run {shlex.quote(entry.name)} --timestamps times.csv --out RUN   # or --fps 5\n"
     if not (runs or videos or images):
-        yield "No video and no run in this folder. See it work, on a simulated flight (a minute or two):"
+        yield "No video and no run in this folder. See it work, on a simulated flight (about three minutes):"
         yield "  velfield demo\n"
         yield "Your own video, from a camera that looks down and stays over one place:"
         yield "  velfield run VIDEO --out RUN\n"
@@ -53,6 +53,7 @@ def _of_runs(runs: list[Path]) -> Iterator[str]:
             continue
         yield f"{run.name} is a finished run:"
         yield f"  velfield view {name}                              # its map, in the browser"
+        yield f"  velfield analyse {name}                           # turning counts, queues, signals, speeds: a report"
         yield f"  velfield export {name} --format cog               # for a GIS; other formats: velfield export --help"
         yield f"  velfield georeference {name} --points points.csv  # georeference it by control points\n"
 

@@ -103,7 +103,7 @@ def test_a_section_without_keys_says_nothing(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no such file; give a YAML file"):
+    with pytest.raises(InputError, match=r"no such file; `velfield init VIDEO` writes one"):
         resolve_config(file=tmp_path / "none.yaml")
 
 

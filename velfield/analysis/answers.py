@@ -113,20 +113,20 @@ def _classes(analysis: TrafficAnalysis) -> Answer:
 
 
 def _movements(analysis: TrafficAnalysis) -> Iterator[Answer]:
-    found = [(j.junction.kind, m) for j in analysis.movements for m in j.movements]
-    for kind, m in sorted(found, key=lambda pair: -(pair[1].seen + pair[1].inferred)):
-        share = f", {estimate_text(m.share, '%', 100)} of the entry" if m.share else ""
+    found = [m for j in analysis.movements for m in j.movements]
+    for m in sorted(found, key=lambda m: -(m.seen + m.inferred)):
+        share = f", {estimate_text(m.share, '%', 100)} of those from {m.arm_in}" if m.share else ""
         delay = f", delay {estimate_text(m.delay_s, 's')}" if m.delay_s else ""
-        subject = f"{kind} {m.junction}, {m.arm_in} to {m.arm_out}"
-        text = f"{m.seen + m.inferred:.0f}{share}{delay}"
+        subject = f"junction {m.junction}, {m.arm_in} to {m.arm_out}"
+        text = f"{count_text(round(m.seen + m.inferred), 'vehicle')}{share}{delay}"
         yield Answer("movement", subject, "found", text, m.flow_veh_per_h, "veh/h")
 
 
 def _scene(analysis: TrafficAnalysis) -> Iterator[Answer]:
     for r in analysis.scene.relations if analysis.scene else ():
-        share = f", {estimate_text(r.share, '%', 100)} of the entry" if r.share else ""
-        text = f"{r.vehicles:.0f}, seen whole {r.seen}{share}"
-        yield Answer("scene", f"{r.origin.name} to {r.destination.name}", "found", text, r.share, "")
+        share = f", {estimate_text(r.share, '%', 100)} of those from {r.origin.name}" if r.share else ""
+        text = f"{count_text(round(r.vehicles), 'vehicle')}, {r.seen} of them tracked all the way{share}"
+        yield Answer("through", f"{r.origin.name} to {r.destination.name}", "found", text, r.share, "")
 
 
 def _speeds(analysis: TrafficAnalysis, unit: SpeedUnit) -> Iterator[Answer]:
@@ -164,7 +164,7 @@ def _conflicts(analysis: TrafficAnalysis) -> Answer:
         text = f"{count_text(unclear, 'pair')} below 1.5 s where it is not clear that the roads are on one level"
         return Answer("conflicts", "", "too little data", f"too little data: {text}")
     return _events(
-        "conflicts", len(likely), analysis.trajectories.duration_s, f"{kinds}, more likely than not below 1.5 s"
+        "conflicts", len(likely), analysis.trajectories.duration_s, f"{kinds}, probably less than 1.5 s apart"
     )
 
 

@@ -16,12 +16,16 @@ def low_coverage_note(pixels: int, pixels_5: int) -> str:
     --------
     >>> low_coverage_note(55251, 1105).partition(".")[0]
     '2 % of the known pixels were passed by 5 or more vehicles'
+    >>> low_coverage_note(74722, 12).partition(".")[0]
+    '12 of 74722 known pixels were passed by 5 or more vehicles'
     >>> low_coverage_note(55251, 20000), low_coverage_note(0, 0)
     ('', '')
     """
     if pixels_5 >= _MIN_FRACTION_5 * pixels:
         return ""
     fraction = f"{percent(pixels_5, pixels)} of the known pixels were" if pixels_5 else "No pixel was"
+    if 0 < pixels_5 < 0.01 * pixels:
+        fraction = f"{pixels_5} of {pixels} known pixels were"
     return (
         f"{fraction} passed by 5 or more vehicles. Directions are reliable; speeds and percentiles are those of "
         "single vehicles. Record for longer, or merge several flights."

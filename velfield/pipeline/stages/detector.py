@@ -42,12 +42,6 @@ _MIN_FRAMES_WITH_BOXES = 0.5
 """Fraction of the frames in which another program's boxes are expected."""
 
 
-_TRAINED = {
-    "labels": "trained on labelled cars",
-    "shipped": "as it ships",
-}
-
-
 def make_detector(plan: Plan) -> StageResult:
     """Set the scale of the working grid, and load or train the detector."""
     use_device(plan.config.work.device)
@@ -192,8 +186,8 @@ def _finish(
         warnings += detector.limitations
         write_atomically(layout.detector, detector.to_json().encode())
         outputs.append(layout.detector)
-        given = Path(plan.job.inputs.detector or "").name
-        notes.append(f"detector: {detector.method}, {_TRAINED.get(training_source, f'of the file {given}')}")
+        if plan.job.inputs.detector:
+            notes.append(f"detector: {detector.method}, of the file {Path(plan.job.inputs.detector).name}")
         notes += detector.notes
     by_vehicles = None if _scale_of_gsd(plan) is not None else scale
     car_px = plan.config.detection.working_car_length_px

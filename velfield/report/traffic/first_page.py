@@ -41,7 +41,11 @@ def first_page(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> FirstP
     events = [f"{topic}: {text}" for topic in ("conflicts", "u-turns", "unusual") for text in found.get(topic, [])[:1]]
     no_junction = "no junction of lanes was found"
     questions = (
-        ("Where do vehicles go?", found.get("movement", []) or found.get("scene", []), "no turn was seen three times"),
+        (
+            "Where do vehicles go?",
+            found.get("movement", []) or found.get("through", []),
+            "no turn was seen three times",
+        ),
         (
             "Which approach waits longest, and how long are the queues?",
             _waits(analysis),
