@@ -46,7 +46,10 @@ def publish_summary(plan: Plan, summary: RunSummary) -> None:
     create_markdown_artifact(key="summary", markdown="\n".join(lines), description="Summary and maps")
     if not is_remote(plan.layout.root):
         create_link_artifact(
-            key="report", link=_address(report), link_text="report", description="The run's own page: map and report"
+            key="report",
+            link=page_address(report),
+            link_text="report",
+            description="The run's own page: map and report",
         )
     create_table_artifact(
         key="stages",
@@ -64,7 +67,7 @@ def publish_summary(plan: Plan, summary: RunSummary) -> None:
     )
 
 
-def _address(report: Path) -> str:
+def page_address(report: Path) -> str:
     """Address of the page under `velfield serve`; else of the file, which browsers open only by hand."""
     served = os.environ.get(PAGES_OF)
     if served is not None and report.resolve().is_relative_to(Path(served).resolve()):

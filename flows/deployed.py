@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from prefect import flow, get_run_logger
 
+from flows.artifacts import page_address
 from flows.console import Console, print_with_time
 from flows.launch import prepare_process
 from flows.process_flight import run_flight
@@ -43,7 +44,7 @@ def process_dropped(source: str, runs: str, cluster: str = "") -> str:
     for line in summary.frames_lost:
         get_run_logger().warning(line)
     lost = f", {len(summary.frames_lost)} frames lost" if summary.frames_lost else ""
-    print_with_time(f"{Path(source).name} is done{lost}: {summary.root}")
+    print_with_time(f"{Path(source).name} is done{lost}: {page_address(RunLayout(Path(summary.root)).report)}")
     return summary.root
 
 

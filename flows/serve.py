@@ -23,7 +23,7 @@ from flows.console import print_with_time
 from flows.launch import PAGES, PAGES_OF
 from flows.stopping import end_children, stop_on_signals
 from velfield.errors import InputError
-from velfield.pipeline.watch import FolderWatcher, is_flight
+from velfield.pipeline.watch import FolderWatcher, is_flight, is_telemetry
 
 if TYPE_CHECKING:
     from prefect.deployments.runner import RunnerDeployment
@@ -224,7 +224,10 @@ def watching(config: ServeConfig) -> Iterator[None]:
     from prefect.events import emit_event
 
     def flight(path: Path) -> None:
-        if not is_flight(path):  # subtitles, thumbnails and proxies that a drone writes beside a video
+        if is_telemetry(path):
+            print_with_time(f"{path.name} has arrived: telemetry, read with the video of its name")
+            return
+        if not is_flight(path):  # thumbnails and proxies that a drone writes beside a video
             print_with_time(f"{path.name} has arrived: neither a video nor a folder, not processed")
             return
         print_with_time(f"{path.name} has arrived: processing")

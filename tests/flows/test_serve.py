@@ -168,7 +168,8 @@ def test_what_a_drone_writes_beside_a_video_is_no_flight(
             time.sleep(0.01)
             text += capsys.readouterr().out
     assert [Path(source).name for source in emitted] == ["DJI_0001.MP4"]
-    assert "DJI_0001.SRT has arrived: neither a video nor a folder, not processed" in text
+    assert "DJI_0001.SRT has arrived: telemetry, read with the video of its name" in text
+    assert "DJI_0001.LRF has arrived: neither a video nor a folder, not processed" in text
 
 
 def test_a_dropped_folder_is_read_by_its_names(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from schemas.job import Inputs
 from velfield.errors import InputError
+from velfield.sources.telemetry.find import TELEMETRY_SUFFIXES
 
 VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".ts", ".m4v", ".mpg", ".webm"})
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"})
@@ -40,6 +41,17 @@ def is_flight(drop: Path) -> bool:
     (True, False)
     """
     return drop.is_dir() or drop.suffix.lower() in VIDEOS
+
+
+def is_telemetry(drop: Path) -> bool:
+    """Whether what arrived is a drone's metadata, which `velfield run` reads with the video of the same name.
+
+    Examples
+    --------
+    >>> is_telemetry(Path("incoming/DJI_0001.SRT")), is_telemetry(Path("incoming/DJI_0001.LRF"))
+    (True, False)
+    """
+    return drop.suffix.lower() in TELEMETRY_SUFFIXES
 
 
 def inputs_of(drop: Path) -> tuple[Inputs, Path | None]:

@@ -7,6 +7,8 @@ from velfield.errors import Failure
 from velfield.sources.telemetry.klv import KLV_KEY, KLV_SUFFIX
 from velfield.sources.telemetry.srt import parse_srt
 
+TELEMETRY_SUFFIXES = (".srt", KLV_SUFFIX)
+"""Suffixes, in lower case, of files that a drone writes beside a video."""
 _HEAD_BYTES = 100_000
 
 
@@ -15,7 +17,7 @@ def find_beside(source: Path) -> Path | None:
     if not source.is_file():
         return None
     name = re.sub(r"([*?\[])", r"[\1]", source.stem)
-    beside = sorted(path for path in source.parent.glob(f"{name}.*") if path.suffix.lower() in (".srt", KLV_SUFFIX))
+    beside = sorted(path for path in source.parent.glob(f"{name}.*") if path.suffix.lower() in TELEMETRY_SUFFIXES)
     return next((path for path in beside if _holds_telemetry(path)), None)
 
 
