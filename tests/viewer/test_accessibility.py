@@ -1,12 +1,11 @@
 """The pages by axe-core's rules (WCAG 2 A and AA, and its best practices), in light and dark, wide and narrow."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from schemas.summary import RunSummary
-from tests.browser import NEEDS_PAGE, Browser, browser, served
+from tests.browser import NEEDS_PAGE, Browser, served
 from velfield import open_run
 
 AXE = Path(__file__).resolve().parents[2] / "page" / "node_modules" / "axe-core" / "axe.min.js"
@@ -17,12 +16,6 @@ pytestmark = [
     NEEDS_PAGE,
     pytest.mark.skipif(not AXE.exists(), reason="axe-core is not installed: `npm ci` in page/, as `make page` does"),
 ]
-
-
-@pytest.fixture(scope="module")
-def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with browser(tmp_path_factory.mktemp("chromium")) as running:
-        yield running
 
 
 @pytest.mark.parametrize(("width", "height", "scheme"), [(1400, 900, "light"), (390, 800, "dark")])

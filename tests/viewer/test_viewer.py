@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from schemas.summary import RunSummary
-from tests.browser import MIDDLE_OF_MAP, NEEDS_PAGE, Browser, Page, browser, served
-from velfield import open_run
+from tests.browser import MIDDLE_OF_MAP, NEEDS_PAGE, Browser, Page, served
 from velfield.analysis import coverage
 from velfield.report.figures import colour_scale_max, round_up
 from velfield.run.layout import RunLayout
@@ -23,19 +22,6 @@ from velfield.run.stores import open_field
 pytestmark = NEEDS_PAGE
 
 
-@pytest.fixture(scope="module")
-def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with browser(tmp_path_factory.mktemp("chromium")) as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
-def address(whole: tuple[Path, RunSummary]) -> Iterator[str]:
-    """The run folder behind Python's plain static server."""
-    with served(whole[0]) as there:
-        yield there
-
-
 @pytest.fixture
 def page(chromium: Browser, address: str) -> Iterator[Page]:
     """A page that complains of nothing and asks no other host for anything."""
@@ -43,11 +29,6 @@ def page(chromium: Browser, address: str) -> Iterator[Page]:
         yield opened
         assert opened.complaints == []
         assert [r for r in opened.requests if not r.startswith((address, "data:", "blob:"))] == []
-
-
-@pytest.fixture(scope="module")
-def run(whole: tuple[Path, RunSummary]) -> Run:
-    return open_run(whole[0])
 
 
 def shown_value(page: Page, name: str) -> Any:
@@ -92,18 +73,13 @@ def test_a_click_shows_the_values_of_python(page: Page, address: str, run: Run) 
 
 
 @pytest.fixture
-def north_up(whole: tuple[Path, RunSummary], tmp_path: Path) -> Iterator[str]:
+def north_up(linked: Path) -> Iterator[str]:
     """The same run, had its base image north at its upper edge."""
-    for path in whole[0].iterdir():
-        (tmp_path / path.name).symlink_to(path)
-    (tmp_path / "view").unlink()
-    (tmp_path / "view").mkdir()
-    for path in (whole[0] / "view").iterdir():
-        (tmp_path / "view" / path.name).symlink_to(path)
-    record = json.loads((tmp_path / "view" / "run.json").read_bytes())
-    (tmp_path / "view" / "run.json").unlink()
-    (tmp_path / "view" / "run.json").write_text(json.dumps({**record, "north_rad": -np.pi / 2}))
-    with served(tmp_path) as there:
+    path = linked / "view" / "run.json"
+    record = json.loads(path.read_bytes())
+    path.unlink()
+    path.write_text(json.dumps({**record, "north_rad": -np.pi / 2}))
+    with served(linked) as there:
         yield there
 
 
