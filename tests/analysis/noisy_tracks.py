@@ -12,6 +12,7 @@ from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.trajectories import make_trajectories, moving
 from velfield.synthetic.flight import Flight
 from velfield.synthetic.observed import NO_ERRORS, observed_detections
+from velfield.synthetic.traffic.traffic import Traffic
 from velfield.tracking.smoothing import clean_tracks
 
 CYCLE_S, GSD_M = 28.0, 0.23
@@ -68,14 +69,13 @@ def flight(seed: int, seconds: float, traffic: TrafficSimulation = TRAFFIC, sign
 @cache
 def driven(seed: int = 913, seconds: float = 140.0) -> TrueTracks:
     """True tracks of one flight."""
-    return true_tracks(flight(seed, seconds), seed)
+    return true_tracks(flight(seed, seconds))
 
 
-def true_tracks(made: Flight, seed: int) -> TrueTracks:
-    """True tracks of a flight."""
-    rng = np.random.default_rng(seed)
-    observe = partial(observed_detections, shape=made.base_shape, rng=rng, errors=NO_ERRORS)
-    table = observe(made.city.traffic, made.times_s, made.city.to_px)
+def true_tracks(made: Flight, traffic: Traffic | None = None, times_s: FloatArray | None = None) -> TrueTracks:
+    """True tracks of a flight; ``traffic``: of other traffic over its roads, at ``times_s``."""
+    observe = partial(observed_detections, shape=made.base_shape, rng=np.random.default_rng(0), errors=NO_ERRORS)
+    table = observe(traffic or made.city.traffic, made.times_s if times_s is None else times_s, made.city.to_px)
     table = table.sort_values(["vehicle_id", "frame"], kind="stable")
     owner = table["vehicle_id"].to_numpy()
     first = np.r_[0, np.flatnonzero(np.diff(owner)) + 1, len(owner)].astype(np.int64)

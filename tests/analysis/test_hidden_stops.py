@@ -7,6 +7,7 @@ import pytest
 
 from schemas.arrays import FloatArray
 from tests.analysis.test_traffic_analysis import CYCLE_S, Track, crossroads, gather
+from velfield.analysis.intervals import Estimate
 from velfield.analysis.signals.cycles import _red_onset, queues
 from velfield.analysis.signals.queues import Stream
 from velfield.analysis.traffic_analysis import TrafficAnalysis
@@ -76,7 +77,7 @@ def test_the_onset_of_red_is_where_crossings_end(whole: TrafficAnalysis) -> None
             times.append(t[kept] + cycle * CYCLE_S)
         crossings = np.sort(np.concatenate(times))
         stream = replace(first_stream(whole), cross_time_s=crossings)
-        found = _red_onset(stream, 0.0, CYCLE_S)
+        found = _red_onset(stream, 0.0, Estimate(CYCLE_S, CYCLE_S, CYCLE_S, cycles))
         assert found is not None
         errors.append(found.value - red_s)
         held.append(found.low <= red_s <= found.high)

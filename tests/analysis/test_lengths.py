@@ -33,8 +33,8 @@ def test_the_gap_is_from_bumper_to_bumper() -> None:
 
 
 def test_a_mixed_pair_has_the_mean_of_both_lengths() -> None:
-    tracks = gather([drive(EAST, 2.0 * k) for k in range(12)])
-    mixed = replace(tracks, measured_length_m=np.where(np.arange(12) % 2, LORRY_M, np.nan))
+    tracks = gather([drive(EAST, 2.0 * k) for k in range(30)])
+    mixed = replace(tracks, measured_length_m=np.where(np.arange(30) % 2, LORRY_M, np.nan))
     (flow,) = TrafficAnalysis(mixed).flows
     assert flow.gap_s is not None
     assert flow.gap_s.value == pytest.approx(2.0 - (LORRY_M + VEHICLE_LENGTH_M) / 2 / 12.0, abs=0.05)

@@ -1,7 +1,6 @@
 """Accuracy of `velfield analyse` on simulated traffic without images: ``python -m tests.benchmarks.analysis``.
 
-Tracks are true trajectories with the errors of tracking (`velfield.synthetic.observed_tracks`). Long-run shares and
-flows are those of other flights of as long over the same plan, of other traffic.
+Tracks are true trajectories with the errors of tracking (`velfield.synthetic.observed_tracks`).
 """
 
 import argparse
@@ -18,25 +17,24 @@ from schemas.simulation import SimulationConfig
 from velfield.analysis.flow.conflicts import MAX_PET_S, find_conflicts
 from velfield.analysis.flow.passings import LaneTraffic
 from velfield.analysis.flow.speeds import Reduction
-from velfield.analysis.intervals import Estimate
 from velfield.analysis.lanes.find import find_lanes
 from velfield.analysis.movements.movements import JunctionMovements, find_passes
 from velfield.analysis.movements.scene import trace_trips
 from velfield.analysis.signals.cycles import JunctionSignal, queues
-from velfield.analysis.signals.queues import Stops, observe_stream
+from velfield.analysis.signals.queues import Stops, Stream, observe_stream
 from velfield.analysis.traffic_analysis import TrafficAnalysis
-from velfield.analysis.trajectories import PathSamples, Trajectories, make_trajectories, moving, sample_paths
+from velfield.analysis.trajectories import PathSamples, Trajectories, make_trajectories, moving
 from velfield.synthetic.city.city_plan import STOP_A, STOP_B
 from velfield.synthetic.flight import Flight
 from velfield.synthetic.lane_score import DirectedGraph, score_lanes
 from velfield.synthetic.observed import NO_ERRORS, observed_detections
 from velfield.synthetic.observed_tracks import observed_tracks
-from velfield.synthetic.traffic.traffic import STEP_S, simulate_traffic
+from velfield.synthetic.traffic.traffic import STEP_S
 
 GSD_M, CYCLE_S = 0.23, 60.0
 AVENUE_KM_PER_H, STREET_KM_PER_H = 49.8, 34.2
 """Medians of the speeds that drivers want: mean 50 km/h, one in twenty a tenth slower; the limit of a street."""
-MARGIN_M, SAME_ENTRY_M, LONG_RUN_SEED = 20.0, 6.0, 5000
+SAME_ENTRY_M = 6.0
 CANNOT_STOP_M_PER_S2 = 3.5
 """A driver who would have to brake harder at the end of green crosses: `velfield.synthetic.traffic.driving`."""
 
@@ -52,25 +50,10 @@ class Case:
 
 
 @dataclass(frozen=True)
-class LongRun:
-    """Paths of all vehicles of so many flights of ``duration_s``, in metres of the plan."""
-
-    samples: PathSamples
-    flights: int
-    duration_s: float
-
-    def seen_in(self, case: Case) -> PathSamples:
-        """The paths in metres of a flight's base image."""
-        s = self.samples
-        return PathSamples(s.track, case.flight.city.to_px(s.xy_m) * GSD_M, s.direction_rad, s.time_s, s.speed_m_per_s)
-
-
-@dataclass(frozen=True)
 class Results:
-    """Values by measure; estimates with their quantity and its true value."""
+    """Values by measure."""
 
     values: defaultdict[str, list[float]]
-    estimates: list[tuple[str, float, Estimate]]
 
 
 def simulate(seed: int, minutes: float) -> Case:
@@ -81,29 +64,6 @@ def simulate(seed: int, minutes: float) -> Case:
     tracks = observed_tracks(traffic, times, city.to_px, shape=flight.base_shape, gsd_m=GSD_M, rng=rng)
     true = observed_detections(traffic, times, city.to_px, shape=flight.base_shape, rng=rng, errors=NO_ERRORS)
     return Case(flight, tracks, true, traffic.dimensions.length_m)
-
-
-def simulate_long_run(case: Case, flights: int, *, seed: int) -> LongRun:
-    """Other traffic on a flight's plan: nothing but the traffic's random numbers differs from flight to flight."""
-    city, times = case.flight.city, case.flight.times_s
-    margin_px = int(MARGIN_M / GSD_M)
-    shape = (case.flight.base_shape[0] + 2 * margin_px, case.flight.base_shape[1] + 2 * margin_px)
-    parts, first = [], 0
-    for k in range(flights):
-        rng = np.random.default_rng([seed, k])
-        traffic = simulate_traffic(
-            city.plan.road_network, city.config.traffic, duration_s=float(times[-1]) + 1.0, rng=rng
-        )
-        table = observed_detections(
-            traffic, times, lambda xy: city.to_px(xy) + margin_px, shape=shape, rng=rng, errors=NO_ERRORS
-        )
-        s = sample_paths(trajectories(table, "vehicle_id"), 2.0)
-        xy = s.xy_m - margin_px * GSD_M - city.to_px(np.zeros((1, 2))) * GSD_M
-        parts.append(PathSamples(s.track + first, xy, s.direction_rad, s.time_s, s.speed_m_per_s))
-        first += int(s.track.max(initial=-1)) + 1
-    names = PathSamples.__dataclass_fields__
-    samples = PathSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-    return LongRun(samples, flights, float(np.ptp(times)))
 
 
 def trajectories(table: pd.DataFrame, owner: str) -> Trajectories:
@@ -121,13 +81,13 @@ def trajectories(table: pd.DataFrame, owner: str) -> Trajectories:
     )
 
 
-def measure(case: Case, long_run: LongRun) -> Results:
+def measure(case: Case) -> Results:
     """Everything about one flight."""
-    results = Results(defaultdict(list), [])
+    results = Results(defaultdict(list))
     found = TrafficAnalysis(trajectories(case.tracks, "track_id"))
     true = TrafficAnalysis(trajectories(case.true, "vehicle_id"))
     _lanes(case, found, results)
-    _movements(found, true, long_run.seen_in(case), long_run, results)
+    _movements(found, true, results)
     _scene(found, true, results)
     _speeds(found, true, results)
     _signals(case, found, true, results)
@@ -171,23 +131,16 @@ def driven_plan(case: Case, *, min_vehicles: int = 3) -> DirectedGraph:
     return DirectedGraph(paths, [[number[j] for j in out[network.edges[k].end] if j in number] for k in number])
 
 
-def _movements(
-    found: TrafficAnalysis, true: TrafficAnalysis, samples: PathSamples, long_run: LongRun, results: Results
-) -> None:
-    hours = long_run.flights * long_run.duration_s / 3600
+def _movements(found: TrafficAnalysis, true: TrafficAnalysis, results: Results) -> None:
     for junction in found.movements:
         names = [arm.name for arm in junction.gates.arms]
-        counts, many = (_true_counts(junction, paths) for paths in (true.samples, samples))
+        counts = _true_counts(junction, true.samples)
         for m in junction.movements:
             i, j = names.index(m.arm_in), names.index(m.arm_out)
             n, total = counts[i, j], m.seen + m.inferred
             results.values["movements: GEH"].append(float(np.sqrt(2 * (total - n) ** 2 / max(total + n, 1))))
             if n >= 20 and m.share:
                 results.values["movements: share, points"].append(100 * abs(m.share.value - n / counts[i].sum()))
-            if m.share and many[i].sum() and 0 < many[i, j] < many[i].sum():
-                results.estimates.append(("share", float(many[i, j] / many[i].sum()), m.share))
-            if m.flow_veh_per_h:
-                results.estimates.append(("flow", float(many[i, j] / hours), m.flow_veh_per_h))
 
 
 def _true_counts(junction: JunctionMovements, samples: PathSamples) -> IntArray:
@@ -231,7 +184,6 @@ def _speeds(found: TrafficAnalysis, true: TrafficAnalysis, results: Results) -> 
             speed = road.speed_m_per_s.in_units(3.6)
             truth = min((AVENUE_KM_PER_H, STREET_KM_PER_H, 20.2, 15.1), key=lambda v: abs(v - speed.value))
             results.values["limit: error, km/h"].append(abs(speed.value - truth))
-            results.estimates.append(("limit", truth, speed))
     for r in found.reductions:
         if found.lanes.junctions[r.junction].kind != "roundabout" or not r.reduction_m_per_s:
             continue
@@ -262,41 +214,47 @@ def _signals(case: Case, found: TrafficAnalysis, true: TrafficAnalysis, results:
         results.values["signals: found"].append(float(signal.signalised is True))
         if signal.cycle_s:
             results.values["signals: cycle, s"].append(abs(signal.cycle_s.value - CYCLE_S))
-            results.estimates.append(("cycle", CYCLE_S, signal.cycle_s))
             _streams(case, signal, samples, stops, results)
 
 
 def _streams(case: Case, signal: JunctionSignal, samples: PathSamples, stops: Stops, results: Results) -> None:
-    origin, warm_up = case.flight.city._origin_m, case.flight.config.traffic.warm_up_s
-    plan, all_red = case.flight.city.plan, case.flight.config.traffic.all_red_s
     for stream in signal.streams:
-        path = stream.stream.approach.path_m
-        step = path[-1] - path[0]
-        axis = int(abs(step[1]) > abs(step[0]))
-        line = stream.stream.stop_line_m
-        centres = np.array([[x, y] for x in plan.avenues_x for y in plan.avenues_y]) - origin
-        number = int(np.argmin(np.hypot(*(centres - path[-20]).T)))
-        onset = -plan.road_network.signal_offsets_s[number] - warm_up + axis * CYCLE_S / 2
-        error = (stream.green_phase_s.value - onset + CYCLE_S / 2) % CYCLE_S - CYCLE_S / 2
-        results.values["signals: green onset, s"].append(abs(error))
-        value = stream.green_phase_s
-        shifted = Estimate(error, error - (value.value - value.low), error + value.high - value.value, value.n)
-        results.estimates.append(("green", 0.0, shifted))
-        if stream.red_phase_s:
-            red = stream.red_phase_s
-            # simulated signals have no yellow: who cannot stop crosses after the end of green
-            red_s = onset + CYCLE_S / 2 - all_red + AVENUE_KM_PER_H / 3.6 / (2 * CANNOT_STOP_M_PER_S2)
-            red_error = (red.value - red_s + CYCLE_S / 2) % CYCLE_S - CYCLE_S / 2
-            results.values["signals: red onset, s"].append(abs(red_error))
-            around = Estimate(red_error, red_error - red.value + red.low, red_error + red.high - red.value, red.n)
-            results.estimates.append(("red", 0.0, around))
+        for name, onset in zip(("green", "red"), signal_onsets_s(case.flight, stream.stream), strict=True):
+            found = stream.green_phase_s if name == "green" else stream.red_phase_s
+            if found:
+                error = (found.value - onset + CYCLE_S / 2) % CYCLE_S - CYCLE_S / 2
+                results.values[f"signals: {name} onset, s"].append(abs(error))
+        path, line = stream.stream.approach.path_m, stream.stream.stop_line_m
         if line is not None:
-            at = path[0] + step / np.hypot(*step) * line
-            distance = abs(float((at - centres[number])[axis]))
+            number, axis = _crossing_of(case.flight, path)
+            at = path[0] + (path[-1] - path[0]) / np.hypot(*(path[-1] - path[0])) * line
+            distance = abs(float((at - crossings_m(case.flight)[number])[axis]))
             results.values["signals: stop line, m"].append(abs(distance - (STOP_B if axis else STOP_A)))
         truth = observe_stream(stream.stream.approach, samples, stops)
         pairs = zip(queues(stream.stream, stream.green_s), queues(truth, stream.green_s), strict=False)
         results.values["signals: queue, vehicles"] += [abs(a.vehicles.value - b.vehicles.value) for a, b in pairs]
+
+
+def crossings_m(made: Flight) -> FloatArray:
+    """(n, 2) crossings of avenues, m of the base image."""
+    plan = made.city.plan
+    return made.city.to_px(np.array([[x, y] for x in plan.avenues_x for y in plan.avenues_y])) * GSD_M
+
+
+def _crossing_of(made: Flight, path_m: FloatArray) -> tuple[int, int]:
+    """Number of the crossing to which a path leads, and the axis along which it does."""
+    step = path_m[-1] - path_m[0]
+    return int(np.argmin(np.hypot(*(crossings_m(made) - path_m[-20]).T))), int(abs(step[1]) > abs(step[0]))
+
+
+def signal_onsets_s(made: Flight, stream: Stream) -> tuple[float, float]:
+    """Onsets of green and of red of a stream, as simulated."""
+    number, axis = _crossing_of(made, stream.approach.path_m)
+    traffic = made.config.traffic
+    green = axis * traffic.cycle_s / 2 - made.city.plan.road_network.signal_offsets_s[number] - traffic.warm_up_s
+    # simulated signals have no yellow: who cannot stop crosses after the end of green
+    late = AVENUE_KM_PER_H / 3.6 / (2 * CANNOT_STOP_M_PER_S2)
+    return green, green + traffic.cycle_s / 2 - traffic.all_red_s + late
 
 
 def _u_turns(case: Case, found: TrafficAnalysis, results: Results) -> None:
@@ -358,16 +316,6 @@ def _pairs(conflicts: list, ids: IntArray) -> dict[tuple[int, int], float]:
     return {(int(ids[c.first]), int(ids[c.second])): c.value_s for c in conflicts if c.kind != "following"}
 
 
-def coverage(all_results: list[Results]) -> dict[str, tuple[int, int]]:
-    """For each quantity how many intervals hold the true value, and of how many."""
-    out: dict[str, tuple[int, int]] = {}
-    for results in all_results:
-        for kind, truth, estimate in results.estimates:
-            hits, n = out.get(kind, (0, 0))
-            out[kind] = (hits + (estimate.low <= truth <= estimate.high), n + 1)
-    return out
-
-
 def lines(all_results: list[Results]) -> Iterator[str]:
     """The table, for people."""
     names = sorted({name for results in all_results for name in results.values})
@@ -379,25 +327,17 @@ def lines(all_results: list[Results]) -> Iterator[str]:
         )
     share = np.array([v for r in all_results for v in r.values["movements: share, points"]])
     yield f"shares within 3 points: {np.mean(share <= 3):.3f} of {len(share)}"
-    covered = coverage(all_results)
-    for kind, (hits, n) in covered.items():
-        yield f"90 % intervals, {kind:8} {hits / n:.3f} of {n}"
-    hits, n = (sum(pair[k] for pair in covered.values()) for k in (0, 1))
-    yield f"90 % intervals, pooled   {hits / max(n, 1):.3f} of {n}"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(913, 923)))
     parser.add_argument("--minutes", type=float, default=6.0)
-    parser.add_argument("--long-run", type=int, default=20, help="flights that shares and flows are held against")
     arguments = parser.parse_args()
     made: list[Results] = []
-    long_run: LongRun | None = None
     for seed in arguments.seeds:
         case = simulate(seed, arguments.minutes)
-        long_run = long_run or simulate_long_run(case, arguments.long_run, seed=LONG_RUN_SEED)
-        made.append(measure(case, long_run))
+        made.append(measure(case))
         print(f"seed {seed}: {', '.join(f'{k} {np.mean(v):.2f}' for k, v in made[-1].values.items())}", flush=True)
     for line in lines(made):
         print(line)

@@ -51,7 +51,7 @@ def make_cases(seed: int, *, clips: int = CLIPS) -> Iterator[Case]:
         large_share=float(rng.choice([0.0, 0.05, 0.2])),
     )
     made = flight(seed, FLIGHT_S, traffic, signals)
-    whole, middles = true_tracks(made, seed), turn_middles_m(made)
+    whole, middles = true_tracks(made), turn_middles_m(made)
     scene = analyse(whole, Noise(), lengths_m=made.city.traffic.dimensions.length_m)
     parked = made.city.vehicles.parked_pose
     parked = parked[((parked[:, :2] > 0) & (parked[:, :2] < made.base_shape[::-1])).all(axis=1)] * [GSD_M, GSD_M, 1]

@@ -1,12 +1,11 @@
 """Answers for people: a number with its interval, none and at most so many an hour, or what is missing for one."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 from schemas.export import PER_M_PER_S, SpeedUnit
-from velfield.analysis.intervals import Estimate
+from velfield.analysis.intervals import Estimate, estimate_event_rate
 from velfield.analysis.signals.cycles import JunctionSignal, Queue, queues
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.vehicle_classes import COUNTED_CLASSES
@@ -14,7 +13,6 @@ from velfield.analysis.vehicle_classes import COUNTED_CLASSES
 State = Literal["found", "none", "too little data"]
 _SHORT_S, _FEW_TRACKS = 60.0, 30
 """In a shorter clip with fewer vehicles nothing is expected to be found; what it did not show may still be frequent."""
-_NONE_PROBABILITY = 0.1
 
 
 @dataclass(frozen=True)
@@ -178,15 +176,18 @@ def _unusual(analysis: TrafficAnalysis) -> Answer:
 
 
 def _events(topic: str, n: int, seconds: float, detail: str = "") -> Answer:
-    """A number of events; of none how rare they are at least."""
+    """A number of events, and how many an hour that is; of none how rare they are at least."""
     if n:
-        return Answer(topic, "", "found", f"{n}: {detail}" if detail else str(n))
+        rate = estimate_event_rate(n, seconds / 3600) if seconds >= _SHORT_S else None
+        often = f", {rate.value:.0f} an hour ({rate.low:.0f} to {rate.high:.0f})" if rate else ""
+        text = f"{n}{often}: {detail}" if detail else f"{n}{often}"
+        return Answer(topic, "", "found", text, rate, "/h" if rate else "")
     if seconds < _SHORT_S:
         text = f"none in {duration_text(seconds)}, too short to say how rare they are"
         return Answer(topic, "", "too little data", text)
-    hourly = -math.log(_NONE_PROBABILITY) / seconds * 3600
-    rate = f"{hourly:.2g}" if hourly < 10 else f"{hourly:.0f}"
-    text = f"none in {duration_text(seconds)}, so fewer than {rate} an hour with 90 % probability"
+    hourly = estimate_event_rate(0, seconds / 3600).high
+    fewer = f"{hourly:.2g}" if hourly < 10 else f"{hourly:.0f}"
+    text = f"none in {duration_text(seconds)}, so fewer than {fewer} an hour with 90 % probability"
     return Answer(topic, "", "none", text, at_most_per_h=hourly)
 
 

@@ -1,6 +1,8 @@
 """Estimates with their 90 % intervals; None where there is too little data for one.
 
-An interval says where the quantity lies in the long run of such traffic, not only in the flight.
+An interval says where the quantity lies in the long run of such traffic, not only in the flight. Vehicles that pass
+soon after each other are alike: a platoon has one speed, a queue waits. Where their times are given the interval is
+that of as many independent vehicles as tell as much.
 """
 
 from dataclasses import dataclass
@@ -10,12 +12,15 @@ from numpy.typing import NDArray
 from scipy import special
 
 from schemas.arrays import FloatArray, IntArray
+from velfield.compiled import kernel
 
 LEVEL = 0.9
 MIN_VEHICLES = 5
 """Fewer vehicles give no estimate."""
-MIN_QUANTILE_TAIL = 2
-"""A quantile needs so many values on either side of it in expectation."""
+_ALIKE_S = 5.0
+"""Time between two vehicles in which the correlation of their speeds and delays falls to 1/e."""
+_ALIKE, _ALIKE_PAIRS = 0.7, 3.0
+"""Correlation of vehicles that pass at once before any is seen, and the number of pairs that it counts for."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +37,63 @@ class Estimate:
         return Estimate(self.value * factor, self.low * factor, self.high * factor, self.n)
 
 
-def estimate_mean(values: NDArray[np.floating], *, min_n: int = MIN_VEHICLES) -> Estimate | None:
-    """Mean of independent values by Student's t.
+def independent_vehicles(values: FloatArray, time_s: FloatArray) -> float:
+    """Number of independent vehicles whose mean is as accurate as that of these values (n,), seen at times.
+
+    The correlation is taken to fall exponentially with the time between two vehicles; how large it is follows from all
+    pairs, by least squares.
+
+    Examples
+    --------
+    >>> round(independent_vehicles(np.array([1.0, 2.0, 2.0, 1.0]), 100.0 * np.arange(4)), 1)
+    4.0
+    >>> round(independent_vehicles(np.array([1.0, 1.1, 2.0, 2.1]), np.array([0.0, 1.0, 50.0, 51.0])), 1)
+    2.3
+    """
+    order = np.argsort(time_s, kind="stable")
+    x, n = values[order] - values.mean(), len(values)
+    variance = float(x.var())
+    decay = np.exp(-np.diff(time_s[order]) / _ALIKE_S)
+    pairs, squares, products = _pair_sums(x / np.sqrt(variance) if variance > 0 else 0 * x, decay)
+    # of deviations from their own mean a pair's product is too low by 1 / n
+    alike = (products + pairs / n + _ALIKE_PAIRS * _ALIKE) / (squares + _ALIKE_PAIRS)
+    return float(n / (1 + 2 * np.clip(alike, 0.0, 1.0) * pairs / n))
+
+
+@kernel
+def _pair_sums(x: FloatArray, decay: FloatArray) -> tuple[float, float, float]:
+    """Sums over all pairs of their weight, its square, and the weighted product of their values (n,); the weight is the
+    product of ``decay`` (n - 1,) between them."""
+    pairs = squares = products = 0.0
+    weight = square = product = 0.0
+    for i in range(1, len(x)):
+        weight = (weight + 1.0) * decay[i - 1]
+        square = (square + 1.0) * decay[i - 1] ** 2
+        product = (product + x[i - 1]) * decay[i - 1]
+        pairs += weight
+        squares += square
+        products += product * x[i]
+    return pairs, squares, products
+
+
+def estimate_mean(
+    values: NDArray[np.floating],
+    time_s: FloatArray | None = None,
+    *,
+    min_n: int = MIN_VEHICLES,
+    spread: tuple[float, int] = (0.0, 0),
+) -> Estimate | None:
+    """Mean by Student's t, of independent values unless their times are given.
+
+    Parameters
+    ----------
+    values, time_s
+        (n,) values, NaN where one is not known, and when they were seen.
+    min_n
+        Fewest values.
+    spread
+        Standard deviation of values like these, and the number of values that it counts for: few may be alike by
+        chance.
 
     Examples
     --------
@@ -41,28 +101,53 @@ def estimate_mean(values: NDArray[np.floating], *, min_n: int = MIN_VEHICLES) ->
     >>> estimate_mean(np.array([1.0, 2.0, 3.0, 4.0, 5.0])).value
     3.0
     """
-    known = values[np.isfinite(values)]
-    if len(known) < min_n:
+    known, n, effective = _known(values, time_s)
+    if n < min_n:
         return None
     mean = float(known.mean())
-    half = float(special.stdtrit(len(known) - 1, (1 + LEVEL) / 2) * known.std(ddof=1) / np.sqrt(len(known)))
-    return Estimate(mean, mean - half, mean + half, len(known))
+    degrees = effective - 1 + spread[1]
+    sd = np.sqrt(((effective - 1) * known.var(ddof=1) + spread[1] * spread[0] ** 2) / degrees)
+    half = float(special.stdtrit(degrees, (1 + LEVEL) / 2) * sd / np.sqrt(effective))
+    return Estimate(mean, mean - half, mean + half, n)
 
 
-def estimate_median(values: NDArray[np.floating]) -> Estimate | None:
-    """Median of independent values, the interval by order statistics."""
-    return estimate_quantile(values, 0.5)
+def _known(values: NDArray[np.floating], time_s: FloatArray | None) -> tuple[FloatArray, int, float]:
+    """Values that are known, their number, and the number of independent ones that tell as much of their mean."""
+    known = np.isfinite(values)
+    used, n = values[known].astype(np.float64), int(known.sum())
+    if time_s is None or n < 2:
+        return used, n, float(n)
+    return used, n, max(independent_vehicles(used, time_s[known]), 2.0)
 
 
-def estimate_quantile(values: NDArray[np.floating], q: float, *, min_n: int = MIN_VEHICLES) -> Estimate | None:
-    """A quantile of independent values; the interval lies between order statistics, interpolated to the level."""
-    known = np.sort(values[np.isfinite(values)])
-    n = len(known)
-    if n < min_n or min(q, 1 - q) * n < MIN_QUANTILE_TAIL:
+def estimate_median(values: NDArray[np.floating], time_s: FloatArray | None = None) -> Estimate | None:
+    """Median, the interval by order statistics: of independent values unless their times are given."""
+    return estimate_quantile(values, 0.5, time_s)
+
+
+def estimate_quantile(
+    values: NDArray[np.floating], q: float, time_s: FloatArray | None = None, *, min_n: int = MIN_VEHICLES
+) -> Estimate | None:
+    """A quantile; the interval lies between order statistics, interpolated to the level; None where it would reach
+    beyond the least or the largest value. The values are independent unless their times are given."""
+    known = np.isfinite(values)
+    n = int(known.sum())
+    if n < min_n:
+        return None
+    used = values[known].astype(np.float64)
+    value = float(np.quantile(used, q))
+    effective = float(n) if time_s is None else independent_vehicles((used <= value) * 1.0, time_s[known])
+    if not _has_interval(effective, q):
         return None
     # The level of the sample quantile is a beta variable (Hutson 1999): interpolated order statistics.
-    low, high = (float(_fractional_order(known, q, alpha)) for alpha in ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
-    return Estimate(float(np.quantile(known, q)), low, high, n)
+    ordered = np.sort(used)
+    low, high = (float(_fractional_order(ordered, effective, q, a)) for a in ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
+    return Estimate(value, low, high, n)
+
+
+def _has_interval(n: float, q: float) -> bool:
+    """Whether all of n independent values lie on one side of a quantile less often than its interval may miss it."""
+    return bool(max(q, 1 - q) ** n <= (1 - LEVEL) / 2)
 
 
 def estimate_censored_quantile(
@@ -91,7 +176,7 @@ def estimate_censored_quantile(
     if observed.all():
         return estimate_quantile(values, q, min_n=min_n)
     n = int(observed.sum())
-    if n < min_n or min(q, 1 - q) * n < MIN_QUANTILE_TAIL:
+    if n < min_n or not _has_interval(n, q):
         return None
     order = np.lexsort((~observed, values))
     ordered, event = values[order].astype(np.float64), observed[order].astype(np.float64)
@@ -116,12 +201,13 @@ def _first_below(curve: FloatArray, values: FloatArray, level: float) -> float |
     return float(values[rows[0]]) if len(rows) else None
 
 
-def _fractional_order(ordered: FloatArray, q: float, alpha: float) -> float:
-    """The order statistic, interpolated, that lies above the quantile ``q`` with probability ``alpha``."""
-    n = len(ordered)
-    ranks = np.arange(1, n + 1)
+def _fractional_order(ordered: FloatArray, n: float, q: float, alpha: float) -> float:
+    """The order statistic, interpolated, that lies above the quantile ``q`` with probability ``alpha`` if ``n`` of the
+    values are independent."""
+    ranks = np.linspace(1, n, round(n))
     above = 1 - special.betainc(ranks, n - ranks + 1, q)  # probability that the statistic of a rank lies above
-    return float(np.interp(alpha, above, ordered))
+    level = np.interp(alpha, above, ranks / (n + 1))
+    return float(np.interp(level, np.arange(1, len(ordered) + 1) / (len(ordered) + 1), ordered))
 
 
 def estimate_share(successes: float, n: int) -> Estimate | None:
@@ -152,6 +238,22 @@ def estimate_rate(counts: IntArray | FloatArray, exposure: float) -> Estimate | 
     shape = (total + 0.5) / factor
     low, high = (float(special.gammaincinv(shape, p) * factor) for p in ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
     return Estimate(total / exposure, low / exposure, high / exposure, round(total))
+
+
+def estimate_event_rate(events: int, hours: float) -> Estimate:
+    """Events an hour of few that come by chance, the interval by Poisson's law; of none from 0 to the rate that is not
+    exceeded.
+
+    Examples
+    --------
+    >>> rate = estimate_event_rate(3, 0.1)
+    >>> round(rate.value), round(rate.low), round(rate.high)
+    (30, 11, 70)
+    """
+    if events == 0:
+        return Estimate(0.0, 0.0, float(-np.log(1 - LEVEL)) / hours, 0)
+    low, high = (float(special.gammaincinv(events + 0.5, p)) / hours for p in ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
+    return Estimate(events / hours, low, high, events)
 
 
 def _dispersion(counts: FloatArray) -> float:

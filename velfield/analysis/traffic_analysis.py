@@ -190,7 +190,7 @@ class TrafficAnalysis:
     @cached_property
     def free_flow(self) -> list[FreeFlow]:
         """Free flow of each road."""
-        return free_flow(self.lane_traffic)
+        return free_flow(self.lane_traffic, position_sd_m=self.trajectories.position_sd_m)
 
     @cached_property
     def reductions(self) -> list[Reduction]:

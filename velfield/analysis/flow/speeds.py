@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy import special
@@ -64,21 +65,22 @@ def speed_profile(traffic: LaneTraffic, lane: int) -> list[Station]:
     count = max(round(length / STATION_M), 1)
     station = np.clip((samples.along_m / length * count).astype(np.int64), 0, count - 1)
     out = []
-    for k, speeds in enumerate(_speeds_by_station(samples, station, count)):
+    for k, (speeds, time_s) in enumerate(_speeds_by_station(samples, station, count)):
         at = (k + 0.5) * length / count
-        quantiles = [estimate_quantile(speeds, q) for q in (0.15, 0.5, 0.85)]
+        quantiles = [estimate_quantile(speeds, q, time_s) for q in (0.15, 0.5, 0.85)]
         out.append(Station(lane, at, traffic.graph.lanes[lane].at(at), len(speeds), *quantiles))
     return out
 
 
-def _speeds_by_station(samples: LaneSamples, station: IntArray, count: int) -> list[FloatArray]:
-    """Mean speed of each track at each station."""
+def _speeds_by_station(samples: LaneSamples, station: IntArray, count: int) -> list[tuple[FloatArray, FloatArray]]:
+    """Mean speed and time of each track at each station."""
     key = station * (int(samples.track.max(initial=0)) + 1) + samples.track
     keys, inverse = np.unique(key, return_inverse=True)
-    mean = np.bincount(inverse, samples.speed_m_per_s) / np.bincount(inverse) if len(key) else np.empty(0)
+    n = np.bincount(inverse, minlength=len(keys))
+    speed, time = (np.bincount(inverse, of, len(keys)) / n for of in (samples.speed_m_per_s, samples.time_s))
     owner = keys // (int(samples.track.max(initial=0)) + 1)
     first = np.searchsorted(owner, np.arange(count + 1))
-    return [mean[first[k] : first[k + 1]] for k in range(count)]
+    return [(speed[a:b], time[a:b]) for a, b in pairwise(first)]
 
 
 @dataclass(frozen=True)
@@ -110,8 +112,8 @@ class FreeFlow:
         return signs.pop() * SIGNS[unit] if len(signs) == 1 else None
 
 
-def free_flow(traffic: LaneTraffic) -> list[FreeFlow]:
-    """Free flow of every road of a lane graph."""
+def free_flow(traffic: LaneTraffic, *, position_sd_m: float = 0.0) -> list[FreeFlow]:
+    """Free flow of every road of a lane graph, of tracks whose positions have a standard deviation."""
     lanes = [_steady_speeds(traffic, lane.number) for lane in traffic.graph]
     found = [(road, [np.concatenate([lanes[k][c] for k in road]) for c in range(4)]) for road in roads(traffic.graph)]
     by_vehicle = [
@@ -120,7 +122,7 @@ def free_flow(traffic: LaneTraffic) -> list[FreeFlow]:
     spread = _spread([one[0] for one in by_vehicle])
     out = []
     for (road, _), speeds in zip(found, by_vehicle, strict=True):
-        median, p85 = (_free_quantile(speeds, q, spread) for q in (0.5, 0.85))
+        median, p85 = (_free_quantile(speeds, q, spread, position_sd_m) for q in (0.5, 0.85))
         out.append(FreeFlow(tuple(road), median, p85))
     return out
 
@@ -146,7 +148,7 @@ def _spread(by_road: Sequence[tuple[FloatArray, Mask]]) -> tuple[float, int]:
 
 
 def _free_quantile(
-    by_headway: Sequence[tuple[FloatArray, Mask]], q: float, spread: tuple[float, int]
+    by_headway: Sequence[tuple[FloatArray, Mask]], q: float, spread: tuple[float, int], position_sd_m: float
 ) -> Estimate | None:
     """A quantile of free speeds: the mean for both headways from which on a vehicle may follow, and the interval that
     holds both of theirs.
@@ -162,7 +164,9 @@ def _free_quantile(
     sd, degrees = spread
     density = float(np.exp(-(special.ndtri(q) ** 2) / 2) / np.sqrt(2 * np.pi))
     least = value * sd * float(special.stdtrit(degrees, (1 + LEVEL) / 2)) * np.sqrt(q * (1 - q) / n) / density
-    systematic = float(special.ndtri((1 + LEVEL) / 2)) * _STEADY_SD * value
+    # errors that last make one stretch of a vehicle seem faster than the others: the fastest of some ten is used
+    error = float(np.hypot(_STEADY_SD, 3 * np.sqrt(2) * position_sd_m / _STEADY_M)) * value
+    systematic = float(special.ndtri((1 + LEVEL) / 2)) * error
     below, above = value - min(e.low for e in known), max(e.high for e in known) - value
     low, high = (float(np.hypot(max(side, least), systematic)) for side in (below, above))
     return Estimate(value, value - low, value + high, n)
@@ -254,15 +258,15 @@ def speed_reduction(
     samples: "PathArrays", junction: Junction, lane: int, tracks: IntArray, entry_s: FloatArray
 ) -> Reduction:
     """Speeds of tracks that enter a junction at given times, from 50 m before it to 100 m after it."""
-    b, w, a, r = slowing(samples.first, samples.time_s, samples.speed_m_per_s, tracks, entry_s).T
+    b, w, a, r, t = slowing(samples.first, samples.time_s, samples.speed_m_per_s, tracks, entry_s).T
     return Reduction(
         junction.number,
         lane,
-        estimate_median(b),
-        estimate_quantile(w, 1 - _FREELY),
-        estimate_median(a),
-        estimate_quantile(b - w, _FREELY),
-        estimate_median(r),
+        estimate_median(b, t),
+        estimate_quantile(w, 1 - _FREELY, t),
+        estimate_median(a, t),
+        estimate_quantile(b - w, _FREELY, t),
+        estimate_median(r, t),
     )
 
 
@@ -270,9 +274,9 @@ def speed_reduction(
 def slowing(
     first: IntArray, time_s: FloatArray, speed: FloatArray, tracks: IntArray, entry_s: FloatArray
 ) -> FloatArray:
-    """Rows (before, lowest, after, recovery): speeds of the tracks that enter a junction and do not stop, m/s, and the
-    distance over which they recover, m."""
-    out = np.empty((len(tracks), 4))
+    """Rows (before, lowest, after, recovery, entry): speeds of the tracks that enter a junction and do not stop, m/s,
+    the distance over which they recover, m, and when they enter, s."""
+    out = np.empty((len(tracks), 5))
     n = 0
     for i in range(len(tracks)):
         a, end = first[tracks[i]], first[tracks[i] + 1]
@@ -294,7 +298,7 @@ def slowing(
                 if speed[q] >= aim:
                     recovery = q - low
                     break
-        out[n, 0], out[n, 1], out[n, 2], out[n, 3] = start, speed[low], after, recovery
+        out[n, 0], out[n, 1], out[n, 2], out[n, 3], out[n, 4] = start, speed[low], after, recovery, entry_s[i]
         n += 1
     return out[:n]
 

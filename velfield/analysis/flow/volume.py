@@ -4,14 +4,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.arrays import FloatArray
+from schemas.arrays import FloatArray, IntArray
 from velfield.analysis.flow.passings import LaneTraffic
 from velfield.analysis.intervals import Estimate, estimate_mean, estimate_median, estimate_rate
+from velfield.analysis.lanes.model import LaneSamples
 from velfield.analysis.observed import ObservedSlices
 from velfield.analysis.trajectories import VEHICLE_LENGTH_M
 
 _FOLLOW_S = 3.0
 """A vehicle with a shorter headway follows the one before."""
+_SPREAD, _SPREAD_N = 0.25, 8
+"""Speeds on a lane have this coefficient of variation before any is seen; it counts for so many vehicles."""
 LOS_SIGNAL_S = (10.0, 20.0, 35.0, 55.0, 80.0)
 """Control delay, s, up to which levels A to E reach at signals: Highway Capacity Manual, 7th edition, Exhibit 19-8."""
 LOS_YIELD_S = (10.0, 15.0, 25.0, 35.0, 50.0)
@@ -82,9 +85,9 @@ def lane_flow(
         lane,
         estimate_rate(by_slice.slices.sums(passing.time_s), by_slice.slices.hours),
         estimate_mean(by_slice.density_veh_per_km) if enough else None,
-        _ratio(by_slice) if enough else None,
+        _space_mean_speed(traffic.samples(lane)),
         estimate_mean(headway),
-        estimate_median(gap[gap > 0]),
+        estimate_median(gap[gap > 0], passing.time_s[follows][gap > 0]),
     )
 
 
@@ -92,32 +95,37 @@ def flow_slices(traffic: LaneTraffic, lane: int, observed_s: FloatArray, *, slic
     """Edie's quantities of one lane by slice of the times (k, 2) that are seen."""
     samples, length = traffic.samples(lane), traffic.graph.lanes[lane].length_m
     slices = ObservedSlices.of(observed_s, slice_s)
-    one = samples.track[1:] == samples.track[:-1]
-    step = np.where(one, samples.along_m[1:] - samples.along_m[:-1], 0.0)
-    wait = np.where(one, samples.time_s[1:] - samples.time_s[:-1], 0.0)
-    ok = one & (step >= 0) & (step < 20.0) & (wait > 0)
+    rows, step, wait = _steps(samples)
     driven, spent = np.zeros(len(slices)), np.zeros(len(slices))
     # a long wait between two samples spreads over slices
     for part in range(8):
-        at = samples.time_s[:-1][ok] + wait[ok] * (part + 0.5) / 8
-        driven += slices.sums(at, step[ok] / 8)
-        spent += slices.sums(at, wait[ok] / 8)
+        at = samples.time_s[rows] + wait * (part + 0.5) / 8
+        driven += slices.sums(at, step / 8)
+        spent += slices.sums(at, wait / 8)
     area = length * np.maximum(slices.end_s - slices.begin_s, 1e-9)
     speed = np.divide(driven, spent, out=np.full(len(slices), np.nan), where=spent > 0)
     return FlowSlices(slices, driven / area * 3600, spent / area * 1000, speed)
 
 
-def _ratio(slices: FlowSlices) -> Estimate | None:
-    """Space-mean speed of all slices together, by the ratio estimator."""
-    flow, density = slices.flow_veh_per_h / 3.6, slices.density_veh_per_km  # veh/s * 1000, veh/km
-    used = density > 0
-    n = int(used.sum())
-    if n < 5:
+def _steps(samples: LaneSamples) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Rows of the samples from which a track goes on along the lane, how far, m, and how long it takes, s."""
+    one = samples.track[1:] == samples.track[:-1]
+    step = np.where(one, samples.along_m[1:] - samples.along_m[:-1], 0.0)
+    wait = np.where(one, samples.time_s[1:] - samples.time_s[:-1], 0.0)
+    rows = np.flatnonzero(one & (step >= 0) & (step < 20.0) & (wait > 0))
+    return rows, step[rows], wait[rows]
+
+
+def _space_mean_speed(samples: LaneSamples) -> Estimate | None:
+    """Distance driven over time spent of all vehicles on a lane, by the ratio estimator."""
+    rows, step, wait = _steps(samples)
+    tracks, of = np.unique(samples.track[rows], return_inverse=True)
+    driven, spent, at = (np.bincount(of, w, len(tracks)) for w in (step, wait, samples.time_s[rows] * wait))
+    if not len(tracks):
         return None
-    ratio = float(flow.sum() / density.sum())
-    residual = (flow - ratio * density)[used]
-    half = 1.645 * float(residual.std(ddof=1)) / np.sqrt(n) / float(density[used].mean())
-    return Estimate(ratio, max(ratio - half, 0.0), ratio + half, n)
+    ratio = float(driven.sum() / spent.sum())
+    off = estimate_mean((driven - ratio * spent) / spent.mean(), at / spent, spread=(_SPREAD * ratio, _SPREAD_N))
+    return Estimate(ratio, max(ratio + off.low, 0.0), ratio + off.high, off.n) if off else None
 
 
 def level_of_service(delay_s: float, *, signalised: bool | None) -> str:

@@ -112,6 +112,6 @@ def _observe(hull: FloatArray, parked: int, samples: PathSamples, duration_s: fl
         len(through),
         estimate_share(float(len(through)), len(entered)),
         estimate_rate(np.array([len(through)]), duration_s / 3600),
-        estimate_mean(samples.time_s[last[rows]] - samples.time_s[first[rows]]),
+        estimate_mean(samples.time_s[last[rows]] - samples.time_s[first[rows]], samples.time_s[first[rows]]),
         through,
     )

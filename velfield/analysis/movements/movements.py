@@ -7,7 +7,7 @@ scaled until their rows add up to the entries that were lost, and their columns 
 method).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,7 +27,9 @@ _FURNESS_STEPS = 60
 _SLICE_S = 120.0
 """Counts of slices so long show how much the flow varies."""
 _MIN_PASSES = 3
-_STOP_S, _STOP_M_PER_S = 2.0, 1.0
+_SPREAD_N = 8
+"""The standard deviation of all travel times through a junction counts for so many of a movement's vehicles: five may
+all have come at green."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,8 @@ def find_movements(
     for junction in graph.junctions:
         gates = find_gates(graph, junction)
         passes = _within(_by_track(find_passes(samples, junction, gates), cut), *trajectories.window_s)
-        out.append(JunctionMovements(junction, gates, passes, tuple(_count(junction, gates, passes, slices))))
+        movements = tuple(_count(junction, gates, passes, slices, trajectories.observed_s))
+        out.append(JunctionMovements(junction, gates, passes, movements))
     return tuple(out)
 
 
@@ -168,7 +171,9 @@ def _within(passes: Passes, begin_s: float, end_s: float) -> Passes:
     return Passes(*(getattr(passes, name)[keep] for name in Passes.__dataclass_fields__))
 
 
-def _count(junction: Junction, gates: Gates, passes: Passes, slices: ObservedSlices) -> Iterator[Movement]:
+def _count(
+    junction: Junction, gates: Gates, passes: Passes, slices: ObservedSlices, observed_s: FloatArray
+) -> Iterator[Movement]:
     arm = np.array([gate.arm for gate in gates.gates] + [-1], np.int64)
     arm_in, arm_out = arm[passes.gate_in], arm[passes.gate_out]
     n = len(gates.arms)
@@ -180,12 +185,14 @@ def _count(junction: Junction, gates: Gates, passes: Passes, slices: ObservedSli
     found = np.bincount(arm_out[(arm_out >= 0) & (arm_in < 0)], minlength=n).astype(np.float64)
     known = seen + joined
     inferred = joined + furness(known, lost, found)
-    for i, j in zip(*np.nonzero(known >= _MIN_PASSES), strict=True):
+    pairs = [(int(i), int(j)) for i, j in zip(*np.nonzero(known >= _MIN_PASSES), strict=True)]
+    spread = _spread([_travel_times(passes, both & (arm_in == i) & (arm_out == j))[0] for i, j in pairs])
+    for i, j in pairs:
         rows = both & (arm_in == i) & (arm_out == j)
         total = seen[i, j] + inferred[i, j]
         entering = seen[i].sum() + inferred[i].sum()
         counts = slices.sums(passes.entry_s[rows]) * total / max(known[i, j], 1)
-        travel, delay = _delay(passes, rows)
+        travel, delay = _delay(*_travel_times(passes, rows), observed_s, spread)
         effective = round(float(known[i].sum()))
         share = estimate_share(total / entering * effective, effective)
         yield Movement(
@@ -224,14 +231,34 @@ def furness(seen: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArr
     return np.asarray(out)
 
 
-def _delay(passes: Passes, rows: FloatArray) -> tuple[Estimate | None, Estimate | None]:
-    """Travel time of a movement, and its delay against the fastest tenth of its vehicles."""
+def _travel_times(passes: Passes, rows: Mask) -> tuple[FloatArray, FloatArray]:
+    """Travel times from upstream of the junction to its exit, where they are known, and when they begin."""
     time = (passes.exit_s - passes.upstream_s)[rows]
-    time = time[np.isfinite(time)]
-    travel = estimate_mean(time)
+    known = np.isfinite(time)
+    return time[known], passes.upstream_s[rows][known]
+
+
+def _spread(times_s: Sequence[FloatArray]) -> tuple[float, int]:
+    """Standard deviation of travel times about their movement's mean, and the number of vehicles that it counts for."""
+    used = [times for times in times_s if len(times) > 1]
+    degrees = sum(len(times) - 1 for times in used)
+    squares = sum(float(((times - times.mean()) ** 2).sum()) for times in used)
+    return (float(np.sqrt(squares / degrees)), _SPREAD_N) if degrees else (0.0, 0)
+
+
+def _delay(
+    time_s: FloatArray, begin_s: FloatArray, observed_s: FloatArray, spread: tuple[float, int]
+) -> tuple[Estimate | None, Estimate | None]:
+    """Travel time of a movement, and its delay against the fastest tenth of its vehicles."""
+    # Those that take long are more often cut by the begin and the end of the time that is seen.
+    seen = np.maximum(np.maximum(np.diff(observed_s, axis=1) - time_s, 0.0).sum(axis=0), 1.0)
+    weight = seen.mean() / seen if len(seen) else seen
+    weight = weight / weight.mean() if len(weight) else weight
+    mean = float((weight * time_s).mean()) if len(time_s) else 0.0
+    travel = estimate_mean(mean + weight * (time_s - mean), begin_s, spread=spread)
     if travel is None or travel.n < 10:
         return travel, None
-    free = float(np.quantile(time, 0.1))
+    free = float(np.quantile(time_s, 0.1))
     return travel, Estimate(travel.value - free, max(travel.low - free, 0.0), travel.high - free, travel.n)
 
 

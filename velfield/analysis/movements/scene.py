@@ -143,7 +143,7 @@ class OriginDestination:
                     float(weight[trips.remains].sum()),
                     estimate_share(weight.sum() / entering * n, n),
                     estimate_rate(slices.sums(trips.entry_s, weight), slices.hours),
-                    estimate_mean((trips.exit_s - trips.entry_s)[seen]),
+                    estimate_mean((trips.exit_s - trips.entry_s)[seen], trips.entry_s[seen]),
                 )
             )
         return tuple(sorted(out, key=lambda relation: -relation.vehicles))

@@ -128,11 +128,9 @@ def find_signal(junction: int, streams: Sequence[Stream], begin_s: float, end_s:
             f"({stopped} of {share.n if share else 0} vehicles stopped)"
         )
         return JunctionSignal(junction, None, reason, None, (), ())
-    estimate, phases = fit_phases(events, cycle)
+    estimate, phases = fit_phases(events, cycle, time_sd_s=max(stream.stop_time_sd_s for stream in used))
     signals = [
-        _stream_signal(used[k], phase.green_s, estimate.value, begin_s, end_s)
-        for phase in phases
-        for k in phase.streams
+        _stream_signal(used[k], phase.green_s, estimate, begin_s, end_s) for phase in phases for k in phase.streams
     ]
     lanes = tuple(tuple(sorted(used[k].approach.lane for k in phase.streams)) for phase in phases)
     return JunctionSignal(junction, True, "", estimate, _with_hidden_share(signals), lanes)
@@ -204,15 +202,16 @@ def _chance(events: Sequence[FloatArray], frequency: FloatArray, concentration: 
     return float((1 + np.sum(best >= concentration - 1e-9)) / (1 + _DRAWS))
 
 
-def _stream_signal(stream: Stream, green: Estimate, cycle_s: float, begin_s: float, end_s: float) -> StreamSignal:
-    value = green.value
+def _stream_signal(stream: Stream, green: Estimate, cycle: Estimate, begin_s: float, end_s: float) -> StreamSignal:
+    value, cycle_s = green.value, cycle.value
     k = np.arange(np.ceil((begin_s - value) / cycle_s), np.floor((end_s - value) / cycle_s) + 1)
     lost, saturation = _discharge(stream, value + k * cycle_s)
-    return StreamSignal(stream, green, _red_onset(stream, value, cycle_s), value + k * cycle_s, lost, saturation)
+    return StreamSignal(stream, green, _red_onset(stream, value, cycle), value + k * cycle_s, lost, saturation)
 
 
-def _red_onset(stream: Stream, green_s: float, cycle_s: float) -> Estimate | None:
+def _red_onset(stream: Stream, green_s: float, cycle: Estimate) -> Estimate | None:
     """Onset of red: when the crossings of the stop line end, those of vehicles too near to stop at yellow included."""
+    cycle_s = cycle.value
     crossed = np.sort((stream.cross_time_s - green_s) % cycle_s)
     n = len(crossed)
     if n < _MIN_CROSSINGS:
@@ -233,7 +232,9 @@ def _red_onset(stream: Stream, green_s: float, cycle_s: float) -> Estimate | Non
     rate = max(crossings, _MIN_RATE_CROSSINGS) / (_RATE_S - 1)
     early, middle, late = (_last_crossing_gap(p, rate) for p in ((1 - LEVEL) / 2, 0.5, (1 + LEVEL) / 2))
     value = quiet_s + last + middle
-    systematic = float(special.ndtri((1 + LEVEL) / 2)) * _RED_SD_S
+    # the onset is that of second 0, the crossings are of some cycles later
+    drift = float(np.abs(stream.cross_time_s).mean()) / cycle_s * (cycle.high - cycle.low) / 2
+    systematic = float(np.hypot(special.ndtri((1 + LEVEL) / 2) * _RED_SD_S, drift))
     low = value - float(np.hypot(middle - early, systematic))
     high = value + float(np.hypot(late - middle, systematic))
     shift = green_s - cycle_s * np.floor((value + green_s) / cycle_s)

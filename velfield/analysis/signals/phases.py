@@ -11,9 +11,9 @@ import numpy as np
 from scipy import special
 
 from schemas.arrays import FloatArray, IntArray
-from velfield.analysis.intervals import Estimate
+from velfield.analysis.intervals import LEVEL, Estimate
 
-START_DELAY_S, START_DELAY_SD_S = 2.0, 0.5
+START_DELAY_S, START_DELAY_SD_S = 1.6, 0.5
 """From green to the moment at which the first vehicle has visibly moved off, where nothing is in its way: its driver's
 reaction, and the time to reach walking speed. It differs from junction to junction by so much."""
 _TOGETHER_S = 4.0
@@ -33,7 +33,9 @@ class Phase:
     green_s: Estimate
 
 
-def fit_phases(starts_s: Sequence[FloatArray], cycle_s: float) -> tuple[Estimate, tuple[Phase, ...]]:
+def fit_phases(
+    starts_s: Sequence[FloatArray], cycle_s: float, *, time_sd_s: float = 0.0
+) -> tuple[Estimate, tuple[Phase, ...]]:
     """The cycle, by least squares over phases and cycles, and the phases in the order of their green.
 
     Parameters
@@ -42,6 +44,8 @@ def fit_phases(starts_s: Sequence[FloatArray], cycle_s: float) -> tuple[Estimate
         For each stream the times (n,) at which the first of a queue moves off.
     cycle_s
         The cycle, nearly.
+    time_sd_s
+        Standard deviation of a start by the errors of the tracks: smoothed speeds rise too early by about as much.
     """
     groups = _group([_circular_mean(times, cycle_s) for times in starts_s], cycle_s)
     number, time, group = _one_a_cycle(starts_s, groups, cycle_s)
@@ -50,7 +54,7 @@ def fit_phases(starts_s: Sequence[FloatArray], cycle_s: float) -> tuple[Estimate
     for k, streams in enumerate(groups):
         rows = group == k
         if rows.sum() >= 2:
-            green = _green(number[rows], time[rows], cycle)
+            green = _green(number[rows], time[rows], cycle, time_sd_s)
             phases.append(Phase(tuple(streams), green))
     return cycle, tuple(sorted(phases, key=lambda phase: phase.green_s.value))
 
@@ -110,13 +114,14 @@ def _fit_cycle(number: IntArray, time: FloatArray, group: IntArray) -> Estimate:
     return Estimate(slope, slope - half, slope + half, len(k))
 
 
-def _green(number: IntArray, time: FloatArray, cycle: Estimate) -> Estimate:
+def _green(number: IntArray, time: FloatArray, cycle: Estimate, time_sd_s: float) -> Estimate:
     """Onset of green after the start of a cycle: before the starts of the cycles in which the junction was clear."""
     onset = np.sort(time - number * cycle.value)
     early = float(np.quantile(onset, _CLEAR_QUANTILE))
     # A low quantile of few values: its error is about that of the mean.
     scatter = float(onset.std(ddof=1) / np.sqrt(len(onset))) * float(special.stdtrit(len(onset) - 1, 0.95))
     drift = float(np.abs(number.mean())) * (cycle.high - cycle.low) / 2
-    half = float(np.sqrt(scatter**2 + drift**2 + (1.645 * START_DELAY_SD_S) ** 2))
-    value = (early - START_DELAY_S) % cycle.value
+    systematic = special.ndtri((1 + LEVEL) / 2) * np.hypot(START_DELAY_SD_S, time_sd_s)
+    half = float(np.sqrt(scatter**2 + drift**2 + systematic**2))
+    value = (early + time_sd_s - START_DELAY_S) % cycle.value
     return Estimate(value, value - half, value + half, len(onset))
