@@ -25,7 +25,10 @@ ExportFormat = Literal[
     "highd",
     "trajectories",
     "turning_counts",
+    "utdf",
+    "signal_events",
     "moving_features",
+    "ssam",
 ]
 """Each is a module of `velfield.exports`, of the same name; those of lanes lie in ``roads``."""
 EXPORT_FORMATS: dict[ExportFormat, str] = {
@@ -44,6 +47,9 @@ EXPORT_FORMATS: dict[ExportFormat, str] = {
     "highd": "trajectories as CSV in highD's columns",
     "trajectories": "trajectories as Parquet, or as CSV with `--out FILE.csv`",
     "turning_counts": "turning counts by 15 minutes as Excel workbook, with peak-hour factor",
+    "utdf": "volumes, lanes and phases of the junctions as Synchro's UTDF",
+    "signal_events": "greens, reds and stop-line detectors as a controller's event log (Indiana enumerations), as ZIP",
+    "ssam": "trajectories as SSAM's .trj, for its conflict analysis",
     "moving_features": "trajectories as OGC Moving Features JSON",
     "video": "the stabilised clip with vehicles, speeds and the field, as MP4",
     "poster": "both maps on a sheet with legend, scale, north, n and date, as PDF or SVG",

@@ -2,11 +2,15 @@
 
 import io
 import re
+import struct
 import zipfile
+from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from tests.analysis.test_traffic_analysis import analysis
@@ -14,7 +18,10 @@ from tests.field_runs import field_run, tracklets_along
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.errors import InputError
 from velfield.exports.export import export_run
+from velfield.exports.roads import ssam
+from velfield.exports.signal_events import event_archive
 from velfield.exports.turning_counts import junction_rows, peak_hour_factor, turning_workbook
+from velfield.exports.utdf import utdf
 
 __all__ = ["analysis"]
 
@@ -73,3 +80,133 @@ def test_moving_pandas_reads_the_trajectories(tmp_path: Path) -> None:
     steps = np.diff(np.array([(point.x, point.y) for point in first.df.geometry]), axis=0)
     assert np.hypot(*steps.T).sum() == pytest.approx(length, rel=0.02)
     assert first.get_duration().total_seconds() == pytest.approx(np.ptp(trajectories.time_s[rows]), abs=0.01)
+
+
+def utdf_sections(text: str) -> dict[str, pd.DataFrame]:
+    """The tables of a UTDF file, by section, each as its own header names it."""
+    parts = re.split(r"^\[(\w+)\]\n", text, flags=re.MULTILINE)[1:]
+    tables = zip(parts[::2], parts[1::2], strict=True)
+    return {name: pd.read_csv(io.StringIO(body), skiprows=1, skip_blank_lines=True) for name, body in tables}
+
+
+def test_utdf_holds_volumes_lanes_and_phases(analysis: TrafficAnalysis) -> None:
+    """The crossroads: 48 straight on and 12 to the right from the west, 48 from the north, a cycle of 40 s."""
+    sections = utdf_sections(utdf(analysis, height_m=100.0))
+    assert set(sections) == {"Network", "Nodes", "Links", "Lanes", "Timeplans", "Phases"}
+    found = next(m for m in analysis.movements if m.junction.kind == "intersection")
+    number = found.junction.number + 1
+    lanes = sections["Lanes"].query("INTID == @number").set_index("RECORDNAME")
+    hours = analysis.trajectories.duration_s / 3600
+    assert lanes.loc["Volume", ["EBT", "EBR", "SBT"]].astype(float).to_numpy() * hours == pytest.approx(
+        [48, 12, 48], abs=1
+    )
+    # the lane from the west goes straight on and to the right
+    assert lanes.loc["Lanes", ["EBT", "EBR", "SBT"]].astype(int).tolist() == [1, 0, 1]
+    assert lanes.loc["Shared", ["EBT", "SBT"]].astype(int).tolist() == [2, 0]
+    phase = lanes.loc["Phase1", ["EBT", "SBT"]].astype(int)
+    assert sorted(phase) == [1, 2]
+    plan = sections["Timeplans"].query("INTID == @number").set_index("RECORDNAME")["DATA"].astype(float)
+    assert plan["Cycle Length"] == pytest.approx(40.0, abs=0.2)
+    phases = sections["Phases"].query("INTID == @number").set_index("RECORDNAME")
+    apart = (phases.loc["Start", f"D{phase['SBT']}"] - phases.loc["Start", f"D{phase['EBT']}"]) % plan["Cycle Length"]
+    signal = analysis.signals[found.junction.number]
+    greens = {s.stream.approach.lane: s.green_phase_s.value for s in signal.streams}
+    lane = {g.lane: found.gates.arms[g.arm].name for g in found.gates.gates if g.inwards}
+    west, north = (next(green for k, green in greens.items() if lane.get(k) == arm) for arm in "WN")
+    assert apart == pytest.approx((north - west) % plan["Cycle Length"], abs=0.2)
+    nodes = sections["Nodes"].set_index("INTID")
+    assert nodes.loc[number, "TYPE"] == 0
+    assert nodes.loc[int(lanes.loc["Up Node", "SBT"]), "Y"] > nodes.loc[number, "Y"]  # y is up
+
+
+@pytest.mark.filterwarnings("ignore:Constructing a DataFrame")  # of the reader: lines are of unequal length
+def test_utdf2gmns_reads_the_volumes(analysis: TrafficAnalysis, tmp_path: Path) -> None:
+    reader = pytest.importorskip("utdf2gmns.func_lib.utdf.read_utdf")
+    (tmp_path / "UTDF.csv").write_text(utdf(analysis, height_m=100.0))
+    read = reader.read_UTDF(str(tmp_path / "UTDF.csv"))
+    volumes = read["Lanes"].set_index("RECORDNAME").loc[["Volume"], "EBT"].iloc[0]
+    assert float(volumes) * analysis.trajectories.duration_s / 3600 == pytest.approx(48, abs=1)
+
+
+def unpack_events(data: bytes) -> tuple[pd.DataFrame, pd.DataFrame]:
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        events, detectors = (pd.read_csv(io.BytesIO(archive.read(f"{n}.csv"))) for n in ("events", "detectors"))
+    events["TimeStamp"] = pd.to_datetime(events["TimeStamp"])
+    return events, detectors
+
+
+def test_signal_events_are_those_of_the_signal(analysis: TrafficAnalysis) -> None:
+    start = datetime(2026, 5, 4, 7, 30, tzinfo=UTC)
+    events, detectors = unpack_events(event_archive(analysis, start))
+    green = events.query("EventId == 1 and Parameter == 1")["TimeStamp"]
+    assert green.diff().dropna().dt.total_seconds().to_numpy() == pytest.approx(40.0, abs=0.2)
+    assert (events["TimeStamp"].diff().dropna() >= pd.Timedelta(0)).all()
+    on, off = (events.query(f"EventId == {kind}").groupby("Parameter").size() for kind in (82, 81))
+    assert on.equals(off)
+    assert on.sum() == sum(len(s.stream.cross_time_s) for signal in analysis.signals.values() for s in signal.streams)
+    assert set(detectors["Parameter"]) == set(on.index)
+    # nobody crosses from the onset of red to that of green
+    reds = events.query("EventId == 10 and Parameter == 1")["TimeStamp"]
+    of_phase = events["Parameter"].isin(detectors.query("Phase == 1")["Parameter"])
+    crossed = events[(events["EventId"] == 82) & of_phase]["TimeStamp"]
+    for red in reds:
+        until = green[green > red].min()
+        assert not crossed.between(red + pd.Timedelta(seconds=1), until).any()
+
+
+def test_atspm_counts_what_crosses_the_stop_lines(analysis: TrafficAnalysis, tmp_path: Path) -> None:
+    atspm = pytest.importorskip("atspm")
+    events, detectors = unpack_events(event_archive(analysis, datetime(2026, 5, 4, 7, 30, tzinfo=UTC)))
+    made = {"raw_data": events, "detector_config": detectors, "bin_size": 15, "output_dir": str(tmp_path)}
+    made |= {"output_format": "csv", "output_to_separate_folders": False, "verbose": 0}
+    asked = [{"name": "actuations", "params": {"fill_in_missing": False}}]
+    with atspm.SignalDataProcessor(**made, aggregations=asked) as processor:
+        processor.run()
+    counted = pd.concat(pd.read_csv(file) for file in tmp_path.rglob("*actuations*.csv"))
+    assert counted["Total"].sum() == (events["EventId"] == 82).sum()
+
+
+def ssam_vehicles(data: bytes) -> Iterator[tuple[float, tuple[float, ...]]]:
+    """Time and fields of each vehicle record, read by the format's own words: little-endian, without padding."""
+    assert struct.unpack_from("<Bcf", data) == (0, b"L", pytest.approx(1.04))
+    kind, metric, scale, *bounds = struct.unpack_from("<BBf4i", data, 6)
+    assert (kind, metric, scale, bounds[:2]) == (1, 1, 1.0, [0, 0])
+    at, time_s = 28, -1.0
+    while at < len(data):
+        if data[at] == 2:
+            time_s, at = struct.unpack_from("<f", data, at + 1)[0], at + 5
+        else:
+            assert data[at] == 3
+            fields = struct.unpack_from("<iiB8f", data, at + 1)
+            at += 42
+            yield time_s, fields
+    assert at == len(data)
+
+
+def test_ssam_has_bumpers_up_the_map(tmp_path: Path) -> None:
+    paths = [np.column_stack([np.arange(0, 390, 6.0), np.full(65, 50.0)]) for _ in range(3)]
+    run = field_run(tmp_path / "run", tracklets_along(paths), shape=(100, 400), gsd_m=0.25)
+    vehicles = list(ssam_vehicles(export_run(run, "ssam", tmp_path / "t.trj").read_bytes()))
+    trajectories = run.analysis.trajectories
+    assert len(vehicles) == len(trajectories.time_s)
+    assert {fields[0] for _, fields in vehicles} == {1, 2, 3}
+    times = np.array([time for time, fields in vehicles if fields[0] == 1])
+    assert (np.diff(times) > 0).all()
+    for _, (_, _, _, front_x, front_y, rear_x, rear_y, length, width, speed, acceleration) in vehicles:
+        assert front_x - rear_x == pytest.approx(length) == 4.5
+        assert front_y == pytest.approx(rear_y, abs=0.2)
+        assert front_y == pytest.approx(25 - 50 * 0.25, abs=0.5)
+        assert (width, speed) == (pytest.approx(1.8), pytest.approx(7.5, abs=1.0))
+        assert abs(acceleration) < 3
+
+
+def test_ssam_keeps_the_way_of_a_vehicle_that_stands() -> None:
+    speed = np.array([0.0, 5.0, 0.0, 0.0])
+    zero = np.zeros(4)
+    table = pd.DataFrame(
+        {"track_id": 7, "frame": range(4), "time_s": 0.2 * np.arange(4), "x_m": 10.0, "y_m": 10.0, "lane": 0}
+        | {"vx_m_per_s": zero, "vy_m_per_s": -speed, "ax_m_per_s2": zero, "ay_m_per_s2": zero}
+        | {"speed_m_per_s": speed, "length_m": np.nan, "width_m": np.nan}
+    )
+    for _, fields in ssam_vehicles(ssam.ssam_records(table, np.array([100.0, 50.0]))):
+        assert fields[4] - fields[6] == pytest.approx(-4.5)

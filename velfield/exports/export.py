@@ -17,7 +17,7 @@ from velfield.run.commits import write_atomically
 from velfield.run.layout import is_remote, to_path
 from velfield.run.run import Run
 
-_OF_ROADS = ("sumo_network", "opendrive", "highd", "trajectories")
+_OF_ROADS = ("sumo_network", "opendrive", "highd", "ssam", "trajectories")
 """Formats whose modules lie in the package ``roads``."""
 
 

@@ -1,0 +1,103 @@
+"""Signals as a controller's event log with the Indiana enumerations, and its detectors: two CSV files, as ZIP.
+
+``events.csv`` (TimeStamp, DeviceId, EventId, Parameter) and ``detectors.csv`` (DeviceId, Phase, Parameter, Function)
+are what `atspm` reads. A device is a junction. Greens are those of the cycle that was found; yellow is not seen, and
+red begins where crossings of the stop line end. A detector lies at the stop line of each lane.
+"""
+
+import io
+import zipfile
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from schemas.arrays import FloatArray
+from schemas.export import ExportOptions
+from velfield.analysis.signals.cycles import JunctionSignal, StreamSignal
+from velfield.analysis.traffic_analysis import TrafficAnalysis
+from velfield.errors import InputError
+from velfield.run.run import Run
+
+FILE_NAME = "signal-events.zip"
+GREEN, RED_CLEARANCE, DETECTOR_OFF, DETECTOR_ON = 1, 10, 81, 82
+"""Phase begin green, phase begin red clearance, and a detector's ends, in the Indiana Traffic Signal Hi Resolution Data
+Logger Enumerations."""
+FUNCTIONS = ("Presence", "Yellow_Red")
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_LEAST_M_PER_S = 1.0
+
+
+def encode(run: Run, _path: Path, options: ExportOptions) -> bytes:
+    """See `velfield.exports.export.ExportModule`; times count from ``--start``, else from what the camera wrote, else
+    from 1970.
+
+    Raises
+    ------
+    InputError
+        No signal was found.
+    """
+    return event_archive(run.analysis.traffic, options.start or (run.start.time if run.start else _EPOCH))
+
+
+def event_archive(analysis: TrafficAnalysis, start: datetime) -> bytes:
+    """Both files of all signals, the first position at second 0 of the video."""
+    found = {number: signal for number, signal in analysis.signals.items() if signal.signalised}
+    if not found:
+        raise InputError("no signal was found, so there are no signal events")
+    events = pd.DataFrame(
+        [row for number, signal in found.items() for row in _events(number, signal, analysis)],
+        columns=["time_s", "DeviceId", "EventId", "Parameter"],
+    ).sort_values("time_s", kind="stable")
+    stamps = [start.replace(tzinfo=None) + timedelta(seconds=s) for s in events.pop("time_s")]
+    events.insert(0, "TimeStamp", [stamp.isoformat(sep=" ", timespec="milliseconds") for stamp in stamps])
+    detectors = pd.DataFrame(
+        [
+            (number, phase, stream.stream.approach.lane + 1, function)
+            for number, signal in found.items()
+            for phase, stream in _streams(signal)
+            for function in FUNCTIONS
+        ],
+        columns=["DeviceId", "Phase", "Parameter", "Function"],
+    )
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, table in (("events.csv", events), ("detectors.csv", detectors)):
+            text = table.to_csv(index=False, lineterminator="\n")
+            archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), text, zipfile.ZIP_DEFLATED)
+    return out.getvalue()
+
+
+def _streams(signal: JunctionSignal) -> Iterator[tuple[int, StreamSignal]]:
+    """Streams with the number of their phase, from 1 on."""
+    for number, lanes in enumerate(signal.phases, start=1):
+        yield from ((number, s) for s in signal.streams if s.stream.approach.lane in lanes)
+
+
+def _events(device: int, signal: JunctionSignal, analysis: TrafficAnalysis) -> Iterator[tuple[float, int, int, int]]:
+    """Events of a junction: time, device, event and parameter."""
+    for phase in range(1, len(signal.phases) + 1):
+        streams = [stream for number, stream in _streams(signal) if number == phase]
+        for kind, times in ((GREEN, streams[0].green_s), (RED_CLEARANCE, red_onsets_s(streams, signal))):
+            yield from ((t, device, kind, phase) for t in _seen(times, analysis))
+    for _, stream in _streams(signal):
+        s, channel = stream.stream, stream.stream.approach.lane + 1
+        half_s = analysis.trajectories.length_m[s.cross_track] / 2 / np.maximum(s.cross_speed_m_per_s, _LEAST_M_PER_S)
+        for kind, times in ((DETECTOR_ON, s.cross_time_s - half_s), (DETECTOR_OFF, s.cross_time_s + half_s)):
+            yield from ((t, device, kind, channel) for t in times.tolist())
+
+
+def red_onsets_s(streams: list[StreamSignal], signal: JunctionSignal) -> FloatArray:
+    """Onset of red after each green of a phase: the last of its streams'; none where no stream's is known."""
+    cycle = signal.cycle_s.value if signal.cycle_s else np.nan
+    reds = [(s.red_phase_s.value - s.green_phase_s.value) % cycle for s in streams if s.red_phase_s]
+    return streams[0].green_s + max(reds) if reds else np.empty(0)
+
+
+def _seen(times_s: FloatArray, analysis: TrafficAnalysis) -> list[float]:
+    """Times at which the junction was filmed."""
+    begin, end = analysis.trajectories.observed_s.T
+    inside = (times_s[:, None] >= begin) & (times_s[:, None] <= end)
+    return [float(t) for t in times_s[inside.any(axis=1)]]
