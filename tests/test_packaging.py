@@ -70,6 +70,13 @@ def test_the_licences_of_what_ships_are_listed() -> None:
     assert [name for name in data if name.lower() not in listed.lower()] == []
 
 
+def test_the_citation_and_the_changelog_are_of_this_version() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == PROJECT["version"]
+    assert f"## {citation['version']} - {citation['date-released']}" in (ROOT / "CHANGELOG.md").read_text()
+    assert [paper["url"] for paper in citation["references"]] == [PROJECT["urls"]["Paper"]]
+
+
 def test_the_lock_names_no_registry() -> None:
     assert re.findall(r"^.*(?:--index-url|--find-links|--extra-index-url|://).*$", LOCK, re.M) == []
 

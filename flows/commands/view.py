@@ -18,7 +18,7 @@ def view(
     port: int | None = None,
     open_browser: Annotated[bool, Parameter(name="--open")] = True,
 ) -> int:
-    """Show a run's page in the browser until Ctrl-C; only this machine can open it.
+    """Show a run's page in the browser until Ctrl-C, the answers first if it is analysed; for this machine alone.
 
     Parameters
     ----------
@@ -29,6 +29,7 @@ def view(
     open_browser
         Open the browser, if there is a screen.
     """
+    from velfield.run.layout import RunLayout
     from velfield.viewer.server import view_app
 
     if run_folder.parts[:1] == ("s3:",):
@@ -39,12 +40,19 @@ def view(
             "`aws s3 sync`"
         )
 
-    serve_until_interrupted(view_app(run_folder), port=port, open_browser=open_browser, place=run_folder)
+    analysed = (RunLayout(run_folder).analysis / "analysis.json").is_file()
+    serve_until_interrupted(
+        view_app(run_folder),
+        port=port,
+        open_browser=open_browser,
+        place=run_folder,
+        start="#tab=analysis" if analysed else "",
+    )
     return 0
 
 
 def serve_until_interrupted(
-    app: "Starlette", *, port: int | None, open_browser: bool, place: Path, purpose: str = ""
+    app: "Starlette", *, port: int | None, open_browser: bool, place: Path, purpose: str = "", start: str = ""
 ) -> None:
     """Serve a page until Ctrl-C; prints the address, what is served and what for."""
     from velfield.viewer.server import serve
@@ -53,6 +61,6 @@ def serve_until_interrupted(
         print("  ".join(part for part in (f"{place}: {address}", purpose, "(Ctrl-C ends)") if part), flush=True)
 
     try:
-        serve(app, port=port, open_browser=open_browser, announce=announce)
+        serve(app, port=port, open_browser=open_browser, announce=announce, start=start)
     except KeyboardInterrupt:
         print()

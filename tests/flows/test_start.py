@@ -7,6 +7,7 @@ import pytest
 
 from flows.cli import app, main
 from flows.commands.start import next_steps, own_command
+from flows.commands.view import view
 from velfield import open_run
 from velfield.errors import InputError
 from velfield.viewer.server import view_app
@@ -73,3 +74,14 @@ def test_the_program_is_called_as_the_shell_finds_it(monkeypatch: pytest.MonkeyP
     assert own_command() == ".venv/bin/velfield"
     monkeypatch.setattr("sys.argv", ["flows/cli.py", "run"])
     assert own_command().endswith(" -m flows.cli")
+
+
+def test_the_page_of_an_analysed_run_opens_with_the_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    starts: list[str] = []
+    monkeypatch.setattr("velfield.viewer.server.view_app", lambda folder: None)
+    monkeypatch.setattr("velfield.viewer.server.serve", lambda *_, start, **options: starts.append(start))
+    view(tmp_path)
+    (tmp_path / "analysis").mkdir()
+    (tmp_path / "analysis" / "analysis.json").touch()
+    view(tmp_path)
+    assert starts == ["", "#tab=analysis"]

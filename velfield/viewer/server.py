@@ -126,7 +126,9 @@ def serve_in_thread(app: "Starlette", port: int) -> Iterator[str]:
             thread.join(_STOP_S)
 
 
-def serve(app: "Starlette", *, port: int | None, open_browser: bool, announce: Callable[[str], None]) -> None:
+def serve(
+    app: "Starlette", *, port: int | None, open_browser: bool, announce: Callable[[str], None], start: str = ""
+) -> None:
     """Serve until interrupted.
 
     Parameters
@@ -137,6 +139,8 @@ def serve(app: "Starlette", *, port: int | None, open_browser: bool, announce: C
         Open the page in the user's browser, where there is a screen.
     announce
         Called with the address once the server listens.
+    start
+        What follows in the address: the part of the page to begin with.
 
     Raises
     ------
@@ -144,7 +148,7 @@ def serve(app: "Starlette", *, port: int | None, open_browser: bool, announce: C
         The port is in use.
     """
     with _listen(port) as listener:
-        address = f"http://{HOST}:{listener.getsockname()[1]}/"
+        address = f"http://{HOST}:{listener.getsockname()[1]}/{start}"
         announce(address)
         if open_browser and _has_screen():
             # The socket listens already: the browser waits for the response.
