@@ -7,9 +7,9 @@ division) or computed by Newton's method to 1e-9 px (polynomial), NaN where ther
 Other packages use the protocol `Lens` and do not depend on the model.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -115,18 +115,67 @@ def _move_radially(xy: Points, model: RadialModel) -> Points:
     return np.asarray(undistort(points.reshape(-1, 2), model).reshape(points.shape))
 
 
+class _Radial:
+    """What the models have in common; each is a frozen dataclass.
+
+    Attributes
+    ----------
+    centre_x_px, centre_y_px
+        Centre of distortion, raw px; a fixed point.
+    half_diagonal_px
+        Unit of the radius, px.
+    """
+
+    centre_x_px: float
+    centre_y_px: float
+    half_diagonal_px: float
+
+    @property
+    def radial(self) -> RadialModel:
+        """The undistortion, for compiled code."""
+        raise NotImplementedError
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether there is no distortion."""
+        return not self.radial.polynomial[1:].any()
+
+    def undistort_points(self, xy_raw: Points) -> Points:
+        """Raw pixels (n, 2) to undistorted pixels (n, 2); NaN rows outside the model's domain."""
+        return _move_radially(xy_raw, self.radial)
+
+    def undistort_tangents(self, xy_raw: Points, tangents: Points) -> Points:
+        """Directions (n, 2) at raw pixels (n, 2), multiplied by the Jacobian of the undistortion."""
+        model, polynomial = self.radial, np.polynomial.Polynomial(self.radial.polynomial)
+        offsets, radius2 = self._offsets(xy_raw)
+        value = polynomial(radius2)
+        value = np.where((value > 0) & (radius2 < model.limit_r2), value, np.nan)
+        derivative_r2 = model.power * value ** (model.power - 1) * polynomial.deriv()(radius2)
+        along = np.sum(offsets * tangents, axis=-1, keepdims=True)
+        return np.asarray(value**model.power * tangents + 2.0 * derivative_r2 * along * offsets)
+
+    def _offsets(self, xy: Points) -> tuple[Points, Points]:
+        """Offsets from the centre (..., 2), half-diagonals, and their squared lengths (..., 1)."""
+        offsets = (np.asarray(xy, dtype=np.float64) - (self.centre_x_px, self.centre_y_px)) / self.half_diagonal_px
+        return offsets, _squares(offsets)
+
+    def _to_pixels(self, offsets: Points) -> Points:
+        return np.asarray(offsets * self.half_diagonal_px + (self.centre_x_px, self.centre_y_px))
+
+    def _build_radial(self, polynomial: tuple[float, ...], power: float, limit_r2: float = np.inf) -> RadialModel:
+        # floats and nothing else: kernels are compiled for the types of their arguments
+        centre_and_unit = float(self.centre_x_px), float(self.centre_y_px), float(self.half_diagonal_px)
+        return RadialModel(*centre_and_unit, np.array(polynomial, np.float64), power, float(limit_r2))
+
+
 @dataclass(frozen=True)
-class HarrisLens:
+class HarrisLens(_Radial):
     """Harris' model, r_d = r / sqrt(1 + a r^2), with its closed inverse r = r_d / sqrt(1 - a r_d^2).
 
     Parameters
     ----------
     a
         Distortion, in 1 / half-diagonal^2: positive is barrel, zero a pinhole camera.
-    centre_x_px, centre_y_px
-        Centre of distortion, raw px; a fixed point.
-    half_diagonal_px
-        Unit of the radius, px.
 
     Examples
     --------
@@ -140,63 +189,33 @@ class HarrisLens:
     centre_y_px: float
     half_diagonal_px: float
 
-    @property
-    def is_identity(self) -> bool:
-        """Whether there is no distortion."""
-        return self.a == 0.0
-
     @cached_property
     def radial(self) -> RadialModel:
         """The undistortion, for compiled code."""
-        return _build_radial(self, (1.0, -self.a), -0.5)
+        return self._build_radial((1.0, -self.a), -0.5)
 
-    def _offsets(self, xy: Points) -> tuple[Points, Points]:
-        offsets = np.asarray(xy, dtype=np.float64) - (self.centre_x_px, self.centre_y_px)
-        return offsets, _squares(offsets) / self.half_diagonal_px**2
-
-    def undistort_points(self, xy_raw: Points) -> Points:
-        """Raw pixels (n, 2) to undistorted pixels (n, 2); NaN rows at and beyond r_d = 1 / sqrt(a)."""
-        return _move_radially(xy_raw, self.radial)
+    @cached_property
+    def _inverse(self) -> RadialModel:
+        """The inverse is the model with the opposite sign."""
+        return self._build_radial((1.0, self.a), -0.5)
 
     def distort_points(self, xy: Points) -> Points:
         """Undistorted pixels (n, 2) to raw pixels (n, 2); NaN rows where pincushion distortion has no inverse."""
         return _move_radially(xy, self._inverse)
 
-    @cached_property
-    def _inverse(self) -> RadialModel:
-        """The inverse is the model with the opposite sign."""
-        return _build_radial(self, (1.0, self.a), -0.5)
-
-    def undistort_tangents(self, xy_raw: Points, tangents: Points) -> Points:
-        """Directions (n, 2) at raw pixels (n, 2), multiplied by the Jacobian of the undistortion."""
-        offsets, radius2 = self._offsets(xy_raw)
-        square = 1.0 - self.a * radius2
-        scale = 1.0 / np.sqrt(np.where(square > 0, square, np.nan))
-        derivative_r2 = 0.5 * self.a * scale**3
-        return _differentiate_radially(offsets / self.half_diagonal_px, tangents, scale, derivative_r2)
-
     def to_record(self) -> HarrisLensRecord:
         """The record that ``camera.json`` holds."""
-        return HarrisLensRecord(
-            a=self.a,
-            centre_x_px=self.centre_x_px,
-            centre_y_px=self.centre_y_px,
-            half_diagonal_px=self.half_diagonal_px,
-        )
+        return HarrisLensRecord(**asdict(self))
 
 
 @dataclass(frozen=True)
-class DivisionLens:
+class DivisionLens(_Radial):
     """Division model, r = r_d / (1 - k r_d^2), with its closed inverse: one parameter, for wide-angle lenses.
 
     Parameters
     ----------
     k
         Distortion, in 1 / half-diagonal^2: positive is barrel.
-    centre_x_px, centre_y_px
-        Centre of distortion, raw px.
-    half_diagonal_px
-        Unit of the radius, px.
 
     Examples
     --------
@@ -210,33 +229,11 @@ class DivisionLens:
     centre_y_px: float
     half_diagonal_px: float
 
-    @property
-    def is_identity(self) -> bool:
-        """Whether there is no distortion."""
-        return self.k == 0.0
-
     @cached_property
     def radial(self) -> RadialModel:
         """The undistortion, for compiled code."""
         # Pincushion distortion folds at k r_d^2 = -1; barrel distortion diverges where the divisor is zero.
-        return _build_radial(self, (1.0, -self.k), -1.0, -1.0 / self.k if self.k < 0 else np.inf)
-
-    def _offsets(self, xy: Points) -> tuple[Points, Points]:
-        offsets = (np.asarray(xy, dtype=np.float64) - (self.centre_x_px, self.centre_y_px)) / self.half_diagonal_px
-        return offsets, _squares(offsets)
-
-    def _to_pixels(self, offsets: Points) -> Points:
-        return np.asarray(offsets * self.half_diagonal_px + (self.centre_x_px, self.centre_y_px))
-
-    def _scale(self, radius2: Points) -> Points:
-        divisor = 1.0 - self.k * radius2
-        # Pincushion distortion folds at k r_d^2 = -1; barrel distortion diverges where the divisor is zero.
-        inside = (divisor > 0) & (self.k * radius2 > -1.0)
-        return 1.0 / np.where(inside, divisor, np.nan)
-
-    def undistort_points(self, xy_raw: Points) -> Points:
-        """Raw pixels (n, 2) to undistorted pixels (n, 2); NaN rows outside the model's domain."""
-        return _move_radially(xy_raw, self.radial)
+        return self._build_radial((1.0, -self.k), -1.0, -1.0 / self.k if self.k < 0 else np.inf)
 
     def distort_points(self, xy: Points) -> Points:
         """Undistorted pixels (n, 2) to raw pixels (n, 2); NaN rows where pincushion distortion has no inverse."""
@@ -244,20 +241,9 @@ class DivisionLens:
         square = 1.0 + 4.0 * self.k * radius2
         return self._to_pixels(offsets * 2.0 / (1.0 + np.sqrt(np.where(square > 0, square, np.nan))))
 
-    def undistort_tangents(self, xy_raw: Points, tangents: Points) -> Points:
-        """Directions (n, 2) at raw pixels (n, 2), multiplied by the Jacobian of the undistortion."""
-        offsets, radius2 = self._offsets(xy_raw)
-        scale = self._scale(radius2)
-        return _differentiate_radially(offsets, tangents, scale, self.k * scale**2)
-
     def to_record(self) -> DivisionLensRecord:
         """The record that ``camera.json`` holds."""
-        return DivisionLensRecord(
-            k=self.k,
-            centre_x_px=self.centre_x_px,
-            centre_y_px=self.centre_y_px,
-            half_diagonal_px=self.half_diagonal_px,
-        )
+        return DivisionLensRecord(**asdict(self))
 
 
 @lru_cache(maxsize=64)
@@ -272,17 +258,13 @@ def _fold_radius(coefficients: tuple[float, ...]) -> float:
 
 
 @dataclass(frozen=True)
-class PolynomialLens:
+class PolynomialLens(_Radial):
     """Polynomial model, r = r_d (1 + k_1 r_d^2 + k_2 r_d^4 + ...), for lenses that one parameter cannot describe.
 
     Parameters
     ----------
     coefficients
         k_1, k_2, ..., with the radius in half-diagonals.
-    centre_x_px, centre_y_px
-        Centre of distortion, raw px.
-    half_diagonal_px
-        Unit of the radius, px.
 
     Notes
     -----
@@ -294,34 +276,14 @@ class PolynomialLens:
     centre_y_px: float
     half_diagonal_px: float
 
-    @property
-    def is_identity(self) -> bool:
-        """Whether there is no distortion."""
-        return not any(self.coefficients)
-
     @cached_property
     def radial(self) -> RadialModel:
         """The undistortion, for compiled code."""
-        return _build_radial(self, (1.0, *self.coefficients), 1.0, self.fold_radius() ** 2)
-
-    def _polynomial(self) -> FloatArray:
-        """The scale as a polynomial in the squared radius, lowest power first."""
-        return np.array((1.0, *self.coefficients))
+        return self._build_radial((1.0, *self.coefficients), 1.0, self.fold_radius() ** 2)
 
     def fold_radius(self) -> float:
         """Raw radius, in half-diagonals, at which the undistorted radius stops growing; infinity if never."""
         return _fold_radius(self.coefficients)
-
-    def _offsets(self, xy: Points) -> tuple[Points, Points]:
-        offsets = (np.asarray(xy, dtype=np.float64) - (self.centre_x_px, self.centre_y_px)) / self.half_diagonal_px
-        return offsets, _squares(offsets)
-
-    def _to_pixels(self, offsets: Points) -> Points:
-        return np.asarray(offsets * self.half_diagonal_px + (self.centre_x_px, self.centre_y_px))
-
-    def undistort_points(self, xy_raw: Points) -> Points:
-        """Raw pixels (n, 2) to undistorted pixels (n, 2); NaN rows beyond the radius where the model folds."""
-        return _move_radially(xy_raw, self.radial)
 
     def distort_points(self, xy: Points) -> Points:
         """Undistorted pixels (n, 2) to raw pixels (n, 2); NaN rows beyond the radius where the model folds."""
@@ -334,7 +296,7 @@ class PolynomialLens:
 
     def _raw_radius(self, radius: Points) -> Points:
         """Solve r_d * scale(r_d^2) = r by Newton's method safeguarded by bisection."""
-        scale = self._polynomial()
+        scale = self.radial.polynomial
         growth = scale * (1.0 + 2.0 * np.arange(len(scale)))
         polyval = np.polynomial.polynomial.polyval
         low = np.zeros_like(radius)
@@ -356,43 +318,9 @@ class PolynomialLens:
         failed = np.abs(raw * polyval(raw * raw, scale) - radius) > 1e-9 * np.maximum(radius, 1.0)
         return np.where(failed, np.nan, raw)
 
-    def undistort_tangents(self, xy_raw: Points, tangents: Points) -> Points:
-        """Directions (n, 2) at raw pixels (n, 2), multiplied by the Jacobian of the undistortion."""
-        offsets, radius2 = self._offsets(xy_raw)
-        polynomial = self._polynomial()
-        scale = np.asarray(np.polynomial.polynomial.polyval(radius2, polynomial), dtype=np.float64)
-        derivative = np.polynomial.polynomial.polyder(polynomial)
-        derivative_r2 = np.asarray(np.polynomial.polynomial.polyval(radius2, derivative), dtype=np.float64)
-        return _differentiate_radially(offsets, tangents, scale, derivative_r2)
-
     def to_record(self) -> PolynomialLensRecord:
         """The record that ``camera.json`` holds."""
-        return PolynomialLensRecord(
-            coefficients=self.coefficients,
-            centre_x_px=self.centre_x_px,
-            centre_y_px=self.centre_y_px,
-            half_diagonal_px=self.half_diagonal_px,
-        )
-
-
-def _build_radial(
-    lens: HarrisLens | DivisionLens | PolynomialLens,
-    polynomial: tuple[float, ...],
-    power: float,
-    limit_r2: float = np.inf,
-) -> RadialModel:
-    # floats and nothing else: kernels are compiled for the types of their arguments
-    centre_and_unit = float(lens.centre_x_px), float(lens.centre_y_px), float(lens.half_diagonal_px)
-    return RadialModel(*centre_and_unit, np.array(polynomial, np.float64), power, float(limit_r2))
-
-
-def _differentiate_radially(offsets: Points, tangents: Points, scale: Points, derivative_r2: Points) -> Points:
-    """Derivative of ``offsets * scale(|offsets|^2)`` along the tangents, offsets in half-diagonals.
-
-    ``derivative_r2`` is that of the scale with respect to the squared radius.
-    """
-    along = np.sum(offsets * tangents, axis=-1, keepdims=True)
-    return np.asarray(scale * tangents + 2.0 * derivative_r2 * along * offsets)
+        return PolynomialLensRecord(**asdict(self))
 
 
 def pinhole(frame_shape: tuple[int, int]) -> HarrisLens:
@@ -414,9 +342,6 @@ def pinhole(frame_shape: tuple[int, int]) -> HarrisLens:
 
 def lens_from_record(record: LensRecord) -> HarrisLens | DivisionLens | PolynomialLens:
     """The lens that a record of ``camera.json`` describes."""
-    centre_and_unit = (record.centre_x_px, record.centre_y_px, record.half_diagonal_px)
-    if isinstance(record, HarrisLensRecord):
-        return HarrisLens(record.a, *centre_and_unit)
-    if isinstance(record, DivisionLensRecord):
-        return DivisionLens(record.k, *centre_and_unit)
-    return PolynomialLens(record.coefficients, *centre_and_unit)
+    models: dict[str, type[Any]] = {"harris": HarrisLens, "division": DivisionLens, "polynomial": PolynomialLens}
+    lens: HarrisLens | DivisionLens | PolynomialLens = models[record.kind](**record.model_dump(exclude={"kind"}))
+    return lens

@@ -149,7 +149,7 @@ STAGES: tuple[Stage, ...] = (
     # Calibrate from edge points and control points of frames spread over the flight.
     Stage(
         name="lens",
-        version=8,
+        version=9,
         label="lens",
         lines=(
             Line("no significant distortion; pinhole model used", lambda counts: not counts.get("corner_px")),
