@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from velfield.errors import InputError
+from velfield.field.accumulate import FieldTile
 from velfield.field.segments import SEGMENT_DTYPE, Segments, VelocityBins
-from velfield.field.view import Tile, VelocityField
+from velfield.field.view import VelocityField
 
 GSD_M = 0.25
 BINS = VelocityBins(width_px_per_s=2 / GSD_M, reach=18, kernel_sigma_px_per_s=0.7 / GSD_M, gsd_m=GSD_M)
@@ -147,10 +148,11 @@ def test_a_density_reads_the_tiles_about_its_places_once() -> None:
     size, rows, columns, read = 16, 6, 9, []
     bins = replace(BINS, reach=2)
 
-    def tile(ty: int, tx: int) -> Tile:
+    def tile(ty: int, tx: int) -> FieldTile:
         read.append((ty, tx))
         histogram = np.random.default_rng([ty, tx]).integers(0, 9, (size, size, bins.n, bins.n), np.int32)
-        return histogram, np.full((size, size), 3, np.int32), np.zeros((size, size), np.int32)
+        nothing = np.zeros((size, size), np.int32)
+        return FieldTile(histogram, np.full((size, size), 3, np.int32), nothing, nothing)
 
     every = [(ty, tx) for ty in range(rows) for tx in range(columns)]
     map_ = VelocityField(

@@ -25,7 +25,7 @@ from velfield.registration.transforms import as_points
 from velfield.run.frame_transforms import FrameTransforms
 from velfield.sources.images import read_grey_image
 from velfield.synthetic import cases, write_flight
-from velfield.synthetic.score import RegistrationScore, score_registration
+from velfield.synthetic.score import RegistrationScore, apply_homography, score_registration
 from velfield.synthetic.truth import Truth, load_truth
 from velfield.synthetic.write import frame_name
 
@@ -69,33 +69,26 @@ class Measurement:
 
     Attributes
     ----------
-    drift_px : change of the mean error from the first tenth of the frames to the last, base px.
     corner_px : largest error of a frame's corners, over all frames, base px; of those that were answered.
-    answered : fraction of all frames for which there is a position; a frame that is not registered has none.
     seconds_a_frame : computing time; reading of images is included for velfield, not for stabilo.
-    frames_registered, frames : number of frames registered, and in total.
+    frames : number of frames in total.
     """
 
     case: str
     method: str
     seed: int
-    mean_px: float
-    p95_px: float
-    jitter_px: float
-    drift_px: float
+    score: RegistrationScore
     corner_px: float
-    answered: float
     seconds_a_frame: float
-    frames_registered: int
     frames: int
 
     def text(self) -> str:
         """One line of the table."""
+        one = self.score
         return (
-            f"{self.case:<11} {self.method:<9} seed {self.seed:<6} mean {self.mean_px:7.3f}  p95 {self.p95_px:7.3f}  "
-            f"jitter {self.jitter_px:6.3f}  drift {self.drift_px:6.3f}  worst corner {self.corner_px:7.2f} px  "
-            f"answered {self.answered:.4f}  "
-            f"{self.seconds_a_frame:5.2f} s a frame  {self.frames_registered}/{self.frames} frames"
+            f"{self.case:<11} {self.method:<9} seed {self.seed:<6} mean {one.mean_px:7.3f}  p95 {one.p95_px:7.3f}  "
+            f"jitter {one.jitter_px:6.3f}  drift {one.drift_px:6.3f}  worst corner {self.corner_px:7.2f} px  "
+            f"answered {one.answered:.4f}  {self.seconds_a_frame:5.2f} s a frame  {one.frames}/{self.frames} frames"
         )
 
 
@@ -118,27 +111,9 @@ def bench_registration(
         to_base, registered, seconds = register(flight, config, truth)
         score = score_registration(truth, to_base, registered, asked=range(config.frames))
         corner = _worst_corner(truth, to_base, registered)
-        measurements.append(_row(case.name, method, seed, score, corner, seconds, config.frames))
+        frames_s = seconds / config.frames
+        measurements.append(Measurement(case.name, method, seed, score, corner, frames_s, config.frames))
     return measurements
-
-
-def _row(
-    case: str, method: str, seed: int, score: RegistrationScore, corner_px: float, seconds: float, frames: int
-) -> Measurement:
-    return Measurement(
-        case=case,
-        method=method,
-        seed=seed,
-        mean_px=score.mean_px,
-        p95_px=score.p95_px,
-        jitter_px=score.jitter_px,
-        drift_px=score.drift_px,
-        corner_px=corner_px,
-        answered=score.answered,
-        seconds_a_frame=seconds / frames,
-        frames_registered=score.frames,
-        frames=frames,
-    )
 
 
 def _worst_corner(truth: Truth, to_base: PointMap, frames: Sequence[int]) -> float:
@@ -155,7 +130,7 @@ def summarise(measurements: Sequence[Measurement]) -> list[str]:
         rows = [m for m in measurements if (m.case, m.method) == (case, method)]
         texts = [f"{case:<11} {method:<9} median (worst) of {len(rows)}:"]
         for name in ("mean_px", "p95_px", "jitter_px", "drift_px", "corner_px", "answered", "seconds_a_frame"):
-            values = [getattr(row, name) for row in rows]
+            values = [getattr(row if hasattr(row, name) else row.score, name) for row in rows]
             worst = min(values) if name == "answered" else max(values)
             texts.append(f"{name} {np.median(values):.3f} ({worst:.3f})")
         lines.append("  ".join(texts))
@@ -216,7 +191,7 @@ def register_by_stabilo(flight: Path, config: SimulationConfig, truth: Truth) ->
             transforms[frame] = np.asarray(matrix, dtype=np.float64)
 
     def to_base(frame: int, xy_raw: FloatArray) -> FloatArray:
-        return _apply_homography(transforms[frame], truth.camera.undistort(as_points(xy_raw)))
+        return apply_homography(transforms[frame], truth.camera.undistort(as_points(xy_raw)))
 
     return to_base, sorted(transforms), seconds
 
@@ -250,8 +225,3 @@ def _undistortion_maps(truth: Truth) -> tuple[Float32Array, Float32Array]:
 
 def _to_bgr(grey: GreyImage) -> GreyImage:
     return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
-
-
-def _apply_homography(matrix: FloatArray, xy: FloatArray) -> FloatArray:
-    mapped = np.column_stack([xy, np.ones(len(xy))]) @ matrix.T
-    return np.asarray(mapped[:, :2] / mapped[:, 2:])

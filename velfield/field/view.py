@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from schemas.arrays import Float32Array, FloatArray
 from velfield.errors import InputError
-from velfield.field.accumulate import accumulate_tile
+from velfield.field.accumulate import FieldTile, accumulate_tile
 from velfield.field.gate import COVERAGE, VelocityGate, make_gate
 from velfield.field.modes import modal_velocity
 from velfield.field.pixel import PixelDistribution, describe_pixel
@@ -20,11 +20,8 @@ from velfield.field.prior import densities_at_pixel, log_density_in_window
 from velfield.field.segments import Segments, VelocityBins, segments_by_tile
 from velfield.field.statistics import TileStatistics, direction_rad, speed_px_per_s, tile_statistics
 
-Tile = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]
-"""(ty, tx, nvy, nvx) histogram, (ty, tx) count of tracks and the sum of their velocities' variances, as in `FieldTile`;
-tiles at the map's edge may be cut or padded."""
-TileSource = Callable[[int, int], Tile | None]
-"""Returns tile (ty, tx), or None where it is empty."""
+TileSource = Callable[[int, int], FieldTile | None]
+"""Returns tile (ty, tx), or None where no vehicle passed; tiles at the map's edge may be cut or padded."""
 LayerSource = Callable[[str], NDArray[Any]]
 """Returns a whole (y, x) layer by its name."""
 
@@ -80,7 +77,7 @@ class VelocityField:
         self.tiles = sorted(tiles)
         self._known = frozenset(self.tiles)
         self._source, self._threads, self._layers = source, threads, layers
-        self._cache: OrderedDict[tuple[int, int], Tile | None] = OrderedDict()
+        self._cache: OrderedDict[tuple[int, int], FieldTile | None] = OrderedDict()
         self._lock = Lock()
         self._modal: Float32Array | None = None
         self._map_weights: FloatArray | None = None
@@ -99,12 +96,11 @@ class VelocityField:
         """The field of a segment table; its tiles are accumulated when they are read."""
         rows = segments_by_tile(segments, shape=shape, tile_size=tile_size, radius_px=radius_px)
 
-        def make(ty: int, tx: int) -> Tile:
+        def make(ty: int, tx: int) -> FieldTile:
             origin = (tx * tile_size, ty * tile_size)
             part = segments[rows[ty, tx]]
             size = (tile_size, tile_size)
-            tile = accumulate_tile(part, origin_xy=origin, shape=size, bins=bins, radius_px=radius_px)
-            return tile.histogram, tile.count, tile.variance_sum
+            return accumulate_tile(part, origin_xy=origin, shape=size, bins=bins, radius_px=radius_px)
 
         return cls(
             make,
@@ -125,7 +121,7 @@ class VelocityField:
                 out[..., 0], out[..., 1] = self._layers("modal_vx"), self._layers("modal_vy")
                 self._modal = out
                 return out.copy()
-            for where, velocity in self._over_tiles(lambda t: modal_velocity(t[0], t[1], bins=self.bins)):
+            for where, velocity in self._over_tiles(lambda t: modal_velocity(t.histogram, t.count, bins=self.bins)):
                 out[where] = velocity[: out[where].shape[0], : out[where].shape[1]]
             self._modal = out
         return self._modal.copy()
@@ -154,7 +150,7 @@ class VelocityField:
         if self._layers is not None:
             return np.array(self._layers("count"), np.int32)
         out = np.zeros(self.shape, np.int32)
-        for where, count in self._over_tiles(lambda t: t[1]):
+        for where, count in self._over_tiles(lambda t: t.count):
             out[where] = count[: out[where].shape[0], : out[where].shape[1]]
         return out
 
@@ -199,14 +195,14 @@ class VelocityField:
             return self._distribution(column, row, self._empty_pixel())
         y0, x0 = row % self.tile_size, column % self.tile_size
         pixel = np.s_[y0 : y0 + 1, x0 : x0 + 1]
-        return self._distribution(column, row, (tile[0][pixel], tile[1][pixel], tile[2][pixel]))
+        return self._distribution(column, row, FieldTile(*(part[pixel] for part in tile)))
 
-    def _empty_pixel(self) -> Tile:
+    def _empty_pixel(self) -> FieldTile:
         """An empty tile of one pixel."""
-        return (np.zeros((1, 1, self.bins.n, self.bins.n), np.int32), *np.zeros((2, 1, 1), np.int32))
+        return FieldTile(np.zeros((1, 1, self.bins.n, self.bins.n), np.int32), *np.zeros((3, 1, 1), np.int32))
 
-    def _distribution(self, x: int, y: int, pixel: Tile) -> PixelDistribution:
-        return describe_pixel(x, y, pixel[0], pixel[1], self.bins, self._tile_statistics(pixel))
+    def _distribution(self, x: int, y: int, pixel: FieldTile) -> PixelDistribution:
+        return describe_pixel(x, y, pixel.histogram, pixel.count, self.bins, self._tile_statistics(pixel))
 
     # -- a prior for another tracker ----------------------------------------------------------------------------------
 
@@ -329,7 +325,7 @@ class VelocityField:
             for ty, tx in self.tiles[::step]:
                 tile = self._tile(ty, tx)
                 if tile is not None:
-                    total += tile[0].sum(axis=(0, 1), dtype=np.int64)
+                    total += tile.histogram.sum(axis=(0, 1), dtype=np.int64)
             self._map_weights = total / max(total.sum(), 1)
         return self._map_weights
 
@@ -343,24 +339,24 @@ class VelocityField:
                 tile = self._tile(row, column)
                 if tile is None:
                     continue
-                tile_height, tile_width = tile[1].shape
+                tile_height, tile_width = tile.count.shape
                 top, left = max(row * size, y0), max(column * size, x0)
                 bottom = min(row * size + tile_height, y0 + height)
                 right = min(column * size + tile_width, x0 + width)
                 target = np.s_[top - y0 : bottom - y0, left - x0 : right - x0]
                 origin = np.s_[top - row * size : bottom - row * size, left - column * size : right - column * size]
-                histogram[target], count[target] = tile[0][origin], tile[1][origin]
+                histogram[target], count[target] = tile.histogram[origin], tile.count[origin]
         return histogram, count
 
     # -- tiles --------------------------------------------------------------------------------------------------------
 
-    def _tile_statistics(self, tile: Tile) -> TileStatistics:
-        histogram, count, variance_sum = tile
+    def _tile_statistics(self, tile: FieldTile) -> TileStatistics:
+        limit = self.stationary_speed_px_per_s
         return tile_statistics(
-            histogram, count, variance_sum, bins=self.bins, stationary_speed_px_per_s=self.stationary_speed_px_per_s
+            tile.histogram, tile.count, tile.variance_sum, bins=self.bins, stationary_speed_px_per_s=limit
         )
 
-    def _tile(self, ty: int, tx: int) -> Tile | None:
+    def _tile(self, ty: int, tx: int) -> FieldTile | None:
         """A tile, from the cache if it is there."""
         key = (ty, tx)
         if key not in self._known:
@@ -376,7 +372,7 @@ class VelocityField:
                 self._cache.popitem(last=False)
         return found
 
-    def _over_tiles(self, work: Callable[[Tile], T]) -> Iterator[tuple[_Window, T]]:
+    def _over_tiles(self, work: Callable[[FieldTile], T]) -> Iterator[tuple[_Window, T]]:
         """The result of ``work`` for every tile with its window in the map, in raster order. Tiles are not cached."""
 
         def one(key: tuple[int, int]) -> T | None:

@@ -8,8 +8,9 @@ from velfield.errors import InputError
 from velfield.field.accumulate import FieldTile
 from velfield.field.algebra import merge_tiles, subtract_tile
 from velfield.field.segments import VelocityBins
+from velfield.field.view import TileSource
 from velfield.run.commits import content_key, digest_file, write_atomically
-from velfield.run.field_reader import TileReader, tile_reader
+from velfield.run.field_reader import tile_reader
 from velfield.run.field_writer import GroupWriter, create_field_store, tile_groups
 from velfield.run.flight_record import read_flight_record
 from velfield.run.frame_transforms import read_grid, read_working
@@ -147,7 +148,7 @@ def _write(
     write_atomically(layout.flight, record.model_dump_json(indent=1).encode())  # last: without it nothing is whole
 
 
-def _write_group(writer: GroupWriter, kinds: Sequence[Sequence[TileReader]], combine: Combine) -> None:
+def _write_group(writer: GroupWriter, kinds: Sequence[Sequence[TileSource]], combine: Combine) -> None:
     for row, column in writer.tiles():
         tile, *timed = (combine([read(row, column) for read in readers]) for readers in kinds)
         if tile is not None:

@@ -1,6 +1,5 @@
 """Read the velocity field of a run folder tile by tile; a missing tile is an error."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
 
@@ -11,14 +10,11 @@ from schemas.records import GridRecord
 from velfield.errors import InputError, StoreError
 from velfield.field.accumulate import FieldTile
 from velfield.field.segments import VelocityBins, stationary_speed_px_per_s
-from velfield.field.view import Tile, VelocityField
+from velfield.field.view import TileSource, VelocityField
 from velfield.run.flight_record import read_flight_record
 from velfield.run.frame_transforms import read_grid
 from velfield.run.layout import RunLayout
 from velfield.run.stores import HISTOGRAM, HISTOGRAM_TIME_WEIGHTED, FieldStore, open_field
-
-TileReader = Callable[[int, int], FieldTile | None]
-"""Returns the tile (row, column); None where no vehicle passed."""
 
 
 @dataclass(frozen=True)
@@ -77,14 +73,8 @@ def field_from_store(
     if histogram not in store.histogram_names():
         raise InputError(f"{path} holds no {histogram}: run the flight again with --set field.time_weighted=true")
     count = store.layer("count")
-    read = tile_reader(store, histogram)
-
-    def tile(row: int, column: int) -> Tile | None:
-        found = read(row, column)
-        return None if found is None else (found.histogram, found.count, found.variance_sum)
-
     return VelocityField(
-        tile,
+        tile_reader(store, histogram),
         tiles=known_tiles(count, store.tile),
         shape=store.shape,
         tile_size=store.tile,
@@ -94,7 +84,7 @@ def field_from_store(
     )
 
 
-def tile_reader(store: FieldStore, histogram: str = HISTOGRAM) -> TileReader:
+def tile_reader(store: FieldStore, histogram: str = HISTOGRAM) -> TileSource:
     """A reader of whole tiles: a histogram, and the layers that are sums."""
     sums = {name: store.layer(name) for name in ("count", "occupancy_ms", "velocity_variance_sum")}
     side = store.tile

@@ -13,6 +13,7 @@ from schemas.flight import FieldConfig
 from schemas.tables import TRACKLET_COLUMNS
 from velfield.field.accumulate import Weight, accumulate_tile
 from velfield.field.segments import (
+    SEGMENT_COLUMNS,
     SEGMENT_DTYPE,
     Segments,
     VelocityBins,
@@ -30,15 +31,6 @@ from velfield.run.stores import open_field, store_key
 from velfield.run.tables import read_tables
 
 _PLACE_COLUMNS = ["track_id", *(f"{axis}_{k}_px" for k in range(3) for axis in "xy")]
-_SEGMENT_COLUMNS = [
-    "tracklet_id",
-    "track_id",
-    *(f"detection_id_{k}" for k in range(3)),
-    *(f"time_{k}_s" for k in range(3)),
-    *(f"{axis}_{k}_px" for k in range(3) for axis in "xy"),
-    *(f"v{axis}_{k}_px_per_s" for k in ("01", "12") for axis in "xy"),
-    *(f"displacement_sd_{k}_px" for k in ("01", "12")),
-]
 
 
 def field_blocks(plan: Plan) -> list[Group]:
@@ -157,11 +149,11 @@ def _tracklets_near(plan: Plan, low_xy: tuple[float, float], high_xy: tuple[floa
     paths = sorted(plan.layout.tracks.glob("unit-*.parquet"))
     read = partial(read_tables, columns=TRACKLET_COLUMNS)
     if not paths:
-        return read([], only=_SEGMENT_COLUMNS)
+        return read([], only=list(SEGMENT_COLUMNS))
     near = np.unique(np.concatenate([_tracks_in(read([path], only=_PLACE_COLUMNS), low_xy, high_xy) for path in paths]))
     parts = []
     for path in paths:
-        table = read([path], only=_SEGMENT_COLUMNS)
+        table = read([path], only=list(SEGMENT_COLUMNS))
         parts.append(table[np.isin(table["track_id"].to_numpy(), near)])
     return pd.concat(parts, ignore_index=True)
 
