@@ -122,7 +122,8 @@ class JunctionRecord(Model):
     """Where lanes cross, merge or diverge."""
 
     junction: NonNegativeInt
-    kind: Literal["intersection", "roundabout", "merge", "diverge"]
+    kind: Literal["intersection", "roundabout", "crossing", "merge", "diverge"]
+    """``crossing``: roads cross, perhaps on two levels."""
     x_px: float
     y_px: float
     hull_px: tuple[Point, ...]

@@ -366,6 +366,23 @@ def test_a_road_above_another_makes_no_conflicts() -> None:
     assert [c for c in analysis.conflicts if c.kind == "crossing"] == []
 
 
+def test_roads_that_cross_are_an_intersection_where_turns_a_signal_or_pairs_show_it(analysis: TrafficAnalysis) -> None:
+    number = next(m.junction.number for m in analysis.movements if analysis.signals.get(m.junction.number))
+    assert analysis.junction_kind(number) == "intersection"
+    # a bridge, of which nothing but the lanes is seen
+    bridge = TrafficAnalysis(
+        gather([drive(EAST, 4.0 * k) for k in range(6)] + [drive(SOUTH, 4.0 * k + 4.2) for k in range(6)])
+    )
+    assert [bridge.junction_kind(k) for k in range(len(bridge.lanes.junctions))] == ["crossing"]
+    answers = {(a.topic, a.subject): a for a in find_answers(bridge)}
+    assert answers["signal", "crossing 0"].state == "too little data"
+    assert "0 junctions, 1 crossing" in answers["lanes", ""].text
+    # many pairs, none of which is there at once
+    level = [drive(EAST, 12.0 * k) for k in range(24)] + [drive(SOUTH, 12.0 * k + 6.0) for k in range(24)]
+    crossed = TrafficAnalysis(gather(level))
+    assert [crossed.junction_kind(k) for k in range(len(crossed.lanes.junctions))] == ["intersection"]
+
+
 def test_vehicles_that_cross_hardly_after_each_other_show_two_levels() -> None:
     """None drives through another beyond errors; but drivers who see each other leave more time."""
     tracks = [drive(EAST, 4.0 * k) for k in range(12)] + [drive(SOUTH, 4.0 * k + 4.95) for k in range(12)]

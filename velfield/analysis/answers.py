@@ -13,6 +13,7 @@ from velfield.analysis.vehicle_classes import COUNTED_CLASSES
 State = Literal["found", "none", "too little data"]
 _SHORT_S, _FEW_TRACKS = 60.0, 30
 """In a shorter clip with fewer vehicles nothing is expected to be found; what it did not show may still be frequent."""
+_TWO_LEVELS = "too little data: nobody was seen to turn, and the roads may be on two levels"
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,10 @@ def find_answers(analysis: TrafficAnalysis, *, unit: SpeedUnit = "km/h") -> Iter
     yield from _scene(analysis)
     yield from _speeds(analysis, unit)
     for number, signal in analysis.signals.items():
-        yield _signal(number, signal)
+        if analysis.junction_kind(number) == "crossing":
+            yield Answer("signal", f"crossing {number}", "too little data", _TWO_LEVELS)
+        else:
+            yield _signal(number, signal)
     seconds = analysis.trajectories.duration_s
     yield _events("u-turns", len(analysis.reversals), seconds)
     yield _conflicts(analysis)
@@ -92,11 +96,17 @@ def _lanes(analysis: TrafficAnalysis) -> Answer:
     seen = f"{count_text(len(tracks), 'moving vehicle')} in {duration_text(tracks.duration_s)}"
     if not len(graph):
         return Answer("lanes", "", "too little data", f"too little data: no lane that three of {seen} drove")
-    text = (
-        f"{count_text(len(graph), 'lane')} of {sum(lane.length_m for lane in graph) / 1000:.2f} km, "
-        f"{count_text(len(graph.junctions), 'junction')}, from {seen}"
-    )
+    crossings = sum(analysis.junction_kind(k) == "crossing" for k in range(len(graph.junctions)))
+    places = count_text(len(graph.junctions) - crossings, "junction")
+    places += f", {count_text(crossings, 'crossing')} where nobody was seen to turn" if crossings else ""
+    length = f"{sum(lane.length_m for lane in graph) / 1000:.2f} km"
+    text = f"{count_text(len(graph), 'lane')} of {length}, {places}, from {seen}"
     return Answer("lanes", "", "found", text)
+
+
+def _place(analysis: TrafficAnalysis, junction: int) -> str:
+    """Name of a junction; of roads that cross, perhaps on two levels, a crossing."""
+    return f"{'crossing' if analysis.junction_kind(junction) == 'crossing' else 'junction'} {junction}"
 
 
 def _classes(analysis: TrafficAnalysis) -> Answer:
@@ -115,7 +125,7 @@ def _movements(analysis: TrafficAnalysis) -> Iterator[Answer]:
     for m in sorted(found, key=lambda m: -(m.seen + m.inferred)):
         share = f", {estimate_text(m.share, '%', 100)} of those from {m.arm_in}" if m.share else ""
         delay = f", delay {estimate_text(m.delay_s, 's')}" if m.delay_s else ""
-        subject = f"junction {m.junction}, {m.arm_in} to {m.arm_out}"
+        subject = f"{_place(analysis, m.junction)}, {m.arm_in} to {m.arm_out}"
         text = f"{count_text(round(m.seen + m.inferred), 'vehicle')}{share}{delay}"
         yield Answer("movement", subject, "found", text, m.flow_veh_per_h, "veh/h")
 

@@ -20,7 +20,8 @@ from velfield.analysis.flow.speeds import (
 )
 from velfield.analysis.flow.volume import LaneFlow, lane_flow
 from velfield.analysis.lanes.find import find_lanes
-from velfield.analysis.lanes.model import LaneGraph
+from velfield.analysis.lanes.junctions import inside_hull
+from velfield.analysis.lanes.model import JunctionKind, LaneGraph
 from velfield.analysis.movements.car_parks import CarPark, find_car_parks
 from velfield.analysis.movements.cut_tracks import CutTracks, join_cut_tracks
 from velfield.analysis.movements.movements import JunctionMovements, find_movements
@@ -175,13 +176,22 @@ class TrafficAnalysis:
         return {
             number: find_signal(number, streams, *self.window_s)
             for number, streams in self.streams.items()
-            if self.lanes.junctions[number].kind in ("intersection", "roundabout")
+            if self.lanes.junctions[number].kind in ("intersection", "roundabout", "crossing")
         }
 
     def is_signalised(self, junction: int) -> bool | None:
         """Whether a junction has a signal; None where that is not known."""
         signal = self.signals.get(junction)
         return signal.signalised if signal else False
+
+    def junction_kind(self, junction: int) -> JunctionKind:
+        """Kind of a junction: a crossing is an intersection where a signal, or how vehicles pass, shows one level."""
+        found = self.lanes.junctions[junction]
+        if found.kind != "crossing":
+            return found.kind
+        level = [c.xy_m for c in self.conflicts if c.kind == "crossing" and c.one_level >= 0.5]
+        on_one = self.is_signalised(junction) or bool(inside_hull(np.array(level).reshape(-1, 2), found.hull_m).any())
+        return "intersection" if on_one else "crossing"
 
     def profile(self, lane: int) -> list[Station]:
         """Speeds along a lane."""

@@ -74,9 +74,10 @@ def junction_rows(analysis: TrafficAnalysis, found: JunctionMovements) -> list[l
     bins = max(int(np.ceil((end - begin) / BIN_S)), 1)
     moves = sorted(found.movements, key=lambda m: (m.arm_in, list(_TURNS).index(m.turn), m.arm_out))
     counts = np.array([_entries(found, m.arm_in, m.arm_out, begin, bins) for m in moves])
+    kind = analysis.junction_kind(found.junction.number)
     head = [f"{bound(m.arm_in)} {_TURNS[m.turn]}" for m in moves]
     rows: list[list[Any]] = [
-        [f"Junction {found.junction.number} ({found.junction.kind}); arms by the side of the image, N its top"],
+        [f"Junction {found.junction.number} ({kind}); arms by the side of the image, N its top"],
         ["From arm, to arm", *(f"{m.arm_in} to {m.arm_out}" for m in moves)],
         ["From the start, min", *head, "All"],
     ]

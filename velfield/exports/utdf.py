@@ -53,7 +53,7 @@ def utdf(analysis: TrafficAnalysis, *, height_m: float) -> str:
     nodes = [
         _Node(analysis, found, height_m)
         for found in analysis.movements
-        if found.junction.kind in ("intersection", "roundabout") and found.movements
+        if analysis.junction_kind(found.junction.number) in ("intersection", "roundabout") and found.movements
     ]
     if not nodes:
         raise InputError("no junction with movements was found, so there are no volumes")

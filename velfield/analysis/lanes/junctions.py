@@ -65,6 +65,8 @@ def _with_whole_lanes(hull_m: FloatArray, lanes: Sequence[Lane]) -> FloatArray:
 
 
 def _kind(kinds: IntArray) -> JunctionKind:
+    if (kinds == 0).all():
+        return "crossing"
     if (kinds == 0).any():
         return "intersection"
     return "merge" if (kinds == 1).sum() >= (kinds == 2).sum() else "diverge"

@@ -10,7 +10,8 @@ import numpy as np
 from schemas.arrays import FloatArray, IntArray
 
 Turn = Literal["straight", "left", "right", "u-turn"]
-JunctionKind = Literal["intersection", "roundabout", "merge", "diverge"]
+JunctionKind = Literal["intersection", "roundabout", "crossing", "merge", "diverge"]
+"""A crossing is where lanes cross and no vehicle was seen to turn: from above a bridge looks so."""
 WidthSource = Literal["neighbour", "spread"]
 
 

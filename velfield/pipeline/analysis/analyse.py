@@ -219,14 +219,19 @@ def _with_clips(table: AnalysisTable, clips: Mapping[int, bytes]) -> AnalysisTab
 
 
 def _with_answers(lanes: LanesRecord, analysis: TrafficAnalysis, unit: SpeedUnit) -> LanesRecord:
-    """With the limits of lanes, and whether junctions have a signal."""
+    """With the limits of lanes, and whether junctions have a signal and are on one level."""
     known = [(road, sign) for road in analysis.free_flow if (sign := road.limit(unit))]
     limits = {lane: sign / PER_M_PER_S[unit] for road, sign in known for lane in road.lanes}
     return lanes.model_copy(
         update={
             "lanes": tuple(lane.model_copy(update={"limit_m_per_s": limits.get(lane.lane)}) for lane in lanes.lanes),
             "junctions": tuple(
-                junction.model_copy(update={"signalised": analysis.signals[junction.junction].signalised})
+                junction.model_copy(
+                    update={
+                        "signalised": analysis.signals[junction.junction].signalised,
+                        "kind": analysis.junction_kind(junction.junction),
+                    }
+                )
                 if junction.junction in analysis.signals
                 else junction
                 for junction in lanes.junctions

@@ -66,7 +66,7 @@ def _groups(analysis: TrafficAnalysis, classes: VehicleClasses) -> Iterator[_Gro
     yield group("picture", "all tracks that move", float(n), np.arange(n), None)
     for found in analysis.movements:
         for m in found.movements:
-            name = f"{found.junction.kind} {m.junction}, {m.arm_in} to {m.arm_out}"
+            name = f"{analysis.junction_kind(m.junction)} {m.junction}, {m.arm_in} to {m.arm_out}"
             geometry = line_geometry(m.line_m, analysis)
             yield group("movement", name, m.seen + m.inferred, found.tracks(m), geometry)
     scene = analysis.scene

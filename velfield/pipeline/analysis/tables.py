@@ -105,7 +105,7 @@ def movement_table(analysis: TrafficAnalysis) -> AnalysisTable:
 
     columns: list[Column[tuple[JunctionMovements, Movement]]] = [
         Column("junction", "Junction", "", lambda row: row[1].junction),
-        Column("kind", "Kind", "", lambda row: row[0].junction.kind),
+        Column("kind", "Kind", "", lambda row: analysis.junction_kind(row[1].junction)),
         Column("from", "From", "", lambda row: row[1].arm_in),
         Column("to", "To", "", lambda row: row[1].arm_out),
         Column("turn", "Turn", "", lambda row: row[1].turn),
@@ -192,7 +192,7 @@ def signal_table(analysis: TrafficAnalysis) -> AnalysisTable:
 
     columns: list[Column[JunctionSignal]] = [
         Column("junction", "Junction", "", lambda signal: signal.junction),
-        Column("kind", "Kind", "", lambda signal: junctions[signal.junction].kind),
+        Column("kind", "Kind", "", lambda signal: analysis.junction_kind(signal.junction)),
         Column("signal", "Signal", "", said),
         estimates("cycle", "Cycle", "s", lambda signal: signal.cycle_s),
         Column("phases", "Lanes with green together", "", lambda signal: " | ".join(map(_numbers, signal.phases))),

@@ -47,12 +47,13 @@ def traffic_diagrams(
     yield Diagram(
         "place",
         "The place",
-        "Lanes with their direction of travel; J: junctions, by the number used in the tables.",
+        "Lanes with their direction of travel; J: junctions, by the number used in the tables. Dashed: roads that "
+        "cross, perhaps on two levels, as nobody was seen to turn.",
         partial(draw_place, analysis=analysis, picture=picture),
         4.6,
     )
     junctions = sorted(
-        (m for m in analysis.movements if m.junction.kind in ("intersection", "roundabout") and m.movements),
+        (m for m in analysis.movements if _is_junction(analysis, m.junction.number) and m.movements),
         key=lambda found: -found.volume,
     )[:_MAX_JUNCTIONS]
     for found in junctions:
@@ -85,6 +86,10 @@ def traffic_diagrams(
             partial(draw_conflicts, analysis=analysis, picture=picture),
             4.6,
         )
+
+
+def _is_junction(analysis: TrafficAnalysis, number: int) -> bool:
+    return analysis.junction_kind(number) in ("intersection", "roundabout")
 
 
 def _signal_diagrams(analysis: TrafficAnalysis, found: JunctionMovements) -> Iterator[Diagram]:
@@ -121,7 +126,7 @@ def _road_diagrams(analysis: TrafficAnalysis, junctions: list[JunctionMovements]
             partial(draw_speed_profile, analysis=analysis, lane=lane.number, unit=unit),
         )
     points = fundamental_points(analysis)
-    if len(points) >= 5:
+    if len(points) >= 5 and analysis.trajectories.duration_s >= 2 * _SLICE_S:
         yield Diagram(
             "fundamental",
             "Flow against density",
@@ -164,8 +169,10 @@ def draw_place(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | 
             style = {"arrowstyle": "-|>", "color": "#1b1f24", "mutation_scale": 11}
             axes.annotate("", xy=(at[1][0], at[1][1]), xytext=(at[0][0], at[0][1]), arrowprops=style)
     for junction in analysis.lanes.junctions:
-        if junction.kind in ("intersection", "roundabout"):
+        level = _is_junction(analysis, junction.number)
+        if level or junction.kind == "crossing":
             box = {"facecolor": "white", "edgecolor": "#1b1f24", "boxstyle": "round,pad=0.25"}
+            box["linestyle"] = "-" if level else "--"
             x, y = junction.centre_m
             axes.text(x, y, f"J{junction.number}", ha="center", va="center", fontsize=11, fontweight="bold", bbox=box)
 

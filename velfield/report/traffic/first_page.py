@@ -72,7 +72,7 @@ def _waits(analysis: TrafficAnalysis) -> list[str]:
     for found in sorted(analysis.movements, key=lambda m: -m.volume):
         number = found.junction.number
         signal = analysis.signals.get(number)
-        if found.junction.kind not in ("intersection", "roundabout"):
+        if analysis.junction_kind(number) not in ("intersection", "roundabout"):
             continue
         parts = [
             f"from {d.arm} {d.delay_s:.0f} s" + (f" (level of service {d.level})" if d.level else "")
