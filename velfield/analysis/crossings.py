@@ -82,13 +82,8 @@ def _with_hysteresis(track: IntArray, after: FloatArray, rows: IntArray, hystere
             yield from stack
             stack = []
         back = bool(stack) and (after[stack[-1]] >= 0) != (after[row] >= 0)
-        if back and _excursion(after, stack[-1], row) < hysteresis_px:
+        if back and np.abs(after[stack[-1] : row]).max() < hysteresis_px:  # largest distance from the line between
             stack.pop()
         else:
             stack.append(int(row))
     yield from stack
-
-
-def _excursion(after: FloatArray, out: int, back: int) -> float:
-    """Largest distance from the line between a crossing and the crossing back, px."""
-    return float(np.abs(after[out:back]).max())

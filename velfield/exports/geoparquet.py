@@ -57,15 +57,11 @@ def tracklet_lines(tracklets: pd.DataFrame, georeference: Georeference) -> tuple
     flat = xy.reshape(-1, 2)
     lines = (georeference.to_crs(flat) if georeference.has_crs else flat * (1.0, -1.0)).reshape(-1, 3, 2)
     columns: dict[str, pa.Array] = {
-        "geometry": pa.array([_wkb(line) for line in lines], pa.binary()),
+        "geometry": pa.array([_LINE.pack(1, _LINE_STRING, 3, *line.ravel()) for line in lines], pa.binary()),
         "heading_deg": pa.array(_headings(tracklets, xy, georeference), pa.float32()),
     }
     columns |= {str(name): pa.array(tracklets[name].to_numpy()) for name in tracklets.columns}
     return pa.table(columns), lines
-
-
-def _wkb(line: FloatArray) -> bytes:
-    return _LINE.pack(1, _LINE_STRING, 3, *line.ravel().tolist())
 
 
 def _boxes(low: FloatArray, high: FloatArray) -> pa.Array:

@@ -54,7 +54,8 @@ def validate_inputs(plan: Plan) -> None:
                 read(Path(path), plan)
             except InputError as error:
                 raise InputError(f"--{option}: {error}") from None
-    if plan.job.inputs.base and _is_pending(plan, "base") and _takes_long(plan):
+    is_far_off = plan.frame_count * plan.info.width * plan.info.height > _LONG_PX  # the stage that checks it too
+    if plan.job.inputs.base and _is_pending(plan, "base") and is_far_off:
         check_base_area(plan)
 
 
@@ -107,11 +108,6 @@ def _middle_frame(plan: Plan) -> GreyImage | None:
         if not frame.flags & UNUSABLE:
             return frame.grey
     return None
-
-
-def _takes_long(plan: Plan) -> bool:
-    """Whether the base stage, which checks the image too, is far off."""
-    return plan.frame_count * plan.info.width * plan.info.height > _LONG_PX
 
 
 def _is_pending(plan: Plan, option: str) -> bool:

@@ -22,8 +22,8 @@ from velfield.registration.fitting import Model, fit_by_case_deletion, fit_polyp
 from velfield.registration.modality import GRADIENT, Modality
 from velfield.registration.transforms import (
     FrameTransform,
+    HomographyTransform,
     PolyprojectiveTransform,
-    fit_normalisation,
 )
 from velfield.registration.warp import footprint, warp_to_base
 
@@ -54,12 +54,7 @@ class ImagePair:
     def from_homography(self, matrix: FloatArray) -> FrameTransform:
         """The frame's map with a homography (3, 3) of undistorted px."""
         height, width = self.image.shape
-        corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=np.float64)
-        source = self.lens.undistort_points(corners)
-        target = _apply_homography(matrix, source)
-        return self.transform(
-            PolyprojectiveTransform.from_homography(matrix, fit_normalisation(source), fit_normalisation(target))
-        )
+        return self.transform(PolyprojectiveTransform.of_frame(matrix, self.lens, width, height))
 
 
 @dataclass(frozen=True)
@@ -120,11 +115,12 @@ def _fit_level(
     if images is None:
         return Failure("the frame would lie outside the base image")
     moving, mask, reference, origin = images
+    spacing_px = int(np.sqrt(mask.sum() / _TARGET_POINTS))  # where the image is too small for enough points
     matches = match_grid(
         moving,
         mask,
         reference,
-        spacing_px=_grid_spacing(mask, pair.config.grid_spacing_px),
+        spacing_px=max(4, min(pair.config.grid_spacing_px, spacing_px)),
         patch_px=pair.config.patch_size_px,
         radius_px=radius_px,
         modality=modality,
@@ -160,11 +156,6 @@ def _base_window(pair: ImagePair, transform: FrameTransform) -> tuple[int, int, 
     right, bottom = min(int(x1) + margin + 1, width), min(int(y1) + margin + 1, height)
     patch = pair.config.patch_size_px
     return (left, top, right - left, bottom - top) if min(right - left, bottom - top) > patch else None
-
-
-def _grid_spacing(mask: Mask, spacing_px: int) -> int:
-    """The configured spacing, or a smaller one where the image is too small for enough points."""
-    return max(4, min(spacing_px, int(np.sqrt(mask.sum() / _TARGET_POINTS))))
 
 
 def _fit_matches(
@@ -237,7 +228,7 @@ def _near_homography(source: FloatArray, target: FloatArray, unit_px: float) -> 
     matrix, _ = cv2.findHomography(source, target, cv2.USAC_MAGSAC, 3.0 * unit_px, maxIters=5000, confidence=0.999)
     if matrix is None:
         return np.zeros(len(source), dtype=bool)
-    return np.asarray(np.linalg.norm(_apply_homography(matrix, source) - target, axis=1) < 12.0 * unit_px)
+    return np.asarray(np.linalg.norm(HomographyTransform(matrix)(source) - target, axis=1) < 12.0 * unit_px)
 
 
 def _reselect_inliers(
@@ -271,8 +262,3 @@ def cv_errors(source: FloatArray, target: FloatArray, model: Model) -> FloatArra
         if not isinstance(fit, Failure):
             errors[fold == part] = np.linalg.norm(fit(source[fold == part]) - target[fold == part], axis=1)
     return np.asarray(np.nan_to_num(errors, nan=np.inf), dtype=np.float64)
-
-
-def _apply_homography(matrix: FloatArray, xy: FloatArray) -> FloatArray:
-    mapped = np.column_stack([xy, np.ones(len(xy))]) @ matrix.T
-    return np.asarray(mapped[:, :2] / mapped[:, 2:])

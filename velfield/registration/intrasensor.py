@@ -46,7 +46,7 @@ from velfield.registration.alignment import (
     smooth_fine,
 )
 from velfield.registration.fitting import fit_by_case_deletion
-from velfield.registration.joint import ControlPoints, JointFit, fit_jointly, is_inlier
+from velfield.registration.joint import ControlPoints, JointFit, fit_jointly, is_inlier, rms
 from velfield.registration.keypoints import (
     Keypoints,
     detect_keypoints,
@@ -61,7 +61,6 @@ from velfield.registration.transforms import (
     PolyprojectiveTransform,
     as_points,
     count_row_knots,
-    fit_normalisation,
 )
 
 QUALITY_CELLS = (6, 8)
@@ -327,20 +326,13 @@ def _register_by_flow(
     if isinstance(prior, Failure):
         return None
     fitter = _FrameFitter(grey, base, lens, config)
-    start_transform = _start_of(prior, lens, width, height)
+    start_transform = PolyprojectiveTransform.of_frame(prior.matrix, lens, width, height)
     fitted = fitter.fit_with_alignment(points, start_transform, before.result.stiffness, templates)
     if isinstance(fitted, Failure):
         return None
     used, fit = fitted
     result = fitter.with_quality_metrics(used, fit, len(used), 0)
     return result if result.ok else None
-
-
-def _start_of(prior: HomographyTransform, lens: Lens, width: int, height: int) -> PolyprojectiveTransform:
-    corners = as_points(lens.undistort_points(_corners(width, height)))
-    return PolyprojectiveTransform.from_homography(
-        prior.matrix, fit_normalisation(corners), fit_normalisation(prior(corners))
-    )
 
 
 def map_keypoints(keypoints: Keypoints, transform: FrameTransform) -> Keypoints:
@@ -386,7 +378,7 @@ def register_frame(
     from_base = _match_control_points(keypoints, predicted, base.keypoints, config, _BASE_SIGMA_PX)
     from_previous = _match_control_points(keypoints, predicted, previous, config, _PREVIOUS_SIGMA_PX)
     height, width = grey.shape
-    start = _start_of(prior, lens, width, height)
+    start = PolyprojectiveTransform.of_frame(prior.matrix, lens, width, height)
     fitter = _FrameFitter(grey, base, lens, config)
     if config.model == "polyprojective":  # the paper matches base and previous frame alike
         fitted = fitter.fit_with_case_deletion(from_base.concatenate(from_previous))
@@ -417,10 +409,6 @@ def _estimate_prior(
 
 def _reason(result: object) -> str:
     return result.reason if isinstance(result, Failure) else ""
-
-
-def _corners(width: int, height: int) -> FloatArray:
-    return np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=np.float64)
 
 
 def _match_control_points(
@@ -626,7 +614,7 @@ class _FrameFitter:
             residuals = points.xy_base - transform.to_base(points.xy_raw)
         inliers = is_inlier(weights)
         error_map = _cell_rms(points.xy_raw[inliers], cv_residuals[inliers], width, height)
-        count, heldout_px = int(inliers.sum()), _rms(cv_residuals[inliers])
+        count, heldout_px = int(inliers.sum()), rms(cv_residuals[inliers])
         counts = (n_matches_base, n_matches_previous, count)
         if count < self.config.min_control_points:
             reason = f"{count} of {len(points)} control points are inliers, {self.config.min_control_points} needed"
@@ -640,7 +628,7 @@ class _FrameFitter:
             transform,
             "ok",
             *counts,
-            _rms(residuals[inliers]),
+            rms(residuals[inliers]),
             heldout_px,
             coverage,
             error_map,
@@ -671,7 +659,3 @@ def _cell_rms(xy_raw: FloatArray, errors: FloatArray, width: int, height: int) -
     counts = np.bincount(cell, minlength=rows * columns)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.sqrt(squares / counts).reshape(rows, columns))
-
-
-def _rms(vectors: FloatArray) -> float:
-    return float(np.sqrt((vectors**2).sum(axis=1).mean())) if len(vectors) else float("nan")

@@ -29,6 +29,7 @@ from velfield.registration.transforms import (
     PolyprojectiveTransform,
     as_points,
     fit_normalisation,
+    frame_corners,
 )
 
 FOLDS = 5
@@ -128,15 +129,16 @@ class JointFit:
     @property
     def residual_px(self) -> float:
         """RMS residual of the inliers."""
-        return _rms(self.residuals[self.inliers])
+        return rms(self.residuals[self.inliers])
 
     @property
     def cv_error_px(self) -> float:
         """RMS cross-validated residual of the inliers."""
-        return _rms(self.cv_residuals[self.inliers])
+        return rms(self.cv_residuals[self.inliers])
 
 
-def _rms(vectors: FloatArray) -> float:
+def rms(vectors: FloatArray) -> float:
+    """Root mean square length of vectors (n, 2); NaN without any."""
     return float(np.sqrt((vectors**2).sum(axis=1).mean())) if len(vectors) else float("nan")
 
 
@@ -287,8 +289,7 @@ def _build_problem(
         first, basis = kernels.spline_basis(rows, height, knots)
     else:
         knots, first, basis = 0, np.zeros(len(raw), np.int64), np.zeros((len(raw), 4))
-    corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=np.float64)
-    source = fit_normalisation(as_points(lens.undistort_points(corners)))
+    source = fit_normalisation(as_points(lens.undistort_points(frame_corners(width, height))))
     target = fit_normalisation(as_points(points.xy_base))
     return _Problem(
         undistorted=undistorted,

@@ -10,13 +10,15 @@ cross-check.
 """
 
 from dataclasses import dataclass
+from itertools import chain
+from typing import Any
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from schemas.arrays import ByteArray, FloatArray, GreyImage, IntArray, Mask
 from schemas.flight import RegistrationConfig
-from velfield.compiled import kernel
 from velfield.errors import Failure
 from velfield.registration.transforms import HomographyTransform
 
@@ -108,6 +110,7 @@ PRIOR_POINTS = 1200
 _RATIO = 0.85
 """Ratio test: largest distance to the nearest descriptor over that to the second nearest."""
 _GUIDED_RATIO = 0.9
+_SAME_PX = 2.0
 _MAX_GUIDED_DISTANCE = 350
 """Largest descriptor distance of a guided match; OpenCV's SIFT descriptors have a norm of about 512."""
 _PRIOR_THRESHOLD_PX = 6.0
@@ -180,64 +183,26 @@ def match_guided(predicted: FloatArray, descriptors: ByteArray, reference: Keypo
     """
     if not len(predicted) or not len(reference):
         return np.zeros((0, 2), np.int64)
-    cell = search_px / 2
-    finite: Mask = np.asarray(np.isfinite(predicted).all(axis=1))
-    origin = reference.xy.min(axis=0)
-    key = np.floor((reference.xy - origin) / cell).astype(np.int64)
-    shape = key.max(axis=0) + 1
-    flat = key[:, 1] * shape[0] + key[:, 0]
-    order = np.argsort(flat, kind="stable")
-    starts = np.searchsorted(flat[order], np.arange(shape[0] * shape[1] + 1))
-    best, back = _nearest_in_window(
-        np.where(finite[:, None], predicted, -1e9),
-        descriptors,
-        reference.xy,
-        reference.descriptors,
-        order,
-        starts,
-        shape,
-        origin,
-        cell,
-        _GUIDED_RATIO**2,
-        _MAX_GUIDED_DISTANCE**2,
-    )
-    rows = np.flatnonzero(best >= 0)
-    rows = rows[back[best[rows]] == rows]
-    return np.stack([rows, best[rows]], axis=1)
+    finite = np.flatnonzero(np.isfinite(predicted).all(axis=1))
+    tree = cKDTree(reference.xy)
+    near: Any = tree.query_ball_point(predicted[finite], search_px / 2, p=np.inf, return_sorted=True)
+    row = np.repeat(finite, [len(each) for each in near])
+    column = np.fromiter(chain.from_iterable(near), np.int64, len(row))
+    difference = descriptors[row].astype(np.int32) - reference.descriptors[column]
+    distance = np.einsum("nk,nk->n", difference, difference)
+    first = _first_of_each(row, distance)
+    best = np.full(len(predicted), -1)
+    best[row[first]] = column[first]
+    # SIFT gives one keypoint per dominant orientation: those of one position do not compete
+    apart = np.abs(reference.xy[column] - reference.xy[best[row]]).sum(axis=1) > _SAME_PX
+    second = np.full(len(predicted), np.iinfo(np.int32).max)
+    np.minimum.at(second, row[apart], distance[apart])
+    mutual = np.isin(first, _first_of_each(column, distance))
+    good = mutual & (distance[first] < np.minimum(_MAX_GUIDED_DISTANCE**2, _GUIDED_RATIO**2 * second[row[first]]))
+    return np.stack([row[first[good]], column[first[good]]], axis=1)
 
 
-@kernel
-def _nearest_in_window(  # type: ignore[no-untyped-def]
-    predicted, moving, xy, reference, order, starts, shape, origin, cell, ratio, limit
-) -> tuple[IntArray, IntArray]:
-    """Nearest reference index for each prediction (-1: none), and nearest prediction for each reference keypoint."""
-    best = np.full(predicted.shape[0], -1, np.int64)
-    back = np.full(xy.shape[0], -1, np.int64)
-    back_distance = np.full(xy.shape[0], 1 << 40, np.int64)
-    for i in range(predicted.shape[0]):
-        column = int(np.floor((predicted[i, 0] - origin[0]) / cell))
-        row = int(np.floor((predicted[i, 1] - origin[1]) / cell))
-        first, second, found = 1 << 40, 1 << 40, -1
-        for r in range(max(row - 1, 0), min(row + 2, shape[1])):
-            for c in range(max(column - 1, 0), min(column + 2, shape[0])):
-                for k in range(starts[r * shape[0] + c], starts[r * shape[0] + c + 1]):
-                    j = order[k]
-                    if abs(xy[j, 0] - predicted[i, 0]) > cell or abs(xy[j, 1] - predicted[i, 1]) > cell:
-                        continue
-                    distance = 0
-                    for d in range(128):
-                        difference = int(moving[i, d]) - int(reference[j, d])
-                        distance += difference * difference
-                    if distance < back_distance[j]:
-                        back_distance[j] = distance
-                        back[j] = i
-                    if distance < first:
-                        # SIFT gives one keypoint per dominant orientation: those of one position do not compete
-                        if found < 0 or abs(xy[j, 0] - xy[found, 0]) + abs(xy[j, 1] - xy[found, 1]) > 2:
-                            second = first
-                        first, found = distance, j
-                    elif distance < second and abs(xy[j, 0] - xy[found, 0]) + abs(xy[j, 1] - xy[found, 1]) > 2:
-                        second = distance
-        if found >= 0 and first < limit and first < ratio * second:
-            best[i] = found
-    return best, back
+def _first_of_each(group: IntArray, distance: IntArray) -> IntArray:
+    """Places, in the order of the groups, of the smallest distance of each group (n,)."""
+    order = np.lexsort((distance, group))
+    return order[np.unique(group[order], return_index=True)[1]]

@@ -72,6 +72,13 @@ class PolyprojectiveTransform:
         coefficients[:, 0], coefficients[:, 1], coefficients[:, 2] = inner[:, 2], inner[:, 0], inner[:, 1]
         return cls(coefficients, source, target)
 
+    @classmethod
+    def of_frame(cls, matrix: FloatArray, lens: Lens, width: int, height: int) -> "PolyprojectiveTransform":
+        """`from_homography` of undistorted px of a frame, in normalisations by its corners."""
+        corners = as_points(lens.undistort_points(frame_corners(width, height)))
+        norms = fit_normalisation(corners), fit_normalisation(HomographyTransform(matrix)(corners))
+        return cls.from_homography(matrix, *norms)
+
     @property
     def is_homography(self) -> bool:
         """Whether all second-order terms are zero."""
@@ -112,6 +119,11 @@ def normalisation_matrix(norm: FloatArray) -> FloatArray:
     return np.array([[s, 0.0, -cx * s], [0.0, s, -cy * s], [0.0, 0.0, 1.0]])
 
 
+def frame_corners(width: int, height: int) -> FloatArray:
+    """Corners (4, 2) of a frame, px."""
+    return np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=np.float64)
+
+
 def fit_normalisation(xy: FloatArray) -> FloatArray:
     """(cx, cy, s) that centres points (n, 2) and scales the largest coordinate to 1."""
     finite = xy[np.isfinite(xy).all(axis=1)]
@@ -142,10 +154,6 @@ def count_row_knots(config: RegistrationConfig) -> int:
     return config.row_spline_knots if config.model == "row_spline" else 0
 
 
-def _empty_rows() -> FloatArray:
-    return np.zeros((3, 0))
-
-
 @dataclass(frozen=True, eq=False)
 class FrameTransform:
     """The complete map of one frame, raw pixels to base pixels.
@@ -174,7 +182,7 @@ class FrameTransform:
     height: int
     lens: Lens
     polyprojective: PolyprojectiveTransform
-    row_coefficients: FloatArray = field(default_factory=_empty_rows)
+    row_coefficients: FloatArray = field(default_factory=lambda: np.zeros((3, 0)))
     mesh: FloatArray | None = None
     cell_size_px: int = 200
 

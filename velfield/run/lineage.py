@@ -81,13 +81,10 @@ def pixel_lineage(run: Run, x: int, y: int) -> PixelLineage:
     if not (0 <= x < width and 0 <= y < height):
         raise InputError(f"pixel ({x}, {y}) is outside the base image of {width} x {height} px")
     tracklets = run.tracklets()
-    touching = _touching(run, _near(tracklets, x, y, _margin_px(run)), x, y)
+    margin_px = (band_radius_px(run.record.config.field, run.grid.gsd_m) or 0.0) + 1.0
+    touching = _touching(run, _near(tracklets, x, y, margin_px), x, y)
     tracks = tuple(_tracks(tracklets, touching))
     return PixelLineage(x, y, tracks, _frames(run, sorted({f for track in tracks for f in track.frames})))
-
-
-def _margin_px(run: Run) -> float:
-    return (band_radius_px(run.record.config.field, run.grid.gsd_m) or 0.0) + 1.0
 
 
 def _near(tracklets: pd.DataFrame, x: int, y: int, margin_px: float) -> pd.DataFrame:

@@ -222,7 +222,8 @@ def _is_expired(text: str) -> bool:
 
 def _has_ended(record: dict[str, Any]) -> bool:
     """Whether the writer of a record is a process of this machine that does not run any more."""
-    return machine_id() != "" and record.get("machine") == machine_id() and not _is_running(int(record["pid"]))
+    # on Windows os.kill(pid, 0) is Ctrl-C
+    return machine_id() != "" and record.get("machine") == machine_id() and not psutil.pid_exists(int(record["pid"]))
 
 
 @cache
@@ -235,10 +236,6 @@ def machine_id() -> str:
         return f"{boot} {os.readlink('/proc/self/ns/pid')}"
     except OSError:
         return ""
-
-
-def _is_running(pid: int) -> bool:
-    return bool(psutil.pid_exists(pid))  # on Windows os.kill(pid, 0) is Ctrl-C
 
 
 def _refusal(name: str, text: str) -> str:

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 import pandas as pd
 
-from schemas.arrays import FloatArray, IntArray, Mask
+from schemas.arrays import IntArray, Mask
 from velfield.analysis.lanes.ridges import NODE_SPACING_M, Nodes
 
 _MAX_STEP_M = 4 * NODE_SPACING_M
@@ -134,7 +134,7 @@ def _stubs(
     flow_out = np.bincount(links.start, links.tracks * (links.tracks >= min_tracks), len(nodes))
     drop = np.zeros(len(nodes), bool)
     for chain in chains:
-        length = _length_m(nodes.xy_m[chain])
+        length = np.hypot(*np.diff(nodes.xy_m[chain], axis=0).T).sum()
         dead = flow_in[chain[0]] == 0 or flow_out[chain[-1]] == 0
         if length < _STUB_M and dead:
             drop[chain] = True
@@ -213,7 +213,3 @@ def _joins(
         if key not in best or best[key][2] < n:
             best[key] = (a, b, n)
     return list(best.values())
-
-
-def _length_m(xy: FloatArray) -> float:
-    return float(np.hypot(*np.diff(xy, axis=0).T).sum())

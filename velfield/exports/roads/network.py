@@ -1,6 +1,6 @@
 """The lane graph of a run and the trips on it, in metres with y upwards: what the formats of roads are written from."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -84,12 +84,8 @@ def road_network(run: Run) -> RoadNetwork:
     connections = tuple((one.start, one.end) for one in graph.connections)
     first_s = float(trajectories.time_s.min()) if len(trajectories.time_s) else 0.0
     trips = _trips(samples.track, samples.lane, samples.time_s - first_s, samples.speed_m_per_s, set(connections))
-    named = tuple(Trip(int(trajectories.track_id[trip.track_id]), *_rest(trip)) for trip in trips)
+    named = tuple(replace(trip, track_id=int(trajectories.track_id[trip.track_id])) for trip in trips)
     return RoadNetwork(tuple(lanes), connections, named, float(np.diff(trajectories.window_s)[0]))
-
-
-def _rest(trip: Trip) -> tuple[float, tuple[int, ...], float]:
-    return trip.depart_s, trip.lanes, trip.speed_m_per_s
 
 
 def _trips(

@@ -42,13 +42,9 @@ def make_maps(plan: Plan) -> StageResult:
     # The viewer's data take about as long as the figures.
     writers: list[Callable[[], list[Path]]] = [write_figures, partial(write_view_data, layout)]
     with ignore_missing_georeference():
-        written = parallel_map(_call, writers)
+        written = parallel_map(lambda write: write(), writers)
     advance("maps")
     return StageResult([path for paths in written for path in paths], {"maps": 2.0})
-
-
-def _call(write: Callable[[], list[Path]]) -> list[Path]:
-    return write()
 
 
 def _modal_velocity(plan: Plan) -> tuple[Mask, FloatArray]:
