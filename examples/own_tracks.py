@@ -11,8 +11,8 @@ import pandas as pd
 
 
 def main(out: str) -> None:
-    """Make a table of 30 vehicles that drive east, 4 s apart, and analyse it."""
-    rows = [(n, 4 * n + t / 5, 10 * t / 5, 0.0) for n in range(30) for t in range(60)]
+    """Make a table of 30 vehicles that drive east, 6 s apart, and analyse it."""
+    rows = [(n, 6 * n + t / 5, 10 * t / 5, 0.0) for n in range(30) for t in range(60)]
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     pd.DataFrame(rows, columns=["track_id", "time_s", "x_m", "y_m"]).to_csv(folder / "tracks.csv", index=False)

@@ -22,8 +22,8 @@ def annotate(
     place
         Image of a frame, or a run folder: then frames spread over its flight are shown.
     labels
-        CSV file to write; its labels of other frames are kept. Default: `labels.csv` in the run folder, or next to
-        the image.
+        CSV file to write; its labels of other frames are kept.
+        Default: `labels.csv` in the run folder, or next to the image.
     frames
         Number of frames of a run to show.
     port

@@ -38,16 +38,16 @@ def georeference(
     run_folder
         The run folder.
     points
-        CSV `x_px,y_px,longitude,latitude`, or `x_px,y_px,x,y` with --epsg; a column `name` is optional. Pixels are
-        those of the map, as the page shows them. Default: click the points in the browser.
+        CSV `x_px,y_px,longitude,latitude`, or `x_px,y_px,x,y` with --epsg; a column `name` is optional.
+        Pixels are those of the map, as the page shows them. Default: click the points in the browser.
     epsg
         EPSG code of the reference system of `x,y`, such as 32633.
     model
-        Transform to fit. Default: a similarity; with six or more points an affine transform, if its error at left-out
-        points is smaller.
+        Transform to fit. Default: a similarity.
+        With six or more points an affine transform, if its error at left-out points is smaller.
     map_
-        Your own map, shown next to the run's in the page to click coordinates on: GeoTIFF, MBTiles of images, or a tile
-        server, such as https://HOST/{z}/{x}/{y}.png. Nothing is loaded from anywhere else.
+        Your own map, shown next to the run's in the page to click coordinates on. Nothing else is loaded.
+        GeoTIFF, MBTiles of images, or a tile server, such as https://HOST/{z}/{x}/{y}.png.
     check
         Print the residuals of --points and change nothing.
     port

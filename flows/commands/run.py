@@ -62,8 +62,8 @@ def run(
     out
         Run folder: everything is written there.
     tracks
-        Tracks of another program instead of a video: CSV or Parquet (geo-trax, highD and others), or SUMO's FCD. Field,
-        maps and analysis are made of them.
+        Tracks of another program instead of a video: CSV or Parquet (geo-trax, highD and others), or SUMO's FCD.
+        Field, maps and analysis are made of them.
     unit
         Unit of the columns x and y in `--tracks`, if their names do not give it.
     y_axis
@@ -72,8 +72,8 @@ def run(
         Image whose pixels become the base pixels: GeoTIFF, PNG with world file, or plain.
         Default: built from the flight.
     gsd_m
-        Ground sample distance, metres per base pixel. Default: from the base image's CRS, the drone's metadata or the
-        lengths of the vehicles.
+        Ground sample distance, metres per base pixel.
+        Default: from the base image's CRS, the drone's metadata or the lengths of the vehicles.
     labels
         Labelled cars to fine-tune the detector on: CSV, GeoJSON, YOLO, COCO, LabelMe, VIA. Default: none.
     detector

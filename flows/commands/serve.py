@@ -1,5 +1,6 @@
 """``velfield serve``: process flights and base images that arrive in a folder, with the Prefect UI."""
 
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -59,8 +60,7 @@ def serve(
         limit=limit,
         cluster=str(cluster.resolve()) if cluster else "",
     )
-    try:
+    with suppress(KeyboardInterrupt):  # Prefect answers most interrupts by returning
         serve_folder(config)
-    except KeyboardInterrupt:
-        print("stopped; all processes ended")
+    print("stopped; all processes ended")
     return 0

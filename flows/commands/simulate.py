@@ -30,8 +30,8 @@ def simulate(
     seed
         Seed of the city and the flight.
     clip
-        Write a drone clip DJI_0001.MP4 (25 frames per second) instead of frames/, with its telemetry `beside` it, in
-        a file DJI_0001.SRT, or `embedded` in the clip.
+        Write a drone clip DJI_0001.MP4 (25 frames per second) instead of frames/.
+        Its telemetry is `beside` it, in a file DJI_0001.SRT, or `embedded` in the clip.
     quiet
         Print warnings only.
     """

@@ -15,8 +15,8 @@ def still(run_folder: Path, /, *, frames: int = 200, within: Path | None = None)
     frames
         At most so many frames, spread over the run.
     within
-        A CSV `x_px,y_px`: corners of the area to measure, base pixels. Roofs and trees move on the map of a camera
-        that flies by; a road does not.
+        A CSV `x_px,y_px`: corners of the area to measure, base pixels.
+        Roofs and trees move on the map of a camera that flies by; a road does not.
     """
     from velfield.bench.still import measure_stability, read_area
     from velfield.run.run import open_run

@@ -156,7 +156,7 @@ class _Reader:
         table = table.sort_values(["track_id", "time_s"], kind="stable", ignore_index=True)
         rows = table.pop("row").to_numpy(np.int64)
         speed = None if speed is None else replace(speed, values=speed.values[rows])
-        named = "unknown format" if self.form is None else self.form.name
+        named = "read by its columns" if self.form is None else self.form.name
         point = "centre" if self.form is None else self.form.point
         names = f"{self.columns[position.x]}, {self.columns[position.y]}"
         of = {"centre": "", "front": ", of the vehicle's front", "corner": ", corner of a box"}[point]
