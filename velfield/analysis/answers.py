@@ -1,6 +1,6 @@
 """Answers for people: a number with its interval, none and at most so many an hour, or what is missing for one."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -141,9 +141,9 @@ def _speeds(analysis: TrafficAnalysis, unit: SpeedUnit) -> Iterator[Answer]:
     known = [(road, road.speed_m_per_s) for road in analysis.free_flow if road.speed_m_per_s]
     for road, speed in sorted(known, key=lambda pair: -pair[1].n):
         sign, factor = road.limit(unit), PER_M_PER_S[unit]
-        limit = f"about {sign:.0f}" if sign else "between two signs"
+        limit = f"about {sign:.0f} {unit}" if sign else "between two signs"
         text = f"free flow {estimate_text(speed, unit, factor)}, limit {limit}"
-        yield Answer("speed", f"lanes {' '.join(map(str, road.lanes))}", "found", text, speed.in_units(factor), unit)
+        yield Answer("speed", lanes_text(road.lanes), "found", text, speed.in_units(factor), unit)
     if not known:
         text = "too little data: no road with 8 vehicles that go freely and steadily"
         yield Answer("speed", "", "too little data", text)
@@ -158,7 +158,7 @@ def _signal(number: int, signal: JunctionSignal) -> Answer:
     for lanes in signal.phases:
         streams = [s for s in signal.streams if s.stream.approach.lane in lanes]
         longest = max((q for s in streams for q in queues(s.stream, s.green_s)), key=lambda q: q.length_m, default=None)
-        text += f"; lanes {' '.join(map(str, lanes))}: green at {estimate_text(streams[0].green_phase_s, 's')}"
+        text += f"; {lanes_text(lanes)}: green at {estimate_text(streams[0].green_phase_s, 's')}"
         if longest:
             text += f", longest queue {queue_text(longest)}"
     return Answer("signal", subject, "found", text, signal.cycle_s, "s")
@@ -210,6 +210,17 @@ def count_text(n: int, noun: str) -> str:
     ('1 lane', '2 lanes')
     """
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def lanes_text(lanes: Sequence[int]) -> str:
+    """Lanes by their numbers.
+
+    Examples
+    --------
+    >>> lanes_text([2]), lanes_text([0, 1])
+    ('lane 2', 'lanes 0, 1')
+    """
+    return f"lane{'s' if len(lanes) != 1 else ''} {', '.join(map(str, lanes))}"
 
 
 def queue_text(queue: Queue) -> str:

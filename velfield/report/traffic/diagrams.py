@@ -47,8 +47,8 @@ def traffic_diagrams(
     yield Diagram(
         "place",
         "The place",
-        "Lanes with their direction of travel; J: junctions, by the number used in the tables. Dashed: roads that "
-        "cross, perhaps on two levels, as nobody was seen to turn.",
+        "Lanes with their direction of travel and their numbers; J: junctions. Text and tables use these numbers. "
+        "Dashed: roads that cross, perhaps on two levels, as nobody was seen to turn.",
         partial(draw_place, analysis=analysis, picture=picture),
         4.6,
     )
@@ -161,13 +161,16 @@ def _draw_map(axes: "Axes", analysis: TrafficAnalysis, picture: GreyImage | None
 
 
 def draw_place(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | None) -> None:
-    """Lanes with arrows, and the junctions' numbers, over the base image."""
+    """Lanes with arrows and numbers, and the junctions' numbers, over the base image."""
     _draw_map(axes, analysis, picture)
     for lane in analysis.lanes:
         if lane.length_m >= 12:
             at = lane.at(lane.length_m / 2), lane.at(lane.length_m / 2 + 3)
             style = {"arrowstyle": "-|>", "color": "#1b1f24", "mutation_scale": 11}
             axes.annotate("", xy=(at[1][0], at[1][1]), xytext=(at[0][0], at[0][1]), arrowprops=style)
+            box = {"facecolor": "white", "edgecolor": "none", "boxstyle": "round,pad=0.1", "alpha": 0.8}
+            x, y = lane.at(lane.length_m / 3)
+            axes.text(x, y, str(lane.number), ha="center", va="center", fontsize=6.5, color="#0b4f8a", bbox=box)
     for junction in analysis.lanes.junctions:
         level = _is_junction(analysis, junction.number)
         if level or junction.kind == "crossing":
