@@ -162,11 +162,19 @@ def queue_pairs(signal: JunctionSignal, truth: Truth) -> Iterator[tuple[Estimate
 def _u_turns(analysis: TrafficAnalysis, numbers: IntArray, whole: set[int], begun: set[int]) -> Iterator[Statement]:
     for reversal in analysis.reversals:
         yield Statement("u-turn", int(numbers[reversal.track]) in begun, f"at {reversal.xy_m.round()}")
-    found = {int(numbers[r.track]) for r in analysis.reversals}
+    hourly = len(whole) / analysis.trajectories.duration_s * 3600
     for answer in find_answers(analysis):
         if answer.topic == "u-turns":
-            withheld = answer.state == "too little data"
-            yield Statement("u-turns", withheld or whole <= found, f"{answer.text}; {len(whole)} in truth", withheld)
+            # each is a statement above; the answer says how many an hour there are, or that this is not known
+            low, high = (answer.estimate.low, answer.estimate.high) if answer.estimate else (0.0, answer.at_most_per_h)
+            text = f"{answer.text}; {len(whole)} in truth"
+            yield Statement("u-turns", high is None or low <= hourly <= high, text, high is None)
+
+
+def u_turns_found(analysis: TrafficAnalysis, truth: Truth, whole: set[int]) -> tuple[int, int]:
+    """U-turns that were seen whole, and how many of them are found."""
+    numbers = true_numbers(analysis, truth.tracks)
+    return len(whole), len(whole & {int(numbers[r.track]) for r in analysis.reversals})
 
 
 def _limits(analysis: TrafficAnalysis, truth: Truth) -> Iterator[Statement]:
@@ -213,9 +221,7 @@ def conflicts_found(analysis: TrafficAnalysis, truth: Truth) -> tuple[int, int]:
         return 0, 0
     numbers = true_numbers(analysis, truth.tracks)
     near = near_in_time(truth, longest_s=1.5 - PET_SLACK_S, doubtless=True)
-    said = {
-        frozenset((int(numbers[c.first]), int(numbers[c.second]))) for c in analysis.conflicts if c.probability >= 0.5
-    }
+    said = {frozenset((int(numbers[c.first]), int(numbers[c.second]))) for c in analysis.conflicts if c.likely}
     return len(near), len(said & near.keys())
 
 
@@ -223,7 +229,7 @@ def _conflicts(analysis: TrafficAnalysis, truth: Truth, numbers: IntArray) -> It
     near = near_in_time(truth)
     levels = np.empty((0, 2)) if truth.signals else truth.crossings_m
     for c in analysis.conflicts:
-        if c.probability >= 0.5:
+        if c.likely:
             pair = frozenset((int(numbers[c.first]), int(numbers[c.second])))
             bridge = c.kind == "crossing" and np.hypot(*(levels - c.xy_m).T).min(initial=np.inf) < CROSSING_M
             value = np.inf if bridge else near.get(pair, np.inf)
@@ -269,8 +275,8 @@ def _times_to_collision(
 
 
 def _encroachments(truth: Truth, longest_s: float, *, doubtless: bool) -> dict[frozenset[int], float]:
-    """Least time between one vehicle's rear and another's front at a place to which they came by different ways;
-    ``doubtless``: of both it is known by which."""
+    """Least time between one vehicle's rear and another's front at a place to which they came by different ways, or
+    lanes; ``doubtless``: of both it is known by which way, as one turned: who changes the lane follows, no more."""
     samples, lengths = truth.analysis.samples, truth.lengths_m[truth.tracks.vehicle]
     ids = truth.analysis.trajectories.track_id[samples.track]
     half = lengths[ids] / 2 / np.maximum(samples.speed_m_per_s, 1.0)
@@ -286,7 +292,7 @@ def _encroachments(truth: Truth, longest_s: float, *, doubtless: bool) -> dict[f
     a, b = pairs.T
     turned = np.abs(np.angle(np.exp(1j * (samples.direction_rad[before[a]] - samples.direction_rad[before[b]]))))
     apart = np.hypot(*(samples.xy_m[before[a]] - samples.xy_m[before[b]]).T)
-    for i in np.flatnonzero((turned > np.radians(15)) | (apart > 3.0)):
+    for i in np.flatnonzero((turned > np.radians(15)) | ((apart > 3.0) & (not doubtless))):
         first, second = (a[i], b[i]) if samples.time_s[a[i]] < samples.time_s[b[i]] else (b[i], a[i])
         value = float(samples.time_s[second] - half[second] - samples.time_s[first] - half[first])
         if value < longest_s:

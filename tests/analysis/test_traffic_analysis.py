@@ -8,10 +8,11 @@ import pytest
 from schemas.arrays import FloatArray
 from velfield.analysis.answers import find_answers
 from velfield.analysis.changes import find_changes
-from velfield.analysis.flow.conflicts import find_conflicts, persistent
+from velfield.analysis.flow.conflicts import find_conflicts, persistent, positions_on_lanes
 from velfield.analysis.flow.speeds import slowing
 from velfield.analysis.flow.volume import flow_slices
 from velfield.analysis.intervals import estimate_censored_quantile, estimate_quantile, estimate_rate, estimate_share
+from velfield.analysis.movements.gates import Arm, Gate, Gates
 from velfield.analysis.movements.movements import furness
 from velfield.analysis.signals.cycles import find_signal, queues
 from velfield.analysis.signals.phases import START_DELAY_S, fit_phases
@@ -234,6 +235,24 @@ def test_a_fast_approach_is_a_conflict_and_a_queue_and_a_double_are_none() -> No
     assert conflict.probability > 0.9
 
 
+def test_a_vehicle_that_leaves_its_lane_and_comes_back_is_not_on_it_between() -> None:
+    detour = np.array([[0.0, 100.0], [100.0, 100.0], [100.0, 130.0], [130.0, 130.0], [130.0, 100.0], [260.0, 100.0]])
+    analysis = TrafficAnalysis(gather([*(drive(EAST, 8.0 * k) for k in range(12)), drive(detour, 100.0)]))
+    paths = analysis.trajectories
+    lane, _ = positions_on_lanes(paths, analysis.lanes)
+    away = np.abs(paths.xy_m[:, 1] - 100.0) > 4.0
+    assert away.sum() > 20
+    assert (lane[away] < 0).all()
+    assert (lane[~away] >= 0).mean() > 0.95
+
+
+def test_a_vehicle_beside_the_lane_of_a_gate_does_not_cross_there() -> None:
+    gates = Gates((Gate(0, True, np.array([10.0, 5.0]), np.pi / 2, 0),), (Arm(0, "N", np.array([10.0, 5.0])),))
+    at = np.array([[10.0, 5.5], [12.0, 5.0], [13.5, 5.0], [10.0, 12.0]])
+    assert gates.nearest(at, np.full(4, np.pi / 2), inwards=True).tolist() == [0, 0, -1, -1]
+    assert gates.nearest(at, np.full(4, -np.pi / 2), inwards=True).tolist() == [-1] * 4
+
+
 def test_queues_behind_a_signal_are_no_conflicts(analysis: TrafficAnalysis) -> None:
     following = [c for c in analysis.conflicts if c.kind == "following"]
     assert sum(c.value_s < 1.5 for c in following) > 10  # who stops behind another has less than 1.5 s to collision
@@ -378,7 +397,7 @@ def test_roads_that_cross_are_an_intersection_where_turns_a_signal_or_pairs_show
     assert answers["signal", "crossing 0"].state == "too little data"
     assert "0 junctions, 1 crossing" in answers["lanes", ""].text
     # many pairs, none of which is there at once
-    level = [drive(EAST, 12.0 * k) for k in range(24)] + [drive(SOUTH, 12.0 * k + 6.0) for k in range(24)]
+    level = [drive(EAST, 12.0 * k) for k in range(40)] + [drive(SOUTH, 12.0 * k + 6.0) for k in range(40)]
     crossed = TrafficAnalysis(gather(level))
     assert [crossed.junction_kind(k) for k in range(len(crossed.lanes.junctions))] == ["intersection"]
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from schemas.simulation import TrafficSimulation
 from tests.analysis.noisy_tracks import GSD_M, Noise, TrueTracks, analyse, clip, flight, true_tracks
-from tests.analysis.statements import Interval, Statement, Truth, conflicts_found, intervals, statements
+from tests.analysis.statements import Interval, Statement, Truth, conflicts_found, intervals, statements, u_turns_found
 from velfield.analysis.traffic_analysis import TrafficAnalysis
 from velfield.analysis.vehicle_classes import find_classes
 from velfield.synthetic.flight import Flight
@@ -117,7 +117,7 @@ def main() -> None:
     said: Counter[str] = Counter()
     false: Counter[str] = Counter()
     withheld: Counter[str] = Counter()
-    doubtless = np.zeros(2, np.int64)
+    doubtless, turns = np.zeros((2, 2), np.int64)
     covered: defaultdict[str, list[bool]] = defaultdict(list)
     for seed in range(*arguments.seeds):
         for case in make_cases(seed):
@@ -128,9 +128,11 @@ def main() -> None:
                 if not s.true and (not arguments.kinds or s.kind in arguments.kinds):
                     print(f"{case.name}: {s.kind}: {s.text}", flush=True)
             doubtless += conflicts_found(case.analysis, case.truth)
+            turns += u_turns_found(case.analysis, case.truth, case.u_turns[0])
             for i in case.intervals():
                 covered[i.kind].append(i.estimate.low <= i.truth <= i.estimate.high)
     print(f"\nconflicts beyond doubt: {doubtless[0]}, found {doubtless[1]}")
+    print(f"U-turns seen 20 m before and after: {turns[0]}, found {turns[1]}")
     print(f"\n{'kind':24} {'said':>6} {'false':>6} {'withheld':>8}")
     for kind in sorted(said | withheld):
         print(f"{kind:24} {said[kind]:6d} {false[kind]:6d} {withheld[kind]:8d}")

@@ -165,7 +165,7 @@ def _signal(number: int, signal: JunctionSignal) -> Answer:
 
 
 def _conflicts(analysis: TrafficAnalysis) -> Answer:
-    likely = [c for c in analysis.conflicts if c.probability >= 0.5]
+    likely = [c for c in analysis.conflicts if c.likely]
     kinds = ", ".join(f"{sum(c.kind == k for c in likely)} {k}" for k in sorted({c.kind for c in likely}))
     unclear = sum(c.probability >= 0.5 * c.one_level for c in analysis.conflicts) - len(likely)
     if unclear and not likely:
@@ -189,7 +189,11 @@ def _events(topic: str, n: int, seconds: float, detail: str = "") -> Answer:
     """A number of events, and how many an hour that is; of none how rare they are at least."""
     if n:
         rate = estimate_event_rate(n, seconds / 3600) if seconds >= _SHORT_S else None
-        often = f", {rate.value:.0f} an hour ({rate.low:.0f} to {rate.high:.0f})" if rate else ""
+        often = (
+            f", {rate.value:.0f} an hour ({rate.low:.0f} to {rate.high:.0f})"
+            if rate
+            else ", too short to say how often"
+        )
         text = f"{n}{often}: {detail}" if detail else f"{n}{often}"
         return Answer(topic, "", "found", text, rate, "/h" if rate else "")
     if seconds < _SHORT_S:

@@ -189,7 +189,7 @@ class TrafficAnalysis:
         found = self.lanes.junctions[junction]
         if found.kind != "crossing":
             return found.kind
-        level = [c.xy_m for c in self.conflicts if c.kind == "crossing" and c.one_level >= 0.5]
+        level = [c.xy_m for c in self.conflicts if c.kind == "crossing" and c.on_one_level]
         on_one = self.is_signalised(junction) or bool(inside_hull(np.array(level).reshape(-1, 2), found.hull_m).any())
         return "intersection" if on_one else "crossing"
 

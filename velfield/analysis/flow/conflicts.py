@@ -37,12 +37,14 @@ _ONE_LEVEL, _TWO_LEVELS = (1.0, 30.0), (3.0, 6.0)
 """Where one road is above the other vehicles know nothing of each other: of the pairs that pass within 3 s a third or
 so has less than half a second between them, or none; on one level they avoid it. Beta distributions of that share,
 which shows in the pairs within so far."""
-_ONE_LEVEL_BEFORE, _LEAST_ONE_LEVEL = 0.1, 0.05
+_ONE_LEVEL_BEFORE, _LEAST_ONE_LEVEL, _CLEARLY_ONE_LEVEL = 0.1, 0.05, 0.9
 """Few pairs do not rule out two levels: to be taken for one level roads must be ten times as likely on it."""
 _JOINED_M = 4.0
 """A lane that joins another is on it so far after its own end."""
 _APART_M = 1.8
 """Lanes that lie nearer to each other on their whole way, and by errors, are one."""
+_ON_LANE_M = 3.5
+"""A vehicle that is farther from a lane's centre line is not on it."""
 _CAME_M = 3
 """A vehicle came by a lane on which it drove so far."""
 
@@ -72,6 +74,16 @@ class Conflict:
     threshold_s: float
     probability: float
     one_level: float = 1.0
+
+    @property
+    def on_one_level(self) -> bool:
+        """Whether it is clear that the roads are on one level."""
+        return self.one_level >= _CLEARLY_ONE_LEVEL
+
+    @property
+    def likely(self) -> bool:
+        """Whether it is more likely than not a conflict, of roads that are clearly on one level."""
+        return self.on_one_level and self.probability >= 0.5
 
 
 def find_conflicts(
@@ -366,6 +378,11 @@ def positions_on_lanes(trajectories: Trajectories, graph: LaneGraph) -> tuple[In
     lane, along = _between(
         trajectories.first, trajectories.time_s, samples.track, samples.lane, samples.along_m, samples.time_s
     )
+    for one in graph:  # who left the lane, and came back, was elsewhere between two samples on it
+        rows = np.flatnonzero(lane == one.number)
+        at = np.column_stack([np.interp(along[rows], one.along_m, one.xy_m[:, k]) for k in (0, 1)])
+        away = np.hypot(*(trajectories.xy_m[rows] - at).T) > _ON_LANE_M
+        lane[rows[away]] = -1
     return lane, along
 
 

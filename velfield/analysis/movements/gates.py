@@ -11,6 +11,8 @@ from velfield.analysis.lanes.model import Junction, LaneGraph
 
 _ARM_M = 17.0
 """Gates of one arm are nearer to each other: a median may lie between them."""
+_REACH_M, _ASIDE_M = 6.0, 2.5
+"""A vehicle crosses the border at a gate that is no farther from it, and hardly more than half a lane to the side."""
 _ARM_RAD = np.radians(35)
 """Axes of one arm's gates differ by less."""
 _COMPASS = ("E", "SE", "S", "SW", "W", "NW", "N", "NE")
@@ -44,18 +46,22 @@ class Gates:
     gates: tuple[Gate, ...]
     arms: tuple[Arm, ...]
 
-    def nearest(self, xy_m: FloatArray, direction_rad: FloatArray, *, inwards: bool, reach_m: float = 6.0) -> IntArray:
-        """Number of the gate (n,) nearest to each crossing of its direction, -1: none near."""
+    def nearest(self, xy_m: FloatArray, direction_rad: FloatArray, *, inwards: bool) -> IntArray:
+        """Number of the gate (n,) nearest to each crossing of its direction, -1: none near.
+
+        The lane beside a gate's may touch the area of the junction, and have no gate: its vehicles are no gate's.
+        """
         rows = [k for k, gate in enumerate(self.gates) if gate.inwards == inwards]
         if not rows or not len(xy_m):
             return np.full(len(xy_m), -1)
         at = np.array([self.gates[k].xy_m for k in rows])
         heading = np.array([self.gates[k].direction_rad for k in rows])
-        distance = np.hypot(*(xy_m[:, None] - at[None]).transpose(2, 0, 1))
+        dx, dy = (xy_m[:, None] - at[None]).transpose(2, 0, 1)
+        distance, aside = np.hypot(dx, dy), np.abs(dy * np.cos(heading) - dx * np.sin(heading))
         turn = np.abs(np.angle(np.exp(1j * (direction_rad[:, None] - heading[None]))))
-        distance = np.where(turn < _ARM_RAD, distance, np.inf)
+        distance = np.where((turn < _ARM_RAD) & (aside < _ASIDE_M), distance, np.inf)
         best = distance.argmin(axis=1)
-        near = distance[np.arange(len(xy_m)), best] < reach_m
+        near = distance[np.arange(len(xy_m)), best] < _REACH_M
         return np.where(near, np.array(rows)[best], -1)
 
 

@@ -18,7 +18,7 @@ _APPROACH_M = 40
 _LEG_M, _LEG_SIGMAS = 8, 24.0
 """Before the turn and after it the vehicle goes on so far, and farther than its errors by so many standard deviations,
 the opposite way."""
-_OPPOSITE_RAD = np.radians(140)
+_OPPOSITE_RAD = np.radians(150)
 _BEND_M, _BEND_RAD = 8, np.radians(20)
 """A turn goes on where the next so many metres bend on by more."""
 _STRAIGHT_M = 16

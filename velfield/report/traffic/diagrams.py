@@ -26,7 +26,6 @@ _RED = "#c62828"
 _MAX_JUNCTIONS = 4
 _SHOWN_S, _SLICE_S = 300.0, 60.0
 _BESIDE_M, _AHEAD_RAD = 2.5, np.radians(45)
-_LIKELY = 0.5
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ def traffic_diagrams(
             )
         yield from _signal_diagrams(analysis, found)
     yield from _road_diagrams(analysis, junctions, unit)
-    likely = [c for c in analysis.conflicts if c.probability >= _LIKELY]
+    likely = [c for c in analysis.conflicts if c.likely]
     if likely:
         yield Diagram(
             "conflicts",
@@ -363,7 +362,7 @@ def draw_flow(axes: "Axes", *, analysis: TrafficAnalysis, found: JunctionMovemen
 def draw_conflicts(axes: "Axes", *, analysis: TrafficAnalysis, picture: GreyImage | None) -> None:
     """Conflicts by kind on the map."""
     _draw_map(axes, analysis, picture)
-    likely = [c for c in analysis.conflicts if c.probability >= _LIKELY]
+    likely = [c for c in analysis.conflicts if c.likely]
     for k, kind in enumerate(sorted({c.kind for c in likely})):
         at = np.array([c.xy_m for c in likely if c.kind == kind])
         axes.plot(*at.T, _MARKS[k], color=_RED, markeredgecolor="white", markersize=8, label=f"{kind}: {len(at)}")
