@@ -8,15 +8,11 @@ shifts. The smallest difference is taken.
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numba import types
-from numba.extending import intrinsic
 
 from schemas.arrays import ByteArray, FloatArray, IntArray
 from velfield.compiled import kernel
-from velfield.vectors import BYTE, WORD, Vectors
 
 MAX_PATCH_SHIFT_PX = 2
 """Patches are compared at shifts of up to this, working px, either way and either axis."""
@@ -80,20 +76,14 @@ _CHUNK = 64
 """Pixels that are compared at a time."""
 
 
-@intrinsic
-def _absolute_sum(_context, before, at, after, to, counted):  # type: ignore[no-untyped-def]
+@kernel
+def _absolute_sum(before: ByteArray, at: np.uint64, after: ByteArray, to: np.uint64, counted: ByteArray) -> int:
     """Sum of the absolute differences of 64 pixels from ``before[at]`` and ``after[to]`` on, where ``counted[at]`` has
     all bits."""
-
-    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
-        v = Vectors(context, build, signature, arguments, _CHUNK)
-        before, at, after, to, counted = v.arguments
-        one, other = v.load(before, at), v.load(after, to)
-        difference = build.sub(v.call("umax", one, other), v.call("umin", one, other))
-        difference = build.and_(difference, v.load(counted, at))
-        return v.call("vector.reduce.add", build.zext(difference, v.kind(WORD)), returns=WORD)
-
-    return types.int32(before, at, after, to, counted), generate
+    total = np.int32(0)
+    for k in range(np.uint64(_CHUNK)):
+        total += abs(np.int32(before[at + k]) - np.int32(after[to + k])) & np.int32(counted[at + k])
+    return int(total)
 
 
 @kernel
@@ -259,28 +249,23 @@ def _prepare(crops: ByteArray, axes: FloatArray, parts: ByteArray) -> IntArray:
     return rows
 
 
-@intrinsic
-def _compare_chunk(_context, before, at, after, to):  # type: ignore[no-untyped-def]
+@kernel
+def _compare_chunk(before: ByteArray, at: np.uint64, after: ByteArray, to: np.uint64) -> int:
     """Sum of the differences of 64 pixels on both cars, and their number times 65536.
 
     ``before[at]`` and ``after[to]`` are grey levels, with the other parts of `PreparedCrops` at their distances.
     """
-
-    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
-        v = Vectors(context, build, signature, arguments, _CHUNK)
-        before, at, after, to = v.arguments
-        grey, low, high, mine = (v.load(before, at, 4 * _PART * k) for k in range(4))
-        other, other_low, other_high, its = (v.load(after, to, 4 * _PART * k) for k in range(4))
-        pairs = ((grey, other_high), (other_low, grey), (other, high), (low, other))
-        outside = [v.call("usub.sat", one, limit) for one, limit in pairs]
-        most = v.call("umax", v.call("umax", *outside[:2]), v.call("umax", *outside[2:]))
-        both = build.and_(mine, its)
-        most = build.zext(build.and_(most, both), v.kind(WORD))
-        number = build.zext(build.and_(both, v.constant(BYTE, 1)), v.kind(WORD))
-        total, count = (v.call("vector.reduce.add", values, returns=WORD) for values in (most, number))
-        return build.add(total, build.shl(count, WORD(16)))
-
-    return types.int32(before, at, after, to), generate
+    part = np.uint64(4 * _PART)
+    both = np.int32(0)
+    for k in range(np.uint64(_CHUNK)):
+        i, j = at + k, to + k
+        grey, other = np.int32(before[i]), np.int32(after[j])
+        above, below = grey - np.int32(after[j + part + part]), np.int32(after[j + part]) - grey
+        its_above, its_below = other - np.int32(before[i + part + part]), np.int32(before[i + part]) - other
+        on_both = np.int32(before[i + part + part + part] & after[j + part + part + part])
+        outside = np.maximum(np.maximum(above, below), np.maximum(its_above, its_below))
+        both += (np.maximum(outside, np.int32(0)) & on_both) + ((on_both & np.int32(1)) << np.int32(16))
+    return int(both)
 
 
 @kernel

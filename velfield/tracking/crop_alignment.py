@@ -20,17 +20,12 @@ deviation.
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from schemas.arrays import ByteArray, Float32Array, FloatArray, IntArray
 from velfield.compiled import kernel
-from velfield.vectors import LONG, REAL, Vectors
 
 CAR_LENGTH_PX = 14.0
 CAR_WIDTH_PX = 6.0
@@ -77,8 +72,8 @@ _SIDE = 2 * _MIDDLE
 """Index of the centre, and side, of the images that hold the box at every shift, with the samples to interpolate."""
 _LEFT = _MIDDLE - _REACH - 1
 """First column of the box in these."""
-_LANES, _RUN = 8, 32
-"""Columns that are summed at a time, and values that are counted at a time."""
+_RUN = 32
+"""Values that are counted at a time."""
 _BEYOND = 1e6
 """Difference of a pixel without weight, grey levels."""
 _MEDIAN_STEPS = 13
@@ -440,41 +435,35 @@ def _median(values: Float32Array, middle: np.float32, count: int) -> np.float32:
     return np.float32(0.5) * (low + high)
 
 
-@intrinsic
-def _sum_columns(_context, difference, weight, slope_x, slope_y, rows, middle, scale, sums):  # type: ignore[no-untyped-def]
+@kernel
+def _sum_columns(difference, weight, slope_x, slope_y, middle, scale, sums) -> None:  # type: ignore[no-untyped-def]
     """Sums for each column of what a step needs, ``sums`` (10, columns): of the weights, and by these of the slopes in
     x and in y, the differences, their squares, the squares and products of slopes, xx, xy and yy, and the products of
     either slope and the differences. These are less ``middle``, and their weights include Tukey's biweight.
 
     A sum for each column leaves no order of additions to the compiler.
     """
-
-    def generate(context: Any, build: Any, signature: Any, arguments: Any) -> Any:
-        v = Vectors(context, build, signature, arguments, _LANES)
-        difference, weight, slope_x, slope_y, rows, middle, scale, sums = v.arguments
-        middle, scale, zero, one = v.spread(middle), v.spread(scale), v.constant(REAL, 0.0), v.constant(REAL, 1.0)
-        totals = [cgutils.alloca_once(build, v.kind(REAL)) for _ in range(10)]
-        for first in range(0, _COLUMNS, _LANES):
-            for total in totals:
-                build.store(zero, total)
-            with cgutils.for_range_slice(build, LONG(first), build.mul(rows, LONG(_COLUMNS)), LONG(_COLUMNS)) as (
-                at,
-                _,
-            ):
-                d, x, y = build.fsub(v.load(difference, at), middle), v.load(slope_x, at), v.load(slope_y, at)
-                root = build.fsub(one, build.fmul(build.fmul(d, scale), build.fmul(d, scale)))
-                root = build.select(build.fcmp_ordered(">", root, zero), root, zero)
-                w = build.fmul(v.load(weight, at), build.fmul(root, root))
-                wx, wy, wd = (build.fmul(w, part) for part in (x, y, d))
-                products = ((wd, d), (wx, x), (wx, y), (wy, y), (wx, d), (wy, d))
-                parts = [w, wx, wy, wd, *(build.fmul(left, right) for left, right in products)]
-                for total, part in zip(totals, parts, strict=True):
-                    build.store(build.fadd(build.load(total), part), total)
-            for k, total in enumerate(totals):
-                v.store(build.load(total), sums, k * _COLUMNS + first)
-        return context.get_dummy_value()
-
-    return types.void(difference, weight, slope_x, slope_y, rows, middle, scale, sums), generate
+    sums[:] = 0.0
+    s, sx, sy, sd, dd = sums[0], sums[1], sums[2], sums[3], sums[4]
+    xx, xy, yy, xd, yd = sums[5], sums[6], sums[7], sums[8], sums[9]
+    for row in range(weight.shape[0]):
+        values, weights = difference[row * _COLUMNS : (row + 1) * _COLUMNS], weight[row]
+        along, across = slope_x[row], slope_y[row]
+        for k in range(np.uint64(_COLUMNS)):
+            d, x, y = values[k] - middle, along[k], across[k]
+            root = max(np.float32(1.0) - (d * scale) * (d * scale), np.float32(0.0))
+            w = weights[k] * (root * root)
+            wx, wy, wd = w * x, w * y, w * d
+            s[k] += w
+            sx[k] += wx
+            sy[k] += wy
+            sd[k] += wd
+            dd[k] += wd * d
+            xx[k] += wx * x
+            xy[k] += wx * y
+            yy[k] += wy * y
+            xd[k] += wx * d
+            yd[k] += wy * d
 
 
 @kernel
@@ -488,7 +477,7 @@ def _step(difference, weight, slope_x, slope_y, count, sums) -> tuple[float, flo
     middle = _median(difference, np.float32(np.nan), count)
     spread = np.float32(1.4826) * _median(difference, middle, count) + np.float32(1.0)
     scale = np.float32(1.0) / (np.float32(TUKEY_C) * spread)
-    _sum_columns(difference, weight, slope_x, slope_y, np.uint64(weight.shape[0]), middle, scale, sums)
+    _sum_columns(difference, weight, slope_x, slope_y, middle, scale, sums)
     s = sx = sy = sd = dd = xx = xy = yy = xd = yd = 0.0
     for x in range(np.uint64(_COLUMNS)):
         s += sums[0, x]
