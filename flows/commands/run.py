@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from flows.commands.start import own_command
 from flows.options import DONE, INCOMPLETE, Device, LogJson, Preset, Quiet, Settings, Verbose
-from schemas.job import Inputs, Job
+from schemas.job import Inputs, Job, absolute
 from velfield.errors import InputError
 from velfield.pipeline.configuration import resolve_config
 
@@ -156,7 +156,8 @@ def run(
         return _show_plan(job, where)
     status = process(job, runner=where, verbosity=_verbosity(quiet, verbose, log_json))
     if status in (DONE, INCOMPLETE):
-        print(f"answers {own_command()} analyse {shlex.quote(str(out))}   (turning counts, queues, signals, speeds)")
+        root = shlex.quote(absolute(str(out)))
+        print(f"answers {own_command()} analyse {root}   (turning counts, queues, signals, speeds)")
     return status
 
 
